@@ -1,0 +1,72 @@
+"""Checks of user input that raise in the form got - need - do.
+
+Each check looks at concrete values only: inside a JAX transformation it passes,
+because there a value cannot be known, and statuses report instead.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def is_concrete(value: Any) -> bool:
+    return not isinstance(value, jax.core.Tracer)
+
+
+def finite(where: str, name: str, value: Any, do: str) -> None:
+    """Raise a `ValueError` if `value` holds NaN or infinity."""
+    if is_concrete(value) and not np.all(np.isfinite(np.asarray(value))):
+        raise ValueError(
+            f"{where}: `{name}` must be finite, got {_short(value)}. {do}"
+        )
+
+
+def positive(where: str, name: str, value: Any, unit: str, do: str) -> None:
+    """Raise a `ValueError` unless every entry of `value` is finite and positive."""
+    if is_concrete(value):
+        numbers = np.asarray(value)
+        if not (np.all(np.isfinite(numbers)) and np.all(numbers > 0)):
+            raise ValueError(
+                f"{where}: `{name}` must be positive, got {_short(value)} {unit}. {do}"
+            )
+
+
+def between(
+    where: str, name: str, value: Any, low: float, high: float, unit: str, do: str
+) -> None:
+    """Raise a `ValueError` unless `low < value < high` everywhere."""
+    if is_concrete(value):
+        numbers = np.asarray(value)
+        if not (np.all(numbers > low) and np.all(numbers < high)):
+            raise ValueError(
+                f"{where}: `{name}` must lie in ({low:g}, {high:g}) {unit}, "
+                f"got {_short(value)} {unit}. {do}"
+            )
+
+
+def shape(where: str, name: str, value: Any, want: Sequence[int | None], do: str) -> None:
+    """Raise a `ValueError` unless `value.shape` matches `want` (None: any length)."""
+    got = jnp.shape(value)
+    fits = len(got) == len(want) and all(
+        w is None or g == w for g, w in zip(got, want, strict=True)
+    )
+    if not fits:
+        need = "(" + ", ".join("any" if w is None else str(w) for w in want) + ")"
+        raise ValueError(f"{where}: `{name}` has shape {got}, need {need}. {do}")
+
+
+def float64(where: str, value: Any) -> None:
+    """Raise a `ValueError` unless `value` is float64."""
+    if value.dtype != jnp.float64:
+        raise ValueError(
+            f"{where}: needs float64, got {value.dtype}: single precision misses the "
+            'tolerances. Call jax.config.update("jax_enable_x64", True) first.'
+        )
+
+
+def _short(value: Any) -> str:
+    numbers = np.asarray(value)
+    return f"{numbers:g}" if numbers.ndim == 0 else np.array2string(numbers, threshold=6)

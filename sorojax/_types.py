@@ -1,0 +1,46 @@
+"""Conversion of user numbers to strongly typed arrays."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def real(value: Any) -> jax.Array:
+    """`value` as a floating array that keeps one dtype and never retraces.
+
+    Floating arrays keep their dtype; Python numbers and integers take the
+    default floating dtype (float64 where `jax_enable_x64` is set). A Python
+    float left inside a pytree would be weakly typed or static: it would retrace
+    at every new value and have no gradient.
+    """
+    if isinstance(value, jax.Array | np.ndarray | np.generic):
+        dtype = value.dtype
+        if not jnp.issubdtype(dtype, jnp.floating):
+            dtype = jnp.result_type(float)
+        return jnp.asarray(value, dtype=dtype)
+    if isinstance(value, list | tuple) and any(
+        isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(list(value))
+    ):
+        return jnp.stack([real(item) for item in value])
+    if type(value) is object or value is None:  # placeholders that JAX puts in
+        return value
+    return jnp.asarray(np.asarray(value, dtype=np.float64), dtype=jnp.result_type(float))
+
+
+def optional_real(value: Any) -> jax.Array | None:
+    """Like `real`, and `None` stays `None`."""
+    return None if value is None else real(value)
+
+
+def integers(value: Any) -> jax.Array:
+    """`value` as an int32 array: connectivity, slots and node numbers."""
+    if type(value) is object:
+        return value  # type: ignore[return-value]
+    return jnp.asarray(value, dtype=jnp.int32)
+
+
+def is_traced(tree: Any) -> bool:
+    """Whether any leaf of `tree` is an abstract value of a JAX transformation."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))

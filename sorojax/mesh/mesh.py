@@ -1,0 +1,74 @@
+"""The mesh: points, cells and named sets."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sorojax._types import integers, real
+from sorojax.mesh.elements import AbstractElement
+
+
+def _int_sets(sets: dict[str, Any]) -> dict[str, jax.Array]:
+    return {name: integers(ids) for name, ids in sets.items()}
+
+
+class Mesh(eqx.Module):
+    """Cells of one element type over points, in the reference configuration.
+
+    `node_sets` holds node numbers. `facet_sets` holds facets as their node
+    numbers, `(facets, facet_nodes)`, corners first with the domain on the left,
+    then the mid-side node. Only `points` can carry a gradient: topology is built
+    outside any trace.
+    """
+
+    points: Float[Array, "nodes dim"] = eqx.field(converter=real)
+    cells: Int[Array, "cells cell_nodes"] = eqx.field(converter=integers)
+    element: AbstractElement
+    node_sets: dict[str, Int[Array, " nodes"]] = eqx.field(
+        converter=_int_sets, default_factory=dict
+    )
+    facet_sets: dict[str, Int[Array, "facets facet_nodes"]] = eqx.field(
+        converter=_int_sets, default_factory=dict
+    )
+
+    def __check_init__(self):
+        want = self.element.num_nodes
+        if self.cells.ndim != 2 or self.cells.shape[1] != want:
+            raise ValueError(
+                f"Mesh: `cells` has shape {self.cells.shape}, {self.element.name} needs "
+                f"(cells, {want}). List corners first, then mid-side nodes."
+            )
+        if self.points.ndim != 2 or self.points.shape[1] != self.element.dim:
+            raise ValueError(
+                f"Mesh: `points` has shape {self.points.shape}, {self.element.name} needs "
+                f"(nodes, {self.element.dim})."
+            )
+        if not isinstance(self.cells, jax.core.Tracer) and self.cells.size:
+            ids = np.asarray(self.cells)
+            if ids.min() < 0 or ids.max() >= self.points.shape[0]:
+                raise ValueError(
+                    f"Mesh: `cells` names nodes {ids.min()} to {ids.max()}, "
+                    f"but there are {self.points.shape[0]} points (0 to "
+                    f"{self.points.shape[0] - 1}). Renumber the cells."
+                )
+
+    @property
+    def num_nodes(self) -> int:
+        return self.points.shape[0]
+
+    @property
+    def num_cells(self) -> int:
+        return self.cells.shape[0]
+
+
+def boundary_facets(mesh: Mesh) -> Int[np.ndarray, "facets facet_nodes"]:
+    """Facets that belong to one cell only, domain on the left (host array)."""
+    cells = np.asarray(mesh.cells)
+    facets = np.concatenate([cells[:, list(f)] for f in mesh.element.facets])
+    ends = np.sort(facets[:, :2], axis=1)
+    keys = ends[:, 0].astype(np.int64) * mesh.num_nodes + ends[:, 1]
+    _, first, count = np.unique(keys, return_index=True, return_counts=True)
+    return facets[np.sort(first[count == 1])]
