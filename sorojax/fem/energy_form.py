@@ -1,0 +1,42 @@
+"""Total potential energy in a form made for differentiation by parameters.
+
+The derivative of the residual in any leaf of the problem, forward or reverse, costs a few
+elementwise passes between two products with the shape gradients.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax.fem.energy import energy_density
+from sorojax.fem.points import deformation_gradients, point_areas
+from sorojax.fem.problem import Problem
+
+
+def load_potential(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
+    """Potential energy of all loads [J]."""
+    terms = (load.potential(problem, u) for load in problem.loads)
+    return sum(terms, start=jnp.zeros((), u.dtype))
+
+
+def potential_energy(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
+    """Stored energy plus the potential of all loads [J]."""
+    F = deformation_gradients(problem.mesh, u)
+    material = jax.tree.map(
+        lambda leaf: leaf[None] if jnp.ndim(leaf) == 1 else leaf, problem.material
+    )
+    density = energy_density(material, problem.kinematics, F)
+    volumes = point_areas(problem.mesh) * problem.kinematics.depth
+    return jnp.sum(volumes * density) + load_potential(problem, u)
+
+
+@jax.jit
+def residual(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, "nodes dim"]:
+    """Unbalanced force at every node [N]: zero at equilibrium, reactions at supports."""
+    return jax.grad(potential_energy, argnums=1)(problem, u)
+
+
+@jax.jit
+def load_force(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, "nodes dim"]:
+    """Force of all loads on the nodes [N]."""
+    return -jax.grad(load_potential, argnums=1)(problem, u)

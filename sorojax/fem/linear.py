@@ -1,0 +1,128 @@
+"""The linearised problem: residual and tangent of body and loads, with supports applied."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from sorojax.fem import assemble as asm
+from sorojax.fem.energy_form import load_force
+from sorojax.fem.problem import Problem
+from sorojax.fem.supports import known_dofs
+from sorojax.math import sparse
+
+
+class Prepared(NamedTuple):
+    """What one solve computes once: shape gradients, known unknowns, slots of facets."""
+
+    geometry: asm.Geometry
+    known: Bool[Array, " dofs"]
+    facet_slots: tuple[Int[Array, "facets entries"], ...]
+
+
+class Linearised(NamedTuple):
+    """Residual [N] and tangent values [N/m] of the whole problem at one state.
+
+    `reference` is the largest load or support reaction [N], that residuals are judged by;
+    `rounding` is the residual that rounding of u and of F = I + Grad u leaves [N].
+    """
+
+    residual: Float[Array, " dofs"]
+    values: Float[Array, " nnz"]
+    volume_ratio: Float[Array, ""]
+    residual_norm: Float[Array, ""]
+    reference: Float[Array, ""]
+    rounding: Float[Array, ""]
+
+
+def prepare(problem: Problem) -> Prepared:
+    """Geometry and index maps of `problem` (facet slots on the host, once per solve)."""
+    dim = problem.mesh.element.dim
+    geometry = asm.geometry(problem.space, problem.kinematics, problem.mesh.points)
+    known = known_dofs(problem.supports, problem.mesh.num_nodes, dim)
+    slots = []
+    for load in problem.loads:
+        if load.curved_facets is not None:
+            facets = np.asarray(load.curved_facets)
+            dofs = (facets[:, :, None] * dim + np.arange(dim)).reshape(len(facets), -1)
+            slots.append(sparse.slots_of(problem.space.system, dofs))
+    return Prepared(geometry, jnp.asarray(known), tuple(slots))
+
+
+@eqx.filter_jit
+def linearise(
+    problem: Problem,
+    prepared: Prepared,
+    u: Float[Array, "nodes dim"],
+    u_before: Float[Array, "nodes dim"],
+) -> Linearised:
+    """Residual and tangent at `u`; see `assemble` for the part of `u_before`."""
+    body = asm.assemble(
+        problem.space, prepared.geometry, problem.material, problem.kinematics, u, u_before
+    )
+    load = load_force(problem, u).ravel()
+    residual = body.force - load
+    zero = jnp.zeros_like(residual)
+    free = jnp.where(prepared.known, zero, residual)
+    reaction = jnp.where(prepared.known, residual, zero)
+    largest = jnp.maximum(jnp.max(jnp.abs(load)), jnp.max(jnp.abs(reaction)))
+    values = _add_load_stiffness(problem, prepared, u, body.values)
+    cell_areas = jnp.sum(prepared.geometry.volumes, axis=1) / problem.kinematics.depth
+    length = jnp.max(jnp.abs(u)) + jnp.sqrt(jnp.max(cell_areas))
+    epsilon = 2 * jnp.finfo(u.dtype).eps
+    return Linearised(
+        residual=residual,
+        values=values,
+        volume_ratio=body.volume_ratio,
+        residual_norm=jnp.max(jnp.abs(free)),
+        reference=largest,
+        rounding=epsilon * jnp.max(jnp.abs(values)) * length,
+    )
+
+
+def _add_load_stiffness(problem, prepared, u, values):
+    curved = [load for load in problem.loads if load.curved_facets is not None]
+    for load, slots in zip(curved, prepared.facet_slots, strict=True):
+        x = (problem.mesh.points + u)[load.curved_facets]
+
+        def energy(flat, load=load, shape=x.shape[1:]):
+            return load.facet_energy(problem, flat.reshape(shape))
+
+        matrices = jax.vmap(jax.hessian(energy))(x.reshape(len(x), -1))
+        first, second = np.triu_indices(matrices.shape[-1])
+        values = values.at[slots].add(matrices[:, first, second])
+    return values
+
+
+@jax.jit
+def constrain(
+    system: sparse.SparseSymmetric,
+    values: Float[Array, " nnz"],
+    residual: Float[Array, " dofs"],
+    known: Bool[Array, " dofs"],
+    move: Float[Array, " dofs"],
+) -> tuple[Float[Array, " nnz"], Float[Array, " dofs"]]:
+    """Matrix and right-hand side of a Newton step in which known unknowns move by `move`."""
+    rhs = -residual - sparse.product(system, values, move)
+    return sparse.fix(system, values, known), jnp.where(known, jnp.zeros_like(rhs), rhs)
+
+
+def step(
+    problem: Problem,
+    prepared: Prepared,
+    values: Float[Array, " nnz"],
+    residual: Float[Array, " dofs"],
+    move: Float[Array, " dofs"],
+) -> tuple[np.ndarray | None, int]:
+    """Newton step [m] on the host and the number of negative eigenvalues of the tangent;
+    `None` if the tangent is singular."""
+    system = problem.space.system
+    matrix, rhs = constrain(system, values, residual, prepared.known, move)
+    factor = system.solver.factor(np.asarray(matrix))
+    if factor is None:
+        return None, -1
+    du = factor.solve(np.asarray(rhs)) + np.asarray(move)
+    return du.reshape(-1, problem.mesh.element.dim), factor.negative_eigenvalues

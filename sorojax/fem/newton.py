@@ -1,0 +1,92 @@
+"""Newton's method at one load level, on the host around compiled kernels.
+
+A step is accepted only if the smallest volume ratio keeps a tenth of its value; else it
+is shortened by a closed form. The residual of thin rubber walls may rise by orders of
+magnitude in the first iteration, so it is not forced to fall: the answer is judged by
+update and residual together, and a state that did not converge is never returned as one.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from sorojax.fem import assemble as asm
+from sorojax.fem.linear import Linearised, Prepared, linearise, step
+from sorojax.fem.problem import Problem
+
+
+class Newton(eqx.Module):
+    """When to stop.
+
+    Args:
+        residual_tolerance: Largest unbalanced force over the largest load or reaction.
+        step_tolerance: Largest last update over the largest displacement.
+        max_iterations: Factorisations per load level.
+    """
+
+    residual_tolerance: float = 1e-9
+    step_tolerance: float = 1e-6
+    max_iterations: int = 15
+
+
+class Iterate(NamedTuple):
+    """State after a load level: converged unless `reason` says why not."""
+
+    u: np.ndarray
+    linearised: Linearised | None
+    iterations: int
+    residual: float
+    negative_eigenvalues: int
+    reason: str
+
+
+def newton_solve(
+    problem: Problem,
+    prepared: Prepared,
+    start: np.ndarray,
+    known_values: np.ndarray,
+    settings: Newton,
+    tangent: Linearised | None = None,
+) -> Iterate:
+    """Equilibrium near `start`. `tangent`, of a neighbouring equilibrium, gives a first
+    guess at the price of one back-substitution."""
+    u, before = start, start
+    state = linearise(problem, prepared, u, before)
+    move = np.where(np.asarray(prepared.known), known_values - u.ravel(), 0.0)
+    iterations, negative, size = 0, 0, np.inf
+    if tangent is not None:
+        du, negative = step(problem, prepared, tangent.values, state.residual, move)
+        if du is not None:
+            u, before, state, size = _advance(problem, prepared, u, du)
+            move = np.where(np.asarray(prepared.known), known_values - u.ravel(), 0.0)
+    while True:
+        norm, reference = float(state.residual_norm), float(state.reference)
+        ratio = norm / reference if reference > 0 else norm
+        if not (np.isfinite(norm) and float(state.volume_ratio) > 0):
+            return Iterate(u, None, iterations, ratio, negative, "an element inverts")
+        small = ratio < settings.residual_tolerance or norm < float(state.rounding)
+        if small and size < settings.step_tolerance and not np.any(move):
+            return Iterate(u, state, iterations, ratio, negative, "")
+        if iterations == settings.max_iterations:
+            reason = f"no convergence in {iterations} Newton iterations"
+            return Iterate(u, None, iterations, ratio, negative, reason)
+        du, negative = step(problem, prepared, state.values, state.residual, move)
+        if du is None:
+            return Iterate(u, None, iterations, ratio, negative, "the tangent is singular")
+        iterations += 1
+        u, before, state, size = _advance(problem, prepared, u, du)
+        move = np.where(np.asarray(prepared.known), known_values - u.ravel(), 0.0)
+        move[np.abs(move) <= 1e-12 * np.abs(known_values).max()] = 0.0
+
+
+def _advance(problem: Problem, prepared: Prepared, u: np.ndarray, du: np.ndarray):
+    """The state after a step, shortened where a cell would collapse."""
+    new = u + du
+    state = linearise(problem, prepared, new, u)
+    if not float(state.volume_ratio) > 0.1:
+        fraction = 0.9 * float(asm.largest_step(problem.space, prepared.geometry, u, du))
+        new = u + fraction * du
+        state = linearise(problem, prepared, new, u)
+    largest = np.abs(new).max()
+    return new, u, state, np.abs(du).max() / largest if largest > 0 else 0.0
