@@ -4,6 +4,7 @@ from sorojax.fem.energy_form import (
     potential_energy as potential_energy,
     residual as residual,
 )
+from sorojax.fem.follow import Stats as Stats, Status as Status
 from sorojax.fem.kinematics import PlaneStrain as PlaneStrain
 from sorojax.fem.loads import (
     Gravity as Gravity,
@@ -16,9 +17,15 @@ from sorojax.fem.solve import (
     ConvergenceError as ConvergenceError,
     Path as Path,
     Solution as Solution,
-    Status as Status,
     solve as solve,
     solve_path as solve_path,
 )
 from sorojax.fem.space import Space as Space, space as space
+from sorojax.fem.stress import (
+    cauchy_stress as cauchy_stress,
+    enclosed_volume as enclosed_volume,
+    nodal_average as nodal_average,
+    reaction_force as reaction_force,
+    von_mises_stress as von_mises_stress,
+)
 from sorojax.fem.supports import Fixed as Fixed, Prescribed as Prescribed

@@ -127,7 +127,7 @@ def assemble(
 
 
 def _contract_block(P, A, G, w):
-    """Sum over points of P G and G' A G: (nodes, dim, lanes), (nodes, dim, nodes, dim, lanes)."""
+    """Sum over points of P G, (nodes, dim, lanes), and of G' A G, one row per (node, dim)."""
     num, lanes_ = G.shape[1], G.shape[-1]
 
     def add_point(sums, point):

@@ -28,9 +28,7 @@ class AbstractLoad(eqx.Module):
     name: eqx.AbstractVar[str]
 
     @abc.abstractmethod
-    def potential(
-        self, problem: "Problem", u: Float[Array, "nodes dim"]
-    ) -> Float[Array, ""]:
+    def potential(self, problem: "Problem", u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
         """Potential energy of the load [J]."""
 
     def facet_energy(
@@ -97,7 +95,7 @@ class Gravity(AbstractLoad):
 
     def potential(self, problem, u):
         moved = integral(problem.mesh, u) * problem.kinematics.depth
-        density = jnp.broadcast_to(problem.material.density, moved.shape[:1])
+        density = jnp.broadcast_to(jnp.asarray(problem.material.density), moved.shape[:1])
         return -jnp.einsum("c,ci,i->", density, moved, self.value)
 
 

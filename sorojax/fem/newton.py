@@ -9,6 +9,7 @@ update and residual together, and a state that did not converge is never returne
 from typing import NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from sorojax.fem import assemble as asm
@@ -52,11 +53,13 @@ def newton_solve(
     """Equilibrium near `start`. `tangent`, of a neighbouring equilibrium, gives a first
     guess at the price of one back-substitution."""
     u, before = start, start
-    state = linearise(problem, prepared, u, before)
+    state = _linearise(problem, prepared, u, before)
     move = np.where(np.asarray(prepared.known), known_values - u.ravel(), 0.0)
     iterations, negative, size = 0, 0, np.inf
     if tangent is not None:
-        du, negative = step(problem, prepared, tangent.values, state.residual, move)
+        du, negative = step(
+            problem, prepared, tangent.values, state.residual, jnp.asarray(move)
+        )
         if du is not None:
             u, before, state, size = _advance(problem, prepared, u, du)
             move = np.where(np.asarray(prepared.known), known_values - u.ravel(), 0.0)
@@ -71,7 +74,7 @@ def newton_solve(
         if iterations == settings.max_iterations:
             reason = f"no convergence in {iterations} Newton iterations"
             return Iterate(u, None, iterations, ratio, negative, reason)
-        du, negative = step(problem, prepared, state.values, state.residual, move)
+        du, negative = step(problem, prepared, state.values, state.residual, jnp.asarray(move))
         if du is None:
             return Iterate(u, None, iterations, ratio, negative, "the tangent is singular")
         iterations += 1
@@ -80,13 +83,19 @@ def newton_solve(
         move[np.abs(move) <= 1e-12 * np.abs(known_values).max()] = 0.0
 
 
+def _linearise(problem, prepared, u: np.ndarray, before: np.ndarray) -> Linearised:
+    return linearise(problem, prepared, jnp.asarray(u), jnp.asarray(before))
+
+
 def _advance(problem: Problem, prepared: Prepared, u: np.ndarray, du: np.ndarray):
     """The state after a step, shortened where a cell would collapse."""
     new = u + du
-    state = linearise(problem, prepared, new, u)
+    state = _linearise(problem, prepared, new, u)
     if not float(state.volume_ratio) > 0.1:
-        fraction = 0.9 * float(asm.largest_step(problem.space, prepared.geometry, u, du))
+        fraction = 0.9 * float(
+            asm.largest_step(problem.space, prepared.geometry, jnp.asarray(u), jnp.asarray(du))
+        )
         new = u + fraction * du
-        state = linearise(problem, prepared, new, u)
+        state = _linearise(problem, prepared, new, u)
     largest = np.abs(new).max()
     return new, u, state, np.abs(du).max() / largest if largest > 0 else 0.0

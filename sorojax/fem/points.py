@@ -38,8 +38,7 @@ def deformation_gradients(
     inverse = ((d / J, -b / J), (-c / J, a / J))
     h = _reference_gradients(mesh, u, at)
     grad = [
-        [h[i][0] * inverse[0][j] + h[i][1] * inverse[1][j] for j in range(2)]
-        for i in range(2)
+        [h[i][0] * inverse[0][j] + h[i][1] * inverse[1][j] for j in range(2)] for i in range(2)
     ]
     return ((grad[0][0] + 1, grad[0][1]), (grad[1][0], grad[1][1] + 1))
 

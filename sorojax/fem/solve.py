@@ -4,9 +4,6 @@ The derivative is that of the implicit function at the converged state: one more
 back-substitution per direction, whatever steps the solver took to get there.
 """
 
-import enum
-from typing import NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,40 +14,12 @@ from sorojax import _check
 from sorojax._progress import report
 from sorojax._types import is_traced, real
 from sorojax.fem.energy_form import residual
-from sorojax.fem.linear import Linearised, Prepared, linearise, prepare
-from sorojax.fem.newton import Newton, newton_solve
+from sorojax.fem.follow import Log, Start, Stats, Status, begin_at, follow
+from sorojax.fem.linear import linearise, prepare
+from sorojax.fem.newton import Newton
 from sorojax.fem.problem import Problem
 from sorojax.fem.supports import known_values
 from sorojax.math import sparse
-
-
-class Status(enum.IntEnum):
-    """How a solve ended."""
-
-    ok = 0
-    not_converged = 1
-
-
-class LoadStep(NamedTuple):
-    """One accepted load step: fraction of the load, Newton iterations, residual over load,
-    and negative eigenvalues of the tangent (0 where the state is stable)."""
-
-    fraction: float
-    iterations: int
-    residual: float
-    negative_eigenvalues: int
-
-
-class Stats(NamedTuple):
-    """Accepted steps, the number of cut steps and why the last one failed, if it did."""
-
-    steps: tuple[LoadStep, ...]
-    cuts: int
-    reason: str = ""
-
-    @property
-    def iterations(self) -> int:
-        return sum(step.iterations for step in self.steps)
 
 
 class Solution(eqx.Module):
@@ -84,14 +53,6 @@ class ConvergenceError(RuntimeError):
         self.solution = solution
 
 
-class _Start(NamedTuple):
-    """A known equilibrium to start from, with the tangent there."""
-
-    u: np.ndarray
-    problem: Problem
-    tangent: Linearised | None
-
-
 def solve(
     problem: Problem,
     *,
@@ -120,7 +81,7 @@ def solve(
         ValueError: If called under `jit` or `vmap`.
     """
     newton = Newton() if newton is None else newton
-    log = _Log(newton, steps, max_cuts)
+    log = Log(newton, steps, max_cuts)
     u = _equilibrium(problem, None if start is None else np.asarray(start), log)
     solution = Solution(problem, u, log.status, log.stats())
     _raise_if_failed("fem.solve", solution, throw)
@@ -151,7 +112,7 @@ def solve_path(
         ValueError: If not exactly one existing load is named, or under `jit` or `vmap`.
     """
     name, row = _named_values(problem, values)
-    log = _Log(Newton() if newton is None else newton, 1, max_cuts)
+    log = Log(Newton() if newton is None else newton, 1, max_cuts)
     begin, states, stats = None, [], []
     for k, value in enumerate(row):
         target = _with_load(problem, name, value)
@@ -170,24 +131,8 @@ def solve_path(
     return Path(problem, stacked, row[: len(states)], name, log.status, tuple(stats))
 
 
-class _Log:
-    """Settings and record of one solve on the host."""
-
-    def __init__(self, newton: Newton, steps: int, max_cuts: int):
-        self.newton, self.num_steps, self.max_cuts = newton, steps, max_cuts
-        self.clear()
-
-    def clear(self) -> None:
-        self.steps: list[LoadStep] = []
-        self.cuts, self.status, self.reason = 0, Status.ok, ""
-        self.end: _Start
-
-    def stats(self) -> Stats:
-        return Stats(tuple(self.steps), self.cuts, self.reason)
-
-
 def _equilibrium(
-    problem: Problem, begin: "_Start | np.ndarray | None", log: _Log
+    problem: Problem, begin: Start | np.ndarray | None, log: Log
 ) -> Float[Array, "nodes dim"]:
     """Displacement at equilibrium with the derivative of the implicit function.
 
@@ -203,7 +148,7 @@ def _equilibrium(
                 "its kernels are compiled already, and grad and jvp work without jit."
             )
         problem = eqx.combine(params, rest)
-        return jnp.asarray(_follow(problem, _start(problem, begin), log))
+        return jnp.asarray(follow(problem, begin_at(problem, begin), log))
 
     @equilibrium.defjvp
     def derivative(primals, tangents):
@@ -233,59 +178,6 @@ def _tangent(rest, u, params, params_dot):
     matrix = sparse.fix(system, values, prepared.known)
     rhs = jnp.where(prepared.known, jnp.zeros_like(rhs), -rhs)
     return (sparse.solve(system, matrix, rhs) + move).reshape(u.shape)
-
-
-def _start(problem: Problem, begin: "_Start | np.ndarray | None") -> _Start:
-    if isinstance(begin, _Start):
-        return begin
-    if begin is None:
-        return _Start(np.zeros(problem.mesh.points.shape), _unloaded(problem), None)
-    return _Start(begin, problem, None)
-
-
-def _follow(problem: Problem, begin: _Start, log: _Log) -> np.ndarray:
-    """Step from `begin` to `problem`, halving steps that fail."""
-    prepared = prepare(problem)
-    u, tangent, done, size, failures = begin.u, begin.tangent, 0.0, 1.0 / log.num_steps, 0
-    while done < 1.0:
-        goal = min(1.0, done + size) if done + size < 1.0 - 1e-9 else 1.0
-        here = problem if goal == 1.0 else _between(begin.problem, problem, goal)
-        known = np.asarray(known_values(here.supports, *u.shape))
-        result = newton_solve(here, prepared, u, known, log.newton, tangent)
-        if result.reason:
-            failures += 1
-            log.cuts += 1
-            if failures > log.max_cuts:
-                log.status, log.reason = Status.not_converged, result.reason
-                return u
-            size, tangent = (goal - done) / 2, None
-            continue
-        u, tangent, done, failures = result.u, result.linearised, goal, 0
-        log.steps.append(
-            LoadStep(goal, result.iterations, result.residual, result.negative_eigenvalues)
-        )
-        log.end = _Start(u, problem, tangent)
-        if result.iterations <= 5:
-            size *= 1.5
-    return u
-
-
-def _unloaded(problem: Problem) -> Problem:
-    return _with_terms(problem, lambda _, b: jnp.zeros_like(b), problem)
-
-
-def _between(first: Problem, last: Problem, fraction: float) -> Problem:
-    """Loads and supports between two problems on the same body."""
-    return _with_terms(first, lambda a, b: a + fraction * (b - a), last)
-
-
-def _with_terms(first: Problem, mix, last: Problem) -> Problem:
-    terms = jax.tree.map(
-        lambda a, b: mix(a, b) if eqx.is_inexact_array(b) else b,
-        (first.loads, first.supports),
-        (last.loads, last.supports),
-    )
-    return eqx.tree_at(lambda p: (p.loads, p.supports), last, terms)
 
 
 def _named_values(problem: Problem, values: dict) -> tuple[str, Float[Array, "steps ..."]]:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from sorojax._types import is_traced
 from sorojax.math import sparse
 from sorojax.mesh.elements import AbstractElement
 from sorojax.mesh.mesh import Mesh
@@ -48,7 +49,7 @@ def space(mesh: Mesh) -> Space:
     Raises:
         ValueError: If the cells are traced: topology is fixed before any trace.
     """
-    if isinstance(mesh.cells, jax.core.Tracer):
+    if is_traced(mesh.cells):
         raise ValueError(
             "fem.space: `mesh.cells` is traced, need concrete cells. Build the space "
             "outside jit and grad, and replace only `mesh.points` inside."

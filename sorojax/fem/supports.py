@@ -35,9 +35,7 @@ class Prescribed(AbstractSupport):
     components: tuple[int, ...] = eqx.field(static=True, default=(0, 1))
 
 
-def known_dofs(
-    supports: tuple[AbstractSupport, ...], num_nodes: int, dim: int
-) -> np.ndarray:
+def known_dofs(supports: tuple[AbstractSupport, ...], num_nodes: int, dim: int) -> np.ndarray:
     """Mask of the unknowns that supports decide (host array)."""
     mask = np.zeros((num_nodes, dim), bool)
     for support in supports:

@@ -12,4 +12,5 @@ from sorojax.material.hyperelastic import (
     first_piola_kirchhoff_stress as first_piola_kirchhoff_stress,
     neo_hookean as neo_hookean,
     small_strain_moduli as small_strain_moduli,
+    strain_energy_density as strain_energy_density,
 )

@@ -25,17 +25,21 @@ _MODULUS = "Moduli are in Pa: write 0.2 * MPa."
 
 
 class AbstractHyperelastic(eqx.Module):
-    """A stored energy per reference volume.
+    """A stored energy per reference volume, isochoric plus volumetric.
 
-    The hook is elementwise code on the entries of F, so one call serves any number
+    The hooks are elementwise code on the entries of F, so one call serves any number
     of points. A leaf may also hold one number per cell of a mesh.
     """
 
     density: eqx.AbstractVar[Float[Array, "..."] | None]
 
     @abc.abstractmethod
-    def strain_energy_density(self, F: Tensor) -> Entry:
-        """Energy per reference volume [J/m^3]."""
+    def isochoric_energy(self, F: Tensor) -> Entry:
+        """Energy of the change of shape per reference volume [J/m^3]."""
+
+    @abc.abstractmethod
+    def volumetric_energy(self, J: Entry) -> Entry:
+        """Energy of the volume ratio J per reference volume [J/m^3]."""
 
 
 class NeoHookean(AbstractHyperelastic):
@@ -48,10 +52,11 @@ class NeoHookean(AbstractHyperelastic):
     def __check_init__(self):
         _check_moduli("NeoHookean", self.shear_modulus, self.bulk_modulus, self.density)
 
-    def strain_energy_density(self, F: Tensor) -> Entry:
-        J = determinant(F)
-        shear = self.shear_modulus / 2 * (isochoric_first_invariant(F, J) - 3)
-        return shear + self.bulk_modulus / 2 * (J - 1) ** 2
+    def isochoric_energy(self, F: Tensor) -> Entry:
+        return self.shear_modulus / 2 * (isochoric_first_invariant(F) - 3)
+
+    def volumetric_energy(self, J: Entry) -> Entry:
+        return self.bulk_modulus / 2 * (J - 1) ** 2
 
 
 class Yeoh(AbstractHyperelastic):
@@ -72,11 +77,12 @@ class Yeoh(AbstractHyperelastic):
         _check_moduli("Yeoh", self.c1, self.bulk_modulus, self.density)
         _check.finite("Yeoh", "c2, c3", jnp.stack([self.c2, self.c3]), _MODULUS)
 
-    def strain_energy_density(self, F: Tensor) -> Entry:
-        J = determinant(F)
-        x = isochoric_first_invariant(F, J) - 3
-        shear = x * (self.c1 + x * (self.c2 + x * self.c3))
-        return shear + self.bulk_modulus / 2 * (J - 1) ** 2
+    def isochoric_energy(self, F: Tensor) -> Entry:
+        x = isochoric_first_invariant(F) - 3
+        return x * (self.c1 + x * (self.c2 + x * self.c3))
+
+    def volumetric_energy(self, J: Entry) -> Entry:
+        return self.bulk_modulus / 2 * (J - 1) ** 2
 
 
 class Scaled(AbstractHyperelastic):
@@ -95,8 +101,11 @@ class Scaled(AbstractHyperelastic):
     def density(self):  # the mass is that of the base
         return self.base.density
 
-    def strain_energy_density(self, F: Tensor) -> Entry:
-        return self.factor * self.base.strain_energy_density(F)
+    def isochoric_energy(self, F: Tensor) -> Entry:
+        return self.factor * self.base.isochoric_energy(F)
+
+    def volumetric_energy(self, J: Entry) -> Entry:
+        return self.factor * self.base.volumetric_energy(J)
 
 
 def _check_moduli(where, shear, bulk, density):
@@ -147,11 +156,16 @@ def small_strain_moduli(
     return shear, A[0, 0, 1, 1] + 2 / 3 * shear
 
 
+def strain_energy_density(material: AbstractHyperelastic, F: Tensor) -> Entry:
+    """Psi per reference volume [J/m^3], elementwise on the entries of F."""
+    return material.isochoric_energy(F) + material.volumetric_energy(determinant(F))
+
+
 def first_piola_kirchhoff_stress(
     material: AbstractHyperelastic, F: Float[Array, "3 3"]
 ) -> Float[Array, "3 3"]:
     """P = dPsi/dF [Pa]."""
-    return jax.grad(lambda F: material.strain_energy_density(from_matrix(F)))(F)
+    return jax.grad(lambda F: strain_energy_density(material, from_matrix(F)))(F)
 
 
 def elasticity_tensor(

@@ -59,6 +59,6 @@ def square_norm(F: Tensor) -> Entry:
     return total
 
 
-def isochoric_first_invariant(F: Tensor, J: Entry) -> Entry:
+def isochoric_first_invariant(F: Tensor) -> Entry:
     """J^(-2/3) tr(F'F)."""
-    return jnp.exp(-2 / 3 * jnp.log(J)) * square_norm(F)
+    return jnp.exp(-2 / 3 * jnp.log(determinant(F))) * square_norm(F)

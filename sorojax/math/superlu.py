@@ -13,9 +13,7 @@ class SuperLUFactor:
     def __init__(self, lu: spla.SuperLU):
         self._lu = lu
         diagonal_pivots = np.array_equal(lu.perm_r, lu.perm_c)
-        self.negative_eigenvalues = (
-            int(np.sum(lu.U.diagonal() < 0)) if diagonal_pivots else -1
-        )
+        self.negative_eigenvalues = int(np.sum(lu.U.diagonal() < 0)) if diagonal_pivots else -1
 
     def solve(self, b: np.ndarray) -> np.ndarray:
         b = np.asarray(b, np.float64)

@@ -1,0 +1,34 @@
+"""Implicit shapes: signed distances in metres, negative inside."""
+
+from sorojax.sdf.base import AbstractSdf as AbstractSdf
+from sorojax.sdf.combine import (
+    Difference as Difference,
+    Intersection as Intersection,
+    SmoothUnion as SmoothUnion,
+    Union as Union,
+    intersection as intersection,
+    union as union,
+)
+from sorojax.sdf.measure import area as area, centroid as centroid
+from sorojax.sdf.query import (
+    bounding_box as bounding_box,
+    gradient as gradient,
+    normal as normal,
+    project as project,
+)
+from sorojax.sdf.shapes2d import (
+    Circle as Circle,
+    HalfPlane as HalfPlane,
+    Polygon as Polygon,
+    Rectangle as Rectangle,
+)
+from sorojax.sdf.shapes3d import Box as Box, Sphere as Sphere
+from sorojax.sdf.surface import Curve as Curve, contour as contour
+from sorojax.sdf.transform import (
+    offset as offset,
+    repeat as repeat,
+    rotate as rotate,
+    scale as scale,
+    shell as shell,
+    translate as translate,
+)

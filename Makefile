@@ -1,0 +1,70 @@
+# `make demo` and `make test` need Python 3.11 or newer and nothing else. The
+# environment in .venv is made once; it is touched again when pyproject.toml changes.
+
+PYTHON  ?= $(shell command -v python3.11 || command -v python3)
+WORKERS ?= 2
+
+VENV := .venv
+PY   := $(VENV)/bin/python
+PIP  := $(PY) -m pip install --disable-pip-version-check
+
+# The closed `mkl` wheel exists for some platforms only: without it SciPy's solver works.
+comma := ,
+define install
+	@$(PIP) -e '.[pardiso$(if $(1),$(comma)$(1))]' || { \
+	  echo "make: the extra 'pardiso' cannot be installed here, going on with SciPy's solver."; \
+	  $(PIP) -e '.$(if $(1),[$(1)])'; }
+endef
+
+.PHONY: demo test lint bench peers clean help
+
+help:
+	@echo "make demo   set up .venv, run the main job, write out/"
+	@echo "make test   set up .venv, run the tests (WORKERS=$(WORKERS) processes)"
+	@echo "make lint   ruff and pyright"
+	@echo "make bench  all benchmarks, page in benchmarks/results/"
+	@echo "make peers  the codes that the benchmarks compare with, one .peers/<name> each"
+	@echo "make clean  remove .venv, .peers, out and benchmarks/results"
+
+demo: $(VENV)/.run
+	@$(PY) -m sorojax demo
+
+test: $(VENV)/.test
+	$(PY) -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
+
+lint: $(VENV)/.dev
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m pyright --pythonpath $(PY)
+
+bench: $(VENV)/.run
+	$(PY) -m benchmarks
+
+peers: $(VENV)/.run
+	$(PY) -m benchmarks.peers install $(PEERS)
+
+$(VENV)/.made:
+	@test -n "$(PYTHON)" || { echo "make: found no python3 on the PATH, need Python 3.11 \
+	or newer. Install it, or name it: make PYTHON=/path/to/python3.11"; exit 2; }
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	echo "make: $(PYTHON) is `"$(PYTHON)" --version 2>&1`, need Python 3.11 or newer. \
+	Name one: make PYTHON=/path/to/python3.11"; exit 2; }
+	@"$(PYTHON)" -m venv --clear $(VENV) || { \
+	echo "make: $(PYTHON) cannot make a virtual environment, need its modules venv and \
+	ensurepip. On Debian and Ubuntu: apt install python3.11-venv"; exit 2; }
+	@touch $@
+
+$(VENV)/.run: pyproject.toml $(VENV)/.made
+	$(call install,)
+	@touch $@
+
+$(VENV)/.test: pyproject.toml $(VENV)/.made
+	$(call install,test)
+	@touch $(VENV)/.run $@
+
+$(VENV)/.dev: pyproject.toml $(VENV)/.made
+	$(call install,test$(comma)dev)
+	@touch $(VENV)/.run $(VENV)/.test $@
+
+clean:
+	rm -rf $(VENV) .peers out benchmarks/results

@@ -1,0 +1,1 @@
+"""Timings with errors: `python -m benchmarks --help`. See README.md here."""

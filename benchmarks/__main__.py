@@ -1,0 +1,74 @@
+"""`python -m benchmarks`: list cases, run some, write JSON lines or a page."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from benchmarks import discover, page
+from benchmarks.rows import dumps
+from benchmarks.runner import run_case
+
+
+def main(argv: list[str] | None = None) -> int:
+    arguments = _parser().parse_args(argv)
+    known = discover.cases(arguments.cases)
+    if arguments.list:
+        width = max(map(len, known), default=0)
+        for name, path in known.items():
+            print(f"{name:<{width}}  {discover.description(path)}")
+        return 0
+    unknown = [name for name in arguments.names if name not in known]
+    if unknown:
+        print(
+            f"benchmarks: no case {', '.join(unknown)}, need one of {', '.join(known)}. "
+            "See --list.",
+            file=sys.stderr,
+        )
+        return 2
+    chosen = {name: known[name] for name in arguments.names or known}
+    lines = _to_json(chosen, arguments.json) if arguments.json else _to_page(chosen)
+    failed = [x for x in lines if x["code"] == "sorojax" and "reason" in x["settings"]]
+    return 1 if failed else 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="CASE", help="default: all")
+    parser.add_argument("--list", action="store_true", help="name the cases and stop")
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="write JSON lines there, and nothing else"
+    )
+    parser.add_argument(
+        "--cases", type=Path, default=discover.CASES, help="another folder of cases"
+    )
+    return parser
+
+
+def _to_json(chosen: dict[str, Path], file: Path) -> list[dict[str, Any]]:
+    lines = []
+    with file.open("w") as out:
+        for name, path in chosen.items():
+            for line in run_case(name, path):
+                print(dumps(line), file=out, flush=True)
+                lines.append(line)
+    return lines
+
+
+def _to_page(chosen: dict[str, Path]) -> list[dict[str, Any]]:
+    lines = []
+    print(page.HEADER)
+    for name, path in chosen.items():
+        for line in run_case(name, path):
+            print(page.text(line), flush=True)
+            lines.append(line)
+    folder = discover.HERE / "results"
+    folder.mkdir(exist_ok=True)
+    target = folder / "index.html"
+    target.write_text(page.html(lines))
+    print(f"\n{target}")
+    return lines
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""One file per case; `rod_acceleration.py` is the case `rod.acceleration`."""

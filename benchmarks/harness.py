@@ -1,0 +1,45 @@
+"""Measuring, inside the process of one case."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from benchmarks.rows import Row as Row, Timing as Timing, missing as missing
+
+
+def measure(function: Callable[..., Any], *args: Any, repeats: int = 9) -> Timing:
+    """Compile a JAX function for the shapes of `args`, then time it.
+
+    The arguments are inputs of the program: XLA cannot fold them.
+    """
+    import jax
+
+    start = time.perf_counter()
+    compiled = jax.jit(function).lower(*args).compile()
+    compile_s = time.perf_counter() - start
+    jax.block_until_ready(compiled(*args))
+    return Timing(compile_s, _runs(lambda: jax.block_until_ready(compiled(*args)), repeats))
+
+
+def measure_calls(function: Callable[[], Any], repeats: int = 5) -> Timing:
+    """Time a function that compiles what it needs at its first call.
+
+    `compile_s` is what the first call takes beyond the median of the later ones.
+    """
+    import jax
+
+    def call():
+        jax.block_until_ready(function())
+
+    (first,) = _runs(call, 1)
+    runs = _runs(call, repeats)
+    return Timing(max(0.0, first - sorted(runs)[len(runs) // 2]), runs)
+
+
+def _runs(call: Callable[[], Any], repeats: int) -> tuple[float, ...]:
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - start)
+    return tuple(seconds)

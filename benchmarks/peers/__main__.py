@@ -1,0 +1,79 @@
+"""`python -m benchmarks.peers install [NAME...]`: one environment per peer."""
+
+import argparse
+import json
+import subprocess
+import sys
+import venv
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.peers.call import home, interpreter, status
+
+
+@dataclass(frozen=True)
+class Peer:
+    """What to install, and which module must import afterwards."""
+
+    requirements: tuple[str, ...]
+    module: str
+    licence: str
+
+
+PEERS = {
+    "soromox": Peer(("soromox>=0.5,<0.6",), "soromox", "MIT"),
+    "felupe": Peer(
+        (
+            "felupe>=11,<12",
+            "pypardiso>=0.4; platform_machine == 'x86_64' and sys_platform != 'darwin'",
+        ),
+        "felupe",
+        "GPL-3.0: only in its own process",
+    ),
+}
+
+
+def install(name: str) -> dict:
+    """Make the environment of one peer; the outcome is kept in its `status.json`."""
+    peer, folder = PEERS[name], home() / name
+    outcome = {"ok": False, "licence": peer.licence}
+    try:
+        venv.create(folder, clear=True, with_pip=True)
+        _run(interpreter(name), "-m", "pip", "install", "-q", *peer.requirements)
+        found = f"from importlib.metadata import version as v; print(v({name!r}))"
+        _run(interpreter(name), "-I", "-c", f"import {peer.module}")
+        outcome |= {"ok": True, "version": _run(interpreter(name), "-I", "-c", found).strip()}
+    except (OSError, subprocess.CalledProcessError) as error:
+        outcome["reason"] = _reason(error)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "status.json").write_text(json.dumps(outcome, indent=1) + "\n")
+    return outcome
+
+
+def _run(*command: str | Path) -> str:
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return done.stdout
+
+
+def _reason(error: Exception) -> str:
+    lines = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
+    errors = [text for text in lines if "error" in text.lower()]
+    return (errors or lines)[-1][:300]
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.peers", description=__doc__)
+    parser.add_argument("command", choices=["install", "status"])
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(PEERS)}")
+    arguments = parser.parse_args(argv)
+    if unknown := [name for name in arguments.names if name not in PEERS]:
+        parser.error(f"no peer {', '.join(unknown)}, need some of {', '.join(PEERS)}")
+    for name in arguments.names or PEERS:
+        outcome = install(name) if arguments.command == "install" else status(name)
+        tail = outcome["version"] if outcome["ok"] else f"not available: {outcome['reason']}"
+        print(f"{name:<10} {tail}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

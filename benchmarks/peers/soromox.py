@@ -1,0 +1,95 @@
+"""The D1 finger in soromox. Run by its own interpreter: `python -I soromox.py FOLDER`.
+
+Answers coordinates in the order of the request: the modes of kappa_y, then of kappa_z.
+"""
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+from soromox.systems import SystemState  # noqa: E402
+from soromox.systems.components import JointSpec, LinkSpec  # noqa: E402
+from soromox.systems.gvs import GVS, GVSSegment, StrainBasisSpec  # noqa: E402
+
+
+def finger(num_nodes, num_modes):
+    link = LinkSpec.circular(
+        length=0.08, radius=0.006, young_modulus=1e6, poisson_ratio=0.3, density=2000.0,
+        reference_strain=[0.0, 0.0, 0.0, 1.0, 0.0, 0.0],
+    )  # fmt: skip
+    segment = GVSSegment(
+        link=link,
+        joint=JointSpec(type="fixed"),
+        basis=StrainBasisSpec("chebyshev", ("kappa_y", "kappa_z"), num_modes - 1),
+        num_gauss_points=num_nodes,
+    )
+    # Its base pose is a scalar-last quaternion and a position.
+    base = jnp.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    return GVS.from_segments([segment], gravity=jnp.array([0, 0, -9.81]), base_pose=base)
+
+
+def measure(function, *args, repeats):
+    start = time.perf_counter()
+    compiled = jax.jit(function).lower(*args).compile()
+    compile_s = time.perf_counter() - start
+    result = jax.block_until_ready(compiled(*args))
+    runs = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        jax.block_until_ready(compiled(*args))
+        runs.append(time.perf_counter() - start)
+    return result, {"compile_s": compile_s, "runs": runs}
+
+
+def acceleration(request, arrays):
+    """Accelerations at (q, v), and the time of one in a compiled loop."""
+    robot = finger(request["nodes"], request["modes"])
+    states = jnp.concatenate([arrays["q"], arrays["v"]], axis=-1)
+    half = arrays["q"].shape[-1]
+
+    def loop(y):
+        def body(_, y):
+            return y + 1e-9 * robot.forward_dynamics(0.0, y)
+
+        return jax.lax.fori_loop(0, request["calls"], body, y)
+
+    _, timing = measure(loop, states[0], repeats=request["repeats"])
+    timing["runs"] = [run / request["calls"] for run in timing["runs"]]
+    rates = jax.jit(lambda y: robot.forward_dynamics(0.0, y))
+    return timing, {"a": np.stack([rates(y)[half:] for y in states])}
+
+
+def simulation(request, arrays):
+    """Tips of the released finger every `save_dt`, without the first."""
+    robot = finger(request["nodes"], request["modes"])
+    rest = jnp.zeros(2 * robot.num_internal_dofs)
+
+    def tips(y):
+        states = robot.rollout_to(
+            SystemState(t=0.0, y=y), t1=request["duration"], solver_dt=request["dt"],
+            save_dt=request["save_dt"], max_steps=None,
+        )  # fmt: skip
+        half = y.size // 2
+        pose = jax.vmap(lambda y: robot.forward_kinematics(y[:half], robot.length))
+        return pose(states.y)[:, :3, 3]
+
+    result, timing = measure(tips, rest, repeats=request["repeats"])
+    return timing, {
+        "tips": np.asarray(result)[-round(request["duration"] / request["save_dt"]) :]
+    }
+
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[1])
+    request = json.loads((folder / "request.json").read_text())
+    arrays = dict(np.load(folder / "request.npz"))
+    answer, results = globals()[request["task"]](request, arrays)
+    (folder / "answer.json").write_text(json.dumps(answer))
+    np.savez(folder / "answer.npz", **results)

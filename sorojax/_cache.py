@@ -1,0 +1,78 @@
+"""The persistent compilation cache: on in the command line, examples, tests and
+benchmarks; never switched on by an import.
+
+Whoever can write to the cache can run code in the process that reads it, so the
+directory belongs to one user and to nobody else.
+"""
+
+import os
+import stat
+import warnings
+from pathlib import Path
+
+
+def cache_directory() -> Path:
+    """Where compiled programs are kept: `$SOROJAX_CACHE/jax`, by default
+    `$XDG_CACHE_HOME/sorojax/jax` or `~/.cache/sorojax/jax`."""
+    return _root() / "jax"
+
+
+def enable_compilation_cache() -> Path | None:
+    """Switch on JAX's persistent compilation cache in `cache_directory()`.
+
+    Returns:
+        The directory, or `None` with a warning if it cannot be made.
+
+    Raises:
+        ValueError: If the directory belongs to, or can be written by, someone else.
+    """
+    import jax
+
+    try:
+        directory = _private_directory()
+    except OSError as error:
+        warnings.warn(
+            f"sorojax: no compilation cache, cannot make {cache_directory()} "
+            f"({error.strerror}): every run compiles again. Set SOROJAX_CACHE to a "
+            "directory that you can write.",
+            stacklevel=2,
+        )
+        return None
+    jax.config.update("jax_compilation_cache_dir", str(directory))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+    return directory
+
+
+def _root() -> Path:
+    if own := os.environ.get("SOROJAX_CACHE"):
+        return Path(own).expanduser().absolute()
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base).expanduser().absolute() / "sorojax"
+
+
+def _private_directory() -> Path:
+    root, directory = _root(), cache_directory()
+    root.parent.mkdir(parents=True, exist_ok=True)
+    for path in (root, directory):
+        path.mkdir(mode=0o700, exist_ok=True)
+        _refuse_shared(path)
+        path.chmod(0o700)
+    return directory
+
+
+def _refuse_shared(path: Path) -> None:
+    if not hasattr(os, "getuid"):  # Windows: user profiles are private
+        return
+    status = path.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid():
+        raise ValueError(
+            f"compilation cache: {path} is a link or belongs to someone else, need a "
+            "directory of your own. Set SOROJAX_CACHE to one."
+        )
+    if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise ValueError(
+            f"compilation cache: {path} has mode {status.st_mode & 0o777:04o}, others can "
+            "put programs there that you would run, need 0700. Look at who wrote there, "
+            f"then: rm -r {path}"
+        )

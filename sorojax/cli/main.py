@@ -1,0 +1,87 @@
+"""The command `sorojax`: run the main job, tell about the installation."""
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status.
+
+    A wrong input ends with one line and status 2; `SOROJAX_DEBUG=1` shows where it
+    was raised.
+    """
+    arguments = _parser().parse_args(argv)
+    if os.environ.get("SOROJAX_DEBUG"):
+        return arguments.run(arguments)
+    try:
+        return arguments.run(arguments)
+    except (ValueError, OSError) as error:
+        print(f"sorojax: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("sorojax: interrupted", file=sys.stderr)
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="sorojax", description="Differentiable soft robots in JAX."
+    )
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+
+    demo = commands.add_parser("demo", help="from a drawing to a moving robot")
+    demo.add_argument(
+        "--out", type=Path, default=Path("out"), help="where results go (default: out)"
+    )
+    demo.add_argument("--quick", action="store_true", help="coarse mesh, short run")
+    demo.set_defaults(run=_demo)
+
+    info = commands.add_parser("info", help="versions, devices, solvers, cache")
+    info.set_defaults(run=_info)
+    return parser
+
+
+class _Version(argparse.Action):
+    def __call__(self, parser, namespace, values, option_string=None):
+        from sorojax import __version__
+
+        print(f"sorojax {__version__}")
+        parser.exit()
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    _start_jax()
+    from sorojax.cli import demo
+
+    return demo.run(arguments.out, arguments.quick)
+
+
+def _info(arguments: argparse.Namespace) -> int:
+    _start_jax()
+    from sorojax.cli.info import info
+
+    for name, value in info().items():
+        print(f"{name:<18} {value}")
+    return 0
+
+
+def _start_jax() -> None:
+    """Float64 and the compilation cache, as every command needs them."""
+    if hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) == 1:
+        # With one worker thread a host callback can wait for itself.
+        os.environ.setdefault("NPROC", "2")
+        os.environ.setdefault("PJRT_NPROC", "2")
+    import jax
+
+    from sorojax._cache import enable_compilation_cache
+
+    jax.config.update("jax_enable_x64", True)
+    enable_compilation_cache()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

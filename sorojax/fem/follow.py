@@ -1,0 +1,121 @@
+"""Following an equilibrium from one load to another, on the host, in adaptive steps."""
+
+import enum
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sorojax.fem.linear import Linearised, prepare
+from sorojax.fem.newton import Newton, newton_solve
+from sorojax.fem.problem import Problem
+from sorojax.fem.supports import known_values
+
+
+class Status(enum.IntEnum):
+    """How a solve ended."""
+
+    ok = 0
+    not_converged = 1
+
+
+class LoadStep(NamedTuple):
+    """One accepted load step: fraction of the load, Newton iterations, residual over load,
+    and negative eigenvalues of the tangent (0 where the state is stable)."""
+
+    fraction: float
+    iterations: int
+    residual: float
+    negative_eigenvalues: int
+
+
+class Stats(NamedTuple):
+    """Accepted steps, the number of cut steps and why the last one failed, if it did."""
+
+    steps: tuple[LoadStep, ...]
+    cuts: int
+    reason: str = ""
+
+    @property
+    def iterations(self) -> int:
+        return sum(step.iterations for step in self.steps)
+
+
+class Start(NamedTuple):
+    """A known equilibrium to start from, with the tangent there."""
+
+    u: np.ndarray
+    problem: Problem
+    tangent: Linearised | None
+
+
+class Log:
+    """Settings and record of one solve on the host."""
+
+    def __init__(self, newton: Newton, steps: int, max_cuts: int):
+        self.newton, self.num_steps, self.max_cuts = newton, steps, max_cuts
+        self.clear()
+
+    def clear(self) -> None:
+        self.steps: list[LoadStep] = []
+        self.cuts, self.status, self.reason = 0, Status.ok, ""
+        self.end: Start
+
+    def stats(self) -> Stats:
+        return Stats(tuple(self.steps), self.cuts, self.reason)
+
+
+def begin_at(problem: Problem, begin: Start | np.ndarray | None) -> Start:
+    """Where to start from: the unloaded body, unless told otherwise."""
+    if isinstance(begin, Start):
+        return begin
+    if begin is None:
+        return Start(np.zeros(problem.mesh.points.shape), _unloaded(problem), None)
+    return Start(begin, problem, None)
+
+
+def follow(problem: Problem, begin: Start, log: Log) -> np.ndarray:
+    """Step from `begin` to `problem`, halving steps that fail."""
+    prepared = prepare(problem)
+    u, tangent, done, size, failures = begin.u, begin.tangent, 0.0, 1.0 / log.num_steps, 0
+    while done < 1.0:
+        goal = min(1.0, done + size) if done + size < 1.0 - 1e-9 else 1.0
+        here = problem if goal == 1.0 else _between(begin.problem, problem, goal)
+        known = np.asarray(known_values(here.supports, *u.shape))
+        result = newton_solve(here, prepared, u, known, log.newton, tangent)
+        if result.reason:
+            failures += 1
+            log.cuts += 1
+            if failures > log.max_cuts:
+                log.status, log.reason = Status.not_converged, result.reason
+                return u
+            size, tangent = (goal - done) / 2, None
+            continue
+        u, tangent, done, failures = result.u, result.linearised, goal, 0
+        log.steps.append(
+            LoadStep(goal, result.iterations, result.residual, result.negative_eigenvalues)
+        )
+        log.end = Start(u, problem, tangent)
+        if result.iterations <= 5:
+            size *= 1.5
+    return u
+
+
+def _unloaded(problem: Problem) -> Problem:
+    return _with_terms(problem, lambda _, b: jnp.zeros_like(b), problem)
+
+
+def _between(first: Problem, last: Problem, fraction: float) -> Problem:
+    """Loads and supports between two problems on the same body."""
+    return _with_terms(first, lambda a, b: a + fraction * (b - a), last)
+
+
+def _with_terms(first: Problem, mix, last: Problem) -> Problem:
+    terms = jax.tree.map(
+        lambda a, b: mix(a, b) if eqx.is_inexact_array(b) else b,
+        (first.loads, first.supports),
+        (last.loads, last.supports),
+    )
+    return eqx.tree_at(lambda p: (p.loads, p.supports), last, terms)

@@ -1,0 +1,42 @@
+"""Small dense symmetric solves."""
+
+import jax.numpy as jnp
+import jax.scipy
+from jaxtyping import Array, Float
+
+UNROLL_BELOW = 13  # written out, LDL' beats a LAPACK call up to 12 unknowns
+
+
+def solve_symmetric(
+    matrix: Float[Array, "dof dof"], right: Float[Array, " dof"]
+) -> Float[Array, " dof"]:
+    """x with `matrix` x = `right`, `matrix` symmetric positive definite."""
+    if right.shape[0] < UNROLL_BELOW:
+        return _solve_ldl(matrix, right)
+    factor = jax.scipy.linalg.cho_factor(matrix)
+    return jax.scipy.linalg.cho_solve(factor, right)
+
+
+def _solve_ldl(matrix: Array, right: Array) -> Array:
+    n = right.shape[0]
+    lower = [[right[0]] * n for _ in range(n)]
+    pivot, inverse = [right[0]] * n, [right[0]] * n
+    for j in range(n):
+        scaled = [lower[j][k] * pivot[k] for k in range(j)]
+        pivot[j] = matrix[j, j] - _dot(lower[j], scaled)
+        inverse[j] = 1 / pivot[j]
+        for i in range(j + 1, n):
+            lower[i][j] = (matrix[i, j] - _dot(lower[i], scaled)) * inverse[j]
+    x = [right[i] for i in range(n)]
+    for i in range(n):
+        x[i] = x[i] - _dot(lower[i], x[:i])
+    x = [value * scale for value, scale in zip(x, inverse, strict=True)]
+    for i in reversed(range(n)):
+        below = [lower[k][i] for k in range(i + 1, n)]
+        x[i] = x[i] - _dot(below, x[i + 1 :])
+    return jnp.stack(x)
+
+
+def _dot(a: list[Array], b: list[Array]) -> Array | float:
+    """Sum of products over the shorter list; 0.0 when empty."""
+    return sum((x * y for x, y in zip(a, b, strict=False)), start=0.0)

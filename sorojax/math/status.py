@@ -1,0 +1,21 @@
+"""How a call ended, as a value that passes through every transformation."""
+
+import equinox as eqx
+
+
+class Status(eqx.Enumeration):
+    """Outcome of a solver; the message says what to do."""
+
+    successful = ""
+    max_steps = (
+        "The step limit was reached. Raise `max_steps`, loosen `rtol`, or look for a "
+        "regulator or a damping that is much faster than the motion of interest."
+    )
+    not_finite = (
+        "A value is not finite. Take shorter steps or a stronger damping, and check that "
+        "gains, limits and units are what you meant."
+    )
+    not_converged = (
+        "No equilibrium was found. Apply the load in steps, starting each from the last "
+        "answer, or raise `max_iterations`."
+    )

@@ -1,0 +1,187 @@
+"""Interior points of a plane mesh: hexagonal seeds smoothed over Delaunay triangles."""
+
+import numpy as np
+from scipy.spatial import Delaunay, cKDTree
+
+from sorojax.mesh.outline import _GRADING, Outline
+from sorojax.sdf.base import AbstractSdf
+from sorojax.sdf.sample import values
+
+_CLEAR = 0.45  # of the local size: least distance of an interior point to the outline
+
+
+class SizeField:
+    """Wanted edge length [m]: that of the outline near it, `size` far from it."""
+
+    def __init__(self, lines: Outline, size: float):
+        total = np.zeros(len(lines.points))
+        count = np.zeros(len(lines.points))
+        for end in (0, 1):
+            np.add.at(total, lines.edges[:, end], lines.lengths)
+            np.add.at(count, lines.edges[:, end], 1)
+        self.local = np.minimum(total / count, size)
+        self.size = size
+        self.tree = cKDTree(lines.points)
+
+    def __call__(self, p: np.ndarray) -> np.ndarray:
+        distance, near = self.tree.query(p, k=min(6, self.tree.n))
+        distance, near = np.atleast_2d(distance), np.atleast_2d(near)
+        grown = self.local[near] + _GRADING * np.maximum(distance - self.local[near], 0)
+        return np.minimum(grown.min(axis=1), self.size)
+
+
+class Guard:
+    """Keeps interior points out of the circles over the edges of the outline."""
+
+    def __init__(self, lines: Outline):
+        self.middle = lines.points[lines.edges].mean(axis=1)
+        self.radius = 0.55 * lines.lengths
+        self.tree = cKDTree(self.middle)
+
+    def push(self, p: np.ndarray) -> np.ndarray:
+        """`p` moved to the nearest circle where it lies inside one."""
+        k = min(4, self.tree.n)
+        distance, near = self.tree.query(p, k=k)
+        distance, near = distance.reshape(len(p), k), near.reshape(len(p), k)
+        depth = self.radius[near] - distance
+        worst = depth.argmax(axis=1)
+        rows = np.arange(len(p))
+        depth, near = depth[rows, worst], near[rows, worst]
+        away = p - self.middle[near]
+        away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-300)
+        return p + np.maximum(depth, 0)[:, None] * away
+
+
+def triangles(shape: AbstractSdf, points: np.ndarray, size: float) -> np.ndarray:
+    """Delaunay triangles of `points` whose centre lies inside `shape`."""
+    cells = Delaunay(points).simplices
+    corners = points[cells]
+    doubled = _doubled_area(corners)
+    # Points in line give triangles without area along straight sides.
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    solid = np.abs(doubled) > 1e-6 * longest**2
+    cells, doubled = cells[solid], doubled[solid]
+    inside = values(shape, points[cells].mean(axis=1)) < -1e-9 * size
+    cells, doubled = cells[inside], doubled[inside]
+    return np.where((doubled > 0)[:, None], cells, cells[:, ::-1])
+
+
+def _doubled_area(corners: np.ndarray) -> np.ndarray:
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def fill(
+    shape: AbstractSdf, lines: Outline, size: float, iterations: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (those of `lines` first) and triangles of the inside of `shape`."""
+    wanted, guard = SizeField(lines, size), Guard(lines)
+    fixed = len(lines.points)
+    points = np.concatenate([lines.points, _seeds(shape, lines, wanted, guard)])
+    for i in range(iterations):
+        cells = triangles(shape, points, size)
+        if i in (3, 6) and i + 2 < iterations:
+            points = _adapt(points, cells, fixed, wanted)
+            cells = triangles(shape, points, size)
+        points = _smooth(shape, points, cells, fixed, wanted, guard)
+    cells = triangles(shape, points, size)
+    used, numbers = np.unique(cells, return_inverse=True)
+    if not np.array_equal(used[:fixed], np.arange(fixed)):
+        raise _lost(lines.points[np.setdiff1d(np.arange(fixed), used)[0]])
+    return points[used], numbers.reshape(cells.shape)
+
+
+def _lost(where: np.ndarray) -> ValueError:
+    return ValueError(
+        f"triangulate: the boundary is not resolved near {where} m. Lower `size`, or "
+        "remove features much thinner than it."
+    )
+
+
+def check_edges(lines: Outline, points: np.ndarray, cells: np.ndarray) -> None:
+    """Raise unless every edge of the outline is a side: once on the boundary, else twice."""
+    sides = np.sort(np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]]), 1)
+    keys, count = np.unique(sides @ [len(points), 1], return_counts=True)
+    want = np.sort(lines.edges, axis=1) @ [len(points), 1]
+    slot = np.minimum(np.searchsorted(keys, want), len(keys) - 1)
+    good = (keys[slot] == want) & (count[slot] == np.where(lines.owner == 0, 1, 2))
+    if not good.all():
+        raise _lost(lines.points[lines.edges[~good][0]].mean(axis=0))
+    if (count == 1).sum() != (lines.owner == 0).sum():
+        raise _lost(points[np.unique(sides[np.isin(sides @ [len(points), 1], keys[count == 1])])][0])
+
+
+def _seeds(shape, lines: Outline, wanted: SizeField, guard: Guard) -> np.ndarray:
+    """Hexagonal lattices, each where its spacing fits the wanted size, finest first."""
+    lower, upper = lines.points.min(axis=0), lines.points.max(axis=0)
+    ratio = wanted.size / wanted.local.min()
+    levels = max(0, int(np.ceil(np.log(ratio) / np.log(1.5) - 0.3)))
+    kept = np.zeros((0, 2))
+    for level in range(levels, -1, -1):
+        spacing = wanted.size / 1.5**level
+        p = _hexagons(lower, upper, spacing)
+        p = p[values(shape, p) < -_CLEAR * spacing]
+        h = wanted(p) if len(p) else np.zeros(0)
+        fits = h > spacing * (0.82 if level < levels else 0.0)
+        if level:
+            fits &= h <= spacing * 1.23
+        p, h = p[fits], h[fits]
+        others = cKDTree(np.concatenate([lines.points, kept]))
+        p = p[others.query(p)[0] > 0.62 * h] if len(p) else p
+        kept = np.concatenate([kept, p])
+    moved = guard.push(kept) if len(kept) else kept
+    return kept[np.linalg.norm(moved - kept, axis=1) < 1e-12 * wanted.size]
+
+
+def _hexagons(lower: np.ndarray, upper: np.ndarray, spacing: float) -> np.ndarray:
+    count = np.ceil((upper - lower) / spacing / [1, np.sqrt(0.75)]).astype(int) + 1
+    i, j = np.meshgrid(np.arange(count[0]), np.arange(count[1]), indexing="ij")
+    grid = np.stack([i + 0.5 * (j % 2), j * np.sqrt(0.75)], axis=-1).reshape(-1, 2)
+    # Centred, so that a symmetric shape gets nearly symmetric seeds.
+    return (lower + upper) / 2 + spacing * (grid - (grid.min(0) + grid.max(0)) / 2)
+
+
+def _sides(cells: np.ndarray) -> np.ndarray:
+    pairs = np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]])
+    return np.unique(np.sort(pairs, axis=1), axis=0)
+
+
+def _adapt(points, cells, fixed: int, wanted: SizeField) -> np.ndarray:
+    """Drop one end of interior sides far too short, add middles of sides far too long."""
+    sides = _sides(cells)
+    ends = points[sides]
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    ratio = length / wanted(ends.mean(axis=1))
+    short = np.unique(sides[(ratio < 0.6) & (sides[:, 1] >= fixed), 1])
+    long = (ratio > 1.55) & (sides[:, 1] >= fixed)
+    keep = np.setdiff1d(np.arange(len(points)), short)
+    return np.concatenate([points[keep], ends[long].mean(axis=1)])
+
+
+def _smooth(shape, points, cells, fixed: int, wanted: SizeField, guard: Guard):
+    """One step towards an optimal Delaunay triangulation graded by the wanted size."""
+    corners = points[cells]
+    center, area = _circumcenters(corners), _doubled_area(corners) / 2
+    middle = corners.mean(axis=1)
+    h = wanted(middle)
+    far = np.linalg.norm(center - middle, axis=1) > 0.6 * h
+    center = np.where(far[:, None], middle, center)
+    weight = area / h**3
+    total = np.bincount(cells.ravel(), np.repeat(weight, 3), len(points))
+    new = np.stack(
+        [np.bincount(cells.ravel(), np.repeat(weight * center[:, k], 3), len(points)) for k in (0, 1)],
+        axis=-1,
+    ) / np.maximum(total, 1e-300)[:, None]
+    new = guard.push(new)
+    keep = (total == 0) | (values(shape, new) > -0.2 * wanted(new))
+    keep[:fixed] = True
+    return np.where(keep[:, None], points, new)
+
+
+def _circumcenters(corners: np.ndarray) -> np.ndarray:
+    a = corners[:, 0]
+    b, c = corners[:, 1] - a, corners[:, 2] - a
+    doubled = 2 * (b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
+    bb, cc = (b * b).sum(axis=1), (c * c).sum(axis=1)
+    x = (c[:, 1] * bb - b[:, 1] * cc) / doubled
+    return a + np.stack([x, (b[:, 0] * cc - c[:, 0] * bb) / doubled], axis=-1)

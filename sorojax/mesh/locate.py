@@ -1,0 +1,64 @@
+"""Where points lie in a mesh, and what nodal fields are there."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sorojax._types import is_traced
+from sorojax.mesh.mesh import Mesh
+from sorojax.mesh.shape import shape_functions, shape_gradients
+
+
+class Locations(NamedTuple):
+    """Nodes of the cells that hold the points, and the weights of these nodes."""
+
+    nodes: Int[Array, "points cell_nodes"]
+    weights: Float[Array, "points cell_nodes"]
+
+    def __call__(self, nodal: Float[Array, "nodes dim"]) -> Float[Array, "points dim"]:
+        """Values of a nodal field at the points; differentiable in the field."""
+        return jnp.einsum("pa,pai->pi", self.weights, nodal[self.nodes])
+
+
+def locate(mesh: Mesh, points: Float[np.ndarray, "points dim"]) -> Locations:
+    """The cells that hold `points` [m] of the reference configuration (on the host).
+
+    Raises:
+        ValueError: If a point lies outside the mesh, or the mesh is traced.
+    """
+    from scipy.spatial import cKDTree
+
+    if is_traced(mesh):
+        raise ValueError("locate: the mesh is traced, need concrete points. Call it outside.")
+    points = np.atleast_2d(np.asarray(points, float))
+    X, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
+    centres = X[cells[:, : mesh.element.num_corners]].mean(axis=1)
+    near = cKDTree(centres).query(points, k=min(24, len(cells)))[1].reshape(len(points), -1)
+    xi = _reference_coordinates(mesh, X[cells[near]], points)
+    inside = np.minimum(xi.min(axis=-1), 1 - xi.sum(axis=-1))
+    best = np.argmax(inside, axis=1)
+    rows = np.arange(len(points))
+    if (outside := np.flatnonzero(inside[rows, best] < -1e-6)).size:
+        raise ValueError(
+            f"locate: {outside.size} of {len(points)} points lie outside the mesh, the first "
+            f"at {points[outside[0]]} m. Move the curve into the body."
+        )
+    weights = shape_functions(mesh.element, xi[rows, best])
+    return Locations(jnp.asarray(cells[near[rows, best]]), jnp.asarray(weights))
+
+
+def _reference_coordinates(mesh: Mesh, corners, points, iterations: int = 4):
+    """Newton's method for X(xi) = point in every candidate cell."""
+    xi = np.full((*corners.shape[:2], 2), 1 / 3)
+    for _ in range(iterations):
+        flat = xi.reshape(-1, 2)
+        N = shape_functions(mesh.element, flat).reshape(*xi.shape[:2], -1)
+        dN = shape_gradients(mesh.element, flat).reshape(*xi.shape[:2], -1, 2)
+        gap = points[:, None] - np.einsum("pca,pcai->pci", N, corners)
+        jac = np.einsum("pcad,pcai->pcid", dN, corners)
+        xi = np.clip(xi + np.linalg.solve(jac, gap[..., None])[..., 0], -2, 3)
+    return xi
+
+

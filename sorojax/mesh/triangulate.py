@@ -1,0 +1,84 @@
+"""From a plane shape to triangles: exact boundary, hexagonal inside, curved sides."""
+
+import numpy as np
+
+from sorojax import _check
+from sorojax._types import real
+from sorojax.mesh.delaunay import check_edges, fill
+from sorojax.mesh.elements import Tri3, Tri6
+from sorojax.mesh.mesh import Mesh
+from sorojax.mesh.outline import Outline, outline
+from sorojax.mesh.tri6 import least_jacobian, with_middles
+from sorojax.sdf.base import AbstractSdf
+from sorojax.sdf.sample import finite_box, land
+
+
+def triangulate(
+    shape: AbstractSdf,
+    *,
+    size: float,
+    order: int = 1,
+    interfaces: tuple[AbstractSdf, ...] = (),
+    iterations: int = 12,
+) -> Mesh:
+    """Triangles that fill a plane shape.
+
+    Boundary points lie on the zero set to rounding, corners included; edges turn at
+    most about 45 degrees on fillets and are split where walls are thinner than they
+    are long. With `order=2` the sides on the boundary and on interfaces are curved.
+
+    Node sets of the result: "corners" (also where curves cross) and "interface_0",
+    ...; facet sets: "boundary" and "interface_0", ....
+
+    Args:
+        shape: A concrete, bounded plane shape.
+        size: Wanted length of the sides [m].
+        order: 1 for `Tri3`, 2 for `Tri6`.
+        interfaces: Shapes whose zero sets become sides of the mesh inside `shape`.
+        iterations: Smoothing steps; more give slightly rounder triangles.
+
+    Raises:
+        ValueError: If the shape is empty, unbounded, traced, or not resolved by `size`.
+    """
+    if order not in (1, 2):
+        raise ValueError(
+            f"triangulate: `order` is {order}, need 1 (Tri3) or 2 (Tri6). Other degrees "
+            "do not exist."
+        )
+    _check.positive("triangulate", "size", size, "m", "Give the wanted length of a side.")
+    _check.float64("triangulate", real(0.0))
+    finite_box("triangulate", shape, 2)
+    interfaces = tuple(interfaces)
+    lines = outline(shape, interfaces, float(size))
+    points, cells = fill(shape, lines, float(size), iterations)
+    check_edges(lines, points, cells)
+    if order == 1:
+        return Mesh(points, cells, Tri3(), *_sets(lines, lines.edges, len(interfaces)))
+    return _curved((shape, *interfaces), lines, points, cells)
+
+
+def _curved(fields, lines: Outline, points, cells) -> Mesh:
+    """The quadratic mesh, middles of outline edges moved onto their zero sets."""
+    points, cells, middles = with_middles(points, cells, lines.edges)
+    for i, field in enumerate(fields):
+        mine = middles[lines.owner == i]
+        points[mine] = land(field, points[mine])
+    worst = least_jacobian(points, cells)
+    if worst.min() <= 0:
+        where = points[cells[worst.argmin()]].mean(axis=0)
+        raise ValueError(
+            f"triangulate: a curved side turns its triangle inside out near {where} m. "
+            "Lower `size` so that the bend is resolved."
+        )
+    facets = np.concatenate([lines.edges, middles[:, None]], axis=1)
+    return Mesh(points, cells, Tri6(), *_sets(lines, facets, len(fields) - 1))
+
+
+def _sets(lines: Outline, facets: np.ndarray, count: int):
+    nodes = {"corners": np.flatnonzero(lines.corner)}
+    sides = {"boundary": facets[lines.owner == 0]}
+    for i in range(count):
+        mine = facets[lines.owner == i + 1]
+        nodes[f"interface_{i}"] = np.unique(mine)
+        sides[f"interface_{i}"] = mine
+    return nodes, sides

@@ -1,0 +1,225 @@
+"""A rod's elastic law, pressure map and section, identified from a FEM load path.
+
+At every equilibrium of the path the solid answers a generalised force on the strain
+coordinates q with its condensed stiffness, one back-substitution per coordinate on the
+tangent that the solve left behind. A co-energy
+
+    Psi*(q, p) = g(p).q + p q'Cq / 2 + h(p) - q'Kq / 2
+
+is fitted to stiffness, equilibrium and enclosed volume together: K - p C is the condensed
+stiffness, dPsi*/dq = 0 the equilibrium, and dPsi*/dp the volume. One potential gives force
+and volume, so no energy is lost between gas and rod.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sorojax._types import real
+from sorojax.fem.linear import linearise, prepare
+from sorojax.fem.loads import Pressure
+from sorojax.fem.points import point_areas
+from sorojax.fem.problem import Problem
+from sorojax.fem.solve import Path
+from sorojax.fem.stress import enclosed_volume
+from sorojax.math import sparse
+from sorojax.mesh.shape import quadrature, shape_functions
+from sorojax.reduction.backbone import Backbone, Line, Probe, line_strain, probe
+from sorojax.reduction.pod import coordinates
+from sorojax.rod import (
+    AbstractDamping,
+    AbstractPressureMap,
+    LinearElastic,
+    Section,
+    StrainBasis,
+)
+
+
+class PressureMap(AbstractPressureMap):
+    """Work that gas at a gauge pressure can do on the coordinates and on the chamber walls.
+
+    `force` and `walls` are coefficients of polynomials in p / `scale`: g(p), without a
+    constant, and h(p). Good for pressures from 0 to about `scale`.
+
+    Attributes:
+        coupling: C, change of stiffness per pressure.
+        force: Coefficients of g, powers 1, 2, ...
+        walls: Coefficients of h [J], powers 1, 2, ...
+        scale: Largest pressure of the path [Pa].
+    """
+
+    coupling: Float[Array, "dof dof"] = eqx.field(converter=real)
+    force: Float[Array, "powers dof"] = eqx.field(converter=real)
+    walls: Float[Array, " powers"] = eqx.field(converter=real)
+    scale: Float[Array, ""] = eqx.field(converter=real)
+
+    def coenergy(self, q: Float[Array, " dof"], pressure: Float[Array, ""]) -> Float[Array, ""]:
+        x = pressure / self.scale
+        push = _powers(x, self.force.shape[0]) @ self.force
+        return push @ q + pressure * (q @ self.coupling @ q) / 2 + (
+            _powers(x, self.walls.shape[0]) @ self.walls
+        )  # fmt: skip
+
+
+class ConstantDamping(AbstractDamping):
+    """Linear damping by a constant matrix [N m s per coordinate rate]."""
+
+    coefficients: Float[Array, "dof dof"] = eqx.field(converter=real)
+
+    def matrix(self, stiffness):
+        return self.coefficients
+
+
+class Fit(eqx.Module):
+    """What a rod needs to stand in for the solid, and how well it was found.
+
+    Attributes:
+        section: Mean section: mass and rotary inertia about the line.
+        length: Length of the line [m].
+        elastic: Linear elastic law K.
+        pressure: Pressure map.
+        stiffness_error: Largest misfit of the condensed stiffness, relative.
+        volume_error: Largest misfit of the enclosed volume, relative to its change.
+    """
+
+    section: Section
+    length: Float[Array, ""]
+    elastic: LinearElastic
+    pressure: PressureMap
+    stiffness_error: float
+    volume_error: float
+
+    def damping(self, time) -> ConstantDamping:
+        """Kelvin-Voigt damping with a retardation `time` [s] of the identified stiffness."""
+        return ConstantDamping(real(time) * self.elastic.stiffness)
+
+
+def identify(
+    path: Path, basis: StrainBasis, backbone: Backbone, line: Line, *, degree: int = 5
+) -> Fit:
+    """Identify a rod along `line` from a path of pressures.
+
+    Args:
+        path: Equilibria for values of one `Pressure` load.
+        basis: Orthonormal modes on the samples of `backbone`, from `pod_basis`.
+        backbone: Snapshots of the same path along `line`.
+        line: The material line.
+        degree: Highest power of the pressure in the map.
+
+    Raises:
+        ValueError: If the path is not driven by a pressure, or has too few states.
+    """
+    problem, load = path.problem, _pressure(path)
+    if len(path) < degree + 2:
+        raise ValueError(
+            f"identify: the path holds {len(path)} states, need {degree + 2} for `degree` "
+            f"{degree}. Solve at more pressures or lower `degree`."
+        )
+    p = np.asarray(path.values)
+    q = np.asarray(coordinates(backbone, basis))
+    at = probe(problem.mesh, line, len(backbone.s))
+    index = list(problem.loads).index(load)
+    volumes, condensed = [], []
+    for u, value in zip(path.displacements, path.values, strict=True):
+        here = eqx.tree_at(lambda problem: problem.loads[index].value, problem, value)
+        condensed.append(_condensed_stiffness(here, u, at, basis, backbone))
+        volumes.append(float(enclosed_volume(problem, u, load.facets)))
+    K, C = _affine(p, np.stack(condensed))
+    pressure = _pressure_map(p, q, np.array(volumes), K, C, degree)
+    return Fit(
+        section=mean_section(problem, line),
+        length=backbone.length,
+        elastic=LinearElastic(K),
+        pressure=pressure,
+        stiffness_error=_relative(K - p[:, None, None] * C - np.stack(condensed), condensed),
+        volume_error=_volume_error(pressure, p, q, np.array(volumes)),
+    )
+
+
+def _pressure(path: Path) -> Pressure:
+    load = next(load for load in path.problem.loads if load.name == path.name)
+    if not isinstance(load, Pressure):
+        raise ValueError(
+            f"identify: the path is driven by the {type(load).__name__} '{path.name}', need a "
+            "Pressure. Solve the path over the pressure of a cavity."
+        )
+    return load
+
+
+def _condensed_stiffness(
+    problem: Problem, u: Array, at: Probe, basis: StrainBasis, backbone: Backbone
+) -> Float[np.ndarray, "dof dof"]:
+    """Stiffness against generalised forces on q at an equilibrium: (H K^-1 H')^-1."""
+    H = _coordinate_jacobian(at, basis, backbone, u).reshape(basis.num_dof, -1)
+    prepared = prepare(problem)
+    tangent = linearise(problem, prepared, u, u).values
+    matrix = sparse.fix(problem.space.system, tangent, prepared.known)
+    rows = np.where(np.asarray(prepared.known), 0.0, np.asarray(H))
+    answer = problem.space.system.solver.solve(np.asarray(matrix), rows)
+    compliance = rows @ answer.T
+    return np.linalg.inv((compliance + compliance.T) / 2)
+
+
+@eqx.filter_jit
+def _coordinate_jacobian(at: Probe, basis: StrainBasis, backbone: Backbone, u):
+    def q_of(u):
+        strain = line_strain(at(u), at.length)
+        snapshot = eqx.tree_at(lambda b: b.strain, backbone, strain[None])
+        return coordinates(snapshot, basis)[0]
+
+    return jax.jacrev(q_of)(u)
+
+
+def _affine(p: np.ndarray, stiffness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """K and C of the least-squares fit K - p C, symmetric."""
+    columns = np.stack([np.ones_like(p), -p], axis=1)
+    flat = stiffness.reshape(len(p), -1)
+    (K, C), *_ = np.linalg.lstsq(columns / np.abs(columns).max(0), flat, rcond=None)
+    scale = np.abs(columns).max(0)
+    shape = stiffness.shape[1:]
+    return (K / scale[0]).reshape(shape), (C / scale[1]).reshape(shape)
+
+
+def _pressure_map(p, q, volumes, K, C, degree) -> PressureMap:
+    """g from the equilibria, then h from the volumes that remain."""
+    scale = np.abs(p).max()
+    x = p / scale
+    push = q @ K - p[:, None] * (q @ C)
+    powers = np.stack([x**k for k in range(1, degree + 1)], axis=1)
+    force, *_ = np.linalg.lstsq(powers, push, rcond=None)
+    slopes = np.stack([k * x ** (k - 1) for k in range(1, degree + 1)], axis=1) / scale
+    bent = np.einsum("ki,ki->k", slopes @ force, q) + np.einsum("ki,ij,kj->k", q, C, q) / 2
+    walls, *_ = np.linalg.lstsq(slopes * scale, (volumes - bent) * scale, rcond=None)
+    return PressureMap(C, force, walls, scale)
+
+
+def _volume_error(pressure: PressureMap, p, q, volumes) -> float:
+    found = jax.vmap(jax.grad(pressure.coenergy, argnums=1))(jnp.asarray(q), jnp.asarray(p))
+    return float(np.max(np.abs(np.asarray(found) - volumes)) / np.ptp(volumes))
+
+
+def _relative(error: np.ndarray, reference) -> float:
+    return float(np.max(np.abs(error)) / np.max(np.abs(np.stack(reference))))
+
+
+def _powers(x: Float[Array, ""], count: int) -> Float[Array, " powers"]:
+    return jnp.stack([x**k for k in range(1, count + 1)])
+
+
+def mean_section(problem: Problem, line: Line) -> Section:
+    """The section of a uniform rod along `line` with the mass of the body and its rotary
+    inertia about the line. The offset of the centre of mass from the line is left out."""
+    mesh, depth = problem.mesh, problem.kinematics.depth
+    start, end = line(jnp.array([0.0, 1.0]))
+    length = jnp.sqrt(jnp.sum((end - start) ** 2))
+    along = (end - start) / length
+    N = jnp.asarray(shape_functions(mesh.element, quadrature(mesh.element).points))
+    points = jnp.einsum("qa,cai->qci", N, mesh.points[mesh.cells]) - start
+    across = along[0] * points[..., 1] - along[1] * points[..., 0]
+    areas = point_areas(mesh)
+    area = jnp.sum(areas) * depth / length
+    second = jnp.sum(areas * across**2) * depth / length
+    out_of_plane = area * depth**2 / 12
+    return Section(area, out_of_plane, second, out_of_plane + second, 5 / 6)

@@ -1,0 +1,84 @@
+"""A planar bellows actuator: a row of air chambers on a strain-limiting layer."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax._types import real
+from sorojax.sdf import AbstractSdf, HalfPlane, Rectangle, repeat
+from sorojax.units import mm
+
+
+class BellowsActuator(eqx.Module):
+    """Dimensions of the side view [m]; x runs along the actuator from its clamp.
+
+    Bellows of `bellow_width` stand `gap` apart behind a solid clamp block. Each holds one
+    chamber inside walls of `wall_thickness` and a roof; below the chambers lies a base
+    whose lowest `layer_thickness` is the strain-limiting layer. All concave and chamber
+    corners are rounded by `fillet`. The defaults are those of a bending actuator of
+    66 x 15 mm with five bellows.
+    """
+
+    wall_thickness: Float[Array, ""] = eqx.field(converter=real, default=2 * mm)
+    bellow_width: Float[Array, ""] = eqx.field(converter=real, default=10 * mm)
+    gap: Float[Array, ""] = eqx.field(converter=real, default=3 * mm)
+    clamp: Float[Array, ""] = eqx.field(converter=real, default=4 * mm)
+    base: Float[Array, ""] = eqx.field(converter=real, default=3 * mm)
+    chamber_height: Float[Array, ""] = eqx.field(converter=real, default=10 * mm)
+    roof: Float[Array, ""] = eqx.field(converter=real, default=2 * mm)
+    layer_thickness: Float[Array, ""] = eqx.field(converter=real, default=1 * mm)
+    fillet: Float[Array, ""] = eqx.field(converter=real, default=1 * mm)
+    num_bellows: int = eqx.field(static=True, default=5)
+
+    def __check_init__(self):
+        for name in ("wall_thickness", "bellow_width", "gap", "base", "roof", "fillet"):
+            _check.between(
+                "BellowsActuator", name, getattr(self, name), 0.0, 1.0, "m",
+                "Lengths are in metres: write 2 * mm.",
+            )  # fmt: skip
+        if _check.is_concrete(self.wall_thickness) and _check.is_concrete(self.bellow_width):
+            width = float(self.bellow_width - 2 * self.wall_thickness)
+            if width < 2 * float(self.fillet):
+                raise ValueError(
+                    f"BellowsActuator: walls leave a chamber {width * 1e3:.3g} mm wide, need "
+                    f"at least two fillets ({2e3 * float(self.fillet):.3g} mm). Make the "
+                    "walls thinner or the bellows wider."
+                )
+
+    @property
+    def pitch(self) -> Float[Array, ""]:
+        return self.bellow_width + self.gap
+
+    @property
+    def length(self) -> Float[Array, ""]:
+        return self.clamp + self.num_bellows * self.pitch - self.gap
+
+    @property
+    def height(self) -> Float[Array, ""]:
+        return self.base + self.chamber_height + self.roof
+
+    def chambers(self) -> AbstractSdf:
+        """The air chambers."""
+        left = self.clamp + self.wall_thickness
+        right = self.clamp + self.bellow_width - self.wall_thickness
+        first = Rectangle(
+            [left, self.base], [right, self.base + self.chamber_height], self.fillet
+        )
+        return repeat(first, [self.pitch, 0.0], count=self.num_bellows)
+
+    def notches(self) -> AbstractSdf:
+        """The gaps between the bellows, open at the top."""
+        left = self.clamp + self.bellow_width
+        first = Rectangle([left, self.base], [left + self.gap, 2 * self.height], self.fillet)
+        return repeat(first, [self.pitch, 0.0], count=self.num_bellows - 1)
+
+    def body(self) -> AbstractSdf:
+        """The rubber."""
+        zero = jnp.zeros_like(self.length)
+        block = Rectangle([zero, zero], [self.length, self.height])
+        return block - self.notches() - self.chambers()
+
+    def layer(self) -> AbstractSdf:
+        """The strain-limiting layer and everything below it."""
+        return HalfPlane([0.0, self.layer_thickness], [0.0, 1.0])

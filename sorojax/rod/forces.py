@@ -1,0 +1,183 @@
+"""Generalised forces on a rod, listed in a tuple: what is absent costs nothing.
+
+To add one, subclass the family that fits:
+
+* `AbstractForce`: any force, a function of time and the `Motion` of the rod.
+* `AbstractElastic`: an elastic law that replaces the rod's own linear one.
+* `AbstractDamping`: a constant matrix; implicit steppers use it in their iteration.
+* `AbstractPressureMap`: volume as a function of q; its pressure comes from a network,
+  or from `Pressurised(map, pressure)`.
+"""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax._types import optional_real, real
+from sorojax.rod.motion import Motion
+
+EARTH = 9.81  # m/s^2
+
+
+class AbstractForce(eqx.Module):
+    """A generalised force, on the side of the loads: M a + coriolis = sum of forces."""
+
+    @abc.abstractmethod
+    def __call__(self, t: Float[Array, ""], motion: Motion) -> Float[Array, " dof"]:
+        """Force that does work on the coordinate rates; power is force @ v [W]."""
+
+
+class AbstractElastic(AbstractForce):
+    """An elastic law in place of the linear `-K q`.
+
+    Implement `restoring_force`; `__call__` is given.
+    """
+
+    @abc.abstractmethod
+    def restoring_force(self, q: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        """Derivative of the stored energy [J] in q; `K q` for a linear law."""
+
+    def __call__(self, t, motion):
+        return -self.restoring_force(motion.q)
+
+
+class AbstractDamping(AbstractForce):
+    """Linear damping by a constant matrix."""
+
+    @abc.abstractmethod
+    def matrix(self, stiffness: Float[Array, "dof dof"]) -> Float[Array, "dof dof"]:
+        """Damping matrix, given the linear stiffness of the rod."""
+
+    def __call__(self, t, motion):
+        return -self.matrix(motion.operators.stiffness) @ motion.v
+
+
+class AbstractPressureMap(eqx.Module):
+    """A fluid chamber in the rod: its volume as a function of q, one or several ports.
+
+    The force is `pressure @ d volume / dq`, by virtual work, so that the power that the
+    fluid gives, p dV/dt, is the power that the rod receives.
+    """
+
+    @abc.abstractmethod
+    def volume(self, q: Float[Array, " dof"]) -> Float[Array, "*ports"]:
+        """Enclosed volume [m^3], scalar or one per port."""
+
+
+class LinearElastic(AbstractElastic):
+    """Elasticity K q with a matrix of its own, e.g. identified from data."""
+
+    stiffness: Float[Array, "dof dof"] = eqx.field(converter=real)
+
+    def restoring_force(self, q):
+        return self.stiffness @ q
+
+
+class Damping(AbstractDamping):
+    """Kelvin-Voigt damping D = time K of the rod's linear stiffness K.
+
+    Attributes:
+        time: Retardation time, viscosity over modulus [s].
+    """
+
+    time: Float[Array, ""] = eqx.field(converter=real)
+
+    def matrix(self, stiffness):
+        return self.time * stiffness
+
+
+class Gravity(AbstractForce):
+    """Weight of the rod.
+
+    Attributes:
+        acceleration: [m/s^2] in the base frame; by default 9.81 against the last axis.
+    """
+
+    acceleration: Float[Array, " dim"] | None = eqx.field(converter=optional_real, default=None)
+
+    def __call__(self, t, motion):
+        g = gravity_or_earth(self.acceleration, motion)
+        loads = motion.operators.mass[:, None] * g[None, :]
+        return loads.reshape(-1) @ motion.linear_jacobian.reshape(-1, motion.q.shape[0])
+
+
+class TipWrench(AbstractForce):
+    """A dead wrench on the last section: its world components never turn.
+
+    Attributes:
+        wrench: Moment [N m], then force [N]: (m_z, f_x, f_y) for a planar rod.
+    """
+
+    wrench: Float[Array, " twist"] = eqx.field(converter=real)
+
+    def __call__(self, t, motion):
+        return self.wrench @ motion.tip_jacobian
+
+
+class Pressurised(AbstractForce):
+    """A pressure map at a given gauge pressure [Pa], scalar or one per port."""
+
+    chamber: AbstractPressureMap
+    pressure: Float[Array, "*ports"] = eqx.field(converter=real)
+
+    def __call__(self, t, motion):
+        _, pull = jax.vjp(self.chamber.volume, motion.q)
+        return pull(self.pressure)[0]
+
+
+def total_force(
+    forces: tuple[AbstractForce, ...], t: Float[Array, ""], motion: Motion
+) -> Float[Array, " dof"]:
+    """Sum of the listed forces and of the rod's elasticity if none replaces it."""
+    unbound = [type(f).__name__ for f in forces if isinstance(f, AbstractPressureMap)]
+    if unbound:
+        raise ValueError(
+            f"rod: the pressure map {unbound[0]} has no pressure. Wrap it, "
+            "Pressurised(map, 10 * kPa), or list it in a RodBody and wire its pressure."
+        )
+    total = None
+    if not any(isinstance(force, AbstractElastic) for force in forces):
+        total = -motion.operators.stiffness @ motion.q
+    for force in forces:
+        term = force(t, motion)
+        total = term if total is None else total + term
+    assert total is not None
+    return total
+
+
+def tangent_stiffness(
+    forces: tuple[AbstractForce, ...], motion: Motion
+) -> Float[Array, "dof dof"]:
+    """Elastic stiffness at the coordinates of `motion`, replaced laws included."""
+    laws = [force for force in forces if isinstance(force, AbstractElastic)]
+    if not laws:
+        return motion.operators.stiffness
+    return sum_matrices(jax.jacfwd(law.restoring_force)(motion.q) for law in laws)
+
+
+def damping_matrix(
+    forces: tuple[AbstractForce, ...], stiffness: Float[Array, "dof dof"]
+) -> Float[Array, "dof dof"]:
+    """Sum of the listed dampings; zeros without one."""
+    listed = [force for force in forces if isinstance(force, AbstractDamping)]
+    if not listed:
+        return jnp.zeros_like(stiffness)
+    return sum_matrices(force.matrix(stiffness) for force in listed)
+
+
+def sum_matrices(matrices: Any) -> Array:
+    first, *rest = matrices
+    for matrix in rest:
+        first = first + matrix
+    return first
+
+
+def gravity_or_earth(acceleration: Array | None, motion: Motion) -> Float[Array, " dim"]:
+    if acceleration is not None:
+        return acceleration
+    dim = motion.tangent.shape[1]
+    return jnp.zeros(dim, motion.q.dtype).at[dim - 1].set(-EARTH)

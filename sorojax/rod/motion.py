@@ -1,0 +1,169 @@
+"""What forces and inertia see of a rod: constants of a rod, fields of a moment."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sorojax.math.quadrature import gauss_legendre, integration_matrix
+from sorojax.rod.basis import STRAINS
+from sorojax.rod.rod import Rod, strain_names
+
+_CELL_POINTS = 12
+
+
+class Operators(NamedTuple):
+    """Constant arrays of one rod, assembled once before a loop.
+
+    Attributes:
+        weights: Gauss weights [m].
+        integration: Integrals from the base to each node [m].
+        strain_rows: Strain per coordinate, one block per active strain.
+        moments: Centred curvature moments of order 0, 1, 2 of the cells between nodes,
+            one block per component of the curvature, per coordinate.
+        rest_moments: The same of the rest curvature.
+        rest_strain: Strain at q = 0, curvatures first.
+        mass: Mass lumped at each node [kg].
+        rotary: Rotary inertia lumped at each node, about x, y, z (planar: z) [kg m^2].
+        stiffness: Linear elastic stiffness.
+    """
+
+    weights: Float[Array, " quad"]
+    integration: Float[Array, "quad quad"]
+    strain_rows: Float[Array, "active quad dof"]
+    moments: Float[Array, "order rot quad dof"]
+    rest_moments: Float[Array, "order rot quad"]
+    rest_strain: Float[Array, " strain"]
+    mass: Float[Array, " quad"]
+    rotary: Float[Array, "rot quad"]
+    stiffness: Float[Array, "dof dof"]
+
+
+class Motion(eqx.Module):
+    """A rod at one moment: coordinates, and fields at the Gauss nodes, world frame.
+
+    What a force does not read is never computed. An integral along the whole rod is
+    `operators.weights @ field`: the pose and Jacobian of the tip are that of the rates.
+
+    Attributes:
+        rod: The rod.
+        operators: Its constants.
+        q, v: Coordinates and their rates.
+        directors: Columns are the local axes of the section.
+        tangent: d position / ds [-].
+        angular_rate: d angular Jacobian / ds.
+        linear_rate: d linear Jacobian / ds.
+        angular_jacobian: Angular velocity per rate (planar: about z).
+        linear_jacobian: Velocity of the section centre per rate.
+    """
+
+    rod: Rod
+    operators: Operators
+    q: Float[Array, " dof"]
+    v: Float[Array, " dof"]
+    directors: Float[Array, "quad dim dim"]
+    tangent: Float[Array, "quad dim"]
+    angular_rate: Float[Array, "quad rot dof"]
+    linear_rate: Float[Array, "quad dim dof"]
+    angular_jacobian: Float[Array, "quad rot dof"]
+    linear_jacobian: Float[Array, "quad dim dof"]
+
+    @property
+    def position(self) -> Float[Array, "quad dim"]:
+        """Centres of the sections [m], the base at the origin."""
+        return self.operators.integration @ self.tangent
+
+    @property
+    def tip_jacobian(self) -> Float[Array, "twist dof"]:
+        """Twist of the tip per rate: angular velocity first, world frame."""
+        weights = self.operators.weights
+        angular = jnp.tensordot(weights, self.angular_rate, 1)
+        return jnp.concatenate([angular, jnp.tensordot(weights, self.linear_rate, 1)])
+
+
+def operators(rod: Rod) -> Operators:
+    """The constant arrays of `rod`; differentiable in all its leaves."""
+    dtype, length = rod.length.dtype, rod.length
+    nodes, weights = (jnp.asarray(x, dtype) for x in gauss_legendre(rod.nodes))
+    rows = jnp.asarray(rod.basis(gauss_legendre(rod.nodes)[0]), dtype)
+    rotary = _rotary(rod)
+    rest = _rest_strain(rod, dtype)
+    rot = rod.group.rotation_dim
+    cells = np.diff(gauss_legendre(rod.nodes)[0], prepend=0.0)
+    plain = np.stack([cells, 0 * cells, cells / 12])  # moments of the constant 1
+    plain = jnp.asarray(plain, dtype)[:, None, :]
+    return Operators(
+        weights=length * weights,
+        integration=length * jnp.asarray(integration_matrix(rod.nodes), dtype),
+        strain_rows=rows,
+        moments=length * _moments(rod, dtype),
+        rest_moments=length * plain * rest[None, :rot, None],
+        rest_strain=rest,
+        mass=length * weights * _along(rod, rod.material.density * rod.section.area),
+        rotary=length * weights[None, :] * rotary,
+        stiffness=_stiffness(rod, rows, weights),
+    )
+
+
+def _along(rod: Rod, value: Array) -> Float[Array, " quad"]:
+    return jnp.broadcast_to(value, (rod.nodes,))
+
+
+def _rest_strain(rod: Rod, dtype) -> Float[Array, " strain"]:
+    if rod.rest_strain is not None:
+        return rod.rest_strain
+    straight = [float(name == "sigma_x") for name in strain_names(rod.group)]
+    return jnp.array(straight, dtype)
+
+
+def _rotary(rod: Rod) -> Float[Array, "rot quad"]:
+    """Rotary inertia per length [kg m]."""
+    section, density = rod.section, rod.material.density
+    about_y, about_z = section.second_moment_y, section.second_moment_z
+    spatial = rod.group.rotation_dim == 3
+    about = (about_y + about_z, about_y, about_z) if spatial else (about_z,)
+    return jnp.stack([_along(rod, density * moment) for moment in about])
+
+
+def _stiffness(rod: Rod, rows: Array, weights: Array) -> Float[Array, "dof dof"]:
+    section, young = rod.section, rod.material.young_modulus
+    shear = young / (2 * (1 + rod.material.poisson_ratio))
+    rigidity = {
+        "kappa_x": shear * section.torsion_constant,
+        "kappa_y": young * section.second_moment_y,
+        "kappa_z": young * section.second_moment_z,
+        "sigma_x": young * section.area,
+        "sigma_y": shear * section.shear_factor * section.area,
+        "sigma_z": shear * section.shear_factor * section.area,
+    }
+    scale = jnp.stack([_along(rod, rigidity[name]) for name in rod.basis.active])
+    scale = rod.length * scale * weights[None, :]
+    return jnp.einsum("aqm,aq,aqn->mn", rows, scale, rows)
+
+
+def _moments(rod: Rod, dtype) -> Float[Array, "order rot quad dof"]:
+    """Moments of the curvature modes over the cells that end at the nodes, unit length."""
+    x, w = gauss_legendre(_CELL_POINTS)
+    ends = gauss_legendre(rod.nodes)[0]
+    sizes = np.diff(ends, prepend=0.0)
+    points = ends[:, None] + sizes[:, None] * (x - 1)[None, :]
+    powers = w[None, None, :] * (x - 0.5)[None, None, :] ** np.arange(3)[:, None, None]
+    powers = jnp.asarray(powers * sizes[None, :, None], dtype)
+    values = jnp.asarray(rod.basis(points.reshape(-1)), dtype)
+    values = values.reshape(-1, *points.shape, rod.basis.num_dof)
+    moments = jnp.einsum("okp,akpn->aokn", powers, values)
+    active = dict(zip(rod.basis.active, moments, strict=True))
+    zero = jnp.zeros(moments.shape[1:], dtype)
+    names = strain_names(rod.group)[: rod.group.rotation_dim]
+    return jnp.stack([active.get(name, zero) for name in names], axis=1)
+
+
+def local_axis(name: str) -> int:
+    """Local axis (0, 1, 2) of a strain component."""
+    return STRAINS.index(name) % 3
+
+
+def is_curvature(name: str) -> bool:
+    return name.startswith("kappa")

@@ -1,0 +1,71 @@
+"""The planar rod: the section angle is linear in q, so no group exponential appears."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax.rod.motion import Motion, Operators, is_curvature
+from sorojax.rod.rod import Rod
+
+
+def motion(rod: Rod, constants: Operators, q: Array, v: Array, unroll: bool) -> Motion:
+    """Fields of the rod at the Gauss nodes; nothing to unroll."""
+    del unroll
+    per_coordinate = jnp.cumsum(constants.moments[0, 0], axis=0)
+    angle = per_coordinate @ q
+    if rod.rest_strain is not None:
+        angle = angle + jnp.cumsum(constants.rest_moments[0, 0])
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    axes = jnp.stack([cosine, sine], axis=1), jnp.stack([-sine, cosine], axis=1)
+    tangent = _tangent(rod, constants, axes, q)
+    linear_rate = _turn(tangent)[:, :, None] * per_coordinate[:, None, :]
+    curvature = jnp.zeros_like(per_coordinate)
+    for name, rows in zip(rod.basis.active, constants.strain_rows, strict=True):
+        if is_curvature(name):
+            curvature = rows
+        else:
+            axis = axes[name == "sigma_y"]
+            linear_rate = linear_rate + axis[:, :, None] * rows[:, None, :]
+    linear = constants.integration @ linear_rate.reshape(rod.nodes, -1)
+    return Motion(
+        rod,
+        constants,
+        q,
+        v,
+        directors=jnp.stack(axes, axis=-1),
+        tangent=tangent,
+        angular_rate=curvature[:, None, :],
+        linear_rate=linear_rate,
+        angular_jacobian=per_coordinate[:, None, :],
+        linear_jacobian=linear.reshape(linear_rate.shape),
+    )
+
+
+def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:
+    """Mass matrix and Coriolis force by one product J' [S J | F]."""
+    constants, v = moment.operators, moment.v
+    quad, _, dof = moment.linear_jacobian.shape
+    angular = moment.angular_jacobian[:, 0]
+    spin = (angular @ v)[:, None]
+    swept = 2 * (moment.linear_rate.reshape(-1, dof) @ v).reshape(quad, 2)
+    # The rate already holds spin x tangent once: a = spin x (spin x r' + 2 p).
+    inner = spin * _turn(swept - spin * _turn(moment.tangent))
+    force = constants.mass[:, None] * (constants.integration @ inner)
+    rows = jnp.concatenate([moment.linear_jacobian.reshape(-1, dof), angular])
+    scale = jnp.concatenate([jnp.repeat(constants.mass, 2), constants.rotary[0]])
+    loads = jnp.concatenate([force.reshape(-1), jnp.zeros_like(spin[:, 0])])
+    product = rows.T @ jnp.concatenate([rows * scale[:, None], loads[:, None]], axis=1)
+    return product[:, :dof], product[:, dof]
+
+
+def _tangent(rod: Rod, constants: Operators, axes, q: Array) -> Array:
+    stretch, shear = constants.rest_strain[1], constants.rest_strain[2]
+    tangent = stretch * axes[0] + shear * axes[1]
+    for name, rows in zip(rod.basis.active, constants.strain_rows, strict=True):
+        if not is_curvature(name):
+            tangent = tangent + axes[name == "sigma_y"] * (rows @ q)[:, None]
+    return tangent
+
+
+def _turn(vectors: Float[Array, "quad dim"]) -> Float[Array, "quad dim"]:
+    """z x each vector."""
+    return jnp.stack([-vectors[:, 1], vectors[:, 0]], axis=1)

@@ -1,0 +1,129 @@
+"""Area and centroid of plane shapes by adaptive cells cut by the tangent line.
+
+Cells that the Lipschitz constant proves full or empty are never refined; the
+smallest ones are cut by the line f + grad f . x = 0, an error of second order in
+a cell 1/4096 of the extent: about 1e-6 relative.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sorojax.sdf.base import AbstractSdf
+from sorojax.sdf.query import _shape_tangent
+from sorojax.sdf.sample import finite_box, raise_empty, values, values_and_gradients
+
+_COARSE = 64
+_LEVELS = 6  # smallest cell: extent / (64 * 2^6)
+
+
+def area(shape: AbstractSdf) -> Float[Array, ""]:
+    """Area [m^2] of a plane shape, differentiable in its parameters.
+
+    The derivative is the integral of -(df/dtheta)/|grad f| along the boundary. The
+    shape must be concrete: use it outside `jit` (`jax.grad` and `jax.jvp` are fine).
+
+    Raises:
+        ValueError: If the shape is empty, unbounded or traced by `jit`.
+    """
+    return _moments(shape)[0]
+
+
+def centroid(shape: AbstractSdf) -> Float[Array, "2"]:
+    """Centroid [m] of a plane shape, differentiable in its parameters as `area` is."""
+    moments = _moments(shape)
+    return moments[1:] / moments[0]
+
+
+@eqx.filter_custom_jvp
+def _moments(shape: AbstractSdf) -> Float[Array, "3"]:
+    return jnp.asarray(_integrate(shape)[0], dtype=jnp.result_type(float))
+
+
+@_moments.def_jvp
+def _moments_jvp(primals, tangents):
+    (shape,), (shape_dot,) = primals, tangents
+    moments, points, weights = _integrate(shape)
+    p = jnp.asarray(points, dtype=jnp.result_type(float))
+    f_dot = _shape_tangent(lambda s: s(p), shape, shape_dot)
+    density = jnp.asarray(
+        np.concatenate([np.ones((len(points), 1)), points], axis=1), dtype=p.dtype
+    )
+    weights = jnp.asarray(weights, dtype=p.dtype)
+    return jnp.asarray(moments, dtype=p.dtype), -(weights * f_dot) @ density
+
+
+def _integrate(shape: AbstractSdf) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(area, moments about the origin), boundary points and weights length/|grad f|."""
+    lower, upper = finite_box("area", shape, 2)
+    cell = float((upper - lower).max()) / _COARSE
+    counts = np.ceil((upper - lower) / cell + 0.5).astype(int)
+    start = (lower + upper) / 2 - cell * counts / 2
+    axes = [start[i] + cell * (np.arange(counts[i]) + 0.5) for i in (0, 1)]
+    centers = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    total = np.zeros(3)
+    quarter = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]]) / 4
+    for level in range(_LEVELS + 1):
+        f = values(shape, centers)
+        open_ = np.abs(f) <= shape.lipschitz * cell * np.sqrt(0.5) * (1 + 1e-9)
+        full = centers[(f < 0) & ~open_]
+        total += cell**2 * np.array([len(full), *full.sum(axis=0)])
+        centers = centers[open_]
+        if level < _LEVELS:
+            centers = (centers[:, None] + cell * quarter).reshape(-1, 2)
+            cell /= 2
+    moments, points, weights = _cut_cells(shape, centers, cell)
+    total += moments
+    if total[0] <= 0:
+        raise_empty("area", lower, upper, cell)
+    return total, points, weights
+
+
+def _cut_cells(shape, centers, cell):
+    """Moments of the inside part of cells cut by their tangent line, and that line."""
+    f, g = values_and_gradients(shape, centers)
+    slope = np.maximum(np.sqrt((g * g).sum(axis=1)), 1e-12)
+    n, depth, half = g / slope[:, None], -f / slope, cell / 2
+    lengths, first = np.zeros((4, len(f))), np.zeros((4, len(f)))
+    # The four sides of a cell: part below the line, as length and middle.
+    for k, (axis, sign) in enumerate([(0, -1), (0, 1), (1, -1), (1, 1)]):
+        across, along = n[:, axis], n[:, 1 - axis]
+        low, high = _below(along, depth - across * sign * half, half)
+        lengths[k], first[k] = high - low, (high + low) / 2
+    # The line closes the polygon of the sides; computed so, rounding cannot open it.
+    line = np.hypot(lengths[1] - lengths[0], lengths[3] - lengths[2])
+    middle = _chord_middle(n, depth, half)
+    part = half / 2 * lengths.sum(axis=0) + depth / 2 * line
+    shift = np.zeros_like(n)
+    for k, (axis, sign) in enumerate([(0, -1), (0, 1), (1, -1), (1, 1)]):
+        shift[:, axis] += half / 3 * lengths[k] * sign * half
+        shift[:, 1 - axis] += half / 3 * lengths[k] * first[k]
+    shift += (depth / 3 * line)[:, None] * middle
+    moments = part[:, None] * centers + shift
+    cut = line > 0
+    points = (centers + middle)[cut]
+    return np.array([part.sum(), *moments.sum(axis=0)]), points, (line / slope)[cut]
+
+
+def _below(slope, level, half):
+    """Interval of t in [-half, half] with slope * t < level."""
+    safe = np.where(np.abs(slope) < 1e-14, 1.0, slope)
+    t = np.clip(level / safe, -half, half)
+    whole = np.where(level > 0, half, -half)
+    flat = np.abs(slope) < 1e-14
+    low = np.where(flat | (slope > 0), -half, t)
+    high = np.where(flat, whole, np.where(slope > 0, t, half))
+    return low, high
+
+
+def _chord_middle(n, depth, half):
+    """Middle of the part of the line n . x = depth inside the cell."""
+    tangent = np.stack([-n[:, 1], n[:, 0]], axis=-1)
+    foot = depth[:, None] * n
+    flat = np.abs(tangent) < 1e-14
+    safe = np.where(flat, 1.0, tangent)
+    ends = np.sort(np.stack([(-half - foot) / safe, (half - foot) / safe]), axis=0)
+    enter = np.where(flat, -np.inf, ends[0]).max(axis=1)
+    leave = np.where(flat, np.inf, ends[1]).min(axis=1)
+    return foot + ((enter + leave) / 2)[:, None] * tangent

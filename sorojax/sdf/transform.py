@@ -1,0 +1,231 @@
+"""Shapes moved, scaled, thickened, hollowed and repeated."""
+
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax._types import is_traced, real
+from sorojax.sdf.base import AbstractSdf, Box
+from sorojax.sdf.scalar import absolute, minimum
+
+
+class AbstractWrapped(AbstractSdf):
+    """A shape made of one other shape of the same dimension and slope."""
+
+    shape: eqx.AbstractVar[AbstractSdf]
+
+    @property
+    def dim(self) -> int:
+        return self.shape.dim
+
+    @property
+    def lipschitz(self) -> float:
+        return self.shape.lipschitz
+
+
+class Translated(AbstractWrapped):
+    """`shape` moved by `offset` [m]."""
+
+    shape: AbstractSdf
+    offset: Float[Array, " dim"] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        _check.shape(
+            "translate", "offset", self.offset, (self.shape.dim,), "One entry per axis."
+        )
+
+    @property
+    def exact(self) -> bool:
+        return self.shape.exact
+
+    def distance(self, *x):
+        return self.shape.distance(*(c - self.offset[i] for i, c in enumerate(x)))
+
+    def bounding_box(self) -> Box:
+        lower, upper = self.shape.bounding_box()
+        return lower + self.offset, upper + self.offset
+
+
+class Rotated(AbstractWrapped):
+    """`shape` turned by `angle` [rad] about `center` [m], in space about the z axis."""
+
+    shape: AbstractSdf
+    angle: Float[Array, ""] = eqx.field(converter=real)
+    center: Float[Array, "2"] = eqx.field(converter=real)
+
+    @property
+    def exact(self) -> bool:
+        return self.shape.exact
+
+    def distance(self, *x):
+        c, s = jnp.cos(self.angle), jnp.sin(self.angle)
+        dx, dy = x[0] - self.center[0], x[1] - self.center[1]
+        turned = (self.center[0] + c * dx + s * dy, self.center[1] - s * dx + c * dy)
+        return self.shape.distance(*turned, *x[2:])
+
+    def bounding_box(self) -> Box:
+        lower, upper = self.shape.bounding_box()
+        bounded = jnp.all(jnp.isfinite(lower[:2]) & jnp.isfinite(upper[:2]))
+        low = jnp.where(bounded, lower[:2], -jnp.ones_like(lower[:2]))
+        high = jnp.where(bounded, upper[:2], jnp.ones_like(upper[:2]))
+        c, s = jnp.cos(self.angle), jnp.sin(self.angle)
+        middle, half = (low + high) / 2 - self.center, (high - low) / 2
+        center = self.center + jnp.stack(
+            [c * middle[0] - s * middle[1], s * middle[0] + c * middle[1]]
+        )
+        c, s = jnp.abs(c), jnp.abs(s)
+        reach = jnp.stack([c * half[0] + s * half[1], s * half[0] + c * half[1]])
+        reach = jnp.where(bounded, reach, jnp.full_like(reach, jnp.inf))
+        return (
+            jnp.concatenate([center - reach, lower[2:]]),
+            jnp.concatenate([center + reach, upper[2:]]),
+        )
+
+
+class Scaled(AbstractWrapped):
+    """`shape` scaled by `factor` about the origin."""
+
+    shape: AbstractSdf
+    factor: Float[Array, ""] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        _check.positive("scale", "factor", self.factor, "", "Mirror is another operation.")
+
+    @property
+    def exact(self) -> bool:
+        return self.shape.exact
+
+    def distance(self, *x):
+        return self.factor * self.shape.distance(*(c / self.factor for c in x))
+
+    def bounding_box(self) -> Box:
+        lower, upper = self.shape.bounding_box()
+        return lower * self.factor, upper * self.factor
+
+
+class Offset(AbstractWrapped):
+    """`shape` grown by `thickness` [m] on all sides, or shrunk where it is negative."""
+
+    shape: AbstractSdf
+    thickness: Float[Array, ""] = eqx.field(converter=real)
+
+    def distance(self, *x):
+        return self.shape.distance(*x) - self.thickness
+
+    def bounding_box(self) -> Box:
+        lower, upper = self.shape.bounding_box()
+        return lower - self.thickness, upper + self.thickness
+
+
+class Shell(AbstractWrapped):
+    """A wall of `thickness` [m] centred on the surface of `shape`."""
+
+    shape: AbstractSdf
+    thickness: Float[Array, ""] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        _check.positive("shell", "thickness", self.thickness, "m", "Give the wall thickness.")
+
+    def distance(self, *x):
+        return absolute(self.shape.distance(*x)) - self.thickness / 2
+
+    def bounding_box(self) -> Box:
+        lower, upper = self.shape.bounding_box()
+        return lower - self.thickness / 2, upper + self.thickness / 2
+
+
+class Repeated(AbstractWrapped):
+    """`count` copies of `shape`, each `step` [m] from the one before.
+
+    Only the copies within `reach` of the nearest cell are evaluated: with a shape
+    that is `w` wide along the step, 1 + w/|step| cells always hold the closest one.
+    """
+
+    shape: AbstractSdf
+    step: Float[Array, " dim"] = eqx.field(converter=real)
+    count: int = eqx.field(static=True)
+    reach: int = eqx.field(static=True)
+    separate: bool = eqx.field(static=True)
+
+    def __check_init__(self):
+        _check.shape("repeat", "step", self.step, (self.shape.dim,), "One entry per axis.")
+        if self.count < 1:
+            raise ValueError(f"repeat: `count` must be at least 1, got {self.count}.")
+
+    @property
+    def exact(self) -> bool:
+        return self.shape.exact and self.separate
+
+    def distance(self, *x):
+        copies = range(self.count)
+        if 2 * self.reach + 1 >= self.count:
+            return self._nearest(x, [jnp.full_like(x[0], i) for i in copies])
+        lower, upper = self.shape.bounding_box()
+        center = (lower + upper) / 2
+        along = sum((c - center[i]) * self.step[i] for i, c in enumerate(x))
+        cell = jnp.round(along / jnp.sum(self.step**2))
+        # The end copies come again, not new ones beyond the array.
+        near = (cell + i for i in range(-self.reach, self.reach + 1))
+        return self._nearest(x, [jnp.clip(i, 0, self.count - 1) for i in near])
+
+    def _nearest(self, x, indices):
+        result = None
+        for index in indices:
+            local = (c - index * self.step[i] for i, c in enumerate(x))
+            value = self.shape.distance(*local)
+            result = value if result is None else minimum(result, value)
+        return result
+
+    def bounding_box(self) -> Box:
+        lower, upper = self.shape.bounding_box()
+        last = (self.count - 1) * self.step
+        zero = jnp.zeros_like(last)
+        return lower + jnp.minimum(zero, last), upper + jnp.maximum(zero, last)
+
+
+def translate(shape: AbstractSdf, offset) -> Translated:
+    """`shape` moved by `offset` [m]."""
+    return Translated(shape, offset)
+
+
+def rotate(shape: AbstractSdf, angle, center=(0.0, 0.0)) -> Rotated:
+    """`shape` turned by `angle` [rad] about `center` [m]; in space about the z axis."""
+    return Rotated(shape, angle, center)
+
+
+def scale(shape: AbstractSdf, factor) -> Scaled:
+    """`shape` scaled by `factor` about the origin; distances scale along."""
+    return Scaled(shape, factor)
+
+
+def offset(shape: AbstractSdf, thickness) -> Offset:
+    """`shape` grown by `thickness` [m]; convex corners become round for exact fields."""
+    return Offset(shape, thickness)
+
+
+def shell(shape: AbstractSdf, thickness) -> Shell:
+    """A wall of `thickness` [m] centred on the surface of `shape`."""
+    return Shell(shape, thickness)
+
+
+def repeat(shape: AbstractSdf, step, count: int) -> Repeated:
+    """A row of `count` copies of `shape`, each `step` [m] from the one before.
+
+    Built under a trace, where sizes are unknown, every copy is evaluated.
+    """
+    step = real(step)
+    if is_traced((shape, step)):
+        return Repeated(shape, step, int(count), reach=int(count), separate=False)
+    stride = np.asarray(step, dtype=float)
+    if not np.all(np.isfinite(stride)) or not np.any(stride):
+        raise ValueError(f"repeat: `step` must be finite and not zero, got {stride} m.")
+    lower, upper = (np.asarray(corner, dtype=float) for corner in shape.bounding_box())
+    # Half width of the box along the step, in steps.
+    width = float(np.abs(stride) @ (upper - lower) / 2 / (stride @ stride))
+    if not math.isfinite(width):
+        return Repeated(shape, step, int(count), reach=int(count), separate=False)
+    return Repeated(shape, step, int(count), 1 + math.floor(width), width <= 0.5)

@@ -1,0 +1,143 @@
+"""A network of blocks is a block: wired, checked and ordered before it runs."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from sorojax.systems.block import AbstractBlock, Input, Output, Signals
+from sorojax.systems.schedule import check_wires, evaluation_order, reachable_inputs
+
+
+def _pairs(wires: Mapping[str, str] | tuple) -> tuple[tuple[str, str], ...]:
+    items = wires.items() if isinstance(wires, Mapping) else wires
+    return tuple(sorted((str(a), str(b)) for a, b in items))
+
+
+class Network(AbstractBlock):
+    """Blocks side by side, their inputs wired to outputs.
+
+    The state is one dictionary entry per block. Wiring decides what is traced: an output
+    that nothing reads costs nothing.
+
+    Attributes:
+        blocks: Blocks by name.
+        wires: `{"block.input": "block.output"}`; an input has one driver.
+        exposed: Inputs that the user of the network supplies, `("block.input", ...)`.
+    """
+
+    blocks: dict[str, AbstractBlock]
+    wires: tuple[tuple[str, str], ...] = eqx.field(static=True, converter=_pairs)
+    exposed: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
+
+    def __check_init__(self):
+        check_wires(self.blocks, dict(self.wires), self.exposed)
+        evaluation_order(self.blocks, dict(self.wires))
+
+    @property
+    def inputs(self) -> dict[str, Input]:
+        return {name: self.input_ports[name] for name in self.exposed}
+
+    @property
+    def outputs(self) -> dict[str, Output]:
+        needs = reachable_inputs(self.blocks, dict(self.wires), self.exposed)
+        return {
+            f"{owner}.{name}": port._replace(needs=needs[f"{owner}.{name}"])
+            for owner, block in self.blocks.items()
+            for name, port in block.outputs.items()
+        }
+
+    @property
+    def input_ports(self) -> dict[str, Input]:
+        """Every input of every block, by full name."""
+        return {
+            f"{owner}.{name}": port
+            for owner, block in self.blocks.items()
+            for name, port in block.inputs.items()
+        }
+
+    def initial_state(self) -> dict[str, PyTree]:
+        state = {name: block.initial_state() for name, block in self.blocks.items()}
+        for name, part in state.items():
+            if isinstance(part, tuple) and not part:  # diffrax cannot save an empty tuple
+                raise ValueError(
+                    f"Network: the initial state of `{name}` is (). A block without memory "
+                    "has the state {}, and returns {} from its vector field."
+                )
+        return state
+
+    def output(self, name, t, state, inputs):
+        return _signals(self, t, state, inputs)[name]
+
+    def vector_field(self, t, state, inputs: Signals | None = None) -> dict[str, PyTree]:
+        signals = _signals(self, t, state, inputs or {})
+        return {
+            name: block.vector_field(t, state[name], _inputs_of(self, name, signals))
+            for name, block in self.blocks.items()
+        }
+
+
+def outputs(
+    network: Network, t: Float[Array, ""], state: PyTree, inputs: Signals | None = None
+) -> dict[str, Array]:
+    """Every output of every block at one moment, `{"block.output": value}`."""
+    signals = _signals(network, t, state, inputs or {})
+    return {name: signals[name] for name in network.outputs}
+
+
+def as_term(network: AbstractBlock, inputs: Signals | None = None) -> dfx.ODETerm:
+    """The block as a diffrax term whose state is the state of the block.
+
+    The block itself travels through `args`, so that it may be differentiated: call
+    `diffrax.diffeqsolve(as_term(network), ..., args=network)`. With `args=None` the block
+    given here is used.
+    """
+
+    def field(t: Any, state: PyTree, args: Any) -> PyTree:
+        system = network if args is None else args
+        t = jnp.asarray(t)
+        return system.vector_field(t, state, at_time(inputs or {}, t))
+
+    return dfx.ODETerm(field)
+
+
+def at_time(inputs: Mapping[str, Any], t: Float[Array, ""]) -> Signals:
+    """Values at `t` of inputs given as values or as functions of time."""
+    values: dict[str, Any] = dict(inputs)
+    return {name: x(t) if callable(x) else x for name, x in values.items()}
+
+
+def _signals(network: Network, t, state, supplied: Signals) -> dict[str, Array]:
+    """All inputs and outputs by full name, outputs in an order that needs no loop."""
+    wires, ports = dict(network.wires), network.input_ports
+    missing = [name for name in network.exposed if name not in supplied]
+    missing = [name for name in missing if ports[name].default is None]
+    if missing:
+        raise ValueError(
+            f"Network: the exposed input `{missing[0]}` got no value. Pass "
+            f'inputs={{"{missing[0]}": ...}}.'
+        )
+    signals: dict[str, Array] = {}
+    for name, port in ports.items():
+        if name in network.exposed and name in supplied:
+            signals[name] = supplied[name]
+        elif name not in wires and port.default is not None:
+            signals[name] = jnp.full(port.shape, port.default, jnp.result_type(float))
+    for name in evaluation_order(network.blocks, wires):
+        if name in wires:
+            signals[name] = signals[wires[name]]
+        elif name not in ports:
+            owner, port_name = name.split(".", 1)
+            given = _inputs_of(network, owner, signals)
+            block = network.blocks[owner]
+            signals[name] = block.output(port_name, t, state[owner], given)
+    return signals
+
+
+def _inputs_of(network: Network, owner: str, signals: dict[str, Array]) -> Signals:
+    names = network.blocks[owner].inputs
+    full = {name: f"{owner}.{name}" for name in names}
+    return {name: signals[key] for name, key in full.items() if key in signals}

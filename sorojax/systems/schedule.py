@@ -1,0 +1,119 @@
+"""Checks of a wiring and the order in which its ports are evaluated."""
+
+from collections.abc import Mapping
+
+from sorojax.systems.block import AbstractBlock
+
+Blocks = Mapping[str, AbstractBlock]
+Wires = Mapping[str, str]
+
+
+def check_wires(blocks: Blocks, wires: Wires, exposed: tuple[str, ...]) -> None:
+    """Raise a `ValueError` unless every input has one driver that fits it."""
+    _check_names(blocks)
+    inputs = {f"{b}.{n}": p for b, block in blocks.items() for n, p in block.inputs.items()}
+    made = {f"{b}.{n}": p for b, block in blocks.items() for n, p in block.outputs.items()}
+    for target, source in wires.items():
+        _need_known("input", target, inputs, f"{source} drives it")
+        _need_known("output", source, made, f"it should drive {target}")
+        _need_fit(target, inputs[target], source, made[source])
+    for name in exposed:
+        _need_known("input", name, inputs, "it is listed as exposed")
+        if name in wires:
+            raise ValueError(
+                f"Network: `{name}` is exposed and also driven by `{wires[name]}`; an input "
+                "has one driver. Remove the wire or the exposure."
+            )
+    for name, port in inputs.items():
+        if port.default is None and name not in wires and name not in exposed:
+            fits = [n for n, out in made.items() if _fits(port, out)]
+            raise ValueError(
+                f"Network: `{name}` [{port.unit}] is not connected and has no default. "
+                f"Wire it to an output that fits ({', '.join(fits) or 'none here'}) "
+                f'or expose it: exposed=("{name}",).'
+            )
+
+
+def evaluation_order(blocks: Blocks, wires: Wires) -> list[str]:
+    """Full names of wired inputs and outputs, each after what it depends on.
+
+    Raises:
+        ValueError: If outputs depend on themselves at the same instant.
+    """
+    depends = _dependencies(blocks, wires)
+    order: list[str] = []
+    state: dict[str, bool] = {}  # False while on the path, True when placed
+
+    def place(name: str, path: tuple[str, ...]) -> None:
+        if state.get(name):
+            return
+        if name in state:
+            loop = [n for n in reversed(path[path.index(name) :]) if n not in wires]
+            shown = " -> ".join([*loop, loop[0]])
+            raise ValueError(
+                f"Network: algebraic loop {shown}: these outputs need each other at the "
+                "same instant. Put a state (a filter, a reservoir) between them."
+            )
+        state[name] = False
+        for other in depends.get(name, ()):
+            place(other, (*path, name))
+        state[name] = True
+        order.append(name)
+
+    for name in depends:
+        place(name, ())
+    return order
+
+
+def reachable_inputs(
+    blocks: Blocks, wires: Wires, exposed: tuple[str, ...]
+) -> dict[str, frozenset[str]]:
+    """For every output, the exposed inputs that it needs at the same instant."""
+    depends = _dependencies(blocks, wires)
+    reached: dict[str, frozenset[str]] = {}
+    for name in evaluation_order(blocks, wires):
+        own = frozenset({name} & set(exposed))
+        parts = (reached.get(other, frozenset()) for other in depends.get(name, ()))
+        reached[name] = own.union(*parts)
+    return reached
+
+
+def _dependencies(blocks: Blocks, wires: Wires) -> dict[str, list[str]]:
+    depends: dict[str, list[str]] = {}
+    for owner, block in blocks.items():
+        for name in block.inputs:
+            full = f"{owner}.{name}"
+            depends[full] = [wires[full]] if full in wires else []
+        for name, port in block.outputs.items():
+            depends[f"{owner}.{name}"] = [f"{owner}.{need}" for need in sorted(port.needs)]
+    return depends
+
+
+def _check_names(blocks: Blocks) -> None:
+    bad = [name for name in blocks if "." in name or not name]
+    if bad:
+        raise ValueError(
+            f"Network: the block name {bad[0]!r} contains a dot or nothing; a port is "
+            "written block.port. Rename the block."
+        )
+
+
+def _need_known(kind: str, name: str, ports: Mapping, why: str) -> None:
+    if name not in ports:
+        raise ValueError(
+            f"Network: there is no {kind} `{name}` ({why}); the {kind}s are "
+            f"{', '.join(ports) or 'none'}. Wires are written {{input: output}}."
+        )
+
+
+def _need_fit(target: str, port, source: str, made) -> None:
+    if not _fits(port, made):
+        raise ValueError(
+            f"Network: `{source}` [{made.unit}, shape {made.shape}] cannot drive `{target}` "
+            f"[{port.unit}, shape {port.shape}]. Connect ports of one unit and one shape."
+        )
+
+
+def _fits(port, made) -> bool:
+    any_unit = port.unit is None or made.unit is None
+    return (any_unit or port.unit == made.unit) and port.shape == made.shape

@@ -1,0 +1,174 @@
+"""The house: what may import what, what an import costs, how long a file may be."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+CORE, HARDWARE = ROOT / "sorojax", ROOT / "hardware"
+BASEMENT = {"units", "_types", "_check", "_edit", "_progress", "_cache"}
+FLOOR = {
+    "math": 0,
+    **dict.fromkeys(("sdf", "material"), 1),
+    **dict.fromkeys(("mesh", "contact"), 2),
+    **dict.fromkeys(("fem", "rod"), 3),
+    **dict.fromkeys(("systems", "reduction"), 4),
+    **dict.fromkeys(("design", "robots"), 5),
+    "io": 6,
+    **dict.fromkeys(("view", "vision", "sweep"), 7),
+    "cli": 8,
+    "__main__": 9,
+}
+ONLY_WHERE_USED = {"cv2", "pyvista", "skimage", "meshio", "matplotlib", "pyrealsense2"}
+MAX_LINES = 300
+LONGER: set[str] = set()  # files of numbers and nothing else
+
+
+def sources(*roots: Path) -> list[Path]:
+    return sorted(path for root in roots for path in root.rglob("*.py"))
+
+
+def imports(path: Path, package_root: Path, inside_functions: bool = True) -> Iterator[str]:
+    """Dotted names that a file imports; `from a import b` counts as `a.b`."""
+    here = path.relative_to(package_root).with_suffix("").parts
+    for node in walk(ast.parse(path.read_text()), inside_functions):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = here[: len(here) - node.level] if node.level else ()
+            module = (*base, *(node.module or "").split("."))
+            for alias in node.names:
+                yield ".".join(part for part in (*module, alias.name) if part)
+
+
+def walk(node: ast.AST, inside_functions: bool) -> Iterator[ast.AST]:
+    for child in ast.iter_child_nodes(node):
+        is_function = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef)
+        is_typing = isinstance(child, ast.If) and "TYPE_CHECKING" in ast.dump(child.test)
+        if not inside_functions and (is_function or is_typing):
+            continue
+        yield child
+        yield from walk(child, inside_functions)
+
+
+def room(path: Path) -> str:
+    return path.relative_to(CORE).with_suffix("").parts[0]
+
+
+def wrong_imports(path: Path) -> list[str]:
+    """Imports of a room on the same floor or above, or of a room without a floor."""
+    mine = room(path)
+    floor = -1 if mine in BASEMENT else FLOOR[mine]
+    found = []
+    for name in imports(path, ROOT):
+        top, _, rest = name.partition(".")
+        other = rest.partition(".")[0]
+        if top == "sorojax_hardware":
+            found.append(f"{path.relative_to(ROOT)} imports {name}")
+        if top == "sorojax" and other in FLOOR and other != mine and FLOOR[other] >= floor:
+            found.append(f"{path.relative_to(ROOT)} imports {name}")
+    return found
+
+
+def test_every_room_has_a_floor():
+    rooms = {room(path) for path in sources(CORE)} - {"__init__"}
+    assert rooms <= FLOOR.keys() | BASEMENT, rooms - FLOOR.keys() - BASEMENT
+
+
+def test_imports_go_down_only():
+    files = [path for path in sources(CORE) if room(path) != "__init__"]
+    assert [line for path in files for line in wrong_imports(path)] == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "import sorojax.fem",
+        "from sorojax import fem",
+        "from sorojax.fem import solve",
+        "from ..fem.solve import solve",
+        "from .. import fem",
+        "def late():\n    from sorojax.rod import rod",
+        "import sorojax_hardware",
+    ],
+)
+def test_the_import_rule_catches(line, tmp_path, monkeypatch):
+    file = tmp_path / "sorojax" / "sdf" / "case.py"
+    file.parent.mkdir(parents=True)
+    file.write_text(line)
+    here = sys.modules[__name__]
+    monkeypatch.setattr(here, "ROOT", tmp_path)
+    monkeypatch.setattr(here, "CORE", tmp_path / "sorojax")
+    assert len(wrong_imports(file)) == 1
+
+
+def test_hardware_knows_nothing_of_the_core():
+    found = [
+        f"{path.relative_to(ROOT)} imports {name}"
+        for path in sources(HARDWARE)
+        for name in imports(path, HARDWARE)
+        if name.partition(".")[0] in ("sorojax", "jax", "equinox", "diffrax")
+    ]
+    assert found == []
+
+
+def test_heavy_libraries_load_only_where_used():
+    found = [
+        f"{path.relative_to(ROOT)} imports {name}"
+        for path in sources(CORE, HARDWARE)
+        for name in imports(path, ROOT, inside_functions=False)
+        if name.partition(".")[0] in ONLY_WHERE_USED
+    ]
+    assert found == []
+
+
+def test_files_are_short():
+    lengths = {
+        str(path.relative_to(ROOT)): len(path.read_text().splitlines())
+        for path in sources(CORE, HARDWARE, ROOT / "benchmarks")
+    }
+    long = {name: n for name, n in lengths.items() if n > MAX_LINES and name not in LONGER}
+    assert long == {}
+    assert lengths.keys() >= LONGER
+
+
+def test_nothing_is_a_stub():
+    found = [
+        f"{path.relative_to(ROOT)}:{node.lineno}"
+        for path in sources(CORE, HARDWARE)
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Name) and node.id == "NotImplementedError"
+    ]
+    assert found == []
+
+
+IMPORT_COST = f"""
+import time
+import jax, equinox, diffrax
+flags = dict(jax.config.values)
+start = time.perf_counter()
+import sorojax
+seconds = time.perf_counter() - start
+import sys
+changed = [name for name, value in jax.config.values.items() if value != flags.get(name)]
+loaded = sorted({ONLY_WHERE_USED!r} & sys.modules.keys())
+print(seconds, changed, loaded, sep=";")
+"""
+
+
+def test_import_is_cheap_and_sets_no_flag():
+    costs = []
+    for _ in range(3):
+        done = subprocess.run(
+            [sys.executable, "-c", IMPORT_COST],
+            cwd=ROOT, capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        seconds, changed, loaded = done.stdout.strip().split(";")
+        assert (changed, loaded) == ("[]", "[]")
+        costs.append(float(seconds))
+    print(f"import sorojax: {min(costs):.3f} s beyond jax, equinox, diffrax")
+    assert min(costs) < 1.0

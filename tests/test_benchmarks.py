@@ -1,0 +1,148 @@
+"""The benchmark harness: cases by file, JSON lines, peers that are missing."""
+
+import json
+import os
+import subprocess
+import sys
+import xml.etree.ElementTree as xml
+from pathlib import Path
+
+import pytest
+
+from benchmarks import discover, page, svg
+from benchmarks.__main__ import main
+from benchmarks.peers import row
+from benchmarks.rows import KEYS, Row, Timing, line
+from benchmarks.runner import run_case
+
+CASE = '''"""A product, with and without a bar."""
+import os
+
+import jax.numpy as jnp
+
+from benchmarks.harness import Row, measure
+from benchmarks.peers import row
+
+def rows():
+    timing = measure(lambda x: x @ x, jnp.ones((8, 8)), repeats=3)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    settings = {"size": 8, "cores": cores, "NPROC": os.environ["NPROC"]}
+    yield Row("sorojax", settings, **timing.columns(), error=1e-3, reference="exact", bar=9.0)
+    yield Row("stock", settings, **timing.columns(), error=float("nan"))
+    yield row("soromox", "acceleration", {}, lambda arrays: 0.0, "exact", nodes=8)
+'''
+BROKEN = '''"""Fails after its first row."""
+from benchmarks.harness import Row
+
+def rows():
+    yield Row("sorojax", {"size": 1})
+    raise RuntimeError("the matrix is singular")
+'''
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("SOROJAX_PEERS", str(tmp_path / "no peers"))
+    (tmp_path / "cases").mkdir()
+    (tmp_path / "cases" / "math_product.py").write_text(CASE)
+    (tmp_path / "cases" / "math_broken.py").write_text(BROKEN)
+    return tmp_path / "cases"
+
+
+def run(folder, name):
+    file = folder.parent / "lines.json"
+    status = main([name, "--json", str(file), "--cases", str(folder)])
+    return status, [json.loads(text) for text in file.read_text().splitlines()]
+
+
+def test_list_names_every_case():
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks", "--list"],
+        cwd=Path(__file__).parent.parent, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    listed = dict(text.split(maxsplit=1) for text in done.stdout.splitlines())
+    assert listed.keys() == discover.cases().keys()
+    assert {"rod.acceleration", "rod.simulation"} <= listed.keys()
+
+
+def test_a_case_writes_json_lines(folder):
+    status, (ours, stock, peer) = run(folder, "math.product")
+    assert status == 0
+    assert all(tuple(x) == KEYS and x["case"] == "math.product" for x in (ours, stock, peer))
+    assert ours["run_s_min"] <= ours["run_s"] <= ours["run_s_max"] and ours["compile_s"] > 0
+    assert ours["holds"] is True and stock["holds"] is None
+    assert stock["error"] is None  # NaN is no JSON
+    assert ours["settings"] == {"size": 8, "cores": 1, "NPROC": "2", "bar_on": "run_s"}
+
+
+def test_a_missing_peer_is_a_row_with_its_reason(folder):
+    peer = run(folder, "math.product")[1][-1]
+    assert peer["code"] == "soromox" and peer["run_s"] is None and peer["holds"] is None
+    assert "not installed" in peer["settings"]["reason"]
+
+
+def test_a_failing_case_keeps_its_rows_and_says_why(folder):
+    status, (first, last) = run(folder, "math.broken")
+    assert status == 1
+    assert first["settings"] == {"size": 1}
+    assert "the matrix is singular" in last["settings"]["reason"]
+
+
+def test_a_case_that_hangs_is_ended(folder):
+    (folder / "math_hang.py").write_text("import time\ntime.sleep(60)\n")
+    (found,) = run_case("math.hang", folder / "math_hang.py", limit=3.0)
+    assert found["settings"]["reason"] == "not finished after 3 s"
+
+
+def test_unknown_case_is_named(folder, capsys):
+    assert main(["math.nothing", "--cases", str(folder)]) == 2
+    assert "math.product" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a shell script stands for the interpreter")
+def test_a_peer_answers_arrays_and_times(folder, monkeypatch):
+    home = folder.parent / "peers"
+    (home / "soromox" / "bin").mkdir(parents=True)
+    (home / "soromox" / "status.json").write_text('{"ok": true, "version": "0"}')
+    fake = home / "soromox" / "bin" / "python"
+    fake.write_text(
+        f"#!{sys.executable}\n"
+        "import json, sys, pathlib, numpy as np\n"
+        "folder = pathlib.Path(sys.argv[-1])\n"
+        "x = np.load(folder / 'request.npz')['x']\n"
+        "answer = {'compile_s': 1.0, 'runs': [3.0, 1.0, 2.0]}\n"
+        "(folder / 'answer.json').write_text(json.dumps(answer))\n"
+        "np.savez(folder / 'answer.npz', y=2 * x)\n"
+    )
+    fake.chmod(0o755)
+    monkeypatch.setenv("SOROJAX_PEERS", str(home))
+    found = row("soromox", "double", {"x": 2.0}, lambda a: abs(a["y"] - 4), "exact", size=1)
+    assert (found.run_s_min, found.run_s, found.run_s_max, found.error) == (1, 2, 3, 0)
+    assert found.settings == {"size": 1, "version": "0"}
+
+
+@pytest.mark.parametrize("bar_on, holds", [("run_s", True), ("error", False)])
+def test_a_bar_is_on_time_or_on_error(bar_on, holds):
+    found = Row("sorojax", run_s=1.0, error=3.0, bar=2.0, bar_on=bar_on)
+    assert found.holds is holds
+    assert Row("sorojax", bar=1.0).holds is False  # not measured is not met
+
+
+def test_timing_is_the_median_per_call():
+    columns = Timing(2.0, (5.0, 1.0, 3.0)).per(10).columns()
+    assert columns == {"compile_s": 2.0, "run_s": 0.3, "run_s_min": 0.1, "run_s_max": 0.5}
+
+
+def test_plot_is_well_formed():
+    text = svg.loglog({"a<b": [(1e-5, 1e-3), (1e-3, 1e-9)], "one": [(1.0, 1.0)]}, "x", "y")
+    assert len(list(xml.fromstring(text).iter("{http://www.w3.org/2000/svg}circle"))) == 5
+
+
+def test_page_names_machine_and_every_row():
+    rows = [
+        Row("sorojax", {"nodes": 8}, 1.0, 2e-6, 1e-6, 3e-6, 1e-9, "32 nodes", 7e-6),
+        Row("other", {"reason": "no <wheel>"}),
+    ]
+    text = page.html([line("rod.test", item) for item in rows])
+    assert "2 us" in text and "no &lt;wheel&gt;" in text and "jax " in text
+    assert "http" not in text.replace("http://www.w3.org/2000/svg", "")

@@ -1,0 +1,123 @@
+"""The command line: starts fast, says what is wrong in one line, keeps its cache private."""
+
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import jax
+import pytest
+
+import sorojax
+from sorojax._cache import cache_directory, enable_compilation_cache
+from sorojax.cli.main import main
+
+ROOT = Path(__file__).parent.parent
+
+
+def command(*words, **environment):
+    return subprocess.run(
+        [sys.executable, "-m", "sorojax", *words],
+        cwd=ROOT, capture_output=True, text=True, env=os.environ | environment,
+    )  # fmt: skip
+
+
+def test_version_is_that_of_the_package():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["version"] == sorojax.__version__
+    assert command("--version").stdout == f"sorojax {sorojax.__version__}\n"
+
+
+def test_info_names_versions_devices_precision_solvers_and_cache(tmp_path):
+    done = command("info", SOROJAX_CACHE=str(tmp_path / "cache"))
+    assert done.returncode == 0, done.stderr
+    facts = dict(line.split(maxsplit=1) for line in done.stdout.splitlines())
+    assert facts["float64"] == "on" and facts["jax"] == jax.__version__
+    assert "superlu" in facts["solvers"] and facts["devices"]
+    assert str(tmp_path) in facts["compilation"]
+
+
+def test_wrong_input_is_one_line_without_traceback(monkeypatch, capsys):
+    def fails():
+        raise ValueError("demo: `out` is wrong.\n  Name a folder.")
+
+    monkeypatch.setattr("sorojax.cli.info.info", fails)
+    monkeypatch.setattr("sorojax.cli.main._start_jax", lambda: None)
+    monkeypatch.delenv("SOROJAX_DEBUG", raising=False)
+    assert main(["info"]) == 2
+    assert capsys.readouterr().err == "sorojax: demo: `out` is wrong. Name a folder.\n"
+    monkeypatch.setenv("SOROJAX_DEBUG", "1")
+    with pytest.raises(ValueError, match="wrong"):
+        main(["info"])
+
+
+def test_unknown_command_exits_with_2():
+    with pytest.raises(SystemExit) as exit:
+        main(["fly"])
+    assert exit.value.code == 2
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """A cache of its own; JAX gets its settings back."""
+    names = (
+        "jax_compilation_cache_dir",
+        "jax_persistent_cache_min_compile_time_secs",
+        "jax_persistent_cache_min_entry_size_bytes",
+    )
+    before = {name: getattr(jax.config, name) for name in names}
+    monkeypatch.setenv("SOROJAX_CACHE", str(tmp_path / "cache"))
+    yield tmp_path / "cache" / "jax"
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+def test_cache_is_private(cache):
+    old = os.umask(0)
+    try:
+        assert enable_compilation_cache() == cache
+    finally:
+        os.umask(old)
+    assert [p.stat().st_mode & 0o777 for p in (cache, cache.parent)] == [0o700, 0o700]
+    assert jax.config.jax_compilation_cache_dir == str(cache)
+
+
+def test_cache_that_others_read_is_closed(cache):
+    cache.mkdir(parents=True)
+    cache.chmod(0o755)
+    cache.parent.chmod(0o755)
+    enable_compilation_cache()
+    assert cache.stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize("mode", [0o770, 0o777, 0o702])
+def test_cache_that_others_write_is_refused(cache, mode):
+    cache.mkdir(parents=True)
+    cache.parent.chmod(0o700)
+    cache.chmod(mode)
+    with pytest.raises(ValueError, match="need 0700"):
+        enable_compilation_cache()
+
+
+def test_cache_that_is_a_link_is_refused(cache, tmp_path):
+    cache.parent.mkdir(mode=0o700)
+    cache.symlink_to(tmp_path)
+    with pytest.raises(ValueError, match="link or belongs to someone else"):
+        enable_compilation_cache()
+
+
+def test_cache_that_cannot_be_made_warns(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("SOROJAX_CACHE", str(tmp_path / "file" / "cache"))
+    with pytest.warns(UserWarning, match="Set SOROJAX_CACHE"):
+        assert enable_compilation_cache() is None
+
+
+def test_cache_follows_the_user_directories(monkeypatch, tmp_path):
+    monkeypatch.delenv("SOROJAX_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache_directory() == tmp_path / "sorojax" / "jax"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert cache_directory() == tmp_path / ".cache" / "sorojax" / "jax"

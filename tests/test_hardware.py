@@ -1,0 +1,170 @@
+"""The device protocols, the loop and the board in memory."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+from sorojax.systems import PID, Constant
+from sorojax_hardware import (
+    Clock,
+    MemoryBoard,
+    SimulatedClock,
+    ValveBoard,
+    WallClock,
+    deadlines,
+    run_loop,
+)
+
+kPa = 1e3
+PERIOD = 0.01
+
+
+def proportional_integral(target, proportional=0.5, integral=8.0):
+    def controller(t, measurement, state):
+        error = target - measurement
+        state = state + error * PERIOD
+        return proportional * error + integral * state, state
+
+    return controller
+
+
+def desk(num_ports=2, **options):
+    clock = SimulatedClock()
+    return clock, MemoryBoard(clock, num_ports, **options)
+
+
+def loop(board, clock, controller, state=0.0, duration=1.0, limits=(-10 * kPa, 60 * kPa)):
+    return run_loop(
+        board, clock, controller, state, duration=duration, period=PERIOD, limits=limits
+    )
+
+
+def test_devices_fit_their_protocols():
+    clock, board = desk()
+    assert isinstance(board, ValveBoard)
+    assert isinstance(clock, Clock) and isinstance(WallClock(), Clock)
+    assert not isinstance(object(), ValveBoard)
+
+
+def test_board_is_a_first_order_lag():
+    clock, board = desk(time_constant=np.array([0.03, 0.1]))
+    board.write_pressure(np.full(2, 50 * kPa))
+    clock.sleep_until(0.06)
+    want = 50 * kPa * (1 - np.exp([-2.0, -0.6]))
+    assert np.allclose(board.read_pressure(), want, rtol=1e-12)
+    assert np.allclose(board.read_pressure(), want, rtol=1e-12)  # no time, no change
+
+
+def test_pi_controller_reaches_its_target_and_the_board_vents():
+    clock, board = desk()
+    target = np.array([20 * kPa, 40 * kPa])
+    ticks = list(loop(board, clock, proportional_integral(target), np.zeros(2), 3.0))
+    assert len(ticks) == 300
+    assert np.allclose(ticks[-1].pressure, target, rtol=1e-3)
+    assert np.all(board.setpoint == 0)
+
+
+def test_the_controller_of_the_simulation_runs_on_the_board():
+    """The PID of `sorojax.systems`, angle in and pressure out, without a change."""
+    clock, board = desk(num_ports=1)
+    target = 0.3  # rad
+    pid = PID(1e4, 5e5, low=0.0, high=20 * kPa, reference=Constant(target))
+    ticks = run_loop(
+        board,
+        clock,
+        eqx.filter_jit(pid),
+        pid.start(0.0, 0.0),
+        duration=2.0,
+        period=PERIOD,
+        limits=(0.0, 20 * kPa),
+        measure=lambda t, pressure: 2e-5 * pressure[0],  # rad, of a soft finger
+    )
+    angles = [2e-5 * tick.pressure[0] for tick in ticks]
+    assert len(angles) == 200 and abs(angles[-1] - target) < 1e-3 * target
+    assert np.all(board.setpoint == 0)
+
+
+def test_commands_are_cut_to_the_limits():
+    clock, board = desk()
+    low, high = np.array([-10 * kPa, 0.0]), np.array([30 * kPa, 5 * kPa])
+    up = [t.setpoint for t in loop(board, clock, lambda t, y, s: (1e9, s), limits=(low, high))]
+    down = [
+        t.setpoint for t in loop(board, clock, lambda t, y, s: (-1e9, s), limits=(low, high))
+    ]
+    assert np.all(np.array(up) == high) and np.all(np.array(down) == low)
+
+
+def test_board_cuts_to_its_own_limits():
+    _, board = desk()
+    board.write_pressure(np.array([150 * kPa, -20 * kPa]))
+    assert np.array_equal(board.setpoint, [100 * kPa, -20 * kPa])
+    assert np.array_equal(board.clipped, [True, False])
+
+
+@pytest.mark.parametrize("wrong", [np.array([np.nan, 0.0]), np.zeros(3)])
+def test_board_refuses_what_is_no_setpoint_and_keeps_the_last(wrong):
+    _, board = desk()
+    board.write_pressure(np.full(2, 5 * kPa))
+    with pytest.raises(ValueError, match="need"):
+        board.write_pressure(wrong)
+    assert np.all(board.setpoint == 5 * kPa)
+
+
+def test_board_vents_when_the_controller_raises():
+    clock, board = desk()
+
+    def fails(t, measurement, state):
+        if t > 0.5:
+            raise RuntimeError("sensor lost")
+        return 30 * kPa, state
+
+    ticks = loop(board, clock, fails)
+    assert np.all(next(ticks).setpoint == 30 * kPa)
+    assert np.all(board.setpoint == 30 * kPa)
+    with pytest.raises(RuntimeError, match="sensor lost"):
+        list(ticks)
+    assert np.all(board.setpoint == 0)
+
+
+def test_board_vents_when_the_loop_is_left():
+    clock, board = desk()
+    ticks = loop(board, clock, lambda t, y, s: (30 * kPa, s))
+    next(ticks)
+    ticks.close()
+    assert np.all(board.setpoint == 0)
+
+
+def test_a_command_that_is_not_finite_ends_the_loop_vented():
+    clock, board = desk()
+    with pytest.raises(ValueError, match="2 finite pressures"):
+        list(loop(board, clock, lambda t, y, s: (np.nan, s)))
+    assert np.all(board.setpoint == 0)
+
+
+@pytest.mark.parametrize("wrong", [{"period": 0.0}, {"duration": -1.0}, {"limits": (1.0, 0.0)}])
+def test_wrong_settings_raise_at_the_call(wrong):
+    clock, board = desk()
+    options = {"duration": 1.0, "period": PERIOD, "limits": (0.0, 1.0)} | wrong
+    with pytest.raises(ValueError, match="run_loop"):
+        run_loop(board, clock, lambda t, y, s: (0.0, s), None, **options)
+
+
+def test_an_overrun_leaves_ticks_out_instead_of_hurrying():
+    clock, board = desk()
+
+    def slow_once(t, measurement, calls):
+        if calls == 10:
+            clock.sleep_until(clock.now() + 0.035)
+        return 0.0, calls + 1
+
+    ticks = list(loop(board, clock, slow_once, 0))
+    report = deadlines(ticks, PERIOD)
+    assert report.num_ticks == 97 and report.num_skipped == 3
+    assert report.max_late < 1e-9
+
+
+def test_wall_clock_waits():
+    clock = WallClock()
+    start = clock.now()
+    clock.sleep_until(start + 0.02)
+    assert 0.02 <= clock.now() - start < 1.0

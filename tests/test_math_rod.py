@@ -1,0 +1,99 @@
+"""Quadrature, rotations, small solves and steppers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sorojax.math.dense import solve_symmetric
+from sorojax.math.lie import SE2, SE3, skew
+from sorojax.math.magnus import rotation_vector
+from sorojax.math.quadrature import (
+    gauss_legendre,
+    integration_matrix,
+    integration_rows,
+)
+from sorojax.math.quaternion import exponential, prefix_product, rotation_columns
+from sorojax.math.steppers import dormand_prince_step, rk4_step
+
+
+@pytest.mark.parametrize("count", [2, 8, 48])
+def test_spectral_integration_is_exact_on_polynomials(count):
+    s, w = gauss_legendre(count)
+    degree = count - 1
+    integral = integration_matrix(count) @ s**degree
+    assert np.allclose(integral, s ** (degree + 1) / (degree + 1), rtol=0, atol=1e-14)
+    assert np.isclose(w.sum(), 1.0, rtol=0, atol=1e-14)
+    tip = integration_rows(count, jnp.array([0.0, 1.0])) @ s**degree
+    assert jnp.allclose(tip, jnp.array([0.0, 1 / count]), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-9, 1e-2, 1.0, 2.5])
+def test_exponentials_agree_with_the_matrix_exponential(scale, getkey):
+    drawn = jax.random.normal(getkey(), (6,))
+    twist = scale * drawn / jnp.linalg.norm(drawn[:3])
+    hat = jnp.zeros((4, 4)).at[:3, :3].set(skew(twist[:3])).at[:3, 3].set(twist[3:])
+    motion = jax.scipy.linalg.expm(hat)
+    assert jnp.allclose(SE3().exp(twist), motion, rtol=0, atol=1e-12)
+    columns = rotation_columns(exponential(tuple(twist[:3])))
+    rotation = jnp.stack([jnp.stack(c) for c in columns], axis=1)
+    assert jnp.allclose(rotation, motion[:3, :3], rtol=0, atol=1e-12)
+
+
+def test_planar_exponential_is_the_spatial_one_restricted():
+    twist = jnp.array([0.7, 0.2, -0.4])
+    spatial = SE3().exp(jnp.array([0.0, 0.0, 0.7, 0.2, -0.4, 0.0]))
+    keep = jnp.array([0, 1, 3])
+    restricted = spatial[keep][:, keep]
+    assert jnp.allclose(SE2().exp(twist), restricted, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("jacobian", [jax.jacfwd, jax.jacrev])
+def test_exponential_is_differentiable_at_the_identity(jacobian):
+    assert jnp.isfinite(jacobian(SE3().exp)(jnp.zeros(6))).all()
+    rate = jacobian(lambda x: jnp.stack(exponential(tuple(x))))(jnp.zeros(3))
+    half = jnp.concatenate([jnp.zeros((1, 3)), jnp.eye(3) / 2])
+    assert jnp.array_equal(rate, half)
+
+
+def test_magnus_is_of_order_six():
+    def turn(cells):
+        """Rotation of kappa = (1, s, s^2) over [0, 1] by `cells` cells."""
+        edges = np.linspace(0, 1, cells + 1)
+        x, w = gauss_legendre(4)
+        s = edges[:-1, None] + x / cells
+        kappa = [np.ones_like(s), 3 * s, 4 * s**2]
+        moments = tuple(
+            tuple(jnp.array((w * (x - 0.5) ** j * k).sum(1) / cells) for k in kappa)
+            for j in range(3)
+        )
+        return jnp.stack([c[-1] for c in prefix_product(exponential(rotation_vector(moments)))])
+
+    exact = turn(64)
+    coarse, fine = (float(jnp.abs(turn(n) - exact).max()) for n in (4, 8))
+    assert 5.5 < np.log2(coarse / fine) < 6.8
+
+
+def test_prefix_product_unrolled_equals_scan(getkey):
+    factors = exponential(tuple(jax.random.normal(getkey(), (3, 5))))
+    plain, unrolled = prefix_product(factors), prefix_product(factors, unroll=True)
+    assert jnp.allclose(jnp.stack(plain), jnp.stack(unrolled), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("dof", [1, 6, 20])
+def test_symmetric_solve(dof, getkey):
+    root = jax.random.normal(getkey(), (dof, dof))
+    matrix = root @ root.T + dof * jnp.eye(dof)
+    right = jnp.ones(dof)
+    assert jnp.allclose(matrix @ solve_symmetric(matrix, right), right, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("step, order", [(rk4_step, 4), (dormand_prince_step, 5)])
+def test_explicit_steps_have_their_order(step, order):
+    def error(count):
+        h, y = jnp.array(1.0 / count), (jnp.array(1.0), jnp.array(0.0))
+        for k in range(count):
+            y = step(lambda t, y: (y[1] * jnp.cos(t) * 0 + y[1], -y[0]), k * h, y, h)
+        return float(jnp.abs(y[0] - jnp.cos(1.0)))
+
+    assert order - 0.5 < np.log2(error(4) / error(8)) < order + 1.2
