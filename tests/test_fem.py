@@ -204,7 +204,7 @@ def test_answer_does_not_depend_on_the_load_steps():
 def test_a_path_has_small_residuals_and_needs_few_iterations():
     path = fem.solve_path(_ring(), air=jnp.linspace(0, 20 * kPa, 5))
     steps = [step for stats in path.stats for step in stats.steps]
-    assert path.status == fem.Status.ok and len(path) == 5
+    assert path.status == fem.Status.successful and len(path) == 5
     assert max(step.residual for step in steps) < 1e-8
     assert sum(step.iterations for step in steps) <= 20
     assert all(step.negative_eigenvalues == 0 for step in steps)

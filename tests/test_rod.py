@@ -262,6 +262,26 @@ def test_numbers_do_not_retrace_and_absent_forces_cost_nothing():
     assert size((R.Gravity(),)) > size(())
 
 
+TRACES = []
+
+
+class Clock(R.AbstractForce):
+    """Counts how often it is traced."""
+
+    def __call__(self, t, motion):
+        TRACES.append(t)
+        return 0 * motion.q * t
+
+
+def test_time_and_points_do_not_retrace():
+    rod, (q, v) = planar(), drawn_state(3)
+    for t in (0.0, 0.5, 1.0):
+        R.forward_dynamics(rod, q, v, (Clock(),), t=t)
+    assert len(TRACES) == 1
+    poses = [R.forward_kinematics(rod, q, [0.2, s]) for s in (0.5, 1.0)]
+    assert jnp.array_equal(poses[0][0], poses[1][0])
+
+
 # Bad input
 
 

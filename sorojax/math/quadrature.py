@@ -5,13 +5,13 @@ and enters a program as a constant.
 """
 
 import functools
-from typing import Any, TypeVar
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-Values = TypeVar("Values", np.ndarray, jax.Array)
+Values: TypeAlias = np.ndarray | jax.Array
 
 
 def legendre_values(s: Values, degree: int) -> Values:
@@ -58,7 +58,7 @@ def integration_rows(count: int, s: Values) -> Values:
 @functools.lru_cache(maxsize=64)
 def integration_matrix(count: int) -> np.ndarray:
     """Integrals from 0 to each Gauss node, (count, count)."""
-    return _frozen(integration_rows(count, gauss_legendre(count)[0]))
+    return _frozen(np.asarray(integration_rows(count, gauss_legendre(count)[0])))
 
 
 def _stack(rows: list) -> Any:

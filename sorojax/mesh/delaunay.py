@@ -1,7 +1,7 @@
 """Interior points of a plane mesh: hexagonal seeds smoothed over Delaunay triangles."""
 
 import numpy as np
-from scipy.spatial import Delaunay, cKDTree
+from scipy.spatial import Delaunay, KDTree
 
 from sorojax.mesh.outline import _GRADING, Outline
 from sorojax.sdf.base import AbstractSdf
@@ -21,7 +21,7 @@ class SizeField:
             np.add.at(count, lines.edges[:, end], 1)
         self.local = np.minimum(total / count, size)
         self.size = size
-        self.tree = cKDTree(lines.points)
+        self.tree = KDTree(lines.points)
 
     def __call__(self, p: np.ndarray) -> np.ndarray:
         distance, near = self.tree.query(p, k=min(6, self.tree.n))
@@ -36,7 +36,7 @@ class Guard:
     def __init__(self, lines: Outline):
         self.middle = lines.points[lines.edges].mean(axis=1)
         self.radius = 0.55 * lines.lengths
-        self.tree = cKDTree(self.middle)
+        self.tree = KDTree(self.middle)
 
     def push(self, p: np.ndarray) -> np.ndarray:
         """`p` moved to the nearest circle where it lies inside one."""
@@ -108,7 +108,9 @@ def check_edges(lines: Outline, points: np.ndarray, cells: np.ndarray) -> None:
     if not good.all():
         raise _lost(lines.points[lines.edges[~good][0]].mean(axis=0))
     if (count == 1).sum() != (lines.owner == 0).sum():
-        raise _lost(points[np.unique(sides[np.isin(sides @ [len(points), 1], keys[count == 1])])][0])
+        raise _lost(
+            points[np.unique(sides[np.isin(sides @ [len(points), 1], keys[count == 1])])][0]
+        )
 
 
 def _seeds(shape, lines: Outline, wanted: SizeField, guard: Guard) -> np.ndarray:
@@ -126,7 +128,7 @@ def _seeds(shape, lines: Outline, wanted: SizeField, guard: Guard) -> np.ndarray
         if level:
             fits &= h <= spacing * 1.23
         p, h = p[fits], h[fits]
-        others = cKDTree(np.concatenate([lines.points, kept]))
+        others = KDTree(np.concatenate([lines.points, kept]))
         p = p[others.query(p)[0] > 0.62 * h] if len(p) else p
         kept = np.concatenate([kept, p])
     moved = guard.push(kept) if len(kept) else kept
@@ -168,10 +170,16 @@ def _smooth(shape, points, cells, fixed: int, wanted: SizeField, guard: Guard):
     center = np.where(far[:, None], middle, center)
     weight = area / h**3
     total = np.bincount(cells.ravel(), np.repeat(weight, 3), len(points))
-    new = np.stack(
-        [np.bincount(cells.ravel(), np.repeat(weight * center[:, k], 3), len(points)) for k in (0, 1)],
-        axis=-1,
-    ) / np.maximum(total, 1e-300)[:, None]
+    new = (
+        np.stack(
+            [
+                np.bincount(cells.ravel(), np.repeat(weight * center[:, k], 3), len(points))
+                for k in (0, 1)
+            ],
+            axis=-1,
+        )
+        / np.maximum(total, 1e-300)[:, None]
+    )
     new = guard.push(new)
     keep = (total == 0) | (values(shape, new) > -0.2 * wanted(new))
     keep[:fixed] = True

@@ -60,5 +60,3 @@ def _reference_coordinates(mesh: Mesh, corners, points, iterations: int = 4):
         jac = np.einsum("pcad,pcai->pcid", dN, corners)
         xi = np.clip(xi + np.linalg.solve(jac, gap[..., None])[..., 0], -2, 3)
     return xi
-
-

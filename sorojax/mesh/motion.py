@@ -7,23 +7,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from sorojax._types import is_traced
+from sorojax._types import integers, is_traced
 from sorojax.math import sparse
 from sorojax.mesh.elements import Tri3, Tri6
 from sorojax.mesh.mesh import Mesh
 from sorojax.mesh.outline_plan import OutlinePlan, plan_outline
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.query import _shape_tangent, project, value_and_gradient
+from sorojax.sdf.query import project, shape_tangent, value_and_gradient
 
 Fields = tuple[AbstractSdf, ...]
 _ZOOMS = (0.3, 0.03, 3e-3, 1e-4, 1e-6)  # of an edge: where a corner's sides are seen
 
 
-def move(
-    mesh: Mesh, shape: AbstractSdf, *, interfaces: tuple[AbstractSdf, ...] = ()
-) -> Mesh:
+def move(mesh: Mesh, shape: AbstractSdf, *, interfaces: tuple[AbstractSdf, ...] = ()) -> Mesh:
     """`mesh` with its nodes moved to fit `shape`, differentiable in the parameters.
 
     Boundary and interface nodes move onto the new zero sets: corners to where their
@@ -51,42 +49,60 @@ def move(
         raise ValueError(f"move: got {mesh.element.name} cells, need Tri3 or Tri6.")
     plan, filling = _prepared(mesh, len(interfaces))
     displacement = _outline_displacement((shape, *interfaces), plan, mesh.points)
-    points = mesh.points + filling.spread(displacement)
+    points = mesh.points + _spread(filling, displacement)
     return eqx.tree_at(lambda m: m.points, mesh, points)
 
 
-class _Filling:
-    """Spreads displacements of the outline over the inside."""
+class _Filling(eqx.Module):
+    """The Laplace problem that spreads displacements of the outline over the inside."""
 
-    def __init__(self, mesh: Mesh, plan: OutlinePlan):
-        cells = np.asarray(mesh.cells)
-        vertices = np.unique(cells[:, :3])
-        number = np.full(mesh.num_nodes, -1)
-        number[vertices] = np.arange(len(vertices))
-        outline = np.concatenate([plan.corners, *(curve.nodes for curve in plan.curves)])
-        on_outline = np.zeros(mesh.num_nodes, bool)
-        on_outline[outline] = True
-        self.system = sparse.from_cells(len(vertices), number[cells[:, :3]])
-        stiffness = _laplace(np.asarray(mesh.points)[cells[:, :3]])
-        self.values = sparse.assemble(self.system, jnp.asarray(stiffness))
-        self.held = jnp.asarray(on_outline[vertices])
-        self.fixed_values = sparse.fix(self.system, self.values, self.held)
-        self.vertices = jnp.asarray(vertices)
-        ends, middles = _straight_middles(mesh, on_outline)
-        self.ends, self.middles = jnp.asarray(ends), jnp.asarray(middles)
+    system: sparse.SparseSymmetric
+    values: Float[Array, " nnz"]
+    fixed_values: Float[Array, " nnz"]
+    held: Bool[Array, " vertices"]
+    vertices: Int[Array, " vertices"] = eqx.field(converter=integers)
+    ends: Int[Array, "middles 2"] = eqx.field(converter=integers)
+    middles: Int[Array, " middles"] = eqx.field(converter=integers)
 
-    def spread(self, displacement: Float[Array, "nodes 2"]) -> Float[Array, "nodes 2"]:
-        """Displacement of all nodes from that of the outline (zero elsewhere)."""
 
-        def one(known):
-            pull = -sparse.product(self.system, self.values, known)
-            pull = jnp.where(self.held, jnp.zeros_like(pull), pull)
-            return known + sparse.solve(self.system, self.fixed_values, pull)
+def _filling(mesh: Mesh, plan: OutlinePlan) -> _Filling:
+    cells = np.asarray(mesh.cells)
+    vertices = np.unique(cells[:, :3])
+    number = np.full(mesh.num_nodes, -1)
+    number[vertices] = np.arange(len(vertices))
+    on_outline = np.zeros(mesh.num_nodes, bool)
+    on_outline[np.concatenate([plan.corners, *(c.nodes for c in plan.curves)])] = True
+    system = sparse.from_cells(len(vertices), number[cells[:, :3]])
+    stiffness = jnp.asarray(_laplace(np.asarray(mesh.points)[cells[:, :3]]))
+    held = jnp.asarray(on_outline[vertices])
+    values, fixed_values = _assembled(system, stiffness, held)
+    return _Filling(
+        system, values, fixed_values, held, vertices, *_straight_middles(mesh, on_outline)
+    )
 
-        inside = jax.vmap(one, 1, 1)(displacement[self.vertices])
-        everywhere = displacement.at[self.vertices].set(inside)
-        between = everywhere[self.ends].mean(axis=1)
-        return everywhere.at[self.middles].set(between)
+
+@eqx.filter_jit
+def _assembled(system, stiffness, held):
+    values = sparse.assemble(system, stiffness)
+    return values, sparse.fix(system, values, held)
+
+
+@eqx.filter_jit
+def _spread(
+    filling: _Filling, displacement: Float[Array, "nodes 2"]
+) -> Float[Array, "nodes 2"]:
+    """Displacement of all nodes from that of the outline (zero elsewhere)."""
+    system, held = filling.system, filling.held
+
+    def one(known):
+        pull = -sparse.product(system, filling.values, known)
+        pull = jnp.where(held, jnp.zeros_like(pull), pull)
+        return known + sparse.solve(system, filling.fixed_values, pull)
+
+    inside = jax.vmap(one, 1, 1)(displacement[filling.vertices])
+    everywhere = displacement.at[filling.vertices].set(inside)
+    between = everywhere[filling.ends].mean(axis=1)
+    return everywhere.at[filling.middles].set(between)
 
 
 def _laplace(x: np.ndarray) -> np.ndarray:
@@ -118,7 +134,7 @@ def _prepared(mesh: Mesh, num_interfaces: int) -> tuple[OutlinePlan, _Filling]:
         with jax.ensure_compile_time_eval():
             plan = plan_outline(mesh, num_interfaces)
             # The arrays are kept alive, so that their ids stay theirs.
-            _recent[key] = (plan, _Filling(mesh, plan), mesh.points, mesh.cells)
+            _recent[key] = (plan, _filling(mesh, plan), mesh.points, mesh.cells)
         if len(_recent) > 4:
             _recent.popitem(last=False)
     _recent.move_to_end(key)
@@ -150,7 +166,7 @@ def _meeting_points(
     zooms = jnp.asarray(_ZOOMS, start.dtype)
 
     def closer(i, x):
-        normals, levels, beside, _ = _sides_near(fields, plan, x, zooms[i])
+        normals, levels, _, beside, _ = _sides_near(fields, plan, x, zooms[i])
         return x + _least_squares(normals, levels, beside, len(x))
 
     return jax.lax.fori_loop(0, len(_ZOOMS), closer, start)
@@ -161,37 +177,32 @@ def _meeting_points_jvp(primals, tangents):
     fields, plan, start = primals
     x = _meeting_points(fields, plan, start)
     zoom = jnp.asarray(_ZOOMS[-1], start.dtype)
-    normals, _, beside, seen = _sides_near(fields, plan, x, zoom)
+    normals, _, slopes, beside, seen = _sides_near(fields, plan, x, zoom)
 
     def fields_at(fields):
-        pairs = [value_and_gradient(f, p) for f, p in zip(fields, seen, strict=True)]
-        return tuple(value for value, _ in pairs)
+        return tuple(f(p) for f, p in zip(fields, seen, strict=True))
 
-    slopes = [
-        jnp.sqrt(jnp.sum(value_and_gradient(f, p)[1] ** 2, axis=1))
-        for f, p in zip(fields, seen, strict=True)
-    ]
-    f_dot = jnp.concatenate(_shape_tangent(fields_at, fields, tangents[0]))
-    speed = -f_dot / jnp.concatenate(slopes)
-    return x, _least_squares(normals, speed, beside, len(x))
+    f_dot = jnp.concatenate(shape_tangent(fields_at, fields, tangents[0]))
+    return x, _least_squares(normals, -f_dot / slopes, beside, len(x))
 
 
 def _sides_near(fields: Fields, plan: OutlinePlan, x, zoom):
-    """Normals of the sides beside the corners `x`, and how far x is from their lines."""
-    normals, levels, seen = [], [], []
+    """Sides beside the corners `x`: normal, how far x is from its line, slope, place."""
+    sides, seen = [], []
     for field, curve in zip(fields, plan.curves, strict=True):
         at = x[curve.beside]
-        p = at + zoom * curve.along
-        for _ in range(3):
+
+        def land(_, p, field=field):
             f, g = value_and_gradient(field, p)
-            p = p - (f / jnp.sum(g * g, axis=1))[:, None] * g
+            return p - (f / jnp.sum(g * g, axis=1))[:, None] * g
+
+        p = jax.lax.fori_loop(0, 3, land, at + zoom * curve.along)
         _, g = value_and_gradient(field, p)
-        n = g / jnp.sqrt(jnp.sum(g * g, axis=1, keepdims=True))
-        normals.append(n)
-        levels.append(jnp.sum(n * (p - at), axis=1))
+        slope = jnp.sqrt(jnp.sum(g * g, axis=1))
+        n = g / slope[:, None]
+        sides.append((n, jnp.sum(n * (p - at), axis=1), slope, curve.beside))
         seen.append(p)
-    beside = jnp.concatenate([curve.beside for curve in plan.curves])
-    return jnp.concatenate(normals), jnp.concatenate(levels), beside, tuple(seen)
+    return *(jnp.concatenate(part) for part in zip(*sides, strict=True)), tuple(seen)
 
 
 def _least_squares(normals, levels, beside, count: int) -> Float[Array, "corners 2"]:

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sample import land, values, values_and_gradients
@@ -38,9 +38,7 @@ class Outline(NamedTuple):
         return np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
 
 
-def outline(
-    shape: AbstractSdf, interfaces: tuple[AbstractSdf, ...], size: float
-) -> Outline:
+def outline(shape: AbstractSdf, interfaces: tuple[AbstractSdf, ...], size: float) -> Outline:
     """Boundary of `shape` and the interfaces inside it, in edges of about `size` [m]."""
     fields = (shape, *interfaces)
     dense = size / 4
@@ -176,7 +174,7 @@ def _join(chains, size: float) -> Outline:
         start += n
     points, corner = np.concatenate(points), np.concatenate(corner)
     target = np.arange(len(points))
-    for a, b in sorted(cKDTree(points).query_pairs(_SAME * size)):
+    for a, b in sorted(KDTree(points).query_pairs(_SAME * size)):
         target[b] = target[a]
     used, numbers = np.unique(target, return_inverse=True)
     shared = np.zeros(len(points), bool)
@@ -226,7 +224,7 @@ def _crowded(lines: Outline) -> np.ndarray:
         neighbours[a].add(b)
         neighbours[b].add(a)
     middle, length = points[edges].mean(axis=1), lines.lengths
-    near = cKDTree(points).query_ball_point(middle, _CROWD * length)
+    near = KDTree(points).query_ball_point(middle, _CROWD * length)
     crowded = np.zeros(len(edges), bool)
     for k, (a, b) in enumerate(edges):
         for p in set(near[k]) - {a, b}:

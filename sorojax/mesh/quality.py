@@ -42,11 +42,13 @@ def quality(mesh: Mesh) -> Quality:
     x = np.asarray(mesh.points)[np.asarray(mesh.cells)[:, :3]]
     side = np.linalg.norm(np.roll(x, -1, axis=1) - x, axis=2)
     a, b, c = side.T
-    cosine = np.stack([
-        (b * b + c * c - a * a) / (2 * b * c),
-        (c * c + a * a - b * b) / (2 * c * a),
-        (a * a + b * b - c * c) / (2 * a * b),
-    ])
+    cosine = np.stack(
+        [
+            (b * b + c * c - a * a) / (2 * b * c),
+            (c * c + a * a - b * b) / (2 * c * a),
+            (a * a + b * b - c * c) / (2 * a * b),
+        ]
+    )
     angle = np.arccos(np.clip(cosine, -1, 1))
     ratio = (b + c - a) * (c + a - b) * (a + b - c) / (a * b * c)
     total = float(jnp.sum(cell_areas(mesh)))

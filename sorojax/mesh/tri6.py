@@ -13,8 +13,8 @@ def with_middles(
     sides = np.sort(np.concatenate([cells[:, list(c)] for c in corners]), axis=1)
     n = len(points)
     keys, number = np.unique(sides @ [n, 1], return_inverse=True)
-    first, second = keys // n, keys % n
-    middles = (points[first] + points[second]) / 2
+    ends = np.stack(np.divmod(keys, n), axis=-1)
+    middles = points[ends].mean(axis=1)
     columns = n + number.reshape(3, -1).T
     on_edges = n + np.searchsorted(keys, np.sort(edges, axis=1) @ [n, 1])
     return np.concatenate([points, middles]), np.concatenate([cells, columns], 1), on_edges

@@ -4,12 +4,12 @@ These are doors: each compiles once per structure of the rod and its forces. Loo
 `motion`, `inertia` and `total_force` directly, with `operators` taken outside.
 """
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax._types import real
 from sorojax.math.dense import solve_symmetric
+from sorojax.math.door import door
 from sorojax.rod import forces as rod_forces
 from sorojax.rod.forces import AbstractForce
 from sorojax.rod.kinematics import inertia, motion
@@ -20,19 +20,19 @@ Coordinates = Float[Array, " dof"]
 Forces = tuple[AbstractForce, ...]
 
 
-@eqx.filter_jit
+@door
 def mass_matrix(rod: Rod, q: Coordinates) -> Float[Array, "dof dof"]:
     """Inertia of the rod in its coordinates."""
     return inertia(motion(rod, q))[0]
 
 
-@eqx.filter_jit
+@door
 def coriolis_force(rod: Rod, q: Coordinates, v: Coordinates) -> Coordinates:
     """C(q, v) v: what velocity alone adds to the left of the equations of motion."""
     return inertia(motion(rod, q, v))[1]
 
 
-@eqx.filter_jit
+@door
 def gravity_force(rod: Rod, q: Coordinates, gravity=None) -> Coordinates:
     """Gradient of the gravitational energy, on the left of the equations of motion.
 
@@ -44,32 +44,32 @@ def gravity_force(rod: Rod, q: Coordinates, gravity=None) -> Coordinates:
     return -rod_forces.Gravity(gravity)(_zero(q), motion(rod, q))
 
 
-@eqx.filter_jit
+@door
 def bias_force(rod: Rod, q: Coordinates, v: Coordinates, gravity=None) -> Coordinates:
     """C(q, v) v + g(q), what a computed-torque controller cancels."""
     moment = motion(rod, q, v)
     return inertia(moment)[1] - rod_forces.Gravity(gravity)(_zero(q), moment)
 
 
-@eqx.filter_jit
+@door
 def stiffness_matrix(rod: Rod) -> Float[Array, "dof dof"]:
     """Stiffness of the rod's own linear elasticity."""
     return operators(rod).stiffness
 
 
-@eqx.filter_jit
+@door
 def elastic_force(rod: Rod, q: Coordinates) -> Coordinates:
     """K q, on the left of the equations of motion."""
     return operators(rod).stiffness @ q
 
 
-@eqx.filter_jit
+@door
 def damping_matrix(rod: Rod, forces: Forces) -> Float[Array, "dof dof"]:
     """Sum of the damping terms among `forces`."""
     return rod_forces.damping_matrix(forces, operators(rod).stiffness)
 
 
-@eqx.filter_jit
+@door
 def forward_dynamics(
     rod: Rod,
     q: Coordinates,
@@ -108,7 +108,7 @@ def acceleration(
     return solve_symmetric(mass, rod_forces.total_force(forces, t, moment) - coriolis)
 
 
-@eqx.filter_jit
+@door
 def inverse_dynamics(
     rod: Rod, q: Coordinates, v: Coordinates, a: Coordinates, forces: Forces = (), *, t=0.0
 ) -> Coordinates:
@@ -118,13 +118,13 @@ def inverse_dynamics(
     return mass @ a + coriolis - rod_forces.total_force(forces, real(t), moment)
 
 
-@eqx.filter_jit
+@door
 def kinetic_energy(rod: Rod, q: Coordinates, v: Coordinates) -> Float[Array, ""]:
     """v' M v / 2 [J]."""
     return v @ mass_matrix(rod, q) @ v / 2
 
 
-@eqx.filter_jit
+@door
 def potential_energy(rod: Rod, q: Coordinates, gravity=None) -> Float[Array, ""]:
     """Linear elastic energy [J], and that of the weight in `gravity` [m/s^2] if given."""
     moment = motion(rod, q)

@@ -1,11 +1,11 @@
 """Where the rod is: strains, poses, Jacobians."""
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import real
+from sorojax.math.door import door
 from sorojax.math.lie import homogeneous
 from sorojax.math.quadrature import integration_rows
 from sorojax.rod import planar, spatial
@@ -44,7 +44,7 @@ def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof
     return _KERNEL[moment.rod.group.space_dim].inertia(moment)
 
 
-@eqx.filter_jit
+@door
 def strain(rod: Rod, q: Float[Array, " dof"], s=None) -> Float[Array, "points strain"]:
     """Strain of the section: curvatures [1/m], then stretch and shears [-].
 
@@ -65,7 +65,7 @@ def strain(rod: Rod, q: Float[Array, " dof"], s=None) -> Float[Array, "points st
     return jnp.stack(parts, axis=1)
 
 
-@eqx.filter_jit
+@door
 def forward_kinematics(rod: Rod, q: Float[Array, " dof"], s=None) -> Float[Array, "points h h"]:
     """Poses of the sections: local to base frame, positions in m.
 
@@ -81,13 +81,13 @@ def forward_kinematics(rod: Rod, q: Float[Array, " dof"], s=None) -> Float[Array
     return homogeneous(_directors_at(moment, rows), rows @ moment.tangent)
 
 
-@eqx.filter_jit
+@door
 def tip_pose(rod: Rod, q: Float[Array, " dof"]) -> Float[Array, "h h"]:
     """Pose of the last section: local to base frame, position in m."""
     return forward_kinematics(rod, q, jnp.ones(1, q.dtype))[0]
 
 
-@eqx.filter_jit
+@door
 def jacobian(rod: Rod, q: Float[Array, " dof"], s=None) -> Float[Array, "points twist dof"]:
     """Twists of the sections per coordinate rate, angular velocity first, world frame.
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sorojax._types import real
+from sorojax.math.door import door
 from sorojax.math.status import Status
 from sorojax.rod.forces import AbstractForce, total_force
 from sorojax.rod.kinematics import motion
@@ -25,7 +26,7 @@ class Equilibrium(eqx.Module):
     num_iterations: Int[Array, ""]
 
 
-@eqx.filter_jit
+@door
 def equilibrium(
     rod: Rod,
     forces: tuple[AbstractForce, ...] = (),

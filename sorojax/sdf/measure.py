@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.query import _shape_tangent
+from sorojax.sdf.query import shape_tangent
 from sorojax.sdf.sample import finite_box, raise_empty, values, values_and_gradients
 
 _COARSE = 64
@@ -46,7 +46,7 @@ def _moments_jvp(primals, tangents):
     (shape,), (shape_dot,) = primals, tangents
     moments, points, weights = _integrate(shape)
     p = jnp.asarray(points, dtype=jnp.result_type(float))
-    f_dot = _shape_tangent(lambda s: s(p), shape, shape_dot)
+    f_dot = shape_tangent(lambda s: s(p), shape, shape_dot)
     density = jnp.asarray(
         np.concatenate([np.ones((len(points), 1)), points], axis=1), dtype=p.dtype
     )

@@ -1,5 +1,7 @@
 """What a shape can be asked at points: slope, normal, closest point."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,9 +24,7 @@ def gradient(shape: AbstractSdf, p: Points) -> Points:
     return value_and_gradient(shape, real(p))[1]
 
 
-def value_and_gradient(
-    shape: AbstractSdf, p: Points
-) -> tuple[Float[Array, "*points"], Points]:
+def value_and_gradient(shape: AbstractSdf, p: Points) -> tuple[Float[Array, "*points"], Points]:
     """Field [m] and slope [-] at `p` by one forward pass per axis."""
     shape = cast(shape, p.dtype)
     x = tuple(p[..., i] for i in range(shape.dim))
@@ -46,79 +46,60 @@ def normal(shape: AbstractSdf, p: Points) -> Points:
 def project(shape: AbstractSdf, p: Points) -> Points:
     """Closest point of the surface of `shape` to `p` [m], by Newton's method.
 
-    Differentiable in the shape and in `p` by the implicit-function rule, exactly
-    where the surface is smooth; a point that starts on the surface moves by
-    -(df/dtheta) grad f / |grad f|^2 with a parameter theta. At an edge the derivative
-    is that of one of the two sides.
+    Steps p <- p - f grad f / |grad f|^2 until the field vanishes; where the field is
+    not an exact distance the result is the closest point to first order in the
+    distance. Differentiable in the shape and in `p` by the implicit-function rule: a
+    point that starts on the surface moves by -(df/dtheta) grad f / |grad f|^2 with a
+    parameter theta. Away from the surface of an inexact field the derivative along
+    the surface is approximate; at an edge it is that of one of the two sides.
 
     Args:
         shape: Any shape; `p` should lie within the radius of curvature of its surface.
         p: Points [m].
     """
     p = real(p)
-    flat = p.reshape(-1, p.shape[-1])
-    return jax.vmap(_project_one, (None, 0))(cast(shape, p.dtype), flat).reshape(p.shape)
+    return _project(cast(shape, p.dtype), p.reshape(-1, p.shape[-1])).reshape(p.shape)
 
 
-def _hessian(shape: AbstractSdf, p: Float[Array, " dim"]) -> Float[Array, "dim dim"]:
-    return jax.jacfwd(lambda q: value_and_gradient(shape, q)[1])(p)
-
-
-def _foot_system(shape, p, x):
-    """Matrix and residual of x + lam grad f(x) = p, f(x) = 0, and its lam."""
-    f, g = value_and_gradient(shape, x)
-    lam = quotient(jnp.sum((p - x) * g), jnp.sum(g * g))
-    eye = jnp.eye(x.size, dtype=x.dtype)
-    upper = jnp.concatenate([eye + lam * _hessian(shape, x), g[:, None]], axis=1)
-    lower = jnp.concatenate([g, jnp.zeros_like(g[:1])])[None]
-    residual = jnp.concatenate([x + lam * g - p, f[None]])
-    return jnp.concatenate([upper, lower]), residual, lam
+def _newton_point(shape, p):
+    f, g = value_and_gradient(shape, p)
+    return p - quotient(f, jnp.sum(g * g, axis=-1))[..., None] * g
 
 
 @eqx.filter_custom_jvp
-def _project_one(shape: AbstractSdf, p: Float[Array, " dim"]) -> Float[Array, " dim"]:
+def _project(shape: AbstractSdf, p: Float[Array, "points dim"]) -> Float[Array, "points dim"]:
     tiny = 4 * jnp.finfo(p.dtype).eps
 
     def descend(state):
         x, _, count = state
-        f, g = value_and_gradient(shape, x)
-        dx = -quotient(f, jnp.sum(g * g)) * g
-        size = jnp.max(jnp.abs(x)) + jnp.max(jnp.abs(p))
-        return x + dx, jnp.max(jnp.abs(dx)) > tiny * size, count + 1
+        new = _newton_point(shape, x)
+        far = jnp.max(jnp.abs(new - x)) > tiny * jnp.max(jnp.abs(x))
+        return new, far, count + 1
 
-    x, _, _ = jax.lax.while_loop(
-        lambda state: state[1] & (state[2] < 30), descend, (p, jnp.array(True), 0)
-    )
-
-    def straighten(_, x):
-        matrix, before, _ = _foot_system(shape, p, x)
-        new = x - jnp.linalg.solve(matrix, before)[: p.size]
-        after = _foot_system(shape, p, new)[1]
-        # Fields that are exact distances are there already; others gain a closest point.
-        better = jnp.sum(after**2) < jnp.sum(before**2)
-        return jnp.where(better, new, x)
-
-    return jax.lax.fori_loop(0, 4, straighten, x)
+    start = (p, jnp.array(p.size > 0), 0)
+    return jax.lax.while_loop(lambda s: s[1] & (s[2] < 30), descend, start)[0]
 
 
-@_project_one.def_jvp
-def _project_one_jvp(primals, tangents):
+@_project.def_jvp
+def _project_jvp(primals, tangents):
     shape, p = primals
     shape_dot, p_dot = tangents
-    x = _project_one(shape, p)
-    matrix, _, lam = _foot_system(shape, p, x)
+    x = _project(shape, p)
+    # Across the surface: it stays on the zero set.
+    _, g = value_and_gradient(shape, x)
+    square = jnp.sum(g * g, axis=1)
+    f_dot = shape_tangent(lambda s: s(x), shape, shape_dot)
+    across = -quotient(f_dot, square)[:, None] * g
+    # Along the surface: as one Newton step does, which is all an exact distance needs.
+    along = shape_tangent(lambda a: _newton_point(*a), (shape, p), (shape_dot, p_dot))
+    slip = quotient(jnp.sum(along * g, axis=1), square)
+    return x, across + along - slip[:, None] * g
 
-    def field(shape):
-        return value_and_gradient(shape, x)
 
-    f_dot, g_dot = _shape_tangent(field, shape, shape_dot)
-    p_dot = jnp.zeros_like(p) if p_dot is None else p_dot
-    rhs = jnp.concatenate([p_dot - lam * g_dot, -f_dot[None]])
-    return x, jnp.linalg.solve(matrix, rhs)[: p.size]
-
-
-def _shape_tangent(function, shape: AbstractSdf, shape_dot):
+def shape_tangent(function, shape: Any, shape_dot: Any):
     """Directional derivative of `function(shape)` along `shape_dot` (None: fixed leaf)."""
+    if all(dot is None for dot in jax.tree.leaves(shape_dot, is_leaf=lambda d: d is None)):
+        return jax.tree.map(jnp.zeros_like, function(shape))
     moving = jax.tree.map(lambda dot: dot is not None, shape_dot, is_leaf=lambda d: d is None)
     varied, held = eqx.partition(shape, moving)
     _, dots = jax.jvp(lambda s: function(eqx.combine(s, held)), (varied,), (shape_dot,))

@@ -105,10 +105,12 @@ def _with_corners(shape, points, normals, size, closed) -> Curve:
     last = len(points) if closed else len(points) - 1
     first = np.arange(last)
     second = (first + 1) % len(points)
-    turn = np.abs(np.arctan2(
-        cross(normals[first], normals[second]),
-        (normals[first] * normals[second]).sum(axis=1),
-    ))
+    turn = np.abs(
+        np.arctan2(
+            cross(normals[first], normals[second]),
+            (normals[first] * normals[second]).sum(axis=1),
+        )
+    )
     first, second = first[turn > _TURN], second[turn > _TURN]
     found, corners = locate_corners(
         shape, points[first], points[second], normals[first], normals[second]

@@ -1,5 +1,6 @@
 """Shapes moved, scaled, thickened, hollowed and repeated."""
 
+import functools
 import math
 
 import equinox as eqx
@@ -161,24 +162,25 @@ class Repeated(AbstractWrapped):
         return self.shape.exact and self.separate
 
     def distance(self, *x):
-        copies = range(self.count)
+        zero = jnp.zeros_like(x[0])
         if 2 * self.reach + 1 >= self.count:
-            return self._nearest(x, [jnp.full_like(x[0], i) for i in copies])
-        lower, upper = self.shape.bounding_box()
-        center = (lower + upper) / 2
-        along = sum((c - center[i]) * self.step[i] for i, c in enumerate(x))
-        cell = jnp.round(along / jnp.sum(self.step**2))
-        # The end copies come again, not new ones beyond the array.
-        near = (cell + i for i in range(-self.reach, self.reach + 1))
-        return self._nearest(x, [jnp.clip(i, 0, self.count - 1) for i in near])
-
-    def _nearest(self, x, indices):
-        result = None
-        for index in indices:
-            local = (c - index * self.step[i] for i, c in enumerate(x))
-            value = self.shape.distance(*local)
-            result = value if result is None else minimum(result, value)
-        return result
+            cells = [zero + i for i in range(self.count)]
+        else:
+            lower, upper = self.shape.bounding_box()
+            center = (lower + upper) / 2
+            along = sum((c - center[i]) * self.step[i] for i, c in enumerate(x))
+            cell = along / jnp.sum(self.step**2)
+            if self.separate:  # the copies on either side hold the closest one
+                near = [jnp.floor(cell), jnp.floor(cell) + 1]
+            else:
+                near = [jnp.round(cell) + i for i in range(-self.reach, self.reach + 1)]
+            # The end copies come again, not new ones beyond the array.
+            cells = [jnp.clip(i, 0, self.count - 1) for i in near]
+        # One evaluation over a leading axis: the program stays as small as one copy.
+        index = jnp.stack(cells)
+        local = (c[None] - index * self.step[i] for i, c in enumerate(x))
+        values = self.shape.distance(*local)
+        return functools.reduce(minimum, (values[i] for i in range(len(cells))))
 
     def bounding_box(self) -> Box:
         lower, upper = self.shape.bounding_box()

@@ -104,7 +104,7 @@ def as_term(network: AbstractBlock, inputs: Signals | None = None) -> dfx.ODETer
     return dfx.ODETerm(field)
 
 
-def at_time(inputs: Mapping[str, Any], t: Float[Array, ""]) -> Signals:
+def at_time(inputs: Mapping[str, Any], t: Float[Array, ""]) -> dict[str, Any]:
     """Values at `t` of inputs given as values or as functions of time."""
     values: dict[str, Any] = dict(inputs)
     return {name: x(t) if callable(x) else x for name, x in values.items()}

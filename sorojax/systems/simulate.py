@@ -82,7 +82,7 @@ def simulate(
     if step is None:
         solver = dfx.Tsit5() if solver is None else solver
         adjoint = dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
-        control = dfx.PIDController(rtol=rtol, atol=atol)
+        control = dfx.PIDController(rtol=real(rtol), atol=real(atol))
         film = _adaptive(network, state, supplied, time, solver, control, max_steps, adjoint)
     else:
         substeps = _substeps(duration, save, step)

@@ -1,0 +1,223 @@
+"""Figures of shapes, meshes and deformed bodies."""
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from sorojax import fem
+from sorojax.fem import Path, Problem
+from sorojax.mesh import Mesh, boundary_facets
+from sorojax.sdf import AbstractSdf, contour
+from sorojax.sdf.sample import finite_box, values
+from sorojax.view import style
+from sorojax.view.drawing import as_path, box, cell_rings, flat_triangles, loops
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+NodalField = Callable[[Problem, Float[Array, "nodes dim"]], Float[Array, " nodes"]]
+
+
+@eqx.filter_jit
+def nodal_von_mises(
+    problem: Problem, u: Float[Array, "nodes dim"]
+) -> Float[Array, " nodes"]:
+    """Von Mises stress at the nodes, averaged between cells [kPa]."""
+    return fem.nodal_average(problem, fem.von_mises_stress(problem, u)) / 1e3
+
+
+def show_deformed(
+    path: Path,
+    states: Sequence[int] | None = None,
+    *,
+    field: NodalField | None = None,
+    label: str = "von Mises stress [kPa]",
+    title: str = "",
+) -> "Figure":
+    """Deformed shapes along a load path, one panel each, the rest shape in grey.
+
+    Colours share one scale that ends at the 99.5th percentile of what is shown, so that
+    a peak in a corner does not wash the picture out; the bar says so by an arrow.
+
+    Args:
+        path: From `fem.solve_path`.
+        states: Which states of the path; six evenly spaced loaded ones if omitted.
+        field: `field(problem, u)` gives the value at every node; von Mises in kPa if
+            omitted.
+        label: Name and unit of the field.
+        title: Title of the figure.
+    """
+    triangles = flat_triangles("show_deformed", path.problem.mesh)
+    field = nodal_von_mises if field is None else field
+    chosen = _chosen_states(path, states)
+    rest = 1e3 * np.asarray(path.problem.mesh.points)
+    shapes = [rest + 1e3 * np.asarray(path.displacements[k]) for k in chosen]
+    colours = [np.asarray(field(path.problem, path.displacements[k])) for k in chosen]
+    low, high, extend = _robust_limits(np.stack(colours))
+    lower, upper = box(rest, *shapes)
+    figure, panels = _panels(len(chosen), float((upper - lower)[1] / (upper - lower)[0]))
+    rings = loops(boundary_facets(path.problem.mesh))
+    painted = None
+    for panel, k, points, colour in zip(panels, chosen, shapes, colours, strict=True):
+        _outline(panel, rest, rings, style.GREY, 0.7)
+        painted = panel.tripcolor(
+            points[:, 0], points[:, 1], triangles, colour,
+            shading="gouraud", cmap=style.FIELD, vmin=low, vmax=high, rasterized=True,
+        )  # fmt: skip
+        _outline(panel, points, rings, style.INK, 0.5)
+        style.dress_plane(panel, lower, upper)
+        panel.set_title(_state_name(path, k), fontsize=style.LABEL, color=style.INK)
+        panel.label_outer()
+    note = " (arrow: the highest 0.5 %)" if extend == "max" else ""
+    style.colour_bar(
+        figure, painted, panels, label + note, extend=extend, shrink=0.9, aspect=30, pad=0.02
+    )
+    style.title(figure, title)
+    return figure
+
+
+def show_mesh(
+    mesh: Mesh,
+    field: Float[Any, " values"] | None = None,
+    *,
+    label: str = "",
+    title: str = "",
+) -> "Figure":
+    """The cells of a plane mesh, coloured by a value per node or per cell if given."""
+    from matplotlib.collections import PolyCollection
+
+    triangles = flat_triangles("show_mesh", mesh)
+    points = 1e3 * np.asarray(mesh.points)
+    lower, upper = box(points)
+    figure = style.new_figure(9.0, _height(9.0, lower, upper))
+    axes = figure.add_subplot()
+    if field is None:
+        faces = "#e8f1f8"
+    else:
+        faces = "none"
+        _paint(figure, axes, mesh, points, triangles, np.asarray(field), label)
+    cells = PolyCollection(
+        points[cell_rings(mesh)], facecolors=faces, edgecolors=style.GREY, linewidths=0.3
+    )  # pyright: ignore[reportArgumentType]
+    axes.add_collection(cells, autolim=False)
+    _outline(axes, points, loops(boundary_facets(mesh)), style.INK, 0.9)
+    style.dress_plane(axes, lower, upper)
+    count = f"{mesh.num_cells} cells {mesh.element.name}, {mesh.num_nodes} nodes"
+    style.title(figure, title or count)
+    return figure
+
+
+def show_sdf(shape: AbstractSdf, *, resolution: int = 300, title: str = "") -> "Figure":
+    """A plane shape: filled contours of its distance and the zero set as a line."""
+    lower, upper = finite_box("show_sdf", shape, 2)
+    step = float(np.max(upper - lower)) / resolution
+    margin = 0.06 * resolution * step
+    ranges = zip(lower - margin, upper + margin + step, strict=True)
+    x, y = np.meshgrid(*(np.arange(low, high, step) for low, high in ranges))
+    f = 1e3 * values(shape, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
+    figure = style.new_figure(9.0, _height(9.0, lower - margin, upper + margin))
+    axes = figure.add_subplot()
+    norm, levels = _two_sided(float(f.min()), float(f.max()))
+    filled = axes.contourf(1e3 * x, 1e3 * y, f, levels=levels, cmap="RdBu_r", norm=norm)
+    for curve in contour(shape, 2 * step):
+        axes.plot(*_closed(1e3 * curve.points, curve.closed).T, color=style.INK, lw=1.5)
+    style.dress_plane(axes, 1e3 * lower, 1e3 * upper)
+    style.colour_bar(
+        figure, filled, axes, "signed distance [mm]", format="%g", shrink=0.9, pad=0.02,
+        ticks=levels[::2] if len(levels) > 12 else levels, spacing="uniform",
+    )  # fmt: skip
+    style.title(figure, title)
+    return figure
+
+
+def _two_sided(low: float, high: float) -> tuple[Any, np.ndarray]:
+    """Colours and round levels on each side of zero, where the depths may differ a lot."""
+    from matplotlib.colors import TwoSlopeNorm
+    from matplotlib.ticker import MaxNLocator
+
+    inside = MaxNLocator(6).tick_values(min(low, -1e-9), 0.0)
+    outside = MaxNLocator(6).tick_values(0.0, max(high, 1e-9))
+    levels = np.concatenate([inside[inside < 0], outside[outside >= 0]])
+    return TwoSlopeNorm(0.0, levels[0], levels[-1]), levels
+
+
+def _closed(points: np.ndarray, closed: bool) -> np.ndarray:
+    return np.concatenate([points, points[:1]]) if closed else points
+
+
+def _chosen_states(path: Path, states: Sequence[int] | None) -> list[int]:
+    last = len(path) - 1
+    if states is None:
+        return np.unique(np.round(np.linspace(0, last, 7)).astype(int))[-6:].tolist()
+    wrong = [k for k in states if not -last - 1 <= k <= last]
+    if wrong or not states:
+        raise ValueError(
+            f"show_deformed: `states` is {list(states)}, the path has states 0 to {last}. "
+            "Choose one or more of them."
+        )
+    return [k % (last + 1) for k in states]
+
+
+def _robust_limits(colours: np.ndarray) -> tuple[float, float, str]:
+    """Limits of the colour scale and which ends of it are cut."""
+    low, high = float(colours.min()), float(np.percentile(colours, 99.5))
+    if low >= 0:
+        low = 0.0
+    if high <= low:
+        return low, low + 1.0, "neither"
+    return low, high, "max" if colours.max() > high else "neither"
+
+
+def _state_name(path: Path, k: int) -> str:
+    load = next(load for load in path.problem.loads if load.name == path.name)
+    value = np.asarray(path.values[k])
+    if value.ndim:
+        return f"state {k}"
+    if isinstance(load, fem.Pressure):
+        return f"{float(value) / 1e3:.3g} kPa"
+    return f"{path.name} = {float(value):.3g}"
+
+
+def _panels(count: int, aspect: float) -> "tuple[Figure, list[Axes]]":
+    """Small multiples, wide bodies in two columns, others in three."""
+    columns = min(count, 2 if aspect < 0.4 else 3)
+    rows = -(-count // columns)
+    width = 10.0
+    height = 0.7 + rows * (0.35 + aspect * (width - 1.4) / columns)
+    figure = style.new_figure(width, min(height, 12.0))
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+    for spare in grid[count:]:
+        spare.remove()
+    return figure, list(grid[:count])
+
+
+def _height(width: float, lower: np.ndarray, upper: np.ndarray) -> float:
+    span = upper - lower
+    return float(np.clip(1.2 + 0.8 * width * span[1] / span[0], 2.6, 9.0))
+
+
+def _outline(axes: "Axes", points: np.ndarray, rings: list, colour: str, width: float) -> None:
+    from matplotlib.patches import PathPatch
+
+    line = PathPatch(as_path(points, rings), fill=False, edgecolor=colour, linewidth=width)
+    axes.add_patch(line)
+
+
+def _paint(figure, axes, mesh: Mesh, points, triangles, field: np.ndarray, label: str) -> None:
+    if field.shape == (mesh.num_nodes,):
+        options = {"shading": "gouraud"}
+    elif field.shape == (mesh.num_cells,):
+        field, options = np.tile(field, len(triangles) // mesh.num_cells), {"shading": "flat"}
+    else:
+        raise ValueError(
+            f"show_mesh: `field` has shape {field.shape}, need one value per node, "
+            f"({mesh.num_nodes},), or per cell, ({mesh.num_cells},)."
+        )
+    painted = axes.tripcolor(
+        points[:, 0], points[:, 1], triangles, field, cmap=style.FIELD, **options
+    )
+    style.colour_bar(figure, painted, axes, label, shrink=0.8, pad=0.02)
