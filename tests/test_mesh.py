@@ -163,3 +163,5 @@ def test_messages_name_the_remedy(coarse):
         M.triangulate(ring(), size=0.2, interfaces=(sdf.HalfPlane([0, 5], [0, 1]),))
     with pytest.raises(ValueError, match="same order"):
         M.move(coarse, ring(), interfaces=(LAYER,))
+    with pytest.raises(ValueError, match="triangulate the new shape"):
+        M.move(coarse, ring(0.95))

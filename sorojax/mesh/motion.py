@@ -16,9 +16,10 @@ from sorojax.mesh.mesh import Mesh
 from sorojax.mesh.outline_plan import OutlinePlan, plan_outline
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.query import project, shape_tangent, value_and_gradient
+from sorojax.sdf.surface import cross
 
 Fields = tuple[AbstractSdf, ...]
-_ZOOMS = (0.3, 0.03, 3e-3, 1e-4, 1e-6)  # of an edge: where a corner's sides are seen
+_ZOOMS = (0.9, 0.3, 0.03, 3e-3, 1e-4, 1e-6)  # of an edge: where a corner's sides are seen
 
 
 def move(mesh: Mesh, shape: AbstractSdf, *, interfaces: tuple[AbstractSdf, ...] = ()) -> Mesh:
@@ -29,8 +30,8 @@ def move(mesh: Mesh, shape: AbstractSdf, *, interfaces: tuple[AbstractSdf, ...] 
     point. Interior nodes follow by one Laplace solve with the stiffness of `mesh`;
     interior sides stay straight. A mesh moved to its own shape stays as it is.
 
-    The topology does not change: corners should move by less than a third of an edge
-    length per call from the mesh given, or `triangulate` anew.
+    The topology does not change: corners should move by less than half of the edges
+    beside them from where they are in `mesh`; beyond that, `triangulate` anew.
 
     Args:
         mesh: A concrete mesh from `triangulate`.
@@ -38,7 +39,8 @@ def move(mesh: Mesh, shape: AbstractSdf, *, interfaces: tuple[AbstractSdf, ...] 
         interfaces: The new interfaces, in the order given to `triangulate`.
 
     Raises:
-        ValueError: If the mesh is traced, not made of triangles, or has other interfaces.
+        ValueError: If the mesh is traced, not made of triangles, has other interfaces, or
+            (outside a trace) if a cell would turn inside out.
     """
     if is_traced(mesh):
         raise ValueError(
@@ -50,7 +52,20 @@ def move(mesh: Mesh, shape: AbstractSdf, *, interfaces: tuple[AbstractSdf, ...] 
     plan, filling = _prepared(mesh, len(interfaces))
     displacement = _outline_displacement((shape, *interfaces), plan, mesh.points)
     points = mesh.points + _spread(filling, displacement)
+    if not is_traced(points):
+        _check_upright(np.asarray(points), np.asarray(mesh.cells))
     return eqx.tree_at(lambda m: m.points, mesh, points)
+
+
+def _check_upright(points: np.ndarray, cells: np.ndarray) -> None:
+    a, b, c = (points[cells[:, i]] for i in range(3))
+    doubled = cross(b - a, c - a)
+    if not np.all(doubled > 0):
+        where = points[cells[np.argmin(np.nan_to_num(doubled, nan=-np.inf))]].mean(axis=0)
+        raise ValueError(
+            f"move: a cell turns inside out near {where} m: the shape changes by more than "
+            "this mesh can follow. Change it less, or triangulate the new shape."
+        )
 
 
 class _Filling(eqx.Module):

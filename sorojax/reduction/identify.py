@@ -27,7 +27,7 @@ from sorojax.fem.stress import enclosed_volume
 from sorojax.math import sparse
 from sorojax.mesh.shape import quadrature, shape_functions
 from sorojax.reduction.backbone import Backbone, Line, Probe, line_strain, probe
-from sorojax.reduction.pod import coordinates
+from sorojax.reduction.pod import coordinates, project
 from sorojax.rod import (
     AbstractDamping,
     AbstractPressureMap,
@@ -54,6 +54,7 @@ class PressureMap(AbstractPressureMap):
     force: Float[Array, "powers dof"] = eqx.field(converter=real)
     walls: Float[Array, " powers"] = eqx.field(converter=real)
     scale: Float[Array, ""] = eqx.field(converter=real)
+    ports: tuple[int, ...] = eqx.field(static=True, default=())
 
     def coenergy(self, q: Float[Array, " dof"], pressure: Float[Array, ""]) -> Float[Array, ""]:
         x = pressure / self.scale
@@ -124,7 +125,7 @@ def identify(
     volumes, condensed = [], []
     for u, value in zip(path.displacements, path.values, strict=True):
         here = eqx.tree_at(lambda problem: problem.loads[index].value, problem, value)
-        condensed.append(_condensed_stiffness(here, u, at, basis, backbone))
+        condensed.append(_condensed_stiffness(here, u, at, basis))
         volumes.append(float(enclosed_volume(problem, u, load.facets)))
     K, C = _affine(p, np.stack(condensed))
     pressure = _pressure_map(p, q, np.array(volumes), K, C, degree)
@@ -149,10 +150,10 @@ def _pressure(path: Path) -> Pressure:
 
 
 def _condensed_stiffness(
-    problem: Problem, u: Array, at: Probe, basis: StrainBasis, backbone: Backbone
+    problem: Problem, u: Array, at: Probe, basis: StrainBasis
 ) -> Float[np.ndarray, "dof dof"]:
     """Stiffness against generalised forces on q at an equilibrium: (H K^-1 H')^-1."""
-    H = _coordinate_jacobian(at, basis, backbone, u).reshape(basis.num_dof, -1)
+    H = _coordinate_jacobian(at, basis, u).reshape(basis.num_dof, -1)
     prepared = prepare(problem)
     tangent = linearise(problem, prepared, u, u).values
     matrix = sparse.fix(problem.space.system, tangent, prepared.known)
@@ -163,13 +164,8 @@ def _condensed_stiffness(
 
 
 @eqx.filter_jit
-def _coordinate_jacobian(at: Probe, basis: StrainBasis, backbone: Backbone, u):
-    def q_of(u):
-        strain = line_strain(at(u), at.length)
-        snapshot = eqx.tree_at(lambda b: b.strain, backbone, strain[None])
-        return coordinates(snapshot, basis)[0]
-
-    return jax.jacrev(q_of)(u)
+def _coordinate_jacobian(at: Probe, basis: StrainBasis, u):
+    return jax.jacrev(lambda u: project(line_strain(at(u), at.length), at.s, basis))(u)
 
 
 def _affine(p: np.ndarray, stiffness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@
 Reference: Caasenbrood et al., Sorotoki, IEEE Access 2024, section V-D4.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -15,10 +16,10 @@ _ROW = {"kappa_z": 0, "sigma_x": 1, "sigma_y": 2}
 _REST = {"kappa_z": 0.0, "sigma_x": 1.0, "sigma_y": 0.0}
 
 
-def weights(s: Float[Array, " samples"]) -> Float[np.ndarray, " samples"]:
+def weights(s: Float[Array, " samples"]) -> Float[Array, " samples"]:
     """Trapezoidal weights of samples in [0, 1]."""
-    gaps = np.diff(np.asarray(s))
-    return (np.concatenate([gaps, [0.0]]) + np.concatenate([[0.0], gaps])) / 2
+    gaps = jnp.pad(jnp.diff(s), 1)
+    return (gaps[1:] + gaps[:-1]) / 2
 
 
 def pod_basis(backbone: Backbone, *, modes: dict[str, int]) -> StrainBasis:
@@ -40,7 +41,8 @@ def pod_basis(backbone: Backbone, *, modes: dict[str, int]) -> StrainBasis:
                 "backbone bends about z."
             )
         snapshots = _snapshots(backbone, name)
-        root = np.sqrt(weights(backbone.s))
+        w = np.asarray(weights(backbone.s))
+        root = np.sqrt(w)
         _, size, rows = np.linalg.svd(snapshots * root, full_matrices=False)
         rank = int(np.sum(size > 1e-10 * max(size[0], 1e-300)))
         if count < 1 or count > rank:
@@ -49,7 +51,7 @@ def pod_basis(backbone: Backbone, *, modes: dict[str, int]) -> StrainBasis:
                 f"{rank}. Add load steps or ask for fewer modes."
             )
         shapes = (rows[:count] / root).T
-        sign = np.sign(np.sum(weights(backbone.s)[:, None] * shapes, axis=0))
+        sign = np.sign(w @ shapes)
         basis[name] = SampledModes(backbone.s, shapes * np.where(sign < 0, -1, 1))
     return StrainBasis(basis)
 
@@ -58,21 +60,27 @@ def captured_energy(backbone: Backbone, basis: StrainBasis) -> dict[str, float]:
     """Share of the snapshots' squared strain that the basis holds, per strain."""
     shares, q = {}, np.asarray(coordinates(backbone, basis))
     for name in basis.active:
-        w = weights(backbone.s)
+        w = np.asarray(weights(backbone.s))
         total = np.sum(w * _snapshots(backbone, name) ** 2)
         shares[name] = float(np.sum(q[:, columns(basis, name)] ** 2) / max(total, 1e-300))
     return shares
 
 
 def coordinates(backbone: Backbone, basis: StrainBasis) -> Float[Array, "steps dof"]:
-    """Coordinates of the snapshots in an orthonormal basis on the samples."""
-    w = jnp.asarray(weights(backbone.s))
-    parts = []
-    for name in basis.active:
-        modes = basis.modes[name]
-        shapes = jnp.asarray(modes(backbone.s))
-        parts.append((backbone.strain[:, :, _ROW[name]] - _REST[name]) * w @ shapes)
-    return jnp.concatenate(parts, axis=1)
+    """Coordinates of the snapshots in a basis that is orthonormal on the samples."""
+    return jax.vmap(lambda strain: project(strain, backbone.s, basis))(backbone.strain)
+
+
+def project(
+    strain: Float[Array, "samples 3"], s: Float[Array, " samples"], basis: StrainBasis
+) -> Float[Array, " dof"]:
+    """Coordinates of one strain field, sampled at `s`, in an orthonormal basis."""
+    w = weights(s)
+    parts = [
+        (w * (strain[:, _ROW[name]] - _REST[name])) @ jnp.asarray(basis.modes[name](s))
+        for name in basis.active
+    ]
+    return jnp.concatenate(parts)
 
 
 def _snapshots(backbone: Backbone, name: str) -> Float[np.ndarray, "steps samples"]:

@@ -26,6 +26,7 @@ from sorojax.rod.dynamics import (
     stiffness_matrix as stiffness_matrix,
 )
 from sorojax.rod.forces import (
+    AbstractChamber as AbstractChamber,
     AbstractDamping as AbstractDamping,
     AbstractElastic as AbstractElastic,
     AbstractForce as AbstractForce,
@@ -54,6 +55,7 @@ from sorojax.rod.motion import (
 from sorojax.rod.rod import (
     Elastic as Elastic,
     Rod as Rod,
+    elastic as elastic,
     rod as rod,
     strain_names as strain_names,
 )

@@ -5,8 +5,8 @@ To add one, subclass the family that fits:
 * `AbstractForce`: any force, a function of time and the `Motion` of the rod.
 * `AbstractElastic`: an elastic law that replaces the rod's own linear one.
 * `AbstractDamping`: a constant matrix; implicit steppers use it in their iteration.
-* `AbstractPressureMap`: volume as a function of q; its pressure comes from a network,
-  or from `Pressurised(map, pressure)`.
+* `AbstractPressureMap`: the work of a fluid; its pressure comes from a network, or from
+  `Pressurised(map, pressure)`. `AbstractChamber` is the one with rigid walls.
 """
 
 import abc
@@ -57,15 +57,31 @@ class AbstractDamping(AbstractForce):
 
 
 class AbstractPressureMap(eqx.Module):
-    """A fluid chamber in the rod: its volume as a function of q, one or several ports.
+    """Fluid chambers in the rod, one or several ports.
 
-    The force is `pressure @ d volume / dq`, by virtual work, so that the power that the
-    fluid gives, p dV/dt, is the power that the rod receives.
+    One function W(q, p) gives the force dW/dq and the volume dW/dp, so that no energy is
+    lost between fluid and rod. What is left of dV/dp at fixed q is the compliance of the
+    walls, one number per port: ports must not stretch each other's walls.
     """
+
+    ports: eqx.AbstractVar[tuple[int, ...]]
+
+    @abc.abstractmethod
+    def coenergy(
+        self, q: Float[Array, " dof"], pressure: Float[Array, "*ports"]
+    ) -> Float[Array, ""]:
+        """W(q, p) [J] at gauge pressure [Pa]; zero at zero pressure."""
+
+
+class AbstractChamber(AbstractPressureMap):
+    """Chambers whose volume depends on q alone: W = p . V(q)."""
 
     @abc.abstractmethod
     def volume(self, q: Float[Array, " dof"]) -> Float[Array, "*ports"]:
         """Enclosed volume [m^3], scalar or one per port."""
+
+    def coenergy(self, q, pressure):
+        return jnp.sum(pressure * self.volume(q))
 
 
 class LinearElastic(AbstractElastic):
@@ -125,8 +141,7 @@ class Pressurised(AbstractForce):
     pressure: Float[Array, "*ports"] = eqx.field(converter=real)
 
     def __call__(self, t, motion):
-        _, pull = jax.vjp(self.chamber.volume, motion.q)
-        return pull(self.pressure)[0]
+        return jax.grad(self.chamber.coenergy)(motion.q, self.pressure)
 
 
 def total_force(

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import optional_real, real
+from sorojax.material.hyperelastic import AbstractHyperelastic, small_strain_moduli
 from sorojax.math.lie import SE2, SE3
 from sorojax.rod.basis import STRAINS, StrainBasis
 from sorojax.rod.section import Section
@@ -35,6 +36,22 @@ class Elastic(eqx.Module):
         _check.positive(where, "density", self.density, "kg/m^3", "Rubber has about 1070.")
         do = "An incompressible rubber has 0.5."
         _check.between(where, "poisson_ratio", self.poisson_ratio, -1, 0.5 + 1e-12, "-", do)
+
+
+def elastic(material: AbstractHyperelastic) -> Elastic:
+    """Small-strain constants of a hyperelastic material.
+
+    Raises:
+        ValueError: If the material has no density.
+    """
+    if material.density is None:
+        raise ValueError(
+            f"rod.elastic: the {type(material).__name__} has no density, a rod needs its mass. "
+            "Give density= in kg/m^3."
+        )
+    shear, bulk = small_strain_moduli(material)
+    young = 9 * bulk * shear / (3 * bulk + shear)
+    return Elastic(young, young / (2 * shear) - 1, material.density)
 
 
 class Rod(eqx.Module, Generic[G]):

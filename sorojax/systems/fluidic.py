@@ -20,8 +20,9 @@ AIR = 287.05  # J/(kg K)
 class Reservoir(AbstractBlock):
     """A well-mixed gas of changing volume, fed by mass flow.
 
-    With absolute pressure p, n = `exponent`: p' = n (R T m' - p V') / V, so that a sealed
-    reservoir keeps p V^n. The state is the absolute pressure.
+    With absolute pressure p, n = `exponent` and V' = volume_rate + compliance p':
+    p' = n (R T m' - p V') / V, so that a sealed reservoir keeps p V^n. The state is the
+    absolute pressure.
 
     Attributes:
         start_pressure: Gauge pressure at the start [Pa].
@@ -54,6 +55,7 @@ class Reservoir(AbstractBlock):
             "mass_flow": Input("kg/s", shape, default=0.0),
             "volume": Input("m^3", shape),
             "volume_rate": Input("m^3/s", shape, default=0.0),
+            "compliance": Input("m^3/Pa", shape, default=0.0),
         }
 
     @property
@@ -69,7 +71,8 @@ class Reservoir(AbstractBlock):
     def vector_field(self, t, state, inputs):
         volume = inputs["volume"] + self.dead_volume
         supply = self.gas_constant * self.temperature * inputs["mass_flow"]
-        return self.exponent * (supply - state * inputs["volume_rate"]) / volume
+        stretch = self.exponent * state * inputs["compliance"]
+        return self.exponent * (supply - state * inputs["volume_rate"]) / (volume + stretch)
 
 
 class Regulator(AbstractBlock):

@@ -25,9 +25,9 @@ from sorojax.systems.block import AbstractBlock, Input, Output
 class RodBody(AbstractBlock):
     """A rod with its forces; the state is {q, v}.
 
-    A pressure map among the forces opens the ports `pressure`, `volume` and
-    `volume_rate`, shaped as the volume it returns. Volume and rate come from the same
-    map as the force, so no energy is lost between fluid and rod.
+    A pressure map among the forces opens the ports `pressure`, `volume`, `volume_rate` (at
+    held pressure) and `compliance` of the walls. All come from the same potential as the
+    force, so no energy is lost between fluid and rod.
 
     Attributes:
         rod: The rod.
@@ -53,7 +53,7 @@ class RodBody(AbstractBlock):
         chamber = self._chamber()
         if chamber is None:
             return {}
-        return {"pressure": Input("Pa", self._ports(chamber), default=0.0)}
+        return {"pressure": Input("Pa", chamber.ports, default=0.0)}
 
     @property
     def outputs(self):
@@ -63,9 +63,9 @@ class RodBody(AbstractBlock):
             ports["tip_angle"] = Output("rad")
         chamber = self._chamber()
         if chamber is not None:
-            shape = self._ports(chamber)
-            ports["volume"] = Output("m^3", shape)
-            ports["volume_rate"] = Output("m^3/s", shape)
+            needs = frozenset({"pressure"})
+            units = {"volume": "m^3", "volume_rate": "m^3/s", "compliance": "m^3/Pa"}
+            ports |= {name: Output(unit, chamber.ports, needs) for name, unit in units.items()}
         return ports
 
     def initial_state(self):
@@ -85,8 +85,13 @@ class RodBody(AbstractBlock):
             return tip_angle(motion(self.rod, q))
         chamber = self._chamber()
         assert chamber is not None
-        volume, rate = jax.jvp(chamber.volume, (q,), (v,))
-        return volume if name == "volume" else rate
+        pressure = inputs["pressure"]
+        volume = jax.grad(chamber.coenergy, argnums=1)
+        if name == "compliance":
+            one = jnp.ones_like(pressure)
+            return jax.jvp(lambda p: volume(q, p), (pressure,), (one,))[1]
+        value, rate = jax.jvp(lambda q: volume(q, pressure), (q,), (v,))
+        return value if name == "volume" else rate
 
     def vector_field(self, t, state, inputs):
         moment = motion(self.rod, state["q"], state["v"])
@@ -108,10 +113,6 @@ class RodBody(AbstractBlock):
 
     def _dof(self) -> tuple[int]:
         return (self.rod.basis.num_dof,)
-
-    def _ports(self, chamber: AbstractPressureMap) -> tuple[int, ...]:
-        q = jax.ShapeDtypeStruct(self._dof(), self.rod.length.dtype)
-        return jax.eval_shape(chamber.volume, q).shape
 
 
 def body_motion(body: RodBody, state) -> Motion:

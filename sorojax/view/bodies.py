@@ -23,9 +23,7 @@ NodalField = Callable[[Problem, Float[Array, "nodes dim"]], Float[Array, " nodes
 
 
 @eqx.filter_jit
-def nodal_von_mises(
-    problem: Problem, u: Float[Array, "nodes dim"]
-) -> Float[Array, " nodes"]:
+def nodal_von_mises(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, " nodes"]:
     """Von Mises stress at the nodes, averaged between cells [kPa]."""
     return fem.nodal_average(problem, fem.von_mises_stress(problem, u)) / 1e3
 
@@ -59,12 +57,14 @@ def show_deformed(
     colours = [np.asarray(field(path.problem, path.displacements[k])) for k in chosen]
     low, high, extend = _robust_limits(np.stack(colours))
     lower, upper = box(rest, *shapes)
-    figure, panels = _panels(len(chosen), float((upper - lower)[1] / (upper - lower)[0]))
+    span = upper - lower
+    figure, panels = _panels(len(chosen), float(span[1] / span[0]))
     rings = loops(boundary_facets(path.problem.mesh))
-    painted = None
+    painted: Any = None
     for panel, k, points, colour in zip(panels, chosen, shapes, colours, strict=True):
         _outline(panel, rest, rings, style.GREY, 0.7)
-        painted = panel.tripcolor(
+        paint: Any = panel.tripcolor  # its stub knows no triangles
+        painted = paint(
             points[:, 0], points[:, 1], triangles, colour,
             shading="gouraud", cmap=style.FIELD, vmin=low, vmax=high, rasterized=True,
         )  # fmt: skip
@@ -72,7 +72,7 @@ def show_deformed(
         style.dress_plane(panel, lower, upper)
         panel.set_title(_state_name(path, k), fontsize=style.LABEL, color=style.INK)
         panel.label_outer()
-    note = " (arrow: the highest 0.5 %)" if extend == "max" else ""
+    note = "\n(arrow: the highest 0.5 %)" if extend == "max" else ""
     style.colour_bar(
         figure, painted, panels, label + note, extend=extend, shrink=0.9, aspect=30, pad=0.02
     )
@@ -101,8 +101,8 @@ def show_mesh(
         faces = "none"
         _paint(figure, axes, mesh, points, triangles, np.asarray(field), label)
     cells = PolyCollection(
-        points[cell_rings(mesh)], facecolors=faces, edgecolors=style.GREY, linewidths=0.3
-    )  # pyright: ignore[reportArgumentType]
+        list(points[cell_rings(mesh)]), facecolors=faces, edgecolors=style.GREY, linewidths=0.3
+    )
     axes.add_collection(cells, autolim=False)
     _outline(axes, points, loops(boundary_facets(mesh)), style.INK, 0.9)
     style.dress_plane(axes, lower, upper)
@@ -123,8 +123,9 @@ def show_sdf(shape: AbstractSdf, *, resolution: int = 300, title: str = "") -> "
     axes = figure.add_subplot()
     norm, levels = _two_sided(float(f.min()), float(f.max()))
     filled = axes.contourf(1e3 * x, 1e3 * y, f, levels=levels, cmap="RdBu_r", norm=norm)
-    for curve in contour(shape, 2 * step):
-        axes.plot(*_closed(1e3 * curve.points, curve.closed).T, color=style.INK, lw=1.5)
+    for curve in contour(shape, step):
+        outline = _closed(1e3 * curve.points, curve.closed).T
+        axes.plot(*outline, color=style.INK, lw=1.5, solid_joinstyle="miter")
     style.dress_plane(axes, 1e3 * lower, 1e3 * upper)
     style.colour_bar(
         figure, filled, axes, "signed distance [mm]", format="%g", shrink=0.9, pad=0.02,
@@ -139,8 +140,8 @@ def _two_sided(low: float, high: float) -> tuple[Any, np.ndarray]:
     from matplotlib.colors import TwoSlopeNorm
     from matplotlib.ticker import MaxNLocator
 
-    inside = MaxNLocator(6).tick_values(min(low, -1e-9), 0.0)
-    outside = MaxNLocator(6).tick_values(0.0, max(high, 1e-9))
+    inside = np.array(MaxNLocator(6).tick_values(min(low, -1e-9), 0.0))
+    outside = np.array(MaxNLocator(6).tick_values(0.0, max(high, 1e-9)))
     levels = np.concatenate([inside[inside < 0], outside[outside >= 0]])
     return TwoSlopeNorm(0.0, levels[0], levels[-1]), levels
 

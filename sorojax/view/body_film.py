@@ -107,7 +107,9 @@ class _Body:
         self.artists: list[Artist] = [self.patch]
         if self.field is not None:
             triangles = flat_triangles("film_of_mesh", mesh)
-            self.triangulation = Triangulation(*positions[0].T.copy(), triangles)
+            self.triangulation = Triangulation(
+                positions[0, :, 0], positions[0, :, 1], triangles
+            )
             low, high = min(0.0, self.field.min()), np.percentile(self.field, 99.5)
             self.colours = axes.tripcolor(
                 self.triangulation, self.field[0], shading="gouraud", cmap=style.FIELD,
@@ -121,7 +123,7 @@ class _Body:
     def move(self, k: int) -> "list[Artist]":
         self.patch.set_path(as_path(self.positions[k], self.rings))
         if self.field is not None:
-            self.triangulation.x[:], self.triangulation.y[:] = self.positions[k].T
+            self.triangulation.x, self.triangulation.y = self.positions[k].T
             self.colours.set_array(self.field[k])
         return self.artists
 
@@ -138,11 +140,12 @@ class _Cavities:
         self.scale = Normalize(min(0.0, pressure.min()), max(pressure.max(), 1.0))
         self.colours = colormaps["OrRd"]
         path = as_path(positions[0], rings)
-        self.patch = axes.add_patch(PathPatch(path, edgecolor="none", zorder=1.5))
+        self.patch = PathPatch(path, edgecolor="none")
+        axes.add_patch(self.patch)
 
     def move(self, k: int) -> "list[Artist]":
         self.patch.set_path(as_path(self.positions[k], self.rings))
-        self.patch.set_facecolor(self.colours(0.95 * self.scale(self.pressure[k])))
+        self.patch.set_facecolor(self.colours(0.75 * self.scale(self.pressure[k])))
         return [self.patch]
 
 
@@ -225,7 +228,7 @@ def _layout(lower, upper, signals) -> "tuple[Figure, Axes, list[Axes]]":
 
 
 def _check_lengths(mesh: Mesh, time, positions, pressure, field, tracks) -> None:
-    want = {"positions": (positions, (len(time), mesh.num_nodes, 2))}
+    want: dict[str, Any] = {"positions": (positions, (len(time), mesh.num_nodes, 2))}
     if pressure is not None:
         want["pressure"] = (np.asarray(pressure), (len(time),))
     if field is not None:

@@ -53,11 +53,15 @@ def show_modes(
     for row, (panel, name) in enumerate(zip(panels, basis.active, strict=True)):
         shapes = values[row][:, columns(basis, name)].T
         share = np.ravel((energy or {}).get(name, ()))
-        for k, (shape, colour) in enumerate(zip(shapes, style.shades(len(shapes)), strict=True)):
+        for k, (shape, colour) in enumerate(
+            zip(shapes, style.shades(len(shapes)), strict=True)
+        ):
             part = f", {_percent(share[k])}" if len(share) == len(shapes) > 1 else ""
             panel.plot(s * 1e3 * float(length), shape, color=colour, lw=1.9,
                        label=f"mode {k + 1}{part}")  # fmt: skip
-        total = f": {_percent(share.sum())} of the squared strain captured" if share.size else ""
+        total = (
+            f": {_percent(share.sum())} of the squared strain captured" if share.size else ""
+        )
         unit = "1/m" if name.startswith("kappa") else "-"
         style.dress(panel, "", f"shape [-], $q$ in [{unit}]", f"{_SYMBOL[name]}{total}")
         panel.axhline(0.0, color=style.GREY, lw=0.8, zorder=1)
@@ -119,10 +123,13 @@ def show_backbones(
     error = 1e3 * np.asarray(backbone_errors(backbone, rod, qs))
     right.plot(load, error, color=style.COLOURS[0], lw=1.8, marker="o", ms=3.5)
     right.axhline(1e3 * bar, color=style.COLOURS[1], lw=1.3, ls=(0, (4, 2)))
-    right.annotate(f"bar: {1e3 * bar:g} mm", (load[0], 1e3 * bar), (0, -4), fontsize=style.SMALL,
-                   textcoords="offset points", va="top", color=style.COLOURS[1])  # fmt: skip
-    style.dress(right, "pressure [kPa]" if pressures is not None else "load step",
-                "mean position error [mm]", f"largest mean error {error.max():.2g} mm")  # fmt: skip
+    right.annotate(
+        f"bar: {1e3 * bar:g} mm", (load[0], 1e3 * bar), (0, -4), fontsize=style.SMALL,
+        textcoords="offset points", va="top", color=style.COLOURS[1],
+    )  # fmt: skip
+    across = "load step" if pressures is None else "pressure [kPa]"
+    largest = f"largest mean error {error.max():.2g} mm"
+    style.dress(right, across, "mean position error [mm]", largest)
     right.set_ylim(0.0, 1.12 * max(1e3 * bar, float(error.max())))
     style.title(figure, title)
     return figure

@@ -105,7 +105,11 @@ def _palette(pictures: "list[Image]") -> "Image":
     sheet = Image.new("RGB", (width, height * len(pictures)))
     for k, picture in enumerate(pictures):
         sheet.paste(picture, (0, k * height))
-    return sheet.quantize(_COLOURS, method=Image.Quantize.MEDIANCUT)
+    found = sheet.quantize(_COLOURS, method=Image.Quantize.MEDIANCUT)
+    colours = np.array(found.getpalette()).reshape(-1, 3)
+    colours[np.argmax(colours.sum(axis=1))] = 255  # averaging turns white paper grey
+    found.putpalette(colours.astype(np.uint8).tobytes())
+    return found
 
 
 def _no_dither() -> Any:

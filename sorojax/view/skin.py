@@ -46,7 +46,7 @@ def bind(points: Float[Array, "points 2"], line_start, line_end) -> Skin:
     length = jnp.sqrt(jnp.sum((end - start) ** 2))
     _check.positive("bind", "length of the line", length, "m", "Give two different points.")
     along = (end - start) / length
-    moved = points - start
+    moved = points - start[None]
     ahead = moved @ along
     inside = jnp.clip(ahead, 0.0, length)
     across = moved @ _normal(along)
@@ -73,7 +73,8 @@ def deform(skin: Skin, rod: Rod, q: Float[Array, " dof"]) -> Float[Array, "point
     cosine, sine = jnp.cos(angle), jnp.sin(angle)
     x = x + skin.ahead * cosine - skin.across * sine
     y = y + skin.ahead * sine + skin.across * cosine
-    return skin.origin + x[:, None] * skin.along + y[:, None] * _normal(skin.along)
+    axes = jnp.stack([skin.along, _normal(skin.along)])
+    return skin.origin[None] + jnp.stack([x, y], axis=1) @ axes
 
 
 def _between_stations(

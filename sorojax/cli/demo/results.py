@@ -1,0 +1,226 @@
+"""Numbers, pictures and the report of the main job."""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sorojax import fem, material, systems, view
+from sorojax.cli.demo.design import DEPTH, LAYER_STIFFNESS, Design, Sensitivity
+from sorojax.cli.demo.loop import DAMPING_TIME, Reduced, Tracking
+from sorojax.units import kPa, mm
+
+
+class Results(NamedTuple):
+    """What the stages found."""
+
+    design: Design
+    path: fem.Path
+    slope: Sensitivity
+    reduced: Reduced
+    film: systems.Trajectory
+    tracking: Tracking
+
+
+def numbers(r: Results) -> dict[str, list[view.Number]]:
+    """Tables of the report, by section."""
+    N = view.Number
+    rubber, problem = r.design.tensile, r.design.problem
+    steps = [step for stats in r.path.stats for step in stats.steps]
+    worst = max(step.residual for step in steps)
+    area_error = abs(r.design.meshed_area / r.design.area - 1)
+    gap = float(r.reduced.errors.max())
+    u = r.path.displacements[-1]
+    facets = problem.loads[0].facets
+    angle = r.film["body.tip_angle"]
+    return {
+        "rubber": [
+            N("c1", float(rubber.material.c1) / kPa, "kPa"),
+            N("c2", float(rubber.material.c2) / kPa, "kPa"),
+            N("c3", float(rubber.material.c3) / kPa, "kPa"),
+            N("rms error of stress", rubber.rms / kPa, "kPa"),
+            N("stable up to stretch", rubber.stable_stretch),
+        ],
+        "mesh": [
+            N("triangles", problem.mesh.num_cells),
+            N("unknowns", problem.space.num_dofs),
+            N("area of the drawing", r.design.area * 1e6, "mm^2"),
+            N("area error of the mesh", area_error, "", "< 1e-3", area_error < 1e-3),
+        ],
+        "equilibrium": [
+            N("Newton iterations", sum(step.iterations for step in steps)),
+            N("largest residual over load", worst, "", "< 1e-8", worst < 1e-8),
+            N("tip rotation", np.degrees(r.slope.rotation), "deg"),
+            N("chamber volume at rest", _volume(problem, 0 * u, facets), "ml"),
+            N("chamber volume at the top pressure", _volume(problem, u, facets), "ml"),
+        ],
+        "gradient": [
+            N("d rotation / d wall thickness", _deg_per_mm(r.slope, "wall_thickness"), "deg/mm"),
+            N("difference to central differences", r.slope.error, "", "< 1e-4",
+              r.slope.error < 1e-4),
+            *(N(f"d rotation / d {name}", _deg_per_mm(r.slope, name), "deg/mm")
+              for name in r.slope.gradient if name != "wall_thickness"),
+        ],
+        "rod": [
+            N("captured squared curvature", r.reduced.captured["kappa_z"]),
+            N("largest mean backbone error", gap / mm, "mm", "< 1 mm", gap < 1 * mm),
+            N("misfit of condensed stiffness", r.reduced.fit.stiffness_error),
+            N("misfit of volume change", r.reduced.fit.volume_error),
+        ],
+        "loop": [
+            N("duration", float(r.film.time[-1]), "s"),
+            N("integration steps", r.tracking.steps),
+            N("rms tracking error", np.degrees(r.tracking.rms), "deg"),
+            N("tracking error at the end", np.degrees(r.tracking.final), "deg"),
+            N("largest bending", float(np.degrees(jnp.max(-angle))), "deg"),
+            N("largest pressure", r.tracking.peak_pressure / kPa, "kPa"),
+        ],
+    }  # fmt: skip
+
+
+def pictures(r: Results) -> dict[str, Any]:
+    """Figures and the film, by file name."""
+    r_ = r.reduced
+    time, film = np.asarray(r.film.time), r.film
+    bending = {
+        "reference": -np.degrees(film["target.value"]),
+        "rod": -np.degrees(film["body.tip_angle"]),
+    }
+    signals = {
+        "bending [deg]": bending,
+        "pressure [kPa]": {
+            "set-point": np.asarray(film["pid.command"]) / kPa,
+            "chambers": np.asarray(film["air.pressure"]) / kPa,
+        },
+    }
+    flow = {"mass flow [mg/s]": {"valve": 1e6 * np.asarray(film["valve.mass_flow"])}}
+    points = material.presets.DRAGON_SKIN_30_POINTS
+    return {
+        "rubber.png": view.show_curve(r.design.tensile, *points),
+        "deformed.png": view.show_deformed(r.path),
+        "modes.png": view.show_modes(r_.basis, r_.fit.length, energy=r_.captured),
+        "backbones.png": view.show_backbones(
+            r_.backbone, r_.rod, r_.states, pressures=r.path.values
+        ),
+        "loop.png": view.show_signals(time, signals | flow),
+        "actuator.gif": _film(r, signals),
+    }
+
+
+def _film(r: Results, signals) -> view.Film:
+    mesh, actuator = r.design.problem.mesh, r.design.actuator
+    middle = float(actuator.layer_thickness) / 2
+    skin = view.bind(mesh.points, [0.0, middle], [float(actuator.length), middle])
+    q = r.film["body.q"]
+    positions = jax.vmap(lambda q: view.deform(skin, r.reduced.rod, q))(q)
+    tip = np.asarray(r.film["body.tip_position"]) + np.array([0.0, middle])
+    target = view.ray(tip, np.asarray(r.film["target.value"]), 15 * mm)
+    return view.film_of_mesh(
+        mesh,
+        positions,
+        time=r.film.time,
+        pressure=r.film["air.pressure"],
+        cavities=r.design.problem.loads[0].facets,
+        lines={"wanted direction": target},
+        signals={"bending [deg]": signals["bending [deg]"]},
+        caption="closed loop on the bending angle",
+    )
+
+
+def write(folder: Path, drawn: dict[str, Any], tables, seconds: dict[str, float]) -> None:
+    """Pictures, `result.json` and `report.html` in `folder`."""
+    files: dict[str, bytes] = {}
+    for name, picture in drawn.items():
+        files[name] = picture.gif if name.endswith(".gif") else view.png(picture)
+        (folder / name).write_bytes(files[name])
+    result = {
+        section: {n.name: {"value": n.value, "unit": n.unit, "bar": n.bar, "holds": n.holds}
+                  for n in rows}
+        for section, rows in tables.items()
+    }  # fmt: skip
+    result["seconds"] = {name: round(value, 3) for name, value in seconds.items()}
+    (folder / "result.json").write_text(json.dumps(result, indent=2) + "\n")
+    (folder / "report.html").write_text(_report(files, tables), encoding="utf-8")
+
+
+def _report(files: dict[str, bytes], tables) -> str:
+    def section(heading, text, table, *pictures):
+        shown = [(caption, files[name]) for name, caption in pictures]
+        return view.Section(heading, text, shown, tables[table])
+
+    return view.html_report(
+        "A bellows actuator, from its drawing to a closed loop",
+        [
+            section(
+                "Closed loop", _TEXT["loop"], "loop",
+                ("actuator.gif", "The rod model, dressed in the mesh, in real time."),
+                ("loop.png", "Bending, chamber pressure and mass flow."),
+            ),
+            section(
+                "Equilibrium under pressure", _TEXT["equilibrium"], "equilibrium",
+                ("deformed.png", "Deformed cross-sections, coloured by stress."),
+            ),
+            section("Gradient", _TEXT["gradient"], "gradient"),
+            section(
+                "Strain modes and rod", _TEXT["rod"], "rod",
+                ("modes.png", "Curvature modes of the snapshots."),
+                ("backbones.png", "Backbones of solid and rod, and their distance."),
+            ),
+            section("Mesh", _TEXT["mesh"], "mesh"),
+            section(
+                "Rubber", _TEXT["rubber"], "rubber",
+                ("rubber.png", "Measured points and fitted curve."),
+            ),
+        ],
+        lead=_TEXT["lead"],
+    )  # fmt: skip
+
+
+def _volume(problem, u, facets) -> float:
+    return float(fem.enclosed_volume(problem, u, facets)) * 1e6
+
+
+def _deg_per_mm(slope: Sensitivity, name: str) -> float:
+    return float(np.degrees(slope.gradient[name])) * mm
+
+
+_TEXT = {
+    "lead": (
+        "One run of `sorojax demo`: a cross-section drawn as a signed distance, meshed, "
+        "pressurised, reduced to a rod with three bending modes, and controlled through a "
+        "pneumatic regulator. Every number below was computed in this run."
+    ),
+    "rubber": (
+        "Yeoh coefficients by least squares on four quoted points of Dragon Skin 30 (L. "
+        "Marechal et al., Soft Robotics 8, 2021, doi:10.1089/soro.2019.0115; one specimen, "
+        "one rate). The bulk modulus is that of a small-strain Poisson ratio of 0.49."
+    ),
+    "mesh": (
+        "Quadratic triangles with curved sides on the zero set of the drawing; the upper "
+        f"edge of the layer, {LAYER_STIFFNESS:g} times stiffer than the rubber, is meshed too."
+    ),
+    "equilibrium": (
+        f"Plane strain, {DEPTH / mm:g} mm deep, clamped at the left end, follower pressure in "
+        "the chambers. A step is accepted only when its unbalanced force has vanished."
+    ),
+    "gradient": (
+        "Derivative of the rotation of the free end at the top pressure in every dimension "
+        "of the drawing, by reverse mode through mesh motion and equilibrium: one adjoint "
+        "solve for all of them. The wall thickness is checked by central differences."
+    ),
+    "rod": (
+        "The curvature of the middle of the layer at every pressure gives the modes; the "
+        "stiffness that the solid opposes to them, its equilibria and its chamber volume "
+        "give the elastic law and the pressure map. The error is that of the rod's own "
+        "equilibrium at each pressure."
+    ),
+    "loop": (
+        "A PID on the bending angle commands a PI pressure regulator that feeds the "
+        "chambers; gas, chamber walls and rod exchange energy through one potential. The "
+        f"retardation time of the rubber, {DAMPING_TIME * 1e3:g} ms, is an assumption. No "
+        "gravity: the actuator moves in a horizontal plane."
+    ),
+}
