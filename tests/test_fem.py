@@ -287,3 +287,9 @@ def test_bad_calls_name_the_remedy():
         )
     with pytest.raises(ValueError, match="must be positive"):
         fem.PlaneStrain(-1.0)
+
+
+def test_a_body_without_load_is_an_equilibrium_at_rest():
+    solution = fem.solve(_ring(0.0))
+    assert solution.stats.iterations <= 2 and solution.stats.cuts == 0
+    assert jnp.max(jnp.abs(solution.displacement)) < 1e-15

@@ -1,6 +1,7 @@
 """Pictures are looked at by their pixels; the skin and the report by what they must keep."""
 
 import base64
+import functools
 import io
 import re
 import subprocess
@@ -34,6 +35,7 @@ def rod():
     )  # fmt: skip
 
 
+@functools.cache
 def pixels(picture):
     from PIL import Image
 

@@ -19,6 +19,7 @@ from sorojax.fem.solve import (
     Solution as Solution,
     solve as solve,
     solve_path as solve_path,
+    with_load as with_load,
 )
 from sorojax.fem.space import Space as Space, space as space
 from sorojax.fem.stress import (

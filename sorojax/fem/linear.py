@@ -16,10 +16,12 @@ from sorojax.math import sparse
 
 
 class Prepared(NamedTuple):
-    """What one solve computes once: shape gradients, known unknowns, slots of facets."""
+    """What one solve computes once: shape gradients, known unknowns, slots of facets, and
+    the size of the largest cell [m]."""
 
     geometry: asm.Geometry
     known: Bool[Array, " dofs"]
+    length: Float[Array, ""]
     facet_slots: tuple[Int[Array, "facets entries"], ...]
 
 
@@ -49,7 +51,8 @@ def prepare(problem: Problem) -> Prepared:
             facets = np.asarray(load.curved_facets)
             dofs = (facets[:, :, None] * dim + np.arange(dim)).reshape(len(facets), -1)
             slots.append(sparse.slots_of(problem.space.system, dofs))
-    return Prepared(geometry, jnp.asarray(known), tuple(slots))
+    cell_areas = jnp.sum(geometry.volumes, axis=1) / problem.kinematics.depth
+    return Prepared(geometry, jnp.asarray(known), jnp.sqrt(jnp.max(cell_areas)), tuple(slots))
 
 
 @eqx.filter_jit
@@ -70,8 +73,7 @@ def linearise(
     reaction = jnp.where(prepared.known, residual, zero)
     largest = jnp.maximum(jnp.max(jnp.abs(load)), jnp.max(jnp.abs(reaction)))
     values = _add_load_stiffness(problem, prepared, u, body.values)
-    cell_areas = jnp.sum(prepared.geometry.volumes, axis=1) / problem.kinematics.depth
-    length = jnp.max(jnp.abs(u)) + jnp.sqrt(jnp.max(cell_areas))
+    length = jnp.max(jnp.abs(u)) + prepared.length
     epsilon = 2 * jnp.finfo(u.dtype).eps
     return Linearised(
         residual=residual,

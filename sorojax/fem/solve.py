@@ -118,7 +118,7 @@ def solve_path(
     log = Log(Newton() if newton is None else newton, 1, max_cuts)
     begin, states, stats = None, [], []
     for k, value in enumerate(row):
-        target = _with_load(problem, name, value)
+        target = with_load(problem, name, value)
         log.clear()
         u = _equilibrium(target, begin, log)
         stats.append(log.stats())
@@ -204,7 +204,8 @@ def _named_values(problem: Problem, values: dict) -> tuple[str, Float[Array, "st
     return name, row
 
 
-def _with_load(problem: Problem, name: str, value: Float[Array, "..."]) -> Problem:
+def with_load(problem: Problem, name: str, value: Float[Array, "..."]) -> Problem:
+    """`problem` with the load called `name` set to `value`."""
     index = [load.name for load in problem.loads].index(name)
     return eqx.tree_at(lambda p: p.loads[index].value, problem, value)
 

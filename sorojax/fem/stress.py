@@ -39,7 +39,7 @@ def von_mises_stress(
     """Von Mises stress at the nodes of every cell [Pa]; zero, with a zero slope, at rest."""
     sigma = cauchy_stress(problem, u)
     mean = jnp.trace(sigma, axis1=-2, axis2=-1) / 3
-    deviator = sigma - mean[..., None, None] * jnp.eye(3, dtype=sigma.dtype)
+    deviator = sigma - mean[..., None, None] * jnp.eye(3, dtype=sigma.dtype)[None, None]
     square = 1.5 * jnp.sum(deviator**2, axis=(-2, -1))
     positive = square > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)

@@ -5,6 +5,7 @@ from sorojax.mesh.elements import (
     Tri3 as Tri3,
     Tri6 as Tri6,
 )
+from sorojax.mesh.locate import Locations as Locations, locate as locate
 from sorojax.mesh.mesh import Mesh as Mesh, boundary_facets as boundary_facets
 from sorojax.mesh.motion import move as move
 from sorojax.mesh.quality import (

@@ -1,8 +1,10 @@
 """Reference elements: leafless markers that carry node order and facets.
 
-Corners come first, counter-clockwise, then mid-side nodes in the order of the
-sides (0, 1), (1, 2), (2, 0). A facet is listed as its two corners, domain on the
-left, followed by its mid-side node where there is one.
+Corners come first, then mid-side nodes. In the plane corners run counter-clockwise and
+a facet is listed as its two corners, domain on the left, then its mid-side node. In
+space the fourth corner of a tetrahedron lies on the side to which (1 - 0) x (2 - 0)
+points, and a facet lists its corners counter-clockwise as seen from outside. The
+order is that of VTK and meshio.
 """
 
 import abc
@@ -10,15 +12,17 @@ from typing import ClassVar
 
 import equinox as eqx
 
+Facets = tuple[tuple[int, ...], ...]
+
 
 class AbstractElement(eqx.Module):
     """A reference cell."""
 
     dim: eqx.AbstractClassVar[int]
-    num_nodes: eqx.AbstractClassVar[int]
-    num_corners: eqx.AbstractClassVar[int]
+    num_nodes: eqx.AbstractVar[int]
+    num_corners: eqx.AbstractVar[int]
     order: eqx.AbstractClassVar[int]
-    facets: eqx.AbstractClassVar[tuple[tuple[int, ...], ...]]
+    facets: eqx.AbstractVar[Facets]
 
     @property
     @abc.abstractmethod
@@ -33,7 +37,7 @@ class Tri3(AbstractElement):
     num_nodes: ClassVar[int] = 3
     num_corners: ClassVar[int] = 3
     order: ClassVar[int] = 1
-    facets: ClassVar[tuple[tuple[int, ...], ...]] = ((0, 1), (1, 2), (2, 0))
+    facets: ClassVar[Facets] = ((0, 1), (1, 2), (2, 0))
 
     @property
     def name(self) -> str:
@@ -47,8 +51,130 @@ class Tri6(AbstractElement):
     num_nodes: ClassVar[int] = 6
     num_corners: ClassVar[int] = 3
     order: ClassVar[int] = 2
-    facets: ClassVar[tuple[tuple[int, ...], ...]] = ((0, 1, 3), (1, 2, 4), (2, 0, 5))
+    facets: ClassVar[Facets] = ((0, 1, 3), (1, 2, 4), (2, 0, 5))
 
     @property
     def name(self) -> str:
         return "Tri6"
+
+
+class Quad4(AbstractElement):
+    """Bilinear quadrilateral."""
+
+    dim: ClassVar[int] = 2
+    num_nodes: ClassVar[int] = 4
+    num_corners: ClassVar[int] = 4
+    order: ClassVar[int] = 1
+    facets: ClassVar[Facets] = ((0, 1), (1, 2), (2, 3), (3, 0))
+
+    @property
+    def name(self) -> str:
+        return "Quad4"
+
+
+class Quad8(AbstractElement):
+    """Serendipity quadrilateral; sides may be curved."""
+
+    dim: ClassVar[int] = 2
+    num_nodes: ClassVar[int] = 8
+    num_corners: ClassVar[int] = 4
+    order: ClassVar[int] = 2
+    facets: ClassVar[Facets] = ((0, 1, 4), (1, 2, 5), (2, 3, 6), (3, 0, 7))
+
+    @property
+    def name(self) -> str:
+        return "Quad8"
+
+
+class PolyN(AbstractElement):
+    """Convex polygon of at most `sides` corners.
+
+    A cell with fewer corners repeats its last node up to `sides` entries, so sums over
+    sides (area, centroid) need no mask; `valences` counts the corners.
+    """
+
+    sides: int = eqx.field(static=True)
+    dim: ClassVar[int] = 2
+    order: ClassVar[int] = 1
+
+    @property
+    def num_nodes(self) -> int:
+        return self.sides
+
+    @property
+    def num_corners(self) -> int:
+        return self.sides
+
+    @property
+    def facets(self) -> Facets:
+        return tuple((i, (i + 1) % self.sides) for i in range(self.sides))
+
+    @property
+    def name(self) -> str:
+        return f"Poly{self.sides}"
+
+
+class Tet4(AbstractElement):
+    """Linear tetrahedron."""
+
+    dim: ClassVar[int] = 3
+    num_nodes: ClassVar[int] = 4
+    num_corners: ClassVar[int] = 4
+    order: ClassVar[int] = 1
+    facets: ClassVar[Facets] = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2))
+
+    @property
+    def name(self) -> str:
+        return "Tet4"
+
+
+class Tet10(AbstractElement):
+    """Quadratic tetrahedron; mid-sides of (0,1), (1,2), (2,0), (0,3), (1,3), (2,3)."""
+
+    dim: ClassVar[int] = 3
+    num_nodes: ClassVar[int] = 10
+    num_corners: ClassVar[int] = 4
+    order: ClassVar[int] = 2
+    facets: ClassVar[Facets] = (
+        (0, 2, 1, 6, 5, 4),
+        (0, 1, 3, 4, 8, 7),
+        (1, 2, 3, 5, 9, 8),
+        (0, 3, 2, 7, 9, 6),
+    )
+
+    @property
+    def name(self) -> str:
+        return "Tet10"
+
+
+class Hex8(AbstractElement):
+    """Trilinear hexahedron: bottom face counter-clockwise from above, then the top."""
+
+    dim: ClassVar[int] = 3
+    num_nodes: ClassVar[int] = 8
+    num_corners: ClassVar[int] = 8
+    order: ClassVar[int] = 1
+    facets: ClassVar[Facets] = (
+        (0, 3, 2, 1),
+        (4, 5, 6, 7),
+        (0, 1, 5, 4),
+        (1, 2, 6, 5),
+        (2, 3, 7, 6),
+        (3, 0, 4, 7),
+    )
+
+    @property
+    def name(self) -> str:
+        return "Hex8"
+
+
+def facet_corners(element: AbstractElement) -> int:
+    """Corners of a facet: 2 in the plane, 3 or 4 in space."""
+    if element.dim == 2:
+        return 2
+    return 4 if isinstance(element, Hex8) else 3
+
+
+def facet_element(element: AbstractElement) -> AbstractElement:
+    """Element of the facets of a cell in space."""
+    return {Tet4: Tri3, Tet10: Tri6, Hex8: Quad4}[type(element)]()

@@ -28,14 +28,14 @@ def locate(mesh: Mesh, points: Float[np.ndarray, "points dim"]) -> Locations:
     Raises:
         ValueError: If a point lies outside the mesh, or the mesh is traced.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     if is_traced(mesh):
         raise ValueError("locate: the mesh is traced, need concrete points. Call it outside.")
     points = np.atleast_2d(np.asarray(points, float))
     X, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
     centres = X[cells[:, : mesh.element.num_corners]].mean(axis=1)
-    near = cKDTree(centres).query(points, k=min(24, len(cells)))[1].reshape(len(points), -1)
+    near = KDTree(centres).query(points, k=min(24, len(cells)))[1].reshape(len(points), -1)
     xi = _reference_coordinates(mesh, X[cells[near]], points)
     inside = np.minimum(xi.min(axis=-1), 1 - xi.sum(axis=-1))
     best = np.argmax(inside, axis=1)

@@ -1,72 +1,59 @@
-"""Shape functions and quadrature of the reference triangle with corners (0,0), (1,0),
-(0,1), and of the reference side [-1, 1]. Host arrays: tables, not computations.
+"""Shape functions and quadrature of the reference cells. Host arrays: tables, not
+computations.
 
-Reference: Hughes, The Finite Element Method, 1987, chapter 3; the six-point rule of
-degree 4 is Dunavant's (1985).
+Triangles and tetrahedra have corners at the origin and at distance 1 on each axis,
+quadrilaterals and hexahedra fill [-1, 1] on each axis, polygons are regular with their
+corners on the unit circle, sides are [-1, 1].
+
+Reference: Hughes, The Finite Element Method, 1987, chapter 3.
 """
 
-from typing import NamedTuple
+from types import ModuleType
 
 import numpy as np
 from jaxtyping import Float
 
-from sorojax.mesh.elements import AbstractElement
+from sorojax.mesh import shape_polygon, shape_simplex, shape_tensor
+from sorojax.mesh.elements import AbstractElement, Hex8, PolyN, Quad4, Quad8
+from sorojax.mesh.shape_simplex import Quadrature as Quadrature
 
 
-class Quadrature(NamedTuple):
-    points: Float[np.ndarray, "quad dim"]
-    weights: Float[np.ndarray, " quad"]
+def _family(element: AbstractElement) -> ModuleType:
+    if isinstance(element, Quad4 | Quad8 | Hex8):
+        return shape_tensor
+    return shape_polygon if isinstance(element, PolyN) else shape_simplex
 
 
 def shape_functions(
     element: AbstractElement, at: Float[np.ndarray, "points dim"]
 ) -> Float[np.ndarray, "points cell_nodes"]:
     """Values of the shape functions at reference points."""
-    corners = _barycentric(at)
-    if element.order == 1:
-        return corners
-    sides = [4 * corners[:, i] * corners[:, j] for i, j in ((0, 1), (1, 2), (2, 0))]
-    return np.concatenate([corners * (2 * corners - 1), np.stack(sides, axis=1)], axis=1)
+    return _family(element).shape_functions(element, np.asarray(at, float))
 
 
 def shape_gradients(
     element: AbstractElement, at: Float[np.ndarray, "points dim"]
 ) -> Float[np.ndarray, "points cell_nodes dim"]:
     """Derivatives with respect to the reference coordinates."""
-    slope = np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]])
-    if element.order == 1:
-        return np.broadcast_to(slope, (len(at), 3, 2)).copy()
-    L = _barycentric(at)
-    corners = (4 * L - 1)[:, :, None] * slope
-    sides = [
-        4 * (L[:, [i], None] * slope[j] + L[:, [j], None] * slope[i])[:, 0]
-        for i, j in ((0, 1), (1, 2), (2, 0))
-    ]
-    return np.concatenate([corners, np.stack(sides, axis=1)], axis=1)
-
-
-def _barycentric(at):
-    at = np.asarray(at, float)
-    return np.concatenate([1 - at.sum(axis=1, keepdims=True), at], axis=1)
+    return _family(element).shape_gradients(element, np.asarray(at, float))
 
 
 def nodes(element: AbstractElement) -> Float[np.ndarray, "cell_nodes dim"]:
     """Reference coordinates of the nodes."""
-    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    if element.order == 1:
-        return corners
-    sides = [(corners[i] + corners[j]) / 2 for i, j in ((0, 1), (1, 2), (2, 0))]
-    return np.concatenate([corners, np.stack(sides)])
+    return _family(element).nodes(element)
 
 
-def quadrature(element: AbstractElement) -> Quadrature:
-    """The rule used for stiffness: degree 1 for Tri3, degree 4 for Tri6."""
-    if element.order == 1:
-        return Quadrature(np.array([[1 / 3, 1 / 3]]), np.array([0.5]))
-    a, b = 0.445948490915965, 0.091576213509771
-    wa, wb = 0.111690794839005, 0.054975871827661
-    points = [p for c in (a, b) for p in ((c, c), (1 - 2 * c, c), (c, 1 - 2 * c))]
-    return Quadrature(np.array(points), np.array([wa] * 3 + [wb] * 3))
+def quadrature(element: AbstractElement, degree: int | None = None) -> Quadrature:
+    """A rule for the reference cell with positive weights.
+
+    Without `degree` the one used for stiffness, degree 1 for Tri3 and Tet4, 4 for Tri6,
+    2 for Tet10, 3 for Quad4 and Hex8, 5 for Quad8; with it the smallest one that is
+    exact for polynomials of that degree.
+
+    Raises:
+        ValueError: If no such rule is tabulated.
+    """
+    return _family(element).quadrature(element, degree)
 
 
 def side_functions(

@@ -10,6 +10,7 @@ from sorojax.reduction.identify import (
     Fit as Fit,
     PressureMap as PressureMap,
     identify as identify,
+    mean_section as mean_section,
 )
 from sorojax.reduction.pod import (
     captured_energy as captured_energy,

@@ -37,7 +37,7 @@ class Line(AbstractCurve):
             )
 
     def __call__(self, s):
-        return self.start + s[:, None] * (self.end - self.start)
+        return self.start[None] + s[:, None] * (self.end - self.start)[None]
 
 
 class Backbone(eqx.Module):
@@ -67,7 +67,7 @@ class Probe(eqx.Module):
         """Positions of the line in the frame of its base [m]."""
         along = (self.rest[-1] - self.rest[0]) / self.length
         across = jnp.stack([-along[1], along[0]])
-        moved = self.rest - self.rest[0] + self.locations(u)
+        moved = self.rest - self.rest[:1] + self.locations(u)
         return moved @ jnp.stack([along, across], axis=1)
 
 

@@ -22,7 +22,7 @@ from sorojax.fem.linear import linearise, prepare
 from sorojax.fem.loads import Pressure
 from sorojax.fem.points import point_areas
 from sorojax.fem.problem import Problem
-from sorojax.fem.solve import Path
+from sorojax.fem.solve import Path, with_load
 from sorojax.fem.stress import enclosed_volume
 from sorojax.math import sparse
 from sorojax.mesh.shape import quadrature, shape_functions
@@ -121,10 +121,9 @@ def identify(
     p = np.asarray(path.values)
     q = np.asarray(coordinates(backbone, basis))
     at = probe(problem.mesh, line, len(backbone.s))
-    index = list(problem.loads).index(load)
     volumes, condensed = [], []
     for u, value in zip(path.displacements, path.values, strict=True):
-        here = eqx.tree_at(lambda problem: problem.loads[index].value, problem, value)
+        here = with_load(problem, path.name, value)
         condensed.append(_condensed_stiffness(here, u, at, basis))
         volumes.append(float(enclosed_volume(problem, u, load.facets)))
     K, C = _affine(p, np.stack(condensed))
@@ -212,7 +211,7 @@ def mean_section(problem: Problem, line: Line) -> Section:
     length = jnp.sqrt(jnp.sum((end - start) ** 2))
     along = (end - start) / length
     N = jnp.asarray(shape_functions(mesh.element, quadrature(mesh.element).points))
-    points = jnp.einsum("qa,cai->qci", N, mesh.points[mesh.cells]) - start
+    points = jnp.einsum("qa,cai->qci", N, mesh.points[mesh.cells]) - start[None, None]
     across = along[0] * points[..., 1] - along[1] * points[..., 0]
     areas = point_areas(mesh)
     area = jnp.sum(areas) * depth / length

@@ -67,8 +67,11 @@ def film_of_mesh(
     parts.append(_Stamp(axes, time, pressure))
     for panel, (label, lines_of) in zip(panels, (signals or {}).items(), strict=True):
         parts.append(_Panel(panel, time, label, lines_of))
-    if panels:
-        panels[-1].set_xlabel("time [s]", fontsize=style.LABEL, color=style.INK)
+        place = panel.get_subplotspec()
+        if place is None or place.is_last_row():
+            panel.set_xlabel("time [s]", fontsize=style.LABEL, color=style.INK)
+        else:
+            panel.tick_params(labelbottom=False)
     chosen = frames_at(time, fps)
 
     def update(k: int) -> "list[Artist]":
@@ -158,7 +161,7 @@ class _Tracks:
             (axes.plot(*track[0].T, label=name, **styles[name])[0], track)
             for name, track in tracks.items()
         ]
-        style.legend(axes, loc="upper right")
+        style.legend(axes, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1)
 
     def move(self, k: int) -> "list[Artist]":
         for line, track in self.pairs:
@@ -173,15 +176,16 @@ class _Stamp:
         self.time = time
         self.pressure = None if pressure is None else np.asarray(pressure)
         self.text = axes.text(
-            0.02, 0.03, "", transform=axes.transAxes, fontsize=style.LABEL, color=style.INK,
-            family="monospace", va="bottom",
+            0.0, 1.03, self.line(0), transform=axes.transAxes, fontsize=style.LABEL,
+            color=style.INK, family="monospace", va="bottom",
         )  # fmt: skip
 
+    def line(self, k: int) -> str:
+        pressure = "" if self.pressure is None else f"  {self.pressure[k] / 1e3:5.1f} kPa"
+        return f"{self.time[k]:5.2f} s{pressure}"
+
     def move(self, k: int) -> "list[Artist]":
-        text = f"t = {self.time[k]:5.2f} s"
-        if self.pressure is not None:
-            text += f"\np = {self.pressure[k] / 1e3:5.1f} kPa"
-        self.text.set_text(text)
+        self.text.set_text(self.line(k))
         return [self.text]
 
 
@@ -190,7 +194,8 @@ class _Panel:
 
     def __init__(self, axes: "Axes", time: np.ndarray, label: str, signals):
         self.time = time
-        lines = draw_signals(axes, time, label, signals)
+        lines = draw_signals(axes, time, "", signals)
+        axes.set_title(label, fontsize=style.LABEL, color=style.INK, loc="left")
         axes.set_xlim(time[0], time[-1])
         style.legend(axes, loc="best")
         axes.set_ylim(axes.get_ylim())
@@ -212,19 +217,13 @@ def _layout(lower, upper, signals) -> "tuple[Figure, Axes, list[Axes]]":
     count = len(signals or {})
     if not count:
         return figure, figure.add_subplot(), []
-    wide = (upper - lower)[0] > 2.2 * (upper - lower)[1]
-    grid = figure.add_gridspec(
-        *((1 + count, 1) if wide else (count, 2)),
-        **({"height_ratios": [2.0] + [1.0] * count} if wide else {"width_ratios": [1.7, 1]}),
-    )
-    body = figure.add_subplot(grid[0, 0] if wide else grid[:, 0])
-    panels: list[Axes] = []
-    for k in range(count):
-        cell = grid[1 + k, 0] if wide else grid[k, 1]
-        panels.append(figure.add_subplot(cell, sharex=panels[0] if panels else None))
-        if k < count - 1:
-            panels[-1].tick_params(labelbottom=False)
-    return figure, body, panels
+    if (upper - lower)[0] > 2.2 * (upper - lower)[1]:
+        grid = figure.add_gridspec(2, count, height_ratios=[1.2, 1])
+        cells = [grid[1, k] for k in range(count)]
+        return figure, figure.add_subplot(grid[0, :]), [figure.add_subplot(c) for c in cells]
+    grid = figure.add_gridspec(count, 2, width_ratios=[1.7, 1])
+    cells = [grid[k, 1] for k in range(count)]
+    return figure, figure.add_subplot(grid[:, 0]), [figure.add_subplot(c) for c in cells]
 
 
 def _check_lengths(mesh: Mesh, time, positions, pressure, field, tracks) -> None:

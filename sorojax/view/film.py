@@ -107,7 +107,7 @@ def _palette(pictures: "list[Image]") -> "Image":
         sheet.paste(picture, (0, k * height))
     found = sheet.quantize(_COLOURS, method=Image.Quantize.MEDIANCUT)
     colours = np.array(found.getpalette()).reshape(-1, 3)
-    colours[np.argmax(colours.sum(axis=1))] = 255  # averaging turns white paper grey
+    colours[colours.min(axis=1) >= 246] = 255  # averaging turns white paper grey
     found.putpalette(colours.astype(np.uint8).tobytes())
     return found
 

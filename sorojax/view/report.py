@@ -167,5 +167,5 @@ tbody tr:nth-child(even) { background: var(--row); }
 .holds { color: var(--good); white-space: nowrap; }
 .missed { color: var(--bad); font-weight: 600; white-space: nowrap; }
 main { padding-bottom: 64px; }
-@media print { nav { display: none; } section { break-inside: avoid; } }
+@media print { nav { display: none; } figure, tr { break-inside: avoid; } }
 """

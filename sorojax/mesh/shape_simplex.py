@@ -1,0 +1,111 @@
+"""Tables of triangles and tetrahedra.
+
+Reference: the six-point rule of degree 4 is Dunavant's (1985), the fourteen-point rule
+of degree 5 Walkington's (2000).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from sorojax.mesh.elements import AbstractElement
+
+_SIDES = {2: ((0, 1), (1, 2), (2, 0)), 3: ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))}
+
+
+class Quadrature(NamedTuple):
+    points: Float[np.ndarray, "quad dim"]
+    weights: Float[np.ndarray, " quad"]
+
+
+def shape_functions(element: AbstractElement, at: np.ndarray) -> np.ndarray:
+    L = _barycentric(at)
+    if element.order == 1:
+        return L
+    sides = [4 * L[:, i] * L[:, j] for i, j in _SIDES[element.dim]]
+    return np.concatenate([L * (2 * L - 1), np.stack(sides, axis=1)], axis=1)
+
+
+def shape_gradients(element: AbstractElement, at: np.ndarray) -> np.ndarray:
+    dim = element.dim
+    slope = np.concatenate([-np.ones((1, dim)), np.eye(dim)])
+    if element.order == 1:
+        return np.broadcast_to(slope, (len(at), dim + 1, dim)).copy()
+    L = _barycentric(at)
+    corners = (4 * L - 1)[:, :, None] * slope
+    sides = [
+        4 * (L[:, [i], None] * slope[j] + L[:, [j], None] * slope[i])[:, 0]
+        for i, j in _SIDES[dim]
+    ]
+    return np.concatenate([corners, np.stack(sides, axis=1)], axis=1)
+
+
+def _barycentric(at: np.ndarray) -> np.ndarray:
+    return np.concatenate([1 - at.sum(axis=1, keepdims=True), at], axis=1)
+
+
+def nodes(element: AbstractElement) -> np.ndarray:
+    corners = np.concatenate([np.zeros((1, element.dim)), np.eye(element.dim)])
+    if element.order == 1:
+        return corners
+    sides = [(corners[i] + corners[j]) / 2 for i, j in _SIDES[element.dim]]
+    return np.concatenate([corners, np.stack(sides)])
+
+
+def quadrature(element: AbstractElement, degree: int | None = None) -> Quadrature:
+    usual = {(2, 1): 1, (2, 2): 4, (3, 1): 1, (3, 2): 2}
+    want = usual[element.dim, element.order] if degree is None else degree
+    rules = _TRIANGLE if element.dim == 2 else _TETRAHEDRON
+    fitting = [known for known in rules if known >= want]
+    if not fitting:
+        raise ValueError(
+            f"quadrature: no rule of degree {want} is tabulated for {element.name}, the "
+            f"highest is {max(rules)}. Ask for that, or split the cell."
+        )
+    return rules[min(fitting)]
+
+
+def _orbits(dim: int, *orbits: tuple[tuple[float, ...], float]) -> Quadrature:
+    """The rule whose points are all permutations of barycentric coordinates.
+
+    Weights are shares of the cell.
+    """
+    from itertools import permutations
+    from math import factorial
+
+    points, weights = [], []
+    for coordinates, weight in orbits:
+        for L in sorted(set(permutations(coordinates)), reverse=True):
+            points.append(L[1:])
+            weights.append(weight / factorial(dim))
+    return Quadrature(np.array(points), np.array(weights))
+
+
+def _triangle_degree_4() -> Quadrature:
+    a, b = 0.445948490915965, 0.091576213509771
+    wa, wb = 0.111690794839005, 0.054975871827661
+    points = [p for c in (a, b) for p in ((c, c), (1 - 2 * c, c), (c, 1 - 2 * c))]
+    return Quadrature(np.array(points), np.array([wa] * 3 + [wb] * 3))
+
+
+def _near(a: float, dim: int) -> tuple[float, ...]:
+    return (1 - dim * a, *([a] * dim))
+
+
+_E = 0.04550370412564965
+_TRIANGLE = {
+    1: Quadrature(np.array([[1 / 3, 1 / 3]]), np.array([0.5])),
+    2: _orbits(2, (_near(1 / 6, 2), 1 / 3)),
+    4: _triangle_degree_4(),
+}
+_TETRAHEDRON = {
+    1: _orbits(3, ((0.25,) * 4, 1.0)),
+    2: _orbits(3, (_near((5 - 5**0.5) / 20, 3), 0.25)),
+    5: _orbits(
+        3,
+        (_near(0.31088591926330060980, 3), 0.11268792571801585080),
+        (_near(0.092735250310891226402, 3), 0.073493043116361949544),
+        ((_E, _E, 0.5 - _E, 0.5 - _E), 0.042546020777081466438),
+    ),
+}

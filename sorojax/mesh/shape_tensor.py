@@ -1,0 +1,60 @@
+"""Tables of quadrilaterals and hexahedra."""
+
+import numpy as np
+
+from sorojax.mesh.elements import AbstractElement, Quad8
+from sorojax.mesh.shape_simplex import Quadrature
+
+_SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+_MIDDLES = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+
+
+def nodes(element: AbstractElement) -> np.ndarray:
+    if element.dim == 3:
+        layers = [np.concatenate([_SQUARE, np.full((4, 1), z)], axis=1) for z in (-1.0, 1.0)]
+        return np.concatenate(layers)
+    return np.concatenate([_SQUARE, _MIDDLES]) if element.order == 2 else _SQUARE
+
+
+def shape_functions(element: AbstractElement, at: np.ndarray) -> np.ndarray:
+    corners = nodes(element)[: element.num_corners]
+    product = np.prod(1 + at[:, None] * corners, axis=2) / 2**element.dim
+    if not isinstance(element, Quad8):
+        return product
+    x, y = at[:, :1], at[:, 1:]
+    bend = (x * corners[:, 0] + y * corners[:, 1]) - 1
+    return np.concatenate([product * bend, _bumps(x, y)], axis=1)
+
+
+def _bumps(x, y) -> np.ndarray:
+    u, v = (1 - x**2) / 2, (1 - y**2) / 2
+    return np.concatenate([u * (1 - y), v * (1 + x), u * (1 + y), v * (1 - x)], axis=1)
+
+
+def shape_gradients(element: AbstractElement, at: np.ndarray) -> np.ndarray:
+    corners = nodes(element)[: element.num_corners]
+    factors = 1 + at[:, None] * corners
+    slopes = []
+    for i in range(element.dim):
+        others = np.prod(np.delete(factors, i, axis=2), axis=2)
+        slopes.append(corners[:, i] * others / 2**element.dim)
+    gradient = np.stack(slopes, axis=2)
+    if not isinstance(element, Quad8):
+        return gradient
+    x, y = at[:, :1], at[:, 1:]
+    bend = (x * corners[:, 0] + y * corners[:, 1]) - 1
+    value = np.prod(factors, axis=2) / 4
+    gradient = gradient * bend[..., None] + value[..., None] * corners
+    u, v = (1 - x**2) / 2, (1 - y**2) / 2
+    along_x = np.concatenate([-x * (1 - y), v, -x * (1 + y), -v], axis=1)
+    along_y = np.concatenate([-u, -y * (1 + x), u, -y * (1 - x)], axis=1)
+    return np.concatenate([gradient, np.stack([along_x, along_y], axis=2)], axis=1)
+
+
+def quadrature(element: AbstractElement, degree: int | None = None) -> Quadrature:
+    if degree is None:
+        degree = 5 if isinstance(element, Quad8) else 3
+    x, w = np.polynomial.legendre.leggauss(degree // 2 + 1)
+    points = np.stack(np.meshgrid(*[x] * element.dim, indexing="ij"), -1)
+    weights = np.prod(np.stack(np.meshgrid(*[w] * element.dim, indexing="ij"), -1), -1)
+    return Quadrature(points.reshape(-1, element.dim), weights.ravel())

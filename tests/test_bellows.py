@@ -1,0 +1,64 @@
+"""The bellows actuator: reference case A, its drawing, and the gradient by its walls."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks.bellows import PRESSURES, case_a, tip_errors
+from sorojax import fem, mesh, sdf
+from sorojax.cli.demo import design as designs
+from sorojax.robots import BellowsActuator
+from sorojax.units import kPa, mm
+
+
+@pytest.fixture(scope="module")
+def path():
+    return fem.solve_path(case_a(0.7 * mm), air=jnp.asarray(PRESSURES))
+
+
+def test_tip_lies_within_0_3_percent_of_the_converged_solution(path):
+    assert tip_errors(path.problem, path.displacements)[1:].max() < 3e-3
+
+
+def test_every_accepted_state_is_an_equilibrium_and_is_found_fast(path):
+    steps = [step for stats in path.stats for step in stats.steps]
+    assert max(step.residual for step in steps) < 1e-8
+    assert sum(step.iterations for step in steps) <= 22
+    u = path.displacements[-1]
+    at_top = fem.with_load(path.problem, "air", path.values[-1])
+    pushed = PRESSURES[-1] * 10 * mm  # on one wall of a chamber, per metre of depth [N]
+    force = fem.reaction_force(at_top, u, at_top.supports[0].nodes)
+    assert jnp.max(jnp.abs(force)) < 1e-8 * pushed
+
+
+def test_mesh_area_is_that_of_the_drawing(path):
+    drawn = float(sdf.area(BellowsActuator().body()))
+    exact = 66 * 15 - (300 - 5 * (4 - math.pi)) - 4 * (3 * 12 - (2 - math.pi / 2))
+    assert abs(drawn / (exact * mm**2) - 1) < 1e-4
+    assert abs(float(jnp.sum(mesh.cell_areas(path.problem.mesh))) / drawn - 1) < 1e-3
+
+
+def test_gradient_by_the_wall_thickness_agrees_with_central_differences():
+    design = designs.draw(1.5 * mm)
+    path = fem.solve_path(design.problem, air=jnp.array([8 * kPa]))
+    slope = designs.sensitivity(design, path)
+    assert slope.error < 1e-6
+    assert all(np.isfinite(value) for value in slope.gradient.values())
+
+
+def test_dimensions_that_leave_no_chamber_are_refused():
+    with pytest.raises(ValueError, match="at least two fillets"):
+        BellowsActuator(wall_thickness=4.5 * mm)
+    with pytest.raises(ValueError, match="write 2 \\* mm"):
+        BellowsActuator(wall_thickness=2.0)
+
+
+def test_the_drawing_is_differentiable_in_every_dimension():
+    point = jnp.array([12.5 * mm, 8 * mm])
+    slopes = jax.grad(lambda a: a.body()(point))(BellowsActuator())
+    leaves = jax.tree.leaves(slopes)
+    assert all(jnp.isfinite(leaf) for leaf in leaves)
+    assert abs(slopes.wall_thickness) == pytest.approx(1.0)
