@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from sorojax.systems import PID, Constant
+from sorojax.cli.demo.loop import controller, reference_angle
 from sorojax_hardware import (
     Clock,
     MemoryBoard,
@@ -64,23 +64,25 @@ def test_pi_controller_reaches_its_target_and_the_board_vents():
     assert np.all(board.setpoint == 0)
 
 
-def test_the_controller_of_the_simulation_runs_on_the_board():
-    """The PID of `sorojax.systems`, angle in and pressure out, without a change."""
+def test_the_controller_of_the_demo_runs_on_the_board():
+    """The PID that `sorojax demo` simulates, angle in and pressure out, without a change."""
     clock, board = desk(num_ports=1)
-    target = 0.3  # rad
-    pid = PID(1e4, 5e5, low=0.0, high=20 * kPa, reference=Constant(target))
+    full, top = np.radians(-77.0), 20 * kPa
+    target = reference_angle(full, 5.0)
+    pid = controller(full, top, target)
     ticks = run_loop(
         board,
         clock,
         eqx.filter_jit(pid),
         pid.start(0.0, 0.0),
-        duration=2.0,
+        duration=5.0,
         period=PERIOD,
-        limits=(0.0, 20 * kPa),
-        measure=lambda t, pressure: 2e-5 * pressure[0],  # rad, of a soft finger
+        limits=(0.0, 1.2 * top),
+        measure=lambda t, pressure: full / top * pressure[0],  # rad, of a slow actuator
     )
-    angles = [2e-5 * tick.pressure[0] for tick in ticks]
-    assert len(angles) == 200 and abs(angles[-1] - target) < 1e-3 * target
+    angles = [full / top * tick.pressure[0] for tick in ticks]
+    assert len(angles) == 500 and abs(angles[-1] / (0.8 * full) - 1) < 5e-3
+    assert abs(angles[220] / (0.6 * full) - 1) < 5e-3  # at rest between two moves
     assert np.all(board.setpoint == 0)
 
 

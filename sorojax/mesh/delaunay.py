@@ -4,6 +4,7 @@ import numpy as np
 from scipy.spatial import Delaunay, KDTree
 
 from sorojax.mesh.outline import _GRADING, Outline
+from sorojax.mesh.sizes import Sizes
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sample import values
 
@@ -13,21 +14,21 @@ _CLEAR = 0.45  # of the local size: least distance of an interior point to the o
 class SizeField:
     """Wanted edge length [m]: that of the outline near it, `size` far from it."""
 
-    def __init__(self, lines: Outline, size: float):
+    def __init__(self, lines: Outline, size: Sizes):
         total = np.zeros(len(lines.points))
         count = np.zeros(len(lines.points))
         for end in (0, 1):
             np.add.at(total, lines.edges[:, end], lines.lengths)
             np.add.at(count, lines.edges[:, end], 1)
-        self.local = np.minimum(total / count, size)
-        self.size = size
+        self.local = np.minimum(total / count, size.largest)
+        self.sizes, self.size = size, size.largest
         self.tree = KDTree(lines.points)
 
     def __call__(self, p: np.ndarray) -> np.ndarray:
         distance, near = self.tree.query(p, k=min(6, self.tree.n))
         distance, near = np.atleast_2d(distance), np.atleast_2d(near)
         grown = self.local[near] + _GRADING * np.maximum(distance - self.local[near], 0)
-        return np.minimum(grown.min(axis=1), self.size)
+        return np.minimum(grown.min(axis=1), self.sizes(p))
 
 
 class Guard:
@@ -72,14 +73,17 @@ def _doubled_area(corners: np.ndarray) -> np.ndarray:
 
 
 def fill(
-    shape: AbstractSdf, lines: Outline, size: float, iterations: int
+    shape: AbstractSdf, lines: Outline, sizes: Sizes, iterations: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points (those of `lines` first) and triangles of the inside of `shape`."""
-    wanted, guard = SizeField(lines, size), Guard(lines)
+    wanted, guard, size = SizeField(lines, sizes), Guard(lines), sizes.smallest
     fixed = len(lines.points)
     points = np.concatenate([lines.points, _seeds(shape, lines, wanted, guard)])
+    cells = np.zeros((0, 3), int)
     for i in range(iterations):
-        cells = triangles(shape, points, size)
+        # Every other step keeps the triangles: they change little and cost most.
+        if i % 2 == 0 or i <= 3:
+            cells = triangles(shape, points, size)
         if i in (3, 6) and i + 2 < iterations:
             points = _adapt(points, cells, fixed, wanted)
             cells = triangles(shape, points, size)
@@ -116,7 +120,7 @@ def check_edges(lines: Outline, points: np.ndarray, cells: np.ndarray) -> None:
 def _seeds(shape, lines: Outline, wanted: SizeField, guard: Guard) -> np.ndarray:
     """Hexagonal lattices, each where its spacing fits the wanted size, finest first."""
     lower, upper = lines.points.min(axis=0), lines.points.max(axis=0)
-    ratio = wanted.size / wanted.local.min()
+    ratio = wanted.size / min(wanted.local.min(), wanted.sizes.smallest)
     levels = max(0, int(np.ceil(np.log(ratio) / np.log(1.5) - 0.3)))
     kept = np.zeros((0, 2))
     for level in range(levels, -1, -1):

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax._types import integers, real
-from sorojax.mesh.elements import AbstractElement
+from sorojax.mesh.elements import AbstractElement, facet_corners
 
 
 def _int_sets(sets: dict[str, Any]) -> dict[str, jax.Array]:
@@ -18,10 +18,10 @@ def _int_sets(sets: dict[str, Any]) -> dict[str, jax.Array]:
 class Mesh(eqx.Module):
     """Cells of one element type over points, in the reference configuration.
 
-    `node_sets` holds node numbers. `facet_sets` holds facets as their node
-    numbers, `(facets, facet_nodes)`, corners first with the domain on the left,
-    then the mid-side node. Only `points` can carry a gradient: topology is built
-    outside any trace.
+    `node_sets` holds node numbers, `regions` cell numbers. `facet_sets` holds facets as
+    their node numbers, `(facets, facet_nodes)`, corners first, in the plane with the
+    domain on the left, in space counter-clockwise as seen from outside; then mid-side
+    nodes. Only `points` can carry a gradient: topology is built outside any trace.
     """
 
     points: Float[Array, "nodes dim"] = eqx.field(converter=real)
@@ -31,6 +31,9 @@ class Mesh(eqx.Module):
         converter=_int_sets, default_factory=dict
     )
     facet_sets: dict[str, Int[Array, "facets facet_nodes"]] = eqx.field(
+        converter=_int_sets, default_factory=dict
+    )
+    regions: dict[str, Int[Array, " cells"]] = eqx.field(
         converter=_int_sets, default_factory=dict
     )
 
@@ -65,10 +68,30 @@ class Mesh(eqx.Module):
 
 
 def boundary_facets(mesh: Mesh) -> Int[np.ndarray, "facets facet_nodes"]:
-    """Facets that belong to one cell only, domain on the left (host array)."""
+    """Facets that belong to one cell only, outward as in `facet_sets` (host array)."""
+    facets, first, count, _ = facet_table(mesh)
+    return facets[np.sort(first[count == 1])]
+
+
+def facet_table(mesh: Mesh):
+    """All facets with repeats, `first` and `count` of the distinct ones, and which
+    distinct facet each is: facet k belongs to cell k % num_cells."""
     cells = np.asarray(mesh.cells)
     facets = np.concatenate([cells[:, list(f)] for f in mesh.element.facets])
-    ends = np.sort(facets[:, :2], axis=1)
-    keys = ends[:, 0].astype(np.int64) * mesh.num_nodes + ends[:, 1]
-    _, first, count = np.unique(keys, return_index=True, return_counts=True)
-    return facets[np.sort(first[count == 1])]
+    corners = np.sort(facets[:, : facet_corners(mesh.element)], axis=1)
+    keys = corners[:, 0].astype(np.int64)
+    for column in corners.T[1:]:
+        # Ranks keep the keys small: three node numbers may not fit 64 bits.
+        keys = np.unique(keys, return_inverse=True)[1] * np.int64(mesh.num_nodes) + column
+    # A padded polygon has sides from its last node to itself.
+    _, first, number, count = np.unique(
+        keys, return_index=True, return_inverse=True, return_counts=True
+    )
+    empty = (corners[:, 0] == corners[:, 1])[first] if mesh.element.dim == 2 else None
+    return facets, first, count if empty is None else np.where(empty, 2, count), number
+
+
+def valences(mesh: Mesh) -> Int[np.ndarray, " cells"]:
+    """Corners of each cell; fewer than the element has where a polygon is padded."""
+    cells = np.asarray(mesh.cells)[:, : mesh.element.num_corners]
+    return 1 + (np.diff(cells, axis=1) != 0).sum(axis=1)

@@ -12,15 +12,14 @@ from jaxtyping import Array, Bool, Float, Int
 from sorojax._types import integers, is_traced
 from sorojax.math import sparse
 from sorojax.mesh.elements import Tri3, Tri6
-from sorojax.mesh.follow import closest, field_tangent
 from sorojax.mesh.mesh import Mesh
 from sorojax.mesh.outline_plan import OutlinePlan, plan_outline
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.query import value_and_gradient
+from sorojax.sdf.query import project, shape_tangent, value_and_gradient
 from sorojax.sdf.surface import cross
 
 Fields = tuple[AbstractSdf, ...]
-_ZOOMS = (0.9, 0.3, 0.03, 3e-3, 1e-4, 1e-6, 1e-6)  # of an edge: where a corner's sides are seen
+_ZOOMS = (0.9, 0.3, 0.03, 3e-3, 1e-4, 1e-6)  # of an edge: where a corner's sides are seen
 
 
 def move(mesh: Mesh, shape: AbstractSdf, *, interfaces: tuple[AbstractSdf, ...] = ()) -> Mesh:
@@ -170,7 +169,7 @@ def _outline_displacement(
     for field, curve in zip(fields, plan.curves, strict=True):
         guess = jnp.sum(curve.share[..., None] * shift[curve.between], axis=1)
         x = points[curve.nodes]
-        moved = moved.at[curve.nodes].set(closest(field, x + guess) - x)
+        moved = moved.at[curve.nodes].set(project(field, x + guess) - x)
     return moved
 
 
@@ -179,60 +178,46 @@ def _meeting_points(
     fields: Fields, plan: OutlinePlan, start: Float[Array, "corners 2"]
 ) -> Float[Array, "corners 2"]:
     """Where the sides of each corner meet, looked at from nearer and nearer."""
-    return _corners_and_sides(fields, plan, start)[0]
-
-
-def _corners_and_sides(fields: Fields, plan: OutlinePlan, start):
-    """The corners and, of the last look at their sides, points and slopes."""
     zooms = jnp.asarray(_ZOOMS, start.dtype)
-    beside = jnp.concatenate([curve.beside for curve in plan.curves])
 
-    def closer(i, state):
-        x, _, _ = state
-        seen, slopes = _sides_near(fields, plan, x, zooms[i])
-        gap = jnp.concatenate(seen) - x[beside]
-        n, _ = _unit(jnp.concatenate(slopes))
-        step = _least_squares(n, jnp.sum(n * gap, axis=1), beside, len(x))
-        return x + step, seen, slopes
+    def closer(i, x):
+        normals, levels, _, beside, _ = _sides_near(fields, plan, x, zooms[i])
+        return x + _least_squares(normals, levels, beside, len(x))
 
-    blank = tuple(jnp.zeros_like(curve.along) for curve in plan.curves)
-    return jax.lax.fori_loop(0, len(_ZOOMS), closer, (start, blank, blank))
+    return jax.lax.fori_loop(0, len(_ZOOMS), closer, start)
 
 
 @_meeting_points.def_jvp
 def _meeting_points_jvp(primals, tangents):
     fields, plan, start = primals
-    x, seen, slopes = _corners_and_sides(fields, plan, start)
+    x = _meeting_points(fields, plan, start)
+    zoom = jnp.asarray(_ZOOMS[-1], start.dtype)
+    normals, _, slopes, beside, seen = _sides_near(fields, plan, x, zoom)
 
-    f_dot = jnp.concatenate(
-        [field_tangent(*each) for each in zip(fields, tangents[0], seen, strict=True)]
-    )
-    beside = jnp.concatenate([curve.beside for curve in plan.curves])
-    n, slope = _unit(jnp.concatenate(slopes))
-    return x, _least_squares(n, -f_dot / slope, beside, len(x))
+    def fields_at(fields):
+        return tuple(f(p) for f, p in zip(fields, seen, strict=True))
 
-
-def _unit(g: Float[Array, "ends 2"]) -> tuple[Float[Array, "ends 2"], Float[Array, " ends"]]:
-    slope = jnp.sqrt(jnp.sum(g * g, axis=1))
-    return g / slope[:, None], slope
+    f_dot = jnp.concatenate(shape_tangent(fields_at, fields, tangents[0]))
+    return x, _least_squares(normals, -f_dot / slopes, beside, len(x))
 
 
 def _sides_near(fields: Fields, plan: OutlinePlan, x, zoom):
-    """Points on the sides beside the corners `x`, and the slope of their field there."""
-    seen, slopes = [], []
+    """Sides beside the corners `x`: normal, how far x is from its line, slope, place."""
+    sides, seen = [], []
     for field, curve in zip(fields, plan.curves, strict=True):
+        at = x[curve.beside]
 
-        # One copy of the field in the loop body: it decides the time to compile.
-        def land(_, state, field=field):
-            p, f, g = state
-            p = p - (f / jnp.sum(g * g, axis=1))[:, None] * g
-            return p, *value_and_gradient(field, p)
+        def land(_, p, field=field):
+            f, g = value_and_gradient(field, p)
+            return p - (f / jnp.sum(g * g, axis=1))[:, None] * g
 
-        p = x[curve.beside] + zoom * curve.along
-        p, _, g = jax.lax.fori_loop(0, 4, land, (p, jnp.zeros_like(p[:, 0]), jnp.ones_like(p)))
+        p = jax.lax.fori_loop(0, 3, land, at + zoom * curve.along)
+        _, g = value_and_gradient(field, p)
+        slope = jnp.sqrt(jnp.sum(g * g, axis=1))
+        n = g / slope[:, None]
+        sides.append((n, jnp.sum(n * (p - at), axis=1), slope, curve.beside))
         seen.append(p)
-        slopes.append(g)
-    return tuple(seen), tuple(slopes)
+    return *(jnp.concatenate(part) for part in zip(*sides, strict=True)), tuple(seen)
 
 
 def _least_squares(normals, levels, beside, count: int) -> Float[Array, "corners 2"]:

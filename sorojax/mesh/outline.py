@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
+from sorojax.mesh.sizes import Sizes
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sample import land, values, values_and_gradients
 from sorojax.sdf.surface import Curve, contour, level_curves
@@ -38,10 +39,10 @@ class Outline(NamedTuple):
         return np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
 
 
-def outline(shape: AbstractSdf, interfaces: tuple[AbstractSdf, ...], size: float) -> Outline:
+def outline(shape: AbstractSdf, interfaces: tuple[AbstractSdf, ...], size: Sizes) -> Outline:
     """Boundary of `shape` and the interfaces inside it, in edges of about `size` [m]."""
     fields = (shape, *interfaces)
-    dense = size / 4
+    dense = max(size.smallest, size.largest / 8) / 4
     pieces = [(0, curve) for curve in contour(shape, dense)]
     every = np.concatenate([curve.points for _, curve in pieces])
     margin = 1.37 * dense
@@ -49,14 +50,16 @@ def outline(shape: AbstractSdf, interfaces: tuple[AbstractSdf, ...], size: float
     for i, interface in enumerate(interfaces):
         pieces += [(i + 1, c) for c in level_curves(interface, lower, upper, dense)]
     broken = [(i, _break(fields, i, curve)) for i, curve in pieces]
-    chains = [(i, part) for i, c in broken for part in _inside_parts(shape, i, c, size)]
+    chains = [(i, part) for i, c in broken for part in _inside_parts(shape, i, c, size.largest)]
     if interfaces and not any(i > 0 for i, _ in chains):
         raise ValueError(
             "triangulate: none of the `interfaces` passes through the shape. Check their "
             "position, or leave them out."
         )
     resampled = [(i, _resample(fields[i], part, size)) for i, part in chains]
-    return _split_crowded(fields, _join(resampled, size), size / _FINEST)
+    return _split_crowded(
+        fields, _join(resampled, size.smallest), size.smallest / _FINEST
+    )
 
 
 def _break(fields, owner: int, curve: Curve) -> Curve:
@@ -116,7 +119,7 @@ def _inside_parts(shape, owner: int, curve: Curve, size: float) -> list[Curve]:
     return parts
 
 
-def _resample(field: AbstractSdf, curve: Curve, size: float) -> Curve:
+def _resample(field: AbstractSdf, curve: Curve, size: Sizes) -> Curve:
     """`curve` in edges of about `size`, shorter where it bends, corners kept."""
     points, corner = curve.points, curve.corner
     if curve.closed:
@@ -144,16 +147,16 @@ def _resample(field: AbstractSdf, curve: Curve, size: float) -> Curve:
     return Curve(new[:-1], fixed[:-1], True)
 
 
-def _spacing(field, points, corner, size: float) -> np.ndarray:
+def _spacing(field, points, corner, size: Sizes) -> np.ndarray:
     """Wanted edge length at each point: bounded turn, bounded growth."""
     g = values_and_gradients(field, points)[1]
     angle = np.arctan2(g[:, 1], g[:, 0])
     turn = np.abs((np.diff(angle) + np.pi) % (2 * np.pi) - np.pi)
     turn[corner[1:] | corner[:-1]] = 0.0  # a corner ends an edge anyway
-    step = np.maximum(np.linalg.norm(np.diff(points, axis=0), axis=1), 1e-6 * size)
+    step = np.maximum(np.linalg.norm(np.diff(points, axis=0), axis=1), 1e-6 * size.largest)
     bend = np.r_[turn / step, 0.0]
     bend = np.maximum(bend, np.r_[0.0, bend[:-1]])
-    wanted = np.minimum(size, _MAX_TURN / np.maximum(bend, 1e-9 / size))
+    wanted = np.minimum(size(points), _MAX_TURN / np.maximum(bend, 1e-9 / size.largest))
     for i in range(1, len(points)):
         wanted[i] = min(wanted[i], wanted[i - 1] + _GRADING * step[i - 1])
     for i in range(len(points) - 2, -1, -1):

@@ -8,6 +8,7 @@ from sorojax.mesh.delaunay import check_edges, fill
 from sorojax.mesh.elements import Tri3, Tri6
 from sorojax.mesh.mesh import Mesh
 from sorojax.mesh.outline import Outline, outline
+from sorojax.mesh.sizes import SizeFunction, sizes
 from sorojax.mesh.tri6 import least_jacobian, with_middles
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sample import finite_box, land
@@ -16,7 +17,7 @@ from sorojax.sdf.sample import finite_box, land
 def triangulate(
     shape: AbstractSdf,
     *,
-    size: float,
+    size: float | SizeFunction,
     order: int = 1,
     interfaces: tuple[AbstractSdf, ...] = (),
     iterations: int = 12,
@@ -32,7 +33,8 @@ def triangulate(
 
     Args:
         shape: A concrete, bounded plane shape.
-        size: Wanted length of the sides [m].
+        size: Wanted length of the sides [m]: a number, or a function of points (n, 2)
+            that returns one length per point, such as `grade(...)`.
         order: 1 for `Tri3`, 2 for `Tri6`.
         interfaces: Shapes whose zero sets become sides of the mesh inside `shape`.
         iterations: Smoothing steps; more give slightly rounder triangles.
@@ -45,12 +47,11 @@ def triangulate(
             f"triangulate: `order` is {order}, need 1 (Tri3) or 2 (Tri6). Other degrees "
             "do not exist."
         )
-    _check.positive("triangulate", "size", size, "m", "Give the wanted length of a side.")
     _check.float64("triangulate", real(0.0))
-    finite_box("triangulate", shape, 2)
+    lengths = sizes("triangulate", size, *finite_box("triangulate", shape, 2))
     interfaces = tuple(interfaces)
-    lines = outline(shape, interfaces, float(size))
-    points, cells = fill(shape, lines, float(size), iterations)
+    lines = outline(shape, interfaces, lengths)
+    points, cells = fill(shape, lines, lengths, iterations)
     check_edges(lines, points, cells)
     if order == 1:
         return Mesh(points, cells, Tri3(), *_sets(lines, lines.edges, len(interfaces)))

@@ -1,10 +1,20 @@
 """Implicit shapes: signed distances in metres, negative inside."""
 
-from sorojax.sdf.base import AbstractSdf as AbstractSdf
+from sorojax.sdf.base import AbstractSdf as AbstractSdf, Exactness as Exactness
+from sorojax.sdf.blend import (
+    AbstractBlend as AbstractBlend,
+    Chamfer as Chamfer,
+    Circular as Circular,
+    Cubic as Cubic,
+    Exponential as Exponential,
+    Quadratic as Quadratic,
+    SmoothDifference as SmoothDifference,
+    SmoothIntersection as SmoothIntersection,
+    SmoothUnion as SmoothUnion,
+)
 from sorojax.sdf.combine import (
     Difference as Difference,
     Intersection as Intersection,
-    SmoothUnion as SmoothUnion,
     Union as Union,
     intersection as intersection,
     union as union,

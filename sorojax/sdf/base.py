@@ -3,26 +3,49 @@
 from __future__ import annotations
 
 import abc
+import functools
+from dataclasses import fields
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Shaped
 
+from sorojax import _check
 from sorojax._types import real
 
 Box = tuple[Float[Array, " dim"], Float[Array, " dim"]]
+Number = float | Float[Array, ""]
+
+
+class Exactness(NamedTuple):
+    """On which sides of the surface |f| is the true distance; elsewhere it is a bound."""
+
+    outside: bool
+    inside: bool
+
+
+EXACT = Exactness(outside=True, inside=True)
+BOUND = Exactness(outside=False, inside=False)
 
 
 class AbstractSdf(eqx.Module):
     """An implicit shape: a field that is negative inside and zero on the surface.
 
     A new shape gives `distance`, `dim` and `bounding_box`; it states its
-    `lipschitz` constant when that is not 1 and `exact` when the field is the true
-    Euclidean distance everywhere (otherwise it is a lower bound of it).
+    `lipschitz` constant when that is not 1 and its `exactness` where the field is the
+    true Euclidean distance. Everywhere |f| <= lipschitz * distance to the surface.
 
-    Shapes combine by `|` or `+` (union), `&` or `/` (intersection), `-` (difference).
+    Shapes combine by `|` or `+` (union), `&` or `/` (intersection), `-` (difference);
+    `*` scales about the origin.
     """
+
+    def __check_init__(self):
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if eqx.is_inexact_array(value):
+                _check.finite(type(self).__name__, field.name, value, "Give real numbers.")
 
     @property
     @abc.abstractmethod
@@ -38,14 +61,29 @@ class AbstractSdf(eqx.Module):
         """Lower and upper corner [m] of a box that holds the inside; may be infinite."""
 
     @property
-    def lipschitz(self) -> float:
+    def lipschitz(self) -> Number:
         """Bound of |grad f|: no point within |f| / lipschitz changes sign."""
         return 1.0
 
     @property
+    def exactness(self) -> Exactness:
+        """On which sides |f| is the true distance to the surface."""
+        return BOUND
+
+    @property
     def exact(self) -> bool:
         """Whether |f| is the true distance to the surface everywhere."""
-        return False
+        return all(self.exactness)
+
+    def level_box(self, level: Number) -> Box:
+        """Corners [m] of a box that holds all points where the field is below `level` [m].
+
+        A bound may stay small far from the surface, so nothing is known of it in general.
+        """
+        lower, upper = self.bounding_box()
+        if self.exactness.outside:
+            return lower - level, upper + level
+        return jnp.full_like(lower, -jnp.inf), jnp.full_like(upper, jnp.inf)
 
     def __call__(self, p: Float[Array, "*points dim"]) -> Float[Array, "*points"]:
         """Field [m] at points `p` [m]."""
@@ -77,6 +115,34 @@ class AbstractSdf(eqx.Module):
 
     def __truediv__(self, other: AbstractSdf) -> AbstractSdf:
         return self & other
+
+    def __mul__(self, factor: Number) -> AbstractSdf:
+        from sorojax.sdf.transform import scale
+
+        return scale(self, factor)
+
+    __rmul__ = __mul__
+
+
+def steepest(*slopes: Number) -> Number:
+    """The largest of `slopes`; a float unless one of them is traced."""
+    if all(_check.is_concrete(slope) for slope in slopes):
+        return max(float(slope) for slope in slopes)
+    return functools.reduce(jnp.maximum, slopes)
+
+
+def number(value: Number) -> Number:
+    """`value` as a float unless it is traced."""
+    return float(value) if _check.is_concrete(value) else value
+
+
+def check_lengths(shape: AbstractSdf, *names: str) -> None:
+    """Raise a `ValueError` unless the named fields are scalars above zero."""
+    where = type(shape).__name__
+    for name in names:
+        value = getattr(shape, name)
+        _check.shape(where, name, value, (), "Give one number.")
+        _check.positive(where, name, value, "m", "Give a length above zero.")
 
 
 def cast(shape: AbstractSdf, dtype: jnp.dtype) -> AbstractSdf:

@@ -85,15 +85,27 @@ def _project_jvp(primals, tangents):
     shape, p = primals
     shape_dot, p_dot = tangents
     x = _project(shape, p)
+    # One derivative for both places: the field is compiled once.
+    both = jnp.concatenate([x, p])
+    if p_dot is None:
+        p_dot = jnp.zeros_like(p)
+    both_dot = jnp.concatenate([jnp.zeros_like(x), p_dot])
+    f, g = value_and_gradient(shape, both)
+    f_dot, g_dot = shape_tangent(
+        lambda a: value_and_gradient(*a), (shape, both), (shape_dot, both_dot)
+    )
     # Across the surface: it stays on the zero set.
-    _, g = value_and_gradient(shape, x)
+    n = len(p)
     square = jnp.sum(g * g, axis=1)
-    f_dot = shape_tangent(lambda s: s(x), shape, shape_dot)
-    across = -quotient(f_dot, square)[:, None] * g
+    normal = g[:n]
+    across = -quotient(f_dot[:n], square[:n])[:, None] * normal
     # Along the surface: as one Newton step does, which is all an exact distance needs.
-    along = shape_tangent(lambda a: _newton_point(*a), (shape, p), (shape_dot, p_dot))
-    slip = quotient(jnp.sum(along * g, axis=1), square)
-    return x, across + along - slip[:, None] * g
+    f, g, f_dot, g_dot, square_p = f[n:], g[n:], f_dot[n:], g_dot[n:], square[n:]
+    step = quotient(f, square_p)
+    step_dot = quotient(f_dot - 2 * step * jnp.sum(g * g_dot, axis=1), square_p)
+    along = p_dot - step_dot[:, None] * g - step[:, None] * g_dot
+    slip = quotient(jnp.sum(along * normal, axis=1), square[:n])
+    return x, across + along - slip[:, None] * normal
 
 
 def shape_tangent(function, shape: Any, shape_dot: Any):

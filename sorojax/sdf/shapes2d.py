@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 
 from sorojax import _check
 from sorojax._types import real
-from sorojax.sdf.base import AbstractSdf, Box
+from sorojax.sdf.base import EXACT, AbstractSdf, Box, Exactness
 from sorojax.sdf.scalar import (
     absolute,
     maximum,
@@ -27,8 +27,8 @@ class AbstractPlaneShape(AbstractSdf):
         return 2
 
     @property
-    def exact(self) -> bool:
-        return True
+    def exactness(self) -> Exactness:
+        return EXACT
 
 
 class Circle(AbstractPlaneShape):

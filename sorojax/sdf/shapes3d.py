@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import real
-from sorojax.sdf.base import AbstractSdf, Box as Bounds
+from sorojax.sdf.base import EXACT, AbstractSdf, Box as Bounds, Exactness
 from sorojax.sdf.scalar import absolute, maximum, minimum, norm, positive_part
 from sorojax.sdf.shapes2d import check_box
 
@@ -19,8 +19,8 @@ class AbstractSolidShape(AbstractSdf):
         return 3
 
     @property
-    def exact(self) -> bool:
-        return True
+    def exactness(self) -> Exactness:
+        return EXACT
 
 
 class Sphere(AbstractSolidShape):

@@ -1,5 +1,6 @@
 """Shapes moved, scaled, thickened, hollowed and repeated."""
 
+import abc
 import functools
 import math
 
@@ -10,7 +11,7 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import is_traced, real
-from sorojax.sdf.base import AbstractSdf, Box
+from sorojax.sdf.base import BOUND, AbstractSdf, Box, Exactness, Number
 from sorojax.sdf.scalar import absolute, minimum
 
 
@@ -24,8 +25,14 @@ class AbstractWrapped(AbstractSdf):
         return self.shape.dim
 
     @property
-    def lipschitz(self) -> float:
+    def lipschitz(self) -> Number:
         return self.shape.lipschitz
+
+    @abc.abstractmethod
+    def level_box(self, level: Number) -> Box: ...
+
+    def bounding_box(self) -> Box:
+        return self.level_box(0.0)
 
 
 class Translated(AbstractWrapped):
@@ -40,14 +47,14 @@ class Translated(AbstractWrapped):
         )
 
     @property
-    def exact(self) -> bool:
-        return self.shape.exact
+    def exactness(self) -> Exactness:
+        return self.shape.exactness
 
     def distance(self, *x):
         return self.shape.distance(*(c - self.offset[i] for i, c in enumerate(x)))
 
-    def bounding_box(self) -> Box:
-        lower, upper = self.shape.bounding_box()
+    def level_box(self, level) -> Box:
+        lower, upper = self.shape.level_box(level)
         return lower + self.offset, upper + self.offset
 
 
@@ -59,8 +66,8 @@ class Rotated(AbstractWrapped):
     center: Float[Array, "2"] = eqx.field(converter=real)
 
     @property
-    def exact(self) -> bool:
-        return self.shape.exact
+    def exactness(self) -> Exactness:
+        return self.shape.exactness
 
     def distance(self, *x):
         c, s = jnp.cos(self.angle), jnp.sin(self.angle)
@@ -68,8 +75,8 @@ class Rotated(AbstractWrapped):
         turned = (self.center[0] + c * dx + s * dy, self.center[1] - s * dx + c * dy)
         return self.shape.distance(*turned, *x[2:])
 
-    def bounding_box(self) -> Box:
-        lower, upper = self.shape.bounding_box()
+    def level_box(self, level) -> Box:
+        lower, upper = self.shape.level_box(level)
         bounded = jnp.all(jnp.isfinite(lower[:2]) & jnp.isfinite(upper[:2]))
         low = jnp.where(bounded, lower[:2], -jnp.ones_like(lower[:2]))
         high = jnp.where(bounded, upper[:2], jnp.ones_like(upper[:2]))
@@ -97,14 +104,14 @@ class Scaled(AbstractWrapped):
         _check.positive("scale", "factor", self.factor, "", "Mirror is another operation.")
 
     @property
-    def exact(self) -> bool:
-        return self.shape.exact
+    def exactness(self) -> Exactness:
+        return self.shape.exactness
 
     def distance(self, *x):
         return self.factor * self.shape.distance(*(c / self.factor for c in x))
 
-    def bounding_box(self) -> Box:
-        lower, upper = self.shape.bounding_box()
+    def level_box(self, level) -> Box:
+        lower, upper = self.shape.level_box(level / self.factor)
         return lower * self.factor, upper * self.factor
 
 
@@ -114,12 +121,20 @@ class Offset(AbstractWrapped):
     shape: AbstractSdf
     thickness: Float[Array, ""] = eqx.field(converter=real)
 
+    @property
+    def exactness(self) -> Exactness:
+        # Growth keeps the distance outside, shrinking the one inside.
+        if not _check.is_concrete(self.thickness):
+            return BOUND
+        outside, inside = self.shape.exactness
+        grows = float(self.thickness) >= 0
+        return Exactness(outside and grows, inside and not grows)
+
     def distance(self, *x):
         return self.shape.distance(*x) - self.thickness
 
-    def bounding_box(self) -> Box:
-        lower, upper = self.shape.bounding_box()
-        return lower - self.thickness, upper + self.thickness
+    def level_box(self, level) -> Box:
+        return self.shape.level_box(level + self.thickness)
 
 
 class Shell(AbstractWrapped):
@@ -131,12 +146,15 @@ class Shell(AbstractWrapped):
     def __check_init__(self):
         _check.positive("shell", "thickness", self.thickness, "m", "Give the wall thickness.")
 
+    @property
+    def exactness(self) -> Exactness:
+        return Exactness(self.shape.exact, False)
+
     def distance(self, *x):
         return absolute(self.shape.distance(*x)) - self.thickness / 2
 
-    def bounding_box(self) -> Box:
-        lower, upper = self.shape.bounding_box()
-        return lower - self.thickness / 2, upper + self.thickness / 2
+    def level_box(self, level) -> Box:
+        return self.shape.level_box(level + self.thickness / 2)
 
 
 class Repeated(AbstractWrapped):
@@ -158,8 +176,9 @@ class Repeated(AbstractWrapped):
             raise ValueError(f"repeat: `count` must be at least 1, got {self.count}.")
 
     @property
-    def exact(self) -> bool:
-        return self.shape.exact and self.separate
+    def exactness(self) -> Exactness:
+        outside, inside = self.shape.exactness
+        return Exactness(outside, inside and self.separate)
 
     def distance(self, *x):
         zero = jnp.zeros_like(x[0])
@@ -182,8 +201,8 @@ class Repeated(AbstractWrapped):
         values = self.shape.distance(*local)
         return functools.reduce(minimum, (values[i] for i in range(len(cells))))
 
-    def bounding_box(self) -> Box:
-        lower, upper = self.shape.bounding_box()
+    def level_box(self, level) -> Box:
+        lower, upper = self.shape.level_box(level)
         last = (self.count - 1) * self.step
         zero = jnp.zeros_like(last)
         return lower + jnp.minimum(zero, last), upper + jnp.maximum(zero, last)

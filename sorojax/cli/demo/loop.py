@@ -62,25 +62,39 @@ def reduce(design: Design, path: fem.Path) -> Reduced:
     )
 
 
+def reference_angle(full: float, duration: float) -> systems.SmoothRamp:
+    """Three moves within `duration` [s], in shares of the angle `full` [rad]."""
+    times = np.array([0.0, 0.1, 0.3, 0.46, 0.62, 0.78, 0.94])
+    shares = np.array([0.0, 0.0, 0.6, 0.6, 0.25, 0.25, 0.8])
+    return systems.SmoothRamp(duration * times, shares * full)
+
+
+def controller(
+    full: float, top: float, reference: systems.AbstractReference | None = None
+) -> systems.PID:
+    """PID from the tip angle [rad] to a pressure [Pa], for an actuator that reaches the angle
+    `full` at the pressure `top`."""
+    per_angle = top / full
+    return systems.PID(
+        proportional=0.5 * per_angle,
+        integral_gain=8.0 * per_angle,
+        derivative=0.05 * per_angle,
+        feed_forward=0.9 * per_angle,
+        low=0.0,
+        high=1.2 * top,
+        filter_time=0.01,
+        reference=reference,
+    )
+
+
 def closed_loop(reduced: Reduced, path: fem.Path, duration: float) -> systems.Network:
     """Reservoir, regulator, rod and PID: the tip follows a reference angle."""
     full = float(_tip_angle(reduced, -1))
-    per_angle = float(path.values[-1]) / full
-    ramp = np.array([0.0, 0.1, 0.3, 0.46, 0.62, 0.78, 0.94])
-    share = np.array([0.0, 0.0, 0.6, 0.6, 0.25, 0.25, 0.8])
-    reference = systems.SmoothRamp(duration * ramp, share * full)
-    pid = systems.PID(
-        proportional=0.3 * per_angle,
-        integral_gain=2.5 * per_angle,
-        derivative=0.04 * per_angle,
-        feed_forward=0.8 * per_angle,
-        low=0.0,
-        high=1.2 * float(path.values[-1]),
-        filter_time=0.01,
-    )
+    reference = systems.Source(reference_angle(full, duration), unit="rad")
+    pid = controller(full, float(path.values[-1]))
     return systems.Network(
         blocks={
-            "target": systems.Source(reference, unit="rad"),
+            "target": reference,
             "pid": pid,
             "valve": systems.Regulator(1.5e-8, integral_gain=3e-8, max_flow=3e-5),
             "air": systems.Reservoir(dead_volume=2 * ml),

@@ -1,0 +1,186 @@
+"""The body-centred cubic lattice over a solid, and tetrahedra cut at its surface.
+
+Reference: Labelle and Shewchuk, Isosurface stuffing, SIGGRAPH 2007.
+"""
+
+import numpy as np
+
+from sorojax.sdf.base import AbstractSdf
+from sorojax.sdf.sample import values
+
+_SNAP_LONG, _SNAP_SHORT = 0.25, 0.41  # share of an edge within which a node is moved
+_MOST_CUBES = 2e7
+_EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+
+
+def lattice(shape: AbstractSdf, lower, upper, pitch: float):
+    """Nodes, their field [m], and tetrahedra that touch the inside of `shape`.
+
+    Cubes are kept where the Lipschitz constant cannot exclude the inside, so memory
+    follows the volume of the shape and not that of its box.
+    """
+    count = np.ceil((upper - lower) / pitch).astype(int) + 2
+    start = (lower + upper) / 2 - pitch * count / 2
+    if count.prod() > _MOST_CUBES:
+        raise ValueError(
+            f"tetrahedralise: a pitch of {pitch:g} m over a box of {upper - lower} m takes "
+            f"{count.prod():.2g} cubes, at most {_MOST_CUBES:.0e} are allowed. Raise `size`."
+        )
+    cubes = _near_cubes(shape, start, count, pitch)
+    centre = np.full(tuple(count), -1, np.int64)
+    centre[tuple(cubes.T)] = np.arange(len(cubes))
+    pairs, rings = [], []
+    for axis in range(3):
+        u, w = (axis + 1) % 3, (axis + 2) % 3
+        beside = cubes.copy()
+        beside[:, axis] += 1
+        inside = beside[:, axis] < count[axis]
+        other = np.full(len(cubes), -1, np.int64)
+        other[inside] = centre[tuple(beside[inside].T)]
+        joined = other >= 0
+        pairs.append(np.stack([np.flatnonzero(joined), other[joined]], axis=1))
+        ring = np.repeat(beside[joined][:, None], 4, axis=1)
+        ring[:, [1, 2], u] += 1
+        ring[:, [2, 3], w] += 1
+        rings.append(ring)
+    pair, ring = np.concatenate(pairs), np.concatenate(rings)
+    flat = np.ravel_multi_index(tuple(np.moveaxis(ring, 2, 0)), tuple(count + 1))
+    used, number = np.unique(flat, return_inverse=True)
+    number = len(cubes) + number.reshape(flat.shape)
+    corners = np.stack(np.unravel_index(used, tuple(count + 1)), axis=1)
+    points = start + pitch * np.concatenate([cubes + 0.5, corners])
+    cells = np.concatenate(
+        [
+            np.concatenate([pair, number[:, [k]], number[:, [(k + 1) % 4]]], axis=1)
+            for k in range(4)
+        ]
+    )
+    f = values(shape, points)
+    return points, f, cells[(f[cells] < 0).any(axis=1)]
+
+
+def _near_cubes(shape: AbstractSdf, start, count, pitch: float) -> np.ndarray:
+    """Cubes that may hold inside, with their neighbours: tested in blocks, then singly."""
+    width = 8
+    blocks = np.stack(
+        np.meshgrid(*(np.arange(-(-n // width)) for n in count), indexing="ij"), axis=-1
+    ).reshape(-1, 3)
+    reach = shape.lipschitz * np.sqrt(0.75) * pitch
+    middle = start + pitch * width * (blocks + 0.5)
+    blocks = blocks[values(shape, middle) < reach * (width + 3)]
+    within = np.stack(np.meshgrid(*[np.arange(width)] * 3, indexing="ij"), axis=-1)
+    cubes = (width * blocks[:, None] + within.reshape(-1, 3)).reshape(-1, 3)
+    cubes = cubes[(cubes < count).all(axis=1)]
+    return cubes[values(shape, start + pitch * (cubes + 0.5)) < 3 * reach]
+
+
+def unique_edges(cells: np.ndarray, num_nodes: int) -> np.ndarray:
+    """Distinct edges of tetrahedra, smaller node first."""
+    ends = np.concatenate([cells[:, list(e)] for e in _EDGES])
+    keys = np.unique(ends.min(axis=1) * np.int64(num_nodes) + ends.max(axis=1))
+    return np.stack(np.divmod(keys, num_nodes), axis=1)
+
+
+def roots(shape: AbstractSdf, a, b, fa, fb, steps: int = 4):
+    """Share of the way from `a` to `b` where the field vanishes, and the point there."""
+    low, high = np.zeros(len(a)), np.ones(len(a))
+    fa, fb, inside = fa.copy(), fb.copy(), fa < 0
+    share, point = low, a
+    for _ in range(steps):
+        share = low + (high - low) * fa / (fa - fb)
+        point = a + share[:, None] * (b - a)
+        f = values(shape, point)
+        same = (f < 0) == inside
+        low, high = np.where(same, share, low), np.where(same, high, share)
+        # Illinois: the end that stays is given half its value.
+        fa, fb = np.where(same, f, fa / 2), np.where(same, fb / 2, f)
+    return np.clip(share, 1e-6, 1 - 1e-6), point
+
+
+def snap(shape: AbstractSdf, points, f, cells, pitch: float):
+    """Lattice nodes close to the surface moved onto it; their field becomes zero."""
+    edges = unique_edges(cells, len(points))
+    edges = edges[(f[edges[:, 0]] < 0) != (f[edges[:, 1]] < 0)]
+    a, b = edges.T
+    share, crossing = roots(shape, points[a], points[b], f[a], f[b])
+    long = ((points[a] - points[b]) ** 2).sum(axis=1) > 0.9 * pitch**2
+    reach = np.where(long, _SNAP_LONG, _SNAP_SHORT)
+    length = np.where(long, 1.0, np.sqrt(0.75))
+    node, way = np.concatenate([a, b]), np.concatenate([share, 1 - share])
+    close = way < np.concatenate([reach, reach])
+    distance = (way * np.concatenate([length, length]))[close]
+    node, target = node[close], np.concatenate([crossing, crossing])[close]
+    order = np.lexsort((distance, node))
+    node, target = node[order], target[order]
+    first = np.r_[True, node[1:] != node[:-1]] if len(node) else np.zeros(0, bool)
+    points, f = points.copy(), f.copy()
+    points[node[first]], f[node[first]] = target[first], 0.0
+    return points, f
+
+
+def clip(shape: AbstractSdf, points, f, cells):
+    """The part of the tetrahedra inside `shape`; on its surface, `(points, cells, skin)`."""
+    sign = np.sign(f).astype(int)
+    state = sign[cells]
+    flat = (state == 0).all(axis=1)
+    if flat.any():
+        flat[flat] = values(shape, points[cells[flat]].mean(axis=1)) > 0
+    cells = cells[((state < 0).any(axis=1) | (state == 0).all(axis=1)) & ~flat]
+    positive = (sign[cells] > 0).any(axis=1)
+    whole, cut = cells[~positive], cells[positive]
+    edges = unique_edges(cut, len(points)) if len(cut) else np.zeros((0, 2), int)
+    edges = edges[sign[edges[:, 0]] * sign[edges[:, 1]] < 0]
+    a, b = edges.T
+    _, crossing = roots(shape, points[a], points[b], *(values(shape, points[e]) for e in (a, b)))
+    keys, base = a * np.int64(len(points)) + b, len(points)
+
+    def middle(p, q):
+        key = np.minimum(p, q) * np.int64(base) + np.maximum(p, q)
+        return base + np.searchsorted(keys, key)
+
+    order = np.argsort(sign[cut], axis=1, kind="stable")
+    cut = np.take_along_axis(cut, order, axis=1)
+    parts = [whole]
+    inside, on = (sign[cut] < 0).sum(axis=1), (sign[cut] == 0).sum(axis=1)
+    for m, z in {*zip(inside.tolist(), on.tolist(), strict=True)}:
+        parts += _inside_part(*cut[(inside == m) & (on == z)].T, m, z, middle)
+    cells = np.concatenate(parts)
+    skin = np.concatenate([sign == 0, np.ones(len(crossing), bool)])
+    points = np.concatenate([points, crossing])
+    used, number = np.unique(cells, return_inverse=True)
+    return points[used], number.reshape(-1, 4), skin[used]
+
+
+def _inside_part(a, b, c, d, inside: int, on: int, middle) -> list[np.ndarray]:
+    """Corners sorted inside, on, outside: the tetrahedra of the inside."""
+    if inside == 1:
+        others = [x if k < on else middle(a, x) for k, x in enumerate((b, c, d))]
+        return [np.stack([a, *others], axis=1)]
+    if inside == 2 and on == 1:
+        return _pyramid(np.stack([a, b, middle(b, d), middle(a, d)], axis=1), c)
+    if inside == 2:
+        return wedge(a, middle(a, c), middle(a, d), b, middle(b, c), middle(b, d))
+    return wedge(a, b, c, middle(a, d), middle(b, d), middle(c, d))
+
+
+def _pyramid(quad: np.ndarray, apex: np.ndarray) -> list[np.ndarray]:
+    """Split by the diagonal from the smallest node: the neighbour does the same."""
+    turn = (np.argmin(quad, axis=1)[:, None] + np.arange(4)) % 4
+    p, q, r, s = np.take_along_axis(quad, turn, axis=1).T
+    return [np.stack([p, q, r, apex], axis=1), np.stack([p, r, s, apex], axis=1)]
+
+
+_TURNS = np.array(
+    [[0, 1, 2, 3, 4, 5], [1, 2, 0, 4, 5, 3], [2, 0, 1, 5, 3, 4],
+     [3, 5, 4, 0, 2, 1], [4, 3, 5, 1, 0, 2], [5, 4, 3, 2, 1, 0]]
+)  # fmt: skip
+
+
+def wedge(*corners: np.ndarray) -> list[np.ndarray]:
+    """Three tetrahedra of a prism, every diagonal from the smallest node of its side."""
+    v = np.stack(corners, axis=1)
+    v = np.take_along_axis(v, _TURNS[np.argmin(v, axis=1)], axis=1)
+    first = np.minimum(v[:, 1], v[:, 5]) < np.minimum(v[:, 2], v[:, 4])
+    one = np.where(first[:, None], v[:, [0, 1, 2, 5]], v[:, [0, 1, 2, 4]])
+    two = np.where(first[:, None], v[:, [0, 1, 5, 4]], v[:, [0, 4, 2, 5]])
+    return [one, two, v[:, [0, 4, 5, 3]]]

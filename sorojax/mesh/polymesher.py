@@ -1,0 +1,124 @@
+"""Polygonal meshes: Voronoi cells evened out by Lloyd's method, cut at the boundary.
+
+Reference: Talischi, Paulino, Pereira, Menezes, PolyMesher, SMO 45, 2012. There seeds are
+mirrored at the boundary, which fails in walls thinner than a cell; here the cells are
+cut by the boundary polygon, which is exact for every number of cells.
+"""
+
+from collections.abc import Callable
+
+import jax
+import numpy as np
+from scipy.spatial import KDTree
+
+from sorojax import _check
+from sorojax._types import real
+from sorojax.mesh.convex import convex_parts
+from sorojax.mesh.elements import PolyN
+from sorojax.mesh.mesh import Mesh, boundary_facets
+from sorojax.mesh.voronoi import cut_cells, polygonise
+from sorojax.sdf.base import AbstractSdf
+from sorojax.sdf.sample import finite_box, raise_empty, values
+
+_SAMPLES = 250  # per cell: points that stand for its area in Lloyd's method
+_EVEN = 5e-3  # Lloyd error that ends the iterations
+
+
+def polymesher(
+    shape: AbstractSdf,
+    count: int,
+    *,
+    key: jax.Array,
+    iterations: int = 60,
+    on_step: Callable[[int, float], None] | None = None,
+) -> Mesh:
+    """About `count` convex polygons that fill a plane shape.
+
+    Cells of curved boundaries end in chords, one per cell; cells are split at re-entrant
+    corners, at holes inside them, and where a thin gap divides them, so the mesh may
+    have more than `count`. Node set "corners", facet set "boundary".
+
+    Args:
+        shape: A concrete, bounded plane shape.
+        count: Number of Voronoi seeds.
+        key: Random key of the first seeds.
+        iterations: Most steps of Lloyd's method.
+        on_step: Called with the number of each step and its Lloyd error: the shift of
+            the seeds over the size of a cell, weighted by area.
+
+    Raises:
+        ValueError: If the shape is empty, unbounded or traced, or `count` is below 2.
+    """
+    if count < 2:
+        raise ValueError(f"polymesher: `count` is {count}, need at least 2 cells.")
+    _check.float64("polymesher", real(0.0))
+    lower, upper = finite_box("polymesher", shape, 2)
+    cloud, area = _cloud(shape, lower, upper, count)
+    picked = jax.random.choice(key, len(cloud), (count,), replace=False)
+    seeds = _lloyd(shape, cloud, area, cloud[np.asarray(picked)], iterations, on_step)
+    border = polygonise(shape, seeds, float(np.sqrt(area / count)))
+    points, faces = cut_cells(seeds, border)
+    cells = [part for loops in faces for part in convex_parts(points, loops)]
+    mesh = _packed(points, cells)
+    _check_area(mesh, border)
+    corners = np.flatnonzero(border.corner)
+    place = KDTree(np.asarray(mesh.points)).query(border.points[corners])[1]
+    sets = {"boundary": boundary_facets(mesh)}
+    return Mesh(mesh.points, mesh.cells, mesh.element, {"corners": np.unique(place)}, sets)
+
+
+def _cloud(shape, lower, upper, count: int) -> tuple[np.ndarray, float]:
+    """Points of a fine grid inside `shape`, and their area [m^2]."""
+    pitch = float(np.sqrt((upper - lower).prod() / (count * _SAMPLES)))
+    for _ in range(2):  # the first grid tells which part of the box is filled
+        axes = [
+            np.arange(lower[i] + pitch / 2, upper[i] + pitch / 2, pitch) for i in range(2)
+        ]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+        inside = grid[values(shape, grid) < 0]
+        if len(inside) < count:
+            raise_empty("polymesher", lower, upper, pitch)
+        area = len(inside) * pitch**2
+        pitch = float(np.sqrt(area / (count * _SAMPLES)))
+    return inside, area
+
+
+def _lloyd(shape, cloud, area: float, seeds, iterations: int, on_step) -> np.ndarray:
+    n = len(seeds)
+    for step in range(iterations):
+        owner = KDTree(seeds).query(cloud)[1]
+        weight = np.bincount(owner, minlength=n)
+        total = np.stack([np.bincount(owner, cloud[:, k], n) for k in (0, 1)], axis=1)
+        centre = np.where(weight[:, None] > 0, total / np.maximum(weight, 1)[:, None], seeds)
+        share = weight / len(cloud)
+        shift = ((centre - seeds) ** 2).sum(axis=1)
+        error = float(np.sqrt((share**2 * shift).sum()) * n / np.sqrt(area))
+        # The centre of a cell across a gap lies in the gap: its seed stays.
+        seeds = np.where((values(shape, centre) < 0)[:, None], centre, seeds)
+        if on_step is not None:
+            on_step(step, error)
+        if error < _EVEN:
+            break
+    return seeds
+
+
+def _packed(points: np.ndarray, cells: list[list[int]]) -> Mesh:
+    most = max(len(cell) for cell in cells)
+    table = np.array([cell + [cell[-1]] * (most - len(cell)) for cell in cells])
+    used, number = np.unique(table, return_inverse=True)
+    return Mesh(points[used], number.reshape(table.shape), PolyN(most))
+
+
+def _check_area(mesh: Mesh, border) -> None:
+    x = np.asarray(mesh.points)[np.asarray(mesh.cells)]
+    got = _shoelace(x, np.roll(x, -1, axis=1)).sum()
+    want = _shoelace(border.points[border.edges[:, 0]], border.points[border.edges[:, 1]]).sum()
+    if abs(got - want) > 1e-10 * want:
+        raise ValueError(
+            f"polymesher: the cells cover {got:.12g} m^2 of the {want:.12g} m^2 inside the "
+            "boundary polygon: walls are far thinner than a cell. Raise `count`."
+        )
+
+
+def _shoelace(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]) / 2

@@ -1,0 +1,182 @@
+"""Smooth combinations: what rounds a joint, how deep it dips, how smooth it is."""
+
+import abc
+import math
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax._types import real
+from sorojax.sdf.base import AbstractSdf, Box, Number, steepest
+from sorojax.sdf.combine import check_same_dim, hull
+from sorojax.sdf.scalar import absolute, minimum, positive_part
+
+
+class AbstractBlend(eqx.Module):
+    """A smooth minimum of two fields over a width k [m].
+
+    Attributes:
+        dip: Largest depth below the sharp minimum, reached at equal fields, over k.
+        continuity: Number of continuous derivatives.
+        slope: Factor on the larger Lipschitz constant of the parts.
+    """
+
+    dip: eqx.AbstractClassVar[float]
+    continuity: eqx.AbstractClassVar[float]
+    slope: eqx.AbstractClassVar[float]
+
+    @abc.abstractmethod
+    def __call__(self, a: Array, b: Array, k: Array) -> Array:
+        """Blended minimum [m] of the fields `a` and `b` [m]."""
+
+
+class Quadratic(AbstractBlend):
+    """Parabola where |a - b| < k: C1, dip k/4."""
+
+    dip: ClassVar[float] = 1 / 4
+    continuity: ClassVar[float] = 1
+    slope: ClassVar[float] = 1.0
+
+    def __call__(self, a, b, k):
+        h = positive_part(k - absolute(a - b))
+        return minimum(a, b) - h * h / (4 * k)
+
+
+class Cubic(AbstractBlend):
+    """Cubic where |a - b| < k: C2, dip k/6."""
+
+    dip: ClassVar[float] = 1 / 6
+    continuity: ClassVar[float] = 2
+    slope: ClassVar[float] = 1.0
+
+    def __call__(self, a, b, k):
+        h = positive_part(k - absolute(a - b)) / k
+        return minimum(a, b) - h * h * h * k / 6
+
+
+class Circular(AbstractBlend):
+    """Circular arc between orthogonal faces where |a - b| < k: C1, dip (1 - 1/sqrt 2) k."""
+
+    dip: ClassVar[float] = 1 - math.sqrt(0.5)
+    continuity: ClassVar[float] = 1
+    slope: ClassVar[float] = 1.0
+
+    def __call__(self, a, b, k):
+        h = positive_part(k - absolute(a - b)) / k
+        return minimum(a, b) - k / 2 * (1 + h - jnp.sqrt(1 + h * (2 - h)))
+
+
+class Exponential(AbstractBlend):
+    """-k ln(exp(-a/k) + exp(-b/k)): smooth, dip k ln 2, not local."""
+
+    dip: ClassVar[float] = math.log(2)
+    continuity: ClassVar[float] = math.inf
+    slope: ClassVar[float] = 1.0
+
+    def __call__(self, a, b, k):
+        return minimum(a, b) - k * jnp.log1p(jnp.exp(-absolute(a - b) / k))
+
+
+class Chamfer(AbstractBlend):
+    """Flat face that cuts k off both sides of a right angle: C0, dip k/sqrt 2."""
+
+    dip: ClassVar[float] = math.sqrt(0.5)
+    continuity: ClassVar[float] = 0
+    # Where both fields rise in the same direction, their scaled sum is steeper.
+    slope: ClassVar[float] = math.sqrt(2)
+
+    def __call__(self, a, b, k):
+        return minimum(minimum(a, b), (a + b - k) * math.sqrt(0.5))
+
+
+def _check_blend(shape: "AbstractBlended") -> None:
+    where = type(shape).__name__
+    check_same_dim(where, (shape.first, shape.second))
+    _check.positive(where, "k", shape.k, "m", "Use `|`, `&` or `-` for a sharp edge.")
+
+
+class AbstractBlended(AbstractSdf):
+    """Two shapes joined by a blend of width `k` [m]."""
+
+    first: eqx.AbstractVar[AbstractSdf]
+    second: eqx.AbstractVar[AbstractSdf]
+    k: eqx.AbstractVar[Float[Array, ""]]
+    blend: eqx.AbstractVar[AbstractBlend]
+
+    @property
+    def dim(self) -> int:
+        return self.first.dim
+
+    @property
+    def lipschitz(self) -> Number:
+        slope = steepest(self.first.lipschitz, self.second.lipschitz)
+        return slope * self.blend.slope
+
+    @abc.abstractmethod
+    def level_box(self, level: Number) -> Box: ...
+
+    def bounding_box(self) -> Box:
+        return self.level_box(0.0)
+
+
+class SmoothUnion(AbstractBlended):
+    """Union with a fillet where the fields differ by less than `k` [m].
+
+    The default blend is quadratic: C1, deepest by k/4 where both fields are equal.
+    """
+
+    first: AbstractSdf
+    second: AbstractSdf
+    k: Float[Array, ""] = eqx.field(converter=real)
+    blend: AbstractBlend = Quadratic()
+
+    def __check_init__(self):
+        _check_blend(self)
+
+    def distance(self, *x):
+        return self.blend(self.first.distance(*x), self.second.distance(*x), self.k)
+
+    def level_box(self, level) -> Box:
+        level = level + self.blend.dip * self.k
+        boxes: list[Box] = [self.first.level_box(level), self.second.level_box(level)]
+        return hull(boxes, jnp.minimum, jnp.maximum)
+
+
+class SmoothIntersection(AbstractBlended):
+    """Intersection whose edges are rounded off where the fields differ by less than `k`."""
+
+    first: AbstractSdf
+    second: AbstractSdf
+    k: Float[Array, ""] = eqx.field(converter=real)
+    blend: AbstractBlend = Quadratic()
+
+    def __check_init__(self):
+        _check_blend(self)
+
+    def distance(self, *x):
+        return -self.blend(-self.first.distance(*x), -self.second.distance(*x), self.k)
+
+    def level_box(self, level) -> Box:
+        boxes: list[Box] = [self.first.level_box(level), self.second.level_box(level)]
+        return hull(boxes, jnp.maximum, jnp.minimum)
+
+
+class SmoothDifference(AbstractBlended):
+    """`first` without `second`; the edges between them are rounded off over `k` [m]."""
+
+    first: AbstractSdf
+    second: AbstractSdf
+    k: Float[Array, ""] = eqx.field(converter=real)
+    blend: AbstractBlend = Quadratic()
+
+    def __check_init__(self):
+        _check_blend(self)
+
+    def distance(self, *x):
+        return -self.blend(-self.first.distance(*x), self.second.distance(*x), self.k)
+
+    def level_box(self, level) -> Box:
+        return self.first.level_box(level)

@@ -1,0 +1,35 @@
+"""Every example runs and gives its number; the README's program is one of them."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+def _main(name: str):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.main
+
+
+def test_drawing_to_loop_reaches_its_target():
+    numbers = _main("01_drawing_to_loop")(quick=True)
+    assert numbers["angle at the end [deg]"] == pytest.approx(-25, abs=0.2)
+    assert numbers["stiffness misfit"] < 0.01
+    assert 2 < numbers["pressure at the end [kPa]"] < 4
+
+
+def test_the_program_of_the_readme_prints_what_it_says(capsys):
+    (program,) = re.findall(r"```python\n(import jax;.*?)```", (ROOT / "README.md").read_text(), re.S)
+    exec(compile(program, "README.md", "exec"), {})
+    height, slope = re.findall(r"Array\(([-+.\de]+)", capsys.readouterr().out)
+    said = re.search(r"# (-[\d.]+) mm, \+([\d.]+) mm per mm", program)
+    assert said is not None
+    assert float(height) * 1e3 == pytest.approx(float(said[1]), abs=0.01)
+    assert float(slope) == pytest.approx(float(said[2]), abs=0.001)
+    assert len([line for line in program.splitlines() if line.strip()]) == 15
