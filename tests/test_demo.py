@@ -26,7 +26,7 @@ def test_all_results_are_there_and_nothing_else(out):
     assert {file.name for file in out.parent.iterdir()} == {"out"}
     page = (out / "report.html").read_text()
     assert page.count("data:image/") == len(FILES) - 2
-    assert "src=\"http" not in page and "href=\"http" not in page
+    assert 'src="http' not in page and 'href="http' not in page
 
 
 def test_every_number_with_a_bar_holds(out):

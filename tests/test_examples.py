@@ -25,11 +25,13 @@ def test_drawing_to_loop_reaches_its_target():
 
 
 def test_the_program_of_the_readme_prints_what_it_says(capsys):
-    (program,) = re.findall(r"```python\n(import jax;.*?)```", (ROOT / "README.md").read_text(), re.S)
+    (program,) = re.findall(
+        r"```python\n(import jax;.*?)```", (ROOT / "README.md").read_text(), re.S
+    )
     exec(compile(program, "README.md", "exec"), {})
     height, slope = re.findall(r"Array\(([-+.\de]+)", capsys.readouterr().out)
     said = re.search(r"# (-[\d.]+) mm, \+([\d.]+) mm per mm", program)
     assert said is not None
     assert float(height) * 1e3 == pytest.approx(float(said[1]), abs=0.01)
     assert float(slope) == pytest.approx(float(said[2]), abs=0.001)
-    assert len([line for line in program.splitlines() if line.strip()]) == 15
+    assert len([line for line in program.splitlines() if line.strip()]) <= 15

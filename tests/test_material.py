@@ -95,7 +95,10 @@ def test_editing_a_modulus_never_retraces():
         (lambda: material.NeoHookean(-1.0, 1e6), "must be positive, got -1 Pa"),
         (lambda: material.Yeoh(float("nan"), 0.0, 0.0, 1e6), "must be positive"),
         (lambda: material.fit_tensile(np.ones(2), np.ones(2)), "at least 3 points"),
-        (lambda: material.fit_tensile(np.array([50.0, 100, 200]), np.ones(3)), "divide percent"),
+        (
+            lambda: material.fit_tensile(np.array([50.0, 100, 200]), np.ones(3)),
+            "divide percent",
+        ),
     ],
 )
 def test_bad_numbers_name_the_remedy(call, message):

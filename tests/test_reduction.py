@@ -19,11 +19,14 @@ def tube_path():
     """A beam with one chamber above its axis, bent by pressure."""
     block = mesh.rectangle([0, 0], [LENGTH, 12 * mm], divisions=(24, 6), order=2)
     centres = np.asarray(block.points)[np.asarray(block.cells)[:, :3]].mean(axis=1)
-    hole = (np.abs(centres[:, 1] - 8 * mm) < 2 * mm) & (np.abs(centres[:, 0] - 30 * mm) < 12.4 * mm)
+    hole = (np.abs(centres[:, 1] - 8 * mm) < 2 * mm) & (
+        np.abs(centres[:, 0] - 30 * mm) < 12.4 * mm
+    )
     used, cells = np.unique(np.asarray(block.cells)[~hole], return_inverse=True)
     body = mesh.Mesh(np.asarray(block.points)[used], cells.reshape(-1, 6), block.element)
     inside = mesh.facets_where(
-        body, lambda p: (jnp.abs(p[1] - 8 * mm) < 2.1 * mm) & (jnp.abs(p[0] - 30 * mm) < 13 * mm)
+        body,
+        lambda p: (jnp.abs(p[1] - 8 * mm) < 2.1 * mm) & (jnp.abs(p[0] - 30 * mm) < 13 * mm),
     )
     problem = fem.problem(
         body,

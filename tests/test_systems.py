@@ -119,7 +119,9 @@ def test_gas_sealed_behind_yielding_walls_keeps_absolute_pressure_times_volume()
         : body.rod.basis.num_dof
     ])  # fmt: skip
     ports = ("volume", "volume_rate", "compliance")
-    wires = {f"air.{port}": f"body.{port}" for port in ports} | {"body.pressure": "air.pressure"}
+    wires = {f"air.{port}": f"body.{port}" for port in ports} | {
+        "body.pressure": "air.pressure"
+    }
     network = S.Network({"body": body, "air": S.Reservoir(start_pressure=20e3)}, wires)
     film = S.simulate(network, 0.2, rtol=1e-9, atol=1e-12)
     product = (film["air.pressure"] + 101325.0) * film["body.volume"]

@@ -6,7 +6,7 @@ import numpy as np
 from benchmarks import peers
 from benchmarks.bellows import PRESSURES, REFERENCE, RUBBER, case_a, tip_errors
 from benchmarks.harness import Row, measure_calls
-from sorojax import fem
+from sorojax import fem, material
 from sorojax.cli.demo.design import LAYER_STIFFNESS
 from sorojax.units import mm
 
@@ -39,9 +39,11 @@ def rows():
 
 def _felupe(problem: fem.Problem, size: float):
     """The same mesh and pressures, plain Newton in 16 equal steps (8 diverge)."""
-    cells, fixed = np.asarray(problem.mesh.cells), np.asarray(problem.supports[0].nodes)
-    part = (np.asarray(problem.material.factor) > 1).astype(int)
-    edges = np.asarray(problem.loads[0].facets)[:, [1, 0, 2]]  # round the cavity
+    (clamp,), (air,), body = problem.supports, problem.loads, problem.material
+    assert isinstance(air, fem.Pressure) and isinstance(body, material.Scaled)
+    cells, fixed = np.asarray(problem.mesh.cells), np.asarray(clamp.nodes)
+    part = (np.asarray(body.factor) > 1).astype(int)
+    edges = np.asarray(air.facets)[:, [1, 0, 2]]  # round the cavity
     levels = np.linspace(0.0, PRESSURES[-1], 17)[1:]
     arrays = {
         "points": np.asarray(problem.mesh.points),

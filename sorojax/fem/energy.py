@@ -49,16 +49,11 @@ def stress_and_tangent(
     def isochoric(F):
         return jax.grad(lambda F: jnp.sum(material.isochoric_energy(kinematics.embed(F))))(F)
 
-    def pressure(F):
-        energy = material.volumetric_energy
-        return jax.grad(lambda J: jnp.sum(energy(J)))(determinant(F))
-
+    pressure = jax.grad(lambda J: jnp.sum(material.volumetric_energy(J)))
     step = jax.tree.map(lambda a, b: a - b, F, F_before)
-    P, C = isochoric(F), cofactor(F)
-    p = pressure(F)
-    p_before, p_rate = jax.jvp(pressure, (F_before,), (step,))
-    bulk = jax.jvp(jax.grad(lambda J: jnp.sum(material.volumetric_energy(J))),
-                   (determinant(F),), (jnp.ones_like(p),))[1]  # fmt: skip
+    P, C, J = isochoric(F), cofactor(F), determinant(F)
+    p, bulk = jax.jvp(pressure, (J,), (jnp.ones_like(J),))
+    p_before, p_rate = jax.jvp(lambda F: pressure(determinant(F)), (F_before,), (step,))
     extra = _extrapolated(isochoric, F, F_before, step, second_piola(F, P))
     A = [[[[None, None], [None, None]] for _ in range(2)] for _ in range(2)]
     for k in range(2):

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sorojax.fem import assemble as asm
 from sorojax.fem.energy_form import load_force
+from sorojax.fem.loads import CurvedPart
 from sorojax.fem.problem import Problem
 from sorojax.fem.supports import known_dofs
 from sorojax.math import sparse
@@ -46,11 +47,10 @@ def prepare(problem: Problem) -> Prepared:
     geometry = asm.geometry(problem.space, problem.kinematics, problem.mesh.points)
     known = known_dofs(problem.supports, problem.mesh.num_nodes, dim)
     slots = []
-    for load in problem.loads:
-        if load.curved_facets is not None:
-            facets = np.asarray(load.curved_facets)
-            dofs = (facets[:, :, None] * dim + np.arange(dim)).reshape(len(facets), -1)
-            slots.append(sparse.slots_of(problem.space.system, dofs))
+    for part in _curved_parts(problem):
+        facets = np.asarray(part.facets)
+        dofs = (facets[:, :, None] * dim + np.arange(dim)).reshape(len(facets), -1)
+        slots.append(sparse.slots_of(problem.space.system, dofs))
     cell_areas = jnp.sum(geometry.volumes, axis=1) / problem.kinematics.depth
     return Prepared(geometry, jnp.asarray(known), jnp.sqrt(jnp.max(cell_areas)), tuple(slots))
 
@@ -85,13 +85,17 @@ def linearise(
     )
 
 
-def _add_load_stiffness(problem, prepared, u, values):
-    curved = [load for load in problem.loads if load.curved_facets is not None]
-    for load, slots in zip(curved, prepared.facet_slots, strict=True):
-        x = (problem.mesh.points + u)[load.curved_facets]
+def _curved_parts(problem: Problem) -> list[CurvedPart]:
+    parts = [load.curved_part(problem) for load in problem.loads]
+    return [part for part in parts if part is not None]
 
-        def energy(flat, load=load, shape=x.shape[1:]):
-            return load.facet_energy(problem, flat.reshape(shape))
+
+def _add_load_stiffness(problem, prepared, u, values):
+    for part, slots in zip(_curved_parts(problem), prepared.facet_slots, strict=True):
+        x = (problem.mesh.points + u)[part.facets]
+
+        def energy(flat, part=part, shape=x.shape[1:]):
+            return part.energy(flat.reshape(shape))
 
         matrices = jax.vmap(jax.hessian(energy))(x.reshape(len(x), -1))
         first, second = np.triu_indices(matrices.shape[-1])

@@ -5,7 +5,8 @@ conservative on a closed cavity, or on a run of facets whose ends cannot move.
 """
 
 import abc
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax
@@ -31,17 +32,16 @@ class AbstractLoad(eqx.Module):
     def potential(self, problem: "Problem", u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
         """Potential energy of the load [J]."""
 
-    def facet_energy(
-        self, problem: "Problem", x: Float[Array, "facet_nodes dim"]
-    ) -> Float[Array, ""]:
-        """Energy of one facet at deformed positions `x`, where it is not linear in `x`."""
-        del problem, x
-        return jnp.zeros(())
+    @abc.abstractmethod
+    def curved_part(self, problem: "Problem") -> "CurvedPart | None":
+        """The part of the potential that is not linear in u; `None` adds no stiffness."""
 
-    @property
-    def curved_facets(self) -> Int[Array, "facets facet_nodes"] | None:
-        """Facets on which the potential is not linear, so that they add stiffness."""
-        return None
+
+class CurvedPart(NamedTuple):
+    """Facets, and the energy [J] of one at its deformed positions [m]."""
+
+    facets: Int[Array, "facets facet_nodes"]
+    energy: Callable[[Float[Array, "facet_nodes dim"]], Float[Array, ""]]
 
 
 class Pressure(AbstractLoad):
@@ -60,13 +60,9 @@ class Pressure(AbstractLoad):
             x, self.facets, problem.mesh.element.order, problem.kinematics.depth
         )
 
-    def facet_energy(self, problem, x):
-        order = problem.mesh.element.order
-        return -self.value * _facet_volume(x, order) * problem.kinematics.depth
-
-    @property
-    def curved_facets(self):
-        return self.facets
+    def curved_part(self, problem):
+        order, depth = problem.mesh.element.order, problem.kinematics.depth
+        return CurvedPart(self.facets, lambda x: -self.value * _facet_volume(x, order) * depth)
 
 
 class Traction(AbstractLoad):
@@ -86,6 +82,9 @@ class Traction(AbstractLoad):
         work = jnp.einsum("q,fq,fqi,i->", weights, length, moved, self.value)
         return -work * problem.kinematics.depth
 
+    def curved_part(self, problem):
+        return None
+
 
 class Gravity(AbstractLoad):
     """Weight of the body; `value` is the acceleration [m/s^2]."""
@@ -97,6 +96,9 @@ class Gravity(AbstractLoad):
         moved = integral(problem.mesh, u) * problem.kinematics.depth
         density = jnp.broadcast_to(jnp.asarray(problem.material.density), moved.shape[:1])
         return -jnp.einsum("c,ci,i->", density, moved, self.value)
+
+    def curved_part(self, problem):
+        return None
 
 
 def _facet_volume(x: Float[Array, "facet_nodes dim"], order: int) -> Float[Array, ""]:

@@ -1,16 +1,15 @@
 """The fall-back direct solver: SciPy's SuperLU in symmetric mode (BSD)."""
 
 import warnings
+from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
-import scipy.sparse.linalg as spla
 
 
 class SuperLUFactor:
     """A numeric LU factor."""
 
-    def __init__(self, lu: spla.SuperLU):
+    def __init__(self, lu: Any):
         self._lu = lu
         diagonal_pivots = np.array_equal(lu.perm_r, lu.perm_c)
         self.negative_eigenvalues = int(np.sum(lu.U.diagonal() < 0)) if diagonal_pivots else -1
@@ -26,6 +25,8 @@ class SuperLU:
     name = "superlu"
 
     def __init__(self, indptr: np.ndarray, indices: np.ndarray, num_factors: int):
+        import scipy.sparse as sp
+
         size, nnz = len(indptr) - 1, len(indices)
         upper = sp.csr_matrix((np.arange(1.0, nnz + 1), indices, indptr), (size, size))
         full = (upper + sp.triu(upper, 1).T).tocsc()
@@ -35,6 +36,9 @@ class SuperLU:
 
     def factor(self, values: np.ndarray, slot: int) -> SuperLUFactor | None:
         """Factor, or `None` if the matrix is singular to working precision."""
+        import scipy.sparse as sp
+        import scipy.sparse.linalg as spla
+
         matrix = sp.csc_matrix(
             (np.asarray(values, np.float64)[self._source], self._indices, self._indptr),
             self._shape,

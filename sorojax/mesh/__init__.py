@@ -1,24 +1,57 @@
 """Meshes: from an implicit shape to cells, and back to what is on them."""
 
+from sorojax.mesh.chambers import (
+    Chambers as Chambers,
+    boundary_loops as boundary_loops,
+    chambers as chambers,
+)
+from sorojax.mesh.distortion import Distortion as Distortion, distortion as distortion
 from sorojax.mesh.elements import (
     AbstractElement as AbstractElement,
+    Hex8 as Hex8,
+    PolyN as PolyN,
+    Quad4 as Quad4,
+    Quad8 as Quad8,
+    Tet4 as Tet4,
+    Tet10 as Tet10,
     Tri3 as Tri3,
     Tri6 as Tri6,
 )
 from sorojax.mesh.locate import Locations as Locations, locate as locate
-from sorojax.mesh.mesh import Mesh as Mesh, boundary_facets as boundary_facets
-from sorojax.mesh.motion import move as move
-from sorojax.mesh.quality import (
-    Quality as Quality,
+from sorojax.mesh.measure import (
     cell_areas as cell_areas,
-    quality as quality,
+    cell_volumes as cell_volumes,
+    enclosed_volume as enclosed_volume,
 )
+from sorojax.mesh.mesh import (
+    Mesh as Mesh,
+    boundary_facets as boundary_facets,
+    valences as valences,
+)
+from sorojax.mesh.motion import move as move
+from sorojax.mesh.polymesher import polymesher as polymesher
+from sorojax.mesh.quality import Quality as Quality, quality as quality
+from sorojax.mesh.repair import Repaired as Repaired, repair as repair
 from sorojax.mesh.select import (
+    cells_connected as cells_connected,
+    cells_inside as cells_inside,
     cells_where as cells_where,
     facets_on as facets_on,
     facets_where as facets_where,
+    named as named,
     nearest_node as nearest_node,
+    nodes_in_box as nodes_in_box,
+    nodes_inside as nodes_inside,
+    nodes_on_line as nodes_on_line,
     nodes_where as nodes_where,
 )
-from sorojax.mesh.structured import rectangle as rectangle
+from sorojax.mesh.sizes import grade as grade
+from sorojax.mesh.structured import box as box, rectangle as rectangle
+from sorojax.mesh.sweep import extrude as extrude, revolve as revolve, sweep as sweep
+from sorojax.mesh.tetrahedralise import tetrahedralise as tetrahedralise
+from sorojax.mesh.trace import (
+    from_image as from_image,
+    from_polygon as from_polygon,
+    image_shape as image_shape,
+)
 from sorojax.mesh.triangulate import triangulate as triangulate

@@ -21,7 +21,7 @@ def lattice(shape: AbstractSdf, lower, upper, pitch: float):
     """
     count = np.ceil((upper - lower) / pitch).astype(int) + 2
     start = (lower + upper) / 2 - pitch * count / 2
-    if count.prod() > _MOST_CUBES:
+    if float(np.prod(count.astype(float))) > _MOST_CUBES:
         raise ValueError(
             f"tetrahedralise: a pitch of {pitch:g} m over a box of {upper - lower} m takes "
             f"{count.prod():.2g} cubes, at most {_MOST_CUBES:.0e} are allowed. Raise `size`."
@@ -131,7 +131,9 @@ def clip(shape: AbstractSdf, points, f, cells):
     edges = unique_edges(cut, len(points)) if len(cut) else np.zeros((0, 2), int)
     edges = edges[sign[edges[:, 0]] * sign[edges[:, 1]] < 0]
     a, b = edges.T
-    _, crossing = roots(shape, points[a], points[b], *(values(shape, points[e]) for e in (a, b)))
+    _, crossing = roots(
+        shape, points[a], points[b], *(values(shape, points[e]) for e in (a, b))
+    )
     keys, base = a * np.int64(len(points)) + b, len(points)
 
     def middle(p, q):

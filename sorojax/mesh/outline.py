@@ -57,9 +57,7 @@ def outline(shape: AbstractSdf, interfaces: tuple[AbstractSdf, ...], size: Sizes
             "position, or leave them out."
         )
     resampled = [(i, _resample(fields[i], part, size)) for i, part in chains]
-    return _split_crowded(
-        fields, _join(resampled, size.smallest), size.smallest / _FINEST
-    )
+    return _split_crowded(fields, _join(resampled, size.smallest), size.smallest / _FINEST)
 
 
 def _break(fields, owner: int, curve: Curve) -> Curve:

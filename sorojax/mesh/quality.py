@@ -1,24 +1,35 @@
-"""How good the triangles of a mesh are."""
+"""How good the cells of a mesh are."""
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
-from sorojax.mesh.elements import Tri3, Tri6
-from sorojax.mesh.mesh import Mesh
+from sorojax.mesh.elements import Hex8, Tet4, Tet10, Tri3, Tri6
+from sorojax.mesh.measure import cell_areas as cell_areas, cell_volumes
+from sorojax.mesh.mesh import Mesh, boundary_facets, facet_table, valences
+from sorojax.mesh.tets import dihedral_cosines, radius_ratios
+from sorojax.sdf.base import AbstractSdf
+from sorojax.sdf.measure import area
+
+_CUBE = ((1, 3, 4), (2, 0, 5), (3, 1, 6), (0, 2, 7), (7, 5, 0), (4, 6, 1), (5, 7, 2), (6, 4, 3))
 
 
 class Quality(NamedTuple):
     """Numbers that tell a good mesh.
 
     Attributes:
-        min_angle: Smallest angle between straight sides [rad].
-        mean_radius_ratio: Mean of 2 r_in / r_circ, 1 for equilateral triangles.
-        area: Area of all cells [m^2], curved sides included.
+        min_angle: Smallest angle between straight sides, in space between faces [rad].
+        mean_radius_ratio: Mean over the cells of `dim` r_in / r_circ, 1 for equilateral
+            ones. Other cells than triangles and tetrahedra: of 4 pi area over perimeter
+            squared, 1 for regular polygons, or of the least scaled Jacobian (Hex8).
+        area: Area of all cells [m^2], curved sides included; in space their volume [m^3].
         num_nodes: Nodes.
         num_cells: Cells.
+        max_angle: Largest angle [rad].
+        histogram: Cells with a radius ratio in [0, 0.1), ..., [0.9, 1].
+        watertight: Whether the boundary is closed and no facet has more than two cells.
+        error: Relative error of `area` against the shape, if one was given.
     """
 
     min_angle: float
@@ -26,51 +37,100 @@ class Quality(NamedTuple):
     area: float
     num_nodes: int
     num_cells: int
+    max_angle: float = np.nan
+    histogram: tuple[int, ...] = ()
+    watertight: bool = True
+    error: float | None = None
 
     def __str__(self) -> str:
+        low, high = np.rad2deg(self.min_angle), np.rad2deg(self.max_angle)
+        error = "" if self.error is None else f" (error {self.error:+.1e})"
         return (
-            f"{self.num_cells} cells, {self.num_nodes} nodes, area {self.area:.6g} m^2, "
-            f"smallest angle {np.rad2deg(self.min_angle):.1f} deg, mean radius ratio "
-            f"{self.mean_radius_ratio:.3f}"
+            f"{self.num_cells} cells, {self.num_nodes} nodes, size {self.area:.6g} m^dim"
+            f"{error}, angles {low:.1f} to {high:.1f} deg, mean radius ratio "
+            f"{self.mean_radius_ratio:.3f}, {'' if self.watertight else 'NOT '}watertight\n"
+            f"radius ratio per tenth: {' '.join(map(str, self.histogram))}"
         )
 
     __repr__ = __str__
 
 
-def quality(mesh: Mesh) -> Quality:
-    """Shape numbers of a triangle mesh."""
-    x = np.asarray(mesh.points)[np.asarray(mesh.cells)[:, :3]]
-    side = np.linalg.norm(np.roll(x, -1, axis=1) - x, axis=2)
-    a, b, c = side.T
-    cosine = np.stack(
-        [
-            (b * b + c * c - a * a) / (2 * b * c),
-            (c * c + a * a - b * b) / (2 * c * a),
-            (a * a + b * b - c * c) / (2 * a * b),
-        ]
-    )
-    angle = np.arccos(np.clip(cosine, -1, 1))
-    ratio = (b + c - a) * (c + a - b) * (a + b - c) / (a * b * c)
-    total = float(jnp.sum(cell_areas(mesh)))
+def quality(mesh: Mesh, shape: AbstractSdf | None = None) -> Quality:
+    """Shape numbers of a mesh, and its size against `shape` if given."""
+    low, high, ratio = _angles_and_ratios(mesh)
+    plane = mesh.element.dim == 2
+    total = float(jnp.sum(cell_areas(mesh) if plane else cell_volumes(mesh)))
+    error = None
+    if shape is not None:
+        error = total / float(area(shape) if plane else _volume(shape)) - 1
+    tenths = np.histogram(ratio, bins=10, range=(0, 1 + 1e-9))[0]
     return Quality(
-        float(angle.min()), float(ratio.mean()), total, mesh.num_nodes, mesh.num_cells
-    )
+        low, float(ratio.mean()), total, mesh.num_nodes, mesh.num_cells, high,
+        tuple(tenths.tolist()), is_watertight(mesh), error,
+    )  # fmt: skip
 
 
-def cell_areas(mesh: Mesh) -> Float[Array, " cells"]:
-    """Area of each triangle [m^2], curved sides included; differentiable in the points."""
-    if not isinstance(mesh.element, Tri3 | Tri6):
-        raise ValueError(
-            f"cell_areas: the mesh has {mesh.element.name} cells, need Tri3 or Tri6."
-        )
-    x = mesh.points[mesh.cells]
-    area = _cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]) / 2
-    for facet in mesh.element.facets if mesh.element.order == 2 else ():
-        a, b, middle = (x[:, i] for i in facet)
-        # A parabola over a chord encloses two thirds of chord times height.
-        area = area + 2 / 3 * _cross(middle - (a + b) / 2, b - a)
-    return area
+def _volume(shape: AbstractSdf):
+    from sorojax.sdf.solid_measure import volume
+
+    return volume(shape)
 
 
-def _cross(a: Float[Array, "cells 2"], b: Float[Array, "cells 2"]) -> Float[Array, " cells"]:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+def is_watertight(mesh: Mesh) -> bool:
+    """Whether no facet has more than two cells and the boundary closes on itself."""
+    if facet_table(mesh)[2].max(initial=0) > 2:
+        return False
+    corners = boundary_facets(mesh)[:, : 2 if mesh.element.dim == 2 else None]
+    if mesh.element.dim == 2:
+        return bool((np.bincount(corners.ravel()) % 2 == 0).all())
+    count = 4 if isinstance(mesh.element, Hex8) else 3
+    ends = np.concatenate([corners[:, [i, (i + 1) % count]] for i in range(count)])
+    keys = ends.astype(np.int64) @ np.array([mesh.num_nodes, 1])
+    back = ends.astype(np.int64) @ np.array([1, mesh.num_nodes])
+    return bool(np.array_equal(np.sort(keys), np.sort(back)))
+
+
+def _angles_and_ratios(mesh: Mesh) -> tuple[float, float, np.ndarray]:
+    x = np.asarray(mesh.points)[np.asarray(mesh.cells)[:, : mesh.element.num_corners]]
+    if isinstance(mesh.element, Tet4 | Tet10):
+        angle = np.arccos(np.clip(dihedral_cosines(x), -1, 1))
+        return float(angle.min()), float(angle.max()), radius_ratios(x)
+    if isinstance(mesh.element, Hex8):
+        return _hexahedra(x)
+    count = valences(mesh)
+    low, high, ratio = np.inf, 0.0, np.zeros(len(x))
+    for n in np.unique(count):
+        mine = count == n
+        angle, ratio[mine] = _polygons(x[mine, :n], isinstance(mesh.element, Tri3 | Tri6))
+        low, high = min(low, angle.min()), max(high, angle.max())
+    return float(low), float(high), ratio
+
+
+def _polygons(x: np.ndarray, triangles: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Angles at the corners, and how close to regular the polygons are."""
+    out, back = np.roll(x, -1, axis=1) - x, np.roll(x, 1, axis=1) - x
+    turn = out[..., 0] * back[..., 1] - out[..., 1] * back[..., 0]
+    angle = np.arctan2(turn, (out * back).sum(axis=2)) % (2 * np.pi)
+    side = np.linalg.norm(out, axis=2)
+    if triangles:
+        a, b, c = side.T
+        return angle, (b + c - a) * (c + a - b) * (a + b - c) / (a * b * c)
+    y = np.roll(x, -1, axis=1)
+    doubled = (x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0]).sum(axis=1)
+    regular = 4 * x.shape[1] * np.tan(np.pi / x.shape[1])
+    return angle, regular * doubled / 2 / side.sum(axis=1) ** 2
+
+
+def _hexahedra(x: np.ndarray) -> tuple[float, float, np.ndarray]:
+    least, cosines = np.full(len(x), np.inf), []
+    for corner, others in enumerate(_CUBE):
+        edges = x[:, list(others)] - x[:, [corner]]
+        edges /= np.linalg.norm(edges, axis=2, keepdims=True)
+        least = np.minimum(least, np.linalg.det(edges))
+        for i, j in ((0, 1), (1, 2), (2, 0)):
+            n = np.cross(edges[:, i], edges[:, (3 - i - j)])
+            m = np.cross(edges[:, i], edges[:, j])
+            size = np.linalg.norm(n, axis=1) * np.linalg.norm(m, axis=1)
+            cosines.append((n * m).sum(axis=1) / np.maximum(size, 1e-300))
+    angle = np.arccos(np.clip(np.stack(cosines), -1, 1))
+    return float(angle.min()), float(angle.max()), np.clip(least, 0, 1)

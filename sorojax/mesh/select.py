@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from sorojax.mesh.mesh import Mesh, boundary_facets
+from sorojax.mesh.elements import facet_corners
+from sorojax.mesh.mesh import Mesh, boundary_facets, facet_table
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sample import values
 
@@ -53,7 +54,7 @@ def facets_on(mesh: Mesh, shape: AbstractSdf, tol: float | None = None) -> Facet
         tol = 1e-6 * float(np.ptp(points, axis=0).max())
     facets = boundary_facets(mesh)
     near = np.abs(values(shape, points)) <= tol
-    ends = points[facets[:, :2]]
+    ends = points[facets[:, : facet_corners(mesh.element)]]
     length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
     # Both ends of a chord between two curves lie on them, its middle does not; the
     # middle of a straight side on a fillet is off by less than a tenth of its length.
@@ -67,8 +68,82 @@ def nearest_node(mesh: Mesh, point: Any) -> int:
     return int(np.argmin((gap**2).sum(axis=1)))
 
 
+def nodes_in_box(mesh: Mesh, lower: Any, upper: Any) -> Nodes:
+    """Nodes between two corners [m], faces included to 1e-9 of the extent."""
+    points = np.asarray(mesh.points)
+    tol = 1e-9 * float(np.ptp(points, axis=0).max())
+    low, high = np.asarray(lower, float) - tol, np.asarray(upper, float) + tol
+    return np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+
+
+def nodes_on_line(mesh: Mesh, start: Any, end: Any, tol: float | None = None) -> Nodes:
+    """Nodes within `tol` [m] of a straight line, in order from `start` to `end` [m]."""
+    points = np.asarray(mesh.points)
+    if tol is None:
+        tol = 1e-6 * float(np.ptp(points, axis=0).max())
+    a, along = np.asarray(start, float), np.asarray(end, float) - np.asarray(start, float)
+    share = np.clip((points - a) @ along / (along @ along), 0, 1)
+    gap = np.linalg.norm(points - a - share[:, None] * along, axis=1)
+    near = np.flatnonzero(gap <= tol)
+    return near[np.argsort(share[near], kind="stable")]
+
+
+def nodes_inside(mesh: Mesh, shape: AbstractSdf, tol: float = 0.0) -> Nodes:
+    """Nodes inside `shape`, or within `tol` [m] of it."""
+    return np.flatnonzero(values(shape, np.asarray(mesh.points)) <= tol)
+
+
+def cells_inside(mesh: Mesh, shape: AbstractSdf) -> Cells:
+    """Cells whose centroid (mean of the corners) lies inside `shape`."""
+    corners = np.asarray(mesh.cells)[:, : mesh.element.num_corners]
+    return np.flatnonzero(values(shape, np.asarray(mesh.points)[corners].mean(axis=1)) < 0)
+
+
+def named(mesh: Mesh, name: str) -> np.ndarray:
+    """The node set, facet set or region called `name`.
+
+    Raises:
+        ValueError: If there is none, with the names that exist.
+    """
+    for sets in (mesh.facet_sets, mesh.node_sets, mesh.regions):
+        if name in sets:
+            return np.asarray(sets[name])
+    known = sorted({*mesh.facet_sets, *mesh.node_sets, *mesh.regions})
+    raise ValueError(f"named: the mesh has no set {name!r}, it has {known}. Name one of them.")
+
+
+def cells_connected(mesh: Mesh, start: Any, walls: Any = ()) -> Cells:
+    """Cells reached from the one nearest to the point `start` [m] without crossing `walls`.
+
+    Args:
+        mesh: Any mesh.
+        start: A point in the part that is wanted.
+        walls: Facets, as node numbers, that stop the flood: for example an interface.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    facets, _, _, number = facet_table(mesh)
+    order = np.argsort(number, kind="stable")
+    same = number[order][1:] == number[order][:-1]
+    first, second = order[:-1][same], order[1:][same]
+    walls = np.asarray(walls, dtype=int)
+    if walls.size:
+        count = facet_corners(mesh.element)
+        barred = {tuple(w) for w in np.sort(walls[:, :count], axis=1).tolist()}
+        corners = np.sort(facets[first][:, :count], axis=1).tolist()
+        free = np.array([tuple(c) not in barred for c in corners], dtype=bool)
+        first, second = first[free], second[free]
+    n = mesh.num_cells
+    graph = coo_matrix((np.ones(len(first)), (first % n, second % n)), shape=(n, n))
+    label = connected_components(graph, directed=False)[1]
+    centres = np.asarray(mesh.points)[np.asarray(mesh.cells)].mean(axis=1)
+    home = int(np.argmin(((centres - np.asarray(start, float)) ** 2).sum(axis=1)))
+    return np.flatnonzero(label == label[home])
+
+
 def _middles(mesh: Mesh, facets: np.ndarray) -> jax.Array:
-    return jnp.mean(mesh.points[facets[:, :2]], axis=1)
+    return jnp.mean(mesh.points[facets[:, : facet_corners(mesh.element)]], axis=1)
 
 
 def _holds(points: jax.Array, predicate: Predicate) -> np.ndarray:

@@ -27,9 +27,7 @@ class Sizes(NamedTuple):
         return np.clip(self.function(p), self.smallest, self.largest)
 
 
-def grade(
-    shape: AbstractSdf, *, near: float, far: float, growth: float = 0.3
-) -> SizeFunction:
+def grade(shape: AbstractSdf, *, near: float, far: float, growth: float = 0.3) -> SizeFunction:
     """Edge lengths that grow away from the zero set of `shape`, for `size=`.
 
     Args:

@@ -105,3 +105,19 @@ def _places(shape, points, ball_cells, row, movers, skin, pitch: float) -> np.nd
         moved = moved - (f / np.maximum((g * g).sum(axis=1), 1e-12))[:, None] * g
     places[1:, on] = moved.reshape(len(tries) - 1, -1, 3)
     return places
+
+
+def radius_ratios(x: np.ndarray) -> np.ndarray:
+    """Three times the inscribed over the circumscribed radius, 1 for regular cells."""
+    a, b, c = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0], x[:, 3] - x[:, 0]
+    volume = np.abs(signed_volumes(x))
+    faces = sum(
+        np.linalg.norm(np.cross(x[:, j] - x[:, i], x[:, k] - x[:, i]), axis=1) / 2
+        for i, j, k in _FACES
+    )
+    center = sum(
+        (u * u).sum(axis=1)[:, None] * np.cross(v, w)
+        for u, v, w in ((a, b, c), (b, c, a), (c, a, b))
+    )
+    circum = np.linalg.norm(center, axis=1) / np.maximum(12 * volume, 1e-300)
+    return 9 * volume / (faces * circum)

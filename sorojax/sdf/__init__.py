@@ -19,6 +19,7 @@ from sorojax.sdf.combine import (
     intersection as intersection,
     union as union,
 )
+from sorojax.sdf.isosurface import Surface as Surface, isosurface as isosurface
 from sorojax.sdf.measure import area as area, centroid as centroid
 from sorojax.sdf.query import (
     bounding_box as bounding_box,
@@ -33,7 +34,12 @@ from sorojax.sdf.shapes2d import (
     Rectangle as Rectangle,
 )
 from sorojax.sdf.shapes3d import Box as Box, Sphere as Sphere
+from sorojax.sdf.solid_measure import inertia_tensor as inertia_tensor, volume as volume
 from sorojax.sdf.surface import Curve as Curve, contour as contour
+from sorojax.sdf.surface_report import (
+    SurfaceReport as SurfaceReport,
+    surface_report as surface_report,
+)
 from sorojax.sdf.transform import (
     offset as offset,
     repeat as repeat,

@@ -13,8 +13,7 @@ from sorojax.sdf.dual_sheets import cell_sheets
 from sorojax.sdf.dual_vertices import place
 from sorojax.sdf.sample import values, values_and_gradients
 
-import os
-_MARGIN = float(os.environ.get("MG","0.02"))  # cells: vertices stay off cell walls, so that none coincide in float32
+MARGIN = 0.02  # cells: vertices stay off cell walls, so that none coincide in float32
 # Cells around a grid edge, counter-clockwise: offsets of the edge within them.
 _AROUND = ((1, 1), (0, 1), (0, 0), (1, 0))
 _PIECE = 1 << 16
@@ -37,16 +36,16 @@ class _Crossings(NamedTuple):
 
 
 def dual_contouring(
-    shape: AbstractSdf, grid: Grid, blocks: np.ndarray
+    shape: AbstractSdf, grid: Grid, blocks: np.ndarray, margin: float = MARGIN
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [m] inside cells and triangles that face outwards."""
+    """Vertices [m] at least `margin` cells inside their cells; outward triangles."""
     found = _crossings(shape, grid, blocks)
     quads, owner = _quads(grid, found)
     vertices = place(found.points, found.normals, quads, len(owner))
     for start in range(0, len(owner), _PIECE):
         piece = slice(start, start + _PIECE)
-        low = grid.node(owner[piece]) + (_MARGIN)
-        vertices[piece] = np.clip(vertices[piece], low, low + (1 - 2 * _MARGIN))
+        low = grid.node(owner[piece]) + margin
+        vertices[piece] = np.clip(vertices[piece], low, low + (1 - 2 * margin))
     triangles = _triangles(vertices, quads, found)
     return grid.points(vertices), triangles
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.query import shape_tangent
 from sorojax.sdf.sample import finite_box, raise_empty, values, values_and_gradients
+from sorojax.sdf.solid_measure import solid_centroid
 
 _COARSE = 64
 _LEVELS = 6  # smallest cell: extent / (64 * 2^6)
@@ -30,8 +31,10 @@ def area(shape: AbstractSdf) -> Float[Array, ""]:
     return _moments(shape)[0]
 
 
-def centroid(shape: AbstractSdf) -> Float[Array, "2"]:
-    """Centroid [m] of a plane shape, differentiable in its parameters as `area` is."""
+def centroid(shape: AbstractSdf) -> Float[Array, " dim"]:
+    """Centroid [m] of a shape, differentiable as `area` and, in space, `volume` are."""
+    if shape.dim == 3:
+        return solid_centroid(shape)
     moments = _moments(shape)
     return moments[1:] / moments[0]
 

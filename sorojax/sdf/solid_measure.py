@@ -14,6 +14,8 @@ from jaxtyping import Array, Float
 
 from sorojax._types import real
 from sorojax.sdf.base import AbstractSdf
+from sorojax.sdf.blocks import active_blocks, grid_around
+from sorojax.sdf.dual_contouring import dual_contouring
 from sorojax.sdf.isosurface import Surface, isosurface
 from sorojax.sdf.query import shape_tangent
 from sorojax.sdf.sample import finite_box, values_and_gradients
@@ -95,7 +97,7 @@ def _integrate(
     if not _has_edges(shape, surface):
         return _about_origin(nodes(surface, shape), middle)
     coarse, fine = (
-        _about_origin(nodes(isosurface(shape, h, "dual_contouring")), middle)
+        _about_origin(nodes(_with_corners(shape, h)), middle)
         for h in (2 * size, size)
     )
     # The error is of second order in the cell: one extrapolation takes most of it away.
@@ -104,6 +106,13 @@ def _integrate(
         np.concatenate([fine[1], coarse[1]]),
         np.concatenate([4 / 3 * fine[2], -1 / 3 * coarse[2]]),
     )
+
+
+def _with_corners(shape: AbstractSdf, size: float) -> Surface:
+    """Dual contouring whose vertices may leave their cells by half: no edge is cut off."""
+    grid = grid_around("volume", shape, size)
+    blocks = active_blocks("volume", shape, grid)
+    return Surface(*dual_contouring(shape, grid, blocks, margin=-0.5))
 
 
 def _has_edges(shape: AbstractSdf, surface: Surface) -> bool:

@@ -1,6 +1,7 @@
 """A tube along a smooth curve through points."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -8,16 +9,53 @@ from sorojax._types import real
 from sorojax.sdf.base import AbstractSdf, Box, Exactness, check_lengths
 from sorojax.sdf.curves import check_points, foot
 from sorojax.sdf.nearest import nearest, take
-from sorojax.sdf.scalar import norm
+from sorojax.sdf.scalar import clip, norm, quotient
 
-_STARTS = 8  # places on each piece where the search for the closest point begins
+_PARTS = 6  # of each piece, short enough to hold one closest point
+
+
+def _slope(t, x, curve):
+    """First and second derivative in t of half the squared distance to the cubic."""
+    first = second = jnp.zeros_like(t)
+    for c, (p, q, r, s) in zip(x, curve, strict=True):
+        gap, speed = p + t * (q + t * (r + t * s)) - c, q + t * (2 * r + 3 * t * s)
+        first = first + gap * speed
+        second = second + speed * speed + gap * (2 * r + 6 * t * s)
+    return first, second
+
+
+def _nearest_time(pieces, start, x):
+    """Parameter of the closest point within one part, from that of its chord."""
+    curve = tuple(zip(*pieces, strict=True))
+    end = start + 1 / _PARTS
+
+    def at(t):
+        return tuple(p + t * (q + t * (r + t * s)) for p, q, r, s in curve)
+
+    a, b = at(start), at(end)
+    zero = jnp.zeros_like(x[0])
+    dot = sum(((c - p) * (q - p) for c, p, q in zip(x, a, b, strict=True)), start=zero)
+    square = sum(((q - p) ** 2 for p, q in zip(a, b, strict=True)), start=zero)
+    t = start + clip(quotient(dot, square), 0.0, 1.0) / _PARTS
+    for _ in range(3):
+        first, second = _slope(t, x, curve)
+        t = t - quotient(first, jnp.where(second > 0, second, zero))
+        t = jnp.where(t < start, start, jnp.where(t > end, end, t))
+    return t
+
+
+def _square(pieces, start, x):
+    curve = tuple(zip(*pieces, strict=True))
+    t = _nearest_time(pieces, start, x)
+    gaps = (p + t * (q + t * (r + t * s)) - c for c, (p, q, r, s) in zip(x, curve, strict=True))
+    return sum((g * g for g in gaps), start=jnp.zeros_like(t))
 
 
 class Spline(AbstractSdf):
     """Tube of `width` [m] along the cubic curve (Catmull-Rom) through `points` [m].
 
-    The closest point is searched at 8 places per piece and refined by Newton's method:
-    exact outside as long as no piece turns more than once between two of them.
+    The closest point is searched on six parts of every piece by Newton's method: exact
+    outside unless one part bends around a point with two closest points.
     """
 
     points: Float[Array, "points dim"] = eqx.field(converter=real)
@@ -54,28 +92,14 @@ class Spline(AbstractSdf):
     def distance(self, *x):
         pieces = self._pieces()
         count = pieces[0].shape[0]
-        t = (jnp.arange(_STARTS, dtype=x[0].dtype) + 0.5) / _STARTS
-        repeated = tuple(jnp.repeat(c, _STARTS, axis=0) for c in pieces)
-        times = jnp.tile(t, count)
+        t = jnp.arange(_PARTS, dtype=x[0].dtype) / _PARTS
+        table = (tuple(jnp.repeat(c, _PARTS, axis=0) for c in pieces), jnp.tile(t, count))
+        index = nearest(lambda row, *x: _square(*row, x), table, x)
+        held = jax.lax.stop_gradient((table, x))
+        near = _nearest_time(take(held[0][0], index), held[0][1][index], held[1])
+        curve = tuple(zip(*take(pieces, index // _PARTS), strict=True))
 
-        def square(row, *x):
-            k, t = row
-            at = k[0] + t * (k[1] + t * (k[2] + t * k[3]))
-            gaps = (c - at[i] for i, c in enumerate(x))
-            return sum((g * g for g in gaps), start=jnp.zeros_like(x[0]))
-
-        index = nearest(square, (repeated, times), x)
-        curve = tuple(zip(*take(pieces, index // _STARTS), strict=True))
-
-        def slope(t, x):
-            first = second = jnp.zeros_like(t)
-            for c, (p, q, r, s) in zip(x, curve, strict=True):
-                gap, speed = p + t * (q + t * (r + t * s)) - c, q + t * (2 * r + 3 * t * s)
-                first = first + gap * speed
-                second = second + speed * speed + gap * (2 * r + 6 * t * s)
-            return first, second
-
-        at = foot(slope, times[index], x, 8)
+        at = foot(lambda t, x: _slope(t, x, curve), near, x, 8)
         gaps = (
             p + at * (q + at * (r + at * s)) - c
             for c, (p, q, r, s) in zip(x, curve, strict=True)

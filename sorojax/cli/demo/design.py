@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from sorojax import fem, material, mesh, sdf
 from sorojax.robots import BellowsActuator
@@ -26,6 +26,12 @@ class Design(NamedTuple):
     problem: fem.Problem
     area: float
     meshed_area: float
+
+    @property
+    def chamber_facets(self) -> Int[Array, "facets facet_nodes"]:
+        (air,) = self.problem.loads
+        assert isinstance(air, fem.Pressure)
+        return air.facets
 
 
 def draw(size: float) -> Design:
@@ -82,7 +88,15 @@ class Sensitivity(NamedTuple):
 def sensitivity(design: Design, path: fem.Path) -> Sensitivity:
     """d(tip rotation)/d(dimensions) by reverse mode, through mesh motion and equilibrium."""
     value, slopes = jax.value_and_grad(lambda a: tip_rotation(a, design, path))(design.actuator)
-    names = ("wall_thickness", "bellow_width", "gap", "base", "chamber_height", "roof", "fillet")
+    names = (
+        "wall_thickness",
+        "bellow_width",
+        "gap",
+        "base",
+        "chamber_height",
+        "roof",
+        "fillet",
+    )
     return Sensitivity(
         float(value),
         {name: float(getattr(slopes, name)) for name in names},
@@ -90,9 +104,7 @@ def sensitivity(design: Design, path: fem.Path) -> Sensitivity:
     )
 
 
-def tip_rotation(
-    actuator: BellowsActuator, design: Design, path: fem.Path
-) -> Float[Array, ""]:
+def tip_rotation(actuator: BellowsActuator, design: Design, path: fem.Path) -> Float[Array, ""]:
     """Rotation of the end face [rad] at the last pressure of `path`, negative when the
     actuator curls towards its layer."""
     flat = design.problem.mesh

@@ -54,7 +54,9 @@ def run(out: Path, quick: bool = False) -> int:
         network = loops.closed_loop(reduced, path, duration)
         film = simulate(network, duration, save=int(100 * duration) + 1)
         tracking = loops.tracking(film)
-        tell(f"{duration:g} s in {tracking.steps} steps, rms {np.degrees(tracking.rms):.2f} deg")
+        tell(
+            f"{duration:g} s in {tracking.steps} steps, rms {np.degrees(tracking.rms):.2f} deg"
+        )
     results = Results(design, path, slope, reduced, film, tracking)
     with clock.stage("pictures and report") as tell, _all_or_nothing(out) as folder:
         drawn = pictures(results)

@@ -135,5 +135,3 @@ def tracking(film: systems.Trajectory) -> Tracking:
 
 def _tip_angle(reduced: Reduced, step: int) -> Float[Array, ""]:
     return rod.tip_angle(rod.motion(reduced.rod, reduced.states[step]))
-
-

@@ -34,7 +34,7 @@ def numbers(r: Results) -> dict[str, list[view.Number]]:
     area_error = abs(r.design.meshed_area / r.design.area - 1)
     gap = float(r.reduced.errors.max())
     u = r.path.displacements[-1]
-    facets = problem.loads[0].facets
+    facets = r.design.chamber_facets
     angle = r.film["body.tip_angle"]
     return {
         "rubber": [
@@ -58,7 +58,8 @@ def numbers(r: Results) -> dict[str, list[view.Number]]:
             N("chamber volume at the top pressure", _volume(problem, u, facets), "ml"),
         ],
         "gradient": [
-            N("d rotation / d wall thickness", _deg_per_mm(r.slope, "wall_thickness"), "deg/mm"),
+            N("d rotation / d wall thickness", _deg_per_mm(r.slope, "wall_thickness"),
+              "deg/mm"),
             N("difference to central differences", r.slope.error, "", "< 1e-4",
               r.slope.error < 1e-4),
             *(N(f"d rotation / d {name}", _deg_per_mm(r.slope, name), "deg/mm")
@@ -123,7 +124,7 @@ def _film(r: Results, signals) -> view.Film:
         positions,
         time=r.film.time,
         pressure=r.film["air.pressure"],
-        cavities=r.design.problem.loads[0].facets,
+        cavities=r.design.chamber_facets,
         lines={"wanted direction": target},
         signals={"bending [deg]": signals["bending [deg]"]},
         caption="closed loop on the bending angle",
@@ -136,7 +137,7 @@ def write(folder: Path, drawn: dict[str, Any], tables, seconds: dict[str, float]
     for name, picture in drawn.items():
         files[name] = picture.gif if name.endswith(".gif") else view.png(picture)
         (folder / name).write_bytes(files[name])
-    result = {
+    result: dict[str, Any] = {
         section: {n.name: {"value": n.value, "unit": n.unit, "bar": n.bar, "holds": n.holds}
                   for n in rows}
         for section, rows in tables.items()

@@ -1,0 +1,121 @@
+"""Surfaces to and from files; the ending of the name says the format."""
+
+import functools
+import os
+from collections.abc import Sequence
+
+import numpy as np
+
+from sorojax import _check
+from sorojax.io import _files, glb, obj, ply, stl, svg, threemf
+from sorojax.sdf import Curve, Surface
+from sorojax.units import mm
+
+_READERS = {".stl": stl.read, ".obj": obj.read, ".ply": ply.read}
+_WRITTEN = (".stl", ".obj", ".ply", ".3mf", ".glb")
+
+
+def export_surface(
+    path: str | os.PathLike,
+    surface: Surface,
+    *,
+    text: bool = False,
+    unit: float = mm,
+    root: str | os.PathLike | None = None,
+) -> None:
+    """Write a surface as STL, OBJ, PLY, 3MF or GLB, whole or not at all.
+
+    Args:
+        path: File name; its ending gives the format.
+        surface: Triangles [m].
+        text: Write STL or PLY as text, which is about five times larger.
+        unit: What 1 in an STL, OBJ or PLY file means [m]; these formats state no unit and
+            printers take millimetres. 3MF is in millimetres and GLB in metres by definition.
+        root: Folder that the file must lie in, links followed.
+
+    Raises:
+        ValueError: If the surface is empty, not finite or names vertices that are not
+            there, the format is unknown, or the path leaves `root`.
+    """
+    where = "export_surface"
+    file = _files.inside(where, path, root)
+    kind = _ending(where, file.suffix, _WRITTEN)
+    checked = _checked(where, surface)
+    _check.positive(where, "unit", unit, "m", "Write unit=sorojax.units.mm.")
+    writers = {
+        ".stl": functools.partial(stl.write_text if text else stl.write, scale=1 / unit),
+        ".obj": functools.partial(obj.write, scale=1 / unit),
+        ".ply": functools.partial(ply.write, scale=1 / unit, text=text),
+        ".3mf": threemf.write,
+        ".glb": glb.write,
+    }
+    _files.write(file, lambda stream: writers[kind](stream, surface=checked))
+
+
+def export_contour(
+    path: str | os.PathLike,
+    curves: Sequence[Curve],
+    *,
+    root: str | os.PathLike | None = None,
+) -> None:
+    """Write the curves of `sdf.contour` as SVG in millimetres, whole or not at all."""
+    where = "export_contour"
+    file = _files.inside(where, path, root)
+    _ending(where, file.suffix, (".svg",))
+    if not sum(len(curve.points) for curve in curves):
+        raise ValueError(f"{where}: no curves, need at least one. Pass sdf.contour(shape, size).")
+    for curve in curves:
+        _check.finite(where, "curves", curve.points, "Check the parameters of the shape.")
+    _files.write(file, lambda stream: svg.write(stream, curves))
+
+
+def import_surface(
+    path: str | os.PathLike,
+    *,
+    unit: float = mm,
+    root: str | os.PathLike | None = None,
+    max_bytes: int = _files.MAX_BYTES,
+) -> Surface:
+    """Read an STL, OBJ or PLY file; equal corners of an STL become one vertex.
+
+    The file is compared with what it declares before memory is taken. Whether the surface
+    is closed is for `sdf.surface_report` to say.
+
+    Args:
+        path: File name; its ending gives the format.
+        unit: What 1 in the file means [m].
+        root: Folder that the file must lie in, links followed.
+        max_bytes: Larger files are refused unread.
+
+    Raises:
+        ValueError: If the file is no surface, truncated, damaged or too large, or the
+            path leaves `root`.
+    """
+    file = _files.inside("import_surface", path, root)
+    kind = _ending("import_surface", file.suffix, tuple(_READERS))
+    _check.positive("import_surface", "unit", unit, "m", "Write unit=sorojax.units.mm.")
+    data = _files.read("import_surface", file, max_bytes)
+    return _READERS[kind](data, f"import_surface: {file.name}", unit)
+
+
+def _ending(where: str, suffix: str, known: tuple[str, ...]) -> str:
+    if suffix.lower() not in known:
+        raise ValueError(
+            f"{where}: the file name ends in `{suffix}`, need one of {', '.join(known)}."
+            + (" Curves are written by export_contour." if suffix.lower() == ".svg" else "")
+        )
+    return suffix.lower()
+
+
+def _checked(where: str, surface: Surface) -> Surface:
+    vertices = np.asarray(surface.vertices, dtype=float).reshape(-1, 3)
+    triangles = np.asarray(surface.triangles).reshape(-1, 3)
+    if not len(triangles):
+        raise ValueError(f"{where}: the surface has no triangle, need one at least.")
+    if triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise ValueError(
+            f"{where}: triangles use vertices {triangles.min()} to {triangles.max()}, the "
+            f"surface has {len(vertices)}. Build it again with sdf.isosurface."
+        )
+    _check.finite(where, "vertices", vertices, "Build the surface with sdf.isosurface.")
+    return Surface(vertices, triangles)

@@ -1,0 +1,227 @@
+"""Shapes bent out of their form: bounds whose Lipschitz constant holds everywhere.
+
+A map that stretches more and more away from the shape is followed only near it: the
+point is first moved into a box around the shape, and beyond that box the distance to
+the box takes over. So one constant holds in the whole space.
+"""
+
+import math
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax._types import real
+from sorojax.sdf.base import AbstractSdf, Box, Number, number, steepest
+from sorojax.sdf.combine import check_same_dim, hull
+from sorojax.sdf.scalar import clip, maximum, norm, quotient, root
+from sorojax.sdf.transform import AbstractWrapped
+
+_MARGIN = 0.1  # of the size of the shape, between it and the side of its domain
+
+
+def _domain(lower: Array, upper: Array) -> Box:
+    margin = _MARGIN * jnp.max(upper - lower)
+    return lower - margin, upper + margin
+
+
+def _confined(field: Callable, domain: Box, x: tuple[Array, ...]) -> Array:
+    """`field` inside the domain; beyond it at the nearest point of it, or further."""
+    lower, upper = domain
+    held = tuple(clip(c, lower[i], upper[i]) for i, c in enumerate(x))
+    beyond = norm(*(c - h for c, h in zip(x, held, strict=True)))
+    value = field(*held)
+    return jnp.where(beyond > 0, maximum(value, beyond), value)
+
+
+def _grown(domain: Box, level: Number) -> Box:
+    return domain[0] - level, domain[1] + level
+
+
+class Twisted(AbstractSdf):
+    """A solid twisted about z by `rate` [rad/m].
+
+    The Lipschitz constant is that of the solid times sqrt(1 + a^2) + a over 1 and a
+    half, a = rate * radius / 2: the stretch of simple shear at the corner of its domain.
+    """
+
+    shape: AbstractSdf
+    rate: Float[Array, ""] = eqx.field(converter=real)
+
+    @property
+    def dim(self) -> int:
+        return 3
+
+    def _domain(self) -> Box:
+        lower, upper = self.shape.bounding_box()
+        far = jnp.maximum(jnp.abs(lower[:2]), jnp.abs(upper[:2]))
+        radius = jnp.sqrt(jnp.sum(far**2))
+        return _domain(
+            jnp.stack([-radius, -radius, lower[2]]), jnp.stack([radius, radius, upper[2]])
+        )
+
+    @property
+    def lipschitz(self) -> Number:
+        half = jnp.abs(self.rate) * self._domain()[1][0] * math.sqrt(2) / 2
+        stretch = half + jnp.sqrt(1 + half * half)  # largest singular value of the shear
+        return steepest(self.shape.lipschitz * number(stretch), 1.0)
+
+    def distance(self, x, y, z):
+        def field(x, y, z):
+            c, s = jnp.cos(self.rate * z), jnp.sin(self.rate * z)
+            return self.shape.distance(c * x + s * y, c * y - s * x, z)
+
+        return _confined(field, self._domain(), (x, y, z))
+
+    def bounding_box(self) -> Box:
+        domain, (lower, upper) = self._domain(), self.shape.bounding_box()
+        return (
+            jnp.concatenate([domain[0][:2], lower[2:]]),
+            jnp.concatenate([domain[1][:2], upper[2:]]),
+        )
+
+    def level_box(self, level) -> Box:
+        return _grown(self._domain(), level)
+
+
+class Tapered(AbstractSdf):
+    """A solid whose section at height z is scaled by 1 + `rate` z, rate in 1/m."""
+
+    shape: AbstractSdf
+    rate: Float[Array, ""] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        lower, upper = self._domain()
+        if _check.is_concrete(lower) and _check.is_concrete(self.rate):
+            least = float(jnp.minimum(1 + self.rate * lower[2], 1 + self.rate * upper[2]))
+            if not least > 0:
+                raise ValueError(
+                    f"taper: the section shrinks to {least:g} of itself between z = "
+                    f"{float(lower[2]):g} m and {float(upper[2]):g} m, need more than 0. "
+                    "Lower `rate`, or cut the shape."
+                )
+
+    @property
+    def dim(self) -> int:
+        return 3
+
+    def _domain(self) -> Box:
+        lower, upper = self.shape.bounding_box()
+        margin = _MARGIN * (upper[2] - lower[2])
+        ends = jnp.stack([lower[2] - margin, upper[2] + margin])
+        most = jnp.max(1 + self.rate * ends)
+        wide_lower, wide_upper = _domain(lower, upper)
+        return (
+            jnp.stack([*(jnp.minimum(wide_lower[:2] * most, wide_lower[:2])), ends[0]]),
+            jnp.stack([*(jnp.maximum(wide_upper[:2] * most, wide_upper[:2])), ends[1]]),
+        )
+
+    @property
+    def lipschitz(self) -> Number:
+        lower, upper = self._domain()
+        sizes = 1 + self.rate * jnp.stack([lower[2], upper[2]])
+        least = jnp.min(sizes)
+        far = jnp.maximum(jnp.abs(lower[:2]), jnp.abs(upper[:2]))
+        shear = jnp.abs(self.rate) * jnp.sqrt(jnp.sum(far**2)) / least**2
+        stretch = jnp.maximum(1.0, 1 / least) + shear
+        return steepest(self.shape.lipschitz * number(stretch), 1.0)
+
+    def distance(self, x, y, z):
+        def field(x, y, z):
+            size = 1 + self.rate * z
+            return self.shape.distance(x / size, y / size, z)
+
+        return _confined(field, self._domain(), (x, y, z))
+
+    def bounding_box(self) -> Box:
+        return self._domain()
+
+    def level_box(self, level) -> Box:
+        return _grown(self._domain(), level)
+
+
+class Bent(AbstractWrapped):
+    """A bar along x bent in the plane of x and y to the curvature `bend` [1/m].
+
+    The line y = 0 keeps its length; material at y turns on the radius 1/bend - y.
+    """
+
+    shape: AbstractSdf
+    bend: Float[Array, ""] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        lower, upper = self.shape.bounding_box()
+        if _check.is_concrete(lower) and _check.is_concrete(self.bend):
+            inner = float(self._inner())
+            turn = float(jnp.abs(self.bend) * jnp.maximum(-lower[0], upper[0]))
+            if not (inner > 0 and turn < math.pi):
+                raise ValueError(
+                    f"bend: the shape reaches {turn:g} rad around the centre (need less than "
+                    f"pi) and {inner:g} of the radius is left at its inner side (need more "
+                    "than 0). Lower `bend`."
+                )
+
+    def _inner(self) -> Array:
+        """Radius over 1/bend of a circle inside of which there is no material."""
+        lower, upper = self.shape.bounding_box()
+        high = jnp.where(self.bend > 0, upper[1], -lower[1])
+        return 0.8 * (1 - jnp.abs(self.bend) * high)
+
+    @property
+    def lipschitz(self) -> Number:
+        # Inside that circle the field runs down to the radius of it at the centre.
+        lower, upper = self.shape.bounding_box()
+        inner, k = self._inner(), jnp.abs(self.bend)
+        far = jnp.sqrt(jnp.sum((upper - lower) ** 2)) + 2 * jnp.maximum(-lower[0], upper[0])
+        slope = steepest(self.shape.lipschitz * number(jnp.maximum(1.0, 1 / inner)), 1.0)
+        rise = number(jnp.maximum(1.0, k * (far + math.pi / jnp.maximum(k, 1e-9)) / inner))
+        return slope + rise
+
+    def distance(self, x, y, *z):
+        k = self.bend
+        near, across = 1 - k * y, k * x
+        ratio = norm(near, across)  # radius over 1/bend
+        inner = self._inner()
+        safe = jnp.where(ratio < inner, inner + jnp.zeros_like(ratio), ratio)
+        height = jnp.where(
+            ratio < inner,
+            quotient(1 - inner, k) + jnp.zeros_like(x),
+            (2 * y - k * (x * x + y * y)) / (1 + safe),
+        )
+        along = _arc(x, near, across, k)
+        value = self.shape.distance(along, height, *z)
+        whole = 2 * math.pi / jnp.where(jnp.abs(k) < 1e-9, 1e-9, jnp.abs(k))
+        other = jnp.where(along > 0, along - whole, along + whole)
+        again = self.shape.distance(other, height, *z)
+        value = jnp.where(again < value, again, value)
+        # Towards the centre the angle turns faster and faster: fade it out.
+        fade = ratio / inner
+        depth = quotient(inner - ratio, jnp.abs(k) + jnp.zeros_like(x))
+        return jnp.where(ratio < inner, fade * value + depth, value)
+
+    def level_box(self, level) -> Box:
+        lower, upper = self.shape.level_box(level)
+        k = jnp.abs(self.bend)
+        far = jnp.maximum(jnp.abs(lower), jnp.abs(upper))
+        # No point moves further from the origin than the bar reaches along and across.
+        reach = (far[0] + far[1] * (1 + k * 0))[None].repeat(2)
+        return (
+            jnp.concatenate([-reach, lower[2:]]), jnp.concatenate([reach, upper[2:]])
+        )  # fmt: skip
+
+
+def _arc(x: Array, near: Array, across: Array, k: Array) -> Array:
+    """atan2(k x, 1 - k y) / k, by its series where the angle is small."""
+    small = (absolute_less(across, 1e-4)) & (near > 0.5)
+    slope = jnp.where(small, across / jnp.where(small, near, 1.0), 0.0)
+    series = x / jnp.where(small, near, 1.0) * (1 - slope * slope / 3)
+    centre = (near == 0) & (across == 0)
+    safe_near = jnp.where(small | centre, jnp.ones_like(near), near)
+    angle = jnp.arctan2(jnp.where(small | centre, jnp.zeros_like(across), across), safe_near)
+    return jnp.where(small, series, quotient(angle, k + jnp.zeros_like(angle)))
+
+
+def absolute_less(a: Array, limit: float) -> Array:
+    return (a < limit) & (a > -limit)
