@@ -293,3 +293,20 @@ def test_a_body_without_load_is_an_equilibrium_at_rest():
     solution = fem.solve(_ring(0.0))
     assert solution.stats.iterations <= 2 and solution.stats.cuts == 0
     assert jnp.max(jnp.abs(solution.displacement)) < 1e-15
+
+
+def test_second_derivatives_of_equilibrium():
+    base = _ring(8 * kPa)
+    tight = fem.Newton(residual_tolerance=1e-12)
+
+    def answer(scale):
+        where = (base.loads[0].value * scale[0], base.material.shear_modulus * scale[1])
+        problem = eqx.tree_at(lambda p: (p.loads[0].value, p.material.shear_modulus), base, where)
+        return jnp.sum(fem.solve(problem, newton=tight).displacement) * 1e3
+
+    at, h = jnp.ones(2), 1e-4
+    hessian = jax.jacfwd(jax.grad(answer))(at)
+    step = h * jnp.eye(2)
+    rows = [(jax.grad(answer)(at + d) - jax.grad(answer)(at - d)) / (2 * h) for d in step]
+    assert jnp.allclose(hessian, hessian.T, rtol=1e-9)
+    assert jnp.allclose(hessian, jnp.stack(rows), rtol=1e-6, atol=1e-6)

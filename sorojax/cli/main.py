@@ -64,8 +64,10 @@ def _info(arguments: argparse.Namespace) -> int:
     _start_jax()
     from sorojax.cli.info import info
 
-    for name, value in info().items():
-        print(f"{name:<18} {value}")
+    rows = info()
+    width = max(map(len, rows))
+    for name, value in rows.items():
+        print(f"{name:<{width}} {value}")
     return 0
 
 

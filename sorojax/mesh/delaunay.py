@@ -185,7 +185,9 @@ def _smooth(shape, points, cells, fixed: int, wanted: SizeField, guard: Guard):
         / np.maximum(total, 1e-300)[:, None]
     )
     new = guard.push(new)
-    keep = (total == 0) | (values(shape, new) > -0.2 * wanted(new))
+    count = np.maximum(np.bincount(cells.ravel(), minlength=len(points)), 1)
+    around = np.bincount(cells.ravel(), np.repeat(h, 3), len(points)) / count
+    keep = (total == 0) | (values(shape, new) > -0.2 * around)
     keep[:fixed] = True
     return np.where(keep[:, None], points, new)
 

@@ -131,9 +131,8 @@ def clip(shape: AbstractSdf, points, f, cells):
     edges = unique_edges(cut, len(points)) if len(cut) else np.zeros((0, 2), int)
     edges = edges[sign[edges[:, 0]] * sign[edges[:, 1]] < 0]
     a, b = edges.T
-    _, crossing = roots(
-        shape, points[a], points[b], *(values(shape, points[e]) for e in (a, b))
-    )
+    fa, fb = values(shape, points[a]), values(shape, points[b])
+    _, crossing = roots(shape, points[a], points[b], fa, fb)
     keys, base = a * np.int64(len(points)) + b, len(points)
 
     def middle(p, q):

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sorojax._types import integers, real
+from sorojax._types import integers, is_traced, real
 from sorojax.mesh.elements import AbstractElement, facet_corners
 
 
@@ -49,7 +49,7 @@ class Mesh(eqx.Module):
                 f"Mesh: `points` has shape {self.points.shape}, {self.element.name} needs "
                 f"(nodes, {self.element.dim})."
             )
-        if not isinstance(self.cells, jax.core.Tracer) and self.cells.size:
+        if not is_traced(self.cells) and self.cells.size:
             ids = np.asarray(self.cells)
             if ids.min() < 0 or ids.max() >= self.points.shape[0]:
                 raise ValueError(

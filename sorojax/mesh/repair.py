@@ -73,7 +73,7 @@ def repair(points, cells, element: AbstractElement, *, tol: float | None = None)
     for a, b in sorted(map(sorted, KDTree(points).query_pairs(tol))):
         target[b] = min(target[b], target[a])
     merged = np.flatnonzero(target != np.arange(len(points)))
-    used = np.unique(cells)
+    used = np.unique(target[cells])
     removed = np.setdiff1d(np.arange(len(points)), np.concatenate([used, merged]))
     kept, numbers = np.unique(target[cells], return_inverse=True)
     mesh = Mesh(points[kept], numbers.reshape(cells.shape), element)
@@ -113,6 +113,5 @@ def _refuse(points, cells, element: AbstractElement) -> None:
 
 
 def _ids(ids: np.ndarray) -> str:
-    return (
-        str(ids.tolist()) if len(ids) <= 12 else f"{ids[:12].tolist()} and {len(ids) - 12} more"
-    )
+    rest = f" and {len(ids) - 12} more" if len(ids) > 12 else ""
+    return f"{ids[:12].tolist()}{rest}"

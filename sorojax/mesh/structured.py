@@ -135,7 +135,7 @@ def _cube_corners(divisions) -> dict[tuple[int, int, int], np.ndarray]:
     base = np.stack(np.meshgrid(*map(np.arange, divisions), indexing="ij"), -1).reshape(-1, 3)
     counts = tuple(n + 1 for n in divisions)
     offsets = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-    return {o: np.ravel_multi_index(tuple((base + o).T), counts) for o in offsets}
+    return {o: np.asarray(np.ravel_multi_index(tuple((base + o).T), counts)) for o in offsets}
 
 
 def _kuhn(corner, axes: tuple[int, ...]) -> np.ndarray:

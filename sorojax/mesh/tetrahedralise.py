@@ -7,6 +7,7 @@ from sorojax._types import real
 from sorojax.mesh.elements import Tet4, Tet10
 from sorojax.mesh.lattice import clip, lattice, snap
 from sorojax.mesh.mesh import Mesh, boundary_facets
+from sorojax.mesh.resolved import check_resolved
 from sorojax.mesh.shape import nodes as reference_nodes, quadrature, shape_gradients
 from sorojax.mesh.tets import badness, improve, signed_volumes
 from sorojax.sdf.base import AbstractSdf
@@ -55,8 +56,12 @@ def tetrahedralise(
     points, cells, skin = clip(shape, points, f, cells)
     cells = _upright(points, cells, float(size))
     points, cells, skin = _compact(points, cells, skin)
+    if not len(cells):
+        raise_empty(where, lower, upper, float(size))
+    points[skin] = land(shape, points[skin], 3)
     points = improve(shape, points, cells, skin, float(size), rounds, _ENOUGH)
-    _check_resolved(points, cells)
+    _check_shapes(points, cells)
+    check_resolved(where, shape, points[skin], float(size), lower, upper)
     if order == 2:
         return _curved(shape, points, cells)
     return _named(Mesh(points, cells, Tet4()))
@@ -78,7 +83,7 @@ def _upright(points, cells, size: float) -> np.ndarray:
     return cells[np.abs(volume) > 1e-9 * size**3]
 
 
-def _check_resolved(points, cells) -> None:
+def _check_shapes(points, cells) -> None:
     bad = badness(points[cells])
     if bad.max() > np.cos(_POOR):
         where = points[cells[bad.argmax()]].mean(axis=0)

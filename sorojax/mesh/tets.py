@@ -115,9 +115,7 @@ def radius_ratios(x: np.ndarray) -> np.ndarray:
         np.linalg.norm(np.cross(x[:, j] - x[:, i], x[:, k] - x[:, i]), axis=1) / 2
         for i, j, k in _FACES
     )
-    center = sum(
-        (u * u).sum(axis=1)[:, None] * np.cross(v, w)
-        for u, v, w in ((a, b, c), (b, c, a), (c, a, b))
-    )
+    turns = ((a, b, c), (b, c, a), (c, a, b))
+    center = sum((u * u).sum(axis=1)[:, None] * np.cross(v, w) for u, v, w in turns)
     circum = np.linalg.norm(center, axis=1) / np.maximum(12 * volume, 1e-300)
     return 9 * volume / (faces * circum)

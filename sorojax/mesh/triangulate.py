@@ -8,6 +8,7 @@ from sorojax.mesh.delaunay import check_edges, fill
 from sorojax.mesh.elements import Tri3, Tri6
 from sorojax.mesh.mesh import Mesh
 from sorojax.mesh.outline import Outline, outline
+from sorojax.mesh.resolved import check_resolved
 from sorojax.mesh.sizes import SizeFunction, sizes
 from sorojax.mesh.tri6 import least_jacobian, with_middles
 from sorojax.sdf.base import AbstractSdf
@@ -20,7 +21,7 @@ def triangulate(
     size: float | SizeFunction,
     order: int = 1,
     interfaces: tuple[AbstractSdf, ...] = (),
-    iterations: int = 12,
+    iterations: int = 8,
 ) -> Mesh:
     """Triangles that fill a plane shape.
 
@@ -48,9 +49,11 @@ def triangulate(
             "do not exist."
         )
     _check.float64("triangulate", real(0.0))
-    lengths = sizes("triangulate", size, *finite_box("triangulate", shape, 2))
+    box = finite_box("triangulate", shape, 2)
+    lengths = sizes("triangulate", size, *box)
     interfaces = tuple(interfaces)
     lines = outline(shape, interfaces, lengths)
+    check_resolved("triangulate", shape, lines.points, lengths.largest, *box)
     points, cells = fill(shape, lines, lengths, iterations)
     check_edges(lines, points, cells)
     if order == 1:

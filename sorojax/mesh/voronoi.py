@@ -126,9 +126,9 @@ def cut_cells(seeds: np.ndarray, border: Border) -> tuple[np.ndarray, list]:
         if not found and not inside[u]:
             continue
         along = vertices[v] - vertices[u]
-        found = sorted(
-            found, key=lambda k, u=u, along=along: (border.points[k] - vertices[u]) @ along
-        )
+        if len(found) > 1:
+            place = (border.points[found] - vertices[u]) @ along
+            found = [found[k] for k in np.argsort(place)]
         stops = [offset + u, *found, offset + v]
         turn = along[0] * (seeds[a] - vertices[u])[1] - along[1] * (seeds[a] - vertices[u])[0]
         left, right = (a, b) if turn > 0 else (b, a)

@@ -15,8 +15,7 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._types import real
 from sorojax.sdf.base import AbstractSdf, Box, Number, number, steepest
-from sorojax.sdf.combine import check_same_dim, hull
-from sorojax.sdf.scalar import clip, maximum, norm, quotient, root
+from sorojax.sdf.scalar import clip, maximum, minimum, norm, quotient
 from sorojax.sdf.transform import AbstractWrapped
 
 _MARGIN = 0.1  # of the size of the shape, between it and the side of its domain
@@ -43,8 +42,8 @@ def _grown(domain: Box, level: Number) -> Box:
 class Twisted(AbstractSdf):
     """A solid twisted about z by `rate` [rad/m].
 
-    The Lipschitz constant is that of the solid times sqrt(1 + a^2) + a over 1 and a
-    half, a = rate * radius / 2: the stretch of simple shear at the corner of its domain.
+    The Lipschitz constant is that of the solid times a + sqrt(1 + a^2), the stretch of
+    the simple shear 2 a = rate * radius at the corner of its domain.
     """
 
     shape: AbstractSdf
@@ -57,10 +56,10 @@ class Twisted(AbstractSdf):
     def _domain(self) -> Box:
         lower, upper = self.shape.bounding_box()
         far = jnp.maximum(jnp.abs(lower[:2]), jnp.abs(upper[:2]))
-        radius = jnp.sqrt(jnp.sum(far**2))
-        return _domain(
-            jnp.stack([-radius, -radius, lower[2]]), jnp.stack([radius, radius, upper[2]])
-        )
+        radius = (1 + _MARGIN) * jnp.sqrt(jnp.sum(far**2))
+        margin = _MARGIN * (upper[2] - lower[2])
+        low, high = lower[2] - margin, upper[2] + margin
+        return jnp.stack([-radius, -radius, low]), jnp.stack([radius, radius, high])
 
     @property
     def lipschitz(self) -> Number:
@@ -171,42 +170,34 @@ class Bent(AbstractWrapped):
 
     @property
     def lipschitz(self) -> Number:
-        # Inside that circle the field runs down to the radius of it at the centre.
-        lower, upper = self.shape.bounding_box()
-        inner, k = self._inner(), jnp.abs(self.bend)
-        far = jnp.sqrt(jnp.sum((upper - lower) ** 2)) + 2 * jnp.maximum(-lower[0], upper[0])
-        slope = steepest(self.shape.lipschitz * number(jnp.maximum(1.0, 1 / inner)), 1.0)
-        rise = number(jnp.maximum(1.0, k * (far + math.pi / jnp.maximum(k, 1e-9)) / inner))
-        return slope + rise
+        stretch = number(jnp.maximum(1.0, 1 / self._inner()))
+        slope = steepest(self.shape.lipschitz * stretch, 1.0)
+        return number((slope * slope + 0.25) ** 0.5)  # with the half slope inside the circle
 
     def distance(self, x, y, *z):
         k = self.bend
         near, across = 1 - k * y, k * x
         ratio = norm(near, across)  # radius over 1/bend
-        inner = self._inner()
-        safe = jnp.where(ratio < inner, inner + jnp.zeros_like(ratio), ratio)
-        height = jnp.where(
-            ratio < inner,
-            quotient(1 - inner, k) + jnp.zeros_like(x),
-            (2 * y - k * (x * x + y * y)) / (1 + safe),
-        )
+        inner, most = self._inner(), 1 / jnp.maximum(jnp.abs(k), 1e-9)
+        outside = ratio >= inner
+        straight = (2 * y - k * (x * x + y * y)) / (1 + ratio)
+        height = jnp.where(outside, straight, quotient(1 - inner, k) + jnp.zeros_like(x))
         along = _arc(x, near, across, k)
-        value = self.shape.distance(along, height, *z)
-        whole = 2 * math.pi / jnp.where(jnp.abs(k) < 1e-9, 1e-9, jnp.abs(k))
-        other = jnp.where(along > 0, along - whole, along + whole)
-        again = self.shape.distance(other, height, *z)
-        value = jnp.where(again < value, again, value)
-        # Towards the centre the angle turns faster and faster: fade it out.
-        fade = ratio / inner
-        depth = quotient(inner - ratio, jnp.abs(k) + jnp.zeros_like(x))
-        return jnp.where(ratio < inner, fade * value + depth, value)
+        # The bar is also met the other way round the circle.
+        other = jnp.where(along > 0, along - 2 * math.pi * most, along + 2 * math.pi * most)
+        value = minimum(
+            self.shape.distance(along, height, *z), self.shape.distance(other, height, *z)
+        )
+        # Towards the centre the angle turns faster and faster: fade its influence out.
+        value = minimum(value, jnp.where(outside, ratio, inner) * most)
+        faded = ratio / inner * value + (inner - ratio) * most / 2
+        return jnp.where(outside, value, faded)
 
     def level_box(self, level) -> Box:
         lower, upper = self.shape.level_box(level)
-        k = jnp.abs(self.bend)
-        far = jnp.maximum(jnp.abs(lower), jnp.abs(upper))
         # No point moves further from the origin than the bar reaches along and across.
-        reach = (far[0] + far[1] * (1 + k * 0))[None].repeat(2)
+        far = jnp.maximum(jnp.abs(lower), jnp.abs(upper))
+        reach = (far[0] + far[1])[None].repeat(2)
         return (
             jnp.concatenate([-reach, lower[2:]]), jnp.concatenate([reach, upper[2:]])
         )  # fmt: skip
@@ -214,7 +205,7 @@ class Bent(AbstractWrapped):
 
 def _arc(x: Array, near: Array, across: Array, k: Array) -> Array:
     """atan2(k x, 1 - k y) / k, by its series where the angle is small."""
-    small = (absolute_less(across, 1e-4)) & (near > 0.5)
+    small = (across < 1e-4) & (across > -1e-4) & (near > 0.5)
     slope = jnp.where(small, across / jnp.where(small, near, 1.0), 0.0)
     series = x / jnp.where(small, near, 1.0) * (1 - slope * slope / 3)
     centre = (near == 0) & (across == 0)
@@ -223,5 +214,16 @@ def _arc(x: Array, near: Array, across: Array, k: Array) -> Array:
     return jnp.where(small, series, quotient(angle, k + jnp.zeros_like(angle)))
 
 
-def absolute_less(a: Array, limit: float) -> Array:
-    return (a < limit) & (a > -limit)
+def twist(shape: AbstractSdf, rate) -> Twisted:
+    """A solid twisted about z by `rate` [rad/m]."""
+    return Twisted(shape, rate)
+
+
+def taper(shape: AbstractSdf, rate) -> Tapered:
+    """A solid whose section at height z is scaled by 1 + `rate` z, rate in 1/m."""
+    return Tapered(shape, rate)
+
+
+def bend(shape: AbstractSdf, curvature) -> Bent:
+    """A bar along x bent in the plane of x and y to `curvature` [1/m]."""
+    return Bent(shape, curvature)

@@ -16,6 +16,7 @@ from sorojax.sdf.base import AbstractSdf, Box, Exactness, Number
 from sorojax.sdf.combine import hull
 from sorojax.sdf.scalar import box_distance, clip, minimum, norm
 from sorojax.sdf.transform import AbstractWrapped
+from sorojax.sdf.turn import turned_box
 
 
 class Extruded(AbstractSdf):
@@ -142,18 +143,6 @@ class Mirrored(AbstractWrapped):
         )  # fmt: skip
 
 
-def turned_box(box: Box, matrix: Float[Array, "dim dim"], shift: Array) -> Box:
-    """Box around the image of `box` under x -> matrix x + shift; open sides stay open."""
-    lower, upper = box
-
-    def side(towards, away):
-        # 0 * inf is a NaN: an axis that does not take part adds nothing.
-        picked = jnp.where(matrix > 0, towards[None], away[None])
-        return jnp.sum(jnp.where(matrix == 0, 0, matrix * picked), axis=1) + shift
-
-    return side(lower, upper), side(upper, lower)
-
-
 class Elongated(AbstractWrapped):
     """`shape` cut at the origin along each axis and drawn apart by `amount` [m].
 
@@ -257,8 +246,6 @@ def polar_repeat(shape: AbstractSdf, count: int) -> PolarRepeated:
         return everything
     corners = np.array([(x, y) for x in (lower[0], upper[0]) for y in (lower[1], upper[1])])
     middle = (lower + upper) / 2
-    turn = np.arctan2(
-        middle[0] * corners[:, 1] - middle[1] * corners[:, 0], corners @ middle
-    )
+    turn = np.arctan2(middle[0] * corners[:, 1] - middle[1] * corners[:, 0], corners @ middle)
     width = float(np.abs(turn).max()) * count / (2 * math.pi)
     return PolarRepeated(shape, int(count), reach=1 + math.floor(width))

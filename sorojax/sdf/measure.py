@@ -1,4 +1,4 @@
-"""Area and centroid of plane shapes by adaptive cells cut by the tangent line.
+"""Area, centroid and second moments of plane shapes by adaptive cells cut by the tangent line.
 
 Cells that the Lipschitz constant proves full or empty are never refined; the
 smallest ones are cut by the line f + grad f . x = 0, an error of second order in
@@ -36,11 +36,21 @@ def centroid(shape: AbstractSdf) -> Float[Array, " dim"]:
     if shape.dim == 3:
         return solid_centroid(shape)
     moments = _moments(shape)
-    return moments[1:] / moments[0]
+    return moments[1:3] / moments[0]
+
+
+def second_moments(shape: AbstractSdf) -> Float[Array, "2 2"]:
+    """Integral of r r^T over a plane shape, r from its centroid [m^4], as `area` is.
+
+    Entry (0, 0) is that of x^2, which resists bending in x; the trace is the polar moment.
+    """
+    m = _moments(shape)
+    xx, xy, yy = m[3:] - jnp.stack([m[1] * m[1], m[1] * m[2], m[2] * m[2]]) / m[0]
+    return jnp.stack([jnp.stack([xx, xy]), jnp.stack([xy, yy])])
 
 
 @eqx.filter_custom_jvp
-def _moments(shape: AbstractSdf) -> Float[Array, "3"]:
+def _moments(shape: AbstractSdf) -> Float[Array, "6"]:
     return jnp.asarray(_integrate(shape)[0], dtype=jnp.result_type(float))
 
 
@@ -50,28 +60,27 @@ def _moments_jvp(primals, tangents):
     moments, points, weights = _integrate(shape)
     p = jnp.asarray(points, dtype=jnp.result_type(float))
     f_dot = shape_tangent(lambda s: s(p), shape, shape_dot)
-    density = jnp.asarray(
-        np.concatenate([np.ones((len(points), 1)), points], axis=1), dtype=p.dtype
-    )
+    density = jnp.asarray(_monomials(points), dtype=p.dtype)
     weights = jnp.asarray(weights, dtype=p.dtype)
     return jnp.asarray(moments, dtype=p.dtype), -(weights * f_dot) @ density
 
 
 def _integrate(shape: AbstractSdf) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(area, moments about the origin), boundary points and weights length/|grad f|."""
+    """Area, first and second moments about the origin; boundary points and weights."""
     lower, upper = finite_box("area", shape, 2)
     cell = float((upper - lower).max()) / _COARSE
     counts = np.ceil((upper - lower) / cell + 0.5).astype(int)
     start = (lower + upper) / 2 - cell * counts / 2
     axes = [start[i] + cell * (np.arange(counts[i]) + 0.5) for i in (0, 1)]
     centers = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    total = np.zeros(3)
+    total = np.zeros(6)
     quarter = np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]]) / 4
     for level in range(_LEVELS + 1):
         f = values(shape, centers)
         open_ = np.abs(f) <= shape.lipschitz * cell * np.sqrt(0.5) * (1 + 1e-9)
         full = centers[(f < 0) & ~open_]
-        total += cell**2 * np.array([len(full), *full.sum(axis=0)])
+        own = np.array([0, 0, 0, 1, 0, 1]) * cell**2 / 12
+        total += cell**2 * (_monomials(full) + own).sum(axis=0)
         centers = centers[open_]
         if level < _LEVELS:
             centers = (centers[:, None] + cell * quarter).reshape(-1, 2)
@@ -106,7 +115,17 @@ def _cut_cells(shape, centers, cell):
     moments = part[:, None] * centers + shift
     cut = line > 0
     points = (centers + middle)[cut]
-    return np.array([part.sum(), *moments.sum(axis=0)]), points, (line / slope)[cut]
+    # Of a cell this small the part counts as a point for its second moments.
+    middle = moments / np.maximum(part, 1e-300)[:, None]
+    total = (part[:, None] * _monomials(middle)).sum(axis=0)
+    total[1:3] = moments.sum(axis=0)
+    return total, points, (line / slope)[cut]
+
+
+def _monomials(points: np.ndarray) -> np.ndarray:
+    """1, x, y, x^2, x y, y^2 at points (n, 2)."""
+    x, y = points.T
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
 
 
 def _below(slope, level, half):

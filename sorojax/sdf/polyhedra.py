@@ -94,7 +94,11 @@ class Pyramid(AbstractSolidShape):
         x, y = maximum(x, y), minimum(x, y)
         inside = (z > 0) & (x * self.height + (z - self.height) * half < 0)
         flank = triangle_side(
-            (x, y, z), (half, -half, zero), (half, half, zero), (zero, zero, self.height), inside
+            (x, y, z),
+            (half, -half, zero),
+            (half, half, zero),
+            (zero, zero, self.height),
+            inside,
         )
         base = jnp.where((x <= half) & (z <= 0), -z, jnp.full_like(x, jnp.inf))
         return jnp.where(inside, maximum(flank, -z), _smaller(base, flank))

@@ -27,13 +27,20 @@ def gradient(shape: AbstractSdf, p: Points) -> Points:
 def value_and_gradient(shape: AbstractSdf, p: Points) -> tuple[Float[Array, "*points"], Points]:
     """Field [m] and slope [-] at `p` by one forward pass per axis."""
     shape = cast(shape, p.dtype)
-    x = tuple(p[..., i] for i in range(shape.dim))
+    f, slopes = value_and_gradient_at(shape, tuple(p[..., i] for i in range(shape.dim)))
+    return f, jnp.stack(slopes, axis=-1)
+
+
+def value_and_gradient_at(
+    shape: AbstractSdf, x: tuple[Array, ...]
+) -> tuple[Array, tuple[Array, ...]]:
+    """Field and slope at separate coordinate arrays."""
     one, zero = jnp.ones_like(x[0]), jnp.zeros_like(x[0])
     passes = [
         jax.jvp(shape.distance, x, tuple(one if i == j else zero for j in range(len(x))))
         for i in range(len(x))
     ]
-    return passes[0][0], jnp.stack([slope for _, slope in passes], axis=-1)
+    return passes[0][0], tuple(slope for _, slope in passes)
 
 
 def normal(shape: AbstractSdf, p: Points) -> Points:

@@ -17,6 +17,7 @@ from sorojax.sdf.scalar import (
     quotient,
     root,
 )
+from sorojax.sdf.simple import touching_edges
 
 
 class AbstractPlaneShape(AbstractSdf):
@@ -124,6 +125,13 @@ class Polygon(AbstractPlaneShape):
                 f"Polygon: `vertices` has {self.vertices.shape[0]} rows, a polygon needs at "
                 "least 3. List each corner once, in order."
             )
+        if _check.is_concrete(self.vertices):
+            edges = touching_edges(np.asarray(self.vertices))
+            if edges is not None:
+                raise ValueError(
+                    f"Polygon: edges {edges[0]} and {edges[1]} touch, need a simple polygon. "
+                    "Put its corners in order, or join several polygons by `|`."
+                )
 
     def distance(self, x, y):
         shape = (1,) * x.ndim + (-1,)

@@ -17,7 +17,7 @@ from sorojax.sdf.scalar import (
     sector,
     segment_side,
 )
-from sorojax.sdf.shapes2d import AbstractPlaneShape
+from sorojax.sdf.shapes2d import AbstractPlaneShape, Polygon
 
 
 def _centred(*half: Array) -> Box:
@@ -147,9 +147,7 @@ class Pie(AbstractPlaneShape):
     def distance(self, x, y):
         zero = jnp.zeros_like(self.radius)
         c, s = jnp.cos(self.half_angle), jnp.sin(self.half_angle)
-        edge = segment_side(
-            x, absolute(y), (zero, zero), (c * self.radius, s * self.radius)
-        )
+        edge = segment_side(x, absolute(y), (zero, zero), (c * self.radius, s * self.radius))
         return maximum(norm(x, y) - self.radius, edge)
 
     def bounding_box(self) -> Box:
@@ -224,3 +222,15 @@ def _power(base: Array, power: Array) -> Array:
     some = base > 0
     safe = jnp.where(some, base, jnp.ones_like(base))
     return jnp.where(some, jnp.exp(power * jnp.log(safe)), jnp.zeros_like(base))
+
+
+def triangle(a, b, c) -> Polygon:
+    """Triangle of three corners [m]."""
+    return Polygon(jnp.stack([real(a), real(b), real(c)]))
+
+
+def trapezoid(width, top_width, height) -> Polygon:
+    """Symmetric trapezoid about the origin, `width` wide below, `top_width` above [m]."""
+    low, high, rise = real(width) / 2, real(top_width) / 2, real(height) / 2
+    corners = [(-low, -rise), (low, -rise), (high, rise), (-high, rise)]
+    return Polygon(jnp.stack([jnp.stack(corner) for corner in corners]))

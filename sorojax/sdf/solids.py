@@ -41,9 +41,7 @@ class BoxFrame(AbstractSolidShape):
         half, t = self.size / 2, self.thickness / 2
         p = tuple(absolute(c) - half[i] for i, c in enumerate((x, y, z)))
         q = tuple(absolute(c + t) - t for c in p)
-        bars = [
-            box_distance(*(p[j] if j == i else q[j] for j in range(3))) for i in range(3)
-        ]
+        bars = [box_distance(*(p[j] if j == i else q[j] for j in range(3))) for i in range(3)]
         return minimum(minimum(bars[0], bars[1]), bars[2])
 
     def bounding_box(self) -> Bounds:
@@ -101,18 +99,26 @@ class CappedTorus(AbstractSolidShape):
 
 
 class InfiniteCylinder(AbstractSolidShape):
-    """Cylinder of `radius` [m] about z without ends."""
+    """Cylinder of `radius` [m] without ends about the `axis` "x", "y" or "z"."""
 
     radius: Float[Array, ""] = eqx.field(converter=real)
+    axis: str = eqx.field(static=True, default="z")
 
     def __check_init__(self):
         check_lengths(self, "radius")
+        if self.axis not in ("x", "y", "z"):
+            raise ValueError(
+                f"InfiniteCylinder: `axis` is {self.axis!r}, need 'x', 'y' or 'z'. Use `turn` "
+                "for other directions."
+            )
 
     def distance(self, x, y, z):
-        return norm(x, y) - self.radius
+        across = {"x": (y, z), "y": (x, z), "z": (x, y)}[self.axis]
+        return norm(*across) - self.radius
 
     def bounding_box(self) -> Bounds:
-        return centred(self.radius, self.radius, jnp.full_like(self.radius, jnp.inf))
+        r, infinity = self.radius, jnp.full_like(self.radius, jnp.inf)
+        return centred(*(infinity if self.axis == name else r for name in "xyz"))
 
 
 class Cylinder(AbstractSolidShape):

@@ -1,0 +1,36 @@
+"""Whether a mesh has seen all of its shape: walls between sample points are missed."""
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from sorojax.sdf.base import AbstractSdf
+from sorojax.sdf.sample import CHUNK, land, values
+
+
+def check_resolved(
+    where: str, shape: AbstractSdf, nodes: np.ndarray, size: float, lower, upper
+) -> None:
+    """Raise if points inside `shape` have a surface near them that has no `nodes`.
+
+    Random points of the box are tested, so a wall that fills less than about a
+    thousandth of it may pass.
+    """
+    p = lower + (upper - lower) * np.random.default_rng(0).random((2 * CHUNK, len(lower)))
+    f = values(shape, p)
+    if not np.all(np.isfinite(f)):
+        raise ValueError(
+            f"{where}: the field of the shape is not finite at {p[~np.isfinite(f)][0]} m. "
+            "Check its parameters for NaN."
+        )
+    p, f = p[f < 0], f[f < 0]
+    tree = KDTree(nodes)
+    p = p[tree.query(p)[0] > np.abs(f) + 0.8 * size]
+    landed = land(shape, p, 6) if len(p) else p
+    lost = landed[
+        (tree.query(landed)[0] > size) & (np.abs(values(shape, landed)) < 1e-6 * size)
+    ]
+    if len(lost):
+        raise ValueError(
+            f"{where}: a wall near {lost[0]} m is thinner than a `size` of {size:g} m can "
+            "see. Lower `size` to a few times the thinnest wall or less, or thicken it."
+        )

@@ -1,0 +1,87 @@
+"""The hand: a palm with five soft fingers, each with an air supply of its own."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax._types import real
+from sorojax.robots.finger import Finger
+from sorojax.robots.parts import Bellows, LaidAlong, pipe
+from sorojax.sdf import AbstractSdf, Box, rotate, translate, union
+from sorojax.units import deg, mm
+
+
+class Hand(eqx.Module):
+    """Dimensions [m] and angles [rad] of a right hand, palm down, fingers along y.
+
+    About 190 x 100 x 40 mm: fingers of 90 mm, a thumb of 80 mm. The fingers bend towards
+    -z and take -10 to 60 kPa; their ports open on the back of the hand.
+    """
+
+    finger: Finger = Finger(bellows=Bellows(
+        outer_radius=9 * mm, inner_radius=5.6 * mm, pitch=8.6 * mm, fold_height=5 * mm,
+        wall_thickness=1.2 * mm, cap=2.5 * mm, fillet=1.2 * mm, num_folds=9,
+    ), tip_radius=7.6 * mm)  # fmt: skip
+    thumb: Finger = Finger(bellows=Bellows(
+        outer_radius=9 * mm, inner_radius=5.6 * mm, pitch=8.4 * mm, fold_height=5 * mm,
+        wall_thickness=1.2 * mm, cap=2.5 * mm, fillet=1.2 * mm, num_folds=8,
+    ), tip_radius=7.8 * mm)  # fmt: skip
+    palm_width: Float[Array, ""] = eqx.field(converter=real, default=90 * mm)
+    palm_length: Float[Array, ""] = eqx.field(converter=real, default=114 * mm)
+    palm_thickness: Float[Array, ""] = eqx.field(converter=real, default=26 * mm)
+    palm_fillet: Float[Array, ""] = eqx.field(converter=real, default=8 * mm)
+    socket_depth: Float[Array, ""] = eqx.field(converter=real, default=14 * mm)
+    finger_spacing: Float[Array, ""] = eqx.field(converter=real, default=22.5 * mm)
+    splay: Float[Array, ""] = eqx.field(converter=real, default=2 * deg)
+    thumb_angle: Float[Array, ""] = eqx.field(converter=real, default=50 * deg)
+    thumb_height: Float[Array, ""] = eqx.field(converter=real, default=40 * mm)
+    port_radius: Float[Array, ""] = eqx.field(converter=real, default=1.5 * mm)
+
+    def __check_init__(self):
+        for name in ("palm_width", "palm_length", "palm_thickness", "finger_spacing"):
+            _check.between(
+                "Hand", name, getattr(self, name), 0.0, 1.0, "m",
+                "Lengths are in metres: write 90 * mm.",
+            )  # fmt: skip
+
+    def _placed(self, part: AbstractSdf, index: int) -> AbstractSdf:
+        """A part of finger `index` (0 to 3, 4: the thumb) where it belongs."""
+        lying = LaidAlong(part, 1)  # its spine, at -x while it stands, comes to -z
+        zero = jnp.zeros_like(self.palm_width)
+        if index == 4:
+            place = jnp.stack([self.palm_width / 2 - self.socket_depth, self.thumb_height, zero])
+            return translate(rotate(lying, -self.thumb_angle), place)
+        across = (index - 1.5) * self.finger_spacing
+        place = jnp.stack([across, self.palm_length - self.socket_depth, zero])
+        return translate(rotate(lying, -(index - 1.5) * self.splay), place)
+
+    def _each(self, finger_part: AbstractSdf, thumb_part: AbstractSdf) -> AbstractSdf:
+        parts = (*(4 * (finger_part,)), thumb_part)
+        return union(*(self._placed(part, i) for i, part in enumerate(parts)))
+
+    def fingers(self) -> AbstractSdf:
+        """The four fingers and the thumb without their hollows."""
+        return self._each(self.finger.solid(), self.thumb.solid())
+
+    def palm(self) -> AbstractSdf:
+        """The base that holds the fingers."""
+        x, z = self.palm_width / 2, self.palm_thickness / 2
+        zero = jnp.zeros_like(x)
+        return Box([-x, zero, -z], [x, self.palm_length, z], self.palm_fillet)
+
+    def _supply(self, finger: Finger) -> AbstractSdf:
+        """Chamber of an upright finger and its port, which leaves towards +x."""
+        foot = finger.bellows.cap + finger.bellows.pitch / 2
+        zero = jnp.zeros_like(foot)
+        port = pipe(self.port_radius, jnp.stack([zero, zero, foot]), self.palm_thickness, 0)
+        return finger.chamber() | port
+
+    def chambers(self) -> AbstractSdf:
+        """The air of all fingers with their ports."""
+        return self._each(self._supply(self.finger), self._supply(self.thumb))
+
+    def body(self) -> AbstractSdf:
+        """What is printed, in one piece."""
+        return (self.palm() | self.fingers()) - self.chambers()
+
