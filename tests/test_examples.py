@@ -32,6 +32,6 @@ def test_the_program_of_the_readme_prints_what_it_says(capsys):
     height, slope = re.findall(r"Array\(([-+.\de]+)", capsys.readouterr().out)
     said = re.search(r"# (-[\d.]+) mm, \+([\d.]+) mm per mm", program)
     assert said is not None
-    assert float(height) * 1e3 == pytest.approx(float(said[1]), abs=0.01)
-    assert float(slope) == pytest.approx(float(said[2]), abs=0.001)
+    assert float(height) * 1e3 == pytest.approx(float(said[1]), abs=0.05)
+    assert float(slope) == pytest.approx(float(said[2]), rel=0.02)
     assert len([line for line in program.splitlines() if line.strip()]) <= 15

@@ -1,6 +1,6 @@
 """PLY: vertices and triangles, binary or as text."""
 
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple, NoReturn
 
 import numpy as np
 
@@ -79,7 +79,7 @@ def read(data: bytes, where: str, unit: float) -> Surface:
     return soup.indexed(where, points, faces, unit)
 
 
-def _refuse(where: str, got: str) -> None:
+def _refuse(where: str, got: str) -> NoReturn:
     raise ValueError(
         f"{where}: {got}, need a whole PLY file of triangles. Export it again as a "
         "triangle mesh."

@@ -63,7 +63,9 @@ def export_contour(
     file = _files.inside(where, path, root)
     _ending(where, file.suffix, (".svg",))
     if not sum(len(curve.points) for curve in curves):
-        raise ValueError(f"{where}: no curves, need at least one. Pass sdf.contour(shape, size).")
+        raise ValueError(
+            f"{where}: no curves, need at least one. Pass sdf.contour(shape, size)."
+        )
     for curve in curves:
         _check.finite(where, "curves", curve.points, "Check the parameters of the shape.")
     _files.write(file, lambda stream: svg.write(stream, curves))

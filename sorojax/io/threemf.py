@@ -17,7 +17,8 @@ _TYPES = (
     'ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/></Types>'
 )
 _LINKS = (
-    _HEAD + '<Relationships xmlns="http://schemas.openxmlformats.org/package/2006/relationships">'
+    _HEAD
+    + '<Relationships xmlns="http://schemas.openxmlformats.org/package/2006/relationships">'
     '<Relationship Target="/3D/3dmodel.model" Id="rel0" '
     'Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relationships>'
 )
@@ -43,8 +44,6 @@ def write(file: BinaryIO, surface: Surface) -> None:
                 model, surface.vertices * 1e3, fmt='<vertex x="%.9g" y="%.9g" z="%.9g"/>'
             )
             model.write(b"</vertices>\n<triangles>\n")
-            np.savetxt(
-                model, surface.triangles, fmt='<triangle v1="%d" v2="%d" v3="%d"/>'
-            )
+            np.savetxt(model, surface.triangles, fmt='<triangle v1="%d" v2="%d" v3="%d"/>')
             model.write(_TAIL.encode())
             model.flush()

@@ -15,7 +15,7 @@ def check_resolved(
     Random points of the box are tested, so a wall that fills less than about a
     thousandth of it may pass.
     """
-    p = lower + (upper - lower) * np.random.default_rng(0).random((2 * CHUNK, len(lower)))
+    p = lower + (upper - lower) * np.random.default_rng(0).random((CHUNK, len(lower)))
     f = values(shape, p)
     if not np.all(np.isfinite(f)):
         raise ValueError(

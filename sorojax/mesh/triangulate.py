@@ -21,7 +21,7 @@ def triangulate(
     size: float | SizeFunction,
     order: int = 1,
     interfaces: tuple[AbstractSdf, ...] = (),
-    iterations: int = 8,
+    iterations: int = 6,
 ) -> Mesh:
     """Triangles that fill a plane shape.
 

@@ -47,7 +47,7 @@ class Finger(eqx.Module):
         half = self.spine_width / 2
         outside = -b.outer_radius - self.spine_thickness / 3
         spine = Box(
-            [outside, -half, zero], [outside + self.spine_thickness, half, b.length],
+            [outside, -half, zero], [outside + self.spine_thickness, half, b.length - b.cap - b.pitch / 2],
             self.spine_thickness / 4,
         )  # fmt: skip
         return b.solid() | tip | spine

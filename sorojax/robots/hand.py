@@ -7,8 +7,8 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._types import real
 from sorojax.robots.finger import Finger
-from sorojax.robots.parts import Bellows, LaidAlong, pipe
-from sorojax.sdf import AbstractSdf, Box, rotate, translate, union
+from sorojax.robots.parts import Bellows, LaidAlong, Placed, pipe
+from sorojax.sdf import AbstractSdf, Box, rotate, translate
 from sorojax.units import deg, mm
 
 
@@ -45,20 +45,18 @@ class Hand(eqx.Module):
                 "Lengths are in metres: write 90 * mm.",
             )  # fmt: skip
 
-    def _placed(self, part: AbstractSdf, index: int) -> AbstractSdf:
-        """A part of finger `index` (0 to 3, 4: the thumb) where it belongs."""
-        lying = LaidAlong(part, 1)  # its spine, at -x while it stands, comes to -z
-        zero = jnp.zeros_like(self.palm_width)
-        if index == 4:
-            place = jnp.stack([self.palm_width / 2 - self.socket_depth, self.thumb_height, zero])
-            return translate(rotate(lying, -self.thumb_angle), place)
-        across = (index - 1.5) * self.finger_spacing
-        place = jnp.stack([across, self.palm_length - self.socket_depth, zero])
-        return translate(rotate(lying, -(index - 1.5) * self.splay), place)
-
     def _each(self, finger_part: AbstractSdf, thumb_part: AbstractSdf) -> AbstractSdf:
-        parts = (*(4 * (finger_part,)), thumb_part)
-        return union(*(self._placed(part, i) for i, part in enumerate(parts)))
+        """Parts of a standing finger and thumb, where the five of them belong."""
+        number = jnp.arange(4).astype(self.palm_width.dtype) - 1.5
+        zero = jnp.zeros_like(number)
+        foot = zero + self.palm_length - self.socket_depth
+        places = jnp.stack([number * self.finger_spacing, foot, zero], axis=-1)
+        # Laid along y, the spine of a standing finger comes to lie at -z.
+        fingers = Placed(LaidAlong(finger_part, 1), -number * self.splay, places)
+        side = self.palm_width / 2 - self.socket_depth
+        place = jnp.stack([side, self.thumb_height, jnp.zeros_like(side)])
+        thumb = rotate(LaidAlong(thumb_part, 1), -self.thumb_angle)
+        return fingers | translate(thumb, place)
 
     def fingers(self) -> AbstractSdf:
         """The four fingers and the thumb without their hollows."""
@@ -84,4 +82,3 @@ class Hand(eqx.Module):
     def body(self) -> AbstractSdf:
         """What is printed, in one piece."""
         return (self.palm() | self.fingers()) - self.chambers()
-

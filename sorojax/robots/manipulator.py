@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._types import real
 from sorojax.robots.finger import Finger
-from sorojax.robots.parts import Bellows, pipe
-from sorojax.sdf import AbstractSdf, rotate, translate, union
+from sorojax.robots.parts import Bellows, Placed, pipe
+from sorojax.sdf import AbstractSdf, translate, union
 from sorojax.sdf.solids import Cylinder, Torus
 from sorojax.units import mm
 
@@ -57,9 +57,10 @@ class Manipulator(eqx.Module):
 
     def _around(self, part: AbstractSdf, distance, height, phase: float) -> AbstractSdf:
         """Three copies of `part`, moved outwards along x and up, then turned about z."""
-        zero = jnp.zeros_like(self.center_distance)
-        moved = translate(part, jnp.stack([zero + distance, zero, zero + height]))
-        return union(*(rotate(moved, phase + 2 * np.pi * k / 3) for k in range(3)))
+        angles = real(phase + 2 * np.pi / 3 * np.arange(3))
+        up = jnp.zeros_like(angles) + height
+        offsets = [distance * jnp.cos(angles), distance * jnp.sin(angles), up]
+        return Placed(part, angles, jnp.stack(offsets, axis=-1))
 
     def _bellows_air(self) -> AbstractSdf:
         b, t = self.bellows, self.plate_thickness

@@ -1,13 +1,25 @@
 """Parts that the printable robots share: round bellows, and shapes laid along an axis."""
 
+import functools
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import real
-from sorojax.sdf import AbstractSdf, Rectangle, SmoothUnion, offset, repeat, translate
+from sorojax.sdf import (
+    AbstractSdf,
+    Rectangle,
+    SmoothUnion,
+    offset,
+    repeat,
+    rotate,
+    translate,
+)
+from sorojax.sdf.combine import hull
 from sorojax.sdf.lift import revolve
+from sorojax.sdf.scalar import minimum
 from sorojax.sdf.solids import Cylinder
 from sorojax.sdf.transform import AbstractWrapped
 from sorojax.units import mm
@@ -88,6 +100,33 @@ class LaidAlong(AbstractWrapped):
     def level_box(self, level):
         lower, upper = self.shape.level_box(level)
         return jnp.roll(lower, self.axis + 1), jnp.roll(upper, self.axis + 1)
+
+
+class Placed(AbstractWrapped):
+    """Copies of `shape`, each turned about z by an angle [rad] and then moved [m].
+
+    One evaluation over a leading axis: the program stays as small as one copy.
+    """
+
+    shape: AbstractSdf
+    angles: Float[Array, " copies"] = eqx.field(converter=real)
+    offsets: Float[Array, "copies 3"] = eqx.field(converter=real)
+
+    def distance(self, x, y, z):
+        wide = (-1,) + (1,) * x.ndim
+        c, s = jnp.cos(self.angles).reshape(wide), jnp.sin(self.angles).reshape(wide)
+        dx, dy, dz = (
+            a[None] - self.offsets[:, i].reshape(wide) for i, a in enumerate((x, y, z))
+        )
+        copies = self.shape.distance(c * dx + s * dy, c * dy - s * dx, dz)
+        return functools.reduce(minimum, (copies[k] for k in range(len(self.angles))))
+
+    def level_box(self, level):
+        copies = [
+            translate(rotate(self.shape, a), o).level_box(level)
+            for a, o in zip(self.angles, self.offsets, strict=True)
+        ]
+        return hull(copies, jnp.minimum, jnp.maximum)
 
 
 def pipe(radius, start, length, axis: int) -> AbstractSdf:

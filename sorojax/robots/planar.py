@@ -6,8 +6,8 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import real
-from sorojax.robots.parts import Bellows, pipe
-from sorojax.sdf import AbstractSdf, Box, translate, union
+from sorojax.robots.parts import Bellows, Placed, pipe
+from sorojax.sdf import AbstractSdf, Box
 from sorojax.units import mm
 
 
@@ -38,16 +38,17 @@ class PlanarActuator(eqx.Module):
                     "gap. Make `spacing` larger than two outer radii."
                 )
 
-    def _at(self, part: AbstractSdf, side: int) -> AbstractSdf:
-        zero = jnp.zeros_like(self.spacing)
-        return translate(part, jnp.stack([side * self.spacing / 2, zero, zero]))
+    def _both(self, part: AbstractSdf) -> AbstractSdf:
+        sides = jnp.stack([-self.spacing / 2, self.spacing / 2])
+        zero = jnp.zeros_like(sides)
+        return Placed(part, zero, jnp.stack([sides, zero, zero], axis=-1))
 
     def chambers(self) -> AbstractSdf:
         """The air of both bellows with their ports."""
         b, zero = self.bellows, jnp.zeros_like(self.spacing)
         start = jnp.stack([zero, zero, -2 * self.plate_thickness])
         port = pipe(self.port_radius, start, 2 * self.plate_thickness + b.cap + b.pitch / 2, 2)
-        return union(*(self._at(part, side) for part in (b.chamber(), port) for side in (-1, 1)))
+        return self._both(b.chamber() | port)
 
     def plates(self) -> AbstractSdf:
         """The two end plates, each overlapping half a cap."""
@@ -60,5 +61,4 @@ class PlanarActuator(eqx.Module):
 
     def body(self) -> AbstractSdf:
         """What is printed."""
-        tubes = union(*(self._at(self.bellows.solid(), side) for side in (-1, 1)))
-        return (tubes | self.plates()) - self.chambers()
+        return (self._both(self.bellows.solid()) | self.plates()) - self.chambers()

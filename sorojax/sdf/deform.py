@@ -198,9 +198,11 @@ class Bent(AbstractWrapped):
         # No point moves further from the origin than the bar reaches along and across.
         far = jnp.maximum(jnp.abs(lower), jnp.abs(upper))
         reach = (far[0] + far[1])[None].repeat(2)
-        return (
-            jnp.concatenate([-reach, lower[2:]]), jnp.concatenate([reach, upper[2:]])
-        )  # fmt: skip
+        box = jnp.concatenate([-reach, lower[2:]]), jnp.concatenate([reach, upper[2:]])
+        # Around the centre of the bend the field stays low everywhere.
+        open_ = level >= self._inner() / jnp.maximum(jnp.abs(self.bend), 1e-9) / 2
+        infinity = jnp.full_like(lower, jnp.inf)
+        return jnp.where(open_, -infinity, box[0]), jnp.where(open_, infinity, box[1])
 
 
 def _arc(x: Array, near: Array, across: Array, k: Array) -> Array:

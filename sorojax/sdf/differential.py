@@ -111,7 +111,7 @@ def _newton(shape, p, x, m):
     dim = x.shape[1]
     f, g = value_and_gradient(shape, x)
     held, slope = jax.lax.stop_gradient((shape, g))
-    block = jnp.eye(dim, dtype=x.dtype) + m[:, None, None] * hessian(held, x)
+    block = jnp.eye(dim, dtype=x.dtype)[None] + m[:, None, None] * hessian(held, x)
     top = jnp.concatenate([block, slope[:, :, None]], axis=2)
     bottom = jnp.concatenate([slope, jnp.zeros_like(f)[:, None]], axis=1)
     matrix = jnp.concatenate([top, bottom[:, None, :]], axis=1)

@@ -40,8 +40,8 @@ def dual_contouring(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [m] at least `margin` cells inside their cells; outward triangles."""
     found = _crossings(shape, grid, blocks)
-    quads, owner = _quads(grid, found)
-    vertices = place(found.points, found.normals, quads, len(owner))
+    quads, owner, alone = _quads(grid, found)
+    vertices = place(found.points, found.normals, quads, alone)
     for start in range(0, len(owner), _PIECE):
         piece = slice(start, start + _PIECE)
         low = grid.node(owner[piece]) + margin
@@ -97,13 +97,19 @@ def _hermite(shape, grid, nodes, step, a, b) -> tuple[np.ndarray, np.ndarray]:
         span = np.where(a == b, 1.0, a - b)
         t = np.clip(low + (high - low) * a / span, low, high)
     points = nodes + t[:, None] * step
-    slope = values_and_gradients(shape, grid.points(points))[1]
-    length = np.sqrt((slope * slope).sum(axis=1, keepdims=True))
-    return points, (slope / np.maximum(length, 1e-12)).astype(np.float32)
+    f, slope = values_and_gradients(shape, grid.points(points))
+    length = np.maximum(np.sqrt((slope * slope).sum(axis=1, keepdims=True)), 1e-12)
+    normals = slope / length
+    # What regula falsi leaves, where the field has a kink on the edge, Newton takes away.
+    move = np.minimum(np.abs(f[:, None]) / length / grid.size, 0.5)
+    return points - np.copysign(move, f[:, None]) * normals, normals.astype(np.float32)
 
 
-def _quads(grid: Grid, found: _Crossings) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 4) around every crossed edge, seen from outside; cell of each vertex."""
+def _quads(grid: Grid, found: _Crossings) -> tuple[np.ndarray, ...]:
+    """Vertices (n, 4) around every crossed edge, seen from outside.
+
+    Also the cell of each vertex, and whether that cell has no other one.
+    """
     wide = grid.counts + 1
     stride = np.array([wide[1] * wide[2], wide[2], 1])
     sheet = cell_sheets(found.code, found.cell, stride)
@@ -123,7 +129,7 @@ def _quads(grid: Grid, found: _Crossings) -> tuple[np.ndarray, np.ndarray]:
         edge = 4 * found.axis + np.int8(d + 2 * e)
         column = np.where(found.start_inside, k, 3 - k)
         quads[np.arange(len(quads)), column] = first[cell] + sheet[cell, edge]
-    return quads, np.repeat(found.cell, number)
+    return quads, np.repeat(found.cell, number), np.repeat(number == 1, number)
 
 
 def _triangles(vertices, quads, found) -> np.ndarray:

@@ -9,28 +9,33 @@ _ROWS, _COLUMNS = np.triu_indices(3)
 
 
 def place(
-    points: np.ndarray, normals: np.ndarray, quads: np.ndarray, count: int
+    points: np.ndarray, normals: np.ndarray, quads: np.ndarray, alone: np.ndarray
 ) -> np.ndarray:
-    """Vertices (count, 3) nearest to the planes of the crossings that `quads` give them.
+    """Vertices (n, 3) nearest to the planes of the crossings that `quads` give them.
 
     Directions that no plane fixes keep the mean of the crossings. Repeated steps of a
     damped problem leave no trace of the damping where planes meet at an edge or corner.
+    Vertices that are not `alone` in their cell stay at the mean, which keeps them apart.
     """
+    count = len(alone)
     corners = [np.ascontiguousarray(quads[:, k]) for k in range(4)]
 
     def gather(weight):
-        return sum(np.bincount(corner, weight, count) for corner in corners)
+        found = np.bincount(corners[0], weight, count)
+        for corner in corners[1:]:
+            found += np.bincount(corner, weight, count)
+        return found
 
     number = gather(np.ones(len(points)))
     mean = np.stack([gather(points[:, i]) for i in range(3)], axis=-1) / number[:, None]
-    # Levels about the middle of the grid lose no digits, as everything is in cells.
     level = (normals * points).sum(axis=1)
     right = np.stack([gather(normals[:, i] * level) for i in range(3)], axis=-1)
     pairs = zip(_ROWS, _COLUMNS, strict=True)
     square = np.stack([gather(normals[:, i] * normals[:, j]) for i, j in pairs], axis=-1)
     for start in range(0, count, _PIECE):
         piece = slice(start, start + _PIECE)
-        mean[piece] = _nearest(mean[piece], square[piece], right[piece], number[piece])
+        near = _nearest(mean[piece], square[piece], right[piece], number[piece])
+        mean[piece] = np.where(alone[piece, None], near, mean[piece])
     return mean
 
 

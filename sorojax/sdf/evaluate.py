@@ -3,7 +3,6 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-
 from jaxtyping import Array, Float
 
 from sorojax._types import real
@@ -38,14 +37,15 @@ def _blocks(kernel, shape: AbstractSdf, points):
             "Reshape them to one row per point."
         )
     count = len(points)
-    if count == min(_padded(count), LARGEST):
+    if count and count == min(_padded(count), LARGEST):
         return kernel(shape, points)
     found = []
     for start in range(0, count, LARGEST):
         piece = points[start : start + LARGEST]
         rows = _padded(len(piece))
         filled = jnp.pad(piece, ((0, rows - len(piece)), (0, 0)), mode="edge")
-        found.append(jax.tree.map(lambda a, n=len(piece): a[:n], kernel(shape, filled)))
+        result, true = kernel(shape, filled), len(piece)
+        found.append(jax.tree.map(lambda a, true=true: a[:true], result))
     if not found:
         return jax.tree.map(
             lambda a: a[:0], kernel(shape, jnp.zeros_like(points, shape=(1, shape.dim)))
@@ -68,12 +68,11 @@ def _value_and_normal(shape: AbstractSdf, points):
     count = len(points)
     chunk = min(_CHUNK, count)
 
-    def one(x):
-        f, slopes = value_and_gradient_at(shape, x)
-        length = norm(*slopes)
-        return f, tuple(quotient(s, length) for s in slopes)
-
     # Apart, the coordinates are contiguous, which is what makes the loops fast.
-    x = tuple(a.reshape(-1, chunk) for a in jax.lax.optimization_barrier(tuple(points.T)))
-    f, normals = jax.lax.optimization_barrier(jax.lax.map(one, x))
-    return f.reshape(count), jnp.stack([n.reshape(count) for n in normals], axis=-1)
+    x = tuple(points[:, i].reshape(-1, chunk) for i in range(shape.dim))
+    x = jax.lax.optimization_barrier(x)
+    f, slopes = jax.lax.map(lambda x: value_and_gradient_at(shape, x), x)
+    # In a loop of its own: fused with others, each component would repeat all the work.
+    scale = jax.lax.map(lambda g: quotient(jnp.ones_like(g[0]), norm(*g)), slopes)
+    normals = jnp.stack([(g * scale).reshape(count) for g in slopes], axis=-1)
+    return f.reshape(count), normals

@@ -86,9 +86,9 @@ def _extract(volume: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _flying_edges(volume: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
-    from vtkmodules.vtkCommonDataModel import vtkImageData
-    from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D
+    from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy  # type: ignore
+    from vtkmodules.vtkCommonDataModel import vtkImageData  # type: ignore
+    from vtkmodules.vtkFiltersCore import vtkFlyingEdges3D  # type: ignore
 
     image = vtkImageData()
     image.SetDimensions(*volume.shape)

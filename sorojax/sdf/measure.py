@@ -116,7 +116,8 @@ def _cut_cells(shape, centers, cell):
     cut = line > 0
     points = (centers + middle)[cut]
     # Of a cell this small the part counts as a point for its second moments.
-    middle = moments / np.maximum(part, 1e-300)[:, None]
+    some = (part > 1e-9 * cell**2)[:, None]
+    middle = np.where(some, moments / np.where(some, part[:, None], 1.0), centers)
     total = (part[:, None] * _monomials(middle)).sum(axis=0)
     total[1:3] = moments.sum(axis=0)
     return total, points, (line / slope)[cut]

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float, Int
 
 from sorojax import _check
 from sorojax._types import integers, real
-from sorojax.sdf.base import Box as Bounds, check_lengths
 from sorojax.sdf.bars import segment_square
+from sorojax.sdf.base import Box as Bounds, check_lengths
 from sorojax.sdf.nearest import scan_rows, take
 from sorojax.sdf.scalar import absolute, maximum, minimum, quotient, root
 from sorojax.sdf.shapes3d import AbstractSolidShape

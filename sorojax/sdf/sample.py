@@ -1,17 +1,29 @@
 """Fields sampled on the host: two compiled kernels of fixed size per kind of shape."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sorojax._types import is_traced
-from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.query import value_and_gradient
+from sorojax.sdf.base import AbstractSdf, cast
 
 CHUNK = 4096  # fits the cache, and one size means one compilation
 
 _value = eqx.filter_jit(lambda shape, p: shape(p))
-_value_and_gradient = eqx.filter_jit(value_and_gradient)
+
+
+@eqx.filter_jit
+def _value_and_gradient(shape, p):
+    """As `query.value_and_gradient`, as one pass over three directions: compiles faster."""
+    shape = cast(shape, p.dtype)
+    x = tuple(p[:, i] for i in range(shape.dim))
+
+    def pushed(direction):
+        along = tuple(jnp.broadcast_to(d, c.shape) for d, c in zip(direction, x, strict=True))
+        return jax.jvp(shape.distance, x, along)
+
+    return jax.vmap(pushed, out_axes=(None, 1))(jnp.eye(shape.dim, dtype=p.dtype))
 
 
 def _chunks(points: np.ndarray):

@@ -70,7 +70,8 @@ class Sampled(AbstractSdf):
 
     def distance(self, *x):
         place = tuple((c - self.origin[i]) / self.spacing for i, c in enumerate(x))
-        held = (clip(c, 0.0, n - 1.0) for c, n in zip(place, self.values.shape, strict=True))
+        last = [float(n - 1) for n in jnp.shape(self.values)]
+        held = (clip(c, 0.0, end) for c, end in zip(place, last, strict=True))
         beyond = norm(*(c - h for c, h in zip(place, held, strict=True)))
         return interpolate(self.values, place) + self.spacing * beyond
 

@@ -63,8 +63,10 @@ def box_distance(*excess: Scalar) -> Scalar:
     return inner + norm(*(positive_part(e) for e in excess))
 
 
-def segment_side(x: Scalar, y: Scalar, a: Scalar, b: Scalar) -> Scalar:
-    """Distance to the segment from a to b, (2,) each, negative on its right side.
+def segment_side(
+    x: Scalar, y: Scalar, a: tuple[Scalar, Scalar], b: tuple[Scalar, Scalar]
+) -> Scalar:
+    """Distance to the segment from a to b, negative on its right side.
 
     Beside the segment it is the distance to its line, which has a slope on the segment.
     """

@@ -51,15 +51,26 @@ def integrate(six: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray
     points, areas = [], []
     for s, t, weight in _RULE:
         r = 1 - s - t
-        value = (r * (2 * r - 1), s * (2 * s - 1), t * (2 * t - 1), 4 * r * s, 4 * s * t, 4 * t * r)
+        value = (
+            r * (2 * r - 1),
+            s * (2 * s - 1),
+            t * (2 * t - 1),
+            4 * r * s,
+            4 * s * t,
+            4 * t * r,
+        )
         along_s = (1 - 4 * r, 4 * s - 1, 0.0, 4 * (r - s), 4 * t, -4 * t)
         along_t = (1 - 4 * r, 0.0, 4 * t - 1, -4 * s, 4 * s, 4 * (r - t))
-        x, xs, xt = (
-            sum(c * node for c, node in zip(row, six, strict=True))
-            for row in (value, along_s, along_t)
-        )
+        x, xs, xt = (_blend(row, six) for row in (value, along_s, along_t))
         vector = weight / 2 * np.cross(xs, xt)
         total += monomials(x) @ (x * vector).sum(axis=1) / (_DEGREE + 3)
         points.append(x)
         areas.append(np.sqrt((vector * vector).sum(axis=1)))
     return total, np.concatenate(points), np.concatenate(areas)
+
+
+def _blend(weights, six: list[np.ndarray]) -> np.ndarray:
+    found = weights[0] * six[0]
+    for weight, node in zip(weights[1:], six[1:], strict=True):
+        found = found + weight * node
+    return found

@@ -97,8 +97,7 @@ def _integrate(
     if not _has_edges(shape, surface):
         return _about_origin(nodes(surface, shape), middle)
     coarse, fine = (
-        _about_origin(nodes(_with_corners(shape, h)), middle)
-        for h in (2 * size, size)
+        _about_origin(nodes(_with_corners(shape, h)), middle) for h in (2 * size, size)
     )
     # The error is of second order in the cell: one extrapolation takes most of it away.
     return (

@@ -53,7 +53,9 @@ def surface_report(surface: Surface) -> SurfaceReport:
     """
     vertices, triangles = _checked(surface)
     t = triangles
-    degenerate = np.flatnonzero((t[:, 0] == t[:, 1]) | (t[:, 1] == t[:, 2]) | (t[:, 2] == t[:, 0]))
+    degenerate = np.flatnonzero(
+        (t[:, 0] == t[:, 1]) | (t[:, 1] == t[:, 2]) | (t[:, 2] == t[:, 0])
+    )
     half = np.stack([t, np.roll(t, -1, axis=1)], axis=-1).reshape(-1, 2)
     ordered = np.sort(half, axis=1)
     name = ordered[:, 0] * max(len(vertices), 1) + ordered[:, 1]

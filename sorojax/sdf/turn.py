@@ -45,8 +45,7 @@ class Turned(AbstractWrapped):
         r = self._matrix()
         d = tuple(c - self.center[i] for i, c in enumerate(x))
         local = (
-            self.center[j] + r[0, j] * d[0] + r[1, j] * d[1] + r[2, j] * d[2]
-            for j in range(3)
+            self.center[j] + r[0, j] * d[0] + r[1, j] * d[1] + r[2, j] * d[2] for j in range(3)
         )
         return self.shape.distance(*local)
 

@@ -1,0 +1,171 @@
+"""Surface files: there and back, and files that are not what they say."""
+
+import json
+import os
+import xml.etree.ElementTree as xml
+import zipfile
+
+import numpy as np
+import pytest
+
+from sorojax import io, sdf
+from sorojax.units import mm
+
+BOX = sdf.isosurface(
+    sdf.Box([0, 0, 0], [30 * mm, 20 * mm, 10 * mm]), 2.3 * mm, "dual_contouring"
+)
+HEAD = b"x" * 80
+KINDS = [("a.stl", False), ("a.stl", True), ("a.obj", False), ("a.ply", False), ("a.ply", True)]
+
+
+@pytest.mark.parametrize("name, text", KINDS)
+@pytest.mark.parametrize("unit", [mm, 1.0])
+def test_surfaces_come_back(tmp_path, name, text, unit):
+    io.export_surface(tmp_path / name, BOX, text=text, unit=unit)
+    back = io.import_surface(tmp_path / name, unit=unit)
+    report = sdf.surface_report(back)
+    assert report.manifold and len(back.triangles) == len(BOX.triangles)
+    assert abs(report.volume / sdf.surface_report(BOX).volume - 1) < 1e-6
+    assert os.listdir(tmp_path) == [name]  # no temporary file stays
+
+
+def test_stl_is_in_millimetres(tmp_path):
+    io.export_surface(tmp_path / "a.stl", BOX)
+    metres = io.import_surface(tmp_path / "a.stl", unit=1.0)
+    assert np.allclose(np.ptp(metres.vertices, axis=0), [30, 20, 10], atol=0.01)
+
+
+def test_3mf_and_glb_hold_what_they_declare(tmp_path):
+    io.export_surface(tmp_path / "a.3mf", BOX)
+    with zipfile.ZipFile(tmp_path / "a.3mf") as package:
+        model = xml.fromstring(package.read("3D/3dmodel.model"))
+    space = "{http://schemas.microsoft.com/3dmanufacturing/core/2015/02}"
+    assert model.get("unit") == "millimeter"
+    assert len(list(model.iter(space + "vertex"))) == len(BOX.vertices)
+    assert len(list(model.iter(space + "triangle"))) == len(BOX.triangles)
+    io.export_surface(tmp_path / "a.glb", BOX)
+    data = (tmp_path / "a.glb").read_bytes()
+    magic, version, length, chunk = np.frombuffer(data, "<u4", 4)
+    assert (magic, version, length) == (0x46546C67, 2, len(data))
+    scene = json.loads(data[20 : 20 + chunk])
+    assert scene["accessors"][1]["count"] == BOX.triangles.size
+
+
+def test_contours_become_svg(tmp_path):
+    ring = sdf.Circle([0, 0], 10 * mm) - sdf.Circle([0, 0], 5 * mm)
+    io.export_contour(tmp_path / "a.svg", sdf.contour(ring, 1 * mm))
+    picture = xml.parse(tmp_path / "a.svg").getroot()
+    (path,) = list(picture)
+    assert path.get("d", "").count("Z") == 2
+    assert float(picture.get("width", "0mm")[:-2]) == pytest.approx(20, abs=0.2)
+
+
+def stl(*corners, count=None):
+    """Bytes of a binary STL."""
+    body = b"".join(
+        np.zeros(3, "<f4").tobytes() + np.array(c, "<f4").tobytes() + b"\0\0" for c in corners
+    )
+    return HEAD + np.uint32(len(corners) if count is None else count).tobytes() + body
+
+
+TRIANGLE = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+TEXT = b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
+END = b"endloop\nendfacet\nendsolid a\n"
+PLY = b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+FACES = b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+BAD = {
+    "declares 4294967295": ("a.stl", stl(TRIANGLE, count=2**32 - 1) + b"\0" * 900),
+    "web page": ("a.stl", b"<!DOCTYPE html><html><body>404 not found</body></html>" * 9),
+    "truncated": ("b.stl", stl(TRIANGLE, TRIANGLE)[:-30]),
+    "text STL has 1 facets, 0": ("c.stl", TEXT),
+    "no number": ("d.stl", TEXT.replace(b"vertex 0 1 0", b"vertex 0 one 0") + END),
+    "finite coordinates": ("e.stl", stl([[0, 0, np.nan], [1, 0, 0], [0, 1, 0]])),
+    "vertex .* is .*1.*e\\+30": ("f.stl", stl([[0, 0, 1e30], [1, 0, 0], [0, 1, 0]])),
+    "finite coordinates below": ("g.stl", TEXT.replace(b"1 0 0", b"nan 0 0") + END),
+    "holds no triangle": ("h.stl", stl()),
+    "truncated or no STL": ("i.stl", b""),
+    "uses vertices": ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n"),
+    "line 4": ("b.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 2147483648\n"),
+    "line 1": ("c.obj", b"v 0 zero 0\n"),
+    "no x, y and z": ("a.ply", PLY.replace(b"ascii", b"binary_little_endian") + FACES),
+    "are left": (
+        "b.ply",
+        PLY.replace(b"ascii", b"binary_little_endian").replace(b"x 3", b"x 4000000000")
+        + b"property float z\n" + FACES,
+    ),
+    "rows of `vertex`": ("c.ply", PLY + b"property float z\n" + FACES.replace(b"1", b"9", 1)),
+    "begins with": ("d.ply", b"GIF89a"),
+    "header says": ("e.ply", PLY + b"property quaternion q\n" + FACES),
+    "ends in": ("a.step", b"ISO-10303-21;"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_bad_files_name_the_remedy(tmp_path, message):
+    name, data = BAD[message]
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(ValueError, match=message) as caught:
+        io.import_surface(tmp_path / name)
+    assert str(caught.value).startswith("import_surface")
+
+
+def test_text_and_binary_are_told_apart_by_length(tmp_path):
+    binary = b"solid facet ".ljust(80) + stl(TRIANGLE)[80:]
+    (tmp_path / "a.stl").write_bytes(binary)
+    assert len(io.import_surface(tmp_path / "a.stl").triangles) == 1
+    (tmp_path / "b.stl").write_bytes(b"\n  SOLID" + TEXT[5:].upper() + END)
+    assert len(io.import_surface(tmp_path / "b.stl").triangles) == 1
+
+
+def test_large_files_are_refused_unread(tmp_path):
+    path = tmp_path / "a.stl"
+    with open(path, "wb") as file:
+        file.truncate(10_000_000_000)
+    with pytest.raises(ValueError, match="10000000000 bytes"):
+        io.import_surface(path)
+
+
+def test_paths_stay_below_their_root(tmp_path):
+    root, outside = tmp_path / "root", tmp_path / "outside"
+    root.mkdir(), outside.mkdir()
+    io.export_surface(outside / "secret.stl", BOX)
+    (root / "link.stl").symlink_to(outside / "secret.stl")
+    (root / "folder").symlink_to(outside)
+    wanted = [
+        "../outside/secret.stl",
+        str(outside / "secret.stl"),
+        "link.stl",
+        "folder/new.stl",
+    ]
+    for path in wanted:
+        with pytest.raises(ValueError, match="leads to"):
+            io.import_surface(path, root=root)
+        with pytest.raises(ValueError, match="leads to"):
+            io.export_surface(path, BOX, root=root)
+    io.export_surface("mine.stl", BOX, root=root)
+    assert len(io.import_surface("mine.stl", root=root).triangles) == len(BOX.triangles)
+    assert os.listdir(outside) == ["secret.stl"]
+
+
+def test_a_failed_export_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "a.stl"
+    io.export_surface(path, BOX)
+    before = path.read_bytes()
+    monkeypatch.setattr("sorojax.io.stl._pieces", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        io.export_surface(path, BOX)
+    assert path.read_bytes() == before and os.listdir(tmp_path) == ["a.stl"]
+
+
+def test_bad_surfaces_are_not_written(tmp_path):
+    cases = {
+        "no triangle": sdf.Surface(np.zeros((0, 3)), np.zeros((0, 3), int)),
+        "use vertices": sdf.Surface(np.zeros((3, 3)), np.array([[0, 1, 3]])),
+        "finite": sdf.Surface(np.full((3, 3), np.nan), np.array([[0, 1, 2]])),
+    }
+    for message, surface in cases.items():
+        with pytest.raises(ValueError, match=message):
+            io.export_surface(tmp_path / "a.stl", surface)
+    with pytest.raises(ValueError, match="export_contour"):
+        io.export_surface(tmp_path / "a.svg", BOX)
+    assert os.listdir(tmp_path) == []

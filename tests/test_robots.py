@@ -1,0 +1,77 @@
+"""Printable robots: files that read back watertight, chambers inside, sane dimensions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sorojax import io, robots, sdf
+from sorojax.units import mm
+
+EXTENTS = {  # mm
+    robots.BendingActuator: (80, 20, 18),
+    robots.PlanarActuator: (50, 24, 67),
+    robots.Hand: (141, 190, 26),
+    robots.Manipulator: (74, 74, 140),
+}
+
+
+@pytest.mark.parametrize("kind", EXTENTS)
+def test_bodies_read_back_watertight(kind, tmp_path):
+    body = kind().body()
+    for method in ("marching_cubes", "dual_contouring"):
+        surface = sdf.isosurface(body, 1.2 * mm, method)
+        io.export_surface(tmp_path / "body.stl", surface)
+        back = io.import_surface(tmp_path / "body.stl")
+        report = sdf.surface_report(back)
+        assert report.watertight, (method, report)
+        assert len(back.triangles) == len(surface.triangles)
+        extent = np.ptp(back.vertices, axis=0) / mm
+        assert np.allclose(extent, EXTENTS[kind], rtol=0, atol=1.0)
+
+
+@pytest.mark.parametrize("kind", EXTENTS)
+def test_walls_are_as_thick_as_asked(kind, getkey):
+    """Nowhere in a chamber is the outside of the robot nearer than the thinnest wall."""
+    robot = kind()
+    air, body = robot.chambers(), robot.body()
+    lower, upper = (np.asarray(corner) for corner in body.bounding_box())
+    p = jax.random.uniform(getkey(), (20000, 3), minval=lower, maxval=upper)
+    inside, solid = (np.asarray(jax.jit(shape)(p)) for shape in (air, body))
+    assert (inside < 0).any() and (solid < 0).any()
+    assert not np.any((inside < -1e-9) & (solid < -1e-9))
+
+
+def test_bellows_wall():
+    part = robots.Bellows()
+    z = part.cap + part.pitch * (0.5 + jnp.arange(3))
+    crest = jnp.stack([0 * z + part.outer_radius, 0 * z, z], axis=-1)
+    assert jnp.allclose(part.solid()(crest), 0, atol=1e-9)
+    assert jnp.allclose(part.chamber()(crest), part.wall_thickness, atol=1e-9)
+
+
+def test_volume_follows_a_dimension():
+    def volume(wall):
+        return sdf.volume(robots.BendingActuator(wall_thickness=wall).body(), 48)
+
+    slope = jax.grad(volume)(jnp.array(1.6 * mm))
+    step = 0.1 * mm
+    difference = (volume(jnp.array(1.6 * mm + step)) - volume(jnp.array(1.6 * mm - step))) / (
+        2 * step
+    )
+    assert abs(float(slope / difference) - 1) < 0.1
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: robots.BendingActuator(wall_thickness=4.5 * mm), "chambers are"),
+        (lambda: robots.BendingActuator(width=20.0), "2 \\* mm"),
+        (lambda: robots.PlanarActuator(spacing=20 * mm), "overlap"),
+        (lambda: robots.Manipulator(center_distance=14 * mm), "overlap"),
+        (lambda: robots.Bellows(fold_height=2 * mm), "two walls"),
+    ],
+)
+def test_bad_dimensions_name_the_remedy(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

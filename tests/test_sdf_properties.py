@@ -1,0 +1,181 @@
+"""Random trees of operators keep their promises; queries, sampling and bad input."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings, strategies as st
+
+from sorojax import sdf
+
+POINTS = np.random.default_rng(3).uniform(-2, 2, (256, 2))
+number = st.floats(-0.8, 0.8).map(lambda v: round(v, 3))
+length = st.floats(0.2, 0.9).map(lambda v: round(v, 3))
+point = st.tuples(number, number).map(list)
+LEAVES = st.one_of(
+    st.builds(sdf.Circle, point, length),
+    st.builds(lambda p, a, b: sdf.Rectangle(p, [p[0] + a, p[1] + b]), point, length, length),
+    st.builds(lambda p, r, n: sdf.translate(sdf.Star(r, r / 2, n), p), point, length,
+              st.integers(3, 6)),
+)  # fmt: skip
+
+
+def grow(parts):
+    two = st.tuples(parts, parts)
+    return st.one_of(
+        two.map(lambda s: s[0] | s[1]), two.map(lambda s: s[0] & s[1]),
+        two.map(lambda s: s[0] - s[1]),
+        st.builds(lambda s, k: sdf.SmoothUnion(*s, k, sdf.Cubic()), two, length),
+        st.builds(lambda s, k: sdf.SmoothDifference(*s, k), two, length),
+        st.builds(lambda s, k: sdf.SmoothUnion(*s, k, sdf.Chamfer()), two, length),
+        st.builds(sdf.rotate, parts, number, point), st.builds(sdf.offset, parts, length),
+        st.builds(lambda s, t: sdf.shell(s, t / 4), parts, length),
+        st.builds(lambda s, a, b: sdf.stretch(s, [2 * a, 2 * b]), parts, length, length),
+        st.builds(sdf.scale, parts, length), st.builds(lambda s: sdf.mirror(s, [1, 2]), parts),
+        st.builds(lambda s: sdf.polar_repeat(s, 3), parts),
+    )  # fmt: skip
+
+
+TREES = st.recursive(LEAVES, grow, max_leaves=3)
+
+
+@settings(
+    max_examples=12, deadline=None, derandomize=True, database=None,
+    suppress_health_check=list(HealthCheck),
+)  # fmt: skip
+@given(TREES)
+def test_random_trees_keep_their_promises(shape):
+    p = jnp.asarray(POINTS)
+    f, g = jax.tree.map(np.asarray, eqx.filter_jit(sdf.query.value_and_gradient)(shape, p))
+    assert np.isfinite(f).all() and np.isfinite(g).all()
+    assert (np.linalg.norm(g, axis=1) <= shape.lipschitz * (1 + 1e-9)).all()
+    # Two points of different sign have surface between them, and so has any third.
+    gap = np.linalg.norm(POINTS[:, None] - POINTS, axis=2)
+    opposite = (f[:, None] < 0) != (f < 0)
+    reach = np.where(opposite, gap, np.inf).min(axis=1)
+    assert (np.abs(f) <= shape.lipschitz * reach + 1e-12).all()
+    assert (np.abs(f[:, None] - f) <= shape.lipschitz * gap * (1 + 1e-9) + 1e-12).all()
+    lower, upper = map(np.asarray, shape.bounding_box())
+    inside = POINTS[f < 0]
+    assert (inside >= lower - 1e-12).all() and (inside <= upper + 1e-12).all()
+
+
+@settings(max_examples=10, deadline=None, derandomize=True, database=None)
+@given(point, number, length)
+def test_transforms_commute_with_evaluation(shift, angle, factor):
+    star, p = sdf.Star(0.9, 0.4, 5), jnp.asarray(POINTS)
+    c, s = np.cos(angle), np.sin(angle)
+    turn = jnp.array([[c, -s], [s, c]])
+    moved = sdf.translate(sdf.rotate(sdf.scale(star, factor), angle), shift)
+    image = factor * p @ turn.T + jnp.array([shift])
+    assert jnp.allclose(moved(image), factor * star(p), rtol=0, atol=1e-12)
+
+
+def test_values_that_are_known():
+    assert jnp.allclose(sdf.Box([-1] * 3, [1] * 3)(jnp.array([2.0, 2, 1])), 2**0.5)
+    balls = [sdf.Sphere([c, 0, 0], 1) for c in (0, 1.2)]
+    both, either = balls[0] & balls[1], balls[0] | balls[1]
+    assert jnp.allclose(either(jnp.array([0.6, 0.3, 0])), -0.329179607)
+    assert jnp.allclose(both(jnp.array([0.6, 1.2, 0])), 0.341640786)
+    assert either.exactness == (True, False) and both.exactness == (False, True)
+    blends = (sdf.Quadratic(), sdf.Cubic(), sdf.Circular(), sdf.Exponential(), sdf.Chamfer())
+    for blend in blends:
+        equal = jnp.array(0.1)
+        sharp = equal * 2**0.5 if isinstance(blend, sdf.Chamfer) else equal
+        assert jnp.allclose(blend(equal, equal, 0.3), sharp - 0.3 * blend.dip)
+
+
+def test_second_moments_have_closed_forms_and_derivatives():
+    square = sdf.rotate(sdf.Rectangle([-1, -1], [1, 1]), np.pi / 4)
+    plate = sdf.translate(square - sdf.Circle([0, 0], 0.5), [0.3, -0.2])
+    assert jnp.allclose(jnp.trace(sdf.second_moments(plate)), 2.568491896, rtol=1e-6)
+    slope = jax.grad(lambda r: jnp.trace(sdf.second_moments(sdf.Circle([1, 0], r))))(0.7)
+    assert jnp.allclose(slope, 2 * np.pi * 0.7**3, rtol=1e-5)
+
+
+def test_curvature_and_frame_of_curved_bodies():
+    p = jnp.array([[0.8, 0.7, 0.2], [-0.3, 0.2, 0.9]])
+    ball = sdf.Sphere([0, 0, 0], 0.5)
+    r = jnp.linalg.norm(p, axis=1)
+    assert jnp.allclose(sdf.curvature(ball, p), 1 / r)
+    assert jnp.allclose(sdf.gaussian_curvature(ball, p), 1 / r**2)
+    assert jnp.allclose(sdf.curvature(sdf.Circle([0, 0], 0.5), p[:, :2]),
+                        1 / jnp.linalg.norm(p[:, :2], axis=1))  # fmt: skip
+    axes = sdf.frame(ball, p)
+    assert jnp.allclose(axes @ axes.mT, jnp.eye(3)[None], atol=1e-14)
+    assert jnp.allclose(jnp.linalg.det(axes), 1)
+    waist = jnp.array([[0.5, 0, 0]])  # inside of a torus: a saddle
+    assert jnp.allclose(sdf.gaussian_curvature(sdf.Torus(0.8, 0.3), waist), -1 / 0.3 / 0.5)
+
+
+def test_closest_point_of_a_bound_and_its_derivatives():
+    p = jnp.array([[1.2, 0.5], [0.3, 0.9], [-0.6, 0.35]])
+
+    @jax.jit
+    def foot(a, p):
+        return sdf.closest_point(sdf.stretch(sdf.Circle([0, 0], 1), jnp.stack([a, 0.5 * a])), p)
+
+    exact = sdf.project(sdf.Ellipsoid([1.0, 0.5]), p)
+    assert jnp.allclose(foot(jnp.array(1.0), p), exact, rtol=0, atol=1e-8)
+    step = 1e-6
+    central = (foot(jnp.array(1 + step), p) - foot(jnp.array(1 - step), p)) / (2 * step)
+    for jacobian in (jax.jacfwd, jax.jacrev):
+        assert jnp.allclose(jacobian(foot)(jnp.array(1.0), p), central, rtol=0, atol=1e-7)
+
+
+def test_sampling_is_even_and_needs_a_key(getkey):
+    ring = sdf.Ring(0.5, 1)
+    p = sdf.sample_interior(ring, 4000, key=getkey())
+    assert p.shape == (4000, 2) and (ring(p) < 0).all()
+    assert jnp.abs(p.mean(axis=0)).max() < 0.05
+    q = sdf.sample_boundary(ring, 4000, key=getkey())
+    assert jnp.abs(ring(q)).max() < 1e-12
+    outer = jnp.mean(jnp.linalg.norm(q, axis=1) > 0.75)
+    assert jnp.abs(outer - 2 / 3) < 0.03
+    nodes = sdf.grid(ring, 0.3)
+    assert nodes.shape == (8, 8, 2) and jnp.allclose(nodes[-1, -1], 1)
+    with pytest.raises(TypeError):
+        sdf.sample_interior(ring, 10)
+
+
+def test_many_points_compile_once_per_power_of_two(getkey):
+    shape = sdf.Torus(0.7, 0.2) | sdf.Sphere([0, 0, 0], 0.3)
+    for count in (0, 1, 100, 128):
+        p = jax.random.normal(getkey(), (count, 3))
+        f, n = sdf.value_and_normal(shape, p)
+        assert jnp.allclose(f, shape(p)) and jnp.allclose(sdf.evaluate(shape, p), f)
+        assert jnp.allclose(n, sdf.normal(shape, p)) and n.shape == (count, 3)
+
+
+def test_new_numbers_do_not_retrace():
+    @eqx.filter_jit
+    @eqx.debug.assert_max_traces(max_traces=1)
+    def value(shape, p):
+        return shape(p)
+
+    for k in (0.5, 1.0, 1.5):
+        twisted = sdf.twist(sdf.Box([-1] * 3, [1, 1, k]), k)
+        assert jnp.isfinite(value(twisted, jnp.zeros((4, 3)))).all()
+
+
+@pytest.mark.parametrize(
+    ("build", "remedy"),
+    [
+        (lambda: sdf.Star(np.nan, 0.5, 5), "above zero"),
+        (lambda: sdf.Circle([np.nan, 0], 1), "Give real numbers"),
+        (lambda: sdf.Polygon([[0, 0], [1, 1], [1, 0], [0, 1]]), "join several polygons"),
+        (lambda: sdf.Polygon([[0, 0], [2, 0], [1, 0], [1, 1]]), "join several polygons"),
+        (lambda: sdf.area(sdf.Circle([0, 0], 1) & sdf.Circle([5, 0], 1)), "overlap"),
+        (lambda: sdf.SmoothUnion(sdf.Circle([0, 0], 1), sdf.Circle([0, 0], 1), 0), "sharp"),
+        (lambda: sdf.bend(sdf.Box([-1] * 3, [1] * 3), 2), "Lower"),
+        (lambda: sdf.taper(sdf.Box([-1] * 3, [1] * 3), 2), "Lower"),
+        (lambda: sdf.image(np.zeros((4, 4)), 1.0), "threshold"),
+        (lambda: sdf.RoundCone([0, 0], [0.1, 0], 1, 0.5), "Use a Circle"),
+        (lambda: sdf.TriangleMesh(np.zeros((4, 3)), [[0, 1, 9]] * 4), "from zero"),
+        (lambda: sdf.extrude(sdf.Sphere([0, 0, 0], 1), 1), "plane shape"),
+    ],
+)  # fmt: skip
+def test_bad_input_names_the_remedy(build, remedy):
+    with pytest.raises(ValueError, match=remedy):
+        build()
