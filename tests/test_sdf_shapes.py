@@ -1,7 +1,5 @@
 """Every primitive, lattice and operator: distance, slope, box and derivatives."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -77,11 +75,7 @@ def kinks(dim: int) -> np.ndarray:
     return np.concatenate([np.zeros((1, dim)), eye, -eye, eye / 2, np.full((1, dim), 0.5)])
 
 
-# Compiling costs more than running here.
-QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-
-
-@functools.partial(jax.jit, compiler_options=QUICK)
+@jax.jit
 def looked_at(shape, p):
     """Value, slope and change of the slope along one direction, in one program."""
     way = jnp.broadcast_to(jnp.array([1.0, 0.7, -0.4])[: shape.dim], p.shape)

@@ -1,8 +1,8 @@
 """Interior points of a plane mesh: hexagonal seeds smoothed over Delaunay triangles."""
 
 import numpy as np
-from scipy.spatial import Delaunay, KDTree
 
+from sorojax.math.spatial import Delaunay, KDTree
 from sorojax.mesh.outline import _GRADING, Outline
 from sorojax.mesh.sizes import Sizes
 from sorojax.sdf.base import AbstractSdf

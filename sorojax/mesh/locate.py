@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax._types import is_traced
+from sorojax.math.spatial import KDTree
 from sorojax.mesh.mesh import Mesh
 from sorojax.mesh.shape import shape_functions, shape_gradients
 
@@ -28,7 +29,6 @@ def locate(mesh: Mesh, points: Float[np.ndarray, "points dim"]) -> Locations:
     Raises:
         ValueError: If a point lies outside the mesh, or the mesh is traced.
     """
-    from scipy.spatial import KDTree
 
     if is_traced(mesh):
         raise ValueError("locate: the mesh is traced, need concrete points. Call it outside.")

@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import KDTree
 
+from sorojax.math.spatial import KDTree
 from sorojax.mesh.sizes import Sizes
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sample import land, values, values_and_gradients

@@ -9,10 +9,10 @@ from collections.abc import Callable
 
 import jax
 import numpy as np
-from scipy.spatial import KDTree
 
 from sorojax import _check
 from sorojax._types import real
+from sorojax.math.spatial import KDTree
 from sorojax.mesh.convex import convex_parts
 from sorojax.mesh.elements import PolyN
 from sorojax.mesh.mesh import Mesh, boundary_facets

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from sorojax.math.spatial import KDTree
 from sorojax.mesh.elements import (
     AbstractElement,
     Hex8,
@@ -63,7 +64,6 @@ def repair(points, cells, element: AbstractElement, *, tol: float | None = None)
         ValueError: With the ids, if cells name missing nodes, points are not finite, or
             cells have no area.
     """
-    from scipy.spatial import KDTree
 
     points, cells = np.asarray(points, dtype=float), np.asarray(cells)
     _refuse(points, cells, element)

@@ -1,8 +1,8 @@
 """Whether a mesh has seen all of its shape: walls between sample points are missed."""
 
 import numpy as np
-from scipy.spatial import KDTree
 
+from sorojax.math.spatial import KDTree
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sample import CHUNK, land, values
 

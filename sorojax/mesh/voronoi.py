@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import KDTree, Voronoi
 
+from sorojax.math.spatial import KDTree, Voronoi
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.surface import contour
 

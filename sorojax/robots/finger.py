@@ -14,10 +14,10 @@ from sorojax.units import mm
 class Finger(eqx.Module):
     """Dimensions [m]; it stands on z = 0 and bends towards its spine at -x."""
 
-    bellows: Bellows = Bellows(
+    bellows: Bellows = eqx.field(default_factory=lambda: Bellows(
         outer_radius=9 * mm, inner_radius=5.6 * mm, pitch=8 * mm, fold_height=4.8 * mm,
         wall_thickness=1.2 * mm, cap=2.5 * mm, fillet=1.2 * mm, num_folds=9,
-    )  # fmt: skip
+    ))  # fmt: skip
     tip_radius: Float[Array, ""] = eqx.field(converter=real, default=7.5 * mm)
     spine_width: Float[Array, ""] = eqx.field(converter=real, default=9 * mm)
     spine_thickness: Float[Array, ""] = eqx.field(converter=real, default=3 * mm)
@@ -46,8 +46,9 @@ class Finger(eqx.Module):
         )
         half = self.spine_width / 2
         outside = -b.outer_radius - self.spine_thickness / 3
+        end = b.length - b.cap - b.pitch / 2
         spine = Box(
-            [outside, -half, zero], [outside + self.spine_thickness, half, b.length - b.cap - b.pitch / 2],
+            [outside, -half, zero], [outside + self.spine_thickness, half, end],
             self.spine_thickness / 4,
         )  # fmt: skip
         return b.solid() | tip | spine

@@ -19,14 +19,14 @@ class Hand(eqx.Module):
     -z and take -10 to 60 kPa; their ports open on the back of the hand.
     """
 
-    finger: Finger = Finger(bellows=Bellows(
+    finger: Finger = eqx.field(default_factory=lambda: Finger(bellows=Bellows(
         outer_radius=9 * mm, inner_radius=5.6 * mm, pitch=8.6 * mm, fold_height=5 * mm,
         wall_thickness=1.2 * mm, cap=2.5 * mm, fillet=1.2 * mm, num_folds=9,
-    ), tip_radius=7.6 * mm)  # fmt: skip
-    thumb: Finger = Finger(bellows=Bellows(
+    ), tip_radius=7.6 * mm))  # fmt: skip
+    thumb: Finger = eqx.field(default_factory=lambda: Finger(bellows=Bellows(
         outer_radius=9 * mm, inner_radius=5.6 * mm, pitch=8.4 * mm, fold_height=5 * mm,
         wall_thickness=1.2 * mm, cap=2.5 * mm, fillet=1.2 * mm, num_folds=8,
-    ), tip_radius=7.8 * mm)  # fmt: skip
+    ), tip_radius=7.8 * mm))  # fmt: skip
     palm_width: Float[Array, ""] = eqx.field(converter=real, default=90 * mm)
     palm_length: Float[Array, ""] = eqx.field(converter=real, default=114 * mm)
     palm_thickness: Float[Array, ""] = eqx.field(converter=real, default=26 * mm)

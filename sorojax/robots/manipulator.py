@@ -22,11 +22,13 @@ class Manipulator(eqx.Module):
     cables. The gripper closes around objects of 40 mm.
     """
 
-    bellows: Bellows = Bellows(outer_radius=13 * mm, inner_radius=8 * mm, num_folds=9)
-    finger: Finger = Finger(bellows=Bellows(
+    bellows: Bellows = eqx.field(default_factory=lambda: Bellows(
+        outer_radius=13 * mm, inner_radius=8 * mm, num_folds=9,
+    ))  # fmt: skip
+    finger: Finger = eqx.field(default_factory=lambda: Finger(bellows=Bellows(
         outer_radius=8 * mm, inner_radius=5 * mm, pitch=8 * mm, fold_height=4.8 * mm,
         wall_thickness=1.2 * mm, cap=2.5 * mm, fillet=1.2 * mm, num_folds=5,
-    ), tip_radius=6.5 * mm)  # fmt: skip
+    ), tip_radius=6.5 * mm))  # fmt: skip
     center_distance: Float[Array, ""] = eqx.field(converter=real, default=20 * mm)
     finger_distance: Float[Array, ""] = eqx.field(converter=real, default=28 * mm)
     plate_radius: Float[Array, ""] = eqx.field(converter=real, default=37 * mm)

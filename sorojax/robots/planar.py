@@ -18,7 +18,7 @@ class PlanarActuator(eqx.Module):
     -10 to 50 kPa. Each bellows has a port of its own through the lower plate.
     """
 
-    bellows: Bellows = Bellows()
+    bellows: Bellows = eqx.field(default_factory=Bellows)
     spacing: Float[Array, ""] = eqx.field(converter=real, default=26 * mm)
     plate_thickness: Float[Array, ""] = eqx.field(converter=real, default=4 * mm)
     port_radius: Float[Array, ""] = eqx.field(converter=real, default=1.5 * mm)

@@ -109,7 +109,7 @@ def image(mask, pixel: float, origin=None) -> Sampled:
         )
     mask = mask.T if mask.ndim == 2 else mask
     mask = np.pad(mask, 1)
-    outside, inside = (distance_transform_edt(m) for m in (~mask, mask))
+    outside, inside = (np.asarray(distance_transform_edt(m)) for m in (~mask, mask))
     # Distances run from centre to centre: the boundary lies half a pixel before.
     field = np.where(mask, 0.5 - inside, outside - 0.5) * pixel
     start = np.zeros(mask.ndim) if origin is None else np.asarray(origin, dtype=float)
