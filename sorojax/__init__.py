@@ -1,12 +1,13 @@
 """sorojax: a JAX-native differentiable soft-robot framework.
 
 `import sorojax as sj`, then `sj.sdf`, `sj.mesh`, `sj.material`, `sj.fem`, `sj.rod`,
-`sj.reduction`, `sj.systems`, `sj.robots`, `sj.view`. Importing sets no JAX flag; mechanics
+`sj.reduction`, `sj.systems`, `sj.robots`, `sj.io`, `sj.view`. Importing sets no JAX flag; mechanics
 needs `jax.config.update("jax_enable_x64", True)`.
 """
 
 from sorojax import (
     fem as fem,
+    io as io,
     material as material,
     math as math,
     mesh as mesh,
