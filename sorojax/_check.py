@@ -7,21 +7,19 @@ because there a value cannot be known, and statuses report instead.
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 
 def is_concrete(value: Any) -> bool:
-    return not isinstance(value, jax.core.Tracer)
+    return not isinstance(value, Tracer)
 
 
 def finite(where: str, name: str, value: Any, do: str) -> None:
     """Raise a `ValueError` if `value` holds NaN or infinity."""
     if is_concrete(value) and not np.all(np.isfinite(np.asarray(value))):
-        raise ValueError(
-            f"{where}: `{name}` must be finite, got {_short(value)}. {do}"
-        )
+        raise ValueError(f"{where}: `{name}` must be finite, got {_short(value)}. {do}")
 
 
 def positive(where: str, name: str, value: Any, unit: str, do: str) -> None:

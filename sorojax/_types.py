@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 
 def real(value: Any) -> jax.Array:
@@ -25,7 +26,7 @@ def real(value: Any) -> jax.Array:
     ):
         return jnp.stack([real(item) for item in value])
     if type(value) is object or value is None:  # placeholders that JAX puts in
-        return value
+        return value  # type: ignore[return-value]
     return jnp.asarray(np.asarray(value, dtype=np.float64), dtype=jnp.result_type(float))
 
 
@@ -43,4 +44,4 @@ def integers(value: Any) -> jax.Array:
 
 def is_traced(tree: Any) -> bool:
     """Whether any leaf of `tree` is an abstract value of a JAX transformation."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))

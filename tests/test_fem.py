@@ -301,7 +301,9 @@ def test_second_derivatives_of_equilibrium():
 
     def answer(scale):
         where = (base.loads[0].value * scale[0], base.material.shear_modulus * scale[1])
-        problem = eqx.tree_at(lambda p: (p.loads[0].value, p.material.shear_modulus), base, where)
+        problem = eqx.tree_at(
+            lambda p: (p.loads[0].value, p.material.shear_modulus), base, where
+        )
         return jnp.sum(fem.solve(problem, newton=tight).displacement) * 1e3
 
     at, h = jnp.ones(2), 1e-4

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import peers
-from benchmarks.bellows import PRESSURES, REFERENCE, RUBBER, case_a, tip_errors
+from benchmarks.bellows import PRESSURES, RUBBER, case_a, tip_errors
 from benchmarks.harness import Row, measure_calls
 from sorojax import fem, material
 from sorojax.cli.demo.design import LAYER_STIFFNESS
