@@ -190,7 +190,7 @@ def _deg_per_mm(slope: Sensitivity, name: str) -> float:
 
 _TEXT = {
     "lead": (
-        "One run of `sorojax demo`: a cross-section drawn as a signed distance, meshed, "
+        "One run of sorojax demo: a cross-section drawn as a signed distance, meshed, "
         "pressurised, reduced to a rod with three bending modes, and controlled through a "
         "pneumatic regulator. Every number below was computed in this run."
     ),
