@@ -62,3 +62,12 @@ def test_the_drawing_is_differentiable_in_every_dimension():
     leaves = jax.tree.leaves(slopes)
     assert all(jnp.isfinite(leaf) for leaf in leaves)
     assert abs(slopes.wall_thickness) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("size", "message"),
+    [(1.0, "do not fit in a box"), (1e-9, "Raise `size`"), (float("nan"), "must be positive")],
+)
+def test_sizes_out_of_range_are_refused_at_once(size, message):
+    with pytest.raises(ValueError, match=message):
+        mesh.triangulate(BellowsActuator().body(), size=size)

@@ -56,6 +56,11 @@ def sizes(where: str, size: float | SizeFunction, lower, upper) -> Sizes:
         _check.positive(where, "size", size, "m", "Give the wanted length of a side.")
         length = float(size)
         field = Sizes(lambda p: np.full(len(p), length), length, length)
+    if field.smallest > (upper - lower).min():
+        raise ValueError(
+            f"{where}: edges of {field.smallest:g} m do not fit in a box of {upper - lower} m. "
+            "Lower `size` (lengths are in metres: write 1 * mm)."
+        )
     count = float(np.prod((upper - lower) / field.smallest))
     if count > _MOST_POINTS:
         raise ValueError(
