@@ -88,7 +88,7 @@ def test_modes_are_orthonormal_and_hold_the_snapshots(tube_path):
 
 def test_identified_rod_stands_where_the_solid_stands(tube_path):
     backbone = reduction.strain_along(tube_path, LINE, samples=41)
-    basis = reduction.pod_basis(backbone, modes={"kappa_z": 3, "sigma_x": 1})
+    basis = reduction.pod_basis(backbone, modes={"kappa_z": 3, "sigma_x": 2})
     fit = reduction.identify(tube_path, basis, backbone, LINE)
     rubber = rod.elastic(tube_path.problem.material)
     body = rod.rod(SE2(), basis, fit.section, rubber, length=fit.length, nodes=40)
@@ -100,7 +100,8 @@ def test_identified_rod_stands_where_the_solid_stands(tube_path):
         q = rod.equilibrium(body, loads).q
         points = rod.forward_kinematics(body, q, backbone.s)[:, :2, 2]
         gap = jnp.linalg.norm(points - backbone.positions[k], axis=1)
-        assert jnp.mean(gap) < 5e-5 * LENGTH
+        bent = jnp.max(jnp.abs(backbone.positions[k, :, 1]))
+        assert jnp.mean(gap) < 0.01 * bent
         assert jnp.allclose(q, reduction.coordinates(backbone, basis)[k], rtol=0, atol=2e-5)
 
 

@@ -84,8 +84,7 @@ def path(beam):
 
 
 def test_deformed_shapes_show_the_stress(path):
-    with jax.numpy_rank_promotion("allow"):
-        figure = view.show_deformed(path, title="beam")
+    figure = view.show_deformed(path, title="beam")
     assert 0.08 < ink(figure) < 0.7 and has_margin(figure)
     assert has(figure, (68, 1, 84)) and has(figure, (253, 231, 37))  # both ends of the map
     titles = [axes.get_title() for axes in figure.axes[:3]]
