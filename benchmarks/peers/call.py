@@ -86,7 +86,8 @@ def row(
     except PeerMissing as reason:
         return missing(peer, str(reason), **options)
     runs = sorted(answer["runs"])
+    told = {key: answer[key] for key in ("version", "solver", "iterations") if key in answer}
     return Row(
-        peer, options | {"version": answer["version"]}, answer["compile_s"],
+        peer, options | told, answer["compile_s"],
         runs[len(runs) // 2], runs[0], runs[-1], error(result), reference,
     )  # fmt: skip
