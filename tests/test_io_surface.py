@@ -51,6 +51,20 @@ def test_3mf_and_glb_hold_what_they_declare(tmp_path):
     assert scene["accessors"][1]["count"] == BOX.triangles.size
 
 
+@pytest.mark.parametrize("ending", ["stl", "obj", "ply", "3mf", "glb"])
+def test_another_program_reads_the_same_body(tmp_path, ending):
+    trimesh = pytest.importorskip("trimesh")
+    if ending == "3mf":
+        pytest.importorskip("lxml"), pytest.importorskip("networkx")
+    body = sdf.Gyroid(8 * mm, 0.3) & sdf.Box([-5 * mm] * 3, [5 * mm] * 3)
+    surface = sdf.isosurface(body, 0.6 * mm)
+    io.export_surface(tmp_path / f"a.{ending}", surface)
+    read = trimesh.load(tmp_path / f"a.{ending}", force="mesh")
+    assert read.is_watertight and read.is_winding_consistent
+    unit = 1.0 if ending == "glb" else mm
+    assert abs(read.volume * unit**3 / sdf.surface_report(surface).volume - 1) < 1e-6
+
+
 def test_contours_become_svg(tmp_path):
     ring = sdf.Circle([0, 0], 10 * mm) - sdf.Circle([0, 0], 5 * mm)
     io.export_contour(tmp_path / "a.svg", sdf.contour(ring, 1 * mm))

@@ -24,16 +24,17 @@ DOMAINS = {"ring": (RING, 0.06, 0.75 * np.pi), "square": (SQUARE, 0.07, 4 - np.p
            "pneunet": (pneunet(), 0.75, 832.0)}  # fmt: skip
 
 
+@pytest.mark.parametrize("part", [1, 0.6, 0.5])
 @pytest.mark.parametrize("name", DOMAINS)
-def test_triangles_of_the_reference_domains_are_good(name):
+def test_triangles_of_the_reference_domains_are_good(name, part):
     shape, size, area = DOMAINS[name]
-    quality = M.quality(M.triangulate(shape, size=size))
-    assert np.rad2deg(quality.min_angle) > 27
+    quality = M.quality(M.triangulate(shape, size=part * size))
+    assert np.rad2deg(quality.min_angle) > 30
     assert quality.mean_radius_ratio > 0.96 and quality.watertight
     assert np.isclose(quality.area, area, rtol=1e-12 if name == "pneunet" else 1e-3)
 
 
-@pytest.mark.parametrize(("name", "count"), [("ring", 150), ("pneunet", 600)])
+@pytest.mark.parametrize(("name", "count"), [("ring", 150), ("square", 150), ("pneunet", 600)])
 def test_voronoi_cells_are_convex_and_fill_the_shape(name, count):
     shape, _, area = DOMAINS[name]
     errors = []
@@ -46,9 +47,10 @@ def test_voronoi_cells_are_convex_and_fill_the_shape(name, count):
     outline = M.enclosed_volume(mesh, M.boundary_facets(mesh))
     assert np.isclose(areas.sum(), -outline, rtol=1e-10) and areas.min() > 0
     assert errors[-1] < 6e-3 < errors[0]
-    if name == "ring":
-        assert mesh.num_cells == count and areas.std() < 0.15 * areas.mean()
-        assert np.isclose(areas.sum(), area, rtol=2e-3)
+    if name != "pneunet":
+        assert mesh.num_cells == count and areas.std() < 0.1 * areas.mean()
+        # Chords of the ring's two circles nearly cancel, those of one hole do not.
+        assert np.isclose(areas.sum(), area, rtol=2e-3 if name == "ring" else 4e-3)
     else:
         assert np.isclose(areas.sum(), area, rtol=1e-10)
 

@@ -57,6 +57,45 @@ def test_repeat_is_the_union_of_its_copies(step, getkey):
     assert jnp.allclose(evaluate(row, p), evaluate(copies, p), rtol=0, atol=1e-12)
 
 
+def test_grid_repeat_is_the_union_of_its_copies(getkey):
+    part = sdf.Polygon([[0, 0], [2, 0], [0.2, 1.4]])
+    moves = [jnp.array([1.5 * i, 0.9 * j]) for i in range(3) for j in range(2)]
+    copies = sdf.union(*(sdf.translate(part, move) for move in moves))
+    p = jax.random.uniform(getkey(), (2000, 2), minval=-2, maxval=7)
+    grid = sdf.grid_repeat(part, [1.5, 0.9], (3, 2))
+    assert jnp.allclose(evaluate(grid, p), evaluate(copies, p), rtol=0, atol=1e-12)
+
+
+def test_elongated_disc_is_a_rounded_rectangle_inside_too(getkey):
+    p = jax.random.uniform(getkey(), (2000, 2), minval=-3, maxval=3)
+    drawn = sdf.elongate(sdf.Circle([0, 0], 0.5), [3.0, 2.0])
+    assert jnp.allclose(
+        evaluate(drawn, p), evaluate(sdf.Rectangle([-2, -1.5], [2, 1.5], 0.5), p),
+        rtol=0, atol=1e-14,
+    )  # fmt: skip
+
+
+def test_text_has_the_area_and_the_holes_of_its_letters():
+    letters = sdf.text("O8", 0.1)
+    assert len(letters.starts) == 5
+    x, y = np.asarray(letters.vertices).T
+    ends = [*letters.starts[1:], len(x)]
+    areas = [
+        0.5 * (x[a:b] * np.roll(y[a:b], -1) - y[a:b] * np.roll(x[a:b], -1)).sum()
+        for a, b in zip(letters.starts, ends, strict=True)
+    ]
+    assert jnp.allclose(sdf.area(letters), abs(sum(areas)), rtol=1e-5)
+    middle = jnp.array([[0.5 * (x[: ends[0]].min() + x[: ends[0]].max()), 0.0365]])
+    assert letters(middle) > 0.02 > letters(jnp.array([[1.0, 1.0]])) - 2
+
+
+@pytest.mark.parametrize("order", [sdf.Pyramid(1.4, 1.2), sdf.OctetLattice(0.8, 0.1)])
+def test_slope_at_a_tie_of_two_coordinates_is_that_of_one_side(order):
+    p = jnp.array([[0.5, 0.5, 0.5], [0.3, 0.3, 0.1], [0.1, 0.27, 0.27], [0.25, 0.1, 0.25]])
+    _, slope = eqx.filter_jit(sdf.query.value_and_gradient)(order, p)
+    assert jnp.allclose(jnp.linalg.norm(slope, axis=1), 1, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("shape", SHAPES)
 def test_first_and_second_derivatives_are_finite_at_kinks(shape):
     @eqx.filter_jit

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from sorojax import sdf
+from sorojax.sdf.evaluate import value_and_normal_at
 
 POINTS = np.random.default_rng(3).uniform(-2, 2, (256, 2))
 number = st.floats(-0.8, 0.8).map(lambda v: round(v, 3))
@@ -146,6 +147,63 @@ def test_many_points_compile_once_per_power_of_two(getkey):
         f, n = sdf.value_and_normal(shape, p)
         assert jnp.allclose(f, shape(p)) and jnp.allclose(sdf.evaluate(shape, p), f)
         assert jnp.allclose(n, sdf.normal(shape, p)) and n.shape == (count, 3)
+        apart = value_and_normal_at(shape, tuple(p.T))
+        assert jnp.array_equal(apart[0], f) and jnp.array_equal(jnp.stack(apart[1], -1), n)
+
+
+def torus_mesh(n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
+    i, j = (a.ravel() for a in np.mgrid[:n, :m])
+    u, v = 2 * np.pi * i / n, 2 * np.pi * j / m
+    r = 0.8 + 0.3 * np.cos(v)
+    a, b = i * m + j, (i + 1) % n * m + j
+    c, d = (i + 1) % n * m + (j + 1) % m, i * m + (j + 1) % m
+    corners = np.stack([r * np.cos(u), r * np.sin(u), 0.3 * np.sin(v)], axis=1)
+    return corners, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+
+
+def test_mesh_by_its_tree_is_as_by_every_face():
+    vertices, faces = torus_mesh(12, 6)
+    mesh = sdf.TriangleMesh(vertices, faces)
+    p = np.random.default_rng(0).uniform(-1.3, 1.3, (700, 3))
+    p[: len(vertices)] = 1.4 * vertices  # closest to corners
+    p = jnp.asarray(p)
+
+    @eqx.filter_jit
+    def values(mesh, p):
+        return sdf.query.value_and_gradient(mesh, p)
+
+    moved = eqx.tree_at(lambda m: m.vertices, mesh, 1.1 * mesh.vertices[:, ::-1])
+    for held in (mesh, moved):
+        tree = held.tree
+        every = eqx.tree_at(
+            lambda m: m.tree, held, None, is_leaf=lambda t, tree=tree: t is tree
+        )
+        (f, g), (exact, slope) = values(held, p), values(every, p)
+        assert jnp.allclose(f, exact, rtol=0, atol=1e-12)
+        random = slice(len(vertices), None)  # the others may be as close to several faces
+        assert jnp.allclose(g[random], slope[random], rtol=0, atol=1e-12)
+    loose = sdf.TriangleMesh(vertices[faces[:, ::-1]].reshape(-1, 3),
+                             np.arange(3 * len(faces)).reshape(-1, 3))  # fmt: skip
+    assert loose.tree is not None
+    assert jnp.allclose(values(loose, p)[0], values(mesh, p)[0], rtol=0, atol=1e-12)
+    assert sdf.TriangleMesh(vertices, faces[1:]).tree is None
+
+
+def test_parameters_have_finite_derivatives_at_ties_and_can_be_batched():
+    p = jnp.array([[0.0, 0, 0], [0.5, 0.5, 0.5], [1, 0, 0], [0.3, 0.3, 0], [0.75, 0.75, 0.75]])
+
+    def field(theta):
+        block = sdf.Box(-jnp.stack([theta[0]] * 3), jnp.stack([theta[0]] * 3))
+        ball = sdf.Sphere(jnp.zeros(3), theta[1])
+        cut = (ball & block) - sdf.InfiniteCylinder(theta[2])
+        return (cut | sdf.Pyramid(theta[1], theta[1]))(p)
+
+    theta = jnp.array([0.75, 1.0, 0.5])
+    slopes = jax.jit(lambda t: (jax.jacfwd(field)(t), jax.jacfwd(jax.jacrev(field))(t)))(theta)
+    assert all(jnp.isfinite(s).all() for s in slopes)
+    many = theta[None] * jnp.array([[1.0], [1.1], [0.9]])
+    batched = jax.jit(jax.vmap(field))(many)
+    assert jnp.allclose(batched, jnp.stack([field(t) for t in many]), rtol=0, atol=1e-14)
 
 
 def test_new_numbers_do_not_retrace():
@@ -173,6 +231,9 @@ def test_new_numbers_do_not_retrace():
         (lambda: sdf.image(np.zeros((4, 4)), 1.0), "threshold"),
         (lambda: sdf.RoundCone([0, 0], [0.1, 0], 1, 0.5), "Use a Circle"),
         (lambda: sdf.TriangleMesh(np.zeros((4, 3)), [[0, 1, 9]] * 4), "from zero"),
+        (lambda: sdf.grid_repeat(sdf.Circle([0, 0], 1), [1, 1], (2,)), "one per axis"),
+        (lambda: sdf.elongate(sdf.Circle([0, 0], 1), [-1, 1]), "shorten"),
+        (lambda: sdf.text(" ", 1), "Write something"),
         (lambda: sdf.extrude(sdf.Sphere([0, 0, 0], 1), 1), "plane shape"),
     ],
 )  # fmt: skip

@@ -177,6 +177,32 @@ def test_report_names_what_is_wrong():
         sdf.surface_report(sdf.Surface(points * np.nan, tetra))
 
 
+def test_report_measures_walls_and_finds_crossings():
+    hollow = sdf.Sphere([0, 0, 0], 1) - sdf.Sphere([0, 0, 0], 0.7)
+    report = sdf.surface_report(sdf.isosurface(hollow, 0.1))
+    assert report.printable and abs(report.wall_thickness / 0.3 - 1) < 0.03
+    plate = sdf.isosurface(sdf.Box([0, 0, 0], [1, 0.5, 0.2]), 0.05, "dual_contouring")
+    assert abs(sdf.surface_report(plate).wall_thickness / 0.2 - 1) < 0.01
+    moved = plate.vertices + np.array([0.3, 0.2, 0.07])
+    both = sdf.Surface(
+        np.concatenate([plate.vertices, moved]),
+        np.concatenate([plate.triangles, plate.triangles + len(moved)]),
+    )
+    report = sdf.surface_report(both)
+    assert report.manifold and not report.printable
+    first, second = report.crossings.T
+    assert (first < len(plate.triangles)).all() and (second >= len(plate.triangles)).all()
+
+
+def test_flying_edges_give_the_same_surface(monkeypatch):
+    pytest.importorskip("vtkmodules")
+    ours = sdf.surface_report(sdf.isosurface(CSG, 2.2 / 48))
+    monkeypatch.setattr("sorojax.sdf.marching.importlib.util.find_spec", lambda name: None)
+    theirs = sdf.surface_report(sdf.isosurface(CSG, 2.2 / 48))
+    assert ours.manifold and ours.genus == theirs.genus
+    assert abs(ours.volume / theirs.volume - 1) < 1e-4
+
+
 def test_smooth_solids_are_of_fourth_order():
     def sphere(radius, resolution):
         return sdf.volume(sdf.Sphere([0.013, 0.027, -0.031], radius), resolution)

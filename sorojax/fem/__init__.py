@@ -5,8 +5,19 @@ from sorojax.fem.energy_form import (
     residual as residual,
 )
 from sorojax.fem.follow import Stats as Stats
-from sorojax.fem.kinematics import PlaneStrain as PlaneStrain
+from sorojax.fem.formulation import (
+    ConstantPressure as ConstantPressure,
+    Displacement as Displacement,
+    LinearPressure as LinearPressure,
+)
+from sorojax.fem.kinematics import (
+    Axisymmetric as Axisymmetric,
+    PlaneStrain as PlaneStrain,
+    PlaneStress as PlaneStress,
+    Solid as Solid,
+)
 from sorojax.fem.loads import (
+    Force as Force,
     Gravity as Gravity,
     Pressure as Pressure,
     Traction as Traction,
@@ -24,8 +35,10 @@ from sorojax.fem.solve import (
 from sorojax.fem.space import Space as Space, space as space
 from sorojax.fem.stress import (
     cauchy_stress as cauchy_stress,
+    deformation_gradient as deformation_gradient,
     enclosed_volume as enclosed_volume,
     nodal_average as nodal_average,
+    principal_stresses as principal_stresses,
     reaction_force as reaction_force,
     von_mises_stress as von_mises_stress,
 )

@@ -5,32 +5,21 @@ elementwise code; the contraction with the shape gradients accumulates one quadr
 point at a time, so that a block stays in the cache.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from sorojax.fem.energy import energy_density, stress_and_tangent
-from sorojax.fem.kinematics import (
-    AbstractKinematics,
-    Planar,
-    cofactor,
-    determinant,
-    stack,
-    unstack,
-)
+from sorojax.fem.contract import block_matrix
+from sorojax.fem.energy import Body, energy_density, response
+from sorojax.fem.formulation import Modes
+from sorojax.fem.geometry import Geometry, deformation_gradient, gradient_entries
+from sorojax.fem.kinematics import AbstractKinematics
 from sorojax.fem.space import Space, lanes, per_block
+from sorojax.fem.tensor import volume_ratio
 from sorojax.material.hyperelastic import AbstractHyperelastic
-from sorojax.mesh.shape import quadrature, shape_gradients
-
-
-class Geometry(NamedTuple):
-    """Gradients of the shape functions and volumes of the quadrature points."""
-
-    gradients: Float[Array, "blocks quad cell_nodes dim lanes"]
-    volumes: Float[Array, "blocks quad lanes"]
 
 
 class Assembly(NamedTuple):
@@ -41,54 +30,15 @@ class Assembly(NamedTuple):
     volume_ratio: Float[Array, ""]
 
 
-@jax.jit
-def geometry(
-    space: Space, kinematics: AbstractKinematics, points: Float[Array, "nodes dim"]
-) -> Geometry:
-    """Shape gradients [1/m] and quadrature volumes [m^3] of the cells at `points`."""
-    rule = quadrature(space.element)
-    slopes = shape_gradients(space.element, rule.points)
+class _Block(NamedTuple):
+    """Arrays of the cells that are worked on together."""
 
-    def block(arrays):
-        cells, real = arrays
-        x = lanes(points, cells)
-        jac = [[_contract(x[i], slopes[:, :, d]) for d in range(2)] for i in range(2)]
-        J = determinant(unstack(stack(jac)))  # type: ignore[arg-type]
-        inverse = [[jac[1][1] / J, -jac[0][1] / J], [-jac[1][0] / J, jac[0][0] / J]]
-        gradients = jnp.stack(
-            [
-                jnp.einsum("qa,qe->qae", slopes[:, :, 0], inverse[0][j])
-                + jnp.einsum("qa,qe->qae", slopes[:, :, 1], inverse[1][j])
-                for j in range(2)
-            ],
-            axis=2,
-        )
-        volumes = J * rule.weights[:, None] * kinematics.depth
-        return gradients, jnp.where(real[None], volumes, jnp.zeros_like(volumes))
-
-    return Geometry(*jax.lax.map(block, (space.cells, space.real)))
-
-
-def _contract(nodal, slopes):
-    return jnp.einsum("ae,qa->qe", nodal, slopes)
-
-
-def displacement_gradient(
-    u: Float[Array, "dim cell_nodes lanes"],
-    gradients: Float[Array, "quad cell_nodes dim lanes"],
-) -> Planar:
-    """Grad u at the quadrature points of a block."""
-    num = u.shape[1]
-    return tuple(  # type: ignore[return-value]
-        tuple(sum(u[i, a][None] * gradients[:, a, j] for a in range(num)) for j in range(2))
-        for i in range(2)
-    )
-
-
-def deformation_gradient(u, gradients) -> Planar:
-    """F = I + Grad u at the quadrature points of a block."""
-    (a, b), (c, d) = displacement_gradient(u, gradients)
-    return ((a + 1, b), (c, d + 1))
+    cells: Any
+    real: Bool[Array, " lanes"]
+    gradients: Any
+    volumes: Any
+    modes: Modes | None
+    varying: Any
 
 
 @jax.jit
@@ -102,98 +52,58 @@ def assemble(
 ) -> Assembly:
     """Internal force and tangent at `u`; the geometric part of the tangent uses the
     stress extrapolated from `u_before` (pass `u` for the exact tangent)."""
-    varying, constant = per_block(space, material)
+    blocks, constant = _blocks(space, geometry, material)
 
-    def block(arrays):
-        cells, G, w, varies = arrays
-        rubber = eqx.combine(varies, constant)
-        F = deformation_gradient(lanes(u, cells), G)
-        F_before = deformation_gradient(lanes(u_before, cells), G)
-        ratio = jnp.min(determinant(F) / determinant(F_before))
-        P, A = stress_and_tangent(rubber, kinematics, F, F_before)
-        A = jnp.stack([jnp.stack([stack(A[i][j]) for j in range(2)]) for i in range(2)])
-        force, matrix = _contract_block(stack(P), A, G, w)
-        num = matrix.shape[0] * 2
-        matrix = matrix.reshape(num, num, -1)
-        upper = jnp.concatenate([matrix[i, i:] for i in range(num)])
-        return force, upper, ratio
+    def work(block: _Block):
+        body = _body(block, constant, kinematics)
+        F = deformation_gradient(kinematics, lanes(u, block.cells), block.gradients)
+        F_before = deformation_gradient(
+            kinematics, lanes(u_before, block.cells), block.gradients
+        )
+        # Otherwise XLA repeats these sums in every use of F.
+        F, F_before = jax.lax.optimization_barrier((F, F_before))
+        J, J_before = volume_ratio(kinematics, F), volume_ratio(kinematics, F_before)
+        answer = response(body, F, F_before)
+        force, upper = block_matrix(kinematics, answer, body, block.gradients)
+        return force, upper, jnp.min(J / J_before)
 
-    blocks = (space.cells, geometry.gradients, geometry.volumes, varying)
-    forces, uppers, ratios = jax.lax.map(block, blocks)
-    force = jnp.zeros_like(u).at[space.cells].add(jnp.moveaxis(forces, 2, -1))
-    # padding writes to one slot more than there are values
+    forces, uppers, ratios = jax.lax.map(work, blocks)
+    # padding writes to one node and one slot more than there are
+    nodes = jnp.where(space.real[:, None], space.cells, space.num_nodes)
+    zero = jnp.zeros((space.num_nodes + 1, space.dim), u.dtype)
+    force = zero.at[nodes].add(jnp.moveaxis(forces, 2, -1))[:-1]
     values = jnp.zeros(space.system.num_values + 1, u.dtype).at[space.slots].add(uppers)
     return Assembly(force.ravel(), values[:-1], jnp.min(ratios))
-
-
-def _contract_block(P, A, G, w):
-    """Sum over points of P G, (nodes, dim, lanes), and of G' A G, one row per (node, dim)."""
-    num, lanes_ = G.shape[1], G.shape[-1]
-
-    def add_point(sums, point):
-        P, A, G, w = point
-        Gw = G * w[None, None]
-        force = jnp.stack(
-            [P[i, 0, None] * Gw[:, 0] + P[i, 1, None] * Gw[:, 1] for i in range(2)], axis=1
-        )
-        AG = [
-            [
-                jnp.stack(
-                    [
-                        A[i, j, k, 0, None] * G[:, 0] + A[i, j, k, 1, None] * G[:, 1]
-                        for k in range(2)
-                    ],
-                    axis=1,
-                )
-                for j in range(2)
-            ]
-            for i in range(2)
-        ]
-        matrix = jnp.stack(
-            [
-                Gw[:, 0, None, None] * AG[i][0][None] + Gw[:, 1, None, None] * AG[i][1][None]
-                for i in range(2)
-            ],
-            axis=1,
-        )
-        return (sums[0] + force, sums[1] + matrix), None
-
-    start = (
-        jnp.zeros((num, 2, lanes_), P.dtype),
-        jnp.zeros((num, 2, num, 2, lanes_), P.dtype),
-    )
-    points = (jnp.moveaxis(P, 2, 0), jnp.moveaxis(A, 4, 0), G, w)
-    return jax.lax.scan(add_point, start, points)[0]
 
 
 @jax.jit
 def largest_step(
     space: Space,
     geometry: Geometry,
+    kinematics: AbstractKinematics,
     u: Float[Array, "nodes dim"],
     du: Float[Array, "nodes dim"],
     keep: float = 0.1,
 ) -> Float[Array, ""]:
-    """Largest fraction of `du`, at most 1, that leaves J >= keep * J(u) at every point.
+    """Largest sampled fraction of `du`, at most 1, up to which J >= keep * J(u) everywhere."""
 
-    J is quadratic in the step, so the answer is a closed form.
-    """
+    def ratio(fraction):
+        def work(arrays):
+            cells, G = arrays
+            F = deformation_gradient(kinematics, lanes(u, cells), G)
+            D = gradient_entries(kinematics, lanes(du, cells), G)
+            J, before = volume_ratio(kinematics, F + fraction * D), volume_ratio(kinematics, F)
+            return jnp.min(J / before)
 
-    def block(arrays):
-        cells, G = arrays
-        F = deformation_gradient(lanes(u, cells), G)
-        D = displacement_gradient(lanes(du, cells), G)
-        C = cofactor(F)
-        a = determinant(D)
-        b = sum(C[i][j] * D[i][j] for i in range(2) for j in range(2))
-        c = (1 - keep) * determinant(F)
-        root = b * b - 4 * a * c
-        safe = jnp.sqrt(jnp.where(root > 0, root, jnp.ones_like(root)))
-        below = safe - b
-        ok = (root > 0) & (below > 0)
-        return jnp.min(jnp.where(ok, 2 * c / jnp.where(ok, below, jnp.ones_like(b)), jnp.inf))
+        return jnp.min(jax.lax.map(work, (space.cells, geometry.gradients)))
 
-    return jnp.minimum(1.0, jnp.min(jax.lax.map(block, (space.cells, geometry.gradients))))
+    fractions = _SHRINK ** jnp.arange(_SAMPLES - 1, -1, -1, dtype=u.dtype)
+    ok = jax.lax.map(ratio, fractions) >= keep
+    count = jnp.sum(jnp.cumprod(ok.astype(u.dtype)))
+    return _SHRINK ** (_SAMPLES - count)
+
+
+_SHRINK, _SAMPLES = 0.75, 32
 
 
 @jax.jit
@@ -205,13 +115,22 @@ def strain_energy(
     u: Float[Array, "nodes dim"],
 ) -> Float[Array, ""]:
     """Stored energy of the body [J]."""
+    blocks, constant = _blocks(space, geometry, material)
+
+    def work(block: _Block):
+        body = _body(block, constant, kinematics)
+        F = deformation_gradient(kinematics, lanes(u, block.cells), block.gradients)
+        energy = jnp.sum(block.volumes * energy_density(body, F), axis=0)
+        return jnp.sum(jnp.where(block.real, energy, jnp.zeros_like(energy)))
+
+    return jnp.sum(jax.lax.map(work, blocks))
+
+
+def _blocks(space: Space, geometry: Geometry, material) -> tuple[_Block, Any]:
     varying, constant = per_block(space, material)
+    return _Block(space.cells, space.real, *geometry, varying), constant
 
-    def block(arrays):
-        cells, G, w, varies = arrays
-        F = deformation_gradient(lanes(u, cells), G)
-        rubber = eqx.combine(varies, constant)
-        return jnp.sum(w * energy_density(rubber, kinematics, F))
 
-    blocks = (space.cells, geometry.gradients, geometry.volumes, varying)
-    return jnp.sum(jax.lax.map(block, blocks))
+def _body(block: _Block, constant, kinematics: AbstractKinematics) -> Body:
+    material = eqx.combine(block.varying, constant)
+    return Body(material, kinematics, block.modes, block.volumes)

@@ -1,4 +1,4 @@
-"""Stress and tangent at points, elementwise on the entries of F.
+"""Stress and tangent at points, elementwise on the kept entries of F.
 
 The tangent may take its geometric parts from a pressure and an isochoric second
 Piola-Kirchhoff stress that are extrapolated linearly from the previous iterate (mixed
@@ -11,77 +11,113 @@ Newton method in geometrically non-linear structural problem discretized via
 displacement-based finite elements", CMAME 313, 2017.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
-from sorojax.fem.kinematics import (
-    AbstractKinematics,
-    Planar,
-    cofactor,
-    determinant,
+from sorojax.fem.formulation import Modes, coefficients, project
+from sorojax.fem.kinematics import AbstractKinematics
+from sorojax.fem.shape_response import shape_energy, shape_stress, shape_tangent
+from sorojax.fem.tensor import (
+    Entries,
+    curvature_entries,
+    curvature_table,
     second_piola,
+    stress_table,
+    volume_ratio,
+    volume_slopes,
 )
-from sorojax.material.hyperelastic import AbstractHyperelastic, strain_energy_density
+from sorojax.material.hyperelastic import AbstractHyperelastic
 from sorojax.material.kinematics import Entry
 
-Tangent = list  # A[i][j][k][l], entries over points
-_PERMUTATION = ((0.0, 1.0), (-1.0, 0.0))
+
+class Body(NamedTuple):
+    """What the energy of a block of cells is made of."""
+
+    material: AbstractHyperelastic
+    kinematics: AbstractKinematics
+    modes: Modes | None
+    volumes: Float[Array, "quad lanes"]
 
 
-def energy_density(
-    material: AbstractHyperelastic, kinematics: AbstractKinematics, F: Planar
-) -> Entry:
-    """Psi at every point [J/m^3]."""
-    return strain_energy_density(material, kinematics.embed(F))
+class Response(NamedTuple):
+    """Stress P and dP/dF between kept entries of F.
 
-
-def stress_and_tangent(
-    material: AbstractHyperelastic,
-    kinematics: AbstractKinematics,
-    F: Planar,
-    F_before: Planar,
-) -> tuple[Planar, Tangent]:
-    """P and A = dP/dF, its geometric parts from stresses extrapolated out of `F_before`.
-
-    With `F_before` equal to `F` the tangent is the exact derivative.
+    With pressure modes the bulk stiffness is not in `tangent`: `slopes` holds
+    dJ/dF and `stiffness` that between modes.
     """
 
-    def isochoric(F):
-        return jax.grad(lambda F: jnp.sum(material.isochoric_energy(kinematics.embed(F))))(F)
-
-    pressure = jax.grad(lambda J: jnp.sum(material.volumetric_energy(J)))
-    step = jax.tree.map(lambda a, b: a - b, F, F_before)
-    P, C, J = isochoric(F), cofactor(F), determinant(F)
-    p, bulk = jax.jvp(pressure, (J,), (jnp.ones_like(J),))
-    p_before, p_rate = jax.jvp(lambda F: pressure(determinant(F)), (F_before,), (step,))
-    extra = _extrapolated(isochoric, F, F_before, step, second_piola(F, P))
-    A = [[[[None, None], [None, None]] for _ in range(2)] for _ in range(2)]
-    for k in range(2):
-        for l in range(2):
-            column = jax.jvp(isochoric, (F,), (_unit(F, k, l),))[1]
-            for i in range(2):
-                for j in range(2):
-                    entry = column[i][j] + bulk * C[i][j] * C[k][l]
-                    if i == k:
-                        entry = entry + extra[j][l]
-                    elif j != l:
-                        sign = _PERMUTATION[i][k] * _PERMUTATION[j][l]
-                        entry = entry + sign * (p_before + p_rate)
-                    A[i][j][k][l] = entry  # type: ignore[call-overload]
-    return jax.tree.map(lambda s, c: s + p * c, P, C), A
+    stress: Entries
+    tangent: Float[Array, "entries entries quad lanes"]
+    slopes: Entries | None
+    stiffness: Float[Array, "modes modes lanes"] | None
 
 
-def _extrapolated(isochoric, F: Planar, F_before: Planar, step: Planar, S: Planar) -> Planar:
-    """Second Piola-Kirchhoff stress extrapolated from `F_before` to `F`, minus S(F)."""
-    before, rate = jax.jvp(lambda F: second_piola(F, isochoric(F)), (F_before,), (step,))
-    return jax.tree.map(lambda s0, ds, s1: s0 + ds - s1, before, rate, S)
+def energy_density(body: Body, F: Entries) -> Entry:
+    """Psi at every point [J/m^3], its volumetric part from the projected J."""
+    shape = shape_energy(body.material, body.kinematics, F)
+    if not body.kinematics.has_volume:
+        return shape
+    return shape + body.material.volumetric_energy(_dilatation(body, F))
 
 
-def _unit(F: Planar, k: int, l: int) -> Planar:
-    return tuple(  # type: ignore[return-value]
-        tuple(
-            jnp.ones_like(F[i][j]) if (i, j) == (k, l) else jnp.zeros_like(F[i][j])
-            for j in range(2)
-        )
-        for i in range(2)
-    )
+def pressure(body: Body, F: Entries) -> Entry:
+    """dU/dJ at every point [Pa], as projected."""
+    slope = _volumetric_slope(body, _dilatation(body, F))
+    return project(body.modes, body.volumes, slope)
+
+
+def response(body: Body, F: Entries, F_before: Entries) -> Response:
+    """P and dP/dF, the geometric parts of dP/dF from stresses extrapolated out of
+    `F_before`. With `F_before` equal to `F` the tangent is the exact derivative."""
+    step = F - F_before
+    P = shape_stress(body.material, body.kinematics, F)
+    tangent = shape_tangent(body.material, body.kinematics, F)
+    extra = _extrapolated_shape(body, F, F_before, step, P)
+    tangent = tangent + _spread(stress_table(body.kinematics), extra)
+    if not body.kinematics.has_volume:
+        return Response(P, tangent, None, None)
+    return _with_volume(body, F, F_before, step, P, tangent)
+
+
+def _spread(table: np.ndarray, entries: Entries) -> Float[Array, "entries entries quad lanes"]:
+    """Entries placed by number; the number beyond the last is nothing."""
+    padded = jnp.concatenate([entries, jnp.zeros_like(entries[:1])])
+    return padded[table]
+
+
+def _extrapolated_shape(body: Body, F, F_before, step, P) -> Entries:
+    """S of the shape energy extrapolated from `F_before` to `F`, minus S(F)."""
+
+    def stress(F):
+        return second_piola(body.kinematics, F, shape_stress(body.material, body.kinematics, F))
+
+    before, rate = jax.jvp(stress, (F_before,), (step,))
+    return before + rate - second_piola(body.kinematics, F, P)
+
+
+def _dilatation(body: Body, F: Entries) -> Entry:
+    return project(body.modes, body.volumes, volume_ratio(body.kinematics, F))
+
+
+def _volumetric_slope(body: Body, J: Entry) -> Entry:
+    return jax.grad(lambda J: jnp.sum(body.material.volumetric_energy(J)))(J)
+
+
+def _with_volume(body: Body, F, F_before, step, P, tangent) -> Response:
+    J = _dilatation(body, F)
+    slope, bulk = jax.jvp(lambda J: _volumetric_slope(body, J), (J,), (jnp.ones_like(J),))
+    p = project(body.modes, body.volumes, slope)
+    p_before, p_rate = jax.jvp(lambda F: pressure(body, F), (F_before,), (step,))
+    C = volume_slopes(body.kinematics, F)
+    place, sign = curvature_table(body.kinematics)
+    curvature = curvature_entries(F)[place] * sign[:, :, None, None]
+    tangent = tangent + (p_before + p_rate)[None, None] * curvature
+    stress = P + p[None] * C
+    if body.modes is None:
+        return Response(stress, tangent + (bulk[None] * C)[:, None] * C[None], None, None)
+    stiffness = [coefficients(body.modes, body.volumes, bulk * mode) for mode in body.modes]
+    return Response(stress, tangent, C, jnp.stack(stiffness))

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sorojax.fem.energy import energy_density
-from sorojax.fem.points import deformation_gradients, point_areas
+from sorojax.fem.energy import Body, energy_density
+from sorojax.fem.points import Points, deformation, pressure_modes, quadrature_points
 from sorojax.fem.problem import Problem
 
 
@@ -19,15 +19,21 @@ def load_potential(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Arra
     return sum(terms, start=jnp.zeros((), u.dtype))
 
 
-def potential_energy(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
-    """Stored energy plus the potential of all loads [J]."""
-    F = deformation_gradients(problem.mesh, u)
+def body_at(problem: Problem, points: Points) -> Body:
+    """What the energy at the quadrature points of all cells is made of."""
     material = jax.tree.map(
         lambda leaf: leaf[None] if jnp.ndim(leaf) == 1 else leaf, problem.material
     )
-    density = energy_density(material, problem.kinematics, F)
-    volumes = point_areas(problem.mesh) * problem.kinematics.depth
-    return jnp.sum(volumes * density) + load_potential(problem, u)
+    modes = pressure_modes(problem.formulation, points)
+    return Body(material, problem.kinematics, modes, points.volumes)
+
+
+def potential_energy(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
+    """Stored energy plus the potential of all loads [J]."""
+    points = quadrature_points(problem.mesh, problem.kinematics)
+    F = deformation(problem.mesh, problem.kinematics, points, u)
+    density = energy_density(body_at(problem, points), F)
+    return jnp.sum(points.volumes * density) + load_potential(problem, u)
 
 
 @jax.jit

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sorojax._progress import report
 from sorojax.fem.linear import Linearised, prepare
 from sorojax.fem.newton import Newton, newton_solve
 from sorojax.fem.problem import Problem
@@ -69,7 +70,7 @@ def begin_at(problem: Problem, begin: Start | np.ndarray | None) -> Start:
     if isinstance(begin, Start):
         return begin
     if begin is None:
-        return Start(np.zeros(problem.mesh.points.shape), _unloaded(problem), None)
+        return Start(np.zeros(problem.mesh.points.shape), unloaded(problem), None)
     return Start(begin, problem, None)
 
 
@@ -79,7 +80,7 @@ def follow(problem: Problem, begin: Start, log: Log) -> np.ndarray:
     u, tangent, done, size, failures = begin.u, begin.tangent, 0.0, 1.0 / log.num_steps, 0
     while done < 1.0:
         goal = min(1.0, done + size) if done + size < 1.0 - 1e-9 else 1.0
-        here = problem if goal == 1.0 else _between(begin.problem, problem, goal)
+        here = problem if goal == 1.0 else between(begin.problem, problem, goal)
         known = np.asarray(known_values(here.supports, *u.shape))
         result = newton_solve(here, prepared, u, known, log.newton, tangent)
         if result.reason:
@@ -95,24 +96,30 @@ def follow(problem: Problem, begin: Start, log: Log) -> np.ndarray:
             LoadStep(goal, result.iterations, result.residual, result.negative_eigenvalues)
         )
         log.end = Start(u, problem, tangent)
+        if len(log.steps) + log.cuts > 1:  # one step is no wait worth a line
+            report("load", done, 1.0, iterations=result.iterations, cuts=log.cuts)
         if result.iterations <= 5:
             size *= 1.5
     return u
 
 
-def _unloaded(problem: Problem) -> Problem:
+def unloaded(problem: Problem) -> Problem:
+    """The body with every load and every prescribed displacement at zero."""
     return _with_terms(problem, lambda _, b: jnp.zeros_like(b), problem)
 
 
-def _between(first: Problem, last: Problem, fraction: float) -> Problem:
+def between(first: Problem, last: Problem, fraction: float) -> Problem:
     """Loads and supports between two problems on the same body."""
     return _with_terms(first, lambda a, b: a + fraction * (b - a), last)
 
 
 def _with_terms(first: Problem, mix, last: Problem) -> Problem:
-    terms = jax.tree.map(
-        lambda a, b: mix(a, b) if eqx.is_inexact_array(b) else b,
-        (first.loads, first.supports),
-        (last.loads, last.supports),
-    )
-    return eqx.tree_at(lambda p: (p.loads, p.supports), last, terms)
+    def moved(a, b):
+        return mix(a, b) if eqx.is_inexact_array(b) else b
+
+    def loaded(a, b):  # where a load acts, its origin for example, does not change its size
+        return eqx.tree_at(lambda load: load.value, b, moved(a.value, b.value))
+
+    loads = tuple(loaded(a, b) for a, b in zip(first.loads, last.loads, strict=True))
+    supports = jax.tree.map(moved, first.supports, last.supports)
+    return eqx.tree_at(lambda p: (p.loads, p.supports), last, (loads, supports))

@@ -1,76 +1,182 @@
-"""How a planar deformation is completed to three dimensions."""
+"""How the displacement of a mesh becomes a deformation gradient in three dimensions.
+
+A kinematics keeps the entries of F that can differ from those of the identity, as a flat
+tuple; the rest of F is known when the kernels are traced, and costs nothing.
+"""
 
 import abc
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import real
+from sorojax.material.hyperelastic import AbstractHyperelastic
 from sorojax.material.kinematics import Entry, Tensor
 
-Planar = tuple[tuple[Entry, Entry], tuple[Entry, Entry]]
+Gradient = tuple[Entry, ...]
+
+
+class Slot(NamedTuple):
+    """Entry F[row][col] is the slope of displacement `component` along `column`."""
+
+    component: int
+    column: int
+    row: int
+    col: int
+
+
+def _square(dim: int) -> tuple[Slot, ...]:
+    return tuple(Slot(i, j, i, j) for i in range(dim) for j in range(dim))
 
 
 class AbstractKinematics(eqx.Module):
-    """Completes the in-plane deformation gradient."""
+    """Completes the entries of F that a mesh determines."""
+
+    dim: eqx.AbstractClassVar[int]
+    slots: eqx.AbstractClassVar[tuple[Slot, ...]]
+    num_columns: eqx.AbstractClassVar[int]
+    has_volume: eqx.AbstractClassVar[bool]
+    num_rigid_modes: eqx.AbstractClassVar[int]
 
     @abc.abstractmethod
-    def embed(self, F: Planar) -> Tensor:
-        """The full deformation gradient."""
+    def embed(self, F: Gradient) -> Tensor:
+        """F in three dimensions, as far as the mesh determines it."""
 
-    @property
     @abc.abstractmethod
-    def depth(self) -> Float[Array, ""]:
-        """Length out of the plane that forces and energies refer to [m]."""
+    def depth(self, position: tuple[Entry, ...]) -> Entry:
+        """Length out of the mesh at a point: thickness, circumference or one."""
+
+    def shape_energy(self, material: AbstractHyperelastic, F: Gradient) -> Entry:
+        """Energy per reference volume that is not a function of J alone [J/m^3]."""
+        return material.isochoric_energy(self.embed(F))
 
 
 class PlaneStrain(AbstractKinematics):
     """No strain out of the plane; forces are those of a body `thickness` deep [m]."""
 
     thickness: Float[Array, ""] = eqx.field(converter=real, default=1.0)
+    dim: ClassVar[int] = 2
+    slots: ClassVar[tuple[Slot, ...]] = _square(2)
+    num_columns: ClassVar[int] = 2
+    has_volume: ClassVar[bool] = True
+    num_rigid_modes: ClassVar[int] = 3
 
     def __check_init__(self):
-        _check.positive(
-            "PlaneStrain", "thickness", self.thickness, "m", "Write 20 * mm, for example."
-        )
+        _check_thickness("PlaneStrain", self.thickness)
 
-    @property
-    def depth(self) -> Float[Array, ""]:
-        return self.thickness
-
-    def embed(self, F: Planar) -> Tensor:
-        (a, b), (c, d) = F
+    def embed(self, F: Gradient) -> Tensor:
+        a, b, c, d = F
         return ((a, b, 0.0), (c, d, 0.0), (0.0, 0.0, 1.0))
 
-
-def cofactor(F: Planar) -> Planar:
-    """dJ/dF of a planar gradient."""
-    (a, b), (c, d) = F
-    return ((d, -c), (-b, a))
+    def depth(self, position) -> Entry:
+        return self.thickness
 
 
-def determinant(F: Planar) -> Entry:
-    """J of a planar gradient."""
-    (a, b), (c, d) = F
-    return a * d - b * c
+class PlaneStress(AbstractKinematics):
+    """A sheet `thickness` thin [m] that is free to contract out of its plane.
+
+    The stretch out of the plane makes the energy of every point least. It is found by
+    Newton's method, and the last step carries its derivative, so that stress and tangent
+    of the energy are those of plane stress.
+    """
+
+    thickness: Float[Array, ""] = eqx.field(converter=real, default=1.0)
+    dim: ClassVar[int] = 2
+    slots: ClassVar[tuple[Slot, ...]] = _square(2)
+    num_columns: ClassVar[int] = 2
+    has_volume: ClassVar[bool] = False
+    num_rigid_modes: ClassVar[int] = 3
+
+    def __check_init__(self):
+        _check_thickness("PlaneStress", self.thickness)
+
+    def embed(self, F: Gradient) -> Tensor:
+        a, b, c, d = F
+        return ((a, b, 0.0), (c, d, 0.0), (0.0, 0.0, 1.0))
+
+    def depth(self, position) -> Entry:
+        return self.thickness
+
+    def shape_energy(self, material: AbstractHyperelastic, F: Gradient) -> Entry:
+        return _sheet_energy(material, F, self.thickness_stretch(material, F))
+
+    def thickness_stretch(self, material: AbstractHyperelastic, F: Gradient) -> Entry:
+        """Stretch out of the plane at which the stress out of the plane vanishes."""
+        held = jax.lax.stop_gradient((material, F))
+        J = held[1][0] * held[1][3] - held[1][1] * held[1][2]
+        start = -0.5 * jnp.log(J)
+
+        def improve(_, log_stretch):
+            step = _thickness_step(*held, log_stretch)
+            return log_stretch + jnp.clip(step, -0.5, 0.5)
+
+        found = jax.lax.fori_loop(0, _SHEET_ITERATIONS, improve, start)
+        return jnp.exp(found + _thickness_step(material, F, jax.lax.stop_gradient(found)))
 
 
-def second_piola(F: Planar, P: Planar) -> Planar:
-    """S = F^-1 P."""
-    (a, b), (c, d) = F
-    J = determinant(F)
-    inverse = ((d / J, -b / J), (-c / J, a / J))
-    return tuple(  # type: ignore[return-value]
-        tuple(inverse[i][0] * P[0][j] + inverse[i][1] * P[1][j] for j in range(2))
-        for i in range(2)
+_SHEET_ITERATIONS = 9
+
+
+def _sheet_energy(material: AbstractHyperelastic, F: Gradient, stretch: Entry) -> Entry:
+    a, b, c, d = F
+    full = ((a, b, 0.0), (c, d, 0.0), (0.0, 0.0, stretch))
+    return material.isochoric_energy(full) + material.volumetric_energy(
+        (a * d - b * c) * stretch
     )
 
 
-def stack(F: Planar) -> Float[Array, "2 2 ..."]:
-    return jnp.stack([jnp.stack(row) for row in F])
+def _thickness_step(material, F: Gradient, log_stretch: Entry) -> Entry:
+    """Newton step for the logarithm of the stretch out of the plane."""
+
+    def slope(s):
+        return jax.grad(lambda s: jnp.sum(_sheet_energy(material, F, jnp.exp(s))))(s)
+
+    value, rate = jax.jvp(slope, (log_stretch,), (jnp.ones_like(log_stretch),))
+    return -value / jax.lax.stop_gradient(rate)
 
 
-def unstack(F: Float[Array, "2 2 ..."]) -> Planar:
-    return ((F[0, 0], F[0, 1]), (F[1, 0], F[1, 1]))
+class Axisymmetric(AbstractKinematics):
+    """A body of revolution about the y axis: x is the radius; forces are those of the
+    whole body."""
+
+    dim: ClassVar[int] = 2
+    slots: ClassVar[tuple[Slot, ...]] = (*_square(2), Slot(0, 2, 2, 2))
+    num_columns: ClassVar[int] = 3
+    has_volume: ClassVar[bool] = True
+    num_rigid_modes: ClassVar[int] = 1
+
+    def embed(self, F: Gradient) -> Tensor:
+        a, b, c, d, hoop = F
+        return ((a, b, 0.0), (c, d, 0.0), (0.0, 0.0, hoop))
+
+    def depth(self, position) -> Entry:
+        return 2 * jnp.pi * position[0]
+
+
+class Solid(AbstractKinematics):
+    """A body in space."""
+
+    dim: ClassVar[int] = 3
+    slots: ClassVar[tuple[Slot, ...]] = _square(3)
+    num_columns: ClassVar[int] = 3
+    has_volume: ClassVar[bool] = True
+    num_rigid_modes: ClassVar[int] = 6
+
+    def embed(self, F: Gradient) -> Tensor:
+        return (F[:3], F[3:6], F[6:])  # type: ignore[return-value]
+
+    def depth(self, position) -> Entry:
+        return jnp.ones((), jnp.result_type(float))
+
+
+def _check_thickness(where: str, thickness) -> None:
+    _check.positive(where, "thickness", thickness, "m", "Write 20 * mm, for example.")
+
+
+def identity(kinematics: AbstractKinematics) -> tuple[float, ...]:
+    """The kept entries of F at rest."""
+    return tuple(float(s.row == s.col) for s in kinematics.slots)

@@ -9,21 +9,22 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax.fem import assemble as asm
+from sorojax.fem.curved import CurvedPart, group_matrices
 from sorojax.fem.energy_form import load_force
-from sorojax.fem.loads import CurvedPart
+from sorojax.fem.geometry import Geometry, geometry
 from sorojax.fem.problem import Problem
 from sorojax.fem.supports import known_dofs
 from sorojax.math import sparse
 
 
 class Prepared(NamedTuple):
-    """What one solve computes once: shape gradients, known unknowns, slots of facets, and
-    the size of the largest cell [m]."""
+    """What one solve computes once: shape gradients, known unknowns, slots of load stiffness,
+    and the size of the largest cell [m]."""
 
-    geometry: asm.Geometry
+    geometry: Geometry
     known: Bool[Array, " dofs"]
     length: Float[Array, ""]
-    facet_slots: tuple[Int[Array, "facets entries"], ...]
+    group_slots: tuple[Int[Array, "groups entries"], ...]
 
 
 class Linearised(NamedTuple):
@@ -42,17 +43,20 @@ class Linearised(NamedTuple):
 
 
 def prepare(problem: Problem) -> Prepared:
-    """Geometry and index maps of `problem` (facet slots on the host, once per solve)."""
+    """Geometry and index maps of `problem` (slots of loads on the host, once per solve)."""
     dim = problem.mesh.element.dim
-    geometry = asm.geometry(problem.space, problem.kinematics, problem.mesh.points)
     known = known_dofs(problem.supports, problem.mesh.num_nodes, dim)
     slots = []
     for part in _curved_parts(problem):
-        facets = np.asarray(part.facets)
-        dofs = (facets[:, :, None] * dim + np.arange(dim)).reshape(len(facets), -1)
+        groups = np.asarray(part.groups)
+        dofs = (groups[:, :, None] * dim + np.arange(dim)).reshape(len(groups), -1)
         slots.append(sparse.slots_of(problem.space.system, dofs))
-    cell_areas = jnp.sum(geometry.volumes, axis=1) / problem.kinematics.depth
-    return Prepared(geometry, jnp.asarray(known), jnp.sqrt(jnp.max(cell_areas)), tuple(slots))
+    return Prepared(
+        geometry(problem.space, problem.kinematics, problem.formulation, problem.mesh.points),
+        jnp.asarray(known),
+        jnp.max(jnp.ptp(problem.mesh.points[problem.mesh.cells], axis=1)),
+        tuple(slots),
+    )
 
 
 @eqx.filter_jit
@@ -91,15 +95,9 @@ def _curved_parts(problem: Problem) -> list[CurvedPart]:
 
 
 def _add_load_stiffness(problem, prepared, u, values):
-    for part, slots in zip(_curved_parts(problem), prepared.facet_slots, strict=True):
-        x = (problem.mesh.points + u)[part.facets]
-
-        def energy(flat, part=part, shape=x.shape[1:]):
-            return part.energy(flat.reshape(shape))
-
-        matrices = jax.vmap(jax.hessian(energy))(x.reshape(len(x), -1))
-        first, second = np.triu_indices(matrices.shape[-1])
-        values = values.at[slots].add(matrices[:, first, second])
+    for part, slots in zip(_curved_parts(problem), prepared.group_slots, strict=True):
+        x = (problem.mesh.points + u)[part.groups]
+        values = values.at[slots].add(group_matrices(part, x))
     return values
 
 

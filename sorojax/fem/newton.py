@@ -92,11 +92,20 @@ def _advance(problem: Problem, prepared: Prepared, u: np.ndarray, du: np.ndarray
     new = u + du
     state = _linearise(problem, prepared, new, u)
     if not float(state.volume_ratio) > 0.1:
-        fraction = 0.9 * float(
-            asm.largest_step(problem.space, prepared.geometry, jnp.asarray(u), jnp.asarray(du))
-        )
-        new = u + fraction * du
+        new = u + safe_fraction(problem, prepared, u, du) * du
         state = _linearise(problem, prepared, new, u)
+    return new, u, state, relative_size(prepared, new, du)
+
+
+def safe_fraction(problem: Problem, prepared: Prepared, u: np.ndarray, du: np.ndarray) -> float:
+    """Fraction of a step that keeps more than a tenth of every volume."""
+    fraction = asm.largest_step(
+        problem.space, prepared.geometry, problem.kinematics, jnp.asarray(u), jnp.asarray(du)
+    )
+    return 0.9 * float(fraction)
+
+
+def relative_size(prepared: Prepared, u: np.ndarray, du: np.ndarray) -> float:
+    """Largest entry of a step over that of the displacement."""
     # without load the displacement is rounding alone, which never gets relatively small
-    scale = np.abs(new).max() + 1e-9 * float(prepared.length)
-    return new, u, state, np.abs(du).max() / scale
+    return np.abs(du).max() / (np.abs(u).max() + 1e-9 * float(prepared.length))

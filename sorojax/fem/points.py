@@ -1,49 +1,130 @@
-"""Fields at the quadrature points of all cells at once, made for differentiation.
+"""Fields at points of all cells at once, made for differentiation by parameters.
 
-One product takes nodal values to reference gradients; the rest is elementwise.
+One product takes nodal values to reference gradients; the rest is elementwise, with
+entries of shape (points, cells).
 """
+
+import functools
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from sorojax.fem.kinematics import Planar, determinant
+from sorojax.fem.formulation import AbstractFormulation, Modes, modes
+from sorojax.fem.geometry import polygon_boundary, three
+from sorojax.fem.kinematics import AbstractKinematics, identity
+from sorojax.fem.tables import Tables, node_tables, quadrature_tables
+from sorojax.fem.tensor import Entries, inverse
+from sorojax.material.kinematics import Entry, Tensor, determinant
+from sorojax.mesh.elements import PolyN
 from sorojax.mesh.mesh import Mesh
-from sorojax.mesh.shape import quadrature, shape_functions, shape_gradients
 
 
-def _reference_gradients(mesh: Mesh, nodal: Float[Array, "nodes dim"], at=None) -> Planar:
-    """d(nodal)_i / d(xi)_d at reference points, entries (points, cells)."""
-    at = quadrature(mesh.element).points if at is None else at
-    slopes = jnp.asarray(shape_gradients(mesh.element, at))
-    by_cell = jnp.moveaxis(nodal.T[:, mesh.cells], -1, 1)  # dim, nodes, cells
-    all_ = jnp.einsum("qad,iac->idqc", slopes, by_cell)
-    return ((all_[0, 0], all_[0, 1]), (all_[1, 0], all_[1, 1]))
+class Points(NamedTuple):
+    """Points of all cells: inverse of dX/dxi, reference volumes [m^3] and positions [m]."""
+
+    back: Tensor
+    volumes: Float[Array, "quad cells"]
+    position: Float[Array, "dim quad cells"]
+    tables: Tables
+    kinds: Int[Array, " cells"] | None
 
 
-def point_areas(mesh: Mesh) -> Float[Array, "quad cells"]:
-    """Reference area of every quadrature point [m^2]."""
-    weights = jnp.asarray(quadrature(mesh.element).weights)[:, None]
-    return weights * determinant(_reference_gradients(mesh, mesh.points))
+def quadrature_points(mesh: Mesh, kinematics: AbstractKinematics) -> Points:
+    """The quadrature points of the stiffness."""
+    return _points(mesh, kinematics, quadrature_tables(mesh.element))
 
 
-def deformation_gradients(
-    mesh: Mesh,
-    u: Float[Array, "nodes dim"],
-    at: Float[np.ndarray, "quad dim"] | None = None,
-) -> Planar:
-    """F, entries (points, cells), at the quadrature points or at reference points `at`."""
-    (a, b), (c, d) = _reference_gradients(mesh, mesh.points, at)
-    J = a * d - b * c
-    inverse = ((d / J, -b / J), (-c / J, a / J))
-    h = _reference_gradients(mesh, u, at)
-    grad = [
-        [h[i][0] * inverse[0][j] + h[i][1] * inverse[1][j] for j in range(2)] for i in range(2)
+def node_points(mesh: Mesh, kinematics: AbstractKinematics) -> Points:
+    """The nodes of every cell; their volumes mean nothing."""
+    return _points(mesh, kinematics, node_tables(mesh.element))
+
+
+def points_of(mesh: Mesh, kinematics: AbstractKinematics, tables: Tables) -> Points:
+    """The points of another rule, one table for all cells or one per kind of polygon."""
+    return _points(mesh, kinematics, tables)
+
+
+def pressure_modes(formulation: AbstractFormulation, points: Points) -> Modes | None:
+    """Orthonormal pressure functions at the quadrature points of all cells."""
+    return modes(formulation, points.position, points.volumes)
+
+
+def _points(mesh: Mesh, kinematics: AbstractKinematics, tables: Tables) -> Points:
+    kinds = None
+    if isinstance(mesh.element, PolyN):  # the number of corners; the last is repeated
+        kinds = 1 + jnp.sum(mesh.cells[:, 1:] != mesh.cells[:, :-1], axis=1)
+    x = _by_cell(mesh, mesh.points)
+    jac = _slopes(tables, kinds, x)
+    full = three([[jac[i, d] for d in range(mesh.element.dim)] for i in range(len(jac))])
+    weights = _of_cells(tables.weights, kinds)
+    areas = determinant(full) * weights
+    if kinds is not None:
+        area, _ = polygon_boundary(x, kinds)
+        areas = areas * (area / jnp.sum(areas, axis=0, keepdims=True))
+    position = _interpolate(tables, kinds, x)
+    volumes = areas * kinematics.depth(tuple(position))
+    return Points(inverse(full), volumes, position, tables, kinds)
+
+
+def deformation(
+    mesh: Mesh, kinematics: AbstractKinematics, points: Points, u: Float[Array, "nodes dim"]
+) -> Entries:
+    """Kept entries of F at the points."""
+    dim = mesh.element.dim
+    by_cell = _by_cell(mesh, u)
+    reference = _slopes(points.tables, points.kinds, by_cell)
+    slopes = [
+        [
+            functools.reduce(jnp.add, (reference[i, d] * points.back[d][j] for d in range(dim)))
+            for j in range(dim)
+        ]
+        for i in range(dim)
     ]
-    return ((grad[0][0] + 1, grad[0][1]), (grad[1][0], grad[1][1] + 1))
+    if points.kinds is not None:
+        slopes = _corrected(mesh, kinematics, points, by_cell, slopes)
+    if kinematics.num_columns > dim:
+        radial = _interpolate(points.tables, points.kinds, by_cell[:1])[0]
+        slopes[0].append(radial / points.position[0])
+    kept = jnp.stack([slopes[s.component][s.column] for s in kinematics.slots])
+    return kept + jnp.asarray(identity(kinematics), kept.dtype)[:, None, None]
 
 
-def integral(mesh: Mesh, nodal: Float[Array, "nodes dim"]) -> Float[Array, "cells dim"]:
-    """Integral of a nodal field over every cell, per depth."""
-    N = jnp.asarray(shape_functions(mesh.element, quadrature(mesh.element).points))
-    return jnp.einsum("qc,qa,cai->ci", point_areas(mesh), N, nodal[mesh.cells])
+def interpolated(mesh: Mesh, points: Points, nodal: Float[Array, "nodes dim"]) -> Entry:
+    """A nodal field at the points, (dim, quad, cells)."""
+    return _interpolate(points.tables, points.kinds, _by_cell(mesh, nodal))
+
+
+def _corrected(mesh: Mesh, kinematics: AbstractKinematics, points: Points, by_cell, slopes):
+    """Polygons: slopes whose mean over a cell is that of its boundary."""
+    area, sides = polygon_boundary(_by_cell(mesh, mesh.points), points.kinds)  # type: ignore
+    share = points.volumes / kinematics.depth(tuple(points.position)) / area
+
+    def fixed(slope, nodal, side):
+        exact = jnp.sum(nodal * side, axis=0, keepdims=True) / area
+        return slope + exact - jnp.sum(share * slope, axis=0, keepdims=True)
+
+    return [[fixed(slopes[i][j], by_cell[i], sides[j]) for j in range(2)] for i in range(2)]
+
+
+def _by_cell(mesh: Mesh, nodal: Float[Array, "nodes dim"]):
+    return jnp.moveaxis(nodal.T[:, mesh.cells], -1, 1)  # dim, nodes, cells
+
+
+def _slopes(tables: Tables, kinds, by_cell) -> Float[Array, "dim dim_ref quad cells"]:
+    if kinds is None:
+        return jnp.einsum("qad,iac->idqc", jnp.asarray(tables.slopes[0]), by_cell)
+    return jnp.einsum("cqad,iac->idqc", jnp.asarray(tables.slopes)[kinds], by_cell)
+
+
+def _interpolate(tables: Tables, kinds, by_cell) -> Float[Array, "dim quad cells"]:
+    if kinds is None:
+        return jnp.einsum("qa,iac->iqc", jnp.asarray(tables.values[0]), by_cell)
+    return jnp.einsum("cqa,iac->iqc", jnp.asarray(tables.values)[kinds], by_cell)
+
+
+def _of_cells(table: np.ndarray, kinds):
+    if kinds is None:
+        return jnp.asarray(table[0])[:, None]
+    return jnp.asarray(table)[kinds].T

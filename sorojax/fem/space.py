@@ -13,10 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sorojax._types import is_traced
 from sorojax.math import sparse
-from sorojax.mesh.elements import AbstractElement
-from sorojax.mesh.mesh import Mesh
-
-_BLOCK = 64  # cells per block: the working set of a block stays in the cache
+from sorojax.mesh.elements import AbstractElement, PolyN
+from sorojax.mesh.mesh import Mesh, valences
 
 
 class Space(eqx.Module):
@@ -24,6 +22,8 @@ class Space(eqx.Module):
 
     Arrays over cells are kept in blocks with the cell axis last, padded by repeats of
     cell 0 that `real` switches off. Unknown `dim * node + component` is a displacement.
+    `slots` follows the order of `block_entries`; `kinds` numbers the shape tables of the
+    cells where they differ.
     """
 
     system: sparse.SparseSymmetric
@@ -31,8 +31,10 @@ class Space(eqx.Module):
     ids: Int[Array, "blocks lanes"]
     real: Bool[Array, "blocks lanes"]
     slots: Int[Array, "blocks entries lanes"]
+    kinds: Int[Array, "blocks lanes"] | None
     element: AbstractElement
     num_nodes: int = eqx.field(static=True)
+    num_cells: int = eqx.field(static=True)
 
     @property
     def dim(self) -> int:
@@ -43,8 +45,14 @@ class Space(eqx.Module):
         return self.num_nodes * self.element.dim
 
 
-def space(mesh: Mesh) -> Space:
-    """The displacement space of `mesh`.
+def lanes_per_block(element: AbstractElement) -> int:
+    """Cells per block: the working set of a block stays in the cache."""
+    return 64 if element.dim == 2 else 32
+
+
+def space(mesh: Mesh, loads: tuple[Any, ...] = ()) -> Space:
+    """The displacement space of `mesh`, with room for the stiffness of `loads` that couple
+    nodes of different cells (springs, tendons, rigid parts).
 
     Raises:
         ValueError: If the cells are traced: topology is fixed before any trace.
@@ -54,27 +62,51 @@ def space(mesh: Mesh) -> Space:
             "fem.space: `mesh.cells` is traced, need concrete cells. Build the space "
             "outside jit and grad, and replace only `mesh.points` inside."
         )
-    cells = np.asarray(mesh.cells)
-    system = sparse.from_cells(mesh.num_nodes, cells, mesh.element.dim)
-    num_blocks = -(-len(cells) // _BLOCK)
-    ids = np.zeros(num_blocks * _BLOCK, np.int32)
+    cells, width = np.asarray(mesh.cells), lanes_per_block(mesh.element)
+    more = tuple(group for load in loads if (group := load.couples()) is not None)
+    system = sparse.from_cells(mesh.num_nodes, cells, mesh.element.dim, more)
+    num_blocks = -(-len(cells) // width)
+    ids = np.zeros(num_blocks * width, np.int32)
     ids[: len(cells)] = np.arange(len(cells))
     real = np.arange(len(ids)) < len(cells)
-    slots = np.where(real[:, None], np.asarray(system.slots)[ids], system.num_values)
+    slots = np.asarray(system.slots)[:, block_entries(mesh.element)]
+    slots = np.where(real[:, None], slots[ids], system.num_values)
+    polygons = isinstance(mesh.element, PolyN)
     return Space(
         system=system,
-        cells=_blocked(cells[ids].astype(np.int32)),
-        ids=jnp.asarray(ids.reshape(num_blocks, _BLOCK)),
-        real=jnp.asarray(real.reshape(num_blocks, _BLOCK)),
-        slots=_blocked(slots.astype(np.int32)),
+        cells=_blocked(cells[ids].astype(np.int32), width),
+        ids=jnp.asarray(ids.reshape(num_blocks, width)),
+        real=jnp.asarray(real.reshape(num_blocks, width)),
+        slots=_blocked(slots.astype(np.int32), width),
+        kinds=jnp.asarray(valences(mesh)[ids].reshape(num_blocks, width)) if polygons else None,
         element=mesh.element,
         num_nodes=mesh.num_nodes,
+        num_cells=len(cells),
     )
 
 
-def _blocked(rows: np.ndarray) -> jax.Array:
+def block_entries(element: AbstractElement) -> Int[np.ndarray, " entries"]:
+    """Where the entries of component blocks lie in the upper triangle of a cell's matrix.
+
+    Blocks come for pairs of components i <= k; a block of i < k holds all pairs of nodes row
+    by row, one of i = k those with first <= second.
+    """
+    n, dim = element.num_nodes, element.dim
+    size = n * dim
+    number = np.zeros((size, size), int)
+    number[np.triu_indices(size)] = np.arange(size * (size + 1) // 2)
+    number = np.maximum(number, number.T)
+    rows = []
+    for i in range(dim):
+        for k in range(i, dim):
+            block = number[i::dim, k::dim]
+            rows.append(block[np.triu_indices(n)] if i == k else block.ravel())
+    return np.concatenate(rows)
+
+
+def _blocked(rows: np.ndarray, width: int) -> jax.Array:
     """(cells, n) as (blocks, n, lanes)."""
-    blocks = rows.reshape(-1, _BLOCK, rows.shape[1])
+    blocks = rows.reshape(-1, width, rows.shape[1])
     return jnp.asarray(np.ascontiguousarray(np.moveaxis(blocks, 1, -1)))
 
 

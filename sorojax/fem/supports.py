@@ -1,26 +1,33 @@
 """Supports: which displacements are known, and their values."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sorojax._types import integers, real
+from sorojax._types import integers, optional_real, real
 
 
 class AbstractSupport(eqx.Module):
-    """Known displacement components of a set of nodes."""
+    """Known displacement components of a set of nodes; all of them when `None`.
+
+    `ramped` names the field that grows from zero while a load is stepped up.
+    """
 
     nodes: eqx.AbstractVar[Int[Array, " nodes"]]
     displacement: eqx.AbstractVar[Float[Array, "..."]]
-    components: eqx.AbstractVar[tuple[int, ...]]
+    components: eqx.AbstractVar[tuple[int, ...] | None]
+    ramped: ClassVar[str | None] = None
 
 
 class Fixed(AbstractSupport):
-    """Nodes that do not move; `components=(0,)` lets them slide along y."""
+    """Nodes that do not move; `components=(0,)` lets them slide in the plane x = const,
+    the condition of symmetry."""
 
     nodes: Int[Array, " nodes"] = eqx.field(converter=integers)
-    components: tuple[int, ...] = eqx.field(static=True, default=(0, 1))
+    components: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
     @property
     def displacement(self) -> Float[Array, ""]:
@@ -28,18 +35,74 @@ class Fixed(AbstractSupport):
 
 
 class Prescribed(AbstractSupport):
-    """Nodes moved by `displacement` [m], one vector for all or one per node."""
+    """Nodes moved by `displacement` [m], one vector for all or one per node, with one entry
+    per known component."""
 
     nodes: Int[Array, " nodes"] = eqx.field(converter=integers)
     displacement: Float[Array, "..."] = eqx.field(converter=real)
-    components: tuple[int, ...] = eqx.field(static=True, default=(0, 1))
+    components: tuple[int, ...] | None = eqx.field(static=True, default=None)
+    ramped: ClassVar[str | None] = "displacement"
+
+
+class Rotated(AbstractSupport):
+    """Nodes turned by `angle` [rad] about the point `about` [m], along arcs: all their
+    displacements are those of `rotated(points, angle, about, axis)`.
+
+    `points` [m] are those of the nodes in the reference configuration, `mesh.points[nodes]`.
+    """
+
+    nodes: Int[Array, " nodes"] = eqx.field(converter=integers)
+    points: Float[Array, "nodes dim"] = eqx.field(converter=real)
+    angle: Float[Array, ""] = eqx.field(converter=real)
+    about: Float[Array, " dim"] = eqx.field(converter=real)
+    axis: Float[Array, "3"] | None = eqx.field(converter=optional_real, default=None)
+    components: ClassVar[tuple[int, ...] | None] = None
+    ramped: ClassVar[str | None] = "angle"
+
+    @property
+    def displacement(self) -> Float[Array, "nodes dim"]:
+        return rotated(self.points, self.angle, self.about, self.axis)
+
+
+def rotated(
+    points: Float[Array, "nodes dim"],
+    angle: Float[Array, ""] | float,
+    about: Float[Array, " dim"],
+    axis: Float[Array, "3"] | None = None,
+) -> Float[Array, "nodes dim"]:
+    """Displacement [m] of `points` [m] that turn by `angle` [rad] about the point `about`,
+    counter-clockwise in the plane, about the direction `axis` in space.
+
+    Differentiable; `Prescribed(nodes, rotated(mesh.points[nodes], angle, about))` holds nodes
+    there, `Rotated` also takes them along the arc while the load is stepped up.
+
+    Raises:
+        ValueError: If a point in space has no axis, or one in the plane has one.
+    """
+    points, angle, about, axis = real(points), real(angle), real(about), optional_real(axis)
+    if (axis is None) != (points.shape[-1] == 2):
+        raise ValueError(
+            f"fem.rotated: got points of dimension {points.shape[-1]} and axis={axis}, need an "
+            "axis in space and none in the plane. Write axis=(0.0, 0.0, 1.0) in space."
+        )
+    arm = points - about[None]
+    if axis is None:
+        across = jnp.stack([-arm[:, 1], arm[:, 0]], axis=1)
+        return jnp.sin(angle) * across - (1 - jnp.cos(angle)) * arm
+    direction = jnp.broadcast_to(axis / jnp.sqrt(jnp.sum(axis**2)), arm.shape)
+    across = jnp.cross(direction, arm)
+    return jnp.sin(angle) * across + (1 - jnp.cos(angle)) * jnp.cross(direction, across)
+
+
+def known_components(support: AbstractSupport, dim: int) -> tuple[int, ...]:
+    return tuple(range(dim)) if support.components is None else support.components
 
 
 def known_dofs(supports: tuple[AbstractSupport, ...], num_nodes: int, dim: int) -> np.ndarray:
     """Mask of the unknowns that supports decide (host array)."""
     mask = np.zeros((num_nodes, dim), bool)
     for support in supports:
-        for component in support.components:
+        for component in known_components(support, dim):
             mask[np.asarray(support.nodes), component] = True
     return mask.ravel()
 
@@ -50,7 +113,7 @@ def known_values(
     """Displacements that supports decide [m], zero elsewhere; differentiable."""
     values = jnp.zeros((num_nodes, dim), jnp.result_type(float))
     for support in supports:
-        for column, component in enumerate(support.components):
+        for column, component in enumerate(known_components(support, dim)):
             moved = support.displacement
             entry = moved if moved.ndim == 0 else moved[..., column]
             values = values.at[support.nodes, component].set(entry)

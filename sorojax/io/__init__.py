@@ -1,5 +1,6 @@
-"""Files: surfaces and contours in and out."""
+"""Files: surfaces, contours and meshes in and out."""
 
+from sorojax.io.mesh import export_mesh as export_mesh, import_mesh as import_mesh
 from sorojax.io.surface import (
     export_contour as export_contour,
     export_surface as export_surface,

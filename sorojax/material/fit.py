@@ -1,65 +1,152 @@
 """Hyperelastic coefficients from uniaxial tensile tests."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from sorojax import _check
-from sorojax.material.hyperelastic import Yeoh, bulk_modulus
+from sorojax.material import checks
+from sorojax.material.hyperelastic import AbstractHyperelastic
+from sorojax.material.ogden import Ogden
+from sorojax.material.rubbers import (
+    Gent,
+    MooneyRivlin,
+    NeoHookean,
+    Yeoh,
+    locking_stretch,
+)
+from sorojax.material.stability import Stability, drucker_stability
+from sorojax.material.tensile import Curve, build, fit_curve, modulus_at_rest
+
+MODELS = (NeoHookean, MooneyRivlin, Yeoh, Gent, Ogden)
+FEWEST = {NeoHookean: 1, MooneyRivlin: 2, Yeoh: 3, Gent: 2}  # numbers per model
 
 
 @dataclass(frozen=True)
 class TensileFit:
     """A fitted material with the range that it is good for.
 
-    `rms` is the root-mean-square error of engineering stress [Pa], `strain_range`
-    the fitted strains, and `stable_stretch` the uniaxial stretch at which the fitted
-    stiffness turns negative (infinite if it never does below a stretch of 20).
+    `rms` is the root-mean-square error of engineering stress [Pa], `relative_rms` its
+    ratio to the root-mean-square stress, `strain_range` the fitted strains, `spread` the
+    scatter between repeats where all have data (root-mean-square standard deviation over
+    root-mean-square mean, NaN for one repeat), and `stable_stretch` the uniaxial stretch
+    at which the fitted stiffness turns negative (infinite if it never does below a
+    stretch of 20). `stability` has Drucker's criterion in three tests.
     """
 
-    material: Yeoh
+    material: Any
     rms: float
     strain_range: tuple[float, float]
     stable_stretch: float
-
-
-def _design(stretch: np.ndarray) -> np.ndarray:
-    """Columns: engineering stress per unit c1, c2, c3 of an incompressible Yeoh bar."""
-    x = stretch**2 + 2 / stretch - 3
-    slope = 2 * (stretch - stretch**-2)
-    return slope[:, None] * np.stack([np.ones_like(x), 2 * x, 3 * x**2], axis=1)
+    relative_rms: float
+    spread: float
+    num_repeats: int
+    stability: Stability
 
 
 def fit_tensile(
-    strain: Float[np.ndarray, " points"],
-    stress: Float[np.ndarray, " points"],
+    strain: Float[np.ndarray, " points"] | Sequence[Any],
+    stress: Float[np.ndarray, " points"] | Sequence[Any],
     *,
+    model: type[AbstractHyperelastic] = Yeoh,
+    terms: int = 2,
+    stable: bool = False,
+    weights: Float[np.ndarray, " points"] | Sequence[Any] | None = None,
     poisson_ratio: float = 0.49,
     density: float | None = None,
 ) -> TensileFit:
-    """Yeoh coefficients by linear least squares on engineering stress.
+    """Coefficients by least squares on engineering stress.
 
-    The bar is taken as incompressible, sigma = 2 (l - l^-2) (c1 + 2 c2 x + 3 c3 x^2)
-    with x = l^2 + 2/l - 3; `poisson_ratio` only sets the bulk modulus of the result.
+    The bar is taken as incompressible, for `Yeoh`
+    sigma = 2 (l - l^-2) (c1 + 2 c2 x + 3 c3 x^2) with x = l^2 + 2/l - 3; `poisson_ratio`
+    only sets the bulk modulus of the result. Repeats count equally whatever their
+    number of points. `Ogden` and `Gent` always come out stable: mu_p alpha_p > 0 (terms
+    that come out zero are dropped) and exponents from 0.5 to 20, because a tensile test
+    cannot tell alpha from -alpha/2, which is far too stiff in equibiaxial tension.
 
     Args:
-        strain: Engineering strain [-], 1.0 is 100 %.
-        stress: Engineering stress [Pa].
+        strain: Engineering strain [-], 1.0 is 100 %; or one list per repeat.
+        stress: Engineering stress [Pa]; or one list per repeat.
+        model: NeoHookean, MooneyRivlin, Yeoh, Gent or Ogden.
+        terms: Terms of `Ogden`, 1 to 3.
+        stable: Allow no negative coefficient, so that the fit is stable everywhere.
+        weights: Weight per point; 1 everywhere unless given.
         poisson_ratio: Small-strain ratio of the returned material, below 0.5.
         density: Mass per reference volume [kg/m^3].
 
     Raises:
-        ValueError: If there are fewer than three points, or they do not determine a
-            material with a positive modulus.
+        ValueError: If there are too few points, they do not determine a material with
+            a positive modulus, or the fit is unstable within the measured deformation
+            in tension, equibiaxial tension or pure shear.
 
-    Reference: Yeoh, Rubber Chem. Technol. 66, 1993.
+    Reference: Yeoh, Rubber Chem. Technol. 66, 1993; Ogden, Saccomandi & Sgura, Comput.
+    Mech. 34, 2004.
     """
+    checks.poisson_ratio("fit_tensile", poisson_ratio)
+    need = _needed(model, terms)
+    repeats = _repeats(strain, stress, weights, need)
+    strains, stresses, weight = (np.concatenate(part) for part in zip(*repeats, strict=True))
+    curve = fit_curve(model, terms, stable, 1 + strains, stresses, weight)
+    modulus = modulus_at_rest(curve)
+    if not modulus > 0:
+        raise ValueError(
+            f"fit_tensile: the fit gives a modulus of {modulus:.3g} Pa at rest, need a "
+            "positive modulus at rest. Add points at small strain, or pass stable=True."
+        )
+    material = build(model, curve, poisson_ratio, density)
+    rms = float(np.sqrt(np.mean((curve(1 + strains) - stresses) ** 2)))
+    fit = TensileFit(
+        material=material,
+        rms=rms,
+        strain_range=(float(strains.min()), float(strains.max())),
+        stable_stretch=_stable_stretch(curve, material),
+        relative_rms=rms / float(np.sqrt(np.mean(stresses**2))),
+        spread=_spread(repeats),
+        num_repeats=len(repeats),
+        stability=drucker_stability(material, limit=max(3.0, 1.2 * float(1 + strains.max()))),
+    )
+    _check_stable(fit)
+    return fit
+
+
+def _needed(model, terms: int) -> int:
+    if model not in MODELS:
+        name = getattr(model, "__name__", repr(model))
+        raise ValueError(
+            f"fit_tensile: `model` is {name}, need one of "
+            f"{', '.join(m.__name__ for m in MODELS)}. Fit others with an optimiser on "
+            "uniaxial_stress."
+        )
+    if model is Ogden and terms not in (1, 2, 3):
+        raise ValueError(f"fit_tensile: `terms` is {terms}, need 1, 2 or 3. Ogden takes 2.")
+    return 2 * terms if model is Ogden else FEWEST[model]
+
+
+def _repeats(strain, stress, weights, need: int) -> list[tuple[np.ndarray, ...]]:
+    """(strain, stress, weight) of every repeat; the weights of each have mean 1 / points."""
+    several = np.ndim(strain[0]) > 0
+    strains, stresses = (strain, stress) if several else ([strain], [stress])
+    given = (
+        (weights if several else [weights]) if weights is not None else [None] * len(strains)
+    )
+    if not len(strains) == len(stresses) == len(given):
+        raise ValueError(
+            f"fit_tensile: got {len(strains)} strain, {len(stresses)} stress and {len(given)} "
+            "weight lists, need one of each per repeat. Repeat by repeat, in one order."
+        )
+    parts = zip(strains, stresses, given, strict=True)
+    return [_repeat(*part, need, len(strains)) for part in parts]
+
+
+def _repeat(strain, stress, weight, need: int, count: int) -> tuple[np.ndarray, ...]:
     strain, stress = np.asarray(strain, float), np.asarray(stress, float)
-    if strain.shape != stress.shape or strain.ndim != 1 or len(strain) < 3:
+    if strain.shape != stress.shape or strain.ndim != 1 or len(strain) < need:
         raise ValueError(
             f"fit_tensile: got strain {strain.shape} and stress {stress.shape}, need two "
-            "equal lists of at least 3 points: three coefficients are fitted."
+            f"equal lists of at least {need} points: {need} numbers are fitted."
         )
     _check.finite("fit_tensile", "strain, stress", np.stack([strain, stress]), "Drop NaN.")
     if np.any(strain <= -1) or np.max(np.abs(strain)) > 20:
@@ -67,26 +154,55 @@ def fit_tensile(
             f"fit_tensile: strains {strain.min():g} to {strain.max():g} are not engineering "
             "strains of a tensile test; divide percent by 100."
         )
-    stretch = 1 + strain
-    columns = _design(stretch)
-    coefficients, *_ = np.linalg.lstsq(columns, stress, rcond=None)
-    if coefficients[0] <= 0:
+    weight = np.ones_like(strain) if weight is None else np.asarray(weight, float)
+    if weight.shape != strain.shape or not np.all(weight >= 0) or not np.any(weight > 0):
         raise ValueError(
-            f"fit_tensile: the fit gives c1 = {coefficients[0]:.3g} Pa, need a positive "
-            "modulus at rest. Add points at small strain."
+            f"fit_tensile: got weights {weight.shape} for {len(strain)} points, need one per "
+            "point, none negative. Leave `weights` out to weigh all points alike."
         )
-    rms = float(np.sqrt(np.mean((columns @ coefficients - stress) ** 2)))
-    c1, c2, c3 = coefficients
-    bulk = bulk_modulus(2 * c1, poisson_ratio)
-    return TensileFit(
-        material=Yeoh(c1, c2, c3, bulk, density),
-        rms=rms,
-        strain_range=(float(strain.min()), float(strain.max())),
-        stable_stretch=_stable_stretch(coefficients),
-    )
+    return strain, stress, weight / (np.mean(weight) * (len(strain) if count > 1 else 1))
 
 
-def _stable_stretch(coefficients: np.ndarray) -> float:
-    stretch = np.linspace(1.0, 20.0, 4000)
-    falling = np.flatnonzero(np.diff(_design(stretch) @ coefficients) <= 0)
+def _stable_stretch(curve: Curve, material) -> float:
+    end = 20.0
+    if isinstance(material, Gent):  # beyond the pole the formula is none
+        end = min(end, 0.999 * float(locking_stretch(material)))
+    stretch = np.linspace(1.0, end, 4000)
+    falling = np.flatnonzero(np.diff(curve(stretch)) <= 0)
     return float(stretch[falling[0]]) if len(falling) else float("inf")
+
+
+def _spread(repeats) -> float:
+    if len(repeats) < 2:
+        return float("nan")
+    low = max(strain.min() for strain, *_ in repeats)
+    high = min(strain.max() for strain, *_ in repeats)
+    at = np.linspace(low, high, 101)
+    curves = np.stack(
+        [np.interp(at, *(v[np.argsort(e)] for v in (e, s))) for e, s, _ in repeats]
+    )
+    deviation = np.sqrt(np.mean(np.var(curves, axis=0, ddof=1)))
+    return float(deviation / np.sqrt(np.mean(np.mean(curves, axis=0) ** 2)))
+
+
+def _check_stable(fit: TensileFit) -> None:
+    """Compare with the largest stretch of each test that has the measured I1."""
+    measured = 1 + fit.strain_range[1]
+    if measured <= 1:
+        return
+    first = measured**2 + 2 / measured
+    grid = np.linspace(1.0, measured, 2001)
+    same_biaxial = grid[np.searchsorted(2 * grid**2 + grid**-4, first) - 1]
+    same_shear = grid[np.searchsorted(1 + grid**2 + grid**-2, first) - 1]
+    tests = {
+        "tension": (min(fit.stable_stretch, fit.stability.uniaxial[1] * 1.02), measured),
+        "equibiaxial tension": (fit.stability.equibiaxial[1] * 1.02, same_biaxial),
+        "pure shear": (fit.stability.pure_shear[1] * 1.02, same_shear),
+    }
+    for name, (reached, needed) in tests.items():
+        if reached < needed:
+            raise ValueError(
+                f"fit_tensile: the fitted {type(fit.material).__name__} is unstable in {name} "
+                f"from a stretch of {reached:.3g}, need {needed:.3g}, which the data "
+                "cover. Pass stable=True, fit a smaller strain range, or another model."
+            )

@@ -41,6 +41,28 @@ def from_matrix(F: Float[Array, "3 3"]) -> Tensor:
     return tuple(tuple(F[i, j] for j in range(3)) for i in range(3))  # type: ignore
 
 
+def is_planar(F: Tensor) -> bool:
+    """Whether the third direction is a principal one because its shears are absent."""
+    return all(absent(entry) for entry in (F[0][2], F[1][2], F[2][0], F[2][1]))
+
+
+def cofactor(F: Tensor) -> Tensor:
+    """dJ/dF."""
+    rows = []
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        rows.append(
+            tuple(
+                minus(
+                    times(F[j][(m + 1) % 3], F[k][(m + 2) % 3]),
+                    times(F[j][(m + 2) % 3], F[k][(m + 1) % 3]),
+                )
+                for m in range(3)
+            )
+        )
+    return tuple(rows)
+
+
 def determinant(F: Tensor) -> Entry:
     """J = det F, the volume ratio."""
     (a, b, c), (d, e, f), (g, h, i) = F
@@ -59,6 +81,24 @@ def square_norm(F: Tensor) -> Entry:
     return total
 
 
+def right_cauchy_green(F: Tensor) -> Tensor:
+    """C = F'F."""
+    return tuple(
+        tuple(
+            plus(
+                plus(times(F[0][i], F[0][j]), times(F[1][i], F[1][j])), times(F[2][i], F[2][j])
+            )
+            for j in range(3)
+        )
+        for i in range(3)
+    )  # type: ignore
+
+
 def isochoric_first_invariant(F: Tensor) -> Entry:
     """J^(-2/3) tr(F'F)."""
     return jnp.exp(-2 / 3 * jnp.log(determinant(F))) * square_norm(F)
+
+
+def isochoric_second_invariant(F: Tensor) -> Entry:
+    """J^(-4/3) |cof F|^2, half of tr(C)^2 - tr(C^2) of the isochoric C."""
+    return jnp.exp(-4 / 3 * jnp.log(determinant(F))) * square_norm(cofactor(F))

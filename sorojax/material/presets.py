@@ -1,16 +1,29 @@
-"""Rubbers with quoted tensile points and the fits to them.
+"""Rubbers with quoted tensile points, fits to tensile tests and those of Sorotoki.
 
-The points are quoted from the soft-robotics materials database of Marechal et al.
-(Soft Robotics 8, 2021, doi:10.1089/soro.2019.0115; Open Database License): uniaxial
-pull to failure, one rate (450 mm/min), cross-head strain. Expect specimens to differ
-by 30 % and more.
+`table()` lists them with what they are good for. The fits are to the soft-robotics
+materials database of Marechal et al. (Soft Robotics 8, 2021, doi:10.1089/soro.2019.0115;
+Open Database License): uniaxial pull to failure, one rate (450 mm/min), cross-head strain,
+mean curves of one batch. The specimens of a batch differ by about 1 %, but batches by far
+more: the Dragon Skin 10 of a published beam test (arXiv:2201.12560) is 1.6 times as stiff.
+The first 10 % of strain carry the play of the grips. A name ending in `_full` is an Ogden
+fit up to failure, stable everywhere; the others are Yeoh fits up to 300 %, better at
+moderate strain. Numbers of the `sorotoki_` family are those of its source code.
 """
+
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from sorojax.material.fit import fit_tensile
-from sorojax.material.hyperelastic import Yeoh
+from sorojax.material import checks
+from sorojax.material.hyperelastic import AbstractHyperelastic, bulk_modulus
+from sorojax.material.ogden import Ogden
+from sorojax.material.rubbers import MooneyRivlin, NeoHookean, Yeoh
 from sorojax.units import kPa
+
+MARECHAL = "Marechal et al. 2021, doi:10.1089/soro.2019.0115, ODbL 1.0 / DbCL 1.0"
+SOROTOKI = "Sorotoki, Caasenbrood, MIT licence"
+FORMLABS = "Formlabs data sheet of Flexible 80A: 6.3 MPa at 100 %, 8.9 MPa at 120 %"
 
 #: Engineering strain [-] and engineering stress [Pa].
 DRAGON_SKIN_30_POINTS = (
@@ -23,13 +36,164 @@ DRAGON_SKIN_10_POINTS = (
 )
 
 
-def dragon_skin_30(*, poisson_ratio: float = 0.49) -> Yeoh:
-    """Yeoh fit of Smooth-On Dragon Skin 30 for strains up to 300 %."""
-    strain, stress = DRAGON_SKIN_30_POINTS
-    return fit_tensile(strain, stress, poisson_ratio=poisson_ratio, density=1080.0).material
+@dataclass(frozen=True)
+class Preset:
+    """Numbers of a rubber and what is known about them.
+
+    `coefficients` are those of `model` in the order of its fields [Pa] (for `Ogden` the
+    moduli, then the exponents), `bulk_modulus` [Pa] is given where the source has one.
+    `strain_range` and `relative_rms` are those of `fit_tensile`; `specimens` went into
+    the mean curve, as its resolution shows, and `spread` is the largest deviation of one
+    from the mean where it broke. None is not known.
+    """
+
+    name: str
+    model: type[AbstractHyperelastic]
+    coefficients: tuple[float, ...]
+    density: float | None
+    source: str
+    strain_range: tuple[float, float] | None = None
+    relative_rms: float | None = None
+    specimens: int | None = None
+    spread: float | None = None
+    bulk_modulus: float | None = None
+
+    @property
+    def shear_modulus(self) -> float:
+        """Small-strain shear modulus [Pa]."""
+        c = self.coefficients
+        if self.model is Ogden:
+            half = len(c) // 2
+            return sum(m * a for m, a in zip(c[:half], c[half:], strict=True)) / 2
+        return {NeoHookean: c[0], MooneyRivlin: 2 * sum(c[:2])}.get(self.model, 2 * c[0])
+
+    def __str__(self) -> str:
+        def percent(value: float | None) -> str:
+            return "-" if value is None else f"{100 * value:.1f} %"
+
+        upto = "-" if self.strain_range is None else f"{100 * self.strain_range[1]:.0f} %"
+        return (
+            f"{self.name:<26s} {self.model.__name__:<12s} {self.shear_modulus / kPa:8.4g} "
+            f"{upto:>7s} {percent(self.relative_rms):>6s} {self.specimens or '-':>5} "
+            f"{percent(self.spread):>6s}  {self.source}"
+        )
+
+
+# fmt: off
+PRESETS = (
+    Preset("ecoflex_00_10", Yeoh, (3605.0, 137.9, -0.1887), 1070.0, MARECHAL,
+           (0.045, 3.0), 0.0107, 3, 0.017),
+    Preset("ecoflex_00_10_full", Ogden, (5490.0, 2.779), 1070.0, MARECHAL,
+           (0.045, 17.091), 0.0153, 3, 0.017),
+    Preset("ecoflex_00_30", Yeoh, (7830.0, 103.4, -0.8065), 1070.0, MARECHAL,
+           (0.068, 3.0), 0.0078, 1, None),
+    Preset("ecoflex_00_30_full", Ogden, (37310.0, 2195.0, 0.9051, 3.261), 1070.0, MARECHAL,
+           (0.068, 16.068), 0.0045, 1, None),
+    Preset("ecoflex_00_50", Yeoh, (10670.0, 260.6, -3.249), 1070.0, MARECHAL,
+           (0.045, 3.0), 0.0071, 2, 0.003),
+    Preset("ecoflex_00_50_full", Ogden, (59510.0, 6271.0, 0.5, 3.017), 1070.0, MARECHAL,
+           (0.045, 16.409), 0.0063, 2, 0.003),
+    Preset("dragon_skin_10", Yeoh, (24290.0, 2250.0, -54.28), 1070.0, MARECHAL,
+           (0.045, 3.0), 0.0142, None, None),
+    Preset("dragon_skin_10_full", Ogden, (72860.0, 2.341), 1070.0, MARECHAL,
+           (0.045, 10.409), 0.0277, None, None),
+    Preset("dragon_skin_20", Yeoh, (70400.0, 5223.0, -112.7), 1080.0, MARECHAL,
+           (0.045, 3.0), 0.0116, 3, 0.005),
+    Preset("dragon_skin_20_full", Ogden, (176900.0, 2.399), 1080.0, MARECHAL,
+           (0.045, 9.205), 0.0264, 3, 0.005),
+    Preset("dragon_skin_30", Yeoh, (100500.0, 6387.0, -149.2), 1080.0, MARECHAL,
+           (0.045, 3.0), 0.0109, 3, 0.006),
+    Preset("dragon_skin_30_full", Ogden, (202700.0, 2.456), 1080.0, MARECHAL,
+           (0.045, 7.091), 0.0183, 3, 0.006),
+    Preset("sorotoki_dragon_skin_10", Yeoh, (36e3, 250.0, 23.0), 1070.0, SOROTOKI,
+           bulk_modulus=2e6),
+    Preset("sorotoki_dragon_skin_30", Yeoh, (153.6e3, 1.6e3, 0.0), 1070.0, SOROTOKI,
+           bulk_modulus=2e6),
+    Preset("sorotoki_ecoflex_00_10", Yeoh, (3e3, -200.0, 23.0), 1070.0, SOROTOKI,
+           bulk_modulus=2e6),
+    Preset("sorotoki_ecoflex_00_30", Yeoh, (17e3, -200.0, 23.0), 1070.0, SOROTOKI,
+           bulk_modulus=1e6),
+    Preset("sorotoki_ecoflex_00_50", Yeoh, (14.5e3, 100.0, 0.0), 1070.0, SOROTOKI,
+           bulk_modulus=0.2e6),
+    Preset("sorotoki_elastic_50a", Yeoh, (505.6e3, 0.0, 2562.0), 1200.0,
+           SOROTOKI + "; Xavier et al. 2021", bulk_modulus=10e6),
+    Preset("sorotoki_elastosil_28", Yeoh, (110e3, 20e3, 0.0), 1332.0, SOROTOKI,
+           bulk_modulus=2e6),
+    Preset("sorotoki_rtv_615", Yeoh, (162.1e3, 14.2e3, 900.0), None, SOROTOKI,
+           bulk_modulus=2e6),
+    Preset("sorotoki_ninjaflex_85", MooneyRivlin, (0.77e6, 2.94e6), None, SOROTOKI),
+    Preset("sorotoki_tpu_90", NeoHookean, (2.464e6,), 1070.0, SOROTOKI,
+           bulk_modulus=11.5e6),
+    Preset("elastic_80a", NeoHookean, (4.088e6,), None, FORMLABS, (1.0, 1.2), 0.104),
+)
+# fmt: on
+
+
+def rubber(name: str, *, poisson_ratio: float | None = None) -> Any:
+    """The material of a preset.
+
+    Args:
+        name: As in `table()`, "dragon_skin_20_full" for example.
+        poisson_ratio: Small-strain ratio, below 0.5; unless given, that of the source,
+            or 0.49 where it has none.
+
+    Raises:
+        ValueError: If there is no such preset or the ratio is out of range.
+    """
+    known = {preset.name: preset for preset in PRESETS}
+    if name not in known:
+        raise ValueError(
+            f"presets.rubber: no preset is called {name!r}, need one of "
+            f"{', '.join(known)}. Fit your own with fit_tensile."
+        )
+    preset = known[name]
+    if poisson_ratio is None and preset.bulk_modulus is not None:
+        bulk = preset.bulk_modulus
+    else:
+        ratio = 0.49 if poisson_ratio is None else poisson_ratio
+        checks.poisson_ratio("presets.rubber", ratio)
+        bulk = bulk_modulus(np.asarray(preset.shear_modulus), ratio)  # type: ignore[arg-type]
+    c = preset.coefficients
+    if preset.model is Ogden:
+        half = len(c) // 2
+        return Ogden(c[:half], c[half:], bulk, preset.density)
+    return preset.model(*c, bulk, preset.density)
+
+
+def table() -> str:
+    """All presets: shear modulus [kPa], fitted strain, error, specimens, spread, source."""
+    head = (
+        f"{'name':<26s} {'model':<12s} {'mu [kPa]':>8s} {'up to':>7s} {'error':>6s} "
+        f"{'tests':>5s} {'spread':>6s}  source"
+    )
+    return "\n".join([head, *map(str, PRESETS)])
+
+
+def ecoflex_00_10(*, poisson_ratio: float = 0.49) -> Yeoh:
+    """Yeoh fit of Smooth-On Ecoflex 00-10 for strains up to 300 %."""
+    return rubber("ecoflex_00_10", poisson_ratio=poisson_ratio)
+
+
+def ecoflex_00_30(*, poisson_ratio: float = 0.49) -> Yeoh:
+    """Yeoh fit of Smooth-On Ecoflex 00-30 for strains up to 300 %."""
+    return rubber("ecoflex_00_30", poisson_ratio=poisson_ratio)
+
+
+def ecoflex_00_50(*, poisson_ratio: float = 0.49) -> Yeoh:
+    """Yeoh fit of Smooth-On Ecoflex 00-50 for strains up to 300 %."""
+    return rubber("ecoflex_00_50", poisson_ratio=poisson_ratio)
 
 
 def dragon_skin_10(*, poisson_ratio: float = 0.49) -> Yeoh:
     """Yeoh fit of Smooth-On Dragon Skin 10 Medium for strains up to 300 %."""
-    strain, stress = DRAGON_SKIN_10_POINTS
-    return fit_tensile(strain, stress, poisson_ratio=poisson_ratio, density=1070.0).material
+    return rubber("dragon_skin_10", poisson_ratio=poisson_ratio)
+
+
+def dragon_skin_20(*, poisson_ratio: float = 0.49) -> Yeoh:
+    """Yeoh fit of Smooth-On Dragon Skin 20 for strains up to 300 %."""
+    return rubber("dragon_skin_20", poisson_ratio=poisson_ratio)
+
+
+def dragon_skin_30(*, poisson_ratio: float = 0.49) -> Yeoh:
+    """Yeoh fit of Smooth-On Dragon Skin 30 for strains up to 300 %."""
+    return rubber("dragon_skin_30", poisson_ratio=poisson_ratio)

@@ -94,6 +94,14 @@ class DirectSolver:
             x[index] = self._solve_many(values[index], b[index], ())
         return x
 
+    def solve_with_inertia(self, values: np.ndarray, b: np.ndarray) -> tuple:
+        """x with A(values) x = b, and how many eigenvalues are negative: -1 and zeros where
+        A is singular, so that a failed step stays finite."""
+        factor = self.factor(values)
+        if factor is None:
+            return np.zeros(b.shape), np.int32(-1)
+        return factor.solve(np.asarray(b)), np.int32(max(factor.negative_eigenvalues, 0))
+
     def _solve_many(self, values, b, lead) -> np.ndarray:
         factor = self.factor(values)
         if factor is None:
@@ -122,32 +130,42 @@ class SparseSymmetric(eqx.Module):
 
 
 def from_cells(
-    num_nodes: int, cells: Int[np.ndarray, "cells cell_nodes"], components: int = 1
+    num_nodes: int,
+    cells: Int[np.ndarray, "cells cell_nodes"],
+    components: int = 1,
+    more: tuple[Int[np.ndarray, "groups group_nodes"], ...] = (),
 ) -> SparseSymmetric:
     """The system whose element matrices couple all unknowns of each cell.
 
     Unknown `components * node + component` belongs to `node`; element matrices are
-    ordered in the same way, node by node. Runs on the host, once per mesh.
+    ordered in the same way, node by node. `more` makes room for groups of nodes that share
+    no cell (`slots_of` finds their places). Runs on the host, once per mesh.
     """
-    cells = np.asarray(cells, np.int64)
     size = components * num_nodes
-    dofs = (cells[:, :, None] * components + np.arange(components)).reshape(len(cells), -1)
-    first, second = np.triu_indices(dofs.shape[1])
-    low = np.minimum(dofs[:, first], dofs[:, second])
-    high = np.maximum(dofs[:, first], dofs[:, second])
+    own = _keys(cells, components, size)
     diagonal = np.arange(size, dtype=np.int64) * (size + 1)  # also of unused nodes
+    others = [_keys(groups, components, size).ravel() for groups in more]
     keys, inverse = np.unique(
-        np.concatenate([(low * size + high).ravel(), diagonal]), return_inverse=True
+        np.concatenate([own.ravel(), diagonal, *others]), return_inverse=True
     )
     rows, cols = keys // size, keys % size
     indptr = np.searchsorted(rows, np.arange(size + 1))
     return SparseSymmetric(
         rows=jnp.asarray(rows, jnp.int32),
         cols=jnp.asarray(cols, jnp.int32),
-        slots=jnp.asarray(inverse[: low.size].reshape(low.shape), jnp.int32),
+        slots=jnp.asarray(inverse[: own.size].reshape(own.shape), jnp.int32),
         size=size,
         solver=DirectSolver(indptr, cols),
     )
+
+
+def _keys(groups, components: int, size: int) -> Int[np.ndarray, "groups entries"]:
+    """Row times size plus column of the upper triangle of every group's matrix."""
+    groups = np.asarray(groups, np.int64)
+    dofs = (groups[:, :, None] * components + np.arange(components)).reshape(len(groups), -1)
+    first, second = np.triu_indices(dofs.shape[1])
+    low = np.minimum(dofs[:, first], dofs[:, second])
+    return low * size + np.maximum(dofs[:, first], dofs[:, second])
 
 
 def slots_of(
@@ -158,16 +176,13 @@ def slots_of(
     Raises:
         ValueError: If a pair of unknowns is not in the pattern.
     """
-    dofs = np.asarray(dofs, np.int64)
-    first, second = np.triu_indices(dofs.shape[1])
-    low = np.minimum(dofs[:, first], dofs[:, second])
-    high = np.maximum(dofs[:, first], dofs[:, second])
-    wanted = low * system.size + high
+    wanted = _keys(dofs, 1, system.size)
     keys = np.asarray(system.rows, np.int64) * system.size + np.asarray(system.cols)
     slots = np.searchsorted(keys, wanted)
     if wanted.size and not np.array_equal(keys[np.minimum(slots, len(keys) - 1)], wanted):
         raise ValueError(
-            "slots_of: these unknowns share no cell of the mesh. Use facets of this mesh."
+            "slots_of: these unknowns have no place in the pattern. Take facets of this mesh, "
+            "or name the groups when the pattern is built."
         )
     return jnp.asarray(slots, jnp.int32)
 
@@ -226,4 +241,17 @@ def solve(
         solve=on_host,
         transpose_solve=on_host,
         symmetric=True,
+    )
+
+
+def solve_with_inertia(
+    system: SparseSymmetric, values: Float[Array, " nnz"], b: Float[Array, " size"]
+) -> tuple[Float[Array, " size"], Int[Array, ""]]:
+    """x with A(values) x = b and the number of negative eigenvalues, -1 if A is singular.
+
+    For loops that decide by the outcome; it has no derivative, `solve` has.
+    """
+    shapes = (jax.ShapeDtypeStruct(b.shape, b.dtype), jax.ShapeDtypeStruct((), jnp.int32))
+    return jax.pure_callback(
+        system.solver.solve_with_inertia, shapes, values, b, vmap_method="sequential"
     )

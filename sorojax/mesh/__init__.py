@@ -12,11 +12,15 @@ from sorojax.mesh.elements import (
     PolyN as PolyN,
     Quad4 as Quad4,
     Quad8 as Quad8,
+    Quad9 as Quad9,
     Tet4 as Tet4,
     Tet10 as Tet10,
+    Tet15 as Tet15,
     Tri3 as Tri3,
     Tri6 as Tri6,
+    Tri7 as Tri7,
 )
+from sorojax.mesh.enrich import enrich as enrich
 from sorojax.mesh.locate import Locations as Locations, locate as locate
 from sorojax.mesh.measure import (
     cell_areas as cell_areas,

@@ -4,10 +4,12 @@ import numpy as np
 
 from sorojax.math.spatial import Delaunay, KDTree
 from sorojax.mesh.outline import _GRADING, Outline
+from sorojax.mesh.polish import polish
 from sorojax.mesh.sizes import Sizes
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sample import values
 
+_GOOD = np.deg2rad(33.0)  # angle above which a triangle is left alone
 _CLEAR = 0.45  # of the local size: least distance of an interior point to the outline
 
 
@@ -92,7 +94,8 @@ def fill(
     used, numbers = np.unique(cells, return_inverse=True)
     if not np.array_equal(used[:fixed], np.arange(fixed)):
         raise _lost(lines.points[np.setdiff1d(np.arange(fixed), used)[0]])
-    return points[used], numbers.reshape(cells.shape)
+    cells = numbers.reshape(cells.shape)
+    return polish(points[used], cells, fixed, _GOOD, 2 * iterations), cells
 
 
 def _lost(where: np.ndarray) -> ValueError:

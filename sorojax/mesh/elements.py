@@ -58,6 +58,20 @@ class Tri6(AbstractElement):
         return "Tri6"
 
 
+class Tri7(AbstractElement):
+    """Quadratic triangle with a node at its centre: quadratic functions and a bubble."""
+
+    dim: ClassVar[int] = 2
+    num_nodes: ClassVar[int] = 7
+    num_corners: ClassVar[int] = 3
+    order: ClassVar[int] = 2
+    facets: ClassVar[Facets] = Tri6.facets
+
+    @property
+    def name(self) -> str:
+        return "Tri7"
+
+
 class Quad4(AbstractElement):
     """Bilinear quadrilateral."""
 
@@ -84,6 +98,20 @@ class Quad8(AbstractElement):
     @property
     def name(self) -> str:
         return "Quad8"
+
+
+class Quad9(AbstractElement):
+    """Biquadratic quadrilateral; the last node is at its centre."""
+
+    dim: ClassVar[int] = 2
+    num_nodes: ClassVar[int] = 9
+    num_corners: ClassVar[int] = 4
+    order: ClassVar[int] = 2
+    facets: ClassVar[Facets] = Quad8.facets
+
+    @property
+    def name(self) -> str:
+        return "Quad9"
 
 
 class PolyN(AbstractElement):
@@ -147,6 +175,22 @@ class Tet10(AbstractElement):
         return "Tet10"
 
 
+class Tet15(AbstractElement):
+    """Quadratic tetrahedron with nodes in its faces, then one at its centre."""
+
+    dim: ClassVar[int] = 3
+    num_nodes: ClassVar[int] = 15
+    num_corners: ClassVar[int] = 4
+    order: ClassVar[int] = 2
+    facets: ClassVar[Facets] = tuple(
+        (*facet, 10 + number) for number, facet in enumerate(Tet10.facets)
+    )
+
+    @property
+    def name(self) -> str:
+        return "Tet15"
+
+
 class Hex8(AbstractElement):
     """Trilinear hexahedron: bottom face counter-clockwise from above, then the top."""
 
@@ -177,4 +221,4 @@ def facet_corners(element: AbstractElement) -> int:
 
 def facet_element(element: AbstractElement) -> AbstractElement:
     """Element of the facets of a cell in space."""
-    return {Tet4: Tri3, Tet10: Tri6, Hex8: Quad4}[type(element)]()
+    return {Tet4: Tri3, Tet10: Tri6, Tet15: Tri7, Hex8: Quad4}[type(element)]()

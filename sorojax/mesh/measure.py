@@ -1,5 +1,6 @@
 """Areas and volumes of cells and cavities, differentiable in the points of a mesh."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -16,6 +17,11 @@ def cell_areas(mesh: Mesh) -> Float[Array, " cells"]:
             f"cell_areas: the mesh has {mesh.element.name} cells, need plane ones. Use "
             "cell_volumes."
         )
+    return _areas(mesh)
+
+
+@eqx.filter_jit
+def _areas(mesh: Mesh) -> Float[Array, " cells"]:
     x = mesh.points[mesh.cells]
     total = jnp.zeros_like(x[:, 0, 0])
     for facet in mesh.element.facets:
@@ -31,6 +37,11 @@ def cell_volumes(mesh: Mesh) -> Float[Array, " cells"]:
             f"cell_volumes: the mesh has {mesh.element.name} cells, need solid ones. Use "
             "cell_areas."
         )
+    return _volumes(mesh)
+
+
+@eqx.filter_jit
+def _volumes(mesh: Mesh) -> Float[Array, " cells"]:
     rule = quadrature(mesh.element, 3)
     slopes = jnp.asarray(shape_gradients(mesh.element, rule.points), mesh.points.dtype)
     x = mesh.points[mesh.cells]
@@ -46,12 +57,17 @@ def enclosed_volume(
 ) -> Float[Array, ""]:
     """Volume [m^3] of the cavity that closed `facets` of a body surround (area [m^2] in
     the plane); negative for an outer surface. Differentiable in the points."""
-    x = mesh.points[jnp.asarray(facets)]
-    if mesh.element.dim == 2:
+    return _enclosed(mesh.points, jnp.asarray(facets), mesh.element)
+
+
+@eqx.filter_jit
+def _enclosed(points, facets, element) -> Float[Array, ""]:
+    x = points[facets]
+    if element.dim == 2:
         origin = x[0, 0]
         ends = [x[:, i] - origin[None] for i in range(facets.shape[1])]
         return -jnp.sum(_under(ends))
-    side = facet_element(mesh.element)
+    side = facet_element(element)
     rule = quadrature(side, 4)
     values = jnp.asarray(shape_functions(side, rule.points), x.dtype)
     slopes = jnp.asarray(shape_gradients(side, rule.points), x.dtype)

@@ -1,106 +1,83 @@
-"""What `move` needs to know about the outline of a mesh, worked out once on the host."""
+"""What `move` needs to know about the outline of a plane mesh, worked out on the host."""
 
-import equinox as eqx
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Array, Float, Int
 
-from sorojax._types import integers, real
+from sorojax.mesh.boundary_motion import BoundaryPlan, FieldPlan
 from sorojax.mesh.mesh import Mesh, boundary_facets
+from sorojax.mesh.surface_sides import unit
 
 _SHARP = np.deg2rad(50.0)  # turn that makes a corner in a mesh without corner set
 
 
-class CurvePlan(eqx.Module):
-    """One zero set: its smooth nodes and its edges next to corners.
+class Border(NamedTuple):
+    """The plan of a boundary and what its guesses are spread over.
 
-    A smooth node starts from the displacements of the two corners it lies between,
-    `share` of the first and of the second. `beside` lists for every edge end at a
-    corner which corner (by place in the corner list) and the vector along the edge.
+    Attributes:
+        plan: For the device.
+        corners: Sharp nodes that are not on a ridge.
+        ridges: (n, 2) sides along ridges, ends only.
+        faces: Facets by their corners, interfaces included.
     """
 
-    nodes: Int[Array, " smooth"] = eqx.field(converter=integers)
-    between: Int[Array, "smooth 2"] = eqx.field(converter=integers)
-    share: Float[Array, "smooth 2"] = eqx.field(converter=real)
-    beside: Int[Array, " ends"] = eqx.field(converter=integers)
-    along: Float[Array, "ends 2"] = eqx.field(converter=real)
+    plan: BoundaryPlan
+    corners: np.ndarray
+    ridges: np.ndarray
+    faces: np.ndarray
 
 
-class OutlinePlan(eqx.Module):
-    """Corners and curves; curve 0 is the boundary, curve 1 + i is interface i."""
-
-    corners: Int[Array, " corners"] = eqx.field(converter=integers)
-    curves: tuple[CurvePlan, ...]
-
-
-def plan_outline(mesh: Mesh, num_interfaces: int) -> OutlinePlan:
-    """The plan of `mesh`; raises where its interfaces are not those given."""
+def facet_groups(mesh: Mesh, num_interfaces: int) -> list[np.ndarray]:
+    """Facets of the boundary, then of each interface; raises where their number differs."""
     found = sum(name.startswith("interface_") for name in mesh.facet_sets)
     if found != num_interfaces:
         raise ValueError(
             f"move: got {num_interfaces} `interfaces`, the mesh has {found}. Pass the ones "
             "it was made with, in the same order."
         )
+    inner = [np.asarray(mesh.facet_sets[f"interface_{i}"]) for i in range(found)]
+    return [np.asarray(mesh.facet_sets.get("boundary", boundary_facets(mesh))), *inner]
+
+
+def plan_outline(mesh: Mesh, num_interfaces: int) -> Border:
+    """The plan of a plane mesh."""
     points = np.asarray(mesh.points)
-    facets = [np.asarray(mesh.facet_sets.get("boundary", boundary_facets(mesh)))]
-    facets += [np.asarray(mesh.facet_sets[f"interface_{i}"]) for i in range(found)]
-    links = [_links(f) for f in facets]
+    groups = facet_groups(mesh, num_interfaces)
     if "corners" in mesh.node_sets:
         corners = np.asarray(mesh.node_sets["corners"])
     else:
-        corners = _sharp_nodes(points, facets[0])
-    place = {int(node): k for k, node in enumerate(corners)}
-    taken: set[int] = set(place)
-    curves = []
-    for link in links:
-        curves.append(_plan_curve(points, link, place, taken))
-        taken |= set(link)
-    return OutlinePlan(corners, tuple(curves))
+        corners = _sharp_nodes(points, groups[0])
+    place = np.full(len(points), -1)
+    place[corners] = np.arange(len(corners))
+    taken = place >= 0
+    fields = []
+    for facets in groups:
+        path = np.concatenate([facets[:, :1], facets[:, 2:], facets[:, 1:2]], axis=1)
+        steps = np.concatenate([path[:, [i, i + 1]] for i in range(path.shape[1] - 1)])
+        fields.append(_plan_curve(points, steps, place, taken))
+        taken[steps] = True
+    empty = np.zeros((0, 2))
+    plan = BoundaryPlan(corners, np.zeros(0, int), empty, tuple(fields))
+    faces = np.concatenate([facets[:, :2] for facets in groups])
+    return Border(plan, corners, empty.astype(int), faces)
 
 
-def _links(facets: np.ndarray) -> dict[int, list[int]]:
-    """Neighbours of each node along the curve, mid-side nodes included."""
-    link: dict[int, list[int]] = {}
-    for a, b, *middle in facets.tolist():
-        path = [a, *middle, b]
-        for p, q in zip(path[:-1], path[1:], strict=True):
-            link.setdefault(p, []).append(q)
-            link.setdefault(q, []).append(p)
-    return link
-
-
-def _plan_curve(points, link, place, taken) -> CurvePlan:
-    between, share, beside, along = {}, {}, [], []
-    for corner in (node for node in link if node in place):
-        for after in link[corner]:
-            beside.append(place[corner])
-            along.append(points[after] - points[corner])
-            path = _walk(link, corner, after, place)
-            step = np.linalg.norm(np.diff(points[path], axis=0), axis=1)
-            arc = np.r_[0, np.cumsum(step)] / step.sum()
-            last = place.get(path[-1])
-            for node, s in zip(path[1:-1], arc[1:-1], strict=True):
-                if last is not None:
-                    between[node] = (place[corner], last)
-                    share[node] = (1 - s, s)
-    nodes = [node for node in link if node not in taken]
-    return CurvePlan(
-        nodes=np.array(nodes, dtype=int),
-        between=np.array([between.get(n, (0, 0)) for n in nodes], int).reshape(-1, 2),
-        share=np.array([share.get(n, (0.0, 0.0)) for n in nodes]).reshape(-1, 2),
-        beside=np.array(beside, dtype=int),
-        along=np.array(along).reshape(-1, 2),
+def _plan_curve(points, steps, place, taken) -> FieldPlan:
+    along = points[steps[:, 1]] - points[steps[:, 0]]
+    turned = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    normal = np.zeros_like(points)
+    for end in (0, 1):
+        np.add.at(normal, steps[:, end], turned)
+    own = np.unique(steps)
+    nodes = own[~taken[own]]
+    first, last = place[steps[:, 0]], place[steps[:, 1]]
+    beside = np.concatenate([first[first >= 0], last[last >= 0]])
+    return FieldPlan(
+        nodes=nodes,
+        normal=unit(normal[nodes]),
+        beside=beside,
+        along=np.concatenate([along[first >= 0], -along[last >= 0]]),
     )
-
-
-def _walk(link, start: int, after: int, stops) -> list[int]:
-    """Nodes from `start` through `after` to the next corner or the end of the curve."""
-    path = [start, after]
-    while path[-1] not in stops:
-        onward = [node for node in link[path[-1]] if node != path[-2]]
-        if not onward or onward[0] == start:
-            break
-        path.append(onward[0])
-    return path
 
 
 def _sharp_nodes(points: np.ndarray, facets: np.ndarray) -> np.ndarray:

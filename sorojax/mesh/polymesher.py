@@ -22,6 +22,8 @@ from sorojax.sdf.sample import finite_box, raise_empty, values
 
 _SAMPLES = 250  # per cell: points that stand for its area in Lloyd's method
 _EVEN = 5e-3  # Lloyd error that ends the iterations
+_EXCHANGES = (8, 14, 20, 26, 32, 38)  # steps after which the largest cells are divided
+_LARGE, _SMALL = 1.12, 0.92  # of the mean area
 
 
 def polymesher(
@@ -93,10 +95,26 @@ def _lloyd(shape, cloud, area: float, seeds, iterations: int, on_step) -> np.nda
         error = float(np.sqrt((share**2 * shift).sum()) * n / np.sqrt(area))
         # The centre of a cell across a gap lies in the gap: its seed stays.
         seeds = np.where((values(shape, centre) < 0)[:, None], centre, seeds)
+        if step in _EXCHANGES and step < iterations - 10:
+            seeds = _exchanged(seeds, weight)
         if on_step is not None:
             on_step(step, error)
-        if error < _EVEN:
+        if error < _EVEN and (step > _EXCHANGES[-1] or iterations <= _EXCHANGES[-1]):
             break
+    return seeds
+
+
+def _exchanged(seeds: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Seeds of the smallest cells put beside those of the largest ones: Lloyd's method
+    alone cannot move cells from a crowded part to an empty one."""
+    order, mean = np.argsort(weight), weight.mean()
+    count = max(1, len(seeds) // 50)
+    small, large = order[:count], order[::-1][:count]
+    worth = (weight[small] < _SMALL * mean) & (weight[large] > _LARGE * mean)
+    nearest = KDTree(seeds).query(seeds[large], k=2)
+    aside = 0.3 * (seeds[nearest[1][:, 1]] - seeds[large])
+    seeds = seeds.copy()
+    seeds[small[worth]] = seeds[large[worth]] + aside[worth]
     return seeds
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from sorojax.mesh.elements import Hex8, Tet4, Tet10, Tri3, Tri6
 from sorojax.mesh.measure import cell_areas as cell_areas, cell_volumes
 from sorojax.mesh.mesh import Mesh, boundary_facets, facet_table, valences
-from sorojax.mesh.tets import dihedral_cosines, radius_ratios
+from sorojax.mesh.tet_shape import dihedral_cosines, radius_ratios
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.measure import area
 

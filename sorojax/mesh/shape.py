@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Float
 
 from sorojax.mesh import shape_polygon, shape_simplex, shape_tensor
-from sorojax.mesh.elements import AbstractElement, Hex8, PolyN, Quad4, Quad8
+from sorojax.mesh.elements import AbstractElement, Hex8, PolyN, Quad4, Quad8, Quad9
 from sorojax.mesh.shape_simplex import Quadrature as Quadrature
 
 
 def _family(element: AbstractElement) -> ModuleType:
-    if isinstance(element, Quad4 | Quad8 | Hex8):
+    if isinstance(element, Quad4 | Quad8 | Quad9 | Hex8):
         return shape_tensor
     return shape_polygon if isinstance(element, PolyN) else shape_simplex
 
@@ -46,9 +46,9 @@ def nodes(element: AbstractElement) -> Float[np.ndarray, "cell_nodes dim"]:
 def quadrature(element: AbstractElement, degree: int | None = None) -> Quadrature:
     """A rule for the reference cell with positive weights.
 
-    Without `degree` the one used for stiffness, degree 1 for Tri3 and Tet4, 4 for Tri6,
-    2 for Tet10, 3 for Quad4 and Hex8, 5 for Quad8; with it the smallest one that is
-    exact for polynomials of that degree.
+    Without `degree` the one used for stiffness, degree 1 for Tri3 and Tet4, 4 for Tri6
+    and Tri7, 2 for Tet10, 5 for Tet15, 3 for Quad4 and Hex8, 5 for Quad8 and Quad9; with
+    it the smallest one that is exact for polynomials of that degree.
 
     Raises:
         ValueError: If no such rule is tabulated.

@@ -4,12 +4,13 @@ Reference: the six-point rule of degree 4 is Dunavant's (1985), the fourteen-poi
 of degree 5 Walkington's (2000).
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from sorojax.mesh.elements import AbstractElement
+from sorojax.mesh.elements import AbstractElement, Tet15, Tri7
 
 _SIDES = {2: ((0, 1), (1, 2), (2, 0)), 3: ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))}
 
@@ -20,11 +21,7 @@ class Quadrature(NamedTuple):
 
 
 def shape_functions(element: AbstractElement, at: np.ndarray) -> np.ndarray:
-    L = _barycentric(at)
-    if element.order == 1:
-        return L
-    sides = [4 * L[:, i] * L[:, j] for i, j in _SIDES[element.dim]]
-    return np.concatenate([L * (2 * L - 1), np.stack(sides, axis=1)], axis=1)
+    return _barycentric(at) if element.order == 1 else _plain(element, at) @ _nodal(element)
 
 
 def shape_gradients(element: AbstractElement, at: np.ndarray) -> np.ndarray:
@@ -33,12 +30,38 @@ def shape_gradients(element: AbstractElement, at: np.ndarray) -> np.ndarray:
     if element.order == 1:
         return np.broadcast_to(slope, (len(at), dim + 1, dim)).copy()
     L = _barycentric(at)
-    corners = (4 * L - 1)[:, :, None] * slope
-    sides = [
-        4 * (L[:, [i], None] * slope[j] + L[:, [j], None] * slope[i])[:, 0]
-        for i, j in _SIDES[dim]
-    ]
-    return np.concatenate([corners, np.stack(sides, axis=1)], axis=1)
+    by_L = [(4 * L - 1)[:, :, None] * slope]
+    by_L += [_product_slope(L, slope, ends, 4.0)[:, None] for ends in _SIDES[dim]]
+    by_L += [_product_slope(L, slope, k, 3.0 ** len(k))[:, None] for k in _bubbles(element)]
+    return np.einsum("qbd,ba->qad", np.concatenate(by_L, axis=1), _nodal(element))
+
+
+def _plain(element: AbstractElement, at: np.ndarray) -> np.ndarray:
+    """Quadratic functions, then bubbles: a basis that is not nodal yet."""
+    L = _barycentric(at)
+    sides = [4 * L[:, i] * L[:, j] for i, j in _SIDES[element.dim]]
+    bubbles = [3.0 ** len(k) * np.prod(L[:, list(k)], axis=1) for k in _bubbles(element)]
+    return np.concatenate([L * (2 * L - 1), np.stack(sides + bubbles, axis=1)], axis=1)
+
+
+def _bubbles(element: AbstractElement) -> list[tuple[int, ...]]:
+    """Corners whose barycentric coordinates are multiplied into a bubble."""
+    if isinstance(element, Tri7):
+        return [(0, 1, 2)]
+    if isinstance(element, Tet15):
+        return [facet[:3] for facet in element.facets] + [(0, 1, 2, 3)]
+    return []
+
+
+@cache
+def _nodal(element: AbstractElement) -> np.ndarray:
+    """Coefficients that make the basis one at a node and zero at the others."""
+    return np.linalg.inv(_plain(element, nodes(element)))
+
+
+def _product_slope(L, slope, factors: tuple[int, ...], scale: float) -> np.ndarray:
+    others = [np.prod(L[:, [j for j in factors if j != i]], axis=1) for i in factors]
+    return scale * np.stack(others, axis=1) @ slope[list(factors)]
 
 
 def _barycentric(at: np.ndarray) -> np.ndarray:
@@ -49,13 +72,14 @@ def nodes(element: AbstractElement) -> np.ndarray:
     corners = np.concatenate([np.zeros((1, element.dim)), np.eye(element.dim)])
     if element.order == 1:
         return corners
-    sides = [(corners[i] + corners[j]) / 2 for i, j in _SIDES[element.dim]]
-    return np.concatenate([corners, np.stack(sides)])
+    groups = [*_SIDES[element.dim], *_bubbles(element)]
+    return np.concatenate([corners, np.stack([corners[list(k)].mean(0) for k in groups])])
 
 
 def quadrature(element: AbstractElement, degree: int | None = None) -> Quadrature:
-    usual = {(2, 1): 1, (2, 2): 4, (3, 1): 1, (3, 2): 2}
-    want = usual[element.dim, element.order] if degree is None else degree
+    usual = {(2, 1): 1, (2, 2): 4, (3, 1): 1, (3, 2): 2}[element.dim, element.order]
+    usual = 5 if isinstance(element, Tet15) else usual
+    want = usual if degree is None else degree
     rules = _TRIANGLE if element.dim == 2 else _TETRAHEDRON
     fitting = [known for known in rules if known >= want]
     if not fitting:

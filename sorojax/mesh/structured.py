@@ -4,12 +4,25 @@ from itertools import permutations
 
 import numpy as np
 
-from sorojax.mesh.elements import AbstractElement, Hex8, Quad4, Quad8, Tet4, Tet10, Tri3, Tri6
+from sorojax.mesh.elements import (
+    AbstractElement,
+    Hex8,
+    Quad4,
+    Quad8,
+    Quad9,
+    Tet4,
+    Tet10,
+    Tet15,
+    Tri3,
+    Tri6,
+    Tri7,
+)
+from sorojax.mesh.enrich import enrich, plain_element
 from sorojax.mesh.mesh import Mesh, boundary_facets
 from sorojax.mesh.middles import with_side_nodes
 
-_PLANE = (Tri3, Tri6, Quad4, Quad8)
-_SOLID = (Hex8, Tet4, Tet10)
+_PLANE = (Tri3, Tri6, Tri7, Quad4, Quad8, Quad9)
+_SOLID = (Hex8, Tet4, Tet10, Tet15)
 
 
 def rectangle(
@@ -30,13 +43,15 @@ def rectangle(
         upper: Upper right corner [m].
         divisions: Grid cells along x and y.
         order: 1 for `Tri3`, 2 for `Tri6` with straight sides; `element` overrides it.
-        element: `Tri3()`, `Tri6()`, `Quad4()` or `Quad8()`.
+        element: `Tri3()`, `Tri6()`, `Tri7()`, `Quad4()`, `Quad8()` or `Quad9()`.
     """
     lower, upper = _corners("rectangle", lower, upper, divisions, 2)
     if order not in (1, 2):
         raise ValueError(f"rectangle: `order` is {order}, need 1 (Tri3) or 2 (Tri6).")
     element = element or (Tri3() if order == 1 else Tri6())
     _known("rectangle", element, _PLANE)
+    if plain := plain_element(element):
+        return enrich(rectangle(lower, upper, divisions=divisions, element=plain))
     nx, ny = divisions
     points = _grid(lower, upper, divisions)
     quads = isinstance(element, Quad4 | Quad8)
@@ -60,11 +75,13 @@ def box(
         lower: Lower corner [m].
         upper: Upper corner [m].
         divisions: Grid cells along x, y and z.
-        element: `Hex8()` (default), `Tet4()` or `Tet10()`.
+        element: `Hex8()` (default), `Tet4()`, `Tet10()` or `Tet15()`.
     """
     lower, upper = _corners("box", lower, upper, divisions, 3)
     element = element or Hex8()
     _known("box", element, _SOLID)
+    if plain := plain_element(element):
+        return enrich(box(lower, upper, divisions=divisions, element=plain))
     points = _grid(lower, upper, divisions)
     corner = _cube_corners(divisions)
     if isinstance(element, Hex8):

@@ -6,7 +6,7 @@ from sorojax._types import is_traced
 from sorojax.mesh.elements import Hex8, Quad4, Tet4, Tri3
 from sorojax.mesh.lattice import wedge
 from sorojax.mesh.mesh import Mesh, boundary_facets
-from sorojax.mesh.tets import signed_volumes
+from sorojax.mesh.tet_shape import signed_volumes
 
 
 def extrude(mesh: Mesh, height: float, *, layers: int) -> Mesh:

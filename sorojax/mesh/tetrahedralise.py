@@ -4,12 +4,15 @@ import numpy as np
 
 from sorojax import _check
 from sorojax._types import real
-from sorojax.mesh.elements import Tet4, Tet10
+from sorojax.mesh.elements import Tet4
+from sorojax.mesh.features import Features, sharpen
 from sorojax.mesh.lattice import clip, lattice, snap
-from sorojax.mesh.mesh import Mesh, boundary_facets
+from sorojax.mesh.mesh import Mesh
+from sorojax.mesh.peel import peel
 from sorojax.mesh.resolved import check_resolved
-from sorojax.mesh.shape import nodes as reference_nodes, quadrature, shape_gradients
-from sorojax.mesh.tets import badness, improve, signed_volumes
+from sorojax.mesh.tet10 import curved, named
+from sorojax.mesh.tet_shape import badness, signed_volumes
+from sorojax.mesh.tets import Surface, improve
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sample import finite_box, land, raise_empty
 
@@ -22,9 +25,10 @@ def tetrahedralise(
 ) -> Mesh:
     """Tetrahedra that fill a solid shape.
 
-    A body-centred cubic lattice is snapped to the surface and cut by it, then nodes of
-    the worst cells are moved. Boundary nodes lie on the zero set; sharp edges are
-    chamfered within one cell. Facet set: "boundary".
+    A body-centred cubic lattice is snapped to the surface and cut by it, nodes are put on
+    sharp edges and corners, then nodes of the worst cells are moved. Boundary nodes lie on
+    the zero set; a sharp edge is chamfered within one cell where cells would degenerate.
+    Facet set: "boundary"; node sets: "ridges" and "corners" of sharp edges.
 
     Args:
         shape: A concrete, bounded solid shape.
@@ -59,17 +63,27 @@ def tetrahedralise(
     if not len(cells):
         raise_empty(where, lower, upper, float(size))
     points[skin] = land(shape, points[skin], 3)
-    points = improve(shape, points, cells, skin, float(size), rounds, _ENOUGH)
+    points, cells, skin, features = sharpen(shape, points, cells, skin, float(size))
+    cells = peel(points, cells, skin, _POOR)
+    points, features = _improved(shape, points, cells, skin, features, rounds)
     _check_shapes(points, cells)
     check_resolved(where, shape, points[skin], float(size), lower, upper)
     if order == 2:
-        return _curved(shape, points, cells)
-    return _named(Mesh(points, cells, Tet4()))
+        return curved(shape, points, cells, features)
+    return named(Mesh(points, cells, Tet4()), features)
 
 
-def _named(mesh: Mesh) -> Mesh:
-    sets = {"boundary": boundary_facets(mesh)}
-    return Mesh(mesh.points, mesh.cells, mesh.element, {}, sets)
+def _improved(shape: AbstractSdf, points, cells, skin, features: Features, rounds: int):
+    """Better cells; ridges are given up where they leave a cell too poor."""
+    for _ in range(3):
+        points = improve(Surface((shape,), skin, features), points, cells, rounds, _ENOUGH)
+        poor = np.unique(cells[badness(points[cells]) > np.cos(_POOR)])
+        poor = poor[features.ridge[poor]]
+        if not len(poor):
+            break
+        points[poor] = features.before[poor]
+        features = features.without(poor)
+    return points, features
 
 
 def _compact(points, cells, skin):
@@ -92,37 +106,3 @@ def _check_shapes(points, cells) -> None:
             f"{np.rad2deg(_POOR):.0f} degrees: the shape is thinner there than `size` can "
             "follow. Lower `size` to the thinnest wall, or thicken it."
         )
-
-
-def _curved(shape: AbstractSdf, points, cells) -> Mesh:
-    """Ten-node cells; mid-sides of the surface on it where all their cells stay valid."""
-    corners = [facet[:2] for facet in ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))]
-    ends = np.concatenate([cells[:, list(c)] for c in corners])
-    n = len(points)
-    keys, number = np.unique(
-        ends.min(axis=1) * np.int64(n) + ends.max(axis=1), return_inverse=True
-    )
-    sides = np.stack(np.divmod(keys, n), axis=1)
-    straight = points[sides].mean(axis=1)
-    ten = np.concatenate([cells, n + number.reshape(6, -1).T], axis=1)
-    mesh = Mesh(np.concatenate([points, straight]), ten, Tet10())
-    surface = np.unique(boundary_facets(mesh)[:, 3:]) - n
-    middles = straight.copy()
-    middles[surface] = land(shape, straight[surface])
-    for _ in range(20):
-        x = np.concatenate([points, middles])
-        folded = np.unique(ten[_least_jacobian(x[ten]) < 0.1, 4:]) - n
-        if not len(folded):
-            break
-        middles[folded] = straight[folded]
-    return _named(Mesh(np.concatenate([points, middles]), ten, Tet10()))
-
-
-def _least_jacobian(x: np.ndarray) -> np.ndarray:
-    """Least det dx/dxi at the nodes and inside, over that of the straight cell."""
-    at = np.concatenate([reference_nodes(Tet10()), quadrature(Tet10(), 5).points])
-    straight = 6 * signed_volumes(x[:, :4])
-    least = np.full(len(x), np.inf)
-    for slopes in shape_gradients(Tet10(), at):
-        least = np.minimum(least, np.linalg.det(np.einsum("cai,ad->cid", x, slopes)))
-    return least / straight

@@ -1,57 +1,46 @@
-"""Numbers of tetrahedra, and better places for the nodes of the worst ones."""
+"""Better places for the nodes of the worst tetrahedra."""
+
+from typing import NamedTuple
 
 import numpy as np
 
+from sorojax.mesh.features import Features
+from sorojax.mesh.settle import normals_near, settle
+from sorojax.mesh.tet_shape import badness
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.sample import values_and_gradients
+from sorojax.sdf.sample import values, values_and_gradients
 
-_FACES = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))  # opposite to each corner, outward
-_STEPS = (0.08, 0.2)  # of the pitch: how far a node is tried away from its place
-
-
-def signed_volumes(x: np.ndarray) -> np.ndarray:
-    """Volumes [m^3] of tetrahedra with corners `x` (cells, 4, 3)."""
-    a, b, c = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0], x[:, 3] - x[:, 0]
-    return np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
+_STEPS = (0.08, 0.2)  # of the edges: how far a node is tried away from its place
+_SAME_SIDE = 0.8  # least cosine between normals before and after: nodes cross no ridge
+_LANDED = 1 - 1e-6  # cosine between the slopes before and after a landing beside a ridge
+_ABREAST = (0.1, 0.01, 1e-3, 1e-4)  # zooms for nodes that are near their ridge already
 
 
-def dihedral_cosines(x: np.ndarray) -> np.ndarray:
-    """Cosines of the six dihedral angles, (cells, 6)."""
-    normals = []
-    for i, j, k in _FACES:
-        n = np.cross(x[:, j] - x[:, i], x[:, k] - x[:, i])
-        normals.append(n / np.maximum(np.sqrt((n * n).sum(axis=1)), 1e-300)[:, None])
-    pairs = [(i, j) for i in range(4) for j in range(i)]
-    return np.stack([-(normals[i] * normals[j]).sum(axis=1) for i, j in pairs], axis=1)
+class Surface(NamedTuple):
+    """What holds nodes: fields, which nodes lie on the first one, which on several."""
+
+    fields: tuple[AbstractSdf, ...]
+    skin: np.ndarray
+    features: Features
 
 
-def badness(x: np.ndarray) -> np.ndarray:
-    """Largest |cos| of the dihedral angles; 2 for a cell without positive volume.
-
-    It is 1/3 for the regular tetrahedron and near 1 where an angle is near 0 or pi.
-    """
-    worst = np.abs(dihedral_cosines(x)).max(axis=1)
-    return np.where(signed_volumes(x) > 0, worst, 2.0)
-
-
-def improve(
-    shape: AbstractSdf, points, cells, skin, pitch: float, rounds: int, enough: float
-) -> np.ndarray:
+def improve(surface: Surface, points, cells, rounds: int, enough: float) -> np.ndarray:
     """`points` with the nodes of cells worse than `enough` [rad] moved where that helps.
 
     In each round a set of nodes without common cells is moved, each to the best of a
-    few places; nodes of the surface stay on it.
+    few places; nodes of the surface stay on it, those of ridges on both sides, and
+    corners where they are.
     """
     points, limit = points.copy(), np.cos(enough)
     owner = np.argsort(cells.ravel(), kind="stable") // 4
     start = np.searchsorted(np.sort(cells.ravel()), np.arange(len(points) + 1))
     bad = badness(points[cells])
     for i in range(rounds):
-        movers = _independent(cells, bad, limit, i, len(points))
+        movers = _independent(cells, bad, limit, i, surface.features.corner)
         if not len(movers):
             break
         ball, row = _balls(owner, start, movers)
-        places = _places(shape, points, cells[ball], row, movers, skin, pitch)
+        places = _places(surface, points, cells[ball], row, movers)
         worst = np.zeros(places.shape[:2])
         x = points[cells[ball]]
         at = np.argmax(cells[ball] == movers[row][:, None], axis=1)
@@ -66,13 +55,14 @@ def improve(
     return points
 
 
-def _independent(cells, bad, limit: float, turn: int, count: int) -> np.ndarray:
+def _independent(cells, bad, limit: float, turn: int, fixed: np.ndarray) -> np.ndarray:
     """Nodes of the worst cells, no two in one cell; other ones at every turn."""
     rng = np.random.default_rng(turn)  # only breaks ties: the result is reproducible
+    count = len(fixed)
     score = np.zeros(count)
     poor = np.flatnonzero(bad > limit)
     np.maximum.at(score, cells[poor].ravel(), np.repeat(bad[poor], 4))
-    score = np.where(score > 0, score + 0.2 * rng.random(count), 0.0)
+    score = np.where((score > 0) & ~fixed, score + 0.2 * rng.random(count), 0.0)
     top = score[cells].max(axis=1)
     beaten = np.zeros(count, bool)
     lower = (score[cells] < top[:, None]) & (top > 0)[:, None]
@@ -88,34 +78,66 @@ def _balls(owner, start, movers):
     return owner[start[movers][row] + offset], row
 
 
-def _places(shape, points, ball_cells, row, movers, skin, pitch: float) -> np.ndarray:
+def _places(surface: Surface, points, ball_cells, row, movers) -> np.ndarray:
     """Places to try, (tries, movers, 3); the first is where the node is."""
     here = points[movers]
-    total = np.zeros_like(here)
+    total, reach = np.zeros_like(here), np.zeros(len(here))
     np.add.at(total, row, points[ball_cells].sum(axis=1) - here[row])
-    mean = total / (3 * np.bincount(row, minlength=len(movers)))[:, None]
+    count = np.bincount(row, minlength=len(movers))
+    mean = total / (3 * count)[:, None]
+    gaps = np.linalg.norm(points[ball_cells] - here[row][:, None], axis=2).sum(axis=1)
+    np.add.at(reach, row, gaps)
+    reach = (reach / (3 * count))[:, None]
     tries = [here, here + 0.5 * (mean - here), mean]
     axes = np.concatenate([np.eye(3), -np.eye(3)])
-    tries += [here + s * pitch * axis for s in _STEPS for axis in axes]
+    tries += [here + s * reach * axis for s in _STEPS for axis in axes]
     places = np.stack(tries)
-    on = skin[movers]
-    moved = places[1:, on].reshape(-1, 3)
-    for _ in range(3 if len(moved) else 0):
-        f, g = values_and_gradients(shape, moved)
-        moved = moved - (f / np.maximum((g * g).sum(axis=1), 1e-12))[:, None] * g
-    places[1:, on] = moved.reshape(len(tries) - 1, -1, 3)
+    ridge = surface.features.ridge[movers]
+    beside = np.zeros(len(movers), bool)
+    np.logical_or.at(beside, row, surface.features.ridge[ball_cells].any(axis=1))
+    _hold_on_skin(surface.fields[0], places, surface.skin[movers] & ~ridge, beside)
+    _hold_on_ridges(surface, places, movers, ridge, reach[:, 0])
     return places
 
 
-def radius_ratios(x: np.ndarray) -> np.ndarray:
-    """Three times the inscribed over the circumscribed radius, 1 for regular cells."""
-    a, b, c = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0], x[:, 3] - x[:, 0]
-    volume = np.abs(signed_volumes(x))
-    faces = sum(
-        np.linalg.norm(np.cross(x[:, j] - x[:, i], x[:, k] - x[:, i]), axis=1) / 2
-        for i, j, k in _FACES
+def _hold_on_skin(shape: AbstractSdf, places, on: np.ndarray, beside: np.ndarray) -> None:
+    if not on.any():
+        return
+    moved, tries = places[:, on].reshape(-1, 3), len(places)
+    normals = []
+    for _ in range(3):
+        f, g = values_and_gradients(shape, moved)
+        square = np.maximum((g * g).sum(axis=1), 1e-12)
+        moved = moved - (f / square)[:, None] * g
+        normals.append((g / np.sqrt(square)[:, None]).reshape(tries, -1, 3))
+    moved, last = moved.reshape(tries, -1, 3), normals[-1]
+    crossed = (last * last[0]).sum(axis=2) < _SAME_SIDE
+    # What lands on the ridge itself came from where the slope is that of neither side.
+    crossed |= beside[on] & ((last * normals[0]).sum(axis=2) < _LANDED)
+    places[1:, on] = np.where(crossed[..., None], places[0, on], moved)[1:]
+
+
+def _hold_on_ridges(surface: Surface, places, movers, on: np.ndarray, reach) -> None:
+    if not on.any():
+        return
+    tries, count = len(places) - 1, int(on.sum())
+    sides = surface.features.sides.of(movers[on], len(surface.skin))
+    shift = (np.arange(tries) * count)[:, None]
+    all_sides = sides._replace(
+        point=(sides.point + shift).ravel(),
+        field=np.tile(sides.field, tries),
+        along=np.tile(sides.along, (tries, 1)),
     )
-    turns = ((a, b, c), (b, c, a), (c, a, b))
-    center = sum((u * u).sum(axis=1)[:, None] * np.cross(v, w) for u, v, w in turns)
-    circum = np.linalg.norm(center, axis=1) / np.maximum(12 * volume, 1e-300)
-    return 9 * volume / (faces * circum)
+    here = places[0, on]
+    normals = normals_near(surface.fields, here, sides, 0.1)[0]
+    order = np.argsort(sides.point, kind="stable").reshape(count, 2)
+    tangent = np.cross(normals[order[:, 0]], normals[order[:, 1]])
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
+    # Only along the ridge, or both sides would see the same one.
+    step = ((places[1:, on] - here) * tangent).sum(axis=2, keepdims=True) * tangent
+    start = (here + step).reshape(-1, 3)
+    moved = settle(surface.fields, start, all_sides, _ABREAST).reshape(tries, count, 3)
+    far = np.linalg.norm(moved - here, axis=2) > 0.5 * reach[on]
+    off = np.abs(values(surface.fields[0], moved.reshape(-1, 3))).reshape(tries, count)
+    far |= off > 1e-4 * reach[on]
+    places[1:, on] = np.where(far[..., None], here, moved)

@@ -18,14 +18,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax._types import real
+from sorojax.fem.kinematics import PlaneStrain
 from sorojax.fem.linear import linearise, prepare
 from sorojax.fem.loads import Pressure
-from sorojax.fem.points import point_areas
+from sorojax.fem.points import quadrature_points
 from sorojax.fem.problem import Problem
 from sorojax.fem.solve import Path, with_load
 from sorojax.fem.stress import enclosed_volume
 from sorojax.math import sparse
-from sorojax.mesh.shape import quadrature, shape_functions
 from sorojax.reduction.backbone import Backbone, Line, Probe, line_strain, probe
 from sorojax.reduction.pod import coordinates, project
 from sorojax.rod import (
@@ -206,14 +206,15 @@ def _powers(x: Float[Array, ""], count: int) -> Float[Array, " powers"]:
 def mean_section(problem: Problem, line: Line) -> Section:
     """The section of a uniform rod along `line` with the mass of the body and its rotary
     inertia about the line. The offset of the centre of mass from the line is left out."""
-    mesh, depth = problem.mesh, problem.kinematics.depth
+    assert isinstance(problem.kinematics, PlaneStrain), "a planar body of one thickness"
+    mesh, depth = problem.mesh, problem.kinematics.thickness
     start, end = line(jnp.array([0.0, 1.0]))
     length = jnp.sqrt(jnp.sum((end - start) ** 2))
     along = (end - start) / length
-    N = jnp.asarray(shape_functions(mesh.element, quadrature(mesh.element).points))
-    points = jnp.einsum("qa,cai->qci", N, mesh.points[mesh.cells]) - start[None, None]
+    inside = quadrature_points(mesh, PlaneStrain())
+    points = jnp.moveaxis(inside.position, 0, -1) - start[None, None]
     across = along[0] * points[..., 1] - along[1] * points[..., 0]
-    areas = point_areas(mesh)
+    areas = inside.volumes
     area = jnp.sum(areas) * depth / length
     second = jnp.sum(areas * across**2) * depth / length
     out_of_plane = area * depth**2 / 12

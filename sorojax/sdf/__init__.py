@@ -68,6 +68,7 @@ from sorojax.sdf.lattice import (
 from sorojax.sdf.lift import (
     elongate as elongate,
     extrude as extrude,
+    grid_repeat as grid_repeat,
     mirror as mirror,
     polar_repeat as polar_repeat,
     revolve as revolve,
@@ -84,6 +85,7 @@ from sorojax.sdf.morph import (
     morph as morph,
     stretch as stretch,
 )
+from sorojax.sdf.outlines import Outlines as Outlines, outlines as outlines, text as text
 from sorojax.sdf.polyhedra import (
     Octahedron as Octahedron,
     Pyramid as Pyramid,

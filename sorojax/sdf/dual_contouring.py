@@ -5,13 +5,17 @@ Ju et al. 2002 for the vertices; the sheets make the surface manifold (Schaefer 
 
 from typing import NamedTuple
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.blocks import LEAF, Grid, leaf_fields
 from sorojax.sdf.dual_sheets import cell_sheets
 from sorojax.sdf.dual_vertices import place
-from sorojax.sdf.sample import values, values_and_gradients
+from sorojax.sdf.query import value_and_gradient
+from sorojax.sdf.sample import CHUNK
 
 MARGIN = 0.02  # cells: vertices stay off cell walls, so that none coincide in float32
 # Cells around a grid edge, counter-clockwise: offsets of the edge within them.
@@ -86,23 +90,49 @@ def _edges(shape, grid, group, field, sign, axis):
 
 def _hermite(shape, grid, nodes, step, a, b) -> tuple[np.ndarray, np.ndarray]:
     """Where grid edges meet the surface [cells], and the normals there."""
+    points, normals = np.empty((len(nodes), 3)), np.empty((len(nodes), 3), np.float32)
+    dtype = jnp.result_type(float)
+    ahead, size = jnp.asarray(step, dtype=dtype), jnp.asarray(grid.size, dtype=dtype)
+    for start in range(0, len(nodes), CHUNK):
+        piece = slice(start, start + CHUNK)
+        rows = grid.points(nodes[piece]), a[piece], b[piece]
+        pad = CHUNK - len(rows[0])
+        if pad:
+            rows = (np.concatenate([r, np.repeat(r[-1:], pad, axis=0)]) for r in rows)
+        found = _cross(shape, *(jnp.asarray(r, dtype=dtype) for r in rows), ahead, size)
+        t, f, slope = (np.asarray(part)[: CHUNK - pad] for part in found)
+        length = np.maximum(np.sqrt((slope * slope).sum(axis=1, keepdims=True)), 1e-12)
+        normal = slope / length
+        # What regula falsi leaves, where the field has a kink on the edge, Newton takes away.
+        move = np.minimum(np.abs(f[:, None]) / length, 0.5)
+        points[piece] = (
+            nodes[piece] + t[:, None] * step - np.copysign(move, f[:, None]) * normal
+        )
+        normals[piece] = normal
+    return points, normals
+
+
+@eqx.filter_jit
+def _cross(shape, start, a, b, step, size):
+    """Share of the way from `start` along grid edges to the zero, field [cells], slope."""
     start_inside = a < 0
-    low, high = np.zeros(len(a)), np.ones(len(a))
-    t = a / (a - b)
-    for _ in range(3):  # regula falsi, Illinois variant
-        f = values(shape, grid.points(nodes + t[:, None] * step)) / grid.size
+
+    def at(t):
+        return start + (size * t)[:, None] * step[None]
+
+    def closer(_, state):  # regula falsi, Illinois variant
+        t, low, high, a, b = state
+        f = shape(at(t)) / size
         same = (f < 0) == start_inside
-        low, high = np.where(same, t, low), np.where(same, high, t)
-        a, b = np.where(same, f, a / 2), np.where(same, b / 2, f)
-        span = np.where(a == b, 1.0, a - b)
-        t = np.clip(low + (high - low) * a / span, low, high)
-    points = nodes + t[:, None] * step
-    f, slope = values_and_gradients(shape, grid.points(points))
-    length = np.maximum(np.sqrt((slope * slope).sum(axis=1, keepdims=True)), 1e-12)
-    normals = slope / length
-    # What regula falsi leaves, where the field has a kink on the edge, Newton takes away.
-    move = np.minimum(np.abs(f[:, None]) / length / grid.size, 0.5)
-    return points - np.copysign(move, f[:, None]) * normals, normals.astype(np.float32)
+        low, high = jnp.where(same, t, low), jnp.where(same, high, t)
+        a, b = jnp.where(same, f, a / 2), jnp.where(same, b / 2, f)
+        share = low + (high - low) * a / jnp.where(a == b, 1.0, a - b)
+        return jnp.clip(share, low, high), low, high, a, b
+
+    state = (a / (a - b), jnp.zeros_like(a), jnp.ones_like(a), a, b)
+    t = jax.lax.fori_loop(0, 3, closer, state)[0]
+    f, slope = value_and_gradient(shape, at(t))
+    return t, f / size, slope
 
 
 def _quads(grid: Grid, found: _Crossings) -> tuple[np.ndarray, ...]:

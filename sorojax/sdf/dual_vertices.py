@@ -1,5 +1,7 @@
 """Where the vertices of dual contouring lie: the points nearest to sets of planes."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 _PULL = 0.02  # weight that holds a vertex at the mean crossing, against 1 per plane
@@ -17,52 +19,77 @@ def place(
     damped problem leave no trace of the damping where planes meet at an edge or corner.
     Vertices that are not `alone` in their cell stay at the mean, which keeps them apart.
     """
-    count = len(alone)
-    corners = [np.ascontiguousarray(quads[:, k]) for k in range(4)]
-
-    def gather(weight):
-        found = np.bincount(corners[0], weight, count)
-        for corner in corners[1:]:
-            found += np.bincount(corner, weight, count)
-        return found
-
-    number = gather(np.ones(len(points)))
-    mean = np.stack([gather(points[:, i]) for i in range(3)], axis=-1) / number[:, None]
-    level = (normals * points).sum(axis=1)
-    right = np.stack([gather(normals[:, i] * level) for i in range(3)], axis=-1)
-    pairs = zip(_ROWS, _COLUMNS, strict=True)
-    square = np.stack([gather(normals[:, i] * normals[:, j]) for i, j in pairs], axis=-1)
-    for start in range(0, count, _PIECE):
+    total = _gathered(points, normals, quads, len(alone))
+    vertices = np.empty((len(alone), 3))
+    for start in range(0, len(alone), _PIECE):
         piece = slice(start, start + _PIECE)
-        near = _nearest(mean[piece], square[piece], right[piece], number[piece])
-        mean[piece] = np.where(alone[piece, None], near, mean[piece])
-    return mean
+        vertices[piece] = _kernel(_nearest, total[piece], alone[piece])
+    return vertices
 
 
-def _nearest(x, square, right, number):
-    damped = square.copy()
-    damped[:, [0, 3, 5]] += _PULL * number[:, None]
-    inverse = _inverse(damped)
+def _kernel(function, *rows) -> np.ndarray:
+    """`function` of arrays padded to one length, so that it is compiled once."""
+    count = len(rows[0])
+    if count < _PIECE:
+        rows = tuple(
+            np.concatenate([r, np.repeat(r[-1:], _PIECE - count, axis=0)]) for r in rows
+        )
+    return np.asarray(function(*(jnp.asarray(r) for r in rows)))[:count]
+
+
+def _gathered(points, normals, quads, count: int) -> np.ndarray:
+    """Sums (count, 13) over the crossings of a vertex: 1, x, n (n . x), n n in six."""
+    from scipy.sparse import csc_array
+
+    total = np.zeros((count, 13))
+    for start in range(0, len(quads), _PIECE):
+        piece = slice(start, start + _PIECE)
+        q = quads[piece]
+        row = _kernel(_features, points[piece], normals[piece])
+        # Neighbours in space are neighbours in number: a piece fills a short range.
+        low, high = int(q.min()), int(q.max()) + 1
+        ends = np.arange(0, q.size + 1, 4, dtype=np.int32)
+        data = (np.ones(q.size), (q - low).ravel(), ends)
+        total[low:high] += csc_array(data, shape=(high - low, len(q))) @ row
+    return total
+
+
+@jax.jit
+def _features(x, n):
+    n = n.astype(x.dtype)
+    level = n[:, 0] * x[:, 0] + n[:, 1] * x[:, 1] + n[:, 2] * x[:, 2]
+    columns = [jnp.ones_like(level), *x.T, *(n[:, i] * level for i in range(3))]
+    columns += [n[:, i] * n[:, j] for i, j in zip(_ROWS, _COLUMNS, strict=True)]
+    return jnp.stack(columns, axis=1)
+
+
+@jax.jit
+def _nearest(total, alone):
+    """Minimum of the squared distances to the planes, by steps that damp ever less."""
+    number, *columns = total.T
+    mean, right, square = columns[:3], columns[3:6], columns[6:]
+    damped = [m + (_PULL if i in (0, 3, 5) else 0.0) * number for i, m in enumerate(square)]
+    inverse = _inverse(*damped)
+    mean = [m / number for m in mean]
+    x = mean
     for _ in range(_STEPS):
-        x = x + _times(inverse, right - _times(square, x))
-    return x
+        rest = [r - s for r, s in zip(right, _times(square, x), strict=True)]
+        x = [a + b for a, b in zip(x, _times(inverse, rest), strict=True)]
+    return jnp.stack([jnp.where(alone, a, b) for a, b in zip(x, mean, strict=True)], axis=1)
 
 
 def _times(m, x):
-    """Symmetric matrices (n, 6) times vectors (n, 3)."""
-    a, b, c = x.T
-    return np.stack(
-        [
-            m[:, 0] * a + m[:, 1] * b + m[:, 2] * c,
-            m[:, 1] * a + m[:, 3] * b + m[:, 4] * c,
-            m[:, 2] * a + m[:, 4] * b + m[:, 5] * c,
-        ],
-        axis=-1,
+    """Symmetric matrix of six entries times a vector."""
+    a, b, c = x
+    return (
+        m[0] * a + m[1] * b + m[2] * c,
+        m[1] * a + m[3] * b + m[4] * c,
+        m[2] * a + m[4] * b + m[5] * c,
     )
 
 
-def _inverse(m):
-    xx, xy, xz, yy, yz, zz = m.T
+def _inverse(xx, xy, xz, yy, yz, zz):
     a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     adjugate = (a, b, c, xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy)
-    return np.stack(adjugate, axis=-1) / (xx * a + xy * b + xz * c)[:, None]
+    determinant = xx * a + xy * b + xz * c
+    return [entry / determinant for entry in adjugate]

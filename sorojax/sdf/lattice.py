@@ -12,7 +12,7 @@ from sorojax._types import real
 from sorojax.sdf.bars import segment_square
 from sorojax.sdf.base import AbstractSdf, Box, Exactness, check_lengths
 from sorojax.sdf.nearest import nearest, take
-from sorojax.sdf.scalar import absolute, maximum, minimum, root
+from sorojax.sdf.scalar import absolute, minimum, ordered, root
 
 
 def _everywhere(like: Array) -> Box:
@@ -175,9 +175,10 @@ class AbstractBeamLattice(AbstractSdf):
         p = tuple(
             absolute(c - self.period * jnp.round(c / self.period)) / half for c in (x, y, z)
         )
-        low, high = minimum(p[0], p[1]), maximum(p[0], p[1])
-        middle = maximum(low, minimum(high, p[2]))
-        p = maximum(high, p[2]), middle, minimum(low, p[2])
+        low, high = ordered(p[0], p[1])
+        middle, high = ordered(high, p[2])
+        low, middle = ordered(low, middle)
+        p = high, middle, low
         squares = [segment_square(p, *self._ends(beam, x)) for beam in self.beams]
         best = squares[0]
         for square in squares[1:]:

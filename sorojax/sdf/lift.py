@@ -14,8 +14,8 @@ from sorojax._types import is_traced, real
 from sorojax.sdf.bars import check_direction
 from sorojax.sdf.base import AbstractSdf, Box, Exactness, Number
 from sorojax.sdf.combine import hull
-from sorojax.sdf.scalar import box_distance, clip, minimum, norm
-from sorojax.sdf.transform import AbstractWrapped
+from sorojax.sdf.scalar import absolute, box_distance, clip, minimum, norm, positive_part
+from sorojax.sdf.transform import AbstractWrapped, repeat
 from sorojax.sdf.turn import turned_box
 
 
@@ -146,7 +146,9 @@ class Mirrored(AbstractWrapped):
 class Elongated(AbstractWrapped):
     """`shape` cut at the origin along each axis and drawn apart by `amount` [m].
 
-    A bound: exact outside only for shapes that are symmetric about the cuts.
+    A bound: exact outside only for shapes that are symmetric about the cuts. Between
+    cuts along all axes lies a block around which the shape is drawn; there the depth
+    in the block adds to the field at the origin.
     """
 
     shape: AbstractSdf
@@ -154,10 +156,18 @@ class Elongated(AbstractWrapped):
 
     def __check_init__(self):
         _check.shape("elongate", "amount", self.amount, (self.shape.dim,), "One per axis.")
+        if _check.is_concrete(self.amount) and not np.all(np.asarray(self.amount) >= 0):
+            raise ValueError(
+                f"elongate: `amount` must not be negative, got {np.asarray(self.amount)} m. "
+                "Cut the shape with `&` to shorten it."
+            )
 
     def distance(self, *x):
         half = self.amount / 2
-        return self.shape.distance(*(c - clip(c, -half[i], half[i]) for i, c in enumerate(x)))
+        f = self.shape.distance(*(c - clip(c, -half[i], half[i]) for i, c in enumerate(x)))
+        room = (half[i] - absolute(c) for i, c in enumerate(x))
+        depth = positive_part(functools.reduce(minimum, room))
+        return jnp.where(f > 0, f + depth, f - depth)
 
     def level_box(self, level) -> Box:
         lower, upper = self.shape.level_box(level)
@@ -249,3 +259,27 @@ def polar_repeat(shape: AbstractSdf, count: int) -> PolarRepeated:
     turn = np.arctan2(middle[0] * corners[:, 1] - middle[1] * corners[:, 0], corners @ middle)
     width = float(np.abs(turn).max()) * count / (2 * math.pi)
     return PolarRepeated(shape, int(count), reach=1 + math.floor(width))
+
+
+def grid_repeat(shape: AbstractSdf, spacing, counts: tuple[int, ...]) -> AbstractSdf:
+    """Copies of `shape` in rows along all axes: a row of rows, in space of layers.
+
+    Right for parts without symmetry and for parts wider than the spacing, as `repeat`.
+
+    Args:
+        shape: The copy at the origin; the others lie at positive coordinates.
+        spacing: Distance [m] between copies, one per axis.
+        counts: Number of copies along each axis.
+    """
+    spacing = real(spacing)
+    _check.shape("grid_repeat", "spacing", spacing, (shape.dim,), "One per axis.")
+    if len(counts) != shape.dim:
+        raise ValueError(
+            f"grid_repeat: got {len(counts)} counts, need {shape.dim}. Give one per axis; 1 "
+            "leaves an axis alone."
+        )
+    for axis, count in enumerate(counts):
+        if count != 1:
+            along = jnp.zeros_like(spacing).at[axis].set(spacing[axis])
+            shape = repeat(shape, along, count)
+    return shape

@@ -35,12 +35,17 @@ def value_and_gradient_at(
     shape: AbstractSdf, x: tuple[Array, ...]
 ) -> tuple[Array, tuple[Array, ...]]:
     """Field and slope at separate coordinate arrays."""
-    one, zero = jnp.ones_like(x[0]), jnp.zeros_like(x[0])
-    passes = [
-        jax.jvp(shape.distance, x, tuple(one if i == j else zero for j in range(len(x))))
-        for i in range(len(x))
-    ]
+    passes = [slope_along(shape, x, i) for i in range(len(x))]
     return passes[0][0], tuple(slope for _, slope in passes)
+
+
+def slope_along(shape: AbstractSdf, x: tuple[Array, ...], axis: int) -> tuple[Array, Array]:
+    """Field and its slope along one axis; the other coordinates take no part in the pass."""
+
+    def along(c):
+        return shape.distance(*x[:axis], c, *x[axis + 1 :])
+
+    return jax.jvp(along, (x[axis],), (jnp.ones_like(x[axis]),))
 
 
 def normal(shape: AbstractSdf, p: Points) -> Points:

@@ -21,6 +21,15 @@ def maximum(a: Scalar, b: Scalar) -> Scalar:
     return jnp.where(a >= b, a, b)
 
 
+def ordered(a: Scalar, b: Scalar) -> tuple[Scalar, Scalar]:
+    """The smaller and the larger of two, each of them once also at a tie.
+
+    `minimum` and `maximum` both take the first there, and its slope with it.
+    """
+    swap = a > b
+    return jnp.where(swap, b, a), jnp.where(swap, a, b)
+
+
 def absolute(a: Scalar) -> Scalar:
     return jnp.where(a < 0, -a, a)
 
@@ -63,9 +72,7 @@ def box_distance(*excess: Scalar) -> Scalar:
     return inner + norm(*(positive_part(e) for e in excess))
 
 
-def segment_side(
-    x: Scalar, y: Scalar, a: tuple[Scalar, Scalar], b: tuple[Scalar, Scalar]
-) -> Scalar:
+def segment_side(x: Scalar, y: Scalar, a: tuple[Scalar, ...], b: tuple[Scalar, ...]) -> Scalar:
     """Distance to the segment from a to b, negative on its right side.
 
     Beside the segment it is the distance to its line, which has a slope on the segment.

@@ -162,6 +162,7 @@ class Polygon(AbstractPlaneShape):
 
 def _inside(py, px, ey, ex) -> Bool[Array, "..."]:
     """Whether a ray to the right crosses an odd number of edges."""
-    crosses = (py >= 0) != (py - ey >= 0)
+    # The height over the next corner by the same subtraction as there: rounding must agree.
+    crosses = (py >= 0) != (jnp.roll(py, -1, -1) >= 0)
     right = (px * ey - py * ex) * jnp.where(ey > 0, 1, -1).astype(px.dtype) < 0
     return jnp.sum(crosses & right, axis=-1) % 2 == 1

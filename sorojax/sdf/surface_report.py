@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sorojax.sdf.isosurface import Surface
+from sorojax.sdf.triangle_pairs import crossing_triangles, least_wall
 
 
 class SurfaceReport(NamedTuple):
@@ -18,6 +19,10 @@ class SurfaceReport(NamedTuple):
         degenerate: Triangles that repeat a vertex.
         num_shells: Connected parts.
         genus: Number of handles, all shells together; -1 for an open surface.
+        crossings: (n, 2) triangles that share no vertex and pass through each other; at most
+            1000 of them.
+        wall_thickness: Smallest distance [m] through the body, from triangle centres along
+            the inward normal; infinite for an open surface.
         volume: Enclosed volume [m^3], negative where triangles face inwards.
         area: Surface area [m^2].
     """
@@ -31,12 +36,19 @@ class SurfaceReport(NamedTuple):
     genus: int
     volume: float
     area: float
+    crossings: np.ndarray
+    wall_thickness: float
 
     @property
     def watertight(self) -> bool:
         """Whether every edge joins two triangles that face the same way."""
         bad = (self.open_edges, self.crowded_edges, self.turned_edges, self.degenerate)
         return not any(len(found) for found in bad)
+
+    @property
+    def printable(self) -> bool:
+        """Whether it is manifold and no two triangles pass through each other."""
+        return self.manifold and not len(self.crossings)
 
     @property
     def manifold(self) -> bool:
@@ -80,6 +92,8 @@ def surface_report(surface: Surface) -> SurfaceReport:
         genus=shells - euler // 2 if closed else -1,
         volume=float((corners.mean(axis=1) * normal).sum() / 3),
         area=float(np.sqrt((normal * normal).sum(axis=1)).sum()),
+        crossings=crossing_triangles(vertices, t),
+        wall_thickness=least_wall(vertices, t) if closed and len(t) else np.inf,
     )
 
 

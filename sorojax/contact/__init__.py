@@ -1,0 +1,9 @@
+"""Contact with implicit shapes: gaps, pressures and forces at points."""
+
+from sorojax.contact.broadphase import far as far
+from sorojax.contact.penalty import Penalty as Penalty
+from sorojax.contact.points import (
+    Contacts as Contacts,
+    contacts as contacts,
+    gaps as gaps,
+)

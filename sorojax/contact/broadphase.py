@@ -1,0 +1,20 @@
+"""Which points can be left out because an obstacle is far away."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from sorojax.sdf.base import AbstractSdf
+
+
+def far(obstacle: AbstractSdf, points: Float[Array, "*points dim"]) -> Bool[Array, ""]:
+    """Whether none of `points` [m] can lie inside `obstacle`, by one value of its field.
+
+    A field changes by at most its Lipschitz constant per length, so a field at the centre
+    of a ball above that constant times the radius is positive in the whole ball. `False`
+    may also mean that it is not known.
+    """
+    flat = points.reshape(-1, points.shape[-1])
+    low, high = jnp.min(flat, axis=0), jnp.max(flat, axis=0)
+    centre = (low + high) / 2
+    radius = jnp.sqrt(jnp.max(jnp.sum((flat - centre[None]) ** 2, axis=1)))
+    return obstacle(centre) > obstacle.lipschitz * radius

@@ -1,0 +1,166 @@
+"""Newton's method for equilibrium together with a few further unknowns.
+
+The unknowns y, a load factor or the pressures of cavities, obey one further equation
+each. The bordered system
+
+    [K  B] [du]     [R]
+    [C' D] [dy] = - [c]
+
+is solved by block elimination: all right-hand sides take one factor of K, whose
+sparse pattern stays that of the mesh. K may be indefinite; it is singular only at
+isolated points of a path, on which no iterate falls but by accident.
+
+Reference: Crisfield, "A fast incremental/iterative solution procedure that handles
+snap-through", Computers & Structures 13, 1981.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from sorojax.fem.linear import Linearised, Prepared, linearise
+from sorojax.fem.newton import Newton, relative_size, safe_fraction
+from sorojax.fem.problem import Problem
+from sorojax.math import sparse
+
+
+class Border(NamedTuple):
+    """The further equations at one state; `scale` is the size of a gap worth its name."""
+
+    force_rate: Float[Array, "rows dofs"]  # B = dR/dy at fixed u
+    known: Float[Array, " dofs"]  # displacements at the supports
+    known_rate: Float[Array, "rows dofs"]
+    gap: Float[Array, " rows"]  # c
+    gap_slope: Float[Array, "rows dofs"]  # C
+    gap_rate: Float[Array, "rows rows"]  # D
+    scale: Float[Array, " rows"]
+
+
+class BorderedIterate(NamedTuple):
+    """State and further unknowns after Newton's method: converged unless `reason` says why
+    not."""
+
+    u: np.ndarray
+    y: np.ndarray
+    linearised: Linearised | None
+    iterations: int
+    residual: float
+    reason: str
+
+
+class Response(NamedTuple):
+    """Answers of the tangent: to the residual, and to each unknown of the border."""
+
+    correction: Float[np.ndarray, " dofs"]
+    rates: Float[np.ndarray, "rows dofs"]
+    negative_eigenvalues: int
+
+
+At = Callable[[np.ndarray, np.ndarray], tuple[Problem, Border]]
+
+
+@jax.jit
+def _constrain(
+    system: sparse.SparseSymmetric,
+    values: Float[Array, " nnz"],
+    forces: Float[Array, "rows dofs"],
+    known: Bool[Array, " dofs"],
+    moves: Float[Array, "rows dofs"],
+):
+    """Matrix and right-hand sides in which known unknowns take given moves."""
+    rhs = -forces - jax.vmap(lambda move: sparse.product(system, values, move))(moves)
+    zero = jnp.zeros_like(rhs)
+    return sparse.fix(system, values, known), jnp.where(known[None], zero, rhs)
+
+
+def respond(
+    problem: Problem,
+    prepared: Prepared,
+    state: Linearised,
+    border: Border,
+    move: np.ndarray,
+) -> Response | None:
+    """Back-substitutions of one state, all with the same factor; `None` if singular."""
+    system = problem.space.system
+    forces = jnp.concatenate([state.residual[None], border.force_rate])
+    moves = np.concatenate([move[None], np.asarray(border.known_rate)])
+    matrix, rhs = _constrain(system, state.values, forces, prepared.known, jnp.asarray(moves))
+    factor = system.solver.factor(np.asarray(matrix))
+    if factor is None:
+        return None
+    x = factor.solve(np.asarray(rhs)) + moves
+    return Response(x[0], x[1:], factor.negative_eigenvalues)
+
+
+def schur_complement(border: Border, rates: np.ndarray) -> np.ndarray:
+    """D - C' K^-1 B: what the further equations see of the further unknowns."""
+    return np.asarray(border.gap_slope) @ rates.T + np.asarray(border.gap_rate)
+
+
+def unknown_move(prepared: Prepared, border: Border, u: np.ndarray) -> np.ndarray:
+    """How far the supports are from where they should be [m]."""
+    known = np.asarray(border.known)
+    move = np.where(np.asarray(prepared.known), known - u.ravel(), 0.0)
+    move[np.abs(move) <= 1e-12 * np.abs(known).max()] = 0.0
+    return move
+
+
+def newton_bordered(
+    at: At, prepared: Prepared, u: np.ndarray, y: np.ndarray, settings: Newton
+) -> BorderedIterate:
+    """Equilibrium near `u`, `y` that obeys the further equations.
+
+    `at(u, y)` is the problem with the unknowns put in, and the border there.
+    """
+    problem, border = at(u, y)
+    state = linearise(problem, prepared, jnp.asarray(u), jnp.asarray(u))
+    iterations, size = 0, np.inf
+    while True:
+        norm, reference = float(state.residual_norm), float(state.reference)
+        ratio = norm / reference if reference > 0 else norm
+        if not (np.isfinite(norm) and float(state.volume_ratio) > 0):
+            return BorderedIterate(u, y, None, iterations, ratio, "an element inverts")
+        move = unknown_move(prepared, border, u)
+        small = ratio < settings.residual_tolerance or norm < float(state.rounding)
+        closed = np.all(np.abs(border.gap) <= 1e-9 * np.asarray(border.scale))
+        if small and closed and size < settings.step_tolerance and not np.any(move):
+            return BorderedIterate(u, y, state, iterations, ratio, "")
+        if iterations == settings.max_iterations:
+            reason = f"no convergence in {iterations} Newton iterations"
+            return BorderedIterate(u, y, None, iterations, ratio, reason)
+        step = _step(problem, prepared, state, border, move)
+        if step is None:
+            return BorderedIterate(u, y, None, iterations, ratio, "the tangent is singular")
+        iterations += 1
+        du, dy = step[0].reshape(u.shape), step[1]
+        before = u
+        u, y, problem, border, state = _advance(at, prepared, problem, u, y, du, dy)
+        size = relative_size(prepared, u, u - before)
+
+
+def _step(problem, prepared, state, border, move) -> tuple[np.ndarray, np.ndarray] | None:
+    found = respond(problem, prepared, state, border, move)
+    if found is None:
+        return None
+    gap = np.asarray(border.gap) + np.asarray(border.gap_slope) @ found.correction
+    try:
+        dy = np.linalg.solve(schur_complement(border, found.rates), -gap)
+    except np.linalg.LinAlgError:
+        return None
+    return found.correction + dy @ found.rates, dy
+
+
+def _advance(at: At, prepared: Prepared, problem: Problem, u, y, du, dy):
+    """The state after a step, shortened where a cell would collapse."""
+    fraction = 1.0
+    while True:
+        new_u, new_y = u + fraction * du, y + fraction * dy
+        new_problem, border = at(new_u, new_y)
+        state = linearise(new_problem, prepared, jnp.asarray(new_u), jnp.asarray(u))
+        if fraction < 1.0 or float(state.volume_ratio) > 0.1:
+            return new_u, new_y, new_problem, border, state
+        fraction = safe_fraction(problem, prepared, u, du)

@@ -1,0 +1,300 @@
+"""What `fem.problem` refuses, before any long computation."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sorojax import _check
+from sorojax._types import is_traced
+from sorojax.fem.facets import open_nodes
+from sorojax.fem.formulation import (
+    AbstractFormulation,
+    ConstantPressure,
+    Displacement,
+    LinearPressure,
+)
+from sorojax.fem.kinematics import AbstractKinematics, Axisymmetric
+from sorojax.fem.loads import AbstractLoad, Gravity, Pressure
+from sorojax.fem.space import Space
+from sorojax.fem.supports import AbstractSupport, known_components, known_dofs
+from sorojax.material.hyperelastic import AbstractHyperelastic, small_strain_moduli
+from sorojax.mesh.elements import PolyN, Quad9, Tet4, Tet15, Tri3, Tri7
+from sorojax.mesh.mesh import Mesh
+from sorojax.mesh.shape import nodes as reference_nodes, shape_gradients
+
+#: Ratio of bulk to shear modulus above which a pressure at every point locks.
+LOCKING_RATIO = {1: 10.0, 2: 100.0}
+
+
+def kinematics(mesh: Mesh, given: AbstractKinematics | None) -> AbstractKinematics:
+    if given is None:
+        raise ValueError(
+            f"fem.problem: {mesh.element.name} cells lie in a plane. Say how the plane is "
+            "completed: kinematics=fem.PlaneStrain(thickness), fem.PlaneStress(thickness) or "
+            "fem.Axisymmetric()."
+        )
+    if given.dim != mesh.element.dim:
+        raise ValueError(
+            f"fem.problem: kinematics {type(given).__name__} is for cells of dimension "
+            f"{given.dim}, {mesh.element.name} has {mesh.element.dim}. Leave `kinematics` out "
+            "in space, or choose a plane one."
+        )
+    if isinstance(given, Axisymmetric) and not is_traced(mesh.points):
+        radius = np.asarray(mesh.points)[:, 0]
+        if radius.min() < -1e-12 * np.ptp(radius):
+            raise ValueError(
+                f"fem.problem: a node has radius {radius.min():.3g} m, need x >= 0 in a body of "
+                "revolution about the y axis. Move the mesh to the right of the axis."
+            )
+    return given
+
+
+def space(mesh: Mesh, given: Space) -> None:
+    if given.num_nodes != mesh.num_nodes or given.num_cells != mesh.num_cells:
+        raise ValueError(
+            f"fem.problem: `space` belongs to a mesh of {given.num_nodes} nodes, this mesh "
+            f"has {mesh.num_nodes}. Call fem.space(mesh) for this mesh."
+        )
+
+
+def cells(mesh: Mesh) -> None:
+    if is_traced(mesh):
+        return
+    points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
+    _check.finite("fem.problem", "mesh.points", points, "Repair the mesh first.")
+    if isinstance(mesh.element, PolyN):
+        after, before = np.roll(points[cells], -1, axis=1), points[cells]
+        turn = before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0]
+        least = turn.sum(axis=1)
+    else:
+        slopes = shape_gradients(mesh.element, reference_nodes(mesh.element))
+        least = np.linalg.det(np.einsum("qad,cai->cqid", slopes, points[cells])).min(axis=1)
+    bad = np.flatnonzero(least <= 0)
+    if len(bad):
+        raise ValueError(
+            f"fem.problem: {len(bad)} of {len(cells)} cells are inverted or flat "
+            f"(first: {bad[:5].tolist()}). List corners counter-clockwise, or re-mesh."
+        )
+
+
+def material(mesh: Mesh, given: AbstractHyperelastic) -> None:
+    for leaf in jax.tree.leaves(given):
+        if jnp.ndim(leaf) and jnp.shape(leaf) != (mesh.num_cells,):
+            raise ValueError(
+                f"fem.problem: a leaf of `material` has shape {jnp.shape(leaf)}, need () or "
+                f"one number per cell, ({mesh.num_cells},)."
+            )
+
+
+def formulation(
+    mesh: Mesh, kinematics: AbstractKinematics, given: AbstractFormulation
+) -> None:
+    """Refuse pairs of displacement and pressure that lock or are unstable."""
+    element = mesh.element
+    if isinstance(given, Displacement):
+        return
+    if not kinematics.has_volume:
+        raise ValueError(
+            "fem.problem: plane stress has no pressure of its own, got "
+            f"{type(given).__name__}. Leave `formulation` out."
+        )
+    if isinstance(given, ConstantPressure) and isinstance(element, Tri3 | Tet4):
+        raise ValueError(
+            f"fem.problem: a constant pressure in {element.name} is the displacement element "
+            "and locks. Use order=2 and mesh.enrich, or quadrilaterals."
+        )
+    if isinstance(given, LinearPressure) and not isinstance(element, Tri7 | Quad9 | Tet15):
+        raise ValueError(
+            f"fem.problem: a linear pressure in {element.name} is not stable, need Tri7, Quad9 "
+            "or Tet15. Call mesh.enrich(mesh) first, or use fem.ConstantPressure()."
+        )
+
+
+def locking(
+    mesh: Mesh,
+    material: AbstractHyperelastic,
+    kinematics: AbstractKinematics,
+    chosen: AbstractFormulation,
+) -> None:
+    """Refuse nearly incompressible materials in cells whose default would lock."""
+    if not isinstance(chosen, Displacement) or not kinematics.has_volume or is_traced(material):
+        return
+    ratio = _bulk_over_shear(material)
+    limit = LOCKING_RATIO[mesh.element.order]
+    if ratio > limit:
+        poisson = (3 * ratio - 2) / (6 * ratio + 2)
+        remedy = (
+            "Use order=2 cells and mesh.enrich(mesh), or quadrilaterals"
+            if mesh.element.order == 1
+            else "Call mesh.enrich(mesh) first"
+        )
+        raise ValueError(
+            f"fem.problem: {mesh.element.name} would lock at a Poisson ratio of {poisson:.4f} "
+            f"(K / mu = {ratio:.0f}, need at most {limit:.0f}). {remedy}; to accept it pass "
+            "formulation=fem.Displacement()."
+        )
+
+
+def _bulk_over_shear(material: AbstractHyperelastic) -> float:
+    """Largest ratio over all cells; 0 where the material cannot tell."""
+    leaves, tree = jax.tree.flatten(material)
+    length = max((leaf.size for leaf in leaves if jnp.ndim(leaf)), default=0)
+    if not length:
+        shear, bulk = small_strain_moduli(material)
+        return float(bulk / shear)
+    values = np.stack([np.broadcast_to(np.asarray(leaf), (length,)) for leaf in leaves], axis=1)
+    kinds = np.unique(values, axis=0)
+    kinds = kinds[np.linspace(0, len(kinds) - 1, min(len(kinds), 8)).astype(int)]
+    ratios = []
+    for kind in kinds:
+        shear, bulk = small_strain_moduli(
+            jax.tree.unflatten(tree, [jnp.asarray(v) for v in kind])
+        )
+        ratios.append(float(bulk / shear))
+    return max(ratios)
+
+
+def supports(
+    mesh: Mesh, kinematics: AbstractKinematics, given: tuple[AbstractSupport, ...]
+) -> np.ndarray:
+    dim = mesh.element.dim
+    for support in given:
+        where = f"{type(support).__name__}"
+        if support.nodes.size == 0:
+            raise ValueError(
+                f"fem.problem: `{where}` holds no node. Check the predicate with "
+                "mesh.nodes_where; lengths are in metres."
+            )
+        _check_ids(where, support.nodes, mesh.num_nodes)
+        _check_components(where, support, dim)
+    known = known_dofs(given, mesh.num_nodes, dim)
+    if is_traced(mesh.points):
+        return known
+    points = np.asarray(mesh.points)
+    if free := _num_free_modes(points, known, kinematics):
+        raise ValueError(
+            f"fem.problem: the supports leave {free} rigid-body mode(s), so there is no "
+            "unique equilibrium. Add a support, for example Fixed(nodes_where(...))."
+        )
+    if isinstance(kinematics, Axisymmetric):
+        _check_axis(points, known)
+    return known
+
+
+def _check_components(where: str, support: AbstractSupport, dim: int) -> None:
+    components = known_components(support, dim)
+    if not components or min(components) < 0 or max(components) >= dim:
+        raise ValueError(
+            f"fem.problem: `{where}` names components {components}, the mesh has 0 to {dim - 1}."
+        )
+    shape = jnp.shape(support.displacement)
+    if shape not in ((), (len(components),), (support.nodes.size, len(components))):
+        raise ValueError(
+            f"fem.problem: `{where}` has a displacement of shape {shape}, need "
+            f"({len(components)},) or ({support.nodes.size}, {len(components)}): one entry per "
+            "known component."
+        )
+
+
+def _check_axis(points: np.ndarray, known: np.ndarray) -> None:
+    on = np.flatnonzero(points[:, 0] <= 1e-12 * np.ptp(points[:, 0]))
+    loose = on[~known.reshape(-1, 2)[on, 0]]
+    if len(loose):
+        raise ValueError(
+            f"fem.problem: {len(loose)} nodes on the axis may leave it (first: "
+            f"{loose[:4].tolist()}). Add Fixed(nodes, components=(0,)) for the nodes at x = 0."
+        )
+
+
+def _num_free_modes(points: np.ndarray, known: np.ndarray, kinematics) -> int:
+    """Rigid-body modes that no known displacement stops."""
+    modes = rigid_modes(points, kinematics)
+    held = modes.reshape(modes.shape[0], -1)[:, known]
+    return len(modes) - (np.linalg.matrix_rank(held, tol=1e-8) if held.size else 0)
+
+
+def rigid_modes(points: np.ndarray, kinematics: AbstractKinematics) -> np.ndarray:
+    """Small rigid motions of the nodes, (modes, nodes, dim), of about unit size."""
+    dim = points.shape[1]
+    x = (points - points.mean(axis=0)) / np.ptp(points, axis=0).max()
+    moves = [np.broadcast_to(axis, x.shape) for axis in np.eye(dim)]
+    if isinstance(kinematics, Axisymmetric):
+        return np.stack(moves[1:])
+    turns = []
+    for i in range(dim):
+        for j in range(i + 1, dim):
+            turn = np.zeros_like(x)
+            turn[:, i], turn[:, j] = -x[:, j], x[:, i]
+            turns.append(turn)
+    return np.stack(moves + turns)
+
+
+def _check_ids(where: str, ids: Any, count: int) -> None:
+    ids = np.asarray(ids)
+    if ids.min() < 0 or ids.max() >= count:
+        raise ValueError(
+            f"fem.problem: `{where}` names nodes {ids.min()} to {ids.max()}, the mesh has 0 "
+            f"to {count - 1}. Select them on this mesh."
+        )
+
+
+def loads(
+    mesh: Mesh,
+    kinematics: AbstractKinematics,
+    material: AbstractHyperelastic,
+    given: tuple[AbstractLoad, ...],
+    known: np.ndarray,
+) -> None:
+    names = [load.name for load in given]
+    if len(set(names)) != len(names):
+        raise ValueError(
+            f"fem.problem: loads are called {names}, need different names. Set `name=`."
+        )
+    for load in given:
+        where = f"{type(load).__name__} '{load.name}'"
+        _check.finite("fem.problem", f"{where} value", load.value, "SI units: 20 * kPa.")
+        if load.value.ndim and load.value.shape != (mesh.element.dim,):
+            raise ValueError(
+                f"fem.problem: {where} has a value of shape {load.value.shape}, need "
+                f"({mesh.element.dim},): one entry per axis."
+            )
+        if isinstance(load, Gravity) and material.density is None:
+            raise ValueError(
+                f"fem.problem: {where} needs a density, the {type(material).__name__} has "
+                "none. Give density= in kg/m^3."
+            )
+        for what in ("facets", "nodes"):
+            ids = getattr(load, what, None)
+            if ids is None:
+                continue
+            if ids.size == 0:
+                raise ValueError(
+                    f"fem.problem: {where} acts on no {what[:-1]}. Check the shape given to "
+                    "mesh.facets_on; lengths are in metres."
+                )
+            _check_ids(where, ids, mesh.num_nodes)
+        if isinstance(load, Pressure):
+            _check_closed(where, load, mesh, kinematics, known)
+
+
+def _check_closed(where: str, load: Pressure, mesh: Mesh, kinematics, known) -> None:
+    """An open end must be held, or slide in a plane through the origin of the load."""
+    ends = open_nodes(mesh.element, np.asarray(load.facets))
+    held = known.reshape(-1, mesh.element.dim)[ends]
+    safe = held.all(axis=1)
+    if not is_traced((mesh.points, load)):
+        origin = np.zeros(mesh.element.dim) if load.origin is None else np.asarray(load.origin)
+        points = np.asarray(mesh.points)
+        off = np.abs(points[ends] - origin) <= 1e-9 * np.ptp(points, axis=0).max()
+        on_plane = held & off
+        if isinstance(kinematics, Axisymmetric):
+            on_plane[:, 1] = held[:, 1]
+        safe |= on_plane.any(axis=1)
+    if not safe.all():
+        raise ValueError(
+            f"fem.problem: {where} acts on facets with an open end at nodes "
+            f"{ends[~safe][:4].tolist()}, so it has no potential. Close the cavity, fix the "
+            "nodes at its ends, or let them slide in planes of symmetry through `origin`."
+        )

@@ -1,0 +1,146 @@
+"""Frictionless contact of a body with a shape that does not deform."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sorojax import _check
+from sorojax._types import integers, is_traced, optional_real
+from sorojax.contact import Contacts, Penalty, contacts, far, gaps
+from sorojax.fem.curved import CurvedPart, blockwise
+from sorojax.fem.facets import facet_tables, normals
+from sorojax.fem.loads import AbstractLoad
+from sorojax.material.hyperelastic import small_strain_moduli
+from sorojax.mesh.elements import facet_corners
+from sorojax.sdf.base import AbstractSdf
+
+_TOGETHER = 32  # facets that the broad phase judges by one ball
+
+
+class Contact(AbstractLoad):
+    """`facets` may not enter `obstacle`, which is `value` away from its place [m].
+
+    A penalty per reference area at the quadrature points of the facets, `contact.Penalty`.
+    Facets of which no point can touch cost one value of the obstacle's field for every 32.
+
+    `stiffness` [Pa/m] is 10 E / h when omitted, h being the mean size of the facets, and
+    `smoothing` [m] is h / 1000: pressure p then overlaps by about h p / (10 E). Under
+    `solve_path(problem, name=positions)` the obstacle moves.
+    """
+
+    facets: Int[Array, "facets facet_nodes"] = eqx.field(converter=integers)
+    obstacle: AbstractSdf
+    stiffness: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
+    smoothing: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
+    value: Float[Array, " dim"] = eqx.field(converter=optional_real, default=None)  # type: ignore
+    name: str = eqx.field(static=True, default="contact")
+
+    @property
+    def law(self) -> Penalty:
+        if self.stiffness is None or self.smoothing is None:
+            raise ValueError(
+                f"fem.Contact '{self.name}': no stiffness yet. Take the load of the problem, "
+                "problem.loads, where the default is filled in."
+            )
+        return Penalty(self.stiffness, self.smoothing)
+
+    def potential(self, problem, u):
+        part = self.curved_part(problem)
+        x = (problem.mesh.points + u)[part.groups]
+
+        def energies(x, areas):
+            return jax.vmap(part.energy)(x, areas)
+
+        return jnp.sum(blockwise(energies, part.idle, x, part.data, ()))
+
+    def curved_part(self, problem):
+        tables = facet_tables(problem.mesh.element)
+        values, law = jnp.asarray(tables.values), self.law
+
+        def energy(x, areas):
+            return jnp.sum(areas * law.energy(gaps(self.obstacle, values @ x, self.value)))
+
+        def idle(x, _):
+            points = jnp.einsum("qa,fai->fqi", values, x)
+            return far(self.obstacle, points - jnp.broadcast_to(self.value, points.shape))
+
+        return CurvedPart(self.facets, energy, areas_of(problem, self.facets), idle)
+
+    def completed(self, mesh, material, kinematics):
+        facets, size = _compact(mesh, self.facets), _mean_size(mesh, self.facets)
+        value = jnp.zeros(mesh.element.dim) if self.value is None else self.value
+        stiffness, smoothing = self.stiffness, self.smoothing
+        if stiffness is None:
+            shear, bulk = small_strain_moduli(material)
+            stiffness = 10 * jnp.max(9 * bulk * shear / (3 * bulk + shear)) / size
+        if smoothing is None:
+            smoothing = 1e-3 * size
+        return Contact(facets, self.obstacle, stiffness, smoothing, value, self.name)
+
+    def check(self, where, mesh, kinematics):
+        if self.obstacle.dim != mesh.element.dim:
+            raise ValueError(
+                f"fem.problem: {where} has an obstacle in {self.obstacle.dim} dimensions, the "
+                f"mesh has {mesh.element.dim}. Use a shape of the same space."
+            )
+        for what, number, unit in (
+            ("stiffness", self.stiffness, "Pa/m"), ("smoothing", self.smoothing, "m"),
+        ):  # fmt: skip
+            _check.positive("fem.problem", f"{where} {what}", number, unit,
+                            "Leave it out for the default.")  # fmt: skip
+
+
+def areas_of(
+    problem, facets: Int[Array, "facets facet_nodes"]
+) -> Float[Array, "facets quad"]:
+    """Reference areas of the quadrature points of facets [m^2]."""
+    tables, kinematics = facet_tables(problem.mesh.element), problem.kinematics
+    weights, values = jnp.asarray(tables.weights), jnp.asarray(tables.values)
+
+    def one(X):
+        size = jnp.sqrt(jnp.sum(normals(tables, X) ** 2, axis=1))
+        return weights * size * kinematics.depth(tuple((values @ X).T))
+
+    return jax.vmap(one)(problem.mesh.points[facets])
+
+
+def contact_state(problem, u: Float[Array, "nodes dim"], name: str = "contact") -> Contacts:
+    """Gap, pressure, normal and force at the quadrature points of the contact `name`.
+
+    `.total` is the force of the obstacle on the body [N], `.active` the points that touch.
+    """
+    loads = [load for load in problem.loads if load.name == name]
+    if not loads or not isinstance(loads[0], Contact):
+        names = [load.name for load in problem.loads if isinstance(load, Contact)]
+        raise ValueError(f"fem.contact_state: got name {name!r}, need one of {names}.")
+    load = loads[0]
+    values = jnp.asarray(facet_tables(problem.mesh.element).values)
+    points = jnp.einsum("qa,fai->fqi", values, (problem.mesh.points + u)[load.facets])
+    areas = areas_of(problem, load.facets).ravel()
+    flat = points.reshape(-1, points.shape[-1])
+    return contacts(load.law, load.obstacle, flat, areas, load.value)
+
+
+def _mean_size(mesh, facets) -> Float[Array, ""]:
+    corners = mesh.points[facets[:, : facet_corners(mesh.element)]]
+    return jnp.mean(jnp.sqrt(jnp.sum((corners[:, 1] - corners[:, 0]) ** 2, axis=1)))
+
+
+def _compact(mesh, facets) -> Int[np.ndarray, "facets facet_nodes"] | Array:
+    """The facets in an order that keeps neighbours together, by halving the longest side."""
+    if is_traced((mesh.points, facets)):
+        return facets
+    facets = np.asarray(facets)
+    centres = np.asarray(mesh.points)[facets].mean(axis=1)
+
+    def halved(ids):
+        if len(ids) <= _TOGETHER:
+            return [ids]
+        axis = np.argmax(np.ptp(centres[ids], axis=0))
+        ids = ids[np.argsort(centres[ids, axis], kind="stable")]
+        middle = -(-len(ids) // (2 * _TOGETHER)) * _TOGETHER
+        return halved(ids[:middle]) + halved(ids[middle:])
+
+    return facets[np.concatenate(halved(np.arange(len(facets))))]

@@ -1,0 +1,73 @@
+"""Load stiffness: small dense matrices of groups of nodes, scattered into the tangent."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+_BLOCK = 32  # groups that are skipped together
+
+
+class CurvedPart(NamedTuple):
+    """Groups of nodes, and the energy [J] of one at its deformed positions [m].
+
+    `energy(x, data)` takes the positions of a group and its row of `data`. Where
+    `idle(x, data)` holds for a block of groups its stiffness is known to be zero and is
+    not computed.
+    """
+
+    groups: Int[Array, "groups group_nodes"]
+    energy: Callable[[Float[Array, "group_nodes dim"], Any], Float[Array, ""]]
+    data: Any = None
+    idle: Callable[[Float[Array, "block group_nodes dim"], Any], Bool[Array, ""]] | None = None
+
+
+def group_matrices(
+    part: CurvedPart, x: Float[Array, "groups group_nodes dim"]
+) -> Float[Array, "groups entries"]:
+    """Upper triangles of the second derivatives, node by node [N/m].
+
+    Where a node stands twice in a group, the entry between the two is one of the diagonal
+    and counts twice.
+    """
+    size, dim = x.shape[1] * x.shape[2], x.shape[2]
+    first, second = np.triu_indices(size)
+    twin = (first != second) & (first % dim == second % dim)
+    repeated = part.groups[:, first // dim] == part.groups[:, second // dim]
+    count = jnp.where(repeated & jnp.asarray(twin)[None], 2.0, 1.0).astype(x.dtype)
+
+    def upper(x, data):
+        def energy(flat):
+            return part.energy(flat.reshape(x.shape), data)
+
+        return jax.hessian(energy)(x.ravel())[first, second]
+
+    def many(x, data):
+        return jax.vmap(upper)(x, data)
+
+    if part.idle is None:
+        return count * many(x, part.data)
+    return count * blockwise(many, part.idle, x, part.data, (len(first),))
+
+
+def blockwise(
+    kernel: Callable, idle: Callable, x: Float[Array, "groups ..."], data: Any, tail: tuple
+) -> Float[Array, "groups ..."]:
+    """`kernel(x, data)` in blocks of groups; zeros of shape `tail` where a block is idle."""
+    count = x.shape[0]
+    width = min(_BLOCK, count)
+    num_blocks = -(-count // width)
+    # the last block is filled up with copies of the last group
+    at = jnp.minimum(jnp.arange(num_blocks * width), count - 1).reshape(num_blocks, width)
+
+    def block(at):
+        own = jax.tree.map(lambda leaf: leaf[at], (x, data))
+        return jax.lax.cond(
+            idle(*own), lambda *_: jnp.zeros((width, *tail), x.dtype), kernel, *own
+        )
+
+    found = jax.lax.map(block, at)
+    return found.reshape(num_blocks * width, *tail)[:count]

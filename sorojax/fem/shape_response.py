@@ -1,0 +1,94 @@
+"""Energy of the change of shape, its stress and its tangent, over arrays of entries of F.
+
+Energies of the first isochoric invariant have a closed form; any other energy is
+differentiated at the point.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax.fem.kinematics import AbstractKinematics
+from sorojax.fem.tensor import (
+    Entries,
+    curvature_entries,
+    curvature_table,
+    volume_ratio,
+    volume_slopes,
+)
+from sorojax.material.hyperelastic import AbstractHyperelastic, first_invariant_energy
+from sorojax.material.kinematics import Entry, square_norm
+
+
+def shape_energy(
+    material: AbstractHyperelastic, kinematics: AbstractKinematics, F: Entries
+) -> Entry:
+    """Energy that is not a function of J alone at every point [J/m^3]."""
+    return kinematics.shape_energy(material, tuple(F))
+
+
+def shape_stress(
+    material: AbstractHyperelastic, kinematics: AbstractKinematics, F: Entries
+) -> Entries:
+    """Its first Piola-Kirchhoff stress [Pa]."""
+    W = _closed_form(material, kinematics)
+    if W is None:
+        return jax.grad(lambda F: jnp.sum(shape_energy(material, kinematics, F)))(F)
+    x, slopes = _first_invariant(kinematics, F)
+    return _slope(W)(x)[None] * slopes
+
+
+def shape_tangent(
+    material: AbstractHyperelastic, kinematics: AbstractKinematics, F: Entries
+) -> Float[Array, "entries entries quad lanes"]:
+    """Derivative of the stress by F [Pa]."""
+    W = _closed_form(material, kinematics)
+    if W is None:
+        num = F.shape[0]
+        unit = jnp.eye(num, dtype=F.dtype)[:, :, None, None]
+        units = jnp.broadcast_to(unit, (num, *F.shape))
+
+        def column(direction):
+            return jax.jvp(lambda F: shape_stress(material, kinematics, F), (F,), (direction,))
+
+        return jax.vmap(lambda direction: column(direction)[1])(units)
+    x, slopes = _first_invariant(kinematics, F)
+    first, second = jax.jvp(_slope(W), (x,), (jnp.ones_like(x),))
+    bent = (second[None] * slopes)[:, None] * slopes[None]
+    return bent + first[None, None] * _invariant_curvature(kinematics, F)
+
+
+def _closed_form(material: AbstractHyperelastic, kinematics: AbstractKinematics):
+    return first_invariant_energy(material) if kinematics.has_volume else None
+
+
+def _slope(W):
+    return lambda x: jax.grad(lambda x: jnp.sum(W(x)))(x)
+
+
+def _parts(kinematics: AbstractKinematics, F: Entries):
+    """J, J^(-2/3), I1 and dJ/dF."""
+    J = volume_ratio(kinematics, F)
+    scale = jnp.exp(-2 / 3 * jnp.log(J))
+    return J, scale, square_norm(kinematics.embed(tuple(F))), volume_slopes(kinematics, F)
+
+
+def _first_invariant(kinematics: AbstractKinematics, F: Entries) -> tuple[Entry, Entries]:
+    """I1_bar - 3 and its derivative by F."""
+    J, scale, I1, C = _parts(kinematics, F)
+    slopes = (2 * scale)[None] * F - (2 / 3 * scale * I1 / J)[None] * C
+    return scale * I1 - 3, slopes
+
+
+def _invariant_curvature(kinematics: AbstractKinematics, F: Entries):
+    """Second derivative of I1_bar by F."""
+    J, scale, I1, C = _parts(kinematics, F)
+    mixed = (-4 / 3 * scale / J)[None] * F
+    square = (5 / 9 * scale * I1 / J**2)[None] * C
+    # the sum of an outer product and its transpose
+    half = (mixed + square)[:, None] * C[None]
+    place, sign = curvature_table(kinematics)
+    bent = curvature_entries(F)[place] * sign[:, :, None, None]
+    flat = 2 * jnp.eye(F.shape[0], dtype=F.dtype)[:, :, None, None]
+    rest = flat * scale[None, None] - (2 / 3 * scale * I1 / J)[None, None] * bent
+    return half + jnp.swapaxes(half, 0, 1) + rest

@@ -1,0 +1,151 @@
+"""Tendons: cables without friction through points of the body."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sorojax import _check
+from sorojax._types import integers, real
+from sorojax.fem.curved import CurvedPart
+from sorojax.fem.loads import AbstractLoad
+from sorojax.mesh.locate import Locations, locate
+from sorojax.mesh.mesh import Mesh
+
+
+class Route(eqx.Module):
+    """Points of a body: nodes of the cells that hold them and the weights of these nodes."""
+
+    nodes: Int[Array, "points cell_nodes"] = eqx.field(converter=integers)
+    weights: Float[Array, "points cell_nodes"] = eqx.field(converter=real)
+
+    def lengths(self, x: Float[Array, "nodes dim"]) -> Float[Array, " segments"]:
+        """Lengths of the straight segments [m] where the nodes are at `x` [m]."""
+        return _lengths(Locations(self.nodes, self.weights)(x))
+
+
+def route(mesh: Mesh, points: Float[np.ndarray, "points dim"]) -> Route:
+    """The way of a tendon through `points` [m] of the reference configuration, in order.
+
+    Raises:
+        ValueError: If there are fewer than two points, two in a row are the same, or one
+            lies outside the mesh.
+    """
+    points = np.asarray(points, float)
+    if points.ndim != 2 or points.shape[1] != mesh.element.dim or len(points) < 2:
+        raise ValueError(
+            f"fem.route: `points` has shape {points.shape}, need (points, "
+            f"{mesh.element.dim}) with at least two points. Give one row per point."
+        )
+    _check.finite("fem.route", "points", points, "Give points in metres.")
+    if (gaps := np.linalg.norm(np.diff(points, axis=0), axis=1)).min() <= 0:
+        raise ValueError(
+            f"fem.route: points {gaps.argmin()} and {gaps.argmin() + 1} are the same. Leave "
+            "one out."
+        )
+    return Route(*locate(mesh, points))
+
+
+def tendon_length(
+    mesh: Mesh, u: Float[Array, "nodes dim"], route: Route
+) -> Float[Array, ""]:
+    """Length of the polyline of a tendon at displacement `u` [m]."""
+    return jnp.sum(route.lengths(mesh.points + u))
+
+
+class Tendon(AbstractLoad):
+    """Cable of tension `value` [N] along `route(mesh, points)`, fixed to its last point.
+
+    Without friction the tension is the same all along, and the potential is tension times
+    length. The force at the first point is that of a cable which leaves the body there
+    along the last segment, or of one that is fixed to it.
+    """
+
+    route: Route
+    value: Float[Array, ""] = eqx.field(converter=real, default=0.0)
+    name: str = eqx.field(static=True, default="tendon")
+
+    def potential(self, problem, u):
+        return self.value * tendon_length(problem.mesh, u, self.route)
+
+    def curved_part(self, problem):
+        weights = self.route.weights
+
+        def energy(x, weights):
+            ends = jnp.einsum("pa,pai->pi", weights, x.reshape(*weights.shape, -1))
+            return self.value * jnp.sum(_lengths(ends))
+
+        data = jnp.stack([weights[:-1], weights[1:]], axis=1)
+        return CurvedPart(_segments(self.route.nodes, jnp), energy, data)
+
+    def couples(self):
+        return _segments(np.asarray(self.route.nodes), np)
+
+
+class Cable(AbstractLoad):
+    """Elastic cable along `route(mesh, points)`, shortened by `value` [m].
+
+    Tension = stiffness (length - rest length + value) [N] where that is positive, slack
+    otherwise; the rest length is that of the reference configuration. A high `stiffness`
+    [N/m] prescribes the length up to tension / stiffness.
+    """
+
+    route: Route
+    stiffness: Float[Array, ""] = eqx.field(converter=real)
+    value: Float[Array, ""] = eqx.field(converter=real, default=0.0)
+    name: str = eqx.field(static=True, default="cable")
+    holds: ClassVar[bool] = False
+
+    def _energy(self, length, rest):
+        elongation = length - rest + self.value
+        taut = jnp.where(elongation > 0, elongation, jnp.zeros_like(elongation))
+        return 0.5 * self.stiffness * taut**2
+
+    def potential(self, problem, u):
+        rest = tendon_length(problem.mesh, jnp.zeros_like(u), self.route)
+        return self._energy(tendon_length(problem.mesh, u, self.route), rest)
+
+    def curved_part(self, problem):
+        # The tension depends on the whole length: all nodes of the cable are one group.
+        rest = tendon_length(
+            problem.mesh, jnp.zeros_like(problem.mesh.points), self.route
+        )
+        shape = self.route.weights.shape
+
+        def energy(x, weights):
+            ends = jnp.einsum("pa,pai->pi", weights, x.reshape(*shape, -1))
+            return self._energy(jnp.sum(_lengths(ends)), rest)
+
+        nodes = self.route.nodes.reshape(1, -1)
+        return CurvedPart(nodes, energy, self.route.weights[None])
+
+    def couples(self):
+        return np.asarray(self.route.nodes).reshape(1, -1)
+
+    def check(self, where, mesh, kinematics):
+        _check.positive("fem.problem", f"{where} stiffness", self.stiffness, "N/m",
+                        "Give axial stiffness over length, EA / L.")  # fmt: skip
+
+
+def tension(problem, u: Float[Array, "nodes dim"], name: str) -> Float[Array, ""]:
+    """Tension [N] in the tendon or cable called `name`, the sum over the springs of one
+    term."""
+    load = next(load for load in problem.loads if load.name == name)
+    if isinstance(load, Tendon):
+        return load.value
+    return jax.grad(_energy_of_value)(load.value, load, problem, u)
+
+
+def _energy_of_value(value, load, problem, u):
+    return eqx.tree_at(lambda load: load.value, load, value).potential(problem, u)
+
+
+def _segments(nodes, xp):
+    return xp.concatenate([nodes[:-1], nodes[1:]], axis=1)
+
+
+def _lengths(ends: Float[Array, "points dim"]) -> Float[Array, " segments"]:
+    return jnp.sqrt(jnp.sum((ends[1:] - ends[:-1]) ** 2, axis=1))

@@ -1,0 +1,105 @@
+"""Where an energy stops being one of a stable rubber."""
+
+import math
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax.material.hyperelastic import AbstractHyperelastic
+
+#: Logarithmic strains of the first two directions per logarithmic stretch.
+MODES = {"uniaxial": (1.0, -0.5), "equibiaxial": (1.0, 1.0), "pure_shear": (1.0, 0.0)}
+POINTS = 241
+
+
+@dataclass(frozen=True)
+class Stability:
+    """Smallest and largest stretch [-] between which a material is stable, by test.
+
+    A bound equal to `limit` (or its reciprocal) is where the search ended.
+    """
+
+    uniaxial: tuple[float, float]
+    equibiaxial: tuple[float, float]
+    pure_shear: tuple[float, float]
+    limit: float
+
+    @property
+    def unlimited(self) -> bool:
+        """Whether no instability was found."""
+        ranges = (self.uniaxial, self.equibiaxial, self.pure_shear)
+        return all(low <= 1 / self.limit and high >= self.limit for low, high in ranges)
+
+    def __str__(self) -> str:
+        lines = [
+            f"{name:<12s} stable for stretch {low:.3g} to {high:.3g}"
+            for name, (low, high) in (
+                ("uniaxial", self.uniaxial),
+                ("equibiaxial", self.equibiaxial),
+                ("pure shear", self.pure_shear),
+            )
+        ]
+        return "\n".join([*lines, f"searched from {1 / self.limit:.3g} to {self.limit:.3g}"])
+
+
+def drucker_stability(material: AbstractHyperelastic, *, limit: float = 10.0) -> Stability:
+    """Stretches between which every further strain costs work, volume held.
+
+    Drucker's criterion on Kirchhoff stress and logarithmic strain of an incompressible
+    isotropic solid: the second derivative of the energy in any two logarithmic principal
+    strains is positive definite. It is looked for along three tests; bounds are those of
+    the search grid, 2 % apart for a limit of 10.
+
+    Args:
+        material: One number per leaf; take a region's own material.
+        limit: Largest stretch to look at.
+
+    Raises:
+        ValueError: If leaves hold one number per cell, or `limit` is not above 1.
+
+    Reference: Drucker, J. Appl. Mech. 26, 1959.
+    """
+    _check.between("drucker_stability", "limit", limit, 1.0, 1e3, "", "Rubbers break at 10.")
+    if any(np.ndim(leaf) for leaf in jax.tree.leaves(material)):
+        raise ValueError(
+            "drucker_stability: got one number per cell, need one per leaf. Check the "
+            "material of each region by itself."
+        )
+    logs = np.linspace(-math.log(limit), math.log(limit), POINTS)
+    strains = np.stack([np.outer(logs, mode) for mode in MODES.values()])
+    stable = np.asarray(_is_stable(material, jnp.asarray(strains)))
+    stretch = np.exp(logs)
+    stretch[0], stretch[-1] = 1 / limit, limit
+    ranges = [_run(stretch, flags) for flags in stable]
+    return Stability(*ranges, limit)
+
+
+@eqx.filter_jit
+def _is_stable(material, strains: Float[Array, "modes points 2"]):
+    def energy(log):
+        a, b = jnp.exp(log)
+        F = ((a, 0.0, 0.0), (0.0, b, 0.0), (0.0, 0.0, 1 / (a * b)))
+        return material.isochoric_energy(F)
+
+    def at(log):
+        H = jax.hessian(energy)(log)
+        return (H[0, 0] > 0) & (H[0, 0] * H[1, 1] > H[0, 1] * H[1, 0])
+
+    return jax.vmap(jax.vmap(at))(strains)
+
+
+def _run(stretch: np.ndarray, stable: np.ndarray) -> tuple[float, float]:
+    """The longest run of stable stretches around 1; (1, 1) if there is none."""
+    middle = len(stretch) // 2
+    if not stable[middle]:
+        return 1.0, 1.0
+    below = np.flatnonzero(~stable[:middle])
+    above = np.flatnonzero(~stable[middle:])
+    low = stretch[below[-1] + 1] if len(below) else stretch[0]
+    high = stretch[middle + above[0] - 1] if len(above) else stretch[-1]
+    return float(low), float(high)

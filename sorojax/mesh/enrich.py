@@ -1,0 +1,86 @@
+"""Quadratic cells with the inner nodes that a linear pressure needs."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from sorojax._types import is_traced
+from sorojax.mesh.elements import (
+    AbstractElement,
+    Quad8,
+    Quad9,
+    Tet10,
+    Tet15,
+    Tri6,
+    Tri7,
+    facet_corners,
+)
+from sorojax.mesh.mesh import Mesh
+from sorojax.mesh.shape import nodes as reference_nodes, shape_functions
+
+_RICHER: dict[type, AbstractElement] = {Tri6: Tri7(), Quad8: Quad9(), Tet10: Tet15()}
+
+
+def plain_element(element: AbstractElement) -> AbstractElement | None:
+    """The element that `enrich` makes `element` from; `None` if it makes none."""
+    found = [plain() for plain, richer in _RICHER.items() if richer == element]
+    return found[0] if found else None
+
+
+def enrich(mesh: Mesh) -> Mesh:
+    """`mesh` with a node at the centre of every cell, and of every face in space.
+
+    Tri6 becomes Tri7, Quad8 Quad9 and Tet10 Tet15: the displacements that, with a pressure
+    linear in each cell, neither lock nor oscillate in nearly incompressible rubber. The
+    geometry is unchanged; new nodes follow the old ones, so node sets stay valid.
+
+    Raises:
+        ValueError: For other cells, or if the cells are traced.
+
+    Reference: Crouzeix & Raviart, RAIRO 7 (R3), 1973.
+    """
+    if is_traced(mesh.cells):
+        raise ValueError("enrich: `mesh.cells` is traced. Enrich the mesh outside jit.")
+    if type(mesh.element) not in _RICHER:
+        names = ", ".join(kind.__name__ for kind in _RICHER)
+        raise ValueError(f"enrich: got {mesh.element.name} cells, need one of {names}.")
+    element = _RICHER[type(mesh.element)]
+    cells = np.asarray(mesh.cells)
+    new = reference_nodes(element)[mesh.element.num_nodes :]
+    at = jnp.asarray(shape_functions(mesh.element, new), mesh.points.dtype)
+    where = jnp.einsum("an,cni->cai", at, mesh.points[mesh.cells])
+    first, number = np.unique(_owners(mesh, element), return_index=True, return_inverse=True)[
+        1:
+    ]
+    columns = mesh.num_nodes + number.reshape(len(cells), -1)
+    points = jnp.concatenate([mesh.points, where.reshape(-1, element.dim)[first]])
+    richer = Mesh(points, np.concatenate([cells, columns], axis=1), element)
+    sets = {name: _with_centres(richer, f) for name, f in mesh.facet_sets.items()}
+    return Mesh(points, richer.cells, element, mesh.node_sets, sets, mesh.regions)
+
+
+def _owners(mesh: Mesh, element: AbstractElement) -> np.ndarray:
+    """A number for each new node of each cell, equal where cells share the node."""
+    cells = np.asarray(mesh.cells)
+    own = mesh.num_nodes + np.arange(len(cells))[:, None]
+    if element.dim == 2:
+        return own
+    count = facet_corners(element)
+    faces = np.stack([np.sort(cells[:, f[:count]], axis=1) for f in element.facets], axis=1)
+    shared = np.unique(faces.reshape(-1, count), axis=0, return_inverse=True)[1]
+    return np.concatenate([shared.reshape(len(cells), -1), own + shared.max()], axis=1)
+
+
+def _with_centres(mesh: Mesh, facets) -> np.ndarray:
+    """Facets of the mesh before, with the node in the middle of each face."""
+    facets = np.asarray(facets)
+    if mesh.element.dim == 2 or not len(facets):
+        return facets
+    count = facet_corners(mesh.element)
+    cells = np.asarray(mesh.cells)
+    known = np.concatenate([cells[:, f[:count]] for f in mesh.element.facets])
+    centres = np.concatenate([cells[:, f[-1]] for f in mesh.element.facets])
+    both = np.concatenate([np.sort(known, axis=1), np.sort(facets[:, :count], axis=1)])
+    key = np.unique(both, axis=0, return_inverse=True)[1].ravel()
+    lookup = np.zeros(key.max() + 1, int)
+    lookup[key[: len(known)]] = centres
+    return np.concatenate([facets, lookup[key[len(known) :], None]], axis=1)

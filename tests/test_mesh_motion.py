@@ -1,0 +1,88 @@
+"""Solid and plane meshes that follow their shape: derivatives against differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sorojax import mesh as M, sdf
+
+
+def can(v):
+    """A cylinder of radius v[0] and height v[1] around a spherical chamber."""
+    centre = jnp.stack([v[3], jnp.zeros_like(v[3]), jnp.zeros_like(v[3])])
+    return sdf.Cylinder(v[0], v[1]) - sdf.Sphere(centre, v[2])
+
+
+CAN = np.array([0.5, 1.0, 0.25, 0.05])
+
+
+def slopes_agree(function, at, rtol=1e-6):
+    exact = np.asarray(jax.jit(jax.jacrev(function))(at))
+    step = 1e-5
+    ends = [[function(at + s * step * e) for s in (1, -1)] for e in np.eye(len(at))]
+    central = np.stack([(np.asarray(a) - b) / (2 * step) for a, b in ends], axis=-1)
+    assert np.abs(exact - central).max() < rtol * np.abs(central).max()
+    return exact
+
+
+@pytest.fixture(scope="module")
+def hollow():
+    return M.chambers(M.tetrahedralise(can(CAN), size=0.16)).mesh
+
+
+def test_sharp_edges_are_in_the_mesh(hollow):
+    rim = np.asarray(hollow.points)[hollow.node_sets["ridges"]]
+    assert len(rim) > 30 and len(hollow.node_sets["corners"]) == 0
+    assert np.allclose(np.hypot(rim[:, 0], rim[:, 1]), 0.5, atol=1e-9)
+    assert np.allclose(np.abs(rim[:, 2]), 0.5, atol=1e-9)
+
+
+def test_volume_chamber_and_inertia_follow_every_parameter(hollow):
+    chamber = hollow.facet_sets["chamber_0"]
+
+    @jax.jit
+    def measures(v):
+        moved = M.move(hollow, can(v))
+        x = jnp.mean(moved.points[moved.cells], axis=1)
+        volume = M.cell_volumes(moved)
+        inertia = jnp.sum(volume * (x[:, 0] ** 2 + x[:, 1] ** 2))
+        return jnp.stack([jnp.sum(volume), M.enclosed_volume(moved, chamber), inertia])
+
+    exact = slopes_agree(measures, CAN)
+    assert np.isclose(exact[0, 1], np.pi / 4, rtol=2e-2)  # of a flat end
+    same = M.move(hollow, can(CAN))
+    assert jnp.abs(same.points - hollow.points).max() < 1e-9
+    moved = M.move(hollow, can(1.04 * CAN))
+    skin = np.unique(M.boundary_facets(moved))
+    assert jnp.abs(can(1.04 * CAN)(moved.points[skin])).max() < 1e-9
+    assert not M.distortion(hollow, moved).remesh
+    with pytest.raises(ValueError, match="mesh the new shape"):
+        M.move(hollow, can(CAN * np.array([1, 1, 1.9, 1])))
+
+
+@pytest.mark.parametrize("cell", [M.Hex8(), M.Tet10()], ids=["Hex8", "Tet10"])
+def test_a_box_keeps_its_corners_and_edges(cell):
+    mesh = M.box([0, 0, 0], [1, 0.9, 0.8], divisions=(2, 2, 2), element=cell)
+
+    @jax.jit
+    def volume(upper):
+        return jnp.sum(M.cell_volumes(M.move(mesh, sdf.Box([0, 0, 0], upper))))
+
+    slope = jax.jit(jax.grad(volume))(np.array([1, 0.9, 0.8]))
+    assert np.allclose(slope, [0.72, 0.8, 0.9], rtol=1e-9)
+    moved = M.move(mesh, sdf.Box([0, 0, 0], [1.05, 0.95, 0.76]))
+    assert jnp.abs(moved.points.max(axis=0) - jnp.array([1.05, 0.95, 0.76])).max() < 1e-12
+    assert np.isclose(jnp.sum(M.cell_volumes(moved)), 1.05 * 0.95 * 0.76, rtol=1e-12)
+
+
+def test_plane_quadrilaterals_follow_and_other_meshes_are_refused():
+    mesh = M.rectangle([0, 0], [2, 1], divisions=(3, 2), element=M.Quad8())
+    moved = M.move(mesh, sdf.Rectangle([0, 0], [2.1, 0.9]))
+    assert np.isclose(M.quality(moved).area, 1.89, rtol=1e-12)
+    assert float(M.distortion(mesh, moved).size_ratio) > 0.9
+    with pytest.raises(ValueError, match="2-D"):
+        M.move(mesh, sdf.Sphere([0, 0, 0], 1))
+    cells = M.polymesher(sdf.Rectangle([0, 0], [1, 1]), 5, key=jax.random.key(0))
+    with pytest.raises(ValueError, match="triangulate"):
+        M.move(cells, sdf.Rectangle([0, 0], [1, 1]))
