@@ -1,4 +1,4 @@
-"""Plane strain under follower pressure in felupe: `python -I felupe.py FOLDER`.
+"""Pressure, assembly and Newton's method in felupe: `python -I felupe.py FOLDER`.
 
 felupe is GPL: it is only ever run as this separate program.
 """
@@ -108,6 +108,65 @@ def assemble(bodies, u):
         residual = residual + solid.assemble.vector(solid.field).toarray().ravel()
         tangent = tangent + solid.assemble.matrix(solid.field)
     return residual, tangent
+
+
+REGIONS = {
+    "Tri3": (fem.RegionTriangle, "triangle", {}),
+    "Quad4": (fem.RegionQuad, "quad", {}),
+    "Tri6": (
+        fem.RegionQuadraticTriangle,
+        "triangle6",
+        {"quadrature": fem.TriangleQuadrature(order=5)},
+    ),
+    "Tet10": (fem.RegionQuadraticTetra, "tetra10", {}),
+    "Hex8": (fem.RegionHexahedron, "hexahedron", {}),
+}
+
+
+def solid_body(request, arrays):
+    """One material on all cells, in plane strain or in space."""
+    repair_quadratic_triangle()
+    region, kind, options = REGIONS[request["element"]]
+    made = region(fem.Mesh(arrays["points"], arrays["cells"], kind), **options)
+    plane = arrays["points"].shape[1] == 2
+    field = fem.FieldPlaneStrain(made, dim=2) if plane else fem.Field(made, dim=3)
+    material = fem.NeoHooke(mu=request["mu"], bulk=request["bulk"])
+    return fem.SolidBody(material, fem.FieldContainer([field]))
+
+
+def assembly(request, arrays):
+    """CPU seconds of residual and tangent, scatter included, at the displacement `u`."""
+    solid = solid_body(request, arrays)
+    assemble([solid], arrays["u"])
+    runs = []
+    for _ in range(request["repeats"]):
+        start = time.process_time()
+        residual, tangent = assemble([solid], arrays["u"])
+        runs.append(time.process_time() - start)
+    way = arrays["way"].ravel()
+    upper = sp.triu(tangent, 1)
+    return {"compile_s": 0.0, "runs": runs}, {"residual": residual, "product": tangent @ way,
+                                             "entries": upper.nnz}  # fmt: skip
+
+
+def newton(request, arrays):
+    """CPU seconds of one Newton iteration: assembly, supports, factorisation, solution.
+
+    Arrays: `points`, `cells`, `fixed` dofs, and the dead nodal `force`.
+    """
+    solid, force = solid_body(request, arrays), arrays["force"].ravel()
+    free = np.setdiff1d(np.arange(force.size), arrays["fixed"])
+    runs = []
+    for _ in range(request["repeats"]):
+        u, start = np.zeros_like(arrays["points"]), time.process_time()
+        for _ in range(request["iterations"]):
+            residual, tangent = assemble([solid], u)
+            step = np.zeros(force.size)
+            rhs = (force - residual)[free]
+            step[free] = spsolve(tangent[free][:, free], rhs)
+            u = u + step.reshape(u.shape)
+        runs.append((time.process_time() - start) / request["iterations"])
+    return {"compile_s": 0.0, "runs": runs, "solver": SOLVER}, {"displacement": u}
 
 
 if __name__ == "__main__":

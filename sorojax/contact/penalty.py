@@ -20,10 +20,8 @@ class Penalty(eqx.Module):
 
     def __check_init__(self):
         for name, unit in (("stiffness", "Pa/m"), ("smoothing", "m")):
-            value = getattr(self, name)
-            if isinstance(value, float | int) or hasattr(value, "dtype"):
-                _check.positive("contact.Penalty", name, value, unit,
-                                "Ten Young's moduli over the size of a cell is a start.")  # fmt: skip
+            do = "Ten Young's moduli over the size of a cell is a start for the stiffness."
+            _check.positive("contact.Penalty", name, getattr(self, name), unit, do)
 
     def energy(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:
         """Energy per area [J/m^2] at a gap [m], negative where bodies overlap."""

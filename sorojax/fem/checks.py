@@ -8,7 +8,6 @@ import numpy as np
 
 from sorojax import _check
 from sorojax._types import is_traced
-from sorojax.fem.facets import open_nodes
 from sorojax.fem.formulation import (
     AbstractFormulation,
     ConstantPressure,
@@ -16,7 +15,6 @@ from sorojax.fem.formulation import (
     LinearPressure,
 )
 from sorojax.fem.kinematics import AbstractKinematics, Axisymmetric
-from sorojax.fem.loads import AbstractLoad, Gravity, Pressure
 from sorojax.fem.space import Space
 from sorojax.fem.supports import AbstractSupport, known_components, known_dofs
 from sorojax.material.hyperelastic import AbstractHyperelastic, small_strain_moduli
@@ -45,8 +43,8 @@ def kinematics(mesh: Mesh, given: AbstractKinematics | None) -> AbstractKinemati
         radius = np.asarray(mesh.points)[:, 0]
         if radius.min() < -1e-12 * np.ptp(radius):
             raise ValueError(
-                f"fem.problem: a node has radius {radius.min():.3g} m, need x >= 0 in a body of "
-                "revolution about the y axis. Move the mesh to the right of the axis."
+                f"fem.problem: a node has radius {radius.min():.3g} m, need x >= 0 in a body "
+                "of revolution about the y axis. Move the mesh to the right of the axis."
             )
     return given
 
@@ -167,19 +165,13 @@ def supports(
                 f"fem.problem: `{where}` holds no node. Check the predicate with "
                 "mesh.nodes_where; lengths are in metres."
             )
-        _check_ids(where, support.nodes, mesh.num_nodes)
+        check_ids(where, support.nodes, mesh.num_nodes)
         _check_components(where, support, dim)
+        _check.finite("fem.problem", f"{where} displacement", support.displacement,
+                      "Give displacements in metres.")  # fmt: skip
     known = known_dofs(given, mesh.num_nodes, dim)
-    if is_traced(mesh.points):
-        return known
-    points = np.asarray(mesh.points)
-    if free := _num_free_modes(points, known, kinematics):
-        raise ValueError(
-            f"fem.problem: the supports leave {free} rigid-body mode(s), so there is no "
-            "unique equilibrium. Add a support, for example Fixed(nodes_where(...))."
-        )
-    if isinstance(kinematics, Axisymmetric):
-        _check_axis(points, known)
+    if isinstance(kinematics, Axisymmetric) and not is_traced(mesh.points):
+        _check_axis(np.asarray(mesh.points), known)
     return known
 
 
@@ -187,7 +179,8 @@ def _check_components(where: str, support: AbstractSupport, dim: int) -> None:
     components = known_components(support, dim)
     if not components or min(components) < 0 or max(components) >= dim:
         raise ValueError(
-            f"fem.problem: `{where}` names components {components}, the mesh has 0 to {dim - 1}."
+            f"fem.problem: `{where}` names components {components}, the mesh has 0 to "
+            f"{dim - 1}."
         )
     shape = jnp.shape(support.displacement)
     if shape not in ((), (len(components),), (support.nodes.size, len(components))):
@@ -208,11 +201,31 @@ def _check_axis(points: np.ndarray, known: np.ndarray) -> None:
         )
 
 
-def _num_free_modes(points: np.ndarray, known: np.ndarray, kinematics) -> int:
-    """Rigid-body modes that no known displacement stops."""
-    modes = rigid_modes(points, kinematics)
-    held = modes.reshape(modes.shape[0], -1)[:, known]
-    return len(modes) - (np.linalg.matrix_rank(held, tol=1e-8) if held.size else 0)
+def held(problem: Any, known: np.ndarray) -> None:
+    """Refuse a body that could move rigidly: supports and springs must hold it."""
+    if is_traced((problem.mesh.points, problem.loads, problem.supports)):
+        return
+    modes = rigid_modes(np.asarray(problem.mesh.points), problem.kinematics)
+    rows = modes.reshape(len(modes), -1)[:, known]
+    if springs := [load for load in problem.loads if load.holds]:
+        rows = np.concatenate([rows, _spring_stiffness(problem, springs, modes)], axis=1)
+    free = len(modes) - (np.linalg.matrix_rank(rows, tol=1e-8) if rows.size else 0)
+    if free:
+        raise ValueError(
+            f"fem.problem: the supports leave {free} rigid-body mode(s), so there is no "
+            "unique equilibrium. Add a support, for example Fixed(nodes_where(...))."
+        )
+
+
+def _spring_stiffness(problem: Any, springs: list, modes: np.ndarray) -> np.ndarray:
+    """Second derivatives of the potential of springs in the rigid modes, of unit size."""
+
+    def energy(amounts):
+        u = jnp.einsum("m,mni->ni", amounts, jnp.asarray(modes))
+        return sum(load.potential(problem, u) for load in springs)
+
+    stiffness = np.asarray(jax.hessian(energy)(jnp.zeros(len(modes))))
+    return stiffness / max(np.abs(stiffness).max(), np.finfo(float).tiny)
 
 
 def rigid_modes(points: np.ndarray, kinematics: AbstractKinematics) -> np.ndarray:
@@ -231,70 +244,10 @@ def rigid_modes(points: np.ndarray, kinematics: AbstractKinematics) -> np.ndarra
     return np.stack(moves + turns)
 
 
-def _check_ids(where: str, ids: Any, count: int) -> None:
+def check_ids(where: str, ids: Any, count: int) -> None:
     ids = np.asarray(ids)
     if ids.min() < 0 or ids.max() >= count:
         raise ValueError(
             f"fem.problem: `{where}` names nodes {ids.min()} to {ids.max()}, the mesh has 0 "
             f"to {count - 1}. Select them on this mesh."
-        )
-
-
-def loads(
-    mesh: Mesh,
-    kinematics: AbstractKinematics,
-    material: AbstractHyperelastic,
-    given: tuple[AbstractLoad, ...],
-    known: np.ndarray,
-) -> None:
-    names = [load.name for load in given]
-    if len(set(names)) != len(names):
-        raise ValueError(
-            f"fem.problem: loads are called {names}, need different names. Set `name=`."
-        )
-    for load in given:
-        where = f"{type(load).__name__} '{load.name}'"
-        _check.finite("fem.problem", f"{where} value", load.value, "SI units: 20 * kPa.")
-        if load.value.ndim and load.value.shape != (mesh.element.dim,):
-            raise ValueError(
-                f"fem.problem: {where} has a value of shape {load.value.shape}, need "
-                f"({mesh.element.dim},): one entry per axis."
-            )
-        if isinstance(load, Gravity) and material.density is None:
-            raise ValueError(
-                f"fem.problem: {where} needs a density, the {type(material).__name__} has "
-                "none. Give density= in kg/m^3."
-            )
-        for what in ("facets", "nodes"):
-            ids = getattr(load, what, None)
-            if ids is None:
-                continue
-            if ids.size == 0:
-                raise ValueError(
-                    f"fem.problem: {where} acts on no {what[:-1]}. Check the shape given to "
-                    "mesh.facets_on; lengths are in metres."
-                )
-            _check_ids(where, ids, mesh.num_nodes)
-        if isinstance(load, Pressure):
-            _check_closed(where, load, mesh, kinematics, known)
-
-
-def _check_closed(where: str, load: Pressure, mesh: Mesh, kinematics, known) -> None:
-    """An open end must be held, or slide in a plane through the origin of the load."""
-    ends = open_nodes(mesh.element, np.asarray(load.facets))
-    held = known.reshape(-1, mesh.element.dim)[ends]
-    safe = held.all(axis=1)
-    if not is_traced((mesh.points, load)):
-        origin = np.zeros(mesh.element.dim) if load.origin is None else np.asarray(load.origin)
-        points = np.asarray(mesh.points)
-        off = np.abs(points[ends] - origin) <= 1e-9 * np.ptp(points, axis=0).max()
-        on_plane = held & off
-        if isinstance(kinematics, Axisymmetric):
-            on_plane[:, 1] = held[:, 1]
-        safe |= on_plane.any(axis=1)
-    if not safe.all():
-        raise ValueError(
-            f"fem.problem: {where} acts on facets with an open end at nodes "
-            f"{ends[~safe][:4].tolist()}, so it has no potential. Close the cavity, fix the "
-            "nodes at its ends, or let them slide in planes of symmetry through `origin`."
         )

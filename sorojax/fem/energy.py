@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax.fem.formulation import Modes, coefficients, project
@@ -23,10 +22,8 @@ from sorojax.fem.kinematics import AbstractKinematics
 from sorojax.fem.shape_response import shape_energy, shape_stress, shape_tangent
 from sorojax.fem.tensor import (
     Entries,
-    curvature_entries,
-    curvature_table,
+    geometric_part,
     second_piola,
-    stress_table,
     volume_ratio,
     volume_slopes,
 )
@@ -75,18 +72,16 @@ def response(body: Body, F: Entries, F_before: Entries) -> Response:
     `F_before`. With `F_before` equal to `F` the tangent is the exact derivative."""
     step = F - F_before
     P = shape_stress(body.material, body.kinematics, F)
-    tangent = shape_tangent(body.material, body.kinematics, F)
-    extra = _extrapolated_shape(body, F, F_before, step, P)
-    tangent = tangent + _spread(stress_table(body.kinematics), extra)
+    tangent, weight = shape_tangent(body.material, body.kinematics, F)
+    S = _extrapolated_shape(body, F, F_before, step, P)
     if not body.kinematics.has_volume:
-        return Response(P, tangent, None, None)
-    return _with_volume(body, F, F_before, step, P, tangent)
-
-
-def _spread(table: np.ndarray, entries: Entries) -> Float[Array, "entries entries quad lanes"]:
-    """Entries placed by number; the number beyond the last is nothing."""
-    padded = jnp.concatenate([entries, jnp.zeros_like(entries[:1])])
-    return padded[table]
+        geometric = geometric_part(body.kinematics, F, weight, S)
+        return Response(P, tangent + geometric, None, None)
+    p_before, p_rate = jax.jvp(lambda F: pressure(body, F), (F_before,), (step,))
+    p_extrapolated = p_before + p_rate
+    weight = p_extrapolated if weight is None else weight + p_extrapolated
+    tangent = tangent + geometric_part(body.kinematics, F, weight, S)
+    return _with_volume(body, F, P, tangent)
 
 
 def _extrapolated_shape(body: Body, F, F_before, step, P) -> Entries:
@@ -107,15 +102,11 @@ def _volumetric_slope(body: Body, J: Entry) -> Entry:
     return jax.grad(lambda J: jnp.sum(body.material.volumetric_energy(J)))(J)
 
 
-def _with_volume(body: Body, F, F_before, step, P, tangent) -> Response:
+def _with_volume(body: Body, F, P, tangent) -> Response:
     J = _dilatation(body, F)
     slope, bulk = jax.jvp(lambda J: _volumetric_slope(body, J), (J,), (jnp.ones_like(J),))
     p = project(body.modes, body.volumes, slope)
-    p_before, p_rate = jax.jvp(lambda F: pressure(body, F), (F_before,), (step,))
     C = volume_slopes(body.kinematics, F)
-    place, sign = curvature_table(body.kinematics)
-    curvature = curvature_entries(F)[place] * sign[:, :, None, None]
-    tangent = tangent + (p_before + p_rate)[None, None] * curvature
     stress = P + p[None] * C
     if body.modes is None:
         return Response(stress, tangent + (bulk[None] * C)[:, None] * C[None], None, None)

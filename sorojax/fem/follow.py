@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -120,6 +119,14 @@ def _with_terms(first: Problem, mix, last: Problem) -> Problem:
     def loaded(a, b):  # where a load acts, its origin for example, does not change its size
         return eqx.tree_at(lambda load: load.value, b, moved(a.value, b.value))
 
+    def held(a, b):
+        if b.ramped is None:
+            return b
+        return eqx.tree_at(
+            lambda support: getattr(support, b.ramped), b,
+            moved(getattr(a, b.ramped), getattr(b, b.ramped)),
+        )  # fmt: skip
+
     loads = tuple(loaded(a, b) for a, b in zip(first.loads, last.loads, strict=True))
-    supports = jax.tree.map(moved, first.supports, last.supports)
+    supports = tuple(held(a, b) for a, b in zip(first.supports, last.supports, strict=True))
     return eqx.tree_at(lambda p: (p.loads, p.supports), last, (loads, supports))

@@ -7,6 +7,7 @@ one back-substitution for each right-hand side, all of them at once.
 """
 
 import contextlib
+import copy
 import functools
 from typing import Any
 
@@ -20,25 +21,42 @@ from jax.interpreters import batching, mlir
 
 from sorojax._types import is_traced
 from sorojax.fem.energy_form import residual
-from sorojax.fem.follow import Log, Start, begin_at, follow
+from sorojax.fem.follow import Log, Start, Stats, begin_at, follow
 from sorojax.fem.lanes import scaled_features, solve_lanes
-from sorojax.fem.linear import Linearised, linearise, prepare
+from sorojax.fem.linear import Linearised, linearise
 from sorojax.fem.newton import Newton
 from sorojax.fem.problem import Problem
 from sorojax.fem.supports import known_values
-from sorojax.fem.traced import Begin, Outcome, follow_traced, prepare_traced, with_terms
+from sorojax.fem.traced import (
+    Begin,
+    Outcome,
+    follow_traced,
+    known_mask,
+    prepare_traced,
+    with_terms,
+)
 from sorojax.math import sparse
+
+#: Last relative update below which the tangent assembled before it is as good as exact.
+_SHARP = 1e-5
 
 _equilibrium_p = Primitive("fem_equilibrium")
 _equilibrium_p.multiple_results = True
 
 
-class Solve:
-    """One call of the primitive: all that is no array, and what the host found.
+class _Record:
+    """What the host found: one log per solve, lanes in row-major order; none in a trace."""
 
-    `logs` has one record per solve after a call with concrete numbers, lanes in row-major
-    order, and stays empty inside a trace.
-    """
+    def __init__(self):
+        self.logs: list[Log] = []
+        self.batched = False
+
+    def keep(self, logs: list[Log], batched: bool) -> None:
+        self.logs, self.batched = logs, batched
+
+
+class Solve:
+    """One call of the primitive: all that is no array, and the record of how it went."""
 
     def __init__(
         self,
@@ -54,14 +72,35 @@ class Solve:
         self.num_problem_leaves = len(jax.tree.leaves(eqx.filter(problem, eqx.is_array)))
         self.settings = (newton, steps, max_cuts)
         self.shape = problem.mesh.points.shape
-        self.num_values = problem.space.system.num_values if want_tangent else 0
-        self.logs: list[Log] = []
+        self.num_all_values = problem.space.system.num_values
+        self.num_values = self.num_all_values if want_tangent else 0
+        self.record = _Record()
 
     def inputs(self, leaves) -> tuple[Problem, Begin | None]:
         return eqx.combine(jax.tree.unflatten(self._tree, leaves), self._static)
 
     def problem(self, leaves) -> Problem:
         return self.inputs(leaves)[0]
+
+    def moving(self, leaves, dots) -> Problem:
+        """The tangents of the problem's numbers, `None` elsewhere."""
+        count = self.num_problem_leaves
+        pairs = zip(leaves[:count], dots[:count], strict=True)
+        real = [dot if eqx.is_inexact_array(leaf) else None for leaf, dot in pairs]
+        problem = self.problem(real + [None] * (len(leaves) - count))
+        return eqx.filter(problem, eqx.is_inexact_array)
+
+    def with_tangent(self) -> "Solve":
+        """The same call, that also returns the tangent; the record is shared."""
+        other = copy.copy(self)
+        other.num_values = self.num_all_values
+        return other
+
+    @property
+    def stats(self) -> Stats | tuple[Stats, ...] | None:
+        """The record of the one solve, of every lane, or `None` inside a trace."""
+        found = tuple(log.stats() for log in self.record.logs)
+        return found[0] if found and not self.record.batched else found or None
 
     def __call__(self) -> Outcome:
         leaves, self.leaves = self.leaves, []
@@ -77,39 +116,66 @@ def _equilibrium(call: Solve, leaves):
 @_equilibrium.defjvp
 def _derivative(call: Solve, primals, tangents):
     (leaves,), (dots,) = primals, tangents
-    u, counts, tangent = _equilibrium(call, leaves)
-    problem = call.problem(leaves)
-    begin = leaves[call.num_problem_leaves :]
-    moving = [d if eqx.is_inexact_array(x) else None for d, x in zip(dots, leaves, strict=True)]
-    dots = call.problem(moving[: call.num_problem_leaves] + [None] * len(begin))
-    u_dot = _tangent(problem, u, eqx.filter(dots, eqx.is_inexact_array))
+    u, counts, values = _equilibrium(call.with_tangent(), leaves)
+    u_dot = _tangent(call, leaves, call.moving(leaves, dots), u, values)
     # a state that is no equilibrium has no derivative; a factor keeps the rule linear
     valid = jnp.where(counts[0] == 0, jnp.ones_like(counts[0]), jnp.nan)
-    return (u, counts, tangent), (u_dot * valid, 0 * counts, 0 * tangent)
+    values = values[: call.num_values]
+    return (u, counts, values), (u_dot * valid, 0 * counts, 0 * values)
 
 
-def _tangent(problem: Problem, u, params_dot):
+def _tangent(call: Solve, leaves, params_dot: Problem, u, values):
     """du of R(u, params) = 0, with prescribed displacements moving along."""
+    problem = call.problem(leaves)
     params, rest = eqx.partition(problem, eqx.is_inexact_array)
-    nodes, dim = u.shape
+    system = problem.space.system
 
-    def known(params):
-        return known_values(eqx.combine(params, rest).supports, nodes, dim)
+    def prescribed(params):
+        return known_values(eqx.combine(params, rest).supports, *u.shape)
 
     def unbalanced(params, u):
         return residual(eqx.combine(params, rest), u).ravel()
 
-    _, move = jax.jvp(known, (params,), (params_dot,))
+    _, move = jax.jvp(prescribed, (params,), (params_dot,))
     directions = (params_dot, move.reshape(u.shape))
     _, rhs = jax.jvp(unbalanced, (params, u), directions)
-    # Concrete numbers run the programs that the solve compiled, not copies for the trace.
-    concrete = not is_traced((problem, u))
+    if call.settings[0].step_tolerance <= _SHARP:
+        values = _tangent_values(call, leaves, u, values)
+    else:
+        values = linearise(problem, _prepare_traced(problem), u, u).values
+    # Concrete numbers run one compiled program, not its operations for the trace.
+    concrete = not is_traced((problem, values))
     with jax.core.eval_context() if concrete else contextlib.nullcontext():
-        prepared = prepare(problem) if concrete else eqx.filter_jit(prepare_traced)(problem)
-        values = linearise(problem, prepared, u, u).values
-        matrix = sparse.fix(problem.space.system, values, prepared.known)
-    rhs = jnp.where(prepared.known, jnp.zeros_like(rhs), -rhs)
-    return (sparse.solve(problem.space.system, matrix, rhs) + move).reshape(u.shape)
+        known = known_mask(problem.supports, *u.shape)
+        matrix = _fix(system, values, known)
+    rhs = jnp.where(known, jnp.zeros_like(rhs), -rhs)
+    return (sparse.solve(system, matrix, rhs) + move).reshape(u.shape)
+
+
+_fix = jax.jit(sparse.fix)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _tangent_values(call: Solve, leaves, u, values):
+    """The tangent that the last check of the residual assembled. It differs from the exact
+    one by the square of the last update; only its own derivative needs new work."""
+    return values
+
+
+@_tangent_values.defjvp
+def _tangent_values_derivative(call: Solve, primals, tangents):
+    (leaves, u, values), (dots, u_dot, _) = primals, tangents
+    params, rest = eqx.partition(call.problem(leaves), eqx.is_inexact_array)
+
+    def assembled(params, u):
+        problem = eqx.combine(params, rest)
+        return linearise(problem, _prepare_traced(problem), u, u).values
+
+    _, change = jax.jvp(assembled, (params, u), (call.moving(leaves, dots), u_dot))
+    return _tangent_values(call, leaves, u, values), change
+
+
+_prepare_traced = eqx.filter_jit(prepare_traced)
 
 
 @_equilibrium_p.def_impl
@@ -118,7 +184,7 @@ def _on_host(*leaves, call: Solve, lead: tuple[int, ...], batched: tuple[bool, .
         if lead:
             return _lanes_on_host(leaves, call, lead, batched)
         log = Log(*call.settings)
-        call.logs[:] = [log]
+        call.record.keep([log], False)
         u = _follow(*call.inputs(leaves), log)
         return _outcome(call, u, log)
 
@@ -160,7 +226,7 @@ def _lanes_on_host(leaves, call: Solve, lead, batched) -> list[jax.Array]:
         return call.inputs(one)
 
     logs = [Log(*call.settings) for _ in range(num)]
-    call.logs[:] = logs
+    call.record.keep(logs, True)
     if call.inputs(leaves)[1] is None:
         varying = [x for x, b in zip(rows, batched, strict=True) if b and x.dtype.kind == "f"]
         body = call.inputs(list(batched))[0]

@@ -46,6 +46,11 @@ def points_of(mesh: Mesh, kinematics: AbstractKinematics, tables: Tables) -> Poi
     return _points(mesh, kinematics, tables)
 
 
+def points_at(mesh: Mesh, kinematics: AbstractKinematics, tables: Tables) -> Points:
+    """The points of every cell that `tables` are for."""
+    return _points(mesh, kinematics, tables)
+
+
 def pressure_modes(formulation: AbstractFormulation, points: Points) -> Modes | None:
     """Orthonormal pressure functions at the quadrature points of all cells."""
     return modes(formulation, points.position, points.volumes)

@@ -3,7 +3,7 @@
 import equinox as eqx
 
 from sorojax import _check
-from sorojax.fem import checks
+from sorojax.fem import checks, checks_loads
 from sorojax.fem.formulation import AbstractFormulation, default_formulation
 from sorojax.fem.kinematics import AbstractKinematics, Solid
 from sorojax.fem.loads import AbstractLoad
@@ -55,12 +55,14 @@ def problem(
         material: Stored energy; its leaves are numbers or arrays with one entry per cell.
         kinematics: `PlaneStrain(thickness)`, `PlaneStress(thickness)` or `Axisymmetric()`
             for a plane mesh; `Solid()`, the default, in space.
-        supports: `Fixed(nodes)`, `Prescribed(nodes, displacement)`.
-        loads: `Pressure`, `Traction`, `Force`, `Gravity`.
+        supports: `Fixed(nodes)`, `Prescribed(nodes, displacement)`, `Rotated(...)`.
+        loads: `Pressure`, `Traction`, `Force`, `Torque`, `Gravity`, `Spring`, `Foundation`,
+            `Tendon`, `Cable`, `Contact` and `rigid(mesh, nodes)`.
         formulation: How the pressure varies in a cell. When omitted `LinearPressure()` for
             Tri7, Quad9 and Tet15, `ConstantPressure()` for Quad4, Hex8 and polygons, and
             `Displacement()` for the rest and in plane stress.
-        space: The mesh's `space(mesh)`, to share between problems on the same topology.
+        space: The mesh's `space(mesh, loads)`, to share between problems on the same
+            topology.
 
     Raises:
         ValueError: If the body could move rigidly, a set is empty, a cell is inverted, the
@@ -69,10 +71,8 @@ def problem(
     """
     _check.float64("fem.problem", mesh.points)
     supports, loads = tuple(supports), tuple(loads)
-    space = make_space(mesh) if space is None else space
     kinematics = checks.kinematics(mesh, kinematics if mesh.element.dim == 2 or kinematics
                                    else Solid())  # fmt: skip
-    checks.space(mesh, space)
     checks.cells(mesh)
     checks.material(mesh, material)
     if formulation is None:
@@ -80,5 +80,13 @@ def problem(
         checks.locking(mesh, material, kinematics, formulation)
     checks.formulation(mesh, kinematics, formulation)
     known = checks.supports(mesh, kinematics, supports)
-    checks.loads(mesh, kinematics, material, loads, known)
-    return Problem(mesh, material, kinematics, supports, loads, formulation, space)
+    loads = tuple(load.completed(mesh, material, kinematics) for load in loads)
+    checks_loads.loads(mesh, kinematics, material, loads, known)
+    if space is None:
+        space = make_space(mesh, loads)
+    else:
+        checks.space(mesh, space)
+        checks_loads.room(space, loads)
+    made = Problem(mesh, material, kinematics, supports, loads, formulation, space)
+    checks.held(made, known)
+    return made

@@ -3,6 +3,7 @@
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -61,8 +62,7 @@ class Rigid(AbstractLoad):
     def potential(self, problem, u):
         part = self.curved_part(problem)
         x = (problem.mesh.points + u)[part.groups]
-        weights, rest = part.data
-        return sum_over(self._energy, x, (weights, rest))
+        return jnp.sum(jax.vmap(self._energy)(x, part.data))
 
     def curved_part(self, problem):
         return CurvedPart(self._groups(jnp), self._energy, self._data(problem))
@@ -86,13 +86,6 @@ class Rigid(AbstractLoad):
         if self.stiffness is not None:
             _check.positive("fem.problem", f"{where} stiffness", self.stiffness, "N/m",
                             "Leave it out for 10^4 times that of the material.")  # fmt: skip
-
-
-def sum_over(energy, x, data):
-    """Energy of all groups [J]."""
-    import jax
-
-    return jnp.sum(jax.vmap(energy)(x, data))
 
 
 def rigid(mesh, nodes, *, stiffness=None, name: str = "rigid") -> Rigid:

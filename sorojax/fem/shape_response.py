@@ -11,8 +11,6 @@ from jaxtyping import Array, Float
 from sorojax.fem.kinematics import AbstractKinematics
 from sorojax.fem.tensor import (
     Entries,
-    curvature_entries,
-    curvature_table,
     volume_ratio,
     volume_slopes,
 )
@@ -40,22 +38,32 @@ def shape_stress(
 
 def shape_tangent(
     material: AbstractHyperelastic, kinematics: AbstractKinematics, F: Entries
-) -> Float[Array, "entries entries quad lanes"]:
-    """Derivative of the stress by F [Pa]."""
+) -> tuple[Float[Array, "entries entries quad lanes"], Entry | None]:
+    """Derivative of the stress by F [Pa], as a matrix plus a multiple of d2J / dF dF."""
     W = _closed_form(material, kinematics)
     if W is None:
-        num = F.shape[0]
-        unit = jnp.eye(num, dtype=F.dtype)[:, :, None, None]
-        units = jnp.broadcast_to(unit, (num, *F.shape))
-
-        def column(direction):
-            return jax.jvp(lambda F: shape_stress(material, kinematics, F), (F,), (direction,))
-
-        return jax.vmap(lambda direction: column(direction)[1])(units)
+        return _differentiated(material, kinematics, F), None
+    J, scale, I1, C = _parts(kinematics, F)
     x, slopes = _first_invariant(kinematics, F)
     first, second = jax.jvp(_slope(W), (x,), (jnp.ones_like(x),))
-    bent = (second[None] * slopes)[:, None] * slopes[None]
-    return bent + first[None, None] * _invariant_curvature(kinematics, F)
+    # an outer product and its transpose, by C; another by the slopes; a diagonal
+    half = (first * scale / J)[None] * (5 / 9 * (I1 / J)[None] * C - 4 / 3 * F)
+    mixed = half[:, None] * C[None] + C[:, None] * half[None]
+    square = (second[None] * slopes)[:, None] * slopes[None]
+    unit = jnp.eye(F.shape[0], dtype=F.dtype)[:, :, None, None]
+    flat = (2 * first * scale)[None, None] * unit
+    return mixed + square + flat, -2 / 3 * first * scale * I1 / J
+
+
+def _differentiated(material, kinematics: AbstractKinematics, F: Entries):
+    num = F.shape[0]
+    unit = jnp.eye(num, dtype=F.dtype)[:, :, None, None]
+
+    def column(direction):
+        return jax.jvp(lambda F: shape_stress(material, kinematics, F), (F,), (direction,))
+
+    units = jnp.broadcast_to(unit, (num, *F.shape))
+    return jax.vmap(lambda direction: column(direction)[1])(units)
 
 
 def _closed_form(material: AbstractHyperelastic, kinematics: AbstractKinematics):
@@ -78,17 +86,3 @@ def _first_invariant(kinematics: AbstractKinematics, F: Entries) -> tuple[Entry,
     J, scale, I1, C = _parts(kinematics, F)
     slopes = (2 * scale)[None] * F - (2 / 3 * scale * I1 / J)[None] * C
     return scale * I1 - 3, slopes
-
-
-def _invariant_curvature(kinematics: AbstractKinematics, F: Entries):
-    """Second derivative of I1_bar by F."""
-    J, scale, I1, C = _parts(kinematics, F)
-    mixed = (-4 / 3 * scale / J)[None] * F
-    square = (5 / 9 * scale * I1 / J**2)[None] * C
-    # the sum of an outer product and its transpose
-    half = (mixed + square)[:, None] * C[None]
-    place, sign = curvature_table(kinematics)
-    bent = curvature_entries(F)[place] * sign[:, :, None, None]
-    flat = 2 * jnp.eye(F.shape[0], dtype=F.dtype)[:, :, None, None]
-    rest = flat * scale[None, None] - (2 / 3 * scale * I1 / J)[None, None] * bent
-    return half + jnp.swapaxes(half, 0, 1) + rest

@@ -4,46 +4,54 @@ The derivative is that of the implicit function at the converged state: one more
 back-substitution per direction, whatever steps the solver took to get there.
 """
 
-import contextlib
-
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sorojax import _check
 from sorojax._progress import report
 from sorojax._types import is_traced, real
-from sorojax.fem.energy_form import residual
-from sorojax.fem.follow import Log, Start, Stats, begin_at, follow
-from sorojax.fem.linear import linearise, prepare
+from sorojax.fem.follow import Stats, unloaded
+from sorojax.fem.implicit import Solve
+from sorojax.fem.linear import linearise
 from sorojax.fem.newton import Newton
 from sorojax.fem.problem import Problem
-from sorojax.fem.supports import known_values
-from sorojax.math import sparse
+from sorojax.fem.traced import Begin, prepare_traced
 from sorojax.math.status import Status
 
 
 class Solution(eqx.Module):
-    """Displacement at equilibrium [m], or at the last converged fraction of the load."""
+    """Displacement at equilibrium [m], or at the last converged fraction of the load.
+
+    Every array gets the batch axes of `jax.vmap` in front, so each lane has its own
+    `status`, `load_fraction` and Newton `iterations`. `stats` is kept on the host: the
+    record of the solve, under `vmap` a tuple with that of every lane in row-major order,
+    and `None` under `jit`, where it does not exist yet.
+    """
 
     problem: Problem
     displacement: Float[Array, "nodes dim"]
     status: Status
-    stats: Stats = eqx.field(static=True)
+    stats: Stats | tuple[Stats, ...] | None = eqx.field(static=True)
+    load_fraction: Float[Array, ""] | None = None
+    iterations: Int[Array, ""] | None = None
 
 
 class Path(eqx.Module):
-    """Equilibria along a load path: `values` of the load `name`, one state for each."""
+    """Equilibria along a load path: `values` of the load `name`, one state for each.
+
+    A path that stops early is cut there; under `jit` and `vmap` it keeps its length and
+    is NaN from there on. `stats` has one entry for each value, as in `Solution`; it is
+    `None` under `jit`.
+    """
 
     problem: Problem
     displacements: Float[Array, "steps nodes dim"]
     values: Float[Array, "steps ..."]
     name: str = eqx.field(static=True)
     status: Status
-    stats: tuple[Stats, ...] = eqx.field(static=True)
+    stats: tuple | None = eqx.field(static=True)
 
     def __len__(self) -> int:
         return self.displacements.shape[0]
@@ -72,22 +80,34 @@ def solve(
     steps; a step that fails is cut in half, and steps grow again on easy ground. The
     answer does not depend on the steps unless the equilibrium is not unique.
 
+    Works under `jit`, `vmap`, `grad` and their compositions. `vmap` outside `jit` is the
+    fast way through many samples: a lane starts from its nearest solved neighbour where
+    that pays. A lane that fails leaves the others alone and has NaN for derivatives.
+
     Args:
         problem: What to solve; differentiable in each of its numbers.
-        start: Displacement to start from at full load, instead of stepping [m].
+        start: Displacement to start from at full load, instead of stepping [m]; the answer
+            has no derivative by it.
         newton: Tolerances; `Newton()` when omitted.
         steps: Number of equal load steps to try first.
         max_cuts: How often a step may be halved in a row.
-        throw: Raise when no equilibrium is found, otherwise report it in `status`.
+        throw: Raise when no equilibrium is found, otherwise report it in `status`. Under
+            `jit` and `vmap` nothing is raised: look at `status`.
 
     Raises:
         ConvergenceError: If `throw` and a step failed after all cuts.
-        ValueError: If called under `jit` or `vmap`.
     """
-    newton = Newton() if newton is None else newton
-    log = Log(newton, steps, max_cuts)
-    u = _equilibrium(problem, None if start is None else np.asarray(start), log)
-    solution = Solution(problem, u, log.status, log.stats())
+    begin = None if start is None else Begin(jax.lax.stop_gradient(real(start)))
+    call = Solve(problem, begin, Newton() if newton is None else newton, steps, max_cuts)
+    u, counts, _ = call()
+    solution = Solution(
+        problem=problem,
+        displacement=u,
+        status=_status(counts[0] != 0),
+        stats=call.stats,
+        load_fraction=counts[1],
+        iterations=counts[2].astype(jnp.int32),
+    )
     _raise_if_failed("fem.solve", solution, throw)
     return solution
 
@@ -108,83 +128,76 @@ def solve_path(
         problem: The problem; differentiable in each of its numbers.
         newton: Tolerances; `Newton()` when omitted.
         max_cuts: How often a step between two values may be halved in a row.
-        throw: Raise when a value has no equilibrium, otherwise stop the path there.
+        throw: Raise when a value has no equilibrium, otherwise stop the path there. Under
+            `jit` and `vmap` nothing is raised: look at `status`.
         **values: One load by name, with one value per state.
 
     Raises:
         ConvergenceError: If `throw` and a step failed after all cuts.
-        ValueError: If not exactly one existing load is named, or under `jit` or `vmap`.
+        ValueError: If not exactly one existing load is named.
     """
     name, row = _named_values(problem, values)
-    log = Log(Newton() if newton is None else newton, 1, max_cuts)
-    begin, states, stats = None, [], []
+    newton = Newton() if newton is None else newton
+
+    # inside jit even a constant is traced: one compiled loop over the values then
+    if is_traced(jnp.zeros(())):
+        states, failed = _scan_path(problem, name, row, newton, max_cuts)
+        return Path(problem, states, row, name, _status(failed), None)
+    begin, states, stats, failed = None, [], [], jnp.asarray(False)
     for k, value in enumerate(row):
         target = with_load(problem, name, value)
-        log.clear()
-        u = _equilibrium(target, begin, log)
-        stats.append(log.stats())
-        if log.reason:
-            solution = Solution(target, u, log.status, log.stats())
+        call = Solve(target, begin, newton, 1, max_cuts, want_tangent=True)
+        u, counts, tangent = call()
+        record = call.stats
+        stats.append(record)
+        failed = failed | (counts[0] != 0)
+        if isinstance(record, Stats) and record.reason:
+            solution = Solution(target, u, Status.not_converged, record)
             _raise_if_failed("fem.solve_path", solution, throw)
             break
-        states.append(u)
-        begin = log.end
-        report("equilibrium", k + 1, len(row), iterations=log.stats().iterations)
+        states.append(jnp.where(failed, jnp.nan, u))
+        terms = (target.loads, target.supports)
+        begin = _fixed(Begin(states[-1], terms, tangent))
+        lanes = (record,) if isinstance(record, Stats) else record
+        report(
+            "equilibrium", k + 1, len(row), iterations=sum(lane.iterations for lane in lanes)
+        )
     shape = (0, *problem.mesh.points.shape)
     stacked = jnp.stack(states) if states else jnp.zeros(shape)
-    return Path(problem, stacked, row[: len(states)], name, log.status, tuple(stats))
+    return Path(problem, stacked, row[: len(states)], name, _status(failed), tuple(stats))
 
 
-def _equilibrium(
-    problem: Problem, begin: Start | np.ndarray | None, log: Log
-) -> Float[Array, "nodes dim"]:
-    """Displacement at equilibrium with the derivative of the implicit function.
+def _scan_path(
+    problem: Problem, name: str, row, newton: Newton, max_cuts: int
+) -> tuple[Float[Array, "steps nodes dim"], Bool[Array, ""]]:
+    """The same in a trace, from the tangent at rest; NaN from the first failure on."""
+    rest = unloaded(problem)
+    u = jnp.zeros_like(problem.mesh.points)
+    tangent = linearise(rest, prepare_traced(rest), u, u).values
+    terms, static = eqx.partition((rest.loads, rest.supports), eqx.is_inexact_array)
 
-    `begin` is a neighbouring equilibrium, a displacement at full load, or nothing (rest).
-    """
-    params, rest = eqx.partition(problem, eqx.is_inexact_array)
+    def advance(carry, value):
+        u, terms, tangent = jax.lax.stop_gradient(carry)
+        target = with_load(problem, name, value)
+        begin = Begin(u, eqx.combine(terms, static), tangent)
+        u, counts, tangent = Solve(target, begin, newton, 1, max_cuts, want_tangent=True)()
+        failed = counts[0] != 0
+        u = jnp.where(failed, jnp.nan, u)
+        terms = eqx.filter((target.loads, target.supports), eqx.is_inexact_array)
+        return (u, terms, tangent), (u, failed)
 
-    @jax.custom_jvp
-    def equilibrium(params):
-        if is_traced(params):
-            raise ValueError(
-                "fem.solve: called under jit or vmap, need concrete numbers. Call it outside: "
-                "its kernels are compiled already, and grad and jvp work without jit."
-            )
-        problem = eqx.combine(params, rest)
-        with jax.core.eval_context():
-            return jnp.asarray(follow(problem, begin_at(problem, begin), log))
-
-    @equilibrium.defjvp
-    def derivative(primals, tangents):
-        u = equilibrium(*primals)
-        return u, _tangent(rest, u, primals[0], tangents[0])
-
-    return equilibrium(params)
+    _, (states, failed) = jax.lax.scan(advance, (u, terms, tangent), row)
+    return states, jnp.any(failed)
 
 
-def _tangent(rest, u, params, params_dot):
-    """du of R(u, params) = 0, with prescribed displacements moving along."""
-    problem = eqx.combine(params, rest)
-    nodes, dim = u.shape
+def _fixed(begin: Begin) -> Begin:
+    """`begin` without derivatives: an equilibrium does not depend on where it came from."""
+    moving, rest = eqx.partition(begin, eqx.is_inexact_array)
+    return eqx.combine(jax.lax.stop_gradient(moving), rest)
 
-    def known(params):
-        return known_values(eqx.combine(params, rest).supports, nodes, dim)
 
-    def unbalanced(params, u):
-        return residual(eqx.combine(params, rest), u).ravel()
-
-    _, move = jax.jvp(known, (params,), (params_dot,))
-    directions = (params_dot, move.reshape(u.shape))
-    _, rhs = jax.jvp(unbalanced, (params, u), directions)
-    # Concrete numbers run the programs that the solve compiled, not copies for the trace.
-    concrete = not is_traced((params, u))
-    with jax.core.eval_context() if concrete else contextlib.nullcontext():
-        prepared = prepare(problem)
-        values = linearise(problem, prepared, u, u).values
-        matrix = sparse.fix(problem.space.system, values, prepared.known)
-    rhs = jnp.where(prepared.known, jnp.zeros_like(rhs), -rhs)
-    return (sparse.solve(problem.space.system, matrix, rhs) + move).reshape(u.shape)
+def _status(failed: Bool[Array, "..."]) -> Status:
+    return Status.where(failed, Status.not_converged, Status.successful)
 
 
 def _named_values(problem: Problem, values: dict) -> tuple[str, Float[Array, "steps ..."]]:
@@ -212,9 +225,9 @@ def with_load(problem: Problem, name: str, value: Float[Array, "..."]) -> Proble
 
 
 def _raise_if_failed(where: str, solution: Solution, throw: bool) -> None:
-    if not throw or not solution.stats.reason:
-        return
     stats = solution.stats
+    if not throw or not isinstance(stats, Stats) or not stats.reason:
+        return
     done = stats.steps[-1].fraction if stats.steps else 0.0
     raise ConvergenceError(
         f"{where}: no equilibrium beyond {100 * done:.0f} % of the load after {stats.cuts} "

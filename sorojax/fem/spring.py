@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
-from sorojax._types import integers, real
+from sorojax._types import integers, is_traced, real
+from sorojax.fem.checks import check_ids
 from sorojax.fem.curved import CurvedPart
 from sorojax.fem.loads import AbstractLoad
 
@@ -33,16 +34,16 @@ class Spring(AbstractLoad):
     def _to_nodes(self) -> bool:
         return jnp.issubdtype(self.ends.dtype, jnp.integer)
 
-    def _rest(self, problem) -> tuple[Float[Array, "springs dim"], Float[Array, " springs"]]:
-        """Reference position of the far ends and rest lengths [m]."""
-        X = problem.mesh.points
+    def _ends(self, X) -> tuple[Float[Array, "springs dim"], Float[Array, " springs"]]:
+        """Reference position of the far ends, and how far away they are [m]."""
         ends = X[self.ends] if self._to_nodes else jnp.broadcast_to(
             jnp.atleast_2d(self.ends), (self.nodes.size, X.shape[1])
         )  # fmt: skip
-        return ends, jnp.sqrt(jnp.sum((X[self.nodes] - ends) ** 2, axis=1)) - self.value
+        return ends, jnp.sqrt(jnp.sum((X[self.nodes] - ends) ** 2, axis=1))
 
     def potential(self, problem, u):
-        ends, rest = self._rest(problem)
+        ends, length = self._ends(problem.mesh.points)
+        rest = length - self.value
         if self._to_nodes:
             ends = ends + u[self.ends]
         return jnp.sum(_stretch_energy(
@@ -50,7 +51,8 @@ class Spring(AbstractLoad):
         ))  # fmt: skip
 
     def curved_part(self, problem):
-        ends, rest = self._rest(problem)
+        ends, length = self._ends(problem.mesh.points)
+        rest = length - self.value
         stiffness = jnp.broadcast_to(self.stiffness, rest.shape)
         if self._to_nodes:
             groups = jnp.stack([self.nodes, self.ends], axis=1)
@@ -79,14 +81,14 @@ class Spring(AbstractLoad):
                 f"node numbers, or points of shape ({dim},) or ({count}, {dim})."
             )
         _check_sizes(where, self.stiffness, (count,))
-        if not self._to_nodes:
+        if self._to_nodes:
+            check_ids(f"{where} ends", self.ends, mesh.num_nodes)
+        else:
             _check.finite("fem.problem", f"{where} ends", self.ends, "Give points in metres.")
-        lengths = np.asarray(self._rest(_Body(mesh))[1] + self.value)
-        if self._to_nodes and not (0 <= np.min(self.ends) <= np.max(self.ends) < mesh.num_nodes):
-            raise ValueError(
-                f"fem.problem: {where} ends at nodes {np.min(self.ends)} to "
-                f"{np.max(self.ends)}, the mesh has 0 to {mesh.num_nodes - 1}."
-            )
+        if is_traced((mesh.points, self.ends)):
+            return
+        _, lengths = self._ends(mesh.points)
+        lengths = np.asarray(lengths)
         if lengths.min() <= 0:
             raise ValueError(
                 f"fem.problem: {where} has ends at the same place (spring "
@@ -131,10 +133,6 @@ class Foundation(AbstractLoad):
                 f"fem.problem: {where} has a stiffness of {np.asarray(stiffness)} N/m, need "
                 "numbers of at least 0, one of them above 0."
             )
-
-
-class _Body(eqx.Module):
-    mesh: object
 
 
 def _stretch_energy(gap, rest, stiffness):

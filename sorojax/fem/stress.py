@@ -34,7 +34,13 @@ def cauchy_stress(
     problem: Problem, u: Float[Array, "nodes dim"]
 ) -> Float[Array, "cells cell_nodes 3 3"]:
     """sigma = P F' / J at the nodes of every cell [Pa], not averaged between cells."""
-    points = node_points(problem.mesh, problem.kinematics)
+    return stress_at(problem, u, node_points(problem.mesh, problem.kinematics))
+
+
+def stress_at(
+    problem: Problem, u: Float[Array, "nodes dim"], points: Points
+) -> Float[Array, "cells points 3 3"]:
+    """Cauchy stress at `points` of every cell [Pa]."""
     F = _full(problem, points, deformation(problem.mesh, problem.kinematics, points, u))
     material = body_at(problem, points).material
     entries = jax.tree.map(lambda e: jnp.broadcast_to(jnp.asarray(e, points.volumes.dtype),

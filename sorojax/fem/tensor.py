@@ -43,42 +43,38 @@ def volume_slopes(kinematics: AbstractKinematics, F: Entries) -> Entries:
 
 
 @cache
-def _tables(kind: type[AbstractKinematics]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Per pair of kept entries: number and sign of the entry of F in d2J / dF dF, and
-    number of the stress S that meets both."""
+def geometric_table(kind: type[AbstractKinematics]) -> np.ndarray:
+    """(entries, entries, entries + 1 + pairs): what the geometric part of dP/dF is made of.
+
+    The first columns hold d2J / dF dF as a multiple of the kept entries of F and of one, the
+    last ones place S between entries in one row of F.
+    """
     slots = kind.slots
     at = {(s.row, s.col): number for number, s in enumerate(slots)}
-    pairs = stress_pairs(kind)
-    m = len(slots)
-    place, sign = np.zeros((m, m), int), np.zeros((m, m))
-    stress = np.full((m, m), len(pairs))
+    pairs, m = stress_pairs(kind), len(slots)
+    table = np.zeros((m, m, m + 1 + len(pairs)))
     for e, a in enumerate(slots):
         for f, b in enumerate(slots):
             if a.row == b.row:
-                stress[e, f] = pairs.index((min(a.col, b.col), max(a.col, b.col)))
-            if a.row != b.row and a.col != b.col:
-                even = (_NEXT[a.row] == b.row) == (_NEXT[a.col] == b.col)
-                # entries that are not kept are those of the identity, after the last
+                pair = (min(a.col, b.col), max(a.col, b.col))
+                table[e, f, m + 1 + pairs.index(pair)] = 1.0
+            elif a.col != b.col:
                 third = (3 - a.row - b.row, 3 - a.col - b.col)
-                place[e, f] = at.get(third, m)
-                known = third in at or third[0] == third[1]
-                sign[e, f] = (1.0 if even else -1.0) if known else 0.0
-    return place, sign, stress
+                even = (_NEXT[a.row] == b.row) == (_NEXT[a.col] == b.col)
+                # entries that are not kept are those of the identity
+                if third in at or third[0] == third[1]:
+                    table[e, f, at.get(third, m)] = 1.0 if even else -1.0
+    return table
 
 
-def curvature_table(kinematics: AbstractKinematics) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers among `curvature_entries` and signs of d2J / dF_e dF_f."""
-    return _tables(type(kinematics))[:2]
-
-
-def curvature_entries(F: Entries) -> Entries:
-    """The kept entries of F, and one."""
-    return jnp.concatenate([F, jnp.ones_like(F[:1])])
-
-
-def stress_table(kinematics: AbstractKinematics) -> np.ndarray:
-    """Number of the S entry between two kept entries in one row of F, or one too many."""
-    return _tables(type(kinematics))[2]
+def geometric_part(
+    kinematics: AbstractKinematics, F: Entries, weight: Entry | None, S: Entries
+) -> Float[Array, "entries entries quad lanes"]:
+    """`weight` times d2J / dF dF, plus S between the entries of one row of F."""
+    weight = jnp.zeros_like(F[0]) if weight is None else weight
+    # A product with a constant table: gathers of rows are several times slower.
+    parts = jnp.concatenate([weight[None] * F, weight[None], S])
+    return jnp.einsum("efk,kql->efql", geometric_table(type(kinematics)), parts)
 
 
 def second_piola(kinematics: AbstractKinematics, F: Entries, P: Entries) -> Entries:

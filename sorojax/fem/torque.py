@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sorojax._types import integers, optional_real, real
+from sorojax._types import integers, is_traced, optional_real, real
 from sorojax.fem.curved import CurvedPart
 from sorojax.fem.kinematics import Axisymmetric
 from sorojax.fem.loads import AbstractLoad
@@ -52,6 +52,8 @@ class Torque(AbstractLoad):
                 f"fem.problem: {where} has axis={self.axis}, need one in space and none in the "
                 "plane. Write axis=(0.0, 0.0, 1.0) in space."
             )
+        if is_traced(mesh.points):
+            return
         X = np.asarray(mesh.points)[np.asarray(self.nodes)]
         if np.ptp(X, axis=0).max() <= 0:
             raise ValueError(

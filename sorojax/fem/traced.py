@@ -75,19 +75,25 @@ class _Level(NamedTuple):
 def prepare_traced(problem: Problem) -> Prepared:
     """`linear.prepare` for a problem whose node numbers may be traced as well."""
     mesh, dim = problem.mesh, problem.mesh.element.dim
-    known = jnp.zeros((mesh.num_nodes, dim), bool)
-    for support in problem.supports:
-        for component in known_components(support, dim):
-            known = known.at[support.nodes, component].set(True)
+    known = known_mask(problem.supports, mesh.num_nodes, dim)
     parts = [load.curved_part(problem) for load in problem.loads]
     slots = tuple(_slots(problem.space.system, p.groups, dim) for p in parts if p is not None)
     shape = geometry(problem.space, problem.kinematics, problem.formulation, mesh.points)
     length = jnp.max(jnp.ptp(mesh.points[mesh.cells], axis=1))
-    return Prepared(shape, known.ravel(), length, slots)
+    return Prepared(shape, known, length, slots)
+
+
+def known_mask(supports: tuple, num_nodes: int, dim: int) -> Bool[Array, " dofs"]:
+    """`known_dofs` where node numbers may be traced."""
+    known = jnp.zeros((num_nodes, dim), bool)
+    for support in supports:
+        for component in known_components(support, dim):
+            known = known.at[support.nodes, component].set(True)
+    return known.ravel()
 
 
 def _slots(system: sparse.SparseSymmetric, groups, dim: int):
-    dofs = (groups[:, :, None] * dim + jnp.arange(dim, dtype=groups.dtype)).astype(jnp.int64)
+    dofs = (groups[:, :, None] * dim + jnp.arange(dim, dtype=groups.dtype)[None, None]).astype(jnp.int64)
     dofs = dofs.reshape(len(groups), -1)
     first, second = jnp.triu_indices(dofs.shape[1])
     low = jnp.minimum(dofs[:, first], dofs[:, second])

@@ -1,5 +1,6 @@
 """Files: surfaces, contours and meshes in and out."""
 
+from sorojax.io.fields import export_fields as export_fields
 from sorojax.io.mesh import export_mesh as export_mesh, import_mesh as import_mesh
 from sorojax.io.surface import (
     export_contour as export_contour,

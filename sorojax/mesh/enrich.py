@@ -31,7 +31,8 @@ def enrich(mesh: Mesh) -> Mesh:
 
     Tri6 becomes Tri7, Quad8 Quad9 and Tet10 Tet15: the displacements that, with a pressure
     linear in each cell, neither lock nor oscillate in nearly incompressible rubber. The
-    geometry is unchanged; new nodes follow the old ones, so node sets stay valid.
+    geometry is unchanged, and old nodes keep their numbers. A node set gains the centres of
+    the faces, and of the cells, all of whose nodes it holds.
 
     Raises:
         ValueError: For other cells, or if the cells are traced.
@@ -55,7 +56,18 @@ def enrich(mesh: Mesh) -> Mesh:
     points = jnp.concatenate([mesh.points, where.reshape(-1, element.dim)[first]])
     richer = Mesh(points, np.concatenate([cells, columns], axis=1), element)
     sets = {name: _with_centres(richer, f) for name, f in mesh.facet_sets.items()}
-    return Mesh(points, richer.cells, element, mesh.node_sets, sets, mesh.regions)
+    nodes = {name: _with_inner(mesh, columns, ids) for name, ids in mesh.node_sets.items()}
+    return Mesh(points, richer.cells, element, nodes, sets, mesh.regions)
+
+
+def _with_inner(mesh: Mesh, columns: np.ndarray, ids) -> np.ndarray:
+    """A node set with the new nodes of faces and cells that lie in it."""
+    inside = np.zeros(mesh.num_nodes, bool)
+    inside[np.asarray(ids)] = True
+    held = inside[np.asarray(mesh.cells)]
+    faces = mesh.element.facets if mesh.element.dim == 3 else ()
+    whole = [held[:, list(face)].all(axis=1) for face in faces] + [held.all(axis=1)]
+    return np.concatenate([np.asarray(ids), np.unique(columns[np.stack(whole, axis=1)])])
 
 
 def _owners(mesh: Mesh, element: AbstractElement) -> np.ndarray:

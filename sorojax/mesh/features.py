@@ -7,6 +7,7 @@ import numpy as np
 
 from sorojax.mesh.ridge_snap import Around, Snapper
 from sorojax.mesh.settle import Sides
+from sorojax.mesh.sizes import Sizes
 from sorojax.mesh.tet_shape import badness
 from sorojax.sdf.base import AbstractSdf
 
@@ -37,12 +38,12 @@ class Features(NamedTuple):
         return Features(Sides(*(part[keep] for part in self.sides)), ridge, corner, self.before)
 
 
-def sharpen(shape: AbstractSdf, points, cells, skin, pitch: float):
+def sharpen(shape: AbstractSdf, points, cells, skin, size: Sizes):
     """`(points, cells, skin, features)` without surface edges that cut a ridge off: a node
     is moved where its cells allow it, else the edge is split."""
     before = points
     for turn in range(_TURNS + 1):
-        found = Snapper(shape, points, cells, pitch)
+        found = Snapper(shape, points, cells, size)
         found.snap_touching()
         found.snap_corners()
         found.snap_ridges()

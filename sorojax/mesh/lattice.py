@@ -3,18 +3,35 @@
 Reference: Labelle and Shewchuk, Isosurface stuffing, SIGGRAPH 2007.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sample import values
 
 _SNAP_LONG, _SNAP_SHORT = 0.25, 0.41  # share of an edge within which a node is moved
+_SNAP_ANY = 0.3  # the same where edges of the lattice are of many lengths
 _MOST_CUBES = 2e7
 _EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
 
-def lattice(shape: AbstractSdf, lower, upper, pitch: float):
-    """Nodes, their field [m], and tetrahedra that touch the inside of `shape`.
+class Lattice(NamedTuple):
+    """Tetrahedra of cubes that may hold inside.
+
+    Attributes:
+        start: Where the coordinates are zero [m].
+        at: (nodes, 3) coordinates in cubes: whole for corners, plus a half for centres.
+        cells: (cells, 4) tetrahedra, not all of one sense.
+    """
+
+    start: np.ndarray
+    at: np.ndarray
+    cells: np.ndarray
+
+
+def lattice(shape: AbstractSdf, lower, upper, pitch: float) -> Lattice:
+    """The lattice with cubes of side `pitch` [m] where `shape` may have its inside.
 
     Cubes are kept where the Lipschitz constant cannot exclude the inside, so memory
     follows the volume of the shape and not that of its box.
@@ -48,15 +65,21 @@ def lattice(shape: AbstractSdf, lower, upper, pitch: float):
     used, number = np.unique(flat, return_inverse=True)
     number = len(cubes) + number.reshape(flat.shape)
     corners = np.stack(np.unravel_index(used, tuple(count + 1)), axis=1)
-    points = start + pitch * np.concatenate([cubes + 0.5, corners])
     cells = np.concatenate(
         [
             np.concatenate([pair, number[:, [k]], number[:, [(k + 1) % 4]]], axis=1)
             for k in range(4)
         ]
     )
+    return Lattice(start, np.concatenate([cubes + 0.5, corners]), cells)
+
+
+def touching(shape: AbstractSdf, points, cells, tiny: float):
+    """Field [m] at `points`, nowhere nearer to zero than `tiny` [m], and the cells with a
+    corner inside `shape`."""
     f = values(shape, points)
-    return points, f, cells[(f[cells] < 0).any(axis=1)]
+    f = np.where(np.abs(f) < tiny, -tiny, f)
+    return f, cells[(f[cells] < 0).any(axis=1)]
 
 
 def _near_cubes(shape: AbstractSdf, start, count, pitch: float) -> np.ndarray:
@@ -97,15 +120,20 @@ def roots(shape: AbstractSdf, a, b, fa, fb, steps: int = 4):
     return np.clip(share, 1e-6, 1 - 1e-6), point
 
 
-def snap(shape: AbstractSdf, points, f, cells, pitch: float):
-    """Lattice nodes close to the surface moved onto it; their field becomes zero."""
+def snap(shape: AbstractSdf, points, f, cells, pitch: float | None):
+    """Lattice nodes close to the surface moved onto it; their field becomes zero.
+
+    `pitch` [m] is that of a regular lattice, `None` where cells were bisected.
+    """
     edges = unique_edges(cells, len(points))
     edges = edges[(f[edges[:, 0]] < 0) != (f[edges[:, 1]] < 0)]
     a, b = edges.T
     share, crossing = roots(shape, points[a], points[b], f[a], f[b])
-    long = ((points[a] - points[b]) ** 2).sum(axis=1) > 0.9 * pitch**2
-    reach = np.where(long, _SNAP_LONG, _SNAP_SHORT)
-    length = np.where(long, 1.0, np.sqrt(0.75))
+    length = np.linalg.norm(points[a] - points[b], axis=1)
+    if pitch is None:
+        reach = np.full(len(a), _SNAP_ANY)
+    else:
+        reach = np.where(length > 0.95 * pitch, _SNAP_LONG, _SNAP_SHORT)
     node, way = np.concatenate([a, b]), np.concatenate([share, 1 - share])
     close = way < np.concatenate([reach, reach])
     distance = (way * np.concatenate([length, length]))[close]
@@ -144,7 +172,7 @@ def clip(shape: AbstractSdf, points, f, cells):
     parts = [whole]
     inside, on = (sign[cut] < 0).sum(axis=1), (sign[cut] == 0).sum(axis=1)
     for m, z in {*zip(inside.tolist(), on.tolist(), strict=True)}:
-        parts += _inside_part(*cut[(inside == m) & (on == z)].T, m, z, middle)
+        parts += inside_part(*cut[(inside == m) & (on == z)].T, m, z, middle)
     cells = np.concatenate(parts)
     skin = np.concatenate([sign == 0, np.ones(len(crossing), bool)])
     points = np.concatenate([points, crossing])
@@ -152,7 +180,7 @@ def clip(shape: AbstractSdf, points, f, cells):
     return points[used], number.reshape(-1, 4), skin[used]
 
 
-def _inside_part(a, b, c, d, inside: int, on: int, middle) -> list[np.ndarray]:
+def inside_part(a, b, c, d, inside: int, on: int, middle) -> list[np.ndarray]:
     """Corners sorted inside, on, outside: the tetrahedra of the inside."""
     if inside == 1:
         others = [x if k < on else middle(a, x) for k, x in enumerate((b, c, d))]

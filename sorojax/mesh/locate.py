@@ -8,8 +8,9 @@ from jaxtyping import Array, Float, Int
 
 from sorojax._types import is_traced
 from sorojax.math.spatial import KDTree
+from sorojax.mesh.elements import Hex8, PolyN, Quad4, Quad8, Quad9
 from sorojax.mesh.mesh import Mesh
-from sorojax.mesh.shape import shape_functions, shape_gradients
+from sorojax.mesh.shape import nodes, shape_functions, shape_gradients
 
 
 class Locations(NamedTuple):
@@ -27,9 +28,11 @@ def locate(mesh: Mesh, points: Float[np.ndarray, "points dim"]) -> Locations:
     """The cells that hold `points` [m] of the reference configuration (on the host).
 
     Raises:
-        ValueError: If a point lies outside the mesh, or the mesh is traced.
+        ValueError: If a point lies outside the mesh, the mesh is traced or its cells are
+            polygons.
     """
-
+    if isinstance(mesh.element, PolyN):
+        raise ValueError("locate: got polygons, need triangles, quadrilaterals or solid cells.")
     if is_traced(mesh):
         raise ValueError("locate: the mesh is traced, need concrete points. Call it outside.")
     points = np.atleast_2d(np.asarray(points, float))
@@ -37,7 +40,7 @@ def locate(mesh: Mesh, points: Float[np.ndarray, "points dim"]) -> Locations:
     centres = X[cells[:, : mesh.element.num_corners]].mean(axis=1)
     near = KDTree(centres).query(points, k=min(24, len(cells)))[1].reshape(len(points), -1)
     xi = _reference_coordinates(mesh, X[cells[near]], points)
-    inside = np.minimum(xi.min(axis=-1), 1 - xi.sum(axis=-1))
+    inside = _depth(mesh, xi)
     best = np.argmax(inside, axis=1)
     rows = np.arange(len(points))
     if (outside := np.flatnonzero(inside[rows, best] < -1e-6)).size:
@@ -49,13 +52,22 @@ def locate(mesh: Mesh, points: Float[np.ndarray, "points dim"]) -> Locations:
     return Locations(jnp.asarray(cells[near[rows, best]]), jnp.asarray(weights))
 
 
+def _depth(mesh: Mesh, xi: np.ndarray) -> np.ndarray:
+    """How far reference points lie inside the cell; negative outside."""
+    if isinstance(mesh.element, Quad4 | Quad8 | Quad9 | Hex8):
+        return 1 - np.abs(xi).max(axis=-1)
+    return np.minimum(xi.min(axis=-1), 1 - xi.sum(axis=-1))
+
+
 def _reference_coordinates(mesh: Mesh, corners, points, iterations: int = 4):
     """Newton's method for X(xi) = point in every candidate cell."""
-    xi = np.full((*corners.shape[:2], 2), 1 / 3)
+    dim = mesh.element.dim
+    centre = nodes(mesh.element)[: mesh.element.num_corners].mean(axis=0)
+    xi = np.broadcast_to(centre, (*corners.shape[:2], dim)).copy()
     for _ in range(iterations):
-        flat = xi.reshape(-1, 2)
+        flat = xi.reshape(-1, dim)
         N = shape_functions(mesh.element, flat).reshape(*xi.shape[:2], -1)
-        dN = shape_gradients(mesh.element, flat).reshape(*xi.shape[:2], -1, 2)
+        dN = shape_gradients(mesh.element, flat).reshape(*xi.shape[:2], -1, dim)
         gap = points[:, None] - np.einsum("pca,pcai->pci", N, corners)
         jac = np.einsum("pcad,pcai->pcid", dN, corners)
         xi = np.clip(xi + np.linalg.solve(jac, gap[..., None])[..., 0], -2, 3)

@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 
 from sorojax.mesh.settle import ZOOMS, Sides, joined, no_sides, normals_near, settle
+from sorojax.mesh.sizes import Sizes
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sample import values, values_and_gradients
 
@@ -42,9 +43,9 @@ class Around:
         return self.table[self.rows_of(node)]
 
 
-def _meeting(shape: AbstractSdf, seen: np.ndarray, start: np.ndarray, pitch: float):
+def _meeting(shape: AbstractSdf, seen: np.ndarray, start: np.ndarray, pitch: np.ndarray):
     """Where the sides seen at the places `seen` (groups, sides, 3) meet, their normals there,
-    and whether they do meet.
+    and whether they do meet; `pitch` (groups,) is the size of the cells there [m].
 
     A rounded edge looks smooth from near, a ridge does not.
     """
@@ -91,9 +92,9 @@ class Snapper:
     normals there; a node off the ridges has one, repeated.
     """
 
-    def __init__(self, shape, points, cells, pitch: float):
+    def __init__(self, shape, points, cells, size: Sizes):
         triangles = boundary_triangles(cells)
-        self.shape, self.points, self.pitch = shape, points.copy(), pitch
+        self.shape, self.points, self.pitch = shape, points.copy(), size(points)
         self.triangles = triangles
         self.ridge, self.corner = np.zeros(len(points), bool), np.zeros(len(points), bool)
         self.parts: dict[int, Sides] = {}
@@ -140,8 +141,8 @@ class Snapper:
             if not len(own):
                 continue
             seen = self.seen[own, :count]
-            x, n, good = _meeting(self.shape, seen, self.points[own], self.pitch)
-            good &= np.linalg.norm(x - self.points[own], axis=1) < 3 * _TOUCH * self.pitch
+            x, n, good = _meeting(self.shape, seen, self.points[own], self.pitch[own])
+            good &= np.linalg.norm(x - self.points[own], axis=1) < 3 * _TOUCH * self.pitch[own]
             for node, *rest in zip(own[good], x[good], seen[good], n[good], strict=True):
                 self._put(node, *rest)
                 self.corner[node] = count == 3
@@ -161,11 +162,12 @@ class Snapper:
         seen = self.seen[triangles].reshape(-1, 9, 3)
         seen = np.take_along_axis(seen, pick[:, :, None], axis=1)
         start = self.points[triangles].mean(axis=1)
-        x, n, good = _meeting(self.shape, seen, start, self.pitch)
+        pitch = self.pitch[triangles].max(axis=1)
+        x, n, good = _meeting(self.shape, seen, start, pitch)
         done = self.points[self.corner]
-        parts = (x[good], triangles[good], seen[good], n[good])
-        for place, group, sides, normals in zip(*parts, strict=True):
-            if len(done) and np.linalg.norm(done - place, axis=1).min() < 1e-3 * self.pitch:
+        parts = (x[good], triangles[good], seen[good], n[good], pitch[good])
+        for place, group, sides, normals, near in zip(*parts, strict=True):
+            if len(done) and np.linalg.norm(done - place, axis=1).min() < 1e-3 * near:
                 continue
             done = np.concatenate([done, place[None]])
             gap = np.linalg.norm(self.points[group] - place, axis=1)
@@ -208,7 +210,8 @@ class Snapper:
             return edges, np.zeros((0, 3)), np.zeros((0, 2, 3)), np.zeros((0, 2, 3))
         rows, seen = self._side_pairs(edges)
         middle = self.points[edges].mean(axis=1)[rows]
-        x, n, good = _meeting(self.shape, seen, middle, self.pitch)
+        pitch = self.pitch[edges].max(axis=1)[rows]
+        x, n, good = _meeting(self.shape, seen, middle, pitch)
         alive = np.array(self.ridge[edges].any(axis=1))
         alive[rows[good]] = True
         self.edges = edges[alive]  # the others are smooth
@@ -246,7 +249,7 @@ class Snapper:
         old = _volumes(x)
         new = _volumes(np.where((cells == node)[..., None], place, x))
         # A cell of the surface alone may become flat: it is taken away.
-        flat = self.skin[cells].all(axis=1) & (new > -_FLAT * self.pitch**3)
+        flat = self.skin[cells].all(axis=1) & (new > -_FLAT * self.pitch[node] ** 3)
         return bool((flat | (new > _LEFT * old)).all())
 
     def _put(self, node: int, place, seen: np.ndarray, normals: np.ndarray) -> None:

@@ -26,6 +26,10 @@ class Sizes(NamedTuple):
     def __call__(self, p: np.ndarray) -> np.ndarray:
         return np.clip(self.function(p), self.smallest, self.largest)
 
+    def scaled(self, factor: float) -> "Sizes":
+        """All lengths times `factor`."""
+        return Sizes(lambda p: factor * self(p), factor * self.smallest, factor * self.largest)
+
 
 def grade(shape: AbstractSdf, *, near: float, far: float, growth: float = 0.3) -> SizeFunction:
     """Edge lengths that grow away from the zero set of `shape`, for `size=`.
@@ -42,8 +46,14 @@ def grade(shape: AbstractSdf, *, near: float, far: float, growth: float = 0.3) -
     return lambda p: np.minimum(near + growth * np.abs(values(shape, p)), far)
 
 
+def constant(length: float) -> Sizes:
+    """The same edge length [m] everywhere."""
+    return Sizes(lambda p: np.full(len(p), length), length, length)
+
+
 def sizes(where: str, size: float | SizeFunction, lower, upper) -> Sizes:
     """`size` as a field, checked before any large array is made."""
+    crowd = 1.0
     if callable(size):
         axes = [np.linspace(lower[i], upper[i], _SAMPLES) for i in range(len(lower))]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
@@ -52,16 +62,16 @@ def sizes(where: str, size: float | SizeFunction, lower, upper) -> Sizes:
         _check.shape(where, "size(points)", found, (len(grid),), "Return one length per point.")
         _check.positive(where, "size(points)", found, "m", "Lengths are above zero.")
         field = Sizes(size, float(found.min()), float(found.max()))
+        crowd = float(np.mean((field.smallest / found) ** len(lower)))
     else:
         _check.positive(where, "size", size, "m", "Give the wanted length of a side.")
-        length = float(size)
-        field = Sizes(lambda p: np.full(len(p), length), length, length)
+        field = constant(float(size))
     if field.smallest > (upper - lower).min():
         raise ValueError(
             f"{where}: edges of {field.smallest:g} m do not fit in a box of {upper - lower} m. "
             "Lower `size` (lengths are in metres: write 1 * mm)."
         )
-    count = float(np.prod((upper - lower) / field.smallest))
+    count = crowd * float(np.prod((upper - lower) / field.smallest))
     if count > _MOST_POINTS:
         raise ValueError(
             f"{where}: edges of {field.smallest:g} m over a box of {upper - lower} m take "

@@ -4,79 +4,121 @@ import numpy as np
 
 from sorojax import _check
 from sorojax._types import real
-from sorojax.mesh.elements import Tet4
 from sorojax.mesh.features import Features, sharpen
-from sorojax.mesh.lattice import clip, lattice, snap
+from sorojax.mesh.bisect import graded
+from sorojax.mesh.interfaces import Parts, insert, whole
+from sorojax.mesh.lattice import clip, lattice, snap, touching
 from sorojax.mesh.mesh import Mesh
 from sorojax.mesh.peel import peel
 from sorojax.mesh.resolved import check_resolved
-from sorojax.mesh.tet10 import curved, named
+from sorojax.mesh.sizes import SizeFunction, Sizes, constant, sizes
+from sorojax.mesh.tet10 import solid_mesh
 from sorojax.mesh.tet_shape import badness, signed_volumes
 from sorojax.mesh.tets import Surface, improve
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sample import finite_box, land, raise_empty
 
 _ENOUGH = np.deg2rad(22.0)  # dihedral angle above which a cell is left alone
+_STRETCH = 1.5  # of the wanted length that an edge of a bisected cell may have
 _POOR = np.deg2rad(5.0)  # below which a wall is thinner than the lattice can follow
 
 
 def tetrahedralise(
-    shape: AbstractSdf, *, size: float, order: int = 1, rounds: int = 12
+    shape: AbstractSdf,
+    *,
+    size: float | SizeFunction,
+    order: int = 1,
+    interfaces: tuple[AbstractSdf, ...] = (),
+    rounds: int = 12,
 ) -> Mesh:
     """Tetrahedra that fill a solid shape.
 
     A body-centred cubic lattice is snapped to the surface and cut by it, nodes are put on
     sharp edges and corners, then nodes of the worst cells are moved. Boundary nodes lie on
     the zero set; a sharp edge is chamfered within one cell where cells would degenerate.
-    Facet set: "boundary"; node sets: "ridges" and "corners" of sharp edges.
+    Facet sets: "boundary" and "interface_0", ...; node sets: "ridges" and "corners" of
+    sharp edges, and "interface_0", .... Materials are cells inside a shape:
+    `cells_inside(mesh, interfaces[0])`.
 
     Args:
         shape: A concrete, bounded solid shape.
-        size: Pitch of the cubes of the lattice [m]; edges are 0.87 to 1 of it.
+        size: Pitch of the cubes of the lattice [m]; edges are 0.87 to 1 of it. A function
+            of points (n, 3) that returns one length per point, such as `grade(...)`, halves
+            the edges of the lattice where it is small.
         order: 1 for `Tet4`, 2 for `Tet10` with mid-sides of the surface on the zero set
             wherever the cells stay valid.
+        interfaces: Shapes whose zero sets become facets of the mesh inside `shape`.
         rounds: Smoothing steps on the worst cells.
 
     Raises:
         ValueError: If the shape is empty, unbounded, traced, or has walls thinner than
-            `size` can follow.
+            `size` can follow; if an interface misses the shape.
     """
     where = "tetrahedralise"
     if order not in (1, 2):
         raise ValueError(f"{where}: `order` is {order}, need 1 (Tet4) or 2 (Tet10).")
-    _check.positive(where, "size", size, "m", "Give the wanted length of an edge.")
     _check.float64(where, real(0.0))
     lower, upper = finite_box(where, shape, 3)
-    points, f, cells = lattice(shape, lower, upper, float(size))
+    lengths = _lengths(where, size, lower, upper)
+    points, f, cells = _background(where, shape, lower, upper, lengths)
+    regular = lengths.largest if lengths.largest == lengths.smallest else None
+    points, f = snap(shape, points, f, cells, regular)
+    points, cells, skin = clip(shape, points, f, cells)
+    cells = _upright(points, cells, lengths)
+    points, cells, skin = _compact(points, cells, skin)
+    if not len(cells):
+        raise_empty(where, lower, upper, lengths.largest)
+    points[skin] = land(shape, points[skin], 3)
+    points, cells, skin, features = sharpen(shape, points, cells, skin, lengths)
+    cells = peel(points, cells, skin, _POOR)
+    points, features = _improved(shape, points, cells, skin, features, rounds)
+    widest = lengths if regular else lengths.scaled(_STRETCH)
+    check_resolved(where, shape, points[skin], widest, lower, upper)
+    parts = _divided((shape, *interfaces), whole(points, cells, skin, features), rounds)
+    _check_shapes(parts.points, parts.cells)
+    return solid_mesh((shape, *interfaces), parts, order)
+
+
+def _divided(fields: tuple[AbstractSdf, ...], parts: Parts, rounds: int) -> Parts:
+    """`parts` with the zero sets of all fields but the first among its facets."""
+    for count in range(2, len(fields) + 1):
+        parts = insert(fields[:count], parts)
+        surface = Surface(fields[:count], parts.owner, parts.features)
+        points = improve(surface, parts.points, parts.cells, 2 * rounds, _ENOUGH)
+        parts = parts._replace(points=points)
+    return parts
+
+
+def _lengths(where: str, size: float | SizeFunction, lower, upper) -> Sizes:
+    if callable(size):
+        return sizes(where, size, lower, upper)
+    _check.positive(where, "size", size, "m", "Give the wanted length of an edge.")
+    return constant(float(size))
+
+
+def _background(where: str, shape: AbstractSdf, lower, upper, lengths: Sizes):
+    """Nodes of the lattice, their field [m] (nowhere zero), and its tetrahedra."""
+    pitch = lengths.largest
+    found = lattice(shape, lower, upper, pitch)
+    points, cells = found.start + pitch * found.at, found.cells
+    if lengths.smallest < pitch:
+        points, cells = graded(shape, found, pitch, lengths)
+    f, cells = touching(shape, points, cells, 1e-9 * lengths.smallest)
     if not np.all(np.isfinite(f)):
         raise ValueError(
             f"{where}: the field is not finite at {points[~np.isfinite(f)][0]} m. Check "
             "the parameters of the shape for NaN."
         )
     if not len(cells):
-        raise_empty(where, lower, upper, float(size))
-    f = np.where(f == 0, -1e-9 * size, f)
-    points, f = snap(shape, points, f, cells, float(size))
-    points, cells, skin = clip(shape, points, f, cells)
-    cells = _upright(points, cells, float(size))
-    points, cells, skin = _compact(points, cells, skin)
-    if not len(cells):
-        raise_empty(where, lower, upper, float(size))
-    points[skin] = land(shape, points[skin], 3)
-    points, cells, skin, features = sharpen(shape, points, cells, skin, float(size))
-    cells = peel(points, cells, skin, _POOR)
-    points, features = _improved(shape, points, cells, skin, features, rounds)
-    _check_shapes(points, cells)
-    check_resolved(where, shape, points[skin], float(size), lower, upper)
-    if order == 2:
-        return curved(shape, points, cells, features)
-    return named(Mesh(points, cells, Tet4()), features)
+        raise_empty(where, lower, upper, pitch)
+    return points, f, cells
 
 
 def _improved(shape: AbstractSdf, points, cells, skin, features: Features, rounds: int):
     """Better cells; ridges are given up where they leave a cell too poor."""
     for _ in range(3):
-        points = improve(Surface((shape,), skin, features), points, cells, rounds, _ENOUGH)
+        surface = Surface((shape,), np.where(skin, 0, -1), features)
+        points = improve(surface, points, cells, rounds, _ENOUGH)
         poor = np.unique(cells[badness(points[cells]) > np.cos(_POOR)])
         poor = poor[features.ridge[poor]]
         if not len(poor):
@@ -91,10 +133,10 @@ def _compact(points, cells, skin):
     return points[used], number.reshape(cells.shape), skin[used]
 
 
-def _upright(points, cells, size: float) -> np.ndarray:
+def _upright(points, cells, lengths: Sizes) -> np.ndarray:
     volume = signed_volumes(points[cells])
     cells = np.where((volume < 0)[:, None], cells[:, [0, 1, 3, 2]], cells)
-    return cells[np.abs(volume) > 1e-9 * size**3]
+    return cells[np.abs(volume) > 1e-9 * lengths(points[cells[:, 0]]) ** 3]
 
 
 def _check_shapes(points, cells) -> None:

@@ -17,10 +17,11 @@ _ABREAST = (0.1, 0.01, 1e-3, 1e-4)  # zooms for nodes that are near their ridge 
 
 
 class Surface(NamedTuple):
-    """What holds nodes: fields, which nodes lie on the first one, which on several."""
+    """What holds nodes: fields, which one a smooth node lies on (or -1), and nodes on
+    several sides."""
 
     fields: tuple[AbstractSdf, ...]
-    skin: np.ndarray
+    owner: np.ndarray
     features: Features
 
 
@@ -95,7 +96,8 @@ def _places(surface: Surface, points, ball_cells, row, movers) -> np.ndarray:
     ridge = surface.features.ridge[movers]
     beside = np.zeros(len(movers), bool)
     np.logical_or.at(beside, row, surface.features.ridge[ball_cells].any(axis=1))
-    _hold_on_skin(surface.fields[0], places, surface.skin[movers] & ~ridge, beside)
+    for i, field in enumerate(surface.fields):
+        _hold_on_skin(field, places, (surface.owner[movers] == i) & ~ridge, beside)
     _hold_on_ridges(surface, places, movers, ridge, reach[:, 0])
     return places
 
@@ -121,7 +123,7 @@ def _hold_on_ridges(surface: Surface, places, movers, on: np.ndarray, reach) -> 
     if not on.any():
         return
     tries, count = len(places) - 1, int(on.sum())
-    sides = surface.features.sides.of(movers[on], len(surface.skin))
+    sides = surface.features.sides.of(movers[on], len(surface.owner))
     shift = (np.arange(tries) * count)[:, None]
     all_sides = sides._replace(
         point=(sides.point + shift).ravel(),
@@ -138,6 +140,9 @@ def _hold_on_ridges(surface: Surface, places, movers, on: np.ndarray, reach) -> 
     start = (here + step).reshape(-1, 3)
     moved = settle(surface.fields, start, all_sides, _ABREAST).reshape(tries, count, 3)
     far = np.linalg.norm(moved - here, axis=2) > 0.5 * reach[on]
-    off = np.abs(values(surface.fields[0], moved.reshape(-1, 3))).reshape(tries, count)
-    far |= off > 1e-4 * reach[on]
+    flat = moved.reshape(-1, 3)
+    for i in np.unique(sides.field):
+        off = np.abs(values(surface.fields[i], flat)).reshape(tries, count)
+        off[:, np.setdiff1d(np.arange(count), sides.point[sides.field == i])] = 0.0
+        far |= off > 1e-4 * reach[on]
     places[1:, on] = np.where(far[..., None], here, moved)

@@ -9,7 +9,7 @@ from sorojax.mesh.elements import Tri3, Tri6
 from sorojax.mesh.mesh import Mesh
 from sorojax.mesh.outline import Outline, outline
 from sorojax.mesh.resolved import check_resolved
-from sorojax.mesh.sizes import SizeFunction, sizes
+from sorojax.mesh.sizes import SizeFunction, constant, sizes
 from sorojax.mesh.tri6 import least_jacobian, with_middles
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sample import finite_box, land
@@ -53,7 +53,7 @@ def triangulate(
     lengths = sizes("triangulate", size, *box)
     interfaces = tuple(interfaces)
     lines = outline(shape, interfaces, lengths)
-    check_resolved("triangulate", shape, lines.points, lengths.largest, *box)
+    check_resolved("triangulate", shape, lines.points, constant(lengths.largest), *box)
     points, cells = fill(shape, lines, lengths, iterations)
     check_edges(lines, points, cells)
     if order == 1:

@@ -17,7 +17,6 @@ from sorojax.sdf.sample import finite_box, raise_empty, values
 LEAF = 8  # cells along a block
 _TOP = 64
 _BATCH = 64  # blocks per call of the compiled kernel
-_GROUP = 2048  # blocks meshed at a time
 _MOST = 4_000_000  # blocks held at a time: about 12 GB of field values
 _BITS = np.array(list(np.ndindex(2, 2, 2)))
 
@@ -119,10 +118,13 @@ def _sampled(shape: AbstractSdf, grid: Grid, blocks: np.ndarray) -> np.ndarray:
 
 
 def leaf_fields(
-    shape: AbstractSdf, grid: Grid, blocks: np.ndarray
+    shape: AbstractSdf, grid: Grid, blocks: np.ndarray, least: int = 2048
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Groups of `blocks` with their field in cells (n, 9, 9, 9), equal where they touch."""
-    groups = _groups(blocks)
+    """Groups of `blocks` with their field in cells (n, 9, 9, 9), equal where they touch.
+
+    A group has `least` blocks or more, and all that have the same first coordinate.
+    """
+    groups = _groups(blocks, least)
     field = _sampled(shape, grid, groups[0])
     for now, ahead in zip(groups, [*groups[1:], groups[0][:0]], strict=True):
         next_field = _sampled(shape, grid, ahead)
@@ -131,12 +133,12 @@ def leaf_fields(
         field = next_field
 
 
-def _groups(blocks: np.ndarray) -> list[np.ndarray]:
+def _groups(blocks: np.ndarray, least: int) -> list[np.ndarray]:
     """`blocks` cut where their first coordinate changes, into pieces of similar length."""
     starts = np.flatnonzero(np.diff(blocks[:, 0], prepend=-1))
     keep = [0]
     for start in starts:
-        if start - keep[-1] >= _GROUP:
+        if start - keep[-1] >= least:
             keep.append(int(start))
     return np.split(blocks, keep[1:])
 

@@ -1,180 +1,187 @@
 """Dual contouring: one vertex per sheet and cell, placed by the planes of its crossings.
 
 Ju et al. 2002 for the vertices; the sheets make the surface manifold (Schaefer et al. 2007).
+The blocks go through in groups, so that only crossings and the result are held for all.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.blocks import LEAF, Grid, leaf_fields
-from sorojax.sdf.dual_sheets import cell_sheets
-from sorojax.sdf.dual_vertices import place
-from sorojax.sdf.query import value_and_gradient
-from sorojax.sdf.sample import CHUNK
+from sorojax.sdf.blocks import Grid, leaf_fields
+from sorojax.sdf.dual_crossings import (
+    Crossings,
+    blocks_before,
+    cells_before,
+    corner,
+    crossings,
+)
+from sorojax.sdf.dual_rims import refuse_lost_walls
+from sorojax.sdf.dual_sheets import Faces, cell_sheets, doubtful_faces
+from sorojax.sdf.dual_vertices import SUMS, gathered, place
+from sorojax.sdf.sample import values
 
-MARGIN = 0.02  # cells: vertices stay off cell walls, so that none coincide in float32
-# Cells around a grid edge, counter-clockwise: offsets of the edge within them.
+# Cells around a grid edge, counter-clockwise: how far they begin before it.
 _AROUND = ((1, 1), (0, 1), (0, 0), (1, 0))
-_PIECE = 1 << 16
+_PIECE = 1 << 13
+_GROUP = 512  # blocks that go through together
 
 
-class _Crossings(NamedTuple):
-    """Cells that hold both signs, in order, and the grid edges that join both signs.
+class Cells(NamedTuple):
+    """All cells that hold surface, in order, and the vertices they get.
 
-    `points` are in cells from the grid's corner; `start_inside` tells which end of the
-    edge lies inside.
+    Attributes:
+        name: (n,) as in `dual_crossings`.
+        code: (n,) bits of the inside corners.
+        kind: (n,) rows of `edges`.
+        edges: (kinds, 12) which vertex of the cell lies on each cell edge.
+        first: (n + 1,) number of the first vertex.
     """
 
-    cell: np.ndarray
+    name: np.ndarray
     code: np.ndarray
-    start: np.ndarray
-    axis: np.ndarray
-    start_inside: np.ndarray
-    points: np.ndarray
-    normals: np.ndarray
+    kind: np.ndarray
+    edges: np.ndarray
+    first: np.ndarray
 
 
 def dual_contouring(
-    shape: AbstractSdf, grid: Grid, blocks: np.ndarray, margin: float = MARGIN
+    shape: AbstractSdf, grid: Grid, blocks: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [m] at least `margin` cells inside their cells; outward triangles."""
-    found = _crossings(shape, grid, blocks)
-    quads, owner, alone = _quads(grid, found)
-    vertices = place(found.points, found.normals, quads, alone)
-    for start in range(0, len(owner), _PIECE):
-        piece = slice(start, start + _PIECE)
-        low = grid.node(owner[piece]) + margin
-        vertices[piece] = np.clip(vertices[piece], low, low + (1 - 2 * margin))
-    triangles = _triangles(vertices, quads, found)
-    return grid.points(vertices), triangles
+    """Vertices [m] inside their cells, and triangles that face outwards."""
+    groups, done = [], 0
+    for group, field in leaf_fields(shape, grid, blocks, _GROUP):
+        groups.append(crossings(shape, grid, group, field, done))
+        done += len(group)
+        del field
+    before = blocks_before(grid, blocks)
+    cells = _numbered(shape, grid, blocks, before, groups)
+    vertices = np.empty((int(cells.first[-1]), 3))
+    count = sum(len(group.offset) for group in groups)
+    triangles, row = np.empty((2, count, 3), np.int32), 0
+    for quads, group, points in _placed(shape, grid, blocks, before, groups, cells, vertices):
+        for start in range(0, len(quads), _PIECE):
+            piece = slice(start, start + _PIECE)
+            split = _split(vertices, quads[piece], points[piece], group.normal[piece])
+            triangles[:, row : row + split.shape[1]] = split
+            row += split.shape[1]
+    vertices *= grid.size
+    vertices += grid.lower
+    return vertices, triangles.reshape(-1, 3)
 
 
-def _crossings(shape: AbstractSdf, grid: Grid, blocks: np.ndarray) -> _Crossings:
-    cells, codes, edges = [], [], []
-    for group, field in leaf_fields(shape, grid, blocks):
-        sign = field < 0
-        code = np.zeros((len(group), LEAF, LEAF, LEAF), np.uint8)
-        for c in range(8):
-            i, j, k = c & 1, c >> 1 & 1, c >> 2
-            part = sign[:, i : i + LEAF, j : j + LEAF, k : k + LEAF]
-            code |= part.astype(np.uint8) << np.uint8(c)
-        block, *local = np.nonzero((code > 0) & (code < 255))
-        cells.append(grid.number(group[block] + np.stack(local, axis=-1)))
-        codes.append(code[(block, *local)])
-        for axis in range(3):
-            edges.append(_edges(shape, grid, group, field, sign, axis))
-    cell, code = np.concatenate(cells), np.concatenate(codes)
-    order = np.argsort(cell)
-    return _Crossings(
-        cell[order], code[order], *(np.concatenate(part) for part in zip(*edges, strict=True))
+def _numbered(shape, grid, blocks, before, groups: list[Crossings]) -> Cells:
+    name = np.concatenate([group.cells for group in groups])
+    code = np.concatenate([group.code for group in groups])
+    second = doubtful_faces(code)
+    axis = np.repeat(np.arange(3), [len(rows) for rows in second])
+    names = np.concatenate(
+        [cells_before(before, name[rows], 1 << f) for f, rows in enumerate(second)]
+    )
+    first = np.minimum(np.searchsorted(name, names), max(len(name) - 1, 0))
+    if not np.array_equal(name[first], names):
+        _raise_leaving()
+    faces = Faces(first, np.concatenate(second), axis)
+    middle = corner(blocks, name[faces.second]) + (1 - np.eye(3)[axis]) / 2
+    sheets = cell_sheets(code, faces, values(shape, grid.points(middle)) < 0)
+    ends = np.zeros(len(name) + 1, np.int32)
+    np.cumsum(sheets.number[sheets.kind], out=ends[1:])
+    return Cells(name, code, sheets.kind, sheets.edges, ends)
+
+
+def _placed(
+    shape, grid, blocks, before, groups: list[Crossings], cells: Cells, vertices: np.ndarray
+) -> Iterator[tuple[np.ndarray, Crossings, np.ndarray]]:
+    """Quadrilaterals of each group with its crossings, once all their vertices are placed.
+
+    A group's vertices are placed when the next group, which shares cells walls with its
+    last layer, has added its planes.
+    """
+    ends = np.concatenate([[0], np.cumsum([len(group.cells) for group in groups])])
+    old = np.zeros((0, SUMS))
+    held = None
+    for g in range(len(groups) + 1):
+        low, now = ends[max(g - 1, 0)], ends[min(g, len(groups))]
+        if g < len(groups):
+            total = np.zeros((cells.first[ends[g + 1]] - cells.first[low], SUMS))
+            total[: len(old)] = old
+            group = groups[g]
+            # Given up here, so that memory falls as the result grows.
+            groups[g] = groups[g]._replace(offset=None, normal=None)  # type: ignore
+            quads = quads_around(before, group, cells, slice(low, ends[g + 1]), now)
+            rows = now + np.concatenate(group.edges)
+            points = corner(blocks, cells.name[rows]) + group.offset
+            gathered(points, group.normal, quads - cells.first[low], total)
+        if held is not None:
+            own = slice(low, now)
+            owner = np.repeat(np.arange(low, now), np.diff(cells.first[low : now + 1]))
+            first = corner(blocks, cells.name[owner])
+            alone = np.diff(cells.first)[owner] == 1
+            done = total[: len(owner)]
+            refuse_lost_walls(shape, grid, done, first, cells.code[owner])
+            vertices[cells.first[own.start] : cells.first[own.stop]] = place(done, first, alone)
+            yield held
+        if g < len(groups):
+            held = quads, group, points
+            old = total[cells.first[now] - cells.first[low] :].copy()
+            total = old
+
+
+def quads_around(before, group: Crossings, cells: Cells, window: slice, now: int) -> np.ndarray:
+    """Vertices (n, 4) around the crossed edges of `group`, seen from outside.
+
+    Args:
+        before: Of `blocks_before`.
+        group: Crossings.
+        cells: All cells; those of the group start at row `now`.
+        window: Rows of the cells that may touch the edges.
+        now: See above.
+    """
+    name = cells.name[window]
+    base = int(name[0]) if len(name) else 0
+    index = np.full(int(name[-1]) - base + 1 if len(name) else 0, -1, np.int32)
+    index[name - base] = np.arange(window.start, window.stop)
+    quads, done = np.empty((sum(map(len, group.edges)), 4), np.int32), 0
+    for axis, edges in enumerate(group.edges):
+        part = quads[done : done + len(edges)]
+        done += len(edges)
+        start = cells.name[now + edges]
+        for k, (d, e) in enumerate(_AROUND):
+            bits = d << (axis + 1) % 3 | e << (axis + 2) % 3
+            at = cells_before(before, start, bits) - base
+            cell = index[np.maximum(at, 0)]
+            if (at < 0).any() or (cell < 0).any():
+                _raise_leaving()
+            part[:, k] = cells.first[cell] + cells.edges[cells.kind[cell], 4 * axis + d + 2 * e]
+        turned = cells.code[now + edges] & 1 == 0
+        part[turned] = part[turned, ::-1]
+    return quads
+
+
+def _raise_leaving() -> None:
+    raise ValueError(
+        "isosurface: the surface leaves the blocks that the shape's Lipschitz constant "
+        "allows or its bounding box, need true bounds. Check `lipschitz` and "
+        "`bounding_box` of the shapes you wrote."
     )
 
 
-def _edges(shape, grid, group, field, sign, axis):
-    """The crossed grid edges along `axis` that begin in `group`, with planes there."""
-    step = np.eye(3, dtype=int)[axis]
-    ahead = tuple(slice(s, s + LEAF) for s in step)
-    block, *local = np.nonzero(sign[:, :LEAF, :LEAF, :LEAF] != sign[(slice(None), *ahead)])
-    beyond = tuple(at + s for at, s in zip(local, step, strict=True))
-    a, b = field[(block, *local)].astype(float), field[(block, *beyond)].astype(float)
-    nodes = group[block] + np.stack(local, axis=-1)
-    points, normals = _hermite(shape, grid, nodes, step, a, b)
-    number = grid.number(nodes)
-    return number, np.full(len(number), axis, np.int8), a < 0, points, normals
+def _split(vertices, quads, points, normals) -> np.ndarray:
+    """Quadrilaterals cut along the diagonal that lies nearer to the surface, (2, n, 3)."""
+    ends = vertices[quads]
+    height = np.einsum("nkj,nj->nk", ends - points[:, None], normals)
 
+    def cost(i, j):
+        along = ends[:, i] - ends[:, j]
+        length = np.sqrt(np.einsum("nj,nj->n", along, along))
+        return np.abs(height[:, i] + height[:, j]) / 2 + 1e-3 * length
 
-def _hermite(shape, grid, nodes, step, a, b) -> tuple[np.ndarray, np.ndarray]:
-    """Where grid edges meet the surface [cells], and the normals there."""
-    points, normals = np.empty((len(nodes), 3)), np.empty((len(nodes), 3), np.float32)
-    dtype = jnp.result_type(float)
-    ahead, size = jnp.asarray(step, dtype=dtype), jnp.asarray(grid.size, dtype=dtype)
-    for start in range(0, len(nodes), CHUNK):
-        piece = slice(start, start + CHUNK)
-        rows = grid.points(nodes[piece]), a[piece], b[piece]
-        pad = CHUNK - len(rows[0])
-        if pad:
-            rows = (np.concatenate([r, np.repeat(r[-1:], pad, axis=0)]) for r in rows)
-        found = _cross(shape, *(jnp.asarray(r, dtype=dtype) for r in rows), ahead, size)
-        t, f, slope = (np.asarray(part)[: CHUNK - pad] for part in found)
-        length = np.maximum(np.sqrt((slope * slope).sum(axis=1, keepdims=True)), 1e-12)
-        normal = slope / length
-        # What regula falsi leaves, where the field has a kink on the edge, Newton takes away.
-        move = np.minimum(np.abs(f[:, None]) / length, 0.5)
-        points[piece] = (
-            nodes[piece] + t[:, None] * step - np.copysign(move, f[:, None]) * normal
-        )
-        normals[piece] = normal
-    return points, normals
-
-
-@eqx.filter_jit
-def _cross(shape, start, a, b, step, size):
-    """Share of the way from `start` along grid edges to the zero, field [cells], slope."""
-    start_inside = a < 0
-
-    def at(t):
-        return start + (size * t)[:, None] * step[None]
-
-    def closer(_, state):  # regula falsi, Illinois variant
-        t, low, high, a, b = state
-        f = shape(at(t)) / size
-        same = (f < 0) == start_inside
-        low, high = jnp.where(same, t, low), jnp.where(same, high, t)
-        a, b = jnp.where(same, f, a / 2), jnp.where(same, b / 2, f)
-        share = low + (high - low) * a / jnp.where(a == b, 1.0, a - b)
-        return jnp.clip(share, low, high), low, high, a, b
-
-    state = (a / (a - b), jnp.zeros_like(a), jnp.ones_like(a), a, b)
-    t = jax.lax.fori_loop(0, 3, closer, state)[0]
-    f, slope = value_and_gradient(shape, at(t))
-    return t, f / size, slope
-
-
-def _quads(grid: Grid, found: _Crossings) -> tuple[np.ndarray, ...]:
-    """Vertices (n, 4) around every crossed edge, seen from outside.
-
-    Also the cell of each vertex, and whether that cell has no other one.
-    """
-    wide = grid.counts + 1
-    stride = np.array([wide[1] * wide[2], wide[2], 1])
-    sheet = cell_sheets(found.code, found.cell, stride)
-    number = sheet.max(axis=1, initial=-1).astype(np.int64) + 1
-    first = np.cumsum(number) - number
-    along_u, along_w = stride[(found.axis + 1) % 3], stride[(found.axis + 2) % 3]
-    quads = np.zeros((len(found.start), 4), np.int32)
-    for k, (d, e) in enumerate(_AROUND):
-        name = found.start - d * along_u - e * along_w
-        cell = np.minimum(np.searchsorted(found.cell, name), len(found.cell) - 1)
-        if not np.array_equal(found.cell[cell], name):
-            raise ValueError(
-                "isosurface: the surface leaves the blocks that the shape's Lipschitz constant "
-                "allows or its bounding box, need true bounds. Check `lipschitz` and "
-                "`bounding_box` of the shapes you wrote."
-            )
-        edge = 4 * found.axis + np.int8(d + 2 * e)
-        column = np.where(found.start_inside, k, 3 - k)
-        quads[np.arange(len(quads)), column] = first[cell] + sheet[cell, edge]
-    return quads, np.repeat(found.cell, number), np.repeat(number == 1, number)
-
-
-def _triangles(vertices, quads, found) -> np.ndarray:
-    """Quadrilaterals cut along the diagonal that lies nearer to the surface."""
-    triangles = np.empty((2, len(quads), 3), np.int32)
-    for start in range(0, len(quads), _PIECE):
-        piece = slice(start, start + _PIECE)
-        q, point, normal = quads[piece], found.points[piece], found.normals[piece]
-
-        def cost(i, j, q=q, point=point, normal=normal):
-            a, b = vertices[q[:, i]], vertices[q[:, j]]
-            off = np.abs((((a + b) / 2 - point) * normal).sum(axis=1))
-            return off + 1e-3 * np.sqrt(((a - b) ** 2).sum(axis=1))
-
-        first = (cost(0, 2) <= cost(1, 3))[:, None]
-        triangles[0, piece] = np.where(first, q[:, [0, 1, 2]], q[:, [0, 1, 3]])
-        triangles[1, piece] = np.where(first, q[:, [0, 2, 3]], q[:, [1, 2, 3]])
-    return triangles.reshape(-1, 3)
+    first = (cost(0, 2) <= cost(1, 3))[:, None]
+    return np.stack(
+        [
+            np.where(first, quads[:, [0, 1, 2]], quads[:, [0, 1, 3]]),
+            np.where(first, quads[:, [0, 2, 3]], quads[:, [1, 2, 3]]),
+        ]
+    )

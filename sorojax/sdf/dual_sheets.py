@@ -1,17 +1,47 @@
 """How many sheets of surface pass through a cell, and which cell edges each one cuts.
 
 Around every face the crossings are joined in pairs; the loops that arise are the sheets.
-On a face with four crossings the pairs part the inside corners, unless the two cells on
-both sides would then each join the pairs to one sheet: such a face makes an edge of four
-triangles, so there the pairs part the outside corners instead.
+On a face with four crossings the field in its middle tells whether the pairs part the inside
+corners or the outside ones. Where the two cells on both sides would each join the pairs to one
+sheet, the face would make an edge of four triangles, so there the other pairs are taken: that
+splits the sheet of either cell, hence comes to an end.
 
 Corner i + 2j + 4k of a cell; edge 4a + d + 2e runs along axis a at offsets d and e along
 the axes a + 1 and a + 2; face 2f + s lies across axis f on side s.
 """
 
 import functools
+from typing import NamedTuple
 
 import numpy as np
+
+
+class Sheets(NamedTuple):
+    """Sheets of cells.
+
+    Attributes:
+        kind: (n,) rows of the tables.
+        edges: (kinds, 12) sheet of every cell edge, -1 where it is not cut.
+        number: (kinds,) sheets.
+    """
+
+    kind: np.ndarray
+    edges: np.ndarray
+    number: np.ndarray
+
+
+class Faces(NamedTuple):
+    """Faces with four crossings.
+
+    Attributes:
+        first: (n,) rows of the cells before them.
+        second: (n,) rows of the cells after them.
+        axis: (n,) axis they lie across.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    axis: np.ndarray
 
 
 def _corner(axis: int, along: int, d: int, e: int) -> int:
@@ -69,34 +99,66 @@ def sheets(code: int, flipped: int = 0) -> tuple[tuple[int, ...], int]:
 
 
 @functools.cache
-def _tables() -> tuple[np.ndarray, np.ndarray]:
-    rows = [sheets(code) for code in range(256)]
-    number = np.array([row[0] for row in rows], dtype=np.int8)
-    return number, np.array([row[1] for row in rows], dtype=np.uint8)
+def _table() -> np.ndarray:
+    return np.array([sheets(code)[0] for code in range(256)], dtype=np.int8)
 
 
-def cell_sheets(code: np.ndarray, name: np.ndarray, stride: np.ndarray) -> np.ndarray:
-    """Sheet of every cell edge (n, 12), -1 where it is not cut.
+@functools.cache
+def _doubtful() -> np.ndarray:
+    """Bits of the first faces along the axes that have four crossings, by code."""
+    codes = np.arange(256)
+    bits = np.zeros(256, np.uint8)
+    for f in range(3):
+        a, b, c, d = (codes >> _corner(f, 0, *at) & 1 for at in ((0, 0), (0, 1), (1, 1), (1, 0)))
+        bits |= ((a == c) & (b == d) & (a != b)).astype(np.uint8) << np.uint8(f)
+    return bits
+
+
+def doubtful_faces(code: np.ndarray) -> list[np.ndarray]:
+    """By axis, the rows of cells whose first face along it has four crossings."""
+    bits = _doubtful()[code]
+    return [np.flatnonzero(bits >> np.uint8(f) & 1) for f in range(3)]
+
+
+def cell_sheets(code: np.ndarray, faces: Faces, inside: np.ndarray) -> Sheets:
+    """Sheets of cells with given bits of the inside corners.
 
     Args:
         code: (n,) bits of the inside corners.
-        name: (n,) ascending integers of the cells.
-        stride: (3,) what `name` grows by along each axis.
+        faces: All faces with four crossings.
+        inside: Whether the middle of each face lies inside.
     """
-    table, joined = _tables()
-    number = table[code]
-    doubtful = joined[code]
     flipped: dict[int, int] = {}
-    for f in range(3):
-        first = np.flatnonzero(doubtful >> (2 * f + 1) & 1)
-        second = np.minimum(np.searchsorted(name, name[first] + stride[f]), len(name) - 1)
-        both = (name[second] == name[first] + stride[f]) & (doubtful[second] >> (2 * f) & 1 > 0)
-        for a, b in zip(first[both].tolist(), second[both].tolist(), strict=True):
-            now_a = sheets(int(code[a]), flipped.get(a, 0))[1]
-            now_b = sheets(int(code[b]), flipped.get(b, 0))[1]
-            if now_a >> (2 * f + 1) & 1 and now_b >> (2 * f) & 1:
-                flipped[a] = flipped.get(a, 0) | 1 << (2 * f + 1)
-                flipped[b] = flipped.get(b, 0) | 1 << (2 * f)
+    rows = [
+        (a, b, 1 << 2 * f)
+        for a, b, f in zip(*(column.tolist() for column in faces), strict=True)
+    ]
+
+    def turn(a, b, low):
+        flipped[a] = flipped.get(a, 0) ^ low << 1
+        flipped[b] = flipped.get(b, 0) ^ low
+
+    for row, inner in zip(rows, inside.tolist(), strict=True):
+        if inner:
+            turn(*row)
+    own = {row: int(code[row]) for a, b, _ in rows for row in (a, b)}
+    changed = True
+    while changed:
+        changed = False
+        for a, b, low in rows:
+            one = sheets(own[a], flipped.get(a, 0))[1] & low << 1
+            if one and sheets(own[b], flipped.get(b, 0))[1] & low:
+                turn(a, b, low)
+                changed = True
+    return _tabulated(code, flipped)
+
+
+def _tabulated(code: np.ndarray, flipped: dict[int, int]) -> Sheets:
+    kind = code.astype(np.uint16)
+    special: dict[tuple[int, int], int] = {}
     for cell, faces in flipped.items():
-        number[cell] = sheets(int(code[cell]), faces)[0]
-    return number
+        if faces:
+            kind[cell] = special.setdefault((int(code[cell]), faces), 256 + len(special))
+    more = np.array([sheets(*key)[0] for key in special], np.int8).reshape(-1, 12)
+    edges = np.concatenate([_table(), more])
+    return Sheets(kind, edges, edges.max(axis=1) + np.int8(1))

@@ -1,0 +1,103 @@
+"""Residual and tangent with their scatter, CPU time per cell, against felupe."""
+
+import numpy as np
+
+from benchmarks import peers
+from benchmarks.blocks import BLOCKS, bent, block, cpu_timing, merged
+from benchmarks.harness import Row, missing
+from sorojax import fem
+from sorojax.fem import assemble as asm
+from sorojax.fem.linear import prepare
+from sorojax.math import sparse
+
+#: Seconds per cell that the displacement form may take; the default mixed form, 1.5 times.
+BARS = {"Tri3": 350e-9, "Quad4": 1.3e-6, "Tri6": 2.6e-6, "Tet10": 22e-6, "Hex8": 22e-6}
+NOTE = "tangent times a vector, of felupe on the same mesh"
+REPEATS = 7
+
+
+def rows():
+    for name, (element, divisions) in BLOCKS.items():
+        plain = block(element, divisions, fem.Displacement())
+        timings, answers = [], []
+        for _ in range(2):  # interleaved, so that both meet the same machine
+            timings.append(_time(plain))
+            if name in BARS:
+                answers.append(_felupe(plain))
+        error = _difference(plain, answers[0]) if answers else None
+        yield _row(plain, merged(*timings), BARS.get(name), error)
+        if name in BARS:
+            yield _peer_row(plain, answers)
+        mixed = block(element, divisions)
+        if not isinstance(mixed.formulation, fem.Displacement):
+            bar = 1.5 * BARS[name] if name in BARS else None
+            yield _row(mixed, _time(mixed), bar, None)
+
+
+def _state(problem: fem.Problem):
+    u = bent(problem.mesh.points)
+    return problem.space, prepare(problem).geometry, problem.material, problem.kinematics, u, u
+
+
+def _time(problem: fem.Problem):
+    state = _state(problem)
+    return cpu_timing(lambda: asm.assemble(*state), REPEATS)
+
+
+def _settings(problem: fem.Problem) -> dict:
+    return {
+        "element": problem.mesh.element.name,
+        "formulation": type(problem.formulation).__name__,
+        "cells": problem.space.num_cells,
+        "dof": problem.space.num_dofs,
+        "clock": "CPU time per cell",
+    }
+
+
+def _row(problem, timing, bar, error) -> Row:
+    per_cell = timing.per(problem.space.num_cells).columns()
+    return Row(
+        "sorojax", _settings(problem), **per_cell, bar=bar,
+        error=error, reference=None if error is None else NOTE,
+    )  # fmt: skip
+
+
+def _way(problem: fem.Problem) -> np.ndarray:
+    return np.random.default_rng(0).standard_normal(problem.mesh.points.shape)
+
+
+def _felupe(problem: fem.Problem):
+    """Answer and arrays of felupe, or the reason why there are none."""
+    rubber = problem.material
+    arrays = {
+        "points": np.asarray(problem.mesh.points),
+        "cells": np.asarray(problem.mesh.cells),
+        "u": np.asarray(bent(problem.mesh.points)),
+        "way": _way(problem),
+    }
+    try:
+        return peers.call(
+            "felupe", "assembly", arrays, element=problem.mesh.element.name, repeats=REPEATS,
+            mu=float(rubber.shear_modulus), bulk=float(rubber.bulk_modulus),
+        )  # fmt: skip
+    except peers.PeerMissing as reason:
+        return str(reason)
+
+
+def _difference(problem: fem.Problem, answer) -> float | None:
+    if isinstance(answer, str):
+        return None
+    found = answer[1]
+    values = asm.assemble(*_state(problem)).values
+    product = sparse.product(problem.space.system, values, _way(problem).ravel())
+    return float(np.abs(product - found["product"]).max() / np.abs(found["product"]).max())
+
+
+def _peer_row(problem: fem.Problem, answers) -> Row:
+    settings = _settings(problem)
+    if isinstance(answers[0], str):
+        return missing("felupe", answers[0], **settings)
+    runs = sorted(run for answer, _ in answers for run in answer["runs"])
+    runs = [run / problem.space.num_cells for run in runs]
+    settings |= {"version": answers[0][0]["version"]}
+    return Row("felupe", settings, 0.0, runs[len(runs) // 2], runs[0], runs[-1])

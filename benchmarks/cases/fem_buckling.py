@@ -1,0 +1,113 @@
+"""Reference case B: the holed square, its critical strain and its force past buckling.
+
+Square of 40 mm with 4 x 4 holes of 8 mm at a pitch of 10 mm, plane strain, E = 19 kPa,
+nu = 0.45, glued between plates that approach each other by 12.5 %.
+"""
+
+import numpy as np
+
+from benchmarks.harness import Row, measure_calls
+from sorojax import fem, material, mesh, sdf
+from sorojax.units import kPa, mm
+
+#: Converged answers of an independent code on another family of meshes (uniform six-node
+#: triangles, 0.25 mm, extrapolated): critical strain, force per depth [N/m] by strain.
+CRITICAL_STRAIN = 0.0859
+FORCES = {0.10: -25.80, 0.125: -26.06}
+NOTE = "converged solution of an independent code"
+SIDE, CENTRES = 40 * mm, np.array([5, 15, 25, 35]) * mm
+IMPERFECTION = 1e-3 * SIDE  # largest entry of the mode added to the nodes
+
+
+def square() -> mesh.Mesh:
+    """Triangles graded to the glued corners and to the necks, mirrored in both middle lines:
+    a mesh without symmetry has no bifurcation."""
+    half, centres = SIDE / 2, CENTRES[:2]
+    holes = [sdf.Circle((x, y), 4 * mm) for x in centres for y in centres]
+    shape = sdf.Rectangle((0, 0), (half, half)) - sdf.union(*holes)
+    lines = np.arange(3) * 10 * mm
+    necks = np.concatenate([_pairs(lines, centres), _pairs(centres, lines)])
+
+    def size(p):
+        at_corner = 0.03 * mm + 0.25 * np.linalg.norm(p, axis=1)
+        at_neck = 0.27 * mm + 0.2 * _distance(p, necks)
+        return np.minimum(np.minimum(at_corner, at_neck), 0.7 * mm)
+
+    quarter = mesh.triangulate(shape, size=size, order=2)
+    return _mirrored(_mirrored(quarter, 0), 1)
+
+
+def _mirrored(part: mesh.Mesh, axis: int) -> mesh.Mesh:
+    """A mesh and its image in the plane through the middle of the square."""
+    points, cells = np.array(part.points), np.asarray(part.cells)
+    image = points.copy()
+    image[:, axis] = SIDE - image[:, axis]
+    on_plane = np.abs(points[:, axis] - SIDE / 2) < 1e-9
+    points[on_plane, axis] = SIDE / 2
+    number = np.arange(len(points))
+    number[~on_plane] = len(points) + np.arange(np.sum(~on_plane))
+    turned = number[cells[:, [0, 2, 1, 5, 4, 3]]]
+    return mesh.Mesh(
+        np.concatenate([points, image[~on_plane]]), np.concatenate([cells, turned]), part.element
+    )
+
+
+def _pairs(x, y):
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def _distance(p, points):
+    return np.linalg.norm(p[:, None] - points[None], axis=2).min(axis=1)
+
+
+def compressed(cells: mesh.Mesh, strain: float) -> fem.Problem:
+    """The square between plates `strain` closer."""
+    bottom = mesh.nodes_where(cells, lambda p: p[1] < 1e-9)
+    top = mesh.nodes_where(cells, lambda p: p[1] > SIDE - 1e-9)
+    young, poisson = 19 * kPa, 0.45
+    rubber = material.NeoHookean(young / (2 + 2 * poisson), young / (3 - 6 * poisson))
+    supports = (fem.Fixed(bottom), fem.Prescribed(top, np.array([0.0, -strain * SIDE])))
+    return fem.problem(cells, rubber, kinematics=fem.PlaneStrain(1.0), supports=supports)
+
+
+def buckled_forces(problem: fem.Problem, shape) -> dict[float, float]:
+    """Force on the upper plate [N] past buckling, at the strains of the reference."""
+    seeded = fem.with_imperfection(problem, shape, IMPERFECTION)
+    forces = {}
+    for strain in FORCES:
+        here = compressed(seeded.mesh, strain)
+        solution = fem.solve(here, steps=5)
+        top = here.supports[1].nodes
+        forces[strain] = float(fem.reaction_force(here, solution.displacement, top)[1])
+    return forces
+
+
+def rows():
+    problem = compressed(square(), 0.125)
+    settings = {"dof": problem.space.num_dofs, "solver": problem.space.system.solver.name}
+
+    def path():
+        return fem.continuation(
+            problem, step=0.2, until=lambda u, factor: factor * 0.125 > 0.088
+        )
+
+    timing = measure_calls(lambda: path().displacements, repeats=1)
+    found = path()
+    critical = found.critical_points[0]
+    strain = 0.125 * float(critical.factor)
+    yield Row(
+        "sorojax",
+        settings | {"quantity": "critical strain", "value": strain, "kind": critical.kind,
+                    "iterations": found.stats.iterations},
+        **timing.columns(), reference=f"{NOTE}: {CRITICAL_STRAIN}",
+        error=abs(strain / CRITICAL_STRAIN - 1), bar=5e-3, bar_on="error",
+    )  # fmt: skip
+    forces = buckled_forces(problem, critical.shape)
+    for compression, wanted in FORCES.items():
+        yield Row(
+            "sorojax",
+            settings | {"quantity": "force [N/m]", "strain": compression,
+                        "value": forces[compression]},
+            reference=f"{NOTE}: {wanted}", error=abs(forces[compression] / wanted - 1),
+            bar=5e-3, bar_on="error",
+        )  # fmt: skip

@@ -1,0 +1,115 @@
+"""What `fem.problem` refuses of loads."""
+
+from typing import Any
+
+import numpy as np
+
+from sorojax import _check
+from sorojax._types import is_traced
+from sorojax.fem.checks import check_ids
+from sorojax.fem.contact_load import Contact
+from sorojax.fem.facets import open_nodes
+from sorojax.fem.kinematics import AbstractKinematics, Axisymmetric
+from sorojax.fem.loads import AbstractLoad, Force, Gravity, Pressure, Traction
+from sorojax.fem.space import Space
+from sorojax.fem.spring import Foundation
+from sorojax.material.hyperelastic import AbstractHyperelastic
+from sorojax.math import sparse
+from sorojax.mesh.mesh import Mesh
+
+
+def loads(
+    mesh: Mesh,
+    kinematics: AbstractKinematics,
+    material: AbstractHyperelastic,
+    given: tuple[AbstractLoad, ...],
+    known: np.ndarray,
+) -> None:
+    names = [load.name for load in given]
+    if len(set(names)) != len(names):
+        raise ValueError(
+            f"fem.problem: loads are called {names}, need different names. Set `name=`."
+        )
+    for load in given:
+        where = f"{type(load).__name__} '{load.name}'"
+        _check.finite("fem.problem", f"{where} value", load.value, "SI units: 20 * kPa.")
+        _check_value(where, load, mesh.element.dim)
+        if isinstance(load, Gravity) and material.density is None:
+            raise ValueError(
+                f"fem.problem: {where} needs a density, the {type(material).__name__} has "
+                "none. Give density= in kg/m^3."
+            )
+        for what in ("facets", "nodes"):
+            ids = getattr(load, what, None)
+            if ids is None:
+                continue
+            if ids.size == 0:
+                raise ValueError(
+                    f"fem.problem: {where} acts on no {what[:-1]}. Check the shape given to "
+                    "mesh.facets_on; lengths are in metres."
+                )
+            check_ids(where, ids, mesh.num_nodes)
+            if what == "facets":
+                _check_facets(where, ids, mesh)
+        load.check(where, mesh, kinematics)
+        if isinstance(load, Pressure):
+            _check_closed(where, load, mesh, kinematics, known)
+
+
+def room(space: Space, given: tuple[AbstractLoad, ...]) -> None:
+    """Refuse a space whose pattern has no place for the stiffness of a load."""
+    for load in given:
+        if (groups := load.couples()) is None:
+            continue
+        dofs = (groups[:, :, None] * space.dim + np.arange(space.dim)).reshape(len(groups), -1)
+        try:
+            sparse.slots_of(space.system, dofs)
+        except ValueError as reason:
+            raise ValueError(
+                f"fem.problem: `space` has no room for {type(load).__name__} '{load.name}', "
+                "which couples nodes of different cells. Build it with fem.space(mesh, loads)."
+            ) from reason
+
+
+def _check_value(where: str, load: AbstractLoad, dim: int) -> None:
+    """A vector where the load has a direction, else a number; a bed of springs has both."""
+    want = ((dim,),) if isinstance(load, Force | Traction | Gravity | Contact) else ((),)
+    if isinstance(load, Foundation):
+        want = ((), (dim,))
+    if load.value.shape not in want:
+        raise ValueError(
+            f"fem.problem: {where} has a value of shape {load.value.shape}, need "
+            f"{' or '.join(map(str, want))}" + (": one entry per axis." if want[-1] else ".")
+        )
+
+
+def _check_facets(where: str, facets: Any, mesh: Mesh) -> None:
+    facets = np.asarray(facets)
+    need = len(mesh.element.facets[0])
+    if facets.ndim != 2 or facets.shape[1] != need:
+        raise ValueError(
+            f"fem.problem: {where} has facets of shape {facets.shape}, a facet of "
+            f"{mesh.element.name} has {need} nodes. Take them from this mesh: "
+            "mesh.facets_on(mesh, shape) or mesh.facet_sets."
+        )
+
+
+def _check_closed(where: str, load: Pressure, mesh: Mesh, kinematics, known) -> None:
+    """An open end must be held, or slide in a plane through the origin of the load."""
+    ends = open_nodes(mesh.element, np.asarray(load.facets))
+    held = known.reshape(-1, mesh.element.dim)[ends]
+    safe = held.all(axis=1)
+    if not is_traced((mesh.points, load)):
+        origin = np.zeros(mesh.element.dim) if load.origin is None else np.asarray(load.origin)
+        points = np.asarray(mesh.points)
+        off = np.abs(points[ends] - origin) <= 1e-9 * np.ptp(points, axis=0).max()
+        on_plane = held & off
+        if isinstance(kinematics, Axisymmetric):
+            on_plane[:, 1] = held[:, 1]
+        safe |= on_plane.any(axis=1)
+    if not safe.all():
+        raise ValueError(
+            f"fem.problem: {where} acts on facets with an open end at nodes "
+            f"{ends[~safe][:4].tolist()}, so it has no potential. Close the cavity, fix the "
+            "nodes at its ends, or let them slide in planes of symmetry through `origin`."
+        )

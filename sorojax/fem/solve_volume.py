@@ -1,0 +1,237 @@
+"""Equilibrium with closed cavities, differentiable by the implicit function theorem."""
+
+import contextlib
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax._progress import report
+from sorojax._types import is_traced, real
+from sorojax.fem.cavity import (
+    AbstractContents,
+    CavityStart,
+    Liquid,
+    Names,
+    contents_gap,
+    follow_contents,
+    pressure_force_rate,
+    volumes,
+    with_pressures,
+)
+from sorojax.fem.energy_form import residual
+from sorojax.fem.follow import Log, Stats, unloaded
+from sorojax.fem.linear import linearise, prepare
+from sorojax.fem.newton import Newton
+from sorojax.fem.problem import Problem
+from sorojax.fem.solve import ConvergenceError
+from sorojax.fem.supports import known_values
+from sorojax.math import sparse
+from sorojax.math.status import Status
+
+
+class CavitySolution(eqx.Module):
+    """Equilibrium with the contents of cavities: `problem` has the pressures found, gauge
+    [Pa]; `volumes` [m^3] are those of the cavities `names`."""
+
+    problem: Problem
+    displacement: Float[Array, "nodes dim"]
+    pressures: Float[Array, " cavities"]
+    volumes: Float[Array, " cavities"]
+    names: Names = eqx.field(static=True)
+    status: Status
+    stats: Stats = eqx.field(static=True)
+
+
+class VolumePath(eqx.Module):
+    """Equilibria for a row of volumes [m^3] of one cavity, and its pressures [Pa]."""
+
+    problem: Problem
+    displacements: Float[Array, "steps nodes dim"]
+    volumes: Float[Array, " steps"]
+    pressures: Float[Array, " steps"]
+    name: str = eqx.field(static=True)
+    status: Status
+    stats: tuple[Stats, ...] = eqx.field(static=True)
+
+    def __len__(self) -> int:
+        return self.volumes.shape[0]
+
+
+def solve_volume(
+    problem: Problem,
+    *,
+    start: CavitySolution | None = None,
+    newton: Newton | None = None,
+    steps: int = 1,
+    max_cuts: int = 10,
+    throw: bool = True,
+    **contents: AbstractContents | float,
+) -> CavitySolution:
+    """Static equilibrium of a body whose cavities hold given contents.
+
+    `solve_volume(problem, air=20e-6)` gives the cavity of the `Pressure` called "air" a
+    volume, `air=Gas(15e-6)` seals it with air at rest; its pressure is found. States past
+    the largest pressure are reached like any other. The values that these loads have in
+    `problem` do not matter; other loads and supports act as they are.
+
+    Args:
+        problem: Differentiable in each of its numbers, as are the contents.
+        start: A solution of the same mesh to start from, instead of rest.
+        newton: Tolerances; `Newton()` when omitted.
+        steps: Number of equal steps of the volume to try first.
+        max_cuts: How often a step may be halved in a row.
+        throw: Raise when no equilibrium is found, otherwise report it in `status`.
+        **contents: By name of a load: a volume [m^3], `Liquid` or `Gas`.
+
+    Raises:
+        ConvergenceError: If `throw` and a step failed after all cuts.
+        ValueError: If a name is no pressure of the problem, or under `jit` or `vmap`.
+    """
+    names, filled = _checked(problem, contents)
+    log = Log(Newton() if newton is None else newton, steps, max_cuts)
+    begin = _begin(problem, names, start)
+    u, pressures = _equilibrium(problem, names, filled, begin, log)
+    found = with_pressures(problem, names, pressures)
+    solution = CavitySolution(
+        found, u, pressures, volumes(found, names, u), names, log.status, log.stats()
+    )
+    if throw and log.reason:
+        done = log.steps[-1].fraction if log.steps else 0.0
+        raise ConvergenceError(
+            f"fem.solve_volume: no equilibrium beyond {100 * done:.0f} % of the change of "
+            f"volume after {log.cuts} cuts ({log.reason}). Give less volume, refine the mesh, "
+            "or pass throw=False for the last converged state.",
+            solution,  # type: ignore[arg-type]
+        )
+    return solution
+
+
+def volume_path(
+    problem: Problem,
+    *,
+    newton: Newton | None = None,
+    max_cuts: int = 10,
+    **row: Float[Array, " steps"],
+) -> VolumePath:
+    """Equilibria for a row of volumes [m^3] of one cavity: the curve of a balloon, over its
+    largest pressure. The path stops where a volume has no equilibrium; see `status`.
+
+    Raises:
+        ValueError: If not exactly one pressure of the problem is named.
+    """
+    if len(row) != 1:
+        raise ValueError(
+            f"fem.volume_path: got volumes for {sorted(row)}, need those of one pressure. Name "
+            "it, as in air=jnp.linspace(1e-5, 2e-5, 11)."
+        )
+    ((name, wanted),) = row.items()
+    wanted, found = real(wanted), []
+    _check.shape("fem.volume_path", name, wanted, (None,), "Give one volume per state.")
+    for k, volume in enumerate(wanted):
+        begin = found[-1] if found else None
+        solution = solve_volume(
+            problem, start=begin, newton=newton, max_cuts=max_cuts, throw=False,
+            **{name: Liquid(volume)},
+        )  # fmt: skip
+        status, stats = solution.status, solution.stats
+        if stats.reason:
+            break
+        found.append(solution)
+        report("volume", k + 1, len(wanted), iterations=stats.iterations)
+    shape = problem.mesh.points.shape
+    states = jnp.stack([s.displacement for s in found]) if found else jnp.zeros((0, *shape))
+    pressures = jnp.concatenate([s.pressures for s in found]) if found else jnp.zeros(0)
+    return VolumePath(
+        problem, states, wanted[: len(found)], pressures, name, status,
+        tuple(s.stats for s in found) + ((stats,) if stats.reason else ()),
+    )  # fmt: skip
+
+
+def _checked(problem: Problem, contents: dict) -> tuple[Names, tuple[AbstractContents, ...]]:
+    loads = {load.name: load for load in problem.loads}
+    scalar = [name for name, load in loads.items() if jnp.ndim(load.value) == 0]
+    if not contents or not set(contents) <= set(scalar):
+        raise ValueError(
+            f"fem.solve_volume: got contents for {sorted(contents)}, need some of the pressures "
+            f"{scalar}. Name a `Pressure` with `name=`."
+        )
+    filled = tuple(
+        c if isinstance(c, AbstractContents) else Liquid(c) for c in contents.values()
+    )
+    return tuple(contents), filled
+
+
+def _begin(problem: Problem, names: Names, start: CavitySolution | None) -> CavityStart:
+    if start is not None:
+        order = [load.name for load in start.problem.loads]
+        values = [start.problem.loads[order.index(name)].value for name in names]
+        return CavityStart(start.problem, start.displacement, jnp.stack(values))
+    zero = jnp.zeros_like(problem.mesh.points)
+    return CavityStart(unloaded(problem), zero, jnp.zeros(len(names), zero.dtype))
+
+
+def _equilibrium(problem, names: Names, contents, begin: CavityStart, log: Log):
+    """Displacement and pressures with the derivative of the implicit function."""
+    params, rest = eqx.partition((problem, contents), eqx.is_inexact_array)
+    held, pattern = eqx.partition(begin, eqx.is_array)
+    held = jax.lax.stop_gradient(held)
+
+    @jax.custom_jvp
+    def equilibrium(params):
+        if is_traced((params, held)):
+            raise ValueError(
+                "fem.solve_volume: called under jit or vmap, need concrete numbers. Call it "
+                "outside: its kernels are compiled already, and grad works without jit."
+            )
+        problem, contents = eqx.combine(params, rest)
+        with jax.core.eval_context():
+            start = eqx.combine(held, pattern)
+            found = follow_contents(problem, names, contents, start, log)
+            return jnp.asarray(found[0]), jnp.asarray(found[1])
+
+    @equilibrium.defjvp
+    def derivative(primals, tangents):
+        state = equilibrium(*primals)
+        return state, _tangent(rest, names, state, primals[0], tangents[0])
+
+    return equilibrium(params)
+
+
+def _tangent(rest, names: Names, state, params, params_dot):
+    """(du, dp) of R(u, p, params) = 0 and of the balance of volumes."""
+    u, pressures = state
+    problem = with_pressures(eqx.combine(params, rest)[0], names, pressures)
+
+    def known(params):
+        return known_values(eqx.combine(params, rest)[0].supports, *u.shape)
+
+    def unbalanced(params, u, pressures):
+        problem, contents = eqx.combine(params, rest)
+        here = with_pressures(problem, names, pressures)
+        gap = contents_gap(here, names, contents, u, pressures)
+        return residual(here, u).ravel(), gap
+
+    _, move = jax.jvp(known, (params,), (params_dot,))
+    still = jnp.zeros_like(pressures)
+    _, (force, gap) = jax.jvp(
+        unbalanced, (params, u, pressures), (params_dot, move.reshape(u.shape), still)
+    )
+    contents_rate = jax.jacfwd(lambda p: unbalanced(params, u, p)[1])(pressures)
+    slope = pressure_force_rate(problem, names, u)
+    concrete = not is_traced((params, u))
+    with jax.core.eval_context() if concrete else contextlib.nullcontext():
+        prepared = prepare(problem)
+        values = linearise(problem, prepared, u, u).values
+        matrix = sparse.fix(problem.space.system, values, prepared.known)
+    system, fixed = problem.space.system, prepared.known
+    # Apart, because only the first is linear in the direction.
+    direct = sparse.solve(system, matrix, jnp.where(fixed, jnp.zeros_like(force), -force))
+    rows = jnp.where(fixed[None], jnp.zeros_like(slope), slope)
+    rates = jax.vmap(lambda b: sparse.solve(system, matrix, b))(rows)
+    change = jnp.linalg.solve(contents_rate - slope @ rates.T, -(gap - slope @ direct))
+    return (direct + change @ rates + move).reshape(u.shape), change

@@ -1,0 +1,133 @@
+"""Contact: the law, the broad phase, a block on a plane and a cylinder on a flat."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sorojax import contact, fem, material, mesh, sdf
+from sorojax.units import mm
+
+LAW = contact.Penalty(2e7, 1e-5)
+FLOOR = sdf.HalfPlane([0.0, 0.0], [0.0, 1.0])
+
+
+def test_the_law_is_twice_differentiable_and_its_inverse_agrees():
+    gap = jnp.linspace(-3e-5, 1e-5, 401)
+    pressure = -jax.vmap(jax.grad(LAW.energy))(gap)
+    assert jnp.allclose(pressure, LAW.pressure(gap), rtol=1e-12, atol=1e-12)
+    curvature = jax.vmap(jax.grad(jax.grad(LAW.energy)))(gap)
+    assert jnp.max(jnp.abs(jnp.diff(curvature))) < 1.01 * 2e7 * 1e-7 / 1e-5
+    assert jnp.all(pressure[gap > 0] == 0) and curvature[0] == 2e7
+    levels = jnp.array([1.0, 90.0, 110.0, 1e3])
+    assert jnp.allclose(LAW.pressure(-LAW.penetration(levels)), levels, rtol=1e-12)
+
+
+def test_forces_are_slopes_of_the_energy_and_balance():
+    ball = sdf.Sphere([0.0, 0.0, 0.0], 0.01)
+    points = jnp.array([[0.0099, 0, 0], [0.0, 0.007, 0.007], [0.0, 0.0, 0.02]])
+    areas, shift = jnp.array([1e-6, 2e-6, 3e-6]), jnp.array([0.0, 1e-5, 0.0])
+
+    def energy(points, shift):
+        return jnp.sum(areas * LAW.energy(contact.gaps(ball, points, shift)))
+
+    found = contact.contacts(LAW, ball, points, areas, shift)
+    slope, on_ball = jax.grad(energy, argnums=(0, 1))(points, shift)
+    assert jnp.allclose(found.force, -slope, rtol=1e-12, atol=1e-18)
+    assert jnp.allclose(found.total, on_ball, rtol=1e-12, atol=1e-18)
+    assert found.active.tolist() == [True, True, False]
+
+
+def test_what_is_far_is_never_inside(getkey):
+    ball = sdf.Sphere([0.0, 0.0, 0.0], 0.01)
+    clouds = 0.03 * jax.random.normal(getkey(), (200, 1, 3)) + 0.004 * jax.random.normal(
+        getkey(), (200, 5, 3)
+    )
+    skipped = jax.vmap(lambda cloud: contact.far(ball, cloud))(clouds)
+    assert 0 < jnp.sum(skipped) < 200
+    assert jnp.all(jnp.min(ball(clouds), axis=1)[skipped] > 0)
+
+
+def _block(stiffness=None):
+    """A block that is pressed on a plane by its own weight and a load on top."""
+    block = mesh.rectangle([0, 0], [20 * mm, 10 * mm], divisions=(4, 2), element=mesh.Quad4())
+    return fem.problem(
+        block,
+        material.neo_hookean(young_modulus=1e5, poisson_ratio=0.0, density=1000.0),
+        kinematics=fem.PlaneStrain(0.03),
+        supports=(fem.Fixed(block.node_sets["left"], components=(0,)),),
+        loads=(
+            fem.Traction(block.facet_sets["top"], jnp.array([0.0, -2e3]), name="weight"),
+            fem.Contact(block.facet_sets["bottom"], FLOOR, stiffness, name="floor"),
+            fem.Foundation(block.node_sets["top"], jnp.array([0.0, 1e-6]), name="soft"),
+        ),
+        formulation=fem.Displacement(),
+    )
+
+
+def test_a_block_on_a_plane_sinks_in_as_the_stiffness_says():
+    problem = _block()
+    solution = fem.solve(problem)
+    floor, pressed = problem.loads[1], 2e3 * 20 * mm * 0.03
+    state = fem.contact_state(problem, solution.displacement, "floor")
+    held = 1e-6 * jnp.sum(solution.displacement[problem.loads[2].nodes, 1])
+    assert jnp.allclose(state.total[1] - held, pressed, rtol=1e-8)
+    assert jnp.abs(state.total[0]) < 1e-8 * pressed
+    assert jnp.allclose(floor.stiffness, 10 * 1e5 / (5 * mm), rtol=1e-6)
+    assert jnp.allclose(-state.gap, floor.law.penetration(jnp.array(2e3)), rtol=1e-7)
+    assert bool(jnp.all(state.active))
+
+
+def test_contact_carries_gradients_of_obstacle_and_stiffness():
+    base = _block(2e7)
+    places = {
+        "obstacle": lambda p: p.loads[1].obstacle.point,
+        "stiffness": lambda p: p.loads[1].stiffness,
+    }
+    tight = fem.Newton(residual_tolerance=1e-12)
+    for where in places.values():
+        start = where(base)
+        way = jnp.array([0.0, 1e-4]) if start.ndim else 0.1 * start
+
+        def height(amount, where=where, start=start, way=way):
+            problem = eqx.tree_at(where, base, start + amount * way)
+            return jnp.sum(fem.solve(problem, newton=tight).displacement[:, 1])
+
+        slope = jax.jvp(height, (jnp.array(0.0),), (jnp.array(1.0),))[1]
+        ahead, behind = height(jnp.array(1e-3)), height(jnp.array(-1e-3))
+        assert jnp.allclose(slope, (ahead - behind) / 2e-3, rtol=1e-5)
+
+
+def test_a_far_obstacle_adds_nothing_and_an_approaching_one_pushes():
+    problem = _block()
+    far = eqx.tree_at(lambda p: p.loads[1].value, problem, jnp.array([0.0, -1.0]))
+    u = jnp.zeros_like(problem.mesh.points)
+    assert far.loads[1].potential(far, u) == 0.0
+    near = eqx.tree_at(lambda p: p.loads[1].value, problem, jnp.array([0.0, 1 * mm]))
+    assert near.loads[1].potential(near, u) > 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"stiffness": -1.0}, "stiffness.*must be positive"),
+        ({"smoothing": 0.0}, "smoothing.*must be positive"),
+        ({"value": np.zeros(3)}, "need \\(2,\\)"),
+        ({"facets": np.zeros((0, 2), int)}, "acts on no facet"),
+        ({"facets": np.array([[0, 99]])}, "names nodes"),
+        ({"facets": np.array([[0, 1, 2]])}, "has 2 nodes"),
+        ({"obstacle": sdf.Sphere([0.0, 0.0, 0.0], 1.0)}, "3 dimensions"),
+    ],
+)
+def test_bad_contacts_are_refused(change, message):
+    block = mesh.rectangle([0, 0], [1.0, 1.0], divisions=(2, 2), element=mesh.Quad4())
+    arguments = {"facets": block.facet_sets["bottom"], "obstacle": FLOOR} | change
+    with pytest.raises(ValueError, match=message):
+        fem.problem(
+            block,
+            material.neo_hookean(young_modulus=1e5, poisson_ratio=0.3),
+            kinematics=fem.PlaneStrain(),
+            supports=(fem.Fixed(block.node_sets["top"]),),
+            loads=(fem.Contact(**arguments),),
+        )
