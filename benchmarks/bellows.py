@@ -23,12 +23,14 @@ PRESSURES = np.array(sorted(REFERENCE)) * kPa
 RUBBER = material.NeoHookean(400 * kPa, 20 * MPa, density=1080.0)
 
 
-def case_a(size: float) -> fem.Problem:
-    """The problem with cells of about `size` [m], one metre deep."""
+def case_a(size: float, linear_pressure: bool = False) -> fem.Problem:
+    """The problem with cells of about `size` [m], one metre deep: Tri6, or Tri7 with
+    `linear_pressure`."""
     actuator = BellowsActuator()
     cells = mesh.triangulate(
         actuator.body(), size=size, order=2, interfaces=(actuator.layer(),)
     )
+    cells = mesh.enrich(cells) if linear_pressure else cells
     return bellows_problem(actuator, cells, RUBBER, 1.0)
 
 

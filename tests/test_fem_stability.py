@@ -17,7 +17,7 @@ BULK = 1e5  # over the shear modulus: the closed form is incompressible
 def _sphere(thickness: float) -> fem.Problem:
     """A spherical shell of inner radius 1, half of a section through its axis."""
     grid = mesh.rectangle(
-        [1.0, 0.0], [1 + thickness, np.pi / 2], divisions=(1, 4), element=mesh.Quad9()
+        [1.0, 0.0], [1 + thickness, np.pi / 2], divisions=(1, 3), element=mesh.Quad9()
     )
     r, angle = np.asarray(grid.points).T
     points = np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1)
@@ -127,14 +127,14 @@ def test_plain_load_steps_end_below_the_limit_point(balloon):
     assert here < stretch and np.isclose(_sphere_pressure(here, 0.2), reached, rtol=1e-3)
 
 
-def test_sealed_gas_obeys_its_law_and_stops_the_collapse(balloon):
+def test_sealed_gas_obeys_its_law_past_the_limit_point(balloon):
     problem, _ = balloon
     rest = float(fem.enclosed_volume(problem, jnp.zeros_like(problem.mesh.points),
                                      problem.loads[0].facets))  # fmt: skip
-    gas = fem.Gas(rest, pressure=0.5, exponent=1.4, ambient=0.1)
+    gas = fem.Gas(rest, pressure=1.6, exponent=1.2, ambient=0.1)
     solution = fem.solve_volume(problem, air=gas)
     (pressure,), (volume,) = solution.pressures, solution.volumes
-    assert jnp.isclose((pressure + 0.1) * volume**1.4, 0.6 * rest**1.4, rtol=1e-8)
+    assert jnp.isclose((pressure + 0.1) * volume**1.2, 1.7 * rest**1.2, rtol=1e-8)
     stretch = _stretches(problem, [solution.displacement])[0]
     assert np.isclose(pressure, _sphere_pressure(stretch, 0.2), rtol=5e-4)
     assert stretch > _limit(0.2)[0]  # where given pressure has no stable state
@@ -289,6 +289,6 @@ def test_bad_calls_name_the_remedy(balloon, column):
 def test_a_volume_out_of_reach_keeps_the_last_converged_state(balloon):
     problem, _ = balloon
     with pytest.raises(fem.ConvergenceError, match="change of volume") as error:
-        fem.solve_volume(problem, max_cuts=2, air=1e-6)
+        fem.solve_volume(problem, newton=fem.Newton(max_iterations=3), max_cuts=1, air=100.0)
     solution = error.value.solution
     assert solution.stats.reason and jnp.all(jnp.isfinite(solution.displacement))

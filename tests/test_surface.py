@@ -125,32 +125,51 @@ def test_sheets_of_every_sign_pattern_are_loops():
 
 def test_random_signs_give_a_manifold_surface(getkey):
     """The hardest case: a field that changes sign at random from node to node."""
-    from sorojax.sdf import blocks
-    from sorojax.sdf.dual_contouring import _Crossings, _quads
+    from sorojax.sdf import blocks, dual_contouring as dc
+    from sorojax.sdf.dual_crossings import blocks_before, cells_before, corner
+    from sorojax.sdf.dual_sheets import Faces, cell_sheets, doubtful_faces
 
-    signs = np.ones((18, 18, 18), bool)
-    signs[1:17, 1:17, 1:17] = np.asarray(jax.random.bernoulli(getkey(), 0.5, (16, 16, 16)))
-    inside = ~signs
-    grid = blocks.Grid(np.zeros(3), 1.0, np.array([17, 17, 17]))
-    nodes = np.stack(np.meshgrid(*[np.arange(17)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    corner = [nodes + [c & 1, c >> 1 & 1, c >> 2] for c in range(8)]
-    code = sum(inside[tuple(n.T)].astype(np.uint8) << c for c, n in enumerate(corner))
-    mixed = (code > 0) & (code < 255)
-    start, axis, begins = [], [], []
-    for a in range(3):
-        step = np.eye(3, dtype=int)[a]
-        crossed = inside[tuple(nodes.T)] != inside[tuple((nodes + step).T)]
-        start.append(grid.number(nodes[crossed]))
-        axis.append(np.full(crossed.sum(), a, np.int8))
-        begins.append(inside[tuple(nodes[crossed].T)])
-    found = _Crossings(
-        grid.number(nodes[mixed]), code[mixed].astype(np.uint8), np.concatenate(start),
-        np.concatenate(axis), np.concatenate(begins), np.zeros(0), np.zeros(0),
-    )  # fmt: skip
-    quads, owner, _ = _quads(grid, found)
+    inside = np.zeros((17, 17, 17), bool)
+    inside[1:16, 1:16, 1:16] = np.asarray(jax.random.bernoulli(getkey(), 0.5, (15, 15, 15)))
+    grid = blocks.Grid(np.zeros(3), 1.0, np.array([16, 16, 16]))
+    starts = 8 * np.array(list(np.ndindex(2, 2, 2)))
+    before = blocks_before(grid, starts)
+    every = corner(starts, np.arange(8 * 512))
+    corners = [every + [c & 1, c >> 1 & 1, c >> 2] for c in range(8)]
+    code = sum(inside[tuple(n.T)].astype(np.uint8) << c for c, n in enumerate(corners))
+    name = np.flatnonzero((code > 0) & (code < 255))
+    code = code[name]
+    second = doubtful_faces(code)
+    names = [cells_before(before, name[rows], 1 << f) for f, rows in enumerate(second)]
+    axis = np.repeat(np.arange(3), [len(rows) for rows in second])
+    first = np.searchsorted(name, np.concatenate(names))
+    middle = np.asarray(jax.random.bernoulli(getkey(), 0.5, axis.shape))
+    found = cell_sheets(code, Faces(first, np.concatenate(second), axis), middle)
+    ends = np.concatenate([[0], np.cumsum(found.number[found.kind])]).astype(np.int32)
+    cells = dc.Cells(name, code, found.kind, found.edges, ends)
+    edges = [np.flatnonzero((code ^ code >> (1 << a)) & 1) for a in range(3)]
+    quads = dc.quads_around(before, edges, cells, slice(0, len(name)), 0)
+    quads = dc.outward(quads, code[np.concatenate(edges)])
     triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    report = sdf.surface_report(sdf.Surface(grid.points(grid.node(owner)), triangles))
+    points = np.repeat(corner(starts, name), np.diff(ends), axis=0)
+    report = sdf.surface_report(sdf.Surface(points, triangles))
     assert report.manifold
+
+
+BLOCK = sdf.Box([-0.7, -0.6, -0.5], [0.7, 0.6, 0.5])
+
+
+@pytest.mark.parametrize(
+    "body", [sdf.Sphere([0.01, 0.02, 0.03], 0.8), sdf.turn(BLOCK, [1, 2, 3], 0.5)]
+)
+def test_walls_as_thick_as_a_cell_have_no_holes(body):
+    """Walls of one cell stay closed; thinner ones are refused with the size they need."""
+    hollow = sdf.shell(body, 0.1)
+    for cells in (1.0, 1.2):
+        report = sdf.surface_report(sdf.isosurface(hollow, 0.1 / cells, METHODS[1]))
+        assert report.manifold and report.num_shells == 2 and report.genus == 0
+    with pytest.raises(ValueError, match="wall about .* m thick .* Use `size` <="):
+        sdf.isosurface(hollow, 0.1 / 0.8, METHODS[1])
 
 
 def test_report_names_what_is_wrong():

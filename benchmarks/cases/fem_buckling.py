@@ -20,18 +20,20 @@ IMPERFECTION = 1e-3 * SIDE  # largest entry of the mode added to the nodes
 
 
 def square() -> mesh.Mesh:
-    """Triangles graded to the glued corners and to the necks, mirrored in both middle lines:
+    """Triangles graded to the holes and to the glued corners, mirrored in both middle lines:
     a mesh without symmetry has no bifurcation."""
     half, centres = SIDE / 2, CENTRES[:2]
     holes = [sdf.Circle((x, y), 4 * mm) for x in centres for y in centres]
     shape = sdf.Rectangle((0, 0), (half, half)) - sdf.union(*holes)
-    lines = np.arange(3) * 10 * mm
-    necks = np.concatenate([_pairs(lines, centres), _pairs(centres, lines)])
+    sides = _pairs(np.arange(3) * 10 * mm, centres)  # the columns bend at these necks
+    middles = _pairs(centres, centres)
 
     def size(p):
-        at_corner = 0.03 * mm + 0.25 * np.linalg.norm(p, axis=1)
-        at_neck = 0.27 * mm + 0.2 * _distance(p, necks)
-        return np.minimum(np.minimum(at_corner, at_neck), 0.7 * mm)
+        off_hole = np.maximum(_distance(p, middles) - 4 * mm, 0)
+        off_neck = np.maximum(_distance(p, sides) - 2.5 * mm, 0)
+        at_neck = 0.26 * mm + 0.35 * off_hole + 0.12 * off_neck
+        at_corner = 0.2 * mm + 0.3 * np.linalg.norm(p, axis=1)
+        return np.minimum(np.minimum(at_neck, at_corner), 0.85 * mm)
 
     quarter = mesh.triangulate(shape, size=size, order=2)
     return _mirrored(_mirrored(quarter, 0), 1)

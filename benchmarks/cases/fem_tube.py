@@ -22,7 +22,7 @@ SERIES = (
     ("tube", mesh.Tri7(), None, ((6, 6), (12, 12), (24, 24)), None),
     ("tube", mesh.Tri6(), fem.Displacement(), ((6, 6), (12, 12), (24, 24)), None),
     ("straight tube", mesh.Quad9(), None, ((8, 1), (16, 1), (32, 1)), 1e-6),
-    ("sphere", mesh.Quad9(), None, ((6, 6), (12, 12), (24, 24)), 1e-6),
+    ("sphere", mesh.Quad9(), None, ((8, 8), (16, 16), (32, 32)), 1e-6),
     ("sphere", mesh.Tri7(), None, ((6, 6), (12, 12), (24, 24)), None),
 )
 

@@ -100,6 +100,7 @@ def volumes(
     return -jax.grad(potential)(jnp.zeros(len(names), u.dtype))
 
 
+@eqx.filter_jit
 def contents_gap(
     problem: Problem, names: Names, contents: tuple[AbstractContents, ...], u, pressures
 ) -> Float[Array, " cavities"]:
@@ -174,6 +175,7 @@ def follow_contents(
     return u, pressures
 
 
+@eqx.filter_jit
 def pressure_force_rate(
     problem: Problem, names: Names, u: Float[Array, "nodes dim"]
 ) -> Float[Array, "cavities dofs"]:

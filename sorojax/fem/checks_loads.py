@@ -13,9 +13,30 @@ from sorojax.fem.kinematics import AbstractKinematics, Axisymmetric
 from sorojax.fem.loads import AbstractLoad, Force, Gravity, Pressure, Traction
 from sorojax.fem.space import Space
 from sorojax.fem.spring import Foundation
+from sorojax.fem.tendon import Cable, Tendon
 from sorojax.material.hyperelastic import AbstractHyperelastic
 from sorojax.math import sparse
 from sorojax.mesh.mesh import Mesh
+
+
+def sets(mesh: Mesh, given: tuple[AbstractLoad, ...]) -> None:
+    """Refuse loads on nodes or facets that are not there."""
+    for load in given:
+        where = f"{type(load).__name__} '{load.name}'"
+        for what in ("facets", "nodes"):
+            ids = getattr(load, what, None)
+            if ids is None:
+                continue
+            if ids.size == 0:
+                raise ValueError(
+                    f"fem.problem: {where} acts on no {what[:-1]}. Check the shape given to "
+                    "mesh.facets_on; lengths are in metres."
+                )
+            check_ids(where, ids, mesh.num_nodes)
+            if what == "facets":
+                _check_facets(where, ids, mesh)
+        if isinstance(load, Tendon | Cable):
+            check_ids(where, load.route.nodes, mesh.num_nodes)
 
 
 def loads(
@@ -39,18 +60,6 @@ def loads(
                 f"fem.problem: {where} needs a density, the {type(material).__name__} has "
                 "none. Give density= in kg/m^3."
             )
-        for what in ("facets", "nodes"):
-            ids = getattr(load, what, None)
-            if ids is None:
-                continue
-            if ids.size == 0:
-                raise ValueError(
-                    f"fem.problem: {where} acts on no {what[:-1]}. Check the shape given to "
-                    "mesh.facets_on; lengths are in metres."
-                )
-            check_ids(where, ids, mesh.num_nodes)
-            if what == "facets":
-                _check_facets(where, ids, mesh)
         load.check(where, mesh, kinematics)
         if isinstance(load, Pressure):
             _check_closed(where, load, mesh, kinematics, known)

@@ -72,22 +72,28 @@ def _point(
     whole = float(np.sum(first.direction * (last.u - first.u)))
     at, values = [0.0, whole], [test(first), test(last)]
     goal = 1e-4 * max(abs(values[0]), abs(values[1]))
-    state, side = last, 0
+    # The update need not be small: along the mode rounding is amplified without bound.
+    newton = Newton(newton.residual_tolerance, 1e-3, newton.max_iterations)
+    state, best, side = None, np.inf, 0
     for _ in range(_MAX_TRIALS):
         s = (at[0] * values[1] - at[1] * values[0]) / (values[1] - values[0])
         # close to either end the step would be rounding
         s = float(np.clip(s, 1e-3 * whole, (1 - 1e-3) * whole))
         trial = _state_at(loading, prepared, first, s, newton)
         if trial is None:
-            return None
-        state, value = trial, test(trial)
-        if abs(value) <= goal:
+            break
+        value = test(trial)
+        if abs(value) < best:
+            state, best = trial, abs(value)
+        if best <= goal:
             break
         k = 0 if value * values[0] > 0 else 1
         at[k], values[k] = s, value
         if side == k + 1:
             values[1 - k] /= 2
         side = k + 1
+    if state is None:
+        return None
     here = loading.at(state.factor)
     number = max(1, 1 + min(ends[0].negative_eigenvalues, ends[1].negative_eigenvalues))
     modes = tangent_modes(here, jnp.asarray(state.u), number)

@@ -16,6 +16,7 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
@@ -82,13 +83,21 @@ class Solve:
     def problem(self, leaves) -> Problem:
         return self.inputs(leaves)[0]
 
-    def moving(self, leaves, dots) -> Problem:
-        """The tangents of the problem's numbers, `None` elsewhere."""
+    def moving(self, leaves, dots) -> tuple[Problem, Problem, Problem]:
+        """The problem in two: the numbers that move and all else, and how they move.
+
+        What stays is left out of the derivative, so that it costs nothing.
+        """
         count = self.num_problem_leaves
-        pairs = zip(leaves[:count], dots[:count], strict=True)
-        real = [dot if eqx.is_inexact_array(leaf) else None for leaf, dot in pairs]
-        problem = self.problem(real + [None] * (len(leaves) - count))
-        return eqx.filter(problem, eqx.is_inexact_array)
+        moves = [not isinstance(dot, SymbolicZero) for dot in dots[:count]]
+        none = [None] * (len(leaves) - count)
+
+        def pick(values, wanted):
+            kept = [x if m == wanted else None for x, m in zip(values, moves, strict=False)]
+            return jax.tree.unflatten(self._tree, kept + none)[0]
+
+        rest = eqx.combine(pick(leaves, False), self._static[0])
+        return pick(leaves, True), rest, pick(dots, True)
 
     def with_tangent(self) -> "Solve":
         """The same call, that also returns the tangent; the record is shared."""
@@ -113,21 +122,23 @@ def _equilibrium(call: Solve, leaves):
     return tuple(_equilibrium_p.bind(*leaves, call=call, lead=(), batched=batched))
 
 
-@_equilibrium.defjvp
 def _derivative(call: Solve, primals, tangents):
     (leaves,), (dots,) = primals, tangents
     u, counts, values = _equilibrium(call.with_tangent(), leaves)
-    u_dot = _tangent(call, leaves, call.moving(leaves, dots), u, values)
+    u_dot = _tangent(call, leaves, dots, u, values)
     # a state that is no equilibrium has no derivative; a factor keeps the rule linear
     valid = jnp.where(counts[0] == 0, jnp.ones_like(counts[0]), jnp.nan)
     values = values[: call.num_values]
     return (u, counts, values), (u_dot * valid, 0 * counts, 0 * values)
 
 
-def _tangent(call: Solve, leaves, params_dot: Problem, u, values):
+_equilibrium.defjvp(_derivative, symbolic_zeros=True)
+
+
+def _tangent(call: Solve, leaves, dots, u, values):
     """du of R(u, params) = 0, with prescribed displacements moving along."""
     problem = call.problem(leaves)
-    params, rest = eqx.partition(problem, eqx.is_inexact_array)
+    params, rest, params_dot = call.moving(leaves, dots)
     system = problem.space.system
 
     def prescribed(params):
@@ -162,17 +173,20 @@ def _tangent_values(call: Solve, leaves, u, values):
     return values
 
 
-@_tangent_values.defjvp
 def _tangent_values_derivative(call: Solve, primals, tangents):
     (leaves, u, values), (dots, u_dot, _) = primals, tangents
-    params, rest = eqx.partition(call.problem(leaves), eqx.is_inexact_array)
+    params, rest, params_dot = call.moving(leaves, dots)
+    u_dot = jnp.zeros_like(u) if isinstance(u_dot, SymbolicZero) else u_dot
 
     def assembled(params, u):
         problem = eqx.combine(params, rest)
         return linearise(problem, _prepare_traced(problem), u, u).values
 
-    _, change = jax.jvp(assembled, (params, u), (call.moving(leaves, dots), u_dot))
+    _, change = jax.jvp(assembled, (params, u), (params_dot, u_dot))
     return _tangent_values(call, leaves, u, values), change
+
+
+_tangent_values.defjvp(_tangent_values_derivative, symbolic_zeros=True)
 
 
 _prepare_traced = eqx.filter_jit(prepare_traced)

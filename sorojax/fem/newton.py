@@ -108,4 +108,4 @@ def safe_fraction(problem: Problem, prepared: Prepared, u: np.ndarray, du: np.nd
 def relative_size(prepared: Prepared, u: np.ndarray, du: np.ndarray) -> float:
     """Largest entry of a step over that of the displacement."""
     # without load the displacement is rounding alone, which never gets relatively small
-    return np.abs(du).max() / (np.abs(u).max() + 1e-9 * float(prepared.length))
+    return np.abs(du).max() / (np.abs(u).max() + 1e-6 * float(prepared.length))

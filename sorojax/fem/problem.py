@@ -80,6 +80,7 @@ def problem(
         checks.locking(mesh, material, kinematics, formulation)
     checks.formulation(mesh, kinematics, formulation)
     known = checks.supports(mesh, kinematics, supports)
+    checks_loads.sets(mesh, loads)
     loads = tuple(load.completed(mesh, material, kinematics) for load in loads)
     checks_loads.loads(mesh, kinematics, material, loads, known)
     if space is None:

@@ -12,6 +12,7 @@ from sorojax.mesh.tet_shape import dihedral_cosines, radius_ratios
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.measure import area
 
+_WORST = 8  # cells that are named
 _CUBE = ((1, 3, 4), (2, 0, 5), (3, 1, 6), (0, 2, 7), (7, 5, 0), (4, 6, 1), (5, 7, 2), (6, 4, 3))
 
 
@@ -30,6 +31,8 @@ class Quality(NamedTuple):
         histogram: Cells with a radius ratio in [0, 0.1), ..., [0.9, 1].
         watertight: Whether the boundary is closed and no facet has more than two cells.
         error: Relative error of `area` against the shape, if one was given.
+        worst: Ids of up to eight cells of the least radius ratio, the poorest first.
+        inverted: Ids of cells without positive area (volume).
     """
 
     min_angle: float
@@ -41,6 +44,8 @@ class Quality(NamedTuple):
     histogram: tuple[int, ...] = ()
     watertight: bool = True
     error: float | None = None
+    worst: tuple[int, ...] = ()
+    inverted: tuple[int, ...] = ()
 
     def __str__(self) -> str:
         low, high = np.rad2deg(self.min_angle), np.rad2deg(self.max_angle)
@@ -49,7 +54,9 @@ class Quality(NamedTuple):
             f"{self.num_cells} cells, {self.num_nodes} nodes, size {self.area:.6g} m^dim"
             f"{error}, angles {low:.1f} to {high:.1f} deg, mean radius ratio "
             f"{self.mean_radius_ratio:.3f}, {'' if self.watertight else 'NOT '}watertight\n"
-            f"radius ratio per tenth: {' '.join(map(str, self.histogram))}"
+            f"radius ratio per tenth: {' '.join(map(str, self.histogram))}, least in cells "
+            f"{', '.join(map(str, self.worst))}"
+            + (f"; inverted cells {', '.join(map(str, self.inverted))}" * bool(self.inverted))
         )
 
     __repr__ = __str__
@@ -59,7 +66,9 @@ def quality(mesh: Mesh, shape: AbstractSdf | None = None) -> Quality:
     """Shape numbers of a mesh, and its size against `shape` if given."""
     low, high, ratio = _angles_and_ratios(mesh)
     plane = mesh.element.dim == 2
-    total = float(jnp.sum(cell_areas(mesh) if plane else cell_volumes(mesh)))
+    parts = np.asarray(cell_areas(mesh) if plane else cell_volumes(mesh))
+    total, inverted = float(parts.sum()), np.flatnonzero(~(parts > 0))
+    ratio = np.where(parts > 0, ratio, 0.0)
     error = None
     if shape is not None:
         error = total / float(area(shape) if plane else _volume(shape)) - 1
@@ -67,6 +76,7 @@ def quality(mesh: Mesh, shape: AbstractSdf | None = None) -> Quality:
     return Quality(
         low, float(ratio.mean()), total, mesh.num_nodes, mesh.num_cells, high,
         tuple(tenths.tolist()), is_watertight(mesh), error,
+        tuple(np.argsort(ratio, kind="stable")[:_WORST].tolist()), tuple(inverted.tolist()),
     )  # fmt: skip
 
 

@@ -10,7 +10,8 @@ from sorojax.mesh.interfaces import Parts, insert, whole
 from sorojax.mesh.lattice import clip, lattice, snap, touching
 from sorojax.mesh.mesh import Mesh
 from sorojax.mesh.peel import peel
-from sorojax.mesh.resolved import check_resolved
+from sorojax.mesh.resolved import check_resolved, check_walls
+from sorojax.mesh.ridge_snap import boundary_triangles
 from sorojax.mesh.sizes import SizeFunction, Sizes, constant, sizes
 from sorojax.mesh.tet10 import solid_mesh
 from sorojax.mesh.tet_shape import badness, signed_volumes
@@ -74,6 +75,7 @@ def tetrahedralise(
     points, features = _improved(shape, points, cells, skin, features, rounds)
     widest = lengths if regular else lengths.scaled(_STRETCH)
     check_resolved(where, shape, points[skin], widest, lower, upper)
+    check_walls(where, shape, points, boundary_triangles(cells), lengths)
     parts = _divided((shape, *interfaces), whole(points, cells, skin, features), rounds)
     _check_shapes(parts.points, parts.cells)
     return solid_mesh((shape, *interfaces), parts, order)

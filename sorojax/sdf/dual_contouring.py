@@ -20,12 +20,13 @@ from sorojax.sdf.dual_crossings import (
 )
 from sorojax.sdf.dual_rims import refuse_lost_walls
 from sorojax.sdf.dual_sheets import Faces, cell_sheets, doubtful_faces
-from sorojax.sdf.dual_vertices import SUMS, gathered, place
+from sorojax.sdf.dual_vertices import SHIFTS, SUMS, diagonals, gathered, place
 from sorojax.sdf.sample import values
 
-# Cells around a grid edge, counter-clockwise: how far they begin before it.
-_AROUND = ((1, 1), (0, 1), (0, 0), (1, 0))
+# By axis of a grid edge: the axes, as bits, to go back along to the four cells around it.
+_AROUND = (SHIFTS @ np.array([1, 2, 4])).astype(int)
 _PIECE = 1 << 13
+_NONE = Crossings(*np.zeros((2, 0)), [], *np.zeros((2, 0, 3)))
 _GROUP = 512  # blocks that go through together
 
 
@@ -61,10 +62,10 @@ def dual_contouring(
     vertices = np.empty((int(cells.first[-1]), 3))
     count = sum(len(group.offset) for group in groups)
     triangles, row = np.empty((2, count, 3), np.int32), 0
-    for quads, group, points in _placed(shape, grid, blocks, before, groups, cells, vertices):
+    for quads, points, normals in _placed(shape, grid, blocks, before, groups, cells, vertices):
         for start in range(0, len(quads), _PIECE):
             piece = slice(start, start + _PIECE)
-            split = _split(vertices, quads[piece], points[piece], group.normal[piece])
+            split = _split(vertices, quads[piece], points[piece], normals[piece])
             triangles[:, row : row + split.shape[1]] = split
             row += split.shape[1]
     vertices *= grid.size
@@ -93,71 +94,83 @@ def _numbered(shape, grid, blocks, before, groups: list[Crossings]) -> Cells:
 
 def _placed(
     shape, grid, blocks, before, groups: list[Crossings], cells: Cells, vertices: np.ndarray
-) -> Iterator[tuple[np.ndarray, Crossings, np.ndarray]]:
-    """Quadrilaterals of each group with its crossings, once all their vertices are placed.
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Quadrilaterals of each group with points and normals, once their vertices are placed.
 
-    A group's vertices are placed when the next group, which shares cells walls with its
-    last layer, has added its planes.
+    A group's vertices are placed when the next group, which shares cell walls with its last
+    layer, has added its planes.
     """
     ends = np.concatenate([[0], np.cumsum([len(group.cells) for group in groups])])
-    old = np.zeros((0, SUMS))
-    held = None
-    for g in range(len(groups) + 1):
-        low, now = ends[max(g - 1, 0)], ends[min(g, len(groups))]
-        if g < len(groups):
-            total = np.zeros((cells.first[ends[g + 1]] - cells.first[low], SUMS))
-            total[: len(old)] = old
-            group = groups[g]
-            # Given up here, so that memory falls as the result grows.
-            groups[g] = groups[g]._replace(offset=None, normal=None)  # type: ignore
-            quads = quads_around(before, group, cells, slice(low, ends[g + 1]), now)
-            rows = now + np.concatenate(group.edges)
-            points = corner(blocks, cells.name[rows]) + group.offset
-            gathered(points, group.normal, quads - cells.first[low], total)
+    total, held = np.zeros((0, SUMS), np.float32), None
+    for g in range(len(groups)):
+        low, now, high = ends[max(g - 1, 0)], ends[g], ends[g + 1]
+        # Taken off the list, so that memory falls as the result grows.
+        group, groups[g] = groups[g], _NONE
+        total = np.concatenate(
+            [total, np.zeros((cells.first[high] - cells.first[now], SUMS), np.float32)]
+        )
+        rows = now + np.concatenate(group.edges)
+        quads = quads_around(before, group.edges, cells, slice(low, high), now)
+        axis = np.repeat(np.arange(3), [len(e) for e in group.edges])
+        gathered(group.offset, group.normal, axis, quads - cells.first[low], total)
         if held is not None:
-            own = slice(low, now)
-            owner = np.repeat(np.arange(low, now), np.diff(cells.first[low : now + 1]))
-            first = corner(blocks, cells.name[owner])
-            alone = np.diff(cells.first)[owner] == 1
-            done = total[: len(owner)]
-            refuse_lost_walls(shape, grid, done, first, cells.code[owner])
-            vertices[cells.first[own.start] : cells.first[own.stop]] = place(done, first, alone)
+            _place(shape, grid, blocks, cells, slice(low, now), total, vertices)
             yield held
-        if g < len(groups):
-            held = quads, group, points
-            old = total[cells.first[now] - cells.first[low] :].copy()
-            total = old
+            total = total[cells.first[now] - cells.first[low] :].copy()
+        points = corner(blocks, cells.name[rows]) + group.offset
+        held = outward(quads, cells.code[rows]), points, group.normal
+    if held is not None:
+        _place(shape, grid, blocks, cells, slice(ends[-2], ends[-1]), total, vertices)
+        yield held
 
 
-def quads_around(before, group: Crossings, cells: Cells, window: slice, now: int) -> np.ndarray:
-    """Vertices (n, 4) around the crossed edges of `group`, seen from outside.
+def _place(shape, grid, blocks, cells: Cells, rows: slice, total, vertices) -> None:
+    """Put the vertices of the cells `rows`, whose sums come first in `total`."""
+    ends = cells.first[rows.start : rows.stop + 1]
+    number = np.diff(ends)
+    owner = np.repeat(np.arange(rows.start, rows.stop), number)
+    first = corner(blocks, cells.name[owner])
+    done = total[: len(owner)]
+    refuse_lost_walls(shape, grid, done, first, cells.code[owner])
+    vertices[ends[0] : ends[-1]] = first + place(done, np.repeat(number == 1, number))
+
+
+def quads_around(
+    before: np.ndarray, edges: list[np.ndarray], cells: Cells, window: slice, now: int
+) -> np.ndarray:
+    """Vertices (n, 4) around crossed grid edges, counter-clockwise about their axis.
 
     Args:
         before: Of `blocks_before`.
-        group: Crossings.
-        cells: All cells; those of the group start at row `now`.
+        edges: By axis, the cells at which they begin, counted from row `now`.
+        cells: All cells.
         window: Rows of the cells that may touch the edges.
         now: See above.
     """
     name = cells.name[window]
-    base = int(name[0]) if len(name) else 0
-    index = np.full(int(name[-1]) - base + 1 if len(name) else 0, -1, np.int32)
+    if not len(name):
+        return np.zeros((0, 4), np.int32)
+    base = int(name[0])
+    index = np.full(int(name[-1]) - base + 1, -1, np.int32)
     index[name - base] = np.arange(window.start, window.stop)
-    quads, done = np.empty((sum(map(len, group.edges)), 4), np.int32), 0
-    for axis, edges in enumerate(group.edges):
-        part = quads[done : done + len(edges)]
-        done += len(edges)
-        start = cells.name[now + edges]
-        for k, (d, e) in enumerate(_AROUND):
-            bits = d << (axis + 1) % 3 | e << (axis + 2) % 3
+    quads, done = np.empty((sum(map(len, edges)), 4), np.int32), 0
+    for axis, rows in enumerate(edges):
+        part = quads[done : done + len(rows)]
+        done += len(rows)
+        start = cells.name[now + rows]
+        for k, bits in enumerate(_AROUND[axis].tolist()):
+            d, e = bits >> (axis + 1) % 3 & 1, bits >> (axis + 2) % 3 & 1
             at = cells_before(before, start, bits) - base
             cell = index[np.maximum(at, 0)]
             if (at < 0).any() or (cell < 0).any():
                 _raise_leaving()
             part[:, k] = cells.first[cell] + cells.edges[cells.kind[cell], 4 * axis + d + 2 * e]
-        turned = cells.code[now + edges] & 1 == 0
-        part[turned] = part[turned, ::-1]
     return quads
+
+
+def outward(quads: np.ndarray, code: np.ndarray) -> np.ndarray:
+    """`quads` turned to be seen from outside, by the bits of the cells their edges begin at."""
+    return np.where((code & 1 > 0)[:, None], quads, quads[:, ::-1])
 
 
 def _raise_leaving() -> None:
@@ -169,16 +182,10 @@ def _raise_leaving() -> None:
 
 
 def _split(vertices, quads, points, normals) -> np.ndarray:
-    """Quadrilaterals cut along the diagonal that lies nearer to the surface, (2, n, 3)."""
+    """Quadrilaterals as two triangles each, (2, n, 3)."""
     ends = vertices[quads]
-    height = np.einsum("nkj,nj->nk", ends - points[:, None], normals)
-
-    def cost(i, j):
-        along = ends[:, i] - ends[:, j]
-        length = np.sqrt(np.einsum("nj,nj->n", along, along))
-        return np.abs(height[:, i] + height[:, j]) / 2 + 1e-3 * length
-
-    first = (cost(0, 2) <= cost(1, 3))[:, None]
+    ends -= points[:, None]
+    first = diagonals(ends, normals)[:, None]
     return np.stack(
         [
             np.where(first, quads[:, [0, 1, 2]], quads[:, [0, 1, 3]]),

@@ -17,14 +17,16 @@ from sorojax.sdf.query import value_and_gradient
 
 _WIDE = LEAF + 1
 _CELLS = LEAF**3
-_PLACES = np.array(list(np.ndindex(LEAF, LEAF, LEAF)))
+_PLACES = np.array(list(np.ndindex(LEAF, LEAF, LEAF)), np.int32)
 _NODES = _PLACES @ np.array([_WIDE * _WIDE, _WIDE, 1])
 _CHUNK = 1 << 13
-_BITS = np.array([1, 2, 4])
+_BITS = np.array([1, 2, 4], np.int32)
 # By bits of the axes to go back along: bits of the block walls passed, place arrived at.
 _BACK = [_PLACES - (bits & _BITS > 0) for bits in range(8)]
 _PASSED = np.stack([(back < 0) @ _BITS for back in _BACK])
-_ARRIVED = np.stack([back % LEAF @ np.array([LEAF * LEAF, LEAF, 1]) for back in _BACK])
+_ARRIVED = np.stack(
+    [back % LEAF @ np.array([LEAF * LEAF, LEAF, 1], np.int32) for back in _BACK]
+)
 
 
 class Crossings(NamedTuple):
@@ -53,7 +55,7 @@ def corner(blocks: np.ndarray, cells: np.ndarray) -> np.ndarray:
 def blocks_before(grid: Grid, blocks: np.ndarray) -> np.ndarray:
     """Rows (n, 8) of the blocks one back along the axes in the bits of the column; or -1."""
     numbers = grid.number(blocks)
-    found = np.empty((len(blocks), 8), np.int64)
+    found = np.empty((len(blocks), 8), np.int32)
     for bits in range(8):
         wanted = grid.number(blocks - LEAF * (bits & _BITS > 0))
         row = np.minimum(np.searchsorted(numbers, wanted), len(numbers) - 1)
@@ -80,7 +82,7 @@ def crossings(
     node = (start >> 9) * _WIDE**3 + _NODES[start & (_CELLS - 1)]
     flat = field.ravel()
     a, b = flat[node], flat[node + np.array([_WIDE * _WIDE, _WIDE, 1])[axis]]
-    nodes = corner(group, start)
+    nodes = corner(group.astype(np.int32), start)
     offset, normal = _hermite(shape, grid, nodes, axis.astype(np.int8), a, b)
     return Crossings((at + _CELLS * first).astype(np.int32), code, edges, offset, normal)
 
@@ -98,7 +100,6 @@ def _hermite(shape, grid, nodes, axis, a, b) -> tuple[np.ndarray, np.ndarray]:
     offset, normal = (np.empty((len(nodes), 3), np.float32) for _ in range(2))
     dtype = jnp.result_type(float)
     lower, size = jnp.asarray(grid.lower, dtype=dtype), jnp.asarray(grid.size, dtype=dtype)
-    nodes = nodes.astype(np.int32)
     for start in range(0, len(nodes), _CHUNK):
         piece = slice(start, start + _CHUNK)
         rows = nodes[piece], axis[piece], a[piece], b[piece]

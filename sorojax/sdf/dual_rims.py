@@ -15,6 +15,7 @@ _TURNED = 0.6  # length of the mean normal of a vertex below which its planes ar
 _MOST = 2000  # cells that are looked at in a group of blocks
 _ALONG = np.arange(1, 16) / 16
 _PARALLEL = -0.98  # cosine between the slopes at both ends: sharper wedges end somewhere
+_SHALLOW = 0.05  # cells: what is less deep is where two sides meet, not a wall
 _CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2] for c in range(8)])
 _EDGES = np.array([(c, c | 1 << a) for a in range(3) for c in range(8) if not c >> a & 1])
 
@@ -44,7 +45,7 @@ def refuse_lost_walls(
     f = values(shape, grid.points(points.reshape(-1, 3))).reshape(len(row), len(_ALONG))
     within = inside[row, _EDGES[edge, 0]]
     depth = np.where(within[:, None], f, -f).max(axis=1, initial=0.0)
-    at = np.flatnonzero(depth > 0)
+    at = np.flatnonzero(depth > _SHALLOW * grid.size)
     slopes = [values_and_gradients(shape, grid.points(end[at]))[1] for end in (a, b)]
     cosine = np.einsum("ni,ni->n", *slopes)
     cosine /= np.maximum(np.prod([np.linalg.norm(s, axis=1) for s in slopes], axis=0), 1e-300)

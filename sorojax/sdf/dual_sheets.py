@@ -109,7 +109,9 @@ def _doubtful() -> np.ndarray:
     codes = np.arange(256)
     bits = np.zeros(256, np.uint8)
     for f in range(3):
-        a, b, c, d = (codes >> _corner(f, 0, *at) & 1 for at in ((0, 0), (0, 1), (1, 1), (1, 0)))
+        a, b, c, d = (
+            codes >> _corner(f, 0, *at) & 1 for at in ((0, 0), (0, 1), (1, 1), (1, 0))
+        )
         bits |= ((a == c) & (b == d) & (a != b)).astype(np.uint8) << np.uint8(f)
     return bits
 

@@ -4,17 +4,34 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-
 MARGIN = 0.02  # cells: vertices stay off cell walls, so that none coincide in float32
 _PULL = 0.02  # weight that holds a vertex at the mean crossing, against 1 per plane
 _STEPS = 3
 _PIECE = 1 << 13
-_ROWS, _COLUMNS = np.triu_indices(3)
+_PAIRS = list(zip(*np.triu_indices(3), strict=True))
+# By axis of a grid edge: the four cells around it, counter-clockwise, begin so far before it.
+SHIFTS = np.array(
+    [
+        [np.roll([0, d, e], axis) for d, e in ((1, 1), (0, 1), (0, 0), (1, 0))]
+        for axis in range(3)
+    ],
+    np.float32,
+)
 SUMS = 16  # 1, x, n, n (n . x), n n in six
 
 
-def gathered(points: np.ndarray, normals: np.ndarray, quads: np.ndarray, total) -> None:
-    """Add planes with `points` [cells] and `normals` to the sums of the vertices `quads`."""
+def gathered(
+    offset: np.ndarray, normal: np.ndarray, shift: np.ndarray, quads: np.ndarray, total
+) -> None:
+    """Add planes to the sums (vertices, 16) of the vertices they belong to.
+
+    Args:
+        offset: (n, 3) points of the planes [cells].
+        normal: (n, 3) unit normals.
+        shift: (n,) rows of `SHIFTS`: how far each of the four cells begins before there.
+        quads: (n, 4) vertices in these cells.
+        total: Sums as seen from the corners of the vertices' cells.
+    """
     from scipy.sparse import csc_array
 
     for start in range(0, len(quads), _PIECE):
@@ -22,64 +39,53 @@ def gathered(points: np.ndarray, normals: np.ndarray, quads: np.ndarray, total) 
         q = quads[piece]
         # Neighbours in space are neighbours in number: a piece fills a short range.
         low, high = int(q.min()), int(q.max()) + 1
-        ends = np.arange(0, q.size + 1, 4, dtype=np.int32)
-        data = (np.ones(q.size), (q - low).ravel(), ends)
-        spread = csc_array(data, shape=(high - low, len(q)))
-        total[low:high] += spread @ _features(points[piece], normals[piece])
+        row = padded(_features, offset[piece], normal[piece], shift[piece])
+        ends = np.arange(q.size + 1, dtype=np.int32)
+        data = (np.ones(q.size, np.float32), (q - low).ravel(), ends)
+        total[low:high] += csc_array(data, shape=(high - low, q.size)) @ row.reshape(-1, SUMS)
 
 
-def _features(x: np.ndarray, n: np.ndarray) -> np.ndarray:
-    row = np.empty((len(x), SUMS))
-    row[:, 0], row[:, 1:4], row[:, 4:7] = 1, x, n
-    level = np.einsum("ij,ij->i", x, n, dtype=float)
-    np.multiply(row[:, 4:7], level[:, None], out=row[:, 7:10])
-    for k, (i, j) in enumerate(zip(_ROWS, _COLUMNS, strict=True)):
-        np.multiply(row[:, 4 + i], row[:, 4 + j], out=row[:, 10 + k])
-    return row
+def padded(function, *rows) -> np.ndarray:
+    """`function` of up to 8192 rows, brought to that length so that it is compiled once."""
+    count = len(rows[0])
+    if count < _PIECE:
+        rows = tuple(
+            np.concatenate([r, np.repeat(r[-1:], _PIECE - count, axis=0)]) for r in rows
+        )
+    return np.asarray(function(*rows))[:count]
 
 
-def place(total: np.ndarray, corner: np.ndarray, alone: np.ndarray) -> np.ndarray:
-    """Vertices (n, 3) [cells] nearest to the planes summed in `total`, inside their cells.
+@jax.jit
+def _features(x, n, shift):
+    """Rows (planes, 4, 16) of what is summed."""
+    shift = jnp.asarray(SHIFTS)[shift]
+    x = [x[:, None, i] + shift[:, :, i] for i in range(3)]
+    n = [jnp.broadcast_to(n[:, None, i], x[0].shape) for i in range(3)]
+    level = n[0] * x[0] + n[1] * x[1] + n[2] * x[2]
+    columns = [jnp.ones_like(level), *x, *n, *(part * level for part in n)]
+    return jnp.stack(columns + [n[i] * n[j] for i, j in _PAIRS], axis=2)
+
+
+def place(total: np.ndarray, alone: np.ndarray) -> np.ndarray:
+    """Vertices (n, 3) in shares of their cells, nearest to the planes summed in `total`.
 
     Directions that no plane fixes keep the mean of the crossings. Repeated steps of a
     damped problem leave no trace of the damping where planes meet at an edge or corner.
     Vertices that are not `alone` in their cell stay at the mean, which keeps them apart.
-
-    Args:
-        total: (n, 16) sums over the crossings of each vertex.
-        corner: (n, 3) first nodes of their cells.
-        alone: (n,) whether no other vertex shares the cell.
     """
-    vertices = np.empty((len(total), 3))
+    found = np.empty((len(total), 3), np.float32)
     for start in range(0, len(total), _PIECE):
         piece = slice(start, start + _PIECE)
-        t, low = total[piece], corner[piece]
-        rows = (_local(t, low), alone[piece])
-        pad = _PIECE - len(low)
-        if pad:
-            rows = tuple(np.concatenate([r, np.repeat(r[-1:], pad, axis=0)]) for r in rows)
-        vertices[piece] = low + np.asarray(_nearest(*rows))[: len(low)]
-    return vertices
-
-
-def _local(total: np.ndarray, corner: np.ndarray) -> np.ndarray:
-    """Mean crossing, right side and matrix of each vertex as seen from its cell's corner."""
-    rows = np.empty((len(total), 12), np.float32)
-    share = 1 / total[:, :1]
-    rows[:, :3] = total[:, 1:4] * share - corner
-    square = total[:, 10:].T
-    moved = _times(square, corner.T)
-    for k in range(3):
-        rows[:, 3 + k] = (total[:, 7 + k] - moved[k]) * share[:, 0]
-    rows[:, 6:] = total[:, 10:] * share
-    return rows
+        found[piece] = padded(_nearest, total[piece], alone[piece])
+    return found
 
 
 @jax.jit
-def _nearest(rows, alone):
+def _nearest(total, alone):
     """Minimum of the squared distances to the planes, by steps that damp ever less."""
-    columns = list(rows.T)
-    mean, right, square = columns[:3], columns[3:6], columns[6:]
+    number, *columns = total.T
+    columns = [column / number for column in columns]
+    mean, right, square = columns[:3], columns[6:9], columns[9:]
     damped = [m + (_PULL if i in (0, 3, 5) else 0.0) for i, m in enumerate(square)]
     inverse = _inverse(*damped)
     x = mean
@@ -107,3 +113,25 @@ def _inverse(xx, xy, xz, yy, yz, zz):
     return [entry / determinant for entry in adjugate]
 
 
+def diagonals(ends: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Whether to cut quadrilaterals from the first to the third corner.
+
+    The diagonal that lies nearer to the surface is taken, the shorter one on planes.
+
+    Args:
+        ends: (n, 4, 3) corners as seen from a point of the surface [cells].
+        normal: (n, 3) unit normal there.
+    """
+    return padded(_diagonals, ends.astype(np.float32), normal)
+
+
+@jax.jit
+def _diagonals(ends, normal):
+    a, b, c, d = ([ends[:, k, i] for i in range(3)] for k in range(4))
+
+    def cost(a, b):
+        off = sum((p + q) * normal[:, i] for i, (p, q) in enumerate(zip(a, b, strict=True)))
+        square = sum((p - q) ** 2 for p, q in zip(a, b, strict=True))
+        return jnp.abs(off) / 2 + 1e-3 * jnp.sqrt(square)
+
+    return cost(a, c) <= cost(b, d)

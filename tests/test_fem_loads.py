@@ -1,0 +1,283 @@
+"""Loads and supports as terms: springs, tendons, torques, rigid parts, turned nodes."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sorojax import fem, io, material, mesh
+from sorojax.fem.curved import CurvedPart, group_matrices
+from sorojax.fem.linear import linearise, prepare
+from sorojax.math import sparse
+from sorojax.units import mm
+
+RUBBER = material.neo_hookean(young_modulus=1e5, poisson_ratio=0.3)
+BEAM = mesh.rectangle([0, 0], [60 * mm, 10 * mm], divisions=(6, 2), element=mesh.Quad8())
+CUBE = mesh.box([0, 0, 0], [20 * mm, 20 * mm, 20 * mm], divisions=(2, 1, 1))
+LEFT, RIGHT = (np.asarray(BEAM.node_sets[side]) for side in ("left", "right"))
+WAY = np.array([[1, 8], [20, 8], [24, 7], [59, 7]]) * mm
+
+
+def _problem(*loads, grid=BEAM, supports=None):
+    return fem.problem(
+        grid,
+        RUBBER,
+        kinematics=fem.PlaneStrain(10 * mm) if grid.element.dim == 2 else None,
+        supports=supports or (fem.Fixed(grid.node_sets["left"]),),
+        loads=loads,
+        formulation=fem.Displacement(),
+    )
+
+
+def _terms(grid):
+    """One of every term that has a stiffness of its own."""
+    dim, right = grid.element.dim, np.asarray(grid.node_sets["right"])
+    left = np.asarray(grid.node_sets["left"])[: len(right)]
+    way = fem.route(grid, WAY if dim == 2 else np.array([[1, 8, 3], [11, 8, 4], [19, 9, 6]]) * mm)
+    return (
+        fem.Spring(right, np.full(dim, -5 * mm), 30.0, 1 * mm, name="ground"),
+        fem.Spring(right, left[::-1], np.linspace(10.0, 20.0, len(right)), name="pairs"),
+        fem.Foundation(right, np.arange(1.0, dim + 1), np.full(dim, 1 * mm)),
+        fem.Torque(right, 1e-2, None if dim == 2 else [1.0, 0.3, 0.0]),
+        fem.Tendon(way, 2.0),
+        fem.Cable(way, 500.0, 2 * mm),
+        fem.rigid(grid, right, stiffness=1e3),
+    )
+
+
+@pytest.mark.parametrize("grid", [BEAM, CUBE], ids=["plane", "space"])
+def test_tangent_of_every_term_is_the_slope_of_its_force(grid, getkey):
+    problem = _problem(*_terms(grid), grid=grid)
+    u = 3e-4 * jax.random.normal(getkey(), grid.points.shape)
+    way = jax.random.normal(getkey(), u.shape)
+    values = linearise(problem, prepare(problem), u, u).values
+    product = sparse.product(problem.space.system, values, way.ravel())
+    change = jax.jvp(lambda u: fem.residual(problem, u), (u,), (way,))[1].ravel()
+    assert jnp.max(jnp.abs(product - change)) < 1e-11 * jnp.max(jnp.abs(change))
+
+
+def test_a_node_that_stands_twice_in_a_group_counts_fully(getkey):
+    """The sum of the entries of a group is that of the energy in the distinct nodes."""
+    x = jax.random.normal(getkey(), (2, 2))
+
+    def energy(x, _):
+        return jnp.sum(jnp.sin(x[0]) * x[1] ** 2 * x[2])
+
+    part = CurvedPart(jnp.array([[0, 1, 0]]), energy)
+    upper = group_matrices(part, x[part.groups])
+    pattern = sparse.from_cells(2, np.array([[0, 1]]), 2)
+    slots = sparse.slots_of(pattern, np.array([[0, 1, 2, 3, 0, 1]]))
+    values = jnp.zeros(pattern.num_values).at[slots].add(upper)
+    matrix = jnp.zeros((4, 4)).at[pattern.rows, pattern.cols].set(values)
+    exact = jax.hessian(lambda flat: energy(flat.reshape(2, 2)[part.groups[0]], None))(x.ravel())
+    assert jnp.allclose(matrix, jnp.triu(exact), atol=1e-13)
+
+
+def test_a_tendon_pulls_with_its_tension_and_a_stiff_cable_keeps_its_length():
+    way = fem.route(BEAM, WAY)
+    free = _problem(fem.Tendon(way, 2.0))
+    force = -jax.grad(lambda u: free.loads[0].potential(free, u))(0.0 * BEAM.points)
+    assert jnp.max(jnp.abs(jnp.sum(force, axis=0))) < 1e-12
+    x = way.weights @ jnp.ones(8)
+    assert jnp.allclose(x, 1.0, atol=1e-12)
+    # virtual work: 2 N times the shortening, for a stretch of the body along x
+    stretch = jnp.stack([BEAM.points[:, 0], jnp.zeros(BEAM.num_nodes)], axis=1)
+    lean = np.diff(WAY, axis=0)
+    rate = (lean[:, 0] ** 2 / np.linalg.norm(lean, axis=1)).sum()
+    assert jnp.allclose(-jnp.sum(force * stretch), 2.0 * rate, rtol=1e-10)
+    pulled = _problem(fem.Cable(way, 1e6, 2 * mm))
+    solution = fem.solve(pulled)
+    rest = fem.tendon_length(BEAM, 0.0 * BEAM.points, way)
+    length = fem.tendon_length(BEAM, solution.displacement, way)
+    tension = fem.tension(pulled, solution.displacement, "cable")
+    assert jnp.allclose(rest - length, 2 * mm - tension / 1e6, rtol=1e-9)
+    same = fem.solve(eqx.tree_at(lambda p: p.loads[0].value, free, tension))
+    gap = same.displacement - solution.displacement
+    assert jnp.max(jnp.abs(gap)) < 1e-7 * jnp.max(jnp.abs(solution.displacement))
+    assert jnp.min(solution.displacement[RIGHT, 1]) > 1 * mm
+
+
+def test_a_slack_cable_does_nothing():
+    solution = fem.solve(_problem(fem.Cable(fem.route(BEAM, WAY), 100.0, -1 * mm)))
+    assert jnp.max(jnp.abs(solution.displacement)) < 1e-14
+
+
+def test_springs_hold_a_body_without_supports_and_obey_their_law():
+    corner = np.asarray(BEAM.node_sets["corners"])
+    pull = fem.Force(RIGHT, jnp.array([0.02, 0.0]))
+    problem = _problem(fem.Foundation(corner, jnp.array([2.0, 5.0])), pull, supports=())
+    u = fem.solve(problem).displacement
+    assert jnp.allclose(2.0 * jnp.sum(u[corner, 0]), 0.02, rtol=1e-8)
+    with pytest.raises(ValueError, match="3 rigid-body mode"):
+        _problem(pull, supports=())
+    tie = fem.Spring(RIGHT[:1], np.array([80 * mm, 0.0]), 50.0, 5 * mm)
+    held = _problem(tie)
+    u = fem.solve(held).displacement
+    start = BEAM.points[RIGHT[0]]
+    end = jnp.array([80 * mm, 0.0])
+    longer = jnp.linalg.norm(start + u[RIGHT[0]] - end) - jnp.linalg.norm(start - end) + 5 * mm
+    pulled = jnp.linalg.norm(fem.reaction_force(held, u, jnp.asarray(LEFT)))
+    assert jnp.allclose(pulled, 50.0 * longer, rtol=1e-8)
+    assert jnp.allclose(fem.tension(held, u, "spring"), 50.0 * longer, rtol=1e-12)
+
+
+def test_a_torque_bends_a_beam_and_has_no_force():
+    problem = _problem(fem.Torque(RIGHT, 2e-3))
+    u = fem.solve(problem).displacement
+    reaction = fem.residual(problem, u)[LEFT]
+    assert jnp.max(jnp.abs(jnp.sum(reaction, axis=0))) < 1e-8
+    arm = (BEAM.points + u)[LEFT]
+    moment = jnp.sum(arm[:, 0] * reaction[:, 1] - arm[:, 1] * reaction[:, 0])
+    assert jnp.allclose(moment, -2e-3, rtol=1e-8)
+    turned = fem.mean_rotation(BEAM.points[RIGHT], (BEAM.points + u)[RIGHT])
+    stiffness = 1e5 / (1 - 0.3**2) * 10 * mm * (10 * mm) ** 3 / 12
+    assert jnp.allclose(turned, 2e-3 * 60 * mm / stiffness, rtol=0.02)
+
+
+@pytest.mark.parametrize("grid", [BEAM, CUBE], ids=["plane", "space"])
+def test_a_rigid_part_keeps_its_shape_and_turns_freely(grid):
+    right = np.asarray(grid.node_sets["right"])
+    dim = grid.element.dim
+    pull = fem.Force(right[-1:], jnp.zeros(dim).at[1].set(-0.02 if dim == 2 else -1.0))
+    problem = _problem(fem.rigid(grid, right), pull, grid=grid)
+    part = problem.loads[0]
+    X = grid.points[right]
+    if dim == 2:
+        moved = fem.rotated(grid.points, 1.2, jnp.array([0.01, 0.0]))
+    else:
+        moved = fem.rotated(grid.points, 1.2, jnp.zeros(3), jnp.array([1.0, 1.0, 0.0]))
+    assert part.potential(problem, moved) < 1e-20 * part.stiffness
+    u = fem.solve(problem).displacement[right]
+
+    def distances(x):
+        return jnp.linalg.norm(x[:, None] - x[None], axis=2)
+
+    assert jnp.max(jnp.abs(u)) > 1e-4
+    assert jnp.max(jnp.abs(distances(X + u) - distances(X))) < 2e-3 * jnp.max(jnp.abs(u))
+
+
+def test_turned_nodes_follow_the_arc_and_carry_gradients():
+    about = jnp.array([30 * mm, 5 * mm])
+    points = BEAM.points[RIGHT]
+    move = fem.rotated(points, jnp.pi / 2, about)
+    assert jnp.allclose(move[:, 0] + points[:, 0] - about[0], -(points[:, 1] - about[1]))
+
+    def work(angle):
+        turned = fem.Rotated(RIGHT, points, angle, points.mean(axis=0))
+        problem = _problem(supports=(fem.Fixed(LEFT), turned))
+        return fem.potential_energy(problem, fem.solve(problem).displacement)
+
+    angle, h = jnp.array(1.0), 1e-4
+    slope = (work(angle + h) - work(angle - h)) / (2 * h)
+    assert jnp.allclose(jax.grad(work)(angle), slope, rtol=1e-5)
+
+
+@pytest.mark.parametrize("element", [mesh.Quad8(), mesh.Tri6(), mesh.Hex8()])
+def test_recovered_fields_have_the_order_of_the_element(element):
+    """A polynomial of the order of the element is recovered exactly, on the boundary too."""
+    if element.dim == 2:
+        grid = mesh.rectangle([0, 0], [1, 1], divisions=(3, 3), element=element)
+    else:
+        grid = mesh.box([0, 0, 0], [1, 1, 1], divisions=(2, 2, 2), element=element)
+
+    def field(p):
+        linear = 1 + p[..., 0] - 2 * p[..., 1]
+        return linear + (p[..., 0] * p[..., 1] if element.order == 2 else 0.0)
+
+    fit = fem.patches(grid)
+    found = fit(field(fem.sample_points(grid)))
+    assert jnp.max(jnp.abs(found - field(grid.points))) < 1e-10
+    assert jnp.allclose(jnp.sum(fit.weights, axis=1), 1.0, rtol=1e-10)
+
+
+def test_recovered_stress_beats_the_average_and_energies_add_up():
+    """Bending by a manufactured displacement, against its own stress."""
+
+    def exact(p):
+        return jnp.stack([0.3 * p[..., 0] ** 2 * p[..., 1], 0.2 * p[..., 1] ** 3], axis=-1)
+
+    errors = []
+    for n in (4, 8):
+        grid = mesh.rectangle([0, 0], [1, 1], divisions=(n, n), element=mesh.Quad4())
+        problem = _problem(grid=grid)
+        u = exact(grid.points)
+
+        def sigma(p):
+            F = jnp.eye(3).at[:2, :2].add(jax.jacfwd(exact)(p))
+            return material.cauchy_stress(RUBBER, F)
+
+        want = jax.vmap(sigma)(grid.points)[:, 0, 0]
+        averaged = fem.nodal_average(problem, fem.cauchy_stress(problem, u)[..., 0, 0])
+        found = fem.nodal_stress(problem, u)[:, 0, 0]
+        errors.append([jnp.sqrt(jnp.mean((f - want) ** 2)) for f in (found, averaged)])
+        total = jnp.sum(fem.strain_energy(problem, u))
+        assert jnp.allclose(total, fem.potential_energy(problem, u), rtol=1e-12)
+    (coarse, plain), (fine, _) = errors
+    assert coarse < 0.5 * plain and coarse / fine > 3.0
+
+
+def test_results_go_to_vtu_and_pvd(tmp_path):
+    problem = _problem(fem.Traction(BEAM.facet_sets["right"], jnp.array([0.0, 0.0]), name="tip"))
+    path = fem.solve_path(problem, tip=jnp.array([[0.0, 10.0], [0.0, 20.0]]))
+    files = io.export_fields("run.pvd", problem, path, fields=io.fields.FIELDS,
+                             times=[0.5, 1.0], root=tmp_path)  # fmt: skip
+    assert [file.name for file in files] == ["run_0000.vtu", "run_0001.vtu", "run.pvd"]
+    assert 'timestep="0.5"' in files[-1].read_text()
+    import meshio
+
+    read = meshio.read(files[1])
+    assert read.cells[0].type == "quad8" and np.array_equal(read.cells[0].data, BEAM.cells)
+    u = path.displacements[1]
+    assert np.allclose(read.point_data["displacement"][:, :2], u)
+    energy = np.asarray(fem.strain_energy(problem, u))
+    assert np.allclose(read.cell_data["energy"][0], energy)
+    io.export_fields(tmp_path / "last.vtu", problem, path, deformed=True, unit=mm)
+    moved = meshio.read(tmp_path / "last.vtu").points[:, :2] * mm
+    assert np.allclose(moved, BEAM.points + u) and len(list(tmp_path.iterdir())) == 4
+    with pytest.raises(ValueError, match="leads to"):
+        io.export_fields("../run.vtu", problem, path, root=tmp_path)
+    with pytest.raises(ValueError, match="got fields"):
+        io.export_fields(tmp_path / "a.vtu", problem, path, fields=("colour",))
+
+
+_HERE = np.array([0])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: fem.Spring(_HERE, np.array([1]), -1.0), "stiffness.*must be positive"),
+        (lambda: fem.Spring(_HERE, np.array([99]), 1.0), "ends.*names nodes 99"),
+        (lambda: fem.Spring(_HERE, np.zeros(2), 1.0), "ends at the same place"),
+        (lambda: fem.Spring(_HERE, np.ones(3), 1.0), "`ends` of shape"),
+        (lambda: fem.Spring(_HERE, np.ones(2), np.ones(4)), "stiffness of shape"),
+        (lambda: fem.Foundation(_HERE, -1.0), "at least 0"),
+        (lambda: fem.Foundation(_HERE, np.nan), "at least 0"),
+        (lambda: fem.Foundation(np.array([], int), 1.0), "acts on no node"),
+        (lambda: fem.Torque(RIGHT, 1.0, [0.0, 0.0, 1.0]), "none in the plane"),
+        (lambda: fem.Torque(_HERE, 1.0), "cannot turn"),
+        (lambda: fem.Force(np.array([-1]), np.zeros(2)), "names nodes -1"),
+        (lambda: fem.Force(_HERE, np.array([np.nan, 0.0])), "must be finite"),
+        (lambda: fem.Force(_HERE, 1.0), "value of shape"),
+        (lambda: fem.Tendon(fem.route(BEAM, WAY), np.inf), "must be finite"),
+        (lambda: fem.Cable(fem.route(BEAM, WAY), -5.0), "must be positive"),
+        (lambda: fem.route(BEAM, np.array([[1.0, 1.0], [2.0, 2.0]])), "outside the mesh"),
+        (lambda: fem.route(BEAM, WAY[[0, 0]]), "are the same"),
+        (lambda: fem.route(BEAM, WAY[:1]), "at least two"),
+        (lambda: fem.rigid(BEAM, np.array([0, 999])), "at least two of this mesh"),
+    ],
+)
+def test_bad_terms_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        _problem(make())
+
+
+def test_bad_supports_and_spaces_are_refused():
+    with pytest.raises(ValueError, match="must be finite"):
+        _problem(supports=(fem.Prescribed(LEFT, np.array([np.nan, 0.0])),))
+    with pytest.raises(ValueError, match="no room for Torque"):
+        fem.problem(
+            BEAM, RUBBER, kinematics=fem.PlaneStrain(1.0), supports=(fem.Fixed(LEFT),),
+            loads=(fem.Torque(RIGHT, 1.0),), space=fem.space(BEAM),
+        )  # fmt: skip
