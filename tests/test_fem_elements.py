@@ -13,19 +13,27 @@ from sorojax.fem.linear import linearise, prepare
 RUBBER = material.neo_hookean(young_modulus=1.0, poisson_ratio=0.49)
 D, P0, P1 = fem.Displacement(), fem.ConstantPressure(), fem.LinearPressure()
 STRAIN, STRESS, AXIAL = fem.PlaneStrain(0.5), fem.PlaneStress(0.1), fem.Axisymmetric()
-PLANE = {
-    mesh.Tri3(): (D,), mesh.Tri6(): (D, P0), mesh.Tri7(): (P1, D, P0), mesh.Quad4(): (P0, D),
-    mesh.Quad8(): (D, P0), mesh.Quad9(): (P1, D, P0), POLYGON: (P0, D),
-}  # fmt: skip
-SPACE = {
-    mesh.Tet4(): (D,), mesh.Tet10(): (P0, D), mesh.Tet15(): (P1, D, P0), mesh.Hex8(): (P0, D)
-}  # fmt: skip
+PLANE = (
+    (mesh.Tri3(), (D,)),
+    (mesh.Tri6(), (D, P0)),
+    (mesh.Tri7(), (P1, D, P0)),
+    (mesh.Quad4(), (P0, D)),
+    (mesh.Quad8(), (D, P0)),
+    (mesh.Quad9(), (P1, D, P0)),
+    (POLYGON, (P0, D)),
+)
+SPACE = (
+    (mesh.Tet4(), (D,)),
+    (mesh.Tet10(), (P0, D)),
+    (mesh.Tet15(), (P1, D, P0)),
+    (mesh.Hex8(), (P0, D)),
+)
 
 
 def _cases():
     """The first formulation of each element in plane strain and in space, and some cells of
     the other kinematics; the rest of the table is slow to compile."""
-    for element, formulations in PLANE.items():
+    for element, formulations in PLANE:
         for formulation in formulations:
             first = formulation is formulations[0]
             yield element, STRAIN, formulation, not first
@@ -34,7 +42,7 @@ def _cases():
                 often = isinstance(element, mesh.Quad4 | mesh.Tri3)
                 yield element, AXIAL, formulation, not often
         yield element, STRESS, D, not isinstance(element, mesh.Quad4)
-    for element, formulations in SPACE.items():
+    for element, formulations in SPACE:
         for formulation in formulations:
             yield element, fem.Solid(), formulation, formulation is not formulations[0]
 
@@ -60,8 +68,13 @@ def _look(problem, prepared, states, directions, tilted):
         return jax.jvp(slope, (u,), (v,))
 
     (energy, force), (_, change) = jax.vmap(at)(states, directions)
-    return state.residual, state.values, energy, force, change, fem.cauchy_stress(
-        problem, tilted
+    return (
+        state.residual,
+        state.values,
+        energy,
+        force,
+        change,
+        fem.cauchy_stress(problem, tilted),
     )
 
 
@@ -112,7 +125,7 @@ def _homogeneous_stress(kinematics, G) -> np.ndarray:
 
     if not isinstance(kinematics, fem.PlaneStress):
         return stress(F[2, 2])
-    return stress(brentq(lambda out: stress(out)[2, 2], 0.5, 2.0, xtol=1e-15, rtol=1e-14))
+    return stress(brentq(lambda out: stress(out)[2, 2], 0.5, 2.0, xtol=1e-15))
 
 
 @pytest.mark.parametrize(("element", "kinematics", "formulation"), CASES)

@@ -85,5 +85,5 @@ def test_product_and_fixed_rows(getkey):
 
 def test_strange_facets_are_refused(getkey):
     system, _, _ = _system(getkey)
-    with pytest.raises(ValueError, match="share no cell"):
+    with pytest.raises(ValueError, match="no place in the pattern"):
         sparse.slots_of(system, np.array([[0, 9]]))

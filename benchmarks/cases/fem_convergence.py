@@ -7,20 +7,21 @@ from benchmarks.manufactured import body, error
 from sorojax import fem, mesh
 
 D, P0 = fem.Displacement(), fem.ConstantPressure()
+#: The field changes volume, so that a higher Poisson ratio would measure its pressure only.
 #: Element, formulation (None is the default), Poisson ratio, cells a side, order expected.
 SERIES = (
     (mesh.Tri3(), D, 0.3, (8, 16, 32), 2),
     (mesh.Quad4(), D, 0.3, (8, 16, 32), 2),
     (mesh.Tri6(), D, 0.3, (8, 16, 32), 3),
     (mesh.Quad8(), D, 0.3, (8, 16, 32), 3),
-    (mesh.Quad4(), None, 0.4999, (8, 16, 32), 2),
-    (mesh.Tri6(), P0, 0.4999, (8, 16, 32), None),
-    (mesh.Tri7(), None, 0.4999, (8, 16, 32), 3),
-    (mesh.Quad9(), None, 0.4999, (8, 16, 32), 3),
+    (mesh.Quad4(), None, 0.45, (8, 16, 32), 2),
+    (mesh.Tri6(), P0, 0.45, (8, 16, 32), None),
+    (mesh.Tri7(), None, 0.45, (8, 16, 32), 3),
+    (mesh.Quad9(), None, 0.45, (8, 16, 32), 3),
     (mesh.Tet10(), D, 0.3, (2, 4, 8), 3),
-    (mesh.Hex8(), None, 0.4999, (3, 6, 12), 2),
-    (mesh.Tet10(), P0, 0.4999, (2, 4, 8), None),
-    (mesh.Tet15(), None, 0.4999, (2, 4, 6), 3),
+    (mesh.Hex8(), None, 0.45, (3, 6, 12), 2),
+    (mesh.Tet10(), P0, 0.45, (2, 4, 8), None),
+    (mesh.Tet15(), None, 0.45, (2, 4, 6), 3),
 )
 
 

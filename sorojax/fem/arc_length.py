@@ -88,7 +88,7 @@ def tangent_state(
     if found is None:
         return None
     rate = found.rates[0].reshape(u.shape)
-    length = np.linalg.norm(rate)
+    length = float(np.linalg.norm(rate))
     if not (np.isfinite(length) and length > 0):
         return None
     sign = 1.0 if ahead is None or np.sum(rate * ahead) >= 0 else -1.0

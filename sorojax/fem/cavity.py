@@ -84,9 +84,7 @@ def with_pressures(
     """`problem` with the loads called `names` set."""
     order = [load.name for load in problem.loads]
     indices = [order.index(name) for name in names]
-    return eqx.tree_at(
-        lambda p: [p.loads[i].value for i in indices], problem, list(pressures)
-    )
+    return eqx.tree_at(lambda p: [p.loads[i].value for i in indices], problem, list(pressures))
 
 
 def volumes(

@@ -47,26 +47,31 @@ class Contact(AbstractLoad):
         return Penalty(self.stiffness, self.smoothing)
 
     def potential(self, problem, u):
-        part = self.curved_part(problem)
-        x = (problem.mesh.points + u)[part.groups]
-
-        def energies(x, areas):
-            return jax.vmap(part.energy)(x, areas)
-
-        return jnp.sum(blockwise(energies, part.idle, x, part.data, ()))
+        x = (problem.mesh.points + u)[self.facets]
+        energies = jax.vmap(self._energy(problem))
+        areas = areas_of(problem, self.facets)
+        return jnp.sum(blockwise(energies, self._idle(problem), x, areas, ()))
 
     def curved_part(self, problem):
-        tables = facet_tables(problem.mesh.element)
-        values, law = jnp.asarray(tables.values), self.law
+        areas = areas_of(problem, self.facets)
+        return CurvedPart(self.facets, self._energy(problem), areas, self._idle(problem))
+
+    def _energy(self, problem):
+        values, law = jnp.asarray(facet_tables(problem.mesh.element).values), self.law
 
         def energy(x, areas):
             return jnp.sum(areas * law.energy(gaps(self.obstacle, values @ x, self.value)))
+
+        return energy
+
+    def _idle(self, problem):
+        values = jnp.asarray(facet_tables(problem.mesh.element).values)
 
         def idle(x, _):
             points = jnp.einsum("qa,fai->fqi", values, x)
             return far(self.obstacle, points - jnp.broadcast_to(self.value, points.shape))
 
-        return CurvedPart(self.facets, energy, areas_of(problem, self.facets), idle)
+        return idle
 
     def completed(self, mesh, material, kinematics):
         facets, size = _compact(mesh, self.facets), _mean_size(mesh, self.facets)
@@ -77,7 +82,11 @@ class Contact(AbstractLoad):
             stiffness = 10 * jnp.max(9 * bulk * shear / (3 * bulk + shear)) / size
         if smoothing is None:
             smoothing = 1e-3 * size
-        return Contact(facets, self.obstacle, stiffness, smoothing, value, self.name)
+        return eqx.tree_at(
+            lambda load: (load.facets, load.stiffness, load.smoothing, load.value),
+            self, (integers(facets), stiffness, smoothing, value),
+            is_leaf=lambda leaf: leaf is None,
+        )  # fmt: skip
 
     def check(self, where, mesh, kinematics):
         if self.obstacle.dim != mesh.element.dim:
@@ -92,9 +101,7 @@ class Contact(AbstractLoad):
                             "Leave it out for the default.")  # fmt: skip
 
 
-def areas_of(
-    problem, facets: Int[Array, "facets facet_nodes"]
-) -> Float[Array, "facets quad"]:
+def areas_of(problem, facets: Int[Array, "facets facet_nodes"]) -> Float[Array, "facets quad"]:
     """Reference areas of the quadrature points of facets [m^2]."""
     tables, kinematics = facet_tables(problem.mesh.element), problem.kinematics
     weights, values = jnp.asarray(tables.weights), jnp.asarray(tables.values)

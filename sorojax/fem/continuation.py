@@ -127,7 +127,7 @@ class _Walk:
         elif isinstance(start, CriticalPoint):
             u, shape = np.asarray(start.displacement), np.asarray(start.shape)
             direction = np.sign(step) * shape / np.linalg.norm(shape)
-            size = np.linalg.norm(u) / max(abs(float(start.factor)), 1e-300)
+            size = float(np.linalg.norm(u)) / max(abs(float(start.factor)), 1e-300)
             self.length = abs(step) * size
             self.states.append(
                 PathState(u, float(start.factor), direction, direction, 0.0, start.negative)
@@ -180,7 +180,7 @@ class _Walk:
 
     def _limit_length(self) -> None:
         if self.largest_step is not None:
-            most = self.largest_step / np.abs(self.states[-1].direction).max()
+            most = self.largest_step / float(np.abs(self.states[-1].direction).max())
             self.length = min(self.length, most)
 
     def _turns(self, here: PathState, state: PathState) -> bool:

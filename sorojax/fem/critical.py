@@ -39,9 +39,7 @@ def locate(
     changes = abs(counts[1] - counts[0]) if min(counts) >= 0 else 0
     points = []
     if turned:
-        points.append(
-            _point("limit point", loading, prepared, (first, last), newton, _slope)
-        )
+        points.append(_point("limit point", loading, prepared, (first, last), newton, _slope))
     if changes > turned:
         lower = min(counts)
 

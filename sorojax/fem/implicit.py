@@ -7,7 +7,6 @@ one back-substitution for each right-hand side, all of them at once.
 """
 
 import contextlib
-import copy
 import functools
 from typing import Any
 
@@ -21,11 +20,11 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
 from sorojax._types import is_traced
+from sorojax.fem.call import Solve
 from sorojax.fem.energy_form import residual
-from sorojax.fem.follow import Log, Start, Stats, begin_at, follow
+from sorojax.fem.follow import Log, Start, begin_at, follow
 from sorojax.fem.lanes import scaled_features, solve_lanes
 from sorojax.fem.linear import Linearised, linearise
-from sorojax.fem.newton import Newton
 from sorojax.fem.problem import Problem
 from sorojax.fem.supports import known_values
 from sorojax.fem.traced import (
@@ -45,75 +44,9 @@ _equilibrium_p = Primitive("fem_equilibrium")
 _equilibrium_p.multiple_results = True
 
 
-class _Record:
-    """What the host found: one log per solve, lanes in row-major order; none in a trace."""
-
-    def __init__(self):
-        self.logs: list[Log] = []
-        self.batched = False
-
-    def keep(self, logs: list[Log], batched: bool) -> None:
-        self.logs, self.batched = logs, batched
-
-
-class Solve:
-    """One call of the primitive: all that is no array, and the record of how it went."""
-
-    def __init__(
-        self,
-        problem: Problem,
-        begin: Begin | None,
-        newton: Newton,
-        steps: int,
-        max_cuts: int,
-        want_tangent: bool = False,
-    ):
-        arrays, self._static = eqx.partition((problem, begin), eqx.is_array)
-        self.leaves, self._tree = jax.tree.flatten(arrays)
-        self.num_problem_leaves = len(jax.tree.leaves(eqx.filter(problem, eqx.is_array)))
-        self.settings = (newton, steps, max_cuts)
-        self.shape = problem.mesh.points.shape
-        self.num_all_values = problem.space.system.num_values
-        self.num_values = self.num_all_values if want_tangent else 0
-        self.record = _Record()
-
-    def inputs(self, leaves) -> tuple[Problem, Begin | None]:
-        return eqx.combine(jax.tree.unflatten(self._tree, leaves), self._static)
-
-    def problem(self, leaves) -> Problem:
-        return self.inputs(leaves)[0]
-
-    def moving(self, leaves, dots) -> tuple[Problem, Problem, Problem]:
-        """The problem in two: the numbers that move and all else, and how they move.
-
-        What stays is left out of the derivative, so that it costs nothing.
-        """
-        count = self.num_problem_leaves
-        moves = [not isinstance(dot, SymbolicZero) for dot in dots[:count]]
-        none = [None] * (len(leaves) - count)
-
-        def pick(values, wanted):
-            kept = [x if m == wanted else None for x, m in zip(values, moves, strict=False)]
-            return jax.tree.unflatten(self._tree, kept + none)[0]
-
-        rest = eqx.combine(pick(leaves, False), self._static[0])
-        return pick(leaves, True), rest, pick(dots, True)
-
-    def with_tangent(self) -> "Solve":
-        """The same call, that also returns the tangent; the record is shared."""
-        other = copy.copy(self)
-        other.num_values = self.num_all_values
-        return other
-
-    @property
-    def stats(self) -> Stats | tuple[Stats, ...] | None:
-        """The record of the one solve, of every lane, or `None` inside a trace."""
-        found = tuple(log.stats() for log in self.record.logs)
-        return found[0] if found and not self.record.batched else found or None
-
-    def __call__(self) -> Outcome:
-        leaves, self.leaves = self.leaves, []
-        return Outcome(*_equilibrium(self, leaves))
+def equilibrium(call: Solve) -> Outcome:
+    """Equilibrium of the problem of `call`; the host's record of it is in `call` then."""
+    return Outcome(*_equilibrium(call, call.leaves))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))

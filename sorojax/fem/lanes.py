@@ -9,7 +9,6 @@ iterations or is not stable itself is thrown away and the load path followed fro
 
 from collections.abc import Callable, Iterator, Sequence
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 

@@ -51,7 +51,9 @@ def eigenmodes(
     Raises:
         ValueError: If the material has no density, or `count` is no possible number.
     """
-    return _modes("fem.eigenmodes", problem, displacement, count, np.asarray(mass_matrix(problem)))
+    return _modes(
+        "fem.eigenmodes", problem, displacement, count, np.asarray(mass_matrix(problem))
+    )
 
 
 def tangent_modes(
@@ -101,7 +103,9 @@ def _signed(shapes: np.ndarray) -> np.ndarray:
     return (flat * np.sign(largest)).reshape(shapes.shape)
 
 
-def expand(modes: Modes, coordinates: Float[Array, "... modes"]) -> Float[Array, "... nodes dim"]:
+def expand(
+    modes: Modes, coordinates: Float[Array, "... modes"]
+) -> Float[Array, "... nodes dim"]:
     """Displacement [m] of modal coordinates q: u = u_0 + sum_k q_k phi_k."""
     moved = jnp.tensordot(real(coordinates), modes.shapes, axes=1)
     lead = (1,) * (moved.ndim - 2)

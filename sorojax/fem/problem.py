@@ -28,14 +28,28 @@ class Problem(eqx.Module):
     space: Space
 
     def __repr__(self) -> str:
-        held = ", ".join(f"{type(s).__name__}({s.nodes.size} nodes)" for s in self.supports)
-        loads = ", ".join(f"{type(load).__name__} '{load.name}'" for load in self.loads)
-        return (
-            f"Problem({self.mesh.element.name}: {self.mesh.num_cells} cells, "
-            f"{self.space.num_dofs} dof; {type(self.formulation).__name__}; "
-            f"{type(self.material).__name__}; {type(self.kinematics).__name__}; "
-            f"supports: {held}; loads: {loads or 'none'})"
-        )
+        system, mesh = self.space.system, self.mesh
+        rows = [
+            f"Problem: {mesh.num_cells} {mesh.element.name} cells, {self.space.num_dofs} dof",
+            f"  body      {type(self.material).__name__}, {type(self.kinematics).__name__}, "
+            f"{type(self.formulation).__name__}",
+            f"  tangent   {system.num_values} entries, factored by {system.solver.name}",
+        ]
+        for support in self.supports:
+            rows.append(f"  support   {type(support).__name__} on {support.nodes.size} nodes")
+        rows += [f"  load      {_described(load)}" for load in self.loads]
+        return "\n".join(rows)
+
+
+def _described(load: AbstractLoad) -> str:
+    """What a load acts on, and the entries that it adds to the tangent."""
+    text = f"{type(load).__name__} '{load.name}'"
+    for what in ("facets", "nodes"):
+        if (ids := getattr(load, what, None)) is not None:
+            text += f" on {len(ids)} {what}"
+    if (groups := load.couples()) is not None:
+        text += f", couples {groups.shape[0]} group(s) of {groups.shape[1]} nodes"
+    return text
 
 
 def problem(

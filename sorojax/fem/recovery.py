@@ -70,8 +70,9 @@ def patches(mesh: Mesh) -> Patches:
 def nodal_stress(
     problem: Problem, u: Float[Array, "nodes dim"], fit: Patches | None = None
 ) -> Float[Array, "nodes 3 3"]:
-    """Cauchy stress [Pa] at the nodes, continuous, one order better than in the cells.
+    """Cauchy stress [Pa] at the nodes, continuous, better than a mean on the boundary.
 
+    Inside a uniform mesh `nodal_average` is of the same order and may be closer.
     At an interface of two materials, where stress jumps, it is smoothed. Pass
     `patches(problem.mesh)` to compute them once for many states.
     """

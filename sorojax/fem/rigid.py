@@ -43,6 +43,7 @@ class Rigid(AbstractLoad):
         # Green strain of a bar times its length: close to the elongation, and smooth
         strain = (jnp.sum(bars**2, axis=1) - square) / (2 * jnp.sqrt(square))
         share = jnp.asarray(len(first) / self.nodes.size, x.dtype)
+        assert self.stiffness is not None  # `problem` fills it in
         return 0.5 * self.stiffness * (jnp.sum(gap**2) + share * jnp.sum(strain**2))
 
     def _data(self, problem):

@@ -12,12 +12,12 @@ from jaxtyping import Array, Bool, Float, Int
 from sorojax import _check
 from sorojax._progress import report
 from sorojax._types import is_traced, real
+from sorojax.fem.call import Solve
 from sorojax.fem.follow import Stats, unloaded
-from sorojax.fem.implicit import Solve
-from sorojax.fem.linear import linearise
+from sorojax.fem.implicit import equilibrium
 from sorojax.fem.newton import Newton
 from sorojax.fem.problem import Problem
-from sorojax.fem.traced import Begin, prepare_traced
+from sorojax.fem.traced import Begin
 from sorojax.math.status import Status
 
 
@@ -99,7 +99,7 @@ def solve(
     """
     begin = None if start is None else Begin(jax.lax.stop_gradient(real(start)))
     call = Solve(problem, begin, Newton() if newton is None else newton, steps, max_cuts)
-    u, counts, _ = call()
+    u, counts, _ = equilibrium(call)
     solution = Solution(
         problem=problem,
         displacement=u,
@@ -147,7 +147,7 @@ def solve_path(
     for k, value in enumerate(row):
         target = with_load(problem, name, value)
         call = Solve(target, begin, newton, 1, max_cuts, want_tangent=True)
-        u, counts, tangent = call()
+        u, counts, tangent = equilibrium(call)
         record = call.stats
         stats.append(record)
         failed = failed | (counts[0] != 0)
@@ -158,7 +158,7 @@ def solve_path(
         states.append(jnp.where(failed, jnp.nan, u))
         terms = (target.loads, target.supports)
         begin = _fixed(Begin(states[-1], terms, tangent))
-        lanes = (record,) if isinstance(record, Stats) else record
+        lanes = (record,) if isinstance(record, Stats) else record or ()
         report(
             "equilibrium", k + 1, len(row), iterations=sum(lane.iterations for lane in lanes)
         )
@@ -170,17 +170,19 @@ def solve_path(
 def _scan_path(
     problem: Problem, name: str, row, newton: Newton, max_cuts: int
 ) -> tuple[Float[Array, "steps nodes dim"], Bool[Array, ""]]:
-    """The same in a trace, from the tangent at rest; NaN from the first failure on."""
+    """The same in a trace; NaN from the first failure on."""
     rest = unloaded(problem)
     u = jnp.zeros_like(problem.mesh.points)
-    tangent = linearise(rest, prepare_traced(rest), u, u).values
+    # no finite tangent, no first guess
+    tangent = jnp.full(problem.space.system.num_values, jnp.nan, u.dtype)
     terms, static = eqx.partition((rest.loads, rest.supports), eqx.is_inexact_array)
 
     def advance(carry, value):
         u, terms, tangent = jax.lax.stop_gradient(carry)
         target = with_load(problem, name, value)
         begin = Begin(u, eqx.combine(terms, static), tangent)
-        u, counts, tangent = Solve(target, begin, newton, 1, max_cuts, want_tangent=True)()
+        call = Solve(target, begin, newton, 1, max_cuts, want_tangent=True)
+        u, counts, tangent = equilibrium(call)
         failed = counts[0] != 0
         u = jnp.where(failed, jnp.nan, u)
         terms = eqx.filter((target.loads, target.supports), eqx.is_inexact_array)

@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
@@ -136,7 +135,7 @@ def volume_path(
         begin = found[-1] if found else None
         solution = solve_volume(
             problem, start=begin, newton=newton, max_cuts=max_cuts, throw=False,
-            **{name: Liquid(volume)},
+            **{name: Liquid(volume)},  # type: ignore[arg-type]
         )  # fmt: skip
         status, stats = solution.status, solution.stats
         if stats.reason:
@@ -157,8 +156,8 @@ def _checked(problem: Problem, contents: dict) -> tuple[Names, tuple[AbstractCon
     scalar = [name for name, load in loads.items() if jnp.ndim(load.value) == 0]
     if not contents or not set(contents) <= set(scalar):
         raise ValueError(
-            f"fem.solve_volume: got contents for {sorted(contents)}, need some of the pressures "
-            f"{scalar}. Name a `Pressure` with `name=`."
+            f"fem.solve_volume: got contents for {sorted(contents)}, need some of the "
+            f"pressures {scalar}. Name a `Pressure` with `name=`."
         )
     filled = tuple(
         c if isinstance(c, AbstractContents) else Liquid(c) for c in contents.values()

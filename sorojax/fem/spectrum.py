@@ -127,7 +127,8 @@ def lowest_of_pair(pencil: Pencil, other: np.ndarray, count: int):
     stiffness, other = free_matrix(pencil, pencil.values), free_matrix(pencil, other)
     size = len(pencil.free)
     if count >= size - 1 or size <= _DENSE:
-        values, vectors = scipy.linalg.eigh(other.toarray(), stiffness.toarray())
+        pair = other.toarray(), stiffness.toarray()  # type: ignore[attr-defined]
+        values, vectors = scipy.linalg.eigh(*pair)
     else:
         inverse = spla.LinearOperator(
             (size, size), matvec=lambda b: solve(pencil, b), dtype=float

@@ -49,9 +49,7 @@ def route(mesh: Mesh, points: Float[np.ndarray, "points dim"]) -> Route:
     return Route(*locate(mesh, points))
 
 
-def tendon_length(
-    mesh: Mesh, u: Float[Array, "nodes dim"], route: Route
-) -> Float[Array, ""]:
+def tendon_length(mesh: Mesh, u: Float[Array, "nodes dim"], route: Route) -> Float[Array, ""]:
     """Length of the polyline of a tendon at displacement `u` [m]."""
     return jnp.sum(route.lengths(mesh.points + u))
 
@@ -110,9 +108,7 @@ class Cable(AbstractLoad):
 
     def curved_part(self, problem):
         # The tension depends on the whole length: all nodes of the cable are one group.
-        rest = tendon_length(
-            problem.mesh, jnp.zeros_like(problem.mesh.points), self.route
-        )
+        rest = tendon_length(problem.mesh, jnp.zeros_like(problem.mesh.points), self.route)
         shape = self.route.weights.shape
 
         def energy(x, weights):

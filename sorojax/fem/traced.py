@@ -93,7 +93,9 @@ def known_mask(supports: tuple, num_nodes: int, dim: int) -> Bool[Array, " dofs"
 
 
 def _slots(system: sparse.SparseSymmetric, groups, dim: int):
-    dofs = (groups[:, :, None] * dim + jnp.arange(dim, dtype=groups.dtype)[None, None]).astype(jnp.int64)
+    dofs = (groups[:, :, None] * dim + jnp.arange(dim, dtype=groups.dtype)[None, None]).astype(
+        jnp.int64
+    )
     dofs = dofs.reshape(len(groups), -1)
     first, second = jnp.triu_indices(dofs.shape[1])
     low = jnp.minimum(dofs[:, first], dofs[:, second])
@@ -111,7 +113,7 @@ def follow_traced(
     state = _initial(problem, begin, steps)
 
     def one_pass(state: _State) -> _State:
-        here = between(first, problem, state.goal)
+        here = between(first, problem, state.goal)  # pyright: ignore[reportArgumentType]
         level = _examine(here, prepared, state, newton)
         return _next(problem, prepared, state, level, max_cuts)
 
@@ -247,5 +249,6 @@ def _cut(state: _State, max_cuts: int) -> _State:
 def _fresh(state: _State) -> _State:
     return state._replace(
         moved=jnp.asarray(False), shortened=jnp.asarray(False),
-        update=jnp.full_like(state.update, jnp.inf), iterations=jnp.zeros_like(state.iterations),
+        update=jnp.full_like(state.update, jnp.inf),
+        iterations=jnp.zeros_like(state.iterations),
     )  # fmt: skip

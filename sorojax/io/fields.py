@@ -3,6 +3,7 @@
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, BinaryIO
 from xml.sax.saxutils import quoteattr
 
 import jax.numpy as jnp
@@ -81,7 +82,7 @@ def export_fields(
         # a link in the folder must not lead out of it either
         target = part if root is None else _files.inside(where, part, root)
         _write(target, here, u, fields, deformed, unit)
-    _files.write(file, lambda out: out.write(_collection(parts, moments).encode()))
+    _save(file, _collection(parts, moments).encode())
     return [*parts, file]
 
 
@@ -122,12 +123,16 @@ def _write(file: Path, problem, u, fields, deformed: bool, unit: float) -> None:
     at_nodes, at_cells = _values(problem, jnp.asarray(u), fields)
     order = np.concatenate([ids for _, _, ids in blocks])
     ends = np.cumsum([len(ids) for _, _, ids in blocks])[:-1]
+    point_data: dict[str, Any] = {"displacement": _three(u[kept]) / unit}
+    point_data |= {name: field[kept] for name, field in at_nodes.items()}
+    cell_data: dict[str, Any] = {
+        name: np.split(field[order], ends) for name, field in at_cells.items()
+    }
     whole = meshio.Mesh(
         _three(points[kept]) / unit,
         [(kind, cells) for kind, cells, _ in blocks],
-        point_data={"displacement": _three(u[kept]) / unit}
-        | {name: field[kept] for name, field in at_nodes.items()},
-        cell_data={name: np.split(field[order], ends) for name, field in at_cells.items()},
+        point_data=point_data,
+        cell_data=cell_data,
     )
     made = file.with_name(f".{file.stem}.{os.getpid()}.vtu")
     try:
@@ -135,7 +140,14 @@ def _write(file: Path, problem, u, fields, deformed: bool, unit: float) -> None:
         content = made.read_bytes()
     finally:
         made.unlink(missing_ok=True)
-    _files.write(file, lambda out: out.write(content))
+    _save(file, content)
+
+
+def _save(file: Path, content: bytes) -> None:
+    def fill(out: BinaryIO) -> None:
+        out.write(content)
+
+    _files.write(file, fill)
 
 
 def _blocks(mesh):

@@ -64,7 +64,8 @@ class _Parts:
 
     def pitches(self) -> np.ndarray:
         """Pitch [m] of the lattice whose cells are as large."""
-        return np.cbrt(12 * np.abs(signed_volumes(self.at[self.cells].astype(float)))) * self.step
+        volume = np.abs(signed_volumes(self.at[self.cells].astype(float)))
+        return np.cbrt(12 * volume) * self.step
 
     def hanging(self) -> np.ndarray:
         """Cells with an edge that was bisected beside them."""

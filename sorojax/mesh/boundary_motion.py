@@ -15,7 +15,7 @@ from sorojax.sdf.scalar import quotient
 
 Fields = tuple[AbstractSdf, ...]
 # Parts of an edge at which the sides of a corner are looked at, one after the other.
-_ZOOMS = (0.9, 0.5, 0.2, 0.06, 0.02, 6e-3, 2e-3, 5e-4, 1e-4, 1e-5, 1e-6)
+ZOOMS = (0.9, 0.5, 0.2, 0.06, 0.02, 6e-3, 2e-3, 5e-4, 1e-4, 1e-5, 1e-6)
 _MOST_STEPS = 40
 
 
@@ -82,7 +82,7 @@ def _meet_jvp(primals, tangents):
 
 @eqx.filter_jit
 def _meet(fields: Fields, plan: BoundaryPlan, start):
-    zooms = jnp.asarray(_ZOOMS, start.dtype)
+    zooms = jnp.asarray(ZOOMS, start.dtype)
 
     def closer(i, state):
         x = state[0]
@@ -95,7 +95,7 @@ def _meet(fields: Fields, plan: BoundaryPlan, start):
     along = tuple(own.along.astype(start.dtype) for own in plan.fields)
     slopes = jnp.zeros(count, start.dtype)
     begin = (start, jnp.broadcast_to(slopes[:, None], (count, start.shape[1])), slopes, along)
-    return jax.lax.fori_loop(0, len(_ZOOMS), closer, begin)
+    return jax.lax.fori_loop(0, len(ZOOMS), closer, begin)
 
 
 @eqx.filter_jit

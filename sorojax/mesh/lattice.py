@@ -11,7 +11,7 @@ from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sample import values
 
 _SNAP_LONG, _SNAP_SHORT = 0.25, 0.41  # share of an edge within which a node is moved
-_SNAP_ANY = 0.3  # the same where edges of the lattice are of many lengths
+_SNAP_ANY = 0.25  # the same where edges of the lattice are of many lengths
 _MOST_CUBES = 2e7
 _EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 

@@ -13,6 +13,7 @@ from sorojax._types import integers, is_traced, real
 from sorojax.mesh.boundary_motion import BoundaryPlan, meet, slide
 from sorojax.mesh.distortion import least_corner
 from sorojax.mesh.elements import PolyN
+from sorojax.mesh.followed import check_followed
 from sorojax.mesh.harmonic import (
     Harmonic,
     harmonic,
@@ -36,9 +37,10 @@ def move(mesh: Mesh, shape: AbstractSdf, *, interfaces: tuple[AbstractSdf, ...] 
     corners. Interior nodes follow by one Laplace solve with the stiffness of `mesh`;
     straight sides stay straight. A mesh moved to its own shape stays as it is.
 
-    The topology does not change: corners should move by less than a quarter of the edges
-    beside them from where they are in `mesh`, and normals turn by less than a right
-    angle; `distortion` tells when to mesh anew.
+    The topology does not change: corners may move by a quarter of the edges beside them
+    from where they are in `mesh`, and normals turn by less than a right angle. Outside a
+    trace a warning tells when corners go farther, and nodes that miss the new surface are
+    refused; under a trace `distortion` tells when to mesh anew.
 
     Args:
         mesh: A concrete mesh whose boundary nodes lie on the zero set, as `triangulate`
@@ -49,7 +51,7 @@ def move(mesh: Mesh, shape: AbstractSdf, *, interfaces: tuple[AbstractSdf, ...] 
 
     Raises:
         ValueError: If the mesh is traced, made of polygons, has other interfaces, or
-            (outside a trace) if a cell would turn inside out.
+            (outside a trace) if a cell would turn inside out or a node miss the surface.
     """
     if is_traced(mesh):
         raise ValueError(
@@ -67,9 +69,11 @@ def move(mesh: Mesh, shape: AbstractSdf, *, interfaces: tuple[AbstractSdf, ...] 
             f"move: the mesh is {mesh.element.dim}-D, the fields are "
             f"{[field.dim for field in fields]}-D. Pass the shape it was made from."
         )
-    points = moved_points(_prepared(mesh, len(interfaces)), fields, mesh.points)
+    motion = _prepared(mesh, len(interfaces))
+    points = moved_points(motion, fields, mesh.points)
     if not is_traced(points):
         _check_upright(np.asarray(points), mesh)
+        check_followed(motion.border, fields, mesh, np.asarray(points))
     return eqx.tree_at(lambda m: m.points, mesh, points)
 
 

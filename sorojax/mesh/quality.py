@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from sorojax.mesh.elements import Hex8, Tet4, Tet10, Tri3, Tri6

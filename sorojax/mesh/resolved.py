@@ -7,7 +7,6 @@ from sorojax.mesh.sizes import Sizes
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sample import CHUNK, land, values, values_and_gradients
 
-
 _THIN = 0.25  # of the size: least thickness of a wall of a solid
 _FACING = -0.9  # cosine between the normals on both sides of a wall
 

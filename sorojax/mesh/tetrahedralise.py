@@ -4,8 +4,9 @@ import numpy as np
 
 from sorojax import _check
 from sorojax._types import real
-from sorojax.mesh.features import Features, sharpen
 from sorojax.mesh.bisect import graded
+from sorojax.mesh.features import Features, sharpen
+from sorojax.mesh.followed import check_movable
 from sorojax.mesh.interfaces import Parts, insert, whole
 from sorojax.mesh.lattice import clip, lattice, snap, touching
 from sorojax.mesh.mesh import Mesh
@@ -78,7 +79,10 @@ def tetrahedralise(
     check_walls(where, shape, points, boundary_triangles(cells), lengths)
     parts = _divided((shape, *interfaces), whole(points, cells, skin, features), rounds)
     _check_shapes(parts.points, parts.cells)
-    return solid_mesh((shape, *interfaces), parts, order)
+    mesh = solid_mesh((shape, *interfaces), parts, order)
+    if parts.features.ridge.any():
+        check_movable(where, (shape, *interfaces), mesh, lengths)
+    return mesh
 
 
 def _divided(fields: tuple[AbstractSdf, ...], parts: Parts, rounds: int) -> Parts:

@@ -233,9 +233,7 @@ def shell(shape: AbstractSdf, thickness) -> Shell:
     return Shell(shape, thickness)
 
 
-def repeat(
-    shape: AbstractSdf, step, count: int, *, separate: bool | None = None
-) -> Repeated:
+def repeat(shape: AbstractSdf, step, count: int, *, separate: bool | None = None) -> Repeated:
     """A row of `count` copies of `shape`, each `step` [m] from the one before.
 
     Args:
