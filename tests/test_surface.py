@@ -136,7 +136,8 @@ def test_random_signs_give_a_manifold_surface(getkey):
     before = blocks_before(grid, starts)
     every = corner(starts, np.arange(8 * 512))
     corners = [every + [c & 1, c >> 1 & 1, c >> 2] for c in range(8)]
-    code = sum(inside[tuple(n.T)].astype(np.uint8) << c for c, n in enumerate(corners))
+    bits = [inside[tuple(n.T)].astype(np.uint8) << c for c, n in enumerate(corners)]
+    code = np.bitwise_or.reduce(bits)
     name = np.flatnonzero((code > 0) & (code < 255))
     code = code[name]
     second = doubtful_faces(code)

@@ -15,7 +15,7 @@ _TURNED = 0.6  # length of the mean normal of a vertex below which its planes ar
 _MOST = 2000  # cells that are looked at in a group of blocks
 _ALONG = np.arange(1, 16) / 16
 _PARALLEL = -0.98  # cosine between the slopes at both ends: sharper wedges end somewhere
-_SHALLOW = 0.05  # cells: what is less deep is where two sides meet, not a wall
+_SHALLOW = 0.2  # cells: what is less deep may be the thin end of a wedge, not a wall
 _CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2] for c in range(8)])
 _EDGES = np.array([(c, c | 1 << a) for a in range(3) for c in range(8) if not c >> a & 1])
 
