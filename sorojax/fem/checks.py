@@ -86,9 +86,7 @@ def material(mesh: Mesh, given: AbstractHyperelastic) -> None:
             )
 
 
-def formulation(
-    mesh: Mesh, kinematics: AbstractKinematics, given: AbstractFormulation
-) -> None:
+def formulation(mesh: Mesh, kinematics: AbstractKinematics, given: AbstractFormulation) -> None:
     """Refuse pairs of displacement and pressure that lock or are unstable."""
     element = mesh.element
     if isinstance(given, Displacement):

@@ -75,7 +75,7 @@ class _Parts:
         if not len(self.ends):
             return np.zeros(keys.shape, bool)
         place = np.minimum(np.searchsorted(self.ends, keys), len(self.ends) - 1)
-        return self.ends[place] == keys
+        return np.equal(self.ends[place], keys)
 
     def bisect(self, split: np.ndarray) -> None:
         cells, rows = self.cells[split], np.arange(int(split.sum()))

@@ -89,7 +89,7 @@ def _snapped(fields, parts: Parts, g: np.ndarray) -> tuple[Parts, np.ndarray]:
     for k in np.argsort(far, kind="stable"):
         if not good[k]:
             continue
-        ball = around(near[k])
+        ball = around(int(near[k]))
         x = np.where((ball == near[k])[..., None], places[k], points[ball])
         if badness(x).max() < max(_THIN, badness(points[ball]).max() + 1e-9):
             points[near[k]] = places[k]

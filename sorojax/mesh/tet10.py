@@ -36,7 +36,8 @@ def solid_mesh(fields: tuple[AbstractSdf, ...], parts: Parts, order: int) -> Mes
     for i, own in enumerate(facets[1:]):
         sets[f"interface_{i}"] = own
         nodes[f"interface_{i}"] = np.unique(own)
-    return Mesh(points, cells, element, nodes, sets)
+    regions = {f"inside_{i}": np.flatnonzero(own) for i, own in enumerate(parts.within.T)}
+    return Mesh(points, cells, element, nodes, sets, regions)
 
 
 def _curved(fields, parts: Parts, facets, ridge):

@@ -39,8 +39,8 @@ def tetrahedralise(
     sharp edges and corners, then nodes of the worst cells are moved. Boundary nodes lie on
     the zero set; a sharp edge is chamfered within one cell where cells would degenerate.
     Facet sets: "boundary" and "interface_0", ...; node sets: "ridges" and "corners" of
-    sharp edges, and "interface_0", .... Materials are cells inside a shape:
-    `cells_inside(mesh, interfaces[0])`.
+    sharp edges, and "interface_0", ...; regions: "inside_0", ... of the cells within each
+    interface.
 
     Args:
         shape: A concrete, bounded solid shape.
@@ -80,8 +80,8 @@ def tetrahedralise(
     parts = _divided((shape, *interfaces), whole(points, cells, skin, features), rounds)
     _check_shapes(parts.points, parts.cells)
     mesh = solid_mesh((shape, *interfaces), parts, order)
-    if parts.features.ridge.any():
-        check_movable(where, (shape, *interfaces), mesh, lengths)
+    if parts.features.ridge.any() and not interfaces:
+        check_movable(where, (shape,), mesh, lengths)
     return mesh
 
 

@@ -33,7 +33,8 @@ def isosurface(
     """Closed, manifold boundary surface of a solid shape.
 
     Only blocks of cells that the Lipschitz constant of the shape cannot exclude are
-    evaluated. Walls and gaps thinner than `size` may be lost.
+    evaluated. Walls and gaps thinner than `size` may be lost; dual contouring keeps those of
+    `size` and more whole, and refuses where thinner ones would be cut open.
 
     Args:
         shape: A concrete, bounded solid shape.
@@ -43,8 +44,9 @@ def isosurface(
             into a cell, which keeps sharp edges and corners.
 
     Raises:
-        ValueError: If the shape is empty, unbounded or traced, or its field varies
-            faster than its Lipschitz constant says.
+        ValueError: If the shape is empty, unbounded or traced, its field varies faster
+            than its Lipschitz constant says, or dual contouring meets a wall of 0.4 to 1
+            `size` that falls between nodes.
     """
     if method not in _METHODS:
         raise ValueError(f"isosurface: `method` is {method!r}, need one of {list(_METHODS)}.")
