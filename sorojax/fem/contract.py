@@ -1,4 +1,8 @@
-"""Cell forces and matrices of a block from stresses and tangents at its points."""
+"""Cell forces and matrices of a block from stresses and tangents at its points.
+
+All points are summed in one expression, so that an entry of a cell matrix is written once;
+with sums kept in memory from point to point their traffic costs more than the arithmetic.
+"""
 
 import functools
 from collections.abc import Iterable
@@ -9,106 +13,95 @@ from jaxtyping import Array, Float
 
 from sorojax.fem.energy import Body, Response
 from sorojax.fem.kinematics import AbstractKinematics
+from sorojax.fem.tensor import Entries
 
 Force = Float[Array, "cell_nodes dim lanes"]
+Gradients = Float[Array, "quad cell_nodes columns lanes"]
 
 
 def block_matrix(
-    kinematics: AbstractKinematics,
-    answer: Response,
-    body: Body,
-    gradients: Float[Array, "quad cell_nodes columns lanes"],
+    kinematics: AbstractKinematics, answer: Response, body: Body, gradients: Gradients
 ) -> tuple[Force, Float[Array, "entries lanes"]]:
     """Sums over points of P G and of G' A G, the latter in the order of `block_entries`."""
-    points = (
-        jnp.moveaxis(answer.stress, 1, 0),
-        jnp.moveaxis(answer.tangent, 2, 0),
-        None if answer.slopes is None else jnp.moveaxis(answer.slopes, 1, 0),
-        gradients,
-        body.volumes,
-        None if body.modes is None else jnp.moveaxis(body.modes, 1, 0),
-    )
-
+    weighted = gradients * body.volumes[:, None, None]
+    bent = _stiff_gradients(kinematics, answer.tangent, gradients)
     # Otherwise XLA repeats the material's work in every entry of the cell matrix.
-    points = jax.lax.optimization_barrier(points)
-
-    def at_point(point):
-        P, A, C, G, w, modes = point
-        Gw = G * w[None, None]
-        if C is None or modes is None:
-            return _force(kinematics, P, Gw), _matrix(kinematics, A, G, Gw), None
-        # d(dilatation)/du of every node, times each pressure function
-        slopes = _force(kinematics, C, Gw)[None] * modes[:, None, None]
-        return _force(kinematics, P, Gw), _matrix(kinematics, A, G, Gw), slopes
-
-    force, blocks, slopes = _sum_over_points(at_point, points)
-    if slopes is not None:
-        blocks = blocks + _bulk(slopes, answer.stiffness)
-    return force, _upper(kinematics.dim, blocks)
-
-
-def _sum_over_points(at_point, points):
-    """One point after the other, so that the sums stay in the cache."""
-    first = jax.tree.map(lambda x: x[0], points)
-    if jax.tree.leaves(points)[0].shape[0] == 1:
-        return at_point(first)
-
-    def add(sums, point):
-        return jax.tree.map(jnp.add, sums, at_point(point)), None
-
-    start = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(at_point, first))
-    return jax.lax.scan(add, start, points)[0]
+    answer, weighted, bent = jax.lax.optimization_barrier((answer, weighted, bent))
+    force = _force(kinematics, answer.stress, weighted)
+    blocks = [_matrix(kinematics, i, bent[i, k], weighted) for i, k in bent]
+    if answer.slopes is not None and answer.stiffness is not None and body.modes is not None:
+        shares = [
+            _force(kinematics, mode[None] * answer.slopes, weighted) for mode in body.modes
+        ]
+        bulk = _bulk(jnp.stack(shares), answer.stiffness)
+        blocks = [block + more for block, more in zip(blocks, bulk, strict=True)]
+    return force, _upper(list(bent), blocks)
 
 
 def component_pairs(dim: int) -> list[tuple[int, int]]:
     return [(i, k) for i in range(dim) for k in range(i, dim)]
 
 
-def _force(kinematics: AbstractKinematics, P, Gw) -> Force:
+def _slots_of(kinematics: AbstractKinematics, component: int) -> list[tuple[int, int]]:
+    """Kept entries of F in one row and the columns of the gradients they take."""
+    slots = enumerate(kinematics.slots)
+    return [(e, s.column) for e, s in slots if s.component == component]
+
+
+def _force(kinematics: AbstractKinematics, P: Entries, weighted: Gradients) -> Force:
     """P : Grad N of every node."""
-    rows = []
-    for i in range(kinematics.dim):
-        mine = [(e, s.column) for e, s in enumerate(kinematics.slots) if s.component == i]
-        rows.append(_total(P[e][None] * Gw[:, j] for e, j in mine))
+    rows = [
+        _total(
+            P[e, q][None] * weighted[q, :, j]
+            for q in range(weighted.shape[0])
+            for e, j in _slots_of(kinematics, i)
+        )
+        for i in range(kinematics.dim)
+    ]
     return jnp.stack(rows, axis=1)
 
 
-def _matrix(kinematics: AbstractKinematics, A, G, Gw) -> Float[Array, "pairs n n lanes"]:
-    """G' A G for every pair of components i <= k."""
-    blocks = []
-    for i, k in component_pairs(kinematics.dim):
-        terms = []
-        for e, first in enumerate(kinematics.slots):
-            if first.component != i:
-                continue
-            AG = _total(
-                A[e, f][None] * G[:, second.column]
-                for f, second in enumerate(kinematics.slots)
-                if second.component == k
-            )
-            terms.append(Gw[:, first.column][:, None] * AG[None])
-        blocks.append(_total(terms))
-    return jnp.stack(blocks)
+def _stiff_gradients(
+    kinematics: AbstractKinematics, A: Float[Array, "entries entries quad lanes"], G: Gradients
+) -> dict[tuple[int, int], list[Float[Array, "quad cell_nodes lanes"]]]:
+    """A G for each pair of components i <= k: one array per kept entry of row i."""
+    return {
+        (i, k): [
+            _total(A[e, f][:, None] * G[:, :, j] for f, j in _slots_of(kinematics, k))
+            for e, _ in _slots_of(kinematics, i)
+        ]
+        for i, k in component_pairs(kinematics.dim)
+    }
+
+
+def _matrix(kinematics: AbstractKinematics, i: int, bent, weighted: Gradients):
+    """G' A G of one pair of components, (nodes, nodes, lanes)."""
+    return _total(
+        weighted[q, :, j][:, None] * stiff[q][None]
+        for q in range(weighted.shape[0])
+        for (_, j), stiff in zip(_slots_of(kinematics, i), bent, strict=True)
+    )
 
 
 def _total(terms: Iterable[jax.Array]) -> jax.Array:
     return functools.reduce(jnp.add, terms)
 
 
-def _bulk(slopes, H) -> Float[Array, "pairs n n lanes"]:
+def _bulk(
+    slopes: Float[Array, "modes cell_nodes dim lanes"], H: Float[Array, "modes modes lanes"]
+) -> list[Float[Array, "cell_nodes cell_nodes lanes"]]:
     """Stiffness of the pressure modes; `slopes` are d(coefficient)/du."""
     through = jnp.sum(H[:, :, None, None] * slopes[None], axis=1)
-    return jnp.stack(
-        [
-            jnp.sum(slopes[:, :, i][:, :, None] * through[:, :, k][:, None], axis=0)
-            for i, k in component_pairs(slopes.shape[2])
-        ]
-    )
+    slopes, through = jax.lax.optimization_barrier((slopes, through))
+    return [
+        _total(a[:, i][:, None] * b[:, k][None] for a, b in zip(slopes, through, strict=True))
+        for i, k in component_pairs(slopes.shape[2])
+    ]
 
 
-def _upper(dim: int, blocks) -> Float[Array, "entries lanes"]:
+def _upper(pairs: list[tuple[int, int]], blocks) -> Float[Array, "entries lanes"]:
     rows = []
-    for (i, k), block in zip(component_pairs(dim), blocks, strict=True):
+    for (i, k), block in zip(pairs, blocks, strict=True):
         if i == k:
             rows += [block[a, a:] for a in range(block.shape[0])]
         else:
