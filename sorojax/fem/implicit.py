@@ -143,11 +143,22 @@ def _follow(problem: Problem, begin: Begin | None, log: Log) -> np.ndarray:
     if not np.all(np.isfinite(u)):
         log.reason = "the state to start from is no equilibrium"
         return u
-    here = problem if begin.terms is None else with_terms(problem, begin.terms)
     zero = jnp.zeros(())
     values = begin.tangent
     known = None if values is None else Linearised(zero, values, zero, zero, zero, zero)
-    return follow(problem, Start(u, here, known), log)
+    if begin.terms is not None:
+        return follow(problem, Start(u, with_terms(problem, begin.terms), known), log)
+    return _from_guess(problem, Start(u, problem, known), log)
+
+
+def _from_guess(problem: Problem, guess: Start, log: Log) -> np.ndarray:
+    """Newton from a guess at full load; from rest along the load if it is too far away."""
+    once = Log(log.newton, 1, 0)
+    u = follow(problem, guess, once)
+    if once.reason:
+        return follow(problem, begin_at(problem, None), log)
+    log.steps, log.end = once.steps, once.end
+    return u
 
 
 def _outcome(call: Solve, u: np.ndarray, log: Log) -> Outcome:

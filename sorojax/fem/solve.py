@@ -86,8 +86,8 @@ def solve(
 
     Args:
         problem: What to solve; differentiable in each of its numbers.
-        start: Displacement to start from at full load, instead of stepping [m]; the answer
-            has no derivative by it.
+        start: Displacement to start from at full load, instead of stepping [m]; where it is
+            too far away the load is followed from rest. The answer has no derivative by it.
         newton: Tolerances; `Newton()` when omitted.
         steps: Number of equal load steps to try first.
         max_cuts: How often a step may be halved in a row.
