@@ -33,7 +33,7 @@ def block(
     """A unit square or cube, held on the left and pulled down on the right by dead load."""
     dim = element.dim
     make = mesh.rectangle if dim == 2 else mesh.box
-    cells = make([0] * dim, [1] * dim, divisions=divisions, element=element)
+    cells = make([0] * dim, [1] * dim, divisions=divisions, element=element)  # type: ignore
     pull = jnp.zeros(dim).at[1].set(-0.02)
     return fem.problem(
         cells,

@@ -54,7 +54,7 @@ def body(
     """A square or cube with cells that change smoothly in shape; its boundary is known."""
     dim = element.dim
     make = mesh.rectangle if dim == 2 else mesh.box
-    grid = make([0] * dim, [1] * dim, divisions=(divisions,) * dim, element=element)
+    grid = make([0] * dim, [1] * dim, divisions=(divisions,) * dim, element=element)  # type: ignore
     bump = jnp.prod(jnp.sin(jnp.pi * grid.points), axis=1, keepdims=True)
     return placed(Mesh(grid.points + 0.1 * bump, grid.cells, element), poisson_ratio,
                   formulation, side)  # fmt: skip

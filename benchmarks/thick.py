@@ -60,7 +60,7 @@ def inner_displacement(num_hoops: int, bulk: float, pressure: float) -> float:
         end = solve_ivp(rates, (INNER, OUTER), start, "DOP853", rtol=1e-13, atol=1e-14)
         return end.y[1, -1]
 
-    return brentq(outer_stress, 1e-6, 0.6, xtol=1e-14, rtol=1e-14)
+    return brentq(outer_stress, 1e-6, 0.6, xtol=1e-14, rtol=1e-14)  # type: ignore
 
 
 def incompressible_displacement(num_hoops: int, pressure: float) -> float:
@@ -74,7 +74,7 @@ def incompressible_displacement(num_hoops: int, pressure: float) -> float:
             return np.log(a / b) + (b**-2 - a**-2) / 2 - pressure
         return 2 / b + 1 / (2 * b**4) - 2 / a - 1 / (2 * a**4) - pressure
 
-    return brentq(excess, 0.0, 0.6, xtol=1e-14)
+    return brentq(excess, 0.0, 0.6, xtol=1e-14)  # type: ignore
 
 
 def quarter(element: mesh.AbstractElement, divisions: tuple[int, int]) -> Mesh:

@@ -78,7 +78,7 @@ def _felupe(problem: fem.Problem):
     try:
         return peers.call(
             "felupe", "assembly", arrays, element=problem.mesh.element.name, repeats=REPEATS,
-            mu=float(rubber.shear_modulus), bulk=float(rubber.bulk_modulus),
+            mu=float(rubber.shear_modulus), bulk=float(rubber.bulk_modulus),  # type: ignore
         )  # fmt: skip
     except peers.PeerMissing as reason:
         return str(reason)
@@ -89,7 +89,7 @@ def _difference(problem: fem.Problem, answer) -> float | None:
         return None
     found = answer[1]
     values = asm.assemble(*_state(problem)).values
-    product = sparse.product(problem.space.system, values, _way(problem).ravel())
+    product = sparse.product(problem.space.system, values, _way(problem).ravel())  # type: ignore
     return float(np.abs(product - found["product"]).max() / np.abs(found["product"]).max())
 
 

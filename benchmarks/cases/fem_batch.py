@@ -25,7 +25,7 @@ def rows():
         here = eqx.tree_at(
             lambda p: (p.material.factor, p.loads[0].value),
             problem,
-            (scale * problem.material.factor, pressure),
+            (scale * problem.material.factor, pressure),  # type: ignore
         )
         return fem.solve(here, throw=False)
 

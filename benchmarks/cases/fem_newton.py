@@ -66,7 +66,7 @@ def _solve(problem: fem.Problem) -> Timing:
     number = count(1)
 
     def another():
-        softer = problem.material.shear_modulus * (1 - 1e-6 * next(number))
+        softer = problem.material.shear_modulus * (1 - 1e-6 * next(number))  # type: ignore
         here = eqx.tree_at(lambda p: p.material.shear_modulus, problem, softer)
         return fem.solve(here).displacement
 
@@ -87,8 +87,8 @@ def _felupe(problem: fem.Problem):
     try:
         return peers.call(
             "felupe", "newton", arrays, element=problem.mesh.element.name, repeats=2,
-            iterations=ITERATIONS, mu=float(rubber.shear_modulus),
-            bulk=float(rubber.bulk_modulus),
+            iterations=ITERATIONS, mu=float(rubber.shear_modulus),  # type: ignore
+            bulk=float(rubber.bulk_modulus),  # type: ignore
         )  # fmt: skip
     except peers.PeerMissing as reason:
         return str(reason)
@@ -113,7 +113,7 @@ def _parts(problem: fem.Problem, settings: dict):
         "supports": held,
         # other values every time: factors of known values are kept
         "factor": lambda: system.solver.factor(matrix * (1 + 1e-9 * next(number))),
-        "solve": lambda: factor.solve(rhs),
+        "solve": lambda: factor.solve(rhs),  # type: ignore
         "preparation, once a solve": lambda: prepare(problem).geometry,
     }
     for name, call in parts.items():

@@ -55,7 +55,7 @@ def _row(problem: fem.Problem, body: str, divisions, wanted: float, bar) -> Row:
         "formulation": type(problem.formulation).__name__,
         "cells": list(divisions),
         "dof": problem.space.num_dofs,
-        "bulk_over_shear": float(problem.material.bulk_modulus),
+        "bulk_over_shear": float(problem.material.bulk_modulus),  # type: ignore
         "iterations": solution.stats.iterations,
     }
     return Row(

@@ -4,6 +4,8 @@ The derivative is that of the implicit function at the converged state: one more
 back-substitution per direction, whatever steps the solver took to get there.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -33,7 +35,7 @@ class Solution(eqx.Module):
     problem: Problem
     displacement: Float[Array, "nodes dim"]
     status: Status
-    stats: Stats | tuple[Stats, ...] | None = eqx.field(static=True)
+    stats: Any = eqx.field(static=True)  # Stats, one per lane under vmap, None under jit
     load_fraction: Float[Array, ""] | None = None
     iterations: Int[Array, ""] | None = None
 
@@ -51,7 +53,7 @@ class Path(eqx.Module):
     values: Float[Array, "steps ..."]
     name: str = eqx.field(static=True)
     status: Status
-    stats: tuple | None = eqx.field(static=True)
+    stats: Any = eqx.field(static=True)  # one Stats per value, None under jit
 
     def __len__(self) -> int:
         return self.displacements.shape[0]

@@ -71,7 +71,7 @@ def geometric_part(
     kinematics: AbstractKinematics, F: Entries, weight: Entry | None, S: Entries
 ) -> Float[Array, "entries entries quad lanes"]:
     """`weight` times d2J / dF dF, plus S between the entries of one row of F."""
-    weight = jnp.zeros_like(F[0]) if weight is None else weight
+    weight = jnp.zeros_like(F[0]) if weight is None else jnp.asarray(weight)
     # A product with a constant table: gathers of rows are several times slower.
     parts = jnp.concatenate([weight[None] * F, weight[None], S])
     return jnp.einsum("efk,kql->efql", geometric_table(type(kinematics)), parts)

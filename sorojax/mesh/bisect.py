@@ -69,7 +69,7 @@ class _Parts:
 
     def hanging(self) -> np.ndarray:
         """Cells with an edge that was bisected beside them."""
-        return self._bisected(self._keys(self.cells)).any(axis=1)
+        return self._bisected(self._keys(self.cells)).any(axis=1)  # type: ignore
 
     def _bisected(self, keys: np.ndarray) -> np.ndarray:
         if not len(self.ends):
