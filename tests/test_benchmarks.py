@@ -99,7 +99,7 @@ def test_unknown_case_is_named(folder, capsys):
     assert "math.product" in capsys.readouterr().err
 
 
-@pytest.mark.skipif(os.name == "nt", reason="a shell script stands for the interpreter")
+@pytest.mark.skipif(os.name == "nt", reason="Windows starts no script as python.exe")
 def test_a_peer_answers_arrays_and_times(folder, monkeypatch):
     home = folder.parent / "peers"
     (home / "soromox" / "bin").mkdir(parents=True)

@@ -135,8 +135,9 @@ def _cell_errors(element, poisson_ratio, formulation=None):
 )
 def test_order_of_convergence(element, poisson_ratio, formulation, order):
     coarse, fine = _cell_errors(element, poisson_ratio, formulation)
-    # the pressures of the mixed pair still fall faster on these few cells: 3.4 instead of 3
-    assert order - 0.15 < np.log2(coarse / fine) < order + 0.5
+    # the pressures of Quad9 still fall faster on these few cells: 3.4 instead of 3
+    above = 0.5 if isinstance(element, mesh.Quad9) else 0.15
+    assert order - 0.15 < np.log2(coarse / fine) < order + above
 
 
 def test_cooks_membrane_does_not_lock_by_default():
