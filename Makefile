@@ -30,7 +30,7 @@ demo: $(VENV)/.run
 	@$(PY) -m sorojax demo
 
 test: $(VENV)/.test
-	$(PY) -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
+	$(PY) -m pytest -n $(WORKERS) --dist loadfile --max-worker-restart 0 $(ARGS)
 
 lint: $(VENV)/.dev
 	$(PY) -m ruff check .

@@ -1,6 +1,8 @@
 """Tests run in float64 with strict promotion and a persistent compilation cache."""
 
+import gc
 import itertools
+from pathlib import Path
 
 import jax
 import pytest
@@ -12,6 +14,19 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 enable_compilation_cache()
+
+_MAX_MAPPINGS = 15_000
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _bounded_number_of_programs():
+    """Every compiled program holds memory mappings, of which Linux allows 65,530 a process;
+    beyond that the compiler crashes. What comes back later is read from the cache."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > _MAX_MAPPINGS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture
