@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.cases import fem_contact
 from sorojax import contact, fem, material, mesh, sdf
 from sorojax.units import mm
 
@@ -106,6 +107,23 @@ def test_a_far_obstacle_adds_nothing_and_an_approaching_one_pushes():
     assert far.loads[1].potential(far, u) == 0.0
     near = eqx.tree_at(lambda p: p.loads[1].value, problem, jnp.array([0.0, 1 * mm]))
     assert near.loads[1].potential(near, u) > 0.0
+
+
+def test_a_cylinder_on_a_block_has_the_contact_of_hertz():
+    """Width and peak of the pressure, and how far the block sinks under that pressure."""
+    problem = fem_contact.pressed_block(32)
+    down = jnp.stack([jnp.array([0.0, -depth]) for depth in fem_contact.APPROACHES])
+    path = fem.solve_path(problem, cylinder=down)
+    assert max(stats.iterations for stats in path.stats) <= 10
+    assert sum(stats.cuts for stats in path.stats) == 0
+    pressed = fem.with_load(problem, "cylinder", down[-1])
+    state = fem.contact_state(pressed, path.displacements[-1], "cylinder")
+    force = -2 * float(state.total[1])
+    half_width, peak = fem_contact.hertz(force)
+    assert abs(fem_contact.own_half_width(state) / half_width - 1) < 0.02
+    assert abs(float(state.pressure.max()) / peak - 1) < 0.03
+    sunk = fem_contact.block_approach(problem, force)
+    assert abs(-float(down[-1, 1]) / sunk - 1) < 0.01
 
 
 @pytest.mark.parametrize(

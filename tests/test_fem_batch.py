@@ -1,5 +1,7 @@
 """Equilibrium under vmap and jit: lanes, their status, gradients, and what they cost."""
 
+import logging
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -178,3 +180,47 @@ def test_a_start_may_differ_between_lanes():
 
     found = jax.vmap(again)(pulls, starts)
     assert _close(found.displacement, starts) and jnp.all(found.iterations == 1)
+
+
+def _renumbered(order):
+    """The problem on the same body with its nodes in another order: equal shapes, another
+    pattern."""
+    number = jnp.argsort(order).astype(jnp.int32)
+    sets = (GRID.cells, GRID.node_sets, GRID.facet_sets)
+    moved = jax.tree.map(lambda ids: number[ids], sets)
+    grid = eqx.tree_at(
+        lambda m: (m.points, m.cells, m.node_sets, m.facet_sets),
+        GRID, (GRID.points[order], *moved),
+    )  # fmt: skip
+    return fem.problem(
+        grid,
+        PROBLEM.material,
+        kinematics=PROBLEM.kinematics,
+        supports=(fem.Fixed(grid.node_sets["left"]),),
+        loads=(fem.Traction(grid.facet_sets["right"], jnp.array([2e4, 3e3]), name="end"),),
+        formulation=fem.Displacement(),
+    )
+
+
+def test_another_problem_of_the_same_shapes_compiles_nothing_and_has_its_own_solver(caplog):
+    orders = jnp.array([jnp.arange(8), [5, 2, 7, 0, 3, 6, 1, 4]])
+    first, second = (_renumbered(order) for order in orders)
+    assert first.space.system.num_values == second.space.system.num_values
+    assert not jnp.array_equal(first.space.system.cols, second.space.system.cols)
+
+    @eqx.filter_jit
+    def inside(problem):
+        return fem.solve(problem, newton=TIGHT)
+
+    def states(problem):
+        return fem.solve(problem, newton=TIGHT).displacement, inside(problem).displacement
+
+    want = states(first)[0]
+    with jax.log_compiles(), caplog.at_level(logging.WARNING):
+        found = states(second)
+    assert not [r for r in caplog.records if r.getMessage().startswith("Compiling")]
+    assert _close(want, states(first)[1], 1e-12)
+    for u in found:
+        assert _close(u, want[orders[1]], 1e-12)
+    returned = inside(second).problem  # static fields of the first, data of the second
+    assert _close(fem.solve(returned, newton=TIGHT).displacement, found[0], 1e-12)

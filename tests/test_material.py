@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import brentq
 
 import sorojax as sj
-from sorojax import material
+from sorojax import fem, material, mesh
 from sorojax.material.kinematics import from_matrix
 from sorojax.units import kPa
 
@@ -190,6 +190,37 @@ def test_closed_forms_of_tension_biaxial_tension_and_shear(name):
             assert np.max(np.abs(P - exact)) < 1e-10 * max(np.max(np.abs(exact)), 1e5)
         P = response(rubber, jnp.eye(3).at[0, 1].set(l - 1))[1]
         assert np.isclose(P[0, 1], shear_stress(name, l - 1), rtol=1e-10, atol=1e-10 * 1e5)
+
+
+SHEET = mesh.rectangle([0, 0], [1, 1], divisions=(1, 1), element=mesh.Tri3())
+SPACE = fem.space(SHEET)
+
+
+@pytest.mark.parametrize("name", ISOTROPIC)
+def test_closed_forms_are_equilibria_of_cells(name):
+    """Two cells pulled in plane strain find the free stretch, force and stress."""
+    walls, pulled = SHEET.node_sets, 1.3
+    problem = fem.problem(
+        SHEET,
+        ISOTROPIC[name],
+        kinematics=fem.PlaneStrain(1.0),
+        supports=(
+            fem.Fixed(walls["left"], components=(0,)),
+            fem.Fixed(walls["bottom"], components=(1,)),
+            fem.Prescribed(walls["right"], [pulled - 1], components=(0,)),
+        ),
+        formulation=fem.Displacement(),
+        space=SPACE,
+    )
+    u = fem.solve(problem, newton=fem.Newton(residual_tolerance=1e-12)).displacement
+    free = free_stretch(name, STATES[2], pulled)
+    stress = principal_stress(name, (pulled, free, 1.0))
+    assert abs(u[mesh.nearest_node(SHEET, [1.0, 1.0]), 1] + 1 - free) < 1e-10
+    force = fem.reaction_force(problem, u, walls["right"])
+    assert abs(force[0] - stress[0] * 1.0) < 1e-10 * abs(stress[0])
+    sigma = fem.cauchy_stress(problem, u)[0, 0]
+    exact = np.diag(stress * np.array([pulled, free, 1.0])) / (pulled * free)
+    assert np.max(np.abs(sigma - exact)) < 1e-10 * np.max(np.abs(exact))
 
 
 @pytest.mark.parametrize("name", ["NeoHookean", "MooneyRivlin", "StVenantKirchhoff"])

@@ -1,5 +1,10 @@
 """The sparse door: right answers, derivatives, batches, and factors that know their owner."""
 
+import gc
+import os
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -87,3 +92,67 @@ def test_strange_facets_are_refused(getkey):
     system, _, _ = _system(getkey)
     with pytest.raises(ValueError, match="no place in the pattern"):
         sparse.slots_of(system, np.array([[0, 9]]))
+
+
+def test_a_program_outlives_the_system_it_was_compiled_for(getkey):
+    first, values, b = _system(getkey)
+    other = sparse.from_cells(5, CELLS[::-1], components=2)
+    assert np.array_equal(first.key, other.key)  # equal patterns share one solver
+    shuffled = sparse.from_cells(5, np.array([[0, 1, 3], [1, 3, 2], [3, 2, 4]]), components=2)
+    assert shuffled.num_values == first.num_values
+    assert not np.array_equal(first.key, shuffled.key)
+
+    @jax.jit
+    def solved(system, values, b):
+        return system, sparse.solve(system, values, b)
+
+    _, x = solved(first, values, b)
+    shuffled_values = jnp.asarray(np.where(shuffled.rows == shuffled.cols, 9.0, 1.0))
+    want = jnp.linalg.solve(_dense(shuffled, shuffled_values), b)
+    copy, y = solved(shuffled, shuffled_values, b)
+    assert solved._cache_size() == 1
+    assert jnp.allclose(y, want) and jnp.allclose(_dense(first, values) @ x, b)
+    del shuffled
+    gc.collect()
+    assert jnp.allclose(solved(copy, shuffled_values, b)[1], want)
+    assert copy.solver.num_factorisations > 0
+
+
+def test_lanes_may_have_patterns_of_their_own(getkey):
+    first, values, b = _system(getkey)
+    second = sparse.from_cells(5, np.array([[0, 1, 3], [1, 3, 2], [3, 2, 4]]), components=2)
+    both = jax.tree.map(lambda x, y: jnp.stack([x, y]), first, second)
+    simple = jnp.where(second.rows == second.cols, 9.0, 1.0)
+    x = jax.jit(jax.vmap(sparse.solve, (0, 0, None)))(both, jnp.stack([values, simple]), b)
+    assert jnp.allclose(_dense(first, values) @ x[0], b)
+    assert jnp.allclose(_dense(second, simple) @ x[1], b)
+
+
+_ONE_CORE = """
+import os
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+import jax, jax.numpy as jnp, numpy as np
+jax.config.update("jax_enable_x64", True)
+from sorojax.math import sparse
+n = 100_000
+system = sparse.from_cells(n, np.stack([np.arange(n - 1), np.arange(1, n)], 1))
+values = jnp.where(system.rows == system.cols, 3.0, -1.0)
+
+@jax.jit
+def steps(values, b):
+    two = sparse.solve(system, values, b) + sparse.solve(system, 2 * values, b[::-1])
+    return jax.lax.fori_loop(0, 3, lambda _, x: sparse.solve(system, values, x), two)
+
+starts = [steps(values, jnp.ones(n) + k) for k in range(4)]
+print(float(sum(jnp.max(x) for x in starts)))
+"""
+
+
+def test_solves_in_programs_under_way_on_one_core_end():
+    if not hasattr(os, "sched_setaffinity"):
+        pytest.skip("this system cannot hold a process to one core")
+    done = subprocess.run(
+        [sys.executable, "-c", _ONE_CORE], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert np.isclose(float(done.stdout), 1.5 * (1 + 2 + 3 + 4), rtol=1e-3)

@@ -1,5 +1,7 @@
 """Frictionless contact of a body with a shape that does not deform."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -25,10 +27,13 @@ class Contact(AbstractLoad):
     A penalty per reference area at the quadrature points of the facets, `contact.Penalty`.
     Facets of which no point can touch cost one value of the obstacle's field for every 32.
 
-    `stiffness` [Pa/m] is 10 E / h when omitted, h being the mean size of the facets, and
-    `smoothing` [m] is h / 1000: pressure p then overlaps by about h p / (10 E). Under
+    `stiffness` [Pa/m] is 10 E / h when omitted, h being the mean size of the facets:
+    pressure p then overlaps by about h p / (10 E). `smoothing` [m] is E / 1000 over the
+    stiffness: the law is linear beyond pressures of E / 2000. Under
     `solve_path(problem, name=positions)` the obstacle moves.
     """
+
+    smooth: ClassVar[bool] = False
 
     facets: Int[Array, "facets facet_nodes"] = eqx.field(converter=integers)
     obstacle: AbstractSdf
@@ -77,11 +82,10 @@ class Contact(AbstractLoad):
         facets, size = _compact(mesh, self.facets), _mean_size(mesh, self.facets)
         value = jnp.zeros(mesh.element.dim) if self.value is None else self.value
         stiffness, smoothing = self.stiffness, self.smoothing
-        if stiffness is None:
-            shear, bulk = small_strain_moduli(material)
-            stiffness = 10 * jnp.max(9 * bulk * shear / (3 * bulk + shear)) / size
-        if smoothing is None:
-            smoothing = 1e-3 * size
+        shear, bulk = small_strain_moduli(material)
+        young = jnp.max(9 * bulk * shear / (3 * bulk + shear))
+        stiffness = 10 * young / size if stiffness is None else stiffness
+        smoothing = 1e-3 * young / stiffness if smoothing is None else smoothing
         return eqx.tree_at(
             lambda load: (load.facets, load.stiffness, load.smoothing, load.value),
             self, (integers(facets), stiffness, smoothing, value),

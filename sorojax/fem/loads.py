@@ -28,6 +28,7 @@ class AbstractLoad(eqx.Module):
     value: eqx.AbstractVar[Float[Array, "..."]]
     name: eqx.AbstractVar[str]
     holds: ClassVar[bool] = False  # whether its stiffness can hold the body
+    smooth: ClassVar[bool] = True  # whether the tangent at one load foretells the next
 
     @abc.abstractmethod
     def potential(self, problem: "Problem", u: Float[Array, "nodes dim"]) -> Float[Array, ""]:

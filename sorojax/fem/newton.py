@@ -51,12 +51,13 @@ def newton_solve(
     tangent: Linearised | None = None,
 ) -> Iterate:
     """Equilibrium near `start`. `tangent`, of a neighbouring equilibrium, gives a first
-    guess at the price of one back-substitution."""
+    guess at the price of one back-substitution, unless a load has kinks: the points that
+    an obstacle moved into have no stiffness yet."""
     u, before = start, start
     state = _linearise(problem, prepared, u, before)
     move = np.where(np.asarray(prepared.known), known_values - u.ravel(), 0.0)
     iterations, negative, size = 0, 0, np.inf
-    if tangent is not None:
+    if tangent is not None and all(load.smooth for load in problem.loads):
         du, negative = step(
             problem, prepared, tangent.values, state.residual, jnp.asarray(move)
         )

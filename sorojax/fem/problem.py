@@ -33,7 +33,7 @@ class Problem(eqx.Module):
             f"Problem: {mesh.num_cells} {mesh.element.name} cells, {self.space.num_dofs} dof",
             f"  body      {type(self.material).__name__}, {type(self.kinematics).__name__}, "
             f"{type(self.formulation).__name__}",
-            f"  tangent   {system.num_values} entries, factored by {system.solver.name}",
+            f"  tangent   {system.num_values} entries, factored by {system.solver_name}",
         ]
         for support in self.supports:
             rows.append(f"  support   {type(support).__name__} on {support.nodes.size} nodes")

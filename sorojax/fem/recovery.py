@@ -19,8 +19,11 @@ from sorojax.fem.problem import Problem
 from sorojax.fem.stress import stress_at
 from sorojax.fem.tables import Tables
 from sorojax.mesh.elements import AbstractElement, Hex8, PolyN, Quad4, Quad8, Quad9
-from sorojax.mesh.mesh import Mesh
+from sorojax.mesh.mesh import Mesh, boundary_facets
 from sorojax.mesh.shape import quadrature, shape_functions, shape_gradients
+
+
+_SURE = 0.02  # smallest singular value of a fit over the largest
 
 
 class Patches(NamedTuple):
@@ -57,7 +60,9 @@ def patches(mesh: Mesh) -> Patches:
     at = np.einsum("qa,cai->cqi", _sample_table(mesh.element).values[0], points[cells])
     rings = _rings(mesh, cells)
     powers = _powers(mesh.element)
-    found = [_fit(points[node], at, rings(node, at.shape[1], len(powers)), powers)
+    inside = np.ones(mesh.num_nodes, bool)
+    inside[np.unique(boundary_facets(mesh))] = False
+    found = [_fit(points[node], at, rings(node), powers, inside[node])
              for node in range(mesh.num_nodes)]  # fmt: skip
     most = max(len(samples) for samples, _ in found)
     samples = np.zeros((mesh.num_nodes, most), np.int32)
@@ -72,7 +77,6 @@ def nodal_stress(
 ) -> Float[Array, "nodes 3 3"]:
     """Cauchy stress [Pa] at the nodes, continuous, better than a mean on the boundary.
 
-    Inside a uniform mesh `nodal_average` is of the same order and may be closer.
     At an interface of two materials, where stress jumps, it is smoothed. Pass
     `patches(problem.mesh)` to compute them once for many states.
     """
@@ -111,7 +115,7 @@ def _powers(element: AbstractElement) -> np.ndarray:
 
 
 def _rings(mesh: Mesh, cells: np.ndarray):
-    """The cells around a node, grown until a fit has half as many samples again as needed."""
+    """The cells around a node, grown ring by ring on request."""
     order = np.argsort(cells.ravel(), kind="stable")
     starts = np.searchsorted(cells.ravel()[order], np.arange(mesh.num_nodes + 1))
     owners = order // cells.shape[1]
@@ -119,25 +123,37 @@ def _rings(mesh: Mesh, cells: np.ndarray):
     def around(nodes):
         return np.unique(np.concatenate([owners[starts[n] : starts[n + 1]] for n in nodes]))
 
-    def grown(node, samples_per_cell, needed):
+    def grown(node):
         own = around([node])
-        while len(own) and len(own) * samples_per_cell < 1.5 * needed:
-            more = around(np.unique(cells[own]))
-            if len(more) == len(own):
-                break
+        yield own
+        while len(more := around(np.unique(cells[own]))) > len(own):
             own = more
-        return own
+            yield own
 
     return grown
 
 
-def _fit(point, at, own, powers) -> tuple[np.ndarray, np.ndarray]:
-    """Samples of the cells `own` and their weights in the least squares fit at `point`."""
-    if not len(own):  # a node without cells
-        return np.zeros(0, int), np.zeros(0)
-    place = at[own].reshape(-1, at.shape[2]) - point
-    place = place / np.abs(place).max()
-    basis = np.prod(place[:, None] ** powers[None], axis=2)
+def _fit(point, at, rings, powers, inside: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Samples and their weights in the least squares fit at `point`, over as many rings of
+    cells as it takes for a sure one.
+
+    Inside near samples count more: a further ring only has to tell the curvature and
+    leaves the value to the cells next to the node. On the boundary the fit has to look
+    outward, for which all samples and half as many again are better (both measured).
+    """
+    ids, weights = np.zeros(0, int), np.zeros(0)
+    enough = len(powers) + 1 if inside else 1.5 * len(powers)
     constant = np.flatnonzero(powers.sum(axis=1) == 0)[0]
-    ids = (own[:, None] * at.shape[1] + np.arange(at.shape[1])).ravel()
-    return ids, np.linalg.pinv(basis, rcond=1e-8)[constant]
+    for own in rings:
+        if not len(own):  # a node without cells
+            break
+        place = at[own].reshape(-1, at.shape[2]) - point
+        distance = np.sqrt(np.sum(place**2, axis=1))
+        basis = np.prod((place / distance.max())[:, None] ** powers[None], axis=2)
+        trust = 1 / (0.1 + (distance / distance.min()) ** 2) if inside else np.ones(len(place))
+        values = np.linalg.svd(basis, compute_uv=False)
+        ids = (own[:, None] * at.shape[1] + np.arange(at.shape[1])).ravel()
+        weights = np.linalg.pinv(trust[:, None] * basis, rcond=1e-8)[constant] * trust
+        if len(basis) >= enough and values[-1] > _SURE * values[0]:
+            break
+    return ids, weights

@@ -139,7 +139,7 @@ def _initial(problem: Problem, begin: Begin | None, steps: int) -> _State:
     points = problem.mesh.points
     u = jnp.zeros_like(points) if begin is None else jnp.asarray(begin.u, points.dtype)
     tangent = None if begin is None else begin.tangent
-    predict = jnp.asarray(tangent is not None)
+    predict = jnp.asarray(tangent is not None and _smooth(problem))
     if tangent is None:
         tangent = jnp.zeros(problem.space.system.num_values, points.dtype)
     false, zero = jnp.asarray(False), jnp.zeros((), points.dtype)
@@ -150,6 +150,10 @@ def _initial(problem: Problem, begin: Begin | None, steps: int) -> _State:
         iterations=none, total=none, cuts=none, failures=none,
         running=jnp.all(jnp.isfinite(u)),
     )  # fmt: skip
+
+
+def _smooth(problem: Problem) -> bool:
+    return all(load.smooth for load in problem.loads)
 
 
 def _goal(done, step):
@@ -216,7 +220,7 @@ def _next(problem, prepared, state: _State, level: _Level, max_cuts: int) -> _St
     branches = (
         (level.stepped, moved),
         (level.collapsed, shortened),
-        (level.converged, _accepted(state, level)),
+        (level.converged, _accepted(state, level, _smooth(problem))),
         (level.failed, _cut(state, max_cuts)),
     )
     chosen = state
@@ -225,11 +229,11 @@ def _next(problem, prepared, state: _State, level: _Level, max_cuts: int) -> _St
     return chosen
 
 
-def _accepted(state: _State, level: _Level) -> _State:
+def _accepted(state: _State, level: _Level, smooth: bool) -> _State:
     step = jnp.where(state.iterations <= 5, 1.5 * state.step, state.step)
     state = state._replace(
         before=state.u, start=state.u, tangent=level.values, done=state.goal, step=step,
-        predict=jnp.asarray(True),
+        predict=jnp.asarray(smooth),
         goal=_goal(state.goal, step), total=state.total + state.iterations,
         failures=jnp.zeros_like(state.failures), running=state.goal < 1.0,
     )  # fmt: skip

@@ -1,17 +1,52 @@
 """Gauss-Legendre quadrature on [0, 1] and spectral integration between its nodes.
 
-Everything here depends on a node count only, so it is computed on the host, cached,
-and enters a program as a constant.
+A rule is a node count, or a `Quadrature` where the integrand is smooth between known
+breaks only. Everything here depends on the rule alone, so it is computed on the host,
+cached, and enters a program as a constant.
 """
 
 import functools
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 Values: TypeAlias = np.ndarray | jax.Array
+
+
+class Quadrature(NamedTuple):
+    """Gauss nodes on each of the spans into which `breaks` divide [0, 1].
+
+    Attributes:
+        count: Nodes of a span.
+        breaks: Where spans meet, rising strictly inside (0, 1).
+    """
+
+    count: int
+    breaks: tuple[float, ...] = ()
+
+    @property
+    def edges(self) -> np.ndarray:
+        """Ends of the spans, 0 and 1 included."""
+        return np.array([0.0, *self.breaks, 1.0])
+
+    @property
+    def num_nodes(self) -> int:
+        return self.count * (len(self.breaks) + 1)
+
+    @property
+    def cell_ends(self) -> np.ndarray:
+        """Nodes and breaks, rising: ends of cells in which an integrand is smooth."""
+        return np.sort(np.concatenate([gauss_legendre(self)[0], self.breaks]))
+
+    @property
+    def node_cells(self) -> np.ndarray:
+        """The cell that ends at each node."""
+        return np.searchsorted(self.cell_ends, gauss_legendre(self)[0])
+
+
+Rule: TypeAlias = int | Quadrature
 
 
 def legendre_values(s: Values, degree: int) -> Values:
@@ -33,18 +68,61 @@ def chebyshev_values(s: Values, degree: int) -> Values:
 
 
 @functools.lru_cache(maxsize=64)
-def gauss_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes and weights on [0, 1], exact for polynomials of degree 2 count - 1."""
-    x, w = np.polynomial.legendre.leggauss(count)
-    return _frozen((x + 1) / 2), _frozen(w / 2)
+def gauss_legendre(rule: Rule) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights on [0, 1], exact for polynomials of degree 2 count - 1 per span."""
+    if isinstance(rule, int):
+        x, w = np.polynomial.legendre.leggauss(rule)
+        return _frozen((x + 1) / 2), _frozen(w / 2)
+    x, w = gauss_legendre(rule.count)
+    starts, sizes = rule.edges[:-1, None], np.diff(rule.edges)[:, None]
+    return _frozen((starts + sizes * x).ravel()), _frozen((sizes * w).ravel())
 
 
-def integration_rows(count: int, s: Values) -> Values:
-    """Weights that integrate from 0 to each `s` what is known at `count` Gauss nodes.
+def integration_rows(rule: Rule, s: Values) -> Values:
+    """Weights that integrate from 0 to each `s` what is known at the nodes of `rule`.
 
     Row k holds the integrals from 0 to s_k of the Lagrange polynomials of the nodes;
     the Legendre form is well conditioned at any count.
     """
+    if isinstance(rule, int):
+        return _integration_rows(rule, s)
+    if not rule.breaks:
+        return _integration_rows(rule.count, s)
+    sizes = np.diff(rule.edges)
+    parts = [
+        float(size) * _integration_rows(rule.count, local)
+        for size, local in zip(sizes, _local(rule, s), strict=True)
+    ]
+    return _joined(parts)
+
+
+def interpolation_rows(rule: Rule, s: Values) -> Values:
+    """Weights that take what is known at the nodes of `rule` to each `s`.
+
+    Row k holds the Lagrange polynomials of the nodes at s_k; a break belongs to the span
+    behind it.
+    """
+    if isinstance(rule, int):
+        return _interpolation_rows(rule, s)
+    if not rule.breaks:
+        return _interpolation_rows(rule.count, s)
+    edges, parts = rule.edges, []
+    for k, local in enumerate(_local(rule, s)):
+        inside = (s >= edges[k]) if k else (s < edges[1])
+        if 0 < k < len(rule.breaks):
+            inside = inside & (s < edges[k + 1])
+        rows = _interpolation_rows(rule.count, local)
+        parts.append(rows * inside[:, None].astype(rows.dtype))
+    return _joined(parts)
+
+
+@functools.lru_cache(maxsize=64)
+def integration_matrix(rule: Rule) -> np.ndarray:
+    """Integrals from 0 to each node, (nodes, nodes)."""
+    return _frozen(np.asarray(integration_rows(rule, gauss_legendre(rule)[0])))
+
+
+def _integration_rows(count: int, s: Values) -> Values:
     nodes, weights = gauss_legendre(count)
     at_nodes = legendre_values(nodes, count - 1) * weights
     values = legendre_values(s, count)
@@ -55,10 +133,29 @@ def integration_rows(count: int, s: Values) -> Values:
     return rises.T @ at_nodes / 2
 
 
-@functools.lru_cache(maxsize=64)
-def integration_matrix(count: int) -> np.ndarray:
-    """Integrals from 0 to each Gauss node, (count, count)."""
-    return _frozen(np.asarray(integration_rows(count, gauss_legendre(count)[0])))
+def _interpolation_rows(count: int, s: Values) -> Values:
+    nodes, weights = gauss_legendre(count)
+    scale = 2 * np.arange(count) + 1.0
+    at_nodes = scale[:, None] * legendre_values(nodes, count - 1) * weights
+    values = legendre_values(s, count - 1)
+    return values.T @ np.asarray(at_nodes, dtype=values.dtype)
+
+
+def _local(rule: Quadrature, s: Values) -> list[Values]:
+    """Coordinates of `s` in each span, held inside it except beyond 0 and 1."""
+    edges, last = rule.edges, len(rule.breaks)
+    xp = jnp if isinstance(s, jax.Array) else np
+    found = []
+    for k in range(last + 1):
+        local = (s - float(edges[k])) / float(edges[k + 1] - edges[k])
+        local = xp.maximum(local, 0.0) if k else local
+        found.append(xp.minimum(local, 1.0) if k < last else local)
+    return found
+
+
+def _joined(parts: list) -> Any:
+    xp = jnp if isinstance(parts[0], jax.Array) else np
+    return xp.concatenate(parts, axis=1)
 
 
 def _stack(rows: list) -> Any:

@@ -6,127 +6,73 @@ differentiable in the values and in the right-hand side, at the price of one mor
 back-substitution with the same factor.
 """
 
-import os
-from collections import OrderedDict
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sorojax.math import pardiso, superlu
-
-_NUM_FACTORS = 4
-Factor = pardiso.PardisoFactor | superlu.SuperLUFactor
-
-
-def available_solvers() -> dict[str, str]:
-    """Direct solvers found on this machine, best first, with their versions."""
-    import scipy
-
-    mkl = pardiso.version()
-    found = {"pardiso": f"MKL {mkl}"} if mkl else {}
-    return found | {"superlu": f"SciPy {scipy.__version__}"}
+from sorojax._types import is_traced
+from sorojax.math.direct import (
+    DirectSolver,
+    Factor as Factor,
+    available_solvers as available_solvers,
+    pattern_key,
+    solver_of,
+)
+from sorojax.math.host_call import host_call
 
 
-def _backend():
-    asked = os.environ.get("SOROJAX_SOLVER", "")
-    if asked not in ("", "pardiso", "superlu"):
-        raise ValueError(
-            f"SOROJAX_SOLVER is {asked!r}, need 'pardiso' or 'superlu'. Unset it for the "
-            "best solver found."
-        )
-    if asked != "superlu" and pardiso.library() is not None:
-        return pardiso.Pardiso
-    if asked == "pardiso":
-        raise ValueError("SOROJAX_SOLVER is 'pardiso': install sorojax[pardiso] first.")
-    return superlu.SuperLU
+class _Kept:
+    """Keeps a solver alive as long as its system. All are equal, so that systems of one
+    size share compiled programs."""
 
+    def __init__(self, solver: DirectSolver):
+        self.solver = solver
 
-class DirectSolver:
-    """Host side of a system: symbolic analysis and the last few numeric factors.
+    def __eq__(self, other):
+        return isinstance(other, _Kept)
 
-    A slot records the values that its factor belongs to, so that a factor is never
-    used for other values than its own.
-    """
-
-    def __init__(self, indptr: np.ndarray, indices: np.ndarray):
-        self._solver = _backend()(indptr, indices, _NUM_FACTORS)
-        self._slots: OrderedDict[int, tuple[np.ndarray, Factor]] = OrderedDict()
-        self.num_factorisations = 0
-
-    @property
-    def name(self) -> str:
-        return self._solver.name
-
-    def factor(self, values: np.ndarray) -> Factor | None:
-        """Factor of `values`, reused if a slot holds it; `None` if singular."""
-        values = np.asarray(values)
-        for slot, (owner, factor) in self._slots.items():
-            if owner is values or np.array_equal(owner, values):
-                self._slots.move_to_end(slot)
-                return factor
-        if not np.all(np.isfinite(values)):
-            return None
-        slot = len(self._slots)
-        if slot == _NUM_FACTORS:
-            slot, _ = self._slots.popitem(last=False)
-        factor = self._solver.factor(values, slot)
-        self.num_factorisations += 1
-        if factor is not None:
-            self._slots[slot] = (values.copy(), factor)
-        else:  # keep the slot's number in circulation
-            self._slots[slot] = (np.full(1, np.nan), factor)  # type: ignore[arg-type]
-            self._slots.move_to_end(slot, last=False)
-        return factor
-
-    def solve(self, values: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """x with A(values) x = b for any leading batch axes; NaN where singular."""
-        values, b = np.asarray(values), np.asarray(b)
-        lead = np.broadcast_shapes(values.shape[:-1], b.shape[:-1])
-        if values.ndim == 1 or values.size == values.shape[-1]:
-            return self._solve_many(values.reshape(-1), b, lead)
-        values = np.broadcast_to(values, (*lead, values.shape[-1]))
-        b = np.broadcast_to(b, (*lead, b.shape[-1]))
-        x = np.empty(b.shape)
-        for index in np.ndindex(*lead):
-            x[index] = self._solve_many(values[index], b[index], ())
-        return x
-
-    def solve_with_inertia(self, values: np.ndarray, b: np.ndarray) -> tuple:
-        """x with A(values) x = b, and how many eigenvalues are negative: -1 and zeros where
-        A is singular, so that a failed step stays finite."""
-        factor = self.factor(values)
-        if factor is None:
-            return np.zeros(b.shape), np.int32(-1)
-        return factor.solve(np.asarray(b)), np.int32(max(factor.negative_eigenvalues, 0))
-
-    def _solve_many(self, values, b, lead) -> np.ndarray:
-        factor = self.factor(values)
-        if factor is None:
-            return np.full((*lead, b.shape[-1]), np.nan)
-        rhs = b.reshape(-1, b.shape[-1])
-        x = factor.solve(rhs[0])[None] if len(rhs) == 1 else factor.solve(rhs)
-        return np.broadcast_to(x.reshape(b.shape), (*lead, b.shape[-1]))
+    def __hash__(self):
+        return hash(_Kept)
 
 
 class SparseSymmetric(eqx.Module):
-    """Pattern of a symmetric matrix, upper triangle by rows.
+    """Pattern of a symmetric matrix, upper triangle by rows, with its whole diagonal.
 
     `slots` places the upper triangle of every element matrix, row by row, in the
-    values. `solver` is host state; it is compared by identity.
+    values. `key` names the pattern and with it the solver on the host, as data: a program
+    compiled for one system serves every other one of the same sizes.
     """
 
     rows: Int[Array, " nnz"]
     cols: Int[Array, " nnz"]
     slots: Int[Array, "cells entries"]
+    key: Int[Array, " 2"]
     size: int = eqx.field(static=True)
-    solver: DirectSolver = eqx.field(static=True)
+    _kept: _Kept = eqx.field(static=True)
 
     @property
     def num_values(self) -> int:
         return self.rows.shape[0]
+
+    @property
+    def solver_name(self) -> str:
+        return self._kept.solver.name
+
+    @property
+    def solver(self) -> DirectSolver:
+        """The solver on the host, for concrete systems.
+
+        Raises:
+            ValueError: Inside a trace; use `solve` there.
+        """
+        if is_traced(self.key):
+            raise ValueError(
+                "SparseSymmetric.solver: got a traced system, need a concrete one. Use "
+                "sparse.solve inside jit and vmap."
+            )
+        return solver_of(self.key, self.rows, self.cols)
 
 
 def from_cells(
@@ -149,13 +95,15 @@ def from_cells(
         np.concatenate([own.ravel(), diagonal, *others]), return_inverse=True
     )
     rows, cols = keys // size, keys % size
-    indptr = np.searchsorted(rows, np.arange(size + 1))
+    rows, cols = rows.astype(np.int32), cols.astype(np.int32)
+    key = pattern_key(rows, cols)
     return SparseSymmetric(
-        rows=jnp.asarray(rows, jnp.int32),
-        cols=jnp.asarray(cols, jnp.int32),
+        rows=jnp.asarray(rows),
+        cols=jnp.asarray(cols),
         slots=jnp.asarray(inverse[: own.size].reshape(own.shape), jnp.int32),
+        key=jnp.asarray(key),
         size=size,
-        solver=DirectSolver(indptr, cols),
+        _kept=_Kept(solver_of(key, rows, cols, owned=True)),
     )
 
 
@@ -227,13 +175,9 @@ def solve(
     """
 
     def on_host(_, rhs):
-        return jax.pure_callback(
-            system.solver.solve,
-            jax.ShapeDtypeStruct(rhs.shape, rhs.dtype),
-            values,
-            rhs,
-            vmap_method="expand_dims",
-        )
+        shape = jax.ShapeDtypeStruct(rhs.shape, rhs.dtype)
+        args = (system.key, system.rows, system.cols, values, rhs)
+        return host_call(_solve_on_host, (shape,), *args)[0]
 
     return jax.lax.custom_linear_solve(
         lambda x: product(system, values, x),
@@ -252,6 +196,22 @@ def solve_with_inertia(
     For loops that decide by the outcome; it has no derivative, `solve` has.
     """
     shapes = (jax.ShapeDtypeStruct(b.shape, b.dtype), jax.ShapeDtypeStruct((), jnp.int32))
-    return jax.pure_callback(
-        system.solver.solve_with_inertia, shapes, values, b, vmap_method="sequential"
-    )
+    args = (system.key, system.rows, system.cols, values, b)
+    x, negative = host_call(_step_on_host, shapes, *args, sequential=True)
+    return x, negative
+
+
+def _solve_on_host(key, rows, cols, values, b) -> tuple[np.ndarray]:
+    if key.size == 2:
+        return (solver_of(key, rows, cols).solve(values, b),)
+    args = (key, rows, cols, values, b)  # lanes with patterns of their own
+    lead = np.broadcast_shapes(*(x.shape[:-1] for x in args))
+    *pattern, values, b = (np.broadcast_to(x, (*lead, x.shape[-1])) for x in args)
+    x = np.empty(b.shape)
+    for lane in np.ndindex(*lead):
+        x[lane] = solver_of(*(p[lane] for p in pattern)).solve(values[lane], b[lane])
+    return (x,)
+
+
+def _step_on_host(key, rows, cols, values, b) -> tuple:
+    return solver_of(key, rows, cols).solve_with_inertia(values, b)

@@ -56,24 +56,53 @@ def _advance(y, h, row, slopes):
     return jax.tree.map(move, y, *(slope for _, slope in used))
 
 
+class ContactTerms(NamedTuple):
+    """Contact apart from the other forces, for methods that treat it apart.
+
+    Attributes:
+        free: (t, q, v) -> (mass matrix, force without contact, moment).
+        near: (moment, h) -> whether a step of `h` about that moment may meet contact.
+        force: (t, q, v) -> (force, stiffness, damping) of the contacts.
+    """
+
+    free: Callable[[Array, Array, Array], tuple[Array, Array, Any]]
+    near: Callable[[Any, Array], Array]
+    force: Callable[[Array, Array, Array], tuple[Array, Array, Array]]
+
+
 class SecondOrder(NamedTuple):
     """Equations M(q) a = f(t, q, v) with the matrices an implicit method may lean on.
+
+    Where rates are not derivatives of coordinates (a pose with a quaternion), `retract`
+    and `rate` say how they move them.
 
     Attributes:
         equations: (t, q, v) -> (mass matrix, force).
         stiffness: About - df/dq.
         damping: About - df/dv.
+        linearised: (t, q, v) -> (mass matrix, force, stiffness, damping) where those
+            matrices change along the motion, as in contact.
+        retract: (q, increment of the rates' dimension) -> q moved; a sum if None.
+        rate: (q, v) -> dq/dt; v if None.
+        unroll: Write the stages of explicit methods out: faster by some percent, slow to
+            compile.
+        contact: Contact, which `equations` hold as well, apart; None without any.
     """
 
     equations: Callable[[Array, Array, Array], tuple[Array, Array]]
     stiffness: Float[Array, "dof dof"]
     damping: Float[Array, "dof dof"]
+    linearised: Callable[[Array, Array, Array], tuple[Array, Array, Array, Array]] | None = None
+    retract: Callable[[Array, Array], Array] | None = None
+    rate: Callable[[Array, Array], Array] | None = None
+    unroll: bool = False
+    contact: ContactTerms | None = None
 
 
 class Kinematic(NamedTuple):
     """Coordinates, rates and accelerations of a second-order system."""
 
-    q: Float[Array, " dof"]
+    q: Float[Array, " coordinates"]
     v: Float[Array, " dof"]
     a: Float[Array, " dof"]
 
@@ -89,6 +118,13 @@ class AbstractStepper(eqx.Module):
 def start(problem: SecondOrder, t, q: Array, v: Array) -> Kinematic:
     """A state with the acceleration that belongs to (q, v)."""
     return Kinematic(q, v, solve_symmetric(*problem.equations(t, q, v)))
+
+
+def linearised(problem: SecondOrder, t, q: Array, v: Array) -> tuple[Array, ...]:
+    """Mass matrix, force, stiffness and damping at (t, q, v)."""
+    if problem.linearised is not None:
+        return problem.linearised(t, q, v)
+    return *problem.equations(t, q, v), problem.stiffness, problem.damping
 
 
 class GeneralisedAlpha(AbstractStepper):
@@ -111,40 +147,127 @@ class GeneralisedAlpha(AbstractStepper):
         gamma = 1 / 2 + af - am
         beta = (gamma + 1 / 2) ** 2 / 4
         q, v, a = state
-        drift = q + h * v + h * h * (1 / 2 - beta) * a
+        leap = h * v + h * h * (1 / 2 - beta) * a
         surge = v + h * (1 - gamma) * a
-        implicit = (1 - af) * (gamma * h * problem.damping + beta * h**2 * problem.stiffness)
-        new = a
-        for _ in range(self.passes):
-            middle_q = (1 - af) * (drift + h * h * beta * new) + af * q
+
+        def improve(_, new):
+            middle_q = move(problem, q, (1 - af) * (leap + h * h * beta * new))
             middle_v = (1 - af) * (surge + h * gamma * new) + af * v
-            mass, force = problem.equations(t + (1 - af) * h, middle_q, middle_v)
+            mass, force, stiffness, damping = linearised(
+                problem, t + (1 - af) * h, middle_q, middle_v
+            )
+            implicit = (1 - af) * (gamma * h * damping + beta * h**2 * stiffness)
             residual = mass @ ((1 - am) * new + am * a) - force
-            new = new - solve_symmetric((1 - am) * mass + implicit, residual)
-        return Kinematic(drift + h * h * beta * new, surge + h * gamma * new, new)
+            return new - solve_symmetric((1 - am) * mass + implicit, residual)
+
+        new = jax.lax.fori_loop(0, self.passes, improve, a)
+        return Kinematic(move(problem, q, leap + h * h * beta * new), surge + h * gamma * new, new)
+
+
+class ImplicitMidpoint(AbstractStepper):
+    """Implicit midpoint with approximate Newton passes: second order, time-reversible.
+
+    Attributes:
+        passes: Newton passes per step.
+    """
+
+    passes: int = eqx.field(static=True, default=2)
+
+    def step(self, problem, t, h, state):
+        q, v, a = state
+
+        def improve(_, new):
+            half = v + h / 2 * new
+            middle = move(problem, q, h / 2 * half)
+            mass, force, stiffness, damping = linearised(problem, t + h / 2, middle, half)
+            implicit = mass + h / 2 * damping + h**2 / 4 * stiffness
+            return new - solve_symmetric(implicit, mass @ new - force)
+
+        new = jax.lax.fori_loop(0, self.passes, improve, a)
+        return Kinematic(move(problem, q, h * (v + h / 2 * new)), v + h * new, new)
+
+
+class TripleJump(AbstractStepper):
+    """Three implicit midpoint steps of h (1.35, -1.70, 1.35): order 4.
+
+    Attributes:
+        passes: Newton passes per midpoint step.
+
+    Reference:
+        Yoshida, Construction of higher order symplectic integrators, Phys. Lett. A 150, 1990.
+    """
+
+    passes: int = eqx.field(static=True, default=2)
+
+    def step(self, problem, t, h, state):
+        midpoint, outer = ImplicitMidpoint(self.passes), 1 / (2 - 2 ** (1 / 3))
+        shares = h * jnp.array([outer, 1 - 2 * outer, outer], h.dtype)
+
+        def jump(carry, share):
+            t, state = carry
+            return (t + share, midpoint.step(problem, t, share, state)), None
+
+        (_, state), _ = jax.lax.scan(jump, (t, state), shares)
+        return state
 
 
 class RungeKutta4(AbstractStepper):
     """Classical explicit method of order 4; unstable beyond h omega = 2.8."""
 
     def step(self, problem, t, h, state):
-        q, v = rk4_step(_first_order(problem), t, (state.q, state.v), h)
-        return Kinematic(q, v, state.a)
+        return _explicit(_RK4, _RK4_TIMES, problem, t, h, state)
 
 
 class DormandPrince(AbstractStepper):
     """Explicit method of order 5, for undamped motion at high accuracy."""
 
     def step(self, problem, t, h, state):
-        q, v = dormand_prince_step(_first_order(problem), t, (state.q, state.v), h)
-        return Kinematic(q, v, state.a)
+        return _explicit(_DORMAND_PRINCE, _DORMAND_PRINCE_TIMES, problem, t, h, state)
 
 
-def _first_order(problem: SecondOrder) -> Field:
+def move(problem: SecondOrder, q: Array, increment: Array) -> Array:
+    """Coordinates after an increment of the rates' dimension."""
+    return q + increment if problem.retract is None else problem.retract(q, increment)
+
+
+def vector_field(problem: SecondOrder) -> Field:
+    """(t, (q, v)) -> (dq/dt, dv/dt), for methods of first order."""
+
     def field(t, y):
-        return y[1], solve_symmetric(*problem.equations(t, *y))
+        q, v = y
+        rate = v if problem.rate is None else problem.rate(q, v)
+        return rate, solve_symmetric(*problem.equations(t, q, v))
 
     return field
+
+
+def _explicit(tableau, times, problem: SecondOrder, t, h, state: Kinematic) -> Kinematic:
+    field = vector_field(problem)
+    if problem.unroll:
+        q, v = _explicit_step(tableau, times, field, t, (state.q, state.v), h)
+    else:
+        q, v = _rolled_step(tableau, times, field, t, (state.q, state.v), h)
+    if problem.retract is not None:
+        q = problem.retract(q, jnp.zeros_like(v))  # back on the manifold
+    return Kinematic(q, v, state.a)
+
+
+def _rolled_step(tableau, times, field, t, y, h):
+    """A Runge-Kutta step that traces the field once, however many stages it has."""
+    count = len(tableau)
+    weights = jnp.array([(*row, *[0.0] * (count - len(row))) for row in tableau], h.dtype)
+    starts = jnp.array([0.0, *times], h.dtype)
+
+    def moved(row, slopes):
+        return jax.tree.map(lambda x, k: x + h * jnp.tensordot(row, k, 1), y, slopes)
+
+    def stage(i, slopes):
+        start = jnp.where(i == 0, jnp.zeros_like(starts), weights[i - 1])
+        rates = field(t + starts[i] * h, moved(start, slopes))
+        return jax.tree.map(lambda k, rate: k.at[i].set(rate), slopes, rates)
+
+    blank = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), y)
+    return moved(weights[-1], jax.lax.fori_loop(0, count, stage, blank))
 
 
 def integrate(

@@ -1,85 +1,127 @@
 """The strains of a material line of a solid: what a rod in its place would feel."""
 
-import abc
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sorojax import _check
-from sorojax._types import real
 from sorojax.fem.solve import Path
 from sorojax.mesh.locate import Locations, locate
+from sorojax.reduction.curve import AbstractCurve, Line as Line, Reference, reference
+from sorojax.reduction.twist import pose_strain, section_axes
+from sorojax.rod.basis import STRAINS
 
-
-class AbstractCurve(eqx.Module):
-    """A curve in the reference configuration, parametrised by s in [0, 1]."""
-
-    @abc.abstractmethod
-    def __call__(self, s: Float[Array, " points"]) -> Float[Array, "points dim"]:
-        """Points [m]."""
-
-
-class Line(AbstractCurve):
-    """The straight line from `start` to `end` [m]."""
-
-    start: Float[Array, "2"] = eqx.field(converter=real)
-    end: Float[Array, "2"] = eqx.field(converter=real)
-
-    def __check_init__(self):
-        _check.shape("Line", "start", self.start, (2,), "Give (x, y) in metres.")
-        _check.shape("Line", "end", self.end, (2,), "Give (x, y) in metres.")
-        if _check.is_concrete(self.start) and np.allclose(self.start, self.end, rtol=0, atol=0):
-            raise ValueError(
-                f"Line: `start` and `end` are both {np.asarray(self.start)} m. Give two points."
-            )
-
-    def __call__(self, s):
-        return self.start[None] + s[:, None] * (self.end - self.start)[None]
+PLANAR = ("kappa_z", "sigma_x", "sigma_y")
 
 
 class Backbone(eqx.Module):
-    """Snapshots of a line in the frame of its base: x along the line at rest.
+    """Snapshots of a curve in the frame of its base: x along the curve at rest.
 
-    `strain` holds kappa_z [1/m], sigma_x and sigma_y [-] at the samples `s` in [0, 1].
+    `strain` holds kappa_z [1/m], sigma_x and sigma_y [-] at the samples `s` in [0, 1], in
+    space all six strains; `rest` is that of the unloaded curve, None for a straight one.
     """
 
     s: Float[Array, " samples"]
     length: Float[Array, ""]
-    positions: Float[Array, "steps samples 2"]
-    strain: Float[Array, "steps samples 3"]
+    positions: Float[Array, "steps samples dim"]
+    strain: Float[Array, "steps samples strain"]
+    rest: Float[Array, "samples strain"] | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns of `strain`."""
+        return STRAINS if self.strain.shape[-1] == 6 else PLANAR
+
+    @property
+    def change(self) -> Float[Array, "steps samples strain"]:
+        """Strain less that of the unloaded curve."""
+        return self.strain - self.rest_or_straight[None]
+
+    @property
+    def rest_or_straight(self) -> Float[Array, "samples strain"]:
+        if self.rest is not None:
+            return self.rest
+        straight = jnp.array([float(name == "sigma_x") for name in self.names])
+        return jnp.broadcast_to(straight, self.strain.shape[1:])
+
+    def rest_strain(self, s: Float[Array, " points"]) -> Float[np.ndarray, "points strain"]:
+        """Strain at rest between the samples: give it to `rod` as its `rest_strain`."""
+        columns = np.asarray(self.rest_or_straight).T
+        return np.stack([np.interp(s, self.s, column) for column in columns], axis=1)
 
 
 class Probe(eqx.Module):
-    """Samples of a line in a mesh: takes a displacement field to line positions."""
+    """Samples of a curve in a mesh: takes a displacement field to positions and strain.
+
+    Row 0 of `fibres` is the curve; then come pairs of points on either side along each
+    axis of the section, unless the section follows the tangent.
+    """
 
     locations: Locations
-    rest: Float[Array, "samples 2"]
+    fibres: Float[Array, "fibres samples dim"]
+    base: Float[Array, "dim dim"]
     s: Float[Array, " samples"]
+    length: Float[Array, ""]
 
-    @property
-    def length(self) -> Float[Array, ""]:
-        return jnp.sqrt(jnp.sum((self.rest[-1] - self.rest[0]) ** 2))
+    def __call__(self, u: Float[Array, "nodes dim"]) -> Float[Array, "samples dim"]:
+        """Positions of the curve in the frame of its base [m]."""
+        return self._moved(u)[0]
 
-    def __call__(self, u: Float[Array, "nodes dim"]) -> Float[Array, "samples 2"]:
-        """Positions of the line in the frame of its base [m]."""
-        along = (self.rest[-1] - self.rest[0]) / self.length
-        across = jnp.stack([-along[1], along[0]])
-        moved = self.rest - self.rest[:1] + self.locations(u)
-        return moved @ jnp.stack([along, across], axis=1)
+    def strain(self, u: Float[Array, "nodes dim"]) -> Float[Array, "samples strain"]:
+        """Strain of the curve in a displacement field."""
+        moved = self._moved(u)
+        if len(moved) == 1:
+            return line_strain(moved[0], self.length)
+        y = moved[1] - moved[2]
+        if moved.shape[2] == 3:
+            axes, places = section_axes(y, moved[3] - moved[4]), moved[0]
+        else:
+            y, places = (jnp.pad(v, ((0, 0), (0, 1))) for v in (y, moved[0]))
+            z = jnp.zeros_like(y).at[:, 2].set(1)
+            axes = section_axes(y, z)
+        found = pose_strain(axes, places, self.length / (len(self.s) - 1))
+        return found if moved.shape[2] == 3 else found[:, jnp.array([2, 3, 4])]
+
+    def _moved(self, u) -> Float[Array, "fibres samples dim"]:
+        moved = self.fibres - self.fibres[:1, :1] + self.locations(u).reshape(self.fibres.shape)
+        return moved @ self.base
 
 
-def probe(mesh, line: Line, samples: int = 81) -> Probe:
-    """Samples of `line` in `mesh`, equally spaced.
+def probe(
+    mesh, curve: AbstractCurve, samples: int = 81, *, arm: float | None = None, up=None
+) -> Probe:
+    """Equally spaced samples of `curve` in `mesh`; see `strain_along`.
 
     Raises:
-        ValueError: If the line leaves the mesh.
+        ValueError: If the curve, or the fibres beside it, leave the mesh.
     """
-    s = jnp.linspace(0.0, 1.0, samples)
-    rest = line(s)
-    return Probe(locate(mesh, np.asarray(rest)), rest, s)
+    known = reference(curve, samples, up)
+    dim = known.position.shape[1]
+    if arm is None and dim == 3:
+        arm = known.length / 50
+    fibres = _fibres(known, arm)
+    try:
+        locations = locate(mesh, fibres.reshape(-1, dim))
+    except ValueError as error:
+        if arm is None:
+            raise
+        raise ValueError(
+            f"strain_along: {error} The fibres lie {arm:.3g} m beside it: lower `arm`."
+        ) from None
+    base = jnp.asarray(known.frame[0])
+    return Probe(
+        locations, jnp.asarray(fibres), base, jnp.asarray(known.s), jnp.asarray(known.length)
+    )
+
+
+def _fibres(known: Reference, arm: float | None) -> np.ndarray:
+    rows = [known.position]
+    if arm is not None:
+        for axis in range(1, known.position.shape[1]):
+            side = arm * known.frame[:, :, axis]
+            rows += [known.position + side, known.position - side]
+    return np.stack(rows)
 
 
 def line_strain(
@@ -108,18 +150,41 @@ def _turns(chord: Float[Array, "chords 2"]) -> Float[Array, " turns"]:
     return jnp.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], jnp.sum(a * b, axis=1))
 
 
-def strain_along(path: Path, line: Line, *, samples: int = 81) -> Backbone:
-    """Backbone snapshots of a load path along a material line.
+def strain_along(
+    path: Path,
+    curve: AbstractCurve,
+    *,
+    samples: int = 81,
+    arm: float | None = None,
+    up=None,
+) -> Backbone:
+    """Backbone snapshots of a load path along a material curve.
 
     Args:
         path: Equilibria, from `fem.solve_path`.
-        line: The line in the reference configuration; its start should be held fast.
-        samples: Equally spaced samples along the line; about one per cell.
+        curve: A `Line` or any `Curve` in the reference configuration; its start should be
+            held fast.
+        samples: Equally spaced samples along the curve; about one per cell.
+        arm: How far beside the curve the fibres lie that tell how a section turns [m]. In
+            space a fiftieth of the length by default; without it a plane section follows
+            the tangent and has no shear.
+        up: In space, a direction near which local z of the first section points.
 
     Raises:
-        ValueError: If the line leaves the mesh.
+        ValueError: If the curve, or the fibres beside it, leave the mesh.
+
+    Reference:
+        Caasenbrood et al., Sorotoki, IEEE Access 2024, algorithm 1; twists by the
+        logarithm of the motion between sections instead of differences of matrices.
     """
-    at = probe(path.problem.mesh, line, samples)
-    positions = jax.vmap(at)(path.displacements)
-    strain = jax.vmap(lambda r: line_strain(r, at.length))(positions)
-    return Backbone(at.s, at.length, positions, strain)
+    at = probe(path.problem.mesh, curve, samples, arm=arm, up=up)
+    positions, strain = _snapshots(at, path.displacements)
+    rest = None
+    if not isinstance(curve, Line):
+        rest = at.strain(jnp.zeros_like(path.displacements[0]))
+    return Backbone(at.s, at.length, positions, strain, rest)
+
+
+@eqx.filter_jit
+def _snapshots(at: Probe, displacements: Array) -> tuple[Array, Array]:
+    return jax.vmap(at)(displacements), jax.vmap(at.strain)(displacements)

@@ -18,15 +18,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax._types import real
-from sorojax.fem.kinematics import PlaneStrain
 from sorojax.fem.linear import linearise, prepare
 from sorojax.fem.loads import Pressure
-from sorojax.fem.points import quadrature_points
 from sorojax.fem.problem import Problem
 from sorojax.fem.solve import Path, with_load
 from sorojax.fem.stress import enclosed_volume
 from sorojax.math import sparse
-from sorojax.reduction.backbone import Backbone, Line, Probe, line_strain, probe
+from sorojax.reduction.backbone import Backbone, Probe, probe
+from sorojax.reduction.curve import AbstractCurve
+from sorojax.reduction.mass import mean_section
 from sorojax.reduction.pod import coordinates, project
 from sorojax.rod import (
     AbstractDamping,
@@ -98,16 +98,24 @@ class Fit(eqx.Module):
 
 
 def identify(
-    path: Path, basis: StrainBasis, backbone: Backbone, line: Line, *, degree: int = 5
+    path: Path,
+    basis: StrainBasis,
+    backbone: Backbone,
+    curve: AbstractCurve,
+    *,
+    degree: int = 5,
+    arm: float | None = None,
+    up=None,
 ) -> Fit:
-    """Identify a rod along `line` from a path of pressures.
+    """Identify a rod along `curve` from a path of pressures.
 
     Args:
         path: Equilibria for values of one `Pressure` load.
-        basis: Orthonormal modes on the samples of `backbone`, from `pod_basis`.
-        backbone: Snapshots of the same path along `line`.
-        line: The material line.
+        basis: Modes, e.g. from `pod_basis`.
+        backbone: Snapshots of the same path along `curve`.
+        curve: The material curve, in the plane or in space.
         degree: Highest power of the pressure in the map.
+        arm, up: As given to `strain_along`.
 
     Raises:
         ValueError: If the path is not driven by a pressure, or has too few states.
@@ -120,7 +128,7 @@ def identify(
         )
     p = np.asarray(path.values)
     q = np.asarray(coordinates(backbone, basis))
-    at = probe(problem.mesh, line, len(backbone.s))
+    at = probe(problem.mesh, curve, len(backbone.s), arm=arm, up=up)
     volumes, condensed = [], []
     for u, value in zip(path.displacements, path.values, strict=True):
         here = with_load(problem, path.name, value)
@@ -129,7 +137,7 @@ def identify(
     K, C = _affine(p, np.stack(condensed))
     pressure = _pressure_map(p, q, np.array(volumes), K, C, degree)
     return Fit(
-        section=mean_section(problem, line),
+        section=mean_section(problem, curve, up=up),
         length=backbone.length,
         elastic=LinearElastic(K),
         pressure=pressure,
@@ -148,6 +156,28 @@ def _pressure(path: Path) -> Pressure:
     return load
 
 
+def condensed_stiffness(
+    path: Path,
+    basis: StrainBasis,
+    curve: AbstractCurve,
+    *,
+    samples: int = 81,
+    arm: float | None = None,
+    up=None,
+) -> Float[np.ndarray, "steps dof dof"]:
+    """Stiffness of the solid against forces on the coordinates, at each state of any path.
+
+    That at rest is the elastic law of a rod: `LinearElastic(condensed_stiffness(...)[0])`.
+    The arguments are those of `strain_along`.
+    """
+    at = probe(path.problem.mesh, curve, samples, arm=arm, up=up)
+    found = [
+        _condensed_stiffness(with_load(path.problem, path.name, value), u, at, basis)
+        for u, value in zip(path.displacements, path.values, strict=True)
+    ]
+    return np.stack(found)
+
+
 def _condensed_stiffness(
     problem: Problem, u: Array, at: Probe, basis: StrainBasis
 ) -> Float[np.ndarray, "dof dof"]:
@@ -164,7 +194,7 @@ def _condensed_stiffness(
 
 @eqx.filter_jit
 def _coordinate_jacobian(at: Probe, basis: StrainBasis, u):
-    return jax.jacrev(lambda u: project(line_strain(at(u), at.length), at.s, basis))(u)
+    return jax.jacrev(lambda u: project(at.strain(u), at.s, basis))(u)
 
 
 def _affine(p: np.ndarray, stiffness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -201,21 +231,3 @@ def _relative(error: np.ndarray, reference) -> float:
 
 def _powers(x: Float[Array, ""], count: int) -> Float[Array, " powers"]:
     return jnp.stack([x**k for k in range(1, count + 1)])
-
-
-def mean_section(problem: Problem, line: Line) -> Section:
-    """The section of a uniform rod along `line` with the mass of the body and its rotary
-    inertia about the line. The offset of the centre of mass from the line is left out."""
-    assert isinstance(problem.kinematics, PlaneStrain), "a planar body of one thickness"
-    mesh, depth = problem.mesh, problem.kinematics.thickness
-    start, end = line(jnp.array([0.0, 1.0]))
-    length = jnp.sqrt(jnp.sum((end - start) ** 2))
-    along = (end - start) / length
-    inside = quadrature_points(mesh, PlaneStrain())
-    points = jnp.moveaxis(inside.position, 0, -1) - start[None, None]
-    across = along[0] * points[..., 1] - along[1] * points[..., 0]
-    areas = inside.volumes
-    area = jnp.sum(areas) * depth / length
-    second = jnp.sum(areas * across**2) * depth / length
-    out_of_plane = area * depth**2 / 12
-    return Section(area, out_of_plane, second, out_of_plane + second, 5 / 6)

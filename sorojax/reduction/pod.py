@@ -8,12 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sorojax.reduction.backbone import Backbone
-from sorojax.rod import SampledModes, StrainBasis
-from sorojax.rod.basis import columns
-
-_ROW = {"kappa_z": 0, "sigma_x": 1, "sigma_y": 2}
-_REST = {"kappa_z": 0.0, "sigma_x": 1.0, "sigma_y": 0.0}
+from sorojax.reduction.backbone import PLANAR, Backbone
+from sorojax.rod import (
+    AbstractModes,
+    Combined,
+    SampledModes,
+    StrainBasis,
+    orthonormalise,
+)
+from sorojax.rod.basis import STRAINS
 
 
 def weights(s: Float[Array, " samples"]) -> Float[Array, " samples"]:
@@ -22,66 +25,110 @@ def weights(s: Float[Array, " samples"]) -> Float[Array, " samples"]:
     return (gaps[1:] + gaps[:-1]) / 2
 
 
-def pod_basis(backbone: Backbone, *, modes: dict[str, int]) -> StrainBasis:
+def pod_basis(
+    backbone: Backbone,
+    *,
+    modes: dict[str, int] | dict[str, float],
+    within: AbstractModes | None = None,
+) -> StrainBasis:
     """Modes that hold most of the snapshots' strain, orthonormal on [0, 1].
 
     Args:
         backbone: Snapshots, from `strain_along`.
-        modes: Number of modes per strain, as `{"kappa_z": 3}`.
+        modes: Number of modes per strain, as `{"kappa_z": 3}`, or the share of the squared
+            strain that they must hold, as `{"kappa_z": 0.999}`.
+        within: Smooth functions that the modes are combined of, e.g. `Legendre(12)`; fewer
+            Gauss nodes then resolve them. By default they are linear between samples.
 
     Raises:
         ValueError: If a strain is unknown, or there are fewer independent snapshots than
             modes.
     """
     basis = {}
-    for name, count in modes.items():
-        if name not in _ROW:
+    for name, wanted in modes.items():
+        if name not in backbone.names:
             raise ValueError(
-                f"pod_basis: the strain `{name}` is not one of {', '.join(_ROW)}. A planar "
-                "backbone bends about z."
+                f"pod_basis: the strain `{name}` is not one of {', '.join(backbone.names)}. A "
+                "planar backbone bends about z."
             )
-        snapshots = _snapshots(backbone, name)
-        w = np.asarray(weights(backbone.s))
-        root = np.sqrt(w)
-        _, size, rows = np.linalg.svd(snapshots * root, full_matrices=False)
-        rank = int(np.sum(size > 1e-10 * max(size[0], 1e-300)))
-        if count < 1 or count > rank:
-            raise ValueError(
-                f"pod_basis: asked for {count} modes of `{name}`, the snapshots hold 1 to "
-                f"{rank}. Add load steps or ask for fewer modes."
-            )
-        shapes = (rows[:count] / root).T
-        sign = np.sign(w @ shapes)
-        basis[name] = SampledModes(backbone.s, shapes * np.where(sign < 0, -1, 1))
+        inner, columns = _shapes(backbone, name, within)
+        root = np.sqrt(np.asarray(weights(backbone.s)))
+        coefficients = np.linalg.lstsq(
+            root[:, None] * columns, (root * _snapshots(backbone, name)).T, rcond=None
+        )[0]
+        left, size, _ = np.linalg.svd(coefficients, full_matrices=False)
+        count = _count(name, wanted, size)
+        sign = np.sign((root**2) @ columns @ left[:, :count])
+        mix = left[:, :count] * np.where(sign < 0, -1, 1)
+        basis[name] = _modes(backbone, inner, columns, mix)
     return StrainBasis(basis)
+
+
+def _shapes(backbone: Backbone, name: str, within: AbstractModes | None):
+    """Functions in which the snapshots are written, and their values at the samples.
+
+    Orthonormal ones: then singular vectors give orthonormal modes.
+    """
+    root = np.sqrt(np.asarray(weights(backbone.s)))
+    if within is None:
+        return None, np.diag(1 / root)
+    if within.count > len(backbone.s):
+        raise ValueError(
+            f"pod_basis: `within` has {within.count} modes, the backbone {len(backbone.s)} "
+            "samples, need as many or more. Take more samples."
+        )
+    inner = orthonormalise(StrainBasis({name: within})).modes[name]
+    return inner, np.asarray(inner(np.asarray(backbone.s)))
+
+
+def _modes(backbone: Backbone, inner, columns: np.ndarray, mix: np.ndarray) -> AbstractModes:
+    return SampledModes(backbone.s, columns @ mix) if inner is None else Combined(inner, mix)
+
+
+def _count(name: str, wanted: int | float, size: np.ndarray) -> int:
+    """How many modes: as asked, or so many that they hold the wanted share."""
+    rank = int(np.sum(size > 1e-10 * max(size[0], 1e-300)))
+    if isinstance(wanted, float) and 0 < wanted < 1:
+        share = np.cumsum(size**2) / max(np.sum(size**2), 1e-300)
+        wanted = int(np.searchsorted(share, wanted)) + 1
+    if isinstance(wanted, bool | float) or wanted < 1 or wanted > rank:
+        raise ValueError(
+            f"pod_basis: asked for {wanted} modes of `{name}`, the snapshots hold 1 to "
+            f"{rank}. Add load steps or ask for fewer modes, or for a share below 1."
+        )
+    return int(wanted)
 
 
 def captured_energy(backbone: Backbone, basis: StrainBasis) -> dict[str, float]:
     """Share of the snapshots' squared strain that the basis holds, per strain."""
-    shares, q = {}, np.asarray(coordinates(backbone, basis))
+    shares, q, start = {}, np.asarray(coordinates(backbone, basis)), 0
+    w = np.asarray(weights(backbone.s))
     for name in basis.active:
-        w = np.asarray(weights(backbone.s))
+        shapes = np.asarray(basis.modes[name](backbone.s))
+        held = q[:, start : start + shapes.shape[1]] @ shapes.T
+        start += shapes.shape[1]
         total = np.sum(w * _snapshots(backbone, name) ** 2)
-        shares[name] = float(np.sum(q[:, columns(basis, name)] ** 2) / max(total, 1e-300))
+        shares[name] = float(np.sum(w * held**2) / max(total, 1e-300))
     return shares
 
 
 def coordinates(backbone: Backbone, basis: StrainBasis) -> Float[Array, "steps dof"]:
-    """Coordinates of the snapshots in a basis that is orthonormal on the samples."""
-    return jax.vmap(lambda strain: project(strain, backbone.s, basis))(backbone.strain)
+    """Coordinates of the snapshots: least squares at the samples, any basis."""
+    return jax.vmap(lambda change: project(change, backbone.s, basis))(backbone.change)
 
 
 def project(
-    strain: Float[Array, "samples 3"], s: Float[Array, " samples"], basis: StrainBasis
+    change: Float[Array, "samples strain"], s: Float[Array, " samples"], basis: StrainBasis
 ) -> Float[Array, " dof"]:
-    """Coordinates of one strain field, sampled at `s`, in an orthonormal basis."""
-    w = weights(s)
-    parts = [
-        (w * (strain[:, _ROW[name]] - _REST[name])) @ jnp.asarray(basis.modes[name](s))
-        for name in basis.active
-    ]
+    """Coordinates of the change of strain from rest, sampled at `s`."""
+    names, w, parts = STRAINS if change.shape[1] == 6 else PLANAR, weights(s), []
+    for name in basis.active:
+        shapes = jnp.asarray(basis.modes[name](s))
+        gram = (w[:, None] * shapes).T @ shapes
+        load = (w * change[:, names.index(name)]) @ shapes
+        parts.append(jnp.linalg.solve(gram, load))
     return jnp.concatenate(parts)
 
 
 def _snapshots(backbone: Backbone, name: str) -> Float[np.ndarray, "steps samples"]:
-    return np.asarray(backbone.strain[:, :, _ROW[name]]) - _REST[name]
+    return np.asarray(backbone.change[:, :, backbone.names.index(name)])

@@ -1,15 +1,24 @@
 """Rods: strain-parameterised Cosserat model, planar and spatial."""
 
+from sorojax.rod.assembly import (
+    Assembly as Assembly,
+    Part as Part,
+    assembly as assembly,
+    num_coordinates as num_coordinates,
+    num_dof as num_dof,
+    rest as rest,
+    serial as serial,
+    slices as slices,
+)
 from sorojax.rod.basis import (
     AbstractModes as AbstractModes,
-    Chebyshev as Chebyshev,
-    Legendre as Legendre,
-    SampledModes as SampledModes,
     StrainBasis as StrainBasis,
-    chebyshev as chebyshev,
     columns as columns,
-    constant as constant,
-    legendre as legendre,
+)
+from sorojax.rod.combined_modes import (
+    Combined as Combined,
+    fitted as fitted,
+    orthonormalise as orthonormalise,
 )
 from sorojax.rod.dynamics import (
     acceleration as acceleration,
@@ -20,10 +29,15 @@ from sorojax.rod.dynamics import (
     forward_dynamics as forward_dynamics,
     gravity_force as gravity_force,
     inverse_dynamics as inverse_dynamics,
-    kinetic_energy as kinetic_energy,
     mass_matrix as mass_matrix,
-    potential_energy as potential_energy,
     stiffness_matrix as stiffness_matrix,
+    vector_field as vector_field,
+)
+from sorojax.rod.energy import (
+    coriolis_matrix as coriolis_matrix,
+    kinetic_energy as kinetic_energy,
+    momentum as momentum,
+    potential_energy as potential_energy,
 )
 from sorojax.rod.forces import (
     AbstractChamber as AbstractChamber,
@@ -36,21 +50,63 @@ from sorojax.rod.forces import (
     LinearElastic as LinearElastic,
     Pressurised as Pressurised,
     TipWrench as TipWrench,
-    total_force as total_force,
+)
+from sorojax.rod.given_modes import (
+    Functions as Functions,
+    SampledModes as SampledModes,
+    functions as functions,
+)
+from sorojax.rod.joint import (
+    AbstractJoint as AbstractJoint,
+    Fixed as Fixed,
+    Free as Free,
+    Prismatic as Prismatic,
+    Revolute as Revolute,
 )
 from sorojax.rod.kinematics import (
     forward_kinematics as forward_kinematics,
-    inertia as inertia,
     jacobian as jacobian,
-    motion as motion,
+    jacobian_rate_product as jacobian_rate_product,
     strain as strain,
     tip_angle as tip_angle,
     tip_pose as tip_pose,
 )
+from sorojax.rod.link import (
+    Link as Link,
+)
+from sorojax.rod.loads import (
+    AbstractPairForce as AbstractPairForce,
+    Between as Between,
+    JointEffort as JointEffort,
+    On as On,
+    total_force as total_force,
+)
+from sorojax.rod.model import (
+    inertia as inertia,
+    motion as motion,
+    operators as operators,
+)
 from sorojax.rod.motion import (
+    Base as Base,
     Motion as Motion,
     Operators as Operators,
-    operators as operators,
+)
+from sorojax.rod.piecewise_modes import (
+    Piecewise as Piecewise,
+    piecewise as piecewise,
+    piecewise_constant as piecewise_constant,
+    piecewise_linear as piecewise_linear,
+)
+from sorojax.rod.polynomial_modes import (
+    Bernstein as Bernstein,
+    Chebyshev as Chebyshev,
+    Fourier as Fourier,
+    Legendre as Legendre,
+    bernstein as bernstein,
+    chebyshev as chebyshev,
+    constant as constant,
+    fourier as fourier,
+    legendre as legendre,
 )
 from sorojax.rod.rod import (
     Elastic as Elastic,
@@ -66,10 +122,28 @@ from sorojax.rod.rollout import (
 )
 from sorojax.rod.section import (
     Section as Section,
+    scaled as scaled,
+    taper as taper,
+)
+from sorojax.rod.section_shapes import (
     circle as circle,
+    ellipse as ellipse,
+    from_mesh as from_mesh,
+    from_shape as from_shape,
     rectangle as rectangle,
+    ring as ring,
+    squircle as squircle,
+)
+from sorojax.rod.spline_modes import (
+    BSpline as BSpline,
+    bspline as bspline,
 )
 from sorojax.rod.statics import (
     Equilibrium as Equilibrium,
     equilibrium as equilibrium,
+)
+from sorojax.rod.tree import (
+    AssemblyMotion as AssemblyMotion,
+    AssemblyOperators as AssemblyOperators,
+    part_motion as part_motion,
 )

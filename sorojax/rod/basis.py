@@ -9,10 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sorojax import _check
-from sorojax._types import real
-from sorojax.math.quadrature import chebyshev_values, legendre_values
-
 Points: TypeAlias = Float[Array, " points"] | np.ndarray
 
 STRAINS = ("kappa_x", "kappa_y", "kappa_z", "sigma_x", "sigma_y", "sigma_z")
@@ -21,7 +17,8 @@ STRAINS = ("kappa_x", "kappa_y", "kappa_z", "sigma_x", "sigma_y", "sigma_z")
 class AbstractModes(eqx.Module):
     """Shape functions of one strain over the normalised arc length s in [0, 1].
 
-    `count` is the number of modes.
+    `count` is the number of modes. Modes that jump or kink name the places in `breaks`:
+    the rod then integrates between them.
     """
 
     count: eqx.AbstractVar[int]
@@ -29,75 +26,21 @@ class AbstractModes(eqx.Module):
     @property
     @abc.abstractmethod
     def resolution(self) -> int:
-        """Number of Gauss nodes along the rod that resolves the modes."""
+        """Number of Gauss nodes between breaks that resolves the modes."""
+
+    @property
+    def breaks(self) -> tuple[float, ...]:
+        """Where the modes are not smooth, rising inside (0, 1)."""
+        return ()
+
+    @property
+    def least(self) -> int:
+        """Gauss nodes between breaks below which two shapes of the modes look alike."""
+        return -(-self.count // (len(self.breaks) + 1))
 
     @abc.abstractmethod
     def __call__(self, s: Points) -> Float[Array, "points modes"]:
         """Values at `s`; a NumPy `s` may give NumPy values, which become constants."""
-
-
-class Chebyshev(AbstractModes):
-    """The first `count` shifted Chebyshev polynomials; the first is constant."""
-
-    count: int = eqx.field(static=True)
-
-    @property
-    def resolution(self) -> int:
-        return max(8, self.count + 4)
-
-    def __call__(self, s):
-        return chebyshev_values(s, self.count - 1).T
-
-
-class Legendre(AbstractModes):
-    """The first `count` shifted Legendre polynomials, orthogonal on [0, 1]."""
-
-    count: int = eqx.field(static=True)
-
-    @property
-    def resolution(self) -> int:
-        return max(8, self.count + 4)
-
-    def __call__(self, s):
-        return legendre_values(s, self.count - 1).T
-
-
-class SampledModes(AbstractModes):
-    """Data-driven modes, linear between samples and constant beyond the first and last.
-
-    A mode is differentiable in its values. Sampled modes need as many Gauss nodes as
-    their ripples, not as their number.
-    """
-
-    s: Float[Array, " samples"] = eqx.field(converter=real)
-    values: Float[Array, "samples modes"] = eqx.field(converter=real)
-
-    def __check_init__(self):
-        do = "Give s in [0, 1] and one column per mode, as `values[sample, mode]`."
-        _check.shape("SampledModes", "values", self.values, (len(self.s), None), do)
-        _check.finite("SampledModes", "values", self.values, "Check the snapshots.")
-        if _check.is_concrete(self.s) and not _is_grid(np.asarray(self.s)):
-            raise ValueError(
-                "SampledModes: `s` must rise strictly inside [0, 1], got "
-                f"{np.array2string(np.asarray(self.s), threshold=6)}. Divide the arc "
-                "length [m] by the length of the backbone."
-            )
-
-    @property
-    def count(self) -> int:
-        return self.values.shape[1]
-
-    @property
-    def resolution(self) -> int:
-        return min(48, max(8, self.s.shape[0] // 4))
-
-    def __call__(self, s):
-        at = jnp.asarray(s, dtype=self.s.dtype)
-        right = jnp.clip(jnp.searchsorted(self.s, at), 1, self.s.shape[0] - 1)
-        left = right - 1
-        fraction = (at - self.s[left]) / (self.s[right] - self.s[left])
-        fraction = jnp.clip(fraction, 0, 1)[:, None]
-        return (1 - fraction) * self.values[left] + fraction * self.values[right]
 
 
 class StrainBasis(eqx.Module):
@@ -117,6 +60,12 @@ class StrainBasis(eqx.Module):
                 f"StrainBasis: got the strains {unknown or 'none'}, need one or more of "
                 f"{', '.join(STRAINS)}. Curvatures are kappa, stretch is sigma_x."
             )
+        for name, modes in self.modes.items():
+            if isinstance(modes, int | float | str | list | tuple):
+                raise ValueError(
+                    f"StrainBasis: `{name}` is {modes!r}, need modes such as Chebyshev(3). "
+                    f"To choose a number of modes write chebyshev({name}=3)."
+                )
 
     @property
     def active(self) -> tuple[str, ...]:
@@ -129,7 +78,13 @@ class StrainBasis(eqx.Module):
 
     @property
     def resolution(self) -> int:
+        """Number of Gauss nodes between breaks that resolves all modes."""
         return max(modes.resolution for modes in self.modes.values())
+
+    @property
+    def breaks(self) -> tuple[float, ...]:
+        """Where any of the modes is not smooth."""
+        return merged(*(modes.breaks for modes in self.modes.values()))
 
     def __or__(self, other: "StrainBasis") -> "StrainBasis":
         """Both bases together; `other` wins where both name a strain."""
@@ -161,30 +116,33 @@ def columns(basis: StrainBasis, name: str) -> slice:
     return slice(start, start + basis.modes[name].count)
 
 
-def chebyshev(**modes: int) -> StrainBasis:
-    """Chebyshev modes per strain: `chebyshev(kappa_y=3, kappa_z=3)`."""
-    return StrainBasis({k: Chebyshev(_positive("chebyshev", k, v)) for k, v in modes.items()})
+def each_count(where: str, counts: dict[str, Any]) -> dict[str, int]:
+    """Numbers of modes per strain, checked."""
+    for name, count in counts.items():
+        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+            raise ValueError(
+                f"{where}: `{name}` must be a number of modes, 1 or more, got {count!r}. "
+                "Leave the strain out to keep it at rest."
+            )
+    return {name: int(count) for name, count in counts.items()}
 
 
-def legendre(**modes: int) -> StrainBasis:
-    """Legendre modes per strain: `legendre(kappa_z=4, sigma_x=1)`."""
-    return StrainBasis({k: Legendre(_positive("legendre", k, v)) for k, v in modes.items()})
+def merged(*breaks: tuple[float, ...]) -> tuple[float, ...]:
+    """All the breaks, rising; those closer than rounding are one."""
+    found: list[float] = []
+    for place in sorted(place for some in breaks for place in some):
+        if not found or place - found[-1] > 1e-9:
+            found.append(place)
+    return tuple(found)
 
 
-def constant(*names: str) -> StrainBasis:
-    """One constant mode per strain: `constant("kappa_z", "sigma_x")`."""
-    return StrainBasis({name: Legendre(1) for name in names})
-
-
-def _positive(where: str, name: str, count: int) -> int:
-    if not isinstance(count, int) or count < 1:
+def checked_breaks(where: str, breaks: Any) -> tuple[float, ...]:
+    """`breaks` as numbers that rise strictly inside (0, 1)."""
+    numbers = np.asarray(breaks, float).reshape(-1)
+    fits = np.all(np.isfinite(numbers)) and np.all(np.diff(numbers) > 0)
+    if not fits or (numbers.size and not 0 < numbers[0] <= numbers[-1] < 1):
         raise ValueError(
-            f"{where}: `{name}` must be a number of modes, 1 or more, got {count!r}. "
-            "Leave the strain out to keep it at rest."
+            f"{where}: the breaks are {numbers.tolist()}, need numbers that rise strictly "
+            "inside (0, 1). Divide arc lengths [m] by the length of the rod."
         )
-    return count
-
-
-def _is_grid(s: np.ndarray) -> bool:
-    rises = s.ndim == 1 and s.size > 1 and bool(np.all(np.diff(s) > 0))
-    return rises and s[0] >= 0 and s[-1] <= 1 + 1e-12
+    return tuple(numbers.tolist())

@@ -1,138 +1,158 @@
-"""Equations of motion of a rod: M a + coriolis = sum of generalised forces.
+"""Equations of motion of a rod or assembly: M a + coriolis = sum of generalised forces.
 
-These are doors: each compiles once per structure of the rod and its forces. Loops use
+These are doors: each compiles once per structure of the model and its forces. Loops use
 `motion`, `inertia` and `total_force` directly, with `operators` taken outside.
 """
 
+from typing import Any
+
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax._types import real
 from sorojax.math.dense import solve_symmetric
 from sorojax.math.door import door
-from sorojax.rod import forces as rod_forces
-from sorojax.rod.forces import AbstractForce
-from sorojax.rod.kinematics import inertia, motion
-from sorojax.rod.motion import Operators, operators
-from sorojax.rod.rod import Rod
+from sorojax.rod import loads
+from sorojax.rod.assembly import Assembly, is_flat, rate
+from sorojax.rod.forces import Gravity
+from sorojax.rod.model import Model, inertia, motion, operators
 
-Coordinates = Float[Array, " dof"]
-Forces = tuple[AbstractForce, ...]
-
-
-@door
-def mass_matrix(rod: Rod, q: Coordinates) -> Float[Array, "dof dof"]:
-    """Inertia of the rod in its coordinates."""
-    return inertia(motion(rod, q))[0]
+Coordinates = Float[Array, " coordinates"]
+Rates = Float[Array, " dof"]
+Forces = tuple[loads.Load, ...]
 
 
 @door
-def coriolis_force(rod: Rod, q: Coordinates, v: Coordinates) -> Coordinates:
+def mass_matrix(model: Model, q: Coordinates) -> Float[Array, "dof dof"]:
+    """Inertia of the model in its coordinates."""
+    return inertia(motion(model, q))[0]
+
+
+@door
+def coriolis_force(model: Model, q: Coordinates, v: Rates) -> Rates:
     """C(q, v) v: what velocity alone adds to the left of the equations of motion."""
-    return inertia(motion(rod, q, v))[1]
+    return inertia(motion(model, q, v))[1]
 
 
 @door
-def gravity_force(rod: Rod, q: Coordinates, gravity=None) -> Coordinates:
+def gravity_force(model: Model, q: Coordinates, gravity=None) -> Rates:
     """Gradient of the gravitational energy, on the left of the equations of motion.
 
     Args:
-        rod: The rod.
+        model: The rod or assembly.
         q: Coordinates.
         gravity: [m/s^2]; by default 9.81 against the last axis.
     """
-    return -rod_forces.Gravity(gravity)(_zero(q), motion(rod, q))
+    return -loads.weight(Gravity(gravity), _zero(q), motion(model, q))
 
 
 @door
-def bias_force(rod: Rod, q: Coordinates, v: Coordinates, gravity=None) -> Coordinates:
+def bias_force(model: Model, q: Coordinates, v: Rates, gravity=None) -> Rates:
     """C(q, v) v + g(q), what a computed-torque controller cancels."""
-    moment = motion(rod, q, v)
-    return inertia(moment)[1] - rod_forces.Gravity(gravity)(_zero(q), moment)
+    moment = motion(model, q, v)
+    return inertia(moment)[1] - loads.weight(Gravity(gravity), _zero(q), moment)
 
 
 @door
-def stiffness_matrix(rod: Rod) -> Float[Array, "dof dof"]:
-    """Stiffness of the rod's own linear elasticity."""
-    return operators(rod).stiffness
+def stiffness_matrix(model: Model) -> Float[Array, "dof dof"]:
+    """Stiffness of the linear elasticity of rods and joints."""
+    return operators(model).stiffness
 
 
 @door
-def elastic_force(rod: Rod, q: Coordinates) -> Coordinates:
+def elastic_force(model: Model, q: Coordinates) -> Rates:
     """K q, on the left of the equations of motion."""
-    return operators(rod).stiffness @ q
+    moment = motion(model, q)
+    return -loads.total_force((), _zero(q), moment)
 
 
 @door
-def damping_matrix(rod: Rod, forces: Forces) -> Float[Array, "dof dof"]:
-    """Sum of the damping terms among `forces`."""
-    return rod_forces.damping_matrix(forces, operators(rod).stiffness)
+def damping_matrix(model: Model, forces: Forces) -> Float[Array, "dof dof"]:
+    """Sum of the damping terms among `forces` and of the dampers of joints."""
+    return loads.damping_matrix(forces, model, operators(model))
 
 
 @door
 def forward_dynamics(
-    rod: Rod,
+    model: Model,
     q: Coordinates,
-    v: Coordinates,
+    v: Rates,
     forces: Forces = (),
     *,
     t=0.0,
     unroll: bool = False,
-) -> Coordinates:
+) -> Rates:
     """Acceleration of the coordinates.
 
     Args:
-        rod: The rod.
+        model: The rod or assembly.
         q: Coordinates.
         v: Their rates.
-        forces: Generalised forces; the rod's elasticity acts unless one replaces it.
+        forces: Generalised forces; elasticity acts unless one replaces it.
         t: Time [s].
         unroll: Write the rotation product out; for compiled forward loops.
     """
-    return acceleration(rod, operators(rod), real(t), q, v, forces, unroll=unroll)
+    return acceleration(model, operators(model), real(t), q, v, forces, unroll=unroll)
 
 
 def acceleration(
-    rod: Rod,
-    constants: Operators,
+    model: Model,
+    constants: Any,
     t: Float[Array, ""],
     q: Coordinates,
-    v: Coordinates,
+    v: Rates,
     forces: Forces,
     *,
     unroll: bool = False,
-) -> Coordinates:
-    """`forward_dynamics` without a door, for loops that hold `operators(rod)`."""
-    moment = motion(rod, q, v, constants=constants, unroll=unroll)
+) -> Rates:
+    """`forward_dynamics` without a door, for loops that hold `operators(model)`."""
+    moment = motion(model, q, v, constants=constants, unroll=unroll)
     mass, coriolis = inertia(moment)
-    return solve_symmetric(mass, rod_forces.total_force(forces, t, moment) - coriolis)
+    return solve_symmetric(mass, loads.total_force(forces, t, moment) - coriolis)
 
 
 @door
 def inverse_dynamics(
-    rod: Rod, q: Coordinates, v: Coordinates, a: Coordinates, forces: Forces = (), *, t=0.0
-) -> Coordinates:
+    model: Model, q: Coordinates, v: Rates, a: Rates, forces: Forces = (), *, t=0.0
+) -> Rates:
     """Generalised force that an actuator must add to reach the acceleration `a`."""
-    moment = motion(rod, q, v)
+    moment = motion(model, q, v)
     mass, coriolis = inertia(moment)
-    return mass @ a + coriolis - rod_forces.total_force(forces, real(t), moment)
+    return mass @ a + coriolis - loads.total_force(forces, real(t), moment)
 
 
-@door
-def kinetic_energy(rod: Rod, q: Coordinates, v: Coordinates) -> Float[Array, ""]:
-    """v' M v / 2 [J]."""
-    return v @ mass_matrix(rod, q) @ v / 2
+class VectorField(eqx.Module):
+    """(t, (q, v), args) -> (dq/dt, dv/dt): the right-hand side that diffrax integrates.
+
+    The field is a pytree: `diffrax.ODETerm(vector_field(rod, forces))` is differentiable
+    in the rod and its forces.
+    """
+
+    model: Model
+    constants: Any
+    forces: Forces
+    unroll: bool = eqx.field(static=True)
+
+    def __call__(self, t: Any, state: tuple[Array, Array], args: Any = None):
+        q, v = state
+        t = jnp.asarray(t, q.dtype)
+        a = acceleration(
+            self.model, self.constants, t, q, v, self.forces, unroll=self.unroll
+        )
+        return coordinate_rate(self.model, q, v), a
 
 
-@door
-def potential_energy(rod: Rod, q: Coordinates, gravity=None) -> Float[Array, ""]:
-    """Linear elastic energy [J], and that of the weight in `gravity` [m/s^2] if given."""
-    moment = motion(rod, q)
-    energy = q @ moment.operators.stiffness @ q / 2
-    if gravity is None:
-        return energy
-    weight = moment.operators.mass[:, None] * real(gravity)[None, :]
-    return energy - jnp.sum(weight * moment.position)
+def vector_field(model: Model, forces: Forces = (), *, unroll: bool = False) -> VectorField:
+    """The equations of first order of a model, for any solver of diffrax."""
+    return VectorField(model, operators(model), forces, unroll)
+
+
+def coordinate_rate(model: Model, q: Coordinates, v: Rates) -> Coordinates:
+    """dq/dt; v itself but for quaternions."""
+    if isinstance(model, Assembly) and not is_flat(model):
+        return rate(model, q, v)
+    return v
 
 
 def _zero(q: Coordinates) -> Float[Array, ""]:

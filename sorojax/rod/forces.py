@@ -2,7 +2,8 @@
 
 To add one, subclass the family that fits:
 
-* `AbstractForce`: any force, a function of time and the `Motion` of the rod.
+* `AbstractForce`: any force, a function of time and the `Motion` of the rod; `points`
+  gives poses, velocities and Jacobians at any s, and takes forces put there.
 * `AbstractElastic`: an elastic law that replaces the rod's own linear one.
 * `AbstractDamping`: a constant matrix; implicit steppers use it in their iteration.
 * `AbstractPressureMap`: the work of a fluid; its pressure comes from a network, or from
@@ -19,6 +20,7 @@ from jaxtyping import Array, Float
 
 from sorojax._types import optional_real, real
 from sorojax.rod.motion import Motion
+from sorojax.rod.points import from_own, own
 
 EARTH = 9.81  # m/s^2
 
@@ -42,7 +44,7 @@ class AbstractElastic(AbstractForce):
         """Derivative of the stored energy [J] in q; `K q` for a linear law."""
 
     def __call__(self, t, motion):
-        return -self.restoring_force(motion.q)
+        return -from_own(motion, self.restoring_force(own(motion, motion.q)))
 
 
 class AbstractDamping(AbstractForce):
@@ -53,7 +55,8 @@ class AbstractDamping(AbstractForce):
         """Damping matrix, given the linear stiffness of the rod."""
 
     def __call__(self, t, motion):
-        return -self.matrix(motion.operators.stiffness) @ motion.v
+        matrix = self.matrix(motion.operators.stiffness)
+        return -from_own(motion, matrix @ own(motion, motion.v))
 
 
 class AbstractPressureMap(eqx.Module):
@@ -124,6 +127,8 @@ class Gravity(AbstractForce):
 class TipWrench(AbstractForce):
     """A dead wrench on the last section: its world components never turn.
 
+    `PointWrench` and `LineWrench` act elsewhere, or turn with the section.
+
     Attributes:
         wrench: Moment [N m], then force [N]: (m_z, f_x, f_y) for a planar rod.
     """
@@ -141,7 +146,8 @@ class Pressurised(AbstractForce):
     pressure: Float[Array, "*ports"] = eqx.field(converter=real)
 
     def __call__(self, t, motion):
-        return jax.grad(self.chamber.coenergy)(motion.q, self.pressure)
+        force = jax.grad(self.chamber.coenergy)(own(motion, motion.q), self.pressure)
+        return from_own(motion, force)
 
 
 def total_force(
@@ -156,7 +162,7 @@ def total_force(
         )
     total = None
     if not any(isinstance(force, AbstractElastic) for force in forces):
-        total = -motion.operators.stiffness @ motion.q
+        total = -from_own(motion, motion.operators.stiffness @ own(motion, motion.q))
     for force in forces:
         term = force(t, motion)
         total = term if total is None else total + term
@@ -171,7 +177,8 @@ def tangent_stiffness(
     laws = [force for force in forces if isinstance(force, AbstractElastic)]
     if not laws:
         return motion.operators.stiffness
-    return sum_matrices(jax.jacfwd(law.restoring_force)(motion.q) for law in laws)
+    q = own(motion, motion.q)
+    return sum_matrices(jax.jacfwd(law.restoring_force)(q) for law in laws)
 
 
 def damping_matrix(

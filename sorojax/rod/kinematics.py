@@ -7,41 +7,20 @@ from sorojax import _check
 from sorojax._types import real
 from sorojax.math.door import door
 from sorojax.math.lie import homogeneous
-from sorojax.math.quadrature import integration_rows
-from sorojax.rod import planar, spatial
-from sorojax.rod.motion import Motion, Operators, operators
+from sorojax.math.quadrature import integration_rows, interpolation_rows
+from sorojax.rod.assembly import Assembly
+from sorojax.rod.composite import bias_accelerations
+from sorojax.rod.kernel import bias_rates, rod_motion
+from sorojax.rod.link import LinkMotion
+from sorojax.rod.model import Model, inertia as inertia, motion as motion
+from sorojax.rod.motion import Motion, operators, rest_along
+from sorojax.rod.moving import cross, turned
+from sorojax.rod.points import Points
 from sorojax.rod.rod import Rod, strain_names
+from sorojax.rod.tree import AssemblyMotion, part_columns, part_motion
 
-_KERNEL = {2: planar, 3: spatial}
-
-
-def motion(
-    rod: Rod,
-    q: Float[Array, " dof"],
-    v: Float[Array, " dof"] | None = None,
-    *,
-    constants: Operators | None = None,
-    unroll: bool = False,
-) -> Motion:
-    """The fields of the rod at (q, v), which forces and inertia read.
-
-    Args:
-        rod: The rod.
-        q: Coordinates.
-        v: Their rates; zero if omitted.
-        constants: `operators(rod)`, if a loop has them already.
-        unroll: Write the rotation product out (see `math.quaternion.prefix_product`).
-    """
-    do = f"The rod has {rod.basis.num_dof} coordinates, ordered as its basis."
-    _check.shape("rod", "q", q, (rod.basis.num_dof,), do)
-    constants = operators(rod) if constants is None else constants
-    v = jnp.zeros_like(q) if v is None else v
-    return _KERNEL[rod.group.space_dim].motion(rod, constants, q, v, unroll)
-
-
-def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:
-    """Mass matrix and Coriolis force of a moment."""
-    return _KERNEL[moment.rod.group.space_dim].inertia(moment)
+Poses = Float[Array, "points h h"]
+Jacobians = Float[Array, "points twist dof"]
 
 
 @door
@@ -56,86 +35,140 @@ def strain(rod: Rod, q: Float[Array, " dof"], s=None) -> Float[Array, "points st
     constants = operators(rod)
     rows = constants.strain_rows if s is None else rod.basis(real(s).astype(q.dtype))
     change = dict(zip(rod.basis.active, rows @ q, strict=True))
-    rest = constants.rest_strain
-    points = rows.shape[1]
+    rest, points = rest_along(constants), rows.shape[1]
+    if s is not None and rest.shape[0] > 1:
+        at = interpolation_rows(rod.quadrature, real(s).astype(q.dtype))
+        rest = jnp.asarray(at, q.dtype) @ rest
     parts = [
-        jnp.broadcast_to(rest[k], (points,)) + change.get(name, jnp.zeros(points, q.dtype))
+        jnp.broadcast_to(rest[:, k], (points,)) + change.get(name, jnp.zeros(points, q.dtype))
         for k, name in enumerate(strain_names(rod.group))
     ]
     return jnp.stack(parts, axis=1)
 
 
 @door
-def forward_kinematics(rod: Rod, q: Float[Array, " dof"], s=None) -> Float[Array, "points h h"]:
+def forward_kinematics(
+    model: Model, q: Float[Array, " coordinates"], s=None
+) -> Poses | dict[str, Poses]:
     """Poses of the sections: local to base frame, positions in m.
 
     Args:
-        rod: The rod; `rod.group` makes the result planar or spatial.
+        model: The rod; of an assembly the poses of every part by name, one for a link.
         q: Coordinates.
         s: Where, in [0, 1]; the Gauss nodes if omitted.
     """
-    moment = motion(rod, q)
-    if s is None:
-        return homogeneous(moment.directors, moment.position)
-    rows = _rows(rod, s)
-    return homogeneous(_directors_at(moment, rows), rows @ moment.tangent)
+    if isinstance(model, Assembly):
+        return {name: _poses(part, s) for name, part in _parts(motion(model, q))}
+    return _poses(rod_motion(model, q), s)
 
 
 @door
-def tip_pose(rod: Rod, q: Float[Array, " dof"]) -> Float[Array, "h h"]:
-    """Pose of the last section: local to base frame, position in m."""
-    return forward_kinematics(rod, q, jnp.ones(1, q.dtype))[0]
+def tip_pose(model: Model, q: Float[Array, " coordinates"]):
+    """Pose of the last section, of every part by name: local to base frame, position in m."""
+    poses = forward_kinematics(model, q, jnp.ones(1, q.dtype))
+    if isinstance(poses, dict):
+        return {name: pose[0] for name, pose in poses.items()}
+    return poses[0]
 
 
 @door
-def jacobian(rod: Rod, q: Float[Array, " dof"], s=None) -> Float[Array, "points twist dof"]:
+def jacobian(
+    model: Model, q: Float[Array, " coordinates"], s=None
+) -> Jacobians | dict[str, Jacobians]:
     """Twists of the sections per coordinate rate, angular velocity first, world frame.
 
     Args:
-        rod: The rod.
+        model: The rod; of an assembly the Jacobians of every part by name, one for a link.
         q: Coordinates.
         s: Where, in [0, 1]; the Gauss nodes if omitted.
     """
-    moment = motion(rod, q)
-    if s is None:
-        parts = [moment.angular_jacobian, moment.linear_jacobian]
-    else:
-        rows = _rows(rod, s)
-        rates = (moment.angular_rate, moment.linear_rate)
-        parts = [jnp.tensordot(rows, rate, 1) for rate in rates]
-    return jnp.concatenate(parts, axis=1)
+    if isinstance(model, Rod):
+        return _jacobian(rod_motion(model, q), s)
+    moment = motion(model, q)
+    return {
+        name: _jacobian(part, s) @ columns
+        for (name, part), columns in zip(_parts(moment), part_columns(moment), strict=True)
+    }
+
+
+@door
+def jacobian_rate_product(
+    model: Model, q: Float[Array, " coordinates"], v: Float[Array, " dof"], s=None
+) -> Float[Array, "points twist"] | dict[str, Float[Array, "points twist"]]:
+    """dJ/dt v: accelerations of the sections that velocity alone makes, world frame.
+
+    Args:
+        model: The rod; of an assembly those of every part by name, one for a link.
+        q: Coordinates.
+        v: Their rates.
+        s: Where, in [0, 1]; the Gauss nodes if omitted.
+    """
+    if isinstance(model, Rod):
+        return _rate_product(rod_motion(model, q, v), s, None)
+    moment = motion(model, q, v)
+    ground = zip(_parts(moment), moment.frames, bias_accelerations(moment), strict=True)
+    found = {}
+    for (name, part), frame, local in ground:
+        rot = model.group.rotation_dim
+        start = None if local is None else _turned_twist(frame.rotation, local, rot)
+        found[name] = _rate_product(part, s, start)
+    return found
 
 
 def tip_angle(moment: Motion) -> Float[Array, ""]:
-    """Angle of the last section of a planar rod [rad], continuous past half a turn."""
+    """Angle of the last section of a planar rod on its base [rad], continuous past half a
+    turn."""
     if moment.rod.group.space_dim != 2:
         raise ValueError("tip_angle: needs a planar rod, got a spatial one. Use tip_pose.")
-    bending = moment.operators.weights @ moment.angular_rate[:, 0] @ moment.q
-    return bending + moment.operators.rest_strain[0] * moment.rod.length
+    bending = moment.angular_rate[:, 0] @ moment.q
+    return moment.operators.weights @ (bending + rest_along(moment.operators)[:, 0])
+
+
+def _parts(moment: AssemblyMotion) -> list[tuple[str, Motion | LinkMotion]]:
+    names = moment.assembly.names
+    return [(name, part_motion(moment, k)) for k, name in enumerate(names)]
+
+
+def _poses(moment: Motion | LinkMotion, s) -> Poses:
+    if isinstance(moment, LinkMotion):
+        return homogeneous(moment.base.directors, moment.base.position)[None]
+    if s is None:
+        return homogeneous(moment.directors, moment.position)
+    at = Points(moment, _rows(moment.rod, s))
+    return homogeneous(at.directors, at.position)
+
+
+def _jacobian(moment: Motion | LinkMotion, s) -> Jacobians:
+    if isinstance(moment, LinkMotion):
+        return moment.tip_jacobian[None]
+    at = moment if s is None else Points(moment, _rows(moment.rod, s))
+    return jnp.concatenate([at.angular_jacobian, at.linear_jacobian], axis=1)
+
+
+def _rate_product(
+    moment: Motion | LinkMotion, s, start: Float[Array, " twist"] | None
+) -> Float[Array, "points twist"]:
+    """Velocity-product accelerations, on a base that has the acceleration `start`."""
+    if isinstance(moment, LinkMotion):
+        return jnp.zeros_like(moment.v)[None] if start is None else start[None]
+    rows = moment.operators.integration if s is None else _rows(moment.rod, s)
+    angular, linear = (rows @ rate for rate in bias_rates(moment))
+    if start is not None:
+        rot, at = angular.shape[1], Points(moment, rows)
+        assert moment.base is not None
+        arms = at.position - moment.base.position[None]
+        angular = angular + start[None, :rot]
+        linear = linear + start[None, rot:] + cross(start[:rot], arms)
+    return jnp.concatenate([angular, linear], axis=1)
+
+
+def _turned_twist(rotation: Array, twist: Array, rot: int) -> Array:
+    spin = turned(rotation, twist[None, :rot, None])[0, :, 0]
+    return jnp.concatenate([spin, rotation @ twist[rot:]])
 
 
 def _rows(rod: Rod, s) -> Float[Array, "points quad"]:
     """Integration weights from the base to each s [m]."""
     s = real(s).astype(rod.length.dtype)
     _check.shape("rod", "s", s, (None,), "Give a list of points in [0, 1].")
-    return rod.length * integration_rows(rod.nodes, s)
-
-
-def _directors_at(moment: Motion, rows: Array) -> Float[Array, "points dim dim"]:
-    """Directors integrated from the base by R' = R hat(kappa), then made orthonormal."""
-    dim = moment.tangent.shape[1]
-    constants = moment.operators
-    if dim == 2:
-        angle = rows @ (moment.angular_rate[:, 0] @ moment.q)
-        angle = angle + constants.rest_strain[0] * jnp.sum(rows, axis=1)
-        cosine, sine = jnp.cos(angle), jnp.sin(angle)
-        columns = jnp.stack([cosine, sine], 1), jnp.stack([-sine, cosine], 1)
-        return jnp.stack(columns, axis=-1)
-    # World-frame curvature: the angular rate is linear in q, the rest turns with it.
-    curvature = moment.angular_rate @ moment.q
-    curvature = curvature + moment.directors @ constants.rest_strain[:3]
-    slope = jnp.cross(curvature[:, :, None], moment.directors, axis=1)
-    eye = jnp.eye(dim, dtype=moment.q.dtype)[None]
-    rotation = eye + jnp.tensordot(rows, slope, 1)
-    gram = jnp.swapaxes(rotation, 1, 2) @ rotation
-    return rotation @ (3 * eye - gram) / 2
+    return rod.length * jnp.asarray(integration_rows(rod.quadrature, s), rod.length.dtype)

@@ -7,7 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sorojax.math.quadrature import gauss_legendre, integration_matrix
+from sorojax.math.quadrature import (
+    gauss_legendre,
+    integration_matrix,
+    interpolation_rows,
+)
 from sorojax.rod.basis import STRAINS
 from sorojax.rod.rod import Rod, strain_names
 
@@ -21,10 +25,10 @@ class Operators(NamedTuple):
         weights: Gauss weights [m].
         integration: Integrals from the base to each node [m].
         strain_rows: Strain per coordinate, one block per active strain.
-        moments: Centred curvature moments of order 0, 1, 2 of the cells between nodes,
-            one block per component of the curvature, per coordinate.
+        moments: Centred curvature moments of order 0, 1, 2 of the cells between nodes
+            (and breaks), one block per component of the curvature, per coordinate.
         rest_moments: The same of the rest curvature.
-        rest_strain: Strain at q = 0, curvatures first.
+        rest_strain: Strain at q = 0, curvatures first; one column per node if it varies.
         mass: Mass lumped at each node [kg].
         rotary: Rotary inertia lumped at each node, about x, y, z (planar: z) [kg m^2].
         stiffness: Linear elastic stiffness.
@@ -33,30 +37,44 @@ class Operators(NamedTuple):
     weights: Float[Array, " quad"]
     integration: Float[Array, "quad quad"]
     strain_rows: Float[Array, "active quad dof"]
-    moments: Float[Array, "order rot quad dof"]
-    rest_moments: Float[Array, "order rot quad"]
-    rest_strain: Float[Array, " strain"]
+    moments: Float[Array, "order rot cells dof"]
+    rest_moments: Float[Array, "order rot cells"]
+    rest_strain: Float[Array, "strain *quad"]
     mass: Float[Array, " quad"]
     rotary: Float[Array, "rot quad"]
     stiffness: Float[Array, "dof dof"]
 
 
+class Base(eqx.Module):
+    """Frame on which a rod or a link starts, and its Jacobians in the columns of a motion."""
+
+    directors: Float[Array, "dim dim"]
+    position: Float[Array, " dim"]
+    angular_jacobian: Float[Array, "rot dof"]
+    linear_jacobian: Float[Array, "dim dof"]
+
+
 class Motion(eqx.Module):
     """A rod at one moment: coordinates, and fields at the Gauss nodes, world frame.
 
-    What a force does not read is never computed. An integral along the whole rod is
-    `operators.weights @ field`: the pose and Jacobian of the tip are that of the rates.
+    What a force does not read is never computed. An integral along the rod is
+    `operators.weights @ field`: a pose or Jacobian at s is that of the base, plus the
+    integral of the rates from the base to s.
+
+    On a moving base the columns of the Jacobians are the twist of the base (its own axes,
+    angular first), then the coordinates of the rod; q is zero in the columns of the base.
 
     Attributes:
         rod: The rod.
         operators: Its constants.
-        q, v: Coordinates and their rates.
+        q, v: Coordinates and their rates, one per column.
         directors: Columns are the local axes of the section.
         tangent: d position / ds [-].
         angular_rate: d angular Jacobian / ds.
         linear_rate: d linear Jacobian / ds.
         angular_jacobian: Angular velocity per rate (planar: about z).
         linear_jacobian: Velocity of the section centre per rate.
+        base: Where the rod starts; None for a clamp at the origin.
     """
 
     rod: Rod
@@ -69,38 +87,39 @@ class Motion(eqx.Module):
     linear_rate: Float[Array, "quad dim dof"]
     angular_jacobian: Float[Array, "quad rot dof"]
     linear_jacobian: Float[Array, "quad dim dof"]
+    base: Base | None = None
 
     @property
     def position(self) -> Float[Array, "quad dim"]:
-        """Centres of the sections [m], the base at the origin."""
-        return self.operators.integration @ self.tangent
+        """Centres of the sections [m]."""
+        path = self.operators.integration @ self.tangent
+        return path if self.base is None else path + self.base.position[None, :]
 
     @property
     def tip_jacobian(self) -> Float[Array, "twist dof"]:
         """Twist of the tip per rate: angular velocity first, world frame."""
         weights = self.operators.weights
         angular = jnp.tensordot(weights, self.angular_rate, 1)
-        return jnp.concatenate([angular, jnp.tensordot(weights, self.linear_rate, 1)])
+        linear = jnp.tensordot(weights, self.linear_rate, 1)
+        if self.base is not None:
+            angular = angular + self.base.angular_jacobian
+            linear = linear + self.base.linear_jacobian
+        return jnp.concatenate([angular, linear])
 
 
 def operators(rod: Rod) -> Operators:
     """The constant arrays of `rod`; differentiable in all its leaves."""
-    dtype, length = rod.length.dtype, rod.length
-    nodes, weights = (jnp.asarray(x, dtype) for x in gauss_legendre(rod.nodes))
-    rows = jnp.asarray(rod.basis(gauss_legendre(rod.nodes)[0]), dtype)
+    dtype, length, rule = rod.length.dtype, rod.length, rod.quadrature
+    nodes, weights = gauss_legendre(rule)
+    rows, weights = jnp.asarray(rod.basis(nodes), dtype), jnp.asarray(weights, dtype)
     rotary = _rotary(rod)
-    rest = _rest_strain(rod, dtype)
-    rot = rod.group.rotation_dim
-    cells = np.diff(gauss_legendre(rod.nodes)[0], prepend=0.0)
-    plain = np.stack([cells, 0 * cells, cells / 12])  # moments of the constant 1
-    plain = jnp.asarray(plain, dtype)[:, None, :]
     return Operators(
         weights=length * weights,
-        integration=length * jnp.asarray(integration_matrix(rod.nodes), dtype),
+        integration=length * jnp.asarray(integration_matrix(rule), dtype),
         strain_rows=rows,
         moments=length * _moments(rod, dtype),
-        rest_moments=length * plain * rest[None, :rot, None],
-        rest_strain=rest,
+        rest_moments=length * _rest_moments(rod, dtype),
+        rest_strain=_rest_strain(rod, dtype),
         mass=length * weights * _along(rod, rod.material.density * rod.section.area),
         rotary=length * weights[None, :] * rotary,
         stiffness=_stiffness(rod, rows, weights),
@@ -111,7 +130,13 @@ def _along(rod: Rod, value: Array) -> Float[Array, " quad"]:
     return jnp.broadcast_to(value, (rod.nodes,))
 
 
-def _rest_strain(rod: Rod, dtype) -> Float[Array, " strain"]:
+def rest_along(constants: Operators) -> Float[Array, "#quad strain"]:
+    """Strain at q = 0 at the nodes, one row if it is constant."""
+    rest = constants.rest_strain
+    return rest[None] if rest.ndim == 1 else rest.T
+
+
+def _rest_strain(rod: Rod, dtype) -> Float[Array, "strain *quad"]:
     if rod.rest_strain is not None:
         return rod.rest_strain
     straight = [float(name == "sigma_x") for name in strain_names(rod.group)]
@@ -130,27 +155,47 @@ def _rotary(rod: Rod) -> Float[Array, "rot quad"]:
 def _stiffness(rod: Rod, rows: Array, weights: Array) -> Float[Array, "dof dof"]:
     section, young = rod.section, rod.material.young_modulus
     shear = young / (2 * (1 + rod.material.poisson_ratio))
+    along_z = section.shear_factor if section.shear_factor_z is None else section.shear_factor_z
     rigidity = {
         "kappa_x": shear * section.torsion_constant,
         "kappa_y": young * section.second_moment_y,
         "kappa_z": young * section.second_moment_z,
         "sigma_x": young * section.area,
         "sigma_y": shear * section.shear_factor * section.area,
-        "sigma_z": shear * section.shear_factor * section.area,
+        "sigma_z": shear * along_z * section.area,
     }
     scale = jnp.stack([_along(rod, rigidity[name]) for name in rod.basis.active])
     scale = rod.length * scale * weights[None, :]
     return jnp.einsum("aqm,aq,aqn->mn", rows, scale, rows)
 
 
-def _moments(rod: Rod, dtype) -> Float[Array, "order rot quad dof"]:
-    """Moments of the curvature modes over the cells that end at the nodes, unit length."""
+def _cells(rod: Rod) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the cells that end at the nodes and breaks, (cells, points), and their
+    weights in the centred moments, (order, cells, points), unit length."""
     x, w = gauss_legendre(_CELL_POINTS)
-    ends = gauss_legendre(rod.nodes)[0]
+    ends = rod.quadrature.cell_ends
     sizes = np.diff(ends, prepend=0.0)
     points = ends[:, None] + sizes[:, None] * (x - 1)[None, :]
     powers = w[None, None, :] * (x - 0.5)[None, None, :] ** np.arange(3)[:, None, None]
-    powers = jnp.asarray(powers * sizes[None, :, None], dtype)
+    return points, powers * sizes[None, :, None]
+
+
+def _rest_moments(rod: Rod, dtype) -> Float[Array, "order rot cells"]:
+    rest, rot = _rest_strain(rod, dtype), rod.group.rotation_dim
+    points, powers = _cells(rod)
+    if rest.ndim == 1:
+        sizes = powers[0].sum(axis=1)
+        plain = np.stack([sizes, 0 * sizes, sizes / 12])  # moments of the constant 1
+        return jnp.asarray(plain, dtype)[:, None, :] * rest[None, :rot, None]
+    rows = jnp.asarray(interpolation_rows(rod.quadrature, points.reshape(-1)), dtype)
+    values = (rest[:rot] @ rows.T).reshape(rot, *points.shape)
+    return jnp.einsum("okp,rkp->ork", jnp.asarray(powers, dtype), values)
+
+
+def _moments(rod: Rod, dtype) -> Float[Array, "order rot cells dof"]:
+    """Moments of the curvature modes over the cells, unit length."""
+    points, powers = _cells(rod)
+    powers = jnp.asarray(powers, dtype)
     values = jnp.asarray(rod.basis(points.reshape(-1)), dtype)
     values = values.reshape(-1, *points.shape, rod.basis.num_dof)
     moments = jnp.einsum("okp,akpn->aokn", powers, values)

@@ -3,17 +3,17 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sorojax.rod.motion import Motion, Operators, is_curvature
+from sorojax.rod.motion import Motion, Operators, is_curvature, rest_along
 from sorojax.rod.rod import Rod
 
 
 def motion(rod: Rod, constants: Operators, q: Array, v: Array, unroll: bool) -> Motion:
     """Fields of the rod at the Gauss nodes; nothing to unroll."""
     del unroll
-    per_coordinate = jnp.cumsum(constants.moments[0, 0], axis=0)
+    per_coordinate = _at_nodes(rod, jnp.cumsum(constants.moments[0, 0], axis=0))
     angle = per_coordinate @ q
     if rod.rest_strain is not None:
-        angle = angle + jnp.cumsum(constants.rest_moments[0, 0])
+        angle = angle + _at_nodes(rod, jnp.cumsum(constants.rest_moments[0, 0]))
     cosine, sine = jnp.cos(angle), jnp.sin(angle)
     axes = jnp.stack([cosine, sine], axis=1), jnp.stack([-sine, cosine], axis=1)
     tangent = _tangent(rod, constants, axes, q)
@@ -43,12 +43,10 @@ def motion(rod: Rod, constants: Operators, q: Array, v: Array, unroll: bool) -> 
 def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:
     """Mass matrix and Coriolis force by one product J' [S J | F]."""
     constants, v = moment.operators, moment.v
-    quad, _, dof = moment.linear_jacobian.shape
+    dof = v.shape[0]
     angular = moment.angular_jacobian[:, 0]
     spin = (angular @ v)[:, None]
-    swept = 2 * (moment.linear_rate.reshape(-1, dof) @ v).reshape(quad, 2)
-    # The rate already holds spin x tangent once: a = spin x (spin x r' + 2 p).
-    inner = spin * _turn(swept - spin * _turn(moment.tangent))
+    inner = _bias_rate(moment, spin)
     force = constants.mass[:, None] * (constants.integration @ inner)
     rows = jnp.concatenate([moment.linear_jacobian.reshape(-1, dof), angular])
     scale = jnp.concatenate([jnp.repeat(constants.mass, 2), constants.rotary[0]])
@@ -57,9 +55,26 @@ def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof
     return product[:, :dof], product[:, dof]
 
 
+def bias_rates(moment: Motion) -> tuple[Float[Array, "quad 1"], Float[Array, "quad 2"]]:
+    """d/ds of the accelerations at zero coordinate acceleration, angular and linear."""
+    spin = moment.angular_jacobian @ moment.v
+    return jnp.zeros_like(spin), _bias_rate(moment, spin)
+
+
+def _bias_rate(moment: Motion, spin: Float[Array, "quad 1"]) -> Float[Array, "quad 2"]:
+    quad, _, dof = moment.linear_rate.shape
+    swept = 2 * (moment.linear_rate.reshape(-1, dof) @ moment.v).reshape(quad, 2)
+    # The rate already holds spin x tangent once: a = spin x (spin x r' + 2 p).
+    return spin * _turn(swept - spin * _turn(moment.tangent))
+
+
+def _at_nodes(rod: Rod, cells: Float[Array, "cells *dof"]) -> Float[Array, "quad *dof"]:
+    return cells[rod.quadrature.node_cells] if rod.quadrature.breaks else cells
+
+
 def _tangent(rod: Rod, constants: Operators, axes, q: Array) -> Array:
-    stretch, shear = constants.rest_strain[1], constants.rest_strain[2]
-    tangent = stretch * axes[0] + shear * axes[1]
+    rest = rest_along(constants)
+    tangent = rest[:, 1:2] * axes[0] + rest[:, 2:3] * axes[1]
     for name, rows in zip(rod.basis.active, constants.strain_rows, strict=True):
         if not is_curvature(name):
             tangent = tangent + axes[name == "sigma_y"] * (rows @ q)[:, None]

@@ -1,18 +1,25 @@
 """The rod: what a user chose about it, and nothing else."""
 
-from typing import Generic, TypeVar
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, TypeAlias, TypeVar
 
 import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import optional_real, real
 from sorojax.material.hyperelastic import AbstractHyperelastic, small_strain_moduli
 from sorojax.math.lie import SE2, SE3
-from sorojax.rod.basis import STRAINS, StrainBasis
+from sorojax.math.quadrature import Quadrature, gauss_legendre
+from sorojax.rod.basis import STRAINS, StrainBasis, checked_breaks, merged
 from sorojax.rod.section import Section
 
 G = TypeVar("G", SE2, SE3)
+T = TypeVar("T")
+AlongRod: TypeAlias = Callable[[Float[np.ndarray, " points"]], T]
 
 _PLANAR = ("kappa_z", "sigma_x", "sigma_y")
 
@@ -67,8 +74,10 @@ class Rod(eqx.Module, Generic[G]):
         section: Constants of the cross-section.
         material: Small-strain constants and density.
         length: Rest length [m].
-        rest_strain: Constant curvatures [1/m], then stretch and shears [-], or None.
+        rest_strain: Curvatures [1/m], then stretch and shears [-], or None; one column per
+            node if they vary.
         nodes: Number of Gauss nodes along the rod.
+        breaks: Where section or rest strain jump; those of the basis need no mention.
     """
 
     group: G
@@ -76,8 +85,9 @@ class Rod(eqx.Module, Generic[G]):
     section: Section
     material: Elastic
     length: Float[Array, ""] = eqx.field(converter=real)
-    rest_strain: Float[Array, " strain"] | None = eqx.field(converter=optional_real)
+    rest_strain: Float[Array, "strain *quad"] | None = eqx.field(converter=optional_real)
     nodes: int = eqx.field(static=True)
+    breaks: tuple[float, ...] = eqx.field(static=True, default=())
 
     def __check_init__(self):
         _check.positive("rod", "length", self.length, "m", "Give the rest length.")
@@ -88,15 +98,28 @@ class Rod(eqx.Module, Generic[G]):
                 f"rod: the basis activates {', '.join(wrong)}, {type(self.group).__name__} "
                 f"has {', '.join(names)}. A planar rod bends about z; use SE3() otherwise."
             )
+        _check_nodes(self.nodes, self.basis, self.quadrature)
+        for part in (self.section, self.material):
+            for field in dataclasses.fields(part):
+                _check_field(field.name, getattr(part, field.name), self.nodes)
         if self.rest_strain is not None:
             do = f"Give one value per strain: {', '.join(names)}; stretch rests at 1."
-            _check.shape("rod", "rest_strain", self.rest_strain, (len(names),), do)
+            varies = len(jnp.shape(self.rest_strain)) == 2
+            want = (len(names), self.nodes) if varies else (len(names),)
+            _check.shape("rod", "rest_strain", self.rest_strain, want, do)
+
+    @property
+    def quadrature(self) -> Quadrature:
+        """The Gauss rule of the rod: breaks of the basis and its own divide it."""
+        breaks = self.basis.breaks
+        breaks = merged(breaks, self.breaks) if self.breaks else breaks
+        return Quadrature(self.nodes // (len(breaks) + 1), breaks)
 
 
 def rod(
     group: G,
     basis: StrainBasis,
-    section: Section,
+    section: Section | AlongRod[Section],
     material: Elastic | None = None,
     *,
     length,
@@ -105,39 +128,79 @@ def rod(
     density=None,
     rest_strain=None,
     nodes: int | None = None,
+    breaks: Sequence[float] = (),
 ) -> Rod[G]:
     """A rod from a basis, a section and a material or its three constants.
 
     Args:
         group: `SE2()` for a planar, `SE3()` for a spatial rod.
         basis: Active strains and their modes, e.g. `chebyshev(kappa_z=3)`.
-        section: e.g. `circle(6 * mm)`.
+        section: e.g. `circle(6 * mm)`, or a function that takes points s in [0, 1] to a
+            section with one value per point, e.g. `taper(circle, 6 * mm, 3 * mm)`.
         material: `Elastic` constants; otherwise give the three that follow.
         length: Rest length [m].
-        young_modulus: [Pa].
-        poisson_ratio: [-].
-        density: [kg/m^3].
-        rest_strain: Constant strain of the unloaded rod, curvatures [1/m] first.
+        young_modulus: [Pa], a number or a function of s.
+        poisson_ratio: [-], as `young_modulus`.
+        density: [kg/m^3], as `young_modulus`.
+        rest_strain: Strain of the unloaded rod, curvatures [1/m] first: one value per
+            strain, or a function of s that gives (points, strains).
         nodes: Gauss nodes; by default what resolves the modes. Add some when the rod
-            turns by more than half a turn.
+            turns by more than half a turn. With breaks a multiple of the spans.
+        breaks: Where section or rest strain jump or kink, in (0, 1).
     """
+    given = {
+        "young_modulus": young_modulus,
+        "poisson_ratio": poisson_ratio,
+        "density": density,
+    }
     if material is None:
-        given = {
-            "young_modulus": young_modulus,
-            "poisson_ratio": poisson_ratio,
-            "density": density,
-        }
         missing = [name for name, value in given.items() if value is None]
         if missing:
             raise ValueError(
                 f"rod: got no `material` and no {', '.join(missing)}; need all three "
                 "constants. Write young_modulus=1 * MPa, poisson_ratio=0.49, density=1070."
             )
-        material = Elastic(young_modulus, poisson_ratio, density)
-    nodes = basis.resolution if nodes is None else nodes
-    if nodes < 2:
-        raise ValueError(f"rod: `nodes` must be 2 or more, got {nodes}. 8 suit 3 modes.")
-    return Rod(group, basis, section, material, length, rest_strain, nodes)
+    own = checked_breaks("rod", breaks)
+    spans = len(merged(basis.breaks, own)) + 1
+    nodes = spans * basis.resolution if nodes is None else nodes
+    s = gauss_legendre(Quadrature(max(nodes // spans, 1), merged(basis.breaks, own)))[0]
+    if material is None:
+        material = Elastic(*(_at(given[name], s) for name in given))
+    if callable(rest_strain):
+        rest_strain = real(rest_strain(s)).T
+    return Rod(group, basis, _at(section, s), material, length, rest_strain, nodes, own)
+
+
+def _at(value: Any, s: np.ndarray) -> Any:
+    return value(s) if callable(value) else value
+
+
+def _check_nodes(nodes: int, basis: StrainBasis, rule: Quadrature) -> None:
+    """Raise a `ValueError` unless the nodes fit the breaks and tell the modes apart."""
+    spans = len(rule.breaks) + 1
+    if nodes % spans:
+        raise ValueError(
+            f"rod: `nodes` is {nodes}, need a multiple of {spans}: breaks divide the rod into "
+            f"{spans} spans. Give {spans * max(2, round(nodes / spans))}."
+        )
+    name, least = max(
+        ((name, modes.least) for name, modes in basis.modes.items()), key=lambda pair: pair[1]
+    )
+    if rule.count < max(2, least):
+        modes = basis.modes[name].count
+        raise ValueError(
+            f"rod: `nodes` is {nodes}, {rule.count} between breaks, need {max(2, least)} or "
+            f"more there to tell the {modes} modes of {name} apart. "
+            f"{spans * basis.resolution} resolve them."
+        )
+
+
+def _check_field(name: str, value: Any, nodes: int) -> None:
+    if value is not None and (shape := jnp.shape(value)) not in ((), (nodes,)):
+        raise ValueError(
+            f"rod: `{name}` has shape {shape}, need one number or ({nodes},), one per Gauss "
+            "node. Give a function of s, such as taper(circle, 6 * mm, 3 * mm)."
+        )
 
 
 def strain_names(group: SE2 | SE3) -> tuple[str, ...]:

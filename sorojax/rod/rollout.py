@@ -1,10 +1,13 @@
-"""Motion of one rod with a fixed step: the fast path, for known forces."""
+"""Motion of a rod or assembly with a fixed step: the fast path, for known forces."""
+
+import functools
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax._types import real
+from sorojax.math.contact_stepper import ContactMidpoint
 from sorojax.math.status import Status
 from sorojax.math.steppers import (
     AbstractStepper,
@@ -13,14 +16,11 @@ from sorojax.math.steppers import (
     integrate,
     start,
 )
-from sorojax.rod.forces import (
-    AbstractForce,
-    damping_matrix,
-    tangent_stiffness,
-    total_force,
-)
-from sorojax.rod.kinematics import inertia, motion
-from sorojax.rod.motion import operators
+from sorojax.rod.assembly import Assembly, is_flat, rate, retract
+from sorojax.rod.assembly_contact import any_contact, contacts_of
+from sorojax.rod.dynamics import Forces
+from sorojax.rod.loads import damping_matrix, tangent_stiffness, total_force
+from sorojax.rod.model import Model, inertia, motion, operators
 from sorojax.rod.rod import Rod
 
 
@@ -28,28 +28,28 @@ class Rollout(eqx.Module):
     """A motion sampled in time: time [s], coordinates and their rates."""
 
     time: Float[Array, " time"]
-    q: Float[Array, "time dof"]
+    q: Float[Array, "time coordinates"]
     v: Float[Array, "time dof"]
     status: Status
 
 
 def rollout(
-    rod: Rod,
-    q: Float[Array, " dof"],
+    model: Model,
+    q: Float[Array, " coordinates"],
     v: Float[Array, " dof"],
-    forces: tuple[AbstractForce, ...] = (),
+    forces: Forces = (),
     *,
     step,
     saves: int,
     every: int = 1,
     t=0.0,
     stepper: AbstractStepper | None = None,
-    unroll: bool = True,
+    unroll: bool | None = None,
 ) -> Rollout:
-    """Move the rod from (q, v) by `saves * every` steps.
+    """Move the model from (q, v) by `saves * every` steps.
 
     Args:
-        rod: The rod.
+        model: The rod or assembly.
         q: Coordinates at `t`.
         v: Their rates.
         forces: Generalised forces.
@@ -57,18 +57,22 @@ def rollout(
         saves: Number of saved moments after the first.
         every: Steps between two of them.
         t: Start [s].
-        stepper: `GeneralisedAlpha()` by default; `RungeKutta4()` or `DormandPrince()`
-            for undamped motion at high accuracy.
-        unroll: Write the rotation product out: runs faster. Pass False when the rollout
+        stepper: `GeneralisedAlpha()` by default, `ContactMidpoint()` if a contact is among
+            the forces; `RungeKutta4()` or `DormandPrince()` for undamped motion at high
+            accuracy.
+        unroll: Write the rotation product and the stages of explicit methods out: runs
+            faster, compiles slower; by default for single rods. Pass False when the rollout
             is differentiated, or it compiles several times slower.
     """
-    stepper = GeneralisedAlpha() if stepper is None else stepper
-    return _rollout(rod, q, v, forces, real(step), real(t), stepper, saves, every, unroll)
+    if stepper is None:
+        stepper = ContactMidpoint() if any_contact(forces) else GeneralisedAlpha()
+    unroll = isinstance(model, Rod) if unroll is None else unroll
+    return _rollout(model, q, v, forces, real(step), real(t), stepper, saves, every, unroll)
 
 
 @eqx.filter_jit
-def _rollout(rod, q, v, forces, step, t, stepper, saves, every, unroll) -> Rollout:
-    problem = second_order(rod, q, forces, unroll=unroll)
+def _rollout(model, q, v, forces, step, t, stepper, saves, every, unroll) -> Rollout:
+    problem = second_order(model, q, forces, unroll=unroll)
     begin = start(problem, t, q, v)
     path = integrate(stepper, problem, begin, t=t, h=step, saves=saves, every=every)
     fine = jnp.all(jnp.isfinite(path.q)) & jnp.all(jnp.isfinite(path.v))
@@ -78,20 +82,32 @@ def _rollout(rod, q, v, forces, step, t, stepper, saves, every, unroll) -> Rollo
 
 
 def second_order(
-    rod: Rod,
-    q: Float[Array, " dof"],
-    forces: tuple[AbstractForce, ...],
+    model: Model,
+    q: Float[Array, " coordinates"],
+    forces: Forces,
     *,
     unroll: bool = False,
 ) -> SecondOrder:
-    """The equations of the rod, with its stiffness at `q` and its damping."""
-    constants = operators(rod)
+    """The equations of the model, with its stiffness at `q` and its damping."""
+    constants = operators(model)
+
+    def at(q, v):
+        return motion(model, q, v, constants=constants, unroll=unroll)
 
     def equations(t, q, v):
-        moment = motion(rod, q, v, constants=constants, unroll=unroll)
+        moment = at(q, v)
         mass, coriolis = inertia(moment)
         return mass, total_force(forces, t, moment) - coriolis
 
-    stiffness = tangent_stiffness(forces, motion(rod, q, constants=constants))
-    damping = damping_matrix(forces, constants.stiffness)
-    return SecondOrder(equations, stiffness, damping)
+    stiffness = tangent_stiffness(forces, motion(model, q, constants=constants))
+    damping = damping_matrix(forces, model, constants)
+    curved = isinstance(model, Assembly) and not is_flat(model)
+    return SecondOrder(
+        equations,
+        stiffness,
+        damping,
+        retract=functools.partial(retract, model) if curved else None,
+        rate=functools.partial(rate, model) if curved else None,
+        unroll=unroll,
+        contact=contacts_of(model, forces, at, inertia),
+    )

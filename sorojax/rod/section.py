@@ -1,19 +1,23 @@
 """Cross-sections: the constants by which a section resists and carries mass."""
 
-import math
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import optional_real, real
 
 
 class Section(eqx.Module):
     """Constants of a cross-section in its local y-z plane; the rod axis is local x.
 
-    Each is one number for a uniform rod, or one value per Gauss node for a tapered one.
+    Each is one number for a uniform rod, or one value per Gauss node for a tapered one:
+    `taper` and functions of s give these for any number of nodes.
     Bending about y resists with `second_moment_y`, about z with `second_moment_z`; a
     planar rod bends about z.
 
@@ -23,6 +27,7 @@ class Section(eqx.Module):
         second_moment_z: Integral of y^2 over the section [m^4].
         torsion_constant: [m^4].
         shear_factor: Share of the area that carries shear [-].
+        shear_factor_z: The same for shear along z, if it differs from that along y.
     """
 
     area: Float[Array, "*quad"] = eqx.field(converter=real)
@@ -30,6 +35,9 @@ class Section(eqx.Module):
     second_moment_z: Float[Array, "*quad"] = eqx.field(converter=real)
     torsion_constant: Float[Array, "*quad"] = eqx.field(converter=real)
     shear_factor: Float[Array, "*quad"] = eqx.field(converter=real, default=5 / 6)
+    shear_factor_z: Float[Array, "*quad"] | None = eqx.field(
+        converter=optional_real, default=None
+    )
 
     def __check_init__(self):
         do = "Write lengths in metres, e.g. with sorojax.units.mm."
@@ -38,43 +46,47 @@ class Section(eqx.Module):
         _check.positive("Section", "second_moment_z", self.second_moment_z, "m^4", do)
         _check.positive("Section", "torsion_constant", self.torsion_constant, "m^4", do)
         _check.positive("Section", "shear_factor", self.shear_factor, "-", "5/6 is usual.")
+        if self.shear_factor_z is not None:
+            do = "Leave it out if it is that along y."
+            _check.positive("Section", "shear_factor_z", self.shear_factor_z, "-", do)
 
 
-def circle(radius, *, shear_factor=9 / 10) -> Section:
-    """A disc of `radius` [m]."""
-    radius = real(radius)
-    _check.positive("circle", "radius", radius, "m", "Give the outer radius.")
-    second_moment = math.pi / 4 * radius**4
+def scaled(section: Section, factor) -> Section:
+    """The same shape `factor` times as large [-]; an array gives one section per entry."""
+    factor = real(factor)
+    _check.positive("scaled", "factor", factor, "-", "1 leaves the section as it is.")
     return Section(
-        area=math.pi * radius**2,
-        second_moment_y=second_moment,
-        second_moment_z=second_moment,
-        torsion_constant=2 * second_moment,
-        shear_factor=shear_factor,
+        area=section.area * factor**2,
+        second_moment_y=section.second_moment_y * factor**4,
+        second_moment_z=section.second_moment_z * factor**4,
+        torsion_constant=section.torsion_constant * factor**4,
+        shear_factor=section.shear_factor,
+        shear_factor_z=section.shear_factor_z,
     )
 
 
-def rectangle(width, height, *, shear_factor=5 / 6) -> Section:
-    """A solid rectangle.
+def taper(section: Callable[..., Section], start: Any, end: Any) -> Callable[..., Section]:
+    """A section whose sizes change linearly from base to tip, as a function of s.
 
     Args:
-        width: Size along local z [m], out of the plane of a planar rod.
-        height: Size along local y [m], in the plane of a planar rod.
-        shear_factor: Share of the area that carries shear [-].
+        section: Makes a section of sizes, e.g. `circle`, or `lambda k: scaled(made, k)`.
+        start: Size [m] at the base, or a tuple with one per argument of `section`.
+        end: The same at the tip.
 
-    Reference:
-        Torsion constant within 4 % (exact 0.1406 a^4 for a square): Young, Budynas,
-        Sadegh, Roark's Formulas for Stress and Strain, table 10.7.
+    Raises:
+        ValueError: If `start` and `end` hold different numbers of sizes.
     """
-    width, height = real(width), real(height)
-    _check.positive("rectangle", "width", width, "m", "Give the size along local z.")
-    _check.positive("rectangle", "height", height, "m", "Give the size along local y.")
-    long, short = jnp.maximum(width, height), jnp.minimum(width, height)
-    ratio = short / long
-    return Section(
-        area=width * height,
-        second_moment_y=height * width**3 / 12,
-        second_moment_z=width * height**3 / 12,
-        torsion_constant=long * short**3 * (1 / 3 - 0.21 * ratio * (1 - ratio**4 / 12)),
-        shear_factor=shear_factor,
-    )
+    first = start if isinstance(start, tuple) else (start,)
+    last = end if isinstance(end, tuple) else (end,)
+    if len(first) != len(last):
+        raise ValueError(
+            f"taper: `start` has {len(first)} sizes and `end` {len(last)}, need as many. Give "
+            "one per argument of the section, e.g. (width, height)."
+        )
+    return jax.tree_util.Partial(_tapered, section, jax.tree.map(real, (first, last)))
+
+
+def _tapered(section, ends, s: Float[np.ndarray, " points"]) -> Section:
+    first, last = ends
+    sizes = (a + (b - a) * jnp.asarray(s, a.dtype) for a, b in zip(first, last, strict=True))
+    return section(*sizes)

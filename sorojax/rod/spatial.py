@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from sorojax.math.magnus import rotation_vector
 from sorojax.math.quaternion import cross, exponential, prefix_product, rotation_columns
-from sorojax.rod.motion import Motion, Operators, is_curvature, local_axis
+from sorojax.rod.motion import Motion, Operators, is_curvature, local_axis, rest_along
 from sorojax.rod.rod import Rod
 
 
@@ -39,10 +39,10 @@ def motion(rod: Rod, constants: Operators, q: Array, v: Array, unroll: bool) -> 
 
 def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:
     """Mass matrix and Coriolis force by one product J' [S J | F]."""
-    constants, v = moment.operators, moment.v
-    quad, _, dof = moment.angular_jacobian.shape
-    spin = (moment.angular_jacobian.reshape(-1, dof) @ v).reshape(quad, 3)
-    linear, angular = _bias_acceleration(moment, spin)
+    constants, dof = moment.operators, moment.v.shape[0]
+    spin = _spin(moment)
+    swing, inner = _bias_rates(moment, spin)
+    linear, angular = constants.integration @ inner, constants.integration @ swing
     local = _to_local(moment.directors, moment.angular_jacobian)
     local_spin = _to_local(moment.directors, spin[:, :, None])[:, :, 0]
     rotary = constants.rotary.T
@@ -56,14 +56,21 @@ def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof
     return product[:, :dof], product[:, dof]
 
 
+def bias_rates(moment: Motion) -> tuple[Float[Array, "quad 3"], Float[Array, "quad 3"]]:
+    """d/ds of the accelerations at zero coordinate acceleration, angular and linear."""
+    return _bias_rates(moment, _spin(moment))
+
+
 def _directors(rod: Rod, constants: Operators, q: Array, unroll: bool) -> list[Array]:
     """Local axes at the nodes, three arrays (quad, dim)."""
-    order, rot, quad, dof = constants.moments.shape
-    moments = (constants.moments.reshape(-1, dof) @ q).reshape(order, rot, quad)
+    order, rot, cells, dof = constants.moments.shape
+    moments = (constants.moments.reshape(-1, dof) @ q).reshape(order, rot, cells)
     if rod.rest_strain is not None:
         moments = moments + constants.rest_moments
-    cells = tuple((m[0], m[1], m[2]) for m in moments)
-    turns = prefix_product(exponential(rotation_vector(cells)), unroll=unroll)  # type: ignore[arg-type]
+    by_order = tuple((m[0], m[1], m[2]) for m in moments)
+    turns = prefix_product(exponential(rotation_vector(by_order)), unroll=unroll)  # type: ignore[arg-type]
+    if rod.quadrature.breaks:
+        turns = tuple(c[rod.quadrature.node_cells] for c in turns)
     return [jnp.stack(column, axis=1) for column in rotation_columns(turns)]
 
 
@@ -87,26 +94,31 @@ def _tangent(rod: Rod, constants: Operators, axes: list[Array], q: Array) -> Arr
     if rod.rest_strain is None:
         tangent = axes[0]
     else:
-        tangent = jnp.stack(axes, axis=-1) @ constants.rest_strain[3:]
+        rest = rest_along(constants)
+        tangent = rest[:, 3:4] * axes[0] + rest[:, 4:5] * axes[1] + rest[:, 5:6] * axes[2]
     for name, rows in zip(rod.basis.active, constants.strain_rows, strict=True):
         if not is_curvature(name):
             tangent = tangent + axes[local_axis(name)] * (rows @ q)[:, None]
     return tangent
 
 
-def _bias_acceleration(moment: Motion, spin: Array) -> tuple[Array, Array]:
-    """Accelerations at zero coordinate acceleration, linear and angular (quad, 3)."""
+def _spin(moment: Motion) -> Float[Array, "quad 3"]:
+    quad, _, dof = moment.angular_jacobian.shape
+    return (moment.angular_jacobian.reshape(-1, dof) @ moment.v).reshape(quad, 3)
+
+
+def _bias_rates(moment: Motion, spin: Array) -> tuple[Array, Array]:
     constants, v = moment.operators, moment.v
     quad, _, dof = moment.angular_rate.shape
     curl = (moment.angular_rate.reshape(-1, dof) @ v).reshape(quad, 3)
-    angular = constants.integration @ _cross(spin, curl)
+    swing = _cross(spin, curl)
+    angular = constants.integration @ swing
     swept = _cross(spin, moment.tangent)
     if any(not is_curvature(name) for name in moment.rod.basis.active):
         turning = _cross(spin, moment.tangent)
         rate = (moment.linear_rate.reshape(-1, dof) @ v).reshape(quad, 3)
         swept = swept + 2 * (rate - turning)
-    inner = _cross(angular, moment.tangent) + _cross(spin, swept)
-    return constants.integration @ inner, angular
+    return swing, _cross(angular, moment.tangent) + _cross(spin, swept)
 
 
 def _to_local(directors: Array, vectors: Float[Array, "quad dim n"]) -> Array:

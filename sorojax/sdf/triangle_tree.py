@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax.sdf.nearest import take
+from sorojax.sdf.triangle_cells import FEW, MOST, TriangleCells, triangle_cells
 from sorojax.sdf.triangles import Vector, dot, foot, minus, triangle_square
 
 LEAF = 4  # triangles in the smallest box
@@ -17,13 +18,14 @@ _STEPS = 6  # boxes looked at between two looks at triangles
 class TriangleTree(eqx.Module):
     """Which triangles of a watertight mesh share a box, an edge or a corner.
 
-    Positions are not held: boxes and normals follow from the vertices of the day. Far from
-    those it was built for the tree is slow, and right.
+    Boxes and normals follow from the vertices of the day. Far from those it was built for
+    the tree is slow, and right. For exactly those `cells` list what may be closest.
     """
 
     order: Int[Array, " slots"]
     corner: Int[Array, "faces 3"]
     edge: Int[Array, "faces 3"]
+    cells: TriangleCells | None
     corners: int = eqx.field(static=True)
     edges: int = eqx.field(static=True)
 
@@ -33,12 +35,38 @@ class TriangleTree(eqx.Module):
         """Number of the face closest to each point p [m]."""
         triangles = vertices[faces[self.order]]
         boxes = _boxes(triangles)
-        # A group goes on until its last point is done, so groups are small.
         count = len(p[0])
         size = min(GROUP, max(count, 1))
-        groups = tuple(jnp.pad(c, (0, -count % size)).reshape(-1, size) for c in p)
-        slot = jax.lax.map(lambda p: _search(triangles, boxes, p), groups)
-        return self.order[slot.reshape(-1)[:count]]
+        lists = None if self.cells is None else self.cells.look_up(vertices, p)
+        rows, back = (p, lists), None
+        if lists is not None and count > size:
+            # A group goes on until its last point is done: it holds points of equal work.
+            work = lists[1] + jnp.where(lists[2], 0, MOST)
+            back = jnp.argsort(work)
+            rows = jax.tree.map(lambda a: a[back], rows)
+        groups = jax.tree.map(lambda a: _grouped(a, size), rows)
+        slot = jax.lax.map(lambda row: self._search(triangles, boxes, *row), groups)
+        slot = slot.reshape(-1)[:count]
+        if back is not None:
+            slot = jnp.zeros_like(slot).at[back].set(slot)
+        return self.order[slot]
+
+    def _search(self, triangles: Float[Array, "slots 3 3"], boxes: tuple, p: Vector, lists):
+        """Slot of the triangle closest to each point of a group."""
+        best, slot = jnp.full_like(p[0], jnp.inf), jnp.zeros(p[0].shape, jnp.int32)
+        if self.cells is None:
+            return _walk(triangles, boxes, p, best, slot, slot == 0)
+        held, parts = self.cells.slots, tuple(triangles[:, i] for i in range(3))
+        first, length, whole = lists
+
+        def compare(k, state):
+            best, slot = state
+            at = held[first + jnp.minimum(jnp.asarray(k, jnp.int32), length - 1)]
+            square = triangle_square(p, *take(parts, at))
+            return jnp.where(square < best, square, best), jnp.where(square < best, at, slot)
+
+        best, slot = jax.lax.fori_loop(0, jnp.max(length), compare, (best, slot))
+        return _walk(triangles, boxes, p, best, slot, ~whole)
 
     def inside(
         self, vertices: Float[Array, "vertices 3"], faces: Int[Array, "faces 3"],
@@ -75,8 +103,13 @@ class TriangleTree(eqx.Module):
         return face, edge, corner
 
 
-def _search(triangles: Float[Array, "slots 3 3"], boxes: tuple, p: Vector) -> Array:
-    """Slot of the closest triangle: down to a near leaf first, then all that may be nearer."""
+def _grouped(a: Array, size: int) -> Array:
+    return jnp.pad(a, (0, -len(a) % size)).reshape(-1, size)
+
+
+def _walk(triangles: Float[Array, "slots 3 3"], boxes: tuple, p: Vector, best, slot, open_):
+    """Slot of the closest triangle, where that is `open_`: the squared distance `best` of
+    `slot` bounds the search, or a near leaf if there is none."""
     leaves = len(triangles) // LEAF
     parts = tuple(triangles[:, i] for i in range(3))
 
@@ -118,10 +151,12 @@ def _search(triangles: Float[Array, "slots 3 3"], boxes: tuple, p: Vector) -> Ar
 
     root = jnp.ones(p[0].shape, jnp.int32)
     if leaves == 1:
-        return look(root, jnp.full_like(p[0], jnp.inf), root - 1)[1]
-    closest = jax.lax.fori_loop(0, leaves.bit_length() - 1, descend, root)
-    best, slot = look(closest, jnp.full_like(p[0], jnp.inf), root - 1)
-    start = (2 * root, best, slot)
+        return look(root, best, slot)[1]
+    blind = jnp.any(open_ & jnp.isinf(best))
+    steps = jnp.where(blind, leaves.bit_length() - 1, 0)
+    closest = jax.lax.fori_loop(0, steps, descend, root)
+    best, slot = look(closest, best, slot)
+    start = (jnp.where(open_, 2 * root, root), best, slot)
     _, _, slot = jax.lax.while_loop(lambda state: jnp.any(state[0] != 1), visit, start)
     return slot
 
@@ -169,8 +204,16 @@ def triangle_tree(vertices: np.ndarray, faces: np.ndarray) -> TriangleTree | Non
     )
     if (uses != 2).any() or len(np.unique(ways, axis=0)) != len(ways):
         return None
+    triangles = vertices[faces]
+    order = _order(triangles.mean(axis=1))
+    cells = None
+    if len(faces) > FEW:
+        slots = np.zeros(len(faces), np.int64)
+        slots[order[::-1]] = np.arange(len(order))[::-1]
+        cells = triangle_cells(jnp.asarray(vertices), triangles, slots)
     return TriangleTree(
-        order=jnp.asarray(_order(vertices[faces].mean(axis=1)), jnp.int32),
+        order=jnp.asarray(order, jnp.int32),
+        cells=cells,
         corner=jnp.asarray(corner, jnp.int32),
         edge=jnp.asarray(edge.reshape(-1, 3), jnp.int32),
         corners=int(corner.max()) + 1,

@@ -1,0 +1,145 @@
+"""Direct solvers on the host: symbolic analysis, the last few factors, who owns them."""
+
+import hashlib
+import os
+import threading
+import weakref
+from collections import OrderedDict, deque
+
+import numpy as np
+from jaxtyping import Int
+
+from sorojax.math import pardiso, superlu
+
+_NUM_FACTORS = 4
+Factor = pardiso.PardisoFactor | superlu.SuperLUFactor
+
+
+def available_solvers() -> dict[str, str]:
+    """Direct solvers found on this machine, best first, with their versions."""
+    import scipy
+
+    mkl = pardiso.version()
+    found = {"pardiso": f"MKL {mkl}"} if mkl else {}
+    return found | {"superlu": f"SciPy {scipy.__version__}"}
+
+
+def _backend():
+    asked = os.environ.get("SOROJAX_SOLVER", "")
+    if asked not in ("", "pardiso", "superlu"):
+        raise ValueError(
+            f"SOROJAX_SOLVER is {asked!r}, need 'pardiso' or 'superlu'. Unset it for the "
+            "best solver found."
+        )
+    if asked != "superlu" and pardiso.library() is not None:
+        return pardiso.Pardiso
+    if asked == "pardiso":
+        raise ValueError("SOROJAX_SOLVER is 'pardiso': install sorojax[pardiso] first.")
+    return superlu.SuperLU
+
+
+class DirectSolver:
+    """Host side of a system: symbolic analysis and the last few numeric factors.
+
+    A slot records the values that its factor belongs to, so that a factor is never
+    used for other values than its own. Programs that run at the same time take turns.
+    """
+
+    def __init__(self, indptr: np.ndarray, indices: np.ndarray):
+        self._solver = _backend()(indptr, indices, _NUM_FACTORS)
+        self._slots: OrderedDict[int, tuple[np.ndarray, Factor]] = OrderedDict()
+        self._turn = threading.RLock()
+        self.num_factorisations = 0
+
+    @property
+    def name(self) -> str:
+        return self._solver.name
+
+    def factor(self, values: np.ndarray) -> Factor | None:
+        """Factor of `values`, reused if a slot holds it; `None` if singular."""
+        with self._turn:
+            return self._factor(np.asarray(values))
+
+    def _factor(self, values: np.ndarray) -> Factor | None:
+        for slot, (owner, factor) in self._slots.items():
+            if owner is values or np.array_equal(owner, values):
+                self._slots.move_to_end(slot)
+                return factor
+        if not np.all(np.isfinite(values)):
+            return None
+        slot = len(self._slots)
+        if slot == _NUM_FACTORS:
+            slot, _ = self._slots.popitem(last=False)
+        factor = self._solver.factor(values, slot)
+        self.num_factorisations += 1
+        if factor is not None:
+            self._slots[slot] = (values.copy(), factor)
+        else:  # keep the slot's number in circulation
+            self._slots[slot] = (np.full(1, np.nan), factor)  # type: ignore[arg-type]
+            self._slots.move_to_end(slot, last=False)
+        return factor
+
+    def solve(self, values: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """x with A(values) x = b for any leading batch axes; NaN where singular."""
+        values, b = np.asarray(values), np.asarray(b)
+        with self._turn:
+            return self._solve(values, b)
+
+    def _solve(self, values: np.ndarray, b: np.ndarray) -> np.ndarray:
+        lead = np.broadcast_shapes(values.shape[:-1], b.shape[:-1])
+        if values.ndim == 1 or values.size == values.shape[-1]:
+            return self._solve_many(values.reshape(-1), b, lead)
+        values = np.broadcast_to(values, (*lead, values.shape[-1]))
+        b = np.broadcast_to(b, (*lead, b.shape[-1]))
+        x = np.empty(b.shape)
+        for index in np.ndindex(*lead):
+            x[index] = self._solve_many(values[index], b[index], ())
+        return x
+
+    def solve_with_inertia(self, values: np.ndarray, b: np.ndarray) -> tuple:
+        """x with A(values) x = b, and how many eigenvalues are negative: -1 and zeros where
+        A is singular, so that a failed step stays finite."""
+        with self._turn:
+            factor = self.factor(values)
+            if factor is None:
+                return np.zeros(b.shape), np.int32(-1)
+            return factor.solve(np.asarray(b)), np.int32(max(factor.negative_eigenvalues, 0))
+
+    def _solve_many(self, values, b, lead) -> np.ndarray:
+        factor = self.factor(values)
+        if factor is None:
+            return np.full((*lead, b.shape[-1]), np.nan)
+        rhs = b.reshape(-1, b.shape[-1])
+        x = factor.solve(rhs[0])[None] if len(rhs) == 1 else factor.solve(rhs)
+        return np.broadcast_to(x.reshape(b.shape), (*lead, b.shape[-1]))
+
+
+_solvers: weakref.WeakValueDictionary[bytes, DirectSolver] = weakref.WeakValueDictionary()
+_rebuilt: deque[DirectSolver] = deque(maxlen=2)  # by callbacks, which own nothing
+_making = threading.Lock()
+
+
+def solver_of(key, rows, cols, owned: bool = False) -> DirectSolver:
+    """The solver of a pattern, made again where the system that it was made for is gone.
+
+    Solvers live as long as an owner; without one the last two are kept.
+    """
+    name = np.ascontiguousarray(key).tobytes()
+    with _making:
+        solver = _solvers.get(name)
+        if solver is None:
+            rows, cols = np.asarray(rows).ravel(), np.asarray(cols).ravel()
+            size = int(rows[-1]) + 1 if len(rows) else 0
+            solver = DirectSolver(np.searchsorted(rows, np.arange(size + 1)), cols)
+            _solvers[name] = solver
+            if not owned:
+                _rebuilt.append(solver)
+    return solver
+
+
+def pattern_key(rows: np.ndarray, cols: np.ndarray) -> Int[np.ndarray, " 2"]:
+    """A digest of the pattern and of the solver that was asked for."""
+    digest = hashlib.blake2b(_backend().name.encode(), digest_size=8)
+    digest.update(rows.tobytes())
+    digest.update(cols.tobytes())
+    return np.frombuffer(digest.digest(), np.int32)

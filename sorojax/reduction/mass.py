@@ -1,0 +1,45 @@
+"""The uniform section that carries the mass of a body along a curve."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sorojax.fem.kinematics import PlaneStrain, Solid
+from sorojax.fem.points import quadrature_points
+from sorojax.fem.problem import Problem
+from sorojax.math.spatial import KDTree
+from sorojax.reduction.curve import AbstractCurve, reference
+from sorojax.rod import Section
+
+_SAMPLES = 201
+
+
+def mean_section(problem: Problem, curve: AbstractCurve, *, up=None) -> Section:
+    """The section of a uniform rod along `curve` with the mass of the body and its rotary
+    inertia about the curve. The offset of the centre of mass from it is left out; of a
+    solid the torsion constant is the polar moment, an upper bound.
+
+    Raises:
+        ValueError: If the body is neither plane strain nor solid.
+    """
+    kinematics = problem.kinematics
+    if not isinstance(kinematics, PlaneStrain | Solid):
+        raise ValueError(
+            f"mean_section: got {type(kinematics).__name__}, need PlaneStrain or Solid. Give "
+            "the rod a section of your own."
+        )
+    known = reference(curve, _SAMPLES, up)
+    inside = quadrature_points(problem.mesh, kinematics)
+    points = jnp.moveaxis(inside.position, 0, -1).reshape(-1, kinematics.dim)
+    volumes = inside.volumes.reshape(-1)
+    near = KDTree(known.position).query(np.asarray(jax.lax.stop_gradient(points)))[1]
+    away = points - jnp.asarray(known.position[near])
+    local = jnp.einsum("pi,pij->pj", away, jnp.asarray(known.frame[near]))
+    length = known.length
+    area = jnp.sum(volumes) / length
+    about_z = jnp.sum(volumes * local[:, 1] ** 2) / length
+    if isinstance(kinematics, Solid):
+        about_y = jnp.sum(volumes * local[:, 2] ** 2) / length
+    else:
+        about_y = area * kinematics.thickness**2 / 12
+    return Section(area, about_y, about_z, about_y + about_z, 5 / 6)

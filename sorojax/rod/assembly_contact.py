@@ -1,0 +1,75 @@
+"""Contacts among the forces on an assembly, apart from the others, for steppers."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from sorojax.math.steppers import ContactTerms
+from sorojax.rod.assembly import index_of
+from sorojax.rod.contact_force import AbstractContact
+from sorojax.rod.contact_terms import contact_terms, has_contact, near
+from sorojax.rod.loads import Load, On, check, total_force
+from sorojax.rod.rod import Rod
+from sorojax.rod.tree import AssemblyMotion, part_columns, part_motion
+
+
+def contacts_of(
+    model: Any, forces: tuple[Load, ...], at: Callable, inertia: Callable
+) -> ContactTerms | None:
+    """The contacts among the forces on a rod or assembly; None without any.
+
+    Args:
+        model: The rod or assembly.
+        forces: Generalised forces.
+        at: (q, v) -> motion.
+        inertia: motion -> (mass matrix, Coriolis force).
+    """
+    if isinstance(model, Rod):
+        return contact_terms(forces, at, inertia) if has_contact(forces) else None
+    check(model, forces)
+    touching = [force for force in forces if _is_contact(force)]
+    if not touching:
+        return None
+    plain = tuple(force for force in forces if not _is_contact(force))
+    where = [(index_of(model, force.part), force.force) for force in touching]
+
+    def free(t, q, v):
+        moment = at(q, v)
+        mass, coriolis = inertia(moment)
+        return mass, total_force(plain, t, moment) - coriolis, moment
+
+    def is_near(moment: AssemblyMotion, h):
+        answers = [near((contact,), part_motion(moment, k), h) for k, contact in where]
+        return jnp.any(jnp.stack(answers))
+
+    def force(t, q, v):
+        moment = at(q, v)
+        columns, terms = part_columns(moment), []
+        for k, contact in where:
+            term = contact.linearised(t, part_motion(moment, k))
+            own = columns[k]
+            terms.append(
+                (
+                    term.force @ own,
+                    own.T @ term.stiffness @ own,
+                    own.T @ term.damping @ own,
+                )
+            )
+        return tuple(_sum(parts) for parts in zip(*terms, strict=True))
+
+    return ContactTerms(free, is_near, force)
+
+
+def any_contact(forces: tuple[Load, ...]) -> bool:
+    """Whether a contact is listed, on a rod or on a part."""
+    return any(_is_contact(force) for force in forces)
+
+
+def _is_contact(force: Load) -> bool:
+    return isinstance(force.force if isinstance(force, On) else force, AbstractContact)
+
+
+def _sum(parts: tuple[Array, ...]) -> Array:
+    return sum(parts[1:], start=parts[0])

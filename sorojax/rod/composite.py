@@ -1,0 +1,132 @@
+"""Inertia and loads of an assembly, from those of its parts."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax.rod.assembly import parents, slices
+from sorojax.rod.kernel import bias_rates, rod_inertia
+from sorojax.rod.link import LinkOperators, link_inertia, link_motion
+from sorojax.rod.moving import cross, release
+from sorojax.rod.rod import Rod
+from sorojax.rod.tree import (
+    AssemblyMotion,
+    Mount,
+    batches,
+    clamped,
+    part_columns,
+)
+
+
+def assembly_inertia(
+    moment: AssemblyMotion,
+) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:
+    """Mass matrix and Coriolis force; cost of order dof^2 beyond that of the parts."""
+    carriers, size = parents(moment.assembly), moment.assembly.group.algebra_dim
+    masses, biases = part_inertias(moment)
+    rows: list[Array] = []
+    for index in reversed(range(len(carriers))):
+        on, mount = carriers[index], moment.mounts[index]
+        joint = mount.axes.T @ masses[index][:size]
+        rows.append(jnp.concatenate([joint, masses[index][size:]]))
+        if on is not None:
+            whole = masses[index][:size, :size]
+            masses[on] = masses[on] + mount.carried.T @ whole @ mount.carried
+    columns = part_columns(moment)
+    lower = jnp.concatenate(
+        [row @ column for row, column in zip(reversed(rows), columns, strict=True)]
+    )
+    # Parts come after what carries them, so the rows hold the lower triangle.
+    lower = jnp.tril(lower)
+    mass = lower + lower.T - jnp.diag(jnp.diagonal(lower))
+    return mass, gather(moment, biases)
+
+
+def gather(
+    moment: AssemblyMotion, loads: list[Float[Array, " own"] | None]
+) -> Float[Array, " dof"]:
+    """Generalised force of loads on the parts, each in the columns of its part: the pass
+    inwards. None is no load."""
+    carriers, size = parents(moment.assembly), moment.assembly.group.algebra_dim
+    total: list = list(loads)
+    pieces = []
+    for index in reversed(range(len(carriers))):
+        on, mount, load = carriers[index], moment.mounts[index], total[index]
+        if load is None:
+            at = slices(moment.assembly)[index]
+            pieces.append(jnp.zeros(at.rod_v.stop - at.joint_v.start, moment.v.dtype))
+            continue
+        pieces.append(jnp.concatenate([load[:size] @ mount.axes, load[size:]]))
+        if on is not None:
+            passed = load[:size] @ mount.carried
+            total[on] = passed if total[on] is None else total[on] + passed
+    return jnp.concatenate(pieces[::-1])
+
+
+def part_inertias(moment: AssemblyMotion) -> tuple[list[Array], list[Array]]:
+    """Mass matrix and Coriolis force of each part in its own columns and frame."""
+    assembly, size = moment.assembly, moment.assembly.group.algebra_dim
+    masses: list = [None] * len(assembly.parts)
+    biases: list = [None] * len(assembly.parts)
+    for members, stack in zip(batches(assembly), moment.batches, strict=True):
+        twists = jnp.stack([moment.frames[k].twist for k in members])
+        every = eqx.filter_vmap(lambda m, twist: rod_inertia(release(m, twist)))
+        mass, bias = every(stack, twists)
+        for place, k in enumerate(members):
+            masses[k], biases[k] = mass[place], bias[place]
+    for k, part in enumerate(assembly.parts):
+        constants = moment.operators.parts[k]
+        if isinstance(constants, LinkOperators):
+            one = link_motion(part.body, constants, moment.frames[k].twist)
+            masses[k], biases[k] = link_inertia(one)
+    for k, frame in enumerate(bias_accelerations(moment)):
+        if frame is not None:
+            biases[k] = biases[k] + masses[k][:, :size] @ frame
+    return masses, biases
+
+
+def bias_accelerations(moment: AssemblyMotion) -> tuple[Float[Array, " twist"] | None, ...]:
+    """Acceleration of each frame at zero coordinate acceleration, along its own axes; None
+    on the ground, where there is none."""
+    assembly, found = moment.assembly, []
+    for index, on in enumerate(parents(assembly)):
+        mount = moment.mounts[index]
+        if on is None:
+            found.append(None)
+            continue
+        size, before = assembly.group.algebra_dim, found[on]
+        own = _section_bias(moment, index, on)
+        if before is not None:
+            own = own + mount.carried[:, :size] @ before
+        found.append(own)
+    return tuple(found)
+
+
+def _section_bias(moment: AssemblyMotion, index: int, on: int) -> Float[Array, " twist"]:
+    """Acceleration of a part on a carrier whose frame and coordinates do not accelerate."""
+    mount, at = moment.mounts[index], slices(moment.assembly)
+    rot = moment.assembly.group.rotation_dim
+    twist = moment.frames[on].twist
+    own = jnp.concatenate([twist, moment.v[at[on].rod_v]])
+    spin = mount.spin @ own
+    angular, linear = jnp.zeros_like(spin), jnp.zeros_like(mount.arm)
+    rows = moment.operators.rows[index]
+    if rows is not None:
+        rates = bias_rates(release(clamped(moment, on), twist))
+        angular, linear = rows[0] @ rates[0], rows[0] @ rates[1]
+    return _on_arm(mount, moment.v[at[index].joint_v], spin, angular, linear, rot)
+
+
+def _on_arm(mount: Mount, v: Array, spin: Array, angular: Array, linear: Array, rot: int):
+    arm, joint = mount.arm, mount.joint_axes @ v
+    swept = _cross(spin, arm) + 2 * joint[rot:]
+    linear = linear + _cross(angular, arm) + _cross(spin, swept)
+    if rot == 3:
+        angular = angular + _cross(spin, joint[:rot])
+        angular = mount.turn.T @ angular
+    return jnp.concatenate([angular, mount.turn.T @ linear])
+
+
+def _cross(spin: Float[Array, " rot"], arm: Float[Array, " dim"]) -> Float[Array, " dim"]:
+    return cross(spin, arm[None])[0]

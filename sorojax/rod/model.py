@@ -1,0 +1,55 @@
+"""A rod or an assembly: the same words for both, chosen when a program is traced."""
+
+from typing import TypeAlias, overload
+
+from jaxtyping import Array, Float
+
+from sorojax.rod.assembly import Assembly
+from sorojax.rod.composite import assembly_inertia
+from sorojax.rod.kernel import rod_inertia, rod_motion
+from sorojax.rod.motion import Motion, Operators, operators as rod_operators
+from sorojax.rod.rod import Rod
+from sorojax.rod.tree import (
+    AssemblyMotion,
+    AssemblyOperators,
+    assembly_motion,
+    assembly_operators,
+)
+
+Model: TypeAlias = Rod | Assembly
+
+
+@overload
+def operators(model: Rod) -> Operators: ...
+@overload
+def operators(model: Assembly) -> AssemblyOperators: ...
+def operators(model):
+    """The constant arrays of a model, once before a loop; differentiable in its leaves."""
+    return rod_operators(model) if isinstance(model, Rod) else assembly_operators(model)
+
+
+@overload
+def motion(model: Rod, q: Array, v: Array | None = None, *, constants=None, unroll=False) -> Motion: ...
+@overload
+def motion(model: Assembly, q: Array, v: Array | None = None, *, constants=None, unroll=False) -> AssemblyMotion: ...
+def motion(model, q, v=None, *, constants=None, unroll: bool = False):
+    """The fields of a model at (q, v), which forces and inertia read.
+
+    Args:
+        model: The rod or assembly.
+        q: Coordinates.
+        v: Their rates; zero if omitted.
+        constants: `operators(model)`, if a loop has them already.
+        unroll: Write the rotation product out (see `math.quaternion.prefix_product`).
+    """
+    of = rod_motion if isinstance(model, Rod) else assembly_motion
+    return of(model, q, v, constants, unroll)
+
+
+def inertia(
+    moment: Motion | AssemblyMotion,
+) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:
+    """Mass matrix and Coriolis force of a moment."""
+    if isinstance(moment, AssemblyMotion):
+        return assembly_inertia(moment)
+    return rod_inertia(moment)

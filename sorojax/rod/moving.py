@@ -1,0 +1,117 @@
+"""A rod on a moving base: its fields with the columns of the base, in any frame."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax.rod.motion import Base, Motion
+
+
+def release(moment: Motion, twist: Float[Array, " base"]) -> Motion:
+    """The clamped rod of `moment` on a base that moves with `twist`, in axes of the base.
+
+    The columns of the twist come first. Its equations of motion hold for a base without
+    acceleration; that of the base adds `mass_matrix[:, base] @ acceleration`.
+    """
+    quad, dim = moment.tangent.shape
+    rot = moment.angular_rate.shape[1]
+    eye, dtype = jnp.eye(dim, dtype=moment.q.dtype), moment.q.dtype
+    spin, none = jnp.eye(rot, dtype=dtype), jnp.zeros((rot, dim), dtype)
+    angular = jnp.concatenate([spin, none], axis=1)
+    linear = jnp.concatenate([jnp.zeros((dim, rot), dtype), eye], axis=1)
+    own = jnp.zeros((rot + dim, moment.q.shape[0]), dtype)
+    still = jnp.zeros((quad, dim, dim), dtype)
+    arms, slopes = levers(moment.position), levers(moment.tangent)
+    base_linear = jnp.concatenate([arms, jnp.broadcast_to(eye, still.shape)], axis=2)
+    base_angular = jnp.broadcast_to(angular, (quad, rot, rot + dim))
+    return eqx.tree_at(
+        lambda m: (
+            m.q,
+            m.v,
+            m.angular_rate,
+            m.linear_rate,
+            m.angular_jacobian,
+            m.linear_jacobian,
+            m.base,
+        ),
+        moment,
+        (
+            jnp.concatenate([jnp.zeros_like(twist), moment.q]),
+            jnp.concatenate([twist, moment.v]),
+            _pad(moment.angular_rate, rot + dim),
+            jnp.concatenate([slopes, still, moment.linear_rate], axis=2),
+            jnp.concatenate([base_angular, moment.angular_jacobian], axis=2),
+            jnp.concatenate([base_linear, moment.linear_jacobian], axis=2),
+            Base(
+                eye,
+                jnp.zeros(dim, dtype),
+                jnp.concatenate([angular, own[:rot]], axis=1),
+                jnp.concatenate([linear, own[rot:]], axis=1),
+            ),
+        ),
+        is_leaf=lambda leaf: leaf is None,
+    )
+
+
+def place(
+    moment: Motion, rotation: Float[Array, "dim dim"], position: Float[Array, " dim"]
+) -> Motion:
+    """The same motion in a frame in which the base stands at (rotation, position)."""
+    base = moment.base
+    assert base is not None
+    return eqx.tree_at(
+        lambda m: (
+            m.directors,
+            m.tangent,
+            m.angular_rate,
+            m.linear_rate,
+            m.angular_jacobian,
+            m.linear_jacobian,
+            m.base,
+        ),
+        moment,
+        (
+            turned(rotation, moment.directors),
+            turned(rotation, moment.tangent[:, :, None])[:, :, 0],
+            turned(rotation, moment.angular_rate),
+            turned(rotation, moment.linear_rate),
+            turned(rotation, moment.angular_jacobian),
+            turned(rotation, moment.linear_jacobian),
+            Base(
+                rotation @ base.directors,
+                rotation @ base.position + position,
+                turned(rotation, base.angular_jacobian[None])[0],
+                turned(rotation, base.linear_jacobian[None])[0],
+            ),
+        ),
+    )
+
+
+def turned(
+    rotation: Float[Array, "dim dim"], fields: Float[Array, "points rows n"]
+) -> Float[Array, "points rows n"]:
+    """`rotation` times each field; the spin of a plane does not turn."""
+    if fields.shape[1] == 1:
+        return fields
+    columns = rotation.T[:, None, :, None]  # written out: tiny batched products are slow
+    terms = [columns[k] * fields[:, k, None, :] for k in range(fields.shape[1])]
+    return sum(terms[1:], start=terms[0])
+
+
+def levers(arm: Float[Array, "points dim"]) -> Float[Array, "points dim rot"]:
+    """Matrices of spin -> spin x arm."""
+    if arm.shape[1] == 2:
+        return jnp.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None]
+    x, y, z = arm[:, 0], arm[:, 1], arm[:, 2]
+    o = jnp.zeros_like(x)
+    rows = ([o, z, -y], [-z, o, x], [y, -x, o])
+    return jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1)
+
+
+def cross(spin: Float[Array, " rot"], arms: Float[Array, "points dim"]) -> Array:
+    """spin x each arm, in the plane too."""
+    return levers(arms) @ spin
+
+
+def _pad(fields: Array, count: int) -> Array:
+    return jnp.pad(fields, ((0, 0), (0, 0), (count, 0)))

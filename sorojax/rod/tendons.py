@@ -1,0 +1,114 @@
+"""Actuators that act along threads, and input maps by function."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax._types import optional_real, real
+from sorojax.rod.forces import AbstractChamber, AbstractForce
+from sorojax.rod.points import from_own, own
+from sorojax.rod.rod import Rod
+from sorojax.rod.routing import AbstractRoute, Thread, pull, thread, thread_length
+
+Signal = Float[Array, " inputs"] | Callable[[Array], Array]
+
+
+class Tendons(AbstractForce):
+    """Threads under given tensions, fixed to the rod at their far ends.
+
+    Attributes:
+        routes: One routing per tendon.
+        tension: [N], one per tendon, or a function of time that returns them.
+        friction: Coefficient [-] by which tensions fall along the routing; None costs
+            nothing.
+    """
+
+    routes: tuple[AbstractRoute, ...]
+    tension: Signal
+    friction: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
+
+    def __init__(self, routes, tension, friction=None):
+        self.routes = (routes,) if isinstance(routes, AbstractRoute) else tuple(routes)
+        self.tension = tension if callable(tension) else jnp.atleast_1d(real(tension))
+        self.friction = optional_real(friction)
+
+    def __call__(self, t, motion):
+        tension = _at(self.tension, t, motion.q.dtype)
+        do = "Give one tension per routing."
+        _check.shape("Tendons", "tension", tension, (len(self.routes),), do)
+        q = own(motion, motion.q)
+        total = jnp.zeros_like(q)
+        for index, route in enumerate(self.routes):
+            total = total + tension[index] * pull(thread(motion.rod, route), q, self.friction)
+        return from_own(motion, total)
+
+
+class ThreadChambers(AbstractChamber):
+    """Thin fluidic chambers of constant section along threads, from `thread_chambers`.
+
+    The pressure pushes with p A along the thread, by the change of its volume.
+    """
+
+    threads: tuple[Thread, ...]
+    areas: Float[Array, " chambers"] = eqx.field(converter=real)
+    is_single: bool = eqx.field(static=True)
+
+    @property
+    def ports(self):
+        return () if self.is_single else (len(self.threads),)
+
+    def volume(self, q):
+        lengths = jnp.stack([thread_length(each, q) for each in self.threads])
+        volumes = self.areas * lengths
+        return volumes[0] if self.is_single else volumes
+
+
+def thread_chambers(
+    rod: Rod, routes: AbstractRoute | tuple[AbstractRoute, ...], areas
+) -> ThreadChambers:
+    """Chambers of `areas` [m^2] along routings in `rod`, as a pressure map.
+
+    One routing gives a scalar port, a tuple one port per chamber. The map is of this rod:
+    build it again, inside a trace too, where the rod changes.
+
+    Raises:
+        ValueError: If an area is not positive or their number is not that of the routings.
+    """
+    is_single = isinstance(routes, AbstractRoute)
+    routes = (routes,) if is_single else tuple(routes)
+    areas = jnp.atleast_1d(real(areas))
+    do = "Give one area per routing, in m^2."
+    _check.shape("thread_chambers", "areas", areas, (len(routes),), do)
+    _check.positive("thread_chambers", "areas", areas, "m^2", do)
+    return ThreadChambers(tuple(thread(rod, route) for route in routes), areas, is_single)
+
+
+class Actuation(AbstractForce):
+    """Inputs that act through a matrix of the coordinates: force = map(q) @ inputs.
+
+    Attributes:
+        map: (dof,) -> (dof, inputs).
+        inputs: One number per column, or a function of time that returns them.
+    """
+
+    map: Callable[[Float[Array, " dof"]], Float[Array, "dof inputs"]]
+    inputs: Signal
+
+    def __init__(self, map, inputs):
+        self.map = map
+        self.inputs = inputs if callable(inputs) else jnp.atleast_1d(real(inputs))
+
+    def __call__(self, t, motion):
+        q, inputs = own(motion, motion.q), _at(self.inputs, t, motion.q.dtype)
+        matrix = self.map(q)
+        do = "Return one row per coordinate and one column per input."
+        _check.shape("Actuation", "map(q)", matrix, (q.shape[0], inputs.shape[0]), do)
+        return from_own(motion, matrix @ inputs)
+
+
+def _at(signal, t, dtype) -> Float[Array, " inputs"]:
+    value = signal(t) if callable(signal) else signal
+    return jnp.atleast_1d(real(value)).astype(dtype)

@@ -1,0 +1,271 @@
+"""An assembly at one moment: batches of equal rods, and the tree that carries them.
+
+Each part is seen in its own frame: its columns are the twist of the frame and its own
+coordinates, so the cost of a rod does not grow with what carries it. Only the tree knows
+the coordinates of the assembly: twists pass outwards, inertia and loads inwards.
+
+Reference:
+    Featherstone, Rigid Body Dynamics Algorithms, 2008, chapters 5 and 6, for the passes.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax.math.quadrature import integration_rows
+from sorojax.rod.assembly import (
+    Assembly,
+    dtype_of,
+    num_coordinates,
+    num_dof,
+    parents,
+    slices,
+)
+from sorojax.rod.kernel import rod_motion
+from sorojax.rod.link import LinkMotion, LinkOperators, link_motion, link_operators, place_link
+from sorojax.rod.motion import Motion, Operators, operators
+from sorojax.rod.moving import levers, place, release
+from sorojax.rod.points import Points
+from sorojax.rod.rod import Rod
+
+
+class AssemblyOperators(NamedTuple):
+    """Constant arrays of an assembly.
+
+    Attributes:
+        parts: Those of each part.
+        batches: Those of equal rods, stacked.
+        rows: Integrals from the base of the carrier to each mount [m].
+        stiffness, damping: Linear elasticity of rods and joints, damping of joints.
+    """
+
+    parts: tuple[Operators | LinkOperators, ...]
+    batches: tuple[Operators, ...]
+    rows: tuple[Float[Array, "1 quad"] | None, ...]
+    stiffness: Float[Array, "dof dof"]
+    damping: Float[Array, "dof dof"]
+
+
+class Mount(NamedTuple):
+    """How a part moves on its carrier.
+
+    Attributes:
+        carried: Twist of the part per twist and coordinate of the carrier; None on ground.
+        axes: Twist of the part per rate of the joint.
+        turn: Rotation from the carrier's frame to the part's.
+        joint_axes: Twist per rate of the joint along the carrier's axes.
+        arm: From the section of the carrier to the part, along the carrier's axes [m].
+        spin: Angular Jacobian of that section in the columns of the carrier.
+    """
+
+    carried: Float[Array, "twist carrier"] | None
+    axes: Float[Array, "twist joint"]
+    turn: Float[Array, "dim dim"]
+    joint_axes: Float[Array, "twist joint"]
+    arm: Float[Array, " dim"]
+    spin: Float[Array, "rot carrier"] | None
+
+
+class Frame(NamedTuple):
+    """Where the frame of a part is in the world, and its twist along its own axes."""
+
+    rotation: Float[Array, "dim dim"]
+    position: Float[Array, " dim"]
+    twist: Float[Array, " twist"]
+
+
+class AssemblyMotion(eqx.Module):
+    """An assembly at one moment; forces see its parts by `part_motion`.
+
+    Attributes:
+        assembly: The assembly.
+        operators: Its constants.
+        q, v: Coordinates and rates.
+        batches: Motions of equal rods, clamped in their own frames, stacked.
+        mounts, frames: How each part is carried, and where it is.
+    """
+
+    assembly: Assembly
+    operators: AssemblyOperators
+    q: Float[Array, " coordinates"]
+    v: Float[Array, " dof"]
+    batches: tuple[Motion, ...]
+    mounts: tuple[Mount, ...]
+    frames: tuple[Frame, ...]
+
+
+def batches(assembly: Assembly) -> tuple[tuple[int, ...], ...]:
+    """Indices of the rods of equal structure, which are computed together."""
+    kinds: list = []
+    found: list[list[int]] = []
+    for index, part in enumerate(assembly.parts):
+        if isinstance(part.body, Rod):
+            leaves, structure = jax.tree.flatten(part.body)
+            kind = (structure, [(leaf.shape, leaf.dtype) for leaf in leaves])
+            if kind not in kinds:
+                kinds.append(kind)
+                found.append([])
+            found[kinds.index(kind)].append(index)
+    return tuple(tuple(members) for members in found)
+
+
+def assembly_operators(assembly: Assembly) -> AssemblyOperators:
+    """The constant arrays of `assembly`; differentiable in all its leaves."""
+    dtype, total = dtype_of(assembly), num_dof(assembly)
+    parts, rows = [], []
+    stiffness, damping = jnp.zeros((total, total), dtype), jnp.zeros((total, total), dtype)
+    for part, on, at in zip(assembly.parts, parents(assembly), slices(assembly), strict=True):
+        is_rod = isinstance(part.body, Rod)
+        own = operators(part.body) if is_rod else link_operators(part.body, dtype)
+        parts.append(own)
+        carrier = None if on is None else assembly.parts[on].body
+        rows.append(_rows(carrier, part.s) if isinstance(carrier, Rod) else None)
+        spring, damper = part.joint.matrices(assembly.group, dtype)
+        stiffness = stiffness.at[at.joint_v, at.joint_v].set(spring)
+        damping = damping.at[at.joint_v, at.joint_v].set(damper)
+        if is_rod:
+            stiffness = stiffness.at[at.rod_v, at.rod_v].set(own.stiffness)
+    stacks = tuple(
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), *(parts[k] for k in members))
+        for members in batches(assembly)
+    )
+    return AssemblyOperators(tuple(parts), stacks, tuple(rows), stiffness, damping)
+
+
+def assembly_motion(
+    assembly: Assembly,
+    q: Float[Array, " coordinates"],
+    v: Float[Array, " dof"] | None = None,
+    constants: AssemblyOperators | None = None,
+    unroll: bool = False,
+) -> AssemblyMotion:
+    """The fields of all parts at (q, v)."""
+    count = num_coordinates(assembly)
+    do = f"The assembly has {count} coordinates and {num_dof(assembly)} rates; see `rest`."
+    _check.shape("assembly", "q", q, (count,), do)
+    v = jnp.zeros(num_dof(assembly), q.dtype) if v is None else v
+    _check.shape("assembly", "v", v, (num_dof(assembly),), do)
+    constants = assembly_operators(assembly) if constants is None else constants
+    places = slices(assembly)
+    moments = []
+    for members, stack in zip(batches(assembly), constants.batches, strict=True):
+        rod = assembly.parts[members[0]].body
+        own_q = jnp.stack([q[places[k].rod_q] for k in members])
+        own_v = jnp.stack([v[places[k].rod_v] for k in members])
+        every = eqx.filter_vmap(lambda c, q, v, rod=rod: rod_motion(rod, q, v, c, unroll))
+        moments.append(every(stack, own_q, own_v))
+    blank = AssemblyMotion(assembly, constants, q, v, tuple(moments), (), ())
+    mounts, frames = _carry(blank)
+    return AssemblyMotion(assembly, constants, q, v, tuple(moments), mounts, frames)
+
+
+def clamped(moment: AssemblyMotion, index: int) -> Motion:
+    """The motion of a rod in its own frame, clamped there."""
+    for members, stack in zip(batches(moment.assembly), moment.batches, strict=True):
+        if index in members:
+            at = members.index(index)
+            one = jax.tree.map(lambda leaf: leaf[at] if eqx.is_array(leaf) else leaf, stack)
+            own = moment.operators.parts[index]
+            both = (moment.assembly.parts[index].body, own)
+            return eqx.tree_at(lambda m: (m.rod, m.operators), one, both)
+    raise ValueError(f"assembly: `{moment.assembly.names[index]}` is a link, need a rod.")
+
+
+def part_motion(moment: AssemblyMotion, index: int) -> Motion | LinkMotion:
+    """A part in the world frame; its columns are its own twist and coordinates."""
+    rotation, position, twist = moment.frames[index]
+    body = moment.assembly.parts[index].body
+    if isinstance(body, Rod):
+        return place(release(clamped(moment, index), twist), rotation, position)
+    constants = moment.operators.parts[index]
+    assert isinstance(constants, LinkOperators)
+    return place_link(link_motion(body, constants, twist), rotation, position)
+
+
+def part_columns(moment: AssemblyMotion) -> tuple[Float[Array, "own dof"], ...]:
+    """Twist and coordinates of each part per rate of the assembly."""
+    assembly, found = moment.assembly, []
+    total, dtype = moment.v.shape[0], moment.v.dtype
+    identity = jnp.eye(total, dtype=dtype)
+    for on, at, mount in zip(
+        parents(assembly), slices(assembly), moment.mounts, strict=True
+    ):
+        twist = mount.axes @ identity[at.joint_v]
+        if on is not None:
+            twist = twist + mount.carried @ found[on]
+        found.append(jnp.concatenate([twist, identity[at.rod_v]]))
+    return tuple(found)
+
+
+def section(moment: AssemblyMotion, index: int, on: int | None) -> tuple[Array, ...]:
+    """Rotation, position and Jacobians (angular, linear) of what carries part `index`, in
+    the frame of the carrier and its columns."""
+    group, dtype = moment.assembly.group, moment.q.dtype
+    dim, rot, twist = group.space_dim, group.rotation_dim, group.algebra_dim
+    eye = jnp.eye(twist, dtype=dtype)
+    rows = moment.operators.rows[index]
+    if rows is None or on is None:
+        still = jnp.zeros(dim, dtype)
+        return jnp.eye(dim, dtype=dtype), still, eye[:rot], eye[rot:]
+    at = Points(clamped(moment, on), rows)
+    centre = at.position[0]
+    own = at.angular_jacobian.shape[2]
+    linear = eye[rot:].at[:, :rot].set(levers(centre[None])[0])
+    angular = jnp.concatenate([jnp.pad(eye[:rot], ((0, 0), (0, own)))], axis=0)
+    angular = angular.at[:, twist:].set(at.angular_jacobian[0])
+    linear = jnp.concatenate([linear, at.linear_jacobian[0]], axis=1)
+    return at.directors[0], centre, angular, linear
+
+
+def _carry(moment: AssemblyMotion) -> tuple[tuple[Mount, ...], tuple[Frame, ...]]:
+    """The pass from the ground outwards: poses and twists."""
+    assembly, mounts, frames = moment.assembly, [], []
+    places = slices(assembly)
+    for index, on in enumerate(parents(assembly)):
+        mount, position = _mount(moment, index, on)
+        v = moment.v[places[index].joint_v]
+        twist, rotation = mount.axes @ v, mount.turn
+        if on is not None:
+            carrier = frames[on]
+            own = jnp.concatenate([carrier.twist, moment.v[places[on].rod_v]])
+            twist = twist + mount.carried @ own
+            position = carrier.position + carrier.rotation @ position
+            rotation = carrier.rotation @ rotation
+        mounts.append(mount)
+        frames.append(Frame(rotation, position, twist))
+    return tuple(mounts), tuple(frames)
+
+
+def _mount(moment: AssemblyMotion, index: int, on: int | None) -> tuple[Mount, Array]:
+    """The mount of a part, and its position in the frame of the carrier."""
+    assembly, dtype = moment.assembly, moment.q.dtype
+    part, group = assembly.parts[index], assembly.group
+    dim, rot = group.space_dim, group.rotation_dim
+    rotation, centre, angular, linear = section(moment, index, on)
+    arm = jnp.zeros(dim, dtype)
+    if part.offset is not None:
+        offset = part.offset.astype(dtype)
+        arm, rotation = rotation @ offset[:dim, dim], rotation @ offset[:dim, :dim]
+    turn, shift = part.joint.pose(group, moment.q[slices(assembly)[index].joint_q])
+    arm, turn = arm + rotation @ shift, rotation @ turn
+    along = _turn(rotation, part.joint.axes(group, dtype), rot)
+    axes = _turn(turn.T, along, rot)
+    if on is None:
+        return Mount(None, axes, turn, along, arm, None), centre + arm
+    swept = jnp.concatenate([angular, linear + levers(arm[None])[0] @ angular])
+    return Mount(_turn(turn.T, swept, rot), axes, turn, along, arm, angular), centre + arm
+
+
+def _turn(rotation: Array, twists: Float[Array, "twist n"], rot: int) -> Array:
+    """Twists along turned axes; the spin of a plane does not turn."""
+    spin = twists[:rot] if rot == 1 else rotation @ twists[:rot]
+    return jnp.concatenate([spin, rotation @ twists[rot:]])
+
+
+def _rows(carrier: Rod, s: Array) -> Float[Array, "1 quad"]:
+    rows = integration_rows(carrier.quadrature, s.astype(carrier.length.dtype)[None])
+    return carrier.length * jnp.asarray(rows, carrier.length.dtype)
