@@ -196,9 +196,10 @@ SHEET = mesh.rectangle([0, 0], [1, 1], divisions=(1, 1), element=mesh.Tri3())
 SPACE = fem.space(SHEET)
 
 
-@pytest.mark.parametrize("name", ISOTROPIC)
+@pytest.mark.parametrize("name", [n for n in ISOTROPIC if n not in ("NeoHookean", "Yeoh")])
 def test_closed_forms_are_equilibria_of_cells(name):
-    """Two cells pulled in plane strain find the free stretch, force and stress."""
+    """Two cells pulled in plane strain find the free stretch, force and stress; the
+    two rubbers left out do so in every kinematics in test_fem_accuracy."""
     walls, pulled = SHEET.node_sets, 1.3
     problem = fem.problem(
         SHEET,

@@ -13,7 +13,8 @@ LAYER = sdf.HalfPlane([0, 1 * mm], [0, 1])
 
 def chambers(top=13 * mm):
     upper = jnp.stack([jnp.asarray(12 * mm), jnp.asarray(top)])
-    return sdf.repeat(sdf.Rectangle([6 * mm, 3 * mm], upper, 1 * mm), [13 * mm, 0], 5)
+    first = sdf.Rectangle([6 * mm, 3 * mm], upper, 1 * mm)
+    return sdf.repeat(first, [13 * mm, 0], 5, separate=True)
 
 
 def bellows(top=13 * mm):

@@ -55,6 +55,15 @@ def test_voronoi_cells_are_convex_and_fill_the_shape(name, count):
         assert np.isclose(areas.sum(), area, rtol=1e-10)
 
 
+@pytest.mark.parametrize("seed", [0, 2])
+def test_cells_are_even_where_the_shape_ends_in_cusps(seed):
+    """Figure 5 of the paper: a turned square less the circle that touches its sides."""
+    square = sdf.rotate(sdf.Rectangle([-1, -1], [1, 1]), np.pi / 4)
+    mesh = M.polymesher(square - sdf.Circle([0, 0], 1.0), 150, key=jax.random.key(seed))
+    areas = np.asarray(M.cell_areas(mesh))
+    assert areas.std() < 0.13 * areas.mean()
+
+
 @pytest.mark.parametrize("order", [1, 2])
 def test_tetrahedra_of_a_hollow_sphere(order):
     mesh = M.tetrahedralise(HOLLOW, size=0.15, order=order)

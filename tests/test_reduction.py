@@ -6,9 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import SE2, fem, material, mesh, reduction, rod
+from sorojax import SE2, SE3, fem, material, mesh, reduction, rod
 from sorojax.reduction.backbone import line_strain
+from sorojax.reduction.curve import reference
 from sorojax.reduction.pod import weights
+from sorojax.reduction.twist import pose_strain, section_axes
 from sorojax.units import kPa, mm
 
 LENGTH = 60 * mm
@@ -60,6 +62,68 @@ def test_a_line_at_rest_has_no_strain_and_finite_slopes():
     assert jnp.all(jnp.isfinite(slopes))
 
 
+STRAIN = jnp.array([8.0, -20.0, 60.0, 1.1, 0.05, -0.1])
+
+
+strain_of = jax.jit(pose_strain)
+
+
+def poses(s, strain=STRAIN, length=0.1):
+    return jax.vmap(SE3().exp)(length * s[:, None] * strain[None])
+
+
+@pytest.mark.parametrize("samples", [3, 21])
+def test_the_strain_of_a_helix_is_exact_at_any_spacing(samples):
+    s = jnp.linspace(0, 1, samples)
+    turn = 0.9 * jnp.pi / 0.1 / jnp.linalg.norm(STRAIN[:3])  # 162 degrees in all
+    strain = jnp.concatenate([turn * STRAIN[:3], STRAIN[3:]])
+    found = poses(s, strain)
+    step = jnp.asarray(0.1 / (samples - 1))
+    exact = jnp.broadcast_to(strain, (samples, 6))
+    assert jnp.allclose(strain_of(found[:, :3, :3], found[:, :3, 3], step), exact, atol=1e-9)
+
+
+def test_strain_of_poses_is_of_second_order_and_smooth_at_rest():
+    s = jnp.linspace(0, 1, 41)
+    basis = rod.chebyshev(kappa_x=2, kappa_y=3, kappa_z=3, sigma_x=2)
+    stuff = dict(young_modulus=1e6, poisson_ratio=0.3, density=1e3)
+    body = rod.rod(SE3(), basis, rod.circle(3 * mm), length=0.1, nodes=24, **stuff)
+    q = jnp.array([5.0, 9, 20, -30, 12, 40, 25, -12, 0.05, 0.1])
+    found, exact = rod.forward_kinematics(body, q, s), rod.strain(body, q, s)
+
+    def worst(every):
+        few, step = found[::every], jnp.asarray(0.1 / 40 * every)
+        strain = strain_of(few[:, :3, :3], few[:, :3, 3], step)
+        return float(jnp.max(jnp.abs(strain - exact[::every])))
+
+    assert 3.5 < worst(2) / worst(1) < 4.5
+    rest = poses(jnp.linspace(0, 1, 5), jnp.array([0.0, 0, 0, 1, 0, 0]))
+
+    def moved(shift):
+        axes = section_axes(rest[:, :3, 1] + shift[:, 0], rest[:, :3, 2] + shift[:, 1])
+        return pose_strain(axes, rest[:, :3, 3] + shift[:, 2], jnp.asarray(0.025))
+
+    slopes = jax.jit(jax.jacrev(moved))(jnp.zeros((5, 3, 3)))
+    assert jnp.all(jnp.isfinite(slopes)) and jnp.any(slopes != 0)
+
+
+def helix(s):
+    turn = 4.0 * s
+    return 0.03 * jnp.stack([jnp.cos(turn), jnp.sin(turn), turn / 2], axis=1)
+
+
+def test_frames_along_a_helix_do_not_turn_about_it():
+    found = reference(reduction.Curve(helix), 81)
+    assert np.isclose(found.length, 0.03 * 4 * np.sqrt(1.25), rtol=1e-7)
+    gaps = np.linalg.norm(np.diff(found.position, axis=0), axis=1)
+    assert np.allclose(gaps, gaps[0], rtol=1e-6)
+    step = jnp.asarray(found.length / 80)
+    rest = pose_strain(jnp.asarray(found.frame), jnp.asarray(found.position), step)
+    assert np.allclose(rest[:, 0], 0, atol=1e-2) and np.allclose(rest[:, 3], 1, atol=1e-3)
+    bent = np.linalg.norm(rest[:, 1:3], axis=1)
+    assert np.allclose(bent, 1 / 0.03 / 1.25, rtol=1e-3)
+
+
 def test_location_reproduces_quadratic_fields(tube_path, getkey):
     body = tube_path.problem.mesh
     points = np.stack([np.linspace(0, LENGTH, 15), np.full(15, 1.3 * mm)], axis=1)
@@ -81,6 +145,12 @@ def test_modes_are_orthonormal_and_hold_the_snapshots(tube_path):
     captured = reduction.captured_energy(backbone, basis)
     assert captured["kappa_z"] > 0.9999 and captured["sigma_x"] > 0.99
     q = reduction.coordinates(backbone, basis)
+    enough = reduction.pod_basis(backbone, modes={"kappa_z": 0.99})
+    count = enough.modes["kappa_z"].count
+    assert reduction.captured_energy(backbone, enough)["kappa_z"] >= 0.99
+    if count > 1:
+        less = reduction.pod_basis(backbone, modes={"kappa_z": count - 1})
+        assert reduction.captured_energy(backbone, less)["kappa_z"] < 0.99
     rebuilt = q[:, :3] @ basis.modes["kappa_z"](backbone.s).T
     worst = jnp.max(jnp.abs(rebuilt - backbone.strain[:, :, 0]))
     assert worst < 0.02 * jnp.max(jnp.abs(backbone.strain[:, :, 0]))
@@ -134,6 +204,16 @@ def test_bad_input_names_the_remedy(tube_path):
         reduction.Line([0.0, 0.0], [0.0, 0.0])
     with pytest.raises(ValueError, match="outside the mesh"):
         reduction.strain_along(tube_path, reduction.Line([0, 8 * mm], [LENGTH, 8 * mm]))
+    with pytest.raises(ValueError, match="lower `arm`"):
+        reduction.strain_along(tube_path, LINE, arm=50 * mm)
+    with pytest.raises(ValueError, match="hold 0.*more modes"):
+        reduction.pod_basis(backbone, modes={"kappa_z": 1 - 1e-9}, within=rod.Legendre(2))
+    with pytest.raises(ValueError, match="asked for 1.5 modes"):
+        reduction.pod_basis(backbone, modes={"kappa_z": 1.5})
+    with pytest.raises(ValueError, match="21 samples, need as many"):
+        reduction.pod_basis(backbone, modes={"kappa_z": 1}, within=rod.Legendre(30))
+    with pytest.raises(ValueError, match="got 2 samples, need 3"):
+        reduction.strain_along(tube_path, LINE, samples=2)
     basis = reduction.pod_basis(backbone, modes={"kappa_z": 1})
     short = eqx.tree_at(
         lambda p: (p.values, p.displacements),
@@ -142,3 +222,51 @@ def test_bad_input_names_the_remedy(tube_path):
     )
     with pytest.raises(ValueError, match="the path holds 3 states"):
         reduction.identify(short, basis, backbone, LINE)
+
+
+BEAM = reduction.Line([0.0, 0.0, 0.0], [LENGTH, 0.0, 0.0])
+PULL = jnp.array([-200.0, 600.0, 1200.0])  # Pa, along the axis and out of both planes
+
+
+@pytest.fixture(scope="module")
+def beam_path():
+    """A solid cantilever, 6 mm by 8 mm, pulled sideways at its tip."""
+    half = np.array([3 * mm, 4 * mm])
+    body = mesh.box([0, *-half], [LENGTH, *half], divisions=(16, 2, 2))
+    tip = mesh.facets_where(body, lambda p: p[0] > LENGTH - 1e-9)
+    problem = fem.problem(
+        body,
+        material.neo_hookean(young_modulus=1e6, poisson_ratio=0.3, density=1000.0),
+        supports=(fem.Fixed(mesh.nodes_where(body, lambda p: p[0] < 1e-9)),),
+        loads=(fem.Traction(tip, name="pull", value=jnp.zeros(3)),),
+    )
+    return fem.solve_path(problem, pull=jnp.linspace(0, 1, 4)[:, None] * PULL[None])
+
+
+def test_a_rod_stands_where_the_solid_in_space_stands(beam_path):
+    sides = dict(samples=17, arm=2 * mm)
+    backbone = reduction.strain_along(beam_path, BEAM, **sides)
+    assert jnp.allclose(backbone.strain[0], backbone.rest_or_straight, rtol=0, atol=1e-12)
+    modes = {"kappa_x": 1, "kappa_y": 2, "kappa_z": 2, "sigma_x": 1}
+    basis = reduction.pod_basis(backbone, modes=modes, within=rod.Legendre(5))
+    captured = reduction.captured_energy(backbone, basis)
+    assert captured["kappa_z"] > 0.999 and captured["kappa_y"] > 0.999
+    problem = beam_path.problem
+    section = reduction.mean_section(problem, BEAM)
+    assert jnp.isclose(section.area, 48 * mm**2) and jnp.isclose(
+        section.second_moment_y, 6 * 8**3 / 12 * mm**4
+    )
+    body = rod.rod(SE3(), basis, section, rod.elastic(problem.material), length=LENGTH)
+    stiffness = reduction.condensed_stiffness(beam_path, basis, BEAM, **sides)[0]
+    assert np.allclose(stiffness, stiffness.T) and np.linalg.eigvalsh(stiffness)[0] > 0
+    law = rod.LinearElastic(stiffness)
+    sway = jnp.linalg.norm(backbone.positions[-1, -1] - backbone.positions[0, -1])
+    assert sway > 0.3 * LENGTH
+    force = jnp.concatenate([jnp.zeros(3), PULL * 48 * mm**2])
+    rest = rod.equilibrium(body, (law, rod.TipWrench(force)))
+    recovered = reduction.coordinates(backbone, basis)[-1]
+    # Shear has no mode (1.3 % here); with the condensed stiffness at rest 3.6 %.
+    for q, error in ((recovered, 2e-2), (rest.q, 5e-2)):
+        points = rod.forward_kinematics(body, q, backbone.s)[:, :3, 3]
+        gap = jnp.linalg.norm(points - backbone.positions[-1], axis=1)
+        assert jnp.max(gap) < error * sway

@@ -45,6 +45,16 @@ def test_chambers_are_no_part_of_the_body(kind, getkey):
     assert not np.any((inside < -1e-9) & (solid < -1e-9))
 
 
+@pytest.mark.parametrize("wall", [1.6, 1.1])
+def test_air_of_the_bending_actuator_is_a_wall_away_from_the_outside(wall, getkey):
+    part = robots.BendingActuator(wall_thickness=wall * mm)
+    lower, upper = (np.array(corner) for corner in part.solid().bounding_box())
+    lower[0] += 3 * mm  # past the opening
+    p = jax.random.uniform(getkey(), (200_000, 3), minval=lower, maxval=upper)
+    deep = -np.asarray(evaluate(part.solid(), p))[np.asarray(evaluate(part.chambers(), p)) < 0]
+    assert wall * mm - 1e-12 < deep.min() < 1.02 * wall * mm
+
+
 def test_bellows_wall():
     part = robots.Bellows()
     z = part.cap + part.pitch * jnp.array([0.5, 1.5, 2.5])

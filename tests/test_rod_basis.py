@@ -43,13 +43,19 @@ BASES = {
     "functions": R.functions(kappa_z=[lambda s: 1 + s, lambda s: np.exp(s) + 0 * s]),
     "module": R.functions(kappa_z=Wave(jnp.array(3.0))),
     "sampled": R.StrainBasis(
-        {"kappa_z": R.SampledModes(np.linspace(0, 1, 11), np.linspace(0, 1, 11)[:, None] ** [1, 3])}
+        {
+            "kappa_z": R.SampledModes(
+                np.linspace(0, 1, 11), np.linspace(0, 1, 11)[:, None] ** [1, 3]
+            )
+        }
     ),
 }
 
 
 def kinks(modes):
-    return R.SampledModes(modes.s, modes.values).s[1:-1] if hasattr(modes, "s") else modes.breaks
+    return (
+        R.SampledModes(modes.s, modes.values).s[1:-1] if hasattr(modes, "s") else modes.breaks
+    )
 
 
 @pytest.mark.parametrize("name", BASES)
@@ -79,7 +85,9 @@ def test_cubic_splines_are_those_of_scipy():
     s, p = np.linspace(0, 1, 30, endpoint=False), 3
     knots = np.array([0, 0, 0, 0, 0.25, 0.5, 0.5, 1, 1, 1, 1])
     modes = R.BSpline((0.25, 0.5, 0.5), p)
-    assert np.allclose(modes(s), BSpline.design_matrix(s, knots, p).toarray(), rtol=0, atol=1e-15)
+    assert np.allclose(
+        modes(s), BSpline.design_matrix(s, knots, p).toarray(), rtol=0, atol=1e-15
+    )
 
 
 def test_a_composite_rule_integrates_and_interpolates_across_its_breaks():
@@ -111,7 +119,9 @@ def test_piecewise_constant_strains_give_products_of_exponentials():
     rng = np.random.default_rng(0)
     scale = np.array([15.0] * 3 + [0.2] * 3)
     strains = rng.normal(size=(6, 3)) * scale[:, None]
-    poses = R.forward_kinematics(rod, jnp.asarray(strains.reshape(-1)), [1 / 3, 0.5, 2 / 3, 1.0])
+    poses = R.forward_kinematics(
+        rod, jnp.asarray(strains.reshape(-1)), [1 / 3, 0.5, 2 / 3, 1.0]
+    )
     rest, third = jnp.array([0, 0, 0, 1.0, 0, 0]), 0.08 / 3
     steps = [SE3().exp(third * (rest + strains[:, k])) for k in range(3)]
     half = SE3().exp(third / 2 * (rest + strains[:, 1]))
@@ -243,7 +253,10 @@ def make(basis=None, **options):
         (lambda: make(R.piecewise_constant(kappa_z=3), nodes=20), "need a multiple of 3"),
         (lambda: make(nodes=1), "need 3 or more"),
         (lambda: make(breaks=[1.5]), "the breaks are"),
-        (lambda: make(section=R.circle(np.full(5, 1e-3))), r"has shape \(5,\), need one number"),
+        (
+            lambda: make(section=R.circle(np.full(5, 1e-3))),
+            r"has shape \(5,\), need one number",
+        ),
         (lambda: make(rest_strain=lambda s: np.zeros((len(s), 2))), "`rest_strain` has shape"),
     ],
 )

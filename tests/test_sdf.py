@@ -57,6 +57,19 @@ def test_repeat_is_the_union_of_its_copies(step, getkey):
     assert jnp.allclose(evaluate(row, p), evaluate(copies, p), rtol=0, atol=1e-12)
 
 
+def test_repeat_has_one_tree_in_and_out_of_a_trace():
+    def row(width, separate=None):
+        part = sdf.Rectangle(jnp.zeros(2), jnp.stack([width, width]))
+        return sdf.repeat(part, [3.0, 0.0], 4, separate=separate)
+
+    for separate in (True, False):
+        inside = jax.jit(lambda w, separate=separate: row(w, separate))(jnp.array(1.0))
+        outside = row(jnp.array(1.0), separate)
+        assert jax.tree.structure(inside) == jax.tree.structure(outside)
+    with pytest.raises(ValueError, match="separate=True"):
+        jax.jit(row)(jnp.array(1.0))
+
+
 def test_grid_repeat_is_the_union_of_its_copies(getkey):
     part = sdf.Polygon([[0, 0], [2, 0], [0.2, 1.4]])
     moves = [jnp.array([1.5 * i, 0.9 * j]) for i in range(3) for j in range(2)]

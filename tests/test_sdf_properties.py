@@ -182,6 +182,12 @@ def test_mesh_by_its_tree_is_as_by_every_face():
         assert jnp.allclose(f, exact, rtol=0, atol=1e-12)
         random = slice(len(vertices), None)  # the others may be as close to several faces
         assert jnp.allclose(g[random], slope[random], rtol=0, atol=1e-12)
+    listed = sdf.TriangleMesh(vertices, faces, lists=True)
+    q = jnp.where(jnp.arange(len(p))[:, None] < 650, p, 20 * p)  # some far outside
+    plain = eqx.filter_jit(lambda mesh, p: mesh(p))
+    for held in (listed, eqx.tree_at(lambda m: m.vertices, listed, moved.vertices)):
+        exact = plain(eqx.tree_at(lambda m: m.tree, held, mesh.tree), q)
+        assert jnp.allclose(plain(held, q), exact, rtol=0, atol=1e-12)
     loose = sdf.TriangleMesh(vertices[faces[:, ::-1]].reshape(-1, 3),
                              np.arange(3 * len(faces)).reshape(-1, 3))  # fmt: skip
     assert loose.tree is not None

@@ -94,11 +94,8 @@ def rows():
 
         timing = measure_calls(lambda: solve().displacements, repeats=3)
         path = solve()
-        states = [
-            fem.contact_state(fem.with_load(problem, "cylinder", move), u, "cylinder")
-            for move, u in zip(moves, path.displacements, strict=True)
-        ]
-        state = states[-1]
+        pressed = fem.with_load(problem, "cylinder", moves[-1])
+        state = fem.contact_state(pressed, path.displacements[-1], "cylinder")
         force = -2 * float(state.total[1])
         half_width, peak = hertz(force)
         settings = {
@@ -110,5 +107,6 @@ def rows():
             "approach_error": round(APPROACHES[-1] / block_approach(problem, force) - 1, 4),
         }
         error = abs(float(state.pressure.max()) / peak - 1)
+        bar = 0.02 if divisions == 48 else None
         yield Row("sorojax", settings, **timing.columns(), reference=NOTE, error=error,
                   bar=bar, bar_on="error")  # fmt: skip

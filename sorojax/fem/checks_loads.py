@@ -1,5 +1,6 @@
 """What `fem.problem` refuses of loads."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -103,22 +104,55 @@ def _check_facets(where: str, facets: Any, mesh: Mesh) -> None:
         )
 
 
-def _check_closed(where: str, load: Pressure, mesh: Mesh, kinematics, known) -> None:
-    """An open end must be held, or slide in a plane through the origin of the load."""
+def parallel_to_ends(
+    mesh: Mesh, kinematics: AbstractKinematics, given: tuple[AbstractLoad, ...], known
+) -> tuple[AbstractLoad, ...]:
+    """The loads, pressures with a field of divergence one along the planes of their ends."""
+    if is_traced((mesh.points, given)) or isinstance(kinematics, Axisymmetric):
+        return given
+    return tuple(_parallel(mesh, load, known) if isinstance(load, Pressure) else load
+                 for load in given)  # fmt: skip
+
+
+def _parallel(mesh: Mesh, load: Pressure, known) -> Pressure:
+    held, through = _ends(mesh, load, known)[1:]
+    rows = held[~(held.all(axis=1) | (held & through).any(axis=1))]
+    across = np.zeros(mesh.element.dim, bool)
+    for row in rows[np.argsort(rows.sum(axis=1), kind="stable")]:
+        if row.any() and not (row & across).any():
+            across[np.flatnonzero(row)[0]] = True
+    if not across.any() or across.all():
+        return load
+    shares = tuple(float(share) for share in ~across / np.sum(~across))
+    return dataclasses.replace(load, flux_shares=shares)
+
+
+def _ends(mesh: Mesh, load: Pressure, known):
+    """Nodes at open ends, which of their components are held, and whether they lie in the
+    plane through the origin of the load across each axis."""
     ends = open_nodes(mesh.element, np.asarray(load.facets))
     held = known.reshape(-1, mesh.element.dim)[ends]
-    safe = held.all(axis=1)
-    if not is_traced((mesh.points, load)):
-        origin = np.zeros(mesh.element.dim) if load.origin is None else np.asarray(load.origin)
-        points = np.asarray(mesh.points)
-        off = np.abs(points[ends] - origin) <= 1e-9 * np.ptp(points, axis=0).max()
-        on_plane = held & off
-        if isinstance(kinematics, Axisymmetric):
-            on_plane[:, 1] = held[:, 1]
-        safe |= on_plane.any(axis=1)
+    if is_traced((mesh.points, load)):
+        return ends, held, np.zeros_like(held)
+    origin = np.zeros(mesh.element.dim) if load.origin is None else np.asarray(load.origin)
+    points = np.asarray(mesh.points)
+    through = np.abs(points[ends] - origin) <= 1e-9 * np.ptp(points, axis=0).max()
+    return ends, held, through
+
+
+def _check_closed(where: str, load: Pressure, mesh: Mesh, kinematics, known) -> None:
+    """An open end must be held, or slide in a plane that the load has no flux through."""
+    ends, held, parallel = _ends(mesh, load, known)
+    if load.flux_shares is not None:
+        parallel = parallel | (np.asarray(load.flux_shares) == 0)
+    sliding = held & parallel
+    if isinstance(kinematics, Axisymmetric):
+        sliding[:, 1] = held[:, 1]
+    safe = held.all(axis=1) | sliding.any(axis=1)
     if not safe.all():
         raise ValueError(
             f"fem.problem: {where} acts on facets with an open end at nodes "
-            f"{ends[~safe][:4].tolist()}, so it has no potential. Close the cavity, fix the "
-            "nodes at its ends, or let them slide in planes of symmetry through `origin`."
+            f"{ends[~safe][:4].tolist()}, so it has no potential: its work depends on the "
+            "way that the end takes. Close the cavity, fix the nodes at its ends, let them "
+            "slide in planes of symmetry through `origin`, or use fem.Traction."
         )

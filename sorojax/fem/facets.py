@@ -59,12 +59,14 @@ def facet_volume(
     element: AbstractElement,
     kinematics: AbstractKinematics,
     x: Float[Array, "facet_nodes dim"],
+    flux_shares: tuple[float, ...] | None = None,
 ) -> Float[Array, ""]:
     """Share of a facet in the volume that its outer side encloses [m^3].
 
     The flux of a field of divergence one that is parallel to the planes through the origin
     (to those across the axis, in a body of revolution), so that cavities cut by planes of
-    symmetry need no lid there.
+    symmetry need no lid there. `flux_shares` by axis add up to one; the field is parallel
+    to every plane across an axis without a share.
     """
     tables = facet_tables(element)
     position = jnp.asarray(tables.values, x.dtype) @ x
@@ -72,18 +74,22 @@ def facet_volume(
     if isinstance(kinematics, Axisymmetric):
         flux = jnp.pi * position[:, 0] ** 2 * normal[:, 0]
     else:
-        flux = jnp.sum(position * normal, axis=1) / x.shape[1]
+        shares = jnp.asarray(flux_shares or (1 / x.shape[1],) * x.shape[1], x.dtype)
+        flux = (position * normal) @ shares
         flux = flux * kinematics.depth(tuple(position.T))
     return -jnp.sum(jnp.asarray(tables.weights, x.dtype) * flux)
 
 
 def cavity_volume(
-    problem: "Problem", u: Float[Array, "nodes dim"], facets: Facets
+    problem: "Problem",
+    u: Float[Array, "nodes dim"],
+    facets: Facets,
+    flux_shares: tuple[float, ...] | None = None,
 ) -> Float[Array, ""]:
     """Volume that closed sets of facets enclose on their outer side [m^3]."""
     x = (problem.mesh.points + u)[facets]
     element, kinematics = problem.mesh.element, problem.kinematics
-    return jnp.sum(jax.vmap(lambda x: facet_volume(element, kinematics, x))(x))
+    return jnp.sum(jax.vmap(lambda x: facet_volume(element, kinematics, x, flux_shares))(x))
 
 
 def facet_integral(

@@ -5,10 +5,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from sorojax.fem.formulation import AbstractFormulation, modes
 from sorojax.fem.kinematics import AbstractKinematics, identity
+from sorojax.fem.polygon import exact_areas, polygon_sums
 from sorojax.fem.space import Space, lanes
 from sorojax.fem.tables import quadrature_tables
 from sorojax.fem.tensor import Entries, inverse
@@ -53,9 +54,15 @@ def geometry(
             for j in range(dim)
         ]
         areas = J * weights
-        if isinstance(space.element, PolyN):
-            gradients, areas = _consistent(x, kinds, gradients, areas)
         position = jnp.einsum("iae,qae->iqe", x, N)
+        if isinstance(space.element, PolyN):
+            sums = polygon_sums(x, kinds, kinematics)
+            areas = exact_areas(sums, position, areas)
+            for j, side in enumerate(sums.sides):
+                exact = side - sums.hoop(j) * jnp.sum(areas[:, None] * N, axis=0)
+                share = sums.shares(position, areas)
+                mean = jnp.sum(share[:, None] * gradients[j], axis=0)
+                gradients[j] += (exact / sums.measure - mean)[None]
         if kinematics.num_columns > dim:
             gradients.append(N / position[0][:, None])
         volumes = areas * kinematics.depth(tuple(position))
@@ -76,39 +83,6 @@ def three(rows) -> Tensor:
     if len(rows) == 3:
         return tuple(tuple(row) for row in rows)  # type: ignore[return-value]
     return ((*rows[0], 0.0), (*rows[1], 0.0), (0.0, 0.0, 1.0))
-
-
-def _consistent(x, kinds, gradients, areas):
-    """Polygons: areas and gradients whose sums over a cell are those of its boundary."""
-    area, boundary = polygon_boundary(x, kinds)
-    areas = areas * (area / jnp.sum(areas, axis=0, keepdims=True))
-    fixed = []
-    for gradient, exact in zip(gradients, boundary, strict=True):
-        mean = jnp.sum(areas[:, None] * gradient, axis=0)
-        fixed.append(gradient + ((exact - mean) / area)[None])
-    return fixed, areas
-
-
-def polygon_boundary(
-    x: Float[Array, "2 cell_nodes lanes"], kinds: Int[Array, " lanes"]
-) -> tuple[Float[Array, "1 lanes"], tuple[Float[Array, "cell_nodes lanes"], ...]]:
-    """Area of polygons [m^2], and integrals of shape function times normal [m].
-
-    The quadrature does not integrate the rational functions exactly; corrected by these
-    sums a linear displacement is an equilibrium.
-
-    Reference: Talischi, Pereira, Menezes, Paulino, "Gradient correction for polygonal and
-    polyhedral finite elements", IJNME 102, 2015.
-    """
-    number = jnp.arange(x.shape[1])[:, None]
-    count = kinds[None]
-    ahead = jnp.where(number + 1 < count, number + 1, jnp.zeros_like(number))
-    behind = jnp.where(number > 0, number - 1, count - 1)
-    after, before = (jnp.take_along_axis(x, at[None], axis=1) for at in (ahead, behind))
-    zero = jnp.zeros_like(x[0])
-    turn = jnp.where(number < count, x[0] * after[1] - x[1] * after[0], zero)
-    side = [jnp.where(number < count, half, zero) for half in (after - before) / 2]
-    return jnp.sum(turn, axis=0, keepdims=True) / 2, (side[1], -side[0])
 
 
 def gradient_entries(

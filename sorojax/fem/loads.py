@@ -55,24 +55,26 @@ class Pressure(AbstractLoad):
     """Follower pressure [Pa, gauge] on the outside of `facets`, pushing on the body.
 
     Give the facets of whole cavities, `facets_on(mesh, cavity)`; the cavity may be cut by
-    planes of symmetry through `origin` [m], the origin of the mesh when omitted.
+    planes of symmetry through `origin` [m], the origin of the mesh when omitted, and by
+    planes across some of the axes anywhere. Nodes of an end have to stay on their plane.
     """
 
     facets: Int[Array, "facets facet_nodes"] = eqx.field(converter=integers)
     value: Float[Array, ""] = eqx.field(converter=real, default=0.0)
     name: str = eqx.field(static=True, default="pressure")
     origin: Float[Array, " dim"] | None = eqx.field(converter=optional_real, default=None)
+    flux_shares: tuple[float, ...] | None = eqx.field(static=True, default=None)  # found
 
     def potential(self, problem, u):
         shift = u if self.origin is None else u - self.origin[None]
-        return -self.value * cavity_volume(problem, shift, self.facets)
+        return -self.value * cavity_volume(problem, shift, self.facets, self.flux_shares)
 
     def curved_part(self, problem):
         element, kinematics = problem.mesh.element, problem.kinematics
 
         def energy(x, _):
             x = x if self.origin is None else x - self.origin[None]
-            return -self.value * facet_volume(element, kinematics, x)
+            return -self.value * facet_volume(element, kinematics, x, self.flux_shares)
 
         return CurvedPart(self.facets, energy)
 

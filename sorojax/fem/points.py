@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax.fem.formulation import AbstractFormulation, Modes, modes
-from sorojax.fem.geometry import polygon_boundary, three
+from sorojax.fem.geometry import three
 from sorojax.fem.kinematics import AbstractKinematics, identity
+from sorojax.fem.polygon import exact_areas, polygon_sums
 from sorojax.fem.tables import Tables, node_tables, quadrature_tables
 from sorojax.fem.tensor import Entries, inverse
 from sorojax.material.kinematics import Entry, Tensor, determinant
@@ -65,10 +66,9 @@ def _points(mesh: Mesh, kinematics: AbstractKinematics, tables: Tables) -> Point
     full = three([[jac[i, d] for d in range(mesh.element.dim)] for i in range(len(jac))])
     weights = _of_cells(tables.weights, kinds)
     areas = determinant(full) * weights
-    if kinds is not None:
-        area, _ = polygon_boundary(x, kinds)
-        areas = areas * (area / jnp.sum(areas, axis=0, keepdims=True))
     position = _interpolate(tables, kinds, x)
+    if kinds is not None:
+        areas = exact_areas(polygon_sums(x, kinds, kinematics), position, areas)
     volumes = areas * kinematics.depth(tuple(position))
     return Points(inverse(full), volumes, position, tables, kinds)
 
@@ -103,14 +103,19 @@ def interpolated(mesh: Mesh, points: Points, nodal: Float[Array, "nodes dim"]) -
 
 def _corrected(mesh: Mesh, kinematics: AbstractKinematics, points: Points, by_cell, slopes):
     """Polygons: slopes whose mean over a cell is that of its boundary."""
-    area, sides = polygon_boundary(_by_cell(mesh, mesh.points), points.kinds)  # type: ignore
-    share = points.volumes / kinematics.depth(tuple(points.position)) / area
+    kinds = points.kinds
+    assert kinds is not None
+    sums = polygon_sums(_by_cell(mesh, mesh.points), kinds, kinematics)
+    areas = points.volumes / kinematics.depth(tuple(points.position))
+    share = sums.shares(points.position, areas)
+    inside = jnp.sum(areas[None] * _interpolate(points.tables, kinds, by_cell), axis=1)
 
-    def fixed(slope, nodal, side):
-        exact = jnp.sum(nodal * side, axis=0, keepdims=True) / area
-        return slope + exact - jnp.sum(share * slope, axis=0, keepdims=True)
+    def fixed(i, j):
+        exact = jnp.sum(by_cell[i] * sums.sides[j], axis=0) - sums.hoop(j) * inside[i]
+        mean = jnp.sum(share * slopes[i][j], axis=0)
+        return slopes[i][j] + (exact / sums.measure[0] - mean)[None]
 
-    return [[fixed(slopes[i][j], by_cell[i], sides[j]) for j in range(2)] for i in range(2)]
+    return [[fixed(i, j) for j in range(2)] for i in range(2)]
 
 
 def _by_cell(mesh: Mesh, nodal: Float[Array, "nodes dim"]):

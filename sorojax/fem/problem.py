@@ -96,6 +96,7 @@ def problem(
     known = checks.supports(mesh, kinematics, supports)
     checks_loads.sets(mesh, loads)
     loads = tuple(load.completed(mesh, material, kinematics) for load in loads)
+    loads = checks_loads.parallel_to_ends(mesh, kinematics, loads, known)
     checks_loads.loads(mesh, kinematics, material, loads, known)
     if space is None:
         space = make_space(mesh, loads)

@@ -22,7 +22,6 @@ from sorojax.mesh.elements import AbstractElement, Hex8, PolyN, Quad4, Quad8, Qu
 from sorojax.mesh.mesh import Mesh, boundary_facets
 from sorojax.mesh.shape import quadrature, shape_functions, shape_gradients
 
-
 _SURE = 0.02  # smallest singular value of a fit over the largest
 
 

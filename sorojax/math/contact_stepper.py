@@ -1,11 +1,22 @@
 """A fixed-step integrator that stays stable, and loses energy only, in stiff contact."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array
 
 from sorojax.math.dense import solve_symmetric
-from sorojax.math.steppers import AbstractStepper, ImplicitMidpoint, Kinematic, SecondOrder, move
+from sorojax.math.steppers import (
+    AbstractStepper,
+    ImplicitMidpoint,
+    Kinematic,
+    SecondOrder,
+    move,
+)
+
+_SHORTER = 0.4  # of a Newton step that did not help
 
 
 class ContactMidpoint(AbstractStepper):
@@ -29,7 +40,7 @@ class ContactMidpoint(AbstractStepper):
     """
 
     passes: int = eqx.field(static=True, default=2)
-    contact_passes: int = eqx.field(static=True, default=8)
+    contact_passes: int = eqx.field(static=True, default=12)
 
     def step(self, problem, t, h, state):
         contact = problem.contact
@@ -40,10 +51,7 @@ class ContactMidpoint(AbstractStepper):
             new, moment = _free(problem, t, h, state, new)
 
         def touch():
-            def improve(_, new):
-                return _touching(problem, t, h, state, new)
-
-            return jax.lax.fori_loop(0, self.contact_passes, improve, new)
+            return _solve_touching(problem, t, h, state, new, self.contact_passes)
 
         new = jax.lax.cond(contact.near(moment, h), touch, lambda: new)
         half = state.v + h / 2 * new
@@ -60,8 +68,35 @@ def _free(problem: SecondOrder, t, h, state: Kinematic, new: Array):
     return new - solve_symmetric(implicit, mass @ new - force), moment
 
 
-def _touching(problem: SecondOrder, t, h, state: Kinematic, new: Array) -> Array:
-    """A Newton pass with contact: normal forces at the end, sliding at the midpoint."""
+class _Search(NamedTuple):
+    """Best mean acceleration so far, the size of its residual, and where to try next."""
+
+    best: Array
+    size: Array
+    direction: Array
+    share: Array
+
+
+def _solve_touching(problem: SecondOrder, t, h, state: Kinematic, new: Array, passes: int):
+    """Newton with contact. A pass whose residual is no smaller than the best shortens the
+    step instead, as a point that comes and goes would make it cycle."""
+
+    def improve(_, search: _Search) -> _Search:
+        trial = search.best + search.share * search.direction
+        size, direction = _touching(problem, t, h, state, trial)
+        better = size < search.size
+        accepted = _Search(trial, size, direction, jnp.ones_like(size))
+        shortened = search._replace(share=_SHORTER * search.share)
+        return jax.tree.map(lambda a, b: jnp.where(better, a, b), accepted, shortened)
+
+    one = jnp.ones((), new.dtype)
+    first = _Search(new, jnp.inf * one, jnp.zeros_like(new), one)
+    return jax.lax.fori_loop(0, passes, improve, first).best
+
+
+def _touching(problem: SecondOrder, t, h, state: Kinematic, new: Array) -> tuple[Array, Array]:
+    """Size of the residual with contact, and the Newton step: normal forces at the end of
+    the step, sliding at its midpoint."""
     assert problem.contact is not None
     half = state.v + h / 2 * new
     middle, end = move(problem, state.q, h / 2 * half), move(problem, state.q, h * half)
@@ -69,4 +104,6 @@ def _touching(problem: SecondOrder, t, h, state: Kinematic, new: Array) -> Array
     contact, stiffness, damping = problem.contact.force(t + h, end, half)
     implicit = mass + h / 2 * (problem.damping + damping)
     implicit = implicit + h**2 / 4 * problem.stiffness + h**2 / 2 * stiffness
-    return new - solve_symmetric(implicit, mass @ new - force - contact)
+    residual = mass @ new - force - contact
+    held = jax.lax.stop_gradient((mass, residual))
+    return held[1] @ solve_symmetric(*held), -solve_symmetric(implicit, residual)

@@ -206,10 +206,10 @@ def _solve_on_host(key, rows, cols, values, b) -> tuple[np.ndarray]:
         return (solver_of(key, rows, cols).solve(values, b),)
     args = (key, rows, cols, values, b)  # lanes with patterns of their own
     lead = np.broadcast_shapes(*(x.shape[:-1] for x in args))
-    *pattern, values, b = (np.broadcast_to(x, (*lead, x.shape[-1])) for x in args)
+    key, rows, cols, values, b = (np.broadcast_to(x, (*lead, x.shape[-1])) for x in args)
     x = np.empty(b.shape)
     for lane in np.ndindex(*lead):
-        x[lane] = solver_of(*(p[lane] for p in pattern)).solve(values[lane], b[lane])
+        x[lane] = solver_of(key[lane], rows[lane], cols[lane]).solve(values[lane], b[lane])
     return (x,)
 
 

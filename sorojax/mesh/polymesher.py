@@ -24,6 +24,7 @@ _SAMPLES = 250  # per cell: points that stand for its area in Lloyd's method
 _EVEN = 5e-3  # Lloyd error that ends the iterations
 _EXCHANGES = (8, 14, 20, 26, 32, 38)  # steps after which the largest cells are divided
 _LARGE, _SMALL = 1.12, 0.92  # of the mean area
+_UNEVEN, _PULLS = 0.1, 16  # deviation of areas over their mean that asks for evening; steps
 
 
 def polymesher(
@@ -87,9 +88,7 @@ def _lloyd(shape, cloud, area: float, seeds, iterations: int, on_step) -> np.nda
     n = len(seeds)
     for step in range(iterations):
         owner = KDTree(seeds).query(cloud)[1]
-        weight = np.bincount(owner, minlength=n)
-        total = np.stack([np.bincount(owner, cloud[:, k], n) for k in (0, 1)], axis=1)
-        centre = np.where(weight[:, None] > 0, total / np.maximum(weight, 1)[:, None], seeds)
+        centre, weight = _centres(cloud, owner, seeds)
         share = weight / len(cloud)
         shift = ((centre - seeds) ** 2).sum(axis=1)
         error = float(np.sqrt((share**2 * shift).sum()) * n / np.sqrt(area))
@@ -101,7 +100,41 @@ def _lloyd(shape, cloud, area: float, seeds, iterations: int, on_step) -> np.nda
             on_step(step, error)
         if error < _EVEN and (step > _EXCHANGES[-1] or iterations <= _EXCHANGES[-1]):
             break
-    return seeds
+    return _evened(shape, cloud, area, seeds) if iterations > _EXCHANGES[-1] else seeds
+
+
+def _evened(shape, cloud, area: float, seeds: np.ndarray) -> np.ndarray:
+    """Seeds drawn towards larger neighbours, as Lloyd's method makes small cells in cusps.
+
+    The side between two cells is midway between their seeds: it follows into the larger.
+    """
+    n, pitch = len(seeds), np.sqrt(area / len(cloud))
+    best, kept = np.inf, seeds
+    for _ in range(_PULLS):
+        distance, owner = KDTree(seeds).query(cloud, k=2)
+        weight = np.bincount(owner[:, 0], minlength=n)
+        uneven = weight.std() / weight.mean()
+        if uneven < best:
+            best, kept = uneven, seeds
+        if best < _UNEVEN:
+            break
+        a, b = owner[distance[:, 1] - distance[:, 0] < pitch].T
+        a, b = np.concatenate([a, b]), np.concatenate([b, a])
+        pull = ((weight[b] - weight[a]) / weight.mean())[:, None] * (seeds[b] - seeds[a])
+        sides = np.maximum(np.bincount(a, minlength=n), 1)
+        drawn = np.stack([np.bincount(a, pull[:, k], n) / sides for k in (0, 1)], axis=1)
+        moved = seeds + 0.5 * drawn + 0.3 * (_centres(cloud, owner[:, 0], seeds)[0] - seeds)
+        seeds = np.where((values(shape, moved) < 0)[:, None], moved, seeds)
+    return kept
+
+
+def _centres(cloud, owner, seeds) -> tuple[np.ndarray, np.ndarray]:
+    """Centre of each cell, its seed if that is empty, and its number of points."""
+    n = len(seeds)
+    weight = np.bincount(owner, minlength=n)
+    total = np.stack([np.bincount(owner, cloud[:, k], n) for k in (0, 1)], axis=1)
+    held = (weight > 0)[:, None]
+    return np.where(held, total / np.maximum(weight, 1)[:, None], seeds), weight
 
 
 def _exchanged(seeds: np.ndarray, weight: np.ndarray) -> np.ndarray:

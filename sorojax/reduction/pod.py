@@ -56,8 +56,12 @@ def pod_basis(
         coefficients = np.linalg.lstsq(
             root[:, None] * columns, (root * _snapshots(backbone, name)).T, rcond=None
         )[0]
-        left, size, _ = np.linalg.svd(coefficients, full_matrices=False)
-        count = _count(name, wanted, size)
+        left, size, right = np.linalg.svd(coefficients, full_matrices=False)
+        rank = int(np.sum(size > 1e-10 * max(size[0], 1e-300)))
+        if isinstance(wanted, float) and 0 < wanted < 1:
+            shapes, parts = root[:, None] * (columns @ left), size[:, None] * right
+            wanted = _enough(name, wanted, (root * _snapshots(backbone, name)).T, shapes, parts)
+        count = _count(name, wanted, rank)
         sign = np.sign((root**2) @ columns @ left[:, :count])
         mix = left[:, :count] * np.where(sign < 0, -1, 1)
         basis[name] = _modes(backbone, inner, columns, mix)
@@ -85,12 +89,21 @@ def _modes(backbone: Backbone, inner, columns: np.ndarray, mix: np.ndarray) -> A
     return SampledModes(backbone.s, columns @ mix) if inner is None else Combined(inner, mix)
 
 
-def _count(name: str, wanted: int | float, size: np.ndarray) -> int:
-    """How many modes: as asked, or so many that they hold the wanted share."""
-    rank = int(np.sum(size > 1e-10 * max(size[0], 1e-300)))
-    if isinstance(wanted, float) and 0 < wanted < 1:
-        share = np.cumsum(size**2) / max(np.sum(size**2), 1e-300)
-        wanted = int(np.searchsorted(share, wanted)) + 1
+def _enough(name: str, wanted: float, snapshots, shapes, parts) -> int:
+    """How many modes hold the share `wanted` of the squared snapshots, at the samples."""
+    total, held = max(np.sum(snapshots**2), 1e-300), 0.0
+    for count in range(1, len(parts) + 1):
+        left_out = snapshots - shapes[:, :count] @ parts[:count]
+        held = 1 - np.sum(left_out**2) / total
+        if held >= wanted:
+            return count
+    raise ValueError(
+        f"pod_basis: asked for {wanted} of `{name}`, all modes of `within` hold {held:.6f}. "
+        "Ask for less, or give `within` more modes."
+    )
+
+
+def _count(name: str, wanted: int | float, rank: int) -> int:
     if isinstance(wanted, bool | float) or wanted < 1 or wanted > rank:
         raise ValueError(
             f"pod_basis: asked for {wanted} modes of `{name}`, the snapshots hold 1 to "

@@ -65,13 +65,13 @@ class BellowsActuator(eqx.Module):
         first = Rectangle(
             [left, self.base], [right, self.base + self.chamber_height], self.fillet
         )
-        return repeat(first, [self.pitch, 0.0], count=self.num_bellows)
+        return repeat(first, [self.pitch, 0.0], self.num_bellows, separate=True)
 
     def notches(self) -> AbstractSdf:
         """The gaps between the bellows, open at the top."""
         left = self.clamp + self.bellow_width
         first = Rectangle([left, self.base], [left + self.gap, 2 * self.height], self.fillet)
-        return repeat(first, [self.pitch, 0.0], count=self.num_bellows - 1)
+        return repeat(first, [self.pitch, 0.0], self.num_bellows - 1, separate=True)
 
     def body(self) -> AbstractSdf:
         """The rubber."""

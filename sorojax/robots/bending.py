@@ -14,8 +14,9 @@ from sorojax.units import mm
 class BendingActuator(eqx.Module):
     """Dimensions [m]; x runs along the actuator, z points from its base to its bellows.
 
-    One channel below the bellows joins all chambers and opens at the end x = 0. Printed
-    in an 80 Shore A elastomer it takes -10 to 100 kPa.
+    One channel through necks between the bellows joins all chambers and opens at the end
+    x = 0. Every wall of the air is `wall_thickness` or more. Printed in an 80 Shore A
+    elastomer it takes -10 to 100 kPa.
     """
 
     width: Float[Array, ""] = eqx.field(converter=real, default=20 * mm)
@@ -24,7 +25,6 @@ class BendingActuator(eqx.Module):
     pitch: Float[Array, ""] = eqx.field(converter=real, default=10 * mm)
     gap: Float[Array, ""] = eqx.field(converter=real, default=1.6 * mm)
     wall_thickness: Float[Array, ""] = eqx.field(converter=real, default=1.6 * mm)
-    neck_height: Float[Array, ""] = eqx.field(converter=real, default=5.2 * mm)
     channel_radius: Float[Array, ""] = eqx.field(converter=real, default=1.5 * mm)
     fillet: Float[Array, ""] = eqx.field(converter=real, default=0.8 * mm)
     num_bellows: int = eqx.field(static=True, default=8)
@@ -57,7 +57,7 @@ class BendingActuator(eqx.Module):
         zero = jnp.zeros_like(side)
         start = jnp.stack([-self.pitch, zero, self.base + w + self.channel_radius])
         channel = pipe(self.channel_radius, start, self.length + self.pitch / 2, 0)
-        return repeat(first, [self.pitch, 0.0, 0.0], self.num_bellows) | channel
+        return repeat(first, [self.pitch, 0.0, 0.0], self.num_bellows, separate=True) | channel
 
     def solid(self) -> AbstractSdf:
         """The actuator without its hollows."""
@@ -67,12 +67,13 @@ class BendingActuator(eqx.Module):
             self.fillet,
         )  # fmt: skip
         slab = Box([zero, -half, zero], [self.length, half, self.base], self.fillet)
-        quarter = self.width / 4
+        quarter, w = self.width / 4, self.wall_thickness
         neck = Box(
             [self.gap / 2, -quarter, self.base / 2],
-            [self.length - self.gap / 2, quarter, self.base + self.neck_height],
+            [self.length - self.gap / 2, quarter, self.base + 2 * (w + self.channel_radius)],
         )
-        return repeat(block, [self.pitch, 0.0, 0.0], self.num_bellows) | slab | neck
+        row = repeat(block, [self.pitch, 0.0, 0.0], self.num_bellows, separate=True)
+        return row | slab | neck
 
     def body(self) -> AbstractSdf:
         """What is printed."""

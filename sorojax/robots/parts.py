@@ -70,7 +70,7 @@ class Bellows(eqx.Module):
         )
         zero = jnp.zeros_like(self.length)
         tube = Rectangle([-self.inner_radius, zero], [self.inner_radius, self.length])
-        folds = repeat(fold, [0.0, self.pitch], self.num_folds)
+        folds = repeat(fold, [0.0, self.pitch], self.num_folds, separate=True)
         return SmoothUnion(folds, tube, self.fillet)
 
     def solid(self) -> AbstractSdf:

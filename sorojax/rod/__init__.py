@@ -20,6 +20,12 @@ from sorojax.rod.combined_modes import (
     fitted as fitted,
     orthonormalise as orthonormalise,
 )
+from sorojax.rod.contact_force import (
+    AbstractContact as AbstractContact,
+    ObstacleContact as ObstacleContact,
+    contact_energy as contact_energy,
+    penetration as penetration,
+)
 from sorojax.rod.dynamics import (
     acceleration as acceleration,
     bias_force as bias_force,
@@ -38,6 +44,10 @@ from sorojax.rod.energy import (
     kinetic_energy as kinetic_energy,
     momentum as momentum,
     potential_energy as potential_energy,
+)
+from sorojax.rod.fluid import (
+    Buoyancy as Buoyancy,
+    Drag as Drag,
 )
 from sorojax.rod.forces import (
     AbstractChamber as AbstractChamber,
@@ -97,6 +107,10 @@ from sorojax.rod.piecewise_modes import (
     piecewise_constant as piecewise_constant,
     piecewise_linear as piecewise_linear,
 )
+from sorojax.rod.points import (
+    Points as Points,
+    points as points,
+)
 from sorojax.rod.polynomial_modes import (
     Bernstein as Bernstein,
     Chebyshev as Chebyshev,
@@ -115,15 +129,33 @@ from sorojax.rod.rod import (
     rod as rod,
     strain_names as strain_names,
 )
+from sorojax.rod.rod_contact import (
+    HeldRod as HeldRod,
+    RodContact as RodContact,
+)
 from sorojax.rod.rollout import (
     Rollout as Rollout,
     rollout as rollout,
     second_order as second_order,
 )
+from sorojax.rod.routing import (
+    AbstractRoute as AbstractRoute,
+    Converging as Converging,
+    Helical as Helical,
+    Routed as Routed,
+    Straight as Straight,
+    thread_lengths as thread_lengths,
+    thread_rates as thread_rates,
+)
 from sorojax.rod.section import (
     Section as Section,
     scaled as scaled,
     taper as taper,
+)
+from sorojax.rod.section_law import (
+    EnergyLaw as EnergyLaw,
+    SectionLaw as SectionLaw,
+    section_law as section_law,
 )
 from sorojax.rod.section_shapes import (
     circle as circle,
@@ -134,6 +166,9 @@ from sorojax.rod.section_shapes import (
     ring as ring,
     squircle as squircle,
 )
+from sorojax.rod.self_contact import (
+    SelfContact as SelfContact,
+)
 from sorojax.rod.spline_modes import (
     BSpline as BSpline,
     bspline as bspline,
@@ -142,8 +177,18 @@ from sorojax.rod.statics import (
     Equilibrium as Equilibrium,
     equilibrium as equilibrium,
 )
+from sorojax.rod.tendons import (
+    Actuation as Actuation,
+    Tendons as Tendons,
+    ThreadChambers as ThreadChambers,
+    thread_chambers as thread_chambers,
+)
 from sorojax.rod.tree import (
     AssemblyMotion as AssemblyMotion,
     AssemblyOperators as AssemblyOperators,
     part_motion as part_motion,
+)
+from sorojax.rod.wrench import (
+    LineWrench as LineWrench,
+    PointWrench as PointWrench,
 )

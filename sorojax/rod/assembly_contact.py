@@ -9,9 +9,10 @@ from jaxtyping import Array
 from sorojax.math.steppers import ContactTerms
 from sorojax.rod.assembly import index_of
 from sorojax.rod.contact_force import AbstractContact
-from sorojax.rod.contact_terms import contact_terms, has_contact, near
-from sorojax.rod.loads import Load, On, check, total_force
+from sorojax.rod.contact_terms import contact_terms, has_contact, near, travel
+from sorojax.rod.loads import Between, Load, On, check, total_force
 from sorojax.rod.rod import Rod
+from sorojax.rod.rod_contact import RodContact, rod_of
 from sorojax.rod.tree import AssemblyMotion, part_columns, part_motion
 
 
@@ -33,7 +34,7 @@ def contacts_of(
     if not touching:
         return None
     plain = tuple(force for force in forces if not _is_contact(force))
-    where = [(index_of(model, force.part), force.force) for force in touching]
+    where = [(_parts(model, force), force.force) for force in touching]
 
     def free(t, q, v):
         moment = at(q, v)
@@ -41,15 +42,22 @@ def contacts_of(
         return mass, total_force(plain, t, moment) - coriolis, moment
 
     def is_near(moment: AssemblyMotion, h):
-        answers = [near((contact,), part_motion(moment, k), h) for k, contact in where]
+        answers = []
+        for parts, contact in where:
+            bodies = [part_motion(moment, k) for k in parts]
+            if isinstance(contact, RodContact):
+                margin = travel(rod_of(bodies[0]), h) + travel(rod_of(bodies[1]), h)
+                answers.append(contact.is_near(*bodies, margin))
+            else:
+                answers.append(near((contact,), bodies[0], h))
         return jnp.any(jnp.stack(answers))
 
     def force(t, q, v):
         moment = at(q, v)
         columns, terms = part_columns(moment), []
-        for k, contact in where:
-            term = contact.linearised(t, part_motion(moment, k))
-            own = columns[k]
+        for parts, contact in where:
+            term = contact.linearised(t, *(part_motion(moment, k) for k in parts))
+            own = jnp.concatenate([columns[k] for k in parts])
             terms.append(
                 (
                     term.force @ own,
@@ -68,7 +76,13 @@ def any_contact(forces: tuple[Load, ...]) -> bool:
 
 
 def _is_contact(force: Load) -> bool:
-    return isinstance(force.force if isinstance(force, On) else force, AbstractContact)
+    inner = force.force if isinstance(force, On | Between) else force
+    return isinstance(inner, AbstractContact | RodContact)
+
+
+def _parts(model: Any, force: On | Between) -> tuple[int, ...]:
+    names = (force.part,) if isinstance(force, On) else (force.first, force.second)
+    return tuple(index_of(model, name) for name in names)
 
 
 def _sum(parts: tuple[Array, ...]) -> Array:

@@ -1,15 +1,15 @@
 """Inertia and loads of an assembly, from those of its parts."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax.rod.assembly import parents, slices
 from sorojax.rod.kernel import bias_rates, rod_inertia
-from sorojax.rod.link import LinkOperators, link_inertia, link_motion
+from sorojax.rod.link import Link, LinkOperators, link_inertia, link_motion
 from sorojax.rod.moving import cross, release
-from sorojax.rod.rod import Rod
 from sorojax.rod.tree import (
     AssemblyMotion,
     Mount,
@@ -44,7 +44,7 @@ def assembly_inertia(
 
 
 def gather(
-    moment: AssemblyMotion, loads: list[Float[Array, " own"] | None]
+    moment: AssemblyMotion, loads: Sequence[Float[Array, " own"] | None]
 ) -> Float[Array, " dof"]:
     """Generalised force of loads on the parts, each in the columns of its part: the pass
     inwards. None is no load."""
@@ -78,6 +78,7 @@ def part_inertias(moment: AssemblyMotion) -> tuple[list[Array], list[Array]]:
     for k, part in enumerate(assembly.parts):
         constants = moment.operators.parts[k]
         if isinstance(constants, LinkOperators):
+            assert isinstance(part.body, Link)
             one = link_motion(part.body, constants, moment.frames[k].twist)
             masses[k], biases[k] = link_inertia(one)
     for k, frame in enumerate(bias_accelerations(moment)):

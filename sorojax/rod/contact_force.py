@@ -76,16 +76,16 @@ class ObstacleContact(AbstractContact):
     Attributes:
         obstacle: Its signed distance, in the world frame.
         radius: Radius of the rod [m], or one per point.
-        law: Force per length; its stiffness also holds the round tip, over one radius.
+        law: Force per length; a round end counts as one radius of length.
         points: Number of points along the rod. Take about one per half radius.
-        tip: Whether the tip is a half ball; the base never is.
+        caps: Which ends are half balls: "tip", "both" for a free rod, or "none".
     """
 
     obstacle: AbstractSdf
     radius: Float[Array, "*points"] = eqx.field(converter=real)
     law: LinePenalty
     points: int = eqx.field(static=True, default=32)
-    tip: bool = eqx.field(static=True, default=True)
+    caps: str = eqx.field(static=True, default="tip")
 
     def __check_init__(self):
         check_line(self, self.radius)
@@ -95,7 +95,7 @@ class ObstacleContact(AbstractContact):
         return near(self.obstacle, centre, reach + jnp.max(self.radius) + margin)
 
     def touch(self, motion):
-        at, weights, radius = line(motion, self.radius, self.points, self.tip)
+        at, weights, radius = line(motion, self.radius, self.points, self.caps)
         gap, slope = jax.vmap(jax.value_and_grad(self.obstacle))(at.position)
         size = jnp.sqrt(jnp.sum(slope**2, axis=1, keepdims=True))
         arm = -radius[:, None] * slope / jnp.where(size > 0, size, jnp.ones_like(size))
@@ -122,32 +122,32 @@ def check_line(contact, radius: Array) -> None:
             f"{where}: got points={contact.points}, need 2 or more along the rod. One per "
             "half radius resolves a contact patch."
         )
+    if contact.caps not in ("tip", "both", "none"):
+        raise ValueError(f'{where}: got caps="{contact.caps}", need "tip", "both" or "none".')
     if radius.ndim > 0:
-        count = contact.points + contact.tip
-        do = f"Give one number, or one for each of {contact.points} points and the tip."
+        count = len(stations(contact.points, contact.caps))
+        do = f"Give one number, or one for each of {contact.points} points and the round ends."
         _check.shape(where, "radius", radius, (count,), do)
 
 
 def line(
-    motion: Motion, radius: Array, count: int, tip: bool
+    motion: Motion, radius: Array, count: int, caps: str
 ) -> tuple[Points, Float[Array, " points"], Float[Array, " points"]]:
-    """Midpoints of `count` parts, the tip if asked for; their lengths and radii.
+    """Midpoints of `count` parts, then the round ends; their lengths and radii.
 
     Midpoints, not Gauss points: a load that is compact inside the rod is then integrated
     with an error that falls faster than any power of the spacing.
     """
-    s = stations(count, tip)
+    s = stations(count, caps)
     radius = jnp.broadcast_to(radius, s.shape).astype(motion.q.dtype)
     weights = motion.rod.length * jnp.full(count, 1 / count, motion.q.dtype)
-    if tip:
-        weights = jnp.append(weights, radius[-1])
-    return points(motion, s), weights, radius
+    return points(motion, s), jnp.concatenate([weights, radius[count:]]), radius
 
 
-def stations(count: int, tip: bool) -> np.ndarray:
-    """Places in [0, 1] of the points of a line."""
-    s = (np.arange(count) + 0.5) / count
-    return np.append(s, 1.0) if tip else s
+def stations(count: int, caps: str) -> np.ndarray:
+    """Places in [0, 1] of the points of a line, its round ends last."""
+    ends = {"tip": [1.0], "both": [1.0, 0.0], "none": []}[caps]
+    return np.concatenate([(np.arange(count) + 0.5) / count, ends])
 
 
 def reach_of(motion: Motion) -> tuple[Float[Array, " dim"], Float[Array, ""]]:

@@ -41,8 +41,7 @@ def contact_terms(
 
     def force(t, q, v):
         moment = at(q, v)
-        terms = [contact.linearised(t, moment) for contact in contacts]
-        return tuple(sum(parts[1:], start=parts[0]) for parts in zip(*terms, strict=True))
+        return linearised(contacts, t, moment)
 
     return ContactTerms(free, lambda moment, h: near(contacts, moment, h), force)
 
@@ -51,23 +50,26 @@ def near(
     contacts: tuple[AbstractContact, ...], moment: Motion, h: Float[Array, ""]
 ) -> Bool[Array, ""]:
     """Whether any contact may act within a step of `h` [s] about `moment`."""
-    velocity = moment.linear_jacobian.reshape(-1, moment.v.shape[0]) @ moment.v
-    fastest = jnp.sqrt(jnp.max(jnp.sum(velocity.reshape(moment.tangent.shape) ** 2, axis=1)))
-    margin = 2 * h * fastest + _SURGE * h**2
+    margin = travel(moment, h)
     answer = contacts[0].is_near(moment, margin)
     for contact in contacts[1:]:
         answer = answer | contact.is_near(moment, margin)
     return answer
 
 
+def travel(moment: Motion, h: Float[Array, ""]) -> Float[Array, ""]:
+    """How far [m] any section may move within a step of `h`."""
+    velocity = moment.linear_jacobian.reshape(-1, moment.v.shape[0]) @ moment.v
+    fastest = jnp.sqrt(jnp.max(jnp.sum(velocity.reshape(moment.tangent.shape) ** 2, axis=1)))
+    return 2 * h * fastest + _SURGE * h**2
+
+
 def linearised(
-    forces: tuple[AbstractForce, ...], t: Float[Array, ""], motion: Motion
+    contacts: tuple[AbstractContact, ...], t: Float[Array, ""], motion: Motion
 ) -> Linearised:
-    """Sum of the contacts among `forces` at one moment; zeros without any."""
-    none = jnp.zeros((motion.v.shape[0],) * 2, motion.v.dtype)
-    total = Linearised(jnp.zeros_like(motion.v), none, none)
-    for force in forces:
-        if isinstance(force, AbstractContact):
-            term = force.linearised(t, motion)
-            total = Linearised(*(a + b for a, b in zip(total, term, strict=True)))
+    """Sum of one or more contacts with their stiffness and damping."""
+    total = contacts[0].linearised(t, motion)
+    for contact in contacts[1:]:
+        term = contact.linearised(t, motion)
+        total = Linearised(*(a + b for a, b in zip(total, term, strict=True)))
     return total

@@ -137,9 +137,7 @@ class VectorField(eqx.Module):
     def __call__(self, t: Any, state: tuple[Array, Array], args: Any = None):
         q, v = state
         t = jnp.asarray(t, q.dtype)
-        a = acceleration(
-            self.model, self.constants, t, q, v, self.forces, unroll=self.unroll
-        )
+        a = acceleration(self.model, self.constants, t, q, v, self.forces, unroll=self.unroll)
         return coordinate_rate(self.model, q, v), a
 
 

@@ -52,7 +52,7 @@ class SampledModes(AbstractModes):
         return (1 - fraction) * self.values[left] + fraction * self.values[right]
 
 
-def _as_function(given: Any) -> Callable:
+def _as_function(given: Any) -> Any:
     """A pytree that can be called, so that the numbers in a module stay differentiable."""
     if isinstance(given, list | tuple):
         return _Stacked(tuple(_as_function(one) for one in given))
@@ -120,12 +120,14 @@ def functions(
     """
     joints = checked_breaks("functions", breaks)
     own = {name: _as_function(f) for name, f in modes.items()}
-    return StrainBasis({k: Functions(f, _columns(f), nodes, joints) for k, f in own.items()})
+    modes_of = {k: _functions(f, nodes, joints) for k, f in own.items()}
+    return StrainBasis(modes_of)
 
 
-def _columns(function: Callable) -> int:
+def _functions(function: Any, nodes: int | None, joints: tuple[float, ...]) -> Functions:
     shape = np.shape(function(np.array([0.25, 0.5, 0.75])))
-    return shape[1] if len(shape) == 2 else 1
+    count = shape[1] if len(shape) == 2 else 1
+    return Functions(function=function, count=count, nodes=nodes, joints=joints)
 
 
 def _is_grid(s: np.ndarray) -> bool:

@@ -5,6 +5,7 @@ its part: `On("finger", TipWrench(...))`.
 """
 
 import abc
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,23 +19,24 @@ from sorojax.rod.forces import (
     AbstractDamping,
     AbstractElastic,
     AbstractForce,
+    AbstractPressureMap,
     Gravity,
     Pressurised,
 )
-from sorojax.rod.link import LinkMotion, LinkOperators, link_motion
+from sorojax.rod.link import Link, LinkMotion, LinkOperators, link_motion
 from sorojax.rod.motion import Motion
 from sorojax.rod.moving import release
 from sorojax.rod.rod import Rod
 from sorojax.rod.tree import AssemblyMotion, batches, clamped, part_motion
 
-_SHAPE_ONLY = (AbstractElastic, AbstractDamping, Pressurised)
+_SHAPE_ONLY = (AbstractElastic, AbstractDamping, Pressurised, AbstractPressureMap)
 
 
 class On(eqx.Module):
     """A force on one part, named as in the assembly."""
 
     part: str = eqx.field(static=True)
-    force: AbstractForce
+    force: AbstractForce | AbstractPressureMap
 
 
 class AbstractPairForce(eqx.Module):
@@ -70,7 +72,7 @@ def total_force(
 ) -> Float[Array, " dof"]:
     """Sum of the listed forces and of the elasticity of rods and joints."""
     if isinstance(motion, Motion):
-        return one.total_force(forces, t, motion)
+        return one.total_force(_plain(forces), t, motion)
     check(motion.assembly, forces)
     loads: list = [_part_load(forces, t, motion, k) for k in range(len(motion.frames))]
     for force in forces:
@@ -100,12 +102,12 @@ def tangent_stiffness(
 ) -> Float[Array, "dof dof"]:
     """Elastic stiffness at the coordinates of `motion`, replaced laws included."""
     if isinstance(motion, Motion):
-        return one.tangent_stiffness(forces, motion)
+        return one.tangent_stiffness(_plain(forces), motion)
     stiffness = motion.operators.stiffness
     for k, at in enumerate(slices(motion.assembly)):
-        laws = tuple(f for f in _on(forces, motion.assembly, k) if isinstance(f, AbstractElastic))
-        if laws:
-            own = one.tangent_stiffness(laws, clamped(motion, k))
+        listed = _on(forces, motion.assembly, k)
+        if any(isinstance(force, AbstractElastic) for force in listed):
+            own = one.tangent_stiffness(listed, clamped(motion, k))
             stiffness = stiffness.at[at.rod_v, at.rod_v].set(own)
     return stiffness
 
@@ -115,7 +117,7 @@ def damping_matrix(
 ) -> Float[Array, "dof dof"]:
     """Sum of the dampings of rods and joints; zeros without one."""
     if isinstance(model, Rod):
-        return one.damping_matrix(forces, constants.stiffness)
+        return one.damping_matrix(_plain(forces), constants.stiffness)
     damping = constants.damping
     for k, at in enumerate(slices(model)):
         if isinstance(model.parts[k].body, Rod):
@@ -155,13 +157,24 @@ def _on(forces: tuple[Load, ...], assembly: Assembly, index: int) -> tuple:
     return tuple(found)
 
 
+def _plain(forces: tuple[Load, ...]) -> Any:
+    """What may act on a single rod."""
+    for force in forces:
+        if isinstance(force, On | Between | JointEffort):
+            raise ValueError(
+                f"rod: got {type(force).__name__}, which names a part, need a plain force. A "
+                "single rod has no parts: leave the name out, or build an assembly."
+            )
+    return forces
+
+
 def _part_load(forces, t, motion: AssemblyMotion, index: int) -> Array | None:
     """Loads of one part in its columns, with the elasticity of a rod."""
     listed = _on(forces, motion.assembly, index)
     if isinstance(motion.operators.parts[index], LinkOperators):
         terms = [force(t, part_motion(motion, index)) for force in listed]
         return one.sum_matrices(terms) if terms else None
-    shape = tuple(force for force in listed if isinstance(force, _SHAPE_ONLY))
+    shape: Any = tuple(force for force in listed if isinstance(force, _SHAPE_ONLY))
     own = one.total_force(shape, t, clamped(motion, index))
     load = jnp.pad(own, (motion.assembly.group.algebra_dim, 0))
     for force in listed:
@@ -178,6 +191,7 @@ def _weights(motion: AssemblyMotion, gravity: Gravity, t) -> list[Array]:
     g = g if gravity.acceleration is None else gravity.acceleration
     local = [frame.rotation.T @ g for frame in motion.frames]
     found: list = [None] * count
+    weigh: Any = Gravity  # it reads links as it reads rods
     for members, stack in zip(batches(motion.assembly), motion.batches, strict=True):
         twists = jnp.stack([motion.frames[k].twist for k in members])
         every = eqx.filter_vmap(lambda m, twist, g: Gravity(g)(t, release(m, twist)))
@@ -186,8 +200,9 @@ def _weights(motion: AssemblyMotion, gravity: Gravity, t) -> list[Array]:
             found[k] = weights[place]
     for k, constants in enumerate(motion.operators.parts):
         if isinstance(constants, LinkOperators):
-            link = motion.assembly.parts[k].body
-            found[k] = Gravity(local[k])(t, link_motion(link, constants, motion.frames[k].twist))
+            link, twist = motion.assembly.parts[k].body, motion.frames[k].twist
+            assert isinstance(link, Link)
+            found[k] = weigh(local[k])(t, link_motion(link, constants, twist))
     return found
 
 

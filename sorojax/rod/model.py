@@ -29,9 +29,13 @@ def operators(model):
 
 
 @overload
-def motion(model: Rod, q: Array, v: Array | None = None, *, constants=None, unroll=False) -> Motion: ...
+def motion(
+    model: Rod, q: Array, v: Array | None = None, *, constants=None, unroll: bool = False
+) -> Motion: ...
 @overload
-def motion(model: Assembly, q: Array, v: Array | None = None, *, constants=None, unroll=False) -> AssemblyMotion: ...
+def motion(
+    model: Assembly, q: Array, v: Array | None = None, *, constants=None, unroll: bool = False
+) -> AssemblyMotion: ...
 def motion(model, q, v=None, *, constants=None, unroll: bool = False):
     """The fields of a model at (q, v), which forces and inertia read.
 
@@ -42,8 +46,9 @@ def motion(model, q, v=None, *, constants=None, unroll: bool = False):
         constants: `operators(model)`, if a loop has them already.
         unroll: Write the rotation product out (see `math.quaternion.prefix_product`).
     """
-    of = rod_motion if isinstance(model, Rod) else assembly_motion
-    return of(model, q, v, constants, unroll)
+    if isinstance(model, Assembly):
+        return assembly_motion(model, q, v, constants, unroll)
+    return rod_motion(model, q, v, constants, unroll)
 
 
 def inertia(

@@ -118,8 +118,7 @@ def _sliding(touch: Touch, velocity: Array) -> tuple[Array, Array]:
 
 def _rows(touch: Touch, jacobian, normal: Array) -> Float[Array, "points dof"]:
     blocks = [
-        side.sign * jnp.sum(normal[:, :, None] * jacobian(side), axis=1)
-        for side in touch.sides
+        side.sign * jnp.sum(normal[:, :, None] * jacobian(side), axis=1) for side in touch.sides
     ]
     return jnp.concatenate(blocks, axis=1)
 

@@ -1,6 +1,7 @@
 """Motion of a rod or assembly with a fixed step: the fast path, for known forces."""
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from sorojax.math.steppers import (
     integrate,
     start,
 )
-from sorojax.rod.assembly import Assembly, is_flat, rate, retract
+from sorojax.rod.assembly import is_flat, rate, retract
 from sorojax.rod.assembly_contact import any_contact, contacts_of
 from sorojax.rod.dynamics import Forces
 from sorojax.rod.loads import damping_matrix, tangent_stiffness, total_force
@@ -101,13 +102,13 @@ def second_order(
 
     stiffness = tangent_stiffness(forces, motion(model, q, constants=constants))
     damping = damping_matrix(forces, model, constants)
-    curved = isinstance(model, Assembly) and not is_flat(model)
+    tree: Any = None if isinstance(model, Rod) or is_flat(model) else model
     return SecondOrder(
         equations,
         stiffness,
         damping,
-        retract=functools.partial(retract, model) if curved else None,
-        rate=functools.partial(rate, model) if curved else None,
+        retract=tree and functools.partial(retract, tree),
+        rate=tree and functools.partial(rate, tree),
         unroll=unroll,
         contact=contacts_of(model, forces, at, inertia),
     )

@@ -104,5 +104,5 @@ def bspline(
                 f"{need}{' or more' if knots is None else ''}. Change the count or `degree`."
             )
         own = np.arange(1, inner + 1) / (inner + 1) if knots is None else knots
-        basis[name] = BSpline(tuple(float(k) for k in own), degree)
+        basis[name] = BSpline(knots=tuple(float(k) for k in own), degree=degree)
     return StrainBasis(basis)

@@ -1,6 +1,7 @@
 """Actuators that act along threads, and input maps by function."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,6 +17,14 @@ from sorojax.rod.routing import AbstractRoute, Thread, pull, thread, thread_leng
 Signal = Float[Array, " inputs"] | Callable[[Array], Array]
 
 
+def _several(routes: Any) -> tuple[AbstractRoute, ...]:
+    return (routes,) if isinstance(routes, AbstractRoute) else tuple(routes)
+
+
+def _signal(value: Any) -> Any:
+    return value if callable(value) or value is None else jnp.atleast_1d(real(value))
+
+
 class Tendons(AbstractForce):
     """Threads under given tensions, fixed to the rod at their far ends.
 
@@ -26,14 +35,9 @@ class Tendons(AbstractForce):
             nothing.
     """
 
-    routes: tuple[AbstractRoute, ...]
-    tension: Signal
+    routes: tuple[AbstractRoute, ...] = eqx.field(converter=_several)
+    tension: Signal = eqx.field(converter=_signal)
     friction: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
-
-    def __init__(self, routes, tension, friction=None):
-        self.routes = (routes,) if isinstance(routes, AbstractRoute) else tuple(routes)
-        self.tension = tension if callable(tension) else jnp.atleast_1d(real(tension))
-        self.friction = optional_real(friction)
 
     def __call__(self, t, motion):
         tension = _at(self.tension, t, motion.q.dtype)
@@ -78,7 +82,7 @@ def thread_chambers(
         ValueError: If an area is not positive or their number is not that of the routings.
     """
     is_single = isinstance(routes, AbstractRoute)
-    routes = (routes,) if is_single else tuple(routes)
+    routes = _several(routes)
     areas = jnp.atleast_1d(real(areas))
     do = "Give one area per routing, in m^2."
     _check.shape("thread_chambers", "areas", areas, (len(routes),), do)
@@ -95,11 +99,7 @@ class Actuation(AbstractForce):
     """
 
     map: Callable[[Float[Array, " dof"]], Float[Array, "dof inputs"]]
-    inputs: Signal
-
-    def __init__(self, map, inputs):
-        self.map = map
-        self.inputs = inputs if callable(inputs) else jnp.atleast_1d(real(inputs))
+    inputs: Signal = eqx.field(converter=_signal)
 
     def __call__(self, t, motion):
         q, inputs = own(motion, motion.q), _at(self.inputs, t, motion.q.dtype)
@@ -109,6 +109,6 @@ class Actuation(AbstractForce):
         return from_own(motion, matrix @ inputs)
 
 
-def _at(signal, t, dtype) -> Float[Array, " inputs"]:
+def _at(signal: Any, t, dtype) -> Float[Array, " inputs"]:
     value = signal(t) if callable(signal) else signal
     return jnp.atleast_1d(real(value)).astype(dtype)

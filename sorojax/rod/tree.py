@@ -8,7 +8,7 @@ Reference:
     Featherstone, Rigid Body Dynamics Algorithms, 2008, chapters 5 and 6, for the passes.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,7 +26,7 @@ from sorojax.rod.assembly import (
     slices,
 )
 from sorojax.rod.kernel import rod_motion
-from sorojax.rod.link import LinkMotion, LinkOperators, link_motion, link_operators, place_link
+from sorojax.rod.link import LinkOperators, link_motion, link_operators, place_link
 from sorojax.rod.motion import Motion, Operators, operators
 from sorojax.rod.moving import levers, place, release
 from sorojax.rod.points import Points
@@ -54,7 +54,7 @@ class Mount(NamedTuple):
     """How a part moves on its carrier.
 
     Attributes:
-        carried: Twist of the part per twist and coordinate of the carrier; None on ground.
+        carried: Twist of the part per twist and coordinate of the carrier; the ground has none.
         axes: Twist of the part per rate of the joint.
         turn: Rotation from the carrier's frame to the part's.
         joint_axes: Twist per rate of the joint along the carrier's axes.
@@ -62,12 +62,12 @@ class Mount(NamedTuple):
         spin: Angular Jacobian of that section in the columns of the carrier.
     """
 
-    carried: Float[Array, "twist carrier"] | None
+    carried: Float[Array, "twist carrier"]
     axes: Float[Array, "twist joint"]
     turn: Float[Array, "dim dim"]
     joint_axes: Float[Array, "twist joint"]
     arm: Float[Array, " dim"]
-    spin: Float[Array, "rot carrier"] | None
+    spin: Float[Array, "rot carrier"]
 
 
 class Frame(NamedTuple):
@@ -119,15 +119,15 @@ def assembly_operators(assembly: Assembly) -> AssemblyOperators:
     parts, rows = [], []
     stiffness, damping = jnp.zeros((total, total), dtype), jnp.zeros((total, total), dtype)
     for part, on, at in zip(assembly.parts, parents(assembly), slices(assembly), strict=True):
-        is_rod = isinstance(part.body, Rod)
-        own = operators(part.body) if is_rod else link_operators(part.body, dtype)
+        body = part.body
+        own = operators(body) if isinstance(body, Rod) else link_operators(body, dtype)
         parts.append(own)
         carrier = None if on is None else assembly.parts[on].body
         rows.append(_rows(carrier, part.s) if isinstance(carrier, Rod) else None)
         spring, damper = part.joint.matrices(assembly.group, dtype)
         stiffness = stiffness.at[at.joint_v, at.joint_v].set(spring)
         damping = damping.at[at.joint_v, at.joint_v].set(damper)
-        if is_rod:
+        if isinstance(body, Rod):
             stiffness = stiffness.at[at.rod_v, at.rod_v].set(own.stiffness)
     stacks = tuple(
         jax.tree.map(lambda *leaves: jnp.stack(leaves), *(parts[k] for k in members))
@@ -154,6 +154,7 @@ def assembly_motion(
     moments = []
     for members, stack in zip(batches(assembly), constants.batches, strict=True):
         rod = assembly.parts[members[0]].body
+        assert isinstance(rod, Rod)
         own_q = jnp.stack([q[places[k].rod_q] for k in members])
         own_v = jnp.stack([v[places[k].rod_v] for k in members])
         every = eqx.filter_vmap(lambda c, q, v, rod=rod: rod_motion(rod, q, v, c, unroll))
@@ -167,16 +168,20 @@ def clamped(moment: AssemblyMotion, index: int) -> Motion:
     """The motion of a rod in its own frame, clamped there."""
     for members, stack in zip(batches(moment.assembly), moment.batches, strict=True):
         if index in members:
-            at = members.index(index)
-            one = jax.tree.map(lambda leaf: leaf[at] if eqx.is_array(leaf) else leaf, stack)
+            one = _member(stack, members.index(index))
             own = moment.operators.parts[index]
             both = (moment.assembly.parts[index].body, own)
             return eqx.tree_at(lambda m: (m.rod, m.operators), one, both)
     raise ValueError(f"assembly: `{moment.assembly.names[index]}` is a link, need a rod.")
 
 
-def part_motion(moment: AssemblyMotion, index: int) -> Motion | LinkMotion:
-    """A part in the world frame; its columns are its own twist and coordinates."""
+def _member(stack: Motion, at: int) -> Motion:
+    return jax.tree.map(lambda leaf: leaf[at] if eqx.is_array(leaf) else leaf, stack)
+
+
+def part_motion(moment: AssemblyMotion, index: int) -> Any:
+    """A part in the world frame, a `Motion` or a `LinkMotion`; its columns are its own twist
+    and coordinates."""
     rotation, position, twist = moment.frames[index]
     body = moment.assembly.parts[index].body
     if isinstance(body, Rod):
@@ -191,9 +196,7 @@ def part_columns(moment: AssemblyMotion) -> tuple[Float[Array, "own dof"], ...]:
     assembly, found = moment.assembly, []
     total, dtype = moment.v.shape[0], moment.v.dtype
     identity = jnp.eye(total, dtype=dtype)
-    for on, at, mount in zip(
-        parents(assembly), slices(assembly), moment.mounts, strict=True
-    ):
+    for on, at, mount in zip(parents(assembly), slices(assembly), moment.mounts, strict=True):
         twist = mount.axes @ identity[at.joint_v]
         if on is not None:
             twist = twist + mount.carried @ found[on]
@@ -213,10 +216,8 @@ def section(moment: AssemblyMotion, index: int, on: int | None) -> tuple[Array, 
         return jnp.eye(dim, dtype=dtype), still, eye[:rot], eye[rot:]
     at = Points(clamped(moment, on), rows)
     centre = at.position[0]
-    own = at.angular_jacobian.shape[2]
     linear = eye[rot:].at[:, :rot].set(levers(centre[None])[0])
-    angular = jnp.concatenate([jnp.pad(eye[:rot], ((0, 0), (0, own)))], axis=0)
-    angular = angular.at[:, twist:].set(at.angular_jacobian[0])
+    angular = jnp.concatenate([eye[:rot], at.angular_jacobian[0]], axis=1)
     linear = jnp.concatenate([linear, at.linear_jacobian[0]], axis=1)
     return at.directors[0], centre, angular, linear
 
@@ -255,7 +256,7 @@ def _mount(moment: AssemblyMotion, index: int, on: int | None) -> tuple[Mount, A
     along = _turn(rotation, part.joint.axes(group, dtype), rot)
     axes = _turn(turn.T, along, rot)
     if on is None:
-        return Mount(None, axes, turn, along, arm, None), centre + arm
+        angular, linear = angular[:, :0], linear[:, :0]
     swept = jnp.concatenate([angular, linear + levers(arm[None])[0] @ angular])
     return Mount(_turn(turn.T, swept, rot), axes, turn, along, arm, angular), centre + arm
 

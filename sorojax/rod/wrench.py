@@ -1,6 +1,7 @@
 """Given moments and forces on a rod: at a section, or per length."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -37,6 +38,10 @@ class PointWrench(AbstractForce):
         return _apply(at, self.wrench[None], self.follower)
 
 
+def _density(value: Any) -> Any:
+    return value if callable(value) else real(value)
+
+
 class LineWrench(AbstractForce):
     """A wrench per length of the unstrained rod.
 
@@ -45,12 +50,8 @@ class LineWrench(AbstractForce):
         follower: Whether the components turn with the sections; otherwise it is dead.
     """
 
-    wrench: Float[Array, " twist"] | Callable[[Array], Array]
-    follower: bool = eqx.field(static=True)
-
-    def __init__(self, wrench, follower: bool = False):
-        self.wrench = wrench if callable(wrench) else real(wrench)
-        self.follower = follower
+    wrench: Float[Array, " twist"] | Callable[[Array], Array] = eqx.field(converter=_density)
+    follower: bool = eqx.field(static=True, default=False)
 
     def __call__(self, t, motion):
         s = jnp.asarray(gauss_legendre(motion.rod.quadrature)[0], motion.q.dtype)

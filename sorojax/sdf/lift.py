@@ -261,7 +261,9 @@ def polar_repeat(shape: AbstractSdf, count: int) -> PolarRepeated:
     return PolarRepeated(shape, int(count), reach=1 + math.floor(width))
 
 
-def grid_repeat(shape: AbstractSdf, spacing, counts: tuple[int, ...]) -> AbstractSdf:
+def grid_repeat(
+    shape: AbstractSdf, spacing, counts: tuple[int, ...], *, separate: bool | None = None
+) -> AbstractSdf:
     """Copies of `shape` in rows along all axes: a row of rows, in space of layers.
 
     Right for parts without symmetry and for parts wider than the spacing, as `repeat`.
@@ -270,6 +272,7 @@ def grid_repeat(shape: AbstractSdf, spacing, counts: tuple[int, ...]) -> Abstrac
         shape: The copy at the origin; the others lie at positive coordinates.
         spacing: Distance [m] between copies, one per axis.
         counts: Number of copies along each axis.
+        separate: As in `repeat`, along every axis.
     """
     spacing = real(spacing)
     _check.shape("grid_repeat", "spacing", spacing, (shape.dim,), "One per axis.")
@@ -281,5 +284,5 @@ def grid_repeat(shape: AbstractSdf, spacing, counts: tuple[int, ...]) -> Abstrac
     for axis, count in enumerate(counts):
         if count != 1:
             along = jnp.zeros_like(spacing).at[axis].set(spacing[axis])
-            shape = repeat(shape, along, count)
+            shape = repeat(shape, along, count, separate=separate)
     return shape

@@ -241,15 +241,21 @@ def repeat(shape: AbstractSdf, step, count: int, *, separate: bool | None = None
         step: From one copy to the next [m].
         count: Number of copies.
         separate: Whether the boxes of the copies stay apart along the step, which makes
-            two copies per point enough. Found from the boxes if omitted; under a trace,
-            where sizes are unknown, every copy is evaluated then. Stating it makes the
-            same tree in and out of a trace, so programs are compiled once.
+            two copies per point enough. Found from the boxes if omitted, which needs their
+            sizes: under a trace it must be stated. False evaluates every copy.
 
     Raises:
-        ValueError: If `step` is zero, or copies stated to be separate overlap.
+        ValueError: If `step` is zero, copies stated to be separate overlap, or `separate`
+            is left out under a trace.
     """
     step = real(step)
     if is_traced((shape, step)):
+        if separate is None:
+            raise ValueError(
+                "repeat: got traced sizes and no `separate`, need it under a trace: whether "
+                "copies overlap decides how many are evaluated. Pass `separate=True` if they "
+                "stay apart along `step`, else `separate=False`."
+            )
         reach = 1 if separate else int(count)
         return Repeated(shape, step, int(count), reach, bool(separate))
     stride = np.asarray(step, dtype=float)

@@ -11,7 +11,6 @@ from jaxtyping import Array, Bool, Float, Int
 from sorojax.sdf.scalar import root
 from sorojax.sdf.triangles import Vector, foot, minus, triangle_square
 
-FEW = 64  # triangles of a mesh that needs no lists
 MOST = 128  # triangles in a list that is complete
 _SPLIT = 64  # triangles in a list that asks for smaller cubes
 _COARSE, _DEPTH = 3, 10  # halvings of the largest cube before a close look, and at all

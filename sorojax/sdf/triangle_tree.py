@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax.sdf.nearest import take
-from sorojax.sdf.triangle_cells import FEW, MOST, TriangleCells, triangle_cells
+from sorojax.sdf.triangle_cells import MOST, TriangleCells, triangle_cells
 from sorojax.sdf.triangles import Vector, dot, foot, minus, triangle_square
 
 LEAF = 4  # triangles in the smallest box
@@ -190,7 +190,9 @@ def _boxes(triangles: Float[Array, "slots 3 3"]) -> tuple[Array, Array]:
     return jnp.concatenate(lower), jnp.concatenate(upper)
 
 
-def triangle_tree(vertices: np.ndarray, faces: np.ndarray) -> TriangleTree | None:
+def triangle_tree(
+    vertices: np.ndarray, faces: np.ndarray, lists: bool = False
+) -> TriangleTree | None:
     """The tree of a mesh; None unless every edge joins two faces of the same sense.
 
     Corners at the same place count as one, as files of loose triangles need it.
@@ -207,7 +209,7 @@ def triangle_tree(vertices: np.ndarray, faces: np.ndarray) -> TriangleTree | Non
     triangles = vertices[faces]
     order = _order(triangles.mean(axis=1))
     cells = None
-    if len(faces) > FEW:
+    if lists:
         slots = np.zeros(len(faces), np.int64)
         slots[order[::-1]] = np.arange(len(order))[::-1]
         cells = triangle_cells(jnp.asarray(vertices), triangles, slots)

@@ -1,5 +1,6 @@
 """Systems: blocks with ports, networks of them, and their simulation."""
 
+from sorojax.systems.assembly_body import AssemblyBody as AssemblyBody
 from sorojax.systems.block import (
     AbstractBlock as AbstractBlock,
     Input as Input,

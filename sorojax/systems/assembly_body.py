@@ -1,0 +1,131 @@
+"""An assembly as a block: pressures of its rods in, volumes, tips and joint efforts."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax._types import optional_real
+from sorojax.rod import (
+    AbstractPressureMap,
+    Assembly,
+    JointEffort,
+    On,
+    Pressurised,
+    acceleration,
+    num_coordinates,
+    num_dof,
+    operators,
+    rest,
+    slices,
+    tip_pose,
+)
+from sorojax.rod.assembly import index_of
+from sorojax.rod.dynamics import coordinate_rate
+from sorojax.rod.loads import Load
+from sorojax.systems.block import AbstractBlock, Input, Output
+
+
+class AssemblyBody(AbstractBlock):
+    """An assembly with its forces; the state is {q, v}.
+
+    Ports of a part are named after it. A pressure map, `On("finger", map)`, opens
+    `finger_pressure`, `finger_volume`, `finger_volume_rate` (at held pressure) and
+    `finger_compliance`, all from one potential. A driven joint opens `wrist_effort`. Each
+    part has `finger_position`, of its tip or of the frame of a link.
+
+    Attributes:
+        assembly: The assembly.
+        forces: Its forces; at most one pressure map per rod.
+        driven: Parts whose joints take an effort from outside.
+        q, v: Coordinates and rates at the start; at rest if omitted.
+    """
+
+    assembly: Assembly
+    forces: tuple[Load, ...] = ()
+    driven: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
+    q: Float[Array, " coordinates"] | None = eqx.field(converter=optional_real, default=None)
+    v: Float[Array, " dof"] | None = eqx.field(converter=optional_real, default=None)
+
+    def __check_init__(self):
+        names = [part for part, _ in _maps(self.forces)]
+        twice = {name for name in names if names.count(name) > 1}
+        if twice:
+            raise ValueError(
+                f"AssemblyBody: `{min(twice)}` has {names.count(min(twice))} pressure maps, "
+                "need at most one per rod. Return several volumes from one map."
+            )
+        for name in (*names, *self.driven):
+            index_of(self.assembly, name)
+
+    @property
+    def inputs(self):
+        ports = {f"{k}_pressure": Input("Pa", m.ports, 0.0) for k, m in self._maps().items()}
+        for name in self.driven:
+            ports[f"{name}_effort"] = Input(None, (self._joint_dof(name),), 0.0)
+        return ports
+
+    @property
+    def outputs(self):
+        dim = self.assembly.group.space_dim
+        ports = {f"{name}_position": Output("m", (dim,)) for name in self.assembly.names}
+        ports["q"] = Output(None, (num_coordinates(self.assembly),))
+        units = {"volume": "m^3", "volume_rate": "m^3/s", "compliance": "m^3/Pa"}
+        for name, chamber in self._maps().items():
+            needs = frozenset({f"{name}_pressure"})
+            for kind, unit in units.items():
+                ports[f"{name}_{kind}"] = Output(unit, chamber.ports, needs)
+        return ports
+
+    def initial_state(self):
+        start = rest(self.assembly)
+        zero = jnp.zeros(num_dof(self.assembly), start.dtype)
+        return {
+            "q": start if self.q is None else self.q,
+            "v": zero if self.v is None else self.v,
+        }
+
+    def output(self, name, t, state, inputs):
+        q, v = state["q"], state["v"]
+        if name == "q":
+            return q
+        for part, chamber in self._maps().items():
+            kind = name.removeprefix(f"{part}_")
+            if name in self.outputs and kind in ("volume", "volume_rate", "compliance"):
+                at = slices(self.assembly)[index_of(self.assembly, part)]
+                own = (q[at.rod_q], v[at.rod_v])
+                return _fluid(chamber, kind, *own, inputs[f"{part}_pressure"])
+        return tip_pose(self.assembly, q)[name.removesuffix("_position")][:-1, -1]
+
+    def vector_field(self, t, state, inputs):
+        q, v = state["q"], state["v"]
+        plain = tuple(force for force in self.forces if not _maps((force,)))
+        bound = tuple(
+            On(part, Pressurised(chamber, inputs[f"{part}_pressure"]))
+            for part, chamber in self._maps().items()
+        )
+        driven = tuple(JointEffort(name, inputs[f"{name}_effort"]) for name in self.driven)
+        constants = operators(self.assembly)
+        a = acceleration(self.assembly, constants, t, q, v, (*plain, *bound, *driven))
+        return {"q": coordinate_rate(self.assembly, q, v), "v": a}
+
+    def _maps(self) -> dict[str, AbstractPressureMap]:
+        return dict(_maps(self.forces))
+
+    def _joint_dof(self, name: str) -> int:
+        return self.assembly[name].joint.num_dof(self.assembly.group)
+
+
+def _maps(forces: tuple[Load, ...]) -> list[tuple[str, AbstractPressureMap]]:
+    """The pressure maps, with the parts that they are on."""
+    on = [force for force in forces if isinstance(force, On)]
+    return [(f.part, f.force) for f in on if isinstance(f.force, AbstractPressureMap)]
+
+
+def _fluid(chamber: AbstractPressureMap, kind: str, q: Array, v: Array, pressure: Array):
+    volume = jax.grad(chamber.coenergy, argnums=1)
+    if kind == "compliance":
+        one = jnp.ones_like(pressure)
+        return jax.jvp(lambda p: volume(q, p), (pressure,), (one,))[1]
+    value, rate = jax.jvp(lambda q: volume(q, pressure), (q,), (v,))
+    return value if kind == "volume" else rate

@@ -1,0 +1,195 @@
+"""Contact of rods: the law, obstacles, itself, each other; energy and derivatives."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sorojax import rod as R, sdf
+from sorojax.contact import LinePenalty
+from sorojax.math.lie import SE2, SE3
+from sorojax.math.status import Status
+
+RADIUS = 6e-3
+FINGER = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2000.0)
+LAW = LinePenalty(stiffness=5e7, smoothing=6e-6, friction=0.5)
+T0 = jnp.zeros(())
+
+
+def size(value):
+    return float(jnp.abs(value).max())
+
+
+def rise(energy):
+    """Largest growth over the least value before it."""
+    energy = np.asarray(energy)
+    return float(np.max(energy - np.minimum.accumulate(energy)))
+
+
+# The law
+
+
+def test_the_law_derives_from_its_energy_and_is_smooth():
+    gap = jnp.linspace(-1.5e-5, 5e-6, 41)
+    pressure = -jax.vmap(jax.grad(LAW.energy))(gap)
+    assert size(pressure - LAW.pressure(gap)) < 1e-12 * size(pressure)
+    slope = -jax.vmap(jax.grad(LAW.pressure))(gap)
+    assert size(slope - LAW.slope(gap)) < 1e-12 * 5e7
+    ends = jax.vmap(jax.grad(LAW.slope))(jnp.array([-1e-12, 1e-12, -6e-6 + 1e-12]))
+    assert size(ends) < 1e-5 * 5e7 / 6e-6
+    damped = eqx.tree_at(lambda law: law.damping, LAW, jnp.array(2.0), is_leaf=lambda x: x is None)
+    assert jnp.allclose(damped.approach(jnp.array([-1.0, 0.1, 1.0])), jnp.array([3.0, 0.8, 0.0]))
+    with pytest.raises(ValueError, match="must be positive"):
+        LinePenalty(stiffness=-1.0, smoothing=1e-5)
+
+
+# A rod that falls into a corner
+
+
+FLOOR, WALL = sdf.Rectangle([-1.0, -1.0], [1.0, 0.0]), sdf.Rectangle([0.09, -1.0], [1.0, 1.0])
+G = jnp.array([0.0, -9.81])
+
+
+def corner(points):
+    return R.ObstacleContact(FLOOR | WALL, RADIUS, LAW, points=points, caps="both")
+
+
+def dropped(points, q, v):
+    """A free planar rod falls for 0.2 s: energy, penetration, end."""
+    rod = R.rod(SE2(), R.chebyshev(kappa_z=2), R.circle(RADIUS), nodes=8, **FINGER)
+    body = R.assembly(SE2(), rod=R.Part(rod, R.Free()))
+    contact = corner(points)
+    forces = (R.Gravity(), R.On("rod", contact))
+    path = R.rollout(body, q, v, forces, step=1e-3, saves=100, every=2, unroll=False)
+
+    def report(q, v):
+        motion = R.tree.part_motion(R.motion(body, q, v), 0)
+        energy = R.kinetic_energy(body, q, v) + R.potential_energy(body, q, G)
+        return energy + R.contact_energy(contact, motion), R.penetration(contact, motion)
+
+    return path, *jax.vmap(report)(path.q, path.v)
+
+
+@pytest.fixture(scope="module")
+def drop():
+    return eqx.filter_jit(dropped)
+
+
+STARTS = ([0.1, -0.03, 0.03, 0.0, 0.0], [-0.6, 0.0, 0.06, 0.0, 0.0])  # turn, x, y, q
+
+
+@pytest.mark.parametrize("start, speed", [(STARTS[0], 0.0), (STARTS[1], 0.4)])
+def test_a_falling_rod_does_not_sink_in_and_loses_energy(drop, start, speed):
+    q, v = jnp.array(start), jnp.zeros(5).at[1].set(speed)
+    path, energy, depth = drop(32, q, v)
+    assert path.status == Status.successful
+    assert 0 < size(depth) < 0.01 * RADIUS
+    assert float(energy[-1]) < float(energy[0])
+    assert rise(energy) < 1e-5 * 2000 * np.pi * RADIUS**2 * 0.08 * 9.81 * 0.08
+
+
+def test_twice_the_points_give_the_same_motion(drop):
+    q = jnp.array(STARTS[0])
+    few, many = (drop(points, q, jnp.zeros(5))[0] for points in (32, 64))
+    assert size(few.q[:, :3] - many.q[:, :3]) < 0.02 * size(few.q[:, :3])
+
+
+# Bodies against each other, at one moment
+
+
+def coil(q):
+    rod = R.rod(
+        SE2(), R.chebyshev(kappa_z=3), R.circle(3e-3), nodes=20, **(FINGER | {"length": 0.2})
+    )
+    return R.motion(rod, q)
+
+
+def crossed(q):
+    rod = R.rod(SE3(), R.chebyshev(kappa_y=2, kappa_z=2), R.circle(RADIUS), **FINGER)
+    low = jnp.array([[0.0, -1, 0, 0.05], [1, 0, 0, -0.04], [0, 0, 1, -0.0118], [0, 0, 0, 1]])
+    pair = R.assembly(SE3(), top=R.Part(rod), low=R.Part(rod, offset=low))
+    return pair, R.motion(pair, q)
+
+
+def test_self_contact_is_the_slope_of_its_energy():
+    law = LinePenalty(stiffness=5e6, smoothing=6e-6)
+    contact = R.SelfContact(3e-3, law, points=64)
+
+    @jax.jit
+    def at(q):
+        slope = jax.grad(lambda q: R.contact_energy(contact, coil(q)))(q)
+        return slope, contact.linearised(T0, coil(q)), R.penetration(contact, coil(q))
+
+    slope, term, depth = at(jnp.array([34.0, 2.0, 0.5]))
+    assert float(depth) > 0 and size(slope) > 0
+    assert size(term.force + slope) < 1e-12 * size(slope)
+    assert float(jnp.linalg.eigvalsh(term.stiffness)[0]) > -1e-12 * size(term.stiffness)
+    slope, term, depth = at(jnp.array([12.0, 1.0, 0.5]))
+    assert float(depth) == 0 and size(slope) == 0 and size(term.force) == 0
+
+
+def test_rods_that_cross_press_against_each_other():
+    contact = R.RodContact([RADIUS, RADIUS], LinePenalty(5e6, 1.2e-5), points=48)
+
+    @jax.jit
+    def at(q):
+        def energy(q):
+            pair, motion = crossed(q)
+            bodies = [R.tree.part_motion(motion, k) for k in (0, 1)]
+            found = R.rod_contact.touches(contact, *bodies)
+            return sum(R.pressing.energy(contact.law, touch) for touch in found)
+
+        pair, motion = crossed(q)
+        plain = R.total_force((), T0, motion)
+        force = R.total_force((R.Between("top", "low", contact),), T0, motion) - plain
+        held = R.HeldRod(contact, R.tree.part_motion(motion, 1))
+        alone = held(T0, R.tree.part_motion(motion, 0))
+        return jax.grad(energy)(q), force, alone
+
+    slope, force, alone = at(jnp.array([1.0, 0.5, 0.3, 0.1, -1.0, 0.2, 0.4, 0.0]))
+    assert size(slope) > 0
+    assert size(force + slope) < 1e-7 * size(slope)
+    assert size(alone[-4:] - force[:4]) < 1e-12 * size(force)
+
+
+# Derivatives through making and breaking contact
+
+
+def test_pushes_are_differentiable_through_contact():
+    rod = R.rod(SE2(), R.chebyshev(kappa_z=2), R.circle(RADIUS), nodes=8, **FINGER)
+    low = sdf.Rectangle([-1.0, -1.0], [1.0, -0.012])
+    contact = R.ObstacleContact(low, RADIUS, LAW, points=16)
+
+    def push(speed):
+        v = jnp.stack([-speed, 0 * speed])
+        forces = (R.Gravity(), contact, R.Damping(0.01))
+        path = R.rollout(rod, 0 * v, v, forces, step=2e-3, saves=15, every=2, unroll=False)
+        return R.tip_pose(rod, path.q[-1])[1, 2], path.q
+
+    one, ahead = jnp.ones(()), 1e-3
+    speeds = 300.0 + ahead * jnp.array([-1.0, 0.0, 1.0])
+    every = jax.jit(jax.vmap(lambda x: jax.jvp(push, (x,), (one,))))
+    (height, path), (forward, _) = every(speeds)
+    backward = jax.jit(jax.grad(lambda x: push(x)[0]))(speeds[1])
+    touches = jax.vmap(lambda q: R.penetration(contact, R.motion(rod, q)))(path[1]) > 0
+    assert touches.any() and not touches[0] and not touches.all()
+    assert jnp.isclose(backward, forward[1], rtol=1e-8)
+    assert jnp.isclose(forward[1], (height[2] - height[0]) / (2 * ahead), rtol=1e-4)
+
+
+# Far obstacles
+
+
+def test_a_far_obstacle_is_skipped_and_a_near_one_is_not():
+    rod = R.rod(SE3(), R.chebyshev(kappa_z=2, sigma_x=1), R.circle(RADIUS), **FINGER)
+    law, none = LinePenalty(5e6, 1.2e-5), jnp.zeros(())
+    motion = R.motion(rod, jnp.array([3.0, 1.0, 0.2]))
+    for height, want in ((-0.2, False), (-5.9e-3, True)):
+        contact = R.ObstacleContact(sdf.HalfSpace([0, height, 0], [0, 1, 0]), RADIUS, law)
+        assert bool(contact.is_near(motion, none)) is want
+        assert (size(contact(T0, motion)) > 0) is want
+    with pytest.raises(ValueError, match="2 or more along the rod"):
+        R.ObstacleContact(FLOOR, RADIUS, law, points=1)
+    with pytest.raises(ValueError, match="one for each of 32 points"):
+        R.ObstacleContact(FLOOR, [RADIUS] * 3, law)
