@@ -73,6 +73,9 @@ class AbstractContact(AbstractForce):
 class ObstacleContact(AbstractContact):
     """Contact of a rod with an obstacle that does not move.
 
+    The force follows the slope of the field, so at the concave edge of a union only one of
+    its faces pushes: list floor and wall as two contacts.
+
     Attributes:
         obstacle: Its signed distance, in the world frame.
         radius: Radius of the rod [m], or one per point.
