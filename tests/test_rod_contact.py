@@ -38,8 +38,12 @@ def test_the_law_derives_from_its_energy_and_is_smooth():
     assert size(slope - LAW.slope(gap)) < 1e-12 * 5e7
     ends = jax.vmap(jax.grad(LAW.slope))(jnp.array([-1e-12, 1e-12, -6e-6 + 1e-12]))
     assert size(ends) < 1e-5 * 5e7 / 6e-6
-    damped = eqx.tree_at(lambda law: law.damping, LAW, jnp.array(2.0), is_leaf=lambda x: x is None)
-    assert jnp.allclose(damped.approach(jnp.array([-1.0, 0.1, 1.0])), jnp.array([3.0, 0.8, 0.0]))
+    damped = eqx.tree_at(
+        lambda law: law.damping, LAW, jnp.array(2.0), is_leaf=lambda x: x is None
+    )
+    assert jnp.allclose(
+        damped.approach(jnp.array([-1.0, 0.1, 1.0])), jnp.array([3.0, 0.8, 0.0])
+    )
     with pytest.raises(ValueError, match="must be positive"):
         LinePenalty(stiffness=-1.0, smoothing=1e-5)
 
@@ -166,6 +170,7 @@ def test_rods_that_cross_press_against_each_other():
 # Derivatives through making and breaking contact
 
 
+@pytest.mark.slow
 def test_pushes_are_differentiable_through_contact():
     rod = R.rod(SE2(), R.chebyshev(kappa_z=2), R.circle(RADIUS), nodes=8, **FINGER)
     low = sdf.Rectangle([-1.0, -1.0], [1.0, -0.012])

@@ -104,9 +104,9 @@ def test_friction_takes_tension_as_on_a_capstan(arc):
     turn = mu * curvature * 0.08
     expected = 2 * 3e-3 * 0.08 * (1 - np.exp(-turn)) / turn
     assert jnp.allclose(force, expected, rtol=1e-10, atol=0)
-    slope = jax.grad(
-        lambda q: R.Tendons(ROUTES[:1], 2.0, mu)(T0, R.motion(arc, q)).sum()
-    )(jnp.zeros(1))
+    slope = jax.grad(lambda q: R.Tendons(ROUTES[:1], 2.0, mu)(T0, R.motion(arc, q)).sum())(
+        jnp.zeros(1)
+    )
     assert jnp.all(jnp.isfinite(slope))
 
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 
 from benchmarks.fingers import LENGTH, finger, random_states
 from benchmarks.harness import Row, measure_calls
-from sorojax.rod import bias_force, mass_matrix, tip_pose
+from sorojax.rod import bias_force, forward_kinematics, mass_matrix
 
 BARS = {"mass": 1e-9, "bias": 1e-9, "tip": 1e-9}
 REFERENCE = "40 nodes: largest entry of the difference over that of the value, tip over length"
@@ -16,7 +16,7 @@ def rows():
     verbs = {
         "mass": lambda rod: mass_matrix(rod, q),
         "bias": lambda rod: bias_force(rod, q, v),
-        "tip": lambda rod: tip_pose(rod, q)[:3, 3],
+        "tip": lambda rod: jnp.asarray(forward_kinematics(rod, q, [1.0]))[0, :3, 3],
     }
     fine = {name: verb(finger(40)) for name, verb in verbs.items()}
     for nodes in (5, 6, 8, 10, 12):

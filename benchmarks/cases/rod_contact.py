@@ -32,7 +32,7 @@ def loop(rod, loads):
     stepper = ContactMidpoint()
 
     def run(q, v):
-        problem = second_order(rod, q, loads, unroll=True)
+        problem = second_order(rod, q, loads, unroll=False)
         t, h = jnp.zeros(()), jnp.asarray(STEP)
         begin = start(problem, t, q, v)
         return jax.lax.fori_loop(0, STEPS, lambda _, s: stepper.step(problem, t, h, s), begin)
@@ -45,7 +45,9 @@ def rows():
     q = jnp.zeros(rod.basis.num_dof)
     cases = (("none", None), ("far", -0.2), ("itself", "itself"), ("met", -0.015))
     programs = {name: loop(rod, forces(obstacle)) for name, obstacle in cases}
-    timings = {name: measure(run, q, q, repeats=25).per(STEPS) for name, run in programs.items()}
+    timings = {
+        name: measure(run, q, q, repeats=25).per(STEPS) for name, run in programs.items()
+    }
     yield from compared(timings, {})
     many = jnp.zeros((BATCH, q.shape[0]))
     timings = {

@@ -21,7 +21,7 @@ REFERENCE = "energy at the start, in the largest elastic energy"
 STEPS = (
     (GeneralisedAlpha(1.0), 1e-3, None),
     (ImplicitMidpoint(), 1e-3, None),
-    (TripleJump(), 1e-3, None),
+    (TripleJump(), 1e-3, BAR),
     (RungeKutta4(), 2.5e-4, None),
     (DormandPrince(), 5e-4, None),
     (DormandPrince(), 2.5e-4, BAR),

@@ -43,6 +43,7 @@ class Pulse(AbstractForce):
     def __call__(self, t, motion):
         share = jnp.clip(jnp.minimum(t / PEAK, (END - t) / (END - PEAK)), 0, 1)
         base = motion.base
+        assert base is not None  # the rod floats
         columns = jnp.concatenate([base.angular_jacobian, base.linear_jacobian])
         return share * self.wrench @ columns
 

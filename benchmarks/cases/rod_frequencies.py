@@ -1,5 +1,6 @@
 """Bending frequencies D2 of the finger without rotary inertia, in units of Euler-Bernoulli."""
 
+import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.fingers import LENGTH, finger
@@ -15,7 +16,7 @@ REFERENCE = "Euler-Bernoulli cantilever, relative"
 
 def frequencies(beam):
     """omega L^2 sqrt(rho A / (E I)), rising."""
-    zero = np.zeros(beam.basis.num_dof)
+    zero = jnp.zeros(beam.basis.num_dof)
     mass, stiffness = np.asarray(mass_matrix(beam, zero)), np.asarray(stiffness_matrix(beam))
     lower = np.linalg.inv(np.linalg.cholesky(mass))
     values = np.linalg.eigvalsh(lower @ stiffness @ lower.T)
@@ -37,7 +38,7 @@ def rows():
         thin = replace(
             thin, lambda r: r.material.young_modulus, beam.material.young_modulus * ratio
         )
-        timing = measure_calls(lambda: mass_matrix(thin, np.zeros(modes)), 3)  # noqa: B023
+        timing = measure_calls(lambda: mass_matrix(thin, jnp.zeros(modes)), 3)  # noqa: B023
         found = frequencies(thin)
         for number in (1, 2):
             error = abs(float(found[number - 1]) / EXACT[number - 1] - 1)

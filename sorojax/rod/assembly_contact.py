@@ -17,7 +17,7 @@ from sorojax.rod.tree import AssemblyMotion, part_columns, part_motion
 
 
 def contacts_of(
-    model: Any, forces: tuple[Load, ...], at: Callable, inertia: Callable
+    model: Any, forces: tuple[Any, ...], at: Callable, inertia: Callable
 ) -> ContactTerms | None:
     """The contacts among the forces on a rod or assembly; None without any.
 
@@ -52,7 +52,7 @@ def contacts_of(
                 answers.append(near((contact,), bodies[0], h))
         return jnp.any(jnp.stack(answers))
 
-    def force(t, q, v):
+    def force(t, q, v) -> Any:
         moment = at(q, v)
         columns, terms = part_columns(moment), []
         for parts, contact in where:

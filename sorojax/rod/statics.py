@@ -1,94 +1,175 @@
-"""Equilibrium of a rod under its forces."""
+"""Equilibrium of a rod or an assembly under its forces."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jax.scipy.linalg import cho_factor, cho_solve
+from jaxtyping import Array, Bool, Float, Int
 
+from sorojax import _check
 from sorojax._types import real
 from sorojax.math.door import door
 from sorojax.math.status import Status
-from sorojax.rod.forces import AbstractForce, total_force
-from sorojax.rod.kinematics import motion
-from sorojax.rod.motion import operators
-from sorojax.rod.rod import Rod
+from sorojax.rod.assembly import dtype_of, num_coordinates, rest as at_rest
+from sorojax.rod.loads import Load, total_force
+from sorojax.rod.model import Model, motion, operators
+from sorojax.rod.tangent import increments, linearised, metric, moved, squared, unit_energy
 
-_STEP_LENGTHS = (1.0, 0.5, 0.25, 0.1)
+_DECREASE = 1e-4  # Armijo: share of the promised decrease that a step must give
+_SHORTEST = 1e-3  # of a Newton step
+
+Residual = Callable[[Array], Array]
 
 
 class Equilibrium(eqx.Module):
     """Coordinates at rest, how the search ended, and its number of iterations."""
 
-    q: Float[Array, " dof"]
+    q: Float[Array, " coordinates"]
     status: Status
     num_iterations: Int[Array, ""]
 
 
+class Search(NamedTuple):
+    """What a Newton search needs to know beside its residual.
+
+    Attributes:
+        model: The rod or assembly.
+        metric: Measures increments, in energy.
+        floor: Energy of an increment that is nothing but rounding.
+        tolerance: Size of the last step relative to the strained shape.
+        max_iterations: Limit of the search.
+    """
+
+    model: Model
+    metric: Float[Array, "dof dof"]
+    floor: Float[Array, ""]
+    tolerance: Float[Array, ""]
+    max_iterations: int
+
+
+class Found(NamedTuple):
+    """Where a search ended."""
+
+    q: Float[Array, " coordinates"]
+    done: Bool[Array, ""]
+    count: Int[Array, ""]
+
+
 @door
 def equilibrium(
-    rod: Rod,
-    forces: tuple[AbstractForce, ...] = (),
-    q: Float[Array, " dof"] | None = None,
+    model: Model,
+    forces: tuple[Load, ...] = (),
+    q: Float[Array, " coordinates"] | None = None,
     *,
     t=0.0,
     tolerance=1e-10,
     max_iterations: int = 50,
 ) -> Equilibrium:
-    """Coordinates at which the forces vanish; differentiable in rod and forces.
+    """Coordinates at which the forces vanish; differentiable in model and forces.
 
-    Newton with a choice of four step lengths, by the elastic energy of the residual; the
-    derivative is that of the solution, not of the iterations.
+    Newton with the exact tangent and a line search on the residual, measured by the
+    elastic energy that it would store. The derivative is that of the solution, not of the
+    iterations. Where the search fails, `equilibrium_path` applies the load in steps.
 
     Args:
-        rod: The rod.
+        model: The rod or assembly.
         forces: Generalised forces.
-        q: First guess; unstrained if omitted.
+        q: First guess; at rest if omitted.
         t: Time at which the forces act [s].
         tolerance: Size of the last step relative to q, both in elastic energy norm.
         max_iterations: Limit of the search.
+
+    Raises:
+        ValueError: If `q` has the wrong shape.
     """
-    constants, t = operators(rod), real(t)
-    guess = jnp.zeros(rod.basis.num_dof, rod.length.dtype) if q is None else q
-    metric = jax.lax.stop_gradient(constants.stiffness)
+    constants, t = operators(model), real(t).astype(dtype_of(model))
+    guess = first_guess("equilibrium", model, q)
+    search = prepare(model, constants, tolerance, max_iterations)
 
     def residual(q: Array) -> Array:
-        return -total_force(forces, t, motion(rod, q, constants=constants))
+        return -total_force(forces, t, motion(model, q, constants=constants))
 
-    def search(residual, guess):
-        return _newton(residual, guess, metric, tolerance, max_iterations)
+    def find(_, guess):
+        found = newton(residual, guess, search)
+        # custom_root differentiates its auxiliary output, which must then be floating.
+        return found.q, (found.done.astype(guess.dtype), found.count.astype(guess.dtype))
 
     rest, (done, count) = jax.lax.custom_root(
-        residual, guess, search, _solve_tangent, has_aux=True
+        lambda q: squared(model, q, residual(q)), guess, find, _solve_tangent, has_aux=True
     )
-    status = Status.where(done > 0, Status.successful, Status.not_converged)
-    return Equilibrium(rest, status, count.astype(jnp.int32))
+    return Equilibrium(rest, ended(done, rest, residual(rest)), count.astype(jnp.int32))
 
 
-def _newton(residual, guess: Array, metric: Array, tolerance, max_iterations) -> Any:
+def first_guess(where: str, model: Model, q: Array | None) -> Float[Array, " coordinates"]:
+    """The guess of a search, or the model at rest."""
+    if q is None:
+        return at_rest(model)
+    do = "It is a guess of the coordinates; leave it out to start from rest."
+    _check.shape(where, "q", q, (num_coordinates(model),), do)
+    return real(q).astype(dtype_of(model))
+
+
+def prepare(model: Model, constants, tolerance, max_iterations: int) -> Search:
+    """A search for the equilibria of `model`; its metric takes no part in derivatives."""
+    measure = jax.lax.stop_gradient(metric(model, constants))
+    rounding = 4 * float(jnp.finfo(measure.dtype).eps)
+    floor = rounding**2 * jax.lax.stop_gradient(unit_energy(model, measure))
+    tolerance = jnp.maximum(real(tolerance).astype(measure.dtype), 16 * rounding)
+    return Search(model, measure, floor, tolerance, max_iterations)
+
+
+def newton(residual: Residual, guess: Array, search: Search) -> Found:
+    """A root of `residual`, by Newton with backtracking."""
+    factor = cho_factor(search.metric)
+
     def size(force):
-        return force @ jnp.linalg.solve(metric, force)
-
-    def searching(state):
-        _, done, count = state
-        return ~done & (count < max_iterations)
+        return force @ cho_solve(factor, force)
 
     def improve(state):
-        q, _, count = state
-        step = -jnp.linalg.solve(jax.jacfwd(residual)(q), residual(q))
-        lengths = jnp.asarray(_STEP_LENGTHS, q.dtype)
-        trials = q[None, :] + lengths[:, None] * step[None, :]
-        best = jnp.argmin(jax.vmap(lambda q: size(residual(q)))(trials))
-        new = trials[best]
-        done = step @ metric @ step <= tolerance**2 * (new @ metric @ new)
-        return new, done, count + 1
+        q, _, _, count = state
+        force, slope = linearised(residual, search.model, q)
+        step = -jnp.linalg.solve(slope, force)
+        shape = increments(search.model, q)
+        strained = shape @ search.metric @ shape
+        small = step @ search.metric @ step <= search.tolerance**2 * strained + search.floor
+        start = size(force)
 
-    begin = (guess, jnp.array(False), jnp.array(0, dtype=jnp.int32))
-    q, done, count = jax.lax.while_loop(searching, improve, begin)
-    done = done & jnp.all(jnp.isfinite(q))
-    # custom_root differentiates its auxiliary output, which must then be floating.
-    return q, (done.astype(q.dtype), count.astype(q.dtype))
+        def too_long(trial):
+            length, value = trial
+            enough = value <= (1 - 2 * _DECREASE * length) * start
+            return ~enough & (length > _SHORTEST)
+
+        def at(length):
+            return length, size(residual(moved(search.model, q, length * step)))
+
+        one = jnp.ones((), q.dtype)
+        # A step of rounding cannot be told from noise: it is taken as it is.
+        first = jax.lax.cond(small, lambda: (one, 0 * start), lambda: at(one))
+        length, value = jax.lax.while_loop(too_long, lambda trial: at(trial[0] / 2), first)
+        good = value <= start
+        new = jnp.where(good, moved(search.model, q, length * step), q)
+        return new, small & good, ~good, count + 1
+
+    def searching(state):
+        _, done, stuck, count = state
+        return ~done & ~stuck & (count < search.max_iterations)
+
+    no = jnp.array(False)
+    begin = (guess, no, no, jnp.array(0, dtype=jnp.int32))
+    q, done, _, count = jax.lax.while_loop(searching, improve, begin)
+    return Found(q, done & jnp.all(jnp.isfinite(q)), count)
+
+
+def ended(done: Array, *values: Array) -> Status:
+    """The status of a search, given what must be finite."""
+    finite = jnp.array(True)
+    for value in values:
+        finite = finite & jnp.all(jnp.isfinite(value))
+    failed = Status.where(finite, Status.not_converged, Status.not_finite)
+    return Status.where(finite & (done > 0), Status.successful, failed)
 
 
 def _solve_tangent(linear, right: Array) -> Array:
