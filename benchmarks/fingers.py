@@ -32,10 +32,10 @@ def finger(nodes: int) -> Rod:
     )  # fmt: skip
 
 
-def accelerate(rod: Rod, constants: Operators, q, v, unroll: bool = True):
-    """Acceleration under the weight; `unroll` for loops that only run forwards."""
+def accelerate(rod: Rod, constants: Operators, q, v):
+    """Acceleration under the weight."""
     zero = jnp.zeros((), q.dtype)
-    return acceleration(rod, constants, zero, q, v, (Gravity(),), unroll=unroll)
+    return acceleration(rod, constants, zero, q, v, (Gravity(),))
 
 
 def tip(rod: Rod, constants: Operators, q):

@@ -21,6 +21,30 @@ def measure(function: Callable[..., Any], *args: Any, repeats: int = 9) -> Timin
     return Timing(compile_s, _runs(lambda: jax.block_until_ready(compiled(*args)), repeats))
 
 
+def measure_together(
+    functions: dict[str, Callable[..., Any]], *args: Any, repeats: int = 9
+) -> dict[str, Timing]:
+    """As `measure`, of several functions of the same arguments whose ratios matter.
+
+    They run in turn, there and back, so that all meet the same machine.
+    """
+    import jax
+
+    compiled, compile_s, runs = {}, {}, {name: [] for name in functions}
+    for name, function in functions.items():
+        start = time.perf_counter()
+        compiled[name] = jax.jit(function).lower(*args).compile()
+        compile_s[name] = time.perf_counter() - start
+        jax.block_until_ready(compiled[name](*args))
+    order = list(functions)
+    for _ in range(repeats):
+        for name in order:
+            call = compiled[name]
+            runs[name].extend(_runs(lambda call=call: jax.block_until_ready(call(*args)), 1))
+        order.reverse()
+    return {name: Timing(compile_s[name], tuple(runs[name])) for name in functions}
+
+
 def measure_calls(function: Callable[[], Any], repeats: int = 5) -> Timing:
     """Time a function that compiles what it needs at its first call.
 

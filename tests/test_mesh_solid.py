@@ -85,7 +85,7 @@ def test_chambers_are_found_and_follow_the_shape():
     assert np.isclose(M.chambers(M.triangulate(pneunet(), size=2)).volumes["chamber_0"], 693)
 
     def shape(radius):
-        holes = sdf.repeat(sdf.Circle(jnp.array([0.5, 0.5]), radius), [1, 0], 2)
+        holes = sdf.repeat(sdf.Circle(jnp.array([0.5, 0.5]), radius), [1, 0], 2, separate=True)
         return sdf.Rectangle([0, 0], [2, 1]) - holes
 
     mesh, volumes = M.chambers(M.triangulate(shape(0.25), size=0.12, order=2))

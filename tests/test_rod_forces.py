@@ -20,24 +20,37 @@ ROUTES = (
 
 
 def size(value):
-    return float(jnp.abs(value).max())
+    return float(np.abs(value).max())
+
+
+motion_of = eqx.filter_jit(R.motion)
+
+
+@eqx.filter_jit
+def forces(motion, *every, t=T0):
+    """Each of the forces at one moment, in one program."""
+    return tuple(force(t, motion) for force in every)
 
 
 @pytest.fixture(scope="module")
 def general():
-    """A rod with every kind of strain, its motion, and the same as a function of q."""
+    """A rod with every kind of strain, and its motion."""
     basis = R.chebyshev(kappa_x=2, kappa_y=2, kappa_z=2, sigma_x=1, sigma_y=1)
     rest = [3.0, -5.0, 4.0, 1.05, 0.1, -0.05]
     rod = R.rod(SE3(), basis, R.circle(6e-3), rest_strain=rest, nodes=14, **FINGER)
     rng = np.random.default_rng(0)
     q = jnp.array(rng.normal(size=8) * np.array([5.0] * 6 + [0.05] * 2))
     v = jnp.array(rng.normal(size=8))
-    return rod, q, v, eqx.filter_jit(R.motion)(rod, q, v)
+    return rod, q, v, motion_of(rod, q, v)
 
 
 @pytest.fixture(scope="module")
 def arc():
     return R.rod(SE2(), R.constant("kappa_z"), R.circle(6e-3), nodes=8, **FINGER)
+
+
+def bent(rod, curvature):
+    return motion_of(rod, jnp.full(1, curvature))
 
 
 def bending(rod):
@@ -50,18 +63,27 @@ def bending(rod):
 def test_points_agree_with_the_kinematics_of_the_rod(general):
     rod, q, v, motion = general
     s = np.linspace(0, 1, 4)
-    at = R.points(motion, s)
-    poses, jacobian = R.forward_kinematics(rod, q, s), R.jacobian(rod, q, s)
-    assert size(at.position - poses[:, :3, 3]) < 1e-15
-    assert size(at.directors - poses[:, :3, :3]) < 1e-14
-    assert size(at.linear_jacobian - jacobian[:, 3:]) < 1e-15
-    assert size(at.velocity - jacobian[:, 3:] @ v) < 1e-15
-    assert size(at.spin - jacobian[:, :3] @ v) < 1e-14
-    rng = np.random.default_rng(1)
-    force, moment = (jnp.array(rng.normal(size=(4, 3))) for _ in range(2))
-    loads = jnp.concatenate([moment, force], axis=1)
-    expected = jnp.einsum("pi,pin->n", loads, jacobian)
-    assert size(at.generalised(force, moment) - expected) < 1e-13
+    force, moment = np.random.default_rng(1).normal(size=(2, 4, 3))
+
+    @jax.jit
+    def found(motion):
+        at = R.points(motion, s)
+        fields = at.position, at.directors, at.linear_jacobian, at.velocity, at.spin
+        return *fields, at.generalised(force, moment)
+
+    @jax.jit
+    def known(rod, q):
+        return R.forward_kinematics(rod, q, s), R.jacobian(rod, q, s)
+
+    poses, jacobian = map(np.asarray, known(rod, q))
+    position, directors, linear, velocity, spin, total = found(motion)
+    assert size(position - poses[:, :3, 3]) < 1e-15
+    assert size(directors - poses[:, :3, :3]) < 1e-14
+    assert size(linear - jacobian[:, 3:]) < 1e-15
+    assert size(velocity - jacobian[:, 3:] @ np.asarray(v)) < 1e-15
+    assert size(spin - jacobian[:, :3] @ np.asarray(v)) < 1e-14
+    loads = np.concatenate([moment, force], axis=1)
+    assert size(total - np.einsum("pi,pin->n", loads, jacobian)) < 1e-13
 
 
 # Threads
@@ -69,53 +91,63 @@ def test_points_agree_with_the_kinematics_of_the_rod(general):
 
 def test_a_length_is_that_of_the_curve_in_space(general):
     rod, q, _, motion = general
-    for route, length in zip(ROUTES, R.thread_lengths(rod, ROUTES, q), strict=True):
-        s = np.linspace(route.start, route.stop, 4001)
-        at, place = R.points(motion, s), jax.vmap(route.offset)(jnp.asarray(s))
-        curve = at.position + jnp.einsum("pij,pj->pi", at.directors[:, :, 1:], place)
-        chords = jnp.sum(jnp.linalg.norm(jnp.diff(curve, axis=0), axis=1))
-        assert abs(float(length - chords)) < 1e-6 * float(length)
+    s = np.linspace([r.start for r in ROUTES], [r.stop for r in ROUTES], 4001)
+
+    @jax.jit
+    def curves(motion):
+        at, pairs = R.points(motion, s.ravel()), zip(ROUTES, s.T, strict=True)
+        place = [jax.vmap(r.offset)(jnp.asarray(own)) for r, own in pairs]
+        return at.position, at.directors, jnp.stack(place, axis=1).reshape(-1, 2)
+
+    position, directors, place = map(np.asarray, curves(motion))
+    curve = position + np.einsum("pij,pj->pi", directors[:, :, 1:], place)
+    steps = np.diff(curve.reshape(4001, -1, 3), axis=0)
+    chords = np.sum(np.linalg.norm(steps, axis=2), axis=0)
+    assert np.allclose(R.thread_lengths(rod, ROUTES, q), chords, rtol=1e-6, atol=0)
 
 
 def test_forces_of_threads_are_slopes_of_lengths_and_volumes(general):
     rod, q, v, motion = general
-    slope = eqx.filter_jit(jax.jacfwd(lambda q: R.thread_lengths(rod, ROUTES, q)))(q)
-    tension = jnp.array([1.0, 2.0, 3.0, 4.0])
-    force = R.Tendons(ROUTES, tension)(T0, motion)
-    assert size(force + slope.T @ tension) < 1e-10 * size(force)
+    lengths = eqx.filter_jit(jax.jacfwd(lambda q: R.thread_lengths(rod, ROUTES, q)))
+    slope, v = np.asarray(lengths(q)), np.asarray(v)
+    tension = np.array([1.0, 2.0, 3.0, 4.0])
     assert size(R.thread_rates(rod, ROUTES, q, v) - slope @ v) < 1e-15
     chambers = R.thread_chambers(rod, ROUTES, 1e-6 * tension)
-    pushed = R.Pressurised(chambers, jnp.full(4, 1e5))(T0, motion)
     assert chambers.ports == (4,)
+    force, pushed, timed = forces(
+        motion,
+        R.Tendons(ROUTES, tension),
+        R.Pressurised(chambers, np.full(4, 1e5)),
+        R.Tendons(ROUTES, lambda t: t * tension),
+        t=jnp.array(2.0),
+    )
+    assert size(force + slope.T @ tension) < 1e-10 * size(force)
     assert size(pushed - 0.1 * slope.T @ tension) < 1e-10 * size(pushed)
-    timed = R.Tendons(ROUTES, lambda t: t * tension)(jnp.array(2.0), motion)
     assert size(timed - 2 * force) < 1e-15
 
 
 def test_a_straight_tendon_bends_to_constant_curvature(arc):
-    rest = R.equilibrium(arc, (R.Tendons(R.Straight([3e-3, 0.0]), 2.0),))
-    assert jnp.allclose(rest.q, 2 * 3e-3 / bending(arc), rtol=1e-12, atol=0)
-
-
-def test_friction_takes_tension_as_on_a_capstan(arc):
-    curvature, mu = 20.0, 0.3
-    motion = R.motion(arc, jnp.array([curvature]))
-    force = R.Tendons(R.Straight([3e-3, 0.0]), 2.0, mu)(T0, motion)
-    turn = mu * curvature * 0.08
-    expected = 2 * 3e-3 * 0.08 * (1 - np.exp(-turn)) / turn
-    assert jnp.allclose(force, expected, rtol=1e-10, atol=0)
-    slope = jax.grad(lambda q: R.Tendons(ROUTES[:1], 2.0, mu)(T0, R.motion(arc, q)).sum())(
-        jnp.zeros(1)
-    )
-    assert jnp.all(jnp.isfinite(slope))
-
-
-def test_routing_is_differentiable(arc):
     def turn(depth):
         route = R.Straight(jnp.stack([depth, 0 * depth]))
         return R.equilibrium(arc, (R.Tendons(route, 2.0),)).q[0]
 
-    assert jnp.isclose(jax.grad(turn)(jnp.array(3e-3)), 2.0 / bending(arc), rtol=1e-9)
+    curvature, slope = jax.jit(jax.value_and_grad(turn))(3e-3)
+    assert np.isclose(curvature, 2 * 3e-3 / bending(arc), rtol=1e-12, atol=0)
+    assert np.isclose(slope, 2.0 / bending(arc), rtol=1e-9, atol=0)
+
+
+def test_friction_takes_tension_as_on_a_capstan(arc):
+    curvature, mu = 20.0, 0.3
+
+    @jax.jit
+    @jax.value_and_grad
+    def pulled(q):
+        return R.Tendons(R.Straight([3e-3, 0.0]), 2.0, mu)(T0, R.motion(arc, q[None]))[0]
+
+    turn = mu * curvature * 0.08
+    expected = 2 * 3e-3 * 0.08 * (1 - np.exp(-turn)) / turn
+    assert np.isclose(pulled(curvature)[0], expected, rtol=1e-10, atol=0)
+    assert np.isfinite(pulled(0.0)[1])
 
 
 # Wrenches, fluids, laws, maps
@@ -123,65 +155,78 @@ def test_routing_is_differentiable(arc):
 
 def test_wrenches_dead_and_follower(general):
     rod, q, v, motion = general
-    wrench = jnp.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
-    assert size(R.PointWrench(wrench)(T0, motion) - R.TipWrench(wrench)(T0, motion)) < 1e-13
-    pose = R.forward_kinematics(rod, q, [0.3])[0, :3, :3]
-    turned = jnp.concatenate([pose @ wrench[:3], pose @ wrench[3:]])
-    follower = R.PointWrench(wrench, 0.3, follower=True)(T0, motion)
-    assert size(follower - R.PointWrench(turned, 0.3)(T0, motion)) < 1e-13
-    weight = motion.operators.mass.sum() / rod.length * -9.81
-    line = R.LineWrench(jnp.zeros(6).at[5].set(weight))(T0, motion)
-    assert size(line - R.Gravity()(T0, motion)) < 1e-15
-    same = R.LineWrench(lambda s: jnp.zeros(6).at[5].set(weight) + 0 * s)(T0, motion)
+    wrench = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    pose = np.asarray(R.forward_kinematics(rod, q, [0.3]))[0, :3, :3]
+    turned = np.concatenate([pose @ wrench[:3], pose @ wrench[3:]])
+    weight = np.zeros(6)
+    weight[5] = np.sum(motion.operators.mass) / 0.08 * -9.81
+    at_tip, tip, follower, dead, line, same, gravity = forces(
+        motion,
+        R.PointWrench(wrench),
+        R.TipWrench(wrench),
+        R.PointWrench(wrench, 0.3, follower=True),
+        R.PointWrench(turned, 0.3),
+        R.LineWrench(weight),
+        R.LineWrench(lambda s: weight + 0 * s),
+        R.Gravity(),
+    )
+    assert size(at_tip - tip) < 1e-13
+    assert size(follower - dead) < 1e-13
+    assert size(line - gravity) < 1e-15
     assert size(line - same) < 1e-16
 
 
 def test_a_fluid_carries_and_brakes(general):
     rod, q, v, motion = general
-    floating = R.Buoyancy(1000.0)(T0, motion)
-    assert size(floating + R.Gravity()(T0, motion) / 2) < 1e-16
     drag = R.Drag(1000.0, 12e-3, viscous=0.1)
-    assert float(drag(T0, motion) @ v) < 0
-    carried = R.Drag(1000.0, 12e-3, flow=[0.0, 0.0, 0.0])(T0, R.motion(rod, q))
+    still = R.Drag(1000.0, 12e-3, flow=[0.0, 0.0, 0.0])
+    floating, gravity, braked = forces(motion, R.Buoyancy(1000.0), R.Gravity(), drag)
+    assert size(floating + gravity / 2) < 1e-16
+    assert float(braked @ v) < 0
+
+    # Only the velocity of a motion depends on its rates.
+    def at(v):
+        return eqx.tree_at(lambda m: m.v, motion, v)
+
+    rest = jax.jit(lambda v: (still(T0, at(v)), jax.jacfwd(lambda v: drag(T0, at(v)))(v)))
+    carried, slope = map(np.asarray, rest(0 * v))
     assert size(carried) == 0
-    slope = jax.jacfwd(lambda v: drag(T0, R.motion(rod, q, v)))(0 * v)
-    assert jnp.all(jnp.linalg.eigvalsh((slope + slope.T) / 2) < 1e-15)
+    assert np.all(np.linalg.eigvalsh((slope + slope.T) / 2) < 1e-15)
 
 
 def test_drag_of_a_cylinder_in_a_cross_flow(arc):
-    motion, flow = R.motion(arc, jnp.zeros(1)), 0.7
-    force = R.Drag(1000.0, 12e-3, flow=[0.0, flow])(T0, motion)
+    flow = 0.7
+    (force,) = forces(bent(arc, 0.0), R.Drag(1000.0, 12e-3, flow=[0.0, flow]))
     # Uniform load p on a clamped straight rod: p L^3 / 6 about constant curvature.
     load = 1000.0 * 12e-3 * 1.1 * flow**2 / 2
-    assert jnp.allclose(force, load * 0.08**3 / 6, rtol=1e-12, atol=0)
+    assert np.allclose(force, load * 0.08**3 / 6, rtol=1e-12, atol=0)
 
 
 def test_a_section_law_replaces_the_linear_one(general):
     rod, q, _, motion = general
-    stiffness = R.stiffness_matrix(rod)
-    names = ("kappa_x", "kappa_y", "kappa_z", "sigma_x", "sigma_y", "sigma_z")
+    expected = np.asarray(R.elastic_force(rod, q))
     young, shear = 1e6, 1e6 / 2.6
     s = rod.section
     moments = [shear * s.torsion_constant, young * s.second_moment_y, young * s.second_moment_z]
-    forces = [young * s.area, *[shear * s.shear_factor * s.area] * 2]
-    scale = jnp.stack([*moments, *forces])
-    assert len(names) == scale.shape[0]
+    tensions = [young * s.area, *[shear * s.shear_factor * s.area] * 2]
+    scale = np.array([*moments, *tensions], float)
+    assert scale.shape == (6,)
     linear = R.section_law(rod, lambda strain, s: scale * strain)
-    assert size(linear(T0, motion) + stiffness @ q) < 1e-13 * size(stiffness @ q)
     hard = R.section_law(rod, R.EnergyLaw(lambda e, s: (1 + s) * jnp.sum(scale * e**2) / 2))
-    assert size(hard(T0, motion)) > 1.2 * size(linear(T0, motion))
-    tangent = R.loads.tangent_stiffness((hard,), motion)
+    soft, strong = forces(motion, linear, hard)
+    assert size(soft + expected) < 1e-13 * size(expected)
+    assert size(strong) > 1.2 * size(soft)
+    tangent = np.asarray(eqx.filter_jit(R.loads.tangent_stiffness)((hard,), motion))
     assert size(tangent - tangent.T) < 1e-12 * size(tangent)
 
 
 def test_an_input_map_acts(arc):
-    motion = R.motion(arc, jnp.array([2.0]))
     force = R.Actuation(lambda q: jnp.outer(q, jnp.array([1.0, 3.0])), [0.5, 1.0])
-    assert jnp.allclose(force(T0, motion), 7.0)
+    assert np.allclose(forces(bent(arc, 2.0), force)[0], 7.0)
 
 
 def test_messages_name_the_remedy(arc):
-    motion = R.motion(arc, jnp.zeros(1))
+    motion = bent(arc, 0.0)
     with pytest.raises(ValueError, match="0 <= start < stop <= 1"):
         R.Straight([1e-3, 0.0], start=0.5, stop=0.2)
     with pytest.raises(ValueError, match="one tension per routing"):

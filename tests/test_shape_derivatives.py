@@ -27,13 +27,16 @@ def test_every_number_of_a_shape_moves_its_measure(name):
     numbers, rest = eqx.partition(make(), eqx.is_inexact_array)
     flat, unravel = ravel_pytree(numbers)
 
+    build = eqx.filter_jit(lambda p: eqx.combine(unravel(p), rest))
+
     def at(p):
-        return measure(eqx.combine(unravel(p), rest))
+        return measure(build(p))
 
     lower, upper = (np.asarray(corner) for corner in make().bounding_box())
-    size, value, slope = (upper - lower).max(), float(at(flat)), np.asarray(jax.grad(at)(flat))
+    value, slope = (np.asarray(a) for a in jax.value_and_grad(at)(flat))
+    size, flat = (upper - lower).max(), np.asarray(flat)
     step = 3e-9 * size  # short: nodes where two walls are as near have kinks
     for k, found in enumerate(slope):
-        ends = [float(at(flat.at[k].add(e * step))) for e in (-2, -1, 1, 2)]
-        difference = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step)
+        way = np.eye(len(flat))[k] * step
+        difference = (float(at(flat + way)) - float(at(flat - way))) / (2 * step)
         assert abs(found - difference) < 1e-6 * max(abs(difference), abs(value) / size), k

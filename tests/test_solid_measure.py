@@ -1,7 +1,9 @@
 """Derivatives of areas, volumes, centroids and inertia against differences of the same door."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from sorojax import sdf
@@ -14,7 +16,7 @@ def box(p):
 
 
 def notched(p):
-    """A bar with two notches, narrower than a cell at 16 cells along it."""
+    """A bar with two notches, narrower than a cell at 8 cells along it."""
     x = jnp.array([0.3, 0.7])
     low = jnp.stack([x - p[0] / 2, jnp.full(2, p[1]), jnp.full(2, -0.1)], axis=1)
     high = jnp.stack([x + p[0] / 2, jnp.full(2, 0.5), jnp.full(2, 0.5)], axis=1)
@@ -55,7 +57,7 @@ def inertia(shape):
 
 CASES = {
     "box": (box, (0.7, 0.4), volume),
-    "notches": (notched, (0.02, 0.13), inertia),
+    "notches": (notched, (0.02, 0.13), lambda shape: sdf.inertia_tensor(shape, 1.0, 8)),
     "lens": (lens, (0.5, 0.6), volume),
     "ball": (ball, (0.4, 0.03), inertia),
     "plate": (plate, (0.2, 2e-4), sdf.area),
@@ -67,13 +69,14 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_derivatives_are_those_of_the_number_itself(name):
     make, parameters, door = CASES[name]
+    make = eqx.filter_jit(make)
     p, way = jnp.array(parameters), jnp.array([1.0, -0.7]) * jnp.array(parameters)
-    value, slope = jax.jvp(lambda q: door(make(q)), (p,), (way,))
+    value, slope = (np.asarray(a) for a in jax.jvp(lambda q: door(make(q)), (p,), (way,)))
     step = 1e-7  # differences of fields with edges have small kinks themselves
-    ends = [door(make(p + e * step * way)) for e in (-2, -1, 1, 2)]
-    difference = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step)
-    scale = jnp.maximum(jnp.abs(difference), 0.1 * jnp.abs(value).max())
-    assert jnp.all(jnp.abs(slope - difference) < 1e-6 * scale), (slope, difference)
+    ends = [np.asarray(door(make(p + e * step * way))) for e in (-1, 1)]
+    difference = (ends[1] - ends[0]) / (2 * step)
+    scale = np.maximum(np.abs(difference), 0.1 * np.abs(value).max())
+    assert np.all(np.abs(slope - difference) < 1e-6 * scale), (slope, difference)
 
 
 def test_narrow_slits_are_counted():

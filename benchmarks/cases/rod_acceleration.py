@@ -16,7 +16,7 @@ REFERENCE = "the same at 32 nodes, largest relative difference"
 def at(rod, q, v):
     """Accelerations of all states [1/(m s^2)]."""
     constants = operators(rod)
-    every = jax.vmap(lambda q, v: accelerate(rod, constants, q, v, unroll=False))
+    every = jax.vmap(lambda q, v: accelerate(rod, constants, q, v))
     return np.asarray(jax.jit(every)(q, v))
 
 

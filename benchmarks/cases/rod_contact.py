@@ -1,18 +1,31 @@
-"""Cost of contact: a step of the soft finger D1 with no, a far, a near and a met obstacle."""
+"""Cost of contact: a step of the soft finger D1 with no, a far and a met obstacle, and with
+contact with itself. Depth of contact: a rod that coils up until it lies on itself."""
 
 import jax
 import jax.numpy as jnp
 
 from benchmarks.fingers import finger
-from benchmarks.harness import Row, measure
+from benchmarks.harness import Row, measure_together
 from sorojax import sdf
 from sorojax.contact import LinePenalty
 from sorojax.math.contact_stepper import ContactMidpoint
+from sorojax.math.lie import SE2
 from sorojax.math.steppers import start
-from sorojax.rod import Gravity, ObstacleContact, SelfContact
+from sorojax.rod import (
+    Damping,
+    Gravity,
+    ObstacleContact,
+    SelfContact,
+    chebyshev,
+    circle,
+    motion,
+    penetration,
+    rod as make_rod,
+    rollout,
+)
 from sorojax.rod.rollout import second_order
 
-STEPS, STEP, BATCH = 500, 1e-3, 64
+STEPS, STEP, BATCH, BATCH_STEPS = 250, 1e-3, 64, 25
 BAR = 0.05  # what a far obstacle may add, unbatched
 LAW = LinePenalty(stiffness=5e7, smoothing=6e-6, friction=0.5)
 
@@ -27,17 +40,32 @@ def forces(obstacle):
     return (Gravity(), ObstacleContact(floor, 6e-3, LAW))
 
 
-def loop(rod, loads):
+def loop(rod, loads, steps=STEPS):
     """Many steps from rest; returns the end."""
     stepper = ContactMidpoint()
 
     def run(q, v):
-        problem = second_order(rod, q, loads, unroll=False)
+        problem = second_order(rod, q, loads)
         t, h = jnp.zeros(()), jnp.asarray(STEP)
         begin = start(problem, t, q, v)
-        return jax.lax.fori_loop(0, STEPS, lambda _, s: stepper.step(problem, t, h, s), begin)
+        return jax.lax.fori_loop(0, steps, lambda _, s: stepper.step(problem, t, h, s), begin)
 
     return run
+
+
+def coiling(stiffness):
+    """Penetration over the radius for 1 s after a rod that rests in 1.08 turns is let
+    go from 0.8 turns: the tip swings onto the base and comes to rest there."""
+    radius = 3e-3
+    rod = make_rod(
+        SE2(), chebyshev(kappa_z=3), circle(radius), length=0.2, young_modulus=1e6,
+        poisson_ratio=0.3, density=2000.0, nodes=20, rest_strain=[34.0, 1.0, 0.0],
+    )  # fmt: skip
+    contact = SelfContact(radius, LinePenalty(stiffness, smoothing=6e-6), points=96)
+    q = jnp.array([-9.0, 4.0, 0.5])
+    path = rollout(rod, q, 0 * q, (Damping(1e-6), contact), step=1e-3, saves=1000)
+    depth = jax.vmap(lambda q: penetration(contact, motion(rod, q)))(path.q)
+    return depth / radius
 
 
 def rows():
@@ -45,23 +73,23 @@ def rows():
     q = jnp.zeros(rod.basis.num_dof)
     cases = (("none", None), ("far", -0.2), ("itself", "itself"), ("met", -0.015))
     programs = {name: loop(rod, forces(obstacle)) for name, obstacle in cases}
-    timings = {
-        name: measure(run, q, q, repeats=25).per(STEPS) for name, run in programs.items()
-    }
-    yield from compared(timings, {})
+    yield from compared(measure_together(programs, q, q, repeats=16), STEPS, {})
     many = jnp.zeros((BATCH, q.shape[0]))
-    timings = {
-        name: measure(jax.vmap(programs[name]), many, many, repeats=5).per(STEPS * BATCH)
-        for name in ("none", "far")
+    programs = {
+        name: jax.vmap(loop(rod, forces(obstacle), BATCH_STEPS)) for name, obstacle in cases[:2]
     }
-    yield from compared(timings, {"batch": BATCH})
+    timings = measure_together(programs, many, many, repeats=6)
+    yield from compared(timings, BATCH_STEPS * BATCH, {"batch": BATCH})
+    depth = float(jnp.max(jax.jit(coiling)(LAW.stiffness)))
+    settings = {"scene": "coil", "stiffness": float(LAW.stiffness)}
+    yield Row("sorojax", settings, error=depth, reference="radius", bar=0.01, bar_on="error")
 
 
-def compared(timings, settings):
-    """Rows with what each adds to the best time without an obstacle."""
+def compared(timings, steps, settings):
+    """Rows with what each adds to the best time without an obstacle, per step."""
     plain = min(timings["none"].runs)
     for name, timing in timings.items():
-        extra = min(timing.runs) / plain - 1
+        extra, timing = min(timing.runs) / plain - 1, timing.per(steps)
         is_barred = name == "far" and not settings
         yield Row(
             "sorojax", {"obstacle": name} | settings, **timing.columns(), error=extra,

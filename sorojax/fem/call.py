@@ -4,7 +4,9 @@ import copy
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array
 
 from sorojax.fem.follow import Log, Stats
 from sorojax.fem.newton import Newton
@@ -23,6 +25,11 @@ class _Record:
         self.logs, self.batched = logs, batched
 
 
+def _strong(x: Array) -> Array:
+    """`jnp.asarray(3.0)` is of a weak type, for which every kernel would compile again."""
+    return jnp.asarray(x, x.dtype) if getattr(x, "weak_type", False) else x
+
+
 class Solve:
     """A problem and where to start from; compared by identity, so it may be a parameter."""
 
@@ -36,7 +43,8 @@ class Solve:
         want_tangent: bool = False,
     ):
         arrays, self._static = eqx.partition((problem, begin), eqx.is_array)
-        self.leaves, self._tree = jax.tree.flatten(arrays)
+        leaves, self._tree = jax.tree.flatten(arrays)
+        self.leaves = [_strong(leaf) for leaf in leaves]
         self.num_problem_leaves = len(jax.tree.leaves(eqx.filter(problem, eqx.is_array)))
         self.settings = (newton, steps, max_cuts)
         self.shape = problem.mesh.points.shape

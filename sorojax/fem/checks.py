@@ -2,9 +2,11 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import is_traced
@@ -218,12 +220,17 @@ def held(problem: Any, known: np.ndarray) -> None:
 def _spring_stiffness(problem: Any, springs: list, modes: np.ndarray) -> np.ndarray:
     """Second derivatives of the potential of springs in the rigid modes, of unit size."""
 
+    stiffness = np.asarray(_curvature(problem, springs, jnp.asarray(modes)))
+    return stiffness / max(np.abs(stiffness).max(), np.finfo(float).tiny)
+
+
+@eqx.filter_jit
+def _curvature(problem: Any, springs: list, modes) -> Float[Array, "modes modes"]:
     def energy(amounts):
-        u = jnp.einsum("m,mni->ni", amounts, jnp.asarray(modes))
+        u = jnp.einsum("m,mni->ni", amounts, modes)
         return sum(load.potential(problem, u) for load in springs)
 
-    stiffness = np.asarray(jax.hessian(energy)(jnp.zeros(len(modes))))
-    return stiffness / max(np.abs(stiffness).max(), np.finfo(float).tiny)
+    return jax.hessian(energy)(jnp.zeros(len(modes)))
 
 
 def rigid_modes(points: np.ndarray, kinematics: AbstractKinematics) -> np.ndarray:

@@ -126,7 +126,11 @@ def contact_state(problem, u: Float[Array, "nodes dim"], name: str = "contact") 
     if not loads or not isinstance(loads[0], Contact):
         names = [load.name for load in problem.loads if isinstance(load, Contact)]
         raise ValueError(f"fem.contact_state: got name {name!r}, need one of {names}.")
-    load = loads[0]
+    return _state(loads[0], problem, u)
+
+
+@eqx.filter_jit
+def _state(load: Contact, problem, u: Float[Array, "nodes dim"]) -> Contacts:
     values = jnp.asarray(facet_tables(problem.mesh.element).values)
     points = jnp.einsum("qa,fai->fqi", values, (problem.mesh.points + u)[load.facets])
     areas = areas_of(problem, load.facets).ravel()

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from sorojax.fem.energy import Body, energy_density
 from sorojax.fem.points import Points, deformation, pressure_modes, quadrature_points
-from sorojax.fem.problem import Problem
+from sorojax.fem.problem import Problem, unsupported
 
 
 def load_potential(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
@@ -30,16 +30,25 @@ def body_at(problem: Problem, points: Points) -> Body:
 
 def potential_energy(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
     """Stored energy plus the potential of all loads [J]."""
+    return _potential_energy(unsupported(problem), u)
+
+
+@jax.jit
+def _potential_energy(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
     points = quadrature_points(problem.mesh, problem.kinematics)
     F = deformation(problem.mesh, problem.kinematics, points, u)
     density = energy_density(body_at(problem, points), F)
     return jnp.sum(points.volumes * density) + load_potential(problem, u)
 
 
-@jax.jit
 def residual(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, "nodes dim"]:
     """Unbalanced force at every node [N]: zero at equilibrium, reactions at supports."""
-    return jax.grad(potential_energy, argnums=1)(problem, u)
+    return _residual(unsupported(problem), u)
+
+
+@jax.jit
+def _residual(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, "nodes dim"]:
+    return jax.grad(_potential_energy, argnums=1)(problem, u)
 
 
 @jax.jit

@@ -12,7 +12,7 @@ from sorojax.fem import assemble as asm
 from sorojax.fem.curved import CurvedPart, group_matrices
 from sorojax.fem.energy_form import load_force
 from sorojax.fem.geometry import Geometry, geometry
-from sorojax.fem.problem import Problem
+from sorojax.fem.problem import Problem, unsupported
 from sorojax.fem.supports import known_dofs
 from sorojax.math import sparse
 
@@ -46,20 +46,18 @@ def prepare(problem: Problem) -> Prepared:
     """Geometry and index maps of `problem` (slots of loads on the host, once per solve)."""
     dim = problem.mesh.element.dim
     known = known_dofs(problem.supports, problem.mesh.num_nodes, dim)
-    slots = []
-    for part in _curved_parts(problem):
-        groups = np.asarray(part.groups)
+    points, slots = np.asarray(problem.mesh.points), []
+    for groups in map(np.asarray, _curved_groups(unsupported(problem))):
         dofs = (groups[:, :, None] * dim + np.arange(dim)).reshape(len(groups), -1)
         slots.append(sparse.slots_of(problem.space.system, dofs))
     return Prepared(
         geometry(problem.space, problem.kinematics, problem.formulation, problem.mesh.points),
         jnp.asarray(known),
-        jnp.max(jnp.ptp(problem.mesh.points[problem.mesh.cells], axis=1)),
+        jnp.asarray(np.ptp(points[np.asarray(problem.mesh.cells)], axis=1).max()),
         tuple(slots),
     )
 
 
-@eqx.filter_jit
 def linearise(
     problem: Problem,
     prepared: Prepared,
@@ -67,6 +65,11 @@ def linearise(
     u_before: Float[Array, "nodes dim"],
 ) -> Linearised:
     """Residual and tangent at `u`; see `assemble` for the part of `u_before`."""
+    return _linearise(unsupported(problem), prepared, u, u_before)
+
+
+@eqx.filter_jit
+def _linearise(problem: Problem, prepared: Prepared, u, u_before) -> Linearised:
     body = asm.assemble(
         problem.space, prepared.geometry, problem.material, problem.kinematics, u, u_before
     )
@@ -92,6 +95,11 @@ def linearise(
 def _curved_parts(problem: Problem) -> list[CurvedPart]:
     parts = [load.curved_part(problem) for load in problem.loads]
     return [part for part in parts if part is not None]
+
+
+@eqx.filter_jit
+def _curved_groups(problem: Problem) -> list[Int[Array, "groups group_nodes"]]:
+    return [part.groups for part in _curved_parts(problem)]
 
 
 def _add_load_stiffness(problem, prepared, u, values):

@@ -1,5 +1,7 @@
 """The boundary value problem: a noun, and the constructor that checks it."""
 
+import dataclasses
+
 import equinox as eqx
 
 from sorojax import _check
@@ -50,6 +52,17 @@ def _described(load: AbstractLoad) -> str:
     if (groups := load.couples()) is not None:
         text += f", couples {groups.shape[0]} group(s) of {groups.shape[1]} nodes"
     return text
+
+
+def unsupported(problem: Problem) -> Problem:
+    """`problem` for kernels that no support enters, so that other supports do not compile
+    them again."""
+    return dataclasses.replace(problem, supports=())
+
+
+def body(problem: Problem) -> Problem:
+    """`problem` for kernels that neither supports nor loads enter."""
+    return dataclasses.replace(problem, supports=(), loads=())
 
 
 def problem(

@@ -7,6 +7,7 @@ estimates, part 1", IJNME 33, 1992.
 import itertools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -15,13 +16,19 @@ from sorojax._types import is_traced
 from sorojax.fem.energy import energy_density
 from sorojax.fem.energy_form import body_at
 from sorojax.fem.points import deformation, points_at, quadrature_points
-from sorojax.fem.problem import Problem
+from sorojax.fem.problem import Problem, body
 from sorojax.fem.stress import stress_at
 from sorojax.fem.tables import Tables
 from sorojax.mesh.elements import AbstractElement, Hex8, PolyN, Quad4, Quad8, Quad9
 from sorojax.mesh.mesh import Mesh, boundary_facets
-from sorojax.mesh.shape import quadrature, shape_functions, shape_gradients
+from sorojax.mesh.shape import (
+    nodes as reference_nodes,
+    quadrature,
+    shape_functions,
+    shape_gradients,
+)
 
+_BILINEAR = Quad4 | Hex8
 _SURE = 0.02  # smallest singular value of a fit over the largest
 
 
@@ -45,7 +52,9 @@ def patches(mesh: Mesh) -> Patches:
 
     A polynomial of the order of the element is fitted to the samples of the cells that
     share a node, of one more ring of cells where these are too few; so a field of that
-    order is recovered exactly, also on the boundary.
+    order is recovered exactly, also on the boundary. In Quad4 and Hex8 that holds for nodes
+    on the boundary, fitted to the centres of the cells; inside, the mean of the cells at the
+    node is better: its error is that of a central difference.
 
     Raises:
         ValueError: If the mesh is traced, has polygons, or too few cells for a fit.
@@ -61,8 +70,19 @@ def patches(mesh: Mesh) -> Patches:
     powers = _powers(mesh.element)
     inside = np.ones(mesh.num_nodes, bool)
     inside[np.unique(boundary_facets(mesh))] = False
-    found = [_fit(points[node], at, rings(node), powers, inside[node])
-             for node in range(mesh.num_nodes)]  # fmt: skip
+    corners = isinstance(mesh.element, _BILINEAR)
+    found = [
+        _mean(cells, next(rings(node)), node)
+        if corners and inside[node]
+        else _fit(points[node], at[:, :1] if corners else at, rings(node), powers, inside[node])
+        for node in range(mesh.num_nodes)
+    ]
+    if corners:  # the centre of a cell is the first of its samples
+        count = at.shape[1]
+        found = [
+            (ids if inside[node] else ids * count, share)
+            for node, (ids, share) in enumerate(found)
+        ]
     most = max(len(samples) for samples, _ in found)
     samples = np.zeros((mesh.num_nodes, most), np.int32)
     weights = np.zeros((mesh.num_nodes, most))
@@ -80,31 +100,50 @@ def nodal_stress(
     `patches(problem.mesh)` to compute them once for many states.
     """
     fit = patches(problem.mesh) if fit is None else fit
+    return _fitted(body(problem), u, fit)
+
+
+@jax.jit
+def _fitted(problem: Problem, u, fit: Patches) -> Float[Array, "nodes 3 3"]:
     points = points_at(problem.mesh, problem.kinematics, _sample_table(problem.mesh.element))
     return fit(stress_at(problem, u, points))
 
 
 def strain_energy(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, " cells"]:
     """Stored energy of every cell [J]."""
+    return _strain_energy(body(problem), u)
+
+
+@jax.jit
+def _strain_energy(problem: Problem, u) -> Float[Array, " cells"]:
     points = quadrature_points(problem.mesh, problem.kinematics)
     F = deformation(problem.mesh, problem.kinematics, points, u)
     return jnp.sum(points.volumes * energy_density(body_at(problem, points), F), axis=0)
 
 
 def sample_points(mesh: Mesh) -> Float[Array, "cells samples dim"]:
-    """Where the stresses of a cell are best [m]: its points of reduced integration."""
+    """Where the stresses of a cell are taken [m]: its points of reduced integration, and
+    in Quad4 and Hex8 its corners as well."""
     values = jnp.asarray(_sample_table(mesh.element).values[0])
     return jnp.einsum("qa,cai->cqi", values, mesh.points[mesh.cells])
 
 
 def _sample_table(element: AbstractElement) -> Tables:
-    if isinstance(element, Quad4 | Quad8 | Quad9 | Hex8):
-        line = np.array([0.0]) if element.order == 1 else np.array([-1.0, 1.0]) / np.sqrt(3)
-        at = np.array(list(itertools.product(line, repeat=element.dim)))
+    if isinstance(element, _BILINEAR):
+        at = np.concatenate([np.zeros((1, element.dim)), reference_nodes(element)])
+    elif isinstance(element, Quad8 | Quad9):
+        line = np.array([-1.0, 1.0]) / np.sqrt(3)
+        at = np.array(list(itertools.product(line, repeat=2)))
     else:
         at = quadrature(element, element.order).points
     tables = shape_functions(element, at), shape_gradients(element, at), np.ones(len(at))
     return Tables(*(table[None] for table in tables))
+
+
+def _mean(cells: np.ndarray, own: np.ndarray, node: int) -> tuple[np.ndarray, np.ndarray]:
+    """The samples of the cells `own` at their common node, with equal weights."""
+    corner = np.argmax(cells[own] == node, axis=1)
+    return own * (1 + cells.shape[1]) + 1 + corner, np.full(len(own), 1 / len(own))
 
 
 def _powers(element: AbstractElement) -> np.ndarray:

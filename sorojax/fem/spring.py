@@ -34,6 +34,7 @@ class Spring(AbstractLoad):
     def _to_nodes(self) -> bool:
         return jnp.issubdtype(self.ends.dtype, jnp.integer)
 
+    @eqx.filter_jit
     def _ends(self, X) -> tuple[Float[Array, "springs dim"], Float[Array, " springs"]]:
         """Reference position of the far ends, and how far away they are [m]."""
         ends = X[self.ends] if self._to_nodes else jnp.broadcast_to(

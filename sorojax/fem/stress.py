@@ -16,15 +16,21 @@ from sorojax.fem.points import (
     pressure_modes,
     quadrature_points,
 )
-from sorojax.fem.problem import Problem
+from sorojax.fem.problem import Problem, body
 from sorojax.fem.tensor import Entries, stack_matrix
 from sorojax.material.kinematics import Entry, Tensor, determinant
+from sorojax.mesh.mesh import Mesh
 
 
 def deformation_gradient(
     problem: Problem, u: Float[Array, "nodes dim"]
 ) -> Float[Array, "cells cell_nodes 3 3"]:
     """F in three dimensions at the nodes of every cell."""
+    return _deformation_gradient(body(problem), u)
+
+
+@jax.jit
+def _deformation_gradient(problem: Problem, u) -> Float[Array, "cells cell_nodes 3 3"]:
     points = node_points(problem.mesh, problem.kinematics)
     F = _full(problem, points, deformation(problem.mesh, problem.kinematics, points, u))
     return jnp.swapaxes(stack_matrix(F, points.volumes), 0, 1)
@@ -34,6 +40,11 @@ def cauchy_stress(
     problem: Problem, u: Float[Array, "nodes dim"]
 ) -> Float[Array, "cells cell_nodes 3 3"]:
     """sigma = P F' / J at the nodes of every cell [Pa], not averaged between cells."""
+    return _cauchy_stress(body(problem), u)
+
+
+@jax.jit
+def _cauchy_stress(problem: Problem, u) -> Float[Array, "cells cell_nodes 3 3"]:
     return stress_at(problem, u, node_points(problem.mesh, problem.kinematics))
 
 
@@ -97,7 +108,11 @@ def von_mises_stress(
     problem: Problem, u: Float[Array, "nodes dim"]
 ) -> Float[Array, "cells cell_nodes"]:
     """Von Mises stress at the nodes of every cell [Pa]; zero, with a zero slope, at rest."""
-    sigma = cauchy_stress(problem, u)
+    return _von_mises(cauchy_stress(problem, u))
+
+
+@jax.jit
+def _von_mises(sigma: Float[Array, "cells cell_nodes 3 3"]):
     mean = jnp.trace(sigma, axis1=-2, axis2=-1) / 3
     deviator = sigma - mean[..., None, None] * jnp.eye(3, dtype=sigma.dtype)[None, None]
     square = 1.5 * jnp.sum(deviator**2, axis=(-2, -1))
@@ -116,10 +131,14 @@ def nodal_average(
     problem: Problem, field: Float[Array, "cells cell_nodes"]
 ) -> Float[Array, " nodes"]:
     """Mean over the cells that share a node, for pictures."""
-    zero = jnp.zeros(problem.mesh.num_nodes, field.dtype)
-    total = zero.at[problem.mesh.cells].add(field)
-    count = zero.at[problem.mesh.cells].add(jnp.ones_like(field))
-    return total / count
+    return _nodal_average(problem.mesh, field)
+
+
+@jax.jit
+def _nodal_average(mesh: Mesh, field: Float[Array, "cells cell_nodes"]):
+    zero = jnp.zeros(mesh.num_nodes, field.dtype)
+    total = zero.at[mesh.cells].add(field)
+    return total / zero.at[mesh.cells].add(jnp.ones_like(field))
 
 
 def reaction_force(
@@ -135,4 +154,7 @@ def enclosed_volume(
     facets: Int[Array, "facets facet_nodes"],
 ) -> Float[Array, ""]:
     """Volume of the cavities that closed sets of `facets` enclose [m^3]."""
-    return cavity_volume(problem, u, facets)
+    return _enclosed_volume(body(problem), u, facets)
+
+
+_enclosed_volume = jax.jit(cavity_volume)

@@ -107,6 +107,7 @@ def known_dofs(supports: tuple[AbstractSupport, ...], num_nodes: int, dim: int) 
     return mask.ravel()
 
 
+@eqx.filter_jit
 def known_values(
     supports: tuple[AbstractSupport, ...], num_nodes: int, dim: int
 ) -> Float[Array, " dofs"]:

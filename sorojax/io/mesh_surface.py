@@ -44,8 +44,8 @@ def mesh_surface(
     Args:
         surface: Vertices [m] and triangles, as `import_surface` reads them.
         size: Wanted length of an edge [m].
-        mesher: "pytetwild" (Python package) or "gmsh" (program on the PATH, run as a
-            process of its own).
+        mesher: "pytetwild" (Python package, with its extra "all") or "gmsh" (program on the
+            PATH, run as a process of its own).
         timeout: Time after which gmsh is stopped [s].
 
     Raises:
@@ -82,7 +82,7 @@ def _by_pytetwild(surface: Surface, size: float, timeout: float) -> Mesh:
     except ImportError as reason:
         raise ModuleNotFoundError(
             f"mesh_surface: pytetwild cannot be imported ({reason}), need the package. Install "
-            "it with `pip install pytetwild`, or use mesher='gmsh'."
+            "it with `pip install 'pytetwild[all]'`, or use mesher='gmsh'."
         ) from reason
     extent = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
     points, cells = tetrahedralize(

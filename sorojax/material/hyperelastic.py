@@ -95,6 +95,7 @@ def small_strain_moduli(
     return jax.vmap(_moduli_at_rest, in_axes=(axes,))(material)
 
 
+@eqx.filter_jit
 def _moduli_at_rest(material):
     stretch = jnp.stack(
         [jnp.asarray(s, jnp.result_type(float)) for s in rest_stretches(material)]

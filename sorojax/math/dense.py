@@ -1,40 +1,56 @@
 """Small dense symmetric solves."""
 
+from collections.abc import Callable
+
+import jax
 import jax.numpy as jnp
 import jax.scipy
 from jaxtyping import Array, Float
 
-UNROLL_BELOW = 13  # written out, LDL' beats a LAPACK call up to 12 unknowns
+UNROLL_BELOW = 9  # written out, LDL' beats a LAPACK call up to 8 unknowns
 
 
 def solve_symmetric(
     matrix: Float[Array, "dof dof"], right: Float[Array, " dof"]
 ) -> Float[Array, " dof"]:
-    """x with `matrix` x = `right`, `matrix` symmetric positive definite."""
-    if right.shape[0] < UNROLL_BELOW:
-        return _solve_ldl(matrix, right)
-    factor = jax.scipy.linalg.cho_factor(matrix)
-    return jax.scipy.linalg.cho_solve(factor, right)
+    """x with `matrix` x = `right`, `matrix` symmetric positive definite.
+
+    Derivatives solve with the same factor: that of M^-1 r is M^-1 (dr - dM x).
+    """
+    fixed = jax.lax.stop_gradient(matrix)
+    solve = _ldl(fixed) if right.shape[0] < UNROLL_BELOW else _cholesky(fixed)
+    return jax.lax.custom_linear_solve(
+        lambda x: matrix @ x, right, lambda _, r: solve(r), symmetric=True
+    )
 
 
-def _solve_ldl(matrix: Array, right: Array) -> Array:
-    n = right.shape[0]
-    lower = [[right[0]] * n for _ in range(n)]
-    pivot, inverse = [right[0]] * n, [right[0]] * n
+def _cholesky(matrix: Array) -> Callable[[Array], Array]:
+    factor, lower = jax.scipy.linalg.cho_factor(matrix)
+    return lambda right: jax.scipy.linalg.cho_solve((factor, lower), right)
+
+
+def _ldl(matrix: Array) -> Callable[[Array], Array]:
+    n = matrix.shape[0]
+    lower = [[matrix[0, 0]] * n for _ in range(n)]
+    pivot, inverse = [matrix[0, 0]] * n, [matrix[0, 0]] * n
     for j in range(n):
         scaled = [lower[j][k] * pivot[k] for k in range(j)]
         pivot[j] = matrix[j, j] - _dot(lower[j], scaled)
         inverse[j] = 1 / pivot[j]
         for i in range(j + 1, n):
             lower[i][j] = (matrix[i, j] - _dot(lower[i], scaled)) * inverse[j]
-    x = [right[i] for i in range(n)]
-    for i in range(n):
-        x[i] = x[i] - _dot(lower[i], x[:i])
-    x = [value * scale for value, scale in zip(x, inverse, strict=True)]
-    for i in reversed(range(n)):
-        below = [lower[k][i] for k in range(i + 1, n)]
-        x[i] = x[i] - _dot(below, x[i + 1 :])
-    return jnp.stack(x)
+
+    def solve(right: Array) -> Array:
+        x = [right[i] for i in range(n)]
+        for i in range(n):
+            x[i] = x[i] - _dot(lower[i], x[:i])
+        x = [value * scale for value, scale in zip(x, inverse, strict=True)]
+        for i in reversed(range(n)):
+            below = [lower[k][i] for k in range(i + 1, n)]
+            x[i] = x[i] - _dot(below, x[i + 1 :])
+        return jnp.stack(x)
+
+    return solve
 
 
 def _dot(a: list[Array], b: list[Array]) -> Array | float:

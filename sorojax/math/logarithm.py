@@ -68,7 +68,7 @@ def _half_turn(rotation: Float[Array, "3 3"]) -> tuple[Array, Float[Array, "3"]]
 
 def _even_terms(square: Array) -> tuple[Array, Array]:
     """Factors of the second and fourth power of the adjoint map at |omega|^2."""
-    small = square < 0.09
+    small = square < 0.02
     safe = jnp.where(small, jnp.ones_like(square), square)
     angle = jnp.sqrt(safe)
     sine, versine = jnp.sin(angle), 1 - jnp.cos(angle)

@@ -58,22 +58,9 @@ def rotation_columns(q: Quaternion) -> tuple[Vector, Vector, Vector]:
     )
 
 
-def prefix_product(q: Quaternion, *, unroll: bool = False) -> Quaternion:
-    """Running products q_0, q_0 q_1, ... along the only axis.
-
-    Args:
-        q: Components of shape (points,).
-        unroll: Write the loop out: fastest inside a compiled forward loop, very slow to
-            compile when differentiated twice. Without it the loop is a `lax.scan`.
-    """
-    count = q[0].shape[0]
-    if unroll:
-        current = tuple(c[0] for c in q)
-        products = [current]
-        for k in range(1, count):
-            current = multiply(current, tuple(c[k] for c in q))  # type: ignore[arg-type]
-            products.append(current)
-        return tuple(jnp.stack(column) for column in zip(*products, strict=True))  # type: ignore[return-value]
+def prefix_product(q: Quaternion) -> Quaternion:
+    """Running products q_0, q_0 q_1, ... along the only axis, of shape (points,)."""
+    # Written out, XLA repeats the chain in every entry from nine points on.
 
     def advance(current, factor):
         product = multiply(current, factor)

@@ -144,6 +144,7 @@ def assemble(
     return jnp.zeros(system.num_values, upper.dtype).at[system.slots].add(upper)
 
 
+@jax.jit
 def product(
     system: SparseSymmetric, values: Float[Array, " nnz"], x: Float[Array, " size"]
 ) -> Float[Array, " size"]:

@@ -19,3 +19,7 @@ class Status(eqx.Enumeration):
         "No equilibrium was found. Apply the load in steps, starting each from the last "
         "answer, or raise `max_iterations`."
     )
+    out_of_reach = (
+        "The targets cannot be met: this is as close as the model comes. Move the targets, "
+        "drop one, widen limits, or give more modes or another first guess."
+    )

@@ -84,8 +84,6 @@ class SecondOrder(NamedTuple):
             matrices change along the motion, as in contact.
         retract: (q, increment of the rates' dimension) -> q moved; a sum if None.
         rate: (q, v) -> dq/dt; v if None.
-        unroll: Write the stages of explicit methods out: faster by some percent, slow to
-            compile.
         contact: Contact, which `equations` hold as well, apart; None without any.
     """
 
@@ -95,7 +93,6 @@ class SecondOrder(NamedTuple):
     linearised: Callable[[Array, Array, Array], tuple[Array, Array, Array, Array]] | None = None
     retract: Callable[[Array, Array], Array] | None = None
     rate: Callable[[Array, Array], Array] | None = None
-    unroll: bool = False
     contact: ContactTerms | None = None
 
 
@@ -245,10 +242,7 @@ def vector_field(problem: SecondOrder) -> Field:
 
 def _explicit(tableau, times, problem: SecondOrder, t, h, state: Kinematic) -> Kinematic:
     field = vector_field(problem)
-    if problem.unroll:
-        q, v = _explicit_step(tableau, times, field, t, (state.q, state.v), h)
-    else:
-        q, v = _rolled_step(tableau, times, field, t, (state.q, state.v), h)
+    q, v = _rolled_step(tableau, times, field, t, (state.q, state.v), h)
     if problem.retract is not None:
         q = problem.retract(q, jnp.zeros_like(v))  # back on the manifold
     return Kinematic(q, v, state.a)

@@ -181,7 +181,7 @@ def strain_along(
     positions, strain = _snapshots(at, path.displacements)
     rest = None
     if not isinstance(curve, Line):
-        rest = at.strain(jnp.zeros_like(path.displacements[0]))
+        rest = _snapshots(at, jnp.zeros_like(path.displacements[:1]))[1][0]
     return Backbone(at.s, at.length, positions, strain, rest)
 
 

@@ -87,21 +87,25 @@ def reference(curve: AbstractCurve, samples: int, up=None) -> Reference:
     """
     if samples < 3:
         raise ValueError(f"backbone: got {samples} samples, need 3 or more. 81 are usual.")
-    dense = jnp.linspace(0.0, 1.0, _DENSE)
-    velocity = jax.jvp(curve, (dense,), (jnp.ones_like(dense),))[1]
+    dense = np.linspace(0.0, 1.0, _DENSE)
+    velocity = _with_slope(curve, jnp.asarray(dense))[1]
     speed = np.linalg.norm(np.asarray(velocity), axis=1)
     if not speed.min() > 1e-9 * speed.max():
         raise ValueError(
             "backbone: the curve stands still at a point, need a smooth parametrisation."
         )
-    steps = np.diff(np.asarray(dense)) * (speed[1:] + speed[:-1]) / 2
+    steps = np.diff(dense) * (speed[1:] + speed[:-1]) / 2
     way = np.concatenate([[0.0], np.cumsum(steps)])
     s = np.linspace(0, 1, samples)
-    at = jnp.asarray(np.interp(s * way[-1], way, np.asarray(dense)))
-    position, slope = jax.jvp(curve, (at,), (jnp.ones_like(at),))
+    position, slope = _with_slope(curve, jnp.asarray(np.interp(s * way[-1], way, dense)))
     tangent = np.asarray(slope) / np.linalg.norm(np.asarray(slope), axis=1)[:, None]
     position = np.asarray(position)
     return Reference(s, float(way[-1]), position, _frames(position, tangent, up))
+
+
+@eqx.filter_jit
+def _with_slope(curve: AbstractCurve, s: Array) -> tuple[Array, Array]:
+    return jax.jvp(curve, (s,), (jnp.ones_like(s),))
 
 
 def _frames(position: np.ndarray, tangent: np.ndarray, up) -> np.ndarray:

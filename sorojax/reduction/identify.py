@@ -221,8 +221,13 @@ def _pressure_map(p, q, volumes, K, C, degree) -> PressureMap:
 
 
 def _volume_error(pressure: PressureMap, p, q, volumes) -> float:
-    found = jax.vmap(jax.grad(pressure.coenergy, argnums=1))(jnp.asarray(q), jnp.asarray(p))
+    found = _volumes(pressure, jnp.asarray(q), jnp.asarray(p))
     return float(np.max(np.abs(np.asarray(found) - volumes)) / np.ptp(volumes))
+
+
+@eqx.filter_jit
+def _volumes(pressure: PressureMap, q: Array, p: Array) -> Float[Array, " steps"]:
+    return jax.vmap(jax.grad(pressure.coenergy, argnums=1))(q, p)
 
 
 def _relative(error: np.ndarray, reference) -> float:

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from sorojax.fem.kinematics import PlaneStrain, Solid
 from sorojax.fem.points import quadrature_points
@@ -31,15 +32,20 @@ def mean_section(problem: Problem, curve: AbstractCurve, *, up=None) -> Section:
     known = reference(curve, _SAMPLES, up)
     inside = quadrature_points(problem.mesh, kinematics)
     points = jnp.moveaxis(inside.position, 0, -1).reshape(-1, kinematics.dim)
-    volumes = inside.volumes.reshape(-1)
     near = KDTree(known.position).query(np.asarray(jax.lax.stop_gradient(points)))[1]
-    away = points - jnp.asarray(known.position[near])
-    local = jnp.einsum("pi,pij->pj", away, jnp.asarray(known.frame[near]))
-    length = known.length
-    area = jnp.sum(volumes) / length
-    about_z = jnp.sum(volumes * local[:, 1] ** 2) / length
+    axes = known.position[near], known.frame[near]
+    volume, *moments = _moments(points, inside.volumes.reshape(-1), *axes)
+    area, about_z = volume / known.length, moments[0] / known.length
     if isinstance(kinematics, Solid):
-        about_y = jnp.sum(volumes * local[:, 2] ** 2) / length
+        about_y = moments[1] / known.length
     else:
         about_y = area * kinematics.thickness**2 / 12
     return Section(area, about_y, about_z, about_y + about_z, 5 / 6)
+
+
+@jax.jit
+def _moments(points: Array, volumes: Array, places: Array, frames: Array) -> list[Array]:
+    """Volume, and its second moments across each axis of the section."""
+    local = jnp.einsum("pi,pij->pj", points - places, frames)
+    across = range(1, local.shape[1])
+    return [jnp.sum(volumes), *(jnp.sum(volumes * local[:, k] ** 2) for k in across)]

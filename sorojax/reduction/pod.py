@@ -3,6 +3,7 @@
 Reference: Caasenbrood et al., Sorotoki, IEEE Access 2024, section V-D4.
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +20,7 @@ from sorojax.rod import (
 from sorojax.rod.basis import STRAINS
 
 
+@jax.jit
 def weights(s: Float[Array, " samples"]) -> Float[Array, " samples"]:
     """Trapezoidal weights of samples in [0, 1]."""
     gaps = jnp.pad(jnp.diff(s), 1)
@@ -125,6 +127,7 @@ def captured_energy(backbone: Backbone, basis: StrainBasis) -> dict[str, float]:
     return shares
 
 
+@eqx.filter_jit
 def coordinates(backbone: Backbone, basis: StrainBasis) -> Float[Array, "steps dof"]:
     """Coordinates of the snapshots: least squares at the samples, any basis."""
     return jax.vmap(lambda change: project(change, backbone.s, basis))(backbone.change)

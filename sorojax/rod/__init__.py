@@ -66,6 +66,10 @@ from sorojax.rod.given_modes import (
     SampledModes as SampledModes,
     functions as functions,
 )
+from sorojax.rod.inverse_kinematics import (
+    Reached as Reached,
+    inverse_kinematics as inverse_kinematics,
+)
 from sorojax.rod.joint import (
     AbstractJoint as AbstractJoint,
     Fixed as Fixed,
@@ -173,9 +177,25 @@ from sorojax.rod.spline_modes import (
     BSpline as BSpline,
     bspline as bspline,
 )
+from sorojax.rod.static_arc import (
+    ArcPath as ArcPath,
+    arc_length_path as arc_length_path,
+)
+from sorojax.rod.static_path import (
+    EquilibriumPath as EquilibriumPath,
+    equilibrium_path as equilibrium_path,
+)
 from sorojax.rod.statics import (
     Equilibrium as Equilibrium,
     equilibrium as equilibrium,
+)
+from sorojax.rod.targets import (
+    AbstractTarget as AbstractTarget,
+    Clear as Clear,
+    Direction as Direction,
+    OnSurface as OnSurface,
+    Pose as Pose,
+    Position as Position,
 )
 from sorojax.rod.tendons import (
     Actuation as Actuation,

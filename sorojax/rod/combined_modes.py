@@ -58,18 +58,15 @@ def orthonormalise(basis: StrainBasis) -> StrainBasis:
 def _orthonormal(name: str, modes: AbstractModes) -> Combined:
     s, w = gauss_legendre(_exact_rule(modes))
     values = modes(s)
-    if not isinstance(values, jax.Array):
-        # QR keeps twice the digits of a Cholesky factor of the Gram matrix.
-        factor = np.linalg.qr(np.sqrt(w)[:, None] * values)[1]
-        factor = factor * np.sign(np.diag(factor))[:, None]
-        _check_independent(name, np.diag(factor))
-        return Combined(modes, np.linalg.inv(factor))
-    root = jnp.sqrt(jnp.asarray(w, values.dtype))[:, None]
-    factor = jnp.linalg.qr(root * values)[1]
-    diagonal = jnp.diagonal(factor)
-    if not is_traced(diagonal):
-        _check_independent(name, np.asarray(diagonal))
-    return Combined(modes, jnp.linalg.inv(factor * jnp.sign(diagonal)[:, None]))
+    # QR keeps twice the digits of a Cholesky factor of the Gram matrix.
+    if is_traced(values):
+        factor = jnp.linalg.qr(jnp.sqrt(jnp.asarray(w, values.dtype))[:, None] * values)[1]
+        return Combined(modes, jnp.linalg.inv(factor * jnp.sign(jnp.diagonal(factor))[:, None]))
+    factor = np.linalg.qr(np.sqrt(w)[:, None] * np.asarray(values, np.float64))[1]
+    _check_independent(name, np.diag(factor))
+    mix = np.linalg.inv(factor * np.sign(np.diag(factor))[:, None])
+    is_on_device = isinstance(values, jax.Array)
+    return Combined(modes, jnp.asarray(mix, values.dtype) if is_on_device else mix)
 
 
 def fitted(basis: StrainBasis, to: AbstractModes) -> StrainBasis:
@@ -98,10 +95,13 @@ def _fit(name: str, modes: AbstractModes, to: AbstractModes) -> AbstractModes:
             f"{to.count} modes of {type(to).__name__}. Take fewer modes."
         )
     gaps = np.pad(np.diff(s), 1)
-    root = jnp.asarray(np.sqrt((gaps[1:] + gaps[:-1]) / 2))[:, None]
-    shapes = jnp.asarray(to(s), modes.values.dtype)
-    root = root.astype(shapes.dtype)
-    return Combined(to, jnp.linalg.lstsq(root * shapes, root * modes.values)[0])
+    root = np.sqrt((gaps[1:] + gaps[:-1]) / 2)[:, None]
+    shapes, dtype = to(s), modes.values.dtype
+    if is_traced(shapes):
+        inverse = jnp.linalg.pinv(jnp.asarray(root, shapes.dtype) * shapes)
+    else:
+        inverse = np.linalg.pinv(root * np.asarray(shapes, np.float64))
+    return Combined(to, jnp.asarray(inverse, dtype) @ (jnp.asarray(root, dtype) * modes.values))
 
 
 def _exact_rule(modes: AbstractModes) -> Quadrature:

@@ -13,6 +13,7 @@ from sorojax import _check
 from sorojax._types import real
 from sorojax.contact.ball import near
 from sorojax.contact.line import LinePenalty
+from sorojax.math.door import door
 from sorojax.rod.forces import AbstractForce
 from sorojax.rod.motion import Motion
 from sorojax.rod.points import Points, points
@@ -105,11 +106,13 @@ class ObstacleContact(AbstractContact):
         return Touch(gap - radius, slope, weights, (Side(at, arm, 1.0),))
 
 
+@door
 def contact_energy(contact: AbstractContact, motion: Motion) -> Float[Array, ""]:
     """Energy stored in a contact [J]."""
     return energy(contact.law, contact.touch(motion))
 
 
+@door
 def penetration(contact: AbstractContact, motion: Motion) -> Float[Array, ""]:
     """Largest overlap of the surfaces [m]; zero without contact."""
     gap = contact.touch(motion).gap

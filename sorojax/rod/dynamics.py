@@ -81,7 +81,6 @@ def forward_dynamics(
     forces: Forces = (),
     *,
     t=0.0,
-    unroll: bool = False,
 ) -> Rates:
     """Acceleration of the coordinates.
 
@@ -91,9 +90,8 @@ def forward_dynamics(
         v: Their rates.
         forces: Generalised forces; elasticity acts unless one replaces it.
         t: Time [s].
-        unroll: Write the rotation product out; for compiled forward loops.
     """
-    return acceleration(model, operators(model), real(t), q, v, forces, unroll=unroll)
+    return acceleration(model, operators(model), real(t), q, v, forces)
 
 
 def acceleration(
@@ -103,11 +101,9 @@ def acceleration(
     q: Coordinates,
     v: Rates,
     forces: Forces,
-    *,
-    unroll: bool = False,
 ) -> Rates:
     """`forward_dynamics` without a door, for loops that hold `operators(model)`."""
-    moment = motion(model, q, v, constants=constants, unroll=unroll)
+    moment = motion(model, q, v, constants=constants)
     mass, coriolis = inertia(moment)
     return solve_symmetric(mass, loads.total_force(forces, t, moment) - coriolis)
 
@@ -132,18 +128,17 @@ class VectorField(eqx.Module):
     model: Model
     constants: Any
     forces: Forces
-    unroll: bool = eqx.field(static=True)
 
     def __call__(self, t: Any, state: tuple[Array, Array], args: Any = None):
         q, v = state
         t = jnp.asarray(t, q.dtype)
-        a = acceleration(self.model, self.constants, t, q, v, self.forces, unroll=self.unroll)
+        a = acceleration(self.model, self.constants, t, q, v, self.forces)
         return coordinate_rate(self.model, q, v), a
 
 
-def vector_field(model: Model, forces: Forces = (), *, unroll: bool = False) -> VectorField:
+def vector_field(model: Model, forces: Forces = ()) -> VectorField:
     """The equations of first order of a model, for any solver of diffrax."""
-    return VectorField(model, operators(model), forces, unroll)
+    return VectorField(model, operators(model), forces)
 
 
 def coordinate_rate(model: Model, q: Coordinates, v: Rates) -> Coordinates:

@@ -44,12 +44,16 @@ class SampledModes(AbstractModes):
         return min(48, max(8, self.s.shape[0] // 4))
 
     def __call__(self, s):
-        at = jnp.asarray(s, dtype=self.s.dtype)
-        right = jnp.clip(jnp.searchsorted(self.s, at), 1, self.s.shape[0] - 1)
-        left = right - 1
-        fraction = (at - self.s[left]) / (self.s[right] - self.s[left])
-        fraction = jnp.clip(fraction, 0, 1)[:, None]
-        return (1 - fraction) * self.values[left] + fraction * self.values[right]
+        return _interpolated(self.s, self.values, jnp.asarray(s, dtype=self.s.dtype))
+
+
+@jax.jit
+def _interpolated(s: Array, values: Array, at: Array) -> Float[Array, "points modes"]:
+    """Linear between samples, constant beyond the first and last."""
+    right = jnp.clip(jnp.searchsorted(s, at), 1, s.shape[0] - 1)
+    left = right - 1
+    fraction = jnp.clip((at - s[left]) / (s[right] - s[left]), 0, 1)[:, None]
+    return (1 - fraction) * values[left] + fraction * values[right]
 
 
 def _as_function(given: Any) -> Any:
@@ -65,7 +69,9 @@ class _Stacked(eqx.Module):
     functions: tuple[Callable, ...]
 
     def __call__(self, s):
-        return jnp.stack([jnp.asarray(f(s)) for f in self.functions], axis=1)
+        rows = [f(s) for f in self.functions]
+        xp = jnp if any(isinstance(row, jax.Array) for row in rows) else np
+        return xp.stack([xp.asarray(row) for row in rows], axis=1)
 
 
 class Functions(AbstractModes):

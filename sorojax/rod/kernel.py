@@ -16,14 +16,13 @@ def rod_motion(
     q: Float[Array, " dof"],
     v: Float[Array, " dof"] | None = None,
     constants: Operators | None = None,
-    unroll: bool = False,
 ) -> Motion:
     """The fields of a rod clamped at the origin."""
     do = f"The rod has {rod.basis.num_dof} coordinates, ordered as its basis."
     _check.shape("rod", "q", q, (rod.basis.num_dof,), do)
     constants = operators(rod) if constants is None else constants
     v = jnp.zeros_like(q) if v is None else v
-    return _KERNEL[rod.group.space_dim].motion(rod, constants, q, v, unroll)
+    return _KERNEL[rod.group.space_dim].motion(rod, constants, q, v)
 
 
 def rod_inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:

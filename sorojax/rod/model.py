@@ -30,13 +30,13 @@ def operators(model):
 
 @overload
 def motion(
-    model: Rod, q: Array, v: Array | None = None, *, constants=None, unroll: bool = False
+    model: Rod, q: Array, v: Array | None = None, *, constants=None
 ) -> Motion: ...
 @overload
 def motion(
-    model: Assembly, q: Array, v: Array | None = None, *, constants=None, unroll: bool = False
+    model: Assembly, q: Array, v: Array | None = None, *, constants=None
 ) -> AssemblyMotion: ...
-def motion(model, q, v=None, *, constants=None, unroll: bool = False):
+def motion(model, q, v=None, *, constants=None):
     """The fields of a model at (q, v), which forces and inertia read.
 
     Args:
@@ -44,11 +44,10 @@ def motion(model, q, v=None, *, constants=None, unroll: bool = False):
         q: Coordinates.
         v: Their rates; zero if omitted.
         constants: `operators(model)`, if a loop has them already.
-        unroll: Write the rotation product out (see `math.quaternion.prefix_product`).
     """
     if isinstance(model, Assembly):
-        return assembly_motion(model, q, v, constants, unroll)
-    return rod_motion(model, q, v, constants, unroll)
+        return assembly_motion(model, q, v, constants)
+    return rod_motion(model, q, v, constants)
 
 
 def inertia(

@@ -7,9 +7,8 @@ from sorojax.rod.motion import Motion, Operators, is_curvature, rest_along
 from sorojax.rod.rod import Rod
 
 
-def motion(rod: Rod, constants: Operators, q: Array, v: Array, unroll: bool) -> Motion:
-    """Fields of the rod at the Gauss nodes; nothing to unroll."""
-    del unroll
+def motion(rod: Rod, constants: Operators, q: Array, v: Array) -> Motion:
+    """Fields of the rod at the Gauss nodes."""
     per_coordinate = _at_nodes(rod, jnp.cumsum(constants.moments[0, 0], axis=0))
     angle = per_coordinate @ q
     if rod.rest_strain is not None:

@@ -45,7 +45,6 @@ def rollout(
     every: int = 1,
     t=0.0,
     stepper: AbstractStepper | None = None,
-    unroll: bool | None = None,
 ) -> Rollout:
     """Move the model from (q, v) by `saves * every` steps.
 
@@ -61,19 +60,15 @@ def rollout(
         stepper: `GeneralisedAlpha()` by default, `ContactMidpoint()` if a contact is among
             the forces; `RungeKutta4()` or `DormandPrince()` for undamped motion at high
             accuracy.
-        unroll: Write the rotation product and the stages of explicit methods out: runs
-            faster, compiles slower; by default for single rods. Pass False when the rollout
-            is differentiated, or it compiles several times slower.
     """
     if stepper is None:
         stepper = ContactMidpoint() if any_contact(forces) else GeneralisedAlpha()
-    unroll = isinstance(model, Rod) if unroll is None else unroll
-    return _rollout(model, q, v, forces, real(step), real(t), stepper, saves, every, unroll)
+    return _rollout(model, q, v, forces, real(step), real(t), stepper, saves, every)
 
 
 @eqx.filter_jit
-def _rollout(model, q, v, forces, step, t, stepper, saves, every, unroll) -> Rollout:
-    problem = second_order(model, q, forces, unroll=unroll)
+def _rollout(model, q, v, forces, step, t, stepper, saves, every) -> Rollout:
+    problem = second_order(model, q, forces)
     begin = start(problem, t, q, v)
     path = integrate(stepper, problem, begin, t=t, h=step, saves=saves, every=every)
     fine = jnp.all(jnp.isfinite(path.q)) & jnp.all(jnp.isfinite(path.v))
@@ -86,14 +81,12 @@ def second_order(
     model: Model,
     q: Float[Array, " coordinates"],
     forces: Forces,
-    *,
-    unroll: bool = False,
 ) -> SecondOrder:
     """The equations of the model, with its stiffness at `q` and its damping."""
     constants = operators(model)
 
     def at(q, v):
-        return motion(model, q, v, constants=constants, unroll=unroll)
+        return motion(model, q, v, constants=constants)
 
     def equations(t, q, v):
         moment = at(q, v)
@@ -109,6 +102,5 @@ def second_order(
         damping,
         retract=tree and functools.partial(retract, tree),
         rate=tree and functools.partial(rate, tree),
-        unroll=unroll,
         contact=contacts_of(model, forces, at, inertia),
     )

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import real
+from sorojax.math.door import door
 from sorojax.math.quadrature import (
     Quadrature,
     gauss_legendre,
@@ -159,6 +160,7 @@ def thread_length(thread: Thread, q: Float[Array, " dof"]) -> Float[Array, ""]:
     return thread.weights @ safe_norm(thread.tangent + thread.tangent_rows @ q)
 
 
+@door
 def thread_lengths(
     rod: Rod, routes: tuple[AbstractRoute, ...], q: Float[Array, " dof"]
 ) -> Float[Array, " threads"]:
@@ -166,6 +168,7 @@ def thread_lengths(
     return jnp.stack([thread_length(thread(rod, route), q) for route in routes])
 
 
+@door
 def thread_rates(
     rod: Rod,
     routes: tuple[AbstractRoute, ...],

@@ -49,12 +49,19 @@ def section_law(
             order of `strain_names(rod.group)`. The gradient of an energy per length keeps
             energy.
     """
+    rows, weights, s = _rows(rod)
+    return SectionLaw(stress, rows, weights, s)
+
+
+@eqx.filter_jit
+def _rows(rod: Rod) -> tuple[Array, Array, Array]:
+    """Strain per coordinate at the Gauss nodes, their weights [m] and places."""
     constants = operators(rod)
     active = dict(zip(rod.basis.active, constants.strain_rows, strict=True))
     none = jnp.zeros(constants.strain_rows.shape[1:], rod.length.dtype)
     rows = jnp.stack([active.get(name, none) for name in strain_names(rod.group)], axis=1)
     s = jnp.asarray(gauss_legendre(rod.quadrature)[0], rod.length.dtype)
-    return SectionLaw(stress, rows, constants.weights, s)
+    return rows, constants.weights, s
 
 
 class EnergyLaw(eqx.Module):

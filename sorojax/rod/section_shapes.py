@@ -92,6 +92,7 @@ _ODD = tuple(range(1, 14, 2))
 _SUM = 1.0045237627951384  # sum of n^-5 over odd n: 31/32 zeta(5)
 
 
+@jax.jit
 def _rectangle_torsion(long: Array, short: Array) -> Array:
     ratio = short / long
     # tanh x = 1 - 2 / (1 + exp 2x): what is left of the series falls like exp(-n pi).
@@ -123,6 +124,7 @@ def ellipse(half_width, half_height, *, poisson_ratio=0.5) -> Section:
     )
 
 
+@jax.jit
 def _ellipse_shear(n: Array, nu: Array) -> Array:
     below = (40 + 37 * nu) * n**4 + (16 + 10 * nu) * n**2 + nu
     return 12 * (1 + nu) * n**2 * (3 * n**2 + 1) / below
@@ -137,14 +139,21 @@ def squircle(radius, power, *, shear_factor=5 / 6) -> Section:
     radius = _length("squircle", "radius", radius, "Give half the side.")
     n = real(power)
     _check.between("squircle", "power", n, 2 - 1e-12, 50, "", "Use rectangle for more.")
-    second = _superellipse(3.0, 1.0, n) * radius**4
+    area, second, torsion = _squircle(n)
     return Section(
-        area=_superellipse(1.0, 1.0, n) * radius**2,
-        second_moment_y=second,
-        second_moment_z=second,
-        torsion_constant=_squircle_torsion(n, 2 * _superellipse(3.0, 1.0, n)) * radius**4,
+        area=area * radius**2,
+        second_moment_y=second * radius**4,
+        second_moment_z=second * radius**4,
+        torsion_constant=torsion * radius**4,
         shear_factor=shear_factor,
     )
+
+
+@jax.jit
+def _squircle(n: Array) -> tuple[Array, Array, Array]:
+    """Area, second moment and torsion constant at radius 1."""
+    second = _superellipse(3.0, 1.0, n)
+    return _superellipse(1.0, 1.0, n), second, _squircle_torsion(n, 2 * second)
 
 
 def _superellipse(a: float, b: float, n: Array) -> Array:

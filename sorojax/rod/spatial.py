@@ -14,9 +14,9 @@ from sorojax.rod.motion import Motion, Operators, is_curvature, local_axis, rest
 from sorojax.rod.rod import Rod
 
 
-def motion(rod: Rod, constants: Operators, q: Array, v: Array, unroll: bool) -> Motion:
+def motion(rod: Rod, constants: Operators, q: Array, v: Array) -> Motion:
     """Fields of the rod at the Gauss nodes."""
-    axes = _directors(rod, constants, q, unroll)
+    axes = _directors(rod, constants, q)
     angular_rate, shape_rate = _strain_rates(rod, constants, axes)
     tangent = _tangent(rod, constants, axes, q)
     angular = _integrate(constants, angular_rate)
@@ -61,14 +61,14 @@ def bias_rates(moment: Motion) -> tuple[Float[Array, "quad 3"], Float[Array, "qu
     return _bias_rates(moment, _spin(moment))
 
 
-def _directors(rod: Rod, constants: Operators, q: Array, unroll: bool) -> list[Array]:
+def _directors(rod: Rod, constants: Operators, q: Array) -> list[Array]:
     """Local axes at the nodes, three arrays (quad, dim)."""
     order, rot, cells, dof = constants.moments.shape
     moments = (constants.moments.reshape(-1, dof) @ q).reshape(order, rot, cells)
     if rod.rest_strain is not None:
         moments = moments + constants.rest_moments
     by_order = tuple((m[0], m[1], m[2]) for m in moments)
-    turns = prefix_product(exponential(rotation_vector(by_order)), unroll=unroll)  # type: ignore[arg-type]
+    turns = prefix_product(exponential(rotation_vector(by_order)))  # type: ignore[arg-type]
     if rod.quadrature.breaks:
         turns = tuple(c[rod.quadrature.node_cells] for c in turns)
     return [jnp.stack(column, axis=1) for column in rotation_columns(turns)]

@@ -169,7 +169,7 @@ def ended(done: Array, *values: Array) -> Status:
     for value in values:
         finite = finite & jnp.all(jnp.isfinite(value))
     failed = Status.where(finite, Status.not_converged, Status.not_finite)
-    return Status.where(finite & (done > 0), Status.successful, failed)
+    return Status.where(finite & done.astype(bool), Status.successful, failed)
 
 
 def _solve_tangent(linear, right: Array) -> Array:

@@ -82,10 +82,15 @@ def unit_energy(model: Model, metric: Float[Array, "dof dof"]) -> Float[Array, "
 def _units(model: Model) -> Float[Array, " dof"]:
     if isinstance(model, Rod):
         one = jnp.ones((), model.length.dtype)
-        return jnp.concatenate([
-            jnp.full(model.basis.modes[name].count, one / model.length if is_curvature(name) else one)
-            for name in model.basis.active
-        ])
+        return jnp.concatenate(
+            [
+                jnp.full(
+                    model.basis.modes[name].count,
+                    one / model.length if is_curvature(name) else one,
+                )
+                for name in model.basis.active
+            ]
+        )
     units = jnp.ones(num_dof(model), dtype_of(model))
     for part, at in zip(model.parts, slices(model), strict=True):
         if isinstance(part.body, Rod):

@@ -87,7 +87,12 @@ def thread_chambers(
     do = "Give one area per routing, in m^2."
     _check.shape("thread_chambers", "areas", areas, (len(routes),), do)
     _check.positive("thread_chambers", "areas", areas, "m^2", do)
-    return ThreadChambers(tuple(thread(rod, route) for route in routes), areas, is_single)
+    return ThreadChambers(_threads(rod, routes), areas, is_single)
+
+
+@eqx.filter_jit
+def _threads(rod: Rod, routes: tuple[AbstractRoute, ...]) -> tuple[Thread, ...]:
+    return tuple(thread(rod, route) for route in routes)
 
 
 class Actuation(AbstractForce):

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._types import is_traced, real
 from sorojax.math import sparse
+from sorojax.math.door import door
 from sorojax.math.quadrature import gauss_legendre
 from sorojax.mesh.elements import Tri3, Tri6
 from sorojax.mesh.mesh import Mesh
@@ -76,6 +77,7 @@ def principal_angle(moments: Float[Array, "2 2"]) -> Float[Array, ""]:
     return jnp.arctan2(2 * moments[0, 1], moments[0, 0] - moments[1, 1]) / 2
 
 
+@door
 def shear_factors(
     constants: PlaneConstants, poisson_ratio
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:

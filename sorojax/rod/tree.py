@@ -141,7 +141,6 @@ def assembly_motion(
     q: Float[Array, " coordinates"],
     v: Float[Array, " dof"] | None = None,
     constants: AssemblyOperators | None = None,
-    unroll: bool = False,
 ) -> AssemblyMotion:
     """The fields of all parts at (q, v)."""
     count = num_coordinates(assembly)
@@ -157,7 +156,7 @@ def assembly_motion(
         assert isinstance(rod, Rod)
         own_q = jnp.stack([q[places[k].rod_q] for k in members])
         own_v = jnp.stack([v[places[k].rod_v] for k in members])
-        every = eqx.filter_vmap(lambda c, q, v, rod=rod: rod_motion(rod, q, v, c, unroll))
+        every = eqx.filter_vmap(lambda c, q, v, rod=rod: rod_motion(rod, q, v, c))
         moments.append(every(stack, own_q, own_v))
     blank = AssemblyMotion(assembly, constants, q, v, tuple(moments), (), ())
     mounts, frames = _carry(blank)

@@ -13,7 +13,7 @@ import numpy as np
 
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.blocks import LEAF, Grid
-from sorojax.sdf.query import value_and_gradient
+from sorojax.sdf.sample import value_and_gradient
 
 _WIDE = LEAF + 1
 _CELLS = LEAF**3

@@ -1,11 +1,12 @@
 """Area, centroid and second moments of plane shapes, differentiable in their parameters."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.moments import Rule, frame, moments
-from sorojax.sdf.solid_measure import solid_centroid
+from sorojax.sdf.solid_measure import middle_of_mass, solid_centroid
 
 _CELLS = 512  # along the longest side; halved eight times at corners and narrow gaps
 
@@ -28,8 +29,7 @@ def centroid(shape: AbstractSdf) -> Float[Array, " dim"]:
     if shape.dim == 3:
         return solid_centroid(shape)
     m = moments(shape, _rule("centroid", shape, 1))
-    middle, size = frame(shape, _CELLS)
-    return middle + size * m[1:3] / m[0]
+    return middle_of_mass(m, *frame(shape, _CELLS))
 
 
 def second_moments(shape: AbstractSdf) -> Float[Array, "2 2"]:
@@ -38,8 +38,14 @@ def second_moments(shape: AbstractSdf) -> Float[Array, "2 2"]:
     Entry (0, 0) is that of x^2, which resists bending in x; the trace is the polar moment.
     """
     m = moments(shape, _rule("second_moments", shape, 2))
+    return _second(m, frame(shape, _CELLS)[1])
+
+
+@jax.jit
+def _second(m: Float[Array, "6"], size: Float[Array, ""]) -> Float[Array, "2 2"]:
+    """About the centroid [m^4], from moments in cells of `size` [m]."""
     xx, yy, xy = m[3:] - jnp.stack([m[1] * m[1], m[2] * m[2], m[1] * m[2]]) / m[0]
-    return frame(shape, _CELLS)[1] ** 4 * jnp.stack([xx, xy, xy, yy]).reshape(2, 2)
+    return size**4 * jnp.stack([xx, xy, xy, yy]).reshape(2, 2)
 
 
 def _rule(where: str, shape: AbstractSdf, order: int) -> Rule:

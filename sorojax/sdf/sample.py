@@ -13,8 +13,7 @@ CHUNK = 4096  # fits the cache, and one size means one compilation
 _value = eqx.filter_jit(lambda shape, p: shape(p))
 
 
-@eqx.filter_jit
-def _value_and_gradient(shape, p):
+def value_and_gradient(shape, p):
     """As `query.value_and_gradient`, as one pass over three directions: compiles faster."""
     shape = cast(shape, p.dtype)
     x = tuple(p[:, i] for i in range(shape.dim))
@@ -24,6 +23,9 @@ def _value_and_gradient(shape, p):
         return jax.jvp(shape.distance, x, along)
 
     return jax.vmap(pushed, out_axes=(None, 1))(jnp.eye(shape.dim, dtype=p.dtype))
+
+
+_value_and_gradient = eqx.filter_jit(value_and_gradient)
 
 
 def _chunks(points: np.ndarray):

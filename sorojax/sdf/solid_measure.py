@@ -7,6 +7,7 @@ computed number, whatever the resolution.
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -32,16 +33,22 @@ def volume(shape: AbstractSdf, resolution: int = 128) -> Float[Array, ""]:
         Min and Gibou 2007, Geometric integration over irregular domains, for the cut cells.
     """
     rule = _rule("volume", shape, resolution, 0)
-    m = moments(shape, rule)
-    return frame(shape, rule.resolution)[1] ** 3 * m[0]
+    return frame(shape, rule.resolution)[1] ** 3 * moments(shape, rule)[0]
 
 
 def solid_centroid(shape: AbstractSdf, resolution: int = 128) -> Float[Array, "3"]:
     """Centroid [m] of a solid shape, differentiable as `volume` is."""
     rule = _rule("centroid", shape, resolution, 1)
     m = moments(shape, rule)
-    middle, size = frame(shape, rule.resolution)
-    return middle + size * m[1:4] / m[0]
+    return middle_of_mass(m, *frame(shape, rule.resolution))
+
+
+@jax.jit
+def middle_of_mass(
+    m: Float[Array, " moments"], middle: Float[Array, " dim"], size: Float[Array, ""]
+) -> Float[Array, " dim"]:
+    """Centroid [m] from moments in cells of `size` [m] about `middle` [m]."""
+    return middle + size * m[1 : 1 + len(middle)] / m[0]
 
 
 def inertia_tensor(
@@ -55,13 +62,18 @@ def inertia_tensor(
         resolution: Cells along the longest side of its bounding box.
     """
     rule = _rule("inertia_tensor", shape, resolution, 2)
-    m = moments(shape, rule)
+    size = frame(shape, rule.resolution)[1]
+    return real(density) * _inertia(moments(shape, rule), size)
+
+
+@jax.jit
+def _inertia(m: Float[Array, "10"], size: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """Of unit density [m^5], from moments in cells of `size` [m]; one program, not twenty."""
     xx, yy, zz, xy, yz, zx = m[4:]
     second = jnp.stack([xx, xy, zx, xy, yy, yz, zx, yz, zz]).reshape(3, 3)
     second = second - m[1:4, None] * m[None, 1:4] / m[0]
-    second = frame(shape, rule.resolution)[1] ** 5 * second
     identity = jnp.eye(3, dtype=m.dtype)
-    return real(density) * (jnp.trace(second) * identity - second)
+    return size**5 * (jnp.trace(second) * identity - second)
 
 
 def _rule(where: str, shape: AbstractSdf, resolution: int, order: int) -> Rule:

@@ -1,0 +1,222 @@
+"""Steps of inverse kinematics: damped least squares, its null space, bounds."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax.scipy.linalg import cho_solve
+from jaxtyping import Array, Float
+
+from sorojax.math.dense import solve_symmetric
+from sorojax.rod.assembly import index_of
+from sorojax.rod.link import LinkMotion
+from sorojax.rod.loads import Load, total_force
+from sorojax.rod.motion import Motion
+from sorojax.rod.points import Points, points
+from sorojax.rod.targets import AbstractTarget, Clear, Frames
+from sorojax.rod.tree import AssemblyMotion, part_columns, part_motion
+
+OBSTACLE_WEIGHT = 30.0  # of a bound against a target; sets how fast bounds are met
+
+Limits = tuple[Float[Array, " dof"], Float[Array, " dof"]]
+
+
+class Tasks(NamedTuple):
+    """All that is asked of a model.
+
+    Attributes:
+        targets: What to reach.
+        obstacles: What to stay clear of.
+        forces: Whose equilibrium the null space seeks, or None.
+        limits: Bounds of the coordinates, or None.
+        metric: Measures increments.
+        length: Of the model, to measure errors [m].
+    """
+
+    targets: tuple[AbstractTarget, ...]
+    obstacles: tuple[Clear, ...]
+    forces: tuple[Load, ...] | None
+    limits: Limits | None
+    metric: Float[Array, "dof dof"]
+    length: Float[Array, ""]
+
+
+class Rows(NamedTuple):
+    """The tasks at one place: errors and what rates make up for, gaps and how they change,
+    and the downhill force of the secondary task."""
+
+    error: Float[Array, " rows"]
+    jacobian: Float[Array, "rows dof"]
+    gap: Float[Array, " bounds"] | None
+    change: Float[Array, "bounds dof"] | None
+    pull: Float[Array, " dof"] | None
+
+
+def rows(tasks: Tasks, t: Array, moment: Motion | AssemblyMotion) -> Rows:
+    """The tasks at a moment."""
+    group = moment.rod.group if isinstance(moment, Motion) else moment.assembly.group
+    pairs = [task.errors(group, _frames(moment, task)) for task in tasks.targets]
+    gaps = [task.gaps(_frames(moment, task)) for task in tasks.obstacles]
+    pull = None if tasks.forces is None else total_force(tasks.forces, t, moment)
+    error, jacobian = _stacked(pairs)
+    gap, change = _stacked(gaps) if gaps else (None, None)
+    return Rows(error, jacobian, gap, change, pull)
+
+
+def all_rows(at: Rows, push: Array | None, ahead: Array | None = None) -> tuple[Array, Array]:
+    """Errors with those of the bounds that are active under the multipliers `push`, or
+    that the increment `ahead` would break."""
+    if at.gap is None or push is None:
+        return at.error, at.jacobian
+    assert at.change is not None
+    over = push - OBSTACLE_WEIGHT * at.gap
+    active = over > 0
+    if ahead is not None:
+        active = active | (over - OBSTACLE_WEIGHT * (at.change @ ahead) > 0)
+    change = jnp.where(active[:, None], OBSTACLE_WEIGHT * at.change, 0.0)
+    error = jnp.concatenate([at.error, jnp.where(active, over, 0.0)])
+    return error, jnp.concatenate([at.jacobian, change])
+
+
+class Step(NamedTuple):
+    """An increment, the share that the secondary task has in it, and what it is worth.
+
+    Attributes:
+        increment: Of the coordinates, in the rates' dimension.
+        size: Of the increment, as the tip moves [m].
+        drift: The same of the share in the null space.
+        slope: Size of the gradient [m]; zero at the closest place.
+    """
+
+    increment: Float[Array, " dof"]
+    size: Float[Array, ""]
+    drift: Float[Array, ""]
+    slope: Float[Array, ""]
+
+
+def step(
+    tasks: Tasks, own: Array, at: Rows, push: Array | None, damping, pull_gain, hessian=None
+) -> Step:
+    """One damped least-squares step with the secondary task in the null space.
+
+    Args:
+        tasks: What is asked.
+        own: Coordinates in the places of their rates.
+        at: The tasks there.
+        push: Multipliers of the bounds.
+        damping: Relative to the mean square of the Jacobian [-].
+        pull_gain: Share of the secondary step that is taken [-].
+        hessian: Of half the squared error; taken in place of J'J where it is positive.
+    """
+    first = _step(tasks, own, at, all_rows(at, push), damping, pull_gain, hessian)
+    if push is None:
+        return first
+    # Bounds that the first answer breaks take part in the second.
+    active = all_rows(at, push, first.increment)
+    if hessian is not None:
+        _, before = all_rows(at, push)
+        hessian = hessian + active[1].T @ active[1] - before.T @ before
+    return _step(tasks, own, at, active, damping, pull_gain, hessian)
+
+
+def _step(tasks: Tasks, own: Array, at: Rows, active, damping, pull_gain, hessian) -> Step:
+    error, jacobian = active
+    down, square = error @ jacobian, jacobian.T @ jacobian
+    scaled, tiny = scaled_metric(tasks, square)
+    free = None
+    if tasks.limits is not None:
+        pulled = down if at.pull is None else down + tiny * _per_metric(tasks, scaled) * at.pull
+        free = _free(tasks.limits, own, pulled)
+        hessian = None if hessian is None else _held(hessian, free)
+        down, square, scaled = free * down, _held(square, free), _held(scaled, free, 1.0)
+    increment = solve_symmetric(square + (damping + tiny) * scaled, down)
+    if hessian is not None:
+        curved = (hessian + hessian.T) / 2 + (damping + tiny) * scaled
+        # Not positive: the factor is not a number.
+        newton = cho_solve((jnp.linalg.cholesky(curved), True), down)
+        increment = jnp.where(jnp.all(jnp.isfinite(newton)), newton, increment)
+    drift = jnp.zeros((), error.dtype)
+    if at.pull is not None:
+        pull = tiny * _per_metric(tasks, scaled) * at.pull
+        pull = pull if free is None else free * pull
+        along = pull_gain * solve_symmetric(square + tiny * scaled, pull)
+        drift, increment = jnp.sqrt(along @ scaled @ along), increment + along
+    slope = jnp.sqrt(jnp.abs(down @ solve_symmetric(scaled, down)))
+    if tasks.limits is not None:
+        low, high = tasks.limits
+        increment = jnp.clip(increment, low - own, high - own)
+    size = jnp.sqrt(increment @ scaled @ increment)
+    return Step(increment, size, drift, slope)
+
+
+def scaled_metric(tasks: Tasks, square: Float[Array, "dof dof"]) -> tuple[Array, Array]:
+    """The metric with the trace of J'J, and the share of it that counts as nothing."""
+    tiny = jnp.finfo(square.dtype).eps ** 0.6
+    trace = jnp.maximum(jnp.trace(square), tiny**2 * tasks.length**2)
+    scaled = trace / jnp.trace(tasks.metric) * tasks.metric
+    return scaled, jnp.asarray(tiny, square.dtype)
+
+
+def pushed(at: Rows, push: Array | None, increment: Array) -> Array | None:
+    """Multipliers of the bounds after a step."""
+    if at.gap is None or at.change is None or push is None:
+        return None
+    return jnp.maximum(push - OBSTACLE_WEIGHT * (at.gap + at.change @ increment), 0.0)
+
+
+def bound_to(limits: Limits, own: Array, down: Array) -> tuple[Array, Array]:
+    """Which coordinates rest on their lower and upper limits."""
+    low, high = limits
+    return (own <= low) & (down < 0), (own >= high) & (down > 0)
+
+
+def _free(limits: Limits, own: Array, down: Array) -> Float[Array, " dof"]:
+    lower, upper = bound_to(limits, own, down)
+    return jnp.where(lower | upper, jnp.zeros_like(own), jnp.ones_like(own))
+
+
+def _held(matrix: Array, free: Array, diagonal: float = 0.0) -> Array:
+    """`matrix` for the free coordinates; those held stay where they are."""
+    kept = matrix * free[:, None] * free[None, :]
+    return kept + jnp.diag((1 - free) * (diagonal * jnp.trace(matrix) / matrix.shape[0]))
+
+
+def _per_metric(tasks: Tasks, scaled: Array) -> Array:
+    return jnp.trace(scaled) / jnp.trace(tasks.metric)
+
+
+def _frames(moment: Motion | AssemblyMotion, task: AbstractTarget | Clear) -> Frames:
+    """The sections of a task."""
+    if isinstance(moment, Motion):
+        if task.part is not None:
+            raise ValueError(
+                f"inverse_kinematics: a target names the part `{task.part}`, a single rod has "
+                "none. Leave the name out."
+            )
+        return _sections(moment, task.s)
+    if task.part is None:
+        raise ValueError(
+            f"inverse_kinematics: {type(task).__name__} names no part, need one of "
+            f"{', '.join(moment.assembly.names)}. Give part=."
+        )
+    index = index_of(moment.assembly, task.part)
+    frames, columns = _sections(part_motion(moment, index), task.s), part_columns(moment)[index]
+    angular, linear = frames.angular_jacobian @ columns, frames.linear_jacobian @ columns
+    return Frames(frames.directors, frames.position, angular, linear)
+
+
+def _sections(moment: Motion | LinkMotion, s: Array) -> Frames:
+    at = (
+        moment.base
+        if isinstance(moment, LinkMotion)
+        else points(moment, s.astype(moment.q.dtype))
+    )
+    if isinstance(at, Points):
+        return Frames(at.directors, at.position, at.angular_jacobian, at.linear_jacobian)
+    base = (at.directors, at.position, at.angular_jacobian, at.linear_jacobian)
+    return Frames(*(jnp.broadcast_to(x, (s.shape[0], *x.shape)) for x in base))
+
+
+def _stacked(pairs) -> tuple[Array, Array]:
+    if len(pairs) == 1:
+        return pairs[0]
+    return jnp.concatenate([e for e, _ in pairs]), jnp.concatenate([j for _, j in pairs])
