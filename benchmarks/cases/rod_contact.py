@@ -35,9 +35,9 @@ def forces(obstacle):
     if obstacle is None:
         return (Gravity(),)
     if obstacle == "itself":
-        return (Gravity(), SelfContact(6e-3, LAW, points=32))
+        return (Gravity(), SelfContact(radius=6e-3, law=LAW, points=32))
     floor = sdf.HalfSpace([0.0, 0.0, obstacle], [0.0, 0.0, 1.0])
-    return (Gravity(), ObstacleContact(floor, 6e-3, LAW))
+    return (Gravity(), ObstacleContact(obstacle=floor, radius=6e-3, law=LAW))
 
 
 def loop(rod, loads, steps=STEPS):
@@ -61,7 +61,8 @@ def coiling(stiffness):
         SE2(), chebyshev(kappa_z=3), circle(radius), length=0.2, young_modulus=1e6,
         poisson_ratio=0.3, density=2000.0, nodes=20, rest_strain=[34.0, 1.0, 0.0],
     )  # fmt: skip
-    contact = SelfContact(radius, LinePenalty(stiffness, smoothing=6e-6), points=96)
+    law = LinePenalty(stiffness, smoothing=6e-6)
+    contact = SelfContact(radius=radius, law=law, points=96)
     q = jnp.array([-9.0, 4.0, 0.5])
     path = rollout(rod, q, 0 * q, (Damping(1e-6), contact), step=1e-3, saves=1000)
     depth = jax.vmap(lambda q: penetration(contact, motion(rod, q)))(path.q)

@@ -126,7 +126,9 @@ def functions(
     """
     joints = checked_breaks("functions", breaks)
     own = {name: _as_function(f) for name, f in modes.items()}
-    modes_of = {k: _functions(f, nodes, joints) for k, f in own.items()}
+    modes_of: dict[str, AbstractModes] = {
+        k: _functions(f, nodes, joints) for k, f in own.items()
+    }
     return StrainBasis(modes_of)
 
 

@@ -1,5 +1,7 @@
 """Where the rod is: strains, poses, Jacobians."""
 
+from typing import overload
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -46,6 +48,10 @@ def strain(rod: Rod, q: Float[Array, " dof"], s=None) -> Float[Array, "points st
     return jnp.stack(parts, axis=1)
 
 
+@overload
+def forward_kinematics(model: Rod, q: Array, s=None) -> Poses: ...
+@overload
+def forward_kinematics(model: Assembly, q: Array, s=None) -> dict[str, Poses]: ...
 @door
 def forward_kinematics(
     model: Model, q: Float[Array, " coordinates"], s=None
@@ -62,6 +68,10 @@ def forward_kinematics(
     return _poses(rod_motion(model, q), s)
 
 
+@overload
+def tip_pose(model: Rod, q: Array) -> Float[Array, "h h"]: ...
+@overload
+def tip_pose(model: Assembly, q: Array) -> dict[str, Float[Array, "h h"]]: ...
 @door
 def tip_pose(model: Model, q: Float[Array, " coordinates"]):
     """Pose of the last section, of every part by name: local to base frame, position in m."""
@@ -71,6 +81,10 @@ def tip_pose(model: Model, q: Float[Array, " coordinates"]):
     return poses[0]
 
 
+@overload
+def jacobian(model: Rod, q: Array, s=None) -> Jacobians: ...
+@overload
+def jacobian(model: Assembly, q: Array, s=None) -> dict[str, Jacobians]: ...
 @door
 def jacobian(
     model: Model, q: Float[Array, " coordinates"], s=None

@@ -29,9 +29,7 @@ def operators(model):
 
 
 @overload
-def motion(
-    model: Rod, q: Array, v: Array | None = None, *, constants=None
-) -> Motion: ...
+def motion(model: Rod, q: Array, v: Array | None = None, *, constants=None) -> Motion: ...
 @overload
 def motion(
     model: Assembly, q: Array, v: Array | None = None, *, constants=None

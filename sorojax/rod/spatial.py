@@ -71,7 +71,8 @@ def _directors(rod: Rod, constants: Operators, q: Array) -> list[Array]:
     turns = prefix_product(exponential(rotation_vector(by_order)))  # type: ignore[arg-type]
     if rod.quadrature.breaks:
         turns = tuple(c[rod.quadrature.node_cells] for c in turns)
-    return [jnp.stack(column, axis=1) for column in rotation_columns(turns)]
+    w, x, y, z = turns
+    return [jnp.stack(column, axis=1) for column in rotation_columns((w, x, y, z))]
 
 
 def _strain_rates(

@@ -1,0 +1,64 @@
+"""Accelerations of the finger D1 in batches, and of its planar twin, in compiled loops.
+
+1024 states by `vmap`, and by `jax.lax.map` in batches of 64, which stay in the cache. The
+planar finger bends in one plane: three coordinates, no exponential of a group.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from benchmarks.cases.rod_acceleration import CALLS, loop
+from benchmarks.fingers import LENGTH, MODES, accelerate, finger, random_states
+from benchmarks.harness import Row, measure_together
+from sorojax.math.lie import SE2
+from sorojax.rod import chebyshev, circle, operators, rod
+from sorojax.units import MPa, mm
+
+STATES = 1024
+ITEM_BAR = 3.5e-6  # s of a state in a batch
+PLANAR_BAR = 0.45  # share of the spatial acceleration
+
+
+def planar_finger():
+    return rod(
+        SE2(), chebyshev(kappa_z=MODES), circle(6 * mm), length=LENGTH,
+        young_modulus=1 * MPa, poisson_ratio=0.3, density=2000.0, nodes=8,
+    )  # fmt: skip
+
+
+def together(rod, q, v):
+    constants = operators(rod)
+    return jax.vmap(lambda q, v: accelerate(rod, constants, q, v))(q, v)
+
+
+def in_chunks(rod, q, v):
+    constants = operators(rod)
+
+    def one(state):
+        return accelerate(rod, constants, *state)
+
+    return jax.lax.map(one, (q, v), batch_size=64)
+
+
+def rows():
+    q, v = (jnp.asarray(x) for x in random_states(STATES))
+    spatial, planar = finger(8), planar_finger()
+    alone = measure_together(
+        {
+            "spatial": lambda both: loop(both[0], q[0], v[0]),
+            "planar": lambda both: loop(both[1], q[0, :MODES], v[0, :MODES]),
+        },
+        (spatial, planar), repeats=15,
+    )  # fmt: skip
+    times = {name: timing.per(CALLS) for name, timing in alone.items()}
+    yield Row("sorojax", {"dof": 6, "states": 1}, **times["spatial"].columns())
+    yield Row(
+        "sorojax", {"dof": 3, "states": 1}, **times["planar"].columns(),
+        bar=PLANAR_BAR * times["spatial"].columns()["run_s"],
+    )  # fmt: skip
+    batches = {"vmap": together, "lax.map in 64": in_chunks}
+    for name, timing in measure_together(batches, spatial, q, v, repeats=15).items():
+        yield Row(
+            "sorojax", {"dof": 6, "states": STATES, "by": name},
+            **timing.per(STATES).columns(), bar=ITEM_BAR,
+        )  # fmt: skip
