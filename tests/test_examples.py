@@ -24,6 +24,15 @@ def test_drawing_to_loop_reaches_its_target():
     assert 2 < numbers["pressure at the end [kPa]"] < 4
 
 
+def test_a_tendon_finger_closes_on_a_ball():
+    numbers = _main("02_tendon_finger")()
+    bent, pull = numbers["tip angle at 0.2 N [deg]"], numbers["pull for 150 deg [N]"]
+    assert numbers["by tension [deg/N]"] == pytest.approx(bent / 0.2, rel=0.01)
+    assert pull == pytest.approx(0.2 * 150 / bent, rel=0.01)
+    assert 80 < numbers["tip angle around the ball [deg]"] < 110
+    assert 0 < numbers["overlap over thickness [%]"] < 0.5
+
+
 def test_the_program_of_the_readme_prints_what_it_says(capsys):
     (program,) = re.findall(
         r"```python\n(import jax;.*?)```", (ROOT / "README.md").read_text(), re.S

@@ -102,7 +102,6 @@ def test_an_assembly_hangs_as_the_rod_it_is_made_of():
     rest = R.equilibrium(pair, (R.Gravity(),))
     assert rest.status == Status.successful
     assert jnp.allclose(R.tip_pose(pair, rest.q)["segment_1"], tip, rtol=0, atol=1e-6)
-    # A quaternion has one coordinate more than rates: a body on springs that floats.
     lost = R.equilibrium(whole, (R.Gravity([0.0, jnp.nan]),))
     assert lost.status == Status.not_finite
 

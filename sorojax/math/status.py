@@ -16,8 +16,8 @@ class Status(eqx.Enumeration):
         "gains, limits and units are what you meant."
     )
     not_converged = (
-        "No equilibrium was found. Apply the load in steps, starting each from the last "
-        "answer, or raise `max_iterations`."
+        "The search did not settle. Apply the load, or move the targets, in steps that start "
+        "from the last answer, or raise `max_iterations`."
     )
     out_of_reach = (
         "The targets cannot be met: this is as close as the model comes. Move the targets, "
