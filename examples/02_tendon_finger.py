@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 import sorojax as sj
-from sorojax.units import deg, kPa, mm
+from sorojax.units import deg, mm
 
 FRAMES, STEP = 50, 1e-3  # saved moments; s
 
