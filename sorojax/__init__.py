@@ -1,27 +1,49 @@
 """sorojax: a JAX-native differentiable soft-robot framework.
 
-`import sorojax as sj`, then `sj.sdf`, `sj.mesh`, `sj.material`, `sj.fem`, `sj.rod`,
-`sj.reduction`, `sj.systems`, `sj.robots`, `sj.io`, `sj.view`. Importing sets no JAX flag;
+`import sorojax as sj`, then `sj.sdf`, `sj.mesh`, `sj.material`, `sj.contact`, `sj.fem`,
+`sj.rod`, `sj.reduction`, `sj.systems`, `sj.robots`, `sj.io`, `sj.view`. Importing sets no JAX flag;
 mechanics needs `jax.config.update("jax_enable_x64", True)`.
 """
 
-from sorojax import (
-    fem as fem,
-    io as io,
-    material as material,
-    math as math,
-    mesh as mesh,
-    reduction as reduction,
-    robots as robots,
-    rod as rod,
-    sdf as sdf,
-    systems as systems,
-    units as units,
-    view as view,
-)
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from sorojax import units as units
 from sorojax._cache import enable_compilation_cache as enable_compilation_cache
 from sorojax._edit import replace as replace
 from sorojax._progress import listen as listen, silent as silent
 from sorojax.math.lie import SE2 as SE2, SE3 as SE3
 
 __version__ = "0.1.0"
+
+_FLOORS = {
+    "contact", "fem", "io", "material", "math", "mesh", "reduction", "robots", "rod", "sdf",
+    "systems", "view",
+}  # fmt: skip
+
+if TYPE_CHECKING:
+    from sorojax import (
+        contact as contact,
+        fem as fem,
+        io as io,
+        material as material,
+        math as math,
+        mesh as mesh,
+        reduction as reduction,
+        robots as robots,
+        rod as rod,
+        sdf as sdf,
+        systems as systems,
+        view as view,
+    )
+
+
+def __getattr__(name: str) -> Any:
+    """A floor is imported when it is first asked for."""
+    if name in _FLOORS:
+        return importlib.import_module(f"sorojax.{name}")
+    raise AttributeError(f"module 'sorojax' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_FLOORS})

@@ -156,6 +156,7 @@ start = time.perf_counter()
 import sorojax
 seconds = time.perf_counter() - start
 import sys
+floors = [getattr(sorojax, name) for name in dir(sorojax)]
 changed = [name for name, value in jax.config.values.items() if value != flags.get(name)]
 loaded = sorted({ONLY_WHERE_USED!r} & sys.modules.keys())
 print(seconds, below, changed, loaded, sep=";")
