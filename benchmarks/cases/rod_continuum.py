@@ -1,0 +1,93 @@
+"""The soft finger D1 with stretch and shear, released at rest: error against the continuum.
+
+Planar, as the motion is: bending, stretch and shear modes by name. The reference has seven
+bending and six stretch and shear modes and is held against the tip of another code.
+"""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.fingers import LENGTH
+from benchmarks.harness import Row, measure
+from sorojax.math.lie import SE2
+from sorojax.math.steppers import GeneralisedAlpha
+from sorojax.rod import (
+    Gravity,
+    chebyshev,
+    circle,
+    motion,
+    operators,
+    rod,
+    rollout,
+    vector_field,
+)
+from sorojax.units import MPa, mm
+
+DURATION, SAVE = 0.5, 0.01  # s
+SAVES = round(DURATION / SAVE)
+PUBLISHED_TIP = np.array([7.999048e-2, -1.01831e-3])  # m at 0.5 s, by another code
+PUBLISHED_DIGITS = 1e-5  # m; the motion is not converged in modes to more
+ERROR_BAR, TIME_BAR = 5e-4, 10e-3  # of the length; s
+SETTINGS = (((4, 3, 3), 1e-3), ((5, 4, 4), 1e-3), ((5, 4, 4), 5e-4))
+
+
+def finger(bend, stretch, shear):
+    basis = chebyshev(kappa_z=bend, sigma_x=stretch, sigma_y=shear)
+    return rod(
+        SE2(), basis, circle(6 * mm, shear_factor=27 / 28), length=LENGTH,
+        young_modulus=1 * MPa, poisson_ratio=0.3, density=2000.0, nodes=bend + 5,
+    )  # fmt: skip
+
+
+def tips(body, q):
+    constants = operators(body)
+    return jax.vmap(lambda q: constants.weights @ motion(body, q, constants=constants).tangent)(
+        q
+    )
+
+
+def stepped(step):
+    def run(body):
+        rest = jnp.zeros(body.basis.num_dof)
+        path = rollout(
+            body, rest, rest, (Gravity(),), step=step, saves=SAVES, every=round(SAVE / step),
+            stepper=GeneralisedAlpha(1.0),
+        )  # fmt: skip
+        return tips(body, path.q[1:])
+
+    return run
+
+
+@jax.jit
+def reference(body):
+    rest = jnp.zeros(body.basis.num_dof)
+    solution = dfx.diffeqsolve(
+        dfx.ODETerm(vector_field(body, (Gravity(),))), dfx.Dopri8(), 0.0, DURATION, 1e-5,
+        (rest, rest), saveat=dfx.SaveAt(ts=jnp.arange(1, SAVES + 1) * SAVE),
+        max_steps=1_000_000, adjoint=dfx.ForwardMode(),
+        stepsize_controller=dfx.PIDController(rtol=1e-9, atol=1e-9),
+    )  # fmt: skip
+    assert solution.ys is not None
+    return tips(body, solution.ys[0])
+
+
+def rows():
+    want = np.asarray(reference(finger(7, 6, 6)))
+    if np.abs(want[-1] - PUBLISHED_TIP).max() > PUBLISHED_DIGITS:
+        raise RuntimeError(f"the reference ends at {want[-1]}, need {PUBLISHED_TIP}")
+    for number, (modes, step) in enumerate(SETTINGS):
+        body, run = finger(*modes), stepped(step)
+        timing = measure(run, body, repeats=5)
+        gap = np.linalg.norm(np.asarray(jax.jit(run)(body)) - want, axis=1) / LENGTH
+        error = float(np.sqrt(np.mean(gap**2)))
+        settings = {"modes": modes, "step": step}
+        text = "modes 7, 6, 6, Dopri8 to 1e-9, RMS of tip distance / length"
+        yield Row(
+            "sorojax", settings, **timing.columns(), error=error, reference=text,
+            bar=ERROR_BAR, bar_on="error",
+        )  # fmt: skip
+        if number == 0:
+            settings |= {"bar": "time"}
+            yield Row("sorojax", settings, **timing.columns(), bar=TIME_BAR)
