@@ -1,8 +1,8 @@
 """sorojax: a JAX-native differentiable soft-robot framework.
 
 `import sorojax as sj`, then `sj.sdf`, `sj.mesh`, `sj.material`, `sj.contact`, `sj.fem`,
-`sj.rod`, `sj.reduction`, `sj.systems`, `sj.robots`, `sj.io`, `sj.view`. Importing sets no JAX flag;
-mechanics needs `jax.config.update("jax_enable_x64", True)`.
+`sj.rod`, `sj.reduction`, `sj.systems`, `sj.robots`, `sj.io`, `sj.view`. Importing sets no JAX
+flag; mechanics needs `jax.config.update("jax_enable_x64", True)`.
 """
 
 import importlib

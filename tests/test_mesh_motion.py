@@ -21,7 +21,7 @@ CAN = np.array([0.5, 1.0, 0.25, 0.05])
 
 def slopes_agree(function, at, rtol=1e-6):
     # One program for the values and their derivatives.
-    both = jax.jit(lambda v: (function(v), jax.jacfwd(function)(v)))
+    both = jax.jit(lambda v: (function(v), jax.jacrev(function)(v)))
     exact = np.asarray(both(at)[1])
     step = 1e-5
     ends = [[np.asarray(both(at + s * step * e)[0]) for s in (1, -1)] for e in np.eye(len(at))]

@@ -26,6 +26,7 @@ FINGER = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2000.0)
 DISC = R.circle(6e-3, shear_factor=27 / 28)
 DOWN = jnp.array([1.0, 2.0, -9.81])
 AT = [0.3, 1.0]
+WRENCH = jnp.array([0.3, -0.1, 0.2, 1.0, 2.0, -3.0])
 Q = jnp.array([0.3, 5.0, -4.0, 0.02, 0.01, 3.0, 2.0, 0.03])  # of the planar tree
 
 
@@ -86,6 +87,8 @@ def everything(model, q, v):
     found["momentum"] = R.momentum(model, q, v)
     found["weight"] = R.gravity_force(model, q, DOWN)
     found["elastic"] = R.elastic_force(model, q)
+    moment, pushes = R.motion(model, q, v), (R.On("finger", R.TipWrench(WRENCH)),)
+    found["pushed"] = R.total_force(pushes, q[0], moment) - R.total_force((), q[0], moment)
     return found
 
 
@@ -125,6 +128,10 @@ def test_gravity_and_springs_take_their_power_from_their_energy(hand, found):
     powers = jnp.stack([found["weight"] @ hand[2], found["elastic"] @ hand[2]])
     assert jnp.abs(powers).min() > 0.01 * jnp.abs(powers).max()
     assert jnp.isclose(powers.sum(), found["potential_rate"], rtol=1e-10, atol=0)
+
+
+def test_a_wrench_on_a_carried_rod_acts_through_its_jacobian(found):
+    assert relative(found["pushed"], WRENCH @ found["jacobian"]["finger"][1]) < 1e-9
 
 
 def test_momentum_is_that_of_the_floating_base(found, hand):

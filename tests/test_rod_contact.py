@@ -194,11 +194,15 @@ def test_pushes_are_differentiable_through_contact():
         one = jnp.ones_like(speed)
         return height, ahead(one)[0], back(one)[0], depth
 
+    # unbatched, where a branch is taken and not selected
+    alone = jax.jit(jax.grad(lambda speed: push(speed)[0]))(jnp.array(300.0))
+
     change = 1e-3
     height, forward, backward, depth = every(300.0 + change * np.array([-1.0, 0.0, 1.0]))
     touches = np.asarray(depth[1] > 0)
     assert touches.any() and not touches[0] and not touches.all()
     assert np.allclose(backward, forward, rtol=1e-8, atol=0)
+    assert np.isclose(alone, forward[1], rtol=1e-8)
     assert np.isclose(forward[1], (height[2] - height[0]) / (2 * change), rtol=1e-4)
 
 

@@ -57,7 +57,7 @@ def coiling(stiffness):
     """Penetration over the radius for 1 s after a rod that rests in 1.08 turns is let
     go from 0.8 turns: the tip swings onto the base and comes to rest there.
 
-    Deepest 0.81 % at 5e7 N/m^2, in the first touch; 1.45 % at 5e6.
+    Deepest 0.81 % at 5e7 N/m^2, in the first touch.
     """
     radius = 3e-3
     rod = make_rod(
