@@ -1,6 +1,7 @@
 """Boards, clocks and the loop that runs a controller on them.
 
-NumPy only: importing this package starts no JAX and opens no device.
+NumPy and the standard library only: importing this package starts no JAX and opens no
+device.
 """
 
 from sorojax_hardware.clocks import (
@@ -9,13 +10,24 @@ from sorojax_hardware.clocks import (
 )
 from sorojax_hardware.loop import (
     Deadlines as Deadlines,
+    Overrun as Overrun,
     Tick as Tick,
     deadlines as deadlines,
     run_loop as run_loop,
+    tick_recorder as tick_recorder,
 )
 from sorojax_hardware.memory import MemoryBoard as MemoryBoard
 from sorojax_hardware.protocols import (
+    Camera as Camera,
     Clock as Clock,
     Controller as Controller,
+    Image as Image,
     ValveBoard as ValveBoard,
+)
+from sorojax_hardware.recorder import Recorder as Recorder, load_record as load_record
+from sorojax_hardware.serving import ModelValves as ModelValves, serve as serve
+from sorojax_hardware.tcp_board import (
+    BoardFault as BoardFault,
+    TcpBoard as TcpBoard,
+    connect as connect,
 )

@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sorojax_hardware.protocols import Clock, Controller, ValveBoard
+from sorojax_hardware.recorder import Recorder
 
 
 class Tick(NamedTuple):
@@ -25,7 +27,12 @@ class Deadlines(NamedTuple):
     num_ticks: int
     num_skipped: int  # planned ticks that an earlier one overran
     median_late: float  # s
+    p99_late: float  # s
     max_late: float  # s
+
+
+class Overrun(RuntimeError):
+    """A tick took longer than the loop allows; the board is vented."""
 
 
 def run_loop(
@@ -37,14 +44,17 @@ def run_loop(
     duration: float,
     period: float,
     limits: tuple[Any, Any],
+    slew: Any = np.inf,
     measure: Callable[[float, np.ndarray], Any] | None = None,
+    max_skipped: float = np.inf,
+    record: Recorder | None = None,
 ) -> Iterator[Tick]:
     """Run a pure controller on a board, one `Tick` per period.
 
     Every tick reads the pressures, measures, calls `controller(t, measurement, state)`,
-    cuts the command to `limits` and writes it. Ticks that an overrun has missed are left
-    out.
-    The board is vented however the loop ends: run out, closed, or by an exception.
+    cuts the command to `limits` and `slew` and writes it. Ticks that an overrun has missed
+    are left out. The board is vented however the loop ends: run out, closed, or by an
+    exception.
 
     Args:
         board: Where pressures are read and written.
@@ -54,11 +64,15 @@ def run_loop(
         duration: Of the run [s].
         period: Between ticks [s].
         limits: Lowest and highest set-point, numbers or one per port [Pa].
+        slew: Fastest change of a set-point, a number or one per port [Pa/s].
         measure: What the controller sees, from time [s] and pressures [Pa], for instance
             an angle from a camera; the pressures if omitted.
+        max_skipped: Ticks that one overrun may leave out before the loop gives up.
+        record: Takes every tick; make it with `tick_recorder`.
 
     Raises:
         ValueError: If a time or a limit makes no sense, or a command is not finite.
+        Overrun: If a tick left out more than `max_skipped` others.
     """
     if not (period > 0 and duration > 0):
         raise ValueError(
@@ -71,25 +85,61 @@ def run_loop(
             f"run_loop: `limits` are {low} and {high} Pa, need (lowest, highest) gauge "
             "pressures. Swap them, and check for NaN."
         )
+    most = np.broadcast_to(np.asarray(slew, float), board.num_ports)
+    if not np.all(most > 0):
+        raise ValueError(f"run_loop: `slew` is {slew} Pa/s, need it positive. 1e6 is quick.")
     see = measure or (lambda t, pressure: pressure)
-    return _ticks(board, clock, see, controller, state, duration, period, low, high)
+    bounds = _Bounds(low, high, most)
+    return _ticks(
+        board, clock, see, controller, state, duration, period, bounds, max_skipped, record
+    )
 
 
-def _ticks(board, clock, see, controller, state, duration, period, low, high):
+class _Bounds(NamedTuple):
+    low: np.ndarray
+    high: np.ndarray
+    slew: np.ndarray
+
+    def cut(self, wanted: np.ndarray, before: np.ndarray, step: float) -> np.ndarray:
+        change = self.slew * step
+        return np.clip(np.clip(wanted, before - change, before + change), self.low, self.high)
+
+
+def _ticks(board, clock, see, controller, state, duration, period, bounds, max_skipped, record):
     start, tick = clock.now(), 0
+    setpoint, before = np.clip(np.zeros(board.num_ports), bounds.low, bounds.high), -period
     try:
         while tick < duration / period - 1e-9:
             # A NumPy number: compilers that treat Python's as constants compile once.
             t = np.float64(clock.now() - start)
+            late = t - tick * period
             pressure = board.read_pressure()
             command, state = controller(t, see(t, pressure), state)
-            setpoint = np.clip(_checked(command, board.num_ports, t), low, high)
+            wanted = _checked(command, board.num_ports, t)
+            setpoint, before = bounds.cut(wanted, setpoint, t - before), t
             board.write_pressure(setpoint)
-            yield Tick(t, pressure, setpoint, state, t - tick * period)
-            tick = max(tick + 1, math.ceil((clock.now() - start) / period - 1e-9))
+            if record is not None:
+                record.write(t, late, pressure, setpoint)
+            yield Tick(t, pressure, setpoint, state, late)
+            following = max(tick + 1, math.ceil((clock.now() - start) / period - 1e-9))
+            if following - tick - 1 > max_skipped:
+                raise Overrun(
+                    f"run_loop: the tick at {tick * period:g} s overran {following - tick - 1} "
+                    f"others, `max_skipped` is {max_skipped:g}. Make the controller faster or "
+                    "the period longer. The board is vented."
+                )
+            tick = following
             clock.sleep_until(start + tick * period)
     finally:
-        board.write_pressure(np.zeros(board.num_ports))
+        board.vent()
+
+
+def tick_recorder(path: str | Path, num_ports: int, **about) -> Recorder:
+    """A file for the ticks of one run; `load_record` gives time, late, pressure, setpoint."""
+    columns = ["time", "late"]
+    for name in ("pressure", "setpoint"):
+        columns += [f"{name}[{port}]" for port in range(num_ports)]
+    return Recorder(path, columns, **about)
 
 
 def _checked(command: Any, num_ports: int, t: float) -> np.ndarray:
@@ -109,4 +159,6 @@ def deadlines(ticks: Iterable[Tick], period: float) -> Deadlines:
     seen = list(ticks)
     late = np.array([tick.late for tick in seen] or [0.0])
     planned = round((seen[-1].time - seen[-1].late) / period) + 1 if seen else 0
-    return Deadlines(len(seen), planned - len(seen), float(np.median(late)), float(late.max()))
+    median, p99 = np.percentile(late, (50, 99))
+    skipped = planned - len(seen)
+    return Deadlines(len(seen), skipped, float(median), float(p99), float(late.max()))

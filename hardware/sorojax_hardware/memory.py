@@ -68,6 +68,9 @@ class MemoryBoard:
         self._setpoint = np.clip(asked, *self._limits)
         self.clipped = self._setpoint != asked
 
+    def vent(self) -> None:
+        self.write_pressure(np.zeros_like(self._setpoint))
+
     def _advance(self) -> None:
         now = self._clock.now()
         left = np.exp(-(now - self._time) / self._lag)

@@ -1,0 +1,135 @@
+"""A valve board on the network."""
+
+import time
+
+import numpy as np
+
+from sorojax_board import messages
+from sorojax_board.frames import Kind
+from sorojax_board.messages import Refusal, Report, State
+from sorojax_hardware.link import Link
+
+
+class BoardFault(RuntimeError):
+    """The board does not follow; `report` is what it said last."""
+
+    def __init__(self, message: str, report: Report | None = None):
+        super().__init__(message)
+        self.report = report
+
+
+class TcpBoard:
+    """The client of `sorojax_board`, a `ValveBoard`.
+
+    Every call is answered within the time-out or raises; a set-point is never sent twice.
+    The board vents by itself when the set-points stop. Use it in a `with` statement:
+
+        with TcpBoard("10.0.0.7", key=key) as board:
+            board.arm((-10e3, 60e3))
+            run_loop(board, ...)
+    """
+
+    def __init__(self, host: str = "127.0.0.1", port: int = 5053, *, key: bytes = b"", **link):
+        """
+        Args:
+            host: Address of the board.
+            port: Of its framed protocol.
+            key: The key that it shares with this machine.
+            **link: `read_only=True` to watch only (the board has one writer), and
+                `timeout`, the longest wait for an answer [s], 0.2 unless given.
+
+        Raises:
+            ConnectionError: If there is no board, or it has another key or protocol.
+        """
+        self._link = Link(host, port, key, **link)
+        self.report = self._ask(Kind.PING)
+
+    @property
+    def num_ports(self) -> int:
+        return len(self._link.welcome.limits)
+
+    @property
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest set-point that the board follows [Pa]."""
+        low, high, _ = np.array(self._link.welcome.limits).T
+        return low, high
+
+    def arm(self, limits=(-1e9, 1e9)) -> None:
+        """Let the board follow; `limits` [Pa], numbers or one per port, narrow its own.
+
+        Raises:
+            BoardFault: If another client writes, or the limits leave nothing.
+        """
+        low, high = (np.broadcast_to(np.asarray(x, float), self.num_ports) for x in limits)
+        bounds = [(float(a), float(b)) for a, b in zip(low, high, strict=True)]
+        self.report = self._ask(Kind.ARM, messages.pack_arm(bounds))
+
+    def read_pressure(self) -> np.ndarray:
+        self.report = self._ask(Kind.PING)
+        return np.array(self.report.pressure)
+
+    def write_pressure(self, setpoint: np.ndarray) -> None:
+        """Ask for gauge pressures [Pa], cut to the board's limits.
+
+        Raises:
+            ValueError: If they are not finite or not one per port.
+            BoardFault: If the board does not follow; it says why.
+            ConnectionError: If no answer came in time.
+        """
+        asked = np.asarray(setpoint, float)
+        if asked.shape != (self.num_ports,) or not np.all(np.isfinite(asked)):
+            raise ValueError(
+                f"TcpBoard: `setpoint` is {asked} Pa, need {self.num_ports} finite gauge "
+                "pressures, one per port. The board keeps its last ones until its watchdog."
+            )
+        bound = np.clip(asked, *self.limits).tolist()
+        mask = (1 << self.num_ports) - 1
+        self.report = self._ask(Kind.SET, messages.pack_set(mask, bound))
+
+    def vent(self) -> None:
+        """Ramp to zero; the board follows again after `arm`."""
+        self.report = self._ask(Kind.VENT)
+
+    def close(self) -> None:
+        """Say goodbye: the board vents."""
+        self._link.close()
+
+    def __enter__(self) -> "TcpBoard":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
+    def _ask(self, kind: Kind, payload: bytes = b"") -> Report:
+        frame = self._link.ask(kind, payload)
+        if frame.kind == Kind.STATE:
+            return messages.unpack_report(frame.payload)
+        _, why = messages.unpack_refused(frame.payload)
+        report = messages.unpack_report(self._link.ask(Kind.PING).payload)
+        raise BoardFault(_explained(kind, why, report), report)
+
+
+def _explained(kind: Kind, why: Refusal, report: Report) -> str:
+    text = f"TcpBoard: the board refused {kind.name}: {why.name.lower().replace('_', ' ')}."
+    if why is Refusal.NOT_ARMED and report.state is State.FAULT:
+        fault = str(report.fault.name).lower().replace("_", " ")
+        text += f" It vented after a fault: {fault}. Look for the cause, then arm()."
+    elif why is Refusal.NOT_ARMED:
+        text += " Call arm() first."
+    elif why is Refusal.NOT_WRITER:
+        text += " Another client writes, or this one is read-only."
+    return text
+
+
+def connect(host: str = "127.0.0.1", port: int = 5053, *, attempts: int = 6, **options):
+    """A `TcpBoard`, tried again with growing pauses (0.1 s, 0.2 s, ...) while there is none.
+
+    Raises:
+        ConnectionError: If the last attempt fails too.
+    """
+    for attempt in range(attempts - 1):
+        try:
+            return TcpBoard(host, port, **options)
+        except ConnectionError:
+            time.sleep(0.1 * 2**attempt)
+    return TcpBoard(host, port, **options)

@@ -1,0 +1,267 @@
+"""The board over sockets, the loop on it, and the record of a run."""
+
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sorojax_board.__main__ import main, new_key, read_config, read_key
+from sorojax_board.bench import BenchValves
+from sorojax_board.board import settings
+from sorojax_board.messages import Fault, State
+from sorojax_board.server import Server
+from sorojax_hardware import (
+    BoardFault,
+    MemoryBoard,
+    ModelValves,
+    Overrun,
+    Recorder,
+    SimulatedClock,
+    TcpBoard,
+    ValveBoard,
+    WallClock,
+    connect,
+    load_record,
+    run_loop,
+    serve,
+    tick_recorder,
+)
+
+KEY = bytes(range(32))
+kPa = 1e3
+
+
+@pytest.fixture
+def desk():
+    valves = BenchValves(2, noise=0.0)
+    with serve(settings(2, low=-10 * kPa, high=60 * kPa), valves, key=KEY) as server:
+        yield server, valves
+
+
+def wait_for(condition, limit=5.0):
+    start = time.monotonic()
+    while not condition():
+        assert time.monotonic() - start < limit
+        time.sleep(0.005)
+    return time.monotonic() - start
+
+
+def hold(port, pressure=50 * kPa):
+    """Drive a board until it is there."""
+    board = TcpBoard(port=port, key=KEY)
+    board.arm()
+    while abs(board.read_pressure()[0] - pressure) > 0.5 * kPa:
+        board.write_pressure(np.full(2, pressure))
+        time.sleep(0.005)
+    return board
+
+
+def test_the_loop_runs_over_the_wire_and_leaves_a_record(desk, tmp_path):
+    server, _ = desk
+    with TcpBoard(port=server.port, key=KEY) as board:
+        assert isinstance(board, ValveBoard) and board.num_ports == 2
+        board.arm((-5 * kPa, 40 * kPa))
+        with tick_recorder(tmp_path / "run.log", 2, who="test") as record:
+            ticks = list(
+                run_loop(
+                    board, WallClock(), lambda t, p, s: (30 * kPa, s + 1), 0, duration=0.4,
+                    period=0.005, limits=(0.0, 60 * kPa), slew=1e6, record=record,
+                )
+            )  # fmt: skip
+        assert board.report.state is State.VENTED  # the loop vents
+    columns, about = load_record(tmp_path / "run.log")
+    assert about == {"who": "test"} and len(columns["time"]) == len(ticks)
+    assert np.array_equal(columns["pressure"], [tick.pressure for tick in ticks])
+    assert np.all(np.diff(columns["setpoint"][:, 0]) <= 1e6 * np.diff(columns["time"]) + 1e-6)
+    assert abs(ticks[-1].pressure[0] - 30 * kPa) < 1 * kPa
+
+
+def test_a_killed_client_leaves_the_board_at_zero(desk):
+    server, valves = desk
+    code = (
+        "import sys, time, numpy as np\n"
+        "from sorojax_hardware import TcpBoard\n"
+        "board = TcpBoard(port=int(sys.argv[1]), key=bytes(range(32)))\n"
+        "board.arm()\n"
+        "while True:\n"
+        "    board.write_pressure(np.full(2, 50e3)); time.sleep(0.005)\n"
+    )
+    path = ":".join(filter(None, sys.path))
+    child = subprocess.Popen(
+        [sys.executable, "-c", code, str(server.port)], env={"PYTHONPATH": path}
+    )
+    try:
+        wait_for(lambda: valves.pressure[0] > 49 * kPa, 30.0)
+    finally:
+        child.send_signal(signal.SIGKILL)
+        child.wait()
+    assert wait_for(lambda: max(map(abs, valves.pressure)) < 0.5 * kPa) < 0.9  # 0.6 measured
+    assert server.board.fault is Fault.DISCONNECTED
+
+
+def test_a_silent_client_is_vented_and_told_why(desk):
+    server, valves = desk
+    board = hold(server.port)
+    assert wait_for(lambda: max(map(abs, valves.pressure)) < 0.5 * kPa) < 0.9
+    with pytest.raises(BoardFault, match="fault: watchdog.*arm") as caught:
+        board.write_pressure(np.zeros(2))
+    assert caught.value.report.fault is Fault.WATCHDOG
+    board.arm()
+    board.write_pressure(np.full(2, 5 * kPa))
+    board.close()
+
+
+def test_a_server_that_stops_leaves_the_valves_at_zero_and_the_client_an_error():
+    valves = BenchValves(2)
+    with serve(settings(2), valves, key=KEY) as server:
+        board = hold(server.port)
+    assert valves._written == (0.0, 0.0)
+    with pytest.raises((ConnectionError, BoardFault)):
+        for _ in range(3):
+            board.write_pressure(np.zeros(2))
+    with pytest.raises(ConnectionError, match="no board at"):
+        connect(port=server.port, key=KEY, attempts=2)
+
+
+def test_who_may_connect(desk):
+    server, _ = desk
+    with pytest.raises(ConnectionError, match="another key"):
+        TcpBoard(port=server.port, key=bytes(32))
+    with (
+        TcpBoard(port=server.port, key=KEY) as first,
+        TcpBoard(port=server.port, key=KEY) as second,
+        TcpBoard(port=server.port, key=KEY, read_only=True) as watcher,
+    ):
+        with pytest.raises(BoardFault, match="arm"):
+            first.write_pressure(np.zeros(2))
+        first.arm()
+        with pytest.raises(BoardFault, match="Another client writes"):
+            second.arm()
+        with pytest.raises(BoardFault, match="read-only"):
+            watcher.arm()
+        assert watcher.read_pressure().shape == (2,)
+        with pytest.raises(ValueError, match="2 finite"):
+            first.write_pressure(np.array([np.nan, 0.0]))
+
+
+def test_strangers_do_not_disturb(desk):
+    server, _ = desk
+    random = np.random.default_rng(0)
+    board = hold(server.port, 20 * kPa)
+    for data in (b"GET / HTTP/1.1\r\n\r\n", random.bytes(3000), b"SORO", b""):
+        with socket.create_connection(("127.0.0.1", server.port)) as stranger:
+            stranger.sendall(data)
+            stranger.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        board.write_pressure(np.full(2, 20 * kPa))  # still there, still followed
+    assert server.board.state is State.ARMED
+    board.close()
+
+
+def test_an_open_address_needs_a_key():
+    board = object()
+    with pytest.raises(ValueError, match="without a key"):
+        Server(board, host="0.0.0.0")  # type: ignore
+    with pytest.raises(ValueError, match="16 or more"):
+        Server(board, key=b"short")  # type: ignore
+
+
+def test_a_model_stands_behind_the_board():
+    """A first-order chamber: the host sees its pressure, not the set-point."""
+
+    def advance(state, setpoint, dt):
+        state = state + (setpoint - state) * (1 - np.exp(-dt / 0.05))
+        return state, state
+
+    valves = ModelValves(advance, np.zeros(1), 1, noise=0.0)
+    valves.write([10 * kPa])
+    times = np.linspace(0.0, 0.1, 21)
+    told = np.array([valves.read(now)[0] for now in times])
+    assert np.allclose(told, 10 * kPa * (1 - np.exp(-times / 0.05)), atol=10.0 + 1000.0)
+    assert told[-1] == pytest.approx(10 * kPa * (1 - np.exp(-2.0)), rel=0.02)
+    with serve(settings(1), valves) as server, TcpBoard(port=server.port) as board:
+        assert board.read_pressure().shape == (1,)
+
+
+def test_a_loop_that_is_too_late_gives_up():
+    clock = SimulatedClock()
+    board = MemoryBoard(clock, 1)
+
+    def slow(t, measurement, state):
+        clock.sleep_until(clock.now() + 0.05)
+        return 0.0, state
+
+    with pytest.raises(Overrun, match="overran 4 others"):
+        list(run_loop(board, clock, slow, None, duration=1.0, period=0.011, limits=(0, 1),
+                      max_skipped=3))  # fmt: skip
+    assert np.all(board.setpoint == 0)
+    with pytest.raises(ValueError, match="slew"):
+        run_loop(board, clock, slow, None, duration=1, period=1, limits=(0, 1), slew=0.0)
+
+
+def test_a_record_cut_short_is_read_to_its_last_row(tmp_path):
+    path = tmp_path / "run.log"
+    with Recorder(path, ["time", "x[0]", "x[1]"]) as record:
+        for k in range(5):
+            record.write(k, [k, -k])
+        with pytest.raises(ValueError, match="need 3"):
+            record.write(1.0)
+    path.write_bytes(path.read_bytes()[:-7])
+    columns, _ = load_record(path)
+    assert columns["time"].tolist() == [0, 1, 2, 3] and columns["x"].shape == (4, 2)
+    path.write_bytes(b"<html>")
+    with pytest.raises(ValueError, match="no record"):
+        load_record(path)
+
+
+def test_keys_and_configuration_files(tmp_path, capsys):
+    key = tmp_path / "key"
+    new_key(key)
+    assert len(read_key(key)) == 32 and read_key(None) == b""
+    key.chmod(0o644)
+    with pytest.raises(PermissionError, match="0600"):
+        read_key(key)
+    config = tmp_path / "board.json"
+    config.write_text('{"ports": [{"low": -1e4, "high": 6e4}], "watchdog": 0.2}')
+    chosen, wiring = read_config(config)
+    assert (chosen.watchdog, chosen.limits[0].high, len(wiring)) == (0.2, 6e4, 1)
+    for wrong in ('{"ports": [{"low": 1, "high": 2}]}', '{"ports": [], "watchdog": 9}', "[}"):
+        config.write_text(wrong)
+        assert main(["--config", str(config)]) == 2
+    assert "sorojax_board:" in capsys.readouterr().err
+
+
+def test_the_program_serves_and_ends_on_request():
+    path = ":".join(filter(None, sys.path))
+    child = subprocess.Popen(
+        [sys.executable, "-m", "sorojax_board", "--port", "0"],
+        stdout=subprocess.PIPE, text=True, env={"PYTHONPATH": path},
+    )  # fmt: skip
+    try:
+        line = child.stdout.readline()  # type: ignore
+        with TcpBoard(port=int(line.rsplit(":", 1)[1])) as board:
+            assert board.num_ports == 12
+            board.arm()
+            board.write_pressure(np.full(12, 1 * kPa))
+    finally:
+        child.send_signal(signal.SIGTERM)
+    assert child.wait(10) == 0
+
+
+def test_the_board_needs_nothing_but_python():
+    """It runs on a bare Raspberry Pi."""
+    root = Path(__file__).parents[1] / "hardware" / "pi"
+    code = (
+        "import sys; import sorojax_board.__main__\n"
+        "print(sorted(m for m in ('numpy', 'sorojax', 'jax') if m in sys.modules))"
+    )
+    run = subprocess.run(
+        [sys.executable, "-I", "-c", f"import sys; sys.path.insert(0, {str(root)!r})\n{code}"],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert run.stdout.strip() == "[]", run.stderr
