@@ -1,8 +1,8 @@
 """sorojax: a JAX-native differentiable soft-robot framework.
 
 `import sorojax as sj`, then `sj.sdf`, `sj.mesh`, `sj.material`, `sj.contact`, `sj.fem`,
-`sj.rod`, `sj.reduction`, `sj.systems`, `sj.robots`, `sj.io`, `sj.view`. Importing sets no JAX
-flag; mechanics needs `jax.config.update("jax_enable_x64", True)`.
+`sj.rod`, `sj.reduction`, `sj.systems`, `sj.robots`, `sj.io`, `sj.view`, `sj.vision`. Importing sets
+no JAX flag; mechanics needs `jax.config.update("jax_enable_x64", True)`.
 """
 
 import importlib
@@ -18,7 +18,7 @@ __version__ = "0.1.0"
 
 _FLOORS = {
     "contact", "fem", "io", "material", "math", "mesh", "reduction", "robots", "rod", "sdf",
-    "systems", "view",
+    "systems", "view", "vision",
 }  # fmt: skip
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
         sdf as sdf,
         systems as systems,
         view as view,
+        vision as vision,
     )
 
 

@@ -4,6 +4,12 @@ NumPy and the standard library only: importing this package starts no JAX and op
 device.
 """
 
+from sorojax_hardware.cameras import (
+    DrawnCamera as DrawnCamera,
+    FolderCamera as FolderCamera,
+    Latest as Latest,
+    VideoCamera as VideoCamera,
+)
 from sorojax_hardware.clocks import (
     SimulatedClock as SimulatedClock,
     WallClock as WallClock,
@@ -24,6 +30,7 @@ from sorojax_hardware.protocols import (
     Image as Image,
     ValveBoard as ValveBoard,
 )
+from sorojax_hardware.realsense import RealSenseCamera as RealSenseCamera
 from sorojax_hardware.recorder import Recorder as Recorder, load_record as load_record
 from sorojax_hardware.serving import ModelValves as ModelValves, serve as serve
 from sorojax_hardware.tcp_board import (

@@ -1,0 +1,49 @@
+"""Vision: from an image to points. Pure functions over NumPy arrays; OpenCV where used."""
+
+from sorojax.vision.calibration import (
+    CharucoBoard as CharucoBoard,
+    calibrate as calibrate,
+)
+from sorojax.vision.camera import (
+    Camera as Camera,
+    Pose as Pose,
+    deproject as deproject,
+    depth_at as depth_at,
+    load_camera as load_camera,
+    project as project,
+    rays as rays,
+    save_camera as save_camera,
+)
+from sorojax.vision.colour import (
+    BLUE as BLUE,
+    GREEN as GREEN,
+    RED as RED,
+    Colour as Colour,
+    colour_mask as colour_mask,
+)
+from sorojax.vision.discs import (
+    Discs as Discs,
+    find_discs as find_discs,
+    hough_discs as hough_discs,
+    refine_discs as refine_discs,
+)
+from sorojax.vision.fiducials import (
+    Fiducials as Fiducials,
+    find_fiducials as find_fiducials,
+    marker_corners as marker_corners,
+    marker_pose as marker_pose,
+    world_frame as world_frame,
+)
+from sorojax.vision.synthetic import (
+    Disturbance as Disturbance,
+    background as background,
+    draw_discs as draw_discs,
+    draw_plane as draw_plane,
+    fiducial_picture as fiducial_picture,
+    photograph as photograph,
+)
+from sorojax.vision.tracking import (
+    Tracks as Tracks,
+    follow as follow,
+    start_tracks as start_tracks,
+)

@@ -1,0 +1,156 @@
+"""The pinhole camera with Brown-Conrady distortion, and depth images.
+
+Camera frame: x right, y down, z along the optical axis. Pixel (0, 0) is the centre of the
+first one. NumPy, because a frame is seen by several programs that do not run JAX.
+
+Reference: D. C. Brown, "Close-range camera calibration", Photogrammetric Engineering 37,
+1971; the order k1 k2 p1 p2 k3 of the coefficients is that of OpenCV and RealSense.
+"""
+
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+_NONE = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class Camera(NamedTuple):
+    """Intrinsics: focal lengths and principal point [px], distortion, image size [px].
+
+    `rms` is the error of the calibration that found them [px].
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float, float] = _NONE
+    width: int = 640
+    height: int = 480
+    rms: float = 0.0
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+
+class Pose(NamedTuple):
+    """Maps points of its own frame to another one: rotation @ x + translation [m]."""
+
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, " 3"]
+
+    def apply(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        return points @ self.rotation.T + self.translation
+
+    def inverse(self) -> "Pose":
+        return Pose(self.rotation.T, -self.rotation.T @ self.translation)
+
+
+def project(camera: Camera, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
+    """Pixels of points in the camera frame [m]; NaN behind the camera."""
+    points = np.asarray(points, float)
+    depth = points[..., 2:]
+    plane = np.divide(points[..., :2], depth, where=depth > 0, out=np.full(
+        points[..., :2].shape, np.nan))  # fmt: skip
+    return _distorted(camera, plane) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+
+
+def deproject(
+    camera: Camera, pixels: Float[np.ndarray, "*n 2"], depth: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n 3"]:
+    """Points in the camera frame [m] from pixels and their depth along the axis [m]; NaN
+    where the depth is not positive, as a sensor marks what it could not see."""
+    depth = np.asarray(depth, float)
+    depth = np.where(depth > 0, depth, np.nan)[..., None]
+    plane = rays(camera, pixels)
+    return np.concatenate([plane * depth, depth], axis=-1)
+
+
+def rays(camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+    """Undistorted coordinates x/z, y/z of pixels, by Newton's method."""
+    pixels = np.asarray(pixels, float)
+    wanted = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    if not any(camera.distortion):
+        return wanted
+    plane, change = wanted, np.inf
+    for _ in range(20):
+        if not change > 1e-14:  # NaN ends it too
+            break
+        left = wanted - _distorted(camera, plane)
+        (a, b), (c, d) = _slopes(camera, plane)
+        x, y = left[..., 0], left[..., 1]
+        move = np.stack([d * x - b * y, a * y - c * x], axis=-1) / (a * d - b * c)[..., None]
+        plane, change = plane + move, np.max(np.abs(move), initial=0.0)
+    return plane
+
+
+def depth_at(
+    depth: Float[np.ndarray, "height width"], pixels: Float[np.ndarray, "n 2"], reach: int = 2
+) -> Float[np.ndarray, " n"]:
+    """Median of the known depths within `reach` pixels [m]; zero where none is known."""
+    height, width = depth.shape
+    found = np.zeros(len(pixels))
+    for k, (x, y) in enumerate(np.rint(pixels).astype(int)):
+        top, left = max(y - reach, 0), max(x - reach, 0)
+        window = depth[top : min(y + reach + 1, height), left : min(x + reach + 1, width)]
+        known = window[np.isfinite(window) & (window > 0)]
+        found[k] = np.median(known) if known.size else 0.0
+    return found
+
+
+def _distorted(camera: Camera, plane: np.ndarray) -> np.ndarray:
+    k1, k2, p1, p2, k3 = camera.distortion
+    x, y = plane[..., 0], plane[..., 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    across = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    down = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return np.stack([x * radial + across, y * radial + down], axis=-1)
+
+
+def _slopes(camera: Camera, plane: np.ndarray):
+    """Derivative of `_distorted`, two rows of two arrays."""
+    k1, k2, p1, p2, k3 = camera.distortion
+    x, y = plane[..., 0], plane[..., 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    rise = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))
+    mixed = x * y * rise + 2 * (p1 * x + p2 * y)
+    return (
+        (radial + x * x * rise + 2 * p1 * y + 6 * p2 * x, mixed),
+        (mixed, radial + y * y * rise + 6 * p1 * y + 2 * p2 * x),
+    )
+
+
+def save_camera(path: str | Path, camera: Camera) -> None:
+    """Write a calibration as JSON."""
+    Path(path).write_text(json.dumps(camera._asdict(), indent=1))
+
+
+def load_camera(path: str | Path) -> Camera:
+    """Read a calibration.
+
+    Raises:
+        ValueError: If the file does not hold a camera.
+    """
+    try:
+        told = json.loads(Path(path).read_text())
+        told["distortion"] = tuple(float(k) for k in told["distortion"])
+        camera = Camera(**told)
+        numbers = np.array(
+            [*camera[:4], *camera.distortion, camera.width, camera.height], float
+        )
+        fine = len(camera.distortion) == 5 and np.all(np.isfinite(numbers))
+        fine = bool(fine and camera.fx > 0 and camera.fy > 0 and camera.width > 0)
+    except (KeyError, TypeError, ValueError, UnicodeDecodeError):
+        fine = False
+    if not fine:
+        raise ValueError(
+            f"load_camera: {path} holds no camera, need what `save_camera` wrote. Calibrate "
+            "again."
+        )
+    return camera

@@ -1,0 +1,141 @@
+"""ArUco markers: corners to a few hundredths of a pixel, poses, and the world frame.
+
+Corners come from the edges: on normals of each side the gradient-weighted place of the
+edge, a total least squares line through them, and the intersections of neighbouring lines.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sorojax.vision._opencv import opencv
+from sorojax.vision.camera import Camera, Pose
+
+
+class Fiducials(NamedTuple):
+    """Identity and corners [px] of markers, from the marker's own top left, clockwise."""
+
+    ids: Int[np.ndarray, " n"]
+    corners: Float[np.ndarray, "n 4 2"]
+
+
+def find_fiducials(image: np.ndarray, dictionary: str = "6X6_250") -> Fiducials:
+    """The ArUco markers of an image, grey or in colour.
+
+    Args:
+        image: Of 8-bit numbers.
+        dictionary: Name in OpenCV without `DICT_`.
+
+    Raises:
+        ValueError: If OpenCV has no such dictionary.
+    """
+    cv2 = opencv()
+    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
+    corners, ids, _ = _detector(dictionary).detectMarkers(grey)
+    if ids is None:
+        return Fiducials(np.zeros(0, int), np.zeros((0, 4, 2)))
+    rough = np.array(corners, float).reshape(-1, 4, 2)
+    refined = np.stack([_refined(grey, one) for one in rough])
+    order = np.argsort(ids.ravel(), kind="stable")
+    return Fiducials(ids.ravel()[order], refined[order])
+
+
+def marker_corners(size: float) -> Float[np.ndarray, "4 3"]:
+    """Corners of a marker of side `size` [m] in its frame: x right, y up, z to the viewer."""
+    return size / 2 * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+
+
+def marker_pose(camera: Camera, corners: Float[np.ndarray, "4 2"], size: float) -> Pose:
+    """Pose of one marker of side `size` [m] in the camera frame."""
+    cv2 = opencv()
+    _, turn, place = cv2.solvePnP(
+        marker_corners(size), corners, camera.matrix, np.array(camera.distortion),
+        flags=cv2.SOLVEPNP_IPPE_SQUARE,
+    )  # fmt: skip
+    return Pose(cv2.Rodrigues(turn)[0], place.ravel())
+
+
+def world_frame(
+    camera: Camera,
+    found: Fiducials,
+    places: Mapping[int, Float[np.ndarray, "4 3"]],
+) -> Pose:
+    """Pose of the world in the camera frame, from markers whose corners [m] are known there.
+
+    Raises:
+        ValueError: If none of the known markers was found.
+    """
+    cv2 = opencv()
+    known = [k for k, one in enumerate(found.ids) if int(one) in places]
+    if not known:
+        raise ValueError(
+            f"world_frame: found markers {found.ids.tolist()}, need one of {sorted(places)}. "
+            "Turn the camera to the board, or give the places of the markers it sees."
+        )
+    points = np.concatenate([np.asarray(places[int(found.ids[k])], float) for k in known])
+    pixels = np.concatenate([found.corners[k] for k in known])
+    distortion = np.array(camera.distortion)
+    method = cv2.SOLVEPNP_SQPNP
+    _, turn, place = cv2.solvePnP(points, pixels, camera.matrix, distortion, flags=method)
+    turn, place = cv2.solvePnPRefineLM(points, pixels, camera.matrix, distortion, turn, place)
+    left, _, right = np.linalg.svd(cv2.Rodrigues(turn)[0])
+    return Pose(left @ right, place.ravel())
+
+
+def _detector(dictionary: str):
+    aruco = opencv().aruco
+    code = getattr(aruco, f"DICT_{dictionary.upper()}", None)
+    if code is None:
+        names = [name[5:] for name in dir(aruco) if name.startswith("DICT_")]
+        raise ValueError(
+            f"find_fiducials: got dictionary {dictionary!r}, need one of {', '.join(names)}."
+        )
+    return aruco.ArucoDetector(aruco.getPredefinedDictionary(code))
+
+
+def _refined(grey: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    for reach in (3.0, 2.0):
+        corners = _from_edges(grey, corners, reach)
+    return corners
+
+
+def _from_edges(grey: np.ndarray, corners: np.ndarray, reach: float) -> np.ndarray:
+    sides = np.roll(corners, -1, axis=0) - corners
+    along = sides / np.linalg.norm(sides, axis=1, keepdims=True)
+    across = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    start = corners[:, None] + np.linspace(0.12, 0.88, 24)[None, :, None] * sides[:, None]
+    offset = _edge_offsets(grey, start, across, reach)
+    points = start + offset[..., None] * across[:, None]
+    lines = [_line(p, o) for p, o in zip(points, offset, strict=True)]
+    refined = np.array([_crossing(lines[k - 1], lines[k]) for k in range(4)])
+    # a corner that runs away had no edge to hold on to
+    fine = np.linalg.norm(refined - corners, axis=1) < 2 * reach
+    return np.where(fine[:, None], refined, corners)
+
+
+def _edge_offsets(grey, start, across, reach: float) -> np.ndarray:
+    """Where on the normal through each point the grey value changes most [px]."""
+    cv2, steps = opencv(), np.arange(-reach, reach + 0.01, 0.5)
+    at = start[:, :, None] + steps[None, None, :, None] * across[:, None, None]
+    x, y = at[..., 0].astype(np.float32), at[..., 1].astype(np.float32)
+    size = x.shape
+    values = cv2.remap(grey, x.reshape(size[0], -1), y.reshape(size[0], -1), cv2.INTER_LINEAR)
+    values = values.reshape(size).astype(float)
+    slope, middle = np.abs(values[..., 2:] - values[..., :-2]), steps[1:-1]
+    peak = middle[np.argmax(slope, axis=-1)]
+    weight = slope * (np.abs(middle - peak[..., None]) <= 1.6)
+    return (weight * middle).sum(axis=-1) / np.maximum(weight.sum(axis=-1), 1e-9)
+
+
+def _line(points: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, float]:
+    """Normal and distance of the line nearest to the points that agree with each other."""
+    kept = points[np.abs(offset - np.median(offset)) < 0.6]
+    middle = kept.mean(axis=0)
+    normal = np.linalg.svd(kept - middle)[2][1]
+    return normal, float(normal @ middle)
+
+
+def _crossing(one, other) -> np.ndarray:
+    return np.linalg.solve(np.stack([one[0], other[0]]), np.array([one[1], other[1]]))

@@ -1,0 +1,111 @@
+"""Pictures with known answers: discs, markers and boards, with blur, noise and hiding."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sorojax.vision._opencv import opencv
+from sorojax.vision.camera import Camera, Pose, project, rays
+from sorojax.vision.colour import Image
+
+#: Blue, green, red of discs that the colours RED, GREEN and BLUE find.
+PAINTS = ((40.0, 40.0, 210.0), (45.0, 190.0, 50.0), (205.0, 70.0, 40.0))
+
+
+class Disturbance(NamedTuple):
+    """What a lens and a sensor do: blur [px] and noise [grey levels], standard deviations."""
+
+    blur: float = 0.8
+    noise: float = 4.0
+
+
+def background(width: int, height: int) -> Float[np.ndarray, "height width 3"]:
+    """A dim, uneven grey."""
+    x, y = np.arange(width), np.arange(height)[:, None]
+    grey = 110 + 25 * np.sin(x / 190) + 12 * np.cos(y / 130)
+    return np.repeat(grey[..., None], 3, axis=2)
+
+
+def draw_discs(
+    canvas: Float[np.ndarray, "height width 3"],
+    centres: Float[np.ndarray, "n 2"],
+    radius: Float[np.ndarray, " n"],
+    colour: Int[np.ndarray, " n"],
+    fine: int = 8,
+) -> Float[np.ndarray, "height width 3"]:
+    """Discs on a canvas, edges covered to 1 / `fine`^2 of a pixel."""
+    canvas = canvas.copy()
+    for (x, y), r, kind in zip(centres, radius, colour, strict=True):
+        x0, y0, side = int(x - r) - 2, int(y - r) - 2, 2 * int(r) + 6
+        at = (np.arange(side * fine) + 0.5) / fine - 0.5
+        inside = (x0 + at[None] - x) ** 2 + (y0 + at[:, None] - y) ** 2 < r * r
+        part = inside.reshape(side, fine, side, fine).mean(axis=(1, 3))[..., None]
+        top, left = max(-y0, 0), max(-x0, 0)
+        target = canvas[y0 + top : y0 + side, x0 + left : x0 + side]
+        part = part[top : top + target.shape[0], left : left + target.shape[1]]
+        target[:] = target * (1 - part) + np.array(PAINTS[int(kind)]) * part
+    return canvas
+
+
+def draw_plane(
+    canvas: Float[np.ndarray, "height width 3"],
+    camera: Camera,
+    pose: Pose,
+    picture: np.ndarray,
+    size: tuple[float, float],
+    fine: int = 4,
+) -> Float[np.ndarray, "height width 3"]:
+    """A flat grey picture of `size` [m] in space, as the camera sees it.
+
+    The picture's middle is the origin of `pose`, x to its right, y up. Exact: every sample
+    of a pixel is followed back to the plane, distortion included.
+    """
+    corners = np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    outline = project(camera, pose.apply(corners * [size[0] / 2, size[1] / 2, 0]))
+    (x0, y0), (x1, y1) = (
+        np.clip(np.floor(outline.min(axis=0)) - 1, 0, None).astype(int),
+        np.minimum(np.ceil(outline.max(axis=0)) + 2, canvas.shape[1::-1]).astype(int),
+    )
+    canvas = canvas.copy()
+    if x1 <= x0 or y1 <= y0:
+        return canvas
+    part = (np.arange(fine) + 0.5) / fine - 0.5
+    x, y = (np.add.outer(np.arange(a, b), part).ravel() for a, b in ((x0, x1), (y0, y1)))
+    ray = rays(camera, np.stack(np.meshgrid(x, y), axis=-1))
+    ray = np.concatenate([ray, np.ones_like(ray[..., :1])], axis=-1) @ pose.rotation
+    origin = pose.rotation.T @ -pose.translation
+    there = origin[:2] - ray[..., :2] * (origin[2] / ray[..., 2])[..., None]
+    rows, columns = picture.shape[:2]
+    u = np.floor((there[..., 0] / size[0] + 0.5) * columns).astype(int)
+    v = np.floor((0.5 - there[..., 1] / size[1]) * rows).astype(int)
+    inside = (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
+    value = picture[np.clip(v, 0, rows - 1), np.clip(u, 0, columns - 1)].astype(float)
+    window = canvas[y0:y1, x0:x1]
+    shape = (y1 - y0, fine, x1 - x0, fine)
+    cover = inside.reshape(shape).mean(axis=(1, 3))[..., None]
+    ink = np.where(inside, value, 0.0).reshape(shape).mean(axis=(1, 3))[..., None]
+    window[:] = window * (1 - cover) + ink
+    return canvas
+
+
+def fiducial_picture(number: int, dictionary: str = "6X6_250") -> np.ndarray:
+    """A marker with a quiet zone of one square around it: 10 by 10 squares for 6X6."""
+    aruco = opencv().aruco
+    words = aruco.getPredefinedDictionary(getattr(aruco, f"DICT_{dictionary.upper()}"))
+    side = words.markerSize + 2
+    picture = aruco.generateImageMarker(words, number, side, borderBits=1)
+    return np.pad(picture, 1, constant_values=255)
+
+
+def photograph(
+    canvas: Float[np.ndarray, "height width 3"],
+    disturbance: Disturbance,
+    random: np.random.Generator,
+) -> Image:
+    """What the sensor makes of a canvas."""
+    cv2 = opencv()
+    if disturbance.blur > 0:
+        canvas = cv2.GaussianBlur(canvas, (0, 0), disturbance.blur)
+    noisy = canvas + disturbance.noise * random.standard_normal(canvas.shape)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
