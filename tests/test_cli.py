@@ -121,3 +121,26 @@ def test_cache_follows_the_user_directories(monkeypatch, tmp_path):
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path))
     assert cache_directory() == tmp_path / ".cache" / "sorojax" / "jax"
+
+
+def test_a_robot_is_written_with_its_checks(tmp_path, capsys):
+    file = tmp_path / "planar.stl"
+    wide = ["--set", "plate_thickness=5", "--set", "bellows.wall_thickness=1.6"]
+    assert main(["robots", "planar", "--size", "1.5", "--out", str(file), *wide]) == 0
+    told = capsys.readouterr().out
+    assert "watertight, one shell, genus 1, 0 crossing" in told and file.stat().st_size > 10_000
+    assert main(["robots", "planar", *wide, "--list"]) == 0
+    listed = dict(line.split() for line in capsys.readouterr().out.splitlines())
+    assert listed["plate_thickness"] == "5" and listed["bellows.wall_thickness"] == "1.6"
+    assert main(["robots", "planar", "--set", "colour=3"]) == 2
+    assert "no dimension 'colour', need one of bellows.outer_radius" in capsys.readouterr().err
+
+
+def test_a_board_is_printed_and_too_few_pictures_are_refused(tmp_path, capsys):
+    cv2 = pytest.importorskip("cv2")
+    board = tmp_path / "board.png"
+    assert main(["calibrate", "--print", str(board)]) == 0
+    assert cv2.imread(str(board)).shape[:2] == (720, 960)
+    assert main(["calibrate", str(board), "--out", str(tmp_path / "camera.json")]) == 2
+    assert "1 pictures show 6 corners" in capsys.readouterr().err
+    assert main(["calibrate", __file__]) == 2

@@ -6,6 +6,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from sorojax.cli import calibrate, robots
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status.
@@ -14,6 +16,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     was raised.
     """
     arguments = _parser().parse_args(argv)
+    if arguments.run is robots.run:
+        _start_jax()
     if os.environ.get("SOROJAX_DEBUG"):
         return arguments.run(arguments)
     try:
@@ -42,6 +46,8 @@ def _parser() -> argparse.ArgumentParser:
 
     info = commands.add_parser("info", help="versions, devices, solvers, cache")
     info.set_defaults(run=_info)
+    for command in (robots, calibrate):
+        command.add(commands)
     return parser
 
 
