@@ -1,8 +1,9 @@
 """sorojax: a JAX-native differentiable soft-robot framework.
 
 `import sorojax as sj`, then `sj.sdf`, `sj.mesh`, `sj.material`, `sj.contact`, `sj.fem`,
-`sj.rod`, `sj.reduction`, `sj.systems`, `sj.robots`, `sj.io`, `sj.view`, `sj.vision`. Importing sets
-no JAX flag; mechanics needs `jax.config.update("jax_enable_x64", True)`.
+`sj.rod`, `sj.reduction`, `sj.systems`, `sj.design`, `sj.robots`, `sj.io`, `sj.view`,
+`sj.vision`, `sj.sweep`. Importing sets no JAX flag; mechanics needs
+`jax.config.update("jax_enable_x64", True)`.
 """
 
 import importlib
@@ -17,13 +18,14 @@ from sorojax.math.lie import SE2 as SE2, SE3 as SE3
 __version__ = "0.1.0"
 
 _FLOORS = {
-    "contact", "fem", "io", "material", "math", "mesh", "reduction", "robots", "rod", "sdf",
-    "systems", "view", "vision",
+    "contact", "design", "fem", "io", "material", "math", "mesh", "reduction", "robots", "rod",
+    "sdf", "sweep", "systems", "view", "vision",
 }  # fmt: skip
 
 if TYPE_CHECKING:
     from sorojax import (
         contact as contact,
+        design as design,
         fem as fem,
         io as io,
         material as material,
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
         robots as robots,
         rod as rod,
         sdf as sdf,
+        sweep as sweep,
         systems as systems,
         view as view,
         vision as vision,

@@ -44,3 +44,11 @@ def test_the_program_of_the_readme_prints_what_it_says(capsys):
     assert float(height) * 1e3 == pytest.approx(float(said[1]), abs=0.05)
     assert float(slope) == pytest.approx(float(said[2]), rel=0.02)
     assert len([line for line in program.splitlines() if line.strip()]) <= 15
+
+
+def test_a_bench_on_a_desk_follows_its_target():
+    pytest.importorskip("cv2")
+    numbers = _main("03_bench_on_a_desk")(quick=True)
+    assert numbers["estimate off the true tip [mm rms]"] < 0.5
+    assert numbers["tip off its target [mm rms]"] < 3
+    assert numbers["pictures used"] == 75

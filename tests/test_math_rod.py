@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sorojax.math.batch import batched
 from sorojax.math.dense import solve_symmetric
 from sorojax.math.lie import SE2, SE3, skew
 from sorojax.math.magnus import rotation_vector
@@ -100,3 +101,32 @@ def test_explicit_steps_have_their_order(step, order):
         return float(jnp.abs(y[0] - jnp.cos(1.0)))
 
     assert order - 0.5 < np.log2(error(4) / error(8)) < order + 1.2
+
+
+@pytest.mark.parametrize("count", [3, 4, 11])
+def test_chunks_give_what_the_whole_batch_gives(count):
+    x = jnp.arange(3.0 * count).reshape(count, 3)
+    items = {"x": x, "name": "kept"}
+
+    def verb(item, shift):
+        assert item["name"] == "kept"
+        return jnp.sin(item["x"]).sum() + shift, item["x"] * shift
+
+    def total(shift):
+        first, second = batched(verb, chunk=4)(items, shift)
+        return first @ second.sum(axis=1), first
+
+    shift = jnp.linspace(0.0, 1.0, count)
+    (_, first), slope = jax.jit(jax.value_and_grad(total, has_aux=True))(shift)
+    sines = jnp.sin(x).sum(axis=1)
+    assert jnp.allclose(first, sines + shift, rtol=1e-14)
+    assert jnp.allclose(slope, x.sum(axis=1) * (sines + 2 * shift), rtol=1e-12)
+
+
+def test_chunks_need_as_many_items_of_all():
+    with pytest.raises(ValueError, match="first axes of"):
+        batched(jnp.add)(jnp.zeros(3), jnp.zeros(4))
+    with pytest.raises(ValueError, match="first axes of"):
+        batched(jnp.add)(jnp.zeros(3), jnp.zeros(()))
+    with pytest.raises(ValueError, match="`chunk` must be positive"):
+        batched(jnp.add, chunk=0)

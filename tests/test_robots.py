@@ -18,6 +18,17 @@ EXTENTS = {  # mm
 }
 
 
+# Handles: gaps between the folds and the spine that joins them, 7 on each of four fingers and
+# 5 on the thumb, the others lie in the palm, and 5 on each of the gripper's three; loops of
+# two plates and two or three bellows; the core through two plates and the ring of air.
+GENUS = {
+    robots.BendingActuator: 0,
+    robots.PlanarActuator: 1,
+    robots.Hand: 4 * 7 + 5,
+    robots.Manipulator: 3 * 5 + 2 + 2 + 1,
+}
+
+
 @pytest.mark.parametrize("kind", EXTENTS)
 def test_bodies_read_back_watertight(kind, tmp_path):
     body = kind().body()
@@ -29,6 +40,8 @@ def test_bodies_read_back_watertight(kind, tmp_path):
         back = io.import_surface(tmp_path / "body.stl")
         report = sdf.surface_report(back)
         assert report.watertight, (method, report)
+        assert report.genus == GENUS[kind] and report.num_shells == 1
+        assert method == "marching_cubes" or not len(report.crossings)
         assert len(back.triangles) == len(surface.triangles)
         extent = np.ptp(back.vertices, axis=0) / mm
         assert np.allclose(extent, EXTENTS[kind], rtol=0, atol=1.0)

@@ -307,8 +307,12 @@ def test_batches_agree_with_single_calls():
     )
     q, v = drawn_state(3)
     many = eqx.filter_vmap(R.forward_dynamics, in_axes=(0, None, None))(rods, q, v)
-    one = R.forward_dynamics(replace(planar(), lambda r: r.length, 0.09), q, v)
+    long = replace(planar(), lambda r: r.length, 0.09)
+    one = R.forward_dynamics(long, q, v)
     assert relative(many[1], one) < 1e-12
+    states = jnp.linspace(0.5, 1.0, 70)[:, None]  # more than a chunk
+    each = R.forward_dynamics(long, states * q[None], states * v[None])
+    assert each.shape == (70, 3) and relative(each[-1], one) < 1e-12
 
 
 class Hardening(R.AbstractElastic):

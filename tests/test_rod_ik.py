@@ -159,3 +159,86 @@ def test_a_grasp_closes_from_rest_without_penetration():
     assert jnp.all(found.status._value == Status.out_of_reach._value)
     assert gap.min() > 0.5e-3  # between the sections that were asked, too
     assert jnp.all(gap[:, 100:].mean(axis=1) < 0.5 * before[:, 12:].mean(axis=1))
+
+
+def test_a_tool_of_an_assembly_is_put_where_it_shall_be():
+    nail = R.Link(0.02, 1e-6)
+    arm = R.assembly(
+        SE2(),
+        finger=R.Part(FLAT, R.Revolute(stiffness=0.1)),
+        tool=R.Part(nail, R.Prismatic([1.0, 0.0], stiffness=50.0), on="finger"),
+    )
+
+    def tool(q):
+        return R.forward_kinematics(arm, q)["tool"][0]
+
+    @jax.jit
+    def reach(pose):
+        found = R.inverse_kinematics(arm, R.Pose(pose, part="tool"))
+        return found, tool(found.q)
+
+    goal = tool(jnp.array([0.4, 6.0, -4.0, 5.0, 1.0, 0.01]))
+    found, end = reach(goal)
+    assert found.status == Status.successful and found.error < 1e-9 * 0.08
+    assert jnp.allclose(end, goal, rtol=0, atol=1e-9)
+    with pytest.raises(ValueError, match="names no part"):
+        R.inverse_kinematics(arm, R.Pose(goal))
+
+
+def test_an_axis_is_turned_while_a_section_stays_put():
+    begin = drawn(1)[0]
+    pose = R.tip_pose(BODY, begin)  # almost straight: its axis turns a little, no more
+    place, axis = pose[:3, 3], pose[:3, 0]
+
+    @jax.jit
+    def turn(direction):
+        targets = R.Direction(direction), R.Position(place)
+        found = R.inverse_kinematics(BODY, targets, begin, forces=())
+        return found, R.tip_pose(BODY, found.q)
+
+    near, far = (axis + jnp.array(d) for d in ([-0.5, 0.0, 0.0], [0.0, 0.0, 1.0]))
+    found, end = turn(near)
+    assert found.status == Status.successful
+    assert jnp.allclose(end[:3, 0], near / jnp.linalg.norm(near), rtol=0, atol=1e-6)
+    assert jnp.allclose(end[:3, 3], place, rtol=0, atol=1e-8)
+    # The null space has a say out of reach, too, and must not keep the search awake.
+    found, _ = turn(far)
+    assert found.status == Status.out_of_reach and found.num_iterations < 60
+    assert 1e-3 < found.error < 1.8e-3
+
+
+def test_the_least_energy_has_first_and_second_derivatives():
+    stiffness = R.stiffness_matrix(FLAT)
+
+    def goal(x):
+        return jnp.stack([x, 0.02 + 0 * x])
+
+    def energy(x):
+        found = R.inverse_kinematics(FLAT, R.Position(goal(x)), forces=())
+        return found.q @ stiffness @ found.q, found
+
+    def balance(ends, x):
+        """Forces of the rod and of what holds its tip, and by how much that is off."""
+        q, force = ends[:4], ends[4:]
+        tip, pull = jax.vjp(lambda q: R.tip_pose(FLAT, q)[:2, 2], q)
+        return jnp.concatenate([stiffness @ q + pull(force)[0], tip - goal(x)])
+
+    def exact(q, x):
+        def newton(_, ends):
+            return ends - jnp.linalg.solve(jax.jacfwd(balance)(ends, x), balance(ends, x))
+
+        ends = jax.lax.fori_loop(0, 6, newton, jnp.concatenate([q, jnp.zeros(2)]))
+        return ends[:4] @ stiffness @ ends[:4]
+
+    @jax.jit
+    def both(x):
+        slope, found = jax.grad(energy, has_aux=True)(x)
+        bend, _ = jax.jacfwd(jax.grad(energy, has_aux=True), has_aux=True)(x)
+        near = x + 1e-4 * jnp.arange(-2.0, 3.0)
+        return found, slope, bend, jax.vmap(lambda x: exact(found.q, x))(near)
+
+    found, slope, bend, e = both(jnp.array(0.07))
+    assert found.status == Status.successful and found.num_iterations < 40
+    first = (e[0] - 8 * e[1] + 8 * e[3] - e[4]) / 12e-4
+    second = (-e[0] + 16 * e[1] - 30 * e[2] + 16 * e[3] - e[4]) / 12e-8
+    assert jnp.abs(slope / first - 1) < 1e-7 and jnp.abs(bend / second - 1) < 1e-6

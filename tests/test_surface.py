@@ -74,7 +74,7 @@ def rms_at_centres(shape, surface):
 def test_surfaces_are_closed_and_manifold(shape, genus, method):
     report = sdf.surface_report(sdf.isosurface(shape, 2.2 / 64, method))
     assert report.watertight and report.manifold
-    assert report.genus == genus
+    assert report.genus == genus and not len(report.crossings)
     assert report.volume > 0
 
 
@@ -171,6 +171,45 @@ def test_walls_as_thick_as_a_cell_have_no_holes(body):
         assert report.manifold and report.num_shells == 2 and report.genus == 0
     with pytest.raises(ValueError, match="wall about .* m thick .* Use `size` <="):
         sdf.isosurface(hollow, 0.1 / 0.8, METHODS[1])
+
+
+@pytest.mark.parametrize("lattice, genus", [(sdf.Gyroid, 72), (sdf.SchwarzP, 57)])
+def test_rims_of_cut_lattices_stay_whole(lattice, genus):
+    """Sheets run out in rims thinner than a cell; the genus is that of fine grids."""
+    part = lattice(0.8, 0.1) & sdf.Sphere([0, 0, 0], 1)
+    report = sdf.surface_report(sdf.isosurface(part, 0.03, METHODS[1]))
+    assert report.printable
+    assert report.num_shells == 1 and report.genus == genus
+
+
+def test_triangles_around_an_edge_stay_apart(getkey):
+    """Wherever four vertices lie in their cells, what is cut keeps to the edge's envelope."""
+    from sorojax.sdf.dual_quads import Quads, split
+
+    count, corners = 2000, np.array([[-1, -1], [0, -1], [0, 0], [-1, 0]])
+    share = np.asarray(jax.random.uniform(getkey(), (count, 4, 3), minval=0.02, maxval=0.98))
+    ends = share + np.concatenate([corners, np.zeros((4, 1))], axis=1)
+    offset = np.zeros((count, 3), np.float32)
+    offset[:, 2] = np.asarray(jax.random.uniform(getkey(), (count,)))
+    normal = np.tile(np.array([0, 0, 1], np.float32), (count, 1))
+    rows = np.arange(4 * count).reshape(-1, 4)
+    zero = np.zeros((count, 3), int)
+    quads = Quads(rows, zero, np.full(count, 2), offset, normal)
+    pairs, more, hubs = split(ends.reshape(-1, 3), quads, 4 * count)
+    assert 2 * len(hubs) == len(more) > 0
+    points = np.concatenate([ends.reshape(-1, 3), hubs])
+    # The edge meets what was cut in two exactly once.
+    whole = ~np.isin(rows[:, 0], more) & (pairs < 4 * count).all(axis=(0, 2))
+    t = points[pairs[:, whole]]
+    turn = [
+        t[..., k, 0] * t[..., (k + 1) % 3, 1] - t[..., k, 1] * t[..., (k + 1) % 3, 0]
+        for k in range(3)
+    ]
+    hit = (np.minimum.reduce(turn) > 0) | (np.maximum.reduce(turn) < 0)
+    assert whole.any() and (hit.sum(axis=0) == 1).all()
+    height = (np.stack(turn) * t[..., [2, 0, 1], 2].transpose(2, 0, 1)).sum(axis=0)
+    height = (height / np.stack(turn).sum(axis=0))[hit]
+    assert ((height > 0) & (height < 1)).all()
 
 
 def test_report_names_what_is_wrong():

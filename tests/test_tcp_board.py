@@ -18,6 +18,7 @@ from sorojax_board.messages import Fault, State
 from sorojax_board.server import Server
 from sorojax_hardware import (
     BoardFault,
+    LocalBoard,
     MemoryBoard,
     ModelValves,
     Overrun,
@@ -284,3 +285,22 @@ def test_the_board_needs_nothing_but_python():
         capture_output=True, text=True,
     )  # fmt: skip
     assert run.stdout.strip() == "[]", run.stderr
+
+
+def test_a_local_board_protects_as_the_one_behind_the_socket():
+    clock, valves = SimulatedClock(), BenchValves(2, noise=0.0)
+    board = LocalBoard(settings(2, **LIMITS), valves, clock)
+    assert isinstance(board, ValveBoard)
+    with pytest.raises(ValueError, match="NOT_ARMED"):
+        board.write_pressure(np.zeros(2))
+    board.arm((-5 * kPa, 40 * kPa))
+    for _ in range(30):
+        board.write_pressure(np.full(2, 50 * kPa))
+        clock.sleep_until(clock.now() + 0.01)
+    assert np.allclose(board.read_pressure(), 40 * kPa, atol=0.2 * kPa)
+    clock.sleep_until(clock.now() + 0.7)
+    assert np.allclose(board.read_pressure(), 0.0, atol=0.2 * kPa)
+    with pytest.raises(ValueError, match="FAULT"):
+        board.write_pressure(np.zeros(2))
+    with pytest.raises(ValueError, match="shape"):
+        board.write_pressure(np.zeros(3))

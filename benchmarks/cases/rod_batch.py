@@ -1,7 +1,8 @@
 """Accelerations of the finger D1 in batches, and of its planar twin, in compiled loops.
 
-1024 states by `vmap`, and by `jax.lax.map` in batches of 64, which stay in the cache. The
-planar finger bends in one plane: three coordinates, no exponential of a group.
+1024 states by `vmap`, and by `forward_dynamics`, which takes them in chunks that stay in
+the cache; and 1024 rods of different radius by `batched`. The planar finger bends in one
+plane: three coordinates, no exponential of a group.
 """
 
 import jax
@@ -9,9 +10,10 @@ import jax.numpy as jnp
 
 from benchmarks.cases.rod_acceleration import CALLS, loop
 from benchmarks.fingers import LENGTH, MODES, accelerate, finger, random_states
-from benchmarks.harness import Row, measure_together
-from sorojax.math.lie import SE2
-from sorojax.rod import chebyshev, circle, operators, rod
+from benchmarks.harness import Row, measure, measure_together
+from sorojax.math.batch import batched
+from sorojax.math.lie import SE2, SE3
+from sorojax.rod import Gravity, chebyshev, circle, forward_dynamics, operators, rod
 from sorojax.units import MPa, mm
 
 STATES = 1024
@@ -26,18 +28,30 @@ def planar_finger():
     )  # fmt: skip
 
 
+def fingers(radii):
+    """Fingers of these radii [m], stacked."""
+
+    def one(radius):
+        return rod(
+            SE3(), chebyshev(kappa_y=MODES, kappa_z=MODES), circle(radius), length=LENGTH,
+            young_modulus=1 * MPa, poisson_ratio=0.3, density=2000.0, nodes=8,
+        )  # fmt: skip
+
+    return jax.vmap(one)(radii)
+
+
 def together(rod, q, v):
     constants = operators(rod)
     return jax.vmap(lambda q, v: accelerate(rod, constants, q, v))(q, v)
 
 
-def in_chunks(rod, q, v):
-    constants = operators(rod)
+def by_door(rod, q, v):
+    return forward_dynamics(rod, q, v, (Gravity(),))
 
-    def one(state):
-        return accelerate(rod, constants, *state)
 
-    return jax.lax.map(one, (q, v), batch_size=64)
+def many_rods(rods, q, v):
+    one = batched(lambda rod, q, v: forward_dynamics(rod, q, v, (Gravity(),)))
+    return one(rods, q, v)
 
 
 def rows():
@@ -56,9 +70,14 @@ def rows():
         "sorojax", {"dof": 3, "states": 1}, **times["planar"].columns(),
         bar=PLANAR_BAR * times["spatial"].columns()["run_s"],
     )  # fmt: skip
-    batches = {"vmap": together, "lax.map in 64": in_chunks}
+    batches = {"vmap": together, "forward_dynamics": by_door}
     for name, timing in measure_together(batches, spatial, q, v, repeats=15).items():
         yield Row(
             "sorojax", {"dof": 6, "states": STATES, "by": name},
             **timing.per(STATES).columns(), bar=ITEM_BAR,
         )  # fmt: skip
+    rods = fingers(jnp.linspace(4 * mm, 8 * mm, STATES))
+    yield Row(
+        "sorojax", {"dof": 6, "rods": STATES, "by": "batched"},
+        **measure(many_rods, rods, q, v, repeats=15).per(STATES).columns(),
+    )  # fmt: skip

@@ -68,10 +68,11 @@ def bodies() -> dict[str, tuple[sdf.AbstractSdf, float]]:
     return {kind.__name__: (kind().body(), size) for kind, size in sizes.items()}
 
 
-def read_back(shape: sdf.AbstractSdf, size: float, method, folder: Path) -> sdf.SurfaceReport:
-    """What the written file holds."""
+def read_back(shape, size: float, method, folder: Path) -> tuple[sdf.SurfaceReport, int]:
+    """What the written file holds, and its number of triangles."""
     io.export_surface(folder / "part.stl", sdf.isosurface(shape, size, method))
-    return sdf.surface_report(io.import_surface(folder / "part.stl"))
+    surface = io.import_surface(folder / "part.stl")
+    return sdf.surface_report(surface), len(surface.triangles)
 
 
 def rows():
@@ -82,7 +83,7 @@ def rows():
             with tempfile.TemporaryDirectory() as folder:
                 start = time.perf_counter()
                 try:
-                    found = read_back(shape, size, method, Path(folder))
+                    found, triangles = read_back(shape, size, method, Path(folder))
                 except ValueError as reason:
                     if "would leave holes" not in str(reason):
                         raise
@@ -94,8 +95,8 @@ def rows():
             wrong = len(found.open_edges) + len(found.crowded_edges) + len(found.turned_edges)
             wrong += len(found.degenerate)
             settings = {
-                "shape": name, "method": method, "volume": found.volume,
-                "shells": found.num_shells, "genus": found.genus,
+                "shape": name, "method": method, "triangles": triangles,
+                "volume": found.volume, "shells": found.num_shells, "genus": found.genus,
                 "pinched": len(found.pinched_vertices), "crossings": len(found.crossings),
             }  # fmt: skip
             yield Row(

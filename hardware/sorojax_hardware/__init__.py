@@ -32,7 +32,11 @@ from sorojax_hardware.protocols import (
 )
 from sorojax_hardware.realsense import RealSenseCamera as RealSenseCamera
 from sorojax_hardware.recorder import Recorder as Recorder, load_record as load_record
-from sorojax_hardware.serving import ModelValves as ModelValves, serve as serve
+from sorojax_hardware.serving import (
+    LocalBoard as LocalBoard,
+    ModelValves as ModelValves,
+    serve as serve,
+)
 from sorojax_hardware.tcp_board import (
     BoardFault as BoardFault,
     TcpBoard as TcpBoard,

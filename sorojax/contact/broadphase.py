@@ -6,8 +6,13 @@ from jaxtyping import Array, Bool, Float
 from sorojax.sdf.base import AbstractSdf
 
 
-def far(obstacle: AbstractSdf, points: Float[Array, "*points dim"]) -> Bool[Array, ""]:
-    """Whether none of `points` [m] can lie inside `obstacle`, by one value of its field.
+def far(
+    obstacle: AbstractSdf,
+    points: Float[Array, "*points dim"],
+    reach: Float[Array, ""] | None = None,
+) -> Bool[Array, ""]:
+    """Whether none of `points` [m] can lie inside `obstacle`, by one value of its field; or
+    within `reach` [m] of it.
 
     A field changes by at most its Lipschitz constant per length, so a field at the centre
     of a ball above that constant times the radius is positive in the whole ball. `False`
@@ -17,4 +22,5 @@ def far(obstacle: AbstractSdf, points: Float[Array, "*points dim"]) -> Bool[Arra
     low, high = jnp.min(flat, axis=0), jnp.max(flat, axis=0)
     centre = (low + high) / 2
     radius = jnp.sqrt(jnp.max(jnp.sum((flat - centre[None]) ** 2, axis=1)))
-    return obstacle(centre) > obstacle.lipschitz * radius
+    reached = obstacle.lipschitz * radius
+    return obstacle(centre) > (reached if reach is None else reached + reach)

@@ -10,12 +10,23 @@ from sorojax.fem.cavity import (
     Gas as Gas,
     Liquid as Liquid,
 )
-from sorojax.fem.contact_load import Contact as Contact, contact_state as contact_state
+from sorojax.fem.contact_load import Contact as Contact
+from sorojax.fem.contact_steps import (
+    advanced as advanced,
+    contact_state as contact_state,
+    overlap as overlap,
+    solve_contact as solve_contact,
+    updated as updated,
+)
 from sorojax.fem.continuation import (
     Continuation as Continuation,
     continuation as continuation,
 )
 from sorojax.fem.critical import CriticalPoint as CriticalPoint
+from sorojax.fem.damping import KelvinVoigt as KelvinVoigt, Rayleigh as Rayleigh
+from sorojax.fem.dynamics import MotionError as MotionError, simulate as simulate
+from sorojax.fem.dynamics_host import MotionStats as MotionStats
+from sorojax.fem.dynamics_step import State as State
 from sorojax.fem.energy_form import (
     potential_energy as potential_energy,
     residual as residual,
@@ -25,6 +36,11 @@ from sorojax.fem.formulation import (
     ConstantPressure as ConstantPressure,
     Displacement as Displacement,
     LinearPressure as LinearPressure,
+)
+from sorojax.fem.generalised_alpha import (
+    EnergyMomentum as EnergyMomentum,
+    GeneralisedAlpha as GeneralisedAlpha,
+    Newmark as Newmark,
 )
 from sorojax.fem.kinematics import (
     Axisymmetric as Axisymmetric,
@@ -51,6 +67,11 @@ from sorojax.fem.modal import (
     modal_force as modal_force,
     tangent_modes as tangent_modes,
 )
+from sorojax.fem.motion import (
+    Energies as Energies,
+    Motion as Motion,
+    momentum as momentum,
+)
 from sorojax.fem.newton import Newton as Newton
 from sorojax.fem.problem import Problem as Problem, problem as problem
 from sorojax.fem.recovery import (
@@ -61,6 +82,7 @@ from sorojax.fem.recovery import (
     strain_energy as strain_energy,
 )
 from sorojax.fem.rigid import Rigid as Rigid, rigid as rigid
+from sorojax.fem.self_contact import SelfContact as SelfContact
 from sorojax.fem.solve import (
     ConvergenceError as ConvergenceError,
     Path as Path,
@@ -77,6 +99,7 @@ from sorojax.fem.solve_volume import (
 )
 from sorojax.fem.space import Space as Space, space as space
 from sorojax.fem.spring import Foundation as Foundation, Spring as Spring
+from sorojax.fem.step_state import StepState as StepState
 from sorojax.fem.stress import (
     cauchy_stress as cauchy_stress,
     deformation_gradient as deformation_gradient,

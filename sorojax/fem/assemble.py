@@ -77,6 +77,25 @@ def assemble(
 
 
 @jax.jit
+def cell_matrices(
+    space: Space,
+    geometry: Geometry,
+    material: AbstractHyperelastic,
+    kinematics: AbstractKinematics,
+    u: Float[Array, "nodes dim"],
+) -> Float[Array, "blocks entries lanes"]:
+    """Tangents of all cells at `u` before they are added up; see `Space.slots`."""
+    blocks, constant = _blocks(space, geometry, material)
+
+    def work(block: _Block):
+        body = _body(block, constant, kinematics)
+        F = deformation_gradient(kinematics, lanes(u, block.cells), block.gradients)
+        return block_matrix(kinematics, response(body, F, F), body, block.gradients)[1]
+
+    return jax.lax.map(work, blocks)
+
+
+@jax.jit
 def largest_step(
     space: Space,
     geometry: Geometry,
@@ -88,14 +107,7 @@ def largest_step(
     """Largest sampled fraction of `du`, at most 1, up to which J >= keep * J(u) everywhere."""
 
     def ratio(fraction):
-        def work(arrays):
-            cells, G = arrays
-            F = deformation_gradient(kinematics, lanes(u, cells), G)
-            D = gradient_entries(kinematics, lanes(du, cells), G)
-            J, before = volume_ratio(kinematics, F + fraction * D), volume_ratio(kinematics, F)
-            return jnp.min(J / before)
-
-        return jnp.min(jax.lax.map(work, (space.cells, geometry.gradients)))
+        return kept_volume(space, geometry, kinematics, u, fraction * du)
 
     fractions = _SHRINK ** jnp.arange(_SAMPLES - 1, -1, -1, dtype=u.dtype)
     ok = jax.lax.map(ratio, fractions) >= keep
@@ -104,6 +116,25 @@ def largest_step(
 
 
 _SHRINK, _SAMPLES = 0.75, 32
+
+
+@jax.jit
+def kept_volume(
+    space: Space,
+    geometry: Geometry,
+    kinematics: AbstractKinematics,
+    u: Float[Array, "nodes dim"],
+    du: Float[Array, "nodes dim"],
+) -> Float[Array, ""]:
+    """Smallest J(u + du) / J(u)."""
+
+    def work(arrays):
+        cells, G = arrays
+        F = deformation_gradient(kinematics, lanes(u, cells), G)
+        D = gradient_entries(kinematics, lanes(du, cells), G)
+        return jnp.min(volume_ratio(kinematics, F + D) / volume_ratio(kinematics, F))
+
+    return jnp.min(jax.lax.map(work, (space.cells, geometry.gradients)))
 
 
 @jax.jit

@@ -1,24 +1,22 @@
-"""Frictionless contact of a body with a shape that does not deform."""
+"""Contact of a body with a shape that does not deform."""
 
+import dataclasses
 from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
-from sorojax._types import integers, is_traced, optional_real
-from sorojax.contact import Contacts, Penalty, contacts, far, gaps
+from sorojax._types import integers, optional_real, real
+from sorojax.contact import Contacts, Coulomb, Grip, Penalty, contacts, far, gaps, no_grip
+from sorojax.fem.contact_area import areas_of, compact, default_law
 from sorojax.fem.curved import CurvedPart, blockwise
-from sorojax.fem.facets import facet_tables, normals
+from sorojax.fem.facets import facet_tables
+from sorojax.fem.friction import gripped, released
 from sorojax.fem.loads import AbstractLoad
-from sorojax.material.hyperelastic import small_strain_moduli
-from sorojax.mesh.elements import facet_corners
 from sorojax.sdf.base import AbstractSdf
-
-_TOGETHER = 32  # facets that the broad phase judges by one ball
 
 
 class Contact(AbstractLoad):
@@ -31,9 +29,23 @@ class Contact(AbstractLoad):
     pressure p then overlaps by about h p / (10 E). `smoothing` [m] is E / 1000 over the
     stiffness: the law is linear beyond pressures of E / 2000. Under
     `solve_path(problem, name=positions)` the obstacle moves.
+
+    With `friction` [-] the contact follows `contact.Coulomb`; `friction_stiffness` [Pa/m] is
+    the stiffness when omitted, so that held points give way by the coefficient times the
+    overlap, and `friction_velocity` [m/s] that of its dashpot. Friction has a memory:
+    `simulate` keeps it; in statics `solve` takes friction at the pressures that the load
+    knows of, none at first, and `advanced(problem, u)` lets it know of an equilibrium.
+
+    Points that are deep inside when a motion begins are let out at `release_velocity` [m/s],
+    not shot out; with `None` the whole overlap pushes at once. In a step the pressure is
+    that at its end, so that contact with a flat obstacle never adds energy.
+
+    `offset` [m] of every point is how far the pressure starts before the surface, the
+    multiplier of an augmented Lagrangian; `solve_contact` finds it.
     """
 
     smooth: ClassVar[bool] = False
+    overshoots: ClassVar[bool] = True
 
     facets: Int[Array, "facets facet_nodes"] = eqx.field(converter=integers)
     obstacle: AbstractSdf
@@ -41,6 +53,21 @@ class Contact(AbstractLoad):
     smoothing: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
     value: Float[Array, " dim"] = eqx.field(converter=optional_real, default=None)  # type: ignore
     name: str = eqx.field(static=True, default="contact")
+    friction: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
+    friction_velocity: Float[Array, ""] = eqx.field(converter=real, default=1e-3)
+    friction_stiffness: Float[Array, ""] | None = eqx.field(
+        converter=optional_real, default=None
+    )
+    offset: Float[Array, "facets quad"] | None = eqx.field(
+        converter=optional_real, default=None
+    )
+    release_velocity: Float[Array, ""] | None = eqx.field(converter=optional_real, default=0.1)
+    sunk: Float[Array, "facets quad"] | None = None  # found: overlap not let out yet [m]
+    fresh: Float[Array, ""] | None = None  # found: one before a motion, then zero
+    began: Float[Array, "facets facet_nodes dim"] | None = None  # found: positions [m]
+    share: Float[Array, ""] | None = None  # found: of a step, after which forces act
+    grip: Grip | None = None  # found
+    place: Float[Array, " dim"] | None = None  # of the obstacle when the grip was taken
 
     @property
     def law(self) -> Penalty:
@@ -51,46 +78,124 @@ class Contact(AbstractLoad):
             )
         return Penalty(self.stiffness, self.smoothing)
 
+    @property
+    def friction_law(self) -> Coulomb:
+        if self.friction is None or self.friction_stiffness is None:
+            raise ValueError(
+                f"fem.Contact '{self.name}': got no friction, need a coefficient. Give "
+                "friction=0.5 and take the load of the problem, problem.loads."
+            )
+        return Coulomb(self.friction, self.friction_stiffness, self.friction_velocity)
+
+    def shift(self) -> Float[Array, "facets quad"] | None:
+        """How far before the surface pressure starts [m]."""
+        terms = [term for term in (self.offset, self.sunk) if term is not None]
+        return sum(terms[1:], start=terms[0]) if terms else None
+
+    def points_of(self, problem, u) -> Float[Array, "facets quad dim"]:
+        """Where the quadrature points of the facets are [m]."""
+        values = jnp.asarray(facet_tables(problem.mesh.element).values)
+        return jnp.einsum("qa,fai->fqi", values, (problem.mesh.points + u)[self.facets])
+
     def potential(self, problem, u):
-        x = (problem.mesh.points + u)[self.facets]
-        energies = jax.vmap(self._energy(problem))
-        areas = areas_of(problem, self.facets)
-        return jnp.sum(blockwise(energies, self._idle(problem), x, areas, ()))
+        return self._total(problem, u, self._energy(problem))
+
+    def stored(self, problem, u):
+        """Energy of the overlap and of the springs of friction [J]."""
+        now = dataclasses.replace(self, began=None, share=None)
+        energy = now._total(problem, u, now._energy(problem, friction=False))
+        if self.grip is None:
+            return energy
+        points = self.points_of(problem, u) - self.value[None, None]
+        held = self.friction_law.stored(self.grip, points)
+        return energy + jnp.sum(areas_of(problem, self.facets) * held)
 
     def curved_part(self, problem):
+        data = self._data(problem)
+        return CurvedPart(self.facets, self._energy(problem), data, self._idle(problem))
+
+    def rows(self, xp=jnp):
+        """All facets that look for the obstacle."""
+        return xp.asarray(self.facets)
+
+    def state(self, problem, u: Float[Array, "nodes dim"]) -> Contacts:
+        """What the quadrature points feel from the obstacle."""
+        points = self.points_of(problem, u)
         areas = areas_of(problem, self.facets)
-        return CurvedPart(self.facets, self._energy(problem), areas, self._idle(problem))
+        flat = points.reshape(-1, points.shape[-1])
+        offset = self.shift()
+        offset = None if offset is None else offset.ravel()
+        found = contacts(self.law, self.obstacle, flat, areas.ravel(), self.value, offset)
+        if self.grip is None:
+            return found
+        traction = self.friction_law.traction(self.grip, points - self.value[None, None])
+        friction = (areas[..., None] * traction).reshape(flat.shape)
+        return found._replace(force=found.force + friction, friction=friction)
 
-    def _energy(self, problem):
+    def begun(self, problem, step):
+        load = self if self.sunk is None else released(self, problem, step.u, step.step)
+        began = (problem.mesh.points + step.u)[self.facets]
+        share = jnp.broadcast_to(jnp.asarray(step.share, began.dtype), ())
+        load = dataclasses.replace(load, began=began, share=share)
+        if load.grip is None:
+            return load
+        return gripped(load, problem, step.u, step.back, step.rate, step.step)
+
+    def _total(self, problem, u, energy):
+        x = (problem.mesh.points + u)[self.facets]
+        data = self._data(problem)
+        return jnp.sum(blockwise(jax.vmap(energy), self._idle(problem), x, data, ()))
+
+    def _data(self, problem):
+        """Numbers of the facets: only where a block may touch are their data looked up."""
+        return jnp.arange(self.facets.shape[0])
+
+    def _energy(self, problem, friction: bool = True):
         values, law = jnp.asarray(facet_tables(problem.mesh.element).values), self.law
+        known = areas_of(problem, self.facets), self.shift(), self.grip, self.began
 
-        def energy(x, areas):
-            return jnp.sum(areas * law.energy(gaps(self.obstacle, values @ x, self.value)))
+        def energy(x, row):
+            areas, offset, grip, began = jax.tree.map(lambda leaf: leaf[row], known)
+            position = values @ x - self.value[None]
+            gap = gaps(self.obstacle, values @ self._end(x, began) - self.value[None])
+            density = law.energy(gap if offset is None else gap - offset)
+            density = density if self.share is None else self.share * density
+            if friction and grip is not None:
+                density = density + self.friction_law.energy(grip, position)
+            return jnp.sum(areas * density)
 
         return energy
 
+    def _end(self, x, began):
+        """Positions at the end of a step, of those where forces act."""
+        return x if self.share is None else began + (x - began) / self.share
+
     def _idle(self, problem):
         values = jnp.asarray(facet_tables(problem.mesh.element).values)
+        shift, grip = self.shift(), self.grip
+        reach = None if shift is None else jnp.max(shift)
 
-        def idle(x, _):
-            points = jnp.einsum("qa,fai->fqi", values, x)
-            return far(self.obstacle, points - jnp.broadcast_to(self.value, points.shape))
+        def idle(x, rows):
+            began = None if self.began is None else self.began[rows]
+            points = jnp.einsum("qa,fai->fqi", values, self._end(x, began))
+            away = far(self.obstacle, points - self.value[None, None], reach)
+            return away if grip is None else away & ~jnp.any(grip.pressure[rows] > 0)
 
         return idle
 
     def completed(self, mesh, material, kinematics):
-        facets, size = _compact(mesh, self.facets), _mean_size(mesh, self.facets)
+        facets = self.facets if self._kept else compact(mesh, self.facets)
         value = jnp.zeros(mesh.element.dim) if self.value is None else self.value
-        stiffness, smoothing = self.stiffness, self.smoothing
-        shear, bulk = small_strain_moduli(material)
-        young = jnp.max(9 * bulk * shear / (3 * bulk + shear))
-        stiffness = 10 * young / size if stiffness is None else stiffness
-        smoothing = 1e-3 * young / stiffness if smoothing is None else smoothing
-        return eqx.tree_at(
-            lambda load: (load.facets, load.stiffness, load.smoothing, load.value),
-            self, (integers(facets), stiffness, smoothing, value),
-            is_leaf=lambda leaf: leaf is None,
-        )  # fmt: skip
+        law = default_law(mesh, material, self.facets, self.stiffness, self.smoothing)
+        made = dataclasses.replace(
+            self, facets=facets, stiffness=law[0], smoothing=law[1], value=value
+        )
+        return made if self._kept and self.began is not None else _free(made, mesh)
+
+    @property
+    def _kept(self) -> bool:
+        """Whether numbers of single facets hang on their order."""
+        return any(x is not None for x in (self.grip, self.offset, self.began))
 
     def check(self, where, mesh, kinematics):
         if self.obstacle.dim != mesh.element.dim:
@@ -100,62 +205,30 @@ class Contact(AbstractLoad):
             )
         for what, number, unit in (
             ("stiffness", self.stiffness, "Pa/m"), ("smoothing", self.smoothing, "m"),
+            ("friction", self.friction, "-"),
+            ("friction_velocity", self.friction_velocity, "m/s"),
+            ("friction_stiffness", self.friction_stiffness, "Pa/m"),
+            ("release_velocity", self.release_velocity, "m/s"),
         ):  # fmt: skip
+            if number is None:
+                continue
             _check.positive("fem.problem", f"{where} {what}", number, unit,
                             "Leave it out for the default.")  # fmt: skip
 
 
-def areas_of(problem, facets: Int[Array, "facets facet_nodes"]) -> Float[Array, "facets quad"]:
-    """Reference areas of the quadrature points of facets [m^2]."""
-    tables, kinematics = facet_tables(problem.mesh.element), problem.kinematics
-    weights, values = jnp.asarray(tables.weights), jnp.asarray(tables.values)
-
-    def one(X):
-        size = jnp.sqrt(jnp.sum(normals(tables, X) ** 2, axis=1))
-        return weights * size * kinematics.depth(tuple((values @ X).T))
-
-    return jax.vmap(one)(problem.mesh.points[facets])
-
-
-def contact_state(problem, u: Float[Array, "nodes dim"], name: str = "contact") -> Contacts:
-    """Gap, pressure, normal and force at the quadrature points of the contact `name`.
-
-    `.total` is the force of the obstacle on the body [N], `.active` the points that touch.
-    """
-    loads = [load for load in problem.loads if load.name == name]
-    if not loads or not isinstance(loads[0], Contact):
-        names = [load.name for load in problem.loads if isinstance(load, Contact)]
-        raise ValueError(f"fem.contact_state: got name {name!r}, need one of {names}.")
-    return _state(loads[0], problem, u)
-
-
-@eqx.filter_jit
-def _state(load: Contact, problem, u: Float[Array, "nodes dim"]) -> Contacts:
-    values = jnp.asarray(facet_tables(problem.mesh.element).values)
-    points = jnp.einsum("qa,fai->fqi", values, (problem.mesh.points + u)[load.facets])
-    areas = areas_of(problem, load.facets).ravel()
-    flat = points.reshape(-1, points.shape[-1])
-    return contacts(load.law, load.obstacle, flat, areas, load.value)
-
-
-def _mean_size(mesh, facets) -> Float[Array, ""]:
-    corners = mesh.points[facets[:, : facet_corners(mesh.element)]]
-    return jnp.mean(jnp.sqrt(jnp.sum((corners[:, 1] - corners[:, 0]) ** 2, axis=1)))
-
-
-def _compact(mesh, facets) -> Int[np.ndarray, "facets facet_nodes"] | Array:
-    """The facets in an order that keeps neighbours together, by halving the longest side."""
-    if is_traced((mesh.points, facets)):
-        return facets
-    facets = np.asarray(facets)
-    centres = np.asarray(mesh.points)[facets].mean(axis=1)
-
-    def halved(ids):
-        if len(ids) <= _TOGETHER:
-            return [ids]
-        axis = np.argmax(np.ptp(centres[ids], axis=0))
-        ids = ids[np.argsort(centres[ids, axis], kind="stable")]
-        middle = -(-len(ids) // (2 * _TOGETHER)) * _TOGETHER
-        return halved(ids[:middle]) + halved(ids[middle:])
-
-    return facets[np.concatenate(halved(np.arange(len(facets))))]
+def _free(load: Contact, mesh) -> Contact:
+    """`load` that has touched nothing yet."""
+    values = jnp.asarray(facet_tables(mesh.element).values)
+    points = jnp.einsum("qa,fai->fqi", values, mesh.points[load.facets])
+    if load.release_velocity is not None:
+        sunk = jnp.zeros_like(points[..., 0])
+        load = dataclasses.replace(load, sunk=sunk, fresh=jnp.ones((), sunk.dtype))
+    load = dataclasses.replace(
+        load, began=mesh.points[load.facets], share=jnp.ones((), points.dtype)
+    )
+    if load.friction is None:
+        return load
+    stiffness = load.stiffness if load.friction_stiffness is None else load.friction_stiffness
+    return dataclasses.replace(
+        load, friction_stiffness=stiffness, grip=no_grip(points), place=load.value
+    )

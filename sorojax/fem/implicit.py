@@ -207,6 +207,12 @@ def _shapes(*leaves, call: Solve, lead, batched):
 
 
 def _batch(leaves, axes, *, call: Solve, lead, batched):
+    rows, wide, batched = widened(leaves, axes, lead, batched)
+    out = _equilibrium_p.bind(*rows, call=call, lead=wide, batched=batched)
+    return out, [0] * len(out)
+
+
+def widened(leaves, axes, lead: tuple[int, ...], batched: tuple[bool, ...]):
     """One more leading axis: arrays that have any of the axes get all of them."""
     sizes = [x.shape[a] for x, a in zip(leaves, axes, strict=True) if a is not None]
     wide = (sizes[0], *lead)
@@ -220,9 +226,7 @@ def _batch(leaves, axes, *, call: Solve, lead, batched):
             own = x.shape[len(wide) :] if axis is not None else x.shape[len(lead) :]
             x = jnp.broadcast_to(x, (*wide, *own))
         rows.append(x)
-    batched = tuple(b or a is not None for a, b in zip(axes, batched, strict=True))
-    out = _equilibrium_p.bind(*rows, call=call, lead=wide, batched=batched)
-    return out, [0] * len(out)
+    return rows, wide, tuple(b or a is not None for a, b in zip(axes, batched, strict=True))
 
 
 batching.primitive_batchers[_equilibrium_p] = _batch

@@ -106,6 +106,9 @@ def _add_load_stiffness(problem, prepared, u, values):
     for part, slots in zip(_curved_parts(problem), prepared.group_slots, strict=True):
         x = (problem.mesh.points + u)[part.groups]
         values = values.at[slots].add(group_matrices(part, x))
+    for load in problem.loads:
+        if (constant := load.tangent_values(problem)) is not None:
+            values = values + constant
     return values
 
 

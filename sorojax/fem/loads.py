@@ -20,6 +20,7 @@ from sorojax.fem.points import interpolated, quadrature_points
 
 if TYPE_CHECKING:
     from sorojax.fem.problem import Problem
+    from sorojax.fem.step_state import StepState
 
 
 class AbstractLoad(eqx.Module):
@@ -29,19 +30,39 @@ class AbstractLoad(eqx.Module):
     name: eqx.AbstractVar[str]
     holds: ClassVar[bool] = False  # whether its stiffness can hold the body
     smooth: ClassVar[bool] = True  # whether the tangent at one load foretells the next
+    overshoots: ClassVar[bool] = False  # whether steps may run past where its force changes
 
     @abc.abstractmethod
     def potential(self, problem: "Problem", u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
         """Potential energy of the load [J]."""
 
+    def stored(self, problem: "Problem", u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
+        """The part of the potential that is an energy at an instant [J]: all but that of
+        friction in a step."""
+        return self.potential(problem, u)
+
     @abc.abstractmethod
     def curved_part(self, problem: "Problem") -> CurvedPart | None:
         """The part of the potential that is not linear in u; `None` adds no stiffness."""
+
+    def longest_share(self, du: Float[Array, "nodes dim"]) -> Float[Array, ""]:
+        """Share of a Newton step [m] after which the load still sees what it acts on."""
+        return jnp.ones((), du.dtype)
 
     def couples(self) -> Int[np.ndarray, "groups group_nodes"] | None:
         """Groups of nodes that share no cell but do share stiffness; `None` if there are
         none. `fem.space(mesh, loads)` makes room for them in the tangent."""
         return None
+
+    def tangent_values(self, problem: "Problem") -> Float[Array, " nnz"] | None:
+        """Stiffness that does not depend on u, in the pattern of the tangent [N/m], beside
+        that of `curved_part`; `None` adds nothing."""
+        return None
+
+    def begun(self, problem: "Problem", step: "StepState") -> "AbstractLoad":
+        """The load for one time step: what depends on rates or on the state before. What it
+        returns is the load that the next step begins with, its `value` set anew."""
+        return self
 
     def completed(self, mesh: Any, material: Any, kinematics: Any) -> "AbstractLoad":
         """The load with the numbers filled in that it takes from body and mesh."""

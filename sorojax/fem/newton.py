@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax.fem import assemble as asm
+from sorojax.fem.line_search import overshoots, share_of_step
 from sorojax.fem.linear import Linearised, Prepared, linearise, step
 from sorojax.fem.problem import Problem
 
@@ -79,6 +80,9 @@ def newton_solve(
         if du is None:
             return Iterate(u, None, iterations, ratio, negative, "the tangent is singular")
         iterations += 1
+        if overshoots(problem) and not np.any(move):
+            args = (problem, prepared.known, state.residual, jnp.asarray(u), jnp.asarray(du))
+            du = float(share_of_step(*args)) * du
         u, before, state, size = _advance(problem, prepared, u, du)
         move = np.where(np.asarray(prepared.known), known_values - u.ravel(), 0.0)
         move[np.abs(move) <= 1e-12 * np.abs(known_values).max()] = 0.0

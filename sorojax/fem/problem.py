@@ -74,6 +74,7 @@ def problem(
     loads: tuple[AbstractLoad, ...] = (),
     formulation: AbstractFormulation | None = None,
     space: Space | None = None,
+    free: bool = False,
 ) -> Problem:
     """A checked boundary value problem.
 
@@ -90,6 +91,7 @@ def problem(
             `Displacement()` for the rest and in plane stress.
         space: The mesh's `space(mesh, loads)`, to share between problems on the same
             topology.
+        free: Accept a body that could move rigidly, for `simulate`.
 
     Raises:
         ValueError: If the body could move rigidly, a set is empty, a cell is inverted, the
@@ -117,5 +119,6 @@ def problem(
         checks.space(mesh, space)
         checks_loads.room(space, loads)
     made = Problem(mesh, material, kinematics, supports, loads, formulation, space)
-    checks.held(made, known)
+    if not free:
+        checks.held(made, known)
     return made

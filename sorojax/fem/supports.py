@@ -13,12 +13,14 @@ from sorojax._types import integers, optional_real, real
 class AbstractSupport(eqx.Module):
     """Known displacement components of a set of nodes; all of them when `None`.
 
-    `ramped` names the field that grows from zero while a load is stepped up.
+    `ramped` names the field that grows from zero while a load is stepped up, and that
+    follows `simulate(problem, ..., name=values)` where there is a `name`.
     """
 
     nodes: eqx.AbstractVar[Int[Array, " nodes"]]
     displacement: eqx.AbstractVar[Float[Array, "..."]]
     components: eqx.AbstractVar[tuple[int, ...] | None]
+    name: eqx.AbstractVar[str]
     ramped: ClassVar[str | None] = None
 
 
@@ -28,6 +30,7 @@ class Fixed(AbstractSupport):
 
     nodes: Int[Array, " nodes"] = eqx.field(converter=integers)
     components: tuple[int, ...] | None = eqx.field(static=True, default=None)
+    name: ClassVar[str] = "fixed"
 
     @property
     def displacement(self) -> Float[Array, ""]:
@@ -41,6 +44,7 @@ class Prescribed(AbstractSupport):
     nodes: Int[Array, " nodes"] = eqx.field(converter=integers)
     displacement: Float[Array, "..."] = eqx.field(converter=real)
     components: tuple[int, ...] | None = eqx.field(static=True, default=None)
+    name: str = eqx.field(static=True, default="prescribed")
     ramped: ClassVar[str | None] = "displacement"
 
 
@@ -56,6 +60,7 @@ class Rotated(AbstractSupport):
     angle: Float[Array, ""] = eqx.field(converter=real)
     about: Float[Array, " dim"] = eqx.field(converter=real)
     axis: Float[Array, "3"] | None = eqx.field(converter=optional_real, default=None)
+    name: str = eqx.field(static=True, default="rotated")
     components: ClassVar[tuple[int, ...] | None] = None
     ramped: ClassVar[str | None] = "angle"
 

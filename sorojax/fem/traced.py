@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sorojax.fem import assemble as asm
 from sorojax.fem.follow import between, unloaded
 from sorojax.fem.geometry import geometry
+from sorojax.fem.line_search import overshoots, share_of_step
 from sorojax.fem.linear import Linearised, Prepared, constrain, linearise
 from sorojax.fem.newton import Newton
 from sorojax.fem.problem import Problem
@@ -105,11 +106,16 @@ def _slots(system: sparse.SparseSymmetric, groups, dim: int):
 
 
 def follow_traced(
-    problem: Problem, begin: Begin | None, newton: Newton, steps: int, max_cuts: int
+    problem: Problem,
+    begin: Begin | None,
+    newton: Newton,
+    steps: int,
+    max_cuts: int,
+    prepared: Prepared | None = None,
 ) -> Outcome:
     """Step from `begin` to `problem`, halving steps that fail; every number may be traced."""
     first = _first(problem, begin)
-    prepared = prepare_traced(problem)
+    prepared = prepare_traced(problem) if prepared is None else prepared
     state = _initial(problem, begin, steps)
 
     def one_pass(state: _State) -> _State:
@@ -188,6 +194,10 @@ def _examine(here: Problem, prepared: Prepared, state: _State, newton: Newton) -
 
     seek = ~(collapsed | converged | failed)
     du, usable = jax.lax.cond(seek, direction, nothing)
+    if overshoots(here):
+        share = share_of_step(here, prepared.known, found.residual, state.u, du)
+        free = seek & ~state.predict & ~jnp.any(move != 0)
+        du = jnp.where(free, share, jnp.ones_like(share)) * du
     # a singular tangent ends the level, except that of the first guess
     failed = failed | (seek & ~usable & ~state.predict)
     return _Level(collapsed, converged, failed, seek & ~failed, usable, du, found.values)

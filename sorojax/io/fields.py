@@ -25,7 +25,7 @@ FIELDS = ("von_mises", "pressure", "stress", "principal", "energy", "reaction")
 def export_fields(
     path: str | os.PathLike,
     problem: fem.Problem,
-    states: fem.Solution | fem.Path | np.ndarray,
+    states: fem.Solution | fem.Path | fem.Motion | np.ndarray,
     *,
     fields: Sequence[str] = ("von_mises", "pressure"),
     deformed: bool = False,
@@ -43,16 +43,16 @@ def export_fields(
     Args:
         path: File name, ending in .vtu or .pvd.
         problem: What was solved.
-        states: A solution, a path, or displacements (nodes, dim) or (states, nodes, dim)
-            [m].
+        states: A solution, a path, a motion, or displacements (nodes, dim) or
+            (states, nodes, dim) [m].
         fields: Beside "displacement" [m], any of "von_mises" [Pa], "pressure" (mean stress,
             tension positive) [Pa], "stress" (Cauchy, 9 components) [Pa], "principal" [Pa],
             "reaction" [N] at the nodes and "energy" [J] in the cells. Nodal stresses are
             means over the cells of a node.
         deformed: Put the points where the body is; otherwise in the reference
             configuration, where a viewer can warp them by "displacement".
-        times: One number per state; the values of the path's load when omitted, where these
-            are numbers, else 0, 1, 2...
+        times: One number per state; those of the motion or the values of the path's load when
+            omitted, where these are numbers, else 0, 1, 2...
         unit: What 1 in the file means for points and displacements [m].
         root: Folder that the files must lie in, links followed.
 
@@ -95,6 +95,9 @@ def _states(where, problem, states, times):
         problems = [fem.with_load(problem, states.name, value) for value in states.values]
         if times is None and states.values.ndim == 1:
             moments = np.asarray(states.values).tolist()
+    elif isinstance(states, fem.Motion):
+        moved = np.asarray(states.displacements)
+        moments = np.asarray(states.times).tolist() if times is None else times
     elif isinstance(states, fem.Solution):
         moved = np.asarray(states.displacement)[None]
     else:

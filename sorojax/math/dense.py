@@ -1,5 +1,6 @@
-"""Small dense symmetric solves."""
+"""Small dense products and symmetric solves."""
 
+import functools
 from collections.abc import Callable
 
 import jax
@@ -22,6 +23,27 @@ def solve_symmetric(
     return jax.lax.custom_linear_solve(
         lambda x: matrix @ x, right, lambda _, r: solve(r), symmetric=True
     )
+
+
+@jax.custom_jvp
+def product(
+    left: Float[Array, "rows terms"], right: Float[Array, "terms columns"]
+) -> Float[Array, "rows columns"]:
+    """`left @ right`, written out up to 8 terms: less than a library call costs.
+
+    For few columns; XLA repeats the sums in every entry that reads them. Derivatives are
+    plain products, as those of the sums would take long to compile.
+    """
+    if not 0 < left.shape[1] < UNROLL_BELOW:
+        return left @ right
+    terms = (left[:, k, None] * right[k][None] for k in range(left.shape[1]))
+    return functools.reduce(jnp.add, terms)
+
+
+@product.defjvp
+def _product_jvp(primals, tangents):
+    (left, right), (change, turn) = primals, tangents
+    return product(left, right), change @ right + left @ turn
 
 
 def _cholesky(matrix: Array) -> Callable[[Array], Array]:

@@ -5,6 +5,8 @@ from jaxtyping import Array, Float
 
 from sorojax.math.lie import SE2, SE3, skew
 
+_NEAR = 0.02  # squared angle below which the factors are power series
+
 
 def logarithm(group: SE2 | SE3, pose: Float[Array, "h h"]) -> Float[Array, " twist"]:
     """Body twist, angular first, that reaches `pose` in unit time; angle up to pi [rad].
@@ -16,18 +18,7 @@ def logarithm(group: SE2 | SE3, pose: Float[Array, "h h"]) -> Float[Array, " twi
     """
     if isinstance(group, SE2):
         return _planar(pose)
-    real, vector = _half_turn(pose[:3, :3])
-    square = vector @ vector
-    small = square < 1e-6
-    sine = jnp.sqrt(jnp.where(small, jnp.ones_like(square), square))
-    half = jnp.arctan2(sine, real)
-    ratio = jnp.where(small, 2 + square / 3 + 3 * square**2 / 20, 2 * half / sine)
-    omega = ratio * vector
-    far = (1 - half * real / sine) / (4 * jnp.where(small, jnp.ones_like(half), half) ** 2)
-    share = jnp.where(small, 1 / 12 + 4 * square / 720, far)
-    turn, position = skew(omega), pose[:3, 3]
-    swept = turn @ position
-    return jnp.concatenate([omega, position - swept / 2 + share * (turn @ swept)])
+    return _spatial(pose)[0]
 
 
 def change_of_logarithm(
@@ -41,13 +32,48 @@ def change_of_logarithm(
     """
     if isinstance(group, SE2):
         return _planar_change(twist)
-    omega, v = skew(twist[:3]), skew(twist[3:])
-    top = jnp.concatenate([omega, jnp.zeros_like(omega)], axis=1)
-    adjoint = jnp.concatenate([top, jnp.concatenate([v, omega], axis=1)])
-    second, fourth = _even_terms(twist[:3] @ twist[:3])
-    square = adjoint @ adjoint
-    eye = jnp.eye(6, dtype=twist.dtype)
-    return eye - adjoint / 2 + square @ (second * eye + fourth * square)
+    square = twist[:3] @ twist[:3]
+    half = jnp.sqrt(jnp.where(square < _NEAR, jnp.ones_like(square), square)) / 2
+    return _change(twist, *_even_terms(square, half, jnp.cos(half), jnp.sin(half)))
+
+
+def logarithm_and_change(
+    group: SE2 | SE3, pose: Float[Array, "h h"]
+) -> tuple[Float[Array, " twist"], Float[Array, "twist twist"]]:
+    """`logarithm` and `change_of_logarithm` of what it gives, which share their angle."""
+    if isinstance(group, SE2):
+        twist = _planar(pose)
+        return twist, _planar_change(twist)
+    twist, second, fourth = _spatial(pose)
+    return twist, _change(twist, second, fourth)
+
+
+def _spatial(pose: Float[Array, "4 4"]) -> tuple[Float[Array, "6"], Array, Array]:
+    """The twist, and the factors of its change."""
+    real, vector = _half_turn(pose[:3, :3])
+    square = vector @ vector
+    small = square < 1e-6
+    sine = jnp.sqrt(jnp.where(small, jnp.ones_like(square), square))
+    half = jnp.arctan2(sine, real)
+    ratio = jnp.where(small, 2 + square / 3 + 3 * square**2 / 20, 2 * half / sine)
+    omega, position = ratio * vector, pose[:3, 3]
+    second, fourth = _even_terms(ratio**2 * square, half, real, sine)
+    swept = _cross(omega, position)
+    moved = position - swept / 2 + second * _cross(omega, swept)
+    return jnp.concatenate([omega, moved]), second, fourth
+
+
+def _change(twist: Float[Array, "6"], second: Array, fourth: Array) -> Float[Array, "6 6"]:
+    """The blocks of 1 - A / 2 + second A^2 + fourth (A^4 + |omega|^2 A^2), A = ad(twist)."""
+    omega, v, eye = twist[:3], twist[3:], jnp.eye(3, dtype=twist.dtype)
+    square, along = jnp.sum(omega * omega), jnp.sum(omega * v)
+    turned = omega[:, None] * omega[None, :] - square * eye
+    mixed = omega[:, None] * v[None, :]
+    mixed = mixed + mixed.T - 2 * along * eye
+    turn = eye - skew(omega) / 2 + second * turned
+    shift = second * mixed - skew(v) / 2 - 2 * along * fourth * turned
+    top = jnp.concatenate([turn, jnp.zeros_like(turn)], axis=1)
+    return jnp.concatenate([top, jnp.concatenate([shift, turn], axis=1)])
 
 
 def _half_turn(rotation: Float[Array, "3 3"]) -> tuple[Array, Float[Array, "3"]]:
@@ -66,17 +92,21 @@ def _half_turn(rotation: Float[Array, "3 3"]) -> tuple[Array, Float[Array, "3"]]
     return unit[0], unit[1:]
 
 
-def _even_terms(square: Array) -> tuple[Array, Array]:
-    """Factors of the second and fourth power of the adjoint map at |omega|^2."""
-    small = square < 0.02
-    safe = jnp.where(small, jnp.ones_like(square), square)
-    angle = jnp.sqrt(safe)
-    sine, versine = jnp.sin(angle), 1 - jnp.cos(angle)
-    second = 2 / safe - (angle + 3 * sine) / (4 * angle * versine)
-    fourth = 1 / safe**2 - (angle + sine) / (4 * angle**3 * versine)
-    near_second = 1 / 12 - square**2 / 30240 - square**3 / 604800
-    near_fourth = -1 / 720 - square / 15120 - square**2 / 403200
-    return jnp.where(small, near_second, second), jnp.where(small, near_fourth, fourth)
+def _even_terms(square: Array, half: Array, real: Array, sine: Array) -> tuple[Array, Array]:
+    """Factors of `_change` at |omega|^2, from half the angle, its cosine and its sine."""
+    near = square < _NEAR
+    one = jnp.ones_like(square)
+    half, sine = jnp.where(near, one, half), jnp.where(near, one, sine)
+    second = (1 - half * real / sine) / (4 * half**2)
+    fourth = (1 - half * (half + sine * real) / (2 * sine**2)) / (16 * half**4)
+    near_second = 1 / 12 + square / 720 + square**2 / 30240 + square**3 / 1209600
+    near_fourth = -1 / 720 - square / 15120 - square**2 / 403200 - square**3 / 11975040
+    return jnp.where(near, near_second, second), jnp.where(near, near_fourth, fourth)
+
+
+def _cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
+    (x, y, z), (u, v, w) = a, b
+    return jnp.stack([y * w - z * v, z * u - x * w, x * v - y * u])
 
 
 def _planar(pose: Float[Array, "3 3"]) -> Float[Array, "3"]:

@@ -23,3 +23,7 @@ class Status(eqx.Enumeration):
         "The targets cannot be met: this is as close as the model comes. Move the targets, "
         "drop one, widen limits, or give more modes or another first guess."
     )
+    max_events = (
+        "The limit of events was reached. Raise `max_events`, or let the event rest: events "
+        "that crowd together without end, as of a ball that comes to rest, need a threshold."
+    )

@@ -11,49 +11,14 @@ from jaxtyping import Array, Float
 
 from sorojax._types import real
 from sorojax.math.dense import solve_symmetric
-
-Field = Callable[[Float[Array, ""], Any], Any]
-
-_DORMAND_PRINCE = (
-    (1 / 5,),
-    (3 / 40, 9 / 40),
-    (44 / 45, -56 / 15, 32 / 9),
-    (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
-    (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
-    (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
+from sorojax.math.explicit import (
+    DORMAND_PRINCE,
+    RK4,
+    dormand_prince_step as dormand_prince_step,
+    rk4_step as rk4_step,
+    rolled_step,
 )
-_DORMAND_PRINCE_TIMES = (1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0)
-_RK4 = ((1 / 2,), (0.0, 1 / 2), (0.0, 0.0, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6))
-_RK4_TIMES = (1 / 2, 1 / 2, 1.0)
-
-
-def rk4_step(field: Field, t: Float[Array, ""], y: Any, h: Float[Array, ""]) -> Any:
-    """One classical Runge-Kutta step of y' = field(t, y), order 4, any pytree."""
-    return _explicit_step(_RK4, _RK4_TIMES, field, t, y, h)
-
-
-def dormand_prince_step(field: Field, t: Float[Array, ""], y: Any, h) -> Any:
-    """One Dormand-Prince step of y' = field(t, y), order 5, any pytree."""
-    return _explicit_step(_DORMAND_PRINCE, _DORMAND_PRINCE_TIMES, field, t, y, h)
-
-
-def _explicit_step(tableau, times, field, t, y, h):
-    slopes = [field(t, y)]
-    for row, time in zip(tableau[:-1], times, strict=True):
-        slopes.append(field(t + time * h, _advance(y, h, row, slopes)))
-    return _advance(y, h, tableau[-1], slopes)
-
-
-def _advance(y, h, row, slopes):
-    used = [(w, k) for w, k in zip(row, slopes, strict=True) if w]
-
-    def move(value, *rates):
-        total = used[0][0] * rates[0]
-        for (weight, _), rate in zip(used[1:], rates[1:], strict=True):
-            total = total + weight * rate
-        return value + h * total
-
-    return jax.tree.map(move, y, *(slope for _, slope in used))
+from sorojax.math.method import Field
 
 
 class ContactTerms(NamedTuple):
@@ -214,14 +179,14 @@ class RungeKutta4(AbstractStepper):
     """Classical explicit method of order 4; unstable beyond h omega = 2.8."""
 
     def step(self, problem, t, h, state):
-        return _explicit(_RK4, _RK4_TIMES, problem, t, h, state)
+        return _explicit(RK4, problem, t, h, state)
 
 
 class DormandPrince(AbstractStepper):
     """Explicit method of order 5, for undamped motion at high accuracy."""
 
     def step(self, problem, t, h, state):
-        return _explicit(_DORMAND_PRINCE, _DORMAND_PRINCE_TIMES, problem, t, h, state)
+        return _explicit(DORMAND_PRINCE, problem, t, h, state)
 
 
 def move(problem: SecondOrder, q: Array, increment: Array) -> Array:
@@ -240,30 +205,12 @@ def vector_field(problem: SecondOrder) -> Field:
     return field
 
 
-def _explicit(tableau, times, problem: SecondOrder, t, h, state: Kinematic) -> Kinematic:
+def _explicit(tableau, problem: SecondOrder, t, h, state: Kinematic) -> Kinematic:
     field = vector_field(problem)
-    q, v = _rolled_step(tableau, times, field, t, (state.q, state.v), h)
+    q, v = rolled_step(tableau, field, t, (state.q, state.v), h)
     if problem.retract is not None:
         q = problem.retract(q, jnp.zeros_like(v))  # back on the manifold
     return Kinematic(q, v, state.a)
-
-
-def _rolled_step(tableau, times, field, t, y, h):
-    """A Runge-Kutta step that traces the field once, however many stages it has."""
-    count = len(tableau)
-    weights = jnp.array([(*row, *[0.0] * (count - len(row))) for row in tableau], h.dtype)
-    starts = jnp.array([0.0, *times], h.dtype)
-
-    def moved(row, slopes):
-        return jax.tree.map(lambda x, k: x + h * jnp.tensordot(row, k, 1), y, slopes)
-
-    def stage(i, slopes):
-        start = jnp.where(i == 0, jnp.zeros_like(starts), weights[i - 1])
-        rates = field(t + starts[i] * h, moved(start, slopes))
-        return jax.tree.map(lambda k, rate: k.at[i].set(rate), slopes, rates)
-
-    blank = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), y)
-    return moved(weights[-1], jax.lax.fori_loop(0, count, stage, blank))
 
 
 def integrate(

@@ -21,6 +21,7 @@ from sorojax.mesh.elements import (
     Tri7 as Tri7,
 )
 from sorojax.mesh.enrich import enrich as enrich
+from sorojax.mesh.join import joined as joined
 from sorojax.mesh.locate import Locations as Locations, locate as locate
 from sorojax.mesh.measure import (
     cell_areas as cell_areas,

@@ -14,7 +14,6 @@ from sorojax.rod.tree import (
     AssemblyMotion,
     Mount,
     batches,
-    clamped,
     part_columns,
 )
 
@@ -91,30 +90,45 @@ def bias_accelerations(moment: AssemblyMotion) -> tuple[Float[Array, " twist"] |
     """Acceleration of each frame at zero coordinate acceleration, along its own axes; None
     on the ground, where there is none."""
     assembly, found = moment.assembly, []
+    rates = _rates_of_carriers(moment)
     for index, on in enumerate(parents(assembly)):
         mount = moment.mounts[index]
         if on is None:
             found.append(None)
             continue
         size, before = assembly.group.algebra_dim, found[on]
-        own = _section_bias(moment, index, on)
+        own = _section_bias(moment, index, on, rates.get(on))
         if before is not None:
             own = own + mount.carried[:, :size] @ before
         found.append(own)
     return tuple(found)
 
 
-def _section_bias(moment: AssemblyMotion, index: int, on: int) -> Float[Array, " twist"]:
+def _rates_of_carriers(moment: AssemblyMotion) -> dict[int, tuple[Array, Array]]:
+    """`bias_rates` of the rods that carry parts, equal rods together."""
+    carriers, found = set(parents(moment.assembly)), {}
+    for members, stack in zip(batches(moment.assembly), moment.batches, strict=True):
+        if carriers.isdisjoint(members):
+            continue
+        # Of all, not of the carriers: inertia needs the same, and XLA makes it once.
+        twists = jnp.stack([moment.frames[k].twist for k in members])
+        every = eqx.filter_vmap(lambda m, twist: bias_rates(release(m, twist)))
+        angular, linear = every(stack, twists)
+        found |= {k: (angular[place], linear[place]) for place, k in enumerate(members)}
+    return found
+
+
+def _section_bias(
+    moment: AssemblyMotion, index: int, on: int, rates: tuple[Array, Array] | None
+) -> Float[Array, " twist"]:
     """Acceleration of a part on a carrier whose frame and coordinates do not accelerate."""
     mount, at = moment.mounts[index], slices(moment.assembly)
     rot = moment.assembly.group.rotation_dim
-    twist = moment.frames[on].twist
-    own = jnp.concatenate([twist, moment.v[at[on].rod_v]])
+    own = jnp.concatenate([moment.frames[on].twist, moment.v[at[on].rod_v]])
     spin = mount.spin @ own
     angular, linear = jnp.zeros_like(spin), jnp.zeros_like(mount.arm)
     rows = moment.operators.rows[index]
-    if rows is not None:
-        rates = bias_rates(release(clamped(moment, on), twist))
+    if rows is not None and rates is not None:
         angular, linear = rows[0] @ rates[0], rows[0] @ rates[1]
     return _on_arm(mount, moment.v[at[index].joint_v], spin, angular, linear, rot)
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax._types import real
+from sorojax.math.batch import batched
 from sorojax.math.dense import solve_symmetric
 from sorojax.math.door import door
 from sorojax.rod import loads
@@ -76,22 +77,35 @@ def damping_matrix(model: Model, forces: Forces) -> Float[Array, "dof dof"]:
 @door
 def forward_dynamics(
     model: Model,
-    q: Coordinates,
-    v: Rates,
+    q: Float[Array, "*states coordinates"],
+    v: Float[Array, "*states dof"],
     forces: Forces = (),
     *,
     t=0.0,
-) -> Rates:
-    """Acceleration of the coordinates.
+) -> Float[Array, "*states dof"]:
+    """Acceleration of the coordinates, of one state or many.
+
+    States along a first axis of `q` and `v` are taken in chunks that stay in the cache of
+    a CPU. For many models give `sorojax.math.batch.batched` this verb.
 
     Args:
         model: The rod or assembly.
-        q: Coordinates.
-        v: Their rates.
+        q: Coordinates, or those of many states.
+        v: Their rates, of the same states.
         forces: Generalised forces; elasticity acts unless one replaces it.
         t: Time [s].
+
+    Raises:
+        ValueError: If the shapes do not fit the model or each other.
     """
-    return acceleration(model, operators(model), real(t), q, v, forces)
+    constants, t = operators(model), real(t)
+
+    def one(q, v):
+        return acceleration(model, constants, t, q, v, forces)
+
+    if jnp.ndim(q) == 1 and jnp.ndim(v) == 1:
+        return one(q, v)
+    return batched(one)(q, v)
 
 
 def acceleration(

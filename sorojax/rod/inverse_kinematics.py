@@ -9,6 +9,7 @@ Reference:
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
@@ -102,34 +103,30 @@ def inverse_kinematics(
     def at(q: Array) -> Rows:
         return rows(tasks, t, motion(model, q, constants=constants))
 
-    size = guess.shape[0]
     count = sum(task.s.shape[0] for task in obstacles)
     push = jnp.zeros(count, dtype) if obstacles else None
-    begin = guess if push is None else jnp.concatenate([guess, push])
-
-    def parts(x):
-        return x[:size], (None if push is None else x[size:])
-
-    def whole(q, push):
-        return q if push is None else jnp.concatenate([q, push])
+    errors = jax.eval_shape(at, guess).error
+    balance = None if forces is None else jnp.zeros(errors.shape, dtype)
+    begin, whole = ravel_pytree(answer.Ends(guess, push, balance))
 
     def find(_, begin):
-        q, push = parts(begin)
+        q, push, _ = whole(begin)
         if iterations is None:
             q, push, done, count = _search(model, tasks, at, q, push, accuracy, max_iterations)
         else:
             q, push, done, count = _fixed(model, tasks, at, q, push, iterations)
         # custom_root differentiates its auxiliary output, which must then be floating.
-        return whole(q, push), (done.astype(dtype), count.astype(dtype))
+        ends, _ = ravel_pytree(answer.balanced(model, tasks, at, q, push))
+        return ends, (done.astype(dtype), count.astype(dtype))
 
     def conditions(x):
-        return whole(*answer.conditions(model, tasks, at, *parts(x)))
+        return ravel_pytree(answer.conditions(model, tasks, at, whole(x)))[0]
 
     def solve(linear, right):
-        return answer.smallest_change(linear, right, tasks, size)
+        return answer.smallest_change(linear, right, tasks, guess.shape[0])
 
     x, (done, count) = jax.lax.custom_root(conditions, begin, find, solve, has_aux=True)
-    found, _ = parts(x)
+    found = whole(x).q
     end = at(found)
     error, overlap = jnp.sqrt(end.error @ end.error), _overlap(end, dtype)
     near = jnp.maximum(error, overlap) <= real(accuracy).astype(dtype) * tasks.length
@@ -184,10 +181,11 @@ def _search(model, tasks: Tasks, at, q: Array, push, accuracy, max_iterations: i
         start, value = merit(here, push), merit(new, push)
         promised = start - _promise(here, push, move.increment)
         ratio = (start - value) / jnp.where(promised > 0, promised, start + 1)
+        flat = _flat(q.dtype) * tasks.length
         good = (value <= start) | (jnp.sqrt(value) <= _DRIFT_ERROR * move.drift)
+        good = good | (value <= flat**2)  # such errors balance the pull, or are rounding
         # What the bounds ask changes with their multipliers, so these follow steps only.
         follow = pushed(here, push, move.increment)
-        flat = _flat(q.dtype) * tasks.length
         settled = jnp.asarray(True)
         if push is not None:
             assert follow is not None

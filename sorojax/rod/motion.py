@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax.math.dense import product
 from sorojax.math.quadrature import (
     gauss_legendre,
     integration_matrix,
@@ -92,7 +93,7 @@ class Motion(eqx.Module):
     @property
     def position(self) -> Float[Array, "quad dim"]:
         """Centres of the sections [m]."""
-        path = self.operators.integration @ self.tangent
+        path = integrated(self.operators, self.tangent)
         return path if self.base is None else path + self.base.position[None, :]
 
     @property
@@ -124,6 +125,13 @@ def operators(rod: Rod) -> Operators:
         rotary=length * weights[None, :] * rotary,
         stiffness=_stiffness(rod, rows, weights),
     )
+
+
+def integrated(
+    constants: Operators, rate: Float[Array, "quad *shape"]
+) -> Float[Array, "quad *shape"]:
+    """Integrals from the base to each node; for few columns."""
+    return product(constants.integration, rate.reshape(rate.shape[0], -1)).reshape(rate.shape)
 
 
 def _along(rod: Rod, value: Array) -> Float[Array, " quad"]:

@@ -1,11 +1,9 @@
 """The planar rod: the section angle is linear in q, so no group exponential appears."""
 
-import functools
-
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sorojax.rod.motion import Motion, Operators, is_curvature, rest_along
+from sorojax.rod.motion import Motion, Operators, integrated, is_curvature, rest_along
 from sorojax.rod.rod import Rod
 
 
@@ -36,7 +34,7 @@ def motion(rod: Rod, constants: Operators, q: Array, v: Array) -> Motion:
         angular_rate=curvature[:, None, :],
         linear_rate=linear_rate,
         angular_jacobian=per_coordinate[:, None, :],
-        linear_jacobian=_integrate(constants, linear_rate),
+        linear_jacobian=integrated(constants, linear_rate),
     )
 
 
@@ -47,7 +45,7 @@ def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof
     angular = moment.angular_jacobian[:, 0]
     spin = (angular @ v)[:, None]
     inner = _bias_rate(moment, spin)
-    force = constants.mass[:, None] * _integrate(constants, inner)
+    force = constants.mass[:, None] * integrated(constants, inner)
     rows = jnp.concatenate([moment.linear_jacobian.reshape(-1, dof), angular])
     scale = jnp.concatenate([jnp.repeat(constants.mass, 2), constants.rotary[0]])
     loads = jnp.concatenate([force.reshape(-1), jnp.zeros_like(spin[:, 0])])
@@ -79,16 +77,6 @@ def _tangent(rod: Rod, constants: Operators, axes, q: Array) -> Array:
         if not is_curvature(name):
             tangent = tangent + axes[name == "sigma_y"] * (rows @ q)[:, None]
     return tangent
-
-
-def _integrate(constants: Operators, rate: Array) -> Array:
-    """Integrals from the base to each node."""
-    matrix, count = constants.integration, rate.shape[0]
-    if count > 8:
-        return (matrix @ rate.reshape(count, -1)).reshape(rate.shape)
-    # A small product costs more to call than to write out.
-    matrix = matrix.reshape(*matrix.shape, *(1 for _ in rate.shape[1:]))
-    return functools.reduce(jnp.add, (matrix[:, k] * rate[k][None] for k in range(count)))
 
 
 def _turn(vectors: Float[Array, "quad dim"]) -> Float[Array, "quad dim"]:

@@ -2,11 +2,12 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float
 
-from sorojax.math.dense import solve_symmetric
+from sorojax.math.dense import product, solve_symmetric
 from sorojax.rod.assembly import index_of
 from sorojax.rod.link import LinkMotion
 from sorojax.rod.loads import Load, total_force
@@ -120,7 +121,7 @@ def step(
 
 def _step(tasks: Tasks, own: Array, at: Rows, active, damping, pull_gain, hessian) -> Step:
     error, jacobian = active
-    down, square = error @ jacobian, jacobian.T @ jacobian
+    down, square = error @ jacobian, product(jacobian.T, jacobian)
     scaled, tiny = scaled_metric(tasks, square)
     free = None
     if tasks.limits is not None:
@@ -128,17 +129,23 @@ def _step(tasks: Tasks, own: Array, at: Rows, active, damping, pull_gain, hessia
         free = _free(tasks.limits, own, pulled)
         hessian = None if hessian is None else _held(hessian, free)
         down, square, scaled = free * down, _held(square, free), _held(scaled, free, 1.0)
-    increment = solve_symmetric(square + (damping + tiny) * scaled, down)
-    if hessian is not None:
-        curved = (hessian + hessian.T) / 2 + (damping + tiny) * scaled
-        # Not positive: the factor is not a number.
-        newton = cho_solve((jnp.linalg.cholesky(curved), True), down)
-        increment = jnp.where(jnp.all(jnp.isfinite(newton)), newton, increment)
-    drift = jnp.zeros((), error.dtype)
-    if at.pull is not None:
+    damped, pull = square + (damping + tiny) * scaled, None
+    drift, along = jnp.zeros((), error.dtype), None
+    if at.pull is None:
+        increment = solve_symmetric(damped, down)
+    else:
         pull = tiny * _per_metric(tasks, scaled) * at.pull
         pull = pull if free is None else free * pull
-        along = pull_gain * solve_symmetric(square + tiny * scaled, pull)
+        systems = jnp.stack([damped, square + tiny * scaled]), jnp.stack([down, pull])
+        increment, along = jax.vmap(solve_symmetric)(*systems)
+    if hessian is not None:
+        even = (hessian + hessian.T) / 2
+        increment = _newton(even + (damping + tiny) * scaled, down, increment)
+        if pull is not None and along is not None:
+            # Out of reach J'J has a null space that the errors do not have.
+            along = _newton(even + tiny * scaled, pull, along)
+    if along is not None:
+        along = pull_gain * along
         drift, increment = jnp.sqrt(along @ scaled @ along), increment + along
     slope = jnp.sqrt(jnp.abs(down @ solve_symmetric(scaled, down)))
     if tasks.limits is not None:
@@ -146,6 +153,13 @@ def _step(tasks: Tasks, own: Array, at: Rows, active, damping, pull_gain, hessia
         increment = jnp.clip(increment, low - own, high - own)
     size = jnp.sqrt(increment @ scaled @ increment)
     return Step(increment, size, drift, slope)
+
+
+def _newton(hessian: Array, right: Array, otherwise: Array) -> Array:
+    """The solution where the matrix is positive."""
+    # Not positive: the factor is not a number.
+    found = cho_solve((jnp.linalg.cholesky(hessian), True), right)
+    return jnp.where(jnp.all(jnp.isfinite(found)), found, otherwise)
 
 
 def scaled_metric(tasks: Tasks, square: Float[Array, "dof dof"]) -> tuple[Array, Array]:

@@ -4,6 +4,7 @@ import functools
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -88,6 +89,9 @@ def second_order(
     def at(q, v):
         return motion(model, q, v, constants=constants)
 
+    # What the equations make on their way would pass through the stores of all loops in
+    # reverse mode, in memory and in the compiled program.
+    @functools.partial(jax.checkpoint, prevent_cse=False)
     def equations(t, q, v):
         moment = at(q, v)
         mass, coriolis = inertia(moment)

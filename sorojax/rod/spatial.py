@@ -10,7 +10,14 @@ from jaxtyping import Array, Float
 
 from sorojax.math.magnus import rotation_vector
 from sorojax.math.quaternion import cross, exponential, prefix_product, rotation_columns
-from sorojax.rod.motion import Motion, Operators, is_curvature, local_axis, rest_along
+from sorojax.rod.motion import (
+    Motion,
+    Operators,
+    integrated,
+    is_curvature,
+    local_axis,
+    rest_along,
+)
 from sorojax.rod.rod import Rod
 
 
@@ -42,7 +49,7 @@ def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof
     constants, dof = moment.operators, moment.v.shape[0]
     spin = _spin(moment)
     swing, inner = _bias_rates(moment, spin)
-    linear, angular = constants.integration @ inner, constants.integration @ swing
+    linear, angular = integrated(constants, inner), integrated(constants, swing)
     local = _to_local(moment.directors, moment.angular_jacobian)
     local_spin = _to_local(moment.directors, spin[:, :, None])[:, :, 0]
     rotary = constants.rotary.T
@@ -67,7 +74,7 @@ def _directors(rod: Rod, constants: Operators, q: Array) -> list[Array]:
     moments = (constants.moments.reshape(-1, dof) @ q).reshape(order, rot, cells)
     if rod.rest_strain is not None:
         moments = moments + constants.rest_moments
-    by_order = tuple((m[0], m[1], m[2]) for m in moments)
+    by_order = tuple(jnp.unstack(m) for m in jnp.unstack(moments))
     turns = prefix_product(exponential(rotation_vector(by_order)))  # type: ignore[arg-type]
     if rod.quadrature.breaks:
         turns = tuple(c[rod.quadrature.node_cells] for c in turns)
@@ -113,7 +120,7 @@ def _bias_rates(moment: Motion, spin: Array) -> tuple[Array, Array]:
     quad, _, dof = moment.angular_rate.shape
     curl = (moment.angular_rate.reshape(-1, dof) @ v).reshape(quad, 3)
     swing = _cross(spin, curl)
-    angular = constants.integration @ swing
+    angular = integrated(constants, swing)
     swept = _cross(spin, moment.tangent)
     if any(not is_curvature(name) for name in moment.rod.basis.active):
         turning = _cross(spin, moment.tangent)

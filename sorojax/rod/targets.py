@@ -10,8 +10,9 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import real
+from sorojax.math.dense import product
 from sorojax.math.lie import SE2, SE3
-from sorojax.math.logarithm import change_of_logarithm, logarithm
+from sorojax.math.logarithm import logarithm_and_change
 from sorojax.sdf.base import AbstractSdf
 
 Errors = tuple[Float[Array, " rows"], Float[Array, "rows dof"]]
@@ -86,14 +87,14 @@ class Pose(AbstractTarget):
             [jnp.full(rot, self.length), jnp.ones_like(self.pose[0, 0, :dim])]
         )
 
+        # Axes of the world at the section: the same sums of squares as in its own.
         def one(pose, directors, position, angular, linear):
             ahead = pose[:dim, dim] - position
-            back = jnp.concatenate([pose[:dim, :dim], ahead[:, None]], axis=1)
-            local = jnp.concatenate([directors.T @ back, pose[dim:]])
-            twist = logarithm(group, local)
-            spin = angular if rot == 1 else directors.T @ angular
-            moving = jnp.concatenate([spin, directors.T @ linear])
-            return scale * twist, scale[:, None] * (change_of_logarithm(group, twist) @ moving)
+            turn = pose[:dim, :dim] @ directors.T
+            back = jnp.concatenate([turn, ahead[:, None]], axis=1)
+            twist, change = logarithm_and_change(group, jnp.concatenate([back, pose[dim:]]))
+            moving = jnp.concatenate([angular, linear])
+            return scale * twist, scale[:, None] * product(change, moving)
 
         if self.pose.shape[0] == 1:  # no batches of one in the time-critical case
             missing, made = one(*(x[0] for x in (self.pose, *frames)))

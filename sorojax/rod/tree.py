@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
@@ -203,30 +204,56 @@ def part_columns(moment: AssemblyMotion) -> tuple[Float[Array, "own dof"], ...]:
     return tuple(found)
 
 
-def section(moment: AssemblyMotion, index: int, on: int | None) -> tuple[Array, ...]:
-    """Rotation, position and Jacobians (angular, linear) of what carries part `index`, in
-    the frame of the carrier and its columns."""
+Section = tuple[Array, Array, Array, Array]
+
+
+def _sections(moment: AssemblyMotion) -> list[Section]:
+    """Rotation, position and Jacobians (angular, linear) of what carries each part, in the
+    frame of the carrier and its columns; those on equal rods together."""
     group, dtype = moment.assembly.group, moment.q.dtype
     dim, rot, twist = group.space_dim, group.rotation_dim, group.algebra_dim
-    eye = jnp.eye(twist, dtype=dtype)
-    rows = moment.operators.rows[index]
-    if rows is None or on is None:
-        still = jnp.zeros(dim, dtype)
-        return jnp.eye(dim, dtype=dtype), still, eye[:rot], eye[rot:]
-    at = Points(clamped(moment, on), rows)
-    centre = at.position[0]
+    eye, on = jnp.eye(twist, dtype=dtype), parents(moment.assembly)
+    ground = (jnp.eye(dim, dtype=dtype), jnp.zeros(dim, dtype), eye[:rot], eye[rot:])
+    found: list[Section] = [ground] * len(on)
+    for members, stack in zip(batches(moment.assembly), moment.batches, strict=True):
+        carried = [k for k, carrier in enumerate(on) if carrier in members]
+        carried = [k for k in carried if moment.operators.rows[k] is not None]
+        if not carried:
+            continue
+        places = [members.index(on[k]) for k in carried]
+        rows = jnp.stack([moment.operators.rows[k] for k in carried])
+        every = eqx.filter_vmap(_section)(_members(stack, places), rows)
+        for nth, k in enumerate(carried):
+            rotation, centre, angular, linear = (field[nth] for field in every)
+            found[k] = rotation, centre, angular, linear
+    return found
+
+
+def _section(moment: Motion, rows: Float[Array, "1 quad"]) -> Section:
+    at, dim = Points(moment, rows), moment.tangent.shape[1]
+    centre, angular = at.position[0], at.angular_jacobian[0]
+    rot, dtype = angular.shape[0], angular.dtype
+    eye = jnp.eye(rot + dim, dtype=dtype)
     linear = eye[rot:].at[:, :rot].set(levers(centre[None])[0])
-    angular = jnp.concatenate([eye[:rot], at.angular_jacobian[0]], axis=1)
+    angular = jnp.concatenate([eye[:rot], angular], axis=1)
     linear = jnp.concatenate([linear, at.linear_jacobian[0]], axis=1)
     return at.directors[0], centre, angular, linear
+
+
+def _members(stack: Motion, places: list[int]) -> Motion:
+    first, count = places[0], len(places)
+    # A slice is a view, a gather a loop.
+    in_row = places == list(range(first, first + count))
+    at = slice(first, first + count) if in_row else np.array(places)
+    return jax.tree.map(lambda leaf: leaf[at] if eqx.is_array(leaf) else leaf, stack)
 
 
 def _carry(moment: AssemblyMotion) -> tuple[tuple[Mount, ...], tuple[Frame, ...]]:
     """The pass from the ground outwards: poses and twists."""
     assembly, mounts, frames = moment.assembly, [], []
-    places = slices(assembly)
+    places, carriers = slices(assembly), _sections(moment)
     for index, on in enumerate(parents(assembly)):
-        mount, position = _mount(moment, index, on)
+        mount, position = _mount(moment, index, on, carriers[index])
         v = moment.v[places[index].joint_v]
         twist, rotation = mount.axes @ v, mount.turn
         if on is not None:
@@ -240,12 +267,14 @@ def _carry(moment: AssemblyMotion) -> tuple[tuple[Mount, ...], tuple[Frame, ...]
     return tuple(mounts), tuple(frames)
 
 
-def _mount(moment: AssemblyMotion, index: int, on: int | None) -> tuple[Mount, Array]:
+def _mount(
+    moment: AssemblyMotion, index: int, on: int | None, carrier: Section
+) -> tuple[Mount, Array]:
     """The mount of a part, and its position in the frame of the carrier."""
     assembly, dtype = moment.assembly, moment.q.dtype
     part, group = assembly.parts[index], assembly.group
     dim, rot = group.space_dim, group.rotation_dim
-    rotation, centre, angular, linear = section(moment, index, on)
+    rotation, centre, angular, linear = carrier
     arm = jnp.zeros(dim, dtype)
     if part.offset is not None:
         offset = part.offset.astype(dtype)

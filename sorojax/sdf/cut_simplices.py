@@ -41,6 +41,19 @@ def monomials(points: np.ndarray, order: int) -> np.ndarray:
     return np.stack(columns[: count(dim, order)], axis=1)
 
 
+def turned(turn: np.ndarray, order: int) -> np.ndarray:
+    """Matrix that takes the `monomials` of p to those of `turn` p."""
+    dim = len(turn)
+    second = pairs(dim)
+    matrix = np.zeros((1 + dim + len(second),) * 2)
+    matrix[0, 0], matrix[1 : 1 + dim, 1 : 1 + dim] = 1.0, turn
+    for k, (i, j) in enumerate(second):
+        for m, (a, b) in enumerate(second):
+            both = turn[i, a] * turn[j, b] + (a != b) * turn[i, b] * turn[j, a]
+            matrix[1 + dim + k, 1 + dim + m] = both
+    return matrix[: count(dim, order), : count(dim, order)]
+
+
 def box_moments(centers: np.ndarray, edge: float, order: int) -> np.ndarray:
     """Moments (n, moments) of cubes."""
     dim = centers.shape[1]

@@ -18,14 +18,22 @@ from sorojax.sdf.dual_crossings import (
     corner,
     crossings,
 )
-from sorojax.sdf.dual_rims import refuse_lost_walls
+from sorojax.sdf.dual_forced import (
+    NONE,
+    Forced,
+    apply_forced,
+    forced_nodes,
+    keep_joined,
+    with_blocks_around,
+)
+from sorojax.sdf.dual_quads import Quads, split
 from sorojax.sdf.dual_sheets import Faces, cell_sheets, doubtful_faces
-from sorojax.sdf.dual_vertices import SHIFTS, SUMS, diagonals, gathered, place
+from sorojax.sdf.dual_vertices import SHIFTS, SUMS, gathered, place
+from sorojax.sdf.dual_walls import NO_EDGES, Lost, joined, lost_edges
 from sorojax.sdf.sample import values
 
 # By axis of a grid edge: the axes, as bits, to go back along to the four cells around it.
 _AROUND = (SHIFTS @ np.array([1, 2, 4])).astype(int)
-_PIECE = 1 << 13
 _NONE = Crossings(*np.zeros((2, 0)), [], *np.zeros((2, 0, 3)))
 _GROUP = 512  # blocks that go through together
 
@@ -52,28 +60,46 @@ def dual_contouring(
     shape: AbstractSdf, grid: Grid, blocks: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [m] inside their cells, and triangles that face outwards."""
-    groups, done = [], 0
-    for group, field in leaf_fields(shape, grid, blocks, _GROUP):
-        groups.append(crossings(shape, grid, group, field, done))
-        done += len(group)
-        del field
+    groups, lost = _crossed(shape, grid, blocks, NONE)
+    forced = NONE
+    if len(lost.axis):
+        forced = forced_nodes(shape, grid, lost, sum(len(group.offset) for group in groups))
+        blocks = with_blocks_around(grid, blocks, forced)
+        groups = _crossed(shape, grid, blocks, forced)[0]
     before = blocks_before(grid, blocks)
-    cells = _numbered(shape, grid, blocks, before, groups)
+    cells = _numbered(shape, grid, blocks, before, groups, forced)
     vertices = np.empty((int(cells.first[-1]), 3))
     count = sum(len(group.offset) for group in groups)
     triangles, row = np.empty((2, count, 3), np.int32), 0
-    for quads, points, normals in _placed(shape, grid, blocks, before, groups, cells, vertices):
-        for start in range(0, len(quads), _PIECE):
-            piece = slice(start, start + _PIECE)
-            split = _split(vertices, quads[piece], points[piece], normals[piece])
-            triangles[:, row : row + split.shape[1]] = split
-            row += split.shape[1]
+    more, added, total = [triangles[0, :0]], [vertices], len(vertices)
+    for quads in _placed(blocks, before, groups, cells, vertices):
+        pairs, rest, points = split(vertices, quads, total)
+        triangles[:, row : row + pairs.shape[1]] = pairs
+        row, total = row + pairs.shape[1], total + len(points)
+        more.append(rest)
+        added.append(points)
+    if total > len(vertices):
+        vertices = np.concatenate(added)
+        triangles = np.concatenate([triangles.reshape(-1, 3), *more])
     vertices *= grid.size
     vertices += grid.lower
     return vertices, triangles.reshape(-1, 3)
 
 
-def _numbered(shape, grid, blocks, before, groups: list[Crossings]) -> Cells:
+def _crossed(shape, grid, blocks, forced: Forced) -> tuple[list[Crossings], Lost]:
+    """Crossings of all groups, and the edges that lose a wall if no node is chosen yet."""
+    groups, lost, done = [], [], 0
+    for group, field in leaf_fields(shape, grid, blocks, _GROUP):
+        if not len(forced.number):
+            lost.append(lost_edges(shape, grid, group, field))
+        apply_forced(grid, forced, group, field)
+        groups.append(crossings(shape, grid, group, field, done, forced))
+        done += len(group)
+        del field
+    return groups, joined(lost) if lost else NO_EDGES
+
+
+def _numbered(shape, grid, blocks, before, groups: list[Crossings], forced: Forced) -> Cells:
     name = np.concatenate([group.cells for group in groups])
     code = np.concatenate([group.code for group in groups])
     second = doubtful_faces(code)
@@ -85,17 +111,18 @@ def _numbered(shape, grid, blocks, before, groups: list[Crossings]) -> Cells:
     if not np.array_equal(name[first], names):
         _raise_leaving()
     faces = Faces(first, np.concatenate(second), axis)
-    middle = corner(blocks, name[faces.second]) + (1 - np.eye(3)[axis]) / 2
-    sheets = cell_sheets(code, faces, values(shape, grid.points(middle)) < 0)
+    node = corner(blocks, name[faces.second])
+    inner = values(shape, grid.points(node + (1 - np.eye(3)[axis]) / 2)) < 0
+    sheets = cell_sheets(code, faces, keep_joined(grid, forced, node, axis, inner))
     ends = np.zeros(len(name) + 1, np.int32)
     np.cumsum(sheets.number[sheets.kind], out=ends[1:])
     return Cells(name, code, sheets.kind, sheets.edges, ends)
 
 
 def _placed(
-    shape, grid, blocks, before, groups: list[Crossings], cells: Cells, vertices: np.ndarray
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Quadrilaterals of each group with points and normals, once their vertices are placed.
+    blocks, before, groups: list[Crossings], cells: Cells, vertices: np.ndarray
+) -> Iterator[Quads]:
+    """Quadrilaterals of each group, once their vertices are placed.
 
     A group's vertices are placed when the next group, which shares cell walls with its last
     layer, has added its planes.
@@ -114,25 +141,25 @@ def _placed(
         axis = np.repeat(np.arange(3), [len(e) for e in group.edges])
         gathered(group.offset, group.normal, axis, quads - cells.first[low], total)
         if held is not None:
-            _place(shape, grid, blocks, cells, slice(low, now), total, vertices)
+            _place(blocks, cells, slice(low, now), total, vertices)
             yield held
             total = total[cells.first[now] - cells.first[low] :].copy()
-        points = corner(blocks, cells.name[rows]) + group.offset
-        held = outward(quads, cells.code[rows]), points, group.normal
+        start = corner(blocks, cells.name[rows])
+        facing = outward(quads, cells.code[rows])
+        held = Quads(facing, start, axis, group.offset, group.normal)
     if held is not None:
-        _place(shape, grid, blocks, cells, slice(ends[-2], ends[-1]), total, vertices)
+        _place(blocks, cells, slice(ends[-2], ends[-1]), total, vertices)
         yield held
 
 
-def _place(shape, grid, blocks, cells: Cells, rows: slice, total, vertices) -> None:
+def _place(blocks, cells: Cells, rows: slice, total, vertices) -> None:
     """Put the vertices of the cells `rows`, whose sums come first in `total`."""
     ends = cells.first[rows.start : rows.stop + 1]
     number = np.diff(ends)
     owner = np.repeat(np.arange(rows.start, rows.stop), number)
     first = corner(blocks, cells.name[owner])
-    done = total[: len(owner)]
-    refuse_lost_walls(shape, grid, done, first, cells.code[owner])
-    vertices[ends[0] : ends[-1]] = first + place(done, np.repeat(number == 1, number))
+    alone = np.repeat(number == 1, number)
+    vertices[ends[0] : ends[-1]] = first + place(total[: len(owner)], alone)
 
 
 def quads_around(
@@ -161,10 +188,11 @@ def quads_around(
         for k, bits in enumerate(_AROUND[axis].tolist()):
             d, e = bits >> (axis + 1) % 3 & 1, bits >> (axis + 2) % 3 & 1
             at = cells_before(before, start, bits) - base
-            cell = index[np.maximum(at, 0)]
+            cell = index.take(np.maximum(at, 0))
             if (at < 0).any() or (cell < 0).any():
                 _raise_leaving()
-            part[:, k] = cells.first[cell] + cells.edges[cells.kind[cell], 4 * axis + d + 2 * e]
+            sheet = cells.edges[:, 4 * axis + d + 2 * e].take(cells.kind.take(cell))
+            part[:, k] = cells.first.take(cell) + sheet
     return quads
 
 
@@ -178,17 +206,4 @@ def _raise_leaving() -> None:
         "isosurface: the surface leaves the blocks that the shape's Lipschitz constant "
         "allows or its bounding box, need true bounds. Check `lipschitz` and "
         "`bounding_box` of the shapes you wrote."
-    )
-
-
-def _split(vertices, quads, points, normals) -> np.ndarray:
-    """Quadrilaterals as two triangles each, (2, n, 3)."""
-    ends = vertices[quads]
-    ends -= points[:, None]
-    first = diagonals(ends, normals)[:, None]
-    return np.stack(
-        [
-            np.where(first, quads[:, [0, 1, 2]], quads[:, [0, 1, 3]]),
-            np.where(first, quads[:, [0, 2, 3]], quads[:, [1, 2, 3]]),
-        ]
     )

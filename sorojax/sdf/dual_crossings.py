@@ -13,6 +13,7 @@ import numpy as np
 
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.blocks import LEAF, Grid
+from sorojax.sdf.dual_forced import Forced, ends_at, forced_crossings
 from sorojax.sdf.sample import value_and_gradient
 
 _WIDE = LEAF + 1
@@ -49,7 +50,8 @@ class Crossings(NamedTuple):
 
 def corner(blocks: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """First nodes (n, 3) of cells."""
-    return blocks[cells >> 9] + _PLACES[cells & (_CELLS - 1)]
+    # `take` gathers rows several times faster than an index does.
+    return blocks.take(cells >> 9, axis=0) + _PLACES.take(cells & (_CELLS - 1), axis=0)
 
 
 def blocks_before(grid: Grid, blocks: np.ndarray) -> np.ndarray:
@@ -66,11 +68,17 @@ def blocks_before(grid: Grid, blocks: np.ndarray) -> np.ndarray:
 def cells_before(before: np.ndarray, cells: np.ndarray, bits: int) -> np.ndarray:
     """Cells one back along the axes of `bits`; below zero where no block holds them."""
     place = cells & (_CELLS - 1)
-    return _CELLS * before[cells >> 9, _PASSED[bits][place]] + _ARRIVED[bits][place]
+    row = before.take((cells >> 9) * 8 + _PASSED[bits].take(place))
+    return _CELLS * row + _ARRIVED[bits].take(place)
 
 
 def crossings(
-    shape: AbstractSdf, grid: Grid, group: np.ndarray, field: np.ndarray, first: int
+    shape: AbstractSdf,
+    grid: Grid,
+    group: np.ndarray,
+    field: np.ndarray,
+    first: int,
+    forced: Forced,
 ) -> Crossings:
     """Crossings of `group`, whose first block is number `first`, by `field` (n, 9, 9, 9)."""
     codes = _codes(field).ravel()
@@ -84,6 +92,10 @@ def crossings(
     a, b = flat[node], flat[node + np.array([_WIDE * _WIDE, _WIDE, 1])[axis]]
     nodes = corner(group.astype(np.int32), start)
     offset, normal = _hermite(shape, grid, nodes, axis.astype(np.int8), a, b)
+    if len(forced.number):
+        rows = np.flatnonzero(ends_at(grid, forced, nodes, axis))
+        found = forced_crossings(shape, grid, nodes[rows], axis[rows], a[rows] < 0)
+        offset[rows], normal[rows] = found
     return Crossings((at + _CELLS * first).astype(np.int32), code, edges, offset, normal)
 
 

@@ -111,27 +111,3 @@ def _inverse(xx, xy, xz, yy, yz, zz):
     adjugate = (a, b, c, xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy)
     determinant = xx * a + xy * b + xz * c
     return [entry / determinant for entry in adjugate]
-
-
-def diagonals(ends: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Whether to cut quadrilaterals from the first to the third corner.
-
-    The diagonal that lies nearer to the surface is taken, the shorter one on planes.
-
-    Args:
-        ends: (n, 4, 3) corners as seen from a point of the surface [cells].
-        normal: (n, 3) unit normal there.
-    """
-    return padded(_diagonals, ends.astype(np.float32), normal)
-
-
-@jax.jit
-def _diagonals(ends, normal):
-    a, b, c, d = ([ends[:, k, i] for i in range(3)] for k in range(4))
-
-    def cost(a, b):
-        off = sum((p + q) * normal[:, i] for i, (p, q) in enumerate(zip(a, b, strict=True)))
-        square = sum((p - q) ** 2 for p, q in zip(a, b, strict=True))
-        return jnp.abs(off) / 2 + 1e-3 * jnp.sqrt(square)
-
-    return cost(a, c) <= cost(b, d)

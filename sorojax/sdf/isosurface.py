@@ -33,8 +33,12 @@ def isosurface(
     """Closed, manifold boundary surface of a solid shape.
 
     Only blocks of cells that the Lipschitz constant of the shape cannot exclude are
-    evaluated. Walls and gaps thinner than `size` may be lost; dual contouring keeps those of
-    `size` and more whole, and refuses where thinner ones would be cut open.
+    evaluated. Walls and gaps thinner than `size` may be lost by marching cubes. Dual
+    contouring keeps those of `size` and more whole, and the thin rims at which sheets run
+    out, up to half a cell thicker. Walls of even thickness between 0.2 and 1 `size` it
+    refuses where it sees them pass between nodes; thinner ones may be lost without a word,
+    so choose `size` no larger than the thinnest wall. Its triangles do not pass through
+    each other but where several sheets share a cell.
 
     Args:
         shape: A concrete, bounded solid shape.
@@ -45,8 +49,8 @@ def isosurface(
 
     Raises:
         ValueError: If the shape is empty, unbounded or traced, its field varies faster
-            than its Lipschitz constant says, or dual contouring meets a wall of 0.4 to 1
-            `size` that falls between nodes.
+            than its Lipschitz constant says, or dual contouring meets a wall of 0.2 to 1
+            `size` that passes between nodes.
     """
     if method not in _METHODS:
         raise ValueError(f"isosurface: `method` is {method!r}, need one of {list(_METHODS)}.")

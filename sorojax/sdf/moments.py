@@ -18,6 +18,7 @@ from sorojax.sdf import six_node
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.blocks import LEAF, Grid, active_blocks
 from sorojax.sdf.cell_tree import SHIFT, Moments, bending, first_level, integrate
+from sorojax.sdf.cut_simplices import turned
 from sorojax.sdf.isosurface import Surface
 from sorojax.sdf.marching import marching_cubes
 from sorojax.sdf.query import shape_tangent
@@ -27,6 +28,10 @@ _SMOOTH = 2e-2  # squared change of slope in a cell that six-node triangles foll
 _DOUBT = 1e-2  # of the volume within cells that may hide something
 _LEVELS = {2: 8, 3: 4}  # halvings of a cell where the field bends
 _ROWS = 1 << 12
+# Cells lie askew in space. All cells along an edge of a box would else be cut alike: what they
+# miss would add up, come and go with every cell the edge moves by, and spoil derivatives.
+_SPIN = np.array([[0.0, -0.31, 0.23], [0.31, 0.0, -0.17], [-0.23, 0.17, 0.0]])
+_TURN = np.linalg.solve(np.eye(3) - _SPIN, np.eye(3) + _SPIN)
 
 
 class Rule(NamedTuple):
@@ -98,11 +103,14 @@ def _found(shape: AbstractSdf, rule: Rule, slope: bool) -> Moments:
     lower, upper = finite_box(rule.where, shape, shape.dim)
     middle, size = (lower + upper) / 2, float((upper - lower).max()) / rule.resolution
 
+    turn = _TURN if shape.dim == 3 else np.eye(2)
+
     def field(points):
-        return values(shape, middle + size * points) / size
+        return values(shape, middle + size * points @ turn.T) / size
 
     reach = float(shape.lipschitz)
-    level, full = first_level(field, reach, (upper - lower) / size, rule.order)
+    extent = np.abs(turn).T @ (upper - lower) / size
+    level, full = first_level(field, reach, extent, rule.order)
     if np.isnan(level.field).any():
         raise ValueError(
             f"{rule.where}: the field of the shape is NaN at {np.isnan(level.field).sum()} "
@@ -112,7 +120,12 @@ def _found(shape: AbstractSdf, rule: Rule, slope: bool) -> Moments:
         found = _smooth(shape, rule, middle, size, upper - lower, slope)
     else:
         found = integrate(field, reach, level, _LEVELS[shape.dim], rule.order, slope)
-        found = found._replace(value=found.value + full, slope=found.slope / size)
+        back = turned(turn, rule.order)
+        found = found._replace(
+            value=back @ (found.value + full),
+            points=found.points @ turn.T,
+            slope=found.slope @ back.T / size,
+        )
     if not found.value[0] > 0:
         raise_empty(rule.where, lower, upper, size)
     if found.doubt > _DOUBT * found.value[0]:

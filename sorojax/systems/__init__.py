@@ -1,6 +1,21 @@
 """Systems: blocks with ports, networks of them, and their simulation."""
 
+from sorojax.math.explicit import (
+    RungeKutta4 as RungeKutta4,
+    SemiImplicitEuler as SemiImplicitEuler,
+    Tsit5 as Tsit5,
+)
+from sorojax.math.linearly_implicit import Rosenbrock2 as Rosenbrock2
+from sorojax.math.rosenbrock import Rodas4 as Rodas4
+from sorojax.systems.algebra import (
+    Function as Function,
+    Lag as Lag,
+    Sensor as Sensor,
+    gain as gain,
+    sum_of as sum_of,
+)
 from sorojax.systems.assembly_body import AssemblyBody as AssemblyBody
+from sorojax.systems.batch import simulate_batch as simulate_batch
 from sorojax.systems.block import (
     AbstractBlock as AbstractBlock,
     Input as Input,
@@ -11,15 +26,44 @@ from sorojax.systems.controller import (
     AbstractController as AbstractController,
     PIDMemory as PIDMemory,
 )
+from sorojax.systems.event import Event as Event, Happened as Happened
 from sorojax.systems.fluidic import Regulator as Regulator, Reservoir as Reservoir
+from sorojax.systems.model_control import (
+    CartesianImpedance as CartesianImpedance,
+    Compensation as Compensation,
+    ComputedTorque as ComputedTorque,
+    EnergyShaping as EnergyShaping,
+    FeedForward as FeedForward,
+    TipSpring as TipSpring,
+)
 from sorojax.systems.network import (
     Network as Network,
     as_term as as_term,
     outputs as outputs,
 )
+from sorojax.systems.rigid_body import RigidBody as RigidBody, Touch as Touch
 from sorojax.systems.rod_body import RodBody as RodBody, body_motion as body_motion
-from sorojax.systems.sampled import simulate_sampled as simulate_sampled
-from sorojax.systems.simulate import Trajectory as Trajectory, simulate as simulate
+from sorojax.systems.sampled import (
+    Sampled as Sampled,
+    simulate_sampled as simulate_sampled,
+)
+from sorojax.systems.shape_estimate import (
+    Markers as Markers,
+    Shape as Shape,
+    estimate_shape as estimate_shape,
+)
+from sorojax.systems.shape_filter import (
+    Filtered as Filtered,
+    ShapeFilter as ShapeFilter,
+    start_filter as start_filter,
+    update_filter as update_filter,
+)
+from sorojax.systems.simulate import (
+    Trajectory as Trajectory,
+    last_state as last_state,
+    simulate as simulate,
+    state_at as state_at,
+)
 from sorojax.systems.source import (
     AbstractReference as AbstractReference,
     Constant as Constant,
@@ -28,3 +72,5 @@ from sorojax.systems.source import (
     Source as Source,
     Step as Step,
 )
+from sorojax.systems.stack import Stack as Stack, stack as stack
+from sorojax.systems.valve import Valve as Valve

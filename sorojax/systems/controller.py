@@ -113,7 +113,7 @@ class PID(AbstractController):
 
     def start(self, t, measurement) -> PIDMemory:
         zero = jnp.zeros_like(self.start_measurement)
-        return PIDMemory(zero, zero + measurement, zero + t)
+        return PIDMemory(jnp.zeros_like(zero + measurement), zero + measurement, zero + t)
 
     def __call__(self, t, measurement, state: PIDMemory):
         elapsed = t - state.time

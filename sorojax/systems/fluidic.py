@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import optional_real, real
 from sorojax.systems.block import AbstractBlock, Input, Output
 
 ATMOSPHERE = 101325.0  # Pa
@@ -21,8 +21,11 @@ class Reservoir(AbstractBlock):
     """A well-mixed gas of changing volume, fed by mass flow.
 
     With absolute pressure p, n = `exponent` and V' = volume_rate + compliance p':
-    p' = n (R T m' - p V') / V, so that a sealed reservoir keeps p V^n. The state is the
-    absolute pressure.
+    p' = (n (R T m' - p V') - n leakage (p - atmosphere) V) / V, so that a sealed reservoir
+    without leak keeps p V^n. The state is the absolute pressure.
+
+    Where no rate of the volume is at hand, `bandwidth` a makes one: z' = -a (z + a V) and
+    V' = z + a V, exact for slow volumes and late by 1/a. It adds a pole at -a.
 
     Attributes:
         start_pressure: Gauge pressure at the start [Pa].
@@ -32,6 +35,15 @@ class Reservoir(AbstractBlock):
         gas_constant: Specific gas constant [J/(kg K)].
         atmosphere: Absolute pressure outside [Pa].
         ports: Number of independent chambers; None for a single scalar one.
+        leakage: Rate at which a rigid isothermal reservoir loses gauge pressure [1/s]; printed
+            chambers have 1e-5 to 3e-2.
+        volume: Volume of a rigid vessel [m^3], which then has no port for it.
+        bandwidth: Of the rate of the volume [rad/s], which then has no port.
+        start_volume: Input volume at the start [m^3], for `bandwidth` only.
+
+    Reference:
+        Caasenbrood, Pogromsky, Nijmeijer, Sorotoki, 2024, eq. 25 to 27, with the sign of the
+        filter mended.
     """
 
     start_pressure: Float[Array, "*ports"] = eqx.field(converter=real, default=0.0)
@@ -41,38 +53,74 @@ class Reservoir(AbstractBlock):
     gas_constant: Float[Array, ""] = eqx.field(converter=real, default=AIR)
     atmosphere: Float[Array, ""] = eqx.field(converter=real, default=ATMOSPHERE)
     ports: int | None = eqx.field(static=True, default=None)
+    leakage: Float[Array, "*ports"] = eqx.field(converter=real, default=0.0)
+    volume: Float[Array, "*ports"] | None = eqx.field(converter=optional_real, default=None)
+    bandwidth: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
+    start_volume: Float[Array, "*ports"] | None = eqx.field(
+        converter=optional_real, default=None
+    )
 
     def __check_init__(self):
         do = "Pressures at ports are gauge: 0 Pa is the atmosphere."
         absolute = self.start_pressure + self.atmosphere
         _check.positive("Reservoir", "start_pressure + atmosphere", absolute, "Pa", do)
         _check.positive("Reservoir", "temperature", self.temperature, "K", "Add 273.15.")
+        if self.bandwidth is not None and (
+            self.start_volume is None or self.volume is not None
+        ):
+            raise ValueError(
+                "Reservoir: `bandwidth` differentiates a volume that changes, need its value "
+                "at the start and no fixed `volume`. Give start_volume=, or leave `bandwidth` "
+                "out."
+            )
 
     @property
     def inputs(self):
         shape = _ports(self.ports)
-        return {
-            "mass_flow": Input("kg/s", shape, default=0.0),
-            "volume": Input("m^3", shape),
-            "volume_rate": Input("m^3/s", shape, default=0.0),
-            "compliance": Input("m^3/Pa", shape, default=0.0),
-        }
+        ports = {"mass_flow": Input("kg/s", shape, default=0.0)}
+        if self.volume is None:
+            ports["volume"] = Input("m^3", shape)
+            if self.bandwidth is None:  # the filtered rate holds what yielding walls add
+                ports["volume_rate"] = Input("m^3/s", shape)
+                ports["compliance"] = Input("m^3/Pa", shape, default=0.0)
+        return ports
 
     @property
     def outputs(self):
         return {"pressure": Output("Pa", _ports(self.ports))}
 
     def initial_state(self):
-        return jnp.broadcast_to(self.start_pressure + self.atmosphere, _ports(self.ports))
+        shape = _ports(self.ports)
+        pressure = jnp.broadcast_to(self.start_pressure + self.atmosphere, shape)
+        if self.bandwidth is None or self.start_volume is None:
+            return pressure
+        delay = jnp.broadcast_to(-self.bandwidth * self.start_volume, shape)
+        return {"pressure": pressure, "filter": delay}
 
     def output(self, name, t, state, inputs):
-        return state - self.atmosphere
+        return self._pressure(state) - self.atmosphere
 
     def vector_field(self, t, state, inputs):
-        volume = inputs["volume"] + self.dead_volume
+        pressure = self._pressure(state)
+        if self.volume is not None:
+            return self._rate(pressure, inputs, self.volume, 0.0, 0.0)
+        volume = inputs["volume"]
+        if self.bandwidth is None:
+            growth, compliance = inputs["volume_rate"], inputs["compliance"]
+            return self._rate(pressure, inputs, volume, growth, compliance)
+        growth = state["filter"] + self.bandwidth * volume
+        rate = self._rate(pressure, inputs, volume, growth, 0.0)
+        return {"pressure": rate, "filter": -self.bandwidth * growth}
+
+    def _pressure(self, state):
+        return state if self.bandwidth is None else state["pressure"]
+
+    def _rate(self, pressure, inputs, volume, growth, compliance):
+        whole = volume + self.dead_volume
         supply = self.gas_constant * self.temperature * inputs["mass_flow"]
-        stretch = self.exponent * state * inputs["compliance"]
-        return self.exponent * (supply - state * inputs["volume_rate"]) / (volume + stretch)
+        lost = self.leakage * (pressure - self.atmosphere) * whole
+        stretch = self.exponent * pressure * compliance
+        return self.exponent * (supply - lost - pressure * growth) / (whole + stretch)
 
 
 class Regulator(AbstractBlock):

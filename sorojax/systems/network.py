@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from sorojax.systems.block import AbstractBlock, Input, Output, Signals
+from sorojax.systems.loops import consistent, torn_wires
 from sorojax.systems.schedule import check_wires, evaluation_order, reachable_inputs
 
 
@@ -27,15 +28,18 @@ class Network(AbstractBlock):
         blocks: Blocks by name.
         wires: `{"block.input": "block.output"}`; an input has one driver.
         exposed: Inputs that the user of the network supplies, `("block.input", ...)`.
+        solve_loops: Solve algebraic loops at every evaluation instead of refusing them.
     """
 
     blocks: dict[str, AbstractBlock]
     wires: tuple[tuple[str, str], ...] = eqx.field(static=True, converter=_pairs)
     exposed: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
+    solve_loops: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
         check_wires(self.blocks, dict(self.wires), self.exposed)
-        evaluation_order(self.blocks, dict(self.wires))
+        if not self.solve_loops:
+            evaluation_order(self.blocks, dict(self.wires))
 
     @property
     def inputs(self) -> dict[str, Input]:
@@ -96,12 +100,19 @@ def as_term(network: AbstractBlock, inputs: Signals | None = None) -> dfx.ODETer
     given here is used.
     """
 
-    def field(t: Any, state: PyTree, args: Any) -> PyTree:
-        system = network if args is None else args
-        t = jnp.asarray(t)
-        return system.vector_field(t, state, at_time(inputs or {}, t))
+    return dfx.ODETerm(_Field(network, dict(inputs or {})))
 
-    return dfx.ODETerm(field)
+
+class _Field(eqx.Module):
+    """The rate of a block under inputs, as diffrax calls it."""
+
+    block: AbstractBlock
+    inputs: dict[str, Any]
+
+    def __call__(self, t: Any, state: PyTree, args: Any) -> PyTree:
+        system = self.block if args is None else args
+        t = jnp.asarray(t)
+        return system.vector_field(t, state, at_time(self.inputs, t))
 
 
 def at_time(inputs: Mapping[str, Any], t: Float[Array, ""]) -> dict[str, Any]:
@@ -120,24 +131,41 @@ def _signals(network: Network, t, state, supplied: Signals) -> dict[str, Array]:
             f"Network: the exposed input `{missing[0]}` got no value. Pass "
             f'inputs={{"{missing[0]}": ...}}.'
         )
-    signals: dict[str, Array] = {}
+    given: dict[str, Array] = {}
     for name, port in ports.items():
         if name in network.exposed and name in supplied:
-            signals[name] = supplied[name]
+            given[name] = supplied[name]
         elif name not in wires and port.default is not None:
-            signals[name] = jnp.full(port.shape, port.default, jnp.result_type(float))
+            given[name] = jnp.full(port.shape, port.default, jnp.result_type(float))
+    torn = torn_wires(network.blocks, wires) if network.solve_loops else ()
+    if not torn:
+        return _propagated(network, wires, t, state, given)
+    left = {name: source for name, source in wires.items() if name not in torn}
+
+    def around(values):
+        signals = _propagated(network, left, t, state, {**given, **values})
+        return {name: signals[wires[name]] for name in torn}
+
+    guess = {name: jnp.zeros(ports[name].shape, jnp.result_type(float)) for name in torn}
+    solved = consistent(around, guess)
+    return _propagated(network, left, t, state, {**given, **solved})
+
+
+def _propagated(network: Network, wires, t, state, given: Signals) -> dict[str, Array]:
+    """Signals that follow from given ones along the wires."""
+    signals, ports = dict(given), network.input_ports
     for name in evaluation_order(network.blocks, wires):
         if name in wires:
             signals[name] = signals[wires[name]]
         elif name not in ports:
             owner, port_name = name.split(".", 1)
-            given = _inputs_of(network, owner, signals)
+            own = _inputs_of(network, owner, signals)
             block = network.blocks[owner]
-            signals[name] = block.output(port_name, t, state[owner], given)
+            signals[name] = block.output(port_name, t, state[owner], own)
     return signals
 
 
-def _inputs_of(network: Network, owner: str, signals: dict[str, Array]) -> Signals:
+def _inputs_of(network: Network, owner: str, signals: Signals) -> Signals:
     names = network.blocks[owner].inputs
     full = {name: f"{owner}.{name}" for name in names}
     return {name: signals[key] for name, key in full.items() if key in signals}

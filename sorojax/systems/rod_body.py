@@ -33,12 +33,14 @@ class RodBody(AbstractBlock):
         rod: The rod.
         forces: Its forces; at most one pressure map (of one or several ports).
         q, v: Coordinates and rates at the start; zero if omitted.
+        driven: Open an input `effort`, a generalised force from outside.
     """
 
     rod: Rod
     forces: tuple[AbstractForce | AbstractPressureMap, ...] = ()
     q: Float[Array, " dof"] | None = eqx.field(converter=optional_real, default=None)
     v: Float[Array, " dof"] | None = eqx.field(converter=optional_real, default=None)
+    driven: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
         maps = [f for f in self.forces if isinstance(f, AbstractPressureMap)]
@@ -51,14 +53,16 @@ class RodBody(AbstractBlock):
     @property
     def inputs(self):
         chamber = self._chamber()
+        effort = {"effort": Input(None, self._dof(), 0.0)} if self.driven else {}
         if chamber is None:
-            return {}
-        return {"pressure": Input("Pa", chamber.ports, default=0.0)}
+            return effort
+        return effort | {"pressure": Input("Pa", chamber.ports, default=0.0)}
 
     @property
     def outputs(self):
         dim = self.rod.group.space_dim
         ports = {"tip_position": Output("m", (dim,)), "q": Output(None, self._dof())}
+        ports["v"] = Output(None, self._dof())
         if dim == 2:
             ports["tip_angle"] = Output("rad")
         chamber = self._chamber()
@@ -77,8 +81,8 @@ class RodBody(AbstractBlock):
 
     def output(self, name, t, state, inputs):
         q, v = state["q"], state["v"]
-        if name == "q":
-            return q
+        if name in ("q", "v"):
+            return state[name]
         if name == "tip_position":
             return tip_pose(self.rod, q)[:-1, -1]
         if name == "tip_angle":
@@ -97,6 +101,8 @@ class RodBody(AbstractBlock):
         moment = motion(self.rod, state["q"], state["v"])
         mass, coriolis = inertia(moment)
         force = total_force(self._bound(inputs), t, moment)
+        if self.driven:
+            force = force + inputs["effort"]
         return {"q": state["v"], "v": solve_symmetric(mass, force - coriolis)}
 
     def _bound(self, inputs) -> tuple[AbstractForce, ...]:

@@ -1,62 +1,89 @@
-"""Simulation with a controller that is called at instants, its command held between."""
+"""Simulation with controllers that are called at instants, their commands held between."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from sorojax import _check
 from sorojax._types import is_traced, real
+from sorojax.math.explicit import RungeKutta4
+from sorojax.math.method import AbstractMethod, finite, guarded
 from sorojax.math.status import Status
-from sorojax.math.steppers import rk4_step
-from sorojax.systems.controller import AbstractController
+from sorojax.systems.integrate import explicit_inputs, interval_of
 from sorojax.systems.network import Network, at_time, outputs
-from sorojax.systems.simulate import Trajectory, all_finite
+from sorojax.systems.progress import tell
+from sorojax.systems.simulate import Trajectory, last_state
+
+Ports = str | tuple[str, ...]
+
+
+class Sampled(eqx.Module):
+    """A controller on a network, called every so many ticks.
+
+    Attributes:
+        controller: `controller(t, measurement, memory) -> (command, memory)`, with
+            `controller.start(t, measurement)` for the memory before the first call.
+        measurement: The output that it reads; of several names it gets a tuple.
+        command: The exposed input that it drives; for several names it returns a tuple.
+        every: Ticks between its calls.
+    """
+
+    controller: Callable[[Any, Any, Any], tuple[Any, Any]]
+    measurement: Ports = eqx.field(static=True)
+    command: Ports = eqx.field(static=True)
+    every: int = eqx.field(static=True, default=1)
+
+    def __check_init__(self):
+        if self.every < 1:
+            raise ValueError(f"Sampled: `every` must be 1 or more, got {self.every}.")
 
 
 def simulate_sampled(
     network: Network,
-    controller: AbstractController,
+    controller: Any,
     duration,
     *,
-    measurement: str,
-    command: str,
     period,
+    measurement: Ports | None = None,
+    command: Ports | None = None,
     substeps: int = 10,
+    method: AbstractMethod | None = None,
     state: PyTree = None,
     memory: Any = None,
     inputs: Mapping[str, Any] | None = None,
+    progress: bool = False,
+    resume: Trajectory | None = None,
 ) -> Trajectory:
-    """Run a network under a sampled controller, the very object that drives the bench.
+    """Run a network under sampled controllers, the very objects that drive the bench.
+
+    Time is counted in whole ticks of `period`, so that no call is lost or doubled however
+    long the run. Differentiable; a run that fails holds its last good state.
 
     Args:
-        network: The network; the input `command` is exposed.
-        controller: `controller(t, measurement, memory) -> (command, memory)`.
+        network: The network; the inputs that are commanded are exposed.
+        controller: A controller, or a tuple of `Sampled` of several rates.
         duration: [s], rounded to whole periods.
-        measurement: Output that the controller reads, `"body.tip_angle"`.
+        period: Length of a tick [s]; time between calls of a single controller.
+        measurement: Output that a single controller reads, `"body.tip_angle"`.
         command: Exposed input that it drives, `"valve.setpoint"`.
-        period: Time between calls [s].
-        substeps: Runge-Kutta steps in a period.
+        substeps: Steps of the method in a tick.
+        method: `RungeKutta4()` if omitted; `Rodas4()` for stiff networks.
         state: Where the network starts.
-        memory: What the controller remembers; `controller.start` if omitted.
+        memory: What a single controller remembers; `controller.start` if omitted.
         inputs: Values or references for the other exposed inputs.
+        progress: Report progress while running.
+        resume: A motion to go on from; two halves give the bits of the whole.
 
     Returns:
-        States and outputs at the calls, outputs with the `command` just given.
+        States and outputs at the ticks, outputs with the commands just given.
     """
-    if command not in network.inputs:
-        raise ValueError(
-            f"simulate_sampled: `{command}` is not an exposed input of the network "
-            f'({", ".join(network.inputs) or "none"}). Write exposed=("{command}",).'
-        )
-    if measurement not in network.outputs:
-        raise ValueError(
-            f"simulate_sampled: there is no output `{measurement}`; the outputs are "
-            f"{', '.join(network.outputs)}."
-        )
+    loops = _loops(controller, measurement, command)
+    for loop in loops:
+        _check_ports(network, loop)
     _check.positive("simulate_sampled", "period", period, "s", "100 Hz is period=0.01.")
     if is_traced((duration, period)):
         raise ValueError(
@@ -64,41 +91,128 @@ def simulate_sampled(
             "be traced. Pass Python numbers."
         )
     ticks = max(1, round(float(duration) / float(period)))
-    state = network.initial_state() if state is None else state
+    first = jnp.zeros((), jnp.int32)
+    memories = None if memory is None else (memory,)
+    held = kept = None
+    if resume is not None:
+        state, (memories, held, kept) = last_state(resume), resume.memory
+        first = jnp.round(resume.time[-1] / real(period)).astype(jnp.int32)
     supplied = {k: v if callable(v) else real(v) for k, v in (inputs or {}).items()}
-    ports = (measurement, command)
-    return _run(
-        network, controller, state, memory, supplied, real(period), ports, ticks, substeps
-    )
+    plan = (ticks, substeps, RungeKutta4() if method is None else method, progress)
+    before = (memories, held, kept)
+    return _run(network, loops, state, before, supplied, real(period), first, plan)
 
 
 @eqx.filter_jit
-def _run(network, controller, state, memory, inputs, period, ports, ticks, substeps):
-    measurement, command = ports
-    h = period / substeps
+def _run(network, loops, state, before, inputs, period, first, plan) -> Trajectory:
+    (ticks, substeps, method, progress), (memories, held, kept) = plan, before
+    move = interval_of(substeps)
+    state = network.initial_state() if state is None else state
+    inputs = explicit_inputs(inputs, period)
+    time = period * (first + jnp.arange(ticks + 1, dtype=jnp.int32)).astype(period.dtype)
 
     def signals(t, state, held):
-        return outputs(network, t, state, {**at_time(inputs, t), command: held})
+        return outputs(network, t, state, {**at_time(inputs, t), **held})
 
-    def tick(carry, t):
-        state, memory, held = carry
-        measured = signals(t, state, held)[measurement]
-        held, memory = controller(t, measured, memory)
+    def call(tick, t, state, memories, held):
+        seen = signals(t, state, held)
+        kept = []
+        for loop, memory in zip(loops, memories, strict=True):
+            held, memory = _call(loop, tick, t, seen, memory, held)
+            kept.append(memory)
+        return tuple(kept), held
 
-        def field(t, state):
-            return network.vector_field(t, state, {**at_time(inputs, t), command: held})
+    def advance(carry, tick):
+        state, memories, held, good, reached = carry
+        t = period * tick.astype(period.dtype)
+        resumed = (tick == first) & (first > 0)  # the call at the seam was made before
+        memories, held = jax.lax.cond(
+            resumed, lambda: (memories, held), lambda: call(tick, t, state, memories, held)
+        )
+        seen = (state, {**signals(t, state, held), **held}, memories, held)
+        given = (method, network, {**inputs, **held}, t, state, kept)
+        new = guarded(move, given, period)
+        good = good & finite(new)
+        new = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, state)
+        if progress:
+            tell((tick - first) / ticks)
+        reached = jnp.where(good, t + period, reached)
+        return (new, memories, held, good, reached), seen
 
-        def one(k, state):
-            return rk4_step(field, t + k.astype(t.dtype) * h, state, h)
+    held = _nothing(network, loops, period.dtype) if held is None else held
+    if memories is None:
+        seen = signals(time[0], state, held)
+        memories = tuple(
+            loop.controller.start(time[0], _pick(seen, loop.measurement)) for loop in loops
+        )
+    if kept is None:
+        kept = move.begin((method, network, {**inputs, **held}, time[0], state), period)
+    begin = (state, memories, held, finite(state), time[0])
+    carry, seen = jax.lax.scan(advance, begin, first + jnp.arange(ticks + 1, dtype=jnp.int32))
+    states, values, memories, held = seen
+    good, reached = finite((states, values)) & carry[3], jnp.minimum(carry[4], time[-1])
+    status = Status.where(good, Status.successful, Status.not_finite)
+    stats = {
+        "steps": jnp.asarray(ticks * substeps),
+        "calls": jnp.asarray(sum(ticks // loop.every + 1 for loop in loops)),
+        "reached": reached,
+    }
+    memory = (*jax.tree.map(lambda x: x[-1], (memories, held)), kept)
+    return Trajectory(time, states, values, status, stats, memory=memory)
 
-        seen = (state, {**signals(t, state, held), command: held})
-        return (jax.lax.fori_loop(0, substeps, one, state), memory, held), seen
 
-    time = period * jnp.arange(ticks + 1, dtype=period.dtype)
-    held = jnp.zeros(network.inputs[command].shape, period.dtype)
-    if memory is None:
-        memory = controller.start(time[0], signals(time[0], state, held)[measurement])
-    _, (states, values) = jax.lax.scan(tick, (state, memory, held), time)
-    status = Status.where(all_finite((states, values)), Status.successful, Status.not_finite)
-    stats = {"steps": jnp.asarray(ticks * substeps), "calls": jnp.asarray(ticks + 1)}
-    return Trajectory(time, states, values, status, stats)
+def _call(loop: Sampled, tick, t, seen, memory, held):
+    """Commands and memory after the tick, at which the controller may be due."""
+
+    def fresh():
+        command, new = loop.controller(t, _pick(seen, loop.measurement), memory)
+        names = _names(loop.command)
+        values = (command,) if isinstance(loop.command, str) else tuple(command)
+        return {**held, **dict(zip(names, values, strict=True))}, new
+
+    if loop.every == 1:
+        return fresh()
+    return jax.lax.cond(tick % loop.every == 0, fresh, lambda: (held, memory))
+
+
+def _loops(controller, measurement, command) -> tuple[Sampled, ...]:
+    if isinstance(controller, Sampled):
+        return (controller,)
+    if isinstance(controller, tuple):
+        return controller
+    if measurement is None or command is None:
+        raise ValueError(
+            "simulate_sampled: a controller alone needs `measurement` and `command`: "
+            'measurement="body.tip_angle", command="valve.setpoint".'
+        )
+    return (Sampled(controller, measurement, command),)
+
+
+def _check_ports(network: Network, loop: Sampled) -> None:
+    for name in _names(loop.command):
+        if name not in network.inputs:
+            raise ValueError(
+                f"simulate_sampled: `{name}` is not an exposed input of the network "
+                f'({", ".join(network.inputs) or "none"}). Write exposed=("{name}",).'
+            )
+    for name in _names(loop.measurement):
+        if name not in network.outputs:
+            raise ValueError(
+                f"simulate_sampled: there is no output `{name}`; the outputs are "
+                f"{', '.join(network.outputs)}."
+            )
+
+
+def _nothing(network: Network, loops, dtype) -> dict[str, Array]:
+    names = [name for loop in loops for name in _names(loop.command)]
+    return {name: jnp.zeros(network.inputs[name].shape, dtype) for name in names}
+
+
+def _names(ports: Ports) -> tuple[str, ...]:
+    return (ports,) if isinstance(ports, str) else tuple(ports)
+
+
+def _pick(signals: Mapping[str, Array], ports: Ports) -> Any:
+    if isinstance(ports, str):
+        return signals[ports]
+    return tuple(signals[name] for name in ports)

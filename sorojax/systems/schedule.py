@@ -40,29 +40,44 @@ def evaluation_order(blocks: Blocks, wires: Wires) -> list[str]:
     Raises:
         ValueError: If outputs depend on themselves at the same instant.
     """
+    order, loop = _sorted(blocks, wires)
+    if loop:
+        path = [name for name in reversed(loop) if name not in wires]
+        raise ValueError(
+            f"Network: algebraic loop {' -> '.join([*path, path[0]])}: these outputs need each "
+            "other at the same instant. Put a state (a filter, a reservoir) between them, or "
+            "have it solved at every instant: Network(..., solve_loops=True)."
+        )
+    return order
+
+
+def loop_of(blocks: Blocks, wires: Wires) -> tuple[str, ...]:
+    """Ports around one algebraic loop, each needing the next; empty without one."""
+    return _sorted(blocks, wires)[1]
+
+
+def _sorted(blocks: Blocks, wires: Wires) -> tuple[list[str], tuple[str, ...]]:
     depends = _dependencies(blocks, wires)
     order: list[str] = []
     state: dict[str, bool] = {}  # False while on the path, True when placed
 
-    def place(name: str, path: tuple[str, ...]) -> None:
+    def place(name: str, path: tuple[str, ...]) -> tuple[str, ...]:
         if state.get(name):
-            return
+            return ()
         if name in state:
-            loop = [n for n in reversed(path[path.index(name) :]) if n not in wires]
-            shown = " -> ".join([*loop, loop[0]])
-            raise ValueError(
-                f"Network: algebraic loop {shown}: these outputs need each other at the "
-                "same instant. Put a state (a filter, a reservoir) between them."
-            )
+            return path[path.index(name) :]
         state[name] = False
         for other in depends.get(name, ()):
-            place(other, (*path, name))
+            if loop := place(other, (*path, name)):
+                return loop
         state[name] = True
         order.append(name)
+        return ()
 
     for name in depends:
-        place(name, ())
-    return order
+        if loop := place(name, ()):
+            return order, loop
+    return order, ()
 
 
 def reachable_inputs(
@@ -71,10 +86,18 @@ def reachable_inputs(
     """For every output, the exposed inputs that it needs at the same instant."""
     depends = _dependencies(blocks, wires)
     reached: dict[str, frozenset[str]] = {}
-    for name in evaluation_order(blocks, wires):
-        own = frozenset({name} & set(exposed))
-        parts = (reached.get(other, frozenset()) for other in depends.get(name, ()))
-        reached[name] = own.union(*parts)
+
+    def collect(name: str, seen: set[str]) -> frozenset[str]:
+        if name in reached:
+            return reached[name]
+        if name in seen:
+            return frozenset()
+        seen.add(name)
+        parts = [collect(other, seen) for other in depends.get(name, ())]
+        return frozenset({name} & set(exposed)).union(*parts)
+
+    for name in depends:
+        reached[name] = collect(name, set())
     return reached
 
 

@@ -7,13 +7,18 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from sorojax import _check
 from sorojax._types import is_traced, real
+from sorojax.math.control import Control
+from sorojax.math.explicit import RungeKutta4, Tsit5
+from sorojax.math.method import AbstractMethod, finite
 from sorojax.math.status import Status
-from sorojax.math.steppers import rk4_step
-from sorojax.systems.network import Network, as_term, at_time, outputs
+from sorojax.systems.event import Event, Happened, run_with_events
+from sorojax.systems.integrate import Motion, adaptive, fixed
+from sorojax.systems.network import Network, at_time, outputs
 
 
 class Trajectory(eqx.Module):
@@ -23,8 +28,12 @@ class Trajectory(eqx.Module):
         time: Saved instants [s].
         state: State of every block, with a leading time axis.
         outputs: Every output, `{"block.output": values}`, with a leading time axis.
-        status: How the run ended; after a failure the later instants are not finite.
-        stats: Numbers of the run, e.g. `steps`.
+        status: How the run ended.
+        stats: Numbers of the run: `steps`, `rejected`, and `reached` [s], beyond which the
+            last good state is held.
+        memory: What controllers remember and hold and the method keeps, to go on from.
+        happened: The events, if there were any to watch.
+        dense: The continuous solution for `state_at`, if asked for.
     """
 
     time: Float[Array, " time"]
@@ -32,9 +41,26 @@ class Trajectory(eqx.Module):
     outputs: dict[str, Array]
     status: Status
     stats: dict[str, Array]
+    memory: Any = None
+    happened: Happened | None = None
+    dense: dfx.DenseInterpolation | None = None
 
     def __getitem__(self, name: str) -> Array:
         return self.outputs[name]
+
+
+def last_state(film: Trajectory) -> PyTree:
+    """The state at the end of a motion."""
+    return jax.tree.map(lambda x: x[-1], film.state)
+
+
+def state_at(film: Trajectory, t: Float[Array, ""]) -> PyTree:
+    """The state at any time [s] of a run made with `dense=True`."""
+    if film.dense is None:
+        raise ValueError(
+            "state_at: this motion holds saved instants only. Run simulate(..., dense=True)."
+        )
+    return ravel_pytree(last_state(film))[1](film.dense.evaluate(t))
 
 
 def simulate(
@@ -45,14 +71,22 @@ def simulate(
     inputs: Mapping[str, Any] | None = None,
     save: int = 201,
     step=None,
-    rtol=1e-6,
-    atol=1e-8,
+    rtol: Any = 1e-6,
+    atol: Any = 1e-8,
+    max_step=None,
     solver: dfx.AbstractSolver | None = None,
     max_steps: int = 200_000,
+    events: tuple[Event, ...] = (),
+    max_events: int = 100,
     adjoint: dfx.AbstractAdjoint | None = None,
+    dense: bool = False,
+    progress: bool = False,
+    resume: Trajectory | None = None,
     throw: bool = True,
 ) -> Trajectory:
     """Run a network for `duration` [s] from t = 0; differentiable in all its leaves.
+
+    A run that fails holds its last good state, which has finite derivatives.
 
     Args:
         network: The network.
@@ -60,14 +94,23 @@ def simulate(
         state: Where to start; `network.initial_state()` if omitted.
         inputs: Values or references (functions of time) for the exposed inputs.
         save: Number of saved instants, both ends included.
-        step: A fixed step [s] for classical Runge-Kutta; adaptive if omitted.
-        rtol: Relative tolerance of the adaptive run.
-        atol: Absolute tolerance, in the unit of each state.
-        solver: Adaptive method; `diffrax.Tsit5()` if omitted. A very fast regulator
-            makes the network stiff: raise `max_steps` or slow it down.
+        step: A fixed step [s]; adaptive if omitted.
+        rtol: Relative tolerance of the adaptive run: a number, or a tree like the state.
+        atol: Absolute tolerance, in the unit of each state: a number, or such a tree.
+        max_step: Longest adaptive step [s]. Keeps an event that comes and goes from being
+            stepped over, and two events from falling into one step, where the first
+            listed would win.
+        solver: `Tsit5()` if omitted, `RungeKutta4()` with a fixed step. `Rodas4()` where a
+            regulator, a valve or a filter is far faster than the body.
         max_steps: Limit of adaptive steps.
+        events: Ends of the run, and resets of its state.
+        max_events: Most resets.
         adjoint: How diffrax differentiates; by default reverse mode with checkpoints.
             `diffrax.ForwardMode()` for derivatives in a few parameters.
+        dense: Keep the continuous solution, for `state_at`; takes memory by `max_steps`.
+        progress: Report progress while running, which costs a little.
+        resume: A motion to go on from, with the state and the time of its end. With fixed
+            steps two halves give the bits of the whole.
         throw: Raise when a run outside a transformation fails; False returns the status.
 
     Raises:
@@ -76,88 +119,113 @@ def simulate(
     _check.positive("simulate", "duration", duration, "s", "Give the end time.")
     if save < 2:
         raise ValueError(f"simulate: `save` must be 2 or more, got {save}.")
-    state = network.initial_state() if state is None else state
+    if step is not None and (events or dense):
+        raise ValueError(
+            "simulate: events and dense output need an adaptive run, got a fixed `step`. "
+            "Leave `step` out, or bound it by max_step=."
+        )
+    if dense and events:
+        raise ValueError(
+            "simulate: got `dense` and `events`; a continuous solution has no resets. Save "
+            "more instants instead."
+        )
+    state, first = _start(state, resume)
     supplied = {k: v if callable(v) else real(v) for k, v in (inputs or {}).items()}
-    time = jnp.linspace(jnp.zeros_like(real(duration)), real(duration), save)
+    interval = real(duration) / (save - 1)
     if step is None:
-        solver = dfx.Tsit5() if solver is None else solver
-        adjoint = dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
-        control = dfx.PIDController(rtol=real(rtol), atol=real(atol))
-        film = _adaptive(network, state, supplied, time, solver, control, max_steps, adjoint)
+        control = Control(rtol, atol, max_step=max_step)
+        options = {"max_steps": max_steps, "adjoint": adjoint, "progress": progress}
+        watch = (events, max_events, dense)
+        solver = Tsit5() if solver is None else solver
+        film = _adaptive(
+            network, state, supplied, first, interval, save, solver, control, watch, options
+        )
     else:
+        method = _fixed_method(solver)
         substeps = _substeps(duration, save, step)
-        film = _fixed(network, state, supplied, time, substeps)
+        memory = None if resume is None else resume.memory
+        film = _fixed(network, state, supplied, first, interval, save, method, substeps, memory)
     failed = throw and not is_traced(film)
     if failed and not bool(film.status == Status.successful):
-        reached = _reached(film)
         raise RuntimeError(
-            f"simulate: stopped after {reached:g} s of {float(real(duration)):g} s and "
-            f"{int(film.stats['steps'])} steps. {Status[film.status]}"
+            f"simulate: stopped after {float(film.stats['reached']):g} s of "
+            f"{float(film.time[-1]):g} s and {int(film.stats['steps'])} steps. "
+            f"{Status[film.status]}"
         )
     return film
 
 
 @eqx.filter_jit
-def _adaptive(network, state, inputs, time, solver, control, max_steps, adjoint):
-    solution = dfx.diffeqsolve(
-        as_term(network, inputs),
-        solver,
-        time[0],
-        time[-1],
-        None,
-        state,
-        args=network,
-        saveat=dfx.SaveAt(ts=time),
-        stepsize_controller=control,
-        max_steps=max_steps,
-        adjoint=adjoint,
-        throw=False,
-    )
-    ended = Status.where(
-        solution.result == dfx.RESULTS.max_steps_reached,
-        Status.max_steps,
-        Status.where(
-            solution.result == dfx.RESULTS.successful, Status.successful, Status.not_finite
-        ),
-    )
-    stats = {
-        "steps": jnp.asarray(solution.stats["num_steps"]),
-        "rejected": jnp.asarray(solution.stats["num_rejected_steps"]),
-    }
-    return _film(network, time, solution.ys, inputs, ended, stats)
+def _adaptive(
+    network, state, inputs, first, interval, save, solver, control, watch, options
+) -> Trajectory:
+    time = instants(first, interval, save)
+    state = network.initial_state() if state is None else state
+    events, most, dense = watch
+    happened = None
+    run = (network, inputs, state, time, solver, control)
+    if events:
+        motion, happened = run_with_events(*run, events, most, **options)
+    else:
+        motion = adaptive(*run, dense=dense, **options)
+    return film_of(network, time, inputs, motion, happened)
 
 
 @eqx.filter_jit
-def _fixed(network, state, inputs, time, substeps: int):
-    h = (time[1] - time[0]) / substeps
-
-    def field(t, state):
-        return network.vector_field(t, state, at_time(inputs, t))
-
-    def advance(state, t):
-        def one(k, state):
-            return rk4_step(field, t + k.astype(t.dtype) * h, state, h)
-
-        state = jax.lax.fori_loop(0, substeps, one, state)
-        return state, state
-
-    _, path = jax.lax.scan(advance, state, time[:-1])
-    path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state, path)
-    stats = {"steps": jnp.asarray(substeps * (time.shape[0] - 1))}
-    return _film(network, time, path, inputs, Status.successful, stats)
+def _fixed(
+    network, state, inputs, first, interval, save, method, substeps, memory
+) -> Trajectory:
+    time = instants(first, interval, save)
+    state = network.initial_state() if state is None else state
+    motion = fixed(network, inputs, state, time, interval, method, substeps, memory)
+    return film_of(network, time, inputs, motion)
 
 
-def _film(network, time, states, inputs, status, stats) -> Trajectory:
-    values = jax.vmap(lambda t, x: outputs(network, t, x, at_time(inputs, t)))(time, states)
-    broken = (status == Status.successful) & ~all_finite((states, values))
-    status = Status.where(broken, Status.not_finite, status)
-    return Trajectory(time, states, values, status, stats)
+def instants(first: Array, interval: Array, save: int) -> Float[Array, " time"]:
+    """`save` instants, from number `first` of a grid that starts at zero."""
+    return interval * (first + jnp.arange(save, dtype=jnp.int32)).astype(interval.dtype)
 
 
-def all_finite(tree: PyTree) -> Array:
-    """Whether every number in `tree` is finite."""
-    leaves = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]
-    return jnp.all(jnp.stack(leaves))
+def film_of(network, time, inputs, motion: Motion, happened=None) -> Trajectory:
+    """The motion with every output."""
+    values = jax.vmap(lambda t, x: outputs(network, t, x, at_time(inputs, t)))(
+        time, motion.path
+    )
+    status, good = motion.status, finite(values)
+    status = Status.where((status == Status.successful) & ~good, Status.not_finite, status)
+    stats = {"steps": motion.steps, "rejected": motion.rejected, "reached": motion.reached}
+    return Trajectory(
+        time,
+        motion.path,
+        values,
+        status,
+        stats,
+        memory=motion.memory,
+        happened=happened,
+        dense=motion.dense,
+    )
+
+
+def _start(state: PyTree, resume: Trajectory | None) -> tuple:
+    """First state, None for that of the network, and its number on the grid of instants."""
+    zero = jnp.zeros((), jnp.int32)
+    if resume is None:
+        return state, zero
+    if state is not None:
+        raise ValueError("simulate: got both `state` and `resume`. Give one of them.")
+    interval = resume.time[1] - resume.time[0]
+    number = jnp.round(resume.time[-1] / interval).astype(jnp.int32)
+    return last_state(resume), number
+
+
+def _fixed_method(solver) -> AbstractMethod:
+    method = RungeKutta4() if solver is None else solver
+    if not isinstance(method, AbstractMethod):
+        raise ValueError(
+            f"simulate: {type(method).__name__} takes no fixed `step` here, need a method of "
+            "sorojax: RungeKutta4(), Tsit5(), Rodas4() or SemiImplicitEuler()."
+        )
+    return method
 
 
 def _substeps(duration, save: int, step) -> int:
@@ -168,9 +236,3 @@ def _substeps(duration, save: int, step) -> int:
         )
     interval = float(duration) / (save - 1)
     return max(1, round(interval / float(step) + 0.499))
-
-
-def _reached(film: Trajectory) -> float:
-    leaves = [leaf.reshape(leaf.shape[0], -1) for leaf in jax.tree.leaves(film.state)]
-    fine = jnp.all(jnp.isfinite(jnp.concatenate(leaves, axis=1)), axis=1)
-    return float(jnp.max(jnp.where(fine, film.time, film.time[0])))

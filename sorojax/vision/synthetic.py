@@ -37,7 +37,9 @@ def draw_discs(
     """Discs on a canvas, edges covered to 1 / `fine`^2 of a pixel."""
     canvas = canvas.copy()
     for (x, y), r, kind in zip(centres, radius, colour, strict=True):
-        x0, y0, side = int(x - r) - 2, int(y - r) - 2, 2 * int(r) + 6
+        x0, y0, side = int(np.floor(x - r)) - 2, int(np.floor(y - r)) - 2, 2 * int(r) + 6
+        if x0 + side <= 0 or y0 + side <= 0 or x0 >= canvas.shape[1] or y0 >= canvas.shape[0]:
+            continue
         at = (np.arange(side * fine) + 0.5) / fine - 0.5
         inside = (x0 + at[None] - x) ** 2 + (y0 + at[:, None] - y) ** 2 < r * r
         part = inside.reshape(side, fine, side, fine).mean(axis=(1, 3))[..., None]

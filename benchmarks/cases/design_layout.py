@@ -1,0 +1,112 @@
+"""Classic layouts: what they reach and what a step costs, against the published figures."""
+
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.harness import Row
+from sorojax import design, fem, material, mesh
+from sorojax._progress import silent
+from sorojax.math.status import Status
+
+STEP = 4e-3  # s for the 60 x 20 beam, warm
+#: Cells, filter radius, kind of filter, compliance published.
+BEAMS = (
+    ((60, 20), 2.4, "sensitivity", 216.8137),
+    ((60, 20), 2.4, "density", 233.7146),
+    ((150, 50), 6.0, "sensitivity", None),
+)
+INVERTER = -1.1131886  # reached at the output, 40 x 20
+
+
+def rows():
+    for (nx, ny), radius, kind, want in BEAMS:
+        found, seconds = _beam(nx, ny, radius, kind)
+        settings = {"layout": "MBB beam", "cells": f"{nx} x {ny}", "filter": kind,
+                    "compliance": float(found.history["objective"][-1]),
+                    "steps": len(seconds),
+                    "converged": bool(found.status == Status.successful)}  # fmt: skip
+        error = None if want is None else abs(settings["compliance"] / want - 1)
+        timing = (float(np.median(seconds[3:])), min(seconds), max(seconds[3:]))
+        yield Row("sorojax", settings, seconds[0], *timing, error=error,
+                  bar=STEP if nx == 60 else None,
+                  reference="published compliance; time of a step")  # fmt: skip
+        if error is not None:
+            yield Row("sorojax", settings | {"what": "compliance"}, error=error, bar=5e-3,
+                      bar_on="error", reference="published compliance")  # fmt: skip
+    found, seconds = _inverter(40, 20)
+    reached = float(found.objective)
+    settings = {"layout": "force inverter", "cells": "40 x 20", "output": reached,
+                "steps": len(seconds)}  # fmt: skip
+    timing = (float(np.median(seconds[3:])), min(seconds), max(seconds[3:]))
+    missing = max(0.0, 1 - reached / INVERTER)
+    yield Row("sorojax", settings, seconds[0], *timing, error=missing, bar=0.0,
+              bar_on="error", reference="published output; error: what is missing")  # fmt: skip
+
+
+def _problem(grid, supports, loads):
+    stuff = material.neo_hookean(young_modulus=1.0, poisson_ratio=0.3)
+    return fem.problem(
+        grid, stuff, kinematics=fem.PlaneStress(1.0), supports=supports, loads=loads,
+        formulation=fem.Displacement(),
+    )  # fmt: skip
+
+
+def _grid(nx: int, ny: int):
+    return mesh.rectangle([0, 0], [nx, ny], divisions=(nx, ny), element=mesh.Quad4())
+
+
+def _timed(loss, volume, cells: int, fraction: float, **options):
+    seconds, last = [], time.perf_counter()
+
+    def tick(_):
+        nonlocal last
+        now = time.perf_counter()
+        seconds.append(now - last)
+        last = now
+
+    with silent():
+        found = design.minimise(
+            loss, jnp.full(cells, fraction), constraints=(volume,), tolerance=0.01,
+            on_step=tick, **options,
+        )  # fmt: skip
+    return found, seconds
+
+
+def _beam(nx: int, ny: int, radius: float, kind: str):
+    grid = _grid(nx, ny)
+    held = (
+        fem.Fixed(grid.node_sets["left"], components=(0,)),
+        fem.Fixed(jnp.array([mesh.nearest_node(grid, [nx, 0.0])]), components=(1,)),
+    )
+    push = fem.Force(jnp.array([mesh.nearest_node(grid, [0.0, ny])]), [0.0, -1.0])
+    model = design.linear(_problem(grid, held, (push,)))
+    smooth, interpolation = design.cone_filter(grid, radius), design.Simp(3.0, 1e-9)
+    dense = smooth if kind == "density" else lambda x: x
+    changed = None
+    if kind == "sensitivity":
+        changed = jax.jit(lambda x, g: design.sensitivity_filtered(smooth, x, g))
+    return _timed(
+        jax.jit(lambda x: design.compliance(model, interpolation(dense(x)))),
+        jax.jit(lambda x: jnp.mean(dense(x)) - 0.5), nx * ny, 0.5, steps=400,
+        optimiser=design.OptimalityCriteria(), change_gradient=changed,
+    )  # fmt: skip
+
+
+def _inverter(nx: int, ny: int):
+    grid = _grid(nx, ny)
+    ends = jnp.array([mesh.nearest_node(grid, [x, ny]) for x in (0.0, nx)])
+    ground = grid.points[ends] - jnp.array([[10.0, 0.0], [-10.0, 0.0]])
+    corner = mesh.nodes_where(grid, lambda p: (p[0] <= 0) & (p[1] <= 3.5))
+    held = (fem.Fixed(grid.node_sets["top"], components=(1,)), fem.Fixed(corner))
+    loads = (fem.Force(ends[:1], [1.0, 0.0]), fem.Spring(ends, ground, 0.1))
+    model = design.linear(_problem(grid, held, loads))
+    smooth, interpolation = design.cone_filter(grid, 1.2), design.Simp(3.0, 1e-9)
+    return _timed(
+        jax.jit(lambda x: design.displacement(model, interpolation(x))[ends[1], 0]),
+        jax.jit(lambda x: 10 * (jnp.mean(x) - 0.3)), nx * ny, 0.3, steps=150, scale=0.1,
+        optimiser=design.MMA(1e-3, 1.0, move=0.2),
+        change_gradient=jax.jit(lambda x, g: design.sensitivity_filtered(smooth, x, g)),
+    )  # fmt: skip

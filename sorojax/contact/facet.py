@@ -1,0 +1,117 @@
+"""How high a point stands over a facet: sides in the plane, flat triangles in space.
+
+A facet is felt a little beyond its rim, with a weight that falls smoothly across it; the
+weights of facets that continue each other add up to one. So the surface of many facets
+has no kinks, and one that ends lets go smoothly.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+_RIM = 0.3  # of half a side, or of the height of a triangle, over which the weight falls
+
+
+class Over(NamedTuple):
+    """Signed height of a point over a facet [m], weight of the facet, and its normal."""
+
+    height: Float[Array, ""]
+    weight: Float[Array, ""]
+    normal: Float[Array, " dim"]
+
+
+def pieces(num_nodes: int, dim: int) -> Int[np.ndarray, "pieces nodes"]:
+    """Nodes of the pieces that a facet consists of: itself in the plane, triangles in
+    space."""
+    if dim == 2:
+        return np.arange(num_nodes)[None]
+    return np.asarray(_TRIANGLES[num_nodes])
+
+
+_TRIANGLES = {
+    3: [[0, 1, 2]],
+    4: [[0, 1, 2], [0, 2, 3]],
+    6: [[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]],
+    7: [[0, 3, 6], [3, 1, 6], [1, 4, 6], [4, 2, 6], [2, 5, 6], [5, 0, 6]],
+}
+
+
+def over(piece: Float[Array, "nodes dim"], point: Float[Array, " dim"]) -> Over:
+    """How `point` [m] stands over a piece of a facet, twice differentiable."""
+    return _over_triangle(piece, point) if point.shape[0] == 3 else _over_side(piece, point)
+
+
+def shared(weights: Float[Array, " pieces"]) -> Float[Array, " pieces"]:
+    """Weights whose sum is one where facets overlap, and below one past the last of them."""
+    total = jnp.sum(weights)
+    short = 2 * jnp.clip(total, 0.5, 1.0) - 1  # smooth between one and the sum
+    return weights / jnp.where(total > 1, total, 1 + (short**3 - short**2) / 2)
+
+
+def _over_side(side: Float[Array, "nodes 2"], point: Float[Array, "2"]) -> Over:
+    t = _foot(*jax.lax.stop_gradient((side, point)))
+    # the same place if it is within the rim, now with a derivative, then with a second one
+    for _ in range(side.shape[0] - 1):
+        away, slope, _ = _at(side, point, t)
+        t = t - (away @ slope) / _curvature(side, point, t)
+    away, slope, _ = _at(side, point, t)
+    across = jnp.stack([slope[1], -slope[0]])
+    normal = across / jnp.sqrt(across @ across)
+    return Over(-(away @ normal), _ramp(1 - jnp.abs(t), _RIM), normal)
+
+
+def _at(side, point, t):
+    """From the point to the side at t in [-1, 1], and the slope of the side there."""
+    middle, along = (side[0] + side[1]) / 2, (side[1] - side[0]) / 2
+    if side.shape[0] == 2:
+        return middle + t * along - point, along, along
+    bow = middle - side[2]
+    return side[2] + t * along + t**2 * bow - point, along + 2 * t * bow, along
+
+
+def _curvature(side, point, t):
+    """Second derivative of half the squared distance along a side, kept positive."""
+    away, slope, along = _at(side, point, t)
+    if side.shape[0] == 2:
+        return along @ along
+    bow = (side[0] + side[1]) / 2 - side[2]
+    return jnp.maximum(slope @ slope + 2 * (away @ bow), 0.5 * (along @ along))
+
+
+def _foot(side, point) -> Float[Array, ""]:
+    """Where the point stands, up to the outer end of the rim."""
+    bound = 1 + _RIM
+    middle, along = (side[0] + side[1]) / 2, (side[1] - side[0]) / 2
+    start = middle if side.shape[0] == 2 else side[2]
+    t = jnp.clip((point - start) @ along / (along @ along), -bound, bound)
+    if side.shape[0] == 2:
+        return t
+
+    def better(_, t):
+        away, slope, _ = _at(side, point, t)
+        return jnp.clip(t - (away @ slope) / _curvature(side, point, t), -bound, bound)
+
+    return jax.lax.fori_loop(0, 5, better, t)
+
+
+def _over_triangle(corners: Float[Array, "3 3"], point: Float[Array, "3"]) -> Over:
+    first, second = corners[1] - corners[0], corners[2] - corners[0]
+    across = jnp.cross(first, second)
+    away = point - corners[0]
+    square = across @ across
+    at_second = jnp.cross(first, away) @ across / square
+    at_first = jnp.cross(away, second) @ across / square
+    normal = across / jnp.sqrt(square)
+    weight = (
+        _ramp(at_first, _RIM) * _ramp(at_second, _RIM) * _ramp(1 - at_first - at_second, _RIM)
+    )
+    return Over(away @ normal, weight, normal)
+
+
+def _ramp(x, width: float):
+    """From 0 at -width to 1 at +width, smooth, symmetric about 1/2."""
+    s = jnp.clip((x + width) / (2 * width), 0.0, 1.0)
+    return s**2 * (3 - 2 * s)

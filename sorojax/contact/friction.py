@@ -1,0 +1,98 @@
+"""Coulomb friction with true stick: a slider in a row with a spring and a dashpot."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax._types import real
+
+
+class Grip(NamedTuple):
+    """What friction knows of each point, in the frame of the obstacle.
+
+    Where the spring has no force [m], the pressure [Pa] and the normal that friction is
+    taken at, the stiffness of the dashpot over a step [Pa/m] and where it has no force.
+    """
+
+    anchor: Float[Array, "*points dim"]
+    pressure: Float[Array, "*points"]
+    normal: Float[Array, "*points dim"]
+    drag: Float[Array, "*points"]
+    back: Float[Array, "*points dim"]
+
+
+class Coulomb(eqx.Module):
+    """Friction per reference area, of at most `coefficient` times the pressure.
+
+    A point hangs on a spring of `stiffness` [Pa/m] that slides when the limit is reached:
+    held points come to rest, they do not creep. A dashpot beside the spring, which alone
+    reaches the limit at `velocity` [m/s], stops them from ringing.
+
+    Given the pressure the increment of a step has a potential, so tangents are symmetric.
+
+    Reference: Wriggers, Computational Contact Mechanics, 2006, section 6.2, for the return
+    of the spring to the limit.
+    """
+
+    coefficient: Float[Array, ""] = eqx.field(converter=real)
+    stiffness: Float[Array, ""] = eqx.field(converter=real)
+    velocity: Float[Array, ""] = eqx.field(converter=real, default=1e-3)
+
+    def __check_init__(self):
+        for name, unit in (("coefficient", "-"), ("stiffness", "Pa/m"), ("velocity", "m/s")):
+            do = "The stiffness of the penalty suits the stiffness, 1e-3 m/s the velocity."
+            _check.positive("contact.Coulomb", name, getattr(self, name), unit, do)
+
+    def energy(self, grip: Grip, position: Float[Array, "*points dim"]) -> Float[Array, "..."]:
+        """Potential of a step per area [J/m^2]; friction is minus its slope."""
+        whole, away = self._trial(grip, position)
+        limit = self.coefficient * grip.pressure
+        square = jnp.sum(away**2, axis=-1)
+        held = whole**2 * square <= limit**2
+        length = jnp.sqrt(jnp.where(held, jnp.ones_like(square), square))
+        return jnp.where(held, whole * square / 2, limit * (length - limit / (2 * whole)))
+
+    def traction(
+        self, grip: Grip, position: Float[Array, "*points dim"]
+    ) -> Float[Array, "*points dim"]:
+        """Force of the obstacle on the points per area [Pa]."""
+        whole, away = self._trial(grip, position)
+        limit = self.coefficient * grip.pressure
+        square = jnp.sum(away**2, axis=-1)
+        held = whole**2 * square <= limit**2
+        length = jnp.sqrt(jnp.where(held, jnp.ones_like(square), square))
+        return -jnp.where(held, whole, limit / length)[..., None] * away
+
+    def stretch(
+        self, grip: Grip, position: Float[Array, "*points dim"]
+    ) -> Float[Array, "*points dim"]:
+        """Length of the spring [m] after a step that ended at `position`."""
+        before = _across(grip.back - grip.anchor, grip.normal)
+        pull = grip.drag[..., None] * before - self.traction(grip, position)
+        return pull / (self.stiffness + grip.drag)[..., None]
+
+    def stored(self, grip: Grip, position: Float[Array, "*points dim"]) -> Float[Array, "..."]:
+        """Energy in the spring per area [J/m^2]."""
+        return self.stiffness / 2 * jnp.sum(self.stretch(grip, position) ** 2, axis=-1)
+
+    def _trial(self, grip: Grip, position):
+        """Stiffness of spring and dashpot together, and how far the point is from where
+        they have no force."""
+        whole = self.stiffness + grip.drag
+        centre = (self.stiffness * grip.anchor + grip.drag[..., None] * grip.back) / whole[
+            ..., None
+        ]
+        return whole, _across(position - centre, grip.normal)
+
+
+def no_grip(position: Float[Array, "*points dim"]) -> Grip:
+    """The grip of points that do not touch."""
+    zero = jnp.zeros_like(position)
+    return Grip(position, zero[..., 0], zero, zero[..., 0], position)
+
+
+def _across(vector, normal):
+    return vector - jnp.sum(vector * normal, axis=-1, keepdims=True) * normal

@@ -1,0 +1,139 @@
+"""Filters and projections between design variables and densities.
+
+References:
+    Bourdin, "Filters in topology optimization", Int. J. Numer. Meth. Engng 50, 2001.
+    Lazarov, Sigmund, "Filters in topology optimization based on Helmholtz-type
+    differential equations", Int. J. Numer. Meth. Engng 86, 2011.
+    Wang, Lazarov, Sigmund, "On projection methods, convergence and robust formulations
+    in topology optimization", Struct. Multidisc. Optim. 43, 2011.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sorojax import _check
+from sorojax._types import real
+from sorojax.math import sparse
+from sorojax.mesh.elements import Quad4, Tri3
+from sorojax.mesh.mesh import Mesh
+
+
+class ConeFilter(eqx.Module):
+    """Means over neighbours, weighed by how much nearer than the radius they are.
+
+    Made by `cone_filter`. Called with one number per cell it returns one per cell.
+    """
+
+    first: Int[Array, " pairs"]
+    second: Int[Array, " pairs"]
+    weights: Float[Array, " pairs"]
+
+    def __call__(self, x: Float[Array, " cells"]) -> Float[Array, " cells"]:
+        return jnp.zeros_like(x).at[self.first].add(self.weights * x[self.second])
+
+
+def cone_filter(mesh: Mesh, radius: float, *, volumes=None) -> ConeFilter:
+    """The filter of `radius` [m] between the centres of cells.
+
+    Args:
+        mesh: The cells.
+        radius: Where the weight becomes zero [m]; less than a cell does nothing.
+        volumes: Volumes of the cells, where they differ much.
+    """
+    from sorojax.math.spatial import KDTree
+
+    _check.positive("cone_filter", "radius", radius, "m", "About two cells is usual.")
+    centres = np.asarray(mesh.points)[np.asarray(mesh.cells)].mean(axis=1)
+    tree = KDTree(centres)
+    near = tree.query_pairs(float(radius), output_type="ndarray")
+    own = np.arange(len(centres))
+    first = np.concatenate([own, near[:, 0], near[:, 1]])
+    second = np.concatenate([own, near[:, 1], near[:, 0]])
+    weights = radius - np.linalg.norm(centres[first] - centres[second], axis=1)
+    if volumes is not None:
+        weights = weights * np.asarray(volumes)[second]
+    total = np.zeros(len(centres))
+    np.add.at(total, first, weights)
+    weights = weights / total[first]
+    return ConeFilter(
+        jnp.asarray(first, jnp.int32), jnp.asarray(second, jnp.int32), jnp.asarray(weights)
+    )
+
+
+class HelmholtzFilter(eqx.Module):
+    """The solution y of y - l^2 laplace(y) = x with no flux through the boundary.
+
+    Made by `helmholtz_filter`; costs one back-substitution, whatever the radius.
+    """
+
+    system: sparse.SparseSymmetric
+    values: Float[Array, " nnz"]
+    cells: Int[Array, "cells nodes"]
+    shares: Float[Array, "cells nodes"]
+
+    def __call__(self, x: Float[Array, " cells"]) -> Float[Array, " cells"]:
+        nodal = jnp.zeros(self.system.size, x.dtype)
+        nodal = nodal.at[self.cells].add(self.shares * x[:, None])
+        solved = sparse.solve(self.system, self.values, nodal)
+        total = jnp.sum(self.shares, axis=1)
+        return jnp.sum(self.shares * solved[self.cells], axis=1) / total
+
+
+def helmholtz_filter(mesh: Mesh, radius: float) -> HelmholtzFilter:
+    """The filter that smooths like a cone filter of `radius` [m]: l = radius / (2 sqrt 3).
+
+    Raises:
+        ValueError: If the cells are not Tri3 or Quad4.
+    """
+    from sorojax.mesh.shape import quadrature, shape_functions, shape_gradients
+
+    _check.positive("helmholtz_filter", "radius", radius, "m", "About two cells is usual.")
+    if not isinstance(mesh.element, Tri3 | Quad4):
+        raise ValueError(
+            f"helmholtz_filter: got {mesh.element.name} cells, need Tri3 or Quad4. Use "
+            "cone_filter."
+        )
+    at, weights = quadrature(mesh.element, 2)
+    N, dN = shape_functions(mesh.element, at), shape_gradients(mesh.element, at)
+    X = np.asarray(mesh.points)[np.asarray(mesh.cells)]
+    J = np.einsum("qaj,cai->cqij", dN, X)
+    volume = np.linalg.det(J) * weights
+    G = np.einsum("qaj,cqji->cqai", dN, np.linalg.inv(J))
+    length = radius / (2 * np.sqrt(3))
+    matrix = length**2 * np.einsum("cqai,cqbi,cq->cab", G, G, volume)
+    matrix += np.einsum("qa,qb,cq->cab", N, N, volume)
+    system = sparse.from_cells(mesh.num_nodes, np.asarray(mesh.cells))
+    return HelmholtzFilter(
+        system,
+        sparse.assemble(system, jnp.asarray(matrix)),
+        jnp.asarray(mesh.cells),
+        jnp.asarray(np.einsum("qa,cq->ca", N, volume)),
+    )
+
+
+def heaviside_projection(
+    x: Float[Array, "..."], sharpness, threshold=0.5
+) -> Float[Array, "..."]:
+    """Pushes densities to 0 and 1: a smooth step at `threshold`, the steeper the larger
+    `sharpness` (1 does next to nothing, 16 and more make black and white)."""
+    beta, eta = real(sharpness), real(threshold)
+    low, high = jnp.tanh(beta * eta), jnp.tanh(beta * (1 - eta))
+    return (low + jnp.tanh(beta * (x - eta))) / (low + high)
+
+
+def greyness(density: Float[Array, " cells"]) -> Float[Array, ""]:
+    """Mean of 4 d (1 - d): 0 for black and white, 1 for all grey [-]."""
+    return jnp.mean(4 * density * (1 - density))
+
+
+def sensitivity_filtered(
+    smooth: ConeFilter, x: Float[Array, " cells"], gradient: Float[Array, " cells"]
+) -> Float[Array, " cells"]:
+    """Sigmund's filter of the gradient itself, a heuristic: not the derivative of anything.
+
+    Reference: Sigmund, "A 99 line topology optimization code written in Matlab", Struct.
+    Multidisc. Optim. 21, 2001.
+    """
+    return smooth(x * gradient) / jnp.maximum(1e-3, x)

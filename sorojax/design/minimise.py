@@ -1,0 +1,238 @@
+"""The optimisation loop: any differentiable function of a pytree, constraints, any method."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PyTree
+
+from sorojax import _check
+from sorojax._progress import report
+from sorojax._types import real
+from sorojax.design.mma import GCMMA, MMA, Values
+from sorojax.design.optimality import OptimalityCriteria
+from sorojax.math.status import Status
+
+Optimiser = MMA | GCMMA | OptimalityCriteria | optax.GradientTransformation
+_INNER = 15  # proposals of GCMMA for one step
+
+
+class Step(eqx.Module):
+    """One step, as `on_step` sees it; also what `minimise` starts again from.
+
+    Attributes:
+        count: Steps taken, from 1.
+        design: The variables after it.
+        objective, constraints: At the design before it.
+        change: Largest change of a variable.
+        memory: Of the optimiser.
+    """
+
+    count: int = eqx.field(static=True)
+    design: PyTree
+    objective: Float[Array, ""]
+    constraints: Float[Array, " m"]
+    change: Float[Array, ""]
+    memory: Any
+
+
+class Optimised(eqx.Module):
+    """Where an optimisation ended.
+
+    Attributes:
+        design: The variables.
+        objective: At `design`.
+        constraints: At `design`, each <= 0 if it holds.
+        status: `successful` when the change fell below the tolerance, `max_steps` when the
+            steps ran out first, `not_finite` when a value broke; the last good design then.
+        history: Objective, constraints (m columns) and change of every step.
+        last: The last step; pass it as `resume` to go on.
+    """
+
+    design: PyTree
+    objective: Float[Array, ""]
+    constraints: Float[Array, " m"]
+    status: Status
+    history: dict[str, Float[np.ndarray, "steps *columns"]]
+    last: Step
+
+
+def minimise(
+    loss: Callable[..., Float[Array, ""]],
+    start: PyTree,
+    *,
+    constraints: Sequence[Callable[..., Float[Array, "..."]]] = (),
+    optimiser: Optimiser | None = None,
+    steps: int = 100,
+    tolerance: float = 1e-3,
+    schedule: Callable[[int], tuple] | None = None,
+    change_gradient: Callable[[PyTree, PyTree], PyTree] | None = None,
+    scale: float | None = None,
+    on_step: Callable[[Step], None] | None = None,
+    resume: Step | None = None,
+) -> Optimised:
+    """The design at which `loss` is least while every constraint stays at or below zero.
+
+    Functions are called outside `jit`, so they may solve equilibria; jit them where they
+    can be.
+
+    Args:
+        loss: Function of the design; differentiable in it.
+        start: Where to begin, a pytree of floating-point arrays.
+        constraints: Functions of the design, numbers or vectors, <= 0 where allowed.
+        optimiser: `MMA()` if omitted; `GCMMA`, `OptimalityCriteria`, or any optax optimiser
+            (without constraints).
+        steps: Most steps.
+        tolerance: Largest change of a variable at which to stop.
+        schedule: Further arguments of loss and constraints at step k = 0, 1, ...: for
+            continuation, `lambda k: (sharpness(k),)`.
+        change_gradient: Replaces the gradient of the loss, from design and gradient.
+        scale: What the objective is divided by for MMA; its size at the start if omitted.
+        on_step: Called after every step: pictures, checkpoints.
+        resume: A step to go on from instead of `start`.
+
+    Raises:
+        ValueError: If something is not finite at the start, or an optax optimiser gets
+            constraints.
+    """
+    optimiser = MMA() if optimiser is None else optimiser
+    constraints = tuple(constraints)
+    plain = isinstance(optimiser, optax.GradientTransformation)
+    if plain and constraints:
+        raise ValueError(
+            "minimise: an optax optimiser takes no constraints. Use MMA() or GCMMA(), or add a "
+            "penalty to the loss."
+        )
+    _check.finite("minimise", "start", ravel_pytree(start)[0], "Check the first design.")
+    flat, back = ravel_pytree(jax.tree.map(real, start))
+    task = _Task(loss, constraints, back, schedule, change_gradient)
+    first, memory = 0, None
+    if resume is not None:
+        flat, memory, first = ravel_pytree(resume.design)[0], resume.memory, resume.count
+    values, scale, history, step = None, scale, [], resume
+    status = Status.max_steps
+    for k in range(first, steps):
+        values = task.values(flat, k)
+        if not _finite(values):
+            if k == first:
+                raise ValueError(
+                    f"minimise: the objective is {values.objective} and the constraints "
+                    f"{values.constraints} at the first design, with "
+                    f"{int(jnp.sum(~jnp.isfinite(values.gradient)))} derivatives that are not "
+                    "finite. Start where the functions are defined."
+                )
+            status = Status.not_finite
+            break
+        scale = _size(values.objective) if scale is None else scale
+        if memory is None:
+            m = values.constraints.shape[0]
+            memory = optimiser.init(flat) if plain else optimiser.init(flat, m)  # type: ignore
+        new, memory = _advance(optimiser, task, k, flat, values, memory, scale)
+        change = float(jnp.max(jnp.abs(new - flat)))
+        last, flat = flat, new
+        step = Step(k + 1, back(flat), values.objective, values.constraints,
+                    jnp.asarray(change), memory)  # fmt: skip
+        history.append((float(values.objective), np.asarray(values.constraints), change))
+        report("minimise", k + 1, steps, objective=history[-1][0], change=change,
+               constraint=float(jnp.max(values.constraints, initial=-jnp.inf)))  # fmt: skip
+        if on_step is not None:
+            on_step(step)
+        if change <= tolerance and schedule is None:
+            status = Status.successful
+            break
+    if status == Status.not_finite:
+        flat = last
+    objective, held = task.plain(flat, max(len(history) + first - 1, 0))
+    return Optimised(back(flat), objective, held, status, _columns(history), step)  # type: ignore
+
+
+class _Task:
+    """The functions of one optimisation over a flat vector, with their derivatives.
+
+    Derivatives of compiled functions are compiled too, once.
+    """
+
+    def __init__(self, loss, constraints, back, schedule, change_gradient):
+        self.back, self.schedule, self.change_gradient = back, schedule, change_gradient
+        self.loss, self.constraints = loss, constraints
+        self._objective = _compiled_as(
+            loss, jax.value_and_grad(lambda flat, *more: loss(back(flat), *more))
+        )
+        self._held = [_compiled_as(g, _with_slopes(g, back)) for g in constraints]
+
+    def _more(self, k: int) -> tuple:
+        return () if self.schedule is None else tuple(self.schedule(k))
+
+    def plain(self, flat, k: int):
+        """Objective and constraints alone."""
+        more, x = self._more(k), self.back(flat)
+        held = [jnp.ravel(jnp.asarray(g(x, *more))) for g in self.constraints]
+        return self.loss(x, *more), jnp.concatenate(held) if held else jnp.zeros(0)
+
+    def values(self, flat, k: int) -> Values:
+        more = self._more(k)
+        objective, gradient = self._objective(flat, *more)
+        if self.change_gradient is not None:
+            changed = self.change_gradient(self.back(flat), self.back(gradient))
+            gradient = ravel_pytree(changed)[0]
+        if not self._held:
+            none = jnp.zeros((0, flat.shape[0]), flat.dtype)
+            return Values(objective, gradient, none[:, 0], none)
+        held, slopes = zip(*(g(flat, *more) for g in self._held), strict=True)
+        return Values(objective, gradient, jnp.concatenate(held), jnp.concatenate(slopes))
+
+
+def _with_slopes(constraint, back):
+    """A constraint as a vector, and its derivative."""
+
+    def both(flat, *more):
+        value, pull = jax.vjp(lambda f: jnp.ravel(constraint(back(f), *more)), flat)
+        rows = [pull(row)[0] for row in jnp.eye(value.shape[0], dtype=flat.dtype)]
+        return value, jnp.stack(rows)
+
+    return both
+
+
+def _compiled_as(function, derived):
+    return jax.jit(derived) if hasattr(function, "lower") else derived
+
+
+def _advance(optimiser, task: _Task, k: int, flat, values: Values, memory, scale):
+    if isinstance(optimiser, optax.GradientTransformation):
+        with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
+            updates, memory = optimiser.update(values.gradient, memory, flat)
+            return jnp.asarray(optax.apply_updates(flat, updates)), memory
+    scaled = values._replace(
+        objective=values.objective / scale, gradient=values.gradient / scale
+    )
+    if not isinstance(optimiser, GCMMA):
+        return optimiser.update(flat, scaled, memory)
+    memory = optimiser.begin(flat, scaled, memory)
+    new, after = optimiser.update(flat, scaled, memory)
+    for _ in range(_INNER):
+        objective, held = task.plain(new, k)
+        found = (objective / scale, held)
+        memory, above = optimiser.stiffen(flat, new, scaled, found, memory)
+        if bool(above):
+            break
+        new, after = optimiser.update(flat, scaled, memory)
+    return new, after
+
+
+def _finite(values: Values) -> bool:
+    return all(bool(jnp.all(jnp.isfinite(part))) for part in values)
+
+
+def _size(objective) -> float:
+    return float(jnp.abs(objective)) or 1.0
+
+
+def _columns(history) -> dict[str, np.ndarray]:
+    names = ("objective", "constraints", "change")
+    columns = list(zip(*history, strict=True)) or [(), (), ()]
+    return {name: np.array(column) for name, column in zip(names, columns, strict=True)}

@@ -1,0 +1,153 @@
+"""The separable convex problem of one step of moving asymptotes.
+
+min sum p_0/(U - x) + q_0/(x - L) + z + sum c y + y^2/2, so that
+    sum p_i/(U - x) + q_i/(x - L) - y_i <= b_i, least <= x <= most, y >= 0, z >= 0.
+
+Reference: Svanberg, "MMA and GCMMA - two methods for nonlinear optimization", KTH
+Stockholm, 2007, for the perturbed optimality conditions and their reduction.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+_PRICE = 1000.0  # of breaking a constraint, against objectives of order one to a hundred
+
+
+class Approximation(NamedTuple):
+    """Row 0 of `p` and `q` is the objective; `right` are the b_i, and `shift_objective` is
+    what the approximate objective has in excess of the true one at the expansion point."""
+
+    p: Float[Array, "functions n"]
+    q: Float[Array, "functions n"]
+    low: Float[Array, " n"]
+    high: Float[Array, " n"]
+    least: Float[Array, " n"]
+    most: Float[Array, " n"]
+    right: Float[Array, " m"]
+    shift_objective: Float[Array, " 1"]
+
+    def at(self, x: Float[Array, " n"]) -> Float[Array, " functions"]:
+        """The sums at `x`."""
+        return self.p @ (1 / (self.high - x)) + self.q @ (1 / (x - self.low))
+
+
+class _Point(NamedTuple):
+    """Primal variables, multipliers and slacks; all but x are positive."""
+
+    x: Array
+    y: Array
+    z: Array
+    lam: Array
+    xsi: Array
+    eta: Array
+    mu: Array
+    zeta: Array
+    s: Array
+
+
+def solve_subproblem(task: Approximation) -> Float[Array, " n"]:
+    """The minimiser, by Newton's method on conditions whose perturbation goes to 1e-7."""
+    dtype, m = task.p.dtype, task.right.shape[0]
+    one, x = jnp.ones(m, dtype), (task.least + task.most) / 2
+    room = jnp.maximum(task.most - task.least, 1e-12)
+    start = _Point(
+        x, one, jnp.ones((), dtype), one,
+        jnp.maximum(1.0, 2 / room), jnp.maximum(1.0, 2 / room),
+        jnp.maximum(one, _PRICE / 2), jnp.ones((), dtype), one,
+    )  # fmt: skip
+
+    def tighten(state):
+        point, epsilon = state
+        point, _, _ = jax.lax.while_loop(
+            lambda s: (s[1] > 0.9 * epsilon) & (s[2] < 200),
+            lambda s: _newton(task, s[0], epsilon, s[2]),
+            (point, jnp.max(jnp.abs(_residual(task, point, epsilon))), 0),
+        )
+        return point, 0.1 * epsilon
+
+    point, _ = jax.lax.while_loop(
+        lambda s: s[1] > 0.9e-7, tighten, (start, jnp.ones((), dtype))
+    )
+    return jnp.clip(point.x, task.least, task.most)
+
+
+def _slopes(task: Approximation, at: _Point):
+    """Lagrangian and constraints: derivative in x, curvature, values, their derivatives."""
+    up, down = 1 / (task.high - at.x), 1 / (at.x - task.low)
+    p, q = task.p[0] + at.lam @ task.p[1:], task.q[0] + at.lam @ task.q[1:]
+    slope = p * up**2 - q * down**2
+    curvature = 2 * (p * up**3 + q * down**3)
+    values = task.p[1:] @ up + task.q[1:] @ down
+    return slope, curvature, values, task.p[1:] * up[None] ** 2 - task.q[1:] * down[None] ** 2
+
+
+def _residual(task: Approximation, at: _Point, epsilon) -> Array:
+    slope, _, values, _ = _slopes(task, at)
+    parts = (
+        slope - at.xsi + at.eta,
+        _PRICE + at.y - at.mu - at.lam,
+        (1 - at.zeta)[None],
+        values - at.y + at.s - task.right,
+        at.xsi * (at.x - task.least) - epsilon,
+        at.eta * (task.most - at.x) - epsilon,
+        at.mu * at.y - epsilon,
+        (at.zeta * at.z - epsilon)[None],
+        at.lam * at.s - epsilon,
+    )
+    return jnp.concatenate(parts)
+
+
+def _newton(task: Approximation, at: _Point, epsilon, count):
+    """One damped step; the norm of the residual does not grow."""
+    move = _direction(task, at, epsilon)
+    size = jnp.linalg.norm(_residual(task, at, epsilon))
+    length = _longest(task, at, move)
+
+    def moved(t):
+        return jax.tree.map(lambda a, b: a + t * b, at, move)
+
+    def grows(state):
+        t, tries = state
+        return (jnp.linalg.norm(_residual(task, moved(t), epsilon)) > size) & (tries < 50)
+
+    length, _ = jax.lax.while_loop(grows, lambda s: (s[0] / 2, s[1] + 1), (length, 0))
+    new = moved(length)
+    return new, jnp.max(jnp.abs(_residual(task, new, epsilon))), count + 1
+
+
+def _direction(task: Approximation, at: _Point, epsilon) -> _Point:
+    slope, curvature, values, slopes = _slopes(task, at)
+    left, right = at.x - task.least, task.most - at.x
+    dx = slope - epsilon / left + epsilon / right
+    dy = _PRICE + at.y - at.lam - epsilon / at.y
+    dlam = values - at.y - task.right + epsilon / at.lam
+    stiff_x = curvature + at.xsi / left + at.eta / right
+    stiff_y = 1 + at.mu / at.y
+    # z enters no constraint, so the system is that of the multipliers
+    matrix = jnp.diag(at.s / at.lam + 1 / stiff_y) + (slopes / stiff_x[None]) @ slopes.T
+    lam = jnp.linalg.solve(matrix, dlam + dy / stiff_y - slopes @ (dx / stiff_x))
+    x = -(dx + lam @ slopes) / stiff_x
+    y = (lam - dy) / stiff_y
+    z = (epsilon / at.z - 1) * at.z / at.zeta
+    return _Point(
+        x, y, z, lam,
+        epsilon / left - at.xsi - at.xsi * x / left,
+        epsilon / right - at.eta + at.eta * x / right,
+        epsilon / at.y - at.mu - at.mu * y / at.y,
+        epsilon / at.z - at.zeta - at.zeta * z / at.z,
+        epsilon / at.lam - at.s - at.s * lam / at.lam,
+    )  # fmt: skip
+
+
+def _longest(task: Approximation, at: _Point, move: _Point) -> Array:
+    """How far all positive numbers stay positive, at most 1."""
+    pairs = [
+        (at.y, move.y), (at.z[None], move.z[None]), (at.lam, move.lam), (at.xsi, move.xsi),
+        (at.eta, move.eta), (at.mu, move.mu), (at.zeta[None], move.zeta[None]),
+        (at.s, move.s), (at.x - task.least, move.x), (task.most - at.x, -move.x),
+    ]  # fmt: skip
+    worst = [jnp.max(-1.01 * change / value, initial=1.0) for value, change in pairs]
+    return 1 / jnp.max(jnp.stack(worst))

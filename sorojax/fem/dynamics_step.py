@@ -1,0 +1,234 @@
+"""One time step as a problem of equilibrium, and the state after it; pure functions.
+
+Forces act at one displacement u within the step. Velocity and acceleration there are affine
+in u, so that inertia and damping are quadratic potentials beside those of the loads.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from sorojax.fem.damping import AbstractDamping
+from sorojax.fem.energy_form import residual
+from sorojax.fem.energy_momentum import Conserving
+from sorojax.fem.generalised_alpha import Coefficients
+from sorojax.fem.inertia import Inertia, Mass, mass_values
+from sorojax.fem.loads import AbstractLoad
+from sorojax.fem.problem import Problem, body
+from sorojax.fem.step_state import StepState
+from sorojax.fem.supports import Prescribed, known_components, known_values
+from sorojax.fem.traced import known_mask
+from sorojax.math import sparse
+
+Row = Float[Array, "grid ..."]
+
+
+class State(eqx.Module):
+    """A moving body at one instant: what continues.
+
+    `memory` holds the loads that remember, such as friction; `work` and `dissipated` [J] are
+    what loads and supports gave and damping took since the start. `share` is the part of a
+    step that was taken last and `tangent` the matrix whose factor goes on being used, so
+    that a run that is cut in two repeats the whole one to the last bit.
+    """
+
+    time: Float[Array, ""]
+    displacement: Float[Array, "nodes dim"]
+    velocity: Float[Array, "nodes dim"]
+    acceleration: Float[Array, "nodes dim"]
+    memory: tuple[AbstractLoad | None, ...]
+    work: Float[Array, ""]
+    dissipated: Float[Array, ""]
+    share: Float[Array, ""]
+    tangent: Float[Array, " nnz"] | None = None
+
+
+class Dynamics(eqx.Module):
+    """All that a motion depends on. `loads` and `supports` hold a row of values on the grid
+    of times for those that follow one; `step` is the distance of the grid [s]."""
+
+    problem: Problem
+    damping: tuple[AbstractDamping, ...]
+    scheme: Coefficients
+    loads: tuple[Row | None, ...]
+    supports: tuple[Row | None, ...]
+    start: State
+    step: Float[Array, ""]
+    mass: Mass = eqx.field(static=True)
+    conserves: bool = eqx.field(static=True, default=False)
+
+
+class Matter(NamedTuple):
+    """Mass matrix and constant part of the damping matrix, computed once per motion."""
+
+    mass: Float[Array, " nnz"]
+    damping: Float[Array, " nnz"] | None
+
+
+class Interval(NamedTuple):
+    """A step: from `begin` to `end`, in steps of the grid from its point `index` on."""
+
+    index: Int[Array, ""]
+    begin: Float[Array, ""]
+    end: Float[Array, ""]
+
+
+class Step(NamedTuple):
+    """A step to solve. `matrix` is the damping matrix; `terms` are the loads and supports of
+    its problem of equilibrium; `target` are displacements known at the end."""
+
+    terms: tuple
+    guess: Float[Array, "nodes dim"]
+    predicted: Float[Array, "nodes dim"]
+    matrix: Float[Array, " nnz"] | None
+    target: Float[Array, " dofs"]
+
+
+def matter(dynamics: Dynamics) -> Matter:
+    """Mass and constant damping of the body."""
+    problem = body(dynamics.problem)
+    mass = mass_values(problem, dynamics.mass)
+    rest = jnp.zeros_like(problem.mesh.points)
+    constant = [d.matrix(problem, mass, rest) for d in dynamics.damping if d.constant]
+    return Matter(mass, sum(constant[1:], start=constant[0]) if constant else None)
+
+
+def begin_step(dynamics: Dynamics, known: Matter, state: State, interval: Interval) -> Step:
+    """The problem of equilibrium of a step."""
+    c = dynamics.scheme
+    h = _size(dynamics, interval)
+    u, v, a = state.displacement, state.velocity, state.acceleration
+    rate, c2 = c.gamma / (c.beta * h), (1 - c.am) / (c.beta * h**2 * (1 - c.af))
+    lead = (1 - (1 - c.af) * c.gamma / c.beta) * v
+    lead = lead + (1 - c.af) * (1 - c.gamma / (2 * c.beta)) * h * a  # -rate * (back - u)
+    drive = (1 - c.am) * (v / (c.beta * h) + (1 / (2 * c.beta) - 1) * a) - c.am * a
+    guess = u + (1 - c.af) * h * v
+    time = state.time + (1 - c.af) * h
+    stage = StepState(u, v, u - lead / rate, rate, guess, time, h, 1 - c.af)
+    loads = _begun(dynamics, state, interval, c.af, stage)
+    damping = _damping_matrix(dynamics, known, guess)
+    matrix, pull = c2 * known.mass, _times(dynamics, known.mass, drive)
+    if damping is not None:
+        matrix = matrix + rate * damping
+        pull = pull - _times(dynamics, damping, lead)
+    inertia = Inertia(matrix, pull, u, jnp.zeros((), u.dtype))
+    extra: tuple[AbstractLoad, ...] = (inertia,)
+    if dynamics.conserves:
+        extra += (Conserving(u, jnp.zeros((), u.dtype)),)
+    target, supports = _held(dynamics, interval, c.af, u)
+    predicted = guess + (1 - c.af) * h**2 / 2 * a
+    return Step((loads + extra, supports), guess, predicted, damping, target)
+
+
+def end_step(
+    dynamics: Dynamics,
+    known: Matter,
+    state: State,
+    interval: Interval,
+    step: Step,
+    u_alpha: Float[Array, "nodes dim"],
+) -> State:
+    """The state after a step whose equilibrium is `u_alpha`."""
+    c = dynamics.scheme
+    h = _size(dynamics, interval)
+    u, v, a = state.displacement, state.velocity, state.acceleration
+    d = (u_alpha - u) / (1 - c.af)
+    a_new = (d - h * v) / (c.beta * h**2) - (1 / (2 * c.beta) - 1) * a
+    v_new = v + h * ((1 - c.gamma) * a + c.gamma * a_new)
+    loads = step.terms[0][: len(dynamics.problem.loads)]
+    memory = tuple(
+        None if m is None else load for m, load in zip(state.memory, loads, strict=True)
+    )
+    taken = jnp.zeros((), u.dtype)
+    if step.matrix is not None:
+        v_alpha = (1 - c.af) * v_new + c.af * v
+        taken = jnp.sum(_times(dynamics, step.matrix, v_alpha) * d.ravel())
+    done = _work(dynamics, step, loads, u_alpha, d)
+    return State(
+        time=state.time + h, displacement=u + d, velocity=v_new, acceleration=a_new,
+        memory=memory, work=state.work + done, dissipated=state.dissipated + taken,
+        share=state.share,
+    )  # fmt: skip
+
+
+def _work(dynamics: Dynamics, step: Step, loads, u_alpha, d) -> Float[Array, ""]:
+    """Work [J] of loads and supports in a step, with the forces that the step takes."""
+    problem = with_terms(dynamics.problem, step.terms)
+
+    def given(u):
+        terms = (load.potential(problem, u) for load in loads)
+        return sum(terms, start=jnp.zeros((), u.dtype))
+
+    work = -jax.jvp(given, (u_alpha,), (d,))[1] if loads else jnp.zeros((), d.dtype)
+    if all(support.ramped is None for support in dynamics.problem.supports):
+        return work
+    reaction = residual(problem, u_alpha)
+    mask = known_mask(problem.supports, *d.shape).reshape(d.shape)
+    return work + jnp.sum(jnp.where(mask, reaction * d, jnp.zeros_like(d)))
+
+
+def with_terms(problem: Problem, terms: tuple) -> Problem:
+    """`problem` under other loads and supports."""
+    return dataclasses.replace(problem, loads=terms[0], supports=terms[1])
+
+
+def _size(dynamics: Dynamics, interval: Interval) -> Float[Array, ""]:
+    return (interval.end - interval.begin) * dynamics.step
+
+
+def _times(dynamics: Dynamics, values, x: Float[Array, "nodes dim"]) -> Float[Array, " dofs"]:
+    return sparse.product(dynamics.problem.space.system, values, x.ravel())
+
+
+def _at(row: Row, index, share) -> Float[Array, "..."]:
+    """A row of values between two points of the grid."""
+    first, last = row[index], row[index + 1]
+    return first + share * (last - first)
+
+
+def _begun(dynamics: Dynamics, state: State, interval: Interval, af, stage: StepState):
+    problem, found = dynamics.problem, []
+    share = interval.end - af * (interval.end - interval.begin)
+    bare = body(problem)
+    for load, row, before in zip(problem.loads, dynamics.loads, state.memory, strict=True):
+        value = load.value if row is None else _at(row, interval.index, share)
+        if before is not None or row is not None:
+            load = load if before is None else before
+            load = eqx.tree_at(lambda load: load.value, load, value)
+        found.append(load.begun(bare, stage))
+    return tuple(found)
+
+
+def _damping_matrix(dynamics: Dynamics, known: Matter, guess):
+    problem = body(dynamics.problem)
+    varying = [d.matrix(problem, known.mass, guess) for d in dynamics.damping if not d.constant]
+    if known.damping is not None:
+        varying.append(known.damping)
+    return sum(varying[1:], start=varying[0]) if varying else None
+
+
+def _held(dynamics: Dynamics, interval: Interval, af, u):
+    """Displacements known at the end, and supports that hold them where forces act."""
+    supports = []
+    for support, row in zip(dynamics.problem.supports, dynamics.supports, strict=True):
+        if row is not None and support.ramped is not None:
+            field = support.ramped
+            support = eqx.tree_at(
+                lambda s, field=field: getattr(s, field),
+                support,
+                _at(row, interval.index, interval.end),
+            )
+        supports.append(support)
+    target = known_values(tuple(supports), *u.shape)
+    held = (1 - af) * target.reshape(u.shape) + af * u
+    dim = u.shape[1]
+    fixed = []
+    for support in supports:
+        columns = jnp.asarray(known_components(support, dim))
+        moved = held[support.nodes][:, columns]
+        fixed.append(Prescribed(support.nodes, moved, support.components))
+    return target, tuple(fixed)

@@ -1,0 +1,203 @@
+"""`sweep`: one function over many designs in chunks that are made once."""
+
+import functools
+import hashlib
+import inspect
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from sorojax import __version__, _progress
+from sorojax.sweep.executors import Serial
+from sorojax.sweep.store import Arrays, Store, digest
+
+_MODES = ("jax_enable_x64", "jax_default_matmul_precision")
+
+
+@dataclass(frozen=True)
+class Swept:
+    """The results of a sweep.
+
+    Attributes:
+        result: Arrays by name, with the leading axis of the designs.
+        keys: Of the chunks, in order.
+        computed: Chunks that ran now.
+        found: Chunks that were in the store.
+        hash: Of all results, equal wherever and however often the sweep ran.
+    """
+
+    result: Arrays
+    keys: tuple[str, ...] = field(repr=False)
+    computed: int
+    found: int
+    hash: str
+
+
+def sweep(
+    function: Callable[..., Mapping[str, Any]],
+    designs: PyTree,
+    store: Store,
+    executor: Any = None,
+    *,
+    chunk: int = 64,
+    config: Any = None,
+    seed: int | None = None,
+    version: str | None = None,
+    retries: int = 3,
+) -> Swept:
+    """Call `function(block)` for blocks of designs, skipping those in the store.
+
+    Inside, `function` may use `vmap`, `simulate_batch` or `shard_map` over its block. With
+    `config` it is called as `function(block, config)`; with `seed`, a last argument is a
+    NumPy integer that differs from chunk to chunk.
+
+    A chunk is known by the versions of code and JAX, the config, its designs and its seed:
+    the same sweep again finds its results, also after a crash of driver or workers, and a
+    longer one only computes what is new. Workers write results themselves.
+
+    Args:
+        function: Pure, importable by the workers; returns arrays by name, each with the
+            leading axis of the block.
+        designs: A pytree of arrays with a leading axis of designs.
+        store: Where results are kept; a folder that all workers see.
+        executor: Anything with `submit`: serial if omitted, a process pool, a Dask client.
+        chunk: Designs per call.
+        config: What else the result depends on; JSON, or it must have a faithful `repr`.
+        seed: Of random results.
+        version: Name of the code; the version of sorojax and the source of the function if
+            omitted. Give one where the function calls code of your own that changes.
+        retries: How often a chunk that fails is tried in all.
+
+    Raises:
+        RuntimeError: If a chunk failed `retries` times; what is done stays in the store.
+    """
+    blocks = _blocks(designs, chunk)
+    code = _code(function) if version is None else version
+    jobs = {}
+    for number, block in enumerate(blocks):
+        own = None if seed is None else _seed(seed, number)
+        key = _key(code, config, block, own)
+        extra = () if config is None else (config,)
+        extra = extra if own is None else (*extra, own)
+        jobs.setdefault(key, (block, extra))
+    order = tuple(
+        _key(code, config, b, None if seed is None else _seed(seed, n))
+        for n, b in enumerate(blocks)
+    )
+    results = {key: found for key in jobs if (found := store.read(key)) is not None}
+    known = len(results)
+    _progress.report("sweep", known, len(jobs))
+    missing = {key: job for key, job in jobs.items() if key not in results}
+    executor = Serial() if executor is None else executor
+    _run_all(function, missing, results, store, executor, len(jobs), retries)
+    joined = _joined([results[key] for key in order])
+    return Swept(joined, order, len(missing), known, digest(joined))
+
+
+def _run_all(function, missing, results, store, executor, total, retries) -> None:
+    """Submit what is missing, collect it, and try again what fails."""
+    failures: dict[str, list[BaseException]] = {key: [] for key in missing}
+
+    def start(key: str):
+        # the number of the attempt makes Dask forget a failure of the same call
+        made = functools.partial(_make, function, store, key, len(failures[key]))
+        return executor.submit(made, *missing[key])
+
+    waiting = {key: start(key) for key in missing}
+    while waiting:
+        ready = [key for key, future in waiting.items() if future.done()]
+        if not ready:
+            time.sleep(0.005)
+        for key in ready:
+            error = waiting.pop(key).exception()
+            found = store.read(key) if error is None else None
+            if found is not None:
+                results[key] = found
+                _progress.report("sweep", len(results), total)
+                continue
+            why = error or OSError(f"its file {store.path(key)} is missing or damaged")
+            failures[key].append(why)
+            if len(failures[key]) >= retries:
+                raise RuntimeError(
+                    f"sweep: chunk {key[:12]} failed {retries} times, {len(results)} of "
+                    f"{total} chunks are in the store. The last error: {why!r}. Mend the "
+                    "cause and call sweep again: finished chunks are not computed twice."
+                ) from error
+            waiting[key] = start(key)
+
+
+def _make(function, store: Store, key: str, attempt: int, block, extra) -> str:
+    """Runs where the executor puts it; a chunk that is there already is not made again."""
+    if store.read(key) is None:
+        made = function(block, *extra)
+        if not isinstance(made, Mapping):
+            raise TypeError(
+                f"sweep: the function returned {type(made).__name__}, need arrays by name. "
+                'Return {"cost": ...}.'
+            )
+        result = {name: np.asarray(value) for name, value in made.items()}
+        length = jax.tree.leaves(block)[0].shape[0]
+        for name, value in result.items():
+            if value.shape[:1] != (length,):
+                raise ValueError(
+                    f"sweep: `{name}` has shape {value.shape}, need a leading axis of "
+                    f"{length} designs. Return one entry per design."
+                )
+        store.write(key, result)
+    return key
+
+
+def _blocks(designs: PyTree, chunk: int) -> list[PyTree]:
+    if chunk < 1:
+        raise ValueError(f"sweep: `chunk` must be 1 or more, got {chunk}.")
+    designs = jax.tree.map(np.asarray, designs)
+    lengths = {leaf.shape[:1] for leaf in jax.tree.leaves(designs)}
+    if len(lengths) != 1 or lengths in ({()}, {(0,)}):
+        raise ValueError(
+            f"sweep: the leaves of `designs` have the leading axes {sorted(lengths)}, need one "
+            "axis of one or more designs. Give arrays of one length."
+        )
+    ((count,),) = lengths
+    return [
+        jax.tree.map(lambda leaf, k=k: leaf[k : k + chunk], designs)
+        for k in range(0, count, chunk)
+    ]
+
+
+def _joined(results: list[Arrays]) -> Arrays:
+    return {k: np.concatenate([part[k] for part in results]) for k in results[0]}
+
+
+def _seed(seed: int, number: int) -> np.integer:
+    return np.random.SeedSequence([seed, number]).generate_state(1)[0]
+
+
+def _code(function: Callable) -> str:
+    """The version of sorojax and the source of the function."""
+    while isinstance(function, functools.partial):
+        function = function.func
+    try:
+        source = inspect.getsource(inspect.unwrap(function))
+    except (OSError, TypeError):
+        raise ValueError(
+            f"sweep: the source of {function!r} cannot be read, so results could not be told "
+            'apart when it changes. Name the code: version="...".'
+        ) from None
+    return f"{__version__} {source}"
+
+
+def _key(code: str, config: Any, block: PyTree, seed: Any) -> str:
+    leaves, structure = jax.tree.flatten(block)
+    hashed = hashlib.sha256()
+    modes = {name: str(jax.config.values[name]) for name in _MODES}
+    about = [code, jax.__version__, modes, str(structure), repr(seed)]
+    hashed.update(json.dumps(about, sort_keys=True).encode())
+    hashed.update(json.dumps(config, sort_keys=True, default=repr).encode())
+    hashed.update(digest({str(k): leaf for k, leaf in enumerate(leaves)}).encode())
+    return hashed.hexdigest()

@@ -1,0 +1,176 @@
+"""The motion of a rod from markers on it, filtered through its dynamics.
+
+Reference: Simon, Optimal State Estimation, 2006, chapter 13.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from sorojax import _check
+from sorojax._types import real
+from sorojax.math.dense import solve_symmetric
+from sorojax.math.door import door
+from sorojax.math.status import Status
+from sorojax.rod import inertia, motion, operators, total_force
+from sorojax.rod.assembly import num_dof
+from sorojax.rod.dynamics import Forces
+from sorojax.rod.loads import damping_matrix, tangent_stiffness
+from sorojax.systems.shape_estimate import Markers, places, root_mean_square, sizes
+
+#: Updates without a marker after which an estimate is only a prediction.
+STALE = 3
+
+
+class ShapeFilter(eqx.Module):
+    """An extended Kalman filter whose prediction is the rod's own dynamics.
+
+    Attributes:
+        markers: Where they sit on the rod.
+        period: Between two updates [s].
+        marker_noise: Standard deviation of a marker's coordinate [m].
+        force_noise: Standard deviation of unknown forces, relative to those that bend the
+            rod by its own length; what contact may do to it [-].
+        substeps: Of the dynamics, each linearly implicit, within a period.
+    """
+
+    markers: Markers
+    period: Float[Array, ""] = eqx.field(converter=real)
+    marker_noise: Float[Array, ""] = eqx.field(converter=real, default=3e-4)
+    force_noise: Float[Array, ""] = eqx.field(converter=real, default=0.05)
+    substeps: int = eqx.field(static=True, default=2)
+
+    def __check_init__(self):
+        for name in ("period", "marker_noise", "force_noise"):
+            _check.positive("ShapeFilter", name, getattr(self, name), "", "See its docstring.")
+
+
+class Filtered(eqx.Module):
+    """What a filter knows: coordinates, rates, their covariance, and since when.
+
+    Attributes:
+        missed: Updates since a marker was last seen; the estimate is `stale` from three on.
+        error: Root mean square distance of the seen markers to the prediction [m].
+    """
+
+    q: Float[Array, " dof"]
+    v: Float[Array, " dof"]
+    covariance: Float[Array, "state state"]
+    missed: Int[Array, ""]
+    error: Float[Array, ""]
+    status: Status
+
+    @property
+    def stale(self) -> Array:
+        return self.missed >= STALE
+
+
+def start_filter(
+    estimator: ShapeFilter, q: Float[Array, " dof"] | None = None, *, spread=0.1
+) -> Filtered:
+    """A filter at rest at `q` (zero if omitted).
+
+    `spread` is how far off that may be: the displacement of the tip over the length.
+    """
+    rod = estimator.markers.rod
+    q = jnp.zeros(num_dof(rod)) if q is None else real(q)
+    size = spread * sizes(rod, q)
+    covariance = jnp.diag(jnp.concatenate([size, size / estimator.period]) ** 2)
+    nothing = jnp.zeros((), q.dtype)
+    return Filtered(
+        q, jnp.zeros_like(q), covariance, jnp.zeros((), jnp.int32), nothing, Status.successful
+    )
+
+
+@door
+def update_filter(
+    estimator: ShapeFilter,
+    last: Filtered,
+    positions: Float[Array, "markers dim"] | None = None,
+    *,
+    forces: Forces = (),
+    t=0.0,
+) -> Filtered:
+    """The estimate one period later, with what the camera saw by then, or without.
+
+    Without markers (None, or all NaN) it is the prediction, with a growing covariance.
+    Where numbers stop being finite the last estimate is kept and `status` says so.
+
+    Args:
+        estimator: The filter.
+        last: The last estimate.
+        positions: Markers [m] in the rod's base frame; NaN if not seen.
+        forces: On the rod over the period: damping, gravity, what is commanded.
+        t: Time at the start of the period [s].
+    """
+    dof = last.q.shape[0]
+    before = jnp.concatenate([last.q, last.v])
+    ahead = _prediction(estimator, forces, real(t))
+    state, slopes = ahead(before), jax.jacfwd(ahead)(before)
+    covariance = slopes @ last.covariance @ slopes.T + _process(estimator, forces, last.q)
+    missed, error = last.missed + 1, jnp.zeros((), state.dtype)
+    if positions is not None:
+        state, covariance, error, seen = _corrected(estimator, state, covariance, positions)
+        missed = jnp.where(seen > 0, jnp.zeros_like(missed), missed)
+    new = Filtered(state[:dof], state[dof:], covariance, missed, error, Status.successful)
+    fine = jnp.all(jnp.isfinite(state)) & jnp.all(jnp.isfinite(covariance))
+    kept = jax.tree.map(
+        lambda a, b: jnp.where(fine, a, b), eqx.filter(new, eqx.is_array), last
+    )  # fmt: skip
+    status = Status.where(fine, Status.successful, Status.not_finite)
+    missed = jnp.where(fine, missed, last.missed + 1)
+    return eqx.tree_at(lambda x: (x.missed, x.status), kept, (missed, status))
+
+
+def _prediction(estimator: ShapeFilter, forces: Forces, t):
+    """(q, v) -> (q, v) a period later, by linearly implicit Euler steps."""
+    rod, constants = estimator.markers.rod, operators(estimator.markers.rod)
+    h = estimator.period / estimator.substeps
+    damping = damping_matrix(forces, rod, constants)
+
+    def step(_, state):
+        q, v = jnp.split(state, 2)
+        moment = motion(rod, q, v, constants=constants)
+        mass, coriolis = inertia(moment)
+        stiffness = tangent_stiffness(forces, moment)
+        force = total_force(forces, t, moment) - coriolis
+        implicit = mass + h * damping + h * h * stiffness
+        v = v + solve_symmetric(implicit, h * (force - h * (stiffness @ v)))
+        return jnp.concatenate([q + h * v, v])
+
+    return lambda state: jax.lax.fori_loop(0, estimator.substeps, step, state)
+
+
+def _process(estimator: ShapeFilter, forces: Forces, q) -> Array:
+    """Covariance of what unknown forces do in a period."""
+    rod, constants = estimator.markers.rod, operators(estimator.markers.rod)
+    moment = motion(rod, q, jnp.zeros_like(q), constants=constants)
+    mass, _ = inertia(moment)
+    stiffness = tangent_stiffness(forces, moment)
+    h = estimator.period
+    # a force that would hold the rod bent, met by inertia, damping and elasticity
+    push = estimator.force_noise * stiffness @ jnp.diag(sizes(rod, q))
+    implicit = mass + h * damping_matrix(forces, rod, constants) + h * h * stiffness
+    kick = jnp.linalg.solve(implicit, h * push)
+    both = jnp.concatenate([h * kick, kick])
+    return both @ both.T
+
+
+def _corrected(estimator: ShapeFilter, state, covariance, positions):
+    """Kalman's update by the markers that were seen, in the form that stays symmetric."""
+    dof = state.shape[0] // 2
+    seen = jnp.all(jnp.isfinite(positions), axis=1)
+    moment = motion(estimator.markers.rod, state[:dof])
+    place, jacobian = places(estimator.markers, moment)
+    ahead = jnp.where(seen[:, None], positions - place, 0.0).reshape(-1)
+    rows = jnp.where(seen[:, None, None], jacobian, 0.0).reshape(ahead.shape[0], -1)
+    rows = jnp.concatenate([rows, jnp.zeros_like(rows)], axis=1)
+    noise = estimator.marker_noise**2 * jnp.eye(ahead.shape[0], dtype=state.dtype)
+    spread = rows @ covariance @ rows.T + noise
+    gain = jnp.linalg.solve(spread, rows @ covariance).T
+    left = jnp.eye(state.shape[0], dtype=state.dtype) - gain @ rows
+    covariance = left @ covariance @ left.T + gain @ noise @ gain.T
+    count = jnp.sum(seen)
+    error = root_mean_square(ahead, count)
+    return state + gain @ ahead, covariance, error, count

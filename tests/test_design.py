@@ -1,0 +1,253 @@
+"""Optimisers on problems with known answers, filters, and two classic layouts."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+import scipy.optimize
+
+from sorojax import design, fem, material, mesh
+from sorojax._progress import silent
+from sorojax.math.status import Status
+
+
+def beam_weight(x):
+    return 0.0624 * jnp.sum(x)
+
+
+def beam_deflection(x):
+    return jnp.sum(jnp.array([61.0, 37.0, 19.0, 7.0, 1.0]) / x**3) - 1
+
+
+@pytest.mark.parametrize("method", [design.MMA(1.0, 10.0), design.GCMMA(1.0, 10.0)])
+def test_svanbergs_beam(method):
+    """Krister Svanberg, Int. J. Numer. Meth. Engng 24, 1987, section 5.2: 1.340."""
+    found = design.minimise(
+        beam_weight, jnp.full(5, 5.0), constraints=(beam_deflection,), optimiser=method,
+        steps=60, tolerance=1e-6,
+    )  # fmt: skip
+    want = [6.0160, 5.3092, 4.4943, 3.5015, 2.1527]
+    assert np.allclose(found.design, want, atol=2e-3) and abs(found.objective - 1.33996) < 1e-5
+    assert float(found.constraints[0]) < 1e-6 and found.status == Status.successful
+
+
+@pytest.mark.parametrize("method", [design.MMA(0.0, 5.0), design.GCMMA(0.0, 5.0)])
+def test_svanbergs_two_balls(method):
+    """The toy problem of the notes on MMA and GCMMA (KTH, 2007)."""
+    centres = ([5.0, 2.0, 1.0], [3.0, 4.0, 3.0])
+
+    def outside(centre, module=jnp):
+        return lambda x: module.sum((x - module.array(centre)) ** 2) - 9
+
+    found = design.minimise(
+        lambda x: jnp.sum(x**2), jnp.array([4.0, 3.0, 2.0]), optimiser=method, steps=60,
+        constraints=tuple(map(outside, centres)), tolerance=1e-7,
+    )  # fmt: skip
+    bounds = [{"type": "ineq", "fun": lambda x, c=c: -outside(c, np)(x)} for c in centres]
+    peer = scipy.optimize.minimize(
+        lambda x: np.sum(x**2), [4.0, 3.0, 2.0], constraints=bounds, method="SLSQP", tol=1e-12
+    )
+    assert np.allclose(found.design, peer.x, atol=1e-5)
+
+
+def test_gcmma_never_rises_where_mma_may():
+    """A function that MMA's fixed convexity misjudges."""
+
+    def rough(x):
+        return jnp.sum(x**2) + 0.5 * jnp.sum(jnp.cos(12 * x))
+
+    start = jnp.array([0.9, -0.8, 0.4])
+    careful = design.minimise(rough, start, optimiser=design.GCMMA(-1.0, 1.0), steps=30,
+                              constraints=(lambda x: jnp.sum(x) - 5,))  # fmt: skip
+    fall = np.diff(careful.history["objective"])
+    assert np.all(fall <= 1e-7 * abs(careful.history["objective"][0]))
+    assert careful.objective < rough(start) - 0.5
+
+
+def test_a_problem_without_a_feasible_point_ends_at_the_least_bad():
+    found = design.minimise(
+        lambda x: jnp.sum(x), jnp.array([0.5]), steps=40,
+        constraints=(lambda x: 0.8 - x, lambda x: x - 0.2),
+    )  # fmt: skip
+    assert np.allclose(found.constraints, 0.3, atol=0.02)
+
+
+def test_any_optax_optimiser_and_any_pytree():
+    start = {"a": jnp.array([2.0, -1.0]), "b": jnp.array(3.0)}
+    found = design.minimise(
+        lambda x: jnp.sum(x["a"] ** 2) + (x["b"] - 1) ** 2, start,
+        optimiser=optax.adam(0.1), steps=400, tolerance=1e-8,
+    )  # fmt: skip
+    assert np.allclose(found.design["a"], 0, atol=1e-3) and abs(found.design["b"] - 1) < 1e-3
+    with pytest.raises(ValueError, match="optax optimiser takes no constraints"):
+        design.minimise(beam_weight, jnp.ones(5), constraints=(beam_deflection,),
+                        optimiser=optax.adam(0.1))  # fmt: skip
+
+
+def test_stopped_and_resumed_gives_the_same_bits():
+    def run(steps, resume=None):
+        return design.minimise(
+            beam_weight, jnp.full(5, 5.0), constraints=(beam_deflection,), steps=steps,
+            optimiser=design.MMA(1.0, 10.0), tolerance=0.0, scale=1.0, resume=resume,
+        )  # fmt: skip
+
+    whole, half = run(12), run(6)
+    rest = run(12, half.last)
+    assert np.array_equal(whole.design, rest.design)
+    assert np.array_equal(whole.history["objective"][6:], rest.history["objective"])
+
+
+def test_values_that_break_are_named_or_stop_the_run():
+    with pytest.raises(ValueError, match="not finite at the first design|objective is nan"):
+        design.minimise(lambda x: jnp.sum(jnp.log(x)), jnp.array([-1.0]))
+    with silent():
+        found = design.minimise(
+            lambda x: jnp.sum(x) + 0 * jnp.sum(jnp.log(x - 0.4)), jnp.array([0.9]),
+            optimiser=optax.sgd(0.3), steps=10,
+        )  # fmt: skip
+    assert found.status == Status.not_finite and np.all(np.isfinite(found.design))
+
+
+GRID = mesh.rectangle([0, 0], [12.0, 6.0], divisions=(12, 6), element=mesh.Quad4())
+
+
+@pytest.mark.parametrize("make", [design.cone_filter, design.helmholtz_filter])
+def test_filters_keep_a_constant_and_smooth(make):
+    smooth = make(GRID, 2.5)
+    assert np.allclose(smooth(jnp.full(72, 0.3)), 0.3, rtol=1e-12)
+    spike = jnp.zeros(72).at[40].set(1.0)
+    out = smooth(spike)
+    assert out.min() > -0.02 and out[40] == out.max() < 0.6
+    weights = jnp.linspace(0.0, 1.0, 72)
+    back = jax.vjp(smooth, spike)[1](weights)[0]
+    assert jnp.vdot(weights, smooth(spike)) == pytest.approx(float(back[40]), rel=1e-12)
+
+
+def test_the_cone_filter_is_a_weighted_mean():
+    """Radius 1.5 on unit squares: weights 1.5, 0.5 and 1.5 - sqrt 2."""
+    smooth = design.cone_filter(GRID, 1.5)
+    middle = np.argmin(
+        np.linalg.norm(
+            np.asarray(GRID.points)[np.asarray(GRID.cells)].mean(axis=1) - [5.5, 2.5], axis=1
+        )
+    )
+    out = smooth(jnp.zeros(72).at[middle].set(1.0))
+    corner = 1.5 - np.sqrt(2)
+    total = 1.5 + 4 * 0.5 + 4 * corner
+    want = sorted([1.5 / total, *4 * [0.5 / total], *4 * [corner / total]])
+    assert np.allclose(sorted(np.asarray(out[out > 0])), want, rtol=1e-12)
+
+
+def test_projection_is_monotone_and_exact_at_its_ends():
+    x = jnp.linspace(0.0, 1.0, 101)
+    for sharpness in (0.1, 4.0, 64.0):
+        y = design.heaviside_projection(x, sharpness, 0.4)
+        assert np.allclose([y[0], y[-1]], [0, 1], atol=1e-12) and np.all(np.diff(y) >= 0)
+    assert design.greyness(design.heaviside_projection(x, 64.0)) < 0.1
+
+
+def mbb(nx, ny):
+    """Half of a beam on two supports under a force in the middle; E = 1, nu = 0.3."""
+    grid = mesh.rectangle([0, 0], [nx, ny], divisions=(nx, ny), element=mesh.Quad4())
+    left = fem.Fixed(grid.node_sets["left"], components=(0,))
+    foot = fem.Fixed(jnp.array([mesh.nearest_node(grid, [nx, 0.0])]), components=(1,))
+    push = fem.Force(jnp.array([mesh.nearest_node(grid, [0.0, ny])]), [0.0, -1.0])
+    stuff = material.neo_hookean(young_modulus=1.0, poisson_ratio=0.3)
+    return fem.problem(
+        grid, stuff, kinematics=fem.PlaneStress(1.0), supports=(left, foot), loads=(push,),
+        formulation=fem.Displacement(),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def small():
+    problem = mbb(12, 6)
+    return problem, design.linear(problem)
+
+
+def test_small_displacements_are_those_of_the_nonlinear_body(small):
+    problem, model = small
+    factor = jnp.linspace(0.3, 1.0, 72)
+    u = design.displacement(model, factor)
+    soft = fem.problem(
+        problem.mesh, material.Scaled(problem.material, 1e6 * factor), loads=problem.loads,
+        kinematics=problem.kinematics, supports=problem.supports,
+        formulation=fem.Displacement(),
+    )  # fmt: skip
+    exact = 1e6 * fem.solve(soft).displacement
+    assert np.max(np.abs(u - exact)) < 1e-3 * np.max(np.abs(u))
+
+
+def test_the_gradient_of_compliance(small):
+    _, model = small
+    interpolation = design.Simp(3.0, 1e-6)
+
+    def loss(x):
+        return design.compliance(model, interpolation(x))
+
+    x, way = jnp.linspace(0.2, 0.9, 72), jnp.cos(jnp.arange(72.0))
+    slope = jnp.vdot(jax.grad(loss)(x), way)
+    h = 1e-6
+    difference = (loss(x + h * way) - loss(x - h * way)) / (2 * h)
+    assert float(slope) == pytest.approx(float(difference), rel=1e-7)
+
+    def through(x):  # the same by the adjoint of the solve
+        return jnp.sum(model.force * design.displacement(model, interpolation(x)))
+
+    assert np.allclose(jax.grad(through)(x), jax.grad(loss)(x), rtol=1e-9)
+
+
+@pytest.mark.parametrize(("kind", "want"), [("sensitivity", 216.8137), ("density", 233.7146)])
+def test_the_mbb_beam(kind, want):
+    """60 x 20, volume 0.5, exponent 3, radius 2.4: the numbers of the 88-line code."""
+    problem = mbb(60, 20)
+    model, smooth = design.linear(problem), design.cone_filter(problem.mesh, 2.4)
+    interpolation = design.Simp(3.0, 1e-9)
+    if kind == "density":
+        loss = jax.jit(lambda x: design.compliance(model, interpolation(smooth(x))))
+        volume = jax.jit(lambda x: jnp.mean(smooth(x)) - 0.5)
+        changed = None
+    else:
+        loss = jax.jit(lambda x: design.compliance(model, interpolation(x)))
+        volume = jax.jit(lambda x: jnp.mean(x) - 0.5)
+        changed = lambda x, g: design.sensitivity_filtered(smooth, x, g)  # noqa: E731
+    with silent():
+        found = design.minimise(
+            loss, jnp.full(1200, 0.5), constraints=(volume,), steps=200, tolerance=0.01,
+            optimiser=design.OptimalityCriteria(), change_gradient=changed,
+        )  # fmt: skip
+    assert float(found.history["objective"][-1]) == pytest.approx(want, rel=5e-3)
+    assert abs(float(found.constraints[0])) < 1e-3
+
+
+def inverter(nx, ny):
+    """Half of a mechanism that turns a push at the left into a pull at the right."""
+    grid = mesh.rectangle([0, 0], [nx, ny], divisions=(nx, ny), element=mesh.Quad4())
+    ends = jnp.array([mesh.nearest_node(grid, [x, ny]) for x in (0.0, nx)])
+    ground = grid.points[ends] - jnp.array([[10.0, 0.0], [-10.0, 0.0]])
+    corner = mesh.nodes_where(grid, lambda p: (p[0] <= 0) & (p[1] <= 3.5))
+    held = (fem.Fixed(grid.node_sets["top"], components=(1,)), fem.Fixed(corner))
+    springs = fem.Spring(ends, ground, 0.1)
+    problem = fem.problem(
+        grid, material.neo_hookean(young_modulus=1.0, poisson_ratio=0.3), supports=held,
+        kinematics=fem.PlaneStress(1.0), loads=(fem.Force(ends[:1], [1.0, 0.0]), springs),
+        formulation=fem.Displacement(),
+    )  # fmt: skip
+    return problem, ends[1]
+
+
+def test_the_force_inverter():
+    """40 x 20, volume 0.3, radius 1.2, springs of 0.1: published -1.113."""
+    problem, end = inverter(40, 20)
+    model, smooth = design.linear(problem), design.cone_filter(problem.mesh, 1.2)
+    interpolation = design.Simp(3.0, 1e-9)
+    out = jax.jit(lambda x: design.displacement(model, interpolation(x))[end, 0])
+    volume = jax.jit(lambda x: 10 * (jnp.mean(x) - 0.3))
+    with silent():
+        found = design.minimise(
+            out, jnp.full(800, 0.3), constraints=(volume,), steps=120, tolerance=0.01,
+            optimiser=design.MMA(1e-3, 1.0, move=0.2), scale=0.1,
+            change_gradient=lambda x, g: design.sensitivity_filtered(smooth, x, g),
+        )  # fmt: skip
+    assert float(found.objective) < -1.113 and abs(float(found.constraints[0])) < 0.02

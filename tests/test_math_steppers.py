@@ -1,0 +1,145 @@
+"""One-step methods, alone and in diffrax, and the control of their steps."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sorojax.math.control import Control
+from sorojax.math.explicit import RungeKutta4, SemiImplicitEuler, Tsit5
+from sorojax.math.linearly_implicit import Rosenbrock2
+from sorojax.math.method import repeat
+from sorojax.math.rosenbrock import Rodas4
+
+METHODS = (
+    (Tsit5(), 5),
+    (RungeKutta4(), 4),
+    (Rodas4(), 4),
+    (SemiImplicitEuler(), 1),
+    (Rosenbrock2(), 2),
+)
+START = {"q": jnp.array([1.0, 0.5]), "v": jnp.array([0.0, 1.0])}
+
+
+def swing(t, y):
+    """A Mathieu oscillator with a cubic spring: nothing linear, nothing constant."""
+    return {"q": y["v"], "v": -y["q"] * (1 + 0.5 * jnp.sin(3 * t)) - 0.2 * y["q"] ** 3}
+
+
+@eqx.filter_jit
+def solve(solver, control, start=START, adjoint=None, field=swing, end=1.0):
+    return dfx.diffeqsolve(
+        dfx.ODETerm(lambda t, y, args: field(t, y)), solver, 0.0, end, None, start,
+        stepsize_controller=control, saveat=dfx.SaveAt(ts=jnp.linspace(0.0, end, 5)),
+        adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+        throw=False,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return solve(dfx.Dopri8(), dfx.PIDController(rtol=1e-13, atol=1e-14)).ys["q"]
+
+
+@pytest.mark.parametrize("method, order", METHODS)
+def test_fixed_steps_have_their_order(method, order, exact):
+    @jax.jit
+    def end(count):
+        def one(k, carry):
+            y, memory = carry
+            new = method.advance(swing, k / count, y, 1 / count, memory)
+            return new.y, new.memory
+
+        first = (START, method.begin(swing, jnp.array(0.0), START, 1 / count))
+        return jax.lax.fori_loop(0, count.astype(int), one, first)[0]["q"]
+
+    errors = [float(jnp.abs(end(jnp.array(n)) - exact[-1]).max()) for n in (10.0, 20.0)]
+    assert order - 0.25 < np.log2(errors[0] / errors[1]) < order + 0.6
+
+
+@pytest.mark.parametrize("method", [Tsit5(), Rodas4()])
+def test_adaptive_runs_hold_their_tolerance_within_steps_too(method, exact):
+    solution = solve(method, Control(1e-9, 1e-10))
+    assert jnp.allclose(solution.ys["q"], exact, rtol=0, atol=1e-8)
+
+
+def test_the_unrolled_method_takes_the_steps_of_diffrax(exact):
+    control = dfx.PIDController(rtol=1e-6, atol=1e-8)
+    own, stock = solve(Tsit5(), control), solve(dfx.Tsit5(), control)
+    assert own.stats["num_steps"] == stock.stats["num_steps"]
+    # sums in another order, to which step sizes answer by another rounding
+    assert jnp.allclose(own.ys["q"], stock.ys["q"], rtol=0, atol=1e-12)
+
+
+def test_rodas4_damps_what_is_infinitely_fast():
+    """L-stable: the slow solution is kept in steps of 0.1 s beside eigenvalues of 1e8 1/s."""
+
+    def field(t, y):
+        return {"fast": -1e8 * (y["fast"] - jnp.cos(t)) - jnp.sin(t), "slow": -y["slow"]}
+
+    start = {"fast": jnp.array(3.0), "slow": jnp.array(1.0)}
+    end = repeat(Rodas4(), field, jnp.array(0.0), start, jnp.array(0.1), 10)
+    assert jnp.isclose(end["fast"], jnp.cos(1.0), rtol=0, atol=1e-6)
+    assert jnp.isclose(end["slow"], jnp.exp(-1.0), rtol=0, atol=1e-6)
+    explicit = repeat(RungeKutta4(), field, jnp.array(0.0), start, jnp.array(0.1), 10)
+    assert not jnp.abs(explicit["fast"]) < 1e6
+
+
+def test_semi_implicit_euler_keeps_energy_where_explicit_euler_gains():
+    def spring(t, y):
+        return {"q": y["v"], "v": -y["q"]}
+
+    start = {"q": jnp.array(1.0), "v": jnp.array(0.0)}
+    end = repeat(SemiImplicitEuler(), spring, jnp.array(0.0), start, jnp.array(0.1), 10_000)
+    assert abs(float(end["q"] ** 2 + end["v"] ** 2) - 1) < 0.11
+    assert (1 + 0.1**2) ** 10_000 > 1e40  # by explicit Euler
+    with pytest.raises(ValueError, match="no leaf of the state"):
+        repeat(SemiImplicitEuler(), lambda t, y: -y, jnp.array(0.0), 1.0 * jnp.ones(2),
+               jnp.array(0.1), 1)  # fmt: skip
+
+
+def test_tolerances_may_differ_between_components():
+    loose = {"q": jnp.array(1e-3), "v": jnp.array(1e-3)}
+    tight = {"q": jnp.array(1e-9), "v": jnp.array(1e-3)}
+    rtol = {"q": jnp.array(0.0), "v": jnp.array(0.0)}
+    few, many = (solve(Tsit5(), Control(rtol, atol)) for atol in (loose, tight))
+    assert int(few.stats["num_steps"]) < int(many.stats["num_steps"])
+    with pytest.raises(ValueError, match="one number per leaf"):
+        solve(Tsit5(), Control({"q": 1e-3}, 1e-6))
+
+
+def test_forward_and_reverse_derivatives_agree(exact):
+    def end(scale, adjoint):
+        start = jax.tree.map(lambda x: scale * x, START)
+        return solve(Rodas4(), Control(1e-9, 1e-10), start, adjoint).ys["q"][-1, 0]
+
+    one = jnp.array(1.0)
+    reverse = jax.grad(end)(one, None)
+    forward = jax.jacfwd(end)(one, dfx.ForwardMode())
+    h = 1e-3
+    difference = (end(one + h, None) - end(one - h, None)) / (2 * h)
+    assert jnp.isclose(reverse, forward, rtol=1e-12)
+    assert jnp.isclose(reverse, difference, rtol=1e-6)
+
+
+def edge(t, y):
+    """Not finite beyond y = 1, which exp(t) reaches at the end and steps beyond."""
+    return {"y": jnp.where(y["y"] < 1.0, y["y"], jnp.nan) + 0 * jnp.sqrt(1.0 - y["y"])}
+
+
+def test_a_step_into_nan_is_repeated_and_leaves_no_nan_in_gradients():
+    def last(start):
+        solution = solve(Tsit5(), Control(1e-4, 1e-4), {"y": start}, field=edge, end=0.999)
+        return solution.ys["y"][-1], solution.stats["num_rejected_steps"]
+
+    (value, rejected), slope = jax.value_and_grad(last, has_aux=True)(jnp.exp(-1.0))
+    assert int(rejected) > 0 and jnp.isfinite(value)
+    assert jnp.isclose(slope, jnp.exp(0.999), rtol=1e-3)
+
+
+def test_a_run_that_cannot_go_on_ends_soon_at_its_last_good_state():
+    solution = solve(Tsit5(), Control(), {"y": jnp.exp(-1.0)}, field=edge, end=2.0)
+    assert solution.result == dfx.RESULTS.dt_min_reached
+    assert int(solution.stats["num_steps"]) < 150

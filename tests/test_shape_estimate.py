@@ -1,0 +1,173 @@
+"""Shapes from markers: against the shapes that made them, with contact, noise and gaps."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sorojax import rod as R
+from sorojax.math.lie import SE2, SE3
+from sorojax.math.status import Status
+from sorojax.systems import (
+    Markers,
+    ShapeFilter,
+    estimate_shape,
+    start_filter,
+    update_filter,
+)
+
+FINGER = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=1100.0)
+PLANAR = R.rod(SE2(), R.chebyshev(kappa_z=3), R.circle(6e-3), nodes=8, **FINGER)
+SPATIAL = R.rod(SE3(), R.chebyshev(kappa_y=2, kappa_z=2), R.circle(6e-3), nodes=6, **FINGER)
+# what is measured has modes that the estimator does not know
+TRUE = R.rod(SE2(), R.chebyshev(kappa_z=6), R.circle(6e-3), nodes=10, **FINGER)
+S = jnp.array([0.25, 0.5, 0.75, 1.0])
+
+
+def pushed(force, at=0.55):
+    """The true finger held by an unknown contact on its side."""
+    push = R.PointWrench([0.0, 0.0, force], s=at)
+    return R.equilibrium(TRUE, (push,)).q
+
+
+def seen(q, s=S, model=TRUE):
+    return R.forward_kinematics(model, q, s)[:, :2, 2]
+
+
+@pytest.mark.parametrize("group", ["planar", "spatial"])
+def test_exact_markers_give_back_the_shape(group):
+    model = PLANAR if group == "planar" else SPATIAL
+    dim = model.group.space_dim
+    q = jnp.array([12.0, -6.0, 3.0]) if group == "planar" else jnp.array([9.0, -4.0, 6.0, 3.0])
+    poses = R.forward_kinematics(model, q, S)
+    offset = jnp.array([[0.0, 4e-3, 1e-3][:dim]] * 4)
+    for arm in (None, offset):
+        places = poses[:, :dim, dim]
+        if arm is not None:
+            places = places + jnp.einsum("mij,mj->mi", poses[:, :dim, :dim], arm)
+        markers = Markers(model, S, arm)
+        shape = estimate_shape(markers, places, jnp.zeros_like(q), trust=1e-7, iterations=8)
+        assert jnp.max(jnp.abs(shape.q - q)) < 1e-5 and shape.error < 1e-8
+        assert shape.status == Status.successful and shape.seen == 4
+
+
+def test_unknown_contact_and_noise_leave_the_tip_within_a_millimetre():
+    random, off = np.random.default_rng(0), []
+    q = jnp.zeros(3)
+    for force in np.linspace(-0.15, 0.15, 31):
+        true = pushed(float(force))
+        places = seen(true) + 2e-4 * random.standard_normal((4, 2))
+        q = estimate_shape(Markers(PLANAR, S), places, q).q
+        off.append(jnp.linalg.norm(R.tip_pose(PLANAR, q)[:2, 2] - seen(true)[-1]))
+    assert jnp.max(jnp.array(off)) < 1e-3
+
+
+def test_what_no_marker_shows_is_filled_by_the_equilibrium():
+    """One marker at the tip, the weight known: the middle is where it should be."""
+    weight = R.Gravity([0.0, -9.81])
+    true = R.equilibrium(PLANAR, (weight, R.TipWrench([0.0, 0.0, 0.02]))).q
+    tip = seen(true, S[3:], PLANAR)
+    q = jnp.zeros(3)
+    for _ in range(4):
+        shape = estimate_shape(Markers(PLANAR, S[3:]), tip, q, forces=(weight,), iterations=8)
+        q = shape.q
+    middle = (
+        R.forward_kinematics(PLANAR, q, S)[1, :2, 2]
+        - R.forward_kinematics(PLANAR, true, S)[1, :2, 2]
+    )
+    assert shape.error < 1e-4 and jnp.linalg.norm(middle) < 5e-4
+    nothing = jnp.full((1, 2), jnp.nan)
+    alone = estimate_shape(Markers(PLANAR, S[3:]), nothing, q, forces=(weight,), iterations=8)
+    rest = R.equilibrium(PLANAR, (weight,)).q
+    assert alone.seen == 0 and jnp.max(jnp.abs(alone.q - rest)) < 1e-3 * jnp.max(jnp.abs(rest))
+
+
+def test_a_hidden_marker_counts_for_nothing():
+    true = pushed(0.1)
+    places = seen(true)
+    hidden = places.at[1].set(jnp.nan)
+    few = Markers(PLANAR, S[jnp.array([0, 2, 3])])
+    q = jnp.zeros(3)
+    a = estimate_shape(Markers(PLANAR, S), hidden, q, iterations=8)
+    b = estimate_shape(few, places[jnp.array([0, 2, 3])], q, iterations=8)
+    assert jnp.allclose(a.q, b.q, rtol=1e-9) and a.seen == 3
+
+
+PERIOD = 1 / 60
+LOADS = (R.Damping(0.01), R.Gravity([0.0, -9.81]))
+
+
+@pytest.fixture(scope="module")
+def swing():
+    """The true finger let go from a bend, at the times of the frames."""
+    q = R.equilibrium(TRUE, (R.TipWrench([0.0, 0.0, 0.1]),)).q
+    return R.rollout(TRUE, q, jnp.zeros(6), LOADS, step=PERIOD / 16, saves=60, every=16)
+
+
+def follow(swing, hidden=(), noise=3e-4):
+    random, estimator = np.random.default_rng(1), ShapeFilter(Markers(PLANAR, S), PERIOD)
+    now, track = start_filter(estimator), []
+    for k in range(61):
+        places = seen(swing.q[k]) + noise * random.standard_normal((4, 2))
+        if k in hidden:
+            places = jnp.full((4, 2), jnp.nan)
+        now = update_filter(estimator, now, places, forces=LOADS)
+        track.append(now)
+    return track
+
+
+def tips(track):
+    return jnp.array([R.tip_pose(PLANAR, one.q)[:2, 2] for one in track])
+
+
+def test_the_filter_beats_its_markers(swing):
+    true = jnp.array([seen(q)[-1] for q in swing.q])
+    off = jnp.linalg.norm(tips(follow(swing)) - true, axis=1)[10:]
+    assert jnp.sqrt(jnp.mean(off**2)) < 3e-4 and jnp.max(off) < 1e-3
+
+
+def test_the_filter_knows_how_sure_it_is(swing):
+    track = follow(swing, hidden=range(30, 36))
+    missed = [int(one.missed) for one in track[28:38]]
+    assert missed == [0, 0, 1, 2, 3, 4, 5, 6, 0, 0]
+    assert [bool(one.stale) for one in track[28:38]] == [m >= 3 for m in missed]
+    spread = [float(jnp.trace(one.covariance[:3, :3])) for one in track]
+    assert all(a < b for a, b in zip(spread[29:34], spread[30:35], strict=True))
+    assert spread[37] < spread[34]
+    for one in track:
+        assert jnp.allclose(one.covariance, one.covariance.T)
+        assert jnp.linalg.eigvalsh(one.covariance)[0] > -1e-12 * spread[0]
+    true = jnp.array([seen(q)[-1] for q in swing.q])
+    gone = jnp.linalg.norm(tips(track)[30:36] - true[30:36], axis=1)
+    assert jnp.max(gone) < 5e-3  # six frames on the model alone
+    assert not track[-1].stale
+
+
+def test_numbers_that_break_keep_the_last_estimate(swing):
+    estimator = ShapeFilter(Markers(PLANAR, S), PERIOD)
+    good = update_filter(estimator, start_filter(estimator), seen(swing.q[0]), forces=LOADS)
+    bad = update_filter(estimator, good, seen(swing.q[1]), forces=(R.Gravity([jnp.nan, 0.0]),))
+    assert bad.status == Status.not_finite and jnp.array_equal(bad.q, good.q)
+    assert bad.missed == good.missed + 1
+
+
+def test_estimates_are_differentiable():
+    true = pushed(0.1)
+
+    def tip(places):
+        return estimate_shape(Markers(PLANAR, S), places, jnp.zeros(3), iterations=8).q[0]
+
+    places, way = seen(true), jnp.ones((4, 2)).at[0].set(-0.5)
+    slope = jnp.vdot(jax.grad(tip)(places), way)
+    step = 1e-6 * way
+    difference = (tip(places + step) - tip(places - step)) / 2e-6
+    assert float(slope) == pytest.approx(float(difference), 1e-5)
+
+
+def test_wrong_markers_are_refused():
+    with pytest.raises(ValueError, match="Markers: `s`"):
+        Markers(PLANAR, [0.5, 1.2])
+    with pytest.raises(ValueError, match="offset"):
+        Markers(PLANAR, S, jnp.zeros((2, 2)))
+    with pytest.raises(ValueError, match="ShapeFilter: `period`"):
+        ShapeFilter(Markers(PLANAR, S), 0.0)
