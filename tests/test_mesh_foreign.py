@@ -71,6 +71,19 @@ def test_interfaces_cross_and_curve():
     inside = volumes[mesh.regions["inside_1"]].sum()
     around = -M.enclosed_volume(mesh, np.asarray(mesh.facet_sets["interface_1"]))
     assert np.isclose(inside, around, rtol=1e-9)
+    flat, ball = sdf.Box([-1, -1, -1], [3, 2, 0.331]), sdf.Sphere([1.002, 0.5, 0.5], 0.351)
+    moved = M.move(mesh, box, interfaces=(flat, ball))
+    assert conforms(moved)
+    for interface, name in ((flat, "interface_0"), (ball, "interface_1")):
+        facets = np.asarray(mesh.facet_sets[name])[:, :3]
+        assert jnp.abs(interface(moved.points[np.unique(facets)])).max() < 1e-12
+
+
+@pytest.mark.parametrize("thickness, message", [(0.01, "lower `size`"), (0.1, "a layer")])
+def test_layers_thinner_than_a_cell_are_refused(thickness, message):
+    box, layer = sdf.Box([0, 0, 0], [1, 1, 1]), sdf.Box([-1, -1, 0.4], [2, 2, 0.4 + thickness])
+    with pytest.raises(ValueError, match=message):
+        M.tetrahedralise(box, size=0.25, interfaces=(layer,))
 
 
 def test_interfaces_move_with_their_parameters(divided):

@@ -42,7 +42,7 @@ def _scene(random, camera: Camera):
         poses[number] = Pose(turn, np.array([*aside, random.uniform(0.4, 0.5)]))
         picture = vision.fiducial_picture(number)
         canvas = vision.draw_plane(
-            canvas, camera, poses[number], picture, (1.25 * SIZE,) * 2, 8
+            canvas, camera, poses[number], picture, (1.25 * SIZE, 1.25 * SIZE), 8
         )
     return vision.photograph(canvas, Disturbance(0.7, 3.0), random), poses
 

@@ -32,13 +32,14 @@ def check_movable(where: str, fields: tuple[AbstractSdf, ...], mesh: Mesh, size:
         np.repeat(np.arange(len(fields)), count),
         np.concatenate([own.along for own in plan.fields]),
     )
-    off = np.linalg.norm(settle(fields, x, sides, ZOOMS) - x, axis=1) / size(x)
+    found = settle(fields, x, sides, ZOOMS, np.asarray(plan.ridge), np.asarray(plan.tangent))
+    off = np.linalg.norm(found - x, axis=1) / size(x)
     lost = np.flatnonzero(~(off < _LOST))
     if len(lost):
         raise ValueError(
             f"{where}: {len(lost)} nodes of sharp edges, the first near {x[lost[0]]} m, are "
-            "beside a wall or a bend that is too narrow for the cells. Lower `size` to the "
-            "thinnest wall or less, or thicken it."
+            "beside a wall, a layer or a bend that is too narrow for the cells. Lower `size` "
+            "to the thinnest wall or layer or less, or thicken it."
         )
 
 

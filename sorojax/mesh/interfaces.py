@@ -14,6 +14,8 @@ from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sample import values, values_and_gradients
 
 _NEAR = 0.35  # of the shortest edge beside a node: nodes that near are put on the set
+_DEEP = 0.1  # of an edge: what goes less deep through a layer is a bend, not a layer
+_OPPOSED = -0.7  # cosine between the slopes on both sides of a layer
 _THIN = np.cos(np.deg2rad(9.0))  # poorest dihedral angle that this may make
 _FACES = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))  # opposite to each corner, outward
 
@@ -59,10 +61,41 @@ def insert(fields: tuple[AbstractSdf, ...], parts: Parts) -> Parts:
     if not (np.any(g[parts.cells] < 0) and np.any(g[parts.cells] > 0)):
         raise ValueError(
             f"tetrahedralise: interface {len(fields) - 2} does not pass through the shape. "
-            "Check its position, or leave it out."
+            "Check its position, lower `size` to its thickness or less, or leave it out."
         )
     parts, g = _snapped(fields, parts, g)
+    _check_seen(fields, parts, g)
     return _cut(fields, parts, g)
+
+
+def _check_seen(fields, parts: Parts, g: np.ndarray) -> None:
+    """Raise where a layer between two sides of the last field passes between nodes."""
+    edges = unique_edges(parts.cells, len(parts.points))
+    a, b = parts.points[edges[:, 0]], parts.points[edges[:, 1]]
+    length = np.linalg.norm(b - a, axis=1)
+    ends = g[edges]
+    reach = float(fields[-1].lipschitz) * length
+    one_side = (ends.min(axis=1) >= 0) | (ends.max(axis=1) <= 0)
+    one_side &= (ends != 0).any(axis=1) & (np.abs(ends).sum(axis=1) < reach)
+    rows = np.flatnonzero(one_side)
+    share = np.arange(1, 8)[:, None] / 8
+    inner = a[rows, None] + share * (b - a)[rows, None]
+    f = values(fields[-1], inner.reshape(-1, 3)).reshape(len(rows), -1)
+    depth = -(f * np.sign(ends[rows].sum(axis=1))[:, None]).min(axis=1, initial=np.inf)
+    thin = depth > _DEEP * length[rows]
+    rows, depth = rows[thin], depth[thin]
+    slopes = [values_and_gradients(fields[-1], x[rows])[1] for x in (a, b)]
+    cosine = (slopes[0] * slopes[1]).sum(axis=1)
+    cosine /= np.maximum(np.prod([np.linalg.norm(s, axis=1) for s in slopes], axis=0), 1e-300)
+    opposed = np.flatnonzero(cosine < _OPPOSED)
+    if len(opposed):
+        worst = opposed[depth[opposed].argmax()]
+        where = np.round((a + b)[rows[worst]] / 2, 6)
+        raise ValueError(
+            f"tetrahedralise: a layer of interface {len(fields) - 2} about "
+            f"{2 * depth[worst]:.2g} m thick near {where} m passes between nodes, need "
+            "nodes within. Lower `size` to that or less, or thicken the layer."
+        )
 
 
 def _snapped(fields, parts: Parts, g: np.ndarray) -> tuple[Parts, np.ndarray]:

@@ -8,6 +8,7 @@ from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sample import values_and_gradients
 
 ZOOMS = (0.5, 0.25, 0.1, 0.03, 0.01, 1e-3, 1e-4, 1e-5)
+_NO_ROWS = np.zeros((0, 3))
 
 
 class Sides(NamedTuple):
@@ -53,14 +54,20 @@ def normals_near(fields: tuple[AbstractSdf, ...], x, sides: Sides, zoom: float):
     return n, (n * step).sum(axis=1) - f / slope
 
 
-def settle(fields: tuple[AbstractSdf, ...], x, sides: Sides, zooms=ZOOMS) -> np.ndarray:
-    """`x` (points, 3) moved by the shortest way to where their sides meet."""
-    x = np.array(x, dtype=float)
+def settle(
+    fields: tuple[AbstractSdf, ...], x, sides: Sides, zooms=ZOOMS, ridge=(), tangent=_NO_ROWS
+) -> np.ndarray:
+    """`x` (points, 3) moved by the shortest way to where their sides meet; those listed in
+    `ridge` stay in the planes across their `tangent`."""
+    start, x, ridge = np.asarray(x, dtype=float), np.array(x, dtype=float), list(ridge)
     for zoom in zooms if len(x) else ():
         n, level = normals_near(fields, x, sides, zoom)
         matrix = np.broadcast_to(1e-11 * np.eye(3), (len(x), 3, 3)).copy()
         np.add.at(matrix, sides.point, n[:, :, None] * n[:, None, :])
         rhs = np.zeros_like(x)
         np.add.at(rhs, sides.point, n * level[:, None])
+        if ridge:
+            matrix[ridge] += tangent[:, :, None] * tangent[:, None, :]
+            rhs[ridge] += tangent * ((start - x)[ridge] * tangent).sum(axis=1, keepdims=True)
         x += np.linalg.solve(matrix, rhs[..., None])[..., 0]
     return x

@@ -80,8 +80,8 @@ def tetrahedralise(
     parts = _divided((shape, *interfaces), whole(points, cells, skin, features), rounds)
     _check_shapes(parts.points, parts.cells)
     mesh = solid_mesh((shape, *interfaces), parts, order)
-    if parts.features.ridge.any() and not interfaces:
-        check_movable(where, (shape,), mesh, lengths)
+    if parts.features.ridge.any() or interfaces:
+        check_movable(where, (shape, *interfaces), mesh, lengths)
     return mesh
 
 

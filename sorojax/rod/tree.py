@@ -215,13 +215,13 @@ def _sections(moment: AssemblyMotion) -> list[Section]:
     eye, on = jnp.eye(twist, dtype=dtype), parents(moment.assembly)
     ground = (jnp.eye(dim, dtype=dtype), jnp.zeros(dim, dtype), eye[:rot], eye[rot:])
     found: list[Section] = [ground] * len(on)
+    weights = {k: rows for k, rows in enumerate(moment.operators.rows) if rows is not None}
     for members, stack in zip(batches(moment.assembly), moment.batches, strict=True):
-        carried = [k for k, carrier in enumerate(on) if carrier in members]
-        carried = [k for k in carried if moment.operators.rows[k] is not None]
+        carried = [k for k in weights if on[k] in members]
         if not carried:
             continue
         places = [members.index(on[k]) for k in carried]
-        rows = jnp.stack([moment.operators.rows[k] for k in carried])
+        rows = jnp.stack([weights[k] for k in carried])
         every = eqx.filter_vmap(_section)(_members(stack, places), rows)
         for nth, k in enumerate(carried):
             rotation, centre, angular, linear = (field[nth] for field in every)

@@ -97,10 +97,10 @@ def _valleys(field, reach):
 def _turns(beyond, end, other):
     """Whether the field may go through zero twice between `end` and `other`, by what it is
     beyond `end`: on the other side, or rising as steeply as it fell from there to the wall."""
-    side = 1.0 - 2.0 * (end < 0)
-    rise, level = side * (beyond - end), side * end
+    level = abs(end)
+    rise, across = abs(beyond) - level, (beyond < 0) != (end < 0)
     steep = (rise > _FLAT) & (level < 1.5 * rise + 0.02)
-    return (side * beyond < 0) | (steep & (rise + side * other - level > _BENT))
+    return across | (steep & (rise + abs(other) - level > _BENT))
 
 
 def _turning(shape, grid, start, axis, place, ends) -> np.ndarray:
