@@ -25,6 +25,7 @@ from sorojax.sdf.dual_forced import (
     forced_nodes,
     keep_joined,
     with_blocks_around,
+    without_specks,
 )
 from sorojax.sdf.dual_quads import Quads, split
 from sorojax.sdf.dual_sheets import Faces, cell_sheets, doubtful_faces
@@ -81,9 +82,10 @@ def dual_contouring(
     if total > len(vertices):
         vertices = np.concatenate(added)
         triangles = np.concatenate([triangles.reshape(-1, 3), *more])
+    vertices, triangles = without_specks(grid, forced, vertices, triangles.reshape(-1, 3))
     vertices *= grid.size
     vertices += grid.lower
-    return vertices, triangles.reshape(-1, 3)
+    return vertices, triangles
 
 
 def _crossed(shape, grid, blocks, forced: Forced) -> tuple[list[Crossings], Lost]:

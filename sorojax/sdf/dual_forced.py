@@ -14,6 +14,7 @@ _EVEN = 0.7  # of the greatest depth: edges as deep in the middle go through a w
 _THIN = 0.1  # cells: walls less deep are kept whole
 _PATCH = 10  # edges through a wall that are refused
 _BEYOND = 0.3  # cosine between the slope at a node and the way to what it would grow onto
+_SPECK = 14  # vertices of a shell around one node: of its 8 cells and its 6 edges
 _BITS = np.array(list(np.ndindex(2, 2, 2)))
 
 
@@ -63,6 +64,34 @@ def forced_nodes(shape: AbstractSdf, grid: Grid, lost: Lost, crossed: int) -> Fo
     slope = (slope * side[:, None]).reshape(-1, 2, 3)[rows, best]
     _check_apart(grid, lost, ends[rows, best][first], slope[first], first)
     return Forced(number[first], ~lost.inside[first])
+
+
+def without_specks(
+    grid: Grid, forced: Forced, vertices: np.ndarray, triangles: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [cells] and triangles without the shells around single chosen nodes.
+
+    A node that was chosen for a wall thinner than its neighbours see stays alone where the
+    wall ends: a speck or a bubble smaller than a cell, that the shape does not have.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    if not len(forced.number):
+        return vertices, triangles
+    first, second = triangles[:, [0, 1]].ravel(), triangles[:, [1, 2]].ravel()
+    pairs = (np.ones(len(first), bool), (first, second))
+    shape = (len(vertices), len(vertices))
+    shells, shell = connected_components(coo_matrix(pairs, shape), directed=False)
+    count = np.bincount(shell, minlength=shells)
+    middle = [np.bincount(shell, axis, shells) / count for axis in vertices.T]
+    node = np.rint(np.stack(middle, axis=1)).astype(int)
+    speck = (count <= _SPECK) & (_chosen(grid, forced, node) >= 0)
+    if not speck.any():
+        return vertices, triangles
+    kept = ~speck[shell]
+    number = np.cumsum(kept) - 1
+    return vertices[kept], number[triangles[kept[triangles[:, 0]]]].astype(triangles.dtype)
 
 
 def _grows_onto(shape, grid, nodes, slope, side) -> np.ndarray:
