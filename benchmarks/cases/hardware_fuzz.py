@@ -84,7 +84,7 @@ def _framed(dice: random.Random):
                     session.receive(piece, 0.0)
                     held = max(held, session._decoder.held)
                 board.tick(0.001 * k)
-            except Exception:
+            except Exception:  # whatever escapes a decoder is what is counted
                 escaped += 1
             forged += valves.told != (0.0, 0.0)
             outside += not all(-10e3 <= p <= 60e3 for p in valves.told) or held > MAX_FRAME
@@ -106,7 +106,7 @@ def _raw(dice: random.Random):
                     session.receive(piece, 0.001 * k)
                     held = max(held, len(session._buffer))
                 board.tick(0.001 * k)
-            except Exception:
+            except Exception:  # whatever escapes a decoder is what is counted
                 escaped += 1
             outside += not all(-10e3 <= p <= 60e3 for p in valves.told)
     return escaped, 0, held, outside
@@ -129,6 +129,6 @@ def _client(dice: random.Random):
                         and encode(Frame(*frame[:4]), keys.to_client) not in good
                     )
                 held = max(held, decoder.held)
-        except Exception:
+        except Exception:  # whatever escapes a decoder is what is counted
             escaped += 1
     return escaped, forged, held, 0

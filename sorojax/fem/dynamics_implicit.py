@@ -23,7 +23,7 @@ from sorojax.fem.dynamics_host import Control, Run
 from sorojax.fem.dynamics_step import Dynamics, begin_step, end_step, matter, with_terms
 from sorojax.fem.dynamics_traced import Record, interval_of, run_traced
 from sorojax.fem.energy_form import residual
-from sorojax.fem.implicit import widened
+from sorojax.fem.implicit import lane_after_lane, widened
 from sorojax.fem.linear import linearise
 from sorojax.fem.supports import known_values
 from sorojax.fem.traced import prepare_traced
@@ -210,17 +210,7 @@ def _in_trace(*leaves, call: MotionCall, lead, batched) -> list[Any]:
     def one(leaves):
         return list(run_traced(call.dynamics(leaves), call.control, call.grid, call.rows))
 
-    if not lead:
-        return one(list(leaves))
-    num = int(np.prod(lead))
-    rows = [x for x, b in zip(leaves, batched, strict=True) if b]
-
-    def lane(row):
-        row = iter(row)
-        return one([next(row) if b else x for x, b in zip(leaves, batched, strict=True)])
-
-    out = jax.lax.map(lane, [x.reshape(num, *x.shape[len(lead) :]) for x in rows])
-    return [x.reshape(*lead, *x.shape[1:]) for x in out]
+    return lane_after_lane(one, leaves, lead, batched)
 
 
 def _batch(leaves, axes, *, call, lead, batched):

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax.fem import assemble as asm
-from sorojax.fem.energy_form import load_force
-from sorojax.fem.linear import Prepared, linearise
+from sorojax.fem.linear import Prepared, linearise, unbalanced
 from sorojax.fem.newton import Newton, relative_size, safe_fraction
 from sorojax.fem.problem import Problem, unsupported
 from sorojax.math import sparse
@@ -63,14 +62,7 @@ def _balance(problem: Problem, prepared: Prepared, u, before) -> Balance:
     body = asm.assemble(
         problem.space, prepared.geometry, problem.material, problem.kinematics, u, before
     )
-    load = load_force(problem, u).ravel()
-    residual = body.force - load
-    zero = jnp.zeros_like(residual)
-    free = jnp.where(prepared.known, zero, residual)
-    reaction = jnp.where(prepared.known, residual, zero)
-    largest = jnp.maximum(jnp.max(jnp.abs(load)), jnp.max(jnp.abs(reaction)))
-    length = jnp.max(jnp.abs(u)) + prepared.length
-    return Balance(residual, jnp.max(jnp.abs(free)), largest, length, body.volume_ratio)
+    return Balance(*unbalanced(problem, prepared, body.force, u), body.volume_ratio)
 
 
 class StepSolver:

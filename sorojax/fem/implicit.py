@@ -242,8 +242,13 @@ def _in_trace(*leaves, call: Solve, lead, batched) -> list[Any]:
         u, counts, tangent = follow_traced(problem, begin, *call.settings)
         return u, counts, tangent[: call.num_values]
 
+    return lane_after_lane(one, leaves, lead, batched)
+
+
+def lane_after_lane(one, leaves, lead: tuple[int, ...], batched) -> list[Any]:
+    """`one(leaves)` for every lane of the leading axes `lead`, inside a trace."""
     if not lead:
-        return list(one(leaves))
+        return list(one(list(leaves)))
     num = int(np.prod(lead))
     rows = [x for x, b in zip(leaves, batched, strict=True) if b]
 

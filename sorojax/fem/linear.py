@@ -73,23 +73,29 @@ def _linearise(problem: Problem, prepared: Prepared, u, u_before) -> Linearised:
     body = asm.assemble(
         problem.space, prepared.geometry, problem.material, problem.kinematics, u, u_before
     )
-    load = load_force(problem, u).ravel()
-    residual = body.force - load
-    zero = jnp.zeros_like(residual)
-    free = jnp.where(prepared.known, zero, residual)
-    reaction = jnp.where(prepared.known, residual, zero)
-    largest = jnp.maximum(jnp.max(jnp.abs(load)), jnp.max(jnp.abs(reaction)))
+    residual, norm, largest, length = unbalanced(problem, prepared, body.force, u)
     values = _add_load_stiffness(problem, prepared, u, body.values)
-    length = jnp.max(jnp.abs(u)) + prepared.length
     epsilon = 2 * jnp.finfo(u.dtype).eps
     return Linearised(
         residual=residual,
         values=values,
         volume_ratio=body.volume_ratio,
-        residual_norm=jnp.max(jnp.abs(free)),
+        residual_norm=norm,
         reference=largest,
         rounding=epsilon * jnp.max(jnp.abs(values)) * length,
     )
+
+
+def unbalanced(problem: Problem, prepared: Prepared, force: Float[Array, " dofs"], u):
+    """Internal `force` minus the loads [N], its largest free entry, the largest load or
+    reaction that it is judged by, and the length [m] that rounding is judged by."""
+    load = load_force(problem, u).ravel()
+    residual = force - load
+    zero = jnp.zeros_like(residual)
+    free = jnp.where(prepared.known, zero, residual)
+    reaction = jnp.where(prepared.known, residual, zero)
+    largest = jnp.maximum(jnp.max(jnp.abs(load)), jnp.max(jnp.abs(reaction)))
+    return residual, jnp.max(jnp.abs(free)), largest, jnp.max(jnp.abs(u)) + prepared.length
 
 
 def _curved_parts(problem: Problem) -> list[CurvedPart]:
