@@ -16,13 +16,14 @@ define install
 	  $(PIP) -e '.$(if $(1),[$(1)])'; }
 endef
 
-.PHONY: demo test lint bench peers clean help
+.PHONY: demo test stress lint bench peers clean help
 
 help:
 	@echo "make demo   set up .venv, run the main job, write out/"
 	@echo "make test   set up .venv, run the tests (WORKERS=$(WORKERS) processes)"
+	@echo "make stress the cases that may break a simulator, and which of them hold"
 	@echo "make lint   ruff and pyright"
-	@echo "make bench  all benchmarks, page in benchmarks/results/"
+	@echo "make bench  all benchmarks, page in benchmarks/results/; QUICK=1 for the main ones"
 	@echo "make peers  the codes that the benchmarks compare with, one .peers/<name> each"
 	@echo "make clean  remove .venv, .peers, out and benchmarks/results"
 
@@ -32,13 +33,16 @@ demo: $(VENV)/.run
 test: $(VENV)/.test
 	$(PY) -m pytest -n $(WORKERS) --dist loadfile --max-worker-restart 0 $(ARGS)
 
+stress: $(VENV)/.test
+	$(PY) -m pytest -n $(WORKERS) --dist loadfile --max-worker-restart 0 -m stress $(ARGS)
+
 lint: $(VENV)/.dev
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m pyright --pythonpath $(PY)
 
 bench: $(VENV)/.run
-	$(PY) -m benchmarks
+	$(PY) -m benchmarks $(if $(QUICK),--quick)
 
 peers: $(VENV)/.run
 	$(PY) -m benchmarks.peers install $(PEERS)

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from benchmarks import discover, page
+from benchmarks import discover, page, suite
 from benchmarks.rows import dumps
 from benchmarks.runner import run_case
 
@@ -26,7 +26,8 @@ def main(argv: list[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 2
-    chosen = {name: known[name] for name in arguments.names or known}
+    names = arguments.names or (suite.quick() if arguments.quick else known)
+    chosen = {name: known[name] for name in names}
     lines = _to_json(chosen, arguments.json) if arguments.json else _to_page(chosen)
     failed = [x for x in lines if x["code"] == "sorojax" and "reason" in x["settings"]]
     return 1 if failed else 0
@@ -36,6 +37,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("names", nargs="*", metavar="CASE", help="default: all")
     parser.add_argument("--list", action="store_true", help="name the cases and stop")
+    parser.add_argument(
+        "--quick", action="store_true", help="one or two cases of every row of the report"
+    )
     parser.add_argument(
         "--json", type=Path, metavar="FILE", help="write JSON lines there, and nothing else"
     )

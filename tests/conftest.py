@@ -40,3 +40,29 @@ def getkey():
     """A fresh typed PRNG key at every call, the same sequence in every run."""
     keys = (jax.random.fold_in(jax.random.key(0), i) for i in itertools.count())
     return lambda: next(keys)
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    """After `-m stress`: every case of the catalogue and whether its tests held."""
+    if config.option.markexpr != "stress":
+        return
+    from tests.stress.catalogue import CASES
+
+    found = {number: [] for number in CASES}
+    for outcome in ("passed", "failed", "skipped", "error"):
+        for report in terminalreporter.stats.get(outcome, ()):
+            for number in dict(getattr(report, "user_properties", ())).get("stress", ()):
+                found[number].append(outcome)
+    terminalreporter.section("stress cases")
+    for number, outcomes in found.items():
+        bad = set(outcomes) - {"passed"}
+        word = "NOT RUN" if not outcomes else "NO" if bad else "holds"
+        terminalreporter.write_line(f"{number:3d}  {word:8s} {CASES[number]}")
+
+
+@pytest.fixture(autouse=True)
+def _cases(request, record_property):
+    """Tells the summary which cases of the catalogue a test shows."""
+    numbers = [n for mark in request.node.iter_markers("stress") for n in mark.args]
+    if numbers:
+        record_property("stress", numbers)

@@ -20,7 +20,7 @@ from sorojax.rod.loads import total_force
 from sorojax.rod.model import Model, motion, operators
 from sorojax.rod.static_path import Loading
 from sorojax.rod.statics import ended, first_guess, newton, prepare
-from sorojax.rod.tangent import increments, linearised, moved
+from sorojax.rod.tangent import increments, linearised, moved, negative_eigenvalues
 
 _ITERATIONS = 12
 _EASY = 5  # corrections below which the next step is longer
@@ -152,12 +152,12 @@ def arc_length_path(
         direction = _unit(jnp.linalg.solve(border, right), weights)
         length = jnp.where(count <= _EASY, 1.5 * length, length)
         new = _Point(q, factor, direction, jnp.minimum(length, longest * begin), done)
-        negative = jnp.sum(jnp.linalg.eigvalsh((slope + slope.T) / 2) < 0)
+        negative = negative_eigenvalues(slope)
         return new, (q, factor, negative, ended(done, increments(model, q), rate))
 
     point = _Point(start.q, factor, direction, begin, start.done)
     _, (q, factors, negative, status) = jax.lax.scan(advance, point, None, length=steps)
-    return ArcPath(q, factors, negative.astype(jnp.int32), status)
+    return ArcPath(q, factors, negative, status)
 
 
 def _unit(vector: Array, weights: Array) -> Array:

@@ -16,7 +16,15 @@ from sorojax.math.status import Status
 from sorojax.rod.assembly import dtype_of, num_coordinates, rest as at_rest
 from sorojax.rod.loads import Load, total_force
 from sorojax.rod.model import Model, motion, operators
-from sorojax.rod.tangent import increments, linearised, metric, moved, squared, unit_energy
+from sorojax.rod.tangent import (
+    increments,
+    linearised,
+    metric,
+    moved,
+    negative_eigenvalues,
+    squared,
+    unit_energy,
+)
 
 _DECREASE = 1e-4  # Armijo: share of the promised decrease that a step must give
 _SHORTEST = 1e-3  # of a Newton step
@@ -25,11 +33,20 @@ Residual = Callable[[Array], Array]
 
 
 class Equilibrium(eqx.Module):
-    """Coordinates at rest, how the search ended, and its number of iterations."""
+    """Where a search for rest ended.
+
+    Attributes:
+        q: Coordinates.
+        status: How it ended.
+        num_iterations: Of Newton.
+        negative: Negative eigenvalues of the tangent; 0 is stable under dead loads. A straight
+            column past its critical load is in balance, with one.
+    """
 
     q: Float[Array, " coordinates"]
     status: Status
     num_iterations: Int[Array, ""]
+    negative: Int[Array, ""]
 
 
 class Search(NamedTuple):
@@ -95,12 +112,15 @@ def equilibrium(
     def find(_, guess):
         found = newton(residual, guess, search)
         # custom_root differentiates its auxiliary output, which must then be floating.
-        return found.q, (found.done.astype(guess.dtype), found.count.astype(guess.dtype))
+        negative = negative_eigenvalues(linearised(residual, model, found.q)[1])
+        ends = (found.done, found.count, negative)
+        return found.q, tuple(x.astype(guess.dtype) for x in ends)
 
-    rest, (done, count) = jax.lax.custom_root(
+    rest, (done, count, negative) = jax.lax.custom_root(
         lambda q: squared(model, q, residual(q)), guess, find, _solve_tangent, has_aux=True
     )
-    return Equilibrium(rest, ended(done, rest, residual(rest)), count.astype(jnp.int32))
+    status = ended(done, rest, residual(rest))
+    return Equilibrium(rest, status, count.astype(jnp.int32), negative.astype(jnp.int32))
 
 
 def first_guess(where: str, model: Model, q: Array | None) -> Float[Array, " coordinates"]:

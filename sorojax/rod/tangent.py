@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from sorojax.rod.assembly import dtype_of, is_flat, num_dof, rest, retract, slices
 from sorojax.rod.model import Model, inertia, motion
@@ -57,6 +57,12 @@ def linearised(
     still = jnp.zeros(num_dof(model), q.dtype)
     slope, value = jax.jacfwd(along, has_aux=True)(still)
     return value, slope
+
+
+def negative_eigenvalues(slope: Float[Array, "dof dof"]) -> Int[Array, ""]:
+    """Of the symmetric part: none where the state is stable under dead loads."""
+    values = jnp.linalg.eigvalsh((slope + slope.T) / 2)
+    return jnp.sum(values < 0, dtype=jnp.int32)
 
 
 def metric(model: Model, constants) -> Float[Array, "dof dof"]:
