@@ -1,5 +1,6 @@
 """Measuring, inside the process of one case."""
 
+import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -7,16 +8,27 @@ from typing import Any
 from benchmarks.rows import Row as Row, Timing as Timing, missing as missing
 
 
-def measure(function: Callable[..., Any], *args: Any, repeats: int = 9) -> Timing:
+def quick() -> bool:
+    """Whether few sizes will do: `python -m benchmarks --quick`."""
+    return os.environ.get("SOROJAX_BENCH_QUICK") == "1"
+
+
+def measure(
+    function: Callable[..., Any], *args: Any, repeats: int = 9,
+    keep: Callable[[Any], Any] | None = None,
+) -> Timing:  # fmt: skip
     """Compile a JAX function for the shapes of `args`, then time it.
 
-    The arguments are inputs of the program: XLA cannot fold them.
+    The arguments are inputs of the program: XLA cannot fold them. `keep` is handed the
+    compiled program.
     """
     import jax
 
     start = time.perf_counter()
     compiled = jax.jit(function).lower(*args).compile()
     compile_s = time.perf_counter() - start
+    if keep is not None:
+        keep(compiled)
     jax.block_until_ready(compiled(*args))
     return Timing(compile_s, _runs(lambda: jax.block_until_ready(compiled(*args)), repeats))
 

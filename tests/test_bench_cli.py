@@ -1,11 +1,16 @@
 """The command of the bench, on a simulated board."""
 
+import signal
+import subprocess
+import sys
+import time
+
 import numpy as np
 import pytest
 
 from sorojax_board.bench import BenchValves
 from sorojax_board.board import settings
-from sorojax_hardware import load_record, serve
+from sorojax_hardware import BoardFault, TcpBoard, load_record, serve
 from sorojax_hardware.cli import main
 
 kPa = 1e3
@@ -50,6 +55,72 @@ def test_a_wave_is_recorded_and_replayed(board, tmp_path):
     assert main(["replay", str(first), *options]) == 0
     assert main(["record", str(second), "--seconds", "0.1", *options]) == 0
     assert len(load_record(second)[0]["time"]) == 10
+
+
+def test_devices_tells_of_boards_and_cameras(board, capsys):
+    options, _ = board
+    assert main(["devices", "--most", "0", *options]) == 0
+    text = capsys.readouterr().out
+    assert "2 ports, -20 to 60 kPa, vented" in text and "camera none opens" in text
+    assert "depth  none" in text
+    assert main(["devices", "--most", "0", "--port", "1"]) == 0
+    assert "board  none: TcpBoard: no board at 127.0.0.1:1" in capsys.readouterr().out
+
+
+MODEL = """
+import numpy as np
+
+def lag(period):
+    part = 1 - np.exp(-period / 0.03)
+
+    def advance(state, setpoint, dt):
+        state = state + part * (setpoint - state)
+        return state, state
+
+    return advance, np.zeros(3), np.array([[-10e3, 50e3]] * 3)
+"""
+
+
+def test_a_model_of_ones_own_is_served(tmp_path):
+    """The command in a process of its own, jogged from here."""
+    (tmp_path / "desk_model.py").write_text(MODEL)
+    path = ":".join([str(tmp_path), *filter(None, sys.path)])
+    child = subprocess.Popen(
+        [sys.executable, "-m", "sorojax_hardware", "serve", "--model", "desk_model:lag",
+         "--port", "0"],
+        stdout=subprocess.PIPE, text=True, env={"PYTHONPATH": path},
+    )  # fmt: skip
+    try:
+        line = child.stdout.readline()  # type: ignore
+        assert line.startswith("simulated desk_model:lag on 127.0.0.1:")
+        with TcpBoard(port=int(line.rsplit(":", 1)[1]), timeout=5.0) as board:
+            assert board.num_ports == 3 and board.limits[1].tolist() == [50 * kPa] * 3
+            board.arm()
+            start, most = time.monotonic(), 0.0
+            while most < 19 * kPa and time.monotonic() - start < 10:
+                try:
+                    board.write_pressure(np.full(3, 20 * kPa))
+                except BoardFault:  # the watchdog, on a busy machine
+                    board.arm()
+                most = board.report.pressure[1]
+                time.sleep(0.005)
+            assert most > 19 * kPa
+    finally:
+        child.send_signal(signal.SIGTERM)
+    assert child.wait(10) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["serve", "--model", "no_such_module:f"], "no_such_module"),
+        (["serve", "--model", "math:no_such"], "math has no function"),
+    ],
+)
+def test_a_model_that_is_not_there_is_one_line(capsys, arguments, message):
+    assert main(arguments) == 2
+    text = capsys.readouterr().err
+    assert message in text and text.count("\n") == 1
 
 
 @pytest.mark.parametrize(

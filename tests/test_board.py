@@ -104,6 +104,7 @@ def refusal(frame):
     return messages.unpack_refused(frame.payload)[1]
 
 
+@pytest.mark.stress(52)
 def test_frames_survive_any_cut():
     frames = [Frame(Kind.SET, k, 10 * k, bytes(range(4 * k))) for k in range(1, 6)]
     data = b"".join(encode(frame, KEY) for frame in frames)
@@ -182,6 +183,7 @@ def test_nothing_a_stranger_sends_moves_a_valve(data):
 
 @budget(max_examples=150, deadline=None)
 @given(st.lists(st.floats(width=32), min_size=2, max_size=2), st.integers(0, 2**32 - 1))
+@pytest.mark.stress(53)
 def test_no_setpoint_leaves_the_limits(values, mask):
     board, valves, client = armed(low=-10 * kPa, high=60 * kPa)
     client.set(values, 0.001, mask)
@@ -218,6 +220,7 @@ def test_slew_is_limited_on_the_board():
     assert np.max(np.diff(told)) <= 1e6 * TICK * (1 + 1e-9) and told[-1] == 90 * kPa
 
 
+@pytest.mark.stress(52)
 def test_silence_ramps_to_zero_within_600_ms_and_stays():
     board, valves, client = armed()
     client.set([80 * kPa, -30 * kPa], 0.0)
@@ -237,6 +240,7 @@ def test_silence_ramps_to_zero_within_600_ms_and_stays():
     assert valves.pressure == [5 * kPa] * 2
 
 
+@pytest.mark.stress(52)
 def test_a_lost_connection_vents_and_frees_the_place_of_the_writer():
     board, valves, client = armed()
     client.set([80 * kPa] * 2, 0.0)
@@ -261,6 +265,7 @@ def test_goodbye_and_vent_are_no_faults():
     assert valves.pressure == [0.0, 0.0]
 
 
+@pytest.mark.stress(52)
 def test_one_writer_others_watch_and_may_stop_it():
     board, _, client = armed()
     second, watcher = Client(board), Client(board, role=READER)
@@ -285,6 +290,7 @@ def test_limits_can_only_be_narrowed():
         assert refusal(client.arm(0.09, low, high)) is Refusal.MALFORMED
 
 
+@pytest.mark.stress(52, 53)
 def test_nonsense_is_counted_and_changes_nothing():
     board, valves, client = armed()
     client.set([40 * kPa] * 2, 0.0)
@@ -299,6 +305,7 @@ def test_nonsense_is_counted_and_changes_nothing():
     assert board.fault is Fault.WATCHDOG
 
 
+@pytest.mark.stress(52)
 def test_replayed_and_late_frames_are_refused():
     board, _, client = armed()
     old = client.frame(Kind.SET, messages.pack_set(3, [9e3, 9e3]), 0.0)
@@ -308,6 +315,7 @@ def test_replayed_and_late_frames_are_refused():
     assert refusal(client.hear(client.session.receive(held_up, 0.15))) is Refusal.STALE
 
 
+@pytest.mark.stress(53)
 def test_ten_kilohertz_are_thinned_to_one():
     board, _, client = armed()
     answers = [client.set([1e3, 1e3], 1e-4 * k).kind for k in range(1, 1001)]
@@ -450,6 +458,7 @@ def test_the_raw_stream_of_the_first_platform():
     assert board.state is State.ARMED
 
 
+@pytest.mark.stress(53)
 def test_payloads_refuse_other_lengths():
     report = Board(settings(3), Still(3)).report()
     assert messages.unpack_report(messages.pack_report(report)) == report

@@ -1,5 +1,6 @@
 """Sources of images."""
 
+import sys
 import time
 
 import numpy as np
@@ -106,6 +107,7 @@ def wait_for(condition):
         time.sleep(0.001)
 
 
+@pytest.mark.stress(54)
 def test_latest_drops_what_is_old():
     """Three images, one of them of the past, one twice: the newest is what a loop sees."""
     source = Script([Image(t, grey(0)) for t in (0.0, 0.1, 0.05, 0.1)])
@@ -117,6 +119,7 @@ def test_latest_drops_what_is_old():
     assert source.closed
 
 
+@pytest.mark.stress(54)
 def test_latest_tells_what_went_wrong():
     camera = Latest(Script([OSError("cable")]))
     wait_for(lambda: camera._error is not None)
@@ -124,6 +127,90 @@ def test_latest_tells_what_went_wrong():
         camera.read()
     assert camera.read() is None
     camera.close()
+
+
+@pytest.mark.parametrize(
+    ("reason", "hint"),
+    [
+        ("libusb-1.0.so.0: cannot open shared object file", "apt install libusb-1.0-0"),
+        ("No module named 'pyrealsense2'", "pip install 'sorojax"),
+    ],
+)
+def test_realsense_tells_what_is_missing(monkeypatch, reason, hint):
+    class Finder:
+        @staticmethod
+        def find_spec(name, path=None, target=None):
+            if name == "pyrealsense2":
+                raise ImportError(reason)
+
+    monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Finder, *sys.meta_path])
+    with pytest.raises(ImportError, match=f"RealSenseCamera: .*{hint}"):
+        RealSenseCamera()
+
+
+def recorded(rs, path, width=64, height=48, count=8):
+    """A film that the SDK's recorder makes of a camera in software: depth 500 + n mm, grey
+    10 n."""
+    lens = rs.intrinsics()
+    lens.width, lens.height, lens.fx, lens.fy = width, height, 60.0, 60.0
+    lens.ppx, lens.ppy, lens.model, lens.coeffs = 31.5, 23.5, rs.distortion.none, [0] * 5
+    camera, same = rs.software_device(), rs.extrinsics()
+    same.rotation, same.translation = [1, 0, 0, 0, 1, 0, 0, 0, 1], [0, 0, 0]
+    kinds = ((rs.stream.depth, rs.format.z16, 2), (rs.stream.color, rs.format.bgr8, 3))
+    sensors = [camera.add_sensor(name) for name in ("Stereo Module", "RGB Camera")]
+    profiles = []
+    for number, (sensor, (kind, form, size)) in enumerate(zip(sensors, kinds, strict=True)):
+        video = rs.video_stream()
+        video.type, video.index, video.uid, video.fps = kind, 0, number, 30
+        video.width, video.height, video.bpp, video.fmt = width, height, size, form
+        video.intrinsics = lens
+        profiles.append(sensor.add_video_stream(video))
+    sensors[0].add_read_only_option(rs.option.depth_units, 0.001)
+    profiles[0].register_extrinsics_to(profiles[1], same)
+    recorder = rs.recorder(str(path), camera)
+    taps = recorder.query_sensors()
+    for tap, profile in zip(taps, profiles, strict=True):
+        tap.open(profile)
+        tap.start(lambda frame: None)
+    for n in range(1, count + 1):
+        depth = np.full((height, width), 500 + n, np.uint16)
+        pictures = (depth, np.full((height, width, 3), 10 * n, np.uint8))
+        for sensor, profile, picture, (_, _, size) in zip(
+            sensors, profiles, pictures, kinds, strict=True
+        ):
+            frame = rs.software_video_frame()
+            frame.pixels, frame.stride, frame.bpp = picture, size * width, size
+            frame.timestamp, frame.domain = n * 33.3, rs.timestamp_domain.hardware_clock
+            frame.frame_number, frame.profile = n, profile.as_video_stream_profile()
+            sensor.on_video_frame(frame)
+        time.sleep(0.02)
+    time.sleep(0.3)  # the recorder writes behind
+    for tap in taps:
+        tap.stop()
+        tap.close()
+
+
+def test_realsense_plays_what_its_recorder_wrote(tmp_path):
+    """Runs where pyrealsense2 and libusb are there, without a camera."""
+    try:
+        import pyrealsense2 as rs
+    except ImportError as missing:
+        pytest.skip(str(missing))
+    recorded(rs, tmp_path / "film.db3")
+    camera = RealSenseCamera(recording=tmp_path / "film.db3")
+    assert camera.intrinsics["fx"] == 60.0 and camera.intrinsics["cy"] == 23.5
+    images, start = [], time.monotonic()
+    while time.monotonic() - start < 10 and len(images) < 6:
+        image = camera.read()
+        if image is not None:
+            images.append(image)
+    camera.close()
+    assert len(images) == 6
+    for image in images:
+        n = round(image.time / 33.3e-3)
+        assert image.colour.shape == (48, 64, 3) and np.all(image.colour == 10 * n)
+        assert image.depth is not None and np.allclose(image.depth, 0.5 + 1e-3 * n, atol=1e-6)
 
 
 def test_realsense_without_a_camera_says_what_is_missing():

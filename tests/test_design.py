@@ -247,7 +247,7 @@ def test_the_force_inverter():
     with silent():
         found = design.minimise(
             out, jnp.full(800, 0.3), constraints=(volume,), steps=120, tolerance=0.01,
-            optimiser=design.MMA(1e-3, 1.0, move=0.2), scale=0.1,
+            optimiser=design.MMA(1e-3, 1.0, move=0.1), scale=0.1,
             change_gradient=lambda x, g: design.sensitivity_filtered(smooth, x, g),
         )  # fmt: skip
     assert float(found.objective) < -1.113 and abs(float(found.constraints[0])) < 0.02

@@ -68,6 +68,7 @@ def _check_lanes(found, loop):
         assert jnp.isnan(slope[FAILS]).all() and jnp.isnan(want[FAILS]).all()
 
 
+@pytest.mark.stress(45)
 def test_lanes_are_those_of_a_loop_and_one_that_fails_leaves_the_others(loop):
     _check_lanes(jax.vmap(_both)(SHEARS, PULLS), loop)
 

@@ -187,6 +187,7 @@ def free_block() -> fem.Problem:
     )
 
 
+@pytest.mark.stress(43)
 def test_on_a_slope_a_block_sticks_without_creep_or_slides_as_coulomb_says():
     def tilted(share):
         """It settles on the flat, then the floor leans up to a share of the threshold."""
@@ -210,6 +211,7 @@ def test_on_a_slope_a_block_sticks_without_creep_or_slides_as_coulomb_says():
     assert np.isclose(velocity[-1] - velocity[-2], slope * 0.05, rtol=0.01)
 
 
+@pytest.mark.stress(41)
 def test_a_block_that_starts_half_inside_is_let_out_and_never_gains_energy():
     problem = free_block()
     u = np.zeros(problem.mesh.points.shape)

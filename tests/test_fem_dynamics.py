@@ -11,6 +11,7 @@ import pytest
 
 from sorojax import fem, material, mesh
 from sorojax.fem.linear import linearise, prepare
+from sorojax.fem.secant import Secants
 from sorojax.io.fields import export_fields
 
 GRID = mesh.rectangle([0, 0], [0.1, 0.01], divisions=(6, 1), order=2)
@@ -190,6 +191,7 @@ def test_a_run_in_two_parts_is_the_whole_run_to_the_last_bit():
     assert np.array_equal(again.energies.balance, whole.energies.balance[12:])
 
 
+@pytest.mark.stress(39)
 def test_a_step_a_hundred_times_too_large_settles(mode):
     """It ends at the statics of the load: stable, and far from exact in between."""
     period = mode[1]
@@ -254,6 +256,7 @@ def test_gradients_are_those_of_differences(slope):
         np.testing.assert_allclose(slope[k], change, rtol=1e-6)
 
 
+@pytest.mark.stress(45)
 def test_lanes_have_their_own_status():
     """A lane without a number fails alone; the others are what they are alone."""
     lanes = jnp.stack([THETA, 1.1 * THETA, THETA.at[2].set(jnp.nan)])
@@ -268,6 +271,30 @@ def test_inside_a_trace_it_is_the_same_motion(slope):
     tip, status = jax.jit(_numbers)(THETA)
     assert status == fem.Status.successful
     np.testing.assert_allclose(tip, _numbers(THETA)[0], rtol=1e-9)
+
+
+def test_secants_follow_a_change_of_low_rank():
+    """An old factor and pairs of a matrix that has changed by rank 3 solve with the new one."""
+    rng = np.random.default_rng(0)
+    root, more = rng.normal(size=(40, 40)), 5 * rng.normal(size=(40, 3))
+    old = root @ root.T + 40 * np.eye(40)
+    new, secants, x = old + more @ more.T, Secants(), np.zeros(40)
+    rhs, errors = rng.normal(size=40), []
+
+    class Factor:
+        def solve(self, b):
+            return np.linalg.solve(old, b)
+
+    for _ in range(15):
+        step = secants.solve(Factor(), rhs - new @ x)
+        errors.append(np.abs(rhs - new @ x).max())
+        secants.add(step, new @ step)
+        x = x + step
+    assert np.allclose(secants.solve(Factor(), new @ step), step)
+    plain = np.abs(np.linalg.matrix_power(np.eye(40) - np.linalg.solve(old, new), 14)).max()
+    assert errors[-1] < 1e-6 * errors[0] and plain > 1e3
+    secants.add(step, -step)  # of no use, left out
+    assert np.allclose(secants.solve(Factor(), new @ step), step)
 
 
 def test_a_motion_becomes_a_series_of_files(tmp_path):

@@ -71,6 +71,7 @@ def balloon():
     return problem, path
 
 
+@pytest.mark.stress(23)
 def test_a_balloon_passes_its_limit_point(balloon):
     problem, path = balloon
     assert path.status == fem.Status.successful
@@ -97,6 +98,7 @@ def test_a_thin_balloon_has_the_limit_point_of_a_membrane():
     assert np.isclose(limit.factor, _limit(thickness)[1], rtol=1e-3)
 
 
+@pytest.mark.stress(23)
 def test_volume_control_finds_the_states_of_the_arc(balloon):
     problem, path = balloon
     facets = _wall(problem)
@@ -121,6 +123,7 @@ def test_a_path_goes_on_where_it_ended(balloon):
     assert np.allclose(more.values, _sphere_pressure(stretches, 0.2), rtol=5e-4)
 
 
+@pytest.mark.stress(22, 23)
 def test_plain_load_steps_end_below_the_limit_point(balloon):
     problem, _ = balloon
     solution = fem.solve(problem, max_cuts=4, throw=False)

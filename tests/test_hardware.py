@@ -86,6 +86,7 @@ def test_the_controller_of_the_demo_runs_on_the_board():
     assert np.all(board.setpoint == 0)
 
 
+@pytest.mark.stress(53)
 def test_commands_are_cut_to_the_limits():
     clock, board = desk()
     low, high = np.array([-10 * kPa, 0.0]), np.array([30 * kPa, 5 * kPa])
@@ -104,6 +105,7 @@ def test_board_cuts_to_its_own_limits():
 
 
 @pytest.mark.parametrize("wrong", [np.array([np.nan, 0.0]), np.zeros(3)])
+@pytest.mark.stress(53)
 def test_board_refuses_what_is_no_setpoint_and_keeps_the_last(wrong):
     _, board = desk()
     board.write_pressure(np.full(2, 5 * kPa))
@@ -136,6 +138,7 @@ def test_board_vents_when_the_loop_is_left():
     assert np.all(board.setpoint == 0)
 
 
+@pytest.mark.stress(53)
 def test_a_command_that_is_not_finite_ends_the_loop_vented():
     clock, board = desk()
     with pytest.raises(ValueError, match="2 finite pressures"):

@@ -60,6 +60,7 @@ def test_plain_formats_keep_cells(suffix, tmp_path):
         same_cells(io.import_mesh(f"part{suffix}", root=tmp_path), mesh, atol=1e-7)
 
 
+@pytest.mark.stress(32)
 def test_mixed_foreign_and_damaged_files_are_refused(tmp_path):
     import meshio
 

@@ -115,6 +115,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("message", BAD)
+@pytest.mark.stress(33)
 def test_bad_files_name_the_remedy(tmp_path, message):
     name, data = BAD[message]
     (tmp_path / name).write_bytes(data)
@@ -123,6 +124,7 @@ def test_bad_files_name_the_remedy(tmp_path, message):
     assert str(caught.value).startswith("import_surface")
 
 
+@pytest.mark.stress(33)
 def test_text_and_binary_are_told_apart_by_length(tmp_path):
     binary = b"solid facet ".ljust(80) + stl(TRIANGLE)[80:]
     (tmp_path / "a.stl").write_bytes(binary)
@@ -131,6 +133,7 @@ def test_text_and_binary_are_told_apart_by_length(tmp_path):
     assert len(io.import_surface(tmp_path / "b.stl").triangles) == 1
 
 
+@pytest.mark.stress(34)
 def test_large_files_are_refused_unread(tmp_path):
     path = tmp_path / "a.stl"
     with open(path, "wb") as file:
@@ -139,6 +142,7 @@ def test_large_files_are_refused_unread(tmp_path):
         io.import_surface(path)
 
 
+@pytest.mark.stress(35)
 def test_paths_stay_below_their_root(tmp_path):
     root, outside = tmp_path / "root", tmp_path / "outside"
     root.mkdir(), outside.mkdir()

@@ -65,6 +65,7 @@ def rotation(key):
 
 
 @pytest.mark.parametrize("name", ALL)
+@pytest.mark.stress(11)
 def test_rest_is_free_of_stress_and_stiff_as_told(name):
     rubber = ALL[name]
     stretch = jnp.array([float(s) for s in material.rest_stretches(rubber)])
@@ -445,6 +446,7 @@ def test_editing_a_modulus_never_retraces():
     assert len(traces) == 1
 
 
+@pytest.mark.stress(20)
 def test_drucker_finds_where_mooney_and_yeoh_fail():
     mooney = material.drucker_stability(material.MooneyRivlin(5e4, -1e4, K))
     # equal stretches fail where c10 + c01 l^2 = 0 against one another
@@ -589,6 +591,7 @@ BASE = ISOTROPIC["NeoHookean"]
         ),
     ],
 )  # fmt: skip
+@pytest.mark.stress(16)
 def test_bad_numbers_name_the_remedy(call, message):
     with pytest.raises(ValueError, match=message):
         call()

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sorojax.math.alpha import GeneralisedAlpha
 from sorojax.math.control import Control
 from sorojax.math.explicit import RungeKutta4, SemiImplicitEuler, Tsit5
 from sorojax.math.linearly_implicit import Rosenbrock2
-from sorojax.math.method import repeat
+from sorojax.math.method import repeat, repeated
 from sorojax.math.rosenbrock import Rodas4
 
 METHODS = (
@@ -19,6 +20,7 @@ METHODS = (
     (Rodas4(), 4),
     (SemiImplicitEuler(), 1),
     (Rosenbrock2(), 2),
+    (GeneralisedAlpha(), 2),
 )
 START = {"q": jnp.array([1.0, 0.5]), "v": jnp.array([0.0, 1.0])}
 
@@ -87,6 +89,7 @@ def test_rodas4_damps_what_is_infinitely_fast():
     assert not jnp.abs(explicit["fast"]) < 1e6
 
 
+@pytest.mark.stress(39)
 def test_semi_implicit_euler_keeps_energy_where_explicit_euler_gains():
     def spring(t, y):
         return {"q": y["v"], "v": -y["q"]}
@@ -129,6 +132,7 @@ def edge(t, y):
     return {"y": jnp.where(y["y"] < 1.0, y["y"], jnp.nan) + 0 * jnp.sqrt(1.0 - y["y"])}
 
 
+@pytest.mark.stress(46)
 def test_a_step_into_nan_is_repeated_and_leaves_no_nan_in_gradients():
     def last(start):
         solution = solve(Tsit5(), Control(1e-4, 1e-4), {"y": start}, field=edge, end=0.999)
@@ -139,7 +143,82 @@ def test_a_step_into_nan_is_repeated_and_leaves_no_nan_in_gradients():
     assert jnp.isclose(slope, jnp.exp(0.999), rtol=1e-3)
 
 
+@pytest.mark.stress(46)
 def test_a_run_that_cannot_go_on_ends_soon_at_its_last_good_state():
     solution = solve(Tsit5(), Control(), {"y": jnp.exp(-1.0)}, field=edge, end=2.0)
     assert solution.result == dfx.RESULTS.dt_min_reached
     assert int(solution.stats["num_steps"]) < 150
+
+
+# Generalised-alpha
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5, 1.0])
+def test_what_is_infinitely_fast_keeps_rho_inf_of_its_size_in_a_step(rho):
+    """A swing of 1e6 rad/s in steps of 1 s, from its second step on."""
+
+    def swing(t, y):
+        return {"q": y["v"], "v": -1e12 * y["q"]}
+
+    start = {"q": jnp.array(0.0), "v": jnp.array(1.0)}
+    sizes, one = [], jnp.array(1.0)
+    step = jax.jit(lambda y, m: repeated(GeneralisedAlpha(rho), swing, 0 * one, y, one, 1, m))
+    y, memory = start, swing(0.0, start)
+    for _ in range(12):
+        y, memory, converged = step(y, memory)
+        sizes.append(float(jnp.hypot(1e6 * y["q"], y["v"])))
+        assert converged
+    if rho == 0.0:
+        assert sizes[-1] < 1e-6 * sizes[0]
+    else:
+        assert np.isclose((sizes[-1] / sizes[3]) ** (1 / 8), rho, rtol=0.15)
+
+
+def stiffening(t, y):
+    """A spring whose force grows without bounds towards |q| = 1, not finite beyond."""
+    return {"q": y["v"], "v": -1e3 * jnp.arctanh(y["q"])}
+
+
+def test_a_step_that_does_not_converge_is_cut_and_never_accepted():
+    start = {"q": jnp.array(0.0), "v": jnp.array(40.0)}
+    zero, h = jnp.array(0.0), jnp.array(0.2)
+
+    def end(scale, method, count=1):
+        first = jax.tree.map(lambda x: scale * x, start)
+        return repeated(method, stiffening, zero, first, h / count, count)
+
+    one = jnp.array(1.0)
+    (held, _, converged) = end(one, GeneralisedAlpha(max_cuts=0))
+    assert not converged and held == start
+    y, _, converged = end(one, GeneralisedAlpha())
+    exact = end(one, GeneralisedAlpha(), 2000)[0]
+    assert converged and jnp.abs(y["q"]) < 1
+    energy = [40.0**2 / 2, float(y["v"] ** 2 / 2 + 1e3 * _stored(y["q"]))]
+    assert energy[1] < 1.05 * energy[0]
+    total = float(exact["v"] ** 2 / 2 + 1e3 * _stored(exact["q"]))
+    assert np.isclose(total, energy[0], rtol=5e-3)
+    slope = jax.grad(lambda s: end(s, GeneralisedAlpha())[0]["q"])(one)
+    forward = jax.jacfwd(lambda s: end(s, GeneralisedAlpha())[0]["q"])(one)
+    step = 1e-6
+    ends = [end(one + d, GeneralisedAlpha())[0]["q"] for d in (step, -step)]
+    assert jnp.isclose(slope, forward, rtol=1e-9)
+    assert jnp.isclose(slope, (ends[0] - ends[1]) / (2 * step), rtol=1e-5)
+
+
+def _stored(q):
+    """The integral of arctanh."""
+    return q * jnp.arctanh(q) + jnp.log1p(-(q**2)) / 2
+
+
+def test_generalised_alpha_is_a_solver_of_diffrax(exact):
+    def run(method):
+        return dfx.diffeqsolve(
+            dfx.ODETerm(lambda t, y, args: swing(t, y)), method, 0.0, 1.0, 0.01, START,
+            throw=False,
+        )  # fmt: skip
+
+    solution = run(GeneralisedAlpha())
+    assert solution.result == dfx.RESULTS.successful
+    assert jnp.allclose(solution.ys["q"][-1], exact[-1], rtol=0, atol=1e-4)
+    failed = run(GeneralisedAlpha(max_iterations=0))
+    assert failed.result == dfx.RESULTS.nonlinear_divergence

@@ -97,6 +97,7 @@ def test_triangles_may_be_revolved_about_their_edge():
         M.revolve(M.rectangle([-1, 0], [1, 1], divisions=(3, 3)), layers=24)
 
 
+@pytest.mark.stress(28, 29, 30)
 def test_repair_mends_or_refuses_with_ids():
     points = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [1, 0], [5, 5.0]])
     mended = M.repair(points, [[0, 4, 2], [0, 3, 2]], M.Tri3())

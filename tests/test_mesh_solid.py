@@ -135,6 +135,7 @@ def test_polygons_and_pictures_become_meshes():
         M.from_image(np.ones((9, 9)), pixel=0.1, size=0.1)
 
 
+@pytest.mark.stress(29, 38)
 def test_bad_input_is_refused_before_memory_is_taken():
     with pytest.raises(ValueError, match="Raise `size`"):
         M.triangulate(RING, size=1e-9)

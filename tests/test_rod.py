@@ -238,6 +238,7 @@ def test_dynamics_are_differentiable_in_the_straight_rod(jacobian):
     assert relative(slope @ (2 * near), ahead - behind) < 1e-6
 
 
+@pytest.mark.stress(5)
 def test_second_derivatives_are_finite_in_the_straight_rod():
     rod, zero = finger(nodes=6), jnp.zeros(6)
     height = lambda q: R.tip_pose(rod, q)[2, 3]  # noqa: E731
@@ -250,6 +251,7 @@ def test_second_derivatives_are_finite_in_the_straight_rod():
     assert jnp.abs(curve - difference).max() < 1e-6 * jnp.abs(slope(zero)).max()
 
 
+@pytest.mark.stress(51)
 def test_single_precision_keeps_its_digits():
     wide, (q, v) = finger(), drawn_state()
     narrow = jax.tree.map(lambda x: x.astype(jnp.float32), wide)

@@ -174,6 +174,7 @@ def test_rods_that_cross_press_against_each_other():
 
 
 @pytest.mark.slow
+@pytest.mark.stress(44)
 def test_pushes_are_differentiable_through_contact():
     rod = R.rod(SE2(), R.chebyshev(kappa_z=2), R.circle(RADIUS), nodes=8, **FINGER)
     low = sdf.Rectangle([-1.0, -1.0], [1.0, -0.012])

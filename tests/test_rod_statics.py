@@ -80,6 +80,7 @@ def press(factor):
     return Pin(jnp.array(ends), jnp.array(1e2)), R.PointWrench(1e-2 * factor * down, 0.5)
 
 
+@pytest.mark.stress(22)
 def test_an_arch_snaps_through():
     path = R.arc_length_path(ARCH, press, first=0.1, steps=60, longest=1.5)
     assert jnp.all(path.status._value == Status.successful._value)

@@ -110,6 +110,7 @@ def test_slope_at_a_tie_of_two_coordinates_is_that_of_one_side(order):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.stress(37)
 def test_first_and_second_derivatives_are_finite_at_kinks(shape):
     @eqx.filter_jit
     def derivatives(shape, p):

@@ -198,6 +198,7 @@ def test_mesh_by_its_tree_is_as_by_every_face():
     assert sdf.TriangleMesh(vertices, faces[1:]).tree is None
 
 
+@pytest.mark.stress(37)
 def test_parameters_have_finite_derivatives_at_ties_and_can_be_batched():
     p = jnp.array([[0.0, 0, 0], [0.5, 0.5, 0.5], [1, 0, 0], [0.3, 0.3, 0], [0.75, 0.75, 0.75]])
 

@@ -161,3 +161,8 @@ def test_lattice_slope_climbs_to_its_bound(lattice):
 
     top = climb(jnp.asarray(np.random.default_rng(0).uniform(0, 6.3, (3, 512)))).max()
     assert 0.98 < top / lattice.bound < 1 + 1e-9
+
+
+def test_one_outline_is_a_shape():
+    square = sdf.outlines([np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])])
+    assert np.isclose(square(jnp.array([0.5, 0.4])), -0.4)

@@ -174,6 +174,44 @@ def test_the_back_of_a_wall_is_no_partner_but_its_neighbour_is():
     assert through_own_wall(body, facets, first[own], second[own], 1 * mm).all()
 
 
+def test_lists_follow_a_motion():
+    """A block thrown along another one meets facets that it did not see at the start."""
+    low = mesh.rectangle([0, 0], [24 * mm, 3 * mm], divisions=(12, 1), element=mesh.Quad4())
+    high = mesh.rectangle(
+        [0, 3.05 * mm], [4 * mm, 6.05 * mm], divisions=(2, 1), element=mesh.Quad4()
+    )
+    both = mesh.joined(low=low, high=high)
+    facets, nodes = both.facet_sets, both.node_sets
+    touch = fem.SelfContact(facets["low.top"], facets["high.bottom"], reach=2 * mm)
+    rubber = material.neo_hookean(young_modulus=YOUNG, poisson_ratio=0.0, density=1000.0)
+    problem = fem.problem(
+        both, rubber, kinematics=fem.PlaneStrain(), loads=(touch,), free=True,
+        supports=(fem.Fixed(nodes["low.bottom"]),), formulation=fem.Displacement(),
+    )  # fmt: skip
+    u, v = np.zeros(both.points.shape), np.zeros(both.points.shape)
+    v[nodes["high"]] = [1.5, -0.3]
+
+    def run(count, start):
+        return fem.simulate(problem, count * 5e-4, 5e-4, start=start)
+
+    whole = run(20, (u, v))
+    energies = whole.energies
+    total = np.asarray(energies.kinetic + energies.elastic + energies.loads)
+    assert float(energies.loads.max()) > 0.01 * total[0]  # they met
+    assert np.all(total < 1.05 * total[0])  # within the step of the impact
+    assert np.all(np.diff(total[2:]) < 0)
+    moved = np.asarray(whole.displacements)[-1, nodes["high"]]
+    assert moved[:, 0].mean() > 10 * mm  # far from the facets that were listed first
+    bottom = np.asarray(both.points)[:, 1] + np.asarray(whole.displacements)[:, :, 1]
+    assert bottom[:, nodes["high.bottom"]].min() > 2.2 * mm  # the low block gives way a little
+    half = run(10, (u, v))
+    again = run(10, half)
+    assert again.end.listed is not None
+    np.testing.assert_allclose(
+        again.displacements[-1], whole.displacements[-1], atol=1e-9 * float(abs(moved).max())
+    )
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

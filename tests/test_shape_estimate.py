@@ -1,5 +1,8 @@
 """Shapes from markers: against the shapes that made them, with contact, noise and gaps."""
 
+import queue
+import time
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +18,7 @@ from sorojax.systems import (
     start_filter,
     update_filter,
 )
+from sorojax_hardware import Image, Latest, MemoryBoard, SimulatedClock, run_loop
 
 FINGER = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=1100.0)
 PLANAR = R.rod(SE2(), R.chebyshev(kappa_z=3), R.circle(6e-3), nodes=8, **FINGER)
@@ -82,6 +86,7 @@ def test_what_no_marker_shows_is_filled_by_the_equilibrium():
     assert alone.seen == 0 and jnp.max(jnp.abs(alone.q - rest)) < 1e-3 * jnp.max(jnp.abs(rest))
 
 
+@pytest.mark.stress(54)
 def test_a_hidden_marker_counts_for_nothing():
     true = pushed(0.1)
     places = seen(true)
@@ -143,6 +148,68 @@ def test_the_filter_knows_how_sure_it_is(swing):
     assert not track[-1].stale
 
 
+class Stopping:
+    """A camera whose `read` waits for the picture that it is given."""
+
+    def __init__(self):
+        self.given = queue.Queue()
+
+    def read(self):
+        return self.given.get()
+
+    def close(self):
+        pass
+
+
+def seen_by(camera, latest, k, places):
+    """Hand the camera a picture and wait until the reading thread has it."""
+    camera.given.put(Image(k * PERIOD, np.asarray(places)))
+    start = time.monotonic()
+    while latest._image is None and latest._last < k * PERIOD:
+        assert time.monotonic() - start < 5
+        time.sleep(1e-4)
+
+
+def test_a_camera_that_is_gone_for_two_seconds_does_not_hold_up_the_loop(swing):
+    """120 frames missed, then one that comes twice, one of the past, and one without any
+    marker: the loop keeps its ticks, the filter says how old it is and finds back."""
+    camera, clock = Stopping(), SimulatedClock()
+    latest, estimator = Latest(camera), ShapeFilter(Markers(PLANAR, S), PERIOD)
+    gone, nothing = range(20, 140), np.full((4, 2), np.nan)
+    track = [start_filter(estimator)]
+
+    def measure(t, pressure):
+        image = latest.read()
+        places = nothing if image is None else image.colour
+        track.append(update_filter(estimator, track[-1], places, forces=LOADS))
+        return pressure
+
+    ticks = run_loop(
+        MemoryBoard(clock, 1), clock, lambda t, p, s: (0.0, s), None,
+        duration=160 * PERIOD, period=PERIOD, limits=(0, 1), measure=measure,
+    )  # fmt: skip
+    seen_by(camera, latest, 1, seen(swing.q[60]))
+    for k, tick in enumerate(ticks, start=1):
+        assert tick.late < 1e-9
+        if k + 1 in gone:
+            continue
+        if k + 1 in (141, 142):  # the same time again, and an earlier one: nothing is taken
+            camera.given.put(Image((140 - (k - 140)) * PERIOD, 9.0 + np.zeros((4, 2))))
+            continue
+        seen_by(camera, latest, k + 1, nothing if k + 1 == 144 else seen(swing.q[60]))
+    camera.given.put(Image(-1.0, nothing))  # lets the reading thread end
+    latest.close()
+    assert len(track) == 161 and latest.dropped == 3
+    assert [int(one.missed) for one in track[19:24]] == [0, 1, 2, 3, 4]
+    assert [bool(one.stale) for one in track[19:24]] == [False, False, False, True, True]
+    assert int(track[139].missed) == 120 and int(track[140].missed) == 0
+    assert [int(one.missed) for one in track[141:146]] == [1, 2, 0, 1, 0]
+    spread = [float(jnp.trace(one.covariance[:3, :3])) for one in track]
+    assert spread[139] > 2 * spread[19] and spread[160] < 1.5 * spread[19]
+    assert all(jnp.all(jnp.isfinite(one.q)) for one in track)
+
+
+@pytest.mark.stress(54)
 def test_numbers_that_break_keep_the_last_estimate(swing):
     estimator = ShapeFilter(Markers(PLANAR, S), PERIOD)
     good = update_filter(estimator, start_filter(estimator), seen(swing.q[0]), forces=LOADS)

@@ -212,6 +212,7 @@ def test_triangles_around_an_edge_stay_apart(getkey):
     assert ((height > 0) & (height < 1)).all()
 
 
+@pytest.mark.stress(31)
 def test_report_names_what_is_wrong():
     box = sdf.isosurface(sdf.Box([0, 0, 0], [1, 1, 1]), 0.3)
     holed = sdf.surface_report(box._replace(triangles=box.triangles[1:]))
@@ -308,6 +309,7 @@ def test_inertia_moves_with_the_body():
         (Field(lambda p, x, y, z: norm(x, y) - p, jnp.array(0.5)), 0.1, "Check `lipschitz`"),
     ],
 )
+@pytest.mark.stress(38)
 def test_bad_shapes_name_the_remedy(shape, size, message):
     with pytest.raises(ValueError, match=message):
         sdf.isosurface(shape, size, "dual_contouring")

@@ -205,6 +205,7 @@ def test_a_racket_flips_and_keeps_its_momentum():
     assert axis.min() < -0.999 and axis.max() > 0.999 and flips >= 8
 
 
+@pytest.mark.stress(42, 49)
 def test_a_ball_comes_to_rest_on_a_floor():
     floor = sdf.HalfSpace([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     touch = S.Touch(floor, [[0.0, 0.0, -0.02]], [1e-4], contact.Penalty(1e8, 1e-5), 3e4)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import io, systems as S
+from sorojax import _progress, io, systems as S
 from sorojax._types import real
 from sorojax.math.status import Status
 
@@ -115,6 +115,7 @@ def test_a_terminating_event_holds_the_state_and_has_the_exact_gradient():
     assert jnp.isclose(slope, FALLS / 2, rtol=1e-6)
 
 
+@pytest.mark.stress(48)
 def test_several_events_tell_which_of_them_happened():
     half = S.Event(lambda t, state, block, inputs: state["ball"]["q"] - 0.5, lambda t, s: s)
     network = S.Network({"ball": Ball()}, {})
@@ -124,6 +125,7 @@ def test_several_events_tell_which_of_them_happened():
     assert jnp.allclose(film.happened.time[:2], hits, rtol=0, atol=1e-8)
 
 
+@pytest.mark.stress(49)
 def test_events_without_end_are_cut_off():
     network = S.Network({"ball": Ball()}, {})
     film = S.simulate(network, 3.0, save=3, events=(BOUNCE,), max_events=4, throw=False)
@@ -145,6 +147,7 @@ def batch():
     return starts, film, slopes
 
 
+@pytest.mark.stress(45)
 def test_a_member_that_diverges_is_held_and_leaves_the_others_alone(batch):
     starts, film, slopes = batch
     good = np.asarray(starts[:3])
@@ -233,6 +236,7 @@ def test_controllers_run_at_their_own_rates():
     assert film.stats["calls"] == 3 + 6
 
 
+@pytest.mark.stress(50)
 def test_no_tick_is_lost_in_a_long_run():
     film = S.simulate_sampled(PLANT, RATES[:1], 20.0, period=1e-3, substeps=1,
                               inputs={"fast.push": 0.0})  # fmt: skip
@@ -245,38 +249,78 @@ HALVES = """
 import jax
 jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
-from sorojax import io, systems as S
+from sorojax import _progress, io, systems as S
 from tests.test_systems_runs import PLANT, RATES, growth
 folder = {folder!r}
 sampled = lambda **k: S.simulate_sampled(PLANT, RATES, 0.2, period=0.01, substeps=2, **k)
 fixed = lambda **k: S.simulate(growth(0.5), 0.5, save=11, step=0.01, **k)
-if {save}:
-    io.save(folder + "/a.npz", sampled())
-    io.save(folder + "/b.npz", fixed())
-else:
-    like = jax.eval_shape(sampled), jax.eval_shape(fixed)
-    like = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-    first = io.load(folder + "/a.npz", like[0]), io.load(folder + "/b.npz", like[1])
-    io.save(folder + "/c.npz", sampled(resume=first[0]))
-    io.save(folder + "/d.npz", fixed(resume=first[1]))
+adaptive = lambda **k: S.simulate(
+    growth(0.5), 0.5, save=6, rtol=1e-5, solver=S.{solver}(), **k
+)
+runs = {{"a": sampled, "b": fixed, "c": adaptive}}
+for name, run in runs.items():
+    if {save}:
+        io.save(f"{{folder}}/{{name}}.npz", run())
+    else:
+        like = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(run))
+        first = io.load(f"{{folder}}/{{name}}.npz", like)
+        io.save(f"{{folder}}/{{name}}2.npz", run(resume=first))
 """
 
 
-def test_two_halves_in_two_processes_give_the_bits_of_the_whole(tmp_path):
+@pytest.mark.parametrize("solver", ["Tsit5", pytest.param("Rodas4", marks=pytest.mark.slow)])
+def test_two_halves_in_two_processes_give_the_bits_of_the_whole(tmp_path, solver):
+    """Also adaptively: the second half takes the steps that the whole run takes."""
     for save in (True, False):
-        run(HALVES.format(folder=str(tmp_path), save=save))
-    whole = (
-        S.simulate_sampled(PLANT, RATES, 0.4, period=0.01, substeps=2),
-        S.simulate(growth(0.5), 1.0, save=21, step=0.01),
-    )
-    for name, film in zip("cd", whole, strict=True):
-        ends = jax.tree.map(lambda x: x[-1], (film.time, film.state, film.outputs))
-        half = eqx.filter_eval_shape(lambda f=film: f)
-        half = load_like(tmp_path / f"{name}.npz", half)
-        found = jax.tree.map(lambda x: x[-1], (half.time, half.state, half.outputs))
-        same = jax.tree.map(lambda a, b: bool(jnp.array_equal(a, b)), ends, found)
-        assert all(jax.tree.leaves(same)), same
+        run(HALVES.format(folder=str(tmp_path), save=save, solver=solver))
+    method = getattr(S, solver)()
+    whole = {
+        "a2": S.simulate_sampled(PLANT, RATES, 0.4, period=0.01, substeps=2),
+        "b2": S.simulate(growth(0.5), 1.0, save=21, step=0.01),
+        "c2": S.simulate(growth(0.5), 1.0, save=11, rtol=1e-5, solver=method),
+    }
+    for name, film in whole.items():
+        half = load_like(tmp_path / f"{name}.npz", _half(film))
+        for x, y in zip(*map(_series, (film, half)), strict=True):
+            assert jnp.array_equal(x[-len(y) :], y)
         assert jax.tree.all(jax.tree.map(jnp.array_equal, film.memory, half.memory))
+
+
+def _series(film):
+    return jax.tree.leaves((film.time, film.state, film.outputs))
+
+
+def _half(film):
+    """The shapes of the second half of a motion."""
+    count = film.time.shape[0] // 2 + 1
+    shapes = eqx.filter_eval_shape(lambda f=film: f)
+
+    def cut(x):
+        return jax.ShapeDtypeStruct((count, *x.shape[1:]), x.dtype)
+
+    parts = jax.tree.map(cut, (shapes.time, shapes.state, shapes.outputs))
+    return eqx.tree_at(lambda f: (f.time, f.state, f.outputs), shapes, parts)
+
+
+@pytest.mark.parametrize(
+    "go",
+    [
+        lambda **k: S.simulate(growth(0.5), 0.5, save=6, **k),
+        lambda **k: S.simulate(growth(0.5), 0.5, save=6, step=0.01, **k),
+        lambda **k: S.simulate_sampled(PLANT, RATES, 0.2, period=0.01, substeps=2, **k),
+    ],
+    ids=["adaptive", "fixed", "sampled"],
+)
+def test_progress_is_told_and_changes_nothing(go):
+    told = []
+    with _progress.listen(lambda p: told.append((p.label, p.done))):
+        film = go(progress=True)
+        jax.effects_barrier()
+    shares = [share for label, share in told if label == "simulate"]
+    assert len(shares) >= 3 and np.all(np.diff(shares) >= 0)
+    assert np.isclose(shares[-1], 1.0) and shares[0] < 0.7
+    plain = go()
+    assert all(jnp.array_equal(x, plain[name]) for name, x in film.outputs.items())
 
 
 def load_like(path, shapes):
@@ -286,6 +330,7 @@ def load_like(path, shapes):
     return io.load(path, blank)
 
 
+@pytest.mark.stress(33)
 def test_damaged_files_are_refused(tmp_path):
     tree = {"a": jnp.arange(3.0), "key": jax.random.key(3), "name": "x"}
     file = tmp_path / "s.npz"

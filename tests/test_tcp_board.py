@@ -98,6 +98,7 @@ def test_the_loop_runs_over_the_wire_and_leaves_a_record(patient_desk, tmp_path)
     assert abs(ticks[-1].pressure[0] - 30 * kPa) < 1 * kPa
 
 
+@pytest.mark.stress(52)
 def test_a_killed_client_leaves_the_board_at_zero(desk):
     server, valves = desk
     code = (
@@ -125,6 +126,7 @@ def test_a_killed_client_leaves_the_board_at_zero(desk):
     assert server.board.fault in (Fault.DISCONNECTED, Fault.WATCHDOG)
 
 
+@pytest.mark.stress(52)
 def test_a_silent_client_is_vented_and_told_why(desk):
     server, valves = desk
     board = hold(server.port)
@@ -137,6 +139,7 @@ def test_a_silent_client_is_vented_and_told_why(desk):
     board.close()
 
 
+@pytest.mark.stress(52)
 def test_a_server_that_stops_leaves_the_valves_at_zero_and_the_client_an_error():
     valves = BenchValves(2)
     with serve(settings(2), valves, key=KEY) as server:

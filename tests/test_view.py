@@ -1,4 +1,4 @@
-"""Pictures are looked at by their pixels; the skin and the report by what they must keep."""
+"""Pictures are looked at by their pixels, the report by what it must keep."""
 
 import base64
 import functools
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from sorojax import _progress, fem, material, mesh as M, rod as R, sdf, view
-from sorojax.math.lie import SE2, SE3
+from sorojax.math.lie import SE2
 from sorojax.math.status import Status
 from sorojax.reduction import Backbone
 
@@ -171,51 +171,6 @@ def test_a_material_fit_passes_its_points():
     exact = 2 * (stretch - stretch**-2) * (c.c1 + 2 * c.c2 * x + 3 * c.c3 * x**2)
     assert np.allclose(1e3 * curve, exact, rtol=1e-10, atol=1e-6)  # Pa
     assert has(figure, ORANGE) and has_margin(figure)
-
-
-def test_a_skin_at_rest_is_the_body(beam, rod):
-    skin = view.bind(beam.points, [0.01, 0.002], [0.01 + LENGTH, 0.002])
-    still = view.deform(skin, rod, jnp.zeros(2))
-    assert jnp.allclose(still, beam.points, rtol=0, atol=1e-12)
-
-
-def test_a_skinned_line_is_an_arc(rod):
-    kappa, turn = 20.0, 0.3
-    along = jnp.array([jnp.cos(turn), jnp.sin(turn)])
-    across = jnp.array([-along[1], along[0]])
-    s = jnp.linspace(0.0, 1.0, 101)[:, None] * LENGTH
-    origin = jnp.array([0.02, 0.01])
-    skin = view.bind(origin[None] + s * along[None], origin, origin + LENGTH * along)
-    moved = view.deform(skin, rod, jnp.array([kappa, 0.0]))
-    arc = jnp.sin(kappa * s) * along[None] + (1 - jnp.cos(kappa * s)) * across[None]
-    assert jnp.allclose(moved, origin[None] + arc / kappa, rtol=0, atol=1e-12)
-
-
-def test_sections_stay_flat_and_ends_move_rigidly(rod):
-    kappa = 60.0  # more than half a turn
-    points = jnp.array([[LENGTH, 0.004], [LENGTH + 0.01, 0.004], [-0.01, 0.003]])
-    skin = view.bind(points, [0.0, 0.0], [LENGTH, 0.0])
-    qs = jnp.array([[kappa, 0.0], [0.0, 0.0]])
-    tip, beyond, behind = jax.vmap(lambda q: view.deform(skin, rod, q))(qs)[0]
-    angle = kappa * LENGTH
-    forward = jnp.array([jnp.cos(angle), jnp.sin(angle)])
-    normal = jnp.array([-forward[1], forward[0]])
-    centre = jnp.array([jnp.sin(angle), 1 - jnp.cos(angle)]) / kappa
-    assert jnp.allclose(tip, centre + 0.004 * normal, rtol=0, atol=1e-12)
-    assert jnp.allclose(beyond, tip + 0.01 * forward, rtol=0, atol=1e-12)
-    assert jnp.allclose(behind, points[2], rtol=0, atol=1e-12)
-
-
-def test_a_skin_needs_a_planar_rod_and_a_line(beam):
-    with pytest.raises(ValueError, match="two different points"):
-        view.bind(beam.points, [0.0, 0.0], [0.0, 0.0])
-    spatial = R.rod(
-        SE3(), R.constant("kappa_z"), R.circle(0.01),
-        length=LENGTH, young_modulus=1e5, poisson_ratio=0.49, density=1e3,
-    )  # fmt: skip
-    skin = view.bind(beam.points, [0.0, 0.0], [LENGTH, 0.0])
-    with pytest.raises(ValueError, match="planar rod"):
-        view.deform(skin, spatial, jnp.zeros(1))
 
 
 @pytest.fixture(scope="module")

@@ -68,6 +68,7 @@ def test_the_hough_way_and_its_refinement():
 
 
 @pytest.mark.parametrize("level", [0, 255])
+@pytest.mark.stress(54)
 def test_an_empty_picture_has_no_discs(level):
     image = np.full((120, 160, 3), level, np.uint8)
     assert len(vision.find_discs(image, COLOURS).radius) == 0
@@ -75,6 +76,7 @@ def test_an_empty_picture_has_no_discs(level):
     assert len(vision.find_fiducials(image).ids) == 0
 
 
+@pytest.mark.stress(54)
 def test_two_hundred_discs_are_all_found():
     random = np.random.default_rng(2)
     grid = np.stack(np.meshgrid(np.arange(20), np.arange(10)), axis=-1).reshape(-1, 2)
@@ -193,6 +195,7 @@ def test_pixels_and_points():
     assert np.all(np.isnan(vision.project(camera, np.array([0.1, 0.1, -1.0]))))
 
 
+@pytest.mark.stress(54)
 def test_depth_of_a_marker_ignores_holes():
     depth = np.full((20, 30), 0.8)
     depth[8:11, 10:13] = 0.0
@@ -225,6 +228,7 @@ def test_calibration_finds_the_camera_that_took_the_pictures(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[1]", '{"fx": -1, "fy": 1, "cx": 0, "cy": 0}'])
+@pytest.mark.stress(54)
 def test_a_broken_calibration_is_refused(tmp_path, text):
     (tmp_path / "camera.json").write_text(text)
     with pytest.raises(ValueError, match="holds no camera"):

@@ -107,6 +107,6 @@ def _inverter(nx: int, ny: int):
     return _timed(
         jax.jit(lambda x: design.displacement(model, interpolation(x))[ends[1], 0]),
         jax.jit(lambda x: 10 * (jnp.mean(x) - 0.3)), nx * ny, 0.3, steps=150, scale=0.1,
-        optimiser=design.MMA(1e-3, 1.0, move=0.2),
+        optimiser=design.MMA(1e-3, 1.0, move=0.1),
         change_gradient=jax.jit(lambda x, g: design.sensitivity_filtered(smooth, x, g)),
     )  # fmt: skip

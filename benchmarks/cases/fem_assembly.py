@@ -1,10 +1,10 @@
-"""Residual and tangent with their scatter, CPU time per cell, against felupe."""
+"""Residual and tangent with their scatter, CPU time per cell, against the peers."""
 
 import numpy as np
 
 from benchmarks import peers
 from benchmarks.blocks import BLOCKS, bent, block, cpu_timing, merged
-from benchmarks.harness import Row, missing
+from benchmarks.harness import Row, missing, quick
 from sorojax import fem
 from sorojax.fem import assemble as asm
 from sorojax.fem.linear import prepare
@@ -14,20 +14,32 @@ from sorojax.math import sparse
 BARS = {"Tri3": 350e-9, "Quad4": 1.3e-6, "Tri6": 2.6e-6, "Tet10": 22e-6, "Hex8": 22e-6}
 NOTE = "tangent times a vector, of felupe on the same mesh"
 REPEATS = 7
+#: Peers that take tenths of a millisecond a cell and more: which cells, and how many a side.
+SLOW = {
+    "scikit_fem": {"Tri3": (60, 60), "Quad4": (60, 60), "Tet10": (4, 4, 4)},
+    "torch_fem": {"Tri3": (60, 60), "Quad4": (60, 60), "Tet10": (4, 4, 4), "Hex8": (8, 8, 8)},
+}
 
 
 def rows():
     for name, (element, divisions) in BLOCKS.items():
+        if quick() and name not in ("Quad4", "Tet10"):
+            continue
         plain = block(element, divisions, fem.Displacement())
         timings, answers = [], []
         for _ in range(2):  # interleaved, so that both meet the same machine
             timings.append(_time(plain))
             if name in BARS:
-                answers.append(_felupe(plain))
+                answers.append(_ask("felupe", plain, REPEATS))
         error = _difference(plain, answers[0]) if answers else None
         yield _row(plain, merged(*timings), BARS.get(name), error)
         if name in BARS:
-            yield _peer_row(plain, answers)
+            yield _peer_row("felupe", plain, answers, None)
+        for peer, sizes in SLOW.items():
+            if name in sizes:
+                small = block(element, sizes[name], fem.Displacement())
+                answer = _ask(peer, small, 3)
+                yield _peer_row(peer, small, [answer], _difference(small, answer))
         mixed = block(element, divisions)
         if not isinstance(mixed.formulation, fem.Displacement):
             bar = 1.5 * BARS[name] if name in BARS else None
@@ -66,8 +78,8 @@ def _way(problem: fem.Problem) -> np.ndarray:
     return np.random.default_rng(0).standard_normal(problem.mesh.points.shape)
 
 
-def _felupe(problem: fem.Problem):
-    """Answer and arrays of felupe, or the reason why there are none."""
+def _ask(peer: str, problem: fem.Problem, repeats: int):
+    """Answer and arrays of a peer, or the reason why there are none."""
     rubber = problem.material
     arrays = {
         "points": np.asarray(problem.mesh.points),
@@ -77,7 +89,7 @@ def _felupe(problem: fem.Problem):
     }
     try:
         return peers.call(
-            "felupe", "assembly", arrays, element=problem.mesh.element.name, repeats=REPEATS,
+            peer, "assembly", arrays, element=problem.mesh.element.name, repeats=repeats,
             mu=float(rubber.shear_modulus), bulk=float(rubber.bulk_modulus),  # type: ignore
         )  # fmt: skip
     except peers.PeerMissing as reason:
@@ -93,11 +105,12 @@ def _difference(problem: fem.Problem, answer) -> float | None:
     return float(np.abs(product - found["product"]).max() / np.abs(found["product"]).max())
 
 
-def _peer_row(problem: fem.Problem, answers) -> Row:
+def _peer_row(peer: str, problem: fem.Problem, answers, error: float | None) -> Row:
     settings = _settings(problem)
     if isinstance(answers[0], str):
-        return missing("felupe", answers[0], **settings)
+        return missing(peer, answers[0], **settings)
     runs = sorted(run for answer, _ in answers for run in answer["runs"])
     runs = [run / problem.space.num_cells for run in runs]
     settings |= {"version": answers[0][0]["version"]}
-    return Row("felupe", settings, 0.0, runs[len(runs) // 2], runs[0], runs[-1])
+    note = None if error is None else "tangent times a vector, of sorojax"
+    return Row(peer, settings, 0.0, runs[len(runs) // 2], runs[0], runs[-1], error, note)

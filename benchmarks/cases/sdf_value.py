@@ -1,9 +1,10 @@
-"""Field of a solid of five primitives at 2^20 points, against two ways to write it in NumPy."""
+"""Field of a solid of five primitives at 2^20 points, against NumPy and fogleman/sdf."""
 
 import statistics
 
 import numpy as np
 
+from benchmarks import peers
 from benchmarks.csg import POINTS, in_numpy, in_numpy_nodes, points, solid
 from benchmarks.harness import Row, measure_calls
 from sorojax import sdf
@@ -40,3 +41,10 @@ def rows():
             error = float(np.abs(form(p) - exact).max())
             settings = {"points": POINTS, "method": f"{dtype}, {name}"}
             yield Row("numpy", settings, **theirs[name].columns(), error=error, reference="")
+    p = points("float64")
+    exact = in_numpy(p)
+    yield peers.row(
+        "sdf_fork", "value", {"points": p},
+        lambda arrays: float(np.abs(arrays["field"] - exact).max()), "NumPy in float64",
+        method="float64", repeats=5,
+    )  # fmt: skip

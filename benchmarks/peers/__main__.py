@@ -30,6 +30,14 @@ PEERS = {
         "felupe",
         "GPL-3.0: only in its own process",
     ),
+    "pyelastica": Peer(("pyelastica>=1.0,<2",), "elastica", "MIT"),
+    # From version 4 on it does not read the cable element any more.
+    "mujoco": Peer(("mujoco>=3.3,<4",), "mujoco", "Apache-2.0"),
+    "scikit_fem": Peer(("scikit-fem>=12,<13",), "skfem", "BSD-3-Clause"),
+    "sdf_fork": Peer(("sdf-fork>=0.1.1,<0.2", "scikit-image"), "sdf", "MIT"),
+    "gmsh": Peer(("gmsh>=4.13,<5", "numpy"), "gmsh", "GPL-2.0+: only in its own process"),
+    "jax_fem": Peer(("jax-fem>=0.0.11",), "jax_fem.problem", "GPL-3.0: only in its own process"),
+    "torch_fem": Peer(("torch-fem>=0.14,<0.15",), "torchfem", "MIT"),
 }
 
 

@@ -14,6 +14,8 @@ from sorojax_hardware.clocks import (
     SimulatedClock as SimulatedClock,
     WallClock as WallClock,
 )
+from sorojax_hardware.desk import simulated as simulated
+from sorojax_hardware.disturbed import DisturbedLink as DisturbedLink
 from sorojax_hardware.loop import (
     Deadlines as Deadlines,
     Overrun as Overrun,

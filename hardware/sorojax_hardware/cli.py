@@ -1,4 +1,5 @@
-"""The command `sorojax-bench`: look at a board, jog a port, record, replay, run a wave."""
+"""The command `sorojax-bench`: find devices, look at a board, jog a port, record, replay, run
+a controller, and put a simulated robot behind a board."""
 
 import argparse
 import sys
@@ -10,6 +11,7 @@ import numpy as np
 
 from sorojax_hardware.cameras import VideoCamera
 from sorojax_hardware.clocks import WallClock
+from sorojax_hardware.desk import add_devices, add_serve, webcams
 from sorojax_hardware.loop import deadlines, run_loop, tick_recorder
 from sorojax_hardware.recorder import load_record
 from sorojax_hardware.tcp_board import BoardFault, TcpBoard
@@ -61,6 +63,8 @@ def _parser() -> argparse.ArgumentParser:
     wave.add_argument("--frequency", type=float, default=0.5, help="[Hz]")
     wave.add_argument("--seconds", type=float, default=10.0)
     wave.add_argument("--out", type=Path, help="record of the run")
+    add_serve(command)
+    add_devices(board)
     cameras = command("cameras", _cameras, "webcams that open")
     cameras.add_argument("--most", type=int, default=4, help="how many numbers to try")
     grab = command("grab", _grab, "save images of a webcam or video, for calibration")
@@ -181,19 +185,7 @@ def _show(t: float, text: str) -> None:
 
 
 def _cameras(asked) -> int:
-    found = 0
-    for number in range(asked.most):
-        try:
-            camera = VideoCamera(number)
-        except ConnectionError:
-            continue
-        image = camera.read()
-        camera.close()
-        size = "no image" if image is None else "x".join(map(str, image.colour.shape[1::-1]))
-        print(f"camera {number}: {size}")
-        found += 1
-    if not found:
-        print("no camera opens")
+    print("\n".join(webcams(asked.most)))
     return 0
 
 

@@ -71,6 +71,8 @@ class RealSenseCamera:
                 f"RealSenseCamera: no camera opens ({reason}). Check the USB 3 cable, or give "
                 "`recording` a file that the camera's own recorder wrote."
             ) from reason
+        if recording is not None:  # at the pace of the reader, so that no image is left out
+            profile.get_device().as_playback().set_real_time(False)
         sensor = profile.get_device().first_depth_sensor()
         self._scale = float(sensor.get_depth_scale())
         if recording is None and sensor.supports(rs.option.emitter_enabled):

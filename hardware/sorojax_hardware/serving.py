@@ -2,12 +2,15 @@
 
 import asyncio
 import contextlib
+import math
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
+from sorojax_board.bench import STEP
 from sorojax_board.board import Backend, Board, Settings
 from sorojax_board.server import Server
 from sorojax_hardware.protocols import Clock
@@ -24,7 +27,9 @@ class ModelValves:
         state: Where it starts.
         num_ports: Of the board.
         period: Step of the model [s]; several are made when more time has passed.
+        dead_time: Before a set-point reaches the model [s].
         noise: Of the sensors, standard deviation [Pa].
+        resolution: Step of the converters on both sides [Pa]; 0 for exact ones.
         seed: Of the noise.
     """
 
@@ -35,26 +40,38 @@ class ModelValves:
         num_ports: int,
         *,
         period: float = 0.005,
+        dead_time: float = 0.0,
         noise: float = 80.0,
+        resolution: float = STEP,
         seed: int = 0,
     ):
         self._advance, self.state, self._period = advance, state, period
         self._random, self._noise = np.random.default_rng(seed), noise
-        self._setpoint, self.pressure = np.zeros(num_ports), np.zeros(num_ports)
-        self._now: float | None = None
+        self._dead_time, self._resolution = dead_time, resolution
+        self._setpoint = self._asked = np.zeros(num_ports)
+        self._waiting: deque[tuple[float, np.ndarray]] = deque()
+        self.pressure, self._now = np.zeros(num_ports), -math.inf
 
     def write(self, pressures: Sequence[float]) -> None:
-        self._setpoint = np.asarray(pressures, float)
+        self._asked = self._rounded(np.asarray(pressures, float))
 
     def read(self, now: float) -> list[float]:
-        if self._now is None or now - self._now > _MOST_BEHIND:
+        if now - self._now > _MOST_BEHIND:
             self._now = now
+        self._waiting.append((now + self._dead_time, self._asked))
         while now - self._now >= self._period:
+            self._now += self._period
+            while self._waiting and self._waiting[0][0] <= self._now:
+                self._setpoint = self._waiting.popleft()[1]
             self.state, pressure = self._advance(self.state, self._setpoint, self._period)
             self.pressure = np.asarray(pressure, float)
-            self._now += self._period
         noisy = self.pressure + self._noise * self._random.standard_normal(self.pressure.shape)
-        return noisy.tolist()
+        return self._rounded(noisy).tolist()
+
+    def _rounded(self, pressure: np.ndarray) -> np.ndarray:
+        if self._resolution == 0:
+            return pressure
+        return np.rint(pressure / self._resolution) * self._resolution
 
 
 class LocalBoard:

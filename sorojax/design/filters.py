@@ -8,6 +8,8 @@ References:
     in topology optimization", Struct. Multidisc. Optim. 43, 2011.
 """
 
+import itertools
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -34,24 +36,25 @@ class ConeFilter(eqx.Module):
         return jnp.zeros_like(x).at[self.first].add(self.weights * x[self.second])
 
 
-def cone_filter(mesh: Mesh, radius: float, *, volumes=None) -> ConeFilter:
+def cone_filter(
+    mesh: Mesh, radius: float, *, volumes=None, periods: tuple[float | None, ...] | None = None
+) -> ConeFilter:
     """The filter of `radius` [m] between the centres of cells.
 
     Args:
         mesh: The cells.
         radius: Where the weight becomes zero [m]; less than a cell does nothing.
         volumes: Volumes of the cells, where they differ much.
-    """
-    from sorojax.math.spatial import KDTree
+        periods: By axis, the length [m] after which the layout repeats, `None` where it
+            does not: cells at one end are then neighbours of those at the other.
 
+    Raises:
+        ValueError: If a period is shorter than two radii or than the mesh.
+    """
     _check.positive("cone_filter", "radius", radius, "m", "About two cells is usual.")
     centres = np.asarray(mesh.points)[np.asarray(mesh.cells)].mean(axis=1)
-    tree = KDTree(centres)
-    near = tree.query_pairs(float(radius), output_type="ndarray")
-    own = np.arange(len(centres))
-    first = np.concatenate([own, near[:, 0], near[:, 1]])
-    second = np.concatenate([own, near[:, 1], near[:, 0]])
-    weights = radius - np.linalg.norm(centres[first] - centres[second], axis=1)
+    first, second, away = _pairs(centres, float(radius), _periods(mesh, radius, periods))
+    weights = radius - away
     if volumes is not None:
         weights = weights * np.asarray(volumes)[second]
     total = np.zeros(len(centres))
@@ -60,6 +63,36 @@ def cone_filter(mesh: Mesh, radius: float, *, volumes=None) -> ConeFilter:
     return ConeFilter(
         jnp.asarray(first, jnp.int32), jnp.asarray(second, jnp.int32), jnp.asarray(weights)
     )
+
+
+def _periods(mesh: Mesh, radius: float, periods) -> np.ndarray:
+    """Period by axis, 0 where there is none."""
+    found = np.array([p or 0.0 for p in periods or (None,) * mesh.element.dim])
+    span = np.ptp(np.asarray(mesh.points), axis=0)
+    if found.shape != span.shape or np.any(
+        (found != 0) & (found < np.maximum((1 - 1e-9) * span, 2 * radius))
+    ):
+        raise ValueError(
+            f"cone_filter: got periods {periods} m, need one per axis, `None` or at least the "
+            f"length {span} m of the mesh and two radii of {float(radius):g} m. Give the "
+            "length of the cell that repeats."
+        )
+    return found
+
+
+def _pairs(centres: np.ndarray, radius: float, periods: np.ndarray):
+    """Cells, their neighbours (themselves too) within `radius`, and how far away they are."""
+    from sorojax.math.spatial import KDTree
+
+    shifts = np.array(list(itertools.product(*([-p, 0.0, p] if p else [0.0] for p in periods))))
+    owners, images = np.arange(len(centres)), centres
+    if len(shifts) > 1:
+        images = (centres[None] + shifts[:, None]).reshape(-1, centres.shape[1])
+        owners = np.tile(owners, len(shifts))
+    near = KDTree(centres).sparse_distance_matrix(
+        KDTree(images), radius, output_type="coo_matrix"
+    )
+    return near.row, owners[near.col], near.data
 
 
 class HelmholtzFilter(eqx.Module):
@@ -114,7 +147,7 @@ def helmholtz_filter(mesh: Mesh, radius: float) -> HelmholtzFilter:
 
 
 def heaviside_projection(
-    x: Float[Array, "..."], sharpness, threshold=0.5
+    x: Float[Array, "..."], sharpness, threshold: Float[Array, ""] | float = 0.5
 ) -> Float[Array, "..."]:
     """Pushes densities to 0 and 1: a smooth step at `threshold`, the steeper the larger
     `sharpness` (1 does next to nothing, 16 and more make black and white)."""

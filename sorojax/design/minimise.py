@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from sorojax import _check
+from sorojax._display import displayed, number, outcome
 from sorojax._progress import report
 from sorojax._types import real
 from sorojax.design.mma import GCMMA, MMA, Values
@@ -20,6 +21,7 @@ from sorojax.math.status import Status
 
 Optimiser = MMA | GCMMA | OptimalityCriteria | optax.GradientTransformation
 _INNER = 15  # proposals of GCMMA for one step
+_RETREATS = 4  # halvings of a step that leads to where a function is not defined
 
 
 class Step(eqx.Module):
@@ -41,6 +43,7 @@ class Step(eqx.Module):
     memory: Any
 
 
+@displayed
 class Optimised(eqx.Module):
     """Where an optimisation ended.
 
@@ -60,6 +63,14 @@ class Optimised(eqx.Module):
     status: Status
     history: dict[str, Float[np.ndarray, "steps *columns"]]
     last: Step
+
+    def _text(self) -> str:
+        count = len(self.history["objective"])
+        held = f", largest constraint {number(jnp.max(self.constraints))}"
+        return (
+            f"Optimised: {outcome(self.status)} after {count} steps, objective "
+            f"{number(self.objective)}{held * bool(self.constraints.size)}"
+        )
 
 
 def minimise(
@@ -114,10 +125,15 @@ def minimise(
     first, memory = 0, None
     if resume is not None:
         flat, memory, first = ravel_pytree(resume.design)[0], resume.memory, resume.count
-    values, scale, history, step = None, scale, [], resume
+    values, last, history, step = None, flat, [], resume
     status = Status.max_steps
     for k in range(first, steps):
         values = task.values(flat, k)
+        for _ in range(_RETREATS if k > first else 0):
+            if _finite(values):
+                break
+            flat = (flat + last) / 2
+            values = task.values(flat, k)
         if not _finite(values):
             if k == first:
                 raise ValueError(
@@ -128,18 +144,18 @@ def minimise(
                 )
             status = Status.not_finite
             break
-        scale = _size(values.objective) if scale is None else scale
+        scale = _size(flat, values) if scale is None else scale
         if memory is None:
             m = values.constraints.shape[0]
             memory = optimiser.init(flat) if plain else optimiser.init(flat, m)  # type: ignore
         new, memory = _advance(optimiser, task, k, flat, values, memory, scale)
-        change = float(jnp.max(jnp.abs(new - flat)))
+        change = float(_distance(new, flat))
         last, flat = flat, new
         step = Step(k + 1, back(flat), values.objective, values.constraints,
                     jnp.asarray(change), memory)  # fmt: skip
         history.append((float(values.objective), np.asarray(values.constraints), change))
         report("minimise", k + 1, steps, objective=history[-1][0], change=change,
-               constraint=float(jnp.max(values.constraints, initial=-jnp.inf)))  # fmt: skip
+               constraint=float(np.max(history[-1][1], initial=-np.inf)))  # fmt: skip
         if on_step is not None:
             on_step(step)
         if change <= tolerance and schedule is None:
@@ -225,11 +241,26 @@ def _advance(optimiser, task: _Task, k: int, flat, values: Values, memory, scale
 
 
 def _finite(values: Values) -> bool:
-    return all(bool(jnp.all(jnp.isfinite(part))) for part in values)
+    return bool(_all_finite(values))
 
 
-def _size(objective) -> float:
-    return float(jnp.abs(objective)) or 1.0
+@jax.jit
+def _all_finite(values: Values) -> Bool[Array, ""]:
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(part)) for part in values]))
+
+
+@jax.jit
+def _distance(a, b) -> Float[Array, ""]:
+    return jnp.max(jnp.abs(a - b))
+
+
+def _size(flat, values: Values) -> float:
+    """The size of the objective, or of what the variables contribute where it starts at 0."""
+    size, change = (
+        float(jnp.abs(values.objective)),
+        float(jnp.abs(values.gradient) @ jnp.abs(flat)),
+    )
+    return (size if size > 1e-3 * change else change) or 1.0
 
 
 def _columns(history) -> dict[str, np.ndarray]:

@@ -52,15 +52,17 @@ def _update(method: OptimalityCriteria, x, values: Values):
     least = jnp.maximum(method.lower, x - method.move)
     most = jnp.minimum(method.upper, x + method.move)
 
+    logs = jnp.log(gain)
+    full = x * jnp.exp(method.damping * logs)
+
     def proposal(log_price):
-        return jnp.clip(x * (gain / jnp.exp(log_price)) ** method.damping, least, most)
+        return jnp.clip(full * jnp.exp(-method.damping * log_price), least, most)
 
     def halve(_, span):
         middle = (span[0] + span[1]) / 2
         heavy = values.constraints[0] + cost @ (proposal(middle) - x) > 0
         return jnp.where(heavy, middle, span[0]), jnp.where(heavy, span[1], middle)
 
-    logs = jnp.log(gain)
     span = (jnp.min(logs) - 60.0, jnp.max(logs) + 60.0)
     low, high = jax.lax.fori_loop(0, 80, halve, span)
     return proposal((low + high) / 2)

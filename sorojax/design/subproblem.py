@@ -49,7 +49,61 @@ class _Point(NamedTuple):
 
 
 def solve_subproblem(task: Approximation) -> Float[Array, " n"]:
-    """The minimiser, by Newton's method on conditions whose perturbation goes to 1e-7."""
+    """The minimiser: by its one multiplier where there is one constraint, otherwise by
+    Newton's method on conditions whose perturbation goes to 1e-7."""
+    if task.right.shape[0] <= 1:
+        return solve_dual(task)
+    return solve_primal_dual(task)
+
+
+def solve_dual(task: Approximation) -> Float[Array, " n"]:
+    """The minimiser under at most one constraint. For a multiplier every x is known in closed
+    form, and what the constraint has in excess falls with it: the root of one function.
+
+    Reference: Svanberg, Int. J. Numer. Meth. Engng 24, 1987, section 4.
+    """
+    if not task.right.shape[0]:
+        return _minimiser(task, task.p[0], task.q[0])
+    price = jnp.asarray(_PRICE, task.p.dtype)
+
+    def excess(lam):
+        p, q = task.p[0] + lam * task.p[1], task.q[0] + lam * task.q[1]
+        x = _minimiser(task, p, q)
+        up, down = 1 / (task.high - x), 1 / (x - task.low)
+        slope = task.p[1] * up**2 - task.q[1] * down**2
+        curvature = 2 * (p * up**3 + q * down**3)
+        free = (x > task.least) & (x < task.most)
+        rate = -jnp.sum(jnp.where(free, slope**2 / curvature, jnp.zeros_like(x)))
+        value = jnp.sum(task.p[1] * up + task.q[1] * down) - task.right[0]
+        broken = jnp.maximum(lam - price, 0.0)
+        return x, value - broken, rate - (broken > 0).astype(x.dtype)
+
+    def improve(state):
+        lam, low, high, _, _, count = state
+        x, value, rate = excess(lam)
+        low, high = jnp.where(value > 0, lam, low), jnp.where(value > 0, high, lam)
+        step = lam - value / rate
+        far = jnp.where(jnp.isfinite(high), (low + high) / 2, 8 * low + 1e-3)
+        far = jnp.where(low > 0, jnp.where(jnp.isfinite(high), jnp.sqrt(low * high), far), far)
+        inside = (step > low) & (step < jnp.minimum(high, 64 * low + 1e3))
+        new = jnp.where(inside, step, far)
+        done = ((lam == 0) & (value <= 0)) | (jnp.abs(new - lam) <= 1e-13 * lam)
+        return new, low, high, x, done, count + 1
+
+    zero = jnp.zeros_like(price)
+    start = (zero, zero, zero + jnp.inf, task.least, jnp.asarray(False), 0)
+    end = jax.lax.while_loop(lambda s: ~s[4] & (s[5] < 100), improve, start)
+    return end[3]
+
+
+def _minimiser(task: Approximation, p, q) -> Float[Array, " n"]:
+    """Of p/(U - x) + q/(x - L) for each variable alone."""
+    a, b = jnp.sqrt(p), jnp.sqrt(q)
+    return jnp.clip((a * task.low + b * task.high) / (a + b), task.least, task.most)
+
+
+def solve_primal_dual(task: Approximation) -> Float[Array, " n"]:
+    """The minimiser under any number of constraints."""
     dtype, m = task.p.dtype, task.right.shape[0]
     one, x = jnp.ones(m, dtype), (task.least + task.most) / 2
     room = jnp.maximum(task.most - task.least, 1e-12)

@@ -18,8 +18,8 @@ from sorojax.fem.formulation import Modes
 from sorojax.fem.geometry import Geometry, deformation_gradient, gradient_entries
 from sorojax.fem.kinematics import AbstractKinematics
 from sorojax.fem.space import Space, lanes, per_block
-from sorojax.fem.tensor import volume_ratio
-from sorojax.material.hyperelastic import AbstractHyperelastic
+from sorojax.fem.tensor import checked_volume_ratio
+from sorojax.material.hyperelastic import AbstractHyperelastic, finite_share
 
 
 class Assembly(NamedTuple):
@@ -62,7 +62,8 @@ def assemble(
         )
         # Otherwise XLA repeats these sums in every use of F.
         F, F_before = jax.lax.optimization_barrier((F, F_before))
-        J, J_before = volume_ratio(kinematics, F), volume_ratio(kinematics, F_before)
+        share = finite_share(body.material)
+        J, J_before = (checked_volume_ratio(kinematics, x, share) for x in (F, F_before))
         answer = response(body, F, F_before)
         force, upper = block_matrix(kinematics, answer, body, block.gradients)
         return force, upper, jnp.min(J / J_before)
@@ -103,11 +104,15 @@ def largest_step(
     u: Float[Array, "nodes dim"],
     du: Float[Array, "nodes dim"],
     keep: float = 0.1,
+    share: Float[Array, "..."] | None = None,
 ) -> Float[Array, ""]:
-    """Largest sampled fraction of `du`, at most 1, up to which J >= keep * J(u) everywhere."""
+    """Largest sampled fraction of `du`, at most 1, up to which J >= keep * J(u) everywhere.
+
+    `share` is the `finite_share` of the material.
+    """
 
     def ratio(fraction):
-        return kept_volume(space, geometry, kinematics, u, fraction * du)
+        return kept_volume(space, geometry, kinematics, u, fraction * du, share)
 
     fractions = _SHRINK ** jnp.arange(_SAMPLES - 1, -1, -1, dtype=u.dtype)
     ok = jax.lax.map(ratio, fractions) >= keep
@@ -125,16 +130,20 @@ def kept_volume(
     kinematics: AbstractKinematics,
     u: Float[Array, "nodes dim"],
     du: Float[Array, "nodes dim"],
+    share: Float[Array, "..."] | None = None,
 ) -> Float[Array, ""]:
     """Smallest J(u + du) / J(u)."""
+    varying, constant = per_block(space, share)
 
     def work(arrays):
-        cells, G = arrays
+        cells, G, varying = arrays
+        own = eqx.combine(varying, constant)
         F = deformation_gradient(kinematics, lanes(u, cells), G)
         D = gradient_entries(kinematics, lanes(du, cells), G)
-        return jnp.min(volume_ratio(kinematics, F + D) / volume_ratio(kinematics, F))
+        J, J_before = (checked_volume_ratio(kinematics, x, own) for x in (F + D, F))
+        return jnp.min(J / J_before)
 
-    return jnp.min(jax.lax.map(work, (space.cells, geometry.gradients)))
+    return jnp.min(jax.lax.map(work, (space.cells, geometry.gradients, varying)))
 
 
 @jax.jit

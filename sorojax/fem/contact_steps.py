@@ -150,8 +150,20 @@ def updated(problem: Problem, u: Float[Array, "nodes dim"]) -> Problem:
     try:
         checks_loads.room(problem.space, loads)
     except ValueError:
-        made = dataclasses.replace(made, space=space(problem.mesh, loads))
+        wide = [_wide(load, problem.mesh, np.asarray(u)) for load in loads]
+        room = (*loads, *problem.loads, *(load for load in wide if load is not None))
+        made = dataclasses.replace(made, space=space(problem.mesh, room))
     return made
+
+
+def _wide(load, mesh, u: np.ndarray) -> SelfContact | None:
+    """The load with longer lists, so that a pattern serves for some time."""
+    if not isinstance(load, SelfContact) or load.reach is None:
+        return None
+    count = 3 * (load.candidates or 1)
+    return with_partners(
+        dataclasses.replace(load, reach=2 * load.reach, candidates=count), mesh, u
+    )
 
 
 def _same(new, old) -> bool:

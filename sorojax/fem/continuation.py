@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
+from sorojax._display import displayed, number, outcome
 from sorojax._progress import report
 from sorojax.fem.arc_length import Loading, PathState, arc_step, tangent_state
 from sorojax.fem.critical import CriticalPoint, locate
@@ -24,6 +25,7 @@ _SHARPEST = 0.5  # cosine of the turn between two states
 _RESOLVED = 4  # cuts after which a turn is one of the path, not of the step
 
 
+@displayed
 class Continuation(eqx.Module):
     """States along a path: `factors` of the load, `values` of the named one, and the number
     of negative eigenvalues of the tangent (0 where stable, -1 unknown)."""
@@ -49,6 +51,13 @@ class Continuation(eqx.Module):
             return self.factors
         load = next(load for load in self.problem.loads if load.name == self.name)
         return jnp.tensordot(self.factors, load.value, axes=0)
+
+    def _text(self) -> str:
+        return (
+            f"Continuation: {len(self)} states, {outcome(self.status)}\n"
+            f"  load factor {number(self.factors)}, {len(self.critical_points)} critical "
+            f"points, negative eigenvalues {number(self.negative_eigenvalues)}"
+        )
 
 
 def continuation(

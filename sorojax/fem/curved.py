@@ -63,11 +63,17 @@ def blockwise(
     # the last block is filled up with copies of the last group
     at = jnp.minimum(jnp.arange(num_blocks * width), count - 1).reshape(num_blocks, width)
 
-    def block(at):
-        own = jax.tree.map(lambda leaf: leaf[at], (x, data))
-        return jax.lax.cond(
-            idle(*own), lambda *_: jnp.zeros((width, *tail), x.dtype), kernel, *own
-        )
+    rows = jax.tree.map(lambda leaf: leaf[at], (x, data))
+    still = jax.vmap(idle)(*rows)
+    zero = jnp.zeros((width, *tail), x.dtype)
 
-    found = jax.lax.map(block, at)
+    def block(row):
+        return jax.lax.cond(row[0], lambda *_: zero, kernel, *row[1])
+
+    # a loop that finds every block idle costs more than all that it finds
+    found = jax.lax.cond(
+        jnp.all(still),
+        lambda: jnp.zeros((num_blocks, width, *tail), x.dtype),
+        lambda: jax.lax.map(block, (still, rows)),
+    )
     return found.reshape(num_blocks * width, *tail)[:count]

@@ -110,8 +110,9 @@ def simulate(
         problem, damping, scheme, loads, supports, rest, size, mass, method.conserves
     )
     begun = _state(where, dynamics, start)
-    # a tangent is no part of the motion, only of its rounding
-    dynamics = dataclasses.replace(dynamics, start=dataclasses.replace(begun, tangent=None))
+    # tangent and lists are no part of the motion, only of how it is computed
+    bare = dataclasses.replace(begun, tangent=None, listed=None)
+    dynamics = dataclasses.replace(dynamics, start=bare)
     error = (1e-3 if adaptive is True else float(adaptive)) if adaptive else None
     if max_steps is None:
         max_steps = grid + 64 if error is None else 16 * grid
@@ -119,7 +120,7 @@ def simulate(
     control = Control(newton, max_cuts, error, max_steps)
     if is_traced((dynamics, jnp.zeros(()))):
         return _in_trace(dynamics, control, grid, every)
-    motion = _on_host(dynamics, control, grid, every, begun.tangent)
+    motion = _on_host(dynamics, control, grid, every, begun)
     if throw and motion.stats.reason:
         raise MotionError(
             f"{where}: no step beyond {float(motion.end.time):.6g} s after "
@@ -131,9 +132,10 @@ def simulate(
 
 
 def _on_host(
-    dynamics: Dynamics, control: Control, grid: int, every: int, tangent: Array | None
+    dynamics: Dynamics, control: Control, grid: int, every: int, begun: State
 ) -> Motion:
-    run = Run(dynamics, control, tangent)
+    run = Run(dynamics, control)
+    run.resume(begun)
     states, points = [dynamics.start], [0]
     for index in range(grid):
         if not run.advance(index):
@@ -144,7 +146,9 @@ def _on_host(
         report("motion", index + 1, grid, iterations=run.iterations, cuts=run.cuts)
 
     def column(first, *others):
-        return jnp.stack([first, *others]) if eqx.is_inexact_array(first) else first
+        if not eqx.is_inexact_array(first):
+            return first
+        return jnp.asarray(np.stack([np.asarray(x) for x in (first, *others)]))
 
     stacked = jax.tree.map(column, *states)
     at = jnp.asarray(points, jnp.int32)

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from sorojax.fem import assemble as asm
+from sorojax.fem.dynamics_lists import has_lists, listed_at
 from sorojax.fem.dynamics_newton import Found, StepSolver
 from sorojax.fem.dynamics_step import (
     Dynamics,
@@ -55,20 +55,37 @@ class MotionStats(NamedTuple):
 class Run:
     """A motion that goes on from grid point to grid point."""
 
-    def __init__(
-        self, dynamics: Dynamics, control: Control, tangent: Float[Array, " nnz"] | None = None
-    ):
-        self.dynamics, self.control = dynamics, control
-        problem = dynamics.problem
-        self.matter = compiled_matter(dynamics)
-        self.prepared = prepare(problem)
-        self.solver = StepSolver(self.prepared, problem.space.system, control.newton)
-        if tangent is not None:
-            self.solver.keep(np.asarray(tangent))
-        self.state = dynamics.start
+    def __init__(self, dynamics: Dynamics, control: Control):
+        self.control, self.state = control, dynamics.start
+        self.follows, self.listed = False, None
+        self._take(dynamics)
         self.rows: list[tuple[int, float, float, np.ndarray]] = []
         self.share, self.reason = float(dynamics.start.share), ""
         self.steps = self.iterations = self.factorisations = self.cuts = 0
+
+    def resume(self, begun: State) -> None:
+        """Go on as the run would have that ended at `begun`; lists follow from here on."""
+        self.follows = has_lists(self.dynamics.problem)
+        if begun.listed is not None:
+            problem, self.listed = listed_at(self.dynamics.problem, begun.listed, None)
+            self._take(dataclasses.replace(self.dynamics, problem=problem))
+        if begun.tangent is not None and begun.tangent.shape == self.matter.mass.shape:
+            self.solver.keep(np.asarray(begun.tangent))
+
+    def _take(self, dynamics: Dynamics) -> None:
+        """Prepare for a problem with other lists, and perhaps a pattern of its own."""
+        self.dynamics, problem = dynamics, dynamics.problem
+        self.prepared = prepare(problem)
+        self.matter = compiled_matter(dynamics)
+        self.solver = StepSolver(self.prepared, problem, self.control.newton)
+
+    def _follow_lists(self) -> None:
+        before, kept = self.dynamics.problem, self.solver.kept
+        problem, self.listed = listed_at(before, self.state.displacement, self.listed)
+        if problem is not before:
+            self._take(dataclasses.replace(self.dynamics, problem=problem))
+            if problem.space is before.space and kept is not None:
+                self.solver.keep(kept.matrix)
 
     @property
     def status(self) -> Status:
@@ -84,7 +101,7 @@ class Run:
         kept = self.solver.kept
         tangent = None if kept is None else jnp.asarray(kept.matrix)
         share = jnp.asarray(self.share, self.dynamics.step.dtype)
-        return dataclasses.replace(self.state, share=share, tangent=tangent)
+        return dataclasses.replace(self.state, share=share, tangent=tangent, listed=self.listed)
 
     def advance(self, index: int) -> bool:
         """From grid point `index` to the next; False where it cannot be reached."""
@@ -93,6 +110,8 @@ class Run:
             if self.steps == self.control.max_steps:
                 self.reason = self.reason or f"{self.steps} steps were taken"
                 return False
+            if self.follows:
+                self._follow_lists()
             end = done + self.share
             new = self._step(Interval(*map(jnp.asarray, (np.int32(index), done, end))))
             if new is None:
@@ -110,11 +129,13 @@ class Run:
         return True
 
     def _step(self, interval: Interval) -> State | None:
-        step = _begin(self.dynamics, self.matter, self.state, interval)
-        problem = with_terms(self.dynamics.problem, step.terms)
-        held = np.asarray(known_values(step.terms[1], *problem.mesh.points.shape))
+        geometry = self.prepared.geometry
+        step, held, kept = _begin(self.dynamics, self.matter, geometry, self.state, interval)
+        problem, held = with_terms(self.dynamics.problem, step.terms), np.asarray(held)
         start = self.state.displacement
-        found = self._solve(problem, step.predicted if self._is_sound(step) else start, held)
+        # a prediction that inverts cells is none
+        sound = float(kept) > LEAST_VOLUME
+        found = self._solve(problem, step.predicted if sound else start, held)
         if found.reason:
             found = self._solve(problem, start, held)
         if found.reason:
@@ -135,14 +156,6 @@ class Run:
         self.steps += 1
         self.rows.append((int(interval.index), *_ends(interval), found.u))
         return new
-
-    def _is_sound(self, step: Step) -> bool:
-        """Whether the prediction keeps the cells from inverting."""
-        problem, u = self.dynamics.problem, self.state.displacement
-        kept = asm.kept_volume(
-            problem.space, self.prepared.geometry, problem.kinematics, u, step.predicted - u
-        )
-        return float(kept) > LEAST_VOLUME
 
     def _solve(self, problem, start, held: np.ndarray) -> Found:
         found = self.solver.solve(problem, np.asarray(start), held)
@@ -172,8 +185,14 @@ compiled_matter: Callable[[Dynamics], Matter] = eqx.filter_jit(matter)
 
 
 @eqx.filter_jit
-def _begin(dynamics: Dynamics, known: Matter, state: State, interval: Interval) -> Step:
-    return begin_step(dynamics, known, state, interval)
+def _begin(dynamics: Dynamics, known: Matter, geometry, state: State, interval: Interval):
+    """A step, the displacements held in it, and the least share of a volume that its
+    prediction keeps."""
+    step = begin_step(dynamics, known, state, interval)
+    problem, u = dynamics.problem, state.displacement
+    args = (problem.space, geometry, problem.kinematics, u, step.predicted - u)
+    kept = asm.kept_volume(*args)
+    return step, known_values(step.terms[1], *u.shape), kept
 
 
 @eqx.filter_jit

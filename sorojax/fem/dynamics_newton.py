@@ -5,17 +5,21 @@ with it takes the residual down well: a residual and a back-substitution cost a 
 a tangent and its factor. A step that raises the energy is shortened.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from sorojax.fem import assemble as asm
-from sorojax.fem.linear import Prepared, linearise, unbalanced
+from sorojax.fem.dynamics_lists import has_lists, longest_share
+from sorojax.fem.energy_form import load_force
+from sorojax.fem.inertia import Inertia
+from sorojax.fem.linear import Prepared, add_load_stiffness
 from sorojax.fem.newton import Newton, relative_size, safe_fraction
 from sorojax.fem.problem import Problem, unsupported
+from sorojax.fem.secant import Secants
 from sorojax.math import sparse
 
 #: A kept factor is given up where the residual keeps more than this share in an iteration.
@@ -34,11 +38,11 @@ class Balance(NamedTuple):
     """Unbalanced force [N] at a state, its largest free entry, the largest force that it is
     judged by, the length that rounding is judged by and the smallest J / J_before."""
 
-    residual: Float[Array, " dofs"]
-    norm: Float[Array, ""]
-    reference: Float[Array, ""]
-    length: Float[Array, ""]
-    volume_ratio: Float[Array, ""]
+    residual: np.ndarray
+    norm: float
+    reference: float
+    length: float
+    volume_ratio: float
 
 
 class Found(NamedTuple):
@@ -52,73 +56,87 @@ class Found(NamedTuple):
     reason: str
 
 
-def balance(problem: Problem, prepared: Prepared, u, before) -> Balance:
-    """Unbalanced force at `u`."""
-    return _balance(unsupported(problem), prepared, u, before)
-
-
 @eqx.filter_jit
-def _balance(problem: Problem, prepared: Prepared, u, before) -> Balance:
+def forces(problem: Problem, prepared: Prepared, u, before):
+    """Internal force and that of the loads [N], and the smallest J / J_before."""
     body = asm.assemble(
         problem.space, prepared.geometry, problem.material, problem.kinematics, u, before
     )
-    return Balance(*unbalanced(problem, prepared, body.force, u), body.volume_ratio)
+    return body.force, load_force(problem, u).ravel(), body.volume_ratio
+
+
+@eqx.filter_jit
+def tangent(problem: Problem, prepared: Prepared, u, before):
+    """Values of the tangent [N/m], and the same with supports applied."""
+    body = asm.assemble(
+        problem.space, prepared.geometry, problem.material, problem.kinematics, u, before
+    )
+    values = add_load_stiffness(problem, prepared, u, body.values)
+    return values, sparse.fix(problem.space.system, values, prepared.known)
 
 
 class StepSolver:
     """Solves the steps of one motion; remembers the last tangent."""
 
-    def __init__(self, prepared: Prepared, system: sparse.SparseSymmetric, newton: Newton):
+    def __init__(self, prepared: Prepared, problem: Problem, newton: Newton):
         self.prepared, self.newton = prepared, newton
-        self.system, self.solver = system, system.solver
-        self.known = np.asarray(prepared.known)
+        self.system = problem.space.system
+        self.solver, self.sees = self.system.solver, has_lists(problem)
+        self.known, self.length = np.asarray(prepared.known), float(prepared.length)
         self.kept: Kept | None = None
+        self._matrix = _Both(self.system)
 
     def solve(self, problem: Problem, guess: np.ndarray, held: np.ndarray) -> Found:
         """Equilibrium near `guess`, where known unknowns are `held`."""
         settings = self.newton
+        (inertia,) = [load for load in problem.loads if isinstance(load, Inertia)]
+        self._matrix.fill(np.asarray(inertia.matrix))
+        self._pull, self._origin = np.asarray(inertia.pull), np.asarray(inertia.origin)
         u, before, fresh, size = guess, guess, 0, np.inf
         now = self._balance(problem, u, u)
-        last, refactor, iterations = np.inf, self.kept is None, 0
+        last, refactor, iterations, secants = np.inf, self.kept is None, 0, Secants()
         while True:
             move = np.where(self.known, held - u.ravel(), 0.0)
             move[np.abs(move) <= 1e-12 * np.abs(held).max(initial=0.0)] = 0.0
             moves = bool(np.any(move))
-            norm, reference = float(now.norm), float(now.reference)
-            if not (np.isfinite(norm) and float(now.volume_ratio) > 0):
+            norm, reference = now.norm, now.reference
+            if not (np.isfinite(norm) and now.volume_ratio > 0):
                 return self._failed(u, iterations, fresh, "an element inverts")
             largest = self.kept.largest if self.kept else 0.0
-            rounding = 2 * np.finfo(float).eps * largest * float(now.length)
+            rounding = 2 * np.finfo(float).eps * largest * now.length
             small = norm <= settings.residual_tolerance * reference or norm <= rounding
             if small and size < settings.step_tolerance and not moves:
-                residual = np.asarray(now.residual)
-                return Found(u, residual, iterations, fresh, self.kept, "")
+                return Found(u, now.residual, iterations, fresh, self.kept, "")
             if fresh >= settings.max_iterations or iterations >= 6 * settings.max_iterations:
                 reason = f"no convergence in {iterations} Newton iterations"
                 return self._failed(u, iterations, fresh, reason)
             slow = iterations > 0 and norm > _SLOW * last and not small
             if refactor or slow or moves:
+                secants.clear()
                 if not self._renew(problem, u, before):
                     return self._failed(u, iterations, fresh, "the tangent is singular")
                 refactor, fresh = False, fresh + 1
             last, iterations = norm, iterations + 1
-            rhs = -np.asarray(now.residual)
+            rhs = -now.residual
             if moves:
                 rhs = rhs - np.asarray(self._product(problem, u, before, move))
             rhs[self.known] = 0.0
             factor = self.solver.factor(self.kept.matrix)  # type: ignore[union-attr]
             if factor is None:
                 return self._failed(u, iterations, fresh, "the tangent is singular")
-            du = (factor.solve(rhs) + move).reshape(u.shape)
+            du = (secants.solve(factor, rhs) + move).reshape(u.shape)
             slope = None if moves else -float(rhs @ du.ravel())
             before = u
             u, now, size = self._advance(problem, u, du, slope)
+            if not moves:
+                change = now.residual + rhs
+                change[self.known] = 0.0
+                secants.add((u - before).ravel(), change)
 
     def _renew(self, problem: Problem, u, before) -> bool:
-        found = linearise(problem, self.prepared, jnp.asarray(u), jnp.asarray(before))
-        self._values = found.values
-        matrix = np.asarray(_fixed(self.system, found.values, self.prepared.known))
-        return self.keep(matrix)
+        at = jnp.asarray(u), jnp.asarray(before)
+        self._values, matrix = tangent(unsupported(problem), self.prepared, *at)
+        return self.keep(np.asarray(matrix))
 
     def keep(self, matrix: np.ndarray) -> bool:
         """Go on with the factor of `matrix`; False if it is not finite."""
@@ -129,14 +147,27 @@ class StepSolver:
         return sparse.product(self.system, self._values, jnp.asarray(move))
 
     def _balance(self, problem: Problem, u, before) -> Balance:
-        return balance(problem, self.prepared, jnp.asarray(u), jnp.asarray(before))
+        """Forces of body and loads from a compiled kernel, inertia by a product here."""
+        rest = tuple(load for load in problem.loads if not isinstance(load, Inertia))
+        bare = dataclasses.replace(unsupported(problem), loads=rest)
+        found = forces(bare, self.prepared, jnp.asarray(u), jnp.asarray(before))
+        internal, load = np.asarray(found[0]), np.asarray(found[1])
+        load = load + self._pull - self._matrix @ (u - self._origin).ravel()
+        residual = internal - load
+        norm = np.abs(np.where(self.known, 0.0, residual)).max()
+        reaction = np.abs(np.where(self.known, residual, 0.0)).max()
+        reference = max(np.abs(load).max(), reaction)
+        length = np.abs(u).max() + self.length
+        return Balance(residual, float(norm), float(reference), length, float(found[2]))
 
     def _advance(self, problem: Problem, u, du, slope):
         """The state after a step, shortened where a cell would collapse or the energy has
         turned at its end."""
+        if self.sees:
+            du = float(longest_share(problem, jnp.asarray(du))) * du
         new = u + du
         now = self._balance(problem, new, u)
-        if not float(now.volume_ratio) > 0.1:
+        if not now.volume_ratio > 0.1:
             du = safe_fraction(problem, self.prepared, u, du) * du
             new = u + du
             now = self._balance(problem, new, u)
@@ -145,7 +176,7 @@ class StepSolver:
             return new, now, size
         share = 1.0
         for _ in range(_MAX_SHORTENINGS):
-            end = float(np.where(self.known, 0.0, np.asarray(now.residual)) @ du.ravel())
+            end = float(np.where(self.known, 0.0, now.residual) @ du.ravel())
             if not end > _SLOPE_TURNED * -slope:
                 break
             share *= slope / (slope - end)
@@ -158,4 +189,23 @@ class StepSolver:
         return Found(u, np.zeros(u.size), iterations, fresh, None, reason)
 
 
-_fixed = eqx.filter_jit(sparse.fix)
+class _Both:
+    """A symmetric matrix with both its triangles, for products on the host."""
+
+    def __init__(self, system: sparse.SparseSymmetric):
+        from scipy.sparse import csr_array
+
+        rows, cols = np.asarray(system.rows), np.asarray(system.cols)
+        off = np.flatnonzero(rows != cols)
+        number = np.concatenate([np.arange(len(rows)), off])
+        at = np.concatenate([rows, cols[off]]), np.concatenate([cols, rows[off]])
+        order = csr_array((number + 1.0, at), (system.size, system.size))
+        self._number = (order.data - 1).astype(np.int64)
+        self._csr, self._values = order, None
+
+    def fill(self, values: np.ndarray) -> None:
+        if self._values is None or not np.array_equal(values, self._values):
+            self._values, self._csr.data = values.copy(), values[self._number]
+
+    def __matmul__(self, x: np.ndarray) -> np.ndarray:
+        return self._csr @ x

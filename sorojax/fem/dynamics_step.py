@@ -32,8 +32,9 @@ class State(eqx.Module):
 
     `memory` holds the loads that remember, such as friction; `work` and `dissipated` [J] are
     what loads and supports gave and damping took since the start. `share` is the part of a
-    step that was taken last and `tangent` the matrix whose factor goes on being used, so
-    that a run that is cut in two repeats the whole one to the last bit.
+    step that was taken last, `tangent` the matrix whose factor goes on being used and
+    `listed` the displacement [m] that lists of near facets were made at, so that a run that
+    is cut in two repeats the whole one to the last bit.
     """
 
     time: Float[Array, ""]
@@ -45,6 +46,7 @@ class State(eqx.Module):
     dissipated: Float[Array, ""]
     share: Float[Array, ""]
     tangent: Float[Array, " nnz"] | None = None
+    listed: Float[Array, "nodes dim"] | None = None
 
 
 class Dynamics(eqx.Module):

@@ -27,7 +27,7 @@ from sorojax.fem.tensor import (
     volume_ratio,
     volume_slopes,
 )
-from sorojax.material.hyperelastic import AbstractHyperelastic
+from sorojax.material.hyperelastic import AbstractHyperelastic, finite_share
 from sorojax.material.kinematics import Entry
 
 
@@ -91,7 +91,12 @@ def _extrapolated_shape(body: Body, F, F_before, step, P) -> Entries:
         return second_piola(body.kinematics, F, shape_stress(body.material, body.kinematics, F))
 
     before, rate = jax.jvp(stress, (F_before,), (step,))
-    return before + rate - second_piola(body.kinematics, F, P)
+    S = before + rate - second_piola(body.kinematics, F, P)
+    share = finite_share(body.material)
+    if share is None:
+        return S
+    # cells of small strains may invert on the way, where S is infinite; theirs is exact
+    return jnp.where(jnp.broadcast_to(share > 0.9, S.shape[1:])[None], S, jnp.zeros_like(S))
 
 
 def _dilatation(body: Body, F: Entries) -> Entry:

@@ -77,6 +77,7 @@ def follow(problem: Problem, begin: Start, log: Log) -> np.ndarray:
     """Step from `begin` to `problem`, halving steps that fail."""
     prepared = prepare(problem)
     u, tangent, done, size, failures = begin.u, begin.tangent, 0.0, 1.0 / log.num_steps, 0
+    least = 0.99 * size / 2 ** (log.max_cuts + 1)
     while done < 1.0:
         goal = min(1.0, done + size) if done + size < 1.0 - 1e-9 else 1.0
         here = problem if goal == 1.0 else between(begin.problem, problem, goal)
@@ -85,10 +86,11 @@ def follow(problem: Problem, begin: Start, log: Log) -> np.ndarray:
         if result.reason:
             failures += 1
             log.cuts += 1
-            if failures > log.max_cuts:
+            size, tangent = (goal - done) / 2, None
+            # at a limit point single steps go on for ever, each shorter than the one before
+            if failures > log.max_cuts or size < least:
                 log.reason = result.reason
                 return u
-            size, tangent = (goal - done) / 2, None
             continue
         u, tangent, done, failures = result.u, result.linearised, goal, 0
         log.steps.append(

@@ -74,7 +74,7 @@ def _linearise(problem: Problem, prepared: Prepared, u, u_before) -> Linearised:
         problem.space, prepared.geometry, problem.material, problem.kinematics, u, u_before
     )
     residual, norm, largest, length = unbalanced(problem, prepared, body.force, u)
-    values = _add_load_stiffness(problem, prepared, u, body.values)
+    values = add_load_stiffness(problem, prepared, u, body.values)
     epsilon = 2 * jnp.finfo(u.dtype).eps
     return Linearised(
         residual=residual,
@@ -108,7 +108,8 @@ def _curved_groups(problem: Problem) -> list[Int[Array, "groups group_nodes"]]:
     return [part.groups for part in _curved_parts(problem)]
 
 
-def _add_load_stiffness(problem, prepared, u, values):
+def add_load_stiffness(problem: Problem, prepared: Prepared, u, values: Array) -> Array:
+    """Tangent `values` of the body with the stiffness of its loads."""
     for part, slots in zip(_curved_parts(problem), prepared.group_slots, strict=True):
         x = (problem.mesh.points + u)[part.groups]
         values = values.at[slots].add(group_matrices(part, x))

@@ -5,14 +5,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax._display import displayed, number
 from sorojax._types import real
 from sorojax.fem import spectrum
 from sorojax.fem.linear import linearise, prepare
 from sorojax.fem.mass import mass_matrix
+from sorojax.fem.modal_slopes import differentiable
 from sorojax.fem.problem import Problem
+from sorojax.fem.supports import known_dofs
 from sorojax.math import sparse
 
 
+@displayed
 class Modes(eqx.Module):
     """Shapes and eigenvalues about the equilibrium `displacement`, lowest first.
 
@@ -35,13 +39,19 @@ class Modes(eqx.Module):
         omega = jnp.sign(self.eigenvalues) * jnp.sqrt(jnp.abs(self.eigenvalues))
         return omega / (2 * jnp.pi)
 
+    def _text(self) -> str:
+        rows = (f"  {k + 1}: {number(f, 'Hz')}" for k, f in enumerate(self.frequencies))
+        return "\n".join([f"Modes: {len(self)}", *rows])
+
 
 def eigenmodes(
     problem: Problem, displacement: Float[Array, "nodes dim"] | None = None, count: int = 6
 ) -> Modes:
     """The lowest vibration modes about an equilibrium: K phi = omega^2 M phi.
 
-    K is the tangent there, load stiffness included, and may be indefinite.
+    K is the tangent there, load stiffness included, and may be indefinite. Eigenvalues and
+    shapes are differentiable in every number of the problem and in the displacement, so pass
+    that of `fem.solve` for derivatives that see the equilibrium move; outside `jit`.
 
     Args:
         problem: The body with the loads that hold it there.
@@ -51,9 +61,7 @@ def eigenmodes(
     Raises:
         ValueError: If the material has no density, or `count` is no possible number.
     """
-    return _modes(
-        "fem.eigenmodes", problem, displacement, count, np.asarray(mass_matrix(problem))
-    )
+    return _modes("fem.eigenmodes", problem, displacement, count, True)
 
 
 def tangent_modes(
@@ -70,22 +78,26 @@ def tangent_modes(
     Raises:
         ValueError: If `count` is no possible number.
     """
-    return _modes("fem.tangent_modes", problem, displacement, count, None)
+    return _modes("fem.tangent_modes", problem, displacement, count, False)
 
 
-def _modes(where: str, problem: Problem, displacement, count: int, mass) -> Modes:
+def _modes(where: str, problem: Problem, displacement, count: int, massive: bool) -> Modes:
     u = jnp.zeros_like(problem.mesh.points) if displacement is None else real(displacement)
     check_state(where, problem, u)
-    prepared = prepare(problem)
-    known = np.asarray(prepared.known)
+    known = known_dofs(problem.supports, *u.shape)
     free = int(np.sum(~known))
     if not 1 <= count <= free:
         raise ValueError(f"{where}: `count` is {count}, need 1 to {free}, the free unknowns.")
-    values = linearise(problem, prepared, u, u).values
-    pencil = spectrum.pencil(problem.space.system, values, known, mass)
-    eigenvalues, vectors = spectrum.lowest(pencil, count, mass)
-    shapes = vectors.reshape(count, *u.shape)
-    return Modes(problem, u, jnp.asarray(eigenvalues), jnp.asarray(_signed(shapes)))
+
+    def find(problem: Problem, u):
+        mass = mass_matrix(problem) if massive else None
+        values = linearise(problem, prepare(problem), u, u).values
+        pencil = spectrum.pencil(problem.space.system, values, known, mass)
+        eigenvalues, vectors = spectrum.lowest(pencil, count, mass)
+        shapes = _signed(vectors.reshape(count, *u.shape))
+        return jnp.asarray(eigenvalues), jnp.asarray(shapes)
+
+    return Modes(problem, u, *differentiable(where, find, problem, u, massive))
 
 
 def check_state(where: str, problem: Problem, u: Float[Array, "..."]) -> None:

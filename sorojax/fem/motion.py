@@ -7,6 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from sorojax._display import displayed, number, outcome
+from sorojax._types import is_traced
+from sorojax.fem.dynamics_lists import has_lists, lists_of, with_lists
 from sorojax.fem.dynamics_step import Dynamics, State, matter
 from sorojax.fem.energy_form import potential_energy
 from sorojax.fem.mass import mass_matrix
@@ -35,6 +38,7 @@ class Energies(eqx.Module):
         return self.kinetic + self.elastic + self.dissipated - self.work
 
 
+@displayed
 class Motion(eqx.Module):
     """States of a body in motion, and how the run ended.
 
@@ -80,11 +84,22 @@ class Motion(eqx.Module):
     @property
     def energies(self) -> Energies:
         """Energies at the saved times, computed when asked for."""
-        return _energies(self.dynamics, self.states, self.points)
+        problem, lists = self.problem, None
+        if has_lists(problem) and not is_traced((problem, self.displacements)):
+            lists = lists_of(problem, self.displacements)
+        return _energies(self.dynamics, self.states, self.points, lists)
+
+    def _text(self) -> str:
+        u = self.displacements
+        largest = number(jnp.max(jnp.sqrt(jnp.sum(u**2, axis=-1))), "m") if u.size else "none"
+        return (
+            f"Motion: {len(self)} saved states, {outcome(self.status)}, largest displacement "
+            f"{largest}\n  time {number(self.times, 's')}"
+        )
 
 
 @eqx.filter_jit
-def _energies(dynamics: Dynamics, states: State, points) -> Energies:
+def _energies(dynamics: Dynamics, states: State, points, lists) -> Energies:
     problem, mass = dynamics.problem, matter(dynamics).mass
     moving, rest = eqx.partition(states, eqx.is_inexact_array)
 
@@ -92,6 +107,7 @@ def _energies(dynamics: Dynamics, states: State, points) -> Energies:
         state, index = eqx.combine(row[0], rest), row[1]
         u, v = state.displacement, state.velocity.ravel()
         loads = _loads_at(dynamics, state, index)
+        loads = loads if lists is None else with_lists(loads, row[2])
         loaded = eqx.tree_at(lambda p: p.loads, body(problem), loads)
         return Energies(
             0.5 * jnp.sum(v * sparse.product(problem.space.system, mass, v)),
@@ -103,7 +119,7 @@ def _energies(dynamics: Dynamics, states: State, points) -> Energies:
             state.dissipated,
         )
 
-    return jax.lax.map(one, (moving, points))
+    return jax.lax.map(one, (moving, points, lists))
 
 
 def _loads_at(dynamics: Dynamics, state: State, index) -> tuple:

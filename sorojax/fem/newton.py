@@ -16,6 +16,7 @@ from sorojax.fem import assemble as asm
 from sorojax.fem.line_search import overshoots, share_of_step
 from sorojax.fem.linear import Linearised, Prepared, linearise, step
 from sorojax.fem.problem import Problem
+from sorojax.material.hyperelastic import finite_share
 
 
 class Newton(eqx.Module):
@@ -105,8 +106,9 @@ def _advance(problem: Problem, prepared: Prepared, u: np.ndarray, du: np.ndarray
 def safe_fraction(problem: Problem, prepared: Prepared, u: np.ndarray, du: np.ndarray) -> float:
     """Fraction of a step that keeps more than a tenth of every volume."""
     fraction = asm.largest_step(
-        problem.space, prepared.geometry, problem.kinematics, jnp.asarray(u), jnp.asarray(du)
-    )
+        problem.space, prepared.geometry, problem.kinematics, jnp.asarray(u), jnp.asarray(du),
+        share=finite_share(problem.material),
+    )  # fmt: skip
     return 0.9 * float(fraction)
 
 

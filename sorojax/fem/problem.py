@@ -5,6 +5,7 @@ import dataclasses
 import equinox as eqx
 
 from sorojax import _check
+from sorojax._display import displayed
 from sorojax.fem import checks, checks_loads
 from sorojax.fem.formulation import AbstractFormulation, default_formulation
 from sorojax.fem.kinematics import AbstractKinematics, Solid
@@ -15,6 +16,7 @@ from sorojax.material.hyperelastic import AbstractHyperelastic
 from sorojax.mesh.mesh import Mesh
 
 
+@displayed
 class Problem(eqx.Module):
     """A hyperelastic body, how it is held and what loads it.
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax import _check
+from sorojax._display import displayed, number, outcome
 from sorojax._progress import report
 from sorojax._types import is_traced, real
 from sorojax.fem.call import Solve
@@ -23,6 +24,7 @@ from sorojax.fem.traced import Begin
 from sorojax.math.status import Status
 
 
+@displayed
 class Solution(eqx.Module):
     """Displacement at equilibrium [m], or at the last converged fraction of the load.
 
@@ -39,7 +41,17 @@ class Solution(eqx.Module):
     load_fraction: Float[Array, ""] | None = None
     iterations: Int[Array, ""] | None = None
 
+    def _text(self) -> str:
+        u = self.displacement
+        largest = number(jnp.max(jnp.sqrt(jnp.sum(u**2, axis=-1))), "m")
+        rows = [f"Solution: {outcome(self.status)}, largest displacement {largest}"]
+        if self.iterations is not None:
+            part = number(self.load_fraction)
+            rows.append(f"  {number(self.iterations)} iterations, load fraction {part}")
+        return "\n".join(rows)
 
+
+@displayed
 class Path(eqx.Module):
     """Equilibria along a load path: `values` of the load `name`, one state for each.
 
@@ -57,6 +69,14 @@ class Path(eqx.Module):
 
     def __len__(self) -> int:
         return self.displacements.shape[0]
+
+    def _text(self) -> str:
+        u = self.displacements
+        largest = number(jnp.max(jnp.sqrt(jnp.sum(u**2, axis=-1))), "m") if u.size else "none"
+        return (
+            f"Path: {len(self)} states, {outcome(self.status)}, largest displacement "
+            f"{largest}\n  {self.name} {number(self.values)}"
+        )
 
 
 class ConvergenceError(RuntimeError):

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sorojax.fem.kinematics import AbstractKinematics
+from sorojax.fem.kinematics import AbstractKinematics, identity
 from sorojax.material.kinematics import Entry, Tensor, absent, determinant, minus, plus, times
 
 Entries = Float[Array, "entries quad lanes"]
@@ -34,6 +34,17 @@ def inverse(F: Tensor) -> Tensor:
 def volume_ratio(kinematics: AbstractKinematics, F: Entries) -> Entry:
     """J of the kept entries."""
     return determinant(kinematics.embed(tuple(F)))
+
+
+def checked_volume_ratio(
+    kinematics: AbstractKinematics, F: Entries, share: Float[Array, "..."] | None
+) -> Entry:
+    """J of F = I + `share` Grad u: the volume that a solver keeps from inverting."""
+    if share is None:
+        return volume_ratio(kinematics, F)
+    rest = jnp.asarray(identity(kinematics), F.dtype)[:, None, None]
+    share = share if jnp.ndim(share) == 0 else share[None]
+    return volume_ratio(kinematics, rest + share * (F - rest))
 
 
 def volume_slopes(kinematics: AbstractKinematics, F: Entries) -> Entries:

@@ -19,6 +19,7 @@ from sorojax.fem.linear import Linearised, Prepared, constrain, linearise
 from sorojax.fem.newton import Newton
 from sorojax.fem.problem import Problem
 from sorojax.fem.supports import known_components, known_values
+from sorojax.material.hyperelastic import finite_share
 from sorojax.math import sparse
 
 
@@ -214,7 +215,8 @@ def _next(problem, prepared, state: _State, level: _Level, max_cuts: int) -> _St
     def shorter():
         du = state.u - state.before
         args = (problem.space, prepared.geometry, problem.kinematics, state.before, du)
-        return state.before + 0.9 * asm.largest_step(*args) * du
+        share = finite_share(problem.material)
+        return state.before + 0.9 * asm.largest_step(*args, share=share) * du
 
     short = jax.lax.cond(level.collapsed, shorter, lambda: state.u)
     new = state.u + level.du

@@ -86,6 +86,27 @@ def load(
     return jax.tree_util.tree_map_with_path(put, like)
 
 
+def leaves(
+    path: str | os.PathLike,
+    *,
+    root: str | os.PathLike | None = None,
+    max_bytes: int = _files.MAX_BYTES,
+) -> dict[str, np.ndarray]:
+    """The arrays of a file of `save` by name, to look into it without the noun.
+
+    Args:
+        path: File name.
+        root: Folder that the file must lie in.
+        max_bytes: Larger files, and files that unpack to more, are refused.
+
+    Raises:
+        ValueError: If the file is damaged or newer than this version.
+    """
+    target = _files.inside("io.leaves", path, root)
+    header, arrays = _unpack(target, _files.read("io.leaves", target, max_bytes), max_bytes)
+    return dict(zip(header["leaves"], arrays, strict=True))
+
+
 def _leaves(tree: Any) -> dict[str, Any]:
     pairs = jax.tree_util.tree_flatten_with_path(eqx.filter(tree, eqx.is_array))[0]
     return {jax.tree_util.keystr(where): leaf for where, leaf in pairs}

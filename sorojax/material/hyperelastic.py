@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sorojax._display import displayed
 from sorojax.material import checks
 from sorojax.material.kinematics import Entry, Tensor, determinant, from_matrix
 
 
+@displayed
 class AbstractHyperelastic(eqx.Module):
     """A stored energy per reference volume, isochoric plus volumetric.
 
@@ -72,6 +74,13 @@ def elasticity_tensor(
 def first_invariant_energy(material: AbstractHyperelastic) -> Callable[[Entry], Entry] | None:
     """The isochoric energy as a function of I1_bar - 3, `None` where it is not one."""
     return getattr(material, "first_invariant_energy", None)
+
+
+@functools.singledispatch
+def finite_share(material: AbstractHyperelastic) -> Float[Array, "..."] | None:
+    """Share of the displacement gradient whose finite strain is stored, `None` for all of
+    it: cells without any may invert."""
+    return None
 
 
 @functools.singledispatch

@@ -24,6 +24,7 @@ from sorojax.units import kPa
 MARECHAL = "Marechal et al. 2021, doi:10.1089/soro.2019.0115, ODbL 1.0 / DbCL 1.0"
 SOROTOKI = "Sorotoki, Caasenbrood, MIT licence"
 FORMLABS = "Formlabs data sheet of Flexible 80A: 6.3 MPa at 100 %, 8.9 MPa at 120 %"
+ASSUMED = FORMLABS + "; assumed: through both points, none measured below 100 %"
 
 #: Engineering strain [-] and engineering stress [Pa].
 DRAGON_SKIN_30_POINTS = (
@@ -125,6 +126,7 @@ PRESETS = (
     Preset("sorotoki_tpu_90", NeoHookean, (2.464e6,), 1070.0, SOROTOKI,
            bulk_modulus=11.5e6),
     Preset("elastic_80a", NeoHookean, (4.088e6,), None, FORMLABS, (1.0, 1.2), 0.104),
+    Preset("flexible_80a", Yeoh, (645.6e3, 288.6e3, 0.0), None, ASSUMED, (1.0, 1.2), 1e-4),
 )
 # fmt: on
 
@@ -197,3 +199,10 @@ def dragon_skin_20(*, poisson_ratio: float = 0.49) -> Yeoh:
 def dragon_skin_30(*, poisson_ratio: float = 0.49) -> Yeoh:
     """Yeoh fit of Smooth-On Dragon Skin 30 for strains up to 300 %."""
     return rubber("dragon_skin_30", poisson_ratio=poisson_ratio)
+
+
+def flexible_80a(*, poisson_ratio: float = 0.49) -> Yeoh:
+    """Formlabs Flexible 80A: an assumption, not a fit. Two moduli through the two points of
+    the maker's data sheet, 6.3 MPa at 100 % and 8.9 MPa at 120 % where it breaks; nothing
+    public says how stiff it is below. Stands for Elastic 80A, of which no data are public."""
+    return rubber("flexible_80a", poisson_ratio=poisson_ratio)

@@ -22,12 +22,15 @@ class Step(NamedTuple):
         error: Estimate of its error, of the structure of y; None where a method has none.
         memory: What the next step may start from.
         dense: What the interpolation within the step needs.
+        converged: Whether equations were solved, in a method that has some to solve. Where
+            they were not, y is the state before the step.
     """
 
     y: PyTree
     error: PyTree | None
     memory: PyTree
     dense: dict[str, PyTree]
+    converged: Any = True
 
 
 class AbstractMethod(dfx.AbstractSolver):
@@ -54,6 +57,12 @@ class AbstractMethod(dfx.AbstractSolver):
         """Whether one memory serves a whole run of fixed steps."""
         return False
 
+    @property
+    def carries(self) -> bool:
+        """Whether the memory goes on through a whole run of fixed steps, as a state does.
+        Such a method answers for its own failures: what it yields is finite."""
+        return False
+
     def order(self, terms) -> int:
         return self.num_order
 
@@ -61,19 +70,27 @@ class AbstractMethod(dfx.AbstractSolver):
         return terms.vf(t0, y0, args)
 
     def init(self, terms, t0, t1, y0, args):
-        return self.begin(_field(terms, args), jnp.asarray(t0), y0, jnp.asarray(t1 - t0))
+        """What the first step starts from, twice: the solver keeps what its next step and
+        what its last step started from, so that a run may go on from within a step."""
+        now = self.begin(_field(terms, args), jnp.asarray(t0), y0, jnp.asarray(t1 - t0))
+        return now, now
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         t, h = jnp.asarray(t0), jnp.asarray(t1 - t0)
-        memory = solver_state
+        now, _ = solver_state
         if made_jump is not False:
             field = _field(terms, args)
-            memory = jax.lax.cond(
-                made_jump, lambda: self.begin(field, t, y0, h), lambda: solver_state
+            now = jax.lax.cond(
+                made_jump, lambda: self.begin(field, t, y0, h), lambda: solver_state[0]
             )
-        new = guarded(_advance, (self, terms, args, t, y0, memory), h)
+        new = guarded(_advance, (self, terms, args, t, y0, now), h)
         dense = {"y0": y0, "y1": new.y} | new.dense
-        return new.y, new.error, dense, new.memory, dfx.RESULTS.successful
+        if new.converged is True:
+            return new.y, new.error, dense, (new.memory, now), dfx.RESULTS.successful
+        ended = dfx.RESULTS.where(
+            new.converged, dfx.RESULTS.successful, dfx.RESULTS.nonlinear_divergence
+        )
+        return new.y, new.error, dense, (new.memory, now), ended
 
 
 def repeat(
@@ -86,14 +103,34 @@ def repeat(
     memory: PyTree = None,
 ) -> PyTree:
     """y after `count` steps of `h` from `t`, with a memory made anew if none is given."""
+    return repeated(method, field, t, y, h, count, memory)[0]
+
+
+def repeated(
+    method: AbstractMethod,
+    field: Field,
+    t: Time,
+    y: PyTree,
+    h: Time,
+    count: int,
+    memory: PyTree = None,
+) -> tuple[PyTree, PyTree, Array]:
+    """As `repeat`, with the memory at the end and whether all steps converged; the first
+    that does not is the last one taken."""
     memory = method.begin(field, t, y, h) if memory is None else memory
 
     def one(k, carry):
-        y, memory = carry
+        y, memory, good = carry
         new = method.advance(field, t + k.astype(h.dtype) * h, y, h, memory)
-        return new.y, new.memory
+        if new.converged is True:
+            return new.y, new.memory, good
+        fine = good & new.converged
+        taken = jax.tree.map(
+            lambda a, b: jnp.where(fine, a, b), (new.y, new.memory), (y, memory)
+        )
+        return (*taken, fine)
 
-    return jax.lax.fori_loop(0, count, one, (y, memory))[0]
+    return jax.lax.fori_loop(0, count, one, (y, memory, jnp.array(True)))
 
 
 def finite(tree: PyTree) -> Array:
@@ -102,8 +139,18 @@ def finite(tree: PyTree) -> Array:
     return jnp.all(jnp.stack(leaves)) if leaves else jnp.array(True)
 
 
+class _Rate(eqx.Module):
+    """The field of diffrax terms, with all that it depends on as leaves."""
+
+    terms: dfx.AbstractTerm
+    args: Any
+
+    def __call__(self, t, y):
+        return self.terms.vf(t, y, self.args)
+
+
 def _field(terms: dfx.AbstractTerm, args: Any) -> Field:
-    return lambda t, y: terms.vf(t, y, args)
+    return _Rate(terms, args)
 
 
 def _advance(given, h) -> Step:

@@ -92,19 +92,23 @@ def linearised(problem: SecondOrder, t, q: Array, v: Array) -> tuple[Array, ...]
 class GeneralisedAlpha(AbstractStepper):
     """Generalised-alpha with approximate Newton passes: implicit, second order.
 
+    Its cost is known beforehand. `math.alpha.GeneralisedAlpha`, for any y' = f(t, y), solves
+    every step to a tolerance, with line search, and cuts steps that do not converge.
+
     Attributes:
-        spectral_radius: At infinite frequency, 1 keeps and 0 kills fast modes [-].
+        rho_inf: What an oscillation much faster than the step keeps of its size in one
+            step: 1 keeps and 0 kills fast modes [-].
         passes: Newton passes per step; 2 are as good as 3 on soft rods.
 
     Reference:
         Chung and Hulbert, J. Appl. Mech. 60, 1993.
     """
 
-    spectral_radius: Float[Array, ""] = eqx.field(converter=real, default=0.8)
+    rho_inf: Float[Array, ""] = eqx.field(converter=real, default=0.5)
     passes: int = eqx.field(static=True, default=2)
 
     def step(self, problem, t, h, state):
-        rho = self.spectral_radius
+        rho = self.rho_inf
         am, af = (2 * rho - 1) / (rho + 1), rho / (rho + 1)
         gamma = 1 / 2 + af - am
         beta = (gamma + 1 / 2) ** 2 / 4

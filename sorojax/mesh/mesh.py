@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sorojax._display import displayed, number
 from sorojax._types import integers, is_traced, real
 from sorojax.mesh.elements import AbstractElement, facet_corners
 
@@ -15,6 +16,7 @@ def _int_sets(sets: dict[str, Any]) -> dict[str, jax.Array]:
     return {name: integers(ids) for name, ids in sets.items()}
 
 
+@displayed
 class Mesh(eqx.Module):
     """Cells of one element type over points, in the reference configuration.
 
@@ -65,6 +67,22 @@ class Mesh(eqx.Module):
     @property
     def num_cells(self) -> int:
         return self.cells.shape[0]
+
+    def _text(self) -> str:
+        count = f"Mesh: {self.num_cells} {self.element.name} cells, {self.num_nodes} nodes"
+        box = (f"{axis} {number(self.points[:, k])}" for k, axis in
+               zip(range(self.element.dim), "xyz", strict=False))  # fmt: skip
+        rows = [count, f"  box [m]     {', '.join(box)}"]
+        kinds = {
+            "node sets": self.node_sets,
+            "facet sets": self.facet_sets,
+            "regions": self.regions,
+        }
+        for kind, sets in kinds.items():
+            if sets:
+                named = (f"{name} ({ids.shape[0]})" for name, ids in sets.items())
+                rows.append(f"  {kind:<11} {', '.join(named)}")
+        return "\n".join(rows)
 
 
 def boundary_facets(mesh: Mesh) -> Int[np.ndarray, "facets facet_nodes"]:

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from sorojax import _check
+from sorojax._progress import report
 from sorojax._types import real
 from sorojax.math.spatial import KDTree
 from sorojax.mesh.convex import convex_parts
@@ -96,6 +97,7 @@ def _lloyd(shape, cloud, area: float, seeds, iterations: int, on_step) -> np.nda
         seeds = np.where((values(shape, centre) < 0)[:, None], centre, seeds)
         if step in _EXCHANGES and step < iterations - 10:
             seeds = _exchanged(seeds, weight)
+        report("polymesher", step + 1, iterations, uneven=error)
         if on_step is not None:
             on_step(step, error)
         if error < _EVEN and (step > _EXCHANGES[-1] or iterations <= _EXCHANGES[-1]):

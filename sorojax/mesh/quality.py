@@ -85,6 +85,13 @@ def _volume(shape: AbstractSdf):
     return volume(shape)
 
 
+def cell_ratios(mesh: Mesh) -> np.ndarray:
+    """The number of each cell that `Quality.mean_radius_ratio` is the mean of; 0 where a cell
+    has no positive area (volume)."""
+    parts = cell_areas(mesh) if mesh.element.dim == 2 else cell_volumes(mesh)
+    return np.where(np.asarray(parts) > 0, _angles_and_ratios(mesh)[2], 0.0)
+
+
 def is_watertight(mesh: Mesh) -> bool:
     """Whether no facet has more than two cells and the boundary closes on itself."""
     if facet_table(mesh)[2].max(initial=0) > 2:

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sorojax._progress import report
 from sorojax.mesh.features import Features
 from sorojax.mesh.settle import normals_near, settle
 from sorojax.mesh.tet_shape import badness
@@ -53,6 +54,7 @@ def improve(surface: Surface, points, cells, rounds: int, enough: float) -> np.n
         better = worst[best, np.arange(len(movers))] < worst[0] - 1e-9
         points[movers[better]] = places[best, np.arange(len(movers))][better]
         bad[ball] = badness(points[cells[ball]])
+        report("tetrahedralise", i + 1, rounds, moved=int(better.sum()))
     return points
 
 

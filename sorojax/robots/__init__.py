@@ -2,8 +2,31 @@
 
 from sorojax.robots.bellows import BellowsActuator as BellowsActuator
 from sorojax.robots.bending import BendingActuator as BendingActuator
+from sorojax.robots.crawler import (
+    Crawler as Crawler,
+    crawler_gait as crawler_gait,
+    crawler_problem as crawler_problem,
+    crawler_rubbers as crawler_rubbers,
+)
 from sorojax.robots.finger import Finger as Finger
 from sorojax.robots.hand import Hand as Hand
 from sorojax.robots.manipulator import Manipulator as Manipulator
+from sorojax.robots.models import (
+    bench as bench,
+    model as model,
+    printed_rubber as printed_rubber,
+)
+from sorojax.robots.models_cell import Cell as Cell, unit_cell as unit_cell
+from sorojax.robots.models_supply import (
+    Model as Model,
+    Supply as Supply,
+    stepper as stepper,
+)
 from sorojax.robots.parts import Bellows as Bellows
 from sorojax.robots.planar import PlanarActuator as PlanarActuator
+from sorojax.robots.walker import (
+    Walker as Walker,
+    pair_angles as pair_angles,
+    walker_problem as walker_problem,
+    walker_rubber as walker_rubber,
+)

@@ -13,7 +13,7 @@ from sorojax.units import deg, mm
 
 
 class Hand(eqx.Module):
-    """Dimensions [m] and angles [rad] of a right hand, palm down, fingers along y.
+    """Dimensions [m] and angles [rad] of a left hand, palm down, fingers along y.
 
     About 190 x 100 x 40 mm: fingers of 90 mm, a thumb of 80 mm. The fingers bend towards
     -z and take -10 to 60 kPa; their ports open on the back of the hand.
@@ -45,18 +45,26 @@ class Hand(eqx.Module):
                 "Lengths are in metres: write 90 * mm.",
             )  # fmt: skip
 
+    def places(self) -> dict[str, tuple[Float[Array, "3"], Float[Array, ""]]]:
+        """Where each finger has its foot [m], and its angle about z [rad]."""
+        number = jnp.arange(4).astype(self.palm_width.dtype) - 1.5
+        zero = jnp.zeros_like(self.palm_width)
+        foot = self.palm_length - self.socket_depth
+        side = self.palm_width / 2 - self.socket_depth
+        found = {"thumb": (jnp.stack([side, self.thumb_height, zero]), -self.thumb_angle)}
+        for k, name in ((3, "index"), (2, "middle"), (1, "ring"), (0, "little")):
+            place = jnp.stack([number[k] * self.finger_spacing, foot, zero])
+            found[name] = (place, -number[k] * self.splay)
+        return found
+
     def _each(self, finger_part: AbstractSdf, thumb_part: AbstractSdf) -> AbstractSdf:
         """Parts of a standing finger and thumb, where the five of them belong."""
-        number = jnp.arange(4).astype(self.palm_width.dtype) - 1.5
-        zero = jnp.zeros_like(number)
-        foot = zero + self.palm_length - self.socket_depth
-        places = jnp.stack([number * self.finger_spacing, foot, zero], axis=-1)
+        places = self.places()
+        place, angle = places.pop("thumb")
+        feet, angles = (jnp.stack(column) for column in zip(*places.values(), strict=True))
         # Laid along y, the spine of a standing finger comes to lie at -z.
-        fingers = Placed(LaidAlong(finger_part, 1), -number * self.splay, places)
-        side = self.palm_width / 2 - self.socket_depth
-        place = jnp.stack([side, self.thumb_height, jnp.zeros_like(side)])
-        thumb = rotate(LaidAlong(thumb_part, 1), -self.thumb_angle)
-        return fingers | translate(thumb, place)
+        fingers = Placed(LaidAlong(finger_part, 1), angles, feet)
+        return fingers | translate(rotate(LaidAlong(thumb_part, 1), angle), place)
 
     def fingers(self) -> AbstractSdf:
         """The four fingers and the thumb without their hollows."""

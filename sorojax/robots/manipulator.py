@@ -55,7 +55,12 @@ class Manipulator(eqx.Module):
     @property
     def length(self) -> Float[Array, ""]:
         """Height of the upper plate's upper side."""
-        return self.bellows.length + self.plate_thickness
+        return self.bellows.length - self.bellows.cap / 2 + self.plate_thickness
+
+    @property
+    def finger_foot(self) -> Float[Array, ""]:
+        """Height of the feet of the fingers: half of their caps lies in the plate."""
+        return self.length - self.finger.bellows.cap / 2
 
     def _around(self, part: AbstractSdf, distance, height, phase: float) -> AbstractSdf:
         """Three copies of `part`, moved outwards along x and up, then turned about z."""
@@ -77,10 +82,10 @@ class Manipulator(eqx.Module):
         ring = translate(
             Torus(self.finger_distance, self.port_radius), jnp.stack([zero, zero, ring_height])
         )
-        down = jnp.stack([zero, zero, -self.plate_thickness / 2])
-        riser = pipe(self.port_radius, down, self.plate_thickness / 2 + 2 * cap, 2)
+        down = ring_height - self.finger_foot
+        riser = pipe(self.port_radius, jnp.stack([zero, zero, down]), 2 * cap - down, 2)
         fingers = self._around(
-            self.finger.chamber() | riser, self.finger_distance, self.length, np.pi / 3
+            self.finger.chamber() | riser, self.finger_distance, self.finger_foot, np.pi / 3
         )
         inlet = pipe(
             self.port_radius, jnp.stack([zero, zero, ring_height]), self.finger_distance, 0
@@ -103,7 +108,7 @@ class Manipulator(eqx.Module):
         zero = jnp.zeros_like(self.core_radius)
         bellows = self._around(self.bellows.solid(), self.center_distance, 0.0, 0.0)
         fingers = self._around(
-            self.finger.solid(), self.finger_distance, self.length, np.pi / 3
+            self.finger.solid(), self.finger_distance, self.finger_foot, np.pi / 3
         )
         below = jnp.stack([zero, zero, -2 * self.plate_thickness])
         core = pipe(self.core_radius, below, self.length + 4 * self.plate_thickness, 2)

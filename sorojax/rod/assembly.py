@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._display import displayed
 from sorojax._types import optional_real, real
 from sorojax.rod.joint import AbstractJoint, Fixed, Group
 from sorojax.rod.link import Link
@@ -37,6 +38,7 @@ class Part(eqx.Module):
             raise ValueError(f"Part: `s` is {self.s}, need a point of the rod in [0, 1].")
 
 
+@displayed
 class Assembly(eqx.Module):
     """A tree of parts. The coordinates are those of the parts in their order: of the joint,
     then of the rod.
@@ -59,6 +61,14 @@ class Assembly(eqx.Module):
 
     def __getitem__(self, name: str) -> Part:
         return self.parts[index_of(self, name)]
+
+    def _text(self) -> str:
+        rows = [f"Assembly in {type(self.group).__name__}: {num_coordinates(self)} coordinates"]
+        for name, part in zip(self.names, self.parts, strict=True):
+            where = f"on {part.on}" if part.on else "on the ground"
+            kind, joint = type(part.body).__name__, type(part.joint).__name__
+            rows.append(f"  {name}: {kind}, {joint} joint {where}")
+        return "\n".join(rows)
 
 
 class Slices(NamedTuple):

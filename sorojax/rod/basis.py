@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax._display import displayed
+
 Points: TypeAlias = Float[Array, " points"] | np.ndarray
 
 STRAINS = ("kappa_x", "kappa_y", "kappa_z", "sigma_x", "sigma_y", "sigma_z")
@@ -43,6 +45,7 @@ class AbstractModes(eqx.Module):
         """Values at `s`; a NumPy `s` may give NumPy values, which become constants."""
 
 
+@displayed
 class StrainBasis(eqx.Module):
     """Modes of each active strain; a strain that is not named has no coordinate.
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._display import displayed, number
 from sorojax._types import optional_real, real
 from sorojax.material.hyperelastic import AbstractHyperelastic, small_strain_moduli
 from sorojax.math.lie import SE2, SE3
@@ -61,6 +62,7 @@ def elastic(material: AbstractHyperelastic) -> Elastic:
     return Elastic(young, young / (2 * shear) - 1, material.density)
 
 
+@displayed
 class Rod(eqx.Module, Generic[G]):
     """A Cosserat rod clamped at its base, whose strains are affine in coordinates q.
 
@@ -114,6 +116,18 @@ class Rod(eqx.Module, Generic[G]):
         breaks = self.basis.breaks
         breaks = merged(breaks, self.breaks) if self.breaks else breaks
         return Quadrature(self.nodes // (len(breaks) + 1), breaks)
+
+    def _text(self) -> str:
+        modes = ", ".join(f"{name} {m.count}" for name, m in self.basis.modes.items())
+        section, material = self.section, self.material
+        return (
+            f"Rod in {type(self.group).__name__}: length {number(self.length, 'm')}, modes "
+            f"{modes}, {self.nodes} nodes\n"
+            f"  section   area {number(section.area, 'm^2')}, second moments y "
+            f"{number(section.second_moment_y)}, z {number(section.second_moment_z, 'm^4')}\n"
+            f"  material  E {number(material.young_modulus, 'Pa')}, nu "
+            f"{number(material.poisson_ratio)}, density {number(material.density, 'kg/m^3')}"
+        )
 
 
 def rod(

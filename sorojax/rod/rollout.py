@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sorojax._display import displayed, number, outcome
 from sorojax._types import real
 from sorojax.math.contact_stepper import ContactMidpoint
 from sorojax.math.status import Status
@@ -26,6 +27,7 @@ from sorojax.rod.model import Model, inertia, motion, operators
 from sorojax.rod.rod import Rod
 
 
+@displayed
 class Rollout(eqx.Module):
     """A motion sampled in time: time [s], coordinates and their rates."""
 
@@ -33,6 +35,12 @@ class Rollout(eqx.Module):
     q: Float[Array, "time coordinates"]
     v: Float[Array, "time dof"]
     status: Status
+
+    def _text(self) -> str:
+        return (
+            f"Rollout: {self.time.shape[0]} saved moments of {self.q.shape[-1]} coordinates, "
+            f"{outcome(self.status)}\n  time {number(self.time, 's')}, q {number(self.q)}"
+        )
 
 
 def rollout(

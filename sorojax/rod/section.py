@@ -10,9 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._display import displayed
 from sorojax._types import optional_real, real
 
 
+@displayed
 class Section(eqx.Module):
     """Constants of a cross-section in its local y-z plane; the rod axis is local x.
 

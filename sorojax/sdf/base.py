@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Shaped
 
 from sorojax import _check
+from sorojax._display import displayed
 from sorojax._types import real
 
 Box = tuple[Float[Array, " dim"], Float[Array, " dim"]]
@@ -30,6 +31,7 @@ EXACT = Exactness(outside=True, inside=True)
 BOUND = Exactness(outside=False, inside=False)
 
 
+@displayed
 class AbstractSdf(eqx.Module):
     """An implicit shape: a field that is negative inside and zero on the surface.
 

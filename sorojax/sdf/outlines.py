@@ -39,7 +39,7 @@ class Outlines(AbstractPlaneShape):
 
     def distance(self, x, y):
         following = np.arange(1, self.vertices.shape[0] + 1)
-        following[np.append(self.starts[1:], len(following)) - 1] = self.starts
+        following[np.array([*self.starts[1:], len(following)]) - 1] = self.starts
         table = (self.vertices, self.vertices[following])
         square, cross = lambda row, *x: segment_square(x, *row), _crossing
         index, crossings = scan_rows(square, table, (x, y), cross)

@@ -1,5 +1,6 @@
 """Systems: blocks with ports, networks of them, and their simulation."""
 
+from sorojax.math.alpha import GeneralisedAlpha as GeneralisedAlpha
 from sorojax.math.explicit import (
     RungeKutta4 as RungeKutta4,
     SemiImplicitEuler as SemiImplicitEuler,
@@ -26,8 +27,16 @@ from sorojax.systems.controller import (
     AbstractController as AbstractController,
     PIDMemory as PIDMemory,
 )
+from sorojax.systems.coupled import Coupled as Coupled
 from sorojax.systems.event import Event as Event, Happened as Happened
+from sorojax.systems.fem_body import FemBody as FemBody
 from sorojax.systems.fluidic import Regulator as Regulator, Reservoir as Reservoir
+from sorojax.systems.modal_basis import Basis as Basis, modal_basis as modal_basis
+from sorojax.systems.modal_body import (
+    ModalBody as ModalBody,
+    displacement as displacement,
+    reduced as reduced,
+)
 from sorojax.systems.model_control import (
     CartesianImpedance as CartesianImpedance,
     Compensation as Compensation,

@@ -122,9 +122,10 @@ def _two_passes(run, designs) -> Trajectory:
     def go(design, solver, control, most) -> Motion:
         network = make(design)
         state = network.initial_state()
-        return adaptive(
+        motion = adaptive(
             network, inputs, state, time, solver, control, max_steps=most, adjoint=adjoint
         )
+        return motion._replace(memory=None)  # which differs between the methods
 
     cap = _cap(lambda design: go(design, cheap, control, cheap_steps), designs, cheap_steps)
     capped = eqx.tree_at(lambda c: c.tries, control, cap, is_leaf=lambda x: x is None)

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import equinox as eqx
 from jaxtyping import Array, Float, PyTree
 
+from sorojax._display import displayed
+
 
 class Input(NamedTuple):
     """An input port.
@@ -40,6 +42,7 @@ class Output(NamedTuple):
 Signals = Mapping[str, Array]
 
 
+@displayed
 class AbstractBlock(eqx.Module):
     """x' = f(t, x, u), y = g(t, x, u), with ports that may depend on what is listed."""
 

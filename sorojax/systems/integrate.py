@@ -11,11 +11,14 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from sorojax.math.method import AbstractMethod, finite, guarded, repeat
+from sorojax.math.control import Control, Seam
+from sorojax.math.method import AbstractMethod
 from sorojax.math.status import Status
 from sorojax.systems.block import AbstractBlock
 from sorojax.systems.network import at_time
 from sorojax.systems.progress import Meter
+
+_FAR = 1e30  # s, beyond the end of every run
 
 
 class Motion(NamedTuple):
@@ -38,6 +41,13 @@ class Motion(NamedTuple):
     triggered: Bool[Array, " events"]
     dense: Any
     memory: Any = None
+
+
+class Resume(NamedTuple):
+    """From where a run goes on: the last step, and the memory of the method before it."""
+
+    seam: Seam
+    memory: Any
 
 
 class FlatField(eqx.Module):
@@ -78,102 +88,78 @@ def adaptive(
     conditions: Conditions = _NO_CONDITIONS,
     dense: bool = False,
     progress: bool = False,
+    seam: Resume | None = None,
 ) -> Motion:
     """Run from `start`, by default time[0], to time[-1]; what the grid holds before `start`
-    is the first state."""
+    is the first state. With a `seam` go on from there.
+
+    Steps are not shortened to end at time[-1], which is interpolated, unless there are
+    conditions: so that a run that is cut in two takes the steps of the whole one.
+    """
     start = time[0] if start is None else start
     flat, unravel = ravel_pytree(state)
     inputs = explicit_inputs(inputs, start)
+    control, end = flat_tolerances(control, state), time[-1]
+    free = isinstance(control, Control) and not conditions.signals
+    further = {}
+    if free:
+        longest = jnp.min(jnp.diff(time))
+        control = control.to_end(time[-1], longest)
+        end = jnp.full_like(end, _FAR)
+    if seam is not None:
+        start, flat = seam.seam.time, seam.seam.state
+        further = {"dt0": seam.seam.step, "controller_state": control.begun(seam.seam)}
+        further["solver_state"] = None if seam.memory is None else (seam.memory, seam.memory)
     solution = dfx.diffeqsolve(
         dfx.ODETerm(FlatField(unravel)),
         solver,
         start,
-        time[-1],
-        None,
+        end,
+        further.pop("dt0", None),
         flat,
         args=(block, inputs, _sides(conditions, block, inputs, state, start)),
         saveat=dfx.SaveAt(
             subs=[dfx.SubSaveAt(ts=jnp.maximum(time, start)), dfx.SubSaveAt(t1=True)],
             dense=dense,
+            solver_state=free,
+            controller_state=free,
         ),
-        stepsize_controller=flat_tolerances(control, state),
+        stepsize_controller=control,
         max_steps=max_steps,
         adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
         event=_event(conditions, unravel),
         throw=False,
-        progress_meter=Meter() if progress else dfx.NoProgressMeter(),
+        progress_meter=Meter(start, end, time[-1]) if progress else dfx.NoProgressMeter(),
+        **further,
     )
     assert solution.ys is not None and solution.ts is not None
     saved = jnp.isfinite(solution.ts[0])
     last = solution.ys[1][0]
     path = jnp.where(saved[:, None], solution.ys[0], last)
+    reached, status = solution.ts[1][0], _status(solution.result)
+    if free:  # the last step may have gone further
+        last = jnp.where(saved[-1], path[-1], last)
+        reached = jnp.minimum(reached, time[-1])
     masks = jax.tree.leaves(solution.event_mask)
     triggered = jnp.stack(masks) if masks else jnp.zeros(0, bool)
     return Motion(
         jax.vmap(unravel)(path),
         unravel(last),
-        solution.ts[1][0],
-        _status(solution.result),
+        reached,
+        status,
         jnp.asarray(solution.stats["num_steps"]),
         jnp.asarray(solution.stats["num_rejected_steps"]),
         triggered,
         solution.interpolation,
+        _seam(solution, solver) if free else None,
     )
 
 
-def fixed(
-    block: AbstractBlock,
-    inputs: Mapping[str, Any],
-    state: PyTree,
-    time: Float[Array, " time"],
-    interval: Float[Array, ""],
-    method: AbstractMethod,
-    substeps: int,
-    memory: Any = None,
-) -> Motion:
-    """Run by `substeps` steps in every interval between saved instants."""
-    inputs = explicit_inputs(inputs, time[0])
-    move = interval_of(substeps)
-    if memory is None:
-        memory = move.begin((method, block, inputs, time[0], state), interval)
-
-    def advance(carry, t):
-        state, good, reached = carry
-        new = guarded(move, (method, block, inputs, t, state, memory), interval)
-        good = good & finite(new)
-        state = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, state)
-        reached = jnp.where(good, t + interval, reached)
-        return (state, good, reached), state
-
-    start = (state, finite(state), time[0])
-    (last, good, reached), path = jax.lax.scan(advance, start, time[:-1])
-    path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state, path)
-    status = Status.where(good, Status.successful, Status.not_finite)
-    steps = jnp.asarray(substeps * (time.shape[0] - 1))
-    none = jnp.zeros(0, bool)
-    return Motion(path, last, reached, status, steps, jnp.zeros_like(steps), none, None, memory)
-
-
-class interval_of(eqx.Module):
-    """Moves a state by a number of steps that share an interval."""
-
-    substeps: int = eqx.field(static=True)
-
-    def begin(self, given, interval):
-        """What the method keeps for the whole run, if it does."""
-        method, block, inputs, t, state = given
-        if not method.keeps:
-            return None
-        return method.begin(_rate(block, inputs), t, state, interval / self.substeps)
-
-    def __call__(self, given, interval):
-        method, block, inputs, t, state, memory = given
-        h = interval / self.substeps
-        return repeat(method, _rate(block, inputs), t, state, h, self.substeps, memory)
-
-
-def _rate(block: AbstractBlock, inputs: Mapping[str, Any]):
-    return lambda t, state: block.vector_field(t, state, at_time(inputs, t))
+def _seam(solution: dfx.Solution, solver: dfx.AbstractSolver) -> Resume:
+    """Where the last step began, and what it began with."""
+    own = isinstance(solver, AbstractMethod)
+    memory = solution.solver_state[1] if own else None
+    return jax.lax.stop_gradient(Resume(solution.controller_state.last, memory))
 
 
 def explicit_inputs(inputs: Mapping[str, Any], t) -> dict[str, Any]:

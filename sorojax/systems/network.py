@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from sorojax._display import displayed
 from sorojax.systems.block import AbstractBlock, Input, Output, Signals
 from sorojax.systems.loops import consistent, torn_wires
 from sorojax.systems.schedule import check_wires, evaluation_order, reachable_inputs
@@ -18,6 +19,7 @@ def _pairs(wires: Mapping[str, str] | tuple) -> tuple[tuple[str, str], ...]:
     return tuple(sorted((str(a), str(b)) for a, b in items))
 
 
+@displayed
 class Network(AbstractBlock):
     """Blocks side by side, their inputs wired to outputs.
 
@@ -77,11 +79,14 @@ class Network(AbstractBlock):
         return _signals(self, t, state, inputs)[name]
 
     def vector_field(self, t, state, inputs: Signals | None = None) -> dict[str, PyTree]:
-        signals = _signals(self, t, state, inputs or {})
-        return {
-            name: block.vector_field(t, state[name], _inputs_of(self, name, signals))
-            for name, block in self.blocks.items()
-        }
+        return rates_of(self, t, state, inputs or {}, tuple(self.blocks))
+
+    def _text(self) -> str:
+        rows = [f"Network: {len(self.blocks)} blocks, {len(self.wires)} wires"]
+        rows += [f"  {name}: {type(block).__name__}" for name, block in self.blocks.items()]
+        rows += [f"  {source} -> {target}" for target, source in self.wires]
+        rows += [f"  from outside -> {target}" for target in self.exposed]
+        return "\n".join(rows)
 
 
 def outputs(
@@ -90,6 +95,24 @@ def outputs(
     """Every output of every block at one moment, `{"block.output": value}`."""
     signals = _signals(network, t, state, inputs or {})
     return {name: signals[name] for name in network.outputs}
+
+
+def rates_of(
+    network: Network, t, state: PyTree, inputs: Signals, names: tuple[str, ...]
+) -> dict[str, PyTree]:
+    """Rates of the blocks called `names` alone."""
+    own = inputs_of(network, t, state, inputs, names)
+    return {
+        name: network.blocks[name].vector_field(t, state[name], own[name]) for name in names
+    }
+
+
+def inputs_of(
+    network: Network, t, state: PyTree, inputs: Signals, names: tuple[str, ...]
+) -> dict[str, Signals]:
+    """The inputs that the blocks called `names` get at one moment."""
+    signals = _signals(network, t, state, inputs)
+    return {name: _inputs_of(network, name, signals) for name in names}
 
 
 def as_term(network: AbstractBlock, inputs: Signals | None = None) -> dfx.ODETerm:

@@ -10,13 +10,12 @@ from jaxtyping import Array, PyTree
 
 from sorojax import _check
 from sorojax._types import is_traced, real
-from sorojax.math.explicit import RungeKutta4
-from sorojax.math.method import AbstractMethod, finite, guarded
-from sorojax.math.status import Status
-from sorojax.systems.integrate import explicit_inputs, interval_of
+from sorojax.math.method import AbstractMethod, finite
+from sorojax.systems.integrate import explicit_inputs
+from sorojax.systems.march import Walk, interval_of
 from sorojax.systems.network import Network, at_time, outputs
 from sorojax.systems.progress import tell
-from sorojax.systems.simulate import Trajectory, last_state
+from sorojax.systems.simulate import Trajectory, default_method, last_state
 
 Ports = str | tuple[str, ...]
 
@@ -71,7 +70,8 @@ def simulate_sampled(
         measurement: Output that a single controller reads, `"body.tip_angle"`.
         command: Exposed input that it drives, `"valve.setpoint"`.
         substeps: Steps of the method in a tick.
-        method: `RungeKutta4()` if omitted; `Rodas4()` for stiff networks.
+        method: `RungeKutta4()` if omitted, `Coupled()` where there is a `FemBody`; `Rodas4()`
+            for stiff networks.
         state: Where the network starts.
         memory: What a single controller remembers; `controller.start` if omitted.
         inputs: Values or references for the other exposed inputs.
@@ -98,7 +98,7 @@ def simulate_sampled(
         state, (memories, held, kept) = last_state(resume), resume.memory
         first = jnp.round(resume.time[-1] / real(period)).astype(jnp.int32)
     supplied = {k: v if callable(v) else real(v) for k, v in (inputs or {}).items()}
-    plan = (ticks, substeps, RungeKutta4() if method is None else method, progress)
+    plan = (ticks, substeps, default_method(network) if method is None else method, progress)
     before = (memories, held, kept)
     return _run(network, loops, state, before, supplied, real(period), first, plan)
 
@@ -123,21 +123,20 @@ def _run(network, loops, state, before, inputs, period, first, plan) -> Trajecto
         return tuple(kept), held
 
     def advance(carry, tick):
-        state, memories, held, good, reached = carry
+        walk, memories, held, _ = carry
         t = period * tick.astype(period.dtype)
         resumed = (tick == first) & (first > 0)  # the call at the seam was made before
         memories, held = jax.lax.cond(
-            resumed, lambda: (memories, held), lambda: call(tick, t, state, memories, held)
+            resumed,
+            lambda: (memories, held),
+            lambda: call(tick, t, walk.state, memories, held),
         )
-        seen = (state, {**signals(t, state, held), **held}, memories, held)
-        given = (method, network, {**inputs, **held}, t, state, kept)
-        new = guarded(move, given, period)
-        good = good & finite(new)
-        new = jax.tree.map(lambda a, b: jnp.where(good, a, b), new, state)
+        seen = (walk.state, {**signals(t, walk.state, held), **held}, memories, held)
+        given = (method, network, {**inputs, **held}, t, walk.state, walk.memory)
+        moved = walk.after(move.taken(given, period), t + period)
         if progress:
             tell((tick - first) / ticks)
-        reached = jnp.where(good, t + period, reached)
-        return (new, memories, held, good, reached), seen
+        return (moved, memories, held, walk.memory), seen
 
     held = _nothing(network, loops, period.dtype) if held is None else held
     if memories is None:
@@ -146,12 +145,17 @@ def _run(network, loops, state, before, inputs, period, first, plan) -> Trajecto
             loop.controller.start(time[0], _pick(seen, loop.measurement)) for loop in loops
         )
     if kept is None:
-        kept = move.begin((method, network, {**inputs, **held}, time[0], state), period)
-    begin = (state, memories, held, finite(state), time[0])
-    carry, seen = jax.lax.scan(advance, begin, first + jnp.arange(ticks + 1, dtype=jnp.int32))
+        _, commands = call(first, time[0], state, memories, held)
+        kept = move.begin((method, network, {**inputs, **commands}, time[0], state), period)
+    if method.carries:  # a step is large beside what it starts from
+        advance = jax.checkpoint(advance, prevent_cse=False)  # pyright: ignore[reportPrivateImportUsage]
+    walk = Walk(state, kept, finite(state), jnp.array(True), time[0])
+    numbers = first + jnp.arange(ticks + 1, dtype=jnp.int32)
+    carry, seen = jax.lax.scan(advance, (walk, memories, held, kept), numbers)
     states, values, memories, held = seen
-    good, reached = finite((states, values)) & carry[3], jnp.minimum(carry[4], time[-1])
-    status = Status.where(good, Status.successful, Status.not_finite)
+    ended, *_, kept = carry
+    good, reached = finite((states, values)) & ended.good, jnp.minimum(ended.reached, time[-1])
+    status = ended._replace(good=good).status
     stats = {
         "steps": jnp.asarray(ticks * substeps),
         "calls": jnp.asarray(sum(ticks // loop.every + 1 for loop in loops)),

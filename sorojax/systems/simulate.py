@@ -11,16 +11,20 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from sorojax import _check
+from sorojax._display import displayed, number, outcome
 from sorojax._types import is_traced, real
 from sorojax.math.control import Control
 from sorojax.math.explicit import RungeKutta4, Tsit5
 from sorojax.math.method import AbstractMethod, finite
 from sorojax.math.status import Status
+from sorojax.systems.coupled import Coupled, bodies_of
 from sorojax.systems.event import Event, Happened, run_with_events
-from sorojax.systems.integrate import Motion, adaptive, fixed
+from sorojax.systems.integrate import Motion, Resume, adaptive
+from sorojax.systems.march import fixed
 from sorojax.systems.network import Network, at_time, outputs
 
 
+@displayed
 class Trajectory(eqx.Module):
     """A simulated motion.
 
@@ -47,6 +51,16 @@ class Trajectory(eqx.Module):
 
     def __getitem__(self, name: str) -> Array:
         return self.outputs[name]
+
+    def _text(self) -> str:
+        steps = number(self.stats["steps"])
+        rows = [
+            f"Trajectory: {self.time.shape[-1]} saved instants, {outcome(self.status)}, "
+            f"{steps} steps",
+            f"  time {number(self.time, 's')}",
+        ]
+        rows += [f"  {name} {number(values)}" for name, values in self.outputs.items()]
+        return "\n".join(rows)
 
 
 def last_state(film: Trajectory) -> PyTree:
@@ -100,8 +114,9 @@ def simulate(
         max_step: Longest adaptive step [s]. Keeps an event that comes and goes from being
             stepped over, and two events from falling into one step, where the first
             listed would win.
-        solver: `Tsit5()` if omitted, `RungeKutta4()` with a fixed step. `Rodas4()` where a
-            regulator, a valve or a filter is far faster than the body.
+        solver: `Tsit5()` if omitted, `RungeKutta4()` with a fixed step, `Coupled()` where
+            there is a `FemBody`. `Rodas4()` where a regulator, a valve or a filter is far
+            faster than the body.
         max_steps: Limit of adaptive steps.
         events: Ends of the run, and resets of its state.
         max_events: Most resets.
@@ -109,8 +124,9 @@ def simulate(
             `diffrax.ForwardMode()` for derivatives in a few parameters.
         dense: Keep the continuous solution, for `state_at`; takes memory by `max_steps`.
         progress: Report progress while running, which costs a little.
-        resume: A motion to go on from, with the state and the time of its end. With fixed
-            steps two halves give the bits of the whole.
+        resume: A motion to go on from, with the state and the time of its end. Two halves
+            give the bits of the whole, with fixed steps and, without events, adaptively: the
+            size of the step goes on too.
         throw: Raise when a run outside a transformation fails; False returns the status.
 
     Raises:
@@ -135,16 +151,19 @@ def simulate(
     if step is None:
         control = Control(rtol, atol, max_step=max_step)
         options = {"max_steps": max_steps, "adjoint": adjoint, "progress": progress}
+        if not events:
+            options["seam"] = _seam_of(resume)
         watch = (events, max_events, dense)
         solver = Tsit5() if solver is None else solver
         film = _adaptive(
             network, state, supplied, first, interval, save, solver, control, watch, options
         )
     else:
-        method = _fixed_method(solver)
+        method = _fixed_method(network, solver)
         substeps = _substeps(duration, save, step)
-        memory = None if resume is None else resume.memory
-        film = _fixed(network, state, supplied, first, interval, save, method, substeps, memory)
+        plan = (save, method, substeps, progress)
+        memory = None if resume is None else _memory_of(resume)
+        film = _fixed(network, state, supplied, first, interval, plan, memory)
     failed = throw and not is_traced(film)
     if failed and not bool(film.status == Status.successful):
         raise RuntimeError(
@@ -172,12 +191,11 @@ def _adaptive(
 
 
 @eqx.filter_jit
-def _fixed(
-    network, state, inputs, first, interval, save, method, substeps, memory
-) -> Trajectory:
+def _fixed(network, state, inputs, first, interval, plan, memory) -> Trajectory:
+    save, method, substeps, progress = plan
     time = instants(first, interval, save)
     state = network.initial_state() if state is None else state
-    motion = fixed(network, inputs, state, time, interval, method, substeps, memory)
+    motion = fixed(network, inputs, state, time, interval, method, substeps, memory, progress)
     return film_of(network, time, inputs, motion)
 
 
@@ -188,9 +206,14 @@ def instants(first: Array, interval: Array, save: int) -> Float[Array, " time"]:
 
 def film_of(network, time, inputs, motion: Motion, happened=None) -> Trajectory:
     """The motion with every output."""
-    values = jax.vmap(lambda t, x: outputs(network, t, x, at_time(inputs, t)))(
-        time, motion.path
-    )
+
+    def one(moment):
+        t, state = moment
+        return outputs(network, t, state, at_time(inputs, t))
+
+    every = (time, motion.path)
+    large = bool(bodies_of(network))  # all instants at once would fill the memory
+    values = jax.lax.map(one, every) if large else jax.vmap(one)(every)
     status, good = motion.status, finite(values)
     status = Status.where((status == Status.successful) & ~good, Status.not_finite, status)
     stats = {"steps": motion.steps, "rejected": motion.rejected, "reached": motion.reached}
@@ -218,14 +241,28 @@ def _start(state: PyTree, resume: Trajectory | None) -> tuple:
     return last_state(resume), number
 
 
-def _fixed_method(solver) -> AbstractMethod:
-    method = RungeKutta4() if solver is None else solver
+def _seam_of(resume: Trajectory | None) -> Resume | None:
+    adaptively = resume is not None and isinstance(resume.memory, Resume)
+    return resume.memory if adaptively else None
+
+
+def _memory_of(resume: Trajectory) -> Any:
+    return None if isinstance(resume.memory, Resume) else resume.memory
+
+
+def _fixed_method(network: Network, solver) -> AbstractMethod:
+    method = default_method(network) if solver is None else solver
     if not isinstance(method, AbstractMethod):
         raise ValueError(
             f"simulate: {type(method).__name__} takes no fixed `step` here, need a method of "
             "sorojax: RungeKutta4(), Tsit5(), Rodas4() or SemiImplicitEuler()."
         )
     return method
+
+
+def default_method(network: Network) -> AbstractMethod:
+    """The method of fixed steps of a network."""
+    return Coupled() if bodies_of(network) else RungeKutta4()
 
 
 def _substeps(duration, save: int, step) -> int:

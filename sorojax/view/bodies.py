@@ -1,31 +1,24 @@
 """Figures of shapes, meshes and deformed bodies."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from sorojax import fem
-from sorojax.fem import Path, Problem
+from sorojax.fem import Path
 from sorojax.mesh import Mesh, boundary_facets
 from sorojax.sdf import AbstractSdf, contour
 from sorojax.sdf.sample import finite_box, values
 from sorojax.view import style
 from sorojax.view.drawing import as_path, box, cell_rings, flat_triangles, loops
+from sorojax.view.fields import NodalField, nodal_von_mises
+from sorojax.view.shell import on_triangles, shell
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-NodalField = Callable[[Problem, Float[Array, "nodes dim"]], Float[Array, " nodes"]]
-
-
-@eqx.filter_jit
-def nodal_von_mises(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, " nodes"]:
-    """Von Mises stress at the nodes, averaged between cells [kPa]."""
-    return fem.nodal_average(problem, fem.von_mises_stress(problem, u)) / 1e3
 
 
 def show_deformed(
@@ -121,7 +114,7 @@ def show_sdf(shape: AbstractSdf, *, resolution: int = 300, title: str = "") -> "
     f = 1e3 * values(shape, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
     figure = style.new_figure(9.0, _height(9.0, lower - margin, upper + margin))
     axes = figure.add_subplot()
-    norm, levels = _two_sided(float(f.min()), float(f.max()))
+    norm, levels = two_sided(float(f.min()), float(f.max()))
     filled = axes.contourf(1e3 * x, 1e3 * y, f, levels=levels, cmap="RdBu_r", norm=norm)
     for curve in contour(shape, step):
         outline = _closed(1e3 * curve.points, curve.closed).T
@@ -135,7 +128,7 @@ def show_sdf(shape: AbstractSdf, *, resolution: int = 300, title: str = "") -> "
     return figure
 
 
-def _two_sided(low: float, high: float) -> tuple[Any, np.ndarray]:
+def two_sided(low: float, high: float) -> tuple[Any, np.ndarray]:
     """Colours and round levels on each side of zero, where the depths may differ a lot."""
     from matplotlib.colors import TwoSlopeNorm
     from matplotlib.ticker import MaxNLocator
@@ -209,16 +202,10 @@ def _outline(axes: "Axes", points: np.ndarray, rings: list, colour: str, width: 
 
 
 def _paint(figure, axes, mesh: Mesh, points, triangles, field: np.ndarray, label: str) -> None:
-    if field.shape == (mesh.num_nodes,):
-        options = {"shading": "gouraud"}
-    elif field.shape == (mesh.num_cells,):
-        field, options = np.tile(field, len(triangles) // mesh.num_cells), {"shading": "flat"}
-    else:
-        raise ValueError(
-            f"show_mesh: `field` has shape {field.shape}, need one value per node, "
-            f"({mesh.num_nodes},), or per cell, ({mesh.num_cells},)."
-        )
+    values, per_node = on_triangles(mesh, shell(mesh), field)
+    options: Any = {"shading": "gouraud"} if per_node else {"facecolors": values}
+    given = (values,) if per_node else ()
     painted = axes.tripcolor(
-        points[:, 0], points[:, 1], triangles, field, cmap=style.FIELD, **options
+        points[:, 0], points[:, 1], triangles, *given, cmap=style.FIELD, **options
     )
     style.colour_bar(figure, painted, axes, label, shrink=0.8, pad=0.02)

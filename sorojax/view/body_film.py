@@ -11,7 +11,7 @@ from sorojax.mesh import Mesh, boundary_facets
 from sorojax.view import style
 from sorojax.view.drawing import as_path, box, flat_triangles, loops
 from sorojax.view.figures import Signals, draw_signals
-from sorojax.view.film import Film, animate, frames_at
+from sorojax.view.film import Film, animate_figure, frames_at
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -77,7 +77,7 @@ def film_of_mesh(
     def update(k: int) -> "list[Artist]":
         return [artist for part in parts for artist in part.move(int(chosen[k]))]
 
-    film = animate(figure, update, len(chosen), fps=fps)
+    film = animate_figure(figure, update, len(chosen), fps=fps)
     if path is not None:
         film.save(path)
     return film

@@ -6,28 +6,32 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sorojax.mesh import Mesh
+from sorojax.view.shell import shell
 
 if TYPE_CHECKING:
     from matplotlib.path import Path as Outline
 
-_SPLIT = {1: ((0, 1, 2),), 2: ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))}
+_RINGS = {
+    "Tri6": (0, 3, 1, 4, 2, 5), "Tri7": (0, 3, 1, 4, 2, 5),
+    "Quad8": (0, 4, 1, 5, 2, 6, 3, 7), "Quad9": (0, 4, 1, 5, 2, 6, 3, 7),
+}  # fmt: skip
 
 
 def flat_triangles(where: str, mesh: Mesh) -> Int[np.ndarray, "triangles 3"]:
-    """Node numbers of flat triangles that cover the cells; four for a six-node triangle."""
-    if mesh.element.dim != 2 or mesh.element.num_corners != 3:
+    """Node numbers of flat triangles that cover the cells of a plane mesh."""
+    if mesh.element.dim != 2:
         raise ValueError(
-            f"{where}: got a mesh of {mesh.element.name}, need plane triangles. Draw a "
-            "section of the body, or its boundary."
+            f"{where}: got a mesh of {mesh.element.name}, need a plane one. Draw it with "
+            "view.show."
         )
-    cells = np.asarray(mesh.cells)
-    return np.concatenate([cells[:, list(part)] for part in _SPLIT[mesh.element.order]])
+    return shell(mesh).triangles
 
 
 def cell_rings(mesh: Mesh) -> Int[np.ndarray, "cells cell_nodes"]:
     """Nodes around each cell in order, mid-side nodes between the corners."""
     cells = np.asarray(mesh.cells)
-    return cells if mesh.element.order == 1 else cells[:, [0, 3, 1, 4, 2, 5]]
+    ring = _RINGS.get(mesh.element.name)
+    return cells if ring is None else cells[:, list(ring)]
 
 
 def loops(facets: Int[Any, "facets facet_nodes"]) -> list[Int[np.ndarray, " nodes"]]:

@@ -17,19 +17,22 @@ if TYPE_CHECKING:
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 INK, GREY, LIGHT = "#1f2430", "#8a8f98", "#d9dce1"
 REFERENCE = "#1f2430"
-FIELD = "viridis"
+FIELD, SIGNED = "viridis", "coolwarm"
+#: Bodies, what acts on them, what holds them, what they rest on.
+BODY, LOAD, HOLD, OBSTACLE = "#c9d3df", "#D55E00", "#1f2430", "#b9a888"
 
 TITLE, LABEL, SMALL = 12.0, 10.0, 9.0
 _REFERENCE_WORDS = ("reference", "target", "setpoint", "set-point")
 
 
-def new_figure(width: float, height: float) -> "Figure":
+def new_figure(width: float, height: float, layout: Any = "constrained") -> "Figure":
     """An empty figure of `width` x `height` inches that keeps its labels inside."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), dpi=140, layout="constrained", facecolor="white")
-    figure.get_layout_engine().set(w_pad=0.08, h_pad=0.08)  # type: ignore[union-attr]
+    figure = Figure(figsize=(width, height), dpi=140, layout=layout, facecolor="white")
+    if layout == "constrained":
+        figure.get_layout_engine().set(w_pad=0.08, h_pad=0.08)  # type: ignore[union-attr]
     FigureCanvasAgg(figure)
     return figure
 

@@ -97,12 +97,16 @@ def main(argv: list[str] | None = None) -> int:
     except (OSError, ValueError, ImportError, KeyError, TypeError) as wrong:
         print(f"sorojax_board: {wrong}", file=sys.stderr)
         return 2
-    asyncio.run(_serve(server, f"{asked.backend} board on {asked.host}"))
+    run_server(server, f"{asked.backend} board on {asked.host}")
     return 0
 
 
+def run_server(server: Server, name: str) -> None:
+    """Serve until the process is asked to end; the valves are at zero then."""
+    asyncio.run(_serve(server, name))
+
+
 async def _serve(server: Server, name: str) -> None:
-    """Until the process is asked to end; the valves are at zero then."""
     work = asyncio.ensure_future(server.run(lambda: print(f"{name}:{server.port}", flush=True)))
     for number in (signal.SIGTERM, signal.SIGINT) if os.name == "posix" else ():
         asyncio.get_running_loop().add_signal_handler(number, work.cancel)

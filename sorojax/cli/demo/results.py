@@ -11,6 +11,7 @@ import numpy as np
 from sorojax import fem, material, systems, view
 from sorojax.cli.demo.design import DEPTH, LAYER_STIFFNESS, Design, Sensitivity
 from sorojax.cli.demo.loop import DAMPING_TIME, Reduced, Tracking
+from sorojax.math.lie import homogeneous
 from sorojax.units import kPa, mm
 
 
@@ -114,9 +115,9 @@ def pictures(r: Results) -> dict[str, Any]:
 def _film(r: Results, signals) -> view.Film:
     mesh, actuator = r.design.problem.mesh, r.design.actuator
     middle = float(actuator.layer_thickness) / 2
-    skin = view.bind(mesh.points, [0.0, middle], [float(actuator.length), middle])
-    q = r.film["body.q"]
-    positions = jax.vmap(lambda q: view.deform(skin, r.reduced.rod, q))(q)
+    base = homogeneous(jnp.eye(2), jnp.array([0.0, middle]))
+    skin = view.bind(mesh.points, r.reduced.rod, base=base)
+    positions = jax.lax.map(lambda q: view.deform(skin, r.reduced.rod, q), r.film["body.q"])
     tip = np.asarray(r.film["body.tip_position"]) + np.array([0.0, middle])
     target = view.ray(tip, np.asarray(r.film["target.value"]), 15 * mm)
     return view.film_of_mesh(

@@ -1,0 +1,48 @@
+"""Fingers in batches of 1 to 4096, more on an accelerator: accelerations, and steps."""
+
+import jax
+import jax.numpy as jnp
+
+from benchmarks import scaling
+from benchmarks.fingers import MODES, finger, random_states
+from benchmarks.harness import quick
+from sorojax.math.batch import batched
+from sorojax.math.steppers import GeneralisedAlpha
+from sorojax.rod import Gravity, forward_dynamics, rollout
+
+STEPS, STEP = 50, 1e-3  # s
+
+
+def members() -> tuple[int, ...]:
+    sizes = [8**k for k in range(5)]
+    if jax.default_backend() != "cpu":
+        sizes += [8**5, 8**6]
+    return tuple(sizes[:: 2 if quick() else 1])
+
+
+def accelerations(body, q, v):
+    return batched(lambda q, v: forward_dynamics(body, q, v, (Gravity(),)))(q, v)
+
+
+def ends(body, q, v):
+    """Coordinates after some steps."""
+
+    def one(q, v):
+        path = rollout(
+            body, q, v, (Gravity(),), step=STEP, saves=1, every=STEPS,
+            stepper=GeneralisedAlpha(1.0),
+        )  # fmt: skip
+        return path.q[-1]
+
+    return batched(one)(q, v)
+
+
+def rows():
+    body, sizes = finger(8), members()
+    q, v = (jnp.asarray(x) for x in random_states(max(sizes)))
+    assert q.shape[1] == 2 * MODES
+    for name, function, calls in (("accelerations", accelerations, 1), ("steps", ends, STEPS)):
+        yield from scaling.rows(
+            name, "members", 1.0,
+            (scaling.program(n, function, body, q[:n], v[:n], calls=calls) for n in sizes),
+        )  # fmt: skip

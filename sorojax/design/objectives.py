@@ -1,0 +1,154 @@
+"""What a design is judged by: numbers of an equilibrium, differentiable in the design.
+
+`graded` puts a design into a problem; `Follower` solves it, from the last design's
+displacement where that is near enough.
+"""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sorojax.design.void import InterpolatedEnergy, interpolated_energy
+from sorojax.fem import Newton, Path, Problem, Solution, solve
+from sorojax.fem.loads import AbstractLoad
+from sorojax.fem.torque import mean_rotation
+
+
+def graded(problem: Problem, factor: Float[Array, " cells"], **settings: float) -> Problem:
+    """`problem` with `factor` times the stiffness in each cell, linear where that is next to
+    nothing; `settings` are those of `interpolated_energy`."""
+    base = problem.material
+    base = base.base if isinstance(base, InterpolatedEnergy) else base
+    return dataclasses.replace(problem, material=interpolated_energy(base, factor, **settings))
+
+
+def replaced_load(problem: Problem, load: AbstractLoad) -> Problem:
+    """`problem` with the load of the same name exchanged for `load`."""
+    names = [old.name for old in problem.loads]
+    if load.name not in names:
+        raise ValueError(
+            f"replaced_load: no load is called {load.name!r}, the problem has {names}. Give "
+            "the problem a load of that name first."
+        )
+    loads = tuple(load if old.name == load.name else old for old in problem.loads)
+    return dataclasses.replace(problem, loads=loads)
+
+
+def work_of_loads(
+    problem: Problem, u: Float[Array, "nodes dim"], names: tuple[str, ...] | None = None
+) -> Float[Array, ""]:
+    """f'u of dead loads and p dV of pressures at the displacement `u` [J], of the loads in
+    `names` or of all that hold nothing: the compliance of a body at full load."""
+    chosen = [
+        load for load in problem.loads
+        if (not load.holds if names is None else load.name in names)
+    ]  # fmt: skip
+    rest = jnp.zeros_like(u)
+    terms = (load.potential(problem, rest) - load.potential(problem, u) for load in chosen)
+    return sum(terms, start=jnp.zeros((), u.dtype))
+
+
+def displacement_along(
+    u: Float[Array, "nodes dim"], nodes: Int[Any, " n"], direction: Float[Any, " dim"]
+) -> Float[Array, ""]:
+    """L'x: mean displacement of `nodes` along `direction` [m]."""
+    return jnp.mean(u[jnp.asarray(nodes)] @ jnp.asarray(direction, u.dtype))
+
+
+def mechanism(
+    problem: Problem,
+    u: Float[Array, "nodes dim"],
+    output: Float[Array, ""],
+    *,
+    output_weight: float = 1.0,
+    work_weight: float = 0.0,
+) -> Float[Array, ""]:
+    """-b1 L'x + b2 f_e'u, what is least in a compliant mechanism.
+
+    `output` is L'x, of `displacement_along` or `rotation`. With b1 = 0 it is the compliance;
+    f_u of the reference is read as the displacement where the loads f_e act.
+
+    Reference: Caasenbrood, Pogromsky, Nijmeijer, "Sorotoki: a Matlab toolkit for design,
+    modeling, and control of soft robots", IEEE Access 12, 2024, equation 11.
+    """
+    return work_weight * work_of_loads(problem, u) - output_weight * output
+
+
+def rotation(
+    problem: Problem, u: Float[Array, "nodes dim"], nodes: Int[Any, " n"]
+) -> Float[Array, ""]:
+    """Mean angle by which `nodes` of a plane body turn, counter-clockwise [rad]."""
+    X = problem.mesh.points[jnp.asarray(nodes)]
+    return mean_rotation(X, X + u[jnp.asarray(nodes)])
+
+
+def path_error(
+    path: Path, nodes: Int[Any, " n"], targets: Float[Array, "steps dim"]
+) -> Float[Array, ""]:
+    """Mean square distance of the middle of `nodes` from `targets` over a load path [m^2].
+
+    `path` is that of `fem.solve_path`; `targets` are positions, one for each of its values.
+    """
+    nodes = jnp.asarray(nodes)
+    middle = jnp.mean(path.problem.mesh.points[nodes], axis=0)
+    moved = middle[None] + jnp.mean(path.displacements[:, nodes], axis=1)
+    return jnp.mean(jnp.sum((moved - targets) ** 2, axis=1))
+
+
+class Follower:
+    """Solves the equilibria of one design after the other, each from the one before.
+
+    Newton's method starts at full load from the last displacement, and follows the load from
+    rest where that does not converge: the equilibria agree unless a design has several. An
+    equilibrium that is not found has NaN for derivatives, on which `minimise` stops.
+    """
+
+    def __init__(self, *, newton: Newton | None = None, steps: int = 1, max_cuts: int = 4):
+        self.settings = {"newton": newton, "steps": steps, "max_cuts": max_cuts}
+        self.last: np.ndarray | None = None
+        self.solutions = 0
+
+    def __call__(self, problem: Problem) -> Solution:
+        start = None if self.last is None else jnp.asarray(self.last)
+        solution = solve(problem, start=start, throw=False, **self.settings)
+        failed = ~jnp.equal(jnp.asarray(solution.load_fraction), 1.0)
+        u = solution.displacement
+        valid = jnp.where(failed, jnp.nan, u)
+        jax.debug.callback(self._keep, jax.lax.stop_gradient(valid))
+        return eqx.tree_at(lambda s: s.displacement, solution, valid)
+
+    def _keep(self, u) -> None:
+        u = np.asarray(u)
+        self.solutions += 1
+        if np.all(np.isfinite(u)):
+            self.last = u
+
+
+class History:
+    """The designs of a run: give it to `minimise` as `on_step`.
+
+    `densities` has one row per kept step, for `view` or an animation, beside `steps` and
+    `objectives`.
+    """
+
+    def __init__(self, density, every: int = 1):
+        self._density, self._every = density, every
+        self.steps: list[int] = []
+        self.objectives: list[float] = []
+        self._rows: list[np.ndarray] = []
+
+    def __call__(self, step) -> None:
+        if (step.count - 1) % self._every:
+            return
+        self.steps.append(step.count)
+        self.objectives.append(float(step.objective))
+        self._rows.append(np.asarray(self._density(step)))
+
+    @property
+    def densities(self) -> Float[np.ndarray, "kept cells"]:
+        return np.stack(self._rows) if self._rows else np.zeros((0, 0))

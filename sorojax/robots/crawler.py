@@ -1,0 +1,205 @@
+"""A crawler: three groups of air chambers on a stiff sole, inflated one after the other.
+
+Reference: Shepherd et al., "Multigait soft robot", PNAS 108, 2011.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sorojax import _check, fem, mesh
+from sorojax._types import real
+from sorojax.material import AbstractHyperelastic, by_region, neo_hookean
+from sorojax.sdf import AbstractSdf, HalfPlane, Rectangle, repeat, translate
+from sorojax.units import MPa, kPa, mm
+
+PORTS = ("rear", "middle", "front")
+
+
+class Crawler(eqx.Module):
+    """Dimensions of the side view [m]; x runs along the crawler, y is 0 under its sole.
+
+    Three groups of chambers stand `group_spacing` apart, each with a port of its own. Under
+    air a group gets longer on top but not in its sole, the lowest `sole_thickness`, and
+    arches its back. The defaults are 150 x 12 mm with 3 x 11 chambers.
+    """
+
+    length: Float[Array, ""] = eqx.field(converter=real, default=150 * mm)
+    height: Float[Array, ""] = eqx.field(converter=real, default=12 * mm)
+    base: Float[Array, ""] = eqx.field(converter=real, default=2.83 * mm)
+    sole_thickness: Float[Array, ""] = eqx.field(converter=real, default=2 * mm)
+    chamber_width: Float[Array, ""] = eqx.field(converter=real, default=3.22 * mm)
+    chamber_height: Float[Array, ""] = eqx.field(converter=real, default=8.4 * mm)
+    wall_thickness: Float[Array, ""] = eqx.field(converter=real, default=0.85 * mm)
+    group_spacing: Float[Array, ""] = eqx.field(converter=real, default=50.5 * mm)
+    num_chambers: int = eqx.field(static=True, default=11)
+
+    def __check_init__(self):
+        for name in ("height", "base", "sole_thickness", "chamber_width", "wall_thickness"):
+            _check.between(
+                "Crawler", name, getattr(self, name), 0.0, 1.0, "m",
+                "Lengths are in metres: write 2 * mm.",
+            )  # fmt: skip
+        if not _check.is_concrete(self.length):
+            return
+        roof = float(self.height - self.base - self.chamber_height)
+        between = float(self.group_spacing - self.group_length)
+        ends = float(self.length - 2 * self.group_spacing - self.group_length) / 2
+        if min(roof, between, ends) <= 0:
+            raise ValueError(
+                f"Crawler: got a roof of {roof * 1e3:.3g} mm, {between * 1e3:.3g} mm between "
+                f"groups and {ends * 1e3:.3g} mm at the ends, need all above zero. Make "
+                "chambers smaller or the body larger."
+            )
+
+    @property
+    def group_length(self) -> Float[Array, ""]:
+        """From the first to the last chamber of a group, both included [m]."""
+        return self.num_chambers * (self.chamber_width + self.wall_thickness) - (
+            self.wall_thickness
+        )
+
+    def chambers(self, group: int) -> AbstractSdf:
+        """The air of a group: 0 at the rear, 1, or 2 in front."""
+        left = (self.length - self.group_length) / 2 + (group - 1) * self.group_spacing
+        first = Rectangle(
+            [0.0 * left, self.base], [self.chamber_width, self.base + self.chamber_height]
+        )
+        pitch = jnp.stack([self.chamber_width + self.wall_thickness, 0.0 * left])
+        row = repeat(first, pitch, self.num_chambers, separate=True)
+        return translate(row, jnp.stack([left, 0.0 * left]))
+
+    def sole(self) -> AbstractSdf:
+        """The stiff layer and everything below it."""
+        return HalfPlane([0.0 * self.height, self.sole_thickness], [0.0, 1.0])
+
+    def body(self) -> AbstractSdf:
+        """The rubber."""
+        zero = jnp.zeros_like(self.length)
+        block = Rectangle([zero, zero], [self.length, self.height])
+        return block - self.chambers(0) - self.chambers(1) - self.chambers(2)
+
+
+def crawler_rubbers() -> tuple[AbstractHyperelastic, AbstractHyperelastic]:
+    """A soft rubber for the body, and one five times as stiff for the sole."""
+    return (
+        neo_hookean(young_modulus=0.2 * MPa, poisson_ratio=0.4, density=1070.0),
+        neo_hookean(young_modulus=1 * MPa, poisson_ratio=0.4, density=1070.0),
+    )
+
+
+def crawler_mesh(crawler: Crawler, size: float) -> mesh.Mesh:
+    """Quad8 cells of about `size` [m] between the lines of the drawing, one or more across
+    every wall; region "sole".
+
+    Raises:
+        ValueError: If the size is not above zero.
+    """
+    _check.positive("crawler_mesh", "size", size, "m", "Take the width of a chamber / 3.")
+    inner = 2 * crawler.num_chambers  # walls of the chambers of a group
+    left = (crawler.length - crawler.group_length) / 2 - crawler.group_spacing
+    pitch = float(crawler.chamber_width + crawler.wall_thickness)
+    start = float(left) + pitch * np.arange(crawler.num_chambers)
+    group = np.stack([start, start + float(crawler.chamber_width)], axis=1).ravel()
+    spacing = float(crawler.group_spacing)
+    walls = [group + k * spacing for k in range(len(PORTS))]
+    x = _divided(np.concatenate([[0.0], *walls, [float(crawler.length)]]), size)
+    top = float(crawler.base + crawler.chamber_height)
+    marks = [0.0, float(crawler.sole_thickness), float(crawler.base), top]
+    y = _divided(np.array([*marks, float(crawler.height)]), size)
+    grid = mesh.rectangle(
+        [0, 0], [len(x) - 1, len(y) - 1], divisions=(len(x) - 1, len(y) - 1),
+        element=mesh.Quad8(),
+    )  # fmt: skip
+    at = np.asarray(grid.points)
+    points = np.stack(
+        [np.interp(at[:, k], np.arange(len(line)), line) for k, line in enumerate((x, y))], 1
+    )
+    cells = np.asarray(grid.cells)
+    middle = points[cells[:, :4]].mean(axis=1)
+    number = np.searchsorted(np.concatenate(walls), middle[:, 0])
+    in_group = (number % inner) % 2 == 1
+    hollow = in_group & (middle[:, 1] > marks[2]) & (middle[:, 1] < top)
+    used, cells = np.unique(cells[~hollow], return_inverse=True)
+    cells = cells.reshape(-1, 8)
+    sole = np.flatnonzero(middle[~hollow, 1] < marks[1])
+    return mesh.Mesh(points[used], cells, mesh.Quad8(), regions={"sole": sole})
+
+
+def _divided(lines: np.ndarray, size: float) -> np.ndarray:
+    """`lines` [m] with more between them, at most about `size` apart."""
+    counts = np.maximum(1, np.round(np.diff(lines) / size).astype(int))
+    at = zip(lines[:-1], lines[1:], counts, strict=True)
+    parts = [np.linspace(a, b, n, endpoint=False) for a, b, n in at]
+    return np.concatenate([*parts, lines[-1:]])
+
+
+def crawler_problem(
+    crawler: Crawler,
+    *,
+    size: float,
+    rubbers: tuple[AbstractHyperelastic, AbstractHyperelastic] | None = None,
+    friction: float = 0.6,
+    depth: float = 40 * mm,
+    stiffness: float = 2e8,
+) -> fem.Problem:
+    """The crawler on a flat floor, free to move: loads "gravity", "floor" and the pressures
+    "rear", "middle" and "front" [Pa].
+
+    Args:
+        crawler: Its dimensions; concrete.
+        size: Length of the sides of its cells [m]; walls hold one or more across.
+        rubbers: Of body and sole, of one class; `crawler_rubbers()` when omitted.
+        friction: Coulomb coefficient of sole and floor [-].
+        depth: Width across the plane of the side view [m].
+        stiffness: Of the contact with the floor [Pa/m]. It carries a body so light that the
+            default of `fem.Contact` would be a thousand times more than needed.
+    """
+    cells = crawler_mesh(crawler, size)
+    soft, stiff = crawler_rubbers() if rubbers is None else rubbers
+    rubber = by_region(cells.num_cells, cells.regions, soft, {"sole": stiff})
+    side = float(crawler.length)
+
+    def outside(p):
+        """The sole and both ends."""
+        ends = (p[0] < 1e-6 * side) | (p[0] > (1 - 1e-6) * side)
+        return (p[1] < 1e-6 * side) | ends
+
+    air = tuple(
+        fem.Pressure(mesh.facets_on(cells, crawler.chambers(k)), name=name)
+        for k, name in enumerate(PORTS)
+    )
+    floor = fem.Contact(
+        mesh.facets_where(cells, outside), HalfPlane([0.0, 0.0], [0.0, 1.0]), stiffness,
+        friction=friction, name="floor",
+    )  # fmt: skip
+    return fem.problem(
+        cells, rubber, kinematics=fem.PlaneStrain(depth), supports=(),
+        loads=(fem.Gravity(), *air, floor), free=True,
+    )  # fmt: skip
+
+
+def crawler_gait(
+    amplitude: float | Float[Array, ""] = 15 * kPa,
+    frequency: float | Float[Array, ""] = 2.5,
+    lag: float | Float[Array, ""] = jnp.pi / 3,
+) -> dict[str, Any]:
+    """Pressures [Pa] of the ports, functions of time [s], for
+    `fem.simulate(problem, ..., **gait)`.
+
+    Positive half waves of a sine of `frequency` [Hz], each port `lag` [rad] after the one
+    before it, from the rear to the front.
+    """
+    amplitude, frequency, lag = real(amplitude), real(frequency), real(lag)
+
+    def pressure(k: int):
+        def at(t):
+            wave = jnp.sin(2 * jnp.pi * frequency * t - k * lag)
+            return amplitude * jnp.maximum(wave, jnp.zeros_like(wave))
+
+        return at
+
+    return {name: pressure(k) for k, name in enumerate(PORTS)}

@@ -1,0 +1,202 @@
+"""A body with its air: reservoirs and regulators wired to an assembly, as a board sees it."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax._types import real
+from sorojax.math.method import AbstractMethod, repeat
+from sorojax.rod import Assembly
+from sorojax.rod.loads import Load
+from sorojax.systems import (
+    AssemblyBody,
+    Network,
+    Regulator,
+    Reservoir,
+    Rosenbrock2,
+    sum_of,
+)
+
+
+class Supply(eqx.Module):
+    """Tubes and proportional regulators, one per port.
+
+    The defaults are of the size of a small bench: 1 m of tube of 4 mm and a regulator of
+    10 l/min; identify your own.
+
+    Attributes:
+        bandwidth: Of the regulator on its chamber at rest [rad/s].
+        max_flow: Largest mass flow, in and out [kg/s].
+        tube_volume: Between a regulator and its chamber [m^3].
+        leakage: Rate at which a port loses gauge pressure [1/s].
+        exponent: Polytropic exponent of the gas: 1 isothermal [-].
+    """
+
+    bandwidth: Float[Array, ""] = eqx.field(converter=real, default=2 * np.pi * 12)
+    max_flow: Float[Array, ""] = eqx.field(converter=real, default=2e-4)
+    tube_volume: Float[Array, ""] = eqx.field(converter=real, default=12.6e-6)
+    leakage: Float[Array, ""] = eqx.field(converter=real, default=0.01)
+    exponent: Float[Array, ""] = eqx.field(converter=real, default=1.0)
+
+    def __check_init__(self):
+        _check.positive("Supply", "bandwidth", self.bandwidth, "rad/s", "12 Hz is usual.")
+        _check.positive("Supply", "max_flow", self.max_flow, "kg/s", "10 l/min is 2e-4.")
+
+
+class Port(NamedTuple):
+    """One or several equal regulators and what they feed.
+
+    Attributes:
+        parts: Rods whose chambers it fills together.
+        volume: Gas in all of them at rest [m^3], one number or one per regulator.
+        low, high: Gauge pressures that they bear [Pa].
+        count: Number of regulators of a rod with that many chambers; None for one.
+        dead: Gas that no motion moves, besides the tube [m^3].
+    """
+
+    parts: tuple[str, ...]
+    volume: Float[Array, "*count"]
+    low: float
+    high: float
+    count: int | None = None
+    dead: float | Array = 0.0
+
+
+class Model(eqx.Module):
+    """A robot as a network that takes set-points and tells pressures.
+
+    Attributes:
+        network: Blocks `body`, and `NAME_air` and `NAME_valve` of every port.
+        ports: Names of the ports.
+        counts: Number of regulators of each; None for a scalar one.
+        low, high: Gauge pressures [Pa] that each regulator may ask for, all ports in a row.
+    """
+
+    network: Network
+    ports: tuple[str, ...] = eqx.field(static=True)
+    counts: tuple[int | None, ...] = eqx.field(static=True)
+    low: Float[Array, " regulators"] = eqx.field(converter=real)
+    high: Float[Array, " regulators"] = eqx.field(converter=real)
+
+    @property
+    def assembly(self) -> Assembly:
+        body = self.network.blocks["body"]
+        assert isinstance(body, AssemblyBody)
+        return body.assembly
+
+    def inputs(self, setpoint: Float[Array, " regulators"]) -> dict[str, Array]:
+        """Set-points [Pa] of all regulators in a row as inputs of the network."""
+        found, at = {}, 0
+        for name, count in zip(self.ports, self.counts, strict=True):
+            many = 1 if count is None else count
+            value = setpoint[at : at + many]
+            found[f"{name}_valve.setpoint"] = value[0] if count is None else value
+            at += many
+        return found
+
+    def pressure(self, state: Any) -> Float[Array, " regulators"]:
+        """Gauge pressures [Pa] of all ports in a row."""
+        found = []
+        for name in self.ports:
+            air = self.network.blocks[f"{name}_air"]
+            told = air.output("pressure", jnp.zeros(()), state[f"{name}_air"], {})
+            found.append(jnp.atleast_1d(told))
+        return jnp.concatenate(found)
+
+
+def supplied(
+    assembly: Assembly, forces: tuple[Load, ...], ports: Mapping[str, Port], supply: Supply
+) -> Model:
+    """The assembly with a reservoir and a regulator at every port."""
+    blocks: dict[str, Any] = {"body": AssemblyBody(assembly, forces)}
+    wires: dict[str, str] = {}
+    for name, port in ports.items():
+        dead = supply.tube_volume + port.dead
+        air = Reservoir(
+            dead_volume=dead, exponent=supply.exponent, ports=port.count,
+            leakage=supply.leakage,
+        )  # fmt: skip
+        volume = jnp.max(port.volume) + dead
+        gain = supply.bandwidth * volume / (air.gas_constant * air.temperature)
+        valve = Regulator(gain, max_flow=supply.max_flow, ports=port.count)
+        blocks |= {f"{name}_air": air, f"{name}_valve": valve}
+        wires[f"{name}_air.mass_flow"] = f"{name}_valve.mass_flow"
+        wires[f"{name}_valve.pressure"] = f"{name}_air.pressure"
+        for part in port.parts:
+            wires[f"body.{part}_pressure"] = f"{name}_air.pressure"
+        for kind, unit in (
+            ("volume", "m^3"), ("volume_rate", "m^3/s"), ("compliance", "m^3/Pa")
+        ):  # fmt: skip
+            sources = [f"body.{part}_{kind}" for part in port.parts]
+            if len(sources) > 1:
+                blocks[f"{name}_{kind}"] = sum_of([1.0] * len(sources), unit=unit)
+                for letter, source in zip("abcdefgh", sources, strict=False):
+                    wires[f"{name}_{kind}.{letter}"] = source
+                sources = [f"{name}_{kind}.value"]
+            wires[f"{name}_air.{kind}"] = sources[0]
+    exposed = tuple(f"{name}_valve.setpoint" for name in ports)
+    counts = tuple(port.count for port in ports.values())
+    low, high = (
+        [x for port in ports.values() for x in [bound(port)] * (port.count or 1)]
+        for bound in (lambda port: port.low, lambda port: port.high)
+    )
+    return Model(Network(blocks, wires, exposed), tuple(ports), counts, low, high)
+
+
+class Running(NamedTuple):
+    """A model at one moment: the state of its network and the memory of the method."""
+
+    state: Any
+    memory: Any
+
+
+Advance = Callable[[Running, Any, float], tuple[Running, Array]]
+
+
+def stepper(
+    model: Model, period: float, *, substeps: int = 2, method: AbstractMethod | None = None
+) -> tuple[Advance, Running]:
+    """The model as something that a valve board drives: `advance(running, setpoint, dt) ->
+    (running, pressures [Pa])`, compiled, and where it starts.
+
+    Args:
+        model: The robot.
+        period: Of every call [s].
+        substeps: Steps of the method in one.
+        method: `Rosenbrock2(refresh=True)` if omitted.
+    """
+    method = Rosenbrock2(refresh=True) if method is None else method
+    _check.positive("stepper", "period", period, "s", "5 ms is period=5e-3.")
+    h, zero = real(period / substeps), jnp.zeros(())
+
+    def field(model, setpoint):
+        inputs = model.inputs(setpoint)
+        return lambda t, y: model.network.vector_field(t, y, inputs)
+
+    @eqx.filter_jit
+    def begin(model, setpoint):
+        state = model.network.initial_state()
+        return Running(state, method.begin(field(model, setpoint), zero, state, h))
+
+    @eqx.filter_jit
+    def move(model, running, setpoint):
+        rate = field(model, setpoint)
+        memory = running.memory if method.keeps else None
+        state = repeat(method, rate, zero, running.state, h, substeps, memory)
+        return Running(state, running.memory), model.pressure(state)
+
+    def advance(running, setpoint, dt):
+        if abs(dt - period) > 1e-9 * period:
+            raise ValueError(
+                f"stepper: asked for {dt:g} s, made for {period:g} s. Make one for this step."
+            )
+        return move(model, running, jnp.asarray(setpoint, h.dtype))
+
+    start = begin(model, jnp.zeros(len(model.low)))
+    advance(start, np.zeros(len(model.low)), period)  # compiles
+    return advance, start

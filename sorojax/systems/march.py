@@ -1,0 +1,117 @@
+"""Fixed steps of one block between instants: runs whose cost is known beforehand."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from sorojax.math.method import AbstractMethod, finite, guarded, repeated
+from sorojax.math.status import Status
+from sorojax.systems.block import AbstractBlock
+from sorojax.systems.integrate import Motion, explicit_inputs
+from sorojax.systems.network import at_time
+from sorojax.systems.progress import tell
+
+
+def fixed(
+    block: AbstractBlock,
+    inputs: Mapping[str, Any],
+    state: PyTree,
+    time: Float[Array, " time"],
+    interval: Float[Array, ""],
+    method: AbstractMethod,
+    substeps: int,
+    memory: Any = None,
+    progress: bool = False,
+) -> Motion:
+    """Run by `substeps` steps in every interval between saved instants."""
+    inputs = explicit_inputs(inputs, time[0])
+    move = interval_of(substeps)
+    if memory is None:
+        memory = move.begin((method, block, inputs, time[0], state), interval)
+    count = time.shape[0] - 1
+
+    def advance(walk: Walk, number):
+        t = time[number]
+        given = (method, block, inputs, t, walk.state, walk.memory)
+        walk = walk.after(move.taken(given, interval), t + interval)
+        if progress:
+            tell((number + 1) / count)
+        return walk, walk.state
+
+    if method.carries:  # a step is large beside what it starts from
+        advance = jax.checkpoint(advance, prevent_cse=False)  # pyright: ignore[reportPrivateImportUsage]
+    start = Walk(state, memory, finite(state), jnp.array(True), time[0])
+    end, path = jax.lax.scan(advance, start, jnp.arange(count))
+    path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state, path)
+    steps = jnp.asarray(substeps * count)
+    none = jnp.zeros(0, bool)
+    return Motion(
+        path, end.state, end.reached, end.status, steps, jnp.zeros_like(steps), none, None,
+        end.memory,
+    )  # fmt: skip
+
+
+class Walk(NamedTuple):
+    """A run of fixed steps on its way: all well so far, every equation solved, and until
+    when [s]."""
+
+    state: PyTree
+    memory: Any
+    good: Bool[Array, ""]
+    solved: Bool[Array, ""]
+    reached: Float[Array, ""]
+
+    def after(self, moved: tuple[PyTree, Any, Array], t) -> "Walk":
+        """The same after an interval that ends at `t`, or held where it failed."""
+        new, memory, converged = moved
+        solved = self.solved & converged
+        good = self.good & solved & finite(new)
+        state, memory = jax.tree.map(
+            lambda a, b: jnp.where(good, a, b), (new, memory), (self.state, self.memory)
+        )
+        return Walk(state, memory, good, solved, jnp.where(good, t, self.reached))
+
+    @property
+    def status(self) -> Status:
+        failed = Status.where(self.solved, Status.not_finite, Status.not_converged)
+        return Status.where(self.good, Status.successful, failed)
+
+
+class Rate(eqx.Module):
+    """The rate of a block under inputs, for methods that may look at the block."""
+
+    block: AbstractBlock
+    inputs: Mapping[str, Any]
+
+    def __call__(self, t, state):
+        return self.block.vector_field(t, state, at_time(self.inputs, t))
+
+
+class interval_of(eqx.Module):
+    """Moves a state by a number of steps that share an interval."""
+
+    substeps: int = eqx.field(static=True)
+
+    def begin(self, given, interval):
+        """What the method keeps or carries through the whole run, if it does."""
+        method, block, inputs, t, state = given
+        if not (method.keeps or method.carries):
+            return None
+        return method.begin(Rate(block, inputs), t, state, interval / self.substeps)
+
+    def taken(self, given, interval) -> tuple[PyTree, Any, Array]:
+        """State, memory and whether all went well, with derivatives wherever it ends."""
+        method, *_, memory = given
+        if method.carries:
+            return self(given, interval)
+        new, _, converged = guarded(self, given, interval)
+        return new, memory, converged
+
+    def __call__(self, given, interval):
+        method, block, inputs, t, state, memory = given
+        h = interval / self.substeps
+        return repeated(method, Rate(block, inputs), t, state, h, self.substeps, memory)

@@ -1,0 +1,140 @@
+"""Triangles of what is drawn again and again: tubes, arrows, balls."""
+
+import functools
+
+import numpy as np
+from jaxtyping import Float, Int
+
+Mesh = tuple[Float[np.ndarray, "points 3"], Int[np.ndarray, "triangles 3"]]
+
+
+def tube(
+    centres: Float[np.ndarray, "stations 3"],
+    across: Float[np.ndarray, "stations 2 3"],
+    outlines: Float[np.ndarray, "stations corners 2"],
+    *,
+    closed: bool = True,
+    inner: Float[np.ndarray, "stations corners 2"] | None = None,
+) -> Mesh:
+    """The surface that closed outlines sweep along a line.
+
+    Args:
+        centres: Of the sections [m].
+        across: Local y and z of each section, as unit vectors.
+        outlines: Corners (y, z) in each section [m], counter-clockwise about local x.
+        closed: Put lids on both ends.
+        inner: Corners of a hole, as many as of the outline.
+    """
+    if inner is not None:
+        outer, hole = tube(centres, across, outlines, closed=False), None
+        hole = tube(centres, across, inner, closed=False)
+        count, corners = len(outer[0]), outlines.shape[1]
+        turned = hole[1][:, ::-1] + count
+        triangles = [outer[1], turned]
+        if closed:
+            a, b = np.arange(corners), np.roll(np.arange(corners), -1)
+            for base, flip in ((0, True), (count - corners, False)):
+                ring = np.concatenate(
+                    [np.stack([a, b, b + count], 1), np.stack([a, b + count, a + count], 1)]
+                )
+                triangles.append((ring[:, ::-1] if flip else ring) + base)
+        return np.concatenate([outer[0], hole[0]]), np.concatenate(triangles)
+    stations, corners = outlines.shape[:2]
+    points = centres[:, None] + np.einsum("scj,sji->sci", outlines, across)
+    a = np.arange(stations - 1)[:, None] * corners + np.arange(corners)[None]
+    b = np.arange(stations - 1)[:, None] * corners + np.roll(np.arange(corners), -1)[None]
+    sides = [np.stack([a, b, b + corners], -1), np.stack([a, b + corners, a + corners], -1)]
+    triangles = [side.reshape(-1, 3) for side in sides]
+    points = points.reshape(-1, 3)
+    if closed:
+        ring = np.arange(corners)
+        last = (stations - 1) * corners
+        middle = len(points)
+        points = np.concatenate([points, centres[:1], centres[-1:]])
+        lid = np.stack([np.roll(ring, -1), ring, np.full(corners, middle)], axis=1)
+        triangles.append(lid)
+        end = np.stack([ring, np.roll(ring, -1), np.zeros(corners, int)], axis=1) + last
+        end[:, 2] = middle + 1
+        triangles.append(end)
+    return points, np.concatenate(triangles)
+
+
+def line_tube(line: Float[np.ndarray, "points 3"], radius: float, corners: int = 10) -> Mesh:
+    """A round tube along a line."""
+    line = np.asarray(line, float)
+    slope = np.gradient(line, axis=0)
+    slope /= np.maximum(np.linalg.norm(slope, axis=1), 1e-300)[:, None]
+    across = _carried(slope)
+    angle = 2 * np.pi * np.arange(corners) / corners
+    ring = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return tube(line, across, np.broadcast_to(ring, (len(line), corners, 2)))
+
+
+def _carried(slope: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 3"]:
+    """Two directions across a line that do not wind about it."""
+    start = np.eye(3)[np.argmin(np.abs(slope[0]))]
+    found = []
+    for along in slope:
+        start = start - (start @ along) * along
+        start = start / np.linalg.norm(start)
+        found.append(np.stack([start, np.cross(along, start)]))
+    return np.stack(found)
+
+
+def arrow_triangles(
+    starts: Float[np.ndarray, "arrows 3"], vectors: Float[np.ndarray, "arrows 3"], radius: float
+) -> Mesh:
+    """Arrows with shafts of `radius` [m]; a short arrow has a small head."""
+    length = np.linalg.norm(vectors, axis=1)
+    kept = length > 1e-12 + 1e-6 * float(length.max(initial=0.0))
+    starts, vectors, length = starts[kept], vectors[kept], length[kept]
+    shape, triangles = _arrow()
+    along = vectors / length[:, None]
+    side = np.cross(along, np.eye(3)[np.argmin(np.abs(along), axis=1)])
+    side /= np.linalg.norm(side, axis=1)[:, None]
+    frames = np.stack([along, side, np.cross(along, side)], axis=1)
+    head = np.minimum(0.45 * length, 6.0 * radius)
+    thin = head / (6.0 * radius) * radius
+    along_at = np.where(
+        shape[None, :, 0] <= 1, shape[None, :, 0] * (length - head)[:, None],
+        (length - head)[:, None] + (shape[None, :, 0] - 1) * head[:, None],
+    )  # fmt: skip
+    local = np.concatenate(
+        [along_at[:, :, None], shape[None, :, 1:] * thin[:, None, None]], axis=2
+    )
+    points = starts[:, None] + np.einsum("aki,aij->akj", local, frames)
+    shift = np.arange(len(starts))[:, None, None] * len(shape)
+    return points.reshape(-1, 3), (triangles[None] + shift).reshape(-1, 3)
+
+
+@functools.cache
+def _arrow(corners: int = 12) -> Mesh:
+    """Along x: 0 to 1 the shaft of radius 1, 1 to 2 the head."""
+    angle = 2 * np.pi * np.arange(corners) / corners
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    places = ((0.0, 0.0), (0.0, 1.0), (1.0, 1.0), (1.0, 2.4), (2.0, 0.0))
+    centres = np.array([[x, 0.0, 0.0] for x, _ in places])
+    across = np.broadcast_to(np.eye(3)[1:], (len(places), 2, 3))
+    outlines = np.stack([r * ring for _, r in places])
+    return tube(centres, across, outlines, closed=False)
+
+
+def ball_triangles(
+    centres: Float[np.ndarray, "balls 3"], radius: float, corners: int = 10
+) -> Mesh:
+    """Balls of `radius` [m]."""
+    shape, triangles = _ball(corners // 2 + 1, corners)
+    points = np.asarray(centres, float)[:, None] + radius * shape[None]
+    shift = np.arange(len(points))[:, None, None] * len(shape)
+    return points.reshape(-1, 3), (triangles[None] + shift).reshape(-1, 3)
+
+
+@functools.cache
+def _ball(rings: int, corners: int) -> Mesh:
+    angle = 2 * np.pi * np.arange(corners) / corners
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    polar = np.linspace(0, np.pi, rings + 1)
+    centres = np.stack([-np.cos(polar), 0 * polar, 0 * polar], axis=1)
+    across = np.broadcast_to(np.eye(3)[1:], (rings + 1, 2, 3))
+    outlines = np.sin(polar)[:, None, None] * ring[None]
+    return tube(centres, across, outlines, closed=False)

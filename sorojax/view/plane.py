@@ -1,0 +1,144 @@
+"""Plane scenes drawn with matplotlib, in mm."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sorojax.view import style
+from sorojax.view.drawing import as_path, loops
+from sorojax.view.scene import Arrows, Dots, Lines, Part, Scale, Scene, Surface
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def plane_figure(scene: Scene, *, width: float = 9.0) -> "tuple[Figure, Axes]":
+    """One plane scene with axes, colour bar and names."""
+    lower, upper = (1e3 * corner for corner in scene.box)
+    figure = style.new_figure(width, height_for(width, lower, upper))
+    axes = figure.add_subplot()
+    draw_plane(axes, scene)
+    style.dress_plane(axes, lower, upper)
+    if scene.scale is not None:
+        bar_beside(figure, axes, scene.scale)
+    name_parts(axes, scene)
+    style.title(figure, scene.title)
+    if scene.note:
+        axes.set_title(scene.note, fontsize=style.LABEL, color=style.INK, loc="left")
+    return figure, axes
+
+
+def height_for(width: float, lower: np.ndarray, upper: np.ndarray) -> float:
+    """Height of a figure [inch] that shows a box of these corners."""
+    span = np.maximum(upper - lower, 1e-9)
+    return float(np.clip(1.2 + 0.8 * width * span[1] / span[0], 2.6, 9.0))
+
+
+def draw_plane(axes: "Axes", scene: Scene) -> "list[Artist]":
+    """Put every part into `axes`; the artists, in the order they are drawn."""
+    made: list[Any] = []
+    for part in scene.parts:
+        made += _draw(axes, part, scene.scale)
+    return made
+
+
+def bar_beside(figure: "Figure", axes: Any, scale: Scale, **options: Any) -> Any:
+    """A colour bar that takes its room from `axes`."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    painted = ScalarMappable(Normalize(scale.low, scale.high), scale.colours)
+    look = {"shrink": 0.9, "aspect": 30, "pad": 0.02, "extend": scale.extend} | options
+    label = scale.label + ("\n(arrow: the highest 0.5 %)" if scale.extend == "max" else "")
+    return style.colour_bar(figure, painted, axes, label, **look)
+
+
+def name_parts(axes: "Axes", scene: Scene) -> None:
+    """A legend of the parts that have names, above the axes."""
+    named = [part.name for part in scene.parts if part.name]
+    if named:
+        style.legend(
+            axes, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2,
+            ncols=min(len(set(named)), 4),
+        )  # fmt: skip
+
+
+def _draw(axes: "Axes", part: Part, scale: Scale | None) -> list:
+    label = part.name or "_"
+    if isinstance(part, Surface):
+        return _surface(axes, part, scale, label)
+    if isinstance(part, Lines):
+        return _lines(axes, part, label)
+    if isinstance(part, Dots):
+        x, y = 1e3 * part.points.T
+        return axes.plot(x, y, "o", color=part.colour, ms=part.size, label=label, mew=0)
+    return _arrows(axes, part, label)
+
+
+def _surface(axes: "Axes", part: Surface, scale: Scale | None, label: str) -> list:
+    from matplotlib.collections import LineCollection, PolyCollection
+    from matplotlib.patches import PathPatch
+
+    points, triangles = 1e3 * np.asarray(part.points), np.asarray(part.triangles)
+    artists: list[Any] = []
+    if part.values is not None and scale is not None:
+        artists.append(_painted(axes, points, triangles, np.asarray(part.values), scale))
+    elif isinstance(part.colour, str):
+        path = as_path(points, loops(rim(triangles)))
+        patch = PathPatch(path, facecolor=part.colour, edgecolor="none", alpha=part.opacity,
+                          label=label)  # fmt: skip
+        artists.append(axes.add_patch(patch))
+    else:
+        faces = PolyCollection(list(points[triangles]), facecolors=part.colour, label=label,
+                               edgecolors="face", linewidths=0.2)  # fmt: skip
+        artists.append(axes.add_collection(faces, autolim=False))
+    if part.wire is not None:
+        ends = np.concatenate(
+            [triangles[part.wire[:, k]][:, [k, (k + 1) % 3]] for k in range(3)]
+        )
+        ends = np.unique(np.sort(ends, axis=1), axis=0)
+        wire = LineCollection(list(points[ends]), colors=style.GREY, linewidths=0.35)
+        artists.append(axes.add_collection(wire, autolim=False))
+    return artists
+
+
+def _painted(axes: Any, points, triangles, values, scale: Scale):
+    per_point = len(values) == len(points) and len(values) != len(triangles)
+    options = {"cmap": scale.colours, "vmin": scale.low, "vmax": scale.high, "rasterized": True}
+    x, y = points.T
+    if per_point:
+        return axes.tripcolor(x, y, triangles, values, shading="gouraud", **options)
+    return axes.tripcolor(x, y, triangles, facecolors=values, **options)
+
+
+def _lines(axes: "Axes", part: Lines, label: str) -> list:
+    from matplotlib.collections import LineCollection
+
+    runs = [1e3 * np.asarray(run) for run in part.runs]
+    dashes: Any = (0, (4, 2)) if part.dashed else "solid"
+    made = LineCollection(runs, colors=part.colour, linewidths=part.width, linestyles=dashes,
+                          label=label, capstyle="round", joinstyle="round")  # fmt: skip
+    return [axes.add_collection(made, autolim=False)]
+
+
+def _arrows(axes: "Axes", part: Arrows, label: str) -> list:
+    x, y = 1e3 * part.starts.T
+    u, v = 1e3 * part.vectors.T
+    made = axes.quiver(
+        x, y, u, v, angles="xy", scale_units="xy", scale=1.0, color=part.colour, units="dots",
+        width=1.1 * axes.figure.dpi / 72, headwidth=4.5, headlength=5.5, headaxislength=5.0,
+        zorder=4,
+    )  # fmt: skip
+    if part.name:
+        axes.plot([], [], color=part.colour, marker=">", lw=1.5, ms=5, label=label)
+    return [made]
+
+
+def rim(triangles: np.ndarray) -> np.ndarray:
+    """Sides of one triangle only, with the triangle on the left."""
+    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    size = int(triangles.max(initial=0)) + 1
+    forward, back = sides @ np.array([size, 1]), sides @ np.array([1, size])
+    return sides[~np.isin(forward, back)]

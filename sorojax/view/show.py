@@ -1,0 +1,80 @@
+"""`show`: one verb that draws any noun; what draws it is loaded when it is first asked for."""
+
+import functools
+import importlib
+from typing import Any
+
+from sorojax.view.picture import Picture
+
+#: Noun, module of this floor, function. The class itself is not imported.
+_DRAWN_BY = {
+    "sorojax.sdf.base.AbstractSdf": ("shapes", "show_shape"),
+    "sorojax.sdf.isosurface.Surface": ("shapes", "show_surface"),
+    "sorojax.mesh.mesh.Mesh": ("meshes", "show_cells"),
+    "sorojax.fem.problem.Problem": ("states", "show_problem"),
+    "sorojax.fem.solve.Solution": ("states", "show_solution"),
+    "sorojax.fem.solve_volume.CavitySolution": ("states", "show_solution"),
+    "sorojax.fem.solve.Path": ("states", "show_path"),
+    "sorojax.fem.continuation.Continuation": ("states", "show_path"),
+    "sorojax.fem.motion.Motion": ("states", "show_path"),
+    "sorojax.fem.modal.Modes": ("states", "show_vibration"),
+    "sorojax.rod.rod.Rod": ("rods", "show_rod"),
+    "sorojax.rod.assembly.Assembly": ("rods", "show_rod"),
+    "sorojax.rod.section.Section": ("parts", "show_section"),
+    "sorojax.rod.basis.StrainBasis": ("parts", "show_basis"),
+    "sorojax.rod.rollout.Rollout": ("runs", "show_rollout"),
+    "sorojax.material.hyperelastic.AbstractHyperelastic": ("parts", "show_material"),
+    "sorojax.systems.rod_body.RodBody": ("parts", "show_body"),
+    "sorojax.systems.assembly_body.AssemblyBody": ("parts", "show_body"),
+    "sorojax.systems.block.AbstractBlock": ("networks", "show_network"),
+    "sorojax.systems.simulate.Trajectory": ("runs", "show_trajectory"),
+    "sorojax.design.minimise.Optimised": ("runs", "show_optimised"),
+    "sorojax.view.charts.Convergence": ("charts", "show_convergence"),
+    "sorojax.view.charts.WorkPrecision": ("charts", "show_work_precision"),
+}
+
+
+@functools.singledispatch
+def show(thing: Any, *at: Any, **options: Any) -> Picture:
+    """Draw any noun of the framework; the result is displayed by a notebook and can be saved.
+
+    Shapes, surfaces and meshes; problems, solutions, load paths, motions and modes; rods,
+    assemblies, sections, strain bases; materials; networks, blocks and trajectories;
+    optimisations; `Convergence` and `WorkPrecision`. In space the picture is shaded by
+    pyvista where it is installed and by sorojax itself elsewhere. `show.register(Type,
+    function)` adds a noun.
+
+    Args:
+        thing: What to draw.
+        *at: Coordinates, of a rod, an assembly or a block that holds one.
+        **options: Of the function that draws it: `view.options(thing)` is that function.
+            Solid pictures take `view=` ("iso", "front", "top", ..., or a `Camera`) and
+            `renderer=`; bodies take `field=`; all take `title=`.
+
+    Raises:
+        TypeError: If nothing is known about the type.
+        ValueError: If the thing cannot be drawn: unbounded, traced, or not finite.
+
+    Example:
+        `view.show(solution, field="von_mises").save("finger.pdf")`
+    """
+    return _known(thing)(thing, *at, **options)
+
+
+def options(thing: Any) -> Any:
+    """The function that `show` calls for `thing`; its signature lists the options."""
+    found = show.dispatch(type(thing))
+    return _known(thing) if found is show.dispatch(object) else found
+
+
+def _known(thing: Any) -> Any:
+    for kind in type(thing).__mro__:
+        entry = _DRAWN_BY.get(f"{kind.__module__}.{kind.__qualname__}")
+        if entry is not None:
+            module = importlib.import_module(f"sorojax.view.{entry[0]}")
+            return getattr(module, entry[1])
+    names = ", ".join(sorted(name.rsplit(".", 1)[1] for name in _DRAWN_BY))
+    raise TypeError(
+        f"view.show: got a {type(thing).__name__}, need one of {names}. Register a function "
+        "for other types with view.show.register."
+    )

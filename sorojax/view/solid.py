@@ -1,0 +1,226 @@
+"""Solid scenes in a figure: the shaded picture, its colour bar, scale, axes and names."""
+
+import warnings
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from sorojax.view import style
+from sorojax.view.camera import Camera, Lens, View, box_corners, camera_at, fit
+from sorojax.view.scene import Scene, Surface, corners_of
+from sorojax.view.shade import shade
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_told = False
+
+
+def picture_of(
+    scene: Scene,
+    lens: Lens,
+    *,
+    renderer: str = "auto",
+    samples: int = 2,
+    dots_per_point: float = 1.4,
+) -> UInt8[np.ndarray, "height width 3"]:
+    """The pixels of a solid scene, by pyvista where it is installed.
+
+    Args:
+        scene: What to draw.
+        lens: From `lens_of`.
+        renderer: "pyvista", "own", or "auto": pyvista if it is there, with one warning if
+            it is not.
+        samples: Per pixel and direction, of the own renderer.
+        dots_per_point: Pixels that a point of print has.
+    """
+    if chosen_renderer(renderer) == "pyvista":
+        from sorojax.view.vtk import screenshot
+
+        return screenshot(scene, lens, dots_per_point)
+    return shade(scene, lens, samples=samples, dots_per_point=dots_per_point)
+
+
+def chosen_renderer(renderer: str) -> str:
+    """ "pyvista" or "own"; tells once that the extra is missing."""
+    global _told
+    if renderer not in ("auto", "own", "pyvista"):
+        raise ValueError(
+            f'view: got renderer={renderer!r}, need "auto", "own" or "pyvista". Leave it out.'
+        )
+    if renderer == "own":
+        return renderer
+    import importlib.util
+
+    if importlib.util.find_spec("pyvista") is not None:
+        return "pyvista"
+    if renderer == "pyvista":
+        raise ValueError(
+            'view: pyvista is not installed. Run pip install "sorojax[view]", or leave '
+            "`renderer` out."
+        )
+    if not _told:
+        _told = True
+        warnings.warn(
+            "view: pyvista is not installed, solid pictures are shaded by sorojax's own "
+            'renderer. Run pip install "sorojax[view]" for pyvista, or pass renderer="own".',
+            stacklevel=4,
+        )
+    return "own"
+
+
+def lens_of(scenes: Sequence[Scene], view: View, size: tuple[int, int], share: float = 0.0):
+    """One lens that holds everything that `scenes` show."""
+    if any(scene.extent is not None for scene in scenes):
+        points = np.concatenate([box_corners(*scene.box) for scene in scenes])
+    else:
+        points = np.concatenate([corners_of(p) for scene in scenes for p in scene.parts])
+    return fit(camera_at(view, share), points[np.all(np.isfinite(points), axis=1)], size)
+
+
+def draw_solid(
+    figure: "Figure",
+    axes: "Axes",
+    scene: Scene,
+    *,
+    view: View = "iso",
+    renderer: str = "auto",
+    lens: Lens | None = None,
+) -> Lens:
+    """Shade `scene` into `axes`, whose place in the figure is final; returns the lens."""
+    box = axes.get_window_extent()
+    size = max(int(round(box.width)), 16), max(int(round(box.height)), 16)
+    lens = lens_of([scene], view, size) if lens is None else lens
+    picture = picture_of(scene, lens, renderer=renderer, dots_per_point=figure.dpi / 72)
+    axes.set_xlim(0, size[0])
+    axes.set_ylim(size[1], 0)
+    axes.imshow(
+        picture, extent=(0, size[0], size[1], 0), interpolation="nearest", aspect="auto"
+    )
+    axes.axis("off")
+    return lens
+
+
+def frame(
+    figure: "Figure", scene: Scene, *, bar: bool = True, title: str | None = None
+) -> "tuple[Axes, Any]":
+    """Axes for the picture, beside a colour bar if the scene has values."""
+    width, height = figure.get_size_inches()
+    heading = scene.title if title is None else title
+    count = len({part.name for part in scene.parts if part.name})
+    names = 0.05 + 0.21 * -(-count // 4) if count else 0.0
+    top = 1 - ((0.42 if heading else 0.08) + names) / height
+    right = 1 - (1.05 / width if scene.scale is not None and bar else 0.08 / width)
+    low = 0.30 / height
+    axes = figure.add_axes((0.08 / width, low, right - 0.08 / width, top - low))
+    drawn = None
+    if scene.scale is not None and bar:
+        place = (right + 0.12 / width, low + 0.1 * (top - low), 0.16 / width, 0.8 * (top - low))
+        drawn = bar_of(figure, scene.scale, figure.add_axes(place))
+    if heading:
+        figure.text(
+            0.5, 1 - 0.1 / height, heading, ha="center", va="top", fontsize=style.TITLE,
+            color=style.INK, fontweight="bold",
+        )  # fmt: skip
+    return axes, drawn
+
+
+def bar_of(figure: "Figure", scale, axes: "Axes") -> Any:
+    """The colour bar of a scale in its own axes."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    painted = ScalarMappable(Normalize(scale.low, scale.high), scale.colours)
+    bar = figure.colorbar(painted, cax=axes, extend=scale.extend)
+    bar.set_label(scale.label, fontsize=style.LABEL, color=style.INK)
+    axes.tick_params(labelsize=style.SMALL, colors=style.INK, length=3, color=style.GREY)
+    bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+    return bar
+
+
+def annotate(figure: "Figure", axes: "Axes", scene: Scene, lens: Lens, note: str = "") -> None:
+    """Directions of the axes, a bar of known length, and the names of the parts."""
+    width, height = lens.size
+    unit = 16 * figure.dpi / 72
+    corner = np.array([1.5 * unit, height - 1.5 * unit])
+    right, up, _ = lens.camera.axes
+    order = np.argsort(lens.camera.axes[2])
+    for k in order:
+        step = np.array([right[k], -up[k]]) * unit
+        colour = ("#c0392b", "#1e8449", "#1f5fa8")[k]
+        tip = corner + step
+        axes.plot(*np.stack([corner, tip]).T, color=colour, lw=1.4, solid_capstyle="round")
+        axes.text(*(corner + 1.35 * step), "xyz"[k], color=colour, fontsize=style.SMALL,
+                  ha="center", va="center")  # fmt: skip
+    length = _round_length(0.22 * width / lens.scale)
+    start = 4.2 * unit
+    axes.plot([start, start + length * lens.scale], [height - 0.6 * unit] * 2,
+              color=style.INK, lw=2.0, solid_capstyle="butt")  # fmt: skip
+    axes.text(
+        start + length * lens.scale + 0.4 * unit, height - 0.6 * unit, _length_text(length),
+        fontsize=style.SMALL, color=style.INK, va="center",
+    )  # fmt: skip
+    if text := note or scene.note:
+        axes.text(width - 0.4 * unit, height - 0.6 * unit, text, fontsize=style.SMALL,
+                  color=style.INK, ha="right", va="center")  # fmt: skip
+    _names(axes, scene)
+
+
+def _names(axes: "Axes", scene: Scene) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    shown: dict[str, Any] = {}
+    for part in scene.parts:
+        colour = getattr(part, "colour", style.INK)
+        if not part.name or part.name in shown or not isinstance(colour, str):
+            continue
+        shown[part.name] = (
+            Patch(color=colour, label=part.name)
+            if isinstance(part, Surface)
+            else Line2D([], [], color=colour, lw=2, label=part.name)
+        )
+    if shown:
+        axes.legend(
+            handles=list(shown.values()), frameon=False, fontsize=style.SMALL,
+            labelcolor=style.INK, loc="lower left", bbox_to_anchor=(0.0, 1.0),
+            borderaxespad=0.1, ncols=min(len(shown), 4), columnspacing=1.2,
+        )  # fmt: skip
+
+
+def _round_length(length: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten below `length`."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(max(m for m in (1, 2, 5) if m * power <= length * 1.0001) * power)
+
+
+def _length_text(length: float) -> str:
+    return f"{length:g} m" if length >= 0.999 else f"{1e3 * length:g} mm"
+
+
+def solid_figure(
+    scene: Scene,
+    *,
+    view: View = "iso",
+    renderer: str = "auto",
+    width: float = 7.0,
+    height: float | None = None,
+) -> "tuple[Figure, Lens]":
+    """One solid scene in a figure of `width` inches."""
+    if height is None:
+        height = _height(scene, camera_at(view), width)
+    figure = style.new_figure(width, height, layout="none")
+    axes, _ = frame(figure, scene)
+    lens = draw_solid(figure, axes, scene, view=view, renderer=renderer)
+    annotate(figure, axes, scene, lens)
+    return figure, lens
+
+
+def _height(scene: Scene, camera: Camera, width: float) -> float:
+    """As high as the picture asks for, between a third of the width and all of it."""
+    flat = fit(camera, box_corners(*scene.box), (100, 100)).raw(box_corners(*scene.box))[:, :2]
+    span = flat.max(axis=0) - flat.min(axis=0)
+    return float(np.clip(0.9 + width * span[1] / max(span[0], 1e-12), 0.45 * width, width))

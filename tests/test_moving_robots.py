@@ -1,0 +1,62 @@
+"""Robots that move by themselves: drawings, meshes, gait, and where they stand."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sorojax import fem, mesh, robots, sdf
+from sorojax.robots.crawler import PORTS, crawler_mesh
+from sorojax.units import kPa, mm
+
+
+def test_the_mesh_of_the_crawler_is_its_drawing():
+    crawler = robots.Crawler(num_chambers=9)
+    cells = crawler_mesh(crawler, 3 * mm)
+    drawn = float(sdf.area(crawler.body()))
+    assert float(jnp.sum(mesh.cell_areas(cells))) == pytest.approx(drawn, rel=1e-4)
+    sole = float(jnp.sum(mesh.cell_areas(cells)[cells.regions["sole"]]))
+    assert sole == pytest.approx(150 * mm * 2 * mm, rel=1e-9)
+    problem = robots.crawler_problem(crawler, size=3 * mm, depth=1.0)
+    air = 9 * 3.22 * mm * 8.4 * mm
+    zero = jnp.zeros_like(cells.points)
+    for load in problem.loads[1:-1]:
+        assert isinstance(load, fem.Pressure)
+        assert load.potential(problem, zero) == 0.0
+        push = fem.with_load(problem, load.name, 1.0)
+        volume = -[x for x in push.loads if x.name == load.name][0].potential(push, zero)
+        assert float(volume) == pytest.approx(air, rel=1e-9)
+    floor = problem.loads[-1]
+    assert isinstance(floor, fem.Contact)
+    assert float(floor.points_of(problem, zero)[..., 1].min()) == 0.0
+
+
+def test_the_gait_is_a_row_of_half_waves():
+    gait = robots.crawler_gait(8 * kPa, 2.0, np.pi / 3)
+    assert tuple(gait) == PORTS
+    t = jnp.linspace(0, 0.5, 601)
+    waves = np.stack([np.asarray(gait[name](t)) for name in PORTS])
+    assert waves.min() == 0.0 and np.allclose(waves.max(axis=1), 8 * kPa, rtol=1e-4)
+    peaks = np.asarray(t)[waves.argmax(axis=1)]
+    assert np.allclose(np.diff(peaks), 0.5 / 6, atol=1e-3)  # a sixth of the period
+
+
+def test_crawlers_without_room_are_refused():
+    with pytest.raises(ValueError, match="between groups"):
+        robots.Crawler(num_chambers=13)
+    with pytest.raises(ValueError, match="metres"):
+        robots.Crawler(height=12.0)
+
+
+def test_the_walker_stands_on_all_its_feet():
+    walker = robots.Walker(num_pairs=2)
+    problem = robots.walker_problem(walker, size=1.6 * mm)
+    cells, floor = problem.mesh, problem.loads[-1]
+    assert isinstance(floor, fem.Contact)
+    zero = jnp.zeros_like(cells.points)
+    points = np.asarray(floor.points_of(problem, zero)).reshape(-1, 2)
+    for foot in np.asarray(walker.bottoms()):
+        near = points[np.abs(points[:, 0] - foot[0]) < 0.3 * mm]
+        assert -1e-9 < near[:, 1].min() < 0.05 * mm
+    assert float(cells.points[:, 1].min()) == pytest.approx(0.0, abs=1e-3 * mm)
+    assert np.allclose(robots.pair_angles(walker, cells, zero[None]), np.pi / 2, atol=0.1)
+    assert float(problem.loads[0].value[0]) == pytest.approx(9.81 / 2)

@@ -1,0 +1,160 @@
+"""Rods of the printable robots: their cells in closed form, their places, their board."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sorojax import material, robots, rod as R, sdf
+from sorojax.math.lie import SE2, SE3
+from sorojax.robots import models_cells
+from sorojax.robots.models_cell import Cell
+from sorojax.robots.models_rods import body, column, side_by_side
+from sorojax.robots.parts import LaidAlong
+from sorojax.units import kPa, mm
+from sorojax_board.bench import STEP
+from sorojax_hardware import LocalBoard, SimulatedClock, run_loop, simulated
+
+RUBBER = robots.printed_rubber()
+CELL = Cell(
+    stiffness=[[400.0, -1.5, 0.0], [-1.5, 0.016, 0.0], [0.0, 0.0, 0.004]],
+    push=[1.2e-4, 2e-7, 0.0], gas=1e-4, compliance=1e-9, solid=1e-4,
+    second_moments=[3e-9, 2e-9], center=[-1.5 * mm, 0.0],
+)  # fmt: skip
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Robots whose cells need not be solved."""
+    monkeypatch.setattr(models_cells, "unit_cell", lambda *_, **__: CELL)
+
+
+def test_the_cell_of_a_tube_is_that_of_lame():
+    inner, outer, young, ratio = 5 * mm, 8 * mm, 1e6, 0.45
+    air = LaidAlong(sdf.Cylinder(inner, 100 * mm), 0)
+    tube = LaidAlong(sdf.Cylinder(outer, 100 * mm), 0) - air
+    rubber = material.neo_hookean(young_modulus=young, poisson_ratio=ratio)
+    cell = robots.unit_cell(
+        tube, air, (0.0, 6 * mm), rubber, size=1.5 * mm, mirrors=(1, 2)
+    )  # fmt: skip
+    area, hole = np.pi * (outer**2 - inner**2), np.pi * inner**2
+    moment = np.pi / 4 * (outer**4 - inner**4)
+    want = young * np.array([area, moment, moment])
+    assert np.allclose(np.diag(cell.stiffness), want, rtol=1e-3)
+    assert np.allclose(
+        cell.stiffness - np.diag(np.diag(cell.stiffness)), 0, atol=1e-9 * want[0]
+    )
+    # held at its ends, the wall under pressure pushes with nu (sigma_r + sigma_t)
+    assert cell.push[0] == pytest.approx(hole * (1 - 2 * ratio), rel=1e-3)
+    assert np.array_equal(cell.push[1:], [0, 0])
+    bulge = inner * (1 + ratio) / young / (outer**2 - inner**2)
+    bulge *= (1 - 2 * ratio) * inner**2 + outer**2
+    assert cell.compliance == pytest.approx(2 * np.pi * inner * bulge, rel=1e-2)
+    assert cell.gas == pytest.approx(hole, rel=1e-3)
+    assert cell.solid == pytest.approx(area, rel=1e-3)
+    assert np.allclose(cell.second_moments, moment, rtol=1e-3)
+
+
+@pytest.mark.parametrize("group", [SE2(), SE3()])
+def test_a_column_bends_by_its_cell(group):
+    """Constant strains: stiffness times strain is push times pressure."""
+    names = ("kappa_z", "sigma_x")
+    made = body(group, R.constant(*names), column(CELL), 0.08, RUBBER, damping=1e-3)
+    q = jnp.linalg.solve(made.forces[0].stiffness, 40 * kPa * made.chambers.push[0])
+    e, k = np.linalg.solve(CELL.stiffness[:2, :2], 40 * kPa * CELL.push[:2])
+    assert np.allclose(q, [-k, e], rtol=1e-9)
+    pressure = jnp.asarray(40 * kPa)
+    got = made.chambers.coenergy(q, pressure) / pressure
+    want = 0.08 * (CELL.gas + CELL.push[0] * e + CELL.push[1] * k + CELL.compliance * 20 * kPa)
+    assert float(got) == pytest.approx(float(want), rel=1e-12)
+    assert jnp.allclose(made.forces[1].matrix(jnp.zeros(())), 1e-3 * made.forces[0].stiffness)
+
+
+def test_columns_side_by_side_have_the_stiffness_of_two_clamped_beams():
+    length, half = 0.05, 13 * mm
+    pair = side_by_side(CELL, jnp.array([[half, 0.0], [-half, 0.0]]), length)
+    one = np.asarray(CELL.stiffness)
+    assert pair.stiffness[0, 0] == pytest.approx(2 * one[0, 0])
+    assert pair.stiffness[1, 1] == pytest.approx(2 * (one[1, 1] + one[0, 0] * half**2))
+    assert pair.shear is not None and pair.shear[0] == pytest.approx(24 * one[1, 1] / length**2)
+    # a force across the end: the ends stay parallel when a moment holds them so
+    made = body(SE2(), R.constant("kappa_z", "sigma_y"), pair, length, RUBBER, damping=0.0)
+    force = jnp.array([-1e-3 * length / 2, 0.0, 1e-3])
+    q = jnp.linalg.solve(made.forces[0].stiffness, jnp.array([0.0, 1e-3 * length]))
+    rest = R.equilibrium(made.rod, (*made.forces, R.TipWrench(force)))
+    assert np.allclose(rest.q, q, rtol=1e-3, atol=1e-4)
+    shift = float(R.tip_pose(made.rod, rest.q)[1, 2])
+    assert shift == pytest.approx(1e-3 * length**3 / (24 * one[1, 1]), rel=2e-3)
+    mass = float(pair.solid * RUBBER.density * length)
+    assert float(jnp.sum(R.operators(made.rod).mass)) == pytest.approx(mass)
+
+
+def test_fingers_stand_where_they_are_drawn(quick):
+    hand = robots.Hand()
+    made = robots.model(hand)
+    assert made.ports == ("thumb", "index", "middle", "ring", "little")
+    assert np.allclose(made.high, 60 * kPa) and np.allclose(made.low, -10 * kPa)
+    skin, tips = hand.fingers(), {}
+    for name in made.ports:
+        part = made.assembly[name]
+        place = part.offset @ jnp.stack([part.body.length, *jnp.zeros(2), jnp.ones(())])
+        along, up = part.offset[:3, 0], part.offset[:3, 1]
+        finger = hand.thumb if name == "thumb" else hand.finger
+        end = place[:3] + along * (finger.bellows.cap + finger.tip_radius)
+        # the axis lies off the middle of the finger, towards its spine
+        assert abs(float(skin(end - up * CELL.center[0]))) < 1e-6 and float(skin(place[:3])) < 0
+        tips[name] = place[0]
+    x = [float(tips[name]) for name in made.ports]
+    assert x == sorted(x, reverse=True)
+
+
+def test_the_gripper_hangs_on_the_arm(quick):
+    robot = robots.Manipulator()
+    made = robots.model(robot)
+    assert made.counts == (3, None) and np.allclose(made.high, np.array([30, 30, 30, 60]) * kPa)
+    arm = made.assembly["arm"]
+    end = arm.offset[:3, 3] + arm.body.length * arm.offset[:3, 0]
+    assert np.allclose(end, [0, 0, 75 * mm])
+    away = robot.finger_distance + CELL.center[0]
+    for k in range(3):
+        foot = end + arm.offset[:3, :3] @ made.assembly[f"finger_{k}"].offset[:3, 3]
+        height = robot.finger_foot + robot.finger.bellows.cap
+        assert float(foot[2]) == pytest.approx(float(height))
+        assert float(jnp.hypot(foot[0], foot[1])) == pytest.approx(float(away))
+    inputs = made.inputs(jnp.arange(4.0))
+    assert inputs["arm_valve.setpoint"].tolist() == [0, 1, 2]
+    assert float(inputs["gripper_valve.setpoint"]) == 3
+    fed = dict(made.network.wires)
+    assert fed["body.finger_2_pressure"] == "gripper_air.pressure"
+    assert fed["gripper_air.volume"] == "gripper_volume.value"
+
+
+def test_what_has_no_model_is_told(quick):
+    with pytest.raises(TypeError, match="need a BendingActuator"):
+        robots.model(robots.Bellows())
+    with pytest.raises(ValueError, match="need one of bending"):
+        robots.bench("foot")
+    with pytest.raises(ValueError, match="no period"):
+        robots.model(robots.BendingActuator(num_bellows=1))
+
+
+def test_a_printed_actuator_behind_a_board():
+    """From the drawing to set-points and pressures, with converters, noise and dead time."""
+    valves, limits = simulated("bending", seed=3)
+    with pytest.raises(ValueError, match="made for 0.005"):
+        valves._advance(valves.state, np.zeros(1), 1e-3)
+    clock = SimulatedClock()
+    board = LocalBoard(limits, valves, clock)
+    board.arm()
+    ticks = list(
+        run_loop(board, clock, lambda t, p, s: (40 * kPa, s), None, duration=0.6, period=0.01,
+                 limits=board.board.settings.limits[0][:2])
+    )  # fmt: skip
+    assert limits.limits[0][:2] == (-10 * kPa, 100 * kPa)
+    pressure = np.array([tick.pressure[0] for tick in ticks])
+    assert np.allclose(pressure[-10:], 40 * kPa, atol=5 * 80) and pressure[2] < 20 * kPa
+    assert np.allclose(pressure / STEP, np.rint(pressure / STEP), atol=1e-6)
+    assert np.std(pressure[-10:]) > 20
+    q = valves.state.state["body"]["q"]
+    assert -10 < float(q[0]) < -3 and 0.02 < float(q[3]) < 0.06  # bends down, grows
+    clock.sleep_until(clock.now() + 0.8)
+    assert abs(board.read_pressure()[0]) < 500
