@@ -21,6 +21,7 @@ from sorojax.math.status import Status
 
 Optimiser = MMA | GCMMA | OptimalityCriteria | optax.GradientTransformation
 _INNER = 15  # proposals of GCMMA for one step
+_HELD = 1e-3  # overshoot of a constraint that counts as none
 _RETREATS = 4  # halvings of a step that leads to where a function is not defined
 
 
@@ -51,8 +52,9 @@ class Optimised(eqx.Module):
         design: The variables.
         objective: At `design`.
         constraints: At `design`, each <= 0 if it holds.
-        status: `successful` when the change fell below the tolerance, `max_steps` when the
-            steps ran out first, `not_finite` when a value broke; the last good design then.
+        status: `successful` when the change fell below the tolerance, `out_of_reach` when it
+            did with a constraint broken, `max_steps` when the steps ran out first,
+            `not_finite` when a value broke; the last good design then.
         history: Objective, constraints (m columns) and change of every step.
         last: The last step; pass it as `resume` to go on.
     """
@@ -164,7 +166,18 @@ def minimise(
     if status == Status.not_finite:
         flat = last
     objective, held = task.plain(flat, max(len(history) + first - 1, 0))
-    return Optimised(back(flat), objective, held, status, _columns(history), step)  # type: ignore
+    columns = _columns(history)
+    if status == Status.successful and _broken(held, columns):
+        status = Status.out_of_reach
+    return Optimised(back(flat), objective, held, status, columns, step)  # type: ignore
+
+
+def _broken(held: Array, columns: dict[str, np.ndarray]) -> bool:
+    """Whether a constraint ends above a thousandth of its values on the way, or of one."""
+    if held.size == 0:
+        return False
+    largest = np.abs(columns["constraints"]).max(axis=0, initial=1.0)
+    return bool(np.any(np.asarray(held) > _HELD * largest))
 
 
 class _Task:
