@@ -6,9 +6,10 @@ import sys
 import xml.etree.ElementTree as xml
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from benchmarks import discover, page, svg
+from benchmarks import discover, harness, memory, page, scaling, suite, svg
 from benchmarks.__main__ import main
 from benchmarks.peers import row
 from benchmarks.rows import KEYS, Row, Timing, line
@@ -146,3 +147,56 @@ def test_page_names_machine_and_every_row():
     text = page.html([line("rod.test", item) for item in rows])
     assert "2 us" in text and "no &lt;wheel&gt;" in text and "jax " in text
     assert "http" not in text.replace("http://www.w3.org/2000/svg", "")
+
+
+def test_suite_names_cases_that_exist_and_groups_all():
+    known = discover.cases()
+    named = [name for cases in suite.ROWS.values() for name in (*cases.quick, *cases.more)]
+    assert set(named) <= known.keys() and len(named) == len(set(named))
+    groups = suite.grouped(known)
+    assert sorted(n for names in groups.values() for n in names) == sorted(known)
+    assert list(groups)[0] == "rod statics" and "fem.cook" in groups["near incompressibility"]
+    assert suite.grouped(["my.case", "rod.ik"]) == {
+        "inverse kinematics and estimator": ["rod.ik"], suite.FURTHER: ["my.case"]
+    }  # fmt: skip
+
+
+def test_exponents_come_from_the_sizes_and_shortest_runs():
+    points = [
+        scaling.Point(n, Timing(0.0, (9.0 * n**2, 1.0 * n**2)), 0.5 * n) for n in (10, 100)
+    ]
+    first, second = scaling.rows("factor", "dof", 1.5, points)
+    assert "exponent" not in first.settings and second.settings["exponent"] == 2.0
+    assert second.settings["peak_MB"] == 50 and second.run_s_min == 10**4
+    text = page.html([line("scaling.test", row) for row in (first, second)])
+    assert "<td>2.00</td><td>1.5</td><td>50 MB</td>" in text and "further cases" in text
+
+
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="Linux tells")
+def test_peak_is_what_a_call_holds_at_most():
+    size = 40 * 2**20
+    found = memory.peak(lambda: len(np.ones(size, np.uint8)))
+    assert found is not None and 38 < found < 80
+
+
+def test_page_shows_features_peers_and_bars(monkeypatch, tmp_path):
+    monkeypatch.setenv("SOROJAX_PEERS", str(tmp_path))
+    pair = [
+        Row("sorojax", {"feature": "gravity", "scene": scene, "instructions": 9 + k,
+                        "flops": 100.0 * k}, run_s=1e-6 * (1 + k))
+        for k, scene in enumerate(("without", "with"))
+    ]  # fmt: skip
+    bars = [Row("sorojax", {}, run_s=1.0, bar=2.0), Row("sorojax", {}, run_s=3.0, bar=2.0)]
+    lines = [line("skip.features", row) for row in pair]
+    text = page.html(lines + [line("rod.statics", row) for row in bars])
+    table = "<td>gravity</td><td>9</td><td>10</td><td>0</td><td>100</td>"
+    assert table + "<td>1 us</td><td>2 us</td><td>2.00</td>" in text
+    assert "<td>1 of 2</td>" in text and "not installed: make peers PEERS=mujoco" in text
+    assert text.index('<h2 id="rod-statics">') < text.index(">skip.features</h3>")
+
+
+def test_a_quick_run_tells_its_cases(monkeypatch):
+    monkeypatch.delenv("SOROJAX_BENCH_QUICK", raising=False)
+    assert not harness.quick()
+    monkeypatch.setenv("SOROJAX_BENCH_QUICK", "1")
+    assert harness.quick()

@@ -1,0 +1,155 @@
+"""A PneuNet curls round a cylinder; three modes of its bending carry its backbone.
+
+Section V-D of the Sorotoki paper: a PneuNet of 120 x 20 mm under 40 kPa, from whose motion
+three modes of curvature are drawn. The cut is that of the paper's picture: 14 chambers (12 in
+its text), 13 slots of 0.55 mm whose walls touch, a cylinder of 20 mm below. Changed: Dragon
+Skin 30, nearly incompressible, on a layer ten times as stiff, in place of moduli of 0.2 and
+5 MPa whose bulk modulus is lambda / 2; equilibria, in place of a motion that its integrator
+damps. `--quick` takes the first six chambers.
+"""
+
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import sorojax as sj
+from sorojax import fem, material, mesh, reduction, rod, sdf
+from sorojax.units import deg, kPa, mm
+
+PITCH, FIRST = 7.47 * mm, 7.2 * mm
+WIDE, SLOT = 1.84 * mm, 0.55 * mm
+LAYER, FLOOR, NOTCH, ROOF, TOP = (y * mm for y in (1.75, 3.54, 10.9, 17.49, 20.0))
+CHAMBERS, END, STRIP = 14, 6.7 * mm, 5.7 * mm  # beyond the last chamber, and the body
+CENTRE, RADIUS = (25 * mm, -30 * mm), 20 * mm  # of the cylinder
+
+
+def columns(first, count, width, low, high) -> sdf.AbstractSdf:
+    """Upright rectangles, one every pitch."""
+    one = sdf.Rectangle([first - width / 2, low], [first + width / 2, high])
+    return sdf.repeat(one, [PITCH, 0.0], count, separate=True)
+
+
+def hollows(chambers: int) -> tuple[sdf.AbstractSdf, sdf.AbstractSdf]:
+    slots = columns(FIRST + PITCH / 2, chambers - 1, SLOT, NOTCH, TOP + mm)
+    return columns(FIRST, chambers, WIDE, FLOOR, ROOF), slots
+
+
+def actuator(chambers: int) -> mesh.Mesh:
+    """Quad8 cells between the lines of the drawing."""
+    middle = FIRST + PITCH * np.arange(chambers)
+    end = middle[-1] + END
+    sides = np.concatenate([middle - WIDE / 2, middle + WIDE / 2])
+    slot = middle[:-1] + PITCH / 2
+    walls = np.concatenate([middle - PITCH / 3.1, middle + PITCH / 3.1])
+    ends = [0, 3.1 * mm, end, end + STRIP]
+    x = np.unique(np.concatenate([ends, sides, walls, slot - SLOT / 2, slot + SLOT / 2]))
+    upper = np.linspace(NOTCH, ROOF, 4)[1:], [(ROOF + TOP) / 2, TOP]
+    y = np.concatenate([[0, LAYER], np.linspace(FLOOR, NOTCH, 4), *upper])
+    lines, counts = (x, y), (len(x) - 1, len(y) - 1)
+    grid = mesh.rectangle([0, 0], counts, divisions=counts, element=mesh.Quad8())
+    points = np.stack([np.interp(np.asarray(grid.points)[:, k], np.arange(len(line)), line)
+                       for k, line in enumerate(lines)], axis=1)  # fmt: skip
+    cells, (air, slots) = np.asarray(grid.cells), hollows(chambers)
+    centre = points[cells[:, :4]].mean(axis=1)
+    strip = (centre[:, 0] > end) & (centre[:, 1] > FLOOR)
+    left = ~strip & (np.asarray(air(centre)) > 0) & (np.asarray(slots(centre)) > 0)
+    used, cells = np.unique(cells[left], return_inverse=True)
+    return mesh.Mesh(points[used], cells.reshape(-1, 8), mesh.Quad8())
+
+
+def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
+    chambers = 6 if quick else CHAMBERS
+    cells, (air, slots) = actuator(chambers), hollows(chambers)
+    length = float(cells.points[:, 0].max())
+    stiff = np.ones(cells.num_cells)
+    stiff[mesh.cells_where(cells, lambda p: p[1] < LAYER)] = 10.0
+    under = mesh.facets_where(cells, lambda p: p[1] < 1e-9)
+    problem = fem.problem(
+        cells, material.Scaled(material.presets.dragon_skin_30(), stiff),
+        kinematics=fem.PlaneStrain(20 * mm),
+        supports=(fem.Fixed(mesh.nodes_where(cells, lambda p: p[0] < 1e-9)),),
+        loads=(
+            fem.Pressure(mesh.facets_on(cells, air), name="air"),
+            fem.SelfContact(mesh.facets_on(cells, slots), reach=0.8 * mm, name="walls"),
+            fem.Contact(under, sdf.Circle(CENTRE, RADIUS), name="cylinder"),
+        ),
+    )  # fmt: skip
+    path = fem.solve_path(problem, air=jnp.linspace(0, 40 * kPa, 9 if quick else 21))
+
+    line = reduction.Line([0.0, LAYER / 2], [length, LAYER / 2])
+    backbone = reduction.strain_along(path, line, samples=241)
+    basis = reduction.pod_basis(backbone, modes={"kappa_z": 3})
+    q = reduction.coordinates(backbone, basis)
+    body = rod.rod(
+        sj.SE2(), basis, rod.rectangle(20 * mm, LAYER), length=backbone.length,
+        young_modulus=1.0, poisson_ratio=0.4, density=1.0,
+    )  # fmt: skip
+    errors = sj.view.backbone_errors(backbone, body, q)
+
+    s = np.asarray(backbone.s)
+    shapes = np.asarray(basis.modes["kappa_z"](backbone.s))
+    gram = np.trapezoid(shapes[:, :, None] * shapes[:, None], s, axis=0)
+    inner = np.abs(s * length - FIRST - PITCH * (chambers - 1) / 2) < PITCH * chambers / 2
+    waves = shapes[inner, 0] - np.poly1d(np.polyfit(s[inner], shapes[inner, 0], 3))(s[inner])
+    peaks = np.abs(np.fft.rfft(waves))
+    if picture is not None:
+        draw(path, backbone, body, q, shapes, Path(picture))
+    last = path.displacements[-1]
+    touch = fem.contact_state(problem, last, "cylinder")
+    return {
+        "unknowns": problem.space.num_dofs,
+        "turn of the tip [deg]": float(
+            jnp.trapezoid(backbone.strain[-1, :, 0], s) * length / deg
+        ),
+        "modes off orthonormal": float(np.abs(gram - np.eye(3)).max()),
+        "waves of the first mode along the chambers": int(peaks.argmax()),
+        "curvature that three modes hold": reduction.captured_energy(backbone, basis)[
+            "kappa_z"
+        ],
+        "mean distance of the backbones, worst [mm]": float(errors.max() / mm),
+        "overlap with the cylinder [mm]": float(touch.penetration / mm),
+        "overlap of the walls [mm]": float(
+            fem.contact_state(problem, last, "walls").penetration / mm
+        ),
+    }
+
+
+def draw(path, backbone, body, q, shapes, file: Path) -> None:
+    """The actuator on its way round the cylinder, and the three modes above the chambers."""
+    import matplotlib.pyplot as plt
+    from matplotlib.patches import Circle
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 5.2), layout="constrained")
+    facets = np.asarray(mesh.boundary_facets(path.problem.mesh))[:, [0, 2, 1]]
+    s = jnp.linspace(0.0, 1.0, 200)
+    steps = len(path.displacements) - 1
+    for k, shade in ((0, 0.25), (steps // 4, 0.4), (steps // 2, 0.6), (steps, 1.0)):
+        now = np.asarray(path.problem.mesh.points + path.displacements[k]) / mm
+        for side in now[facets]:
+            left.plot(*side.T, color="#2a6f97", lw=0.8, alpha=shade)
+        places = np.asarray(rod.forward_kinematics(body, q[k], s)[:, :2, 2]) / mm
+        left.plot(places[:, 0], places[:, 1] + LAYER / 2 / mm, color="#e76f51", lw=1.6)
+    left.add_patch(Circle((CENTRE[0] / mm, CENTRE[1] / mm), RADIUS / mm, color="#b9a888"))
+    left.set(aspect="equal", xlabel="x [mm]", ylabel="y [mm]")
+    left.set_title("0, 10, 20 and 40 kPa, the rod of three modes in red", fontsize=10)
+    for k in range(CHAMBERS):
+        middle = FIRST + k * PITCH
+        right.axvspan((middle - WIDE / 2) / mm, (middle + WIDE / 2) / mm, color="#d9dce1")
+    for k, colour in enumerate(("#2a6f97", "#e76f51", "#e9b44c")):
+        right.plot(np.asarray(backbone.s * backbone.length) / mm, shapes[:, k], color=colour,
+                   label=f"mode {k + 1}")  # fmt: skip
+    right.set(xlabel="along the actuator [mm], chambers in grey", ylabel="curvature [-]")
+    right.legend(frameon=False)
+    figure.savefig(file, dpi=100)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    sj.enable_compilation_cache()
+    names = [name for name in sys.argv[1:] if name != "--quick"]
+    for name, number in main("--quick" in sys.argv, *names[:1]).items():
+        print(f"{name:46s} {number:10.4g}")

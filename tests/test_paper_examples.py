@@ -1,0 +1,79 @@
+"""The worked examples of the Sorotoki paper give their numbers, in quick mode."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def numbers_of(name: str) -> dict[str, float]:
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.main(quick=True)
+
+
+def test_shapes_are_cut_and_fit_to_print():
+    numbers = numbers_of("10_sdf_algebra")
+    assert abs(numbers["area over its exact value, less 1"]) < 1e-5
+    assert numbers["field off the distance inside [mm]"] < 0.01
+    assert numbers["slope off one"] < 1e-12
+    assert numbers["points off the surface [mm]"] < 1e-12
+    assert numbers["fit to print"] == 1
+    assert numbers["volume of the triangles over the exact value"] == pytest.approx(1, abs=0.01)
+
+
+def test_lloyd_evens_the_cells():
+    numbers = numbers_of("11_voronoi")
+    spread = [value for name, value in numbers.items() if name.startswith("spread")]
+    assert spread == sorted(spread, reverse=True) and spread[-1] < 0.15 < spread[0]
+    assert numbers["cells"] == 150
+    assert numbers["largest angle of a cell [deg]"] < 180
+    assert numbers["nodes outside the shape [mm]"] < 1e-3
+    assert numbers["area of the cells off that of the shape"] < 0.005
+    first, last = (numbers[f"shift of the seeds, {which} step"] for which in ("first", "last"))
+    assert last < 0.1 * first
+
+
+def test_the_holed_square_buckles_into_ellipses():
+    numbers = numbers_of("12_buckling")
+    assert numbers["critical strain, columns leaning"] == pytest.approx(0.0859, rel=0.01)
+    assert 0.98 * 0.0843 < numbers["critical strain, ellipses"] < 1.02 * 0.0843
+    assert numbers["critical strain, ellipses"] < numbers["critical strain, columns leaning"]
+    assert numbers["alternation of the first mode, 12.5 %"] > 0.95
+    assert numbers["alternation of the first four, 0 %"] < 0.5
+    assert (
+        numbers["unstable modes kept at 12.5 %"] > 0 == numbers["unstable modes past buckling"]
+    )
+    assert numbers["Poisson's ratio, 0 to 2 %"] > 0.3
+    assert numbers["Poisson's ratio beyond 10 %"] < -0.5
+
+
+def test_modes_of_a_pneunet_show_its_chambers():
+    numbers = numbers_of("13_pneunet_basis")
+    assert numbers["modes off orthonormal"] < 1e-10
+    assert numbers["waves of the first mode along the chambers"] == 6  # all of them
+    assert numbers["mean distance of the backbones, worst [mm]"] < 1
+    assert 0 < numbers["overlap with the cylinder [mm]"] < 0.05
+    assert 0 < numbers["overlap of the walls [mm]"] < 0.05
+
+
+def test_six_fingers_lie_on_the_ball():
+    numbers = numbers_of("14_jellyfish")
+    assert numbers["fingers on the ball"] == 6
+    assert numbers["penetration [mm]"] < 0.1
+    assert numbers["farthest off the ball, outer 40 % [mm]"] < 0.5
+    assert numbers["tips apart [mm]"] > 4.5  # wider than a finger
+
+
+def test_the_fingers_of_a_hand_follow_each_other():
+    numbers = numbers_of("15_soft_hand")
+    assert numbers["a finger behind the one before [deg]"] == pytest.approx(30, abs=1)
+    assert numbers["fingers of one length differ by [deg]"] < 2
+    assert numbers["first finger behind the thumb [deg]"] == pytest.approx(30, abs=3)
+    assert 90 < numbers["swing of the tip [deg]"] < 160
+    assert 80 < numbers["highest pressure [kPa]"] < 95
+    assert 2 < numbers["flow that fills the growing finger [%]"] < 20

@@ -1,0 +1,50 @@
+"""The studies with rods give their numbers: impedance, shape sensing, gripping."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def numbers(name: str) -> dict[str, float]:
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.main(quick=True)
+
+
+def test_a_tip_under_impedance_control_follows_a_wavy_wall():
+    found = numbers("23_impedance")
+    assert found["contact at [s]"] == pytest.approx(0.88, abs=0.1)
+    assert found["tip off the projected set-point, sliding [mm]"] < 5
+    assert found["the same at the end [mm]"] < 1
+    asked = found["stiffness times offset [N]"]
+    assert found["force at the end [N]"] == pytest.approx(asked, rel=0.05) and asked > 1
+    assert found["overlap, greatest [mm]"] < 1
+    assert found["effort at the switch over that before"] > 1.2
+
+
+def test_a_shape_is_told_from_the_tip_under_pushes():
+    found = numbers("24_shape_sensing")
+    assert found["largest error of the tip [mm]"] < 1
+    middle = found["largest error of the middle [mm]"]
+    assert middle < 3
+    assert found["of the middle without the null-space task [mm]"] > 1.5 * middle
+    assert found["mean of the middle without [mm]"] > 1.3 * found["mean of the middle [mm]"]
+    assert found["way of the tip [mm]"] > 20
+
+
+def test_fingers_hold_things_and_turn_a_bolt():
+    found = numbers("22_gripper")
+    for thing in ("beaker", "wrench"):
+        weight = found[f"{thing}: weight [N]"]
+        assert found[f"{thing}: sum of the contact forces [N]"] == pytest.approx(
+            weight, rel=0.01
+        )
+    left, right = (found[f"bolt {side}: turns a second"] for side in ("left", "right"))
+    assert 0.12 < abs(left) < 0.25 and right == pytest.approx(-left, rel=0.02)
+    for side in ("left", "right"):
+        assert found[f"bolt {side}: way back, of a step [%]"] < 2
