@@ -1,7 +1,9 @@
 """`python -m benchmarks`: list cases, run some, write JSON lines or a page."""
 
 import argparse
+import os
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,8 @@ def main(argv: list[str] | None = None) -> int:
         )
         return 2
     names = arguments.names or (suite.quick() if arguments.quick else known)
+    if arguments.quick:
+        os.environ["SOROJAX_BENCH_QUICK"] = "1"  # for the processes of the cases
     chosen = {name: known[name] for name in names}
     lines = _to_json(chosen, arguments.json) if arguments.json else _to_page(chosen)
     failed = [x for x in lines if x["code"] == "sorojax" and "reason" in x["settings"]]
@@ -38,7 +42,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("names", nargs="*", metavar="CASE", help="default: all")
     parser.add_argument("--list", action="store_true", help="name the cases and stop")
     parser.add_argument(
-        "--quick", action="store_true", help="one or two cases of every row of the report"
+        "--quick", action="store_true", help="few cases of every row of the report, few sizes"
     )
     parser.add_argument(
         "--json", type=Path, metavar="FILE", help="write JSON lines there, and nothing else"
@@ -60,7 +64,7 @@ def _to_json(chosen: dict[str, Path], file: Path) -> list[dict[str, Any]]:
 
 
 def _to_page(chosen: dict[str, Path]) -> list[dict[str, Any]]:
-    lines = []
+    lines, start = [], time.monotonic()
     print(page.HEADER)
     for name, path in chosen.items():
         for line in run_case(name, path):
@@ -70,7 +74,7 @@ def _to_page(chosen: dict[str, Path]) -> list[dict[str, Any]]:
     folder.mkdir(exist_ok=True)
     target = folder / "index.html"
     target.write_text(page.html(lines))
-    print(f"\n{target}")
+    print(f"\n{len(chosen)} cases in {time.monotonic() - start:.0f} s: {target}")
     return lines
 
 

@@ -16,6 +16,11 @@ def resident(entry: str) -> float:
     return int(line.split()[1]) / 1024
 
 
+def forget_peak() -> None:
+    """From here on, the highest is counted anew."""
+    _CLEAR.write_text("5")
+
+
 def peak(call: Callable[[], Any]) -> float | None:
     """Most memory [MB] that `call` holds beyond what there was; `None` if the system does
     not tell. What the process kept of earlier calls is given back before."""
@@ -24,7 +29,7 @@ def peak(call: Callable[[], Any]) -> float | None:
     gc.collect()
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
         libc.malloc_trim(0)
-    _CLEAR.write_text("5")
+    forget_peak()
     before = resident("VmRSS")
     result = call()
     most = resident("VmHWM") - before

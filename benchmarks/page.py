@@ -9,10 +9,11 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from benchmarks import svg
+from benchmarks import suite, svg, tables
 
 Line = dict[str, Any]
 COLUMNS = ("case", "code", "compile", "run", "min .. max", "error", "bar", "holds")
+HIDDEN = ("bar_on", "against")
 _WIDTHS = (22, 12, 10, 10, 21, 9, 10, 6)
 PACKAGES = ("jax", "equinox", "diffrax", "numpy", "scipy", "mkl")
 STYLE = """
@@ -23,7 +24,9 @@ th, td { text-align: left; padding: 3px 10px 3px 0; border-bottom: 1px solid #dd
          vertical-align: top; }
 svg { width: 100%; max-width: 640px; font: 11px system-ui, sans-serif; }
 .grid { stroke: #e3e3e3; } .no { color: #b00020; font-weight: 600; }
-.small { color: #666; font-size: 13px; }
+.small { color: #666; font-size: 13px; } .wide { overflow-x: auto; }
+.runs td:not(:last-child) { white-space: nowrap; }
+h2 { border-bottom: 2px solid #0b6e99; margin-top: 2.5em; } h3 { margin-top: 2em; }
 """
 
 
@@ -64,33 +67,52 @@ def text(line: Line) -> str:
 
 
 def _settings(line: Line) -> str:
-    return ", ".join(f"{k}={v}" for k, v in line["settings"].items() if k != "bar_on")
+    return ", ".join(f"{k}={v}" for k, v in line["settings"].items() if k not in HIDDEN)
 
 
 def html(lines: list[Line]) -> str:
-    """The page: a plot and a table per case, and what it was measured on."""
-    names = list(dict.fromkeys(line["case"] for line in lines))
-    parts = [_section(name, [x for x in lines if x["case"] == name]) for name in names]
+    """The page: row by row of the report, a plot and a table per case, and what it was
+    measured on."""
+    by_case: dict[str, list[Line]] = {}
+    for line in lines:
+        by_case.setdefault(line["case"], []).append(line)
+    groups = suite.grouped(by_case)
+    parts = [tables.contents({row: [by_case[n] for n in g] for row, g in groups.items()})]
+    for row, names in groups.items():
+        parts.append(f'<h2 id="{tables.anchor(row)}">{escape(row)}</h2>')
+        parts.extend(_section(name, by_case[name]) for name in names)
     return (
         '<!doctype html><html lang="en"><meta charset="utf-8"><title>sorojax benchmarks'
         f"</title><style>{STYLE}</style><h1>Run time against error</h1>"
         f"<p>{escape(machine())}</p><p class=small>Medians over repeats on one pinned "
         "core, every case in its own process, every peer in its own environment. "
         "compile: XLA without a persistent cache, or the first call.</p>"
-        + "".join(parts) + "</html>\n"
+        + "".join(parts) + tables.peers() + "</html>\n"
     )  # fmt: skip
 
 
 def _section(name: str, lines: list[Line]) -> str:
-    series: svg.Points = {}
-    for line in lines:
-        if line["run_s"] and line["error"]:
-            name = f"{line['code']} {line['settings'].get('method', '')}".strip()
-            series.setdefault(name, []).append((line["run_s"], line["error"]))
-    plot = svg.loglog(series, "run time [s]", "error") if series else ""
-    references = {str(x["reference"]) for x in lines if x["reference"] is not None}
+    references = {str(x["reference"]) for x in lines if x["reference"]}
     against = f"Error against: {'; '.join(sorted(references))}." if references else ""
-    return f"<h2>{escape(name)}</h2><p>{escape(against)}</p>{plot}{_table(lines)}"
+    special = tables.features(lines, seconds) or tables.scaling(lines, seconds)
+    body = _plots(lines) + (special or f'<div class="wide">{_table(lines)}</div>')
+    return f"<h3>{escape(name)}</h3><p>{escape(against)}</p>{body}"
+
+
+def _plots(lines: list[Line]) -> str:
+    """Error over run time, or run time over each size that was varied."""
+    plots: dict[tuple[str, str], svg.Points] = {}
+    for line in lines:
+        size = line["settings"].get("against")
+        x, y = (
+            (line["settings"][size], line["run_s"]) if size else (line["run_s"], line["error"])
+        )
+        if x and y:
+            labels = (size, "run time [s]") if size else ("run time [s]", "error")
+            told = line["settings"]
+            label = f"{line['code']} {told.get('method', told.get('case', ''))}".strip()
+            plots.setdefault(labels, {}).setdefault(label, []).append((x, y))
+    return "".join(svg.loglog(series, *labels) for labels, series in plots.items())
 
 
 def _table(lines: list[Line]) -> str:
@@ -100,7 +122,7 @@ def _table(lines: list[Line]) -> str:
         row = "".join(f"<td>{escape(cell)}</td>" for cell in cells(line)[1:])
         style = ' class="no"' if line["holds"] is False else ""
         rows.append(f"<tr{style}>{row}<td>{escape(_settings(line))}</td></tr>")
-    return f"<table><tr>{head}</tr>{''.join(rows)}</table>"
+    return f"<table class=runs><tr>{head}</tr>{''.join(rows)}</table>"
 
 
 def machine() -> str:

@@ -26,7 +26,12 @@ def rows(what: str, of: str, expected: float, points: Iterable[Point]) -> Iterat
     """
     last: Point | None = None
     for point in points:
-        settings = {"method": what, "against": of, of: point.size, "expected": expected}
+        settings = {
+            "method": what,
+            "against": of,
+            of: point.size,
+            "expected": round(expected, 2),
+        }
         if last is not None:
             settings["exponent"] = round(exponent(last, point), 2)
         if point.peak_MB is not None:

@@ -1,24 +1,71 @@
 """What the report compares, row by row, and which cases show a row in little time."""
 
+from collections.abc import Iterable
+from typing import NamedTuple
+
+FURTHER = "further cases"
+
+
+class Cases(NamedTuple):
+    """Cases of a row: those of a quick run, and the others."""
+
+    quick: tuple[str, ...]
+    more: tuple[str, ...] = ()
+
+
 ROWS = {
-    "rod statics": ("rod.statics",),
-    "rod dynamics": ("rod.acceleration", "rod.simulation"),
-    "rod batches": ("rod.batch",),
-    "FEM assembly": ("fem.assembly",),
-    "FEM equilibrium": ("fem.case_a",),
-    "near incompressibility": ("fem.cook",),
-    "buckling": ("fem.buckling",),
-    "FEM dynamics with contact": ("fem.friction",),
-    "SDF evaluation and surfaces": ("sdf.value", "sdf.surface"),
-    "meshing": ("mesh.triangulate", "mesh.tetrahedralise"),
-    "topology optimisation": ("design.layout",),
-    "system integration": ("systems.easy", "systems.stiff"),
-    "inverse kinematics and estimator": ("rod.ik", "systems.estimator"),
-    "gradients": ("fem.gradient",),
-    "start": ("cli.import", "rod.first_call"),
+    "rod statics": Cases(("rod.statics",), ("rod.accuracy", "rod.frequencies")),
+    "rod dynamics": Cases(
+        ("rod.acceleration", "rod.simulation", "rod.continuum"),
+        ("rod.assembly", "rod.contact", "rod.damped", "rod.drift", "rod.flight"),
+    ),
+    "rod batches": Cases(("rod.batch",)),
+    "FEM assembly": Cases(("fem.assembly",), ("fem.newton",)),
+    "FEM equilibrium": Cases(
+        ("fem.case_a",),
+        ("fem.batch", "fem.beam_data", "fem.convergence", "fem.pneunet", "fem.tube"),
+    ),
+    "near incompressibility": Cases(("fem.cook",)),
+    "buckling": Cases(("fem.buckling",)),
+    "FEM dynamics with contact": Cases(
+        ("fem.friction",),
+        (
+            "fem.contact",
+            "fem.crawler",
+            "fem.dynamics",
+            "fem.hertz",
+            "fem.release",
+            "fem.walker",
+        ),
+    ),
+    "SDF evaluation and surfaces": Cases(
+        ("sdf.value", "sdf.surface"), ("sdf.gallery", "sdf.normal", "sdf.volume")
+    ),
+    "meshing": Cases(("mesh.triangulate", "mesh.tetrahedralise")),
+    "topology optimisation": Cases(
+        ("design.layout",), ("design.calibrate", "design.mma", "design.nonlinear")
+    ),
+    "system integration": Cases(
+        ("systems.easy", "systems.stiff"), ("systems.batch", "systems.fem", "systems.hand")
+    ),
+    "inverse kinematics and estimator": Cases(("rod.ik", "systems.estimator")),
+    "gradients": Cases(("fem.gradient",), ("rod.gradient",)),
+    "start": Cases(("cli.import", "rod.first_call")),
+    "what a scene does not need": Cases(("skip.features",)),
+    "scaling": Cases(("scaling.rod", "scaling.fem", "scaling.batch", "scaling.design")),
 }
 
 
 def quick() -> tuple[str, ...]:
-    """One or two cases of every row."""
-    return tuple(name for names in ROWS.values() for name in names)
+    """One to four cases of every row."""
+    return tuple(name for cases in ROWS.values() for name in cases.quick)
+
+
+def grouped(names: Iterable[str]) -> dict[str, list[str]]:
+    """Those of the names that a row has, row by row, and the others at the end."""
+    left, groups = list(dict.fromkeys(names)), {}
+    for row, cases in ROWS.items():
+        if found := [name for name in (*cases.quick, *cases.more) if name in left]:
+            groups[row] = found
+            left = [name for name in left if name not in found]
+    return groups | ({FURTHER: left} if left else {})

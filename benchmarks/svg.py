@@ -61,6 +61,7 @@ def _labels(x_label: str, y_label: str) -> str:
 
 def _series(name: str, index: int, points, x: _axis, y: _axis) -> str:
     colour = COLOURS[index % len(COLOURS)]
+    dashes = ' stroke-dasharray="5 3"' if index >= len(COLOURS) else ""
     pixels = [(x(a), y(b)) for a, b in points]
     path = "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in pixels)
     marks = "".join(
@@ -71,8 +72,8 @@ def _series(name: str, index: int, points, x: _axis, y: _axis) -> str:
     row = TOP + 12 + 18 * index
     key = WIDTH - RIGHT + 14
     return (
-        f'<path d="{path}" fill="none" stroke="{colour}" stroke-width="1.5"/>{marks}'
-        f'<circle cx="{key}" cy="{row}" r="4" fill="{colour}"/>'
+        f'<path d="{path}" fill="none" stroke="{colour}" stroke-width="1.5"{dashes}/>'
+        f'{marks}<circle cx="{key}" cy="{row}" r="4" fill="{colour}"/>'
         + _text(key + 10, row + 4, escape(name), "start")
     )
 

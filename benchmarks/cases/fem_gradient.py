@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.bellows import PRESSURES, case_a
-from benchmarks.harness import Row, measure_calls
+from benchmarks.harness import Row, measure_calls, quick
 from sorojax import fem, mesh
 from sorojax.fem.linear import linearise, prepare, step
 from sorojax.units import mm
@@ -15,7 +15,7 @@ SIZES = (0.7, 0.32)  # mm: 13k and 50k dof
 
 
 def rows():
-    for size in SIZES:
+    for size in SIZES[: 1 if quick() else None]:
         yield from _rows(size)
 
 

@@ -5,7 +5,7 @@ import numpy as np
 
 from benchmarks import peers
 from benchmarks.fingers import MODES, accelerate, finger, random_states
-from benchmarks.harness import Row, measure
+from benchmarks.harness import Row, measure, quick
 from sorojax.rod import operators
 
 CALLS, STATES = 1000, 4
@@ -46,7 +46,7 @@ def rows():
             "sorojax", {"nodes": nodes}, **timing.columns(), error=error({"a": at(rod, q, v)}),
             reference=REFERENCE, bar=BAR if nodes == 8 else None,
         )  # fmt: skip
-    for nodes in (8, 12):
+    for nodes in (8,) if quick() else (8, 12):
         yield peers.row(
             "soromox", "acceleration", {"q": q, "v": v}, error, REFERENCE,
             nodes=nodes, modes=MODES, calls=CALLS, repeats=5,

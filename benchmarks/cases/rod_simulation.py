@@ -7,7 +7,7 @@ import numpy as np
 
 from benchmarks import peers
 from benchmarks.fingers import LENGTH, MODES, accelerate, finger, tip
-from benchmarks.harness import Row, measure
+from benchmarks.harness import Row, measure, quick
 from sorojax.math.steppers import DormandPrince, GeneralisedAlpha, RungeKutta4
 from sorojax.rod import Gravity, operators
 from sorojax.rod.rollout import rollout
@@ -77,12 +77,13 @@ def rows():
         )
 
     for stepper, steps in STEPS:
-        for h in steps:
+        for h in steps[: 1 if quick() else None]:
             yield row("sorojax", type(stepper).__name__, h, lambda rod: own(rod, stepper, h))  # noqa: B023
-    for h in (1e-3, 5e-4):
+    peer_steps = (1e-3,) if quick() else (1e-3, 5e-4)
+    for h in peer_steps:
         fixed = dfx.ConstantStepSize()
         yield row("diffrax", "Tsit5", h, lambda rod: stock(rod, dfx.Tsit5(), fixed, h))  # noqa: B023
-    for h in (1e-3, 5e-4):
+    for h in peer_steps:
         yield peers.row(
             "soromox", "simulation", {}, error, REFERENCE,
             nodes=8, modes=MODES, duration=DURATION, dt=h, save_dt=SAVE, repeats=3,

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 
 from benchmarks import scaling
 from benchmarks.cases.rod_assembly import CALLS, loop
-from benchmarks.harness import quick
 from benchmarks.fingers import LENGTH, finger
+from benchmarks.harness import quick
 from sorojax.math.lie import SE3
 from sorojax.rod import chebyshev, circle, num_dof, rest, rod, serial
 from sorojax.units import MPa, mm

@@ -1,4 +1,4 @@
-"""Surface of a solid of five primitives on 512^3 cells, against every cell and scikit-image."""
+"""Surface of a solid of five primitives on 512^3 cells, against scikit-image, fogleman/sdf."""
 
 import functools
 import time
@@ -9,12 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.harness import Row
+from benchmarks import peers
+from benchmarks.harness import Row, quick
+from benchmarks.memory import forget_peak, resident
 from sorojax import sdf
 from sorojax.sdf.base import AbstractSdf, cast
 from sorojax.sdf.scalar import minimum, norm
 
-CELLS, SIDE = 512, 2.2  # along the cube, and its edge in m
+CELLS, SIDE = 256 if quick() else 512, 2.2  # along the cube, and its edge in m
 METHODS: tuple[Literal["marching_cubes", "dual_contouring"], ...] = (
     "marching_cubes",
     "dual_contouring",
@@ -63,28 +65,16 @@ def dense(shape: AbstractSdf, cells: int) -> tuple[np.ndarray, np.ndarray]:
     return vertices * (SIDE / cells) - SIDE / 2, triangles
 
 
-def _memory(entry: str) -> float:
-    """Resident memory of this process [MB]: `VmRSS` now, `VmHWM` at its highest."""
-    with open("/proc/self/status") as file:
-        line = next(line for line in file if line.startswith(entry))
-    return int(line.split()[1]) / 1024
-
-
-def _forget_peak() -> None:
-    with open("/proc/self/clear_refs", "w") as file:
-        file.write("5")
-
-
 def measured(function, repeats: int = 3) -> tuple[list[float], float, Any]:
     """Seconds of every run, peak memory [MB] of the last one, and its result."""
     runs, peak, result = [], 0.0, None
     for _ in range(repeats):
         del result
-        _forget_peak()
-        before, start = _memory("VmRSS"), time.perf_counter()
+        forget_peak()
+        before, start = resident("VmRSS"), time.perf_counter()
         result = function()
         runs.append(time.perf_counter() - start)
-        peak = _memory("VmHWM") - before
+        peak = resident("VmHWM") - before
     return sorted(runs), peak, result
 
 
@@ -120,6 +110,14 @@ def rows():
         else:
             bar = {"bar": 0.5 * runs[len(runs) // 2]}
         yield _row("sorojax", settings, ours, memory, found, **bar)
+
+    def error_of(arrays):
+        corners = arrays["corners"]
+        return rms(shape, corners, np.arange(len(corners)).reshape(-1, 3))
+
+    yield peers.row(
+        "sdf_fork", "surface", {}, error_of, REFERENCE, side=SIDE, cells=CELLS, repeats=1
+    )
 
 
 def _row(code, settings, runs, peak, error, **bar) -> Row:

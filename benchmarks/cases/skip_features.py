@@ -2,8 +2,8 @@
 
 import jax
 
-from benchmarks.harness import Row, measure
-from benchmarks.scenes import features, operations
+from benchmarks.harness import Row, measure_together, quick
+from benchmarks.scenes import Feature, features, operations
 
 LOOPS = 200
 
@@ -22,12 +22,27 @@ def repeated(function):
     return run
 
 
+#: Enough to see that what is absent costs nothing.
+FEW = ("gravity", "contact", "friction", "third dimension", "logging", "follower load")
+
+
+def together(feature: Feature):
+    """Times of both scenes, in turn."""
+    (bare, args), (full, more) = feature.without, feature.with_it
+    runs = {
+        "without": lambda args, more: repeated(bare)(*args),
+        "with": lambda args, more: repeated(full)(*more),
+    }
+    return measure_together(runs, args, more, repeats=5)
+
+
 def rows():
     for feature in features():
+        if quick() and feature.name not in FEW:
+            continue
+        times = together(feature)
         for state, scene in (("without", feature.without), ("with", feature.with_it)):
             instructions, flops = operations(scene)
-            function, args = scene
-            timing = measure(repeated(function), *args, repeats=5).per(LOOPS)
             settings = {"feature": feature.name, "scene": state}
             more = {"instructions": instructions, "flops": flops}
-            yield Row("sorojax", settings | more, **timing.columns())
+            yield Row("sorojax", settings | more, **times[state].per(LOOPS).columns())

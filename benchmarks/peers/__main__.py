@@ -7,17 +7,20 @@ import sys
 import venv
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from benchmarks.peers.call import home, interpreter, status
+from benchmarks.peers.call import PeerMissing, call, home, interpreter, status
 
 
 @dataclass(frozen=True)
 class Peer:
-    """What to install, and which module must import afterwards."""
+    """What to install, which module must import afterwards, and a task whose first run
+    compiles what later ones load."""
 
     requirements: tuple[str, ...]
     module: str
     licence: str
+    first: dict[str, Any] | None = None
 
 
 PEERS = {
@@ -30,13 +33,39 @@ PEERS = {
         "felupe",
         "GPL-3.0: only in its own process",
     ),
-    "pyelastica": Peer(("pyelastica>=1.0,<2",), "elastica", "MIT"),
+    "pyelastica": Peer(
+        ("pyelastica>=1.0,<2",),
+        "elastica",
+        "MIT",
+        {
+            "task": "simulation",
+            "elements": 10,
+            "share": 0.3,
+            "duration": 1e-3,
+            "save_dt": 1e-3,
+            "repeats": 1,
+        },
+    ),
     # From version 4 on it does not read the cable element any more.
     "mujoco": Peer(("mujoco>=3.3,<4",), "mujoco", "Apache-2.0"),
     "scikit_fem": Peer(("scikit-fem>=12,<13",), "skfem", "BSD-3-Clause"),
     "sdf_fork": Peer(("sdf-fork>=0.1.1,<0.2", "scikit-image"), "sdf", "MIT"),
     "gmsh": Peer(("gmsh>=4.13,<5", "numpy"), "gmsh", "GPL-2.0+: only in its own process"),
-    "jax_fem": Peer(("jax-fem>=0.0.11",), "jax_fem.problem", "GPL-3.0: only in its own process"),
+    "jax_fem": Peer(
+        # the wheel does not name what it imports
+        (
+            "jax-fem>=0.0.11",
+            "jax",
+            "scipy",
+            "pyfiglet",
+            "meshio",
+            "matplotlib",
+            "gmsh",
+            "fenics-basix",
+        ),
+        "jax_fem.problem",
+        "GPL-3.0: only in its own process",
+    ),
     "torch_fem": Peer(("torch-fem>=0.14,<0.15",), "torchfem", "MIT"),
 }
 
@@ -53,9 +82,19 @@ def install(name: str) -> dict:
         outcome |= {"ok": True, "version": _run(interpreter(name), "-I", "-c", found).strip()}
     except (OSError, subprocess.CalledProcessError) as error:
         outcome["reason"] = _reason(error)
+    _keep(folder, outcome)
+    if outcome["ok"] and peer.first:
+        try:
+            call(name, arrays={}, **peer.first)
+        except PeerMissing as reason:
+            outcome |= {"ok": False, "reason": str(reason)}
+            _keep(folder, outcome)
+    return outcome
+
+
+def _keep(folder: Path, outcome: dict[str, Any]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "status.json").write_text(json.dumps(outcome, indent=1) + "\n")
-    return outcome
 
 
 def _run(*command: str | Path) -> str:
