@@ -12,8 +12,8 @@ from sorojax.contact import LinePenalty
 from sorojax.fem.linear import linearise, prepare
 from sorojax.math.lie import SE2, SE3
 
-FINGER = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2000.0)
-LAW = dict(stiffness=5e7, smoothing=6e-6)
+FINGER: dict[str, Any] = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2000.0)
+LAW: dict[str, Any] = dict(stiffness=5e7, smoothing=6e-6)
 FLOOR = sdf.HalfSpace([0.0, 0.0, -0.015], [0.0, 0.0, 1.0])
 
 
@@ -29,9 +29,9 @@ def operations(scene: tuple[Callable[..., Any], tuple]) -> tuple[int, float]:
     """Instructions of the compiled program, and its floating-point operations."""
     function, args = scene
     compiled = jax.jit(function).lower(*args).compile()
-    lines = (line.strip() for line in compiled.as_text().splitlines())
+    lines = (line.strip() for line in (compiled.as_text() or "").splitlines())
     count = sum(" = " in line and " parameter(" not in line for line in lines)
-    cost = compiled.cost_analysis()
+    cost: Any = compiled.cost_analysis()
     return count, float((cost[0] if isinstance(cost, list) else cost).get("flops", 0.0))
 
 
@@ -47,7 +47,8 @@ def _bent(forces: tuple = ()):
 
 
 def _contact(**friction: float):
-    return R.ObstacleContact(FLOOR, 6e-3, LinePenalty(**LAW, **friction), points=16)
+    law = LinePenalty(**LAW, **friction)
+    return R.ObstacleContact(obstacle=FLOOR, radius=6e-3, law=law, points=16)
 
 
 GRID = mesh.rectangle([0, 0], [1, 1], divisions=(8, 8), element=mesh.Quad4())
@@ -75,14 +76,14 @@ def _loop(air: bool = False, logged: bool = False):
     """Rate of a finger with a chamber, alone or with the gas in it; all outputs if logged."""
     body = R.rod(SE2(), R.chebyshev(kappa_z=3), R.circle(6e-3), nodes=8, **FINGER)
     forces = (R.thread_chambers(body, R.Straight([4e-3, 0.0]), 2e-5), R.Damping(0.01))
-    finger = {"finger": S.RodBody(body, forces if air else forces[1:])}
+    finger: dict[str, Any] = {"finger": S.RodBody(body, forces if air else forces[1:])}
     wires = {
         "finger.pressure": "air.pressure", "air.volume": "finger.volume",
         "air.volume_rate": "finger.volume_rate",
     }  # fmt: skip
-    network = (
-        S.Network(finger | {"air": S.Reservoir()}, wires) if air else S.Network(finger, {})
-    )
+    if air:
+        finger["air"] = S.Reservoir()
+    network = S.Network(finger, wires if air else {})
     zero = jnp.zeros(())
 
     def rate(state):

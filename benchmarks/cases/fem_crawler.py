@@ -1,5 +1,7 @@
 """The multigait crawler: cost of a second, gait, independence, derivatives, against felupe."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -68,8 +70,7 @@ def _against():
 
 def _changes(problem):
     """Way of the second and third cycle under other numbers."""
-    law = problem.loads[-1]
-    assert isinstance(law, fem.Contact)
+    law: Any = problem.loads[-1]
     stiffer = eqx.tree_at(
         lambda p: (p.loads[-1].stiffness, p.loads[-1].friction_stiffness),
         problem, (2 * law.stiffness, 2 * law.friction_stiffness),

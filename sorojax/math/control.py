@@ -100,7 +100,7 @@ class Control(dfx.AbstractAdaptiveStepSizeController):
         one, none = jnp.ones_like(t0), jnp.zeros((), jnp.int32)
         pace = _Pace(one, jnp.zeros(2, jnp.int32), None, None)
         if self.end is not None:
-            pace = self.begun(Seam(t0, y0, dt0, one, none))
+            pace = self.begun(Seam(jnp.asarray(t0), y0, dt0, one, none))
         return t0 + dt0, pace
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, state):

@@ -87,9 +87,8 @@ class AbstractMethod(dfx.AbstractSolver):
         dense = {"y0": y0, "y1": new.y} | new.dense
         if new.converged is True:
             return new.y, new.error, dense, (new.memory, now), dfx.RESULTS.successful
-        ended = dfx.RESULTS.where(
-            new.converged, dfx.RESULTS.successful, dfx.RESULTS.nonlinear_divergence
-        )
+        failed: dfx.RESULTS = dfx.RESULTS.nonlinear_divergence  # type: ignore[assignment]
+        ended = dfx.RESULTS.where(new.converged, dfx.RESULTS.successful, failed)
         return new.y, new.error, dense, (new.memory, now), ended
 
 

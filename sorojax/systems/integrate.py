@@ -100,15 +100,16 @@ def adaptive(
     flat, unravel = ravel_pytree(state)
     inputs = explicit_inputs(inputs, start)
     control, end = flat_tolerances(control, state), time[-1]
+    going: Any = control
     free = isinstance(control, Control) and not conditions.signals
     further = {}
     if free:
         longest = jnp.min(jnp.diff(time))
-        control = control.to_end(time[-1], longest)
+        control = going = going.to_end(time[-1], longest)
         end = jnp.full_like(end, _FAR)
     if seam is not None:
         start, flat = seam.seam.time, seam.seam.state
-        further = {"dt0": seam.seam.step, "controller_state": control.begun(seam.seam)}
+        further = {"dt0": seam.seam.step, "controller_state": going.begun(seam.seam)}
         further["solver_state"] = None if seam.memory is None else (seam.memory, seam.memory)
     solution = dfx.diffeqsolve(
         dfx.ODETerm(FlatField(unravel)),
@@ -157,9 +158,9 @@ def adaptive(
 
 def _seam(solution: dfx.Solution, solver: dfx.AbstractSolver) -> Resume:
     """Where the last step began, and what it began with."""
-    own = isinstance(solver, AbstractMethod)
-    memory = solution.solver_state[1] if own else None
-    return jax.lax.stop_gradient(Resume(solution.controller_state.last, memory))
+    own: Any = solution.solver_state if isinstance(solver, AbstractMethod) else (None, None)
+    pace: Any = solution.controller_state
+    return jax.lax.stop_gradient(Resume(pace.last, own[1]))
 
 
 def explicit_inputs(inputs: Mapping[str, Any], t) -> dict[str, Any]:

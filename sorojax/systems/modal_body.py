@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import fem
+from sorojax._types import is_traced
 from sorojax.fem.energy_form import potential_energy, residual
 from sorojax.math import sparse
 from sorojax.systems.block import AbstractBlock, Input, Output
@@ -231,9 +232,7 @@ def _work(body: FemBody, name: str, basis: Basis) -> Polynomial:
 
     zero = jnp.zeros(len(basis), basis.shapes.dtype)
     bent = [work(zero + 1e-6, s * jnp.ones_like(load.value)) for s in (0.0, 1.0)]
-    if not any(isinstance(x, jax.core.Tracer) for x in bent) and not np.allclose(
-        bent[0], bent[1], rtol=1e-9, atol=0.0
-    ):
+    if not is_traced(bent) and not np.allclose(bent[0], bent[1], rtol=1e-9, atol=0.0):
         raise ValueError(
             f"reduced: `{name}` is a {type(load).__name__}, whose force is not proportional "
             "to its input. Drive the body by pressures, forces or tendons."

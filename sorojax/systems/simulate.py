@@ -242,8 +242,9 @@ def _start(state: PyTree, resume: Trajectory | None) -> tuple:
 
 
 def _seam_of(resume: Trajectory | None) -> Resume | None:
-    adaptively = resume is not None and isinstance(resume.memory, Resume)
-    return resume.memory if adaptively else None
+    if resume is None or not isinstance(resume.memory, Resume):
+        return None
+    return resume.memory
 
 
 def _memory_of(resume: Trajectory) -> Any:
