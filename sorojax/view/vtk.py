@@ -33,7 +33,7 @@ def _plotter(size: tuple[int, int]) -> Any:
         _held.clear()
         plotter = pv.Plotter(off_screen=True, window_size=list(size), lighting="light kit")
         plotter.set_background("white")
-        plotter.enable_anti_aliasing("msaa", multi_samples=8)
+        plotter.enable_anti_aliasing("msaa", multi_samples=4)
         _held[size] = plotter
     return _held[size]
 
