@@ -53,7 +53,7 @@ def draw(problem, motion, centre, file: Path) -> None:
         for line in now[facets]:
             axes[k].plot(*line.T, color="#2a6f97", lw=0.8)
         axes[k].axhline(0.0, color="#e76f51", lw=1)
-        axes[k].set(aspect="equal", xticks=[], yticks=[])
+        axes[k].set(aspect="equal", xticks=[], yticks=[], xlim=(-3, 158), ylim=(-1, 26))
         axes[k].set_ylabel(f"{share:g} T")
     axes[4].plot(times, centre[:, 0], color="#2a6f97", label="forwards")
     axes[4].plot(times, centre[:, 1], color="#e76f51", label="upwards")
@@ -66,5 +66,7 @@ def draw(problem, motion, centre, file: Path) -> None:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    for name, number in main(picture=sys.argv[1] if len(sys.argv) > 1 else None).items():
+    quick, names = "--quick" in sys.argv, [a for a in sys.argv[1:] if a[:2] != "--"]
+    numbers = main(quick, names[0] if names else None)
+    for name, number in numbers.items():
         print(f"{name:34s} {number:10.4g}")
