@@ -172,7 +172,9 @@ def test_exponents_come_from_the_sizes_and_shortest_runs():
     assert "<td>2.00</td><td>1.5</td><td>50 MB</td>" in text and "further cases" in text
 
 
-@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="Linux tells")
+@pytest.mark.skipif(
+    not Path("/proc/self/clear_refs").exists(), reason="peak memory is read from Linux's /proc"
+)
 def test_peak_is_what_a_call_holds_at_most():
     size = 40 * 2**20
     found = memory.peak(lambda: len(np.ones(size, np.uint8)))

@@ -1,31 +1,21 @@
 """Every example runs and gives its number; the README's program is one of them."""
 
-import importlib.util
 import re
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
-
-
-def _main(name: str):
-    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.main
+from tests.scripts import ROOT, main_of
 
 
 def test_drawing_to_loop_reaches_its_target():
-    numbers = _main("01_drawing_to_loop")(quick=True)
+    numbers = main_of("01_drawing_to_loop")(quick=True)
     assert numbers["angle at the end [deg]"] == pytest.approx(-25, abs=0.2)
     assert numbers["stiffness misfit"] < 0.01
     assert 2 < numbers["pressure at the end [kPa]"] < 4
 
 
 def test_a_tendon_finger_closes_on_a_ball():
-    numbers = _main("02_tendon_finger")()
+    numbers = main_of("02_tendon_finger")()
     bent, pull = numbers["tip angle at 0.2 N [deg]"], numbers["pull for 150 deg [N]"]
     assert numbers["by tension [deg/N]"] == pytest.approx(bent / 0.2, rel=0.01)
     assert pull == pytest.approx(0.2 * 150 / bent, rel=0.01)
@@ -48,7 +38,7 @@ def test_the_program_of_the_readme_prints_what_it_says(capsys):
 
 def test_a_bench_on_a_desk_follows_its_target():
     pytest.importorskip("cv2")
-    numbers = _main("03_bench_on_a_desk")(quick=True)
+    numbers = main_of("03_bench_on_a_desk")(quick=True)
     assert numbers["estimate off the true tip [mm rms]"] < 0.5
     assert numbers["tip off its target [mm rms]"] < 3
     assert numbers["pictures used"] == 75

@@ -1,23 +1,12 @@
 """The worked examples of the Sorotoki paper give their numbers, in quick mode."""
 
-import importlib.util
-from pathlib import Path
-
 import pytest
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
-
-
-def numbers_of(name: str) -> dict[str, float]:
-    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.main(quick=True)
+from tests.scripts import main_of
 
 
 def test_shapes_are_cut_and_fit_to_print():
-    numbers = numbers_of("10_sdf_algebra")
+    numbers = main_of("10_sdf_algebra")(quick=True)
     assert abs(numbers["area over its exact value, less 1"]) < 1e-5
     assert numbers["field off the distance inside [mm]"] < 0.01
     assert numbers["slope off one"] < 1e-12
@@ -27,7 +16,7 @@ def test_shapes_are_cut_and_fit_to_print():
 
 
 def test_lloyd_evens_the_cells():
-    numbers = numbers_of("11_voronoi")
+    numbers = main_of("11_voronoi")(quick=True)
     spread = [value for name, value in numbers.items() if name.startswith("spread")]
     assert spread == sorted(spread, reverse=True) and spread[-1] < 0.15 < spread[0]
     assert numbers["cells"] == 150
@@ -39,7 +28,7 @@ def test_lloyd_evens_the_cells():
 
 
 def test_the_holed_square_buckles_into_ellipses():
-    numbers = numbers_of("12_buckling")
+    numbers = main_of("12_buckling")(quick=True)
     assert numbers["critical strain, columns leaning"] == pytest.approx(0.0859, rel=0.01)
     assert 0.98 * 0.0843 < numbers["critical strain, ellipses"] < 1.02 * 0.0843
     assert numbers["critical strain, ellipses"] < numbers["critical strain, columns leaning"]
@@ -53,7 +42,7 @@ def test_the_holed_square_buckles_into_ellipses():
 
 
 def test_modes_of_a_pneunet_show_its_chambers():
-    numbers = numbers_of("13_pneunet_basis")
+    numbers = main_of("13_pneunet_basis")(quick=True)
     assert numbers["modes off orthonormal"] < 1e-10
     assert numbers["waves of the first mode along the chambers"] == 6  # all of them
     assert numbers["mean distance of the backbones, worst [mm]"] < 1
@@ -62,7 +51,7 @@ def test_modes_of_a_pneunet_show_its_chambers():
 
 
 def test_six_fingers_lie_on_the_ball():
-    numbers = numbers_of("14_jellyfish")
+    numbers = main_of("14_jellyfish")(quick=True)
     assert numbers["fingers on the ball"] == 6
     assert numbers["penetration [mm]"] < 0.1
     assert numbers["farthest off the ball, outer 40 % [mm]"] < 0.5
@@ -70,7 +59,7 @@ def test_six_fingers_lie_on_the_ball():
 
 
 def test_the_fingers_of_a_hand_follow_each_other():
-    numbers = numbers_of("15_soft_hand")
+    numbers = main_of("15_soft_hand")(quick=True)
     assert numbers["a finger behind the one before [deg]"] == pytest.approx(30, abs=1)
     assert numbers["fingers of one length differ by [deg]"] < 2
     assert numbers["first finger behind the thumb [deg]"] == pytest.approx(30, abs=3)

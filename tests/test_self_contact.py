@@ -191,15 +191,19 @@ def test_lists_follow_a_motion():
     u, v = np.zeros(both.points.shape), np.zeros(both.points.shape)
     v[nodes["high"]] = [1.5, -0.3]
 
-    def run(count, start):
-        return fem.simulate(problem, count * 5e-4, 5e-4, start=start)
+    def run(count, start, step=5e-4):
+        return fem.simulate(problem, count * step, step, start=start)
 
+    def total(motion):
+        energies = motion.energies
+        return np.asarray(energies.kinetic + energies.elastic + energies.loads)
+
+    # A step that spans the impact may gain energy in it, one that resolves it does not.
+    fine = total(run(40, (u, v), 1.25e-4))
+    assert fine.max() < 1.001 * fine[0]
     whole = run(20, (u, v))
-    energies = whole.energies
-    total = np.asarray(energies.kinetic + energies.elastic + energies.loads)
-    assert float(energies.loads.max()) > 0.01 * total[0]  # they met
-    assert np.all(total < 1.05 * total[0])  # within the step of the impact
-    assert np.all(np.diff(total[2:]) < 0)
+    assert float(whole.energies.loads.max()) > 0.01 * fine[0]  # they met
+    assert total(whole).max() < 1.05 * fine[0] and np.all(np.diff(total(whole)[2:]) < 0)
     moved = np.asarray(whole.displacements)[-1, nodes["high"]]
     assert moved[:, 0].mean() > 10 * mm  # far from the facets that were listed first
     bottom = np.asarray(both.points)[:, 1] + np.asarray(whole.displacements)[:, :, 1]

@@ -1,23 +1,12 @@
 """The studies with rods give their numbers: impedance, shape sensing, gripping."""
 
-import importlib.util
-from pathlib import Path
-
 import pytest
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
-
-
-def numbers(name: str) -> dict[str, float]:
-    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.main(quick=True)
+from tests.scripts import main_of
 
 
 def test_a_tip_under_impedance_control_follows_a_wavy_wall():
-    found = numbers("23_impedance")
+    found = main_of("23_impedance")(quick=True)
     assert found["contact at [s]"] == pytest.approx(0.88, abs=0.1)
     assert found["tip off the projected set-point, sliding [mm]"] < 5
     assert found["the same at the end [mm]"] < 1
@@ -28,7 +17,7 @@ def test_a_tip_under_impedance_control_follows_a_wavy_wall():
 
 
 def test_a_shape_is_told_from_the_tip_under_pushes():
-    found = numbers("24_shape_sensing")
+    found = main_of("24_shape_sensing")(quick=True)
     assert found["largest error of the tip [mm]"] < 1
     middle = found["largest error of the middle [mm]"]
     assert middle < 3
@@ -38,7 +27,7 @@ def test_a_shape_is_told_from_the_tip_under_pushes():
 
 
 def test_fingers_hold_things_and_turn_a_bolt():
-    found = numbers("22_gripper")
+    found = main_of("22_gripper")(quick=True)
     for thing in ("beaker", "wrench"):
         weight = found[f"{thing}: weight [N]"]
         assert found[f"{thing}: sum of the contact forces [N]"] == pytest.approx(
