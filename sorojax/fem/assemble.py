@@ -20,6 +20,7 @@ from sorojax.fem.kinematics import AbstractKinematics
 from sorojax.fem.space import Space, lanes, per_block
 from sorojax.fem.tensor import checked_volume_ratio
 from sorojax.material.hyperelastic import AbstractHyperelastic, finite_share
+from sorojax.math.apart import apart
 
 
 class Assembly(NamedTuple):
@@ -54,27 +55,33 @@ def assemble(
     stress extrapolated from `u_before` (pass `u` for the exact tangent)."""
     blocks, constant = _blocks(space, geometry, material)
 
-    def work(block: _Block):
+    def work(total: Assembly, part: tuple[_Block, Any, Any]):
+        block, nodes, slots = part
+        alone = apart(block.cells[0, 0] >= 0)
         body = _body(block, constant, kinematics)
-        F = deformation_gradient(kinematics, lanes(u, block.cells), block.gradients)
-        F_before = deformation_gradient(
-            kinematics, lanes(u_before, block.cells), block.gradients
-        )
-        # Otherwise XLA repeats these sums in every use of F.
-        F, F_before = jax.lax.optimization_barrier((F, F_before))
+        F, F_before = alone(lambda: tuple(
+            deformation_gradient(kinematics, lanes(x, block.cells), block.gradients)
+            for x in (u, u_before)
+        ))  # fmt: skip
         share = finite_share(body.material)
         J, J_before = (checked_volume_ratio(kinematics, x, share) for x in (F, F_before))
-        answer = response(body, F, F_before)
-        force, upper = block_matrix(kinematics, answer, body, block.gradients)
-        return force, upper, jnp.min(J / J_before)
+        answer = response(body, F, F_before, alone)
+        force, upper = block_matrix(kinematics, answer, body, block.gradients, alone)
+        return Assembly(
+            total.force.at[nodes].add(jnp.moveaxis(force, 1, -1)),
+            total.values.at[slots].add(upper),
+            jnp.minimum(total.volume_ratio, jnp.min(J / J_before)),
+        ), None
 
-    forces, uppers, ratios = jax.lax.map(work, blocks)
     # padding writes to one node and one slot more than there are
     nodes = jnp.where(space.real[:, None], space.cells, space.num_nodes)
-    zero = jnp.zeros((space.num_nodes + 1, space.dim), u.dtype)
-    force = zero.at[nodes].add(jnp.moveaxis(forces, 2, -1))[:-1]
-    values = jnp.zeros(space.system.num_values + 1, u.dtype).at[space.slots].add(uppers)
-    return Assembly(force.ravel(), values[:-1], jnp.min(ratios))
+    nothing = Assembly(
+        jnp.zeros((space.num_nodes + 1, space.dim), u.dtype),
+        jnp.zeros(space.system.num_values + 1, u.dtype),
+        jnp.asarray(jnp.inf, u.dtype),
+    )
+    total, _ = jax.lax.scan(work, nothing, (blocks, nodes, space.slots))
+    return Assembly(total.force[:-1].ravel(), total.values[:-1], total.volume_ratio)
 
 
 @jax.jit
@@ -89,9 +96,13 @@ def cell_matrices(
     blocks, constant = _blocks(space, geometry, material)
 
     def work(block: _Block):
+        alone = apart(block.cells[0, 0] >= 0)
         body = _body(block, constant, kinematics)
-        F = deformation_gradient(kinematics, lanes(u, block.cells), block.gradients)
-        return block_matrix(kinematics, response(body, F, F), body, block.gradients)[1]
+        F = alone(
+            lambda: deformation_gradient(kinematics, lanes(u, block.cells), block.gradients)
+        )
+        answer = response(body, F, F, alone)
+        return block_matrix(kinematics, answer, body, block.gradients, alone)[1]
 
     return jax.lax.map(work, blocks)
 

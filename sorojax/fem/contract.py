@@ -14,28 +14,45 @@ from jaxtyping import Array, Float
 from sorojax.fem.energy import Body, Response
 from sorojax.fem.kinematics import AbstractKinematics
 from sorojax.fem.tensor import Entries
+from sorojax.math.apart import Alone, at_once
 
 Force = Float[Array, "cell_nodes dim lanes"]
 Gradients = Float[Array, "quad cell_nodes columns lanes"]
 
 
 def block_matrix(
-    kinematics: AbstractKinematics, answer: Response, body: Body, gradients: Gradients
+    kinematics: AbstractKinematics,
+    answer: Response,
+    body: Body,
+    gradients: Gradients,
+    alone: Alone = at_once,
 ) -> tuple[Force, Float[Array, "entries lanes"]]:
     """Sums over points of P G and of G' A G, the latter in the order of `block_entries`."""
-    weighted = gradients * body.volumes[:, None, None]
-    bent = _stiff_gradients(kinematics, answer.tangent, gradients)
-    # Otherwise XLA repeats the material's work in every entry of the cell matrix.
-    answer, weighted, bent = jax.lax.optimization_barrier((answer, weighted, bent))
-    force = _force(kinematics, answer.stress, weighted)
-    blocks = [_matrix(kinematics, i, bent[i, k], weighted) for i, k in bent]
-    if answer.slopes is not None and answer.stiffness is not None and body.modes is not None:
-        shares = [
-            _force(kinematics, mode[None] * answer.slopes, weighted) for mode in body.modes
+    weighted, bent = alone(lambda: (
+        gradients * body.volumes[:, None, None],
+        _stiff_gradients(kinematics, answer.tangent, gradients),
+    ))  # fmt: skip
+    shares = alone(lambda: _shares(kinematics, answer, body, weighted))
+
+    def contract():
+        blocks = [
+            _matrix(kinematics, i, stiff, weighted)
+            for (i, _), stiff in zip(component_pairs(kinematics.dim), bent, strict=True)
         ]
-        bulk = _bulk(jnp.stack(shares), answer.stiffness)
-        blocks = [block + more for block, more in zip(blocks, bulk, strict=True)]
-    return force, _upper(list(bent), blocks)
+        if shares is not None:
+            blocks = [b + more for b, more in zip(blocks, _bulk(*shares), strict=True)]
+        return _force(kinematics, answer.stress, weighted), _upper(blocks)
+
+    return alone(contract)
+
+
+def _shares(kinematics: AbstractKinematics, answer: Response, body: Body, weighted: Gradients):
+    """d(coefficient)/du of the pressure modes, and the same times their stiffness."""
+    if answer.slopes is None or answer.stiffness is None or body.modes is None:
+        return None
+    each = [_force(kinematics, mode[None] * answer.slopes, weighted) for mode in body.modes]
+    slopes = jnp.stack(each)
+    return slopes, jnp.sum(answer.stiffness[:, :, None, None] * slopes[None], axis=1)
 
 
 def component_pairs(dim: int) -> list[tuple[int, int]]:
@@ -63,15 +80,15 @@ def _force(kinematics: AbstractKinematics, P: Entries, weighted: Gradients) -> F
 
 def _stiff_gradients(
     kinematics: AbstractKinematics, A: Float[Array, "entries entries quad lanes"], G: Gradients
-) -> dict[tuple[int, int], list[Float[Array, "quad cell_nodes lanes"]]]:
+) -> list[list[Float[Array, "quad cell_nodes lanes"]]]:
     """A G for each pair of components i <= k: one array per kept entry of row i."""
-    return {
-        (i, k): [
+    return [
+        [
             _total(A[e, f][:, None] * G[:, :, j] for f, j in _slots_of(kinematics, k))
             for e, _ in _slots_of(kinematics, i)
         ]
         for i, k in component_pairs(kinematics.dim)
-    }
+    ]
 
 
 def _matrix(kinematics: AbstractKinematics, i: int, bent, weighted: Gradients):
@@ -88,18 +105,19 @@ def _total(terms: Iterable[jax.Array]) -> jax.Array:
 
 
 def _bulk(
-    slopes: Float[Array, "modes cell_nodes dim lanes"], H: Float[Array, "modes modes lanes"]
+    slopes: Float[Array, "modes cell_nodes dim lanes"],
+    through: Float[Array, "modes cell_nodes dim lanes"],
 ) -> list[Float[Array, "cell_nodes cell_nodes lanes"]]:
-    """Stiffness of the pressure modes; `slopes` are d(coefficient)/du."""
-    through = jnp.sum(H[:, :, None, None] * slopes[None], axis=1)
-    slopes, through = jax.lax.optimization_barrier((slopes, through))
+    """Stiffness of the pressure modes."""
     return [
         _total(a[:, i][:, None] * b[:, k][None] for a, b in zip(slopes, through, strict=True))
         for i, k in component_pairs(slopes.shape[2])
     ]
 
 
-def _upper(pairs: list[tuple[int, int]], blocks) -> Float[Array, "entries lanes"]:
+def _upper(blocks: list[Float[Array, "cell_nodes cell_nodes lanes"]]):
+    """Blocks of the pairs i <= k of components, as rows of entries."""
+    pairs = component_pairs(2 if len(blocks) == 3 else 3)
     rows = []
     for (i, k), block in zip(pairs, blocks, strict=True):
         if i == k:

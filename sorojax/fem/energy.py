@@ -19,7 +19,13 @@ from jaxtyping import Array, Float
 
 from sorojax.fem.formulation import Modes, coefficients, project
 from sorojax.fem.kinematics import AbstractKinematics
-from sorojax.fem.shape_response import shape_energy, shape_stress, shape_tangent
+from sorojax.fem.shape_response import (
+    ShapeVectors,
+    shape_energy,
+    shape_response,
+    shape_stress,
+    shape_tangent,
+)
 from sorojax.fem.tensor import (
     Entries,
     geometric_part,
@@ -29,6 +35,7 @@ from sorojax.fem.tensor import (
 )
 from sorojax.material.hyperelastic import AbstractHyperelastic, finite_share
 from sorojax.material.kinematics import Entry
+from sorojax.math.apart import Alone, at_once
 
 
 class Body(NamedTuple):
@@ -67,21 +74,38 @@ def pressure(body: Body, F: Entries) -> Entry:
     return project(body.modes, body.volumes, slope)
 
 
-def response(body: Body, F: Entries, F_before: Entries) -> Response:
+def response(body: Body, F: Entries, F_before: Entries, alone: Alone = at_once) -> Response:
     """P and dP/dF, the geometric parts of dP/dF from stresses extrapolated out of
     `F_before`. With `F_before` equal to `F` the tangent is the exact derivative."""
+    vectors = alone(lambda: _vectors(body, F, F_before))
+    return alone(lambda: _with_tangent(body, F, *vectors))
+
+
+def _vectors(body: Body, F: Entries, F_before: Entries):
+    """Stress and parts of the tangent of the shape energy, the extrapolated S and pressure,
+    and the volumetric part: p, bulk stiffness and dJ/dF."""
+    P, parts = shape_response(body.material, body.kinematics, F)
     step = F - F_before
-    P = shape_stress(body.material, body.kinematics, F)
-    tangent, weight = shape_tangent(body.material, body.kinematics, F)
     S = _extrapolated_shape(body, F, F_before, step, P)
     if not body.kinematics.has_volume:
-        geometric = geometric_part(body.kinematics, F, weight, S)
-        return Response(P, tangent + geometric, None, None)
+        return P, parts, S, None, None
     p_before, p_rate = jax.jvp(lambda F: pressure(body, F), (F_before,), (step,))
-    p_extrapolated = p_before + p_rate
-    weight = p_extrapolated if weight is None else weight + p_extrapolated
-    tangent = tangent + geometric_part(body.kinematics, F, weight, S)
-    return _with_volume(body, F, P, tangent)
+    return P, parts, S, p_before + p_rate, _volumetric(body, F)
+
+
+def _with_tangent(body: Body, F, P, parts, S, p, volumetric) -> Response:
+    weight = parts.weight if isinstance(parts, ShapeVectors) else None
+    if p is not None:
+        weight = p if weight is None else weight + p
+    tangent = shape_tangent(parts) + geometric_part(body.kinematics, F, weight, S)
+    if volumetric is None:
+        return Response(P, tangent, None, None)
+    p, bulk, C = volumetric
+    stress = P + p[None] * C
+    if body.modes is None:
+        return Response(stress, tangent + (bulk[None] * C)[:, None] * C[None], None, None)
+    stiffness = [coefficients(body.modes, body.volumes, bulk * mode) for mode in body.modes]
+    return Response(stress, tangent, C, jnp.stack(stiffness))
 
 
 def _extrapolated_shape(body: Body, F, F_before, step, P) -> Entries:
@@ -107,13 +131,8 @@ def _volumetric_slope(body: Body, J: Entry) -> Entry:
     return jax.grad(lambda J: jnp.sum(body.material.volumetric_energy(J)))(J)
 
 
-def _with_volume(body: Body, F, P, tangent) -> Response:
+def _volumetric(body: Body, F: Entries) -> tuple[Entry, Entry, Entries]:
     J = _dilatation(body, F)
     slope, bulk = jax.jvp(lambda J: _volumetric_slope(body, J), (J,), (jnp.ones_like(J),))
     p = project(body.modes, body.volumes, slope)
-    C = volume_slopes(body.kinematics, F)
-    stress = P + p[None] * C
-    if body.modes is None:
-        return Response(stress, tangent + (bulk[None] * C)[:, None] * C[None], None, None)
-    stiffness = [coefficients(body.modes, body.volumes, bulk * mode) for mode in body.modes]
-    return Response(stress, tangent, C, jnp.stack(stiffness))
+    return p, bulk, volume_slopes(body.kinematics, F)

@@ -128,7 +128,11 @@ def constrain(
     move: Float[Array, " dofs"],
 ) -> tuple[Float[Array, " nnz"], Float[Array, " dofs"]]:
     """Matrix and right-hand side of a Newton step in which known unknowns move by `move`."""
-    rhs = -residual - sparse.product(system, values, move)
+    moved = jax.lax.cond(  # most steps move no support
+        jnp.any(move != 0), lambda: sparse.product(system, values, move),
+        lambda: jnp.zeros_like(residual),
+    )  # fmt: skip
+    rhs = -residual - moved
     return sparse.fix(system, values, known), jnp.where(known, jnp.zeros_like(rhs), rhs)
 
 
@@ -137,7 +141,7 @@ def step(
     prepared: Prepared,
     values: Float[Array, " nnz"],
     residual: Float[Array, " dofs"],
-    move: Float[Array, " dofs"],
+    move: Float[np.ndarray, " dofs"],
 ) -> tuple[np.ndarray | None, int]:
     """Newton step [m] on the host and the number of negative eigenvalues of the tangent;
     `None` if the tangent is singular."""
@@ -146,5 +150,5 @@ def step(
     factor = system.solver.factor(np.asarray(matrix))
     if factor is None:
         return None, -1
-    du = factor.solve(np.asarray(rhs)) + np.asarray(move)
+    du = factor.solve(np.asarray(rhs)) + move
     return du.reshape(-1, problem.mesh.element.dim), factor.negative_eigenvalues

@@ -60,9 +60,7 @@ def newton_solve(
     move = np.where(np.asarray(prepared.known), known_values - u.ravel(), 0.0)
     iterations, negative, size = 0, 0, np.inf
     if tangent is not None and all(load.smooth for load in problem.loads):
-        du, negative = step(
-            problem, prepared, tangent.values, state.residual, jnp.asarray(move)
-        )
+        du, negative = step(problem, prepared, tangent.values, state.residual, move)
         if du is not None:
             u, before, state, size = _advance(problem, prepared, u, du)
             move = np.where(np.asarray(prepared.known), known_values - u.ravel(), 0.0)
@@ -77,7 +75,7 @@ def newton_solve(
         if iterations == settings.max_iterations:
             reason = f"no convergence in {iterations} Newton iterations"
             return Iterate(u, None, iterations, ratio, negative, reason)
-        du, negative = step(problem, prepared, state.values, state.residual, jnp.asarray(move))
+        du, negative = step(problem, prepared, state.values, state.residual, move)
         if du is None:
             return Iterate(u, None, iterations, ratio, negative, "the tangent is singular")
         iterations += 1
@@ -90,7 +88,7 @@ def newton_solve(
 
 
 def _linearise(problem, prepared, u: np.ndarray, before: np.ndarray) -> Linearised:
-    return linearise(problem, prepared, jnp.asarray(u), jnp.asarray(before))
+    return linearise(problem, prepared, u, before)  # type: ignore[arg-type]
 
 
 def _advance(problem: Problem, prepared: Prepared, u: np.ndarray, du: np.ndarray):

@@ -4,6 +4,8 @@ Energies of the first isochoric invariant have a closed form; any other energy i
 differentiated at the point.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -36,23 +38,47 @@ def shape_stress(
     return _slope(W)(x)[None] * slopes
 
 
-def shape_tangent(
+class ShapeVectors(NamedTuple):
+    """What dP/dF is made of, where the energy is one of the first isochoric invariant: an outer
+    product of `half` and C = dJ/dF with its transpose, `second` times that of the slopes of the
+    invariant, a multiple `flat` of unity, and `weight` times d2J / dF dF."""
+
+    half: Entries
+    C: Entries
+    slopes: Entries
+    second: Entry
+    flat: Entry
+    weight: Entry
+
+
+def shape_response(
     material: AbstractHyperelastic, kinematics: AbstractKinematics, F: Entries
-) -> tuple[Float[Array, "entries entries quad lanes"], Entry | None]:
-    """Derivative of the stress by F [Pa], as a matrix plus a multiple of d2J / dF dF."""
+) -> tuple[Entries, ShapeVectors | Float[Array, "entries entries quad lanes"]]:
+    """Stress P [Pa], and dP/dF or what it is made of [Pa]."""
     W = _closed_form(material, kinematics)
     if W is None:
-        return _differentiated(material, kinematics, F), None
+        stress = shape_stress(material, kinematics, F)
+        return stress, _differentiated(material, kinematics, F)
     J, scale, I1, C = _parts(kinematics, F)
     x, slopes = _first_invariant(kinematics, F)
     first, second = jax.jvp(_slope(W), (x,), (jnp.ones_like(x),))
-    # an outer product and its transpose, by C; another by the slopes; a diagonal
     half = (first * scale / J)[None] * (5 / 9 * (I1 / J)[None] * C - 4 / 3 * F)
+    weight = -2 / 3 * first * scale * I1 / J
+    vectors = ShapeVectors(half, C, slopes, second, 2 * first * scale, weight)
+    return first[None] * slopes, vectors
+
+
+def shape_tangent(
+    parts: ShapeVectors | Float[Array, "entries entries quad lanes"],
+) -> Float[Array, "entries entries quad lanes"]:
+    """dP/dF [Pa] of `shape_response`, but for the multiple of d2J / dF dF."""
+    if not isinstance(parts, ShapeVectors):
+        return parts
+    half, C, slopes, second, flat, _ = parts
     mixed = half[:, None] * C[None] + C[:, None] * half[None]
     square = (second[None] * slopes)[:, None] * slopes[None]
-    unit = jnp.eye(F.shape[0], dtype=F.dtype)[:, :, None, None]
-    flat = (2 * first * scale)[None, None] * unit
-    return mixed + square + flat, -2 / 3 * first * scale * I1 / J
+    unit = jnp.eye(C.shape[0], dtype=C.dtype)[:, :, None, None]
+    return mixed + square + flat[None, None] * unit
 
 
 def _differentiated(material, kinematics: AbstractKinematics, F: Entries):

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sorojax._types import is_traced
 from sorojax.math import sparse
-from sorojax.mesh.elements import AbstractElement, PolyN, Tet4, Tri3
+from sorojax.mesh.elements import AbstractElement, PolyN, Tet4
 from sorojax.mesh.mesh import Mesh, valences
 
 
@@ -47,9 +47,9 @@ class Space(eqx.Module):
 
 def lanes_per_block(element: AbstractElement) -> int:
     """Cells per block, so that the working set of a block stays in the cache (measured)."""
-    if isinstance(element, Tri3 | Tet4):
+    if isinstance(element, Tet4) or (element.dim == 2 and element.order == 1):
         return 256
-    return 128 if element.dim == 2 and element.order == 1 else 32
+    return 128 if element.dim == 2 else 32
 
 
 def space(mesh: Mesh, loads: tuple[Any, ...] = ()) -> Space:
