@@ -10,6 +10,7 @@ from typing import Any
 from benchmarks import discover, page, suite
 from benchmarks.rows import dumps
 from benchmarks.runner import run_case
+from sorojax._progress import report
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -56,10 +57,11 @@ def _parser() -> argparse.ArgumentParser:
 def _to_json(chosen: dict[str, Path], file: Path) -> list[dict[str, Any]]:
     lines = []
     with file.open("w") as out:
-        for name, path in chosen.items():
+        for k, (name, path) in enumerate(chosen.items()):
             for line in run_case(name, path):
                 print(dumps(line), file=out, flush=True)
                 lines.append(line)
+            report("benchmarks", k + 1, len(chosen), rows=len(lines))
     return lines
 
 

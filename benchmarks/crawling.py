@@ -38,9 +38,9 @@ class Cycles(NamedTuple):
     cuts: int
 
 
-def cycles(problem: fem.Problem, step: float, count: int = 3) -> Cycles:
+def cycles(problem: fem.Problem, step: float, count: int = 3, **options) -> Cycles:
     """Some cycles of the gait."""
-    motion = run(problem, count / FREQUENCY, step)
+    motion = run(problem, count / FREQUENCY, step, **options)
     x = np.asarray(moved(problem, motion))[:, 0]
     ends = np.interp(np.arange(count + 1) / FREQUENCY, np.asarray(motion.times), x)
     floor = problem.loads[-1]

@@ -32,37 +32,24 @@ def columns(first, count, width, low, high) -> sdf.AbstractSdf:
     return sdf.repeat(one, [PITCH, 0.0], count, separate=True)
 
 
-def hollows(chambers: int) -> tuple[sdf.AbstractSdf, sdf.AbstractSdf]:
-    slots = columns(FIRST + PITCH / 2, chambers - 1, SLOT, NOTCH, TOP + mm)
-    return columns(FIRST, chambers, WIDE, FLOOR, ROOF), slots
-
-
-def actuator(chambers: int) -> mesh.Mesh:
-    """Quad8 cells between the lines of the drawing."""
+def actuator(chambers: int) -> tuple[mesh.Mesh, sdf.AbstractSdf, sdf.AbstractSdf]:
+    """Quad8 cells between the lines of the drawing, the chambers, and the slots."""
     middle = FIRST + PITCH * np.arange(chambers)
-    end = middle[-1] + END
-    sides = np.concatenate([middle - WIDE / 2, middle + WIDE / 2])
-    slot = middle[:-1] + PITCH / 2
-    walls = np.concatenate([middle - PITCH / 3.1, middle + PITCH / 3.1])
-    ends = [0, 3.1 * mm, end, end + STRIP]
-    x = np.unique(np.concatenate([ends, sides, walls, slot - SLOT / 2, slot + SLOT / 2]))
+    end, slot = middle[-1] + END, middle[:-1] + PITCH / 2
+    lines = [middle + far for half in (WIDE / 2, PITCH / 3.1) for far in (-half, half)]
+    lines += [slot - SLOT / 2, slot + SLOT / 2, [0, 3.1 * mm, end, end + STRIP]]
     upper = np.linspace(NOTCH, ROOF, 4)[1:], [(ROOF + TOP) / 2, TOP]
     y = np.concatenate([[0, LAYER], np.linspace(FLOOR, NOTCH, 4), *upper])
-    lines, counts = (x, y), (len(x) - 1, len(y) - 1)
-    grid = mesh.rectangle([0, 0], counts, divisions=counts, element=mesh.Quad8())
-    points = np.stack([np.interp(np.asarray(grid.points)[:, k], np.arange(len(line)), line)
-                       for k, line in enumerate(lines)], axis=1)  # fmt: skip
-    cells, (air, slots) = np.asarray(grid.cells), hollows(chambers)
-    centre = points[cells[:, :4]].mean(axis=1)
-    strip = (centre[:, 0] > end) & (centre[:, 1] > FLOOR)
-    left = ~strip & (np.asarray(air(centre)) > 0) & (np.asarray(slots(centre)) > 0)
-    used, cells = np.unique(cells[left], return_inverse=True)
-    return mesh.Mesh(points[used], cells.reshape(-1, 8), mesh.Quad8())
+    air = columns(FIRST, chambers, WIDE, FLOOR, ROOF)
+    slots = columns(FIRST + PITCH / 2, chambers - 1, SLOT, NOTCH, TOP + mm)
+    block = sdf.Rectangle([0, 0], [end, TOP]) | sdf.Rectangle([0, 0], [end + STRIP, FLOOR])
+    grid = mesh.between_lines(np.unique(np.concatenate(lines)), y, element=mesh.Quad8())
+    return mesh.kept(grid, mesh.cells_inside(grid, block - air - slots)), air, slots
 
 
 def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
     chambers = 6 if quick else CHAMBERS
-    cells, (air, slots) = actuator(chambers), hollows(chambers)
+    cells, air, slots = actuator(chambers)
     length = float(cells.points[:, 0].max())
     stiff = np.ones(cells.num_cells)
     stiff[mesh.cells_where(cells, lambda p: p[1] < LAYER)] = 10.0
@@ -88,33 +75,29 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
         young_modulus=1.0, poisson_ratio=0.4, density=1.0,
     )  # fmt: skip
     errors = sj.view.backbone_errors(backbone, body, q)
+    s, shapes = np.asarray(backbone.s), np.asarray(basis.modes["kappa_z"](backbone.s))
+    if picture is not None:
+        draw(path, backbone, body, q, shapes, Path(picture))
 
-    s = np.asarray(backbone.s)
-    shapes = np.asarray(basis.modes["kappa_z"](backbone.s))
     gram = np.trapezoid(shapes[:, :, None] * shapes[:, None], s, axis=0)
     inner = np.abs(s * length - FIRST - PITCH * (chambers - 1) / 2) < PITCH * chambers / 2
     waves = shapes[inner, 0] - np.poly1d(np.polyfit(s[inner], shapes[inner, 0], 3))(s[inner])
-    peaks = np.abs(np.fft.rfft(waves))
-    if picture is not None:
-        draw(path, backbone, body, q, shapes, Path(picture))
-    last = path.displacements[-1]
-    touch = fem.contact_state(problem, last, "cylinder")
+    turn, off = jnp.trapezoid(backbone.strain[-1, :, 0], s) * length, errors.max() / mm
+    last, held = path.displacements[-1], reduction.captured_energy(backbone, basis)
     return {
         "unknowns": problem.space.num_dofs,
-        "turn of the tip [deg]": float(
-            jnp.trapezoid(backbone.strain[-1, :, 0], s) * length / deg
-        ),
+        "turn of the tip [deg]": float(turn / deg),
         "modes off orthonormal": float(np.abs(gram - np.eye(3)).max()),
-        "waves of the first mode along the chambers": int(peaks.argmax()),
-        "curvature that three modes hold": reduction.captured_energy(backbone, basis)[
-            "kappa_z"
-        ],
-        "mean distance of the backbones, worst [mm]": float(errors.max() / mm),
-        "overlap with the cylinder [mm]": float(touch.penetration / mm),
-        "overlap of the walls [mm]": float(
-            fem.contact_state(problem, last, "walls").penetration / mm
-        ),
+        "waves of the first mode along the chambers": int(np.abs(np.fft.rfft(waves)).argmax()),
+        "curvature that three modes hold": held["kappa_z"],
+        "mean distance of the backbones, worst [mm]": float(off),
+        "overlap with the cylinder [mm]": overlap(problem, last, "cylinder"),
+        "overlap of the walls [mm]": overlap(problem, last, "walls"),
     }
+
+
+def overlap(problem, u, contact: str) -> float:
+    return float(fem.contact_state(problem, u, contact).penetration / mm)
 
 
 def draw(path, backbone, body, q, shapes, file: Path) -> None:

@@ -25,8 +25,7 @@ from sorojax.units import MPa, deg, kPa, ml, mm
 
 RATE, LAG, PERIOD = 7.0, math.pi / 6, 0.005  # rad/s; rad; s between two set-points
 MODES, VOLUME = 5, 6 * ml
-LENGTHS = np.array([80.0, 90.0, 90.0, 90.0, 90.0]) * mm
-SECTION = 10 * mm, 10 * mm
+LENGTHS, SECTION = np.array([80.0, 90.0, 90.0, 90.0, 90.0]) * mm, (10 * mm, 10 * mm)
 
 
 class Chamber(rod.AbstractChamber):
@@ -46,21 +45,16 @@ def finger(length) -> systems.Network:
         young_modulus=1.5 * MPa, poisson_ratio=0.45, density=1100.0, nodes=8,
     )  # fmt: skip
     upright = rod.Gravity([-9.81, 0.0])
-    return systems.Network(
-        blocks={
-            "valve": systems.Regulator(4e-9, integral_gain=2e-8),
-            "air": systems.Reservoir(),
-            "body": systems.RodBody(body, (Chamber(length), upright, rod.Damping(0.02))),
-        },
-        wires={
-            "valve.pressure": "air.pressure",
-            "air.mass_flow": "valve.mass_flow",
-            "air.volume": "body.volume",
-            "air.volume_rate": "body.volume_rate",
-            "body.pressure": "air.pressure",
-        },
-        exposed=("valve.setpoint",),
-    )
+    blocks = {
+        "valve": systems.Regulator(4e-9, integral_gain=2e-8), "air": systems.Reservoir(),
+        "body": systems.RodBody(body, (Chamber(length), upright, rod.Damping(0.02))),
+    }  # fmt: skip
+    wires = {
+        "valve.pressure": "air.pressure", "air.mass_flow": "valve.mass_flow",
+        "air.volume": "body.volume", "air.volume_rate": "body.volume_rate",
+        "body.pressure": "air.pressure",
+    }  # fmt: skip
+    return systems.Network(blocks, wires, exposed=("valve.setpoint",))
 
 
 class Waves(eqx.Module):

@@ -1,12 +1,14 @@
 """Four soft fingers hold a beaker and a wrench, and turn a bolt by walking round it.
 
 Study VI-C of the Sorotoki paper, after Suzumori et al. (1991): fingers of 12 x 80 mm on a
-circle of 37.5 mm, whose chambers act as bending moments. All four get the same command, so
-one is simulated, with a quarter of an object that slides or turns on the axis between them.
-Changed: Coulomb friction that is smooth below 1 mm/s in place of a sign, the second moment
-of area of a disc, round things (the wrench a bar of 10 mm), a bolt with viscous damping.
+circle of 37.5 mm, whose chambers act as bending moments, all four with the same command.
+Beaker and wrench slide on the axis, the bolt turns on it. Free to turn as well, a beaker that
+is held as hard as here twists the fingers round itself within two seconds. Changed: Coulomb
+friction that is smooth below 1 mm/s in place of a sign, the second moment of area of a disc,
+round things (the wrench a bar of 10 mm), a bolt with viscous damping.
 """
 
+import functools
 import sys
 from pathlib import Path
 
@@ -17,17 +19,26 @@ import numpy as np
 from jaxtyping import Array
 
 import sorojax as sj
+from sorojax import rod
+from sorojax.math.contact_stepper import ContactMidpoint
 from sorojax.math.lie import homogeneous
-from sorojax.rod import Between, On, Part
 from sorojax.units import mm
 
 GRASP, WALK = 0.03, 0.02  # N m
 GRIP = sj.contact.LinePenalty(stiffness=5e5, smoothing=50e-6, friction=0.8, slip=1e-3)
+# radius, length, depth of the middle below the feet of the fingers [m], mass [kg]
+THINGS = {
+    "beaker": (20 * mm, 60 * mm, 75 * mm, 0.05),
+    "wrench": (5 * mm, 100 * mm, 95 * mm, 0.04),
+}
+BOLT = 28 * mm, 44 * mm, 58 * mm, 0.012
+HELD = ContactMidpoint(passes=1, lasting=True, theta=1.0, tolerance=1e-4)
+FINGERS = tuple(f"finger_{k}" for k in range(4))
 
 
-class Moments(eqx.Module):
-    """Bending inwards and sideways [N m]: closed within half a second, or once a second in
-    turn, `phase` [rad] apart."""
+class Chambers(eqx.Module):
+    """Moments at the tips, along their axes, and zero forces: inwards and sideways [N m],
+    closed within half a second, or once a second in turn, `phase` [rad] apart."""
 
     inwards: Array
     aside: Array
@@ -36,132 +47,86 @@ class Moments(eqx.Module):
     def __call__(self, t):
         start, angle = jnp.clip(2 * t, 0, 1), 2 * np.pi * t
         walk = jnp.where(self.aside > 0, jnp.clip(jnp.sin(angle), -0.25, 1), 1.0)
-        aside = jnp.sin(angle + self.phase)
-        return self.inwards * start * walk, self.aside * start * aside
+        bend = [0 * t, self.aside * jnp.sin(angle + self.phase), self.inwards * walk]
+        return jnp.concatenate([start * jnp.stack(bend), jnp.zeros(3)])
 
 
-class Air(sj.rod.AbstractForce):
-    """Bending moments inwards and sideways [N m] that chambers make, as given by time."""
-
-    moments: Moments
-
-    def __call__(self, t, motion):
-        inwards, aside = self.moments(t)
-        turn = jnp.stack([jnp.zeros_like(inwards), aside, inwards])
-        at = sj.rod.points(motion, np.ones(1))
-        return at.generalised(None, (at.directors[0] @ turn)[None])
+def lowered(t):
+    """Weight [m/s^2] that comes on while a table sinks away, from 0.5 to 0.8 s."""
+    return jnp.array([0.0, 0.0, -9.81]) * jnp.clip((t - 0.5) / 0.3, 0, 1)
 
 
-def upright(angle, radius, height):
-    """A frame whose x points down and whose y points to the axis."""
+def upright(angle):
+    """A frame on the circle whose x points down and whose y points to the axis."""
     c, s = np.cos(angle), np.sin(angle)
     turn = jnp.array([[0.0, -c, -s], [0.0, -s, c], [-1.0, 0.0, 0.0]])
-    return homogeneous(turn, jnp.array([radius * c, radius * s, height]))
-
-
-class Lowered(sj.rod.AbstractForce):
-    """Weight that comes on while a table sinks away, from 0.5 to 0.8 s."""
-
-    def __call__(self, t, motion):
-        return jnp.clip((t - 0.5) / 0.3, 0, 1) * sj.rod.Gravity()(t, motion)
-
-
-class Axial(sj.rod.AbstractJoint):
-    """Along x by `advance` [m] and about it by `turn` [rad] per coordinate, with damping."""
-
-    turn: Array
-    advance: Array
-    damping: Array
-
-    def num_dof(self, group):
-        return 1
-
-    def axes(self, group, dtype):
-        return jnp.zeros((6, 1), dtype).at[0].set(self.turn).at[3].set(self.advance)
-
-    def pose(self, group, q):
-        c, s = jnp.cos(self.turn * q[0]), jnp.sin(self.turn * q[0])
-        turn = jnp.eye(3).at[1:, 1:].set(jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])]))
-        return turn, jnp.zeros(3).at[0].set(self.advance * q[0])
-
-    def matrices(self, group, dtype):
-        return jnp.zeros((1, 1), dtype), self.damping[None, None]
-
-    def effort(self, q, v):
-        return -self.damping * v
-
-
-def quarter(radius, length, top, mass, joint):
-    """A finger and a quarter of a round object that hangs by `joint` on the axis."""
-    finger = sj.rod.rod(
-        sj.SE3(), sj.rod.chebyshev(kappa_y=2, kappa_z=2), sj.rod.circle(6 * mm),
-        length=80 * mm, young_modulus=1e6, poisson_ratio=0.3, density=2000, nodes=6,
-    )  # fmt: skip
-    thing = sj.rod.rod(
-        sj.SE3(), sj.rod.constant("kappa_z"), sj.rod.circle(radius), length=length,
-        young_modulus=1e7, poisson_ratio=0.3, density=mass / (4 * np.pi * radius**2 * length),
-    )  # fmt: skip
-    foot, hung = upright(0.0, 37.5 * mm, 0.0), upright(0.0, 0.0, top)
-    parts = {"finger": Part(finger, offset=foot), "object": Part(thing, joint, offset=hung)}
-    return sj.rod.assembly(sj.SE3(), **parts)
+    return homogeneous(turn, 37.5 * mm * jnp.array([c, s, 0.0]))
 
 
 @eqx.filter_jit
-def run(model, radius, moments, step, saves):
-    """Motion, and the mean force [N] or moment [N m] on the object over its last 50 steps."""
-    contact = sj.rod.RodContact(jnp.stack([jnp.asarray(6 * mm), radius]), GRIP, points=24)
-    touch = Between("finger", "object", contact)
-    forces = (
-        On("finger", sj.rod.Gravity()), On("object", Lowered()), sj.rod.Damping(0.03),
-        On("finger", Air(moments)), touch,
+def run(joint, radius, length, depth, mass, chambers, step, saves):
+    """The robot, its motion, and the contact force [N] or moment [N m] that the thing takes
+    along the axis, the mean of the last 50 steps."""
+    finger = rod.rod(
+        sj.SE3(), rod.chebyshev(kappa_y=2, kappa_z=2), rod.circle(6 * mm), length=80 * mm,
+        young_modulus=1e6, poisson_ratio=0.3, density=2000, nodes=6,
     )  # fmt: skip
-    q, v = sj.rod.rest(model), jnp.zeros(sj.rod.num_dof(model))
-    path = sj.rod.rollout(model, q, v, forces, step=step, saves=saves)
+    across = mass * (3 * radius**2 + length**2) / 12
+    thing = rod.Link(mass, jnp.stack([across, across, mass * radius**2 / 2]))
+    hung = homogeneous(jnp.eye(3), jnp.stack([0 * depth, 0 * depth, -depth]))
+    parts = {
+        name: rod.Part(finger, offset=upright(k * np.pi / 2)) for k, name in enumerate(FINGERS)
+    }
+    model = rod.assembly(sj.SE3(), **parts, thing=rod.Part(thing, joint, offset=hung))
+    touch = rod.LinkContact(sj.sdf.Cylinder(radius, length), 6 * mm, GRIP, points=24)
+    air = rod.Varying(functools.partial(rod.PointWrench, follower=True), chambers)
+    touches = tuple(rod.Between(name, "thing", touch) for name in FINGERS)
+    own = [rod.On(name, force) for name in FINGERS for force in (rod.Gravity(), air)]
+    forces = (
+        rod.Damping(0.03),
+        rod.On("thing", rod.Varying(rod.Gravity, lowered)),
+        *own,
+        *touches,
+    )
+    q, v = rod.rest(model), jnp.zeros(rod.num_dof(model))
+    path = rod.rollout(model, q, v, forces, step=step, saves=saves, stepper=HELD)
 
-    def pull(q, v):  # normal forces act at the end of a step, friction at its middle
-        end, none = sj.rod.motion(model, q, v), jnp.zeros(())
-        both = sj.rod.total_force((touch,), none, end) - sj.rod.total_force((), none, end)
-        return both[sj.rod.slices(model)[1].joint_v][0]
+    def pull(q, v):
+        here, none = rod.motion(model, q, v), jnp.zeros(())
+        return (rod.total_force(touches, none, here) - rod.total_force((), none, here))[-1]
 
-    middle = (path.v[-50:] + path.v[-51:-1]) / 2
-    return path, jnp.mean(jax.vmap(pull)(path.q[-50:], middle))
+    return model, path, jnp.mean(jax.vmap(pull)(path.q[-50:], path.v[-50:]))
 
 
 def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, float]:
-    radii = {"beaker": 20 * mm, "wrench": 5 * mm, "bolt": 28 * mm}
     seconds, step = (3, 2e-3) if quick else (5, 1e-3)
-    saves = round(seconds / step)
+    saves, told, films = round(seconds / step), {}, {}
 
-    def do(thing, length, top, mass, joint, bend, aside=0.0, phase=0.0):
-        radius = jnp.asarray(radii[thing])
-        model = quarter(radius, jnp.asarray(length), top, mass, Axial(*map(jnp.asarray, joint)))
-        moments = Moments(*map(jnp.asarray, (bend, aside, phase)))
-        path, pull = run(model, radius, moments, jnp.asarray(step), saves)
-        return model, path, float(pull)
+    def do(name, joint, size, bend, aside=0.0, phase=0.0):
+        chambers = Chambers(*map(jnp.asarray, (bend, aside, phase)))
+        films[name] = (*run(joint, *map(jnp.asarray, size), chambers, step, saves), size)
+        return films[name][1:3]
 
-    slides, turns = (0.0, 1.0, 0.0), (1.0, 0.0, 1e-4)  # N m s damps a quarter of the bolt
-    told, films = {}, {}
-    for thing, length, mass in (("beaker", 60 * mm, 0.05), ("wrench", 100 * mm, 0.04)):
-        model, path, pull = do(thing, length, -45 * mm, mass, slides, GRASP)
-        films[thing] = model, path
-        told[f"{thing}: weight [N]"] = mass * 9.81
-        told[f"{thing}: sum of the contact forces [N]"] = -4 * pull
-        told[f"{thing}: sinks by [mm/s]"] = float(path.v[-1, 4]) / mm
+    for name, size in THINGS.items():
+        path, pull = do(name, rod.Screw(turn=0.0, advance=1.0), size, GRASP)
+        told[f"{name}: weight [N]"] = size[-1] * 9.81
+        told[f"{name}: sum of the contact forces [N]"] = float(pull)
+        told[f"{name}: sinks by [mm/s]"] = -float(path.v[-1, -1]) / mm
     for name, phase in (("left", np.pi / 2), ("right", -np.pi / 2)):
-        model, path, _ = do("bolt", 44 * mm, -36 * mm, 0.012, turns, WALK, WALK, phase)
-        films[name] = model, path
-        angle = np.asarray(path.q[:, 4]) / (2 * np.pi)
-        angle = angle[saves // seconds :]  # after the first second
+        path, _ = do(
+            name, rod.Screw(turn=1.0, advance=0.0, damping=4e-4), BOLT, WALK, WALK, phase
+        )
+        angle = np.asarray(path.q[saves // seconds :, -1]) / (2 * np.pi)  # after a second
         told[f"bolt {name}: turns a second"] = float(angle[-1] - angle[0]) / (seconds - 1)
         way = np.sign(angle[-1]) * angle
         back, size = np.max(np.maximum.accumulate(way) - way), np.ptp(way) / (seconds - 1)
         told[f"bolt {name}: way back, of a step [%]"] = float(100 * back / size)
     if picture is not None:
-        draw(films, radii, picture)
+        draw(films, picture)
     return told
 
 
-def draw(films, radii, file) -> None:
+def draw(films, file) -> None:
     """The fingers at the end, seen from the side, and the way of the bolt."""
     import matplotlib
 
@@ -171,23 +136,22 @@ def draw(films, radii, file) -> None:
 
     figure, axes = plt.subplots(1, 4, figsize=(13, 3.8), width_ratios=(1, 1, 1, 1.7))
     points = np.linspace(0, 1, 30)
-    for axis, thing in zip(axes, ("beaker", "wrench", "bolt"), strict=False):
-        model, path = films["left" if thing == "bolt" else thing]
-        poses = sj.rod.forward_kinematics(model, path.q[-1], points)
-        line, body = (np.asarray(poses[k])[:, :3, 3] / mm for k in ("finger", "object"))
-        for k, shade in ((1, 0.4), (3, 0.4), (0, 1.0), (2, 1.0)):
-            c, s = np.cos(np.pi / 2 * k), np.sin(np.pi / 2 * k)
-            x = c * line[:, 0] - s * line[:, 1]
-            axis.plot(x, line[:, 2], color="#2a6f97", alpha=shade, lw=9, solid_capstyle="round")
-        width = radii[thing] / mm
-        corner = (-width, body[:, 2].min())
-        height = np.ptp(body[:, 2])
-        axis.add_patch(Rectangle(corner, 2 * width, height, color="#e76f51", alpha=0.8))
-        axis.set(aspect="equal", xlim=(-55, 55), ylim=(-170, 15), title=thing, xlabel="[mm]")
+    for axis, name in zip(axes, (*THINGS, "left"), strict=False):
+        model, path, _, (radius, length, *_) = films[name]
+        poses = rod.forward_kinematics(model, path.q[-1], points)
+        for finger, shade in zip(FINGERS, (1.0, 0.4, 1.0, 0.4), strict=True):
+            x, _, z = np.asarray(poses[finger])[:, :3, 3].T / mm
+            axis.plot(x, z, color="#2a6f97", alpha=shade, lw=9, solid_capstyle="round")
+        middle = np.asarray(poses["thing"])[0, :3, 3] / mm
+        corner = middle[[0, 2]] - np.array([radius, length / 2]) / mm
+        box = Rectangle(corner, 2 * radius / mm, length / mm, color="#e76f51", alpha=0.8)
+        axis.add_patch(box)
+        title = "bolt" if name == "left" else name
+        axis.set(aspect="equal", xlim=(-55, 55), ylim=(-170, 15), title=title, xlabel="[mm]")
     for name in ("left", "right"):
         path = films[name][1]
         axes[3].plot(
-            path.time, np.asarray(path.q[:, 4]) / (2 * np.pi), label=f"phase of {name}"
+            path.time, np.asarray(path.q[:, -1]) / (2 * np.pi), label=f"phase of {name}"
         )
     axes[3].set(xlabel="time [s]", ylabel="turns of the bolt")
     axes[3].legend(frameon=False)

@@ -14,7 +14,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 import sorojax as sj
 from sorojax.math.contact_stepper import ContactMidpoint
@@ -27,32 +26,11 @@ FIRST, FROM, TO = [167.0, 28.0], [167.0, 24.0], [45.0, 24.0]  # along the chord,
 APPROACH, SLIDE = 1.0, 3.5  # s
 
 
-class Moving(sj.systems.AbstractReference):
-    """From one point to another within `time` [s], from `begin` on."""
-
-    begin: Array = eqx.field(converter=jnp.asarray)
-    points: Array
-    time: Array = eqx.field(converter=jnp.asarray)
-
-    def __call__(self, t):
-        share = jnp.clip((t - self.begin) / self.time, 0, 1)
-        return self.points[0] + share * (self.points[1] - self.points[0])
-
-
-class Controlled(sj.rod.AbstractForce):
-    """The effort of a controller that sees the coordinates at every instant."""
-
-    law: sj.systems.CartesianImpedance
-
-    def __call__(self, t, motion):
-        return self.law.effort(t, motion.q, motion.v)
-
-
 def on_chord(x):
     """Points of the plane [m] from places along the chord of the wall and off it [mm]."""
     along = (HIGH - LOW) / np.linalg.norm(HIGH - LOW)
     x = np.asarray(x)
-    return (LOW + x[..., :1] * along + x[..., 1:] * [along[1], -along[0]]) * mm
+    return jnp.asarray((LOW + x[..., :1] * along + x[..., 1:] * [along[1], -along[0]]) * mm)
 
 
 def wall():
@@ -84,7 +62,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     @eqx.filter_jit
     def run(q, v, t, target):
         spring = sj.systems.CartesianImpedance(rod, (lossy,), target, STIFFNESS, DAMPING)
-        forces = (lossy, touch, Controlled(spring))
+        forces = (lossy, touch, sj.systems.ControlForce(spring))
         path = sj.rod.rollout(
             rod, q, v, forces, step=SAVED / every, saves=MOMENTS, every=every, t=t,
             stepper=stepper,
@@ -95,62 +73,58 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
             push = (law.pressure(met.gap) * met.weights) @ met.normal
             gap, normal = jax.value_and_grad(solid)(target(t))
             return {
-                "goal": target(t), "foot": target(t) + (HALF - gap) * normal, "push": push,
-                "tip": sj.rod.tip_pose(rod, q)[:2, 2], "overlap": -jnp.min(met.gap),
+                "time": t, "q": q, "goal": target(t), "push": jnp.linalg.norm(push),
+                "foot": target(t) + (HALF - gap) * normal, "overlap": -jnp.min(met.gap),
+                "tip": sj.rod.tip_pose(rod, q)[:2, 2],
                 "effort": jnp.linalg.norm(spring.effort(t, q, v)),
             }  # fmt: skip
 
-        return path, jax.vmap(seen)(path.time, path.q, path.v)
+        return jax.vmap(seen)(path.time, path.q, path.v), path.v[-1]
+
+    def target(switch):
+        """Straight at the wall until `switch` [s], then along it."""
+        way = sj.systems.Waypoints([0.0, APPROACH], [tip, on_chord(FIRST)])
+        places = [tip, way(switch), on_chord(FROM), on_chord(TO)]
+        times = [0.0, switch, switch, switch + SLIDE]
+        return sj.systems.Waypoints(jnp.stack(jnp.asarray(times)), jnp.stack(places))
 
     q, v = jnp.full(6, 0.3), jnp.zeros(6)
-    way = jnp.stack([sj.rod.tip_pose(rod, q)[:2, 2], jnp.asarray(on_chord(FIRST))])
-    path, seen = run(q, v, jnp.zeros(()), Moving(0.0, way, APPROACH))
-    k = int(jnp.argmax(seen["overlap"] > 0))  # where it touches
-    films, switch = [(path, seen)], float(path.time[k])
-    q, v, t = path.q[k], path.v[k], path.time[k]
-    for _ in range(4):
-        path, more = run(q, v, t, Moving(switch, jnp.asarray(on_chord([FROM, TO])), SLIDE))
-        q, v, t = path.q[-1], path.v[-1], path.time[-1]
-        films.append((path, more))
-    time = np.concatenate([films[0][0].time[:k], *(path.time[:-1] for path, _ in films[1:])])
-    film = {
-        name: np.concatenate([seen[name][:k], *(more[name][:-1] for _, more in films[1:])])
-        for name in seen
-    }
+    tip = sj.rod.tip_pose(rod, q)[:2, 2]
+    first, _ = run(q, v, jnp.zeros(()), target(APPROACH))
+    k = int(jnp.argmax(first["overlap"] > 0))  # where it touches
+    switch, films, t = first["time"][k], [], jnp.zeros(())
+    for _ in range(5):
+        part, v = run(q, v, t, target(switch))
+        q, t = part["q"][-1], part["time"][-1]
+        films.append(part)
+    film = jax.tree.map(lambda *parts: np.concatenate([x[:-1] for x in parts]), *films)
     off = np.linalg.norm(film["tip"] - film["foot"], axis=1)
-    push = np.linalg.norm(film["push"], axis=1)
     asked = STIFFNESS * np.linalg.norm(film["goal"] - film["tip"], axis=1)
     if picture is not None:
-        lines = [jax.vmap(lambda q: line(rod, q))(path.q[:-1]) for path, _ in films]
-        lines = np.concatenate([lines[0][:k], *lines[1:]])
-        draw(time, film, push, asked, solid, lines, picture)
+        draw(rod, film, asked, solid, picture)
     # the jump of the set-point at the switch has half a second to die out
-    sliding = (time > switch + 0.5) & (time < switch + SLIDE)
+    sliding = (film["time"] > switch + 0.5) & (film["time"] < switch + SLIDE)
+    jump = film["effort"][k : k + 25].max() / film["effort"][:k].max()
     return {
-        "contact at [s]": switch,
+        "contact at [s]": float(switch),
         "tip off the projected set-point, sliding [mm]": 1e3 * float(off[sliding].max()),
         "the same at the end [mm]": 1e3 * float(off[-1]),
-        "force at the end [N]": float(push[-1]),
+        "force at the end [N]": float(film["push"][-1]),
         "stiffness times offset [N]": float(asked[-1]),
         "overlap, greatest [mm]": 1e3 * float(film["overlap"].max()),
-        "effort at the switch over that before": float(
-            film["effort"][k : k + 25].max() / film["effort"][:k].max()
-        ),
+        "effort at the switch over that before": float(jump),
     }
 
 
-def line(rod, q):
-    """Points of the centre line [m]."""
-    return sj.rod.forward_kinematics(rod, q, jnp.linspace(0, 1, 40))[:, :2, 2]
-
-
-def draw(time, film, push, asked, solid, lines, file) -> None:
+def draw(rod, film, asked, solid, file) -> None:
     """The rod on its way, and the force that it holds the wall with."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
+    time, s = film["time"], jnp.linspace(0, 1, 40)
+    lines = jax.vmap(lambda q: sj.rod.forward_kinematics(rod, q, s)[:, :2, 2])(film["q"])
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.2), width_ratios=(1, 1.2))
     outline = np.asarray(solid.vertices) / mm
     left.fill(-outline[:, 1], outline[:, 0], color="#adb5bd", lw=0)
@@ -161,7 +135,7 @@ def draw(time, film, push, asked, solid, lines, file) -> None:
         left.plot(-film[name][:, 1] / mm, film[name][:, 0] / mm, color=colour, label=name)
     left.set(aspect="equal", xlabel="x [mm]", ylabel="y [mm]", xlim=(-290, 20), ylim=(0, 420))
     left.legend(frameon=False, loc="lower right")
-    right.plot(time, push, color="#012a4a", label="force on the wall")
+    right.plot(time, film["push"], color="#012a4a", label="force on the wall")
     right.plot(time, asked, "--", color="#e76f51", label="stiffness times offset")
     right.set(xlabel="time [s]", ylabel="[N]", ylim=(0, 6))
     right.legend(frameon=False)

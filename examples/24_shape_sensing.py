@@ -11,6 +11,7 @@ the middle grows with them: with Dragon Skin 10 and pushes of 20 mN it was 14 mm
 than without the task. Here it is Dragon Skin 30, with 12 mN at most on each of three bellows.
 """
 
+import functools
 import sys
 import time
 from pathlib import Path
@@ -24,141 +25,98 @@ from sorojax import fem, reduction
 from sorojax.units import kPa, mm
 
 DOWN = [9.81, 0.0]  # m/s^2, along the actuator
-STATIONS = (np.arange(24) + 0.5) / 24
 STEPS = 20  # of the search, per frame
 PUSH = 0.012  # N, greatest, on each of three bellows
 NOISE = 0.1 * mm  # of the marker, per axis
+SHAKEN = ("push_2", "push_4", "push_7")  # the third, fifth and eighth bellow
 
 
-def make_problem(actuator, size, order=2):
-    """The actuator in air, with forces on the backs of its third, fifth and eighth bellow."""
-    mesh = sj.mesh.triangulate(actuator.body(), size=size, order=order)
+def solid(actuator, size):
+    """The actuator in air, with forces on the backs of some bellows."""
+    mesh = sj.mesh.triangulate(actuator.body(), size=size, order=2)
 
-    def back(k):
-        left = actuator.clamp + k * actuator.pitch
-        top = actuator.height - 1e-6
-        return sj.mesh.nodes_where(
-            mesh, lambda p: (p[1] > top) & (p[0] > left) & (p[0] < left + actuator.bellow_width)
-        )
+    def back(name):
+        low = jnp.array([actuator.clamp + int(name[-1]) * actuator.pitch, actuator.height])
+        high = low + jnp.array([actuator.bellow_width, 1e-3])
+        return sj.mesh.nodes_in_box(mesh, low - 1e-6, high + 1e-6)
 
-    zero = [0.0, 0.0]
-    pushes = (fem.Force(back(k), zero, name=f"push_{k}") for k in (2, 4, 7))
     return fem.problem(
-        mesh,
-        sj.material.presets.dragon_skin_30(),
+        mesh, sj.material.presets.dragon_skin_30(),
         kinematics=fem.PlaneStrain(thickness=20 * mm),
         supports=(fem.Fixed(sj.mesh.nodes_where(mesh, lambda p: p[0] < 1e-9)),),
         loads=(
             fem.Pressure(sj.mesh.facets_on(mesh, actuator.chambers()), name="air"),
-            fem.Gravity(zero),
-            *pushes,
+            fem.Gravity([0.0, 0.0]),
+            *(fem.Force(back(name), [0.0, 0.0], name=name) for name in SHAKEN),
         ),
-    )
+    )  # fmt: skip
 
 
-def make_rod(path, hanging, line):
-    """A rod of three bending modes and a stretch, as pressure and weight teach it."""
-    shapes = jnp.concatenate([path.displacements, hanging])
-    both = sj.replace(path, lambda x: x.displacements, shapes)
-    modes = {"kappa_z": 3, "sigma_x": 1}
-    basis = reduction.pod_basis(reduction.strain_along(both, line), modes=modes)
-    backbone = reduction.strain_along(path, line)
-    fit = reduction.identify(path, basis, backbone, line, degree=3)
-    rubber = sj.rod.elastic(path.problem.material)
-    return sj.rod.rod(sj.SE2(), basis, fit.section, rubber, length=fit.length), fit
-
-
-class Weight(sj.rod.AbstractForce):
-    """Weight [N] per station of an actuator whose mass lies `arm` [m] beside its line."""
-
-    load: np.ndarray
-    arm: float
-
-    def __call__(self, t, motion):
-        at = sj.rod.points(motion, STATIONS)
-        aside = self.arm * at.directors[:, :, 1]
-        load = jnp.broadcast_to(jnp.asarray(self.load), aside.shape)
-        return at.generalised(load, aside[:, :1] * load[:, 1:] - aside[:, 1:] * load[:, :1])
-
-
-def weight(problem, line):
-    """The weight of the solid about its line."""
-    shares = np.asarray(fem.lumped_mass(problem))[1::2]
-    height = shares @ np.asarray(problem.mesh.points)[:, 1] / shares.sum()
-    return Weight(shares.sum() / len(STATIONS) * np.array(DOWN), height - float(line.start[1]))
-
-
-def loaded(problem, pressure, pushes):
-    """The problem with a pressure [Pa], its weight, and three forces [N] on its backs."""
-    along = jnp.stack([jnp.zeros(3), pushes], axis=1)
-    values = [pressure, jnp.array(DOWN), *along]
-    return sj.replace(problem, lambda p: [load.value for load in p.loads], values)
+def hanging(problem, pressure, pushes=np.zeros(3), start=None):  # noqa: B008
+    """Displacement under a pressure [Pa], the weight, and forces [N] on the backs."""
+    values = [pressure, jnp.array(DOWN), *np.stack([0 * pushes, pushes], axis=1)]
+    loaded = sj.replace(problem, lambda p: [load.value for load in p.loads], values)
+    return fem.solve(loaded, start=start).displacement
 
 
 def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, float]:
     actuator = sj.robots.BellowsActuator(num_bellows=9)
-    problem = make_problem(actuator, (2.0 if quick else 1.2) * mm)
+    problem = solid(actuator, (2.0 if quick else 1.2) * mm)
     path = fem.solve_path(problem, air=jnp.linspace(0, 6 * kPa, 6))
     line = reduction.Line([0.0, 1 * mm], [actuator.length, 1 * mm])
-    still = jnp.zeros(3)
-    hanging = [fem.solve(loaded(problem, p, still)).displacement for p in path.values[::5]]
-    rod, fit = make_rod(path, jnp.stack(hanging), line)
+
+    def backbones(shapes):
+        seen = sj.replace(path, lambda x: x.displacements, jnp.stack(shapes))
+        return reduction.strain_along(seen, line)
+
+    # A rod of three bending modes and a stretch, as pressure and weight teach it.
+    taught = backbones([*path.displacements, *(hanging(problem, p) for p in path.values[::5])])
+    basis = reduction.pod_basis(taught, modes={"kappa_z": 3, "sigma_x": 1})
+    fit = reduction.identify(path, basis, reduction.strain_along(path, line), line, degree=3)
+    rubber = sj.rod.elastic(problem.material)
+    rod = sj.rod.rod(sj.SE2(), basis, fit.section, rubber, length=fit.length)
 
     random, frames = np.random.default_rng(1), 24 if quick else 60
     pressure = 6 * kPa * np.clip(np.sin(np.linspace(0, 2 * np.pi, frames)), 0, 1)
     pushes = PUSH * random.uniform(-1, 1, (frames, 3))
     pushes[: frames // 6] = 0.0
-    u, seen = jnp.zeros_like(problem.mesh.points), []
+    shapes = [jnp.zeros_like(problem.mesh.points)]
     for p, f in zip(pressure, pushes, strict=True):
-        u = fem.solve(loaded(problem, jnp.asarray(p), jnp.asarray(f)), start=u).displacement
-        seen.append(u)
-    truth = reduction.strain_along(
-        sj.replace(path, lambda x: x.displacements, jnp.stack(seen)), line
-    )
-
+        shapes.append(hanging(problem, p, f, shapes[-1]))
+    truth = backbones(shapes[1:])
     true = np.asarray(truth.positions)
     tip = true[:, -1] + NOISE * random.standard_normal((frames, 2))
-    heavy = weight(problem, line)
+    heavy = reduction.offset_weight(problem, line, DOWN)
 
-    @jax.jit
-    def balanced(q, tip, pressure):
+    @functools.partial(jax.jit, static_argnums=0)
+    def estimate(balanced, q, tip, pressure):
         forces = (fit.elastic, heavy, sj.rod.Pressurised(fit.pressure, pressure))
-        target = sj.rod.Position(tip)
-        return sj.rod.inverse_kinematics(rod, target, q, forces=forces, iterations=STEPS).q
+        target, given = sj.rod.Position(tip), {"forces": forces} if balanced else {}
+        q = sj.rod.inverse_kinematics(rod, target, q, iterations=STEPS, **given).q
+        return q, sj.rod.forward_kinematics(rod, q, truth.s)[:, :2, 2]
 
-    @jax.jit
-    def alone(q, tip, pressure):
-        return sj.rod.inverse_kinematics(rod, sj.rod.Position(tip), q, iterations=STEPS).q
-
-    places = jax.jit(lambda q: sj.rod.forward_kinematics(rod, q, truth.s)[:, :2, 2])
-    lines, off = {}, {}
-    for estimate in (balanced, alone):
+    lines, spent = [], []
+    for balanced in (True, False):
         q, told = jnp.zeros(rod.basis.num_dof), []
         for x, p in zip(tip, pressure, strict=True):
-            q = estimate(q, x, p)
-            told.append(np.asarray(places(q)))
-        lines[estimate] = np.stack(told)
-        off[estimate] = np.linalg.norm(lines[estimate] - true, axis=2) / mm
-    spent = [seconds(balanced, q, tip[0], pressure[0]) for _ in range(300)]
+            begin = time.perf_counter()
+            q, shape = jax.block_until_ready(estimate(balanced, q, x, p))
+            spent.append(time.perf_counter() - begin)
+            told.append(np.asarray(shape))
+        lines.append(np.stack(told))
+    off = np.linalg.norm(np.stack(lines) - true, axis=3) / mm
     if picture is not None:
-        draw(true, tip, lines[balanced], lines[alone], off[balanced], off[alone], picture)
+        draw(true, tip, *lines, *off, picture)
     middle = len(truth.s) // 2
     return {
-        "largest error of the tip [mm]": float(off[balanced][:, -1].max()),
-        "largest error of the middle [mm]": float(off[balanced][:, middle].max()),
-        "of the middle without the null-space task [mm]": float(off[alone][:, middle].max()),
-        "mean of the middle [mm]": float(off[balanced][:, middle].mean()),
-        "mean of the middle without [mm]": float(off[alone][:, middle].mean()),
+        "largest error of the tip [mm]": float(off[0, :, -1].max()),
+        "largest error of the middle [mm]": float(off[0, :, middle].max()),
+        "of the middle without the null-space task [mm]": float(off[1, :, middle].max()),
+        "mean of the middle [mm]": float(off[0, :, middle].mean()),
+        "mean of the middle without [mm]": float(off[1, :, middle].mean()),
         "way of the tip [mm]": float(np.ptp(true[:, -1, 1]) / mm),
-        "estimates a second": 1 / min(spent),
+        "estimates a second": 1 / min(spent[:frames]),
     }
-
-
-def seconds(function, *arguments) -> float:
-    """Time of one call."""
-    begin = time.perf_counter()
-    function(*arguments).block_until_ready()
-    return time.perf_counter() - begin
 
 
 def draw(true, tip, balanced, alone, with_task, without, file) -> None:

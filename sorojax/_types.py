@@ -18,7 +18,10 @@ def real(value: Any) -> jax.Array:
     """
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         dtype = value.dtype
-        if not jnp.issubdtype(dtype, jnp.floating):
+        floating = jnp.issubdtype(dtype, jnp.floating)
+        if floating and isinstance(value, jax.Array) and not value.weak_type:
+            return value  # a conversion of a traced value costs a derivative
+        if not floating:
             dtype = jnp.result_type(float)
         return jnp.asarray(value, dtype=dtype)
     if isinstance(value, list | tuple) and any(

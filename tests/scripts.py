@@ -1,5 +1,6 @@
 """The scripts of `examples`, as functions."""
 
+import ast
 import importlib.util
 from collections.abc import Callable
 from pathlib import Path
@@ -15,3 +16,28 @@ def main_of(name: str) -> Callable[..., dict[str, Any]]:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module.main
+
+
+def user_code(name: str) -> int:
+    """Lines of an example that a user has to write: all but imports, docstrings, comments,
+    blank lines, the picture and the command line."""
+    text = (ROOT / "examples" / f"{name}.py").read_text()
+    tree, left_out = ast.parse(text), set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.FunctionDef | ast.ClassDef):
+            first = node.body[0]
+            if ast.get_docstring(node) is not None:
+                left_out |= _lines(first)
+    for node in tree.body:
+        is_picture = isinstance(node, ast.FunctionDef) and node.name in ("draw", "plot")
+        is_command = isinstance(node, ast.If) and "__name__" in ast.dump(node.test)
+        if is_picture or is_command or isinstance(node, ast.Import | ast.ImportFrom):
+            left_out |= _lines(node)
+    return sum(
+        bool(line.strip()) and not line.strip().startswith("#") and number not in left_out
+        for number, line in enumerate(text.splitlines(), 1)
+    )
+
+
+def _lines(node: Any) -> set[int]:
+    return set(range(node.lineno, node.end_lineno + 1))

@@ -9,10 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import design, fem, material, mesh
+from sorojax import design, fem, material, mesh, view
 from sorojax._progress import silent
+from sorojax.design.settle import settled
 from sorojax.design.subproblem import Approximation, solve_dual, solve_primal_dual
+from sorojax.fem.energy_form import load_force
+from sorojax.fem.linear import add_load_stiffness, prepare
 from sorojax.material.kinematics import from_matrix
+from sorojax.math import sparse
 from sorojax.mesh.mesh import Mesh, boundary_facets
 
 RUBBER = material.neo_hookean(young_modulus=1.0, poisson_ratio=0.4)
@@ -236,25 +240,20 @@ def test_the_stiffness_of_a_pressure_in_void(element, kinematics):
         grid, RUBBER, kinematics=kinematics, supports=(), loads=(load,), free=True,
         formulation=fem.Displacement(),
     )  # fmt: skip
-    bare = dataclasses.replace(made, loads=())
     u = 0.1 * jnp.sin(3 * grid.points)
     way = jnp.cos(2 * grid.points)
+    system, none = made.space.system, jnp.zeros(made.space.system.num_values)
+    prepared = prepare(made)
 
-    def stiffness(problem):
-        from sorojax.fem.linear import linearise, prepare
-        from sorojax.math import sparse
-
-        values = linearise(problem, prepare(problem), u, u).values
-        return sparse.product(problem.space.system, values, way.ravel())
-
-    def force(problem, u):
-        return fem.residual(problem, u).ravel()
+    @jax.jit
+    def stiffness(u):
+        values = add_load_stiffness(made, prepared, u, none)
+        return sparse.product(system, values, way.ravel())
 
     h = 1e-5
-    both = [(force(made, u + s * h * way) - force(bare, u + s * h * way)) for s in (1, -1)]
-    want = (both[0] - both[1]) / (2 * h)
-    assert np.allclose(stiffness(made) - stiffness(bare), want, atol=1e-8)
-    assert np.abs(want).max() > 1e-2
+    ahead, behind = (-load_force(made, u + s * h * way).ravel() for s in (1, -1))
+    want = (ahead - behind) / (2 * h)
+    assert np.allclose(stiffness(u), want, atol=1e-8) and np.abs(want).max() > 1e-2
 
 
 def test_flood_fills_what_the_source_reaches(plans):
@@ -312,16 +311,35 @@ def test_layouts_are_symmetric_and_keep_their_passive_cells():
         design.layout(GRID, solid=[3], void=[3])
 
 
-def test_a_periodic_filter_sees_across_the_ends():
-    smooth = design.cone_filter(GRID, 1.5, periods=(12.0, None))
-    corner = int(np.argmin(np.linalg.norm(CENTRES - [0.5, 2.5], axis=1)))
-    out = np.asarray(smooth(jnp.zeros(72).at[corner].set(1.0)))
-    other = int(np.argmin(np.linalg.norm(CENTRES - [11.5, 2.5], axis=1)))
-    inner = int(np.argmin(np.linalg.norm(CENTRES - [1.5, 2.5], axis=1)))
-    assert out[other] == pytest.approx(out[inner]) and out[other] > 0
-    assert np.allclose(smooth(jnp.full(72, 0.3)), 0.3, rtol=1e-12)
-    with pytest.raises(ValueError, match="cone_filter: got periods"):
-        design.cone_filter(GRID, 1.5, periods=(6.0, None))
+@pytest.mark.parametrize("make", [design.cone_filter, design.helmholtz_filter])
+def test_a_periodic_filter_knows_no_ends(make):
+    """What is moved along comes out moved along, across the ends too."""
+    smooth = make(GRID, 1.5, periods=(12.0, None))
+    place = CENTRES[:, 0].astype(int) + 12 * CENTRES[:, 1].astype(int)
+    density = np.random.default_rng(0).uniform(size=(6, 12))
+
+    def smoothed(rows):
+        out = np.empty(72)
+        out[place] = smooth(jnp.asarray(rows.ravel()[place]))
+        return out.reshape(6, 12)
+
+    whole = smoothed(density)
+    for shift in (1, 5):
+        assert np.allclose(smoothed(np.roll(density, shift, 1)), np.roll(whole, shift, 1))
+    assert np.allclose(smoothed(np.full((6, 12), 0.3)), 0.3, rtol=1e-12)
+    assert not np.allclose(smoothed(np.roll(density, 1, 0)), np.roll(whole, 1, 0), atol=1e-2)
+    with pytest.raises(ValueError, match=f"{make.__name__}: got periods"):
+        make(GRID, 1.5, periods=(6.0, None))
+
+
+def test_a_helmholtz_filter_repeats_meshes_whose_ends_match():
+    both = design.helmholtz_filter(GRID, 1.5, periods=(12.0, 6.0))
+    assert both.system.size == 72
+    with pytest.raises(ValueError, match="do not repeat after 13 m along axis 0"):
+        design.helmholtz_filter(GRID, 1.5, periods=(13.0, None))
+    row = mesh.rectangle([0, 0], [1.0, 3.0], divisions=(1, 3), element=mesh.Quad4())
+    with pytest.raises(ValueError, match="at least two cells"):
+        design.helmholtz_filter(row, 1.5, periods=(1.0, None))
 
 
 @pytest.mark.parametrize("right", [0.5, 3.0, -2.0])
@@ -342,7 +360,7 @@ def test_a_follower_starts_from_the_last_design_and_history_keeps_the_designs():
     made = body(1e-3)
     follow = design.Follower()
     plan = design.layout(GRID, radius=1.5)
-    history = design.History(lambda step: plan(step.design), every=2)
+    history = design.History(lambda step: plan(step.design), every=2, mesh=GRID)
 
     def loss(x):
         graded = design.graded(made, design.Simp(3.0, 1e-6)(plan(x)))
@@ -355,6 +373,36 @@ def test_a_follower_starts_from_the_last_design_and_history_keeps_the_designs():
         )  # fmt: skip
     assert np.all(np.diff(found.history["objective"]) < 0)
     assert history.densities.shape == (2, 72) and history.steps == [1, 3]
+    assert len(view.show(history).panels) == 2
+    film = list(view.animate(history, fps=2.0, speed=1.0, size=(160, 120), stamp=False))
+    assert len(film) >= 2 and np.any(np.asarray(film[0]) != np.asarray(film[-1]))
+    with pytest.raises(ValueError, match="got no mesh"):
+        view.show(design.History(lambda step: step.design))
     again = eqx.filter_jit(lambda x: plan(x))(found.design)
     fresh = fem.solve(design.graded(made, design.Simp(3.0, 1e-6)(again)))
     assert follow.last is not None and np.allclose(follow.last, fresh.displacement, atol=1e-8)
+
+
+def arch(force):
+    """A shallow arch of the cells of `GRID`, pushed down in its middle."""
+    x, y = GRID.points.T
+    points = jnp.stack([x, 0.08 * (y - 3) + jnp.sin(jnp.pi * x / 12)], axis=1)
+    top = jnp.array([mesh.nearest_node(GRID, [6.0, 6.0])])
+    held = tuple(fem.Fixed(GRID.node_sets[side]) for side in ("left", "right"))
+    made = eqx.tree_at(lambda p: p.mesh.points, body(force), points)
+    made = eqx.tree_at(lambda p: p.loads[0].nodes, made, top)
+    return dataclasses.replace(made, supports=held), int(top[0])
+
+
+def test_a_body_that_has_buckled_falls_into_a_stable_state():
+    """Newton's method along the load jumps over the snap; downhill is the same state."""
+    made, top = arch(5e-3)
+    want = fem.solve(made, steps=4).displacement
+    assert float(want[top, 1]) < -1.5
+    before = fem.solve(arch(2e-3)[0]).displacement
+    u, stable = settled(made, before)
+    assert stable and np.allclose(u, want, atol=1e-5)
+    follow = design.Follower(newton=fem.Newton(max_iterations=4), max_cuts=0)
+    follow.last = np.asarray(before)
+    assert np.allclose(follow(made).displacement, want, atol=1e-7)
+    assert not settled(made, before, steps=2)[1]

@@ -7,6 +7,7 @@ import pytest
 from sorojax import fem, mesh, robots, sdf
 from sorojax.robots.crawler import PORTS, crawler_mesh
 from sorojax.units import kPa, mm
+from tests.scripts import main_of
 
 
 def test_the_mesh_of_the_crawler_is_its_drawing():
@@ -16,6 +17,8 @@ def test_the_mesh_of_the_crawler_is_its_drawing():
     assert float(jnp.sum(mesh.cell_areas(cells))) == pytest.approx(drawn, rel=1e-4)
     sole = float(jnp.sum(mesh.cell_areas(cells)[cells.regions["sole"]]))
     assert sole == pytest.approx(150 * mm * 2 * mm, rel=1e-9)
+    halved = crawler_mesh(crawler, 1.5 * mm, across=2)
+    assert halved.num_cells == 4 * cells.num_cells
     problem = robots.crawler_problem(crawler, size=3 * mm, depth=1.0)
     air = 9 * 3.22 * mm * 8.4 * mm
     zero = jnp.zeros_like(cells.points)
@@ -60,3 +63,14 @@ def test_the_walker_stands_on_all_its_feet():
     assert float(cells.points[:, 1].min()) == pytest.approx(0.0, abs=1e-3 * mm)
     assert np.allclose(robots.pair_angles(walker, cells, zero[None]), np.pi / 2, atol=0.1)
     assert float(problem.loads[0].value[0]) == pytest.approx(9.81 / 2)
+
+
+def test_the_walker_finds_one_rhythm_for_its_legs():
+    numbers = main_of("20_passive_walker")(quick=True)
+    assert 19 < numbers["frequency of the gait [Hz]"] < 23
+    assert numbers["frequencies apart [Hz]"] < 1.5  # a record of 0.2 s tells no more
+    assert numbers["a period like the one before"] > 0.9
+    assert numbers["swing of the legs [deg]"] > 3
+    assert numbers["step of the front foot [mm]"] > 1
+    assert numbers["slip back of the front foot [mm]"] < 0.5
+    assert numbers["cut steps"] == 0

@@ -2,7 +2,27 @@
 
 import pytest
 
-from tests.scripts import main_of
+from tests.scripts import ROOT, main_of, user_code
+
+LONGEST = 60  # lines of user code
+LONGER = {
+    # a scene of robot, cylinder and contacts, a board, a controller and a taught path
+    "16_pick_and_place": 104,
+    "03_bench_on_a_desk": 83,
+    "13_pneunet_basis": 67,
+    "20_passive_walker": 80,
+    "21_pneunet_topology": 64,
+    "22_gripper": 77,
+    "23_impedance": 78,
+    "24_shape_sensing": 77,
+}
+
+
+def test_examples_are_short():
+    names = sorted(path.stem for path in (ROOT / "examples").glob("[0-9]*.py"))
+    lengths = {name: user_code(name) for name in names}
+    assert len(lengths) > 10 and min(lengths.values()) > 10
+    assert {n: k for n, k in lengths.items() if k > LONGER.get(n, LONGEST)} == {}
 
 
 def test_shapes_are_cut_and_fit_to_print():
@@ -66,3 +86,33 @@ def test_the_fingers_of_a_hand_follow_each_other():
     assert 90 < numbers["swing of the tip [deg]"] < 160
     assert 80 < numbers["highest pressure [kPa]"] < 95
     assert 2 < numbers["flow that fills the growing finger [%]"] < 20
+
+
+def test_a_gripper_carries_a_cylinder_to_its_place():
+    numbers = main_of("16_pick_and_place")(quick=True)
+    assert numbers["lift [mm]"] > 8
+    assert numbers["contact forces over weight, carried"] == pytest.approx(1, abs=0.01)
+    assert numbers["moved in the grip [mm]"] < 0.5
+    assert numbers["place off its target [mm]"] < 2
+    assert numbers["tilt at the end [deg]"] < 0.1 and numbers["farthest tilt [deg]"] > 10
+    assert numbers["speed at the end [mm/s]"] < 0.1
+    assert 0 < numbers["overlap with fingers, greatest [mm]"] < 0.1
+    assert 0 < numbers["overlap with the floor, greatest [mm]"] < 0.1
+    assert numbers["gripper lets go [mm]"] > 0.5
+
+
+def test_a_chamber_that_nobody_drew_is_a_drop_and_bends():
+    numbers = main_of("21_pneunet_topology")(quick=True)
+    assert (
+        numbers["output of the cell [mm]"] > 1.5 * numbers["output of the cell at first [mm]"]
+    )
+    assert numbers["volume over the largest allowed"] == pytest.approx(1, abs=0.02)
+    assert numbers["grey measure"] < 0.05
+    assert numbers["widest part of the chamber, share of its height"] < 0.5
+    assert numbers["width of the lower third over that of the upper"] > 1.2
+    assert numbers["finer mesh off the first [mm]"] < 2
+    assert numbers["tip moves by [mm]"] > 3
+    assert numbers["turn grows with pressure"] and numbers["watertight"]
+    assert numbers["volume of the triangles over that of the body"] == pytest.approx(
+        1, abs=0.02
+    )

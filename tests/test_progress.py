@@ -6,10 +6,11 @@ import sys
 import time
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import _progress, listen, mesh, sdf, silent
+from sorojax import SE2, _progress, listen, mesh, rod, sdf, silent, systems
 from sorojax._progress import Notebook, Progress, Terminal, Watch, report
 
 
@@ -156,4 +157,70 @@ def test_meshing_tells_how_far_it_is():
     mine = [p for p in told if p.label == "tetrahedralise"]
     assert len(mine) > 2 and "moved" in mine[0].numbers
     steps = np.diff([p.done for p in mine])
-    assert np.all((steps == 1) | (steps < 0))  # a second series starts anew
+    ended = np.array([p.fraction == 1.0 for p in mine])
+    assert np.all((steps == 1) | (steps < 0) | ended[1:])  # a second series starts anew
+    assert ended[-1]
+
+
+FINGER = rod.rod(
+    SE2(), rod.chebyshev(kappa_z=1), rod.circle(0.01), length=0.1, young_modulus=1e5,
+    poisson_ratio=0.4, density=1e3, nodes=4,
+)  # fmt: skip
+
+
+def swing(q, progress):
+    return rod.rollout(FINGER, q, jnp.zeros(1), step=1e-3, saves=250, progress=progress).q
+
+
+@pytest.mark.parametrize("lanes", [0, 3])
+def test_a_rollout_tells_about_a_hundred_times_also_of_many_rods(lanes):
+    told, start = [], jnp.full((lanes, 1) if lanes else 1, 2.0)
+    go = jax.vmap(swing, (0, None)) if lanes else swing
+    with listen(told.append):
+        loud = jax.block_until_ready(go(start, True))
+        jax.effects_barrier()
+    quiet = go(start, False)
+    assert jnp.array_equal(loud, quiet)
+    assert {p.label for p in told} == {"rollout"} and told[-1].fraction == 1.0
+    shares = [p.fraction for p in told]
+    assert shares == sorted(shares) and 100 <= len(shares) <= 130
+
+
+def lag_to_one(pace):
+    return systems.Network({"lag": systems.Lag(pace)}, {}, ("lag.a",))
+
+
+def batch(paces, progress):
+    return systems.simulate_batch(
+        lag_to_one, paces, 1.0, inputs={"lag.a": 1.0}, save=3, cheap_steps=100,
+        progress=progress,
+    )  # fmt: skip
+
+
+def test_a_batch_tells_its_mean_and_who_ran_again():
+    told, paces = [], jnp.array([0.1, 0.2, 1e-5, 0.3])  # the third is stiff
+    with listen(told.append):
+        loud = jax.block_until_ready(batch(paces, True))
+        jax.effects_barrier()
+    assert loud.stats["stiff"].tolist() == [False, False, True, False]
+    first = [p.fraction for p in told if p.label == "batch"]
+    assert len(first) > 3 and first == sorted(first) and first[-1] > 0.7
+    again = [p.fraction for p in told if p.label == "stiff members"]
+    assert again == [0.75, 1.0]
+    quiet = batch(paces, False)
+    assert jnp.array_equal(loud["lag.value"], quiet["lag.value"])
+
+
+@pytest.mark.parametrize("call", [lambda p: swing(jnp.ones(1), p), lambda p: batch(
+    jnp.array([0.1, 0.2]), p)])  # fmt: skip
+def test_a_compiled_run_without_progress_has_no_callback(call):
+    silent_one, loud = (str(jax.make_jaxpr(lambda p=p: call(p))()) for p in (False, True))
+    assert "debug_callback" not in silent_one and "debug_callback" in loud
+
+
+def test_surfaces_tell_how_far_they_are():
+    told = []
+    with listen(told.append):
+        sdf.isosurface(sdf.Sphere([0.0, 0.0, 0.0], 1.0), 0.009)
+    mine = [p for p in told if p.label == "isosurface"]
+    assert mine[-1].fraction == 1.0 and len(mine) >= 2

@@ -70,6 +70,21 @@ def test_air_of_the_bending_actuator_is_a_wall_away_from_the_outside(wall, getke
     assert wall * mm - 1e-12 < deep.min() < 1.02 * wall * mm
 
 
+def test_triangles_of_one_plane_do_not_cross():
+    """Two of the side of a finger as a file rounds them; and one that does pass through."""
+    points = np.array([
+        [-0.03869514, 0.111315, -0.000685], [-0.03872134, 0.111815, -0.000685],
+        [-0.03877133, 0.111815, -0.000185], [-0.03866893, 0.110815, -0.000685],
+        [-0.03874512, 0.111315, -0.000185], [-0.03871892, 0.110815, -0.000185],
+    ], np.float32).astype(float)  # fmt: skip
+    both = np.array([[0, 1, 2], [3, 4, 5]])
+    assert len(sdf.surface_report(sdf.Surface(points, both)).crossings) == 0
+    away = np.array([[-1e-4, 0, 0], [1e-4, 1e-5, 0], [1e-4, 0, 1e-5]])
+    through = points[:3].mean(axis=0) + away
+    crossed = sdf.Surface(np.concatenate([points[:3], through]), both)
+    assert sdf.surface_report(crossed).crossings.tolist() == [[0, 1]]
+
+
 def test_bellows_wall():
     part = robots.Bellows()
     z = part.cap + part.pitch * jnp.array([0.5, 1.5, 2.5])

@@ -1,8 +1,14 @@
 """Rods of the printable robots: their cells in closed form, their places, their board."""
 
+import functools
+
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.polynomial import Polynomial
+from scipy.optimize import minimize_scalar
 
 from sorojax import material, robots, rod as R, sdf
 from sorojax.math.lie import SE2, SE3
@@ -28,15 +34,22 @@ def quick(monkeypatch):
     monkeypatch.setattr(models_cells, "unit_cell", lambda *_, **__: CELL)
 
 
-def test_the_cell_of_a_tube_is_that_of_lame():
-    inner, outer, young, ratio = 5 * mm, 8 * mm, 1e6, 0.45
+@pytest.fixture(scope="module")
+def tube():
+    """A tube of rubber, its cell, the areas of wall and hole."""
+    inner, outer = 5 * mm, 8 * mm
     air = LaidAlong(sdf.Cylinder(inner, 100 * mm), 0)
-    tube = LaidAlong(sdf.Cylinder(outer, 100 * mm), 0) - air
-    rubber = material.neo_hookean(young_modulus=young, poisson_ratio=ratio)
+    body = LaidAlong(sdf.Cylinder(outer, 100 * mm), 0) - air
+    rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45)
     cell = robots.unit_cell(
-        tube, air, (0.0, 6 * mm), rubber, size=1.5 * mm, mirrors=(1, 2)
+        body, air, (0.0, 6 * mm), rubber, size=1.5 * mm, mirrors=(1, 2)
     )  # fmt: skip
-    area, hole = np.pi * (outer**2 - inner**2), np.pi * inner**2
+    return rubber, cell, np.pi * (outer**2 - inner**2), np.pi * inner**2
+
+
+def test_the_cell_of_a_tube_is_that_of_lame(tube):
+    inner, outer, young, ratio = 5 * mm, 8 * mm, 1e6, 0.45
+    _, cell, area, hole = tube
     moment = np.pi / 4 * (outer**4 - inner**4)
     want = young * np.array([area, moment, moment])
     assert np.allclose(np.diag(cell.stiffness), want, rtol=1e-3)
@@ -52,6 +65,53 @@ def test_the_cell_of_a_tube_is_that_of_lame():
     assert cell.gas == pytest.approx(hole, rel=1e-3)
     assert cell.solid == pytest.approx(area, rel=1e-3)
     assert np.allclose(cell.second_moments, moment, rtol=1e-3)
+
+
+def test_the_tube_at_large_strains_is_that_of_a_uniform_stretch(tube):
+    """Derivatives in the stretch of force and volume, the wall as wide as it wants to be."""
+    rubber, cell, area, hole = tube
+    shear, bulk = (float(m) for m in material.small_strain_moduli(rubber))
+
+    def energy(e, wide):
+        J = (1 + e) * wide**2
+        first = J ** (-2 / 3) * ((1 + e) ** 2 + 2 * wide**2)
+        return shear / 2 * (first - 3) + bulk / 2 * (J - 1) ** 2
+
+    e = 0.1 * np.cos(np.linspace(0, np.pi, 13))
+    wide = np.array([minimize_scalar(functools.partial(energy, x), (0.9, 1.1), tol=1e-13).x
+                     for x in e])  # fmt: skip
+
+    def derivatives(values):
+        fit = Polynomial.fit(e, values, 12)
+        return [float(fit.deriv(k)(0.0)) for k in range(5)]
+
+    stored = derivatives(area * energy(e, wide))
+    volume = derivatives(hole * (1 + e) * wide**2)
+    assert float(cell.third[0]) == pytest.approx(stored[3], rel=2e-3)
+    assert float(cell.fourth[0]) == pytest.approx(stored[4], rel=2e-3)
+    assert float(cell.third[1]) == pytest.approx(-volume[2], rel=5e-3)
+    assert float(cell.fourth[1]) == pytest.approx(-volume[3], rel=2e-2)
+
+
+def test_what_columns_store_beyond_linear_answers():
+    """Force and volume of a rod of one column, from one energy."""
+    third, fourth = [4e3, 5e-5, -2e-10, -2e-16], [2e4, 2e-4, -2e-10, 3e-16, -1e-21]
+    cell = eqx.tree_at(lambda c: (c.third, c.fourth), CELL,
+                       (jnp.array(third), jnp.array(fourth)))  # fmt: skip
+    one = side_by_side(cell, jnp.zeros((1, 2)), 0.08)
+    made = body(SE2(), R.constant("sigma_x"), one, 0.08, RUBBER, damping=0.0, single=False)
+    e, p = 0.02, 40 * kPa
+    push, volume = jax.jit(jax.grad(made.chambers.coenergy, argnums=(0, 1)))(
+        jnp.array([e]), jnp.array([p])
+    )
+    a, b, c, d = third
+    f, g, h, k, m = fourth
+    force = 1.2e-4 * p - (a * e**2 + 2 * b * e * p + c * p**2) / 2
+    force -= (f * e**3 + 3 * g * e**2 * p + 3 * h * e * p**2 + k * p**3) / 6
+    room = 1e-4 + 1.2e-4 * e + 1e-9 * p - (b * e**2 + 2 * c * e * p + d * p**2) / 2
+    room -= (g * e**3 + 3 * h * e**2 * p + 3 * k * e * p**2 + m * p**3) / 6
+    assert float(push[0]) == pytest.approx(0.08 * force, rel=1e-9)
+    assert float(volume[0]) == pytest.approx(0.08 * room, rel=1e-9)
 
 
 @pytest.mark.parametrize("group", [SE2(), SE3()])
@@ -93,7 +153,7 @@ def test_fingers_stand_where_they_are_drawn(quick):
     made = robots.model(hand)
     assert made.ports == ("thumb", "index", "middle", "ring", "little")
     assert np.allclose(made.high, 60 * kPa) and np.allclose(made.low, -10 * kPa)
-    skin, tips = hand.fingers(), {}
+    feet, ends, tips = [], [], {}
     for name in made.ports:
         part = made.assembly[name]
         place = part.offset @ jnp.stack([part.body.length, *jnp.zeros(2), jnp.ones(())])
@@ -101,8 +161,11 @@ def test_fingers_stand_where_they_are_drawn(quick):
         finger = hand.thumb if name == "thumb" else hand.finger
         end = place[:3] + along * (finger.bellows.cap + finger.tip_radius)
         # the axis lies off the middle of the finger, towards its spine
-        assert abs(float(skin(end - up * CELL.center[0]))) < 1e-6 and float(skin(place[:3])) < 0
+        ends.append(end - up * CELL.center[0])
+        feet.append(place[:3])
         tips[name] = place[0]
+    skin = np.asarray(sdf.evaluate(hand.fingers(), jnp.stack(ends + feet)))
+    assert np.max(np.abs(skin[:5])) < 1e-6 and np.max(skin[5:]) < 0
     x = [float(tips[name]) for name in made.ports]
     assert x == sorted(x, reverse=True)
 

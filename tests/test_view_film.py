@@ -7,12 +7,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import _progress, fem, io as files, material, mesh as M, rod as R, sdf, view
+from sorojax import (
+    _progress,
+    fem,
+    io as files,
+    material,
+    mesh as M,
+    rod as R,
+    sdf,
+    systems,
+    view,
+)  # fmt: skip
 from sorojax.cli.main import main
-from sorojax.math.lie import SE3
+from sorojax.math.lie import SE2, SE3
 from sorojax.math.status import Status
 from sorojax.view.scene import Surface
-from sorojax.view.tracks import positions_track
+from sorojax.view.tracks import positions_track, track_of
 
 LENGTH = 0.06
 
@@ -207,3 +217,44 @@ def test_the_command_shows_files(tmp_path, path, monkeypatch, capsys):
     assert "holds no time" in capsys.readouterr().err
     (tmp_path / "bad.pvd").write_text("<VTKFile>")
     assert main(["show", str(tmp_path / "bad.pvd")]) == 2
+
+
+def swung(rod, qs):
+    """A trajectory of a network with that rod, as `simulate` returns it."""
+    body = systems.Network({"body": systems.RodBody(rod)}, {})
+    time = jnp.linspace(0.0, 1.0, len(qs))
+    stats = {"steps": jnp.asarray(1), "rejected": jnp.asarray(0), "reached": time[-1]}
+    state = {"body": {"q": jnp.asarray(qs), "v": 0 * jnp.asarray(qs)}}
+    return body, systems.Trajectory(time, state, {}, Status.successful, stats)
+
+
+@pytest.mark.parametrize("drawn", ["mesh", "shape"])
+def test_a_trajectory_carries_a_skin(beam, drawn):
+    """The skin starts where the rod does, lies along it, and bends to its curvature."""
+    rod = R.rod(SE2(), R.chebyshev(kappa_z=1), R.rectangle(0.01, 0.02), length=LENGTH,
+                young_modulus=1e5, poisson_ratio=0.4, density=1e3)  # fmt: skip
+    kappa = np.pi / 2 / LENGTH
+    network, film = swung(rod, [[0.0], [kappa / 2], [kappa]])
+    skin = beam if drawn == "mesh" else sdf.Rectangle([0.0, -0.005], [LENGTH, 0.005])
+    made = track_of(film, network=network, skin=skin)
+    first, last = (made.scene(k).parts[0].points for k in (0, 2))
+    rest = np.asarray(beam.points) if drawn == "mesh" else first
+    assert np.allclose(first, rest, rtol=0, atol=1e-12)
+    x, y = rest.T
+    angle = kappa * x
+    arc = np.stack([(1 / kappa - y) * np.sin(angle), 1 / kappa - (1 / kappa - y) *
+                    np.cos(angle)], axis=1)  # fmt: skip
+    assert np.allclose(last, arc, rtol=0, atol=1e-4 * LENGTH)
+    shown = view.animate(film, network=network, skin=skin, fps=2, size=(200, 150))
+    assert shown.frames == 3
+    assert np.mean(np.any(shown.draw(0) != shown.draw(2), axis=2)) > 0.01
+
+
+def test_a_trajectory_needs_to_know_what_moved(beam):
+    rod = R.rod(SE2(), R.chebyshev(kappa_z=1), R.rectangle(0.01, 0.02), length=LENGTH,
+                young_modulus=1e5, poisson_ratio=0.4, density=1e3)  # fmt: skip
+    network, film = swung(rod, [[0.0], [1.0]])
+    with pytest.raises(ValueError, match="Pass network="):
+        view.animate(film)
+    with pytest.raises(ValueError, match="the bodies body"):
+        view.animate(film, network=network, block="arm")

@@ -122,7 +122,7 @@ RING = sdf.Circle([0.0, 0.0], 0.02) - sdf.Circle([0.0, 0.0], 0.008)
 
 
 def test_a_solid_shape_is_shaded_with_its_hollow():
-    picture = view.show(CUBE, size=0.002, title="cube")
+    picture = view.show(CUBE, size=0.002, title="cube", renderer="own")
     assert is_whole(picture, 0.2) and "cube" in words(picture) and "mm" in words(picture)
     image = pixels(picture)
     front, side = picture.pixels([[-0.02, -0.02, -0.01], [0.03, 0.015, -0.015]]).astype(int)

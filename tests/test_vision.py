@@ -6,6 +6,7 @@ import pytest
 cv2 = pytest.importorskip("cv2")
 
 from sorojax import vision  # noqa: E402
+from sorojax.cli.main import main  # noqa: E402
 from sorojax.vision import BLUE, GREEN, RED, Camera, Discs, Disturbance, Pose  # noqa: E402
 
 COLOURS = (RED, GREEN, BLUE)
@@ -223,6 +224,13 @@ def test_calibration_finds_the_camera_that_took_the_pictures(tmp_path):
     assert abs(found.cx - true.cx) < 1.0 and abs(found.cy - true.cy) < 1.0 and found.rms < 0.3
     vision.save_camera(tmp_path / "camera.json", found)
     assert vision.load_camera(tmp_path / "camera.json") == found
+    files = [tmp_path / f"{k}.png" for k in range(10)]
+    assert all(cv2.imwrite(str(f), image) for f, image in zip(files, images, strict=True))
+    told = ["calibrate", *map(str, files), "--out", str(tmp_path / "by_command.json")]
+    assert main(told) == 0
+    same = vision.load_camera(tmp_path / "by_command.json")
+    assert abs(same.fx / true.fx - 1) < 2e-3 and abs(same.fy / true.fy - 1) < 2e-3
+    assert (same.width, same.height) == (320, 240)
     with pytest.raises(ValueError, match="0 pictures"):
         vision.calibrate([np.zeros((48, 64), np.uint8)] * 6, board)
 

@@ -7,7 +7,8 @@ are fitted together. The noise is the scatter of the repeats and of the alignmen
 markers for the drops, 2 % for frequencies, and 20 % for damping ratios. The bars are 1 mm and
 5 %. Viscous losses fall with the frequency and those of this rubber do not, so the two
 damping ratios cannot both be met; they have no bar. A second fit takes the record without
-load alone and predicts the other.
+load alone and predicts the other, to show what a hold-out tells. It has no bar: in a drop
+of 6.4 mm the alignment of the markers is worth 8 % of the modulus.
 """
 
 import dataclasses
@@ -25,6 +26,7 @@ from sorojax._progress import silent
 from sorojax.units import mm
 
 NOTE = "measured drops, frequency and damping ratio of a released beam"
+HELD_OUT = "the same, of a record that was not fitted: a prediction, no bar"
 NOISE = np.array([0.5, 0.5, 0.5])  # mm
 FREQUENCY_NOISE, RATIO_NOISE = 0.02, 0.2  # relative
 DROP_BAR, FREQUENCY_BAR = 1.0, 0.05  # mm, relative
@@ -103,8 +105,9 @@ def _fit(name: str, experiments, hold_out):
                 "frequency_error": frequency, "frequency_Hz": float(check.predicted[3]),
                 "damping_ratio": float(check.predicted[4]), "rms_over_noise": check.rms,
             }  # fmt: skip
-            yield Row(
-                "sorojax", settings, run_s=seconds,
-                error=max(drop / DROP_BAR, frequency / FREQUENCY_BAR), reference=NOTE,
-                bar=1.0, bar_on="error",
-            )  # fmt: skip
+            error = max(drop / DROP_BAR, frequency / FREQUENCY_BAR)
+            if kind == "held out":
+                yield Row("sorojax", settings, run_s=seconds, error=error, reference=HELD_OUT)
+                continue
+            yield Row("sorojax", settings, run_s=seconds, error=error, reference=NOTE,
+                      bar=1.0, bar_on="error")  # fmt: skip

@@ -1,4 +1,8 @@
-"""The cantilever at large displacement of Wang et al. 2014: end compliance of the optima."""
+"""The cantilever at large displacement of Wang et al. 2014: end compliance of the optima.
+
+`error` is by how much the compliance that was reached lies above the published one; a
+stiffer cantilever of the same volume has no error.
+"""
 
 import time
 
@@ -21,12 +25,14 @@ def rows():
         found, seconds, density = optimised(force)
         reached = float(found.objective)
         settings = {"layout": "nonlinear cantilever", "force_kN": force / 1e3,
-                    "compliance_kJ": reached / 1e3, "steps": len(seconds),
+                    "compliance_kJ": reached / 1e3, "over_published": reached / published - 1,
+                    "steps": len(seconds),
                     "volume": float(jnp.mean(density)), "status": str(found.status),
                     "grey": float(design.greyness(density))}  # fmt: skip
         timing = (float(np.median(seconds[3:])), min(seconds), max(seconds[3:]))
-        yield Row("sorojax", settings, seconds[0], *timing, error=abs(reached / published - 1),
-                  bar=WITHIN, bar_on="error",
+        above = max(0.0, reached / published - 1)
+        yield Row("sorojax", settings, seconds[0], *timing, error=above, bar=WITHIN,
+                  bar_on="error",
                   reference="Wang, Lazarov, Sigmund, Jensen 2014; time of a step")  # fmt: skip
 
 

@@ -68,7 +68,7 @@ def _rows(size: float):
 def _iteration(problem: fem.Problem):
     """Timing of one Newton iteration: assembly, factorisation, back-substitution."""
     prepared = prepare(problem)
-    still = jnp.zeros(problem.space.num_dofs)
+    still = np.zeros(problem.space.num_dofs)
     states = (1e-9 * jnp.sin(100 * k * problem.mesh.points) for k in range(1, 99))
 
     def iterate():

@@ -4,6 +4,8 @@ shape of a frame of markers estimated in every tick."""
 import os
 import subprocess
 import sys
+from pathlib import Path
+from time import process_time
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +20,7 @@ from sorojax_hardware import TcpBoard, WallClock, deadlines, run_loop
 RATE, DURATION = 200.0, 60.0
 BAR = 1e-3  # s, the 99th percentile of the error of a period
 S = jnp.array([0.25, 0.5, 0.75, 1.0])
+STAT = Path("/proc/stat")
 
 
 def rows():
@@ -60,22 +63,44 @@ def _loop(port: int) -> Row:
     with TcpBoard(port=port, timeout=1.0) as board:
         board.arm((-10e3, 60e3))
         start = (0, jnp.zeros(3), np.zeros(board.num_ports))
+        before, spent = _processors(), process_time()
         ticks = list(
             run_loop(
                 board, WallClock(), controller, start, duration=DURATION, period=1 / RATE,
                 limits=(0.0, 50e3),
             )
         )  # fmt: skip
-        refused, late, state = board.report.refused, board.late, board.report.state.name
+        used, spent = _used(before), process_time() - spent
+        refused, late, state = board.report.refused, board.late, board.report
     report = deadlines(ticks, 1 / RATE)
     error = np.abs(np.diff([tick.time for tick in ticks]) - 1 / RATE)
     settings = {
-        "rate": RATE, "duration": DURATION, "ticks": report.num_ticks,
-        "left_out": report.num_skipped, "late_set_points": late, "board": state,
-        "load": os.getloadavg()[0], "p50_period_error": float(np.median(error)),
+        "rate": RATE, "duration": DURATION, "needs": "two free cores", **used,
+        "cores_of_the_loop": spent / DURATION, "load": os.getloadavg()[0],
+        "ticks": report.num_ticks, "left_out": report.num_skipped, "late_set_points": late,
+        "board": f"{state.state.name.lower()}, fault {state.fault!r}",
+        "p50_period_error": float(np.median(error)),
     }  # fmt: skip
     return Row(
         "sorojax", settings, 0.0, float(np.percentile(error, 99)), float(error.min()),
         float(error.max()), error=float(report.num_skipped + refused), bar=BAR,
         reference="99th percentile of the error of a period; error: samples lost",
     )  # fmt: skip
+
+
+def _processors() -> np.ndarray | None:
+    """Ticks of all processors so far: at work, idle, taken by other virtual machines."""
+    if not STAT.exists():
+        return None
+    told = [int(word) for word in STAT.read_text().split("\n", 1)[0].split()[1:9]]
+    user, nice, system, idle, waiting, hard, soft, stolen = told
+    return np.array([user + nice + system + hard + soft, idle + waiting, stolen], float)
+
+
+def _used(before: np.ndarray | None) -> dict[str, float]:
+    """Cores at work since then, loop and board among them, and cores taken away."""
+    now = _processors()
+    if now is None or before is None:
+        return {}
+    share = (now - before) / np.sum(now - before) * (os.cpu_count() or 1)
+    return {"cores": os.cpu_count() or 1, "busy": float(share[0]), "stolen": float(share[2])}

@@ -44,13 +44,14 @@ def _once(kind: str) -> tuple[float, str]:
     valves = BenchValves(2, noise=0.0)
     limits = settings(2, low=-10e3, high=60e3)
     if kind == "server ended":
-        with serve(limits, valves) as server, TcpBoard(port=server.port) as board:
+        with serve(limits, valves) as server:
+            board = TcpBoard(port=server.port)
             _drive(board, valves)
             start = time.monotonic()
         # the set-points are zero when the server is gone; the valves follow by themselves
         took = time.monotonic() - start
         assert valves._written == (0.0, 0.0)
-        return took, "vented at the end"
+        return took, _said(board)
     with serve(limits, valves) as server, DisturbedLink(server.port) as link:
         if kind == "client killed":
             child = subprocess.Popen([sys.executable, "-c", CLIENT, str(link.port)])
@@ -90,6 +91,15 @@ def _keep(board: TcpBoard) -> None:
         while True:
             board.write_pressure(np.full(2, 50e3))
             time.sleep(0.005)
+
+
+def _said(board: TcpBoard) -> str:
+    """What a client hears of a server that is gone."""
+    try:
+        board.read_pressure()
+    except (OSError, BoardFault) as told:
+        return str(told)
+    raise AssertionError("the server still answers")
 
 
 def _wait(condition) -> None:

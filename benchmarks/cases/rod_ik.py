@@ -31,10 +31,11 @@ def rows():
         jax.block_until_ready(call(poses[0], rest))
         first = time.perf_counter() - start
         ends = [jnp.asarray(tip_pose(rod, call(pose, rest))) for pose in poses]
+        two = jax.block_until_ready([poses[0], poses[1]])
         errors = [float(jnp.linalg.norm(d[:3, 3])) / LENGTH for d in jnp.stack(ends) - poses]
         seconds = []
         for index in range(CALLS):
-            pose = poses[0] if index % 2 else poses[1]
+            pose = two[index % 2]
             start = time.perf_counter()
             jax.block_until_ready(call(pose, rest))
             seconds.append(time.perf_counter() - start)

@@ -4,10 +4,10 @@ NumPy and the standard library only: importing this package starts no JAX and op
 device.
 """
 
+from sorojax_hardware.board_fault import BoardFault as BoardFault
 from sorojax_hardware.cameras import (
     DrawnCamera as DrawnCamera,
     FolderCamera as FolderCamera,
-    Latest as Latest,
     VideoCamera as VideoCamera,
 )
 from sorojax_hardware.clocks import (
@@ -16,6 +16,8 @@ from sorojax_hardware.clocks import (
 )
 from sorojax_hardware.desk import simulated as simulated
 from sorojax_hardware.disturbed import DisturbedLink as DisturbedLink
+from sorojax_hardware.latest import Latest as Latest
+from sorojax_hardware.local_board import LocalBoard as LocalBoard
 from sorojax_hardware.loop import (
     Deadlines as Deadlines,
     Overrun as Overrun,
@@ -34,13 +36,5 @@ from sorojax_hardware.protocols import (
 )
 from sorojax_hardware.realsense import RealSenseCamera as RealSenseCamera
 from sorojax_hardware.recorder import Recorder as Recorder, load_record as load_record
-from sorojax_hardware.serving import (
-    LocalBoard as LocalBoard,
-    ModelValves as ModelValves,
-    serve as serve,
-)
-from sorojax_hardware.tcp_board import (
-    BoardFault as BoardFault,
-    TcpBoard as TcpBoard,
-    connect as connect,
-)
+from sorojax_hardware.serving import ModelValves as ModelValves, serve as serve
+from sorojax_hardware.tcp_board import TcpBoard as TcpBoard, connect as connect

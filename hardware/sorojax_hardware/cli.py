@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from sorojax_hardware.board_fault import BoardFault
 from sorojax_hardware.cameras import VideoCamera
 from sorojax_hardware.clocks import WallClock
 from sorojax_hardware.desk import add_devices, add_serve, webcams
 from sorojax_hardware.loop import deadlines, run_loop, tick_recorder
 from sorojax_hardware.recorder import load_record
-from sorojax_hardware.tcp_board import BoardFault, TcpBoard
+from sorojax_hardware.tcp_board import TcpBoard
 
 _PERIOD = 0.01  # s
 

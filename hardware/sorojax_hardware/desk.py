@@ -42,6 +42,9 @@ def add_serve(make: Callable[..., argparse.ArgumentParser]) -> None:
 
 def serve(asked: argparse.Namespace) -> int:
     """Run until interrupted."""
+    _prepare()
+    if asked.robot is not None:  # what was compiled once is there at the next start
+        importlib.import_module("sorojax").enable_compilation_cache()
     valves, settings = simulated(asked.robot, asked.model, asked.period * 1e-3)
     server = Server(
         Board(settings, valves), key=read_key(asked.key), host=asked.host, port=asked.port,
@@ -67,8 +70,7 @@ def simulated(
         ValueError: If it has no such function.
     """
     where, _, name = (model or _BENCH).partition(":")
-    # mechanics needs float64; the flag counts where JAX is not running yet
-    os.environ.setdefault("JAX_ENABLE_X64", "1")
+    _prepare()
     make = getattr(importlib.import_module(where), name, None)
     if make is None:
         raise ValueError(f"{where} has no function {name!r}. Write MODULE:FUNCTION.")
@@ -76,6 +78,13 @@ def simulated(
     settings = Settings(tuple(Limits(float(low), float(high), 2e6) for low, high in limits))
     options = {"period": period, "dead_time": 0.004} | options
     return ModelValves(advance, state, len(settings.limits), **options), settings
+
+
+def _prepare() -> None:
+    """Settings that count where JAX is not running yet."""
+    os.environ.setdefault("JAX_ENABLE_X64", "1")  # mechanics needs it
+    # threads cost more than they give to systems of 60 unknowns
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def add_devices(make: Callable[..., argparse.ArgumentParser]) -> None:

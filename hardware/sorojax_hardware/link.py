@@ -57,13 +57,26 @@ class Link:
             raise
 
     def ask(self, kind: Kind, payload: bytes = b"") -> Frame:
-        """The board's answer, authentic and in order.
+        """The board's answer, authentic and in order; heartbeats before it are passed over.
 
         Raises:
             ConnectionError: If none came in time, or one that is not the board's.
         """
         self._send(kind, payload)
-        frame = self._receive()
+        while (frame := self._trusted(self._timeout)).kind == Kind.HEARTBEAT:
+            pass
+        return frame
+
+    def listen(self, period: float) -> Frame:
+        """The next heartbeat of a board that sends one every `period` [s].
+
+        Raises:
+            ConnectionError: As `ask`.
+        """
+        return self._trusted(self._timeout + period)
+
+    def _trusted(self, patience: float) -> Frame:
+        frame = self._receive(patience)
         if not authentic(frame, self._keys.to_client) or frame.sequence <= self._heard:
             self._socket.close()
             raise ConnectionError("TcpBoard: an answer that is not the board's.")
@@ -76,7 +89,7 @@ class Link:
         self._socket.close()
 
     def _handshake(self, key: bytes, read_only: bool, nonce: bytes) -> Welcome:
-        first = self._receive()
+        first = self._receive(self._timeout)
         if first.kind != Kind.CHALLENGE or not authentic(first, challenge_key(key)):
             raise ConnectionError(
                 "TcpBoard: the board signs with another key, or none. Give the key of its "
@@ -92,8 +105,8 @@ class Link:
         frame = Frame(kind, self._sent, int(monotonic() * 1e9), payload)
         self._socket.sendall(encode(frame, self._keys.to_board))
 
-    def _receive(self) -> Frame:
-        deadline = monotonic() + self._timeout
+    def _receive(self, patience: float) -> Frame:
+        deadline = monotonic() + patience
         try:
             while not self._waiting:
                 self._socket.settimeout(max(deadline - monotonic(), 1e-4))
@@ -107,7 +120,7 @@ class Link:
         except TimeoutError as late:
             self._socket.close()
             raise ConnectionError(
-                f"TcpBoard: no answer in {self._timeout} s. The board vents by itself; make a "
+                f"TcpBoard: no answer in {patience:g} s. The board vents by itself; make a "
                 "new TcpBoard when it is back."
             ) from late
         except OSError:

@@ -13,13 +13,15 @@ import numpy as np
 from sorojax_board.bench import STEP
 from sorojax_board.board import Backend, Board, Settings
 from sorojax_board.server import Server
-from sorojax_hardware.protocols import Clock
 
-_MOST_BEHIND = 1.0  # s; after a longer pause the model goes on from where it was
+_MOST_BEHIND = 0.01  # s that one reading makes up for; the program has to go on meanwhile
 
 
 class ModelValves:
     """A simulated robot behind the board: `advance(state, setpoint, dt)` moves it.
+
+    A model that takes longer than the time that passes goes on in slow motion; `behind` [s]
+    is how much it has left out.
 
     Args:
         advance: `(state, setpoints [Pa], dt [s]) -> (state, pressures [Pa])`, for instance
@@ -50,16 +52,18 @@ class ModelValves:
         self._dead_time, self._resolution = dead_time, resolution
         self._setpoint = self._asked = np.zeros(num_ports)
         self._waiting: deque[tuple[float, np.ndarray]] = deque()
-        self.pressure, self._now = np.zeros(num_ports), -math.inf
+        self.pressure, self._now, self.behind = np.zeros(num_ports), math.nan, 0.0
 
     def write(self, pressures: Sequence[float]) -> None:
         self._asked = self._rounded(np.asarray(pressures, float))
 
     def read(self, now: float) -> list[float]:
-        if now - self._now > _MOST_BEHIND:
+        if math.isnan(self._now):
             self._now = now
+        late = max(now - self._now - max(_MOST_BEHIND, 2 * self._period), 0.0)
+        self._now, self.behind = self._now + late, self.behind + late
         self._waiting.append((now + self._dead_time, self._asked))
-        while now - self._now >= self._period:
+        while now - self._now >= self._period - 1e-9:
             self._now += self._period
             while self._waiting and self._waiting[0][0] <= self._now:
                 self._setpoint = self._waiting.popleft()[1]
@@ -72,65 +76,6 @@ class ModelValves:
         if self._resolution == 0:
             return pressure
         return np.rint(pressure / self._resolution) * self._resolution
-
-
-class LocalBoard:
-    """A board's program without a socket, on any clock: a `ValveBoard`.
-
-    With a `SimulatedClock` a run is as fast as its computations and the same every time.
-    """
-
-    _period = 0.002  # s, between ticks of the program
-
-    def __init__(self, settings: Settings, backend: Backend, clock: Clock):
-        self._clock, self._ticked, self._count = clock, clock.now(), 0
-        self.board = Board(settings, backend, self._ticked)
-
-    @property
-    def num_ports(self) -> int:
-        return self.board.num_ports
-
-    def arm(self, limits=(-1e9, 1e9)) -> None:
-        """As `TcpBoard.arm`."""
-        low, high = (np.broadcast_to(np.asarray(x, float), self.num_ports) for x in limits)
-        bounds = list(zip(low.tolist(), high.tolist(), strict=True))
-        self.board.arm(self, bounds, self._clock.now())
-
-    def read_pressure(self) -> np.ndarray:
-        self._advance()
-        return np.array(self.board.report().pressure)
-
-    def write_pressure(self, setpoint: np.ndarray) -> None:
-        """As `TcpBoard.write_pressure`.
-
-        Raises:
-            ValueError: If the set-points are not finite, not one per port, or the board does
-                not follow.
-        """
-        asked = np.asarray(setpoint, float)
-        if asked.shape != (self.num_ports,):
-            raise ValueError(
-                f"LocalBoard: `setpoint` has shape {asked.shape}, need ({self.num_ports},)."
-            )
-        self._advance()
-        self._count += 1
-        mask, stamp = (1 << self.num_ports) - 1, (self._count, 0)
-        why = self.board.set(self, mask, asked.tolist(), stamp, self._clock.now())
-        if why is not None:
-            report = self.board.report()
-            raise ValueError(
-                f"LocalBoard: the board refused: {why.name}, state {report.state.name}, faults "
-                f"{report.fault!r}. Call arm() after the cause is gone."
-            )
-
-    def vent(self) -> None:
-        self._advance()
-        self.board.vent(self._clock.now())
-
-    def _advance(self) -> None:
-        while self._ticked + self._period <= self._clock.now() + 1e-9:
-            self._ticked += self._period
-            self.board.tick(self._ticked)
 
 
 @contextlib.contextmanager

@@ -1,21 +1,18 @@
 """A valve board on the network."""
 
+import contextlib
 import time
+from collections.abc import Iterator
 
 import numpy as np
 
 from sorojax_board import messages
 from sorojax_board.frames import Kind
 from sorojax_board.messages import Refusal, Report, State
+from sorojax_hardware.board_fault import BoardFault, explained
 from sorojax_hardware.link import Link
 
-
-class BoardFault(RuntimeError):
-    """The board does not follow; `report` is what it said last."""
-
-    def __init__(self, message: str, report: Report | None = None):
-        super().__init__(message)
-        self.report = report
+_TRIES = 5
 
 
 class TcpBoard:
@@ -25,9 +22,7 @@ class TcpBoard:
     The board vents by itself when the set-points stop. `late` counts set-points that it left
     out because they were under way too long, or came too fast. Use it in a `with` statement:
 
-        with TcpBoard("10.0.0.7", key=key) as board:
-            board.arm((-10e3, 60e3))
-            run_loop(board, ...)
+        with TcpBoard("10.0.0.7", key=key) as board: ...
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 5053, *, key: bytes = b"", **link):
@@ -91,6 +86,22 @@ class TcpBoard:
         """Ramp to zero; the board follows again after `arm`."""
         self.report = self._ask(Kind.VENT)
 
+    def watch(self, period: float = 0.1) -> Iterator[Report]:
+        """The heartbeat of the board: what it measures, every `period` [s] by itself.
+
+        Raises:
+            ConnectionError: If a heartbeat does not come in time.
+            BoardFault: If `period` is not between 2 ms and 10 s.
+        """
+        self.report = self._ask(Kind.WATCH, messages.pack_floats([period]))
+        try:
+            while True:
+                self.report = messages.unpack_report(self._link.listen(period).payload)
+                yield self.report
+        finally:
+            with contextlib.suppress(OSError):  # of a board that is gone
+                self._ask(Kind.WATCH, messages.pack_floats([0.0]))
+
     def close(self) -> None:
         """Say goodbye: the board vents."""
         self._link.close()
@@ -106,23 +117,23 @@ class TcpBoard:
         if frame.kind == Kind.STATE:
             return messages.unpack_report(frame.payload)
         _, why = messages.unpack_refused(frame.payload)
-        report = messages.unpack_report(self._link.ask(Kind.PING).payload)
+        report = self._now()
+        if kind is Kind.PING:
+            return report
         if why in (Refusal.STALE, Refusal.TOO_FAST) and report.state is State.ARMED:
             self.late += 1  # the next set-point may be in time; if none is, the board vents
             return report
-        raise BoardFault(_explained(kind, why, report), report)
+        raise BoardFault(explained(kind, why, report), report)
 
-
-def _explained(kind: Kind, why: Refusal, report: Report) -> str:
-    text = f"TcpBoard: the board refused {kind.name}: {why.name.lower().replace('_', ' ')}."
-    if why is Refusal.NOT_ARMED and report.state is State.FAULT:
-        fault = str(report.fault.name).lower().replace("_", " ")
-        text += f" It vented after a fault: {fault}. Look for the cause, then arm()."
-    elif why is Refusal.NOT_ARMED:
-        text += " Call arm() first."
-    elif why is Refusal.NOT_WRITER:
-        text += " Another client writes, or this one is read-only."
-    return text
+    def _now(self) -> Report:
+        for _ in range(_TRIES):  # on a busy line a question may be stale too
+            frame = self._link.ask(Kind.PING)
+            if frame.kind == Kind.STATE:
+                return messages.unpack_report(frame.payload)
+        self._link.close()
+        raise ConnectionError(
+            f"TcpBoard: {_TRIES} frames in a row were 0.1 s late. Make a new TcpBoard."
+        )
 
 
 def connect(host: str = "127.0.0.1", port: int = 5053, *, attempts: int = 6, **options):

@@ -24,6 +24,7 @@ from sorojax.design.filters import (
     sensitivity_filtered as sensitivity_filtered,
 )
 from sorojax.design.flood import Flood as Flood, flood as flood, flooded as flooded
+from sorojax.design.history import History as History
 from sorojax.design.layout import Layout as Layout, layout as layout
 from sorojax.design.linear import (
     Linear as Linear,
@@ -44,7 +45,6 @@ from sorojax.design.mma import (
 )
 from sorojax.design.objectives import (
     Follower as Follower,
-    History as History,
     displacement_along as displacement_along,
     graded as graded,
     mechanism as mechanism,
@@ -68,6 +68,7 @@ from sorojax.design.pneunet import (
     optimise_pneunet as optimise_pneunet,
     pneunet_cell as pneunet_cell,
 )
+from sorojax.design.settle import settled as settled
 from sorojax.design.shape_loop import (
     OptimisedShape as OptimisedShape,
     ShapeStep as ShapeStep,

@@ -11,6 +11,7 @@ References:
 import itertools
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -53,7 +54,8 @@ def cone_filter(
     """
     _check.positive("cone_filter", "radius", radius, "m", "About two cells is usual.")
     centres = np.asarray(mesh.points)[np.asarray(mesh.cells)].mean(axis=1)
-    first, second, away = _pairs(centres, float(radius), _periods(mesh, radius, periods))
+    lengths = _periods("cone_filter", mesh, periods, 2 * radius)
+    first, second, away = _pairs(centres, float(radius), lengths)
     weights = radius - away
     if volumes is not None:
         weights = weights * np.asarray(volumes)[second]
@@ -65,17 +67,17 @@ def cone_filter(
     )
 
 
-def _periods(mesh: Mesh, radius: float, periods) -> np.ndarray:
+def _periods(where: str, mesh: Mesh, periods, least: float) -> np.ndarray:
     """Period by axis, 0 where there is none."""
     found = np.array([p or 0.0 for p in periods or (None,) * mesh.element.dim])
     span = np.ptp(np.asarray(mesh.points), axis=0)
     if found.shape != span.shape or np.any(
-        (found != 0) & (found < np.maximum((1 - 1e-9) * span, 2 * radius))
+        (found != 0) & (found < np.maximum((1 - 1e-9) * span, least))
     ):
         raise ValueError(
-            f"cone_filter: got periods {periods} m, need one per axis, `None` or at least the "
-            f"length {span} m of the mesh and two radii of {float(radius):g} m. Give the "
-            "length of the cell that repeats."
+            f"{where}: got periods {periods} m, need one per axis, `None` or at least the "
+            f"length {span} m of the mesh and {least:g} m. Give the length of the cell that "
+            "repeats."
         )
     return found
 
@@ -96,7 +98,8 @@ def _pairs(centres: np.ndarray, radius: float, periods: np.ndarray):
 
 
 class HelmholtzFilter(eqx.Module):
-    """The solution y of y - l^2 laplace(y) = x with no flux through the boundary.
+    """The solution y of y - l^2 laplace(y) = x with no flux through the boundary, or the
+    same on both sides of a layout that repeats.
 
     Made by `helmholtz_filter`; costs one back-substitution, whatever the radius.
     """
@@ -114,11 +117,19 @@ class HelmholtzFilter(eqx.Module):
         return jnp.sum(self.shares * solved[self.cells], axis=1) / total
 
 
-def helmholtz_filter(mesh: Mesh, radius: float) -> HelmholtzFilter:
+def helmholtz_filter(
+    mesh: Mesh, radius: float, *, periods: tuple[float | None, ...] | None = None
+) -> HelmholtzFilter:
     """The filter that smooths like a cone filter of `radius` [m]: l = radius / (2 sqrt 3).
 
+    Args:
+        mesh: The cells.
+        radius: Of the cone filter that smooths as much [m].
+        periods: By axis, the length of the mesh [m] where the layout repeats after it,
+            `None` where it does not. Nodes at both ends have to lie opposite each other.
+
     Raises:
-        ValueError: If the cells are not Tri3 or Quad4.
+        ValueError: If the cells are not Tri3 or Quad4, or the ends of a period do not match.
     """
     from sorojax.mesh.shape import quadrature, shape_functions, shape_gradients
 
@@ -137,13 +148,43 @@ def helmholtz_filter(mesh: Mesh, radius: float) -> HelmholtzFilter:
     length = radius / (2 * np.sqrt(3))
     matrix = length**2 * np.einsum("cqai,cqbi,cq->cab", G, G, volume)
     matrix += np.einsum("qa,qb,cq->cab", N, N, volume)
-    system = sparse.from_cells(mesh.num_nodes, np.asarray(mesh.cells))
+    number = _joined_nodes(mesh, _periods("helmholtz_filter", mesh, periods, 0.0))
+    cells = number[np.asarray(mesh.cells)]
+    system = sparse.from_cells(int(number.max()) + 1, cells)
     return HelmholtzFilter(
         system,
         sparse.assemble(system, jnp.asarray(matrix)),
-        jnp.asarray(mesh.cells),
+        jnp.asarray(cells, jnp.int32),
         jnp.asarray(np.einsum("qa,cq->ca", N, volume)),
     )
+
+
+def _joined_nodes(mesh: Mesh, periods: np.ndarray) -> Int[np.ndarray, " nodes"]:
+    """A number for every node, the same at both ends of a period."""
+    from sorojax.math.spatial import KDTree
+
+    points = np.asarray(mesh.points)
+    low, size = points.min(axis=0), np.ptp(points)
+    owner, tree = np.arange(len(points)), KDTree(points)
+    for axis in np.flatnonzero(periods):
+        shift = np.zeros(len(low))
+        shift[axis] = periods[axis]
+        end = np.flatnonzero(np.abs(points[:, axis] - low[axis] - shift[axis]) < 1e-6 * size)
+        away, opposite = tree.query(points[end] - shift)
+        if not len(end) or np.max(away) > 1e-6 * size:
+            raise ValueError(
+                f"helmholtz_filter: the nodes of the mesh do not repeat after {shift[axis]:g} "
+                f"m along axis {axis}. Give the length of the mesh, and mesh both ends alike."
+            )
+        owner[end] = owner[opposite]
+    number = np.unique(owner, return_inverse=True)[1].ravel()
+    twice = np.sort(number[np.asarray(mesh.cells)], axis=1)
+    if np.any(twice[:, 1:] == twice[:, :-1]):
+        raise ValueError(
+            "helmholtz_filter: a cell reaches from one end of a period to the other, need at "
+            "least two cells. Refine the mesh."
+        )
+    return number
 
 
 def heaviside_projection(
@@ -151,7 +192,11 @@ def heaviside_projection(
 ) -> Float[Array, "..."]:
     """Pushes densities to 0 and 1: a smooth step at `threshold`, the steeper the larger
     `sharpness` (1 does next to nothing, 16 and more make black and white)."""
-    beta, eta = real(sharpness), real(threshold)
+    return _projected(real(x), real(sharpness), real(threshold))
+
+
+@jax.jit
+def _projected(x, beta, eta):
     low, high = jnp.tanh(beta * eta), jnp.tanh(beta * (1 - eta))
     return (low + jnp.tanh(beta * (x - eta))) / (low + high)
 

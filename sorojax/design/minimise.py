@@ -165,7 +165,7 @@ def minimise(
             break
     if status == Status.not_finite:
         flat = last
-    objective, held = task.plain(flat, max(len(history) + first - 1, 0))
+    objective, held = task.last(flat, max(len(history) + first - 1, 0))
     columns = _columns(history)
     if status == Status.successful and _broken(held, columns):
         status = Status.out_of_reach
@@ -202,6 +202,13 @@ class _Task:
         more, x = self._more(k), self.back(flat)
         held = [jnp.ravel(jnp.asarray(g(x, *more))) for g in self.constraints]
         return self.loss(x, *more), jnp.concatenate(held) if held else jnp.zeros(0)
+
+    def last(self, flat, k: int):
+        """The same, by programs that were compiled for the steps."""
+        if not hasattr(self.loss, "lower"):
+            return self.plain(flat, k)
+        values = self.values(flat, k)
+        return values.objective, values.constraints
 
     def values(self, flat, k: int) -> Values:
         more = self._more(k)

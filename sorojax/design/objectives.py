@@ -13,8 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sorojax._types import is_traced
+from sorojax.design.settle import settled
 from sorojax.design.void import InterpolatedEnergy, interpolated_energy
 from sorojax.fem import Newton, Path, Problem, Solution, solve
+from sorojax.fem.energy_form import load_potential
 from sorojax.fem.loads import AbstractLoad
 from sorojax.fem.torque import mean_rotation
 
@@ -48,16 +51,24 @@ def work_of_loads(
         load for load in problem.loads
         if (not load.holds if names is None else load.name in names)
     ]  # fmt: skip
-    rest = jnp.zeros_like(u)
-    terms = (load.potential(problem, rest) - load.potential(problem, u) for load in chosen)
-    return sum(terms, start=jnp.zeros((), u.dtype))
+    return _work(dataclasses.replace(problem, supports=(), loads=tuple(chosen)), u)
+
+
+@jax.jit
+def _work(problem: Problem, u):
+    return load_potential(problem, jnp.zeros_like(u)) - load_potential(problem, u)
 
 
 def displacement_along(
     u: Float[Array, "nodes dim"], nodes: Int[Any, " n"], direction: Float[Any, " dim"]
 ) -> Float[Array, ""]:
     """L'x: mean displacement of `nodes` along `direction` [m]."""
-    return jnp.mean(u[jnp.asarray(nodes)] @ jnp.asarray(direction, u.dtype))
+    return _mean_along(u, jnp.asarray(nodes), jnp.asarray(direction, u.dtype))
+
+
+@jax.jit
+def _mean_along(u, nodes, direction):
+    return jnp.mean(u[nodes] @ direction)
 
 
 def mechanism(
@@ -83,8 +94,12 @@ def rotation(
     problem: Problem, u: Float[Array, "nodes dim"], nodes: Int[Any, " n"]
 ) -> Float[Array, ""]:
     """Mean angle by which `nodes` of a plane body turn, counter-clockwise [rad]."""
-    X = problem.mesh.points[jnp.asarray(nodes)]
-    return mean_rotation(X, X + u[jnp.asarray(nodes)])
+    return _turn(problem.mesh.points, u, jnp.asarray(nodes))
+
+
+@jax.jit
+def _turn(points, u, nodes):
+    return mean_rotation(points[nodes], points[nodes] + u[nodes])
 
 
 def path_error(
@@ -94,9 +109,14 @@ def path_error(
 
     `path` is that of `fem.solve_path`; `targets` are positions, one for each of its values.
     """
-    nodes = jnp.asarray(nodes)
-    middle = jnp.mean(path.problem.mesh.points[nodes], axis=0)
-    moved = middle[None] + jnp.mean(path.displacements[:, nodes], axis=1)
+    points = path.problem.mesh.points
+    return _miss(points, path.displacements, jnp.asarray(nodes), jnp.asarray(targets))
+
+
+@jax.jit
+def _miss(points, displacements, nodes, targets):
+    middle = jnp.mean(points[nodes], axis=0)
+    moved = middle[None] + jnp.mean(displacements[:, nodes], axis=1)
     return jnp.mean(jnp.sum((moved - targets) ** 2, axis=1))
 
 
@@ -104,8 +124,10 @@ class Follower:
     """Solves the equilibria of one design after the other, each from the one before.
 
     Newton's method starts at full load from the last displacement, and follows the load from
-    rest where that does not converge: the equilibria agree unless a design has several. An
-    equilibrium that is not found has NaN for derivatives, on which `minimise` stops.
+    rest where that does not converge: the equilibria agree unless a design has several. Where
+    the load path ends too, the last equilibrium has buckled, and the body falls from there
+    into a stable one (`settled`; not under `jit`). An equilibrium that is not found has NaN
+    for derivatives, on which `minimise` stops.
     """
 
     def __init__(self, *, newton: Newton | None = None, steps: int = 1, max_cuts: int = 4):
@@ -116,39 +138,32 @@ class Follower:
     def __call__(self, problem: Problem) -> Solution:
         start = None if self.last is None else jnp.asarray(self.last)
         solution = solve(problem, start=start, throw=False, **self.settings)
-        failed = ~jnp.equal(jnp.asarray(solution.load_fraction), 1.0)
-        u = solution.displacement
-        valid = jnp.where(failed, jnp.nan, u)
-        jax.debug.callback(self._keep, jax.lax.stop_gradient(valid))
-        return eqx.tree_at(lambda s: s.displacement, solution, valid)
+        found = jnp.equal(jnp.asarray(solution.load_fraction), 1.0)
+        if start is not None and not is_traced(found) and not bool(jnp.all(found)):
+            solution = self._fallen(problem, start, solution)
+            found = jnp.equal(jnp.asarray(solution.load_fraction), 1.0)
+        if is_traced(found) or not bool(jnp.all(found)):
+            valid = jnp.where(found, solution.displacement, jnp.nan)
+            solution = eqx.tree_at(lambda s: s.displacement, solution, valid)
+        u = jax.lax.stop_gradient(solution.displacement)
+        if is_traced(u):
+            jax.debug.callback(self._keep, u)
+        else:
+            self._keep(u)
+        return solution
+
+    def _fallen(self, problem: Problem, start, solution: Solution) -> Solution:
+        moving, rest = eqx.partition(problem, eqx.is_inexact_array)
+        here = eqx.combine(jax.lax.stop_gradient(moving), rest)
+        if is_traced(here):
+            return solution
+        u, stable = settled(here, start)
+        if not stable:
+            return solution
+        return solve(problem, start=jnp.asarray(u), throw=False, **self.settings)
 
     def _keep(self, u) -> None:
         u = np.asarray(u)
         self.solutions += 1
         if np.all(np.isfinite(u)):
             self.last = u
-
-
-class History:
-    """The designs of a run: give it to `minimise` as `on_step`.
-
-    `densities` has one row per kept step, for `view` or an animation, beside `steps` and
-    `objectives`.
-    """
-
-    def __init__(self, density, every: int = 1):
-        self._density, self._every = density, every
-        self.steps: list[int] = []
-        self.objectives: list[float] = []
-        self._rows: list[np.ndarray] = []
-
-    def __call__(self, step) -> None:
-        if (step.count - 1) % self._every:
-            return
-        self.steps.append(step.count)
-        self.objectives.append(float(step.objective))
-        self._rows.append(np.asarray(self._density(step)))
-
-    @property
-    def densities(self) -> Float[np.ndarray, "kept cells"]:
-        return np.stack(self._rows) if self._rows else np.zeros((0, 0))

@@ -184,8 +184,8 @@ def optimise_pneunet(
     """The chamber that turns the right side most, by moving asymptotes.
 
     The projection becomes steeper over the first six tenths of the steps (`sharpness`), then
-    the move limit falls to a tenth. Densities of a step are
-    `cell.plan(step.design, sharpness(step.count - 1, steps))`.
+    the move limit falls to a tenth, and for the last fifth to a fiftieth. Densities of a step
+    are `cell.plan(step.design, sharpness(step.count - 1, steps))`.
 
     Args:
         cell: Of `pneunet_cell`.
@@ -212,8 +212,9 @@ def optimise_pneunet(
         )  # fmt: skip
 
     scale = 0.01 * float(jnp.sqrt(jnp.sum(cell.plan.volumes)))
-    late, histories = int(0.6 * steps), []
-    for until, method in ((late, MMA(move=move)), (steps, MMA(move=move / 10))):
+    histories = []
+    for share, slower in ((0.6, 1), (0.8, 10), (1.0, 50)):
+        until, method = int(share * steps), MMA(move=move / slower)
         if resume is None or resume.count < until:
             found = run(until, method, resume)
             resume = found.last

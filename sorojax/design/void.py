@@ -25,6 +25,9 @@ from sorojax.material.hyperelastic import (
     strain_energy_density,
 )
 from sorojax.material.kinematics import Entry, Tensor, minus, plus, times
+from sorojax.material.unsplit import StVenantKirchhoff
+
+_KEPT = 0.3  # share of the stiffness of the solid from which a cell is one
 
 
 class InterpolatedEnergy(AbstractHyperelastic):
@@ -75,7 +78,10 @@ class InterpolatedEnergy(AbstractHyperelastic):
 
 @finite_share.register
 def _(material: InterpolatedEnergy):
-    return material.share
+    if not isinstance(material.base, StVenantKirchhoff):
+        return material.share
+    # its energy is finite however far a cell is squeezed: only what is to stay is guarded
+    return jnp.where(material.factor < _KEPT, jnp.zeros_like(material.share), material.share)
 
 
 def interpolated_energy(

@@ -6,6 +6,7 @@ ends: on the walls of the cavity, along their deformed normals, wherever a desig
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -110,10 +111,18 @@ def void_pressure(
     share = real(share)
     count = mesh.num_cells if per == "cell" else mesh.num_nodes
     _check.shape("void_pressure", "share", share, (count,), f"Give one number per {per}.")
-    if per == "node":
-        return VoidPressure(share=share[mesh.cells], value=real(value), name=name)
-    share = jnp.broadcast_to(share[:, None], mesh.cells.shape)
+    share = (_of_nodes if per == "node" else _of_cells)(share, mesh.cells)
     return VoidPressure(share=share, value=real(value), name=name)
+
+
+@jax.jit
+def _of_nodes(share, cells):
+    return share[cells]
+
+
+@jax.jit
+def _of_cells(share, cells):
+    return jnp.broadcast_to(share[:, None], cells.shape)
 
 
 def cell_gradients(

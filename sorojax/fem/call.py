@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
+from sorojax._types import is_traced
 from sorojax.fem.follow import Log, Stats
 from sorojax.fem.newton import Newton
 from sorojax.fem.problem import Problem
@@ -45,12 +46,20 @@ class Solve:
         arrays, self._static = eqx.partition((problem, begin), eqx.is_array)
         leaves, self._tree = jax.tree.flatten(arrays)
         self.leaves = [_strong(leaf) for leaf in leaves]
+        self.traced = [k for k, leaf in enumerate(self.leaves) if is_traced(leaf)]
         self.num_problem_leaves = len(jax.tree.leaves(eqx.filter(problem, eqx.is_array)))
         self.settings = (newton, steps, max_cuts)
         self.shape = problem.mesh.points.shape
         self.num_all_values = problem.space.system.num_values
         self.num_values = self.num_all_values if want_tangent else 0
         self.record = _Record()
+
+    def complete(self, traced) -> list:
+        """All leaves, from those that some transformation acts on."""
+        leaves = list(self.leaves)
+        for k, leaf in zip(self.traced, traced, strict=True):
+            leaves[k] = leaf
+        return leaves
 
     def inputs(self, leaves) -> tuple[Problem, Begin | None]:
         return eqx.combine(jax.tree.unflatten(self._tree, leaves), self._static)
@@ -59,20 +68,25 @@ class Solve:
         return self.inputs(leaves)[0]
 
     def moving(self, leaves, dots) -> tuple[Problem, Problem, Problem]:
-        """The problem in two: the numbers that move and all else, and how they move.
+        """The problem in two: the numbers that move and all else, and how they move; `dots`
+        are those of the traced leaves.
 
         What stays is left out of the derivative, so that it costs nothing.
         """
         count = self.num_problem_leaves
-        moves = [not isinstance(dot, SymbolicZero) for dot in dots[:count]]
-        none = [None] * (len(leaves) - count)
+        moved = {
+            k: dot for k, dot in zip(self.traced, dots, strict=True)
+            if k < count and not isinstance(dot, SymbolicZero)
+        }  # fmt: skip
+        all_leaves = range(len(leaves))
 
-        def pick(values, wanted):
-            kept = [x if m == wanted else None for x, m in zip(values, moves, strict=False)]
-            return jax.tree.unflatten(self._tree, kept + none)[0]
+        def problem(values) -> Problem:
+            return jax.tree.unflatten(self._tree, values)[0]
 
-        rest = eqx.combine(pick(leaves, False), self._static[0])
-        return pick(leaves, True), rest, pick(dots, True)
+        rest = [leaves[k] if k < count and k not in moved else None for k in all_leaves]
+        params = [leaves[k] if k in moved else None for k in all_leaves]
+        rates = [moved.get(k) for k in all_leaves]
+        return problem(params), eqx.combine(problem(rest), self._static[0]), problem(rates)
 
     def with_tangent(self) -> "Solve":
         """The same call, that also returns the tangent; the record is shared."""

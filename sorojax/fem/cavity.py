@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._progress import report
 from sorojax._types import real
 from sorojax.fem.bordered import Border, newton_bordered
 from sorojax.fem.energy_form import load_force, load_potential
@@ -168,6 +169,7 @@ def follow_contents(
             continue
         u, pressures, done, failures = found.u, found.y, goal, 0
         log.steps.append(LoadStep(goal, found.iterations, found.residual, -1))
+        report("contents", done, 1.0, iterations=found.iterations, cuts=log.cuts)
         if found.iterations <= 5:
             size *= 1.5
     return u, pressures

@@ -110,6 +110,7 @@ def continuation(
             walk.locate()
         report("continuation", len(walk.states), max_states, factor=walk.states[-1].factor,
                negative=walk.states[-1].negative_eigenvalues, cuts=walk.cuts)  # fmt: skip
+    report("continuation", 1, 1, factor=walk.states[-1].factor)
     return walk.result()
 
 

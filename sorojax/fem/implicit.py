@@ -2,11 +2,9 @@
 
 One primitive stands for the solve. With concrete numbers it follows the load path on the
 host, lane after lane under `vmap`; inside a trace it becomes the loop of `traced`. Its
-derivative is that of the implicit function: one factor of the tangent at equilibrium and
-one back-substitution for each right-hand side, all of them at once.
+derivative is that of the implicit function (`response`).
 """
 
-import contextlib
 import functools
 from typing import Any
 
@@ -21,21 +19,18 @@ from jax.interpreters import batching, mlir
 
 from sorojax._types import is_traced
 from sorojax.fem.call import Solve
-from sorojax.fem.energy_form import residual
 from sorojax.fem.follow import Log, Start, begin_at, follow
 from sorojax.fem.lanes import scaled_features, solve_lanes
 from sorojax.fem.linear import Linearised, linearise
 from sorojax.fem.problem import Problem
-from sorojax.fem.supports import known_values
+from sorojax.fem.response import Equilibrium, response, response_at_once
 from sorojax.fem.traced import (
     Begin,
     Outcome,
     follow_traced,
-    known_mask,
     prepare_traced,
     with_terms,
 )
-from sorojax.math import sparse
 
 #: Last relative update below which the tangent assembled before it is as good as exact.
 _SHARP = 1e-5
@@ -46,69 +41,54 @@ _equilibrium_p.multiple_results = True
 
 def equilibrium(call: Solve) -> Outcome:
     """Equilibrium of the problem of `call`; the host's record of it is in `call` then."""
-    return Outcome(*_equilibrium(call, call.leaves))
+    return Outcome(*_equilibrium(call, [call.leaves[k] for k in call.traced]))
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _equilibrium(call: Solve, leaves):
+def _equilibrium(call: Solve, traced):
+    leaves = call.complete(traced)
     batched = (False,) * len(leaves)
     return tuple(_equilibrium_p.bind(*leaves, call=call, lead=(), batched=batched))
 
 
 def _derivative(call: Solve, primals, tangents):
-    (leaves,), (dots,) = primals, tangents
-    u, counts, values = _equilibrium(call.with_tangent(), leaves)
-    u_dot = _tangent(call, leaves, dots, u, values)
-    # a state that is no equilibrium has no derivative; a factor keeps the rule linear
-    valid = jnp.where(counts[0] == 0, jnp.ones_like(counts[0]), jnp.nan)
+    (traced,), (dots,) = primals, tangents
+    u, counts, values = _equilibrium(call.with_tangent(), traced)
+    u_dot = _tangent(call, traced, dots, u, counts, values)
     values = values[: call.num_values]
-    return (u, counts, values), (u_dot * valid, 0 * counts, 0 * values)
+    return (u, counts, values), (u_dot, _still(counts), _still(values))
+
+
+def _still(x) -> SymbolicZero:
+    return SymbolicZero(jax.typeof(x).to_tangent_aval())
 
 
 _equilibrium.defjvp(_derivative, symbolic_zeros=True)
 
 
-def _tangent(call: Solve, leaves, dots, u, values):
+def _tangent(call: Solve, traced, dots, u, counts, values):
     """du of R(u, params) = 0, with prescribed displacements moving along."""
-    problem = call.problem(leaves)
-    params, rest, params_dot = call.moving(leaves, dots)
-    system = problem.space.system
-
-    def prescribed(params):
-        return known_values(eqx.combine(params, rest).supports, *u.shape)
-
-    def unbalanced(params, u):
-        return residual(eqx.combine(params, rest), u).ravel()
-
-    _, move = jax.jvp(prescribed, (params,), (params_dot,))
-    directions = (params_dot, move.reshape(u.shape))
-    _, rhs = jax.jvp(unbalanced, (params, u), directions)
+    leaves = call.complete(traced)
+    params, rest, rates = call.moving(leaves, dots)
     if call.settings[0].step_tolerance <= _SHARP:
-        values = _tangent_values(call, leaves, u, values)
+        values = _tangent_values(call, traced, u, values)
     else:
+        problem = call.problem(leaves)
         values = linearise(problem, _prepare_traced(problem), u, u).values
-    # Concrete numbers run one compiled program, not its operations for the trace.
-    concrete = not is_traced((problem, values))
-    with jax.core.eval_context() if concrete else contextlib.nullcontext():
-        known = known_mask(problem.supports, *u.shape)
-        matrix = _fix(system, values, known)
-    rhs = jnp.where(known, jnp.zeros_like(rhs), -rhs)
-    return (sparse.solve(system, matrix, rhs) + move).reshape(u.shape)
-
-
-_fix = jax.jit(sparse.fix)
+    at = Equilibrium(params, rest, u, values, counts[0])
+    return response(at, rates) if is_traced(at) else response_at_once(at, rates)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _tangent_values(call: Solve, leaves, u, values):
+def _tangent_values(call: Solve, traced, u, values):
     """The tangent that the last check of the residual assembled. It differs from the exact
     one by the square of the last update; only its own derivative needs new work."""
     return values
 
 
 def _tangent_values_derivative(call: Solve, primals, tangents):
-    (leaves, u, values), (dots, u_dot, _) = primals, tangents
-    params, rest, params_dot = call.moving(leaves, dots)
+    (traced, u, values), (dots, u_dot, _) = primals, tangents
+    params, rest, params_dot = call.moving(call.complete(traced), dots)
     u_dot = jnp.zeros_like(u) if isinstance(u_dot, SymbolicZero) else u_dot
 
     def assembled(params, u):
@@ -116,7 +96,7 @@ def _tangent_values_derivative(call: Solve, primals, tangents):
         return linearise(problem, _prepare_traced(problem), u, u).values
 
     _, change = jax.jvp(assembled, (params, u), (params_dot, u_dot))
-    return _tangent_values(call, leaves, u, values), change
+    return _tangent_values(call, traced, u, values), change
 
 
 _tangent_values.defjvp(_tangent_values_derivative, symbolic_zeros=True)

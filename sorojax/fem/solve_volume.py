@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._display import displayed, number, outcome
 from sorojax._progress import report
 from sorojax._types import is_traced, real
 from sorojax.fem.cavity import (
@@ -33,6 +34,7 @@ from sorojax.math import sparse
 from sorojax.math.status import Status
 
 
+@displayed
 class CavitySolution(eqx.Module):
     """Equilibrium with the contents of cavities: `problem` has the pressures found, gauge
     [Pa]; `volumes` [m^3] are those of the cavities `names`."""
@@ -45,7 +47,16 @@ class CavitySolution(eqx.Module):
     status: Status
     stats: Stats = eqx.field(static=True)
 
+    def _text(self) -> str:
+        size = jnp.linalg.norm(self.displacement, axis=1).max()
+        rows = [f"CavitySolution: {outcome(self.status)}, largest displacement "
+                f"{number(size, 'm')}"]  # fmt: skip
+        for name, p, volume in zip(self.names, self.pressures, self.volumes, strict=True):
+            rows.append(f"  {name}: {number(p, 'Pa')} in {number(volume, 'm^3')}")
+        return "\n".join(rows)
 
+
+@displayed
 class VolumePath(eqx.Module):
     """Equilibria for a row of volumes [m^3] of one cavity, and its pressures [Pa]."""
 
@@ -59,6 +70,12 @@ class VolumePath(eqx.Module):
 
     def __len__(self) -> int:
         return self.volumes.shape[0]
+
+    def _text(self) -> str:
+        return (
+            f"VolumePath: {len(self)} states, {outcome(self.status)}\n  {self.name} from "
+            f"{number(self.volumes, 'm^3')}, pressure {number(self.pressures, 'Pa')}"
+        )
 
 
 def solve_volume(

@@ -33,6 +33,13 @@ class ContactMidpoint(AbstractStepper):
     Attributes:
         passes: Newton passes per step without contact.
         contact_passes: Newton passes per step near contact.
+        lasting: Start those from the step before instead of from a step without contact:
+            for grasps that last, where few passes then do.
+        theta: Where within a step the other forces, friction and damping act: at 1/2 the rule
+            of the midpoint, at 1 backward Euler, which damps what is faster than the step and
+            would ring in a grip.
+        tolerance: Unbalanced force over contact force at which passes stop, both in the norm
+            of the inverse mass; 0 makes all passes.
 
     Reference:
         Kane, Repetto, Ortiz, Marsden, Finite element analysis of nonsmooth contact, Comput.
@@ -41,69 +48,101 @@ class ContactMidpoint(AbstractStepper):
 
     passes: int = eqx.field(static=True, default=2)
     contact_passes: int = eqx.field(static=True, default=12)
+    lasting: bool = eqx.field(static=True, default=False)
+    theta: float = eqx.field(static=True, default=0.5)
+    tolerance: float = eqx.field(static=True, default=0.0)
 
     def step(self, problem, t, h, state):
         contact = problem.contact
         if contact is None:
             return ImplicitMidpoint(self.passes).step(problem, t, h, state)
         new, moment = state.a, None
+        at = _At(t, h, self.theta * h)
         for _ in range(self.passes):
-            new, moment = _free(problem, t, h, state, new)
+            new, moment = _free(problem, at, state, new)
 
         def touch():
-            return _solve_touching(problem, t, h, state, new, self.contact_passes)
+            first = state.a if self.lasting else new
+            return _solve_touching(problem, at, state, first, self)
 
         new = jax.lax.cond(contact.near(moment, h), touch, lambda: new)
-        half = state.v + h / 2 * new
+        half = state.v + at.part * new
         return Kinematic(move(problem, state.q, h * half), state.v + h * new, new)
 
 
-def _free(problem: SecondOrder, t, h, state: Kinematic, new: Array):
-    """A Newton pass for the mean acceleration, without contact, and the midpoint."""
+class _At(NamedTuple):
+    """A step: its start [s], its length, and the part of it at which most forces act."""
+
+    t: Array
+    h: Array
+    part: Array
+
+
+def _free(problem: SecondOrder, at: _At, state: Kinematic, new: Array):
+    """A Newton pass for the mean acceleration, without contact, and the motion then."""
     assert problem.contact is not None
-    half = state.v + h / 2 * new
-    middle = move(problem, state.q, h / 2 * half)
-    mass, force, moment = problem.contact.free(t + h / 2, middle, half)
-    implicit = mass + h / 2 * problem.damping + h**2 / 4 * problem.stiffness
+    inner = state.v + at.part * new
+    middle = move(problem, state.q, at.part * inner)
+    mass, force, moment = problem.contact.free(at.t + at.part, middle, inner)
+    implicit = mass + at.part * problem.damping + at.part**2 * problem.stiffness
     return new - solve_symmetric(implicit, mass @ new - force), moment
 
 
 class _Search(NamedTuple):
-    """Best mean acceleration so far, the size of its residual, and where to try next."""
+    """Best mean acceleration so far, the size of its residual, where to try next, and
+    whether that is needed."""
 
     best: Array
     size: Array
     direction: Array
     share: Array
+    done: Array
 
 
-def _solve_touching(problem: SecondOrder, t, h, state: Kinematic, new: Array, passes: int):
+def _solve_touching(
+    problem: SecondOrder, at: _At, state: Kinematic, new: Array, method: ContactMidpoint
+):
     """Newton with contact. A pass whose residual is no smaller than the best shortens the
     step instead, as a point that comes and goes would make it cycle."""
 
     def improve(_, search: _Search) -> _Search:
         trial = search.best + search.share * search.direction
-        size, direction = _touching(problem, t, h, state, trial)
+        size, direction, contact = _touching(problem, at, state, trial)
         better = size < search.size
-        accepted = _Search(trial, size, direction, jnp.ones_like(size))
+        done = size <= method.tolerance**2 * contact
+        accepted = _Search(trial, size, direction, jnp.ones_like(size), done)
         shortened = search._replace(share=_SHORTER * search.share)
         return jax.tree.map(lambda a, b: jnp.where(better, a, b), accepted, shortened)
 
     one = jnp.ones((), new.dtype)
-    first = _Search(new, jnp.inf * one, jnp.zeros_like(new), one)
-    return jax.lax.fori_loop(0, passes, improve, first).best
+    first = _Search(new, jnp.inf * one, jnp.zeros_like(new), one, jnp.array(False))
+
+    def unless_done(k, search: _Search) -> _Search:
+        return jax.lax.cond(search.done, lambda: search, lambda: improve(k, search))
+
+    loop = unless_done if method.tolerance > 0 else improve
+    return jax.lax.fori_loop(0, method.contact_passes, loop, first).best
 
 
-def _touching(problem: SecondOrder, t, h, state: Kinematic, new: Array) -> tuple[Array, Array]:
-    """Size of the residual with contact, and the Newton step: normal forces at the end of
-    the step, sliding at its midpoint."""
+def _touching(
+    problem: SecondOrder, at: _At, state: Kinematic, new: Array
+) -> tuple[Array, Array, Array]:
+    """Size of the residual with contact, the Newton step, and the size of the contact
+    forces: normal ones at the end of the step, all others within it."""
     assert problem.contact is not None
-    half = state.v + h / 2 * new
-    middle, end = move(problem, state.q, h / 2 * half), move(problem, state.q, h * half)
-    mass, force, _ = problem.contact.free(t + h / 2, middle, half)
-    contact, stiffness, damping = problem.contact.force(t + h, end, half)
-    implicit = mass + h / 2 * (problem.damping + damping)
-    implicit = implicit + h**2 / 4 * problem.stiffness + h**2 / 2 * stiffness
+    h, part = at.h, at.part
+    inner = state.v + part * new
+    middle, end = move(problem, state.q, part * inner), move(problem, state.q, h * inner)
+    mass, force, _ = problem.contact.free(at.t + part, middle, inner)
+    contact, stiffness, damping = problem.contact.force(at.t + h, end, inner)
+    implicit = mass + part * (problem.damping + damping)
+    implicit = implicit + part**2 * problem.stiffness + part * h * stiffness
     residual = mass @ new - force - contact
-    held = jax.lax.stop_gradient((mass, residual))
-    return held[1] @ solve_symmetric(*held), -solve_symmetric(implicit, residual)
+    solve = solve_symmetric if problem.contact.symmetric else jnp.linalg.solve
+    sizes = [_size(mass, force) for force in (residual, contact)]
+    return sizes[0], -solve(implicit, residual), sizes[1]
+
+
+def _size(mass: Array, force: Array) -> Array:
+    mass, force = jax.lax.stop_gradient((mass, force))
+    return force @ solve_symmetric(mass, force)

@@ -1,8 +1,9 @@
 """Fixed-step integrators, for loops whose cost must be known beforehand."""
 
 import abc
+import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,6 +20,7 @@ from sorojax.math.explicit import (
     rolled_step,
 )
 from sorojax.math.method import Field
+from sorojax.math.told import tell
 
 
 class ContactTerms(NamedTuple):
@@ -28,11 +30,13 @@ class ContactTerms(NamedTuple):
         free: (t, q, v) -> (mass matrix, force without contact, moment).
         near: (moment, h) -> whether a step of `h` about that moment may meet contact.
         force: (t, q, v) -> (force, stiffness, damping) of the contacts.
+        symmetric: Whether those matrices are.
     """
 
     free: Callable[[Array, Array, Array], tuple[Array, Array, Any]]
     near: Callable[[Any, Array], Array]
     force: Callable[[Array, Array, Array], tuple[Array, Array, Array]]
+    symmetric: bool = True
 
 
 class SecondOrder(NamedTuple):
@@ -70,7 +74,17 @@ class Kinematic(NamedTuple):
 
 
 class AbstractStepper(eqx.Module):
-    """A fixed-step method for second-order systems."""
+    """A fixed-step method for second-order systems.
+
+    Attributes:
+        settles: Whether a step of no length finds the acceleration of its state.
+    """
+
+    settles: ClassVar[bool] = False
+
+    def begin(self, problem: SecondOrder, t, q: Array, v: Array) -> Kinematic:
+        """The state to begin with."""
+        return start(problem, t, q, v)
 
     @abc.abstractmethod
     def step(self, problem: SecondOrder, t, h, state: Kinematic) -> Kinematic:
@@ -106,12 +120,14 @@ class GeneralisedAlpha(AbstractStepper):
 
     rho_inf: Float[Array, ""] = eqx.field(converter=real, default=0.5)
     passes: int = eqx.field(static=True, default=2)
+    settles: ClassVar[bool] = True
 
     def step(self, problem, t, h, state):
         rho = self.rho_inf
         am, af = (2 * rho - 1) / (rho + 1), rho / (rho + 1)
         gamma = 1 / 2 + af - am
         beta = (gamma + 1 / 2) ** 2 / 4
+        am = jnp.where(h == 0, 0.0, am)  # nothing of the acceleration before
         q, v, a = state
         leap = h * v + h * h * (1 / 2 - beta) * a
         surge = v + h * (1 - gamma) * a
@@ -139,6 +155,7 @@ class ImplicitMidpoint(AbstractStepper):
     """
 
     passes: int = eqx.field(static=True, default=2)
+    settles: ClassVar[bool] = True
 
     def step(self, problem, t, h, state):
         q, v, a = state
@@ -166,6 +183,7 @@ class TripleJump(AbstractStepper):
     """
 
     passes: int = eqx.field(static=True, default=2)
+    settles: ClassVar[bool] = True
 
     def step(self, problem, t, h, state):
         midpoint, outer = ImplicitMidpoint(self.passes), 1 / (2 - 2 ** (1 / 3))
@@ -179,14 +197,21 @@ class TripleJump(AbstractStepper):
         return state
 
 
-class RungeKutta4(AbstractStepper):
+class AbstractExplicit(AbstractStepper):
+    """Methods that keep no acceleration."""
+
+    def begin(self, problem, t, q, v):
+        return Kinematic(q, v, jnp.zeros_like(v))
+
+
+class RungeKutta4(AbstractExplicit):
     """Classical explicit method of order 4; unstable beyond h omega = 2.8."""
 
     def step(self, problem, t, h, state):
         return _explicit(RK4, problem, t, h, state)
 
 
-class DormandPrince(AbstractStepper):
+class DormandPrince(AbstractExplicit):
     """Explicit method of order 5, for undamped motion at high accuracy."""
 
     def step(self, problem, t, h, state):
@@ -220,23 +245,48 @@ def _explicit(tableau, problem: SecondOrder, t, h, state: Kinematic) -> Kinemati
 def integrate(
     stepper: AbstractStepper,
     problem: SecondOrder,
-    state: Kinematic,
+    q: Array,
+    v: Array,
     *,
     t: Float[Array, ""],
     h: Float[Array, ""],
     saves: int,
     every: int,
+    label: str | None = None,
 ) -> Kinematic:
-    """The states after each of `saves` runs of `every` steps, stacked after the first."""
+    """The first state and those after each of `saves` runs of `every` steps, stacked; with a
+    `label` tells how far it is, about a hundred times."""
+    idle = stepper.settles and saves >= _WORTH_IDLING
+    pause = max(1, saves // 100)
 
-    def advance(carry, _):
+    def advance(carry, number):
+        counts = jnp.ones((), h.dtype) if number is None else (number > 0).astype(h.dtype)
+
         def one(_, carry):
             index, state = carry
-            return index + 1, stepper.step(problem, t + index * h, h, state)
+            return index + counts, stepper.step(problem, t + index * h, counts * h, state)
 
         carry = jax.lax.fori_loop(0, every, one, carry) if every > 1 else one(0, carry)
+        if label is not None and number is not None:
+            due = (number % pause == 0) | (number == saves)
+            tell_share = functools.partial(_tell_share, label, saves)
+            jax.lax.cond(due, tell_share, lambda _: None, number)
         return carry, carry[1]
 
-    begin = (jnp.zeros((), h.dtype), state)
-    _, states = jax.lax.scan(advance, begin, length=saves)
+    none = jnp.zeros((), h.dtype)
+    if idle:
+        # A run of steps of no length finds the first acceleration: equations written out a
+        # second time before the loop would compile for almost as long as the loop.
+        begin, numbers = Kinematic(q, v, jnp.zeros_like(v)), jnp.arange(saves + 1)
+        return jax.lax.scan(advance, (none, begin), numbers)[1]
+    state = stepper.begin(problem, t, q, v)
+    numbers = None if label is None else jnp.arange(1, saves + 1)
+    _, states = jax.lax.scan(advance, (none, state), numbers, length=saves)
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state, states)
+
+
+_WORTH_IDLING = 20  # runs that one more is at most five per cent of
+
+
+def _tell_share(label: str, saves: int, number: Array) -> None:
+    tell(label, number / saves)

@@ -22,6 +22,7 @@ from sorojax.mesh.elements import (
 )
 from sorojax.mesh.enrich import enrich as enrich
 from sorojax.mesh.join import joined as joined
+from sorojax.mesh.lines import between_lines as between_lines, kept as kept
 from sorojax.mesh.locate import Locations as Locations, locate as locate
 from sorojax.mesh.measure import (
     cell_areas as cell_areas,
@@ -33,6 +34,7 @@ from sorojax.mesh.mesh import (
     boundary_facets as boundary_facets,
     valences as valences,
 )
+from sorojax.mesh.mirror import mirrored as mirrored
 from sorojax.mesh.motion import move as move
 from sorojax.mesh.polymesher import polymesher as polymesher
 from sorojax.mesh.quality import Quality as Quality, quality as quality

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from sorojax._progress import report
+
 _STEPS = (0.06, 0.15)  # of the sides: how far a node is tried away from its place
 _WAYS = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=1)
 
@@ -25,6 +27,7 @@ def polish(points, cells, fixed: int, enough: float, rounds: int) -> np.ndarray:
     for turn in range(rounds):
         movers = _independent(cells, angle, fixed, enough, turn, n)
         if not len(movers):
+            report("triangulate", rounds, rounds)
             break
         count = start[movers + 1] - start[movers]
         row = np.repeat(np.arange(len(movers)), count)
@@ -41,6 +44,7 @@ def polish(points, cells, fixed: int, enough: float, rounds: int) -> np.ndarray:
         better = least[best, lines] > least[0] + 1e-9
         points[movers[better]] = places[best, lines][better]
         angle[ball] = least_angles(points[cells[ball]])
+        report("triangulate", turn + 1, rounds, moved=int(better.sum()))
     return points
 
 

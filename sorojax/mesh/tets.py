@@ -40,6 +40,7 @@ def improve(surface: Surface, points, cells, rounds: int, enough: float) -> np.n
     for i in range(rounds):
         movers = _independent(cells, bad, limit, i, surface.features.corner)
         if not len(movers):
+            report("tetrahedralise", rounds, rounds)
             break
         ball, row = _balls(owner, start, movers)
         places = _places(surface, points, cells[ball], row, movers)

@@ -21,3 +21,7 @@ from sorojax.reduction.pod import (
     coordinates as coordinates,
     pod_basis as pod_basis,
 )
+from sorojax.reduction.weight import (
+    OffsetWeight as OffsetWeight,
+    offset_weight as offset_weight,
+)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax._display import displayed, number
 from sorojax.fem.solve import Path
 from sorojax.mesh.locate import Locations, locate
 from sorojax.reduction.curve import AbstractCurve, Line as Line, Reference, reference
@@ -15,6 +16,7 @@ from sorojax.rod.basis import STRAINS
 PLANAR = ("kappa_z", "sigma_x", "sigma_y")
 
 
+@displayed
 class Backbone(eqx.Module):
     """Snapshots of a curve in the frame of its base: x along the curve at rest.
 
@@ -32,6 +34,13 @@ class Backbone(eqx.Module):
     def names(self) -> tuple[str, ...]:
         """Names of the columns of `strain`."""
         return STRAINS if self.strain.shape[-1] == 6 else PLANAR
+
+    def _text(self) -> str:
+        steps, samples, dim = self.positions.shape
+        return (
+            f"Backbone: {steps} snapshots of {samples} samples in {dim} dimensions, length "
+            f"{number(self.length, 'm')}\n  {', '.join(self.names)}"
+        )
 
     @property
     def change(self) -> Float[Array, "steps samples strain"]:

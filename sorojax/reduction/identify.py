@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax._progress import report
 from sorojax._types import real
 from sorojax.fem.linear import linearise, prepare
 from sorojax.fem.loads import Pressure
@@ -134,6 +135,7 @@ def identify(
         here = with_load(problem, path.name, value)
         condensed.append(_condensed_stiffness(here, u, at, basis))
         volumes.append(float(enclosed_volume(problem, u, load.facets)))
+        report("identify", len(volumes), len(p))
     K, C = _affine(p, np.stack(condensed))
     pressure = _pressure_map(p, q, np.array(volumes), K, C, degree)
     return Fit(

@@ -19,8 +19,10 @@ from sorojax.robots.models import (
 from sorojax.robots.models_cell import Cell as Cell, unit_cell as unit_cell
 from sorojax.robots.models_supply import (
     Model as Model,
+    Port as Port,
     Supply as Supply,
     stepper as stepper,
+    supplied as supplied,
 )
 from sorojax.robots.parts import Bellows as Bellows
 from sorojax.robots.planar import PlanarActuator as PlanarActuator

@@ -91,9 +91,9 @@ def crawler_rubbers() -> tuple[AbstractHyperelastic, AbstractHyperelastic]:
     )
 
 
-def crawler_mesh(crawler: Crawler, size: float) -> mesh.Mesh:
-    """Quad8 cells of about `size` [m] between the lines of the drawing, one or more across
-    every wall; region "sole".
+def crawler_mesh(crawler: Crawler, size: float, across: int = 1) -> mesh.Mesh:
+    """Quad8 cells of about `size` [m] between the lines of the drawing, `across` or more
+    across every wall; region "sole".
 
     Raises:
         ValueError: If the size is not above zero.
@@ -106,10 +106,10 @@ def crawler_mesh(crawler: Crawler, size: float) -> mesh.Mesh:
     group = np.stack([start, start + float(crawler.chamber_width)], axis=1).ravel()
     spacing = float(crawler.group_spacing)
     walls = [group + k * spacing for k in range(len(PORTS))]
-    x = _divided(np.concatenate([[0.0], *walls, [float(crawler.length)]]), size)
+    x = _divided(np.concatenate([[0.0], *walls, [float(crawler.length)]]), size, across)
     top = float(crawler.base + crawler.chamber_height)
     marks = [0.0, float(crawler.sole_thickness), float(crawler.base), top]
-    y = _divided(np.array([*marks, float(crawler.height)]), size)
+    y = _divided(np.array([*marks, float(crawler.height)]), size, across)
     grid = mesh.rectangle(
         [0, 0], [len(x) - 1, len(y) - 1], divisions=(len(x) - 1, len(y) - 1),
         element=mesh.Quad8(),
@@ -129,9 +129,9 @@ def crawler_mesh(crawler: Crawler, size: float) -> mesh.Mesh:
     return mesh.Mesh(points[used], cells, mesh.Quad8(), regions={"sole": sole})
 
 
-def _divided(lines: np.ndarray, size: float) -> np.ndarray:
+def _divided(lines: np.ndarray, size: float, least: int) -> np.ndarray:
     """`lines` [m] with more between them, at most about `size` apart."""
-    counts = np.maximum(1, np.round(np.diff(lines) / size).astype(int))
+    counts = np.maximum(least, np.round(np.diff(lines) / size).astype(int))
     at = zip(lines[:-1], lines[1:], counts, strict=True)
     parts = [np.linspace(a, b, n, endpoint=False) for a, b, n in at]
     return np.concatenate([*parts, lines[-1:]])
@@ -141,6 +141,7 @@ def crawler_problem(
     crawler: Crawler,
     *,
     size: float,
+    across: int = 1,
     rubbers: tuple[AbstractHyperelastic, AbstractHyperelastic] | None = None,
     friction: float = 0.6,
     depth: float = 40 * mm,
@@ -151,14 +152,15 @@ def crawler_problem(
 
     Args:
         crawler: Its dimensions; concrete.
-        size: Length of the sides of its cells [m]; walls hold one or more across.
+        size: Length of the sides of its cells [m].
+        across: Cells across a wall at least.
         rubbers: Of body and sole, of one class; `crawler_rubbers()` when omitted.
         friction: Coulomb coefficient of sole and floor [-].
         depth: Width across the plane of the side view [m].
         stiffness: Of the contact with the floor [Pa/m]. It carries a body so light that the
             default of `fem.Contact` would be a thousand times more than needed.
     """
-    cells = crawler_mesh(crawler, size)
+    cells = crawler_mesh(crawler, size, across)
     soft, stiff = crawler_rubbers() if rubbers is None else rubbers
     rubber = by_region(cells.num_cells, cells.regions, soft, {"sole": stiff})
     side = float(crawler.length)

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 from sorojax._types import real
 from sorojax.material import AbstractHyperelastic
 from sorojax.robots.models_grid import Grid, cut_grid
+from sorojax.robots.models_series import energy_series
 from sorojax.sdf import AbstractSdf
 
 _SAME = 1e-6  # of the extent: coordinates that are equal
@@ -34,6 +35,9 @@ class Cell(eqx.Module):
         solid: Volume of the solid [m^2].
         second_moments: Integrals of y^2 and z^2 over the solid [m^4].
         center: Axis (y, z), through the centroid of the solid [m].
+        third, fourth: Derivatives of the energy in stretch e and pressure p beyond the linear
+            answer, eee [N], eep [m^2], epp, ppp and eeee [N], eeep [m^2] and so on: the force
+            is the linear one and (eee e^2 + 2 eep e p + epp p^2) / 2 and so on.
     """
 
     stiffness: Float[Array, "3 3"] = eqx.field(converter=real)
@@ -43,6 +47,8 @@ class Cell(eqx.Module):
     solid: Float[Array, ""] = eqx.field(converter=real)
     second_moments: Float[Array, "2"] = eqx.field(converter=real)
     center: Float[Array, "2"] = eqx.field(converter=real)
+    third: Float[Array, "4"] = eqx.field(converter=real, default=(0.0,) * 4)
+    fourth: Float[Array, "5"] = eqx.field(converter=real, default=(0.0,) * 5)
 
 
 def unit_cell(
@@ -54,7 +60,9 @@ def unit_cell(
     size: float,
     mirrors: tuple[int, ...] = (),
 ) -> Cell:
-    """The half period of `body` between x = `span[0]` and `span[1]` [m], small strains.
+    """The half period of `body` between x = `span[0]` and `span[1]` [m].
+
+    Small strains; of bodies with both mirrors, which stretch without bending, two terms more.
 
     Args:
         body: The solid, symmetric about both planes.
@@ -82,7 +90,15 @@ def unit_cell(
     stiffness = np.array([[np.sum(f * u) for u in answers] for f in forces]) * even
     push = [0.0 if parity else np.sum(grid.swelling * u)
             for parity, u in zip(odd, answers, strict=True)]  # fmt: skip
-    whole = 2.0 ** len(mirrors) / length
+    whole, third, fourth = 2.0 ** len(mirrors) / length, np.zeros(4), np.zeros(5)
+    if len(mirrors) == 2:
+        # a pressure of which the walls store as much as of a unit strain
+        scale = np.sqrt(stiffness[0, 0] / np.sum(grid.swelling * bulge))
+        third, fourth = energy_series(
+            grid, material, (answers[0], scale * bulge), (0.0, scale),
+            lambda load: grid.displacement(held[0], none, load),
+        )  # fmt: skip
+        third, fourth = third / scale ** np.arange(4), fourth / scale ** np.arange(5)
     return Cell(
         stiffness=whole * stiffness,
         push=whole * np.array(push),
@@ -91,6 +107,8 @@ def unit_cell(
         solid=whole * volume,
         second_moments=whole * second,
         center=center,
+        third=whole * third,
+        fourth=whole * fourth,
     )
 
 

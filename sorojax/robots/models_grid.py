@@ -33,6 +33,7 @@ class Grid(NamedTuple):
         swelling: Volume of the gas per displacement of the nodes [m^2].
         gas: Volume of the gas [m^3].
         volumes, places: Samples of the solid [m^3], [m].
+        pieces: The same samples, and those of the gas, by boxes.
     """
 
     points: Float[np.ndarray, "nodes 3"]
@@ -43,6 +44,7 @@ class Grid(NamedTuple):
     gas: float
     volumes: Float[np.ndarray, " samples"]
     places: Float[np.ndarray, "samples 3"]
+    pieces: tuple["Piece", ...]
 
     def force(self, u: Float[np.ndarray, "nodes 3"]) -> Float[np.ndarray, "nodes 3"]:
         """Internal force [N] of a displacement [m]."""
@@ -69,13 +71,22 @@ class Grid(NamedTuple):
         return factor.solve(rhs.ravel()).reshape(move.shape) + move
 
 
-class _Samples(NamedTuple):
+class Samples(NamedTuple):
     """Points of the reference box, what a box of these edges answers at each of them."""
 
     at: Float[np.ndarray, "points 3"]
     modes: Float[np.ndarray, "points 4"]
     gradient: Float[np.ndarray, "points dofs"]
     shear: Float[np.ndarray, "points upper"]
+
+
+class Piece(NamedTuple):
+    """Boxes whose samples are `solid` and `gas` [m^3], None where there is none of it."""
+
+    cells: Int[np.ndarray, "boxes 27"]
+    samples: Samples
+    solid: Float[np.ndarray, "boxes points"] | None
+    gas: Float[np.ndarray, "boxes points"] | None
 
 
 def cut_grid(
@@ -101,7 +112,7 @@ def cut_grid(
     solid, gas = (_filled(shape, start, edges) for shape in (body, air))
     cut = np.flatnonzero((solid == 0) | (gas == 0))
     active, swelling = solid > 0, np.zeros(points.size)
-    volumes, places, content = [], [], 0.0
+    volumes, places, pieces, content = [], [], [], 0.0
     rows = {}
     for at in range(0, len(cut), _BLOCK):
         some = cut[at : at + _BLOCK]
@@ -117,16 +128,22 @@ def cut_grid(
             rows[box] = row + _VOID * matrix
         empty = (1 - air_share) * np.prod(edges) / _FINE**3
         # the exact whole less what is sampled as solid: nodes in the gas then feel nothing
-        own = (swell - empty @ fine.gradient) * np.any(air_share > 0, axis=1, keepdims=True)
+        holds = np.any(air_share > 0, axis=1, keepdims=True)
+        own = (swell - empty @ fine.gradient) * holds
         np.add.at(swelling, _dofs(cells[some]), own)
+        pieces.append(Piece(cells[some], fine, part * some_solid[:, None], -empty * holds))
+        pieces.append(_all_gas(cells[some[holds[:, 0]]], exact, whole))
         content += float(np.sum(np.prod(edges) - empty.sum(axis=1)))
         volumes.append(part[part > 0])
         places.append(place[part > 0])
     full_gas = np.flatnonzero((gas > 0) & (solid < 0))
     np.add.at(swelling, _dofs(cells[full_gas]), np.tile(swell, (len(full_gas), 1)))
+    pieces.append(_all_gas(cells[full_gas], exact, whole))
     full = (solid > 0) & (gas != 0)
     inner = start[full][:, None] + exact.at * edges
-    volumes.append(np.broadcast_to(whole, inner.shape[:2]).ravel())
+    filled = np.broadcast_to(whole, inner.shape[:2])
+    pieces.append(Piece(cells[full], exact, filled, None))
+    volumes.append(filled.ravel())
     places.append(inner.reshape(-1, 3))
     boxes = np.flatnonzero(active)
     system = sparse.from_cells(len(points), cells[boxes], 3)
@@ -138,8 +155,12 @@ def cut_grid(
     return Grid(
         points, used, system, values, swelling.reshape(-1, 3),
         content + float(len(full_gas) * np.prod(edges)), np.concatenate(volumes),
-        np.concatenate(places),
+        np.concatenate(places), tuple(pieces),
     )  # fmt: skip
+
+
+def _all_gas(cells, exact: Samples, whole) -> Piece:
+    return Piece(cells, exact, None, np.broadcast_to(whole, (len(cells), whole.shape[1])))
 
 
 def _boxes(counts, lower, edges) -> tuple[Int[np.ndarray, "boxes 27"], np.ndarray]:
@@ -157,7 +178,7 @@ def _dofs(cells) -> np.ndarray:
     return (3 * cells[..., None] + np.arange(3)).reshape(len(cells), 3 * cells.shape[1])
 
 
-def _samples(line: np.ndarray, edges: np.ndarray) -> _Samples:
+def _samples(line: np.ndarray, edges: np.ndarray) -> Samples:
     at = np.stack(np.meshgrid(*[line] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     values = np.stack([(1 - at) * (1 - 2 * at), 4 * at * (1 - at), at * (2 * at - 1)])
     slopes = np.stack([4 * at - 3, 4 - 8 * at, 4 * at - 1]) / edges
@@ -174,10 +195,10 @@ def _samples(line: np.ndarray, edges: np.ndarray) -> _Samples:
     size = 3 * gradient.shape[1]
     law = law.reshape(len(at), size, size)[:, *np.triu_indices(size)]
     modes = np.concatenate([np.ones((len(at), 1)), 2 * at - 1], axis=1)
-    return _Samples(at, modes, gradient.reshape(len(at), -1), law)
+    return Samples(at, modes, gradient.reshape(len(at), -1), law)
 
 
-def _matrices(samples: _Samples, volumes, shear: float, bulk: float) -> np.ndarray:
+def _matrices(samples: Samples, volumes, shear: float, bulk: float) -> np.ndarray:
     """Upper triangles of boxes whose samples have these volumes [m^3]."""
     seen = np.einsum("cq,qm,qd->cmd", volumes, samples.modes, samples.gradient, optimize=True)
     gram = np.einsum("cq,qm,qn->cmn", volumes, samples.modes, samples.modes, optimize=True)

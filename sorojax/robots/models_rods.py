@@ -38,6 +38,8 @@ class Bundle(eqx.Module):
         push: Of each chamber.
         gas, compliance: Of each chamber, per length.
         solid, second_moments: Of all columns.
+        arms: Stretch of each column per strain of the middle.
+        third, fourth: Of each column, as in `Cell`; None where the answer is linear.
     """
 
     stiffness: Float[Array, "3 3"]
@@ -46,14 +48,17 @@ class Bundle(eqx.Module):
     compliance: Float[Array, " ports"]
     solid: Float[Array, ""]
     second_moments: Float[Array, "2"]
+    arms: Float[Array, "ports 3"]
     shear: Float[Array, "2"] | None = None
+    third: Float[Array, "4"] | None = None
+    fourth: Float[Array, "5"] | None = None
 
 
 def column(cell: Cell) -> Bundle:
-    """One column."""
+    """One column, with linear answers."""
     return Bundle(
         cell.stiffness, cell.push[None], cell.gas[None], cell.compliance[None], cell.solid,
-        cell.second_moments,
+        cell.second_moments, jnp.eye(1, 3, dtype=cell.push.dtype),
     )  # fmt: skip
 
 
@@ -62,6 +67,7 @@ def side_by_side(cell: Cell, places: Float[Array, "columns 2"], length) -> Bundl
 
     All have the curvature of the middle, and its strain at their place. A shift of one end
     bends each column to an S: 12 EI / L^2 per column, exact for ends that alone are loaded.
+    Large stretches and pressures count along the columns, not in how these bend.
     """
     places, count = real(places), len(places)
     rows = jnp.zeros((count, 3, 3), places.dtype).at[:].set(jnp.eye(3, dtype=places.dtype))
@@ -75,27 +81,58 @@ def side_by_side(cell: Cell, places: Float[Array, "columns 2"], length) -> Bundl
         compliance=jnp.broadcast_to(cell.compliance, (count,)),
         solid=count * cell.solid,
         second_moments=count * cell.second_moments + cell.solid * square,
+        arms=rows[:, 0],
         shear=count * 12 * bending / real(length) ** 2,
+        third=cell.third,
+        fourth=cell.fourth,
     )
 
 
+class Stretched(eqx.Module):
+    """What columns store beyond linear answers, at the nodes of a rod.
+
+    Attributes:
+        rows: Stretch of each column per coordinate, at every node.
+        weights: Of the nodes [m].
+        third, fourth: As in `Cell`.
+    """
+
+    rows: Float[Array, "ports nodes dof"]
+    weights: Float[Array, " nodes"]
+    third: Float[Array, "4"]
+    fourth: Float[Array, "5"]
+
+    def energy(self, q, pressure) -> Array:
+        """Less pressure times volume [J]."""
+        e, p = self.rows @ q, pressure[:, None]
+        a, b, c, d = self.third / 6
+        f, g, h, k, m = self.fourth / 24
+        cubic = a * e**3 + 3 * b * e**2 * p + 3 * c * e * p**2 + d * p**3
+        quartic = f * e**4 + 4 * g * e**3 * p + 6 * h * e**2 * p**2 + 4 * k * e * p**3
+        return jnp.sum((cubic + quartic + m * p**4) @ self.weights)
+
+
 class Chambers(AbstractPressureMap):
-    """Gas in the cells of a rod: W = p . (volume + push q) + compliance p^2 / 2.
+    """Gas in the cells of a rod: W = p . (volume + push q) + compliance p^2 / 2, and what
+    large stretches and pressures take from it.
 
     Attributes:
         push: Change of volume per coordinate.
         rest: Volume at rest [m^3].
         compliance: Of the walls at held strain [m^3/Pa].
+        beyond: None where the answer is linear.
     """
 
     push: Float[Array, "ports dof"]
     rest: Float[Array, " ports"]
     compliance: Float[Array, " ports"]
     ports: tuple[int, ...] = eqx.field(static=True)
+    beyond: Stretched | None = None
 
     def coenergy(self, q, pressure):
         p = jnp.atleast_1d(pressure)
-        return p @ (self.rest + self.push @ q) + jnp.sum(self.compliance * p**2) / 2
+        linear = p @ (self.rest + self.push @ q) + jnp.sum(self.compliance * p**2) / 2
+        return linear if self.beyond is None else linear - self.beyond.energy(q, p)
 
 
 class Body(NamedTuple):
@@ -143,10 +180,14 @@ def body(
     stiffness = jnp.einsum("aqi,ab,bqj,q->ij", rows, law[np.ix_(at, at)], rows, weights)
     push = jnp.einsum("pb,bqj,q->pj", bundle.push @ turn[:3][:, at], rows, weights)
     ports = () if single and len(bundle.gas) == 1 else (len(bundle.gas),)
-    span = real(length)
+    span, beyond = real(length), None
+    if bundle.third is not None and bundle.fourth is not None:
+        along = jnp.einsum("pb,bqj->pqj", bundle.arms @ turn[:3][:, at], rows)
+        beyond = Stretched(along, weights, bundle.third, bundle.fourth)
     chambers = Chambers(
-        push=push, rest=span * bundle.gas, compliance=span * bundle.compliance, ports=ports
-    )
+        push=push, rest=span * bundle.gas, compliance=span * bundle.compliance, ports=ports,
+        beyond=beyond,
+    )  # fmt: skip
     lossy = ConstantDamping(real(damping) * stiffness)
     return Body(made, (LinearElastic(stiffness), lossy), chambers)
 

@@ -10,17 +10,20 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import real
-from sorojax.math.method import AbstractMethod, repeat
+from sorojax.math.method import AbstractMethod, finite, repeated
 from sorojax.rod import Assembly
-from sorojax.rod.loads import Load
 from sorojax.systems import (
+    AbstractBlock,
     AssemblyBody,
+    Coupled,
+    FemBody,
     Network,
     Regulator,
     Reservoir,
     Rosenbrock2,
     sum_of,
 )
+from sorojax.systems.march import Rate
 
 
 class Supply(eqx.Module):
@@ -52,7 +55,7 @@ class Port(NamedTuple):
     """One or several equal regulators and what they feed.
 
     Attributes:
-        parts: Rods whose chambers it fills together.
+        parts: Rods, or chambers of a block, that it fills together.
         volume: Gas in all of them at rest [m^3], one number or one per regulator.
         low, high: Gauge pressures that they bear [Pa].
         count: Number of regulators of a rod with that many chambers; None for one.
@@ -110,10 +113,18 @@ class Model(eqx.Module):
 
 
 def supplied(
-    assembly: Assembly, forces: tuple[Load, ...], ports: Mapping[str, Port], supply: Supply
+    body: AbstractBlock, ports: Mapping[str, Port], supply: Supply | None = None
 ) -> Model:
-    """The assembly with a reservoir and a regulator at every port."""
-    blocks: dict[str, Any] = {"body": AssemblyBody(assembly, forces)}
+    """A body with a reservoir and a regulator at every port.
+
+    Args:
+        body: An `AssemblyBody`, a `FemBody`, or any block that takes `PART_pressure` and tells
+            `PART_volume` and `PART_volume_rate` of every part that a port names.
+        ports: By name.
+        supply: Tubes and regulators; `Supply()` if omitted.
+    """
+    supply = Supply() if supply is None else supply
+    blocks: dict[str, Any] = {"body": body}
     wires: dict[str, str] = {}
     for name, port in ports.items():
         dead = supply.tube_volume + port.dead
@@ -132,7 +143,11 @@ def supplied(
         for kind, unit in (
             ("volume", "m^3"), ("volume_rate", "m^3/s"), ("compliance", "m^3/Pa")
         ):  # fmt: skip
-            sources = [f"body.{part}_{kind}" for part in port.parts]
+            sources = [
+                f"body.{part}_{kind}" for part in port.parts if f"{part}_{kind}" in body.outputs
+            ]
+            if not sources:  # solids have no compliance of their own
+                continue
             if len(sources) > 1:
                 blocks[f"{name}_{kind}"] = sum_of([1.0] * len(sources), unit=unit)
                 for letter, source in zip("abcdefgh", sources, strict=False):
@@ -149,17 +164,24 @@ def supplied(
 
 
 class Running(NamedTuple):
-    """A model at one moment: the state of its network and the memory of the method."""
+    """A model at one moment: the state of its network, the memory of the method, and for how
+    many calls it has had that."""
 
     state: Any
     memory: Any
+    age: int = 0
 
 
 Advance = Callable[[Running, Any, float], tuple[Running, Array]]
 
 
 def stepper(
-    model: Model, period: float, *, substeps: int = 2, method: AbstractMethod | None = None
+    model: Model,
+    period: float,
+    *,
+    substeps: int = 2,
+    renew: int = 4,
+    method: AbstractMethod | None = None,
 ) -> tuple[Advance, Running]:
     """The model as something that a valve board drives: `advance(running, setpoint, dt) ->
     (running, pressures [Pa])`, compiled, and where it starts.
@@ -168,35 +190,50 @@ def stepper(
         model: The robot.
         period: Of every call [s].
         substeps: Steps of the method in one.
-        method: `Rosenbrock2(refresh=True)` if omitted.
+        renew: Calls that share a Jacobian, of methods that may use an old one.
+        method: `Coupled()` for finite elements, `Rosenbrock2(refresh=True)` for others, if
+            omitted.
+
+    Raises:
+        RuntimeError: By `advance`, if a step does not converge.
     """
-    method = Rosenbrock2(refresh=True) if method is None else method
+    method = _method(model.network) if method is None else method
     _check.positive("stepper", "period", period, "s", "5 ms is period=5e-3.")
     h, zero = real(period / substeps), jnp.zeros(())
 
-    def field(model, setpoint):
-        inputs = model.inputs(setpoint)
-        return lambda t, y: model.network.vector_field(t, y, inputs)
+    @eqx.filter_jit
+    def begin(model, state, setpoint):
+        return method.begin(Rate(model.network, model.inputs(setpoint)), zero, state, h)
 
     @eqx.filter_jit
-    def begin(model, setpoint):
-        state = model.network.initial_state()
-        return Running(state, method.begin(field(model, setpoint), zero, state, h))
-
-    @eqx.filter_jit
-    def move(model, running, setpoint):
-        rate = field(model, setpoint)
-        memory = running.memory if method.keeps else None
-        state = repeat(method, rate, zero, running.state, h, substeps, memory)
-        return Running(state, running.memory), model.pressure(state)
+    def move(model, state, memory, setpoint):
+        rate = Rate(model.network, model.inputs(setpoint))
+        state, memory, good = repeated(method, rate, zero, state, h, substeps, memory)
+        return state, memory, model.pressure(state), good & finite(state)
 
     def advance(running, setpoint, dt):
         if abs(dt - period) > 1e-9 * period:
             raise ValueError(
                 f"stepper: asked for {dt:g} s, made for {period:g} s. Make one for this step."
             )
-        return move(model, running, jnp.asarray(setpoint, h.dtype))
+        state, memory, age = running
+        asked = jnp.asarray(setpoint, h.dtype)
+        if age >= renew and not (method.keeps or method.carries):
+            memory, age = begin(model, state, asked), 0
+        state, memory, pressure, good = move(model, state, memory, asked)
+        if not good:
+            raise RuntimeError(
+                f"stepper: the robot does not get through {period:g} s at set-points of "
+                f"{np.asarray(setpoint)} Pa. Make more `substeps`."
+            )
+        return Running(state, memory, age + 1), pressure
 
-    start = begin(model, jnp.zeros(len(model.low)))
-    advance(start, np.zeros(len(model.low)), period)  # compiles
+    state, none = model.network.initial_state(), jnp.zeros(len(model.low))
+    start = Running(state, begin(model, state, none))
+    advance(start, none, period)  # compiles
     return advance, start
+
+
+def _method(network: Network) -> AbstractMethod:
+    solid = any(isinstance(block, FemBody) for block in network.blocks.values())
+    return Coupled() if solid else Rosenbrock2(refresh=True)

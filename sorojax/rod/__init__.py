@@ -88,6 +88,10 @@ from sorojax.rod.kinematics import (
 from sorojax.rod.link import (
     Link as Link,
 )
+from sorojax.rod.link_contact import (
+    LinkContact as LinkContact,
+    LinkObstacle as LinkObstacle,
+)
 from sorojax.rod.loads import (
     AbstractPairForce as AbstractPairForce,
     Between as Between,
@@ -151,6 +155,7 @@ from sorojax.rod.routing import (
     thread_lengths as thread_lengths,
     thread_rates as thread_rates,
 )
+from sorojax.rod.screw import Screw as Screw
 from sorojax.rod.section import (
     Section as Section,
     scaled as scaled,
@@ -207,6 +212,9 @@ from sorojax.rod.tree import (
     AssemblyMotion as AssemblyMotion,
     AssemblyOperators as AssemblyOperators,
     part_motion as part_motion,
+)
+from sorojax.rod.varying import (
+    Varying as Varying,
 )
 from sorojax.rod.wrench import (
     LineWrench as LineWrench,

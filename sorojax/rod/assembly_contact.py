@@ -10,10 +10,13 @@ from sorojax.math.steppers import ContactTerms
 from sorojax.rod.assembly import index_of
 from sorojax.rod.contact_force import AbstractContact
 from sorojax.rod.contact_terms import contact_terms, has_contact, near, travel
+from sorojax.rod.link_contact import LinkContact
 from sorojax.rod.loads import Between, Load, On, check, total_force
 from sorojax.rod.rod import Rod
-from sorojax.rod.rod_contact import RodContact, rod_of
+from sorojax.rod.rod_contact import RodContact
 from sorojax.rod.tree import AssemblyMotion, part_columns, part_motion
+
+PAIRS = (RodContact, LinkContact)
 
 
 def contacts_of(
@@ -45,8 +48,8 @@ def contacts_of(
         answers = []
         for parts, contact in where:
             bodies = [part_motion(moment, k) for k in parts]
-            if isinstance(contact, RodContact):
-                margin = travel(rod_of(bodies[0]), h) + travel(rod_of(bodies[1]), h)
+            if isinstance(contact, PAIRS):
+                margin = travel(bodies[0], h) + travel(bodies[1], h)
                 answers.append(contact.is_near(*bodies, margin))
             else:
                 answers.append(near((contact,), bodies[0], h))
@@ -67,7 +70,8 @@ def contacts_of(
             )
         return tuple(_sum(parts) for parts in zip(*terms, strict=True))
 
-    return ContactTerms(free, is_near, force)
+    grips = any(isinstance(contact, LinkContact) for _, contact in where)
+    return ContactTerms(free, is_near, force, symmetric=not grips)
 
 
 def any_contact(forces: tuple[Load, ...]) -> bool:
@@ -77,7 +81,7 @@ def any_contact(forces: tuple[Load, ...]) -> bool:
 
 def _is_contact(force: Load) -> bool:
     inner = force.force if isinstance(force, On | Between) else force
-    return isinstance(inner, AbstractContact | RodContact)
+    return isinstance(inner, (AbstractContact, *PAIRS))
 
 
 def _parts(model: Any, force: On | Between) -> tuple[int, ...]:

@@ -90,6 +90,20 @@ def tangent(
     return _square(normal_rows, weights * stiffness), viscous
 
 
+def coupling(law: LinePenalty, touch: Touch) -> Float[Array, "dof dof"] | float:
+    """What friction adds to the stiffness as it grows with pressure; not symmetric."""
+    if law.friction is None:
+        return 0.0
+    velocity = _velocity(law, touch)
+    sliding, size = _sliding(touch, velocity)
+    approach = law.approach(jnp.sum(touch.normal * velocity, axis=1))
+    growth = touch.weights * law.slope(touch.gap) * approach * size
+    load = law.drag(growth, sliding)[:, None] * sliding
+    across = jnp.sum(_surface_rows(touch) * load[:, :, None], axis=1)
+    along = _rows(touch, lambda side: side.points.linear_jacobian, touch.normal)
+    return -(across.T @ along)
+
+
 def _friction_square(touch: Touch, normal_rows, size, drag) -> Array:
     """Square of the sliding velocity per rate: of the whole, less that of its normal part."""
     rows = _surface_rows(touch)

@@ -17,7 +17,6 @@ from sorojax.math.steppers import (
     GeneralisedAlpha,
     SecondOrder,
     integrate,
-    start,
 )
 from sorojax.rod.assembly import is_flat, rate, retract
 from sorojax.rod.assembly_contact import any_contact, contacts_of
@@ -54,6 +53,7 @@ def rollout(
     every: int = 1,
     t=0.0,
     stepper: AbstractStepper | None = None,
+    progress: bool = False,
 ) -> Rollout:
     """Move the model from (q, v) by `saves * every` steps.
 
@@ -69,17 +69,20 @@ def rollout(
         stepper: `GeneralisedAlpha()` by default, `ContactMidpoint()` if a contact is among
             the forces; `RungeKutta4()` or `DormandPrince()` for undamped motion at high
             accuracy.
+        progress: Report progress while running; of rods under `vmap` in one report.
     """
     if stepper is None:
         stepper = ContactMidpoint() if any_contact(forces) else GeneralisedAlpha()
-    return _rollout(model, q, v, forces, real(step), real(t), stepper, saves, every)
+    label = "rollout" if progress else None
+    return _rollout(model, q, v, forces, real(step), real(t), stepper, saves, every, label)
 
 
 @eqx.filter_jit
-def _rollout(model, q, v, forces, step, t, stepper, saves, every) -> Rollout:
+def _rollout(model, q, v, forces, step, t, stepper, saves, every, label) -> Rollout:
     problem = second_order(model, q, forces)
-    begin = start(problem, t, q, v)
-    path = integrate(stepper, problem, begin, t=t, h=step, saves=saves, every=every)
+    path = integrate(
+        stepper, problem, q, v, t=t, h=step, saves=saves, every=every, label=label
+    )  # fmt: skip
     fine = jnp.all(jnp.isfinite(path.q)) & jnp.all(jnp.isfinite(path.v))
     status = Status.where(fine, Status.successful, Status.not_finite)
     time = t + step * every * jnp.arange(saves + 1, dtype=step.dtype)

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from sorojax._progress import report
 from sorojax.sdf.base import AbstractSdf, cast
 from sorojax.sdf.sample import finite_box, raise_empty, values
 
@@ -125,12 +126,14 @@ def leaf_fields(
     A group has `least` blocks or more, and all that have the same first coordinate.
     """
     groups = _groups(blocks, least)
+    done = 0
     field = _sampled(shape, grid, groups[0])
     for now, ahead in zip(groups, [*groups[1:], groups[0][:0]], strict=True):
         next_field = _sampled(shape, grid, ahead)
         _share(grid, now, field, ahead, next_field)
         yield now, field
-        field = next_field
+        field, done = next_field, done + len(now)
+        report("isosurface", done, len(blocks))
 
 
 def _groups(blocks: np.ndarray, least: int) -> list[np.ndarray]:

@@ -56,9 +56,13 @@ def _crossing(vertices, triangles, first, second) -> np.ndarray:
     near &= (q.min(axis=1) <= p.max(axis=1)).all(axis=1)
     first, second, p, q = first[near], second[near], p[near], q[near]
     hit = np.zeros(len(first), bool)
+    both = np.concatenate([p, q], axis=1)
+    reach = np.ptp(both, axis=1).max(axis=1, initial=0.0)
+    # of a volume, from coordinates that are rounded: triangles in one plane are no crossing
+    rounding = 16 * np.finfo(float).eps * np.abs(both).max(axis=(1, 2), initial=0.0) * reach**2
     for k in range(3):
-        hit |= _pierces(p[:, k], p[:, (k + 1) % 3], q)
-        hit |= _pierces(q[:, k], q[:, (k + 1) % 3], p)
+        hit |= _pierces(p[:, k], p[:, (k + 1) % 3], q, rounding)
+        hit |= _pierces(q[:, k], q[:, (k + 1) % 3], p, rounding)
     return np.sort(np.stack([first[hit], second[hit]], axis=1), axis=1)
 
 
@@ -67,13 +71,14 @@ def _volume(a, b, c, d) -> np.ndarray:
     return (np.cross(b - a, c - a) * (d - a)).sum(axis=1)
 
 
-def _pierces(start, end, triangle) -> np.ndarray:
+def _pierces(start, end, triangle, rounding) -> np.ndarray:
     """Whether segments pass through the inside of triangles (n, 3, 3)."""
     a, b, c = triangle[:, 0], triangle[:, 1], triangle[:, 2]
-    across = _volume(a, b, c, start) * _volume(a, b, c, end) < 0
+    ends = _volume(a, b, c, start), _volume(a, b, c, end)
+    across = (np.minimum(*ends) < -rounding) & (np.maximum(*ends) > rounding)
     sides = [_volume(start, end, u, v) for u, v in ((a, b), (b, c), (c, a))]
     least, most = np.minimum.reduce(sides), np.maximum.reduce(sides)
-    return across & ((least > 0) | (most < 0))
+    return across & ((least > rounding) | (most < -rounding))
 
 
 def least_wall(vertices: np.ndarray, triangles: np.ndarray) -> float:

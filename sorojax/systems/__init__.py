@@ -22,6 +22,7 @@ from sorojax.systems.block import (
     Input as Input,
     Output as Output,
 )
+from sorojax.systems.control_force import ControlForce as ControlForce
 from sorojax.systems.controller import (
     PID as PID,
     AbstractController as AbstractController,
@@ -50,6 +51,7 @@ from sorojax.systems.network import (
     as_term as as_term,
     outputs as outputs,
 )
+from sorojax.systems.partitioned import Parted as Parted, partitioned as partitioned
 from sorojax.systems.rigid_body import RigidBody as RigidBody, Touch as Touch
 from sorojax.systems.rod_body import RodBody as RodBody, body_motion as body_motion
 from sorojax.systems.sampled import (
@@ -83,3 +85,4 @@ from sorojax.systems.source import (
 )
 from sorojax.systems.stack import Stack as Stack, stack as stack
 from sorojax.systems.valve import Valve as Valve
+from sorojax.systems.waypoints import Waypoints as Waypoints

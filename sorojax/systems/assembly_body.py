@@ -98,16 +98,19 @@ class AssemblyBody(AbstractBlock):
         return tip_pose(self.assembly, q)[name.removesuffix("_position")][:-1, -1]
 
     def vector_field(self, t, state, inputs):
-        q, v = state["q"], state["v"]
+        q, v, constants = state["q"], state["v"], operators(self.assembly)
+        a = acceleration(self.assembly, constants, t, q, v, self.acting(inputs))
+        return {"q": coordinate_rate(self.assembly, q, v), "v": a}
+
+    def acting(self, inputs) -> tuple[Load, ...]:
+        """The forces under given inputs: maps with their pressures, joints with efforts."""
         plain = tuple(force for force in self.forces if not _maps((force,)))
         bound = tuple(
             On(part, Pressurised(chamber, inputs[f"{part}_pressure"]))
             for part, chamber in self._maps().items()
         )
         driven = tuple(JointEffort(name, inputs[f"{name}_effort"]) for name in self.driven)
-        constants = operators(self.assembly)
-        a = acceleration(self.assembly, constants, t, q, v, (*plain, *bound, *driven))
-        return {"q": coordinate_rate(self.assembly, q, v), "v": a}
+        return (*plain, *bound, *driven)
 
     def _maps(self) -> dict[str, AbstractPressureMap]:
         return dict(_maps(self.forces))

@@ -16,6 +16,7 @@ from sorojax.math.control import Control
 from sorojax.math.explicit import Tsit5
 from sorojax.math.rosenbrock import Rodas4
 from sorojax.math.status import Status
+from sorojax.math.told import tell
 from sorojax.systems.integrate import Motion, adaptive
 from sorojax.systems.network import Network
 from sorojax.systems.simulate import Trajectory, film_of, instants
@@ -39,6 +40,7 @@ def simulate_batch(
     stiff_solver: dfx.AbstractSolver | None = None,
     adjoint: dfx.AbstractAdjoint | None = None,
     devices: Sequence[Any] | None = None,
+    progress: bool = False,
 ) -> Trajectory:
     """Run `make(design)` for every design, differentiable in the designs.
 
@@ -61,6 +63,8 @@ def simulate_batch(
         adjoint: As in `simulate`.
         devices: Share the members among these devices; their number divides that of the
             members.
+        progress: Report progress while running: how far all members are on average, then how
+            many of them have been looked at for the stiff method.
 
     Returns:
         A trajectory whose leaves, status and stats have a leading axis of members; the
@@ -78,7 +82,7 @@ def simulate_batch(
     supplied = {k: v if callable(v) else real(v) for k, v in (inputs or {}).items()}
     control = Control(rtol, atol, max_step=max_step)
     solvers = (solver or Tsit5(), stiff_solver or Rodas4())
-    limits = (save, cheap_steps, max_steps)
+    limits = (save, cheap_steps, max_steps, progress)
     run = (make, supplied, real(duration), control, solvers, adjoint, limits)
     if devices is None:
         return _whole(run, designs)
@@ -115,29 +119,36 @@ def _shared(run, designs, devices) -> Trajectory:
 
 def _two_passes(run, designs) -> Trajectory:
     make, inputs, duration, control, (cheap, stiff), adjoint, limits = run
-    save, cheap_steps, max_steps = limits
+    save, cheap_steps, max_steps, progress = limits
     zero = jnp.zeros((), jnp.int32)
     time = instants(zero, duration / (save - 1), save)
 
-    def go(design, solver, control, most) -> Motion:
+    def go(design, solver, control, most, label=None) -> Motion:
         network = make(design)
         state = network.initial_state()
         motion = adaptive(
-            network, inputs, state, time, solver, control, max_steps=most, adjoint=adjoint
-        )
+            network, inputs, state, time, solver, control, max_steps=most, adjoint=adjoint,
+            progress=progress and (label or False),
+        )  # fmt: skip
         return motion._replace(memory=None)  # which differs between the methods
 
     cap = _cap(lambda design: go(design, cheap, control, cheap_steps), designs, cheap_steps)
     capped = eqx.tree_at(lambda c: c.tries, control, cap, is_leaf=lambda x: x is None)
-    first = jax.vmap(lambda design: go(design, cheap, capped, cheap_steps))(designs)
+    first = jax.vmap(lambda design: go(design, cheap, capped, cheap_steps, "batch"))(designs)
     again = first.status != Status.successful
+    count = again.shape[0]
 
     def member(_, given):
-        design, motion, again = given
+        number, design, motion, again = given
         repeat = lambda: go(design, stiff, control, max_steps)  # noqa: E731
-        return None, jax.lax.cond(again, repeat, lambda: motion)
+        motion = jax.lax.cond(again, repeat, lambda: motion)
+        if progress:
+            done = (number + 1) / count
+            due = again | (number + 1 == count)
+            jax.lax.cond(due, lambda x: tell("stiff members", x), lambda _: None, done)
+        return None, motion
 
-    motion = jax.lax.scan(member, None, (designs, first, again))[1]
+    motion = jax.lax.scan(member, None, (jnp.arange(count), designs, first, again))[1]
     motion = _still(motion)
     film = jax.vmap(lambda d, m: film_of(make(d), time, inputs, m))(designs, motion)
     return eqx.tree_at(lambda film: film.stats, film, film.stats | {"stiff": again})

@@ -87,7 +87,7 @@ def adaptive(
     start: Float[Array, ""] | None = None,
     conditions: Conditions = _NO_CONDITIONS,
     dense: bool = False,
-    progress: bool = False,
+    progress: bool | str = False,
     seam: Resume | None = None,
 ) -> Motion:
     """Run from `start`, by default time[0], to time[-1]; what the grid holds before `start`
@@ -130,7 +130,7 @@ def adaptive(
         adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
         event=_event(conditions, unravel),
         throw=False,
-        progress_meter=Meter(start, end, time[-1]) if progress else dfx.NoProgressMeter(),
+        progress_meter=_meter(progress, start, end, time[-1]),
         **further,
     )
     assert solution.ys is not None and solution.ts is not None
@@ -154,6 +154,12 @@ def adaptive(
         solution.interpolation,
         _seam(solution, solver) if free else None,
     )
+
+
+def _meter(progress: bool | str, start, far, end) -> dfx.AbstractProgressMeter:
+    if not progress:
+        return dfx.NoProgressMeter()
+    return Meter(start, far, end, progress if isinstance(progress, str) else "simulate")
 
 
 def _seam(solution: dfx.Solution, solver: dfx.AbstractSolver) -> Resume:

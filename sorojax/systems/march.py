@@ -10,10 +10,10 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from sorojax.math.method import AbstractMethod, finite, guarded, repeated
 from sorojax.math.status import Status
+from sorojax.math.told import tell
 from sorojax.systems.block import AbstractBlock
 from sorojax.systems.integrate import Motion, explicit_inputs
 from sorojax.systems.network import at_time
-from sorojax.systems.progress import tell
 
 
 def fixed(
@@ -39,7 +39,7 @@ def fixed(
         given = (method, block, inputs, t, walk.state, walk.memory)
         walk = walk.after(move.taken(given, interval), t + interval)
         if progress:
-            tell((number + 1) / count)
+            tell("simulate", (number + 1) / count)
         return walk, walk.state
 
     if method.carries:  # a step is large beside what it starts from

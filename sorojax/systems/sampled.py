@@ -11,10 +11,10 @@ from jaxtyping import Array, PyTree
 from sorojax import _check
 from sorojax._types import is_traced, real
 from sorojax.math.method import AbstractMethod, finite
+from sorojax.math.told import tell
 from sorojax.systems.integrate import explicit_inputs
 from sorojax.systems.march import Walk, interval_of
 from sorojax.systems.network import Network, at_time, outputs
-from sorojax.systems.progress import tell
 from sorojax.systems.simulate import Trajectory, default_method, last_state
 
 Ports = str | tuple[str, ...]
@@ -135,7 +135,7 @@ def _run(network, loops, state, before, inputs, period, first, plan) -> Trajecto
         given = (method, network, {**inputs, **held}, t, walk.state, walk.memory)
         moved = walk.after(move.taken(given, period), t + period)
         if progress:
-            tell((tick - first) / ticks)
+            tell("simulate", (tick - first) / ticks)
         return (moved, memories, held, walk.memory), seen
 
     held = _nothing(network, loops, period.dtype) if held is None else held

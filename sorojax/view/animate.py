@@ -215,6 +215,7 @@ class _Solid(_Stage):
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
         chosen_renderer(self.renderer)
+        self.firsts = [track.scene(0).parts for track in self.tracks]
         self.places, count = [], len(self.tracks)
         first = replace(self.scene(self.tracks[0], 0), title=self.title)
         whole, _ = frame_of(self.figure, first)
@@ -253,7 +254,7 @@ class _Solid(_Stage):
 
     def _lens(self, track: Track, size: tuple[int, int], share: float):
         index = self.tracks.index(track)
-        whole = Scene(track.scene(0).parts, extent=self.boxes[index])
+        whole = Scene(self.firsts[index], extent=self.boxes[index])
         return lens_of([whole], camera_at(self.view, share), size)
 
     def frame(self, k: int) -> Frame:

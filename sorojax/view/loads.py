@@ -12,11 +12,13 @@ from sorojax.mesh.elements import facet_corners
 from sorojax.mesh.locate import Locations
 from sorojax.view import style
 from sorojax.view.fields import short
+from sorojax.view.load_marks import marks_of
 from sorojax.view.scene import Arrows, Dots, Lines, Part
 from sorojax.view.shapes import obstacle_part
 
 _LENGTH = 0.10  # of the body, that of the longest arrow of a load
 _MOST = 24  # arrows of one load
+_SUPPORTS = {"held": style.HOLD, "sliding": style.GREY, "moved": style.COLOURS[3]}
 
 
 def support_parts(problem: Problem, u: Float[np.ndarray, "nodes dim"]) -> list[Part]:
@@ -24,19 +26,19 @@ def support_parts(problem: Problem, u: Float[np.ndarray, "nodes dim"]) -> list[P
     points = np.asarray(problem.mesh.points) + u
     outer = _boundary_nodes(problem)
     parts: list[Part] = []
-    for name, slides in (("held", False), ("sliding", True)):
-        group = [s.nodes for s in problem.supports if _slides(s, problem) == slides]
+    for name in _SUPPORTS:
+        group = [s.nodes for s in problem.supports if _kind(s, problem) == name]
         nodes = np.unique(np.concatenate([np.asarray(ids).ravel() for ids in group] or [[]]))
         nodes = nodes.astype(int)
         nodes = nodes[outer[nodes]]
         if len(nodes):
-            colour = style.HOLD if name == "held" else style.GREY
-            parts.append(Dots(points[nodes], colour, 3.0, name))
+            parts.append(Dots(points[nodes], _SUPPORTS[name], 3.0, name))
     return parts
 
 
 def load_parts(problem: Problem, u: Float[np.ndarray, "nodes dim"]) -> list[Part]:
-    """Arrows of forces, tractions, pressures and weight; lines of cables; obstacles.
+    """Arrows of forces, tractions, pressures and weight; lines of cables; obstacles; arcs of
+    torques, coils of springs, rigid parts.
 
     Arrows of one load share one scale; those of different loads do not compare.
     """
@@ -57,6 +59,9 @@ def _load(problem: Problem, load: AbstractLoad, points: np.ndarray, size: float)
     if isinstance(load, fem.Contact):
         shift = None if load.value is None else np.asarray(load.value)
         return obstacle_part(load.obstacle, points, size, shift)
+    marks = marks_of(problem, load, points, size)
+    if marks is not None:
+        return marks
     found = _arrows(problem, load, points)
     if found is None:
         return []
@@ -113,9 +118,11 @@ def _thinned(facets: np.ndarray) -> np.ndarray:
     return facets[::step]
 
 
-def _slides(support: AbstractSupport, problem: Problem) -> bool:
+def _kind(support: AbstractSupport, problem: Problem) -> str:
+    if np.any(np.asarray(support.displacement)):
+        return "moved"
     dim = problem.mesh.element.dim
-    return len(known_components(support, dim)) < dim
+    return "sliding" if len(known_components(support, dim)) < dim else "held"
 
 
 def _boundary_nodes(problem: Problem) -> np.ndarray:

@@ -93,9 +93,12 @@ def _outlines(mesh: Mesh, points: np.ndarray) -> list[Part]:
     return [Lines([points[np.append(ring, ring[0])] for ring in rings], style.INK, 0.9)]
 
 
-def edge_lines(mesh: Mesh, points: np.ndarray, **look: Any) -> Lines:
-    """The edges that tell the shape of a mesh whose nodes are at `points` [m]."""
-    ends = outline(mesh)
+def edge_lines(
+    mesh: Mesh, points: np.ndarray, ends: np.ndarray | None = None, **look: Any
+) -> Lines:
+    """The edges that tell the shape of a mesh whose nodes are at `points` [m]; `ends` is
+    `outline(mesh)`, found once for many."""
+    ends = outline(mesh) if ends is None else ends
     if not len(ends):
         ends = np.zeros((1, 2), int)
     return Lines(list(points[ends]), **look)

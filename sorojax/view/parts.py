@@ -79,3 +79,8 @@ def show_body(body: Any, q: Any = None, **options: Any) -> Picture:
     model = body.rod if hasattr(body, "rod") else body.assembly
     q = body.q if q is None else q
     return show_rod(model, q, **({"forces": body.forces} | options))
+
+
+def show_model(model: Any, q: Any = None, **options: Any) -> Picture:
+    """The body of a model of a robot; options of `show_rod`. Its `network` is a diagram."""
+    return show_body(model.network.blocks["body"], q, **options)

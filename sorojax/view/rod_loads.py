@@ -150,7 +150,7 @@ def contact_parts(model: Rod | Assembly, q: np.ndarray, found: Acting) -> list[P
         at, force = (np.asarray(x) for x in _pushes(model, jnp.asarray(q), part, contact))
         pushed.append((at, force))
         if isinstance(contact, R.ObstacleContact):
-            size = _size(model)
+            size = size_of(model)
             parts += obstacle_part(contact.obstacle, at, size)
     for pair in found.pairs:
         if isinstance(pair.force, R.RodContact):
@@ -162,12 +162,13 @@ def contact_parts(model: Rod | Assembly, q: np.ndarray, found: Acting) -> list[P
     if not size.max(initial=0.0) > 0:
         return parts
     kept = size > 1e-3 * size.max()
-    vectors = forces[kept] * (_LENGTH * _size(model) / size.max())
+    vectors = forces[kept] * (_LENGTH * size_of(model) / size.max())
     name = f"contact, {short(float(np.linalg.norm(forces.sum(axis=0))), 'N')} in all"
     return [*parts, Arrows(starts[kept], vectors, style.LOAD, name)]
 
 
-def _size(model: Rod | Assembly) -> float:
+def size_of(model: Rod | Assembly) -> float:
+    """Length of the rod, or of the longest one [m]."""
     if isinstance(model, Rod):
         return float(model.length)
     rods = [part.body for part in model.parts if isinstance(part.body, Rod)]

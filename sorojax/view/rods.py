@@ -14,10 +14,11 @@ from sorojax.view import style
 from sorojax.view.camera import View
 from sorojax.view.glyphs import ball_triangles, tube
 from sorojax.view.picture import Picture
-from sorojax.view.rod_loads import acting, contact_parts, thread_parts
+from sorojax.view.rod_loads import acting, contact_parts, size_of, thread_parts
 from sorojax.view.scene import Arrows, Dots, Lines, Part, Scene, Surface
 from sorojax.view.sections import outlines_of
 from sorojax.view.shapes import picture_of_scene, shape_scene
+from sorojax.view.wrenches import wrench_parts
 
 _STATIONS = 61
 _SEE_THROUGH = 0.45
@@ -44,7 +45,7 @@ def show_rod(
         q: Coordinates; at rest if omitted. Several rows draw several states, the last in
             full.
         forces: As given to its verbs: tendons and chambers are drawn in their place,
-            contacts as arrows with what is touched.
+            contacts as arrows with what is touched, wrenches and weight as arrows and arcs.
         section: Plane shape of the section (y, z), where constants do not tell it.
         shapes: Bodies of links by name, a solid shape or triangles in the frame of the
             link; without one a link is the ellipsoid of its inertia.
@@ -117,7 +118,8 @@ def _state(model, q, forces, section, shapes, directors: bool, shade) -> list[Pa
                 parts += director_parts(pose[::10], 0.06 * float(body.length))
         else:
             parts += _link(name, body, pose[0], shapes, colour)
-    return parts + contact_parts(model, q, found)
+    parts += contact_parts(model, q, found)
+    return parts + wrench_parts(where, s, forces, size_of(model))
 
 
 def _rod(body: Rod, pose, s, section, colour: str, opacity: float) -> list[Part]:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sorojax.design import Optimised
+from sorojax.design import History, Optimised
 from sorojax.mesh import Mesh
 from sorojax.systems import AbstractBlock, Trajectory
 from sorojax.view import style
@@ -176,11 +176,26 @@ def show_optimised(
     return Picture(figure, tuple(Panel(panel) for panel in axes))
 
 
+def show_history(
+    history: History, *, steps: Sequence[int] | None = None, title: str = ""
+) -> Picture:
+    """Layouts of a run that `design.History(..., mesh=mesh)` kept.
+
+    Args:
+        history: With the mesh of its cells.
+        steps: Which of the kept ones; up to six, evenly spaced, if omitted.
+        title: Title of the figure.
+    """
+    return show_densities(history.mesh, history.densities, steps=steps, title=title,
+                          counts=history.steps)  # fmt: skip
+
+
 def show_densities(
     mesh: Mesh,
     densities: Float[Any, "steps cells"],
     *,
     steps: Sequence[int] | None = None,
+    counts: Sequence[int] | None = None,
     title: str = "",
 ) -> Picture:
     """Densities of a layout, one panel per step, black where there is material.
@@ -189,6 +204,7 @@ def show_densities(
         mesh: The cells.
         densities: One row per step, or one row.
         steps: Which rows to draw; up to six, evenly spaced, if omitted.
+        counts: Number of the step of every row; 1, 2, ... if omitted.
         title: Title of the figure.
     """
     rows = np.atleast_2d(np.asarray(densities))
@@ -208,4 +224,6 @@ def show_densities(
         assert isinstance(body, Surface)
         bare = Surface(body.points, body.triangles, values=body.values)
         scenes.append(Scene((bare, *scene.parts[1:]), scale))
-    return panels(scenes, [f"step {k + 1}" if count > 1 else "" for k in chosen], title=title)
+    numbers = np.arange(1, count + 1) if counts is None else np.asarray(counts)
+    names = [f"step {numbers[k]}" if count > 1 else "" for k in chosen]
+    return panels(scenes, names, title=title)

@@ -15,6 +15,7 @@ _DRAWN_BY = {
     "sorojax.fem.solve.Solution": ("states", "show_solution"),
     "sorojax.fem.solve_volume.CavitySolution": ("states", "show_solution"),
     "sorojax.fem.solve.Path": ("states", "show_path"),
+    "sorojax.fem.solve_volume.VolumePath": ("states", "show_path"),
     "sorojax.fem.continuation.Continuation": ("states", "show_path"),
     "sorojax.fem.motion.Motion": ("states", "show_path"),
     "sorojax.fem.modal.Modes": ("states", "show_vibration"),
@@ -24,11 +25,14 @@ _DRAWN_BY = {
     "sorojax.rod.basis.StrainBasis": ("parts", "show_basis"),
     "sorojax.rod.rollout.Rollout": ("runs", "show_rollout"),
     "sorojax.material.hyperelastic.AbstractHyperelastic": ("parts", "show_material"),
+    "sorojax.reduction.backbone.Backbone": ("snapshots", "show_snapshots"),
+    "sorojax.robots.models_supply.Model": ("parts", "show_model"),
     "sorojax.systems.rod_body.RodBody": ("parts", "show_body"),
     "sorojax.systems.assembly_body.AssemblyBody": ("parts", "show_body"),
     "sorojax.systems.block.AbstractBlock": ("networks", "show_network"),
     "sorojax.systems.simulate.Trajectory": ("runs", "show_trajectory"),
     "sorojax.design.minimise.Optimised": ("runs", "show_optimised"),
+    "sorojax.design.history.History": ("runs", "show_history"),
     "sorojax.view.charts.Convergence": ("charts", "show_convergence"),
     "sorojax.view.charts.WorkPrecision": ("charts", "show_work_precision"),
 }
@@ -39,10 +43,10 @@ def show(thing: Any, *at: Any, **options: Any) -> Picture:
     """Draw any noun of the framework; the result is displayed by a notebook and can be saved.
 
     Shapes, surfaces and meshes; problems, solutions, load paths, motions and modes; rods,
-    assemblies, sections, strain bases; materials; networks, blocks and trajectories;
-    optimisations; `Convergence` and `WorkPrecision`. In space the picture is shaded by
-    pyvista where it is installed and by sorojax itself elsewhere. `show.register(Type,
-    function)` adds a noun.
+    assemblies, sections, strain bases, backbones; materials; networks, blocks, trajectories
+    and models of robots; optimisations; `Convergence` and `WorkPrecision`. In space the
+    picture is shaded by pyvista where it is installed and by sorojax itself elsewhere.
+    `show.register(Type, function)` adds a noun.
 
     Args:
         thing: What to draw.

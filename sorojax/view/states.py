@@ -12,6 +12,7 @@ from sorojax.fem import Modes, Problem
 from sorojax.view import style
 from sorojax.view.camera import View
 from sorojax.view.fields import Coloured, Field, evaluate, readable, short
+from sorojax.view.load_marks import wall_parts
 from sorojax.view.loads import load_parts, support_parts
 from sorojax.view.meshes import edge_lines
 from sorojax.view.panels import panels
@@ -22,8 +23,9 @@ from sorojax.view.shell import Shell, on_triangles, shell
 
 _UNITS = {
     fem.Pressure: "Pa", fem.Traction: "Pa", fem.Force: "N", fem.Tendon: "N", fem.Cable: "m",
-    fem.Gravity: "m/s$^2$", fem.Contact: "m",
+    fem.Gravity: "m/s$^2$", fem.Contact: "m", fem.Torque: "N m", fem.Spring: "m",
 }  # fmt: skip
+_CLEAR = 0.4  # opacity of a body whose walls under pressure are seen through it
 
 
 def show_problem(problem: Problem, *, view: View = "iso", renderer: str = "auto",
@@ -32,7 +34,11 @@ def show_problem(problem: Problem, *, view: View = "iso", renderer: str = "auto"
     still = np.zeros(problem.mesh.points.shape)
     mesh, points = problem.mesh, np.asarray(problem.mesh.points)
     seen = shell(mesh)
-    parts: list[Part] = [Surface(points, seen.triangles, wire=seen.wire)]
+    walls = wall_parts(problem, points) if mesh.element.dim == 3 else []
+    clear = _CLEAR if walls else 1.0
+    parts: list[Part] = [
+        *walls, Surface(points, seen.triangles, wire=seen.wire, opacity=clear)
+    ]  # fmt: skip
     parts += [edge_lines(mesh, points, colour=style.INK, width=0.9)]
     parts += support_parts(problem, still) + load_parts(problem, still)
     name = f"{mesh.num_cells} cells {mesh.element.name}, {problem.space.num_dofs} unknowns"
@@ -88,7 +94,7 @@ def show_path(
     """States along a load path, a continuation or a motion, one panel each, on one scale.
 
     Args:
-        path: From `fem.solve_path`, `fem.continuation` or `fem.simulate`.
+        path: From `fem.solve_path`, `fem.volume_path`, `fem.continuation` or `fem.simulate`.
         states: Which of them; up to six, evenly spaced, if omitted.
         view: Camera of a solid body.
         renderer: Of a solid body.
@@ -189,6 +195,8 @@ def chosen_states(where: str, count: int, states: Sequence[int] | None) -> list[
 
 def problem_at(path: Any, k: int) -> Problem:
     """The problem with the load of state `k` of a path."""
+    if isinstance(path, fem.VolumePath):
+        return fem.with_load(path.problem, path.name, path.pressures[k])
     if isinstance(path, fem.Path) or (getattr(path, "name", None) is not None):
         return fem.with_load(path.problem, path.name, path.values[k])
     return path.problem
@@ -198,6 +206,9 @@ def state_name(path: Any, k: int) -> str:
     """What tells a state from the others: its load, its factor or its time."""
     if isinstance(path, fem.Motion):
         return f"{float(path.times[k]):.4g} s"
+    if isinstance(path, fem.VolumePath):
+        pressure = short(float(path.pressures[k]), "Pa")
+        return f"{1e6 * float(path.volumes[k]):.4g} ml at {pressure}"
     name = getattr(path, "name", None)
     value = np.asarray(path.values[k])
     if name is None:

@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from sorojax import fem
-from sorojax.fem import Continuation, Modes, Motion, Path
+from sorojax.design import History
+from sorojax.fem import Continuation, Modes, Motion, Path, VolumePath
 from sorojax.mesh import Mesh
 from sorojax.rod import Assembly, Rod, Rollout
 from sorojax.sdf import AbstractSdf
@@ -19,7 +20,7 @@ from sorojax.view.loads import load_parts, support_parts
 from sorojax.view.meshes import edge_lines
 from sorojax.view.rods import rod_scene
 from sorojax.view.scene import Part, Scale, Scene, Surface, robust_scale
-from sorojax.view.shell import on_triangles, shell
+from sorojax.view.shell import on_triangles, outline, shell
 from sorojax.view.states import coloured, problem_at
 
 
@@ -27,17 +28,20 @@ def track_of(result: Any, **options: Any) -> Track:
     """The scenes of a result; options are those of the kind of result."""
     if isinstance(result, Track):
         return result
-    if isinstance(result, Path | Continuation | Motion):
+    if isinstance(result, Path | VolumePath | Continuation | Motion):
         return _body_track(result, **options)
     if isinstance(result, Modes):
         return _mode_track(result, **options)
+    if isinstance(result, History):
+        return _layout_track(result, **options)
     if isinstance(result, Rollout):
         return _rod_track(np.asarray(result.time), np.asarray(result.q), **options)
     if isinstance(result, Trajectory):
         return _network_track(result, **options)
     raise TypeError(
         f"view.animate: got a {type(result).__name__}, need a Motion, Path, Continuation, "
-        "Modes, Rollout, Trajectory or Track. Make a Track of scenes for anything else."
+        "Modes, History, Rollout, Trajectory or Track. Make a Track of scenes for what else "
+        "moves."
     )
 
 
@@ -52,14 +56,15 @@ def positions_track(
     name: str = "",
 ) -> Track:
     """A film of a mesh whose nodes are at `positions` [m], e.g. a skin or measured points."""
-    seen, moved = shell(mesh), np.asarray(positions)
+    seen, sides, moved = shell(mesh), outline(mesh), np.asarray(positions)
     rows = None if field is None else np.asarray(field)
     scale = None if rows is None else robust_scale(label, list(rows), limits=limits)
 
     def scene(k: int) -> Scene:
         value = None if rows is None else on_triangles(mesh, seen, rows[k])[0]
         body = Surface(moved[k], seen.triangles, values=value)
-        return Scene((body, edge_lines(mesh, moved[k], colour=style.INK, width=0.7)), scale)
+        edges = edge_lines(mesh, moved[k], sides, colour=style.INK, width=0.7)
+        return Scene((body, edges), scale)
 
     flat = moved.reshape(-1, moved.shape[-1])
     box = np.nanmin(flat, axis=0), np.nanmax(flat, axis=0)
@@ -83,15 +88,16 @@ def _body_track(
     rows = [evaluate(problem_at(result, k), moved[k], field, label) for k in range(len(moved))]
     found = [row for row in rows if row is not None]
     scale, values = coloured(found, limits) if found else (None, [None] * len(rows))
-    outline = edge_lines(mesh, points, colour=style.GREY, width=0.8)
+    sides = outline(mesh)
+    still = edge_lines(mesh, points, sides, colour=style.GREY, width=0.8)
 
     def scene(k: int) -> Scene:
         value, u = values[k], moved[k]
         on = None if value is None else on_triangles(mesh, seen, value)[0]
-        parts: list[Part] = [outline] if rest else []
+        parts: list[Part] = [still] if rest else []
         parts.append(Surface(points + u, seen.triangles, values=on,
                              wire=seen.wire if wire else None))  # fmt: skip
-        parts.append(edge_lines(mesh, points + u, colour=style.INK, width=0.7))
+        parts.append(edge_lines(mesh, points + u, sides, colour=style.INK, width=0.7))
         if loads:
             problem = problem_at(result, k)
             parts += support_parts(problem, u) + load_parts(problem, u)
@@ -103,23 +109,44 @@ def _body_track(
     return Track(time, scene, scale, unit, extent=None if loads else box)
 
 
+def _layout_track(history: History, *, name: str = "") -> Track:
+    """Densities step by step, black where there is material."""
+    mesh, rows = history.mesh, history.densities
+    points, seen = np.asarray(mesh.points), shell(mesh)
+    scale = Scale("density [-]", 0.0, 1.0, colours="Greys")
+
+    def scene(k: int) -> Scene:
+        body = Surface(points, seen.triangles, values=on_triangles(mesh, seen, rows[k])[0])
+        return Scene((body,), scale)
+
+    box = points.min(axis=0), points.max(axis=0)
+    return Track(np.asarray(history.steps, float), scene, scale, "steps", box, name)
+
+
 def _clock(result: Any) -> tuple[np.ndarray, str]:
     """Times of a motion; along a path its number where the load does not just rise."""
     if isinstance(result, Motion):
         return np.asarray(result.times), "s"
+    if isinstance(result, VolumePath):
+        volumes = 1e6 * np.asarray(result.volumes)
+        return (volumes, "ml") if np.all(np.diff(volumes) > 0) else _steps(len(volumes))
     values = np.asarray(result.values, float)
     if values.ndim == 1 and np.all(np.diff(values) > 0):
         load = next((x for x in result.problem.loads if x.name == result.name), None)
         if isinstance(load, fem.Pressure):
             return values / 1e3, "kPa"
         return values, result.name or "of the load"
-    return np.arange(len(values), dtype=float), "steps"
+    return _steps(len(values))
+
+
+def _steps(count: int) -> tuple[np.ndarray, str]:
+    return np.arange(count, dtype=float), "steps"
 
 
 def _mode_track(modes: Modes, *, mode: int = 0, share: float = 0.12, cycles: int = 2) -> Track:
     """One mode swinging `cycles` times, a second each."""
     mesh, base = modes.problem.mesh, np.asarray(modes.displacement)
-    points, seen = np.asarray(mesh.points) + base, shell(mesh)
+    points, seen, sides = np.asarray(mesh.points) + base, shell(mesh), outline(mesh)
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     shape = np.asarray(modes.shapes[mode])
     length = np.linalg.norm(shape, axis=1)
@@ -130,7 +157,8 @@ def _mode_track(modes: Modes, *, mode: int = 0, share: float = 0.12, cycles: int
     def scene(k: int) -> Scene:
         moved = points + np.sin(2 * np.pi * time[k]) * swing
         body = Surface(moved, seen.triangles, values=length / length.max())
-        return Scene((body, edge_lines(mesh, moved, colour=style.INK, width=0.7)), scale)
+        edges = edge_lines(mesh, moved, sides, colour=style.INK, width=0.7)
+        return Scene((body, edges), scale)
 
     both = np.concatenate([points + swing, points - swing])
     name = f"mode {mode + 1}: {float(modes.frequencies[mode]):.4g} Hz, slowed down"

@@ -51,7 +51,7 @@ def _add(plotter, part: Part, scene: Scene, lens: Lens, dots_per_point: float) -
         ahead = 1.5 * reach * max(part.width, 1.0) * lens.camera.axes[2]
         lines = pv.PolyData(np.concatenate(runs) + ahead, lines=np.concatenate(cells))
         plotter.add_mesh(lines, color=part.colour, line_width=part.width * dots_per_point,
-                         lighting=False, reset_camera=False)  # fmt: skip
+                         lighting=False, reset_camera=False, render=False)  # fmt: skip
         return
     if isinstance(part, Arrows):
         surface = Surface(*arrow_triangles(part.starts, part.vectors, 1.1 * reach), part.colour)
@@ -69,7 +69,7 @@ def _add(plotter, part: Part, scene: Scene, lens: Lens, dots_per_point: float) -
         ahead = 1.5 * reach * lens.camera.axes[2]
         wire = pv.PolyData(np.asarray(surface.points, float) + ahead, lines=cells)
         plotter.add_mesh(wire, color="#1f2430", line_width=0.7 * dots_per_point, opacity=0.6,
-                         lighting=False, reset_camera=False)  # fmt: skip
+                         lighting=False, reset_camera=False, render=False)  # fmt: skip
 
 
 def _add_surface(plotter, pv, part: Surface, scene: Scene) -> None:
@@ -86,7 +86,7 @@ def _add_surface(plotter, pv, part: Surface, scene: Scene) -> None:
     mesh.point_data.active_normals = normals
     look: dict[str, Any] = {
         "opacity": part.opacity, "smooth_shading": True, "split_sharp_edges": False,
-        "specular": 0.15, "specular_power": 20, "reset_camera": False,
+        "specular": 0.15, "specular_power": 20, "reset_camera": False, "render": False,
     }  # fmt: skip
     if part.values is not None and scene.scale is not None:
         values = np.asarray(part.values, float)

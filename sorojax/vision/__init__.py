@@ -34,6 +34,7 @@ from sorojax.vision.fiducials import (
     marker_pose as marker_pose,
     world_frame as world_frame,
 )
+from sorojax.vision.scene import Balls as Balls, draw_balls as draw_balls
 from sorojax.vision.synthetic import (
     Disturbance as Disturbance,
     background as background,

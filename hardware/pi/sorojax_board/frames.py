@@ -17,7 +17,7 @@ NONCE_SIZE = 16
 
 
 class Kind(IntEnum):
-    """What a frame says; the board sends CHALLENGE, WELCOME, STATE and REFUSED."""
+    """What a frame says; the board sends CHALLENGE, WELCOME, STATE, REFUSED, HEARTBEAT."""
 
     CHALLENGE = 1
     HELLO = 2
@@ -29,6 +29,8 @@ class Kind(IntEnum):
     PING = 8
     REFUSED = 9
     BYE = 10
+    WATCH = 11
+    HEARTBEAT = 12
 
 
 class Frame(NamedTuple):

@@ -37,8 +37,8 @@ class LegacySession:
     def challenge(self, now: float) -> bytes:
         return b""
 
-    def tick(self, now: float) -> None:
-        pass
+    def tick(self, now: float) -> bytes:
+        return b""
 
     def state(self, now: float) -> bytes:
         volts = [voltage_of_pressure(p) for p in self.board.report().pressure]

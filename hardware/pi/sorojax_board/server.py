@@ -55,7 +55,7 @@ class Server:
         if legacy_port is not None:
             self._ports[legacy_port] = self._raw
         self._on_close = on_close or (lambda reason: None)
-        self._sessions: set = set()
+        self._clients: dict = {}  # sessions and where to write to them
         self._tasks: set = set()
         self.port = port
 
@@ -91,25 +91,26 @@ class Server:
         while True:
             now = monotonic()
             self.board.tick(now)
-            for session in self._sessions:
-                session.tick(now)
+            for session, writer in self._clients.items():
+                if beat := session.tick(now):
+                    self._send(session, writer, beat)
             due = max(due + self._period, now)
             await asyncio.sleep(max(0.0, due - monotonic()))
 
     def _client(self, make: Callable):
         async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            if len(self._sessions) >= _MOST_CLIENTS:
+            if len(self._clients) >= _MOST_CLIENTS:
                 writer.close()
                 return
             session, task = make(monotonic()), asyncio.current_task()
-            self._sessions.add(session)
+            self._clients[session] = writer
             self._tasks.add(task)
             try:
                 await self._talk(session, reader, writer)
             except OSError as reason:
                 session.closed = session.closed or str(reason)
             finally:
-                self._sessions.discard(session)
+                del self._clients[session]
                 self._tasks.discard(task)
                 session.lost(monotonic())
                 self._on_close(session.closed)
@@ -126,6 +127,12 @@ class Server:
                 continue  # the watchdog judges silence, this only sees a session that ended
             if not data:
                 return
-            writer.write(session.receive(data, monotonic()))
-            if writer.transport.get_write_buffer_size() > _MOST_UNSENT:
-                session.closed = "the client does not read"
+            self._send(session, writer, session.receive(data, monotonic()))
+
+    @staticmethod
+    def _send(session, writer, data: bytes) -> None:
+        if writer.is_closing():
+            return
+        writer.write(data)
+        if writer.transport.get_write_buffer_size() > _MOST_UNSENT:
+            session.closed = "the client does not read"

@@ -19,6 +19,7 @@ from sorojax_board.frames import (
 from sorojax_board.messages import Malformed, Refusal, Welcome
 
 _HANDSHAKE, _AGE = 2.0, 0.1  # s
+_FASTEST_BEAT, _SLOWEST_BEAT = 0.002, 10.0  # s
 READER, WRITER = 0, 1
 
 
@@ -38,9 +39,10 @@ class Session:
         self._ready = self._writer = False
         self._sent, self._heard = 0, 0
         self._delay = float("inf")  # least difference of the clocks seen so far, s
+        self._beat, self._due = 0.0, float("inf")  # period and time of the next heartbeat, s
         self._actions: dict[int, Callable[[Frame, float], bytes]] = {
             Kind.ARM: self._arm, Kind.SET: self._set, Kind.VENT: self._vent,
-            Kind.PING: self._ping, Kind.BYE: self._bye,
+            Kind.PING: self._ping, Kind.BYE: self._bye, Kind.WATCH: self._watch,
         }  # fmt: skip
 
     def challenge(self, now: float) -> bytes:
@@ -58,10 +60,14 @@ class Session:
             self._close(self._decoder.broken, now)
         return b"".join(answers)
 
-    def tick(self, now: float) -> None:
-        """Close a connection that does not say hello."""
+    def tick(self, now: float) -> bytes:
+        """The heartbeat where one is due; a connection that does not say hello is closed."""
         if not self._ready and not self.closed and now - self._opened > _HANDSHAKE:
             self._close("no hello in time", now)
+        if self.closed or now < self._due:
+            return b""
+        self._due = max(self._due + self._beat, now)
+        return self._answer(Kind.HEARTBEAT, messages.pack_report(self.board.report()), now)
 
     def lost(self, now: float) -> None:
         """The socket is gone."""
@@ -142,6 +148,13 @@ class Session:
         return self.state(now)
 
     def _ping(self, frame: Frame, now: float) -> bytes:
+        return self.state(now)
+
+    def _watch(self, frame: Frame, now: float) -> bytes:
+        (period,) = messages.floats(frame.payload, 1)
+        if period and not _FASTEST_BEAT <= period <= _SLOWEST_BEAT:
+            raise Malformed(f"period {period} s")
+        self._beat, self._due = period, now + period if period else float("inf")
         return self.state(now)
 
     def _bye(self, frame: Frame, now: float) -> bytes:

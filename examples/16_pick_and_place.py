@@ -1,0 +1,201 @@
+"""A soft manipulator picks up a cylinder, carries it and puts it down, behind a valve board.
+
+Section V-F of the Sorotoki paper, figures 16 and 17: three bellows and a gripper of three
+fingers on four proportional valves, a free cylinder of 40 mm and 45 g. The robot is that of
+`robots.Manipulator` with its reservoirs and regulators, hung from a beam, behind the program
+of the board with its noise, dead time and limits; nothing holds the cylinder but contact and
+friction with fingers and floor. Changed: the paper plays back pressures; here a loop at 100 Hz
+sees the place of the gripper, as a camera would tell it, and brings it along a taught path.
+"""
+
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import sorojax as sj
+from sorojax import rod, systems
+from sorojax.math.contact_stepper import ContactMidpoint
+from sorojax.math.lie import homogeneous
+from sorojax.units import kPa, mm
+from sorojax_board.board import Settings
+from sorojax_board.messages import Limits
+from sorojax_hardware import LocalBoard, ModelValves, SimulatedClock, run_loop
+
+RADIUS, HEIGHT, MASS, TARGET = 20 * mm, 40 * mm, 0.045, 29.7 * mm
+BEAM, SPINE = 167.5 * mm, 7.2 * mm  # height of the base; from the axis of a finger to its face
+FINGERS = tuple(f"finger_{k}" for k in range(3))
+GRIP = sj.contact.LinePenalty(stiffness=3e7, smoothing=5e-6, friction=0.8, slip=1e-4)
+FLOOR = sj.contact.LinePenalty(stiffness=1e8, smoothing=5e-6, friction=0.8, slip=1e-4)
+PERIOD, TICK = 4e-3, 1e-2  # s, of the model and of the loop
+# seconds, place of the finger tips x, z [mm], pressure in the gripper [kPa]; the arm tilts as
+# it reaches out, and the cylinder stands up 8 mm farther out than the tips let it go
+WAY = np.array([
+    [0.0, 0, 47, -30], [0.5, 0, 30.5, -30], [0.7, 0, 30.5, -30], [0.9, 0, 30.5, 60],
+    [1.1, 0, 30.5, 60], [1.6, 0, 40, 60], [2.4, 22, 41, 60], [2.7, 22, 41, 60],
+    [3.3, 22, 33.3, 60], [3.6, 22, 33.3, 60], [3.8, 22, 33.3, -30], [3.9, 22, 33.3, -30],
+    [4.7, 22, 45, -30], [4.9, 22, 45, -30],
+])  # fmt: skip
+
+
+def scene(size):
+    """The robot with air and valves, hung over a cylinder on the floor, and the contacts."""
+    made = sj.robots.model(sj.robots.Manipulator(), size=size)
+    body = made.network.blocks["body"]
+    down = homogeneous(jnp.diag(jnp.array([1.0, -1.0, -1.0])), jnp.array([0.0, 0.0, BEAM]))
+    parts = dict(zip(body.assembly.names, body.assembly.parts, strict=True))
+    parts["arm"] = sj.replace(
+        parts["arm"], lambda part: part.offset, down @ parts["arm"].offset
+    )
+    across = MASS * (3 * RADIUS**2 + HEIGHT**2) / 12
+    link = rod.Link(MASS, [across, across, MASS * RADIUS**2 / 2])
+    whole = rod.assembly(sj.SE3(), **parts, cylinder=rod.Part(link, rod.Free()))
+    touch = rod.LinkContact(sj.sdf.Cylinder(RADIUS, HEIGHT), SPINE, GRIP, points=16)
+    angle = 2 * np.pi * np.arange(24) / 24
+    rim = np.stack([RADIUS * np.cos(angle), RADIUS * np.sin(angle), 0 * angle - HEIGHT / 2], 1)
+    ground = sj.sdf.HalfSpace([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
+    floor = rod.LinkObstacle(ground, rim, np.full(24, 2 * np.pi * RADIUS / 24), FLOOR)
+    contacts = *(rod.Between(f, "cylinder", touch) for f in FINGERS), rod.On("cylinder", floor)
+    q = rod.rest(whole).at[-1].set(HEIGHT / 2)
+    hung = systems.AssemblyBody(whole, (*body.forces, *contacts), q=q)
+    return sj.replace(made, lambda made: made.network.blocks["body"], hung), contacts
+
+
+def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, float]:
+    made, contacts = scene(1.2 * mm if quick else None)
+    whole, states = made.assembly, []
+    grip = ContactMidpoint(passes=1, lasting=True, theta=1.0, tolerance=1e-4)
+    move, start = systems.partitioned(made.network, PERIOD, substeps=2, stepper=grip)
+
+    def advance(now, setpoint, dt):
+        states.append(now.state["body"])
+        now = move(now, made.inputs(jnp.asarray(setpoint)))
+        return now, made.pressure(now.state)
+
+    @jax.jit
+    def tips(q):
+        poses = rod.tip_pose(whole, q)
+        return jnp.mean(jnp.stack([poses[f"{name}_tip"][:3, 3] for name in FINGERS]), axis=0)
+
+    way = systems.Waypoints(WAY[:, 0], WAY[:, 1:] * [mm, mm, kPa], smooth=True)
+    low, high = np.asarray(made.low), np.asarray(made.high)
+    valves = ModelValves(advance, start, 4, period=PERIOD, dead_time=4e-3)
+    clock = SimulatedClock()
+    limits = tuple(Limits(*map(float, bounds), 2e6) for bounds in zip(low, high, strict=True))
+    board = LocalBoard(Settings(limits), valves, clock)
+    board.arm()
+    # m/Pa by which one bellows after the other moves the tips, from a jog of the robot
+    around = 2 * np.pi / 3 * np.arange(3)
+    bends = np.stack([-1.35 * np.cos(around), 1.35 * np.sin(around), np.full(3, -0.2315)])
+    back, home = np.linalg.inv(1e-6 * bends), np.asarray(tips(start.state["body"]["q"]))
+
+    def controller(t, place, sum_):
+        x, z, gripper = np.asarray(way(jnp.asarray(t)))
+        goal = np.array([x, 0.0, z])
+        wanted = back @ (goal - home + sum_)
+        given = np.clip(wanted, low[:3], high[:3])
+        sum_ = (
+            sum_ + 5.0 * TICK * (goal - place) - 0.4 * np.linalg.pinv(back) @ (wanted - given)
+        )
+        return np.append(given, gripper), sum_
+
+    ticks = list(run_loop(
+        board, clock, controller, np.zeros(3), duration=WAY[-1, 0], period=TICK,
+        limits=(low, high), measure=lambda *_: tips(valves.state.state["body"]["q"]),
+    ))  # fmt: skip
+
+    @jax.jit
+    @jax.vmap
+    def seen(now):
+        here = rod.motion(whole, now["q"], now["v"])
+        parts = {name: rod.part_motion(here, k) for k, name in enumerate(whole.names)}
+        thing, plate = parts["cylinder"], parts["plate"].base
+        *fingers, floor = contacts
+        held = [rod.total_force(f, jnp.zeros(()), here)[-1] for f in (tuple(fingers), ())]
+        gaps = [f.force.touch(parts[f.first], thing).gap for f in fingers]
+        below = floor.force.touch(thing).gap
+        return {
+            "overlap": -jnp.min(jnp.concatenate(gaps)), "gap": jnp.min(below),
+            "up": thing.base.directors[2, 2], "force": held[0] - held[1],
+            "place": now["q"][-3:],
+            "held": plate.directors.T @ (now["q"][-3:] - plate.position),
+        }  # fmt: skip
+
+    film = jax.tree.map(lambda *rows: jnp.stack(rows), *states)
+    found = jax.tree.map(np.asarray, seen(film))
+    time = PERIOD * np.arange(len(states))
+    free = (found["gap"] > 0.1 * mm) & (time < 3.7)
+    moved = np.linalg.norm(found["held"][free] - found["held"][free][0], axis=1)
+    if picture is not None:
+        draw(whole, film["q"], time, found, ticks, picture)
+    end = found["place"][-1]
+    return {
+        "lift [mm]": found["gap"][free].max() / mm,
+        "contact forces over weight, carried": found["force"][free].mean() / (9.81 * MASS),
+        "moved in the grip [mm]": moved.max() / mm,
+        "farthest tilt [deg]": np.degrees(np.arccos(found["up"].min())),
+        "place off its target [mm]": np.linalg.norm(end[:2] - [TARGET, 0.0]) / mm,
+        "tilt at the end [deg]": np.degrees(np.arccos(min(1.0, found["up"][-1]))),
+        "speed at the end [mm/s]": np.linalg.norm(film["v"][-1, -3:]) / mm,
+        "overlap with fingers, greatest [mm]": found["overlap"].max() / mm,
+        "overlap with the floor, greatest [mm]": -found["gap"].min() / mm,
+        "gripper lets go [mm]": -found["overlap"][-1] / mm,
+    }
+
+
+def draw(whole, q, time, found, ticks, file) -> None:
+    """Six moments from the front, and heights, forces and pressures over time."""
+    import dataclasses
+    import io
+
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    from sorojax.view.rods import rod_scene
+    from sorojax.view.shapes import picture_of_scene
+
+    moments = (0.1, 0.7, 1.6, 2.6, 3.5, 4.85)
+    shapes = {"cylinder": sj.sdf.Cylinder(RADIUS, HEIGHT)}
+    scenes = [rod_scene(whole, q[round(t / PERIOD)], shapes=shapes) for t in moments]
+    low = np.min([scene.box[0] for scene in scenes], axis=0)
+    high = np.max([scene.box[1] for scene in scenes], axis=0)
+    figure = plt.figure(figsize=(12, 6.4), layout="constrained")
+    grid = figure.add_gridspec(2, 6, height_ratios=(1.35, 1))
+    for column, (t, scene) in enumerate(zip(moments, scenes, strict=True)):
+        scene = dataclasses.replace(scene, extent=(low, high))
+        shown = picture_of_scene(scene, view=sj.view.Camera(-90.0, 8.0), renderer="own")
+        axes = figure.add_subplot(grid[0, column])
+        image = plt.imread(io.BytesIO(shown.png))
+        rows, columns = image.shape[:2]
+        axes.imshow(image[: int(0.93 * rows), int(0.2 * columns) : int(0.82 * columns)])
+        axes.set_title(f"{t:g} s")
+        axes.set_axis_off()
+    panels = [figure.add_subplot(grid[1, k : k + 2]) for k in (0, 2, 4)]
+    for k, name in ((0, "x"), (2, "z")):
+        panels[0].plot(time, found["place"][:, k] / mm, label=f"{name} of the cylinder")
+    panels[0].axhline(TARGET / mm, color="0.6", lw=0.8)
+    panels[0].set(xlabel="time [s]", ylabel="[mm]")
+    panels[1].plot(time, found["force"], color="#2a6f97", label="lift of the fingers")
+    panels[1].axhline(9.81 * MASS, color="#e76f51", lw=1, label="weight")
+    panels[1].set(xlabel="time [s]", ylabel="[N]", ylim=(-0.6, 1.2))
+    pressures = np.array([tick.pressure for tick in ticks]) / kPa
+    panels[2].plot([tick.time for tick in ticks], pressures)
+    panels[2].set(xlabel="time [s]", ylabel="measured pressure [kPa]")
+    panels[2].legend(["bellows 1", "2", "3", "gripper"], frameon=False, fontsize=8)
+    for panel in panels[:2]:
+        panel.legend(frameon=False, fontsize=8)
+    figure.savefig(Path(file), dpi=90)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    sj.enable_compilation_cache()
+    quick = "--quick" in sys.argv
+    file = None if quick else Path(__file__).with_suffix(".png")
+    for name, value in main(quick, file).items():
+        print(f"{name:<42} {value:.4g}")

@@ -1,0 +1,198 @@
+"""How an equilibrium answers to small changes of its numbers: a linear map and its transpose.
+
+The map is R_u du = -R_p dp. With concrete numbers it is one primitive, so that tracing a
+derivative stages one operation; the work is done in whichever direction is asked for: one
+compiled program, one factor and one back-substitution.
+"""
+
+import contextlib
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array, Bool, Float
+
+from sorojax._types import is_traced
+from sorojax.fem.energy_form import potential_energy, residual
+from sorojax.fem.problem import Problem, unsupported
+from sorojax.fem.supports import known_values
+from sorojax.fem.traced import known_mask
+from sorojax.math import sparse
+
+
+class Equilibrium(NamedTuple):
+    """What the map is made of: the numbers that move, all others, and the state.
+
+    `values` are those of the tangent; `failed` is one where the state is no equilibrium,
+    which has no derivative.
+    """
+
+    params: Problem
+    rest: Problem
+    u: Float[Array, "nodes dim"]
+    values: Float[Array, " nnz"]
+    failed: Float[Array, ""]
+
+
+def response(at: Equilibrium, rates: Problem) -> Float[Array, "nodes dim"]:
+    """du for the rates dp of the numbers that move, by operations that JAX differentiates."""
+    system, matrix, known = _held_tangent(at)
+    if _supports_move(at):
+        rhs, move = _moved_unbalance(at, rates, known)
+        return _answer(system, matrix, rhs, at.u) + move
+    rhs = _unbalance(_without_supports(at), unsupported(rates), known)
+    return _answer(system, matrix, rhs, at.u)
+
+
+def response_at_once(at: Equilibrium, rates: Problem) -> Float[Array, "nodes dim"]:
+    """The same for a concrete equilibrium, as one primitive."""
+    moving, tree = jax.tree.flatten(rates)
+    return _response_p.bind(*moving, at=_Map(at, tree))
+
+
+class _Map:
+    """An equilibrium as the parameter of a primitive, compared by identity."""
+
+    def __init__(self, at: Equilibrium, tree):
+        self.at, self.tree = at, tree
+
+    def forward(self, *moving):
+        return response(self.at, jax.tree.unflatten(self.tree, moving))
+
+    def backward(self, change) -> list:
+        like = jax.tree.leaves(self.at.params)
+        return list(jax.linear_transpose(self.forward, *like)(change))
+
+    def backward_at_once(self, change) -> list:
+        """By one back-substitution and the derivative of one number."""
+        if _supports_move(self.at):
+            return self.backward(change)
+        system, matrix, known = _held_tangent(self.at)
+        force = np.where(np.asarray(known), 0.0, np.asarray(change).ravel())
+        work = jnp.asarray(system.solver.solve(np.asarray(matrix), force))
+        return jax.tree.leaves(_pulled(_without_supports(self.at), work, known))
+
+
+_response_p, _pull_p = Primitive("fem_response"), Primitive("fem_response_transpose")
+_pull_p.multiple_results = True
+_response_p.def_impl(lambda *moving, at: at.forward(*moving))
+_pull_p.def_impl(lambda change, at: at.backward_at_once(change))
+
+
+@_response_p.def_abstract_eval
+def _(*moving, at):
+    return jax.core.ShapedArray(at.at.u.shape, at.at.u.dtype)
+
+
+@_pull_p.def_abstract_eval
+def _(change, at):
+    return [jax.core.ShapedArray(x.shape, x.dtype) for x in jax.tree.leaves(at.at.params)]
+
+
+ad.deflinear2(_response_p, lambda change, *_, at: _pull_p.bind(change, at=at))
+ad.primitive_jvps[_pull_p] = lambda primals, tangents, at: (
+    _pull_p.bind(*primals, at=at), _pull_p.bind(*map(ad.instantiate_zeros, tangents), at=at)
+)  # fmt: skip
+ad.primitive_transposes[_pull_p] = lambda rates, _, at: [
+    _response_p.bind(*map(ad.instantiate_zeros, rates), at=at)
+]
+
+
+def _batched_response(moving, axes, *, at):
+    return jax.vmap(at.forward, axes)(*moving), 0
+
+
+def _batched_pull(change, axes, *, at):
+    out = jax.vmap(at.backward, axes)(*change)
+    return out, [0] * len(out)
+
+
+batching.primitive_batchers[_response_p] = _batched_response
+batching.primitive_batchers[_pull_p] = _batched_pull
+mlir.register_lowering(
+    _response_p, mlir.lower_fun(lambda *moving, at: at.forward(*moving), False)
+)
+mlir.register_lowering(_pull_p, mlir.lower_fun(lambda change, at: at.backward(change), True))
+
+
+def _supports_move(at: Equilibrium) -> bool:
+    return bool(jax.tree.leaves(at.params.supports))
+
+
+def _without_supports(at: Equilibrium) -> Equilibrium:
+    return at._replace(params=unsupported(at.params), rest=unsupported(at.rest))
+
+
+def _held_tangent(at: Equilibrium):
+    """The system, the tangent with its supports, and which unknowns these decide."""
+    problem = eqx.combine(at.params, at.rest)
+    system, concrete = problem.space.system, not is_traced(at)
+    # Concrete numbers run one compiled program, not its operations for the trace.
+    with jax.core.eval_context() if concrete else contextlib.nullcontext():
+        return system, *_held(system, problem.supports, at.values, at.u)
+
+
+@eqx.filter_jit
+def _held(system: sparse.SparseSymmetric, supports: tuple, values, u):
+    known = known_mask(supports, *u.shape)
+    return sparse.fix(system, values, known), known
+
+
+# Few programs, each differentiated and transposed once: operation by operation the trace
+# of a derivative costs more than the solve.
+
+
+@jax.jit
+def _unbalance(at: Equilibrium, rates: Problem, known: Bool[Array, " dofs"]):
+    """-dR for the numbers that move, at displacements that stay."""
+
+    def unbalanced(params):
+        return residual(eqx.combine(params, at.rest), at.u).ravel()
+
+    _, rate = jax.jvp(unbalanced, (at.params,), (rates,))
+    return jnp.where(known, jnp.zeros_like(rate), -_valid(at) * rate)
+
+
+@jax.jit
+def _pulled(at: Equilibrium, work: Float[Array, " dofs"], known: Bool[Array, " dofs"]):
+    """-work . dR by each of these numbers."""
+    way = jnp.where(known, jnp.zeros_like(work), -_valid(at) * work).reshape(at.u.shape)
+
+    def along(params):
+        def energy(u):
+            return potential_energy(eqx.combine(params, at.rest), u)
+
+        return jax.jvp(energy, (at.u,), (way,))[1]
+
+    return jax.grad(along)(at.params)
+
+
+@eqx.filter_jit
+def _moved_unbalance(at: Equilibrium, rates: Problem, known: Bool[Array, " dofs"]):
+    """-dR with the displacements that supports prescribe, and how these move [m]."""
+
+    def prescribed(params):
+        return known_values(eqx.combine(params, at.rest).supports, *at.u.shape)
+
+    def unbalanced(params, u):
+        return residual(eqx.combine(params, at.rest), u).ravel()
+
+    _, move = jax.jvp(prescribed, (at.params,), (rates,))
+    move = _valid(at) * move.reshape(at.u.shape)
+    _, rate = jax.jvp(unbalanced, (at.params, at.u), (rates, move))
+    return jnp.where(known, jnp.zeros_like(rate), -_valid(at) * rate), move
+
+
+@jax.jit
+def _answer(system: sparse.SparseSymmetric, matrix, rhs, u):
+    return sparse.solve(system, matrix, rhs).reshape(u.shape)
+
+
+def _valid(at: Equilibrium) -> Float[Array, ""]:
+    """1, or NaN where there is no derivative: a factor keeps the map linear."""
+    return jnp.where(at.failed == 0, jnp.ones_like(at.failed), jnp.nan)

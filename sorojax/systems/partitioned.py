@@ -1,0 +1,110 @@
+"""Networks whose body touches things: the body is moved by a stepper made for contact, all
+other blocks by a method of first order, in turns."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax._types import real
+from sorojax.math.contact_stepper import ContactMidpoint
+from sorojax.math.linearly_implicit import Rosenbrock2
+from sorojax.math.method import AbstractMethod
+from sorojax.math.steppers import AbstractStepper, Kinematic
+from sorojax.rod.rollout import second_order
+from sorojax.systems.assembly_body import AssemblyBody
+from sorojax.systems.block import Signals
+from sorojax.systems.network import Network, inputs_of, rates_of
+
+
+class Parted(NamedTuple):
+    """A network at one moment.
+
+    Attributes:
+        state: Of the network.
+        acceleration: Of the body, mean of the step before.
+        time: [s].
+    """
+
+    state: Any
+    acceleration: Float[Array, " dof"]
+    time: Float[Array, ""]
+
+
+Move = Callable[[Parted, Signals], Parted]
+
+
+def partitioned(
+    network: Network,
+    period: float,
+    *,
+    body: str = "body",
+    substeps: int = 1,
+    stepper: AbstractStepper | None = None,
+    method: AbstractMethod | None = None,
+) -> tuple[Move, Parted]:
+    """`move(parted, inputs) -> parted`, compiled, which advances by `period`, and the start.
+
+    In every step the body moves under the signals that the other blocks had, then they move
+    under those that the body has now: of order 1 in the step, and stable like a symplectic
+    step where gas and body swing together. Contacts may be as stiff as the stepper bears.
+
+    Args:
+        network: With one `AssemblyBody`.
+        period: Of every call [s].
+        body: Name of the block.
+        substeps: Steps in one call.
+        stepper: `ContactMidpoint()` if omitted.
+        method: For the other blocks; `Rosenbrock2(refresh=True)` if omitted.
+
+    Raises:
+        ValueError: If the network has no such body.
+    """
+    if not isinstance(network.blocks.get(body), AssemblyBody):
+        raise ValueError(
+            f"partitioned: `{body}` is no AssemblyBody, need the name of one among "
+            f"{', '.join(network.blocks)}. Pass body=."
+        )
+    _check.positive("partitioned", "period", period, "s", "5 ms is period=5e-3.")
+    stepper = ContactMidpoint() if stepper is None else stepper
+    method = Rosenbrock2(refresh=True) if method is None else method
+    h = real(period / substeps)
+    state = network.initial_state()
+    start = Parted(state, jnp.zeros_like(state[body]["v"]), jnp.zeros_like(h))
+
+    def move(parted: Parted, inputs: Signals) -> Parted:
+        given = {name: jnp.asarray(value, h.dtype) for name, value in inputs.items()}
+        return _move(network, parted, given, h, stepper, method, body, substeps)
+
+    return move, start
+
+
+@eqx.filter_jit
+def _move(network, parted, inputs, h, stepper, method, name, count) -> Parted:
+    def one(_, now: Parted) -> Parted:
+        body = network.blocks[name]
+        own = inputs_of(network, now.time, now.state, inputs, (name,))[name]
+        q, v = now.state[name]["q"], now.state[name]["v"]
+        problem = second_order(body.assembly, q, body.acting(own))
+        new = stepper.step(problem, now.time, h, Kinematic(q, v, now.acceleration))
+        state = now.state | {name: {"q": new.q, "v": new.v}}
+        state = _others(network, now.time, state, inputs, h, method, name)
+        return Parted(state, new.a, now.time + h)
+
+    return jax.lax.fori_loop(0, count, one, parted)
+
+
+def _others(network, t, state, inputs, h, method, body: str):
+    """The state after a step of all blocks but the body, which stays."""
+    names = tuple(name for name in network.blocks if name != body)
+
+    def field(t, part):
+        return rates_of(network, t, state | part, inputs, names)
+
+    part = {name: state[name] for name in names}
+    moved = method.advance(field, t, part, h, method.begin(field, t, part, h))
+    return state | moved.y

@@ -1,0 +1,91 @@
+"""The gallery shows every example, its picture, and what was measured beside the paper."""
+
+import html
+import json
+import re
+import subprocess
+import sys
+
+import pytest
+
+from tests.scripts import ROOT
+
+FOLDER = ROOT / "examples"
+BUILD = FOLDER / "gallery" / "build.py"
+SCRIPTS = sorted(FOLDER.glob("[0-9][0-9]_*.py"))
+SCRIPT = '''"""A spring: how far it goes.
+
+A second paragraph with <signs>.
+"""
+
+
+def main(quick=False):
+    return {"way [mm]": 1 / 3 if quick else 2.5, "springs": 4}
+'''
+BROKEN = '''"""One that fails."""
+
+
+def main():
+    raise ValueError("no such spring")
+'''
+
+
+def build(*arguments):
+    command = [sys.executable, str(BUILD), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module")
+def stored():
+    return (FOLDER / "gallery" / "index.html").read_text()
+
+
+def test_the_page_is_whole_and_static(stored):
+    for file in SCRIPTS:
+        assert f'<section id="{file.stem}">' in stored
+    links = [link for link in re.findall(r'(?:src|href)="([^"]+)"', stored) if link[0] != "#"]
+    assert len(links) > len(SCRIPTS)
+    for link in links:
+        assert (FOLDER / "gallery" / html.unescape(link)).exists(), link
+    shown = re.sub(r"<pre>.*?</pre>", "", stored, flags=re.S)
+    assert "http" not in shown and "<script" not in shown and "url(" not in shown
+
+
+def test_every_picture_has_its_place(stored):
+    numbered = [p for p in FOLDER.glob("[0-9][0-9]_*.png")]
+    assert numbered
+    for picture in numbered:
+        assert f'<img src="../{picture.name}"' in stored
+
+
+def test_numbers_of_the_paper_stand_beside_measured_ones():
+    paper = json.loads((FOLDER / "gallery" / "paper.json").read_text())
+    for name, entry in paper.items():
+        file = FOLDER / "gallery" / "numbers" / f"{name}.json"
+        if entry.get("numbers") and file.exists():
+            measured = json.loads(file.read_text())["numbers"]
+            assert set(entry["numbers"]) <= set(measured), name
+
+
+def test_a_new_script_is_found_measured_and_shown(tmp_path):
+    (tmp_path / "31_spring.py").write_text(SCRIPT)
+    (tmp_path / "31_spring.png").write_bytes(b"")
+    (tmp_path / "32_broken.py").write_text(BROKEN)
+    (tmp_path / "gallery").mkdir()
+    paper = {"31_spring": {"section": "II", "numbers": {"way [mm]": "3 < x", "mass": "1"}}}
+    (tmp_path / "gallery" / "paper.json").write_text(json.dumps(paper))
+    done = build("--folder", tmp_path, "--run")
+    assert done.returncode == 1 and "no such spring" in done.stderr
+    made = json.loads((tmp_path / "gallery" / "numbers" / "31_spring.json").read_text())
+    assert made["numbers"] == {"way [mm]": 2.5, "springs": 4} and not made["quick"]
+    assert made["machine"] and "JAX" in made["versions"]
+    text = (tmp_path / "gallery" / "index.html").read_text()
+    assert "<td>way [mm]</td><td>2.5</td><td>3 &lt; x</td>" in text
+    assert "<td>mass</td><td>-</td><td>1</td>" in text and "paper II" in text
+    assert '<img src="../31_spring.png"' in text and "&lt;signs&gt;" in text
+    assert "not measured yet" in text  # the one that failed
+    again = build("--folder", tmp_path, "--run", "31", "--quick")
+    assert (
+        again.returncode == 0
+        and "quick mode" in (tmp_path / "gallery" / "index.html").read_text()
+    )
