@@ -43,14 +43,22 @@ ROWS = {
     ),
     "meshing": Cases(("mesh.triangulate", "mesh.tetrahedralise")),
     "topology optimisation": Cases(
-        ("design.layout",), ("design.calibrate", "design.mma", "design.nonlinear")
+        ("design.layout",),
+        (
+            "design.calibrate",
+            "design.gradient",
+            "design.mma",
+            "design.nonlinear",
+            "design.pneunet",
+        ),
     ),
     "system integration": Cases(
         ("systems.easy", "systems.stiff"), ("systems.batch", "systems.fem", "systems.hand")
     ),
     "inverse kinematics and estimator": Cases(("rod.ik", "systems.estimator")),
     "gradients": Cases(("fem.gradient",), ("rod.gradient",)),
-    "start": Cases(("cli.import", "rod.first_call")),
+    "start": Cases(("cli.import", "rod.first_call"), ("view.first",)),
+    "pictures": Cases(("view.skin",), ("view.film", "view.web")),
     "what a scene does not need": Cases(("skip.features",)),
     "scaling": Cases(("scaling.rod", "scaling.fem", "scaling.batch", "scaling.design")),
 }

@@ -198,3 +198,29 @@ def test_a_browser_shows_the_loop(rig):
         assert np.mean(np.any(np.abs(straight - bent) > 20, axis=2)) > 0.005
         asked = {url for url in tab.requests if not url.endswith("favicon.ico")}
         assert asked == {feed.url, f"{feed.url}frames"}
+
+
+def test_a_viser_scene_follows_the_loop(rig):
+    """The scene in this process; `live` starts it in another like any sink."""
+    pytest.importorskip("viser", reason="the extra `live` is not installed")
+    sink = view.Viser(rig, port=0)
+    address = sink.open()
+    try:
+        with urllib.request.urlopen(address, timeout=20) as page:
+            assert b"<html" in page.read().lower()
+        for time_of, q in ((0.0, 0.0), (0.5, 20.0)):
+            sink.show(time_of, np.array([q]))
+            exact = np.asarray(view.pose(rig, jnp.array([q])))
+            shown = sink._mesh.vertices
+            assert np.allclose(shown[:, : exact.shape[1]], exact, atol=1e-7)
+        assert sink._stamp.value == "t = 0.50 s"
+    finally:
+        sink.close()
+    with pytest.raises(OSError):
+        urllib.request.urlopen(address, timeout=5)
+
+
+def test_viser_missing_is_named(rig, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(ModuleNotFoundError, match=r"sorojax\[live\]"):
+        view.Viser(rig).open()

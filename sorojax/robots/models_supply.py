@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._display import displayed, number
 from sorojax._types import real
 from sorojax.math.method import AbstractMethod, finite, repeated
 from sorojax.rod import Assembly
@@ -70,6 +71,7 @@ class Port(NamedTuple):
     dead: float | Array = 0.0
 
 
+@displayed
 class Model(eqx.Module):
     """A robot as a network that takes set-points and tells pressures.
 
@@ -85,6 +87,16 @@ class Model(eqx.Module):
     counts: tuple[int | None, ...] = eqx.field(static=True)
     low: Float[Array, " regulators"] = eqx.field(converter=real)
     high: Float[Array, " regulators"] = eqx.field(converter=real)
+
+    def _text(self) -> str:
+        ports = ", ".join(
+            name if count is None else f"{name} ({count})"
+            for name, count in zip(self.ports, self.counts, strict=True)
+        )
+        return (
+            f"Model: a network of {len(self.network.blocks)} blocks, ports {ports}\n"
+            f"  set-points from {number(self.low, 'Pa')} to {number(self.high, 'Pa')}"
+        )
 
     @property
     def assembly(self) -> Assembly:

@@ -12,6 +12,7 @@ from sorojax.view.charts import Convergence as Convergence, WorkPrecision as Wor
 from sorojax.view.film import Film as Film, animate_figure as animate_figure
 from sorojax.view.live import Feed as Feed, live as live
 from sorojax.view.live_sinks import AbstractSink as AbstractSink, Recording as Recording
+from sorojax.view.live_viser import Viser as Viser
 from sorojax.view.picture import Picture as Picture
 from sorojax.view.report import (
     Number as Number,

@@ -81,7 +81,8 @@ def live(what: Rig | AbstractSink, **options: Any) -> Feed:
 
     Args:
         what: A rig, shown in a page at an address of this machine (`feed.url`), to which its
-            coordinates are sent; or another sink, such as `Recording(path, size)`.
+            coordinates are sent; or another sink: `Viser(rig)` for a scene of the extra
+            `live`, `Recording(path, size)`.
         **options: Those of `Browser`: `port`, `title`, `fps`.
 
     Raises:
