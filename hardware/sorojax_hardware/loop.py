@@ -1,5 +1,6 @@
 """The one loop that runs a controller on a board."""
 
+import gc
 import math
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -106,6 +107,8 @@ class _Bounds(NamedTuple):
 
 
 def _ticks(board, clock, see, controller, state, duration, period, bounds, max_skipped, record):
+    # What there is now is not looked through for garbage again, which takes longer than a tick.
+    gc.freeze()
     start, tick = clock.now(), 0
     setpoint, before = np.clip(np.zeros(board.num_ports), bounds.low, bounds.high), -period
     try:
@@ -132,6 +135,7 @@ def _ticks(board, clock, see, controller, state, duration, period, bounds, max_s
             clock.sleep_until(start + tick * period)
     finally:
         board.vent()
+        gc.unfreeze()
 
 
 def tick_recorder(path: str | Path, num_ports: int, **about) -> Recorder:

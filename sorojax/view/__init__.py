@@ -31,9 +31,6 @@ from sorojax.view.scene import (
 from sorojax.view.show import options as options, show as show
 from sorojax.view.skin import Skin as Skin, bind as bind, deform as deform
 from sorojax.view.style import png as png
-from sorojax.view.web import Page as Page, to_html as to_html
-from sorojax.view.web_actor import Actor as Actor, actor as actor
-from sorojax.view.web_glb import to_glb as to_glb
 
 _LATE = {
     **dict.fromkeys(("show_deformed", "show_mesh", "show_sdf"), "bodies"),
@@ -42,6 +39,9 @@ _LATE = {
     **dict.fromkeys(("backbone_errors", "show_backbones", "show_curve"), "figures"),
     **dict.fromkeys(("show_modes", "show_signals"), "figures"),
     **dict.fromkeys(("animate_file", "show_file"), "files"),
+    **dict.fromkeys(("Page", "to_html"), "web"),
+    **dict.fromkeys(("Actor", "actor"), "web_actor"),
+    "to_glb": "web_glb",
 }
 
 if TYPE_CHECKING:
@@ -60,6 +60,9 @@ if TYPE_CHECKING:
         show_signals as show_signals,
     )
     from sorojax.view.files import animate_file as animate_file, show_file as show_file
+    from sorojax.view.web import Page as Page, to_html as to_html
+    from sorojax.view.web_actor import Actor as Actor, actor as actor
+    from sorojax.view.web_glb import to_glb as to_glb
 
 
 def __getattr__(name: str) -> Any:

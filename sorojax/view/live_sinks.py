@@ -11,10 +11,7 @@ from typing import Any
 import numpy as np
 
 from sorojax.rod import num_coordinates
-from sorojax.view import web
 from sorojax.view.rig import Rig, pose
-from sorojax.view.web_actor import actor
-from sorojax.view.web_pack import Packer, quantised
 
 _PATIENCE = 1.0  # s between two signs of life of a page without news
 
@@ -76,6 +73,10 @@ class Browser(AbstractSink):
         self.size = num_coordinates(rig.model)
 
     def open(self) -> str:
+        from sorojax.view import web
+        from sorojax.view.web_actor import actor
+        from sorojax.view.web_pack import Packer
+
         still = actor(self.rig, name=self.title or "robot")
         low, high = web.room([still])
         reach = float(np.max(high - low))
@@ -97,6 +98,8 @@ class Browser(AbstractSink):
         return f"http://127.0.0.1:{port}/"
 
     def show(self, time: float, values: np.ndarray) -> None:
+        from sorojax.view.web_pack import quantised
+
         points = np.asarray(pose(self.rig, values))
         points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
         levels = quantised(points.T[None], *self._ends)

@@ -94,15 +94,24 @@ def _lit(colour, soup: Soup, triangle, shares, axes) -> Float[np.ndarray, "n 3"]
     gleam = gleam**2
     gleam = gleam**2
     gleam = np.float32(_SHINE) * gleam * gleam * gleam  # to the power 24
-    valued = np.isfinite(soup.values[:, 0])[triangle]
-    light = np.where(
-        valued, 0.72 + 0.24 * bright + 0.10 * weak, 0.42 + 0.52 * bright + 0.16 * weak
-    )
-    gleam *= np.where(valued, np.float32(0.4), np.float32(1.0))
-    lit = soup.lit[triangle] > 0
-    light = np.where(lit, light, np.float32(1.0)).astype(np.float32)
-    gleam = np.where(lit, gleam, np.float32(0.0))
-    return np.minimum(colour * light[:, None] + gleam[:, None], np.float32(1.0))
+    valued, lit = np.isfinite(soup.values[:, 0]), soup.lit > 0
+
+    def weight(coloured: float, plain: float):
+        return _each(np.where(valued, coloured, plain).astype(np.float32), triangle)
+
+    light = weight(0.72, 0.42) + weight(0.24, 0.52) * bright + weight(0.10, 0.16) * weak
+    gleam *= weight(0.4, 1.0)
+    if not np.all(lit):
+        light = np.where(lit[triangle], light, np.float32(1.0))
+        gleam = np.where(lit[triangle], gleam, np.float32(0.0))
+    colour = colour * light[:, None]
+    colour += gleam[:, None]
+    return np.minimum(colour, np.float32(1.0), out=colour)
+
+
+def _each(table: Float[np.ndarray, " triangles"], triangle):
+    """The number of every sample's triangle; one number where all are equal."""
+    return table[0] if np.all(table == table[0]) else table[triangle]
 
 
 def _facing(normal, lamp) -> np.ndarray:
