@@ -36,26 +36,28 @@ def build(*arguments):
 
 
 @pytest.fixture(scope="module")
-def stored():
+def written():
+    done = build()
+    assert done.returncode == 0, done.stderr
     return (FOLDER / "gallery" / "index.html").read_text()
 
 
-def test_the_page_is_whole_and_static(stored):
+def test_the_page_is_whole_and_static(written):
     for file in SCRIPTS:
-        assert f'<section id="{file.stem}">' in stored
-    links = [link for link in re.findall(r'(?:src|href)="([^"]+)"', stored) if link[0] != "#"]
+        assert f'<section id="{file.stem}">' in written
+    links = [link for link in re.findall(r'(?:src|href)="([^"]+)"', written) if link[0] != "#"]
     assert len(links) > len(SCRIPTS)
     for link in links:
         assert (FOLDER / "gallery" / html.unescape(link)).exists(), link
-    shown = re.sub(r"<pre>.*?</pre>", "", stored, flags=re.S)
+    shown = re.sub(r"<pre>.*?</pre>", "", written, flags=re.S)
     assert "http" not in shown and "<script" not in shown and "url(" not in shown
 
 
-def test_every_picture_has_its_place(stored):
+def test_every_picture_has_its_place(written):
     numbered = [p for p in FOLDER.glob("[0-9][0-9]_*.png")]
     assert numbered
     for picture in numbered:
-        assert f'<img src="../{picture.name}"' in stored
+        assert f'<img src="../{picture.name}"' in written
 
 
 def test_numbers_of_the_paper_stand_beside_measured_ones():

@@ -1,7 +1,4 @@
-"""The chamber of a bending actuator found in 100 steps, as in the Sorotoki paper VI-B.
-
-The time in all is that of the processor, which one core would need.
-"""
+"""The chamber of a bending actuator found in 100 steps, as in the Sorotoki paper VI-B."""
 
 import time
 
@@ -20,14 +17,14 @@ ACTIVE, GREY = 1e-3, 0.05
 
 def rows():
     for chamber in ("darcy", "flood"):
-        start, begin = time.perf_counter(), time.process_time()
+        start = time.perf_counter()
         cell = design.pneunet_cell(chamber=chamber)
         ticks = [time.perf_counter()]
         with silent():
             found = design.optimise_pneunet(
                 cell, steps=STEPS, on_step=lambda _, t=ticks: t.append(time.perf_counter())
             )  # fmt: skip
-        whole, seconds = time.process_time() - begin, np.diff(ticks)
+        seconds = np.diff(ticks)
         density = cell.plan(found.design, sharpness(STEPS - 1, STEPS))
         objective = found.history["objective"]
         settings = {
@@ -38,8 +35,8 @@ def rows():
             "whole_s": round(ticks[-1] - start, 1),
         }  # fmt: skip
         yield Row("sorojax", settings, seconds[0], float(np.median(seconds[3:])),
-                  float(seconds.min()), float(seconds[3:].max()), error=whole,
-                  bar=MOST, bar_on="error", reference="seconds of one core in all")  # fmt: skip
+                  float(seconds.min()), float(seconds[3:].max()), error=ticks[-1] - start,
+                  bar=MOST, bar_on="error", reference="seconds in all")  # fmt: skip
         slack = abs(float(jnp.max(found.constraints)))
         yield Row("sorojax", settings | {"what": "volume constraint"}, error=slack, bar=ACTIVE,
                   bar_on="error", reference="active")  # fmt: skip

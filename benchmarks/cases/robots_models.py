@@ -18,7 +18,7 @@ from sorojax.robots.models_rods import Body, body, column, side_by_side
 from sorojax.units import kPa, mm
 
 BAR = 0.05
-PRESSURES = np.array([5.0, 30.0]) * kPa
+PRESSURES = np.array([5.0, 10.0, 20.0, 30.0]) * kPa
 
 
 def rows():

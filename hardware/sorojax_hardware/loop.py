@@ -107,8 +107,10 @@ class _Bounds(NamedTuple):
 
 
 def _ticks(board, clock, see, controller, state, duration, period, bounds, max_skipped, record):
-    # What there is now is not looked through for garbage again, which takes longer than a tick.
-    gc.freeze()
+    # What there is now is not looked through for garbage again: that takes many ticks.
+    freezes = gc.get_freeze_count() == 0
+    if freezes:
+        gc.freeze()
     start, tick = clock.now(), 0
     setpoint, before = np.clip(np.zeros(board.num_ports), bounds.low, bounds.high), -period
     try:
@@ -135,7 +137,8 @@ def _ticks(board, clock, see, controller, state, duration, period, bounds, max_s
             clock.sleep_until(start + tick * period)
     finally:
         board.vent()
-        gc.unfreeze()
+        if freezes:
+            gc.unfreeze()
 
 
 def tick_recorder(path: str | Path, num_ports: int, **about) -> Recorder:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from sorojax.fem.energy import Body, Response
 from sorojax.fem.kinematics import AbstractKinematics
 from sorojax.fem.tensor import Entries
-from sorojax.math.apart import Alone, at_once
+from sorojax.math.apart import Alone
 
 Force = Float[Array, "cell_nodes dim lanes"]
 Gradients = Float[Array, "quad cell_nodes columns lanes"]
@@ -25,7 +25,7 @@ def block_matrix(
     answer: Response,
     body: Body,
     gradients: Gradients,
-    alone: Alone = at_once,
+    alone: Alone,
 ) -> tuple[Force, Float[Array, "entries lanes"]]:
     """Sums over points of P G and of G' A G, the latter in the order of `block_entries`."""
     weighted, bent = alone(lambda: (

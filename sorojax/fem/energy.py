@@ -35,7 +35,7 @@ from sorojax.fem.tensor import (
 )
 from sorojax.material.hyperelastic import AbstractHyperelastic, finite_share
 from sorojax.material.kinematics import Entry
-from sorojax.math.apart import Alone, at_once
+from sorojax.math.apart import Alone
 
 
 class Body(NamedTuple):
@@ -74,7 +74,7 @@ def pressure(body: Body, F: Entries) -> Entry:
     return project(body.modes, body.volumes, slope)
 
 
-def response(body: Body, F: Entries, F_before: Entries, alone: Alone = at_once) -> Response:
+def response(body: Body, F: Entries, F_before: Entries, alone: Alone) -> Response:
     """P and dP/dF, the geometric parts of dP/dF from stresses extrapolated out of
     `F_before`. With `F_before` equal to `F` the tangent is the exact derivative."""
     vectors = alone(lambda: _vectors(body, F, F_before))

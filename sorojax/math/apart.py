@@ -16,11 +16,6 @@ Answer = TypeVar("Answer")
 Alone = Callable[[Callable[[], Any]], Any]
 
 
-def at_once(work: Callable[[], Answer]) -> Answer:
-    """`work()`, left to XLA."""
-    return work()
-
-
 def apart(always: Bool[Array, ""]) -> Alone:
     """A function that calls `work()` by itself. `always` is true, but known at run time only:
     where it is not, the answer is NaN."""

@@ -260,11 +260,11 @@ def integrate(
     pause = max(1, saves // 100)
 
     def advance(carry, number):
-        counts = jnp.ones((), h.dtype) if number is None else (number > 0).astype(h.dtype)
+        share = jnp.ones((), h.dtype) if number is None else (number > 0).astype(h.dtype)
 
         def one(_, carry):
             index, state = carry
-            return index + counts, stepper.step(problem, t + index * h, counts * h, state)
+            return index + share, stepper.step(problem, t + index * h, share * h, state)
 
         carry = jax.lax.fori_loop(0, every, one, carry) if every > 1 else one(0, carry)
         if label is not None and number is not None:
