@@ -33,9 +33,11 @@ def desk(num_ports=2, **options):
     return clock, MemoryBoard(clock, num_ports, **options)
 
 
-def loop(board, clock, controller, state=0.0, duration=1.0, limits=(-10 * kPa, 60 * kPa)):
+def loop(
+    board, clock, controller, state=0.0, duration=1.0, limits=(-10 * kPa, 60 * kPa), **how
+):
     return run_loop(
-        board, clock, controller, state, duration=duration, period=PERIOD, limits=limits
+        board, clock, controller, state, duration=duration, period=PERIOD, limits=limits, **how
     )
 
 
@@ -154,7 +156,9 @@ def test_wrong_settings_raise_at_the_call(wrong):
         run_loop(board, clock, lambda t, y, s: (0.0, s), None, **options)
 
 
-def test_an_overrun_leaves_ticks_out_instead_of_hurrying():
+@pytest.mark.parametrize(("catch_up", "made_up"), [(3, True), (2, False), (0, False)])
+def test_an_overrun_is_made_up_for_or_left_out(catch_up, made_up):
+    """A stall of 3.5 periods: three ticks begin late, one after another, or never."""
     clock, board = desk()
 
     def slow_once(t, measurement, calls):
@@ -162,10 +166,24 @@ def test_an_overrun_leaves_ticks_out_instead_of_hurrying():
             clock.sleep_until(clock.now() + 0.035)
         return 0.0, calls + 1
 
-    ticks = list(loop(board, clock, slow_once, 0))
+    ticks = list(loop(board, clock, slow_once, 0, catch_up=catch_up))
     report = deadlines(ticks, PERIOD)
-    assert report.num_ticks == 97 and report.num_skipped == 3
-    assert report.max_late < 1e-9
+    assert report.num_ticks == (100 if made_up else 97)
+    assert report.num_skipped == 100 - report.num_ticks
+    late = [0.025, 0.015, 0.005, 0.0] if made_up else [0.0] * 4
+    assert np.allclose([tick.late for tick in ticks[11:15]], late, atol=1e-9)
+    assert report.num_behind == (2 if made_up else 0)
+
+
+def test_a_loop_that_is_always_too_slow_stays_within_its_bound():
+    clock, board = desk()
+
+    def slow(t, measurement, state):
+        clock.sleep_until(clock.now() + 1.5 * PERIOD)
+        return 0.0, state
+
+    ticks = list(loop(board, clock, slow, None, catch_up=2))
+    assert 60 < len(ticks) < 70 and max(tick.late for tick in ticks) < 3 * PERIOD
 
 
 def test_wall_clock_waits():

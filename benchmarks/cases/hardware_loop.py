@@ -77,7 +77,8 @@ def _loop(port: int) -> Row:
     settings = {
         "rate": RATE, "duration": DURATION, "needs": "two free cores", **used,
         "cores_of_the_loop": spent / DURATION, "load": os.getloadavg()[0],
-        "ticks": report.num_ticks, "left_out": report.num_skipped, "late_set_points": late,
+        "ticks": report.num_ticks, "left_out": report.num_skipped,
+        "made_up": report.num_behind, "max_late": report.max_late, "late_set_points": late,
         "board": f"{state.state.name.lower()}, fault {state.fault!r}",
         "p50_period_error": float(np.median(error)),
     }  # fmt: skip

@@ -168,7 +168,8 @@ def _wave(asked) -> int:
             if log is not None:
                 log.close()
     late = deadlines(ticks, _PERIOD)
-    print(f"\n{late.num_ticks} ticks, {late.num_skipped} left out, late: median "
+    print(f"\n{late.num_ticks} ticks, {late.num_skipped} left out, {late.num_behind} more than "
+          f"a period late; late by a median of "
           f"{late.median_late * 1e3:.2f} ms, p99 {late.p99_late * 1e3:.2f} ms")  # fmt: skip
     return 0
 

@@ -26,7 +26,8 @@ class Deadlines(NamedTuple):
     """How well a loop kept its period."""
 
     num_ticks: int
-    num_skipped: int  # planned ticks that an earlier one overran
+    num_skipped: int  # planned ticks left out after an overrun
+    num_behind: int  # ticks that began more than a period late
     median_late: float  # s
     p99_late: float  # s
     max_late: float  # s
@@ -47,15 +48,17 @@ def run_loop(
     limits: tuple[Any, Any],
     slew: Any = np.inf,
     measure: Callable[[float, np.ndarray], Any] | None = None,
+    catch_up: int = 4,
     max_skipped: float = np.inf,
     record: Recorder | None = None,
 ) -> Iterator[Tick]:
     """Run a pure controller on a board, one `Tick` per period.
 
     Every tick reads the pressures, measures, calls `controller(t, measurement, state)`,
-    cuts the command to `limits` and `slew` and writes it. Ticks that an overrun has missed
-    are left out. The board is vented however the loop ends: run out, closed, or by an
-    exception.
+    cuts the command to `limits` and `slew` and writes it. After an overrun the missed ticks
+    run at once, so that a controller in discrete time and the record have every sample; if
+    the loop is further behind than `catch_up` ticks, those are left out. The board is vented
+    however the loop ends: run out, closed, or by an exception.
 
     Args:
         board: Where pressures are read and written.
@@ -68,12 +71,13 @@ def run_loop(
         slew: Fastest change of a set-point, a number or one per port [Pa/s].
         measure: What the controller sees, from time [s] and pressures [Pa], for instance
             an angle from a camera; the pressures if omitted.
-        max_skipped: Ticks that one overrun may leave out before the loop gives up.
+        catch_up: Missed ticks that are made up for; 0 leaves out every one.
+        max_skipped: Ticks that the loop may be behind before it gives up.
         record: Takes every tick; make it with `tick_recorder`.
 
     Raises:
         ValueError: If a time or a limit makes no sense, or a command is not finite.
-        Overrun: If a tick left out more than `max_skipped` others.
+        Overrun: If a tick overran more than `max_skipped` others.
     """
     if not (period > 0 and duration > 0):
         raise ValueError(
@@ -91,9 +95,8 @@ def run_loop(
         raise ValueError(f"run_loop: `slew` is {slew} Pa/s, need it positive. 1e6 is quick.")
     see = measure or (lambda t, pressure: pressure)
     bounds = _Bounds(low, high, most)
-    return _ticks(
-        board, clock, see, controller, state, duration, period, bounds, max_skipped, record
-    )
+    pace = _Pace(period, math.ceil(duration / period - 1e-9), catch_up, max_skipped)
+    return _ticks(board, clock, see, controller, state, pace, bounds, record)
 
 
 class _Bounds(NamedTuple):
@@ -102,22 +105,40 @@ class _Bounds(NamedTuple):
     slew: np.ndarray
 
     def cut(self, wanted: np.ndarray, before: np.ndarray, step: float) -> np.ndarray:
-        change = self.slew * step
+        change = self.slew * max(step, 1e-9)  # made-up ticks may fall into one instant
         return np.clip(np.clip(wanted, before - change, before + change), self.low, self.high)
 
 
-def _ticks(board, clock, see, controller, state, duration, period, bounds, max_skipped, record):
+class _Pace(NamedTuple):
+    period: float  # s
+    num_ticks: int
+    catch_up: int
+    max_skipped: float
+
+    def after(self, tick: int, elapsed: float) -> int:
+        """The tick that follows `tick`, which ended at `elapsed` [s]."""
+        missed = math.ceil(elapsed / self.period - 1e-9) - tick - 1
+        if missed > self.max_skipped:
+            raise Overrun(
+                f"run_loop: the tick at {tick * self.period:g} s overran {missed} others, "
+                f"`max_skipped` is {self.max_skipped:g}. Make the controller faster or the "
+                "period longer. The board is vented."
+            )
+        return tick + 1 if missed <= self.catch_up else tick + 1 + missed
+
+
+def _ticks(board, clock, see, controller, state, pace: _Pace, bounds, record):
     # What there is now is not looked through for garbage again: that takes many ticks.
     freezes = gc.get_freeze_count() == 0
     if freezes:
         gc.freeze()
     start, tick = clock.now(), 0
-    setpoint, before = np.clip(np.zeros(board.num_ports), bounds.low, bounds.high), -period
+    setpoint, before = np.clip(np.zeros(board.num_ports), bounds.low, bounds.high), -pace.period
     try:
-        while tick < duration / period - 1e-9:
+        while tick < pace.num_ticks:
             # A NumPy number: compilers that treat Python's as constants compile once.
             t = np.float64(clock.now() - start)
-            late = t - tick * period
+            late = t - tick * pace.period
             pressure = board.read_pressure()
             command, state = controller(t, see(t, pressure), state)
             wanted = _checked(command, board.num_ports, t)
@@ -126,15 +147,8 @@ def _ticks(board, clock, see, controller, state, duration, period, bounds, max_s
             if record is not None:
                 record.write(t, late, pressure, setpoint)
             yield Tick(t, pressure, setpoint, state, late)
-            following = max(tick + 1, math.ceil((clock.now() - start) / period - 1e-9))
-            if following - tick - 1 > max_skipped:
-                raise Overrun(
-                    f"run_loop: the tick at {tick * period:g} s overran {following - tick - 1} "
-                    f"others, `max_skipped` is {max_skipped:g}. Make the controller faster or "
-                    "the period longer. The board is vented."
-                )
-            tick = following
-            clock.sleep_until(start + tick * period)
+            tick = pace.after(tick, clock.now() - start)
+            clock.sleep_until(start + tick * pace.period)
     finally:
         board.vent()
         if freezes:
@@ -167,5 +181,5 @@ def deadlines(ticks: Iterable[Tick], period: float) -> Deadlines:
     late = np.array([tick.late for tick in seen] or [0.0])
     planned = round((seen[-1].time - seen[-1].late) / period) + 1 if seen else 0
     median, p99 = np.percentile(late, (50, 99))
-    skipped = planned - len(seen)
-    return Deadlines(len(seen), skipped, float(median), float(p99), float(late.max()))
+    skipped, behind = planned - len(seen), int(np.sum(late > period))
+    return Deadlines(len(seen), skipped, behind, float(median), float(p99), float(late.max()))
