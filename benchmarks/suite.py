@@ -59,6 +59,7 @@ ROWS = {
     "gradients": Cases(("fem.gradient",), ("rod.gradient",)),
     "start": Cases(("cli.import", "rod.first_call"), ("view.first",)),
     "pictures": Cases(("view.skin",), ("view.film", "view.web")),
+    "single precision": Cases(("precision.single",)),
     "what a scene does not need": Cases(("skip.features",)),
     "scaling": Cases(("scaling.rod", "scaling.fem", "scaling.batch", "scaling.design")),
 }

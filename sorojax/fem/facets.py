@@ -100,9 +100,10 @@ def facet_integral(
 
     def one(X, value):
         size = jnp.sqrt(jnp.sum(normals(tables, X) ** 2, axis=1))
-        position = jnp.asarray(tables.values) @ X
-        area = jnp.asarray(tables.weights) * size * kinematics.depth(tuple(position.T))
-        return area @ (jnp.asarray(tables.values) @ value)
+        values = jnp.asarray(tables.values, X.dtype)
+        position = values @ X
+        area = jnp.asarray(tables.weights, X.dtype) * size * kinematics.depth(tuple(position.T))
+        return area @ (values @ value)
 
     return jnp.sum(jax.vmap(one)(problem.mesh.points[facets], nodal[facets]), axis=0)
 

@@ -170,7 +170,7 @@ class Solid(AbstractKinematics):
         return (F[:3], F[3:6], F[6:])  # type: ignore[return-value]
 
     def depth(self, position) -> Entry:
-        return jnp.ones((), jnp.result_type(float))
+        return jnp.ones((), jnp.result_type(*position))
 
 
 def _check_thickness(where: str, thickness) -> None:

@@ -64,7 +64,7 @@ def _points(mesh: Mesh, kinematics: AbstractKinematics, tables: Tables) -> Point
     x = _by_cell(mesh, mesh.points)
     jac = _slopes(tables, kinds, x)
     full = three([[jac[i, d] for d in range(mesh.element.dim)] for i in range(len(jac))])
-    weights = _of_cells(tables.weights, kinds)
+    weights = _of_cells(tables.weights.astype(x.dtype), kinds)
     areas = determinant(full) * weights
     position = _interpolate(tables, kinds, x)
     if kinds is not None:
@@ -123,15 +123,17 @@ def _by_cell(mesh: Mesh, nodal: Float[Array, "nodes dim"]):
 
 
 def _slopes(tables: Tables, kinds, by_cell) -> Float[Array, "dim dim_ref quad cells"]:
+    dtype = by_cell.dtype
     if kinds is None:
-        return jnp.einsum("qad,iac->idqc", jnp.asarray(tables.slopes[0]), by_cell)
-    return jnp.einsum("cqad,iac->idqc", jnp.asarray(tables.slopes)[kinds], by_cell)
+        return jnp.einsum("qad,iac->idqc", jnp.asarray(tables.slopes[0], dtype), by_cell)
+    return jnp.einsum("cqad,iac->idqc", jnp.asarray(tables.slopes, dtype)[kinds], by_cell)
 
 
 def _interpolate(tables: Tables, kinds, by_cell) -> Float[Array, "dim quad cells"]:
+    dtype = by_cell.dtype
     if kinds is None:
-        return jnp.einsum("qa,iac->iqc", jnp.asarray(tables.values[0]), by_cell)
-    return jnp.einsum("cqa,iac->iqc", jnp.asarray(tables.values)[kinds], by_cell)
+        return jnp.einsum("qa,iac->iqc", jnp.asarray(tables.values[0], dtype), by_cell)
+    return jnp.einsum("cqa,iac->iqc", jnp.asarray(tables.values, dtype)[kinds], by_cell)
 
 
 def _of_cells(table: np.ndarray, kinds):

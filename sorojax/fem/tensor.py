@@ -85,7 +85,8 @@ def geometric_part(
     weight = jnp.zeros_like(F[0]) if weight is None else jnp.asarray(weight)
     # A product with a constant table: gathers of rows are several times slower.
     parts = jnp.concatenate([weight[None] * F, weight[None], S])
-    return jnp.einsum("efk,kql->efql", geometric_table(type(kinematics)), parts)
+    table = jnp.asarray(geometric_table(type(kinematics)), parts.dtype)
+    return jnp.einsum("efk,kql->efql", table, parts)
 
 
 def second_piola(kinematics: AbstractKinematics, F: Entries, P: Entries) -> Entries:

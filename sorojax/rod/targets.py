@@ -84,7 +84,7 @@ class Pose(AbstractTarget):
     def errors(self, group, frames):
         dim, rot = group.space_dim, group.rotation_dim
         scale = jnp.concatenate(
-            [jnp.full(rot, self.length), jnp.ones_like(self.pose[0, 0, :dim])]
+            [jnp.broadcast_to(self.length, rot), jnp.ones_like(self.pose[0, 0, :dim])]
         )
 
         # Axes of the world at the section: the same sums of squares as in its own.

@@ -5,6 +5,7 @@ from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
@@ -159,7 +160,7 @@ def _signals(network: Network, t, state, supplied: Signals) -> dict[str, Array]:
         if name in network.exposed and name in supplied:
             given[name] = supplied[name]
         elif name not in wires and port.default is not None:
-            given[name] = jnp.full(port.shape, port.default, jnp.result_type(float))
+            given[name] = jnp.full(port.shape, port.default, _dtype(state))
     torn = torn_wires(network.blocks, wires) if network.solve_loops else ()
     if not torn:
         return _propagated(network, wires, t, state, given)
@@ -169,9 +170,15 @@ def _signals(network: Network, t, state, supplied: Signals) -> dict[str, Array]:
         signals = _propagated(network, left, t, state, {**given, **values})
         return {name: signals[wires[name]] for name in torn}
 
-    guess = {name: jnp.zeros(ports[name].shape, jnp.result_type(float)) for name in torn}
+    guess = {name: jnp.zeros(ports[name].shape, _dtype(state)) for name in torn}
     solved = consistent(around, guess)
     return _propagated(network, left, t, state, {**given, **solved})
+
+
+def _dtype(state: PyTree):
+    """That of the first floating number of a state."""
+    kinds = [x.dtype for x in jax.tree.leaves(state) if eqx.is_inexact_array(x)]
+    return kinds[0] if kinds else jnp.result_type(float)
 
 
 def _propagated(network: Network, wires, t, state, given: Signals) -> dict[str, Array]:
