@@ -78,7 +78,8 @@ def _latency(what: str, call, first: float, error: float | None):
         seconds.append(time.perf_counter() - start)
     for percent, bar in BARS.items():
         yield Row(
-            "sorojax", {"what": what, "modes": 3, "markers": 4, "percentile": percent, "calls": CALLS}, first,
+            "sorojax", {"what": what, "modes": 3, "markers": 4, "percentile": percent,
+                        "calls": CALLS}, first,
             float(np.percentile(seconds, percent)), min(seconds), max(seconds), error=error,
             reference=REFERENCE if error is not None else None, bar=bar,
         )  # fmt: skip
