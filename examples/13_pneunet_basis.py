@@ -16,71 +16,47 @@ import jax.numpy as jnp
 import numpy as np
 
 import sorojax as sj
-from sorojax import fem, material, mesh, reduction, rod, sdf
+from sorojax import fem, material, mesh, reduction, robots, rod, sdf
 from sorojax.units import deg, kPa, mm
 
-PITCH, FIRST = 7.47 * mm, 7.2 * mm
-WIDE, SLOT = 1.84 * mm, 0.55 * mm
-LAYER, FLOOR, NOTCH, ROOF, TOP = (y * mm for y in (1.75, 3.54, 10.9, 17.49, 20.0))
-CHAMBERS, END, STRIP = 14, 6.7 * mm, 5.7 * mm  # beyond the last chamber, and the body
 CENTRE, RADIUS = (25 * mm, -30 * mm), 20 * mm  # of the cylinder
 
 
-def columns(first, count, width, low, high) -> sdf.AbstractSdf:
-    """Upright rectangles, one every pitch."""
-    one = sdf.Rectangle([first - width / 2, low], [first + width / 2, high])
-    return sdf.repeat(one, [PITCH, 0.0], count, separate=True)
-
-
-def actuator(chambers: int) -> tuple[mesh.Mesh, sdf.AbstractSdf, sdf.AbstractSdf]:
-    """Quad8 cells between the lines of the drawing, the chambers, and the slots."""
-    middle = FIRST + PITCH * np.arange(chambers)
-    end, slot = middle[-1] + END, middle[:-1] + PITCH / 2
-    lines = [middle + far for half in (WIDE / 2, PITCH / 3.1) for far in (-half, half)]
-    lines += [slot - SLOT / 2, slot + SLOT / 2, [0, 3.1 * mm, end, end + STRIP]]
-    upper = np.linspace(NOTCH, ROOF, 4)[1:], [(ROOF + TOP) / 2, TOP]
-    y = np.concatenate([[0, LAYER], np.linspace(FLOOR, NOTCH, 4), *upper])
-    air = columns(FIRST, chambers, WIDE, FLOOR, ROOF)
-    slots = columns(FIRST + PITCH / 2, chambers - 1, SLOT, NOTCH, TOP + mm)
-    block = sdf.Rectangle([0, 0], [end, TOP]) | sdf.Rectangle([0, 0], [end + STRIP, FLOOR])
-    grid = mesh.between_lines(np.unique(np.concatenate(lines)), y, element=mesh.Quad8())
-    return mesh.kept(grid, mesh.cells_inside(grid, block - air - slots)), air, slots
-
-
 def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
-    chambers = 6 if quick else CHAMBERS
-    cells, air, slots = actuator(chambers)
-    length = float(cells.points[:, 0].max())
+    robot = robots.PneuNet(num_chambers=6 if quick else 14)
+    cells, layer = robots.pneunet_mesh(robot), float(robot.layer)
+    length = float(robot.length)
     stiff = np.ones(cells.num_cells)
-    stiff[mesh.cells_where(cells, lambda p: p[1] < LAYER)] = 10.0
+    stiff[cells.regions["layer"]] = 10.0
     under = mesh.facets_where(cells, lambda p: p[1] < 1e-9)
     problem = fem.problem(
         cells, material.Scaled(material.presets.dragon_skin_30(), stiff),
         kinematics=fem.PlaneStrain(20 * mm),
         supports=(fem.Fixed(mesh.nodes_where(cells, lambda p: p[0] < 1e-9)),),
         loads=(
-            fem.Pressure(mesh.facets_on(cells, air), name="air"),
-            fem.SelfContact(mesh.facets_on(cells, slots), reach=0.8 * mm, name="walls"),
+            fem.Pressure(mesh.facets_on(cells, robot.chambers()), name="air"),
+            fem.SelfContact(mesh.facets_on(cells, robot.slots()), reach=0.8 * mm, name="walls"),
             fem.Contact(under, sdf.Circle(CENTRE, RADIUS), name="cylinder"),
         ),
     )  # fmt: skip
     path = fem.solve_path(problem, air=jnp.linspace(0, 40 * kPa, 9 if quick else 21))
 
-    line = reduction.Line([0.0, LAYER / 2], [length, LAYER / 2])
+    line = reduction.Line([0.0, layer / 2], [length, layer / 2])
     backbone = reduction.strain_along(path, line, samples=241)
     basis = reduction.pod_basis(backbone, modes={"kappa_z": 3})
     q = reduction.coordinates(backbone, basis)
     body = rod.rod(
-        sj.SE2(), basis, rod.rectangle(20 * mm, LAYER), length=backbone.length,
+        sj.SE2(), basis, rod.rectangle(20 * mm, layer), length=backbone.length,
         young_modulus=1.0, poisson_ratio=0.4, density=1.0,
     )  # fmt: skip
     errors = sj.view.backbone_errors(backbone, body, q)
     s, shapes = np.asarray(backbone.s), np.asarray(basis.modes["kappa_z"](backbone.s))
     if picture is not None:
-        draw(path, backbone, body, q, shapes, Path(picture))
+        draw(robot, path, backbone, body, q, shapes, Path(picture))
 
     gram = np.trapezoid(shapes[:, :, None] * shapes[:, None], s, axis=0)
-    inner = np.abs(s * length - FIRST - PITCH * (chambers - 1) / 2) < PITCH * chambers / 2
+    middles, half = np.asarray(robot.middles), float(robot.pitch) / 2
+    inner = (s * length > middles[0] - half) & (s * length < middles[-1] + half)
     waves = shapes[inner, 0] - np.poly1d(np.polyfit(s[inner], shapes[inner, 0], 3))(s[inner])
     turn, off = jnp.trapezoid(backbone.strain[-1, :, 0], s) * length, errors.max() / mm
     last, held = path.displacements[-1], reduction.captured_energy(backbone, basis)
@@ -100,7 +76,7 @@ def overlap(problem, u, contact: str) -> float:
     return float(fem.contact_state(problem, u, contact).penetration / mm)
 
 
-def draw(path, backbone, body, q, shapes, file: Path) -> None:
+def draw(robot, path, backbone, body, q, shapes, file: Path) -> None:
     """The actuator on its way round the cylinder, and the three modes above the chambers."""
     import matplotlib.pyplot as plt
     from matplotlib.patches import Circle
@@ -108,19 +84,19 @@ def draw(path, backbone, body, q, shapes, file: Path) -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 5.2), layout="constrained")
     facets = np.asarray(mesh.boundary_facets(path.problem.mesh))[:, [0, 2, 1]]
     s = jnp.linspace(0.0, 1.0, 200)
-    steps = len(path.displacements) - 1
+    steps, under = len(path.displacements) - 1, float(robot.layer) / 2 / mm
     for k, shade in ((0, 0.25), (steps // 4, 0.4), (steps // 2, 0.6), (steps, 1.0)):
         now = np.asarray(path.problem.mesh.points + path.displacements[k]) / mm
         for side in now[facets]:
             left.plot(*side.T, color="#2a6f97", lw=0.8, alpha=shade)
         places = np.asarray(rod.forward_kinematics(body, q[k], s)[:, :2, 2]) / mm
-        left.plot(places[:, 0], places[:, 1] + LAYER / 2 / mm, color="#e76f51", lw=1.6)
+        left.plot(places[:, 0], places[:, 1] + under, color="#e76f51", lw=1.6)
     left.add_patch(Circle((CENTRE[0] / mm, CENTRE[1] / mm), RADIUS / mm, color="#b9a888"))
     left.set(aspect="equal", xlabel="x [mm]", ylabel="y [mm]")
     left.set_title("0, 10, 20 and 40 kPa, the rod of three modes in red", fontsize=10)
-    for k in range(CHAMBERS):
-        middle = FIRST + k * PITCH
-        right.axvspan((middle - WIDE / 2) / mm, (middle + WIDE / 2) / mm, color="#d9dce1")
+    for middle in np.asarray(robot.middles):
+        ends = middle + np.array([-0.5, 0.5]) * float(robot.chamber_width)
+        right.axvspan(*ends / mm, color="#d9dce1")
     for k, colour in enumerate(("#2a6f97", "#e76f51", "#e9b44c")):
         right.plot(np.asarray(backbone.s * backbone.length) / mm, shapes[:, k], color=colour,
                    label=f"mode {k + 1}")  # fmt: skip

@@ -79,21 +79,19 @@ def draw(angles, q, file: Path) -> None:
 
     import matplotlib.pyplot as plt
 
-    from sorojax.view.rods import rod_scene
-    from sorojax.view.shapes import picture_of_scene, shape_scene
-
     fingers = {
         f"f{k}": rod.Part(make_finger(), offset=mount(angle)) for k, angle in enumerate(angles)
     }
     palm = sdf.translate(sdf.Cylinder(PALM + 4 * mm, 4 * mm), [0, 0, 2 * mm])
-    ball, plate = (shape_scene(shape).parts[0] for shape in (sdf.Sphere(CENTER, RADIUS), palm))
-    bodies = rod_scene(rod.assembly(sj.SE3(), **fingers), np.asarray(q).ravel()).parts
+    hand = rod.assembly(sj.SE3(), **fingers)
+    scene = sj.view.joined(
+        *(sj.view.scene_of(shape) for shape in (sdf.Sphere(CENTER, RADIUS), palm)),
+        sj.view.scene_of(hand, np.asarray(q).ravel()),
+    )
     views = sj.view.Camera(-60.0, 8.0), sj.view.Camera(-60.0, -55.0)
     figure, axes = plt.subplots(1, 2, figsize=(11, 5.5), layout="constrained")
     for place, view in zip(axes, views, strict=True):
-        shown = picture_of_scene(
-            sj.view.Scene((ball, plate, *bodies)), view=view, renderer="own"
-        )
+        shown = sj.view.show(scene, view=view, renderer="own")
         place.imshow(plt.imread(io.BytesIO(shown.png)))
         place.set_axis_off()
     figure.savefig(file, dpi=100)

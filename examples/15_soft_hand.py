@@ -103,9 +103,6 @@ def draw(film, angle, pressure, file: Path) -> None:
     """Pressures, angles, and the hand at four moments."""
     import matplotlib.pyplot as plt
 
-    from sorojax.view.rods import rod_scene
-    from sorojax.view.shapes import picture_of_scene
-
     def place(k):  # the thumb lower and aside, turned by 45 degrees about the hand's axis
         pose, turn = np.eye(4), -45 * deg if k == 0 else 0.0
         across = np.array([np.cos(turn), np.sin(turn), 0.0])
@@ -127,12 +124,14 @@ def draw(film, angle, pressure, file: Path) -> None:
         -1 - round(share * 2 * math.pi / RATE / PERIOD) for share in (0.75, 0.5, 0.25, 0)
     ]
     states = np.asarray(film.state["fingers"]["body"]["q"])
-    scenes = [rod_scene(rod.assembly(sj.SE3(), **parts), states[k].ravel()) for k in moments]
+    scenes = [
+        sj.view.scene_of(rod.assembly(sj.SE3(), **parts), states[k].ravel()) for k in moments
+    ]
     low = np.min([scene.box[0] for scene in scenes], axis=0)
     high = np.max([scene.box[1] for scene in scenes], axis=0)
     for column, (k, scene) in enumerate(zip(moments, scenes, strict=True)):
-        shown = picture_of_scene(dataclasses.replace(scene, extent=(low, high)),
-                                 view=sj.view.Camera(-40.0, 15.0), renderer="own")  # fmt: skip
+        shown = sj.view.show(dataclasses.replace(scene, extent=(low, high)),
+                             view=sj.view.Camera(-40.0, 15.0), renderer="own")  # fmt: skip
         axes = figure.add_subplot(grid[0, column])
         axes.imshow(plt.imread(io.BytesIO(shown.png)))
         axes.set_title(f"{float(film.time[k]):.2f} s")

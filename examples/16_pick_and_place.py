@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import sorojax as sj
-from sorojax import rod, systems
+from sorojax import robots, rod, systems
 from sorojax.math.contact_stepper import ContactMidpoint
 from sorojax.math.lie import homogeneous
 from sorojax.units import kPa, mm
@@ -42,21 +42,18 @@ WAY = np.array([
 
 def scene(size):
     """The robot with air and valves, hung over a cylinder on the floor, and the contacts."""
-    made = sj.robots.model(sj.robots.Manipulator(), size=size)
+    made = robots.model(robots.Manipulator(), size=size)
     body = made.network.blocks["body"]
     down = homogeneous(jnp.diag(jnp.array([1.0, -1.0, -1.0])), jnp.array([0.0, 0.0, BEAM]))
     parts = dict(zip(body.assembly.names, body.assembly.parts, strict=True))
     parts["arm"] = sj.replace(
         parts["arm"], lambda part: part.offset, down @ parts["arm"].offset
     )
-    across = MASS * (3 * RADIUS**2 + HEIGHT**2) / 12
-    link = rod.Link(MASS, [across, across, MASS * RADIUS**2 / 2])
-    whole = rod.assembly(sj.SE3(), **parts, cylinder=rod.Part(link, rod.Free()))
+    thing = rod.Part(robots.cylinder(MASS, RADIUS, HEIGHT), rod.Free())
+    whole = rod.assembly(sj.SE3(), **parts, cylinder=thing)
     touch = rod.LinkContact(sj.sdf.Cylinder(RADIUS, HEIGHT), SPINE, GRIP, points=16)
-    angle = 2 * np.pi * np.arange(24) / 24
-    rim = np.stack([RADIUS * np.cos(angle), RADIUS * np.sin(angle), 0 * angle - HEIGHT / 2], 1)
     ground = sj.sdf.HalfSpace([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
-    floor = rod.LinkObstacle(ground, rim, np.full(24, 2 * np.pi * RADIUS / 24), FLOOR)
+    floor = rod.LinkObstacle(ground, *robots.rim(RADIUS, -HEIGHT / 2), FLOOR)
     contacts = *(rod.Between(f, "cylinder", touch) for f in FINGERS), rod.On("cylinder", floor)
     q = rod.rest(whole).at[-1].set(HEIGHT / 2)
     hung = systems.AssemblyBody(whole, (*body.forces, *contacts), q=q)
@@ -106,46 +103,32 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
         limits=(low, high), measure=lambda *_: tips(valves.state.state["body"]["q"]),
     ))  # fmt: skip
 
-    @jax.jit
-    @jax.vmap
-    def seen(now):
-        here = rod.motion(whole, now["q"], now["v"])
-        parts = {name: rod.part_motion(here, k) for k, name in enumerate(whole.names)}
-        thing, plate = parts["cylinder"], parts["plate"].base
-        *fingers, floor = contacts
-        held = [rod.total_force(f, jnp.zeros(()), here)[-1] for f in (tuple(fingers), ())]
-        gaps = [f.force.touch(parts[f.first], thing).gap for f in fingers]
-        below = floor.force.touch(thing).gap
-        return {
-            "overlap": -jnp.min(jnp.concatenate(gaps)), "gap": jnp.min(below),
-            "up": thing.base.directors[2, 2], "force": held[0] - held[1],
-            "place": now["q"][-3:],
-            "held": plate.directors.T @ (now["q"][-3:] - plate.position),
-        }  # fmt: skip
-
     film = jax.tree.map(lambda *rows: jnp.stack(rows), *states)
-    found = jax.tree.map(np.asarray, seen(film))
-    time = PERIOD * np.arange(len(states))
-    free = (found["gap"] > 0.1 * mm) & (time < 3.7)
-    moved = np.linalg.norm(found["held"][free] - found["held"][free][0], axis=1)
+    seen = systems.touching(whole, contacts, film["q"], film["v"])
+    *fingers, floor = np.asarray(seen.overlap).T
+    force = np.asarray(seen.effort)[:, : len(fingers), -1].sum(axis=1)  # what lifts it
+    poses = jax.jit(jax.vmap(lambda q: rod.tip_pose(whole, q)))(film["q"])
+    thing, plate = (np.asarray(poses[name]) for name in ("cylinder", "plate"))
+    place, up, time = thing[:, :3, 3], thing[:, 2, 2], PERIOD * np.arange(len(states))
+    free = (floor < -0.1 * mm) & (time < 3.7)
+    held = np.einsum("tij,ti->tj", plate[:, :3, :3], place - plate[:, :3, 3])[free]
     if picture is not None:
-        draw(whole, film["q"], time, found, ticks, picture)
-    end = found["place"][-1]
+        draw(whole, film["q"], time, place, force, ticks, picture)
     return {
-        "lift [mm]": found["gap"][free].max() / mm,
-        "contact forces over weight, carried": found["force"][free].mean() / (9.81 * MASS),
-        "moved in the grip [mm]": moved.max() / mm,
-        "farthest tilt [deg]": np.degrees(np.arccos(found["up"].min())),
-        "place off its target [mm]": np.linalg.norm(end[:2] - [TARGET, 0.0]) / mm,
-        "tilt at the end [deg]": np.degrees(np.arccos(min(1.0, found["up"][-1]))),
+        "lift [mm]": -floor[free].min() / mm,
+        "contact forces over weight, carried": force[free].mean() / (9.81 * MASS),
+        "moved in the grip [mm]": np.linalg.norm(held - held[0], axis=1).max() / mm,
+        "farthest tilt [deg]": np.degrees(np.arccos(up.min())),
+        "place off its target [mm]": np.linalg.norm(place[-1, :2] - [TARGET, 0.0]) / mm,
+        "tilt at the end [deg]": np.degrees(np.arccos(min(1.0, up[-1]))),
         "speed at the end [mm/s]": np.linalg.norm(film["v"][-1, -3:]) / mm,
-        "overlap with fingers, greatest [mm]": found["overlap"].max() / mm,
-        "overlap with the floor, greatest [mm]": -found["gap"].min() / mm,
-        "gripper lets go [mm]": -found["overlap"][-1] / mm,
+        "overlap with fingers, greatest [mm]": np.max(fingers) / mm,
+        "overlap with the floor, greatest [mm]": floor.max() / mm,
+        "gripper lets go [mm]": -np.max(fingers, axis=0)[-1] / mm,
     }
 
 
-def draw(whole, q, time, found, ticks, file) -> None:
+def draw(whole, q, time, place, force, ticks, file) -> None:
     """Six moments from the front, and heights, forces and pressures over time."""
     import dataclasses
     import io
@@ -155,19 +138,16 @@ def draw(whole, q, time, found, ticks, file) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    from sorojax.view.rods import rod_scene
-    from sorojax.view.shapes import picture_of_scene
-
     moments = (0.1, 0.7, 1.6, 2.6, 3.5, 4.85)
     shapes = {"cylinder": sj.sdf.Cylinder(RADIUS, HEIGHT)}
-    scenes = [rod_scene(whole, q[round(t / PERIOD)], shapes=shapes) for t in moments]
+    scenes = [sj.view.scene_of(whole, q[round(t / PERIOD)], shapes=shapes) for t in moments]
     low = np.min([scene.box[0] for scene in scenes], axis=0)
     high = np.max([scene.box[1] for scene in scenes], axis=0)
     figure = plt.figure(figsize=(12, 6.4), layout="constrained")
     grid = figure.add_gridspec(2, 6, height_ratios=(1.35, 1))
     for column, (t, scene) in enumerate(zip(moments, scenes, strict=True)):
         scene = dataclasses.replace(scene, extent=(low, high))
-        shown = picture_of_scene(scene, view=sj.view.Camera(-90.0, 8.0), renderer="own")
+        shown = sj.view.show(scene, view=sj.view.Camera(-90.0, 8.0), renderer="own")
         axes = figure.add_subplot(grid[0, column])
         image = plt.imread(io.BytesIO(shown.png))
         rows, columns = image.shape[:2]
@@ -176,10 +156,10 @@ def draw(whole, q, time, found, ticks, file) -> None:
         axes.set_axis_off()
     panels = [figure.add_subplot(grid[1, k : k + 2]) for k in (0, 2, 4)]
     for k, name in ((0, "x"), (2, "z")):
-        panels[0].plot(time, found["place"][:, k] / mm, label=f"{name} of the cylinder")
+        panels[0].plot(time, place[:, k] / mm, label=f"{name} of the cylinder")
     panels[0].axhline(TARGET / mm, color="0.6", lw=0.8)
     panels[0].set(xlabel="time [s]", ylabel="[mm]")
-    panels[1].plot(time, found["force"], color="#2a6f97", label="lift of the fingers")
+    panels[1].plot(time, force, color="#2a6f97", label="lift of the fingers")
     panels[1].axhline(9.81 * MASS, color="#e76f51", lw=1, label="weight")
     panels[1].set(xlabel="time [s]", ylabel="[N]", ylim=(-0.6, 1.2))
     pressures = np.array([tick.pressure for tick in ticks]) / kPa

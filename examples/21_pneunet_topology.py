@@ -27,21 +27,18 @@ SIZE, DEPTH, WALL, CAP, MOST = (15 * mm, 30 * mm), 25 * mm, 2 * mm, 4 * mm, 80 *
 def bent(body, count, size, pressures):
     """Shapes of a chain clamped on its left, on a mesh of its own, with air in its chambers."""
     solid = mesh.chambers(mesh.triangulate(body, size=size, order=2))
-    largest = sorted(solid.volumes, key=lambda name: solid.volumes[name])[-count:]
-    facets = np.concatenate([solid.mesh.facet_sets[name] for name in largest])
     problem = fem.problem(
         solid.mesh, material.presets.flexible_80a(), kinematics=fem.PlaneStrain(DEPTH),
         supports=(fem.Fixed(mesh.nodes_where(solid.mesh, lambda p: p[0] < 1e-9)),),
-        loads=(fem.Pressure(facets, name="air"),),
+        loads=(fem.Pressure(solid.largest(count), name="air"),),
     )  # fmt: skip
     return fem.solve_path(problem, air=pressures)
 
 
 def places(path, length):
     """Where five points of the underside and the upper end are at every pressure [m]."""
-    points = np.asarray(path.problem.mesh.points)
     marks = [[x, 0.0] for x in np.linspace(0, length, 6)[1:]] + [[length, SIZE[1]]]
-    nodes = [int(np.linalg.norm(points - [mark], axis=1).argmin()) for mark in marks]
+    nodes = [mesh.nearest_node(path.problem.mesh, mark) for mark in marks]
     return np.array(marks) + np.asarray(path.displacements)[:, nodes]
 
 
@@ -76,8 +73,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
 
     closed = sdf.extrude(block, DEPTH + 2 * WALL) - sdf.extrude(block - body, DEPTH)
     surface = sdf.isosurface(closed, 1.0 * mm if quick else 0.6 * mm, "dual_contouring")
-    printed = Path(tempfile.gettempdir()) / "pneunet.stl"
-    sj.io.export_surface(printed, surface)
+    printed = sj.io.export_surface(Path(tempfile.gettempdir()) / "pneunet.stl", surface)
     report = sdf.surface_report(sj.io.import_surface(printed))
     volume = sdf.area(body) * DEPTH + sdf.area(block) * 2 * WALL
     heights, wide = widths(made)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array
 
 import sorojax as sj
-from sorojax import rod
+from sorojax import robots, rod, systems
 from sorojax.math.contact_stepper import ContactMidpoint
 from sorojax.math.lie import homogeneous
 from sorojax.units import mm
@@ -33,7 +33,6 @@ THINGS = {
 }
 BOLT = 28 * mm, 44 * mm, 58 * mm, 0.012
 HELD = ContactMidpoint(passes=1, lasting=True, theta=1.0, tolerance=1e-4)
-FINGERS = tuple(f"finger_{k}" for k in range(4))
 
 
 class Chambers(eqx.Module):
@@ -56,13 +55,6 @@ def lowered(t):
     return jnp.array([0.0, 0.0, -9.81]) * jnp.clip((t - 0.5) / 0.3, 0, 1)
 
 
-def upright(angle):
-    """A frame on the circle whose x points down and whose y points to the axis."""
-    c, s = np.cos(angle), np.sin(angle)
-    turn = jnp.array([[0.0, -c, -s], [0.0, -s, c], [-1.0, 0.0, 0.0]])
-    return homogeneous(turn, 37.5 * mm * jnp.array([c, s, 0.0]))
-
-
 @eqx.filter_jit
 def run(joint, radius, length, depth, mass, chambers, step, saves):
     """The robot, its motion, and the contact force [N] or moment [N m] that the thing takes
@@ -71,51 +63,39 @@ def run(joint, radius, length, depth, mass, chambers, step, saves):
         sj.SE3(), rod.chebyshev(kappa_y=2, kappa_z=2), rod.circle(6 * mm), length=80 * mm,
         young_modulus=1e6, poisson_ratio=0.3, density=2000, nodes=6,
     )  # fmt: skip
-    across = mass * (3 * radius**2 + length**2) / 12
-    thing = rod.Link(mass, jnp.stack([across, across, mass * radius**2 / 2]))
+    fingers = robots.ring(finger, 4, 37.5 * mm)
     hung = homogeneous(jnp.eye(3), jnp.stack([0 * depth, 0 * depth, -depth]))
-    parts = {
-        name: rod.Part(finger, offset=upright(k * np.pi / 2)) for k, name in enumerate(FINGERS)
-    }
-    model = rod.assembly(sj.SE3(), **parts, thing=rod.Part(thing, joint, offset=hung))
+    thing = rod.Part(robots.cylinder(mass, radius, length), joint, offset=hung)
+    model = rod.assembly(sj.SE3(), **fingers, thing=thing)
     touch = rod.LinkContact(sj.sdf.Cylinder(radius, length), 6 * mm, GRIP, points=24)
+    touches = tuple(rod.Between(name, "thing", touch) for name in fingers)
     air = rod.Varying(functools.partial(rod.PointWrench, follower=True), chambers)
-    touches = tuple(rod.Between(name, "thing", touch) for name in FINGERS)
-    own = [rod.On(name, force) for name in FINGERS for force in (rod.Gravity(), air)]
-    forces = (
-        rod.Damping(0.03),
-        rod.On("thing", rod.Varying(rod.Gravity, lowered)),
-        *own,
-        *touches,
-    )
+    own = [rod.On(name, force) for name in fingers for force in (rod.Gravity(), air)]
+    weight = rod.On("thing", rod.Varying(rod.Gravity, lowered))
     q, v = rod.rest(model), jnp.zeros(rod.num_dof(model))
+    forces = (rod.Damping(0.03), weight, *own, *touches)
     path = rod.rollout(model, q, v, forces, step=step, saves=saves, stepper=HELD)
-
-    def pull(q, v):
-        here, none = rod.motion(model, q, v), jnp.zeros(())
-        return (rod.total_force(touches, none, here) - rod.total_force((), none, here))[-1]
-
-    return model, path, jnp.mean(jax.vmap(pull)(path.q[-50:], path.v[-50:]))
+    seen = systems.touching(model, touches, path.q[-50:], path.v[-50:])
+    return model, path, jnp.mean(jnp.sum(seen.effort[..., -1], axis=1))
 
 
 def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, float]:
     seconds, step = (3, 2e-3) if quick else (5, 1e-3)
     saves, told, films = round(seconds / step), {}, {}
 
-    def do(name, joint, size, bend, aside=0.0, phase=0.0):
-        chambers = Chambers(*map(jnp.asarray, (bend, aside, phase)))
-        films[name] = (*run(joint, *map(jnp.asarray, size), chambers, step, saves), size)
+    def do(name, joint, size, *command):
+        chambers = Chambers(*jnp.array(command))
+        films[name] = (*run(joint, *jnp.array(size), chambers, step, saves), size)
         return films[name][1:3]
 
     for name, size in THINGS.items():
-        path, pull = do(name, rod.Screw(turn=0.0, advance=1.0), size, GRASP)
+        path, pull = do(name, rod.Screw(turn=0.0, advance=1.0), size, GRASP, 0.0, 0.0)
         told[f"{name}: weight [N]"] = size[-1] * 9.81
         told[f"{name}: sum of the contact forces [N]"] = float(pull)
         told[f"{name}: sinks by [mm/s]"] = -float(path.v[-1, -1]) / mm
+    turning = rod.Screw(turn=1.0, advance=0.0, damping=4e-4)
     for name, phase in (("left", np.pi / 2), ("right", -np.pi / 2)):
-        path, _ = do(
-            name, rod.Screw(turn=1.0, advance=0.0, damping=4e-4), BOLT, WALK, WALK, phase
-        )
+        path, _ = do(name, turning, BOLT, WALK, WALK, phase)
         angle = np.asarray(path.q[saves // seconds :, -1]) / (2 * np.pi)  # after a second
         told[f"bolt {name}: turns a second"] = float(angle[-1] - angle[0]) / (seconds - 1)
         way = np.sign(angle[-1]) * angle
@@ -139,7 +119,7 @@ def draw(films, file) -> None:
     for axis, name in zip(axes, (*THINGS, "left"), strict=False):
         model, path, _, (radius, length, *_) = films[name]
         poses = rod.forward_kinematics(model, path.q[-1], points)
-        for finger, shade in zip(FINGERS, (1.0, 0.4, 1.0, 0.4), strict=True):
+        for finger, shade in zip(model.names, (1.0, 0.4, 1.0, 0.4), strict=False):
             x, _, z = np.asarray(poses[finger])[:, :3, 3].T / mm
             axis.plot(x, z, color="#2a6f97", alpha=shade, lw=9, solid_capstyle="round")
         middle = np.asarray(poses["thing"])[0, :3, 3] / mm

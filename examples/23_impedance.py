@@ -10,7 +10,6 @@ the tip is round, the set-point comes to the wall within 1 s and keeps off the e
 import sys
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +18,7 @@ import sorojax as sj
 from sorojax.math.contact_stepper import ContactMidpoint
 from sorojax.units import MPa, mm
 
-SAVED, MOMENTS = 8e-3, 150  # s between saved moments, saved moments of a run
+SAVED = 8e-3  # s between saved moments
 STIFFNESS, DAMPING, HALF = 240.0, 18.0, 10 * mm  # N/m, N s/m, thickness over two
 LOW, HIGH = np.array([243.3, 265.2]), np.array([400.6, 92.1])  # ends of the wall [mm]
 FIRST, FROM, TO = [167.0, 28.0], [167.0, 24.0], [45.0, 24.0]  # along the chord, from it [mm]
@@ -57,85 +56,71 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     law = sj.contact.LinePenalty(stiffness=2 * MPa, smoothing=20e-6)
     touch = sj.rod.ObstacleContact(solid, HALF, law, points=20 if quick else 40)
     lossy, every = sj.rod.Damping(0.05), 2 if quick else 4
-    stepper = ContactMidpoint(contact_passes=6)
+    start, stepper = jnp.full(6, 0.3), ContactMidpoint(contact_passes=6)
+    tip = sj.rod.tip_pose(rod, start)[:2, 2]
 
-    @eqx.filter_jit
-    def run(q, v, t, target):
-        spring = sj.systems.CartesianImpedance(rod, (lossy,), target, STIFFNESS, DAMPING)
-        forces = (lossy, touch, sj.systems.ControlForce(spring))
-        path = sj.rod.rollout(
-            rod, q, v, forces, step=SAVED / every, saves=MOMENTS, every=every, t=t,
-            stepper=stepper,
-        )  # fmt: skip
-
-        def seen(t, q, v):
-            met = touch.touch(sj.rod.motion(rod, q, v))
-            push = (law.pressure(met.gap) * met.weights) @ met.normal
-            gap, normal = jax.value_and_grad(solid)(target(t))
-            return {
-                "time": t, "q": q, "goal": target(t), "push": jnp.linalg.norm(push),
-                "foot": target(t) + (HALF - gap) * normal, "overlap": -jnp.min(met.gap),
-                "tip": sj.rod.tip_pose(rod, q)[:2, 2],
-                "effort": jnp.linalg.norm(spring.effort(t, q, v)),
-            }  # fmt: skip
-
-        return jax.vmap(seen)(path.time, path.q, path.v), path.v[-1]
-
-    def target(switch):
-        """Straight at the wall until `switch` [s], then along it."""
+    def spring(switch):
+        """Pulls the tip straight at the wall until `switch` [s], then along it."""
         way = sj.systems.Waypoints([0.0, APPROACH], [tip, on_chord(FIRST)])
         places = [tip, way(switch), on_chord(FROM), on_chord(TO)]
-        times = [0.0, switch, switch, switch + SLIDE]
-        return sj.systems.Waypoints(jnp.stack(jnp.asarray(times)), jnp.stack(places))
+        times = jnp.array([0.0, switch, switch, switch + SLIDE])
+        goal = sj.systems.Waypoints(times, jnp.stack(places))
+        return sj.systems.CartesianImpedance(rod, (lossy,), goal, STIFFNESS, DAMPING)
 
-    q, v = jnp.full(6, 0.3), jnp.zeros(6)
-    tip = sj.rod.tip_pose(rod, q)[:2, 2]
-    first, _ = run(q, v, jnp.zeros(()), target(APPROACH))
-    k = int(jnp.argmax(first["overlap"] > 0))  # where it touches
-    switch, films, t = first["time"][k], [], jnp.zeros(())
-    for _ in range(5):
-        part, v = run(q, v, t, target(switch))
-        q, t = part["q"][-1], part["time"][-1]
-        films.append(part)
-    film = jax.tree.map(lambda *parts: np.concatenate([x[:-1] for x in parts]), *films)
-    off = np.linalg.norm(film["tip"] - film["foot"], axis=1)
-    asked = STIFFNESS * np.linalg.norm(film["goal"] - film["tip"], axis=1)
+    def run(law, seconds):
+        return sj.rod.rollout(
+            rod, start, jnp.zeros(6), (lossy, touch, sj.systems.ControlForce(law)),
+            step=SAVED / every, saves=round(seconds / SAVED), every=every, stepper=stepper,
+        )  # fmt: skip
+
+    first = run(spring(APPROACH), 1.2)
+    k = int(jnp.argmax(sj.systems.touching(rod, (touch,), first.q, first.v).overlap > 0))
+    switch = float(first.time[k])  # where it touches
+    control = spring(switch)
+    path = run(control, 6.0)
+    seen = sj.systems.touching(rod, (touch,), path.q, path.v)
+
+    goal = jax.vmap(control.reference)(path.time)
+    tips = jax.vmap(lambda q: sj.rod.tip_pose(rod, q)[:2, 2])(path.q)
+    off = sj.sdf.project(sj.sdf.offset(solid, HALF), goal) - tips
+    effort = jax.vmap(control.effort)(path.time, path.q, path.v)
+    off, effort, push = (np.linalg.norm(x, axis=1) for x in (off, effort, seen.push[:, 0]))
+    time, asked = np.asarray(path.time), STIFFNESS * np.linalg.norm(goal - tips, axis=1)
     if picture is not None:
-        draw(rod, film, asked, solid, picture)
+        draw(rod, path, goal, tips, push, asked, solid, picture)
     # the jump of the set-point at the switch has half a second to die out
-    sliding = (film["time"] > switch + 0.5) & (film["time"] < switch + SLIDE)
-    jump = film["effort"][k : k + 25].max() / film["effort"][:k].max()
+    sliding = (time > switch + 0.5) & (time < switch + SLIDE)
     return {
-        "contact at [s]": float(switch),
+        "contact at [s]": switch,
         "tip off the projected set-point, sliding [mm]": 1e3 * float(off[sliding].max()),
         "the same at the end [mm]": 1e3 * float(off[-1]),
-        "force at the end [N]": float(film["push"][-1]),
+        "force at the end [N]": float(push[-1]),
         "stiffness times offset [N]": float(asked[-1]),
-        "overlap, greatest [mm]": 1e3 * float(film["overlap"].max()),
-        "effort at the switch over that before": float(jump),
+        "overlap, greatest [mm]": 1e3 * float(seen.overlap.max()),
+        "effort at the switch over that before": effort[k : k + 25].max() / effort[:k].max(),
     }
 
 
-def draw(rod, film, asked, solid, file) -> None:
+def draw(rod, path, goal, tips, push, asked, solid, file) -> None:
     """The rod on its way, and the force that it holds the wall with."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    time, s = film["time"], jnp.linspace(0, 1, 40)
-    lines = jax.vmap(lambda q: sj.rod.forward_kinematics(rod, q, s)[:, :2, 2])(film["q"])
+    time, s = path.time, jnp.linspace(0, 1, 40)
+    lines = jax.vmap(lambda q: sj.rod.forward_kinematics(rod, q, s)[:, :2, 2])(path.q)
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.2), width_ratios=(1, 1.2))
     outline = np.asarray(solid.vertices) / mm
     left.fill(-outline[:, 1], outline[:, 0], color="#adb5bd", lw=0)
     for k in np.linspace(0, len(time) - 1, 9).astype(int):
         shade = 0.25 + 0.75 * k / len(time)
         left.plot(-lines[k, :, 1] / mm, lines[k, :, 0] / mm, color="#2a6f97", alpha=shade, lw=4)
-    for name, colour in (("goal", "#e76f51"), ("tip", "#012a4a")):
-        left.plot(-film[name][:, 1] / mm, film[name][:, 0] / mm, color=colour, label=name)
+    for name, way, colour in (("goal", goal, "#e76f51"), ("tip", tips, "#012a4a")):
+        left.plot(-way[:, 1] / mm, way[:, 0] / mm, color=colour, label=name)
     left.set(aspect="equal", xlabel="x [mm]", ylabel="y [mm]", xlim=(-290, 20), ylim=(0, 420))
     left.legend(frameon=False, loc="lower right")
-    right.plot(time, film["push"], color="#012a4a", label="force on the wall")
+    right.plot(time, push, color="#012a4a", label="force on the wall")
     right.plot(time, asked, "--", color="#e76f51", label="stiffness times offset")
     right.set(xlabel="time [s]", ylabel="[N]", ylim=(0, 6))
     right.legend(frameon=False)

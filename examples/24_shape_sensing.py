@@ -28,18 +28,14 @@ DOWN = [9.81, 0.0]  # m/s^2, along the actuator
 STEPS = 20  # of the search, per frame
 PUSH = 0.012  # N, greatest, on each of three bellows
 NOISE = 0.1 * mm  # of the marker, per axis
-SHAKEN = ("push_2", "push_4", "push_7")  # the third, fifth and eighth bellow
+SHAKEN = (2, 4, 7)  # the third, fifth and eighth bellow
 
 
 def solid(actuator, size):
     """The actuator in air, with forces on the backs of some bellows."""
     mesh = sj.mesh.triangulate(actuator.body(), size=size, order=2)
-
-    def back(name):
-        low = jnp.array([actuator.clamp + int(name[-1]) * actuator.pitch, actuator.height])
-        high = low + jnp.array([actuator.bellow_width, 1e-3])
-        return sj.mesh.nodes_in_box(mesh, low - 1e-6, high + 1e-6)
-
+    backs = (sj.mesh.nodes_on_line(mesh, *actuator.back(k)) for k in SHAKEN)
+    pushes = (fem.Force(nodes, [0.0, 0.0], name=f"push_{k}") for k, nodes in enumerate(backs))
     return fem.problem(
         mesh, sj.material.presets.dragon_skin_30(),
         kinematics=fem.PlaneStrain(thickness=20 * mm),
@@ -47,7 +43,7 @@ def solid(actuator, size):
         loads=(
             fem.Pressure(sj.mesh.facets_on(mesh, actuator.chambers()), name="air"),
             fem.Gravity([0.0, 0.0]),
-            *(fem.Force(back(name), [0.0, 0.0], name=name) for name in SHAKEN),
+            *pushes,
         ),
     )  # fmt: skip
 

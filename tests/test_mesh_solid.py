@@ -76,9 +76,11 @@ def test_tetrahedra_of_a_hollow_sphere(order):
     assert np.isclose(found.volumes["chamber_0"], exact[1], rtol=2e-2 if order == 1 else 1e-4)
     skin = np.unique(mesh.facet_sets["boundary"])
     assert np.abs(HOLLOW(mesh.points[skin])).max() < (1e-9 if order == 1 else 1e-3)
-    assert len(M.facets_on(mesh, sdf.Sphere([0, 0, 0], 0.6), tol=1e-3)) == len(
-        found.mesh.facet_sets["chamber_0"]
-    )
+    walls = found.mesh.facet_sets["chamber_0"]
+    assert len(M.facets_on(mesh, sdf.Sphere([0, 0, 0], 0.6), tol=1e-3)) == len(walls)
+    assert np.array_equal(found.largest(), walls)
+    with pytest.raises(ValueError, match="need 1 to 1"):
+        found.largest(2)
 
 
 def test_chambers_are_found_and_follow_the_shape():

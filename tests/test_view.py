@@ -255,9 +255,25 @@ def test_the_report_is_one_file(film):
     assert html.count(">\u2713 holds<") == 1 and html.count(">\u2717 missed<") == 1
 
 
-def test_importing_the_floor_loads_no_drawing_library():
-    code = "import sys, sorojax.view; print(sorted({'matplotlib', 'PIL'} & sys.modules.keys()))"
+LOADED = """
+import sys, sorojax.view
+first = sorted({"matplotlib", "PIL"} & sys.modules.keys())
+import sorojax.view.shapes, sorojax.view.solid  # what a solid shape is drawn with
+solvers = {"matplotlib", "diffrax", "sorojax.fem", "sorojax.rod"}
+print(first, sorted(solvers & sys.modules.keys()))
+"""
+
+
+def test_the_floor_loads_no_drawing_library_and_shapes_no_solver():
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        [sys.executable, "-c", LOADED], capture_output=True, text=True, check=True
     )
-    assert done.stdout.strip() == "[]"
+    assert done.stdout.strip() == "[] []"
+
+
+def test_every_name_of_the_floor_is_there():
+    names = [name for name in dir(view) if not name.startswith("_")]
+    assert {"animate", "live", "rig", "show", "to_html"} <= set(names)
+    for name in names:
+        assert getattr(view, name) is not None
+    assert all(callable(getattr(view, name)) for name in ("animate", "live", "rig", "show"))

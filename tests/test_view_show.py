@@ -14,7 +14,7 @@ from sorojax import contact, design, fem, material, mesh as M, rod as R, sdf, sy
 from sorojax.math.lie import SE2, SE3, homogeneous
 from sorojax.math.status import Status
 from sorojax.view import networks, sections, states
-from sorojax.view.fields import short
+from sorojax.view.quantity import short
 from sorojax.view.rod_loads import acting
 from sorojax.view.shell import outline, shell
 
@@ -536,6 +536,22 @@ def test_nouns_print_what_matters(beam, plane, arm, loop):
     empty = jax.tree.map(lambda x: None, arm)  # what transformations put in
     assert isinstance(repr(empty), str)
     assert isinstance(repr(jax.eval_shape(lambda: beam)), str)
+
+
+def test_scenes_are_put_together_anew(plane):
+    ball, arm = sdf.Sphere([0.0, 0.0, 0.0], 0.01), np.array([[0.0, 0, 0], [0, 0, 0.03]])
+    lone = view.scene_of(ball, size=0.004)
+    both = view.joined(lone, view.Scene((view.Lines([arm]),)), title="ball on a stick")
+    assert len(both.parts) == 2 and both.title == "ball on a stick"
+    shown = view.show(both, view="front", renderer="own")
+    lower, upper = both.box
+    at = shown.pixels(np.array([[0.0, 0, 0.02], [0.0, 0, 0.005]]))
+    image = pixels(shown)
+    assert image[int(at[0, 1]), int(at[0, 0])].max() < 90 and np.isclose(upper[2], 0.03)
+    assert 100 < image[int(at[1, 1]), int(at[1, 0]) - 20].max() < 250
+    assert view.scene_of(plane).dim == 2
+    with pytest.raises(TypeError, match="need one of AbstractSdf, Assembly"):
+        view.scene_of(3.0)
 
 
 QUIET = """

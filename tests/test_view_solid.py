@@ -166,6 +166,28 @@ def test_cells_are_outlined():
     assert image.sum() < bare.sum()
 
 
+@pytest.mark.parametrize("opacity", [1.0, 0.5])
+def test_light_by_pixel_is_as_good_as_light_by_sample(opacity, monkeypatch):
+    ball = glyphs.ball_triangles(np.array([[0.5, 0.2, 0.5]]), 0.4, corners=32)
+    wire = np.array([[True, True, False], [False, True, True]])
+    line = Lines([np.array([[0.0, -0.2, 0.1], [1.0, -0.2, 0.8]])], "#0000ff", 1.0)
+    scene = Scene(
+        (
+            Surface(SQUARE, TWO, values=SQUARE[:, 0], wire=wire),
+            Surface(*ball, "#c08060", opacity=opacity), line,
+        ),
+        Scale("x", 0.0, 1.0),
+    )  # fmt: skip
+    lit = []
+    true = S._colours
+    monkeypatch.setattr(S, "_colours", lambda *a: lit.append(len(a[1])) or true(*a))
+    quick, _ = picture(scene, "iso", (160, 160))
+    assert sum(lit) < 0.7 * 4 * 160**2
+    monkeypatch.setattr(S, "_rough", lambda *_: np.ones((160, 160), bool))
+    whole, _ = picture(scene, "iso", (160, 160))
+    assert np.abs(quick.astype(int) - whole).max() <= 2
+
+
 def test_normals_are_smooth_but_across_edges():
     points, triangles = glyphs.ball_triangles(np.zeros((1, 3)), 1.0, corners=24)
     normals = soup.corner_normals(points, triangles)

@@ -3,6 +3,7 @@
 import functools
 import os
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -22,7 +23,7 @@ def export_surface(
     text: bool = False,
     unit: float = mm,
     root: str | os.PathLike | None = None,
-) -> None:
+) -> Path:
     """Write a surface as STL, OBJ, PLY, 3MF or GLB, whole or not at all.
 
     Args:
@@ -32,6 +33,9 @@ def export_surface(
         unit: What 1 in an STL, OBJ or PLY file means [m]; these formats state no unit and
             printers take millimetres. 3MF is in millimetres and GLB in metres by definition.
         root: Folder that the file must lie in, links followed.
+
+    Returns:
+        The file.
 
     Raises:
         ValueError: If the surface is empty, not finite or names vertices that are not
@@ -50,6 +54,7 @@ def export_surface(
         ".glb": glb.write,
     }
     _files.write(file, lambda stream: writers[kind](stream, surface=checked))
+    return file
 
 
 def export_contour(

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sorojax import _check
+from sorojax._display import displayed
 from sorojax.material import checks
 from sorojax.material.hyperelastic import AbstractHyperelastic
 from sorojax.material.ogden import Ogden
@@ -25,6 +26,7 @@ MODELS = (NeoHookean, MooneyRivlin, Yeoh, Gent, Ogden)
 FEWEST = {NeoHookean: 1, MooneyRivlin: 2, Yeoh: 3, Gent: 2}  # numbers per model
 
 
+@displayed
 @dataclass(frozen=True)
 class TensileFit:
     """A fitted material with the range that it is good for.

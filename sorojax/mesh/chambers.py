@@ -21,6 +21,20 @@ class Chambers(NamedTuple):
     mesh: Mesh
     volumes: dict[str, float]
 
+    def largest(self, count: int = 1) -> Int[np.ndarray, "facets facet_nodes"]:
+        """Walls of the `count` largest chambers.
+
+        Raises:
+            ValueError: If there are not so many.
+        """
+        if not 1 <= count <= len(self.volumes):
+            raise ValueError(
+                f"Chambers.largest: got count={count}, need 1 to {len(self.volumes)}, as many "
+                "as there are. Look at `volumes`."
+            )
+        names = sorted(self.volumes, key=lambda name: self.volumes[name])[-count:]
+        return np.concatenate([np.asarray(self.mesh.facet_sets[name]) for name in names])
+
 
 def boundary_loops(mesh: Mesh) -> list[Int[np.ndarray, "facets facet_nodes"]]:
     """Connected pieces of the boundary; in the plane in order along each loop."""

@@ -1,5 +1,6 @@
 """Ready-made and printable bodies as parametric programs."""
 
+from sorojax.robots.around import cylinder as cylinder, rim as rim, ring as ring
 from sorojax.robots.bellows import BellowsActuator as BellowsActuator
 from sorojax.robots.bending import BendingActuator as BendingActuator
 from sorojax.robots.crawler import (
@@ -26,6 +27,7 @@ from sorojax.robots.models_supply import (
 )
 from sorojax.robots.parts import Bellows as Bellows
 from sorojax.robots.planar import PlanarActuator as PlanarActuator
+from sorojax.robots.pneunet import PneuNet as PneuNet, pneunet_mesh as pneunet_mesh
 from sorojax.robots.walker import (
     Walker as Walker,
     pair_angles as pair_angles,

@@ -5,11 +5,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._display import displayed
 from sorojax._types import real
 from sorojax.sdf import AbstractSdf, HalfPlane, Rectangle, repeat
 from sorojax.units import mm
 
 
+@displayed
 class BellowsActuator(eqx.Module):
     """Dimensions of the side view [m]; x runs along the actuator from its clamp.
 
@@ -57,6 +59,17 @@ class BellowsActuator(eqx.Module):
     @property
     def height(self) -> Float[Array, ""]:
         return self.base + self.chamber_height + self.roof
+
+    def back(self, bellow: int) -> Float[Array, "2 2"]:
+        """Both ends of the upper side of a bellow, counted from the clamp from 0 on [m]."""
+        if not 0 <= bellow < self.num_bellows:
+            raise ValueError(
+                f"BellowsActuator.back: got bellow {bellow}, need 0 to {self.num_bellows - 1}. "
+                "They count from the clamp."
+            )
+        left = self.clamp + bellow * self.pitch
+        x = jnp.stack([left, left + self.bellow_width])
+        return jnp.stack([x, jnp.broadcast_to(self.height, x.shape)], axis=1)
 
     def chambers(self) -> AbstractSdf:
         """The air chambers."""

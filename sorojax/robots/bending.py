@@ -5,12 +5,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._display import displayed
 from sorojax._types import real
 from sorojax.robots.parts import pipe
 from sorojax.sdf import AbstractSdf, Box, repeat
 from sorojax.units import mm
 
 
+@displayed
 class BendingActuator(eqx.Module):
     """Dimensions [m]; x runs along the actuator, z points from its base to its bellows.
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check, fem, mesh
+from sorojax._display import displayed
 from sorojax._types import real
 from sorojax.material import AbstractHyperelastic, by_region, neo_hookean
 from sorojax.sdf import AbstractSdf, HalfPlane, Rectangle, repeat, translate
@@ -19,6 +20,7 @@ from sorojax.units import MPa, kPa, mm
 PORTS = ("rear", "middle", "front")
 
 
+@displayed
 class Crawler(eqx.Module):
     """Dimensions of the side view [m]; x runs along the crawler, y is 0 under its sole.
 

@@ -5,12 +5,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._display import displayed
 from sorojax._types import real
 from sorojax.robots.parts import Bellows
 from sorojax.sdf import AbstractSdf, Box, Sphere, translate
 from sorojax.units import mm
 
 
+@displayed
 class Finger(eqx.Module):
     """Dimensions [m]; it stands on z = 0 and bends towards its spine at -x."""
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._display import displayed
 from sorojax._types import real
 from sorojax.robots.finger import Finger
 from sorojax.robots.parts import Bellows, LaidAlong, Placed, pipe
@@ -12,6 +13,7 @@ from sorojax.sdf import AbstractSdf, Box, rotate, translate
 from sorojax.units import deg, mm
 
 
+@displayed
 class Hand(eqx.Module):
     """Dimensions [m] and angles [rad] of a left hand, palm down, fingers along y.
 

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._display import displayed
 from sorojax._types import real
 from sorojax.robots.finger import Finger
 from sorojax.robots.parts import Bellows, Placed, pipe
@@ -14,6 +15,7 @@ from sorojax.sdf.solids import Cylinder, Torus
 from sorojax.units import mm
 
 
+@displayed
 class Manipulator(eqx.Module):
     """Dimensions [m]; it stands along z, its gripper on top.
 

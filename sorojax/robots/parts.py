@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._display import displayed
 from sorojax._types import real
 from sorojax.sdf import (
     AbstractSdf,
@@ -25,6 +26,7 @@ from sorojax.sdf.transform import AbstractWrapped
 from sorojax.units import mm
 
 
+@displayed
 class Bellows(eqx.Module):
     """A round bellows standing on z = 0, closed at both ends [m].
 

@@ -5,12 +5,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._display import displayed
 from sorojax._types import real
 from sorojax.robots.parts import Bellows, Placed, pipe
 from sorojax.sdf import AbstractSdf, Box
 from sorojax.units import mm
 
 
+@displayed
 class PlanarActuator(eqx.Module):
     """Dimensions [m]; the bellows stand along z at x = -spacing/2 and spacing/2.
 

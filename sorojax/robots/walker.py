@@ -10,12 +10,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check, fem, mesh
+from sorojax._display import displayed
 from sorojax._types import real
 from sorojax.material import AbstractHyperelastic, neo_hookean
 from sorojax.sdf import AbstractSdf, Capsule, HalfPlane, Rectangle, repeat, rotate, translate
 from sorojax.units import MPa, deg, mm
 
 
+@displayed
 class Walker(eqx.Module):
     """Dimensions of the side view [m]; x runs along the spine, y is 0 under the feet.
 

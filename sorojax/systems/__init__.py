@@ -84,5 +84,6 @@ from sorojax.systems.source import (
     Step as Step,
 )
 from sorojax.systems.stack import Stack as Stack, stack as stack
+from sorojax.systems.touching import Touching as Touching, touching as touching
 from sorojax.systems.valve import Valve as Valve
 from sorojax.systems.waypoints import Waypoints as Waypoints

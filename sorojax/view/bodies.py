@@ -1,4 +1,4 @@
-"""Figures of shapes, meshes and deformed bodies."""
+"""Figures of meshes and deformed bodies."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -9,8 +9,6 @@ from jaxtyping import Float
 from sorojax import fem
 from sorojax.fem import Path
 from sorojax.mesh import Mesh, boundary_facets
-from sorojax.sdf import AbstractSdf, contour
-from sorojax.sdf.sample import finite_box, values
 from sorojax.view import style
 from sorojax.view.drawing import as_path, box, cell_rings, flat_triangles, loops
 from sorojax.view.fields import NodalField, nodal_von_mises
@@ -86,7 +84,7 @@ def show_mesh(
     triangles = flat_triangles("show_mesh", mesh)
     points = 1e3 * np.asarray(mesh.points)
     lower, upper = box(points)
-    figure = style.new_figure(9.0, _height(9.0, lower, upper))
+    figure = style.new_figure(9.0, style.height_for(9.0, lower, upper))
     axes = figure.add_subplot()
     if field is None:
         faces = "#e8f1f8"
@@ -102,45 +100,6 @@ def show_mesh(
     count = f"{mesh.num_cells} cells {mesh.element.name}, {mesh.num_nodes} nodes"
     style.title(figure, title or count)
     return figure
-
-
-def show_sdf(shape: AbstractSdf, *, resolution: int = 300, title: str = "") -> "Figure":
-    """A plane shape: filled contours of its distance and the zero set as a line."""
-    lower, upper = finite_box("show_sdf", shape, 2)
-    step = float(np.max(upper - lower)) / resolution
-    margin = 0.06 * resolution * step
-    ranges = zip(lower - margin, upper + margin + step, strict=True)
-    x, y = np.meshgrid(*(np.arange(low, high, step) for low, high in ranges))
-    f = 1e3 * values(shape, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
-    figure = style.new_figure(9.0, _height(9.0, lower - margin, upper + margin))
-    axes = figure.add_subplot()
-    norm, levels = two_sided(float(f.min()), float(f.max()))
-    filled = axes.contourf(1e3 * x, 1e3 * y, f, levels=levels, cmap="RdBu_r", norm=norm)
-    for curve in contour(shape, step):
-        outline = _closed(1e3 * curve.points, curve.closed).T
-        axes.plot(*outline, color=style.INK, lw=1.5, solid_joinstyle="miter")
-    style.dress_plane(axes, 1e3 * lower, 1e3 * upper)
-    style.colour_bar(
-        figure, filled, axes, "signed distance [mm]", format="%g", shrink=0.9, pad=0.02,
-        ticks=levels[::2] if len(levels) > 12 else levels, spacing="uniform",
-    )  # fmt: skip
-    style.title(figure, title)
-    return figure
-
-
-def two_sided(low: float, high: float) -> tuple[Any, np.ndarray]:
-    """Colours and round levels on each side of zero, where the depths may differ a lot."""
-    from matplotlib.colors import TwoSlopeNorm
-    from matplotlib.ticker import MaxNLocator
-
-    inside = np.array(MaxNLocator(6).tick_values(min(low, -1e-9), 0.0))
-    outside = np.array(MaxNLocator(6).tick_values(0.0, max(high, 1e-9)))
-    levels = np.concatenate([inside[inside < 0], outside[outside >= 0]])
-    return TwoSlopeNorm(0.0, levels[0], levels[-1]), levels
-
-
-def _closed(points: np.ndarray, closed: bool) -> np.ndarray:
-    return np.concatenate([points, points[:1]]) if closed else points
 
 
 def _chosen_states(path: Path, states: Sequence[int] | None) -> list[int]:
@@ -187,11 +146,6 @@ def _panels(count: int, aspect: float) -> "tuple[Figure, list[Axes]]":
     for spare in grid[count:]:
         spare.remove()
     return figure, list(grid[:count])
-
-
-def _height(width: float, lower: np.ndarray, upper: np.ndarray) -> float:
-    span = upper - lower
-    return float(np.clip(1.2 + 0.8 * width * span[1] / span[0], 2.6, 9.0))
 
 
 def _outline(axes: "Axes", points: np.ndarray, rings: list, colour: str, width: float) -> None:

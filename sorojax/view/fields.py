@@ -1,7 +1,7 @@
-"""Values to colour a body by: fields known by name, functions and arrays, with units."""
+"""Values to colour a body by: fields known by name, functions and arrays."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,18 +10,11 @@ from jaxtyping import Array, Float
 
 from sorojax import fem
 from sorojax.fem import Problem
-from sorojax.mesh import Mesh, cell_areas, cell_volumes
+from sorojax.mesh import cell_areas, cell_volumes
+from sorojax.view.quantity import Coloured
 
 NodalField = Callable[[Problem, Float[Array, "nodes dim"]], Float[Array, " nodes"]]
 Field = str | NodalField | Float[Any, " values"] | None
-
-
-class Coloured(NamedTuple):
-    """Values per node or per cell in SI units, their name, and what they are measured in."""
-
-    values: Float[np.ndarray, " values"]
-    name: str
-    unit: str
 
 
 @eqx.filter_jit
@@ -90,41 +83,3 @@ def evaluate(
         return Coloured(np.asarray(function(problem, u)), label or name, "" if label else unit)
     values = field(problem, u) if callable(field) else field
     return Coloured(np.asarray(values), label, "")
-
-
-_STEPS = {
-    "Pa": ((1e6, "MPa"), (1e3, "kPa"), (1.0, "Pa")),
-    "m": ((1.0, "m"), (1e-3, "mm"), (1e-6, "um")),
-    "J/m^3": ((1e6, "MJ/m$^3$"), (1e3, "kJ/m$^3$"), (1.0, "J/m$^3$")),
-}
-
-
-def readable(rows: list[Coloured]) -> tuple[list[np.ndarray], str]:
-    """The values of all rows in one unit that gives short numbers, and the label."""
-    first = rows[0]
-    if first.unit not in _STEPS:
-        unit = f" [{first.unit}]" if first.unit else ""
-        return [row.values for row in rows], f"{first.name}{unit}"
-    flat = np.concatenate([np.ravel(row.values) for row in rows])
-    largest = float(np.max(np.abs(flat[np.isfinite(flat)]), initial=0.0))
-    factor, unit = _step(largest / 2, first.unit)
-    return [row.values / factor for row in rows], f"{first.name} [{unit}]"
-
-
-def short(value: float, unit: str) -> str:
-    """A number with its unit: 12500 Pa as `12.5 kPa`."""
-    factor, name = _step(abs(value), unit) if unit in _STEPS else (1.0, unit)
-    return f"{value / factor:.3g} {name}".strip()
-
-
-def _step(value: float, unit: str) -> tuple[float, str]:
-    """The largest unit of which `value` has at least one, its size first."""
-    steps = _STEPS[unit]
-    return next((s for s in steps if value >= s[0]), steps[-1] if value else steps[1])
-
-
-def mesh_quality(mesh: Mesh) -> Float[np.ndarray, " cells"]:
-    """Shape number of every cell in [0, 1], as in `mesh.quality`; 1 is the best."""
-    from sorojax.mesh.quality import cell_ratios
-
-    return cell_ratios(mesh)

@@ -13,15 +13,16 @@ from sorojax.mesh import Mesh
 from sorojax.units import mm
 from sorojax.view import style
 from sorojax.view.camera import View
-from sorojax.view.fields import Coloured, readable
 from sorojax.view.film import Film
 from sorojax.view.meshes import edge_lines, show_cells
 from sorojax.view.panels import panels
 from sorojax.view.picture import Picture
+from sorojax.view.quantity import Coloured, readable
 from sorojax.view.runs import time_plots
 from sorojax.view.scene import Part, Scene, Surface, joint_extent, robust_scale
-from sorojax.view.shapes import picture_of_scene, show_surface
+from sorojax.view.shapes import show_surface
 from sorojax.view.shell import on_triangles, shell
+from sorojax.view.stage import show_scene
 
 _SURFACES = (".stl", ".obj", ".ply")
 _UNITS = {"von_mises": "Pa", "pressure": "Pa", "displacement": "m", "energy": "J"}
@@ -76,8 +77,7 @@ def show_file(
         return show_cells(state.mesh, title=title, **options)
     scene = _scenes([state], wire)[0]
     scene = Scene(scene.parts, scene.scale, name)
-    options = {} if scene.dim == 2 else {"view": view, "renderer": renderer}
-    return picture_of_scene(scene, **options)
+    return show_scene(scene, view=view, renderer=renderer)
 
 
 def animate_file(
@@ -85,7 +85,7 @@ def animate_file(
     **options: Any,
 ) -> Film:  # fmt: skip
     """A film of a series of results (.pvd); options of `animate`."""
-    from sorojax.view.animate import Track, animate
+    from sorojax.view.animation import Track, animate
 
     states = [_state(file, field, unit) for file in _series(Path(path))]
     scenes = joint_extent(_scenes(states, False))

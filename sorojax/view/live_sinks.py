@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sorojax.rod import num_coordinates
-from sorojax.view.rig import Rig, pose
+from sorojax.view.rigging import Rig, pose
 
 _PATIENCE = 1.0  # s between two signs of life of a page without news
 

@@ -8,7 +8,7 @@ import numpy as np
 from sorojax.rod import num_coordinates
 from sorojax.view import style
 from sorojax.view.live_sinks import AbstractSink
-from sorojax.view.rig import Rig, pose
+from sorojax.view.rigging import Rig, pose
 
 
 class Viser(AbstractSink):

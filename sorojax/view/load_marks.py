@@ -8,8 +8,8 @@ from sorojax.fem import Problem
 from sorojax.fem.loads import AbstractLoad
 from sorojax.mesh.elements import facet_corners
 from sorojax.view import style
-from sorojax.view.fields import short
 from sorojax.view.marks import coil, turning
+from sorojax.view.quantity import short
 from sorojax.view.scene import Dots, Lines, Part, Surface
 
 _SPRING, _RIGID, _TURN, _WALL = (style.COLOURS[k] for k in (2, 0, 4, 1))

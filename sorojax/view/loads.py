@@ -11,8 +11,8 @@ from sorojax.fem.supports import AbstractSupport, known_components
 from sorojax.mesh.elements import facet_corners
 from sorojax.mesh.locate import Locations
 from sorojax.view import style
-from sorojax.view.fields import short
 from sorojax.view.load_marks import marks_of
+from sorojax.view.quantity import short
 from sorojax.view.scene import Arrows, Dots, Lines, Part
 from sorojax.view.shapes import obstacle_part
 

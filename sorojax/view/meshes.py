@@ -6,14 +6,14 @@ import numpy as np
 from jaxtyping import Float
 
 from sorojax.mesh import Mesh, boundary_facets
+from sorojax.mesh.quality import cell_ratios
 from sorojax.view import style
 from sorojax.view.camera import View
 from sorojax.view.drawing import loops
-from sorojax.view.fields import mesh_quality
 from sorojax.view.picture import Picture
 from sorojax.view.scene import Dots, Lines, Part, Scale, Scene, Surface, robust_scale
-from sorojax.view.shapes import picture_of_scene
 from sorojax.view.shell import Shell, on_triangles, outline, shell
+from sorojax.view.stage import show_scene
 
 _PALE = 0.55  # how far the colours of regions are mixed with white
 
@@ -43,8 +43,7 @@ def show_cells(
         title: Title; the kind and number of cells if omitted.
     """
     scene = mesh_scene(mesh, by=by, field=field, label=label, limits=limits, title=title)
-    options = {} if mesh.element.dim == 2 else {"view": view, "renderer": renderer}
-    return picture_of_scene(scene, **options)
+    return show_scene(scene, view=view, renderer=renderer)
 
 
 def mesh_scene(
@@ -66,7 +65,7 @@ def mesh_scene(
     scale: Scale | None = None
     values, colour = None, style.BODY
     if by == "quality":
-        field, label = mesh_quality(mesh), label or "shape of the cell [-], 1 is the best"
+        field, label = cell_ratios(mesh), label or "shape of the cell [-], 1 is the best"
         limits = (0.0, 1.0) if limits is None else limits
     if field is not None:
         values, _ = on_triangles(mesh, seen, np.asarray(field))

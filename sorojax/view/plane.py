@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def plane_figure(scene: Scene, *, width: float = 9.0) -> "tuple[Figure, Axes]":
     """One plane scene with axes, colour bar and names."""
     lower, upper = (1e3 * corner for corner in scene.box)
-    figure = style.new_figure(width, height_for(width, lower, upper))
+    figure = style.new_figure(width, style.height_for(width, lower, upper))
     axes = figure.add_subplot()
     draw_plane(axes, scene)
     style.dress_plane(axes, lower, upper)
@@ -28,12 +28,6 @@ def plane_figure(scene: Scene, *, width: float = 9.0) -> "tuple[Figure, Axes]":
     if scene.note:
         axes.set_title(scene.note, fontsize=style.LABEL, color=style.INK, loc="left")
     return figure, axes
-
-
-def height_for(width: float, lower: np.ndarray, upper: np.ndarray) -> float:
-    """Height of a figure [inch] that shows a box of these corners."""
-    span = np.maximum(upper - lower, 1e-9)
-    return float(np.clip(1.2 + 0.8 * width * span[1] / span[0], 2.6, 9.0))
 
 
 def draw_plane(axes: "Axes", scene: Scene) -> "list[Artist]":

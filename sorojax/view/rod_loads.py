@@ -13,8 +13,8 @@ from sorojax import rod as R
 from sorojax.rod import Assembly, Rod
 from sorojax.rod.routing import Thread
 from sorojax.view import style
-from sorojax.view.fields import short
 from sorojax.view.glyphs import line_tube
+from sorojax.view.quantity import short
 from sorojax.view.scene import Arrows, Lines, Part, Surface
 from sorojax.view.shapes import obstacle_part
 

@@ -17,7 +17,8 @@ from sorojax.view.picture import Picture
 from sorojax.view.rod_loads import acting, contact_parts, size_of, thread_parts
 from sorojax.view.scene import Arrows, Dots, Lines, Part, Scene, Surface
 from sorojax.view.sections import outlines_of
-from sorojax.view.shapes import picture_of_scene, shape_scene
+from sorojax.view.shapes import shape_scene
+from sorojax.view.stage import show_scene
 from sorojax.view.wrenches import wrench_parts
 
 _STATIONS = 61
@@ -63,8 +64,7 @@ def show_rod(
         directors=directors,
         title=title,
     )
-    options = {} if scene.dim == 2 else {"view": view, "renderer": renderer}
-    return picture_of_scene(scene, **options)
+    return show_scene(scene, view=view, renderer=renderer)
 
 
 def rod_scene(

@@ -129,6 +129,13 @@ def box_of(parts: Sequence[Part]) -> tuple[np.ndarray, np.ndarray]:
     return points.min(axis=0), points.max(axis=0)
 
 
+def joined(*scenes: Scene, title: str = "") -> Scene:
+    """One scene of the parts of all, with the first scale that one of them has."""
+    parts = tuple(part for scene in scenes for part in scene.parts)
+    scale = next((scene.scale for scene in scenes if scene.scale is not None), None)
+    return Scene(parts, scale, title or next((s.title for s in scenes if s.title), ""))
+
+
 def joint_extent(scenes: Sequence[Scene]) -> list[Scene]:
     """The scenes with one box and one scale, so that they compare."""
     boxes = [scene.box for scene in scenes]

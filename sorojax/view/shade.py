@@ -1,17 +1,31 @@
-"""A solid scene as a picture: light, colours, thin lines, smooth edges; NumPy alone."""
+"""A solid scene as a picture with smooth edges; NumPy alone.
+
+Which triangle is seen is found for every sample of every pixel. Light is dear and changes
+slowly, so it is worked out once per pixel, and for all samples only where they differ.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from sorojax.view.camera import Lens
-from sorojax.view.raster import Seen, barycentric, rasterise
-from sorojax.view.scene import Scene, Surface
-from sorojax.view.soup import Soup, painted, soup_of
+from sorojax.view.light import INK, lit_colour
+from sorojax.view.raster import Seen, rasterise
+from sorojax.view.scene import Part, Scene, Surface
+from sorojax.view.soup import Soup, soup_of
 
-_KEY = np.array([-0.45, 0.62, 0.65])  # right, up, towards the eye
-_FILL = np.array([0.70, 0.10, 0.55])
-_INK = np.array([0.12, 0.14, 0.19], np.float32)
-_SHINE, _SHARP = 0.10, 24
+_STEP = 0.02  # of red, green or blue between pixels: from there on all samples are lit
+_FAR = 0.04  # of the depth of the scene: from there on a nearer surface has an outline
+
+
+class _Layer(NamedTuple):
+    """Triangles with the samples that see them; of each part its share of the colour."""
+
+    soup: Soup
+    triangle: Int[np.ndarray, " samples"]
+    edge: Bool[np.ndarray, " samples"]
+    opacity: Float[np.ndarray, " parts"] | None = None
 
 
 def shade(
@@ -25,140 +39,106 @@ def shade(
         samples: Per pixel and direction; 2 smooths edges.
         dots_per_point: Pixels that a point of print has.
     """
-    width, height = lens.size[0] * samples, lens.size[1] * samples
-    fine = Lens(lens.camera, lens.centre, lens.distance, (width, height),
+    width, height = lens.size
+    fine = Lens(lens.camera, lens.centre, lens.distance, (width * samples, height * samples),
                 lens.scale * samples, lens.shift * samples)  # fmt: skip
-    numbered = list(enumerate(scene.parts))
-    clear = [pair for pair in numbered if isinstance(pair[1], Surface) and pair[1].opacity < 1]
-    solid = [pair for pair in numbered if pair not in clear]
     points = dots_per_point * samples
-    soup = soup_of(solid, fine, points)
-    seen = rasterise(soup.pixels, width, height)
-    picture = np.ones((height * width, 3), np.float32)
-    _paint(picture, soup, seen, fine, scene, np.ones(1), points)
-    _outline(picture, soup, seen, samples)
-    if clear:
-        soup = soup_of(clear, fine, points)
-        above = rasterise(soup.pixels, width, height)
-        shown = above.triangle.copy()
-        shown[above.depth > seen.depth] = -1
-        above = Seen(shown, above.depth)
-        opacity = np.array([getattr(part, "opacity", 1.0) for part in scene.parts])
-        _paint(picture, soup, above, fine, scene, opacity, points)
-    picture = picture.reshape(height, width, 3)
+    layers = _layers(scene, fine, points)
+
+    def lit(at: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+        return _colours(layers, at, scene, fine, points, samples)
+
+    row = width * samples * np.arange(samples)
+    within = (row[:, None] + np.arange(samples)).ravel()
+    row = width * samples**2 * np.arange(height)
+    first = (row[:, None] + samples * np.arange(width)).ravel()
+    picture = lit(first)
     if samples > 1:
-        parts = [
-            picture[a::samples, b::samples] for a in range(samples) for b in range(samples)
-        ]
-        picture = sum(parts[1:], parts[0]) / np.float32(samples**2)
+        rough = np.flatnonzero(_rough(layers, picture, lens.size, samples))
+        every = lit((first[rough, None] + within).ravel()).reshape(-1, samples**2, 3)
+        picture[rough] = np.add.reduce(every, axis=1) / np.float32(samples**2)
+    picture = picture.reshape(height, width, 3)
     return (255 * np.clip(picture, 0, 1) + 0.5).astype(np.uint8)
 
 
-def _paint(picture, soup: Soup, seen: Seen, lens: Lens, scene: Scene, opacity, points) -> None:
-    """Light what is seen; surfaces that are clear are mixed with what is below."""
-    flat = seen.triangle.ravel()
-    pixel = np.flatnonzero(flat >= 0)
-    if not len(pixel):
-        return
-    triangle = flat[pixel]
-    row, column = np.divmod(pixel, lens.size[0])
-    shares = barycentric(soup.pixels, triangle, column, row)
-    if lens.camera.opening:
-        weights = lens.share(soup.pixels[:, :, 2]).astype(np.float32)
-        in_space = [share * weights[triangle, k] for k, share in enumerate(shares)]
-        total = in_space[0] + in_space[1] + in_space[2]
-        in_space = [share / total for share in in_space]
-    else:
-        in_space = shares
-    colour = painted(soup, triangle, in_space, scene.scale)
-    colour = _lit(colour, soup, triangle, in_space, lens.camera.axes)
-    colour = _wired(colour, soup, triangle, shares, 0.45 * points)
-    if len(opacity) > 1:
-        share = opacity[soup.part[triangle].astype(int)][:, None].astype(np.float32)
-        colour = share * colour + (1 - share) * picture[pixel]
-    picture[pixel] = colour
+def _layers(scene: Scene, lens: Lens, points: float) -> list[_Layer]:
+    """What is opaque, and before it what is clear."""
+    numbered: list[tuple[int, Part]] = list(enumerate(scene.parts))
+    clear = [pair for pair in numbered if isinstance(pair[1], Surface) and pair[1].opacity < 1]
+    solid = [pair for pair in numbered if pair not in clear]
+    soup = soup_of(solid, lens, points)
+    seen = rasterise(soup.pixels, *lens.size)
+    layers = [_Layer(soup, seen.triangle.ravel(), _outlined(soup, seen).ravel())]
+    if clear:
+        soup = soup_of(clear, lens, points)
+        above = rasterise(soup.pixels, *lens.size)
+        shown = np.where(above.depth > seen.depth, -1, above.triangle).ravel()
+        opacity = [getattr(part, "opacity", 1.0) for part in scene.parts]
+        none = np.zeros(shown.shape, bool)
+        layers.append(_Layer(soup, shown, none, np.array(opacity, np.float32)))
+    return layers
 
 
-def _lit(colour, soup: Soup, triangle, shares, axes) -> Float[np.ndarray, "n 3"]:
-    """Two lamps that move with the eye; both sides of a surface are lit."""
-    turned = (soup.normals @ axes.T).astype(np.float32)
-    x, y, z = (sum(shares[c] * turned[:, c, k][triangle] for c in range(3)) for k in range(3))
-    size = np.sqrt(x * x + y * y + z * z)
-    size = np.where(z < 0, -1, 1) / np.maximum(size, np.float32(1e-12))
-    normal = (x * size, y * size, z * size)
-    key, fill = _KEY / np.linalg.norm(_KEY), _FILL / np.linalg.norm(_FILL)
-    half = key + np.array([0, 0, 1.0])
-    bright, weak = _facing(normal, key), _facing(normal, fill)
-    gleam = _facing(normal, half / np.linalg.norm(half))
-    gleam = gleam**2
-    gleam = gleam**2
-    gleam = gleam**2
-    gleam = np.float32(_SHINE) * gleam * gleam * gleam  # to the power 24
-    valued, lit = np.isfinite(soup.values[:, 0]), soup.lit > 0
-
-    def weight(coloured: float, plain: float):
-        return _each(np.where(valued, coloured, plain).astype(np.float32), triangle)
-
-    light = weight(0.72, 0.42) + weight(0.24, 0.52) * bright + weight(0.10, 0.16) * weak
-    gleam *= weight(0.4, 1.0)
-    if not np.all(lit):
-        light = np.where(lit[triangle], light, np.float32(1.0))
-        gleam = np.where(lit[triangle], gleam, np.float32(0.0))
-    colour = colour * light[:, None]
-    colour += gleam[:, None]
-    return np.minimum(colour, np.float32(1.0), out=colour)
+def _colours(layers, at, scene: Scene, lens: Lens, points: float, samples: int):
+    """Red, green and blue of the samples `at`: every layer over the one below."""
+    colours = np.ones((len(at), 3), np.float32)
+    for soup, seen, edge, opacity in layers:
+        triangle = seen.take(at)
+        hit = np.flatnonzero(triangle >= 0)
+        if not len(hit):
+            continue
+        triangle = triangle.take(hit).astype(np.intp)
+        found = lit_colour(soup, lens, scene.scale, triangle, at.take(hit), 0.45 * points)
+        if opacity is not None:
+            share = opacity.take(soup.part.take(triangle).astype(int))[:, None]
+            found = share * found + (1 - share) * colours[hit]
+        colours[hit] = found
+        inked = np.flatnonzero(edge.take(at))
+        strength = np.float32(0.55 if samples > 1 else 0.45)
+        colours[inked] = (1 - strength) * colours[inked] + strength * INK
+    return colours
 
 
-def _each(table: Float[np.ndarray, " triangles"], triangle):
-    """The number of every sample's triangle; one number where all are equal."""
-    return table[0] if np.all(table == table[0]) else table[triangle]
+def _rough(layers, picture, size: tuple[int, int], samples: int) -> Bool[np.ndarray, "h w"]:
+    """Pixels whose samples see different parts or an outline, or which differ from the next."""
+    width, height = size
+    rough = np.zeros((height, width), bool)
+    for soup, triangle, edge, _ in layers:
+        part = np.append(soup.part, -1).astype(np.int16).take(triangle)  # -1 takes the last
+        for whole, differ in ((part, np.not_equal), (edge, np.logical_or)):
+            block = whole.reshape(height, samples, width, samples)
+            first = block[:, 0, :, 0]
+            for k in range(1, samples**2):
+                rough |= differ(block[:, k // samples, :, k % samples], first)
+    shown = picture.reshape(height, width, 3)
+    for after, before in (
+        ((slice(1, None),), (slice(None, -1),)),
+        ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
+    ):
+        step = np.abs(shown[after] - shown[before]).max(axis=2) > _STEP
+        rough[after] |= step
+        rough[before] |= step
+    return rough
 
 
-def _facing(normal, lamp) -> np.ndarray:
-    x, y, z = (np.float32(a) * n for a, n in zip(lamp, normal, strict=True))
-    return np.maximum(x + y + z, np.float32(0.0))
-
-
-def _wired(colour, soup: Soup, triangle, shares, width: float) -> Float[np.ndarray, "n 3"]:
-    """Sides of cells as lines of `width` pixels, fainter where cells are tiny."""
-    if not np.any(soup.wire):
-        return colour
-    corners = soup.pixels[:, :, :2]
-    sides = np.stack([corners[:, (k + 1) % 3] - corners[:, k] for k in range(3)], axis=1)
-    area = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
-    high = area[:, None] / np.maximum(np.linalg.norm(sides, axis=2), 1e-9)
-    most = high.max(axis=1)
-    high = np.where(soup.wire > 0, high, 1e12).astype(np.float32)
-    nearest = np.full(len(triangle), np.inf, np.float32)
-    for k in range(3):  # side k is opposite to the corner k + 2
-        away = np.abs(shares[(k + 2) % 3] * high[triangle, k])
-        nearest = np.fmin(nearest, away)
-    ink = np.clip(np.float32(width / 2 + 0.5) - nearest, 0, 1)
-    strength = (0.55 * np.clip(most / (6 * width), 0.15, 1)).astype(np.float32)
-    ink = (ink * strength[triangle])[:, None]
-    return colour * (1 - ink) + _INK * ink
-
-
-def _outline(picture, soup: Soup, seen: Seen, samples: int) -> None:
-    """Dark lines where a lit surface stands in front of paper or of something far behind."""
+def _outlined(soup: Soup, seen: Seen) -> Bool[np.ndarray, "height width"]:
+    """Where a lit surface stands in front of paper or of something far behind."""
     found = seen.triangle
-    if not len(soup.lit) or not np.any(found >= 0):
-        return
-    lit = soup.lit[found] > 0
-    lit &= found >= 0
-    depth = np.where(lit, seen.depth, np.inf).astype(np.float32)
-    inside = depth[lit]
+    edge = np.zeros(found.shape, bool)
+    depth, covered = seen.depth.astype(np.float32), None
+    if not np.all(soup.lit):
+        lit = np.append(soup.lit, 0).take(found) > 0
+        covered = (found >= 0) & ~lit  # a line in front leaves no edge
+        depth[~lit] = np.inf
+    inside = depth[np.isfinite(depth)]
     if not len(inside):
-        return
-    jump = np.float32(0.04 * max(float(inside.max() - inside.min()), 1e-12))
-    covered = (found >= 0) & ~lit  # a line in front leaves no edge
-    edge = np.zeros(lit.shape, bool)
+        return edge
+    jump = np.float32(_FAR * max(float(inside.max() - inside.min()), 1e-12))
     whole, ahead, behind = slice(None), slice(1, None), slice(None, -1)
     for mine, other in (
         ((ahead, whole), (behind, whole)), ((behind, whole), (ahead, whole)),
         ((whole, ahead), (whole, behind)), ((whole, behind), (whole, ahead)),
     ):  # fmt: skip
-        edge[mine] |= (depth[other] > depth[mine] + jump) & ~covered[other]
-    where = np.flatnonzero(edge & lit)
-    strength = np.float32(0.55 if samples > 1 else 0.45)
-    picture[where] = (1 - strength) * picture[where] + strength * _INK
+        stands = depth[other] > depth[mine] + jump
+        edge[mine] |= stands if covered is None else stands & ~covered[other]
+    return edge

@@ -4,17 +4,14 @@ from typing import Any
 
 import numpy as np
 
-from sorojax.sdf import AbstractSdf, Surface as Triangles, contour, isosurface
+from sorojax.sdf import AbstractSdf, Surface as Triangles, isosurface
 from sorojax.sdf.sample import finite_box, values
 from sorojax.view import style
-from sorojax.view.bodies import show_sdf
 from sorojax.view.camera import View
+from sorojax.view.distance import show_sdf, show_slice
 from sorojax.view.picture import Panel, Picture
-from sorojax.view.plane import plane_figure
 from sorojax.view.scene import Lines, Part, Scene, Surface
-from sorojax.view.solid import solid_figure
-
-_AXES = {"x": 0, "y": 1, "z": 2}
+from sorojax.view.stage import show_scene
 
 
 def show_shape(
@@ -41,12 +38,12 @@ def show_shape(
         title: Title of the figure.
     """
     if shape.dim == 3 and slice is None:
-        return picture_of_scene(shape_scene(shape, size, title), view=view, renderer=renderer)
+        return show_scene(shape_scene(shape, size, title), view=view, renderer=renderer)
     if shape.dim == 3:
         assert slice is not None
-        return _slice(shape, slice, resolution, title)
+        return show_slice(shape, slice, resolution, title)
     if filled:
-        return picture_of_scene(shape_scene(shape, size, title))
+        return show_scene(shape_scene(shape, size, title))
     figure = show_sdf(shape, resolution=resolution, title=title)
     return Picture(figure, (Panel(figure.axes[0]),))
 
@@ -57,7 +54,13 @@ def shape_scene(shape: AbstractSdf, size: float | None = None, title: str = "") 
     longest = float(np.max(upper - lower))
     if shape.dim == 2:
         return Scene((_filled(shape, longest / 300 if size is None else size),), title=title)
-    return surface_scene(_surface(shape, longest / 72 if size is None else size), title)
+    return Scene((shape_surface(shape, longest / 72 if size is None else size),), title=title)
+
+
+def shape_surface(shape: AbstractSdf, size: float, **look: Any) -> Surface:
+    """A solid shape as a part of a scene, with its `colour`, `opacity` and `name`."""
+    surface = _surface(shape, size)
+    return Surface(surface.vertices, surface.triangles, **look)
 
 
 def _surface(shape: AbstractSdf, size: float) -> Triangles:
@@ -85,16 +88,7 @@ def show_surface(
     """A triangle surface, e.g. from `sdf.isosurface` or `io.import_surface`."""
     if not title:
         title = f"{len(surface.triangles)} triangles, {len(surface.vertices)} vertices"
-    return picture_of_scene(surface_scene(surface, title, wire), view=view, renderer=renderer)
-
-
-def picture_of_scene(scene: Scene, **options: Any) -> Picture:
-    """One scene as a picture, in the plane or in space."""
-    if scene.dim == 2:
-        figure, axes = plane_figure(scene)
-        return Picture(figure, (Panel(axes),))
-    figure, lens = solid_figure(scene, **options)
-    return Picture(figure, (Panel(figure.axes[0], lens),))
+    return show_scene(surface_scene(surface, title, wire), view=view, renderer=renderer)
 
 
 def obstacle_part(
@@ -145,56 +139,3 @@ def _filled(shape: AbstractSdf, size: float) -> Surface:
     lower, upper = finite_box("view.show", shape, 2)
     mesh = triangulate(shape, size=max(size, float(np.max(upper - lower)) / 60))
     return Surface(np.asarray(mesh.points), np.asarray(mesh.cells))
-
-
-def _slice(shape: AbstractSdf, slice: dict[str, float], resolution: int, title: str) -> Picture:
-    """The distance in a plane across one axis, with the zero line."""
-    if len(slice) != 1 or next(iter(slice)) not in _AXES:
-        raise ValueError(
-            f'view.show: got slice={slice}, need one axis with its place [m]: {{"z": 0.01}}.'
-        )
-    name, place = next(iter(slice.items()))
-    across = _AXES[name]
-    lower, upper = finite_box("view.show", shape, 3)
-    rest = [axis for axis in range(3) if axis != across]
-    low, high = lower[rest], upper[rest]
-    margin = 0.06 * float(np.max(high - low))
-    low, high = low - margin, high + margin
-    count = np.maximum((high - low) / np.max(high - low) * resolution, 16).astype(int)
-    x, y = np.meshgrid(
-        *(np.linspace(a, b, n) for a, b, n in zip(low, high, count, strict=True))
-    )
-    points = np.full((x.size, 3), float(place))
-    points[:, rest[0]], points[:, rest[1]] = x.ravel(), y.ravel()
-    f = 1e3 * values(shape, points).reshape(x.shape)
-    figure, axes = distance_figure(x, y, f, title or f"{name} = {1e3 * float(place):g} mm")
-    style.dress_plane(axes, 1e3 * low, 1e3 * high, *(f"{'xyz'[k]} [mm]" for k in rest))
-    return Picture(figure, (Panel(axes),))
-
-
-def distance_figure(x, y, f, title: str):
-    """Filled contours of a distance [mm] over a grid [m], and its zero line."""
-    from sorojax.view.bodies import two_sided
-    from sorojax.view.plane import height_for
-
-    corners = 1e3 * np.array([[x.min(), y.min()], [x.max(), y.max()]])
-    figure = style.new_figure(9.0, height_for(9.0, *corners))
-    axes = figure.add_subplot()
-    norm, levels = two_sided(float(f.min()), float(f.max()))
-    painted = axes.contourf(1e3 * x, 1e3 * y, f, levels=levels, cmap="RdBu_r", norm=norm)
-    if f.min() < 0 < f.max():
-        axes.contour(1e3 * x, 1e3 * y, f, levels=[0.0], colors=style.INK, linewidths=1.5)
-    style.colour_bar(
-        figure, painted, axes, "signed distance [mm]", format="%g", shrink=0.9, pad=0.02,
-        ticks=levels[::2] if len(levels) > 12 else levels, spacing="uniform",
-    )  # fmt: skip
-    style.title(figure, title)
-    return figure, axes
-
-
-def outline_runs(shape: AbstractSdf, size: float) -> list[np.ndarray]:
-    """Closed curves of a plane shape, the first point repeated at the end."""
-    return [
-        np.concatenate([c.points, c.points[:1]]) if c.closed else c.points
-        for c in contour(shape, size)
-    ]

@@ -19,13 +19,29 @@ _DRAWN_BY = {
     "sorojax.fem.continuation.Continuation": ("states", "show_path"),
     "sorojax.fem.motion.Motion": ("states", "show_path"),
     "sorojax.fem.modal.Modes": ("states", "show_vibration"),
+    "sorojax.fem.buckling.CriticalLoads": ("answers", "show_buckling"),
+    "sorojax.fem.critical.CriticalPoint": ("answers", "show_buckling"),
     "sorojax.rod.rod.Rod": ("rods", "show_rod"),
     "sorojax.rod.assembly.Assembly": ("rods", "show_rod"),
     "sorojax.rod.section.Section": ("parts", "show_section"),
     "sorojax.rod.basis.StrainBasis": ("parts", "show_basis"),
     "sorojax.rod.rollout.Rollout": ("runs", "show_rollout"),
+    "sorojax.rod.statics.Equilibrium": ("answers", "show_posed"),
+    "sorojax.rod.static_path.EquilibriumPath": ("answers", "show_posed"),
+    "sorojax.rod.static_arc.ArcPath": ("answers", "show_posed"),
+    "sorojax.rod.inverse_kinematics.Reached": ("answers", "show_posed"),
     "sorojax.material.hyperelastic.AbstractHyperelastic": ("parts", "show_material"),
     "sorojax.reduction.backbone.Backbone": ("snapshots", "show_snapshots"),
+    "sorojax.robots.bellows.BellowsActuator": ("robots", "show_robot"),
+    "sorojax.robots.bending.BendingActuator": ("robots", "show_robot"),
+    "sorojax.robots.crawler.Crawler": ("robots", "show_robot"),
+    "sorojax.robots.finger.Finger": ("robots", "show_robot"),
+    "sorojax.robots.hand.Hand": ("robots", "show_robot"),
+    "sorojax.robots.manipulator.Manipulator": ("robots", "show_robot"),
+    "sorojax.robots.parts.Bellows": ("robots", "show_robot"),
+    "sorojax.robots.planar.PlanarActuator": ("robots", "show_robot"),
+    "sorojax.robots.pneunet.PneuNet": ("robots", "show_robot"),
+    "sorojax.robots.walker.Walker": ("robots", "show_robot"),
     "sorojax.robots.models_supply.Model": ("parts", "show_model"),
     "sorojax.systems.rod_body.RodBody": ("parts", "show_body"),
     "sorojax.systems.assembly_body.AssemblyBody": ("parts", "show_body"),
@@ -33,8 +49,15 @@ _DRAWN_BY = {
     "sorojax.systems.simulate.Trajectory": ("runs", "show_trajectory"),
     "sorojax.design.minimise.Optimised": ("runs", "show_optimised"),
     "sorojax.design.history.History": ("runs", "show_history"),
+    "sorojax.design.shape_loop.OptimisedShape": ("answers", "show_optimised_shape"),
+    "sorojax.design.part.Part": ("answers", "show_part"),
+    "sorojax.design.calibration.Calibration": ("answers", "show_calibration"),
+    "sorojax.material.fit.TensileFit": ("answers", "show_fit"),
+    "sorojax.mesh.repair.Repaired": ("answers", "show_repaired"),
+    "sorojax.view.rigging.Rig": ("answers", "show_rig"),
     "sorojax.view.charts.Convergence": ("charts", "show_convergence"),
     "sorojax.view.charts.WorkPrecision": ("charts", "show_work_precision"),
+    "sorojax.view.scene.Scene": ("stage", "show_scene"),
 }
 
 
@@ -42,10 +65,12 @@ _DRAWN_BY = {
 def show(thing: Any, *at: Any, **options: Any) -> Picture:
     """Draw any noun of the framework; the result is displayed by a notebook and can be saved.
 
-    Shapes, surfaces and meshes; problems, solutions, load paths, motions and modes; rods,
-    assemblies, sections, strain bases, backbones; materials; networks, blocks, trajectories
-    and models of robots; optimisations; `Convergence` and `WorkPrecision`. In space the
-    picture is shaded by pyvista where it is installed and by sorojax itself elsewhere.
+    Shapes, surfaces and meshes; robots and their models; problems, solutions, load paths,
+    motions, modes, critical loads; rods, assemblies, sections, strain bases, backbones, rigs;
+    materials and their fits; networks, blocks, trajectories; optimisations, calibrations,
+    parts; `Convergence` and `WorkPrecision`; a `Scene`. What a search on rods or a buckling
+    analysis found needs what was searched, `model=` or `problem=`. In space the picture is
+    shaded by pyvista where it is installed and by sorojax itself elsewhere.
     `show.register(Type, function)` adds a noun.
 
     Args:

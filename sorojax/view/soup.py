@@ -10,6 +10,7 @@ from sorojax.view.glyphs import arrow_triangles, ball_triangles
 from sorojax.view.scene import Arrows, Dots, Lines, Part, Scale, Surface
 
 _CREASE = np.cos(np.deg2rad(35.0))
+_HALF_CREASE = np.cos(np.deg2rad(35.0 / 2))  # so close to the mean no two are a crease apart
 
 
 class Soup(NamedTuple):
@@ -86,39 +87,44 @@ def _triangles(number: int, part: Surface, lens: Lens) -> Soup:
 def corner_normals(points: np.ndarray, triangles: np.ndarray) -> Float[np.ndarray, "n 3 3"]:
     """Normals at the corners: the mean over the triangles around, but those across a
     crease."""
-    a, b, c = (points[triangles[:, k]] for k in range(3))
+    a, b, c = (points.take(triangles[:, k], axis=0) for k in range(3))
     across = np.cross(b - a, c - a)
     face = across / np.maximum(np.linalg.norm(across, axis=1), 1e-300)[:, None]
-    corner, other = _around(triangles, len(points))
-    mine = face[corner // 3]
-    kept = np.einsum("pi,pi->p", mine, face[other]) > _CREASE
-    corner, weight = corner[kept], across[other[kept]]
-    total = np.stack(
-        [np.bincount(corner, weight[:, k], minlength=3 * len(triangles)) for k in range(3)], 1
-    )
-    size = np.linalg.norm(total, axis=1)[:, None]
-    mean = np.where(size > 0, total / np.maximum(size, 1e-300), np.repeat(face, 3, axis=0))
+    corner = triangles.ravel()
+    total = _summed(corner, np.repeat(across, 3, axis=0), len(points))
+    mean = _unit(total).take(corner, axis=0)
+    turned = np.einsum("tci,ti->tc", mean.reshape(-1, 3, 3), face) < _HALF_CREASE
+    sharp = np.zeros(len(points), bool)
+    sharp[triangles[turned]] = True
+    rows = np.flatnonzero(sharp.take(corner))
+    mean[rows] = _beside_creases(corner[rows], across.take(rows // 3, axis=0),
+                                 face.take(rows // 3, axis=0))  # fmt: skip
     return mean.reshape(-1, 3, 3)
 
 
-def _around(triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of a corner (three times its triangle plus its place) and a triangle around it."""
-    key = triangles.shape, count, hash(triangles.tobytes())
-    if key not in _pairs:
-        flat = triangles.ravel()
-        order = np.argsort(flat, kind="stable")
-        valence = np.bincount(flat, minlength=count)
-        start = np.cumsum(valence) - valence
-        repeats = valence[flat]
-        corner = np.repeat(np.arange(len(flat)), repeats)
-        nth = np.arange(len(corner)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
-        if len(_pairs) > 8:
-            _pairs.clear()
-        _pairs[key] = corner, order[start[flat[corner]] + nth] // 3
-    return _pairs[key]
+def _beside_creases(corner: np.ndarray, across: np.ndarray, face: np.ndarray) -> np.ndarray:
+    """Normals of corners at the points `corner`, of triangles with normals `face` and
+    `across` times twice their area; all corners at these points are there."""
+    order = np.argsort(corner, kind="stable")
+    _, number, valence = np.unique(corner, return_inverse=True, return_counts=True)
+    start = np.cumsum(valence) - valence
+    repeats = valence[number]
+    mine = np.repeat(np.arange(len(corner)), repeats)
+    nth = np.arange(len(mine)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
+    other = order[start[number[mine]] + nth]
+    kept = np.einsum("pi,pi->p", face[mine], face[other]) > _CREASE
+    total = _summed(mine[kept], across[other[kept]], len(corner))
+    none = np.linalg.norm(total, axis=1) == 0
+    return np.where(none[:, None], face, _unit(total))
 
 
-_pairs: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}  # a film asks for the same again
+def _summed(where: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
+    columns = [np.bincount(where, rows[:, k], minlength=count) for k in range(3)]
+    return np.stack(columns, axis=1)
+
+
+def _unit(rows: np.ndarray) -> np.ndarray:
+    return rows / np.maximum(np.linalg.norm(rows, axis=1), 1e-300)[:, None]
 
 
 def _ribbons(number: int, part: Lines, lens: Lens, width: float) -> Soup:
@@ -178,14 +184,14 @@ def _colours(colour, count: int) -> Float[np.ndarray, "n 3"]:
 
 def painted(soup: Soup, triangle, shares, scale: Scale | None) -> Float[np.ndarray, "pixels 3"]:
     """Colour of every pixel before light falls on it."""
-    colour = soup.colour.astype(np.float32)[triangle]
+    colour = soup.colour.astype(np.float32).take(triangle, axis=0)
     if scale is None or not np.any(np.isfinite(soup.values)):
         return colour
     values = soup.values.astype(np.float32)
-    value = sum(share * values[:, k][triangle] for k, share in enumerate(shares))
+    value = sum(share * values[:, k].take(triangle) for k, share in enumerate(shares))
     table = scale.table()
     step = np.float32(len(table) / (scale.high - scale.low))
     place = (value - np.float32(scale.low)) * step
     known = np.isfinite(place)
     place = np.clip(np.where(known, place, 0), 0, len(table) - 1).astype(np.int32)
-    return np.where(known[:, None], table[place], colour)
+    return np.where(known[:, None], table.take(place, axis=0), colour)

@@ -1,6 +1,7 @@
 """Deformed bodies: equilibria, load paths, motions and vibration modes."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -11,15 +12,16 @@ from sorojax import fem
 from sorojax.fem import Modes, Problem
 from sorojax.view import style
 from sorojax.view.camera import View
-from sorojax.view.fields import Coloured, Field, evaluate, readable, short
+from sorojax.view.fields import Field, evaluate
 from sorojax.view.load_marks import wall_parts
 from sorojax.view.loads import load_parts, support_parts
 from sorojax.view.meshes import edge_lines
 from sorojax.view.panels import panels
 from sorojax.view.picture import Picture
+from sorojax.view.quantity import Coloured, readable, short
 from sorojax.view.scene import Part, Scale, Scene, Surface, joint_extent, robust_scale
-from sorojax.view.shapes import picture_of_scene
 from sorojax.view.shell import Shell, on_triangles, shell
+from sorojax.view.stage import show_scene
 
 _UNITS = {
     fem.Pressure: "Pa", fem.Traction: "Pa", fem.Force: "N", fem.Tendon: "N", fem.Cable: "m",
@@ -31,6 +33,11 @@ _CLEAR = 0.4  # opacity of a body whose walls under pressure are seen through it
 def show_problem(problem: Problem, *, view: View = "iso", renderer: str = "auto",
                  title: str = "") -> Picture:  # fmt: skip
     """The body at rest with its cells, supports and loads."""
+    return show_scene(problem_scene(problem, title), view=view, renderer=renderer)
+
+
+def problem_scene(problem: Problem, title: str = "") -> Scene:
+    """As `show_problem`, before it is drawn."""
     still = np.zeros(problem.mesh.points.shape)
     mesh, points = problem.mesh, np.asarray(problem.mesh.points)
     seen = shell(mesh)
@@ -42,7 +49,7 @@ def show_problem(problem: Problem, *, view: View = "iso", renderer: str = "auto"
     parts += [edge_lines(mesh, points, colour=style.INK, width=0.9)]
     parts += support_parts(problem, still) + load_parts(problem, still)
     name = f"{mesh.num_cells} cells {mesh.element.name}, {problem.space.num_dofs} unknowns"
-    return _drawn(Scene(tuple(parts), title=title or name), view, renderer)
+    return Scene(tuple(parts), title=title or name)
 
 
 def show_solution(
@@ -73,13 +80,18 @@ def show_solution(
         renderer: Of a solid body.
         title: Title of the figure.
     """
-    u = np.asarray(solution.displacement)
-    scenes = body_scenes(
-        [solution.problem], [u], field=field, label=label, limits=limits, rest=rest,
-        loads=loads, wire=wire,
+    scene = solution_scene(
+        solution, title, field=field, label=label, limits=limits, rest=rest, loads=loads,
+        wire=wire,
     )  # fmt: skip
-    scene = Scene(scenes[0].parts, scenes[0].scale, title)
-    return _drawn(scene, view, renderer)
+    return show_scene(scene, view=view, renderer=renderer)
+
+
+def solution_scene(solution: Any, title: str = "", **options: Any) -> Scene:
+    """As `show_solution`, before it is drawn."""
+    u = np.asarray(solution.displacement)
+    (scene,) = body_scenes([solution.problem], [u], **options)
+    return replace(scene, title=title)
 
 
 def show_path(
@@ -224,8 +236,3 @@ def state_name(path: Any, k: int) -> str:
 
 def _frequency(modes: Modes, k: int) -> str:
     return f"{float(modes.frequencies[k]):.4g} Hz"
-
-
-def _drawn(scene: Scene, view: View, renderer: str) -> Picture:
-    options = {} if scene.dim == 2 else {"view": view, "renderer": renderer}
-    return picture_of_scene(scene, **options)

@@ -37,6 +37,12 @@ def new_figure(width: float, height: float, layout: Any = "constrained") -> "Fig
     return figure
 
 
+def height_for(width: float, lower, upper) -> float:
+    """Height of a figure [inch] that shows a box of these corners."""
+    span = np.maximum(np.subtract(upper, lower), 1e-9)
+    return float(np.clip(1.2 + 0.8 * width * span[1] / span[0], 2.6, 9.0))
+
+
 def dress(axes: "Axes", x: str = "", y: str = "", title: str = "", grid: bool = True) -> None:
     """Labels, a light grid and no box."""
     axes.set_facecolor("white")

@@ -14,7 +14,7 @@ from sorojax.rod import Assembly, Rod, Rollout
 from sorojax.sdf import AbstractSdf
 from sorojax.systems import AssemblyBody, Network, RodBody, Trajectory
 from sorojax.view import style
-from sorojax.view.animate import Track
+from sorojax.view.animation import Track
 from sorojax.view.fields import Field, evaluate
 from sorojax.view.loads import load_parts, support_parts
 from sorojax.view.meshes import edge_lines

@@ -11,7 +11,7 @@ from sorojax.fem import Motion, Path, Problem, Solution
 from sorojax.mesh import Mesh, boundary_facets
 from sorojax.sdf import Surface
 from sorojax.view import style
-from sorojax.view.rig import Rig, pose
+from sorojax.view.rigging import Rig, pose
 
 NodalField = Callable[[Problem, Float[Array, "nodes dim"]], Float[Array, " nodes"]]
 

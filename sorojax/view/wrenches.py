@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from sorojax import rod as R
 from sorojax.view import style
-from sorojax.view.fields import short
 from sorojax.view.marks import turning
+from sorojax.view.quantity import short
 from sorojax.view.scene import Arrows, Part
 
 _ALONG = 9  # arrows of a force per length

@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from sorojax.view.live_sinks import AbstractSink, Browser
 from sorojax.view.live_slots import Slots
-from sorojax.view.rig import Rig
+from sorojax.view.rigging import Rig
 
 _START = 60.0  # s that a viewer may take to start
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
+from sorojax._display import displayed
 from sorojax._types import integers, real
 from sorojax.math.door import door
 from sorojax.rod import Assembly, Rod, num_coordinates, rest
@@ -17,6 +18,7 @@ from sorojax.view.rig_tube import Outline, own_surface
 from sorojax.view.skin import Skin, bind, deform
 
 
+@displayed
 class Rig(eqx.Module):
     """A rod or assembly and a surface bound to it.
 
