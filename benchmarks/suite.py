@@ -23,7 +23,14 @@ ROWS = {
     "FEM assembly": Cases(("fem.assembly",), ("fem.newton",)),
     "FEM equilibrium": Cases(
         ("fem.case_a",),
-        ("fem.batch", "fem.beam_data", "fem.convergence", "fem.pneunet", "fem.tube"),
+        (
+            "fem.batch",
+            "fem.beam_data",
+            "fem.convergence",
+            "fem.iterative",
+            "fem.pneunet",
+            "fem.tube",
+        ),
     ),
     "near incompressibility": Cases(("fem.cook",)),
     "buckling": Cases(("fem.buckling",)),

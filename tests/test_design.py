@@ -1,5 +1,6 @@
 """Optimisers on problems with known answers, filters, and two classic layouts."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -196,6 +197,57 @@ def test_the_gradient_of_compliance(small):
         return jnp.sum(model.force * design.displacement(model, interpolation(x)))
 
     assert np.allclose(jax.grad(through)(x), jax.grad(loss)(x), rtol=1e-9)
+    # and their second derivatives
+    curve = jax.jvp(jax.grad(loss), (x,), (way,))[1] @ way
+    change = (jax.grad(loss)(x + h * way) - jax.grad(loss)(x - h * way)) @ way / (2 * h)
+    assert float(curve) == pytest.approx(float(change), rel=1e-6)
+    assert float(jax.jvp(jax.grad(through), (x,), (way,))[1] @ way) == pytest.approx(curve)
+
+
+def test_a_displacement_moves_with_cells_loads_and_springs(small):
+    """Every number that it is made of, in both directions."""
+    _, model = small
+    factor, way = jnp.linspace(0.2, 0.9, 72), jnp.cos(jnp.arange(1.0 * model.force.size))
+
+    def end(scale):
+        changed = eqx.tree_at(
+            lambda m: (m.stiffness, m.others), model,
+            (scale[0] * model.stiffness, scale[1] * model.stiffness.max() + model.others),
+        )  # fmt: skip
+        u = design.displacement(changed, factor, scale[2] * model.force)
+        return u.ravel() @ way
+
+    at, h = jnp.array([1.1, 0.01, 0.8]), 1e-6
+    want = [float(end(at.at[k].add(h)) - end(at.at[k].add(-h))) / (2 * h) for k in range(3)]
+    assert np.allclose(jax.grad(end)(at), want, rtol=1e-6)
+    assert np.allclose(jax.jacfwd(end)(at), want, rtol=1e-6)
+
+
+def test_compiled_functions_and_others_take_the_same_steps():
+    """Few programs for compiled functions, one after the other for those that are not."""
+    functions = (beam_weight, beam_deflection, lambda x, g: g / (1 + x / 100))
+    designs = []
+    for make in (lambda f: f, jax.jit):
+        loss, held, changed = map(make, functions)
+        found = design.minimise(
+            loss, jnp.full(5, 5.0), constraints=(held,), optimiser=design.MMA(1.0, 10.0),
+            change_gradient=changed, steps=5,
+        )  # fmt: skip
+        designs.append(found.design)
+    assert np.allclose(*designs, rtol=1e-12)
+
+
+@pytest.mark.parametrize("target", [0.3, 0.62, 0.05])
+def test_optimality_criteria_meet_the_volume_within_their_limits(target):
+    """Also where it is out of reach of a step: as near as the step comes then."""
+    random = np.random.default_rng(0)
+    x, gain = jnp.asarray(random.uniform(0.2, 0.8, 50)), jnp.asarray(random.uniform(1, 5, 50))
+    slopes = jnp.full((1, 50), 1 / 50)
+    values = design.Values(jnp.asarray(1.0), -gain, jnp.mean(x)[None] - target, slopes)
+    new, _ = design.OptimalityCriteria().update(x, values, None)
+    assert np.all(np.abs(new - x) <= 0.2 + 1e-12)
+    reach = jnp.mean(jnp.maximum(x - 0.2, 0.0))
+    assert float(jnp.mean(new)) == pytest.approx(max(target, float(reach)), abs=1e-12)
 
 
 @pytest.mark.parametrize(("kind", "want"), [("sensitivity", 216.8137), ("density", 233.7146)])

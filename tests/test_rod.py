@@ -1,5 +1,7 @@
 """Rods: closed forms, invariants, derivatives, coherence, cost, bad input."""
 
+import dataclasses
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -9,6 +11,7 @@ import pytest
 
 from sorojax import replace, rod as R
 from sorojax.math.lie import SE2, SE3
+from sorojax.math.quadrature import gauss_legendre
 from sorojax.math.status import Status
 from sorojax.math.steppers import (
     DormandPrince,
@@ -104,7 +107,10 @@ def test_eight_nodes_resolve_the_inertia_of_three_modes():
 def general():
     basis = R.chebyshev(kappa_x=2, kappa_y=1, kappa_z=1, sigma_x=1, sigma_y=1, sigma_z=1)
     rest = [3.0, -5.0, 4.0, 1.05, 0.1, -0.05]
-    rod = R.rod(SE3(), basis, R.rectangle(8e-3, 14e-3), rest_strain=rest, nodes=20, **FINGER)
+    section = dataclasses.replace(
+        R.rectangle(8e-3, 14e-3), mass_offset_y=1.5e-3, mass_offset_z=-1e-3
+    )
+    rod = R.rod(SE3(), basis, section, rest_strain=rest, nodes=20, **FINGER)
     rng = np.random.default_rng(1)
     scale = np.array([8.0] * 4 + [0.1] * 3)
     return rod, jnp.array(rng.normal(size=7) * scale), jnp.array(5 * rng.normal(size=7) * scale)
@@ -152,6 +158,37 @@ def test_momentum_of_a_clamped_rod_is_the_impulse_of_its_clamp(general):
     momentum = R.momentum(rod, q, v)
     assert relative((R.mass_matrix(free, place) @ rates)[:6], momentum) < 1e-12
     assert relative(R.mass_matrix(free, place)[6:, 6:], R.mass_matrix(rod, q)) < 1e-14
+
+
+def test_mass_beside_the_axis_moves_with_the_section(general):
+    flat = planar(nodes=9)
+    offset = dataclasses.replace(flat.section, mass_offset_y=1.2e-3)
+    flat = dataclasses.replace(flat, section=offset)
+    for body, q, v in (general, (flat, general[1][:3], general[2][:3])):
+        dim, section = body.group.space_dim, body.section
+        s, weights = (jnp.asarray(x) for x in gauss_legendre(body.quadrature))
+        offsets = [0.0, section.mass_offset_y, section.mass_offset_z][:dim]
+        point = jnp.array([*offsets, 1.0])
+
+        def places(q, body=body, s=s, point=point, dim=dim):
+            poses = R.forward_kinematics(body, q, s)
+            return (poses @ point)[:, :dim], poses[:, :dim, :dim]
+
+        (_, turn), (velocity, turning) = jax.jvp(places, (q,), (v,))
+        spin = jnp.swapaxes(turn, 1, 2) @ turning
+        area, about_y, about_z = section.area, section.second_moment_y, section.second_moment_z
+        about_z = about_z - area * section.mass_offset_y**2
+        rates = spin[:, 1, 0] ** 2 * about_z
+        if dim == 3:
+            about_y = about_y - area * section.mass_offset_z**2
+            rates = (
+                rates + spin[:, 2, 0] ** 2 * about_y + spin[:, 2, 1] ** 2 * (about_y + about_z)
+            )
+        lines = area * jnp.sum(velocity**2, axis=1) + rates
+        exact = body.material.density * body.length * (weights @ lines) / 2
+        assert relative(R.kinetic_energy(body, q, v), exact) < 1e-10  # 20 nodes: 4.7e-11
+    with pytest.raises(ValueError, match="mass cannot lie further away"):
+        R.Section(1e-4, 1e-9, 1e-9, 2e-9, mass_offset_y=4e-3)
 
 
 def test_gravity_is_the_gradient_of_its_energy(general):

@@ -1,5 +1,7 @@
 """Assemblies: invariants, closed forms, coherence with single rods, motion, bad input."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -53,10 +55,12 @@ def hand():
     inertia = jnp.array([[3e-6, 1e-7, 0], [1e-7, 5e-6, 2e-7], [0, 2e-7, 4e-6]])
     link = R.Link(0.02, inertia, [0.005, 0.002, -0.003])
     hinge = R.Revolute([1.0, 2.0, 3.0], stiffness=0.1)
+    heavy = dataclasses.replace(DISC, mass_offset_y=1e-3, mass_offset_z=-2e-3)
+    finger = dataclasses.replace(bent(), section=heavy)
     model = R.assembly(
         SE3(),
         palm=R.Part(link, R.Free()),
-        finger=R.Part(bent(), hinge, on="palm", offset=pose(0.01, 0.02, 0.4)),
+        finger=R.Part(finger, hinge, on="palm", offset=pose(0.01, 0.02, 0.4)),
         nail=R.Part(
             link, R.Prismatic([0.0, 1.0, 1.0]), on="finger", s=0.6, offset=pose(0, 0.01, 1)
         ),

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import sorojax as sj
 from sorojax import rod as R, sdf
 from sorojax.math.lie import SE2, SE3
 from sorojax.math.logarithm import change_of_logarithm, logarithm
@@ -42,6 +43,19 @@ def test_poses_are_reached_from_rest_in_ten_steps():
 
     error, apart = jax.jit(jax.vmap(reach))(drawn(20))
     assert jnp.all(error < 1e-6 * 0.08) and jnp.abs(apart).max() < 1e-5
+
+
+def test_a_loop_in_real_time_reaches_what_the_verb_reaches():
+    poses = [R.tip_pose(BODY, q) for q in drawn(3)]
+
+    def reach(pose, q):
+        return R.inverse_kinematics(BODY, R.Pose(pose), q, iterations=10)
+
+    compiled = sj.compiled(reach, poses[0], jnp.zeros(6))
+    for pose in poses:
+        found = compiled(pose, jnp.zeros(6))
+        assert found.status == Status.successful
+        assert jnp.abs(R.tip_pose(BODY, found.q) - pose).max() < 1e-5
 
 
 def test_a_far_target_gives_the_closest_pose_and_says_so():

@@ -10,6 +10,7 @@ import pytest
 from sorojax import design, fem, io, material, mesh, sdf, systems as S
 from sorojax._progress import silent
 from sorojax._types import real
+from sorojax.fem.energy_form import load_force
 from sorojax.math.status import Status
 
 STUFF = material.neo_hookean(young_modulus=1.0, poisson_ratio=0.3, density=1.0)
@@ -142,7 +143,7 @@ def test_wrong_calls_are_refused():
     with pytest.raises(ValueError, match="`size` or `mesher`"):
         design.minimise_shape(yielding, START, plate, pulled)
     with pytest.raises(ValueError, match="inside jit or vmap"):
-        jax.jit(lambda p: fem.eigenmodes(moved(p, jnp.asarray(5e-2))).eigenvalues)(DIMENSIONS)
+        jax.jit(lambda p: fem.eigenmodes(moved(p, 5e-2)).eigenvalues)(DIMENSIONS)
 
 
 DIMENSIONS = jnp.array([0.42, 0.25])
@@ -153,14 +154,18 @@ def moved(p, traction):
     """The plate with nodes moved to its dimensions, pulled to the right by some percent."""
     points = mesh.move(BODY.mesh, plate({"a": p[0], "b": p[1]})).points
     problem = eqx.tree_at(lambda q: q.mesh.points, BODY, points)
-    return fem.with_load(problem, "right", jnp.stack([traction, 0 * traction]))
+    return fem.with_load(problem, "right", jnp.array([traction, 0.0]))
+
+
+def modes_of(problem):
+    """Two modes about its equilibrium."""
+    u = fem.solve(problem, newton=fem.Newton(residual_tolerance=1e-12)).displacement
+    return fem.eigenmodes(problem, u, count=2)
 
 
 def basis(p):
     """Frequencies and shapes at a corner of two modes about the stretched plate."""
-    problem = moved(p, jnp.asarray(5e-2))
-    u = fem.solve(problem, newton=fem.Newton(residual_tolerance=1e-12)).displacement
-    modes = fem.eigenmodes(problem, u, count=2)
+    modes = modes_of(moved(p, 5e-2))
     return jnp.concatenate([modes.frequencies, modes.shapes[:, RIGHT[0], 0]])
 
 
@@ -209,11 +214,10 @@ class Modal(S.AbstractBlock):
 
 def tracking(p):
     """Squared error of the end under a PID that drives the traction."""
-    problem = moved(p, jnp.asarray(0.0))
-    modes = fem.eigenmodes(problem, count=2)
-    rest = jnp.zeros_like(problem.mesh.points)
-    loaded = fem.with_load(problem, "right", jnp.array([1.0, 0.0]))
-    push = fem.modal_force(modes, fem.residual(problem, rest) - fem.residual(loaded, rest))
+    problem = moved(p, 0.0)
+    modes, rest = modes_of(problem), jnp.zeros_like(problem.mesh.points)
+    force = load_force(moved(p, 1.0), rest) - load_force(problem, rest)
+    push = fem.modal_force(modes, force)
     return _run(Modal(modes.eigenvalues, push, modes.shapes[:, RIGHT[0], 0]))
 
 

@@ -1,4 +1,10 @@
-"""The cantilever at large displacement of Wang et al. 2014: end compliance of the optima."""
+"""The cantilever at large displacement of Wang et al. 2014: end compliance of the optima.
+
+The error is two-sided: an optimum that is stiffer than the published one counts as well. What
+the number of a design is worth is told by two further rows of each, without a bar: its dense
+cells alone, without any void between them, and the whole on cells split in nine, as four-node
+cells of this size bend too little.
+"""
 
 import time
 
@@ -29,6 +35,40 @@ def rows():
         yield Row("sorojax", settings, seconds[0], *timing, error=abs(reached / published - 1),
                   bar=WITHIN, bar_on="error",
                   reference="Wang, Lazarov, Sigmund, Jensen 2014; time of a step")  # fmt: skip
+        for what, make in (("without void", alone), ("on finer cells", split)):
+            body = make(force, density)
+            found = fem.solve(body, steps=6, throw=False)
+            again = float(design.work_of_loads(body, found.displacement))
+            told = settings | {"what": what, "compliance_kJ": again / 1e3,
+                               "over_published": again / published - 1,
+                               "load_fraction": float(found.load_fraction)}  # fmt: skip
+            yield Row("sorojax", told, error=abs(again / reached - 1),
+                      reference="the same design as it was optimised, no bar")  # fmt: skip
+
+
+def alone(force: float, density) -> fem.Problem:
+    """The cells of a design that are denser than a half, and nothing between them."""
+    whole = cantilever(force)
+    cells = np.asarray(whole.mesh.cells)[np.asarray(density) > 0.5]
+    nodes, renumbered = np.unique(cells, return_inverse=True)
+    points = whole.mesh.points[nodes]
+    dense = mesh.Mesh(points, renumbered.reshape(cells.shape), whole.mesh.element)
+    return body_of(force, dense, mesh.nodes_where(dense, lambda p: p[0] <= 0))
+
+
+def split(force: float, density, times: int = 3) -> fem.Problem:
+    """A design on a mesh of which `times` x `times` cells make one of its own."""
+    coarse, fine = cantilever(force), cantilever(force, 120 * times, 30 * times)
+    rows, finer = (_places(p.mesh) for p in (coarse, fine))
+    table = np.zeros((120, 30))
+    table[rows] = np.asarray(density)
+    return design.graded(fine, design.Simp(3.0, 1e-9)(jnp.asarray(table[finer])))
+
+
+def _places(grid: mesh.Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Column and row of the 120 x 30 cells in which every cell lies."""
+    middle = np.asarray(grid.points)[np.asarray(grid.cells)].mean(axis=1)
+    return tuple(np.floor(120 * middle).astype(int).T)  # type: ignore[return-value]
 
 
 def continuation(k: int) -> tuple[float, float]:
@@ -44,10 +84,14 @@ def continuation(k: int) -> tuple[float, float]:
 def cantilever(force: float, nx: int = 120, ny: int = 30) -> fem.Problem:
     """1 m x 0.25 m x 0.1 m of 3 GPa, nu 0.4, held at the left, loaded at the right."""
     grid = mesh.rectangle([0, 0], [1.0, 0.25], divisions=(nx, ny), element=mesh.Quad4())
+    return body_of(force, grid, grid.node_sets["left"])
+
+
+def body_of(force: float, grid: mesh.Mesh, left) -> fem.Problem:
     end = jnp.array([mesh.nearest_node(grid, [1.0, 0.125])])
     return fem.problem(
         grid, material.st_venant_kirchhoff(young_modulus=3e9, poisson_ratio=0.4),
-        kinematics=fem.PlaneStrain(0.1), supports=(fem.Fixed(grid.node_sets["left"]),),
+        kinematics=fem.PlaneStrain(0.1), supports=(fem.Fixed(left),),
         loads=(fem.Force(end, [0.0, -force]),), formulation=fem.Displacement(),
     )  # fmt: skip
 

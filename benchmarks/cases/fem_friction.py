@@ -1,12 +1,13 @@
 """Friction: threshold and creep on a slope, and what a contact far away costs."""
 
 import dataclasses
+import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.harness import Row, measure_together
+from benchmarks.harness import Row, Timing, measure_together
 from sorojax import fem, material, mesh, sdf
 from sorojax.fem import linear
 from sorojax.units import mm
@@ -60,19 +61,25 @@ def rows():
         yield Row("sorojax", found, error=error, bar=0.005, bar_on="error",
                   reference="Coulomb: g (sin - mu cos)")  # fmt: skip
     yield from _far()
+    yield from _far_in_motion()
+
+
+def _far_cases() -> dict[str, fem.Problem]:
+    """The block without a floor, and with one a metre below it."""
+    problem, smooth = block((120, 30)), block((120, 30), None)
+    below = jnp.array([0.0, -1.0])
+    return {
+        "none": dataclasses.replace(problem, loads=problem.loads[:1]),
+        "frictionless, far": fem.with_load(smooth, "floor", below),
+        "friction, far": fem.with_load(problem, "floor", below),
+    }
 
 
 def _far():
     """Assembly of residual and tangent with a contact out of reach, and without one."""
     timed, base = {}, None
-    problem = block((120, 30))
-    far = fem.with_load(problem, "floor", jnp.array([0.0, -1.0]))
-    smooth = block((120, 30), None)
-    cases = {
-        "none": dataclasses.replace(problem, loads=problem.loads[:1]),
-        "frictionless, far": fem.with_load(smooth, "floor", jnp.array([0.0, -1.0])),
-        "friction, far": far,
-    }
+    cases = _far_cases()
+    problem = cases["none"]
     u = jnp.zeros_like(problem.mesh.points)
     calls = {}
     for name, case in cases.items():
@@ -91,3 +98,38 @@ def _far():
         yield Row("sorojax", {"contact": name, "dof": problem.space.num_dofs,
                               "extra": round(extra, 4)}, **timing.columns(), error=extra,
                   bar=bar, bar_on="error", reference="assembly without contact")  # fmt: skip
+
+
+def _far_in_motion(steps: int = 20, repeats: int = 9):
+    """CPU seconds of a step of a bending block in free flight, in turns."""
+    cases = _far_cases()
+    runs, iterations = {name: [] for name in cases}, {}
+    points = np.asarray(cases["none"].mesh.points)
+    speed = np.zeros_like(points)
+    speed[:, 1] = 4.0 * (2 * points[:, 0] / SIZE[0] - 1) ** 2
+
+    def fly(case):
+        start = time.process_time()
+        motion = fem.simulate(case, steps * 2e-4, 2e-4, start=(0 * speed, speed), save=2)
+        return (time.process_time() - start) / steps, motion
+
+    compile_s = {name: fly(case)[0] * steps for name, case in cases.items()}
+    for turn in range(repeats):
+        for name in list(cases)[:: 1 - 2 * (turn % 2)]:
+            took, motion = fly(cases[name])
+            runs[name].append(took)
+            iterations[name] = motion.stats.iterations
+    base = min(runs["none"])
+    for name, took in runs.items():
+        extra = min(took) / base - 1
+        settings = {
+            "contact": name,
+            "of": "a step in motion",
+            "dof": cases[name].space.num_dofs,
+            "iterations": iterations[name],
+            "extra": round(extra, 4),
+        }
+        timing = Timing(compile_s[name], tuple(took))
+        yield Row("sorojax", settings, **timing.columns(), error=extra,
+                  bar=None if name == "none" else 0.05, bar_on="error",
+                  reference="a step without contact")  # fmt: skip

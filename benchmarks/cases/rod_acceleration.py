@@ -1,11 +1,13 @@
-"""Acceleration of the soft finger D1 at random states, per call in a compiled loop."""
+"""Acceleration of the soft finger D1 at random states, per call in a loop compiled by
+`jax.jit`, and by `sorojax.jit`, which makes one kernel of it."""
 
 import jax
 import numpy as np
 
 from benchmarks import peers
 from benchmarks.fingers import MODES, accelerate, finger, random_states
-from benchmarks.harness import Row, measure, quick
+from benchmarks.harness import Row, measure, measure_calls, quick
+from sorojax import jit
 from sorojax.rod import operators
 
 CALLS, STATES = 1000, 4
@@ -40,12 +42,17 @@ def rows():
         return float(np.max(np.linalg.norm(arrays["a"] - reference, axis=1) / size))
 
     for nodes in (6, 8, 10, 12):
-        rod = finger(nodes)
-        timing = measure(loop, rod, q[0], v[0]).per(CALLS)
-        yield Row(
-            "sorojax", {"nodes": nodes}, **timing.columns(), error=error({"a": at(rod, q, v)}),
-            reference=REFERENCE, bar=BAR if nodes == 8 else None,
-        )  # fmt: skip
+        rod, alone = finger(nodes), jit(loop)
+        timings = {
+            "jax.jit": measure(loop, rod, q[0], v[0]),
+            "sorojax.jit": measure_calls(lambda: alone(rod, q[0], v[0]), repeats=9),  # noqa: B023
+        }
+        for by, timing in timings.items():
+            yield Row(
+                "sorojax", {"nodes": nodes, "by": by}, **timing.per(CALLS).columns(),
+                error=error({"a": at(rod, q, v)}), reference=REFERENCE,
+                bar=BAR if nodes == 8 else None,
+            )  # fmt: skip
     for nodes in (8,) if quick() else (8, 12):
         yield peers.row(
             "soromox", "acceleration", {"q": q, "v": v}, error, REFERENCE,

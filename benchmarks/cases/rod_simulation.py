@@ -1,4 +1,5 @@
-"""The soft finger D1 released at rest, 0.5 s, tips every 10 ms."""
+"""The soft finger D1 released at rest, 0.5 s, tips every 10 ms; by `jax.jit`, and by
+`sorojax.jit`."""
 
 import diffrax as dfx
 import jax
@@ -7,7 +8,8 @@ import numpy as np
 
 from benchmarks import peers
 from benchmarks.fingers import LENGTH, MODES, accelerate, finger, tip
-from benchmarks.harness import Row, measure, quick
+from benchmarks.harness import Row, measure, measure_calls, quick
+from sorojax import jit
 from sorojax.math.steppers import DormandPrince, GeneralisedAlpha, RungeKutta4
 from sorojax.rod import Gravity, operators
 from sorojax.rod.rollout import rollout
@@ -68,17 +70,22 @@ def rows():
         distance = np.linalg.norm(arrays["tips"] - want, axis=1) / LENGTH
         return float(np.sqrt(np.mean(distance**2)))
 
-    def row(code, name, step, function):
-        timing = measure(function, rod, repeats=5)
-        settings = {"nodes": 8, "method": name, "step": step}
-        tips = jax.jit(function)(rod)
+    def row(code, name, step, function, by="jax.jit"):
+        settings = {"nodes": 8, "method": name, "step": step, "by": by}
+        if by == "jax.jit":
+            timing, tips = measure(function, rod, repeats=5), jax.jit(function)(rod)
+        else:
+            alone = jit(function)
+            timing, tips = measure_calls(lambda: alone(rod), repeats=5), alone(rod)
         return Row(
             code, settings, **timing.columns(), error=error({"tips": tips}), reference=REFERENCE
         )
 
     for stepper, steps in STEPS:
         for h in steps[: 1 if quick() else None]:
-            yield row("sorojax", type(stepper).__name__, h, lambda rod: own(rod, stepper, h))  # noqa: B023
+            run = lambda rod: own(rod, stepper, h)  # noqa: B023, E731
+            for by in ("jax.jit", "sorojax.jit"):
+                yield row("sorojax", type(stepper).__name__, h, run, by)
     peer_steps = (1e-3,) if quick() else (1e-3, 5e-4)
     for h in peer_steps:
         fixed = dfx.ConstantStepSize()

@@ -17,8 +17,10 @@ structures and compliant mechanisms using the Darcy method", Struct. Multidisc. 
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax import _check
@@ -48,6 +50,7 @@ class Darcy(eqx.Module):
     system: sparse.SparseSymmetric
     conduction: Float[Array, "cells nodes nodes"]
     storage: Float[Array, "cells nodes nodes"]
+    cells: Int[Array, "cells nodes"]
     known: Bool[Array, " nodes"]
     given: Float[Array, " nodes"]
     depth: Float[Array, ""] = eqx.field(converter=real)
@@ -58,15 +61,53 @@ class Darcy(eqx.Module):
 
     def __call__(self, density: Float[Array, " cells"]) -> Float[Array, " nodes"]:
         solid = heaviside_projection(density, self.sharpness, self.threshold)
-        flow = (1 - (1 - self.tight) * solid)[:, None, None] * self.conduction
-        rate = (jnp.log(self.remainder) / self.depth) ** 2 * self.tight
-        values = sparse.assemble(
-            self.system, flow + (rate * solid)[:, None, None] * self.storage
-        )
-        right = -sparse.product(self.system, values, self.given)
-        right = jnp.where(self.known, jnp.zeros_like(right), right)
-        held = sparse.fix(self.system, values, self.known)
-        return sparse.solve(self.system, held, right) + self.given
+        permeable = 1 - (1 - self.tight) * solid
+        drained = (jnp.log(self.remainder) / self.depth) ** 2 * self.tight * solid
+        return _pressure(self, permeable, drained)
+
+
+@jax.custom_jvp
+def _pressure(seep: Darcy, permeable, drained) -> Float[Array, " nodes"]:
+    matrix = _values(seep, permeable, drained)
+    right = -sparse.product(seep.system, matrix, seep.given)
+    return _answer(seep, matrix, right) + seep.given
+
+
+def _pressure_derivative(primals, tangents):
+    seep, *factors = primals
+    seep_dot, *factors_dot = tangents
+    matrix, p = _values(*primals), _pressure(*primals)
+    own, right = p[seep.cells], jnp.zeros_like(p)
+    parts = (seep.conduction, seep.storage)
+    parts_dot = (seep_dot.conduction, seep_dot.storage)
+    given_dot = jnp.zeros_like(p)
+    if not isinstance(seep_dot.given, SymbolicZero):
+        given_dot = seep_dot.given
+        right = right - sparse.product(seep.system, matrix, given_dot)
+    for part, part_dot, factor, factor_dot in zip(
+        parts, parts_dot, factors, factors_dot, strict=True
+    ):
+        # cell by cell: the matrix itself is not differentiated
+        if not isinstance(factor_dot, SymbolicZero):
+            flux = jnp.sum(part * own[:, None], axis=2)
+            right = right.at[seep.cells].add(-factor_dot[:, None] * flux)
+        if not isinstance(part_dot, SymbolicZero):
+            flux = jnp.sum(part_dot * own[:, None], axis=2)
+            right = right.at[seep.cells].add(-factor[:, None] * flux)
+    return p, _answer(seep, matrix, right) + given_dot
+
+
+_pressure.defjvp(_pressure_derivative, symbolic_zeros=True)
+
+
+def _values(seep: Darcy, permeable, drained) -> Float[Array, " nnz"]:
+    flow = permeable[:, None, None] * seep.conduction
+    return sparse.assemble(seep.system, flow + drained[:, None, None] * seep.storage)
+
+
+def _answer(seep: Darcy, matrix, right) -> Float[Array, " nodes"]:
+    right = jnp.where(seep.known, jnp.zeros_like(right), right)
+    return sparse.solve(seep.system, sparse.fix(seep.system, matrix, seep.known), right)
 
 
 def darcy(
@@ -113,6 +154,7 @@ def darcy(
         sparse.from_cells(mesh.num_nodes, np.asarray(mesh.cells)),
         jnp.einsum("cqai,cqbi,cq->cab", G, G, V),
         jnp.einsum("cqa,cqb,cq->cab", N, N, V),
+        jnp.asarray(mesh.cells, jnp.int32),
         jnp.asarray(np.isin(np.arange(mesh.num_nodes), np.concatenate([sources, drains]))),
         jnp.asarray(given),
         depth,

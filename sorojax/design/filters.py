@@ -192,7 +192,8 @@ def heaviside_projection(
 ) -> Float[Array, "..."]:
     """Pushes densities to 0 and 1: a smooth step at `threshold`, the steeper the larger
     `sharpness` (1 does next to nothing, 16 and more make black and white)."""
-    return _projected(real(x), real(sharpness), real(threshold))
+    settings = (s if isinstance(s, float) else real(s) for s in (sharpness, threshold))
+    return _projected(real(x), *settings)
 
 
 @jax.jit

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from sorojax import _check
 from sorojax._display import displayed, number, outcome
@@ -17,6 +17,7 @@ from sorojax._progress import report
 from sorojax._types import real
 from sorojax.design.mma import GCMMA, MMA, Values
 from sorojax.design.optimality import OptimalityCriteria
+from sorojax.design.task import Task
 from sorojax.math.status import Status
 
 Optimiser = MMA | GCMMA | OptimalityCriteria | optax.GradientTransformation
@@ -123,20 +124,20 @@ def minimise(
         )
     _check.finite("minimise", "start", ravel_pytree(start)[0], "Check the first design.")
     flat, back = ravel_pytree(jax.tree.map(real, start))
-    task = _Task(loss, constraints, back, schedule, change_gradient)
+    task = Task(loss, constraints, back, schedule, change_gradient)
     first, memory = 0, None
     if resume is not None:
         flat, memory, first = ravel_pytree(resume.design)[0], resume.memory, resume.count
-    values, last, history, step = None, flat, [], resume
+    values, size, last, history, step = None, None, flat, [], resume
     status = Status.max_steps
     for k in range(first, steps):
-        values = task.values(flat, k)
+        values, finite = task.found(flat, k)
         for _ in range(_RETREATS if k > first else 0):
-            if _finite(values):
+            if finite:
                 break
             flat = (flat + last) / 2
-            values = task.values(flat, k)
-        if not _finite(values):
+            values, finite = task.found(flat, k)
+        if not finite:
             if k == first:
                 raise ValueError(
                     f"minimise: the objective is {values.objective} and the constraints "
@@ -146,11 +147,11 @@ def minimise(
                 )
             status = Status.not_finite
             break
-        scale = _size(flat, values) if scale is None else scale
+        size = real(_size(flat, values) if scale is None else scale) if size is None else size
         if memory is None:
             m = values.constraints.shape[0]
             memory = optimiser.init(flat) if plain else optimiser.init(flat, m)  # type: ignore
-        new, memory = _advance(optimiser, task, k, flat, values, memory, scale)
+        new, memory = _advance(optimiser, task, k, flat, values, memory, size)
         change = float(_distance(new, flat))
         last, flat = flat, new
         step = Step(k + 1, back(flat), values.objective, values.constraints,
@@ -180,72 +181,12 @@ def _broken(held: Array, columns: dict[str, np.ndarray]) -> bool:
     return bool(np.any(np.asarray(held) > _HELD * largest))
 
 
-class _Task:
-    """The functions of one optimisation over a flat vector, with their derivatives.
-
-    Derivatives of compiled functions are compiled too, once.
-    """
-
-    def __init__(self, loss, constraints, back, schedule, change_gradient):
-        self.back, self.schedule, self.change_gradient = back, schedule, change_gradient
-        self.loss, self.constraints = loss, constraints
-        self._objective = _compiled_as(
-            loss, jax.value_and_grad(lambda flat, *more: loss(back(flat), *more))
-        )
-        self._held = [_compiled_as(g, _with_slopes(g, back)) for g in constraints]
-
-    def _more(self, k: int) -> tuple:
-        return () if self.schedule is None else tuple(self.schedule(k))
-
-    def plain(self, flat, k: int):
-        """Objective and constraints alone."""
-        more, x = self._more(k), self.back(flat)
-        held = [jnp.ravel(jnp.asarray(g(x, *more))) for g in self.constraints]
-        return self.loss(x, *more), jnp.concatenate(held) if held else jnp.zeros(0)
-
-    def last(self, flat, k: int):
-        """The same, by programs that were compiled for the steps."""
-        if not hasattr(self.loss, "lower"):
-            return self.plain(flat, k)
-        values = self.values(flat, k)
-        return values.objective, values.constraints
-
-    def values(self, flat, k: int) -> Values:
-        more = self._more(k)
-        objective, gradient = self._objective(flat, *more)
-        if self.change_gradient is not None:
-            changed = self.change_gradient(self.back(flat), self.back(gradient))
-            gradient = ravel_pytree(changed)[0]
-        if not self._held:
-            none = jnp.zeros((0, flat.shape[0]), flat.dtype)
-            return Values(objective, gradient, none[:, 0], none)
-        held, slopes = zip(*(g(flat, *more) for g in self._held), strict=True)
-        return Values(objective, gradient, jnp.concatenate(held), jnp.concatenate(slopes))
-
-
-def _with_slopes(constraint, back):
-    """A constraint as a vector, and its derivative."""
-
-    def both(flat, *more):
-        value, pull = jax.vjp(lambda f: jnp.ravel(constraint(back(f), *more)), flat)
-        rows = [pull(row)[0] for row in jnp.eye(value.shape[0], dtype=flat.dtype)]
-        return value, jnp.stack(rows)
-
-    return both
-
-
-def _compiled_as(function, derived):
-    return jax.jit(derived) if hasattr(function, "lower") else derived
-
-
-def _advance(optimiser, task: _Task, k: int, flat, values: Values, memory, scale):
+def _advance(optimiser, task: Task, k: int, flat, values: Values, memory, scale):
     if isinstance(optimiser, optax.GradientTransformation):
         with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
             updates, memory = optimiser.update(values.gradient, memory, flat)
             return jnp.asarray(optax.apply_updates(flat, updates)), memory
-    scaled = values._replace(
-        objective=values.objective / scale, gradient=values.gradient / scale
-    )
+    scaled = _scaled(values, scale)
     if not isinstance(optimiser, GCMMA):
         return optimiser.update(flat, scaled, memory)
     memory = optimiser.begin(flat, scaled, memory)
@@ -260,13 +201,9 @@ def _advance(optimiser, task: _Task, k: int, flat, values: Values, memory, scale
     return new, after
 
 
-def _finite(values: Values) -> bool:
-    return bool(_all_finite(values))
-
-
 @jax.jit
-def _all_finite(values: Values) -> Bool[Array, ""]:
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(part)) for part in values]))
+def _scaled(values: Values, scale) -> Values:
+    return values._replace(objective=values.objective / scale, gradient=values.gradient / scale)
 
 
 @jax.jit

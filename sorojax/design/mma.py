@@ -15,6 +15,7 @@ import abc
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -126,7 +127,7 @@ class GCMMA(AbstractMMA):
         return _stiffen(self, x, proposal, values, found, state)
 
 
-@eqx.filter_jit
+@jax.jit
 def _update(method, x, values: Values, state: MMAState):
     low, high = _asymptotes(method, x, state)
     answer = solve_subproblem(_approximation(method, x, values, state, low, high))
@@ -134,7 +135,7 @@ def _update(method, x, values: Values, state: MMAState):
     return answer, new
 
 
-@eqx.filter_jit
+@jax.jit
 def _stiffen(method, x, proposal, values, found, state):
     low, high = _asymptotes(method, x, state)
     told = _approximation(method, x, values, state, low, high)

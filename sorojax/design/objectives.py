@@ -20,14 +20,24 @@ from sorojax.fem import Newton, Path, Problem, Solution, solve
 from sorojax.fem.energy_form import load_potential
 from sorojax.fem.loads import AbstractLoad
 from sorojax.fem.torque import mean_rotation
+from sorojax.material.hyperelastic import AbstractHyperelastic
 
 
 def graded(problem: Problem, factor: Float[Array, " cells"], **settings: float) -> Problem:
     """`problem` with `factor` times the stiffness in each cell, linear where that is next to
-    nothing; `settings` are those of `interpolated_energy`."""
+    nothing; `settings` are those of `interpolated_energy`.
+
+    Every compiled function between a design and its equilibrium adds to the gradient: for a
+    small body compile all from the variables to `interpolated_energy` in one, and put that
+    in its place.
+    """
+    material = interpolated_energy(solid_of(problem), factor, **settings)
+    return dataclasses.replace(problem, material=material)
+
+
+def solid_of(problem: Problem) -> AbstractHyperelastic:
     base = problem.material
-    base = base.base if isinstance(base, InterpolatedEnergy) else base
-    return dataclasses.replace(problem, material=interpolated_energy(base, factor, **settings))
+    return base.base if isinstance(base, InterpolatedEnergy) else base
 
 
 def replaced_load(problem: Problem, load: AbstractLoad) -> Problem:
@@ -47,11 +57,18 @@ def work_of_loads(
 ) -> Float[Array, ""]:
     """f'u of dead loads and p dV of pressures at the displacement `u` [J], of the loads in
     `names` or of all that hold nothing: the compliance of a body at full load."""
+    return _work(_loaded(problem, names), u)
+
+
+def _loaded(problem: Problem, names: tuple[str, ...] | None) -> Problem:
+    """What a work is made of: no stiffness, whose derivative is zero and not for nothing."""
     chosen = [
         load for load in problem.loads
         if (not load.holds if names is None else load.name in names)
     ]  # fmt: skip
-    return _work(dataclasses.replace(problem, supports=(), loads=tuple(chosen)), u)
+    return dataclasses.replace(
+        problem, supports=(), loads=tuple(chosen), material=solid_of(problem)
+    )
 
 
 @jax.jit
@@ -87,7 +104,12 @@ def mechanism(
     Reference: Caasenbrood, Pogromsky, Nijmeijer, "Sorotoki: a Matlab toolkit for design,
     modeling, and control of soft robots", IEEE Access 12, 2024, equation 11.
     """
-    return work_weight * work_of_loads(problem, u) - output_weight * output
+    return _weighed(_loaded(problem, None), u, output, output_weight, work_weight)
+
+
+@jax.jit
+def _weighed(problem: Problem, u, output, output_weight, work_weight):
+    return work_weight * _work(problem, u) - output_weight * output
 
 
 def rotation(
@@ -138,12 +160,11 @@ class Follower:
     def __call__(self, problem: Problem) -> Solution:
         start = None if self.last is None else jnp.asarray(self.last)
         solution = solve(problem, start=start, throw=False, **self.settings)
-        found = jnp.equal(jnp.asarray(solution.load_fraction), 1.0)
-        if start is not None and not is_traced(found) and not bool(jnp.all(found)):
+        if not _is_found(solution) and start is not None:
             solution = self._fallen(problem, start, solution)
-            found = jnp.equal(jnp.asarray(solution.load_fraction), 1.0)
-        if is_traced(found) or not bool(jnp.all(found)):
-            valid = jnp.where(found, solution.displacement, jnp.nan)
+        if not _is_found(solution):
+            here = jnp.equal(jnp.asarray(solution.load_fraction), 1.0)
+            valid = jnp.where(here, solution.displacement, jnp.nan)
             solution = eqx.tree_at(lambda s: s.displacement, solution, valid)
         u = jax.lax.stop_gradient(solution.displacement)
         if is_traced(u):
@@ -155,7 +176,7 @@ class Follower:
     def _fallen(self, problem: Problem, start, solution: Solution) -> Solution:
         moving, rest = eqx.partition(problem, eqx.is_inexact_array)
         here = eqx.combine(jax.lax.stop_gradient(moving), rest)
-        if is_traced(here):
+        if is_traced((here, solution.load_fraction)):
             return solution
         u, stable = settled(here, start)
         if not stable:
@@ -167,3 +188,9 @@ class Follower:
         self.solutions += 1
         if np.all(np.isfinite(u)):
             self.last = u
+
+
+def _is_found(solution: Solution) -> bool:
+    """Whether it is known to be an equilibrium at full load; nothing is, in a trace."""
+    fraction = solution.load_fraction
+    return not is_traced(fraction) and bool(np.all(np.asarray(fraction) == 1.0))

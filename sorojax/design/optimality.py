@@ -12,6 +12,9 @@ from jaxtyping import Array, Float
 from sorojax._types import real
 from sorojax.design.mma import Values
 
+_FAR = 60.0  # beyond every gain: how far the logarithm of the price may go
+_EXACT, _MOST = 1e-14, 100  # change of the logarithm of the price at which to stop, and steps
+
 
 class OptimalityCriteria(eqx.Module):
     """Scales each variable by how much it gains against what it costs.
@@ -45,7 +48,7 @@ class OptimalityCriteria(eqx.Module):
         return _update(self, x, values), None
 
 
-@eqx.filter_jit
+@jax.jit
 def _update(method: OptimalityCriteria, x, values: Values):
     cost = values.slopes[0]
     gain = jnp.maximum(-values.gradient, 1e-10 * jnp.max(jnp.abs(values.gradient))) / cost
@@ -58,11 +61,22 @@ def _update(method: OptimalityCriteria, x, values: Values):
     def proposal(log_price):
         return jnp.clip(full * jnp.exp(-method.damping * log_price), least, most)
 
-    def halve(_, span):
-        middle = (span[0] + span[1]) / 2
-        heavy = values.constraints[0] + cost @ (proposal(middle) - x) > 0
-        return jnp.where(heavy, middle, span[0]), jnp.where(heavy, span[1], middle)
+    def excess(log_price):
+        """Of the constraint, and its slope: variables at a limit do not move."""
+        new = proposal(log_price)
+        free = (new > least) & (new < most)
+        slope = -method.damping * jnp.sum(jnp.where(free, cost * new, jnp.zeros_like(new)))
+        return values.constraints[0] + cost @ (new - x), slope
 
-    span = (jnp.min(logs) - 60.0, jnp.max(logs) + 60.0)
-    low, high = jax.lax.fori_loop(0, 80, halve, span)
-    return proposal((low + high) / 2)
+    def improve(state):
+        price, low, high, _, count = state
+        value, slope = excess(price)
+        low, high = jnp.where(value > 0, price, low), jnp.where(value > 0, high, price)
+        step = price - value / slope
+        new = jnp.where((step >= low) & (step <= high), step, (low + high) / 2)
+        return new, low, high, jnp.abs(new - price) <= _EXACT * (1 + jnp.abs(new)), count + 1
+
+    low, high = jnp.min(logs) - _FAR, jnp.max(logs) + _FAR
+    start = ((jnp.min(logs) + jnp.max(logs)) / 2, low, high, jnp.asarray(False), 0)
+    end = jax.lax.while_loop(lambda state: ~state[3] & (state[4] < _MOST), improve, start)
+    return proposal(end[0])

@@ -8,6 +8,7 @@ Reference: Caasenbrood, Pogromsky, Nijmeijer, "Sorotoki: a Matlab toolkit for de
 modeling, and control of soft robots", IEEE Access 12, 2024, section VI-B.
 """
 
+import dataclasses
 from collections.abc import Callable
 
 import equinox as eqx
@@ -23,11 +24,16 @@ from sorojax.design.flood import Flood, flood
 from sorojax.design.layout import Layout, layout
 from sorojax.design.minimise import Optimised, Step, minimise
 from sorojax.design.mma import MMA
-from sorojax.design.objectives import Follower, graded, replaced_load
+from sorojax.design.objectives import Follower, replaced_load, solid_of
 from sorojax.design.simp import Simp
 from sorojax.design.symmetry import Mirrored
 from sorojax.design.void import interpolated_energy
-from sorojax.design.void_pressure import void_pressure
+from sorojax.design.void_pressure import (
+    VoidPressure,
+    of_cells,
+    of_nodes,
+    void_pressure,
+)
 from sorojax.fem import Fixed, Foundation, PlaneStrain, Problem, problem
 from sorojax.material import presets
 from sorojax.material.hyperelastic import AbstractHyperelastic
@@ -61,22 +67,31 @@ class PneuNetCell(eqx.Module):
 
 def body(cell: PneuNetCell, density: Float[Array, " cells"]) -> Problem:
     """The boundary value problem of a design."""
-    factor, share = _parts(cell, density)
-    made = graded(cell.problem, factor)
-    per = "node" if isinstance(cell.chamber, Darcy) else "cell"
     air = next(load for load in cell.problem.loads if load.name == "air")
-    pressure = void_pressure(cell.problem.mesh, share, air.value, per=per, name="air")
-    return replaced_load(made, pressure)
+    base = solid_of(cell.problem)
+    parts = cell.interpolation, cell.chamber
+    material, share = _parts(parts, base, cell.problem.mesh.cells, density)
+    made = dataclasses.replace(cell.problem, material=material)
+    return replaced_load(made, VoidPressure(share=share, value=air.value, name="air"))
 
 
-@eqx.filter_jit
-def _parts(cell: PneuNetCell, density):
-    return cell.interpolation(density), cell.chamber(density)
+@jax.jit
+def _parts(parts, base: AbstractHyperelastic, cells, density):
+    """Everything that follows a design, in one program: started one by one, small ones take
+    as long as the solve when they are differentiated."""
+    interpolation, chamber = parts
+    spread = of_nodes if isinstance(chamber, Darcy) else of_cells
+    return interpolated_energy(base, interpolation(density)), spread(chamber(density), cells)
 
 
 def output(cell: PneuNetCell, u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
     """L'x: how far the right side has turned, in its displacements along x [m]."""
-    return jnp.sum(cell.selector * u)
+    return _chosen(cell.selector, u)
+
+
+@jax.jit
+def _chosen(selector, u):
+    return jnp.sum(selector * u)
 
 
 def pneunet_cell(

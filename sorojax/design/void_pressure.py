@@ -111,17 +111,19 @@ def void_pressure(
     share = real(share)
     count = mesh.num_cells if per == "cell" else mesh.num_nodes
     _check.shape("void_pressure", "share", share, (count,), f"Give one number per {per}.")
-    share = (_of_nodes if per == "node" else _of_cells)(share, mesh.cells)
+    share = (of_nodes if per == "node" else of_cells)(share, mesh.cells)
     return VoidPressure(share=share, value=real(value), name=name)
 
 
 @jax.jit
-def _of_nodes(share, cells):
+def of_nodes(share, cells):
+    """Numbers of nodes at the nodes of every cell."""
     return share[cells]
 
 
 @jax.jit
-def _of_cells(share, cells):
+def of_cells(share, cells):
+    """Numbers of cells, at all nodes of each."""
     return jnp.broadcast_to(share[:, None], cells.shape)
 
 

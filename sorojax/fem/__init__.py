@@ -18,6 +18,7 @@ from sorojax.fem.contact_steps import (
     solve_contact as solve_contact,
     updated as updated,
 )
+from sorojax.fem.contact_switching import Switching as Switching, switching as switching
 from sorojax.fem.continuation import (
     Continuation as Continuation,
     continuation as continuation,
@@ -124,4 +125,5 @@ from sorojax.fem.tendon import (
     tension as tension,
 )
 from sorojax.fem.torque import Torque as Torque, mean_rotation as mean_rotation
+from sorojax.math.sparse import ConjugateGradient as ConjugateGradient
 from sorojax.math.status import Status as Status

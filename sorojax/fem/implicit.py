@@ -46,6 +46,10 @@ def equilibrium(call: Solve) -> Outcome:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _equilibrium(call: Solve, traced):
+    return _solved(call, traced)
+
+
+def _solved(call: Solve, traced):
     leaves = call.complete(traced)
     batched = (False,) * len(leaves)
     return tuple(_equilibrium_p.bind(*leaves, call=call, lead=(), batched=batched))
@@ -53,9 +57,11 @@ def _equilibrium(call: Solve, traced):
 
 def _derivative(call: Solve, primals, tangents):
     (traced,), (dots,) = primals, tangents
-    u, counts, values = _equilibrium(call.with_tangent(), traced)
+    # rules of their own are for derivatives of derivatives, and cost as much as a factor
+    solve = _equilibrium if is_traced(traced) else _solved
+    u, counts, values = solve(call.with_tangent(), traced)
     u_dot = _tangent(call, traced, dots, u, counts, values)
-    values = values[: call.num_values]
+    values = jax.lax.slice_in_dim(values, 0, call.num_values)
     return (u, counts, values), (u_dot, _still(counts), _still(values))
 
 
@@ -71,7 +77,8 @@ def _tangent(call: Solve, traced, dots, u, counts, values):
     leaves = call.complete(traced)
     params, rest, rates = call.moving(leaves, dots)
     if call.settings[0].step_tolerance <= _SHARP:
-        values = _tangent_values(call, traced, u, values)
+        if is_traced((traced, u, values)):
+            values = _tangent_values(call, traced, u, values)
     else:
         problem = call.problem(leaves)
         values = linearise(problem, _prepare_traced(problem), u, u).values

@@ -144,11 +144,16 @@ def step(
     move: Float[np.ndarray, " dofs"],
 ) -> tuple[np.ndarray | None, int]:
     """Newton step [m] on the host and the number of negative eigenvalues of the tangent;
-    `None` if the tangent is singular."""
+    `None` if the tangent is singular or the iterative solver does not get there."""
     system = problem.space.system
     matrix, rhs = constrain(system, values, residual, prepared.known, move)
     factor = system.solver.factor(np.asarray(matrix))
     if factor is None:
         return None, -1
-    du = factor.solve(np.asarray(rhs)) + move
-    return du.reshape(-1, problem.mesh.element.dim), factor.negative_eigenvalues
+    if isinstance(factor, sparse.IterativeFactor):
+        du, negative = factor.step(np.asarray(rhs))
+        if du is None:
+            return None, -1
+    else:
+        du, negative = factor.solve(np.asarray(rhs)), factor.negative_eigenvalues
+    return (du + move).reshape(-1, problem.mesh.element.dim), negative

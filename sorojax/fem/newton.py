@@ -77,7 +77,8 @@ def newton_solve(
             return Iterate(u, None, iterations, ratio, negative, reason)
         du, negative = step(problem, prepared, state.values, state.residual, move)
         if du is None:
-            return Iterate(u, None, iterations, ratio, negative, "the tangent is singular")
+            reason = problem.space.system.unsolved
+            return Iterate(u, None, iterations, ratio, negative, reason)
         iterations += 1
         if overshoots(problem) and not np.any(move):
             args = (problem, prepared.known, state.residual, jnp.asarray(u), jnp.asarray(du))

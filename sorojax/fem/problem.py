@@ -1,5 +1,6 @@
 """The boundary value problem: a noun, and the constructor that checks it."""
 
+import copy
 import dataclasses
 
 import equinox as eqx
@@ -13,6 +14,7 @@ from sorojax.fem.loads import AbstractLoad
 from sorojax.fem.space import Space, space as make_space
 from sorojax.fem.supports import AbstractSupport
 from sorojax.material.hyperelastic import AbstractHyperelastic
+from sorojax.math.sparse import ConjugateGradient
 from sorojax.mesh.mesh import Mesh
 
 
@@ -37,7 +39,7 @@ class Problem(eqx.Module):
             f"Problem: {mesh.num_cells} {mesh.element.name} cells, {self.space.num_dofs} dof",
             f"  body      {type(self.material).__name__}, {type(self.kinematics).__name__}, "
             f"{type(self.formulation).__name__}",
-            f"  tangent   {system.num_values} entries, factored by {system.solver_name}",
+            f"  tangent   {system.num_values} entries, {system.means}",
         ]
         for support in self.supports:
             rows.append(f"  support   {type(support).__name__} on {support.nodes.size} nodes")
@@ -59,7 +61,10 @@ def _described(load: AbstractLoad) -> str:
 def unsupported(problem: Problem) -> Problem:
     """`problem` for kernels that no support enters, so that other supports do not compile
     them again."""
-    return dataclasses.replace(problem, supports=())
+    # many calls of every solve: a copy, as the checks of a constructor take longer
+    bare = copy.copy(problem)
+    object.__setattr__(bare, "supports", ())
+    return bare
 
 
 def body(problem: Problem) -> Problem:
@@ -76,6 +81,7 @@ def problem(
     loads: tuple[AbstractLoad, ...] = (),
     formulation: AbstractFormulation | None = None,
     space: Space | None = None,
+    solver: str | ConjugateGradient = "direct",
     free: bool = False,
 ) -> Problem:
     """A checked boundary value problem.
@@ -93,6 +99,7 @@ def problem(
             `Displacement()` for the rest and in plane stress.
         space: The mesh's `space(mesh, loads)`, to share between problems on the same
             topology.
+        solver: How linear systems are solved, as in `space`, unless one is given.
         free: Accept a body that could move rigidly, for `simulate`.
 
     Raises:
@@ -116,7 +123,7 @@ def problem(
     loads = checks_loads.parallel_to_ends(mesh, kinematics, loads, known)
     checks_loads.loads(mesh, kinematics, material, loads, known)
     if space is None:
-        space = make_space(mesh, loads)
+        space = make_space(mesh, loads, solver)
     else:
         checks.space(mesh, space)
         checks_loads.room(space, loads)

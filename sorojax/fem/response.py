@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from sorojax._types import is_traced
 from sorojax.fem.energy_form import potential_energy, residual
 from sorojax.fem.problem import Problem, unsupported
-from sorojax.fem.supports import known_values
+from sorojax.fem.supports import known_dofs, known_values
 from sorojax.fem.traced import known_mask
 from sorojax.math import sparse
 
@@ -72,9 +72,10 @@ class _Map:
         """By one back-substitution and the derivative of one number."""
         if _supports_move(self.at):
             return self.backward(change)
-        system, matrix, known = _held_tangent(self.at)
-        force = np.where(np.asarray(known), 0.0, np.asarray(change).ravel())
-        work = jnp.asarray(system.solver.solve(np.asarray(matrix), force))
+        system, matrix, known = _held_on_host(self.at)
+        force = np.where(known, 0.0, np.asarray(change).ravel())
+        # the last factor of the solve belongs to the state before the last, small update
+        work = system.solver.solve_near(matrix, force)
         return jax.tree.leaves(_pulled(_without_supports(self.at), work, known))
 
 
@@ -135,6 +136,13 @@ def _held_tangent(at: Equilibrium):
     # Concrete numbers run one compiled program, not its operations for the trace.
     with jax.core.eval_context() if concrete else contextlib.nullcontext():
         return system, *_held(system, problem.supports, at.values, at.u)
+
+
+def _held_on_host(at: Equilibrium):
+    """The same as arrays of the host, where supports do not move."""
+    system = eqx.combine(at.params.space.system, at.rest.space.system)
+    known = known_dofs(at.rest.supports, *at.u.shape)
+    return system, sparse.fixed_on_host(system, np.asarray(at.values), known), known
 
 
 @eqx.filter_jit

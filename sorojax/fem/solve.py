@@ -245,7 +245,8 @@ def _named_values(problem: Problem, values: dict) -> tuple[str, Float[Array, "st
 def with_load(problem: Problem, name: str, value: Float[Array, "..."]) -> Problem:
     """`problem` with the load called `name` set to `value`."""
     index = [load.name for load in problem.loads].index(name)
-    return eqx.tree_at(lambda p: p.loads[index].value, problem, value)
+    # a weakly typed number would compile every kernel again
+    return eqx.tree_at(lambda p: p.loads[index].value, problem, real(value))
 
 
 def _raise_if_failed(where: str, solution: Solution, throw: bool) -> None:

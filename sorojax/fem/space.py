@@ -52,12 +52,24 @@ def lanes_per_block(element: AbstractElement) -> int:
     return 128 if element.dim == 2 else 32
 
 
-def space(mesh: Mesh, loads: tuple[Any, ...] = ()) -> Space:
+def space(
+    mesh: Mesh,
+    loads: tuple[Any, ...] = (),
+    solver: str | sparse.ConjugateGradient = "direct",
+) -> Space:
     """The displacement space of `mesh`, with room for the stiffness of `loads` that couple
     nodes of different cells (springs, tendons, rigid parts).
 
+    Args:
+        mesh: The mesh.
+        loads: Those of the problem.
+        solver: Of the linear systems: "direct" factors them on the host, the fast way on a
+            CPU; "conjugate_gradient", or `ConjugateGradient(...)` with settings of its own,
+            iterates in the compiled program, on an accelerator too.
+
     Raises:
-        ValueError: If the cells are traced: topology is fixed before any trace.
+        ValueError: If the cells are traced: topology is fixed before any trace; or if the
+            solver is not known.
     """
     if is_traced(mesh.cells):
         raise ValueError(
@@ -66,7 +78,9 @@ def space(mesh: Mesh, loads: tuple[Any, ...] = ()) -> Space:
         )
     cells, width = np.asarray(mesh.cells), lanes_per_block(mesh.element)
     more = tuple(group for load in loads if (group := load.couples()) is not None)
-    system = sparse.from_cells(mesh.num_nodes, cells, mesh.element.dim, more)
+    system = sparse.from_cells(
+        mesh.num_nodes, cells, mesh.element.dim, more, _settings(solver), mesh.points
+    )
     num_blocks = -(-len(cells) // width)
     ids = np.zeros(num_blocks * width, np.int32)
     ids[: len(cells)] = np.arange(len(cells))
@@ -85,6 +99,17 @@ def space(mesh: Mesh, loads: tuple[Any, ...] = ()) -> Space:
         num_nodes=mesh.num_nodes,
         num_cells=len(cells),
     )
+
+
+def _settings(solver: str | sparse.ConjugateGradient) -> sparse.ConjugateGradient | None:
+    if isinstance(solver, sparse.ConjugateGradient):
+        return solver
+    if solver not in ("direct", "conjugate_gradient"):
+        raise ValueError(
+            f"fem.space: got solver {solver!r}, need 'direct', 'conjugate_gradient' or a "
+            "ConjugateGradient. Leave it out for the direct one."
+        )
+    return sparse.ConjugateGradient() if solver == "conjugate_gradient" else None
 
 
 def block_entries(element: AbstractElement) -> Int[np.ndarray, " entries"]:

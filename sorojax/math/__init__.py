@@ -1,9 +1,27 @@
 """Mathematics: groups, quadrature, small solves, steppers, sparse systems."""
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from sorojax.math.lie import SE2 as SE2, SE3 as SE3
 from sorojax.math.status import Status as Status
-from sorojax.math.steppers import (
-    DormandPrince as DormandPrince,
-    GeneralisedAlpha as GeneralisedAlpha,
-    RungeKutta4 as RungeKutta4,
-)
+
+if TYPE_CHECKING:
+    from sorojax.math.steppers import (
+        DormandPrince as DormandPrince,
+        GeneralisedAlpha as GeneralisedAlpha,
+        RungeKutta4 as RungeKutta4,
+    )
+
+_STEPPERS = {"DormandPrince", "GeneralisedAlpha", "RungeKutta4"}
+
+
+def __getattr__(name: str) -> Any:
+    """The steppers load diffrax, which shapes and bodies do without."""
+    if name in _STEPPERS:
+        return getattr(importlib.import_module("sorojax.math.steppers"), name)
+    raise AttributeError(f"module 'sorojax.math' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_STEPPERS})

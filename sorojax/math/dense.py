@@ -61,14 +61,19 @@ def _ldl(matrix: Array) -> Callable[[Array], Array]:
         inverse[j] = 1 / pivot[j]
         for i in range(j + 1, n):
             lower[i][j] = (matrix[i, j] - _dot(lower[i], scaled)) * inverse[j]
+    # One array: what a solve keeps passes through the stores of all loops in reverse mode.
+    kept = jnp.stack([value for i in range(n) for value in (*lower[i][:i], inverse[i])])
 
     def solve(right: Array) -> Array:
-        x = [right[i] for i in range(n)]
+        entries = iter(jnp.unstack(kept))
+        x, rows, scales = [right[i] for i in range(n)], [], []
         for i in range(n):
-            x[i] = x[i] - _dot(lower[i], x[:i])
-        x = [value * scale for value, scale in zip(x, inverse, strict=True)]
+            rows.append([next(entries) for _ in range(i)])
+            scales.append(next(entries))
+            x[i] = x[i] - _dot(rows[i], x[:i])
+        x = [value * scale for value, scale in zip(x, scales, strict=True)]
         for i in reversed(range(n)):
-            below = [lower[k][i] for k in range(i + 1, n)]
+            below = [rows[k][i] for k in range(i + 1, n)]
             x[i] = x[i] - _dot(below, x[i + 1 :])
         return jnp.stack(x)
 

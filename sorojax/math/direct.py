@@ -1,18 +1,23 @@
-"""Direct solvers on the host: symbolic analysis, the last few factors, who owns them."""
+"""Solvers on the host: symbolic analysis, the last few factors, who owns them."""
 
+import functools
 import hashlib
 import os
 import threading
 import weakref
 from collections import OrderedDict, deque
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int
 
 from sorojax.math import pardiso, superlu
+from sorojax.math.conjugate_gradient import IterativeFactor
+from sorojax.math.refined import SymmetricProduct, refined
 
 _NUM_FACTORS = 4
-Factor = pardiso.PardisoFactor | superlu.SuperLUFactor
+Factor = pardiso.PardisoFactor | superlu.SuperLUFactor | IterativeFactor
 
 
 def available_solvers() -> dict[str, str]:
@@ -39,14 +44,17 @@ def _backend():
 
 
 class DirectSolver:
-    """Host side of a system: symbolic analysis and the last few numeric factors.
+    """Host side of a system: symbolic analysis, or what an iterative solver knows of the
+    pattern, and the last few numeric factors.
 
     A slot records the values that its factor belongs to, so that a factor is never
     used for other values than its own. Programs that run at the same time take turns.
     """
 
-    def __init__(self, indptr: np.ndarray, indices: np.ndarray):
-        self._solver = _backend()(indptr, indices, _NUM_FACTORS)
+    def __init__(self, backend: Any, indptr: np.ndarray, indices: np.ndarray):
+        self._solver = backend
+        self._pattern = (indptr, indices)
+        self._product: SymmetricProduct | None = None
         self._slots: OrderedDict[int, tuple[np.ndarray, Factor]] = OrderedDict()
         self._turn = threading.RLock()
         self.num_factorisations = 0
@@ -96,6 +104,28 @@ class DirectSolver:
             x[index] = self._solve_many(values[index], b[index], ())
         return x
 
+    def solve_near(self, values: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """x with A(values) x = b by the nearest factor that is there, refined, where that
+        converges at once; by a new factor otherwise."""
+        values, b = np.asarray(values), np.asarray(b)
+        with self._turn:
+            x, near = None, self._nearest(values)
+            if near is not None:
+                if self._product is None:
+                    self._product = SymmetricProduct(*self._pattern)
+                product = functools.partial(self._product, values)
+                x = refined(near, product, b)
+            return self._solve(values, b) if x is None else x
+
+    def _nearest(self, values: np.ndarray) -> Factor | None:
+        """The factor whose values differ least, by some of them."""
+        kept = [
+            (np.max(np.abs(owner[::_FEW] - values[::_FEW]), initial=0.0), factor)
+            for owner, factor in self._slots.values()
+            if factor is not None and not isinstance(factor, IterativeFactor)
+        ]  # fmt: skip
+        return min(kept, key=lambda pair: pair[0], default=(0.0, None))[1]
+
     def solve_with_inertia(self, values: np.ndarray, b: np.ndarray) -> tuple:
         """x with A(values) x = b, and how many eigenvalues are negative: -1 and zeros where
         A is singular, so that a failed step stays finite."""
@@ -119,14 +149,25 @@ def _equal(a: np.ndarray, b: np.ndarray) -> bool:
     return np.array_equal(a[:_GLANCE], b[:_GLANCE]) and np.array_equal(a, b)
 
 
-_GLANCE = 256
+_GLANCE, _FEW = 256, 16
 _solvers: weakref.WeakValueDictionary[bytes, DirectSolver] = weakref.WeakValueDictionary()
 _rebuilt: deque[DirectSolver] = deque(maxlen=2)  # by callbacks, which own nothing
 _making = threading.Lock()
 
 
-def solver_of(key, rows, cols, owned: bool = False) -> DirectSolver:
-    """The solver of a pattern, made again where the system that it was made for is gone.
+def direct_solver_of(key, rows, cols, owned: bool = False) -> DirectSolver:
+    """The direct solver of a pattern."""
+
+    def analysed(starts, cols):
+        return _backend()(starts, cols, _NUM_FACTORS)
+
+    return solver_of(key, rows, cols, analysed, owned)
+
+
+def solver_of(
+    key, rows, cols, make: Callable[[np.ndarray, np.ndarray], Any], owned: bool = False
+) -> DirectSolver:
+    """The solver of a system, made again where the system that it was made for is gone.
 
     Solvers live as long as an owner; without one the last two are kept.
     """
@@ -136,16 +177,21 @@ def solver_of(key, rows, cols, owned: bool = False) -> DirectSolver:
         if solver is None:
             rows, cols = np.asarray(rows).ravel(), np.asarray(cols).ravel()
             size = int(rows[-1]) + 1 if len(rows) else 0
-            solver = DirectSolver(np.searchsorted(rows, np.arange(size + 1)), cols)
+            starts = np.searchsorted(rows, np.arange(size + 1))
+            solver = DirectSolver(make(starts, cols), starts, cols)
             _solvers[name] = solver
             if not owned:
                 _rebuilt.append(solver)
     return solver
 
 
-def pattern_key(rows: np.ndarray, cols: np.ndarray) -> Int[np.ndarray, " 2"]:
-    """A digest of the pattern and of the solver that was asked for."""
-    digest = hashlib.blake2b(_backend().name.encode(), digest_size=8)
-    digest.update(rows.tobytes())
-    digest.update(cols.tobytes())
+def pattern_key(
+    rows: np.ndarray, cols: np.ndarray, iterative: tuple[Any, ...] = ()
+) -> Int[np.ndarray, " 2"]:
+    """A digest of the pattern and of the solver that was asked for, which is that of
+    `iterative` settings and arrays if there are any."""
+    digest = hashlib.blake2b(digest_size=8)
+    digest.update(repr(iterative[0]).encode() if iterative else _backend().name.encode())
+    for array in (rows, cols, *iterative[1:]):
+        digest.update(np.ascontiguousarray(array).tobytes())
     return np.frombuffer(digest.digest(), np.int32)

@@ -140,7 +140,9 @@ def rolled_step(tableau: Tableau, field: Field, t, y: PyTree, h) -> Any:
     def stage(i, slopes):
         start = jnp.where(i == 0, jnp.zeros_like(starts), weights[i - 1])
         rates = field(t + starts[i] * h, moved(start, slopes))
-        return jax.tree.map(lambda k, rate: k.at[i].set(rate), slopes, rates)
+        return jax.tree.map(
+            lambda k, rate: jax.lax.dynamic_update_index_in_dim(k, rate, i, 0), slopes, rates
+        )
 
     blank = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), y)
     return moved(weights[-1], jax.lax.fori_loop(0, count, stage, blank))

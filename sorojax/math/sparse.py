@@ -1,9 +1,10 @@
-"""Symmetric sparse systems: one pattern, many values, direct factors, derivatives.
+"""Symmetric sparse systems: one pattern, many values, two ways to solve, derivatives.
 
 A system keeps the upper triangle by rows. Its pattern, the slots of the element
 matrices in it and the solver's symbolic analysis are computed once; `solve` is
 differentiable in the values and in the right-hand side, at the price of one more
-back-substitution with the same factor.
+back-substitution with the same factor. Factors are made on the host; conjugate gradients
+with multigrid stay in the program, and with it on an accelerator.
 """
 
 import equinox as eqx
@@ -13,10 +14,17 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax._types import is_traced
+from sorojax.math import conjugate_gradient as cg
+from sorojax.math.aggregation import hierarchy
+from sorojax.math.conjugate_gradient import (
+    ConjugateGradient as ConjugateGradient,
+    IterativeFactor as IterativeFactor,
+)
 from sorojax.math.direct import (
     DirectSolver,
     Factor as Factor,
     available_solvers as available_solvers,
+    direct_solver_of,
     pattern_key,
     solver_of,
 )
@@ -42,13 +50,15 @@ class SparseSymmetric(eqx.Module):
 
     `slots` places the upper triangle of every element matrix, row by row, in the
     values. `key` names the pattern and with it the solver on the host, as data: a program
-    compiled for one system serves every other one of the same sizes.
+    compiled for one system serves every other one of the same sizes. `iterative` is there
+    where systems are solved by iteration.
     """
 
     rows: Int[Array, " nnz"]
     cols: Int[Array, " nnz"]
     slots: Int[Array, "cells entries"]
     key: Int[Array, " 2"]
+    iterative: cg.Iterative | None
     size: int = eqx.field(static=True)
     _kept: _Kept = eqx.field(static=True)
 
@@ -72,7 +82,25 @@ class SparseSymmetric(eqx.Module):
                 "SparseSymmetric.solver: got a traced system, need a concrete one. Use "
                 "sparse.solve inside jit and vmap."
             )
-        return solver_of(self.key, self.rows, self.cols)
+        if self.iterative is not None:
+            return _iterative_solver_of(self.key, self.rows, self.cols, self.iterative)
+        return direct_solver_of(self.key, self.rows, self.cols)
+
+    @property
+    def means(self) -> str:
+        """How systems are solved, in words."""
+        if self.iterative is None:
+            return f"factored by {self.solver_name}"
+        levels = len(self.iterative.maps.levels) + 1
+        return f"solved by conjugate gradients with multigrid of {levels} levels"
+
+    @property
+    def unsolved(self) -> str:
+        """What it means that a system has no answer."""
+        if self.iterative is None:
+            return "the tangent is singular"
+        most = self.iterative.settings.max_iterations
+        return f"conjugate gradients do not converge in {most} iterations"
 
 
 def from_cells(
@@ -80,12 +108,16 @@ def from_cells(
     cells: Int[np.ndarray, "cells cell_nodes"],
     components: int = 1,
     more: tuple[Int[np.ndarray, "groups group_nodes"], ...] = (),
+    solver: ConjugateGradient | None = None,
+    points: Float[Array | np.ndarray, "nodes components"] | None = None,
 ) -> SparseSymmetric:
     """The system whose element matrices couple all unknowns of each cell.
 
     Unknown `components * node + component` belongs to `node`; element matrices are
     ordered in the same way, node by node. `more` makes room for groups of nodes that share
-    no cell (`slots_of` finds their places). Runs on the host, once per mesh.
+    no cell (`slots_of` finds their places). Without a `solver` matrices are factored; with
+    one the unknowns are displacements of nodes at `points` [m], whose rigid motions the
+    preconditioner knows. Runs on the host, once per mesh.
     """
     size = components * num_nodes
     own = _keys(cells, components, size)
@@ -96,15 +128,42 @@ def from_cells(
     )
     rows, cols = keys // size, keys % size
     rows, cols = rows.astype(np.int32), cols.astype(np.int32)
-    key = pattern_key(rows, cols)
+    iterative, key = None, pattern_key(rows, cols)
+    if solver is not None:
+        maps = hierarchy(_placed(points, num_nodes, components), rows, cols, solver.coarsest)
+        iterative = cg.Iterative(solver, maps)
+        key = pattern_key(rows, cols, (solver, points))
     return SparseSymmetric(
         rows=jnp.asarray(rows),
         cols=jnp.asarray(cols),
         slots=jnp.asarray(inverse[: own.size].reshape(own.shape), jnp.int32),
         key=jnp.asarray(key),
+        iterative=iterative,
         size=size,
-        _kept=_Kept(solver_of(key, rows, cols, owned=True)),
+        _kept=_Kept(
+            direct_solver_of(key, rows, cols, owned=True)
+            if iterative is None
+            else _iterative_solver_of(key, rows, cols, iterative, owned=True)
+        ),
     )
+
+
+def _placed(points, num_nodes: int, components: int) -> Float[np.ndarray, "nodes components"]:
+    if points is None or is_traced(points) or np.shape(points) != (num_nodes, components):
+        got = "none" if points is None else "traced ones" if is_traced(points) else (
+            f"those of shape {np.shape(points)}")  # fmt: skip
+        raise ValueError(
+            f"from_cells: got points {got}, need concrete ones of shape ({num_nodes}, "
+            f"{components}) for the multigrid of ConjugateGradient. Build the system outside "
+            "jit and grad, and replace only the points of the mesh inside."
+        )
+    return np.asarray(points)
+
+
+def _iterative_solver_of(
+    key, rows, cols, iterative: cg.Iterative, owned: bool = False
+) -> DirectSolver:
+    return solver_of(key, rows, cols, lambda *_: cg.IterativeBackend(iterative), owned)
 
 
 def _keys(groups, components: int, size: int) -> Int[np.ndarray, "groups entries"]:
@@ -166,14 +225,28 @@ def fix(
     return jnp.where(touched, jnp.where(diagonal, scale, zero), values)
 
 
+def fixed_on_host(
+    system: SparseSymmetric, values: np.ndarray, fixed: np.ndarray
+) -> Float[np.ndarray, " nnz"]:
+    """The bits of `fix` without a program, for what stays on the host."""
+    rows, cols = np.asarray(system.rows), np.asarray(system.cols)
+    diagonal, touched = rows == cols, fixed[rows] | fixed[cols]
+    held = np.where(touched, 0.0, values)
+    held[diagonal & touched] = np.max(np.abs(values[diagonal]))
+    return held
+
+
 def solve(
     system: SparseSymmetric, values: Float[Array, " nnz"], b: Float[Array, " size"]
 ) -> Float[Array, " size"]:
-    """x with A(values) x = b by a direct factorisation on the host.
+    """x with A(values) x = b by a direct factorisation on the host, or by iteration.
 
     Differentiable (forward, reverse, twice) in `values` and `b`; under `vmap` all
-    right-hand sides of one matrix are solved at once. NaN where A is singular.
+    right-hand sides of one matrix are solved at once. NaN where A is singular, or where
+    the iteration does not converge.
     """
+    if system.iterative is not None:
+        return cg.solve(system.iterative, lambda x: product(system, values, x), values, b)
 
     def on_host(_, rhs):
         shape = jax.ShapeDtypeStruct(rhs.shape, rhs.dtype)
@@ -194,8 +267,12 @@ def solve_with_inertia(
 ) -> tuple[Float[Array, " size"], Int[Array, ""]]:
     """x with A(values) x = b and the number of negative eigenvalues, -1 if A is singular.
 
-    For loops that decide by the outcome; it has no derivative, `solve` has.
+    An iterative solver stops at the accuracy of a Newton step, counts the negative
+    eigenvalues that it met, and gives -1 where it does not converge. For loops that decide
+    by the outcome; it has no derivative, `solve` has.
     """
+    if system.iterative is not None:
+        return cg.newton_step(system.iterative, values, b)
     shapes = (jax.ShapeDtypeStruct(b.shape, b.dtype), jax.ShapeDtypeStruct((), jnp.int32))
     args = (system.key, system.rows, system.cols, values, b)
     x, negative = host_call(_step_on_host, shapes, *args, sequential=True)
@@ -204,15 +281,16 @@ def solve_with_inertia(
 
 def _solve_on_host(key, rows, cols, values, b) -> tuple[np.ndarray]:
     if key.size == 2:
-        return (solver_of(key, rows, cols).solve(values, b),)
+        return (direct_solver_of(key, rows, cols).solve(values, b),)
     args = (key, rows, cols, values, b)  # lanes with patterns of their own
     lead = np.broadcast_shapes(*(x.shape[:-1] for x in args))
     key, rows, cols, values, b = (np.broadcast_to(x, (*lead, x.shape[-1])) for x in args)
     x = np.empty(b.shape)
     for lane in np.ndindex(*lead):
-        x[lane] = solver_of(key[lane], rows[lane], cols[lane]).solve(values[lane], b[lane])
+        solver = direct_solver_of(key[lane], rows[lane], cols[lane])
+        x[lane] = solver.solve(values[lane], b[lane])
     return (x,)
 
 
 def _step_on_host(key, rows, cols, values, b) -> tuple:
-    return solver_of(key, rows, cols).solve_with_inertia(values, b)
+    return direct_solver_of(key, rows, cols).solve_with_inertia(values, b)

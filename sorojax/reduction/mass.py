@@ -16,9 +16,9 @@ _SAMPLES = 201
 
 
 def mean_section(problem: Problem, curve: AbstractCurve, *, up=None) -> Section:
-    """The section of a uniform rod along `curve` with the mass of the body and its rotary
-    inertia about the curve. The offset of the centre of mass from it is left out; of a
-    solid the torsion constant is the polar moment, an upper bound.
+    """The section of a uniform rod along `curve` with the mass of the body, its mean offset
+    from the curve and its rotary inertia about it. Of a solid the torsion constant is the
+    polar moment, an upper bound.
 
     Raises:
         ValueError: If the body is neither plane strain nor solid.
@@ -34,18 +34,24 @@ def mean_section(problem: Problem, curve: AbstractCurve, *, up=None) -> Section:
     points = jnp.moveaxis(inside.position, 0, -1).reshape(-1, kinematics.dim)
     near = KDTree(known.position).query(np.asarray(jax.lax.stop_gradient(points)))[1]
     axes = known.position[near], known.frame[near]
-    volume, *moments = _moments(points, inside.volumes.reshape(-1), *axes)
+    volume, offsets, moments = _moments(points, inside.volumes.reshape(-1), *axes)
     area, about_z = volume / known.length, moments[0] / known.length
     if isinstance(kinematics, Solid):
         about_y = moments[1] / known.length
     else:
         about_y = area * kinematics.thickness**2 / 12
-    return Section(area, about_y, about_z, about_y + about_z, 5 / 6)
+    return Section(
+        area, about_y, about_z, about_y + about_z, 5 / 6,
+        mass_offset_y=offsets[0], mass_offset_z=offsets[1] if len(offsets) > 1 else None,
+    )  # fmt: skip
 
 
 @jax.jit
-def _moments(points: Array, volumes: Array, places: Array, frames: Array) -> list[Array]:
-    """Volume, and its second moments across each axis of the section."""
+def _moments(
+    points: Array, volumes: Array, places: Array, frames: Array
+) -> tuple[Array, list[Array], list[Array]]:
+    """Volume, its mean place along each axis of the section, and its second moments."""
     local = jnp.einsum("pi,pij->pj", points - places, frames)
-    across = range(1, local.shape[1])
-    return [jnp.sum(volumes), *(jnp.sum(volumes * local[:, k] ** 2) for k in across)]
+    total, across = jnp.sum(volumes), [local[:, k] for k in range(1, local.shape[1])]
+    means = [jnp.sum(volumes * x) / total for x in across]
+    return total, means, [jnp.sum(volumes * x**2) for x in across]

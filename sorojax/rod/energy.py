@@ -9,6 +9,7 @@ from sorojax.math.door import door
 from sorojax.rod.assembly import is_flat, slices
 from sorojax.rod.dynamics import coordinate_rate
 from sorojax.rod.link import LinkMotion
+from sorojax.rod.mass_line import mass_jacobian, mass_position
 from sorojax.rod.model import Model, inertia, motion
 from sorojax.rod.motion import Motion
 from sorojax.rod.points import moment_of
@@ -36,7 +37,9 @@ def potential_energy(
         return energy
     g = real(gravity)
     for part, _ in _parts(moment):
-        energy = energy - jnp.sum(part.operators.mass[:, None] * g[None, :] * part.position)
+        energy = energy - jnp.sum(
+            part.operators.mass[:, None] * g[None, :] * mass_position(part)
+        )
     return energy
 
 
@@ -53,7 +56,7 @@ def momentum(
         spin = jnp.einsum("pij,pj->pi", rotary, local @ part.v)
         if spin.shape[1] == 3:
             spin = jnp.einsum("pij,pj->pi", part.directors, spin)
-        angular = spin + moment_of(part.position, push)
+        angular = spin + moment_of(mass_position(part), push)
         term = jnp.concatenate([jnp.sum(angular, axis=0), jnp.sum(push, axis=0)])
         total = term if total is None else total + term
     assert total is not None
@@ -113,7 +116,7 @@ def _rows(part: Motion | LinkMotion) -> tuple[Array, Array, Array, Array]:
         rotary = part.rotary[None]
     else:
         rotary = jax.vmap(jnp.diag)(part.operators.rotary.T)
-    return part.operators.mass, rotary, part.linear_jacobian, local
+    return part.operators.mass, rotary, mass_jacobian(part), local
 
 
 def _strain_coordinates(model: Model, q: Array) -> Float[Array, " dof"]:

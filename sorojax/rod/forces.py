@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax._types import optional_real, real
+from sorojax.rod.mass_line import mass_jacobian
 from sorojax.rod.motion import Motion
 from sorojax.rod.points import from_own, own
 
@@ -121,7 +122,7 @@ class Gravity(AbstractForce):
     def __call__(self, t, motion):
         g = gravity_or_earth(self.acceleration, motion)
         loads = motion.operators.mass[:, None] * g[None, :]
-        return loads.reshape(-1) @ motion.linear_jacobian.reshape(-1, motion.q.shape[0])
+        return loads.reshape(-1) @ mass_jacobian(motion).reshape(-1, motion.q.shape[0])
 
 
 class TipWrench(AbstractForce):
@@ -202,4 +203,4 @@ def gravity_or_earth(acceleration: Array | None, motion: Motion) -> Float[Array,
     if acceleration is not None:
         return acceleration
     dim = motion.tangent.shape[1]
-    return jnp.zeros(dim, motion.q.dtype).at[dim - 1].set(-EARTH)
+    return jnp.array([0.0] * (dim - 1) + [-EARTH], motion.q.dtype)

@@ -39,10 +39,12 @@ class Link(eqx.Module):
 
 
 class LinkOperators(NamedTuple):
-    """Constants of a link: its mass as a list of one [kg], and no stiffness."""
+    """Constants of a link: its mass as a list of one [kg], no stiffness, and no offset from
+    its centre of mass."""
 
     mass: Float[Array, "1"]
     stiffness: Float[Array, "0 0"]
+    mass_offset: None = None
 
 
 class LinkMotion(eqx.Module):

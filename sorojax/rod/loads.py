@@ -187,7 +187,7 @@ def _weights(motion: AssemblyMotion, gravity: Gravity, t) -> list[Array]:
     """Weight of each part in its columns; equal rods together, seen from their frames."""
     count = len(motion.frames)
     dim = motion.assembly.group.space_dim
-    g = jnp.zeros(dim, motion.q.dtype).at[dim - 1].set(-one.EARTH)
+    g = jnp.array([0.0] * (dim - 1) + [-one.EARTH], motion.q.dtype)
     g = g if gravity.acceleration is None else gravity.acceleration
     local = [frame.rotation.T @ g for frame in motion.frames]
     found: list = [None] * count

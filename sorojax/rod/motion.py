@@ -33,6 +33,8 @@ class Operators(NamedTuple):
         mass: Mass lumped at each node [kg].
         rotary: Rotary inertia lumped at each node, about x, y, z (planar: z) [kg m^2].
         stiffness: Linear elastic stiffness.
+        mass_offset: From the centre line to the centre of mass along the local axes across
+            it [m]; None where the mass lies on the line.
     """
 
     weights: Float[Array, " quad"]
@@ -44,6 +46,7 @@ class Operators(NamedTuple):
     mass: Float[Array, " quad"]
     rotary: Float[Array, "rot quad"]
     stiffness: Float[Array, "dof dof"]
+    mass_offset: Float[Array, "across quad"] | None = None
 
 
 class Base(eqx.Module):
@@ -124,6 +127,7 @@ def operators(rod: Rod) -> Operators:
         mass=length * weights * _along(rod, rod.material.density * rod.section.area),
         rotary=length * weights[None, :] * rotary,
         stiffness=_stiffness(rod, rows, weights),
+        mass_offset=_mass_offset(rod),
     )
 
 
@@ -152,12 +156,25 @@ def _rest_strain(rod: Rod, dtype) -> Float[Array, "strain *quad"]:
 
 
 def _rotary(rod: Rod) -> Float[Array, "rot quad"]:
-    """Rotary inertia per length [kg m]."""
+    """Rotary inertia per length about the centres of mass [kg m]."""
     section, density = rod.section, rod.material.density
     about_y, about_z = section.second_moment_y, section.second_moment_z
+    if section.mass_offset_z is not None:
+        about_y = about_y - section.area * section.mass_offset_z**2
+    if section.mass_offset_y is not None:
+        about_z = about_z - section.area * section.mass_offset_y**2
     spatial = rod.group.rotation_dim == 3
     about = (about_y + about_z, about_y, about_z) if spatial else (about_z,)
     return jnp.stack([_along(rod, density * moment) for moment in about])
+
+
+def _mass_offset(rod: Rod) -> Float[Array, "across quad"] | None:
+    section = rod.section
+    offsets = [section.mass_offset_y, section.mass_offset_z][: rod.group.space_dim - 1]
+    if all(offset is None for offset in offsets):
+        return None
+    none = jnp.zeros((), rod.length.dtype)
+    return jnp.stack([_along(rod, none if offset is None else offset) for offset in offsets])
 
 
 def _stiffness(rod: Rod, rows: Array, weights: Array) -> Float[Array, "dof dof"]:

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sorojax.rod.mass_line import acceleration_on_arms, mass_arms, mass_jacobian
 from sorojax.rod.motion import Motion, Operators, integrated, is_curvature, rest_along
 from sorojax.rod.rod import Rod
 
@@ -45,8 +46,10 @@ def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof
     angular = moment.angular_jacobian[:, 0]
     spin = (angular @ v)[:, None]
     inner = _bias_rate(moment, spin)
-    force = constants.mass[:, None] * integrated(constants, inner)
-    rows = jnp.concatenate([moment.linear_jacobian.reshape(-1, dof), angular])
+    linear = integrated(constants, inner)
+    linear = acceleration_on_arms(linear, jnp.zeros_like(spin), spin, mass_arms(moment))
+    force = constants.mass[:, None] * linear
+    rows = jnp.concatenate([mass_jacobian(moment).reshape(-1, dof), angular])
     scale = jnp.concatenate([jnp.repeat(constants.mass, 2), constants.rotary[0]])
     loads = jnp.concatenate([force.reshape(-1), jnp.zeros_like(spin[:, 0])])
     product = rows.T @ jnp.concatenate([rows * scale[:, None], loads[:, None]], axis=1)

@@ -30,6 +30,8 @@ class Section(eqx.Module):
         torsion_constant: [m^4].
         shear_factor: Share of the area that carries shear [-].
         shear_factor_z: The same for shear along z, if it differs from that along y.
+        mass_offset_y: From the axis to the centre of mass, along y [m].
+        mass_offset_z: The same along z.
     """
 
     area: Float[Array, "*quad"] = eqx.field(converter=real)
@@ -38,6 +40,12 @@ class Section(eqx.Module):
     torsion_constant: Float[Array, "*quad"] = eqx.field(converter=real)
     shear_factor: Float[Array, "*quad"] = eqx.field(converter=real, default=5 / 6)
     shear_factor_z: Float[Array, "*quad"] | None = eqx.field(
+        converter=optional_real, default=None
+    )
+    mass_offset_y: Float[Array, "*quad"] | None = eqx.field(
+        converter=optional_real, default=None
+    )
+    mass_offset_z: Float[Array, "*quad"] | None = eqx.field(
         converter=optional_real, default=None
     )
 
@@ -51,6 +59,12 @@ class Section(eqx.Module):
         if self.shear_factor_z is not None:
             do = "Leave it out if it is that along y."
             _check.positive("Section", "shear_factor_z", self.shear_factor_z, "-", do)
+        do = "Both are about the axis: the mass cannot lie further away than they say."
+        for offset, about in ((self.mass_offset_y, "z"), (self.mass_offset_z, "y")):
+            if offset is not None:
+                left = getattr(self, f"second_moment_{about}") - self.area * offset**2
+                name = f"second_moment_{about} - area mass_offset^2"
+                _check.positive("Section", name, left, "m^4", do)
 
 
 def scaled(section: Section, factor) -> Section:
@@ -64,6 +78,8 @@ def scaled(section: Section, factor) -> Section:
         torsion_constant=section.torsion_constant * factor**4,
         shear_factor=section.shear_factor,
         shear_factor_z=section.shear_factor_z,
+        mass_offset_y=None if section.mass_offset_y is None else factor * section.mass_offset_y,
+        mass_offset_z=None if section.mass_offset_z is None else factor * section.mass_offset_z,
     )
 
 

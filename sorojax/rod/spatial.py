@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from sorojax.math.magnus import rotation_vector
 from sorojax.math.quaternion import cross, exponential, prefix_product, rotation_columns
+from sorojax.rod.mass_line import acceleration_on_arms, mass_arms, on_arms
 from sorojax.rod.motion import (
     Motion,
     Operators,
@@ -50,6 +51,9 @@ def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof
     spin = _spin(moment)
     swing, inner = _bias_rates(moment, spin)
     linear, angular = integrated(constants, inner), integrated(constants, swing)
+    arms = mass_arms(moment)
+    linear = acceleration_on_arms(linear, angular, spin, arms)
+    moving = on_arms(moment, moment.linear_jacobian, arms)
     local = _to_local(moment.directors, moment.angular_jacobian)
     local_spin = _to_local(moment.directors, spin[:, :, None])[:, :, 0]
     rotary = constants.rotary.T
@@ -57,7 +61,7 @@ def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof
     torque = torque + _cross(local_spin, rotary * local_spin)
     force = constants.mass[:, None] * linear
     scale = jnp.concatenate([jnp.repeat(constants.mass, 3), rotary.reshape(-1)])
-    rows = jnp.concatenate([moment.linear_jacobian.reshape(-1, dof), local.reshape(-1, dof)])
+    rows = jnp.concatenate([moving.reshape(-1, dof), local.reshape(-1, dof)])
     loads = jnp.concatenate([force.reshape(-1), torque.reshape(-1)])
     product = rows.T @ jnp.concatenate([rows * scale[:, None], loads[:, None]], axis=1)
     return product[:, :dof], product[:, dof]

@@ -1,0 +1,56 @@
+"""Systems solved by the factor of a neighbouring one."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sorojax import mesh
+from sorojax.math import sparse
+from sorojax.math.refined import refined
+
+GRID = mesh.rectangle([0, 0], [1.0, 1.0], divisions=(6, 6), element=mesh.Quad4())
+SYSTEM = sparse.from_cells(GRID.num_nodes, np.asarray(GRID.cells))
+RANDOM = np.random.default_rng(0)
+MATRICES = RANDOM.standard_normal((36, 4, 4))
+SPREAD = RANDOM.standard_normal((36, 4, 4))
+RIGHT = RANDOM.standard_normal(SYSTEM.size)
+
+
+def values(spread):
+    """Of a positive definite matrix for a small `spread`, of another one for each."""
+    cells = MATRICES @ MATRICES.swapaxes(1, 2) + np.eye(4) + spread * (SPREAD + SPREAD.mT)
+    return np.asarray(sparse.assemble(SYSTEM, jnp.asarray(cells)))
+
+
+@pytest.mark.parametrize(("spread", "new"), [(0.0, 0), (1e-9, 0), (1e-4, 0), (0.3, 1)])
+def test_a_near_factor_gives_the_digits_of_its_own(spread, new):
+    solver = SYSTEM.solver
+    solver.factor(values(10.0))  # far away, and the last one
+    solver.factor(values(0.0))
+    solver.factor(values(20.0))
+    before = solver.num_factorisations
+    x = solver.solve_near(values(spread), RIGHT)
+    assert solver.num_factorisations == before + new
+    want = solver.solve(values(spread), RIGHT)
+    assert np.allclose(x, want, rtol=0, atol=1e-11 * np.abs(want).max())
+    left = sparse.product(SYSTEM, jnp.asarray(values(spread)), jnp.asarray(x))
+    assert np.allclose(left, RIGHT, atol=1e-11)
+
+
+def test_a_factor_that_is_none_is_found_out():
+    class Nothing:
+        def solve(self, b):
+            return np.full_like(b, np.nan)
+
+    class Half:
+        def solve(self, b):
+            return b / 2
+
+    assert refined(Nothing(), lambda x: x, RIGHT) is None
+    assert refined(Half(), lambda x: x, RIGHT) is None
+
+
+def test_supports_on_the_host_have_the_bits_of_the_program():
+    fixed = RANDOM.uniform(size=SYSTEM.size) < 0.3
+    want = sparse.fix(SYSTEM, jnp.asarray(values(0.1)), jnp.asarray(fixed))
+    assert np.array_equal(sparse.fixed_on_host(SYSTEM, values(0.1), fixed), want)
