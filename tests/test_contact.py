@@ -25,6 +25,40 @@ def test_the_law_is_twice_differentiable_and_its_inverse_agrees():
     assert jnp.allclose(LAW.pressure(-LAW.penetration(levels)), levels, rtol=1e-12)
 
 
+def test_the_mean_pressure_of_a_step_takes_what_the_energy_gives(getkey):
+    before, after = 3e-5 * jax.random.uniform(getkey(), (2, 200), minval=-1.0)
+    after = after.at[:3].set(before[:3])  # points at rest
+    mean = LAW.mean_pressure(before, after)
+    given = LAW.energy(before) - LAW.energy(after)
+    assert jnp.allclose(mean * (after - before), given, rtol=1e-13, atol=1e-15)
+    assert jnp.allclose(mean[:3], LAW.pressure(before[:3]), rtol=1e-12)
+    # the energy of a step is one of its slope, of which the other gap knows too
+    slope = jax.vmap(jax.grad(LAW.energy_of_step, argnums=1))
+    assert jnp.allclose(slope(before, after), -mean, rtol=1e-12, atol=1e-12)
+    curved = jax.vmap(jax.hessian(LAW.energy_of_step, argnums=(1, 0)))(before, after)[0]
+    for k, gaps in enumerate(((0 * before, 1e-9), (1e-9, 0 * after))):
+        ends = [slope(before + sign * gaps[0], after + sign * gaps[1]) for sign in (1, -1)]
+        assert jnp.allclose(curved[k], (ends[0] - ends[1]) / 2e-9, atol=1e-6 * 2e7)
+    assert jnp.all(curved[0] >= 0)  # so that a step has one solution
+
+
+def test_points_that_go_through_a_wall_are_seen():
+    wall = sdf.Rectangle([0.0, -1.0], [1 * mm, 1.0])
+    ways = (  # from, to, along the wall [mm], seen
+        (-10.0, 15.0, 3.0, True), (-10.0, 0.9, 0.0, True), (-10.0, 0.4, 5.0, False),
+        (-1.0, 1.2, 0.0, True), (0.1, 0.3, 9.0, False), (0.4, 0.7, 0.0, True),
+        (0.3, 1.5, 0.0, True), (0.9, 1.5, 0.0, False), (0.2, -9.0, 0.0, False),
+        (-1.0, -0.5, 30.0, False), (-1.0, -1.0, 0.0, False),
+    )  # fmt: skip
+    x, to, sway, seen = (jnp.array(column) for column in zip(*ways, strict=True))
+    before = jnp.stack([x, 0 * x], axis=1) * mm
+    after = jnp.stack([to, sway], axis=1) * mm
+    assert jnp.array_equal(contact.passes(wall, before, after), seen)
+    assert not jnp.any(contact.passes(wall, before - 1.0, after - 1.0))
+    hole = sdf.HalfPlane([0.0, 0.0], [1.0, 0.0]) | sdf.HalfPlane([1 * mm, 0.0], [-1.0, 0.0])
+    assert not jnp.any(contact.passes(hole, before[:7], after[:7]) & (x[:7] > -0.5))
+
+
 def test_forces_are_slopes_of_the_energy_and_balance():
     ball = sdf.Sphere([0.0, 0.0, 0.0], 0.01)
     points = jnp.array([[0.0099, 0, 0], [0.0, 0.007, 0.007], [0.0, 0.0, 0.02]])

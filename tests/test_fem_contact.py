@@ -200,11 +200,15 @@ def test_on_a_slope_a_block_sticks_without_creep_or_slides_as_coulomb_says():
         return fem.simulate(free_block(), 0.2, 2e-3, save=5, gravity=gravity)
 
     held = tilted(0.9975)
+    turns = fem.switching(held, 0.05)
+    assert bool(turns.near[-1]) and not bool(turns.switched[-1])
+    assert 0 < float(turns.slip[-1]) < 0.05 and float(turns.gap[-1]) > 0
     speed = np.abs(np.asarray(held.velocities)[-1]).max()
     assert speed < 1e-4 * float(held.problem.loads[1].friction_velocity)
     slid = np.asarray(held.displacements)[:, :, 0].mean(axis=1)
     assert 0 < slid[-1] < 3e-5  # the springs of friction and the shear of the block
     free = tilted(1.05)
+    assert bool(jnp.any(fem.switching(free).switched[1:]))
     velocity = np.asarray(free.velocities)[:, :, 0].mean(axis=1)
     steep = 1.05 * np.arctan(FRICTION)
     slope = 9.81 * (np.sin(steep) - FRICTION * np.cos(steep))

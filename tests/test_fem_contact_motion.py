@@ -75,7 +75,7 @@ def unexplained(friction: float, viscosity: float, step: float) -> float:
     damping = fem.KelvinVoigt(viscosity)
     motion = bounce(ring(friction), step=step, method=method, damping=damping)
     energy, taken = total(motion), float(motion.energies.dissipated[-1]) - rubbed(motion)
-    assert np.diff(energy).max() < 1e-3 * energy[0]
+    assert np.diff(energy).max() < 2e-3 * energy[0]
     pressed = pressure(motion.states).max(axis=(1, 2))
     assert pressed.max() > 0 == pressed[-1]  # it has left the floor
     assert (taken > 0.1 * energy[0]) == (viscosity > 0)
@@ -83,11 +83,79 @@ def unexplained(friction: float, viscosity: float, step: float) -> float:
 
 
 def test_a_bouncing_ring_loses_energy_to_damping_and_friction_alone():
-    """A contact that steps do not resolve loses a little more, and less in shorter ones."""
+    """But for the error in time of the elastic forces, of order two."""
     bare, damped, rubs = (unexplained(*x, 2.5e-4) for x in ((1e-9, 0), (1e-9, 20), (0.5, 20)))
     for share in (bare, damped, rubs):
-        assert 0 < share < 0.04
-    assert unexplained(1e-9, 0.0, 1.25e-4) < 0.9 * bare
+        assert abs(share) < 0.005
+    assert abs(unexplained(1e-9, 0.0, 1.25e-4)) < 0.3 * abs(bare)
+
+
+def test_a_conserving_method_keeps_the_energy_of_a_bouncing_ring():
+    motion = bounce(ring(1e-9), method=fem.EnergyMomentum())
+    energy = total(motion)
+    assert np.abs(energy / energy[0] - 1).max() < 1e-6
+    assert float(motion.energies.loads.max()) > 0.01 * energy[0]  # it was in contact
+
+
+def plate(obstacle, young_modulus, stiffness=None) -> fem.Problem:
+    """A plate of 20 x 5 mm and an obstacle below its underside."""
+    shape = mesh.rectangle([0, 0], [20 * mm, 5 * mm], divisions=(4, 1), element=mesh.Quad4())
+    rubber = material.neo_hookean(
+        young_modulus=young_modulus, poisson_ratio=0.3, density=1000.0
+    )
+    touch = fem.Contact(shape.facet_sets["bottom"], obstacle, stiffness, name="wall")
+    return fem.problem(
+        shape, rubber, kinematics=fem.PlaneStrain(0.03), supports=(), loads=(touch,),
+        formulation=fem.Displacement(), free=True,
+    )  # fmt: skip
+
+
+def shot(problem, duration, step, height=10 * mm, **options) -> fem.Motion:
+    """Down at 100 m/s."""
+    rest = jnp.zeros_like(problem.mesh.points)
+    start = rest.at[:, 1].set(height), rest.at[:, 1].set(-100.0)
+    return fem.simulate(problem, duration, step, start=start, **options)
+
+
+WALL = sdf.Rectangle([-0.1, -1 * mm], [0.1, 0.0])
+
+
+def risen(motion: fem.Motion) -> float:
+    """Share of its energy that a body was given by nobody."""
+    energy = total(motion)
+    assert np.all(np.isfinite(energy))
+    return float((energy / energy[0]).max() - 1)
+
+
+@pytest.mark.stress(40)
+def test_at_a_hundred_metres_per_second_nothing_gets_through_a_wall_of_a_millimetre():
+    """In steps of a quarter of a millisecond, 25 mm of its way."""
+    motion = shot(plate(WALL, 1e9), 5e-4, 2.5e-4)
+    assert motion.stats.cuts > 0 and risen(motion) < 1e-3
+    assert float(motion.velocities[-1, :, 1].mean()) > 50.0  # it has bounced
+    # a contact far too soft to hold it stops the run instead
+    soft = shot(plate(WALL, 1e9, 1e10), 5e-4, 2.5e-4, throw=False)
+    assert bool(soft.status == fem.Status.not_converged) and risen(soft) < 1e-3
+    assert float((soft.problem.mesh.points + soft.end.displacement)[:, 1].min()) > -1 * mm
+
+
+@pytest.mark.stress(40)
+def test_rubber_survives_a_hundred_metres_per_second():
+    """Three times the speed of its waves."""
+    motion = shot(plate(FLOOR, 1e6), 5e-4, 2.5e-4)
+    assert risen(motion) < 1e-3 and float(motion.velocities[-1, :, 1].mean()) > 10.0
+
+
+@pytest.mark.stress(40)
+def test_sixteen_steps_in_the_period_of_a_contact_keep_its_energy():
+    stiffness = 5.0 * 1e4**2  # of a plate of 5 kg/m^2, for 1592 Hz
+    problem = plate(FLOOR, 1e10, stiffness)
+    step = 2 * np.pi / 1e4 / 16
+    method = fem.GeneralisedAlpha(1.0)
+    motion = shot(problem, 20 * step, step, 1 * mm, method=method)
+    energy = total(motion)
+    assert float(motion.velocities[-1, :, 1].mean()) > 99.0  # it has bounced
+    assert abs(energy[-1] / energy[0] - 1) < 1e-6
 
 
 def _way(theta):

@@ -1,5 +1,8 @@
 """Cost of contact: a step of the soft finger D1 with no, a far and a met obstacle, and with
-contact with itself. Depth of contact: a rod that coils up until it lies on itself."""
+contact with itself. Depth of contact: a rod that coils up until it lies on itself. What twice
+the contact points change: at rest on a stone, and in the fall of a free rod into a corner."""
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +16,20 @@ from sorojax.math.lie import SE2
 from sorojax.math.steppers import start
 from sorojax.rod import (
     Damping,
+    Free,
     Gravity,
     ObstacleContact,
+    On,
+    Part,
     SelfContact,
+    assembly,
     chebyshev,
     circle,
+    equilibrium,
     motion,
+    part_motion,
     penetration,
+    points,
     rod as make_rod,
     rollout,
 )
@@ -27,6 +37,8 @@ from sorojax.rod.rollout import second_order
 
 STEPS, STEP, BATCH, BATCH_STEPS = 250, 1e-3, 64, 25
 BAR = 0.05  # what a far obstacle may add, unbatched
+DOUBLED_BAR = 0.02  # what twice the contact points may change
+FINGER: Any = {"length": 0.08, "young_modulus": 1e6, "poisson_ratio": 0.3, "density": 2000.0}
 LAW = LinePenalty(stiffness=5e7, smoothing=6e-6, friction=0.5)
 
 
@@ -72,7 +84,47 @@ def coiling(stiffness):
     return depth / radius
 
 
+def fallen(count):
+    """Ends and middle of a free rod that falls for 0.2 s and bounces, in steps that resolve
+    its impacts; 8 steps to a row."""
+    rod = make_rod(SE2(), chebyshev(kappa_z=2), circle(6e-3), nodes=8, **FINGER)
+    body = assembly(SE2(), rod=Part(rod, Free()))
+    faces = sdf.Rectangle([-1.0, -1.0], [1.0, 0.0]), sdf.Rectangle([0.09, -1.0], [1.0, 1.0])
+    options = {"radius": 6e-3, "law": LAW, "points": count, "caps": "both"}
+    corner = (On("rod", ObstacleContact(obstacle=face, **options)) for face in faces)
+    q, v = jnp.array([-0.6, 0.0, 0.06, 0.0, 0.0]), jnp.array([0.0, 0.4, 0.0, 0.0, 0.0])
+    path = rollout(body, q, v, (Gravity(), *corner), step=2.5e-4, saves=100, every=8)
+    at = jnp.array([0.0, 0.5, 1.0])
+    return jax.vmap(lambda q: points(part_motion(motion(body, q), 0), at).position)(path.q)
+
+
+def lying(count):
+    """Middle and end of a rod that its weight presses onto a round stone."""
+    rod = make_rod(SE2(), chebyshev(kappa_z=3), circle(6e-3), **FINGER)
+    stone = sdf.Circle([0.045, -0.014], 6e-3)
+    contact = ObstacleContact(obstacle=stone, radius=6e-3, law=LAW, points=count)
+    rest = equilibrium(rod, (Gravity(), contact))
+    places = [
+        points(motion(rod, q), jnp.array([0.5, 1.0])).position for q in (0 * rest.q, rest.q)
+    ]
+    return jnp.stack(places)
+
+
+def doubled(scene):
+    """Distance of two results over the travel, largest and mean: 32 and 64 points."""
+    few, many = (jax.jit(scene, static_argnums=0)(count) for count in (32, 64))
+    travel = jnp.max(jnp.linalg.norm(many - many[:1], axis=-1))
+    apart = jnp.linalg.norm(few - many, axis=-1) / travel
+    return float(jnp.max(apart)), float(jnp.mean(apart))
+
+
 def rows():
+    for name, scene in (("stone", lying), ("fall", fallen)):
+        largest, mean = doubled(scene)
+        yield Row(
+            "sorojax", {"scene": name, "points": "32, 64", "mean": round(mean, 5)},
+            error=largest, reference="travel", bar=DOUBLED_BAR, bar_on="error",
+        )  # fmt: skip
     rod = finger(8)
     q = jnp.zeros(rod.basis.num_dof)
     cases = (("none", None), ("far", -0.2), ("itself", "itself"), ("met", -0.015))

@@ -9,3 +9,4 @@ from sorojax.contact.points import (
     contacts as contacts,
     gaps as gaps,
 )
+from sorojax.contact.swept import passes as passes

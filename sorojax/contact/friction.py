@@ -66,6 +66,17 @@ class Coulomb(eqx.Module):
         length = jnp.sqrt(jnp.where(held, jnp.ones_like(square), square))
         return -jnp.where(held, whole, limit / length)[..., None] * away
 
+    def loading(
+        self, grip: Grip, position: Float[Array, "*points dim"]
+    ) -> Float[Array, "*points"]:
+        """Pull of spring and dashpot over the limit: points hold below 1 and slide above;
+        infinite without pressure."""
+        whole, away = self._trial(grip, position)
+        limit = self.coefficient * grip.pressure
+        touches = limit > 0
+        pull = whole * jnp.sqrt(jnp.sum(away**2, axis=-1))
+        return jnp.where(touches, pull / jnp.where(touches, limit, 1.0), jnp.inf)
+
     def stretch(
         self, grip: Grip, position: Float[Array, "*points dim"]
     ) -> Float[Array, "*points dim"]:

@@ -1,7 +1,10 @@
 """The contact law: a smooth pressure that grows with penetration."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from sorojax import _check
@@ -36,6 +39,28 @@ class Penalty(eqx.Module):
         depth, ramp = self._parts(gap)
         return self.stiffness * (ramp**2 / (2 * self.smoothing) + depth - ramp)
 
+    def mean_pressure(
+        self, before: Float[Array, "..."], after: Float[Array, "..."]
+    ) -> Float[Array, "..."]:
+        """Mean of the pressure over the way from one gap to another [Pa]: times that way it
+        is what the energy loses, to the last digit."""
+        (d0, r0), (d1, r1) = self._parts(before), self._parts(after)
+        way, width = before - after, self.smoothing
+        still = jnp.abs(way) <= _STILL * (jnp.abs(before) + jnp.abs(after) + width)
+        way = jnp.where(still, jnp.ones_like(way), way)
+        b0, b1 = d0 - r0, d1 - r1
+        within = (r1 - r0) / way * (r0 * r0 + r0 * r1 + r1 * r1) / (6 * width)
+        beyond = (b1 - b0) / way * (b0 + b1 + width) / 2
+        here = self.pressure((before + after) / 2)
+        return jnp.where(still, here, self.stiffness * (within + beyond))
+
+    def energy_of_step(
+        self, before: Float[Array, "..."], after: Float[Array, "..."]
+    ) -> Float[Array, "..."]:
+        """Energy per area [J/m^2] whose slope in the gap `after` is minus the mean pressure
+        over the step. Its value is a quadrature, its slope exact."""
+        return _energy_of_step(self.stiffness, self.smoothing, before, after)
+
     def penetration(self, pressure: Float[Array, "..."]) -> Float[Array, "..."]:
         """Depth [m] at which the pressure [Pa] is reached."""
         depth = pressure / self.stiffness + self.smoothing / 2
@@ -47,3 +72,43 @@ class Penalty(eqx.Module):
         """Penetration, and the part of it within the smooth start."""
         depth = jnp.where(gap < 0, -gap, jnp.zeros_like(gap))
         return depth, jnp.where(depth < self.smoothing, depth, self.smoothing)
+
+
+_STILL = 1e-6  # way over the gaps, below which the pressure is that in the middle
+
+
+def _by_quadrature(stiffness, smoothing, before, after):
+    law = Penalty(stiffness, smoothing)
+    total = jnp.zeros_like(after)
+    for at, weight in zip(*np.polynomial.legendre.leggauss(4), strict=True):
+        share = (1 + float(at)) / 2
+        lost = law.energy(before + share * (after - before)) - law.energy(before)
+        total = total + float(weight) / (2 * share) * lost
+    return total
+
+
+@jax.custom_jvp
+def _energy_of_step(stiffness, smoothing, before, after):
+    return _by_quadrature(stiffness, smoothing, before, after)
+
+
+def _slope_of_step(primals, tangents):
+    """Exact in the gap after the step, the only one that forces are slopes in."""
+    stiffness, smoothing, before, after = primals
+    value = _by_quadrature(*primals)
+    slope = jnp.zeros_like(value)
+    if not isinstance(tangents[3], SymbolicZero):
+        slope = slope - Penalty(stiffness, smoothing).mean_pressure(before, after) * tangents[3]
+    moving = [k for k in range(3) if not isinstance(tangents[k], SymbolicZero)]
+    if moving:
+
+        def of(*moved):
+            given = dict(zip(moving, moved, strict=True))
+            return _by_quadrature(*(given.get(k, primals[k]) for k in range(4)))
+
+        at, along = zip(*((primals[k], tangents[k]) for k in moving), strict=True)
+        slope = slope + jax.jvp(of, at, along)[1]
+    return value, slope
+
+
+_energy_of_step.defjvp(_slope_of_step, symbolic_zeros=True)

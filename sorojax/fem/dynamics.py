@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._progress import report
 from sorojax._types import is_traced, real
+from sorojax.fem.contact_load import Contact
 from sorojax.fem.damping import AbstractDamping
 from sorojax.fem.dynamics_host import Control, Run
 from sorojax.fem.dynamics_implicit import MotionCall, recorded
@@ -62,8 +63,8 @@ def simulate(
     """Motion of `problem` for `duration` [s] in steps of `step` [s].
 
     Every step is the equilibrium of the body with its inertia and damping, solved by
-    Newton's method; one that does not converge, or would invert a cell, is never accepted
-    but halved, and steps grow again afterwards.
+    Newton's method; one that does not converge, would invert a cell or takes a point through
+    the obstacle of a `Contact` is never accepted but halved, and steps grow again afterwards.
 
     Args:
         problem: What moves; its material needs a density.
@@ -80,8 +81,8 @@ def simulate(
             the largest displacement; `True` is 1e-3.
         newton: Tolerances; `Newton()` when omitted.
         max_cuts: How often a step may be halved in a row.
-        max_steps: Accepted steps at most; 64 more than asked for when omitted, and 16 times
-            as many with `adaptive`.
+        max_steps: Accepted steps at most; when omitted 256 times as many as asked for. Inside
+            a trace, where it is memory, 64 more, and 16 times as many with `adaptive`.
         throw: Raise when a run outside a trace fails, otherwise report it in `status`.
         **histories: Values of loads and of prescribed supports by name: functions of time
             [s] or rows with one value for each end of a step. They are taken at the ends of
@@ -105,7 +106,7 @@ def simulate(
     begin = _begin_time(start)
     times = begin + size * jnp.arange(grid + 1, dtype=size.dtype)
     loads, supports = _rows(where, problem, histories, times)
-    scheme, rest = method.coefficients(), _rest(problem)
+    scheme, rest = method.coefficients(), _rest(problem, loads)
     dynamics = Dynamics(
         problem, damping, scheme, loads, supports, rest, size, mass, method.conserves
     )
@@ -114,11 +115,13 @@ def simulate(
     bare = dataclasses.replace(begun, tangent=None, listed=None)
     dynamics = dataclasses.replace(dynamics, start=bare)
     error = (1e-3 if adaptive is True else float(adaptive)) if adaptive else None
-    if max_steps is None:
+    traced = is_traced((dynamics, jnp.zeros(())))
+    if max_steps is None and traced:
         max_steps = grid + 64 if error is None else 16 * grid
+    max_steps = 256 * grid if max_steps is None else max_steps
     newton = Newton() if newton is None else newton
     control = Control(newton, max_cuts, error, max_steps)
-    if is_traced((dynamics, jnp.zeros(()))):
+    if traced:
         return _in_trace(dynamics, control, grid, every)
     motion = _on_host(dynamics, control, grid, every, begun)
     if throw and motion.stats.reason:
@@ -190,11 +193,22 @@ def _remembers(load: AbstractLoad) -> bool:
     return type(load).begun is not AbstractLoad.begun
 
 
-def _rest(problem: Problem) -> State:
+def _rest(problem: Problem, rows: tuple[Array | None, ...]) -> State:
     zero = jnp.zeros_like(problem.mesh.points)
     none = jnp.zeros((), zero.dtype)
-    memory = tuple(load if _remembers(load) else None for load in problem.loads)
+    first = zip(problem.loads, rows, strict=True)
+    memory = tuple(_placed(load, row) if _remembers(load) else None for load, row in first)
     return State(none, zero, zero, zero, memory, none, none, jnp.ones_like(none))
+
+
+def _placed(load: AbstractLoad, row: Array | None) -> AbstractLoad:
+    """`load` with its obstacle where the motion begins, unless friction holds on to it."""
+    if not isinstance(load, Contact):
+        return load
+    place = load.value if row is None else row[0]
+    if load.grip is not None and load.place is not None:
+        place = jnp.where(jnp.any(load.grip.pressure > 0), load.place, place)
+    return dataclasses.replace(load, place=place)
 
 
 def _state(where: str, dynamics: Dynamics, start: Start | None) -> State:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax.fem import assemble as asm
+from sorojax.fem.contact_swept import passed_through
 from sorojax.fem.dynamics_lists import has_lists, listed_at
 from sorojax.fem.dynamics_newton import Found, StepSolver
 from sorojax.fem.dynamics_step import (
@@ -27,8 +28,10 @@ from sorojax.fem.newton import Newton
 from sorojax.fem.supports import known_values
 from sorojax.math.status import Status
 
-#: A prediction that leaves a cell less of its volume is no guess to start from.
+#: A prediction that leaves a cell less of its volume is no guess to start from, and a step
+#: that does is too long.
 LEAST_VOLUME = 0.1
+_CALM = 0.8  # a step whose forces act at more of every volume does not get near to that
 
 
 class Control(NamedTuple):
@@ -136,13 +139,23 @@ class Run:
         # a prediction that inverts cells is none
         sound = float(kept) > LEAST_VOLUME
         found = self._solve(problem, step.predicted if sound else start, held)
+        least = found.volume * (float(kept) if sound else 1.0)
         if found.reason:
             found = self._solve(problem, start, held)
+            least = found.volume
         if found.reason:
             self.reason = found.reason
             return None
         u = jnp.asarray(found.u)
-        new, error = _end(self.dynamics, self.matter, self.state, interval, step, u)
+        new, error, through = _end(self.dynamics, self.matter, self.state, interval, step, u)
+        if through:
+            self.reason = "a point goes through an obstacle"
+        elif not (least > _CALM or self._kept(new) > LEAST_VOLUME):
+            self.reason = "a cell loses most of its volume"
+        else:
+            self.reason = ""
+        if self.reason:
+            return None
         self._easy = found.iterations <= 6 * self.control.newton.max_iterations // 4
         if self.control.error is not None:
             scale = float(jnp.max(jnp.abs(new.displacement))) + 0.01 * float(
@@ -156,6 +169,13 @@ class Run:
         self.steps += 1
         self.rows.append((int(interval.index), *_ends(interval), found.u))
         return new
+
+    def _kept(self, new: State) -> float:
+        """Least share of its volume that a cell keeps in a step to `new`, which is further
+        than where its forces act."""
+        problem, u = self.dynamics.problem, self.state.displacement
+        args = (problem.space, self.prepared.geometry, problem.kinematics)
+        return float(asm.kept_volume(*args, u, new.displacement - u))
 
     def _solve(self, problem, start, held: np.ndarray) -> Found:
         found = self.solver.solve(problem, np.asarray(start), held)
@@ -198,4 +218,5 @@ def _begin(dynamics: Dynamics, known: Matter, geometry, state: State, interval: 
 @eqx.filter_jit
 def _end(dynamics: Dynamics, known: Matter, state: State, interval: Interval, step: Step, u):
     new = end_step(dynamics, known, state, interval, step, u)
-    return new, step_error(dynamics, interval, state, new)
+    through = passed_through(dynamics.problem, step.terms[0], new.displacement)
+    return new, step_error(dynamics, interval, state, new), through

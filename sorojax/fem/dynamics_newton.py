@@ -8,17 +8,18 @@ a tangent and its factor. A step that raises the energy is shortened.
 import dataclasses
 from typing import NamedTuple
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sorojax.fem import assemble as asm
+from sorojax.fem.dynamics_kernel import Split, kernel
 from sorojax.fem.dynamics_lists import has_lists, longest_share
 from sorojax.fem.energy_form import load_force
 from sorojax.fem.inertia import Inertia
 from sorojax.fem.linear import Prepared, add_load_stiffness
-from sorojax.fem.newton import Newton, relative_size, safe_fraction
-from sorojax.fem.problem import Problem, unsupported
+from sorojax.fem.newton import Newton, safe_fraction
+from sorojax.fem.problem import Problem, body
 from sorojax.fem.secant import Secants
 from sorojax.math import sparse
 
@@ -46,7 +47,8 @@ class Balance(NamedTuple):
 
 
 class Found(NamedTuple):
-    """State that a step converged to, unless `reason` says why not."""
+    """State that a step converged to, unless `reason` says why not; no cell of it has less
+    than `volume` of what it had in the guess, and perhaps much more."""
 
     u: np.ndarray
     residual: np.ndarray
@@ -54,25 +56,53 @@ class Found(NamedTuple):
     factorisations: int
     kept: Kept | None
     reason: str
+    volume: float = 0.0
 
 
-@eqx.filter_jit
-def forces(problem: Problem, prepared: Prepared, u, before):
-    """Internal force and that of the loads [N], and the smallest J / J_before."""
-    body = asm.assemble(
-        problem.space, prepared.geometry, problem.material, problem.kinematics, u, before
+class Acting(NamedTuple):
+    """A problem whose parts were taken apart for the kernels: body and what is prepared once
+    per motion, and the loads of a step."""
+
+    fixed: Split
+    loads: Split
+
+
+def acting(problem: Problem, prepared: Prepared, fixed: Split | None = None) -> Acting:
+    """`problem` taken apart; `fixed` if its body was already."""
+    fixed = Split((body(problem), prepared)) if fixed is None else fixed
+    return Acting(fixed, Split(problem.loads))
+
+
+@kernel
+def _forces(fixed, loads, u, before):
+    body, prepared = fixed
+    found = asm.assemble(
+        body.space, prepared.geometry, body.material, body.kinematics, u, before
     )
-    return body.force, load_force(problem, u).ravel(), body.volume_ratio
+    rest = tuple(load for load in loads if not isinstance(load, Inertia))
+    loaded = load_force(dataclasses.replace(body, loads=rest), u)
+    return found.force, loaded.ravel(), found.volume_ratio
 
 
-@eqx.filter_jit
-def tangent(problem: Problem, prepared: Prepared, u, before):
-    """Values of the tangent [N/m], and the same with supports applied."""
-    body = asm.assemble(
-        problem.space, prepared.geometry, problem.material, problem.kinematics, u, before
+@kernel
+def _tangent(fixed, loads, u, before):
+    body, prepared = fixed
+    found = asm.assemble(
+        body.space, prepared.geometry, body.material, body.kinematics, u, before
     )
-    values = add_load_stiffness(problem, prepared, u, body.values)
+    problem = dataclasses.replace(body, loads=loads)
+    values = add_load_stiffness(problem, prepared, u, found.values)
     return values, sparse.fix(problem.space.system, values, prepared.known)
+
+
+def forces(of: Acting, u, before):
+    """Internal force and that of the loads but inertia [N], and the smallest J / J_before."""
+    return _forces(of, u, before)
+
+
+def tangent(of: Acting, u, before):
+    """Values of the tangent [N/m], and the same with supports applied."""
+    return _tangent(of, u, before)
 
 
 class StepSolver:
@@ -84,6 +114,7 @@ class StepSolver:
         self.solver, self.sees = self.system.solver, has_lists(problem)
         self.known, self.length = np.asarray(prepared.known), float(prepared.length)
         self.kept: Kept | None = None
+        self._fixed = Split((body(problem), prepared))
         self._matrix = _Both(self.system)
 
     def solve(self, problem: Problem, guess: np.ndarray, held: np.ndarray) -> Found:
@@ -92,8 +123,9 @@ class StepSolver:
         (inertia,) = [load for load in problem.loads if isinstance(load, Inertia)]
         self._matrix.fill(np.asarray(inertia.matrix))
         self._pull, self._origin = np.asarray(inertia.pull), np.asarray(inertia.origin)
-        u, before, fresh, size = guess, guess, 0, np.inf
-        now = self._balance(problem, u, u)
+        self._of = acting(problem, self.prepared, self._fixed)
+        u, before, fresh, size, volume = guess, guess, 0, np.inf, 1.0
+        now = self._balance(u, u)
         last, refactor, iterations, secants = np.inf, self.kept is None, 0, Secants()
         while True:
             move = np.where(self.known, held - u.ravel(), 0.0)
@@ -106,20 +138,20 @@ class StepSolver:
             rounding = 2 * np.finfo(float).eps * largest * now.length
             small = norm <= settings.residual_tolerance * reference or norm <= rounding
             if small and size < settings.step_tolerance and not moves:
-                return Found(u, now.residual, iterations, fresh, self.kept, "")
+                return Found(u, now.residual, iterations, fresh, self.kept, "", volume)
             if fresh >= settings.max_iterations or iterations >= 6 * settings.max_iterations:
                 reason = f"no convergence in {iterations} Newton iterations"
                 return self._failed(u, iterations, fresh, reason)
             slow = iterations > 0 and norm > _SLOW * last and not small
             if refactor or slow or moves:
                 secants.clear()
-                if not self._renew(problem, u, before):
+                if not self._renew(u, before):
                     return self._failed(u, iterations, fresh, "the tangent is singular")
                 refactor, fresh = False, fresh + 1
             last, iterations = norm, iterations + 1
             rhs = -now.residual
             if moves:
-                rhs = rhs - np.asarray(self._product(problem, u, before, move))
+                rhs = rhs - np.asarray(self._product(move))
             rhs[self.known] = 0.0
             factor = self.solver.factor(self.kept.matrix)  # type: ignore[union-attr]
             if factor is None:
@@ -128,14 +160,14 @@ class StepSolver:
             slope = None if moves else -float(rhs @ du.ravel())
             before = u
             u, now, size = self._advance(problem, u, du, slope)
+            volume *= now.volume_ratio
             if not moves:
                 change = now.residual + rhs
                 change[self.known] = 0.0
                 secants.add((u - before).ravel(), change)
 
-    def _renew(self, problem: Problem, u, before) -> bool:
-        at = jnp.asarray(u), jnp.asarray(before)
-        self._values, matrix = tangent(unsupported(problem), self.prepared, *at)
+    def _renew(self, u, before) -> bool:
+        self._values, matrix = tangent(self._of, u, before)
         return self.keep(np.asarray(matrix))
 
     def keep(self, matrix: np.ndarray) -> bool:
@@ -143,22 +175,19 @@ class StepSolver:
         self.kept = Kept(matrix, float(np.abs(matrix).max()))
         return bool(np.isfinite(self.kept.largest))
 
-    def _product(self, problem, u, before, move):
+    def _product(self, move):
         return sparse.product(self.system, self._values, jnp.asarray(move))
 
-    def _balance(self, problem: Problem, u, before) -> Balance:
+    def _balance(self, u, before) -> Balance:
         """Forces of body and loads from a compiled kernel, inertia by a product here."""
-        rest = tuple(load for load in problem.loads if not isinstance(load, Inertia))
-        bare = dataclasses.replace(unsupported(problem), loads=rest)
-        found = forces(bare, self.prepared, jnp.asarray(u), jnp.asarray(before))
-        internal, load = np.asarray(found[0]), np.asarray(found[1])
+        internal, load, ratio = jax.device_get(forces(self._of, u, before))
         load = load + self._pull - self._matrix @ (u - self._origin).ravel()
         residual = internal - load
         norm = np.abs(np.where(self.known, 0.0, residual)).max()
         reaction = np.abs(np.where(self.known, residual, 0.0)).max()
         reference = max(np.abs(load).max(), reaction)
         length = np.abs(u).max() + self.length
-        return Balance(residual, float(norm), float(reference), length, float(found[2]))
+        return Balance(residual, float(norm), float(reference), length, float(ratio))
 
     def _advance(self, problem: Problem, u, du, slope):
         """The state after a step, shortened where a cell would collapse or the energy has
@@ -166,12 +195,13 @@ class StepSolver:
         if self.sees:
             du = float(longest_share(problem, jnp.asarray(du))) * du
         new = u + du
-        now = self._balance(problem, new, u)
+        now = self._balance(new, u)
         if not now.volume_ratio > 0.1:
             du = safe_fraction(problem, self.prepared, u, du) * du
             new = u + du
-            now = self._balance(problem, new, u)
-        size = relative_size(self.prepared, new, du)
+            now = self._balance(new, u)
+        # without load the displacement is rounding alone, which never gets relatively small
+        size = np.abs(du).max() / (np.abs(new).max() + 1e-6 * self.length)
         if slope is None or not slope < 0:
             return new, now, size
         share = 1.0
@@ -181,7 +211,7 @@ class StepSolver:
                 break
             share *= slope / (slope - end)
             new = u + share * du
-            now = self._balance(problem, new, u)
+            now = self._balance(new, u)
         return new, now, share * size
 
     def _failed(self, u, iterations: int, fresh: int, reason: str) -> Found:

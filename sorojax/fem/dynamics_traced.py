@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax.fem import assemble as asm
+from sorojax.fem.contact_swept import passed_through
 from sorojax.fem.dynamics_host import LEAST_VOLUME, Control, step_error
 from sorojax.fem.dynamics_step import (
     Dynamics,
@@ -94,7 +95,9 @@ def _attempt(dynamics, known, prepared: Prepared, control: Control, state, inter
     again = (counts[0] != 0) & sound
     u, counts = jax.lax.cond(again, lambda: solved(start), lambda: (u, counts))
     new = end_step(dynamics, known, state, interval, step, u)
-    fine, easy = counts[0] == 0, jnp.asarray(True)
+    through = passed_through(dynamics.problem, step.terms[0], new.displacement)
+    keeps = asm.kept_volume(*args[:4], new.displacement - start) > LEAST_VOLUME
+    fine, easy = (counts[0] == 0) & ~through & keeps, jnp.asarray(True)
     if control.error is not None:
         scale = jnp.max(jnp.abs(new.displacement)) + 0.01 * prepared.length
         ratio = step_error(dynamics, interval, state, new) / (control.error * scale)

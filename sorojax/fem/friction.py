@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sorojax.contact import Grip, gaps
+from sorojax.contact import Grip, far, gaps
+from sorojax.fem.curved import blockwise
 
 if TYPE_CHECKING:
     from sorojax.fem.contact_load import Contact
@@ -30,11 +31,14 @@ def released(
     motion begins, and let out at the velocity of release."""
     assert load.sunk is not None and load.fresh is not None
     assert load.release_velocity is not None and load.smoothing is not None
-    gap = gaps(load.obstacle, load.points_of(problem, u), load.value)
-    zero = jnp.zeros_like(gap)
-    deep = jnp.where(gap < -_DEEP * load.smoothing, gap, zero)
+    zero, depth = jnp.zeros_like(load.sunk), _DEEP * load.smoothing
+
+    def found():
+        gap = gaps(load.obstacle, load.points_of(problem, u), load.value)
+        return jnp.where(gap < -depth, gap, zero)
+
     left = jnp.minimum(load.sunk + load.release_velocity * step, zero)
-    sunk = jnp.where(load.fresh > 0, deep, left)
+    sunk = jax.lax.cond(load.fresh > 0, found, lambda: left)
     fresh = jnp.zeros_like(load.fresh)
     return eqx.tree_at(lambda load: (load.sunk, load.fresh), load, (sunk, fresh))
 
@@ -49,15 +53,11 @@ def gripped(
 ) -> "Contact":
     """`load` for the step from `u`, in which points move at `rate * (x - back)`, relative to
     an obstacle that has moved from its last place to `value` within `step` [s]."""
-    law, friction = load.law, load.friction_law
+    friction = load.friction_law
     assert load.grip is not None and load.place is not None
     start = load.points_of(problem, u) - load.place[None, None]
     anchor = start - friction.stretch(load.grip, start)
-    gap, slope = jax.vmap(jax.vmap(jax.value_and_grad(lambda x: gaps(load.obstacle, x))))(start)
-    size = jnp.sqrt(jnp.sum(slope**2, axis=-1, keepdims=True))
-    normal = slope / jnp.where(size > 0, size, jnp.ones_like(size))
-    shift = load.shift()
-    pressure = law.pressure(gap if shift is None else gap - shift)
+    pressure, normal = _felt(load, start)
     drag = friction.coefficient * pressure * rate / friction.velocity
     still = rate <= 0
     speed = (load.value - load.place) / jnp.where(still, 1.0, step)
@@ -65,6 +65,29 @@ def gripped(
     away = load.points_of(problem, back) + (lead - load.value)[None, None]
     grip = Grip(anchor, pressure, normal, drag, away)
     return eqx.tree_at(lambda load: (load.grip, load.place), load, (grip, load.value))
+
+
+def _felt(
+    load: "Contact", points: Float[Array, "facets quad dim"]
+) -> tuple[Float[Array, "facets quad"], Float[Array, "facets quad dim"]]:
+    """Pressure and normal at points in the frame of the obstacle, zero where a block of
+    facets is far from it."""
+    law, shift = load.law, load.shift()
+    reach = None if shift is None else jnp.max(shift)
+
+    def felt(points, row):
+        gap, slope = jax.vmap(jax.value_and_grad(lambda x: gaps(load.obstacle, x)))(points)
+        size = jnp.sqrt(jnp.sum(slope**2, axis=-1, keepdims=True))
+        normal = slope / jnp.where(size > 0, size, jnp.ones_like(size))
+        pressure = law.pressure(gap if shift is None else gap - shift[row])
+        return jnp.concatenate([pressure[:, None], normal], axis=1)
+
+    def idle(points, _):
+        return far(load.obstacle, points, reach)
+
+    num, quad, dim = points.shape
+    found = blockwise(jax.vmap(felt), idle, points, jnp.arange(num), (quad, dim + 1))
+    return found[..., 0], found[..., 1:]
 
 
 @eqx.filter_jit
