@@ -67,7 +67,8 @@ def _finger():
 
 
 def _accelerate(body, q, v):
-    return R.forward_dynamics(body, q, v, (R.Gravity(),), t=jnp.zeros((), q.dtype))
+    t: Any = jnp.zeros((), q.dtype)
+    return R.forward_dynamics(body, q, v, (R.Gravity(),), t=t)
 
 
 def _pressed(body, floor, q, v):

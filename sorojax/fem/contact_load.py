@@ -158,6 +158,7 @@ class Contact(AbstractLoad):
         if self.sunk is not None:
             assert self.fresh is not None
             load = released(self, problem, step.u, step.step)
+            assert load.sunk is not None
             # what is not felt when a motion begins has not been felt before
             sunk = jnp.where(self.fresh > 0, load.sunk, self.sunk)
             at_first = dataclasses.replace(self, sunk=sunk)
