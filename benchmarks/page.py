@@ -107,7 +107,7 @@ def _plots(lines: list[Line]) -> str:
         x, y = (
             (line["settings"][size], line["run_s"]) if size else (line["run_s"], line["error"])
         )
-        if x and y:
+        if x and y and y > 0:  # a difference may be negative, axes are logarithmic
             labels = (size, "run time [s]") if size else ("run time [s]", "error")
             told = line["settings"]
             label = f"{line['code']} {told.get('method', told.get('case', ''))}".strip()

@@ -186,6 +186,24 @@ def test_a_rollout_tells_about_a_hundred_times_also_of_many_rods(lanes):
     assert shares == sorted(shares) and 100 <= len(shares) <= 130
 
 
+def weighed(factor):
+    return (rod.Gravity(factor * jnp.array([0.0, -9.81])),)
+
+
+def test_paths_of_a_rod_tell_every_state():
+    told = []
+    with listen(told.append):
+        path = rod.equilibrium_path(FINGER, weighed, jnp.linspace(0, 1, 5), progress=True)
+        arc = rod.arc_length_path(FINGER, weighed, steps=4, progress=True)
+        jax.block_until_ready((path.q, arc.q))
+        jax.effects_barrier()
+    for label, count in (("equilibrium path", 5), ("arc length path", 4)):
+        shares = [p.fraction for p in told if p.label == label]
+        assert np.allclose(shares, np.arange(1, count + 1) / count)
+    quiet = rod.equilibrium_path(FINGER, weighed, jnp.linspace(0, 1, 5))
+    assert jnp.array_equal(path.q, quiet.q)
+
+
 def lag_to_one(pace):
     return systems.Network({"lag": systems.Lag(pace)}, {}, ("lag.a",))
 

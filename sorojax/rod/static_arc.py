@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 from sorojax._types import real
 from sorojax.math.door import door
 from sorojax.math.status import Status
+from sorojax.math.told import tell
 from sorojax.rod.assembly import dtype_of
 from sorojax.rod.loads import total_force
 from sorojax.rod.model import Model, motion, operators
@@ -63,6 +64,7 @@ def arc_length_path(
     t=0.0,
     tolerance=1e-10,
     max_cuts: int = 10,
+    progress: bool = False,
 ) -> ArcPath:
     """Equilibria one arc length apart, through limit points, where the load turns back.
 
@@ -81,6 +83,7 @@ def arc_length_path(
         t: Time at which the forces act [s].
         tolerance: Distance from equilibrium relative to the first step.
         max_cuts: How often a step may be halved.
+        progress: Report progress while running; under `vmap` in one report.
     """
     constants, dtype = operators(model), dtype_of(model)
     factor, first, longest, t = (real(x).astype(dtype) for x in (factor, first, longest, t))
@@ -131,7 +134,7 @@ def arc_length_path(
         near = jnp.sqrt(shift @ weights @ shift) < 3 * length  # the same branch
         return *at(shift), (size <= search.tolerance * begin) & near, count
 
-    def advance(point: _Point, _):
+    def advance(point: _Point, share):
         def going(state):
             _, _, length, done, _ = state
             return point.alive & ~done & (length > begin * 0.5**max_cuts)
@@ -153,10 +156,13 @@ def arc_length_path(
         length = jnp.where(count <= _EASY, 1.5 * length, length)
         new = _Point(q, factor, direction, jnp.minimum(length, longest * begin), done)
         negative = negative_eigenvalues(slope)
+        if progress:
+            tell("arc length path", share)
         return new, (q, factor, negative, ended(done, increments(model, q), rate))
 
     point = _Point(start.q, factor, direction, begin, start.done)
-    _, (q, factors, negative, status) = jax.lax.scan(advance, point, None, length=steps)
+    shares = jnp.linspace(0.0, 1.0, steps + 1, dtype=dtype)[1:]
+    _, (q, factors, negative, status) = jax.lax.scan(advance, point, shares)
     return ArcPath(q, factors, negative, status)
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 from sorojax._types import real
 from sorojax.math.door import door
 from sorojax.math.status import Status
+from sorojax.math.told import tell
 from sorojax.rod.assembly import dtype_of
 from sorojax.rod.loads import Load, total_force
 from sorojax.rod.model import Model, motion, operators
@@ -43,6 +44,7 @@ def equilibrium_path(
     tolerance=1e-10,
     max_iterations: int = 25,
     max_cuts: int = 8,
+    progress: bool = False,
 ) -> EquilibriumPath:
     """Equilibria at given load factors, each started from the one before.
 
@@ -60,6 +62,7 @@ def equilibrium_path(
         tolerance: As of `equilibrium`.
         max_iterations: Limit of one search.
         max_cuts: How often a step may be halved.
+        progress: Report progress while running; under `vmap` in one report.
 
     Raises:
         ValueError: If `q` has the wrong shape.
@@ -73,14 +76,18 @@ def equilibrium_path(
     def residual(q: Array, factor: Array) -> Array:
         return -total_force(loading(factor), t, motion(model, q, constants=constants))
 
+    shares = jnp.linspace(0.0, 1.0, len(factors) + 1, dtype=dtype)[1:]
+
     def find(_, guesses):
-        def advance(state, target):
-            q, last, alive = state
+        def advance(state, row):
+            (q, last, alive), (target, share) = state, row
             new, done, count = _step(residual, q, last, target, alive, search, max_cuts)
+            if progress:
+                tell("equilibrium path", share)
             return (new, target, done), (new, done.astype(dtype), count.astype(dtype))
 
         _, (q, done, count) = jax.lax.scan(
-            advance, (guesses[0], first, jnp.array(True)), factors
+            advance, (guesses[0], first, jnp.array(True)), (factors, shares)
         )
         return q, (done, count)
 

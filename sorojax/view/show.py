@@ -54,6 +54,11 @@ _DRAWN_BY = {
     "sorojax.design.calibration.Calibration": ("answers", "show_calibration"),
     "sorojax.material.fit.TensileFit": ("answers", "show_fit"),
     "sorojax.mesh.repair.Repaired": ("answers", "show_repaired"),
+    "sorojax.mesh.quality.Quality": ("records", "show_quality"),
+    "sorojax.sdf.surface.Curve": ("records", "show_curve"),
+    "sorojax.io.glb_animation.MovingSurface": ("records", "show_moving"),
+    "sorojax.sweep.sweep.Swept": ("records", "show_sweep"),
+    "sorojax.vision.tracking.Tracks": ("records", "show_tracks"),
     "sorojax.view.rigging.Rig": ("answers", "show_rig"),
     "sorojax.view.charts.Convergence": ("charts", "show_convergence"),
     "sorojax.view.charts.WorkPrecision": ("charts", "show_work_precision"),
@@ -67,7 +72,8 @@ def show(thing: Any, *at: Any, **options: Any) -> Picture:
 
     Shapes, surfaces and meshes; robots and their models; problems, solutions, load paths,
     motions, modes, critical loads; rods, assemblies, sections, strain bases, backbones, rigs;
-    materials and their fits; networks, blocks, trajectories; optimisations, calibrations,
+    materials and their fits; mesh quality, boundary curves, moving surfaces, sweeps, tracks of
+    markers; networks, blocks, trajectories; optimisations, calibrations,
     parts; `Convergence` and `WorkPrecision`; a `Scene`. What a search on rods or a buckling
     analysis found needs what was searched, `model=` or `problem=`. In space the picture is
     shaded by pyvista where it is installed and by sorojax itself elsewhere.
