@@ -1,7 +1,9 @@
 """What a contact remembers from step to step: friction, and overlap that is let out.
 
 Pressure and normal of friction are those at the start of the step, which keeps the tangent
-symmetric and, over an impact, the friction impulse at the coefficient times the normal one.
+symmetric. Over an impact the friction impulse is the coefficient times the normal one where the
+normal pressure is that at the ends of steps (`rho_inf` up to 1/2); beyond, where steps do not
+resolve the impact, it may differ.
 """
 
 import dataclasses
