@@ -11,6 +11,11 @@ from sorojax.math import jit as module, one_kernel as kernels
 X = jnp.linspace(0.1, 0.9, 6)
 
 
+@pytest.fixture(autouse=True)
+def _asked_for(monkeypatch):
+    monkeypatch.setenv("SOROJAX_ONE_KERNEL", "1")
+
+
 def elementwise(_, x):
     """All that one kernel may hold, of numbers between 0 and 1."""
     odd = [jnp.arcsin, jnp.arctan, jnp.arctanh, jnp.cbrt, jnp.sin, jnp.sinh, jnp.tan, jnp.tanh,
