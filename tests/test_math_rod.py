@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sorojax.math.batch import batched
-from sorojax.math.dense import solve_symmetric
+from sorojax.math.dense import solve_columns, solve_symmetric
 from sorojax.math.lie import SE2, SE3, skew
 from sorojax.math.magnus import rotation_vector
 from sorojax.math.quadrature import (
@@ -90,6 +90,8 @@ def test_symmetric_solve(dof, getkey):
     matrix = root @ root.T + dof * jnp.eye(dof)
     right = jnp.ones(dof)
     assert jnp.allclose(matrix @ solve_symmetric(matrix, right), right, rtol=0, atol=1e-12)
+    many = jnp.stack([right, jnp.arange(dof, dtype=right.dtype)], axis=1)
+    assert jnp.allclose(matrix @ solve_columns(matrix, many), many, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("step, order", [(rk4_step, 4), (dormand_prince_step, 5)])

@@ -231,6 +231,18 @@ def test_estimates_are_differentiable():
     assert float(slope) == pytest.approx(float(difference), 1e-5)
 
 
+def test_a_filter_can_be_tuned_by_its_gradient(swing):
+    def off(scale):
+        estimator = ShapeFilter(Markers(PLANAR, S), PERIOD, marker_noise=3e-4 * scale)
+        now = update_filter(estimator, start_filter(estimator), seen(swing.q[2]), forces=LOADS)
+        return jnp.vdot(now.q, now.q) + 1e-3 * jnp.vdot(now.v, now.v)
+
+    off, one = jax.jit(off), jnp.ones(())
+    slope = jax.jit(jax.grad(off))(one)
+    difference = (off(one + 1e-4) - off(one - 1e-4)) / 2e-4
+    assert float(slope) == pytest.approx(float(difference), 1e-6)
+
+
 def test_wrong_markers_are_refused():
     with pytest.raises(ValueError, match="Markers: `s`"):
         Markers(PLANAR, [0.5, 1.2])

@@ -25,6 +25,32 @@ def solve_symmetric(
     )
 
 
+def solve_columns(
+    matrix: Float[Array, "dof dof"], right: Float[Array, "dof columns"]
+) -> Float[Array, "dof columns"]:
+    """`solve_symmetric` for every column of `right`."""
+    fixed = jax.lax.stop_gradient(matrix)
+    if matrix.shape[0] < UNROLL_BELOW:
+        solve = functools.partial(_eliminated, fixed)
+    else:
+        solve = _cholesky(fixed)
+    return jax.lax.custom_linear_solve(
+        lambda x: matrix @ x, right, lambda _, r: solve(r), symmetric=True
+    )
+
+
+def _eliminated(matrix: Array, right: Array) -> Array:
+    """Gauss and Jordan's elimination: a loop is a quarter of what writing it out costs."""
+    n = matrix.shape[0]
+
+    def clear(k, both):
+        row = both[k] / both[k, k]
+        rest = both - both[:, k, None] * row[None]
+        return jnp.where((jnp.arange(n) == k)[:, None], row[None], rest)
+
+    return jax.lax.fori_loop(0, n, clear, jnp.concatenate([matrix, right], axis=1))[:, n:]
+
+
 @jax.custom_jvp
 def product(
     left: Float[Array, "rows terms"], right: Float[Array, "terms columns"]

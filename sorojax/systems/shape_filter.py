@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from sorojax import _check
 from sorojax._types import real
-from sorojax.math.dense import solve_symmetric
+from sorojax.math.dense import product, solve_columns, solve_symmetric
 from sorojax.math.door import door
 from sorojax.math.status import Status
 from sorojax.rod import inertia, motion, operators, total_force
@@ -107,8 +107,9 @@ def update_filter(
     dof = last.q.shape[0]
     before = jnp.concatenate([last.q, last.v])
     ahead = _prediction(estimator, forces, real(t))
-    state, slopes = ahead(before), jax.jacfwd(ahead)(before)
-    covariance = slopes @ last.covariance @ slopes.T + _process(estimator, forces, last.q)
+    slopes, (state, mass, stiffness) = jax.jacfwd(ahead, has_aux=True)(before)
+    process = _process(estimator, forces, mass, stiffness)
+    covariance = product(product(slopes, last.covariance), slopes.T) + process
     missed, error = last.missed + 1, jnp.zeros((), state.dtype)
     if positions is not None:
         state, covariance, error, seen = _corrected(estimator, state, covariance, positions)
@@ -124,37 +125,42 @@ def update_filter(
 
 
 def _prediction(estimator: ShapeFilter, forces: Forces, t):
-    """(q, v) -> (q, v) a period later, by linearly implicit Euler steps."""
+    """(q, v) -> (q, v) a period later, by linearly implicit Euler steps; beside it again the
+    state, with the mass matrix and the stiffness of the last step."""
     rod, constants = estimator.markers.rod, operators(estimator.markers.rod)
     h = estimator.period / estimator.substeps
     damping = damping_matrix(forces, rod, constants)
 
-    def step(_, state):
-        q, v = jnp.split(state, 2)
+    def step(_, carry):
+        q, v = jnp.split(carry[0], 2)
         moment = motion(rod, q, v, constants=constants)
         mass, coriolis = inertia(moment)
         stiffness = tangent_stiffness(forces, moment)
         force = total_force(forces, t, moment) - coriolis
         implicit = mass + h * damping + h * h * stiffness
         v = v + solve_symmetric(implicit, h * (force - h * (stiffness @ v)))
-        return jnp.concatenate([q + h * v, v])
+        state = jnp.concatenate([q + h * v, v])
+        return state, mass, stiffness
 
-    return lambda state: jax.lax.fori_loop(0, estimator.substeps, step, state)
+    def ahead(state):
+        nothing = jnp.zeros((state.shape[0] // 2,) * 2, state.dtype)
+        start = state, nothing, nothing
+        end = jax.lax.fori_loop(0, estimator.substeps, step, start)
+        return end[0], end
+
+    return ahead
 
 
-def _process(estimator: ShapeFilter, forces: Forces, q) -> Array:
+def _process(estimator: ShapeFilter, forces: Forces, mass, stiffness) -> Array:
     """Covariance of what unknown forces do in a period."""
-    rod, constants = estimator.markers.rod, operators(estimator.markers.rod)
-    moment = motion(rod, q, jnp.zeros_like(q), constants=constants)
-    mass, _ = inertia(moment)
-    stiffness = tangent_stiffness(forces, moment)
-    h = estimator.period
+    rod, h = estimator.markers.rod, estimator.period
     # a force that would hold the rod bent, met by inertia, damping and elasticity
-    push = estimator.force_noise * stiffness @ jnp.diag(sizes(rod, q))
-    implicit = mass + h * damping_matrix(forces, rod, constants) + h * h * stiffness
-    kick = jnp.linalg.solve(implicit, h * push)
+    push = estimator.force_noise * stiffness * sizes(rod, jnp.zeros_like(mass[0]))[None]
+    damping = damping_matrix(forces, rod, operators(rod))
+    implicit = mass + h * damping + h * h * stiffness
+    kick = solve_columns(implicit, h * push)
     both = jnp.concatenate([h * kick, kick])
-    return both @ both.T
+    return product(both, both.T)
 
 
 def _corrected(estimator: ShapeFilter, state, covariance, positions):
@@ -164,13 +170,15 @@ def _corrected(estimator: ShapeFilter, state, covariance, positions):
     moment = motion(estimator.markers.rod, state[:dof])
     place, jacobian = places(estimator.markers, moment)
     ahead = jnp.where(seen[:, None], positions - place, 0.0).reshape(-1)
-    rows = jnp.where(seen[:, None, None], jacobian, 0.0).reshape(ahead.shape[0], -1)
-    rows = jnp.concatenate([rows, jnp.zeros_like(rows)], axis=1)
-    noise = estimator.marker_noise**2 * jnp.eye(ahead.shape[0], dtype=state.dtype)
-    spread = rows @ covariance @ rows.T + noise
-    gain = jnp.linalg.solve(spread, rows @ covariance).T
-    left = jnp.eye(state.shape[0], dtype=state.dtype) - gain @ rows
-    covariance = left @ covariance @ left.T + gain @ noise @ gain.T
+    rows = jnp.where(seen[:, None, None], jacobian, 0.0).reshape(ahead.shape[0], dof)
+    variance = estimator.marker_noise**2
+    seen_with = product(rows, covariance[:dof])
+    spread = product(seen_with[:, :dof], rows.T)
+    spread = spread + variance * jnp.eye(ahead.shape[0], dtype=state.dtype)
+    gain = solve_columns(spread, seen_with).T
+    taken = product(gain, rows)  # Joseph's form; markers do not see rates
+    left = covariance - product(taken, covariance[:dof])
+    covariance = left - product(left[:, :dof], taken.T) + variance * product(gain, gain.T)
     count = jnp.sum(seen)
     error = root_mean_square(ahead, count)
-    return state + gain @ ahead, covariance, error, count
+    return state + product(gain, ahead[:, None])[:, 0], covariance, error, count
