@@ -47,7 +47,48 @@ def test_a_factor_that_is_none_is_found_out():
             return b / 2
 
     assert refined(Nothing(), lambda x: x, RIGHT) is None
-    assert refined(Half(), lambda x: x, RIGHT) is None
+    assert refined(Half(), lambda x: np.linspace(0.1, 2.0, len(x)) * x, RIGHT) is None
+
+
+class Diagonal:
+    def __init__(self, values):
+        self.values = values
+
+    def solve(self, b):
+        return b / self.values
+
+
+@pytest.mark.parametrize("turned", [-0.01, -0.2])
+def test_a_neighbour_that_is_not_positive_definite_is_found_out(turned):
+    known = np.linspace(1.0, 100.0, 60)
+    near = known * (1 + 0.02 * RANDOM.uniform(-1, 1, 60))
+    right = RANDOM.standard_normal(60)
+    x = refined(Diagonal(known), lambda x: near * x, right)
+    assert np.allclose(near * x, right, rtol=0, atol=1e-10)
+    near[7] = turned * known[7]
+    right[7] = 0.0  # the load does not push that way
+    start = 0.1 * RANDOM.standard_normal(60)
+    assert refined(Diagonal(known), lambda x: near * x, right, start) is None
+    guess = np.where(np.arange(60) == 7, 0.0, start)
+    x = refined(Diagonal(known), lambda x: near * x, right, guess)
+    assert np.allclose(near * x, right, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-6])
+def test_a_step_is_solved_to_what_is_asked_for(tolerance):
+    known = np.linspace(1.0, 100.0, 60)
+    near, asked = known * (1 + 0.1 * RANDOM.uniform(-1, 1, 60)), []
+
+    class Counted(Diagonal):
+        def solve(self, b):
+            asked.append(1)
+            return super().solve(b)
+
+    right = RANDOM.standard_normal(60)
+    x = refined(Counted(known), lambda x: near * x, right, tolerance=tolerance)
+    want = right / near
+    assert np.abs(x - want).max() <= tolerance * np.abs(want).max()
+    assert len(asked) <= (3 if tolerance == 1e-2 else 6)
 
 
 def test_supports_on_the_host_have_the_bits_of_the_program():

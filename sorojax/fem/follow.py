@@ -77,22 +77,24 @@ def follow(problem: Problem, begin: Start, log: Log) -> np.ndarray:
     """Step from `begin` to `problem`, halving steps that fail."""
     prepared = prepare(problem)
     u, tangent, done, size, failures = begin.u, begin.tangent, 0.0, 1.0 / log.num_steps, 0
+    kept = None
     least = 0.99 * size / 2 ** (log.max_cuts + 1)
     while done < 1.0:
         goal = min(1.0, done + size) if done + size < 1.0 - 1e-9 else 1.0
         here = problem if goal == 1.0 else between(begin.problem, problem, goal)
         known = np.asarray(known_values(here.supports, *u.shape))
-        result = newton_solve(here, prepared, u, known, log.newton, tangent)
+        result = newton_solve(here, prepared, u, known, log.newton, tangent, kept)
         if result.reason:
             failures += 1
             log.cuts += 1
-            size, tangent = (goal - done) / 2, None
+            size, tangent, kept = (goal - done) / 2, None, None
             # at a limit point single steps go on for ever, each shorter than the one before
             if failures > log.max_cuts or size < least:
                 log.reason = result.reason
                 return u
             continue
         u, tangent, done, failures = result.u, result.linearised, goal, 0
+        kept = result.kept
         log.steps.append(
             LoadStep(goal, result.iterations, result.residual, result.negative_eigenvalues)
         )

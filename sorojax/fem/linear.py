@@ -136,24 +136,48 @@ def constrain(
     return sparse.fix(system, values, known), jnp.where(known, jnp.zeros_like(rhs), rhs)
 
 
+class Step(NamedTuple):
+    """A Newton step [m] on the host, `None` if the tangent is singular or the iterative solver
+    does not get there; the number of negative eigenvalues; the factor, if a new one."""
+
+    du: np.ndarray | None
+    negative_eigenvalues: int
+    factor: sparse.Factor | None
+
+
+class Neighbour(NamedTuple):
+    """A factor to solve with, from which guess [m], and to which relative error."""
+
+    factor: sparse.Factor
+    start: np.ndarray | None
+    tolerance: float
+
+
 def step(
     problem: Problem,
     prepared: Prepared,
     values: Float[Array, " nnz"],
     residual: Float[Array, " dofs"],
     move: Float[np.ndarray, " dofs"],
-) -> tuple[np.ndarray | None, int]:
-    """Newton step [m] on the host and the number of negative eigenvalues of the tangent;
-    `None` if the tangent is singular or the iterative solver does not get there."""
+    near: Neighbour | None = None,
+) -> Step:
+    """The Newton step at a tangent, by a `near` factor where that converges at once."""
     system = problem.space.system
     matrix, rhs = constrain(system, values, residual, prepared.known, move)
-    factor = system.solver.factor(np.asarray(matrix))
+    matrix, rhs = np.asarray(matrix), np.asarray(rhs)
+    shape = -1, problem.mesh.element.dim
+    if near is not None:
+        factor, start, tolerance = near
+        du = system.solver.solve_by(factor, matrix, rhs, start, tolerance)
+        if du is not None:
+            return Step((du + move).reshape(shape), 0, None)
+    factor = system.solver.factor(matrix)
     if factor is None:
-        return None, -1
+        return Step(None, -1, None)
     if isinstance(factor, sparse.IterativeFactor):
-        du, negative = factor.step(np.asarray(rhs))
+        du, negative = factor.step(rhs)
         if du is None:
-            return None, -1
-    else:
-        du, negative = factor.solve(np.asarray(rhs)), factor.negative_eigenvalues
-    return (du + move).reshape(-1, problem.mesh.element.dim), negative
+            return Step(None, -1, None)
+        return Step((du + move).reshape(shape), negative, None)
+    du = factor.solve(rhs)
+    return Step((du + move).reshape(shape), factor.negative_eigenvalues, factor)

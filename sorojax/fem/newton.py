@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax.fem import assemble as asm
+from sorojax.fem.kept_factor import KeptFactor
 from sorojax.fem.line_search import overshoots, share_of_step
 from sorojax.fem.linear import Linearised, Prepared, linearise, step
 from sorojax.fem.problem import Problem
@@ -25,7 +26,7 @@ class Newton(eqx.Module):
     Args:
         residual_tolerance: Largest unbalanced force over the largest load or reaction.
         step_tolerance: Largest last update over the largest displacement.
-        max_iterations: Factorisations per load level.
+        max_iterations: Steps per load level.
     """
 
     residual_tolerance: float = 1e-9
@@ -42,6 +43,7 @@ class Iterate(NamedTuple):
     residual: float
     negative_eigenvalues: int
     reason: str
+    kept: KeptFactor | None = None
 
 
 def newton_solve(
@@ -51,19 +53,25 @@ def newton_solve(
     known_values: np.ndarray,
     settings: Newton,
     tangent: Linearised | None = None,
+    kept: KeptFactor | None = None,
 ) -> Iterate:
     """Equilibrium near `start`. `tangent`, of a neighbouring equilibrium, gives a first
-    guess at the price of one back-substitution, unless a load has kinks: the points that
-    an obstacle moved into have no stiffness yet."""
+    guess at the price of a few back-substitutions with the factor `kept` from there, unless
+    a load has kinks: the points that an obstacle moved into have no stiffness yet."""
     u, before = start, start
     state = _linearise(problem, prepared, u, before)
-    move = np.where(np.asarray(prepared.known), known_values - u.ravel(), 0.0)
+    known = np.asarray(prepared.known)
+    move = np.where(known, known_values - u.ravel(), 0.0)
     iterations, negative, size = 0, 0, np.inf
+    if kept is None:
+        kept = KeptFactor(known, problem.mesh.element.dim, settings.residual_tolerance)
     if tangent is not None and all(load.smooth for load in problem.loads):
-        du, negative = step(problem, prepared, tangent.values, state.residual, move)
+        near = kept.near(u, 1.0, 0.0)
+        du, negative, new = step(problem, prepared, tangent.values, state.residual, move, near)
+        kept.renew(new, u)
         if du is not None:
             u, before, state, size = _advance(problem, prepared, u, du)
-            move = np.where(np.asarray(prepared.known), known_values - u.ravel(), 0.0)
+            move = np.where(known, known_values - u.ravel(), 0.0)
     while True:
         norm, reference = float(state.residual_norm), float(state.reference)
         ratio = norm / reference if reference > 0 else norm
@@ -71,11 +79,13 @@ def newton_solve(
             return Iterate(u, None, iterations, ratio, negative, "an element inverts")
         small = ratio < settings.residual_tolerance or norm < float(state.rounding)
         if small and size < settings.step_tolerance and not np.any(move):
-            return Iterate(u, state, iterations, ratio, negative, "")
+            return Iterate(u, state, iterations, ratio, negative, "", kept)
         if iterations == settings.max_iterations:
             reason = f"no convergence in {iterations} Newton iterations"
             return Iterate(u, None, iterations, ratio, negative, reason)
-        du, negative = step(problem, prepared, state.values, state.residual, move)
+        near = kept.near(u, ratio, size)
+        du, negative, new = step(problem, prepared, state.values, state.residual, move, near)
+        kept.renew(new, u)
         if du is None:
             reason = problem.space.system.unsolved
             return Iterate(u, None, iterations, ratio, negative, reason)
@@ -84,7 +94,7 @@ def newton_solve(
             args = (problem, prepared.known, state.residual, jnp.asarray(u), jnp.asarray(du))
             du = float(share_of_step(*args)) * du
         u, before, state, size = _advance(problem, prepared, u, du)
-        move = np.where(np.asarray(prepared.known), known_values - u.ravel(), 0.0)
+        move = np.where(known, known_values - u.ravel(), 0.0)
         move[np.abs(move) <= 1e-12 * np.abs(known_values).max()] = 0.0
 
 

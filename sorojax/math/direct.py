@@ -109,20 +109,37 @@ class DirectSolver:
         converges at once; by a new factor otherwise."""
         values, b = np.asarray(values), np.asarray(b)
         with self._turn:
-            x, near = None, self._nearest(values)
-            if near is not None:
-                if self._product is None:
-                    self._product = SymmetricProduct(*self._pattern)
-                product = functools.partial(self._product, values)
-                x = refined(near, product, b)
+            near = self._nearest(values)
+            x = None if near is None else refined(near, self._product_with(values), b)
             return self._solve(values, b) if x is None else x
 
+    def solve_by(
+        self,
+        factor: Factor,
+        values: np.ndarray,
+        b: np.ndarray,
+        start: np.ndarray | None,
+        tolerance: float,
+    ) -> np.ndarray | None:
+        """x with A(values) x = b by `factor` of a neighbour, see `refined`; `None` where the
+        factor is gone or not near enough."""
+        with self._turn:
+            if all(factor is not own for _, own in self._slots.values()):
+                return None
+            return refined(factor, self._product_with(values), b, start, tolerance)
+
+    def _product_with(self, values: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        if self._product is None:
+            self._product = SymmetricProduct(*self._pattern)
+        return functools.partial(self._product, values)
+
     def _nearest(self, values: np.ndarray) -> Factor | None:
-        """The factor whose values differ least, by some of them."""
+        """The factor of a positive definite matrix whose values differ least, by some."""
         kept = [
             (np.max(np.abs(owner[::_FEW] - values[::_FEW]), initial=0.0), factor)
             for owner, factor in self._slots.values()
             if factor is not None and not isinstance(factor, IterativeFactor)
+            and factor.negative_eigenvalues == 0
         ]  # fmt: skip
         return min(kept, key=lambda pair: pair[0], default=(0.0, None))[1]
 
