@@ -33,7 +33,8 @@ def main(argv: list[str] | None = None) -> int:
     if arguments.quick:
         os.environ["SOROJAX_BENCH_QUICK"] = "1"  # for the processes of the cases
     chosen = {name: known[name] for name in names}
-    lines = _to_json(chosen, arguments.json) if arguments.json else _to_page(chosen)
+    left_out = [name for name in known if name not in chosen] if arguments.quick else []
+    lines = _to_json(chosen, arguments.json) if arguments.json else _to_page(chosen, left_out)
     failed = [x for x in lines if x["code"] == "sorojax" and "reason" in x["settings"]]
     return 1 if failed else 0
 
@@ -65,17 +66,20 @@ def _to_json(chosen: dict[str, Path], file: Path) -> list[dict[str, Any]]:
     return lines
 
 
-def _to_page(chosen: dict[str, Path]) -> list[dict[str, Any]]:
-    lines, start = [], time.monotonic()
+def _to_page(chosen: dict[str, Path], left_out: list[str]) -> list[dict[str, Any]]:
+    lines, took, start = [], {}, time.monotonic()
     print(page.HEADER)
     for name, path in chosen.items():
+        begin = time.monotonic()
         for line in run_case(name, path):
             print(page.text(line), flush=True)
             lines.append(line)
+        took[name] = time.monotonic() - begin
+        print(f"{name}: {took[name]:.0f} s", flush=True)
     folder = discover.HERE / "results"
     folder.mkdir(exist_ok=True)
     target = folder / "index.html"
-    target.write_text(page.html(lines))
+    target.write_text(page.html(lines, took, left_out))
     print(f"\n{len(chosen)} cases in {time.monotonic() - start:.0f} s: {target}")
     return lines
 

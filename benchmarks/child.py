@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from benchmarks.discover import load
+from benchmarks.harness import left_out
 from benchmarks.rows import dumps, line
 
 
@@ -41,6 +42,8 @@ def main(name: str, file: str, lines: str) -> None:
     with Path(lines).open("w") as out:
         for row in load(name, Path(file)).rows():
             print(dumps(line(name, row)), file=out, flush=True)
+        if last := left_out():
+            print(dumps(line(name, last)), file=out)
 
 
 if __name__ == "__main__":

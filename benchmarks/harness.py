@@ -7,10 +7,21 @@ from typing import Any
 
 from benchmarks.rows import Row as Row, Timing as Timing, missing as missing
 
+_left_out: dict[str, None] = {}  # in order, each once
 
-def quick() -> bool:
-    """Whether few sizes will do: `python -m benchmarks --quick`."""
-    return os.environ.get("SOROJAX_BENCH_QUICK") == "1"
+
+def quick(left_out: str = "") -> bool:
+    """Whether few sizes will do: `python -m benchmarks --quick`. The page then names under
+    the case what it leaves out."""
+    short = os.environ.get("SOROJAX_BENCH_QUICK") == "1"
+    if short and left_out:
+        _left_out[left_out] = None
+    return short
+
+
+def left_out() -> Row | None:
+    """The row that names what this quick run leaves out of the case."""
+    return Row("sorojax", {"left_out": list(_left_out)}) if _left_out else None
 
 
 def measure(
@@ -34,11 +45,13 @@ def measure(
 
 
 def measure_together(
-    functions: dict[str, Callable[..., Any]], *args: Any, repeats: int = 9
-) -> dict[str, Timing]:
+    functions: dict[str, Callable[..., Any]], *args: Any, repeats: int = 9,
+    results: dict[str, Any] | None = None,
+) -> dict[str, Timing]:  # fmt: skip
     """As `measure`, of several functions of the same arguments whose ratios matter.
 
-    They run in turn, there and back, so that all meet the same machine.
+    They run in turn, there and back, so that all meet the same machine. What they yield is
+    put into `results`.
     """
     import jax
 
@@ -47,7 +60,9 @@ def measure_together(
         start = time.perf_counter()
         compiled[name] = jax.jit(function).lower(*args).compile()
         compile_s[name] = time.perf_counter() - start
-        jax.block_until_ready(compiled[name](*args))
+        first = jax.block_until_ready(compiled[name](*args))
+        if results is not None:
+            results[name] = first
     order = list(functions)
     for _ in range(repeats):
         for name in order:

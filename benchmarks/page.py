@@ -2,7 +2,7 @@
 
 import os
 import platform
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from html import escape
 from importlib import metadata
@@ -70,33 +70,46 @@ def _settings(line: Line) -> str:
     return ", ".join(f"{k}={v}" for k, v in line["settings"].items() if k not in HIDDEN)
 
 
-def html(lines: list[Line]) -> str:
+def html(
+    lines: list[Line], took: Mapping[str, float] | None = None, left_out: Iterable[str] = ()
+) -> str:
     """The page: row by row of the report, a plot and a table per case, and what it was
-    measured on."""
+    measured on; with the seconds that cases took, and the cases that a quick run leaves out."""
     by_case: dict[str, list[Line]] = {}
     for line in lines:
         by_case.setdefault(line["case"], []).append(line)
+    took = took or {}
     groups = suite.grouped(by_case)
     parts = [tables.contents({row: [by_case[n] for n in g] for row, g in groups.items()})]
     for row, names in groups.items():
         parts.append(f'<h2 id="{tables.anchor(row)}">{escape(row)}</h2>')
-        parts.extend(_section(name, by_case[name]) for name in names)
+        parts.extend(_section(name, by_case[name], took.get(name)) for name in names)
     return (
         '<!doctype html><html lang="en"><meta charset="utf-8"><title>sorojax benchmarks'
         f"</title><style>{STYLE}</style><h1>Run time against error</h1>"
         f"<p>{escape(machine())}</p><p class=small>Medians over repeats on one pinned "
         "core, every case in its own process, every peer in its own environment. "
         "compile: XLA without a persistent cache, or the first call.</p>"
-        + "".join(parts) + tables.peers() + "</html>\n"
+        + _quick(left_out) + "".join(parts) + tables.peers() + "</html>\n"
     )  # fmt: skip
 
 
-def _section(name: str, lines: list[Line]) -> str:
+def _quick(left_out: Iterable[str]) -> str:
+    names = ", ".join(left_out)
+    text = f"A quick run: cases left out are {names}; sizes left out are named by case."
+    return f"<p class=small>{escape(text)}</p>" if names else ""
+
+
+def _section(name: str, lines: list[Line], took: float | None) -> str:
+    notes = [text for line in lines for text in line["settings"].get("left_out", ())]
+    lines = [line for line in lines if "left_out" not in line["settings"]]
     references = {str(x["reference"]) for x in lines if x["reference"]}
     against = f"Error against: {'; '.join(sorted(references))}." if references else ""
     special = tables.features(lines, seconds) or tables.scaling(lines, seconds)
     body = _plots(lines) + (special or f'<div class="wide">{_table(lines)}</div>')
-    return f"<h3>{escape(name)}</h3><p>{escape(against)}</p>{body}"
+    head = name if took is None else f"{name} ({took:.0f} s)"
+    left = f"<p class=small>Left out of a quick run: {escape('; '.join(notes))}.</p>"
+    return f"<h3>{escape(head)}</h3><p>{escape(against)}</p>{body}{left if notes else ''}"
 
 
 def _plots(lines: list[Line]) -> str:

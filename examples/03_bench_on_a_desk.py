@@ -3,9 +3,10 @@ camera, markers found in its pictures, a filter of the finger's shape, and a loo
 the tip.
 
 On a real bench `TcpBoard`, a `VideoCamera` in `Latest` and `WallClock` take the places of
-`LocalBoard`, `DrawnCamera` and `SimulatedClock`; the rest stays.
+`simulated_board`, its clock and `DrawnCamera`; the rest stays.
 """
 
+import functools
 import sys
 from pathlib import Path
 
@@ -15,18 +16,10 @@ import numpy as np
 
 import sorojax as sj
 from sorojax import vision
-from sorojax.math.steppers import GeneralisedAlpha, start
 from sorojax.units import kPa, mm
-from sorojax_board.board import settings
-from sorojax_hardware import (
-    DrawnCamera,
-    LocalBoard,
-    ModelValves,
-    SimulatedClock,
-    run_loop,
-)
+from sorojax_hardware import DrawnCamera, run_loop, simulated_board
 
-RATE, FRAMES = 100.0, 30.0  # Hz, of the loop and of the camera
+RATE, LIMITS = 100.0, (-20 * kPa, 60 * kPa)  # Hz, of the loop
 S = np.array([0.25, 0.5, 0.75, 1.0])  # markers
 SCALE, CORNER = 6000.0, np.array([60.0, 120.0])  # px per metre, px
 COLOURS = (vision.RED, vision.GREEN, vision.BLUE, vision.RED)
@@ -46,75 +39,47 @@ def loads(modes: int, pressure):
     return (sj.rod.Gravity([0.0, -9.81]), sj.rod.Damping(0.02), chamber)
 
 
-def robot():
-    """What is on the bench: six modes, 5 % stiffer than the model, a valve with a lag."""
-    finger, step = make_finger(6, 1.05), GeneralisedAlpha()
-
-    @jax.jit
-    def advance(state, setpoint, dt):
-        q, v, pressure = state
-        pressure = pressure + (setpoint - pressure) * (1 - jnp.exp(-dt / 0.03))
-        problem = sj.rod.second_order(finger, q, loads(6, pressure[0]))
-        zero = jnp.zeros(())
-        new = step.step(problem, zero, dt, start(problem, zero, q, v))
-        return (new.q, new.v, pressure), pressure
-
-    rest = (jnp.zeros(6), jnp.zeros(6), jnp.zeros(1))
-    advance(rest, np.zeros(1), 0.005)[1].block_until_ready()
-    places = jax.jit(lambda q: sj.rod.forward_kinematics(finger, q, S)[:, :2, 2])
-    places(rest[0]).block_until_ready()
-    return ModelValves(advance, rest, 1), places
-
-
 def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
-    model = make_finger(3)
+    # on the bench: six modes, 5 % stiffer than the model, valves with a lag
+    model, finger = make_finger(3), make_finger(6, stiffer=1.05)
+    robot = sj.robots.rod_stepper(finger, functools.partial(loads, 6), lag=0.03)
+    board, valves = simulated_board(*robot, LIMITS)
+    places = jax.jit(lambda q: sj.rod.forward_kinematics(finger, q, S)[:, :2, 2])
+    random, kinds, width = np.random.default_rng(0), np.array([0, 1, 2, 0]), np.full(4, 9.0)
+
+    def pixels():
+        return np.asarray(places(valves.state.q)) * SCALE + CORNER
+
+    def draw(_):
+        canvas = vision.draw_discs(vision.background(640, 480), pixels(), width, kinds)
+        return vision.photograph(canvas, vision.Disturbance(), random)
+
+    camera = DrawnCamera(draw, board.clock, rate=30.0)
+    first = vision.Discs(pixels(), width, kinds)
+    seen = vision.MarkerStream(camera, first, COLOURS, lambda px: (px - CORNER) / SCALE)
     estimator = sj.systems.ShapeFilter(
         sj.systems.Markers(model, S), 1 / RATE, marker_noise=1e-4, force_noise=0.02
     )
-    valves, places = robot()
-    random, clock = np.random.default_rng(0), SimulatedClock()
-    kinds, width = np.array([0, 1, 2, 0]), np.full(4, 9.0)
-
-    def draw(_):
-        pixels = np.asarray(places(valves.state[0])) * SCALE + CORNER
-        canvas = vision.draw_discs(vision.background(640, 480), pixels, width, kinds)
-        return vision.photograph(canvas, vision.Disturbance(), random)
+    shape, log = sj.systems.start_filter(estimator), []
 
     @jax.jit
-    def update(last, seen, p):
-        return sj.systems.update_filter(estimator, last, seen, forces=loads(3, p))
+    def update(last, markers, pressure):
+        new = sj.systems.update_filter(estimator, last, markers, forces=loads(3, pressure))
+        return new, sj.rod.tip_pose(model, new.q)[1, 2]
 
-    tip = jax.jit(lambda q: sj.rod.tip_pose(model, q)[1, 2])
-    nothing, log = np.full((4, 2), np.nan), []
-    seen = np.asarray(places(valves.state[0])) * SCALE + CORNER
-    tracks = vision.start_tracks(vision.Discs(seen, width, kinds))
-    memory = [sj.systems.start_filter(estimator), tracks, 0]
-    camera = DrawnCamera(draw, clock, rate=FRAMES)
+    target = sj.systems.Sine(10 * mm, frequency=0.5, offset=15 * mm)
+    low, high = LIMITS
+    pid = sj.systems.PID(3e5, integral_gain=4e6, reference=target, low=low, high=high)  # Pa/m
 
     def measure(t, pressure):
-        image, markers = camera.read(), nothing
-        if image is not None:
-            memory[2] += 1
-            memory[1] = vision.follow(image.colour, memory[1], COLOURS)
-            markers = (memory[1].discs.centre - CORNER) / SCALE
-        memory[0] = update(memory[0], markers, float(pressure[0]))
-        height = float(tip(memory[0].q))
-        log.append((t, target(t), height, float(places(valves.state[0])[-1, 1])))
+        nonlocal shape
+        shape, height = update(shape, seen.read(), pressure)
+        log.append((t, target(t), height, places(valves.state.q)[-1, 1]))
         return height
 
-    def target(t):
-        return 15 * mm + 10 * mm * np.sin(2 * np.pi * 0.5 * t)
-
-    def controller(t, height, integral):
-        error = target(t) - height
-        integral = integral + error / RATE
-        return 3e5 * error + 4e6 * integral, integral  # Pa
-
-    board = LocalBoard(settings(1, low=-20 * kPa, high=60 * kPa), valves, clock)
-    board.arm()
     for _ in run_loop(
-        board, clock, controller, 0.0, duration=2.5 if quick else 6.0, period=1 / RATE,
-        limits=(-20 * kPa, 60 * kPa), measure=measure,
+        board, board.clock, jax.jit(lambda *now: pid(*now)), pid.start(0.0, 0.0),
+        period=1 / RATE, limits=LIMITS, duration=2.5 if quick else 6.0, measure=measure,
     ):  # fmt: skip
         pass
     t, wanted, told, true = np.array(log).T
@@ -124,7 +89,7 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
     return {
         "estimate off the true tip [mm rms]": 1e3 * rms((told - true)[settled]),
         "tip off its target [mm rms]": 1e3 * rms((true - wanted)[settled]),
-        "pictures used": float(memory[2]),
+        "pictures used": float(seen.images),
     }
 
 
@@ -154,5 +119,6 @@ def plot(t, wanted, told, true, frame, file: Path) -> None:
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
     sj.enable_compilation_cache()
+    sj.enable_low_latency()
     for name, value in main(picture=sys.argv[1] if len(sys.argv) > 1 else None).items():
         print(f"{name:<36} {value:.4g}")

@@ -17,103 +17,69 @@ import numpy as np
 
 import sorojax as sj
 from sorojax import robots, rod, systems
-from sorojax.math.contact_stepper import ContactMidpoint
-from sorojax.math.lie import homogeneous
 from sorojax.units import kPa, mm
-from sorojax_board.board import Settings
-from sorojax_board.messages import Limits
-from sorojax_hardware import LocalBoard, ModelValves, SimulatedClock, run_loop
+from sorojax_hardware import run_loop, simulated_board
 
 RADIUS, HEIGHT, MASS, TARGET = 20 * mm, 40 * mm, 0.045, 29.7 * mm
 BEAM, SPINE = 167.5 * mm, 7.2 * mm  # height of the base; from the axis of a finger to its face
 FINGERS = tuple(f"finger_{k}" for k in range(3))
 GRIP = sj.contact.LinePenalty(stiffness=3e7, smoothing=5e-6, friction=0.8, slip=1e-4)
 FLOOR = sj.contact.LinePenalty(stiffness=1e8, smoothing=5e-6, friction=0.8, slip=1e-4)
-PERIOD, TICK = 4e-3, 1e-2  # s, of the model and of the loop
-# seconds, place of the finger tips x, z [mm], pressure in the gripper [kPa]; the arm tilts as
-# it reaches out, and the cylinder stands up 8 mm farther out than the tips let it go
+PERIOD = 4e-3  # s, of the model
+# seconds, place of the finger tips x, y, z [mm], pressure in the gripper [kPa]; the arm tilts
+# as it reaches out, and the cylinder stands up 8 mm farther out than the tips let it go
 WAY = np.array([
-    [0.0, 0, 47, -30], [0.5, 0, 30.5, -30], [0.7, 0, 30.5, -30], [0.9, 0, 30.5, 60],
-    [1.1, 0, 30.5, 60], [1.6, 0, 40, 60], [2.4, 22, 41, 60], [2.7, 22, 41, 60],
-    [3.3, 22, 33.3, 60], [3.6, 22, 33.3, 60], [3.8, 22, 33.3, -30], [3.9, 22, 33.3, -30],
-    [4.7, 22, 45, -30], [4.9, 22, 45, -30],
+    [0.0, 0, 0, 47, -30], [0.5, 0, 0, 30.5, -30], [0.7, 0, 0, 30.5, -30], [0.9, 0, 0, 30.5, 60],
+    [1.1, 0, 0, 30.5, 60], [1.6, 0, 0, 40, 60], [2.4, 22, 0, 41, 60], [2.7, 22, 0, 41, 60],
+    [3.3, 22, 0, 33.3, 60], [3.6, 22, 0, 33.3, 60], [3.8, 22, 0, 33.3, -30],
+    [3.9, 22, 0, 33.3, -30], [4.7, 22, 0, 45, -30], [4.9, 22, 0, 45, -30],
 ])  # fmt: skip
 
 
 def scene(size):
     """The robot with air and valves, hung over a cylinder on the floor, and the contacts."""
-    made = robots.model(robots.Manipulator(), size=size)
-    body = made.network.blocks["body"]
-    down = homogeneous(jnp.diag(jnp.array([1.0, -1.0, -1.0])), jnp.array([0.0, 0.0, BEAM]))
-    parts = dict(zip(body.assembly.names, body.assembly.parts, strict=True))
-    parts["arm"] = sj.replace(
-        parts["arm"], lambda part: part.offset, down @ parts["arm"].offset
-    )
-    thing = rod.Part(robots.cylinder(MASS, RADIUS, HEIGHT), rod.Free())
-    whole = rod.assembly(sj.SE3(), **parts, cylinder=thing)
+    thing, floor = robots.standing_cylinder(MASS, RADIUS, HEIGHT, FLOOR)
     touch = rod.LinkContact(sj.sdf.Cylinder(RADIUS, HEIGHT), SPINE, GRIP, points=16)
-    ground = sj.sdf.HalfSpace([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
-    floor = rod.LinkObstacle(ground, *robots.rim(RADIUS, -HEIGHT / 2), FLOOR)
     contacts = *(rod.Between(f, "cylinder", touch) for f in FINGERS), rod.On("cylinder", floor)
-    q = rod.rest(whole).at[-1].set(HEIGHT / 2)
-    hung = systems.AssemblyBody(whole, (*body.forces, *contacts), q=q)
-    return sj.replace(made, lambda made: made.network.blocks["body"], hung), contacts
+    made, up = robots.model(robots.Manipulator(), size=size), robots.upside_down(BEAM)
+    return robots.surrounded(made, contacts, mount=up, cylinder=thing), contacts
 
 
 def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, float]:
     made, contacts = scene(1.2 * mm if quick else None)
-    whole, states = made.assembly, []
-    grip = ContactMidpoint(passes=1, lasting=True, theta=1.0, tolerance=1e-4)
-    move, start = systems.partitioned(made.network, PERIOD, substeps=2, stepper=grip)
+    whole, limits = made.assembly, (made.low, made.high)
+    moving = robots.contact_stepper(made, PERIOD)
+    board, valves = simulated_board(*moving, limits, period=PERIOD, dead_time=4e-3, keep=True)
+    # Pa for a metre, from a jog of the robot: how far [um/Pa] each bellows moves the tips
+    back = 1e6 * np.linalg.inv([[-1.35, 0.675, 0.675], [0, 1.169, -1.169], 3 * [-0.2315]])
+    tips = jax.jit(lambda q: robots.middle(whole, q, [f"{name}_tip" for name in FINGERS]))
+    home = tips(valves.state.q)
 
-    def advance(now, setpoint, dt):
-        states.append(now.state["body"])
-        now = move(now, made.inputs(jnp.asarray(setpoint)))
-        return now, made.pressure(now.state)
+    def asked(place, gripper):
+        """Pressures that would bring the tips from their first place to another."""
+        return jnp.append(back @ (place - home), gripper)
 
-    @jax.jit
-    def tips(q):
-        poses = rod.tip_pose(whole, q)
-        return jnp.mean(jnp.stack([poses[f"{name}_tip"][:3, 3] for name in FINGERS]), axis=0)
-
-    way = systems.Waypoints(WAY[:, 0], WAY[:, 1:] * [mm, mm, kPa], smooth=True)
-    low, high = np.asarray(made.low), np.asarray(made.high)
-    valves = ModelValves(advance, start, 4, period=PERIOD, dead_time=4e-3)
-    clock = SimulatedClock()
-    limits = tuple(Limits(*map(float, bounds), 2e6) for bounds in zip(low, high, strict=True))
-    board = LocalBoard(Settings(limits), valves, clock)
-    board.arm()
-    # m/Pa by which one bellows after the other moves the tips, from a jog of the robot
-    around = 2 * np.pi / 3 * np.arange(3)
-    bends = np.stack([-1.35 * np.cos(around), 1.35 * np.sin(around), np.full(3, -0.2315)])
-    back, home = np.linalg.inv(1e-6 * bends), np.asarray(tips(start.state["body"]["q"]))
-
-    def controller(t, place, sum_):
-        x, z, gripper = np.asarray(way(jnp.asarray(t)))
-        goal = np.array([x, 0.0, z])
-        wanted = back @ (goal - home + sum_)
-        given = np.clip(wanted, low[:3], high[:3])
-        sum_ = (
-            sum_ + 5.0 * TICK * (goal - place) - 0.4 * np.linalg.pinv(back) @ (wanted - given)
-        )
-        return np.append(given, gripper), sum_
-
+    way = jax.vmap(asked)(WAY[:, 1:4] * mm, WAY[:, 4] * kPa)
+    pid = systems.PID(
+        0.0, integral_gain=[5.0, 5.0, 5.0, 0.0], feed_forward=1.0, tracking_time=0.025,
+        reference=systems.Waypoints(WAY[:, 0], way, smooth=True), low=made.low, high=made.high,
+    )  # fmt: skip
     ticks = list(run_loop(
-        board, clock, controller, np.zeros(3), duration=WAY[-1, 0], period=TICK,
-        limits=(low, high), measure=lambda *_: tips(valves.state.state["body"]["q"]),
+        board, board.clock, jax.jit(lambda *now: pid(*now)), pid.start(0.0, jnp.zeros(4)),
+        duration=WAY[-1, 0], period=1e-2, limits=limits,
+        measure=lambda *_: asked(tips(valves.state.q), 0.0),
     ))  # fmt: skip
 
-    film = jax.tree.map(lambda *rows: jnp.stack(rows), *states)
-    seen = systems.touching(whole, contacts, film["q"], film["v"])
+    film = robots.replay(whole, valves.states)
+    seen = systems.touching(whole, contacts, film.q, film.v)
     *fingers, floor = np.asarray(seen.overlap).T
     force = np.asarray(seen.effort)[:, : len(fingers), -1].sum(axis=1)  # what lifts it
-    poses = jax.jit(jax.vmap(lambda q: rod.tip_pose(whole, q)))(film["q"])
-    thing, plate = (np.asarray(poses[name]) for name in ("cylinder", "plate"))
-    place, up, time = thing[:, :3, 3], thing[:, 2, 2], PERIOD * np.arange(len(states))
+    thing, plate = film.poses["cylinder"], film.poses["plate"]
+    place, up, time = thing[:, :3, 3], thing[:, 2, 2], PERIOD * np.arange(len(thing))
     free = (floor < -0.1 * mm) & (time < 3.7)
     held = np.einsum("tij,ti->tj", plate[:, :3, :3], place - plate[:, :3, 3])[free]
     if picture is not None:
-        draw(whole, film["q"], time, place, force, ticks, picture)
+        draw(whole, film.q, time, place, force, ticks, picture)
     return {
         "lift [mm]": -floor[free].min() / mm,
         "contact forces over weight, carried": force[free].mean() / (9.81 * MASS),
@@ -121,7 +87,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
         "farthest tilt [deg]": np.degrees(np.arccos(up.min())),
         "place off its target [mm]": np.linalg.norm(place[-1, :2] - [TARGET, 0.0]) / mm,
         "tilt at the end [deg]": np.degrees(np.arccos(min(1.0, up[-1]))),
-        "speed at the end [mm/s]": np.linalg.norm(film["v"][-1, -3:]) / mm,
+        "speed at the end [mm/s]": np.linalg.norm(film.v[-1, -3:]) / mm,
         "overlap with fingers, greatest [mm]": np.max(fingers) / mm,
         "overlap with the floor, greatest [mm]": floor.max() / mm,
         "gripper lets go [mm]": -np.max(fingers, axis=0)[-1] / mm,

@@ -21,7 +21,6 @@ from jaxtyping import Array
 import sorojax as sj
 from sorojax import robots, rod, systems
 from sorojax.math.contact_stepper import ContactMidpoint
-from sorojax.math.lie import homogeneous
 from sorojax.units import mm
 
 GRASP, WALK = 0.03, 0.02  # N m
@@ -56,7 +55,7 @@ def lowered(t):
 
 
 @eqx.filter_jit
-def run(joint, radius, length, depth, mass, chambers, step, saves):
+def run(joint, radius, length, depth, mass, command, step, saves):
     """The robot, its motion, and the contact force [N] or moment [N m] that the thing takes
     along the axis, the mean of the last 50 steps."""
     finger = rod.rod(
@@ -64,12 +63,11 @@ def run(joint, radius, length, depth, mass, chambers, step, saves):
         young_modulus=1e6, poisson_ratio=0.3, density=2000, nodes=6,
     )  # fmt: skip
     fingers = robots.ring(finger, 4, 37.5 * mm)
-    hung = homogeneous(jnp.eye(3), jnp.stack([0 * depth, 0 * depth, -depth]))
-    thing = rod.Part(robots.cylinder(mass, radius, length), joint, offset=hung)
+    thing = rod.Part(robots.cylinder(mass, radius, length), joint, offset=robots.below(depth))
     model = rod.assembly(sj.SE3(), **fingers, thing=thing)
     touch = rod.LinkContact(sj.sdf.Cylinder(radius, length), 6 * mm, GRIP, points=24)
     touches = tuple(rod.Between(name, "thing", touch) for name in fingers)
-    air = rod.Varying(functools.partial(rod.PointWrench, follower=True), chambers)
+    air = rod.Varying(functools.partial(rod.PointWrench, follower=True), Chambers(*command))
     own = [rod.On(name, force) for name in fingers for force in (rod.Gravity(), air)]
     weight = rod.On("thing", rod.Varying(rod.Gravity, lowered))
     q, v = rod.rest(model), jnp.zeros(rod.num_dof(model))
@@ -84,8 +82,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     saves, told, films = round(seconds / step), {}, {}
 
     def do(name, joint, size, *command):
-        chambers = Chambers(*jnp.array(command))
-        films[name] = (*run(joint, *jnp.array(size), chambers, step, saves), size)
+        films[name] = (*run(joint, *jnp.array(size), jnp.array(command), step, saves), size)
         return films[name][1:3]
 
     for name, size in THINGS.items():

@@ -21,14 +21,13 @@ from sorojax.units import MPa, mm
 SAVED = 8e-3  # s between saved moments
 STIFFNESS, DAMPING, HALF = 240.0, 18.0, 10 * mm  # N/m, N s/m, thickness over two
 LOW, HIGH = np.array([243.3, 265.2]), np.array([400.6, 92.1])  # ends of the wall [mm]
-FIRST, FROM, TO = [167.0, 28.0], [167.0, 24.0], [45.0, 24.0]  # along the chord, from it [mm]
+FIRST, FROM, TO = np.array([[167.0, 28.0], [167.0, 24.0], [45.0, 24.0]])  # on the chord [mm]
 APPROACH, SLIDE = 1.0, 3.5  # s
 
 
 def on_chord(x):
     """Points of the plane [m] from places along the chord of the wall and off it [mm]."""
     along = (HIGH - LOW) / np.linalg.norm(HIGH - LOW)
-    x = np.asarray(x)
     return jnp.asarray((LOW + x[..., :1] * along + x[..., 1:] * [along[1], -along[0]]) * mm)
 
 
@@ -38,16 +37,15 @@ def wall():
     x = np.linspace(0, chord, 65)
     ends = np.sin(np.clip(np.minimum(x, chord - x) / 30.5, 0, 1) * np.pi / 2)
     bulge = ends * (20.5 + 5.5 * np.cos(2 * np.pi * (x - chord / 2) / 61))
-    outline = [*np.stack([x, bulge], 1), [chord, -50.0], [0.0, -50.0]]
+    outline = np.concatenate([np.stack([x, bulge], 1), [[chord, -50.0], [0.0, -50.0]]])
     return sj.sdf.Polygon(on_chord(outline))
 
 
 def arm():
-    segments = sj.rod.piecewise_constant(kappa_z=6)
     return sj.rod.rod(
-        sj.SE2(), segments, sj.rod.rectangle(60 * mm, 2 * HALF), length=378 * mm,
-        young_modulus=5 * MPa, poisson_ratio=0.33, density=0.334 / (63 * 60 * 20 * mm**3),
-        nodes=12,
+        sj.SE2(), sj.rod.piecewise_constant(kappa_z=6), sj.rod.rectangle(60 * mm, 2 * HALF),
+        length=378 * mm, young_modulus=5 * MPa, poisson_ratio=0.33,
+        density=0.334 / (63 * 60 * 20 * mm**3), nodes=12,
     )  # fmt: skip
 
 
@@ -63,8 +61,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
         """Pulls the tip straight at the wall until `switch` [s], then along it."""
         way = sj.systems.Waypoints([0.0, APPROACH], [tip, on_chord(FIRST)])
         places = [tip, way(switch), on_chord(FROM), on_chord(TO)]
-        times = jnp.array([0.0, switch, switch, switch + SLIDE])
-        goal = sj.systems.Waypoints(times, jnp.stack(places))
+        goal = sj.systems.Waypoints([0.0, switch, switch, switch + SLIDE], places)
         return sj.systems.CartesianImpedance(rod, (lossy,), goal, STIFFNESS, DAMPING)
 
     def run(law, seconds):
@@ -80,10 +77,8 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     path = run(control, 6.0)
     seen = sj.systems.touching(rod, (touch,), path.q, path.v)
 
-    goal = jax.vmap(control.reference)(path.time)
-    tips = jax.vmap(lambda q: sj.rod.tip_pose(rod, q)[:2, 2])(path.q)
+    goal, tips, effort = sj.systems.followed(control, path)
     off = sj.sdf.project(sj.sdf.offset(solid, HALF), goal) - tips
-    effort = jax.vmap(control.effort)(path.time, path.q, path.v)
     off, effort, push = (np.linalg.norm(x, axis=1) for x in (off, effort, seen.push[:, 0]))
     time, asked = np.asarray(path.time), STIFFNESS * np.linalg.norm(goal - tips, axis=1)
     if picture is not None:

@@ -25,27 +25,8 @@ from sorojax import fem, reduction
 from sorojax.units import kPa, mm
 
 DOWN = [9.81, 0.0]  # m/s^2, along the actuator
-STEPS = 20  # of the search, per frame
 PUSH = 0.012  # N, greatest, on each of three bellows
-NOISE = 0.1 * mm  # of the marker, per axis
 SHAKEN = (2, 4, 7)  # the third, fifth and eighth bellow
-
-
-def solid(actuator, size):
-    """The actuator in air, with forces on the backs of some bellows."""
-    mesh = sj.mesh.triangulate(actuator.body(), size=size, order=2)
-    backs = (sj.mesh.nodes_on_line(mesh, *actuator.back(k)) for k in SHAKEN)
-    pushes = (fem.Force(nodes, [0.0, 0.0], name=f"push_{k}") for k, nodes in enumerate(backs))
-    return fem.problem(
-        mesh, sj.material.presets.dragon_skin_30(),
-        kinematics=fem.PlaneStrain(thickness=20 * mm),
-        supports=(fem.Fixed(sj.mesh.nodes_where(mesh, lambda p: p[0] < 1e-9)),),
-        loads=(
-            fem.Pressure(sj.mesh.facets_on(mesh, actuator.chambers()), name="air"),
-            fem.Gravity([0.0, 0.0]),
-            *pushes,
-        ),
-    )  # fmt: skip
 
 
 def hanging(problem, pressure, pushes=np.zeros(3), start=None):  # noqa: B008
@@ -57,7 +38,9 @@ def hanging(problem, pressure, pushes=np.zeros(3), start=None):  # noqa: B008
 
 def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, float]:
     actuator = sj.robots.BellowsActuator(num_bellows=9)
-    problem = solid(actuator, (2.0 if quick else 1.2) * mm)
+    mesh = sj.mesh.triangulate(actuator.body(), size=(2.0 if quick else 1.2) * mm, order=2)
+    rubber = sj.material.presets.dragon_skin_30()
+    problem = sj.robots.bellows_problem(actuator, mesh, rubber, gravity=[0, 0], pushed=SHAKEN)
     path = fem.solve_path(problem, air=jnp.linspace(0, 6 * kPa, 6))
     line = reduction.Line([0.0, 1 * mm], [actuator.length, 1 * mm])
 
@@ -69,8 +52,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     taught = backbones([*path.displacements, *(hanging(problem, p) for p in path.values[::5])])
     basis = reduction.pod_basis(taught, modes={"kappa_z": 3, "sigma_x": 1})
     fit = reduction.identify(path, basis, reduction.strain_along(path, line), line, degree=3)
-    rubber = sj.rod.elastic(problem.material)
-    rod = sj.rod.rod(sj.SE2(), basis, fit.section, rubber, length=fit.length)
+    rod = sj.rod.rod(sj.SE2(), basis, fit.section, sj.rod.elastic(rubber), length=fit.length)
 
     random, frames = np.random.default_rng(1), 24 if quick else 60
     pressure = 6 * kPa * np.clip(np.sin(np.linspace(0, 2 * np.pi, frames)), 0, 1)
@@ -81,14 +63,14 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
         shapes.append(hanging(problem, p, f, shapes[-1]))
     truth = backbones(shapes[1:])
     true = np.asarray(truth.positions)
-    tip = true[:, -1] + NOISE * random.standard_normal((frames, 2))
+    tip = true[:, -1] + 0.1 * mm * random.standard_normal((frames, 2))  # the marker
     heavy = reduction.offset_weight(problem, line, DOWN)
 
     @functools.partial(jax.jit, static_argnums=0)
     def estimate(balanced, q, tip, pressure):
         forces = (fit.elastic, heavy, sj.rod.Pressurised(fit.pressure, pressure))
         target, given = sj.rod.Position(tip), {"forces": forces} if balanced else {}
-        q = sj.rod.inverse_kinematics(rod, target, q, iterations=STEPS, **given).q
+        q = sj.rod.inverse_kinematics(rod, target, q, iterations=20, **given).q
         return q, sj.rod.forward_kinematics(rod, q, truth.s)[:, :2, 2]
 
     lines, spent = [], []
@@ -148,6 +130,7 @@ def draw(true, tip, balanced, alone, with_task, without, file) -> None:
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
     sj.enable_compilation_cache()
+    sj.enable_low_latency()
     quick = "--quick" in sys.argv
     file = None if quick else Path(__file__).with_suffix(".png")
     for name, value in main(quick, file).items():

@@ -24,6 +24,12 @@ enable_compilation_cache()
 _MAX_MAPPINGS = 15_000
 
 
+def pytest_collection_finish(session):
+    """Tracing makes so many objects that looking for garbage takes a sixth of the time;
+    looked for less often, a hundredth."""
+    gc.set_threshold(100_000, 20, 20)
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _bounded_number_of_programs():
     """Every compiled program holds memory mappings, of which Linux allows 65,530 a process;

@@ -10,7 +10,9 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 CORE, HARDWARE = ROOT / "sorojax", ROOT / "hardware"
-BASEMENT = {"units", "_types", "_check", "_display", "_edit", "_progress", "_cache"}
+BASEMENT = {
+    "units", "_types", "_check", "_display", "_edit", "_progress", "_cache", "_latency",
+}  # fmt: skip
 FLOOR = {
     "math": 0,
     **dict.fromkeys(("sdf", "material"), 1),

@@ -40,12 +40,23 @@ def rows():
 '''
 
 
+SHORT = '''"""Of two sizes, one in a quick run."""
+from benchmarks.harness import Row, quick
+
+def rows():
+    for size in (1,) if quick("size <2>") else (1, 2):
+        yield Row("sorojax", {"size": size}, run_s=1.0)
+    quick("size <2>")  # said once
+'''
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("SOROJAX_PEERS", str(tmp_path / "no peers"))
     (tmp_path / "cases").mkdir()
     (tmp_path / "cases" / "math_product.py").write_text(CASE)
     (tmp_path / "cases" / "math_broken.py").write_text(BROKEN)
+    (tmp_path / "cases" / "math_short.py").write_text(SHORT)
     return tmp_path / "cases"
 
 
@@ -202,3 +213,19 @@ def test_a_quick_run_tells_its_cases(monkeypatch):
     assert not harness.quick()
     monkeypatch.setenv("SOROJAX_BENCH_QUICK", "1")
     assert harness.quick()
+
+
+def test_what_a_quick_run_leaves_out_is_on_the_page(folder, monkeypatch):
+    """Sizes of a case, and whole cases; nothing in a full run."""
+    monkeypatch.delenv("SOROJAX_BENCH_QUICK", raising=False)
+    full = run(folder, "math.short")[1]
+    assert [x["settings"] for x in full] == [{"size": 1}, {"size": 2}]
+    assert "Left out" not in page.html(full) and "quick run" not in page.html(full)
+    monkeypatch.setenv("SOROJAX_BENCH_QUICK", "1")
+    one, left = run(folder, "math.short")[1]
+    assert one["settings"] == {"size": 1} and left["settings"] == {"left_out": ["size <2>"]}
+    assert left["holds"] is None and left["run_s"] is None
+    text = page.html([one, left], {"math.short": 3.2}, ["math.product"])
+    assert "Left out of a quick run: size &lt;2&gt;." in text
+    assert "cases left out are math.product" in text and "math.short (3 s)" in text
+    assert text.count("<tr><td>sorojax</td>") == 1  # the note is no row of the table

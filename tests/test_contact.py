@@ -82,6 +82,12 @@ def test_what_is_far_is_never_inside(getkey):
     skipped = jax.vmap(lambda cloud: contact.far(ball, cloud))(clouds)
     assert 0 < jnp.sum(skipped) < 200
     assert jnp.all(jnp.min(ball(clouds), axis=1)[skipped] > 0)
+    # nor if it moves by less than what it has room for
+    room = jax.vmap(lambda cloud: contact.clearance(ball, cloud, jnp.array(1e-3)))(clouds)
+    way = jax.random.normal(getkey(), clouds.shape)
+    way = 0.999 * room[:, None, None] * way / jnp.linalg.norm(way, axis=2, keepdims=True)
+    assert jnp.any(room > 0)
+    assert jnp.all(jnp.min(ball(clouds + way), axis=1)[room > 0] > 1e-3)
 
 
 def _block(stiffness=None):

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from sorojax import contact, fem, material, mesh, sdf
+from sorojax.fem.contact_start import moving
+from sorojax.fem.step_state import StepState
 from sorojax.units import mm
 
 FRICTION, WEIGHT, LENGTH, DEPTH = 0.5, 981.0, 20 * mm, 0.03  # [-], N/m^3, m, m
@@ -185,6 +187,33 @@ def free_block() -> fem.Problem:
         formulation=fem.Displacement(),
         free=True,
     )
+
+
+@eqx.filter_jit
+def _begun(problem, u) -> fem.Contact:
+    """The contact of a block in a step from displacement `u`."""
+    one, floor = jnp.ones(()), problem.loads[1]
+    step = StepState(u, u, u, one, u, one, one, jnp.array(2 / 3))
+    return moving(floor, problem.mesh, floor.value).begun(problem, step)
+
+
+def test_a_step_knows_how_far_points_may_move_before_they_touch():
+    problem, rest = free_block(), jnp.zeros((10, 2))
+    tilted = rest.at[:, 1].set(3 * mm + 0.1 * problem.mesh.points[:, 0])
+    above = _begun(problem, tilted)
+    gaps = jnp.min(above.points_of(problem, tilted)[..., 1], axis=1)
+    assert above.start is not None
+    assert jnp.all((above.start.clear > 0) & (above.start.clear <= gaps * (1 + 1e-12)))
+    room = above.room(problem)
+    assert 0 < room <= 2 / 3 * jnp.min(gaps)
+    # no force within, one a little beyond what the nearest point has
+    for share, acts in ((0.999, False), (1.6, True)):
+        lower = tilted.at[:, 1].add(-share * (2 / 3 * jnp.min(gaps) if acts else room))
+        force = jax.grad(above.potential, argnums=1)(problem, lower)
+        assert bool(jnp.any(force != 0)) == acts
+    down = _begun(problem, rest.at[:, 1].set(-1e-5))
+    assert down.start is not None
+    assert jnp.all(down.start.clear == 0) and down.room(problem) <= 0
 
 
 @pytest.mark.stress(43)

@@ -97,6 +97,19 @@ def test_a_conserving_method_keeps_the_energy_of_a_bouncing_ring():
     assert float(motion.energies.loads.max()) > 0.01 * energy[0]  # it was in contact
 
 
+@pytest.mark.parametrize("rho_inf", [0.5, 0.8, 1.0])
+def test_friction_gives_its_share_of_an_impulse_that_steps_do_not_resolve(rho_inf):
+    """The ring touches for seven of them."""
+    friction = 0.1
+    method = fem.GeneralisedAlpha(rho_inf)
+    motion = bounce(ring(friction), 0.02, 1e-3, (1.0, -0.5), 0.0, method=method)
+    assert 5 <= np.sum(pressure(motion.states).max(axis=(1, 2)) > 0) <= 9
+    linear = np.asarray(fem.momentum(motion)[0])
+    along, across = linear[-1] - linear[0]
+    across += 9.81 * float(fem.total_mass(motion.problem) * motion.times[-1])
+    np.testing.assert_allclose(-along, friction * across, rtol=1e-5)
+
+
 def plate(obstacle, young_modulus, stiffness=None) -> fem.Problem:
     """A plate of 20 x 5 mm and an obstacle below its underside."""
     shape = mesh.rectangle([0, 0], [20 * mm, 5 * mm], divisions=(4, 1), element=mesh.Quad4())

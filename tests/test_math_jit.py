@@ -1,19 +1,18 @@
 """Programs compiled by themselves: the same numbers, loops in one kernel, what is refused."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import sorojax as sj
+from sorojax import rod as R
 from sorojax.math import jit as module, one_kernel as kernels
+from sorojax.systems import Markers, ShapeFilter, start_filter, update_filter
 
 X = jnp.linspace(0.1, 0.9, 6)
-
-
-@pytest.fixture(autouse=True)
-def _asked_for(monkeypatch):
-    monkeypatch.setenv("SOROJAX_ONE_KERNEL", "1")
 
 
 def elementwise(_, x):
@@ -48,9 +47,13 @@ def with_library(_, x):
     return jnp.linalg.solve(2 * jnp.eye(6) + jnp.outer(x, x), jnp.sin(x))
 
 
-def text(function, *args):
+def compiled(function, *args):
     program = jax.jit(kernels.one_kernel(function), compiler_options=kernels.OPTIONS)
-    return program.lower(*args).compile().as_text()
+    return program.lower(*args).compile()
+
+
+def text(function, *args):
+    return str(compiled(function, *args).as_text())
 
 
 def entry(text):
@@ -64,9 +67,9 @@ def test_the_numbers_are_those_of_the_plain_program(body):
 
     plain, alone = jax.jit(run)(X), sj.jit(run)(X)
     assert np.allclose(alone, plain, rtol=1e-13, atol=1e-15)
-    compiled = text(run, X)
-    assert (" while(" in entry(compiled)) is (body is with_library)
-    assert ("small_call" in entry(compiled)) is (body is not with_library)
+    main = entry(text(run, X))
+    assert (" while(" in main) is (body is with_library)
+    assert ("small_call" in main) is (body is not with_library)
 
 
 def test_loops_over_large_arrays_and_long_ones_stay_as_they_are(monkeypatch):
@@ -146,3 +149,91 @@ def test_arguments_that_a_loop_does_not_use_and_branches():
     assert "xla_cpu_small_call" in text(run, *args)
     for got, want in zip(sj.jit(run)(*args), jax.jit(run)(*args), strict=True):
         assert np.allclose(got, want, rtol=1e-14)
+
+
+def test_no_kernel_has_an_argument_that_it_could_do_without():
+    """The compiler ends the process where one does, at times: constants, once found, and
+    states that a loop forgets are the ways to it."""
+    table = jnp.linspace(0.0, 1.0, 600)
+
+    def run(x, count):
+        found = 0 * count + jnp.arange(3)  # a constant, but not by its looks
+        part = jax.lax.fori_loop(
+            0, 4, lambda i, s: s + table[:6] * jnp.sum(found).astype(s.dtype), x
+        )
+        forgets = jax.lax.while_loop(
+            lambda s: s[0], lambda s: (jnp.array(False), s[1] * 0 + 2), (count > 0, count)
+        )
+
+        @jax.jit
+        def inner(x, unused):
+            return jnp.cumsum(x) * table[2]
+
+        known = jax.lax.fori_loop(0, 3, lambda i, s: jnp.sin(s) + i, 0.5)
+        rows = known * jnp.ones((5, 6))
+        end, rest = jax.lax.scan(lambda s, row: (inner(s, row), row), part, rows)
+        slope = jax.grad(lambda x: jnp.sum(jax.lax.fori_loop(0, 3, lambda _, s: 2 * s, x)))(x)
+        return end, rest, forgets, slope
+
+    args = X, jnp.array(2)
+    assert not list(unused_arguments(text(run, *args)))
+    alone, plain = (jax.tree.leaves(f(run)(*args)) for f in (sj.jit, jax.jit))
+    for got, want in zip(alone, plain, strict=True):
+        assert np.allclose(got, want, rtol=1e-13)
+
+
+def unused_arguments(text):
+    """Arguments of computations inside of kernels that nothing there uses."""
+    bodies = {}
+    for line in text.splitlines():
+        if head := re.match(r"(?:ENTRY )?%?([\w.\-]+) .*\{$", line):
+            lines = bodies[head.group(1)] = []
+        elif " = " in line:
+            lines.append(line)
+    calls = [
+        line for lines in bodies.values() for line in lines
+        if " call(" in line and 'small_call="true"' in line
+    ]  # fmt: skip
+    assert calls
+    reached = inside(calls)
+    for name in reached:
+        reached += [each for each in inside(bodies[name]) if each not in reached]
+        for line in bodies[name]:
+            argument = re.match(r"\s*(%[\w.\-]+) = .* parameter\(", line)
+            if argument and not uses(bodies[name], argument.group(1)):
+                yield name, argument.group(1)
+
+
+def inside(lines):
+    """Computations that are called; what reduces has arguments of its own kind."""
+    found = re.findall(r"(?:body|condition|to_apply)=(%?[\w.\-]+)", "\n".join(lines))
+    return [name.lstrip("%") for name in found if "reduce" not in name]
+
+
+def uses(lines, name):
+    return [line for line in lines if re.search(re.escape(name) + r"[,)]", line)]
+
+
+def test_a_filter_with_constants_among_its_arguments_compiles():
+    """It once ended the process."""
+    model = R.rod(
+        sj.SE2(), R.chebyshev(kappa_z=1), R.circle(6e-3), nodes=4, length=0.08,
+        young_modulus=1e6, poisson_ratio=0.3, density=1100.0,
+    )  # fmt: skip
+    at = jnp.array([0.5, 1.0])
+    estimator = ShapeFilter(Markers(model, at), 1 / 60)
+    seen = R.forward_kinematics(model, jnp.array([3.0]), at)[:, :2, 2]
+
+    def update(last, seen):
+        return update_filter(estimator, last, seen, forces=(R.Damping(0.01),)).q
+
+    begin = start_filter(estimator)
+    program = compiled(update, begin, seen)
+    assert not list(unused_arguments(program.as_text()))
+    assert np.allclose(program(begin, seen)[0], update(begin, seen), rtol=1e-9)
+
+
+def test_it_can_be_left_out(monkeypatch):
+    assert kernels.runs_alone(X)
+    monkeypatch.setenv("SOROJAX_ONE_KERNEL", "0")
+    assert not kernels.runs_alone(X)

@@ -5,15 +5,7 @@ import pytest
 from tests.scripts import ROOT, main_of, user_code
 
 LONGEST = 60  # lines of user code
-LONGER = {
-    # a scene of robot, cylinder and contacts, a board, a controller and a taught path
-    "16_pick_and_place": 88,
-    "03_bench_on_a_desk": 83,
-    "20_passive_walker": 80,
-    "22_gripper": 62,
-    "23_impedance": 65,
-    "24_shape_sensing": 75,
-}
+LONGER = {"20_passive_walker": 80}
 
 
 def test_examples_are_short():

@@ -20,7 +20,7 @@ from benchmarks.cases.design_layout import _problem
 from benchmarks.harness import Row, quick
 from sorojax import design, fem, material, mesh
 from sorojax._progress import silent
-from sorojax.design.pneunet import body, output
+from sorojax.design.pneunet import body_of, output
 
 MOST = 0.5
 AGREES = 1e-5  # with central differences along a random direction
@@ -117,10 +117,10 @@ def _cantilever() -> fem.Problem:
 
 def _inflated(chamber: str, begins: tuple[str, ...] = ("warm", "rest")) -> Objective:
     cell = design.pneunet_cell(chamber=chamber)
-    density = jax.jit(lambda x: cell.plan(x, 4.0))
+    sharpness = jnp.asarray(4.0)
 
     def of(solver):
-        return lambda x: output(cell, solver(body(cell, density(x))).displacement)
+        return lambda x: output(cell, solver(body_of(cell, x, sharpness)).displacement)
 
     return Objective(cell.start, of, begins=begins)
 

@@ -98,8 +98,9 @@ def rows():
     def path():
         return fem.continuation(problem, step=0.2, until=lambda _, factor: factor > 0.7)
 
-    timing = measure_calls(lambda: path().displacements, repeats=1)
-    found = path()
+    paths = []
+    timing = measure_calls(lambda: paths.append(path()) or paths[-1].displacements, repeats=1)
+    found = paths[-1]
     located = [0.125 * float(point.factor) for point in found.critical_points]
     yield Row(
         "sorojax",

@@ -24,13 +24,16 @@ SOLID = (
 
 
 def rows():
-    last = slice(-1 if quick() else None, None)
+    short = quick("Poisson ratios but 0.4999, meshes but the finest, solids, Tri6")
+    last = slice(-1 if short else None, None)
     for poisson_ratio in list(REFERENCE)[last]:
         for element, formulation, sizes, bar in PLANE:
+            if short and element.name == "Tri6":
+                continue
             for n in sizes[last]:
                 problem = plane_panel(element, n, poisson_ratio, formulation)
                 yield _row(problem, n, poisson_ratio, bar if n == sizes[-1] else None)
-    for element, formulation, sizes in SOLID[: 0 if quick() else None]:
+    for element, formulation, sizes in () if short else SOLID:
         for n in sizes:
             yield _row(solid_panel(element, n, 0.4999, formulation), n, 0.4999, None)
 

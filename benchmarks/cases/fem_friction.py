@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.harness import Row, Timing, measure_together
+from benchmarks.harness import Row, Timing, measure_together, quick
 from sorojax import fem, material, mesh, sdf
 from sorojax.fem import linear
 from sorojax.units import mm
@@ -61,18 +61,22 @@ def rows():
         yield Row("sorojax", found, error=error, bar=0.005, bar_on="error",
                   reference="Coulomb: g (sin - mu cos)")  # fmt: skip
     yield from _far()
-    yield from _far_in_motion()
+    if not quick("steps in motion with a far contact"):
+        yield from _far_in_motion()
 
 
 def _far_cases() -> dict[str, fem.Problem]:
     """The block without a floor, and with one a metre below it."""
     problem, smooth = block((120, 30)), block((120, 30), None)
     below = jnp.array([0.0, -1.0])
-    return {
+    cases = {
         "none": dataclasses.replace(problem, loads=problem.loads[:1]),
         "frictionless, far": fem.with_load(smooth, "floor", below),
         "friction, far": fem.with_load(problem, "floor", below),
     }
+    if quick("a far contact without friction"):
+        del cases["frictionless, far"]
+    return cases
 
 
 def _far():

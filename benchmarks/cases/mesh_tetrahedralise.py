@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks import peers
-from benchmarks.harness import Row, measure_calls, missing
+from benchmarks.harness import Row, measure_calls, missing, quick
 from sorojax import mesh, sdf
 
 #: Outer and inner radius, size of cells and seconds, by name.
@@ -14,8 +14,14 @@ def rows():
     for name, (outer, inner, size, bar) in SCENES.items():
         shape = sdf.Sphere([0, 0, 0], outer)
         shape = shape - sdf.Sphere([0, 0, 0], inner) if inner else shape
-        timing = measure_calls(lambda s=shape, h=size: mesh.tetrahedralise(s, size=h))
-        quality = mesh.quality(mesh.tetrahedralise(shape, size=size))
+        made = []
+        timing = measure_calls(
+            lambda s=shape, h=size, kept=made: (
+                kept.append(mesh.tetrahedralise(s, size=h)) or kept[-1]
+            ),
+            repeats=3 if quick() else 5,
+        )
+        quality = mesh.quality(made[-1])
         volume = 4 / 3 * np.pi * (outer**3 - inner**3)
         yield Row(
             "sorojax", _shape_numbers(name, quality), **timing.columns(),

@@ -92,10 +92,11 @@ def rows():
 
     for number, (modes, step) in enumerate(SETTINGS):
         body, run = finger(*modes), stepped(step)
-        timing = measure(run, body, repeats=5)
+        programs = []
+        timing = measure(run, body, repeats=5, keep=programs.append)
         settings = {"modes": modes, "step": step}
         yield Row(
-            "sorojax", settings, **timing.columns(), error=error(jax.jit(run)(body)),
+            "sorojax", settings, **timing.columns(), error=error(programs[0](body)),
             reference=REFERENCE, bar=ERROR_BAR, bar_on="error",
         )  # fmt: skip
         if number == 0:
@@ -106,11 +107,11 @@ def rows():
 
 def _peers(error):
     """Fewer elements where time is short."""
-    most = 2 if quick() else 3
+    some = slice(1, 2) if quick("peers but with 20 elements or links") else slice(None)
     common = {"duration": DURATION, "save_dt": SAVE, "repeats": 3}
-    for elements, share in ELASTICA[:most]:
+    for elements, share in ELASTICA[some]:
         yield peers.row("pyelastica", "simulation", {}, error, REFERENCE,
                         elements=elements, share=share, **common)  # fmt: skip
-    for links, method, dt in CABLES[:most]:
+    for links, method, dt in CABLES[some]:
         yield peers.row("mujoco", "simulation", {}, error, REFERENCE,
                         links=links, method=method, dt=dt, **common)  # fmt: skip

@@ -11,19 +11,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.fingers import LENGTH, finger, random_states
-from benchmarks.harness import Row
-from sorojax import compiled
+from benchmarks.harness import Row, quick
+from sorojax import compiled, enable_low_latency
 from sorojax.rod import Pose, inverse_kinematics, tip_pose
 
 TARGETS, ITERATIONS = 20, 10
 CALLS = {"compiled": 100_000, "jax.jit": 5000}  # the slowest of them is the last column
+KINDS = ((8, True), (6, True), (8, False))  # nodes, with the null space
 BARS = {50: 80e-6, 99: 1e-3}
 REFERENCE = "worst tip of 20 drawn poses, each from rest, over length"
 
 
 def rows():
-    for nodes, null_space in ((6, True), (8, True), (8, False)):
-        for by in ("compiled", "jax.jit"):
+    enable_low_latency()  # as a loop in real time would
+    few = quick("6 nodes, and steps without the null space")
+    for nodes, null_space in KINDS[:1] if few else KINDS:
+        for by in ("compiled",) if quick("jax.jit") else CALLS:
             yield from latency(nodes, null_space, by)
 
 

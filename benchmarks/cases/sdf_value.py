@@ -24,7 +24,7 @@ def rows():
         theirs = {
             name: measure_calls(lambda form=form, p=p: form(p)) for name, form in PEERS.items()
         }
-        ours = measure_calls(lambda held=held: sdf.evaluate(shape, held), repeats=15)
+        ours = measure_calls(lambda held=held: sdf.evaluate(shape, held), repeats=51)
         seconds = {name: statistics.median(timing.runs) for name, timing in theirs.items()}
         exact = in_numpy(p.astype("float64"))
         error = float(np.abs(np.asarray(sdf.evaluate(shape, held)) - exact).max())

@@ -17,7 +17,10 @@ from sorojax_hardware.clocks import (
 from sorojax_hardware.desk import simulated as simulated
 from sorojax_hardware.disturbed import DisturbedLink as DisturbedLink
 from sorojax_hardware.latest import Latest as Latest
-from sorojax_hardware.local_board import LocalBoard as LocalBoard
+from sorojax_hardware.local_board import (
+    LocalBoard as LocalBoard,
+    simulated_board as simulated_board,
+)
 from sorojax_hardware.loop import (
     Deadlines as Deadlines,
     Overrun as Overrun,

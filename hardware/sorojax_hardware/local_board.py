@@ -1,9 +1,15 @@
 """A board's program without a socket."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
 from sorojax_board.board import Backend, Board, Settings
+from sorojax_board.messages import Limits
+from sorojax_hardware.clocks import SimulatedClock
 from sorojax_hardware.protocols import Clock
+from sorojax_hardware.serving import ModelValves
 
 
 class LocalBoard:
@@ -15,7 +21,7 @@ class LocalBoard:
     _period = 0.002  # s, between ticks of the program
 
     def __init__(self, settings: Settings, backend: Backend, clock: Clock):
-        self._clock, self._ticked, self._count = clock, clock.now(), 0
+        self.clock, self._ticked, self._count = clock, clock.now(), 0
         self.board = Board(settings, backend, self._ticked)
 
     @property
@@ -26,7 +32,7 @@ class LocalBoard:
         """As `TcpBoard.arm`."""
         low, high = (np.broadcast_to(np.asarray(x, float), self.num_ports) for x in limits)
         bounds = list(zip(low.tolist(), high.tolist(), strict=True))
-        self.board.arm(self, bounds, self._clock.now())
+        self.board.arm(self, bounds, self.clock.now())
 
     def read_pressure(self) -> np.ndarray:
         self._advance()
@@ -47,7 +53,7 @@ class LocalBoard:
         self._advance()
         self._count += 1
         mask, stamp = (1 << self.num_ports) - 1, (self._count, 0)
-        why = self.board.set(self, mask, asked.tolist(), stamp, self._clock.now())
+        why = self.board.set(self, mask, asked.tolist(), stamp, self.clock.now())
         if why is not None:
             report = self.board.report()
             raise ValueError(
@@ -57,9 +63,37 @@ class LocalBoard:
 
     def vent(self) -> None:
         self._advance()
-        self.board.vent(self._clock.now())
+        self.board.vent(self.clock.now())
 
     def _advance(self) -> None:
-        while self._ticked + self._period <= self._clock.now() + 1e-9:
+        while self._ticked + self._period <= self.clock.now() + 1e-9:
             self._ticked += self._period
             self.board.tick(self._ticked)
+
+
+def simulated_board(
+    advance: Callable[[Any, np.ndarray, float], tuple[Any, Any]],
+    state: Any,
+    limits: tuple[Any, Any],
+    *,
+    slew: float = 2e6,
+    clock: Clock | None = None,
+    **options: Any,
+) -> tuple[LocalBoard, ModelValves]:
+    """A simulated robot behind an armed board of this process, and its valves, whose `state`
+    is the robot's.
+
+    Args:
+        advance: `(state, setpoints [Pa], dt [s]) -> (state, pressures [Pa])`.
+        state: Where it starts.
+        limits: Lowest and highest set-points [Pa], one or several of each.
+        slew: Fastest change of a set-point [Pa/s].
+        clock: `board.clock`; a `SimulatedClock` if omitted.
+        **options: Of `ModelValves`.
+    """
+    low, high = np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, float)) for x in limits))
+    each = tuple(Limits(float(a), float(b), slew) for a, b in zip(low, high, strict=True))
+    valves = ModelValves(advance, state, len(each), **options)
+    board = LocalBoard(Settings(each), valves, SimulatedClock() if clock is None else clock)
+    board.arm()
+    return board, valves

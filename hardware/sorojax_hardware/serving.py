@@ -33,6 +33,7 @@ class ModelValves:
         noise: Of the sensors, standard deviation [Pa].
         resolution: Step of the converters on both sides [Pa]; 0 for exact ones.
         seed: Of the noise.
+        keep: Keep the state after every step in `states`, behind the first one.
     """
 
     def __init__(
@@ -46,8 +47,10 @@ class ModelValves:
         noise: float = 80.0,
         resolution: float = STEP,
         seed: int = 0,
+        keep: bool = False,
     ):
         self._advance, self.state, self._period = advance, state, period
+        self.states = [state] if keep else None
         self._random, self._noise = np.random.default_rng(seed), noise
         self._dead_time, self._resolution = dead_time, resolution
         self._setpoint = self._asked = np.zeros(num_ports)
@@ -69,6 +72,8 @@ class ModelValves:
                 self._setpoint = self._waiting.popleft()[1]
             self.state, pressure = self._advance(self.state, self._setpoint, self._period)
             self.pressure = np.asarray(pressure, float)
+            if self.states is not None:
+                self.states.append(self.state)
         noisy = self.pressure + self._noise * self._random.standard_normal(self.pressure.shape)
         return self._rounded(noisy).tolist()
 

@@ -1,6 +1,6 @@
 """Contact with implicit shapes: gaps, pressures and forces at points."""
 
-from sorojax.contact.broadphase import far as far
+from sorojax.contact.broadphase import clearance as clearance, far as far
 from sorojax.contact.friction import Coulomb as Coulomb, Grip as Grip, no_grip as no_grip
 from sorojax.contact.line import LinePenalty as LinePenalty
 from sorojax.contact.penalty import Penalty as Penalty

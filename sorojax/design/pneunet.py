@@ -27,7 +27,7 @@ from sorojax.design.mma import MMA
 from sorojax.design.objectives import Follower, replaced_load, solid_of
 from sorojax.design.simp import Simp
 from sorojax.design.symmetry import Mirrored
-from sorojax.design.void import interpolated_energy
+from sorojax.design.void import InterpolatedEnergy, interpolated_energy
 from sorojax.design.void_pressure import (
     VoidPressure,
     of_cells,
@@ -62,26 +62,47 @@ class PneuNetCell(eqx.Module):
     selector: Float[Array, "nodes dim"]
     start: Float[Array, " variables"]
     volume: Float[Array, ""] = eqx.field(converter=real)
-    interpolation: Simp = Simp(3.0, 1e-6)
+    interpolation: Simp = eqx.field(default_factory=lambda: Simp(3.0, 1e-6))
 
 
 def body(cell: PneuNetCell, density: Float[Array, " cells"]) -> Problem:
     """The boundary value problem of a design."""
-    air = next(load for load in cell.problem.loads if load.name == "air")
-    base = solid_of(cell.problem)
+    return _filled(cell, _parts(*_model(cell), density))
+
+
+def body_of(
+    cell: PneuNetCell, x: Float[Array, " variables"], sharpness: Float[Array, ""]
+) -> Problem:
+    """`body` of the densities `cell.plan(x, sharpness)`, at a smaller price of a gradient."""
+    return _filled(cell, _planned(cell.plan, *_model(cell), x, sharpness))
+
+
+def _model(cell: PneuNetCell):
     parts = cell.interpolation, cell.chamber
-    material, share = _parts(parts, base, cell.problem.mesh.cells, density)
+    return parts, solid_of(cell.problem), cell.problem.mesh.cells
+
+
+def _filled(cell: PneuNetCell, parts: tuple[InterpolatedEnergy, Array]) -> Problem:
+    material, share = parts
+    air = next(load for load in cell.problem.loads if load.name == "air")
     made = dataclasses.replace(cell.problem, material=material)
     return replaced_load(made, VoidPressure(share=share, value=air.value, name="air"))
 
 
+# Everything that follows a design in one program: started one by one, small ones take as
+# long as the solve when they are differentiated.
+
+
 @jax.jit
 def _parts(parts, base: AbstractHyperelastic, cells, density):
-    """Everything that follows a design, in one program: started one by one, small ones take
-    as long as the solve when they are differentiated."""
     interpolation, chamber = parts
     spread = of_nodes if isinstance(chamber, Darcy) else of_cells
     return interpolated_energy(base, interpolation(density)), spread(chamber(density), cells)
+
+
+@jax.jit
+def _planned(plan: Layout, parts, base: AbstractHyperelastic, cells, x, sharpness):
+    return _parts(parts, base, cells, plan(x, sharpness))
 
 
 def output(cell: PneuNetCell, u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
@@ -213,8 +234,7 @@ def optimise_pneunet(
     plan = cell.plan
 
     def loss(x, beta):
-        made = body(cell, _density(plan, x, beta))
-        return -output(cell, solved(made).displacement)
+        return -output(cell, solved(body_of(cell, x, beta)).displacement)
 
     @jax.jit
     def held(x, beta):
@@ -236,11 +256,6 @@ def optimise_pneunet(
             histories.append(found.history)
     joined = {key: np.concatenate([h[key] for h in histories]) for key in histories[0]}
     return eqx.tree_at(lambda f: f.history, found, joined)
-
-
-@eqx.filter_jit
-def _density(plan: Layout, x, beta):
-    return plan(x, beta)
 
 
 def sharpness(step: int, steps: int = 100) -> Float[Array, ""]:

@@ -1,37 +1,33 @@
 """Contact of a body with a shape that does not deform."""
 
 import dataclasses
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
 from sorojax._types import integers, optional_real, real
-from sorojax.contact import Contacts, Coulomb, Grip, Penalty, contacts, far, gaps, no_grip
+from sorojax.contact import Contacts, Coulomb, Grip, Penalty, contacts, far, gaps
 from sorojax.fem.contact_area import areas_of, compact, default_law
-from sorojax.fem.curved import CurvedPart, blockwise
+from sorojax.fem.contact_start import Start, untouched
+from sorojax.fem.curved import CurvedPart, group_energy
 from sorojax.fem.facets import facet_tables
-from sorojax.fem.friction import gripped, released
+from sorojax.fem.friction import felt, gripped, released
 from sorojax.fem.loads import AbstractLoad
 from sorojax.sdf.base import AbstractSdf
-
-
-class Start(NamedTuple):
-    """Where a step of a contact begins: place of the obstacle, and how far before its surface
-    pressure starts [m]."""
-
-    place: Float[Array, " dim"]
-    shift: Float[Array, "facets quad"]
 
 
 class Contact(AbstractLoad):
     """`facets` may not enter `obstacle`, which is `value` away from its place [m].
 
     A penalty per reference area at the quadrature points of the facets, `contact.Penalty`.
-    Facets of which no point can touch cost one value of the obstacle's field for every 32.
+    Facets of which no point can touch cost one value of the obstacle's field for every 32; in
+    a step of `simulate` it is asked once, and forces leave the contact out until a point has
+    moved as far as it had room.
 
     `stiffness` [Pa/m] is 10 E / h when omitted, h being the mean size of the facets:
     pressure p then overlaps by about h p / (10 E). `smoothing` [m] is E / 1000 over the
@@ -103,28 +99,31 @@ class Contact(AbstractLoad):
 
     def shift(self) -> Float[Array, "facets quad"] | None:
         """How far before the surface pressure starts [m]."""
-        terms = [term for term in (self.offset, self.sunk) if term is not None]
-        return sum(terms[1:], start=terms[0]) if terms else None
+        return _sum(self.offset, self.sunk)
 
     def points_of(self, problem, u) -> Float[Array, "facets quad dim"]:
         """Where the quadrature points of the facets are [m]."""
+        return self.points_at(problem, (problem.mesh.points + u)[self.facets])
+
+    def points_at(self, problem, x) -> Float[Array, "facets quad dim"]:
+        """Where they are with the nodes of facets at `x` [m]."""
         values = jnp.asarray(facet_tables(problem.mesh.element).values)
-        return jnp.einsum("qa,fai->fqi", values, (problem.mesh.points + u)[self.facets])
+        return jnp.einsum("qa,fai->fqi", values, x)
 
     def acted(self, problem, u) -> Float[Array, "facets quad dim"]:
         """Where its quadrature points were [m] when forces acted in the step to `u`."""
-        values = jnp.asarray(facet_tables(problem.mesh.element).values)
         x = (problem.mesh.points + u)[self.facets]
         x = x if self.share is None else self.began + self.share * (x - self.began)
-        return jnp.einsum("qa,fai->fqi", values, x)
+        return self.points_at(problem, x)
 
     def potential(self, problem, u):
-        return self._total(problem, u, self._energy(problem))
+        return group_energy((problem.mesh.points + u)[self.facets], self, problem)
 
     def stored(self, problem, u):
         """Energy of the overlap and of the springs of friction [J]."""
-        now = dataclasses.replace(self, began=None, share=None)
-        energy = now._total(problem, u, now._energy(problem, friction=False))
+        now = dataclasses.replace(self, began=None, share=None, start=None)
+        bare = dataclasses.replace(now, grip=None)
+        energy = bare.potential(problem, u)
         if self.grip is None:
             return energy
         points = self.points_of(problem, u) - self.value[None, None]
@@ -132,8 +131,8 @@ class Contact(AbstractLoad):
         return energy + jnp.sum(areas_of(problem, self.facets) * held)
 
     def curved_part(self, problem):
-        data = self._data(problem)
-        return CurvedPart(self.facets, self._energy(problem), data, self._idle(problem))
+        rows = jnp.arange(self.facets.shape[0])
+        return CurvedPart(self.facets, self._energy(problem), rows, self._idle(problem))
 
     def rows(self, xp=jnp):
         """All facets that look for the obstacle."""
@@ -167,28 +166,22 @@ class Contact(AbstractLoad):
         shift = at_first.shift()
         assert self.start is not None and self.place is not None
         shift = jnp.zeros_like(self.start.shift) if shift is None else shift
-        start = Start(self.place, shift)
+        feels = felt(load, problem, step.u)
+        start = Start(self.place, shift, feels.clear)
         load = dataclasses.replace(load, began=began, share=share, start=start)
         if load.grip is None:
             return dataclasses.replace(load, place=self.value)
-        return gripped(load, problem, step.u, step.back, step.rate, step.step)
+        return gripped(load, problem, step.u, step.back, step.rate, step.step, feels)
 
-    def _total(self, problem, u, energy):
-        x = (problem.mesh.points + u)[self.facets]
-        data = self._data(problem)
-        return jnp.sum(blockwise(jax.vmap(energy), self._idle(problem), x, data, ()))
-
-    def _data(self, problem):
-        """Numbers of the facets: only where a block may touch are their data looked up."""
-        return jnp.arange(self.facets.shape[0])
-
-    def _energy(self, problem, friction: bool = True):
+    def _energy(self, problem):
         values, law = jnp.asarray(facet_tables(problem.mesh.element).values), self.law
-        known = areas_of(problem, self.facets), self.shift(), self.grip, self.began
+        known = self.facets, self.offset, self.sunk, self.grip, self.began
         start = self.start
 
         def energy(x, row):
-            areas, offset, grip, began = jax.tree.map(lambda leaf: leaf[row], known)
+            # only where a block may touch are the data of its facets looked up
+            facet, offset, sunk, grip, began = jax.tree.map(lambda leaf: leaf[row], known)
+            areas, offset = areas_of(problem, facet[None])[0], _sum(offset, sunk)
             position = values @ x - self.value[None]
             gap = self.gap_of(values @ self._end(x, began), offset)
             density = law.energy(gap)
@@ -197,7 +190,7 @@ class Contact(AbstractLoad):
                 before = gaps(self.obstacle, values @ began, start.place)
                 mean = law.energy_of_step(before - start.shift[row], gap)
                 density = self.share * (ending * density + (1 - ending) * mean)
-            if friction and grip is not None:
+            if grip is not None:
                 density = density + self.friction_law.energy(grip, position)
             return jnp.sum(areas * density)
 
@@ -219,21 +212,32 @@ class Contact(AbstractLoad):
         return x if self.share is None else began + (x - began) / self.share
 
     def _idle(self, problem):
-        values = jnp.asarray(facet_tables(problem.mesh.element).values)
         shift, grip, start = self.shift(), self.grip, self.start
+        reach = None if shift is None or start is not None else jnp.max(shift)
 
-        def away(x, place, shift):
-            points = jnp.einsum("qa,fai->fqi", values, x) - place[None, None]
-            return far(self.obstacle, points, None if shift is None else jnp.max(shift))
+        def near(x, rows):
+            """In a step nothing is asked of the field: it was where the step began."""
+            assert start is not None and self.began is not None
+            began = self.began[rows]
+            way = self.points_at(problem, self._end(x, began) - began)
+            way = way - (self.value - start.place)[None, None]
+            return jnp.sum(way**2, axis=2) < start.clear[rows, None] ** 2
 
         def idle(x, rows):
-            began = None if self.began is None else self.began[rows]
-            free = away(self._end(x, began), self.value, shift)
-            if began is not None and start is not None:
-                free &= away(began, *start)
+            if start is not None:
+                return jnp.all(near(x, rows))
+            points = self.points_at(problem, x) - self.value[None, None]
+            free = far(self.obstacle, points, reach)
             return free if grip is None else free & ~jnp.any(grip.pressure[rows] > 0)
 
         return idle
+
+    def room(self, problem):
+        values = facet_tables(problem.mesh.element).values
+        assert self.start is not None and self.share is not None
+        moved = jnp.sqrt(jnp.sum((self.value - self.start.place) ** 2))
+        free = self.share * (jnp.min(self.start.clear) - moved)
+        return free / float(np.abs(values).sum(axis=1).max())
 
     def completed(self, mesh, material, kinematics):
         facets = self.facets if self._kept else compact(mesh, self.facets)
@@ -242,12 +246,12 @@ class Contact(AbstractLoad):
         made = dataclasses.replace(
             self, facets=facets, stiffness=law[0], smoothing=law[1], value=value
         )
-        return made if self._kept and self.began is not None else _free(made, mesh)
+        return made if self._kept and self.place is not None else untouched(made, mesh)
 
     @property
     def _kept(self) -> bool:
         """Whether numbers of single facets hang on their order."""
-        return any(x is not None for x in (self.grip, self.offset, self.began))
+        return any(x is not None for x in (self.place, self.offset))
 
     def check(self, where, mesh, kinematics):
         if self.obstacle.dim != mesh.element.dim:
@@ -268,18 +272,7 @@ class Contact(AbstractLoad):
                             "Leave it out for the default.")  # fmt: skip
 
 
-def _free(load: Contact, mesh) -> Contact:
-    """`load` that has touched nothing yet."""
-    values = jnp.asarray(facet_tables(mesh.element).values)
-    points = jnp.einsum("qa,fai->fqi", values, mesh.points[load.facets])
-    if load.release_velocity is not None:
-        sunk = jnp.zeros_like(points[..., 0])
-        load = dataclasses.replace(load, sunk=sunk, fresh=jnp.ones((), sunk.dtype))
-    load = dataclasses.replace(
-        load, began=mesh.points[load.facets], share=jnp.ones((), points.dtype),
-        place=load.value, start=Start(load.value, jnp.zeros_like(points[..., 0])),
-    )  # fmt: skip
-    if load.friction is None:
-        return load
-    stiffness = load.stiffness if load.friction_stiffness is None else load.friction_stiffness
-    return dataclasses.replace(load, friction_stiffness=stiffness, grip=no_grip(points))
+def _sum(*terms: Array | None) -> Array | None:
+    """Of those that there are."""
+    given = [term for term in terms if term is not None]
+    return sum(given[1:], start=given[0]) if given else None

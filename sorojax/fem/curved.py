@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,10 +54,43 @@ def group_matrices(
     return count * blockwise(many, part.idle, x, part.data, (len(first),))
 
 
+@eqx.filter_custom_jvp
+def group_energy(
+    x: Float[Array, "groups group_nodes dim"], load: Any, problem: Any
+) -> Float[Array, ""]:
+    """Energy [J] of the groups of `load` at positions `x` [m].
+
+    Of groups that are idle neither the energy nor its slope is computed.
+    """
+    return _summed(x, load, problem)
+
+
+def _summed(x, load, problem):
+    part = load.curved_part(problem)
+    return jnp.sum(blockwise(jax.vmap(part.energy), part.idle, x, part.data, ()))
+
+
+@group_energy.def_jvp
+def _group_slope(primals, tangents):
+    if jax.tree.leaves(tangents[1:]):
+        return eqx.filter_jvp(_summed, primals, tangents)
+    x, load, problem = primals
+    part = load.curved_part(problem)
+    slope = jax.vmap(jax.grad(part.energy))
+    found = blockwise(slope, part.idle, x, part.data, x.shape[1:])
+    return group_energy(x, load, problem), jnp.sum(found * tangents[0])
+
+
 def blockwise(
-    kernel: Callable, idle: Callable, x: Float[Array, "groups ..."], data: Any, tail: tuple
+    kernel: Callable,
+    idle: Callable,
+    x: Float[Array, "groups ..."],
+    data: Any,
+    tail: tuple,
+    rest: Callable | None = None,
 ) -> Float[Array, "groups ..."]:
-    """`kernel(x, data)` in blocks of groups; zeros of shape `tail` where a block is idle."""
+    """`kernel(x, data)` in blocks of groups; where a block is idle `rest(x, data)`, or zeros
+    of shape `tail`."""
     count = x.shape[0]
     width = min(_BLOCK, count)
     num_blocks = -(-count // width)
@@ -65,15 +99,17 @@ def blockwise(
 
     rows = jax.tree.map(lambda leaf: leaf[at], (x, data))
     still = jax.vmap(idle)(*rows)
-    zero = jnp.zeros((width, *tail), x.dtype)
+
+    def nothing(*_):
+        return jnp.zeros((width, *tail), x.dtype)
 
     def block(row):
-        return jax.lax.cond(row[0], lambda *_: zero, kernel, *row[1])
+        return jax.lax.cond(row[0], rest or nothing, kernel, *row[1])
 
     # a loop that finds every block idle costs more than all that it finds
     found = jax.lax.cond(
         jnp.all(still),
-        lambda: jnp.zeros((num_blocks, width, *tail), x.dtype),
+        lambda: jax.vmap(rest or nothing)(*rows),
         lambda: jax.lax.map(block, (still, rows)),
     )
     return found.reshape(num_blocks * width, *tail)[:count]

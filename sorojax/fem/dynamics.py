@@ -14,6 +14,7 @@ from sorojax import _check
 from sorojax._progress import report
 from sorojax._types import is_traced, real
 from sorojax.fem.contact_load import Contact
+from sorojax.fem.contact_start import moving
 from sorojax.fem.damping import AbstractDamping
 from sorojax.fem.dynamics_host import Control, Run
 from sorojax.fem.dynamics_implicit import MotionCall, recorded
@@ -30,6 +31,7 @@ from sorojax.fem.step_state import StepState
 from sorojax.fem.traced import known_mask
 from sorojax.math import sparse
 from sorojax.math.status import Status
+from sorojax.mesh.mesh import Mesh
 
 History = Callable[[Float[Array, ""]], Array] | Float[Array, "grid ..."]
 Start = Motion | State | tuple[Float[Array, "nodes dim"], Float[Array, "nodes dim"]]
@@ -139,12 +141,12 @@ def _on_host(
 ) -> Motion:
     run = Run(dynamics, control)
     run.resume(begun)
-    states, points = [dynamics.start], [0]
+    states, points = [run.now], [0]
     for index in range(grid):
         if not run.advance(index):
             break
         if (index + 1) % every == 0:
-            states.append(run.state)
+            states.append(run.now)
             points.append(index + 1)
         report("motion", index + 1, grid, iterations=run.iterations, cuts=run.cuts)
 
@@ -153,7 +155,7 @@ def _on_host(
             return first
         return jnp.asarray(np.stack([np.asarray(x) for x in (first, *others)]))
 
-    stacked = jax.tree.map(column, *states)
+    stacked = jax.tree.map(column, *states).whole()
     at = jnp.asarray(points, jnp.int32)
     return Motion(dynamics, stacked, at, run.end(), run.status, run.stats())
 
@@ -197,18 +199,20 @@ def _rest(problem: Problem, rows: tuple[Array | None, ...]) -> State:
     zero = jnp.zeros_like(problem.mesh.points)
     none = jnp.zeros((), zero.dtype)
     first = zip(problem.loads, rows, strict=True)
-    memory = tuple(_placed(load, row) if _remembers(load) else None for load, row in first)
+    memory = tuple(
+        _placed(load, row, problem.mesh) if _remembers(load) else None for load, row in first
+    )
     return State(none, zero, zero, zero, memory, none, none, jnp.ones_like(none))
 
 
-def _placed(load: AbstractLoad, row: Array | None) -> AbstractLoad:
+def _placed(load: AbstractLoad, row: Array | None, mesh: Mesh) -> AbstractLoad:
     """`load` with its obstacle where the motion begins, unless friction holds on to it."""
     if not isinstance(load, Contact):
         return load
     place = load.value if row is None else row[0]
     if load.grip is not None and load.place is not None:
         place = jnp.where(jnp.any(load.grip.pressure > 0), load.place, place)
-    return dataclasses.replace(load, place=place)
+    return moving(load, mesh, place)
 
 
 def _state(where: str, dynamics: Dynamics, start: Start | None) -> State:
@@ -243,9 +247,13 @@ def _acceleration(dynamics: Dynamics, state: State) -> Float[Array, "nodes dim"]
 def _balance(dynamics: Dynamics, state: State):
     problem, u = dynamics.problem, state.displacement
     known: Matter = matter(dynamics)
+    kept = (
+        load if before is None else before
+        for load, before in zip(problem.loads, state.memory, strict=True)
+    )
     loads = tuple(
         load if row is None else eqx.tree_at(lambda load: load.value, load, row[0])
-        for load, row in zip(problem.loads, dynamics.loads, strict=True)
+        for load, row in zip(kept, dynamics.loads, strict=True)
     )
     none = jnp.zeros((), u.dtype)
     rest = StepState(u, state.velocity, u, none, u, state.time, none)

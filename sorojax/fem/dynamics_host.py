@@ -10,8 +10,9 @@ import numpy as np
 
 from sorojax.fem import assemble as asm
 from sorojax.fem.contact_swept import passed_through
+from sorojax.fem.dynamics_kernel import Split, kernel
 from sorojax.fem.dynamics_lists import has_lists, listed_at
-from sorojax.fem.dynamics_newton import Found, StepSolver
+from sorojax.fem.dynamics_newton import Found, StepSolver, Task, may_rest
 from sorojax.fem.dynamics_step import (
     Dynamics,
     Interval,
@@ -21,8 +22,9 @@ from sorojax.fem.dynamics_step import (
     begin_step,
     end_step,
     matter,
-    with_terms,
 )
+from sorojax.fem.geometry import Geometry
+from sorojax.fem.inertia import Inertia
 from sorojax.fem.linear import prepare
 from sorojax.fem.newton import Newton
 from sorojax.fem.supports import known_values
@@ -59,7 +61,7 @@ class Run:
     """A motion that goes on from grid point to grid point."""
 
     def __init__(self, dynamics: Dynamics, control: Control):
-        self.control, self.state = control, dynamics.start
+        self.control, self.now = control, Split(dynamics.start)
         self.follows, self.listed = False, None
         self._take(dynamics)
         self.rows: list[tuple[int, float, float, np.ndarray]] = []
@@ -81,6 +83,7 @@ class Run:
         self.prepared = prepare(problem)
         self.matter = compiled_matter(dynamics)
         self.solver = StepSolver(self.prepared, problem, self.control.newton)
+        self._fixed = Split((dynamics, self.matter, self.prepared.geometry))
 
     def _follow_lists(self) -> None:
         before, kept = self.dynamics.problem, self.solver.kept
@@ -89,6 +92,10 @@ class Run:
             self._take(dataclasses.replace(self.dynamics, problem=problem))
             if problem.space is before.space and kept is not None:
                 self.solver.keep(kept.matrix)
+
+    @property
+    def state(self) -> State:
+        return self.now.whole()
 
     @property
     def status(self) -> Status:
@@ -124,33 +131,31 @@ class Run:
                     return False
                 self.share /= 2
                 continue
-            self.state, done, failures = new, end, 0
+            self.now, done, failures = new, end, 0
             wide = 2 * self.share
             if self._easy and wide <= 1.0 and done % wide == 0.0:
                 self.share = wide
         self.reason = ""
         return True
 
-    def _step(self, interval: Interval) -> State | None:
-        geometry = self.prepared.geometry
-        step, held, kept = _begin(self.dynamics, self.matter, geometry, self.state, interval)
-        problem, held = with_terms(self.dynamics.problem, step.terms), np.asarray(held)
-        start = self.state.displacement
+    def _step(self, interval: Interval) -> Split | None:
+        step, task, held, predicted, kept = _begin((self._fixed, self.now), interval)
+        start, held = task.origin, np.asarray(held)
         # a prediction that inverts cells is none
         sound = float(kept) > LEAST_VOLUME
-        found = self._solve(problem, step.predicted if sound else start, held)
+        found = self._solve(task, predicted if sound else start, held)
         least = found.volume * (float(kept) if sound else 1.0)
         if found.reason:
-            found = self._solve(problem, start, held)
+            found = self._solve(task, start, held)
             least = found.volume
         if found.reason:
             self.reason = found.reason
             return None
         u = jnp.asarray(found.u)
-        new, error, through = _end(self.dynamics, self.matter, self.state, interval, step, u)
+        new, displacement, error, through = _end((self._fixed, self.now, step), interval, u)
         if through:
             self.reason = "a point goes through an obstacle"
-        elif not (least > _CALM or self._kept(new) > LEAST_VOLUME):
+        elif not (least > _CALM or self._kept(start, displacement) > LEAST_VOLUME):
             self.reason = "a cell loses most of its volume"
         else:
             self.reason = ""
@@ -158,9 +163,7 @@ class Run:
             return None
         self._easy = found.iterations <= 6 * self.control.newton.max_iterations // 4
         if self.control.error is not None:
-            scale = float(jnp.max(jnp.abs(new.displacement))) + 0.01 * float(
-                self.prepared.length
-            )
+            scale = float(jnp.max(jnp.abs(displacement))) + 0.01 * float(self.prepared.length)
             ratio = float(error) / (self.control.error * scale)
             if not ratio <= 1.0:
                 self.reason = f"an error of a step of {float(error):.3g} m"
@@ -170,15 +173,15 @@ class Run:
         self.rows.append((int(interval.index), *_ends(interval), found.u))
         return new
 
-    def _kept(self, new: State) -> float:
-        """Least share of its volume that a cell keeps in a step to `new`, which is further
-        than where its forces act."""
-        problem, u = self.dynamics.problem, self.state.displacement
+    def _kept(self, u, new) -> float:
+        """Least share of its volume that a cell keeps in a step to displacement `new`, which
+        is further than where its forces act."""
+        problem = self.dynamics.problem
         args = (problem.space, self.prepared.geometry, problem.kinematics)
-        return float(asm.kept_volume(*args, u, new.displacement - u))
+        return float(asm.kept_volume(*args, u, new - u))
 
-    def _solve(self, problem, start, held: np.ndarray) -> Found:
-        found = self.solver.solve(problem, np.asarray(start), held)
+    def _solve(self, task: Task, start, held: np.ndarray) -> Found:
+        found = self.solver.solve(task, np.asarray(start), held)
         self.iterations += found.iterations
         self.factorisations += found.factorisations
         return found
@@ -204,19 +207,28 @@ def step_error(dynamics: Dynamics, interval: Interval, state: State, new: State)
 compiled_matter: Callable[[Dynamics], Matter] = eqx.filter_jit(matter)
 
 
-@eqx.filter_jit
-def _begin(dynamics: Dynamics, known: Matter, geometry, state: State, interval: Interval):
-    """A step, the displacements held in it, and the least share of a volume that its
-    prediction keeps."""
+@kernel
+def _begin(fixed: tuple[Dynamics, Matter, Geometry], state: State, interval: Interval):
+    """A step and what there is to solve, the displacements held in it and predicted, and the
+    least share of a volume that the prediction keeps."""
+    dynamics, known, geometry = fixed
     step = begin_step(dynamics, known, state, interval)
     problem, u = dynamics.problem, state.displacement
     args = (problem.space, geometry, problem.kinematics, u, step.predicted - u)
     kept = asm.kept_volume(*args)
-    return step, known_values(step.terms[1], *u.shape), kept
+    loads, few, room = step.terms[0], None, jnp.zeros((), u.dtype)
+    rooms = [x for x in (load.room(problem) for load in loads) if x is not None]
+    if rooms:
+        few = Split(tuple(load for load in loads if not may_rest(load)))
+        room = jnp.min(jnp.stack(rooms))
+    (inertia,) = (load for load in loads if isinstance(load, Inertia))
+    task = Task(Split(loads), few, room, inertia.matrix, inertia.pull, inertia.origin)
+    return Split(step), task, known_values(step.terms[1], *u.shape), step.predicted, kept
 
 
-@eqx.filter_jit
-def _end(dynamics: Dynamics, known: Matter, state: State, interval: Interval, step: Step, u):
+@kernel
+def _end(fixed, state: State, step: Step, interval: Interval, u):
+    dynamics, known, _ = fixed
     new = end_step(dynamics, known, state, interval, step, u)
     through = passed_through(dynamics.problem, step.terms[0], new.displacement)
-    return new, step_error(dynamics, interval, state, new), through
+    return Split(new), new.displacement, step_error(dynamics, interval, state, new), through

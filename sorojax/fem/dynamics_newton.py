@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from sorojax.fem import assemble as asm
 from sorojax.fem.dynamics_kernel import Split, kernel
@@ -18,6 +19,7 @@ from sorojax.fem.dynamics_lists import has_lists, longest_share
 from sorojax.fem.energy_form import load_force
 from sorojax.fem.inertia import Inertia
 from sorojax.fem.linear import Prepared, add_load_stiffness
+from sorojax.fem.loads import AbstractLoad
 from sorojax.fem.newton import Newton, safe_fraction
 from sorojax.fem.problem import Problem, body
 from sorojax.fem.secant import Secants
@@ -59,6 +61,18 @@ class Found(NamedTuple):
     volume: float = 0.0
 
 
+class Task(NamedTuple):
+    """A step to solve: its loads, those of them that may not rest if any may, how far nodes
+    may move from `origin` until the others act [m], and the numbers of inertia."""
+
+    loads: Split
+    few: Split | None
+    room: Array
+    matrix: Array
+    pull: Array
+    origin: Array
+
+
 class Acting(NamedTuple):
     """A problem whose parts were taken apart for the kernels: body and what is prepared once
     per motion, and the loads of a step."""
@@ -67,10 +81,9 @@ class Acting(NamedTuple):
     loads: Split
 
 
-def acting(problem: Problem, prepared: Prepared, fixed: Split | None = None) -> Acting:
-    """`problem` taken apart; `fixed` if its body was already."""
-    fixed = Split((body(problem), prepared)) if fixed is None else fixed
-    return Acting(fixed, Split(problem.loads))
+def acting(problem: Problem, prepared: Prepared) -> Acting:
+    """`problem` taken apart."""
+    return Acting(Split((body(problem), prepared)), Split(problem.loads))
 
 
 @kernel
@@ -109,21 +122,23 @@ class StepSolver:
     """Solves the steps of one motion; remembers the last tangent."""
 
     def __init__(self, prepared: Prepared, problem: Problem, newton: Newton):
-        self.prepared, self.newton = prepared, newton
+        self.prepared, self.newton, self._problem = prepared, newton, problem
         self.system = problem.space.system
         self.solver, self.sees = self.system.solver, has_lists(problem)
         self.known, self.length = np.asarray(prepared.known), float(prepared.length)
         self.kept: Kept | None = None
         self._fixed = Split((body(problem), prepared))
+        self._resting = Split((body(problem), _without_resting(problem, prepared)))
         self._matrix = _Both(self.system)
 
-    def solve(self, problem: Problem, guess: np.ndarray, held: np.ndarray) -> Found:
+    def solve(self, task: Task, guess: np.ndarray, held: np.ndarray) -> Found:
         """Equilibrium near `guess`, where known unknowns are `held`."""
         settings = self.newton
-        (inertia,) = [load for load in problem.loads if isinstance(load, Inertia)]
-        self._matrix.fill(np.asarray(inertia.matrix))
-        self._pull, self._origin = np.asarray(inertia.pull), np.asarray(inertia.origin)
-        self._of = acting(problem, self.prepared, self._fixed)
+        self._matrix.fill(np.asarray(task.matrix))
+        self._pull, self._origin = np.asarray(task.pull), np.asarray(task.origin)
+        self._of, self._room = Acting(self._fixed, task.loads), 0.0
+        if task.few is not None:
+            self._few, self._room = Acting(self._resting, task.few), float(task.room)
         u, before, fresh, size, volume = guess, guess, 0, np.inf, 1.0
         now = self._balance(u, u)
         last, refactor, iterations, secants = np.inf, self.kept is None, 0, Secants()
@@ -159,7 +174,7 @@ class StepSolver:
             du = (secants.solve(factor, rhs) + move).reshape(u.shape)
             slope = None if moves else -float(rhs @ du.ravel())
             before = u
-            u, now, size = self._advance(problem, u, du, slope)
+            u, now, size = self._advance(u, du, slope)
             volume *= now.volume_ratio
             if not moves:
                 change = now.residual + rhs
@@ -167,7 +182,7 @@ class StepSolver:
                 secants.add((u - before).ravel(), change)
 
     def _renew(self, u, before) -> bool:
-        self._values, matrix = tangent(self._of, u, before)
+        self._values, matrix = tangent(self._acting(u), u, before)
         return self.keep(np.asarray(matrix))
 
     def keep(self, matrix: np.ndarray) -> bool:
@@ -178,9 +193,19 @@ class StepSolver:
     def _product(self, move):
         return sparse.product(self.system, self._values, jnp.asarray(move))
 
+    def _acting(self, u) -> Acting:
+        """Body and loads that act at `u`: a contact that is out of reach is left out, as long
+        as no node has moved further than it leaves room for."""
+        if self._room > 0:
+            moved = np.sqrt(u.shape[1]) * np.abs(u - self._origin).max()
+            if moved < self._room:
+                return self._few
+        return self._of
+
     def _balance(self, u, before) -> Balance:
         """Forces of body and loads from a compiled kernel, inertia by a product here."""
-        internal, load, ratio = jax.device_get(forces(self._of, u, before))
+        found = forces(self._acting(u), u, before)
+        internal, load, ratio = (np.asarray(x) for x in found)
         load = load + self._pull - self._matrix @ (u - self._origin).ravel()
         residual = internal - load
         norm = np.abs(np.where(self.known, 0.0, residual)).max()
@@ -189,15 +214,15 @@ class StepSolver:
         length = np.abs(u).max() + self.length
         return Balance(residual, float(norm), float(reference), length, float(ratio))
 
-    def _advance(self, problem: Problem, u, du, slope):
+    def _advance(self, u, du, slope):
         """The state after a step, shortened where a cell would collapse or the energy has
         turned at its end."""
         if self.sees:
-            du = float(longest_share(problem, jnp.asarray(du))) * du
+            du = float(longest_share(self._problem, jnp.asarray(du))) * du
         new = u + du
         now = self._balance(new, u)
         if not now.volume_ratio > 0.1:
-            du = safe_fraction(problem, self.prepared, u, du) * du
+            du = safe_fraction(self._problem, self.prepared, u, du) * du
             new = u + du
             now = self._balance(new, u)
         # without load the displacement is rounding alone, which never gets relatively small
@@ -217,6 +242,25 @@ class StepSolver:
     def _failed(self, u, iterations: int, fresh: int, reason: str) -> Found:
         self.kept = None
         return Found(u, np.zeros(u.size), iterations, fresh, None, reason)
+
+
+def may_rest(load: AbstractLoad) -> bool:
+    """Whether there are places where the load is known not to act."""
+    return type(load).room is not AbstractLoad.room
+
+
+def _without_resting(problem: Problem, prepared: Prepared) -> Prepared:
+    """`prepared` without the slots of loads that may rest."""
+    rests: list[bool] = []
+
+    def look():
+        curved = (load for load in problem.loads if load.curved_part(problem) is not None)
+        rests.extend(map(may_rest, curved))
+        return jnp.zeros(())
+
+    jax.eval_shape(look)
+    slots = zip(prepared.group_slots, rests, strict=True)
+    return prepared._replace(group_slots=tuple(rows for rows, rest in slots if not rest))
 
 
 class _Both:

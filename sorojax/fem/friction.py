@@ -1,20 +1,18 @@
 """What a contact remembers from step to step: friction, and overlap that is let out.
 
-Pressure and normal of friction are those at the start of the step, which keeps the tangent
-symmetric. Over an impact the friction impulse is the coefficient times the normal one where the
-normal pressure is that at the ends of steps (`rho_inf` up to 1/2); beyond, where steps do not
-resolve the impact, it may differ.
+Pressure and normal of friction are those that a point felt in the step before, which keeps the
+tangent symmetric. So the impulse of friction on points that slide is the coefficient times the
+normal one, a step later, whether steps resolve an impact or not.
 """
 
-import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sorojax.contact import Grip, far, gaps
+from sorojax.contact import Grip, clearance, far, gaps
 from sorojax.fem.curved import blockwise
 
 if TYPE_CHECKING:
@@ -24,6 +22,15 @@ if TYPE_CHECKING:
 Nodal = Float[Array, "nodes dim"]
 
 _DEEP = 50.0  # times the smoothing: overlap under pressures of E / 20
+
+
+class Felt(NamedTuple):
+    """Of points where a step begins: pressure in the step before [Pa], normal of the obstacle,
+    and how far points of a facet may move until one feels it [m]."""
+
+    pressure: Float[Array, "facets quad"]
+    normal: Float[Array, "facets quad dim"]
+    clear: Float[Array, " facets"]
 
 
 def released(
@@ -52,49 +59,73 @@ def gripped(
     back: Nodal,
     rate: Float[Array, ""],
     step: Float[Array, ""],
+    feels: Felt,
 ) -> "Contact":
-    """`load` for the step from `u`, in which points move at `rate * (x - back)`, relative to
-    an obstacle that has moved from its last place to `value` within `step` [s]."""
+    """`load` for the step from `u`, where its points feel `feels`, in which they move at
+    `rate * (x - back)`, relative to an obstacle that has moved from its last place to `value`
+    within `step` [s]."""
     friction = load.friction_law
     assert load.grip is not None and load.place is not None
     start = load.points_of(problem, u) - load.place[None, None]
     anchor = start - friction.stretch(load.grip, start)
-    pressure, normal = _felt(load, start)
+    pressure = feels.pressure
     drag = friction.coefficient * pressure * rate / friction.velocity
     still = rate <= 0
     speed = (load.value - load.place) / jnp.where(still, 1.0, step)
     lead = jnp.where(still, jnp.zeros_like(speed), speed / jnp.where(still, 1.0, rate))
     away = load.points_of(problem, back) + (lead - load.value)[None, None]
-    grip = Grip(anchor, pressure, normal, drag, away)
+    grip = Grip(anchor, pressure, feels.normal, drag, away)
     return eqx.tree_at(lambda load: (load.grip, load.place), load, (grip, load.value))
 
 
-def _felt(
-    load: "Contact", points: Float[Array, "facets quad dim"]
-) -> tuple[Float[Array, "facets quad"], Float[Array, "facets quad dim"]]:
-    """Pressure and normal at points in the frame of the obstacle, zero where a block of
-    facets is far from it."""
-    law, shift = load.law, load.shift()
+def felt(load: "Contact", problem: "Problem", u: Nodal) -> Felt:
+    """What the points feel where a step from `u` begins, from `load` as the last step left
+    it; nothing where a block of facets was and is far from the obstacle."""
+    law, shift, start, bound = load.law, load.shift(), load.start, load.obstacle.lipschitz
+    assert load.place is not None
+    points = load.points_of(problem, u) - load.place[None, None]
+    was = (
+        None if start is None else load.points_at(problem, load.began) - start.place[None, None]
+    )
     reach = None if shift is None else jnp.max(shift)
 
-    def felt(points, row):
+    def near(points, row):
+        row, was = row
         gap, slope = jax.vmap(jax.value_and_grad(lambda x: gaps(load.obstacle, x)))(points)
         size = jnp.sqrt(jnp.sum(slope**2, axis=-1, keepdims=True))
         normal = slope / jnp.where(size > 0, size, jnp.ones_like(size))
-        pressure = law.pressure(gap if shift is None else gap - shift[row])
-        return jnp.concatenate([pressure[:, None], normal], axis=1)
+        gap = gap if shift is None else gap - shift[row]
+        pressure = law.pressure(gap)
+        if start is not None:
+            ending = load.ending()
+            mean = law.mean_pressure(gaps(load.obstacle, was) - start.shift[row], gap)
+            pressure = ending * pressure + (1 - ending) * mean
+        room = jnp.where(pressure > 0, jnp.zeros_like(gap), gap / bound)
+        return jnp.concatenate([pressure[:, None], normal, room[:, None]], axis=1)
 
-    def idle(points, _):
-        return far(load.obstacle, points, reach)
+    def idle(points, row):
+        free = far(load.obstacle, points, reach)
+        if start is None:
+            return free
+        return free & far(load.obstacle, row[1], jnp.max(start.shift))
+
+    def away(points, _):
+        room = clearance(load.obstacle, points, reach)
+        nothing = jnp.zeros((*points.shape[:2], points.shape[2] + 1), points.dtype)
+        rooms = jnp.broadcast_to(room, nothing[..., :1].shape)
+        return jnp.concatenate([nothing, rooms], axis=2)
 
     num, quad, dim = points.shape
-    found = blockwise(jax.vmap(felt), idle, points, jnp.arange(num), (quad, dim + 1))
-    return found[..., 0], found[..., 1:]
+    rows = jnp.arange(num), was
+    found = blockwise(jax.vmap(near), idle, points, rows, (quad, dim + 2), away)
+    least = jax.lax.stop_gradient(jnp.min(found[..., -1], axis=1))
+    clear = jnp.maximum(least, jnp.zeros_like(least))
+    return Felt(found[..., 0], found[..., 1:-1], clear)
 
 
 @eqx.filter_jit
 def settled(load: "Contact", problem: "Problem", u: Nodal) -> "Contact":
     """`load` after an equilibrium `u`, ready for the next one."""
     zero = jnp.zeros((), u.dtype)
-    made = gripped(load, problem, u, u, zero, zero)
-    return dataclasses.replace(made, began=load.began, share=jnp.ones_like(zero))
+    feels = felt(load, problem, u)
+    return gripped(load, problem, u, u, zero, zero, feels)

@@ -49,6 +49,11 @@ class AbstractLoad(eqx.Module):
         """Share of a Newton step [m] after which the load still sees what it acts on."""
         return jnp.ones((), du.dtype)
 
+    def room(self, problem: "Problem") -> Float[Array, ""] | None:
+        """How far nodes may move from where a step began [m] before the load acts; `None` for
+        one that may act anywhere."""
+        return None
+
     def couples(self) -> Int[np.ndarray, "groups group_nodes"] | None:
         """Groups of nodes that share no cell but do share stiffness; `None` if there are
         none. `fem.space(mesh, loads)` makes room for them in the tangent."""

@@ -16,7 +16,7 @@ from sorojax.contact.facet import over, pieces, shared
 from sorojax.contact.search import close_pairs, listed
 from sorojax.fem.checks import check_ids
 from sorojax.fem.contact_area import areas_of, compact, default_law, mean_size
-from sorojax.fem.curved import CurvedPart, blockwise
+from sorojax.fem.curved import CurvedPart, group_energy
 from sorojax.fem.facets import facet_tables, normals
 from sorojax.fem.loads import AbstractLoad
 from sorojax.fem.own_wall import through_own_wall
@@ -77,9 +77,7 @@ class SelfContact(AbstractLoad):
         return xp.concatenate([xp.asarray(self.facets), xp.asarray(self.others)])
 
     def potential(self, problem, u):
-        part, idle = self.curved_part(problem), self._idle(problem)
-        x = (problem.mesh.points + u)[part.groups]
-        return jnp.sum(blockwise(jax.vmap(part.energy), idle, x, part.data, ()))
+        return group_energy((problem.mesh.points + u)[self._groups()], self, problem)
 
     def curved_part(self, problem):
         data = areas_of(problem, self.rows()) / 2, self.real, self.offset

@@ -5,6 +5,7 @@ import io
 import json
 import os
 import zipfile
+import zlib
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -129,25 +130,36 @@ def _digest(array: np.ndarray) -> str:
     return hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
 
 
+#: What the libraries raise at a file that is no archive of arrays, or a damaged one.
+_BROKEN = (
+    zipfile.BadZipFile, zlib.error, EOFError, KeyError, OSError, RuntimeError, TypeError,
+    ValueError,
+)  # fmt: skip
+
+
 def _unpack(target, content: bytes, max_bytes: int) -> tuple[dict, list[np.ndarray]]:
     """Header and arrays; the size that is declared is checked before anything unpacks."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
-        if size > max_bytes:
-            raise ValueError(
-                f"io.load: {target} unpacks to {size} bytes, the limit is {max_bytes}. Raise "
-                "`max_bytes` if you trust it and have the memory."
-            )
+    except _BROKEN as error:
+        raise ValueError(_damaged(target, str(error))) from error
+    if size > max_bytes:
+        raise ValueError(
+            f"io.load: {target} unpacks to {size} bytes, the limit is {max_bytes}. Raise "
+            "`max_bytes` if you trust it and have the memory."
+        )
+    try:
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             header = json.loads(file[_HEADER].tobytes())
             arrays = [file[f"leaf{k}"] for k in range(len(header["leaves"]))]
-    except (zipfile.BadZipFile, KeyError, TypeError, EOFError, json.JSONDecodeError) as error:
+        version = int(header["format"])
+    except _BROKEN as error:
         raise ValueError(_damaged(target, str(error))) from error
-    if header["format"] > FORMAT:
+    if version > FORMAT:
         raise ValueError(
-            f"io.load: {target} has format {header['format']}, this version reads up to "
-            f"{FORMAT}. Update sorojax."
+            f"io.load: {target} has format {version}, this version reads up to {FORMAT}. "
+            "Update sorojax."
         )
     return header, arrays
 

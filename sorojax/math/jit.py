@@ -17,9 +17,8 @@ Verb = TypeVar("Verb", bound=Callable[..., Any])
 def jit(function: Verb) -> Verb:
     """`function` compiled, as by `equinox.filter_jit`: for rods, networks and their gradients.
 
-    Experimental: with SOROJAX_ONE_KERNEL=1 in the environment, loops over small arrays become
-    one kernel each on a CPU, which is up to two and a half times faster. XLA ends the process
-    where it cannot compile such a kernel (the shape filter is one).
+    On a CPU, loops over small arrays become one kernel each, which is up to two and a half
+    times faster; SOROJAX_ONE_KERNEL=0 in the environment leaves that out.
     Inside `jit`, `vmap` or `grad` it is part of the program around it, so the outermost
     function is the one to wrap:
 

@@ -115,7 +115,8 @@ def repeated(
     memory: PyTree = None,
 ) -> tuple[PyTree, PyTree, Array]:
     """As `repeat`, with the memory at the end and whether all steps converged; the first
-    that does not is the last one taken."""
+    that does not is the last one taken. A method that carries its memory computes none
+    after it."""
     memory = method.begin(field, t, y, h) if memory is None else memory
 
     def one(k, carry):
@@ -129,7 +130,12 @@ def repeated(
         )
         return (*taken, fine)
 
-    return jax.lax.fori_loop(0, count, one, (y, memory, jnp.array(True)))
+    def next_one(k, carry):
+        if not method.carries:
+            return one(k, carry)
+        return jax.lax.cond(carry[-1], one, lambda _, held: held, k, carry)
+
+    return jax.lax.fori_loop(0, count, next_one, (y, memory, jnp.array(True)))
 
 
 def finite(tree: PyTree) -> Array:

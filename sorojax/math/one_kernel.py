@@ -20,19 +20,26 @@ import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
+import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend import core
 
 LARGEST = 4096  # numbers in an array that is made inside a loop: some 32 kB
+LARGEST_PASSED = 65536  # numbers in an array that a loop is given, or leaves
 LARGEST_PRODUCT = 8192  # multiplications of a matrix product; beyond that a library is faster
 LONGEST = 4000  # operations in a loop: beyond that one kernel compiles slowly
 LARGEST_GIVEN = 1024  # numbers in an argument: batches of states are no small arrays
 MARK = {"xla_cpu_small_call": "true", "inlineable": "false"}
+NO_MARK = {"xla_cpu_small_call": "false", "inlineable": "true"}  # of what a kernel calls
 # No kernel can hold products by that library; the emitters take longer to compile what is
 # left, and gain nothing where arrays are small.
 OPTIONS = {"xla_cpu_experimental_ynn_fusion_type": "", "xla_cpu_use_fusion_emitters": False}
 
 _NUMBER = "float32"
+_KINDS = {
+    np.dtype(kind)
+    for kind in ("bool", "float32", "float64", "int32", "int64", "uint32", "uint64")
+}
 _LOOPS = {"scan", "while"}
 _INLINED = {
     "checkpoint", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call",
@@ -58,15 +65,18 @@ Answer = TypeVar("Answer")
 def one_kernel(function: Callable[..., Answer]) -> Callable[..., tuple[Answer, Any]]:
     """`function` with its small loops marked, to be compiled by itself with `OPTIONS`.
 
-    Beside the answer it returns a number that no one needs: it reads the arguments of every
-    kernel, as the compiler aborts the process where a kernel does not use one.
+    Beside the answer it returns a number that no one needs: the kernels hand it on, and so
+    none of them can do without its arguments.
     """
 
     @functools.wraps(function)
     def marked(*args: Any, **kwargs: Any) -> tuple[Answer, Any]:
         closed, shapes, rest = eqx.filter_make_jaxpr(function)(*args, **kwargs)
         arrays = jax.tree.leaves(eqx.filter((args, kwargs), eqx.is_array))
-        reads: list[Any] = [jnp.zeros((), _NUMBER)]
+        known = [x for x in arrays if x.size and _is_number(x)]
+        if not known:
+            return function(*args, **kwargs), None
+        reads = [known[0].reshape(-1)[0].astype(_NUMBER)]
         leaves = _run(closed.jaxpr, closed.consts, arrays, reads)
         answer = eqx.combine(jax.tree.unflatten(jax.tree.structure(shapes), leaves), rest)
         return answer, functools.reduce(jnp.add, reads)
@@ -81,45 +91,115 @@ def runs_alone(*args: Any) -> bool:
     for leaf in jax.tree.leaves(args):
         if isinstance(leaf, jax.core.Tracer) or getattr(leaf, "size", 0) > LARGEST_GIVEN:
             return False
-    asked = os.environ.get("SOROJAX_ONE_KERNEL") == "1" and _KNOWN
-    return asked and jax.default_backend() == "cpu" and jax.device_count() == 1
+    allowed = _KNOWN and os.environ.get("SOROJAX_ONE_KERNEL") != "0"
+    return allowed and jax.default_backend() == "cpu" and jax.device_count() == 1
 
 
-# The mark and the options belong to the compiler of these releases. It does not always refuse a
-# kernel that it cannot hold, but may end the process: hence only where it is asked for.
+# The mark and the options belong to the compiler of these releases.
 _KNOWN = metadata.version("jaxlib").startswith("0.10.")
 _AT_THE_TOP = core.get_opaque_trace_state(convention="flax")
 
 
-def _run(jaxpr: Any, consts: Any, args: Any, reads: list[Any]) -> list[Any]:
+def _run(jaxpr: Any, consts: Any, args: list[Any], reads: list[Any]) -> list[Any]:
+    return _values(functools.partial(_answer, reads=reads), jaxpr, consts, args)
+
+
+def _values(evaluate: Any, jaxpr: Any, consts: Any, args: list[Any]) -> list[Any]:
     values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True))
 
     def read(atom: Any) -> Any:
         return atom.val if isinstance(atom, core.Literal) else values[atom]
 
     for equation in jaxpr.eqns:
-        found = _answer(jaxpr, equation, [read(atom) for atom in equation.invars], reads)
+        found = evaluate(jaxpr, equation, [read(atom) for atom in equation.invars])
         values.update(zip(equation.outvars, found, strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
 
 def _answer(jaxpr: Any, equation: Any, given: list[Any], reads: list[Any]) -> list[Any]:
     name, inner = equation.primitive.name, _bodies(equation)
-    if name in _LOOPS and _is_small(equation) and _length(equation) <= LONGEST:
-        with set_xla_metadata(**MARK):
-            found, number = jax.jit(lambda *x: (_bound(jaxpr, equation, x), _read(x)))(*given)
-        reads.append(number)
-        return found
+    if name in _LOOPS and _passes_few(equation) and _is_small(equation):
+        return _in_one(functools.partial(_inside, jaxpr, equation), given, reads)
     if name in _INLINED and len(inner) == 1:
         return _run(*inner[0], given, reads)
     return _bound(jaxpr, equation, given)
 
 
-def _read(arrays: Any) -> Any:
-    """A number that needs all arrays."""
-    first = [jax.lax.slice(x, (0,) * x.ndim, (1,) * x.ndim) for x in arrays if x.size]
-    numbers = [jax.lax.convert_element_type(x.reshape(()).real, _NUMBER) for x in first]
-    return functools.reduce(jnp.add, numbers, jnp.zeros((), _NUMBER))
+def _in_one(function: Callable[..., list[Any]], given: list[Any], reads: list[Any]) -> Any:
+    """`function` of `given` in one call that is marked; constants stay constants.
+
+    The compiler ends the process where a computation in such a call does not use its
+    argument, and what is found to be constant is no argument any more. So there is one
+    argument for each kind of number, and it begins with a number that no compiler can know.
+    """
+    kinds: dict[Any, list[int]] = {}
+    for place, value in enumerate(given):
+        if isinstance(value, jax.core.Tracer):
+            kinds.setdefault(value.dtype, []).append(place)
+    if not kinds:
+        return function(given)
+    packs = [
+        jnp.concatenate(
+            [reads[0].reshape(1).astype(kind), *(given[k].reshape(-1) for k in places)]
+        )
+        for kind, places in kinds.items()
+    ]
+
+    def marked(*packs: Any) -> Any:
+        with set_xla_metadata(**NO_MARK):
+            values = list(given)
+            for pack, places in zip(packs, kinds.values(), strict=True):
+                start = 1
+                for k in places:
+                    size, shape = given[k].size, given[k].shape
+                    values[k] = jax.lax.slice(pack, (start,), (start + size,)).reshape(shape)
+                    start += size
+            first = [pack[:1].astype(_NUMBER) for pack in packs]
+            return function(values), functools.reduce(jnp.add, first)[0]
+
+    with set_xla_metadata(**MARK):
+        found, number = jax.jit(marked)(*packs)
+    reads.append(number)
+    return found
+
+
+def _inside(jaxpr: Any, equation: Any, given: Any) -> list[Any]:
+    """One equation in a kernel. Every loop counts: what forgets its state has no argument."""
+    name, params = equation.primitive.name, equation.params
+    if name != "while" and not any(_holds(body, {"while"}) for body, _ in _bodies(equation)):
+        return _bound(jaxpr, equation, given)  # a scan counts anyway
+    if name == "scan":
+        fixed, ends = params["num_consts"], params["num_consts"] + params["num_carry"]
+
+        def step(carry: Any, row: Any) -> Any:
+            found = _evaluate(params["jaxpr"], [*given[:fixed], *carry, *row])
+            return found[: ends - fixed], found[ends - fixed :]
+
+        how = {key: params[key] for key in ("length", "reverse", "unroll")}
+        carry, rows = jax.lax.scan(step, given[fixed:ends], given[ends:], **how)
+        return [*carry, *rows]
+    if name == "while":
+        first = params["cond_nconsts"]
+        second = first + params["body_nconsts"]
+
+        def goes_on(state: Any) -> Any:
+            on = _evaluate(params["cond_jaxpr"], [*given[:first], *state[1]])[0]
+            return on & (state[0] != 1)  # it is even
+
+        def turn(state: Any) -> Any:
+            new = _evaluate(params["body_jaxpr"], [*given[first:second], *state[1]])
+            return state[0] + 2, new
+
+        start = (jnp.zeros((), "uint32"), given[second:])
+        return jax.lax.while_loop(goes_on, turn, start)[1]
+    inner = _bodies(equation)
+    if name in _INLINED and len(inner) == 1:
+        return _evaluate(core.ClosedJaxpr(*inner[0]), given)
+    return _bound(jaxpr, equation, given)
+
+
+def _evaluate(closed: Any, args: list[Any]) -> list[Any]:
+    return _values(_inside, closed.jaxpr, closed.consts, args)
 
 
 def _bound(jaxpr: Any, equation: Any, given: Any) -> list[Any]:
@@ -137,32 +217,43 @@ def _bound(jaxpr: Any, equation: Any, given: Any) -> list[Any]:
 
 def _is_small(equation: Any) -> bool:
     """Whether a kernel can hold what an equation does, and should."""
-    name = equation.primitive.name
+    name, inner = equation.primitive.name, _bodies(equation)
     if name not in _HELD or equation.effects:
         return False
-    # Neither may a branch leave an argument unused, nor a loop its state.
+    # A branch may leave an argument unused; a batched condition is a loop of its own kind.
     if name == "cond" and equation.params.get("branches_platforms") is None:
         return False
-    if name == "while" and not all(_uses_state(equation, part) for part in ("cond", "body")):
+    if name == "while" and equation.params["cond_jaxpr"].out_avals[0].shape:
         return False
     if name == "dot_general" and _multiplications(equation) > LARGEST_PRODUCT:
         return False
+    if not all(_is_number(var.aval) for var in (*equation.invars, *equation.outvars)):
+        return False
+    if name not in _LOOPS | _INLINED and any(_holds(jaxpr, _LOOPS) for jaxpr, _ in inner):
+        return False
     return all(
-        all(getattr(var.aval, "size", 0) <= LARGEST for var in inner.outvars)
-        and _is_small(inner)
-        for jaxpr, _ in _bodies(equation)
-        for inner in jaxpr.eqns
+        all(getattr(var.aval, "size", 0) <= LARGEST for var in each.outvars) and _is_small(each)
+        for jaxpr, _ in inner
+        for each in jaxpr.eqns
     )
 
 
-def _uses_state(loop: Any, part: str) -> bool:
-    fixed, body = loop.params[f"{part}_nconsts"], loop.params[f"{part}_jaxpr"].jaxpr
-    state = set(body.invars[fixed:])
+def _passes_few(loop: Any) -> bool:
+    passed = (*loop.invars, *loop.outvars)
+    few = all(getattr(var.aval, "size", 0) <= LARGEST_PASSED for var in passed)
+    return few and _length(loop) <= LONGEST
+
+
+def _holds(jaxpr: Any, names: set[str]) -> bool:
     return any(
-        not isinstance(atom, core.Literal) and atom in state
-        for equation in body.eqns
-        for atom in equation.invars
+        equation.primitive.name in names
+        or any(_holds(body, names) for body, _ in _bodies(equation))
+        for equation in jaxpr.eqns
     )
+
+
+def _is_number(array: Any) -> bool:
+    return getattr(array, "dtype", None) in _KINDS
 
 
 def _multiplications(product: Any) -> int:

@@ -102,10 +102,12 @@ def box(
 def _corners(where: str, lower, upper, divisions, dim: int):
     lower, upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
     fits = lower.shape == upper.shape == (dim,) and len(divisions) == dim
-    if not fits or min(divisions) < 1 or not np.all(upper > lower):
+    finite = np.all(np.isfinite([*lower.flat, *upper.flat]))
+    if not fits or not finite or min(divisions) < 1 or not np.all(upper > lower):
         raise ValueError(
             f"{where}: got `lower` {lower}, `upper` {upper} m, `divisions` {divisions}; "
-            f"need {dim} entries each, upper > lower and divisions of at least 1."
+            f"need {dim} finite entries each, upper > lower and divisions of at "
+            "least 1."
         )
     return lower, upper
 

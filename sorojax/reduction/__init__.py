@@ -9,7 +9,12 @@ from sorojax.reduction.curve import (
     Curve as Curve,
     Line as Line,
 )
+from sorojax.reduction.damping import (
+    DampingFit as DampingFit,
+    identify_damping as identify_damping,
+)
 from sorojax.reduction.identify import (
+    ConstantDamping as ConstantDamping,
     Fit as Fit,
     PressureMap as PressureMap,
     condensed_stiffness as condensed_stiffness,

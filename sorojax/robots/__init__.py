@@ -1,7 +1,14 @@
 """Ready-made and printable bodies as parametric programs."""
 
-from sorojax.robots.around import cylinder as cylinder, rim as rim, ring as ring
+from sorojax.robots.around import (
+    below as below,
+    cylinder as cylinder,
+    rim as rim,
+    ring as ring,
+    upside_down as upside_down,
+)
 from sorojax.robots.bellows import BellowsActuator as BellowsActuator
+from sorojax.robots.bellows_problem import bellows_problem as bellows_problem
 from sorojax.robots.bending import BendingActuator as BendingActuator
 from sorojax.robots.crawler import (
     Crawler as Crawler,
@@ -28,6 +35,19 @@ from sorojax.robots.models_supply import (
 from sorojax.robots.parts import Bellows as Bellows
 from sorojax.robots.planar import PlanarActuator as PlanarActuator
 from sorojax.robots.pneunet import PneuNet as PneuNet, pneunet_mesh as pneunet_mesh
+from sorojax.robots.rod_stepper import (
+    RodBehindValves as RodBehindValves,
+    rod_stepper as rod_stepper,
+)
+from sorojax.robots.surroundings import (
+    InContact as InContact,
+    Replay as Replay,
+    contact_stepper as contact_stepper,
+    middle as middle,
+    replay as replay,
+    standing_cylinder as standing_cylinder,
+    surrounded as surrounded,
+)
 from sorojax.robots.walker import (
     Walker as Walker,
     pair_angles as pair_angles,

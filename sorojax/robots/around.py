@@ -53,6 +53,21 @@ def _hanging(angle: float, radius: Float[Array, ""]) -> Float[Array, "4 4"]:
     return homogeneous(turn, radius * jnp.stack([c, s, zero]))
 
 
+def below(depth: Float[Array, ""] | float) -> Float[Array, "4 4"]:
+    """Pose of what hangs `depth` [m] below the middle of a ring, not turned."""
+    depth = real(depth)
+    zero = jnp.zeros_like(depth)
+    return homogeneous(jnp.eye(3, dtype=depth.dtype), jnp.stack([zero, zero, -depth]))
+
+
+def upside_down(height: Float[Array, ""] | float) -> Float[Array, "4 4"]:
+    """Pose of what hangs from a beam at `height` [m], its z axis down, its x axis kept."""
+    height = real(height)
+    zero = jnp.zeros_like(height)
+    turn = jnp.diag(jnp.asarray([1.0, -1.0, -1.0], height.dtype))
+    return homogeneous(turn, jnp.stack([zero, zero, height]))
+
+
 def cylinder(
     mass: Float[Array, ""] | float,
     radius: Float[Array, ""] | float,

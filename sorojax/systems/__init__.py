@@ -32,6 +32,7 @@ from sorojax.systems.coupled import Coupled as Coupled
 from sorojax.systems.event import Event as Event, Happened as Happened
 from sorojax.systems.fem_body import FemBody as FemBody
 from sorojax.systems.fluidic import Regulator as Regulator, Reservoir as Reservoir
+from sorojax.systems.followed import Followed as Followed, followed as followed
 from sorojax.systems.modal_basis import Basis as Basis, modal_basis as modal_basis
 from sorojax.systems.modal_body import (
     ModalBody as ModalBody,

@@ -48,7 +48,8 @@ class PID(AbstractController):
     y_f' = (y - y_f) / filter_time, e = r - y.
 
     Wired in a network it runs in continuous time; called as a function it takes a step
-    of the same equations. Gains are in command units per measurement unit.
+    of the same equations, of several signals at once if measurement and reference are
+    vectors. Gains are in command units per measurement unit.
 
     Attributes:
         proportional, integral_gain, derivative: Gains [-], [1/s], [s] times those units.
@@ -65,8 +66,8 @@ class PID(AbstractController):
     integral_gain: Scalar = eqx.field(converter=real, default=0.0)
     derivative: Scalar = eqx.field(converter=real, default=0.0)
     feed_forward: Scalar = eqx.field(converter=real, default=0.0)
-    low: Scalar = eqx.field(converter=real, default=-math.inf)
-    high: Scalar = eqx.field(converter=real, default=math.inf)
+    low: Float[Array, "..."] = eqx.field(converter=real, default=-math.inf)
+    high: Float[Array, "..."] = eqx.field(converter=real, default=math.inf)
     filter_time: Scalar = eqx.field(converter=real, default=0.01)
     tracking_time: Scalar = eqx.field(converter=real, default=0.1)
     start_measurement: Scalar = eqx.field(converter=real, default=0.0)
@@ -78,9 +79,9 @@ class PID(AbstractController):
         do = "Take about a tenth of the time in which the plant answers."
         _check.positive("PID", "filter_time", self.filter_time, "s", do)
         _check.positive("PID", "tracking_time", self.tracking_time, "s", do)
-        if _check.is_concrete(self.high - self.low) and not self.low < self.high:
+        if _check.is_concrete(self.high - self.low) and not jnp.all(self.low < self.high):
             raise ValueError(
-                f"PID: `low` must be below `high`, got {self.low:g} and {self.high:g} "
+                f"PID: `low` must be below `high`, got {self.low} and {self.high} "
                 f"{self.command_unit}. Swap them, or leave one out."
             )
 

@@ -37,7 +37,13 @@ def fixed(
     def advance(walk: Walk, number):
         t = time[number]
         given = (method, block, inputs, t, walk.state, walk.memory)
-        walk = walk.after(move.taken(given, interval), t + interval)
+        if method.carries:  # a step is large: none is computed after one that failed
+            moved = jax.lax.cond(
+                walk.good, lambda: move.taken(given, interval), lambda: walk.held
+            )
+        else:
+            moved = move.taken(given, interval)
+        walk = walk.after(moved, t + interval)
         if progress:
             tell("simulate", (number + 1) / count)
         return walk, walk.state
@@ -74,6 +80,11 @@ class Walk(NamedTuple):
             lambda a, b: jnp.where(good, a, b), (new, memory), (self.state, self.memory)
         )
         return Walk(state, memory, good, solved, jnp.where(good, t, self.reached))
+
+    @property
+    def held(self) -> tuple[PyTree, Any, Array]:
+        """What an interval yields after one that failed."""
+        return self.state, self.memory, self.solved
 
     @property
     def status(self) -> Status:

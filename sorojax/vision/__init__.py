@@ -35,6 +35,7 @@ from sorojax.vision.fiducials import (
     world_frame as world_frame,
 )
 from sorojax.vision.scene import Balls as Balls, draw_balls as draw_balls
+from sorojax.vision.stream import MarkerStream as MarkerStream
 from sorojax.vision.synthetic import (
     Disturbance as Disturbance,
     background as background,

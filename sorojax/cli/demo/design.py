@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sorojax import fem, material, mesh, sdf
+from sorojax import fem, material, mesh, robots, sdf
 from sorojax.robots import BellowsActuator
 from sorojax.units import kPa, mm
 
@@ -61,13 +61,7 @@ def bellows_problem(
     layer = actuator.layer()
     stiff = np.ones(cells.num_cells)
     stiff[mesh.cells_where(cells, lambda p: layer(p) < 0)] = LAYER_STIFFNESS
-    return fem.problem(
-        cells,
-        material.Scaled(rubber, stiff),
-        kinematics=fem.PlaneStrain(depth),
-        supports=(fem.Fixed(mesh.nodes_where(cells, lambda p: p[0] < 1e-9)),),
-        loads=(fem.Pressure(mesh.facets_on(cells, actuator.chambers()), name="air"),),
-    )
+    return robots.bellows_problem(actuator, cells, material.Scaled(rubber, stiff), depth=depth)
 
 
 class Sensitivity(NamedTuple):

@@ -1,0 +1,162 @@
+"""A robot among other bodies: where it is mounted, what it touches, and how it moves then."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sorojax._edit import replace
+from sorojax.contact import LinePenalty
+from sorojax.math.contact_stepper import ContactMidpoint
+from sorojax.math.method import finite
+from sorojax.math.steppers import AbstractStepper
+from sorojax.robots.around import below, cylinder, rim
+from sorojax.robots.models_supply import Model
+from sorojax.rod import Assembly, Free, LinkObstacle, Part, assembly, tip_pose
+from sorojax.rod.loads import Load
+from sorojax.sdf import HalfSpace
+from sorojax.systems import AssemblyBody, Parted, partitioned
+
+
+def surrounded(
+    model: Model,
+    forces: tuple[Load, ...],
+    *,
+    mount: Float[Array, "h h"] | None = None,
+    **parts: Part,
+) -> Model:
+    """`model` with further bodies, and with forces between them: contacts above all.
+
+    Args:
+        model: A robot, of `robots.model`.
+        forces: `On(part, force)` and `Between(first, second, contact)`, of old and new parts.
+        mount: Pose of the robot, in which it was drawn if omitted; weight keeps its direction.
+        **parts: The bodies by name, in the frame of the ground unless a part carries them.
+
+    Raises:
+        ValueError: If a name is taken.
+    """
+    body = model.network.blocks["body"]
+    own = dict(zip(model.assembly.names, model.assembly.parts, strict=True))
+    if taken := sorted(own.keys() & parts.keys()):
+        raise ValueError(
+            f"surrounded: the robot has a part called `{taken[0]}` already, need other names. "
+            "Rename the new one."
+        )
+    if mount is not None:
+        own = {name: _mounted(part, jnp.asarray(mount)) for name, part in own.items()}
+    whole = assembly(model.assembly.group, **own, **parts)
+    assert isinstance(body, AssemblyBody)
+    new = AssemblyBody(whole, (*body.forces, *forces), driven=body.driven)
+    return replace(model, lambda made: made.network.blocks["body"], new)
+
+
+def _mounted(part: Part, pose: Array) -> Part:
+    if part.on is not None:
+        return part
+    own = pose if part.offset is None else pose @ part.offset
+    return Part(part.body, part.joint, part.on, own, part.s)
+
+
+def standing_cylinder(
+    mass: float, radius: float, height: float, law: LinePenalty
+) -> tuple[Part, LinkObstacle]:
+    """A free cylinder that stands at the origin, and its contact with the floor z = 0.
+
+    Args:
+        mass: [kg].
+        radius: [m].
+        height: [m].
+        law: Between its lower rim and the floor.
+    """
+    part = Part(cylinder(mass, radius, height), Free(), offset=below(-height / 2))
+    floor = HalfSpace([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
+    points, lengths = rim(radius, -height / 2)
+    return part, LinkObstacle(obstacle=floor, points=points, lengths=lengths, law=law)
+
+
+def middle(
+    model: Assembly, q: Float[Array, " coordinates"], names: Sequence[str]
+) -> Float[Array, " dim"]:
+    """Mean position of the tips or frames of some parts [m]: between fingers, for example."""
+    poses = tip_pose(model, q)
+    return jnp.mean(jnp.stack([poses[name][:-1, -1] for name in names]), axis=0)
+
+
+class InContact(NamedTuple):
+    """A robot of `contact_stepper` at one moment."""
+
+    network: Parted
+
+    @property
+    def q(self) -> Float[Array, " coordinates"]:
+        return self.network.state["body"]["q"]
+
+    @property
+    def v(self) -> Float[Array, " dof"]:
+        return self.network.state["body"]["v"]
+
+
+class Replay(NamedTuple):
+    """Coordinates, rates and poses by part along a motion."""
+
+    q: Float[Array, "moments coordinates"]
+    v: Float[Array, "moments dof"]
+    poses: dict[str, Float[np.ndarray, "moments h h"]]
+
+
+def replay(model: Assembly, states: Sequence[InContact]) -> Replay:
+    """The states that a board kept, in a row."""
+    q, v = (jnp.stack([getattr(state, name) for state in states]) for name in ("q", "v"))
+    poses = _poses(model, q)
+    return Replay(q, v, {name: np.asarray(rows) for name, rows in poses.items()})
+
+
+@eqx.filter_jit
+def _poses(model: Assembly, q):
+    return jax.vmap(lambda row: tip_pose(model, row))(q)
+
+
+def contact_stepper(
+    model: Model, period: float, *, substeps: int = 2, stepper: AbstractStepper | None = None
+) -> tuple[Callable[..., tuple[InContact, Array]], InContact]:
+    """`robots.stepper` of a robot that touches things, by `systems.partitioned`.
+
+    Args:
+        model: The robot, of `surrounded` for example.
+        period: Of every call [s].
+        substeps: Steps in one.
+        stepper: Of the body; one for grasps if omitted: a `ContactMidpoint` that keeps
+            contacts from step to step and finds their forces in one pass.
+
+    Raises:
+        RuntimeError: By `advance`, if a step does not converge.
+    """
+    if stepper is None:
+        stepper = ContactMidpoint(passes=1, lasting=True, theta=1.0, tolerance=1e-4)
+    move, start = partitioned(model.network, period, substeps=substeps, stepper=stepper)
+
+    @eqx.filter_jit
+    def told(model, state):
+        return model.pressure(state), finite(state)
+
+    def advance(now: InContact, setpoint: Any, dt: float):
+        if abs(dt - period) > 1e-9 * period:
+            raise ValueError(
+                f"contact_stepper: asked for {dt:g} s, made for {period:g} s. Make one for "
+                "this step."
+            )
+        moved = move(now.network, model.inputs(jnp.asarray(setpoint)))
+        pressure, good = told(model, moved.state)
+        if not good:
+            raise RuntimeError(
+                f"contact_stepper: the robot does not get through {period:g} s at set-points "
+                f"of {np.asarray(setpoint)} Pa. Make more `substeps`."
+            )
+        return InContact(moved), pressure
+
+    return advance, InContact(start)
