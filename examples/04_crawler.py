@@ -53,7 +53,7 @@ def draw(problem, motion, centre, file: Path) -> None:
         for line in now[facets]:
             axes[k].plot(*line.T, color="#2a6f97", lw=0.8)
         axes[k].axhline(0.0, color="#e76f51", lw=1)
-        axes[k].set(aspect="equal", xticks=[], yticks=[], xlim=(-3, 158), ylim=(-1, 26))
+        axes[k].set(aspect="equal", xticks=[], yticks=[], xlim=(-8, 160), ylim=(-1, 34))
         axes[k].set_ylabel(f"{share:g} T")
     axes[4].plot(times, centre[:, 0], color="#2a6f97", label="forwards")
     axes[4].plot(times, centre[:, 1], color="#e76f51", label="upwards")

@@ -5,14 +5,13 @@ import pytest
 from tests.scripts import ROOT, main_of, user_code
 
 LONGEST = 60  # lines of user code
-LONGER = {"20_passive_walker": 80}
 
 
 def test_examples_are_short():
     names = sorted(path.stem for path in (ROOT / "examples").glob("[0-9]*.py"))
     lengths = {name: user_code(name) for name in names}
     assert len(lengths) > 10 and min(lengths.values()) > 10
-    assert {n: k for n, k in lengths.items() if k > LONGER.get(n, LONGEST)} == {}
+    assert {n: k for n, k in lengths.items() if k > LONGEST} == {}
 
 
 def test_shapes_are_cut_and_fit_to_print():

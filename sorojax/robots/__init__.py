@@ -17,6 +17,7 @@ from sorojax.robots.crawler import (
     crawler_rubbers as crawler_rubbers,
 )
 from sorojax.robots.finger import Finger as Finger
+from sorojax.robots.gait import Gait as Gait, gait as gait
 from sorojax.robots.hand import Hand as Hand
 from sorojax.robots.manipulator import Manipulator as Manipulator
 from sorojax.robots.models import (
