@@ -41,7 +41,8 @@ def rows():
     body, sizes = finger(8), members()
     q, v = (jnp.asarray(x) for x in random_states(max(sizes)))
     assert q.shape[1] == 2 * MODES
-    for name, function, calls in (("accelerations", accelerations, 1), ("steps", ends, STEPS)):
+    kinds = ("accelerations", accelerations, 1), ("steps", ends, STEPS)
+    for name, function, calls in kinds[1:] if quick("accelerations: in rod.batch") else kinds:
         yield from scaling.rows(
             name, "members", 1.0,
             (scaling.program(n, function, body, q[:n], v[:n], calls=calls) for n in sizes),
