@@ -7,6 +7,7 @@ until it falls or comes to rest, and no gait lasts.
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from sorojax.units import deg, mm, ms
 RUBBER, SLOPE, DROP = fem.KelvinVoigt(800.0), 30 * deg, 3 * mm
 
 
-def walk(duration: float, step: float, method=None, **floor: float) -> fem.Motion:
+def walk(duration: float, step: float, method=None, **floor: Any) -> fem.Motion:
     """From rest, a little above the slope."""
     floor = {"slope": SLOPE, "friction": 0.7} | floor
     problem = robots.walker_problem(robots.Walker(), size=2.5 * mm, **floor)
