@@ -5,7 +5,7 @@ def enable_low_latency() -> None:
     """Have JAX run small programs on a CPU where they are called, for loops in real time.
 
     By default it hands them to another thread, whose waking takes longer than an estimate of
-    a rod's shape: on one busy core the median of such a call is halved. Python then no longer
+    a rod's shape: on one core the median of such a call may be halved. Python then no longer
     prepares the next call while the last one runs. To be called before the first array is
     made; never done by an import.
 

@@ -154,7 +154,10 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="needs Dask")
+@pytest.mark.skipif(
+    importlib.util.find_spec("distributed") is None,
+    reason="no Dask here: it comes with the extra `sweep`",
+)
 def test_dask_survives_killed_workers_a_killed_driver_and_a_damaged_file(tmp_path, serial):
     def drive(deadly):
         script = tmp_path / "driver.py"

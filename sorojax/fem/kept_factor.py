@@ -37,7 +37,7 @@ class KeptFactor:
         self, u: Float[np.ndarray, "nodes dim"], ratio: float, size: float
     ) -> Neighbour | None:
         """What to solve with at `u`, where the residual is `ratio` of the load and the last
-        step was `size` of the displacement."""
+        step was `size` of the displacement; 0 where no eigenvalues are asked for."""
         if self._factor is None or not 0 < ratio < np.inf:
             return None
         largest = np.abs(u).max()
@@ -45,7 +45,9 @@ class KeptFactor:
         if not moved <= self._reach * largest:
             return None
         start = None
-        if moved > _SAME * largest:  # as large as the step to come, and in every mode
+        if (
+            size > 0 and moved > _SAME * largest
+        ):  # as large as the step to come, and in every mode
             start = size * size * largest * self._modes(self._factor)
         tolerance = max(min(_SHARE * self._tolerance / ratio, 1e-2), _QUADRATIC * ratio)
         return Neighbour(self._factor, start, min(tolerance, 1e-2))
