@@ -16,7 +16,7 @@ define install
 	  $(PIP) -e '.$(if $(1),[$(1)])'; }
 endef
 
-.PHONY: demo test stress lint bench peers clean help
+.PHONY: demo test stress lint bench bench-device peers clean help
 
 help:
 	@echo "make demo   set up .venv, run the main job, write out/"
@@ -24,6 +24,7 @@ help:
 	@echo "make stress the cases that may break a simulator, and which of them hold"
 	@echo "make lint   ruff and pyright"
 	@echo "make bench  all benchmarks, page in benchmarks/results/; QUICK=1 for the main ones"
+	@echo "make bench-device  kernels on an accelerator and on the CPU (jax[cuda13] in .venv)"
 	@echo "make peers  the codes that the benchmarks compare with, one .peers/<name> each"
 	@echo "make clean  remove .venv, .peers, out and benchmarks/results"
 
@@ -43,6 +44,9 @@ lint: $(VENV)/.dev
 
 bench: $(VENV)/.run
 	$(PY) -m benchmarks $(if $(QUICK),--quick)
+
+bench-device: $(VENV)/.run
+	JAX_PLATFORMS=cuda,cpu $(PY) -m benchmarks device.sdf device.rods device.fem
 
 peers: $(VENV)/.run
 	$(PY) -m benchmarks.peers install $(PEERS)

@@ -48,3 +48,11 @@ def integers(value: Any) -> jax.Array:
 def is_traced(tree: Any) -> bool:
     """Whether any leaf of `tree` is an abstract value of a JAX transformation."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def platform() -> str:
+    """Where arrays are made here: "cpu", "gpu", "tpu"."""
+    chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    if chosen is None:
+        return jax.default_backend()
+    return chosen if isinstance(chosen, str) else chosen.platform

@@ -127,7 +127,7 @@ def _solves(name: str, problem: fem.Problem):
             jnp.max(jnp.abs(found.displacement - exact.displacement))
             / jnp.max(jnp.abs(exact.displacement))
         )
-        again = _others(solver)
+        again = varied(solver)
         timing = cpu_timing(lambda p=again: fem.solve(next(p)).displacement, 2)
         settings = {
             "problem": name,
@@ -141,7 +141,7 @@ def _solves(name: str, problem: fem.Problem):
         )  # fmt: skip
 
 
-def _others(problem: fem.Problem):
+def varied(problem: fem.Problem):
     """`problem` under slightly other loads: the factors of known values are kept."""
     for number in count(1):
         load = problem.loads[0].value * (1 - 1e-6 * number)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sorojax._types import is_traced
+from sorojax._types import is_traced, platform
 from sorojax.math import sparse
 from sorojax.mesh.elements import AbstractElement, PolyN, Tet4
 from sorojax.mesh.mesh import Mesh, valences
@@ -45,8 +45,14 @@ class Space(eqx.Module):
         return self.num_nodes * self.element.dim
 
 
-def lanes_per_block(element: AbstractElement) -> int:
-    """Cells per block, so that the working set of a block stays in the cache (measured)."""
+_WIDEST = 1 << 15  # cells of a block that an accelerator holds without trouble
+
+
+def lanes_per_block(element: AbstractElement, num_cells: int) -> int:
+    """Cells per block: on a CPU so many that the working set of a block stays in the cache
+    (measured), on an accelerator as many as there are threads to take them."""
+    if platform() != "cpu":
+        return -(-num_cells // -(-num_cells // _WIDEST))
     if isinstance(element, Tet4) or (element.dim == 2 and element.order == 1):
         return 256
     return 128 if element.dim == 2 else 32
@@ -76,7 +82,7 @@ def space(
             "fem.space: `mesh.cells` is traced, need concrete cells. Build the space "
             "outside jit and grad, and replace only `mesh.points` inside."
         )
-    cells, width = np.asarray(mesh.cells), lanes_per_block(mesh.element)
+    cells, width = np.asarray(mesh.cells), lanes_per_block(mesh.element, mesh.num_cells)
     more = tuple(group for load in loads if (group := load.couples()) is not None)
     system = sparse.from_cells(
         mesh.num_nodes, cells, mesh.element.dim, more, _settings(solver), mesh.points

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from sorojax._display import displayed, number, outcome
 from sorojax._types import real
 from sorojax.math.contact_stepper import ContactMidpoint
+from sorojax.math.door import full_products
 from sorojax.math.status import Status
 from sorojax.math.steppers import (
     AbstractStepper,
@@ -21,7 +22,7 @@ from sorojax.math.steppers import (
 from sorojax.rod.assembly import is_flat, rate, retract
 from sorojax.rod.assembly_contact import any_contact, contacts_of
 from sorojax.rod.dynamics import Forces
-from sorojax.rod.loads import damping_matrix, tangent_stiffness, total_force
+from sorojax.rod.loads import damping_matrix, on_model, tangent_stiffness, total_force
 from sorojax.rod.model import Model, inertia, motion, operators
 from sorojax.rod.rod import Rod
 
@@ -78,7 +79,9 @@ def rollout(
 
 
 @eqx.filter_jit
+@full_products
 def _rollout(model, q, v, forces, step, t, stepper, saves, every, label) -> Rollout:
+    step, t, stepper = _like(q, (step, t, stepper))
     problem = second_order(model, q, forces)
     path = integrate(
         stepper, problem, q, v, t=t, h=step, saves=saves, every=every, label=label
@@ -89,13 +92,18 @@ def _rollout(model, q, v, forces, step, t, stepper, saves, every, label) -> Roll
     return Rollout(time, path.q, path.v, status)
 
 
+def _like(q, tree):
+    """`tree` with its numbers in the precision of the coordinates."""
+    return jax.tree.map(lambda x: x.astype(q.dtype) if eqx.is_inexact_array(x) else x, tree)
+
+
 def second_order(
     model: Model,
     q: Float[Array, " coordinates"],
     forces: Forces,
 ) -> SecondOrder:
     """The equations of the model, with its stiffness at `q` and its damping."""
-    constants = operators(model)
+    constants, forces = operators(model), on_model(forces, model)
 
     def at(q, v):
         return motion(model, q, v, constants=constants)

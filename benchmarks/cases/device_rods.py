@@ -1,0 +1,55 @@
+"""Fingers in batches on an accelerator: accelerations and steps, against one CPU core."""
+
+import jax.numpy as jnp
+
+from benchmarks import devices
+from benchmarks.fingers import finger, random_states
+from benchmarks.harness import quick
+from sorojax.math.batch import batched
+from sorojax.math.steppers import GeneralisedAlpha
+from sorojax.rod import Gravity, forward_dynamics, rollout
+
+SHARED = 4096  # members that both devices take, and that errors are counted of
+STEPS, STEP = 50, 1e-3  # s
+ERRORS = {True: 1e-9, False: 2e-3}  # double precision or single
+
+
+def accelerations(body, q, v):
+    return batched(lambda q, v: forward_dynamics(body, q, v, (Gravity(),)))(q, v)
+
+
+def ends(body, q, v):
+    """Coordinates after some steps [1/m]."""
+
+    def one(q, v):
+        path = rollout(
+            body, q, v, (Gravity(),), step=STEP, saves=1, every=STEPS,
+            stepper=GeneralisedAlpha(1.0),
+        )  # fmt: skip
+        return path.q[-1]
+
+    return batched(one)(q, v)
+
+
+def rows():
+    cpu, *others = devices.found()
+    if not others:
+        yield devices.absent()
+        return
+    large = 2**15 if quick() else 2**18
+    body = finger(8)
+    q, v = (jnp.asarray(x) for x in random_states(SHARED))
+    # the same states again and again, so that errors are known for all
+    many = tuple(jnp.tile(x, (large // SHARED, 1)) for x in (q, v))
+    kinds = ("acceleration", accelerations, 1), ("step", ends, STEPS)
+    for what, function, calls in kinds:
+        exact = devices.on_cpu(function, body, q, v)
+        for double in (True, False):
+            for count, states, where in (
+                (SHARED, (q, v), [cpu, *others]), (large, many, others),
+            ):  # fmt: skip
+                yield from devices.compared(
+                    what, function, (body, *states), count=count, of="members", calls=calls,
+                    error_of=devices.relative(exact), bar=ERRORS[double], double=double,
+                    reference="CPU in double precision", devices=where,
+                )  # fmt: skip

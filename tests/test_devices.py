@@ -1,0 +1,73 @@
+"""Kernels on accelerators: what differs there, as far as a CPU can show it."""
+
+from importlib import import_module
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks import devices, discover
+from benchmarks.blocks import bent, block
+from benchmarks.fingers import finger, random_states
+from benchmarks.single import narrow
+from sorojax import fem, mesh, rod as R
+from sorojax.fem.linear import linearise, prepare
+from sorojax.math import door as door_module
+
+
+@pytest.mark.parametrize("name", ["device.fem", "device.rods", "device.sdf"])
+def test_without_an_accelerator_a_case_says_so(name):
+    (row,) = discover.load(name, discover.cases()[name]).rows()
+    assert "Install jax[cuda13]" in row.settings["reason"]
+
+
+def test_both_devices_have_a_row_with_their_error():
+    cpu = devices.found()[0]
+    x = jnp.linspace(0.0, 1.0, 8)
+    exact = devices.on_cpu(jnp.sin, x)
+    for double, error in ((True, 0.0), (False, 1e-7)):
+        rows = devices.compared(
+            "sine", jnp.sin, (x,), count=8, of="points", error_of=devices.relative(exact),
+            bar=1e-6, reference="CPU", devices=[cpu, cpu], double=double,
+        )  # fmt: skip
+        for row in rows:
+            assert row.holds and row.error <= error
+            assert row.settings["device"] == "one CPU core"
+
+
+def test_an_accelerator_takes_all_cells_at_once_with_the_same_tangent(monkeypatch):
+    def tangent():
+        problem = block(mesh.Quad4(), (9, 31), fem.Displacement())
+        u = bent(problem.mesh.points)
+        return problem.space.cells.shape, linearise(problem, prepare(problem), u, u)
+
+    shape, narrow_blocks = tangent()
+    monkeypatch.setattr(import_module("sorojax.fem.space"), "platform", lambda: "gpu")
+    wide_shape, wide_blocks = tangent()
+    assert shape == (2, 4, 256) and wide_shape == (1, 4, 279)
+    for name in ("residual", "values"):
+        a, b = (np.asarray(getattr(x, name)) for x in (narrow_blocks, wide_blocks))
+        assert np.abs(a - b).max() <= 1e-13 * np.abs(a).max()
+
+
+def test_products_of_single_precision_keep_its_digits(monkeypatch):
+    def trace(x):
+        verb = door_module.door(lambda x: x @ x)
+        return str(jax.make_jaxpr(lambda x: verb(x))(x))
+
+    x = jnp.ones((2, 2), jnp.float32)
+    assert "HIGHEST" not in trace(x)
+    monkeypatch.setattr(door_module, "platform", lambda: "gpu")
+    assert "HIGHEST" in trace(x)
+    with jax.default_matmul_precision("bfloat16"):
+        assert "HIGHEST" not in trace(x)
+
+
+def test_motion_in_single_precision_stays_single():
+    body, (q,), (v,) = finger(8), *random_states(1)
+    args = body, jnp.asarray(q), jnp.asarray(v), (R.Gravity(),)
+    paths = [R.rollout(*given, step=1e-3, saves=2) for given in (narrow(args), args)]
+    assert paths[0].q.dtype == paths[0].time.dtype == jnp.float32
+    scale = jnp.abs(paths[1].q).max()
+    assert jnp.abs(paths[0].q.astype(jnp.float64) - paths[1].q).max() < 1e-4 * scale
