@@ -11,15 +11,34 @@ from jaxtyping import Array, Float
 UNROLL_BELOW = 9  # written out, LDL' beats a LAPACK call up to 8 unknowns
 
 
+@jax.custom_jvp
 def solve_symmetric(
     matrix: Float[Array, "dof dof"], right: Float[Array, " dof"]
 ) -> Float[Array, " dof"]:
     """x with `matrix` x = `right`, `matrix` symmetric positive definite.
 
-    Derivatives solve with the same factor: that of M^-1 r is M^-1 (dr - dM x).
+    The derivative of M^-1 r is M^-1 (dr - dM x).
+    """
+    solve = _ldl(matrix) if right.shape[0] < UNROLL_BELOW else _cholesky(matrix)
+    return solve(right)
+
+
+@solve_symmetric.defjvp
+def _solve_symmetric_jvp(primals, tangents):
+    return jax.jvp(_solved, primals, tangents)
+
+
+def _solved(matrix: Array, right: Array) -> Array:
+    """`solve_symmetric` in programs of derivatives, where several solves share a factor.
+
+    Of a few unknowns that is the inverse, by a loop: what is written out is long to compile.
     """
     fixed = jax.lax.stop_gradient(matrix)
-    solve = _ldl(fixed) if right.shape[0] < UNROLL_BELOW else _cholesky(fixed)
+    if right.shape[0] < UNROLL_BELOW:
+        inverse = _eliminated(fixed, jnp.eye(right.shape[0], dtype=matrix.dtype))
+        solve = functools.partial(jnp.matmul, inverse)
+    else:
+        solve = _cholesky(fixed)
     return jax.lax.custom_linear_solve(
         lambda x: matrix @ x, right, lambda _, r: solve(r), symmetric=True
     )
@@ -57,8 +76,8 @@ def product(
 ) -> Float[Array, "rows columns"]:
     """`left @ right`, written out up to 8 terms: less than a library call costs.
 
-    For few columns; XLA repeats the sums in every entry that reads them. Derivatives are
-    plain products, as those of the sums would take long to compile.
+    For few columns; XLA repeats the sums in every entry that reads them. Programs of
+    derivatives hold plain products, as sums would take long to compile.
     """
     if not 0 < left.shape[1] < UNROLL_BELOW:
         return left @ right
@@ -69,7 +88,7 @@ def product(
 @product.defjvp
 def _product_jvp(primals, tangents):
     (left, right), (change, turn) = primals, tangents
-    return product(left, right), change @ right + left @ turn
+    return left @ right, change @ right + left @ turn
 
 
 def _cholesky(matrix: Array) -> Callable[[Array], Array]:
@@ -87,19 +106,14 @@ def _ldl(matrix: Array) -> Callable[[Array], Array]:
         inverse[j] = 1 / pivot[j]
         for i in range(j + 1, n):
             lower[i][j] = (matrix[i, j] - _dot(lower[i], scaled)) * inverse[j]
-    # One array: what a solve keeps passes through the stores of all loops in reverse mode.
-    kept = jnp.stack([value for i in range(n) for value in (*lower[i][:i], inverse[i])])
 
     def solve(right: Array) -> Array:
-        entries = iter(jnp.unstack(kept))
-        x, rows, scales = [right[i] for i in range(n)], [], []
+        x = [right[i] for i in range(n)]
         for i in range(n):
-            rows.append([next(entries) for _ in range(i)])
-            scales.append(next(entries))
-            x[i] = x[i] - _dot(rows[i], x[:i])
-        x = [value * scale for value, scale in zip(x, scales, strict=True)]
+            x[i] = x[i] - _dot(lower[i], x[:i])
+        x = [value * scale for value, scale in zip(x, inverse, strict=True)]
         for i in reversed(range(n)):
-            below = [rows[k][i] for k in range(i + 1, n)]
+            below = [lower[k][i] for k in range(i + 1, n)]
             x[i] = x[i] - _dot(below, x[i + 1 :])
         return jnp.stack(x)
 

@@ -3,6 +3,7 @@
 Tuples of component arrays fuse into few elementwise kernels; stacked arrays do not.
 """
 
+import functools
 import math
 from typing import TypeAlias
 
@@ -25,6 +26,12 @@ def cross(a: Vector, b: Vector) -> Vector:
         a[2] * b[0] - a[0] * b[2],
         a[0] * b[1] - a[1] * b[0],
     )
+
+
+def cross_columns(a: Array, b: Array) -> Array:
+    """Cross product along axis 1 of arrays."""
+    # Reverse mode makes one array of the parts of an `unstack`, and one of each slice.
+    return jnp.stack(cross(jnp.unstack(a, axis=1), jnp.unstack(b, axis=1)), axis=1)  # type: ignore[arg-type]
 
 
 def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
@@ -70,8 +77,15 @@ def prefix_product(q: Quaternion) -> Quaternion:
     return jax.lax.scan(advance, (one, zero, zero, zero), q)[1]
 
 
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _series(coefficients: tuple[float, ...], x: Float[Array, "..."]) -> Float[Array, "..."]:
     total = jnp.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         total = total * x + coefficient
     return total
+
+
+@_series.defjvp
+def _series_jvp(coefficients, primals, tangents):
+    slope = tuple(k * c for k, c in enumerate(coefficients))[1:] or (0.0,)
+    return _series(coefficients, *primals), _series(slope, *primals) * tangents[0]

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from sorojax.math.steppers import ContactTerms
+from sorojax.rod.alike import each
 from sorojax.rod.assembly import index_of
 from sorojax.rod.contact_force import AbstractContact
 from sorojax.rod.contact_terms import contact_terms, has_contact, near, travel
@@ -45,30 +46,32 @@ def contacts_of(
         return mass, total_force(plain, t, moment) - coriolis, moment
 
     def is_near(moment: AssemblyMotion, h):
-        answers = []
-        for parts, contact in where:
-            bodies = [part_motion(moment, k) for k in parts]
-            if isinstance(contact, PAIRS):
-                margin = travel(bodies[0], h) + travel(bodies[1], h)
-                answers.append(contact.is_near(*bodies, margin))
-            else:
-                answers.append(near((contact,), bodies[0], h))
-        return jnp.any(jnp.stack(answers))
+        def one(contact, *bodies):
+            if not isinstance(contact, PAIRS):
+                return near((contact,), bodies[0], h)
+            return contact.is_near(*bodies, travel(bodies[0], h) + travel(bodies[1], h))
+
+        rows = [(contact, *(part_motion(moment, k) for k in parts)) for parts, contact in where]
+        return jnp.any(jnp.stack(each(one, rows)))
 
     def force(t, q, v) -> Any:
         moment = at(q, v)
-        columns, terms = part_columns(moment), []
-        for parts, contact in where:
-            term = contact.linearised(t, *(part_motion(moment, k) for k in parts))
-            own = jnp.concatenate([columns[k] for k in parts])
-            terms.append(
-                (
-                    term.force @ own,
-                    own.T @ term.stiffness @ own,
-                    own.T @ term.damping @ own,
-                )
+        columns = part_columns(moment)
+
+        def one(contact, own, *bodies):
+            term = contact.linearised(t, *bodies)
+            return (
+                term.force @ own,
+                own.T @ term.stiffness @ own,
+                own.T @ term.damping @ own,
             )
-        return tuple(_sum(parts) for parts in zip(*terms, strict=True))
+
+        rows = [
+            (contact, jnp.concatenate([columns[k] for k in parts]),
+             *(part_motion(moment, k) for k in parts))
+            for parts, contact in where
+        ]  # fmt: skip
+        return tuple(_sum(parts) for parts in zip(*each(one, rows), strict=True))
 
     grips = any(isinstance(contact, LinkContact) for _, contact in where)
     return ContactTerms(free, is_near, force, symmetric=not grips)

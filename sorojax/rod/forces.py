@@ -22,6 +22,7 @@ from sorojax._types import optional_real, real
 from sorojax.rod.mass_line import mass_jacobian
 from sorojax.rod.motion import Motion
 from sorojax.rod.points import from_own, own
+from sorojax.rod.rod import Rod
 
 EARTH = 9.81  # m/s^2
 
@@ -32,6 +33,10 @@ class AbstractForce(eqx.Module):
     @abc.abstractmethod
     def __call__(self, t: Float[Array, ""], motion: Motion) -> Float[Array, " dof"]:
         """Force that does work on the coordinate rates; power is force @ v [W]."""
+
+    def on_rod(self, rod: Rod) -> "AbstractForce":
+        """The same force on `rod` alone: loops make here, once, what does not move."""
+        return self
 
 
 class AbstractElastic(AbstractForce):

@@ -3,6 +3,7 @@
 from typing import overload
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
@@ -20,6 +21,8 @@ from sorojax.rod.moving import cross, turned
 from sorojax.rod.points import Points
 from sorojax.rod.rod import Rod, strain_names
 from sorojax.rod.tree import AssemblyMotion, part_columns, part_motion
+
+_TIP = np.ones(1)
 
 Poses = Float[Array, "points h h"]
 Jacobians = Float[Array, "points twist dof"]
@@ -75,10 +78,9 @@ def tip_pose(model: Assembly, q: Array) -> dict[str, Float[Array, "h h"]]: ...
 @door
 def tip_pose(model: Model, q: Float[Array, " coordinates"]):
     """Pose of the last section, of every part by name: local to base frame, position in m."""
-    poses = forward_kinematics(model, q, jnp.ones(1, q.dtype))
-    if isinstance(poses, dict):
-        return {name: pose[0] for name, pose in poses.items()}
-    return poses[0]
+    if isinstance(model, Assembly):
+        return {name: _poses(part, _TIP)[0] for name, part in _parts(motion(model, q))}
+    return _poses(rod_motion(model, q), _TIP)[0]
 
 
 @overload
@@ -183,6 +185,6 @@ def _turned_twist(rotation: Array, twist: Array, rot: int) -> Array:
 
 def _rows(rod: Rod, s) -> Float[Array, "points quad"]:
     """Integration weights from the base to each s [m]."""
-    s = real(s).astype(rod.length.dtype)
+    s = s if s is _TIP else real(s).astype(rod.length.dtype)
     _check.shape("rod", "s", s, (None,), "Give a list of points in [0, 1].")
     return rod.length * jnp.asarray(integration_rows(rod.quadrature, s), rod.length.dtype)

@@ -88,6 +88,24 @@ def total_force(
     return total
 
 
+def on_model(forces: tuple[Load, ...], model: Rod | Assembly) -> tuple[Load, ...]:
+    """The forces on `model` alone: what does not move is made, once before a loop."""
+    if isinstance(model, Rod):
+        return tuple(_on_body(force, model) for force in _plain(forces))
+    check(model, forces)
+    return tuple(
+        On(force.part, _on_body(force.force, model.parts[index_of(model, force.part)].body))
+        if isinstance(force, On)
+        else force
+        for force in forces
+    )
+
+
+def _on_body(force: Any, body: Any) -> Any:
+    fits = isinstance(body, Rod) and isinstance(force, AbstractForce)
+    return force.on_rod(body) if fits else force
+
+
 def weight(
     gravity: Gravity, t: Float[Array, ""], motion: Motion | AssemblyMotion
 ) -> Float[Array, " dof"]:

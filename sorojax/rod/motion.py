@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax.math.dense import product
+from sorojax.math.magnus import FROM_MOMENTS
 from sorojax.math.quadrature import (
     gauss_legendre,
     integration_matrix,
@@ -26,8 +27,9 @@ class Operators(NamedTuple):
         weights: Gauss weights [m].
         integration: Integrals from the base to each node [m].
         strain_rows: Strain per coordinate, one block per active strain.
-        moments: Centred curvature moments of order 0, 1, 2 of the cells between nodes
-            (and breaks), one block per component of the curvature, per coordinate.
+        moments: What the rotations of the cells between nodes (and breaks) read of the
+            curvature, one block per component, per coordinate: the three coefficients of
+            their Magnus expansion, in the plane the angle [rad].
         rest_moments: The same of the rest curvature.
         rest_strain: Strain at q = 0, curvatures first; one column per node if it varies.
         mass: Mass lumped at each node [kg].
@@ -196,22 +198,21 @@ def _stiffness(rod: Rod, rows: Array, weights: Array) -> Float[Array, "dof dof"]
 
 def _cells(rod: Rod) -> tuple[np.ndarray, np.ndarray]:
     """Points of the cells that end at the nodes and breaks, (cells, points), and their
-    weights in the centred moments, (order, cells, points), unit length."""
+    weights in the moments, (order, cells, points), unit length."""
     x, w = gauss_legendre(_CELL_POINTS)
     ends = rod.quadrature.cell_ends
     sizes = np.diff(ends, prepend=0.0)
     points = ends[:, None] + sizes[:, None] * (x - 1)[None, :]
-    powers = w[None, None, :] * (x - 0.5)[None, None, :] ** np.arange(3)[:, None, None]
-    return points, powers * sizes[None, :, None]
+    powers = (x - 0.5)[None, :] ** np.arange(3)[:, None]
+    kept = FROM_MOMENTS @ powers if rod.group.rotation_dim == 3 else powers[:1]
+    return points, (w * kept)[:, None, :] * sizes[None, :, None]
 
 
 def _rest_moments(rod: Rod, dtype) -> Float[Array, "order rot cells"]:
     rest, rot = _rest_strain(rod, dtype), rod.group.rotation_dim
     points, powers = _cells(rod)
     if rest.ndim == 1:
-        sizes = powers[0].sum(axis=1)
-        plain = np.stack([sizes, 0 * sizes, sizes / 12])  # moments of the constant 1
-        return jnp.asarray(plain, dtype)[:, None, :] * rest[None, :rot, None]
+        return jnp.asarray(powers.sum(axis=2), dtype)[:, None, :] * rest[None, :rot, None]
     rows = jnp.asarray(interpolation_rows(rod.quadrature, points.reshape(-1)), dtype)
     values = (rest[:rot] @ rows.T).reshape(rot, *points.shape)
     return jnp.einsum("okp,rkp->ork", jnp.asarray(powers, dtype), values)

@@ -4,7 +4,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax.rod.mass_line import acceleration_on_arms, mass_arms, mass_jacobian
-from sorojax.rod.motion import Motion, Operators, integrated, is_curvature, rest_along
+from sorojax.rod.motion import (
+    Motion,
+    Operators,
+    integrated,
+    is_curvature,
+    local_axis,
+    rest_along,
+)
+from sorojax.rod.points import own
 from sorojax.rod.rod import Rod
 
 
@@ -63,10 +71,12 @@ def bias_rates(moment: Motion) -> tuple[Float[Array, "quad 1"], Float[Array, "qu
 
 
 def _bias_rate(moment: Motion, spin: Float[Array, "quad 1"]) -> Float[Array, "quad 2"]:
-    quad, _, dof = moment.linear_rate.shape
-    swept = 2 * (moment.linear_rate.reshape(-1, dof) @ moment.v).reshape(quad, 2)
-    # The rate already holds spin x tangent once: a = spin x (spin x r' + 2 p).
-    return spin * _turn(swept - spin * _turn(moment.tangent))
+    rate = spin * _turn(moment.tangent)
+    for name, rows in zip(moment.rod.basis.active, moment.operators.strain_rows, strict=True):
+        if not is_curvature(name):
+            speed = rows @ own(moment, moment.v)
+            rate = rate + 2 * moment.directors[:, :, local_axis(name)] * speed[:, None]
+    return spin * _turn(rate)
 
 
 def _at_nodes(rod: Rod, cells: Float[Array, "cells *dof"]) -> Float[Array, "quad *dof"]:

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax.math.quadrature import integration_rows
+from sorojax.math.quaternion import cross_columns
 from sorojax.rod.motion import Motion, rest_along
 
 
@@ -117,7 +118,7 @@ def directors(points: Points) -> Float[Array, "points dim dim"]:
         columns = jnp.stack([cosine, sine], 1), jnp.stack([-sine, cosine], 1)
         turn = jnp.stack(columns, axis=-1)
         return turn if motion.base is None else motion.base.directors[None] @ turn
-    slope = jnp.cross(curvature(motion)[:, :, None], motion.directors, axis=1)
+    slope = cross_columns(curvature(motion)[:, :, None], motion.directors)
     eye = jnp.eye(dim, dtype=motion.q.dtype)
     start = eye if motion.base is None else motion.base.directors
     rotation = start[None] + jnp.tensordot(rows, slope, 1)

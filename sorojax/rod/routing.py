@@ -23,6 +23,7 @@ from sorojax.math.quadrature import (
     integration_matrix,
     interpolation_rows,
 )
+from sorojax.math.quaternion import cross_columns
 from sorojax.rod.basis import STRAINS
 from sorojax.rod.motion import operators, rest_along
 from sorojax.rod.points import safe_norm
@@ -143,10 +144,10 @@ def thread(rod: Rod, route: AbstractRoute) -> Thread:
     rest, rows = _strains(rod, s)
     arm = jnp.pad(place, ((0, 0), (1, 0)))
     tangent = rest[:, 3:] + jnp.pad(slope, ((0, 0), (1, 0))) / rod.length
-    bent = jnp.cross(rows[:, :3], arm[:, :, None], axis=1)
+    bent = cross_columns(rows[:, :3], arm[:, :, None])
     return Thread(
         weights=rod.length * share * jnp.asarray(gauss_legendre(rule)[1], dtype),
-        tangent=tangent + jnp.cross(rest[:, :3], arm),
+        tangent=tangent + cross_columns(rest[:, :3], arm),
         tangent_rows=rows[:, 3:] + bent,
         curvature=rest[:, :3],
         curvature_rows=rows[:, :3],
@@ -205,7 +206,7 @@ def _turned(thread: Thread, q: Array, unit: Array) -> Float[Array, " points"]:
     dtype = q.dtype
     slope = jnp.asarray(_differentiation(thread.rule), dtype) @ unit / thread.span
     curvature = thread.curvature + thread.curvature_rows @ q
-    bending = safe_norm(slope + jnp.cross(curvature, unit))
+    bending = safe_norm(slope + cross_columns(curvature, unit))
     return thread.span * (jnp.asarray(integration_matrix(thread.rule), dtype) @ bending)
 
 

@@ -40,13 +40,27 @@ class Tendons(AbstractForce):
     friction: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
 
     def __call__(self, t, motion):
+        return self.on_rod(motion.rod)(t, motion)
+
+    def on_rod(self, rod):
+        return _Threads(_threads(rod, self.routes), self.tension, self.friction)
+
+
+class _Threads(AbstractForce):
+    """Tendons in one rod."""
+
+    threads: tuple[Thread, ...]
+    tension: Signal
+    friction: Float[Array, ""] | None
+
+    def __call__(self, t, motion):
         tension = _at(self.tension, t, motion.q.dtype)
         do = "Give one tension per routing."
-        _check.shape("Tendons", "tension", tension, (len(self.routes),), do)
+        _check.shape("Tendons", "tension", tension, (len(self.threads),), do)
         q = own(motion, motion.q)
         total = jnp.zeros_like(q)
-        for index, route in enumerate(self.routes):
-            total = total + tension[index] * pull(thread(motion.rod, route), q, self.friction)
+        for index, each in enumerate(self.threads):
+            total = total + tension[index] * pull(each, q, self.friction)
         return from_own(motion, total)
 
 
