@@ -123,7 +123,7 @@ def minimise(
             "penalty to the loss."
         )
     _check.finite("minimise", "start", ravel_pytree(start)[0], "Check the first design.")
-    flat, back = ravel_pytree(jax.tree.map(real, start))
+    flat, back = _as_vector(jax.tree.map(real, start))
     task = Task(loss, constraints, back, schedule, change_gradient)
     first, memory = 0, None
     if resume is not None:
@@ -152,7 +152,7 @@ def minimise(
             m = values.constraints.shape[0]
             memory = optimiser.init(flat) if plain else optimiser.init(flat, m)  # type: ignore
         new, memory = _advance(optimiser, task, k, flat, values, memory, size)
-        change = float(_distance(new, flat))
+        change = float(np.max(np.abs(np.asarray(new) - np.asarray(flat))))
         last, flat = flat, new
         step = Step(k + 1, back(flat), values.objective, values.constraints,
                     jnp.asarray(change), memory)  # fmt: skip
@@ -186,6 +186,8 @@ def _advance(optimiser, task: Task, k: int, flat, values: Values, memory, scale)
         with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
             updates, memory = optimiser.update(values.gradient, memory, flat)
             return jnp.asarray(optax.apply_updates(flat, updates)), memory
+    if isinstance(optimiser, OptimalityCriteria):  # the same for any scale
+        return optimiser.update(flat, values, memory)
     scaled = _scaled(values, scale)
     if not isinstance(optimiser, GCMMA):
         return optimiser.update(flat, scaled, memory)
@@ -206,9 +208,11 @@ def _scaled(values: Values, scale) -> Values:
     return values._replace(objective=values.objective / scale, gradient=values.gradient / scale)
 
 
-@jax.jit
-def _distance(a, b) -> Float[Array, ""]:
-    return jnp.max(jnp.abs(a - b))
+def _as_vector(start: PyTree):
+    """`ravel_pytree`, which takes operations even for what is a vector."""
+    if isinstance(start, jax.Array) and start.ndim == 1:
+        return start, lambda x: x
+    return ravel_pytree(start)
 
 
 def _size(flat, values: Values) -> float:

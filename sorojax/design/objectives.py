@@ -4,7 +4,6 @@
 displacement where that is near enough.
 """
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -16,11 +15,14 @@ from jaxtyping import Array, Float, Int
 from sorojax._types import is_traced
 from sorojax.design.settle import settled
 from sorojax.design.void import InterpolatedEnergy, interpolated_energy
-from sorojax.fem import Newton, Path, Problem, Solution, solve
+from sorojax.fem import Newton, Path, Problem, Solution
 from sorojax.fem.energy_form import load_potential
 from sorojax.fem.loads import AbstractLoad
+from sorojax.fem.problem import exchanged
+from sorojax.fem.solve import solved_and_kept
 from sorojax.fem.torque import mean_rotation
 from sorojax.material.hyperelastic import AbstractHyperelastic
+from sorojax.math.at_once import at_once
 
 
 def graded(problem: Problem, factor: Float[Array, " cells"], **settings: float) -> Problem:
@@ -28,11 +30,11 @@ def graded(problem: Problem, factor: Float[Array, " cells"], **settings: float) 
     nothing; `settings` are those of `interpolated_energy`.
 
     Every compiled function between a design and its equilibrium adds to the gradient: for a
-    small body compile all from the variables to `interpolated_energy` in one, and put that
-    in its place.
+    small body compile all from the variables to `interpolated_energy` in one by `at_once`,
+    and put that in its place.
     """
     material = interpolated_energy(solid_of(problem), factor, **settings)
-    return dataclasses.replace(problem, material=material)
+    return exchanged(problem, material=material)
 
 
 def solid_of(problem: Problem) -> AbstractHyperelastic:
@@ -49,7 +51,7 @@ def replaced_load(problem: Problem, load: AbstractLoad) -> Problem:
             "the problem a load of that name first."
         )
     loads = tuple(load if old.name == load.name else old for old in problem.loads)
-    return dataclasses.replace(problem, loads=loads)
+    return exchanged(problem, loads=loads)
 
 
 def work_of_loads(
@@ -66,12 +68,10 @@ def _loaded(problem: Problem, names: tuple[str, ...] | None) -> Problem:
         load for load in problem.loads
         if (not load.holds if names is None else load.name in names)
     ]  # fmt: skip
-    return dataclasses.replace(
-        problem, supports=(), loads=tuple(chosen), material=solid_of(problem)
-    )
+    return exchanged(problem, supports=(), loads=tuple(chosen), material=solid_of(problem))
 
 
-@jax.jit
+@at_once
 def _work(problem: Problem, u):
     return load_potential(problem, jnp.zeros_like(u)) - load_potential(problem, u)
 
@@ -83,7 +83,7 @@ def displacement_along(
     return _mean_along(u, jnp.asarray(nodes), jnp.asarray(direction, u.dtype))
 
 
-@jax.jit
+@at_once
 def _mean_along(u, nodes, direction):
     return jnp.mean(u[nodes] @ direction)
 
@@ -107,7 +107,7 @@ def mechanism(
     return _weighed(_loaded(problem, None), u, output, output_weight, work_weight)
 
 
-@jax.jit
+@at_once
 def _weighed(problem: Problem, u, output, output_weight, work_weight):
     return work_weight * _work(problem, u) - output_weight * output
 
@@ -119,7 +119,7 @@ def rotation(
     return _turn(problem.mesh.points, u, jnp.asarray(nodes))
 
 
-@jax.jit
+@at_once
 def _turn(points, u, nodes):
     return mean_rotation(points[nodes], points[nodes] + u[nodes])
 
@@ -135,7 +135,7 @@ def path_error(
     return _miss(points, path.displacements, jnp.asarray(nodes), jnp.asarray(targets))
 
 
-@jax.jit
+@at_once
 def _miss(points, displacements, nodes, targets):
     middle = jnp.mean(points[nodes], axis=0)
     moved = middle[None] + jnp.mean(displacements[:, nodes], axis=1)
@@ -153,35 +153,39 @@ class Follower:
     """
 
     def __init__(self, *, newton: Newton | None = None, steps: int = 1, max_cuts: int = 4):
-        self.settings = {"newton": newton, "steps": steps, "max_cuts": max_cuts}
+        self.settings = (Newton() if newton is None else newton, steps, max_cuts)
         self.last: np.ndarray | None = None
         self.solutions = 0
 
     def __call__(self, problem: Problem) -> Solution:
-        start = None if self.last is None else jnp.asarray(self.last)
-        solution = solve(problem, start=start, throw=False, **self.settings)
-        if not _is_found(solution) and start is not None:
-            solution = self._fallen(problem, start, solution)
+        solution, u = self._solved(problem, self.last)
+        if not _is_found(solution) and self.last is not None:
+            solution, u = self._fallen(problem, self.last, solution)
         if not _is_found(solution):
             here = jnp.equal(jnp.asarray(solution.load_fraction), 1.0)
             valid = jnp.where(here, solution.displacement, jnp.nan)
             solution = eqx.tree_at(lambda s: s.displacement, solution, valid)
-        u = jax.lax.stop_gradient(solution.displacement)
+            u = None
+        if u is None:
+            u = jax.lax.stop_gradient(solution.displacement)
         if is_traced(u):
             jax.debug.callback(self._keep, u)
         else:
             self._keep(u)
         return solution
 
-    def _fallen(self, problem: Problem, start, solution: Solution) -> Solution:
+    def _solved(self, problem: Problem, start: np.ndarray | None):
+        return solved_and_kept(problem, start, self.settings, throw=False)
+
+    def _fallen(self, problem: Problem, start: np.ndarray, solution: Solution):
         moving, rest = eqx.partition(problem, eqx.is_inexact_array)
         here = eqx.combine(jax.lax.stop_gradient(moving), rest)
         if is_traced((here, solution.load_fraction)):
-            return solution
+            return solution, None
         u, stable = settled(here, start)
         if not stable:
-            return solution
-        return solve(problem, start=jnp.asarray(u), throw=False, **self.settings)
+            return solution, None
+        return self._solved(problem, u)
 
     def _keep(self, u) -> None:
         u = np.asarray(u)

@@ -8,7 +8,6 @@ Reference: Caasenbrood, Pogromsky, Nijmeijer, "Sorotoki: a Matlab toolkit for de
 modeling, and control of soft robots", IEEE Access 12, 2024, section VI-B.
 """
 
-import dataclasses
 from collections.abc import Callable
 
 import equinox as eqx
@@ -35,8 +34,10 @@ from sorojax.design.void_pressure import (
     void_pressure,
 )
 from sorojax.fem import Fixed, Foundation, PlaneStrain, Problem, problem
+from sorojax.fem.problem import exchanged
 from sorojax.material import presets
 from sorojax.material.hyperelastic import AbstractHyperelastic
+from sorojax.math.at_once import at_once
 from sorojax.mesh import rectangle
 from sorojax.mesh.elements import Quad4
 from sorojax.mesh.mesh import boundary_facets
@@ -85,7 +86,7 @@ def _model(cell: PneuNetCell):
 def _filled(cell: PneuNetCell, parts: tuple[InterpolatedEnergy, Array]) -> Problem:
     material, share = parts
     air = next(load for load in cell.problem.loads if load.name == "air")
-    made = dataclasses.replace(cell.problem, material=material)
+    made = exchanged(cell.problem, material=material)
     return replaced_load(made, VoidPressure(share=share, value=air.value, name="air"))
 
 
@@ -93,14 +94,14 @@ def _filled(cell: PneuNetCell, parts: tuple[InterpolatedEnergy, Array]) -> Probl
 # long as the solve when they are differentiated.
 
 
-@jax.jit
+@at_once
 def _parts(parts, base: AbstractHyperelastic, cells, density):
     interpolation, chamber = parts
     spread = of_nodes if isinstance(chamber, Darcy) else of_cells
     return interpolated_energy(base, interpolation(density)), spread(chamber(density), cells)
 
 
-@jax.jit
+@at_once
 def _planned(plan: Layout, parts, base: AbstractHyperelastic, cells, x, sharpness):
     return _parts(parts, base, cells, plan(x, sharpness))
 
@@ -110,7 +111,7 @@ def output(cell: PneuNetCell, u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
     return _chosen(cell.selector, u)
 
 
-@jax.jit
+@at_once
 def _chosen(selector, u):
     return jnp.sum(selector * u)
 

@@ -5,10 +5,11 @@ import copy
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
-from sorojax._types import is_traced
 from sorojax.fem.follow import Log, Stats
 from sorojax.fem.newton import Newton
 from sorojax.fem.problem import Problem
@@ -16,14 +17,16 @@ from sorojax.fem.traced import Begin
 
 
 class _Record:
-    """What the host found: one log per solve, lanes in row-major order; none in a trace."""
+    """What the host found: one log per solve, lanes in row-major order; none in a trace.
+    `displacement` is that of a single solve [m]."""
 
     def __init__(self):
         self.logs: list[Log] = []
         self.batched = False
+        self.displacement: np.ndarray | None = None
 
     def keep(self, logs: list[Log], batched: bool) -> None:
-        self.logs, self.batched = logs, batched
+        self.logs, self.batched, self.displacement = logs, batched, None
 
 
 def _strong(x: Array) -> Array:
@@ -43,11 +46,13 @@ class Solve:
         max_cuts: int,
         want_tangent: bool = False,
     ):
-        arrays, self._static = eqx.partition((problem, begin), eqx.is_array)
-        leaves, self._tree = jax.tree.flatten(arrays)
-        self.leaves = [_strong(leaf) for leaf in leaves]
-        self.traced = [k for k, leaf in enumerate(self.leaves) if is_traced(leaf)]
-        self.num_problem_leaves = len(jax.tree.leaves(eqx.filter(problem, eqx.is_array)))
+        # by hand: partition, filter and combine take as long as a small solve
+        self._all, self._tree = jax.tree.flatten((problem, begin))
+        self._places = [k for k, leaf in enumerate(self._all) if eqx.is_array(leaf)]
+        self.leaves = [_strong(self._all[k]) for k in self._places]
+        self.traced = [k for k, leaf in enumerate(self.leaves) if isinstance(leaf, Tracer)]
+        last = len(jax.tree.leaves(begin))
+        self.num_problem_leaves = sum(k < len(self._all) - last for k in self._places)
         self.settings = (newton, steps, max_cuts)
         self.shape = problem.mesh.points.shape
         self.num_all_values = problem.space.system.num_values
@@ -62,7 +67,14 @@ class Solve:
         return leaves
 
     def inputs(self, leaves) -> tuple[Problem, Begin | None]:
-        return eqx.combine(jax.tree.unflatten(self._tree, leaves), self._static)
+        return self._with(leaves, self._all)
+
+    def _with(self, leaves, others):
+        """Problem and start with `leaves` for arrays and what `others` has for the rest."""
+        values = list(others)
+        for place, leaf in zip(self._places, leaves, strict=True):
+            values[place] = leaf
+        return jax.tree.unflatten(self._tree, values)
 
     def problem(self, leaves) -> Problem:
         return self.inputs(leaves)[0]
@@ -78,15 +90,15 @@ class Solve:
             k: dot for k, dot in zip(self.traced, dots, strict=True)
             if k < count and not isinstance(dot, SymbolicZero)
         }  # fmt: skip
-        all_leaves = range(len(leaves))
-
-        def problem(values) -> Problem:
-            return jax.tree.unflatten(self._tree, values)[0]
-
+        all_leaves, none = range(len(leaves)), [None] * len(self._all)
         rest = [leaves[k] if k < count and k not in moved else None for k in all_leaves]
         params = [leaves[k] if k in moved else None for k in all_leaves]
         rates = [moved.get(k) for k in all_leaves]
-        return problem(params), eqx.combine(problem(rest), self._static[0]), problem(rates)
+        return (
+            self._with(params, none)[0],
+            self._with(rest, self._all)[0],
+            self._with(rates, none)[0],
+        )
 
     def with_tangent(self) -> "Solve":
         """The same call, that also returns the tangent; the record is shared."""

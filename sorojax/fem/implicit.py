@@ -5,6 +5,7 @@ host, lane after lane under `vmap`; inside a trace it becomes the loop of `trace
 derivative is that of the implicit function (`response`).
 """
 
+import contextlib
 import functools
 from typing import Any
 
@@ -57,11 +58,15 @@ def _solved(call: Solve, traced):
 
 def _derivative(call: Solve, primals, tangents):
     (traced,), (dots,) = primals, tangents
-    # rules of their own are for derivatives of derivatives, and cost as much as a factor
-    solve = _equilibrium if is_traced(traced) else _solved
-    u, counts, values = solve(call.with_tangent(), traced)
-    u_dot = _tangent(call, traced, dots, u, counts, values)
-    values = jax.lax.slice_in_dim(values, 0, call.num_values)
+    concrete = not is_traced(traced)
+    # what is staged for a derivative, or as the rule of one, costs as much as a factor
+    with jax.core.eval_context() if concrete else contextlib.nullcontext():
+        solve = _solved if concrete else _equilibrium
+        u, counts, values = solve(call.with_tangent(), traced)
+        at, rates = _linearised_at(call, traced, dots, u, counts, values)
+        if call.num_values != call.num_all_values:
+            values = jax.lax.slice_in_dim(values, 0, call.num_values)
+    u_dot = response_at_once(at, rates) if concrete else response(at, rates)
     return (u, counts, values), (u_dot, _still(counts), _still(values))
 
 
@@ -72,18 +77,16 @@ def _still(x) -> SymbolicZero:
 _equilibrium.defjvp(_derivative, symbolic_zeros=True)
 
 
-def _tangent(call: Solve, traced, dots, u, counts, values):
-    """du of R(u, params) = 0, with prescribed displacements moving along."""
+def _linearised_at(call: Solve, traced, dots, u, counts, values):
+    """What makes du of R(u, params) = 0, with prescribed displacements moving along."""
     leaves = call.complete(traced)
     params, rest, rates = call.moving(leaves, dots)
-    if call.settings[0].step_tolerance <= _SHARP:
-        if is_traced((traced, u, values)):
-            values = _tangent_values(call, traced, u, values)
-    else:
+    if call.settings[0].step_tolerance > _SHARP:
         problem = call.problem(leaves)
         values = linearise(problem, _prepare_traced(problem), u, u).values
-    at = Equilibrium(params, rest, u, values, counts[0])
-    return response(at, rates) if is_traced(at) else response_at_once(at, rates)
+    elif is_traced(traced):
+        values = _tangent_values(call, traced, u, values)
+    return Equilibrium(params, rest, u, values, counts[0]), rates
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -119,7 +122,7 @@ def _on_host(*leaves, call: Solve, lead: tuple[int, ...], batched: tuple[bool, .
             return _lanes_on_host(leaves, call, lead, batched)
         log = Log(*call.settings)
         call.record.keep([log], False)
-        u = _follow(*call.inputs(leaves), log)
+        u = call.record.displacement = _follow(*call.inputs(leaves), log)
         return _outcome(call, u, log)
 
 

@@ -1,7 +1,7 @@
 """The boundary value problem: a noun, and the constructor that checks it."""
 
 import copy
-import dataclasses
+from typing import Any
 
 import equinox as eqx
 
@@ -61,15 +61,21 @@ def _described(load: AbstractLoad) -> str:
 def unsupported(problem: Problem) -> Problem:
     """`problem` for kernels that no support enters, so that other supports do not compile
     them again."""
-    # many calls of every solve: a copy, as the checks of a constructor take longer
-    bare = copy.copy(problem)
-    object.__setattr__(bare, "supports", ())
-    return bare
+    return exchanged(problem, supports=())
 
 
 def body(problem: Problem) -> Problem:
     """`problem` for kernels that neither supports nor loads enter."""
-    return dataclasses.replace(problem, supports=(), loads=())
+    return exchanged(problem, supports=(), loads=())
+
+
+def exchanged(problem: Problem, **parts: Any) -> Problem:
+    """`problem` with other `parts`: what `dataclasses.replace` returns."""
+    # many calls of every solve: a copy, as the checks of a constructor take longer
+    other = copy.copy(problem)
+    for name, part in parts.items():
+        object.__setattr__(other, name, part)
+    return other
 
 
 def problem(

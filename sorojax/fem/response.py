@@ -13,8 +13,6 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Bool, Float
 
 from sorojax._types import is_traced
@@ -23,6 +21,7 @@ from sorojax.fem.problem import Problem, unsupported
 from sorojax.fem.supports import known_dofs, known_values
 from sorojax.fem.traced import known_mask
 from sorojax.math import sparse
+from sorojax.math.linear_map import pushed
 
 
 class Equilibrium(NamedTuple):
@@ -52,73 +51,33 @@ def response(at: Equilibrium, rates: Problem) -> Float[Array, "nodes dim"]:
 def response_at_once(at: Equilibrium, rates: Problem) -> Float[Array, "nodes dim"]:
     """The same for a concrete equilibrium, as one primitive."""
     moving, tree = jax.tree.flatten(rates)
-    return _response_p.bind(*moving, at=_Map(at, tree))
+    return pushed(moving, _Map(at, tree))[0]
 
 
 class _Map:
-    """An equilibrium as the parameter of a primitive, compared by identity."""
+    """An equilibrium as a `LinearMap`."""
 
     def __init__(self, at: Equilibrium, tree):
         self.at, self.tree = at, tree
+        self.inputs, self.outputs = jax.tree.leaves(at.params), (at.u,)
 
-    def forward(self, *moving):
-        return response(self.at, jax.tree.unflatten(self.tree, moving))
+    def push(self, *moving) -> tuple:
+        return (response(self.at, jax.tree.unflatten(self.tree, moving)),)
 
-    def backward(self, change) -> list:
-        like = jax.tree.leaves(self.at.params)
-        return list(jax.linear_transpose(self.forward, *like)(change))
+    push_at_once = push
 
-    def backward_at_once(self, change) -> list:
+    def pull(self, *changes) -> list:
+        return list(jax.linear_transpose(self.push, *self.inputs)(changes))
+
+    def pull_at_once(self, *changes) -> list:
         """By one back-substitution and the derivative of one number."""
         if _supports_move(self.at):
-            return self.backward(change)
+            return self.pull(*changes)
         system, matrix, known = _held_on_host(self.at)
-        force = np.where(known, 0.0, np.asarray(change).ravel())
+        force = np.where(known, 0.0, np.asarray(changes[0]).ravel())
         # the last factor of the solve belongs to the state before the last, small update
         work = system.solver.solve_near(matrix, force)
         return jax.tree.leaves(_pulled(_without_supports(self.at), work, known))
-
-
-_response_p, _pull_p = Primitive("fem_response"), Primitive("fem_response_transpose")
-_pull_p.multiple_results = True
-_response_p.def_impl(lambda *moving, at: at.forward(*moving))
-_pull_p.def_impl(lambda change, at: at.backward_at_once(change))
-
-
-@_response_p.def_abstract_eval
-def _(*moving, at):
-    return jax.core.ShapedArray(at.at.u.shape, at.at.u.dtype)
-
-
-@_pull_p.def_abstract_eval
-def _(change, at):
-    return [jax.core.ShapedArray(x.shape, x.dtype) for x in jax.tree.leaves(at.at.params)]
-
-
-ad.deflinear2(_response_p, lambda change, *_, at: _pull_p.bind(change, at=at))
-ad.primitive_jvps[_pull_p] = lambda primals, tangents, at: (
-    _pull_p.bind(*primals, at=at), _pull_p.bind(*map(ad.instantiate_zeros, tangents), at=at)
-)  # fmt: skip
-ad.primitive_transposes[_pull_p] = lambda rates, _, at: [
-    _response_p.bind(*map(ad.instantiate_zeros, rates), at=at)
-]
-
-
-def _batched_response(moving, axes, *, at):
-    return jax.vmap(at.forward, axes)(*moving), 0
-
-
-def _batched_pull(change, axes, *, at):
-    out = jax.vmap(at.backward, axes)(*change)
-    return out, [0] * len(out)
-
-
-batching.primitive_batchers[_response_p] = _batched_response
-batching.primitive_batchers[_pull_p] = _batched_pull
-mlir.register_lowering(
-    _response_p, mlir.lower_fun(lambda *moving, at: at.forward(*moving), False)
-)
-mlir.register_lowering(_pull_p, mlir.lower_fun(lambda change, at: at.backward(change), True))
 
 
 def _supports_move(at: Equilibrium) -> bool:

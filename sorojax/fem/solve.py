@@ -4,11 +4,14 @@ The derivative is that of the implicit function at the converged state: one more
 back-substitution per direction, whatever steps the solver took to get there.
 """
 
+import contextlib
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax import _check
@@ -119,19 +122,38 @@ def solve(
     Raises:
         ConvergenceError: If `throw` and a step failed after all cuts.
     """
-    begin = None if start is None else Begin(jax.lax.stop_gradient(real(start)))
-    call = Solve(problem, begin, Newton() if newton is None else newton, steps, max_cuts)
+    settings = (Newton() if newton is None else newton, steps, max_cuts)
+    return solved_and_kept(problem, start, settings, throw)[0]
+
+
+def solved_and_kept(
+    problem: Problem, start: Any, settings: tuple[Newton, int, int], throw: bool
+) -> tuple[Solution, Float[np.ndarray, "nodes dim"] | None]:
+    """`solve`, and the displacement on the host where that is known, which needs no operation
+    that a derivative would stage."""
+    call = Solve(problem, None if start is None else _begun(start), *settings)
     u, counts, _ = equilibrium(call)
-    solution = Solution(
-        problem=problem,
-        displacement=u,
-        status=_status(counts[0] != 0),
-        stats=call.stats,
-        load_fraction=counts[1],
-        iterations=counts[2].astype(jnp.int32),
-    )
+    solution = Solution(problem, u, *_told(counts, call.stats))
     _raise_if_failed("fem.solve", solution, throw)
-    return solution
+    return solution, call.record.displacement
+
+
+def _begun(start: Any) -> Begin:
+    if is_traced(start):
+        return Begin(jax.lax.stop_gradient(real(start)))
+    with jax.core.eval_context():
+        return Begin(real(start))
+
+
+def _told(counts: Float[Array, " 4"], stats):
+    """Status, record, fraction of the load and iterations, from what is concrete at once:
+    every operation beside a derivative is staged with it."""
+    with contextlib.nullcontext() if is_traced(counts) else jax.core.eval_context():
+        if isinstance(stats, Stats):
+            failed, fraction, iterations, _ = np.asarray(counts)
+            status = Status.not_converged if failed else Status.successful
+            return status, stats, jnp.asarray(fraction), jnp.asarray(np.int32(iterations))
+        return _status(counts[0] != 0), stats, counts[1], counts[2].astype(jnp.int32)
 
 
 def solve_path(
@@ -172,14 +194,18 @@ def solve_path(
         u, counts, tangent = equilibrium(call)
         record = call.stats
         stats.append(record)
-        failed = failed | (counts[0] != 0)
-        if isinstance(record, Stats) and record.reason:
+        if not isinstance(record, Stats):
+            failed = failed | (counts[0] != 0)
+            u = at = jnp.where(failed, jnp.nan, u)
+        elif record.reason:
+            failed = jnp.asarray(True)
             solution = Solution(target, u, Status.not_converged, record)
             _raise_if_failed("fem.solve_path", solution, throw)
             break
-        states.append(jnp.where(failed, jnp.nan, u))
-        terms = (target.loads, target.supports)
-        begin = _fixed(Begin(states[-1], terms, tangent))
+        else:  # nothing to hide, and no operation that a derivative would stage
+            at = _begun(call.record.displacement).u
+        states.append(u)
+        begin = _fixed(Begin(at, (target.loads, target.supports), tangent))
         lanes = (record,) if isinstance(record, Stats) else record or ()
         report(
             "equilibrium", k + 1, len(row), iterations=sum(lane.iterations for lane in lanes)
@@ -216,8 +242,12 @@ def _scan_path(
 
 def _fixed(begin: Begin) -> Begin:
     """`begin` without derivatives: an equilibrium does not depend on where it came from."""
-    moving, rest = eqx.partition(begin, eqx.is_inexact_array)
-    return eqx.combine(jax.lax.stop_gradient(moving), rest)
+
+    def fixed(x):
+        moves = is_traced(x) and jnp.issubdtype(x.dtype, jnp.inexact)
+        return jax.lax.stop_gradient(x) if moves else x
+
+    return jax.tree.map(fixed, begin)
 
 
 def _status(failed: Bool[Array, "..."]) -> Status:

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from sorojax.math import pardiso, superlu
+from sorojax.math import banded, pardiso, superlu
 from sorojax.math.conjugate_gradient import IterativeFactor
 from sorojax.math.refined import SymmetricProduct, refined
 
 _NUM_FACTORS = 4
-Factor = pardiso.PardisoFactor | superlu.SuperLUFactor | IterativeFactor
+Factor = pardiso.PardisoFactor | superlu.SuperLUFactor | banded.BandedFactor | IterativeFactor
 
 
 def available_solvers() -> dict[str, str]:
@@ -124,9 +124,13 @@ class DirectSolver:
         """x with A(values) x = b by `factor` of a neighbour, see `refined`; `None` where the
         factor is gone or not near enough."""
         with self._turn:
-            if all(factor is not own for _, own in self._slots.values()):
+            if not self.holds(factor):
                 return None
             return refined(factor, self._product_with(values), b, start, tolerance)
+
+    def holds(self, factor: Factor) -> bool:
+        """Whether `factor` still is one of the last few."""
+        return any(factor is own for _, own in self._slots.values())
 
     def _product_with(self, values: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         if self._product is None:
@@ -176,7 +180,12 @@ def direct_solver_of(key, rows, cols, owned: bool = False) -> DirectSolver:
     """The direct solver of a pattern."""
 
     def analysed(starts, cols):
-        return _backend()(starts, cols, _NUM_FACTORS)
+        general = _backend()(starts, cols, _NUM_FACTORS)
+        asked = os.environ.get("SOROJAX_SOLVER")
+        order = None if asked else banded.narrow_order(starts, cols)
+        if order is None:
+            return general
+        return banded.Banded(general, order, starts, cols, _NUM_FACTORS)
 
     return solver_of(key, rows, cols, analysed, owned)
 
