@@ -38,19 +38,23 @@ class Cycles(NamedTuple):
     cuts: int
 
 
-def cycles(problem: fem.Problem, step: float, count: int = 3, **options) -> Cycles:
-    """Some cycles of the gait."""
-    motion = run(problem, count / FREQUENCY, step, **options)
-    x = np.asarray(moved(problem, motion))[:, 0]
-    ends = np.interp(np.arange(count + 1) / FREQUENCY, np.asarray(motion.times), x)
+def cycles(problem: fem.Problem, *motions: fem.Motion) -> Cycles:
+    """Whole cycles of the gait in a motion from rest, and in those that go on from it."""
+    x = np.concatenate([np.asarray(moved(problem, motion))[:, 0] for motion in motions])
+    times = np.concatenate([np.asarray(motion.times) for motion in motions])
+    count = round(float(times[-1]) * FREQUENCY)
+    ends = np.interp(np.arange(count + 1) / FREQUENCY, times, x)
     floor = problem.loads[-1]
     assert isinstance(floor, fem.Contact)
 
     def lowest(u):
         return jnp.min(floor.points_of(problem, u)[..., 1])
 
-    overlap = -float(jnp.min(jax.lax.map(lowest, motion.displacements)))
-    return Cycles(np.diff(ends), max(0.0, overlap), motion.stats.cuts)
+    overlap = -min(
+        float(jnp.min(jax.lax.map(lowest, motion.displacements))) for motion in motions
+    )
+    cuts = sum(motion.stats.cuts for motion in motions)
+    return Cycles(np.diff(ends), max(0.0, overlap), cuts)
 
 
 def felupe_arrays(problem: fem.Problem, steps: int, step: float) -> dict[str, np.ndarray]:

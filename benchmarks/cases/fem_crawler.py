@@ -3,6 +3,7 @@
 Times are CPU seconds on one core.
 """
 
+import statistics
 import time
 from typing import Any
 
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import peers
-from benchmarks.crawling import cycles, felupe_arrays, moved, run
+from benchmarks.crawling import FREQUENCY, cycles, felupe_arrays, moved, run
 from benchmarks.harness import Row, Timing
 from sorojax import fem
 from sorojax.robots import Crawler, crawler_gait, crawler_problem
@@ -24,91 +25,106 @@ PEER_STEPS, GRADIENT_STEPS = 100, 6
 
 def rows():
     problem = crawler_problem(Crawler(), size=SIZE)
-    yield from _second(problem)
+    timing, second = timed(run, problem, 1.0, STEP)
+    yield _second(problem, STEP, timing, second)
+    yield _second(problem, STEP / 2, *timed(run, problem, 1.0, STEP / 2, save=2))
     yield from _against()
-    yield from _changes(problem)
+    yield from _changes(problem, second)
     yield _slopes()
 
 
-def timed(go, *arguments) -> tuple[Timing, Any]:
+def timed(go, *arguments, **options) -> tuple[Timing, Any]:
     """What `go(*arguments, **options)` takes and gives, compiled by its first step."""
     start = time.process_time()
-    go(*arguments, max_steps=1, throw=False)
+    go(*arguments, max_steps=1, throw=False, **options)
     ready = time.process_time()
-    found = go(*arguments)
+    found = go(*arguments, **options)
     return Timing(ready - start, (time.process_time() - ready,)), found
 
 
-def _second(problem):
-    """One second of motion, at the original's step and at half of it."""
-    for step in (STEP, STEP / 2):
-        timing, motion = timed(run, problem, 1.0, step)
-        stats, took = motion.stats, timing.runs[0]
-        settings = {
-            "dof": problem.space.num_dofs,
-            "step_ms": 1e3 * step,
-            "ms_per_step": round(1e3 * took / stats.steps, 2),
-            "iterations": round(stats.iterations / stats.steps, 2),
-            "factorisations": round(stats.factorisations / stats.steps, 2),
-            "cuts": stats.cuts,
-        }
-        yield Row("sorojax", settings, **timing.columns(), bar=60.0)
+def _second(problem, step, timing: Timing, motion: fem.Motion) -> Row:
+    """One second of motion."""
+    stats, took = motion.stats, timing.runs[0]
+    settings = {
+        "dof": problem.space.num_dofs,
+        "step_ms": 1e3 * step,
+        "ms_per_step": round(1e3 * took / stats.steps, 2),
+        "iterations": round(stats.iterations / stats.steps, 2),
+        "factorisations": round(stats.factorisations / stats.steps, 2),
+        "cuts": stats.cuts,
+    }
+    return Row("sorojax", settings, **timing.columns(), bar=60.0)
 
 
 def _against():
-    """The first steps, beside a plain loop of felupe and SciPy with the same mesh."""
+    """The first steps, beside a plain loop of felupe and SciPy with the same mesh, which
+    runs between ours."""
     flat = crawler_problem(Crawler(), size=SIZE, depth=1.0)
-    duration = PEER_STEPS * STEP
-    timing, motion = timed(run, flat, duration, STEP)
+    runs = (flat, PEER_STEPS * STEP, STEP)
+    timing, motion = timed(run, *runs)
     end = np.asarray(motion.displacements[-1])
 
     def error(answer):
         return float(np.abs(answer["displacement"][-1] - end).max() / np.abs(end).max())
 
-    settings = {"dof": flat.space.num_dofs, "steps": PEER_STEPS}
-    yield Row("sorojax", settings, **timing.columns())
     arrays = felupe_arrays(flat, PEER_STEPS, STEP)
     law = flat.loads[-1]
     assert isinstance(law, fem.Contact)
     numbers = ("stiffness", "smoothing", "friction", "friction_velocity")
     options = {name: float(getattr(law, name)) for name in numbers}
+    found = []
     for solver in ("superlu", "pardiso"):
-        yield peers.row(
+        found.append(peers.row(
             "felupe", "motion", arrays, error, "sorojax, largest difference over largest",
             element="Quad8", step=STEP, rho_inf=0.5, tolerance=1e-6, max_iterations=60,
             solver=solver, **options,
-        )  # fmt: skip
+        ))  # fmt: skip
+        start = time.process_time()
+        run(*runs)
+        timing = Timing(timing.compile_s, (*timing.runs, time.process_time() - start))
+    settings = {"dof": flat.space.num_dofs, "steps": PEER_STEPS,
+                "solver": flat.space.system.solver.name}  # fmt: skip
+    share = None if found[0].run_s is None else statistics.median(timing.runs) / found[0].run_s
+    yield Row("sorojax", settings, **timing.columns(), error=share, bar=0.2, bar_on="error",
+              reference="time over that of felupe with SciPy's solver")  # fmt: skip
+    yield from found
 
 
-def _changes(problem):
+def _changes(problem, second: fem.Motion):
     """Way of a cycle under other numbers; other cells by their first cycle."""
     law: Any = problem.loads[-1]
     stiffer = eqx.tree_at(
         lambda p: (p.loads[-1].stiffness, p.loads[-1].friction_stiffness),
         problem, (2 * law.stiffness, 2 * law.friction_stiffness),
     )  # fmt: skip
+    rest = run(problem, 2 / FREQUENCY - 1.0, STEP, start=second)
+    base = cycles(problem, second, rest)
+    yield Row("sorojax", _told("as it is", problem, base), reference="no bar: what others "
+              "are compared with")  # fmt: skip
     halved = crawler_problem(Crawler(), size=SIZE / 2, across=2)
     coarse = crawler_problem(Crawler(), size=2 * SIZE)
-    base = None
     for name, case, step, count, bar in (
-        ("as it is", problem, STEP, 2, None),
         ("contact twice as stiff", stiffer, STEP, 2, 0.02),
         ("steps three times as long", problem, 3 * STEP, 2, None),
         ("cells half as large", halved, STEP, 1, 0.05),
         ("cells twice as large", coarse, STEP, 1, None),
     ):
-        timing, found = timed(cycles, case, step, count)
-        settings = {
-            "case": name,
-            "dof": case.space.num_dofs,
-            "mm_per_cycle": np.round(found.ways / mm, 3).tolist(),
-            "overlap_mm": round(found.overlap / mm, 4),
-            "cuts": found.cuts,
-        }
-        base = found.ways if base is None else base
-        error = float(abs(found.ways[-1] / base[count - 1] - 1))
-        yield Row("sorojax", settings, **timing.columns(), error=error, bar=bar,
-                  bar_on="error", reference=f"cycle {count} of: as it is")  # fmt: skip
+        timing, motion = timed(run, case, count / FREQUENCY, step)
+        found = cycles(case, motion)
+        error = float(abs(found.ways[-1] / base.ways[count - 1] - 1))
+        yield Row("sorojax", _told(name, case, found), **timing.columns(), error=error,
+                  bar=bar, bar_on="error", reference=f"cycle {count} of: as it is")  # fmt: skip
+
+
+def _told(name, case, found) -> dict[str, Any]:
+    return {
+        "case": name,
+        "dof": case.space.num_dofs,
+        "cells": case.mesh.num_cells,
+        "mm_per_cycle": np.round(found.ways / mm, 3).tolist(),
+        "overlap_mm": round(found.overlap / mm, 4),
+        "cuts": found.cuts,
+    }
 
 
 def _slopes():

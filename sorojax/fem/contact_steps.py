@@ -19,6 +19,7 @@ from sorojax.fem.problem import Problem
 from sorojax.fem.self_contact import SelfContact, with_partners
 from sorojax.fem.solve import ConvergenceError, Solution, solve
 from sorojax.fem.space import space
+from sorojax.math.jit import once
 from sorojax.math.status import Status
 
 Touching = Contact | SelfContact
@@ -118,7 +119,7 @@ def contact_state(
     return _state(loads[0], problem, u)
 
 
-@eqx.filter_jit
+@once
 def _state(load: Touching, problem: Problem, u: Float[Array, "nodes dim"]) -> Contacts:
     return load.state(problem, u)
 

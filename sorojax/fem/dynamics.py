@@ -16,9 +16,9 @@ from sorojax._types import is_traced, real
 from sorojax.fem.contact_load import Contact
 from sorojax.fem.contact_start import moving
 from sorojax.fem.damping import AbstractDamping
-from sorojax.fem.dynamics_host import Control, Run
+from sorojax.fem.dynamics_host import Control, Run, compiled_matter
 from sorojax.fem.dynamics_implicit import MotionCall, recorded
-from sorojax.fem.dynamics_step import Dynamics, Matter, State, matter
+from sorojax.fem.dynamics_step import Dynamics, Matter, State
 from sorojax.fem.dynamics_traced import replay
 from sorojax.fem.energy_form import residual
 from sorojax.fem.generalised_alpha import AbstractMethod, GeneralisedAlpha
@@ -30,6 +30,7 @@ from sorojax.fem.problem import Problem, body
 from sorojax.fem.step_state import StepState
 from sorojax.fem.traced import known_mask
 from sorojax.math import sparse
+from sorojax.math.jit import once
 from sorojax.math.status import Status
 from sorojax.mesh.mesh import Mesh
 
@@ -234,7 +235,7 @@ def _state(where: str, dynamics: Dynamics, start: Start | None) -> State:
 
 def _acceleration(dynamics: Dynamics, state: State) -> Float[Array, "nodes dim"]:
     """Acceleration [m/s^2] that balances a state."""
-    matrix, rhs = _balance(dynamics, state)
+    matrix, rhs = _balance(dynamics, compiled_matter(dynamics), state)
     system = dynamics.problem.space.system
     if is_traced((matrix, rhs)):
         a = sparse.solve(system, matrix, rhs)
@@ -243,10 +244,9 @@ def _acceleration(dynamics: Dynamics, state: State) -> Float[Array, "nodes dim"]
     return a.reshape(state.displacement.shape)
 
 
-@eqx.filter_jit
-def _balance(dynamics: Dynamics, state: State):
+@once
+def _balance(dynamics: Dynamics, known: Matter, state: State):
     problem, u = dynamics.problem, state.displacement
-    known: Matter = matter(dynamics)
     kept = (
         load if before is None else before
         for load, before in zip(problem.loads, state.memory, strict=True)

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,7 +11,14 @@ from sorojax.fem import assemble as asm
 from sorojax.fem.contact_swept import passed_through
 from sorojax.fem.dynamics_kernel import Split, kernel
 from sorojax.fem.dynamics_lists import has_lists, listed_at
-from sorojax.fem.dynamics_newton import Found, StepSolver, Task, may_rest
+from sorojax.fem.dynamics_newton import (
+    LEAST_VOLUME,
+    UNSOUND,
+    Found,
+    StepSolver,
+    Task,
+    may_rest,
+)
 from sorojax.fem.dynamics_step import (
     Dynamics,
     Interval,
@@ -23,16 +29,17 @@ from sorojax.fem.dynamics_step import (
     end_step,
     matter,
 )
+from sorojax.fem.energy_form import load_force
 from sorojax.fem.geometry import Geometry
+from sorojax.fem.host_inertia import Numbers
 from sorojax.fem.inertia import Inertia
 from sorojax.fem.linear import prepare
 from sorojax.fem.newton import Newton
+from sorojax.fem.problem import body
 from sorojax.fem.supports import known_values
+from sorojax.math.jit import once
 from sorojax.math.status import Status
 
-#: A prediction that leaves a cell less of its volume is no guess to start from, and a step
-#: that does is too long.
-LEAST_VOLUME = 0.1
 _CALM = 0.8  # a step whose forces act at more of every volume does not get near to that
 
 
@@ -82,7 +89,9 @@ class Run:
         self.dynamics, problem = dynamics, dynamics.problem
         self.prepared = prepare(problem)
         self.matter = compiled_matter(dynamics)
-        self.solver = StepSolver(self.prepared, problem, self.control.newton)
+        self.solver = StepSolver(
+            self.prepared, problem, self.control.newton, np.asarray(self.matter.mass)
+        )
         self._fixed = Split((dynamics, self.matter, self.prepared.geometry))
 
     def _follow_lists(self) -> None:
@@ -123,7 +132,8 @@ class Run:
             if self.follows:
                 self._follow_lists()
             end = done + self.share
-            new = self._step(Interval(*map(jnp.asarray, (np.int32(index), done, end))))
+            ends = np.int32(index), np.float64(done), np.float64(end)
+            new = self._step(Interval(*ends))  # type: ignore[arg-type]
             if new is None:
                 failures += 1
                 self.cuts += 1
@@ -139,23 +149,23 @@ class Run:
         return True
 
     def _step(self, interval: Interval) -> Split | None:
-        step, task, held, predicted, kept = _begin((self._fixed, self.now), interval)
-        start, held = task.origin, np.asarray(held)
-        # a prediction that inverts cells is none
-        sound = float(kept) > LEAST_VOLUME
-        found = self._solve(task, predicted if sound else start, held)
-        least = found.volume * (float(kept) if sound else 1.0)
+        step, task, held, predicted = _begin((self._fixed, self.now), interval)
+        self.solver.begin(task)
+        start, held = task.inertia.origin, np.asarray(held)
+        found = self._solve(predicted, held)
+        if found.reason == UNSOUND:
+            found = self._solve(start, held)
         if found.reason:
-            found = self._solve(task, start, held)
-            least = found.volume
+            found = self._solve(start, held)
         if found.reason:
             self.reason = found.reason
             return None
-        u = jnp.asarray(found.u)
-        new, displacement, error, through = _end((self._fixed, self.now, step), interval, u)
+        taken = self.solver.inertia.taken(found.u)
+        args = interval, found.u, np.float64(taken)
+        new, displacement, error, through = _end((self._fixed, self.now, step), *args)
         if through:
             self.reason = "a point goes through an obstacle"
-        elif not (least > _CALM or self._kept(start, displacement) > LEAST_VOLUME):
+        elif not (found.volume > _CALM or self._kept(start, displacement) > LEAST_VOLUME):
             self.reason = "a cell loses most of its volume"
         else:
             self.reason = ""
@@ -180,8 +190,8 @@ class Run:
         args = (problem.space, self.prepared.geometry, problem.kinematics)
         return float(asm.kept_volume(*args, u, new - u))
 
-    def _solve(self, task: Task, start, held: np.ndarray) -> Found:
-        found = self.solver.solve(task, np.asarray(start), held)
+    def _solve(self, start, held: np.ndarray) -> Found:
+        found = self.solver.solve(np.asarray(start), held)
         self.iterations += found.iterations
         self.factorisations += found.factorisations
         return found
@@ -204,31 +214,42 @@ def step_error(dynamics: Dynamics, interval: Interval, state: State, new: State)
     return h**2 * jnp.abs(beta - 1 / 6) * change
 
 
-compiled_matter: Callable[[Dynamics], Matter] = eqx.filter_jit(matter)
+compiled_matter: Callable[[Dynamics], Matter] = once(matter)
 
 
 @kernel
 def _begin(fixed: tuple[Dynamics, Matter, Geometry], state: State, interval: Interval):
-    """A step and what there is to solve, the displacements held in it and predicted, and the
-    least share of a volume that the prediction keeps."""
-    dynamics, known, geometry = fixed
+    """A step and what there is to solve, the displacements held in it and predicted."""
+    dynamics, known, _ = fixed
     step = begin_step(dynamics, known, state, interval)
-    problem, u = dynamics.problem, state.displacement
-    args = (problem.space, geometry, problem.kinematics, u, step.predicted - u)
-    kept = asm.kept_volume(*args)
+    problem, u, c = dynamics.problem, state.displacement, dynamics.scheme
     loads, few, room = step.terms[0], None, jnp.zeros((), u.dtype)
+    (inertia,) = (load for load in loads if isinstance(load, Inertia))
+    # the products with mass and damping are those of the host
+    unmoved = dataclasses.replace(inertia, pull=jnp.zeros_like(inertia.pull))
+    bare = tuple(unmoved if load is inertia else load for load in loads)
     rooms = [x for x in (load.room(problem) for load in loads) if x is not None]
     if rooms:
-        few = Split(tuple(load for load in loads if not may_rest(load)))
+        few = Split(tuple(load for load in bare if not may_rest(load)))
         room = jnp.min(jnp.stack(rooms))
-    (inertia,) = (load for load in loads if isinstance(load, Inertia))
-    task = Task(Split(loads), few, room, inertia.matrix, inertia.pull, inertia.origin)
-    return Split(step), task, known_values(step.terms[1], *u.shape), step.predicted, kept
+    dead = tuple(load for load in loads if load.dead)
+    h = (interval.end - interval.begin) * dynamics.step
+    numbers = Numbers(
+        inertia.matrix, step.matrix,
+        load_force(dataclasses.replace(body(problem), loads=dead), u).ravel(),
+        step.lead, step.drive, inertia.origin, c.gamma / (c.beta * h), 1 - c.af,
+    )  # fmt: skip
+    still = all(support.ramped is None for support in problem.supports)
+    kept = loads[: len(problem.loads)] if still else loads
+    ending = step._replace(terms=(kept, step.terms[1]), matrix=None)
+    task = Task(Split(bare), few, room, numbers)
+    return Split(ending), task, known_values(step.terms[1], *u.shape), step.predicted
 
 
 @kernel
-def _end(fixed, state: State, step: Step, interval: Interval, u):
+def _end(fixed, state: State, step: Step, interval: Interval, u, taken):
     dynamics, known, _ = fixed
     new = end_step(dynamics, known, state, interval, step, u)
+    new = dataclasses.replace(new, dissipated=new.dissipated + taken)
     through = passed_through(dynamics.problem, step.terms[0], new.displacement)
     return Split(new), new.displacement, step_error(dynamics, interval, state, new), through

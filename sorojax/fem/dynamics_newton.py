@@ -17,6 +17,7 @@ from sorojax.fem import assemble as asm
 from sorojax.fem.dynamics_kernel import Split, kernel
 from sorojax.fem.dynamics_lists import has_lists, longest_share
 from sorojax.fem.energy_form import load_force
+from sorojax.fem.host_inertia import HostInertia, Numbers
 from sorojax.fem.inertia import Inertia
 from sorojax.fem.linear import Prepared, add_load_stiffness
 from sorojax.fem.loads import AbstractLoad
@@ -28,13 +29,18 @@ from sorojax.math import sparse
 #: A kept factor is given up where the residual keeps more than this share in an iteration.
 _SLOW = 0.2
 _SLOPE_TURNED, _MAX_SHORTENINGS = 0.5, 12
+#: A guess that leaves a cell less of its volume is none to start from.
+LEAST_VOLUME = 0.1
+UNSOUND = "a cell loses most of its volume"
 
 
 class Kept(NamedTuple):
-    """A tangent with its supports applied, whose factor goes on being used."""
+    """A tangent with its supports applied, whose factor goes on being used, if it has one
+    already."""
 
     matrix: np.ndarray
     largest: float
+    factor: sparse.Factor | None = None
 
 
 class Balance(NamedTuple):
@@ -50,7 +56,7 @@ class Balance(NamedTuple):
 
 class Found(NamedTuple):
     """State that a step converged to, unless `reason` says why not; no cell of it has less
-    than `volume` of what it had in the guess, and perhaps much more."""
+    than `volume` of what it had where the step begins, and perhaps much more."""
 
     u: np.ndarray
     residual: np.ndarray
@@ -63,14 +69,12 @@ class Found(NamedTuple):
 
 class Task(NamedTuple):
     """A step to solve: its loads, those of them that may not rest if any may, how far nodes
-    may move from `origin` until the others act [m], and the numbers of inertia."""
+    may move from where it begins until the others act [m], and the numbers of inertia."""
 
     loads: Split
     few: Split | None
     room: Array
-    matrix: Array
-    pull: Array
-    origin: Array
+    inertia: Numbers
 
 
 class Acting(NamedTuple):
@@ -92,7 +96,7 @@ def _forces(fixed, loads, u, before):
     found = asm.assemble(
         body.space, prepared.geometry, body.material, body.kinematics, u, before
     )
-    rest = tuple(load for load in loads if not isinstance(load, Inertia))
+    rest = tuple(load for load in loads if not (load.dead or isinstance(load, Inertia)))
     loaded = load_force(dataclasses.replace(body, loads=rest), u)
     return found.force, loaded.ravel(), found.volume_ratio
 
@@ -100,52 +104,59 @@ def _forces(fixed, loads, u, before):
 @kernel
 def _tangent(fixed, loads, u, before):
     body, prepared = fixed
-    found = asm.assemble(
-        body.space, prepared.geometry, body.material, body.kinematics, u, before
-    )
-    problem = dataclasses.replace(body, loads=loads)
-    values = add_load_stiffness(problem, prepared, u, found.values)
-    return values, sparse.fix(problem.space.system, values, prepared.known)
+    args = (body.space, prepared.geometry, body.material, body.kinematics)
+    values = asm.assemble(*args, u, before).values
+    return add_load_stiffness(dataclasses.replace(body, loads=loads), prepared, u, values)
+
+
+@kernel
+def _held(fixed, values):
+    body, prepared = fixed
+    return sparse.fix(body.space.system, values, prepared.known)
 
 
 def forces(of: Acting, u, before):
-    """Internal force and that of the loads but inertia [N], and the smallest J / J_before."""
+    """Internal force and that of the loads but inertia and dead ones [N], and the smallest
+    J / J_before."""
     return _forces(of, u, before)
 
 
 def tangent(of: Acting, u, before):
     """Values of the tangent [N/m], and the same with supports applied."""
-    return _tangent(of, u, before)
+    values = _tangent(of, u, before)
+    return values, _held((of.fixed,), values)
 
 
 class StepSolver:
     """Solves the steps of one motion; remembers the last tangent."""
 
-    def __init__(self, prepared: Prepared, problem: Problem, newton: Newton):
+    def __init__(self, prepared: Prepared, problem: Problem, newton: Newton, mass: np.ndarray):
         self.prepared, self.newton, self._problem = prepared, newton, problem
         self.system = problem.space.system
         self.solver, self.sees = self.system.solver, has_lists(problem)
         self.known, self.length = np.asarray(prepared.known), float(prepared.length)
-        self.kept: Kept | None = None
+        self.free, self.kept = not self.known.any(), None
         self._fixed = Split((body(problem), prepared))
         self._resting = Split((body(problem), _without_resting(problem, prepared)))
-        self._matrix = _Both(self.system)
+        self.inertia = HostInertia(self.system, mass)
 
-    def solve(self, task: Task, guess: np.ndarray, held: np.ndarray) -> Found:
-        """Equilibrium near `guess`, where known unknowns are `held`."""
-        settings = self.newton
-        self._matrix.fill(np.asarray(task.matrix))
-        self._pull, self._origin = np.asarray(task.pull), np.asarray(task.origin)
+    def begin(self, task: Task) -> None:
+        """Go on with another step."""
+        self.inertia.begin(task.inertia)
         self._of, self._room = Acting(self._fixed, task.loads), 0.0
         if task.few is not None:
             self._few, self._room = Acting(self._resting, task.few), float(task.room)
-        u, before, fresh, size, volume = guess, guess, 0, np.inf, 1.0
-        now = self._balance(u, u)
+
+    def solve(self, guess: np.ndarray, held: np.ndarray) -> Found:
+        """Equilibrium of the step near `guess`, where known unknowns are `held`."""
+        settings, u, before, fresh, size = self.newton, guess, guess, 0, np.inf
+        now = self._balance(u, self.inertia.origin)
+        if not now.volume_ratio > LEAST_VOLUME:
+            return Found(u, np.zeros(u.size), 0, 0, self.kept, UNSOUND)
+        volume = now.volume_ratio
         last, refactor, iterations, secants = np.inf, self.kept is None, 0, Secants()
         while True:
-            move = np.where(self.known, held - u.ravel(), 0.0)
-            move[np.abs(move) <= 1e-12 * np.abs(held).max(initial=0.0)] = 0.0
-            moves = bool(np.any(move))
+            move, moves = self._to_move(u, held)
             norm, reference = now.norm, now.reference
             if not (np.isfinite(norm) and now.volume_ratio > 0):
                 return self._failed(u, iterations, fresh, "an element inverts")
@@ -168,7 +179,7 @@ class StepSolver:
             if moves:
                 rhs = rhs - np.asarray(self._product(move))
             rhs[self.known] = 0.0
-            factor = self.solver.factor(self.kept.matrix)  # type: ignore[union-attr]
+            factor = self._factor()
             if factor is None:
                 return self._failed(u, iterations, fresh, "the tangent is singular")
             du = (secants.solve(factor, rhs) + move).reshape(u.shape)
@@ -181,9 +192,26 @@ class StepSolver:
                 change[self.known] = 0.0
                 secants.add((u - before).ravel(), change)
 
+    def _to_move(self, u, held):
+        """What known unknowns have to move yet [m], and whether any has."""
+        if self.free:
+            return 0.0, False
+        move = np.where(self.known, held - u.ravel(), 0.0)
+        move[np.abs(move) <= 1e-12 * np.abs(held).max(initial=0.0)] = 0.0
+        return move, bool(np.any(move))
+
     def _renew(self, u, before) -> bool:
-        self._values, matrix = tangent(self._acting(u), u, before)
+        self._values = matrix = _tangent(self._acting(u), u, before)
+        if not self.free:
+            matrix = _held((self._fixed,), matrix)
         return self.keep(np.asarray(matrix))
+
+    def _factor(self) -> sparse.Factor | None:
+        kept = self.kept
+        assert kept is not None
+        if kept.factor is None or not self.solver.holds(kept.factor):
+            kept = self.kept = kept._replace(factor=self.solver.factor(kept.matrix))
+        return kept.factor
 
     def keep(self, matrix: np.ndarray) -> bool:
         """Go on with the factor of `matrix`; False if it is not finite."""
@@ -197,7 +225,7 @@ class StepSolver:
         """Body and loads that act at `u`: a contact that is out of reach is left out, as long
         as no node has moved further than it leaves room for."""
         if self._room > 0:
-            moved = np.sqrt(u.shape[1]) * np.abs(u - self._origin).max()
+            moved = np.sqrt(u.shape[1]) * np.abs(u - self.inertia.origin).max()
             if moved < self._room:
                 return self._few
         return self._of
@@ -206,11 +234,13 @@ class StepSolver:
         """Forces of body and loads from a compiled kernel, inertia by a product here."""
         found = forces(self._acting(u), u, before)
         internal, load, ratio = (np.asarray(x) for x in found)
-        load = load + self._pull - self._matrix @ (u - self._origin).ravel()
+        load = load + self.inertia.force(u)
         residual = internal - load
-        norm = np.abs(np.where(self.known, 0.0, residual)).max()
-        reaction = np.abs(np.where(self.known, residual, 0.0)).max()
-        reference = max(np.abs(load).max(), reaction)
+        size, reference = np.abs(residual), np.abs(load).max()
+        norm = size.max()
+        if not self.free:
+            norm = np.where(self.known, 0.0, size).max()
+            reference = max(reference, np.where(self.known, size, 0.0).max())
         length = np.abs(u).max() + self.length
         return Balance(residual, float(norm), float(reference), length, float(ratio))
 
@@ -261,25 +291,3 @@ def _without_resting(problem: Problem, prepared: Prepared) -> Prepared:
     jax.eval_shape(look)
     slots = zip(prepared.group_slots, rests, strict=True)
     return prepared._replace(group_slots=tuple(rows for rows, rest in slots if not rest))
-
-
-class _Both:
-    """A symmetric matrix with both its triangles, for products on the host."""
-
-    def __init__(self, system: sparse.SparseSymmetric):
-        from scipy.sparse import csr_array
-
-        rows, cols = np.asarray(system.rows), np.asarray(system.cols)
-        off = np.flatnonzero(rows != cols)
-        number = np.concatenate([np.arange(len(rows)), off])
-        at = np.concatenate([rows, cols[off]]), np.concatenate([cols, rows[off]])
-        order = csr_array((number + 1.0, at), (system.size, system.size))
-        self._number = (order.data - 1).astype(np.int64)
-        self._csr, self._values = order, None
-
-    def fill(self, values: np.ndarray) -> None:
-        if self._values is None or not np.array_equal(values, self._values):
-            self._values, self._csr.data = values.copy(), values[self._number]
-
-    def __matmul__(self, x: np.ndarray) -> np.ndarray:
-        return self._csr @ x

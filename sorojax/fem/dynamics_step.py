@@ -81,13 +81,17 @@ class Interval(NamedTuple):
 
 class Step(NamedTuple):
     """A step to solve. `matrix` is the damping matrix; `terms` are the loads and supports of
-    its problem of equilibrium; `target` are displacements known at the end."""
+    its problem of equilibrium; `target` are displacements known at the end. Inertia pulls by
+    the mass times `drive` [m/s^2] minus the damping times `lead` [m/s], the velocity where
+    forces act of a body that keeps its displacement."""
 
     terms: tuple
     guess: Float[Array, "nodes dim"]
     predicted: Float[Array, "nodes dim"]
     matrix: Float[Array, " nnz"] | None
     target: Float[Array, " dofs"]
+    lead: Float[Array, "nodes dim"]
+    drive: Float[Array, "nodes dim"]
 
 
 def matter(dynamics: Dynamics) -> Matter:
@@ -125,7 +129,7 @@ def begin_step(dynamics: Dynamics, known: Matter, state: State, interval: Interv
     predicted = guess
     if all(load.smooth for load in dynamics.problem.loads):
         predicted = guess + (1 - c.af) * h**2 / 2 * a  # that of an impact is not the next one
-    return Step((loads + extra, supports), guess, predicted, damping, target)
+    return Step((loads + extra, supports), guess, predicted, damping, target, lead, drive)
 
 
 def end_step(

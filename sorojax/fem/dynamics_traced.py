@@ -13,7 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sorojax.fem import assemble as asm
 from sorojax.fem.contact_swept import passed_through
-from sorojax.fem.dynamics_host import LEAST_VOLUME, Control, step_error
+from sorojax.fem.dynamics_host import Control, step_error
+from sorojax.fem.dynamics_newton import LEAST_VOLUME
 from sorojax.fem.dynamics_step import (
     Dynamics,
     Interval,

@@ -31,6 +31,7 @@ class AbstractLoad(eqx.Module):
     holds: ClassVar[bool] = False  # whether its stiffness can hold the body
     smooth: ClassVar[bool] = True  # whether the tangent at one load foretells the next
     overshoots: ClassVar[bool] = False  # whether steps may run past where its force changes
+    dead: ClassVar[bool] = False  # whether its force is the same in every state
 
     @abc.abstractmethod
     def potential(self, problem: "Problem", u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
@@ -108,6 +109,8 @@ class Pressure(AbstractLoad):
 class Traction(AbstractLoad):
     """Dead force per reference area [Pa] on `facets`, one vector."""
 
+    dead: ClassVar[bool] = True
+
     facets: Int[Array, "facets facet_nodes"] = eqx.field(converter=integers)
     value: Float[Array, " dim"] = eqx.field(converter=real)
     name: str = eqx.field(static=True, default="traction")
@@ -122,6 +125,8 @@ class Traction(AbstractLoad):
 class Force(AbstractLoad):
     """Dead force [N], one vector in all, shared equally by `nodes`."""
 
+    dead: ClassVar[bool] = True
+
     nodes: Int[Array, " nodes"] = eqx.field(converter=integers)
     value: Float[Array, " dim"] = eqx.field(converter=real)
     name: str = eqx.field(static=True, default="force")
@@ -135,6 +140,8 @@ class Force(AbstractLoad):
 
 class Gravity(AbstractLoad):
     """Weight of the body; `value` is the acceleration [m/s^2], one entry per axis."""
+
+    dead: ClassVar[bool] = True
 
     value: Float[Array, " dim"] = eqx.field(converter=real, default=(0.0, -9.81))
     name: str = eqx.field(static=True, default="gravity")
