@@ -69,7 +69,7 @@ ROWS = {
     "single precision": Cases(("precision.single",)),
     "what a scene does not need": Cases(("skip.features",)),
     "accelerators": Cases((), ("device.fem", "device.rods", "device.sdf")),
-    "scaling": Cases(("scaling.rod", "scaling.fem", "scaling.batch", "scaling.design")),
+    "scaling": Cases(("scaling.rod", "scaling.fem", "scaling.batch"), ("scaling.design",)),
 }
 
 

@@ -29,12 +29,12 @@ def main(picture: str | None = None) -> dict[str, float]:
         rest = sj.rod.equilibrium(rod, (sj.rod.Tendons(route, tension),))
         return sj.rod.tip_angle(sj.rod.motion(rod, rest.q))
 
-    bent, (by_tension, by_taper) = jax.jit(jax.value_and_grad(angle, (0, 1)))(0.2, 3 * mm)
+    pull, slopes = jnp.array(0.2), jax.jit(jax.value_and_grad(angle, (0, 1)))
+    bent, (by_tension, by_taper) = slopes(pull, 3 * mm)
 
     # Newton on the angle: the pull that turns the tip by 150 degrees
-    pull, slope = 0.2, jax.jit(jax.value_and_grad(angle))
     for _ in range(6):
-        found, rate = slope(pull, 3 * mm)
+        found, (rate, _) = slopes(pull, 3 * mm)
         pull = pull - (found - 150 * deg) / rate
 
     # the same pull, ramped up within half a second, around a ball
@@ -86,5 +86,7 @@ def draw(finger, path, file: Path) -> None:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    for name, number in main(sys.argv[1] if len(sys.argv) > 1 else None).items():
+    sj.enable_compilation_cache()
+    names = [name for name in sys.argv[1:] if name != "--quick"]
+    for name, number in main(*names[:1]).items():
         print(f"{name:34s} {number:10.4g}")

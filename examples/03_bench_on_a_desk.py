@@ -120,5 +120,6 @@ if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
     sj.enable_compilation_cache()
     sj.enable_low_latency()
-    for name, value in main(picture=sys.argv[1] if len(sys.argv) > 1 else None).items():
+    names = [name for name in sys.argv[1:] if name != "--quick"]
+    for name, value in main("--quick" in sys.argv, *names[:1]).items():
         print(f"{name:<36} {value:.4g}")

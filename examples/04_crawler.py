@@ -66,6 +66,7 @@ def draw(problem, motion, centre, file: Path) -> None:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
+    sj.enable_compilation_cache()
     quick, names = "--quick" in sys.argv, [a for a in sys.argv[1:] if a[:2] != "--"]
     numbers = main(quick, names[0] if names else None)
     for name, number in numbers.items():

@@ -86,6 +86,7 @@ def draw(shapes, file: Path) -> None:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
+    sj.enable_compilation_cache()
     names = [name for name in sys.argv[1:] if name != "--quick"]
     for name, number in main("--quick" in sys.argv, *names[:1]).items():
         print(f"{name:46s} {number:10.4g}")

@@ -79,19 +79,24 @@ def overlap(problem, u, contact: str) -> float:
 def draw(robot, path, backbone, body, q, shapes, file: Path) -> None:
     """The actuator on its way round the cylinder, and the three modes above the chambers."""
     import matplotlib.pyplot as plt
+    from matplotlib.collections import LineCollection, PolyCollection
     from matplotlib.patches import Circle
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 5.2), layout="constrained")
-    facets = np.asarray(mesh.boundary_facets(path.problem.mesh))[:, [0, 2, 1]]
+    solid = path.problem.mesh
+    facets = np.asarray(mesh.boundary_facets(solid))[:, [0, 2, 1]]
+    corners = np.asarray(solid.cells)[:, : solid.element.num_corners]
     s = jnp.linspace(0.0, 1.0, 200)
     steps, under = len(path.displacements) - 1, float(robot.layer) / 2 / mm
-    for k, shade in ((0, 0.25), (steps // 4, 0.4), (steps // 2, 0.6), (steps, 1.0)):
-        now = np.asarray(path.problem.mesh.points + path.displacements[k]) / mm
-        for side in now[facets]:
-            left.plot(*side.T, color="#2a6f97", lw=0.8, alpha=shade)
+    left.add_patch(Circle((CENTRE[0] / mm, CENTRE[1] / mm), RADIUS / mm, color="#d9cfbd"))
+    moments = (0, steps // 4, steps // 2, steps)
+    for k, fill in zip(moments, ("#eef2f5", "#dce6ee", "#c3d6e4", "#94bad5"), strict=True):
+        now = np.asarray(solid.points + path.displacements[k]) / mm
+        left.add_collection(PolyCollection(list(now[corners]), color=fill, lw=0.3))
+        left.add_collection(LineCollection(list(now[facets]), color="#2a6f97", lw=0.7))
+    for k in moments:
         places = np.asarray(rod.forward_kinematics(body, q[k], s)[:, :2, 2]) / mm
         left.plot(places[:, 0], places[:, 1] + under, color="#e76f51", lw=1.6)
-    left.add_patch(Circle((CENTRE[0] / mm, CENTRE[1] / mm), RADIUS / mm, color="#b9a888"))
     left.set(aspect="equal", xlabel="x [mm]", ylabel="y [mm]")
     left.set_title("0, 10, 20 and 40 kPa, the rod of three modes in red", fontsize=10)
     for middle in np.asarray(robot.middles):

@@ -49,12 +49,12 @@ class Chambers(eqx.Module):
         return jnp.concatenate([start * jnp.stack(bend), jnp.zeros(3)])
 
 
-def lowered(t):
-    """Weight [m/s^2] that comes on while a table sinks away, from 0.5 to 0.8 s."""
-    return jnp.array([0.0, 0.0, -9.81]) * jnp.clip((t - 0.5) / 0.3, 0, 1)
+def table(t):
+    """What a table carries of the weight [m/s^2], which sinks away from 0.5 to 0.8 s."""
+    return jnp.array([0.0, 0.0, 9.81]) * jnp.clip((0.8 - t) / 0.3, 0, 1)
 
 
-@eqx.filter_jit
+@functools.partial(sj.jit, kernels=False)
 def run(joint, radius, length, depth, mass, command, step, saves):
     """The robot, its motion, and the contact force [N] or moment [N m] that the thing takes
     along the axis, the mean of the last 50 steps."""
@@ -68,10 +68,10 @@ def run(joint, radius, length, depth, mass, command, step, saves):
     touch = rod.LinkContact(sj.sdf.Cylinder(radius, length), 6 * mm, GRIP, points=24)
     touches = tuple(rod.Between(name, "thing", touch) for name in fingers)
     air = rod.Varying(functools.partial(rod.PointWrench, follower=True), Chambers(*command))
-    own = [rod.On(name, force) for name in fingers for force in (rod.Gravity(), air)]
-    weight = rod.On("thing", rod.Varying(rod.Gravity, lowered))
+    own = [rod.On(name, air) for name in fingers]
+    carried = rod.On("thing", rod.Varying(rod.Gravity, table))
     q, v = rod.rest(model), jnp.zeros(rod.num_dof(model))
-    forces = (rod.Damping(0.03), weight, *own, *touches)
+    forces = (rod.Damping(0.03), rod.Gravity(), carried, *own, *touches)
     path = rod.rollout(model, q, v, forces, step=step, saves=saves, stepper=HELD)
     seen = systems.touching(model, touches, path.q[-50:], path.v[-50:])
     return model, path, jnp.mean(jnp.sum(seen.effort[..., -1], axis=1))

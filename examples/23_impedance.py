@@ -64,18 +64,18 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
         goal = sj.systems.Waypoints([0.0, switch, switch, switch + SLIDE], places)
         return sj.systems.CartesianImpedance(rod, (lossy,), goal, STIFFNESS, DAMPING)
 
-    def run(law, seconds):
-        return sj.rod.rollout(
+    def run(law):
+        path = sj.rod.rollout(
             rod, start, jnp.zeros(6), (lossy, touch, sj.systems.ControlForce(law)),
-            step=SAVED / every, saves=round(seconds / SAVED), every=every, stepper=stepper,
+            step=SAVED / every, saves=round(6.0 / SAVED), every=every, stepper=stepper,
         )  # fmt: skip
+        return path, sj.systems.touching(rod, (touch,), path.q, path.v)
 
-    first = run(spring(APPROACH), 1.2)
-    k = int(jnp.argmax(sj.systems.touching(rod, (touch,), first.q, first.v).overlap > 0))
+    first, seen = run(spring(APPROACH))
+    k = int(jnp.argmax(seen.overlap > 0))
     switch = float(first.time[k])  # where it touches
     control = spring(switch)
-    path = run(control, 6.0)
-    seen = sj.systems.touching(rod, (touch,), path.q, path.v)
+    path, seen = run(control)
 
     goal, tips, effort = sj.systems.followed(control, path)
     off = sj.sdf.project(sj.sdf.offset(solid, HALF), goal) - tips

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from sorojax._display import displayed
 from sorojax.material import checks
 from sorojax.material.kinematics import Entry, Tensor, determinant, from_matrix
+from sorojax.math.jit import once
 
 
 @displayed
@@ -104,7 +105,7 @@ def small_strain_moduli(
     return jax.vmap(_moduli_at_rest, in_axes=(axes,))(material)
 
 
-@eqx.filter_jit
+@once
 def _moduli_at_rest(material):
     stretch = jnp.stack(
         [jnp.asarray(s, jnp.result_type(float)) for s in rest_stretches(material)]

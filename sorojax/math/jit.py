@@ -1,6 +1,7 @@
 """Programs of small arrays, compiled for speed where they run by themselves."""
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -9,16 +10,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sorojax.math.one_kernel import OPTIONS, one_kernel, runs_alone
+from sorojax.math.one_kernel import LARGEST_GIVEN, OPTIONS, one_kernel, runs_alone
 
 Verb = TypeVar("Verb", bound=Callable[..., Any])
 
 
-def jit(function: Verb) -> Verb:
+def jit(function: Verb, *, kernels: bool = True, largest: float = LARGEST_GIVEN) -> Verb:
     """`function` compiled, as by `equinox.filter_jit`: for rods, networks and their gradients.
 
     On a CPU, loops over small arrays become one kernel each, which is up to two and a half
-    times faster; SOROJAX_ONE_KERNEL=0 in the environment leaves that out.
+    times faster; SOROJAX_ONE_KERNEL=0 in the environment leaves that out. Long programs
+    compile faster with `kernels=False`, which leaves their loops as they are. Calls with
+    arrays of more than `largest` numbers are compiled as by `jax.jit`.
+
     Inside `jit`, `vmap` or `grad` it is part of the program around it, so the outermost
     function is the one to wrap:
 
@@ -27,12 +31,13 @@ def jit(function: Verb) -> Verb:
     Arrays are traced, all else is static.
     """
     inside = eqx.filter_jit(function)
-    alone = eqx.filter_jit(one_kernel(function), compiler_options=OPTIONS)
+    marked = one_kernel(function) if kernels else _unmarked(function)
+    alone = eqx.filter_jit(marked, compiler_options=OPTIONS)
     refused = []
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        if not refused and runs_alone(args, kwargs):
+        if not refused and runs_alone(args, kwargs, largest=largest):
             try:
                 return alone(*args, **kwargs)[0]
             except jax.errors.JaxRuntimeError as error:
@@ -42,6 +47,20 @@ def jit(function: Verb) -> Verb:
         return inside(*args, **kwargs)
 
     return call  # type: ignore[return-value]
+
+
+def once(function: Verb) -> Verb:
+    """`function` compiled as by `equinox.filter_jit`, but faster: for programs that run a few
+    times, of arrays of any size."""
+    return jit(function, kernels=False, largest=math.inf)
+
+
+def _unmarked(function: Callable[..., Any]) -> Callable[..., tuple[Any, None]]:
+    @functools.wraps(function)
+    def answer(*args: Any, **kwargs: Any) -> tuple[Any, None]:
+        return function(*args, **kwargs), None
+
+    return answer
 
 
 class Compiled:

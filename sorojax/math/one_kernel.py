@@ -84,12 +84,13 @@ def one_kernel(function: Callable[..., Answer]) -> Callable[..., tuple[Answer, A
     return marked
 
 
-def runs_alone(*args: Any) -> bool:
-    """Whether a call with `args` is a program of small arrays by itself, on a CPU."""
+def runs_alone(*args: Any, largest: float = LARGEST_GIVEN) -> bool:
+    """Whether a call with `args` is a program by itself on a CPU, of arrays of at most
+    `largest` numbers."""
     if core.get_opaque_trace_state(convention="flax") != _AT_THE_TOP:
         return False
     for leaf in jax.tree.leaves(args):
-        if isinstance(leaf, jax.core.Tracer) or getattr(leaf, "size", 0) > LARGEST_GIVEN:
+        if isinstance(leaf, jax.core.Tracer) or getattr(leaf, "size", 0) > largest:
             return False
     allowed = _KNOWN and os.environ.get("SOROJAX_ONE_KERNEL") != "0"
     return allowed and jax.default_backend() == "cpu" and jax.device_count() == 1

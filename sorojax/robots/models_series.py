@@ -11,7 +11,6 @@ from collections.abc import Callable
 from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +18,7 @@ from jaxtyping import Float
 
 from sorojax.material import AbstractHyperelastic, small_strain_moduli
 from sorojax.material.kinematics import from_matrix
+from sorojax.math.jit import once
 from sorojax.robots.models_grid import Grid, Piece
 
 _BLOCK = 400  # boxes at a time
@@ -134,7 +134,7 @@ def _shape(material, solid: np.ndarray, now: _Motion):
     return third, fourth, stresses.reshape(3, *now.H[0].shape)
 
 
-@eqx.filter_jit
+@once
 def _derivatives(material, pairs: Any, weights: Any):
     """Sums of third and fourth derivatives along two directions, and stresses of the second
     order, at rest."""

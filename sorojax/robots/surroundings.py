@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from sorojax._edit import replace
 from sorojax.contact import LinePenalty
 from sorojax.math.contact_stepper import ContactMidpoint
+from sorojax.math.jit import once
 from sorojax.math.method import finite
 from sorojax.math.steppers import AbstractStepper
 from sorojax.robots.around import below, cylinder, rim
@@ -111,14 +112,18 @@ class Replay(NamedTuple):
 
 def replay(model: Assembly, states: Sequence[InContact]) -> Replay:
     """The states that a board kept, in a row."""
-    q, v = (jnp.stack([getattr(state, name) for state in states]) for name in ("q", "v"))
+    # on the host: each number of states would be a program of its own
+    q, v = (
+        jnp.asarray(np.stack([np.asarray(getattr(state, name)) for state in states]))
+        for name in ("q", "v")
+    )
     poses = _poses(model, q)
     return Replay(q, v, {name: np.asarray(rows) for name, rows in poses.items()})
 
 
-@eqx.filter_jit
+@once
 def _poses(model: Assembly, q):
-    return jax.vmap(lambda row: tip_pose(model, row))(q)
+    return jax.lax.map(lambda row: tip_pose(model, row), q)
 
 
 def contact_stepper(

@@ -5,13 +5,13 @@ writes the result; a field that searches or holds a table per point goes in chun
 stay in the cache.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Jaxpr
 from jaxtyping import Array, Float
 
 from sorojax._types import real
+from sorojax.math.jit import once
 from sorojax.sdf.base import AbstractSdf, cast
 from sorojax.sdf.query import slope_along, value_and_gradient_at
 
@@ -107,7 +107,7 @@ def _in_chunks(function, x: Coordinates):
     return jax.tree.map(lambda a: a.reshape(count), jax.lax.map(function, pieces))
 
 
-@eqx.filter_jit
+@once
 def _value(shape: AbstractSdf, points):
     shape = cast(shape, points.dtype)
     x = tuple(points[:, i] for i in range(shape.dim))
@@ -138,7 +138,7 @@ def _rows(components):
     return jnp.stack(components).T
 
 
-@eqx.filter_jit
+@once
 def _value_and_slopes(shape: AbstractSdf, x: Coordinates):
     shape = cast(shape, x[0].dtype)
     if not _is_one_loop(shape, x):

@@ -4,7 +4,6 @@ other blocks by a method of first order, in turns."""
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -12,6 +11,7 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._types import real
 from sorojax.math.contact_stepper import ContactMidpoint
+from sorojax.math.jit import once
 from sorojax.math.linearly_implicit import Rosenbrock2
 from sorojax.math.method import AbstractMethod
 from sorojax.math.steppers import AbstractStepper, Kinematic
@@ -83,7 +83,7 @@ def partitioned(
     return move, start
 
 
-@eqx.filter_jit
+@once
 def _move(network, parted, inputs, h, stepper, method, name, count) -> Parted:
     def one(_, now: Parted) -> Parted:
         body = network.blocks[name]

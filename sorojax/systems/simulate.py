@@ -1,5 +1,6 @@
 """Time simulation of networks."""
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,6 +16,7 @@ from sorojax._display import displayed, number, outcome
 from sorojax._types import is_traced, real
 from sorojax.math.control import Control
 from sorojax.math.explicit import RungeKutta4, Tsit5
+from sorojax.math.jit import jit
 from sorojax.math.method import AbstractMethod, finite
 from sorojax.math.status import Status
 from sorojax.systems.coupled import Coupled, bodies_of
@@ -174,7 +176,7 @@ def simulate(
     return film
 
 
-@eqx.filter_jit
+@functools.partial(jit, kernels=False)
 def _adaptive(
     network, state, inputs, first, interval, save, solver, control, watch, options
 ) -> Trajectory:

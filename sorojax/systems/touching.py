@@ -8,11 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax._types import real
-from sorojax.math.door import door
+from sorojax.math.jit import once
 from sorojax.rod import (
     AbstractContact,
     Assembly,
-    AssemblyMotion,
     Between,
     LinkContact,
     Motion,
@@ -21,10 +20,11 @@ from sorojax.rod import (
     RodContact,
     motion,
     part_motion,
-    total_force,
 )
+from sorojax.rod.alike import each
 from sorojax.rod.pressing import Touch
 from sorojax.rod.rod_contact import touches
+from sorojax.rod.tree import part_columns
 
 
 class Touching(eqx.Module):
@@ -42,7 +42,6 @@ class Touching(eqx.Module):
     effort: Float[Array, "moments contacts dof"]
 
 
-@door
 def touching(
     model: Rod | Assembly,
     contacts: tuple[Any, ...],
@@ -63,14 +62,17 @@ def touching(
     """
     for contact in contacts:
         _check_kind(contact)
+    return _along(model, contacts, real(q), real(v))
 
+
+@once
+def _along(model, contacts, q, v) -> Touching:
     def at(q, v):
         here = motion(model, q, v)
-        none = total_force((), jnp.zeros((), q.dtype), here)
-        rows = [_seen(contact, here, none) for contact in contacts]
+        rows = each(_seen, [_seated(contact, here) for contact in contacts])
         return Touching(*(jnp.stack(column) for column in zip(*rows, strict=True)))
 
-    return jax.lax.map(lambda row: at(*row), (real(q), real(v)))
+    return jax.lax.map(lambda row: at(*row), (q, v))
 
 
 def _inner(contact: Any) -> Any:
@@ -86,29 +88,27 @@ def _check_kind(contact: Any) -> None:
         )
 
 
-def _seen(contact: Any, here: Motion | AssemblyMotion, none: Array):
-    effort = total_force((contact,), jnp.zeros((), none.dtype), here) - none
-    law, found = _inner(contact).law, _touches(contact, here)
-    overlap = -jnp.min(jnp.concatenate([touch.gap for touch in found]))
-    push = _resultant(found[0], law)
-    for touch in found[1:]:  # of two rods: the second searches the first
-        push = push - _resultant(touch, law)
-    return overlap, push, effort
-
-
-def _touches(contact: Any, here: Any) -> tuple[Touch, ...]:
+def _seated(contact: Any, here: Any) -> tuple[Any, ...]:
+    """A contact, the bodies that it is on, and their columns per rate of the model."""
     inner = _inner(contact)
-    if not isinstance(contact, On | Between):
-        return (inner.touch(here),)
-    names = here.assembly.names
-    if isinstance(contact, On):
-        return (inner.touch(part_motion(here, names.index(contact.part))),)
-    first, second = (
-        part_motion(here, names.index(name)) for name in (contact.first, contact.second)
-    )
-    if isinstance(inner, RodContact):
-        return touches(inner, first, second)
-    return (inner.touch(first, second),)
+    if isinstance(here, Motion):
+        return inner, jnp.eye(here.v.shape[0], dtype=here.v.dtype), here
+    names = (contact.part,) if isinstance(contact, On) else (contact.first, contact.second)
+    places, columns = [here.assembly.names.index(name) for name in names], part_columns(here)
+    own = jnp.concatenate([columns[k] for k in places])
+    return inner, own, *(part_motion(here, k) for k in places)
+
+
+def _seen(contact: Any, own: Array, *bodies: Any):
+    load = contact(jnp.zeros((), own.dtype), *bodies)
+    effort = (load if len(bodies) == 1 else jnp.concatenate(load)) @ own
+    is_pair = isinstance(contact, RodContact)
+    found = touches(contact, *bodies) if is_pair else (contact.touch(*bodies),)
+    overlap = -jnp.min(jnp.concatenate([touch.gap for touch in found]))
+    push = _resultant(found[0], contact.law)
+    for touch in found[1:]:  # of two rods: the second searches the first
+        push = push - _resultant(touch, contact.law)
+    return overlap, push, effort
 
 
 def _resultant(touch: Touch, law: Any) -> Float[Array, " dim"]:

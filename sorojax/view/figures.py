@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax.material import AbstractHyperelastic, TensileFit, strain_energy_density
+from sorojax.math.jit import once
 from sorojax.reduction import Backbone
 from sorojax.rod import Rod, StrainBasis, columns, forward_kinematics
 from sorojax.view import style
@@ -80,9 +81,9 @@ def backbone_errors(
     return jnp.mean(jnp.sqrt(jnp.sum(gap**2, axis=2)), axis=1)
 
 
-@eqx.filter_jit
+@once
 def _rod_lines(rod: Rod, qs, s) -> Float[Array, "steps samples 2"]:
-    return jax.vmap(lambda q: forward_kinematics(rod, q, s)[:, :2, 2])(qs)
+    return jax.lax.map(lambda q: forward_kinematics(rod, q, s)[:, :2, 2], qs)
 
 
 def show_backbones(
