@@ -11,10 +11,11 @@ import numpy as np
 from benchmarks.harness import Row, measure, missing
 from benchmarks.single import narrow
 
+Device = Any  # a `jax.Device`, whose type is a variable to type checkers
 COMMAND = "make bench-device"
 
 
-def found() -> list[jax.Device]:
+def found() -> list[Device]:
     """One CPU core of this machine and, where there is one, an accelerator."""
     devices = [jax.devices("cpu")[0]]
     return devices + [d for d in jax.devices()[:1] if d.platform != "cpu"]
@@ -27,20 +28,20 @@ def absent() -> Row:
     )
 
 
-def put(tree: Any, device: jax.Device) -> Any:
+def put(tree: Any, device: Device) -> Any:
     """`tree` with all its arrays on `device`."""
     arrays, rest = eqx.partition(tree, eqx.is_array)
     return eqx.combine(jax.device_put(arrays, device), rest)
 
 
-def name(device: jax.Device) -> str:
+def name(device: Device) -> str:
     return "one CPU core" if device.platform == "cpu" else device.device_kind
 
 
 def compared(
     what: str, function: Callable[..., Any], args: tuple, *, count: int, of: str,
     error_of: Callable[[Any], float], bar: float | None, reference: str,
-    devices: list[jax.Device], double: bool = True, calls: int = 1,
+    devices: list[Device], double: bool = True, calls: int = 1,
 ) -> Iterator[Row]:  # fmt: skip
     """A row for each device: seconds per call and item, and the error there.
 
@@ -67,7 +68,7 @@ def compared(
         )  # fmt: skip
 
 
-def named(what: str, device: jax.Device, double: bool = True) -> dict[str, Any]:
+def named(what: str, device: Device, double: bool = True) -> dict[str, Any]:
     """Settings that say what ran where."""
     precision = "double" if double else "single"
     return {"method": f"{what}, {name(device)}, {precision}", "device": name(device)}
