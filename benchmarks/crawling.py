@@ -1,4 +1,4 @@
-"""The crawler in motion: runs, its way per cycle, and the arrays that felupe needs."""
+"""The crawler in motion: runs, and its way per cycle."""
 
 from typing import NamedTuple
 
@@ -8,9 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import fem
-from sorojax.fem.contact_area import areas_of
 from sorojax.robots import crawler_gait
-from sorojax.robots.crawler import PORTS
 from sorojax.units import kPa
 
 FREQUENCY, DAMPING = 1.25, fem.Rayleigh(mass=1.0, stiffness=1e-3)
@@ -55,35 +53,3 @@ def cycles(problem: fem.Problem, *motions: fem.Motion) -> Cycles:
     )
     cuts = sum(motion.stats.cuts for motion in motions)
     return Cycles(np.diff(ends), max(0.0, overlap), cuts)
-
-
-def felupe_arrays(problem: fem.Problem, steps: int, step: float) -> dict[str, np.ndarray]:
-    """What `peers/felupe.py motion` asks for, of a crawler one metre deep."""
-    cells, floor = problem.mesh, problem.loads[-1]
-    assert isinstance(floor, fem.Contact)
-    mass = fem.mass_matrix(problem)
-    weight = np.asarray(fem.lumped_mass(problem)).copy()
-    weight[::2], weight[1::2] = 0.0, -9.81 * weight[1::2]
-    sole = np.zeros(cells.num_cells, int)
-    sole[np.asarray(cells.regions["sole"])] = 1
-    times = step * jnp.arange(steps + 1)
-    pressures = [jax.vmap(GAIT[name])(times) for name in PORTS]
-    air = {load.name: load.facets for load in problem.loads if isinstance(load, fem.Pressure)}
-    first = [int(np.argmax(sole == k)) for k in (0, 1)]
-    moduli = problem.material.shear_modulus, problem.material.bulk_modulus  # type: ignore
-    return {
-        "points": np.asarray(cells.points),
-        "cells": np.asarray(cells.cells),
-        "part": sole,
-        "mu": np.asarray(moduli[0])[first],
-        "bulk": np.asarray(moduli[1])[first],
-        "rows": np.asarray(problem.space.system.rows),
-        "cols": np.asarray(problem.space.system.cols),
-        "mass": np.asarray(mass),
-        "damping": np.asarray(DAMPING.matrix(problem, mass, jnp.zeros_like(cells.points))),
-        "weight": weight,
-        "pressures": np.stack([np.asarray(p) for p in pressures], axis=1),
-        "touching": np.asarray(floor.facets),
-        "areas": np.asarray(areas_of(problem, floor.facets)),
-        **{f"edges_{k}": np.asarray(air[n])[:, [1, 0, 2]] for k, n in enumerate(PORTS)},
-    }  # fmt: skip

@@ -3,8 +3,6 @@
 Times are CPU seconds on one core.
 """
 
-import statistics
-import time
 from typing import Any
 
 import equinox as eqx
@@ -12,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import peers
-from benchmarks.crawling import FREQUENCY, cycles, felupe_arrays, moved, run
+from benchmarks.crawling import DAMPING, FREQUENCY, GAIT, cycles, moved, run
 from benchmarks.harness import Row, Timing
+from benchmarks.on_a_floor import against_felupe, timed
 from sorojax import fem
 from sorojax.robots import Crawler, crawler_gait, crawler_problem
 from sorojax.units import kPa, mm
@@ -28,18 +26,10 @@ def rows():
     timing, second = timed(run, problem, 1.0, STEP)
     yield _second(problem, STEP, timing, second)
     yield _second(problem, STEP / 2, *timed(run, problem, 1.0, STEP / 2, save=2))
-    yield from _against()
+    flat = crawler_problem(Crawler(), size=SIZE, depth=1.0)
+    yield from against_felupe(run, flat, DAMPING, PEER_STEPS, STEP, GAIT, "Quad8")
     yield from _changes(problem, second)
     yield _slopes()
-
-
-def timed(go, *arguments, **options) -> tuple[Timing, Any]:
-    """What `go(*arguments, **options)` takes and gives, compiled by its first step."""
-    start = time.process_time()
-    go(*arguments, max_steps=1, throw=False, **options)
-    ready = time.process_time()
-    found = go(*arguments, **options)
-    return Timing(ready - start, (time.process_time() - ready,)), found
 
 
 def _second(problem, step, timing: Timing, motion: fem.Motion) -> Row:
@@ -54,40 +44,6 @@ def _second(problem, step, timing: Timing, motion: fem.Motion) -> Row:
         "cuts": stats.cuts,
     }
     return Row("sorojax", settings, **timing.columns(), bar=60.0)
-
-
-def _against():
-    """The first steps, beside a plain loop of felupe and SciPy with the same mesh, which
-    runs between ours."""
-    flat = crawler_problem(Crawler(), size=SIZE, depth=1.0)
-    runs = (flat, PEER_STEPS * STEP, STEP)
-    timing, motion = timed(run, *runs)
-    end = np.asarray(motion.displacements[-1])
-
-    def error(answer):
-        return float(np.abs(answer["displacement"][-1] - end).max() / np.abs(end).max())
-
-    arrays = felupe_arrays(flat, PEER_STEPS, STEP)
-    law = flat.loads[-1]
-    assert isinstance(law, fem.Contact)
-    numbers = ("stiffness", "smoothing", "friction", "friction_velocity")
-    options = {name: float(getattr(law, name)) for name in numbers}
-    found = []
-    for solver in ("superlu", "pardiso"):
-        found.append(peers.row(
-            "felupe", "motion", arrays, error, "sorojax, largest difference over largest",
-            element="Quad8", step=STEP, rho_inf=0.5, tolerance=1e-6, max_iterations=60,
-            solver=solver, **options,
-        ))  # fmt: skip
-        start = time.process_time()
-        run(*runs)
-        timing = Timing(timing.compile_s, (*timing.runs, time.process_time() - start))
-    settings = {"dof": flat.space.num_dofs, "steps": PEER_STEPS,
-                "solver": flat.space.system.solver.name}  # fmt: skip
-    share = None if found[0].run_s is None else statistics.median(timing.runs) / found[0].run_s
-    yield Row("sorojax", settings, **timing.columns(), error=share, bar=0.2, bar_on="error",
-              reference="time over that of felupe with SciPy's solver")  # fmt: skip
-    yield from found
 
 
 def _changes(problem, second: fem.Motion):

@@ -1,4 +1,5 @@
-"""The passive walker in its gait: frequency, cost, contact stiffness, cells.
+"""The passive walker in its gait: frequency, cost, contact stiffness, cells; its first steps
+against felupe.
 
 Times are CPU seconds on one core.
 """
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.harness import Row
+from benchmarks.on_a_floor import against_felupe
 from sorojax import fem, mesh
 from sorojax.robots import Walker, gait, pair_angles, walker_problem
 from sorojax.units import mm
@@ -20,6 +22,8 @@ SIZE, STEP, DURATION, DROP = 2.5 * mm, 1e-3, 0.5, 3 * mm  # m, s, s, m
 # these make cells of half the side.
 FINE = 0.6 * mm
 DAMPING = fem.KelvinVoigt(800.0)
+# The original's step, and for felupe damping by a matrix that does not turn with the legs.
+PEER_STEP, PEER_STEPS, PLAIN = 1e-3 / 3, 90, fem.Rayleigh(stiffness=2e-3)
 
 
 def walk(problem: fem.Problem, step: float = STEP, **options: Any) -> fem.Motion:
@@ -36,8 +40,27 @@ def side(cells: mesh.Mesh) -> float:
     return float(np.sqrt(np.mean(np.abs(ax * by - ay * bx)) * 2 / np.sqrt(3)))
 
 
+def plain(problem: fem.Problem) -> fem.Problem:
+    """The same on quadratic triangles without the bubble and the pressures of their own,
+    which felupe lacks."""
+    cells = problem.mesh
+    corners = np.asarray(cells.cells)[:, :6]
+    bare = mesh.Mesh(cells.points[: corners.max() + 1], corners, mesh.Tri6())
+    return fem.problem(
+        bare, problem.material, kinematics=problem.kinematics, supports=(),
+        loads=problem.loads, free=True,
+    )  # fmt: skip
+
+
+def fall(problem: fem.Problem, duration: float, step: float, **options: Any) -> fem.Motion:
+    """From rest, with all feet on the slope."""
+    return fem.simulate(problem, duration, step, damping=PLAIN, **options)
+
+
 def rows():
     walker, base = Walker(), None
+    deep = plain(walker_problem(walker, size=SIZE, depth=1.0))
+    yield from against_felupe(fall, deep, PLAIN, PEER_STEPS, PEER_STEP, {}, "Tri6")
     problem = walker_problem(walker, size=SIZE)
     law: Any = problem.loads[-1]
     stiffer = eqx.tree_at(

@@ -116,7 +116,8 @@ def motion(request, arrays):
     floor, X, iterations = Floor(arrays, request), points.ravel(), 0
     start, ends = time.process_time(), []
     for before, after in zip(levels[:-1], levels[1:], strict=True):
-        load = sum(p * B for p, B in zip((1 - af) * after + af * before, air, strict=True))
+        shares = (1 - af) * after + af * before
+        load = sum((p * B for p, B in zip(shares, air, strict=True)), start=0 * mass)
         floor.begin(X + u, h)
         new = u + h * v
 
