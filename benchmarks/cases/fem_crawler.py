@@ -3,6 +3,7 @@
 Times are CPU seconds on one core.
 """
 
+import time
 from typing import Any
 
 import equinox as eqx
