@@ -56,7 +56,8 @@ def against_felupe(
         found.append(peers.row(
             "felupe", "motion", arrays, error, "sorojax, largest difference over largest",
             element=element, step=step, rho_inf=0.5, tolerance=STEP_TOLERANCE,
-            max_iterations=60, solver=solver, **{name: float(getattr(law, name)) for name in LAW},
+            max_iterations=60, solver=solver,
+            **{name: float(getattr(law, name)) for name in LAW},
         ))  # fmt: skip
         start = time.process_time()
         run(*runs, newton=NEWTON)
