@@ -94,8 +94,7 @@ def pressure(request, arrays):
 
 
 def motion(request, arrays):
-    """A body on the floor y = 0 in motion, by generalised-alpha and Newton with a
-    line search; CPU seconds.
+    """A body on the floor y = 0 in motion: generalised-alpha, Newton, line search; CPU seconds.
 
     Arrays: those of `pressure` without `levels`, cavity k in `edges_k` and the pressures at
     the ends of steps in `pressures`; upper triangles `mass` and `damping` on `rows`, `cols`;
