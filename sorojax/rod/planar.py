@@ -3,7 +3,6 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sorojax.math.trigonometry import cosine_and_sine
 from sorojax.rod.mass_line import acceleration_on_arms, mass_arms, mass_jacobian
 from sorojax.rod.motion import (
     Motion,
@@ -23,7 +22,7 @@ def motion(rod: Rod, constants: Operators, q: Array, v: Array) -> Motion:
     angle = per_coordinate @ q
     if rod.rest_strain is not None:
         angle = angle + _at_nodes(rod, jnp.cumsum(constants.rest_moments[0, 0]))
-    cosine, sine = cosine_and_sine(angle)
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
     axes = jnp.stack([cosine, sine], axis=1), jnp.stack([-sine, cosine], axis=1)
     tangent = _tangent(rod, constants, axes, q)
     linear_rate = _turn(tangent)[:, :, None] * per_coordinate[:, None, :]
