@@ -3,32 +3,12 @@
 import jax.numpy as jnp
 
 from benchmarks import devices
+from benchmarks.cases.scaling_batch import STEPS, accelerations, ends
 from benchmarks.fingers import finger, random_states
 from benchmarks.harness import quick
-from sorojax.math.batch import batched
-from sorojax.math.steppers import GeneralisedAlpha
-from sorojax.rod import Gravity, forward_dynamics, rollout
 
 SHARED = 4096  # members that both devices take, and that errors are counted of
-STEPS, STEP = 50, 1e-3  # s
 ERRORS = {True: 1e-9, False: 2e-3}  # double precision or single
-
-
-def accelerations(body, q, v):
-    return batched(lambda q, v: forward_dynamics(body, q, v, (Gravity(),)))(q, v)
-
-
-def ends(body, q, v):
-    """Coordinates after some steps [1/m]."""
-
-    def one(q, v):
-        path = rollout(
-            body, q, v, (Gravity(),), step=STEP, saves=1, every=STEPS,
-            stepper=GeneralisedAlpha(1.0),
-        )  # fmt: skip
-        return path.q[-1]
-
-    return batched(one)(q, v)
 
 
 def rows():
