@@ -31,8 +31,8 @@ def door(verb: Verb) -> Verb:
 def full_products(verb: Verb) -> Verb:
     """`verb` whose products keep all digits of single precision.
 
-    By default JAX rounds the factors of such products to 10 bits on recent accelerators,
-    which leaves an acceleration of a soft finger 14 % wrong. A precision that the user has
+    By default JAX rounds the factors of such products to 10 bits on recent accelerators, where
+    an acceleration of a soft finger came out 14 % wrong. A precision that the user has
     chosen by `jax_default_matmul_precision` is left alone.
     """
 
