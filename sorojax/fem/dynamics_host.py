@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -31,11 +32,12 @@ from sorojax.fem.dynamics_step import (
 )
 from sorojax.fem.energy_form import load_force
 from sorojax.fem.geometry import Geometry
-from sorojax.fem.host_inertia import Numbers
+from sorojax.fem.host_inertia import HostInertia, Numbers
 from sorojax.fem.inertia import Inertia
 from sorojax.fem.linear import prepare
+from sorojax.fem.loads import AbstractLoad
 from sorojax.fem.newton import Newton
-from sorojax.fem.problem import body
+from sorojax.fem.problem import Problem, body
 from sorojax.fem.supports import known_values
 from sorojax.math.jit import once
 from sorojax.math.status import Status
@@ -89,9 +91,13 @@ class Run:
         self.dynamics, problem = dynamics, dynamics.problem
         self.prepared = prepare(problem)
         self.matter = compiled_matter(dynamics)
-        self.solver = StepSolver(
-            self.prepared, problem, self.control.newton, np.asarray(self.matter.mass)
-        )
+        mass, damping = jax.tree.map(np.asarray, tuple(self.matter))
+        inertia = HostInertia(problem.space.system, mass, damping)
+        same = zip(problem.loads, _steady(dynamics), strict=True)
+        steady = tuple(load for load, always in same if always)
+        dead = np.asarray(_force_of(problem, steady))
+        newton = self.control.newton
+        self.solver = StepSolver(self.prepared, problem, newton, inertia, dead)
         self._fixed = Split((dynamics, self.matter, self.prepared.geometry))
 
     def _follow_lists(self) -> None:
@@ -161,7 +167,8 @@ class Run:
             self.reason = found.reason
             return None
         taken = self.solver.inertia.taken(found.u)
-        args = interval, found.u, np.float64(taken)
+        given = None if self.dynamics.conserves else np.float64(self._given(found))
+        args = interval, found.u, given, np.float64(taken)
         new, displacement, error, through = _end((self._fixed, self.now, step), *args)
         if through:
             self.reason = "a point goes through an obstacle"
@@ -182,6 +189,15 @@ class Run:
         self.steps += 1
         self.rows.append((int(interval.index), *_ends(interval), found.u))
         return new
+
+    def _given(self, found: Found) -> float:
+        """Work [J] of loads and supports in a step, with the forces that the step takes."""
+        inertia, known = self.solver.inertia, self.solver.known
+        moved = (found.u - inertia.origin).ravel() / inertia.share
+        work = float(found.load @ moved)
+        if any(support.ramped is not None for support in self.dynamics.problem.supports):
+            work += float(found.residual[known] @ moved[known])
+        return work
 
     def _kept(self, u, new) -> float:
         """Least share of its volume that a cell keeps in a step to displacement `new`, which
@@ -217,6 +233,22 @@ def step_error(dynamics: Dynamics, interval: Interval, state: State, new: State)
 compiled_matter: Callable[[Dynamics], Matter] = once(matter)
 
 
+def _steady(dynamics: Dynamics) -> list[bool]:
+    """Which loads have the same force in every step."""
+    rows = zip(dynamics.problem.loads, dynamics.loads, strict=True)
+    return [
+        load.dead and row is None and type(load).begun is AbstractLoad.begun
+        for load, row in rows
+    ]
+
+
+@once
+def _force_of(problem: Problem, loads: tuple[AbstractLoad, ...]):
+    """Force of `loads` on the body at rest [N]."""
+    bare = dataclasses.replace(body(problem), loads=loads)
+    return load_force(bare, jnp.zeros_like(problem.mesh.points)).ravel()
+
+
 @kernel
 def _begin(fixed: tuple[Dynamics, Matter, Geometry], state: State, interval: Interval):
     """A step and what there is to solve, the displacements held in it and predicted."""
@@ -224,32 +256,27 @@ def _begin(fixed: tuple[Dynamics, Matter, Geometry], state: State, interval: Int
     step = begin_step(dynamics, known, state, interval)
     problem, u, c = dynamics.problem, state.displacement, dynamics.scheme
     loads, few, room = step.terms[0], None, jnp.zeros((), u.dtype)
-    (inertia,) = (load for load in loads if isinstance(load, Inertia))
-    # the products with mass and damping are those of the host
-    unmoved = dataclasses.replace(inertia, pull=jnp.zeros_like(inertia.pull))
-    bare = tuple(unmoved if load is inertia else load for load in loads)
     rooms = [x for x in (load.room(problem) for load in loads) if x is not None]
+    acting = tuple(load for load in loads if not (load.dead or isinstance(load, Inertia)))
     if rooms:
-        few = Split(tuple(load for load in bare if not may_rest(load)))
+        few = Split(tuple(load for load in acting if not may_rest(load)))
         room = jnp.min(jnp.stack(rooms))
-    dead = tuple(load for load in loads if load.dead)
+    same = zip(loads, _steady(dynamics), strict=False)
+    changing = tuple(load for load, steady in same if load.dead and not steady)
+    dead = _force_of(problem, changing) if changing else None
     h = (interval.end - interval.begin) * dynamics.step
-    numbers = Numbers(
-        inertia.matrix, step.matrix,
-        load_force(dataclasses.replace(body(problem), loads=dead), u).ravel(),
-        step.lead, step.drive, inertia.origin, c.gamma / (c.beta * h), 1 - c.af,
-    )  # fmt: skip
-    still = all(support.ramped is None for support in problem.supports)
-    kept = loads[: len(problem.loads)] if still else loads
-    ending = step._replace(terms=(kept, step.terms[1]), matrix=None)
-    task = Task(Split(bare), few, room, numbers)
+    varying = None if all(term.constant for term in dynamics.damping) else step.matrix
+    rates = (1 - c.am) / (c.beta * h**2 * (1 - c.af)), c.gamma / (c.beta * h)
+    numbers = Numbers(varying, step.lead, step.drive, u, *rates, 1 - c.af)
+    needed = loads if dynamics.conserves else loads[: len(problem.loads)]
+    ending = step._replace(terms=(needed, step.terms[1]), matrix=None)
+    task = Task(Split(acting), few, room, dead, numbers)
     return Split(ending), task, known_values(step.terms[1], *u.shape), step.predicted
 
 
 @kernel
-def _end(fixed, state: State, step: Step, interval: Interval, u, taken):
+def _end(fixed, state: State, step: Step, interval: Interval, u, work, taken):
     dynamics, known, _ = fixed
-    new = end_step(dynamics, known, state, interval, step, u)
-    new = dataclasses.replace(new, dissipated=new.dissipated + taken)
+    new = end_step(dynamics, known, state, interval, step, u, work, taken)
     through = passed_through(dynamics.problem, step.terms[0], new.displacement)
     return Split(new), new.displacement, step_error(dynamics, interval, state, new), through

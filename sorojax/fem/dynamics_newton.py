@@ -18,7 +18,6 @@ from sorojax.fem.dynamics_kernel import Split, kernel
 from sorojax.fem.dynamics_lists import has_lists, longest_share
 from sorojax.fem.energy_form import load_force
 from sorojax.fem.host_inertia import HostInertia, Numbers
-from sorojax.fem.inertia import Inertia
 from sorojax.fem.linear import Prepared, add_load_stiffness
 from sorojax.fem.loads import AbstractLoad
 from sorojax.fem.newton import Newton, safe_fraction
@@ -44,10 +43,12 @@ class Kept(NamedTuple):
 
 
 class Balance(NamedTuple):
-    """Unbalanced force [N] at a state, its largest free entry, the largest force that it is
-    judged by, the length that rounding is judged by and the smallest J / J_before."""
+    """Unbalanced force [N] at a state, that of the loads, its largest free entry, the largest
+    force that it is judged by, the length that rounding is judged by and the smallest
+    J / J_before."""
 
     residual: np.ndarray
+    load: np.ndarray
     norm: float
     reference: float
     length: float
@@ -55,11 +56,13 @@ class Balance(NamedTuple):
 
 
 class Found(NamedTuple):
-    """State that a step converged to, unless `reason` says why not; no cell of it has less
-    than `volume` of what it had where the step begins, and perhaps much more."""
+    """State that a step converged to, unless `reason` says why not, and what is unbalanced
+    and comes from loads there; no cell of it has less than `volume` of what it had where the
+    step begins, and perhaps much more."""
 
     u: np.ndarray
     residual: np.ndarray
+    load: np.ndarray
     iterations: int
     factorisations: int
     kept: Kept | None
@@ -69,11 +72,13 @@ class Found(NamedTuple):
 
 class Task(NamedTuple):
     """A step to solve: its loads, those of them that may not rest if any may, how far nodes
-    may move from where it begins until the others act [m], and the numbers of inertia."""
+    may move from where it begins until the others act [m], the force of dead loads that
+    change [N], and the numbers of inertia."""
 
     loads: Split
     few: Split | None
     room: Array
+    dead: Array | None
     inertia: Numbers
 
 
@@ -91,18 +96,21 @@ def acting(problem: Problem, prepared: Prepared) -> Acting:
 
 
 @kernel
-def _forces(fixed, loads, u, before):
+def forces(fixed, loads, u, before):
+    """Internal force and that of the loads but dead ones [N], and the smallest
+    J / J_before; to be called with what is `acting`."""
     body, prepared = fixed
     found = asm.assemble(
         body.space, prepared.geometry, body.material, body.kinematics, u, before
     )
-    rest = tuple(load for load in loads if not (load.dead or isinstance(load, Inertia)))
+    rest = tuple(load for load in loads if not load.dead)
     loaded = load_force(dataclasses.replace(body, loads=rest), u)
     return found.force, loaded.ravel(), found.volume_ratio
 
 
 @kernel
-def _tangent(fixed, loads, u, before):
+def tangent(fixed, loads, u, before):
+    """Values of the tangent [N/m] of body and loads, to be called with what is `acting`."""
     body, prepared = fixed
     args = (body.space, prepared.geometry, body.material, body.kinematics)
     values = asm.assemble(*args, u, before).values
@@ -110,27 +118,19 @@ def _tangent(fixed, loads, u, before):
 
 
 @kernel
-def _held(fixed, values):
+def fixed_rows(fixed, values):
+    """The same with supports applied."""
     body, prepared = fixed
     return sparse.fix(body.space.system, values, prepared.known)
-
-
-def forces(of: Acting, u, before):
-    """Internal force and that of the loads but inertia and dead ones [N], and the smallest
-    J / J_before."""
-    return _forces(of, u, before)
-
-
-def tangent(of: Acting, u, before):
-    """Values of the tangent [N/m], and the same with supports applied."""
-    values = _tangent(of, u, before)
-    return values, _held((of.fixed,), values)
 
 
 class StepSolver:
     """Solves the steps of one motion; remembers the last tangent."""
 
-    def __init__(self, prepared: Prepared, problem: Problem, newton: Newton, mass: np.ndarray):
+    def __init__(
+        self, prepared: Prepared, problem: Problem, newton: Newton, inertia: HostInertia,
+        dead: np.ndarray,
+    ):  # fmt: skip
         self.prepared, self.newton, self._problem = prepared, newton, problem
         self.system = problem.space.system
         self.solver, self.sees = self.system.solver, has_lists(problem)
@@ -138,11 +138,12 @@ class StepSolver:
         self.free, self.kept = not self.known.any(), None
         self._fixed = Split((body(problem), prepared))
         self._resting = Split((body(problem), _without_resting(problem, prepared)))
-        self.inertia = HostInertia(self.system, mass)
+        self.inertia, self._steady = inertia, dead
 
     def begin(self, task: Task) -> None:
         """Go on with another step."""
         self.inertia.begin(task.inertia)
+        self._dead = self._steady + (0.0 if task.dead is None else np.asarray(task.dead))
         self._of, self._room = Acting(self._fixed, task.loads), 0.0
         if task.few is not None:
             self._few, self._room = Acting(self._resting, task.few), float(task.room)
@@ -152,7 +153,7 @@ class StepSolver:
         settings, u, before, fresh, size = self.newton, guess, guess, 0, np.inf
         now = self._balance(u, self.inertia.origin)
         if not now.volume_ratio > LEAST_VOLUME:
-            return Found(u, np.zeros(u.size), 0, 0, self.kept, UNSOUND)
+            return Found(u, now.residual, now.load, 0, 0, self.kept, UNSOUND)
         volume = now.volume_ratio
         last, refactor, iterations, secants = np.inf, self.kept is None, 0, Secants()
         while True:
@@ -164,7 +165,8 @@ class StepSolver:
             rounding = 2 * np.finfo(float).eps * largest * now.length
             small = norm <= settings.residual_tolerance * reference or norm <= rounding
             if small and size < settings.step_tolerance and not moves:
-                return Found(u, now.residual, iterations, fresh, self.kept, "", volume)
+                found = u, now.residual, now.load, iterations, fresh
+                return Found(*found, self.kept, "", volume)
             if fresh >= settings.max_iterations or iterations >= 6 * settings.max_iterations:
                 reason = f"no convergence in {iterations} Newton iterations"
                 return self._failed(u, iterations, fresh, reason)
@@ -201,9 +203,10 @@ class StepSolver:
         return move, bool(np.any(move))
 
     def _renew(self, u, before) -> bool:
-        self._values = matrix = _tangent(self._acting(u), u, before)
+        matrix = np.asarray(tangent(self._acting(u), u, before)) + self.inertia.values
+        self._values = matrix
         if not self.free:
-            matrix = _held((self._fixed,), matrix)
+            matrix = fixed_rows((self._fixed,), matrix)
         return self.keep(np.asarray(matrix))
 
     def _factor(self) -> sparse.Factor | None:
@@ -234,15 +237,16 @@ class StepSolver:
         """Forces of body and loads from a compiled kernel, inertia by a product here."""
         found = forces(self._acting(u), u, before)
         internal, load, ratio = (np.asarray(x) for x in found)
-        load = load + self.inertia.force(u)
-        residual = internal - load
-        size, reference = np.abs(residual), np.abs(load).max()
+        load = load + self._dead
+        driven = load + self.inertia.force(u)
+        residual = internal - driven
+        size, reference = np.abs(residual), np.abs(driven).max()
         norm = size.max()
         if not self.free:
             norm = np.where(self.known, 0.0, size).max()
             reference = max(reference, np.where(self.known, size, 0.0).max())
         length = np.abs(u).max() + self.length
-        return Balance(residual, float(norm), float(reference), length, float(ratio))
+        return Balance(residual, load, float(norm), float(reference), length, float(ratio))
 
     def _advance(self, u, du, slope):
         """The state after a step, shortened where a cell would collapse or the energy has
@@ -271,7 +275,8 @@ class StepSolver:
 
     def _failed(self, u, iterations: int, fresh: int, reason: str) -> Found:
         self.kept = None
-        return Found(u, np.zeros(u.size), iterations, fresh, None, reason)
+        none = np.zeros(u.size)
+        return Found(u, none, none, iterations, fresh, None, reason)
 
 
 def may_rest(load: AbstractLoad) -> bool:

@@ -139,8 +139,11 @@ def end_step(
     interval: Interval,
     step: Step,
     u_alpha: Float[Array, "nodes dim"],
+    work: Float[Array, ""] | None = None,
+    taken: Float[Array, ""] | None = None,
 ) -> State:
-    """The state after a step whose equilibrium is `u_alpha`."""
+    """The state after a step whose equilibrium is `u_alpha`; pass the `work` of loads and
+    supports and what damping has `taken` in it [J] where they are known."""
     c = dynamics.scheme
     h = _size(dynamics, interval)
     u, v, a = state.displacement, state.velocity, state.acceleration
@@ -151,14 +154,13 @@ def end_step(
     memory = tuple(
         None if m is None else load for m, load in zip(state.memory, loads, strict=True)
     )
-    taken = jnp.zeros((), u.dtype)
-    if step.matrix is not None:
-        v_alpha = (1 - c.af) * v_new + c.af * v
-        taken = jnp.sum(_times(dynamics, step.matrix, v_alpha) * d.ravel())
-    done = _work(dynamics, step, loads, u_alpha, d)
+    if work is None:
+        work = _work(dynamics, step, loads, u_alpha, d)
+    if taken is None:
+        taken = _taken(dynamics, step, (1 - c.af) * v_new + c.af * v, d)
     return State(
         time=state.time + h, displacement=u + d, velocity=v_new, acceleration=a_new,
-        memory=memory, work=state.work + done, dissipated=state.dissipated + taken,
+        memory=memory, work=state.work + work, dissipated=state.dissipated + taken,
         share=state.share,
     )  # fmt: skip
 
@@ -177,6 +179,13 @@ def _work(dynamics: Dynamics, step: Step, loads, u_alpha, d) -> Float[Array, ""]
     reaction = residual(problem, u_alpha)
     mask = known_mask(problem.supports, *d.shape).reshape(d.shape)
     return work + jnp.sum(jnp.where(mask, reaction * d, jnp.zeros_like(d)))
+
+
+def _taken(dynamics: Dynamics, step: Step, v_alpha, d) -> Float[Array, ""]:
+    """What damping takes in a step [J]."""
+    if step.matrix is None:
+        return jnp.zeros((), d.dtype)
+    return jnp.sum(_times(dynamics, step.matrix, v_alpha) * d.ravel())
 
 
 def with_terms(problem: Problem, terms: tuple) -> Problem:

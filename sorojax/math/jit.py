@@ -19,7 +19,8 @@ def jit(function: Verb, *, kernels: bool = True, largest: float = LARGEST_GIVEN)
     """`function` compiled, as by `equinox.filter_jit`: for rods, networks and their gradients.
 
     On a CPU, loops over small arrays become one kernel each, which is up to two and a half
-    times faster; SOROJAX_ONE_KERNEL=0 in the environment leaves that out. Long programs
+    times faster; SOROJAX_ONE_KERNEL=0 in the environment leaves that out. Sine and cosine
+    in them are polynomials: to 3e-16, of angles rounded to 1e-16 of their size. Long programs
     compile faster with `kernels=False`, which leaves their loops as they are. Calls with
     arrays of more than `largest` numbers are compiled as by `jax.jit`.
 

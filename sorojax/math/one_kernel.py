@@ -24,6 +24,8 @@ import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend import core
 
+from sorojax.math.trigonometry import cosine, sine
+
 LARGEST = 4096  # numbers in an array that is made inside a loop: some 32 kB
 LARGEST_PASSED = 65536  # numbers in an array that a loop is given, or leaves
 LARGEST_PRODUCT = 8192  # multiplications of a matrix product; beyond that a library is faster
@@ -45,6 +47,9 @@ _INLINED = {
     "checkpoint", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call",
     "custom_vjp_call_jaxpr", "jit", "pjit", "remat", "remat2",
 }  # fmt: skip
+# In a kernel a library would be called for every entry.
+_FAST = {"sin": sine, "cos": cosine}
+_OTHER = {"while", *_FAST}
 _HELD = _LOOPS | _INLINED | {
     "abs", "acos", "acosh", "add", "add_any", "and", "argmax", "argmin", "asin", "asinh",
     "atan", "atan2", "atanh", "broadcast_in_dim", "cbrt", "ceil", "clamp", "concatenate",
@@ -167,7 +172,9 @@ def _in_one(function: Callable[..., list[Any]], given: list[Any], reads: list[An
 def _inside(jaxpr: Any, equation: Any, given: Any) -> list[Any]:
     """One equation in a kernel. Every loop counts: what forgets its state has no argument."""
     name, params = equation.primitive.name, equation.params
-    if name != "while" and not any(_holds(body, {"while"}) for body, _ in _bodies(equation)):
+    if name in _FAST and given[0].dtype == np.float64:
+        return [_FAST[name](given[0])]
+    if name != "while" and not any(_holds(body, _OTHER) for body, _ in _bodies(equation)):
         return _bound(jaxpr, equation, given)  # a scan counts anyway
     if name == "scan":
         fixed, ends = params["num_consts"], params["num_consts"] + params["num_carry"]
