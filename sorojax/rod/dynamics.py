@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from sorojax._types import real
 from sorojax.math.batch import batched
 from sorojax.math.dense import solve_symmetric
-from sorojax.math.door import door
+from sorojax.math.door import door, full_products
 from sorojax.rod import loads
 from sorojax.rod.assembly import Assembly, is_flat, rate
 from sorojax.rod.forces import Gravity
@@ -108,6 +108,7 @@ def forward_dynamics(
     return batched(one)(q, v)
 
 
+@full_products
 def acceleration(
     model: Model,
     constants: Any,

@@ -4,6 +4,7 @@ from typing import TypeAlias, overload
 
 from jaxtyping import Array, Float
 
+from sorojax.math.door import full_products
 from sorojax.rod.assembly import Assembly
 from sorojax.rod.composite import assembly_inertia
 from sorojax.rod.kernel import rod_inertia, rod_motion
@@ -23,6 +24,7 @@ Model: TypeAlias = Rod | Assembly
 def operators(model: Rod) -> Operators: ...
 @overload
 def operators(model: Assembly) -> AssemblyOperators: ...
+@full_products
 def operators(model):
     """The constant arrays of a model, once before a loop; differentiable in its leaves."""
     return rod_operators(model) if isinstance(model, Rod) else assembly_operators(model)
@@ -34,6 +36,7 @@ def motion(model: Rod, q: Array, v: Array | None = None, *, constants=None) -> M
 def motion(
     model: Assembly, q: Array, v: Array | None = None, *, constants=None
 ) -> AssemblyMotion: ...
+@full_products
 def motion(model, q, v=None, *, constants=None):
     """The fields of a model at (q, v), which forces and inertia read.
 
@@ -48,6 +51,7 @@ def motion(model, q, v=None, *, constants=None):
     return rod_motion(model, q, v, constants)
 
 
+@full_products
 def inertia(
     moment: Motion | AssemblyMotion,
 ) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:
