@@ -8,6 +8,7 @@ import pytest
 
 from sorojax import rod as R, sdf
 from sorojax.contact import LinePenalty
+from sorojax.math import contact_stepper
 from sorojax.math.contact_stepper import ContactMidpoint
 from sorojax.math.lie import SE2, SE3, homogeneous
 from sorojax.systems import SmoothRamp
@@ -97,6 +98,28 @@ def test_a_block_slides_as_far_as_friction_lets_it(stepper):
     assert sunk.max() < 2 * still  # of a load that comes at once
     nose = 0.5 * 0.05 * 9.81 / (half * 5e5) / (2 * half)  # down by friction while it slides
     assert abs(float(path.q[-1, 0])) < nose
+
+
+def test_one_loop_for_both_solutions_gives_the_same_path(monkeypatch):
+    """Through the air, onto the floor and along it."""
+    half = 0.01
+    floor = sdf.Rectangle([-1.0, -1.0], [1.0, 0.0])
+    corners = np.array([[-half, -half], [half, -half]])
+    contact = R.LinkObstacle(floor, corners, [half, half], LAW)
+    block = R.assembly(SE2(), block=R.Part(R.Link(0.05, 1e-5), R.Free()))
+    q, v = jnp.array([0.0, 0.0, 1.2 * half]), jnp.array([0.0, 0.1, 0.0])
+    forces = (R.Gravity(), R.On("block", contact))
+
+    def path():
+        jax.clear_caches()
+        return R.rollout(block, q, v, forces, step=1e-3, saves=50, stepper=LASTING)
+
+    once = path()
+    monkeypatch.setattr(contact_stepper, "_solve_together", contact_stepper._solve_apart)
+    apart = path()
+    height = np.asarray(once.q)[:, 2]
+    assert height.max() > 1.1 * half and height.min() < half
+    np.testing.assert_allclose(once.q, apart.q, rtol=0, atol=1e-14)
 
 
 def test_two_rods_are_no_rod_and_link():

@@ -364,3 +364,18 @@ def test_a_failed_run_says_so():
         S.simulate(loop, 9.0, save=3, max_steps=4)
     film = S.simulate(loop, 9.0, save=3, max_steps=4, throw=False)
     assert film.status == Status.max_steps
+
+
+def test_outputs_that_nothing_reads_are_not_traced():
+    class Shy(Breath):
+        def output(self, name, t, state, inputs):
+            if name == "volume_rate":
+                raise AssertionError("nobody asked")
+            return super().output(name, t, state, inputs)
+
+    network = S.Network({"breath": Shy()}, wires={})
+    state = network.initial_state()
+    S.network.rates_of(network, jnp.zeros(()), state, {}, ("breath",))
+    assert float(network.output("breath.volume", jnp.zeros(()), state, {})) > 0
+    with pytest.raises(AssertionError, match="nobody asked"):
+        S.outputs(network, jnp.zeros(()), state)

@@ -56,16 +56,11 @@ class ContactMidpoint(AbstractStepper):
         contact = problem.contact
         if contact is None:
             return ImplicitMidpoint(self.passes).step(problem, t, h, state)
-        new, moment = state.a, None
         at = _At(t, h, self.theta * h)
-        for _ in range(self.passes):
-            new, moment = _free(problem, at, state, new)
-
-        def touch():
-            first = state.a if self.lasting else new
-            return _solve_touching(problem, at, state, first, self)
-
-        new = jax.lax.cond(contact.near(moment, h), touch, lambda: new)
+        if self.lasting and self.passes == 1 and self.tolerance > 0:
+            new = _solve_together(problem, at, state, self)
+        else:
+            new = _solve_apart(problem, at, state, self)
         half = state.v + at.part * new
         return Kinematic(move(problem, state.q, h * half), state.v + h * new, new)
 
@@ -78,14 +73,19 @@ class _At(NamedTuple):
     part: Array
 
 
-def _free(problem: SecondOrder, at: _At, state: Kinematic, new: Array):
-    """A Newton pass for the mean acceleration, without contact, and the motion then."""
+def _solve_apart(problem: SecondOrder, at: _At, state: Kinematic, method: ContactMidpoint):
+    """The mean acceleration without contact, or with it if that comes near."""
     assert problem.contact is not None
-    inner = state.v + at.part * new
-    middle = move(problem, state.q, at.part * inner)
-    mass, force, moment = problem.contact.free(at.t + at.part, middle, inner)
-    implicit = mass + at.part * problem.damping + at.part**2 * problem.stiffness
-    return new - solve_symmetric(implicit, mass @ new - force), moment
+    new, moment = state.a, None
+    for _ in range(method.passes):
+        mass, force, moment = _free_at(problem, at, state, new)
+        new = new - _newton(problem, at, mass, mass @ new - force)
+
+    def touch():
+        first = state.a if method.lasting else new
+        return _solve_touching(problem, at, state, first, method)
+
+    return jax.lax.cond(problem.contact.near(moment, at.h), touch, lambda: new)
 
 
 class _Search(NamedTuple):
@@ -102,38 +102,89 @@ class _Search(NamedTuple):
 def _solve_touching(
     problem: SecondOrder, at: _At, state: Kinematic, new: Array, method: ContactMidpoint
 ):
-    """Newton with contact. A pass whose residual is no smaller than the best shortens the
-    step instead, as a point that comes and goes would make it cycle."""
+    """Newton with contact."""
 
     def improve(_, search: _Search) -> _Search:
         trial = search.best + search.share * search.direction
-        size, direction, contact = _touching(problem, at, state, trial)
-        better = size < search.size
-        done = size <= method.tolerance**2 * contact
-        accepted = _Search(trial, size, direction, jnp.ones_like(size), done)
-        shortened = search._replace(share=_SHORTER * search.share)
-        return jax.tree.map(lambda a, b: jnp.where(better, a, b), accepted, shortened)
-
-    one = jnp.ones((), new.dtype)
-    first = _Search(new, jnp.inf * one, jnp.zeros_like(new), one, jnp.array(False))
+        mass, force, _ = _free_at(problem, at, state, trial)
+        return _judged(search, trial, _touching(problem, at, state, trial, mass, force), method)
 
     def unless_done(k, search: _Search) -> _Search:
         return jax.lax.cond(search.done, lambda: search, lambda: improve(k, search))
 
     loop = unless_done if method.tolerance > 0 else improve
-    return jax.lax.fori_loop(0, method.contact_passes, loop, first).best
+    return jax.lax.fori_loop(0, method.contact_passes, loop, _search_from(new)).best
+
+
+def _solve_together(problem: SecondOrder, at: _At, state: Kinematic, method: ContactMidpoint):
+    """As `_solve_apart` where both solutions begin at the acceleration before: one loop whose
+    first pass tells whether contact is near, so that the program holds the equations once."""
+    contact = problem.contact
+    assert contact is not None
+
+    def improve(k, near, search: _Search) -> tuple[Array, _Search]:
+        trial = search.best + search.share * search.direction
+        mass, force, moment = _free_at(problem, at, state, trial)
+        near = jnp.where(k == 0, contact.near(moment, at.h), near)
+
+        def touching() -> _Search:
+            found = _touching(problem, at, state, trial, mass, force)
+            return _judged(search, trial, found, method)
+
+        def apart() -> _Search:
+            new = trial - _newton(problem, at, mass, mass @ trial - force)
+            return search._replace(best=new, done=jnp.ones_like(search.done))
+
+        return near, jax.lax.cond(near, touching, apart)
+
+    def unless_done(k, carry):
+        return jax.lax.cond(carry[1].done, lambda: carry, lambda: improve(k, *carry))
+
+    start = jnp.array(False), _search_from(state.a)
+    return jax.lax.fori_loop(0, max(1, method.contact_passes), unless_done, start)[1].best
+
+
+def _search_from(new: Array) -> _Search:
+    one = jnp.ones((), new.dtype)
+    return _Search(new, jnp.inf * one, jnp.zeros_like(new), one, jnp.array(False))
+
+
+def _judged(
+    search: _Search, trial: Array, found: tuple[Array, Array, Array], method: ContactMidpoint
+) -> _Search:
+    """A pass whose residual is no smaller than the best shortens the step instead, as a point
+    that comes and goes would make it cycle."""
+    size, direction, contact = found
+    better = size < search.size
+    done = size <= method.tolerance**2 * contact
+    accepted = _Search(trial, size, direction, jnp.ones_like(size), done)
+    shortened = search._replace(share=_SHORTER * search.share)
+    return jax.tree.map(lambda a, b: jnp.where(better, a, b), accepted, shortened)
+
+
+def _free_at(problem: SecondOrder, at: _At, state: Kinematic, new: Array):
+    """Mass, force without contact and motion within a step of mean acceleration `new`."""
+    assert problem.contact is not None
+    inner = state.v + at.part * new
+    middle = move(problem, state.q, at.part * inner)
+    return problem.contact.free(at.t + at.part, middle, inner)
+
+
+def _newton(problem: SecondOrder, at: _At, mass: Array, residual: Array) -> Array:
+    """What the acceleration is too large by, without contact."""
+    implicit = mass + at.part * problem.damping + at.part**2 * problem.stiffness
+    return solve_symmetric(implicit, residual)
 
 
 def _touching(
-    problem: SecondOrder, at: _At, state: Kinematic, new: Array
+    problem: SecondOrder, at: _At, state: Kinematic, new: Array, mass: Array, force: Array
 ) -> tuple[Array, Array, Array]:
     """Size of the residual with contact, the Newton step, and the size of the contact
-    forces: normal ones at the end of the step, all others within it."""
+    forces: normal ones at the end of the step, all others, `force` beside them, within it."""
     assert problem.contact is not None
     h, part = at.h, at.part
     inner = state.v + part * new
-    middle, end = move(problem, state.q, part * inner), move(problem, state.q, h * inner)
-    mass, force, _ = problem.contact.free(at.t + part, middle, inner)
+    end = move(problem, state.q, h * inner)
     contact, stiffness, damping = problem.contact.force(at.t + h, end, inner)
     implicit = mass + part * (problem.damping + damping)
     implicit = implicit + part**2 * problem.stiffness + part * h * stiffness

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PyTree
 from sorojax._display import displayed
 from sorojax.systems.block import AbstractBlock, Input, Output, Signals
 from sorojax.systems.loops import consistent, torn_wires
-from sorojax.systems.schedule import check_wires, evaluation_order, reachable_inputs
+from sorojax.systems.schedule import check_wires, evaluation_order, needed, reachable_inputs
 
 
 def _pairs(wires: Mapping[str, str] | tuple) -> tuple[tuple[str, str], ...]:
@@ -77,7 +77,7 @@ class Network(AbstractBlock):
         return state
 
     def output(self, name, t, state, inputs):
-        return _signals(self, t, state, inputs)[name]
+        return _signals(self, t, state, inputs, [name])[name]
 
     def vector_field(self, t, state, inputs: Signals | None = None) -> dict[str, PyTree]:
         return rates_of(self, t, state, inputs or {}, tuple(self.blocks))
@@ -94,8 +94,9 @@ def outputs(
     network: Network, t: Float[Array, ""], state: PyTree, inputs: Signals | None = None
 ) -> dict[str, Array]:
     """Every output of every block at one moment, `{"block.output": value}`."""
-    signals = _signals(network, t, state, inputs or {})
-    return {name: signals[name] for name in network.outputs}
+    names = list(network.outputs)
+    signals = _signals(network, t, state, inputs or {}, names)
+    return {name: signals[name] for name in names}
 
 
 def rates_of(
@@ -112,7 +113,8 @@ def inputs_of(
     network: Network, t, state: PyTree, inputs: Signals, names: tuple[str, ...]
 ) -> dict[str, Signals]:
     """The inputs that the blocks called `names` get at one moment."""
-    signals = _signals(network, t, state, inputs)
+    wanted = [f"{name}.{port}" for name in names for port in network.blocks[name].inputs]
+    signals = _signals(network, t, state, inputs, wanted)
     return {name: _inputs_of(network, name, signals) for name in names}
 
 
@@ -145,10 +147,13 @@ def at_time(inputs: Mapping[str, Any], t: Float[Array, ""]) -> dict[str, Any]:
     return {name: x(t) if callable(x) else x for name, x in values.items()}
 
 
-def _signals(network: Network, t, state, supplied: Signals) -> dict[str, Array]:
-    """All inputs and outputs by full name, outputs in an order that needs no loop."""
+def _signals(
+    network: Network, t, state, supplied: Signals, wanted: list[str]
+) -> dict[str, Array]:
+    """Inputs and outputs by full name, those `wanted` and what they depend on."""
     wires, ports = dict(network.wires), network.input_ports
-    missing = [name for name in network.exposed if name not in supplied]
+    used = needed(network.blocks, wires, wanted)
+    missing = [name for name in network.exposed if name in used and name not in supplied]
     missing = [name for name in missing if ports[name].default is None]
     if missing:
         raise ValueError(
@@ -163,16 +168,17 @@ def _signals(network: Network, t, state, supplied: Signals) -> dict[str, Array]:
             given[name] = jnp.full(port.shape, port.default, _dtype(state))
     torn = torn_wires(network.blocks, wires) if network.solve_loops else ()
     if not torn:
-        return _propagated(network, wires, t, state, given)
+        return _propagated(network, wires, t, state, given, wanted)
     left = {name: source for name, source in wires.items() if name not in torn}
+    sources = [wires[name] for name in torn]
 
     def around(values):
-        signals = _propagated(network, left, t, state, {**given, **values})
+        signals = _propagated(network, left, t, state, {**given, **values}, sources)
         return {name: signals[wires[name]] for name in torn}
 
     guess = {name: jnp.zeros(ports[name].shape, _dtype(state)) for name in torn}
     solved = consistent(around, guess)
-    return _propagated(network, left, t, state, {**given, **solved})
+    return _propagated(network, left, t, state, {**given, **solved}, wanted)
 
 
 def _dtype(state: PyTree):
@@ -181,10 +187,16 @@ def _dtype(state: PyTree):
     return kinds[0] if kinds else jnp.result_type(float)
 
 
-def _propagated(network: Network, wires, t, state, given: Signals) -> dict[str, Array]:
-    """Signals that follow from given ones along the wires."""
+def _propagated(
+    network: Network, wires, t, state, given: Signals, wanted: list[str]
+) -> dict[str, Array]:
+    """Signals that follow from given ones along the wires, in an order that needs no loop; of
+    outputs that nothing wanted depends on there is no trace."""
     signals, ports = dict(given), network.input_ports
+    used = needed(network.blocks, wires, wanted)
     for name in evaluation_order(network.blocks, wires):
+        if name not in used:
+            continue
         if name in wires:
             signals[name] = signals[wires[name]]
         elif name not in ports:

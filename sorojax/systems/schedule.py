@@ -1,6 +1,6 @@
 """Checks of a wiring and the order in which its ports are evaluated."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from sorojax.systems.block import AbstractBlock
 
@@ -78,6 +78,19 @@ def _sorted(blocks: Blocks, wires: Wires) -> tuple[list[str], tuple[str, ...]]:
         if loop := place(name, ()):
             return order, loop
     return order, ()
+
+
+def needed(blocks: Blocks, wires: Wires, wanted: Iterable[str]) -> set[str]:
+    """Ports that those `wanted` depend on at the same instant, and these."""
+    depends = _dependencies(blocks, wires)
+    found: set[str] = set()
+    left = list(wanted)
+    while left:
+        name = left.pop()
+        if name not in found:
+            found.add(name)
+            left += depends.get(name, [])
+    return found
 
 
 def reachable_inputs(
