@@ -2,6 +2,7 @@
 
 import re
 
+import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import sorojax as sj
 from sorojax import rod as R
 from sorojax.math import jit as module, one_kernel as kernels
+from sorojax.math.explicit import Tsit5
 from sorojax.systems import Markers, ShapeFilter, start_filter, update_filter
 
 X = jnp.linspace(0.1, 0.9, 6)
@@ -246,3 +248,26 @@ def test_it_can_be_left_out(monkeypatch):
     assert kernels.runs_alone(X)
     monkeypatch.setenv("SOROJAX_ONE_KERNEL", "0")
     assert not kernels.runs_alone(X)
+
+
+@marked
+@pytest.mark.parametrize("batched", [False, True], ids=["one", "many"])
+def test_an_adaptive_run_is_one_kernel(batched):
+    def swing(gravity):
+        def field(t, state, _):
+            return {"x": state["v"], "v": -gravity * jnp.sin(state["x"]) + 0.1 * jnp.cos(t)}
+
+        start = {"x": jnp.array([1.0, 0.3]), "v": jnp.zeros(2)}
+        control = dfx.PIDController(rtol=1e-6, atol=1e-8)
+        run = dfx.diffeqsolve(
+            dfx.ODETerm(field), Tsit5(), 0.0, 2.0, 0.01, start, stepsize_controller=control,
+            saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 2.0, 5)),
+        )  # fmt: skip
+        return run.ys, run.stats["num_steps"]
+
+    function, x = (jax.vmap(swing), jnp.array([9.0, 5.0])) if batched else (swing, X[-1] * 10)
+    assert "xla_cpu_small_call" in text(function, x)
+    (found, steps), (exact, count) = sj.jit(function)(x), jax.jit(function)(x)
+    assert jnp.array_equal(steps, count)
+    for name in ("x", "v"):
+        np.testing.assert_allclose(found[name], exact[name], rtol=0, atol=1e-12)

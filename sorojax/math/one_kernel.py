@@ -49,8 +49,13 @@ _INLINED = {
 }  # fmt: skip
 # In a kernel a library would be called for every entry.
 _FAST = {"sin": sine, "cos": cosine}
-_OTHER = {"while", *_FAST}
-_HELD = _LOOPS | _INLINED | {
+# What solvers of diffrax ask for in batches, where there is none.
+_ALONE: dict[str, Callable[..., Any]] = {
+    "nonbatchable": lambda x: x, "nontraceable": lambda x: x, "unvmap_any": jnp.any,
+    "unvmap_all": jnp.all, "unvmap_max": jnp.max, "select_if_vmap": lambda _, x, other: x,
+}  # fmt: skip
+_OTHER = {"while", *_FAST, *_ALONE}
+_HELD = _LOOPS | _INLINED | set(_ALONE) | {
     "abs", "acos", "acosh", "add", "add_any", "and", "argmax", "argmin", "asin", "asinh",
     "atan", "atan2", "atanh", "broadcast_in_dim", "cbrt", "ceil", "clamp", "concatenate",
     "cond", "convert_element_type", "copy", "copy_p", "cos", "cosh", "cumsum",
@@ -174,6 +179,8 @@ def _inside(jaxpr: Any, equation: Any, given: Any) -> list[Any]:
     name, params = equation.primitive.name, equation.params
     if name in _FAST and given[0].dtype == np.float64:
         return [_FAST[name](given[0])]
+    if name in _ALONE:
+        return [_ALONE[name](*given)]
     if name != "while" and not any(_holds(body, _OTHER) for body, _ in _bodies(equation)):
         return _bound(jaxpr, equation, given)  # a scan counts anyway
     if name == "scan":
