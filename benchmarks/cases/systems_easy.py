@@ -35,9 +35,9 @@ def rows():
     bar = times["diffrax"].columns()["run_s"] / RATIO
     for name, timing in times.items():
         code = name.removesuffix(".jit")
-        by = "jax.jit" if name == code else name
+        by, most = ("jax.jit", None) if name == code else (name, bar)
         yield Row(
             code, {"method": "Tsit5", "gain": GAIN, "steps": counts[name], "by": by},
             **timing.columns(), error=error(ends[name][0], want),
-            reference="Radau of SciPy to 1e-11, modes at 1 s", bar=None if name == code else bar,
+            reference="Radau of SciPy to 1e-11, modes at 1 s", bar=most,
         )  # fmt: skip
