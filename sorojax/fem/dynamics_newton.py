@@ -119,7 +119,7 @@ def tangent(fixed, loads, u, before):
 
 @kernel
 def fixed_rows(fixed, values):
-    """The same with supports applied."""
+    """Values of a tangent with supports applied."""
     body, prepared = fixed
     return sparse.fix(body.space.system, values, prepared.known)
 
