@@ -125,7 +125,7 @@ def _solve_together(problem: SecondOrder, at: _At, state: Kinematic, method: Con
     def improve(k, near, search: _Search) -> tuple[Array, _Search]:
         trial = search.best + search.share * search.direction
         mass, force, moment = _free_at(problem, at, state, trial)
-        near = jnp.where(k == 0, contact.near(moment, at.h), near)
+        near = jax.lax.cond(k == 0, lambda: contact.near(moment, at.h), lambda: near)
 
         def touching() -> _Search:
             found = _touching(problem, at, state, trial, mass, force)
