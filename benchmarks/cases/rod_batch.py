@@ -98,7 +98,7 @@ def rows():
     }
     yield from compared(in_turns(programs, repeats=15), "sorojax.jit")
     batches = {"vmap": together, "forward_dynamics": by_door}
-    for name, timing in measure_together(batches, spatial, q, v, repeats=15).items():
+    for name, timing in measure_together(batches, spatial, q, v, repeats=60).items():
         yield Row(
             "sorojax", {"dof": 6, "states": STATES, "by": name},
             **timing.per(STATES).columns(), bar=ITEM_BAR,
@@ -106,5 +106,5 @@ def rows():
     rods = fingers(jnp.linspace(4 * mm, 8 * mm, STATES))
     yield Row(
         "sorojax", {"dof": 6, "rods": STATES, "by": "batched"},
-        **measure(many_rods, rods, q, v, repeats=15).per(STATES).columns(),
+        **measure(many_rods, rods, q, v, repeats=60).per(STATES).columns(),
     )  # fmt: skip

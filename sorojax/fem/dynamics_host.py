@@ -10,7 +10,6 @@ import numpy as np
 
 from sorojax.fem import assemble as asm
 from sorojax.fem.contact_swept import passed_through
-from sorojax.fem.dynamics_kernel import Split, kernel
 from sorojax.fem.dynamics_lists import has_lists, listed_at
 from sorojax.fem.dynamics_newton import (
     LEAST_VOLUME,
@@ -40,6 +39,7 @@ from sorojax.fem.newton import Newton
 from sorojax.fem.problem import Problem, body
 from sorojax.fem.supports import known_values
 from sorojax.math.jit import once
+from sorojax.math.split import Split, kernel
 from sorojax.math.status import Status
 
 _CALM = 0.8  # a step whose forces act at more of every volume does not get near to that

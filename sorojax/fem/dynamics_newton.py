@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Array
 
 from sorojax.fem import assemble as asm
-from sorojax.fem.dynamics_kernel import Split, kernel
 from sorojax.fem.dynamics_lists import has_lists, longest_share
 from sorojax.fem.energy_form import load_force
 from sorojax.fem.host_inertia import HostInertia, Numbers
@@ -24,6 +23,7 @@ from sorojax.fem.newton import Newton, safe_fraction
 from sorojax.fem.problem import Problem, body
 from sorojax.fem.secant import Secants
 from sorojax.math import sparse
+from sorojax.math.split import Split, kernel
 
 #: A kept factor is given up where the residual keeps more than this share in an iteration.
 _SLOW = 0.2

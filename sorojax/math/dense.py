@@ -81,8 +81,8 @@ def product(
     """
     if not 0 < left.shape[1] < UNROLL_BELOW:
         return left @ right
-    terms = (left[:, k, None] * right[k][None] for k in range(left.shape[1]))
-    return functools.reduce(jnp.add, terms)
+    both = zip(jnp.unstack(left, axis=1), jnp.unstack(right), strict=True)
+    return functools.reduce(jnp.add, (column[:, None] * row[None] for column, row in both))
 
 
 @product.defjvp

@@ -17,6 +17,7 @@ from sorojax._edit import replace
 from sorojax._types import real
 from sorojax.material import AbstractHyperelastic
 from sorojax.math.lie import SE2, SE3, homogeneous
+from sorojax.math.together import together
 from sorojax.robots.bending import BendingActuator
 from sorojax.robots.finger import Finger
 from sorojax.robots.hand import Hand
@@ -193,8 +194,11 @@ def _(robot: Hand, making: Making) -> Model:
 @_model.register
 def _(robot: Manipulator, making: Making) -> Model:
     b, zero = robot.bellows, jnp.zeros_like(robot.center_distance)
-    cell, length = bellows_cell(b, making.material, making.size), b.num_folds * b.pitch
-    angles = 2 * np.pi / 3 * jnp.arange(3.0)
+    cell, one = together(
+        lambda: bellows_cell(b, making.material, making.size),
+        lambda: _finger(robot.finger, robot.finger.bellows.cap, making),
+    )
+    length, angles = b.num_folds * b.pitch, 2 * np.pi / 3 * jnp.arange(3.0)
     around = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1)
     made = body(
         SE3(), constant("kappa_y", "kappa_z", "sigma_x", "sigma_y", "sigma_z"),
@@ -205,7 +209,7 @@ def _(robot: Manipulator, making: Making) -> Model:
     plate = rigid(_upper_plate(robot), end, STANDING, making.density)
     upright = _placed(STANDING, jnp.stack([zero, zero, b.cap]))
     parts = {"arm": Part(made.rod, offset=upright), "plate": Part(plate, on="arm")}
-    one, bodies = _finger(robot.finger, robot.finger.bellows.cap, making), {"arm": made}
+    bodies = {"arm": made}
     for k in range(3):
         turn = _about_z(angles[k] + np.pi / 3)
         foot = turn @ (jnp.stack([robot.finger_distance, zero, robot.finger_foot]) + one.base)

@@ -20,7 +20,8 @@ from sorojax.sdf.evaluate import evaluate
 
 _FINE = 6  # samples of a cut box along each axis
 _VOID = 1e-7  # stiffness of what is not solid in a cut box, over that of the solid
-_BLOCK = 500  # boxes at a time
+_BLOCK = 600  # boxes at a time
+_POINTS = 2**17  # samples at a time: those of a block
 
 
 class Grid(NamedTuple):
@@ -61,8 +62,8 @@ class Grid(NamedTuple):
         """
         move = np.where(known, prescribed, 0.0)
         rhs = np.where(known, 0.0, load - self.force(move))
-        fixed = sparse.fix(self.system, jnp.asarray(self.values), jnp.asarray(known.ravel()))
-        factor = self.system.solver.factor(np.asarray(fixed))
+        fixed = sparse.fixed_on_host(self.system, self.values, known.ravel())
+        factor = self.system.solver.factor(fixed)
         if factor is None:
             raise ValueError(
                 "unit_cell: the cell is singular, need one connected piece between the planes. "
@@ -210,12 +211,23 @@ def _matrices(samples: Samples, volumes, shear: float, bulk: float) -> np.ndarra
 
 def _filled(shape: AbstractSdf, start, edges) -> Int[np.ndarray, " boxes"]:
     """1 where a box lies in the shape, -1 where it does not, 0 where it may be cut."""
-    middle = np.asarray(evaluate(shape, jnp.asarray(start + edges / 2)))
+    middle = _field(shape, start + edges / 2)
     reach = np.linalg.norm(edges) / 2
     return np.where(middle < -reach, 1, np.where(middle > reach, -1, 0))
 
 
 def covered(shape: AbstractSdf, points, edge: float) -> Float[np.ndarray, "*points"]:
     """Share of the cube with this `edge` [m] around each point that lies in the shape."""
-    depth = np.asarray(evaluate(shape, jnp.asarray(points.reshape(-1, 3))))
-    return np.clip(0.5 - depth.reshape(points.shape[:-1]) / edge, 0.0, 1.0)
+    depth = _field(shape, points.reshape(-1, 3)).reshape(points.shape[:-1])
+    return np.clip(0.5 - depth / edge, 0.0, 1.0)
+
+
+def _field(shape: AbstractSdf, points) -> Float[np.ndarray, " points"]:
+    """By one program for any number, as it takes longer to compile than to run."""
+    found = []
+    for at in range(0, len(points), _POINTS):
+        some = points[at : at + _POINTS]
+        rest = np.repeat(some[:1], _POINTS - len(some), axis=0)
+        field = evaluate(shape, jnp.asarray(np.concatenate([some, rest])))
+        found.append(np.asarray(field)[: len(some)])
+    return np.concatenate(found)

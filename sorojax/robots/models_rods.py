@@ -1,5 +1,6 @@
 """Rods with the stiffness, chambers and mass of cells, alone or side by side."""
 
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,6 +10,7 @@ from jaxtyping import Array, Float
 
 from sorojax._types import real
 from sorojax.material import AbstractHyperelastic
+from sorojax.math.jit import once
 from sorojax.math.lie import SE2, SE3
 from sorojax.reduction.identify import ConstantDamping
 from sorojax.robots.models_cell import Cell
@@ -94,22 +96,31 @@ class Stretched(eqx.Module):
     Attributes:
         rows: Stretch of each column per coordinate, at every node.
         weights: Of the nodes [m].
-        third, fourth: As in `Cell`.
+        coefficients: Of stretch^i pressure^j in the energy per length less pressure times
+            area.
     """
 
     rows: Float[Array, "ports nodes dof"]
     weights: Float[Array, " nodes"]
-    third: Float[Array, "4"]
-    fourth: Float[Array, "5"]
+    coefficients: Float[Array, "5 5"]
 
     def energy(self, q, pressure) -> Array:
         """Less pressure times volume [J]."""
-        e, p = self.rows @ q, pressure[:, None]
-        a, b, c, d = self.third / 6
-        f, g, h, k, m = self.fourth / 24
-        cubic = a * e**3 + 3 * b * e**2 * p + 3 * c * e * p**2 + d * p**3
-        quartic = f * e**4 + 4 * g * e**3 * p + 6 * h * e**2 * p**2 + 4 * k * e * p**3
-        return jnp.sum((cubic + quartic + m * p**4) @ self.weights)
+        sums = _powers(self.rows @ q) @ self.weights
+        return jnp.sum(sums * (self.coefficients @ _powers(pressure)))
+
+
+def _powers(x: Array) -> Array:
+    square = x * x
+    return jnp.stack([jnp.ones_like(x), x, square, square * x, square * square])
+
+
+def _coefficients(third: Float[Array, "4"], fourth: Float[Array, "5"]) -> Array:
+    """Of the powers, from the derivatives of a `Cell`."""
+    places = [(order - k, k) for order in (3, 4) for k in range(order + 1)]
+    scale = [math.factorial(i) * math.factorial(j) for i, j in places]
+    values = jnp.concatenate([third, fourth]) / np.array(scale, third.dtype)
+    return jnp.zeros((5, 5), values.dtype).at[*np.array(places).T].set(values)
 
 
 class Chambers(AbstractPressureMap):
@@ -143,6 +154,7 @@ class Body(NamedTuple):
     chambers: Chambers
 
 
+@once
 def body(
     group: Any,
     basis: StrainBasis,
@@ -183,7 +195,7 @@ def body(
     span, beyond = real(length), None
     if bundle.third is not None and bundle.fourth is not None:
         along = jnp.einsum("pb,bqj->pqj", bundle.arms @ turn[:3][:, at], rows)
-        beyond = Stretched(along, weights, bundle.third, bundle.fourth)
+        beyond = Stretched(along, weights, _coefficients(bundle.third, bundle.fourth))
     chambers = Chambers(
         push=push, rest=span * bundle.gas, compliance=span * bundle.compliance, ports=ports,
         beyond=beyond,

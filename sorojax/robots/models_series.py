@@ -148,7 +148,7 @@ def _derivatives(material, pairs: Any, weights: Any):
 
         rest = jnp.zeros(2, pair.dtype)
         cubic = jax.jacfwd(jax.jacfwd(jax.jacfwd(lambda x: energy(at(x)))))
-        third, fourth = cubic(rest), jax.jacfwd(cubic)(rest)
+        fourth, third = jax.jacfwd(lambda x: (cubic(x),) * 2, has_aux=True)(rest)
         stress = jax.jacfwd(jax.jacfwd(lambda x: jax.grad(energy)(at(x))))(rest)
         return (
             weight * jnp.stack([third[i] for i in _THREE]),

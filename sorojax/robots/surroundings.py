@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ from sorojax.contact import LinePenalty
 from sorojax.math.contact_stepper import ContactMidpoint
 from sorojax.math.jit import once
 from sorojax.math.method import finite
+from sorojax.math.split import Split, kernel
 from sorojax.math.steppers import AbstractStepper
 from sorojax.robots.around import below, cylinder, rim
 from sorojax.robots.models_supply import Model
@@ -145,7 +145,10 @@ def contact_stepper(
         stepper = ContactMidpoint(passes=1, lasting=True, theta=1.0, tolerance=1e-4)
     move, start = partitioned(model.network, period, substeps=substeps, stepper=stepper)
 
-    @eqx.filter_jit
+    # to take a method of a module costs as much as to take it apart
+    inputs, fixed = model.inputs, (Split(model),)
+
+    @kernel
     def told(model, state):
         return model.pressure(state), finite(state)
 
@@ -155,8 +158,8 @@ def contact_stepper(
                 f"contact_stepper: asked for {dt:g} s, made for {period:g} s. Make one for "
                 "this step."
             )
-        moved = move(now.network, model.inputs(jnp.asarray(setpoint)))
-        pressure, good = told(model, moved.state)
+        moved = move(now.network, inputs(np.asarray(setpoint)))
+        pressure, good = told(fixed, moved.state)
         if not good:
             raise RuntimeError(
                 f"contact_stepper: the robot does not get through {period:g} s at set-points "

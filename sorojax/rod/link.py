@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
@@ -112,19 +113,19 @@ def link_motion(
 ) -> LinkMotion:
     """The link moving with `twist`, in its own axes."""
     rot = {3: 1, 6: 3}[twist.shape[0]]
-    eye = jnp.eye(twist.shape[0], dtype=twist.dtype)
+    eye = jnp.asarray(np.eye(twist.shape[0]), twist.dtype)
     dim = twist.shape[0] - rot
-    home = jnp.eye(dim, dtype=twist.dtype), jnp.zeros(dim, twist.dtype)
+    home = jnp.asarray(np.eye(dim), twist.dtype), jnp.zeros(dim, twist.dtype)
     base = Base(*home, eye[:rot], eye[rot:])
     return LinkMotion(link, constants, jnp.zeros_like(twist), twist, base)
 
 
 def place_link(moment: LinkMotion, rotation: Array, position: Array) -> LinkMotion:
-    """The same motion in a frame in which the link stands at (rotation, position)."""
+    """A motion in own axes in a frame in which the link stands at (rotation, position)."""
     base = moment.base
     placed = Base(
-        rotation @ base.directors,
-        rotation @ base.position + position,
+        rotation,
+        position,
         turned(rotation, base.angular_jacobian[None])[0],
         turned(rotation, base.linear_jacobian[None])[0],
     )
@@ -141,7 +142,7 @@ def link_inertia(
     dim, dtype = arm.shape[0], arm.dtype
     about = moment.rotary
     top = jnp.concatenate([about + mass * lever.T @ lever, mass * lever.T], axis=1)
-    low = jnp.concatenate([mass * lever, mass * jnp.eye(dim, dtype=dtype)], axis=1)
+    low = jnp.concatenate([mass * lever, mass * jnp.asarray(np.eye(dim), dtype)], axis=1)
     spin = moment.v[:rot]
     force = mass * levers((lever @ spin)[None])[0] @ spin
     torque = lever.T @ force

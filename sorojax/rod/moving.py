@@ -2,8 +2,10 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax.math.quaternion import cross_columns
 from sorojax.rod.motion import Base, Motion
 
 
@@ -15,8 +17,8 @@ def release(moment: Motion, twist: Float[Array, " base"]) -> Motion:
     """
     quad, dim = moment.tangent.shape
     rot = moment.angular_rate.shape[1]
-    eye, dtype = jnp.eye(dim, dtype=moment.q.dtype), moment.q.dtype
-    spin, none = jnp.eye(rot, dtype=dtype), jnp.zeros((rot, dim), dtype)
+    eye, dtype = jnp.asarray(np.eye(dim), moment.q.dtype), moment.q.dtype
+    spin, none = jnp.asarray(np.eye(rot), dtype), jnp.zeros((rot, dim), dtype)
     angular = jnp.concatenate([spin, none], axis=1)
     linear = jnp.concatenate([jnp.zeros((dim, rot), dtype), eye], axis=1)
     own = jnp.zeros((rot + dim, moment.q.shape[0]), dtype)
@@ -56,7 +58,7 @@ def release(moment: Motion, twist: Float[Array, " base"]) -> Motion:
 def place(
     moment: Motion, rotation: Float[Array, "dim dim"], position: Float[Array, " dim"]
 ) -> Motion:
-    """The same motion in a frame in which the base stands at (rotation, position)."""
+    """A released motion in a frame in which the base stands at (rotation, position)."""
     base = moment.base
     assert base is not None
     return eqx.tree_at(
@@ -78,8 +80,8 @@ def place(
             turned(rotation, moment.angular_jacobian),
             turned(rotation, moment.linear_jacobian),
             Base(
-                rotation @ base.directors,
-                rotation @ base.position + position,
+                rotation,
+                position,
                 turned(rotation, base.angular_jacobian[None])[0],
                 turned(rotation, base.linear_jacobian[None])[0],
             ),
@@ -93,24 +95,42 @@ def turned(
     """`rotation` times each field; the spin of a plane does not turn."""
     if fields.shape[1] == 1:
         return fields
-    columns = rotation.T[:, None, :, None]  # written out: tiny batched products are slow
-    terms = [columns[k] * fields[:, k, None, :] for k in range(fields.shape[1])]
+    # written out: tiny batched products are slow
+    columns, rows = jnp.unstack(rotation[None, :, None], axis=3), jnp.unstack(fields, axis=1)
+    terms = [column * row[:, None] for column, row in zip(columns, rows, strict=True)]
     return sum(terms[1:], start=terms[0])
+
+
+def turned_pose(rotation: Array, turn: Array, shift: Array) -> tuple[Array, Array]:
+    """`rotation` times both, by one product."""
+    both = rotation @ jnp.concatenate([turn, shift[:, None]], axis=1)
+    return both[:, :-1], both[:, -1]
+
+
+def turned_twists(rotation: Array, twists: Float[Array, "twist n"], rot: int) -> Array:
+    """Twists along turned axes; the spin of a plane does not turn."""
+    count = twists.shape[1]
+    if count == 0:
+        return twists
+    if rot == 1:
+        return jnp.concatenate([twists[:rot], rotation @ twists[rot:]])
+    return turned(rotation, twists.reshape(2, rot, count)).reshape(-1, count)
 
 
 def levers(arm: Float[Array, "points dim"]) -> Float[Array, "points dim rot"]:
     """Matrices of spin -> spin x arm."""
     if arm.shape[1] == 2:
         return jnp.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None]
-    x, y, z = arm[:, 0], arm[:, 1], arm[:, 2]
+    x, y, z = jnp.unstack(arm, axis=1)
     o = jnp.zeros_like(x)
-    rows = ([o, z, -y], [-z, o, x], [y, -x, o])
-    return jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1)
+    return jnp.stack([o, z, -y, -z, o, x, y, -x, o], axis=1).reshape(-1, 3, 3)
 
 
 def cross(spin: Float[Array, " rot"], arms: Float[Array, "points dim"]) -> Array:
     """spin x each arm, in the plane too."""
-    return levers(arms) @ spin
+    if arms.shape[1] == 2:
+        return levers(arms) @ spin
+    return cross_columns(spin[None], arms)
 
 
 def _pad(fields: Array, count: int) -> Array:

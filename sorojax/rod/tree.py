@@ -29,7 +29,7 @@ from sorojax.rod.assembly import (
 from sorojax.rod.kernel import rod_motion
 from sorojax.rod.link import LinkOperators, link_motion, link_operators, place_link
 from sorojax.rod.motion import Motion, Operators, operators
-from sorojax.rod.moving import levers, place, release
+from sorojax.rod.moving import levers, place, release, turned_pose, turned_twists
 from sorojax.rod.points import Points
 from sorojax.rod.rod import Rod
 
@@ -195,7 +195,7 @@ def part_columns(moment: AssemblyMotion) -> tuple[Float[Array, "own dof"], ...]:
     """Twist and coordinates of each part per rate of the assembly."""
     assembly, found = moment.assembly, []
     total, dtype = moment.v.shape[0], moment.v.dtype
-    identity = jnp.eye(total, dtype=dtype)
+    identity = jnp.asarray(np.eye(total), dtype)
     for on, at, mount in zip(parents(assembly), slices(assembly), moment.mounts, strict=True):
         twist = mount.axes @ identity[at.joint_v]
         if on is not None:
@@ -212,8 +212,8 @@ def _sections(moment: AssemblyMotion) -> list[Section]:
     frame of the carrier and its columns; those on equal rods together."""
     group, dtype = moment.assembly.group, moment.q.dtype
     dim, rot, twist = group.space_dim, group.rotation_dim, group.algebra_dim
-    eye, on = jnp.eye(twist, dtype=dtype), parents(moment.assembly)
-    ground = (jnp.eye(dim, dtype=dtype), jnp.zeros(dim, dtype), eye[:rot], eye[rot:])
+    eye, on = jnp.asarray(np.eye(twist), dtype), parents(moment.assembly)
+    ground = (jnp.asarray(np.eye(dim), dtype), jnp.zeros(dim, dtype), eye[:rot], eye[rot:])
     found: list[Section] = [ground] * len(on)
     weights = {k: rows for k, rows in enumerate(moment.operators.rows) if rows is not None}
     for members, stack in zip(batches(moment.assembly), moment.batches, strict=True):
@@ -233,7 +233,7 @@ def _section(moment: Motion, rows: Float[Array, "1 quad"]) -> Section:
     at, dim = Points(moment, rows), moment.tangent.shape[1]
     centre, angular = at.position[0], at.angular_jacobian[0]
     rot, dtype = angular.shape[0], angular.dtype
-    eye = jnp.eye(rot + dim, dtype=dtype)
+    eye = jnp.asarray(np.eye(rot + dim), dtype)
     linear = eye[rot:].at[:, :rot].set(levers(centre[None])[0])
     angular = jnp.concatenate([eye[:rot], angular], axis=1)
     linear = jnp.concatenate([linear, at.linear_jacobian[0]], axis=1)
@@ -260,8 +260,8 @@ def _carry(moment: AssemblyMotion) -> tuple[tuple[Mount, ...], tuple[Frame, ...]
             carrier = frames[on]
             own = jnp.concatenate([carrier.twist, moment.v[places[on].rod_v]])
             twist = twist + mount.carried @ own
-            position = carrier.position + carrier.rotation @ position
-            rotation = carrier.rotation @ rotation
+            rotation, moved = turned_pose(carrier.rotation, rotation, position)
+            position = carrier.position + moved
         mounts.append(mount)
         frames.append(Frame(rotation, position, twist))
     return tuple(mounts), tuple(frames)
@@ -278,21 +278,20 @@ def _mount(
     arm = jnp.zeros(dim, dtype)
     if part.offset is not None:
         offset = part.offset.astype(dtype)
-        arm, rotation = rotation @ offset[:dim, dim], rotation @ offset[:dim, :dim]
-    turn, shift = part.joint.pose(group, moment.q[slices(assembly)[index].joint_q])
-    arm, turn = arm + rotation @ shift, rotation @ turn
-    along = _turn(rotation, part.joint.axes(group, dtype), rot)
-    axes = _turn(turn.T, along, rot)
+        rotation, arm = turned_pose(rotation, offset[:dim, :dim], offset[:dim, dim])
+    turn = rotation
+    if part.joint.num_dof(group) > 0:
+        turned_by, shift = part.joint.pose(group, moment.q[slices(assembly)[index].joint_q])
+        turn, shift = turned_pose(rotation, turned_by, shift)
+        arm = arm + shift
+    along = turned_twists(rotation, part.joint.axes(group, dtype), rot)
+    axes = turned_twists(turn.T, along, rot)
     if on is None:
         angular, linear = angular[:, :0], linear[:, :0]
     swept = jnp.concatenate([angular, linear + levers(arm[None])[0] @ angular])
-    return Mount(_turn(turn.T, swept, rot), axes, turn, along, arm, angular), centre + arm
-
-
-def _turn(rotation: Array, twists: Float[Array, "twist n"], rot: int) -> Array:
-    """Twists along turned axes; the spin of a plane does not turn."""
-    spin = twists[:rot] if rot == 1 else rotation @ twists[:rot]
-    return jnp.concatenate([spin, rotation @ twists[rot:]])
+    return Mount(
+        turned_twists(turn.T, swept, rot), axes, turn, along, arm, angular
+    ), centre + arm
 
 
 def _rows(carrier: Rod, s: Array) -> Float[Array, "1 quad"]:

@@ -14,6 +14,7 @@ from sorojax.math.contact_stepper import ContactMidpoint
 from sorojax.math.jit import once
 from sorojax.math.linearly_implicit import Rosenbrock2
 from sorojax.math.method import AbstractMethod
+from sorojax.math.split import Split
 from sorojax.math.steppers import AbstractStepper, Kinematic
 from sorojax.rod.rollout import second_order
 from sorojax.systems.assembly_body import AssemblyBody
@@ -73,18 +74,20 @@ def partitioned(
     stepper = ContactMidpoint() if stepper is None else stepper
     method = Rosenbrock2(refresh=True) if method is None else method
     h = real(period / substeps)
-    state = network.initial_state()
+    fixed, state = Split((network, h, stepper, method)), network.initial_state()
     start = Parted(state, jnp.zeros_like(state[body]["v"]), jnp.zeros_like(h))
 
     def move(parted: Parted, inputs: Signals) -> Parted:
         given = {name: jnp.asarray(value, h.dtype) for name, value in inputs.items()}
-        return _move(network, parted, given, h, stepper, method, body, substeps)
+        return _move(fixed, parted, given, body, substeps)
 
     return move, start
 
 
 @once
-def _move(network, parted, inputs, h, stepper, method, name, count) -> Parted:
+def _move(fixed: Split, parted: Parted, inputs, name: str, count: int) -> Parted:
+    network, h, stepper, method = fixed.whole()
+
     def one(_, now: Parted) -> Parted:
         body = network.blocks[name]
         own = inputs_of(network, now.time, now.state, inputs, (name,))[name]
