@@ -44,6 +44,14 @@ def version() -> str | None:
     return importlib.metadata.version("mkl") if library() is not None else None
 
 
+def _number(value: int):
+    return ctypes.byref(ctypes.c_int(value))
+
+
+def _pointer(array: np.ndarray | None) -> ctypes.c_void_p:
+    return ctypes.c_void_p(0 if array is None else array.ctypes.data)
+
+
 class _Phases:
     """One analysed pattern for one matrix type, with several numeric factors."""
 
@@ -60,22 +68,19 @@ class _Phases:
         for entry, value in ((0, 1), (1, 2), (7, 0), (9, 8), (20, 1), (34, 1)):
             self.params[entry] = value
         self.pattern_values = np.ones(len(self.indices))
+        self._memory, self._params = _pointer(self.memory), _pointer(self.params)
+        self._pattern = _pointer(self.indptr), _pointer(self.indices)
+        self._count, self._kind = _number(num_factors), _number(matrix_type)
+        self._size, self._quiet = _number(self.size), _number(0)
         self.call(_ANALYSE, 0, self.pattern_values)
 
     def call(self, phase: int, slot: int, values, b=None, x=None, num_rhs: int = 1) -> int:
-        def number(v):
-            return ctypes.byref(ctypes.c_int(v))
-
-        def pointer(array):
-            return ctypes.c_void_p(0 if array is None else array.ctypes.data)
-
         error = ctypes.c_int(0)
         assert self.lib is not None
         self.lib.pardiso(
-            pointer(self.memory), number(self.num_factors), number(slot + 1),
-            number(self.matrix_type), number(phase), number(self.size), pointer(values),
-            pointer(self.indptr), pointer(self.indices), None, number(num_rhs),
-            pointer(self.params), number(0), pointer(b), pointer(x), ctypes.byref(error),
+            self._memory, self._count, _number(slot + 1), self._kind, _number(phase),
+            self._size, _pointer(values), *self._pattern, None, _number(num_rhs),
+            self._params, self._quiet, _pointer(b), _pointer(x), ctypes.byref(error),
         )  # fmt: skip
         return error.value
 

@@ -13,7 +13,7 @@ def together(*works: Callable[[], Any]) -> list[Any]:
     Precision and default device of the caller hold in all of them.
     """
     first, *rest = works
-    x64, device = jax.config.jax_enable_x64, jax.config.jax_default_device
+    x64, device = jax.config.jax_enable_x64, jax.config.jax_default_device  # type: ignore
 
     def alike(work: Callable[[], Any]) -> Any:
         with jax.enable_x64(x64), jax.default_device(device):

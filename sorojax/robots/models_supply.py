@@ -104,7 +104,7 @@ class Model(eqx.Module):
         assert isinstance(body, AssemblyBody)
         return body.assembly
 
-    def inputs(self, setpoint: Float[Array, " regulators"]) -> dict[str, Array]:
+    def inputs(self, setpoint: Float[Array | np.ndarray, " regulators"]) -> dict[str, Array]:
         """Set-points [Pa] of all regulators in a row as inputs of the network."""
         found, at = {}, 0
         for name, count in zip(self.ports, self.counts, strict=True):
