@@ -12,6 +12,7 @@ from sorojax import _check
 from sorojax._display import displayed, number
 from sorojax._types import real
 from sorojax.math.method import AbstractMethod, finite, repeated
+from sorojax.math.split import Split
 from sorojax.rod import Assembly
 from sorojax.systems import (
     AbstractBlock,
@@ -211,14 +212,16 @@ def stepper(
     """
     method = _method(model.network) if method is None else method
     _check.positive("stepper", "period", period, "s", "5 ms is period=5e-3.")
-    h, zero = real(period / substeps), jnp.zeros(())
+    h, zero, fixed = real(period / substeps), jnp.zeros(()), Split(model)
 
     @eqx.filter_jit
-    def begin(model, state, setpoint):
+    def begin(fixed, state, setpoint):
+        model = fixed.whole()
         return method.begin(Rate(model.network, model.inputs(setpoint)), zero, state, h)
 
     @eqx.filter_jit
-    def move(model, state, memory, setpoint):
+    def move(fixed, state, memory, setpoint):
+        model = fixed.whole()
         rate = Rate(model.network, model.inputs(setpoint))
         state, memory, good = repeated(method, rate, zero, state, h, substeps, memory)
         return state, memory, model.pressure(state), good & finite(state)
@@ -231,8 +234,8 @@ def stepper(
         state, memory, age = running
         asked = jnp.asarray(setpoint, h.dtype)
         if age >= renew and not (method.keeps or method.carries):
-            memory, age = begin(model, state, asked), 0
-        state, memory, pressure, good = move(model, state, memory, asked)
+            memory, age = begin(fixed, state, asked), 0
+        state, memory, pressure, good = move(fixed, state, memory, asked)
         if not good:
             raise RuntimeError(
                 f"stepper: the robot does not get through {period:g} s at set-points of "
@@ -241,7 +244,7 @@ def stepper(
         return Running(state, memory, age + 1), pressure
 
     state, none = model.network.initial_state(), jnp.zeros(len(model.low))
-    start = Running(state, begin(model, state, none))
+    start = Running(state, begin(fixed, state, none))
     advance(start, none, period)  # compiles
     return advance, start
 
