@@ -114,6 +114,13 @@ def test_what_columns_store_beyond_linear_answers():
     assert float(volume[0]) == pytest.approx(0.08 * room, rel=1e-9)
 
 
+def test_a_body_without_length_or_with_bad_damping_is_refused():
+    with pytest.raises(ValueError, match=r"`length` must be positive, got -0\.01 m"):
+        body(SE2(), R.constant("kappa_z"), column(CELL), -0.01, RUBBER, damping=0.0)
+    with pytest.raises(ValueError, match="`damping`"):
+        body(SE2(), R.constant("kappa_z"), column(CELL), 0.01, RUBBER, damping=np.nan)
+
+
 @pytest.mark.parametrize("group", [SE2(), SE3()])
 def test_a_column_bends_by_its_cell(group):
     """Constant strains: stiffness times strain is push times pressure."""

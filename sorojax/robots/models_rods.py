@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax import _check
 from sorojax._types import real
 from sorojax.material import AbstractHyperelastic
 from sorojax.math.jit import once
@@ -154,7 +155,6 @@ class Body(NamedTuple):
     chambers: Chambers
 
 
-@once
 def body(
     group: Any,
     basis: StrainBasis,
@@ -177,7 +177,18 @@ def body(
         damping: Retardation time of the solid, viscosity over modulus [s].
         plane: Lateral axis of the cells in whose direction an `SE2()` rod bends.
         single: Whether a bundle of one chamber has a scalar port.
+
+    Raises:
+        ValueError: If there is no length left, or `damping` is not finite.
     """
+    do = "Make the robot longer, or the ends in which it is held shorter."
+    _check.positive("robots.model", "length", length, "m", do)
+    _check.finite("robots.model", "damping", damping, "Give a time in seconds: 3e-3.")
+    return _body(group, basis, bundle, real(length), material, real(damping), plane, single)
+
+
+@once
+def _body(group, basis, bundle, length, material, damping, plane, single) -> Body:
     y, z = bundle.second_moments[plane - 1], bundle.second_moments[2 - plane]
     # elasticity is given below; of the section only what carries mass counts
     section = Section(bundle.solid, z, y, y + z)
@@ -192,15 +203,15 @@ def body(
     stiffness = jnp.einsum("aqi,ab,bqj,q->ij", rows, law[np.ix_(at, at)], rows, weights)
     push = jnp.einsum("pb,bqj,q->pj", bundle.push @ turn[:3][:, at], rows, weights)
     ports = () if single and len(bundle.gas) == 1 else (len(bundle.gas),)
-    span, beyond = real(length), None
+    beyond = None
     if bundle.third is not None and bundle.fourth is not None:
         along = jnp.einsum("pb,bqj->pqj", bundle.arms @ turn[:3][:, at], rows)
         beyond = Stretched(along, weights, _coefficients(bundle.third, bundle.fourth))
     chambers = Chambers(
-        push=push, rest=span * bundle.gas, compliance=span * bundle.compliance, ports=ports,
-        beyond=beyond,
+        push=push, rest=length * bundle.gas, compliance=length * bundle.compliance,
+        ports=ports, beyond=beyond,
     )  # fmt: skip
-    lossy = ConstantDamping(real(damping) * stiffness)
+    lossy = ConstantDamping(damping * stiffness)
     return Body(made, (LinearElastic(stiffness), lossy), chambers)
 
 
