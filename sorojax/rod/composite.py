@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from sorojax.rod.assembly import parents, slices
 from sorojax.rod.kernel import bias_rates, rod_inertia
 from sorojax.rod.link import Link, LinkOperators, link_inertia, link_motion
-from sorojax.rod.moving import cross, release
+from sorojax.rod.moving import cross, release, turned_twists
 from sorojax.rod.tree import (
     AssemblyMotion,
     Mount,
@@ -126,21 +126,30 @@ def _section_bias(
     rot = moment.assembly.group.rotation_dim
     own = jnp.concatenate([moment.frames[on].twist, moment.v[at[on].rod_v]])
     spin = mount.spin @ own
-    angular, linear = jnp.zeros_like(spin), jnp.zeros_like(mount.arm)
-    rows = moment.operators.rows[index]
+    rows, section = moment.operators.rows[index], None
     if rows is not None and rates is not None:
-        angular, linear = rows[0] @ rates[0], rows[0] @ rates[1]
-    return _on_arm(mount, moment.v[at[index].joint_v], spin, angular, linear, rot)
+        section = rows[0] @ rates[0], rows[0] @ rates[1]
+    return _on_arm(mount, moment.v[at[index].joint_v], spin, section, rot)
 
 
-def _on_arm(mount: Mount, v: Array, spin: Array, angular: Array, linear: Array, rot: int):
-    arm, joint = mount.arm, mount.joint_axes @ v
-    swept = _cross(spin, arm) + 2 * joint[rot:]
-    linear = linear + _cross(angular, arm) + _cross(spin, swept)
-    if rot == 3:
-        angular = angular + _cross(spin, joint[:rot])
-        angular = mount.turn.T @ angular
-    return jnp.concatenate([angular, mount.turn.T @ linear])
+def _on_arm(
+    mount: Mount, v: Array, spin: Array, section: tuple[Array, Array] | None, rot: int
+) -> Float[Array, " twist"]:
+    """Acceleration at the end of the arm, from that of the section that carries it; what is
+    absent costs nothing."""
+    arm, angular = mount.arm, jnp.zeros_like(spin)
+    linear = jnp.zeros(mount.turn.shape[0], spin.dtype)
+    swept = None if arm is None else _cross(spin, arm)
+    if section is not None:
+        angular, linear = section
+        linear = linear if arm is None else linear + _cross(angular, arm)
+    if v.shape[0] > 0:
+        joint = mount.joint_axes @ v
+        swept = 2 * joint[rot:] if swept is None else swept + 2 * joint[rot:]
+        angular = angular + _cross(spin, joint[:rot]) if rot == 3 else angular
+    linear = linear if swept is None else linear + _cross(spin, swept)
+    both = jnp.concatenate([angular, linear])[:, None]
+    return turned_twists(mount.turn.T, both, rot)[:, 0]
 
 
 def _cross(spin: Float[Array, " rot"], arm: Float[Array, " dim"]) -> Float[Array, " dim"]:

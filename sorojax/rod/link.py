@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._types import optional_real, real
 from sorojax.rod.motion import Base
-from sorojax.rod.moving import levers, turned
+from sorojax.rod.moving import cross, levers, swept_by, turned
 
 
 class Link(eqx.Module):
@@ -72,7 +72,8 @@ class LinkMotion(eqx.Module):
     @property
     def position(self) -> Float[Array, "1 dim"]:
         """Centre of mass [m]."""
-        return (self.base.position + self._arm)[None]
+        arm = self._arm
+        return (self.base.position if arm is None else self.base.position + arm)[None]
 
     @property
     def angular_jacobian(self) -> Float[Array, "1 rot dof"]:
@@ -80,8 +81,10 @@ class LinkMotion(eqx.Module):
 
     @property
     def linear_jacobian(self) -> Float[Array, "1 dim dof"]:
-        turning = levers(self._arm[None])[0] @ self.base.angular_jacobian
-        return (self.base.linear_jacobian + turning)[None]
+        arm, linear = self._arm, self.base.linear_jacobian
+        if arm is not None:
+            linear = linear + swept_by(arm, self.base.angular_jacobian)
+        return linear[None]
 
     @property
     def tip_jacobian(self) -> Float[Array, "twist dof"]:
@@ -94,7 +97,10 @@ class LinkMotion(eqx.Module):
         return _matrix(inertia, self.base.angular_jacobian.shape[0])
 
     @property
-    def _arm(self) -> Float[Array, " dim"]:
+    def _arm(self) -> Float[Array, " dim"] | None:
+        """To the centre of mass [m]; None where the frame is there."""
+        if self.link.center is None:
+            return None
         return self.base.directors @ center(self.link, self.base.position)
 
 
@@ -136,19 +142,22 @@ def link_inertia(
     moment: LinkMotion,
 ) -> tuple[Float[Array, "twist twist"], Float[Array, " twist"]]:
     """Mass matrix and Coriolis force of a link about its frame, in its own axes."""
-    rot = moment.base.angular_jacobian.shape[0]
-    mass, arm = moment.operators.mass[0], center(moment.link, moment.base.position)
-    lever = levers(arm[None])[0]
-    dim, dtype = arm.shape[0], arm.dtype
-    about = moment.rotary
-    top = jnp.concatenate([about + mass * lever.T @ lever, mass * lever.T], axis=1)
-    low = jnp.concatenate([mass * lever, mass * jnp.asarray(np.eye(dim), dtype)], axis=1)
-    spin = moment.v[:rot]
-    force = mass * levers((lever @ spin)[None])[0] @ spin
-    torque = lever.T @ force
+    rot, dim = moment.base.angular_jacobian.shape[0], moment.base.position.shape[0]
+    mass, spin, about = moment.operators.mass[0], moment.v[:rot], moment.rotary
+    coupling, torque = jnp.zeros((dim, rot), about.dtype), jnp.zeros(rot, about.dtype)
+    turning, force = about, jnp.zeros(dim, about.dtype)
+    if moment.link.center is not None:
+        arm = center(moment.link, moment.base.position)[None]
+        lever = levers(arm)[0]
+        turning, coupling = about + mass * lever.T @ lever, mass * lever
+        force = mass * cross(spin, cross(spin, arm))[0]
+        torque = lever.T @ force
     if rot == 3:
         torque = torque + jnp.cross(spin, about @ spin)
-    return jnp.concatenate([top, low]), jnp.concatenate([torque, force])
+    moving = mass * jnp.asarray(np.eye(dim), about.dtype)
+    top, low = [turning, coupling.T], [coupling, moving]
+    matrix = jnp.concatenate([jnp.concatenate(row, axis=1) for row in (top, low)])
+    return matrix, jnp.concatenate([torque, force])
 
 
 def _matrix(inertia: Array, rot: int) -> Float[Array, "rot rot"]:

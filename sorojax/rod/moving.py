@@ -126,6 +126,13 @@ def levers(arm: Float[Array, "points dim"]) -> Float[Array, "points dim rot"]:
     return jnp.stack([o, z, -y, -z, o, x, y, -x, o], axis=1).reshape(-1, 3, 3)
 
 
+def swept_by(arm: Float[Array, " dim"], spins: Float[Array, "rot n"]) -> Float[Array, "dim n"]:
+    """Velocities of the end of an arm, of many spins."""
+    if arm.shape[0] == 2:
+        return levers(arm[None])[0] @ spins
+    return cross_columns(spins[None], arm[None, :, None])[0]
+
+
 def cross(spin: Float[Array, " rot"], arms: Float[Array, "points dim"]) -> Array:
     """spin x each arm, in the plane too."""
     if arms.shape[1] == 2:

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax.math.quadrature import integration_rows
+from sorojax.rod import moving
 from sorojax.rod.assembly import (
     Assembly,
     dtype_of,
@@ -29,7 +30,6 @@ from sorojax.rod.assembly import (
 from sorojax.rod.kernel import rod_motion
 from sorojax.rod.link import LinkOperators, link_motion, link_operators, place_link
 from sorojax.rod.motion import Motion, Operators, operators
-from sorojax.rod.moving import levers, place, release, turned_pose, turned_twists
 from sorojax.rod.points import Points
 from sorojax.rod.rod import Rod
 
@@ -59,7 +59,8 @@ class Mount(NamedTuple):
         axes: Twist of the part per rate of the joint.
         turn: Rotation from the carrier's frame to the part's.
         joint_axes: Twist per rate of the joint along the carrier's axes.
-        arm: From the section of the carrier to the part, along the carrier's axes [m].
+        arm: From the section of the carrier to the part, along the carrier's axes [m]; None of
+            a part that sits there.
         spin: Angular Jacobian of that section in the columns of the carrier.
     """
 
@@ -67,7 +68,7 @@ class Mount(NamedTuple):
     axes: Float[Array, "twist joint"]
     turn: Float[Array, "dim dim"]
     joint_axes: Float[Array, "twist joint"]
-    arm: Float[Array, " dim"]
+    arm: Float[Array, " dim"] | None
     spin: Float[Array, "rot carrier"]
 
 
@@ -185,7 +186,7 @@ def part_motion(moment: AssemblyMotion, index: int) -> Any:
     rotation, position, twist = moment.frames[index]
     body = moment.assembly.parts[index].body
     if isinstance(body, Rod):
-        return place(release(clamped(moment, index), twist), rotation, position)
+        return moving.place(moving.release(clamped(moment, index), twist), rotation, position)
     constants = moment.operators.parts[index]
     assert isinstance(constants, LinkOperators)
     return place_link(link_motion(body, constants, twist), rotation, position)
@@ -234,7 +235,7 @@ def _section(moment: Motion, rows: Float[Array, "1 quad"]) -> Section:
     centre, angular = at.position[0], at.angular_jacobian[0]
     rot, dtype = angular.shape[0], angular.dtype
     eye = jnp.asarray(np.eye(rot + dim), dtype)
-    linear = eye[rot:].at[:, :rot].set(levers(centre[None])[0])
+    linear = eye[rot:].at[:, :rot].set(moving.levers(centre[None])[0])
     angular = jnp.concatenate([eye[:rot], angular], axis=1)
     linear = jnp.concatenate([linear, at.linear_jacobian[0]], axis=1)
     return at.directors[0], centre, angular, linear
@@ -260,7 +261,7 @@ def _carry(moment: AssemblyMotion) -> tuple[tuple[Mount, ...], tuple[Frame, ...]
             carrier = frames[on]
             own = jnp.concatenate([carrier.twist, moment.v[places[on].rod_v]])
             twist = twist + mount.carried @ own
-            rotation, moved = turned_pose(carrier.rotation, rotation, position)
+            rotation, moved = moving.turned_pose(carrier.rotation, rotation, position)
             position = carrier.position + moved
         mounts.append(mount)
         frames.append(Frame(rotation, position, twist))
@@ -275,23 +276,23 @@ def _mount(
     part, group = assembly.parts[index], assembly.group
     dim, rot = group.space_dim, group.rotation_dim
     rotation, centre, angular, linear = carrier
-    arm = jnp.zeros(dim, dtype)
+    arm = None
     if part.offset is not None:
         offset = part.offset.astype(dtype)
-        rotation, arm = turned_pose(rotation, offset[:dim, :dim], offset[:dim, dim])
+        rotation, arm = moving.turned_pose(rotation, offset[:dim, :dim], offset[:dim, dim])
     turn = rotation
     if part.joint.num_dof(group) > 0:
         turned_by, shift = part.joint.pose(group, moment.q[slices(assembly)[index].joint_q])
-        turn, shift = turned_pose(rotation, turned_by, shift)
-        arm = arm + shift
-    along = turned_twists(rotation, part.joint.axes(group, dtype), rot)
-    axes = turned_twists(turn.T, along, rot)
+        turn, shift = moving.turned_pose(rotation, turned_by, shift)
+        arm = shift if arm is None else arm + shift
+    along = moving.turned_twists(rotation, part.joint.axes(group, dtype), rot)
+    axes = moving.turned_twists(turn.T, along, rot)
     if on is None:
         angular, linear = angular[:, :0], linear[:, :0]
-    swept = jnp.concatenate([angular, linear + levers(arm[None])[0] @ angular])
-    return Mount(
-        turned_twists(turn.T, swept, rot), axes, turn, along, arm, angular
-    ), centre + arm
+    if arm is not None:
+        centre, linear = centre + arm, linear + moving.swept_by(arm, angular)
+    carried = moving.turned_twists(turn.T, jnp.concatenate([angular, linear]), rot)
+    return Mount(carried, axes, turn, along, arm, angular), centre
 
 
 def _rows(carrier: Rod, s: Array) -> Float[Array, "1 quad"]:
