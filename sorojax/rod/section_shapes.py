@@ -30,14 +30,14 @@ def circle(radius, *, shear_factor=9 / 10) -> Section:
         The shear coefficient in Timoshenko's beam theory, J. Appl. Mech. 33, 1966.
     """
     radius = _length("circle", "radius", radius, "Give the outer radius.")
+    return Section(*_disc(radius), shear_factor=shear_factor)
+
+
+@jax.jit
+def _disc(radius):
+    """Area, both second moments and the torsion constant, by one small program."""
     second_moment = math.pi / 4 * radius**4
-    return Section(
-        area=math.pi * radius**2,
-        second_moment_y=second_moment,
-        second_moment_z=second_moment,
-        torsion_constant=2 * second_moment,
-        shear_factor=shear_factor,
-    )
+    return math.pi * radius**2, second_moment, second_moment, 2 * second_moment
 
 
 def ring(radius, inner_radius, *, poisson_ratio=0.5) -> Section:
