@@ -225,9 +225,9 @@ def covered(shape: AbstractSdf, points, edge: float) -> Float[np.ndarray, "*poin
 def _field(shape: AbstractSdf, points) -> Float[np.ndarray, " points"]:
     """By one program for any number, as it takes longer to compile than to run."""
     found = []
-    for at in range(0, len(points), _POINTS):
+    for at in range(0, max(len(points), 1), _POINTS):
         some = points[at : at + _POINTS]
-        rest = np.repeat(some[:1], _POINTS - len(some), axis=0)
+        rest = np.zeros((_POINTS - len(some), points.shape[1]))
         field = evaluate(shape, jnp.asarray(np.concatenate([some, rest])))
         found.append(np.asarray(field)[: len(some)])
     return np.concatenate(found)
