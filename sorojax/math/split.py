@@ -1,7 +1,7 @@
 """Compiled functions of large pytrees that stay the same from call to call.
 
 To take a problem apart costs as much as to evaluate its forces on a small mesh, to take a
-network apart a quarter of its step: it is done once, and calls hand over the list of arrays.
+network apart a third of its step: it is done once, and calls hand over the list of arrays.
 """
 
 from collections.abc import Callable
