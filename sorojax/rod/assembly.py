@@ -118,10 +118,12 @@ def parents(assembly: Assembly) -> tuple[int | None, ...]:
 
 def slices(assembly: Assembly) -> tuple[Slices, ...]:
     """Where each part has its coordinates and rates."""
-    found, q, v = [], 0, 0
+    found, q, v, group = [], 0, 0, assembly.group
     for part in assembly.parts:
         body = part.body.basis.num_dof if isinstance(part.body, Rod) else 0
-        jq, jv = part.joint.num_coordinates(assembly.group), part.joint.num_dof(assembly.group)
+        # by its class, as a module makes an object of each method that is taken from it
+        joint, kind = part.joint, type(part.joint)
+        jq, jv = kind.num_coordinates(joint, group), kind.num_dof(joint, group)
         ends = (slice(q, q + jq), slice(q + jq, q + jq + body))
         rates = (slice(v, v + jv), slice(v + jv, v + jv + body))
         found.append(Slices(*ends, *rates))

@@ -22,7 +22,7 @@ class AbstractJoint(eqx.Module):
 
     def num_coordinates(self, group: Group) -> int:
         """Number of coordinates q."""
-        return self.num_dof(group)
+        return type(self).num_dof(self, group)
 
     @abc.abstractmethod
     def num_dof(self, group: Group) -> int:

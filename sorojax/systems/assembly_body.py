@@ -25,6 +25,8 @@ from sorojax.rod.dynamics import coordinate_rate
 from sorojax.rod.loads import Load
 from sorojax.systems.block import AbstractBlock, Input, Output
 
+_FLUID = {"volume": "m^3", "volume_rate": "m^3/s", "compliance": "m^3/Pa"}
+
 
 class AssemblyBody(AbstractBlock):
     """An assembly with its forces; the state is {q, v}.
@@ -70,10 +72,9 @@ class AssemblyBody(AbstractBlock):
         dim = self.assembly.group.space_dim
         ports = {f"{name}_position": Output("m", (dim,)) for name in self.assembly.names}
         ports["q"] = Output(None, (num_coordinates(self.assembly),))
-        units = {"volume": "m^3", "volume_rate": "m^3/s", "compliance": "m^3/Pa"}
         for name, chamber in self._maps().items():
             needs = frozenset({f"{name}_pressure"})
-            for kind, unit in units.items():
+            for kind, unit in _FLUID.items():
                 ports[f"{name}_{kind}"] = Output(unit, chamber.ports, needs)
         return ports
 
@@ -91,7 +92,7 @@ class AssemblyBody(AbstractBlock):
             return q
         for part, chamber in self._maps().items():
             kind = name.removeprefix(f"{part}_")
-            if name in self.outputs and kind in ("volume", "volume_rate", "compliance"):
+            if name != kind and kind in _FLUID:
                 at = slices(self.assembly)[index_of(self.assembly, part)]
                 own = (q[at.rod_q], v[at.rod_v])
                 return _fluid(chamber, kind, *own, inputs[f"{part}_pressure"])
@@ -127,8 +128,9 @@ def _maps(forces: tuple[Load, ...]) -> list[tuple[str, AbstractPressureMap]]:
 
 def _fluid(chamber: AbstractPressureMap, kind: str, q: Array, v: Array, pressure: Array):
     volume = jax.grad(chamber.coenergy, argnums=1)
+    if kind == "volume":
+        return volume(q, pressure)
     if kind == "compliance":
         one = jnp.ones_like(pressure)
         return jax.jvp(lambda p: volume(q, p), (pressure,), (one,))[1]
-    value, rate = jax.jvp(lambda q: volume(q, pressure), (q,), (v,))
-    return value if kind == "volume" else rate
+    return jax.jvp(lambda q: volume(q, pressure), (q,), (v,))[1]
