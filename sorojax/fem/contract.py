@@ -28,9 +28,10 @@ def block_matrix(
     alone: Alone,
 ) -> tuple[Force, Float[Array, "entries lanes"]]:
     """Sums over points of P G and of G' A G, the latter in the order of `block_entries`."""
-    weighted, bent = alone(lambda: (
+    weighted, bent, pull = alone(lambda: (
         gradients * body.volumes[:, None, None],
         _stiff_gradients(kinematics, answer.tangent, gradients),
+        answer.stress * body.volumes[None],
     ))  # fmt: skip
     shares = alone(lambda: _shares(kinematics, answer, body, weighted))
 
@@ -41,7 +42,7 @@ def block_matrix(
         ]
         if shares is not None:
             blocks = [b + more for b, more in zip(blocks, _bulk(*shares), strict=True)]
-        return _force(kinematics, answer.stress, weighted), _upper(blocks)
+        return _force(kinematics, pull, gradients), _upper(blocks)
 
     return alone(contract)
 
@@ -65,12 +66,12 @@ def _slots_of(kinematics: AbstractKinematics, component: int) -> list[tuple[int,
     return [(e, s.column) for e, s in slots if s.component == component]
 
 
-def _force(kinematics: AbstractKinematics, P: Entries, weighted: Gradients) -> Force:
-    """P : Grad N of every node."""
+def _force(kinematics: AbstractKinematics, P: Entries, gradients: Gradients) -> Force:
+    """P : Grad N of every node, one of both times the volumes of the points."""
     rows = [
         _total(
-            P[e, q][None] * weighted[q, :, j]
-            for q in range(weighted.shape[0])
+            P[e, q][None] * gradients[q, :, j]
+            for q in range(gradients.shape[0])
             for e, j in _slots_of(kinematics, i)
         )
         for i in range(kinematics.dim)

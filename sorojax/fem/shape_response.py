@@ -18,6 +18,7 @@ from sorojax.fem.tensor import (
 )
 from sorojax.material.hyperelastic import AbstractHyperelastic, first_invariant_energy
 from sorojax.material.kinematics import Entry, square_norm
+from sorojax.math.root import inverse_cube_root
 
 
 def shape_energy(
@@ -59,11 +60,11 @@ def shape_response(
     if W is None:
         stress = shape_stress(material, kinematics, F)
         return stress, _differentiated(material, kinematics, F)
-    J, scale, I1, C = _parts(kinematics, F)
+    inverse, scale, I1, C = _parts(kinematics, F)
     x, slopes = _first_invariant(kinematics, F)
     first, second = jax.jvp(_slope(W), (x,), (jnp.ones_like(x),))
-    half = (first * scale / J)[None] * (5 / 9 * (I1 / J)[None] * C - 4 / 3 * F)
-    weight = -2 / 3 * first * scale * I1 / J
+    half = (first * scale * inverse)[None] * (5 / 9 * (I1 * inverse)[None] * C - 4 / 3 * F)
+    weight = -2 / 3 * first * scale * I1 * inverse
     vectors = ShapeVectors(half, C, slopes, second, 2 * first * scale, weight)
     return first[None] * slopes, vectors
 
@@ -101,14 +102,15 @@ def _slope(W):
 
 
 def _parts(kinematics: AbstractKinematics, F: Entries):
-    """J, J^(-2/3), I1 and dJ/dF."""
-    J = volume_ratio(kinematics, F)
-    scale = jnp.exp(-2 / 3 * jnp.log(J))
-    return J, scale, square_norm(kinematics.embed(tuple(F))), volume_slopes(kinematics, F)
+    """1/J, J^(-2/3), I1 and dJ/dF."""
+    root = inverse_cube_root(volume_ratio(kinematics, F))
+    scale = root * root
+    I1 = square_norm(kinematics.embed(tuple(F)))
+    return scale * root, scale, I1, volume_slopes(kinematics, F)
 
 
 def _first_invariant(kinematics: AbstractKinematics, F: Entries) -> tuple[Entry, Entries]:
     """I1_bar - 3 and its derivative by F."""
-    J, scale, I1, C = _parts(kinematics, F)
-    slopes = (2 * scale)[None] * F - (2 / 3 * scale * I1 / J)[None] * C
+    inverse, scale, I1, C = _parts(kinematics, F)
+    slopes = (2 * scale)[None] * F - (2 / 3 * scale * I1 * inverse)[None] * C
     return scale * I1 - 3, slopes

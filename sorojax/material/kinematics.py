@@ -11,8 +11,9 @@ Reference: Bonet & Wood, Nonlinear Continuum Mechanics for Finite Element Analys
 
 from typing import Any
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from sorojax.math.root import inverse_cube_root
 
 Entry = Any  # float or array over points
 Tensor = tuple[tuple[Entry, Entry, Entry], ...]
@@ -96,9 +97,11 @@ def right_cauchy_green(F: Tensor) -> Tensor:
 
 def isochoric_first_invariant(F: Tensor) -> Entry:
     """J^(-2/3) tr(F'F)."""
-    return jnp.exp(-2 / 3 * jnp.log(determinant(F))) * square_norm(F)
+    root = inverse_cube_root(determinant(F))
+    return root * root * square_norm(F)
 
 
 def isochoric_second_invariant(F: Tensor) -> Entry:
     """J^(-4/3) |cof F|^2, half of tr(C)^2 - tr(C^2) of the isochoric C."""
-    return jnp.exp(-4 / 3 * jnp.log(determinant(F))) * square_norm(cofactor(F))
+    square = inverse_cube_root(determinant(F)) ** 2
+    return square * square * square_norm(cofactor(F))
