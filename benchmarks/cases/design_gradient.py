@@ -41,7 +41,7 @@ class Objective(NamedTuple):
 def rows():
     for name, objective in objectives().items():
         for begin in objective.begins:
-            value, both, wrong = _cost(objective, begin == "warm", 1 if quick() else 4)
+            value, both, wrong = _cost(objective, begin == "warm", 1.0 if quick() else 4.0)
             settings = {"objective": name, "start": begin, "densities": objective.start.size,
                         "value_ms": 1e3 * value, "gradient_ms": 1e3 * (both - value),
                         "slope_error": wrong}  # fmt: skip
@@ -125,9 +125,10 @@ def _inflated(chamber: str, begins: tuple[str, ...] = ("warm", "rest")) -> Objec
     return Objective(cell.start, of, begins=begins)
 
 
-def _cost(objective: Objective, warm: bool, repeats: int) -> tuple[float, float, float]:
+def _cost(objective: Objective, warm: bool, budget: float) -> tuple[float, float, float]:
     """Processor seconds of a value and of a value with its gradient, and how far the slope
-    along the way is from that of differences."""
+    along the way is from that of differences. Repeats take `budget` seconds, as a hiccup of
+    the machine is longer than what is compared."""
     size = objective.start.size
     ways = np.random.default_rng(0).uniform(-STEP, STEP, (NUM_DESIGNS, size))
     inside = np.clip(np.asarray(objective.start) + np.cumsum(ways, axis=0), 0.0, 1.0)
@@ -150,10 +151,13 @@ def _cost(objective: Objective, warm: bool, repeats: int) -> tuple[float, float,
         return spent
 
     with silent():
-        spent = np.array([(seconds(value), seconds(both)) for _ in range(repeats + 1)][1:])
+        seconds(value), seconds(both)  # compiles
+        rounds, begin = [], time.process_time()
+        while len(rounds) < 2 or time.process_time() < begin + budget:
+            rounds.append((seconds(value), seconds(both)))
         way = jnp.asarray(designs[1] - designs[0])
         slope = float(jnp.vdot(both(designs[0])[1], way))
         ahead, behind = (float(value(designs[0] + s * 1e-2 * way)) for s in (1, -1))
     # of every design the repeat that met the quietest machine
-    alone, together = spent.min(axis=0).mean(axis=1)
+    alone, together = np.min(rounds, axis=0).mean(axis=1)
     return float(alone), float(together), abs(slope / ((ahead - behind) / 2e-2) - 1)
