@@ -151,7 +151,8 @@ def _cost(objective: Objective, warm: bool, budget: float) -> tuple[float, float
         return spent
 
     with silent():
-        seconds(value), seconds(both)  # compiles
+        for function in (value, both):
+            seconds(function)  # compiles
         rounds, begin = [], time.process_time()
         while len(rounds) < 2 or time.process_time() < begin + budget:
             rounds.append((seconds(value), seconds(both)))

@@ -6,18 +6,17 @@ network apart a third of its step: it is done once, and calls hand over the list
 
 from collections.abc import Callable
 from typing import Any
-from weakref import WeakValueDictionary
 
 import equinox as eqx
 import jax
 
 
 class _Form:
-    """All of a pytree but its arrays. What is equal is one object as a rule, so that to look
-    up a compiled function compares no parts."""
+    """All of a pytree but its arrays."""
 
-    def __init__(self, parts):
-        self._parts, self._hash = parts, hash(parts)
+    def __init__(self, tree, others, others_tree):
+        self._parts = tree, others_tree, tuple(others)
+        self._hash = hash(self._parts)
 
     def __hash__(self):
         return self._hash
@@ -34,9 +33,6 @@ class _Form:
         )
 
 
-_FORMS: WeakValueDictionary[Any, _Form] = WeakValueDictionary()
-
-
 @jax.tree_util.register_pytree_node_class
 class Split:
     """A pytree, taken apart once; what a kernel gives as one it takes without a look."""
@@ -44,9 +40,7 @@ class Split:
     def __init__(self, tree: Any):
         arrays, others = eqx.partition(tree, eqx.is_array)
         self.leaves, form = jax.tree.flatten(arrays)
-        left, left_form = jax.tree.flatten(others)
-        parts = form, left_form, tuple(left)
-        self.form = _FORMS.setdefault(parts, _Form(parts))
+        self.form = _Form(form, *jax.tree.flatten(others))
 
     def whole(self) -> Any:
         return self.form.whole(self.leaves)
