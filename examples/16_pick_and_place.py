@@ -55,7 +55,6 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     tips = jax.jit(lambda q: robots.middle(whole, q, [f"{name}_tip" for name in FINGERS]))
     home = tips(valves.state.q)
 
-    @jax.jit
     def asked(place, gripper):
         """Pressures that would bring the tips from their first place to another."""
         return jnp.append(back @ (place - home), gripper)
