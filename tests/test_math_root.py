@@ -29,9 +29,17 @@ def test_derivatives_of_any_order(x):
 
 @pytest.mark.parametrize("kind", ["float64", "float32"])
 def test_without_a_root_there_is_no_number(kind):
-    x = np.array([0.0, -1e-3, -2.0, np.inf, np.nan], kind)
+    denormal = np.finfo(kind).tiny / 2
+    x = np.array([0.0, -1e-3, -2.0, np.inf, -np.inf, np.nan, denormal], kind)
     assert np.all(np.isnan(root(x)))
     assert np.all(np.isnan(jax.grad(lambda x: jnp.sum(inverse_cube_root(x)))(x)))
+
+
+@pytest.mark.parametrize("kind", ["float64", "float32"])
+def test_the_smallest_and_the_largest_number_have_a_root(kind):
+    ends = np.array([np.finfo(kind).tiny, np.finfo(kind).max])
+    exact = ends.astype(np.longdouble) ** (np.longdouble(-1) / 3)
+    assert np.allclose(root(ends), exact.astype(kind), rtol=2 * np.finfo(kind).eps, atol=0)
 
 
 def test_other_numbers_take_a_power():

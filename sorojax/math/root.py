@@ -19,18 +19,19 @@ _ONE = {"float64": (0x3FF00000, 71_500), "float32": (0x3F800000, 572_000)}
 
 @jax.custom_jvp
 def inverse_cube_root(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """x^(-1/3) to one unit in the last place; NaN unless 0 < x < inf.
+    """x^(-1/3) to one unit in the last place; NaN unless x is a normal number above zero.
 
     A few operations on all entries, where a library is called for each otherwise: a sixth of
-    the time of a power by exponential and logarithm. Its derivatives hold no division.
+    the time of a power by exponential and logarithm. Derivatives are powers of the root.
     """
     x = jnp.asarray(x)
     if x.dtype.name not in _ONE:
         return x ** (-1 / 3)
     guess = _guess(x)
-    rest = 1 - x * (guess * guess * guess)
+    # from the left: x times one root is far from the ends of the numbers, a cube is not
+    rest = 1 - x * guess * guess * guess
     near = guess + guess * rest * polynomial(_SERIES, rest)
-    rest = 1 - x * (near * near * near)
+    rest = 1 - x * near * near * near
     # XLA repeats cheap operations for every use of theirs, but no division: so it ends in one
     return jnp.where(x > 0, near, jnp.nan) / (1 - rest * (1 / 3 + rest / 9))
 

@@ -6,11 +6,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import is_traced, real
+from sorojax._types import real
 from sorojax.math.contact_stepper import ContactMidpoint
 from sorojax.math.jit import once
 from sorojax.math.linearly_implicit import Rosenbrock2
@@ -79,10 +78,7 @@ def partitioned(
     start = Parted(state, jnp.zeros_like(state[body]["v"]), jnp.zeros_like(h))
 
     def move(parted: Parted, inputs: Signals) -> Parted:
-        given = {
-            name: value if is_traced(value) else np.asarray(value, h.dtype)
-            for name, value in inputs.items()
-        }
+        given = {name: jnp.asarray(value, h.dtype) for name, value in inputs.items()}
         return _move(fixed, parted, given, body, substeps)
 
     return move, start
