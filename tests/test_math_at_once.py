@@ -84,3 +84,12 @@ def test_numbers_do_not_compile_again():
         slope = jax.grad(function)(X * scale, Y + scale)
         np.testing.assert_allclose(slope, Y + scale, rtol=1e-15)
     assert count == once
+
+
+def test_without_the_private_door_of_jax(monkeypatch):
+    """Where a version of JAX has it no longer, or another, the derivative is traced."""
+    ad = pytest.importorskip("jax._src.interpreters.ad")
+    told = jax.grad(cost(at_once(parts)))(X)
+    for rule in [r for r in ad.primitive_linearizations if r.name == "at_once"]:
+        monkeypatch.delitem(ad.primitive_linearizations, rule)
+    np.testing.assert_array_equal(jax.grad(cost(at_once(parts)))(X), told)

@@ -73,12 +73,12 @@ def _places(grid: mesh.Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def continuation(k: int) -> tuple[float, float]:
-    """Exponent and sharpness at step k: 1 to 3 by 0.05, every 2 steps up to 2 and every 5
-    from there; then 4 to 64, doubled in 10 steps, in small ones lest a grey bar vanishes."""
+    """Exponent and sharpness at step k, as in section 5.1 of the reference: 1 to 3 by 0.05,
+    every 2 steps up to 2 and every 5 from there; then 4 to 64, doubled every 10 steps."""
     early = min(k // 2, 20)
     late = max(0, (k - 40) // 5)
     penalty = min(1 + 0.05 * early + 0.05 * late, 3.0)
-    doubled = min(max(0, k - 140) / 10, 4.0)
+    doubled = min(max(0, k - 140) // 10, 4)
     return penalty, 4.0 * 2.0**doubled
 
 

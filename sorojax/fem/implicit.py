@@ -86,7 +86,7 @@ def _linearised_at(call: Solve, traced, dots, u, counts, values):
         values = linearise(problem, _prepare_traced(problem), u, u).values
     elif is_traced(traced):
         values = _tangent_values(call, traced, u, values)
-    return Equilibrium(params, rest, u, values, counts[0]), rates
+    return Equilibrium(params, rest, u, values, counts), rates
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))

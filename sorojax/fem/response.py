@@ -27,15 +27,15 @@ from sorojax.math.linear_map import pushed
 class Equilibrium(NamedTuple):
     """What the map is made of: the numbers that move, all others, and the state.
 
-    `values` are those of the tangent; `failed` is one where the state is no equilibrium,
-    which has no derivative.
+    `values` are those of the tangent; the first of the `counts` of the solve is one where the
+    state is no equilibrium, which has no derivative.
     """
 
     params: Problem
     rest: Problem
     u: Float[Array, "nodes dim"]
     values: Float[Array, " nnz"]
-    failed: Float[Array, ""]
+    counts: Float[Array, " 4"]
 
 
 def response(at: Equilibrium, rates: Problem) -> Float[Array, "nodes dim"]:
@@ -162,4 +162,5 @@ def _answer(system: sparse.SparseSymmetric, matrix, rhs, u):
 
 def _valid(at: Equilibrium) -> Float[Array, ""]:
     """1, or NaN where there is no derivative: a factor keeps the map linear."""
-    return jnp.where(at.failed == 0, jnp.ones_like(at.failed), jnp.nan)
+    failed = at.counts[0]
+    return jnp.where(failed == 0, jnp.ones_like(failed), jnp.nan)
