@@ -14,6 +14,7 @@ from sorojax._types import real
 from sorojax.math.batch import batched
 from sorojax.math.dense import solve_symmetric
 from sorojax.math.door import door, full_products
+from sorojax.math.long_batch import long_batches
 from sorojax.rod import loads
 from sorojax.rod.assembly import Assembly, is_flat, rate
 from sorojax.rod.forces import Gravity
@@ -74,6 +75,7 @@ def damping_matrix(model: Model, forces: Forces) -> Float[Array, "dof dof"]:
     return loads.damping_matrix(forces, model, operators(model))
 
 
+@long_batches
 @door
 def forward_dynamics(
     model: Model,
@@ -85,8 +87,9 @@ def forward_dynamics(
 ) -> Float[Array, "*states dof"]:
     """Acceleration of the coordinates, of one state or many.
 
-    States along a first axis of `q` and `v` are taken in chunks that stay in the cache of
-    a CPU. For many models give `sorojax.math.batch.batched` this verb.
+    States along a first axis of `q` and `v`, and models and states by `jax.vmap`, are taken
+    in chunks that stay in the cache of a CPU. A loop around this verb keeps its lanes at
+    once: give the loop to `sorojax.math.batch.batched`.
 
     Args:
         model: The rod or assembly.
@@ -108,6 +111,7 @@ def forward_dynamics(
     return batched(one)(q, v)
 
 
+@long_batches
 @full_products
 def acceleration(
     model: Model,
