@@ -12,16 +12,18 @@ from benchmarks.harness import left_out
 from benchmarks.rows import dumps, line
 
 
-def environment() -> dict[str, str]:
+def environment(workers: int) -> dict[str, str]:
     """What a measured process needs in its environment before it starts.
 
-    One thread per library; two for JAX, because a host callback that waits for the
-    only worker thread waits for ever. Run-time checks are left out of the timings.
+    One thread per library, `workers` of JAX. A case takes two, because a host callback that
+    waits for the only one waits for ever; where nothing calls the host and arrays are long it
+    takes one: two that share the core wait for each other's time slice of 4 ms. Run-time
+    checks are left out of the timings.
     """
     threads = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
     return dict.fromkeys(threads, "1") | {
-        "NPROC": "2",
-        "PJRT_NPROC": "2",
+        "NPROC": str(workers),
+        "PJRT_NPROC": str(workers),
         "EQX_ON_ERROR": "nan",
         "JAX_PLATFORMS": os.environ.get("JAX_PLATFORMS", "cpu"),
     }

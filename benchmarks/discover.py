@@ -21,6 +21,14 @@ def description(path: Path) -> str:
     return text.partition("\n")[0]
 
 
+def workers(path: Path) -> int:
+    """Threads of JAX that a case asks for by `WORKERS = 1`, two otherwise; read likewise."""
+    for statement in ast.parse(path.read_text()).body:
+        if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == "WORKERS":
+            return ast.literal_eval(statement.value)
+    return 2
+
+
 def load(name: str, path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(f"case_{path.stem}", path)
     if spec is None or spec.loader is None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.child import environment
-from benchmarks.discover import HERE
+from benchmarks.discover import HERE, workers
 from benchmarks.rows import line, missing
 
 TIME_LIMIT = 1800.0  # s per case
@@ -37,7 +37,7 @@ def _run(name: str, file: Path, lines: Path, log: Path, limit: float) -> str | N
         child = subprocess.Popen(
             command,
             cwd=HERE.parent,
-            env=os.environ | environment(),
+            env=os.environ | environment(workers(file)),
             stdout=out,
             stderr=subprocess.STDOUT,
             start_new_session=True,

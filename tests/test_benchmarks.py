@@ -86,6 +86,11 @@ def test_a_case_writes_json_lines(folder):
     assert ours["settings"] == {"size": 8, "cores": 1, "NPROC": "2", "bar_on": "run_s"}
 
 
+def test_a_case_may_ask_for_one_worker(folder):
+    (folder / "math_alone.py").write_text(CASE.replace("def rows", "WORKERS = 1\n\ndef rows"))
+    assert run(folder, "math.alone")[1][0]["settings"]["NPROC"] == "1"
+
+
 def test_a_missing_peer_is_a_row_with_its_reason(folder):
     peer = run(folder, "math.product")[1][-1]
     assert peer["code"] == "soromox" and peer["run_s"] is None and peer["holds"] is None

@@ -62,13 +62,18 @@ def _grid(nx: int, ny: int):
 
 
 def _timed(loss, volume, cells: int, fraction: float, **options):
-    spent, last = [], _clocks()
+    """Seconds and processor time of every step, and processor time of the objective with its
+    derivatives alone at each of the designs, next to one another in time."""
+    both = jax.jit(jax.value_and_grad(loss))
+    spent, alone, last = [], [], _clocks()
 
-    def tick(_):
+    def tick(step):
         nonlocal last
-        now = _clocks()
-        spent.append(now - last)
-        last = now
+        spent.append(_clocks() - last)
+        begin = time.process_time()
+        jax.block_until_ready(both(0.999 * step.design))
+        alone.append(time.process_time() - begin)
+        last = _clocks()
 
     with silent():
         found = design.minimise(
@@ -76,7 +81,7 @@ def _timed(loss, volume, cells: int, fraction: float, **options):
             on_step=tick, **options,
         )  # fmt: skip
     seconds, work = np.array(spent).T
-    return found, seconds, work
+    return found, seconds, float(np.median(work[3:]) / np.median(alone[3:]))
 
 
 def _clocks() -> np.ndarray:
@@ -97,22 +102,10 @@ def _beam(nx: int, ny: int, radius: float, kind: str):
     if kind == "sensitivity":
         changed = jax.jit(lambda x, g: design.sensitivity_filtered(smooth, x, g))
     loss = jax.jit(lambda x: design.compliance(model, interpolation(dense(x))))
-    found, seconds, work = _timed(
+    return _timed(
         loss, jax.jit(lambda x: jnp.mean(dense(x)) - 0.5), nx * ny, 0.5, steps=400,
         optimiser=design.OptimalityCriteria(), change_gradient=changed,
     )  # fmt: skip
-    return found, seconds, float(np.median(work[3:])) / _alone(loss, found.design)
-
-
-def _alone(loss, x) -> float:
-    """Processor time of the objective with its derivatives, a new design every time [s]."""
-    both, spent = jax.jit(jax.value_and_grad(loss)), []
-    for _ in range(23):
-        x = 0.999 * x
-        begin = time.process_time()
-        jax.block_until_ready(both(x))
-        spent.append(time.process_time() - begin)
-    return float(np.median(spent[3:]))
 
 
 def _inverter(nx: int, ny: int):
