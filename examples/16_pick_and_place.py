@@ -70,7 +70,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
         measure=lambda *_: asked(tips(valves.state.q), 0.0),
     ))  # fmt: skip
 
-    film = robots.replay(whole, valves.states)
+    film = robots.replay(whole, valves.states, ("cylinder", "plate"))
     seen = systems.touching(whole, contacts, film.q, film.v)
     *fingers, floor = np.asarray(seen.overlap).T
     force = np.asarray(seen.effort)[:, : len(fingers), -1].sum(axis=1)  # what lifts it

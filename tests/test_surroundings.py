@@ -1,5 +1,6 @@
 """What examples are put together from: robots among other bodies, simulated boards, streams."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -47,6 +48,14 @@ def test_a_robot_hangs_over_a_cylinder():
     assert np.allclose(middle, [0, 0, 0.3]) and np.isclose(poses["thing"][2, 3], 20 * mm)
     seen = systems.touching(whole, (rod.On("thing", floor),), q[None], jnp.zeros((1, 6)))
     assert abs(seen.overlap[0, 0]) < 1e-12  # it stands
+    states = [SimpleNamespace(q=q, v=jnp.zeros(6))] * 3
+    film, few = robots.replay(whole, states), robots.replay(whole, states, ["thing"])
+    assert set(film.poses) == {"arm", "hand", "thing"} and set(few.poses) == {"thing"}
+    assert np.array_equal(few.q, jnp.stack([q] * 3)) and few.v.shape == (3, 6)
+    assert np.allclose(few.poses["thing"], poses["thing"][None])
+    assert np.allclose(film.poses["hand"], poses["hand"][None])
+    with pytest.raises(ValueError, match=r"got the parts \['leg'\], the model has \['arm'"):
+        robots.replay(whole, states, ["leg"])
     with pytest.raises(ValueError, match="has a part called `arm` already"):
         robots.surrounded(model, (), arm=thing)
 

@@ -110,20 +110,41 @@ class Replay(NamedTuple):
     poses: dict[str, Float[np.ndarray, "moments h h"]]
 
 
-def replay(model: Assembly, states: Sequence[InContact]) -> Replay:
-    """The states that a board kept, in a row."""
+def replay(
+    model: Assembly, states: Sequence[InContact], parts: Sequence[str] | None = None
+) -> Replay:
+    """The states that a board kept, in a row.
+
+    Args:
+        model: The robot with what is around it.
+        states: In the order of time.
+        parts: Those whose poses are asked for; all if omitted. Few compile faster.
+
+    Raises:
+        ValueError: If the model has no part of such a name.
+    """
+    parts = model.names if parts is None else tuple(parts)
+    if unknown := sorted(set(parts) - set(model.names)):
+        raise ValueError(
+            f"replay: got the parts {unknown}, the model has {sorted(model.names)}. Name some "
+            "of these."
+        )
     # on the host: each number of states would be a program of its own
     q, v = (
         jnp.asarray(np.stack([np.asarray(getattr(state, name)) for state in states]))
         for name in ("q", "v")
     )
-    poses = _poses(model, q)
+    poses = _poses(model, q, parts)
     return Replay(q, v, {name: np.asarray(rows) for name, rows in poses.items()})
 
 
 @once
-def _poses(model: Assembly, q):
-    return jax.lax.map(lambda row: tip_pose(model, row), q)
+def _poses(model: Assembly, q, parts: tuple[str, ...]):
+    def at(row):
+        poses = tip_pose(model, row)
+        return {name: poses[name] for name in parts}
+
+    return jax.lax.map(at, q)
 
 
 def contact_stepper(
