@@ -94,7 +94,7 @@ def _far():
             return linear.linearise(*jax.tree.unflatten(tree, leaves), u, u)
 
         calls[name] = assemble
-    timed = measure_together(calls, u, repeats=15)
+    timed = measure_together(calls, u, repeats=100)  # 15 were 50 ms, shorter than a hiccup
     base = min(timed["none"].runs)
     for name, timing in timed.items():
         extra = min(timing.runs) / base - 1
