@@ -71,7 +71,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     ))  # fmt: skip
 
     film = robots.replay(whole, valves.states, ("cylinder", "plate"))
-    seen = systems.touching(whole, contacts, film.q, film.v)
+    seen = systems.touching(whole, contacts, film.q, film.v, ["cylinder"])
     *fingers, floor = np.asarray(seen.overlap).T
     force = np.asarray(seen.effort)[:, : len(fingers), -1].sum(axis=1)  # what lifts it
     thing, plate = film.poses["cylinder"], film.poses["plate"]

@@ -67,6 +67,16 @@ def test_what_contacts_did_is_what_they_give():
     assert up > 0 > down  # the ground lifts the arm, the ball presses on it
     assert np.isclose(seen.effort[0, 1, -1], -down, rtol=1e-6)  # and is pressed as hard
     assert seen.effort[0, 1, -2] < 0 == seen.effort[0, 0, -2]  # friction brakes the ball
+    at = {"arm": [0, 1], "ball": [2, 3, 4]}
+    for parts in (["ball"], ["arm"], ["ball", "arm"]):
+        some = systems.touching(model, contacts, q, v, parts)
+        chosen = [k for name in parts for k in at[name]]
+        assert np.allclose(some.effort, seen.effort[..., chosen], rtol=0, atol=1e-12)
+        assert np.array_equal(some.overlap, seen.overlap)
+    with pytest.raises(ValueError, match="there is no part `leg`"):
+        systems.touching(model, contacts, q, v, ["leg"])
+    with pytest.raises(ValueError, match=r"got the parts \['arm'\] of a rod"):
+        systems.touching(finger, (ground,), q[:, :2], v[:, :2], ["arm"])
     with pytest.raises(TypeError, match="got a Gravity, need contacts"):
         systems.touching(model, (R.Gravity(),), q, v)
 

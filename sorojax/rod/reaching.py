@@ -9,12 +9,13 @@ from jaxtyping import Array, Float
 
 from sorojax.math.dense import product, solve_symmetric
 from sorojax.rod.assembly import index_of
+from sorojax.rod.columns import part_columns
 from sorojax.rod.link import LinkMotion
 from sorojax.rod.loads import Load, total_force
 from sorojax.rod.motion import Motion
 from sorojax.rod.points import Points, points
 from sorojax.rod.targets import AbstractTarget, Clear, Frames
-from sorojax.rod.tree import AssemblyMotion, part_columns, part_motion
+from sorojax.rod.tree import AssemblyMotion, part_motion
 
 OBSTACLE_WEIGHT = 30.0  # of a bound against a target; sets how fast bounds are met
 

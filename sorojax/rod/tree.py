@@ -192,19 +192,6 @@ def part_motion(moment: AssemblyMotion, index: int) -> Any:
     return place_link(link_motion(body, constants, twist), rotation, position)
 
 
-def part_columns(moment: AssemblyMotion) -> tuple[Float[Array, "own dof"], ...]:
-    """Twist and coordinates of each part per rate of the assembly."""
-    assembly, found = moment.assembly, []
-    total, dtype = moment.v.shape[0], moment.v.dtype
-    identity = jnp.asarray(np.eye(total), dtype)
-    for on, at, mount in zip(parents(assembly), slices(assembly), moment.mounts, strict=True):
-        twist = mount.axes @ identity[at.joint_v]
-        if on is not None:
-            twist = twist + mount.carried @ found[on]
-        found.append(jnp.concatenate([twist, identity[at.rod_v]]))
-    return tuple(found)
-
-
 Section = tuple[Array, Array, Array, Array]
 
 

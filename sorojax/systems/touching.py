@@ -1,10 +1,12 @@
 """What contacts did along a motion of rods: how deep, how hard, and what they moved."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax._types import real
@@ -22,9 +24,10 @@ from sorojax.rod import (
     part_motion,
 )
 from sorojax.rod.alike import each
+from sorojax.rod.assembly import index_of, num_dof, slices
+from sorojax.rod.columns import columns_of
 from sorojax.rod.pressing import Touch
 from sorojax.rod.rod_contact import touches
-from sorojax.rod.tree import part_columns
 
 
 class Touching(eqx.Module):
@@ -34,7 +37,8 @@ class Touching(eqx.Module):
         overlap: Greatest overlap of each contact [m]; below zero the distance that is left.
         push: Resultant of the normal forces on the body, the first one of a pair [N].
         effort: Generalised force of each contact, friction included, over the rates of the
-            model: of a link that is free to move, the force and moment on it.
+            model, or of those of its parts that were asked for: of a link that is free to
+            move, the force and moment on it.
     """
 
     overlap: Float[Array, "moments contacts"]
@@ -47,6 +51,7 @@ def touching(
     contacts: tuple[Any, ...],
     q: Float[Array, "moments coordinates"],
     v: Float[Array, "moments dof"],
+    parts: Sequence[str] | None = None,
 ) -> Touching:
     """Overlaps and forces of `contacts` along a motion.
 
@@ -56,20 +61,30 @@ def touching(
             `Between(first, second, contact)`.
         q: Coordinates, e.g. of a `Rollout`.
         v: Rates; they set the friction.
+        parts: Of an assembly, those over whose rates to tell the efforts, one part after
+            the other; all if omitted. Few compile faster.
 
     Raises:
         TypeError: If one of `contacts` is no contact.
+        ValueError: If the model has no part of such a name.
     """
     for contact in contacts:
         _check_kind(contact)
-    return _along(model, contacts, real(q), real(v))
+    rates = tuple(range(num_dof(model)))
+    if parts is not None:
+        if isinstance(model, Rod):
+            raise ValueError(f"touching: got the parts {list(parts)} of a rod, which has none. "
+                             "Leave them out.")  # fmt: skip
+        places = [slices(model)[index_of(model, name)] for name in parts]
+        rates = tuple(k for at in places for own in (at.joint_v, at.rod_v) for k in rates[own])
+    return _along(model, contacts, rates, real(q), real(v))
 
 
 @once
-def _along(model, contacts, q, v) -> Touching:
+def _along(model, contacts, rates: tuple[int, ...], q, v) -> Touching:
     def at(q, v):
         here = motion(model, q, v)
-        rows = each(_seen, [_seated(contact, here) for contact in contacts])
+        rows = each(_seen, [_seated(contact, here, rates) for contact in contacts])
         return Touching(*(jnp.stack(column) for column in zip(*rows, strict=True)))
 
     return jax.lax.map(lambda row: at(*row), (q, v))
@@ -88,20 +103,23 @@ def _check_kind(contact: Any) -> None:
         )
 
 
-def _seated(contact: Any, here: Any) -> tuple[Any, ...]:
-    """A contact, the bodies that it is on, and their columns per rate of the model."""
-    inner = _inner(contact)
+def _seated(contact: Any, here: Any, rates: tuple[int, ...]) -> tuple[Any, ...]:
+    """A contact, the columns per rate of the bodies that it is on, an effort of nothing, and
+    these bodies."""
+    inner, nothing = _inner(contact), jnp.zeros(len(rates), here.v.dtype)
     if isinstance(here, Motion):
-        return inner, jnp.eye(here.v.shape[0], dtype=here.v.dtype), here
+        return inner, (jnp.eye(len(rates), dtype=here.v.dtype),), nothing, here
     names = (contact.part,) if isinstance(contact, On) else (contact.first, contact.second)
-    places, columns = [here.assembly.names.index(name) for name in names], part_columns(here)
-    own = jnp.concatenate([columns[k] for k in places])
-    return inner, own, *(part_motion(here, k) for k in places)
+    places = [here.assembly.names.index(name) for name in names]
+    columns = columns_of(here, np.array(rates, int))
+    own = tuple(columns[k] for k in places)
+    return inner, own, nothing, *(part_motion(here, k) for k in places)
 
 
-def _seen(contact: Any, own: Array, *bodies: Any):
-    load = contact(jnp.zeros((), own.dtype), *bodies)
-    effort = (load if len(bodies) == 1 else jnp.concatenate(load)) @ own
+def _seen(contact: Any, own: tuple[Array | None, ...], effort: Array, *bodies: Any):
+    load = contact(jnp.zeros((), effort.dtype), *bodies)
+    for part, columns in zip((load,) if len(bodies) == 1 else load, own, strict=True):
+        effort = effort if columns is None else effort + part @ columns
     is_pair = isinstance(contact, RodContact)
     found = touches(contact, *bodies) if is_pair else (contact.touch(*bodies),)
     overlap = -jnp.min(jnp.concatenate([touch.gap for touch in found]))
