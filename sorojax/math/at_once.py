@@ -189,8 +189,8 @@ mlir.register_lowering(
 
 
 def _tell_jax_the_linear_part() -> None:
-    """Spares JAX tracing `_derivative` to find it, half of what asking for a derivative takes.
-    Its door for that is not public: where it is missing or another, JAX traces."""
+    """Spares JAX tracing `_derivative` to find it. Its door for that is not public: where it is
+    missing or another, JAX traces."""
     try:
         from jax._src.interpreters.ad import fallback_linearize_rule, primitive_linearizations
     except ImportError:
