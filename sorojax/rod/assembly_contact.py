@@ -9,11 +9,11 @@ from jaxtyping import Array
 from sorojax.math.steppers import ContactTerms
 from sorojax.rod.alike import each
 from sorojax.rod.assembly import index_of
-from sorojax.rod.columns import part_columns
 from sorojax.rod.contact_force import AbstractContact
 from sorojax.rod.contact_terms import contact_terms, has_contact, near, travel
 from sorojax.rod.link_contact import LinkContact
 from sorojax.rod.loads import Between, Load, On, check, total_force
+from sorojax.rod.part_columns import part_columns
 from sorojax.rod.rod import Rod
 from sorojax.rod.rod_contact import RodContact
 from sorojax.rod.tree import AssemblyMotion, part_motion

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax.rod.assembly import parents, slices
-from sorojax.rod.columns import part_columns
 from sorojax.rod.kernel import bias_rates, rod_inertia
 from sorojax.rod.link import Link, LinkOperators, link_inertia, link_motion
 from sorojax.rod.moving import cross, release, turned_twists
+from sorojax.rod.part_columns import part_columns
 from sorojax.rod.tree import AssemblyMotion, Mount, batches
 
 

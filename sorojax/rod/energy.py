@@ -7,12 +7,12 @@ from jaxtyping import Array, Float
 from sorojax._types import real
 from sorojax.math.door import door
 from sorojax.rod.assembly import is_flat, slices
-from sorojax.rod.columns import part_columns
 from sorojax.rod.dynamics import coordinate_rate
 from sorojax.rod.link import LinkMotion
 from sorojax.rod.mass_line import mass_jacobian, mass_position
 from sorojax.rod.model import Model, inertia, motion
 from sorojax.rod.motion import Motion
+from sorojax.rod.part_columns import part_columns
 from sorojax.rod.points import moment_of
 from sorojax.rod.rod import Rod
 from sorojax.rod.tree import AssemblyMotion, part_motion

@@ -12,13 +12,13 @@ from sorojax.math.door import door
 from sorojax.math.lie import homogeneous
 from sorojax.math.quadrature import integration_rows, interpolation_rows
 from sorojax.rod.assembly import Assembly
-from sorojax.rod.columns import part_columns
 from sorojax.rod.composite import bias_accelerations
 from sorojax.rod.kernel import bias_rates, rod_motion
 from sorojax.rod.link import LinkMotion
 from sorojax.rod.model import Model, inertia as inertia, motion as motion
 from sorojax.rod.motion import Motion, operators, rest_along
 from sorojax.rod.moving import cross, turned
+from sorojax.rod.part_columns import part_columns
 from sorojax.rod.points import Points
 from sorojax.rod.rod import Rod, strain_names
 from sorojax.rod.tree import AssemblyMotion, part_motion

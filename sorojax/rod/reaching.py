@@ -9,10 +9,10 @@ from jaxtyping import Array, Float
 
 from sorojax.math.dense import product, solve_symmetric
 from sorojax.rod.assembly import index_of
-from sorojax.rod.columns import part_columns
 from sorojax.rod.link import LinkMotion
 from sorojax.rod.loads import Load, total_force
 from sorojax.rod.motion import Motion
+from sorojax.rod.part_columns import part_columns
 from sorojax.rod.points import Points, points
 from sorojax.rod.targets import AbstractTarget, Clear, Frames
 from sorojax.rod.tree import AssemblyMotion, part_motion

@@ -25,7 +25,7 @@ from sorojax.rod import (
 )
 from sorojax.rod.alike import each
 from sorojax.rod.assembly import index_of, num_dof, slices
-from sorojax.rod.columns import columns_of
+from sorojax.rod.part_columns import columns_of
 from sorojax.rod.pressing import Touch
 from sorojax.rod.rod_contact import touches
 
