@@ -177,3 +177,27 @@ def test_import_is_cheap_and_sets_no_flag():
         shares.append(float(seconds) / float(below))
     # in seconds it is the benchmark cli.import
     assert min(shares) < 1.0, f"import sorojax costs {min(shares):.2f} of what lies below it"
+
+
+HIDDEN = """
+import contextlib, importlib, pkgutil, sys
+for floor in sys.argv[1:]:
+    package = importlib.import_module("sorojax." + floor)
+    public = {name: value for name, value in vars(package).items() if callable(value)}
+    for module in pkgutil.iter_modules(package.__path__):
+        with contextlib.suppress(ImportError):  # of what is not installed
+            importlib.import_module(package.__name__ + "." + module.name)
+    for name, value in public.items():
+        if getattr(package, name) is not value:
+            print(package.__name__ + "." + name)
+"""
+
+
+def test_no_module_hides_a_public_name():
+    """A module is set on its package when it is first imported, over a function of its name."""
+    floors = [name for name in FLOOR if (CORE / name).is_dir()]
+    done = subprocess.run(
+        [sys.executable, "-c", HIDDEN, *floors],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout == ""
