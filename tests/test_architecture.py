@@ -180,13 +180,12 @@ def test_import_is_cheap_and_sets_no_flag():
 
 
 HIDDEN = """
-import contextlib, importlib, pkgutil, sys
+import importlib, pkgutil, sys
 for floor in sys.argv[1:]:
     package = importlib.import_module("sorojax." + floor)
     public = {name: value for name, value in vars(package).items() if callable(value)}
     for module in pkgutil.iter_modules(package.__path__):
-        with contextlib.suppress(ImportError):  # of what is not installed
-            importlib.import_module(package.__name__ + "." + module.name)
+        importlib.import_module(package.__name__ + "." + module.name)
     for name, value in public.items():
         if getattr(package, name) is not value:
             print(package.__name__ + "." + name)

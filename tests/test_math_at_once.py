@@ -90,6 +90,7 @@ def test_without_the_private_door_of_jax(monkeypatch):
     """Where a version of JAX has it no longer, or another, the derivative is traced."""
     ad = pytest.importorskip("jax._src.interpreters.ad")
     told = jax.grad(cost(at_once(parts)))(X)
-    for rule in [r for r in ad.primitive_linearizations if r.name == "at_once"]:
-        monkeypatch.delitem(ad.primitive_linearizations, rule)
+    rules = getattr(ad, "primitive_linearizations", {})
+    for rule in [r for r in rules if r.name == "at_once"]:
+        monkeypatch.delitem(rules, rule)
     np.testing.assert_array_equal(jax.grad(cost(at_once(parts)))(X), told)

@@ -54,7 +54,7 @@ def test_a_robot_hangs_over_a_cylinder():
     assert np.array_equal(few.q, jnp.stack([q] * 3)) and few.v.shape == (3, 6)
     assert np.allclose(few.poses["thing"], poses["thing"][None])
     assert np.allclose(film.poses["hand"], poses["hand"][None])
-    with pytest.raises(ValueError, match=r"got the parts \['leg'\], the model has \['arm'"):
+    with pytest.raises(ValueError, match="there is no part `leg`"):
         robots.replay(whole, states, ["leg"])
     with pytest.raises(ValueError, match="has a part called `arm` already"):
         robots.surrounded(model, (), arm=thing)

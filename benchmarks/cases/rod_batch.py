@@ -20,7 +20,7 @@ from sorojax.math.lie import SE2, SE3
 from sorojax.rod import Gravity, chebyshev, circle, forward_dynamics, operators, rod
 from sorojax.units import MPa, mm
 
-WORKERS = 1
+WORKERS = 1  # nothing here calls the host
 STATES = 1024
 ITEM_BAR = 3.5e-6  # s of a state in a batch
 PLANAR_BAR = 0.45  # share of the spatial acceleration

@@ -18,6 +18,7 @@ from sorojax.math.steppers import AbstractStepper
 from sorojax.robots.around import below, cylinder, rim
 from sorojax.robots.models_supply import Model
 from sorojax.rod import Assembly, Free, LinkObstacle, Part, assembly, tip_pose
+from sorojax.rod.assembly import index_of
 from sorojax.rod.loads import Load
 from sorojax.sdf import HalfSpace
 from sorojax.systems import AssemblyBody, Parted, partitioned
@@ -124,11 +125,8 @@ def replay(
         ValueError: If the model has no part of such a name.
     """
     parts = model.names if parts is None else tuple(parts)
-    if unknown := sorted(set(parts) - set(model.names)):
-        raise ValueError(
-            f"replay: got the parts {unknown}, the model has {sorted(model.names)}. Name some "
-            "of these."
-        )
+    for name in parts:
+        index_of(model, name)
     # on the host: each number of states would be a program of its own
     q, v = (
         jnp.asarray(np.stack([np.asarray(getattr(state, name)) for state in states]))
