@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.extend import core
 
 
 def real(value: Any) -> jax.Array:
@@ -48,6 +49,14 @@ def integers(value: Any) -> jax.Array:
 def is_traced(tree: Any) -> bool:
     """Whether any leaf of `tree` is an abstract value of a JAX transformation."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def at_the_top() -> bool:
+    """Whether no transformation of JAX is at work here."""
+    return core.get_opaque_trace_state(convention="flax") == _AT_THE_TOP
+
+
+_AT_THE_TOP = core.get_opaque_trace_state(convention="flax")
 
 
 def platform() -> str:

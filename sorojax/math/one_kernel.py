@@ -24,6 +24,7 @@ import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend import core
 
+from sorojax._types import at_the_top
 from sorojax.math.trigonometry import cosine, sine
 
 LARGEST = 4096  # numbers in an array that is made inside a loop: some 32 kB
@@ -97,7 +98,7 @@ def one_kernel(function: Callable[..., Answer]) -> Callable[..., tuple[Answer, A
 def runs_alone(*args: Any, largest: float = LARGEST_GIVEN) -> bool:
     """Whether a call with `args` is a program by itself on a CPU, of arrays of at most
     `largest` numbers."""
-    if core.get_opaque_trace_state(convention="flax") != _AT_THE_TOP:
+    if not at_the_top():
         return False
     for leaf in jax.tree.leaves(args):
         if isinstance(leaf, jax.core.Tracer) or getattr(leaf, "size", 0) > largest:
@@ -108,7 +109,6 @@ def runs_alone(*args: Any, largest: float = LARGEST_GIVEN) -> bool:
 
 # The mark and the options belong to the compiler of these releases.
 _KNOWN = metadata.version("jaxlib").startswith("0.10.")
-_AT_THE_TOP = core.get_opaque_trace_state(convention="flax")
 
 
 def _run(jaxpr: Any, consts: Any, args: list[Any], reads: list[Any]) -> list[Any]:
