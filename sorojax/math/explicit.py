@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from sorojax.math.method import AbstractMethod, Field, Step
+from sorojax.math.small_products import with_sums
 
 
 class Tableau(NamedTuple):
@@ -56,6 +57,7 @@ class Tsit5(AbstractMethod):
         return field(t, y)
 
     def advance(self, field, t, y, h, memory):
+        field = with_sums(field, t, y)
         slopes = _slopes(TSIT5, field, t, y, h, memory)
         new = _moved(y, h, TSIT5.rows[-1], slopes)
         slopes.append(field(t + h, new))
@@ -124,6 +126,7 @@ def dormand_prince_step(field: Field, t: Float[Array, ""], y: PyTree, h) -> Any:
 
 def explicit_step(tableau: Tableau, field: Field, t, y: PyTree, h) -> Any:
     """One step with the stages written out."""
+    field = with_sums(field, t, y)
     return _moved(y, h, tableau.rows[-1], _slopes(tableau, field, t, y, h, field(t, y)))
 
 

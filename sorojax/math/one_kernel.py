@@ -65,9 +65,9 @@ _HELD = _LOOPS | _INLINED | set(_ALONE) | {
     "gt", "integer_pow", "iota", "is_finite", "le", "log", "log1p", "logistic", "lt", "max",
     "min", "mul", "ne", "neg", "nextafter", "not", "or", "pad", "platform_index", "pow",
     "reduce_and", "reduce_max", "reduce_min", "reduce_or", "reduce_prod", "reduce_sum", "rem",
-    "reshape", "rev", "round", "rsqrt", "select_n", "sign", "sin", "sinh", "slice", "split",
-    "sqrt", "square", "squeeze", "stack", "stop_gradient", "sub", "tan", "tanh", "tile",
-    "transpose", "unstack", "xor",
+    "reshape", "rev", "round", "rsqrt", "select_n", "sign", "sin", "sinh", "slice",
+    "small_product", "split", "sqrt", "square", "squeeze", "stack", "stop_gradient", "sub",
+    "tan", "tanh", "tile", "transpose", "unstack", "xor",
 }  # fmt: skip
 
 Answer = TypeVar("Answer")
