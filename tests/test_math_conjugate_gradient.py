@@ -77,6 +77,21 @@ def test_lines_hold_lists_of_any_length():
     assert np.allclose(found, wanted)
 
 
+def test_a_residual_is_small_everywhere(held):
+    """An unknown that is 1e8 times as stiff hardly enters the norm of the energy."""
+    system, values, b, _ = held
+    stiff = jnp.argmax(jnp.abs(b))
+    scale = jnp.ones(system.size).at[stiff].set(1e4)
+    values = values * scale[np.asarray(system.rows)] * scale[np.asarray(system.cols)]
+    b = b.at[stiff].set(1e-3)
+    tolerance = 1e-6
+    levels = multigrid(OURS.space.system.iterative.maps, values)
+    found = cg.iterate(levels, b, tolerance, 1000)
+    left = jnp.abs(sparse.product(system, values, found.x) - b)
+    assert found.converged
+    assert jnp.max(left) <= 100 * tolerance * jnp.max(jnp.abs(b))
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_every_level_holds_the_rigid_motions(dim):
     make = mesh.rectangle if dim == 2 else mesh.box

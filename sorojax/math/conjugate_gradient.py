@@ -21,6 +21,7 @@ from sorojax.math.aggregation import Hierarchy
 from sorojax.math.multigrid import Multigrid, cycle, multigrid
 
 _ROUNDING = 8  # units of rounding in a residual that no method makes smaller
+_ANYWHERE = 100  # tolerances: a residual of one corner alone hardly enters its norm
 
 
 class ConjugateGradient(eqx.Module):
@@ -83,7 +84,8 @@ def iterate(
     levels: Multigrid, b: Float[Array, " size"], tolerance: float, max_iterations: int
 ) -> Found:
     """x with A x = b, until the residual is below `tolerance` times b in the norm of the
-    preconditioner, or as small as rounding lets any method make it.
+    preconditioner, and no number of it above a hundred times `tolerance` of the largest of
+    b, or as small as rounding lets any method make it.
 
     Negative curvature does not stop it: without a breakdown the iteration finds the answer
     of an indefinite system too.
@@ -91,6 +93,7 @@ def iterate(
     b = b.reshape(levels.sums.shape)
     unit = _ROUNDING * jnp.finfo(b.dtype).eps
     least = jnp.maximum(jnp.asarray(tolerance, b.dtype), jnp.finfo(b.dtype).eps)
+    highest = _ANYWHERE * least * jnp.max(jnp.abs(b))
 
     def one_pass(s: _State) -> _State:
         z = cycle(levels, s.r)
@@ -98,7 +101,8 @@ def iterate(
         first = s.iterations == 0
         goal = jnp.where(first, jnp.square(least) * size, s.goal)
         rounding = unit * (levels.sums * jnp.max(jnp.abs(s.x)) + jnp.abs(b))
-        small = (jnp.abs(size) <= goal) | jnp.all(jnp.abs(s.r) <= rounding)
+        left = jnp.abs(s.r)
+        small = (jnp.abs(size) <= goal) & jnp.all(left <= highest) | jnp.all(left <= rounding)
         check = small & ~s.exact
         way = z + jnp.where(s.exact, 0.0, size / s.size) * s.way
         image = levels.matrix @ jnp.where(check, s.x, way)
