@@ -10,7 +10,6 @@ function is part of a program that belongs to others.
 """
 
 import functools
-import math
 import os
 from collections.abc import Callable
 from importlib import metadata
@@ -25,6 +24,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend import core
 
 from sorojax._types import at_the_top
+from sorojax.math.small_products import multiplications
 from sorojax.math.trigonometry import cosine, sine
 
 LARGEST = 4096  # numbers in an array that is made inside a loop: some 32 kB
@@ -272,9 +272,8 @@ def _is_number(array: Any) -> bool:
 
 
 def _multiplications(product: Any) -> int:
-    (summed, _), _ = product.params["dimension_numbers"]
-    sizes = product.invars[0].aval.shape
-    return product.outvars[0].aval.size * math.prod(sizes[axis] for axis in summed)
+    shapes = (var.aval for var in product.invars)
+    return multiplications(*shapes, product.params["dimension_numbers"])
 
 
 def _length(equation: Any) -> int:

@@ -1,7 +1,7 @@
 """Matrix products of a few numbers as sums, which a compiler joins with what is around them.
 
 A product of its own is a kernel of its own, and so is each of its factors: of the step of a
-network with a dozen states that is half of the time.
+network with a dozen states that is a quarter of the time.
 """
 
 import math
@@ -63,10 +63,11 @@ def _replaced(equation: Any) -> Any:
 def _is_small(a, b, *, dimension_numbers, preferred_element_type, out_sharding, **_) -> bool:
     plain = preferred_element_type in (None, a.dtype) and out_sharding is None
     real = a.dtype == b.dtype and jnp.issubdtype(a.dtype, jnp.floating)
-    return plain and real and 0 < _multiplications(a, b, dimension_numbers) <= LARGEST
+    return plain and real and 0 < multiplications(a, b, dimension_numbers) <= LARGEST
 
 
-def _multiplications(a, b, dimension_numbers) -> int:
+def multiplications(a: Any, b: Any, dimension_numbers: Any) -> int:
+    """Of a product, by the shapes of its factors."""
     (_, summed), (_, shared) = dimension_numbers
     return a.size * math.prod(b.shape[axis] for axis in _free(b, summed, shared))
 
@@ -109,7 +110,7 @@ def _in_lanes(values, axes, *, dimension_numbers, **params):
     else:
         lane = [*shared_a, *free_a].index(axis_a)
     numbers = (summed_a, summed_b), (shared_a, shared_b)
-    few = _multiplications(a, b, numbers) <= LARGEST_BATCH
+    few = multiplications(a, b, numbers) <= LARGEST_BATCH
     product = product_p if few else jax.lax.dot_general_p
     return product.bind(a, b, dimension_numbers=numbers, **params), lane
 
