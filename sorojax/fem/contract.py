@@ -12,7 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax.fem.energy import Body, Response
-from sorojax.fem.kinematics import AbstractKinematics
+from sorojax.fem.kinematics import AbstractKinematics, component_pairs, entries_of
+from sorojax.fem.point_tangent import Tangent, tangent_entries
 from sorojax.fem.tensor import Entries
 from sorojax.math.apart import Alone
 
@@ -56,23 +57,13 @@ def _shares(kinematics: AbstractKinematics, answer: Response, body: Body, weight
     return slopes, jnp.sum(answer.stiffness[:, :, None, None] * slopes[None], axis=1)
 
 
-def component_pairs(dim: int) -> list[tuple[int, int]]:
-    return [(i, k) for i in range(dim) for k in range(i, dim)]
-
-
-def _slots_of(kinematics: AbstractKinematics, component: int) -> list[tuple[int, int]]:
-    """Kept entries of F in one row and the columns of the gradients they take."""
-    slots = enumerate(kinematics.slots)
-    return [(e, s.column) for e, s in slots if s.component == component]
-
-
 def _force(kinematics: AbstractKinematics, P: Entries, gradients: Gradients) -> Force:
     """P : Grad N of every node, one of both times the volumes of the points."""
     rows = [
         _total(
             P[e, q][None] * gradients[q, :, j]
             for q in range(gradients.shape[0])
-            for e, j in _slots_of(kinematics, i)
+            for e, j in entries_of(kinematics, i)
         )
         for i in range(kinematics.dim)
     ]
@@ -80,15 +71,16 @@ def _force(kinematics: AbstractKinematics, P: Entries, gradients: Gradients) -> 
 
 
 def _stiff_gradients(
-    kinematics: AbstractKinematics, A: Float[Array, "entries entries quad lanes"], G: Gradients
+    kinematics: AbstractKinematics, tangent: Tangent, G: Gradients
 ) -> list[list[Float[Array, "quad cell_nodes lanes"]]]:
     """A G for each pair of components i <= k: one array per kept entry of row i."""
+    ends = [entries_of(kinematics, k) for _, k in component_pairs(kinematics.dim)]
     return [
         [
-            _total(A[e, f][:, None] * G[:, :, j] for f, j in _slots_of(kinematics, k))
-            for e, _ in _slots_of(kinematics, i)
+            _total(A[:, None] * G[:, :, j] for A, (_, j) in zip(row, end, strict=True))
+            for row in rows
         ]
-        for i, k in component_pairs(kinematics.dim)
+        for end, rows in zip(ends, tangent_entries(kinematics, tangent), strict=True)
     ]
 
 
@@ -97,7 +89,7 @@ def _matrix(kinematics: AbstractKinematics, i: int, bent, weighted: Gradients):
     return _total(
         weighted[q, :, j][:, None] * stiff[q][None]
         for q in range(weighted.shape[0])
-        for (_, j), stiff in zip(_slots_of(kinematics, i), bent, strict=True)
+        for (_, j), stiff in zip(entries_of(kinematics, i), bent, strict=True)
     )
 
 

@@ -19,16 +19,18 @@ from jaxtyping import Array, Float
 
 from sorojax.fem.formulation import Modes, coefficients, project
 from sorojax.fem.kinematics import AbstractKinematics
+from sorojax.fem.point_tangent import Tangent, point_tangent
 from sorojax.fem.shape_response import (
+    Shape,
     ShapeVectors,
     shape_energy,
     shape_response,
     shape_stress,
-    shape_tangent,
+    stiffened,
 )
 from sorojax.fem.tensor import (
     Entries,
-    geometric_part,
+    extrapolated_piola,
     second_piola,
     volume_ratio,
     volume_slopes,
@@ -55,7 +57,7 @@ class Response(NamedTuple):
     """
 
     stress: Entries
-    tangent: Float[Array, "entries entries quad lanes"]
+    tangent: Tangent
     slopes: Entries | None
     stiffness: Float[Array, "modes modes lanes"] | None
 
@@ -77,50 +79,76 @@ def pressure(body: Body, F: Entries) -> Entry:
 def response(body: Body, F: Entries, F_before: Entries, alone: Alone) -> Response:
     """P and dP/dF, the geometric parts of dP/dF from stresses extrapolated out of
     `F_before`. With `F_before` equal to `F` the tangent is the exact derivative."""
-    vectors = alone(lambda: _vectors(body, F, F_before))
-    return alone(lambda: _with_tangent(body, F, *vectors))
+    law, before = alone(lambda: (_law(body, F), _before(body, F_before, F - F_before)))
+    return alone(lambda: _with_tangent(body, F, F_before, law, before))
 
 
-def _vectors(body: Body, F: Entries, F_before: Entries):
-    """Stress and parts of the tangent of the shape energy, the extrapolated S and pressure,
-    and the volumetric part: p, bulk stiffness and dJ/dF."""
-    P, parts = shape_response(body.material, body.kinematics, F)
-    step = F - F_before
-    S = _extrapolated_shape(body, F, F_before, step, P)
+class _Law(NamedTuple):
+    """Stress and parts of the tangent of the shape energy; p, bulk stiffness and dJ/dF."""
+
+    P: Entries
+    shape: Shape
+    volumetric: tuple[Entry, Entry, Entries] | None
+
+
+class _Before(NamedTuple):
+    """Stress of the shape energy at the previous iterate, its change by the step, and the
+    extrapolated pressure."""
+
+    P: Entries
+    rate: Entries
+    p: Entry | None
+
+
+def _law(body: Body, F: Entries) -> _Law:
+    P, shape = shape_response(body.material, body.kinematics, F)
     if not body.kinematics.has_volume:
-        return P, parts, S, None, None
-    p_before, p_rate = jax.jvp(lambda F: pressure(body, F), (F_before,), (step,))
-    return P, parts, S, p_before + p_rate, _volumetric(body, F)
-
-
-def _with_tangent(body: Body, F, P, parts, S, p, volumetric) -> Response:
-    weight = parts.weight if isinstance(parts, ShapeVectors) else None
-    if p is not None:
-        weight = p if weight is None else weight + p
-    tangent = shape_tangent(parts) + geometric_part(body.kinematics, F, weight, S)
-    if volumetric is None:
-        return Response(P, tangent, None, None)
-    p, bulk, C = volumetric
-    stress = P + p[None] * C
+        return _Law(P, shape, None)
+    p, bulk, C = _volumetric(body, F)
     if body.modes is None:
-        return Response(stress, tangent + (bulk[None] * C)[:, None] * C[None], None, None)
+        shape = stiffened(shape, bulk, C)
+    return _Law(P, shape, (p, bulk, C))
+
+
+def _before(body: Body, F: Entries, step: Entries) -> _Before:
+    def stress(F):
+        return shape_stress(body.material, body.kinematics, F)
+
+    P, rate = jax.jvp(stress, (F,), (step,))
+    if not body.kinematics.has_volume:
+        return _Before(P, rate, None)
+    p, p_rate = jax.jvp(lambda F: pressure(body, F), (F,), (step,))
+    return _Before(P, rate, p + p_rate)
+
+
+def _with_tangent(body: Body, F, F_before, law: _Law, before: _Before) -> Response:
+    weight = law.shape.weight if isinstance(law.shape, ShapeVectors) else None
+    if before.p is not None:
+        weight = before.p if weight is None else weight + before.p
+    S = _geometric_stress(body, F, F_before, law.P, before)
+    tangent = point_tangent(body.kinematics, F, law.shape, weight, S)
+    if law.volumetric is None:
+        return Response(law.P, tangent, None, None)
+    p, bulk, C = law.volumetric
+    stress = law.P + p[None] * C
+    if body.modes is None:
+        return Response(stress, tangent, None, None)
     stiffness = [coefficients(body.modes, body.volumes, bulk * mode) for mode in body.modes]
     return Response(stress, tangent, C, jnp.stack(stiffness))
 
 
-def _extrapolated_shape(body: Body, F, F_before, step, P) -> Entries:
-    """S of the shape energy extrapolated from `F_before` to `F`, minus S(F)."""
-
-    def stress(F):
-        return second_piola(body.kinematics, F, shape_stress(body.material, body.kinematics, F))
-
-    before, rate = jax.jvp(stress, (F_before,), (step,))
-    S = before + rate - second_piola(body.kinematics, F, P)
+def _geometric_stress(body: Body, F, F_before, P, before: _Before) -> tuple[Entry, ...]:
+    """S of the shape energy extrapolated to `F`, minus S(F)."""
+    S_before = extrapolated_piola(
+        body.kinematics, F_before, F - F_before, before.P, before.rate
+    )
+    S = [a - b for a, b in zip(S_before, second_piola(body.kinematics, F, P), strict=True)]
     share = finite_share(body.material)
     if share is None:
-        return S
+        return tuple(S)
     # cells of small strains may invert on the way, where S is infinite; theirs is exact
-    return jnp.where(jnp.broadcast_to(share > 0.9, S.shape[1:])[None], S, jnp.zeros_like(S))
+    finite = jnp.broadcast_to(share > 0.9, S[0].shape)
+    return tuple(jnp.where(finite, s, jnp.zeros_like(s)) for s in S)
 
 
 def _dilatation(body: Body, F: Entries) -> Entry:

@@ -180,3 +180,13 @@ def _check_thickness(where: str, thickness) -> None:
 def identity(kinematics: AbstractKinematics) -> tuple[float, ...]:
     """The kept entries of F at rest."""
     return tuple(float(s.row == s.col) for s in kinematics.slots)
+
+
+def component_pairs(dim: int) -> list[tuple[int, int]]:
+    return [(i, k) for i in range(dim) for k in range(i, dim)]
+
+
+def entries_of(kinematics: AbstractKinematics, component: int) -> list[tuple[int, int]]:
+    """Kept entries of F in one row and the columns of the gradients they take."""
+    slots = enumerate(kinematics.slots)
+    return [(e, s.column) for e, s in slots if s.component == component]

@@ -18,6 +18,7 @@ from sorojax.fem.tensor import (
 )
 from sorojax.material.hyperelastic import AbstractHyperelastic, first_invariant_energy
 from sorojax.material.kinematics import Entry, square_norm
+from sorojax.math.depends import depends
 from sorojax.math.root import inverse_cube_root
 
 
@@ -42,19 +43,24 @@ def shape_stress(
 class ShapeVectors(NamedTuple):
     """What dP/dF is made of, where the energy is one of the first isochoric invariant: an outer
     product of `half` and C = dJ/dF with its transpose, `second` times that of the slopes of the
-    invariant, a multiple `flat` of unity, and `weight` times d2J / dF dF."""
+    invariant (`None`: the energy is linear in it), a multiple `flat` of unity, and `weight`
+    times d2J / dF dF."""
 
     half: Entries
     C: Entries
     slopes: Entries
-    second: Entry
+    second: Entry | None
     flat: Entry
     weight: Entry
 
 
+#: dP/dF of the shape energy, or what it is made of.
+Shape = ShapeVectors | Float[Array, "entries entries quad lanes"]
+
+
 def shape_response(
     material: AbstractHyperelastic, kinematics: AbstractKinematics, F: Entries
-) -> tuple[Entries, ShapeVectors | Float[Array, "entries entries quad lanes"]]:
+) -> tuple[Entries, Shape]:
     """Stress P [Pa], and dP/dF or what it is made of [Pa]."""
     W = _closed_form(material, kinematics)
     if W is None:
@@ -62,24 +68,20 @@ def shape_response(
         return stress, _differentiated(material, kinematics, F)
     inverse, scale, I1, C = _parts(kinematics, F)
     x, slopes = _first_invariant(kinematics, F)
-    first, second = jax.jvp(_slope(W), (x,), (jnp.ones_like(x),))
+    first, second = _slope(W)(x), None
+    if depends(_slope(W), x):
+        second = jax.jvp(_slope(W), (x,), (jnp.ones_like(x),))[1]
     half = (first * scale * inverse)[None] * (5 / 9 * (I1 * inverse)[None] * C - 4 / 3 * F)
     weight = -2 / 3 * first * scale * I1 * inverse
     vectors = ShapeVectors(half, C, slopes, second, 2 * first * scale, weight)
     return first[None] * slopes, vectors
 
 
-def shape_tangent(
-    parts: ShapeVectors | Float[Array, "entries entries quad lanes"],
-) -> Float[Array, "entries entries quad lanes"]:
-    """dP/dF [Pa] of `shape_response`, but for the multiple of d2J / dF dF."""
-    if not isinstance(parts, ShapeVectors):
-        return parts
-    half, C, slopes, second, flat, _ = parts
-    mixed = half[:, None] * C[None] + C[:, None] * half[None]
-    square = (second[None] * slopes)[:, None] * slopes[None]
-    unit = jnp.eye(C.shape[0], dtype=C.dtype)[:, :, None, None]
-    return mixed + square + flat[None, None] * unit
+def stiffened(shape: Shape, bulk: Entry, C: Entries) -> Shape:
+    """`shape` with `bulk` times the outer product of C = dJ/dF with itself."""
+    if isinstance(shape, ShapeVectors):
+        return shape._replace(half=shape.half + (0.5 * bulk)[None] * C)
+    return shape + (bulk[None] * C)[:, None] * C[None]
 
 
 def _differentiated(material, kinematics: AbstractKinematics, F: Entries):

@@ -1,34 +1,28 @@
 """Three-by-three algebra on the entries of a tensor; what is absent costs nothing."""
 
-from functools import cache
+from functools import reduce
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax.fem.kinematics import AbstractKinematics, identity
-from sorojax.material.kinematics import Entry, Tensor, absent, determinant, minus, plus, times
+from sorojax.material.kinematics import (
+    Entry,
+    Tensor,
+    cofactor,
+    determinant,
+    minus,
+    plus,
+    times,
+)
 
 Entries = Float[Array, "entries quad lanes"]
-_NEXT = (1, 2, 0)
-
-
-def cofactor(F: Tensor) -> Tensor:
-    """dJ/dF."""
-
-    def entry(i, j):
-        k, l, m, n = _NEXT[i], _NEXT[_NEXT[i]], _NEXT[j], _NEXT[_NEXT[j]]
-        return minus(times(F[k][m], F[l][n]), times(F[k][n], F[l][m]))
-
-    return tuple(tuple(entry(i, j) for j in range(3)) for i in range(3))  # type: ignore
 
 
 def inverse(F: Tensor) -> Tensor:
     """F^-1."""
-    J, C = determinant(F), cofactor(F)
-    return tuple(  # type: ignore[return-value]
-        tuple(0.0 if absent(C[j][i]) else C[j][i] / J for j in range(3)) for i in range(3)
-    )
+    C, shrink = cofactor(F), 1 / determinant(F)
+    return tuple(tuple(times(C[j][i], shrink) for j in range(3)) for i in range(3))  # type: ignore
 
 
 def volume_ratio(kinematics: AbstractKinematics, F: Entries) -> Entry:
@@ -53,56 +47,40 @@ def volume_slopes(kinematics: AbstractKinematics, F: Entries) -> Entries:
     return jnp.stack([C[s.row][s.col] for s in kinematics.slots])
 
 
-@cache
-def geometric_table(kind: type[AbstractKinematics]) -> np.ndarray:
-    """(entries, entries, entries + 1 + pairs): what the geometric part of dP/dF is made of.
-
-    The first columns hold d2J / dF dF as a multiple of the kept entries of F and of one, the
-    last ones place S between entries in one row of F.
-    """
-    slots = kind.slots
-    at = {(s.row, s.col): number for number, s in enumerate(slots)}
-    pairs, m = stress_pairs(kind), len(slots)
-    table = np.zeros((m, m, m + 1 + len(pairs)))
-    for e, a in enumerate(slots):
-        for f, b in enumerate(slots):
-            if a.row == b.row:
-                pair = (min(a.col, b.col), max(a.col, b.col))
-                table[e, f, m + 1 + pairs.index(pair)] = 1.0
-            elif a.col != b.col:
-                third = (3 - a.row - b.row, 3 - a.col - b.col)
-                even = (_NEXT[a.row] == b.row) == (_NEXT[a.col] == b.col)
-                # entries that are not kept are those of the identity
-                if third in at or third[0] == third[1]:
-                    table[e, f, at.get(third, m)] = 1.0 if even else -1.0
-    return table
-
-
-def geometric_part(
-    kinematics: AbstractKinematics, F: Entries, weight: Entry | None, S: Entries
-) -> Float[Array, "entries entries quad lanes"]:
-    """`weight` times d2J / dF dF, plus S between the entries of one row of F."""
-    weight = jnp.zeros_like(F[0]) if weight is None else jnp.asarray(weight)
-    # A product with a constant table: gathers of rows are several times slower.
-    parts = jnp.concatenate([weight[None] * F, weight[None], S])
-    table = jnp.asarray(geometric_table(type(kinematics)), parts.dtype)
-    return jnp.einsum("efk,kql->efql", table, parts)
-
-
-def second_piola(kinematics: AbstractKinematics, F: Entries, P: Entries) -> Entries:
+def second_piola(kinematics: AbstractKinematics, F: Entries, P: Entries) -> tuple[Entry, ...]:
     """S = F^-1 P, the entries that `stress_pairs` lists."""
-    full = [[0.0] * 3 for _ in range(3)]
-    for slot, value in zip(kinematics.slots, P, strict=True):
-        full[slot.row][slot.col] = value
     back = inverse(kinematics.embed(tuple(F)))
+    return _pairs(kinematics, _product(back, _full(kinematics, P)))
 
+
+def extrapolated_piola(
+    kinematics: AbstractKinematics, F: Entries, step: Entries, P: Entries, rate: Entries
+) -> tuple[Entry, ...]:
+    """S and its change where F changes by `step` and P by `rate`, as F S = P."""
+    back = inverse(kinematics.embed(tuple(F)))
+    S = _product(back, _full(kinematics, P))
+    turned = _product(_full(kinematics, step), S)
+    rows = zip(_full(kinematics, rate), turned, strict=True)
+    change = _product(back, tuple(tuple(map(minus, *pair)) for pair in rows))
+    return tuple(map(plus, _pairs(kinematics, S), _pairs(kinematics, change)))
+
+
+def _full(kinematics: AbstractKinematics, entries: Entries) -> Tensor:
+    full: list[list[Entry]] = [[0.0] * 3 for _ in range(3)]
+    for slot, value in zip(kinematics.slots, entries, strict=True):
+        full[slot.row][slot.col] = value
+    return tuple(map(tuple, full))  # type: ignore[arg-type]
+
+
+def _product(a: Tensor, b: Tensor) -> Tensor:
     def entry(i, j):
-        total: Entry = 0.0
-        for k in range(3):
-            total = plus(total, times(back[i][k], full[k][j]))
-        return total
+        return reduce(plus, (times(a[i][k], b[k][j]) for k in range(3)))
 
-    return jnp.stack([entry(*pair) for pair in stress_pairs(type(kinematics))])
+    return tuple(tuple(entry(i, j) for j in range(3)) for i in range(3))  # type: ignore
+
+
+def _pairs(kinematics: AbstractKinematics, S: Tensor) -> tuple[Entry, ...]:
+    return tuple(S[i][j] for i, j in stress_pairs(type(kinematics)))
 
 
 def stress_pairs(kind: type[AbstractKinematics]) -> list[tuple[int, int]]:
