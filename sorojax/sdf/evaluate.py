@@ -5,18 +5,23 @@ writes the result; a field that searches or holds a table per point goes in chun
 stay in the cache.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr
 from jaxtyping import Array, Float
 
-from sorojax._types import real
+from sorojax._types import platform, real
+from sorojax.math.apart import Alone, apart
 from sorojax.math.jit import once
 from sorojax.sdf.base import AbstractSdf, cast
 from sorojax.sdf.query import slope_along, value_and_gradient_at
 
 LARGEST = 2**20  # points in one call of a compiled program
 _CHUNK = 2**13  # points of a field that is more than one loop
+_WIDE = 2**16  # rows whose columns and slopes are held at a time
 
 Coordinates = tuple[Float[Array, " points"], ...]
 
@@ -99,12 +104,17 @@ def _scalars(program: Jaxpr, count: int) -> bool:
     return True
 
 
-def _in_chunks(function, x: Coordinates):
-    """`function(x)` a chunk at a time; coordinates apart are contiguous, which is fast."""
-    x = jax.lax.optimization_barrier(x)
-    count = len(x[0])
-    pieces = tuple(c.reshape(-1, min(_CHUNK, count)) for c in x)
-    return jax.tree.map(lambda a: a.reshape(count), jax.lax.map(function, pieces))
+def _in_chunks(function, points, width: int):
+    """`function(points)` at most `width` points at a time."""
+    count = len(jax.tree.leaves(points)[0])
+    pieces = jax.tree.map(lambda a: a.reshape(-1, min(width, count), *a.shape[1:]), points)
+    found = jax.lax.map(function, pieces)
+    return jax.tree.map(lambda a: a.reshape(count, *a.shape[2:]), found)
+
+
+def _in_small_chunks(function, x: Coordinates):
+    """For fields of more than one loop; coordinates apart are contiguous, which is fast."""
+    return _in_chunks(function, jax.lax.optimization_barrier(x), _CHUNK)
 
 
 @once
@@ -113,36 +123,48 @@ def _value(shape: AbstractSdf, points):
     x = tuple(points[:, i] for i in range(shape.dim))
     if _is_one_loop(shape, x):
         return shape.distance(*x)
-    return _in_chunks(lambda x: shape.distance(*x), x)
+    return _in_small_chunks(lambda x: shape.distance(*x), x)
 
 
 def _value_and_normal(shape: AbstractSdf, points):
-    # Programs of their own: in one, reordering joins their loops, which lose their vector form.
-    f, normals = _normals(shape, _columns(points))
-    return f, _rows(normals)
+    return _rows(shape, points, np.True_)
+
+
+@once
+def _rows(shape: AbstractSdf, points, always):
+    """Field and normals of rows, a chunk at a time: columns and slopes stay in the cache, and
+    results alone are new memory, whose first touch costs as much as the arithmetic."""
+    shape, count = cast(shape, points.dtype), len(points)
+    alone: Alone = apart(always) if platform() == "cpu" else lambda work: work()
+    one_loop = _is_one_loop(shape, tuple(points.T))
+
+    def chunk(points):
+        x = alone(lambda: tuple(points.T))
+        if one_loop:
+            f = alone(lambda: shape.distance(*x))
+            slopes = tuple(
+                alone(lambda i=i: slope_along(shape, x, i)[1]) for i in range(shape.dim)
+            )
+        else:
+            f, slopes = value_and_gradient_at(shape, x)
+        scale = alone(lambda: _unit_scale(slopes))
+        return f, alone(lambda: jnp.stack([g * scale for g in slopes], axis=1))
+
+    wide = _WIDE if platform() == "cpu" else max(count, 1)
+    return _in_chunks(chunk, points, wide if one_loop else _CHUNK)
 
 
 def _normals(shape: AbstractSdf, x: Coordinates):
+    # Programs of their own: in one, reordering joins their loops, which lose their vector form.
     f, slopes = _value_and_slopes(shape, x)
-    return f, _unit(slopes)
-
-
-@jax.jit
-def _columns(points):
-    across = jax.lax.optimization_barrier(points.T)
-    return tuple(across[i] for i in range(points.shape[1]))
-
-
-@jax.jit
-def _rows(components):
-    return jnp.stack(components).T
+    return f, _scaled(slopes, _unit_scale(slopes))
 
 
 @once
 def _value_and_slopes(shape: AbstractSdf, x: Coordinates):
     shape = cast(shape, x[0].dtype)
     if not _is_one_loop(shape, x):
-        return _in_chunks(lambda x: value_and_gradient_at(shape, x), x)
+        return _in_small_chunks(lambda x: value_and_gradient_at(shape, x), x)
     f, slopes = shape.distance(*x), []
     for i in range(shape.dim):
         # Roots shared by the passes would be written to memory: each has its own.
@@ -152,13 +174,14 @@ def _value_and_slopes(shape: AbstractSdf, x: Coordinates):
 
 
 @jax.jit
-def _unit(slopes: Coordinates) -> Coordinates:
-    """The vector of `slopes` at length one; zero stays zero."""
-    units = []
-    for i in range(len(slopes)):
-        slopes = jax.lax.optimization_barrier(slopes)
-        square = sum((g * g for g in slopes[1:]), start=slopes[0] * slopes[0])
-        some = square > 0
-        scale = jax.lax.rsqrt(jnp.where(some, square, jnp.ones_like(square)))
-        units.append(jnp.where(some, slopes[i] * scale, jnp.zeros_like(square)))
-    return tuple(units)
+def _scaled(slopes: Coordinates, scale: Array) -> Coordinates:
+    return tuple(g * scale for g in slopes)
+
+
+@jax.jit
+def _unit_scale(slopes: Coordinates) -> Array:
+    """One over the length of the vector of `slopes`, zero where that is zero."""
+    square = functools.reduce(jnp.add, (g * g for g in slopes))
+    some = square > 0
+    scale = jax.lax.rsqrt(jnp.where(some, square, jnp.ones_like(square)))
+    return jnp.where(some, scale, jnp.zeros_like(square))
