@@ -64,8 +64,8 @@ class _Phases:
         self.memory = np.zeros(64, np.int64)
         self.params = np.zeros(64, np.int32)
         # user values; nested dissection; pivot perturbation 1e-8 (LDL'); Bunch-Kaufman
-        # pivoting; zero-based indices. Entry 7 = 0 refines
-        # only where pivots were perturbed; any other value refines every solve.
+        # pivoting; zero-based indices. Entry 7 = 0 refines only where pivots were
+        # perturbed; any other value refines every solve.
         for entry, value in ((0, 1), (1, 2), (7, 0), (9, 8), (20, 1), (34, 1)):
             self.params[entry] = value
         self.pattern_values = np.ones(len(self.indices))

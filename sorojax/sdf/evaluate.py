@@ -1,8 +1,8 @@
 """Fields of many points at full speed: compiled once per power of two.
 
 A field made of scalars becomes one loop per output, which reads the coordinates and
-writes the result; a field that searches or holds a table per point goes in chunks that
-stay in the cache.
+writes the result; normals of rows, and a field that searches or holds a table per point,
+go in chunks that stay in the cache.
 """
 
 import functools
@@ -134,7 +134,7 @@ def _value_and_normal(shape: AbstractSdf, points):
 def _rows(shape: AbstractSdf, points, always):
     """Field and normals of rows, a chunk at a time: columns and slopes stay in the cache, and
     results alone are new memory, whose first touch costs as much as the arithmetic."""
-    shape, count = cast(shape, points.dtype), len(points)
+    shape = cast(shape, points.dtype)
     alone: Alone = apart(always) if platform() == "cpu" else lambda work: work()
     one_loop = _is_one_loop(shape, tuple(points.T))
 
@@ -150,7 +150,7 @@ def _rows(shape: AbstractSdf, points, always):
         scale = alone(lambda: _unit_scale(slopes))
         return f, alone(lambda: jnp.stack([g * scale for g in slopes], axis=1))
 
-    wide = _WIDE if platform() == "cpu" else max(count, 1)
+    wide = _WIDE if platform() == "cpu" else len(points)
     return _in_chunks(chunk, points, wide if one_loop else _CHUNK)
 
 
