@@ -9,13 +9,20 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from sorojax._jax import versions as _versions
+
+_versions.check()  # before anything imports JAX
+
 from sorojax import units as units
 from sorojax._cache import enable_compilation_cache as enable_compilation_cache
 from sorojax._edit import replace as replace
-from sorojax._latency import enable_low_latency as enable_low_latency
+from sorojax._jax import devices as _devices
+from sorojax._jax.jit import compiled as compiled, jit as jit
+from sorojax._jax.low_latency import enable_low_latency as enable_low_latency
 from sorojax._progress import listen as listen, silent as silent
-from sorojax.math.jit import compiled as compiled, jit as jit
 from sorojax.math.lie import SE2 as SE2, SE3 as SE3
+
+_devices.leave_out_absent()
 
 __version__ = "0.1.0"
 

@@ -9,11 +9,12 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
+
+from sorojax._jax.trace_state import is_tracer
 
 
 def is_concrete(value: Any) -> bool:
-    return not isinstance(value, Tracer)
+    return not is_tracer(value)
 
 
 def finite(where: str, name: str, value: Any, do: str) -> None:

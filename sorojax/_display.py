@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 import wadler_lindig as wl
 
-from sorojax._types import is_traced
+from sorojax._jax.trace_state import is_traced
 
 Noun = TypeVar("Noun", bound=type)
 _FEW = 6  # numbers that are written out

@@ -5,8 +5,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
-from jax.extend import core
 
 
 def real(value: Any) -> jax.Array:
@@ -44,19 +42,6 @@ def integers(value: Any) -> jax.Array:
     if type(value) is object:
         return value  # type: ignore[return-value]
     return jnp.asarray(value, dtype=jnp.int32)
-
-
-def is_traced(tree: Any) -> bool:
-    """Whether any leaf of `tree` is an abstract value of a JAX transformation."""
-    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
-
-
-def at_the_top() -> bool:
-    """Whether no transformation of JAX is at work here."""
-    return core.get_opaque_trace_state(convention="flax") == _AT_THE_TOP
-
-
-_AT_THE_TOP = core.get_opaque_trace_state(convention="flax")
 
 
 def platform() -> str:

@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 CORE, HARDWARE = ROOT / "sorojax", ROOT / "hardware"
 BASEMENT = {
-    "units", "_types", "_check", "_display", "_edit", "_progress", "_cache", "_latency",
+    "units", "_types", "_check", "_display", "_edit", "_progress", "_cache", "_jax",
 }  # fmt: skip
 FLOOR = {
     "math": 0,
@@ -25,8 +25,15 @@ FLOOR = {
     "cli": 8,
     "__main__": 9,
 }
+NOT_PROMISED = (
+    "jax._src", "jax.core", "jax.extend", "jax.interpreters", "jax.experimental", "jax.lib",
+    "jaxlib",
+)  # fmt: skip
+CALLBACKS_AND_OPTIONS = {
+    "pure_callback", "io_callback", "compiler_options", "Primitive", "set_xla_metadata",
+}  # fmt: skip
 ONLY_WHERE_USED = {"cv2", "pyvista", "skimage", "meshio", "matplotlib", "pyrealsense2"}
-MAX_LINES = 300
+MAX_LINES = 600
 LONGER: set[str] = set()  # files of numbers and nothing else
 
 
@@ -59,6 +66,11 @@ def walk(node: ast.AST, inside_functions: bool) -> Iterator[ast.AST]:
 
 def room(path: Path) -> str:
     return path.relative_to(CORE).with_suffix("").parts[0]
+
+
+def room_of(path: Path) -> str:
+    """The package of the core that a file lies in, or what else holds it."""
+    return room(path) if path.is_relative_to(CORE) else path.relative_to(ROOT).parts[0]
 
 
 def wrong_imports(path: Path) -> list[str]:
@@ -126,6 +138,60 @@ def test_heavy_libraries_load_only_where_used():
         if name.partition(".")[0] in ONLY_WHERE_USED
     ]
     assert found == []
+
+
+def not_promised(path: Path) -> list[str]:
+    """Where a file touches what JAX does not promise, host callbacks or compiler options."""
+    tree = ast.parse(path.read_text())
+    names = [(0, name) for name in imports(path, ROOT)]
+    for node in ast.walk(tree):
+        line = getattr(node, "lineno", 0)
+        if isinstance(node, ast.Attribute):
+            names.append((line, ast.unparse(node)))
+        elif isinstance(node, ast.keyword):
+            names.append((line, node.arg or ""))
+    return [
+        f"{path.relative_to(ROOT)}:{line} {name}"
+        for line, name in names
+        if any(name == start or name.startswith(start + ".") for start in NOT_PROMISED)
+        or name.rpartition(".")[2] in CALLBACKS_AND_OPTIONS
+        or name.startswith("jax.debug.")
+    ]
+
+
+def test_one_room_touches_what_jax_does_not_promise():
+    outside = [path for path in sources(CORE, HARDWARE) if room_of(path) != "_jax"]
+    assert [line for path in outside for line in not_promised(path)] == []
+    assert any(not_promised(path) for path in sources(CORE / "_jax"))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "from jax._src import core",
+        "import jax.core",
+        "from jax.extend.core import Primitive",
+        "import jax\nx = jax.core.Tracer",
+        "import jax\njax.pure_callback(f, s)",
+        "import jax\njax.debug.callback(f)",
+        "import jax\njax.jit(f, compiler_options={})",
+        "from jax.interpreters import mlir",
+        "def late():\n    from jax.experimental import io_callback",
+    ],
+)
+def test_the_rule_of_that_room_catches(line, tmp_path, monkeypatch):
+    file = tmp_path / "sorojax" / "sdf" / "case.py"
+    file.parent.mkdir(parents=True)
+    file.write_text(line)
+    monkeypatch.setattr(sys.modules[__name__], "ROOT", tmp_path)
+    assert not_promised(file)
+
+
+def test_each_file_of_that_room_says_what_it_rests_on():
+    plain = {"__init__.py", "optional.py", "versions.py", "trigonometry.py"}
+    for path in sources(CORE / "_jax"):
+        text = ast.get_docstring(ast.parse(path.read_text())) or ""
+        assert path.name in plain or "Rests on" in text, path.name
 
 
 def test_files_are_short():

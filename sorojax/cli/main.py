@@ -78,7 +78,7 @@ def _info(arguments: argparse.Namespace) -> int:
 
 
 def _start_jax() -> None:
-    """Float64 and the compilation cache, as every command needs them."""
+    """Float64, the compilation cache and a device, as every command needs them."""
     if hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) == 1:
         # With one worker thread a host callback can wait for itself.
         os.environ.setdefault("NPROC", "2")
@@ -86,9 +86,11 @@ def _start_jax() -> None:
     import jax
 
     from sorojax._cache import enable_compilation_cache
+    from sorojax._jax import devices
 
     jax.config.update("jax_enable_x64", True)
     enable_compilation_cache()
+    devices.start()
 
 
 if __name__ == "__main__":

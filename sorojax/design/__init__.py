@@ -84,4 +84,3 @@ from sorojax.design.void_pressure import (
     VoidPressure as VoidPressure,
     void_pressure as void_pressure,
 )
-from sorojax.math.at_once import at_once as at_once

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sorojax._types import is_traced
+from sorojax._jax.host_call import tell_host
+from sorojax._jax.trace_state import is_traced
 from sorojax.design.settle import settled
 from sorojax.design.void import InterpolatedEnergy, interpolated_energy
 from sorojax.fem import Newton, Path, Problem, Solution
@@ -22,7 +23,6 @@ from sorojax.fem.problem import exchanged
 from sorojax.fem.solve import solved_and_kept
 from sorojax.fem.torque import mean_rotation
 from sorojax.material.hyperelastic import AbstractHyperelastic
-from sorojax.math.at_once import at_once
 
 
 def graded(problem: Problem, factor: Float[Array, " cells"], **settings: float) -> Problem:
@@ -30,7 +30,7 @@ def graded(problem: Problem, factor: Float[Array, " cells"], **settings: float) 
     nothing; `settings` are those of `interpolated_energy`.
 
     Every compiled function between a design and its equilibrium adds to the gradient: for a
-    small body compile all from the variables to `interpolated_energy` in one by `at_once`,
+    small body compile all from the variables to `interpolated_energy` in one by `jax.jit`,
     and put that in its place.
     """
     material = interpolated_energy(solid_of(problem), factor, **settings)
@@ -71,7 +71,7 @@ def _loaded(problem: Problem, names: tuple[str, ...] | None) -> Problem:
     return exchanged(problem, supports=(), loads=tuple(chosen), material=solid_of(problem))
 
 
-@at_once
+@jax.jit
 def _work(problem: Problem, u):
     return load_potential(problem, jnp.zeros_like(u)) - load_potential(problem, u)
 
@@ -83,7 +83,7 @@ def displacement_along(
     return _mean_along(u, jnp.asarray(nodes), jnp.asarray(direction, u.dtype))
 
 
-@at_once
+@jax.jit
 def _mean_along(u, nodes, direction):
     return jnp.mean(u[nodes] @ direction)
 
@@ -107,7 +107,7 @@ def mechanism(
     return _weighed(_loaded(problem, None), u, output, output_weight, work_weight)
 
 
-@at_once
+@jax.jit
 def _weighed(problem: Problem, u, output, output_weight, work_weight):
     return work_weight * _work(problem, u) - output_weight * output
 
@@ -119,7 +119,7 @@ def rotation(
     return _turn(problem.mesh.points, u, jnp.asarray(nodes))
 
 
-@at_once
+@jax.jit
 def _turn(points, u, nodes):
     return mean_rotation(points[nodes], points[nodes] + u[nodes])
 
@@ -135,7 +135,7 @@ def path_error(
     return _miss(points, path.displacements, jnp.asarray(nodes), jnp.asarray(targets))
 
 
-@at_once
+@jax.jit
 def _miss(points, displacements, nodes, targets):
     middle = jnp.mean(points[nodes], axis=0)
     moved = middle[None] + jnp.mean(displacements[:, nodes], axis=1)
@@ -169,7 +169,7 @@ class Follower:
         if u is None:
             u = jax.lax.stop_gradient(solution.displacement)
         if is_traced(u):
-            jax.debug.callback(self._keep, u)
+            tell_host(self._keep, u)
         else:
             self._keep(u)
         return solution

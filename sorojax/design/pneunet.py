@@ -37,7 +37,6 @@ from sorojax.fem import Fixed, Foundation, PlaneStrain, Problem, problem
 from sorojax.fem.problem import exchanged
 from sorojax.material import presets
 from sorojax.material.hyperelastic import AbstractHyperelastic
-from sorojax.math.at_once import at_once
 from sorojax.mesh import rectangle
 from sorojax.mesh.elements import Quad4
 from sorojax.mesh.mesh import boundary_facets
@@ -94,14 +93,14 @@ def _filled(cell: PneuNetCell, parts: tuple[InterpolatedEnergy, Array]) -> Probl
 # long as the solve when they are differentiated.
 
 
-@at_once
+@jax.jit
 def _parts(parts, base: AbstractHyperelastic, cells, density):
     interpolation, chamber = parts
     spread = of_nodes if isinstance(chamber, Darcy) else of_cells
     return interpolated_energy(base, interpolation(density)), spread(chamber(density), cells)
 
 
-@at_once
+@jax.jit
 def _planned(plan: Layout, parts, base: AbstractHyperelastic, cells, x, sharpness):
     return _parts(parts, base, cells, plan(x, sharpness))
 
@@ -111,7 +110,7 @@ def output(cell: PneuNetCell, u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
     return _chosen(cell.selector, u)
 
 
-@at_once
+@jax.jit
 def _chosen(selector, u):
     return jnp.sum(selector * u)
 

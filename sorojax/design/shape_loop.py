@@ -10,7 +10,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from sorojax._types import is_traced, real
+from sorojax._jax.trace_state import is_traced
+from sorojax._types import real
 from sorojax.design.minimise import Optimised, Optimiser, Step, minimise
 from sorojax.fem import Problem
 from sorojax.mesh.distortion import distortion

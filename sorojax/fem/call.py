@@ -6,10 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
+from sorojax._jax.trace_state import is_tracer
 from sorojax.fem.follow import Log, Stats
 from sorojax.fem.newton import Newton
 from sorojax.fem.problem import Problem
@@ -50,7 +50,7 @@ class Solve:
         self._all, self._tree = jax.tree.flatten((problem, begin))
         self._places = [k for k, leaf in enumerate(self._all) if eqx.is_array(leaf)]
         self.leaves = [_strong(self._all[k]) for k in self._places]
-        self.traced = [k for k, leaf in enumerate(self.leaves) if isinstance(leaf, Tracer)]
+        self.traced = [k for k, leaf in enumerate(self.leaves) if is_tracer(leaf)]
         last = len(jax.tree.leaves(begin))
         self.num_problem_leaves = sum(k < len(self._all) - last for k in self._places)
         self.settings = (newton, steps, max_cuts)

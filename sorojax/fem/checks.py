@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import is_traced
+from sorojax._jax.trace_state import is_traced
 from sorojax.fem.formulation import (
     AbstractFormulation,
     ConstantPressure,

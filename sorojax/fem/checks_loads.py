@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from sorojax import _check
-from sorojax._types import is_traced
+from sorojax._jax.trace_state import is_traced
 from sorojax.fem.checks import check_ids
 from sorojax.fem.contact_load import Contact
 from sorojax.fem.facets import open_nodes

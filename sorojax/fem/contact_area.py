@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sorojax._types import is_traced
+from sorojax._jax.trace_state import is_traced
 from sorojax.fem.facets import facet_tables, normals
 from sorojax.material.hyperelastic import small_strain_moduli
 from sorojax.mesh.elements import facet_corners

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax._jax.jit import once
+from sorojax._jax.trace_state import is_traced
 from sorojax._progress import report
-from sorojax._types import is_traced
 from sorojax.contact import Contacts
 from sorojax.fem import checks_loads
 from sorojax.fem.contact_load import Contact
@@ -19,7 +20,6 @@ from sorojax.fem.problem import Problem
 from sorojax.fem.self_contact import SelfContact, with_partners
 from sorojax.fem.solve import ConvergenceError, Solution, solve
 from sorojax.fem.space import space
-from sorojax.math.jit import once
 from sorojax.math.status import Status
 
 Touching = Contact | SelfContact

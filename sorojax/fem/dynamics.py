@@ -11,8 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._jax.jit import once
+from sorojax._jax.trace_state import is_traced
 from sorojax._progress import report
-from sorojax._types import is_traced, real
+from sorojax._types import real
 from sorojax.fem.contact_load import Contact
 from sorojax.fem.contact_start import moving
 from sorojax.fem.damping import AbstractDamping
@@ -30,7 +32,6 @@ from sorojax.fem.problem import Problem, body
 from sorojax.fem.step_state import StepState
 from sorojax.fem.traced import known_mask
 from sorojax.math import sparse
-from sorojax.math.jit import once
 from sorojax.math.status import Status
 from sorojax.mesh.mesh import Mesh
 

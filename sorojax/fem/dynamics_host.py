@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sorojax._jax.jit import once
 from sorojax.fem import assemble as asm
 from sorojax.fem.contact_swept import passed_through
 from sorojax.fem.dynamics_lists import has_lists, listed_at
@@ -38,7 +39,6 @@ from sorojax.fem.loads import AbstractLoad
 from sorojax.fem.newton import Newton
 from sorojax.fem.problem import Problem, body
 from sorojax.fem.supports import known_values
-from sorojax.math.jit import once
 from sorojax.math.split import Split, kernel
 from sorojax.math.status import Status
 

@@ -1,6 +1,6 @@
 """A motion as a function of the numbers of its dynamics, for every transformation.
 
-One primitive stands for the run: with concrete numbers it steps on the host, lane after
+One operation stands for the run: with concrete numbers it steps on the host, lane after
 lane under `vmap`; inside a trace it becomes the loop of `dynamics_traced`. Its derivative
 is that of the discrete equations, step by step with the exact tangent at each solved
 displacement: one assembly, one factor and one back-substitution for each direction. In
@@ -11,14 +11,13 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jax.extend.core import Primitive
-from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
+from sorojax._jax.operations import Rules, operation
+from sorojax._jax.trace_state import evaluated_now
 from sorojax.fem.dynamics_host import Control, Run
 from sorojax.fem.dynamics_step import Dynamics, begin_step, end_step, matter, with_terms
 from sorojax.fem.dynamics_traced import Record, interval_of, run_traced
@@ -28,9 +27,6 @@ from sorojax.fem.linear import linearise
 from sorojax.fem.supports import known_values
 from sorojax.fem.traced import prepare_traced
 from sorojax.math import sparse
-
-_motion_p = Primitive("fem_motion")
-_motion_p.multiple_results = True
 
 
 class MotionCall:
@@ -65,7 +61,7 @@ def recorded(call: MotionCall) -> Record:
 
 def _bound(call: MotionCall, leaves):
     batched = (False,) * len(leaves)
-    return tuple(_motion_p.bind(*leaves, call=call, lead=(), batched=batched))
+    return tuple(_motion_of(*leaves, call=call, lead=(), batched=batched))
 
 
 _recorded = jax.custom_jvp(_bound, nondiff_argnums=(0,))
@@ -165,9 +161,8 @@ def _linear_motion(params: Dynamics, rest: Dynamics, params_dot: Dynamics, u, st
     return dots
 
 
-@_motion_p.def_impl
 def _on_host(*leaves, call: MotionCall, lead: tuple[int, ...], batched: tuple[bool, ...]):
-    with jax.core.eval_context():
+    with evaluated_now():
         if not lead:
             return list(_run(call, list(leaves)))
         num = int(np.prod(lead))
@@ -196,11 +191,10 @@ def _run(call: MotionCall, leaves) -> Record:
     return Record(*map(jnp.asarray, (u, steps, np.array(counts, float))))
 
 
-@_motion_p.def_abstract_eval
 def _shapes(*leaves, call: MotionCall, lead, batched):
     dtype = jnp.result_type(float)
     shapes = ((call.rows, *call.shape), (call.rows, 3), (4,))
-    return [jax.core.ShapedArray((*lead, *shape), dtype) for shape in shapes]
+    return [jax.ShapeDtypeStruct((*lead, *shape), dtype) for shape in shapes]
 
 
 def _in_trace(*leaves, call: MotionCall, lead, batched) -> list[Any]:
@@ -215,9 +209,7 @@ def _in_trace(*leaves, call: MotionCall, lead, batched) -> list[Any]:
 
 def _batch(leaves, axes, *, call, lead, batched):
     rows, wide, batched = widened(leaves, axes, lead, batched)
-    out = _motion_p.bind(*rows, call=call, lead=wide, batched=batched)
-    return out, [0] * len(out)
+    return _motion_of(*rows, call=call, lead=wide, batched=batched)
 
 
-batching.primitive_batchers[_motion_p] = _batch
-mlir.register_lowering(_motion_p, mlir.lower_fun(_in_trace, multiple_results=True))
+_motion_of = operation("fem_motion", Rules(_on_host, _in_trace, _shapes, _batch))

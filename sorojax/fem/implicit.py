@@ -1,24 +1,21 @@
 """Equilibrium as a function of the numbers of a problem, for every transformation.
 
-One primitive stands for the solve. With concrete numbers it follows the load path on the
+One operation stands for the solve. With concrete numbers it follows the load path on the
 host, lane after lane under `vmap`; inside a trace it becomes the loop of `traced`. Its
 derivative is that of the implicit function (`response`).
 """
 
-import contextlib
 import functools
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jax.extend.core import Primitive
-from jax.interpreters import batching, mlir
 
-from sorojax._types import is_traced
+from sorojax._jax.operations import Rules, operation
+from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax.fem.call import Solve
 from sorojax.fem.follow import Log, Start, begin_at, follow
 from sorojax.fem.lanes import scaled_features, solve_lanes
@@ -36,9 +33,6 @@ from sorojax.fem.traced import (
 #: Last relative update below which the tangent assembled before it is as good as exact.
 _SHARP = 1e-5
 
-_equilibrium_p = Primitive("fem_equilibrium")
-_equilibrium_p.multiple_results = True
-
 
 def equilibrium(call: Solve) -> Outcome:
     """Equilibrium of the problem of `call`; the host's record of it is in `call` then."""
@@ -53,14 +47,14 @@ def _equilibrium(call: Solve, traced):
 def _solved(call: Solve, traced):
     leaves = call.complete(traced)
     batched = (False,) * len(leaves)
-    return tuple(_equilibrium_p.bind(*leaves, call=call, lead=(), batched=batched))
+    return tuple(_equilibrium_of(*leaves, call=call, lead=(), batched=batched))
 
 
 def _derivative(call: Solve, primals, tangents):
     (traced,), (dots,) = primals, tangents
     concrete = not is_traced(traced)
     # what is staged for a derivative, or as the rule of one, costs as much as a factor
-    with jax.core.eval_context() if concrete else contextlib.nullcontext():
+    with evaluated_now(traced):
         solve = _solved if concrete else _equilibrium
         u, counts, values = solve(call.with_tangent(), traced)
         at, rates = _linearised_at(call, traced, dots, u, counts, values)
@@ -115,9 +109,8 @@ _tangent_values.defjvp(_tangent_values_derivative, symbolic_zeros=True)
 _prepare_traced = eqx.filter_jit(prepare_traced)
 
 
-@_equilibrium_p.def_impl
 def _on_host(*leaves, call: Solve, lead: tuple[int, ...], batched: tuple[bool, ...]):
-    with jax.core.eval_context():
+    with evaluated_now():
         if lead:
             return _lanes_on_host(leaves, call, lead, batched)
         log = Log(*call.settings)
@@ -189,17 +182,15 @@ def _lanes_on_host(leaves, call: Solve, lead, batched) -> list[jax.Array]:
     return [x.reshape(*lead, *x.shape[1:]) for x in stacked]
 
 
-@_equilibrium_p.def_abstract_eval
 def _shapes(*leaves, call: Solve, lead, batched):
     dtype = jnp.result_type(float)
     shapes = (call.shape, (4,), (call.num_values,))
-    return [jax.core.ShapedArray((*lead, *shape), dtype) for shape in shapes]
+    return [jax.ShapeDtypeStruct((*lead, *shape), dtype) for shape in shapes]
 
 
 def _batch(leaves, axes, *, call: Solve, lead, batched):
     rows, wide, batched = widened(leaves, axes, lead, batched)
-    out = _equilibrium_p.bind(*rows, call=call, lead=wide, batched=batched)
-    return out, [0] * len(out)
+    return _equilibrium_of(*rows, call=call, lead=wide, batched=batched)
 
 
 def widened(leaves, axes, lead: tuple[int, ...], batched: tuple[bool, ...]):
@@ -217,9 +208,6 @@ def widened(leaves, axes, lead: tuple[int, ...], batched: tuple[bool, ...]):
             x = jnp.broadcast_to(x, (*wide, *own))
         rows.append(x)
     return rows, wide, tuple(b or a is not None for a, b in zip(axes, batched, strict=True))
-
-
-batching.primitive_batchers[_equilibrium_p] = _batch
 
 
 def _in_trace(*leaves, call: Solve, lead, batched) -> list[Any]:
@@ -250,4 +238,4 @@ def lane_after_lane(one, leaves, lead: tuple[int, ...], batched) -> list[Any]:
     return [x.reshape(*lead, *x.shape[1:]) for x in out]
 
 
-mlir.register_lowering(_equilibrium_p, mlir.lower_fun(_in_trace, multiple_results=True))
+_equilibrium_of = operation("fem_equilibrium", Rules(_on_host, _in_trace, _shapes, _batch))

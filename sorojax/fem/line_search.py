@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from sorojax._jax.jit import once
 from sorojax.fem.problem import Problem, unsupported
-from sorojax.math.jit import once
 
 _MOST = 1.1  # change of the slope, over what the whole energy needs, that a step may bring
 _LEAST = 0.4  # and that a shortened one brings

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-from sorojax._types import is_traced
+from sorojax._jax.trace_state import is_traced
 from sorojax.fem.linear import linearise
 from sorojax.fem.mass import mass_matrix
 from sorojax.fem.problem import Problem

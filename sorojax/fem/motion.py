@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sorojax._display import displayed, number, outcome
-from sorojax._types import is_traced
+from sorojax._jax.trace_state import is_traced
 from sorojax.fem.dynamics_lists import has_lists, lists_of, with_lists
 from sorojax.fem.dynamics_step import Dynamics, State, matter
 from sorojax.fem.energy_form import potential_energy

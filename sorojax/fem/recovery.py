@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sorojax._types import is_traced
+from sorojax._jax.trace_state import is_traced
 from sorojax.fem.energy import energy_density
 from sorojax.fem.energy_form import body_at
 from sorojax.fem.points import deformation, points_at, quadrature_points

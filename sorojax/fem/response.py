@@ -1,27 +1,25 @@
 """How an equilibrium answers to small changes of its numbers: a linear map and its transpose.
 
-The map is R_u du = -R_p dp. With concrete numbers it is one primitive, so that tracing a
+The map is R_u du = -R_p dp. With concrete numbers it is one operation, so that tracing a
 derivative stages one operation; the work is done in whichever direction is asked for: one
 compiled program, one factor and one back-substitution.
 """
 
-import contextlib
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from sorojax._types import is_traced
+from sorojax._jax.linear_map import pushed
+from sorojax._jax.trace_state import evaluated_now
 from sorojax.fem.energy_form import potential_energy, residual
 from sorojax.fem.problem import Problem, unsupported
 from sorojax.fem.supports import known_dofs, known_values
 from sorojax.fem.traced import known_mask
 from sorojax.math import sparse
-from sorojax.math.linear_map import pushed
 
 
 class Equilibrium(NamedTuple):
@@ -49,7 +47,7 @@ def response(at: Equilibrium, rates: Problem) -> Float[Array, "nodes dim"]:
 
 
 def response_at_once(at: Equilibrium, rates: Problem) -> Float[Array, "nodes dim"]:
-    """The same for a concrete equilibrium, as one primitive."""
+    """The same for a concrete equilibrium, as one operation."""
     moving, tree = jax.tree.flatten(rates)
     return pushed(moving, _Map(at, tree))[0]
 
@@ -64,12 +62,12 @@ class _Map:
     def push(self, *moving) -> tuple:
         return (response(self.at, jax.tree.unflatten(self.tree, moving)),)
 
-    push_at_once = push
+    push_now = push
 
     def pull(self, *changes) -> list:
         return list(jax.linear_transpose(self.push, *self.inputs)(changes))
 
-    def pull_at_once(self, *changes) -> list:
+    def pull_now(self, *changes) -> list:
         """By one back-substitution and the derivative of one number."""
         if _supports_move(self.at):
             return self.pull(*changes)
@@ -91,9 +89,9 @@ def _without_supports(at: Equilibrium) -> Equilibrium:
 def _held_tangent(at: Equilibrium):
     """The system, the tangent with its supports, and which unknowns these decide."""
     problem = eqx.combine(at.params, at.rest)
-    system, concrete = problem.space.system, not is_traced(at)
+    system = problem.space.system
     # Concrete numbers run one compiled program, not its operations for the trace.
-    with jax.core.eval_context() if concrete else contextlib.nullcontext():
+    with evaluated_now(at):
         return system, *_held(system, problem.supports, at.values, at.u)
 
 

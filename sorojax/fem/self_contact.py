@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax import _check
-from sorojax._types import integers, is_traced, optional_real, real
+from sorojax._jax.trace_state import is_traced
+from sorojax._types import integers, optional_real, real
 from sorojax.contact import Contacts, Penalty
 from sorojax.contact.facet import over, pieces, shared
 from sorojax.contact.search import close_pairs, listed

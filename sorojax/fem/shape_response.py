@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sorojax._jax.programs import depends
 from sorojax.fem.kinematics import AbstractKinematics
 from sorojax.fem.tensor import (
     Entries,
@@ -18,7 +19,6 @@ from sorojax.fem.tensor import (
 )
 from sorojax.material.hyperelastic import AbstractHyperelastic, first_invariant_energy
 from sorojax.material.kinematics import Entry, square_norm
-from sorojax.math.depends import depends
 from sorojax.math.root import inverse_cube_root
 
 

@@ -4,20 +4,19 @@ The derivative is that of the implicit function at the converged state: one more
 back-substitution per direction, whatever steps the solver took to get there.
 """
 
-import contextlib
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax import _check
 from sorojax._display import displayed, number, outcome
+from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax._progress import report
-from sorojax._types import is_traced, real
+from sorojax._types import real
 from sorojax.fem.call import Solve
 from sorojax.fem.follow import Stats, unloaded
 from sorojax.fem.implicit import equilibrium
@@ -141,14 +140,14 @@ def solved_and_kept(
 def _begun(start: Any) -> Begin:
     if is_traced(start):
         return Begin(jax.lax.stop_gradient(real(start)))
-    with jax.core.eval_context():
+    with evaluated_now():
         return Begin(real(start))
 
 
 def _told(counts: Float[Array, " 4"], stats):
     """Status, record, fraction of the load and iterations, from what is concrete at once:
     every operation beside a derivative is staged with it."""
-    with contextlib.nullcontext() if is_traced(counts) else jax.core.eval_context():
+    with evaluated_now(counts):
         if isinstance(stats, Stats):
             failed, fraction, iterations, _ = np.asarray(counts)
             status = Status.not_converged if failed else Status.successful

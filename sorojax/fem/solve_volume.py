@@ -1,17 +1,15 @@
 """Equilibrium with closed cavities, differentiable by the implicit function theorem."""
 
-import contextlib
-
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._display import displayed, number, outcome
+from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax._progress import report
-from sorojax._types import is_traced, real
+from sorojax._types import real
 from sorojax.fem.cavity import (
     AbstractContents,
     CavityStart,
@@ -205,7 +203,7 @@ def _equilibrium(problem, names: Names, contents, begin: CavityStart, log: Log):
                 "outside: its kernels are compiled already, and grad works without jit."
             )
         problem, contents = eqx.combine(params, rest)
-        with jax.core.eval_context():
+        with evaluated_now():
             start = eqx.combine(held, pattern)
             found = follow_contents(problem, names, contents, start, log)
             return jnp.asarray(found[0]), jnp.asarray(found[1])
@@ -239,8 +237,7 @@ def _tangent(rest, names: Names, state, params, params_dot):
     )
     contents_rate = jax.jacfwd(lambda p: unbalanced(params, u, p)[1])(pressures)
     slope = pressure_force_rate(problem, names, u)
-    concrete = not is_traced((params, u))
-    with jax.core.eval_context() if concrete else contextlib.nullcontext():
+    with evaluated_now(params, u):
         prepared = prepare(problem)
         values = linearise(problem, prepared, u, u).values
         matrix = sparse.fix(problem.space.system, values, prepared.known)

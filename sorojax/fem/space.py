@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sorojax._types import is_traced, platform
+from sorojax._jax.trace_state import is_traced
+from sorojax._types import platform
 from sorojax.math import sparse
 from sorojax.mesh.elements import AbstractElement, PolyN, Tet4
 from sorojax.mesh.mesh import Mesh, valences

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
-from sorojax._types import integers, is_traced, real
+from sorojax._jax.trace_state import is_traced
+from sorojax._types import integers, real
 from sorojax.fem.checks import check_ids
 from sorojax.fem.curved import CurvedPart
 from sorojax.fem.loads import AbstractLoad

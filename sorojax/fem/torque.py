@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sorojax._types import integers, is_traced, optional_real, real
+from sorojax._jax.trace_state import is_traced
+from sorojax._types import integers, optional_real, real
 from sorojax.fem.curved import CurvedPart
 from sorojax.fem.kinematics import Axisymmetric
 from sorojax.fem.loads import AbstractLoad

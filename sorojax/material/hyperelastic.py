@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax._display import displayed
+from sorojax._jax.jit import once
 from sorojax.material import checks
 from sorojax.material.kinematics import Entry, Tensor, determinant, from_matrix
-from sorojax.math.jit import once
 
 
 @displayed

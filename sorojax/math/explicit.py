@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from sorojax._jax.small_products import with_sums
 from sorojax.math.method import AbstractMethod, Field, Step
-from sorojax.math.small_products import with_sums
 
 
 class Tableau(NamedTuple):

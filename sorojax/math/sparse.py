@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sorojax._types import is_traced
+from sorojax._jax.host_call import host_call
+from sorojax._jax.trace_state import is_traced
 from sorojax.math import conjugate_gradient as cg
 from sorojax.math.aggregation import hierarchy
 from sorojax.math.conjugate_gradient import (
@@ -28,7 +29,6 @@ from sorojax.math.direct import (
     pattern_key,
     solver_of,
 )
-from sorojax.math.host_call import host_call
 
 
 class _Kept:

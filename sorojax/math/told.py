@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sorojax._jax.host_call import tell_host
 from sorojax._progress import report
 
 
@@ -14,7 +15,7 @@ def tell(label: str, share: Float[Array, ""]) -> None:
     """Report that `share` of the call `label` is done; of lanes that run at once their
     mean, in one report."""
     share = mean_of_lanes(jax.lax.stop_gradient(share))
-    jax.debug.callback(lambda x: report(label, float(x), 1.0), share)
+    tell_host(lambda x: report(label, float(x), 1.0), share)
 
 
 def _over_lanes(reduce: Callable[[Array], Array]) -> Callable[[Array], Array]:

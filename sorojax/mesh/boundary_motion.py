@@ -1,14 +1,13 @@
 """Where boundary nodes go when the shape changes, by the implicit-function rule."""
 
-import contextlib
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from sorojax._types import integers, is_traced, real
+from sorojax._jax.trace_state import evaluated_now
+from sorojax._types import integers, real
 from sorojax.sdf.base import AbstractSdf, cast
 from sorojax.sdf.query import shape_tangent
 from sorojax.sdf.scalar import quotient
@@ -42,11 +41,6 @@ class BoundaryPlan(eqx.Module):
     fields: tuple[FieldPlan, ...]
 
 
-def _compiled(tree):
-    """Concrete numbers run programs that are compiled already, not copies for a trace."""
-    return contextlib.nullcontext() if is_traced(tree) else jax.core.eval_context()
-
-
 def _field_at(field: AbstractSdf, p: Float[Array, "points dim"]) -> Float[Array, " points"]:
     return cast(field, p.dtype).distance(*(p[:, i] for i in range(field.dim)))
 
@@ -67,14 +61,14 @@ def meet(
     fields: Fields, plan: BoundaryPlan, start: Float[Array, "sharp dim"]
 ) -> Float[Array, "sharp dim"]:
     """Where the sides of each sharp node meet, ridge nodes abreast of `start`."""
-    with _compiled((fields, start)):
+    with evaluated_now((fields, start)):
         return _meet(fields, plan, start)[0]
 
 
 @meet.def_jvp
 def _meet_jvp(primals, tangents):
     fields, plan, start = primals
-    with _compiled((fields, start)):
+    with evaluated_now((fields, start)):
         x, normals, slopes, seen = _meet(fields, plan, start)
     start_dot = jnp.zeros_like(start) if tangents[2] is None else tangents[2]
     return x, _meet_dot(fields, plan, normals, slopes, seen, tangents[0], start_dot)
@@ -154,14 +148,14 @@ def slide(
     fields: Fields, plan: BoundaryPlan, start: tuple[Float[Array, "smooth dim"], ...]
 ) -> tuple[Float[Array, "smooth dim"], ...]:
     """Smooth nodes of each field moved from `start` along their normals to the zero set."""
-    with _compiled((fields, start)):
+    with evaluated_now((fields, start)):
         return _slide(fields, plan, start)[0]
 
 
 @slide.def_jvp
 def _slide_jvp(primals, tangents):
     fields, plan, start = primals
-    with _compiled((fields, start)):
+    with evaluated_now((fields, start)):
         x, slopes = _slide(fields, plan, start)
     moving = jax.tree.map(
         lambda s, dot: jnp.zeros_like(s) if dot is None else dot,

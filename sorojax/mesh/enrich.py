@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from sorojax._types import is_traced
+from sorojax._jax.trace_state import is_traced
 from sorojax.mesh.elements import (
     AbstractElement,
     Quad8,

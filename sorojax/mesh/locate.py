@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sorojax._types import is_traced
+from sorojax._jax.trace_state import is_traced
 from sorojax.math.spatial import KDTree
 from sorojax.mesh.elements import Hex8, PolyN, Quad4, Quad8, Quad9
 from sorojax.mesh.mesh import Mesh

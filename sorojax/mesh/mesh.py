@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax._display import displayed, number
-from sorojax._types import integers, is_traced, real
+from sorojax._jax.trace_state import is_traced
+from sorojax._types import integers, real
 from sorojax.mesh.elements import AbstractElement, facet_corners
 
 

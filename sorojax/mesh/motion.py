@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sorojax._types import integers, is_traced, real
+from sorojax._jax.trace_state import is_traced
+from sorojax._types import integers, real
 from sorojax.mesh.boundary_motion import BoundaryPlan, meet, slide
 from sorojax.mesh.distortion import least_corner
 from sorojax.mesh.elements import PolyN

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sorojax._types import is_traced
+from sorojax._jax.trace_state import is_traced
 from sorojax.mesh.elements import Hex8, Quad4, Tet4, Tri3
 from sorojax.mesh.lattice import wedge
 from sorojax.mesh.mesh import Mesh, boundary_facets

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._jax.jit import once
 from sorojax._types import real
 from sorojax.material import AbstractHyperelastic
-from sorojax.math.jit import once
 from sorojax.math.lie import SE2, SE3
 from sorojax.reduction.identify import ConstantDamping
 from sorojax.robots.models_cell import Cell

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from sorojax._jax.jit import once
 from sorojax.material import AbstractHyperelastic, small_strain_moduli
 from sorojax.material.kinematics import from_matrix
-from sorojax.math.jit import once
 from sorojax.robots.models_grid import Grid, Piece
 
 _BLOCK = 400  # boxes at a time

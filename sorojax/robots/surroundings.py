@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax._edit import replace
+from sorojax._jax.jit import once
 from sorojax.contact import LinePenalty
 from sorojax.math.contact_stepper import ContactMidpoint
-from sorojax.math.jit import once
 from sorojax.math.method import finite
 from sorojax.math.split import Split, kernel
 from sorojax.math.steppers import AbstractStepper

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sorojax._types import is_traced
+from sorojax._jax.trace_state import is_traced
 from sorojax.math.quadrature import Quadrature, gauss_legendre
 from sorojax.rod.basis import AbstractModes, StrainBasis, merged
 from sorojax.rod.given_modes import SampledModes

@@ -14,7 +14,6 @@ from sorojax._types import real
 from sorojax.math.batch import batched
 from sorojax.math.dense import solve_symmetric
 from sorojax.math.door import door, full_products
-from sorojax.math.long_batch import long_batches
 from sorojax.rod import loads
 from sorojax.rod.assembly import Assembly, is_flat, rate
 from sorojax.rod.forces import Gravity
@@ -75,7 +74,6 @@ def damping_matrix(model: Model, forces: Forces) -> Float[Array, "dof dof"]:
     return loads.damping_matrix(forces, model, operators(model))
 
 
-@long_batches
 @door
 def forward_dynamics(
     model: Model,
@@ -111,7 +109,6 @@ def forward_dynamics(
     return batched(one)(q, v)
 
 
-@long_batches
 @full_products
 def acceleration(
     model: Model,

@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import is_traced, real
+from sorojax._jax.trace_state import is_traced
+from sorojax._types import real
 from sorojax.math import sparse
 from sorojax.math.door import door
 from sorojax.math.quadrature import gauss_legendre

@@ -10,12 +10,12 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr
 from jaxtyping import Array, Float
 
+from sorojax._jax.jit import once
+from sorojax._jax.programs import is_one_loop
 from sorojax._types import platform, real
 from sorojax.math.apart import Alone, apart
-from sorojax.math.jit import once
 from sorojax.sdf.base import AbstractSdf, cast
 from sorojax.sdf.query import slope_along, value_and_gradient_at
 
@@ -89,19 +89,7 @@ def _fill(piece: Array) -> Array:
 
 def _is_one_loop(shape: AbstractSdf, x: Coordinates) -> bool:
     """Whether the field is made of scalars alone: no search, no table of a row per point."""
-    return _scalars(jax.make_jaxpr(shape.distance)(*x).jaxpr, len(x[0]))
-
-
-def _scalars(program: Jaxpr, count: int) -> bool:
-    for step in program.eqns:
-        if step.primitive.name in ("while", "scan", "gather"):
-            return False
-        if any(getattr(var.aval, "size", 0) > count for var in step.outvars):
-            return False
-        inner = (v.jaxpr if isinstance(v, ClosedJaxpr) else v for v in step.params.values())
-        if not all(_scalars(v, count) for v in inner if isinstance(v, Jaxpr)):
-            return False
-    return True
+    return is_one_loop(shape.distance, *x)
 
 
 def _in_chunks(function, points, width: int):

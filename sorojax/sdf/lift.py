@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import is_traced, real
+from sorojax._jax.trace_state import is_traced
+from sorojax._types import real
 from sorojax.sdf.bars import check_direction
 from sorojax.sdf.base import AbstractSdf, Box, Exactness, Number
 from sorojax.sdf.combine import hull

@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
-from sorojax._types import integers, is_traced, real
+from sorojax._jax.trace_state import is_traced
+from sorojax._types import integers, real
 from sorojax.sdf.base import Box as Bounds, check_lengths
 from sorojax.sdf.nearest import scan_rows, take
 from sorojax.sdf.scalar import absolute, maximum, minimum, ordered

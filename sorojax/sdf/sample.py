@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sorojax._types import is_traced
+from sorojax._jax.trace_state import is_traced
 from sorojax.sdf.base import AbstractSdf, cast
 
 CHUNK = 4096  # fits the cache, and one size means one compilation

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import fem
-from sorojax._types import is_traced
+from sorojax._jax.trace_state import is_traced
 from sorojax.fem.energy_form import potential_energy, residual
 from sorojax.math import sparse
 from sorojax.systems.block import AbstractBlock, Input, Output

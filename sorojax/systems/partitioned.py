@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._jax.jit import once
 from sorojax._types import real
 from sorojax.math.contact_stepper import ContactMidpoint
-from sorojax.math.jit import once
 from sorojax.math.linearly_implicit import Rosenbrock2
 from sorojax.math.method import AbstractMethod
 from sorojax.math.split import Split

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from sorojax import _check
-from sorojax._types import is_traced, real
+from sorojax._jax.trace_state import is_traced
+from sorojax._types import real
 from sorojax.math.method import AbstractMethod, finite
 from sorojax.math.told import tell
 from sorojax.systems.integrate import explicit_inputs

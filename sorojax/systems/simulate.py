@@ -13,10 +13,11 @@ from jaxtyping import Array, Float, PyTree
 
 from sorojax import _check
 from sorojax._display import displayed, number, outcome
-from sorojax._types import is_traced, real
+from sorojax._jax.jit import jit
+from sorojax._jax.trace_state import is_traced
+from sorojax._types import real
 from sorojax.math.control import Control
 from sorojax.math.explicit import RungeKutta4, Tsit5
-from sorojax.math.jit import jit
 from sorojax.math.method import AbstractMethod, finite
 from sorojax.math.status import Status
 from sorojax.systems.coupled import Coupled, bodies_of

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax._jax.jit import once
 from sorojax._types import real
-from sorojax.math.jit import once
 from sorojax.rod import (
     AbstractContact,
     Assembly,

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax._jax.jit import once
 from sorojax.material import AbstractHyperelastic, TensileFit, strain_energy_density
-from sorojax.math.jit import once
 from sorojax.reduction import Backbone
 from sorojax.rod import Rod, StrainBasis, columns, forward_kinematics
 from sorojax.view import style

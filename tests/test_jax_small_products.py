@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from sorojax._jax import small_products
+from sorojax._jax.small_products import LARGEST, LARGEST_BATCH, product_p, with_sums
 from sorojax.math.explicit import rk4_step
-from sorojax.math.small_products import LARGEST, LARGEST_BATCH, product_p, with_sums
+
+pytestmark = [
+    pytest.mark.versions,
+    pytest.mark.skipif(product_p is None, reason=small_products.status()),
+]
 
 SHAPES = {
     "dot": ((3,), (3,), "i,i->"),

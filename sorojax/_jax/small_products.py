@@ -2,24 +2,37 @@
 
 A product of its own is a kernel of its own, and so is each of its factors: of the step of a
 network with a dozen states that is a quarter of the time.
+
+Rests on `jax.extend.core.Primitive` and `ClosedJaxpr`, on `jax.core.eval_jaxpr` and on the
+tables of rules in `jax.interpreters`. Without them products stay as they are.
 """
 
 import math
 from typing import Any
 
 import jax
-import jax.core
 import jax.numpy as jnp
-from jax.core import ShapedArray
-from jax.extend import core
-from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
-from sorojax._types import at_the_top
+from sorojax._jax.optional import optional, reason
+from sorojax._jax.trace_state import outside_transformations
 
 LARGEST = 36  # multiplications in a product
 LARGEST_BATCH = 128  # in all lanes: beyond that, factors computed again cost more
 _INLINED = "jit", "pjit"
+
+_NAMES = (
+    ("jax.extend.core", "Primitive"),
+    ("jax.extend.core", "ClosedJaxpr"),
+    ("jax.core", "ShapedArray"),
+    ("jax.core", "eval_jaxpr"),
+    ("jax.interpreters.ad", "primitive_jvps"),
+    ("jax.interpreters.batching", "primitive_batchers"),
+    ("jax.interpreters.mlir", "lower_fun"),
+    ("jax.interpreters.mlir", "register_lowering"),
+)
+_found: dict[str, Any] = {name: optional(module, name) for module, name in _NAMES}
+_missing = [where for where in _NAMES if _found[where[1]] is None]
 
 
 def with_sums(field: Any, *args: Any) -> Any:
@@ -27,20 +40,20 @@ def with_sums(field: Any, *args: Any) -> Any:
 
     It is traced once for all its calls; run operation by operation, it stays as it is.
     """
-    if at_the_top():
+    if _missing or outside_transformations():
         return field
     closed, shapes = jax.make_jaxpr(field, return_shape=True)(*args)
     program = _with_sums(closed.jaxpr)
     form = jax.tree.structure(shapes)
 
     def summed(*args: Any) -> Any:
-        leaves = jax.core.eval_jaxpr(program, closed.consts, *jax.tree.leaves(args))
+        leaves = _found["eval_jaxpr"](program, closed.consts, *jax.tree.leaves(args))
         return jax.tree.unflatten(form, leaves)
 
     return summed
 
 
-def _with_sums(jaxpr: core.Jaxpr) -> core.Jaxpr:
+def _with_sums(jaxpr: Any) -> Any:
     """The program with small products replaced; itself where it has none."""
     equations = [_replaced(equation) for equation in jaxpr.eqns]
     if all(new is old for new, old in zip(equations, jaxpr.eqns, strict=True)):
@@ -55,7 +68,7 @@ def _replaced(equation: Any) -> Any:
     if name in _INLINED:
         inner = _with_sums(params["jaxpr"].jaxpr)
         if inner is not params["jaxpr"].jaxpr:
-            closed = core.ClosedJaxpr(inner, params["jaxpr"].consts)
+            closed = _found["ClosedJaxpr"](inner, params["jaxpr"].consts)
             return equation.replace(params=params | {"jaxpr": closed})
     return equation
 
@@ -88,16 +101,6 @@ def _free(x: Any, *axes: tuple[int, ...]) -> list[int]:
     return [k for k in range(x.ndim) if not any(k in some for some in axes)]
 
 
-product_p = core.Primitive("small_product")
-product_p.def_impl(jax.lax.dot_general_p.bind)
-
-
-@product_p.def_abstract_eval
-def _(a, b, **params):
-    found = jax.eval_shape(lambda a, b: jax.lax.dot_general_p.bind(a, b, **params), a, b)
-    return ShapedArray(found.shape, found.dtype)
-
-
 def _in_lanes(values, axes, *, dimension_numbers, **params):
     (a, b), (axis_a, axis_b) = values, axes
     (summed_a, summed_b), (shared_a, shared_b) = dimension_numbers
@@ -123,6 +126,24 @@ def _beside(lane: Any, summed: Any, shared: Any, both: bool) -> Any:
     return summed, (lane, *shared) if both else shared
 
 
-ad.primitive_jvps[product_p] = ad.primitive_jvps[jax.lax.dot_general_p]
-batching.primitive_batchers[product_p] = _in_lanes
-mlir.register_lowering(product_p, mlir.lower_fun(as_sum, multiple_results=False))
+def _primitive() -> Any:
+    one, dot = _found["Primitive"]("small_product"), jax.lax.dot_general_p
+    one.def_impl(dot.bind)
+
+    @one.def_abstract_eval
+    def _(a: Any, b: Any, **params: Any) -> Any:
+        found = jax.eval_shape(lambda a, b: dot.bind(a, b, **params), a, b)
+        return _found["ShapedArray"](found.shape, found.dtype)
+
+    _found["primitive_jvps"][one] = _found["primitive_jvps"][dot]
+    _found["primitive_batchers"][one] = _in_lanes
+    _found["register_lowering"](one, _found["lower_fun"](as_sum, multiple_results=False))
+    return one
+
+
+product_p = None if _missing else _primitive()
+
+
+def status() -> str:
+    """Whether small products become sums, for `sorojax info`."""
+    return f"off: {reason(*_missing[0])}" if _missing else "on"

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import sorojax as sj
-from sorojax.math import one_kernel as kernels
-from sorojax.math.trigonometry import cosine, sine
+from sorojax._jax import small_kernels as kernels
+from sorojax._jax.trigonometry import cosine, sine
 
+pytestmark = pytest.mark.versions
 fast = jax.jit(lambda x: (sine(x), cosine(x)))
 
 
@@ -40,7 +41,7 @@ def test_quarter_turns():
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-16)
 
 
-@pytest.mark.skipif(not kernels._KNOWN, reason="kernels belong to the compiler of jaxlib 0.10")
+@pytest.mark.skipif(not kernels._IS_PROVEN, reason=kernels.status())
 @pytest.mark.parametrize("kind", ["float64", "float32"])
 def test_loops_in_kernels_use_them(kind):
     x = jnp.linspace(0.1, 0.9, 6).astype(kind)

@@ -1,5 +1,9 @@
-"""Programs of small arrays, compiled for speed where they run by themselves."""
+"""Programs of small arrays, compiled for speed where they run by themselves.
 
+Rests on `sorojax._jax.small_kernels`, without which they are compiled as by `jax.jit`.
+"""
+
+import contextlib
 import functools
 import math
 from collections.abc import Callable
@@ -10,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sorojax.math.one_kernel import LARGEST_GIVEN, OPTIONS, one_kernel, runs_alone
+from sorojax._jax.small_kernels import LARGEST_GIVEN, OPTIONS, one_kernel, runs_alone
 
 Verb = TypeVar("Verb", bound=Callable[..., Any])
 
@@ -19,10 +23,11 @@ def jit(function: Verb, *, kernels: bool = True, largest: float = LARGEST_GIVEN)
     """`function` compiled, as by `equinox.filter_jit`: for rods, networks and their gradients.
 
     On a CPU, loops over small arrays become one kernel each, which is up to two and a half
-    times faster; SOROJAX_ONE_KERNEL=0 in the environment leaves that out. Sine and cosine
-    in them are polynomials: to 3e-16, of angles rounded to 1e-16 of their size. Long programs
-    compile faster with `kernels=False`, which leaves their loops as they are. Calls with
-    arrays of more than `largest` numbers are compiled as by `jax.jit`.
+    times faster, where the installed jaxlib is one that was proven to compile them
+    (`sorojax info`). Sine and cosine in them are polynomials: to 3e-16, of angles rounded to
+    1e-16 of their size. Long programs compile faster with `kernels=False`, which leaves their
+    loops as they are. Calls with arrays of more than `largest` numbers are compiled as by
+    `jax.jit`.
 
     Inside `jit`, `vmap` or `grad` it is part of the program around it, so the outermost
     function is the one to wrap:
@@ -41,10 +46,10 @@ def jit(function: Verb, *, kernels: bool = True, largest: float = LARGEST_GIVEN)
         if not refused and runs_alone(args, kwargs, largest=largest):
             try:
                 return alone(*args, **kwargs)[0]
-            except jax.errors.JaxRuntimeError as error:
-                if not is_refusal(error):
-                    raise
-                refused.append(error)
+            except jax.errors.JaxRuntimeError:
+                if compiles(alone, *args, **kwargs):
+                    raise  # of the program itself, which must not run twice
+                refused.append(True)
         return inside(*args, **kwargs)
 
     return call  # type: ignore[return-value]
@@ -125,17 +130,17 @@ def compiled(function: Callable[..., Any], *examples: Any) -> Compiled:
             )
     examples = jax.tree.map(jnp.asarray, examples)
     if runs_alone():
-        try:
-            program = jax.jit(one_kernel(function), compiler_options=OPTIONS)
+        program = jax.jit(one_kernel(function), compiler_options=OPTIONS)
+        with contextlib.suppress(jax.errors.JaxRuntimeError):
             return Compiled(program.lower(*examples).compile(), examples)
-        except jax.errors.JaxRuntimeError as error:
-            if not is_refusal(error):
-                raise
     plain = jax.jit(lambda *args: (function(*args), None))
     return Compiled(plain.lower(*examples).compile(), examples)
 
 
-def is_refusal(error: Exception) -> bool:
-    """Whether it is the compiler that cannot, not the program that failed."""
-    words = "UNIMPLEMENTED", "Unsupported", "No such compile option"
-    return any(word in str(error) for word in words)
+def compiles(program: Any, *args: Any, **kwargs: Any) -> bool:
+    """Whether the compiler takes `program`: then an error was the program's own."""
+    try:
+        program.lower(*args, **kwargs).compile()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True

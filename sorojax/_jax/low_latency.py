@@ -1,4 +1,16 @@
-"""Loops in real time: JAX answers in the thread that asks."""
+"""Loops in real time: JAX answers in the thread that asks.
+
+Rests on the option `jax_cpu_enable_async_dispatch`, which JAX documents, and on
+`jax._src.xla_bridge.backends_are_initialized`, without which a call that comes too late is
+not noticed.
+"""
+
+import jax
+
+from sorojax._jax.optional import optional
+
+_OPTION = "jax_cpu_enable_async_dispatch"
+_has_started = optional("jax._src.xla_bridge", "backends_are_initialized")
 
 
 def enable_low_latency() -> None:
@@ -12,13 +24,9 @@ def enable_low_latency() -> None:
     Raises:
         RuntimeError: If JAX has started already.
     """
-    import jax
-    from jax._src import xla_bridge
-
-    name = "jax_cpu_enable_async_dispatch"
-    if xla_bridge.backends_are_initialized() and jax.config.read(name):
+    if _has_started is not None and _has_started() and jax.config.values.get(_OPTION, True):
         raise RuntimeError(
             "enable_low_latency: JAX has started already, need it before the first array. Call "
             "it right after the imports."
         )
-    jax.config.update(name, False)
+    jax.config.update(_OPTION, False)

@@ -7,26 +7,28 @@ whose operations such a kernel can hold.
 
 Only programs that run by themselves can be compiled so: inside `jit`, `vmap` or `grad` a
 function is part of a program that belongs to others.
+
+Rests on a mark and options of XLA's compiler for CPUs, on `set_xla_metadata`, and on the
+programs of `jax.extend.core`. A jaxlib that is not among `PROVEN` gets the plain program.
 """
 
 import functools
-import os
 from collections.abc import Callable
 from importlib import metadata
 from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend import core
 
-from sorojax._types import at_the_top
-from sorojax.math.small_products import multiplications
-from sorojax.math.trigonometry import cosine, sine
+from sorojax._jax.optional import optional, reason
+from sorojax._jax.small_products import multiplications
+from sorojax._jax.trace_state import is_tracer, outside_transformations
+from sorojax._jax.trigonometry import cosine, sine
 
+#: Releases of jaxlib on which 2,000 random programs agree with the plain ones (`make fuzz`).
+PROVEN = ("0.10.0", "0.10.2", "0.12.0.1")
 LARGEST = 4096  # numbers in an array that is made inside a loop: some 32 kB
 LARGEST_PASSED = 65536  # numbers in an array that a loop is given, or leaves
 LARGEST_PRODUCT = 8192  # multiplications of a matrix product; beyond that a library is faster
@@ -34,9 +36,21 @@ LONGEST = 4000  # operations in a loop: beyond that one kernel compiles slowly
 LARGEST_GIVEN = 1024  # numbers in an argument: batches of states are no small arrays
 MARK = {"xla_cpu_small_call": "true", "inlineable": "false"}
 NO_MARK = {"xla_cpu_small_call": "false", "inlineable": "true"}  # of what a kernel calls
-# No kernel can hold products by that library; the emitters take longer to compile what is
-# left, and gain nothing where arrays are small.
-OPTIONS = {"xla_cpu_experimental_ynn_fusion_type": "", "xla_cpu_use_fusion_emitters": False}
+_JAXLIB = metadata.version("jaxlib")
+# No kernel can hold products by that library.
+OPTIONS: dict[str, Any] = {"xla_cpu_experimental_ynn_fusion_type": ""}
+if _JAXLIB.startswith("0.10."):
+    # They take longer to compile what is left, and gain nothing where arrays are small.
+    OPTIONS["xla_cpu_use_fusion_emitters"] = False
+
+_NAMES = (
+    ("jax.experimental.xla_metadata", "set_xla_metadata"),
+    ("jax.core", "eval_jaxpr"),
+    ("jax.extend.core", "Literal"),
+    ("jax.extend.core", "Jaxpr"),
+    ("jax.extend.core", "ClosedJaxpr"),
+)
+_found: dict[str, Any] = {name: optional(module, name) for module, name in _NAMES}
 
 _NUMBER = "float32"
 _KINDS = {
@@ -97,18 +111,24 @@ def one_kernel(function: Callable[..., Answer]) -> Callable[..., tuple[Answer, A
 
 def runs_alone(*args: Any, largest: float = LARGEST_GIVEN) -> bool:
     """Whether a call with `args` is a program by itself on a CPU, of arrays of at most
-    `largest` numbers."""
-    if not at_the_top():
+    `largest` numbers, and its kernels are proven."""
+    if not _IS_PROVEN or not outside_transformations():
         return False
     for leaf in jax.tree.leaves(args):
-        if isinstance(leaf, jax.core.Tracer) or getattr(leaf, "size", 0) > largest:
+        if is_tracer(leaf) or getattr(leaf, "size", 0) > largest:
             return False
-    allowed = _KNOWN and os.environ.get("SOROJAX_ONE_KERNEL") != "0"
-    return allowed and jax.default_backend() == "cpu" and jax.device_count() == 1
+    return jax.default_backend() == "cpu" and jax.device_count() == 1
 
 
-# The mark and the options belong to the compiler of these releases.
-_KNOWN = metadata.version("jaxlib").startswith("0.10.")
+def status() -> str:
+    """Whether loops become kernels, for `sorojax info`."""
+    if _JAXLIB not in PROVEN:
+        return f"off: not proven on jaxlib {_JAXLIB}, needs one of {', '.join(PROVEN)}"
+    missing = [where for where in _NAMES if _found[where[1]] is None]
+    return f"off: {reason(*missing[0])}" if missing else "on"
+
+
+_IS_PROVEN = status() == "on"
 
 
 def _run(jaxpr: Any, consts: Any, args: list[Any], reads: list[Any]) -> list[Any]:
@@ -119,7 +139,7 @@ def _values(evaluate: Any, jaxpr: Any, consts: Any, args: list[Any]) -> list[Any
     values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True))
 
     def read(atom: Any) -> Any:
-        return atom.val if isinstance(atom, core.Literal) else values[atom]
+        return atom.val if isinstance(atom, _found["Literal"]) else values[atom]
 
     for equation in jaxpr.eqns:
         found = evaluate(jaxpr, equation, [read(atom) for atom in equation.invars])
@@ -145,7 +165,7 @@ def _in_one(function: Callable[..., list[Any]], given: list[Any], reads: list[An
     """
     kinds: dict[Any, list[int]] = {}
     for place, value in enumerate(given):
-        if isinstance(value, jax.core.Tracer):
+        if is_tracer(value):
             kinds.setdefault(value.dtype, []).append(place)
     if not kinds:
         return function(given)
@@ -157,7 +177,7 @@ def _in_one(function: Callable[..., list[Any]], given: list[Any], reads: list[An
     ]
 
     def marked(*packs: Any) -> Any:
-        with set_xla_metadata(**NO_MARK):
+        with _found["set_xla_metadata"](**NO_MARK):
             values = list(given)
             for pack, places in zip(packs, kinds.values(), strict=True):
                 start = 1
@@ -168,7 +188,7 @@ def _in_one(function: Callable[..., list[Any]], given: list[Any], reads: list[An
             first = [pack[:1].astype(_NUMBER) for pack in packs]
             return function(values), functools.reduce(jnp.add, first)[0]
 
-    with set_xla_metadata(**MARK):
+    with _found["set_xla_metadata"](**MARK):
         found, number = jax.jit(marked)(*packs)
     reads.append(number)
     return found
@@ -184,7 +204,7 @@ def _inside(jaxpr: Any, equation: Any, given: Any) -> list[Any]:
     if name != "while" and not any(_holds(body, _OTHER) for body, _ in _bodies(equation)):
         return _bound(jaxpr, equation, given)  # a scan counts anyway
     if name == "scan":
-        fixed, ends = params["num_consts"], params["num_consts"] + params["num_carry"]
+        fixed, ends = _constants_and_carry(params)
 
         def step(carry: Any, row: Any) -> Any:
             found = _evaluate(params["jaxpr"], [*given[:fixed], *carry, *row])
@@ -209,8 +229,16 @@ def _inside(jaxpr: Any, equation: Any, given: Any) -> list[Any]:
         return jax.lax.while_loop(goes_on, turn, start)[1]
     inner = _bodies(equation)
     if name in _INLINED and len(inner) == 1:
-        return _evaluate(core.ClosedJaxpr(*inner[0]), given)
+        return _evaluate(_found["ClosedJaxpr"](*inner[0]), given)
     return _bound(jaxpr, equation, given)
+
+
+def _constants_and_carry(params: Any) -> tuple[int, int]:
+    """Where the constants of a scan end among its arguments, and where its carry does."""
+    if "ft_in" in params:  # since jax 0.11
+        constants, carry, _ = params["ft_in"].unpack()
+        return len(constants), len(constants) + len(carry)
+    return params["num_consts"], params["num_consts"] + params["num_carry"]
 
 
 def _evaluate(closed: Any, args: list[Any]) -> list[Any]:
@@ -222,12 +250,12 @@ def _bound(jaxpr: Any, equation: Any, given: Any) -> list[Any]:
     pairs = {
         var: value
         for var, value in zip(equation.invars, given, strict=True)
-        if not isinstance(var, core.Literal)
+        if not isinstance(var, _found["Literal"])
     }
     parts = {"eqns": [equation], "outvars": equation.outvars, "constvars": []}
     unnamed = jaxpr.debug_info._replace(arg_names=None, result_paths=None)
     alone = jaxpr.replace(invars=list(pairs), **parts, debug_info=unnamed)
-    return jax.core.eval_jaxpr(alone, (), *pairs.values())
+    return _found["eval_jaxpr"](alone, (), *pairs.values())
 
 
 def _is_small(equation: Any) -> bool:
@@ -286,11 +314,11 @@ def _bodies(equation: Any) -> list[tuple[Any, Any]]:
     found = []
     leaves = jax.tree.leaves(
         list(equation.params.values()),
-        is_leaf=lambda x: isinstance(x, core.Jaxpr | core.ClosedJaxpr),
+        is_leaf=lambda x: isinstance(x, (_found["Jaxpr"], _found["ClosedJaxpr"])),
     )
     for leaf in leaves:
-        if isinstance(leaf, core.ClosedJaxpr):
+        if isinstance(leaf, _found["ClosedJaxpr"]):
             found.append((leaf.jaxpr, leaf.consts))
-        elif isinstance(leaf, core.Jaxpr):
+        elif isinstance(leaf, _found["Jaxpr"]):
             found.append((leaf, ()))
     return found

@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.versions
+
 PROGRAM = """
 import resource
 import jax

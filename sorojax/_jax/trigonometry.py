@@ -3,11 +3,11 @@
 Reference: Cody, Waite, "Software Manual for the Elementary Functions", 1980, chapter 8.
 """
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-
-from sorojax.math.polynomial import polynomial
 
 # Taylor coefficients: up to pi/4 the first term left out is 2e-17.
 _SINE = [(-1.0) ** k / float(np.prod(np.arange(1.0, 2 * k + 2))) for k in range(9)]
@@ -42,5 +42,13 @@ def _of_quarter(turns: Array, rest: Array) -> Array:
     square = rest * rest
     quarter = turns - 4 * jnp.floor(turns / 4)
     odd = (quarter == 1) | (quarter == 3)
-    size = jnp.where(odd, polynomial(_COSINE, square), rest * polynomial(_SINE, square))
+    size = jnp.where(odd, _polynomial(_COSINE, square), rest * _polynomial(_SINE, square))
     return jnp.where(quarter >= 2, -size, size)
+
+
+def _polynomial(coefficients: Sequence[float], x: Array) -> Array:
+    """Sum of `coefficients[k] * x**k`, by Horner's rule."""
+    value = jnp.full_like(x, coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        value = value * x + coefficient
+    return value
