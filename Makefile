@@ -3,6 +3,7 @@
 
 PYTHON  ?= $(shell command -v python3.11 || command -v python3)
 WORKERS ?= 2
+PROGRAMS ?= 2000
 
 VENV := .venv
 PY   := $(VENV)/bin/python
@@ -16,23 +17,32 @@ define install
 	  $(PIP) -e '.$(if $(1),[$(1)])'; }
 endef
 
-.PHONY: demo test stress lint bench bench-device peers clean help
+.PHONY: demo test test-versions fuzz stress lint bench bench-device peers clean help
 
 help:
 	@echo "make demo   set up .venv, run the main job, write out/"
 	@echo "make test   set up .venv, run the tests (WORKERS=$(WORKERS) processes)"
+	@echo "make test-versions  the tests on each Python found, with the oldest dependencies and"
+	@echo "            without AVX-512, one table; ONLY=3.13,oldest,avx2 ARGS=tests/test_fem.py"
+	@echo "make fuzz   PROGRAMS=$(PROGRAMS) random programs against their plain evaluation"
 	@echo "make stress the cases that may break a simulator, and which of them hold"
 	@echo "make lint   ruff and pyright"
 	@echo "make bench  all benchmarks, page in benchmarks/results/; QUICK=1 for the main ones"
 	@echo "make bench-device  kernels on an accelerator and on the CPU (jax[cuda13] in .venv)"
 	@echo "make peers  the codes that the benchmarks compare with, one .peers/<name> each"
-	@echo "make clean  remove .venv, .peers, out and benchmarks/results"
+	@echo "make clean  remove .venv, .venvs, .peers, out and benchmarks/results"
 
 demo: $(VENV)/.run
 	@$(PY) -m sorojax demo
 
 test: $(VENV)/.test
 	$(PY) -m pytest -n $(WORKERS) --dist loadfile --max-worker-restart 0 $(ARGS)
+
+test-versions: $(VENV)/.made
+	@$(PY) -m tests.versions --only '$(ONLY)' --workers $(WORKERS) -- $(ARGS)
+
+fuzz: $(VENV)/.test
+	$(PY) -m tests.fuzz_kernels --programs $(PROGRAMS)
 
 stress: $(VENV)/.test
 	$(PY) -m pytest -n $(WORKERS) --dist loadfile --max-worker-restart 0 -m stress $(ARGS)
@@ -75,4 +85,4 @@ $(VENV)/.dev: pyproject.toml $(VENV)/.made
 	@touch $(VENV)/.run $(VENV)/.test $@
 
 clean:
-	rm -rf $(VENV) .peers out benchmarks/results
+	rm -rf $(VENV) .venvs .peers out benchmarks/results

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sorojax.math.jit import once
+from sorojax._jax.jit import once
 from sorojax.rod.alike import each
 
 

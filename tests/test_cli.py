@@ -11,6 +11,7 @@ import pytest
 
 import sorojax
 from sorojax._cache import cache_directory, enable_compilation_cache
+from sorojax.cli.info import info
 from sorojax.cli.main import main
 
 ROOT = Path(__file__).parent.parent
@@ -29,13 +30,28 @@ def test_version_is_that_of_the_package():
     assert command("--version").stdout == f"sorojax {sorojax.__version__}\n"
 
 
+@pytest.mark.versions
 def test_info_names_versions_devices_precision_solvers_and_cache(tmp_path):
     done = command("info", SOROJAX_CACHE=str(tmp_path / "cache"))
     assert done.returncode == 0, done.stderr
     facts = dict(line.split(maxsplit=1) for line in done.stdout.splitlines())
-    assert facts["float64"] == "on" and facts["jax"] == jax.__version__
+    assert facts["float64"] == "on" and facts["jax"].startswith(f"{jax.__version__}, ")
     assert "superlu" in facts["solvers"] and facts["devices"]
     assert str(tmp_path) in facts["compilation"]
+
+
+def test_info_tells_whether_jax_was_tested_and_which_fast_paths_are_off(monkeypatch):
+    paths = {"small_kernels": "on", "host_call": "off: this jax has no such name"}
+    monkeypatch.setattr("sorojax._jax.fast_paths", lambda: paths)
+    installed = {"jax": "0.10.0", "jaxlib": "0.10.0"}
+    monkeypatch.setattr("sorojax.cli.info._version", lambda name: installed.get(name, "1.0"))
+    facts = info()
+    assert facts["jax"] == f"0.10.0, tested with sorojax {sorojax.__version__}"
+    assert facts["fast path small_kernels"] == "on"
+    assert facts["fast path host_call"] == "off: this jax has no such name"
+    for jax_and_lib in (("0.13.0", "0.13.0"), ("0.10.2", "0.10.0")):
+        installed.update(zip(("jax", "jaxlib"), jax_and_lib, strict=True))
+        assert f", not tested with sorojax {sorojax.__version__}" in info()["jax"]
 
 
 def test_wrong_input_is_one_line_without_traceback(monkeypatch, capsys):

@@ -14,6 +14,7 @@ LAW = contact.Penalty(2e7, 1e-5)
 FLOOR = sdf.HalfPlane([0.0, 0.0], [0.0, 1.0])
 
 
+@pytest.mark.versions
 def test_the_law_is_twice_differentiable_and_its_inverse_agrees():
     gap = jnp.linspace(-3e-5, 1e-5, 401)
     pressure = -jax.vmap(jax.grad(LAW.energy))(gap)
@@ -59,6 +60,7 @@ def test_points_that_go_through_a_wall_are_seen():
     assert not jnp.any(contact.passes(hole, before[:7], after[:7]) & (x[:7] > -0.5))
 
 
+@pytest.mark.versions
 def test_forces_are_slopes_of_the_energy_and_balance():
     ball = sdf.Sphere([0.0, 0.0, 0.0], 0.01)
     points = jnp.array([[0.0099, 0, 0], [0.0, 0.007, 0.007], [0.0, 0.0, 0.02]])
@@ -120,6 +122,7 @@ def test_a_block_on_a_plane_sinks_in_as_the_stiffness_says():
     assert bool(jnp.all(state.active))
 
 
+@pytest.mark.versions
 def test_contact_carries_gradients_of_obstacle_and_stiffness():
     base = _block(2e7)
     places = {

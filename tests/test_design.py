@@ -22,6 +22,7 @@ def beam_deflection(x):
 
 
 @pytest.mark.parametrize("method", [design.MMA(1.0, 10.0), design.GCMMA(1.0, 10.0)])
+@pytest.mark.versions
 def test_svanbergs_beam(method):
     """Krister Svanberg, Int. J. Numer. Meth. Engng 24, 1987, section 5.2: 1.340."""
     found = design.minimise(
@@ -74,6 +75,7 @@ def test_a_problem_without_a_feasible_point_ends_at_the_least_bad():
     assert np.allclose(found.constraints, 0.3, atol=0.02)
 
 
+@pytest.mark.versions
 def test_any_optax_optimiser_and_any_pytree():
     start = {"a": jnp.array([2.0, -1.0]), "b": jnp.array(3.0)}
     found = design.minimise(
@@ -223,6 +225,7 @@ def test_a_displacement_moves_with_cells_loads_and_springs(small):
     assert np.allclose(jax.jacfwd(end)(at), want, rtol=1e-6)
 
 
+@pytest.mark.versions
 def test_compiled_functions_and_others_take_the_same_steps():
     """Few programs for compiled functions, one after the other for those that are not."""
     functions = (beam_weight, beam_deflection, lambda x, g: g / (1 + x / 100))

@@ -174,6 +174,7 @@ def test_gradients_of_equilibrium_agree_with_central_differences(leaf):
     assert jnp.allclose(exact, difference, rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.versions
 def test_gradient_of_a_prescribed_displacement():
     grid = _distorted(1)  # the kernels of the patch
     left, right = (mesh.nodes_where(grid, lambda p, x=x: p[0] == x) for x in (0.0, 1.0))
@@ -221,6 +222,7 @@ def test_a_load_beyond_reach_keeps_the_last_converged_state():
     assert jnp.array_equal(error.value.solution.displacement, solution.displacement)
 
 
+@pytest.mark.versions
 def test_numbers_do_not_retrace_the_kernels():
     problem = _ring()
     fem.solve(problem)
@@ -294,6 +296,7 @@ def test_a_body_without_load_is_an_equilibrium_at_rest():
     assert jnp.max(jnp.abs(solution.displacement)) < 1e-15
 
 
+@pytest.mark.versions
 def test_second_derivatives_of_equilibrium():
     base = _ring(8 * kPa)
     tight = fem.Newton(residual_tolerance=1e-12)

@@ -66,6 +66,7 @@ def test_pi_controller_reaches_its_target_and_the_board_vents():
     assert np.all(board.setpoint == 0)
 
 
+@pytest.mark.versions
 def test_the_controller_of_the_demo_runs_on_the_board():
     """The PID that `sorojax demo` simulates, angle in and pressure out, without a change."""
     clock, board = desk(num_ports=1)

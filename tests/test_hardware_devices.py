@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from sorojax_board import messages
+from sorojax_board.__main__ import INSTALLER
 from sorojax_board.bench import BenchValves
 from sorojax_board.board import Board, settings
 from sorojax_board.frames import NONCE_SIZE, Decoder, Frame, Kind, encode, session_keys
@@ -260,7 +261,7 @@ def test_a_board_that_was_killed_vents_when_it_starts_again():
     board.tick(0.0)
     zero = dac_code(0.0)
     assert all(set(bus.codes.values()) == {zero} for bus in buses.values())
-    unit = (HARDWARE / "pi" / "sorojax-board.service").read_text()
+    unit = (INSTALLER / "sorojax-board.service").read_text()
     assert "Restart=always" in unit and "--key" in unit
 
 

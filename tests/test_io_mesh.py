@@ -52,6 +52,7 @@ def test_cells_and_sets_come_back(element, suffix, tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".bdf", ".mdpa", ".vol"])
+@pytest.mark.versions
 def test_plain_formats_keep_cells(suffix, tmp_path):
     for element in (M.Tri6(), M.Tet10(), M.Hex8()):
         mesh = sample(element)

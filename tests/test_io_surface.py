@@ -20,6 +20,7 @@ KINDS = [("a.stl", False), ("a.stl", True), ("a.obj", False), ("a.ply", False), 
 
 @pytest.mark.parametrize("name, text", KINDS)
 @pytest.mark.parametrize("unit", [mm, 1.0])
+@pytest.mark.versions
 def test_surfaces_come_back(tmp_path, name, text, unit):
     io.export_surface(tmp_path / name, BOX, text=text, unit=unit)
     back = io.import_surface(tmp_path / name, unit=unit)

@@ -337,6 +337,7 @@ def test_fibres_bear_tension_along_their_direction_only():
     assert jnp.max(jnp.abs(extra(across))) < 1e-8
 
 
+@pytest.mark.versions
 def test_growth_moves_the_rest_state_and_keeps_the_moduli():
     shear, bulk = material.small_strain_moduli(GROWN)
     assert jnp.allclose(shear, 1e5, rtol=1e-11) and jnp.allclose(bulk, K, rtol=1e-11)
@@ -417,6 +418,7 @@ def test_gradients_by_parameters_match_central_differences(rubber, quantity):
         assert jnp.allclose(slopes[i], (high - low) / (2 * h), rtol=1e-7)
 
 
+@pytest.mark.versions
 def test_second_derivatives_pass_through_the_free_faces():
     rubber = ISOTROPIC["NeoHookean"]
     slope = jax.jit(jax.grad(lambda l: material.uniaxial_stress(rubber, l)))
@@ -433,6 +435,7 @@ def test_small_strain_moduli_are_those_asked_for():
         assert jnp.allclose(bulk, 3e5 / 0.3, rtol=1e-12)
 
 
+@pytest.mark.versions
 def test_editing_a_modulus_never_retraces():
     traces = []
 

@@ -57,6 +57,7 @@ def test_exponential_is_differentiable_at_the_identity(jacobian):
     assert jnp.array_equal(rate, half)
 
 
+@pytest.mark.versions
 def test_magnus_is_of_order_six():
     def turn(cells):
         """Rotation of kappa = (1, s, s^2) over [0, 1] by `cells` cells."""

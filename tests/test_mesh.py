@@ -63,6 +63,7 @@ def test_nodes_of_the_outline_lie_on_the_zero_sets(body):
     assert len(body.node_sets["corners"]) == 14  # 12 of the body, 2 where the layer ends
 
 
+@pytest.mark.versions
 def test_linear_triangles_fill_a_polygon_exactly():
     ell = sdf.Polygon([[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2]])
     quality = M.quality(M.triangulate(ell, size=0.2))
@@ -107,6 +108,7 @@ def test_move_to_the_same_shape_changes_nothing(body):
     assert jnp.abs(moved.points - body.points).max() < 1e-12 * 66 * mm
 
 
+@pytest.mark.versions
 def test_motion_is_differentiable_in_the_shape(coarse):
     @jax.jit
     def points(radius):

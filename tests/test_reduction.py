@@ -51,6 +51,7 @@ def line_with_slopes(places):
     return found(places), jax.jacrev(found)(places)
 
 
+@pytest.mark.versions
 def test_strain_of_a_circular_arc_is_constant():
     s, curvature, stretch = np.linspace(0, 1, 61), 20.0, 1.05
     angle = curvature * stretch * LENGTH * s
@@ -106,6 +107,7 @@ def test_strain_of_poses_is_of_second_order():
     assert 3.5 < error(slice(0, 41, 2), 2).max() / fine < 4.5
 
 
+@pytest.mark.versions
 def test_strain_is_smooth_at_rest():
     rest = np.asarray(poses(0.025 * np.arange(5), np.array([0.0, 0, 0, 1, 0, 0])))
 
@@ -135,6 +137,7 @@ def test_frames_along_a_helix_do_not_turn_about_it():
     assert np.allclose(bent, 1 / 0.03 / 1.25, rtol=1e-3)
 
 
+@pytest.mark.versions
 def test_location_reproduces_quadratic_fields(tube_path, getkey):
     body = tube_path.problem.mesh
     points = np.stack([np.linspace(0, LENGTH, 15), np.full(15, 1.3 * mm)], axis=1)

@@ -85,6 +85,7 @@ def test_triangles_of_one_plane_do_not_cross():
     assert sdf.surface_report(crossed).crossings.tolist() == [[0, 1]]
 
 
+@pytest.mark.versions
 def test_bellows_wall():
     part = robots.Bellows()
     z = part.cap + part.pitch * jnp.array([0.5, 1.5, 2.5])
@@ -93,6 +94,7 @@ def test_bellows_wall():
     assert jnp.allclose(part.chamber()(crest), part.wall_thickness, atol=1e-9)
 
 
+@pytest.mark.versions
 def test_volume_follows_a_dimension():
     def volume(length):
         return sdf.volume(robots.Hand(palm_length=length).palm(), 64)

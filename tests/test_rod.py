@@ -46,6 +46,7 @@ def relative(value, reference):
 # Closed forms
 
 
+@pytest.mark.versions
 def test_constant_curvature_is_a_circular_arc():
     curvature, s = 30.0, jnp.array([0.3, 1.0])
     rod = planar(R.constant("kappa_z"), nodes=16)
@@ -251,6 +252,7 @@ def test_steppers_reach_the_reference_motion(stepper, step, error):
     assert jnp.linalg.norm(tip - reference) < error * 0.08
 
 
+@pytest.mark.versions
 def test_any_solver_of_diffrax_moves_the_rod():
     rod, rest = planar(), jnp.zeros(3)
     term = dfx.ODETerm(R.vector_field(rod, (R.Gravity(), R.Damping(0.01))))
@@ -301,6 +303,7 @@ def test_single_precision_keeps_its_digits():
     assert relative(mass, R.mass_matrix(wide, q)) < 2e-6
 
 
+@pytest.mark.versions
 def test_equilibrium_is_differentiable_in_every_number():
     rod = planar()
 
@@ -341,6 +344,7 @@ def test_sampled_modes_reproduce_the_modes_they_sample():
     assert jnp.isfinite(energy.modes["kappa_z"].values).all()
 
 
+@pytest.mark.versions
 def test_batches_agree_with_single_calls():
     rods = eqx.filter_vmap(lambda length: replace(planar(), lambda r: r.length, length))(
         jnp.array([0.07, 0.09])
@@ -381,6 +385,7 @@ def test_an_elastic_term_replaces_the_law_of_the_rod():
 # Cost
 
 
+@pytest.mark.versions
 def test_numbers_do_not_retrace_and_absent_forces_cost_nothing():
     rod, (q, v) = planar(), drawn_state(3)
     once = eqx.filter_jit(eqx.debug.assert_max_traces(R.mass_matrix, max_traces=1))

@@ -35,6 +35,7 @@ def test_box_distance_is_euclidean_at_corners_and_inside(shape):
     )
 
 
+@pytest.mark.versions
 def test_operators_and_their_aliases_agree():
     a, b = SQUARE, sdf.Circle([1, 0], 0.5)
     p = jnp.array([[0.9, 0.1], [1.2, 0.2], [0.0, 0.0], [2.0, 2.0]])
@@ -130,6 +131,7 @@ def test_field_respects_its_lipschitz_constant_and_transformations(shape, getkey
     assert jax.eval_shape(shape, p.astype(jnp.float32)).dtype == jnp.float32
 
 
+@pytest.mark.versions
 def test_project_lands_on_the_surface_and_is_differentiable():
     @jax.jit
     def foot(radius, p):
@@ -176,6 +178,7 @@ def test_contour_locates_corners_and_keeps_the_inside_on_the_left():
         assert np.abs(np.asarray(shape(jnp.asarray(curve.points)))).max() < 1e-14
 
 
+@pytest.mark.versions
 def test_numbers_do_not_retrace():
     @eqx.filter_jit
     @eqx.debug.assert_max_traces(max_traces=1)

@@ -84,6 +84,7 @@ def test_a_second_sweep_computes_nothing_and_a_longer_one_what_is_new(serial):
     assert (more.computed, more.found) == (1, 10)
 
 
+@pytest.mark.versions
 def test_the_key_holds_code_config_designs_and_seed(tmp_path):
     store = W.Store(tmp_path)
     seen = [
@@ -121,6 +122,7 @@ def test_progress_is_told(tmp_path):
     assert told[-1] == ("sweep", 10, 10) and len(told) == 11
 
 
+@pytest.mark.versions
 def test_a_process_pool_gives_the_same_hash(tmp_path, serial):
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         swept = run(tmp_path, pool)

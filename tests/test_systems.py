@@ -129,6 +129,7 @@ def test_gas_sealed_behind_yielding_walls_keeps_absolute_pressure_times_volume()
     assert jnp.allclose(product, product[0], rtol=1e-7)
 
 
+@pytest.mark.versions
 def test_mass_flow_fills_a_rigid_volume_linearly():
     source = S.Source(S.Constant(1e-6), unit="kg/s")
     wires = {"air.mass_flow": "pump.value"}
@@ -204,6 +205,7 @@ def test_the_loop_reaches_its_reference_adaptively_and_by_fixed_steps(loop):
     assert film.state["body"]["q"].shape == (11, 2)
 
 
+@pytest.mark.versions
 def test_a_network_of_networks_and_exposed_inputs():
     ports = ("air.volume", "air.volume_rate", "air.mass_flow")
     inner = S.Network({"air": S.Reservoir()}, {}, ports)
@@ -274,6 +276,7 @@ def test_a_spatial_body_swings_like_its_rollout():
 # Derivatives and cost
 
 
+@pytest.mark.versions
 def test_a_simulation_is_differentiable():
     network = S.Network({"body": make_body()}, {}, ("body.pressure",))
 
@@ -307,6 +310,7 @@ def test_an_adaptive_run_is_differentiable_backwards():
     assert jnp.isclose(slope, 287.05 * 293.15 / 1e-4, rtol=1e-9)
 
 
+@pytest.mark.versions
 def test_numbers_do_not_retrace(loop):
     def rate(network, state):
         return network.vector_field(jnp.array(0.0), state)

@@ -83,6 +83,7 @@ def path(beam):
     return fem.Path(problem, states, values, "pull", Status.successful, ())
 
 
+@pytest.mark.versions
 def test_deformed_shapes_show_the_stress(path):
     figure = view.show_deformed(path, title="beam")
     assert 0.08 < ink(figure) < 0.7 and has_margin(figure)
@@ -264,6 +265,7 @@ print(first, sorted(solvers & sys.modules.keys()))
 """
 
 
+@pytest.mark.versions
 def test_the_floor_loads_no_drawing_library_and_shapes_no_solver():
     done = subprocess.run(
         [sys.executable, "-c", LOADED], capture_output=True, text=True, check=True

@@ -130,6 +130,7 @@ def markers_at(random, camera, size=0.05):
     return vision.photograph(canvas, Disturbance(0.7, 3.0), random), poses
 
 
+@pytest.mark.versions
 def test_fiducials_and_their_poses():
     random = np.random.default_rng(5)
     off, away, turned = [], [], []
@@ -179,6 +180,7 @@ def test_the_world_frame_from_four_markers():
         vision.world_frame(CAMERA, vision.find_fiducials(image), {17: places[0]})
 
 
+@pytest.mark.versions
 def test_pixels_and_points():
     camera = Camera(600.0, 600.0, 319.5, 239.5)
     point = vision.deproject(camera, np.array([400.25, 300.75]), np.array(0.5))

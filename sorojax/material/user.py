@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sorojax import _check, _types
+from sorojax import _check
+from sorojax._jax.trace_state import is_traced
 from sorojax._types import optional_real, real
 from sorojax.material import checks
 from sorojax.material.hyperelastic import AbstractHyperelastic
@@ -99,7 +100,7 @@ class InvariantEnergy(AbstractHyperelastic):
 
 
 def _check_energy(where: str, parameters: Any, at_rest: Callable[[], Entry]) -> None:
-    if _types.is_traced(parameters):
+    if is_traced(parameters):
         return
     energy = at_rest()
     cells = {np.shape(p) for p in jax.tree.leaves(parameters)} | {()}

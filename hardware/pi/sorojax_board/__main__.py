@@ -17,6 +17,8 @@ from sorojax_board.i2c import PLATFORM, I2CValves, Wiring, open_bus
 from sorojax_board.messages import Limits
 from sorojax_board.server import LEGACY_PORT, PORT, Server
 
+INSTALLER = Path(__file__).parent / "raspberry_pi"
+
 
 def arguments() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m sorojax_board", description=__doc__)
@@ -29,6 +31,8 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--legacy", action="store_true",
                         help=f"also the raw float64 stream on port {LEGACY_PORT}")  # fmt: skip
     parser.add_argument("--new-key", type=Path, help="write a new key there and stop")
+    parser.add_argument("--installer", action="store_true",
+                        help="print where that of a Raspberry Pi is and stop")  # fmt: skip
     return parser
 
 
@@ -79,6 +83,9 @@ def read_config(path: Path | None) -> tuple[Settings, tuple[Wiring, ...]]:
 
 def main(argv: list[str] | None = None) -> int:
     asked = arguments().parse_args(argv)
+    if asked.installer:
+        print(INSTALLER)
+        return 0
     try:
         if asked.new_key:
             new_key(asked.new_key)
