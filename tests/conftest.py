@@ -1,14 +1,9 @@
-"""Tests run in float64 with strict promotion and a persistent compilation cache."""
+"""Tests run in float64 with strict promotion, a persistent compilation cache and the compiler
+that users have."""
 
 import gc
 import itertools
-import os
-from importlib import metadata
 from pathlib import Path
-
-if metadata.version("jaxlib").startswith("0.10."):  # elsewhere an unknown flag is fatal
-    # Compiles a third faster. XLA_FLAGS= runs the tests with the compiler that users have.
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
 import jax
 import pytest

@@ -6,9 +6,11 @@ numbers, from programs that are larger.
 """
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from sorojax._jax.optional import optional, reason
 from sorojax._jax.trace_state import is_traced
@@ -59,8 +61,11 @@ def operation(name: str, rules: Rules) -> Callable[..., list[Any]]:
 
 def _public(rules: Rules) -> Callable[..., list[Any]]:
     def call(*arrays: Any, **params: Any) -> list[Any]:
-        concrete = not is_traced(arrays) and not is_traced(jax.numpy.zeros(()))
-        return list((rules.run if concrete else rules.stage)(*arrays, **params))
+        if is_traced(arrays) or is_traced(jnp.zeros(())):
+            return list(rules.stage(*arrays, **params))
+        # a thread of its own is outside of the transformation that this may be inside of
+        with ThreadPoolExecutor(1) as pool:
+            return list(pool.submit(rules.run, *arrays, **params).result())
 
     return call
 

@@ -57,9 +57,10 @@ def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof
     linear = integrated(constants, inner)
     linear = acceleration_on_arms(linear, jnp.zeros_like(spin), spin, mass_arms(moment))
     force = constants.mass[:, None] * linear
-    rows = jnp.concatenate([mass_jacobian(moment).reshape(-1, dof), angular])
-    scale = jnp.concatenate([jnp.repeat(constants.mass, 2), constants.rotary[0]])
-    loads = jnp.concatenate([force.reshape(-1), jnp.zeros_like(spin[:, 0])])
+    # Small terms first, as in the spatial rod: fewer sums round at full size.
+    rows = jnp.concatenate([angular, mass_jacobian(moment).reshape(-1, dof)])
+    scale = jnp.concatenate([constants.rotary[0], jnp.repeat(constants.mass, 2)])
+    loads = jnp.concatenate([jnp.zeros_like(spin[:, 0]), force.reshape(-1)])
     product = rows.T @ jnp.concatenate([rows * scale[:, None], loads[:, None]], axis=1)
     return product[:, :dof], product[:, dof]
 

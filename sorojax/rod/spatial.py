@@ -66,9 +66,10 @@ def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof
     rotary = constants.rotary.T
     torque = rotary * local_angular + cross_columns(local_spin, rotary * local_spin)
     force = constants.mass[:, None] * linear
-    scale = jnp.concatenate([jnp.repeat(constants.mass, 3), rotary.reshape(-1)])
-    rows = jnp.concatenate([moving.reshape(-1, dof), local.reshape(-1, dof)])
-    loads = jnp.concatenate([force.reshape(-1), torque.reshape(-1)])
+    # Small terms first, from rotary inertia to the mass of the tip: fewer sums round at full size.
+    scale = jnp.concatenate([rotary.reshape(-1), jnp.repeat(constants.mass, 3)])
+    rows = jnp.concatenate([local.reshape(-1, dof), moving.reshape(-1, dof)])
+    loads = jnp.concatenate([torque.reshape(-1), force.reshape(-1)])
     # A library multiplies rows by columns twice as fast as columns by columns.
     product = jnp.concatenate([rows.T * scale[None], loads[None]]) @ rows
     return product[:dof], product[dof]
