@@ -85,9 +85,9 @@ def forward_dynamics(
 ) -> Float[Array, "*states dof"]:
     """Acceleration of the coordinates, of one state or many.
 
-    States along a first axis of `q` and `v`, and models and states by `jax.vmap`, are taken
-    in chunks that stay in the cache of a CPU. A loop around this verb keeps its lanes at
-    once: give the loop to `sorojax.math.batch.batched`.
+    States along a first axis of `q` and `v` are taken in chunks that stay in the cache of a
+    CPU, those of `jax.vmap` at once. For many models, or a loop around this verb, use
+    `sorojax.math.batch.batched`.
 
     Args:
         model: The rod or assembly.

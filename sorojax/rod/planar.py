@@ -57,7 +57,7 @@ def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof
     linear = integrated(constants, inner)
     linear = acceleration_on_arms(linear, jnp.zeros_like(spin), spin, mass_arms(moment))
     force = constants.mass[:, None] * linear
-    # Small terms first, as in the spatial rod: fewer sums round at full size.
+    # Small terms first, as in the spatial rod: few sums round at full size.
     rows = jnp.concatenate([angular, mass_jacobian(moment).reshape(-1, dof)])
     scale = jnp.concatenate([constants.rotary[0], jnp.repeat(constants.mass, 2)])
     loads = jnp.concatenate([jnp.zeros_like(spin[:, 0]), force.reshape(-1)])
