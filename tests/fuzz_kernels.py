@@ -144,7 +144,7 @@ def some(draw: Draw, pool: list[Any], least: int, most: int) -> list[Any]:
 def of_one(draw: Draw, pool: list[Any]) -> Any:
     """Sine and cosine often: loops around them are made anew."""
     return draw.one((
-        *(jnp.sin, jnp.cos) * 4, jnp.tanh, jnp.arctan, jnp.abs, lax.neg, lax.erf, lax.logistic,
+        *(jnp.sin, jnp.cos) * 8, jnp.tanh, jnp.arctan, jnp.abs, lax.neg, lax.erf, lax.logistic,
         lambda x: 0.9 * x, lambda x: jnp.exp(-(x**2)), lambda x: jnp.log1p(x**2) / 2,
         lambda x: jnp.sqrt(1 + x**2) - 1, lambda x: jnp.clip(x, -0.7, 0.6), lambda x: x * 0,
         lambda x: jnp.round(4 * jnp.tanh(x) + 0.137) / 4, lambda x: jnp.sign(x + 0.1379),
@@ -253,14 +253,15 @@ def loop(draw: Draw, pool: list[Any]) -> list[Any]:
 
 def scan(draw: Draw, pool: Any, body: Draw, state: Any, rest: Any, count: int) -> Any:
     shapes = (count,), (count, 3), (count, 2, 2)
-    rows = [value(draw, pool, draw.kind(), draw.one(shapes)) for _ in range(draw.number(0, 2))]
+    several = range(draw.one((0, 1, 1, 2)))
+    rows = [value(draw, pool, draw.kind(), draw.one(shapes)) for _ in several]
 
     def step(state: Any, row: list[Any]) -> Any:
         new = after(body, state, [*rest, *row])
         return new, some(body.inside("out"), [*new, *row, *rest], 0, 2)
 
     unroll = draw.one((2, True)) if 0 < count < 6 and draw.chance(0.2) else 1
-    return lax.scan(step, state, rows, count, reverse=draw.chance(0.3), unroll=unroll)
+    return lax.scan(step, state, rows, count, reverse=draw.chance(0.5), unroll=unroll)
 
 
 def counted(draw: Draw, pool: Any, body: Draw, state: Any, rest: Any, count: Any) -> Any:
@@ -345,7 +346,8 @@ pulled.defvjp(lambda x: (pulled(x), x), lambda x, slope: (slope * jnp.exp(-x * x
 
 def with_rules(draw: Draw, pool: list[Any]) -> list[Any]:
     """Functions with derivatives of their own, in a loop and by themselves."""
-    x, own = value(draw, pool, draw.real()), draw.one((ruled, pulled, solved))
+    x, forward = value(draw, pool, draw.real()), "/jvp/" in draw.name
+    own = draw.one((ruled, solved) if forward else (ruled, solved, pulled))
 
     def run(x: Any) -> Any:
         return lax.fori_loop(0, 3, lambda _, x: own(x) + x / 4, x)
@@ -358,7 +360,7 @@ def solved(x: Any) -> Any:
     return lax.custom_linear_solve(lambda y: 1.7 * y, x, solve, solve)
 
 
-EASY = [of_one] * 5 + [of_two] * 4 + [of_whole] * 2 + [of_truth, *[of_all] * 2] + [of_parts] * 3
+EASY = [of_one] * 8 + [of_two] * 4 + [of_whole] * 2 + [of_truth, *[of_all] * 2] + [of_parts] * 3
 DEEP = [loop] * 4 + [branch] * 3 + [around] * 4 + [with_rules]
 
 

@@ -99,8 +99,9 @@ def test_rods_in_single_precision_where_factors_are_rounded(
         found = jax.jit(lambda body, *x: R.vector_field(body, gravity)(0.0, x)[1])(body, q, v)
     error = jnp.abs(found.astype(jnp.float64) - exact).max() / jnp.abs(exact).max()
     assert found.dtype == jnp.float32
-    # without the request for all digits such a device is far off, and the test could not fail
-    assert error < 2e-4 if device == "gpu" else error > 5e-3
+    # Without the request for all digits such a device is far off, and the test could not fail.
+    # The bound is that of `test_single_precision_keeps_its_digits`.
+    assert error < 8e-4 if device == "gpu" else error > 5e-3
 
 
 def test_motion_in_single_precision_stays_single():

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from sorojax.material.hyperelastic import AbstractHyperelastic, strain_energy_density
 from sorojax.material.kinematics import Entry, Tensor
+from sorojax.math.implicit_root import implicit_root
 
 MAX_ITERATIONS = 60
 LONGEST_STEP = 0.3  # of the logarithm of the stretch across
@@ -89,7 +90,7 @@ def _free_stretch(material, stretch, start, state: State):
     def tangent_solve(linear, target):  # every point by itself
         return target / linear(jnp.ones_like(target))
 
-    return jnp.exp(jax.lax.custom_root(slope, jnp.log(start), _newton, tangent_solve))
+    return jnp.exp(implicit_root(slope, jnp.log(start), _newton, tangent_solve))
 
 
 def _newton(function: Callable[[Entry], Entry], start: Entry) -> Entry:

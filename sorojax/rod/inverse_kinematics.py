@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 from sorojax import _check
 from sorojax._types import real
 from sorojax.math.door import door
+from sorojax.math.implicit_root import implicit_root
 from sorojax.math.status import Status
 from sorojax.rod import answer
 from sorojax.rod.assembly import dtype_of, num_dof
@@ -115,7 +116,7 @@ def inverse_kinematics(
             q, push, done, count = _search(model, tasks, at, q, push, accuracy, max_iterations)
         else:
             q, push, done, count = _fixed(model, tasks, at, q, push, iterations)
-        # custom_root differentiates its auxiliary output, which must then be floating.
+        # What comes with a root has a derivative of zero, so it is floating.
         ends, _ = ravel_pytree(answer.balanced(model, tasks, at, q, push))
         return ends, (done.astype(dtype), count.astype(dtype))
 
@@ -125,7 +126,7 @@ def inverse_kinematics(
     def solve(linear, right):
         return answer.smallest_change(linear, right, tasks, guess.shape[0])
 
-    x, (done, count) = jax.lax.custom_root(conditions, begin, find, solve, has_aux=True)
+    x, (done, count) = implicit_root(conditions, begin, find, solve, has_aux=True)
     found = whole(x).q
     end = at(found)
     error, overlap = jnp.sqrt(end.error @ end.error), _overlap(end, dtype)

@@ -66,7 +66,7 @@ def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof
     rotary = constants.rotary.T
     torque = rotary * local_angular + cross_columns(local_spin, rotary * local_spin)
     force = constants.mass[:, None] * linear
-    # Small terms first, rotary inertia and then mass up to the tip: few sums round at full size.
+    # Small terms first, rotary inertia, then mass up to the tip: few sums round at full size.
     scale = jnp.concatenate([rotary.reshape(-1), jnp.repeat(constants.mass, 3)])
     rows = jnp.concatenate([local.reshape(-1, dof), moving.reshape(-1, dof)])
     loads = jnp.concatenate([torque.reshape(-1), force.reshape(-1)])

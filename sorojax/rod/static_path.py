@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from sorojax._types import real
 from sorojax.math.door import door
+from sorojax.math.implicit_root import implicit_root
 from sorojax.math.status import Status
 from sorojax.math.told import tell
 from sorojax.rod.assembly import dtype_of
@@ -95,7 +96,7 @@ def equilibrium_path(
         return jax.vmap(lambda q, f: squared(model, q, residual(q, f)))(q, factors)
 
     guesses = jnp.broadcast_to(guess, (factors.shape[0], guess.shape[0]))
-    rest, (done, count) = jax.lax.custom_root(balance, guesses, find, _solve_rows, has_aux=True)
+    rest, (done, count) = implicit_root(balance, guesses, find, _solve_rows, has_aux=True)
     status = jax.vmap(ended)(done, rest, jax.vmap(residual)(rest, factors))
     return EquilibriumPath(rest, status, count.astype(jnp.int32))
 

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sorojax import _check
 from sorojax._types import real
 from sorojax.math.door import door
+from sorojax.math.implicit_root import implicit_root
 from sorojax.math.status import Status
 from sorojax.rod.assembly import dtype_of, num_coordinates, rest as at_rest
 from sorojax.rod.loads import Load, total_force
@@ -111,12 +112,12 @@ def equilibrium(
 
     def find(_, guess):
         found = newton(residual, guess, search)
-        # custom_root differentiates its auxiliary output, which must then be floating.
+        # What comes with a root has a derivative of zero, so it is floating.
         negative = negative_eigenvalues(linearised(residual, model, found.q)[1])
         ends = (found.done, found.count, negative)
         return found.q, tuple(x.astype(guess.dtype) for x in ends)
 
-    rest, (done, count, negative) = jax.lax.custom_root(
+    rest, (done, count, negative) = implicit_root(
         lambda q: squared(model, q, residual(q)), guess, find, _solve_tangent, has_aux=True
     )
     status = ended(done, rest, residual(rest))

@@ -1,0 +1,66 @@
+"""Roots whose derivative is that of the implicit function, whatever search finds them.
+
+For `jax.lax.custom_root`, which since jax 0.12 (0.12.0.1 was tried) hands `tangent_solve` a
+map whose Jacobian by `jax.jacobian` is wrong, without an error.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+Function = Callable[[Array], Array]
+
+
+def implicit_root(
+    f: Function,
+    guess: Array,
+    solve: Callable[[Function, Array], Any],
+    tangent_solve: Callable[[Function, Array], Array],
+    *,
+    has_aux: bool = False,
+) -> Any:
+    """The x with f(x) = 0 near `guess`; dx = -f_x^-1 df by the numbers that `f` closes over.
+
+    Args:
+        f: Of x, and of any numbers that it closes over.
+        guess: Where the search begins; without a derivative.
+        solve: Of `f` and `guess`, answers x, or x and more with `has_aux`; not differentiated.
+        tangent_solve: Of a linear map and a right-hand side, answers its solution.
+        has_aux: Whether `solve` answers a pair, whose second part has no derivative.
+    """
+
+    def search(guess: Array) -> tuple[Array, Any]:
+        found = solve(f, guess)
+        return found if has_aux else (found, ())
+
+    equation, numbers = jax.closure_convert(f, guess)
+    method, constants = jax.closure_convert(search, guess)
+
+    @jax.custom_jvp
+    def root(numbers: Any, constants: Any, guess: Array) -> tuple[Array, Any]:
+        return method(guess, *constants)
+
+    @root.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        numbers, rates = primals[0], tangents[0]
+        x, more = root(*primals)
+        _, change = jax.jvp(lambda *numbers: equation(x, *numbers), numbers, rates)
+
+        def linear(rate: Array) -> Array:
+            return jax.jvp(lambda x: equation(x, *numbers), (x,), (rate,))[1]
+
+        return (x, more), (-tangent_solve(linear, change), jax.tree.map(_still, more))
+
+    x, more = root(tuple(numbers), tuple(constants), guess)
+    return (x, more) if has_aux else x
+
+
+def _still(x: Array) -> Any:
+    """A rate of zero."""
+    if jnp.issubdtype(x.dtype, jnp.inexact):
+        return jnp.zeros_like(x)
+    return np.zeros(x.shape, jax.dtypes.float0)
