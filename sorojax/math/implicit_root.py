@@ -42,7 +42,7 @@ def implicit_root(
 
     @jax.custom_jvp
     def root(numbers: Any, constants: Any, guess: Array) -> tuple[Array, Any]:
-        return method(guess, *constants)
+        return jax.tree.map(jnp.asarray, method(guess, *constants))  # constants are numbers
 
     @root.defjvp
     def _(primals: Any, tangents: Any) -> Any:
