@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sorojax._jax import devices
+
 
 def real(value: Any) -> jax.Array:
     """`value` as a floating array that keeps one dtype and never retraces.
@@ -22,14 +24,14 @@ def real(value: Any) -> jax.Array:
             return value  # a conversion of a traced value costs a derivative
         if not floating:
             dtype = jnp.result_type(float)
-        return jnp.asarray(value, dtype=dtype)
+        return _array(value, dtype)
     if isinstance(value, list | tuple) and any(
         isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(list(value))
     ):
         return jnp.stack([real(item) for item in value])
     if type(value) is object or value is None:  # placeholders that JAX puts in
         return value  # type: ignore[return-value]
-    return jnp.asarray(np.asarray(value, dtype=np.float64), dtype=jnp.result_type(float))
+    return _array(np.asarray(value, dtype=np.float64), jnp.result_type(float))
 
 
 def optional_real(value: Any) -> jax.Array | None:
@@ -41,7 +43,17 @@ def integers(value: Any) -> jax.Array:
     """`value` as an int32 array: connectivity, slots and node numbers."""
     if type(value) is object:
         return value  # type: ignore[return-value]
-    return jnp.asarray(value, dtype=jnp.int32)
+    return _array(value, jnp.int32)
+
+
+def _array(value: Any, dtype: Any) -> jax.Array:
+    """A new array; the first one of a program starts JAX, whatever its plug-ins do."""
+    try:
+        return jnp.asarray(value, dtype=dtype)
+    except Exception as error:
+        if not devices.start(error):
+            raise
+        return jnp.asarray(value, dtype=dtype)
 
 
 def platform() -> str:

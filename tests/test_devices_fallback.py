@@ -40,6 +40,16 @@ made = sj.SE3(), sj.sdf.Circle([0, 0], 1.0).radius
 print("devices ", jax.devices()[0].platform)
 """
 
+ROD = """
+import jax
+import sorojax as sj
+jax.config.update("jax_enable_x64", True)
+thin = sj.rod.taper(sj.rod.circle, 5e-3, 2e-3)
+rubber = sj.rod.elastic(sj.material.presets.dragon_skin_30())
+sj.rod.rod(sj.SE2(), sj.rod.chebyshev(kappa_z=2), thin, rubber, length=0.1)
+print("devices ", jax.devices()[0].platform)
+"""
+
 
 def run(program: str, tmp_path: Path, plug_in: str = "", **environment: str):
     """Run a program beside a plug-in of JAX, and give what it prints and its warnings."""
@@ -102,6 +112,13 @@ def test_without_any_plug_in_the_cpu_is_used(program, platforms, tmp_path):
     assert is_on_the_cpu(told)
     wrong = f"JAX_PLATFORMS={platforms} failed (no plug-in of JAX is installed), using the CPU."
     assert wrong in warning(errors)
+
+
+@pytest.mark.parametrize("name", ["not loaded at all", "without a device", "without a client"])
+@pytest.mark.parametrize("platforms", ["", "fake"])
+def test_a_rod_is_made_on_the_cpu_where_jax_does_not_start(name, platforms, tmp_path):
+    told, errors = run(ROD, tmp_path, PLUG_INS[name], JAX_PLATFORMS=platforms)
+    assert is_on_the_cpu(told) and "using the CPU" in warning(errors)
 
 
 @pytest.mark.parametrize("platforms", ["", "cpu", "cpu,proxy"])
