@@ -46,9 +46,10 @@ def jit(function: Verb, *, kernels: bool = True, largest: float = LARGEST_GIVEN)
         if not refused and runs_alone(args, kwargs, largest=largest):
             try:
                 return alone(*args, **kwargs)[0]
-            except jax.errors.JaxRuntimeError:
-                if compiles(alone, *args, **kwargs):
-                    raise  # of the program itself, which must not run twice
+            except jax.errors.JaxRuntimeError as error:
+                # the words may be the program's own: it must not run twice for them
+                if not _is_refusal(error) or compiles(alone, *args, **kwargs):
+                    raise
                 refused.append(True)
         return inside(*args, **kwargs)
 
@@ -131,10 +132,16 @@ def compiled(function: Callable[..., Any], *examples: Any) -> Compiled:
     examples = jax.tree.map(jnp.asarray, examples)
     if runs_alone():
         program = jax.jit(one_kernel(function), compiler_options=OPTIONS)
-        with contextlib.suppress(jax.errors.JaxRuntimeError):
+        with contextlib.suppress(jax.errors.JaxRuntimeError):  # it does not run here
             return Compiled(program.lower(*examples).compile(), examples)
     plain = jax.jit(lambda *args: (function(*args), None))
     return Compiled(plain.lower(*examples).compile(), examples)
+
+
+def _is_refusal(error: Exception) -> bool:
+    """Whether it may be the compiler that cannot, by the words of its errors."""
+    words = "UNIMPLEMENTED", "Unsupported", "No such compile option"
+    return any(word in str(error) for word in words)
 
 
 def compiles(program: Any, *args: Any, **kwargs: Any) -> bool:

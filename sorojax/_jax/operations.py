@@ -36,11 +36,11 @@ class Rules(NamedTuple):
         run: Its results for concrete arrays, at once.
         stage: The same by operations of JAX, for compiled programs.
         shapes: Shapes and dtypes of the results.
-        batch: Arrays, their mapped axes (`None` where there is none) and the parameters to
-            results mapped along their first axis.
-        derivative: Primals and tangents, zeros made arrays, to results and their tangents.
-            Without it the operation has none.
-        transpose: Cotangents of the results, zeros made arrays, to those of the arrays; for
+        batch: Gets the arrays and the axis along which each is mapped (`None`: not at all),
+            answers results that are mapped along their first axis.
+        derivative: Gets the arrays and their tangents, answers results and their tangents.
+            Without it the operation has no derivative.
+        transpose: Gets the cotangents of the results, answers those of the arrays; for
             operations that are linear in all their arrays.
         lowering: A rule of MLIR in place of `stage`, which is then the fallback.
     """
@@ -100,7 +100,7 @@ def _primitive(name: str, rules: Rules) -> Callable[..., list[Any]]:
 
 
 def _lower(one: Any, rules: Rules) -> None:
-    if rules.lowering is not None:  # one callback each, so that equal programs share none
+    if rules.lowering is not None:
         _found["register_lowering"](one, rules.lowering, cacheable=False)
         return
 

@@ -1,6 +1,5 @@
 """Where boundary nodes go when the shape changes, by the implicit-function rule."""
 
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
