@@ -141,7 +141,7 @@ def _primitive() -> Any:
     return one
 
 
-product_p = None if _missing else _primitive()
+product_p: Any = None if _missing else _primitive()
 
 
 def status() -> str:
