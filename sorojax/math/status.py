@@ -15,6 +15,23 @@ class Status(eqx.Enumeration):
         "A value is not finite. Take shorter steps or a stronger damping, and check that "
         "gains, limits and units are what you meant."
     )
+    unstable = (
+        "The steps are too long: the errors of single steps add up to as much as the motion, "
+        "as beyond the limit of stability of a method. Take shorter steps, or a method for "
+        "stiff equations."
+    )
+    inverted = (
+        "Matter is turned inside out: a stretch or a volume is no longer positive. Lower the "
+        "load, raise it in steps, or check units and signs."
+    )
+    outside_model = (
+        "A state left what its model describes: gas below vacuum, or a rod stretched more than "
+        "tenfold. Check units and limits, or take shorter steps."
+    )
+    unresolved = (
+        "The mesh or the nodes do not carry this shape: with twice as many the answer would be "
+        "another one. Give more, e.g. `nodes=` of a rod."
+    )
     not_converged = (
         "The search did not settle. Apply the load, or move the targets, in steps that start "
         "from the last answer, or raise `max_iterations`."

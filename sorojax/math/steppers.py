@@ -8,7 +8,8 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from sorojax._types import real
 from sorojax.math.dense import solve_symmetric
@@ -20,6 +21,14 @@ from sorojax.math.explicit import (
     rolled_step,
 )
 from sorojax.math.method import Field
+from sorojax.math.step_doubling import (
+    Doubled,
+    after_start,
+    passes,
+    rows_between,
+    rows_too_long,
+    whole_rows,
+)
 from sorojax.math.told import tell
 
 
@@ -253,40 +262,50 @@ def integrate(
     saves: int,
     every: int,
     label: str | None = None,
-) -> Kinematic:
-    """The first state and those after each of `saves` runs of `every` steps, stacked; with a
-    `label` tells how far it is, about a hundred times."""
-    idle = stepper.settles and saves >= _WORTH_IDLING
-    pause = max(1, saves // 100)
+    judged: bool = True,
+) -> tuple[Kinematic, Bool[Array, ""]]:
+    """The first state and those after each of `saves` runs of `every` steps, stacked, and
+    whether the steps were too long, if that is to be `judged`; with a `label` tells how far
+    it is, about a hundred times."""
+    rows = rows_between(saves, every, judged)
+    short, count = every // rows, saves * rows
+    plan, pause = passes(count, saves * every, judged), max(1, count // 100)
+    idle = stepper.settles and count >= _WORTH_IDLING
 
-    def advance(carry, number):
-        share = jnp.ones((), h.dtype) if number is None else (number > 0).astype(h.dtype)
+    def advance(run: Doubled, one_pass):
+        number, part, first, length = one_pass
+        begun = run.begin(part)
 
-        def one(_, carry):
-            index, state = carry
-            return index + share, stepper.step(problem, t + index * h, share * h, state)
+        def one(k, state):
+            at = t + (first * short + k * length) * h
+            return stepper.step(problem, at, length * h, state)
 
-        carry = jax.lax.fori_loop(0, every, one, carry) if every > 1 else one(0, carry)
-        if label is not None and number is not None:
-            due = (number % pause == 0) | (number == saves)
-            tell_share = functools.partial(_tell_share, label, saves)
+        new = jax.lax.fori_loop(0, short, one, begun) if short > 1 else one(0, begun)
+        if label is not None:
+            due = (part == 0) & ((number % pause == 0) | (number == count))
+            tell_share = functools.partial(_tell_share, label, count)
             jax.lax.cond(due, tell_share, lambda _: None, number)
-        return carry, carry[1]
+        return run.end(part, begun, new), new
 
-    none = jnp.zeros((), h.dtype)
+    made = (plan.row + 1, plan.part, plan.start.astype(h.dtype), plan.length.astype(h.dtype))
     if idle:
         # A run of steps of no length finds the first acceleration: equations written out a
         # second time before the loop would compile for almost as long as the loop.
-        begin, numbers = Kinematic(q, v, jnp.zeros_like(v)), jnp.arange(saves + 1)
-        return jax.lax.scan(advance, (none, begin), numbers)[1]
-    state = stepper.begin(problem, t, q, v)
-    numbers = None if label is None else jnp.arange(1, saves + 1)
-    _, states = jax.lax.scan(advance, (none, state), numbers, length=saves)
-    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state, states)
+        made = tuple(np.insert(column, 0, 0) for column in made)
+        begin = Kinematic(q, v, jnp.zeros_like(v))
+    else:
+        begin = stepper.begin(problem, t, q, v)
+    _, states = jax.lax.scan(advance, Doubled.at(begin), made)
+    if idle:
+        begin = jax.tree.map(lambda a: a[0], states)
+        states = jax.tree.map(lambda a: a[1:], states)
+    path = after_start(begin, whole_rows(plan, states))
+    too_long = rows_too_long(plan, [path.q], [states.q])
+    return jax.tree.map(lambda a: a[::rows], path), too_long
 
 
-_WORTH_IDLING = 20  # runs that one more is at most five per cent of
+_WORTH_IDLING = 20  # rows that one more is at most five per cent of
 
 
-def _tell_share(label: str, saves: int, number: Array) -> None:
-    tell(label, number / saves)
+def _tell_share(label: str, rows: int, number: Array) -> None:
+    tell(label, number / rows)

@@ -6,6 +6,8 @@ Reference:
     Nocedal, Wright, Numerical Optimization, 2006, chapters 10 and 17, for the method.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -33,6 +35,7 @@ from sorojax.rod.rod import Rod
 from sorojax.rod.statics import first_guess
 from sorojax.rod.tangent import increments, linearised, metric, moved
 from sorojax.rod.targets import AbstractTarget, Clear
+from sorojax.rod.validity import checked_status
 
 _DAMPING = 1e-3  # at the first step, relative to the mean square of the Jacobian
 _DRIFT_ERROR = 0.1  # error that a step in the null space may make, against its length
@@ -74,9 +77,9 @@ def inverse_kinematics(
 
     Damped least squares. Obstacles and limits are bounds: they hold at the answer, the
     targets as far as they let. Where the targets leave freedom, the step in the true null
-    space seeks the equilibrium under `forces`. Differentiable in model, targets,
-    obstacles, limits and forces, by the conditions that hold at the answer: not where the
-    search was stopped before.
+    space seeks the equilibrium under `forces`, so that the answer does not depend on the first
+    guess. Differentiable in model, targets, obstacles, limits and forces, by the conditions
+    that hold at the answer: not where the search was stopped before.
 
     Args:
         model: The rod or assembly.
@@ -84,8 +87,8 @@ def inverse_kinematics(
         q: First guess, e.g. the last answer; at rest if omitted.
         obstacles: What sections must stay clear of.
         limits: Lowest and highest coordinates, each a number or one per rate.
-        forces: Seek their equilibrium in the null space: `()` for least elastic energy.
-            None leaves the null space alone.
+        forces: Seek their equilibrium in the null space: `()` for least elastic energy, the
+            default where the targets have fewer components than there are rates.
         t: Time at which the forces act [s].
         accuracy: Error at which targets count as met, relative to the length.
         iterations: Take just so many steps, without tests: for real time.
@@ -101,13 +104,16 @@ def inverse_kinematics(
     bounds = _limits(model, limits, dtype)
     tasks = Tasks(targets, obstacles, forces, bounds, measure, _length(model))
 
-    def at(q: Array) -> Rows:
+    def found_rows(tasks: Tasks, q: Array) -> Rows:
         return rows(tasks, t, motion(model, q, constants=constants))
 
+    errors = jax.eval_shape(lambda q: found_rows(tasks, q).error, guess)
+    if forces is None and errors.shape[0] < num_dof(model):
+        tasks = tasks._replace(forces=())
+    at = functools.partial(found_rows, tasks)
     count = sum(task.s.shape[0] for task in obstacles)
     push = jnp.zeros(count, dtype) if obstacles else None
-    errors = jax.eval_shape(at, guess).error
-    balance = None if forces is None else jnp.zeros(errors.shape, dtype)
+    balance = None if tasks.forces is None else jnp.zeros(errors.shape, dtype)
     begin, whole = ravel_pytree(answer.Ends(guess, push, balance))
 
     def find(_, begin):
@@ -135,6 +141,7 @@ def inverse_kinematics(
     status = Status.where(near, Status.successful, status)
     finite = jnp.all(jnp.isfinite(found)) & jnp.isfinite(error)
     status = Status.where(finite, status, Status.not_finite)
+    status = checked_status(status, model, found)
     return Reached(found, status, error, overlap, count.astype(jnp.int32))
 
 

@@ -22,6 +22,7 @@ from sorojax.rod.model import Model, motion, operators
 from sorojax.rod.static_path import Loading
 from sorojax.rod.statics import ended, first_guess, newton, prepare
 from sorojax.rod.tangent import increments, linearised, moved, negative_eigenvalues
+from sorojax.rod.validity import checked_status
 
 _ITERATIONS = 12
 _EASY = 5  # corrections below which the next step is longer
@@ -163,6 +164,7 @@ def arc_length_path(
     point = _Point(start.q, factor, direction, begin, start.done)
     shares = jnp.linspace(0.0, 1.0, steps + 1, dtype=dtype)[1:]
     _, (q, factors, negative, status) = jax.lax.scan(advance, point, shares)
+    status = jax.vmap(lambda x, q: checked_status(x, model, q))(status, q)
     return ArcPath(q, factors, negative, status)
 
 

@@ -17,6 +17,7 @@ from sorojax.rod.loads import Load, total_force
 from sorojax.rod.model import Model, motion, operators
 from sorojax.rod.statics import Search, ended, first_guess, newton, prepare
 from sorojax.rod.tangent import squared
+from sorojax.rod.validity import checked_status
 
 Loading = Callable[[Array], tuple[Load, ...]]
 
@@ -98,6 +99,7 @@ def equilibrium_path(
     guesses = jnp.broadcast_to(guess, (factors.shape[0], guess.shape[0]))
     rest, (done, count) = implicit_root(balance, guesses, find, _solve_rows, has_aux=True)
     status = jax.vmap(ended)(done, rest, jax.vmap(residual)(rest, factors))
+    status = jax.vmap(lambda x, q: checked_status(x, model, q))(status, rest)
     return EquilibriumPath(rest, status, count.astype(jnp.int32))
 
 

@@ -26,6 +26,7 @@ from sorojax.rod.tangent import (
     squared,
     unit_energy,
 )
+from sorojax.rod.validity import checked_status
 
 _DECREASE = 1e-4  # Armijo: share of the promised decrease that a step must give
 _SHORTEST = 1e-3  # of a Newton step
@@ -120,7 +121,7 @@ def equilibrium(
     rest, (done, count, negative) = implicit_root(
         lambda q: squared(model, q, residual(q)), guess, find, _solve_tangent, has_aux=True
     )
-    status = ended(done, rest, residual(rest))
+    status = checked_status(ended(done, rest, residual(rest)), model, rest)
     return Equilibrium(rest, status, count.astype(jnp.int32), negative.astype(jnp.int32))
 
 

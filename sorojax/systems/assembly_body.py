@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax._types import optional_real
+from sorojax.math.status import Status
 from sorojax.rod import (
     AbstractPressureMap,
     Assembly,
@@ -23,6 +24,7 @@ from sorojax.rod import (
 from sorojax.rod.assembly import index_of
 from sorojax.rod.dynamics import coordinate_rate
 from sorojax.rod.loads import Load
+from sorojax.rod.validity import checked_status
 from sorojax.systems.block import AbstractBlock, Input, Output
 
 _FLUID = {"volume": "m^3", "volume_rate": "m^3/s", "compliance": "m^3/Pa"}
@@ -102,6 +104,9 @@ class AssemblyBody(AbstractBlock):
         q, v, constants = state["q"], state["v"], operators(self.assembly)
         a = acceleration(self.assembly, constants, t, q, v, self.acting(inputs))
         return {"q": coordinate_rate(self.assembly, q, v), "v": a}
+
+    def path_status(self, path):
+        return checked_status(Status.successful, self.assembly, path["q"])
 
     def acting(self, inputs) -> tuple[Load, ...]:
         """The forces under given inputs: maps with their pressures, joints with efforts."""

@@ -8,6 +8,7 @@ import equinox as eqx
 from jaxtyping import Array, Float, PyTree
 
 from sorojax._display import displayed
+from sorojax.math.status import Status
 
 
 class Input(NamedTuple):
@@ -67,3 +68,9 @@ class AbstractBlock(eqx.Module):
     @abc.abstractmethod
     def vector_field(self, t: Float[Array, ""], state: PyTree, inputs: Signals) -> PyTree:
         """Rate of the state, of its structure; `inputs` holds every input."""
+
+    def path_status(self, path: PyTree) -> Status | None:
+        """What is wrong with a run through the states `path`, with a leading time axis, e.g.
+        `Status.outside_model`; None where there is nothing to look at."""
+        del path
+        return None

@@ -6,15 +6,19 @@ Ports carry gauge pressure [Pa]; the gas law is written in absolute pressure.
 import math
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import optional_real, real
+from sorojax.math.status import Status
 from sorojax.systems.block import AbstractBlock, Input, Output
 
 ATMOSPHERE = 101325.0  # Pa
 AIR = 287.05  # J/(kg K)
+_THIN = 1e3  # Pa, absolute: below it no pump draws its whole flow
+_NOISE = 10.0  # Pa that errors of steps may carry a pressure below vacuum
 
 
 class Reservoir(AbstractBlock):
@@ -22,7 +26,8 @@ class Reservoir(AbstractBlock):
 
     With absolute pressure p, n = `exponent` and V' = volume_rate + compliance p':
     p' = (n (R T m' - p V') - n leakage (p - atmosphere) V) / V, so that a sealed reservoir
-    without leak keeps p V^n. The state is the absolute pressure.
+    without leak keeps p V^n. The state is the absolute pressure. Where it is below 1 kPa, flow
+    out falls with it, to none at vacuum, whatever the wire carries.
 
     Where no rate of the volume is at hand, `bandwidth` a makes one: z' = -a (z + a V) and
     V' = z + a V, exact for slow volumes and late by 1/a. It adds a pole at -a.
@@ -112,12 +117,19 @@ class Reservoir(AbstractBlock):
         rate = self._rate(pressure, inputs, volume, growth, 0.0)
         return {"pressure": rate, "filter": -self.bandwidth * growth}
 
+    def path_status(self, path):
+        above = jnp.all(jax.lax.stop_gradient(self._pressure(path)) > -_NOISE)
+        return Status.where(above, Status.successful, Status.outside_model)
+
     def _pressure(self, state):
         return state if self.bandwidth is None else state["pressure"]
 
     def _rate(self, pressure, inputs, volume, growth, compliance):
         whole = volume + self.dead_volume
-        supply = self.gas_constant * self.temperature * inputs["mass_flow"]
+        flow = inputs["mass_flow"]
+        left = jnp.clip(pressure / _THIN, 0.0, 1.0)
+        flow = jnp.where(flow < 0, left * flow, flow)
+        supply = self.gas_constant * self.temperature * flow
         lost = self.leakage * (pressure - self.atmosphere) * whole
         stretch = self.exponent * pressure * compliance
         return self.exponent * (supply - lost - pressure * growth) / (whole + stretch)

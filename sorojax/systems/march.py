@@ -10,6 +10,16 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from sorojax.math.method import AbstractMethod, finite, guarded, repeated
 from sorojax.math.status import Status
+from sorojax.math.step_doubling import (
+    Doubled,
+    after_start,
+    judged_status,
+    passes,
+    positions,
+    rows_between,
+    rows_too_long,
+    whole_rows,
+)
 from sorojax.math.told import tell
 from sorojax.systems.block import AbstractBlock
 from sorojax.systems.integrate import Motion, explicit_inputs
@@ -26,38 +36,50 @@ def fixed(
     substeps: int,
     memory: Any = None,
     progress: bool = False,
+    judged: bool = True,
 ) -> Motion:
-    """Run by `substeps` steps in every interval between saved instants."""
+    """Run by `substeps` steps in every interval between saved instants; if `judged`, ends as
+    `unstable` where the steps were too long (`math.step_doubling`)."""
     inputs = explicit_inputs(inputs, time[0])
-    move = interval_of(substeps)
-    if memory is None:
-        memory = move.begin((method, block, inputs, time[0], state), interval)
     count = time.shape[0] - 1
+    judged = judged and not method.carries
+    parts = rows_between(count, substeps, judged)
+    move, short = interval_of(substeps // parts), interval / parts
+    if memory is None:
+        memory = move.begin((method, block, inputs, time[0], state), short)
+    plan = passes(count * parts, substeps * count, judged)
 
-    def advance(walk: Walk, number):
-        t = time[number]
+    def advance(run: Doubled, one_pass):
+        number, part, first, length = one_pass
+        walk, h = run.begin(part), length * short
+        t = time[number // parts] + first * short
         given = (method, block, inputs, t, walk.state, walk.memory)
         if method.carries:  # a step is large: none is computed after one that failed
-            moved = jax.lax.cond(
-                walk.good, lambda: move.taken(given, interval), lambda: walk.held
-            )
+            moved = jax.lax.cond(walk.good, lambda: move.taken(given, h), lambda: walk.held)
         else:
-            moved = move.taken(given, interval)
-        walk = walk.after(moved, t + interval)
+            moved = move.taken(given, h)
+        new = walk.after(moved, t + h)
         if progress:
-            tell("simulate", (number + 1) / count)
-        return walk, walk.state
+            tell("simulate", (number + 1) / (count * parts))
+        return run.end(part, walk, new), new.state
 
     if method.carries:  # a step is large beside what it starts from
         advance = jax.checkpoint(advance, prevent_cse=False)  # pyright: ignore[reportPrivateImportUsage]
     start = Walk(state, memory, finite(state), jnp.array(True), time[0])
-    end, path = jax.lax.scan(advance, start, jnp.arange(count))
-    path = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), state, path)
+    within = plan.start - plan.row // parts * parts
+    made = (
+        plan.row, plan.part, within.astype(interval.dtype), plan.length.astype(interval.dtype)
+    )  # fmt: skip
+    run, states = jax.lax.scan(advance, Doubled.at(start), made)
+    end = run.now
+    path = after_start(state, whole_rows(plan, states))
+    too_long = rows_too_long(plan, positions(path), positions(states))
+    path = jax.tree.map(lambda a: a[::parts], path)
     steps = jnp.asarray(substeps * count)
     none = jnp.zeros(0, bool)
     return Motion(
-        path, end.state, end.reached, end.status, steps, jnp.zeros_like(steps), none, None,
-        end.memory,
+        path, end.state, end.reached, judged_status(end.status, too_long), steps,
+        jnp.zeros_like(steps), none, None, end.memory,
     )  # fmt: skip
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from sorojax._display import displayed
+from sorojax.math.status import Status
 from sorojax.systems.block import AbstractBlock, Input, Output, Signals
 from sorojax.systems.loops import consistent, torn_wires
 from sorojax.systems.schedule import check_wires, evaluation_order, needed, reachable_inputs
@@ -81,6 +82,14 @@ class Network(AbstractBlock):
 
     def vector_field(self, t, state, inputs: Signals | None = None) -> dict[str, PyTree]:
         return rates_of(self, t, state, inputs or {}, tuple(self.blocks))
+
+    def path_status(self, path):
+        every = [block.path_status(path[name]) for name, block in self.blocks.items()]
+        found = [one for one in every if one is not None]
+        status = found[0] if found else None
+        for one in found[1:]:
+            status = Status.where(status == Status.successful, one, status)
+        return status
 
     def _text(self) -> str:
         rows = [f"Network: {len(self.blocks)} blocks, {len(self.wires)} wires"]

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from sorojax._types import optional_real
 from sorojax.math.dense import solve_symmetric
+from sorojax.math.status import Status
 from sorojax.rod import (
     AbstractForce,
     AbstractPressureMap,
@@ -19,6 +20,7 @@ from sorojax.rod import (
     tip_pose,
     total_force,
 )
+from sorojax.rod.validity import checked_status
 from sorojax.systems.block import AbstractBlock, Input, Output
 
 
@@ -104,6 +106,9 @@ class RodBody(AbstractBlock):
         if self.driven:
             force = force + inputs["effort"]
         return {"q": state["v"], "v": solve_symmetric(mass, force - coriolis)}
+
+    def path_status(self, path):
+        return checked_status(Status.successful, self.rod, path["q"])
 
     def _bound(self, inputs) -> tuple[AbstractForce, ...]:
         return tuple(

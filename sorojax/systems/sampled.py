@@ -12,11 +12,19 @@ from sorojax import _check
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
 from sorojax.math.method import AbstractMethod, finite
+from sorojax.math.step_doubling import (
+    Doubled,
+    judged_status,
+    passes,
+    positions,
+    rows_too_long,
+    whole_rows,
+)
 from sorojax.math.told import tell
 from sorojax.systems.integrate import explicit_inputs
 from sorojax.systems.march import Walk, interval_of
 from sorojax.systems.network import Network, at_time, outputs
-from sorojax.systems.simulate import Trajectory, default_method, last_state
+from sorojax.systems.simulate import Trajectory, default_method, last_state, within_model
 
 Ports = str | tuple[str, ...]
 
@@ -105,8 +113,8 @@ def simulate_sampled(
 
 
 @eqx.filter_jit
-def _run(network, loops, state, before, inputs, period, first, plan) -> Trajectory:
-    (ticks, substeps, method, progress), (memories, held, kept) = plan, before
+def _run(network, loops, state, before, inputs, period, first, settings) -> Trajectory:
+    (ticks, substeps, method, progress), (memories, held, kept) = settings, before
     move = interval_of(substeps)
     state = network.initial_state() if state is None else state
     inputs = explicit_inputs(inputs, period)
@@ -123,21 +131,26 @@ def _run(network, loops, state, before, inputs, period, first, plan) -> Trajecto
             kept.append(memory)
         return tuple(kept), held
 
-    def advance(carry, tick):
-        walk, memories, held, _ = carry
-        t = period * tick.astype(period.dtype)
-        resumed = (tick == first) & (first > 0)  # the call at the seam was made before
+    def advance(carry, one_pass):
+        run, memories, held, kept = carry
+        row, part, start, length = one_pass
+        tick, walk, h = first + row, run.begin(part), length * period
+        t = period * (first.astype(period.dtype) + start)
+        # The call at the seam was made before; a pass that repeats a tick keeps its commands.
+        called = ((tick == first) & (first > 0)) | (part > 0)
         memories, held = jax.lax.cond(
-            resumed,
+            called,
             lambda: (memories, held),
             lambda: call(tick, t, walk.state, memories, held),
         )
-        seen = (walk.state, {**signals(t, walk.state, held), **held}, memories, held)
         given = (method, network, {**inputs, **held}, t, walk.state, walk.memory)
-        moved = walk.after(move.taken(given, period), t + period)
+        new = walk.after(move.taken(given, h), t + h)
+        run = run.end(part, walk, new)
+        kept = jax.tree.map(lambda a, b: jnp.where(part == 0, a, b), walk.memory, kept)
         if progress:
-            tell("simulate", (tick - first) / ticks)
-        return (moved, memories, held, walk.memory), seen
+            tell("simulate", row / ticks)
+        seen = (walk.state, {**signals(t, walk.state, held), **held}, memories, held)
+        return (run, memories, held, kept), (seen, new.state)
 
     held = _nothing(network, loops, period.dtype) if held is None else held
     if memories is None:
@@ -151,12 +164,18 @@ def _run(network, loops, state, before, inputs, period, first, plan) -> Trajecto
     if method.carries:  # a step is large beside what it starts from
         advance = jax.checkpoint(advance, prevent_cse=False)  # pyright: ignore[reportPrivateImportUsage]
     walk = Walk(state, kept, finite(state), jnp.array(True), time[0])
-    numbers = first + jnp.arange(ticks + 1, dtype=jnp.int32)
-    carry, seen = jax.lax.scan(advance, (walk, memories, held, kept), numbers)
-    states, values, memories, held = seen
-    ended, *_, kept = carry
+    plan = passes(ticks + 1, (ticks + 1) * substeps, not method.carries)
+    dtype = period.dtype
+    made = (plan.row, plan.part, plan.start.astype(dtype), plan.length.astype(dtype))
+    carry, (seen, ends) = jax.lax.scan(advance, (Doubled.at(walk), memories, held, kept), made)
+    states, values, memories, held = whole_rows(plan, seen)
+    run, *_, kept = carry
+    ended = run.now
     good, reached = finite((states, values)) & ended.good, jnp.minimum(ended.reached, time[-1])
-    status = ended._replace(good=good).status
+    path = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), states, ended.state)
+    too_long = rows_too_long(plan, positions(path), positions(ends))
+    status = judged_status(ended._replace(good=good).status, too_long)
+    status = within_model(network, status, states)
     stats = {
         "steps": jnp.asarray(ticks * substeps),
         "calls": jnp.asarray(sum(ticks // loop.every + 1 for loop in loops)),

@@ -219,6 +219,7 @@ def film_of(network, time, inputs, motion: Motion, happened=None) -> Trajectory:
     values = jax.lax.map(one, every) if large else jax.vmap(one)(every)
     status, good = motion.status, finite(values)
     status = Status.where((status == Status.successful) & ~good, Status.not_finite, status)
+    status = within_model(network, status, motion.path)
     stats = {"steps": motion.steps, "rejected": motion.rejected, "reached": motion.reached}
     return Trajectory(
         time,
@@ -230,6 +231,14 @@ def film_of(network, time, inputs, motion: Motion, happened=None) -> Trajectory:
         happened=happened,
         dense=motion.dense,
     )
+
+
+def within_model(network: Network, status: Status, path: PyTree) -> Status:
+    """`status`, or what the blocks find wrong with the path of a successful run."""
+    found = network.path_status(path)
+    if found is None:
+        return status
+    return Status.where(status == Status.successful, found, status)
 
 
 def _start(state: PyTree, resume: Trajectory | None) -> tuple:

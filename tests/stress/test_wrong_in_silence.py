@@ -1,0 +1,104 @@
+"""Answers that are wrong say so: runs, rods and gas outside what their models describe."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sorojax import rod as R, systems as S
+from sorojax.math import steppers
+from sorojax.math.lie import SE2
+from sorojax.math.status import Status
+
+SOFT = {"length": 0.1, "young_modulus": 1e5, "poisson_ratio": 0.45, "density": 1000.0}
+EA = 1e5 * float(R.circle(10e-3).area)
+
+
+def vessel(volume=1e-4, target=3e3, **regulator) -> S.Network:
+    blocks = {
+        "target": S.Source(S.Constant(target), unit="Pa"),
+        "valve": S.Regulator(**regulator),
+        "air": S.Reservoir(volume=volume),
+    }
+    wires = {
+        "valve.setpoint": "target.value",
+        "valve.pressure": "air.pressure",
+        "air.mass_flow": "valve.mass_flow",
+    }
+    return S.Network(blocks, wires)
+
+
+def finger(nodes=6, **modes) -> R.Rod:
+    return R.rod(SE2(), R.chebyshev(**(modes or {"kappa_z": 2})), R.circle(10e-3), nodes=nodes,
+                 **SOFT)  # fmt: skip
+
+
+@pytest.mark.stress(81)
+@pytest.mark.parametrize("save, step", [(201, 0.05), (21, 0.05), (3, 0.05), (201, 1e-4)])
+def test_a_network_beyond_stability_says_so(save, step):
+    net = vessel(proportional=1e-5, integral_gain=1e-7, max_flow=1e3)
+    film = S.simulate(net, 1.0, save=save, step=step, throw=False)
+    small = step < 1e-3 or save == 201  # a saved interval bounds the step
+    wrong = float(jnp.abs(film["air.pressure"] - 3e3)[-1]) > 3e3
+    assert wrong != small or save == 201
+    assert (film.status == Status.successful) == (not wrong)
+
+
+@pytest.mark.stress(82)
+@pytest.mark.parametrize("stepper", [steppers.RungeKutta4(), steppers.DormandPrince()])
+def test_a_rod_beyond_stability_says_so(stepper):
+    rod, rest = finger(), jnp.zeros(2)
+    fastest = jnp.sqrt(jnp.max(jnp.linalg.eigvals(jnp.linalg.solve(
+        R.inertia(R.motion(rod, rest))[0], R.operators(rod).stiffness
+    )).real))  # fmt: skip
+    for share, saves, every, good in ((0.2, 20, 40, True), (3.0, 3, 20, False)):
+        run = R.rollout(
+            rod, rest, rest, (R.Gravity((0.0, -9.81)),), step=1.4 * share / fastest,
+            saves=saves, every=every, stepper=stepper,
+        )  # fmt: skip
+        assert (run.status == Status.successful) == good
+
+
+@pytest.mark.stress(83)
+def test_gas_does_not_go_below_vacuum():
+    net = vessel(proportional=1e-8, integral_gain=1e-7, max_flow=1e-4, target=-2e5)
+    film = S.simulate(net, 5.0)
+    assert film.status == Status.successful
+    assert -1.0 < float(jnp.min(film.state["air"])) < 1e3
+
+
+@pytest.mark.stress(84)
+@pytest.mark.parametrize(
+    "force, status",
+    [(-1.5 * EA, "inverted"), (1e12, "outside_model"), (0.2 * EA, "successful")],
+)
+def test_a_rod_inside_out_or_torn_says_so(force, status):
+    rod = finger(kappa_z=2, sigma_x=1)
+    found = R.equilibrium(rod, (R.TipWrench([0.0, force, 0.0]),))
+    assert found.status == getattr(Status, status)
+
+
+@pytest.mark.stress(85)
+@pytest.mark.parametrize("turns, nodes, good", [(1, 8, True), (3, 8, False), (3, 16, True)])
+def test_a_coil_that_the_nodes_do_not_carry_says_so(turns, nodes, good):
+    rod = R.rod(SE2(), R.constant("kappa_z"), R.circle(1e-3), nodes=nodes, **SOFT)
+    moment = 2 * np.pi * turns / 0.1 * 1e5 * float(rod.section.second_moment_z)
+    found = R.equilibrium(rod, (R.TipWrench([moment, 0.0, 0.0]),))
+    assert found.status == (Status.successful if good else Status.unresolved)
+    off = float(jnp.abs(R.tip_pose(rod, found.q)[:2, 2]).max()) / 0.1
+    assert (off < 1e-3) == good
+
+
+@pytest.mark.stress(86)
+@pytest.mark.parametrize("extra", [{}, {"limits": (-40.0, 40.0)}])
+def test_inverse_kinematics_of_a_redundant_rod_has_the_slope_of_its_answers(extra):
+    rod = finger(nodes=8, kappa_z=3)
+
+    def find(target):
+        return R.inverse_kinematics(rod, R.Position(target), **extra).q
+
+    target, gap = jnp.array([0.08, 0.04]), 1e-5
+    slope = jax.jacfwd(find)(target)
+    ends = jax.vmap(find)(target[None] + gap * jnp.array([[1.0, 0], [-1, 0], [0, 1], [0, -1]]))
+    differences = jnp.stack([ends[0] - ends[1], ends[2] - ends[3]], axis=1) / (2 * gap)
+    assert jnp.allclose(slope, differences, rtol=0, atol=1e-4 * float(jnp.abs(slope).max()))
