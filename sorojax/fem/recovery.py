@@ -29,6 +29,7 @@ from sorojax.mesh.shape import (
 )
 
 _BILINEAR = Quad4 | Hex8
+_PRODUCTS = _BILINEAR | Quad8 | Quad9
 _SURE = 0.02  # smallest singular value of a fit over the largest
 
 
@@ -50,11 +51,12 @@ class Patches(NamedTuple):
 def patches(mesh: Mesh) -> Patches:
     """Patches of `mesh`, for fields at its `sample_points` (on the host, once per mesh).
 
-    A polynomial of the order of the element is fitted to the samples of the cells that
-    share a node, of one more ring of cells where these are too few; so a field of that
-    order is recovered exactly, also on the boundary. In Quad4 and Hex8 that holds for nodes
-    on the boundary, fitted to the centres of the cells; inside, the mean of the cells at the
-    node is better: its error is that of a central difference.
+    Inside, a polynomial of the order of the element is fitted to the samples of the cells that
+    share a node, of one more ring of cells where these are too few; so a field of that order
+    is recovered exactly. In Quad4 and Hex8 the mean of the cells at the node is as good there:
+    its error is that of a central difference. On the boundary quadrilaterals and Hex8 take
+    that mean, triangles and tetrahedra the fit, in which near samples count more: each is the
+    better one at the root of an ellipse (NAFEMS LE1) and at the rim of a hole.
 
     Raises:
         ValueError: If the mesh is traced, has polygons, or too few cells for a fit.
@@ -66,23 +68,19 @@ def patches(mesh: Mesh) -> Patches:
         )
     cells, points = np.asarray(mesh.cells), np.asarray(mesh.points)
     at = np.einsum("qa,cai->cqi", _sample_table(mesh.element).values[0], points[cells])
-    rings = _rings(mesh, cells)
-    powers = _powers(mesh.element)
-    inside = np.ones(mesh.num_nodes, bool)
-    inside[np.unique(boundary_facets(mesh))] = False
-    corners = isinstance(mesh.element, _BILINEAR)
-    found = [
-        _mean(cells, next(rings(node)), node)
-        if corners and inside[node]
-        else _fit(points[node], at[:, :1] if corners else at, rings(node), powers, inside[node])
-        for node in range(mesh.num_nodes)
-    ]
-    if corners:  # the centre of a cell is the first of its samples
-        count = at.shape[1]
-        found = [
-            (ids if inside[node] else ids * count, share)
-            for node, (ids, share) in enumerate(found)
-        ]
+    rings, powers, count = _rings(mesh, cells), _powers(mesh.element), at.shape[1]
+    edge = np.zeros(mesh.num_nodes, bool)
+    edge[np.unique(boundary_facets(mesh))] = True
+    inner = len(_inner_points(mesh.element))
+    by_mean = np.full(mesh.num_nodes, isinstance(mesh.element, _BILINEAR))
+    by_mean |= edge & isinstance(mesh.element, _PRODUCTS)
+
+    def at_node(node):
+        if by_mean[node]:
+            return _mean(cells, next(rings(node)), node, inner, count)
+        return _fit(points[node], at[:, :inner], rings(node), powers, count)
+
+    found = [at_node(node) for node in range(mesh.num_nodes)]
     most = max(len(samples) for samples, _ in found)
     samples = np.zeros((mesh.num_nodes, most), np.int32)
     weights = np.zeros((mesh.num_nodes, most))
@@ -94,9 +92,11 @@ def patches(mesh: Mesh) -> Patches:
 def nodal_stress(
     problem: Problem, u: Float[Array, "nodes dim"], fit: Patches | None = None
 ) -> Float[Array, "nodes 3 3"]:
-    """Cauchy stress [Pa] at the nodes, continuous, better than a mean on the boundary.
+    """Cauchy stress [Pa] at the nodes, continuous: inside more accurate than the mean of the
+    cells (`nodal_average` of `cauchy_stress`), on the boundary at least as accurate.
 
-    At an interface of two materials, where stress jumps, it is smoothed. Pass
+    To be taken where a stress is read off a coarse mesh, or compared with a strength; the mean
+    costs nothing once and is enough for pictures. At an interface of two materials, where stress jumps, it is smoothed. Pass
     `patches(problem.mesh)` to compute them once for many states.
     """
     fit = patches(problem.mesh) if fit is None else fit
@@ -122,28 +122,37 @@ def _strain_energy(problem: Problem, u) -> Float[Array, " cells"]:
 
 
 def sample_points(mesh: Mesh) -> Float[Array, "cells samples dim"]:
-    """Where the stresses of a cell are taken [m]: its points of reduced integration, and
-    in Quad4 and Hex8 its corners as well."""
+    """Where the stresses of a cell are taken [m]: its points of reduced integration, in
+    quadrilaterals and Hex8 its nodes as well."""
     values = jnp.asarray(_sample_table(mesh.element).values[0])
     return jnp.einsum("qa,cai->cqi", values, mesh.points[mesh.cells])
 
 
 def _sample_table(element: AbstractElement) -> Tables:
-    if isinstance(element, _BILINEAR):
-        at = np.concatenate([np.zeros((1, element.dim)), reference_nodes(element)])
-    elif isinstance(element, Quad8 | Quad9):
-        line = np.array([-1.0, 1.0]) / np.sqrt(3)
-        at = np.array(list(itertools.product(line, repeat=2)))
-    else:
-        at = quadrature(element, element.order).points
+    at = _inner_points(element)
+    if isinstance(element, _PRODUCTS):
+        at = np.concatenate([at, reference_nodes(element)])
     tables = shape_functions(element, at), shape_gradients(element, at), np.ones(len(at))
     return Tables(*(table[None] for table in tables))
 
 
-def _mean(cells: np.ndarray, own: np.ndarray, node: int) -> tuple[np.ndarray, np.ndarray]:
-    """The samples of the cells `own` at their common node, with equal weights."""
+def _inner_points(element: AbstractElement) -> np.ndarray:
+    """Points of reduced integration, where stresses are the most accurate."""
+    if isinstance(element, _BILINEAR):
+        return np.zeros((1, element.dim))
+    if isinstance(element, Quad8 | Quad9):
+        line = np.array([-1.0, 1.0]) / np.sqrt(3)
+        return np.array(list(itertools.product(line, repeat=2)))
+    return quadrature(element, element.order).points
+
+
+def _mean(
+    cells: np.ndarray, own: np.ndarray, node: int, inner: int, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The samples of the cells `own` at their common node, with equal weights; the `inner`
+    points of a cell are the first of its `count`."""
     corner = np.argmax(cells[own] == node, axis=1)
-    return own * (1 + cells.shape[1]) + 1 + corner, np.full(len(own), 1 / len(own))
+    return own * count + inner + corner, np.full(len(own), 1 / max(len(own), 1))
 
 
 def _powers(element: AbstractElement) -> np.ndarray:
@@ -171,16 +180,14 @@ def _rings(mesh: Mesh, cells: np.ndarray):
     return grown
 
 
-def _fit(point, at, rings, powers, inside: bool) -> tuple[np.ndarray, np.ndarray]:
+def _fit(point, at, rings, powers, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Samples and their weights in the least squares fit at `point`, over as many rings of
     cells as it takes for a sure one.
 
-    Inside near samples count more: a further ring only has to tell the curvature and
-    leaves the value to the cells next to the node. On the boundary the fit has to look
-    outward, for which all samples and half as many again are better (both measured).
+    Near samples count more: a further ring only has to tell the curvature and leaves the
+    value to the cells next to the node.
     """
     ids, weights = np.zeros(0, int), np.zeros(0)
-    enough = len(powers) + 1 if inside else 1.5 * len(powers)
     constant = np.flatnonzero(powers.sum(axis=1) == 0)[0]
     for own in rings:
         if not len(own):  # a node without cells
@@ -188,10 +195,10 @@ def _fit(point, at, rings, powers, inside: bool) -> tuple[np.ndarray, np.ndarray
         place = at[own].reshape(-1, at.shape[2]) - point
         distance = np.sqrt(np.sum(place**2, axis=1))
         basis = np.prod((place / distance.max())[:, None] ** powers[None], axis=2)
-        trust = 1 / (0.1 + (distance / distance.min()) ** 2) if inside else np.ones(len(place))
+        trust = 1 / (0.1 + (distance / distance.min()) ** 2)
         values = np.linalg.svd(basis, compute_uv=False)
-        ids = (own[:, None] * at.shape[1] + np.arange(at.shape[1])).ravel()
+        ids = (own[:, None] * count + np.arange(at.shape[1])).ravel()
         weights = np.linalg.pinv(trust[:, None] * basis, rcond=1e-8)[constant] * trust
-        if len(basis) >= enough and values[-1] > _SURE * values[0]:
+        if len(basis) > len(powers) and values[-1] > _SURE * values[0]:
             break
     return ids, weights

@@ -128,15 +128,16 @@ def principal_stresses(
 
 
 def nodal_average(
-    problem: Problem, field: Float[Array, "cells cell_nodes"]
-) -> Float[Array, " nodes"]:
-    """Mean over the cells that share a node, for pictures."""
+    problem: Problem, field: Float[Array, "cells cell_nodes *value"]
+) -> Float[Array, "nodes *value"]:
+    """Mean over the cells that share a node, of numbers, vectors or tensors at the nodes of
+    every cell."""
     return _nodal_average(problem.mesh, field)
 
 
 @jax.jit
-def _nodal_average(mesh: Mesh, field: Float[Array, "cells cell_nodes"]):
-    zero = jnp.zeros(mesh.num_nodes, field.dtype)
+def _nodal_average(mesh: Mesh, field: Float[Array, "cells cell_nodes *value"]):
+    zero = jnp.zeros((mesh.num_nodes, *field.shape[2:]), field.dtype)
     total = zero.at[mesh.cells].add(field)
     return total / zero.at[mesh.cells].add(jnp.ones_like(field))
 

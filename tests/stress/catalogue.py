@@ -58,4 +58,11 @@ CASES = {
     52: "a valve board on a bad line: at zero in time, says why",
     53: "commands that no valve may follow: refused or cut, counted",
     54: "cameras that fail: prediction goes on, marked stale, never blocks",
+    81: "a network by steps beyond stability: unstable; shorter ones successful",
+    82: "a rod by explicit steps beyond stability: unstable, however few are saved",
+    83: "a pump that is asked for less than vacuum: flow out stops there",
+    84: "a rod turned inside out or stretched tenfold: status",
+    85: "coils that the nodes of a rod do not carry: unresolved",
+    86: "inverse kinematics of redundant rods: slope of the answers, with limits too",
+    87: "stress at the root of an ellipse and the rim of a hole: never behind the mean",
 }
