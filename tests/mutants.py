@@ -215,9 +215,8 @@ def main() -> int:
             word = "SURVIVES" if alive else "seen"
             print(f"{number:3} {word:8} {seconds:5.0f} s  {mutant.name}", flush=True)
     open_ones = [m for m in left if m.name not in EQUIVALENT]
-    print(
-        f"{len(chosen)} mutants, {len(left)} survive, {len(left) - len(open_ones)} of them equal"
-    )
+    equal = len(left) - len(open_ones)
+    print(f"{len(chosen)} mutants, {len(left)} survive, {equal} of them equivalent")
     return 1 if len(open_ones) > 3 else 0
 
 

@@ -31,8 +31,10 @@ from sorojax_board.i2c import (
     adc_request,
     dac_code,
     dac_pressure,
+    pressure_of_command,
+    voltage_of_pressure,
 )
-from sorojax_board.legacy import LegacySession, pressure_of_command, voltage_of_pressure
+from sorojax_board.legacy import LegacySession
 from sorojax_board.messages import Fault, Flag, Refusal, State
 from sorojax_board.session import READER, WRITER, Session
 
@@ -325,6 +327,15 @@ def test_ten_kilohertz_are_thinned_to_one():
     assert board.state is State.ARMED
 
 
+@pytest.mark.stress(53)
+def test_a_calm_second_saves_up_no_burst():
+    board, _, client = armed(watchdog=5.0)
+    for now in np.arange(0.01, 1.0, 0.01):
+        client.set([1e3, 1e3], now)
+    answers = [client.set([2e3, 2e3], 1.0).kind for _ in range(200)]
+    assert 19 <= answers.count(Kind.STATE) <= 21
+
+
 def test_a_wrong_key_never_gets_in():
     board = Board(settings(2), Still())
     stranger = Client(board, key=bytes(32))
@@ -355,6 +366,7 @@ def test_who_does_not_say_hello_is_put_out():
         (lambda v: setattr(v, "reading", lambda port, p: float("nan")), Fault.SENSOR),
         (lambda v: setattr(v, "reading", lambda port, p: 300 * kPa), Fault.SENSOR),
         (lambda v: setattr(v, "reading", lambda port, p: 75 * kPa), Fault.OVER_PRESSURE),
+        (lambda v: setattr(v, "reading", lambda port, p: -25 * kPa), Fault.OVER_PRESSURE),
         (lambda v: v.stuck.add(1), Fault.TRACKING),
     ],
 )
@@ -447,8 +459,6 @@ def test_the_raw_stream_of_the_first_platform():
     assert struct.unpack("<2d", answer) == (5.0, 5.0)
     run(board, 0.0, 0.1)
     assert valves.pressure == [50 * kPa, 0.0]
-    for wrong in (np.nan, 1.5, -1e300):
-        session.receive(struct.pack("<2d", wrong, 0.5), 0.1)
     run(board, 0.1, 0.7)
     assert valves.pressure == [0.0, 0.0] and board.fault is Fault.WATCHDOG
     session.receive(data, 0.7)
@@ -456,6 +466,47 @@ def test_the_raw_stream_of_the_first_platform():
     session.lost(0.8)
     LegacySession(board, 0.9).receive(data, 0.9)
     assert board.state is State.ARMED
+
+
+@pytest.mark.stress(55)
+@pytest.mark.parametrize(
+    "wrong",
+    [struct.pack("<2d", bad, 0.5) for bad in (np.nan, np.inf, 1.5, -1e300, 1e-300)]
+    + [
+        b"GET / HTTP/1.1\r\nHost: 127.0.0.1:8888\r\nAccept: */*\r\n\r\n",
+        b"GET /a? HTTP/1.1\r\nHost: localhost\r\nX: aaaaaa??aaaaaa??",  # numbers in [0, 1]
+        b"aaaaaa??bbbbbb??" * 4,
+        bytes.fromhex("16030100f8010000f40303") + bytes(range(64)),  # a hello of TLS
+        b"SORO" + bytes(60),
+    ],
+)
+def test_the_raw_stream_ends_at_the_first_message_that_is_no_commands(wrong):
+    for before in (0, 1):
+        valves = Still(2)
+        board = Board(settings(2), valves)
+        session = LegacySession(board, 0.0)
+        good = struct.pack("<2d", 0.7, 0.6)
+        answer = session.receive(before * good + wrong + 3 * good, 0.0)
+        assert "no commands" in session.closed and len(answer) == before * len(good)
+        assert board.state is (State.FAULT if before else State.VENTED) and board.owner is None
+        assert session.receive(good, 0.001) == b""
+        run(board, 0.0, 0.09)
+        assert all(value == 0 for told in valves.told for value in told)
+
+
+def test_the_raw_stream_follows_every_command_of_a_client():
+    board = Board(settings(2), Still(2))
+    session = LegacySession(board, 0.0)
+    sweep = [0.0, 1.0, *(0.5 + 0.5 * np.sin(np.linspace(0, 20, 999)))]
+    for k, u in enumerate(sweep):
+        session.receive(struct.pack("<2d", u, 1 - u), 0.002 * k)
+    assert not session.closed and board.refused == 0
+    silent = LegacySession(board, 0.0)
+    silent.receive(b"\0" * 9, 1.9)
+    silent.tick(1.99)
+    assert not silent.closed
+    silent.tick(2.01)
+    assert "in time" in silent.closed
 
 
 @pytest.mark.stress(53)

@@ -93,6 +93,15 @@ BAD = {
     "web page": ("a.stl", b"<!DOCTYPE html><html><body>404 not found</body></html>" * 9),
     "truncated": ("b.stl", stl(TRIANGLE, TRIANGLE)[:-30]),
     "text STL has 1 facets, 0": ("c.stl", TEXT),
+    "1 facets, 0 ends of facets and 3": ("i1.stl", TEXT + b"endloop\nendsolid a\n"),
+    "1 facets, 1 ends of facets and 2": ("i2.stl", TEXT.replace(b"vertex 0 1 0\n", b"") + END),
+    "1 facets, 1 ends of facets and 4": ("i3.stl", TEXT + b"vertex 1 1 0\n" + END),
+    "2 facets, 1 ends of facets and 3": ("i4.stl", TEXT + b"facet normal 0 0 1\n" + END),
+    "1 facets, 1 ends of facets and 3": ("i5.stl", TEXT + END.replace(b"endsolid a\n", b"")),
+    "2 facets, 2 ends of facets and 6": (  # as many as needed, four in one and two in the other
+        "i6.stl",
+        TEXT + b"vertex 1 1 0\n" + END[:17] + TEXT[8:].replace(b"vertex 0 1 0\n", b"") + END,
+    ),
     "no number": ("d.stl", TEXT.replace(b"vertex 0 1 0", b"vertex 0 one 0") + END),
     "finite coordinates": ("e.stl", stl([[0, 0, np.nan], [1, 0, 0], [0, 1, 0]])),
     "vertex .* is .*1.*e\\+30": ("f.stl", stl([[0, 0, 1e30], [1, 0, 0], [0, 1, 0]])),
@@ -123,6 +132,20 @@ def test_bad_files_name_the_remedy(tmp_path, message):
     with pytest.raises(ValueError, match=message) as caught:
         io.import_surface(tmp_path / name)
     assert str(caught.value).startswith("import_surface")
+
+
+@pytest.mark.stress(61)
+@pytest.mark.parametrize("written", [1.0, 1e-7, 0.0254])
+def test_a_size_that_no_part_has_in_millimetres_needs_its_unit(tmp_path, written):
+    """A part of 20 mm whose file is in metres, tenths of a micrometre or inches."""
+    shape = sdf.Box([0, 0, 0], [20e-3, 15e-3, 10e-3])
+    io.export_surface(tmp_path / "a.stl", sdf.isosurface(shape, size=2e-3), unit=written)
+    with pytest.raises(ValueError, match=r"a\.stl: its longest side is .*, need .*unit="):
+        io.import_surface(tmp_path / "a.stl")
+    back = io.import_surface(tmp_path / "a.stl", unit=written)
+    assert np.allclose(np.ptp(back.vertices, axis=0), [20e-3, 15e-3, 10e-3], rtol=1e-5)
+    tiny = io.import_surface(tmp_path / "a.stl", unit=1e-6)  # as asked for
+    assert np.ptp(tiny.vertices, axis=0)[0] == pytest.approx(20e-3 / written * 1e-6)
 
 
 @pytest.mark.stress(33)

@@ -550,6 +550,36 @@ def test_dragon_skin_30_fits_its_quoted_points_within_two_percent():
     assert 1.8e5 < 2 * fit.material.c1 < 2.3e5  # small-strain shear modulus [Pa]
 
 
+@pytest.mark.stress(61)
+@pytest.mark.parametrize("name", OWN)
+def test_data_in_other_units_or_quantities_are_refused(name):
+    rubber, options = OWN[name]
+    options = options | {"model": type(rubber)}
+    stress = incompressible(rubber, 1 + STRAIN)
+    for other in (1e-6, -1e-6):
+        with pytest.raises(ValueError, match="stress is .*, need Pa, .*MPa by 1e6"):
+            material.fit_tensile(STRAIN, stress * other, **options)
+    stretches = (1 + STRAIN, 1 + np.append(0.0, STRAIN), np.linspace(1.1, 4, 9),
+                 np.linspace(0.6, 1.8, 9), np.linspace(0.5, 0.95, 9))  # fmt: skip
+    for stretch in stretches:
+        with pytest.raises(ValueError, match="stress vanishes at a strain of .*Subtract 1"):
+            material.fit_tensile(stretch, incompressible(rubber, stretch), **options)
+
+
+def test_strains_without_small_ones_and_slack_clamps_are_no_stretches():
+    rubber = material.Gent(1e5, 30.0, 1e9)
+    for strain in (
+        np.linspace(0.9, 3, 9),
+        np.linspace(-0.4, -0.05, 9),
+        np.linspace(-0.3, 2, 9),
+    ):
+        stress = incompressible(rubber, 1 + strain)
+        fit = material.fit_tensile(strain, stress, model=material.Gent)
+        assert fit.relative_rms < 1e-6
+    slack = np.maximum(STRAIN - 0.1, 0)
+    material.fit_tensile(STRAIN, incompressible(rubber, 1 + slack), model=material.Gent)
+
+
 ONE = np.ones(1)
 BASE = ISOTROPIC["NeoHookean"]
 

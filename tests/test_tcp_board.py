@@ -1,5 +1,8 @@
 """The board over sockets, the loop on it, and the record of a run."""
 
+import contextlib
+import json
+import re
 import signal
 import socket
 import struct
@@ -11,9 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sorojax_board.__main__ import main, new_key, read_config, read_key
+from sorojax_board.__main__ import INSTALLER, main, new_key, read_key
 from sorojax_board.bench import BenchValves
-from sorojax_board.board import settings
+from sorojax_board.board import Board, settings
+from sorojax_board.config import read_config
 from sorojax_board.messages import Fault, State
 from sorojax_board.server import Server
 from sorojax_hardware import (
@@ -186,6 +190,72 @@ def test_strangers_do_not_disturb(patient_desk):
     board.close()
 
 
+def vent_in(server):
+    """How long a newcomer takes to stop the robot [s]."""
+    start = time.monotonic()
+    with TcpBoard(port=server.port, **PATIENT) as newcomer:
+        newcomer.vent()
+        return time.monotonic() - start
+
+
+@pytest.mark.stress(57)
+@pytest.mark.parametrize("places", [8, 200])
+def test_silent_connections_do_not_keep_a_newcomer_from_stopping_the_robot(
+    patient_desk, places
+):
+    server, _ = patient_desk
+    with hold(server.port, 20 * kPa) as writer:
+        took = []
+        for _ in range(3):  # the least: other tests may hold the processor
+            writer.arm()
+            address = ("127.0.0.1", server.port)
+            silent = [socket.create_connection(address) for _ in range(places)]
+            took.append(vent_in(server))
+            assert server.board.state is State.VENTED
+            for one in silent:
+                one.close()
+        assert min(took) < 0.2
+        assert writer.read_pressure().shape == (2,)  # and the writer kept its place
+
+
+@pytest.mark.stress(57)
+def test_clients_that_said_hello_and_fell_silent_give_their_places_but_the_writer(patient_desk):
+    server, _ = patient_desk
+    with hold(server.port, 20 * kPa) as writer:
+        readers = [TcpBoard(port=server.port, read_only=True, **PATIENT) for _ in range(7)]
+        readers[0].read_pressure()
+        assert vent_in(server) < PATIENT["timeout"]
+        assert len(server._clients) <= 8
+        writer.arm()
+        readers[0].read_pressure()
+        with pytest.raises(OSError):  # silent for longest
+            readers[1].read_pressure()
+        for reader in readers:
+            reader.close()
+
+
+def test_a_silent_connection_is_put_out_on_both_ports():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        free = probe.getsockname()[1]
+    reasons, started = [], time.monotonic()
+    with serve(
+        settings(2), BenchValves(2), legacy_port=free, on_close=reasons.append
+    ) as server:
+        ports = (server.port, free)
+        silent = [socket.create_connection(("127.0.0.1", port)) for port in ports]
+        with socket.create_connection(("127.0.0.1", free)) as browser:
+            browser.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            browser.settimeout(5.0)
+            with contextlib.suppress(ConnectionResetError):
+                assert browser.recv(100) == b""
+        wait_for(lambda: len(reasons) == 3)
+        assert time.monotonic() - started > 1.9 and server.board.state is State.VENTED
+    assert "no commands" in reasons[0] and all("in time" in why for why in reasons[1:])
+    for one in silent:
+        one.close()
+
+
 def test_an_open_address_needs_a_key():
     board = object()
     with pytest.raises(ValueError, match="without a key"):
@@ -257,6 +327,74 @@ def test_keys_and_configuration_files(tmp_path, capsys):
         config.write_text(wrong)
         assert main(["--config", str(config)]) == 2
     assert "sorojax_board:" in capsys.readouterr().err
+
+
+PORTS = [{"low": -1e4, "high": 6e4, "slew": 2e6}]
+WIRE = {"bus": 1, "dac": 96, "adc": 72, "channel": 0, "gain": 3.0}
+NUMBERS = {
+    "ramp": (-0.45, 0, 1e3), "watchdog": (-0.1, 0, 9), "rate": (-1, 0, 1e9),
+    "over_pressure": (-1, 0, 1e9), "tracking": (-1, 0, 1e9), "patience": (-1, 0, 1e9),
+    "plausible[0]": (-1e9, 7e4), "plausible[1]": (1e9, -2e5), "ports[0].low": (1.0, -2e5),
+    "ports[0].high": (-1.0, 1e9), "ports[0].slew": (-1.0, 0, 1e12), "wiring[0].bus": (-1, 1.5),
+    "wiring[0].dac": (0, 200), "wiring[0].adc": (0, 200), "wiring[0].channel": (-1, 4),
+    "wiring[0].gain": (0, -1),
+}  # fmt: skip
+NEVER = (float("nan"), float("inf"), -float("inf"), None, "1", True, [1], 10**400)
+
+
+@pytest.mark.stress(56)
+@pytest.mark.parametrize("key", NUMBERS)
+def test_every_number_of_the_configuration_has_a_range(tmp_path, key):
+    config = tmp_path / "board.json"
+    for wrong in (*NUMBERS[key], *NEVER):
+        told = {"ports": [dict(PORTS[0])], "wiring": [dict(WIRE)], "plausible": [-12e4, 14e4]}
+        config.write_text(json.dumps(told))
+        read_config(config)
+        place, _, name = key.partition(".")
+        owner, at = (told[place[:-3]], int(place[-2])) if "[" in place else (told, key)
+        if name:
+            owner[at][name] = wrong
+        else:
+            owner[at] = wrong
+        config.write_text(json.dumps(told))
+        with pytest.raises(ValueError, match=", need ") as caught:
+            read_config(config)
+        said = str(caught.value)
+        assert f"`{key.split('[')[0]}" in said and (name or key.split("[")[0]) in said
+
+
+@pytest.mark.stress(56)
+@pytest.mark.parametrize(
+    ("told", "names"),
+    [
+        ([], "the file is []"), ({}, "no `ports`"), ({"ports": {}}, "`ports` is {}"),
+        ({"ports": []}, "`ports` has 0"), ({"ports": PORTS * 33}, "`ports` has 33"),
+        ({"ports": [3]}, "`ports[0]` is 3"), ({"ports": [{"low": 0}]}, "no `high`"),
+        ({"ports": PORTS, "rump": 1}, "unknown key `rump`"),
+        ({"ports": PORTS, "wiring": [{"bus": 1, "pin": 2}]}, "unknown key `pin`"),
+        ({"ports": PORTS * 2, "wiring": [WIRE]}, "`wiring` has 1 entries"),
+        ({"ports": PORTS * 2, "wiring": [WIRE, WIRE]}, "`wiring[1].dac`"),
+        ({"ports": PORTS * 2, "wiring": [WIRE, WIRE | {"dac": 97}]}, "`wiring[1].adc`"),
+        ({"ports": PORTS, "plausible": 3}, "`plausible` is 3"),
+    ],
+)  # fmt: skip
+def test_another_configuration_is_named(tmp_path, told, names):
+    config = tmp_path / "board.json"
+    config.write_text(json.dumps(told))
+    with pytest.raises(ValueError, match=re.escape(names)):
+        read_config(config)
+
+
+@pytest.mark.stress(56)
+def test_settings_of_a_program_have_the_ranges_of_the_file():
+    for wrong in ({"ramp": -0.45}, {"high": float("inf")}, {"patience": float("nan")}):
+        with pytest.raises(ValueError, match=f"Board: `.*{next(iter(wrong))}` is"):
+            Board(settings(2, **wrong), BenchValves(2))
+
+
+def test_the_configuration_that_comes_with_the_board_is_one():
+    chosen, wiring = read_config(INSTALLER / "board.json")
+    assert len(chosen.limits) == len(wiring) == 2
 
 
 def test_the_program_serves_and_ends_on_request():

@@ -214,7 +214,7 @@ def test_the_command_shows_files(tmp_path, path, monkeypatch, capsys):
     assert main(["show", str(tmp_path / "ball.stl"), "--out", str(gif)]) == 2
     files.save(tmp_path / "still.npz", {"a": jnp.zeros(3)})
     assert main(["show", str(tmp_path / "still.npz")]) == 2
-    assert "holds no time" in capsys.readouterr().err
+    assert "or a time to draw over" in capsys.readouterr().err
     (tmp_path / "bad.pvd").write_text("<VTKFile>")
     assert main(["show", str(tmp_path / "bad.pvd")]) == 2
 

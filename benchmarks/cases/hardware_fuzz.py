@@ -1,6 +1,7 @@
 """Mutated, split and merged streams on both decoders of the valve board."""
 
 import random
+import struct
 from time import process_time
 
 from benchmarks.harness import Row
@@ -98,9 +99,9 @@ def _raw(dice: random.Random):
     for _ in range(STREAMS // 100):
         valves = _Valves()
         board = Board(settings(2, low=-10e3, high=60e3), valves)
-        session = LegacySession(board, 0.0)
-        good = [session._message.pack(0.6, 0.7), session._message.pack(1.0, 0.5)]
+        good = [struct.pack("<2d", 0.6, 0.7), struct.pack("<2d", 1.0, 0.5)]
         for k in range(100):
+            session = LegacySession(board, 0.001 * k)
             try:
                 for piece in _pieces(dice, _mutated(dice, good)):
                     session.receive(piece, 0.001 * k)
@@ -109,6 +110,7 @@ def _raw(dice: random.Random):
             except Exception:  # whatever escapes a decoder is what is counted
                 escaped += 1
             outside += not all(-10e3 <= p <= 60e3 for p in valves.told)
+            session.lost(0.001 * k)
     return escaped, 0, held, outside
 
 

@@ -145,8 +145,8 @@ def locking(
         share = ratio / (ratio + _NOTICED)
         poisson = (3 * ratio - 2) / (6 * ratio + 2)
         warnings.warn(
-            f"fem.problem: {mesh.element.name} at a Poisson ratio of {poisson:.3f} is too stiff, "
-            f"in bending by about {12 * share:.0f} % with one cell through a wall and "
+            f"fem.problem: {mesh.element.name} at a Poisson ratio of {poisson:.3f} is too "
+            f"stiff, in bending by about {12 * share:.0f} % with one cell through a wall and "
             f"{1.7 * share:.1f} % with two. Call mesh.enrich(mesh) first; to accept it pass "
             "formulation=fem.Displacement().",
             stacklevel=3,

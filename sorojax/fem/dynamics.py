@@ -46,6 +46,9 @@ class MotionError(RuntimeError):
         super().__init__(message)
         self.motion = motion
 
+    def __reduce__(self):
+        return type(self), (str(self), self.motion)
+
 
 def simulate(
     problem: Problem,

@@ -96,8 +96,9 @@ def nodal_stress(
     cells (`nodal_average` of `cauchy_stress`), on the boundary at least as accurate.
 
     To be taken where a stress is read off a coarse mesh, or compared with a strength; the mean
-    costs nothing once and is enough for pictures. At an interface of two materials, where stress jumps, it is smoothed. Pass
-    `patches(problem.mesh)` to compute them once for many states.
+    costs nothing once and is enough for pictures. At an interface of two materials, where
+    stress jumps, it is smoothed. Pass `patches(problem.mesh)` to compute them once for many
+    states.
     """
     fit = patches(problem.mesh) if fit is None else fit
     return _fitted(body(problem), u, fit)

@@ -88,6 +88,9 @@ class ConvergenceError(RuntimeError):
         super().__init__(message)
         self.solution = solution
 
+    def __reduce__(self):
+        return type(self), (str(self), self.solution)
+
 
 def solve(
     problem: Problem,

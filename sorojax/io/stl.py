@@ -11,6 +11,7 @@ from sorojax.sdf import Surface
 _HEAD = 80
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("extra", "<u2")])
 _VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)")
+_START, _END = re.compile(rb"\bfacet\s+normal\b"), re.compile(rb"\bendfacet\b")
 _PIECE = 1 << 16
 
 
@@ -72,20 +73,28 @@ def read(data: bytes, where: str, unit: float) -> Surface:
 
 def _read_text(data: bytes, where: str, unit: float) -> Surface:
     text = data.lower()
-    facets, ends = text.count(b"facet normal"), text.count(b"endfacet")
-    rows = sum(1 for _ in _VERTEX.finditer(text))
-    if not (facets == ends and rows == 3 * facets and b"endsolid" in text[-4096:]):
+    starts, ends = _places(_START, text), _places(_END, text)
+    rows = _places(_VERTEX, text)
+    whole = len(starts) == len(ends) and len(rows) == 3 * len(starts)
+    if whole:  # three vertices between the ends of each
+        order = np.column_stack([starts, rows.reshape(-1, 3), ends]).ravel()
+        whole = bool(np.all(np.diff(order) > 0))
+    if not (whole and b"endsolid" in text[-4096:]):
         raise ValueError(
-            f"{where}: the text STL has {facets} facets, {ends} ends of facets and {rows} "
-            "vertices, need three vertices in each and a last line `endsolid`. It is "
-            "truncated: copy or export it again."
+            f"{where}: the text STL has {len(starts)} facets, {len(ends)} ends of facets and "
+            f"{len(rows)} vertices, need three vertices in each and a last line `endsolid`. It "
+            "is truncated: copy or export it again."
         )
     try:
         numbers = (float(x) for match in _VERTEX.finditer(text) for x in match.groups())
-        corners = np.fromiter(numbers, np.float64, 9 * facets).reshape(-1, 3, 3)
+        corners = np.fromiter(numbers, np.float64, 9 * len(starts)).reshape(-1, 3, 3)
     except ValueError as error:
         raise ValueError(
             f"{where}: a vertex is no number ({error}). The file is damaged: export it again."
         ) from None
     soup.check_numbers(where, corners.reshape(-1, 3))
     return soup.merged(where, corners, unit)
+
+
+def _places(pattern: re.Pattern[bytes], text: bytes) -> np.ndarray:
+    return np.fromiter((found.start() for found in pattern.finditer(text)), np.int64)

@@ -13,6 +13,7 @@ from sorojax.sdf import Curve, Surface
 from sorojax.units import mm
 
 _READERS = {".stl": stl.read, ".obj": obj.read, ".ply": ply.read}
+_SMALLEST, _LARGEST = 1e-3, 100.0  # m, of a part whose unit is not given
 _WRITTEN = (".stl", ".obj", ".ply", ".3mf", ".glb")
 
 
@@ -79,7 +80,7 @@ def export_contour(
 def import_surface(
     path: str | os.PathLike,
     *,
-    unit: float = mm,
+    unit: float | None = None,
     root: str | os.PathLike | None = None,
     max_bytes: int = _files.MAX_BYTES,
 ) -> Surface:
@@ -90,19 +91,35 @@ def import_surface(
 
     Args:
         path: File name; its ending gives the format.
-        unit: What 1 in the file means [m].
+        unit: What 1 in the file means [m]. If omitted a millimetre, and a surface whose
+            longest side is then not between 1 mm and 100 m is refused.
         root: Folder that the file must lie in, links followed.
         max_bytes: Larger files are refused unread.
 
     Raises:
-        ValueError: If the file is no surface, truncated, damaged or too large, or the
-            path leaves `root`.
+        ValueError: If the file is no surface, truncated, damaged or too large, of a size
+            that needs its unit, or the path leaves `root`.
     """
     file = _files.inside("import_surface", path, root)
     kind = _ending("import_surface", file.suffix, tuple(_READERS))
-    _check.positive("import_surface", "unit", unit, "m", "Write unit=sorojax.units.mm.")
+    scale = mm if unit is None else unit
+    _check.positive("import_surface", "unit", scale, "m", "Write unit=sorojax.units.mm.")
     data = _files.read("import_surface", file, max_bytes)
-    return _READERS[kind](data, f"import_surface: {file.name}", unit)
+    surface = _READERS[kind](data, f"import_surface: {file.name}", scale)
+    if unit is None:
+        _check_size(file.name, surface)
+    return surface
+
+
+def _check_size(name: str, surface: Surface) -> None:
+    """Refuse what most likely is not in millimetres."""
+    longest = float(np.max(np.ptp(surface.vertices, axis=0)))
+    if not _SMALLEST <= longest <= _LARGEST:
+        raise ValueError(
+            f"import_surface: {name}: its longest side is {longest / mm:.3g} in the file, in "
+            f"millimetres {longest:.3g} m, need {_SMALLEST:g} to {_LARGEST:g} m. Give the unit "
+            "of the file: unit=1.0 for metres, 0.0254 for inches, 1e-3 if it is millimetres."
+        )
 
 
 def _ending(where: str, suffix: str, known: tuple[str, ...]) -> str:

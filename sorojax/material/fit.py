@@ -23,6 +23,7 @@ from sorojax.material.stability import Stability, drucker_stability
 from sorojax.material.tensile import Curve, build, fit_curve, modulus_at_rest
 
 MODELS = (NeoHookean, MooneyRivlin, Yeoh, Gent, Ogden)
+_SOFTEST = 100.0  # Pa: the largest stress in a test of the softest gels
 FEWEST = {NeoHookean: 1, MooneyRivlin: 2, Yeoh: 3, Gent: 2}  # numbers per model
 
 
@@ -80,7 +81,8 @@ def fit_tensile(
         density: Mass per reference volume [kg/m^3].
 
     Raises:
-        ValueError: If there are too few points, they do not determine a material with
+        ValueError: If there are too few points, they look like MPa, kPa, percent or
+            stretch, they do not determine a material with
             a positive modulus, or the fit is unstable within the measured deformation
             in tension, equibiaxial tension or pure shear.
 
@@ -156,6 +158,7 @@ def _repeat(strain, stress, weight, need: int, count: int) -> tuple[np.ndarray, 
             f"fit_tensile: strains {strain.min():g} to {strain.max():g} are not engineering "
             "strains of a tensile test; divide percent by 100."
         )
+    _check_units(strain, stress)
     weight = np.ones_like(strain) if weight is None else np.asarray(weight, float)
     if weight.shape != strain.shape or not np.all(weight >= 0) or not np.any(weight > 0):
         raise ValueError(
@@ -163,6 +166,35 @@ def _repeat(strain, stress, weight, need: int, count: int) -> tuple[np.ndarray, 
             "point, none negative. Leave `weights` out to weigh all points alike."
         )
     return strain, stress, weight / (np.mean(weight) * (len(strain) if count > 1 else 1))
+
+
+def _check_units(strain: np.ndarray, stress: np.ndarray) -> None:
+    """Refuse what looks like another quantity or unit."""
+    largest = np.max(np.abs(stress))
+    if largest < _SOFTEST:
+        raise ValueError(
+            f"fit_tensile: the largest stress is {largest:.3g}, need Pa, in which no rubber "
+            f"or gel stays below {_SOFTEST:g}. Multiply MPa by 1e6, kPa by 1e3."
+        )
+    at_rest = _strain_without_stress(strain, stress)
+    if np.min(strain) > 0 and abs(at_rest - 1) < 0.2:
+        raise ValueError(
+            f"fit_tensile: the stress vanishes at a strain of {at_rest:.3g}, need engineering "
+            "strain, which is 0 there. Subtract 1 from stretch."
+        )
+
+
+def _strain_without_stress(strain: np.ndarray, stress: np.ndarray) -> float:
+    """Where the curve has no stress: the root of a line through its end nearest to that."""
+    order = np.argsort(strain)
+    e, s = strain[order], stress[order]
+    near = int(np.argmin(np.abs(s)))
+    reach = 0.2 * (e[-1] - e[0])
+    far = int(np.argmax(np.abs(e - e[near]) * (np.abs(e - e[near]) <= reach)))
+    if far == near:
+        far = near + 1 if near + 1 < len(e) else near - 1
+    rise = s[far] - s[near]
+    return float(e[near] - s[near] * (e[far] - e[near]) / rise) if rise else float("nan")
 
 
 def _stable_stretch(curve: Curve, material) -> float:

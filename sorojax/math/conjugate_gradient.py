@@ -243,8 +243,8 @@ class IterativeBackend:
     name = "conjugate_gradient"
 
     def __init__(self, solver: Iterative):
-        self._solver = solver
+        self.solver = solver
 
     def factor(self, values: np.ndarray, slot: int) -> IterativeFactor:
-        levels = multigrid(self._solver.maps, jnp.asarray(values))
-        return IterativeFactor(levels, self._solver.settings)
+        levels = multigrid(self.solver.maps, jnp.asarray(values))
+        return IterativeFactor(levels, self.solver.settings)

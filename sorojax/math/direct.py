@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Int
 
 from sorojax.math import banded, pardiso, superlu
-from sorojax.math.conjugate_gradient import IterativeFactor
+from sorojax.math.conjugate_gradient import Iterative, IterativeBackend, IterativeFactor
 from sorojax.math.refined import SymmetricProduct, refined
 
 _NUM_FACTORS = 4
@@ -51,8 +51,8 @@ class DirectSolver:
     used for other values than its own. Programs that run at the same time take turns.
     """
 
-    def __init__(self, backend: Any, indptr: np.ndarray, indices: np.ndarray):
-        self._solver = backend
+    def __init__(self, key: Any, backend: Any, indptr: np.ndarray, indices: np.ndarray):
+        self._key, self._solver = np.array(key), backend
         self._pattern = (indptr, indices)
         self._product: SymmetricProduct | None = None
         self._slots: OrderedDict[int, tuple[np.ndarray, Factor]] = OrderedDict()
@@ -62,6 +62,12 @@ class DirectSolver:
     @property
     def name(self) -> str:
         return self._solver.name
+
+    @property
+    def recipe(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, Iterative | None]:
+        """What it is made of: key, pattern by rows, and what iterates, if anything does."""
+        iterates = isinstance(self._solver, IterativeBackend)
+        return self._key, *self._pattern, self._solver.solver if iterates else None
 
     def factor(self, values: np.ndarray) -> Factor | None:
         """Factor of `values`, reused if a slot holds it; `None` if singular."""
@@ -204,7 +210,7 @@ def solver_of(
             rows, cols = np.asarray(rows).ravel(), np.asarray(cols).ravel()
             size = int(rows[-1]) + 1 if len(rows) else 0
             starts = np.searchsorted(rows, np.arange(size + 1))
-            solver = DirectSolver(make(starts, cols), starts, cols)
+            solver = DirectSolver(key, make(starts, cols), starts, cols)
             _solvers[name] = solver
             if not owned:
                 _rebuilt.append(solver)

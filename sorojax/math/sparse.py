@@ -44,6 +44,29 @@ class _Kept:
     def __hash__(self):
         return hash(_Kept)
 
+    def __deepcopy__(self, memo):
+        return self
+
+    def __reduce__(self):
+        """Pattern and key: another process analyses them again."""
+        return _kept_again, (*self.solver.recipe, _double())
+
+
+def _double() -> bool:
+    return bool(jax.config.read("jax_enable_x64"))
+
+
+def _kept_again(key, starts, cols, iterative: cg.Iterative | None, double: bool) -> _Kept:
+    if double and not _double():
+        raise ValueError(
+            "unpickling: this process has single precision, need double as where it was "
+            "pickled, or its arrays lose digits. Set JAX_ENABLE_X64=1 for workers as well."
+        )
+    rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    if iterative is not None:
+        return _Kept(_iterative_solver_of(key, rows, cols, iterative, owned=True))
+    return _Kept(direct_solver_of(key, rows, cols, owned=True))
+
 
 class SparseSymmetric(eqx.Module):
     """Pattern of a symmetric matrix, upper triangle by rows, with its whole diagonal.
@@ -146,6 +169,43 @@ def from_cells(
             else _iterative_solver_of(key, rows, cols, iterative, owned=True)
         ),
     )
+
+
+def from_pattern(
+    rows: Int[Array, "*lanes nnz"],
+    cols: Int[Array, "*lanes nnz"],
+    slots: Int[Array, "*lanes cells entries"],
+    key: Int[Array, "*lanes 2"],
+    iterative: cg.Iterative | None,
+    size: int,
+) -> SparseSymmetric:
+    """The system of a pattern from a file, with a solver of this machine and its key.
+
+    Raises:
+        ValueError: If the pattern is not an upper triangle by rows with its whole diagonal.
+    """
+    if not (isinstance(size, int) and size > 0 and isinstance(iterative, cg.Iterative | None)):
+        raise ValueError(f"a system of {size} unknowns and {type(iterative).__name__}")
+    lead, keys = np.shape(rows)[:-1], []
+    fits = np.shape(rows) == np.shape(cols) and np.shape(key) == (*lead, 2)
+    if not fits or 0 in np.shape(rows) or np.ndim(slots) < 2:
+        raise ValueError(f"rows {np.shape(rows)}, columns {np.shape(cols)}")
+    for i, k in zip(
+        *(np.asarray(x).reshape(-1, x.shape[-1]) for x in (rows, cols)), strict=True
+    ):
+        place = i.astype(np.int64) * size + k
+        inside = i.dtype == k.dtype == np.int32 and np.all((i >= 0) & (i <= k) & (k < size))
+        if not inside or np.any(np.diff(place) <= 0) or np.sum(i == k) != size:
+            raise ValueError("rows and columns are no upper triangle by rows with its diagonal")
+        more = (
+            () if iterative is None else (iterative.settings, *jax.tree.leaves(iterative.maps))
+        )
+        keys.append(pattern_key(i, k, more))
+    starts = np.searchsorted(i, np.arange(size + 1))
+    return SparseSymmetric(
+        rows, cols, slots, jnp.asarray(np.stack(keys).reshape(key.shape)), iterative, size,
+        _kept_again(keys[-1], starts, k, iterative, _double()),
+    )  # fmt: skip
 
 
 def _placed(points, num_nodes: int, components: int) -> Float[np.ndarray, "nodes components"]:

@@ -5,6 +5,9 @@ On one machine, with processes:
     from concurrent.futures import ProcessPoolExecutor
     sweep(function, designs, store, ProcessPoolExecutor(mp_context=get_context("spawn")))
 
+Workers need the precision of their driver: set JAX_ENABLE_X64=1 in the environment, which
+they inherit. JAX makes pickled arrays single in a process that has not got it.
+
 With Dask, the official extra `sorojax[sweep]`, two lines locally and two for a queue:
 
     client = sweep.dask_local(workers=2)

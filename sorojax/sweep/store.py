@@ -1,18 +1,16 @@
 """A folder of results, each under the key of what made it, whole or not there."""
 
 import hashlib
-import io
 import json
 import os
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from sorojax.io import _files
+from sorojax.io import _archive, _files
+from sorojax.io._archive import Arrays as Arrays
 
-Arrays = dict[str, np.ndarray]
 _CHECK = "sha256"
 
 
@@ -40,9 +38,10 @@ class Store:
         target.parent.mkdir(parents=True, exist_ok=True)
         check = np.frombuffer(digest(result).encode(), np.uint8)
 
+        named = {f"result.{name}": value for name, value in result.items()}
+
         def fill(file):
-            np.savez(file, allow_pickle=False, **{f"result.{k}": v for k, v in result.items()},
-                     **{_CHECK: check})  # fmt: skip
+            _archive.write(file, named | {_CHECK: check})
 
         _files.write(target, fill)
 
@@ -53,15 +52,11 @@ class Store:
             return None
         try:
             content = _files.read("sweep", target, self.max_bytes)
-            with zipfile.ZipFile(io.BytesIO(content)) as archive:
-                if sum(entry.file_size for entry in archive.infolist()) > self.max_bytes:
-                    return None
-            with np.load(io.BytesIO(content), allow_pickle=False) as file:
-                names = [name for name in file.files if name.startswith("result.")]
-                result = {name.removeprefix("result."): file[name] for name in names}
-                check = file[_CHECK].tobytes().decode()
-        except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
+            found = _archive.read(content, self.max_bytes)
+            check = found.pop(_CHECK).tobytes().decode()
+        except (ValueError, KeyError, OSError):
             return None
+        result = {name.removeprefix("result."): array for name, array in found.items()}
         return result if digest(result) == check else None
 
 

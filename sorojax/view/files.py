@@ -1,5 +1,6 @@
 """Pictures of what is in a file: surfaces, meshes with results, saved motions."""
 
+import inspect
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -10,7 +11,6 @@ from jaxtyping import Float
 
 from sorojax import io
 from sorojax.mesh import Mesh
-from sorojax.units import mm
 from sorojax.view import style
 from sorojax.view.camera import View
 from sorojax.view.film import Film
@@ -22,6 +22,7 @@ from sorojax.view.runs import time_plots
 from sorojax.view.scene import Part, Scene, Surface, joint_extent, robust_scale
 from sorojax.view.shapes import show_surface
 from sorojax.view.shell import on_triangles, shell
+from sorojax.view.show import options as drawn_by, show
 from sorojax.view.stage import show_scene
 
 _SURFACES = (".stl", ".obj", ".ply")
@@ -43,7 +44,7 @@ def show_file(
 
     Args:
         path: A surface (.stl, .obj, .ply), a mesh or a result that meshio reads (.vtu, .vtk,
-            .msh, .inp, ...), a series of results (.pvd), or a motion from `io.save` (.npz).
+            .msh, .inp, ...), a series of results (.pvd), or what `io.save` wrote (.npz).
         field: Which values of a result; the first scalar ones if omitted.
         unit: What 1 in the file means [m]; mm for surfaces, else m.
         wire: Draw the triangles or cells.
@@ -57,13 +58,13 @@ def show_file(
     path = Path(path)
     kind, name = path.suffix.lower(), title or Path(path).name
     if kind in _SURFACES:
-        surface = io.import_surface(path, unit=mm if unit is None else unit)
+        surface = io.import_surface(path, unit=unit)
         return show_surface(
             surface, wire=wire, view=view, renderer=renderer,
             title=title or f"{path.name}: {len(surface.triangles)} triangles",
         )  # fmt: skip
     if kind == ".npz":
-        return _saved(path, name)
+        return _saved(path, name, field=field, view=view, renderer=renderer, wire=wire)
     scale = 1.0 if unit is None else unit
     if kind == ".pvd":
         states = [_state(file, field, scale) for file in _series(path)]
@@ -176,17 +177,15 @@ def _series(path: Path) -> list[Path]:
     return files
 
 
-def _saved(path: Path, title: str) -> Picture:
-    """Everything in a file of `io.save` that has one entry per instant, over time."""
+def _saved(path: Path, title: str, **options: Any) -> Picture:
+    """Everything in a file of `io.save` that has one entry per instant, over time; where
+    there is no time, what was saved, as `show` draws it."""
     arrays = io.leaves(path)
     times = [
         name for name in arrays if re.search(r"\btimes?\W*$", name) and arrays[name].ndim == 1
     ]
     if not times:
-        listed = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
-        raise ValueError(
-            f"show: {path} holds no time to draw over, it holds {listed}. Load it with io.load."
-        )
+        return _drawn(path, arrays, title, options)
     time = arrays[times[0]]
     groups: dict[str, dict[str, np.ndarray]] = {}
     for name, array in arrays.items():
@@ -201,5 +200,20 @@ def _saved(path: Path, title: str) -> Picture:
         groups[short] = {f"{short}[{k}]" if several else short: rows[:, k]
                          for k in range(rows.shape[1])}  # fmt: skip
     if not groups:
-        raise ValueError(f"show: {path} holds a time and nothing of its length to draw.")
+        return _drawn(path, arrays, title, options)
     return time_plots(time, groups, "", title)
+
+
+def _drawn(path: Path, arrays: dict[str, np.ndarray], title: str, options: dict) -> Picture:
+    """`show` with those options that it takes for what was saved."""
+    thing = io.load(path)
+    try:
+        known = inspect.signature(drawn_by(thing)).parameters
+    except TypeError as error:
+        listed = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
+        raise ValueError(
+            f"show: {path} holds a {type(thing).__name__} of {listed}, need a noun or result "
+            "of sorojax, or a time to draw over. Load it with io.load."
+        ) from error
+    given = {"title": title} | {k: v for k, v in options.items() if v}
+    return show(thing, **{k: v for k, v in given.items() if k in known})

@@ -3,7 +3,9 @@
 Examples are drawn by hypothesis, the same in every run.
 """
 
+import json
 import warnings
+import zipfile
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,7 @@ from hypothesis import given, settings, strategies as st
 
 from sorojax import io, material, mesh, rod as R, sdf
 from sorojax.math.lie import SE2
+from sorojax.sweep.store import Store, digest
 
 TETRAHEDRON = sdf.Surface(
     np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]]),
@@ -116,6 +119,111 @@ def test_a_damaged_state_is_refused_or_of_the_structure_asked_for(folder):
         assert found["a"].shape == (3,) and found["b"]["c"].shape == (2,)
 
     check()
+
+
+@pytest.mark.stress(58)
+@pytest.mark.parametrize("change", [0xFF, 0x01, 0x08])
+def test_a_changed_byte_of_a_sweep_or_a_state_is_noticed_wherever_it_is(tmp_path, change):
+    store = Store(tmp_path)
+    store.write("key", {"y": np.arange(3.0), "n": np.arange(2)})
+    want = digest(store.read("key") or {})
+    io.save(tmp_path / "a.npz", TREE)
+
+    def load():
+        try:
+            return jax.tree.leaves(io.load(tmp_path / "a.npz", TREE))
+        except ValueError as refusal:
+            assert str(refusal).startswith("io.load: "), refusal
+            return None
+
+    def same(found):
+        return all(map(np.array_equal, found, jax.tree.leaves(TREE)))
+
+    for file, read, right in (
+        (store.path("key"), lambda: store.read("key"), lambda found: digest(found) == want),
+        (tmp_path / "a.npz", load, same),
+    ):
+        whole, noticed = file.read_bytes(), 0
+        for at in range(len(whole)):
+            file.write_bytes(whole[:at] + bytes([whole[at] ^ change]) + whole[at + 1 :])
+            found = read()
+            noticed += found is None
+            assert found is None or right(found), at
+        assert noticed > 0.5 * len(whole)
+
+
+ENTRY = {"shape": [3], "dtype": "float64", "sha256": ""}
+HEADERS = [
+    b"", b"[", b"[" * 100_000, b"1" * 5000, b"null", b"[]", b"{}", b"\xff", b'{"leaves": {}}',
+    *(
+        json.dumps({"format": version, "leaves": leaves}).encode()
+        for version, leaves in (
+            (None, {}), ("1", {}), (1e400, {}), (True, {}), (1, []), (1, 3), (1, None),
+            (1, "a"), (1, {"['a']": None}), (1, {"['a']": []}), (1, {"['a']": {}}),
+            (1, {"['a']": ENTRY}),
+            (1, {"['a']": ENTRY | {"shape": 3}}), (1, {"['a']": ENTRY | {"shape": ["3"]}}),
+            (1, {"['a']": ENTRY | {"dtype": []}}), (1, {f"[{k}]": ENTRY for k in range(9)}),
+        )
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.stress(58)
+@pytest.mark.parametrize("header", HEADERS, ids=lambda header: str(header[:60]))
+def test_a_crafted_header_is_refused_by_name(tmp_path, header):
+    text = np.frombuffer(header, np.uint8)
+    np.savez(tmp_path / "a.npz", **{"sorojax.json": text, "leaf0": np.arange(3.0)})
+    for read in (io.leaves, lambda path: io.load(path, {"a": np.zeros(3)})):
+        with pytest.raises(ValueError, match="^io\\.(load|leaves): .* is damaged .*, need"):
+            read(tmp_path / "a.npz")
+
+
+@pytest.mark.stress(58)
+def test_a_crafted_archive_is_refused_by_name(tmp_path):
+    file = tmp_path / "a.npz"
+    for damage in (
+        lambda: np.savez_compressed(file, a=np.zeros(9)),
+        lambda: np.savez(file, **{"sorojax.json": np.array([{}])}),  # an object: pickled
+        lambda: file.write_bytes(b"PK\x05\x06" + bytes(18)),
+        lambda: _entry(file, "leaf0.npy", b"\x93NUMPY\x01\x00"),
+        lambda: _entry(file, "leaf0.npy", _npy("{'descr': '<f8', 'shape': (1" + 15 * "0")),
+        lambda: _entry(file, "leaf0.npy", _npy("{'descr': '<f8', 'fortran_order': False, "
+                                               "'shape': (1000000000000,), }")),
+    ):  # fmt: skip
+        damage()
+        with pytest.raises(ValueError, match="^io.leaves: .* is damaged"):
+            io.leaves(file)
+        file.rename(tmp_path / "b.npz")
+        assert Store(tmp_path).read("b") is None
+
+
+def _entry(file, name, content):
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr(name, content)
+
+
+def _npy(header):
+    text = header.encode().ljust(117) + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
+
+
+@pytest.mark.stress(58)
+@pytest.mark.parametrize(
+    "like",
+    [jnp.zeros(5), jnp.zeros((3, 1)), jnp.zeros(()), jnp.zeros(3, int), np.zeros(3, "f4")],
+)
+def test_numbers_of_another_shape_or_type_are_refused(tmp_path, like):
+    io.save(tmp_path / "a.npz", {"a": jnp.arange(3.0)})
+    with pytest.raises(ValueError, match=r"`\['a'\]` as float64 of shape \(3,\), `like` needs"):
+        io.load(tmp_path / "a.npz", {"a": like})
+
+
+def test_short_floats_come_back(tmp_path):
+    tree = {"a": jnp.arange(3, dtype=jnp.bfloat16), "b": np.zeros((2, 0)), "c": jnp.ones(())}
+    io.save(tmp_path / "a.npz", tree)
+    back = io.load(tmp_path / "a.npz", tree)
+    assert back["a"].dtype == jnp.bfloat16 and jnp.array_equal(back["a"], tree["a"])
+    assert back["b"].shape == (2, 0) and back["c"] == 1
 
 
 number = st.one_of(

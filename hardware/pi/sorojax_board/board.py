@@ -6,9 +6,13 @@ knows no socket: time comes in as an argument, so tests need not wait.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
-from sorojax_board.messages import Fault, Flag, Limits, Refusal, Report, State
+from sorojax_board import config
+from sorojax_board.config import Settings as Settings, settings as settings
+from sorojax_board.messages import Fault, Flag, Refusal, Report, State
+
+_BURST = 20.0  # set-points that may come at once
 
 
 class Backend(Protocol):
@@ -22,28 +26,15 @@ class Backend(Protocol):
         ...
 
 
-class Settings(NamedTuple):
-    """What the board enforces; times in s, pressures in Pa, gauge."""
-
-    limits: tuple[Limits, ...]
-    watchdog: float = 0.1
-    ramp: float = 0.45
-    rate: float = 1000.0  # set-points a second
-    over_pressure: float = 10e3  # beyond the limits of a port
-    tracking: float = 30e3  # between set-point and measurement
-    patience: float = 1.0  # how long that may last
-    plausible: tuple[float, float] = (-120e3, 140e3)  # what a working sensor can read
-
-
-def settings(ports: int = 12, low=-100e3, high=100e3, slew=2e6, **more) -> Settings:
-    """Equal limits for every port."""
-    return Settings(limits=(Limits(low, high, slew),) * ports, **more)
-
-
 class Board:
-    """Pressures follow set-points of the one owner while it keeps sending them."""
+    """Pressures follow set-points of the one owner while it keeps sending them.
+
+    Raises:
+        ValueError: If a number of the settings is not in its range.
+    """
 
     def __init__(self, settings: Settings, backend: Backend, now: float = 0.0):
+        config.check("Board", settings)
         count = len(settings.limits)
         self.settings, self.backend = settings, backend
         self.state, self.fault = State.VENTED, Fault(0)
@@ -75,7 +66,7 @@ class Board:
             narrowed.append((max(low, own.low), min(high, own.high)))
         self._ranges = narrowed
         self.owner, self.state, self.fault = owner, State.ARMED, Fault(0)
-        self._target, self._fed, self._credit = [0.0] * self.num_ports, now, 20.0
+        self._target, self._fed, self._credit = [0.0] * self.num_ports, now, _BURST
         self._off_track = [now] * self.num_ports
         self._flags = [Flag(0)] * self.num_ports
 
@@ -111,7 +102,8 @@ class Board:
             return Refusal.NOT_WRITER
         if not all(map(math.isfinite, values)):
             return Refusal.NOT_FINITE
-        self._credit = min(self._credit + (now - self._credited) * self.settings.rate, 20.0)
+        gained = (now - self._credited) * self.settings.rate
+        self._credit = min(self._credit + gained, _BURST)
         self._credited = now
         if self._credit < 1:
             self._fed = now  # somebody is there, only too eager

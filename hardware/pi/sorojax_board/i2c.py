@@ -9,8 +9,6 @@ Reference: Microchip MCP4725 and Texas Instruments ADS1015 data sheets.
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
-from sorojax_board.legacy import pressure_of_command
-
 
 class Bus(Protocol):
     """An I2C bus."""
@@ -39,6 +37,16 @@ PLATFORM = tuple(
 
 _CONVERSION, _CONFIGURATION = 0x00, 0x01
 _VOLTS_PER_STEP = 4.096 / 2048
+
+
+def pressure_of_command(u: float) -> float:
+    """Set-point [Pa] of a command in [0, 1]."""
+    return (200 * u - 100) * 1e3
+
+
+def voltage_of_pressure(pressure: float) -> float:
+    """Sensor voltage [V] of a pressure [Pa]."""
+    return pressure / 20e3 + 5
 
 
 def dac_code(pressure: float) -> int:

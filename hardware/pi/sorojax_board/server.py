@@ -11,11 +11,15 @@ from sorojax_board.session import Session
 
 PORT, LEGACY_PORT = 5053, 8888
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
-_MOST_CLIENTS, _MOST_UNSENT = 8, 65536
+_MOST_CLIENTS, _MOST_STRANGERS, _MOST_UNSENT = 8, 128, 65536
 
 
 class Server:
     """Serves one board until cancelled; ticks it 500 times a second.
+
+    Nobody is turned away at the door, as anybody with the key may come to stop the robot:
+    where places run out, the eldest connection that has not said hello gives its own, or
+    the client that was silent longest. The writer keeps its place.
 
     Args:
         board: The state machine.
@@ -94,21 +98,23 @@ class Server:
             for session, writer in self._clients.items():
                 if beat := session.tick(now):
                     self._send(session, writer, beat)
+                if session.closed:
+                    writer.transport.abort()
             due = max(due + self._period, now)
             await asyncio.sleep(max(0.0, due - monotonic()))
 
     def _client(self, make: Callable):
         async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            if len(self._clients) >= _MOST_CLIENTS:
-                writer.close()
-                return
             session, task = make(monotonic()), asyncio.current_task()
             self._clients[session] = writer
             self._tasks.add(task)
+            self._make_room()
             try:
                 await self._talk(session, reader, writer)
             except OSError as reason:
                 session.closed = session.closed or str(reason)
+            except asyncio.CancelledError:  # nobody waits for this task but `run`
+                session.closed = session.closed or "the board stops"
             finally:
                 del self._clients[session]
                 self._tasks.discard(task)
@@ -118,16 +124,27 @@ class Server:
 
         return talk
 
+    def _make_room(self) -> None:
+        now = monotonic()
+        strangers = [one for one in self._clients if not (one.ready or one.closed)]
+        known = [one for one in self._clients if one.ready and not one.closed]
+        quiet = [one for one in known if one is not self.board.owner]
+        quiet.sort(key=lambda one: one.last_heard)
+        spare = strangers[: max(len(strangers) - _MOST_STRANGERS, 0)]
+        for one in (*spare, *quiet[: max(len(known) - _MOST_CLIENTS, 0)]):
+            one.close("another client needed its place", now)
+            self._clients[one].transport.abort()
+
     async def _talk(self, session, reader, writer) -> None:
         writer.write(session.challenge(monotonic()))
         while not session.closed:
-            try:
-                data = await asyncio.wait_for(reader.read(4096), 1.0)
-            except TimeoutError:
-                continue  # the watchdog judges silence, this only sees a session that ended
+            data = await reader.read(4096)
             if not data:
                 return
+            known = session.ready
             self._send(session, writer, session.receive(data, monotonic()))
+            if session.ready and not known:
+                self._make_room()
 
     @staticmethod
     def _send(session, writer, data: bytes) -> None:

@@ -18,7 +18,7 @@ from sorojax_board.frames import (
 )
 from sorojax_board.messages import Malformed, Refusal, Welcome
 
-_HANDSHAKE, _AGE = 2.0, 0.1  # s
+HANDSHAKE, _AGE = 2.0, 0.1  # s
 _FASTEST_BEAT, _SLOWEST_BEAT = 0.002, 10.0  # s
 READER, WRITER = 0, 1
 
@@ -28,7 +28,8 @@ class Session:
 
     A stream that is not this protocol, or not signed by the holder of the key, closes the
     session (`closed` says why); a frame that arrives too late, twice or with nonsense in
-    it is refused by itself. Nothing raises.
+    it is refused by itself. Nothing raises. `ready` says that the client said a valid hello,
+    `last_heard` when it was heard last [s].
     """
 
     def __init__(self, board: Board, shared: bytes, now: float, nonce: bytes | None = None):
@@ -36,7 +37,8 @@ class Session:
         self._shared, self._opened = shared, now
         self._nonce = os.urandom(NONCE_SIZE) if nonce is None else nonce
         self._decoder, self._keys = Decoder(), Keys(b"", b"")
-        self._ready = self._writer = False
+        self.ready, self._writer = False, False
+        self.last_heard = now  # an authentic frame
         self._sent, self._heard = 0, 0
         self._delay = float("inf")  # least difference of the clocks seen so far, s
         self._beat, self._due = 0.0, float("inf")  # period and time of the next heartbeat, s
@@ -57,13 +59,13 @@ class Session:
                 break
             answers.append(self._accept(frame, now))
         if self._decoder.broken and not self.closed:
-            self._close(self._decoder.broken, now)
+            self.close(self._decoder.broken, now)
         return b"".join(answers)
 
     def tick(self, now: float) -> bytes:
         """The heartbeat where one is due; a connection that does not say hello is closed."""
-        if not self._ready and not self.closed and now - self._opened > _HANDSHAKE:
-            self._close("no hello in time", now)
+        if not self.ready and not self.closed and now - self._opened > HANDSHAKE:
+            self.close("no hello in time", now)
         if self.closed or now < self._due:
             return b""
         self._due = max(self._due + self._beat, now)
@@ -71,27 +73,28 @@ class Session:
 
     def lost(self, now: float) -> None:
         """The socket is gone."""
-        self._close(self.closed or "connection lost", now)
+        self.close(self.closed or "connection lost", now)
 
     def state(self, now: float) -> bytes:
         """The board's state, empty before the handshake."""
-        if not self._ready or self.closed:
+        if not self.ready or self.closed:
             return b""
         return self._answer(Kind.STATE, messages.pack_report(self.board.report()), now)
 
-    def _close(self, why: str, now: float) -> None:
+    def close(self, why: str, now: float) -> None:
+        """Speak for nobody from now on; the writer's board vents."""
         self.closed = why
         self.board.lost(self, now)
 
     def _accept(self, frame: Frame, now: float) -> bytes:
-        if not self._ready:
+        if not self.ready:
             return self._hello(frame, now)
         if not authentic(frame, self._keys.to_board):
-            self._close("a frame that is not signed with the key of this session", now)
+            self.close("a frame that is not signed with the key of this session", now)
             return b""
         if frame.sequence <= self._heard:
             return self._refuse(frame, Refusal.REPLAYED, now)
-        self._heard = frame.sequence
+        self._heard, self.last_heard = frame.sequence, now
         if self._late(frame, now):
             return self._refuse(frame, Refusal.STALE, now)
         action = self._actions.get(frame.kind)
@@ -111,13 +114,14 @@ class Session:
     def _hello(self, frame: Frame, now: float) -> bytes:
         nonce, role = frame.payload[:NONCE_SIZE], frame.payload[NONCE_SIZE:]
         if frame.kind != Kind.HELLO or role not in (bytes([READER]), bytes([WRITER])):
-            self._close("no hello", now)
+            self.close("no hello", now)
             return b""
         keys = session_keys(self._shared, self._nonce, nonce)
         if not authentic(frame, keys.to_board):
-            self._close("hello signed with another key", now)
+            self.close("hello signed with another key", now)
             return b""
-        self._keys, self._ready, self._heard = keys, True, frame.sequence
+        self._keys, self.ready = keys, True
+        self._heard, self.last_heard = frame.sequence, now
         self._writer = role == bytes([WRITER])
         self._late(frame, now)
         limits = self.board.settings
@@ -161,7 +165,7 @@ class Session:
         if self.board.owner is self:
             self.board.vent(now)
             self.board.owner = None
-        self._close("the client said goodbye", now)
+        self.close("the client said goodbye", now)
         return b""
 
     def _refuse(self, frame: Frame, why: Refusal, now: float) -> bytes:
