@@ -1,9 +1,9 @@
 """Whether the steps of a run are short enough: a few of them made again as two halves.
 
 A run of fixed steps is a scan over its rows, of one or more steps each. Of some rows the scan
-makes two more passes, from the same state by steps of half the length. Their distance from
-the row, over how far the row moved, times the length of the whole path, bounds what the
-errors of all steps may add up to; a run whose bound is as large as its motion is unstable.
+makes two more passes, from the same state by steps of half the length. Their distance from the
+rows is the error of these rows; a run whose errors add up to as much as its motion is
+unstable.
 
 Reference:
     Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, 1993, section II.4,
@@ -149,17 +149,27 @@ def judged_status(status: Status, too_long: Bool[Array, ""]) -> Status:
 
 
 def _too_long(path: Array, repeated: Array, rows: np.ndarray) -> Bool[Array, ""]:
-    """Whether the errors of `rows`, over how far they moved, times the whole path are as large
-    as the largest distance from the start."""
+    """Whether the errors of all rows add up to as much as the largest distance from the start.
+
+    Between two rows that were repeated the error changes as an exponential function would.
+    """
     path, repeated = jax.lax.stop_gradient((path, repeated))
     x, y = path.reshape(len(path), -1), repeated.reshape(len(rows), -1)
     noise = _ROUNDING * jnp.finfo(x.dtype).eps * jnp.max(jnp.abs(x), initial=0.0)
-    moved = _sizes(jnp.diff(x, axis=0))
     error = jnp.maximum(_sizes(y - x[rows + 1]) - noise, 0.0)
-    seen = jnp.sum(moved[rows])
-    share = jnp.sum(error) / jnp.where(seen > 0, seen, 1.0)
-    limit = jnp.where(share > _COARSE, _COARSE, _LIMIT)
-    return share * jnp.sum(moved) > limit * jnp.max(_sizes(x - x[:1]))
+    sum_of_errors = jnp.sum(error) + jnp.sum(_means(error) * (np.diff(rows) - 1))
+    seen = jnp.sum(_sizes(x[rows + 1] - x[rows]))
+    limit = jnp.where(jnp.sum(error) > _COARSE * seen, _COARSE, _LIMIT)
+    return sum_of_errors > limit * jnp.max(_sizes(x - x[:1]))
+
+
+def _means(values: Float[Array, " n"]) -> Float[Array, " n-1"]:
+    """Logarithmic means of neighbours: of exponential functions between them."""
+    low, high = jnp.minimum(values[:-1], values[1:]), jnp.maximum(values[:-1], values[1:])
+    ratio = jnp.maximum(low / jnp.where(high > 0, high, 1.0), jnp.finfo(values.dtype).eps)
+    apart = ratio < 0.99
+    slope = (1 - ratio) / -jnp.log(jnp.where(apart, ratio, 0.5))
+    return high * jnp.where(apart, slope, 1.0)
 
 
 def _sizes(rows: Float[Array, "rows n"]) -> Float[Array, " rows"]:
