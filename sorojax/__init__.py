@@ -14,6 +14,7 @@ from sorojax._jax import versions as _versions
 _versions.check()  # before anything imports JAX
 
 from sorojax import units as units
+from sorojax._arguments import public as _public
 from sorojax._cache import enable_compilation_cache as enable_compilation_cache
 from sorojax._edit import replace as replace
 from sorojax._jax import devices as _devices
@@ -23,6 +24,8 @@ from sorojax._progress import listen as listen, silent as silent
 from sorojax.math.lie import SE2 as SE2, SE3 as SE3
 
 _devices.leave_out_absent()
+for _name in ("compiled", "jit", "listen"):
+    globals()[_name] = _public(__name__, _name, globals()[_name])
 
 __version__ = "0.1.0"
 

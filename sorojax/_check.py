@@ -33,6 +33,12 @@ def positive(where: str, name: str, value: Any, unit: str, do: str) -> None:
             )
 
 
+def not_negative(where: str, name: str, value: Any, unit: str, do: str) -> None:
+    """Raise a `ValueError` if an entry of `value` is known to be negative."""
+    if is_concrete(value) and np.any(np.asarray(value) < 0):
+        raise ValueError(f"{where}: `{name}` is {_short(value)} {unit}, need 0 or more. {do}")
+
+
 def between(
     where: str, name: str, value: Any, low: float, high: float, unit: str, do: str
 ) -> None:
@@ -48,7 +54,7 @@ def between(
 
 def shape(where: str, name: str, value: Any, want: Sequence[int | None], do: str) -> None:
     """Raise a `ValueError` unless `value.shape` matches `want` (None: any length)."""
-    got = jnp.shape(value)
+    got = np.shape(value)
     fits = len(got) == len(want) and all(
         w is None or g == w for g, w in zip(got, want, strict=True)
     )

@@ -1,5 +1,6 @@
 """Conversion of user numbers to strongly typed arrays."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -7,6 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax._jax import devices
+
+Numbers = jax.Array | np.ndarray | np.generic | float | Sequence[Any]
+"""A number, or what becomes an array: of these, arguments without a fixed shape."""
 
 
 def real(value: Any) -> jax.Array:
@@ -20,6 +24,11 @@ def real(value: Any) -> jax.Array:
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         dtype = value.dtype
         floating = jnp.issubdtype(dtype, jnp.floating)
+        if jnp.issubdtype(dtype, jnp.complexfloating):
+            raise TypeError(
+                f"got complex numbers of shape {value.shape}, need real ones. Take `.real`, if "
+                "the rest is rounding."
+            )
         if floating and isinstance(value, jax.Array) and not value.weak_type:
             return value  # a conversion of a traced value costs a derivative
         if not floating:

@@ -12,6 +12,7 @@ ROOT = Path(__file__).parent.parent
 CORE, HARDWARE = ROOT / "sorojax", ROOT / "hardware"
 BASEMENT = {
     "units", "_types", "_check", "_display", "_edit", "_progress", "_cache", "_jax",
+    "_arguments", "_explain", "_kinds",
 }  # fmt: skip
 FLOOR = {
     "math": 0,

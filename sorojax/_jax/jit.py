@@ -82,7 +82,7 @@ class Compiled:
     def __call__(self, *args: Any) -> Any:
         try:
             return self._program(*args)[0]
-        except TypeError:  # other kinds of numbers
+        except (OverflowError, TypeError):  # other kinds of numbers
             return self._program(*self._alike(args))[0]
 
     def _alike(self, args: tuple[Any, ...]) -> Any:
@@ -99,9 +99,23 @@ class Compiled:
                     f"compiled: got an array of shape {np.shape(leaf)}, need {example.shape}. "
                     "Compile once more for other shapes."
                 )
-            return jnp.asarray(leaf, example.dtype)
+            return _exactly(leaf, example.dtype)
 
         return jax.tree.map(one, args, self._examples)
+
+
+def _exactly(leaf: Any, dtype: Any) -> jax.Array:
+    """`leaf` in the numbers of the example: rounded, never cut off or wrapped."""
+    made = None
+    with contextlib.suppress(OverflowError, TypeError):  # a Python int, what is no number
+        if eqx.is_array_like(leaf) and np.can_cast(jnp.result_type(leaf), dtype, "same_kind"):
+            made = jnp.asarray(leaf).astype(dtype)
+    if made is None or (dtype.kind in "iu" and not np.array_equal(made, np.asarray(leaf))):
+        raise ValueError(
+            f"compiled: got {leaf!r}, need numbers that {dtype} holds, as the example does. "
+            "Give such numbers, or compile with an example of that kind, as 1.0 instead of 1."
+        )
+    return made
 
 
 def compiled(function: Callable[..., Any], *examples: Any) -> Compiled:
@@ -121,7 +135,8 @@ def compiled(function: Callable[..., Any], *examples: Any) -> Compiled:
 
     Raises:
         TypeError: If there is more than numbers and arrays in `examples`.
-        ValueError: When called with arguments of another structure or shape.
+        ValueError: When called with arguments of another structure or shape, or with numbers
+            that those of the example cannot hold, as 2.7 where it was 1.
     """
     for leaf in jax.tree.leaves(examples):
         if not eqx.is_array_like(leaf) or isinstance(leaf, bool | np.bool_):

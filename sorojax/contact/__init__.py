@@ -1,5 +1,6 @@
 """Contact with implicit shapes: gaps, pressures and forces at points."""
 
+from sorojax._arguments import check_package as _check_package
 from sorojax.contact.broadphase import clearance as clearance, far as far
 from sorojax.contact.friction import Coulomb as Coulomb, Grip as Grip, no_grip as no_grip
 from sorojax.contact.line import LinePenalty as LinePenalty
@@ -10,3 +11,5 @@ from sorojax.contact.points import (
     gaps as gaps,
 )
 from sorojax.contact.swept import passes as passes
+
+_check_package(__name__)

@@ -51,7 +51,9 @@ class Contacts(NamedTuple):
 
 
 def gaps(
-    obstacle: AbstractSdf, points: Float[Array, "*points dim"], shift=None
+    obstacle: AbstractSdf,
+    points: Float[Array, "*points dim"],
+    shift: Float[Array, " dim"] | None = None,
 ) -> Float[Array, "*points"]:
     """Distance of `points` [m] from `obstacle` moved by `shift` (dim,) [m]; negative
     inside. Differentiable in points, obstacle and shift."""

@@ -1,5 +1,6 @@
 """Design loops: densities, optimisers, and the loop that joins them."""
 
+from sorojax._arguments import check_package as _check_package
 from sorojax.design.calibrate import (
     CalibrationStep as CalibrationStep,
     calibrate as calibrate,
@@ -84,3 +85,5 @@ from sorojax.design.void_pressure import (
     VoidPressure as VoidPressure,
     void_pressure as void_pressure,
 )
+
+_check_package(__name__)

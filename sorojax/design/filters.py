@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.math import sparse
 from sorojax.mesh.elements import Quad4, Tri3
 from sorojax.mesh.mesh import Mesh
@@ -38,7 +38,11 @@ class ConeFilter(eqx.Module):
 
 
 def cone_filter(
-    mesh: Mesh, radius: float, *, volumes=None, periods: tuple[float | None, ...] | None = None
+    mesh: Mesh,
+    radius: float,
+    *,
+    volumes: Numbers | None = None,
+    periods: tuple[float | None, ...] | None = None,
 ) -> ConeFilter:
     """The filter of `radius` [m] between the centres of cells.
 
@@ -188,7 +192,7 @@ def _joined_nodes(mesh: Mesh, periods: np.ndarray) -> Int[np.ndarray, " nodes"]:
 
 
 def heaviside_projection(
-    x: Float[Array, "..."], sharpness, threshold: Float[Array, ""] | float = 0.5
+    x: Float[Array, "..."], sharpness: Numbers, threshold: Float[Array, ""] | float = 0.5
 ) -> Float[Array, "..."]:
     """Pushes densities to 0 and 1: a smooth step at `threshold`, the steeper the larger
     `sharpness` (1 does next to nothing, 16 and more make black and white)."""

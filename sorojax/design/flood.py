@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.mesh.mesh import Mesh, facet_table
 
 
@@ -36,7 +36,7 @@ class Flood(eqx.Module):
         return jnp.where(flooded(self, density), wet, jnp.zeros_like(wet))
 
 
-def flood(mesh: Mesh, sources, *, threshold: float = 0.1) -> Flood:
+def flood(mesh: Mesh, sources: Numbers, *, threshold: float = 0.1) -> Flood:
     """What is needed to flood the void of designs on `mesh`.
 
     Args:

@@ -1,5 +1,6 @@
 """Hyperelastic finite elements: problem, equilibrium, path, stresses."""
 
+from sorojax._arguments import check_package as _check_package
 from sorojax.fem.buckling import (
     CriticalLoads as CriticalLoads,
     critical_loads as critical_loads,
@@ -127,3 +128,5 @@ from sorojax.fem.tendon import (
 from sorojax.fem.torque import Torque as Torque, mean_rotation as mean_rotation
 from sorojax.math.sparse import ConjugateGradient as ConjugateGradient
 from sorojax.math.status import Status as Status
+
+_check_package(__name__)

@@ -17,7 +17,21 @@ from sorojax.fem.spring import Foundation
 from sorojax.fem.tendon import Cable, Tendon
 from sorojax.material.hyperelastic import AbstractHyperelastic
 from sorojax.math import sparse
+from sorojax.mesh.enrich import plain_element, with_centres
 from sorojax.mesh.mesh import Mesh
+
+
+def enriched(mesh: Mesh, load: AbstractLoad) -> AbstractLoad:
+    """`load` on the facets of an enriched mesh, where it has those of the mesh before."""
+    new = {}
+    for what in ("facets", "others"):
+        facets = getattr(load, what, None)
+        count = len(mesh.element.facets[0])
+        if facets is None or is_traced(facets) or plain_element(mesh.element) is None:
+            continue
+        if mesh.element.dim == 3 and facets.ndim == 2 and facets.shape[1] == count - 1:
+            new[what] = with_centres(mesh, facets)
+    return dataclasses.replace(load, **new) if new else load
 
 
 def sets(mesh: Mesh, given: tuple[AbstractLoad, ...]) -> None:

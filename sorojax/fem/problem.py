@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 
 from sorojax import _check
+from sorojax._arguments import sized
 from sorojax._display import displayed
 from sorojax.fem import checks, checks_loads
 from sorojax.fem.formulation import AbstractFormulation, default_formulation
@@ -15,7 +16,7 @@ from sorojax.fem.space import Space, space as make_space
 from sorojax.fem.supports import AbstractSupport
 from sorojax.material.hyperelastic import AbstractHyperelastic
 from sorojax.math.sparse import ConjugateGradient
-from sorojax.mesh.mesh import Mesh
+from sorojax.mesh.mesh import Mesh, axis_lengths
 
 
 @displayed
@@ -56,6 +57,11 @@ def _described(load: AbstractLoad) -> str:
     if (groups := load.couples()) is not None:
         text += f", couples {groups.shape[0]} group(s) of {groups.shape[1]} nodes"
     return text
+
+
+@sized(Problem)
+def _(problem: Problem) -> dict[str, int]:
+    return axis_lengths(problem.mesh)
 
 
 def unsupported(problem: Problem) -> Problem:
@@ -124,6 +130,7 @@ def problem(
         checks.locking(mesh, material, kinematics, formulation)
     checks.formulation(mesh, kinematics, formulation)
     known = checks.supports(mesh, kinematics, supports)
+    loads = tuple(checks_loads.enriched(mesh, load) for load in loads)
     checks_loads.sets(mesh, loads)
     loads = tuple(load.completed(mesh, material, kinematics) for load in loads)
     loads = checks_loads.parallel_to_ends(mesh, kinematics, loads, known)

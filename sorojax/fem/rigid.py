@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
-from sorojax._types import integers, optional_real, real
+from sorojax._types import Numbers, integers, optional_real, real
 from sorojax.fem.curved import CurvedPart
 from sorojax.fem.loads import AbstractLoad
 from sorojax.material.hyperelastic import small_strain_moduli
+from sorojax.mesh.mesh import Mesh
 
 _STIFFNESS = 1e4  # times that of the material around
 
@@ -89,7 +90,13 @@ class Rigid(AbstractLoad):
                             "Leave it out for 10^4 times that of the material.")  # fmt: skip
 
 
-def rigid(mesh, nodes, *, stiffness=None, name: str = "rigid") -> Rigid:
+def rigid(
+    mesh: Mesh,
+    nodes: Int[np.ndarray, " nodes"],
+    *,
+    stiffness: Numbers | None = None,
+    name: str = "rigid",
+) -> Rigid:
     """A term that makes `nodes` move as one rigid body.
 
     The body may still stretch by its load over `stiffness`; the default, 10^4 times

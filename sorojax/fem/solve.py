@@ -276,7 +276,13 @@ def _named_values(problem: Problem, values: dict) -> tuple[str, Float[Array, "st
 
 def with_load(problem: Problem, name: str, value: Float[Array, "..."]) -> Problem:
     """`problem` with the load called `name` set to `value`."""
-    index = [load.name for load in problem.loads].index(name)
+    names = [load.name for load in problem.loads]
+    if name not in names:
+        raise ValueError(
+            f"fem.with_load: no load is called {name!r}, need one of {names}. Set `name=` "
+            "where a load is made."
+        )
+    index = names.index(name)
     # a weakly typed number would compile every kernel again
     return eqx.tree_at(lambda p: p.loads[index].value, problem, real(value))
 

@@ -19,6 +19,7 @@ from sorojax.fem.points import (
 from sorojax.fem.problem import Problem, body
 from sorojax.fem.tensor import Entries, stack_matrix
 from sorojax.material.kinematics import Entry, Tensor, determinant
+from sorojax.mesh.measure import check_some
 from sorojax.mesh.mesh import Mesh
 
 
@@ -154,7 +155,12 @@ def enclosed_volume(
     u: Float[Array, "nodes dim"],
     facets: Int[Array, "facets facet_nodes"],
 ) -> Float[Array, ""]:
-    """Volume of the cavities that closed sets of `facets` enclose [m^3]."""
+    """Volume of the cavities that closed sets of `facets` enclose [m^3].
+
+    Raises:
+        ValueError: If there is no facet.
+    """
+    check_some("fem.enclosed_volume", facets)
     return _enclosed_volume(body(problem), u, facets)
 
 

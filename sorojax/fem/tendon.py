@@ -1,6 +1,6 @@
 """Tendons: cables without friction through points of the body."""
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax
@@ -14,6 +14,9 @@ from sorojax.fem.curved import CurvedPart
 from sorojax.fem.loads import AbstractLoad
 from sorojax.mesh.locate import Locations, locate
 from sorojax.mesh.mesh import Mesh
+
+if TYPE_CHECKING:
+    from sorojax.fem.problem import Problem
 
 
 class Route(eqx.Module):
@@ -60,21 +63,33 @@ class Tendon(AbstractLoad):
     Without friction the tension is the same all along, and the potential is tension times
     length. The force at the first point is that of a cable which leaves the body there
     along the last segment, or of one that is fixed to it.
+
+    A tendon pulls and never pushes: a negative tension is refused where it is known, and acts
+    as none where a path, a command or a traced number gives it.
     """
 
     route: Route
     value: Float[Array, ""] = eqx.field(converter=real, default=0.0)
     name: str = eqx.field(static=True, default="tendon")
 
+    def __check_init__(self):
+        do = "Tendons pull; put one on the other side to pull back."
+        _check.not_negative("Tendon", "value", self.value, "N", do)
+
+    @property
+    def tension(self) -> Float[Array, ""]:
+        """[N]; with the slope of `value` at zero too, where paths of loads begin."""
+        return jnp.where(self.value >= 0, self.value, jnp.zeros_like(self.value))
+
     def potential(self, problem, u):
-        return self.value * tendon_length(problem.mesh, u, self.route)
+        return self.tension * tendon_length(problem.mesh, u, self.route)
 
     def curved_part(self, problem):
         weights = self.route.weights
 
         def energy(x, weights):
             ends = jnp.einsum("pa,pai->pi", weights, x.reshape(*weights.shape, -1))
-            return self.value * jnp.sum(_lengths(ends))
+            return self.tension * jnp.sum(_lengths(ends))
 
         data = jnp.stack([weights[:-1], weights[1:]], axis=1)
         return CurvedPart(_segments(self.route.nodes, jnp), energy, data)
@@ -126,12 +141,12 @@ class Cable(AbstractLoad):
                         "Give axial stiffness over length, EA / L.")  # fmt: skip
 
 
-def tension(problem, u: Float[Array, "nodes dim"], name: str) -> Float[Array, ""]:
+def tension(problem: "Problem", u: Float[Array, "nodes dim"], name: str) -> Float[Array, ""]:
     """Tension [N] in the tendon or cable called `name`, the sum over the springs of one
     term."""
     load = next(load for load in problem.loads if load.name == name)
     if isinstance(load, Tendon):
-        return load.value
+        return load.tension
     return jax.grad(_energy_of_value)(load.value, load, problem, u)
 
 

@@ -1,5 +1,6 @@
 """Files: surfaces, contours, meshes, states and results in and out."""
 
+from sorojax._arguments import check_package as _check_package
 from sorojax.io.animation import (
     MovingSurface as MovingSurface,
     export_animation as export_animation,
@@ -13,3 +14,5 @@ from sorojax.io.surface import (
     export_surface as export_surface,
     import_surface as import_surface,
 )
+
+_check_package(__name__)

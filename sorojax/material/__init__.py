@@ -1,5 +1,6 @@
 """Materials: stored energies, fits and presets."""
 
+from sorojax._arguments import check_package as _check_package
 from sorojax.material import presets as presets
 from sorojax.material.fibre import (
     FibreReinforced as FibreReinforced,
@@ -59,3 +60,5 @@ from sorojax.material.volumetric import (
     SimoMiehe as SimoMiehe,
     SimoTaylor as SimoTaylor,
 )
+
+_check_package(__name__)

@@ -4,6 +4,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
@@ -18,7 +19,7 @@ Direction = tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]
 def _direction(value: Any) -> Direction:
     """Three leaves from three numbers, an array (3,) or one row per cell (cells, 3)."""
     if not isinstance(value, list | tuple):
-        value = jnp.moveaxis(real(value), -1, 0) if jnp.ndim(value) else (value,)
+        value = jnp.moveaxis(real(value), -1, 0) if np.ndim(value) else (value,)
     return tuple(real(entry) for entry in value)  # type: ignore[return-value]
 
 

@@ -9,6 +9,8 @@ from jaxtyping import Float
 
 from sorojax import _check
 from sorojax._display import displayed
+from sorojax._explain import got
+from sorojax._kinds import number_like
 from sorojax.material import checks
 from sorojax.material.hyperelastic import AbstractHyperelastic
 from sorojax.material.ogden import Ogden
@@ -131,6 +133,11 @@ def _needed(model, terms: int) -> int:
 
 def _repeats(strain, stress, weights, need: int) -> list[tuple[np.ndarray, ...]]:
     """(strain, stress, weight) of every repeat; the weights of each have mean 1 / points."""
+    if len(strain) == 0 or len(stress) == 0:
+        raise ValueError(
+            f"fit_tensile: got {len(strain)} strains and {len(stress)} stresses, need as many "
+            "as the model has constants, or more. Give the points of the test."
+        )
     several = np.ndim(strain[0]) > 0
     strains, stresses = (strain, stress) if several else ([strain], [stress])
     given = (
@@ -146,6 +153,11 @@ def _repeats(strain, stress, weights, need: int) -> list[tuple[np.ndarray, ...]]
 
 
 def _repeat(strain, stress, weight, need: int, count: int) -> tuple[np.ndarray, ...]:
+    if not number_like(strain) or not number_like(stress):
+        raise TypeError(
+            f"fit_tensile: got {got(strain)} and {got(stress)}, need numbers. Give strains [-] "
+            "and stresses [Pa]."
+        )
     strain, stress = np.asarray(strain, float), np.asarray(stress, float)
     if strain.shape != stress.shape or strain.ndim != 1 or len(strain) < need:
         raise ValueError(

@@ -15,6 +15,11 @@ from sorojax.material.hyperelastic import AbstractHyperelastic
 #: Logarithmic strains of the first two directions per logarithmic stretch.
 MODES = {"uniaxial": (1.0, -0.5), "equibiaxial": (1.0, 1.0), "pure_shear": (1.0, 0.0)}
 POINTS = 241
+#: For each principal direction a change of shape that leaves its stretch, and one across, as
+#: changes of the first two logarithmic strains.
+_BASES = np.array([[[0, 1], [-2, 1]], [[1, 0], [1, -2]], [[1, -1], [1, 1]]]) / np.sqrt(
+    [[[2], [6]]]
+)
 
 
 @dataclass(frozen=True)
@@ -86,9 +91,16 @@ def _is_stable(material, strains: Float[Array, "modes points 2"]):
         F = ((a, 0.0, 0.0), (0.0, b, 0.0), (0.0, 0.0, 1 / (a * b)))
         return material.isochoric_energy(F)
 
+    def curvature(log, basis):
+        """Second derivatives [J/m^3] along two changes of shape."""
+        return jax.hessian(lambda z: energy(log + z @ basis))(jnp.zeros_like(log))
+
     def at(log):
-        H = jax.hessian(energy)(log)
-        return (H[0, 0] > 0) & (H[0, 0] * H[1, 1] > H[0, 1] * H[1, 0])
+        # along what leaves the stiffest direction as it is, its stiffness cannot drown the rest
+        H = jax.vmap(curvature, (None, 0))(log, jnp.asarray(_BASES, log.dtype))
+        H = H[jnp.argmax(jnp.abs(H[:, 1, 1]))]
+        rounding = 16 * jnp.finfo(log.dtype).eps * jnp.abs(H[1, 1])
+        return (H[1, 1] > 0) & (H[0, 0] - H[0, 1] ** 2 / H[1, 1] > -rounding)
 
     return jax.vmap(jax.vmap(at))(strains)
 

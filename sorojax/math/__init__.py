@@ -3,6 +3,7 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from sorojax._arguments import check_package as _check_package, public as _public
 from sorojax.math.lie import SE2 as SE2, SE3 as SE3
 from sorojax.math.status import Status as Status
 
@@ -13,13 +14,15 @@ if TYPE_CHECKING:
         RungeKutta4 as RungeKutta4,
     )
 
+_check_package(__name__)
 _STEPPERS = {"DormandPrince", "GeneralisedAlpha", "RungeKutta4"}
 
 
 def __getattr__(name: str) -> Any:
     """The steppers load diffrax, which shapes and bodies do without."""
     if name in _STEPPERS:
-        return getattr(importlib.import_module("sorojax.math.steppers"), name)
+        value = getattr(importlib.import_module("sorojax.math.steppers"), name)
+        return _public(__name__, name, value)
     raise AttributeError(f"module 'sorojax.math' has no attribute {name!r}")
 
 

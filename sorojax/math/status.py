@@ -1,6 +1,12 @@
 """How a call ended, as a value that passes through every transformation."""
 
+from typing import Any
+
 import equinox as eqx
+import jax
+import numpy as np
+
+from sorojax._jax.trace_state import is_tracer
 
 
 class Status(eqx.Enumeration):
@@ -44,3 +50,31 @@ class Status(eqx.Enumeration):
         "The limit of events was reached. Raise `max_events`, or let the event rest: events "
         "that crowd together without end, as of a ball that comes to rest, need a threshold."
     )
+
+
+class _Outcome(type(Status.successful)):  # pyright: ignore[reportGeneralTypeIssues]
+    """A status that prints its name, and of several how many there are of each."""
+
+    def __repr__(self) -> str:
+        if is_tracer(self._value):
+            return "Status(traced)"
+        if not isinstance(self._value, jax.Array | np.ndarray | np.generic):
+            return "Status(unknown)"  # a tree of something else
+        names = list(Status._name_to_item)
+        values = np.asarray(self._value)
+        if values.ndim == 0:
+            return f"Status({names[int(values)]})"
+        counts = np.bincount(values.ravel(), minlength=len(names))
+        found = [f"{name}: {n}" for name, n in zip(names, counts, strict=True) if n]
+        return f"Status({', '.join(found)})"
+
+
+def _where(pred: Any, a: Any, b: Any) -> Any:
+    """`a` where `pred` holds, else `b`."""
+    return _Outcome(_plain_where(pred, a, b)._value, Status)
+
+
+_plain_where = Status.where
+Status.where = staticmethod(_where)
+for _name, _item in list(Status._name_to_item.items()):
+    Status._name_to_item[_name] = _Outcome(_item._value, Status)

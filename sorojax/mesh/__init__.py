@@ -1,5 +1,6 @@
 """Meshes: from an implicit shape to cells, and back to what is on them."""
 
+from sorojax._arguments import check_package as _check_package
 from sorojax.mesh.chambers import (
     Chambers as Chambers,
     boundary_loops as boundary_loops,
@@ -62,3 +63,5 @@ from sorojax.mesh.trace import (
     image_shape as image_shape,
 )
 from sorojax.mesh.triangulate import triangulate as triangulate
+
+_check_package(__name__)

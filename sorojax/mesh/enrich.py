@@ -55,7 +55,7 @@ def enrich(mesh: Mesh) -> Mesh:
     columns = mesh.num_nodes + number.reshape(len(cells), -1)
     points = jnp.concatenate([mesh.points, where.reshape(-1, element.dim)[first]])
     richer = Mesh(points, np.concatenate([cells, columns], axis=1), element)
-    sets = {name: _with_centres(richer, f) for name, f in mesh.facet_sets.items()}
+    sets = {name: with_centres(richer, f) for name, f in mesh.facet_sets.items()}
     nodes = {name: _with_inner(mesh, columns, ids) for name, ids in mesh.node_sets.items()}
     return Mesh(points, richer.cells, element, nodes, sets, mesh.regions)
 
@@ -82,8 +82,8 @@ def _owners(mesh: Mesh, element: AbstractElement) -> np.ndarray:
     return np.concatenate([shared.reshape(len(cells), -1), own + shared.max()], axis=1)
 
 
-def _with_centres(mesh: Mesh, facets) -> np.ndarray:
-    """Facets of the mesh before, with the node in the middle of each face."""
+def with_centres(mesh: Mesh, facets) -> np.ndarray:
+    """Facets of the mesh before it was enriched, with the node in the middle of each face."""
     facets = np.asarray(facets)
     if mesh.element.dim == 2 or not len(facets):
         return facets
@@ -93,6 +93,12 @@ def _with_centres(mesh: Mesh, facets) -> np.ndarray:
     centres = np.concatenate([cells[:, f[-1]] for f in mesh.element.facets])
     both = np.concatenate([np.sort(known, axis=1), np.sort(facets[:, :count], axis=1)])
     key = np.unique(both, axis=0, return_inverse=True)[1].ravel()
-    lookup = np.zeros(key.max() + 1, int)
+    lookup = np.full(key.max() + 1, -1)
     lookup[key[: len(known)]] = centres
-    return np.concatenate([facets, lookup[key[len(known) :], None]], axis=1)
+    found = lookup[key[len(known) :], None]
+    if (found < 0).any():
+        raise ValueError(
+            f"enrich: {int((found < 0).sum())} of {len(facets)} facets belong to no cell of "
+            "the mesh. Take them from this mesh, or from the one that it was enriched from."
+        )
+    return np.concatenate([facets, found], axis=1)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sorojax import _check
 from sorojax._jax.trace_state import is_traced
 from sorojax.math.spatial import KDTree
 from sorojax.mesh.elements import Hex8, PolyN, Quad4, Quad8, Quad9
@@ -36,6 +37,10 @@ def locate(mesh: Mesh, points: Float[np.ndarray, "points dim"]) -> Locations:
     if is_traced(mesh):
         raise ValueError("locate: the mesh is traced, need concrete points. Call it outside.")
     points = np.atleast_2d(np.asarray(points, float))
+    _check.finite("locate", "points", points, "Give points in metres.")
+    _check.shape("locate", "points", points, (None, mesh.element.dim), "One row per point.")
+    if not len(points):
+        raise ValueError("locate: got no point, need one or more. Give one row per point.")
     X, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
     centres = X[cells[:, : mesh.element.num_corners]].mean(axis=1)
     near = KDTree(centres).query(points, k=min(24, len(cells)))[1].reshape(len(points), -1)

@@ -1,5 +1,7 @@
 """Areas and volumes of cells and cavities, differentiable in the points of a mesh."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -56,8 +58,22 @@ def enclosed_volume(
     mesh: Mesh, facets: Int[np.ndarray, "facets facet_nodes"]
 ) -> Float[Array, ""]:
     """Volume [m^3] of the cavity that closed `facets` of a body surround (area [m^2] in
-    the plane); negative for an outer surface. Differentiable in the points."""
+    the plane); negative for an outer surface. Differentiable in the points.
+
+    Raises:
+        ValueError: If there is no facet.
+    """
+    check_some("mesh.enclosed_volume", facets)
     return _enclosed(mesh.points, jnp.asarray(facets), mesh.element)
+
+
+def check_some(where: str, facets: Any) -> None:
+    """Raise a `ValueError` if there is no facet."""
+    if 0 in np.shape(facets):
+        raise ValueError(
+            f"{where}: got no facet, need those around a cavity. Look at mesh.chambers(mesh), "
+            "or at the shape given to mesh.facets_on."
+        )
 
 
 @eqx.filter_jit

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sorojax._arguments import sized
 from sorojax._display import displayed, number
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import integers, real
@@ -84,6 +85,12 @@ class Mesh(eqx.Module):
                 named = (f"{name} ({ids.shape[0]})" for name, ids in sets.items())
                 rows.append(f"  {kind:<11} {', '.join(named)}")
         return "\n".join(rows)
+
+
+@sized(Mesh)
+def axis_lengths(mesh: Mesh) -> dict[str, int]:
+    nodes, dim = mesh.points.shape[-2:]
+    return {"nodes": nodes, "dim": dim, "cells": mesh.cells.shape[-2]}
 
 
 def boundary_facets(mesh: Mesh) -> Int[np.ndarray, "facets facet_nodes"]:

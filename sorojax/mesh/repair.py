@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from sorojax._types import Numbers
 from sorojax.math.spatial import KDTree
 from sorojax.mesh.elements import (
     AbstractElement,
@@ -49,7 +50,9 @@ class Repaired(NamedTuple):
         )
 
 
-def repair(points, cells, element: AbstractElement, *, tol: float | None = None) -> Repaired:
+def repair(
+    points: Numbers, cells: Numbers, element: AbstractElement, *, tol: float | None = None
+) -> Repaired:
     """A mesh from `points` [m] and `cells` that may have common faults.
 
     Nodes at one place are merged, nodes without cells removed, inverted cells turned.

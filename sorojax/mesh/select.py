@@ -6,8 +6,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
+from sorojax._types import Numbers
 from sorojax.mesh.elements import facet_corners
 from sorojax.mesh.mesh import Mesh, boundary_facets, facet_table
 from sorojax.sdf.base import AbstractSdf
@@ -46,7 +47,7 @@ def facets_on(mesh: Mesh, shape: AbstractSdf, tol: float | None = None) -> Facet
     Args:
         mesh: A mesh; the outline of `shape` should be part of its boundary.
         shape: For example the chambers that were cut out of the body.
-        tol: Largest distance of a node from the zero set [m]; 1e-6 of the extent of
+        tol: Largest distance of a corner from the zero set [m]; 1e-6 of the extent of
             the mesh when omitted.
     """
     points = np.asarray(mesh.points)
@@ -54,21 +55,24 @@ def facets_on(mesh: Mesh, shape: AbstractSdf, tol: float | None = None) -> Facet
         tol = 1e-6 * float(np.ptp(points, axis=0).max())
     facets = boundary_facets(mesh)
     near = np.abs(values(shape, points)) <= tol
-    ends = points[facets[:, : facet_corners(mesh.element)]]
-    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    corners = facets[:, : facet_corners(mesh.element)]  # other nodes may lie beside a curve
+    ends = points[corners]
+    length = np.linalg.norm(ends - np.roll(ends, 1, axis=1), axis=2).max(axis=1)
     # Both ends of a chord between two curves lie on them, its middle does not; the
     # middle of a straight side on a fillet is off by less than a tenth of its length.
     off = np.abs(values(shape, ends.mean(axis=1)))
-    return facets[near[facets].all(axis=1) & (off <= 0.15 * length + tol)]
+    return facets[near[corners].all(axis=1) & (off <= 0.15 * length + tol)]
 
 
-def nearest_node(mesh: Mesh, point: Any) -> int:
+def nearest_node(mesh: Mesh, point: Float[np.ndarray, " dim"]) -> int:
     """The node closest to `point` [m]."""
     gap = np.asarray(mesh.points) - np.asarray(point, dtype=float)
     return int(np.argmin((gap**2).sum(axis=1)))
 
 
-def nodes_in_box(mesh: Mesh, lower: Any, upper: Any) -> Nodes:
+def nodes_in_box(
+    mesh: Mesh, lower: Float[np.ndarray, " dim"], upper: Float[np.ndarray, " dim"]
+) -> Nodes:
     """Nodes between two corners [m], faces included to 1e-9 of the extent."""
     points = np.asarray(mesh.points)
     tol = 1e-9 * float(np.ptp(points, axis=0).max())
@@ -76,7 +80,12 @@ def nodes_in_box(mesh: Mesh, lower: Any, upper: Any) -> Nodes:
     return np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
 
 
-def nodes_on_line(mesh: Mesh, start: Any, end: Any, tol: float | None = None) -> Nodes:
+def nodes_on_line(
+    mesh: Mesh,
+    start: Float[np.ndarray, " dim"],
+    end: Float[np.ndarray, " dim"],
+    tol: float | None = None,
+) -> Nodes:
     """Nodes within `tol` [m] of a straight line, in order from `start` to `end` [m]."""
     points = np.asarray(mesh.points)
     if tol is None:
@@ -112,7 +121,7 @@ def named(mesh: Mesh, name: str) -> np.ndarray:
     raise ValueError(f"named: the mesh has no set {name!r}, it has {known}. Name one of them.")
 
 
-def cells_connected(mesh: Mesh, start: Any, walls: Any = ()) -> Cells:
+def cells_connected(mesh: Mesh, start: Float[np.ndarray, " dim"], walls: Numbers = ()) -> Cells:
     """Cells reached from the one nearest to the point `start` [m] without crossing `walls`.
 
     Args:

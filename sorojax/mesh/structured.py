@@ -4,6 +4,7 @@ from itertools import permutations
 
 import numpy as np
 
+from sorojax._types import Numbers
 from sorojax.mesh.elements import (
     AbstractElement,
     Hex8,
@@ -26,8 +27,8 @@ _SOLID = (Hex8, Tet4, Tet10, Tet15)
 
 
 def rectangle(
-    lower,
-    upper,
+    lower: Numbers,
+    upper: Numbers,
     *,
     divisions: tuple[int, int],
     order: int = 1,
@@ -64,7 +65,11 @@ def rectangle(
 
 
 def box(
-    lower, upper, *, divisions: tuple[int, int, int], element: AbstractElement | None = None
+    lower: Numbers,
+    upper: Numbers,
+    *,
+    divisions: tuple[int, int, int],
+    element: AbstractElement | None = None,
 ) -> Mesh:
     """Hexahedra, or tetrahedra six per grid cell, in a cuboid.
 

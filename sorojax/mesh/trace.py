@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sorojax import _check
+from sorojax._types import Numbers
 from sorojax.mesh.mesh import Mesh
 from sorojax.mesh.sizes import SizeFunction
 from sorojax.mesh.triangulate import triangulate
@@ -60,7 +61,9 @@ def from_image(
     )
 
 
-def image_shape(image, *, pixel: float, level=None, smooth: float = 0.35) -> AbstractSdf:
+def image_shape(
+    image: Numbers, *, pixel: float, level: float | None = None, smooth: float = 0.35
+) -> AbstractSdf:
     """The bright part of a picture as polygons minus their holes."""
     from skimage.measure import approximate_polygon, find_contours
 

@@ -1,5 +1,6 @@
 """From finite elements to rods: backbone strains, POD modes, identified laws."""
 
+from sorojax._arguments import check_package as _check_package
 from sorojax.reduction.backbone import (
     Backbone as Backbone,
     strain_along as strain_along,
@@ -30,3 +31,5 @@ from sorojax.reduction.weight import (
     OffsetWeight as OffsetWeight,
     offset_weight as offset_weight,
 )
+
+_check_package(__name__)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax._display import displayed, number
+from sorojax._types import Numbers
 from sorojax.fem.solve import Path
 from sorojax.mesh.locate import Locations, locate
 from sorojax.reduction.curve import AbstractCurve, Line as Line, Reference, reference
@@ -165,7 +166,7 @@ def strain_along(
     *,
     samples: int = 81,
     arm: float | None = None,
-    up=None,
+    up: Numbers | None = None,
 ) -> Backbone:
     """Backbone snapshots of a load path along a material curve.
 

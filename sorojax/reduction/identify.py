@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax._progress import report
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.fem.linear import linearise, prepare
 from sorojax.fem.loads import Pressure
 from sorojax.fem.problem import Problem
@@ -106,7 +106,7 @@ def identify(
     *,
     degree: int = 5,
     arm: float | None = None,
-    up=None,
+    up: Numbers | None = None,
 ) -> Fit:
     """Identify a rod along `curve` from a path of pressures.
 
@@ -165,7 +165,7 @@ def condensed_stiffness(
     *,
     samples: int = 81,
     arm: float | None = None,
-    up=None,
+    up: Numbers | None = None,
 ) -> Float[np.ndarray, "steps dof dof"]:
     """Stiffness of the solid against forces on the coordinates, at each state of any path.
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from sorojax._types import Numbers
 from sorojax.fem.kinematics import PlaneStrain, Solid
 from sorojax.fem.points import quadrature_points
 from sorojax.fem.problem import Problem
@@ -15,7 +16,9 @@ from sorojax.rod import Section
 _SAMPLES = 201
 
 
-def mean_section(problem: Problem, curve: AbstractCurve, *, up=None) -> Section:
+def mean_section(
+    problem: Problem, curve: AbstractCurve, *, up: Numbers | None = None
+) -> Section:
     """The section of a uniform rod along `curve` with the mass of the body, its mean offset
     from the curve and its rotary inertia about it. Of a solid the torsion constant is the
     polar moment, an upper bound.

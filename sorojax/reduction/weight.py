@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.fem.mass import lumped_mass
 from sorojax.fem.problem import Problem
 from sorojax.reduction.curve import Line
@@ -35,7 +35,7 @@ class OffsetWeight(AbstractForce):
         return at.generalised(load, turn[:, None])
 
 
-def offset_weight(problem: Problem, line: Line, acceleration) -> OffsetWeight:
+def offset_weight(problem: Problem, line: Line, acceleration: Numbers) -> OffsetWeight:
     """The weight of a planar solid about a straight line in it.
 
     Args:

@@ -1,5 +1,6 @@
 """Ready-made and printable bodies as parametric programs."""
 
+from sorojax._arguments import check_package as _check_package
 from sorojax.robots.around import (
     below as below,
     cylinder as cylinder,
@@ -55,3 +56,5 @@ from sorojax.robots.walker import (
     walker_problem as walker_problem,
     walker_rubber as walker_rubber,
 )
+
+_check_package(__name__)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from sorojax import fem, mesh
+from sorojax._types import Numbers
 from sorojax.material import AbstractHyperelastic
 from sorojax.robots.bellows import BellowsActuator
 from sorojax.units import mm
@@ -15,7 +16,7 @@ def bellows_problem(
     rubber: AbstractHyperelastic,
     *,
     depth: float = 20 * mm,
-    gravity: Any = None,
+    gravity: Numbers | None = None,
     pushed: Sequence[int] = (),
 ) -> fem.Problem:
     """Clamped at its left end, with a pressure called "air" [Pa] in all chambers.

@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from sorojax import material as materials
 from sorojax._edit import replace
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.material import AbstractHyperelastic
 from sorojax.math.lie import SE2, SE3, homogeneous
 from sorojax.math.together import together
@@ -72,7 +72,7 @@ def model(
     material: AbstractHyperelastic | None = None,
     *,
     supply: Supply | None = None,
-    damping: Any = DAMPING,
+    damping: Numbers = DAMPING,
     size: float | None = None,
     modes: int = 3,
 ) -> Model:

@@ -1,5 +1,6 @@
 """Rods: strain-parameterised Cosserat model, planar and spatial."""
 
+from sorojax._arguments import check_package as _check_package
 from sorojax.rod.assembly import (
     Assembly as Assembly,
     Part as Part,
@@ -220,3 +221,5 @@ from sorojax.rod.wrench import (
     LineWrench as LineWrench,
     PointWrench as PointWrench,
 )
+
+_check_package(__name__)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._arguments import axis_lengths
 from sorojax._display import displayed
 from sorojax._types import optional_real, real
 from sorojax.rod.joint import AbstractJoint, Fixed, Group
@@ -139,6 +140,12 @@ def num_coordinates(model: Rod | Assembly) -> int:
 def num_dof(model: Rod | Assembly) -> int:
     """Length of v, and of generalised forces."""
     return model.basis.num_dof if isinstance(model, Rod) else slices(model)[-1].rod_v.stop
+
+
+@axis_lengths(Rod)
+@axis_lengths(Assembly)
+def _(model: Rod | Assembly) -> dict[str, int]:
+    return {"coordinates": num_coordinates(model), "dof": num_dof(model)}
 
 
 def rest(model: Rod | Assembly) -> Float[Array, " coordinates"]:

@@ -8,9 +8,10 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.math.batch import batched
 from sorojax.math.dense import solve_symmetric
 from sorojax.math.door import door, full_products
@@ -37,7 +38,7 @@ def coriolis_force(model: Model, q: Coordinates, v: Rates) -> Rates:
 
 
 @door
-def gravity_force(model: Model, q: Coordinates, gravity=None) -> Rates:
+def gravity_force(model: Model, q: Coordinates, gravity: Numbers | None = None) -> Rates:
     """Gradient of the gravitational energy, on the left of the equations of motion.
 
     Args:
@@ -49,7 +50,7 @@ def gravity_force(model: Model, q: Coordinates, gravity=None) -> Rates:
 
 
 @door
-def bias_force(model: Model, q: Coordinates, v: Rates, gravity=None) -> Rates:
+def bias_force(model: Model, q: Coordinates, v: Rates, gravity: Numbers | None = None) -> Rates:
     """C(q, v) v + g(q), what a computed-torque controller cancels."""
     moment = motion(model, q, v)
     return inertia(moment)[1] - loads.weight(Gravity(gravity), _zero(q), moment)
@@ -104,7 +105,7 @@ def forward_dynamics(
     def one(q, v):
         return acceleration(model, constants, t, q, v, forces)
 
-    if jnp.ndim(q) == 1 and jnp.ndim(v) == 1:
+    if np.ndim(q) == 1 and np.ndim(v) == 1:
         return one(q, v)
     return batched(one)(q, v)
 

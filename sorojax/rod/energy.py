@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.math.door import door
 from sorojax.rod.assembly import is_flat, slices
 from sorojax.rod.dynamics import coordinate_rate
@@ -28,7 +28,7 @@ def kinetic_energy(
 
 @door
 def potential_energy(
-    model: Model, q: Float[Array, " coordinates"], gravity=None
+    model: Model, q: Float[Array, " coordinates"], gravity: Numbers | None = None
 ) -> Float[Array, ""]:
     """Linear elastic energy [J], and that of the weight in `gravity` [m/s^2] if given."""
     moment = motion(model, q)

@@ -28,11 +28,36 @@ EARTH = 9.81  # m/s^2
 
 
 class AbstractForce(eqx.Module):
-    """A generalised force, on the side of the loads: M a + coriolis = sum of forces."""
+    """A generalised force, on the side of the loads: M a + coriolis = sum of forces.
+
+    `motion` is the rod at one moment, a `rod.Motion`. It offers:
+
+    * `motion.q`, `motion.v`: coordinates and their rates, `(dof,)`;
+    * `motion.rod`: the rod, with `length` [m], `section`, `material`, `group`, `basis`;
+    * at the Gauss nodes, world frame: `position` `(quad, dim)` [m], `directors`
+      `(quad, dim, dim)`, `tangent` `(quad, dim)`, `linear_jacobian` `(quad, dim, dof)`,
+      `angular_jacobian` `(quad, rot, dof)`, and the weights `motion.operators.weights`
+      `(quad,)` [m] that integrate along the rod;
+    * `motion.tip_jacobian` `(twist, dof)`: twist of the tip per rate, angular first;
+    * `rod.points(motion, s)`: position, velocity, spin, directors and Jacobians at any s in
+      [0, 1].
+
+    What is not read is never computed. A force of 2 N/m along y, all along the rod:
+
+        class SideWind(rod.AbstractForce):
+            def __call__(self, t, motion):
+                weights = motion.operators.weights
+                return 2.0 * weights @ motion.linear_jacobian[:, 1]
+    """
 
     @abc.abstractmethod
     def __call__(self, t: Float[Array, ""], motion: Motion) -> Float[Array, " dof"]:
-        """Force that does work on the coordinate rates; power is force @ v [W]."""
+        """Force [N m, N] that does work on the coordinate rates; power is force @ v [W].
+
+        Args:
+            t: Time [s].
+            motion: The rod at this time.
+        """
 
     def on_rod(self, rod: Rod) -> "AbstractForce":
         """The same force on `rod` alone: loops make here, once, what does not move."""

@@ -70,6 +70,13 @@ class _Stacked(eqx.Module):
 
     def __call__(self, s):
         rows = [f(s) for f in self.functions]
+        if any(np.shape(row) != np.shape(s) for row in rows):
+            shapes = ", ".join(str(np.shape(row)) for row in rows)
+            raise ValueError(
+                f"functions: {np.size(s)} points gave values of shapes {shapes}, need "
+                f"{np.shape(s)} of each mode. Return one value per point, of a constant mode "
+                "np.ones_like(s)."
+            )
         xp = jnp if any(isinstance(row, jax.Array) for row in rows) else np
         return xp.stack([xp.asarray(row) for row in rows], axis=1)
 
@@ -112,7 +119,10 @@ class Functions(AbstractModes):
 
 
 def functions(
-    *, nodes: int | None = None, breaks: Sequence[float] = (), **modes: Any
+    *,
+    nodes: int | None = None,
+    breaks: Sequence[float] = (),
+    **modes: Callable | Sequence[Callable],
 ) -> StrainBasis:
     """Modes of your own per strain: `functions(kappa_z=[lambda s: s, lambda s: s**2])`.
 
@@ -134,6 +144,11 @@ def functions(
 
 def _functions(function: Any, nodes: int | None, joints: tuple[float, ...]) -> Functions:
     shape = np.shape(function(np.array([0.25, 0.5, 0.75])))
+    if shape[:1] != (3,) or len(shape) > 2:
+        raise ValueError(
+            f"functions: 3 points gave values of shape {shape}, need (3,) or (3, modes). "
+            "Return one value per point, of a constant mode np.ones_like(s)."
+        )
     count = shape[1] if len(shape) == 2 else 1
     return Functions(function=function, count=count, nodes=nodes, joints=joints)
 

@@ -7,6 +7,7 @@ Reference:
 """
 
 import functools
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -15,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.math.door import door
 from sorojax.math.implicit_root import implicit_root
 from sorojax.math.status import Status
@@ -66,7 +67,7 @@ def inverse_kinematics(
     q: Float[Array, " coordinates"] | None = None,
     *,
     obstacles: tuple[Clear, ...] = (),
-    limits=None,
+    limits: Sequence[Numbers] | None = None,
     forces: tuple[Load, ...] | None = None,
     t=0.0,
     accuracy=1e-6,
@@ -98,6 +99,11 @@ def inverse_kinematics(
         ValueError: If shapes do not fit, or the model has no part of a target's name.
     """
     targets = (targets,) if isinstance(targets, AbstractTarget) else tuple(targets)
+    if not targets:
+        raise ValueError(
+            "inverse_kinematics: got no target, need one or more. Give rod.Position, rod.Pose "
+            "or another."
+        )
     constants, dtype = operators(model), dtype_of(model)
     guess, t = first_guess("inverse_kinematics", model, q), real(t).astype(dtype)
     measure = jax.lax.stop_gradient(metric(model, constants))

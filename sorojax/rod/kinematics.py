@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.math.door import door
 from sorojax.math.lie import homogeneous
 from sorojax.math.quadrature import integration_rows, interpolation_rows
@@ -30,7 +30,9 @@ Jacobians = Float[Array, "points twist dof"]
 
 
 @door
-def strain(rod: Rod, q: Float[Array, " dof"], s=None) -> Float[Array, "points strain"]:
+def strain(
+    rod: Rod, q: Float[Array, " dof"], s: Numbers | None = None
+) -> Float[Array, "points strain"]:
     """Strain of the section: curvatures [1/m], then stretch and shears [-].
 
     Args:
@@ -53,12 +55,14 @@ def strain(rod: Rod, q: Float[Array, " dof"], s=None) -> Float[Array, "points st
 
 
 @overload
-def forward_kinematics(model: Rod, q: Array, s=None) -> Poses: ...
+def forward_kinematics(model: Rod, q: Array, s: Numbers | None = None) -> Poses: ...
 @overload
-def forward_kinematics(model: Assembly, q: Array, s=None) -> dict[str, Poses]: ...
+def forward_kinematics(
+    model: Assembly, q: Array, s: Numbers | None = None
+) -> dict[str, Poses]: ...
 @door
 def forward_kinematics(
-    model: Model, q: Float[Array, " coordinates"], s=None
+    model: Model, q: Float[Array, " coordinates"], s: Numbers | None = None
 ) -> Poses | dict[str, Poses]:
     """Poses of the sections: local to base frame, positions in m.
 
@@ -85,12 +89,12 @@ def tip_pose(model: Model, q: Float[Array, " coordinates"]):
 
 
 @overload
-def jacobian(model: Rod, q: Array, s=None) -> Jacobians: ...
+def jacobian(model: Rod, q: Array, s: Numbers | None = None) -> Jacobians: ...
 @overload
-def jacobian(model: Assembly, q: Array, s=None) -> dict[str, Jacobians]: ...
+def jacobian(model: Assembly, q: Array, s: Numbers | None = None) -> dict[str, Jacobians]: ...
 @door
 def jacobian(
-    model: Model, q: Float[Array, " coordinates"], s=None
+    model: Model, q: Float[Array, " coordinates"], s: Numbers | None = None
 ) -> Jacobians | dict[str, Jacobians]:
     """Twists of the sections per coordinate rate, angular velocity first, world frame.
 
@@ -110,7 +114,10 @@ def jacobian(
 
 @door
 def jacobian_rate_product(
-    model: Model, q: Float[Array, " coordinates"], v: Float[Array, " dof"], s=None
+    model: Model,
+    q: Float[Array, " coordinates"],
+    v: Float[Array, " dof"],
+    s: Numbers | None = None,
 ) -> Float[Array, "points twist"] | dict[str, Float[Array, "points twist"]]:
     """dJ/dt v: accelerations of the sections that velocity alone makes, world frame.
 

@@ -25,7 +25,7 @@ def operators(model: Rod) -> Operators: ...
 @overload
 def operators(model: Assembly) -> AssemblyOperators: ...
 @full_products
-def operators(model):
+def operators(model: Rod | Assembly):
     """The constant arrays of a model, once before a loop; differentiable in its leaves."""
     return rod_operators(model) if isinstance(model, Rod) else assembly_operators(model)
 
@@ -37,7 +37,13 @@ def motion(
     model: Assembly, q: Array, v: Array | None = None, *, constants=None
 ) -> AssemblyMotion: ...
 @full_products
-def motion(model, q, v=None, *, constants=None):
+def motion(
+    model: Rod | Assembly,
+    q: Float[Array, " coordinates"],
+    v: Float[Array, " dof"] | None = None,
+    *,
+    constants=None,
+):
     """The fields of a model at (q, v), which forces and inertia read.
 
     Args:

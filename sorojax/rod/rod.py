@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._display import displayed, number
-from sorojax._types import optional_real, real
+from sorojax._types import Numbers, optional_real, real
 from sorojax.material.hyperelastic import AbstractHyperelastic, small_strain_moduli
 from sorojax.math.lie import SE2, SE3
 from sorojax.math.quadrature import Quadrature, gauss_legendre
@@ -136,11 +136,11 @@ def rod(
     section: Section | AlongRod[Section],
     material: Elastic | None = None,
     *,
-    length,
-    young_modulus=None,
-    poisson_ratio=None,
-    density=None,
-    rest_strain=None,
+    length: Numbers,
+    young_modulus: Numbers | None = None,
+    poisson_ratio: Numbers | None = None,
+    density: Numbers | None = None,
+    rest_strain: Numbers | None = None,
     nodes: int | None = None,
     breaks: Sequence[float] = (),
 ) -> Rod[G]:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax._display import displayed, number, outcome
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.math.contact_stepper import ContactMidpoint
 from sorojax.math.door import full_products
 from sorojax.math.status import Status
@@ -51,7 +51,7 @@ def rollout(
     v: Float[Array, " dof"],
     forces: Forces = (),
     *,
-    step,
+    step: Numbers,
     saves: int,
     every: int = 1,
     t=0.0,
@@ -78,6 +78,11 @@ def rollout(
             where errors add up to the motion: a twentieth of the time of a run of 160 steps
             or more, four steps of a shorter one. Runs of fewer than 8 steps are not judged.
     """
+    if saves < 1 or every < 1:
+        raise ValueError(
+            f"rollout: got saves={saves} and every={every}, need 1 or more of both. They count "
+            "moments and steps."
+        )
     if stepper is None:
         stepper = ContactMidpoint() if any_contact(forces) else GeneralisedAlpha()
     label = "rollout" if progress else None

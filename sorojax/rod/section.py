@@ -1,7 +1,6 @@
 """Cross-sections: the constants by which a section resists and carries mass."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,7 +10,7 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._display import displayed
-from sorojax._types import optional_real, real
+from sorojax._types import Numbers, optional_real, real
 
 
 @displayed
@@ -67,7 +66,7 @@ class Section(eqx.Module):
                 _check.positive("Section", name, left, "m^4", do)
 
 
-def scaled(section: Section, factor) -> Section:
+def scaled(section: Section, factor: Numbers) -> Section:
     """The same shape `factor` times as large [-]; an array gives one section per entry."""
     factor = real(factor)
     _check.positive("scaled", "factor", factor, "-", "1 leaves the section as it is.")
@@ -83,7 +82,9 @@ def scaled(section: Section, factor) -> Section:
     )
 
 
-def taper(section: Callable[..., Section], start: Any, end: Any) -> Callable[..., Section]:
+def taper(
+    section: Callable[..., Section], start: Numbers, end: Numbers
+) -> Callable[..., Section]:
     """A section whose sizes change linearly from base to tip, as a function of s.
 
     Args:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.mesh.mesh import Mesh
 from sorojax.mesh.motion import move
 from sorojax.mesh.triangulate import triangulate
@@ -22,7 +22,7 @@ from sorojax.sdf.evaluate import evaluate
 from sorojax.sdf.sample import finite_box
 
 
-def circle(radius, *, shear_factor=9 / 10) -> Section:
+def circle(radius: Numbers, *, shear_factor=9 / 10) -> Section:
     """A disc of `radius` [m].
 
     Reference:
@@ -40,7 +40,7 @@ def _disc(radius):
     return math.pi * radius**2, second_moment, second_moment, 2 * second_moment
 
 
-def ring(radius, inner_radius, *, poisson_ratio=0.5) -> Section:
+def ring(radius: Numbers, inner_radius: Numbers, *, poisson_ratio=0.5) -> Section:
     """A tube of outer `radius` and `inner_radius` [m].
 
     Reference:
@@ -63,7 +63,7 @@ def ring(radius, inner_radius, *, poisson_ratio=0.5) -> Section:
     )
 
 
-def rectangle(width, height, *, shear_factor=5 / 6) -> Section:
+def rectangle(width: Numbers, height: Numbers, *, shear_factor=5 / 6) -> Section:
     """A solid rectangle.
 
     Args:
@@ -100,7 +100,7 @@ def _rectangle_torsion(long: Array, short: Array) -> Array:
     return long * short**3 / 3 * (1 - 192 / math.pi**5 * ratio * (_SUM - rest))
 
 
-def ellipse(half_width, half_height, *, poisson_ratio=0.5) -> Section:
+def ellipse(half_width: Numbers, half_height: Numbers, *, poisson_ratio=0.5) -> Section:
     """A solid ellipse.
 
     Args:
@@ -130,7 +130,7 @@ def _ellipse_shear(n: Array, nu: Array) -> Array:
     return 12 * (1 + nu) * n**2 * (3 * n**2 + 1) / below
 
 
-def squircle(radius, power, *, shear_factor=5 / 6) -> Section:
+def squircle(radius: Numbers, power: Numbers, *, shear_factor=5 / 6) -> Section:
     """A superellipse |y|^power + |z|^power = radius^power, from disc (2) to square.
 
     The torsion constant is that of the harmonic function fitted to the boundary: within

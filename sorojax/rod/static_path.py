@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.math.door import door
 from sorojax.math.implicit_root import implicit_root
 from sorojax.math.status import Status
@@ -41,7 +41,7 @@ def equilibrium_path(
     factors: Float[Array, "steps *loads"],
     q: Float[Array, " coordinates"] | None = None,
     *,
-    begin=None,
+    begin: Numbers | None = None,
     t=0.0,
     tolerance=1e-10,
     max_iterations: int = 25,

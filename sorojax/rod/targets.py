@@ -193,6 +193,11 @@ def _rows(values, rank: int) -> Array:
 
 def _check_points(where: str, name: str, values: Array, s: Array) -> None:
     _check.finite(where, name, values, "It is where sections shall go.")
+    if values.ndim == 0 or s.ndim == 0:
+        raise ValueError(
+            f"{where}: got a number for `{name}`, need coordinates [m]. Give one row per "
+            "target."
+        )
     if values.shape[0] != s.shape[0]:
         raise ValueError(
             f"{where}: got {values.shape[0]} of `{name}` and {s.shape[0]} of `s`, need as "

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import optional_real, real
+from sorojax._types import Numbers, optional_real, real
 from sorojax.rod.forces import AbstractChamber, AbstractForce
 from sorojax.rod.points import from_own, own
 from sorojax.rod.rod import Rod
@@ -28,6 +28,9 @@ def _signal(value: Any) -> Any:
 class Tendons(AbstractForce):
     """Threads under given tensions, fixed to the rod at their far ends.
 
+    A thread pulls and never pushes: a negative tension is refused where it is known, and acts
+    as none, with no slope, where a function of time or a traced number gives it.
+
     Attributes:
         routes: One routing per tendon.
         tension: [N], one per tendon, or a function of time that returns them.
@@ -38,6 +41,11 @@ class Tendons(AbstractForce):
     routes: tuple[AbstractRoute, ...] = eqx.field(converter=_several)
     tension: Signal = eqx.field(converter=_signal)
     friction: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
+
+    def __check_init__(self):
+        if not callable(self.tension):
+            do = "Tendons pull; put one on the other side to pull back."
+            _check.not_negative("Tendons", "tension", self.tension, "N", do)
 
     def __call__(self, t, motion):
         return self.on_rod(motion.rod)(t, motion)
@@ -58,6 +66,7 @@ class _Threads(AbstractForce):
         do = "Give one tension per routing."
         _check.shape("Tendons", "tension", tension, (len(self.threads),), do)
         q = own(motion, motion.q)
+        tension = jnp.where(tension >= 0, tension, jnp.zeros_like(tension))
         total = jnp.zeros_like(q)
         for index, each in enumerate(self.threads):
             total = total + tension[index] * pull(each, q, self.friction)
@@ -85,7 +94,7 @@ class ThreadChambers(AbstractChamber):
 
 
 def thread_chambers(
-    rod: Rod, routes: AbstractRoute | tuple[AbstractRoute, ...], areas
+    rod: Rod, routes: AbstractRoute | tuple[AbstractRoute, ...], areas: Numbers
 ) -> ThreadChambers:
     """Chambers of `areas` [m^2] along routings in `rod`, as a pressure map.
 

@@ -1,5 +1,6 @@
 """Implicit shapes: signed distances in metres, negative inside."""
 
+from sorojax._arguments import check_package as _check_package
 from sorojax.sdf.bars import (
     Capsule as Capsule,
     HalfSpace as HalfSpace,
@@ -153,3 +154,5 @@ from sorojax.sdf.transform import (
     translate as translate,
 )
 from sorojax.sdf.turn import turn as turn
+
+_check_package(__name__)

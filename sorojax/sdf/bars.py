@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.sdf.base import EXACT, AbstractSdf, Box, Exactness, check_lengths
 from sorojax.sdf.scalar import absolute, box_distance, clip, norm, quotient, root
 
@@ -197,7 +197,7 @@ def segment_square(x: tuple[Array, ...], a: tuple, b: tuple) -> Array:
     return sum(((c - t * k) ** 2 for c, k in zip(d, e, strict=True)), start=zero)
 
 
-def stadium(length, width) -> Capsule:
+def stadium(length: Numbers, width: Numbers) -> Capsule:
     """Plane stadium along x about the origin, `length` [m] over all, `width` [m] high."""
     width = real(width)
     half = jnp.stack([(real(length) - width) / 2, jnp.zeros_like(width)])

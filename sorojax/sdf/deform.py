@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.sdf.base import AbstractSdf, Box, Number, number, steepest
 from sorojax.sdf.scalar import clip, maximum, minimum, norm, quotient
 from sorojax.sdf.transform import AbstractWrapped
@@ -216,16 +216,16 @@ def _arc(x: Array, near: Array, across: Array, k: Array) -> Array:
     return jnp.where(small, series, quotient(angle, k + jnp.zeros_like(angle)))
 
 
-def twist(shape: AbstractSdf, rate) -> Twisted:
+def twist(shape: AbstractSdf, rate: Numbers) -> Twisted:
     """A solid twisted about z by `rate` [rad/m]."""
     return Twisted(shape, rate)
 
 
-def taper(shape: AbstractSdf, rate) -> Tapered:
+def taper(shape: AbstractSdf, rate: Numbers) -> Tapered:
     """A solid whose section at height z is scaled by 1 + `rate` z, rate in 1/m."""
     return Tapered(shape, rate)
 
 
-def bend(shape: AbstractSdf, curvature) -> Bent:
+def bend(shape: AbstractSdf, curvature: Numbers) -> Bent:
     """A bar along x bent in the plane of x and y to `curvature` [1/m]."""
     return Bent(shape, curvature)

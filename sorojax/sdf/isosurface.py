@@ -24,6 +24,9 @@ class Surface(NamedTuple):
     vertices: np.ndarray
     triangles: np.ndarray
 
+    def __repr__(self) -> str:
+        return f"Surface: {len(self.vertices)} vertices, {len(self.triangles)} triangles"
+
 
 def isosurface(
     shape: AbstractSdf,

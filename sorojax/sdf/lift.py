@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._jax.trace_state import is_traced
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.sdf.bars import check_direction
 from sorojax.sdf.base import AbstractSdf, Box, Exactness, Number
 from sorojax.sdf.combine import hull
@@ -221,7 +221,7 @@ class PolarRepeated(AbstractWrapped):
         )  # fmt: skip
 
 
-def extrude(profile: AbstractSdf, height) -> Extruded:
+def extrude(profile: AbstractSdf, height: Numbers) -> Extruded:
     """A plane shape drawn out along z from 0 to `height` [m]."""
     return Extruded(profile, height)
 
@@ -233,12 +233,12 @@ def revolve(profile: AbstractSdf) -> Revolved:
     return Revolved(profile, clear=bool(profile.bounding_box()[0][0] >= 0))
 
 
-def mirror(shape: AbstractSdf, normal, point=None) -> Mirrored:
+def mirror(shape: AbstractSdf, normal: Numbers, point: Numbers | None = None) -> Mirrored:
     """`shape` together with its mirror image at the plane through `point` [m]."""
     return Mirrored(shape, normal, [0.0] * shape.dim if point is None else point)
 
 
-def elongate(shape: AbstractSdf, amount) -> Elongated:
+def elongate(shape: AbstractSdf, amount: Numbers) -> Elongated:
     """`shape` cut at the origin and drawn apart by `amount` [m] per axis."""
     return Elongated(shape, amount)
 
@@ -263,7 +263,11 @@ def polar_repeat(shape: AbstractSdf, count: int) -> PolarRepeated:
 
 
 def grid_repeat(
-    shape: AbstractSdf, spacing, counts: tuple[int, ...], *, separate: bool | None = None
+    shape: AbstractSdf,
+    spacing: Numbers,
+    counts: tuple[int, ...],
+    *,
+    separate: bool | None = None,
 ) -> AbstractSdf:
     """Copies of `shape` in rows along all axes: a row of rows, in space of layers.
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.sdf.base import AbstractSdf, Box, Number, number, steepest
 from sorojax.sdf.combine import check_same_dim, hull
 from sorojax.sdf.transform import AbstractWrapped
@@ -126,7 +126,7 @@ class Stretched(AbstractWrapped):
         return lower * self.factors, upper * self.factors
 
 
-def morph(first: AbstractSdf, second: AbstractSdf, fraction) -> Morph:
+def morph(first: AbstractSdf, second: AbstractSdf, fraction: Numbers) -> Morph:
     """The mean of two fields: `first` at `fraction` 0, `second` at 1."""
     return Morph(first, second, fraction)
 
@@ -136,6 +136,6 @@ def displace(shape: AbstractSdf, relief: AbstractRelief) -> Displaced:
     return Displaced(shape, relief)
 
 
-def stretch(shape: AbstractSdf, factors) -> Stretched:
+def stretch(shape: AbstractSdf, factors: Numbers) -> Stretched:
     """`shape` scaled by one of `factors` per axis; a bound of the distance."""
     return Stretched(shape, factors)

@@ -1,5 +1,7 @@
 """Regions between closed outlines, and text drawn by them."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.sdf.bars import segment_square
 from sorojax.sdf.base import Box
 from sorojax.sdf.nearest import scan_rows, take
@@ -60,7 +62,7 @@ def _crossing(row: tuple[Array, Array], x: Array, y: Array) -> Array:
     return (((ay > y) != (by > y)) & right).astype(x.dtype)
 
 
-def outlines(loops) -> Outlines:
+def outlines(loops: Sequence[Numbers]) -> Outlines:
     """The region between closed `loops`, each an array of corners (n, 2) [m]."""
     loops = [real(loop) for loop in loops]
     if not loops:
@@ -76,7 +78,7 @@ def outlines(loops) -> Outlines:
     return Outlines(jnp.concatenate(loops), tuple(int(i) for i in starts))
 
 
-def text(line: str, height, font: str = "DejaVu Sans") -> Outlines:
+def text(line: str, height: Numbers, font: str = "DejaVu Sans") -> Outlines:
     """One `line` of text from the origin along x, as the polygons of its letters.
 
     Args:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.sdf.base import AbstractSdf, Box, Number, number, steepest
 from sorojax.sdf.scalar import clip, norm
 
@@ -90,7 +90,7 @@ class Sampled(AbstractSdf):
         return self.origin - reach, self.origin + self.spacing * last + reach
 
 
-def image(mask, pixel: float, origin=None) -> Sampled:
+def image(mask: Numbers, pixel: float, origin: Numbers | None = None) -> Sampled:
     """The shape of the true pixels (or voxels) of `mask`, by Euclidean distance transform.
 
     Args:

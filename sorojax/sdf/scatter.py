@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sample import finite_box, land, raise_empty, values, values_and_gradients
@@ -13,12 +13,16 @@ _TRIES = 2000
 _BAND = 5e-3  # of the extent: half the layer whose points are moved onto the surface
 
 
-def sample_interior(shape: AbstractSdf, count: int, *, key) -> Float[Array, "count dim"]:
+def sample_interior(
+    shape: AbstractSdf, count: int, *, key: Key[Array, ""]
+) -> Float[Array, "count dim"]:
     """`count` points spread evenly over the inside [m], by rejection."""
     return _collect("sample_interior", shape, count, key, _inside)
 
 
-def sample_boundary(shape: AbstractSdf, count: int, *, key) -> Float[Array, "count dim"]:
+def sample_boundary(
+    shape: AbstractSdf, count: int, *, key: Key[Array, ""]
+) -> Float[Array, "count dim"]:
     """`count` points spread evenly over the surface [m].
 
     Points of a thin layer around the surface are moved onto it: even up to the square

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.sdf.base import BOUND, AbstractSdf, Box, Exactness, check_lengths
 from sorojax.sdf.scalar import (
     absolute,
@@ -224,12 +224,12 @@ def _power(base: Array, power: Array) -> Array:
     return jnp.where(some, jnp.exp(power * jnp.log(safe)), jnp.zeros_like(base))
 
 
-def triangle(a, b, c) -> Polygon:
+def triangle(a: Numbers, b: Numbers, c: Numbers) -> Polygon:
     """Triangle of three corners [m]."""
     return Polygon(jnp.stack([real(a), real(b), real(c)]))
 
 
-def trapezoid(width, top_width, height) -> Polygon:
+def trapezoid(width: Numbers, top_width: Numbers, height: Numbers) -> Polygon:
     """Symmetric trapezoid about the origin, `width` wide below, `top_width` above [m]."""
     low, high, rise = real(width) / 2, real(top_width) / 2, real(height) / 2
     corners = [(-low, -rise), (low, -rise), (high, rise), (-high, rise)]

@@ -5,13 +5,11 @@ edges, narrow gaps or small fillets: cells that halve there. The derivative is t
 computed number, whatever the resolution.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.moments import Rule, frame, moments
 
@@ -52,7 +50,7 @@ def middle_of_mass(
 
 
 def inertia_tensor(
-    shape: AbstractSdf, density: Any = 1.0, resolution: int = 128
+    shape: AbstractSdf, density: Numbers = 1.0, resolution: int = 128
 ) -> Float[Array, "3 3"]:
     """Moments of inertia [kg m^2] about the centroid, differentiable as `volume` is.
 

@@ -39,6 +39,18 @@ class SurfaceReport(NamedTuple):
     crossings: np.ndarray
     wall_thickness: float
 
+    def __repr__(self) -> str:
+        faults = (
+            "open_edges", "crowded_edges", "turned_edges", "pinched_vertices", "degenerate",
+            "crossings",
+        )  # fmt: skip
+        found = [f"{len(getattr(self, f))} {f}" for f in faults if len(getattr(self, f))]
+        return (
+            f"SurfaceReport: {self.num_shells} shell(s) of genus {self.genus}, volume "
+            f"{self.volume:.4g} m^3, area {self.area:.4g} m^2, wall {self.wall_thickness:.4g} "
+            f"m\n  {', '.join(found) or 'no fault found'}"
+        )
+
     @property
     def watertight(self) -> bool:
         """Whether every edge joins two triangles that face the same way."""

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._jax.trace_state import is_traced
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.sdf.base import BOUND, AbstractSdf, Box, Exactness, Number
 from sorojax.sdf.scalar import absolute, minimum
 
@@ -209,32 +209,34 @@ class Repeated(AbstractWrapped):
         return lower + jnp.minimum(zero, last), upper + jnp.maximum(zero, last)
 
 
-def translate(shape: AbstractSdf, offset) -> Translated:
+def translate(shape: AbstractSdf, offset: Numbers) -> Translated:
     """`shape` moved by `offset` [m]."""
     return Translated(shape, offset)
 
 
-def rotate(shape: AbstractSdf, angle, center=(0.0, 0.0)) -> Rotated:
+def rotate(shape: AbstractSdf, angle: Numbers, center=(0.0, 0.0)) -> Rotated:
     """`shape` turned by `angle` [rad] about `center` [m]; in space about the z axis."""
     return Rotated(shape, angle, center)
 
 
-def scale(shape: AbstractSdf, factor) -> Scaled:
+def scale(shape: AbstractSdf, factor: Numbers) -> Scaled:
     """`shape` scaled by `factor` about the origin; distances scale along."""
     return Scaled(shape, factor)
 
 
-def offset(shape: AbstractSdf, thickness) -> Offset:
+def offset(shape: AbstractSdf, thickness: Numbers) -> Offset:
     """`shape` grown by `thickness` [m]; convex corners become round for exact fields."""
     return Offset(shape, thickness)
 
 
-def shell(shape: AbstractSdf, thickness) -> Shell:
+def shell(shape: AbstractSdf, thickness: Numbers) -> Shell:
     """A wall of `thickness` [m] centred on the surface of `shape`."""
     return Shell(shape, thickness)
 
 
-def repeat(shape: AbstractSdf, step, count: int, *, separate: bool | None = None) -> Repeated:
+def repeat(
+    shape: AbstractSdf, step: Numbers, count: int, *, separate: bool | None = None
+) -> Repeated:
     """A row of `count` copies of `shape`, each `step` [m] from the one before.
 
     Args:

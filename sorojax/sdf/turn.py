@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.sdf.bars import check_direction
 from sorojax.sdf.base import AbstractSdf, Box, Exactness
 from sorojax.sdf.scalar import norm
@@ -67,6 +67,6 @@ def turned_box(box: Box, matrix: Float[Array, "dim dim"], shift: Array) -> Box:
     return side(lower, upper), side(upper, lower)
 
 
-def turn(shape: AbstractSdf, axis, angle, center=(0.0, 0.0, 0.0)) -> Turned:
+def turn(shape: AbstractSdf, axis: Numbers, angle: Numbers, center=(0.0, 0.0, 0.0)) -> Turned:
     """A solid turned by `angle` [rad] about `axis` through `center` [m]."""
     return Turned(shape, axis, angle, center)

@@ -38,6 +38,12 @@ class Swept:
     found: int
     hash: str
 
+    def __repr__(self) -> str:
+        arrays = (f"{name} {np.shape(values)}" for name, values in self.result.items())
+        return (
+            f"Swept: {', '.join(arrays)}; {self.computed} chunks computed, {self.found} found"
+        )
+
 
 def sweep(
     function: Callable[..., Mapping[str, Any]],
@@ -95,6 +101,11 @@ def sweep(
     _progress.report("sweep", known, len(jobs))
     missing = {key: job for key, job in jobs.items() if key not in results}
     executor = Serial() if executor is None else executor
+    if not hasattr(executor, "submit"):
+        raise TypeError(
+            f"sweep: got {executor!r} for `executor`, need something with `submit`. Leave it "
+            "out, or give a concurrent.futures executor or sweep.dask_local(workers)."
+        )
     _run_all(function, missing, results, store, executor, len(jobs), retries)
     joined = _joined([results[key] for key in order])
     return Swept(joined, order, len(missing), known, digest(joined))

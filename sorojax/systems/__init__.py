@@ -1,5 +1,6 @@
 """Systems: blocks with ports, networks of them, and their simulation."""
 
+from sorojax._arguments import check_package as _check_package
 from sorojax.math.alpha import GeneralisedAlpha as GeneralisedAlpha
 from sorojax.math.explicit import (
     RungeKutta4 as RungeKutta4,
@@ -88,3 +89,5 @@ from sorojax.systems.stack import Stack as Stack, stack as stack
 from sorojax.systems.touching import Touching as Touching, touching as touching
 from sorojax.systems.valve import Valve as Valve
 from sorojax.systems.waypoints import Waypoints as Waypoints
+
+_check_package(__name__)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.systems.block import AbstractBlock, Input, Output
 
 
@@ -57,14 +57,14 @@ class Weighted(eqx.Module):
         return sum(self.weights[k] * term for k, term in enumerate(terms))
 
 
-def sum_of(weights, *, shape=(), unit: str | None = None) -> Function:
+def sum_of(weights: Numbers, *, shape=(), unit: str | None = None) -> Function:
     """A block that adds inputs `a`, `b`, ... with one weight each; -1 subtracts."""
     law = Weighted(weights)
     ports = tuple("abcdefghijklmnop"[: law.weights.shape[0]])
     return Function(law, ports, shape, unit, shape, unit)
 
 
-def gain(factor, *, shape=(), unit: str | None = None, input_unit: str | None = None):
+def gain(factor: Numbers, *, shape=(), unit: str | None = None, input_unit: str | None = None):
     """A block that multiplies its input `a`; the units say what the factor turns into what."""
     return Function(Weighted([factor]), ("a",), shape, unit, shape, input_unit)
 

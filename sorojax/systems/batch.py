@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from sorojax import _check
 from sorojax._types import real
@@ -27,13 +27,13 @@ _PILOTS = 4  # members that show what the others need
 def simulate_batch(
     make: Callable[[Any], Network],
     designs: PyTree,
-    duration,
+    duration: float | Float[Array, ""],
     *,
     inputs: Mapping[str, Any] | None = None,
     save: int = 201,
     rtol: Any = 1e-6,
     atol: Any = 1e-8,
-    max_step=None,
+    max_step: float | Float[Array, ""] | None = None,
     cheap_steps: int = 4000,
     max_steps: int = 200_000,
     solver: dfx.AbstractSolver | None = None,

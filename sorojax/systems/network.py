@@ -113,9 +113,41 @@ def rates_of(
 ) -> dict[str, PyTree]:
     """Rates of the blocks called `names` alone."""
     own = inputs_of(network, t, state, inputs, names)
-    return {
-        name: network.blocks[name].vector_field(t, state[name], own[name]) for name in names
-    }
+    rates = {}
+    for name in names:
+        rates[name] = network.blocks[name].vector_field(t, state[name], own[name])
+        _check_rate(network, name, state[name], rates[name])
+    return rates
+
+
+def _check_rate(network: Network, name: str, state: PyTree, rate: PyTree) -> None:
+    """Refuse a rate of another structure than its state: integrators pair leaves by place."""
+    want, got = jax.tree.leaves_with_path(state), jax.tree.leaves_with_path(rate)
+    if [(path, jnp.shape(x)) for path, x in want] == [(p, jnp.shape(x)) for p, x in got]:
+        return
+    shapes = {jax.tree_util.keystr(path): jnp.shape(x) for path, x in want}
+    rates = {jax.tree_util.keystr(path): jnp.shape(x) for path, x in got}
+    where = f"Network: `vector_field` of the block `{name}` ({_kind(network, name)})"
+    for leaf in (*shapes, *rates):
+        if leaf not in rates:
+            raise ValueError(
+                f"{where} gives no rate of the state leaf `{leaf}`, need one of shape "
+                f"{shapes[leaf]}. Return a rate for every leaf of `initial_state`."
+            )
+        if leaf not in shapes:
+            raise ValueError(
+                f"{where} gives a rate `{leaf}` that its state has not, need "
+                f"{', '.join(shapes) or 'none'}. Leave it out, or add it to `initial_state`."
+            )
+        if shapes[leaf] != rates[leaf]:
+            raise ValueError(
+                f"{where} gives a rate of shape {rates[leaf]} for the state leaf `{leaf}`, "
+                f"need {shapes[leaf]}. Return it in the shape of the state."
+            )
+
+
+def _kind(network: Network, name: str) -> str:
+    return type(network.blocks[name]).__name__
 
 
 def inputs_of(

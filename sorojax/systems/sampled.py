@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from sorojax import _check
 from sorojax._jax.trace_state import is_traced
@@ -53,9 +53,9 @@ class Sampled(eqx.Module):
 def simulate_sampled(
     network: Network,
     controller: Any,
-    duration,
+    duration: float | Float[Array, ""],
     *,
-    period,
+    period: float | Float[Array, ""],
     measurement: Ports | None = None,
     command: Ports | None = None,
     substeps: int = 10,
@@ -101,6 +101,8 @@ def simulate_sampled(
         )
     ticks = max(1, round(float(duration) / float(period)))
     first = jnp.zeros((), jnp.int32)
+    if memory is None and resume is None:
+        _check_starts(loops)
     memories = None if memory is None else (memory,)
     held = kept = None
     if resume is not None:
@@ -209,7 +211,23 @@ def _loops(controller, measurement, command) -> tuple[Sampled, ...]:
             "simulate_sampled: a controller alone needs `measurement` and `command`: "
             'measurement="body.tip_angle", command="valve.setpoint".'
         )
-    return (Sampled(controller, measurement, command),)
+    if not callable(controller):
+        raise TypeError(
+            f"simulate_sampled: got {controller!r} for `controller`, need a function or a "
+            "Sampled. Write controller(t, measurement, memory) -> (command, memory)."
+        )
+    law: Any = controller
+    return (Sampled(law, measurement, command),)
+
+
+def _check_starts(loops: tuple[Sampled, ...]) -> None:
+    for loop in loops:
+        if not hasattr(loop.controller, "start"):
+            raise ValueError(
+                f"simulate_sampled: got {loop.controller!r} without `start` as a controller, "
+                "need what it remembers before the first call. Pass `memory=`, `memory={}` if "
+                "it remembers nothing."
+            )
 
 
 def _check_ports(network: Network, loop: Sampled) -> None:

@@ -11,6 +11,14 @@ Wires = Mapping[str, str]
 def check_wires(blocks: Blocks, wires: Wires, exposed: tuple[str, ...]) -> None:
     """Raise a `ValueError` unless every input has one driver that fits it."""
     _check_names(blocks)
+    for name, block in blocks.items():
+        for ports in ("inputs", "outputs"):
+            if not isinstance(getattr(block, ports), Mapping):
+                raise TypeError(
+                    f"Network: `{ports}` of the block `{name}` ({type(block).__name__}) is a "
+                    f"{type(getattr(block, ports)).__name__}, need a dict of ports by name. "
+                    "Write it as a property: @property above its def."
+                )
     inputs = {f"{b}.{n}": p for b, block in blocks.items() for n, p in block.inputs.items()}
     made = {f"{b}.{n}": p for b, block in blocks.items() for n, p in block.outputs.items()}
     for target, source in wires.items():

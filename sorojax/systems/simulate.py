@@ -82,15 +82,15 @@ def state_at(film: Trajectory, t: Float[Array, ""]) -> PyTree:
 
 def simulate(
     network: Network,
-    duration,
+    duration: float | Float[Array, ""],
     *,
     state: PyTree = None,
     inputs: Mapping[str, Any] | None = None,
     save: int = 201,
-    step=None,
+    step: float | Float[Array, ""] | None = None,
     rtol: Any = 1e-6,
     atol: Any = 1e-8,
-    max_step=None,
+    max_step: float | Float[Array, ""] | None = None,
     solver: dfx.AbstractSolver | None = None,
     max_steps: int = 200_000,
     events: tuple[Event, ...] = (),

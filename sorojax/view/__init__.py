@@ -7,6 +7,7 @@ not wait for the solvers.
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from sorojax._arguments import check_package as _check_package, public as _public
 from sorojax.view.camera import Camera as Camera, between as between, orbit as orbit
 from sorojax.view.picture import Picture as Picture
 from sorojax.view.scene import (
@@ -76,10 +77,13 @@ if TYPE_CHECKING:
     from sorojax.view.web_actor import Actor as Actor, actor as actor
     from sorojax.view.web_glb import to_glb as to_glb
 
+_check_package(__name__)
+
 
 def __getattr__(name: str) -> Any:
     if name in _MODULE:
-        return getattr(importlib.import_module(f"sorojax.view.{_MODULE[name]}"), name)
+        value = getattr(importlib.import_module(f"sorojax.view.{_MODULE[name]}"), name)
+        return globals().setdefault(name, _public(__name__, name, value))
     raise AttributeError(f"module 'sorojax.view' has no attribute {name!r}")
 
 

@@ -32,7 +32,7 @@ _SYMBOL = {
 
 def show_modes(
     basis: StrainBasis,
-    length,
+    length: float | Float[Array, ""],
     *,
     energy: Mapping[str, float | Sequence[float]] | None = None,
     title: str = "",

@@ -2,8 +2,10 @@
 
 import functools
 import importlib
+import inspect
 from typing import Any
 
+from sorojax import _explain
 from sorojax.view.picture import Picture
 
 #: Noun, module of this floor, function. The class itself is not imported.
@@ -93,7 +95,20 @@ def show(thing: Any, *at: Any, **options: Any) -> Picture:
     Example:
         `view.show(solution, field="von_mises").save("finger.pdf")`
     """
-    return _known(thing)(thing, *at, **options)
+    draw = _known(thing)
+    try:
+        inspect.signature(draw).bind(thing, *at, **options)
+    except TypeError as error:
+        raise TypeError(
+            f"view.show: got {_explain.got(thing)} with {_given(at, options)}, {error}. Need "
+            f"show({', '.join(inspect.signature(draw).parameters)})."
+        ) from None
+    return draw(thing, *at, **options)
+
+
+def _given(at: tuple[Any, ...], options: dict[str, Any]) -> str:
+    words = [f"{len(at)} coordinates"] * bool(at) + [f"`{name}=`" for name in options]
+    return ", ".join(words) or "nothing else"
 
 
 def options(thing: Any) -> Any:

@@ -49,7 +49,7 @@ def actor(
     poses: Float[Any, "frames 4 4"] | None = None,
     displacements: Float[Any, "frames nodes dim"] | None = None,
     field: NodalField | None = None,
-    values: Float[Any, "frames points"] | None = None,
+    values: Float[Any, "*frames points"] | None = None,
     colour: str = style.BODY,
     name: str = "body",
 ) -> Actor:

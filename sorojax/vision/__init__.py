@@ -1,5 +1,6 @@
 """Vision: from an image to points. Pure functions over NumPy arrays; OpenCV where used."""
 
+from sorojax._arguments import check_package as _check_package
 from sorojax.vision.calibration import (
     CharucoBoard as CharucoBoard,
     calibrate as calibrate,
@@ -49,3 +50,5 @@ from sorojax.vision.tracking import (
     follow as follow,
     start_tracks as start_tracks,
 )
+
+_check_package(__name__)
