@@ -24,7 +24,7 @@ _ROWS_PER_CHECK = 80
 _FEWEST_STEPS = 8  # of a run that is judged
 _LIMIT = 0.7  # of the motion
 _COARSE = 0.4  # of what a row moved: then errors no longer follow the order of a method
-_ROUNDING = 16  # units in the last place that two ways of one step may differ by
+_ROUNDING = 0.6  # power of the unit roundoff: what two ways of a step may differ by
 
 
 class Passes(NamedTuple):
@@ -155,7 +155,7 @@ def _too_long(path: Array, repeated: Array, rows: np.ndarray) -> Bool[Array, ""]
     """
     path, repeated = jax.lax.stop_gradient((path, repeated))
     x, y = path.reshape(len(path), -1), repeated.reshape(len(rows), -1)
-    noise = _ROUNDING * jnp.finfo(x.dtype).eps * jnp.max(jnp.abs(x), initial=0.0)
+    noise = float(jnp.finfo(x.dtype).eps) ** _ROUNDING * jnp.max(jnp.abs(x), initial=0.0)
     error = jnp.maximum(_sizes(y - x[rows + 1]) - noise, 0.0)
     between = (np.diff(rows) - 1).astype(error.dtype)
     sum_of_errors = jnp.sum(error) + jnp.sum(_means(error) * between)

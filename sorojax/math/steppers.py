@@ -267,6 +267,7 @@ def integrate(
     """The first state and those after each of `saves` runs of `every` steps, stacked, and
     whether the steps were too long, if that is to be `judged`; with a `label` tells how far
     it is, about a hundred times."""
+    judged = judged and problem.contact is None  # impacts do not follow the order of a method
     rows = rows_between(saves, every, judged)
     short, count = every // rows, saves * rows
     plan, pause = passes(count, saves * every, judged), max(1, count // 100)

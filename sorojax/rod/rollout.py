@@ -78,9 +78,9 @@ def rollout(
             where errors add up to the motion: a twentieth of the time of a run of 160 steps
             or more, four steps of a shorter one. Runs of fewer than 8 steps are not judged.
     """
-    if saves < 1 or every < 1:
+    if saves < 0 or every < 1:
         raise ValueError(
-            f"rollout: got saves={saves} and every={every}, need 1 or more of both. They count "
+            f"rollout: got saves={saves} and every={every}, need 0 and 1 or more. They count "
             "moments and steps."
         )
     if stepper is None:

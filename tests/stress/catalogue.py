@@ -42,7 +42,7 @@ CASES = {
     36: "empty scenes: a defined empty answer",
     37: "fields at kinks and centres: finite slopes",
     38: "shapes without inside: an error, no slivers",
-    39: "steps a hundred times too long: status, or damped; explicit Euler gains energy",
+    39: "steps a hundred times too long: status, and damped by implicit methods",
     40: "impact at 100 m/s: no tunnelling, no energy from nothing",
     41: "a start deep inside an obstacle: let out slowly",
     42: "rest for 1000 s: no drift",

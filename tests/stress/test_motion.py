@@ -49,7 +49,7 @@ def test_a_step_a_hundred_times_too_long(explicit):
         assert film.status == Status.not_finite
     else:
         film = R.rollout(ROD, BENT, 0 * BENT, step=step, saves=200, stepper=GeneralisedAlpha())
-        assert film.status == Status.successful
+        assert film.status == Status.unstable
         assert energy(film.q[-1], film.v[-1]) <= energy(BENT, 0 * BENT)
 
 
