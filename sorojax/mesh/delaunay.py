@@ -3,6 +3,7 @@
 import numpy as np
 
 from sorojax.math.spatial import Delaunay, KDTree
+from sorojax.mesh.constrained import constrained
 from sorojax.mesh.outline import _GRADING, Outline
 from sorojax.mesh.polish import polish
 from sorojax.mesh.sizes import Sizes
@@ -77,7 +78,11 @@ def _doubled_area(corners: np.ndarray) -> np.ndarray:
 def fill(
     shape: AbstractSdf, lines: Outline, sizes: Sizes, iterations: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (those of `lines` first) and triangles of the inside of `shape`."""
+    """Points (those of `lines` first) and triangles of the inside of `shape`.
+
+    Raises:
+        Missing: If edges of the outline cross.
+    """
     wanted, guard, size = SizeField(lines, sizes), Guard(lines), sizes.smallest
     fixed = len(lines.points)
     points = np.concatenate([lines.points, _seeds(shape, lines, wanted, guard)])
@@ -91,33 +96,22 @@ def fill(
             cells = triangles(shape, points, size)
         points = _smooth(shape, points, cells, fixed, wanted, guard)
     cells = triangles(shape, points, size)
+    if not _whole(lines, points, cells):
+        cells = constrained(points, lines)
     used, numbers = np.unique(cells, return_inverse=True)
-    if not np.array_equal(used[:fixed], np.arange(fixed)):
-        raise _lost(lines.points[np.setdiff1d(np.arange(fixed), used)[0]])
     cells = numbers.reshape(cells.shape)
     return polish(points[used], cells, fixed, _GOOD, 2 * iterations), cells
 
 
-def _lost(where: np.ndarray) -> ValueError:
-    return ValueError(
-        f"triangulate: the boundary is not resolved near {where} m. Lower `size`, or "
-        "remove features much thinner than it."
-    )
-
-
-def check_edges(lines: Outline, points: np.ndarray, cells: np.ndarray) -> None:
-    """Raise unless every edge of the outline is a side: once on the boundary, else twice."""
+def _whole(lines: Outline, points: np.ndarray, cells: np.ndarray) -> bool:
+    """Whether every edge of the outline is a side: once on the boundary, else twice."""
     sides = np.sort(np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]]), 1)
     keys, count = np.unique(sides @ [len(points), 1], return_counts=True)
     want = np.sort(lines.edges, axis=1) @ [len(points), 1]
     slot = np.minimum(np.searchsorted(keys, want), len(keys) - 1)
     good = (keys[slot] == want) & (count[slot] == np.where(lines.owner == 0, 1, 2))
-    if not good.all():
-        raise _lost(lines.points[lines.edges[~good][0]].mean(axis=0))
-    if (count == 1).sum() != (lines.owner == 0).sum():
-        raise _lost(
-            points[np.unique(sides[np.isin(sides @ [len(points), 1], keys[count == 1])])][0]
-        )
+    used = len(cells) and np.isin(np.arange(len(lines.points)), cells).all()
+    return bool(used and good.all() and (count == 1).sum() == (lines.owner == 0).sum())
 
 
 def _seeds(shape, lines: Outline, wanted: SizeField, guard: Guard) -> np.ndarray:
@@ -128,7 +122,13 @@ def _seeds(shape, lines: Outline, wanted: SizeField, guard: Guard) -> np.ndarray
     kept = np.zeros((0, 2))
     for level in range(levels, -1, -1):
         spacing = wanted.size / 1.5**level
-        p = _hexagons(lower, upper, spacing)
+        if spacing > 0.8 * wanted.sizes.smallest:
+            p = _hexagons(lower, upper, spacing)
+        else:  # only beside edges of the outline that are so short
+            reach = (1.25 / _GRADING + 1) * spacing
+            p = _hexagons(
+                lower, upper, spacing, lines.points[wanted.local < 1.25 * spacing], reach
+            )
         p = p[values(shape, p) < -_CLEAR * spacing]
         h = wanted(p) if len(p) else np.zeros(0)
         fits = h > spacing * (0.82 if level < levels else 0.0)
@@ -142,12 +142,24 @@ def _seeds(shape, lines: Outline, wanted: SizeField, guard: Guard) -> np.ndarray
     return kept[np.linalg.norm(moved - kept, axis=1) < 1e-12 * wanted.size]
 
 
-def _hexagons(lower: np.ndarray, upper: np.ndarray, spacing: float) -> np.ndarray:
-    count = np.ceil((upper - lower) / spacing / [1, np.sqrt(0.75)]).astype(int) + 1
-    i, j = np.meshgrid(np.arange(count[0]), np.arange(count[1]), indexing="ij")
-    grid = np.stack([i + 0.5 * (j % 2), j * np.sqrt(0.75)], axis=-1).reshape(-1, 2)
+def _hexagons(lower, upper, spacing: float, near=None, reach: float = 0.0) -> np.ndarray:
+    """A hexagonal lattice over a box; with `near` (n, 2), only within about `reach` of it."""
+    high = np.sqrt(0.75)
+    count = np.ceil((upper - lower) / spacing / [1, high]).astype(int) + 1
     # Centred, so that a symmetric shape gets nearly symmetric seeds.
-    return (lower + upper) / 2 + spacing * (grid - (grid.min(0) + grid.max(0)) / 2)
+    most = np.array([count[0] - 1 + 0.5 * (count[1] > 1), (count[1] - 1) * high])
+    start = (lower + upper) / 2 - spacing * most / 2
+    if near is None:
+        i, j = np.meshgrid(np.arange(count[0]), np.arange(count[1]), indexing="ij")
+        ij = np.stack([i, j], axis=-1).reshape(-1, 2)
+    else:
+        here = np.unique(np.round((near - start) / spacing / [1, high]).astype(int), axis=0)
+        wide = int(np.ceil(reach / spacing / high)) + 1
+        block = np.stack(np.meshgrid(*[np.arange(-wide, wide + 1)] * 2), axis=-1)
+        ij = np.unique((here[:, None] + block.reshape(-1, 2)).reshape(-1, 2), axis=0)
+        ij = ij[((ij >= 0) & (ij < count)).all(axis=1)]
+    grid = np.stack([ij[:, 0] + 0.5 * (ij[:, 1] % 2), ij[:, 1] * high], axis=-1)
+    return start + spacing * grid
 
 
 def _sides(cells: np.ndarray) -> np.ndarray:
@@ -173,9 +185,9 @@ def _smooth(shape, points, cells, fixed: int, wanted: SizeField, guard: Guard):
     center, area = _circumcenters(corners), _doubled_area(corners) / 2
     middle = corners.mean(axis=1)
     h = wanted(middle)
-    far = np.linalg.norm(center - middle, axis=1) > 0.6 * h
+    far = ~(np.linalg.norm(center - middle, axis=1) <= 0.6 * h)  # or without area
     center = np.where(far[:, None], middle, center)
-    weight = area / h**3
+    weight = np.maximum(area, 0) / h**3  # cells that were kept may have turned over
     total = np.bincount(cells.ravel(), np.repeat(weight, 3), len(points))
     new = (
         np.stack(

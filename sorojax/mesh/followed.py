@@ -2,11 +2,13 @@
 
 import warnings
 
+import equinox as eqx
 import numpy as np
 
 from sorojax.mesh.boundary_motion import ZOOMS, BoundaryPlan
 from sorojax.mesh.elements import facet_corners
 from sorojax.mesh.mesh import Mesh, boundary_facets
+from sorojax.mesh.resolved import thinnest
 from sorojax.mesh.settle import Sides, settle
 from sorojax.mesh.sizes import Sizes
 from sorojax.mesh.surface_plan import plan_surface
@@ -15,17 +17,45 @@ from sorojax.sdf.sample import values_and_gradients
 
 _OFF = 1e-3  # of an edge: distance from the zero set of a node that was to be on it
 _FAR = 0.25  # of an edge: motion of a corner beyond which its sides may be taken for others
+_ROUNDS = 5  # of taking nodes from ridges
+_NAMED = 24  # nodes at most of which the thinnest place is named
 _LOST = 0.5  # of the size: how far a sharp node may settle from where it is
 
 
-def check_movable(where: str, fields: tuple[AbstractSdf, ...], mesh: Mesh, size: Sizes) -> None:
-    """Raise if corners or ridge nodes of a solid mesh do not settle where they are.
+def movable(where: str, fields: tuple[AbstractSdf, ...], mesh: Mesh, size: Sizes) -> Mesh:
+    """A solid mesh whose corners and ridge nodes settle where they are.
 
     Their sides are looked at from the facets beside them: where these are as long as a wall
-    is thick, another surface is seen, and `move` would take it for theirs.
+    is thick, another surface is seen, and `move` would take it for theirs. Such nodes of the
+    boundary count as those of a chamfer: they stay, and are no longer in "ridges" and
+    "corners". Where interfaces meet the boundary there is an error.
     """
+    for _ in range(_ROUNDS):
+        lost = _unsettled(fields, mesh, size)
+        if not len(lost):
+            return mesh
+        names = ("ridges", "corners")
+        kept = {k: np.setdiff1d(mesh.node_sets[k], lost) for k in names if k in mesh.node_sets}
+        fewer = eqx.tree_at(lambda m: m.node_sets, mesh, {**mesh.node_sets, **kept})
+        if all(len(kept[k]) == len(mesh.node_sets[k]) for k in kept):
+            break
+        mesh = fewer
+    x = np.asarray(mesh.points)[lost]
+    name, at, thick = min(
+        (thinnest(field, x[:_NAMED], size.largest) for field in fields), key=lambda f: f[2]
+    )
+    raise ValueError(
+        f"{where}: {len(lost)} nodes of sharp edges are beside a {name}, a layer or a bend "
+        f"too narrow for the cells, the thinnest near {at} m about {thick:.2g} m thick. "
+        "Lower `size` to the thinnest wall or layer or less, or thicken it."
+    )
+
+
+def _unsettled(fields: tuple[AbstractSdf, ...], mesh: Mesh, size: Sizes) -> np.ndarray:
+    """Corners and ridge nodes that do not settle where they are."""
     plan = plan_surface(mesh, len(fields) - 1).plan
-    x = np.asarray(mesh.points)[np.asarray(plan.sharp)]
+    sharp = np.asarray(plan.sharp)
+    x = np.asarray(mesh.points)[sharp]
     count = [len(own.beside) for own in plan.fields]
     sides = Sides(
         np.concatenate([own.beside for own in plan.fields]).astype(int),
@@ -34,13 +64,7 @@ def check_movable(where: str, fields: tuple[AbstractSdf, ...], mesh: Mesh, size:
     )
     found = settle(fields, x, sides, ZOOMS, np.asarray(plan.ridge), np.asarray(plan.tangent))
     off = np.linalg.norm(found - x, axis=1) / size(x)
-    lost = np.flatnonzero(~(off < _LOST))
-    if len(lost):
-        raise ValueError(
-            f"{where}: {len(lost)} nodes of sharp edges, the first near {x[lost[0]]} m, are "
-            "beside a wall, a layer or a bend that is too narrow for the cells. Lower `size` "
-            "to the thinnest wall or layer or less, or thicken it."
-        )
+    return sharp[~(off < _LOST)]
 
 
 def check_followed(

@@ -15,7 +15,10 @@ _GRADING = 0.35  # growth of the edge length per distance
 _SAME = 1e-6  # of the size: points nearer than that are one point
 _CROWD = 0.75  # of the edge length: radius around its middle free of strangers
 _FINEST = 32  # size over the shortest edge that splitting may leave
+_DETAIL = 1 / 200  # of the size: shorter pieces between corners become one point
+_BESIDE = 2.0  # of a short piece between corners: most of the edge next to it
 _MAX_SPLITS = 12
+_BULGE = 0.4  # of an edge: most distance from its middle to the middle of what it stands for
 
 
 class Outline(NamedTuple):
@@ -39,10 +42,13 @@ class Outline(NamedTuple):
         return np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
 
 
-def outline(shape: AbstractSdf, interfaces: tuple[AbstractSdf, ...], size: Sizes) -> Outline:
-    """Boundary of `shape` and the interfaces inside it, in edges of about `size` [m]."""
+def outline(
+    shape: AbstractSdf, interfaces: tuple[AbstractSdf, ...], size: Sizes, looks: int = 4
+) -> Outline:
+    """Boundary of `shape` and the interfaces inside it, in edges of about `size` [m]; the
+    shapes are looked at `looks` times within a size."""
     fields = (shape, *interfaces)
-    dense = max(size.smallest, size.largest / 8) / 4
+    dense = max(size.smallest, size.largest / 8) / looks
     pieces = [(0, curve) for curve in contour(shape, dense)]
     every = np.concatenate([curve.points for _, curve in pieces])
     margin = 1.37 * dense
@@ -57,7 +63,8 @@ def outline(shape: AbstractSdf, interfaces: tuple[AbstractSdf, ...], size: Sizes
             "position, or leave them out."
         )
     resampled = [(i, _resample(fields[i], part, size)) for i, part in chains]
-    return _split_crowded(fields, _join(resampled, size.smallest), size.smallest / _FINEST)
+    lines = _contracted(_join(resampled, size.smallest), _DETAIL * size.smallest)
+    return _split_crowded(fields, lines, size.smallest / _FINEST)
 
 
 def _break(fields, owner: int, curve: Curve) -> Curve:
@@ -130,13 +137,15 @@ def _resample(field: AbstractSdf, curve: Curve, size: Sizes) -> Curve:
     density = np.r_[0, np.cumsum(step * 2 / (wanted[1:] + wanted[:-1]))]
     stops = np.flatnonzero(corner)
     least = 3 if curve.closed and len(stops) == 2 else 1
-    targets = []
+    targets, starts = [], [0]
     for a, b in zip(stops[:-1], stops[1:], strict=True):
         count = max(least, int(np.ceil(density[b] - density[a] - 0.15)))
         targets.append(np.linspace(density[a], density[b], count + 1)[:-1])
+        starts.append(starts[-1] + count)
     target = np.concatenate([*targets, density[-1:]])
     new = np.stack([np.interp(target, density, points[:, k]) for k in (0, 1)], axis=-1)
-    fixed = np.isin(target, density[stops])
+    fixed = np.zeros(len(target), bool)
+    fixed[starts] = True
     new[~fixed] = land(field, new[~fixed])
     new[fixed] = points[stops]
     if not curve.closed:
@@ -155,6 +164,11 @@ def _spacing(field, points, corner, size: Sizes) -> np.ndarray:
     bend = np.r_[turn / step, 0.0]
     bend = np.maximum(bend, np.r_[0.0, bend[:-1]])
     wanted = np.minimum(size(points), _MAX_TURN / np.maximum(bend, 1e-9 / size.largest))
+    stops = np.flatnonzero(corner)
+    piece = np.diff(np.r_[0, np.cumsum(step)][stops])
+    piece = np.where(piece < _DETAIL * size.smallest, np.inf, _BESIDE * piece)
+    for ends in (stops[:-1], stops[1:]):
+        wanted[ends] = np.minimum(wanted[ends], piece)
     for i in range(1, len(points)):
         wanted[i] = min(wanted[i], wanted[i - 1] + _GRADING * step[i - 1])
     for i in range(len(points) - 2, -1, -1):
@@ -185,6 +199,30 @@ def _join(chains, size: float) -> Outline:
     return Outline(points[used], edges[proper], np.concatenate(owner)[proper], shared[used])
 
 
+def _contracted(lines: Outline, least: float) -> Outline:
+    """`lines` with edges shorter than `least` [m] drawn together to one of their ends."""
+    short = lines.edges[lines.lengths < least]
+    if not len(short):
+        return lines
+    target = np.arange(len(lines.points))
+    for a, b in short:
+        a, b = target[a], target[b]
+        keep, gone = (b, a) if lines.corner[b] and not lines.corner[a] else (a, b)
+        target[target == gone] = keep
+    corner = lines.corner.copy()
+    np.logical_or.at(corner, target, lines.corner)
+    edges = target[lines.edges]
+    # what is smaller than the detail altogether has become points, or edges there and back
+    ways = np.sort(edges, axis=1) @ [len(target), 1]
+    _, row, count = np.unique(ways, return_inverse=True, return_counts=True)
+    there_and_back = (count[row] == 2) & (lines.owner == 0)
+    proper = (edges[:, 0] != edges[:, 1]) & ~there_and_back
+    used, numbers = np.unique(edges[proper], return_inverse=True)
+    return Outline(
+        lines.points[used], numbers.reshape(-1, 2), lines.owner[proper], corner[used]
+    )
+
+
 def _split_crowded(fields, lines: Outline, shortest: float) -> Outline:
     """Split edges until no fixed point lies in the circle over an edge.
 
@@ -193,24 +231,36 @@ def _split_crowded(fields, lines: Outline, shortest: float) -> Outline:
     splitting would go on for ever: it ends at edges of length `shortest`.
     """
     for _ in range(_MAX_SPLITS):
-        points, edges, owner, corner = lines
         crowded = _crowded(lines) & (lines.lengths > 2 * shortest)
         if not crowded.any():
             return lines
-        number = len(points) + np.arange(crowded.sum())
-        new = points[edges[crowded]].mean(axis=1)
-        for i, field in enumerate(fields):
-            mine = owner[crowded] == i
-            new[mine] = land(field, new[mine])
-        first = np.stack([edges[crowded, 0], number], axis=-1)
-        second = np.stack([number, edges[crowded, 1]], axis=-1)
-        lines = Outline(
-            np.concatenate([points, new]),
-            np.concatenate([edges[~crowded], first, second]),
-            np.concatenate([owner[~crowded], owner[crowded], owner[crowded]]),
-            np.concatenate([corner, np.zeros(len(new), bool)]),
-        )
+        lines = split(fields, lines, np.flatnonzero(crowded))
     return lines  # what is still crowded may do; the finished mesh is checked
+
+
+def split(fields, lines: Outline, rows) -> Outline:
+    """`lines` with the edges `rows` halved, new points on the zero sets; an edge whose middle
+    belongs to another part of a zero set stays."""
+    points, edges, owner, corner = lines
+    rows = np.asarray(rows)
+    middle = points[edges[rows]].mean(axis=1)
+    new = middle.copy()
+    for i, field in enumerate(fields):
+        mine = owner[rows] == i
+        new[mine] = land(field, new[mine])
+    own = np.linalg.norm(new - middle, axis=1) < _BULGE * lines.lengths[rows]
+    new, rows = new[own], rows[own]
+    halved = np.zeros(len(edges), bool)
+    halved[rows] = True
+    number = len(points) + np.arange(len(rows))
+    first = np.stack([edges[rows, 0], number], axis=-1)
+    second = np.stack([number, edges[rows, 1]], axis=-1)
+    return Outline(
+        np.concatenate([points, new]),
+        np.concatenate([edges[~halved], first, second]),
+        np.concatenate([owner[~halved], owner[rows], owner[rows]]),
+        np.concatenate([corner, np.zeros(len(new), bool)]),
+    )
 
 
 def _crowded(lines: Outline) -> np.ndarray:

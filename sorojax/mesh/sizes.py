@@ -66,10 +66,11 @@ def sizes(where: str, size: float | SizeFunction, lower, upper) -> Sizes:
     else:
         _check.positive(where, "size", size, "m", "Give the wanted length of a side.")
         field = constant(float(size))
-    if field.smallest > (upper - lower).min():
+    if field.smallest > 2 * (upper - lower).min():
         raise ValueError(
-            f"{where}: edges of {field.smallest:g} m do not fit in a box of {upper - lower} m. "
-            "Lower `size` (lengths are in metres: write 1 * mm)."
+            f"{where}: edges of {field.smallest:g} m do not fit in a box of {upper - lower} m "
+            f"about {(lower + upper) / 2} m: it is {(upper - lower).min():.2g} m thick, need "
+            "half of `size`. Lower `size` (lengths are in metres: write 1 * mm)."
         )
     count = crowd * float(np.prod((upper - lower) / field.smallest))
     if count > _MOST_POINTS:

@@ -20,8 +20,10 @@ def plan_surface(mesh: Mesh, num_interfaces: int) -> Border:
     facets = np.concatenate(groups)
     owner = np.repeat(np.arange(len(groups)), [len(g) for g in groups])
     faces, middles = facets[:, :count], facets[:, count:]
-    sides = surface_sides(points, faces, owner, _marked(mesh))
-    corners, ridge, tangent = _sharp_nodes(points, faces, sides)
+    known = _marked(mesh)
+    sides = surface_sides(points, faces, owner, known)
+    allowed = _most_sides(mesh, faces, owner, known)
+    corners, ridge, tangent, chamfers = _sharp_nodes(points, faces, sides, allowed)
     bent = _curved(points, faces, middles)
     on_ridge = bent & sides.sharp[sides.number]
     if bent.any():
@@ -34,7 +36,8 @@ def plan_surface(mesh: Mesh, num_interfaces: int) -> Border:
     taken, fields = place >= 0, []
     for i in range(len(groups)):
         own = owner == i
-        rows = (faces[own], middles[own], bent[own], sides.patch[own])
+        patch = np.where(np.isin(sides.patch[own], chamfers), -1, sides.patch[own])
+        rows = (faces[own], middles[own], bent[own], patch)
         fields.append(_plan_field(points, *rows, place, taken))
         taken[np.asarray(fields[-1].nodes)] = True
     where = np.arange(len(corners), len(sharp))
@@ -52,8 +55,24 @@ def _marked(mesh: Mesh) -> np.ndarray | None:
     return known
 
 
-def _sharp_nodes(points, faces, sides: Sides):
-    """Corners, ridge nodes, and the direction in which sharp nodes see no side."""
+def _most_sides(mesh: Mesh, faces, owner, known: np.ndarray | None) -> np.ndarray:
+    """How many sides a node may have: two on a ridge, any number at corners and where surfaces
+    meet, else one. Where facets cut an edge off they turn sharply beside nodes of one side."""
+    most = np.full(mesh.num_nodes, mesh.num_nodes)
+    if known is None:
+        return most
+    count = np.zeros(mesh.num_nodes, int)
+    for i in np.unique(owner):
+        count[np.unique(faces[owner == i])] += 1
+    single = count < 2
+    single[np.asarray(mesh.node_sets.get("corners", []), int)] = False
+    most[single] = np.where(known, 2, 1)[single]
+    return most
+
+
+def _sharp_nodes(points, faces, sides: Sides, allowed: np.ndarray):
+    """Corners, ridge nodes, the direction in which sharp nodes see no side, and the patches
+    that are none of the `allowed` number of sides of their node."""
     n = len(points)
     patches, first, number = np.unique(
         sides.patch.ravel(), return_index=True, return_inverse=True
@@ -63,15 +82,21 @@ def _sharp_nodes(points, faces, sides: Sides):
     owner, normal = faces.ravel()[first], unit(total)
     sharp = np.zeros(n, bool)
     sharp[sides.ends[sides.sharp]] = True
-    sharp &= np.bincount(owner, minlength=n) > 1
+    count = np.bincount(owner, minlength=n)
+    sharp &= (count > 1) & (allowed > 1)
+    chamfer = np.zeros(len(patches), bool)
+    for node in np.flatnonzero(sharp & (allowed == 2) & (count > 2)):
+        mine = np.flatnonzero(owner == node)
+        cosine = normal[mine] @ normal[mine].T
+        chamfer[np.delete(mine, np.unravel_index(cosine.argmin(), cosine.shape))] = True
     matrix = np.zeros((n, 3, 3))
-    np.add.at(matrix, owner, normal[:, :, None] * normal[:, None, :])
+    np.add.at(matrix, owner, (normal * ~chamfer[:, None])[:, :, None] * normal[:, None, :])
     nodes = np.flatnonzero(sharp)
     strength, ways = np.linalg.eigh(matrix[nodes])
     tangent = np.zeros_like(points)
     tangent[nodes] = ways[:, :, 0]
     ridge = strength[:, 0] < _FLAT
-    return nodes[~ridge], nodes[ridge], tangent
+    return nodes[~ridge], nodes[ridge], tangent, patches[chamfer]
 
 
 def _curved(points, faces, middles) -> np.ndarray:
@@ -99,7 +124,7 @@ def _plan_field(points, faces, middles, bent, patch, place, taken) -> FieldPlan:
     else:
         nodes = np.zeros(0, int)
     smooth = np.flatnonzero(own & ~taken)
-    row, corner = np.nonzero(place[faces] >= 0)
+    row, corner = np.nonzero((place[faces] >= 0) & (patch >= 0))
     # One side per patch around a sharp node, seen towards the middle of its facets.
     which, first, number = np.unique(patch[row, corner], return_index=True, return_inverse=True)
     here = faces[row, corner]

@@ -6,22 +6,29 @@ from sorojax import _check
 from sorojax._types import real
 from sorojax.mesh.bisect import graded
 from sorojax.mesh.features import Features, sharpen
-from sorojax.mesh.followed import check_movable
+from sorojax.mesh.followed import movable
 from sorojax.mesh.interfaces import Parts, insert, whole
 from sorojax.mesh.lattice import clip, lattice, snap, touching
 from sorojax.mesh.mesh import Mesh
 from sorojax.mesh.peel import peel
-from sorojax.mesh.resolved import check_resolved, check_walls
+from sorojax.mesh.resolved import (
+    NotResolved,
+    check_resolved,
+    check_walls,
+    raise_if_thin,
+    raise_thin,
+)
 from sorojax.mesh.ridge_snap import boundary_triangles
 from sorojax.mesh.sizes import SizeFunction, Sizes, constant, sizes
 from sorojax.mesh.tet10 import solid_mesh
 from sorojax.mesh.tet_shape import badness, signed_volumes
 from sorojax.mesh.tets import Surface, improve
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.sample import finite_box, land, raise_empty
+from sorojax.sdf.sample import EmptyShape, finite_box, land, raise_empty
 
 _ENOUGH = np.deg2rad(22.0)  # dihedral angle above which a cell is left alone
 _STRETCH = 1.5  # of the wanted length that an edge of a bisected cell may have
+_FINER = (1.0, 0.93, 0.85, 0.7)  # of the wanted pitch: lattices that are tried
 _POOR = np.deg2rad(5.0)  # below which a wall is thinner than the lattice can follow
 
 
@@ -44,9 +51,10 @@ def tetrahedralise(
 
     Args:
         shape: A concrete, bounded solid shape.
-        size: Pitch of the cubes of the lattice [m]; edges are 0.87 to 1 of it. A function
-            of points (n, 3) that returns one length per point, such as `grade(...)`, halves
-            the edges of the lattice where it is small.
+        size: Pitch of the cubes of the lattice [m]; edges are 0.87 to 1 of it. Where no wall
+            is thin and cells get too flat all the same, a finer lattice is tried, down to
+            0.7 of it. A function of points (n, 3) that returns one length per point, such as
+            `grade(...)`, halves the edges of the lattice where it is small.
         order: 1 for `Tet4`, 2 for `Tet10` with mid-sides of the surface on the zero set
             wherever the cells stay valid.
         interfaces: Shapes whose zero sets become facets of the mesh inside `shape`.
@@ -62,6 +70,23 @@ def tetrahedralise(
     _check.float64(where, real(0.0))
     lower, upper = finite_box(where, shape, 3)
     lengths = _lengths(where, size, lower, upper)
+    for finer in _FINER:
+        try:
+            return _meshed(
+                (shape, *interfaces), lower, upper, lengths.scaled(finer), order, rounds
+            )
+        except (EmptyShape, NotResolved) as found:
+            # another lattice may do, unless a thin wall is the reason
+            if finer > _FINER[-1] and not getattr(found, "thin", False):
+                continue
+            if isinstance(found, EmptyShape):
+                raise_if_thin(where, shape, lower, upper, lengths)
+            raise
+    raise AssertionError("unreachable")
+
+
+def _meshed(fields, lower, upper, lengths: Sizes, order: int, rounds: int) -> Mesh:
+    where, (shape, *interfaces) = "tetrahedralise", fields
     points, f, cells = _background(where, shape, lower, upper, lengths)
     regular = lengths.largest if lengths.largest == lengths.smallest else None
     points, f = snap(shape, points, f, cells, regular)
@@ -77,11 +102,11 @@ def tetrahedralise(
     widest = lengths if regular else lengths.scaled(_STRETCH)
     check_resolved(where, shape, points[skin], widest, lower, upper)
     check_walls(where, shape, points, boundary_triangles(cells), lengths)
-    parts = _divided((shape, *interfaces), whole(points, cells, skin, features), rounds)
-    _check_shapes(parts.points, parts.cells)
-    mesh = solid_mesh((shape, *interfaces), parts, order)
+    parts = _divided(fields, whole(points, cells, skin, features), rounds)
+    _check_shapes(fields, parts.points, parts.cells, lengths)
+    mesh = solid_mesh(fields, parts, order)
     if parts.features.ridge.any() or interfaces:
-        check_movable(where, (shape, *interfaces), mesh, lengths)
+        mesh = movable(where, fields, mesh, lengths)
     return mesh
 
 
@@ -145,12 +170,8 @@ def _upright(points, cells, lengths: Sizes) -> np.ndarray:
     return cells[np.abs(volume) > 1e-9 * lengths(points[cells[:, 0]]) ** 3]
 
 
-def _check_shapes(points, cells) -> None:
+def _check_shapes(fields, points, cells, lengths: Sizes) -> None:
     bad = badness(points[cells])
-    if bad.max() > np.cos(_POOR):
-        where = points[cells[bad.argmax()]].mean(axis=0)
-        raise ValueError(
-            f"tetrahedralise: a cell near {where} m has a dihedral angle of less than "
-            f"{np.rad2deg(_POOR):.0f} degrees: the shape is thinner there than `size` can "
-            "follow. Lower `size` to the thinnest wall, or thicken it."
-        )
+    poor = np.flatnonzero(bad > np.cos(_POOR))
+    if len(poor):
+        raise_thin("tetrahedralise", fields, points[cells[poor]].mean(axis=1), lengths)

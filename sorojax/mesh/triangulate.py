@@ -4,15 +4,19 @@ import numpy as np
 
 from sorojax import _check
 from sorojax._types import real
-from sorojax.mesh.delaunay import check_edges, fill
+from sorojax.mesh.constrained import Missing
+from sorojax.mesh.delaunay import fill
 from sorojax.mesh.elements import Tri3, Tri6
 from sorojax.mesh.mesh import Mesh
-from sorojax.mesh.outline import Outline, outline
-from sorojax.mesh.resolved import check_resolved
-from sorojax.mesh.sizes import SizeFunction, constant, sizes
+from sorojax.mesh.outline import Outline, outline, split
+from sorojax.mesh.resolved import bulging, raise_if_thin, raise_thin, unseen
+from sorojax.mesh.sizes import SizeFunction, Sizes, sizes
 from sorojax.mesh.tri6 import least_jacobian, with_middles
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.sample import finite_box, land
+from sorojax.sdf.sample import EmptyShape, finite_box, land, raise_empty
+
+_LOOKS = (4, 8, 24)  # points within a size where the shape is looked at: more if in doubt
+_REPAIRS = 6  # rounds of splitting edges that cross
 
 
 def triangulate(
@@ -52,13 +56,34 @@ def triangulate(
     box = finite_box("triangulate", shape, 2)
     lengths = sizes("triangulate", size, *box)
     interfaces = tuple(interfaces)
-    lines = outline(shape, interfaces, lengths)
-    check_resolved("triangulate", shape, lines.points, constant(lengths.largest), *box)
-    points, cells = fill(shape, lines, lengths, iterations)
-    check_edges(lines, points, cells)
+    lines, points, cells = _filled(shape, interfaces, lengths, box, iterations)
     if order == 1:
         return Mesh(points, cells, Tri3(), *_sets(lines, lines.edges, len(interfaces)))
     return _curved((shape, *interfaces), lines, points, cells)
+
+
+def _filled(shape, interfaces, lengths: Sizes, box, iterations: int):
+    """`(lines, points, cells)`; the outline is drawn from nearer where it is in doubt."""
+    for looks in _LOOKS:
+        try:
+            lines = outline(shape, interfaces, lengths, looks)
+            if not len(lines.edges):
+                raise_empty("triangulate", *box, lengths.smallest / looks)
+        except EmptyShape:
+            if looks < _LOOKS[-1]:
+                continue
+            raise_if_thin("triangulate", shape, *box, lengths)
+            raise
+        if looks < _LOOKS[-1] and bulging((shape, *interfaces), lines, lengths):
+            continue
+        doubt = unseen(shape, lines, lengths, *box)
+        for _ in range(_REPAIRS if not len(doubt) else 0):
+            try:
+                return lines, *fill(shape, lines, lengths, iterations)
+            except Missing as found:
+                doubt = lines.points[lines.edges[found.edges]].mean(axis=1)
+                lines = split((shape, *interfaces), lines, found.edges)
+    raise_thin("triangulate", (shape, *interfaces), doubt, lengths)
 
 
 def _curved(fields, lines: Outline, points, cells) -> Mesh:

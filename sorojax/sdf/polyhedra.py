@@ -72,6 +72,9 @@ def _smaller(base: Array, flank: Array) -> Array:
     return minimum(base, absolute(flank))
 
 
+_ON_SURFACE = 16  # of rounding: points that near to the surface are on it
+
+
 class TriangleMesh(AbstractSolidShape):
     """Solid inside a closed triangle mesh, by the nearest of its triangles.
 
@@ -117,8 +120,14 @@ class TriangleMesh(AbstractSolidShape):
             inside = self.tree.inside(held, self.faces, index, at)
         # Over a face its plane gives the distance; the sign stays as found.
         side = triangle_side(p, *take(corners, index), inside)
-        outward = jnp.where(jax.lax.stop_gradient(side) < 0, inside, ~inside)
-        return jnp.where(outward | (side == 0), side, -side).reshape(x.shape)
+        found = jax.lax.stop_gradient(side)
+        outward = jnp.where(found < 0, inside, ~inside)
+        # On the surface rounding decides the sign, but not which way the faces look.
+        a, b, c = jax.lax.stop_gradient(corners)
+        tiny = _ON_SURFACE * float(jnp.finfo(found.dtype).eps) * jnp.max(absolute(a))
+        looks_out = jnp.sum(a * jnp.cross(b, c)) > 0
+        outward = jnp.where(absolute(found) <= tiny, looks_out, outward)
+        return jnp.where(outward, side, -side).reshape(x.shape)
 
     def bounding_box(self) -> Bounds:
         used = self.vertices[self.faces.reshape(-1)]

@@ -1,5 +1,7 @@
 """Fields sampled on the host: two compiled kernels of fixed size per kind of shape."""
 
+from typing import NoReturn
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -95,8 +97,12 @@ def finite_box(where: str, shape: AbstractSdf, dim: int) -> tuple[np.ndarray, np
     return lower, upper
 
 
-def raise_empty(where: str, lower: np.ndarray, upper: np.ndarray, cell: float) -> None:
-    raise ValueError(
+class EmptyShape(ValueError):
+    """No inside was found."""
+
+
+def raise_empty(where: str, lower: np.ndarray, upper: np.ndarray, cell: float) -> NoReturn:
+    raise EmptyShape(
         f"{where}: the shape is empty: no inside found between {lower} m and {upper} m at a "
         f"resolution of {cell:g} m. Check its signs (negative inside), or lower `size`."
     )

@@ -68,7 +68,8 @@ def level_curves(
     field = np.where(np.abs(field) < nudge, nudge, field)
     spacing = (upper - lower) / (counts - 1)
     rough = [lower + c * spacing for c in find_contours(field, 0.0)]
-    return [_refine(shape, c, size) for c in rough if len(c) > 3]
+    curves = [_refine(shape, c, size) for c in rough if len(c) > 3]
+    return [c for c in curves if len(c.points) > (2 if c.closed else 1)]
 
 
 def _refine(shape: AbstractSdf, rough: np.ndarray, size: float) -> Curve:

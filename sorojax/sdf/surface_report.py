@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sorojax.sdf.isosurface import Surface
-from sorojax.sdf.triangle_pairs import crossing_triangles, least_wall
+from sorojax.sdf.triangle_pairs import crossing_triangles
+from sorojax.sdf.triangle_rays import least_wall
 
 
 class SurfaceReport(NamedTuple):
@@ -21,8 +22,9 @@ class SurfaceReport(NamedTuple):
         genus: Number of handles, all shells together; -1 for an open surface.
         crossings: (n, 2) triangles that share no vertex and pass through each other; at most
             1000 of them.
-        wall_thickness: Smallest distance [m] through the body, from triangle centres along
-            the inward normal; infinite for an open surface.
+        wall_thickness: Smallest distance [m] through the body along inward normals, between
+            sides that face away from each other within 25 degrees; infinite for an open
+            surface, and where no such sides are.
         volume: Enclosed volume [m^3], negative where triangles face inwards.
         area: Surface area [m^2].
     """

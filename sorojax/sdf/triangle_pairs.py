@@ -1,14 +1,11 @@
-"""Triangles that pass through each other, and the walls between triangles that face away."""
+"""Triangles that pass through each other."""
 
 import numpy as np
 
 from sorojax.math.spatial import KDTree
 
 _MOST = 1000  # pairs that are listed
-_SAMPLES = 4000  # triangles whose wall is measured
 _PIECE = 20_000
-_SMOOTH = 0.7  # cosine between neighbours below which an edge is sharp
-_OPPOSITE = -0.9  # cosine between the normals of the two sides of a wall
 
 
 def _circles(vertices, triangles) -> tuple[np.ndarray, np.ndarray]:
@@ -79,55 +76,3 @@ def _pierces(start, end, triangle, rounding) -> np.ndarray:
     sides = [_volume(start, end, u, v) for u, v in ((a, b), (b, c), (c, a))]
     least, most = np.minimum.reduce(sides), np.maximum.reduce(sides)
     return across & ((least > rounding) | (most < -rounding))
-
-
-def least_wall(vertices: np.ndarray, triangles: np.ndarray) -> float:
-    """Smallest diameter [m] of balls inside the surface that touch it at triangle centres.
-
-    A ball shrinks until no other centre lies in it (Ma et al. 2012). At sharp edges the
-    balls vanish: triangles that meet a neighbour there are not asked, unless all do, and
-    only sides that face away from each other within 25 degrees make a wall. At most 4000
-    triangles, spread over the list, are asked.
-    """
-    corners = vertices[triangles]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.sqrt((normal * normal).sum(axis=1))
-    real = np.flatnonzero(length > 0)
-    normal, centers = normal[real] / length[real, None], corners[real].mean(axis=1)
-    if not len(real):
-        return np.inf
-    tree = KDTree(centers)
-    flat = _away_from_edges(triangles[real], normal)
-    asked = np.flatnonzero(flat)
-    rows = asked[:: -(-len(asked) // _SAMPLES)]
-    point, inward = centers[rows], -normal[rows]
-    radius = np.full(len(rows), float(np.ptp(centers, axis=0).max()) + 1e-300)
-    touched = rows.copy()
-    active = np.arange(len(rows))
-    for _ in range(30):
-        at, r, into = point[active], radius[active], inward[active]
-        distance, near = tree.query(at + r[:, None] * into)
-        offset = centers[near] - at
-        along = (offset * into).sum(axis=1)
-        shrinks = (distance < r * (1 - 1e-6)) & (near != rows[active]) & (along > 0)
-        active, near = active[shrinks], near[shrinks]
-        if not len(active):
-            break
-        radius[active] = (offset**2).sum(axis=1)[shrinks] / (2 * along[shrinks])
-        touched[active] = near
-    opposite = (normal[touched] * normal[rows]).sum(axis=1) < _OPPOSITE
-    opposite &= flat[touched]
-    return float(2 * radius[opposite].min(initial=np.inf))
-
-
-def _away_from_edges(triangles: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Triangles all of whose neighbours lie within 45 degrees; all of them if there is none."""
-    half = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1), axis=-1)
-    name = (half[..., 0] * (int(triangles.max()) + 1) + half[..., 1]).ravel()
-    order = np.argsort(name, kind="stable")
-    same = np.flatnonzero(name[order[1:]] == name[order[:-1]])
-    a, b = order[same] // 3, order[same + 1] // 3
-    bent = (normal[a] * normal[b]).sum(axis=1) < _SMOOTH
-    flat = np.ones(len(triangles), bool)
-    flat[a[bent]] = flat[b[bent]] = False
-    return flat if flat.any() else ~flat

@@ -207,7 +207,7 @@ def triangle_tree(
     if (uses != 2).any() or len(np.unique(ways, axis=0)) != len(ways):
         return None
     triangles = vertices[faces]
-    order = _order(triangles.mean(axis=1))
+    order = order_by_halving(triangles.mean(axis=1))
     cells = None
     if lists:
         slots = np.zeros(len(faces), np.int64)
@@ -223,7 +223,7 @@ def triangle_tree(
     )
 
 
-def _order(centres: np.ndarray) -> np.ndarray:
+def order_by_halving(centres: np.ndarray) -> np.ndarray:
     """Rows of `centres` halved again and again across their longest side, padded."""
     count = len(centres)
     leaves = 1 << max(0, -(-count // LEAF) - 1).bit_length()

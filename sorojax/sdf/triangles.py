@@ -7,6 +7,7 @@ from sorojax.sdf.bars import segment_square
 from sorojax.sdf.scalar import clip, minimum, quotient, root
 
 Vector = tuple[Array, ...]  # x, y, z
+_ON_EDGE = 1024  # of rounding, of a side: points that near to an edge are on it
 
 
 def minus(a: Vector, b: Vector) -> Vector:
@@ -23,14 +24,17 @@ def cross(a: Vector, b: Vector) -> Vector:
     )  # fmt: skip
 
 
-def over(p: Vector, a: Vector, b: Vector, c: Vector) -> tuple[Array, Array]:
-    """Height of p over the plane of a triangle, and whether its foot is on the triangle."""
+def over(p: Vector, a: Vector, b: Vector, c: Vector, slack: float = 0.0) -> tuple[Array, Array]:
+    """Height of p over the plane of a triangle, and whether its foot is on the triangle, or
+    beside it by at most `slack` of its sides."""
     n = cross(minus(b, a), minus(c, a))
+    square = dot(n, n)
     within = None
     for start, end in ((a, b), (b, c), (c, a)):
-        side = dot(cross(minus(end, start), minus(p, start)), n) >= 0
+        e = minus(end, start)
+        beyond = -slack * dot(e, e) * root(square) if slack else 0.0
+        side = dot(cross(e, minus(p, start)), n) >= beyond
         within = side if within is None else within & side
-    square = dot(n, n)
     height = quotient(dot(n, minus(p, a)), root(square) + jnp.zeros_like(p[0]))
     return height, within & (square > 0)
 
@@ -43,8 +47,9 @@ def triangle_square(p: Vector, a: Vector, b: Vector, c: Vector) -> Array:
 
 
 def triangle_side(p: Vector, a: Vector, b: Vector, c: Vector, inside: Array) -> Array:
-    """Signed distance to the nearest triangle; over its face it has a slope at zero too."""
-    height, within = over(p, a, b, c)
+    """Signed distance to the nearest triangle; over its face it has a slope at zero too, and
+    on an edge that of one of the faces beside it."""
+    height, within = over(p, a, b, c, _ON_EDGE * float(jnp.finfo(p[0].dtype).eps))
     edges = [segment_square(p, *ends) for ends in ((a, b), (b, c), (c, a))]
     far = root(minimum(edges[0], minimum(edges[1], edges[2])))
     return jnp.where(within, height, jnp.where(inside, -far, far))
