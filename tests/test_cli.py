@@ -43,13 +43,13 @@ def test_info_names_versions_devices_precision_solvers_and_cache(tmp_path):
 def test_info_tells_whether_jax_was_tested_and_which_fast_paths_are_off(monkeypatch):
     paths = {"small_kernels": "on", "host_call": "off: this jax has no such name"}
     monkeypatch.setattr("sorojax._jax.fast_paths", lambda: paths)
-    installed = {"jax": "0.10.0", "jaxlib": "0.10.0"}
+    installed = {"jax": "0.10.2", "jaxlib": "0.10.2"}
     monkeypatch.setattr("sorojax.cli.info._version", lambda name: installed.get(name, "1.0"))
     facts = info()
-    assert facts["jax"] == f"0.10.0, tested with sorojax {sorojax.__version__}"
+    assert facts["jax"] == f"0.10.2, tested with sorojax {sorojax.__version__}"
     assert facts["fast path small_kernels"] == "on"
     assert facts["fast path host_call"] == "off: this jax has no such name"
-    for jax_and_lib in (("0.13.0", "0.13.0"), ("0.10.2", "0.10.0")):
+    for jax_and_lib in (("0.13.0", "0.13.0"), ("0.12.0.1", "0.10.2")):
         installed.update(zip(("jax", "jaxlib"), jax_and_lib, strict=True))
         assert f", not tested with sorojax {sorojax.__version__}" in info()["jax"]
 

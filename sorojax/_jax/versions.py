@@ -4,8 +4,8 @@ import importlib.util
 import re
 from importlib import metadata
 
-OLDEST = "0.10.0"
-TESTED = ("0.10.0", "0.10.2", "0.12.0.1")
+OLDEST = "0.10.2"
+TESTED = ("0.10.2", "0.12.0.1")
 _COMMAND = f"pip install --upgrade 'jax>={OLDEST}'"
 
 

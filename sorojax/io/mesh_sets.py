@@ -109,6 +109,7 @@ def unpacked(
         for part in () if name.startswith("rest_") or not tags else name.split(_BETWEEN):
             known = lists.get(part)
             lists[part] = rows if known is None else _together(known, rows)
+    _check_sets(nodes, lists, count, [len(block.data) for block in raw.cells])
     start = np.cumsum([0, *(len(raw.cells[i].data) for i in own)])
     regions, facets = {}, {}
     for name, rows in lists.items():
@@ -120,6 +121,27 @@ def unpacked(
             facets[name] = new[np.concatenate(sides)]
     renumbered = {name: new[ids] for name, ids in nodes.items()}
     return Sets({n: ids[ids >= 0] for n, ids in renumbered.items()}, facets, regions)
+
+
+def _check_sets(nodes: dict, lists: dict, num_nodes: int, num_cells: list[int]) -> None:
+    """Raise a `ValueError` where a set names nodes or cells that the file does not hold."""
+    for name, ids in nodes.items():
+        if not _within(ids, num_nodes):
+            raise ValueError(_unknown(name, "nodes", f"{num_nodes} nodes"))
+    for name, rows in lists.items():
+        if len(rows) != len(num_cells) or not all(map(_within, rows, num_cells)):
+            raise ValueError(_unknown(name, "cells", f"{len(num_cells)} blocks of {num_cells}"))
+
+
+def _within(ids: np.ndarray, count: int) -> bool:
+    return len(ids) == 0 or (ids.min() >= 0 and ids.max() < count)
+
+
+def _unknown(name: str, kind: str, found: str) -> str:
+    return (
+        f"import_mesh: the set `{name}` names {kind} that the file does not hold, which has "
+        f"{found}. Export it again."
+    )
 
 
 def _together(first: list, second: list) -> list[np.ndarray]:

@@ -138,7 +138,8 @@ def prepare(model: Model, constants, tolerance, max_iterations: int) -> Search:
     """A search for the equilibria of `model`; its metric takes no part in derivatives."""
     measure = jax.lax.stop_gradient(metric(model, constants))
     rounding = 4 * float(jnp.finfo(measure.dtype).eps)
-    floor = rounding**2 * jax.lax.stop_gradient(unit_energy(model, measure))
+    # Forces far larger than those of the rod, as of a stiff pin, leave rounding of their own.
+    floor = (16 * rounding) ** 2 * jax.lax.stop_gradient(unit_energy(model, measure))
     tolerance = jnp.maximum(real(tolerance).astype(measure.dtype), 16 * rounding)
     return Search(model, measure, floor, tolerance, max_iterations)
 
