@@ -141,10 +141,14 @@ def bored(wall, radius=0.15):
     return sdf.Box([-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]) - cut
 
 
+def test_a_wall_of_a_quarter_of_the_size_is_meshed():
+    quality = M.quality(M.tetrahedralise(bored(0.03), size=0.12))
+    assert quality.watertight and np.isclose(quality.size, 1 - np.pi * 0.15**2, rtol=1e-2)
+
+
 def test_bad_solids_are_refused_with_the_remedy():
-    for wall in (0.0035, 0.03):
-        with pytest.raises(ValueError, match="Lower `size`"):
-            M.tetrahedralise(bored(wall), size=0.12)
+    with pytest.raises(ValueError, match="Lower `size`"):
+        M.tetrahedralise(bored(0.0035), size=0.12)
     with pytest.raises(ValueError, match="empty"):
         M.tetrahedralise(BALL & sdf.Sphere([1.8, 0.9, 0], 1), size=0.3)
     lost = eqx.tree_at(lambda s: s.radius, BALL, jnp.asarray(np.nan))
