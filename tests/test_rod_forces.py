@@ -202,6 +202,16 @@ def test_drag_of_a_cylinder_in_a_cross_flow(arc):
     assert np.allclose(force, load * 0.08**3 / 6, rtol=1e-12, atol=0)
 
 
+def test_drag_of_a_cylinder_along_the_flow():
+    flow, finger = 0.7, dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2e3)
+    rod = R.rod(SE2(), R.chebyshev(sigma_x=1), R.circle(6e-3), nodes=4, **finger)
+    drag = R.Drag(1000.0, 12e-3, along=0.02, flow=[flow, 0.0])
+    (force,) = forces(R.motion(rod, jnp.zeros(1)), drag)
+    # Friction on the circumference, whose load p stretches a clamped rod by p L^2 / 2.
+    load = 1000.0 * np.pi * 12e-3 * 0.02 * flow**2 / 2
+    assert np.allclose(force, load * 0.08**2 / 2, rtol=1e-12, atol=0)
+
+
 def test_a_section_law_replaces_the_linear_one(general):
     rod, q, _, motion = general
     expected = np.asarray(R.elastic_force(rod, q))

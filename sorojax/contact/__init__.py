@@ -10,6 +10,6 @@ from sorojax.contact.points import (
     contacts as contacts,
     gaps as gaps,
 )
-from sorojax.contact.swept import passes as passes
+from sorojax.contact.swept import crosses as crosses, passes as passes
 
 _check_package(__name__)

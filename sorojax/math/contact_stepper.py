@@ -5,8 +5,10 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
+from sorojax.math.cut import cut
 from sorojax.math.dense import solve_symmetric
 from sorojax.math.steppers import (
     AbstractStepper,
@@ -14,9 +16,13 @@ from sorojax.math.steppers import (
     Kinematic,
     SecondOrder,
     move,
+    start,
 )
 
 _SHORTER = 0.4  # of a Newton step that did not help
+_CUTS = 7  # halvings of a step in a row
+_GAIN, _FREE_GAIN = 1e-3, 1e-2  # of its energy, that a long step may gain in contact, apart
+_LEAST = 1e-5  # of it, however much was gained before
 
 
 class ContactMidpoint(AbstractStepper):
@@ -52,17 +58,39 @@ class ContactMidpoint(AbstractStepper):
     theta: float = eqx.field(static=True, default=0.5)
     tolerance: float = eqx.field(static=True, default=0.0)
 
+    def begin(self, problem, t, q, v):
+        begun = start(problem, t, q, v)
+        return begun if problem.contact is None else _with_record(begun)
+
     def step(self, problem, t, h, state):
-        contact = problem.contact
-        if contact is None:
+        if problem.contact is None:
             return ImplicitMidpoint(self.passes).step(problem, t, h, state)
-        at = _At(t, h, self.theta * h)
-        if self.lasting and self.passes == 1 and self.tolerance > 0:
-            new = _solve_together(problem, at, state, self)
-        else:
-            new = _solve_apart(problem, at, state, self)
-        half = state.v + at.part * new
-        return Kinematic(move(problem, state.q, h * half), state.v + h * new, new)
+        state = _with_record(state)
+
+        def whole(t, h, *state):
+            return _step(problem, _At(t, h, self.theta * h), Kinematic(*state), self)
+
+        t, begun = jnp.asarray(t, h.dtype), state[:4]
+        method, numbers = jax.closure_convert(whole, t, h, *begun)
+
+        def attempt(given, offset, size, state):
+            t, resolved, numbers = given
+            return jax.lax.cond(
+                resolved,
+                lambda: method(t + offset, size, *state, *numbers),
+                lambda: (state, jnp.zeros((), bool)),
+            )
+
+        given = t, state.resolved, tuple(numbers)
+        new, reached = cut(attempt, _CUTS, given, h, begun)
+        return Kinematic(*new, state.resolved & reached)
+
+
+def _with_record(state: Kinematic) -> Kinematic:
+    """The state with what contact keeps a record of."""
+    if state.resolved is not None:
+        return state
+    return Kinematic(*state[:3], jnp.zeros((), state.v.dtype), jnp.array(True))
 
 
 class _At(NamedTuple):
@@ -71,6 +99,40 @@ class _At(NamedTuple):
     t: Array
     h: Array
     part: Array
+
+
+def _step(problem: SecondOrder, at: _At, state: Kinematic, method: ContactMidpoint):
+    """The state after a step, without its flag, and whether the step can be taken."""
+    contact = problem.contact
+    assert contact is not None
+    if method.lasting and method.passes == 1 and method.tolerance > 0:
+        near, long, new = _solve_together(problem, at, state, method)
+    else:
+        near, long, new = _solve_apart(problem, at, state, method)
+    inner = state.v + at.part * new
+    end = Kinematic(move(problem, state.q, at.h * inner), state.v + at.h * new, new)
+    ways = jax.lax.stop_gradient((state[:2], end[:2]))
+    passed = jax.lax.cond(near, lambda: contact.passed(*ways, at.h), lambda: np.False_)
+    kept, gained = jax.lax.cond(
+        long, lambda: _balance(problem, at, state, end, inner), lambda: (np.True_, 0 * at.h)
+    )
+    return (*end[:3], state.gained + gained), ~passed & kept
+
+
+def _balance(problem: SecondOrder, at: _At, state: Kinematic, end: Kinematic, inner: Array):
+    """Whether the energies of motion and contact grew by no more than the work of the other
+    forces, but for small shares of them, in this step and in all; and what they gained."""
+    contact = problem.contact
+    assert contact is not None
+    state, end, inner = jax.lax.stop_gradient((state, end, inner))
+    middle = move(problem, state.q, at.part * inner)
+    work = at.h * (inner @ contact.plain(at.t + at.part, middle, inner))
+    (moving, stored), (moves, stores) = (contact.energy(*x[:2]) for x in (state, end))
+    gained = moves + stores - moving - stored - work
+    size = moving + stored + moves + stores
+    most = jnp.where(stores > 0, _GAIN, _FREE_GAIN) * size
+    most = jnp.minimum(most, _GAIN * size / 4 - state.gained)
+    return gained <= jnp.maximum(most, _LEAST * size), jax.lax.stop_gradient(gained)
 
 
 def _solve_apart(problem: SecondOrder, at: _At, state: Kinematic, method: ContactMidpoint):
@@ -85,7 +147,8 @@ def _solve_apart(problem: SecondOrder, at: _At, state: Kinematic, method: Contac
         first = state.a if method.lasting else new
         return _solve_touching(problem, at, state, first, method)
 
-    return jax.lax.cond(problem.contact.near(moment, at.h), touch, lambda: new)
+    near, long = problem.contact.near(moment, at.h)
+    return near, long, jax.lax.cond(near, touch, lambda: new)
 
 
 class _Search(NamedTuple):
@@ -122,10 +185,12 @@ def _solve_together(problem: SecondOrder, at: _At, state: Kinematic, method: Con
     contact = problem.contact
     assert contact is not None
 
-    def improve(k, near, search: _Search) -> tuple[Array, _Search]:
+    def improve(k, near, long, search: _Search) -> tuple[Array, Array, _Search]:
         trial = search.best + search.share * search.direction
         mass, force, moment = _free_at(problem, at, state, trial)
-        near = jax.lax.cond(k == 0, lambda: contact.near(moment, at.h), lambda: near)
+        near, long = jax.lax.cond(
+            k == 0, lambda: contact.near(moment, at.h), lambda: (near, long)
+        )
 
         def touching() -> _Search:
             found = _touching(problem, at, state, trial, mass, force)
@@ -135,13 +200,16 @@ def _solve_together(problem: SecondOrder, at: _At, state: Kinematic, method: Con
             new = trial - _newton(problem, at, mass, mass @ trial - force)
             return search._replace(best=new, done=jnp.ones_like(search.done))
 
-        return near, jax.lax.cond(near, touching, apart)
+        return near, long, jax.lax.cond(near, touching, apart)
 
     def unless_done(k, carry):
-        return jax.lax.cond(carry[1].done, lambda: carry, lambda: improve(k, *carry))
+        return jax.lax.cond(carry[2].done, lambda: carry, lambda: improve(k, *carry))
 
-    start = jnp.array(False), _search_from(state.a)
-    return jax.lax.fori_loop(0, max(1, method.contact_passes), unless_done, start)[1].best
+    none = jnp.array(False)
+    start = none, none, _search_from(state.a)
+    passes = max(1, method.contact_passes)
+    near, long, search = jax.lax.fori_loop(0, passes, unless_done, start)
+    return near, long, search.best
 
 
 def _search_from(new: Array) -> _Search:

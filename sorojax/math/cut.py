@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from sorojax.math.method import finite
+from sorojax.math.told import any_of_lanes
 
 #: (given, offset, size, state) -> state after a step of `size` at `offset`, converged or not.
 Attempt = Callable[[Any, Array, Array, PyTree], tuple[PyTree, Bool[Array, ""]]]
@@ -48,16 +49,29 @@ def cut(
 @cut.def_jvp
 def _cut_jvp(primals, tangents):
     attempt, max_cuts, given, h, state = primals
-    walk = _walked(attempt, max_cuts, given, h, state)
-    ends = jax.lax.stop_gradient(walk.ends)
 
-    def replayed(given, h, state):
-        return _replay(attempt, ends, given, h, state)
+    def whole(given, h, state):
+        return attempt(given, jnp.zeros_like(h), h, state)
 
-    moved = eqx.filter_jvp(replayed, (given, h, state), tangents[2:])[1]
-    reached = walk.done >= 1.0
-    kept = jax.tree.map(lambda a: jnp.where(reached, a, jnp.zeros_like(a)), moved)
-    return _held(walk, walk.state, state), (kept, None)
+    (new, converged), (moved, _) = eqx.filter_jvp(whole, primals[2:], tangents[2:])
+    fine = _fine(new, converged)
+
+    def in_parts():
+        walk = _walked(attempt, max_cuts, given, h, state)
+        ends = jax.lax.stop_gradient(walk.ends)
+
+        def replayed(given, h, state):
+            return _replay(attempt, ends, given, h, state)
+
+        moved = eqx.filter_jvp(replayed, primals[2:], tangents[2:])[1]
+        reached = walk.done >= 1.0
+        kept = jax.tree.map(lambda a: jnp.where(reached, a, jnp.zeros_like(a)), moved)
+        return _held(walk, walk.state, state), kept
+
+    # most steps are whole, whose derivative needs no replay
+    return_whole = (new, fine), moved
+    values, moved = jax.lax.cond(any_of_lanes(~fine), in_parts, lambda: return_whole)
+    return values, (moved, None)
 
 
 def filled(values: PyTree, tangents: PyTree) -> PyTree:
@@ -69,6 +83,10 @@ def filled(values: PyTree, tangents: PyTree) -> PyTree:
     return jax.tree.map(one, values, tangents, is_leaf=lambda x: x is None)
 
 
+def _fine(new: PyTree, converged: Bool[Array, ""]) -> Bool[Array, ""]:
+    return converged & finite(eqx.filter(new, eqx.is_inexact_array))
+
+
 def _held(walk: _Walk, new: PyTree, old: PyTree):
     reached = walk.done >= 1.0
     return jax.tree.map(lambda a, b: jnp.where(reached, a, b), new, old), reached
@@ -77,7 +95,7 @@ def _held(walk: _Walk, new: PyTree, old: PyTree):
 def _walked(attempt: Attempt, max_cuts: int, given, h, state) -> _Walk:
     def one_pass(walk: _Walk) -> _Walk:
         new, converged = attempt(given, walk.done * h, walk.share * h, walk.state)
-        fine = converged & finite(eqx.filter(new, eqx.is_inexact_array))
+        fine = _fine(new, converged)
         end = walk.done + walk.share
         wide = 2 * walk.share
         grows = (wide <= 1.0) & (jnp.remainder(end, wide) == 0.0)

@@ -35,8 +35,11 @@ class Status(eqx.Enumeration):
         "tenfold. Check units and limits, or take shorter steps."
     )
     unresolved = (
-        "The mesh or the nodes do not carry this shape: with twice as many the answer would be "
-        "another one. Give more, e.g. `nodes=` of a rod."
+        "Nodes or steps are too coarse: with twice as many nodes a rod would end elsewhere, or "
+        "a step would carry a body through another or give it energy; such a run stays at the "
+        "state before that step. Give more `nodes=`, shorter steps, or a stiffer contact: a "
+        "body sinks in by about its speed times the root of its mass over the stiffness, "
+        "which must be less than it takes to get through."
     )
     not_converged = (
         "The search did not settle. Apply the load, or move the targets, in steps that start "

@@ -37,14 +37,21 @@ class ContactTerms(NamedTuple):
 
     Attributes:
         free: (t, q, v) -> (mass matrix, force without contact, moment).
-        near: (moment, h) -> whether a step of `h` about that moment may meet contact.
+        near: (moment, h) -> whether a step of `h` about that moment may meet contact, and
+            whether it is so long that it may gain energy.
         force: (t, q, v) -> (force, stiffness, damping) of the contacts.
+        passed: ((q, v) before, (q, v) after, h) -> whether anything went through anything.
+        energy: (q, v) -> energy of motion, and in contacts [J].
+        plain: (t, q, v) -> the forces without contact.
         symmetric: Whether those matrices are.
     """
 
     free: Callable[[Array, Array, Array], tuple[Array, Array, Any]]
-    near: Callable[[Any, Array], Array]
+    near: Callable[[Any, Array], tuple[Array, Array]]
     force: Callable[[Array, Array, Array], tuple[Array, Array, Array]]
+    passed: Callable[[tuple[Array, Array], tuple[Array, Array], Array], Array]
+    energy: Callable[[Array, Array], tuple[Array, Array]]
+    plain: Callable[[Array, Array, Array], Array]
     symmetric: bool = True
 
 
@@ -75,11 +82,17 @@ class SecondOrder(NamedTuple):
 
 
 class Kinematic(NamedTuple):
-    """Coordinates, rates and accelerations of a second-order system."""
+    """Coordinates, rates and accelerations of a second-order system.
+
+    In contact, `resolved` says whether every step so far could be taken; where not, the state
+    is that before the step. `gained` is the energy that steps gained by themselves [J].
+    """
 
     q: Float[Array, " coordinates"]
     v: Float[Array, " dof"]
     a: Float[Array, " dof"]
+    gained: Float[Array, ""] | None = None
+    resolved: Bool[Array, ""] | None = None
 
 
 class AbstractStepper(eqx.Module):
@@ -137,7 +150,7 @@ class GeneralisedAlpha(AbstractStepper):
         gamma = 1 / 2 + af - am
         beta = (gamma + 1 / 2) ** 2 / 4
         am = jnp.where(h == 0, 0.0, am)  # nothing of the acceleration before
-        q, v, a = state
+        q, v, a = state[:3]
         leap = h * v + h * h * (1 / 2 - beta) * a
         surge = v + h * (1 - gamma) * a
 
@@ -167,7 +180,7 @@ class ImplicitMidpoint(AbstractStepper):
     settles: ClassVar[bool] = True
 
     def step(self, problem, t, h, state):
-        q, v, a = state
+        q, v, a = state[:3]
 
         def improve(_, new):
             half = v + h / 2 * new
@@ -267,7 +280,7 @@ def integrate(
     """The first state and those after each of `saves` runs of `every` steps, stacked, and
     whether the steps were too long, if that is to be `judged`; with a `label` tells how far
     it is, about a hundred times."""
-    judged = judged and problem.contact is None  # impacts do not follow the order of a method
+    judged = judged and problem.contact is None  # whose steps balance their own energy
     rows = rows_between(saves, every, judged)
     short, count = every // rows, saves * rows
     plan, pause = passes(count, saves * every, judged), max(1, count // 100)

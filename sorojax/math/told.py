@@ -34,4 +34,5 @@ def _over_lanes(reduce: Callable[[Array], Array]) -> Callable[[Array], Array]:
 
 
 mean_of_lanes = _over_lanes(lambda x: jnp.mean(x, axis=0))
+any_of_lanes = _over_lanes(lambda x: jnp.any(x, axis=0))
 largest_of_lanes = _over_lanes(lambda x: jnp.max(x, axis=0))

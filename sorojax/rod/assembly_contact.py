@@ -10,7 +10,16 @@ from sorojax.math.steppers import ContactTerms
 from sorojax.rod.alike import each
 from sorojax.rod.assembly import index_of
 from sorojax.rod.contact_force import AbstractContact
-from sorojax.rod.contact_terms import contact_terms, has_contact, near, travel
+from sorojax.rod.contact_terms import (
+    Parts,
+    any_of,
+    contact_terms,
+    has_contact,
+    long,
+    passed_by,
+    terms_of,
+    travel,
+)
 from sorojax.rod.link_contact import LinkContact
 from sorojax.rod.loads import Between, Load, On, check, total_force
 from sorojax.rod.part_columns import part_columns
@@ -41,19 +50,14 @@ def contacts_of(
     plain = tuple(force for force in forces if not _is_contact(force))
     where = [(_parts(model, force), force.force) for force in touching]
 
-    def free(t, q, v):
-        moment = at(q, v)
-        mass, coriolis = inertia(moment)
-        return mass, total_force(plain, t, moment) - coriolis, moment
-
-    def is_near(moment: AssemblyMotion, h):
+    def near_and_long(moment: AssemblyMotion, h):
         def one(contact, *bodies):
-            if not isinstance(contact, PAIRS):
-                return near((contact,), bodies[0], h)
-            return contact.is_near(*bodies, travel(bodies[0], h) + travel(bodies[1], h))
+            margin = sum((travel(body, h) for body in bodies), start=jnp.zeros((), h.dtype))
+            turns = jnp.stack([long(body, h) for body in bodies])
+            return contact.is_near(*bodies, margin), jnp.any(turns)
 
         rows = [(contact, *(part_motion(moment, k) for k in parts)) for parts, contact in where]
-        return jnp.any(jnp.stack(each(one, rows)))
+        return tuple(jnp.any(jnp.stack(x)) for x in zip(*each(one, rows), strict=True))
 
     def force(t, q, v) -> Any:
         moment = at(q, v)
@@ -74,8 +78,23 @@ def contacts_of(
         ]  # fmt: skip
         return tuple(_sum(parts) for parts in zip(*each(one, rows), strict=True))
 
+    def passed(before, after, h):
+        def one(contact, before, after):
+            return passed_by(contact, h, before, after)
+
+        rows = [
+            (contact, *(tuple(part_motion(end, k) for k in parts) for end in (before, after)))
+            for parts, contact in where
+        ]
+        return any_of(each(one, rows))
+
+    def stored(moment):
+        rows = [(contact, *(part_motion(moment, k) for k in parts)) for parts, contact in where]
+        return sum(each(lambda contact, *bodies: contact.stored(*bodies), rows))
+
     grips = any(isinstance(contact, LinkContact) for _, contact in where)
-    return ContactTerms(free, is_near, force, symmetric=not grips)
+    terms = Parts(lambda t, moment: total_force(plain, t, moment), passed, stored)
+    return terms_of(terms, near_and_long, force, at, inertia, symmetric=not grips)
 
 
 def any_contact(forces: tuple[Load, ...]) -> bool:

@@ -39,6 +39,13 @@ def curve(motion: Motion, count: int) -> Curve:
     return Curve(np.asarray(places), np.asarray(slopes), count)
 
 
+def ends(motion: Motion, count: int) -> Float[Array, "ends dim"]:
+    """The ends of the `count` cubics of a rod [m]."""
+    table = jnp.asarray(curve(motion, count).places, motion.q.dtype)
+    place = motion.rod.length * (table @ motion.tangent)
+    return place if motion.base is None else place + motion.base.position[None]
+
+
 def closest(
     motion: Motion,
     line: Curve,

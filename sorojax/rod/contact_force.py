@@ -13,6 +13,7 @@ from sorojax import _check
 from sorojax._types import real
 from sorojax.contact.ball import near
 from sorojax.contact.line import LinePenalty
+from sorojax.contact.swept import passes
 from sorojax.math.door import door
 from sorojax.rod.forces import AbstractForce
 from sorojax.rod.motion import Motion
@@ -34,7 +35,7 @@ class Linearised(NamedTuple):
 class AbstractContact(AbstractForce):
     """A contact: implicit steppers ask for its stiffness, which comes and goes.
 
-    Implement `is_near`, `touch` and `law`; a contact that is far costs one test.
+    Implement `is_near`, `touch`, `passed` and `law`; a contact that is far costs one test.
     """
 
     law: eqx.AbstractVar[LinePenalty]
@@ -46,6 +47,14 @@ class AbstractContact(AbstractForce):
     @abc.abstractmethod
     def touch(self, motion: Motion) -> Touch:
         """The contacts and the sides that take their force, all of one motion."""
+
+    @abc.abstractmethod
+    def passed(self, before: tuple[Motion], after: tuple[Motion]) -> Bool[Array, ""]:
+        """Whether anything went through anything in a step from one motion to another."""
+
+    def stored(self, motion: Motion) -> Float[Array, ""]:
+        """Energy [J]."""
+        return energy(self.law, self.touch(motion))
 
     def __call__(self, t, motion):
         def force():
@@ -105,11 +114,17 @@ class ObstacleContact(AbstractContact):
         arm = -radius[:, None] * slope / jnp.where(size > 0, size, jnp.ones_like(size))
         return Touch(gap - radius, slope, weights, (Side(at, arm, 1.0),))
 
+    def passed(self, before, after):
+        (start, _, radius), (end, _, _) = (
+            line(motion, self.radius, self.points, self.caps) for (motion,) in (before, after)
+        )
+        return jnp.any(passes(self.obstacle, start.position, end.position, radius))
+
 
 @door
 def contact_energy(contact: AbstractContact, motion: Motion) -> Float[Array, ""]:
     """Energy stored in a contact [J]."""
-    return energy(contact.law, contact.touch(motion))
+    return contact.stored(motion)
 
 
 @door

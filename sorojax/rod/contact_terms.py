@@ -1,8 +1,10 @@
 """The contacts among the forces on a rod, apart from the others, for steppers."""
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -12,6 +14,8 @@ from sorojax.rod.forces import AbstractForce, total_force
 from sorojax.rod.motion import Motion
 
 _SURGE = 100.0  # acceleration that a broad phase allows for within a step [m/s^2]
+# turn [rad], and twice the way over the length of a rod, that make a step a long one
+_TURN, _SHARE = 0.3, 0.02
 
 
 def has_contact(forces: tuple[AbstractForce, ...]) -> bool:
@@ -34,16 +38,64 @@ def contact_terms(
     plain = tuple(force for force in forces if not isinstance(force, AbstractContact))
     contacts = tuple(force for force in forces if isinstance(force, AbstractContact))
 
-    def free(t, q, v):
-        moment = at(q, v)
-        mass, coriolis = inertia(moment)
-        return mass, total_force(plain, t, moment) - coriolis, moment
-
     def force(t, q, v):
         moment = at(q, v)
         return linearised(contacts, t, moment)
 
-    return ContactTerms(free, lambda moment, h: near(contacts, moment, h), force)
+    def passed(before, after, h):
+        return any_of([passed_by(contact, h, (before,), (after,)) for contact in contacts])
+
+    def stored(moment):
+        return sum(contact.stored(moment) for contact in contacts)
+
+    def near_and_long(moment, h):
+        return near(contacts, moment, h), long(moment, h)
+
+    parts = Parts(lambda t, moment: total_force(plain, t, moment), passed, stored)
+    return terms_of(parts, near_and_long, force, at, inertia)
+
+
+class Parts(NamedTuple):
+    """What `ContactTerms` are made of.
+
+    Attributes:
+        plain: (t, motion) -> the forces without contacts.
+        passed: (motion before, motion after, h) -> whether anything went through anything.
+        stored: motion -> energy in contacts.
+    """
+
+    plain: Callable[[Array, Any], Array]
+    passed: Callable[[Any, Any, Array], Array]
+    stored: Callable[[Any], Array]
+
+
+def terms_of(
+    parts: Parts,
+    near: Callable,
+    force: Callable,
+    at: Callable[[Array, Array], Any],
+    inertia: Callable[[Any], tuple[Array, Array]],
+    symmetric: bool = True,
+) -> ContactTerms:
+    """The terms by (q, v), from those by motion."""
+
+    def free(t, q, v):
+        moment = at(q, v)
+        mass, coriolis = inertia(moment)
+        return mass, parts.plain(t, moment) - coriolis, moment
+
+    def passed(before, after, h):
+        return parts.passed(*still((at(*before), at(*after))), h)
+
+    def energy(q, v):
+        moment = at(q, v)
+        mass, _ = inertia(moment)
+        return still((v @ mass @ v / 2, parts.stored(moment)))
+
+    def plain(t, q, v):
+        return still(parts.plain(t, at(q, v)))
+
+    return ContactTerms(free, near, force, passed, energy, plain, symmetric)
 
 
 def near(
@@ -62,6 +114,39 @@ def travel(moment: Motion, h: Float[Array, ""]) -> Float[Array, ""]:
     velocity = moment.linear_jacobian.reshape(-1, moment.v.shape[0]) @ moment.v
     fastest = jnp.sqrt(jnp.max(jnp.sum(velocity.reshape(moment.tangent.shape) ** 2, axis=1)))
     return 2 * h * fastest + _SURGE * h**2
+
+
+def long(moment: Any, h: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether any section turns, or moves, so far within a step of `h` that the step may
+    gain energy."""
+    spin = moment.angular_jacobian.reshape(-1, moment.v.shape[0]) @ moment.v
+    turns = h * jnp.max(jnp.abs(spin)) > _TURN
+    if not isinstance(moment, Motion):
+        return turns
+    return turns | (travel(moment, h) - _SURGE * h**2 > _SHARE * moment.rod.length)
+
+
+def passed_by(
+    contact: Any, h: Float[Array, ""], before: tuple, after: tuple
+) -> Bool[Array, ""]:
+    """Whether in a step of `h` [s] one body of a contact went through the other, at one test
+    if they are far."""
+    margin = sum((travel(body, h) for body in after), start=0 * h)
+    contact = still(contact)
+    is_near = contact.is_near(*after, margin)
+    return jax.lax.cond(
+        is_near, lambda: contact.passed(before, after), lambda: jnp.zeros((), bool)
+    )
+
+
+def any_of(flags: Sequence[Array]) -> Bool[Array, ""]:
+    return jnp.any(jnp.stack(flags))
+
+
+def still(tree: Any) -> Any:
+    """`tree` without derivatives."""
+    numbers, rest = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(jax.lax.stop_gradient(numbers), rest)
 
 
 def linearised(

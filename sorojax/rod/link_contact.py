@@ -11,6 +11,7 @@ from sorojax import _check
 from sorojax._types import real
 from sorojax.contact.ball import near
 from sorojax.contact.line import LinePenalty
+from sorojax.contact.swept import passes
 from sorojax.rod.contact_force import (
     AbstractContact,
     Linearised,
@@ -23,7 +24,7 @@ from sorojax.rod.loads import AbstractPairForce
 from sorojax.rod.motion import Motion
 from sorojax.rod.moving import levers
 from sorojax.rod.points import safe_norm, spin_cross
-from sorojax.rod.pressing import Side, Touch, coupling, press, tangent
+from sorojax.rod.pressing import Side, Touch, coupling, energy, press, tangent
 from sorojax.sdf.base import AbstractSdf
 
 
@@ -124,6 +125,21 @@ class LinkContact(AbstractPairForce):
         sides = Side(at, arm, 1.0), Side(there, jnp.zeros_like(arm), -1.0)
         return Touch(gap - radius, normal, weights, sides)
 
+    def passed(self, before: tuple, after: tuple) -> Bool[Array, ""]:
+        """Whether the rod went through the link from one pair of motions to another."""
+        radius = line(before[0], self.radius, self.points, self.caps)[2]
+        ways = [self._inside(*bodies) for bodies in (before, after)]
+        return jnp.any(passes(self.shape, *ways, radius))
+
+    def stored(self, first: Any, second: Any) -> Float[Array, ""]:
+        """Energy [J]."""
+        return energy(self.law, self.touch(first, second))
+
+    def _inside(self, rod: Any, link: Any) -> Float[Array, "points dim"]:
+        """Points of the rod in the frame of the link [m]."""
+        at, _, _ = line(rod, self.radius, self.points, self.caps)
+        return (at.position - link.base.position[None]) @ link.base.directors
+
     def linearised(self, t: Float[Array, ""], first: Motion, second: LinkMotion) -> Linearised:
         """Force, stiffness and damping over the columns of both, one after the other.
 
@@ -171,9 +187,15 @@ class LinkObstacle(AbstractContact):
         reach = jnp.max(safe_norm(self.points))
         return near(self.obstacle, link.base.position, reach + margin)
 
+    def passed(self, before, after):
+        return jnp.any(passes(self.obstacle, self._places(*before), self._places(*after)))
+
+    def _places(self, link: Any) -> Float[Array, "points dim"]:
+        return link.base.position[None] + self.points @ link.base.directors.T
+
     def touch(self, motion):
         link: Any = motion
-        there = link.base.position[None] + self.points @ link.base.directors.T
+        there = self._places(link)
         gap, normal = _field(self.obstacle, there)
         at: Any = LinkPoints(link, there)
         side = Side(at, jnp.zeros_like(there), 1.0)

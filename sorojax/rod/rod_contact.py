@@ -8,13 +8,14 @@ from jaxtyping import Array, Bool, Float
 from sorojax import _check
 from sorojax._types import real
 from sorojax.contact.line import LinePenalty
-from sorojax.rod.closest import closest, curve
+from sorojax.contact.swept import crosses
+from sorojax.rod.closest import closest, curve, ends
 from sorojax.rod.contact_force import AbstractContact, Linearised, line, reach_of
 from sorojax.rod.link import LinkMotion
 from sorojax.rod.loads import AbstractPairForce
 from sorojax.rod.motion import Motion
 from sorojax.rod.points import Points
-from sorojax.rod.pressing import Side, Touch, press, tangent
+from sorojax.rod.pressing import Side, Touch, energy, press, tangent
 from sorojax.rod.self_contact import meeting
 
 
@@ -82,6 +83,21 @@ class RodContact(AbstractPairForce):
         is_near = self.is_near(first, second, jnp.zeros((), first.q.dtype))
         return jax.lax.cond(is_near, full, lambda: Linearised(none[0], none, none))
 
+    def stored(self, first: Motion | LinkMotion, second: Motion | LinkMotion) -> Array:
+        """Energy [J]."""
+        one, two = touches(self, rod_of(first), rod_of(second))
+        return energy(self.law, one) + energy(self.law, two)
+
+    def passed(self, before: tuple, after: tuple) -> Bool[Array, ""]:
+        """Whether the rods went through each other from one pair of motions to another."""
+        first, second = zip(before, after, strict=True)
+        lines = [
+            line(motion, self.radii[0], self.points, self.caps)[0].position for motion in first
+        ]
+        others = [ends(motion, self.points) for motion in second]
+        reach = jnp.broadcast_to(jnp.sum(self.radii), lines[0].shape[:1])
+        return crosses(*lines, *others, reach)
+
 
 class HeldRod(AbstractContact):
     """Contact of a rod with another rod that does not move.
@@ -100,6 +116,9 @@ class HeldRod(AbstractContact):
 
     def is_near(self, motion, margin):
         return self.pair.is_near(motion, self.held, margin)
+
+    def passed(self, before, after):
+        return self.pair.passed((*before, self.held), (*after, self.held))
 
     def touch(self, motion):
         one, two = touches(self.pair, motion, self.held)

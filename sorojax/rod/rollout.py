@@ -102,6 +102,8 @@ def _rollout(model, q, v, forces, step, t, stepper, saves, every, label, check) 
     )  # fmt: skip
     fine = jnp.all(jnp.isfinite(path.q)) & jnp.all(jnp.isfinite(path.v))
     status = Status.where(fine, Status.successful, Status.not_finite)
+    if path.resolved is not None:
+        status = Status.where(jnp.all(path.resolved), status, Status.unresolved)
     time = t + step * every * jnp.arange(saves + 1, dtype=step.dtype)
     if check:
         status = checked_status(judged_status(status, too_long), model, path.q)

@@ -8,7 +8,8 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._types import real
 from sorojax.contact.line import LinePenalty
-from sorojax.rod.closest import closest, curve
+from sorojax.contact.swept import crosses
+from sorojax.rod.closest import closest, curve, ends
 from sorojax.rod.contact_force import AbstractContact, check_line, line, stations
 from sorojax.rod.points import Points, curvature, safe_norm
 from sorojax.rod.pressing import Side, Touch
@@ -52,13 +53,25 @@ class SelfContact(AbstractContact):
             total = motion.operators.weights @ jnp.abs(curvature(motion)[:, 0])
         return total > turn
 
+    def passed(self, before, after):
+        lines = [
+            line(motion, self.radius, self.points, self.caps)[0].position
+            for (motion,) in (before, after)
+        ]
+        others = [ends(motion, self.points) for (motion,) in (before, after)]
+        s = stations(self.points, self.caps)
+        reach = jnp.broadcast_to(2 * self.radius, s.shape)
+        apart = np.abs(s[:, None] - np.linspace(0.0, 1.0, self.points + 1)[None, :])
+        allowed = apart > self.apart * self.radius / before[0].rod.length
+        return crosses(*lines, *others, reach, allowed)
+
     def touch(self, motion):
         s, shape = stations(self.points, self.caps), curve(motion, self.points)
         at, weights, radius = line(motion, self.radius, self.points, self.caps)
-        ends = np.linspace(0.0, 1.0, self.points + 1)
+        places = np.linspace(0.0, 1.0, self.points + 1)
         least = self.apart * self.radius / motion.rod.length
-        ahead = ends[None, :] - s[:, None] > least
-        behind = s[:, None] - ends[None, :] > least
+        ahead = places[None, :] - s[:, None] > least
+        behind = s[:, None] - places[None, :] > least
         low = jnp.concatenate([jnp.clip(s + least, 0, 1), jnp.zeros(s.shape)])
         high = jnp.concatenate([jnp.ones(s.shape), jnp.clip(s - least, 0, 1)])
         first = Points(motion, jnp.concatenate([at.rows, at.rows]))

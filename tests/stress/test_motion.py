@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.cases import contact_grid
 from sorojax import rod as R, sdf, systems as S
 from sorojax.contact import LinePenalty
 from sorojax.math.lie import SE2
@@ -86,6 +87,70 @@ def test_a_tip_at_a_hundred_metres_per_second_does_not_get_through(swing):
     tip = jax.vmap(lambda q, v: R.jacobian(ROD, q)[-1] @ v)(path.q, path.v)
     assert path.status == Status.successful and jnp.abs(tip[0]).max() > 90
     assert 0 < depth.max() < RADIUS and rise(total) < 0.01 * float(total[0])
+
+
+@pytest.fixture(scope="module")
+def impact():
+    """(kind, speed, wall, step) -> status, through, largest energy over the first."""
+    runs = {}
+
+    def run(kind, *cell):
+        scene = contact_grid.SCENES[kind]
+        made = runs.setdefault(kind, contact_grid.run_of(scene))
+        return made(*(jnp.asarray(number) for number in cell))[:3]
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("kind", "speed", "wall", "step"),
+    [
+        pytest.param("shape", 5.0, 2e-3, 1e-3, marks=pytest.mark.stress(76)),
+        pytest.param("shape", 50.0, 2e-3, 2e-4, marks=pytest.mark.stress(76)),
+        pytest.param("shape", 20.0, 2e-3, 1e-3, marks=pytest.mark.stress(76)),
+        pytest.param("rod", 20.0, 2e-3, 1e-3, marks=pytest.mark.stress(77)),
+        pytest.param("link", 50.0, 1e-3, 2e-4, marks=pytest.mark.stress(77)),
+        pytest.param("itself", 20.0, 4e-3, 1e-3, marks=pytest.mark.stress(78)),
+        pytest.param("itself", 50.0, 8e-3, 2e-4, marks=pytest.mark.stress(78)),
+    ],
+)
+def test_nothing_is_jumped_over(impact, kind, speed, wall, step):
+    status, through, most = impact(kind, speed, wall, step)
+    assert status == Status.successful and not through
+    assert most <= contact_grid.GAINED
+
+
+@pytest.mark.stress(79)
+def test_what_contact_cannot_hold_is_said_and_does_not_pass(impact):
+    """It would sink in by more than its radius and half the wall."""
+    status, through, most = impact("shape", 100.0, 1e-3, 2e-5)
+    assert status == Status.unresolved and not through
+    assert most <= contact_grid.GAINED
+
+
+@pytest.mark.stress(80)
+def test_one_member_that_tunnels_is_cut_and_differentiable():
+    model, forces = contact_grid.on_shape(jnp.asarray(2e-3))
+
+    def end(speed):
+        q, v = contact_grid.falling(None)(model, speed, jnp.asarray(2e-3))
+        return R.rollout(model, q, v, forces, step=1e-3, saves=2).q[-1]
+
+    @jax.jit
+    @jax.vmap
+    def every(speed):
+        place, ahead = jax.linearize(end, speed)
+        return place, ahead(jnp.ones_like(speed)), jax.grad(lambda x: end(x)[2])(speed)
+
+    # Between speeds at which the number of parts of a step changes, and with it the answer.
+    change = 1e-4
+    speeds = jnp.array([0.5, 19.5, 19.5 - change, 19.5 + change])
+    place, slope, back = every(speeds)
+    assert jnp.abs(place[0, 2] - 9e-3 + 0.5 * 2e-3) < 1e-12  # in free fall
+    assert jnp.all(place[1:, 2] > 0)  # 40 mm on, and not through
+    apart = (place[3] - place[2]) / (2 * change)
+    assert jnp.allclose(slope[1], apart, rtol=1e-3, atol=1e-3 * jnp.abs(apart).max())
+    assert jnp.allclose(back, slope[:, 2], rtol=1e-9)
 
 
 @pytest.mark.stress(41)
