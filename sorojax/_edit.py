@@ -84,7 +84,8 @@ def _as_constructed(old: Any, new: Any) -> Any:
     if isinstance(new, Mapping):
         return {name: _as_constructed(old.get(name), each) for name, each in new.items()}
     if type(new) in (list, tuple):
-        return type(new)(map(_as_constructed, old, new))
+        same_length = len(old) == len(new)
+        return type(new)(map(_as_constructed, old, new)) if same_length else new
     if not isinstance(new, eqx.Module):
         return new
     made: Any = copy.copy(new)

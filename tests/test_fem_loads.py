@@ -335,7 +335,7 @@ _HERE = np.array([0])
         (lambda: fem.route(BEAM, np.array([[1.0, 1.0], [2.0, 2.0]])), "outside the mesh"),
         (lambda: fem.route(BEAM, WAY[[0, 0]]), "are the same"),
         (lambda: fem.route(BEAM, WAY[:1]), "at least two"),
-        (lambda: fem.rigid(BEAM, np.array([0, 999])), "at least two of this mesh"),
+        (lambda: fem.rigid(BEAM, np.array([0, 999])), "got numbers 0 to 999 in `nodes`"),
     ],
 )
 def test_bad_terms_are_refused(make, message):

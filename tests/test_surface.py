@@ -316,7 +316,7 @@ def test_bad_shapes_name_the_remedy(shape, size, message):
 
 
 def test_unknown_method_and_traced_shape():
-    with pytest.raises(ValueError, match="need one of"):
+    with pytest.raises(ValueError, match="need 'marching_cubes' or 'dual_contouring'"):
         sdf.isosurface(sdf.Sphere([0, 0, 0], 1), 0.1, "marching")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="traced"):
         jax.jit(lambda r: jnp.asarray(sdf.isosurface(sdf.Sphere([0, 0, 0], r), 0.1).vertices))(

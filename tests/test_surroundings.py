@@ -48,7 +48,8 @@ def test_a_robot_hangs_over_a_cylinder():
     assert np.allclose(middle, [0, 0, 0.3]) and np.isclose(poses["thing"][2, 3], 20 * mm)
     seen = systems.touching(whole, (rod.On("thing", floor),), q[None], jnp.zeros((1, 6)))
     assert abs(seen.overlap[0, 0]) < 1e-12  # it stands
-    states = [SimpleNamespace(q=q, v=jnp.zeros(6))] * 3
+    network = SimpleNamespace(state={"body": {"q": q, "v": jnp.zeros(6)}})
+    states = [robots.InContact(network)] * 3  # type: ignore[arg-type]
     film, few = robots.replay(whole, states), robots.replay(whole, states, ["thing"])
     assert set(film.poses) == {"arm", "hand", "thing"} and set(few.poses) == {"thing"}
     assert np.array_equal(few.q, jnp.stack([q] * 3)) and few.v.shape == (3, 6)

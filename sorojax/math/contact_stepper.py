@@ -65,7 +65,9 @@ class ContactMidpoint(AbstractStepper):
     def step(self, problem, t, h, state):
         if problem.contact is None:
             return ImplicitMidpoint(self.passes).step(problem, t, h, state)
-        state = _with_record(state)
+        if state.resolved is None:  # a loop that could not tell of a step that is held
+            at = _At(t, h, self.theta * h)
+            return Kinematic(*_step(problem, at, _with_record(state), self)[0][:3])
 
         def whole(t, h, *state):
             return _step(problem, _At(t, h, self.theta * h), Kinematic(*state), self)
