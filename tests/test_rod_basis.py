@@ -248,7 +248,7 @@ def make(basis=None, **options):
     [
         (lambda: R.chebyshev(kappa_w=3), r"got the strains \['kappa_w'\], need one or more"),
         (lambda: R.bernstein(kappa_z=0), "must be a number of modes, 1 or more, got 0"),
-        (lambda: R.piecewise_constant(kappa_z=1.5), "got 1.5 for `kappa_z`, need a whole number"),
+        (lambda: R.piecewise_constant(kappa_z=1.5), "got 1.5 for `kappa_z`, need a whole"),
         (lambda: R.StrainBasis({"kappa_z": 3}), "need a dict of AbstractModes"),
         (lambda: R.StrainBasis({}), "got the strains none"),
         (lambda: R.piecewise(R.constant("kappa_z"), [0.5, 0.5]), "rise strictly inside"),
