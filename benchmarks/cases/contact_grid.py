@@ -46,7 +46,9 @@ def flier(radius):
 
 def on_shape(wall):
     shape = sdf.Rectangle(jnp.stack([0 * wall - 1.0, -wall]), jnp.array([1.0, 0.0]))
-    contact = R.ObstacleContact(shape, RADIUS, LAW, points=64, caps="both")
+    contact = R.ObstacleContact(
+        obstacle=shape, radius=RADIUS, law=LAW, points=64, caps="both"
+    )  # fmt: skip
     return R.assembly(SE2(), rod=flier(RADIUS)), (R.On("rod", contact),)
 
 

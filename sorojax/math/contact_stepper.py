@@ -127,6 +127,7 @@ def _balance(problem: SecondOrder, at: _At, state: Kinematic, end: Kinematic, in
     contact = problem.contact
     assert contact is not None
     state, end, inner = jax.lax.stop_gradient((state, end, inner))
+    assert state.gained is not None
     middle = move(problem, state.q, at.part * inner)
     work = at.h * (inner @ contact.plain(at.t + at.part, middle, inner))
     (moving, stored), (moves, stores) = (contact.energy(*x[:2]) for x in (state, end))

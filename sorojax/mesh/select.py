@@ -64,7 +64,7 @@ def facets_on(mesh: Mesh, shape: AbstractSdf, tol: float | None = None) -> Facet
     return facets[near[corners].all(axis=1) & (off <= 0.15 * length + tol)]
 
 
-def nearest_node(mesh: Mesh, point: Float[np.ndarray, " dim"]) -> int:
+def nearest_node(mesh: Mesh, point: Float[Any, " dim"]) -> int:
     """The node closest to `point` [m]."""
     gap = np.asarray(mesh.points) - np.asarray(point, dtype=float)
     return int(np.argmin((gap**2).sum(axis=1)))

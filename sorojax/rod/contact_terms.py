@@ -66,7 +66,7 @@ class Parts(NamedTuple):
 
     plain: Callable[[Array, Any], Array]
     passed: Callable[[Any, Any, Array], Array]
-    stored: Callable[[Any], Array]
+    stored: Callable[[Any], Any]
 
 
 def terms_of(

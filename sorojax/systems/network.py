@@ -86,8 +86,10 @@ class Network(AbstractBlock):
     def path_status(self, path):
         every = [block.path_status(path[name]) for name, block in self.blocks.items()]
         found = [one for one in every if one is not None]
-        status = found[0] if found else None
-        for one in found[1:]:
+        if not found:
+            return None
+        status, *others = found
+        for one in others:
             status = Status.where(status == Status.successful, one, status)
         return status
 
