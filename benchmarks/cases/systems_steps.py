@@ -180,7 +180,9 @@ def rows():
     errors, good = (np.concatenate(x) for x in zip(*every, strict=True))
     missed = (good & (errors > 1)).sum()
     flagged = (~good & (errors < 0.01)).sum() / (errors < 0.01).sum()
-    yield Row("sorojax", {"what": "wrong and successful"}, error=float(missed), bar=0.0,
-              reference=REFERENCE)  # fmt: skip
-    yield Row("sorojax", {"what": "accurate and flagged, share"}, error=float(flagged),
-              bar=0.01, reference=REFERENCE)  # fmt: skip
+    wrong, early = {"what": "wrong and successful"}, {"what": "accurate and flagged, share"}
+    for settings, error, bar in ((wrong, missed, 0.0), (early, flagged, 0.01)):
+        yield Row(
+            "sorojax", settings, error=float(error), bar=bar, bar_on="error",
+            reference=REFERENCE,
+        )  # fmt: skip
