@@ -179,12 +179,13 @@ def _series(path: Path) -> list[Path]:
 
 def _saved(path: Path, title: str, **options: Any) -> Picture:
     """Everything in a file of `io.save` that has one entry per instant, over time; where
-    there is no time, what was saved, as `show` draws it."""
+    there is no time, or a body of finite elements, what was saved, as `show` draws it."""
     arrays = io.leaves(path)
     times = [
         name for name in arrays if re.search(r"\btimes?\W*$", name) and arrays[name].ndim == 1
     ]
-    if not times:
+    is_body = any(name.startswith((".dynamics", ".problem")) for name in arrays)
+    if not times or is_body:
         return _drawn(path, arrays, title, options)
     time = arrays[times[0]]
     groups: dict[str, dict[str, np.ndarray]] = {}
