@@ -34,7 +34,7 @@ def parts() -> dict:
     )  # fmt: skip
     for folds, around in ((3, 32), (4, 64), (3, 400)):
         made[f"bellows, {folds} folds, {around} facets"] = _bellows(trimesh, folds, around), 1.8
-    ball = trimesh.creation.uv_sphere(12, count=[300, 320])
+    ball = trimesh.creation.uv_sphere(12, count=[150, 320])
     made["dense hollow ball"] = _cut(trimesh, ball, trimesh.creation.icosphere(4, 9)), 3.0
     return made
 

@@ -143,7 +143,7 @@ def bored(wall, radius=0.15):
 
 def test_a_wall_of_a_quarter_of_the_size_is_meshed():
     quality = M.quality(M.tetrahedralise(bored(0.03), size=0.12))
-    assert quality.watertight and np.isclose(quality.size, 1 - np.pi * 0.15**2, rtol=1e-2)
+    assert quality.watertight and np.isclose(quality.area, 1 - np.pi * 0.15**2, rtol=1e-2)
 
 
 def test_bad_solids_are_refused_with_the_remedy():
