@@ -34,14 +34,14 @@ def finger(nodes=6, **modes) -> R.Rod:
 
 
 @pytest.mark.stress(81)
-@pytest.mark.parametrize("save, step", [(201, 0.05), (21, 0.05), (3, 0.05), (201, 1e-4)])
-def test_a_network_beyond_stability_says_so(save, step):
+@pytest.mark.parametrize(
+    "save, step, good", [(21, 0.05, False), (3, 0.05, False), (201, 1e-4, True)]
+)
+def test_a_network_beyond_stability_says_so(save, step, good):
     net = vessel(proportional=1e-5, integral_gain=1e-7, max_flow=1e3)
     film = S.simulate(net, 1.0, save=save, step=step, throw=False)
-    small = step < 1e-3 or save == 201  # a saved interval bounds the step
-    wrong = float(jnp.abs(film["air.pressure"] - 3e3)[-1]) > 3e3
-    assert wrong != small or save == 201
-    assert (film.status == Status.successful) == (not wrong)
+    right = float(jnp.abs(film["air.pressure"] - 3e3)[-1]) < 30.0
+    assert right == good and (film.status == Status.successful) == good
 
 
 @pytest.mark.stress(82)
