@@ -24,7 +24,10 @@ class TooLarge(ValueError):
 
 def write(file: BinaryIO, arrays: Arrays) -> None:
     """The arrays by name, not compressed, none of them pickled."""
-    np.savez(file, allow_pickle=False, **arrays)
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, np.asanyarray(array), allow_pickle=False)
 
 
 def read(content: bytes, max_bytes: int) -> Arrays:
