@@ -192,3 +192,13 @@ def test_bad_contacts_are_refused(change, message):
             supports=(fem.Fixed(block.node_sets["top"]),),
             loads=(fem.Contact(**arguments),),
         )
+
+
+def test_a_point_without_pressure_has_no_stiffness_where_it_stands():
+    """Its slope there is that of free motion, as it is beside that place."""
+    law, at = contact.Coulomb(0.5, 2.0**20), jnp.asarray([0.5, 0.25])
+    grip = contact.no_grip(at)
+    for slope in (jax.hessian(law.energy, argnums=1), jax.jacobian(law.traction, argnums=1)):
+        assert np.all(np.asarray(slope(grip, at)) == 0)
+    pressed = grip._replace(pressure=jnp.asarray(2.0))
+    assert np.allclose(jax.hessian(law.energy, argnums=1)(pressed, at), 2.0**20 * np.eye(2))

@@ -53,7 +53,8 @@ class Coulomb(eqx.Module):
         square = jnp.sum(away**2, axis=-1)
         held = whole**2 * square <= limit**2
         length = jnp.sqrt(jnp.where(held, jnp.ones_like(square), square))
-        return jnp.where(held, whole * square / 2, limit * (length - limit / (2 * whole)))
+        spring = jnp.where(limit > 0, whole, jnp.zeros_like(whole))  # none without pressure
+        return jnp.where(held, spring * square / 2, limit * (length - limit / (2 * whole)))
 
     def traction(
         self, grip: Grip, position: Float[Array, "*points dim"]
@@ -64,7 +65,8 @@ class Coulomb(eqx.Module):
         square = jnp.sum(away**2, axis=-1)
         held = whole**2 * square <= limit**2
         length = jnp.sqrt(jnp.where(held, jnp.ones_like(square), square))
-        return -jnp.where(held, whole, limit / length)[..., None] * away
+        spring = jnp.where(limit > 0, whole, jnp.zeros_like(whole))
+        return -jnp.where(held, spring, limit / length)[..., None] * away
 
     def loading(
         self, grip: Grip, position: Float[Array, "*points dim"]

@@ -32,7 +32,7 @@ class Linear(eqx.Module):
 def linear(problem: Problem) -> Linear:
     """`problem` for small displacements: its cells, loads, springs and supports at rest.
 
-    Prescribed displacements count as zero.
+    Prescribed displacements count as zero. Differentiable in every number of the problem.
     """
     rest = jnp.zeros_like(problem.mesh.points)
     known = known_dofs(problem.supports, problem.mesh.num_nodes, problem.mesh.element.dim)
@@ -48,8 +48,8 @@ def displacement(
 ) -> Float[Array, "nodes dim"]:
     """Displacement [m] when cell c has `factor[c]` times its stiffness.
 
-    Differentiable in `factor` and `force` (that of the problem's loads if omitted), at one
-    back-substitution with the same factorisation.
+    Differentiable in `model`, `factor` and `force` (that of the problem's loads if omitted),
+    at one back-substitution with the same factorisation.
     """
     return _solved(model, factor, model.force if force is None else force)
 
@@ -69,19 +69,27 @@ def _solved_derivative(primals, tangents):
         rate = rate + force_dot
     if not isinstance(factor_dot, SymbolicZero):
         rate = rate - _weighed(model.space, _cell_forces(model, u), factor_dot)
-    changes = (model_dot.stiffness, model_dot.others)
-    if not all(isinstance(change, SymbolicZero) for change in changes):
-        cells, others = (
-            jnp.zeros_like(x) if isinstance(change, SymbolicZero) else change
-            for x, change in zip((model.stiffness, model.others), changes, strict=True)
-        )
-        values = assembled(model.space, cells, factor) + others
-        moved = sparse.product(model.space.system, values, u.ravel())
-        rate = rate - moved.reshape(u.shape)
+    if (moved := _stiffened(model, model_dot, factor, u)) is not None:
+        rate = rate - moved
     return u, _answer(model, held, rate)
 
 
 _solved.defjvp(_solved_derivative, symbolic_zeros=True)
+
+
+def _stiffened(
+    model: Linear, model_dot: Linear, factor, u: Float[Array, "nodes dim"]
+) -> Float[Array, "nodes dim"] | None:
+    """Force at `u` of the change of the stiffness of cells and loads [N], if there is one."""
+    changes = (model_dot.stiffness, model_dot.others)
+    if all(isinstance(change, SymbolicZero) for change in changes):
+        return None
+    cells, others = (
+        jnp.zeros_like(x) if isinstance(change, SymbolicZero) else change
+        for x, change in zip((model.stiffness, model.others), changes, strict=True)
+    )
+    values = assembled(model.space, cells, factor) + others
+    return sparse.product(model.space.system, values, u.ravel()).reshape(u.shape)
 
 
 def _held(model: Linear, factor: Float[Array, " cells"]) -> Float[Array, " nnz"]:
@@ -132,15 +140,23 @@ def _places(element: AbstractElement) -> Int[np.ndarray, "cell_dofs cell_dofs"]:
 def compliance(model: Linear, factor: Float[Array, " cells"]) -> Float[Array, ""]:
     """Work of the loads f'u [J]: small where the body is stiff.
 
-    Its gradient takes no further solve.
+    Differentiable in `model` and `factor`; its gradient takes no further solve.
     """
     return jnp.sum(model.force * displacement(model, factor))
 
 
-@compliance.defjvp
-def _(primals, tangents):
+def _compliance_derivative(primals, tangents):
     model, factor = primals
-    _, change = tangents
+    model_dot, factor_dot = tangents
     u = displacement(model, factor)
-    slope = -jnp.sum(u * _weighed(model.space, _cell_forces(model, u), change))
+    slope = jnp.zeros((), u.dtype)
+    if not isinstance(factor_dot, SymbolicZero):
+        slope = slope - jnp.sum(u * _weighed(model.space, _cell_forces(model, u), factor_dot))
+    if not isinstance(model_dot.force, SymbolicZero):
+        slope = slope + 2 * jnp.sum(u * model_dot.force)
+    if (moved := _stiffened(model, model_dot, factor, u)) is not None:
+        slope = slope - jnp.sum(u * moved)
     return jnp.sum(model.force * u), slope
+
+
+compliance.defjvp(_compliance_derivative, symbolic_zeros=True)

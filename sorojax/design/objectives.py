@@ -148,8 +148,9 @@ class Follower:
     Newton's method starts at full load from the last displacement, and follows the load from
     rest where that does not converge: the equilibria agree unless a design has several. Where
     the load path ends too, the last equilibrium has buckled, and the body falls from there
-    into a stable one (`settled`; not under `jit`). An equilibrium that is not found has NaN
-    for derivatives, on which `minimise` stops.
+    into a stable one (`settled`; not under `jit`). Derivatives are those of `fem.solve`, none
+    of them by where a solve starts from. An equilibrium that is not found has NaN for
+    derivatives, on which `minimise` stops.
     """
 
     def __init__(self, *, newton: Newton | None = None, steps: int = 1, max_cuts: int = 4):

@@ -32,7 +32,8 @@ def critical_loads(
     """Linear buckling: (K + (f - factor) dK/df) phi = 0 about an equilibrium.
 
     dK/df is the derivative of the tangent along the path of equilibria. A prediction: the
-    nearer to the critical point the state, the better. `continuation` finds the point.
+    nearer to the critical point the state, the better. `continuation` finds the point. Found
+    on the host from concrete numbers; no derivative goes through.
 
     Args:
         problem: Its loads and supports at factor one.

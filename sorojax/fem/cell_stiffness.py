@@ -7,9 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sorojax._jax.trace_state import is_traced
 from sorojax.fem.assemble import cell_matrices
 from sorojax.fem.linear import linearise, prepare
 from sorojax.fem.space import Space
+from sorojax.fem.traced import prepare_traced
 
 
 def stiffness_at_rest(
@@ -17,7 +19,7 @@ def stiffness_at_rest(
 ) -> tuple[Float[Array, "blocks entries lanes"], Float[Array, " nnz"]]:
     """Matrices of all cells in the blocks of the space [N/m], and what the loads add to the
     tangent, in the order of its values."""
-    prepared = prepare(problem)
+    prepared = prepare_traced(problem) if is_traced(problem) else prepare(problem)
     rest = jnp.zeros_like(problem.mesh.points)
     cells = cell_matrices(
         problem.space, prepared.geometry, problem.material, problem.kinematics, rest

@@ -77,7 +77,8 @@ def continuation(
 
     Neither load nor displacement is prescribed: where the load has a maximum the path goes
     on down, through unstable states too. The last state is where `until` first holds, by
-    default the first at or beyond the full load.
+    default the first at or beyond the full load. Found on the host from concrete numbers; no
+    derivative goes through.
 
     Args:
         problem: Its loads and supports at factor one.

@@ -80,8 +80,9 @@ class PlaneStress(AbstractKinematics):
     """A sheet `thickness` thin [m] that is free to contract out of its plane.
 
     The stretch out of the plane makes the energy of every point least. It is found by
-    Newton's method, and the last step carries its derivative, so that stress and tangent
-    of the energy are those of plane stress.
+    Newton's method, and the last step carries its first derivative. As the energy is least,
+    its derivatives up to the third are those of plane stress: stress, tangent, and what both
+    change by with any number. Do not differentiate a stress twice.
     """
 
     thickness: Float[Array, ""] = eqx.field(converter=real, default=1.0)

@@ -95,7 +95,8 @@ def solve_volume(
 
     Args:
         problem: Differentiable in each of its numbers, as are the contents.
-        start: A solution of the same mesh to start from, instead of rest.
+        start: A solution of the same mesh to start from, instead of rest. The answer has no
+            derivative by it.
         newton: Tolerances; `Newton()` when omitted.
         steps: Number of equal steps of the volume to try first.
         max_cuts: How often a step may be halved in a row.
