@@ -22,13 +22,13 @@ CASES = {
     "contacts": Case(
         lambda at: C.contacts(*at),
         (LAW, BALL, POINTS, jnp.full(3, 1e-4), jnp.array([1e-3, 0.0, 2e-3])),
-        step=1e-5,
+        step=1e-6,
         rtol=1e-6,
     ),
     "contacts of spheres": Case(
         lambda at: C.contacts(*at[:-1], offset=at[-1]),
         (LAW, BALL, 1.1 * POINTS, jnp.full(3, 1e-4), jnp.full(3, 5e-3)),
-        step=1e-5,
+        step=1e-6,
         rtol=1e-6,
     ),
 }

@@ -58,7 +58,7 @@ def in_both(verb, law, other):
 
 def regional(modulus):
     soft = M.neo_hookean(young_modulus=modulus, poisson_ratio=0.4)
-    return M.by_region(4, {"wall": jnp.array([1, 2])}, RUBBER, {"wall": soft})
+    return M.by_region(4, {"wall": np.array([1, 2])}, RUBBER, {"wall": soft})
 
 
 def of_constants(verb, *names):

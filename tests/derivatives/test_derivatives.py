@@ -10,7 +10,7 @@ from tests.derivatives.case import check
 
 FLOORS = {
     floor: importlib.import_module(f"tests.derivatives.{floor}")
-    for floor in ("sdf",)
+    for floor in ("contact", "material", "mesh", "reduction", "rod", "sdf", "systems")
 }
 CASES = [(floor, name) for floor, module in FLOORS.items() for name in module.CASES]
 
