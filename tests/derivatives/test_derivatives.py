@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+import re
 
 import pytest
 
@@ -10,7 +11,7 @@ from tests.derivatives.case import check
 
 FLOORS = {
     floor: importlib.import_module(f"tests.derivatives.{floor}")
-    for floor in ("contact", "material", "mesh", "reduction", "rod", "sdf", "systems")
+    for floor in ("contact", "material", "mesh", "reduction", "rod", "sdf")
 }
 CASES = [(floor, name) for floor, module in FLOORS.items() for name in module.CASES]
 
@@ -26,10 +27,11 @@ def public(floor):
 @pytest.mark.parametrize("floor", FLOORS)
 def test_every_public_function_is_compared_or_has_a_reason(floor):
     module = FLOORS[floor]
-    compared = {name.split()[0] for name in module.CASES}
-    without = [name for names in module.NONE.values() for name in names.split()]
-    assert len(without) == len(set(without)) and not compared & set(without)
     functions = set(public(floor))
+    said = " ".join(name.split(":")[0] for name in module.CASES)
+    compared = functions & set(re.findall(r"\w+", said))
+    without = [name for names in module.NONE.values() for name in names.split()]
+    assert len(without) == len(set(without))
     assert functions - compared == set(without)
 
 
