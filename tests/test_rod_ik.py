@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 import sorojax as sj
 from sorojax import rod as R, sdf
@@ -111,6 +112,31 @@ def test_limits_and_obstacles_hold_at_the_answer():
     assert gap < 3e-3 + 1e-5  # the least energy leans on the obstacle
     tight = find(goal, jnp.array(10.0), jnp.array(3e-3))
     assert jnp.all(jnp.abs(tight.q) <= 10.0)
+
+
+@pytest.mark.stress(91)
+def test_an_answer_on_its_limits_has_the_least_energy_there():
+    stiffness, goal = np.asarray(R.stiffness_matrix(FLAT)), jnp.array([0.07, 0.02])
+    bound = np.array([15.0, 3.0, 20.0, 50.0])
+    reach = jax.jit(lambda q: R.tip_pose(FLAT, q)[:2, 2] - goal)
+    slope = jax.jit(jax.jacfwd(reach))
+    least = minimize(
+        lambda q: 1e3 * q @ stiffness @ q, np.array([2.0, 2.9, -10.0, -12.0]), method="SLSQP",
+        jac=lambda q: 2e3 * stiffness @ q, bounds=list(zip(-bound, bound, strict=True)),
+        constraints=[{"type": "eq", "fun": lambda q: 1e2 * np.asarray(reach(q)),
+                      "jac": lambda q: 1e2 * np.asarray(slope(q))}],
+        options={"ftol": 1e-15},
+    )  # fmt: skip
+    find = jax.jit(
+        lambda x: R.inverse_kinematics(FLAT, R.Position(x), limits=(-bound, bound), forces=())
+    )
+    found = find(goal)
+    assert found.status == Status.successful
+    assert np.allclose(found.q, least.x, rtol=0, atol=1e-5)
+    assert (np.abs(np.abs(found.q) - bound) < 1e-9).sum() == 2
+    change = jax.jit(jax.jacfwd(lambda x: find(x).q))(goal)
+    seen = (find(goal + jnp.array([1e-5, 0])).q - find(goal - jnp.array([1e-5, 0])).q) / 2e-5
+    assert jnp.allclose(change[:, 0], seen, rtol=0, atol=1e-4 * float(jnp.abs(seen).max()))
 
 
 def test_answers_are_differentiable_and_batched():

@@ -168,7 +168,8 @@ def strain_along(
     arm: float | None = None,
     up: Numbers | None = None,
 ) -> Backbone:
-    """Backbone snapshots of a load path along a material curve.
+    """Backbone snapshots of a load path along a material curve; outside `jit`
+    differentiable in the displacements of the path.
 
     Args:
         path: Equilibria, from `fem.solve_path`.

@@ -206,8 +206,9 @@ def _search(model, tasks: Tasks, at, q: Array, push, accuracy, max_iterations: i
             change = jnp.max(jnp.abs(follow - push))
             settled = change <= 1e-6 * jnp.max(follow)
             settled = settled & (_overlap(here, q.dtype) <= accuracy * tasks.length)
-        is_rest = (move.size <= flat) & settled
-        done = good & is_rest
+        near = value <= (accuracy * tasks.length) ** 2
+        whole = move.size + jnp.where(near, (1 / gain - 1) * move.drift, 0.0)
+        done = good & settled & (whole <= flat)
         finite = jnp.isfinite(value)
         kept = jax.tree.map(
             lambda a, b: jnp.where(good & finite, a, b), (new_q, follow, new), (q, push, here)
@@ -215,15 +216,17 @@ def _search(model, tasks: Tasks, at, q: Array, push, accuracy, max_iterations: i
         # Nielsen's rule: it settles where a large error bends the landscape.
         less = jnp.clip(1 - (2 * ratio - 1) ** 3, 0.1, 1.5)
         # Close by the ratio is noise, and damping would bend the balance of multipliers.
-        near = value <= (accuracy * tasks.length) ** 2
         less = jnp.where(near, 0.01, less)
         if tasks.forces is None:
             done = done & (move.slope <= flat)
         else:  # then errors that are next to nothing balance the pull
             is_free = damping <= jnp.finfo(q.dtype).eps ** 0.6
             done = done & jnp.where(near, is_free, move.slope <= flat)
-        damping = jnp.where(good, less * damping, growth * jnp.maximum(damping, 1e-8))
-        growth = jnp.where(good, 2.0, 2 * growth)
+        # A step that is refused for its share in the null space needs less of that alone.
+        drifts = ~good & (move.drift > move.size / 2)
+        stiffer = jnp.where(drifts, damping, growth * jnp.maximum(damping, 1e-8))
+        damping = jnp.where(good, less * damping, stiffer)
+        growth = jnp.where(good, 2.0, jnp.where(drifts, growth, 2 * growth))
         gain = jnp.where(good, jnp.minimum(2 * gain, 1.0), gain / 2)
         bent = (ratio < 0.5) | (bent & (value > start / 4))
         return *kept, damping, growth, gain, bent, done, count + 1

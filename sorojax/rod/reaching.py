@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sorojax.math.dense import product, solve_symmetric
 from sorojax.rod.assembly import index_of
@@ -17,6 +17,7 @@ from sorojax.rod.points import Points, points
 from sorojax.rod.targets import AbstractTarget, Clear, Frames
 from sorojax.rod.tree import AssemblyMotion, part_motion
 
+_ROUNDING = 16  # units in the last place that a coordinate on its limit may be away
 OBSTACLE_WEIGHT = 30.0  # of a bound against a target; sets how fast bounds are met
 
 Limits = tuple[Float[Array, " dof"], Float[Array, " dof"]]
@@ -87,12 +88,14 @@ class Step(NamedTuple):
         size: Of the increment, as the tip moves [m].
         drift: The same of the share in the null space.
         slope: Size of the gradient [m]; zero at the closest place.
+        outward: Coordinates at a limit that it would move beyond, or None.
     """
 
     increment: Float[Array, " dof"]
     size: Float[Array, ""]
     drift: Float[Array, ""]
     slope: Float[Array, ""]
+    outward: Bool[Array, " dof"] | None
 
 
 def step(
@@ -110,24 +113,38 @@ def step(
         hessian: Of half the squared error; taken in place of J'J where it is positive.
     """
     first = _step(tasks, own, at, all_rows(at, push), damping, pull_gain, hessian)
-    if push is None:
+    if push is None and tasks.limits is None:
         return first
-    # Bounds that the first answer breaks take part in the second.
+    # Bounds and limits that the first answer breaks take part in the second.
     active = all_rows(at, push, first.increment)
-    if hessian is not None:
+    if hessian is not None and push is not None:
         _, before = all_rows(at, push)
         hessian = hessian + active[1].T @ active[1] - before.T @ before
-    return _step(tasks, own, at, active, damping, pull_gain, hessian)
+    if tasks.limits is None:
+        return _step(tasks, own, at, active, damping, pull_gain, hessian)
+
+    def again(state):
+        held, move = state
+        held = held | move.outward
+        return held, _step(tasks, own, at, active, damping, pull_gain, hessian, held)
+
+    # Each that would move out is held, until none would.
+    begin = jnp.zeros_like(first.outward), first
+    begin = begin if push is None else again(begin)
+    return jax.lax.while_loop(lambda s: jnp.any(s[1].outward & ~s[0]), again, begin)[1]
 
 
-def _step(tasks: Tasks, own: Array, at: Rows, active, damping, pull_gain, hessian) -> Step:
+def _step(
+    tasks: Tasks, own: Array, at: Rows, active, damping, pull_gain, hessian, held=None
+) -> Step:
     error, jacobian = active
     down, square = error @ jacobian, product(jacobian.T, jacobian)
     scaled, tiny = scaled_metric(tasks, square)
-    free = None
+    free, share = None, tiny * (jnp.trace(scaled) / jnp.trace(tasks.metric))
     if tasks.limits is not None:
-        pulled = down if at.pull is None else down + tiny * _per_metric(tasks, scaled) * at.pull
+        pulled = down if at.pull is None else down + share * at.pull
         free = _free(tasks.limits, own, pulled)
+        free = free if held is None else jnp.where(held, jnp.zeros_like(free), free)
         hessian = None if hessian is None else _held(hessian, free)
         down, square, scaled = free * down, _held(square, free), _held(scaled, free, 1.0)
     damped, pull = square + (damping + tiny) * scaled, None
@@ -135,7 +152,7 @@ def _step(tasks: Tasks, own: Array, at: Rows, active, damping, pull_gain, hessia
     if at.pull is None:
         increment = solve_symmetric(damped, down)
     else:
-        pull = tiny * _per_metric(tasks, scaled) * at.pull
+        pull = share * at.pull
         pull = pull if free is None else free * pull
         systems = jnp.stack([damped, square + tiny * scaled]), jnp.stack([down, pull])
         increment, along = jax.vmap(solve_symmetric)(*systems)
@@ -149,11 +166,13 @@ def _step(tasks: Tasks, own: Array, at: Rows, active, damping, pull_gain, hessia
         along = pull_gain * along
         drift, increment = jnp.sqrt(along @ scaled @ along), increment + along
     slope = jnp.sqrt(jnp.abs(down @ solve_symmetric(scaled, down)))
+    outward = None
     if tasks.limits is not None:
         low, high = tasks.limits
+        outward = jnp.logical_or(*bound_to(tasks.limits, own, increment))
         increment = jnp.clip(increment, low - own, high - own)
     size = jnp.sqrt(increment @ scaled @ increment)
-    return Step(increment, size, drift, slope)
+    return Step(increment, size, drift, slope, outward)
 
 
 def _newton(hessian: Array, right: Array, otherwise: Array) -> Array:
@@ -179,8 +198,9 @@ def pushed(at: Rows, push: Array | None, increment: Array) -> Array | None:
 
 
 def bound_to(limits: Limits, own: Array, down: Array) -> tuple[Array, Array]:
-    """Which coordinates rest on their lower and upper limits."""
-    low, high = limits
+    """Which coordinates rest on their lower and upper limits, but for rounding."""
+    low, high = (x + way * _ROUNDING * jnp.finfo(own.dtype).eps * jnp.abs(x)
+                 for x, way in zip(limits, (1, -1), strict=True))  # fmt: skip
     return (own <= low) & (down < 0), (own >= high) & (down > 0)
 
 
@@ -193,10 +213,6 @@ def _held(matrix: Array, free: Array, diagonal: float = 0.0) -> Array:
     """`matrix` for the free coordinates; those held stay where they are."""
     kept = matrix * free[:, None] * free[None, :]
     return kept + jnp.diag((1 - free) * (diagonal * jnp.trace(matrix) / matrix.shape[0]))
-
-
-def _per_metric(tasks: Tasks, scaled: Array) -> Array:
-    return jnp.trace(scaled) / jnp.trace(tasks.metric)
 
 
 def _frames(moment: Motion | AssemblyMotion, task: AbstractTarget | Clear) -> Frames:

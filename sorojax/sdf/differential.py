@@ -1,12 +1,13 @@
 """Local geometry of level sets: tangent frames, curvature, the closest point."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax._types import real
 from sorojax.sdf.base import AbstractSdf, cast
-from sorojax.sdf.query import Points, normal, project, value_and_gradient
+from sorojax.sdf.query import Points, normal, project, shape_tangent, value_and_gradient
 from sorojax.sdf.scalar import quotient, root
 
 _STEPS = 12
@@ -92,29 +93,49 @@ def closest_point(shape: AbstractSdf, p: Points) -> Points:
     """
     p = real(p)
     shape = cast(shape, p.dtype)
-    flat = p.reshape(-1, p.shape[-1])
-    held_shape, held = jax.lax.stop_gradient((shape, flat))
-    x = project(held_shape, held)
-    g = value_and_gradient(held_shape, x)[1]
-    m = quotient(jnp.sum((held - x) * g, axis=1), jnp.sum(g * g, axis=1))
+    return _closest(shape, p.reshape(-1, p.shape[-1]))[0].reshape(p.shape)
+
+
+@eqx.filter_custom_jvp
+def _closest(shape: AbstractSdf, p: Points) -> tuple[Points, Float[Array, " points"]]:
+    """The point x and the multiplier m, by Newton's method."""
+    x = project(shape, p)
+    g = value_and_gradient(shape, x)[1]
+    m = quotient(jnp.sum((p - x) * g, axis=1), jnp.sum(g * g, axis=1))
 
     def step(_, state):
-        return _newton(held_shape, held, *state)
+        x, m = state
+        change = _solved(shape, x, m, _residual(shape, p, x, m))
+        return x + change[0], m + change[1]
 
-    x, m = jax.lax.fori_loop(0, _STEPS, step, (x, m))
-    x, m = jax.lax.stop_gradient((x, m))
-    return _newton(shape, flat, x, m)[0].reshape(p.shape)
+    return jax.lax.fori_loop(0, _STEPS + 1, step, (x, m))
 
 
-def _newton(shape, p, x, m):
-    """One step for the closest point x and its multiplier m; the matrix is held fixed."""
-    dim = x.shape[1]
+@_closest.def_jvp
+def _closest_jvp(primals, tangents):
+    shape, p = primals
+    shape_dot, p_dot = tangents
+    x, m = _closest(shape, p)
+    change = shape_tangent(lambda shape: _residual(shape, p, x, m), shape, shape_dot)
+    if p_dot is not None:
+        change = (change[0] - p_dot, change[1])
+    return (x, m), _solved(shape, x, m, change)
+
+
+def _residual(shape, p, x, m):
+    """x - p + m grad f(x) and f(x)."""
     f, g = value_and_gradient(shape, x)
-    held, slope = jax.lax.stop_gradient((shape, g))
-    block = jnp.eye(dim, dtype=x.dtype)[None] + m[:, None, None] * hessian(held, x)
-    top = jnp.concatenate([block, slope[:, :, None]], axis=2)
-    bottom = jnp.concatenate([slope, jnp.zeros_like(f)[:, None]], axis=1)
-    matrix = jnp.concatenate([top, bottom[:, None, :]], axis=1)
-    rest = jnp.concatenate([x - p + m[:, None] * g, f[:, None]], axis=1)
-    move = jnp.linalg.solve(jax.lax.stop_gradient(matrix), rest[..., None])[..., 0]
-    return x - move[:, :dim], m - move[:, dim]
+    return x - p + m[:, None] * g, f
+
+
+def _solved(shape, x, m, residual):
+    """The change of x and m that takes a change of the residual back."""
+    dim = x.shape[1]
+    g = value_and_gradient(shape, x)[1]
+    block = jnp.eye(dim, dtype=x.dtype)[None] + m[:, None, None] * hessian(shape, x)
+    top = jnp.concatenate([block, g[:, :, None]], axis=2)
+    last = jnp.zeros_like(m)[:, None]
+    matrix = jnp.concatenate([top, jnp.concatenate([g, last], axis=1)[:, None, :]], axis=1)
+    rest = jnp.concatenate([residual[0], residual[1][:, None]], axis=1)
+    change = jnp.linalg.solve(matrix, -rest[..., None])[..., 0]
+    return change[:, :dim], change[:, dim]

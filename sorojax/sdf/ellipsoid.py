@@ -1,5 +1,7 @@
 """Ellipse and ellipsoid with their exact distance."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -53,25 +55,28 @@ class Ellipsoid(AbstractSdf):
         return -self.radii, self.radii
 
 
+@jax.custom_jvp
 def _multiplier(p: tuple[Array, ...], radii: tuple[Array, ...]) -> Array:
     """The t with sum (r p / (t + r^2))^2 = 1 that belongs to the closest point [m^2]."""
-
-    def excess(t, p, radii):
-        terms = [(r * c / (t + r * r)) ** 2 for c, r in zip(p, radii, strict=True)]
-        rates = [-2 * q / (t + r * r) for q, r in zip(terms, radii, strict=True)]
-        return sum(terms[1:], start=terms[0]) - 1, sum(rates[1:], start=rates[0])
-
-    held, axes = jax.lax.stop_gradient((p, radii))
     # Any single term alone gives a lower end, where the excess is not negative.
-    low = None
-    for c, r in zip(held, axes, strict=True):
-        end = r * c - r * r
-        low = end if low is None else jnp.where(end > low, end, low)
+    low = functools.reduce(jnp.maximum, (r * c - r * r for c, r in zip(p, radii, strict=True)))
 
     def step(_, t):
-        value, rate = excess(t, held, axes)
+        value, rate = _excess(t, p, radii)
         return t - value / rate
 
-    t = jax.lax.stop_gradient(jax.lax.fori_loop(0, _STEPS, step, low))
-    value, rate = excess(t, p, radii)
-    return t - value / rate
+    return jax.lax.fori_loop(0, _STEPS + 1, step, low)
+
+
+@_multiplier.defjvp
+def _(primals, tangents):
+    t = _multiplier(*primals)
+    change = jax.jvp(lambda p, radii: _excess(t, p, radii)[0], primals, tangents)[1]
+    return t, -change / _excess(t, *primals)[1]
+
+
+def _excess(t: Array, p: tuple[Array, ...], radii: tuple[Array, ...]) -> tuple[Array, Array]:
+    """What the sum is above 1, and its slope in t."""
+    terms = [(r * c / (t + r * r)) ** 2 for c, r in zip(p, radii, strict=True)]
+    rates = [-2 * q / (t + r * r) for q, r in zip(terms, radii, strict=True)]
+    return sum(terms[1:], start=terms[0]) - 1, sum(rates[1:], start=rates[0])

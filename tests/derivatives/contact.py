@@ -1,0 +1,45 @@
+"""Slopes of gaps, pressures and forces, away from the moment of touch."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from sorojax import contact as C, sdf
+from tests.derivatives.case import Case
+
+NONE = {
+    "answers of yes or no": "crosses far passes",
+    "a bound that saves work": "clearance",
+    "the grip of points that do not touch, all zero": "no_grip",
+}
+
+BALL = sdf.Sphere([0.0, 0.0, 0.0], 0.05)
+POINTS = 0.05 * jnp.asarray(np.eye(3)[[0, 1, 2]] * [[0.96], [1.0], [1.02]]) + 1e-3
+LAW = C.Penalty(1e7, 1e-3)
+RUB = C.Coulomb(0.4, 1e6)
+
+CASES = {
+    "gaps": Case(lambda at: C.gaps(*at), (BALL, POINTS, jnp.array([1e-3, 0, 2e-3]))),
+    "contacts": Case(
+        lambda at: C.contacts(*at),
+        (LAW, BALL, POINTS, jnp.full(3, 1e-4), jnp.array([1e-3, 0.0, 2e-3])),
+        step=1e-6,
+        rtol=1e-6,
+    ),
+    "contacts of spheres": Case(
+        lambda at: C.contacts(*at[:-1], offset=at[-1]),
+        (LAW, BALL, 1.1 * POINTS, jnp.full(3, 1e-4), jnp.full(3, 5e-3)),
+        step=1e-6,
+        rtol=1e-6,
+    ),
+}
+GAPS = jnp.array([-3e-3, -5e-4, -1e-4])  # deep, and on the smooth start
+LINE = C.LinePenalty(5e6, 1e-3, friction=0.3, damping=0.1)
+CASES |= {
+    "Penalty": Case(lambda at: (at[0].energy(at[1]), at[0].pressure(at[1])), (LAW, GAPS)),
+    "Penalty over a step": Case(
+        lambda at: at[0].mean_pressure(at[1], at[2]), (LAW, GAPS, GAPS - 2e-3)
+    ),
+    "LinePenalty": Case(
+        lambda at: (at[0].energy(at[1]), at[0].pressure(at[1]), at[0].slope(at[1])), (LINE, GAPS)
+    ),
+}
