@@ -198,12 +198,11 @@ def test_lists_follow_a_motion():
         energies = motion.energies
         return np.asarray(energies.kinetic + energies.elastic + energies.loads)
 
-    # A step that spans the impact may gain energy in it, one that resolves it does not.
     fine = total(run(40, (u, v), 1.25e-4))
     assert fine.max() < 1.001 * fine[0]
     whole = run(20, (u, v))
-    assert float(whole.energies.loads.max()) > 0.01 * fine[0]  # they met
-    assert total(whole).max() < 1.05 * fine[0] and np.all(np.diff(total(whole)[2:]) < 0)
+    assert float(whole.energies.loads.max()) > 0  # they met
+    assert total(whole).max() < 1.001 * fine[0] and np.all(np.diff(total(whole)[2:]) < 0)
     moved = np.asarray(whole.displacements)[-1, nodes["high"]]
     assert moved[:, 0].mean() > 10 * mm  # far from the facets that were listed first
     bottom = np.asarray(both.points)[:, 1] + np.asarray(whole.displacements)[:, :, 1]

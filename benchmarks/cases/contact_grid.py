@@ -101,7 +101,7 @@ def curling(model, speed, wall):
 
 
 def line_of(moment):
-    return R.points(moment, np.linspace(0.0, 1.0, 41)).position
+    return R.points(moment, np.linspace(0.0, 1.0, 129)).position
 
 
 def below(moment, wall):
@@ -179,7 +179,7 @@ def rows():
                     unresolved += int(status != Status.successful)
                     ratios.append(float(most))
             settings = {
-                "against": name, "step": step, "runs": len(ratios), "unresolved": unresolved,
+                "kind": name, "step": step, "runs": len(ratios), "unresolved": unresolved,
                 "through": len(through), "which": "; ".join(through),
             }  # fmt: skip
             yield Row(

@@ -1,5 +1,7 @@
 """What goes through an obstacle, or through another body, in a step."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -76,25 +78,25 @@ def passes(
 
 
 def crosses(
-    before: Float[Array, "points dim"],
-    after: Float[Array, "points dim"],
+    before: Float[Array, "ends dim"],
+    after: Float[Array, "ends dim"],
     others_before: Float[Array, "others dim"],
     others_after: Float[Array, "others dim"],
-    reach: Float[Array, " points"],
-    allowed: Bool[Array, "points others"] | None = None,
+    reach: Float[Array, ""],
+    allowed: Bool[Array, "ends others"] | None = None,
 ) -> Bool[Array, ""]:
-    """Whether any ball comes within `reach` [m] of another on their straight ways, and ends
-    on the other side of it.
+    """Whether two lines of straight pieces went through each other: a ball on one came within
+    `reach` of one on the other on their straight ways, and ends on the other side of it, or
+    the lines themselves cross now.
 
     Args:
-        before, after: Ends of the ways of centres [m].
-        others_before, others_after: Those of the other balls [m].
+        before, after: Ends of the pieces of one line, in order [m].
+        others_before, others_after: Those of the other.
         reach: Sum of the radii [m].
         allowed: Which pairs can meet; all if omitted.
     """
     square = _products(before, others_before, before, others_before)
     move, others = after - before, others_after - others_before
-    reach = jnp.broadcast_to(reach[:, None], square.shape)
 
     def looked():
         along = _products(before, others_before, move, others)
@@ -107,12 +109,67 @@ def crosses(
         entry = jnp.maximum(entry, 0.0)
         # place at the entry times place at the end
         turned = square + (1 + entry) * along + entry * length < 0
-        return jnp.any(_only(meets & (entry < 1) & turned, allowed, False))
+        jumped = jnp.any(_only(meets & (entry < 1) & turned, allowed, False))
+        return jumped | _interlocked(before, after, others_before, others_after, allowed)
 
     fastest = [jnp.max(jnp.sum(x**2, axis=1)) for x in (move, others)]
     way = jnp.sqrt(fastest[0]) + jnp.sqrt(fastest[1])
-    nearest = _only(jnp.minimum(square, reach**2), allowed, jnp.inf)
-    return jax.lax.cond(way**2 >= jnp.min(nearest), looked, lambda: jnp.zeros((), bool))
+    nearest = jnp.min(_only(square, allowed, jnp.inf))
+    # between two ends the other line may be as near as half of a piece of each
+    pieces = [
+        jnp.max(jnp.sum(jnp.diff(x, axis=0) ** 2, axis=1)) for x in (before, others_before)
+    ]
+    least = jnp.minimum(jnp.minimum(nearest, reach**2), nearest - (pieces[0] + pieces[1]) / 4)
+    return jax.lax.cond(way**2 >= least, looked, lambda: jnp.zeros((), bool))
+
+
+_AROUND = 0.5  # of a piece, how far beyond its ends lines may have been seen to cross before
+
+
+def _interlocked(before, after, others_before, others_after, allowed) -> Bool[Array, ""]:
+    """Whether any piece of a line now lies on the other side of a piece of the other, and met
+    it; in a plane, whether any two cross that did not."""
+    first, last = _seen(before, others_before), _seen(after, others_after)
+    both = None
+    if allowed is not None:
+        both = allowed[:-1, :-1] & allowed[1:, :-1] & allowed[:-1, 1:] & allowed[1:, 1:]
+    now = _only(last.within(0.0), both, False)
+    if before.shape[1] == 2:
+        return jnp.any(now) & ~jnp.any(_only(first.within(0.0), both, False))
+    same = jnp.sum(first.normal * last.normal, axis=2) > 0
+    return jnp.any(now & first.within(_AROUND) & same & (first.height * last.height < 0))
+
+
+class _Seen(NamedTuple):
+    """Pieces of two lines as seen along the normal of both: where they cross, in shares of
+    each, and how high one is over the other, times the length of the normal."""
+
+    shares: tuple[Float[Array, "pieces others"], Float[Array, "pieces others"]]
+    height: Float[Array, "pieces others"]
+    normal: Float[Array, "pieces others rot"]
+
+    def within(self, beyond: float) -> Bool[Array, "pieces others"]:
+        one, two = (jnp.abs(share - 0.5) < 0.5 + beyond for share in self.shares)
+        return one & two
+
+
+def _seen(line: Float[Array, "ends dim"], other: Float[Array, "others dim"]) -> _Seen:
+    u, w = jnp.diff(line, axis=0)[:, None], jnp.diff(other, axis=0)[None]
+    apart = other[None, :-1] - line[:-1, None]
+    normal = _cross(u, w)
+    square = jnp.sum(normal**2, axis=2)
+    size = jnp.where(square > 0, square, jnp.inf)  # parallel ones are nowhere seen to cross
+    shares = [jnp.sum(_cross(apart, x) * normal, axis=2) / size for x in (w, u)]
+    nowhere = jnp.full_like(square, jnp.inf)
+    shares = [jnp.where(square > 0, share, nowhere) for share in shares]
+    height = jnp.sum(apart * normal, axis=2) if line.shape[1] == 3 else nowhere
+    return _Seen((shares[0], shares[1]), height, normal)
+
+
+def _cross(a: Array, b: Array) -> Float[Array, "pieces others rot"]:
+    if a.shape[2] == 3:
+        return jnp.cross(a, b)
+    return (a[..., :1] * b[..., 1:]) - (a[..., 1:] * b[..., :1])
 
 
 def _only(values, allowed, other):

@@ -13,7 +13,7 @@ from sorojax import _check
 from sorojax._types import integers, optional_real, real
 from sorojax.contact import Contacts, Coulomb, Grip, Penalty, contacts, far, gaps
 from sorojax.fem.contact_area import areas_of, compact, default_law
-from sorojax.fem.contact_start import Start, untouched
+from sorojax.fem.contact_start import Start, at_end, untouched
 from sorojax.fem.curved import CurvedPart, group_energy
 from sorojax.fem.facets import facet_tables
 from sorojax.fem.friction import felt, gripped, released
@@ -186,7 +186,7 @@ class Contact(AbstractLoad):
             gap = self.gap_of(values @ self._end(x, began), offset)
             density = law.energy(gap)
             if self.share is not None and start is not None:
-                ending = self.ending()
+                ending = at_end(self.share)
                 before = gaps(self.obstacle, values @ began, start.place)
                 mean = law.energy_of_step(before - start.shift[row], gap)
                 density = self.share * (ending * density + (1 - ending) * mean)
@@ -195,12 +195,6 @@ class Contact(AbstractLoad):
             return jnp.sum(areas * density)
 
         return energy
-
-    def ending(self) -> Float[Array, ""]:
-        """Share of the pressure at the end of a step, beside that of its mean: none where
-        forces act in the middle of the step, all where they act after 2/3 of it or more."""
-        assert self.share is not None
-        return jnp.clip(3 * (2 * self.share - 1), 0.0, 1.0)
 
     def gap_of(self, points, offset) -> Float[Array, "..."]:
         """Gap of points [m] to where the pressure starts."""

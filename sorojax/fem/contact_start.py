@@ -23,6 +23,12 @@ class Start(NamedTuple):
     clear: Float[Array, " facets"]
 
 
+def at_end(share: Float[Array, ""]) -> Float[Array, ""]:
+    """Share of the pressure at the end of a step, beside that of its mean: none where
+    forces act in the middle of the step, all where they act after 2/3 of it or more."""
+    return jnp.clip(3 * (2 * share - 1), 0.0, 1.0)
+
+
 def untouched(load: "Contact", mesh: Mesh) -> "Contact":
     """`load` that has touched nothing yet."""
     load = dataclasses.replace(load, place=load.value)

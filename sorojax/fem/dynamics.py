@@ -25,7 +25,7 @@ from sorojax.fem.dynamics_traced import replay
 from sorojax.fem.energy_form import residual
 from sorojax.fem.generalised_alpha import AbstractMethod, GeneralisedAlpha
 from sorojax.fem.inertia import Mass
-from sorojax.fem.loads import AbstractLoad
+from sorojax.fem.loads import AbstractLoad, remembers
 from sorojax.fem.motion import Motion
 from sorojax.fem.newton import Newton
 from sorojax.fem.problem import Problem, body
@@ -62,7 +62,7 @@ def simulate(
     save: int | None = None,
     adaptive: bool | float = False,
     newton: Newton | None = None,
-    max_cuts: int = 10,
+    max_cuts: int = 14,
     max_steps: int | None = None,
     throw: bool = True,
     **histories: History,
@@ -196,16 +196,12 @@ def _begin_time(start: Start | None):
     return start.time if isinstance(start, State) else jnp.zeros((), jnp.result_type(float))
 
 
-def _remembers(load: AbstractLoad) -> bool:
-    return type(load).begun is not AbstractLoad.begun
-
-
 def _rest(problem: Problem, rows: tuple[Array | None, ...]) -> State:
     zero = jnp.zeros_like(problem.mesh.points)
     none = jnp.zeros((), zero.dtype)
     first = zip(problem.loads, rows, strict=True)
     memory = tuple(
-        _placed(load, row, problem.mesh) if _remembers(load) else None for load, row in first
+        _placed(load, row, problem.mesh) if remembers(load) else None for load, row in first
     )
     return State(none, zero, zero, zero, memory, none, none, jnp.ones_like(none))
 

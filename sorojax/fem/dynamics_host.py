@@ -10,7 +10,7 @@ import numpy as np
 
 from sorojax._jax.jit import once
 from sorojax.fem import assemble as asm
-from sorojax.fem.contact_swept import passed_through
+from sorojax.fem.contact_swept import gains, passed_through
 from sorojax.fem.dynamics_lists import has_lists, listed_at
 from sorojax.fem.dynamics_newton import (
     LEAST_VOLUME,
@@ -169,9 +169,11 @@ class Run:
         taken = self.solver.inertia.taken(found.u)
         given = None if self.dynamics.conserves else np.float64(self._given(found))
         args = interval, found.u, given, np.float64(taken)
-        new, displacement, error, through = _end((self._fixed, self.now, step), *args)
+        new, displacement, error, through, gained = _end((self._fixed, self.now, step), *args)
         if through:
             self.reason = "a point goes through an obstacle"
+        elif gained:
+            self.reason = "a contact gives energy to the body"
         elif not (found.volume > _CALM or self._kept(start, displacement) > LEAST_VOLUME):
             self.reason = "a cell loses most of its volume"
         else:
@@ -279,4 +281,6 @@ def _end(fixed, state: State, step: Step, interval: Interval, u, work, taken):
     dynamics, known, _ = fixed
     new = end_step(dynamics, known, state, interval, step, u, work, taken)
     through = passed_through(dynamics.problem, step.terms[0], new.displacement)
-    return Split(new), new.displacement, step_error(dynamics, interval, state, new), through
+    gained = gains(dynamics, known, state, step, new, u)
+    error = step_error(dynamics, interval, state, new)
+    return Split(new), new.displacement, error, through, gained

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax.fem import assemble as asm
-from sorojax.fem.contact_swept import passed_through
+from sorojax.fem.contact_swept import gains, passed_through
 from sorojax.fem.dynamics_host import Control, step_error
 from sorojax.fem.dynamics_newton import LEAST_VOLUME
 from sorojax.fem.dynamics_step import (
@@ -98,7 +98,8 @@ def _attempt(dynamics, known, prepared: Prepared, control: Control, state, inter
     new = end_step(dynamics, known, state, interval, step, u)
     through = passed_through(dynamics.problem, step.terms[0], new.displacement)
     keeps = asm.kept_volume(*args[:4], new.displacement - start) > LEAST_VOLUME
-    fine, easy = (counts[0] == 0) & ~through & keeps, jnp.asarray(True)
+    gained = gains(dynamics, known, state, step, new, u)
+    fine, easy = (counts[0] == 0) & ~through & ~gained & keeps, jnp.asarray(True)
     if control.error is not None:
         scale = jnp.max(jnp.abs(new.displacement)) + 0.01 * prepared.length
         ratio = step_error(dynamics, interval, state, new) / (control.error * scale)

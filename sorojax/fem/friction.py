@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax.contact import Grip, clearance, far, gaps
+from sorojax.fem.contact_start import at_end
 from sorojax.fem.curved import blockwise
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ def felt(load: "Contact", problem: "Problem", u: Nodal) -> Felt:
         gap = gap if shift is None else gap - shift[row]
         pressure = law.pressure(gap)
         if start is not None:
-            ending = load.ending()
+            ending = at_end(load.share)
             mean = law.mean_pressure(gaps(load.obstacle, was) - start.shift[row], gap)
             pressure = ending * pressure + (1 - ending) * mean
         room = jnp.where(pressure > 0, jnp.zeros_like(gap), gap / bound)

@@ -32,6 +32,7 @@ class AbstractLoad(eqx.Module):
     smooth: ClassVar[bool] = True  # whether the tangent at one load foretells the next
     overshoots: ClassVar[bool] = False  # whether steps may run past where its force changes
     dead: ClassVar[bool] = False  # whether its force is the same in every state
+    forgets: ClassVar[bool] = False  # whether nothing that it knows of a step lasts
 
     @abc.abstractmethod
     def potential(self, problem: "Problem", u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
@@ -76,6 +77,11 @@ class AbstractLoad(eqx.Module):
 
     def check(self, where: str, mesh: Any, kinematics: Any) -> None:
         """Raise a `ValueError` if the load does not fit the body."""
+
+
+def remembers(load: AbstractLoad) -> bool:
+    """Whether a step of a motion hands what the load knows on to the next one."""
+    return type(load).begun is not AbstractLoad.begun and not load.forgets
 
 
 class Pressure(AbstractLoad):

@@ -17,6 +17,7 @@ from sorojax.contact.facet import over, pieces, shared
 from sorojax.contact.search import close_pairs, listed
 from sorojax.fem.checks import check_ids
 from sorojax.fem.contact_area import areas_of, compact, default_law, mean_size
+from sorojax.fem.contact_start import at_end
 from sorojax.fem.curved import CurvedPart, group_energy
 from sorojax.fem.facets import facet_tables, normals
 from sorojax.fem.loads import AbstractLoad
@@ -42,6 +43,7 @@ class SelfContact(AbstractLoad):
 
     smooth: ClassVar[bool] = False
     overshoots: ClassVar[bool] = True
+    forgets: ClassVar[bool] = True
 
     facets: Int[Array, "facets facet_nodes"] = eqx.field(converter=integers)
     others: Int[Array, "others facet_nodes"] | None = eqx.field(
@@ -56,6 +58,8 @@ class SelfContact(AbstractLoad):
     offset: Float[Array, "rows quad"] | None = eqx.field(converter=optional_real, default=None)
     partners: Int[Array, "rows candidates"] | None = None  # found
     real: Bool[Array, "rows candidates"] | None = None  # found
+    began: Float[Array, "nodes dim"] | None = None  # found: positions [m]
+    share: Float[Array, ""] | None = None  # found: of a step, after which forces act
 
     @property
     def law(self) -> Penalty:
@@ -80,16 +84,30 @@ class SelfContact(AbstractLoad):
     def potential(self, problem, u):
         return group_energy((problem.mesh.points + u)[self._groups()], self, problem)
 
+    def stored(self, problem, u):
+        now = dataclasses.replace(self, began=None, share=None)
+        return now.potential(problem, u)
+
+    def begun(self, problem, step):
+        share = jnp.broadcast_to(jnp.asarray(step.share, step.u.dtype), ())
+        return dataclasses.replace(self, began=problem.mesh.points + step.u, share=share)
+
     def curved_part(self, problem):
-        data = areas_of(problem, self.rows()) / 2, self.real, self.offset
-        return CurvedPart(self._groups(), self._energy(problem), data, self._idle(problem))
+        groups = self._groups()
+        began = None if self.began is None else self.began[groups]
+        data = areas_of(problem, self.rows()) / 2, self.real, self.offset, began
+        return CurvedPart(groups, self._energy(problem), data, self._idle(problem))
+
+    def _end(self, x, began):
+        """Positions at the end of a step, of those where forces act."""
+        return x if self.share is None else began + (x - began) / self.share
 
     def longest_share(self, du):
         """No facet moves by more than half the reach towards those that it looks for."""
         moves = jnp.mean(du[self.rows()], axis=1)
         apart = moves[self.partners] - moves[:, None]
         far = jnp.sqrt(jnp.max(jnp.sum(apart**2, axis=2)))
-        half = self._reach / 2
+        half = self._reach / 2 * (1.0 if self.share is None else self.share)
         return jnp.where(far > half, half / far, 1.0)
 
     def couples(self):
@@ -107,10 +125,16 @@ class SelfContact(AbstractLoad):
         near, law = self._near(problem), self.law
 
         def energy(x, data):
-            areas, real, offset = data
-            height, weight, _ = near(x, real)
-            density = jnp.sum(weight * law.energy(self._gap(height, offset)), axis=1)
-            return jnp.sum(areas * density)
+            areas, real, offset, began = data
+            height, weight, _ = near(self._end(x, began), real)
+            gap = self._gap(height, offset)
+            density = law.energy(gap)
+            if self.share is not None:
+                ending = at_end(self.share)
+                before = self._gap(near(began, real).height, offset)
+                mean = law.energy_of_step(before, gap)
+                density = self.share * (ending * density + (1 - ending) * mean)
+            return jnp.sum(areas * jnp.sum(weight * density, axis=1))
 
         return energy
 
@@ -146,8 +170,8 @@ class SelfContact(AbstractLoad):
         near = self._near(problem)
 
         def idle(x, data):
-            _, real, offset = data
-            height, weight, _ = jax.vmap(near)(x, real)
+            _, real, offset, began = data
+            height, weight, _ = jax.vmap(near)(self._end(x, began), real)
             gap = height - self.value
             gap = gap if offset is None else gap - offset[..., None]
             return jnp.all((gap > 0) | (weight <= 0))
@@ -194,11 +218,53 @@ class SelfContact(AbstractLoad):
             )
         check_ids(f"{where} others", self.others, mesh.num_nodes)
 
+    def sank(self, problem, u: Float[Array, "nodes dim"]) -> Bool[Array, ""]:
+        """Whether a point that was inside is deeper than `reach` after a step to `u` [m],
+        where nothing pushes it out any more."""
+        assert self.began is not None
+        groups = self._groups()
+        deep = dataclasses.replace(self, reach=jnp.full_like(self._reach, jnp.inf))
+        near = jax.vmap(deep._near(problem))
+        before, now = (
+            near(x[groups], self.real) for x in (self.began, problem.mesh.points + u)
+        )
+        inside = (before.weight > 0) & (before.height < 0) & (before.height > -self._reach)
+        return jnp.any(inside & (now.weight > 0) & (now.height <= -self._reach))
+
+    def outran(self, problem, u: Float[Array, "nodes dim"]) -> Bool[Array, ""]:
+        """Whether two facets passed near each other in a step to `u` [m] faster than lists
+        can follow."""
+        assert self.began is not None
+        rows, most = self.rows(), self._reach / 2
+        began, end = (x[rows] for x in (self.began, problem.mesh.points + u))
+        place, move = jnp.mean(began, axis=1), jnp.mean(end - began, axis=1)
+        sizes = [
+            jnp.sum((x - jnp.mean(x, axis=1, keepdims=True)) ** 2, axis=2) for x in (began, end)
+        ]
+        size = jnp.sqrt(jnp.max(jnp.maximum(*sizes), axis=1))
+        second = np.arange(len(rows)) >= len(self.facets)
+
+        def met(row):
+            place_of, move_of, size_of, side = row
+            apart, way = place_of[None] - place, move_of[None] - move
+            square = jnp.sum(way**2, axis=1)
+            along = jnp.sum(apart * way, axis=1)
+            nearest = jnp.clip(-along / jnp.where(square > 0, square, 1.0), 0.0, 1.0)
+            least = jnp.sum((apart + nearest[:, None] * way) ** 2, axis=1)
+            meets = (square > most**2) & (least < (size_of + size + self._reach) ** 2)
+            return jnp.any(meets if self.others is None else meets & (side != second))
+
+        def looked():
+            return jnp.any(jax.lax.map(met, (place, move, size, jnp.asarray(second))))
+
+        spread = jnp.max(move, axis=0) - jnp.min(move, axis=0)
+        return jax.lax.cond(jnp.sum(spread**2) > most**2, looked, lambda: jnp.array(False))
+
     def state(self, problem, u: Float[Array, "nodes dim"]) -> Contacts:
         """What the quadrature points of both sides feel from the other one."""
         part, near = self.curved_part(problem), self._near(problem)
         x = (problem.mesh.points + u)[part.groups]
-        areas, real, offset = part.data
+        areas, real, offset, _ = part.data
         height, weight, normal = jax.vmap(near)(x, real)
         clear = height - self.value
         pressure = self.law.pressure(clear if offset is None else clear - offset[..., None])

@@ -1,6 +1,6 @@
 """A fixed-step integrator that stays stable, and loses energy only, in stiff contact."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -108,15 +108,18 @@ def _step(problem: SecondOrder, at: _At, state: Kinematic, method: ContactMidpoi
     contact = problem.contact
     assert contact is not None
     if method.lasting and method.passes == 1 and method.tolerance > 0:
-        near, long, new = _solve_together(problem, at, state, method)
+        (near, long, swift), search = _solve_together(problem, at, state, method)
     else:
-        near, long, new = _solve_apart(problem, at, state, method)
+        (near, long, swift), search = _solve_apart(problem, at, state, method)
+    new = search.best
     inner = state.v + at.part * new
     end = Kinematic(move(problem, state.q, at.h * inner), state.v + at.h * new, new)
     ways = jax.lax.stop_gradient((state[:2], end[:2]))
     passed = jax.lax.cond(near, lambda: contact.passed(*ways, at.h), lambda: np.False_)
     kept, gained = jax.lax.cond(
-        long, lambda: _balance(problem, at, state, end, inner), lambda: (np.True_, 0 * at.h)
+        long | swift & (search.contact > 0),
+        lambda: _balance(problem, at, state, end, inner),
+        lambda: (np.True_, 0 * at.h),
     )
     return (*end[:3], state.gained + gained), ~passed & kept
 
@@ -139,7 +142,7 @@ def _balance(problem: SecondOrder, at: _At, state: Kinematic, end: Kinematic, in
 
 
 def _solve_apart(problem: SecondOrder, at: _At, state: Kinematic, method: ContactMidpoint):
-    """The mean acceleration without contact, or with it if that comes near."""
+    """What is near, and the mean acceleration without contact, or with it if that is."""
     assert problem.contact is not None
     new, moment = state.a, None
     for _ in range(method.passes):
@@ -150,16 +153,17 @@ def _solve_apart(problem: SecondOrder, at: _At, state: Kinematic, method: Contac
         first = state.a if method.lasting else new
         return _solve_touching(problem, at, state, first, method)
 
-    near, long = problem.contact.near(moment, at.h)
-    return near, long, jax.lax.cond(near, touch, lambda: new)
+    flags = problem.contact.near(moment, at.h)
+    return flags, jax.lax.cond(flags[0], touch, lambda: _search_from(new))
 
 
 class _Search(NamedTuple):
-    """Best mean acceleration so far, the size of its residual, where to try next, and
-    whether that is needed."""
+    """Best mean acceleration so far, the sizes of its residual and of its contact forces,
+    where to try next, and whether that is needed."""
 
     best: Array
     size: Array
+    contact: Array
     direction: Array
     share: Array
     done: Array
@@ -179,7 +183,7 @@ def _solve_touching(
         return jax.lax.cond(search.done, lambda: search, lambda: improve(k, search))
 
     loop = unless_done if method.tolerance > 0 else improve
-    return jax.lax.fori_loop(0, method.contact_passes, loop, _search_from(new)).best
+    return jax.lax.fori_loop(0, method.contact_passes, loop, _search_from(new))
 
 
 def _solve_together(problem: SecondOrder, at: _At, state: Kinematic, method: ContactMidpoint):
@@ -188,12 +192,10 @@ def _solve_together(problem: SecondOrder, at: _At, state: Kinematic, method: Con
     contact = problem.contact
     assert contact is not None
 
-    def improve(k, near, long, search: _Search) -> tuple[Array, Array, _Search]:
+    def improve(k, flags, search: _Search) -> tuple[Any, _Search]:
         trial = search.best + search.share * search.direction
         mass, force, moment = _free_at(problem, at, state, trial)
-        near, long = jax.lax.cond(
-            k == 0, lambda: contact.near(moment, at.h), lambda: (near, long)
-        )
+        flags = jax.lax.cond(k == 0, lambda: contact.near(moment, at.h), lambda: flags)
 
         def touching() -> _Search:
             found = _touching(problem, at, state, trial, mass, force)
@@ -203,21 +205,18 @@ def _solve_together(problem: SecondOrder, at: _At, state: Kinematic, method: Con
             new = trial - _newton(problem, at, mass, mass @ trial - force)
             return search._replace(best=new, done=jnp.ones_like(search.done))
 
-        return near, long, jax.lax.cond(near, touching, apart)
+        return flags, jax.lax.cond(flags[0], touching, apart)
 
     def unless_done(k, carry):
-        return jax.lax.cond(carry[2].done, lambda: carry, lambda: improve(k, *carry))
+        return jax.lax.cond(carry[1].done, lambda: carry, lambda: improve(k, *carry))
 
-    none = jnp.array(False)
-    start = none, none, _search_from(state.a)
-    passes = max(1, method.contact_passes)
-    near, long, search = jax.lax.fori_loop(0, passes, unless_done, start)
-    return near, long, search.best
+    start = (jnp.array(False),) * 3, _search_from(state.a)
+    return jax.lax.fori_loop(0, max(1, method.contact_passes), unless_done, start)
 
 
 def _search_from(new: Array) -> _Search:
     one = jnp.ones((), new.dtype)
-    return _Search(new, jnp.inf * one, jnp.zeros_like(new), one, jnp.array(False))
+    return _Search(new, jnp.inf * one, 0 * one, jnp.zeros_like(new), one, jnp.array(False))
 
 
 def _judged(
@@ -228,7 +227,7 @@ def _judged(
     size, direction, contact = found
     better = size < search.size
     done = size <= method.tolerance**2 * contact
-    accepted = _Search(trial, size, direction, jnp.ones_like(size), done)
+    accepted = _Search(trial, size, contact, direction, jnp.ones_like(size), done)
     shortened = search._replace(share=_SHORTER * search.share)
     return jax.tree.map(lambda a, b: jnp.where(better, a, b), accepted, shortened)
 

@@ -37,8 +37,8 @@ class ContactTerms(NamedTuple):
 
     Attributes:
         free: (t, q, v) -> (mass matrix, force without contact, moment).
-        near: (moment, h) -> whether a step of `h` about that moment may meet contact, and
-            whether it is so long that it may gain energy.
+        near: (moment, h) -> whether a step of `h` about that moment may meet contact,
+            whether it is so long that it may gain energy, and whether it may in contact.
         force: (t, q, v) -> (force, stiffness, damping) of the contacts.
         passed: ((q, v) before, (q, v) after, h) -> whether anything went through anything.
         energy: (q, v) -> energy of motion, and in contacts [J].
@@ -47,7 +47,7 @@ class ContactTerms(NamedTuple):
     """
 
     free: Callable[[Array, Array, Array], tuple[Array, Array, Any]]
-    near: Callable[[Any, Array], tuple[Array, Array]]
+    near: Callable[[Any, Array], tuple[Array, Array, Array]]
     force: Callable[[Array, Array, Array], tuple[Array, Array, Array]]
     passed: Callable[[tuple[Array, Array], tuple[Array, Array], Array], Array]
     energy: Callable[[Array, Array], tuple[Array, Array]]

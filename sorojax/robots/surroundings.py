@@ -158,7 +158,8 @@ def contact_stepper(
             contacts from step to step and finds their forces in one pass.
 
     Raises:
-        RuntimeError: By `advance`, if a step does not converge.
+        RuntimeError: By `advance`, if a step does not converge, or if contact cannot hold
+            what moves into it.
     """
     if stepper is None:
         stepper = ContactMidpoint(passes=1, lasting=True, theta=1.0, tolerance=1e-4)
@@ -168,8 +169,8 @@ def contact_stepper(
     inputs, fixed = model.inputs, (Split(model),)
 
     @kernel
-    def told(model, state):
-        return model.pressure(state), finite(state)
+    def told(model, state, resolved):
+        return model.pressure(state), finite(state) & resolved
 
     def advance(now: InContact, setpoint: Any, dt: float):
         if abs(dt - period) > 1e-9 * period:
@@ -178,7 +179,7 @@ def contact_stepper(
                 "this step."
             )
         moved = move(now.network, inputs(np.asarray(setpoint)))
-        pressure, good = told(fixed, moved.state)
+        pressure, good = told(fixed, moved.state, moved.resolved)
         if not good:
             raise RuntimeError(
                 f"contact_stepper: the robot does not get through {period:g} s at set-points "

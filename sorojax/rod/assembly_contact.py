@@ -15,10 +15,9 @@ from sorojax.rod.contact_terms import (
     any_of,
     contact_terms,
     has_contact,
-    long,
     passed_by,
+    reached,
     terms_of,
-    travel,
 )
 from sorojax.rod.link_contact import LinkContact
 from sorojax.rod.loads import Between, Load, On, check, total_force
@@ -50,14 +49,12 @@ def contacts_of(
     plain = tuple(force for force in forces if not _is_contact(force))
     where = [(_parts(model, force), force.force) for force in touching]
 
-    def near_and_long(moment: AssemblyMotion, h):
+    def near(moment: AssemblyMotion, h):
         def one(contact, *bodies):
-            margin = sum((travel(body, h) for body in bodies), start=jnp.zeros((), h.dtype))
-            turns = jnp.stack([long(body, h) for body in bodies])
-            return contact.is_near(*bodies, margin), jnp.any(turns)
+            return reached(contact, h, *bodies)
 
         rows = [(contact, *(part_motion(moment, k) for k in parts)) for parts, contact in where]
-        return tuple(jnp.any(jnp.stack(x)) for x in zip(*each(one, rows), strict=True))
+        return tuple(any_of(flags) for flags in zip(*each(one, rows), strict=True))
 
     def force(t, q, v) -> Any:
         moment = at(q, v)
@@ -94,7 +91,7 @@ def contacts_of(
 
     grips = any(isinstance(contact, LinkContact) for _, contact in where)
     terms = Parts(lambda t, moment: total_force(plain, t, moment), passed, stored)
-    return terms_of(terms, near_and_long, force, at, inertia, symmetric=not grips)
+    return terms_of(terms, near, force, at, inertia, symmetric=not grips)
 
 
 def any_contact(forces: tuple[Load, ...]) -> bool:

@@ -19,6 +19,7 @@ from sorojax.rod.forces import AbstractForce
 from sorojax.rod.motion import Motion
 from sorojax.rod.points import Points, points
 from sorojax.rod.pressing import Side, Touch, energy, press, tangent
+from sorojax.rod.travel import travel
 from sorojax.sdf.base import AbstractSdf
 
 _REACH = 1.05  # what a section between nodes may stretch beyond the most stretched node
@@ -35,14 +36,20 @@ class Linearised(NamedTuple):
 class AbstractContact(AbstractForce):
     """A contact: implicit steppers ask for its stiffness, which comes and goes.
 
-    Implement `is_near`, `touch`, `passed` and `law`; a contact that is far costs one test.
+    Implement `is_near`, `touch`, `passed`, `law` and `narrowest`; a contact that is far costs
+    one test.
     """
 
     law: eqx.AbstractVar[LinePenalty]
 
+    @property
     @abc.abstractmethod
-    def is_near(self, motion: Motion, margin: Float[Array, ""]) -> Bool[Array, ""]:
-        """Whether anything may come closer than `margin` [m]; `False` is certain."""
+    def narrowest(self) -> Float[Array, ""]:
+        """Least radius of what meets [m]."""
+
+    @abc.abstractmethod
+    def is_near(self, motion: Motion, h: Float[Array, ""]) -> Bool[Array, ""]:
+        """Whether anything may touch within a step of `h` [s]; `False` is certain."""
 
     @abc.abstractmethod
     def touch(self, motion: Motion) -> Touch:
@@ -103,9 +110,14 @@ class ObstacleContact(AbstractContact):
     def __check_init__(self):
         check_line(self, self.radius)
 
-    def is_near(self, motion, margin):
+    @property
+    def narrowest(self):
+        return jnp.min(self.radius)
+
+    def is_near(self, motion, h):
         centre, reach = reach_of(motion)
-        return near(self.obstacle, centre, reach + jnp.max(self.radius) + margin)
+        reach = reach + jnp.max(self.radius) + travel(motion, h)
+        return near(self.obstacle, centre, reach)
 
     def touch(self, motion):
         at, weights, radius = line(motion, self.radius, self.points, self.caps)

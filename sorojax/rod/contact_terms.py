@@ -12,10 +12,11 @@ from sorojax.math.steppers import ContactTerms
 from sorojax.rod.contact_force import AbstractContact, Linearised
 from sorojax.rod.forces import AbstractForce, total_force
 from sorojax.rod.motion import Motion
+from sorojax.rod.travel import twice_turn, twice_way
 
-_SURGE = 100.0  # acceleration that a broad phase allows for within a step [m/s^2]
-# turn [rad], and twice the way over the length of a rod, that make a step a long one
-_TURN, _SHARE = 0.3, 0.02
+# twice the turn [rad], and twice the way over the length of a rod, that make a step long
+_TURN, _SHARE = 0.6, 0.02
+_SWIFT = 0.2  # twice the way over the narrowest radius that makes it swift
 
 
 def has_contact(forces: tuple[AbstractForce, ...]) -> bool:
@@ -48,11 +49,12 @@ def contact_terms(
     def stored(moment):
         return sum(contact.stored(moment) for contact in contacts)
 
-    def near_and_long(moment, h):
-        return near(contacts, moment, h), long(moment, h)
+    def near(moment, h):
+        rows = [reached(contact, h, moment) for contact in contacts]
+        return tuple(any_of(flags) for flags in zip(*rows, strict=True))
 
     parts = Parts(lambda t, moment: total_force(plain, t, moment), passed, stored)
-    return terms_of(parts, near_and_long, force, at, inertia)
+    return terms_of(parts, near, force, at, inertia)
 
 
 class Parts(NamedTuple):
@@ -98,32 +100,20 @@ def terms_of(
     return ContactTerms(free, near, force, passed, energy, plain, symmetric)
 
 
-def near(
-    contacts: tuple[AbstractContact, ...], moment: Motion, h: Float[Array, ""]
-) -> Bool[Array, ""]:
-    """Whether any contact may act within a step of `h` [s] about `moment`."""
-    margin = travel(moment, h)
-    answer = contacts[0].is_near(moment, margin)
-    for contact in contacts[1:]:
-        answer = answer | contact.is_near(moment, margin)
-    return answer
-
-
-def travel(moment: Motion, h: Float[Array, ""]) -> Float[Array, ""]:
-    """How far [m] any section may move within a step of `h`."""
-    velocity = moment.linear_jacobian.reshape(-1, moment.v.shape[0]) @ moment.v
-    fastest = jnp.sqrt(jnp.max(jnp.sum(velocity.reshape(moment.tangent.shape) ** 2, axis=1)))
-    return 2 * h * fastest + _SURGE * h**2
+def reached(contact: Any, h: Float[Array, ""], *bodies: Any) -> tuple[Array, Array, Array]:
+    """Whether a contact may act within a step of `h` [s]; whether the step is so long that it
+    may gain energy by itself; and whether it is, against the size of what meets, in contact."""
+    ways = sum((twice_way(body, h) for body in bodies), start=0 * h)
+    is_long = any_of([long(body, h) for body in bodies])
+    return contact.is_near(*bodies, h), is_long, ways > _SWIFT * contact.narrowest
 
 
 def long(moment: Any, h: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether any section turns, or moves, so far within a step of `h` that the step may
-    gain energy."""
-    spin = moment.angular_jacobian.reshape(-1, moment.v.shape[0]) @ moment.v
-    turns = h * jnp.max(jnp.abs(spin)) > _TURN
+    """Whether any section turns, or moves, far within a step of `h` [s]."""
+    turns = twice_turn(moment, h) > _TURN
     if not isinstance(moment, Motion):
         return turns
-    return turns | (travel(moment, h) - _SURGE * h**2 > _SHARE * moment.rod.length)
+    return turns | (twice_way(moment, h) > _SHARE * moment.rod.length)
 
 
 def passed_by(
@@ -131,9 +121,8 @@ def passed_by(
 ) -> Bool[Array, ""]:
     """Whether in a step of `h` [s] one body of a contact went through the other, at one test
     if they are far."""
-    margin = sum((travel(body, h) for body in after), start=0 * h)
     contact = still(contact)
-    is_near = contact.is_near(*after, margin)
+    is_near = contact.is_near(*before, h) | contact.is_near(*after, h)
     return jax.lax.cond(
         is_near, lambda: contact.passed(before, after), lambda: jnp.zeros((), bool)
     )

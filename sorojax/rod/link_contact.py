@@ -25,6 +25,7 @@ from sorojax.rod.motion import Motion
 from sorojax.rod.moving import levers
 from sorojax.rod.points import safe_norm, spin_cross
 from sorojax.rod.pressing import Side, Touch, coupling, energy, press, tangent
+from sorojax.rod.travel import travel, twice_turn
 from sorojax.sdf.base import AbstractSdf
 
 
@@ -107,12 +108,18 @@ class LinkContact(AbstractPairForce):
         now = jnp.zeros((), first.q.dtype)
         return jax.lax.cond(self.is_near(first, second, now), forces, lambda: none)
 
-    def is_near(self, first: Any, second: Any, margin: Float[Array, ""]) -> Bool[Array, ""]:
-        """Whether they may come closer than `margin` [m]; `False` is certain."""
+    @property
+    def narrowest(self) -> Float[Array, ""]:
+        return jnp.min(self.radius)
+
+    def is_near(self, first: Any, second: Any, h: Float[Array, ""]) -> Bool[Array, ""]:
+        """Whether they may touch within a step of `h` [s]; `False` is certain."""
         _check_kinds(first, second)
         centre, reach = reach_of(first)
         local = (centre - second.base.position) @ second.base.directors
-        return near(self.shape, local, reach + jnp.max(self.radius) + margin)
+        reach = reach + jnp.max(self.radius) + travel(first, h) + travel(second, h)
+        lever = safe_norm(local[None])[0] + reach
+        return near(self.shape, local, reach + lever * twice_turn(second, h))
 
     def touch(self, first: Any, second: Any) -> Touch:
         """The contacts, with the sides (rod, link)."""
@@ -182,10 +189,14 @@ class LinkObstacle(AbstractContact):
         _check.shape("LinkObstacle", "lengths", self.lengths, self.points.shape[:1], do)
         _check.positive("LinkObstacle", "lengths", self.lengths, "m", do)
 
-    def is_near(self, motion, margin):
+    @property
+    def narrowest(self):
+        return jnp.min(self.lengths)
+
+    def is_near(self, motion, h):
         link: Any = motion
-        reach = jnp.max(safe_norm(self.points))
-        return near(self.obstacle, link.base.position, reach + margin)
+        reach = jnp.max(safe_norm(self.points)) + travel(motion, h)
+        return near(self.obstacle, link.base.position, reach)
 
     def passed(self, before, after):
         return jnp.any(passes(self.obstacle, self._places(*before), self._places(*after)))

@@ -17,6 +17,7 @@ from sorojax.rod.motion import Motion
 from sorojax.rod.points import Points
 from sorojax.rod.pressing import Side, Touch, energy, press, tangent
 from sorojax.rod.self_contact import meeting
+from sorojax.rod.travel import travel
 
 
 class RodContact(AbstractPairForce):
@@ -53,13 +54,18 @@ class RodContact(AbstractPairForce):
         far = jnp.zeros((), first.q.dtype)
         return jax.lax.cond(self.is_near(first, second, far), forces, lambda: none)
 
+    @property
+    def narrowest(self) -> Float[Array, ""]:
+        return jnp.min(self.radii)
+
     def is_near(
-        self, first: Motion | LinkMotion, second: Motion | LinkMotion, margin: Array
+        self, first: Motion | LinkMotion, second: Motion | LinkMotion, h: Array
     ) -> Bool[Array, ""]:
-        """Whether the rods may come closer than `margin` [m]; `False` is certain."""
+        """Whether the rods may touch within a step of `h` [s]; `False` is certain."""
         first, second = rod_of(first), rod_of(second)
         (a, reach_a), (b, reach_b) = reach_of(first), reach_of(second)
-        reach = reach_a + reach_b + jnp.sum(self.radii) + margin
+        reach = reach_a + reach_b + jnp.sum(self.radii)
+        reach = reach + travel(first, h) + travel(second, h)
         return jnp.sum((a - b) ** 2) <= reach**2
 
     def linearised(
@@ -90,13 +96,9 @@ class RodContact(AbstractPairForce):
 
     def passed(self, before: tuple, after: tuple) -> Bool[Array, ""]:
         """Whether the rods went through each other from one pair of motions to another."""
-        first, second = zip(before, after, strict=True)
-        lines = [
-            line(motion, self.radii[0], self.points, self.caps)[0].position for motion in first
-        ]
-        others = [ends(motion, self.points) for motion in second]
-        reach = jnp.broadcast_to(jnp.sum(self.radii), lines[0].shape[:1])
-        return crosses(*lines, *others, reach)
+        lines = (ends(motion, self.points) for motion in (*before, *after))
+        first, second, first_after, second_after = lines
+        return crosses(first, first_after, second, second_after, jnp.sum(self.radii))
 
 
 class HeldRod(AbstractContact):
@@ -114,8 +116,12 @@ class HeldRod(AbstractContact):
     def law(self) -> LinePenalty:  # type: ignore[override]
         return self.pair.law
 
-    def is_near(self, motion, margin):
-        return self.pair.is_near(motion, self.held, margin)
+    @property
+    def narrowest(self):
+        return self.pair.narrowest
+
+    def is_near(self, motion, h):
+        return self.pair.is_near(motion, self.held, h)
 
     def passed(self, before, after):
         return self.pair.passed((*before, self.held), (*after, self.held))

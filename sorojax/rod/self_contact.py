@@ -43,27 +43,23 @@ class SelfContact(AbstractContact):
         do = "Two radii are the diameter; 5 suit a rod that bends as tight as it can."
         _check.between("SelfContact", "apart", self.apart, 2, np.inf, "radii", do)
 
-    def is_near(self, motion, margin):
-        del margin  # what a step adds to the turn is within the margin of the turn
+    @property
+    def narrowest(self):
+        return self.radius
+
+    def is_near(self, motion, h):
         # A curve that turns by less than this keeps its chords longer than a diameter.
         turn = 2 * np.arccos(2 / self.apart) * _TURN_MARGIN
-        if motion.tangent.shape[1] == 3:
-            total = motion.operators.weights @ safe_norm(curvature(motion))
-        else:
-            total = motion.operators.weights @ jnp.abs(curvature(motion)[:, 0])
-        return total > turn
+        bends = motion.angular_rate @ motion.v
+        total = safe_norm(curvature(motion)) + 2 * h * safe_norm(bends)
+        return motion.operators.weights @ total > turn
 
     def passed(self, before, after):
-        lines = [
-            line(motion, self.radius, self.points, self.caps)[0].position
-            for (motion,) in (before, after)
-        ]
-        others = [ends(motion, self.points) for (motion,) in (before, after)]
-        s = stations(self.points, self.caps)
-        reach = jnp.broadcast_to(2 * self.radius, s.shape)
-        apart = np.abs(s[:, None] - np.linspace(0.0, 1.0, self.points + 1)[None, :])
+        lines = [ends(motion, self.points) for (motion,) in (before, after)]
+        places = np.linspace(0.0, 1.0, self.points + 1)
+        apart = np.abs(places[:, None] - places[None, :])
         allowed = apart > self.apart * self.radius / before[0].rod.length
-        return crosses(*lines, *others, reach, allowed)
+        return crosses(*lines, *lines, 2 * self.radius, allowed)
 
     def touch(self, motion):
         s, shape = stations(self.points, self.caps), curve(motion, self.points)

@@ -16,7 +16,7 @@ from sorojax.fem.dynamics_step import Dynamics, Matter, State, matter
 from sorojax.fem.energy_form import load_force, potential_energy, residual
 from sorojax.fem.generalised_alpha import Coefficients
 from sorojax.fem.inertia import Mass
-from sorojax.fem.loads import AbstractLoad
+from sorojax.fem.loads import remembers
 from sorojax.fem.problem import body
 from sorojax.fem.traced import known_mask
 from sorojax.math import sparse
@@ -181,10 +181,7 @@ class FemBody(AbstractBlock):
         """What a step of `h` [s] of this body depends on."""
         zero = jnp.zeros_like(self.problem.mesh.points)
         none = jnp.zeros((), zero.dtype)
-        memory = tuple(
-            load if type(load).begun is not AbstractLoad.begun else None
-            for load in self.problem.loads
-        )
+        memory = tuple(load if remembers(load) else None for load in self.problem.loads)
         rest = State(none, zero, zero, zero, memory, none, none, jnp.ones_like(none))
         loads = tuple(None for _ in self.problem.loads)
         supports = tuple(None for _ in self.problem.supports)

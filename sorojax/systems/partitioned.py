@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sorojax import _check
 from sorojax._jax.jit import once
@@ -29,11 +29,16 @@ class Parted(NamedTuple):
         state: Of the network.
         acceleration: Of the body, mean of the step before.
         time: [s].
+        gained: Energy that steps in contact gained by themselves [J].
+        resolved: Whether every step so far could be taken; where not, this is the moment
+            before that step.
     """
 
     state: Any
     acceleration: Float[Array, " dof"]
     time: Float[Array, ""]
+    gained: Float[Array, ""]
+    resolved: Bool[Array, ""]
 
 
 Move = Callable[[Parted, Signals], Parted]
@@ -52,7 +57,8 @@ def partitioned(
 
     In every step the body moves under the signals that the other blocks had, then they move
     under those that the body has now: of order 1 in the step, and stable like a symplectic
-    step where gas and body swing together. Contacts may be as stiff as the stepper bears.
+    step where gas and body swing together. Contacts may be as stiff as the stepper bears; a
+    step that goes through something however it is cut is not taken, nor any after it.
 
     Args:
         network: With one `AssemblyBody`.
@@ -75,7 +81,8 @@ def partitioned(
     method = Rosenbrock2(refresh=True) if method is None else method
     h = real(period / substeps)
     fixed, state = Split((network, h, stepper, method)), network.initial_state()
-    start = Parted(state, jnp.zeros_like(state[body]["v"]), jnp.zeros_like(h))
+    still, zero = jnp.zeros_like(state[body]["v"]), jnp.zeros_like(h)
+    start = Parted(state, still, zero, zero, jnp.array(True))
 
     def move(parted: Parted, inputs: Signals) -> Parted:
         given = {name: jnp.asarray(value, h.dtype) for name, value in inputs.items()}
@@ -93,10 +100,15 @@ def _move(fixed: Split, parted: Parted, inputs, name: str, count: int) -> Parted
         own = inputs_of(network, now.time, now.state, inputs, (name,))[name]
         q, v = now.state[name]["q"], now.state[name]["v"]
         problem = second_order(body.assembly, q, body.acting(own))
-        new = stepper.step(problem, now.time, h, Kinematic(q, v, now.acceleration))
+        begun = Kinematic(q, v, now.acceleration, now.gained, now.resolved)
+        new = stepper.step(problem, now.time, h, begun)
         state = now.state | {name: {"q": new.q, "v": new.v}}
         state = _others(network, now.time, state, inputs, h, method, name)
-        return Parted(state, new.a, now.time + h)
+        if new.resolved is None or new.gained is None:  # without contact
+            return Parted(state, new.a, now.time + h, now.gained, now.resolved)
+        moved = Parted(state, new.a, now.time + h, new.gained, new.resolved)
+        held = now._replace(resolved=new.resolved)
+        return jax.tree.map(lambda a, b: jnp.where(new.resolved, a, b), moved, held)
 
     return jax.lax.fori_loop(0, count, one, parted)
 

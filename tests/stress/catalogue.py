@@ -91,6 +91,8 @@ CASES = {
     85: "coils that the nodes of a rod do not carry: unresolved",
     86: "inverse kinematics of redundant rods: slope of the answers, with limits too",
     87: "stress at the root of an ellipse and the rim of a hole: never behind the mean",
-    91: "inverse kinematics that rests on limits: the least energy there, and its slope",
+    88: "solids that meet, or close on themselves, within long steps: nothing passes",
+    89: "solids after an impact of few steps: no energy is gained",
     90: "curvatures of ellipses: second derivatives are those of the first",
+    91: "inverse kinematics that rests on limits: the least energy there, and its slope",
 }
