@@ -1,12 +1,15 @@
 """Quadrature, rotations, small solves and steppers."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sorojax import rod as R
 from sorojax.math.batch import batched
-from sorojax.math.dense import solve_columns, solve_symmetric
+from sorojax.math.dense import product, solve_columns, solve_symmetric
 from sorojax.math.lie import SE2, SE3, skew
 from sorojax.math.magnus import FROM_MOMENTS, rotation_vector
 from sorojax.math.quadrature import (
@@ -134,3 +137,46 @@ def test_chunks_need_as_many_items_of_all():
         batched(jnp.add)(jnp.zeros(3), jnp.zeros(()))
     with pytest.raises(ValueError, match="`chunk` must be positive"):
         batched(jnp.add, chunk=0)
+
+
+@pytest.mark.versions
+@pytest.mark.stress(92)
+@pytest.mark.parametrize(
+    ("call", "shared", "own"),
+    [
+        (product, (8, 8), (8, 8, 8)),
+        (product, (8, 8), (3, 8, 2)),
+        (lambda a, b: product(b, a), (8, 2), (3, 8, 8)),
+        (lambda a, b: solve_symmetric(a @ a.T + 4 * jnp.eye(4), b), (4, 4), (4, 4)),
+        (lambda a, b: solve_symmetric(b @ b.T + 4 * jnp.eye(4), a), (4,), (3, 4, 4)),
+        (lambda a, b: solve_symmetric(a @ a.T + 4 * jnp.eye(12), b), (12, 12), (12, 12)),
+    ],
+)
+def test_derivatives_of_compiled_lanes_are_those_of_a_loop(call, shared, own):
+    rng = np.random.default_rng(0)
+    a, b, way = (jnp.asarray(rng.normal(size=shape)) for shape in (shared, own, shared))
+    lanes, loop = (
+        jax.jvp(all_of, (a,), (way,))[1]
+        for all_of in (
+            lambda a: jax.vmap(jax.jit(lambda b: jnp.sum(jnp.sin(a)) * call(a, b)))(b),
+            lambda a: jnp.stack([jnp.sum(jnp.sin(a)) * call(a, x) for x in b]),
+        )
+    )
+    assert jnp.allclose(lanes, loop, rtol=1e-12, atol=1e-12 * float(jnp.abs(loop).max()))
+
+
+@pytest.mark.stress(92)
+def test_a_mass_matrix_of_as_many_lanes_as_nodes_has_its_derivative():
+    rod = R.rod(
+        SE2(), R.chebyshev(kappa_z=2), R.circle(6e-3), length=0.08, nodes=8,
+        young_modulus=1e6, poisson_ratio=0.3, density=2000.0,
+    )  # fmt: skip
+    states = jnp.asarray(np.random.default_rng(0).normal(size=(8, 2)))
+
+    def total(length):
+        model = replace(rod, length=length)
+        return jnp.sum(jax.vmap(lambda q: R.mass_matrix(model, q))(states) ** 2)
+
+    length, h = rod.length, 1e-4
+    seen = (total(length + h) - total(length - h)) / (2 * h)
+    assert jnp.isclose(jax.jit(jax.grad(total))(length), seen, rtol=1e-5)

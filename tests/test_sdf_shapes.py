@@ -92,7 +92,9 @@ def test_change_of_the_slope_is_that_of_its_differences(dim, name):
     shape, h = GALLERY[dim][name], 1e-5
     p = np.random.default_rng(2).uniform(-1.6, 1.6, (2048, dim))
     way = np.array([1.0, 0.7, -0.4])[:dim]
-    back, ahead = (np.asarray(looked_at(shape, jnp.asarray(p + k * h * way))[1]) for k in (-1, 1))
+    back, ahead = (
+        np.asarray(looked_at(shape, jnp.asarray(p + k * h * way))[1]) for k in (-1, 1)
+    )
     seen, change = (ahead - back) / (2 * h), np.asarray(looked_at(shape, jnp.asarray(p))[2])
     size = np.linalg.norm(change, axis=1)
     smooth = np.linalg.norm(seen, axis=1) < 0.1 / h  # no kink lies between

@@ -98,6 +98,7 @@ def felt(load: "Contact", problem: "Problem", u: Nodal) -> Felt:
         gap = gap if shift is None else gap - shift[row]
         pressure = law.pressure(gap)
         if start is not None:
+            assert load.share is not None
             ending = at_end(load.share)
             mean = law.mean_pressure(gaps(load.obstacle, was) - start.shift[row], gap)
             pressure = ending * pressure + (1 - ending) * mean

@@ -20,12 +20,22 @@ def solve_symmetric(
     The derivative of M^-1 r is M^-1 (dr - dM x).
     """
     solve = _ldl(matrix) if right.shape[0] < UNROLL_BELOW else _cholesky(matrix)
-    return solve(right)
+    return _batch_first(solve(right))
 
 
 @solve_symmetric.defjvp
 def _solve_symmetric_jvp(primals, tangents):
     return jax.jvp(_solved, primals, tangents)
+
+
+def _batch_first(x: Array) -> Array:
+    """`x`, with any axis of `jax.vmap` as the first one.
+
+    A function with a rule and that rule must have it in one place: where they do not, JAX
+    (0.10.2 and 0.12.0.1 were tried) confuses axes in derivatives of `vmap(jit(f))`, without
+    an error where the sizes allow it.
+    """
+    return jnp.squeeze(x[..., None], -1)
 
 
 def _solved(matrix: Array, right: Array) -> Array:
@@ -39,9 +49,10 @@ def _solved(matrix: Array, right: Array) -> Array:
         solve = functools.partial(jnp.matmul, inverse)
     else:
         solve = _cholesky(fixed)
-    return jax.lax.custom_linear_solve(
+    solution = jax.lax.custom_linear_solve(
         lambda x: matrix @ x, right, lambda _, r: solve(r), symmetric=True
     )
+    return _batch_first(solution)
 
 
 def solve_columns(
@@ -80,7 +91,7 @@ def product(
     derivatives hold plain products, as sums would take long to compile.
     """
     if not 0 < left.shape[1] < UNROLL_BELOW:
-        return left @ right
+        return _batch_first(left @ right)
     both = zip(jnp.unstack(left, axis=1), jnp.unstack(right), strict=True)
     return functools.reduce(jnp.add, (column[:, None] * row[None] for column, row in both))
 
@@ -88,7 +99,7 @@ def product(
 @product.defjvp
 def _product_jvp(primals, tangents):
     (left, right), (change, turn) = primals, tangents
-    return left @ right, change @ right + left @ turn
+    return _batch_first(left @ right), change @ right + left @ turn
 
 
 def _cholesky(matrix: Array) -> Callable[[Array], Array]:

@@ -1,6 +1,6 @@
 """Steps of inverse kinematics: damped least squares, its null space, bounds."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -120,7 +120,7 @@ def step(
     if hessian is not None and push is not None:
         _, before = all_rows(at, push)
         hessian = hessian + active[1].T @ active[1] - before.T @ before
-    if tasks.limits is None:
+    if first.outward is None:
         return _step(tasks, own, at, active, damping, pull_gain, hessian)
 
     def again(state):
@@ -129,7 +129,7 @@ def step(
         return held, _step(tasks, own, at, active, damping, pull_gain, hessian, held)
 
     # Each that would move out is held, until none would.
-    begin = jnp.zeros_like(first.outward), first
+    begin: Any = jnp.zeros_like(first.outward), first
     begin = begin if push is None else again(begin)
     return jax.lax.while_loop(lambda s: jnp.any(s[1].outward & ~s[0]), again, begin)[1]
 

@@ -16,7 +16,7 @@ from sorojax.fem.dynamics_step import Dynamics, Matter, State, matter
 from sorojax.fem.energy_form import load_force, potential_energy, residual
 from sorojax.fem.generalised_alpha import Coefficients
 from sorojax.fem.inertia import Mass
-from sorojax.fem.loads import remembers
+from sorojax.fem.loads import AbstractLoad, remembers
 from sorojax.fem.problem import body
 from sorojax.fem.traced import known_mask
 from sorojax.math import sparse

@@ -34,13 +34,15 @@ class Case(NamedTuple):
 
 
 def direction_of(flat, moves, seed=0):
-    """A random direction: each leaf by its own size, or by one where it is zero."""
+    """A random direction: each leaf by its own size, by one where it is zero, not at all where
+    it is a bound at infinity."""
     draw = np.random.default_rng(seed)
     parts = []
     for leaf in jax.tree.leaves(moves):
-        size = float(jnp.max(jnp.abs(leaf), initial=0.0))
-        parts.append(draw.uniform(0.3, 1.0, leaf.size) * draw.choice([-1, 1], leaf.size))
-        parts[-1] *= size if size > 0 else 1.0
+        size = float(jnp.max(jnp.abs(leaf), initial=0.0)) or 1.0
+        signs = draw.choice([-1, 1], leaf.size) if np.isfinite(size) else np.zeros(leaf.size)
+        parts.append(draw.uniform(0.3, 1.0, leaf.size) * signs)
+        parts[-1] *= size if np.isfinite(size) else 0.0
     return jnp.asarray(np.concatenate(parts)) if parts else jnp.zeros_like(flat)
 
 

@@ -40,6 +40,7 @@ CASES |= {
         lambda at: at[0].mean_pressure(at[1], at[2]), (LAW, GAPS, GAPS - 2e-3)
     ),
     "LinePenalty": Case(
-        lambda at: (at[0].energy(at[1]), at[0].pressure(at[1]), at[0].slope(at[1])), (LINE, GAPS)
+        lambda at: (at[0].energy(at[1]), at[0].pressure(at[1]), at[0].slope(at[1])),
+        (LINE, GAPS),
     ),
 }

@@ -82,7 +82,10 @@ CASES = (
     | {
         f"{verb.__name__} of {type(law).__name__}": in_both(verb, law, STRETCH)
         for verb in (
-            M.equibiaxial_stress, M.lateral_stretch, M.pure_shear_stress, M.uniaxial_stress,
+            M.equibiaxial_stress,
+            M.lateral_stretch,
+            M.pure_shear_stress,
+            M.uniaxial_stress,
         )
         for law in (RUBBER, ENERGIES["Ogden"])
     }
@@ -101,10 +104,12 @@ CASES = (
         "growth_volume": Case(M.growth_volume, ENERGIES["Grown"]),
         "locking_stretch": Case(M.locking_stretch, GENT),
         "neo_hookean": of_constants(M.neo_hookean, "young_modulus", "poisson_ratio"),
-        "st_venant_kirchhoff": of_constants(M.st_venant_kirchhoff, "young_modulus", "poisson_ratio"),
+        "st_venant_kirchhoff": of_constants(
+            M.st_venant_kirchhoff, "young_modulus", "poisson_ratio"
+        ),
         "ogden_shear_modulus": Case(M.ogden_shear_modulus, ENERGIES["Ogden"]),
         "rest_stretches": Case(M.rest_stretches, ENERGIES["Grown"]),
         "simple_shear_stress": in_both(M.simple_shear_stress, RUBBER, jnp.array([-0.5, 0.2])),
         "small_strain_moduli": Case(M.small_strain_moduli, ENERGIES["Ogden"]),
     }
-)  # fmt: skip
+)

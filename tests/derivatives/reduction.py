@@ -27,9 +27,12 @@ def path():
     held = fem.Fixed(mesh.nodes_where(BODY, lambda p: p[0] < 1e-9))
     tip = mesh.facets_where(BODY, lambda p: p[0] > LENGTH - 1e-9)
     problem = fem.problem(
-        BODY, RUBBER, kinematics=fem.PlaneStrain(0.02), supports=(held,),
+        BODY,
+        RUBBER,
+        kinematics=fem.PlaneStrain(0.02),
+        supports=(held,),
         loads=(fem.Traction(tip, name="pull", value=jnp.zeros(2)),),
-    )  # fmt: skip
+    )
     return fem.solve_path(problem, pull=jnp.array([[0.0, 200.0], [0.0, 400.0]]))
 
 
@@ -62,4 +65,4 @@ CASES = {
     "PressureMap": Case(
         lambda at: at[0].coenergy(at[1], at[2]), (PRESSURE, STATE, jnp.asarray(2e3))
     ),
-}  # fmt: skip
+}

@@ -22,11 +22,18 @@ NONE = {
 }
 
 SOFT = dict(young_modulus=1e6, poisson_ratio=0.3, density=2000.0)
-DISC = replace(R.circle(6e-3), mass_offset_y=jnp.asarray(1e-3), mass_offset_z=jnp.asarray(-2e-3))
+DISC = replace(
+    R.circle(6e-3), mass_offset_y=jnp.asarray(1e-3), mass_offset_z=jnp.asarray(-2e-3)
+)
 FINGER = R.rod(
-    SE3(), R.chebyshev(kappa_y=1, kappa_z=2, sigma_x=1), DISC, length=0.08, nodes=8,
-    rest_strain=[3.0, -5.0, 4.0, 1.05, 0.1, -0.05], **SOFT,
-)  # fmt: skip
+    SE3(),
+    R.chebyshev(kappa_y=1, kappa_z=2, sigma_x=1),
+    DISC,
+    length=0.08,
+    nodes=8,
+    rest_strain=[3.0, -5.0, 4.0, 1.05, 0.1, -0.05],
+    **SOFT,
+)
 FLAT = R.rod(SE2(), R.chebyshev(kappa_z=4), R.circle(6e-3), length=0.08, nodes=10, **SOFT)
 Q, V = jnp.array([5.0, -4.0, 3.0, 0.02]), jnp.array([1.0, 2.0, -3.0, 0.1])
 BENT = jnp.array([9.0, -5.0, 3.0, 2.0])
@@ -60,18 +67,28 @@ def moment(at):
     here = R.motion(model, q, v)
     ends = R.jacobian_rate_product(model, q, v, AT), R.forward_kinematics(model, q, AT)
     return (
-        R.mass_matrix(model, q), R.coriolis_force(model, q, v), R.coriolis_matrix(model, q, v),
-        R.bias_force(model, q, v, DOWN), R.gravity_force(model, q, DOWN), R.elastic_force(model, q),
-        R.kinetic_energy(model, q, v), R.potential_energy(model, q, DOWN), R.momentum(model, q, v),
-        R.jacobian(model, q, AT), R.inertia(here), R.stiffness_matrix(model), R.tip_pose(model, q),
-        R.damping_matrix(model, (R.Damping(0.02),)), ends,
-    )  # fmt: skip
+        R.mass_matrix(model, q),
+        R.coriolis_force(model, q, v),
+        R.coriolis_matrix(model, q, v),
+        R.bias_force(model, q, v, DOWN),
+        R.gravity_force(model, q, DOWN),
+        R.elastic_force(model, q),
+        R.kinetic_energy(model, q, v),
+        R.potential_energy(model, q, DOWN),
+        R.momentum(model, q, v),
+        R.jacobian(model, q, AT),
+        R.inertia(here),
+        R.stiffness_matrix(model),
+        R.tip_pose(model, q),
+        R.damping_matrix(model, (R.Damping(0.02),)),
+        ends,
+    )
 
 
 MOMENT = (
     "mass_matrix, coriolis_force, coriolis_matrix, bias_force, gravity_force, elastic_force, "
-    "kinetic_energy, potential_energy, momentum, jacobian, inertia, stiffness_matrix, tip_pose, "
-    "damping_matrix, jacobian_rate_product, forward_kinematics, motion"
+    "kinetic_energy, potential_energy, momentum, jacobian, inertia, stiffness_matrix, "
+    "tip_pose, damping_matrix, jacobian_rate_product, forward_kinematics, motion"
 )
 
 
@@ -83,20 +100,24 @@ def dynamics(at):
     a = R.forward_dynamics(model, q, v, forces)
     field = R.vector_field(model, forces)
     return (
-        a, R.inverse_dynamics(model, q, v, 2 * a, forces), field(T, (q, v), None),
+        a,
+        R.inverse_dynamics(model, q, v, 2 * a, forces),
+        field(T, (q, v), None),
         R.acceleration(model, R.operators(model), T, q, v, forces),
         R.second_order(model, q, forces).equations(T, q, v),
-    )  # fmt: skip
+    )
 
 
+DYNAMICS = "forward_dynamics, inverse_dynamics, vector_field, acceleration, second_order"
 WRENCH = jnp.array([0.003, -0.001, 0.002, 0.1, 0.2, -0.3])
 
 # Forces, each by itself
 
 ROUTES = (
-    R.Straight([3e-3, 1e-3]), R.Converging([4e-3, 0.0], [1e-3, 1e-3], stop=0.7),
+    R.Straight([3e-3, 1e-3]),
+    R.Converging([4e-3, 0.0], [1e-3, 1e-3], stop=0.7),
     R.Helical(3e-3, 1.5, 0.3),
-)  # fmt: skip
+)
 
 
 def push(inputs):
@@ -104,12 +125,17 @@ def push(inputs):
 
 
 FORCES = (
-    R.Gravity(DOWN), R.TipWrench(WRENCH), R.PointWrench(WRENCH, 0.4, follower=True),
-    R.LineWrench(WRENCH), R.Damping(0.02), R.Buoyancy(900.0, DOWN),
+    R.Gravity(DOWN),
+    R.TipWrench(WRENCH),
+    R.PointWrench(WRENCH, 0.4, follower=True),
+    R.LineWrench(WRENCH),
+    R.Damping(0.02),
+    R.Buoyancy(900.0, DOWN),
     R.Drag(1000.0, 0.012, flow=[0.1, 0.2, 0.0], viscous=0.3),
-    R.Tendons(ROUTES, [3.0, 2.0, 1.0]), R.Tendons(ROUTES[:2], [3.0, 2.0], friction=0.2),
+    R.Tendons(ROUTES, [3.0, 2.0, 1.0]),
+    R.Tendons(ROUTES[:2], [3.0, 2.0], friction=0.2),
     R.LinearElastic(np.diag([1.0, 2.0, 2.0, 5.0])),
-)  # fmt: skip
+)
 
 
 def each_force(at):
@@ -128,9 +154,10 @@ def threads(at):
     chambers = R.thread_chambers(model, routes, areas)
     push = R.Pressurised(chambers, pressure)
     return (
-        R.thread_lengths(model, routes, q), R.thread_rates(model, routes, q, v),
+        R.thread_lengths(model, routes, q),
+        R.thread_rates(model, routes, q, v),
         R.total_force((push,), T, here) - R.total_force((), T, here),
-    )  # fmt: skip
+    )
 
 
 def laws(at):
@@ -145,10 +172,12 @@ def laws(at):
     push = R.Actuation(lambda q: jnp.stack([q, q**2], axis=1), jnp.stack([tension, -tension]))
     plain = R.total_force((), T, here)
     return (
-        R.total_force((section,), T, here), R.total_force((varying,), T, here) - plain,
-        R.total_force((push,), T, here) - plain, R.strain(model, q, AT),
+        R.total_force((section,), T, here),
+        R.total_force((varying,), T, here) - plain,
+        R.total_force((push,), T, here) - plain,
+        R.strain(model, q, AT),
         R.points(here, np.array([0.2, 0.9])).position,
-    )  # fmt: skip
+    )
 
 
 # Contact, where it presses
@@ -255,16 +284,18 @@ IK = {
     "default arguments, redundant": (reached(R.Position), goal()),
     "least energy": (reached(R.Position, ()), goal()),
     "limits are active": (
-        reached(R.Position, (), limits=between), goal(limits=jnp.array([15.0, 3.0, 20.0, 50.0]))
+        reached(R.Position, (), limits=between),
+        goal(limits=jnp.array([15.0, 3.0, 20.0, 50.0])),
     ),
     "an obstacle is active": (reached(R.Position, (), obstacles=clear), goal(obstacles=BALL)),
     "under its weight": (reached(R.Position, (R.Gravity([3.0, -9.81]),)), goal()),
     "a pose": (reached(R.Pose, ()), goal(homogeneous(jnp.eye(2), jnp.array([0.07, 0.01])))),
     "a direction": (reached(R.Direction, ()), goal(jnp.array([0.6, 0.8]))),
     "on a surface": (
-        reached(lambda ball: R.OnSurface(ball, 1.0), ()), goal(sdf.Circle((0.05, 0.05), 8e-3))
+        reached(lambda ball: R.OnSurface(ball, 1.0), ()),
+        goal(sdf.Circle((0.05, 0.05), 8e-3)),
     ),
-}  # fmt: skip
+}
 
 # Motion
 
@@ -276,16 +307,20 @@ def thrown(stepper=None, forces=(), steps=6):
         path = R.rollout(model, q, v, pushed, step=step, saves=steps, stepper=stepper)
         return path.q, path.v
 
-    return Case(call, (FLAT, BENT, 10 * BENT, FLAT_WRENCH, jnp.asarray(1e-3)), rtol=1e-6, step=1e-4)
+    return Case(
+        call, (FLAT, BENT, 10 * BENT, FLAT_WRENCH, jnp.asarray(1e-3)), rtol=1e-6, step=1e-4
+    )
 
 
 # Sections
 
 SIZES = {
-    "circle": (R.circle, (6e-3,)), "ellipse": (R.ellipse, (6e-3, 4e-3)),
-    "rectangle": (R.rectangle, (6e-3, 4e-3)), "ring": (R.ring, (6e-3, 4e-3)),
+    "circle": (R.circle, (6e-3,)),
+    "ellipse": (R.ellipse, (6e-3, 4e-3)),
+    "rectangle": (R.rectangle, (6e-3, 4e-3)),
+    "ring": (R.ring, (6e-3, 4e-3)),
     "squircle": (R.squircle, (6e-3, 3.0)),
-}  # fmt: skip
+}
 OVAL = sdf.Ellipsoid([6e-3, 4e-3])
 PLATE = mesh.triangulate(OVAL, size=2.5e-3, order=2)
 
@@ -299,9 +334,16 @@ def sampled(at):
 def built(at):
     modulus, density, length, radius, rest = at
     made = R.rod(
-        SE3(), R.chebyshev(kappa_z=2), R.circle(radius), length=length, nodes=6,
-        young_modulus=modulus, poisson_ratio=0.3, density=density, rest_strain=rest,
-    )  # fmt: skip
+        SE3(),
+        R.chebyshev(kappa_z=2),
+        R.circle(radius),
+        length=length,
+        nodes=6,
+        young_modulus=modulus,
+        poisson_ratio=0.3,
+        density=density,
+        rest_strain=rest,
+    )
     two = R.serial(made, made)
     return R.operators(made), R.mass_matrix(two, jnp.array([3.0, -2.0, 1.0, 2.0]))
 
@@ -312,16 +354,21 @@ def elastic(at):
     return R.elastic(material.NeoHookean(*at, density=1e3))
 
 
+SLOW = (f"{MOMENT}: a tree", "total_force: rod on a rod")
 CASES = (
     {f"{MOMENT}: {name}": Case(moment, at, reverse=False) for name, at in MODELS.items()}
     | {
-        f"forward_dynamics, inverse_dynamics, vector_field, acceleration, second_order: {name}": (
-            Case(dynamics, (*at, WRENCH), step=1e-4, reverse=False)
-        )
+        f"{DYNAMICS}: {name}": Case(dynamics, (*at, WRENCH), step=1e-4, reverse=False)
         for name, at in MODELS.items()
     }
-    | {f"inverse_kinematics: {name}": Case(*case, rtol=1e-4, step=1e-3) for name, case in IK.items()}
-    | {name: Case(lambda at, make=make: make(*at), sizes) for name, (make, sizes) in SIZES.items()}
+    | {
+        f"inverse_kinematics: {name}": Case(*case, rtol=1e-4, step=1e-3)
+        for name, case in IK.items()
+    }
+    | {
+        name: Case(lambda at, make=make: make(*at), sizes)
+        for name, (make, sizes) in SIZES.items()
+    }
     | {
         "total_force: each force": Case(each_force, (FORCES, FINGER, Q, V), reverse=False),
         "thread_lengths, thread_rates, thread_chambers": Case(
@@ -349,7 +396,9 @@ CASES = (
         ),
         "equilibrium_path": Case(loaded, (FLAT, FLAT_WRENCH), rtol=1e-6),
         "rollout": thrown(),
-        "from_shape": Case(lambda shape: R.from_shape(shape, mesh=PLATE), OVAL, step=1e-4, rtol=1e-6),
+        "from_shape": Case(
+            lambda shape: R.from_shape(shape, mesh=PLATE), OVAL, step=1e-4, rtol=1e-6
+        ),
         "from_mesh": Case(lambda x: R.from_mesh(replace(PLATE, points=x)), PLATE.points),
         "scaled, taper": Case(sampled, (DISC, jnp.asarray(1.3))),
         "rod, serial, operators, assembly": Case(
@@ -361,4 +410,4 @@ CASES = (
             lambda at: R.part_motion(R.motion(*at), 1).tangent, (TREE, W, RATES)
         ),
     }
-)  # fmt: skip
+)

@@ -44,8 +44,10 @@ def counted(verb, shape, *rest):
 #: Made by verbs without a class of their own in the gallery.
 MADE = {
     "intersection": sdf.intersection(EGG, sdf.Circle([0.3, 0.2], 0.9)),
-    "offset": sdf.offset(EGG, 0.1), "shell": sdf.shell(EGG, 0.1), "union": sdf.union(BALL, sdf.Sphere([1, 0, 0], 0.6)),
-    "rotate": sdf.rotate(EGG, 0.3, (0.1, 0.2)), "translate": sdf.translate(BALL, [0.1, 0.2, 0.3]),
+    "offset": sdf.offset(EGG, 0.1), "shell": sdf.shell(EGG, 0.1),
+    "union": sdf.union(BALL, sdf.Sphere([1, 0, 0], 0.6)),
+    "rotate": sdf.rotate(EGG, 0.3, (0.1, 0.2)),
+    "translate": sdf.translate(BALL, [0.1, 0.2, 0.3]),
     "scale": sdf.scale(EGG, 1.1), "repeat": sdf.repeat(BALL, [2.0, 0.1, 0], 2),
     "text": sdf.text("so", 1.0),
 }  # fmt: skip
@@ -56,7 +58,9 @@ SMOOTH = {
         sdf.gradient, sdf.hessian, sdf.normal, sdf.value_and_normal,
     )
 }  # fmt: skip
-PAIRS = [(name, shape) for shapes in (*GALLERY.values(), MADE) for name, shape in shapes.items()]
+PAIRS = [
+    (name, shape) for shapes in (*GALLERY.values(), MADE) for name, shape in shapes.items()
+]
 CASES = (
     {
         f"field of {name} {shape.dim}": Case(
@@ -64,7 +68,7 @@ CASES = (
             (shape, jnp.asarray(PLANE if shape.dim == 2 else SPACE)),
             step=1e-5,
             rtol=1e-6,
-            forward=False,  # tests/test_sdf_shapes.py goes forward, and to the second derivative
+            forward=False,  # as tests/test_sdf_shapes.py goes, twice
         )
         for name, shape in PAIRS
     }

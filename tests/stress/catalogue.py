@@ -95,4 +95,5 @@ CASES = {
     89: "solids after an impact of few steps: no energy is gained",
     90: "curvatures of ellipses: second derivatives are those of the first",
     91: "inverse kinematics that rests on limits: the least energy there, and its slope",
+    92: "derivatives of compiled functions in lanes: those of a loop",
 }
