@@ -361,3 +361,17 @@ def run(script, **environment):
         env={**os.environ, "XLA_FLAGS": f"{flags} {extra}".strip()},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-3000:]
+
+
+@pytest.mark.stress(93)
+@pytest.mark.parametrize("options", [{"rtol": 1e-9}, {"step": 0.05}])
+def test_a_run_that_goes_on_has_the_slope_of_the_first_half(options):
+    def vessel(start):
+        return S.Network({"air": S.Reservoir(start, volume=1e-4, leakage=0.5)}, {})
+
+    def end(start):
+        first = S.simulate(vessel(start), 1.0, save=5, solver=S.Tsit5(), **options)
+        later = S.simulate(vessel(1e4), 1.0, save=5, solver=S.Tsit5(), resume=first, **options)
+        return later["air.pressure"][-1]
+
+    assert jnp.isclose(jax.grad(end)(jnp.asarray(5e4)), jnp.exp(-1.0), rtol=1e-6)

@@ -28,6 +28,11 @@ class Seam(NamedTuple):
     rejected: Int[Array, ""]
 
 
+def _paced(seam: Seam) -> Seam:
+    """The state alone has derivatives: steps are chosen."""
+    return jax.lax.stop_gradient(seam._replace(state=None))._replace(state=seam.state)
+
+
 class _Pace(NamedTuple):
     """What the control remembers: error of the last step, rejections in a row and attempts,
     and, in a run with an `end`, the step under way and the last one taken."""
@@ -86,7 +91,7 @@ class Control(dfx.AbstractAdaptiveStepSizeController):
 
     def begun(self, seam: Seam) -> _Pace:
         """What to remember in order to take the step of `seam` again and go on."""
-        seam = jax.lax.stop_gradient(seam)
+        seam = _paced(seam)
         counts = jnp.stack([seam.rejected, jnp.zeros_like(seam.rejected)])
         return _Pace(seam.before, counts, seam.step, seam)
 
@@ -123,7 +128,7 @@ class Control(dfx.AbstractAdaptiveStepSizeController):
         if self.end is not None:
             this = Seam(t0, y0, state.step, before, rejected)
             last = jax.tree.map(lambda a, b: jnp.where(keep, a, b), this, last)
-            last = jax.lax.stop_gradient(last)
+            last = _paced(last)
         rejected = jnp.where(keep, 0, rejected + 1).astype(jnp.int32)
         ended = dfx.RESULTS.where(
             (rejected > self.patience) | (start + h <= start),

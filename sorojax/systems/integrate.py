@@ -166,7 +166,7 @@ def _seam(solution: dfx.Solution, solver: dfx.AbstractSolver) -> Resume:
     """Where the last step began, and what it began with."""
     own: Any = solution.solver_state if isinstance(solver, AbstractMethod) else (None, None)
     pace: Any = solution.controller_state
-    return jax.lax.stop_gradient(Resume(pace.last, own[1]))
+    return Resume(pace.last, own[1])
 
 
 def explicit_inputs(inputs: Mapping[str, Any], t) -> dict[str, Any]:

@@ -67,6 +67,12 @@ def ran(**options):
     return call
 
 
+def resumed(at):
+    first = S.simulate(at, 0.02, inputs=INPUTS, save=3, rtol=1e-10, atol=1e-10)
+    options = dict(inputs=INPUTS, save=3, rtol=1e-10, atol=1e-10)
+    return S.simulate(at, 0.02, resume=first, **options).outputs
+
+
 def dense(at):
     film = S.simulate(*at, inputs=INPUTS, rtol=1e-10, atol=1e-10, dense=True, save=3)
     return S.state_at(film, jnp.asarray(0.023))
@@ -164,6 +170,7 @@ CASES = {
     "simulate: adaptive": Case(
         ran(rtol=1e-10, atol=1e-10), (air(), INPUTS), rtol=1e-5, step=1e-4, forward=False
     ),
+    "simulate: resumed": Case(resumed, air(), rtol=1e-5, step=1e-4, forward=False),
     "simulate: fixed steps": Case(
         ran(step=1e-3, solver=S.Tsit5()), (ARM, {}), step=1e-4, forward=False
     ),

@@ -96,4 +96,5 @@ CASES = {
     90: "curvatures of ellipses: second derivatives are those of the first",
     91: "inverse kinematics that rests on limits: the least energy there, and its slope",
     92: "derivatives of compiled functions in lanes: those of a loop",
+    93: "a motion that is gone on with: the slopes of what came before",
 }
