@@ -1,10 +1,12 @@
 """The rod: what a user chose about it, and nothing else."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Generic, TypeAlias, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -158,8 +160,9 @@ def rod(
         density: [kg/m^3], as `young_modulus`.
         rest_strain: Strain of the unloaded rod, curvatures [1/m] first: one value per
             strain, or a function of s that gives (points, strains).
-        nodes: Gauss nodes; by default what resolves the modes. Add some when the rod
-            turns by more than half a turn. With breaks a multiple of the spans.
+        nodes: Gauss nodes; by default what resolves the modes, and coils of the rest strain
+            where its numbers are known. Add some when the rod bends by turns. With breaks a
+            multiple of the spans.
         breaks: Where section or rest strain jump or kink, in (0, 1).
     """
     given = {
@@ -176,13 +179,31 @@ def rod(
             )
     own = checked_breaks("rod", breaks)
     spans = len(merged(basis.breaks, own)) + 1
-    nodes = spans * basis.resolution if nodes is None else nodes
+    if nodes is None:
+        turn = _turn_at_rest(group, rest_strain, length)
+        nodes = spans * max(basis.resolution, 5 + math.ceil(turn / (_PER_NODE * spans)))
     s = gauss_legendre(Quadrature(max(nodes // spans, 1), merged(basis.breaks, own)))[0]
     if material is None:
         material = Elastic(*(_at(given[name], s) for name in given))
     if callable(rest_strain):
         rest_strain = real(rest_strain(s)).T
     return Rod(group, basis, _at(section, s), material, length, rest_strain, nodes, own)
+
+
+_PER_NODE = 3.0  # [rad] of a coil; leaves less than 1e-4 of the length at the tip
+
+
+def _turn_at_rest(group: SE2 | SE3, rest_strain: Any, length: Any) -> float:
+    """How far the sections of the unloaded rod turn at most [rad]; 0 where that is traced."""
+    if rest_strain is None:
+        return 0.0
+    values = rest_strain(np.linspace(0.0, 1.0, 33)) if callable(rest_strain) else rest_strain
+    if not all(map(_check.is_concrete, jax.tree.leaves((values, length)))):
+        return 0.0
+    rows = np.atleast_2d(np.asarray(values, float))
+    curvatures = rows[:, : 1 if group.space_dim == 2 else 3]
+    turn = np.max(np.linalg.norm(curvatures, axis=1)) * np.max(np.asarray(length))
+    return float(turn) if np.isfinite(turn) else 0.0
 
 
 def _at(value: Any, s: np.ndarray) -> Any:

@@ -89,6 +89,27 @@ def test_a_coil_that_the_nodes_do_not_carry_says_so(turns, nodes, good):
     assert (off < 1e-3) == good
 
 
+@pytest.mark.stress(85)
+@pytest.mark.parametrize("turns", [1, 5])
+@pytest.mark.parametrize("given", ["numbers", "function", "traced"])
+def test_the_nodes_of_a_coil_at_rest_carry_it(turns, given):
+    curvature = 2 * np.pi * turns / 0.1
+
+    def coil(curvature):
+        rest = jnp.array([1.0, 0.0]) if given == "traced" else np.array([1.0, 0.0])
+        rest = [curvature, *rest] if given != "traced" else jnp.stack([curvature, *rest])
+        shape = (lambda s: np.tile(rest, (len(s), 1))) if given == "function" else rest
+        return R.rod(SE2(), R.constant("kappa_z"), R.circle(1e-3), rest_strain=shape, **SOFT)
+
+    if given == "traced":  # sizes cannot follow: the status tells
+        found = jax.jit(lambda k: R.equilibrium(coil(k)))(jnp.asarray(curvature))
+        assert found.status == (Status.successful if turns == 1 else Status.unresolved)
+        return
+    rod = coil(curvature)
+    assert R.equilibrium(rod).status == Status.successful
+    assert jnp.abs(R.tip_pose(rod, jnp.zeros(1))[:2, 2]).max() < 1e-5
+
+
 @pytest.mark.stress(86)
 @pytest.mark.parametrize("extra", [{}, {"limits": (-40.0, 40.0)}])
 def test_inverse_kinematics_of_a_redundant_rod_has_the_slope_of_its_answers(extra):
