@@ -1,5 +1,6 @@
 """Slopes of meshes and of their measures in points and shapes."""
 
+import functools
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -32,36 +33,62 @@ def frame(lower, upper, center, radius):
 
 FRAME = frame(*SIZES)
 ROUND = FRAME.removed
-PLATE = M.triangulate(FRAME, size=0.4, order=2)
-HOLE = M.facets_on(PLATE, ROUND)
 BALL = sdf.Ellipsoid([1.0, 0.8, 1.2])
-EGG = M.tetrahedralise(BALL, size=0.7)
-BLOCK = M.box([0, 0, 0], [2, 1, 1], divisions=(2, 1, 1))
+
+
+@functools.cache
+def plate():
+    return M.triangulate(FRAME, size=0.4, order=2)
+
+
+@functools.cache
+def egg():
+    return M.tetrahedralise(BALL, size=0.7)
+
+
+def block():
+    return M.box([0, 0, 0], [2, 1, 1], divisions=(2, 1, 1))
 
 
 def shaken(mesh):
     return mesh.points + 0.03 * np.random.default_rng(0).uniform(-1, 1, mesh.points.shape)
 
 
-def in_points(verb, mesh):
-    return Case(lambda points: verb(replace(mesh, points=points)), shaken(mesh))
+def in_points(verb, make):
+    def case():
+        mesh = make()
+        return Case(lambda points: verb(replace(mesh, points=points)), shaken(mesh))
+
+    return case
+
+
+def hole(mesh):
+    return M.enclosed_volume(mesh, M.facets_on(plate(), ROUND))
+
+
+def distorted():
+    def ratios(points):
+        return M.distortion(plate(), replace(plate(), points=points))[:2]
+
+    return Case(ratios, shaken(plate()), step=1e-5)  # the worst cell stays the worst
+
+
+def moved_in_the_plane():
+    sizes = tuple(jnp.asarray(x) for x in SIZES)
+    return Case(lambda sizes: M.move(plate(), frame(*sizes)).points, sizes, step=1e-4)
+
+
+def moved_in_space():
+    return Case(lambda shape: M.move(egg(), shape).points, BALL, step=1e-4)
 
 
 CASES = {
-    "cell_areas": in_points(M.cell_areas, PLATE),
-    "cell_volumes of tetrahedra": in_points(M.cell_volumes, EGG),
-    "cell_volumes of hexahedra": in_points(M.cell_volumes, BLOCK),
-    "distortion": Case(
-        lambda points: M.distortion(PLATE, replace(PLATE, points=points))[:2],
-        shaken(PLATE),
-        step=1e-5,  # the worst cell stays the worst
-    ),
-    "enclosed_volume": in_points(lambda mesh: M.enclosed_volume(mesh, HOLE), PLATE),
-    "enrich": in_points(lambda mesh: M.enrich(mesh).points, PLATE),
-    "move in the plane": Case(
-        lambda sizes: M.move(PLATE, frame(*sizes)).points,
-        tuple(jnp.asarray(x) for x in SIZES),
-        step=1e-4,
-    ),
-    "move in space": Case(lambda shape: M.move(EGG, shape).points, BALL, step=1e-4),
+    "cell_areas": in_points(M.cell_areas, plate),
+    "cell_volumes of tetrahedra": in_points(M.cell_volumes, egg),
+    "cell_volumes of hexahedra": in_points(M.cell_volumes, block),
+    "distortion": distorted,
+    "enclosed_volume": in_points(hole, plate),
+    "enrich": in_points(lambda mesh: M.enrich(mesh).points, plate),
+    "move in the plane": moved_in_the_plane,
+    "move in space": moved_in_space,
 }

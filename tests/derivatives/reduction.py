@@ -50,7 +50,7 @@ def section(at):
 
 def in_motion(call):
     """The curve is looked up in the mesh on the host, so outside `jit`."""
-    return Case(call, path().displacements, jit=False)
+    return lambda: Case(call, path().displacements, jit=False)
 
 
 PRESSURE = R.PressureMap(
@@ -61,7 +61,7 @@ CASES = {
     "strain_along": in_motion(lambda u: backbone(u).strain),
     "strain_along with an arm": in_motion(lambda u: backbone(u, arm=0.003).strain),
     "coordinates": in_motion(lambda u: R.coordinates(backbone(u), BASIS)),
-    "mean_section": Case(section, path().problem.mesh.points, jit=False),
+    "mean_section": lambda: Case(section, path().problem.mesh.points, jit=False),
     "PressureMap": Case(
         lambda at: at[0].coenergy(at[1], at[2]), (PRESSURE, STATE, jnp.asarray(2e3))
     ),

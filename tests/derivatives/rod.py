@@ -1,11 +1,12 @@
 """Slopes of rods and assemblies in their numbers, coordinates, rates and forces."""
 
+import functools
 from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
 
-from sorojax import mesh, rod as R, sdf
+from sorojax import material, mesh, rod as R, sdf
 from sorojax.contact import LinePenalty
 from sorojax.math.lie import SE2, SE3, homogeneous
 from sorojax.math.status import Status
@@ -322,7 +323,11 @@ SIZES = {
     "squircle": (R.squircle, (6e-3, 3.0)),
 }
 OVAL = sdf.Ellipsoid([6e-3, 4e-3])
-PLATE = mesh.triangulate(OVAL, size=2.5e-3, order=2)
+
+
+@functools.cache
+def plate():
+    return mesh.triangulate(OVAL, size=2.5e-3, order=2)
 
 
 def sampled(at):
@@ -349,8 +354,6 @@ def built(at):
 
 
 def elastic(at):
-    from sorojax import material
-
     return R.elastic(material.NeoHookean(*at, density=1e3))
 
 
@@ -396,10 +399,12 @@ CASES = (
         ),
         "equilibrium_path": Case(loaded, (FLAT, FLAT_WRENCH), rtol=1e-6),
         "rollout": thrown(),
-        "from_shape": Case(
-            lambda shape: R.from_shape(shape, mesh=PLATE), OVAL, step=1e-4, rtol=1e-6
+        "from_shape": lambda: Case(
+            lambda shape: R.from_shape(shape, mesh=plate()), OVAL, step=1e-4, rtol=1e-6
         ),
-        "from_mesh": Case(lambda x: R.from_mesh(replace(PLATE, points=x)), PLATE.points),
+        "from_mesh": lambda: Case(
+            lambda x: R.from_mesh(replace(plate(), points=x)), plate().points
+        ),
         "scaled, taper": Case(sampled, (DISC, jnp.asarray(1.3))),
         "rod, serial, operators, assembly": Case(
             built, (1e6, 2e3, 0.08, 6e-3, jnp.array([1.0, 2.0, 5.0, 1.05, 0.1, -0.05]))

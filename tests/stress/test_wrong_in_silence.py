@@ -96,10 +96,12 @@ def test_the_nodes_of_a_coil_at_rest_carry_it(turns, given):
     curvature = 2 * np.pi * turns / 0.1
 
     def coil(curvature):
-        rest = jnp.array([1.0, 0.0]) if given == "traced" else np.array([1.0, 0.0])
-        rest = [curvature, *rest] if given != "traced" else jnp.stack([curvature, *rest])
-        shape = (lambda s: np.tile(rest, (len(s), 1))) if given == "function" else rest
-        return R.rod(SE2(), R.constant("kappa_z"), R.circle(1e-3), rest_strain=shape, **SOFT)
+        rest = {
+            "numbers": [curvature, 1.0, 0.0],
+            "function": lambda s: np.tile([curvature, 1.0, 0.0], (len(s), 1)),
+            "traced": jnp.zeros(3).at[0].set(curvature).at[1].set(1.0),
+        }[given]
+        return R.rod(SE2(), R.constant("kappa_z"), R.circle(1e-3), rest_strain=rest, **SOFT)
 
     if given == "traced":  # sizes cannot follow: the status tells
         found = jax.jit(lambda k: R.equilibrium(coil(k)))(jnp.asarray(curvature))
