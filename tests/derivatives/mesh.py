@@ -62,24 +62,28 @@ def in_points(verb, make):
     return case
 
 
-def hole(mesh):
-    return M.enclosed_volume(mesh, M.facets_on(plate(), ROUND))
+def around_the_hole():
+    hole = M.facets_on(plate(), ROUND)
+    return in_points(lambda mesh: M.enclosed_volume(mesh, hole), plate)()
 
 
 def distorted():
-    def ratios(points):
-        return M.distortion(plate(), replace(plate(), points=points))[:2]
+    made = plate()
 
-    return Case(ratios, shaken(plate()), step=1e-5)  # the worst cell stays the worst
+    def ratios(points):
+        return M.distortion(made, replace(made, points=points))[:2]
+
+    return Case(ratios, shaken(made), step=1e-5)  # the worst cell stays the worst
 
 
 def moved_in_the_plane():
-    sizes = tuple(jnp.asarray(x) for x in SIZES)
-    return Case(lambda sizes: M.move(plate(), frame(*sizes)).points, sizes, step=1e-4)
+    made, sizes = plate(), tuple(jnp.asarray(x) for x in SIZES)
+    return Case(lambda sizes: M.move(made, frame(*sizes)).points, sizes, step=1e-4)
 
 
 def moved_in_space():
-    return Case(lambda shape: M.move(egg(), shape).points, BALL, step=1e-4)
+    made = egg()
+    return Case(lambda shape: M.move(made, shape).points, BALL, step=1e-4)
 
 
 CASES = {
@@ -87,7 +91,7 @@ CASES = {
     "cell_volumes of tetrahedra": in_points(M.cell_volumes, egg),
     "cell_volumes of hexahedra": in_points(M.cell_volumes, block),
     "distortion": distorted,
-    "enclosed_volume": in_points(hole, plate),
+    "enclosed_volume": around_the_hole,
     "enrich": in_points(lambda mesh: M.enrich(mesh).points, plate),
     "move in the plane": moved_in_the_plane,
     "move in space": moved_in_space,

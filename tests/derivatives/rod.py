@@ -330,6 +330,16 @@ def plate():
     return mesh.triangulate(OVAL, size=2.5e-3, order=2)
 
 
+def drawn():
+    made = plate()
+    return Case(lambda shape: R.from_shape(shape, mesh=made), OVAL, step=1e-4, rtol=1e-6)
+
+
+def meshed():
+    made = plate()
+    return Case(lambda x: R.from_mesh(replace(made, points=x)), made.points)
+
+
 def sampled(at):
     section, factor = at
     tapered = R.taper(R.rectangle, (6e-3, factor * 4e-3), (3e-3, 2e-3))
@@ -399,12 +409,8 @@ CASES = (
         ),
         "equilibrium_path": Case(loaded, (FLAT, FLAT_WRENCH), rtol=1e-6),
         "rollout": thrown(),
-        "from_shape": lambda: Case(
-            lambda shape: R.from_shape(shape, mesh=plate()), OVAL, step=1e-4, rtol=1e-6
-        ),
-        "from_mesh": lambda: Case(
-            lambda x: R.from_mesh(replace(plate(), points=x)), plate().points
-        ),
+        "from_shape": drawn,
+        "from_mesh": meshed,
         "scaled, taper": Case(sampled, (DISC, jnp.asarray(1.3))),
         "rod, serial, operators, assembly": Case(
             built, (1e6, 2e3, 0.08, 6e-3, jnp.array([1.0, 2.0, 5.0, 1.05, 0.1, -0.05]))
