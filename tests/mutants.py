@@ -168,15 +168,25 @@ def drawn(rooms: list[str], count: int, seed: int) -> list[Mutant]:
 
 
 def survives(mutant: Mutant, copy_of: Path, workers: int) -> bool:
-    """Whether the tests of its room pass with the mutant in place."""
-    target = copy_of / mutant.file
+    """Whether the tests of its room, then derivatives and stress cases of every floor, pass
+    with the mutant in place."""
+    target, tests = copy_of / mutant.file, copy_of / "tests"
     kept = target.read_text(encoding="utf-8")
     room = next(r for r in ROOMS if mutant.file.startswith(r))
-    files = sorted({f for p in ROOMS[room] for f in (copy_of / "tests").glob(f"{p}.py")})
+    files = sorted({f for p in ROOMS[room] for f in tests.glob(f"{p}.py")})
     order = sorted(files, key=lambda f: Path(mutant.file).stem not in f.read_text())
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", str(workers), "--dist",
-               "loadfile", "-p", "no:cacheprovider", *map(str, order)]  # fmt: skip
     target.write_text(mutant.text, encoding="utf-8")
+    try:
+        return _pass(order, copy_of, workers) and _pass(
+            [tests / "derivatives", tests / "stress"], copy_of, workers
+        )
+    finally:
+        target.write_text(kept, encoding="utf-8")
+
+
+def _pass(files: list[Path], copy_of: Path, workers: int) -> bool:
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", str(workers), "--dist",
+               "load", "-p", "no:cacheprovider", *map(str, files)]  # fmt: skip
     path = os.pathsep.join(str(copy_of / part) for part in ("", "hardware", "hardware/pi"))
     try:
         done = subprocess.run(
@@ -186,8 +196,6 @@ def survives(mutant: Mutant, copy_of: Path, workers: int) -> bool:
         return done.returncode == 0
     except subprocess.TimeoutExpired:
         return False  # a loop without end is seen
-    finally:
-        target.write_text(kept, encoding="utf-8")
 
 
 def main() -> int:
