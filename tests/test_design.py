@@ -67,6 +67,28 @@ def test_gcmma_never_rises_where_mma_may():
     assert careful.objective < rough(start) - 0.5
 
 
+def test_curvature_of_gcmma_after_a_proposal_that_was_too_good():
+    """min(10 rho, 1.1 (rho + delta)), Svanberg 2002, eq. 4.12, with delta by the closed form of
+    one variable between asymptotes at 0 and 1."""
+    x, y, slope, value, found = 0.5, 0.6, 2.0, 1.0, 1.27
+    method = design.GCMMA(0.0, 1.0)
+    values = design.Values(value, jnp.array([slope]), jnp.zeros(0), jnp.zeros((0, 1)))
+    state = method.begin(jnp.array([x]), values, method.init(jnp.array([x]), 0))
+    rho = 0.1 * slope
+
+    def told(rho):
+        p, q = 0.25 * (1.001 * slope + rho), 0.25 * (0.001 * slope + rho)
+        return value + p * (1 / (1 - y) - 2) + q * (1 / y - 2)
+
+    delta = (found - told(rho)) / (told(1.0) - told(0.0))
+    assert 0 < delta < 5 * rho
+    stiffer, held = method.stiffen(
+        jnp.array([x]), jnp.array([y]), values, (jnp.asarray(found), jnp.zeros(0)), state
+    )
+    assert not held
+    assert np.allclose(stiffer.curvature, 1.1 * (rho + delta), rtol=1e-12)
+
+
 def test_a_problem_without_a_feasible_point_ends_at_the_least_bad():
     found = design.minimise(
         lambda x: jnp.sum(x), jnp.array([0.5]), steps=40,
