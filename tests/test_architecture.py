@@ -121,6 +121,13 @@ def test_the_import_rule_catches(line, tmp_path, monkeypatch):
     assert len(wrong_imports(file)) == 1
 
 
+def test_a_checker_sees_arguments_in_their_order():
+    """`eqx.AbstractVar` is a field for type checkers, the first of the signature they see:
+    `if TYPE_CHECKING:` with `ClassVar` is none."""
+    found = [f.name for f in CORE.rglob("*.py") if "AbstractVar[" in f.read_text()]
+    assert not found
+
+
 def test_hardware_knows_nothing_of_the_core():
     found = [
         f"{path.relative_to(ROOT)} imports {name}"

@@ -12,7 +12,7 @@ References:
 """
 
 import abc
-from typing import NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -47,9 +47,10 @@ class MMAState(eqx.Module):
 class AbstractMMA(eqx.Module):
     """What both versions share: bounds, asymptotes and the convex functions."""
 
-    lower: eqx.AbstractVar[Float[Array, "..."]]
-    upper: eqx.AbstractVar[Float[Array, "..."]]
-    move: eqx.AbstractVar[Float[Array, ""]]
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        lower: ClassVar[Float[Array, "..."]]
+        upper: ClassVar[Float[Array, "..."]]
+        move: ClassVar[Float[Array, ""]]
 
     @abc.abstractmethod
     def _curvature(self, state: MMAState, values: Values, span: Array) -> Array:

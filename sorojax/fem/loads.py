@@ -26,8 +26,9 @@ if TYPE_CHECKING:
 class AbstractLoad(eqx.Module):
     """A load of size `value`, called by `name` in `solve_path(problem, name=values)`."""
 
-    value: eqx.AbstractVar[Float[Array, "..."]]
-    name: eqx.AbstractVar[str]
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        value: ClassVar[Float[Array, "..."]]
+        name: ClassVar[str]
     holds: ClassVar[bool] = False  # whether its stiffness can hold the body
     smooth: ClassVar[bool] = True  # whether the tangent at one load foretells the next
     overshoots: ClassVar[bool] = False  # whether steps may run past where its force changes

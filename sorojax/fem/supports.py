@@ -1,6 +1,6 @@
 """Supports: which displacements are known, and their values."""
 
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,10 +17,11 @@ class AbstractSupport(eqx.Module):
     follows `simulate(problem, ..., name=values)` where there is a `name`.
     """
 
-    nodes: eqx.AbstractVar[Int[Array, " nodes"]]
-    displacement: eqx.AbstractVar[Float[Array, "..."]]
-    components: eqx.AbstractVar[tuple[int, ...] | None]
-    name: eqx.AbstractVar[str]
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        nodes: ClassVar[Int[Array, " nodes"]]
+        displacement: ClassVar[Float[Array, "..."]]
+        components: ClassVar[tuple[int, ...] | None]
+        name: ClassVar[str]
     ramped: ClassVar[str | None] = None
 
 

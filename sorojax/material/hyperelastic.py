@@ -3,6 +3,7 @@
 import abc
 import functools
 from collections.abc import Callable
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax
@@ -23,7 +24,8 @@ class AbstractHyperelastic(eqx.Module):
     of points. A leaf may also hold one number per cell of a mesh.
     """
 
-    density: eqx.AbstractVar[Float[Array, "..."] | None]
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        density: ClassVar[Float[Array, "..."] | None]
 
     @abc.abstractmethod
     def isochoric_energy(self, F: Tensor) -> Entry:

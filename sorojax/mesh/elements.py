@@ -8,7 +8,7 @@ order is that of VTK and meshio.
 """
 
 import abc
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 
@@ -19,10 +19,11 @@ class AbstractElement(eqx.Module):
     """A reference cell."""
 
     dim: eqx.AbstractClassVar[int]
-    num_nodes: eqx.AbstractVar[int]
-    num_corners: eqx.AbstractVar[int]
     order: eqx.AbstractClassVar[int]
-    facets: eqx.AbstractVar[Facets]
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        num_nodes: ClassVar[int]
+        num_corners: ClassVar[int]
+        facets: ClassVar[Facets]
 
     @property
     @abc.abstractmethod

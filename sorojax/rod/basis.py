@@ -1,7 +1,7 @@
 """Strain bases: which strains of a rod are active, and the shapes they may take."""
 
 import abc
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
 import equinox as eqx
 import jax
@@ -23,7 +23,8 @@ class AbstractModes(eqx.Module):
     the rod then integrates between them.
     """
 
-    count: eqx.AbstractVar[int]
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        count: ClassVar[int]
 
     @property
     @abc.abstractmethod

@@ -1,7 +1,7 @@
 """Contact of a rod with a fixed obstacle, and what all contacts of rods share."""
 
 import abc
-from typing import NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -40,7 +40,8 @@ class AbstractContact(AbstractForce):
     one test.
     """
 
-    law: eqx.AbstractVar[LinePenalty]
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        law: ClassVar[LinePenalty]
 
     @property
     @abc.abstractmethod

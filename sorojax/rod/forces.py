@@ -11,7 +11,7 @@ To add one, subclass the family that fits:
 """
 
 import abc
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -98,7 +98,8 @@ class AbstractPressureMap(eqx.Module):
     walls, one number per port: ports must not stretch each other's walls.
     """
 
-    ports: eqx.AbstractVar[tuple[int, ...]]
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        ports: ClassVar[tuple[int, ...]]
 
     @abc.abstractmethod
     def coenergy(

@@ -6,7 +6,7 @@ depends on the coordinates of the rod alone, and every derivative is exact.
 
 import abc
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -36,9 +36,10 @@ class AbstractRoute(eqx.Module):
     `nodes` is the number of Gauss points between two breaks of the strain basis.
     """
 
-    start: eqx.AbstractVar[float]
-    stop: eqx.AbstractVar[float]
-    nodes: eqx.AbstractVar[int]
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        start: ClassVar[float]
+        stop: ClassVar[float]
+        nodes: ClassVar[int]
 
     def __check_init__(self):
         if not 0 <= self.start < self.stop <= 1:

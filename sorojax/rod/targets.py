@@ -1,7 +1,7 @@
 """What inverse kinematics is asked for: where sections shall be, and what they shall avoid."""
 
 import abc
-from typing import NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -30,8 +30,9 @@ class Frames(NamedTuple):
 class AbstractTarget(eqx.Module):
     """A task for the sections at `s` in [0, 1] of a rod, or of the named part."""
 
-    s: eqx.AbstractVar[Float[Array, " points"]]
-    part: eqx.AbstractVar[str | None]
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        s: ClassVar[Float[Array, " points"]]
+        part: ClassVar[str | None]
 
     @abc.abstractmethod
     def errors(self, group: SE2 | SE3, frames: Frames) -> Errors:

@@ -2,7 +2,7 @@
 
 import abc
 import math
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -101,10 +101,11 @@ def _check_blend(shape: "AbstractBlended") -> None:
 class AbstractBlended(AbstractSdf):
     """Two shapes joined by a blend of width `k` [m]."""
 
-    first: eqx.AbstractVar[AbstractSdf]
-    second: eqx.AbstractVar[AbstractSdf]
-    k: eqx.AbstractVar[Float[Array, ""]]
-    blend: eqx.AbstractVar[AbstractBlend]
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        first: ClassVar[AbstractSdf]
+        second: ClassVar[AbstractSdf]
+        k: ClassVar[Float[Array, ""]]
+        blend: ClassVar[AbstractBlend]
 
     @property
     def dim(self) -> int:

@@ -2,7 +2,7 @@
 
 import abc
 import math
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -28,9 +28,10 @@ class AbstractSurfaceLattice(AbstractSdf):
     F is steepest and thicker elsewhere.
     """
 
-    period: eqx.AbstractVar[Float[Array, ""]]
-    thickness: eqx.AbstractVar[Float[Array, ""]]
-    level: eqx.AbstractVar[Float[Array, ""]]
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        period: ClassVar[Float[Array, ""]]
+        thickness: ClassVar[Float[Array, ""]]
+        level: ClassVar[Float[Array, ""]]
     bound: eqx.AbstractClassVar[float]
 
     @abc.abstractmethod
@@ -158,8 +159,9 @@ class AbstractBeamLattice(AbstractSdf):
     in which the nearest beam lies too; `beams` are those of the wedge over period/2.
     """
 
-    period: eqx.AbstractVar[Float[Array, ""]]
-    width: eqx.AbstractVar[Float[Array, ""]]
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        period: ClassVar[Float[Array, ""]]
+        width: ClassVar[Float[Array, ""]]
     beams: eqx.AbstractClassVar[tuple]
 
     @property

@@ -3,6 +3,7 @@
 import abc
 import functools
 import math
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,7 +20,8 @@ from sorojax.sdf.scalar import absolute, minimum
 class AbstractWrapped(AbstractSdf):
     """A shape made of one other shape of the same dimension and slope."""
 
-    shape: eqx.AbstractVar[AbstractSdf]
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        shape: ClassVar[AbstractSdf]
 
     @property
     def dim(self) -> int:

@@ -5,7 +5,7 @@ inputs `q` and `v`, output `effort`, for a body with `driven=True`.
 """
 
 import abc
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -35,7 +35,8 @@ Effort = Float[Array, " dof"]
 class AbstractLaw(AbstractController):
     """A static law from (t, q, v) to an effort in the coordinates of a rod."""
 
-    rod: eqx.AbstractVar[Rod]
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        rod: ClassVar[Rod]
 
     @abc.abstractmethod
     def effort(self, t: Float[Array, ""], q: Effort, v: Effort) -> Effort:
