@@ -468,6 +468,7 @@ OWN = {
     "Gent": (material.Gent(1e5, 40.0, 1e9), {}),
     "Ogden 1": (material.Ogden((6e4,), (2.6,), 1e9), {"terms": 1}),
     "Ogden 2": (material.Ogden((6e4, 3e2), (1.7, 5.0), 1e9), {"terms": 2}),
+    "Ogden 2, one exponent small": (material.Ogden((6e4, 3e2), (0.6, 5.0), 1e9), {"terms": 2}),
     "Ogden 3": (material.Ogden((6e4, 2e4, 40.0), (1.2, 2.9, 6.0), 1e9), {"terms": 3}),
 }
 
