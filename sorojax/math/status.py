@@ -45,6 +45,11 @@ class Status(eqx.Enumeration):
         "The search did not settle. Apply the load, or move the targets, in steps that start "
         "from the last answer, or raise `max_iterations`."
     )
+    unstable_equilibrium = (
+        "In balance, but not stable: the least push carries it away, as it does a straight "
+        "column past its critical load. Start the search from a shape on the side to which it "
+        "shall go, or follow the branch by `arc_length_path`."
+    )
     out_of_reach = (
         "The targets cannot be met: this is as close as the model comes. Move the targets, "
         "drop one, widen limits, or give more modes or another first guess."

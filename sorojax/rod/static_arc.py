@@ -156,7 +156,7 @@ def arc_length_path(
         direction = _unit(jnp.linalg.solve(border, right), weights)
         length = jnp.where(count <= _EASY, 1.5 * length, length)
         new = _Point(q, factor, direction, jnp.minimum(length, longest * begin), done)
-        negative = negative_eigenvalues(slope)
+        negative = negative_eigenvalues(slope, search.metric)
         if progress:
             tell("arc length path", share)
         return new, (q, factor, negative, ended(done, increments(model, q), rate))

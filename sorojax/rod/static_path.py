@@ -15,7 +15,7 @@ from sorojax.math.told import tell
 from sorojax.rod.assembly import dtype_of
 from sorojax.rod.loads import Load, total_force
 from sorojax.rod.model import Model, motion, operators
-from sorojax.rod.statics import Search, ended, first_guess, newton, prepare
+from sorojax.rod.statics import Search, ended, first_guess, newton, prepare, stability
 from sorojax.rod.tangent import squared
 from sorojax.rod.validity import checked_status
 
@@ -26,7 +26,8 @@ class EquilibriumPath(eqx.Module):
     """Coordinates at rest under each load, how each search ended, and its iterations.
 
     Where a search fails, the path stops: the rest of `q` repeats the last equilibrium
-    and says so in `status`.
+    and says so in `status`. A state that is in balance without being stable is an
+    `unstable_equilibrium`; the path goes on.
     """
 
     q: Float[Array, "steps coordinates"]
@@ -83,22 +84,27 @@ def equilibrium_path(
     def find(_, guesses):
         def advance(state, row):
             (q, last, alive), (target, share) = state, row
-            new, done, count = _step(residual, q, last, target, alive, search, max_cuts)
+            new, done, count, unstable = _step(
+                residual, q, last, target, alive, search, max_cuts
+            )
             if progress:
                 tell("equilibrium path", share)
-            return (new, target, done), (new, done.astype(dtype), count.astype(dtype))
+            ends = tuple(x.astype(dtype) for x in (done, count, unstable))
+            return (new, target, done), (new, ends)
 
-        _, (q, done, count) = jax.lax.scan(
-            advance, (guesses[0], first, jnp.array(True)), (factors, shares)
-        )
-        return q, (done, count)
+        start = (guesses[0], first, jnp.array(True))
+        return jax.lax.scan(advance, start, (factors, shares))[1]
 
     def balance(q):
         return jax.vmap(lambda q, f: squared(model, q, residual(q, f)))(q, factors)
 
     guesses = jnp.broadcast_to(guess, (factors.shape[0], guess.shape[0]))
-    rest, (done, count) = implicit_root(balance, guesses, find, _solve_rows, has_aux=True)
-    status = jax.vmap(ended)(done, rest, jax.vmap(residual)(rest, factors))
+    rest, (done, count, unstable) = implicit_root(
+        balance, guesses, find, _solve_rows, has_aux=True
+    )
+    status = jax.vmap(lambda done, unstable, *values: ended(done, *values, unstable=unstable))(
+        done, unstable, rest, jax.vmap(residual)(rest, factors)
+    )
     status = jax.vmap(lambda x, q: checked_status(x, model, q))(status, rest)
     return EquilibriumPath(rest, status, count.astype(jnp.int32))
 
@@ -109,21 +115,23 @@ def _step(residual, q: Array, last: Array, target: Array, alive, search: Search,
     shortest = 0.5**max_cuts
 
     def going(state):
-        _, at, part, _ = state
+        _, at, part, *_ = state
         return alive & (at < 1) & (part >= shortest)
 
     def advance(state):
-        q, at, part, count = state
+        q, at, part, count, slope = state
         aim = jnp.minimum(at + part, whole)
         factor = last + aim * (target - last)
         found = newton(lambda q: residual(q, factor), q, search)
         good = found.done
         new = jnp.where(good, found.q, q), jnp.where(good, aim, at)
-        return *new, jnp.where(good, 2 * part, part / 2), count + found.count
+        slope = jnp.where(good, found.slope, slope)
+        return *new, jnp.where(good, 2 * part, part / 2), count + found.count, slope
 
-    state = (q, 0 * whole, whole, jnp.array(0, dtype=jnp.int32))
-    q, at, _, count = jax.lax.while_loop(going, advance, state)
-    return q, alive & (at >= 1), count
+    state = (q, 0 * whole, whole, jnp.array(0, dtype=jnp.int32), search.metric)
+    q, at, _, count, slope = jax.lax.while_loop(going, advance, state)
+    _, unstable = stability(slope, search)
+    return q, alive & (at >= 1), count, unstable
 
 
 def _solve_rows(linear, right: Float[Array, "steps unknowns"]) -> Array:

@@ -19,6 +19,7 @@ from sorojax.rod.loads import Load, total_force
 from sorojax.rod.model import Model, motion, operators
 from sorojax.rod.tangent import (
     increments,
+    is_unstable,
     linearised,
     metric,
     moved,
@@ -41,8 +42,9 @@ class Equilibrium(eqx.Module):
         q: Coordinates.
         status: How it ended.
         num_iterations: Of Newton.
-        negative: Negative eigenvalues of the tangent; 0 is stable under dead loads. A straight
-            column past its critical load is in balance, with one.
+        negative: Negative eigenvalues of the symmetric part of the tangent; 0 is stable. A
+            straight column past its critical load has one, and the status
+            `unstable_equilibrium`.
     """
 
     q: Float[Array, " coordinates"]
@@ -70,9 +72,10 @@ class Search(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Where a search ended."""
+    """Where a search ended, and the tangent of its last step."""
 
     q: Float[Array, " coordinates"]
+    slope: Float[Array, "dof dof"]
     done: Bool[Array, ""]
     count: Int[Array, ""]
 
@@ -114,14 +117,13 @@ def equilibrium(
     def find(_, guess):
         found = newton(residual, guess, search)
         # What comes with a root has a derivative of zero, so it is floating.
-        negative = negative_eigenvalues(linearised(residual, model, found.q)[1])
-        ends = (found.done, found.count, negative)
+        ends = (found.done, found.count, *stability(found.slope, search))
         return found.q, tuple(x.astype(guess.dtype) for x in ends)
 
-    rest, (done, count, negative) = implicit_root(
+    rest, (done, count, negative, unstable) = implicit_root(
         lambda q: squared(model, q, residual(q)), guess, find, _solve_tangent, has_aux=True
     )
-    status = checked_status(ended(done, rest, residual(rest)), model, rest)
+    status = checked_status(ended(done, rest, residual(rest), unstable=unstable), model, rest)
     return Equilibrium(rest, status, count.astype(jnp.int32), negative.astype(jnp.int32))
 
 
@@ -152,7 +154,7 @@ def newton(residual: Residual, guess: Array, search: Search) -> Found:
         return force @ cho_solve(factor, force)
 
     def improve(state):
-        q, _, _, count = state
+        q, _, _, _, count = state
         force, slope = linearised(residual, search.model, q)
         step = -jnp.linalg.solve(slope, force)
         shape = increments(search.model, q)
@@ -174,25 +176,36 @@ def newton(residual: Residual, guess: Array, search: Search) -> Found:
         length, value = jax.lax.while_loop(too_long, lambda trial: at(trial[0] / 2), first)
         good = value <= start
         new = jnp.where(good, moved(search.model, q, length * step), q)
-        return new, small & good, ~good, count + 1
+        return new, slope, small & good, ~good, count + 1
 
     def searching(state):
-        _, done, stuck, count = state
+        _, _, done, stuck, count = state
         return ~done & ~stuck & (count < search.max_iterations)
 
     no = jnp.array(False)
-    begin = (guess, no, no, jnp.array(0, dtype=jnp.int32))
-    q, done, _, count = jax.lax.while_loop(searching, improve, begin)
-    return Found(q, done & jnp.all(jnp.isfinite(q)), count)
+    begin = (guess, search.metric, no, no, jnp.array(0, dtype=jnp.int32))
+    q, slope, done, _, count = jax.lax.while_loop(searching, improve, begin)
+    return Found(q, slope, done & jnp.all(jnp.isfinite(q)), count)
 
 
-def ended(done: Array, *values: Array) -> Status:
+def stability(
+    slope: Float[Array, "dof dof"], search: Search
+) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+    """Negative eigenvalues at the end of a search, and whether they make it unstable."""
+    negative = negative_eigenvalues(slope, search.metric)
+    return negative, is_unstable(slope, search.metric, negative)
+
+
+def ended(done: Array, *values: Array, unstable: Array | bool = False) -> Status:
     """The status of a search, given what must be finite."""
     finite = jnp.array(True)
     for value in values:
         finite = finite & jnp.all(jnp.isfinite(value))
     failed = Status.where(finite, Status.not_converged, Status.not_finite)
-    return Status.where(finite & done.astype(bool), Status.successful, failed)
+    good = Status.where(
+        jnp.asarray(unstable).astype(bool), Status.unstable_equilibrium, Status.successful
+    )
+    return Status.where(finite & done.astype(bool), good, failed)
 
 
 def _solve_tangent(linear, right: Array) -> Array:

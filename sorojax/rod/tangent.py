@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from sorojax.rod.assembly import dtype_of, is_flat, num_dof, rest, retract, slices
 from sorojax.rod.model import Model, inertia, motion
@@ -59,10 +59,38 @@ def linearised(
     return value, slope
 
 
-def negative_eigenvalues(slope: Float[Array, "dof dof"]) -> Int[Array, ""]:
-    """Of the symmetric part: none where the state is stable under dead loads."""
+def negative_eigenvalues(
+    slope: Float[Array, "dof dof"], metric: Float[Array, "dof dof"]
+) -> Int[Array, ""]:
+    """Of the symmetric part, beyond rounding."""
+    slope = _scaled(slope, metric)
     values = jnp.linalg.eigvalsh((slope + slope.T) / 2)
-    return jnp.sum(values < 0, dtype=jnp.int32)
+    rounding = 32 * jnp.finfo(slope.dtype).eps * jnp.max(jnp.abs(values))
+    return jnp.sum(values < -rounding, dtype=jnp.int32)
+
+
+def is_unstable(
+    slope: Float[Array, "dof dof"], metric: Float[Array, "dof dof"], negative: Int[Array, ""]
+) -> Bool[Array, ""]:
+    """Whether a state of this tangent is surely left.
+
+    Under loads that have a potential by a negative eigenvalue. Loads that follow the body make
+    the tangent unsymmetric; then one real negative eigenvalue, as a negative determinant tells:
+    the symmetric part may have one where the state is stable.
+
+    Reference: Bolotin, "Nonconservative Problems of the Theory of Elastic Stability", 1963.
+    """
+    slope = _scaled(slope, metric)
+    share = float(jnp.finfo(slope.dtype).eps) ** 0.5
+    apart = jnp.max(jnp.abs(slope - slope.T)) > share * jnp.max(jnp.abs(slope))
+    sign, _ = jnp.linalg.slogdet(slope)
+    return (negative > 0) & (~apart | (sign < 0))
+
+
+def _scaled(slope: Array, metric: Array) -> Array:
+    """Without units: strains and bends differ by many orders."""
+    scale = jnp.sqrt(jnp.diag(metric))
+    return slope / (scale[:, None] * scale[None])
 
 
 def metric(model: Model, constants) -> Float[Array, "dof dof"]:

@@ -97,4 +97,5 @@ CASES = {
     91: "inverse kinematics that rests on limits: the least energy there, and its slope",
     92: "derivatives of compiled functions in lanes: those of a loop",
     93: "a motion that is gone on with: the slopes of what came before",
+    94: "a column past its critical load: in balance, and called unstable",
 }

@@ -121,11 +121,32 @@ def test_a_column_below_at_and_above_its_critical_load():
     assert below.negative == 0
     # Straight is in balance still, and the answer says that it is not stable.
     above = pushed(jnp.array(1.1), none, straight)
-    assert above.status == Status.successful and above.negative == 1
+    assert above.status == Status.unstable_equilibrium and above.negative == 1
     for side in (none, jnp.array(1e-6)):
         bent = pushed(jnp.array(1.1), side, bowed)
         assert bent.status == Status.successful and bent.negative == 0
         assert jnp.abs(bent.q).max() > 1.0
+
+
+@pytest.mark.stress(94)
+def test_balance_past_the_critical_load_is_called_unstable_unless_the_load_follows():
+    """A load along the tip has no other balance than straight up to flutter at 20.05 EI / L^2
+    (Beck, ZAMP 3, 1952); one that keeps its direction at 2.47 has."""
+    rod = planar(R.chebyshev(kappa_z=4), nodes=10)
+    critical = np.pi**2 * EI / (4 * 0.08**2)
+
+    @eqx.filter_jit
+    def ends(share):
+        wrench = critical * jnp.stack([jnp.zeros_like(share), -share, jnp.zeros_like(share)])
+        loads = [R.PointWrench(wrench, follower=turns) for turns in (False, True)]
+        path = R.equilibrium_path(rod, lambda f: (loads[0],), jnp.ones(2), begin=1.0)
+        return [R.equilibrium(rod, (load,)).status for load in loads], path.status
+
+    (dead, following), path = ends(jnp.array(3.0))
+    assert dead == Status.unstable_equilibrium and following == Status.successful
+    assert str(path) == "Status(unstable_equilibrium: 2)"
+    (dead, following), path = ends(jnp.array(0.9))
+    assert dead == following == Status.successful and str(path) == "Status(successful: 2)"
 
 
 @pytest.mark.stress(8)
