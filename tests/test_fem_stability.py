@@ -211,6 +211,13 @@ def test_a_column_buckles_under_the_load_of_euler(column, buckled):
     assert abs(abs(point.shape[tip, 1]) - 1) < 1e-2
 
 
+def test_a_solution_past_the_critical_load_says_that_it_is_not_stable(column):
+    at = fem.solve(fem.with_load(column, "push", 1.2 * column.loads[0].value))
+    assert "not stable: negative eigenvalues of the tangent 1" in str(at)
+    path = fem.solve_path(column, push=np.outer([0.5, 1.2], column.loads[0].value))
+    assert "not stable: negative eigenvalues of the tangent 0, 1" in str(path)
+
+
 @pytest.mark.parametrize("side", [-1, 1])
 def test_the_buckled_branch_is_stable_and_goes_to_either_side(column, buckled, side):
     (point,) = buckled.critical_points

@@ -50,7 +50,7 @@ class Solution(eqx.Module):
         if self.iterations is not None:
             part = number(self.load_fraction)
             rows.append(f"  {number(self.iterations)} iterations, load fraction {part}")
-        return "\n".join(rows)
+        return "\n".join(rows + _unstable([self.stats]))
 
 
 @displayed
@@ -78,7 +78,16 @@ class Path(eqx.Module):
         return (
             f"Path: {len(self)} states, {outcome(self.status)}, largest displacement "
             f"{largest}\n  {self.name} {number(self.values)}"
-        )
+        ) + "".join(f"\n{row}" for row in _unstable(self.stats))
+
+
+def _unstable(records: Any) -> list[str]:
+    """What a print says of states that are in balance without being stable."""
+    steps = [r.steps[-1] for r in records or () if isinstance(r, Stats) and r.steps]
+    if not any(step.negative_eigenvalues > 0 for step in steps):
+        return []
+    counts = ", ".join(str(step.negative_eigenvalues) for step in steps)
+    return [f"  not stable: negative eigenvalues of the tangent {counts}; see `continuation`"]
 
 
 class ConvergenceError(RuntimeError):

@@ -150,3 +150,8 @@ def test_edges_that_a_delaunay_triangulation_lacks_are_put_in():
     crossing = lines._replace(points=np.where(points == 0.02, -0.02, points))
     with pytest.raises(Missing):
         constrained(crossing.points, crossing)
+    # edges that face the corners of a frame around lie on the hull without one of these
+    diamond = np.array([[1.0, 0], [2, 1], [1, 2], [0, 1]])
+    edges = np.array([[0, 1], [1, 2], [2, 3], [3, 0]])
+    lines = Outline(diamond, edges, np.zeros(4, int), np.ones(4, bool))
+    assert len(constrained(diamond, lines)) == 2
