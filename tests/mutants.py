@@ -39,7 +39,7 @@ ROOMS = {
     "sorojax/systems": ["test_systems*", "test_shape_estimate", "test_waypoints"],
     "sorojax/reduction": ["test_reduction*"],
     "sorojax/design": ["test_design", "test_layout", "test_calibrate", "test_part"],
-    "sorojax/io": ["test_io_*", "test_fem_loads"],
+    "sorojax/io": ["test_io_*", "test_fem_loads", "test_web", "test_view*"],
     "hardware/pi/sorojax_board": ["test_board", "test_tcp_board", "test_hardware*"],
 }
 

@@ -90,6 +90,12 @@ def test_what_is_far_is_never_inside(getkey):
     way = 0.999 * room[:, None, None] * way / jnp.linalg.norm(way, axis=2, keepdims=True)
     assert jnp.any(room > 0)
     assert jnp.all(jnp.min(ball(clouds + way), axis=1)[room > 0] > 1e-3)
+    # as large as one value can tell: from the middle of the points, less the farthest of them
+    corners = jnp.array([[0.02, 0.03, 0.0], [0.04, 0.05, 0.0]])
+    want = jnp.hypot(0.03, 0.04) - 0.01 - 0.01 * jnp.sqrt(2.0)
+    assert jnp.allclose(contact.clearance(ball, corners), want, rtol=1e-12)
+    near = contact.clearance(ball, corners, jnp.array(1e-3))
+    assert jnp.allclose(near, want - 1e-3, rtol=1e-12)
 
 
 def _block(stiffness=None):

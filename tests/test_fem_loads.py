@@ -181,6 +181,9 @@ def test_a_rigid_part_keeps_its_shape_and_turns_freely():
     turned = fem.rotated(CUBE.points, 1.2, jnp.zeros(3), jnp.array([1.0, 1.0, 0.0]))
     solid = _problem(fem.rigid(CUBE, CUBE.node_sets["right"]), grid=CUBE)
     assert solid.loads[0].potential(solid, turned) < 1e-20 * solid.loads[0].stiffness
+    grown = fem.with_load(solid, "rigid", 0.02)
+    swollen = turned + 0.02 * (CUBE.points + turned)
+    assert grown.loads[0].potential(grown, swollen) < 1e-20 * solid.loads[0].stiffness
     stiff = _problem(fem.rigid(BEAM, RIGHT)).loads[0].stiffness
     free, tied = (
         _only(ground={"stiffness": 4.0}, rigid={"stiffness": s}) for s in (0.0, stiff)
