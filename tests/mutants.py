@@ -167,9 +167,9 @@ def drawn(rooms: list[str], count: int, seed: int) -> list[Mutant]:
     return rows[:count]
 
 
-def survives(mutant: Mutant, copy_of: Path, workers: int) -> bool:
-    """Whether the tests of its room, then its derivatives and the stress cases, pass with the
-    mutant in place."""
+def survives(mutant: Mutant, copy_of: Path, workers: int, wide: bool) -> bool:
+    """Whether the tests of its room pass with the mutant in place, and then, if `wide`, its
+    derivatives and the stress cases."""
     target, tests = copy_of / mutant.file, copy_of / "tests"
     kept = target.read_text(encoding="utf-8")
     room = next(r for r in ROOMS if mutant.file.startswith(r))
@@ -178,8 +178,10 @@ def survives(mutant: Mutant, copy_of: Path, workers: int) -> bool:
     target.write_text(mutant.text, encoding="utf-8")
     try:
         floor = f"{Path(room).name}- or stress"
-        return _pass(order, copy_of, workers) and _pass(
-            [tests / "derivatives", tests / "stress", "-k", floor], copy_of, workers
+        alive = _pass(order, copy_of, workers)
+        return alive and (
+            not wide
+            or _pass([tests / "derivatives", tests / "stress", "-k", floor], copy_of, workers)
         )
     finally:
         target.write_text(kept, encoding="utf-8")
@@ -206,6 +208,7 @@ def main() -> int:
     parser.add_argument("--room", action="append", choices=list(ROOMS))
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--skip", type=int, default=0, help="leave out the first of the draw")
+    parser.add_argument("--narrow", action="store_true", help="the tests of its room alone")
     parser.add_argument("--list", action="store_true")
     options = parser.parse_args()
     chosen = drawn(options.room or list(ROOMS), options.draw, options.seed)[options.skip :]
@@ -219,7 +222,7 @@ def main() -> int:
         shutil.copytree(ROOT, copy_of, ignore=ignored)
         for number, mutant in enumerate(chosen, options.skip + 1):
             start = time.perf_counter()
-            alive = survives(mutant, copy_of, options.workers)
+            alive = survives(mutant, copy_of, options.workers, not options.narrow)
             left += [mutant] if alive else []
             seconds = time.perf_counter() - start
             word = "SURVIVES" if alive else "seen"
