@@ -210,6 +210,23 @@ def test_a_reduced_body_breathes_like_the_full_one(basis, breath):
     assert missed[1] < 0.01 and missed[0] > 2 * missed[1], missed
 
 
+def test_the_tendon_of_a_reduced_body_does_not_push():
+    pulled = fem.Tendon(fem.route(GRID, np.array([[5e-3, 2e-3], [8e-3, 2e-3]])))
+    held = (fem.Fixed(GRID.node_sets["bottom"], (1,)),)
+    problem = fem.problem(
+        GRID, tube_problem(1e6).material, kinematics=fem.Axisymmetric(), supports=held,
+        loads=(pulled,),
+    )  # fmt: skip
+    body = S.FemBody(problem, driven=("tendon",))
+    small = S.reduced(body, S.modal_basis(body, 1, bending=False), order=1)
+    rest = small.initial_state()
+    pull, push, none = (
+        small.vector_field(0.0, rest, {"tendon": jnp.asarray(value)})["v"]
+        for value in (1.0, -1.0, 0.0)
+    )
+    assert jnp.max(jnp.abs(pull - none)) > 1e-3 and jnp.array_equal(push, none)
+
+
 # A soft actuator
 
 

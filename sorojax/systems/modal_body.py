@@ -92,6 +92,7 @@ class ModalBody(AbstractBlock):
         works: What each driven load works on, in the unit of work over that of the load: of
             a pressure its volume.
         ports: Of the driven loads: name, input, shape, unit, and the name of the volume.
+        pulls: Loads that are tendons: they do not push, whatever the input.
         markers: Places at q = 0 and how they move, by name.
         q, v: At the start.
     """
@@ -106,6 +107,7 @@ class ModalBody(AbstractBlock):
     ports: tuple[tuple[str, str, tuple[int, ...], str | None], ...] = eqx.field(static=True)
     volumes: tuple[tuple[str, str, str], ...] = eqx.field(static=True)
     energies: bool = eqx.field(static=True, default=False)
+    pulls: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
     def inputs(self):
@@ -146,7 +148,10 @@ class ModalBody(AbstractBlock):
         total = -self.force(q) - self.damping @ v
         for load, port, *_ in self.ports:
             _, pull = jax.vjp(self.works[load], q)
-            total = total + pull(inputs[port].reshape(-1))[0]
+            given = inputs[port].reshape(-1)
+            if load in self.pulls:
+                given = jnp.where(given >= 0, given, jnp.zeros_like(given))
+            total = total + pull(given)[0]
         return {"q": v, "v": total}
 
 
@@ -199,6 +204,7 @@ def reduced(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBody:
             for name, x in cavities.items()
         ),
         body.energies,
+        tuple(name for name, load in body.drives.items() if isinstance(load, fem.Tendon)),
     )
 
 
