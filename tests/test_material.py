@@ -450,6 +450,10 @@ def test_editing_a_modulus_never_retraces():
 
 
 @pytest.mark.stress(20)
+def _negative(I1, I2):
+    return -1e4 * (I1 - 3)
+
+
 def test_drucker_finds_where_mooney_and_yeoh_fail():
     mooney = material.drucker_stability(material.MooneyRivlin(5e4, -1e4, K))
     # equal stretches fail where c10 + c01 l^2 = 0 against one another
@@ -458,6 +462,9 @@ def test_drucker_finds_where_mooney_and_yeoh_fail():
     assert material.drucker_stability(ISOTROPIC["MooneyRivlin"]).unlimited
     yeoh = material.drucker_stability(material.Yeoh(5e4, 0.0, -50.0, K))
     assert 1.5 < yeoh.equibiaxial[1] < yeoh.uniaxial[1] < 10
+    soft = material.InvariantEnergy(_negative, bulk_modulus=K)
+    found = material.drucker_stability(soft)
+    assert found.uniaxial == found.equibiaxial == (1.0, 1.0)
 
 
 STRAIN = np.linspace(0.05, 3.0, 25)

@@ -202,3 +202,9 @@ def test_messages_name_the_remedy():
     for verb in (sdf.area, lambda shape: sdf.contour(shape, 0.1)):
         with pytest.raises(ValueError, match="empty"):
             verb(apart)
+
+
+def test_a_combination_of_one_shape_is_that_shape():
+    ball = sdf.Sphere([0.0, 0.0, 0.0], 1.0)
+    for both in (sdf.Intersection((ball,)), sdf.Union((ball,))):
+        assert both.dim == 3 and both(jnp.zeros(3)) == -1.0
