@@ -37,13 +37,16 @@ ROOMS = {
     "sorojax/contact": ["test_contact", "test_fem_contact*", "test_rod_contact"],
     "sorojax/rod": ["test_rod*", "test_math_rod", "test_link_contact", "test_self_contact"],
     "sorojax/systems": ["test_systems*", "test_shape_estimate", "test_waypoints"],
-    "sorojax/reduction": ["test_reduction*"],
+    "sorojax/reduction": ["test_reduction*", "test_waypoints"],
     "sorojax/design": ["test_design", "test_layout", "test_calibrate", "test_part"],
     "sorojax/io": ["test_io_*", "test_fem_loads", "test_web", "test_view*"],
     "hardware/pi/sorojax_board": ["test_board", "test_tcp_board", "test_hardware*"],
 }
 
-EQUIVALENT: dict[str, str] = {}
+EQUIVALENT = {
+    "sorojax/design/optimality.py omission: count + 1 -> (count)": "the limit of a search that "
+    "ends by rounding after some sixty halvings at most; kept against inputs without order",
+}
 
 
 class Mutant(NamedTuple):
@@ -66,8 +69,12 @@ class Mutant(NamedTuple):
     text: str
 
     @property
+    def change(self) -> str:
+        return f"{self.kind}: {self.before} -> {self.after}"
+
+    @property
     def name(self) -> str:
-        return f"{self.file}:{self.line} {self.kind}: {self.before} -> {self.after}"
+        return f"{self.file}:{self.line} {self.change}"
 
 
 _TURNED = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult}
@@ -227,7 +234,7 @@ def main() -> int:
             seconds = time.perf_counter() - start
             word = "SURVIVES" if alive else "seen"
             print(f"{number:3} {word:8} {seconds:5.0f} s  {mutant.name}", flush=True)
-    open_ones = [m for m in left if m.name not in EQUIVALENT]
+    open_ones = [m for m in left if f"{m.file} {m.change}" not in EQUIVALENT]
     equal = len(left) - len(open_ones)
     print(f"{len(chosen)} mutants, {len(left)} survive, {equal} of them equivalent")
     return 1 if len(open_ones) > 3 else 0

@@ -407,6 +407,13 @@ def test_bench_valves_rise_without_overshoot():
     want = 50 * kPa * (1 - np.exp(-z * w * t) * (np.cos(wd * t) + z * w / wd * np.sin(wd * t)))
     assert np.max(np.abs(told - want)) < 1.0 * kPa
     assert abs(told[-1] - 50 * kPa) <= 1.5 * STEP
+    # a command acts within the step of 0.5 ms in whose first half it arrives, or in the next
+    for dead_time, moves in ((2e-4, True), (3e-4, False)):
+        valves = BenchValves(1, noise=0.0, dead_time=dead_time)
+        valves.read(0.0)
+        valves.write([50 * kPa])
+        valves.read(5e-4)
+        assert (valves.pressure[0] > 0) == moves
 
 
 def test_scales_of_the_platform():

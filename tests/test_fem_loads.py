@@ -9,6 +9,7 @@ import pytest
 from sorojax import fem, io, material, mesh
 from sorojax.fem.curved import CurvedPart, group_matrices
 from sorojax.fem.energy_form import load_force
+from sorojax.fem.facets import open_nodes
 from sorojax.fem.linear import linearise, prepare
 from sorojax.math import sparse
 from sorojax.units import mm
@@ -354,3 +355,13 @@ def test_bad_supports_and_spaces_are_refused():
             BEAM, RUBBER, kinematics=fem.PlaneStrain(1.0), supports=(fem.Fixed(LEFT),),
             loads=(fem.Torque(RIGHT, 1.0),), space=fem.space(BEAM),
         )  # fmt: skip
+
+
+@pytest.mark.parametrize("element", [mesh.Tet4(), mesh.Tet10(), mesh.Hex8()])
+def test_the_rim_of_a_set_of_facets_is_found_with_its_middles(element):
+    cube = mesh.box([0, 0, 0], [1, 1, 1], divisions=(2, 2, 2), element=element)
+    found = open_nodes(element, cube.facet_sets["right"])
+    points = np.asarray(cube.points)[found]
+    assert np.all(points[:, 0] == 1)
+    assert np.all(np.isclose(np.abs(points[:, 1:] - 0.5).max(axis=1), 0.5))
+    assert len(found) == (16 if element.order == 2 else 8)

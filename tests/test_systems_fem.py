@@ -210,6 +210,14 @@ def test_a_reduced_body_breathes_like_the_full_one(basis, breath):
     assert missed[1] < 0.01 and missed[0] > 2 * missed[1], missed
 
 
+def test_a_body_at_rest_stays_there():
+    """No displacement is small beside another one: the step ends by the length of the body."""
+    film = run(S.Network({"tube": tube()}, {}), 4e-4)
+    assert film.status == Status.successful
+    place = np.asarray(film["tube.skin_position"])
+    assert np.all(place == place[0])
+
+
 def test_the_tendon_of_a_reduced_body_does_not_push():
     pulled = fem.Tendon(fem.route(GRID, np.array([[5e-3, 2e-3], [8e-3, 2e-3]])))
     held = (fem.Fixed(GRID.node_sets["bottom"], (1,)),)
