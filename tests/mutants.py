@@ -29,7 +29,7 @@ LIMIT = 900  # s for the tests of one mutant
 
 # Kernels and solvers of every floor, and the tests that shall see an error in them.
 ROOMS = {
-    "sorojax/math": ["test_math_*", "test_sparse", "test_refined", "test_rod_statics"],
+    "sorojax/math": ["test_math_*", "test_sparse", "test_refined", "test_rod_statics", "test_rod"],
     "sorojax/sdf": ["test_sdf*", "test_surface"],
     "sorojax/material": ["test_material", "test_point_tangent"],
     "sorojax/mesh": ["test_mesh*", "test_shape_derivatives"],
