@@ -211,7 +211,7 @@ def test_a_reduced_body_breathes_like_the_full_one(basis, breath):
 
 
 def test_a_body_at_rest_stays_there():
-    """No displacement is small beside another one: the step ends by the length of the body."""
+    """Rounding of the stresses at rest does not move it."""
     film = run(S.Network({"tube": tube()}, {}), 4e-4)
     assert film.status == Status.successful
     place = np.asarray(film["tube.skin_position"])
