@@ -67,6 +67,14 @@ def test_gcmma_never_rises_where_mma_may():
     assert careful.objective < rough(start) - 0.5
 
 
+def test_a_step_beyond_where_a_function_is_defined_is_halved_until_it_is_not():
+    found = design.minimise(
+        lambda x: jnp.sum(-x - 0.01 * jnp.log(0.6 - x)), jnp.full(2, 0.5),
+        optimiser=design.MMA(0.0, 1.0), constraints=(lambda x: jnp.sum(x) - 5,), steps=30,
+    )  # fmt: skip
+    assert found.status != Status.not_finite and jnp.allclose(found.design, 0.59, atol=5e-3)
+
+
 def test_curvature_of_gcmma_after_a_proposal_that_was_too_good():
     """min(10 rho, 1.1 (rho + delta)), Svanberg 2002, eq. 4.12, with delta by the closed form of
     one variable between asymptotes at 0 and 1."""

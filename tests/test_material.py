@@ -572,6 +572,9 @@ def test_data_in_other_units_or_quantities_are_refused(name):
     for stretch in stretches:
         with pytest.raises(ValueError, match="stress vanishes at a strain of .*Subtract 1"):
             material.fit_tensile(stretch, incompressible(rubber, stretch), **options)
+    line = np.linspace(1.1, 2.0, 10)
+    with pytest.raises(ValueError, match="stress vanishes at a strain of 1, need"):
+        material.fit_tensile(line, 1e5 * (line - 1), **options)
 
 
 def test_strains_without_small_ones_and_slack_clamps_are_no_stretches():
