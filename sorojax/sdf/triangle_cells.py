@@ -15,6 +15,7 @@ MOST = 128  # triangles in a list that is complete
 _SPLIT = 64  # triangles in a list that asks for smaller cubes
 _COARSE, _DEPTH = 3, 10  # halvings of the largest cube before a close look, and at all
 _WORK = 400  # pairs of cube and triangle looked at, for each triangle of the mesh
+_HELD = 1 << 22  # of those pairs at once, of some 100 bytes each
 _REACH = 0.6  # half an edge of the largest cube over the longest side of the mesh
 _PIECE = 1 << 14
 _LATTICE = np.array([[i // 9, i // 3 % 3, i % 3] for i in range(27)])
@@ -100,7 +101,7 @@ def triangle_cells(
         count = np.bincount(owner, minlength=len(low))
         split = np.flatnonzero(count > (_SPLIT if edge > finest else len(triangles)))
         split = split[np.argsort(-count[split], kind="stable")]
-        split = np.sort(split[np.cumsum(count[split]) <= left])
+        split = np.sort(split[np.cumsum(count[split]) <= min(left, _HELD)])
         left -= int(count[split].sum())
         number = np.full(len(low), -1)
         number[split] = np.arange(len(split))
