@@ -50,10 +50,16 @@ ROOMS = {
 }
 
 EQUIVALENT = {
-    "sorojax/design/optimality.py omission: count + 1 -> (count)": "the limit of a search that "
-    "ends by rounding after some sixty halvings at most; kept against inputs without order",
-    "sorojax/mesh/voronoi.py factor: 1.0 -> (2.0)": "stands for the rise of level sides, which "
-    "no ray crosses: what is divided by it is not used",
+    "sorojax/rod/section_shapes.py factor: r[:, None] / jnp.max(r) "
+    "-> (r[:, None] * jnp.max(r))": (
+        "the scale of functions that a least-squares fit combines"
+    ),
+    "sorojax/design/optimality.py omission: count + 1 -> (count)": (
+        "the limit of a search that ends by rounding after some sixty halvings at most"
+    ),
+    "sorojax/mesh/voronoi.py factor: 1.0 -> (2.0)": (
+        "stands for the rise of level sides, which no ray crosses: the quotient is not used"
+    ),
 }
 
 

@@ -488,6 +488,15 @@ def incompressible(rubber, stretch):
     return np.asarray(jax.grad(energy)(jnp.asarray(stretch)))
 
 
+def _shear_modulus(rubber):
+    """At rest, by the second difference of the energy of simple shear."""
+
+    def energy(g):
+        return rubber.isochoric_energy(((1.0, g, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+
+    return jax.grad(jax.grad(lambda g: jnp.sum(energy(g))))(0.0)
+
+
 @pytest.mark.parametrize("name", OWN)
 def test_fit_recovers_its_own_material(name):
     rubber, options = OWN[name]
@@ -499,6 +508,8 @@ def test_fit_recovers_its_own_material(name):
         pairs = zip(jax.tree.leaves(fit.material), jax.tree.leaves(rubber), strict=False)
         for found, exact in list(pairs)[: -1 if options else -1]:
             assert exact == 1e9 or np.allclose(found, exact, rtol=1e-5)
+    bulk, shear = fit.material.bulk_modulus, _shear_modulus(fit.material)
+    assert np.isclose((3 * bulk - 2 * shear) / (6 * bulk + 2 * shear), 0.49, rtol=1e-9)
     assert fit.strain_range == (0.05, 3.0) and fit.stable_stretch > 4
     assert np.isnan(fit.spread) and fit.num_repeats == 1
 

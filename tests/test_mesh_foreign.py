@@ -157,3 +157,15 @@ def test_bad_solids_are_refused_with_the_remedy():
     bow = [[0, 0], [1, 0], [0.5, 0.5], [1, 1], [0, 1], [0.5, 0.5]]
     with pytest.raises(ValueError, match="touches or crosses"):
         M.from_polygon(np.array(bow), size=0.1)
+
+
+def test_what_gmsh_said_last_is_told(tmp_path, monkeypatch):
+    program = tmp_path / "gmsh"
+    program.write_text(
+        "#!/bin/sh\nprintf 'noise %.0s' $(seq 100) >&2\necho 'no volume' >&2\nexit 1\n"
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    ball = sdf.isosurface(BALL, 0.5)
+    with pytest.raises(ValueError, match="gmsh failed .noise .*no volume"):
+        io.mesh_surface(ball, 0.5, mesher="gmsh")

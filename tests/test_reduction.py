@@ -156,6 +156,7 @@ def test_modes_are_orthonormal_and_hold_the_snapshots(tube_path):
         shapes = modes(backbone.s)
         gram = (w[:, None] * shapes).T @ shapes
         assert jnp.allclose(gram, jnp.eye(len(gram)), atol=1e-10)
+        assert jnp.all(w @ shapes >= -1e-12)  # of either sign that with the positive mean
     captured = reduction.captured_energy(backbone, basis)
     assert captured["kappa_z"] > 0.9999 and captured["sigma_x"] > 0.99
     q = reduction.coordinates(backbone, basis)
@@ -205,6 +206,8 @@ def test_pressure_map_gives_the_volume_of_the_solid(tube_path):
 
 def test_mean_section_has_the_mass_of_the_body(tube_path):
     section = reduction.mean_section(tube_path.problem, LINE)
+    thickness = tube_path.problem.kinematics.thickness
+    assert jnp.isclose(section.second_moment_y, section.area * thickness**2 / 12, rtol=1e-12)
     solid = (LENGTH * 12 * mm - 25 * mm * 4 * mm) * 20 * mm
     assert jnp.allclose(section.area * LENGTH, solid, rtol=1e-12)
 

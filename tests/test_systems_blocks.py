@@ -237,6 +237,17 @@ def closed_loop(law, duration=0.5, **options):
     return S.simulate(network, duration, save=6, step=5e-4, solver=S.Rosenbrock2(True))
 
 
+def test_contact_turns_a_body_about_its_centre():
+    """A floor below the left end pushes it up: the right end goes down."""
+    floor = sdf.HalfSpace([0.0, 0.0, -0.02], [0.0, 0.0, 1.0])
+    touch = S.Touch(floor, [[-0.03, 0.01, -0.0201]], [1e-4], contact.Penalty(1e8, 1e-5))
+    body = S.RigidBody(0.1, [1e-4, 1e-4, 1e-4], touch=(touch,))
+    none = {"force": jnp.zeros(3), "torque": jnp.zeros(3)}
+    turn, push = jnp.split(body.vector_field(0.0, body.initial_state(), none)["p"], 2)
+    assert push[2] > 0 and jnp.allclose(push[:2], 0.0)
+    assert jnp.allclose(turn, jnp.cross(jnp.array([-0.03, 0.01, -0.0201]), push), rtol=1e-9)
+
+
 def test_computed_torque_makes_errors_decay_as_asked():
     film = closed_loop(S.ComputedTorque(REST, FORCES, GOAL, 400.0, 40.0))
     decay = (1 + 20 * film.time) * jnp.exp(-20 * film.time)  # critically damped
