@@ -8,7 +8,7 @@ import functools
 import numpy as np
 
 from sorojax import sdf
-from sorojax.sdf.sample import values, values_and_gradients
+from sorojax.sdf.sampling import values, values_and_gradients
 
 FACING = -0.6  # cosine between the normals of both sides of a wall or a gap
 _LEAVES = {

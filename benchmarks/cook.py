@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax import fem, material, mesh
-from sorojax.fem.formulation import AbstractFormulation
+from sorojax.fem.assembly.space import AbstractFormulation
 from sorojax.mesh import Mesh
 
 YOUNG_MODULUS = 240.565

@@ -8,10 +8,10 @@ from jaxtyping import Array, Float
 
 from sorojax import fem, material, mesh
 from sorojax._types import real
-from sorojax.fem.formulation import AbstractFormulation
-from sorojax.fem.loads import AbstractLoad
+from sorojax.fem.assembly.space import AbstractFormulation
+from sorojax.fem.loads.loads import AbstractLoad
 from sorojax.mesh import Mesh
-from sorojax.mesh.shape import quadrature, shape_functions, shape_gradients
+from sorojax.mesh.elements.shape_functions import quadrature, shape_functions, shape_gradients
 
 
 class NodalForces(AbstractLoad):

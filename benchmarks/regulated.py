@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from sorojax import systems
 from sorojax._types import real
-from sorojax.systems.block import AbstractBlock, Input, Output
+from sorojax.systems.blocks.block import AbstractBlock, Input, Output
 
 FREQUENCIES = 5.7, 35.5, 67.6  # Hz
 MASS = 1e-4  # kg of every mode

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from sorojax import fem, material, mesh, rod as R, sdf, systems as S
 from sorojax.contact import LinePenalty
-from sorojax.fem.linear import linearise, prepare
+from sorojax.fem.equilibrium.linear import linearise, prepare
 from sorojax.math.lie import SE2, SE3
 
 FINGER: dict[str, Any] = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2000.0)

@@ -14,8 +14,8 @@ from benchmarks.fingers import LENGTH, finger, random_states
 from benchmarks.hands import hand
 from sorojax import fem, material, mesh, rod as R, sdf
 from sorojax.contact import LinePenalty
-from sorojax.fem.linear import linearise, prepare
-from sorojax.sdf.evaluate import value_and_normal_at
+from sorojax.fem.equilibrium.linear import linearise, prepare
+from sorojax.sdf.query import value_and_normal_at
 
 
 class Kernel(NamedTuple):

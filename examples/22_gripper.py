@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 import sorojax as sj
 from sorojax import robots, rod, systems
-from sorojax.math.contact_stepper import ContactMidpoint
+from sorojax.math.ode.contact_midpoint import ContactMidpoint
 from sorojax.units import mm
 
 GRASP, WALK = 0.03, 0.02  # N m

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import sorojax as sj
-from sorojax.math.contact_stepper import ContactMidpoint
+from sorojax.math.ode.contact_midpoint import ContactMidpoint
 from sorojax.units import MPa, mm
 
 SAVED = 8e-3  # s between saved moments

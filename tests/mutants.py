@@ -50,14 +50,14 @@ ROOMS = {
 }
 
 EQUIVALENT = {
-    "sorojax/rod/section_shapes.py factor: r[:, None] / jnp.max(r) "
+    "sorojax/rod/model/section_shapes.py factor: r[:, None] / jnp.max(r) "
     "-> (r[:, None] * jnp.max(r))": (
         "the scale of functions that a least-squares fit combines"
     ),
-    "sorojax/design/optimality.py omission: count + 1 -> (count)": (
+    "sorojax/design/optimise/optimality.py omission: count + 1 -> (count)": (
         "the limit of a search that ends by rounding after some sixty halvings at most"
     ),
-    "sorojax/mesh/voronoi.py factor: 1.0 -> (2.0)": (
+    "sorojax/mesh/plane/polymesh.py factor: 1.0 -> (2.0)": (
         "stands for the rise of level sides, which no ray crosses: the quotient is not used"
     ),
 }

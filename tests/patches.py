@@ -5,7 +5,7 @@ import numpy as np
 from sorojax import mesh
 from sorojax.mesh import Mesh
 from sorojax.mesh.enrich import plain_element
-from sorojax.mesh.middles import with_side_nodes
+from sorojax.mesh.mesh import with_side_nodes
 
 
 def patch(element: mesh.AbstractElement, lower=(0.0, 0.0, 0.0), seed: int = 0) -> Mesh:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax._jax.jit import once
-from sorojax.rod.alike import each
+from sorojax.rod.dynamics.tree import each
 
 
 class Spring(eqx.Module):

@@ -10,7 +10,7 @@ import scipy.optimize
 
 from sorojax import SE2, design, fem, material, mesh, rod as R, systems as S
 from sorojax._progress import listen, silent
-from sorojax.design.experiment import directions_of, sensitivity
+from sorojax.design.calibration.calibration import directions_of, sensitivity
 from sorojax.math.status import Status
 
 TIMES = jnp.linspace(0.0, 2.0, 9)

@@ -12,8 +12,8 @@ from benchmarks.blocks import bent, block
 from benchmarks.fingers import finger, random_states
 from benchmarks.single import narrow
 from sorojax import fem, mesh, rod as R
-from sorojax.fem.linear import linearise, prepare
-from sorojax.math import door as door_module
+from sorojax.fem.equilibrium.linear import linearise, prepare
+from sorojax.math import compiled as door_module
 
 
 @pytest.mark.parametrize("name", ["device.fem", "device.rods", "device.sdf"])
@@ -43,7 +43,7 @@ def test_an_accelerator_takes_all_cells_at_once_with_the_same_tangent(monkeypatc
         return problem.space.cells.shape, linearise(problem, prepare(problem), u, u)
 
     shape, narrow_blocks = tangent()
-    monkeypatch.setattr(import_module("sorojax.fem.space"), "platform", lambda: "gpu")
+    monkeypatch.setattr(import_module("sorojax.fem.assembly.space"), "platform", lambda: "gpu")
     wide_shape, wide_blocks = tangent()
     assert shape == (2, 4, 256) and wide_shape == (1, 4, 279)
     for name in ("residual", "values"):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sorojax import fem, material, mesh
-from sorojax.fem import assemble as asm
-from sorojax.fem.linear import linearise, prepare
+from sorojax.fem.assembly import assemble as asm
+from sorojax.fem.equilibrium.linear import linearise, prepare
 from sorojax.mesh import Mesh
 from sorojax.units import kPa, mm
 
@@ -126,7 +126,7 @@ def test_assembled_force_and_tangent_are_derivatives_of_the_energy(getkey):
     assert jnp.allclose(state.residual, force, rtol=0, atol=1e-11 * jnp.max(jnp.abs(force)))
     direction = jax.random.normal(getkey(), u.shape)
     _, change = jax.jvp(lambda u: fem.residual(problem, u), (u,), (direction,))
-    from sorojax.math import sparse
+    from sorojax.math.linalg import sparse
 
     product = sparse.product(problem.space.system, state.values, direction.ravel())
     scale = jnp.max(jnp.abs(change))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from sorojax import contact, fem, material, mesh, sdf
-from sorojax.fem.contact_start import moving
-from sorojax.fem.step_state import StepState
+from sorojax.fem.contact.friction import moving
+from sorojax.fem.dynamics.step import StepState
 from sorojax.units import mm
 
 FRICTION, WEIGHT, LENGTH, DEPTH = 0.5, 981.0, 20 * mm, 0.03  # [-], N/m^3, m, m

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from sorojax import fem, material, mesh
-from sorojax.fem.linear import linearise, prepare
-from sorojax.fem.secant import Secants
+from sorojax.fem.equilibrium.linear import linearise, prepare
+from sorojax.fem.equilibrium.newton import Secants
 from sorojax.io.fields import export_fields
 
 GRID = mesh.rectangle([0, 0], [0.1, 0.01], divisions=(6, 1), order=2)

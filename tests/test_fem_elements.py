@@ -8,7 +8,7 @@ from patches import POLYGON, patch
 from scipy.optimize import brentq
 
 from sorojax import fem, material, mesh
-from sorojax.fem.linear import linearise, prepare
+from sorojax.fem.equilibrium.linear import linearise, prepare
 
 RUBBER = material.neo_hookean(young_modulus=1.0, poisson_ratio=0.49)
 D, P0, P1 = fem.Displacement(), fem.ConstantPressure(), fem.LinearPressure()

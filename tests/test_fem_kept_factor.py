@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sorojax import fem, material, mesh
-from sorojax.fem import kept_factor
+from sorojax.fem.equilibrium import newton as kept_factor
 from sorojax.units import MPa, kPa
 
 RUBBER = material.neo_hookean(young_modulus=1 * MPa, poisson_ratio=0.45, density=1000.0)

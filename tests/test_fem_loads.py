@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from sorojax import fem, io, material, mesh
-from sorojax.fem.curved import CurvedPart, group_matrices
-from sorojax.fem.energy_form import load_force
-from sorojax.fem.facets import open_nodes
-from sorojax.fem.linear import linearise, prepare
-from sorojax.math import sparse
+from sorojax.fem.equilibrium.linear import linearise, prepare
+from sorojax.fem.loads.facets import CurvedPart, group_matrices, open_nodes
+from sorojax.fem.problem import load_force
+from sorojax.math.linalg import sparse
 from sorojax.units import mm
 
 RUBBER = material.neo_hookean(young_modulus=1e5, poisson_ratio=0.3)

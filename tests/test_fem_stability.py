@@ -10,7 +10,7 @@ from scipy.special import ellipk
 
 from sorojax import fem, material, mesh
 from sorojax._progress import listen
-from sorojax.math import sparse
+from sorojax.math.linalg import sparse
 
 BULK = 1e5  # over the shear modulus: the closed form is incompressible
 

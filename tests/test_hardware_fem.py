@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sorojax import fem, material, mesh, robots, systems as S
-from sorojax.systems.fem_body import volume
+from sorojax.systems.blocks.fem_body import volume
 from sorojax_board.board import settings
 from sorojax_board.messages import State
 from sorojax_hardware import (

@@ -12,7 +12,7 @@ import pytest
 
 from sorojax import fem, io, mesh, view
 from sorojax.cli.main import main
-from sorojax.io import _structure
+from sorojax.io import state as _structure
 from sorojax.math.status import Status
 from tests.test_pickle import SCENES, beam, iterated, same, tip
 

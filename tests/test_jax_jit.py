@@ -11,7 +11,7 @@ import pytest
 import sorojax as sj
 from sorojax import rod as R
 from sorojax._jax import jit as module, small_kernels as kernels
-from sorojax.math.explicit import Tsit5
+from sorojax.math.ode.explicit import Tsit5
 from sorojax.systems import Markers, ShapeFilter, start_filter, update_filter
 
 pytestmark = pytest.mark.versions

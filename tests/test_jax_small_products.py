@@ -8,7 +8,7 @@ from jax.test_util import check_grads
 
 from sorojax._jax import small_products
 from sorojax._jax.small_products import LARGEST, LARGEST_BATCH, product_p, with_sums
-from sorojax.math.explicit import rk4_step
+from sorojax.math.ode.explicit import rk4_step
 
 pytestmark = [
     pytest.mark.versions,

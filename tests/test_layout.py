@@ -11,12 +11,12 @@ import pytest
 
 from sorojax import design, fem, material, mesh, view
 from sorojax._progress import silent
-from sorojax.design.settle import settled
-from sorojax.design.subproblem import Approximation, solve_dual, solve_primal_dual
-from sorojax.fem.energy_form import load_force
-from sorojax.fem.linear import add_load_stiffness, prepare
+from sorojax.design.objectives import settled
+from sorojax.design.optimise.mma import Approximation, solve_dual, solve_primal_dual
+from sorojax.fem.equilibrium.linear import add_load_stiffness, prepare
+from sorojax.fem.problem import load_force
 from sorojax.material.kinematics import from_matrix
-from sorojax.math import sparse
+from sorojax.math.linalg import sparse
 from sorojax.mesh.mesh import Mesh, boundary_facets
 
 RUBBER = material.neo_hookean(young_modulus=1.0, poisson_ratio=0.4)

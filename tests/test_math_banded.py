@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sorojax import mesh
-from sorojax.math import banded, direct, sparse
+from sorojax.math.linalg import factor as direct, host_solvers as banded, sparse
 
 
 def system(nx: int, ny: int) -> sparse.SparseSymmetric:

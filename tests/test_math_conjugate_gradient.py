@@ -10,10 +10,9 @@ import pytest
 
 from sorojax import fem, material, mesh
 from sorojax.fem.checks import rigid_modes
-from sorojax.fem.linear import linearise, prepare
-from sorojax.math import block_rows, conjugate_gradient as cg, sparse
-from sorojax.math.aggregation import hierarchy
-from sorojax.math.multigrid import cycle, multigrid
+from sorojax.fem.equilibrium.linear import linearise, prepare
+from sorojax.math.linalg import conjugate_gradient as cg, multigrid as block_rows, sparse
+from sorojax.math.linalg.multigrid import cycle, hierarchy, multigrid
 
 SETTINGS = sparse.ConjugateGradient(coarsest=60)
 

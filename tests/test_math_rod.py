@@ -8,17 +8,25 @@ import numpy as np
 import pytest
 
 from sorojax import rod as R
-from sorojax.math.batch import batched
-from sorojax.math.dense import product, solve_columns, solve_symmetric
-from sorojax.math.lie import SE2, SE3, skew
-from sorojax.math.magnus import FROM_MOMENTS, rotation_vector
+from sorojax.math.compiled import batched
+from sorojax.math.lie import (
+    FROM_MOMENTS,
+    SE2,
+    SE3,
+    exponential,
+    multiply,
+    prefix_product,
+    rotation_columns,
+    rotation_vector,
+    skew,
+)
+from sorojax.math.linalg.dense import product, solve_columns, solve_symmetric
+from sorojax.math.ode.steppers import dormand_prince_step, rk4_step
 from sorojax.math.quadrature import (
     gauss_legendre,
     integration_matrix,
     integration_rows,
 )
-from sorojax.math.quaternion import exponential, multiply, prefix_product, rotation_columns
-from sorojax.math.steppers import dormand_prince_step, rk4_step
 
 
 @pytest.mark.parametrize("count", [2, 8, 48])

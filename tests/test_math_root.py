@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax.math.root import inverse_cube_root
+from sorojax.math.linalg.dense import inverse_cube_root
 
 root = jax.jit(inverse_cube_root)
 third = jax.jit(jax.grad(jax.grad(jax.grad(inverse_cube_root))))

@@ -7,12 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax.math.alpha import GeneralisedAlpha
-from sorojax.math.control import Control
-from sorojax.math.explicit import RungeKutta4, SemiImplicitEuler, Tsit5
-from sorojax.math.linearly_implicit import Rosenbrock2
-from sorojax.math.method import repeat, repeated
-from sorojax.math.rosenbrock import Rodas4
+from sorojax.math.ode.explicit import RungeKutta4, SemiImplicitEuler, Tsit5, repeat, repeated
+from sorojax.math.ode.generalised_alpha import GeneralisedAlpha
+from sorojax.math.ode.rosenbrock import Rodas4, Rosenbrock2
+from sorojax.math.ode.step_control import Control
 
 METHODS = (
     (Tsit5(), 5),

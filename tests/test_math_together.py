@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from sorojax.math.together import together
+from sorojax.math.host import together
 
 
 def test_works_run_at_the_same_time_and_answer_in_order():

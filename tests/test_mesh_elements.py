@@ -8,7 +8,7 @@ import pytest
 from patches import patch
 
 from sorojax import mesh as M
-from sorojax.mesh import shape as tables
+from sorojax.mesh.elements import shape_functions as tables
 
 CELLS = (M.Tri7(), M.Quad9(), M.Tet15())
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sorojax import mesh as M, sdf
-from sorojax.mesh.mirror import turned
+from sorojax.mesh.structured import turned
 
 
 def inside_out(cells: M.Mesh) -> bool:

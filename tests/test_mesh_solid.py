@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sorojax import mesh as M, sdf
-from sorojax.mesh.convex import is_convex
+from sorojax.mesh.plane.polymesh import is_convex
 
 RING = sdf.Circle([0, 0], 1) - sdf.Circle([0, 0], 0.5)
 SQUARE = sdf.rotate(sdf.Rectangle([-1, -1], [1, 1]), np.pi / 4) - sdf.Circle([0, 0], 0.5)

@@ -17,7 +17,7 @@ import pytest
 import sorojax as sj
 from sorojax import fem, material, mesh, rod, sdf, sweep, systems
 from sorojax._cache import enable_compilation_cache
-from sorojax.fem.dynamics import MotionError
+from sorojax.fem.dynamics.simulate import MotionError
 from sorojax.math.status import Status
 
 WAYS = {"pickle": lambda x: pickle.loads(pickle.dumps(x)), "deepcopy": copy.deepcopy}

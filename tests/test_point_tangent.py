@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 
 from sorojax import fem, material
-from sorojax.fem.energy import Body, energy_density, response
+from sorojax.fem.assembly.energy import (
+    Body,
+    energy_density,
+    extrapolated_piola,
+    response,
+    second_piola,
+    shape_response,
+    shape_stress,
+    tangent_entries,
+)
 from sorojax.fem.kinematics import component_pairs, entries_of, identity
-from sorojax.fem.point_tangent import tangent_entries
-from sorojax.fem.shape_response import shape_response, shape_stress
-from sorojax.fem.tensor import extrapolated_piola, second_piola
 
 KINEMATICS = (fem.PlaneStrain(1.0), fem.PlaneStress(1.0), fem.Axisymmetric(), fem.Solid())
 RUBBERS = (

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from sorojax import SE2, SE3, fem, material, mesh, reduction, rod
-from sorojax.reduction.backbone import line_strain
+from sorojax.reduction.backbone import line_strain, pose_strain, section_axes
 from sorojax.reduction.curve import reference
 from sorojax.reduction.pod import weights
-from sorojax.reduction.twist import pose_strain, section_axes
 from sorojax.units import kPa, mm
 
 LENGTH = 60 * mm

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sorojax import SE2, reduction, rod as R
-from sorojax.math.steppers import TripleJump
+from sorojax.math.ode.steppers import TripleJump
 
 BODY = R.rod(
     SE2(), R.chebyshev(kappa_z=2, sigma_x=1), R.circle(6e-3), length=0.1,

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from sorojax import mesh
-from sorojax.math import sparse
-from sorojax.math.refined import refined
+from sorojax.math.linalg import sparse
+from sorojax.math.linalg.factor import refined
 
 GRID = mesh.rectangle([0, 0], [1.0, 1.0], divisions=(6, 6), element=mesh.Quad4())
 SYSTEM = sparse.from_cells(GRID.num_nodes, np.asarray(GRID.cells))

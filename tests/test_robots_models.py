@@ -12,9 +12,9 @@ from scipy.optimize import minimize_scalar
 
 from sorojax import material, robots, rod as R, sdf
 from sorojax.math.lie import SE2, SE3
-from sorojax.robots import models_cells
-from sorojax.robots.models_cell import Cell
-from sorojax.robots.models_rods import body, column, side_by_side
+from sorojax.robots.models import cell as models_cells
+from sorojax.robots.models.cell import Cell
+from sorojax.robots.models.rods import body, column, side_by_side
 from sorojax.robots.parts import LaidAlong
 from sorojax.units import kPa, mm
 from sorojax_board.bench import STEP

@@ -12,14 +12,14 @@ import pytest
 
 from sorojax import replace, rod as R
 from sorojax.math.lie import SE2, SE3
-from sorojax.math.quadrature import gauss_legendre
-from sorojax.math.status import Status
-from sorojax.math.steppers import (
+from sorojax.math.ode.steppers import (
     DormandPrince,
     GeneralisedAlpha,
     ImplicitMidpoint,
     TripleJump,
 )
+from sorojax.math.quadrature import gauss_legendre
+from sorojax.math.status import Status
 
 FINGER = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2000.0)
 DISC = R.circle(6e-3, shear_factor=27 / 28)

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sorojax import replace, rod as R, systems as S
 from sorojax.math.lie import SE2, SE3, homogeneous
-from sorojax.math.status import Status
-from sorojax.math.steppers import (
+from sorojax.math.ode.steppers import (
     DormandPrince,
     GeneralisedAlpha,
     ImplicitMidpoint,
@@ -21,8 +20,9 @@ from sorojax.math.steppers import (
     TripleJump,
     start,
 )
-from sorojax.rod.assembly import rate, retract
-from sorojax.rod.rollout import second_order
+from sorojax.math.status import Status
+from sorojax.rod.dynamics.rollout import second_order
+from sorojax.rod.model.assembly import rate, retract
 
 FINGER = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2000.0)
 DISC = R.circle(6e-3, shear_factor=27 / 28)

@@ -9,8 +9,7 @@ from scipy.optimize import minimize
 
 import sorojax as sj
 from sorojax import rod as R, sdf
-from sorojax.math.lie import SE2, SE3
-from sorojax.math.logarithm import change_of_logarithm, logarithm
+from sorojax.math.lie import SE2, SE3, change_of_logarithm, logarithm
 from sorojax.math.status import Status
 
 FINGER = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2000.0)

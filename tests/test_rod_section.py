@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sorojax import mesh, rod as R, sdf
-from sorojax.rod.torsion import plane_constants
+from sorojax.rod.model.torsion import plane_constants
 
 NU = 0.3
 FIELDS = ("area", "second_moment_y", "second_moment_z", "torsion_constant")

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from sorojax import sdf
-from sorojax.sdf.evaluate import value_and_normal_at
+from sorojax.sdf.query import value_and_normal_at
 
 POINTS = np.random.default_rng(3).uniform(-2, 2, (256, 2))
 number = st.floats(-0.8, 0.8).map(lambda v: round(v, 3))

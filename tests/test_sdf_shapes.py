@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from sorojax import sdf
-from sorojax.sdf.sample import value_and_gradient
+from sorojax.sdf.sampling import value_and_gradient
 
 TRIANGLE = sdf.triangle([0.3, -0.2], [0.9, 0.1], [0.5, 0.3])
 BAR = sdf.Box([-1, -0.2, -0.3], [1, 0.3, 0.3])

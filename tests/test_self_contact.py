@@ -8,8 +8,8 @@ import pytest
 
 from sorojax import fem, material, mesh
 from sorojax.contact.facet import over, pieces, shared
-from sorojax.fem.linear import prepare
-from sorojax.fem.own_wall import through_own_wall
+from sorojax.fem.contact.self_contact import through_own_wall
+from sorojax.fem.equilibrium.linear import prepare
 from sorojax.units import mm
 
 WIDTH, YOUNG, PRESSURE = 12 * mm, 1e5, 2e3

@@ -10,7 +10,7 @@ import pytest
 from sorojax import design, fem, io, material, mesh, sdf, systems as S
 from sorojax._progress import silent
 from sorojax._types import real
-from sorojax.fem.energy_form import load_force
+from sorojax.fem.problem import load_force
 from sorojax.math.status import Status
 
 STUFF = material.neo_hookean(young_modulus=1.0, poisson_ratio=0.3, density=1.0)

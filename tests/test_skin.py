@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from sorojax import rod as R, sdf, view
-from sorojax.math.lie import SE2, SE3, homogeneous
-from sorojax.math.quaternion import rotation_columns
-from sorojax.view import modifiers
+from sorojax.math.lie import SE2, SE3, homogeneous, rotation_columns
+from sorojax.view.rigging import modifiers
 
 LENGTH = 0.06
 RUBBER = {"young_modulus": 1e5, "poisson_ratio": 0.49, "density": 1e3}

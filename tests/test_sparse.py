@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax.math import sparse
+from sorojax.math.linalg import sparse
 
 CELLS = np.array([[0, 1, 2], [1, 2, 3], [2, 3, 4]])
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sorojax import sdf
-from sorojax.sdf.dual_sheets import sheets
-from sorojax.sdf.scalar import absolute, norm
+from sorojax.sdf.base import absolute, norm
+from sorojax.sdf.surface.sheets import sheets
 
 METHODS = ("marching_cubes", "dual_contouring")
 
@@ -90,9 +90,9 @@ def test_dual_contouring_keeps_edges():
 @pytest.mark.parametrize("method", METHODS)
 def test_pruning_loses_nothing(method):
     """The same surface from blocks as from every cell of the grid."""
-    from sorojax.sdf import blocks
-    from sorojax.sdf.dual_contouring import dual_contouring
-    from sorojax.sdf.marching import marching_cubes
+    from sorojax.sdf.surface import blocks
+    from sorojax.sdf.surface.dual_contouring import dual_contouring
+    from sorojax.sdf.surface.marching import marching_cubes
 
     grid = blocks.grid_around("test", CSG, 0.05)
     axes = [np.arange(0, n, blocks.LEAF) for n in grid.counts]
@@ -105,7 +105,7 @@ def test_pruning_loses_nothing(method):
 
 
 def test_numbers_do_not_recompile():
-    from sorojax.sdf import blocks
+    from sorojax.sdf.surface import blocks
 
     sdf.isosurface(sdf.Sphere([0, 0, 0], 0.9), 0.1, "dual_contouring")
     before = blocks._sample._cached._cache_size()
@@ -125,9 +125,15 @@ def test_sheets_of_every_sign_pattern_are_loops():
 
 def test_random_signs_give_a_manifold_surface(getkey):
     """The hardest case: a field that changes sign at random from node to node."""
-    from sorojax.sdf import blocks, dual_contouring as dc
-    from sorojax.sdf.dual_crossings import blocks_before, cells_before, corner
-    from sorojax.sdf.dual_sheets import Faces, cell_sheets, doubtful_faces
+    from sorojax.sdf.surface import blocks, dual_contouring as dc
+    from sorojax.sdf.surface.sheets import (
+        Faces,
+        blocks_before,
+        cell_sheets,
+        cells_before,
+        corner,
+        doubtful_faces,
+    )
 
     inside = np.zeros((17, 17, 17), bool)
     inside[1:16, 1:16, 1:16] = np.asarray(jax.random.bernoulli(getkey(), 0.5, (15, 15, 15)))
@@ -184,7 +190,7 @@ def test_rims_of_cut_lattices_stay_whole(lattice, genus):
 
 def test_triangles_around_an_edge_stay_apart(getkey):
     """Wherever four vertices lie in their cells, what is cut keeps to the edge's envelope."""
-    from sorojax.sdf.dual_quads import Quads, split
+    from sorojax.sdf.surface.dual_contouring import Quads, split
 
     count, corners = 2000, np.array([[-1, -1], [0, -1], [0, 0], [-1, 0]])
     share = np.asarray(jax.random.uniform(getkey(), (count, 4, 3), minval=0.02, maxval=0.98))
@@ -257,7 +263,9 @@ def test_report_measures_walls_and_finds_crossings():
 def test_flying_edges_give_the_same_surface(monkeypatch):
     pytest.importorskip("vtkmodules")
     ours = sdf.surface_report(sdf.isosurface(CSG, 2.2 / 48))
-    monkeypatch.setattr("sorojax.sdf.marching.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr(
+        "sorojax.sdf.surface.marching.importlib.util.find_spec", lambda name: None
+    )
     theirs = sdf.surface_report(sdf.isosurface(CSG, 2.2 / 48))
     assert ours.manifold and ours.genus == theirs.genus
     assert abs(ours.volume / theirs.volume - 1) < 1e-4

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sorojax import fem, material, mesh, systems as S
-from sorojax.math import sparse
+from sorojax.math.linalg import sparse
 from sorojax.math.status import Status
 from sorojax.robots import BellowsActuator
 

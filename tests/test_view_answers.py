@@ -8,15 +8,15 @@ import sorojax as sj
 from sorojax import fem, material, mesh as M, robots, rod as R, sdf, view
 from sorojax.math.status import Status
 from sorojax.view import style
-from sorojax.view.robots import air_of, robot_scene
-from sorojax.view.scene import Surface
+from sorojax.view.draw.records import air_of, robot_scene
+from sorojax.view.raster.scene import Surface
 from tests.test_view_show import is_whole, near, patch, pixels, words
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _own_renderer():
     """The same pictures with and without the extra, and no warning."""
-    from sorojax.view import solid
+    from sorojax.view.raster import solid
 
     before, solid._told = solid._told, True
     yield

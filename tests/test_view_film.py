@@ -21,8 +21,8 @@ from sorojax import (
 from sorojax.cli.main import main
 from sorojax.math.lie import SE2, SE3
 from sorojax.math.status import Status
-from sorojax.view.scene import Surface
-from sorojax.view.tracks import positions_track, track_of
+from sorojax.view.film.tracks import positions_track, track_of
+from sorojax.view.raster.scene import Surface
 
 LENGTH = 0.06
 

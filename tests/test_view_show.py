@@ -13,10 +13,10 @@ import pytest
 from sorojax import contact, design, fem, material, mesh as M, rod as R, sdf, systems, view
 from sorojax.math.lie import SE2, SE3, homogeneous
 from sorojax.math.status import Status
-from sorojax.view import networks, sections, states
-from sorojax.view.quantity import short
-from sorojax.view.rod_loads import acting
-from sorojax.view.shell import outline, shell
+from sorojax.view.draw import networks, rod_loads as sections, states
+from sorojax.view.draw.rod_loads import acting
+from sorojax.view.raster.scene import short
+from sorojax.view.raster.shell import outline, shell
 
 LENGTH = 0.06
 LOAD, OBSTACLE = (213, 94, 0), (185, 168, 136)
@@ -56,7 +56,7 @@ def words(picture):
 @pytest.fixture(scope="module", autouse=True)
 def _own_renderer():
     """The same pictures with and without the extra, and no warning."""
-    from sorojax.view import solid
+    from sorojax.view.raster import solid
 
     before, solid._told = solid._told, True
     yield

@@ -6,10 +6,11 @@ import importlib.util
 import numpy as np
 import pytest
 
-from sorojax.view import Camera, between, glyphs, orbit, shade as S, solid, soup
-from sorojax.view.camera import box_corners, camera_at, fit
-from sorojax.view.raster import barycentric, rasterise
-from sorojax.view.scene import Arrows, Dots, Lines, Scale, Scene, Surface
+from sorojax.view import Camera, between, orbit
+from sorojax.view.raster import glyphs, raster as S, raster as soup, solid
+from sorojax.view.raster.camera import box_corners, camera_at, fit
+from sorojax.view.raster.raster import barycentric, rasterise
+from sorojax.view.raster.scene import Arrows, Dots, Lines, Scale, Scene, Surface
 
 PRESETS = ("iso", "front", "back", "left", "right", "top", "bottom")
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]])
@@ -179,7 +180,7 @@ def test_light_by_pixel_is_as_good_as_light_by_sample(opacity, monkeypatch):
         Scale("x", 0.0, 1.0),
     )  # fmt: skip
     lit = []
-    true = S._colours
+    true = S._shade_colours
     monkeypatch.setattr(S, "_colours", lambda *a: lit.append(len(a[1])) or true(*a))
     quick, _ = picture(scene, "iso", (160, 160))
     assert sum(lit) < 0.7 * 4 * 160**2
@@ -233,7 +234,7 @@ def test_without_pyvista_one_warning_is_given(monkeypatch):
 
 def test_both_renderers_see_the_same():
     pytest.importorskip("pyvista", reason="the extra `view` is not installed")
-    from sorojax.view.vtk import screenshot
+    from sorojax.view.raster.solid import screenshot
 
     points, triangles = glyphs.ball_triangles(np.array([[0.0, 0, 0], [3, 1, 0]]), 1.0, 24)
     scene = Scene((Surface(points, triangles), Lines([np.array([[-1.0, 0, 2], [4, 0, 2]])])))

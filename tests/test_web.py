@@ -16,7 +16,7 @@ from benchmarks.cases import view_web
 from sorojax import fem, material, mesh as M, view
 from sorojax.math.status import Status
 from sorojax.sdf import Surface, surface_report
-from sorojax.view.web_actor import mesh_triangles
+from sorojax.view.web.actor import mesh_triangles
 
 needs_chromium = pytest.mark.skipif(
     chromium.found() is None,
@@ -186,7 +186,7 @@ def test_a_glb_file_moves_as_the_actors(grasp, tmp_path):
 
 
 def test_quaternions_of_a_file_turn_like_the_matrices():
-    from sorojax.io.glb_animation import _quaternions
+    from sorojax.io.animation import _quaternions
 
     rng = np.random.default_rng(0)
     q = rng.normal(size=(50, 4))

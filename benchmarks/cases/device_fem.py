@@ -15,11 +15,11 @@ from benchmarks.blocks import bent, block
 from benchmarks.cases.fem_iterative import iterating, varied
 from benchmarks.harness import Row, measure, measure_calls, quick
 from sorojax import fem, mesh
-from sorojax.fem.energy_form import residual
-from sorojax.fem.linear import constrain, linearise, prepare
-from sorojax.math import sparse
-from sorojax.math.conjugate_gradient import iterate
-from sorojax.math.multigrid import multigrid
+from sorojax.fem.equilibrium.linear import constrain, linearise, prepare
+from sorojax.fem.problem import residual
+from sorojax.math.linalg import sparse
+from sorojax.math.linalg.conjugate_gradient import iterate
+from sorojax.math.linalg.multigrid import multigrid
 
 ERROR, SAME = 1e-8, 1e-11  # of solutions and equilibria; of one pass over the cells
 

@@ -6,9 +6,9 @@ from benchmarks import peers
 from benchmarks.blocks import BLOCKS, bent, block, cpu_timing, merged
 from benchmarks.harness import Row, missing, quick
 from sorojax import fem
-from sorojax.fem import assemble as asm
-from sorojax.fem.linear import prepare
-from sorojax.math import sparse
+from sorojax.fem.assembly import assemble as asm
+from sorojax.fem.equilibrium.linear import prepare
+from sorojax.math.linalg import sparse
 
 #: Seconds per cell that the displacement form may take; the default mixed form, 1.5 times.
 BARS = {"Tri3": 350e-9, "Quad4": 1.3e-6, "Tri6": 2.6e-6, "Tet10": 22e-6, "Hex8": 22e-6}

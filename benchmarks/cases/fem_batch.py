@@ -8,7 +8,7 @@ import numpy as np
 from benchmarks.bellows import case_a
 from benchmarks.harness import Row, measure, measure_calls
 from sorojax import fem
-from sorojax.math import sparse
+from sorojax.math.linalg import sparse
 from sorojax.units import kPa, mm
 
 NUM_LANES = 32

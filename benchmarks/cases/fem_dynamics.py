@@ -12,8 +12,8 @@ import numpy as np
 
 from benchmarks.harness import Row, measure_calls
 from sorojax import fem, material, mesh
-from sorojax.fem.dynamics_newton import acting, fixed_rows, forces, tangent
-from sorojax.fem.linear import linearise, prepare
+from sorojax.fem.dynamics.newton import acting, fixed_rows, forces, tangent
+from sorojax.fem.equilibrium.linear import linearise, prepare
 from sorojax.units import mm
 
 NOTE = "floor: residuals, back-substitutions, tangents and factors of the same run alone"

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.harness import Row, Timing, measure_together, quick
 from sorojax import fem, material, mesh, sdf
-from sorojax.fem import linear
+from sorojax.fem.equilibrium import linear
 from sorojax.units import mm
 
 FRICTION, SIZE = 0.5, (20 * mm, 5 * mm)

@@ -8,7 +8,7 @@ import numpy as np
 from benchmarks.bellows import PRESSURES, case_a
 from benchmarks.harness import Row, measure_calls, quick
 from sorojax import fem, mesh
-from sorojax.fem.linear import linearise, prepare, step
+from sorojax.fem.equilibrium.linear import linearise, prepare, step
 from sorojax.units import mm
 
 SIZES = (0.7, 0.32)  # mm: 13k and 50k dof

@@ -17,8 +17,8 @@ from benchmarks.bellows import PRESSURES, case_a
 from benchmarks.blocks import bent, block, cpu_timing
 from benchmarks.harness import Row, quick
 from sorojax import fem, mesh
-from sorojax.fem.linear import constrain, linearise, prepare
-from sorojax.math import sparse
+from sorojax.fem.equilibrium.linear import constrain, linearise, prepare
+from sorojax.math.linalg import sparse
 from sorojax.units import mm
 
 #: Element and cells a side of the systems that are timed, and of those that are counted.

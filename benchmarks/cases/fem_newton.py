@@ -12,8 +12,8 @@ from benchmarks import peers
 from benchmarks.blocks import bent, block, cpu_timing, merged
 from benchmarks.harness import Row, Timing, missing
 from sorojax import fem, mesh
-from sorojax.fem.energy_form import load_force
-from sorojax.fem.linear import constrain, linearise, prepare
+from sorojax.fem.equilibrium.linear import constrain, linearise, prepare
+from sorojax.fem.problem import load_force
 
 #: Element, cells a side and how many times faster than felupe it should be.
 CASES = (

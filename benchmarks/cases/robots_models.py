@@ -11,10 +11,10 @@ import numpy as np
 from benchmarks.harness import Row
 from sorojax import fem, mesh, rod, sdf
 from sorojax.math.lie import SE2
-from sorojax.mesh.elements import Tet10
+from sorojax.mesh.elements.elements import Tet10
 from sorojax.robots import Bellows, BendingActuator, printed_rubber, unit_cell
-from sorojax.robots.models_cells import bellows_cell
-from sorojax.robots.models_rods import Body, body, column, side_by_side
+from sorojax.robots.models.cell import bellows_cell
+from sorojax.robots.models.rods import Body, body, column, side_by_side
 from sorojax.units import kPa, mm
 
 BAR = 0.05

@@ -15,7 +15,7 @@ from benchmarks.cases.rod_acceleration import CALLS, loop
 from benchmarks.fingers import LENGTH, MODES, accelerate, finger, random_states
 from benchmarks.harness import Row, Timing, measure, measure_together
 from sorojax import jit
-from sorojax.math.batch import batched
+from sorojax.math.compiled import batched
 from sorojax.math.lie import SE2, SE3
 from sorojax.rod import Gravity, chebyshev, circle, forward_dynamics, operators, rod
 from sorojax.units import MPa, mm

@@ -11,9 +11,9 @@ from benchmarks.fingers import finger
 from benchmarks.harness import Row, measure_together
 from sorojax import sdf
 from sorojax.contact import LinePenalty
-from sorojax.math.contact_stepper import ContactMidpoint
 from sorojax.math.lie import SE2
-from sorojax.math.steppers import start
+from sorojax.math.ode.contact_midpoint import ContactMidpoint
+from sorojax.math.ode.steppers import start
 from sorojax.rod import (
     Damping,
     Free,
@@ -33,7 +33,7 @@ from sorojax.rod import (
     rod as make_rod,
     rollout,
 )
-from sorojax.rod.rollout import second_order
+from sorojax.rod.dynamics.rollout import second_order
 
 STEPS, STEP, BATCH, BATCH_STEPS = 250, 1e-3, 64, 25
 BAR = 0.05  # what a far obstacle may add, unbatched

@@ -14,7 +14,7 @@ from benchmarks import peers
 from benchmarks.fingers import LENGTH
 from benchmarks.harness import Row, measure, quick
 from sorojax.math.lie import SE2
-from sorojax.math.steppers import GeneralisedAlpha
+from sorojax.math.ode.steppers import GeneralisedAlpha
 from sorojax.rod import (
     Gravity,
     chebyshev,

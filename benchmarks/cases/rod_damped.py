@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks.fingers import LENGTH, finger, tip
 from benchmarks.harness import Row, measure, measure_calls
 from sorojax import jit
-from sorojax.math.steppers import GeneralisedAlpha, ImplicitMidpoint, TripleJump
+from sorojax.math.ode.steppers import GeneralisedAlpha, ImplicitMidpoint, TripleJump
 from sorojax.rod import Damping, Gravity, operators, rollout, vector_field
 
 DURATION, SAVE = 0.5, 0.01  # s

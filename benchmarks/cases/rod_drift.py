@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.fingers import finger
 from benchmarks.harness import Row, measure
-from sorojax.math.steppers import (
+from sorojax.math.ode.steppers import (
     DormandPrince,
     GeneralisedAlpha,
     ImplicitMidpoint,

@@ -8,7 +8,7 @@ import numpy as np
 from benchmarks.harness import Row, measure
 from sorojax._types import real
 from sorojax.math.lie import SE3, homogeneous
-from sorojax.math.steppers import DormandPrince, GeneralisedAlpha, TripleJump
+from sorojax.math.ode.steppers import DormandPrince, GeneralisedAlpha, TripleJump
 from sorojax.rod import (
     AbstractForce,
     Free,

@@ -10,9 +10,9 @@ from benchmarks import peers
 from benchmarks.fingers import LENGTH, MODES, accelerate, finger, tip
 from benchmarks.harness import Row, measure, measure_calls, quick
 from sorojax import jit
-from sorojax.math.steppers import DormandPrince, GeneralisedAlpha, RungeKutta4
+from sorojax.math.ode.steppers import DormandPrince, GeneralisedAlpha, RungeKutta4
 from sorojax.rod import Gravity, operators
-from sorojax.rod.rollout import rollout
+from sorojax.rod.dynamics.rollout import rollout
 
 DURATION, SAVE = 0.5, 0.01  # s
 SAVES = round(DURATION / SAVE)

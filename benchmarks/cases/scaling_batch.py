@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from benchmarks import scaling
 from benchmarks.fingers import MODES, finger, random_states
 from benchmarks.harness import quick
-from sorojax.math.batch import batched
-from sorojax.math.steppers import GeneralisedAlpha
+from sorojax.math.compiled import batched
+from sorojax.math.ode.steppers import GeneralisedAlpha
 from sorojax.rod import Gravity, forward_dynamics, rollout
 
 STEPS, STEP = 50, 1e-3  # s

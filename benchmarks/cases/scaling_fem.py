@@ -15,7 +15,7 @@ from benchmarks import memory, scaling
 from benchmarks.blocks import bent, block
 from benchmarks.harness import Timing, measure_calls, quick
 from sorojax import fem, mesh
-from sorojax.fem.linear import constrain, linearise, prepare
+from sorojax.fem.equilibrium.linear import constrain, linearise, prepare
 
 PLANE, SPACE = (6, 21, 69, 222, 397), (6, 13, 25)  # cells a side
 

@@ -5,7 +5,7 @@ import numpy as np
 from benchmarks.csg import POINTS, in_numpy, points, solid
 from benchmarks.harness import Row, measure_calls
 from sorojax import sdf
-from sorojax.sdf.evaluate import value_and_normal_at
+from sorojax.sdf.query import value_and_normal_at
 
 STEP = 1e-6
 RATE = 80  # million points per second in float32

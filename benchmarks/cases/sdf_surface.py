@@ -13,8 +13,7 @@ from benchmarks import peers
 from benchmarks.harness import Row, quick
 from benchmarks.memory import forget_peak, resident
 from sorojax import sdf
-from sorojax.sdf.base import AbstractSdf, cast
-from sorojax.sdf.scalar import minimum, norm
+from sorojax.sdf.base import AbstractSdf, cast, minimum, norm
 
 CELLS, SIDE = 512, 2.2  # along the cube, and its edge in m
 METHODS: tuple[Literal["marching_cubes", "dual_contouring"], ...] = (
@@ -79,7 +78,7 @@ def measured(function, repeats: int = 2 if quick() else 3) -> tuple[list[float],
 
 
 def rms(shape: AbstractSdf, vertices, triangles) -> float:
-    from sorojax.sdf.sample import values
+    from sorojax.sdf.sampling import values
 
     chosen = triangles[:: max(1, len(triangles) // 200_000)]
     f = values(shape, np.asarray(vertices, dtype=float)[chosen].mean(axis=1))

@@ -6,8 +6,7 @@ import numpy as np
 
 from benchmarks.harness import Row, measure_calls
 from sorojax import sdf
-from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.scalar import norm
+from sorojax.sdf.base import AbstractSdf, norm
 
 RADIUS, TUBE = 0.7, 0.25
 

@@ -14,7 +14,7 @@ from benchmarks.cases.rod_batch import in_turns
 from benchmarks.harness import Row
 from benchmarks.regulated import error, reference, regulated, solver_run
 from sorojax import jit
-from sorojax.math.explicit import Tsit5
+from sorojax.math.ode.explicit import Tsit5
 
 GAIN, RTOL = 10.0, 1e-6
 RATIO = 3.0  # of diffrax to the unrolled method

@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.hands import PERIOD, Grip, hand, lengths, separate
 from benchmarks.harness import Row, measure, measure_together
 from sorojax import systems
-from sorojax.math.dense import solve_symmetric
+from sorojax.math.linalg.dense import solve_symmetric
 from sorojax.rod import Pressurised, inertia, motion, total_force
 
 SUBSTEPS = 2

@@ -13,17 +13,17 @@ import numpy as np
 
 from benchmarks.harness import Row
 from sorojax import rod, systems
-from sorojax.math.explicit import RungeKutta4, Tsit5
 from sorojax.math.lie import SE2
-from sorojax.math.status import Status
-from sorojax.math.step_doubling import positions
-from sorojax.math.steppers import (
+from sorojax.math.ode.explicit import RungeKutta4, Tsit5
+from sorojax.math.ode.step_control import positions
+from sorojax.math.ode.steppers import (
     DormandPrince,
     GeneralisedAlpha,
     ImplicitMidpoint,
     RungeKutta4 as SecondOrderRungeKutta4,
 )
-from sorojax.systems.block import AbstractBlock, Output
+from sorojax.math.status import Status
+from sorojax.systems.blocks.block import AbstractBlock, Output
 
 DRAWS, SAVES = 40, 20
 REFERENCE = "steps of a fiftieth of the shortest by Dormand-Prince, or adaptive to 1e-9"

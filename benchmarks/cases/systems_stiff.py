@@ -6,8 +6,8 @@ import numpy as np
 
 from benchmarks.harness import Row, measure_together
 from benchmarks.regulated import error, reference, regulated, solver_run
-from sorojax.math.control import Control
-from sorojax.math.rosenbrock import Rodas4
+from sorojax.math.ode.rosenbrock import Rodas4
+from sorojax.math.ode.step_control import Control
 
 GAIN = 1000.0
 WANTED = 2e-7  # relative error of the modes at 1 s

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.harness import Row, Timing, missing
 from sorojax import mesh, view
-from sorojax.view.tracks import positions_track
+from sorojax.view.film.tracks import positions_track
 
 FRAMES, SIZE, BAR = 30, (640, 480), 1 / 10
 LENGTH = 0.06  # m

@@ -18,7 +18,7 @@ def info() -> dict[str, str]:
     from sorojax import __version__
     from sorojax._cache import cache_directory
     from sorojax._jax import fast_paths
-    from sorojax.math.sparse import available_solvers
+    from sorojax.math.linalg.sparse import available_solvers
 
     facts = {"python": f"{platform.python_version()} on {platform.platform()}"}
     facts["sorojax"] = __version__

@@ -1,8 +1,15 @@
-"""Which points can be left out because an obstacle is far away."""
+"""Which points can be left out because an obstacle is far away.
+
+Broad phase by balls: bodies that cannot touch, found by one number each.
+
+Broad phase among facets, on the host: for each the few others that it may meet.
+"""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
+from sorojax.math.host import KDTree
 from sorojax.sdf.base import AbstractSdf
 
 
@@ -35,3 +42,69 @@ def clearance(
     bound = obstacle.lipschitz
     room = obstacle(centre) / bound - radius
     return room if reach is None else room - reach / bound
+
+
+# Broad phase by balls: bodies that cannot touch, found by one number each
+
+
+def ball(points: Float[Array, "points dim"]) -> tuple[Array, Array]:
+    """Centre and radius [m] of a ball that holds all `points` [m]."""
+    centre = (jnp.min(points, axis=0) + jnp.max(points, axis=0)) / 2
+    square = jnp.sum((points - centre[None]) ** 2, axis=1)
+    return centre, jnp.sqrt(jnp.max(square))
+
+
+def near(
+    obstacle: AbstractSdf, centre: Float[Array, " dim"], radius: Float[Array, ""]
+) -> Bool[Array, ""]:
+    """Whether a ball may reach into `obstacle`; `False` is certain, `True` is not.
+
+    A field changes by at most its Lipschitz constant per length.
+    """
+    return obstacle(centre) <= obstacle.lipschitz * radius
+
+
+# Broad phase among facets, on the host: for each the few others that it may meet
+
+
+Facets = Float[np.ndarray, "facets facet_nodes dim"]
+
+
+def close_pairs(x: Facets, reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All ordered pairs of facets at positions `x` [m] closer than `reach` [m], and about
+    how far they are apart: between their nodes and centres, less what lies between those."""
+    centres = x.mean(axis=1)
+    radii = np.sqrt(((x - centres[:, None]) ** 2).sum(axis=2).max(axis=1))
+    pairs = KDTree(centres).query_pairs(reach + 2 * radii.max(), output_type="ndarray")
+    if not len(pairs):
+        none = np.zeros(0, int)
+        return none, none, np.zeros(0)
+    first, second = np.concatenate([pairs, pairs[:, ::-1]]).T
+    samples = np.concatenate([x, centres[:, None]], axis=1)
+    apart = np.full(len(first), np.inf)
+    for at in np.moveaxis(samples, 1, 0):
+        gap = np.sqrt(((samples[second] - at[first][:, None]) ** 2).sum(axis=2)).min(axis=1)
+        apart = np.minimum(apart, gap)
+    close = apart - radii[first] / 2 - radii[second] / 2 < reach
+    return first[close], second[close], apart[close]
+
+
+def listed(
+    first: Int[np.ndarray, " pairs"],
+    second: Int[np.ndarray, " pairs"],
+    apart: Float[np.ndarray, " pairs"],
+    num_facets: int,
+    count: int,
+) -> tuple[Int[np.ndarray, "facets count"], Bool[np.ndarray, "facets count"]]:
+    """The `count` nearest partners of each facet by number, and which of them are real."""
+    order = np.lexsort((apart, first))
+    first, second = first[order], second[order]
+    rank = np.arange(len(first)) - np.searchsorted(first, first)
+    kept = rank < count
+    partners = np.repeat(np.arange(num_facets)[:, None], count, axis=1)
+    real = np.zeros(partners.shape, bool)
+    partners[first[kept], rank[kept]] = second[kept]
+    real[first[kept], rank[kept]] = True
+    nearest = np.where(real, partners, num_facets)  # in the order of their numbers
+    order = np.argsort(nearest, axis=1, kind="stable")
+    return np.take_along_axis(partners, order, 1), np.take_along_axis(real, order, 1)

@@ -1,21 +1,19 @@
 """Design loops: densities, optimisers, and the loop that joins them."""
 
 from sorojax._arguments import check_package as _check_package
-from sorojax.design.calibrate import (
+from sorojax.design.calibration.calibrate import (
     CalibrationStep as CalibrationStep,
     calibrate as calibrate,
 )
-from sorojax.design.calibration import (
+from sorojax.design.calibration.calibration import (
     Calibration as Calibration,
     Check as Check,
     Combination as Combination,
+    Experiment as Experiment,
     checked as checked,
     unseen as unseen,
 )
-from sorojax.design.darcy import Darcy as Darcy, darcy as darcy
-from sorojax.design.experiment import Experiment as Experiment
-from sorojax.design.field import SplineField as SplineField
-from sorojax.design.filters import (
+from sorojax.design.density.filters import (
     ConeFilter as ConeFilter,
     HelmholtzFilter as HelmholtzFilter,
     cone_filter as cone_filter,
@@ -24,26 +22,34 @@ from sorojax.design.filters import (
     helmholtz_filter as helmholtz_filter,
     sensitivity_filtered as sensitivity_filtered,
 )
-from sorojax.design.flood import Flood as Flood, flood as flood, flooded as flooded
-from sorojax.design.history import History as History
-from sorojax.design.layout import Layout as Layout, layout as layout
-from sorojax.design.linear import (
+from sorojax.design.density.layout import (
+    Layout as Layout,
+    Mirrored as Mirrored,
+    Ramp as Ramp,
+    Repeated as Repeated,
+    Simp as Simp,
+    layout as layout,
+)
+from sorojax.design.density.linear import (
     Linear as Linear,
     compliance as compliance,
     displacement as displacement,
     linear as linear,
 )
-from sorojax.design.minimise import (
-    Optimised as Optimised,
-    Step as Step,
-    minimise as minimise,
+from sorojax.design.density.pressure import (
+    Darcy as Darcy,
+    Flood as Flood,
+    VoidPressure as VoidPressure,
+    darcy as darcy,
+    flood as flood,
+    flooded as flooded,
+    void_pressure as void_pressure,
 )
-from sorojax.design.mma import (
-    GCMMA as GCMMA,
-    MMA as MMA,
-    MMAState as MMAState,
-    Values as Values,
+from sorojax.design.density.void import (
+    InterpolatedEnergy as InterpolatedEnergy,
+    interpolated_energy as interpolated_energy,
 )
+from sorojax.design.field import SplineField as SplineField
 from sorojax.design.objectives import (
     Follower as Follower,
     displacement_along as displacement_along,
@@ -52,9 +58,27 @@ from sorojax.design.objectives import (
     path_error as path_error,
     replaced_load as replaced_load,
     rotation as rotation,
+    settled as settled,
     work_of_loads as work_of_loads,
 )
-from sorojax.design.optimality import OptimalityCriteria as OptimalityCriteria
+from sorojax.design.optimise.minimise import (
+    History as History,
+    Optimised as Optimised,
+    Step as Step,
+    minimise as minimise,
+)
+from sorojax.design.optimise.mma import (
+    GCMMA as GCMMA,
+    MMA as MMA,
+    MMAState as MMAState,
+    Values as Values,
+)
+from sorojax.design.optimise.optimality import OptimalityCriteria as OptimalityCriteria
+from sorojax.design.optimise.shape_loop import (
+    OptimisedShape as OptimisedShape,
+    ShapeStep as ShapeStep,
+    minimise_shape as minimise_shape,
+)
 from sorojax.design.part import (
     Mirror as Mirror,
     Part as Part,
@@ -68,22 +92,6 @@ from sorojax.design.pneunet import (
     PneuNetCell as PneuNetCell,
     optimise_pneunet as optimise_pneunet,
     pneunet_cell as pneunet_cell,
-)
-from sorojax.design.settle import settled as settled
-from sorojax.design.shape_loop import (
-    OptimisedShape as OptimisedShape,
-    ShapeStep as ShapeStep,
-    minimise_shape as minimise_shape,
-)
-from sorojax.design.simp import Ramp as Ramp, Simp as Simp
-from sorojax.design.symmetry import Mirrored as Mirrored, Repeated as Repeated
-from sorojax.design.void import (
-    InterpolatedEnergy as InterpolatedEnergy,
-    interpolated_energy as interpolated_energy,
-)
-from sorojax.design.void_pressure import (
-    VoidPressure as VoidPressure,
-    void_pressure as void_pressure,
 )
 
 _check_package(__name__)

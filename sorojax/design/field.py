@@ -19,8 +19,7 @@ from sorojax import _check
 from sorojax._types import real
 from sorojax.mesh.measure import cell_areas, cell_volumes
 from sorojax.mesh.mesh import Mesh
-from sorojax.sdf.base import AbstractSdf, Box, Number, number
-from sorojax.sdf.scalar import clip, norm
+from sorojax.sdf.base import AbstractSdf, Box, Number, clip, norm, number
 
 _REACH = 1.0  # cells: radius of the means that fill the space between their centres
 _NEAR = {2: 16, 3: 48}  # cells within that radius, with room for uneven ones
@@ -130,7 +129,7 @@ def sampled(mesh: Mesh, density, lower, upper, spacing: float, fold) -> Samples:
     Between centres of cells they are means over the cells nearby; beyond the mesh those of
     its edge go on. `fold` takes points of the box into the mesh.
     """
-    from sorojax.math.spatial import KDTree
+    from sorojax.math.host import KDTree
 
     density = np.asarray(density, float)
     dim = mesh.element.dim
@@ -183,7 +182,7 @@ def _pieces(level: np.ndarray) -> Float[np.ndarray, "pieces corners dim"]:
 
 def _distances(points: np.ndarray, pieces: np.ndarray) -> Float[np.ndarray, " points"]:
     """Distance of points to the nearest of many pieces of about one size."""
-    from sorojax.math.spatial import KDTree
+    from sorojax.math.host import KDTree
 
     near = min(_CANDIDATES, len(pieces))
     found = KDTree(pieces.mean(axis=1)).query(points, k=near)[1].reshape(len(points), near)

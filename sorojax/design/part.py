@@ -19,12 +19,12 @@ from sorojax.design.field import (
     sampled,
 )
 from sorojax.mesh.mesh import Mesh
+from sorojax.mesh.plane.triangulate import triangulate
 from sorojax.mesh.quality import Quality, quality
-from sorojax.mesh.tetrahedralise import tetrahedralise
-from sorojax.mesh.triangulate import triangulate
+from sorojax.mesh.solid.tetrahedralise import tetrahedralise
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.sample import values, values_and_gradients
-from sorojax.sdf.surface_report import SurfaceReport
+from sorojax.sdf.sampling import values, values_and_gradients
+from sorojax.sdf.surface.report import SurfaceReport
 
 _FINER = 4  # points per node of the grid where a volume is taken
 _FAR = 4.0  # nodes of the grid: how far the surface may move to keep the volume

@@ -18,27 +18,27 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import real
-from sorojax.design.darcy import Darcy, darcy
-from sorojax.design.flood import Flood, flood
-from sorojax.design.layout import Layout, layout
-from sorojax.design.minimise import Optimised, Step, minimise
-from sorojax.design.mma import MMA
-from sorojax.design.objectives import Follower, replaced_load, solid_of
-from sorojax.design.simp import Simp
-from sorojax.design.symmetry import Mirrored
-from sorojax.design.void import InterpolatedEnergy, interpolated_energy
-from sorojax.design.void_pressure import (
+from sorojax.design.density.layout import Layout, Mirrored, Simp, layout
+from sorojax.design.density.pressure import (
+    Darcy,
+    Flood,
     VoidPressure,
+    darcy,
+    flood,
     of_cells,
     of_nodes,
     void_pressure,
 )
+from sorojax.design.density.void import InterpolatedEnergy, interpolated_energy
+from sorojax.design.objectives import Follower, replaced_load, solid_of
+from sorojax.design.optimise.minimise import Optimised, Step, minimise
+from sorojax.design.optimise.mma import MMA
 from sorojax.fem import Fixed, Foundation, PlaneStrain, Problem, problem
 from sorojax.fem.problem import exchanged
 from sorojax.material import presets
 from sorojax.material.hyperelastic import AbstractHyperelastic
 from sorojax.mesh import rectangle
-from sorojax.mesh.elements import Quad4
+from sorojax.mesh.elements.elements import Quad4
 from sorojax.mesh.mesh import boundary_facets
 from sorojax.units import kPa, mm
 

@@ -11,19 +11,19 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._jax.trace_state import is_traced
-from sorojax.fem.formulation import (
+from sorojax.fem.assembly.space import (
     AbstractFormulation,
     ConstantPressure,
     Displacement,
     LinearPressure,
+    Space,
 )
 from sorojax.fem.kinematics import AbstractKinematics, Axisymmetric
-from sorojax.fem.space import Space
 from sorojax.fem.supports import AbstractSupport, known_components, known_dofs
 from sorojax.material.hyperelastic import AbstractHyperelastic, small_strain_moduli
-from sorojax.mesh.elements import PolyN, Quad9, Tet4, Tet15, Tri3, Tri7
+from sorojax.mesh.elements.elements import PolyN, Quad9, Tet4, Tet15, Tri3, Tri7
+from sorojax.mesh.elements.shape_functions import nodes as reference_nodes, shape_gradients
 from sorojax.mesh.mesh import Mesh
-from sorojax.mesh.shape import nodes as reference_nodes, shape_gradients
 
 #: Ratio of bulk to shear modulus above which a pressure at every point locks.
 LOCKING_RATIO = {1: 10.0, 2: 100.0}

@@ -11,7 +11,7 @@ import numpy as np
 
 from sorojax import _check, fem
 from sorojax.io import _files
-from sorojax.mesh.elements import PolyN, Tet15
+from sorojax.mesh.elements.elements import PolyN, Tet15
 from sorojax.mesh.mesh import valences
 
 _TYPES = {

@@ -8,11 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from sorojax import _check
-from sorojax.io import _files, glb, obj, ply, stl, svg, threemf
+from sorojax.io import (
+    _files,
+    formats as glb,
+    formats as obj,
+    formats as ply,
+    formats as stl,
+    formats as svg,
+    formats as threemf,
+)
 from sorojax.sdf import Curve, Surface
 from sorojax.units import mm
 
-_READERS = {".stl": stl.read, ".obj": obj.read, ".ply": ply.read}
+_READERS = {".stl": stl.read_stl, ".obj": obj.read_obj, ".ply": ply.read_ply}
 _SMALLEST, _LARGEST = 1e-3, 100.0  # m, of a part whose unit is not given
 _WRITTEN = (".stl", ".obj", ".ply", ".3mf", ".glb")
 
@@ -48,11 +56,13 @@ def export_surface(
     checked = _checked(where, surface)
     _check.positive(where, "unit", unit, "m", "Write unit=sorojax.units.mm.")
     writers = {
-        ".stl": functools.partial(stl.write_text if text else stl.write, scale=1 / unit),
-        ".obj": functools.partial(obj.write, scale=1 / unit),
-        ".ply": functools.partial(ply.write, scale=1 / unit, text=text),
-        ".3mf": threemf.write,
-        ".glb": glb.write,
+        ".stl": functools.partial(
+            stl.write_stl_text if text else stl.write_stl, scale=1 / unit
+        ),
+        ".obj": functools.partial(obj.write_obj, scale=1 / unit),
+        ".ply": functools.partial(ply.write_ply, scale=1 / unit, text=text),
+        ".3mf": threemf.write_threemf,
+        ".glb": glb.write_glb,
     }
     _files.write(file, lambda stream: writers[kind](stream, surface=checked))
     return file
@@ -74,7 +84,7 @@ def export_contour(
         )
     for curve in curves:
         _check.finite(where, "curves", curve.points, "Check the parameters of the shape.")
-    _files.write(file, lambda stream: svg.write(stream, curves))
+    _files.write(file, lambda stream: svg.write_svg(stream, curves))
 
 
 def import_surface(

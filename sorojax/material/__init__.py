@@ -9,8 +9,22 @@ from sorojax.material.fibre import (
 )
 from sorojax.material.fit import TensileFit as TensileFit, fit_tensile as fit_tensile
 from sorojax.material.growth import Grown as Grown, growth_volume as growth_volume
+from sorojax.material.homogeneous import (
+    Stability as Stability,
+    drucker_stability as drucker_stability,
+    equibiaxial_stress as equibiaxial_stress,
+    lateral_stretch as lateral_stretch,
+    pure_shear_stress as pure_shear_stress,
+    simple_shear_stress as simple_shear_stress,
+    uniaxial_stress as uniaxial_stress,
+)
 from sorojax.material.hyperelastic import (
     AbstractHyperelastic as AbstractHyperelastic,
+    AbstractVolumetricLaw as AbstractVolumetricLaw,
+    Logarithmic as Logarithmic,
+    Quadratic as Quadratic,
+    SimoMiehe as SimoMiehe,
+    SimoTaylor as SimoTaylor,
     bulk_modulus as bulk_modulus,
     cauchy_stress as cauchy_stress,
     elasticity_tensor as elasticity_tensor,
@@ -24,41 +38,22 @@ from sorojax.material.mixture import (
     Scaled as Scaled,
     by_region as by_region,
 )
-from sorojax.material.ogden import Ogden as Ogden, ogden_shear_modulus as ogden_shear_modulus
 from sorojax.material.rubbers import (
     Gent as Gent,
     MooneyRivlin as MooneyRivlin,
     NeoHookean as NeoHookean,
+    Ogden as Ogden,
     Yeoh as Yeoh,
     locking_stretch as locking_stretch,
     neo_hookean as neo_hookean,
-)
-from sorojax.material.stability import (
-    Stability as Stability,
-    drucker_stability as drucker_stability,
-)
-from sorojax.material.states import (
-    equibiaxial_stress as equibiaxial_stress,
-    lateral_stretch as lateral_stretch,
-    pure_shear_stress as pure_shear_stress,
-    simple_shear_stress as simple_shear_stress,
-    uniaxial_stress as uniaxial_stress,
-)
-from sorojax.material.unsplit import (
-    CompressibleNeoHookean as CompressibleNeoHookean,
-    StVenantKirchhoff as StVenantKirchhoff,
-    st_venant_kirchhoff as st_venant_kirchhoff,
+    ogden_shear_modulus as ogden_shear_modulus,
 )
 from sorojax.material.user import (
+    CompressibleNeoHookean as CompressibleNeoHookean,
     InvariantEnergy as InvariantEnergy,
+    StVenantKirchhoff as StVenantKirchhoff,
     UserEnergy as UserEnergy,
-)
-from sorojax.material.volumetric import (
-    AbstractVolumetricLaw as AbstractVolumetricLaw,
-    Logarithmic as Logarithmic,
-    Quadratic as Quadratic,
-    SimoMiehe as SimoMiehe,
-    SimoTaylor as SimoTaylor,
+    st_venant_kirchhoff as st_venant_kirchhoff,
 )
 
 _check_package(__name__)

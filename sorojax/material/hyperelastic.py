@@ -1,4 +1,7 @@
-"""Stored energies; stress and tangent follow by differentiation."""
+"""Stored energies; stress and tangent follow by differentiation.
+
+Laws of the volume ratio; all have the bulk modulus K as their curvature at J = 1.
+"""
 
 import abc
 import functools
@@ -116,3 +119,48 @@ def _moduli_at_rest(material):
     c = jnp.einsum("ijkl,j,l->ijkl", A, stretch, stretch) / jnp.prod(stretch)
     trace, square = jnp.einsum("iijj", c), jnp.einsum("ijij", c)
     return (square - trace / 3) / 10, trace / 9
+
+
+# Laws of the volume ratio; all have the bulk modulus K as their curvature at J = 1
+
+
+class AbstractVolumetricLaw(eqx.Module):
+    """Energy per bulk modulus of a volume ratio, elementwise."""
+
+    @abc.abstractmethod
+    def __call__(self, J: Entry) -> Entry:
+        """U(J) / K [-]."""
+
+
+class Quadratic(AbstractVolumetricLaw):
+    """(J - 1)^2 / 2: pressure linear in the volume, finite at J = 0."""
+
+    def __call__(self, J: Entry) -> Entry:
+        return (J - 1) ** 2 / 2
+
+
+class SimoMiehe(AbstractVolumetricLaw):
+    """(J^2 - 1 - 2 ln J) / 4: convex in J and infinite at J = 0.
+
+    Reference: Simo & Miehe, CMAME 98, 1992.
+    """
+
+    def __call__(self, J: Entry) -> Entry:
+        return (J**2 - 1) / 4 - jnp.log(J) / 2
+
+
+class SimoTaylor(AbstractVolumetricLaw):
+    """((J - 1)^2 + (ln J)^2) / 4: infinite at J = 0.
+
+    Reference: Simo, Taylor & Pister, CMAME 51, 1985.
+    """
+
+    def __call__(self, J: Entry) -> Entry:
+        return ((J - 1) ** 2 + jnp.log(J) ** 2) / 4
+
+
+class Logarithmic(AbstractVolumetricLaw):
+    """(ln J)^2 / 2: infinite at J = 0, softens beyond J = e."""
+
+    def __call__(self, J: Entry) -> Entry:
+        return jnp.log(J) ** 2 / 2

@@ -13,7 +13,7 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
-from sorojax.math.root import inverse_cube_root
+from sorojax.math.linalg.dense import inverse_cube_root
 
 Entry = Any  # float or array over points
 Tensor = tuple[tuple[Entry, Entry, Entry], ...]

@@ -17,8 +17,7 @@ import numpy as np
 
 from sorojax.material import checks
 from sorojax.material.hyperelastic import AbstractHyperelastic, bulk_modulus
-from sorojax.material.ogden import Ogden
-from sorojax.material.rubbers import MooneyRivlin, NeoHookean, Yeoh
+from sorojax.material.rubbers import MooneyRivlin, NeoHookean, Ogden, Yeoh
 from sorojax.units import kPa
 
 MARECHAL = "Marechal et al. 2021, doi:10.1089/soro.2019.0115, ODbL 1.0 / DbCL 1.0"

@@ -8,7 +8,7 @@ from sorojax.math.lie import SE2 as SE2, SE3 as SE3
 from sorojax.math.status import Status as Status
 
 if TYPE_CHECKING:
-    from sorojax.math.steppers import (
+    from sorojax.math.ode.steppers import (
         DormandPrince as DormandPrince,
         GeneralisedAlpha as GeneralisedAlpha,
         RungeKutta4 as RungeKutta4,
@@ -21,7 +21,7 @@ _STEPPERS = {"DormandPrince", "GeneralisedAlpha", "RungeKutta4"}
 def __getattr__(name: str) -> Any:
     """The steppers load diffrax, which shapes and bodies do without."""
     if name in _STEPPERS:
-        value = getattr(importlib.import_module("sorojax.math.steppers"), name)
+        value = getattr(importlib.import_module("sorojax.math.ode.steppers"), name)
         return _public(__name__, name, value)
     raise AttributeError(f"module 'sorojax.math' has no attribute {name!r}")
 

@@ -3,14 +3,18 @@
 A rule is a node count, or a `Quadrature` where the integrand is smooth between known
 breaks only. Everything here depends on the rule alone, so it is computed on the host,
 cached, and enters a program as a constant.
+
+Polynomials of a few given coefficients.
 """
 
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 Values: TypeAlias = np.ndarray | jax.Array
 
@@ -165,3 +169,16 @@ def _stack(rows: list) -> Any:
 def _frozen(values: np.ndarray) -> np.ndarray:
     values.flags.writeable = False
     return values
+
+
+# Polynomials of a few given coefficients
+
+
+def polynomial(
+    coefficients: Sequence[float], x: Float[Array, "*shape"]
+) -> Float[Array, "*shape"]:
+    """Sum of `coefficients[k] * x**k`, by Horner's rule."""
+    value = jnp.full_like(x, coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        value = value * x + coefficient
+    return value

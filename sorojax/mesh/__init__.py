@@ -1,13 +1,7 @@
 """Meshes: from an implicit shape to cells, and back to what is on them."""
 
 from sorojax._arguments import check_package as _check_package
-from sorojax.mesh.chambers import (
-    Chambers as Chambers,
-    boundary_loops as boundary_loops,
-    chambers as chambers,
-)
-from sorojax.mesh.distortion import Distortion as Distortion, distortion as distortion
-from sorojax.mesh.elements import (
+from sorojax.mesh.elements.elements import (
     AbstractElement as AbstractElement,
     Hex8 as Hex8,
     PolyN as PolyN,
@@ -22,28 +16,41 @@ from sorojax.mesh.elements import (
     Tri7 as Tri7,
 )
 from sorojax.mesh.enrich import enrich as enrich
-from sorojax.mesh.join import joined as joined
-from sorojax.mesh.lines import between_lines as between_lines, kept as kept
-from sorojax.mesh.locate import Locations as Locations, locate as locate
 from sorojax.mesh.measure import (
+    Locations as Locations,
     cell_areas as cell_areas,
     cell_volumes as cell_volumes,
     enclosed_volume as enclosed_volume,
+    locate as locate,
 )
 from sorojax.mesh.mesh import (
     Mesh as Mesh,
     boundary_facets as boundary_facets,
+    joined as joined,
     valences as valences,
 )
-from sorojax.mesh.mirror import mirrored as mirrored
-from sorojax.mesh.motion import move as move
-from sorojax.mesh.polymesher import polymesher as polymesher
-from sorojax.mesh.quality import Quality as Quality, quality as quality
+from sorojax.mesh.motion.move import move as move
+from sorojax.mesh.plane.polymesh import polymesher as polymesher
+from sorojax.mesh.plane.trace import (
+    from_image as from_image,
+    from_polygon as from_polygon,
+    image_shape as image_shape,
+)
+from sorojax.mesh.plane.triangulate import triangulate as triangulate
+from sorojax.mesh.quality import (
+    Distortion as Distortion,
+    Quality as Quality,
+    distortion as distortion,
+    quality as quality,
+)
 from sorojax.mesh.repair import Repaired as Repaired, repair as repair
 from sorojax.mesh.select import (
+    Chambers as Chambers,
+    boundary_loops as boundary_loops,
     cells_connected as cells_connected,
     cells_inside as cells_inside,
     cells_where as cells_where,
+    chambers as chambers,
     facets_on as facets_on,
     facets_where as facets_where,
     named as named,
@@ -54,14 +61,16 @@ from sorojax.mesh.select import (
     nodes_where as nodes_where,
 )
 from sorojax.mesh.sizes import grade as grade
-from sorojax.mesh.structured import box as box, rectangle as rectangle
-from sorojax.mesh.sweep import extrude as extrude, revolve as revolve, sweep as sweep
-from sorojax.mesh.tetrahedralise import tetrahedralise as tetrahedralise
-from sorojax.mesh.trace import (
-    from_image as from_image,
-    from_polygon as from_polygon,
-    image_shape as image_shape,
+from sorojax.mesh.solid.tetrahedralise import tetrahedralise as tetrahedralise
+from sorojax.mesh.structured import (
+    between_lines as between_lines,
+    box as box,
+    extrude as extrude,
+    kept as kept,
+    mirrored as mirrored,
+    rectangle as rectangle,
+    revolve as revolve,
+    sweep as sweep,
 )
-from sorojax.mesh.triangulate import triangulate as triangulate
 
 _check_package(__name__)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax._jax.trace_state import is_traced
-from sorojax.mesh.elements import (
+from sorojax.mesh.elements.elements import (
     AbstractElement,
     Quad8,
     Quad9,
@@ -14,8 +14,8 @@ from sorojax.mesh.elements import (
     Tri7,
     facet_corners,
 )
+from sorojax.mesh.elements.shape_functions import nodes as reference_nodes, shape_functions
 from sorojax.mesh.mesh import Mesh
-from sorojax.mesh.shape import nodes as reference_nodes, shape_functions
 
 _RICHER: dict[type, AbstractElement] = {Tri6: Tri7(), Quad8: Quad9(), Tet10: Tet15()}
 

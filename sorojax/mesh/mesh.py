@@ -1,9 +1,15 @@
-"""The mesh: points, cells and named sets."""
+"""The mesh: points, cells and named sets.
+
+Mid-side nodes on straight sides, for any quadratic cell.
+
+Several bodies as one mesh.
+"""
 
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -11,7 +17,7 @@ from sorojax._arguments import sized
 from sorojax._display import displayed, number
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import integers, real
-from sorojax.mesh.elements import AbstractElement, facet_corners
+from sorojax.mesh.elements.elements import AbstractElement, Quad8, Tet10, Tri6, facet_corners
 
 
 def _int_sets(sets: dict[str, Any]) -> dict[str, jax.Array]:
@@ -121,3 +127,60 @@ def valences(mesh: Mesh) -> Int[np.ndarray, " cells"]:
     """Corners of each cell; fewer than the element has where a polygon is padded."""
     cells = np.asarray(mesh.cells)[:, : mesh.element.num_corners]
     return 1 + (np.diff(cells, axis=1) != 0).sum(axis=1)
+
+
+# Mid-side nodes on straight sides, for any quadratic cell
+
+
+_SIDES = {
+    Tri6: ((0, 1), (1, 2), (2, 0)),
+    Quad8: ((0, 1), (1, 2), (2, 3), (3, 0)),
+    Tet10: ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)),
+}
+
+
+def with_side_nodes(
+    points: np.ndarray, cells: np.ndarray, element: AbstractElement
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points and cells of the quadratic `element` from those of its corners."""
+    sides = _SIDES[type(element)]
+    ends = np.sort(np.concatenate([cells[:, list(s)] for s in sides]), axis=1)
+    n = len(points)
+    keys, number = np.unique(ends[:, 0] * np.int64(n) + ends[:, 1], return_inverse=True)
+    middles = points[np.stack(np.divmod(keys, n), axis=1)].mean(axis=1)
+    columns = n + number.reshape(len(sides), -1).T
+    return np.concatenate([points, middles]), np.concatenate([cells, columns], axis=1)
+
+
+# Several bodies as one mesh
+
+
+def joined(**bodies: Mesh) -> Mesh:
+    """One mesh of several bodies that share no nodes, for contact between them.
+
+    `joined(finger=a, ball=b)` names the cells of each body in `regions`, its nodes in
+    `node_sets`, and its sets "finger.top"; nodes keep their order, body after body.
+    Differentiable in the points.
+
+    Raises:
+        ValueError: If there is no body, or the elements differ.
+    """
+    kinds = {type(body.element).__name__ for body in bodies.values()}
+    if len(kinds) != 1:
+        raise ValueError(
+            f"mesh.joined: got bodies of {sorted(kinds)}, need one kind of cells for all. "
+            "Mesh them alike."
+        )
+    nodes, cells, node_sets, facet_sets, regions = 0, [], {}, {}, {}
+    num_cells = 0
+    for name, body in bodies.items():
+        cells.append(np.asarray(body.cells) + nodes)
+        node_sets[name] = np.arange(nodes, nodes + body.num_nodes)
+        regions[name] = np.arange(num_cells, num_cells + body.num_cells)
+        node_sets |= {f"{name}.{key}": ids + nodes for key, ids in body.node_sets.items()}
+        facet_sets |= {f"{name}.{key}": ids + nodes for key, ids in body.facet_sets.items()}
+        regions |= {f"{name}.{key}": ids + num_cells for key, ids in body.regions.items()}
+        nodes, num_cells = nodes + body.num_nodes, num_cells + body.num_cells
+    points = jnp.concatenate([body.points for body in bodies.values()])
+    element = next(iter(bodies.values())).element
+    return Mesh(points, np.concatenate(cells), element, node_sets, facet_sets, regions)

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax._types import Numbers
-from sorojax.math.spatial import KDTree
-from sorojax.mesh.elements import (
+from sorojax.math.host import KDTree
+from sorojax.mesh.elements.elements import (
     AbstractElement,
     Hex8,
     PolyN,

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from sorojax import _check
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.sample import values
+from sorojax.sdf.sampling import values
 
 _SAMPLES = 64  # per axis of the box, to learn the range of a size field
 _MOST_POINTS = 1e7

@@ -1,13 +1,25 @@
-"""Regular meshes of boxes."""
+"""Regular meshes of boxes.
 
+Cells between given lines, and a mesh without some of its cells.
+
+Solid meshes from plane ones: extruded, revolved, swept along frames.
+
+A mesh and its mirror image as one mesh, node for node the same on both sides.
+"""
+
+from collections.abc import Sequence
 from itertools import permutations
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 
+from sorojax._jax.trace_state import is_traced
 from sorojax._types import Numbers
-from sorojax.mesh.elements import (
+from sorojax.mesh.elements.elements import (
     AbstractElement,
     Hex8,
+    PolyN,
     Quad4,
     Quad8,
     Quad9,
@@ -17,10 +29,12 @@ from sorojax.mesh.elements import (
     Tri3,
     Tri6,
     Tri7,
+    facet_element,
 )
+from sorojax.mesh.elements.shape_functions import nodes as reference_nodes
 from sorojax.mesh.enrich import enrich, plain_element
-from sorojax.mesh.mesh import Mesh, boundary_facets
-from sorojax.mesh.middles import with_side_nodes
+from sorojax.mesh.mesh import Mesh, boundary_facets, with_side_nodes
+from sorojax.mesh.solid.lattice import signed_volumes, wedge
 
 _PLANE = (Tri3, Tri6, Tri7, Quad4, Quad8, Quad9)
 _SOLID = (Hex8, Tet4, Tet10, Tet15)
@@ -171,3 +185,255 @@ def _kuhn(corner, axes: tuple[int, ...]) -> np.ndarray:
     if axes in ((0, 2, 1), (1, 0, 2), (2, 1, 0)):  # odd
         path[1], path[2] = path[2], path[1]
     return np.stack(path, axis=1)
+
+
+# Cells between given lines, and a mesh without some of its cells
+
+
+def between_lines(
+    *lines: Float[np.ndarray, " lines"] | Sequence[float], element: AbstractElement
+) -> Mesh:
+    """Cells between lines across each axis [m]: thin walls, and what lies between, as drawn.
+
+    `between_lines(x, y, element=Quad8())` fills a rectangle, three lists a cuboid. Sets are
+    those of `rectangle` and `box`.
+
+    Raises:
+        ValueError: If a list does not rise, or the element does not fit.
+    """
+    places = [np.asarray(line, float) for line in lines]
+    if len(places) != element.dim or any(
+        p.ndim != 1 or len(p) < 2 or np.any(np.diff(p) <= 0) for p in places
+    ):
+        raise ValueError(
+            f"mesh.between_lines: got {len(places)} lists for {element.name}, need "
+            f"{element.dim}, each of two or more rising numbers. np.unique sorts them."
+        )
+    counts: Any = tuple(len(p) - 1 for p in places)
+    make: Any = rectangle if element.dim == 2 else box
+    grid = make([0.0] * element.dim, counts, divisions=counts, element=element)
+    steps = np.asarray(grid.points).T
+    points = [np.interp(s, np.arange(len(p)), p) for s, p in zip(steps, places, strict=True)]
+    return Mesh(
+        np.stack(points, axis=1), grid.cells, element, grid.node_sets, grid.facet_sets
+    )  # fmt: skip
+
+
+def kept(mesh: Mesh, cells: Int[np.ndarray, " kept"]) -> Mesh:
+    """The mesh with the listed cells only, and the nodes that they use.
+
+    Node sets and regions keep what is left of them; facet sets, whose facets may have gone,
+    are dropped: choose facets anew with `facets_where` or `facets_on`.
+    """
+    chosen = np.asarray(cells)
+    if not len(chosen):
+        raise ValueError("mesh.kept: got no cells, need one or more.")
+    used, inverse = np.unique(np.asarray(mesh.cells)[chosen], return_inverse=True)
+    node_sets = {
+        name: np.flatnonzero(np.isin(used, np.asarray(ids)))
+        for name, ids in mesh.node_sets.items()
+    }
+    regions = {
+        name: np.flatnonzero(np.isin(chosen, np.asarray(ids)))
+        for name, ids in mesh.regions.items()
+    }
+    points = np.asarray(mesh.points)[used]
+    return Mesh(points, inverse.reshape(len(chosen), -1), mesh.element, node_sets, {}, regions)
+
+
+# Solid meshes from plane ones: extruded, revolved, swept along frames
+
+
+def extrude(mesh: Mesh, height: float, *, layers: int) -> Mesh:
+    """`mesh` drawn along z from 0 to `height` [m].
+
+    Quadrilaterals become `Hex8`, triangles `Tet4` (three per prism). Facet sets of the
+    sides carry over, "start" and "end" are the caps; node sets hold all layers.
+    """
+    if not height > 0:
+        raise ValueError(f"extrude: `height` is {height} m, need a positive length.")
+    flat = _plane_points("extrude", mesh, layers)
+    z = np.linspace(0.0, height, layers + 1)
+    levels = [np.concatenate([flat, np.full((len(flat), 1), h)], axis=1) for h in z]
+    return _stacked(mesh, np.stack(levels), closed=False)
+
+
+def revolve(mesh: Mesh, *, layers: int, angle: float = 2 * np.pi) -> Mesh:
+    """`mesh` turned about the y axis by `angle` [rad], its x being the radius.
+
+    A full turn closes on itself. Triangles may touch the axis, quadrilaterals not.
+
+    Raises:
+        ValueError: If nodes have negative radius, or a quadrilateral touches the axis.
+    """
+    flat = _plane_points("revolve", mesh, layers)
+    closed = bool(abs(angle - 2 * np.pi) < 1e-12)
+    if not 0 < angle <= 2 * np.pi + 1e-12 or layers < (3 if closed else 1):
+        raise ValueError(
+            f"revolve: got `angle` {angle} rad and {layers} `layers`, need an angle in "
+            "(0, 2 pi] and at least 3 layers for a full turn."
+        )
+    tiny = 1e-12 * float(np.ptp(flat, axis=0).max())
+    if flat[:, 0].min() < -tiny:
+        raise ValueError(
+            f"revolve: a node has x = {flat[:, 0].min():g} m, need x >= 0, the radius. Move "
+            "the section to one side of the y axis."
+        )
+    axis = flat[:, 0] <= tiny
+    if isinstance(mesh.element, Quad4) and axis.any():
+        raise ValueError(
+            "revolve: quadrilaterals touch the axis, where hexahedra would collapse. Use "
+            "triangles, or leave a hole around the axis."
+        )
+    turn = np.linspace(0.0, angle, layers + 1)[: layers if closed else None]
+    r, y = flat.T
+    levels = [np.stack([r * np.cos(t), y, r * np.sin(t)], axis=1) for t in turn]
+    return _stacked(mesh, np.stack(levels), closed, axis)
+
+
+def sweep(mesh: Mesh, frames: np.ndarray) -> Mesh:
+    """`mesh` carried along `frames`, (stations, 4, 4) poses; its z axis is the way on.
+
+    Each frame is a homogeneous matrix that takes (x, y, 0) to space.
+    """
+    frames = np.asarray(frames, dtype=float)
+    if frames.ndim != 3 or frames.shape[1:] != (4, 4) or len(frames) < 2:
+        raise ValueError(f"sweep: `frames` has shape {frames.shape}, need (at least 2, 4, 4).")
+    flat = _plane_points("sweep", mesh, len(frames) - 1)
+    flat = np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)
+    levels = np.einsum("sij,nj->sni", frames[:, :3, :3], flat) + frames[:, None, :3, 3]
+    return _stacked(mesh, levels, closed=False)
+
+
+def _plane_points(where: str, mesh: Mesh, layers: int) -> np.ndarray:
+    if is_traced(mesh):
+        raise ValueError(f"{where}: the mesh is traced, need concrete points. Call it outside.")
+    if not isinstance(mesh.element, Tri3 | Quad4):
+        raise ValueError(
+            f"{where}: got {mesh.element.name} cells, need Tri3 or Quad4. Mesh with order=1."
+        )
+    if layers < 1:
+        raise ValueError(f"{where}: got {layers} `layers`, need at least 1.")
+    return np.asarray(mesh.points)
+
+
+def _stacked(mesh: Mesh, levels: np.ndarray, closed: bool, axis=None) -> Mesh:
+    stations, n = levels.shape[:2]
+    number = np.arange(stations * n).reshape(stations, n)
+    if axis is not None:
+        number[:, axis] = number[0, axis]
+    flat = np.asarray(mesh.cells)
+    below, above = number, np.roll(number, -1, axis=0)
+    if not closed:
+        below, above = below[:-1], above[:-1]
+    low, high = below[:, flat].reshape(-1, flat.shape[1]), above[:, flat]
+    high = high.reshape(-1, flat.shape[1])
+    points = levels.reshape(-1, 3)
+    if flat.shape[1] == 4:
+        cells, element = np.concatenate([low, high], axis=1), Hex8()
+    else:
+        cells, element = _prisms(points, low, high), Tet4()
+    used, cells = np.unique(cells, return_inverse=True)
+    solid = Mesh(points[used], cells.reshape(-1, element.num_nodes), element)
+    return _carry_sets(mesh, solid, used // n, used % n, stations, closed)
+
+
+def _prisms(points, low, high) -> np.ndarray:
+    cells = np.concatenate(wedge(*low.T, *high.T))
+    ordered = np.sort(cells, axis=1)
+    cells = cells[(np.diff(ordered, axis=1) > 0).all(axis=1)]
+    volume = signed_volumes(points[cells])
+    return np.where((volume < 0)[:, None], cells[:, [0, 1, 3, 2]], cells)
+
+
+def _carry_sets(mesh: Mesh, solid: Mesh, station, base, stations: int, closed: bool) -> Mesh:
+    facets = boundary_facets(solid)
+    node_sets = {
+        name: np.flatnonzero(np.isin(base, np.asarray(ids)))
+        for name, ids in mesh.node_sets.items()
+    }
+    roots = base[facets]
+    low, high = roots.min(axis=1), roots.max(axis=1)
+    # A side facet stands on two nodes of one edge; a cap has three or four.
+    side = ((roots == low[:, None]) | (roots == high[:, None])).all(axis=1)
+    keys = low * np.int64(mesh.num_nodes) + high
+    facet_sets = {}
+    for name, edges in mesh.facet_sets.items():
+        ends = np.sort(np.asarray(edges)[:, :2], axis=1)
+        own = np.isin(keys, ends @ np.array([mesh.num_nodes, 1], np.int64))
+        facet_sets[name] = facets[side & own]
+    if not closed:
+        for name, place in (("start", 0), ("end", stations - 1)):
+            facet_sets[name] = facets[~side & (station[facets].max(axis=1) == place)]
+    facet_sets["boundary"] = facets
+    return Mesh(solid.points, solid.cells, solid.element, node_sets, facet_sets)
+
+
+# A mesh and its mirror image as one mesh, node for node the same on both sides
+
+
+_SAME = 1e-9  # of the extent: on the plane
+
+
+def mirrored(mesh: Mesh, axis: int, at: float) -> Mesh:
+    """`mesh` with its image behind the plane x[axis] = `at` [m]; both share the nodes on it.
+
+    A mesh without symmetry has no bifurcation, only an imperfection. Nodes on the plane are
+    moved onto it, images come after them. Sets hold the images too; facets on the plane,
+    which no longer bound anything, leave theirs.
+
+    Raises:
+        ValueError: For polygons, or if the mesh reaches across the plane.
+
+    Example:
+        `mirrored(mirrored(quarter, 0, 20 * mm), 1, 20 * mm)` is the whole square.
+    """
+    if isinstance(mesh.element, PolyN):
+        raise ValueError("mesh.mirrored: got polygons, need another kind of cells.")
+    points = np.array(mesh.points)
+    slack = _SAME * float(np.ptp(points, axis=0).max())
+    _check_side(points[:, axis] - at, slack)
+    shared = np.abs(points[:, axis] - at) <= slack
+    points[shared, axis] = at
+    image = points[~shared]
+    image[:, axis] = 2 * at - image[:, axis]
+    number = np.where(shared, np.arange(len(points)), len(points) - 1 + np.cumsum(~shared))
+    cells = np.asarray(mesh.cells)
+    facets = {name: _facets(mesh, ids, shared, number) for name, ids in mesh.facet_sets.items()}
+    return Mesh(
+        np.concatenate([points, image]),
+        np.concatenate([cells, number[cells[:, turned(mesh.element)]]]),
+        mesh.element,
+        {name: np.unique(np.concatenate([ids, number[np.asarray(ids)]]))
+         for name, ids in mesh.node_sets.items()},
+        facets,
+        {name: np.concatenate([ids, np.asarray(ids) + len(cells)])
+         for name, ids in mesh.regions.items()},
+    )  # fmt: skip
+
+
+def turned(element: AbstractElement) -> Int[np.ndarray, " nodes"]:
+    """Order of the nodes in which the mirror image of a cell is a cell."""
+    here = reference_nodes(element)
+    image = here.copy()
+    image[:, [0, 1]] = here[:, [1, 0]]
+    apart = np.abs(image[:, None] - here[None]).sum(axis=2)
+    return apart.argmin(axis=1)
+
+
+def _facets(mesh: Mesh, ids, shared, number) -> np.ndarray:
+    facets = np.asarray(ids)
+    facets = facets[~shared[facets].all(axis=1)]
+    if mesh.element.dim == 2:
+        order = np.array([1, 0, *range(2, facets.shape[1])])
+    else:
+        order = turned(facet_element(mesh.element))
+    return np.concatenate([facets, number[facets[:, order]]])
+
+
+def _check_side(away: np.ndarray, slack: float) -> None:
+    if away.min() < -slack and away.max() > slack:
+        raise ValueError(
+            f"mesh.mirrored: the mesh reaches from {away.min():.3g} to {away.max():.3g} m "
+            "about the plane, need all of it on one side. Mesh one half only."
+        )

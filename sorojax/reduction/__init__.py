@@ -10,25 +10,23 @@ from sorojax.reduction.curve import (
     Curve as Curve,
     Line as Line,
 )
-from sorojax.reduction.damping import (
-    DampingFit as DampingFit,
-    identify_damping as identify_damping,
-)
 from sorojax.reduction.identify import (
     ConstantDamping as ConstantDamping,
+    DampingFit as DampingFit,
     Fit as Fit,
     PressureMap as PressureMap,
     condensed_stiffness as condensed_stiffness,
     identify as identify,
+    identify_damping as identify_damping,
 )
-from sorojax.reduction.mass import mean_section as mean_section
 from sorojax.reduction.pod import (
     captured_energy as captured_energy,
     coordinates as coordinates,
     pod_basis as pod_basis,
 )
-from sorojax.reduction.weight import (
+from sorojax.reduction.section import (
     OffsetWeight as OffsetWeight,
+    mean_section as mean_section,
     offset_weight as offset_weight,
 )
 

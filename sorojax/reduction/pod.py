@@ -17,7 +17,7 @@ from sorojax.rod import (
     StrainBasis,
     orthonormalise,
 )
-from sorojax.rod.basis import STRAINS
+from sorojax.rod.model.basis import STRAINS
 
 
 @jax.jit

@@ -18,11 +18,11 @@ from sorojax.sdf import (
     rotate,
     translate,
 )
-from sorojax.sdf.combine import hull
-from sorojax.sdf.lift import revolve
-from sorojax.sdf.scalar import minimum
-from sorojax.sdf.solids import Cylinder
-from sorojax.sdf.transform import AbstractWrapped
+from sorojax.sdf.base import minimum
+from sorojax.sdf.operations.booleans import hull
+from sorojax.sdf.operations.lift import revolve
+from sorojax.sdf.operations.transform import AbstractWrapped
+from sorojax.sdf.shapes.solid import Cylinder
 from sorojax.units import mm
 
 

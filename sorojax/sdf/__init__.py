@@ -1,60 +1,8 @@
 """Implicit shapes: signed distances in metres, negative inside."""
 
 from sorojax._arguments import check_package as _check_package
-from sorojax.sdf.bars import (
-    Capsule as Capsule,
-    HalfSpace as HalfSpace,
-    RoundCone as RoundCone,
-    Slab as Slab,
-    Strut as Strut,
-    stadium as stadium,
-)
 from sorojax.sdf.base import AbstractSdf as AbstractSdf, Exactness as Exactness
-from sorojax.sdf.blend import (
-    AbstractBlend as AbstractBlend,
-    Chamfer as Chamfer,
-    Circular as Circular,
-    Cubic as Cubic,
-    Exponential as Exponential,
-    Quadratic as Quadratic,
-    SmoothDifference as SmoothDifference,
-    SmoothIntersection as SmoothIntersection,
-    SmoothUnion as SmoothUnion,
-)
-from sorojax.sdf.combine import (
-    Difference as Difference,
-    Intersection as Intersection,
-    Union as Union,
-    intersection as intersection,
-    union as union,
-)
-from sorojax.sdf.curves import (
-    Bezier as Bezier,
-    Helix as Helix,
-    Parabola as Parabola,
-    Polyline as Polyline,
-)
-from sorojax.sdf.deform import (
-    bend as bend,
-    taper as taper,
-    twist as twist,
-)
-from sorojax.sdf.differential import (
-    closest_point as closest_point,
-    curvature as curvature,
-    frame as frame,
-    gaussian_curvature as gaussian_curvature,
-    hessian as hessian,
-)
-from sorojax.sdf.ellipsoid import (
-    Ellipsoid as Ellipsoid,
-)
-from sorojax.sdf.evaluate import (
-    evaluate as evaluate,
-    value_and_normal as value_and_normal,
-)
-from sorojax.sdf.isosurface import Surface as Surface, isosurface as isosurface
-from sorojax.sdf.lattice import (
+from sorojax.sdf.lattices import (
     BccLattice as BccLattice,
     Diamond as Diamond,
     Gyroid as Gyroid,
@@ -66,7 +14,40 @@ from sorojax.sdf.lattice import (
     SchwarzP as SchwarzP,
     VoronoiFoam as VoronoiFoam,
 )
-from sorojax.sdf.lift import (
+from sorojax.sdf.measure.moments import (
+    area as area,
+    centroid as centroid,
+    inertia_tensor as inertia_tensor,
+    second_moments as second_moments,
+    volume as volume,
+)
+from sorojax.sdf.operations.booleans import (
+    AbstractBlend as AbstractBlend,
+    Chamfer as Chamfer,
+    Circular as Circular,
+    Cubic as Cubic,
+    Difference as Difference,
+    Exponential as Exponential,
+    Intersection as Intersection,
+    Quadratic as Quadratic,
+    SmoothDifference as SmoothDifference,
+    SmoothIntersection as SmoothIntersection,
+    SmoothUnion as SmoothUnion,
+    Union as Union,
+    intersection as intersection,
+    union as union,
+)
+from sorojax.sdf.operations.deform import (
+    AbstractRelief as AbstractRelief,
+    Waves as Waves,
+    bend as bend,
+    displace as displace,
+    morph as morph,
+    stretch as stretch,
+    taper as taper,
+    twist as twist,
+)
+from sorojax.sdf.operations.lift import (
     elongate as elongate,
     extrude as extrude,
     grid_repeat as grid_repeat,
@@ -74,50 +55,67 @@ from sorojax.sdf.lift import (
     polar_repeat as polar_repeat,
     revolve as revolve,
 )
-from sorojax.sdf.measure import (
-    area as area,
-    centroid as centroid,
-    second_moments as second_moments,
-)
-from sorojax.sdf.morph import (
-    AbstractRelief as AbstractRelief,
-    Waves as Waves,
-    displace as displace,
-    morph as morph,
-    stretch as stretch,
-)
-from sorojax.sdf.outlines import Outlines as Outlines, outlines as outlines, text as text
-from sorojax.sdf.polyhedra import (
-    Octahedron as Octahedron,
-    Pyramid as Pyramid,
-    TriangleMesh as TriangleMesh,
+from sorojax.sdf.operations.transform import (
+    offset as offset,
+    repeat as repeat,
+    rotate as rotate,
+    scale as scale,
+    shell as shell,
+    translate as translate,
+    turn as turn,
 )
 from sorojax.sdf.query import (
     bounding_box as bounding_box,
+    closest_point as closest_point,
+    curvature as curvature,
+    evaluate as evaluate,
+    frame as frame,
+    gaussian_curvature as gaussian_curvature,
     gradient as gradient,
+    hessian as hessian,
     normal as normal,
     project as project,
+    value_and_normal as value_and_normal,
 )
-from sorojax.sdf.sampled import (
-    HeightMap as HeightMap,
-    Sampled as Sampled,
-    image as image,
-)
-from sorojax.sdf.scatter import (
+from sorojax.sdf.sampling import (
     grid as grid,
     sample_boundary as sample_boundary,
     sample_interior as sample_interior,
 )
-from sorojax.sdf.shapes2d import (
+from sorojax.sdf.shapes.bars import (
+    Capsule as Capsule,
+    HalfSpace as HalfSpace,
+    RoundCone as RoundCone,
+    Slab as Slab,
+    Strut as Strut,
+    stadium as stadium,
+)
+from sorojax.sdf.shapes.curves import (
+    Bezier as Bezier,
+    Helix as Helix,
+    Parabola as Parabola,
+    Polyline as Polyline,
+    Spline as Spline,
+)
+from sorojax.sdf.shapes.data import (
+    HeightMap as HeightMap,
+    Octahedron as Octahedron,
+    Outlines as Outlines,
+    Pyramid as Pyramid,
+    Sampled as Sampled,
+    TriangleMesh as TriangleMesh,
+    image as image,
+    outlines as outlines,
+    text as text,
+)
+from sorojax.sdf.shapes.ellipsoid import Ellipsoid as Ellipsoid
+from sorojax.sdf.shapes.plane import (
+    Arc as Arc,
     Circle as Circle,
     HalfPlane as HalfPlane,
+    Pie as Pie,
     Polygon as Polygon,
     Rectangle as Rectangle,
-)
-from sorojax.sdf.shapes3d import Box as Box, Sphere as Sphere
-from sorojax.sdf.sketch import (
-    Arc as Arc,
-    Pie as Pie,
     RegularPolygon as RegularPolygon,
     Ring as Ring,
     Squircle as Squircle,
@@ -126,8 +124,8 @@ from sorojax.sdf.sketch import (
     trapezoid as trapezoid,
     triangle as triangle,
 )
-from sorojax.sdf.solid_measure import inertia_tensor as inertia_tensor, volume as volume
-from sorojax.sdf.solids import (
+from sorojax.sdf.shapes.solid import (
+    Box as Box,
     BoxFrame as BoxFrame,
     CappedCone as CappedCone,
     CappedTorus as CappedTorus,
@@ -135,24 +133,14 @@ from sorojax.sdf.solids import (
     Cylinder as Cylinder,
     HexagonalPrism as HexagonalPrism,
     InfiniteCylinder as InfiniteCylinder,
+    Sphere as Sphere,
     Torus as Torus,
 )
-from sorojax.sdf.spline import (
-    Spline as Spline,
-)
-from sorojax.sdf.surface import Curve as Curve, contour as contour
-from sorojax.sdf.surface_report import (
+from sorojax.sdf.surface.contour import Curve as Curve, contour as contour
+from sorojax.sdf.surface.marching import Surface as Surface, isosurface as isosurface
+from sorojax.sdf.surface.report import (
     SurfaceReport as SurfaceReport,
     surface_report as surface_report,
 )
-from sorojax.sdf.transform import (
-    offset as offset,
-    repeat as repeat,
-    rotate as rotate,
-    scale as scale,
-    shell as shell,
-    translate as translate,
-)
-from sorojax.sdf.turn import turn as turn
 
 _check_package(__name__)

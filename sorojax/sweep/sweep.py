@@ -1,12 +1,41 @@
-"""`sweep`: one function over many designs in chunks that are made once."""
+"""`sweep`: one function over many designs in chunks that are made once.
+
+A folder of results, each under the key of what made it, whole or not there.
+
+Where chunks run: anything with `submit(function, *args)` that returns a future.
+
+On one machine, with processes:
+
+    from concurrent.futures import ProcessPoolExecutor
+    sweep(function, designs, store, ProcessPoolExecutor(mp_context=get_context("spawn")))
+
+Workers need the precision of their driver: set JAX_ENABLE_X64=1 in the environment, which
+they inherit. JAX makes pickled arrays single in a process that has not got it.
+
+With Dask, the official extra `sorojax[sweep]`, two lines locally and two for a queue:
+
+    client = sweep.dask_local(workers=2)
+    sweep(function, designs, store, client)
+
+    cluster = dask_jobqueue.SLURMCluster(cores=4, memory="8GB"); cluster.scale(jobs=20)
+    sweep(function, designs, store, distributed.Client(cluster))
+
+Workers run what they are sent: who can reach a scheduler can run code on it. `dask_local`
+listens on the loopback only. Beyond one machine use TLS, with keys of your own:
+`distributed.security.Security(tls_ca_file=..., tls_client_cert=..., tls_client_key=...,
+require_encryption=True)`, given to the cluster and to the client.
+"""
 
 import functools
 import hashlib
 import inspect
 import json
+import os
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,8 +43,102 @@ import numpy as np
 from jaxtyping import PyTree
 
 from sorojax import __version__, _progress
-from sorojax.sweep.executors import Serial
-from sorojax.sweep.store import Arrays, Store, digest
+from sorojax.io import _files, state as _archive
+from sorojax.io.state import Arrays as Arrays
+
+_CHECK = "sha256"
+
+
+@dataclass(frozen=True)
+class Store:
+    """Results in a folder that several drivers and workers may share.
+
+    A file appears by renaming, so nobody reads half of one; a file whose content does not
+    match its checksum counts as missing and is made again.
+
+    Attributes:
+        folder: Made at the first write.
+        max_bytes: Larger files are refused.
+    """
+
+    folder: str | os.PathLike
+    max_bytes: int = _files.MAX_BYTES
+
+    def path(self, key: str) -> Path:
+        return Path(self.folder) / f"{key}.npz"
+
+    def write(self, key: str, result: Arrays) -> None:
+        """Keep a result; a second one of the same key replaces the first."""
+        target = self.path(key)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        check = np.frombuffer(digest(result).encode(), np.uint8)
+
+        named = {f"result.{name}": value for name, value in result.items()}
+
+        def fill(file):
+            _archive.write(file, named | {_CHECK: check})
+
+        _files.write(target, fill)
+
+    def read(self, key: str) -> Arrays | None:
+        """The result of a key; None if there is none, or a damaged one."""
+        target = self.path(key)
+        if not target.is_file():
+            return None
+        try:
+            content = _files.read("sweep", target, self.max_bytes)
+            found = _archive.read(content, self.max_bytes)
+            check = found.pop(_CHECK).tobytes().decode()
+        except (ValueError, KeyError, OSError):
+            return None
+        result = {name.removeprefix("result."): array for name, array in found.items()}
+        return result if digest(result) == check else None
+
+
+def digest(result: Arrays) -> str:
+    """A hash of names, types, shapes and bits."""
+    hashed = hashlib.sha256()
+    for name in sorted(result):
+        array = np.ascontiguousarray(result[name])
+        hashed.update(json.dumps([name, str(array.dtype), array.shape]).encode())
+        hashed.update(array.tobytes())
+    return hashed.hexdigest()
+
+
+# Where chunks run: anything with `submit(function, *args)` that returns a future
+
+
+class Serial:
+    """Runs every chunk at once, in this process."""
+
+    def submit(self, function, /, *args: Any) -> Future:
+        future: Future = Future()
+        try:
+            future.set_result(function(*args))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+def dask_local(workers: int, **options: Any) -> Any:
+    """A Dask client with worker processes of one thread on this machine's loopback.
+
+    Needs `distributed`, the extra `sorojax[sweep]`. Close it: `client.shutdown()`.
+    """
+    from distributed import Client, LocalCluster
+
+    cluster = LocalCluster(
+        n_workers=workers,
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        **{"dashboard_address": None, **options},
+    )
+    return Client(cluster)
+
+
+# `sweep`: one function over many designs in chunks that are made once
+
 
 _MODES = ("jax_enable_x64", "jax_default_matmul_precision")
 

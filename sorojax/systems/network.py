@@ -11,9 +11,15 @@ from jaxtyping import Array, Float, PyTree
 
 from sorojax._display import displayed
 from sorojax.math.status import Status
-from sorojax.systems.block import AbstractBlock, Input, Output, Signals
-from sorojax.systems.loops import consistent, torn_wires
-from sorojax.systems.schedule import check_wires, evaluation_order, needed, reachable_inputs
+from sorojax.systems.blocks.block import AbstractBlock, Input, Output, Signals
+from sorojax.systems.schedule import (
+    check_wires,
+    consistent,
+    evaluation_order,
+    needed,
+    reachable_inputs,
+    torn_wires,
+)
 
 
 def _pairs(wires: Mapping[str, str] | tuple) -> tuple[tuple[str, str], ...]:

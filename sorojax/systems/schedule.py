@@ -1,8 +1,16 @@
-"""Checks of a wiring and the order in which its ports are evaluated."""
+"""Checks of a wiring and the order in which its ports are evaluated.
 
-from collections.abc import Iterable, Mapping
+Algebraic loops: torn wires, and the root find that makes them consistent.
+"""
 
-from sorojax.systems.block import AbstractBlock
+from collections.abc import Callable, Iterable, Mapping
+
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array
+
+from sorojax.systems.blocks.block import AbstractBlock
 
 Blocks = Mapping[str, AbstractBlock]
 Wires = Mapping[str, str]
@@ -161,3 +169,36 @@ def _need_fit(target: str, port, source: str, made) -> None:
 def _fits(port, made) -> bool:
     any_unit = port.unit is None or made.unit is None
     return (any_unit or port.unit == made.unit) and port.shape == made.shape
+
+
+# Algebraic loops: torn wires, and the root find that makes them consistent
+
+
+Signals = dict[str, Array]
+
+
+def torn_wires(blocks: Blocks, wires: Wires) -> tuple[str, ...]:
+    """Wired inputs to cut, one per loop, so that the rest can be evaluated in order."""
+    left = dict(wires)
+    torn: list[str] = []
+    while loop := loop_of(blocks, left):
+        name = min(entry for entry in loop if entry in left)
+        del left[name]
+        torn.append(name)
+    return tuple(torn)
+
+
+def consistent(propagate: Callable[[Signals], Signals], guess: Signals) -> Signals:
+    """Values of torn inputs that equal what `propagate` makes of them.
+
+    One step solves loops that are linear; derivatives follow from the implicit function
+    theorem. Where no root is found the values are NaN, which ends a simulation.
+    """
+
+    def residual(values, _):
+        return jax.tree.map(lambda a, b: a - b, propagate(values), values)
+
+    solver = optx.Newton(rtol=1e-12, atol=1e-12)
+    found = optx.root_find(residual, solver, guess, max_steps=50, throw=False)
+    good = found.result == optx.RESULTS.successful
+    return jax.tree.map(lambda x: jnp.where(good, x, jnp.full_like(x, jnp.nan)), found.value)

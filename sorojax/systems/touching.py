@@ -23,11 +23,11 @@ from sorojax.rod import (
     motion,
     part_motion,
 )
-from sorojax.rod.alike import each
-from sorojax.rod.assembly import index_of, num_dof, slices
-from sorojax.rod.part_columns import columns_of
-from sorojax.rod.pressing import Touch
-from sorojax.rod.rod_contact import touches
+from sorojax.rod.contact.obstacle import Touch
+from sorojax.rod.contact.rods import touches
+from sorojax.rod.dynamics.composite import columns_of
+from sorojax.rod.dynamics.tree import each
+from sorojax.rod.model.assembly import index_of, num_dof, slices
 
 
 class Touching(eqx.Module):

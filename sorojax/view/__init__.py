@@ -8,9 +8,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from sorojax._arguments import check_package as _check_package, public as _public
-from sorojax.view.camera import Camera as Camera, between as between, orbit as orbit
 from sorojax.view.picture import Picture as Picture
-from sorojax.view.scene import (
+from sorojax.view.raster.camera import Camera as Camera, between as between, orbit as orbit
+from sorojax.view.raster.scene import (
     Arrows as Arrows,
     Dots as Dots,
     Lines as Lines,
@@ -19,63 +19,109 @@ from sorojax.view.scene import (
     Surface as Surface,
     joined as joined,
 )
-from sorojax.view.show import options as options, show as show
-from sorojax.view.stage import scene_of as scene_of
+from sorojax.view.show import options as options, scene_of as scene_of, show as show
 from sorojax.view.style import png as png
 
 _NAMES = {
-    "animation": ("Track", "animate"),
-    "bodies": ("show_deformed", "show_mesh"),
-    "body_film": ("film_of_mesh", "ray"),
-    "charts": ("Convergence", "WorkPrecision"),
-    "distance": ("show_sdf",),
-    "feed": ("Feed", "live"),
-    "fields": ("nodal_von_mises",),
-    "figures": (
-        "backbone_errors", "show_backbones", "show_curve", "show_modes", "show_signals"
+    "draw.bodies": (
+        "show_deformed",
+        "show_mesh",
     ),
-    "files": ("animate_file", "show_file"),
-    "film": ("Film", "animate_figure"),
-    "live_sinks": ("AbstractSink", "Recording"),
-    "live_viser": ("Viser",),
-    "report": ("Number", "Section", "html_report"),
-    "rigging": ("Rig", "placed", "pose", "rig"),
-    "skin": ("Skin", "bind", "deform"),
-    "web": ("Page", "to_html"),
-    "web_actor": ("Actor", "actor"),
-    "web_glb": ("to_glb",),
-}  # fmt: skip
+    "draw.figures": (
+        "Convergence",
+        "WorkPrecision",
+        "backbone_errors",
+        "show_backbones",
+        "show_curve",
+        "show_modes",
+        "show_signals",
+    ),
+    "draw.files": (
+        "animate_file",
+        "show_file",
+    ),
+    "draw.shapes": ("show_sdf",),
+    "draw.states": ("nodal_von_mises",),
+    "film.animation": (
+        "Track",
+        "animate",
+    ),
+    "film.body_film": (
+        "film_of_mesh",
+        "ray",
+    ),
+    "film.film": (
+        "Film",
+        "animate_figure",
+    ),
+    "live_view.feed": (
+        "Feed",
+        "Viser",
+        "live",
+    ),
+    "live_view.sinks": (
+        "AbstractSink",
+        "Recording",
+    ),
+    "report": (
+        "Number",
+        "Section",
+        "html_report",
+    ),
+    "rigging.rig": (
+        "Rig",
+        "placed",
+        "pose",
+        "rig",
+    ),
+    "rigging.skin": (
+        "Skin",
+        "bind",
+        "deform",
+    ),
+    "web.actor": (
+        "Actor",
+        "actor",
+    ),
+    "web.page": (
+        "Page",
+        "to_glb",
+        "to_html",
+    ),
+}
 _MODULE = {name: module for module, names in _NAMES.items() for name in names}
 
 if TYPE_CHECKING:
-    from sorojax.view.animation import Track as Track, animate as animate
-    from sorojax.view.bodies import show_deformed as show_deformed, show_mesh as show_mesh
-    from sorojax.view.body_film import film_of_mesh as film_of_mesh, ray as ray
-    from sorojax.view.charts import Convergence as Convergence, WorkPrecision as WorkPrecision
-    from sorojax.view.distance import show_sdf as show_sdf
-    from sorojax.view.feed import Feed as Feed, live as live
-    from sorojax.view.fields import nodal_von_mises as nodal_von_mises
-    from sorojax.view.figures import (
+    from sorojax.view.draw.bodies import show_deformed as show_deformed, show_mesh as show_mesh
+    from sorojax.view.draw.figures import (
+        Convergence as Convergence,
+        WorkPrecision as WorkPrecision,
         backbone_errors as backbone_errors,
         show_backbones as show_backbones,
         show_curve as show_curve,
         show_modes as show_modes,
         show_signals as show_signals,
     )
-    from sorojax.view.files import animate_file as animate_file, show_file as show_file
-    from sorojax.view.film import Film as Film, animate_figure as animate_figure
-    from sorojax.view.live_sinks import AbstractSink as AbstractSink, Recording as Recording
-    from sorojax.view.live_viser import Viser as Viser
+    from sorojax.view.draw.files import animate_file as animate_file, show_file as show_file
+    from sorojax.view.draw.shapes import show_sdf as show_sdf
+    from sorojax.view.draw.states import nodal_von_mises as nodal_von_mises
+    from sorojax.view.film.animation import Track as Track, animate as animate
+    from sorojax.view.film.body_film import film_of_mesh as film_of_mesh, ray as ray
+    from sorojax.view.film.film import Film as Film, animate_figure as animate_figure
+    from sorojax.view.live_view.feed import Feed as Feed, Viser as Viser, live as live
+    from sorojax.view.live_view.sinks import (
+        AbstractSink as AbstractSink,
+        Recording as Recording,
+    )
     from sorojax.view.report import (
         Number as Number,
         Section as Section,
         html_report as html_report,
     )
-    from sorojax.view.rigging import Rig as Rig, placed as placed, pose as pose, rig as rig
-    from sorojax.view.skin import Skin as Skin, bind as bind, deform as deform
-    from sorojax.view.web import Page as Page, to_html as to_html
-    from sorojax.view.web_actor import Actor as Actor, actor as actor
-    from sorojax.view.web_glb import to_glb as to_glb
+    from sorojax.view.rigging.rig import Rig as Rig, placed as placed, pose as pose, rig as rig
+    from sorojax.view.rigging.skin import Skin as Skin, bind as bind, deform as deform
+    from sorojax.view.web.actor import Actor as Actor, actor as actor
+    from sorojax.view.web.page import Page as Page, to_glb as to_glb, to_html as to_html
 
 _check_package(__name__)
 

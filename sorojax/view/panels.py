@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from sorojax.view import style
-from sorojax.view.camera import View, box_corners, camera_at, fit
 from sorojax.view.picture import Panel, Picture
-from sorojax.view.plane import bar_beside, draw_plane, name_parts
-from sorojax.view.scene import Scene
-from sorojax.view.solid import bar_of, draw_solid, lens_of
+from sorojax.view.raster.camera import View, box_corners, camera_at, fit
+from sorojax.view.raster.plane import bar_beside, draw_plane, name_parts
+from sorojax.view.raster.scene import Scene
+from sorojax.view.raster.solid import bar_of, draw_solid, lens_of
 
 
 def panels(

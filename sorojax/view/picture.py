@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sorojax.view import style
-from sorojax.view.camera import Lens
+from sorojax.view.raster.camera import Lens
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

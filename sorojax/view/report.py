@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Union
 
-from sorojax.view.film import Film
+from sorojax.view.film.film import Film
 from sorojax.view.style import png
 
 if TYPE_CHECKING:

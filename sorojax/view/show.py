@@ -1,4 +1,7 @@
-"""`show`: one verb that draws any noun; what draws it is loaded when it is first asked for."""
+"""`show`: one verb that draws any noun; what draws it is loaded when it is first asked for.
+
+Scenes as pictures, and nouns as scenes: what `show` draws, to be put together anew.
+"""
 
 import functools
 import importlib
@@ -6,65 +9,70 @@ import inspect
 from typing import Any
 
 from sorojax import _explain
-from sorojax.view.picture import Picture
+from sorojax.view.picture import Panel, Picture
+from sorojax.view.raster.camera import View
+from sorojax.view.raster.scene import Scene
 
 #: Noun, module of this floor, function. The class itself is not imported.
 _DRAWN_BY = {
-    "sorojax.sdf.base.AbstractSdf": ("shapes", "show_shape"),
-    "sorojax.sdf.isosurface.Surface": ("shapes", "show_surface"),
-    "sorojax.mesh.mesh.Mesh": ("meshes", "show_cells"),
-    "sorojax.fem.problem.Problem": ("states", "show_problem"),
-    "sorojax.fem.solve.Solution": ("states", "show_solution"),
-    "sorojax.fem.solve_volume.CavitySolution": ("states", "show_solution"),
-    "sorojax.fem.solve.Path": ("states", "show_path"),
-    "sorojax.fem.solve_volume.VolumePath": ("states", "show_path"),
-    "sorojax.fem.continuation.Continuation": ("states", "show_path"),
-    "sorojax.fem.motion.Motion": ("states", "show_path"),
-    "sorojax.fem.modal.Modes": ("states", "show_vibration"),
-    "sorojax.fem.buckling.CriticalLoads": ("answers", "show_buckling"),
-    "sorojax.fem.critical.CriticalPoint": ("answers", "show_buckling"),
-    "sorojax.rod.rod.Rod": ("rods", "show_rod"),
-    "sorojax.rod.assembly.Assembly": ("rods", "show_rod"),
-    "sorojax.rod.section.Section": ("parts", "show_section"),
-    "sorojax.rod.basis.StrainBasis": ("parts", "show_basis"),
-    "sorojax.rod.rollout.Rollout": ("runs", "show_rollout"),
-    "sorojax.rod.statics.Equilibrium": ("answers", "show_posed"),
-    "sorojax.rod.static_path.EquilibriumPath": ("answers", "show_posed"),
-    "sorojax.rod.static_arc.ArcPath": ("answers", "show_posed"),
-    "sorojax.rod.inverse_kinematics.Reached": ("answers", "show_posed"),
-    "sorojax.material.hyperelastic.AbstractHyperelastic": ("parts", "show_material"),
-    "sorojax.reduction.backbone.Backbone": ("snapshots", "show_snapshots"),
-    "sorojax.robots.bellows.BellowsActuator": ("robots", "show_robot"),
-    "sorojax.robots.bending.BendingActuator": ("robots", "show_robot"),
-    "sorojax.robots.crawler.Crawler": ("robots", "show_robot"),
-    "sorojax.robots.finger.Finger": ("robots", "show_robot"),
-    "sorojax.robots.hand.Hand": ("robots", "show_robot"),
-    "sorojax.robots.manipulator.Manipulator": ("robots", "show_robot"),
-    "sorojax.robots.parts.Bellows": ("robots", "show_robot"),
-    "sorojax.robots.planar.PlanarActuator": ("robots", "show_robot"),
-    "sorojax.robots.pneunet.PneuNet": ("robots", "show_robot"),
-    "sorojax.robots.walker.Walker": ("robots", "show_robot"),
-    "sorojax.robots.models_supply.Model": ("parts", "show_model"),
-    "sorojax.systems.rod_body.RodBody": ("parts", "show_body"),
-    "sorojax.systems.assembly_body.AssemblyBody": ("parts", "show_body"),
-    "sorojax.systems.block.AbstractBlock": ("networks", "show_network"),
-    "sorojax.systems.simulate.Trajectory": ("runs", "show_trajectory"),
-    "sorojax.design.minimise.Optimised": ("runs", "show_optimised"),
-    "sorojax.design.history.History": ("runs", "show_history"),
-    "sorojax.design.shape_loop.OptimisedShape": ("answers", "show_optimised_shape"),
-    "sorojax.design.part.Part": ("answers", "show_part"),
-    "sorojax.design.calibration.Calibration": ("answers", "show_calibration"),
-    "sorojax.material.fit.TensileFit": ("answers", "show_fit"),
-    "sorojax.mesh.repair.Repaired": ("answers", "show_repaired"),
-    "sorojax.mesh.quality.Quality": ("records", "show_quality"),
-    "sorojax.sdf.surface.Curve": ("records", "show_curve"),
-    "sorojax.io.glb_animation.MovingSurface": ("records", "show_moving"),
-    "sorojax.sweep.sweep.Swept": ("records", "show_sweep"),
-    "sorojax.vision.tracking.Tracks": ("records", "show_tracks"),
-    "sorojax.view.rigging.Rig": ("answers", "show_rig"),
-    "sorojax.view.charts.Convergence": ("charts", "show_convergence"),
-    "sorojax.view.charts.WorkPrecision": ("charts", "show_work_precision"),
-    "sorojax.view.scene.Scene": ("stage", "show_scene"),
+    "sorojax.sdf.base.AbstractSdf": ("draw.shapes", "show_shape"),
+    "sorojax.sdf.surface.marching.Surface": ("draw.shapes", "show_surface"),
+    "sorojax.mesh.mesh.Mesh": ("draw.meshes", "show_cells"),
+    "sorojax.fem.problem.Problem": ("draw.states", "show_problem"),
+    "sorojax.fem.equilibrium.solve.Solution": ("draw.states", "show_solution"),
+    "sorojax.fem.equilibrium.volume.CavitySolution": ("draw.states", "show_solution"),
+    "sorojax.fem.equilibrium.solve.Path": ("draw.states", "show_path"),
+    "sorojax.fem.equilibrium.volume.VolumePath": ("draw.states", "show_path"),
+    "sorojax.fem.stability.continuation.Continuation": ("draw.states", "show_path"),
+    "sorojax.fem.dynamics.motion.Motion": ("draw.states", "show_path"),
+    "sorojax.fem.stability.modal.Modes": ("draw.states", "show_vibration"),
+    "sorojax.fem.stability.buckling.CriticalLoads": ("draw.answers", "show_buckling"),
+    "sorojax.fem.stability.continuation.CriticalPoint": ("draw.answers", "show_buckling"),
+    "sorojax.rod.model.rod.Rod": ("draw.rods", "show_rod"),
+    "sorojax.rod.model.assembly.Assembly": ("draw.rods", "show_rod"),
+    "sorojax.rod.model.section.Section": ("draw.answers", "show_section"),
+    "sorojax.rod.model.basis.StrainBasis": ("draw.answers", "show_basis"),
+    "sorojax.rod.dynamics.rollout.Rollout": ("draw.runs", "show_rollout"),
+    "sorojax.rod.statics.equilibrium.Equilibrium": ("draw.answers", "show_posed"),
+    "sorojax.rod.statics.path.EquilibriumPath": ("draw.answers", "show_posed"),
+    "sorojax.rod.statics.path.ArcPath": ("draw.answers", "show_posed"),
+    "sorojax.rod.statics.inverse_kinematics.Reached": ("draw.answers", "show_posed"),
+    "sorojax.material.hyperelastic.AbstractHyperelastic": ("draw.answers", "show_material"),
+    "sorojax.reduction.backbone.Backbone": ("draw.figures", "show_snapshots"),
+    "sorojax.robots.bellows.BellowsActuator": ("draw.records", "show_robot"),
+    "sorojax.robots.printable.BendingActuator": ("draw.records", "show_robot"),
+    "sorojax.robots.crawler.Crawler": ("draw.records", "show_robot"),
+    "sorojax.robots.printable.Finger": ("draw.records", "show_robot"),
+    "sorojax.robots.printable.Hand": ("draw.records", "show_robot"),
+    "sorojax.robots.printable.Manipulator": ("draw.records", "show_robot"),
+    "sorojax.robots.parts.Bellows": ("draw.records", "show_robot"),
+    "sorojax.robots.printable.PlanarActuator": ("draw.records", "show_robot"),
+    "sorojax.robots.pneunet.PneuNet": ("draw.records", "show_robot"),
+    "sorojax.robots.walker.Walker": ("draw.records", "show_robot"),
+    "sorojax.robots.models.supply.Model": ("draw.answers", "show_model"),
+    "sorojax.systems.blocks.rod_body.RodBody": ("draw.answers", "show_body"),
+    "sorojax.systems.blocks.rod_body.AssemblyBody": ("draw.answers", "show_body"),
+    "sorojax.systems.blocks.block.AbstractBlock": ("draw.networks", "show_network"),
+    "sorojax.systems.integrate.simulate.Trajectory": ("draw.runs", "show_trajectory"),
+    "sorojax.design.optimise.minimise.Optimised": ("draw.runs", "show_optimised"),
+    "sorojax.design.optimise.minimise.History": ("draw.runs", "show_history"),
+    "sorojax.design.optimise.shape_loop.OptimisedShape": (
+        "draw.answers",
+        "show_optimised_shape",
+    ),
+    "sorojax.design.part.Part": ("draw.answers", "show_part"),
+    "sorojax.design.calibration.calibration.Calibration": ("draw.answers", "show_calibration"),
+    "sorojax.material.fit.TensileFit": ("draw.answers", "show_fit"),
+    "sorojax.mesh.repair.Repaired": ("draw.answers", "show_repaired"),
+    "sorojax.mesh.quality.Quality": ("draw.records", "show_quality"),
+    "sorojax.sdf.surface.contour.Curve": ("draw.records", "show_curve"),
+    "sorojax.io.animation.MovingSurface": ("draw.records", "show_moving"),
+    "sorojax.sweep.sweep.Swept": ("draw.records", "show_sweep"),
+    "sorojax.vision.tracking.Tracks": ("draw.records", "show_tracks"),
+    "sorojax.view.rigging.rig.Rig": ("draw.answers", "show_rig"),
+    "sorojax.view.draw.figures.Convergence": ("draw.figures", "show_convergence"),
+    "sorojax.view.draw.figures.WorkPrecision": ("draw.figures", "show_work_precision"),
+    "sorojax.view.raster.scene.Scene": ("show", "show_scene"),
 }
 
 
@@ -127,4 +135,67 @@ def _known(thing: Any) -> Any:
     raise TypeError(
         f"view.show: got a {type(thing).__name__}, need one of {names}. Register a function "
         "for other types with view.show.register."
+    )
+
+
+# Scenes as pictures, and nouns as scenes: what `show` draws, to be put together anew
+
+
+#: Noun, module of this floor, function that makes its scene.
+_SCENES = {
+    "sorojax.sdf.base.AbstractSdf": ("draw.shapes", "shape_scene"),
+    "sorojax.sdf.surface.marching.Surface": ("draw.shapes", "surface_scene"),
+    "sorojax.mesh.mesh.Mesh": ("draw.meshes", "mesh_scene"),
+    "sorojax.fem.problem.Problem": ("draw.states", "problem_scene"),
+    "sorojax.fem.equilibrium.solve.Solution": ("draw.states", "solution_scene"),
+    "sorojax.fem.equilibrium.volume.CavitySolution": ("draw.states", "solution_scene"),
+    "sorojax.rod.model.rod.Rod": ("draw.rods", "rod_scene"),
+    "sorojax.rod.model.assembly.Assembly": ("draw.rods", "rod_scene"),
+}
+
+
+def show_scene(scene: Scene, *, view: View = "iso", renderer: str = "auto") -> Picture:
+    """One scene, in the plane with axes or shaded in space.
+
+    Args:
+        scene: From `scene_of`, or put together from `Surface`, `Lines`, `Arrows` and `Dots`.
+        view: Camera of a solid scene.
+        renderer: Of a solid scene.
+    """
+    if scene.dim == 2:
+        from sorojax.view.raster.plane import plane_figure
+
+        figure, axes = plane_figure(scene)
+        return Picture(figure, (Panel(axes),))
+    from sorojax.view.raster.solid import solid_figure
+
+    figure, lens = solid_figure(scene, view=view, renderer=renderer)
+    return Picture(figure, (Panel(figure.axes[0], lens),))
+
+
+def scene_of(thing: Any, *at: Any, **options: Any) -> Scene:
+    """A shape, surface, mesh, problem, solution, rod or assembly before it is drawn.
+
+    Its `parts` may be joined with those of other scenes and shown as one.
+
+    Args:
+        thing: What is to be drawn.
+        *at: Coordinates, of a rod or an assembly.
+        **options: As of `show`, but `view` and `renderer`.
+
+    Raises:
+        TypeError: If `thing` has no scene.
+
+    Example:
+        `view.show(view.joined(view.scene_of(ball), view.scene_of(hand, q)), view="top")`
+    """
+    for kind in type(thing).__mro__:
+        entry = _SCENES.get(f"{kind.__module__}.{kind.__qualname__}")
+        if entry is not None:
+            module = importlib.import_module(f"sorojax.view.{entry[0]}")
+            return getattr(module, entry[1])(thing, *at, **options)
+    names = ", ".join(sorted(name.rsplit(".", 1)[1] for name in _SCENES))
+    raise TypeError(
+        f"view.scene_of: got a {type(thing).__name__}, need one of {names}. Make a view.Scene "
+        "of its parts."
     )

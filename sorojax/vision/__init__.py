@@ -1,10 +1,6 @@
 """Vision: from an image to points. Pure functions over NumPy arrays; OpenCV where used."""
 
 from sorojax._arguments import check_package as _check_package
-from sorojax.vision.calibration import (
-    CharucoBoard as CharucoBoard,
-    calibrate as calibrate,
-)
 from sorojax.vision.camera import (
     Camera as Camera,
     Pose as Pose,
@@ -15,28 +11,27 @@ from sorojax.vision.camera import (
     rays as rays,
     save_camera as save_camera,
 )
-from sorojax.vision.colour import (
+from sorojax.vision.discs import (
     BLUE as BLUE,
     GREEN as GREEN,
     RED as RED,
     Colour as Colour,
-    colour_mask as colour_mask,
-)
-from sorojax.vision.discs import (
     Discs as Discs,
+    colour_mask as colour_mask,
     find_discs as find_discs,
     hough_discs as hough_discs,
     refine_discs as refine_discs,
 )
 from sorojax.vision.fiducials import (
+    CharucoBoard as CharucoBoard,
     Fiducials as Fiducials,
+    calibrate as calibrate,
     find_fiducials as find_fiducials,
     marker_corners as marker_corners,
     marker_pose as marker_pose,
     world_frame as world_frame,
 )
 from sorojax.vision.scene import Balls as Balls, draw_balls as draw_balls
-from sorojax.vision.stream import MarkerStream as MarkerStream
 from sorojax.vision.synthetic import (
     Disturbance as Disturbance,
     background as background,
@@ -46,6 +41,7 @@ from sorojax.vision.synthetic import (
     photograph as photograph,
 )
 from sorojax.vision.tracking import (
+    MarkerStream as MarkerStream,
     Tracks as Tracks,
     follow as follow,
     start_tracks as start_tracks,

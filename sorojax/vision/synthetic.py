@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 
 from sorojax.vision._opencv import opencv
 from sorojax.vision.camera import Camera, Pose, project, rays
-from sorojax.vision.colour import Image
+from sorojax.vision.discs import Image
 
 #: Blue, green, red of discs that the colours RED, GREEN and BLUE find.
 PAINTS = ((40.0, 40.0, 210.0), (45.0, 190.0, 50.0), (205.0, 70.0, 40.0))

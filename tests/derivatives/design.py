@@ -9,7 +9,7 @@ import numpy as np
 
 from sorojax import design, fem, material, mesh
 from sorojax.design import pneunet
-from sorojax.design.experiment import sensitivity
+from sorojax.design.calibration.calibration import sensitivity
 from tests.derivatives.case import Case
 from tests.derivatives.fem import SHARP, drawn, uneven
 

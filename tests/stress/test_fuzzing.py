@@ -15,7 +15,7 @@ from hypothesis import given, settings, strategies as st
 
 from sorojax import io, material, mesh, rod as R, sdf
 from sorojax.math.lie import SE2
-from sorojax.sweep.store import Store, digest
+from sorojax.sweep.sweep import Store, digest
 
 TETRAHEDRON = sdf.Surface(
     np.array([[0.0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]]),

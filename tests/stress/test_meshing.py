@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from sorojax import mesh, sdf
-from sorojax.mesh.constrained import Missing, constrained
-from sorojax.mesh.outline import Outline
-from sorojax.sdf.isosurface import Surface
-from sorojax.sdf.sample import values_and_gradients
+from sorojax.mesh.plane.delaunay import Missing, constrained
+from sorojax.mesh.plane.outline import Outline
+from sorojax.sdf.sampling import values_and_gradients
+from sorojax.sdf.surface.marching import Surface
 
 O = [0.0, 0.0, 0.0]
 

@@ -10,8 +10,8 @@ from benchmarks.cases import contact_grid
 from sorojax import rod as R, sdf, systems as S
 from sorojax.contact import LinePenalty
 from sorojax.math.lie import SE2
+from sorojax.math.ode.steppers import GeneralisedAlpha, RungeKutta4
 from sorojax.math.status import Status
-from sorojax.math.steppers import GeneralisedAlpha, RungeKutta4
 
 RADIUS = 6e-3
 FINGER = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2000.0)

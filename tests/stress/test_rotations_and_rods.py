@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from sorojax import rod as R
-from sorojax.math.lie import SE2, SE3
-from sorojax.math.logarithm import change_of_logarithm, logarithm
+from sorojax.math.lie import SE2, SE3, change_of_logarithm, logarithm
+from sorojax.math.ode.steppers import RungeKutta4
 from sorojax.math.status import Status
-from sorojax.math.steppers import RungeKutta4
 
 FINGER = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2000.0)
 DISC = R.circle(6e-3, shear_factor=27 / 28)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sorojax import rod as R, systems as S
-from sorojax.math import steppers
 from sorojax.math.lie import SE2
+from sorojax.math.ode import steppers
 from sorojax.math.status import Status
 
 SOFT = {"length": 0.1, "young_modulus": 1e5, "poisson_ratio": 0.45, "density": 1000.0}

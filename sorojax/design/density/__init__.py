@@ -1,0 +1,1 @@
+"""Layouts of densities: filters, stiffness, void, pressure."""

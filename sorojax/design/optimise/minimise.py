@@ -1,0 +1,282 @@
+"""The optimisation loop: any differentiable function of a pytree, constraints, any method.
+
+The designs of a run, for pictures and films of it.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PyTree
+
+from sorojax import _check
+from sorojax._display import displayed, number, outcome
+from sorojax._progress import report
+from sorojax._types import real
+from sorojax.design.optimise.mma import GCMMA, MMA, Values
+from sorojax.design.optimise.optimality import OptimalityCriteria, Task
+from sorojax.math.status import Status
+from sorojax.mesh.mesh import Mesh
+
+Optimiser = MMA | GCMMA | OptimalityCriteria | optax.GradientTransformation
+_INNER = 15  # proposals of GCMMA for one step
+_HELD = 1e-3  # overshoot of a constraint that counts as none
+_RETREATS = 4  # halvings of a step that leads to where a function is not defined
+
+
+class Step(eqx.Module):
+    """One step, as `on_step` sees it; also what `minimise` starts again from.
+
+    Attributes:
+        count: Steps taken, from 1.
+        design: The variables after it.
+        objective, constraints: At the design before it.
+        change: Largest change of a variable.
+        memory: Of the optimiser.
+    """
+
+    count: int = eqx.field(static=True)
+    design: PyTree
+    objective: Float[Array, ""]
+    constraints: Float[Array, " m"]
+    change: Float[Array, ""]
+    memory: Any
+
+
+@displayed
+class Optimised(eqx.Module):
+    """Where an optimisation ended.
+
+    Attributes:
+        design: The variables.
+        objective: At `design`.
+        constraints: At `design`, each <= 0 if it holds.
+        status: `successful` when the change fell below the tolerance, `out_of_reach` when it
+            did with a constraint broken, `max_steps` when the steps ran out first,
+            `not_finite` when a value broke; the last good design then.
+        history: Objective, constraints (m columns) and change of every step.
+        last: The last step; pass it as `resume` to go on.
+    """
+
+    design: PyTree
+    objective: Float[Array, ""]
+    constraints: Float[Array, " m"]
+    status: Status
+    history: dict[str, Float[np.ndarray, "steps *columns"]]
+    last: Step
+
+    def _text(self) -> str:
+        count = len(self.history["objective"])
+        held = f", largest constraint {number(jnp.max(self.constraints))}"
+        return (
+            f"Optimised: {outcome(self.status)} after {count} steps, objective "
+            f"{number(self.objective)}{held * bool(self.constraints.size)}"
+        )
+
+
+def minimise(
+    loss: Callable[..., Float[Array, ""]],
+    start: PyTree,
+    *,
+    constraints: Sequence[Callable[..., Float[Array, "..."]]] = (),
+    optimiser: Optimiser | None = None,
+    steps: int = 100,
+    tolerance: float = 1e-3,
+    schedule: Callable[[int], tuple] | None = None,
+    change_gradient: Callable[[PyTree, PyTree], PyTree] | None = None,
+    scale: float | None = None,
+    on_step: Callable[[Step], None] | None = None,
+    resume: Step | None = None,
+) -> Optimised:
+    """The design at which `loss` is least while every constraint stays at or below zero.
+
+    Functions are called outside `jit`, so they may solve equilibria; jit them where they
+    can be.
+
+    Args:
+        loss: Function of the design; differentiable in it.
+        start: Where to begin, a pytree of floating-point arrays.
+        constraints: Functions of the design, numbers or vectors, <= 0 where allowed.
+        optimiser: `MMA()` if omitted; `GCMMA`, `OptimalityCriteria`, or any optax optimiser
+            (without constraints).
+        steps: Most steps.
+        tolerance: Largest change of a variable at which to stop.
+        schedule: Further arguments of loss and constraints at step k = 0, 1, ...: for
+            continuation, `lambda k: (sharpness(k),)`.
+        change_gradient: Replaces the gradient of the loss, from design and gradient.
+        scale: What the objective is divided by for MMA; its size at the start if omitted.
+        on_step: Called after every step: pictures, checkpoints.
+        resume: A step to go on from instead of `start`.
+
+    Raises:
+        ValueError: If something is not finite at the start, or an optax optimiser gets
+            constraints.
+    """
+    optimiser = MMA() if optimiser is None else optimiser
+    constraints = tuple(constraints)
+    plain = isinstance(optimiser, optax.GradientTransformation)
+    if plain and constraints:
+        raise ValueError(
+            "minimise: an optax optimiser takes no constraints. Use MMA() or GCMMA(), or add a "
+            "penalty to the loss."
+        )
+    _check.finite("minimise", "start", ravel_pytree(start)[0], "Check the first design.")
+    flat, back = _as_vector(jax.tree.map(real, start))
+    task = Task(loss, constraints, back, schedule, change_gradient)
+    first, memory = 0, None
+    if resume is not None:
+        flat, memory, first = ravel_pytree(resume.design)[0], resume.memory, resume.count
+    values, size, last, history, step = None, None, flat, [], resume
+    status = Status.max_steps
+    for k in range(first, steps):
+        values, finite = task.found(flat, k)
+        for _ in range(_RETREATS if k > first else 0):
+            if finite:
+                break
+            flat = (flat + last) / 2
+            values, finite = task.found(flat, k)
+        if not finite:
+            if k == first:
+                raise ValueError(
+                    f"minimise: the objective is {values.objective} and the constraints "
+                    f"{values.constraints} at the first design, with "
+                    f"{int(jnp.sum(~jnp.isfinite(values.gradient)))} derivatives that are not "
+                    "finite. Start where the functions are defined."
+                )
+            status = Status.not_finite
+            break
+        size = real(_size(flat, values) if scale is None else scale) if size is None else size
+        if memory is None:
+            m = values.constraints.shape[0]
+            memory = optimiser.init(flat) if plain else optimiser.init(flat, m)  # type: ignore
+        new, memory = _advance(optimiser, task, k, flat, values, memory, size)
+        change = float(np.max(np.abs(np.asarray(new) - np.asarray(flat))))
+        last, flat = flat, new
+        step = Step(k + 1, back(flat), values.objective, values.constraints,
+                    jnp.asarray(change), memory)  # fmt: skip
+        history.append((float(values.objective), np.asarray(values.constraints), change))
+        report("minimise", k + 1, steps, objective=history[-1][0], change=change,
+               constraint=float(np.max(history[-1][1], initial=-np.inf)))  # fmt: skip
+        if on_step is not None:
+            on_step(step)
+        if change <= tolerance and schedule is None:
+            status = Status.successful
+            break
+    if status == Status.not_finite:
+        flat = last
+    objective, held = task.last(flat, max(len(history) + first - 1, 0))
+    columns = _columns(history)
+    if status == Status.successful and _broken(held, columns):
+        status = Status.out_of_reach
+    return Optimised(back(flat), objective, held, status, columns, step)  # type: ignore
+
+
+def _broken(held: Array, columns: dict[str, np.ndarray]) -> bool:
+    """Whether a constraint ends above a thousandth of its values on the way, or of one."""
+    if held.size == 0:
+        return False
+    largest = np.abs(columns["constraints"]).max(axis=0, initial=1.0)
+    return bool(np.any(np.asarray(held) > _HELD * largest))
+
+
+def _advance(optimiser, task: Task, k: int, flat, values: Values, memory, scale):
+    if isinstance(optimiser, optax.GradientTransformation):
+        with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
+            updates, memory = optimiser.update(values.gradient, memory, flat)
+            return jnp.asarray(optax.apply_updates(flat, updates)), memory
+    if isinstance(optimiser, OptimalityCriteria):  # the same for any scale
+        return optimiser.update(flat, values, memory)
+    scaled = _scaled(values, scale)
+    if not isinstance(optimiser, GCMMA):
+        return optimiser.update(flat, scaled, memory)
+    memory = optimiser.begin(flat, scaled, memory)
+    new, after = optimiser.update(flat, scaled, memory)
+    for _ in range(_INNER):
+        objective, held = task.plain(new, k)
+        found = (objective / scale, held)
+        memory, above = optimiser.stiffen(flat, new, scaled, found, memory)
+        if bool(above):
+            break
+        new, after = optimiser.update(flat, scaled, memory)
+    return new, after
+
+
+@jax.jit
+def _scaled(values: Values, scale) -> Values:
+    return values._replace(objective=values.objective / scale, gradient=values.gradient / scale)
+
+
+def _as_vector(start: PyTree):
+    """`ravel_pytree`, which takes operations even for what is a vector."""
+    if isinstance(start, jax.Array) and start.ndim == 1:
+        return start, lambda x: x
+    return ravel_pytree(start)
+
+
+def _size(flat, values: Values) -> float:
+    """The size of the objective, or of what the variables contribute where it starts at 0."""
+    size, change = (
+        float(jnp.abs(values.objective)),
+        float(jnp.abs(values.gradient) @ jnp.abs(flat)),
+    )
+    return (size if size > 1e-3 * change else change) or 1.0
+
+
+def _columns(history) -> dict[str, np.ndarray]:
+    names = ("objective", "constraints", "change")
+    columns = list(zip(*history, strict=True)) or [(), (), ()]
+    return {name: np.array(column) for name, column in zip(names, columns, strict=True)}
+
+
+# The designs of a run, for pictures and films of it
+
+
+class History:
+    """The designs of a run: give it to `minimise` as `on_step`.
+
+    `densities` has one row per kept step, beside `steps` and `objectives`. With the `mesh` of
+    the cells, `view.show(history)` draws some of them and `view.animate(history)` all.
+
+    Args:
+        density: From a `Step` to the densities of its design.
+        every: Steps from one that is kept to the next.
+        mesh: The cells.
+    """
+
+    def __init__(
+        self, density: Callable[[Step], Any], every: int = 1, *, mesh: Mesh | None = None
+    ):
+        self._density, self._every, self._mesh = density, every, mesh
+        self.steps: list[int] = []
+        self.objectives: list[float] = []
+        self._rows: list[np.ndarray] = []
+
+    def __call__(self, step: Step) -> None:
+        if (step.count - 1) % self._every:
+            return
+        self.steps.append(step.count)
+        self.objectives.append(float(step.objective))
+        self._rows.append(np.asarray(self._density(step)))
+
+    @property
+    def mesh(self) -> Mesh:
+        """The cells.
+
+        Raises:
+            ValueError: If none was given.
+        """
+        if self._mesh is None:
+            raise ValueError(
+                "design.History: got no mesh, need that of the cells for a picture. Make it "
+                "with mesh=."
+            )
+        return self._mesh
+
+    @property
+    def densities(self) -> Float[np.ndarray, "kept cells"]:
+        return np.stack(self._rows) if self._rows else np.zeros((0, 0))

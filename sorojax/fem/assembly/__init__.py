@@ -1,0 +1,1 @@
+"""Internal forces and tangents: shape functions, energies, element matrices."""

@@ -1,0 +1,262 @@
+"""Shape gradients and volumes of the quadrature points, in blocks of cells.
+
+Shape tables of a mesh: one for all cells, or for polygons one per number of corners.
+
+Sums over polygons that their quadrature has to get right.
+
+The shape functions of a polygon are rational, so no rule integrates them exactly. Corrected
+by integrals over its straight sides a linear displacement is an equilibrium.
+
+Reference: Talischi, Pereira, Menezes, Paulino, "Gradient correction for polygonal and
+polyhedral finite elements", IJNME 102, 2015.
+"""
+
+import functools
+from functools import cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sorojax.fem.assembly.energy import Entries, inverse
+from sorojax.fem.assembly.space import AbstractFormulation, Space, lanes, modes
+from sorojax.fem.kinematics import AbstractKinematics, Axisymmetric, identity
+from sorojax.material.kinematics import Tensor, determinant
+from sorojax.mesh.elements.elements import AbstractElement, PolyN
+from sorojax.mesh.elements.shape_functions import (
+    Quadrature,
+    nodes,
+    quadrature,
+    shape_functions,
+    shape_gradients,
+)
+
+
+class Tables(NamedTuple):
+    """Shape functions, their slopes and weights at reference points, by kind of cell.
+
+    Polygons have a kind per number of corners, padded by points of no weight; every other
+    element has one kind.
+    """
+
+    values: Float[np.ndarray, "kinds quad cell_nodes"]
+    slopes: Float[np.ndarray, "kinds quad cell_nodes dim"]
+    weights: Float[np.ndarray, "kinds quad"]
+
+
+def quadrature_tables(element: AbstractElement) -> Tables:
+    """Tables at the quadrature points of the stiffness."""
+    return _tables(element, "quadrature")
+
+
+def node_tables(element: AbstractElement) -> Tables:
+    """Tables at the nodes."""
+    return _tables(element, "nodes")
+
+
+@cache
+def _tables(element: AbstractElement, at: str) -> Tables:
+    if not isinstance(element, PolyN):
+        rule = _rule(element, at)
+        values, slopes = _at(element, rule)
+        return Tables(values[None], slopes[None], rule.weights[None])
+    kinds = [PolyN(max(n, 3)) for n in range(element.sides + 1)]
+    rules = [_rule(kind, at) for kind in kinds]
+    most = max(len(rule.weights) for rule in rules)
+    rows = [
+        _padded(kind, rule, most, element.sides)
+        for kind, rule in zip(kinds, rules, strict=True)
+    ]
+    return Tables(*(np.stack(column) for column in zip(*rows, strict=True)))
+
+
+def _rule(element: AbstractElement, at: str) -> Quadrature:
+    if at == "quadrature":
+        return quadrature(element)
+    return Quadrature(nodes(element), np.ones(element.num_nodes))
+
+
+def _at(element: AbstractElement, rule: Quadrature) -> tuple[np.ndarray, np.ndarray]:
+    return shape_functions(element, rule.points), shape_gradients(element, rule.points)
+
+
+def _padded(kind: AbstractElement, rule: Quadrature, num_points: int, num_nodes: int):
+    """Tables with the last point repeated without weight, and nodes that do nothing."""
+    values, slopes = _at(kind, rule)
+    more = num_points - len(rule.weights)
+    values = np.pad(np.concatenate([values, values[-1:].repeat(more, 0)]),
+                    ((0, 0), (0, num_nodes - kind.num_nodes)))  # fmt: skip
+    slopes = np.pad(np.concatenate([slopes, slopes[-1:].repeat(more, 0)]),
+                    ((0, 0), (0, num_nodes - kind.num_nodes), (0, 0)))  # fmt: skip
+    return values, slopes, np.pad(rule.weights, (0, more))
+
+
+# Sums over polygons that their quadrature has to get right
+
+
+class PolygonSums(NamedTuple):
+    """Area [m^2], first moments [m^3] and, by axis, the integrals of each shape function
+    times the normal over the sides of a polygon.
+
+    In a body of revolution area and sides are weighted by the radius, `measure` [m^3] and
+    `sides` [m^2], as the volumes of its points are.
+    """
+
+    area: Float[Array, "1 lanes"]
+    moments: Float[Array, "2 1 lanes"]
+    measure: Float[Array, "1 lanes"]
+    sides: tuple[Float[Array, "cell_nodes lanes"], Float[Array, "cell_nodes lanes"]]
+    revolved: bool
+
+    def hoop(self, axis: int) -> float:
+        """Share of the shape functions themselves in the mean slope: r N has the slope
+        r dN/dr + N."""
+        return 1.0 if self.revolved and axis == 0 else 0.0
+
+    def shares(self, position, areas):
+        """Weights of the points of a cell in the mean slope; they add up to one."""
+        return areas * (position[0] if self.revolved else 1.0) / self.measure
+
+
+def polygon_sums(
+    x: Float[Array, "2 cell_nodes lanes"],
+    kinds: Int[Array, " lanes"],
+    kinematics: AbstractKinematics,
+) -> PolygonSums:
+    """Sums of polygons with `kinds` corners; further entries of `x` are repeats."""
+    number = jnp.arange(x.shape[1])[:, None]
+    count = kinds[None]
+    ahead = jnp.where(number + 1 < count, number + 1, jnp.zeros_like(number))
+    behind = jnp.where(number > 0, number - 1, count - 1)
+    after, before = (jnp.take_along_axis(x, at[None], axis=1) for at in (ahead, behind))
+    real = number < count
+    zero = jnp.zeros_like(x[0])
+    turn = jnp.where(real, x[0] * after[1] - x[1] * after[0], zero) / 2
+    area = jnp.sum(turn, axis=0, keepdims=True)
+    moments = jnp.sum(turn[None] * (x + after), axis=1, keepdims=True) / 3
+    revolved = isinstance(kinematics, Axisymmetric)
+    one = jnp.ones_like(zero)
+    # mean of radius times shape function over the side ahead and the one behind
+    here, there = (
+        ((2 * x[0] + other[0]) / 6 if revolved else one / 2) for other in (after, before)
+    )
+    side = [
+        jnp.where(real, here * (after - x)[k] + there * (x - before)[k], zero) for k in range(2)
+    ]
+    measure = moments[0] if revolved else area
+    return PolygonSums(area, moments, measure, (side[1], -side[0]), revolved)
+
+
+def exact_areas(
+    sums: PolygonSums,
+    position: Float[Array, "2 quad lanes"],
+    areas: Float[Array, "quad lanes"],
+) -> Float[Array, "quad lanes"]:
+    """Areas of the points of a cell with the sum of the polygon; in a body of revolution
+    with its first moments too."""
+    areas = areas * (sums.area / jnp.sum(areas, axis=0, keepdims=True))
+    if not sums.revolved:
+        return areas
+    centre = jnp.sum(areas[None] * position, axis=1, keepdims=True) / sums.area[None]
+    away = position - centre
+    a, b, d = (
+        jnp.sum(areas * away[i] * away[k], axis=0, keepdims=True)
+        for i, k in ((0, 0), (0, 1), (1, 1))
+    )
+    p, q = sums.moments - sums.area[None] * centre
+    det = a * d - b * b
+    tilt = ((d * p - b * q) / det, (a * q - b * p) / det)
+    return areas * (1 + tilt[0] * away[0] + tilt[1] * away[1])
+
+
+# Shape gradients and volumes of the quadrature points, in blocks of cells
+
+
+class Geometry(NamedTuple):
+    """Gradients of the shape functions, volumes and pressure functions of the points.
+
+    In a body of revolution the third column of a gradient is the shape function over the
+    radius.
+    """
+
+    gradients: Float[Array, "blocks quad cell_nodes columns lanes"]
+    volumes: Float[Array, "blocks quad lanes"]
+    modes: Float[Array, "blocks modes quad lanes"] | None
+
+
+@jax.jit
+def geometry(
+    space: Space,
+    kinematics: AbstractKinematics,
+    formulation: AbstractFormulation,
+    points: Float[Array, "nodes dim"],
+) -> Geometry:
+    """Shape gradients [1/m] and quadrature volumes [m^3] of the cells at `points`."""
+    tables = quadrature_tables(space.element)
+    dim = space.dim
+
+    def block(arrays):
+        cells, kinds = arrays
+        x = lanes(points, cells)
+        N, slopes, weights = (_of_kinds(jnp.asarray(table), kinds) for table in tables)
+        jac = jnp.einsum("iae,qade->idqe", x, slopes)
+        full = three([[jac[i, d] for d in range(dim)] for i in range(dim)])
+        J, back = determinant(full), inverse(full)
+        gradients = [
+            functools.reduce(
+                jnp.add, (slopes[:, :, d] * back[d][j][:, None] for d in range(dim))
+            )
+            for j in range(dim)
+        ]
+        areas = J * weights
+        position = jnp.einsum("iae,qae->iqe", x, N)
+        if isinstance(space.element, PolyN):
+            sums = polygon_sums(x, kinds, kinematics)
+            areas = exact_areas(sums, position, areas)
+            for j, side in enumerate(sums.sides):
+                exact = side - sums.hoop(j) * jnp.sum(areas[:, None] * N, axis=0)
+                share = sums.shares(position, areas)
+                mean = jnp.sum(share[:, None] * gradients[j], axis=0)
+                gradients[j] += (exact / sums.measure - mean)[None]
+        if kinematics.num_columns > dim:
+            gradients.append(N / position[0][:, None])
+        volumes = areas * kinematics.depth(tuple(position))
+        return jnp.stack(gradients, axis=2), volumes, modes(formulation, position, volumes)
+
+    return Geometry(*jax.lax.map(block, (space.cells, space.kinds)))
+
+
+def _of_kinds(table, kinds):
+    """The table of every lane, with the lane axis last (of length 1 if all are alike)."""
+    if kinds is None:
+        return jnp.moveaxis(table, 0, -1)
+    return jnp.moveaxis(table[kinds], 0, -1)
+
+
+def three(rows) -> Tensor:
+    """A 2x2 or 3x3 matrix as a tensor."""
+    if len(rows) == 3:
+        return tuple(tuple(row) for row in rows)  # type: ignore[return-value]
+    return ((*rows[0], 0.0), (*rows[1], 0.0), (0.0, 0.0, 1.0))
+
+
+def gradient_entries(
+    kinematics: AbstractKinematics,
+    u: Float[Array, "dim cell_nodes lanes"],
+    gradients: Float[Array, "quad cell_nodes columns lanes"],
+) -> Entries:
+    """Slopes of `u` at the quadrature points of a block, entry by entry of F."""
+    G = jnp.moveaxis(gradients, 2, 0)
+    slopes = functools.reduce(
+        jnp.add, (u[:, None, None, a] * G[None, :, :, a] for a in range(u.shape[1]))
+    )
+    return jnp.stack([slopes[s.component, s.column] for s in kinematics.slots])
+
+
+def deformation_gradient(kinematics: AbstractKinematics, u, gradients) -> Entries:
+    """Kept entries of F = I + Grad u at the quadrature points of a block."""
+    slopes = gradient_entries(kinematics, u, gradients)
+    rest = jnp.asarray(identity(kinematics), slopes.dtype)
+    return slopes + rest[:, None, None]

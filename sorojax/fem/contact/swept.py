@@ -1,0 +1,81 @@
+"""Whether a step took points of a body through an obstacle, or gained energy in contact."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from sorojax.contact import far, passes
+from sorojax.fem.contact.obstacle import Contact
+from sorojax.fem.contact.self_contact import SelfContact
+from sorojax.fem.dynamics.step import Dynamics, Matter, State, Step
+from sorojax.fem.loads.facets import blockwise, facet_tables
+from sorojax.fem.problem import Problem, body, potential_energy
+from sorojax.math.linalg import sparse
+
+Nodal = Float[Array, "nodes dim"]
+
+
+def passed_through(
+    problem: Problem, loads: tuple, u: Float[Array, "nodes dim"]
+) -> Bool[Array, ""]:
+    """Whether any point jumped through the obstacle of a contact among `loads`, those of a
+    step that ends at displacement `u` [m], or a facet past another one."""
+    found = [_jumped(load, problem, u) for load in loads if isinstance(load, Contact)]
+    for load in loads:
+        if isinstance(load, SelfContact):
+            found += [load.outran(problem, u), load.sank(problem, u)]
+    return jnp.any(jnp.stack(found)) if found else jnp.zeros((), bool)
+
+
+_GAIN = 5e-4  # of the energy before and after a step together, that it may gain
+
+
+def gains(
+    dynamics: Dynamics, known: Matter, state: State, step: Step, new: State, u: Nodal
+) -> Bool[Array, ""]:
+    """Whether the energies of body and contacts grew by more than the work of the other
+    loads and of the supports, in a step whose forces act at displacement `u` [m]."""
+    contacts = [load for load in step.terms[0] if isinstance(load, Contact | SelfContact)]
+    if not contacts or any(_rubs(load) for load in contacts):
+        return jnp.zeros((), bool)
+    problem = body(dynamics.problem)
+
+    def energy(at: State):
+        v = at.velocity.ravel()
+        moving = v @ sparse.product(problem.space.system, known.mass, v) / 2
+        stored = sum(load.stored(problem, at.displacement) for load in contacts)
+        return moving + potential_energy(problem, at.displacement) + stored
+
+    def pushing(u):
+        return sum((load.potential(problem, u) for load in contacts), start=0.0)
+
+    (before, after), way = (energy(state), energy(new)), new.displacement - state.displacement
+    pushed = -jax.jvp(pushing, (u,), (way,))[1]
+    return after - before - (new.work - state.work - pushed) > _GAIN * (before + after)
+
+
+def _rubs(load: Contact | SelfContact) -> bool:
+    """Whether a contact has friction, whose springs hold less in short steps: there steps are
+    not cut for their energy, which would change the answer."""
+    return isinstance(load, Contact) and load.grip is not None
+
+
+def _jumped(load: Contact, problem: Problem, u) -> Bool[Array, ""]:
+    assert load.began is not None and load.start is not None
+    values = jnp.asarray(facet_tables(problem.mesh.element).values)
+    places = jnp.stack([load.start.place, load.value])
+
+    def points_of(ends):
+        """In the frame of the obstacle, that may move."""
+        points = jnp.einsum("qa,feai->efqi", values, ends)
+        return (points - places[:, None, None]).reshape(2, -1, points.shape[3])
+
+    def jumped(ends, _):
+        hit = passes(load.obstacle, *points_of(ends))
+        return jnp.any(hit.reshape(ends.shape[0], -1), axis=1).astype(ends.dtype)
+
+    def idle(ends, _):
+        return far(load.obstacle, points_of(ends))
+
+    ends = jnp.stack([load.began, (problem.mesh.points + u)[load.facets]], axis=1)
+    return jnp.any(blockwise(jumped, idle, ends, None, ()) > 0)

@@ -1,0 +1,1 @@
+"""Motion: time integration on the host and under `jit`, and its derivative."""

@@ -1,0 +1,253 @@
+"""Damping of a moving body: matrices C in the pattern of the tangent, force -C v.
+
+Mass matrices: consistent in the pattern of the tangent, lumped on the diagonal.
+
+Reference: Hinton, Rock, Zienkiewicz, "A note on mass lumping and related processes in
+the finite element method", Earthquake Engineering & Structural Dynamics 4, 1976.
+"""
+
+import abc
+from functools import cache
+from typing import TYPE_CHECKING, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax._types import real
+from sorojax.fem.assembly import assemble as asm
+from sorojax.fem.assembly.fields import deformation, points_of, quadrature_points
+from sorojax.fem.assembly.geometry import Tables, geometry, quadrature_tables
+from sorojax.fem.problem import Problem
+from sorojax.math.linalg import sparse
+from sorojax.mesh.elements.elements import (
+    AbstractElement,
+    Hex8,
+    PolyN,
+    Quad4,
+    Quad8,
+    Quad9,
+    Tet15,
+    Tri7,
+)
+from sorojax.mesh.elements.shape_functions import quadrature, shape_functions, shape_gradients
+
+if TYPE_CHECKING:
+    from sorojax.fem.problem import Problem
+
+
+class AbstractDamping(eqx.Module):
+    """Something that takes energy from a motion; never gives any."""
+
+    constant: eqx.AbstractClassVar[bool]  # whether the matrix is the same in every state
+
+    @abc.abstractmethod
+    def matrix(
+        self, problem: "Problem", mass: Float[Array, " nnz"], u: Float[Array, "nodes dim"]
+    ) -> Float[Array, " nnz"]:
+        """C [N s/m] at the state u."""
+
+    def check(self, problem: "Problem") -> None:
+        """Raise a `ValueError` if the damping does not fit the body."""
+
+
+class Rayleigh(AbstractDamping):
+    """C = mass M + stiffness K, of the body at rest without loads.
+
+    The damping ratio at the angular frequency w is (mass / w + stiffness w) / 2. The part of
+    the stiffness [s] also resists large rotations; `KelvinVoigt` does not. That of the mass
+    [1/s] resists every motion, as a resting fluid does.
+    """
+
+    mass: Float[Array, ""] = eqx.field(converter=real, default=0.0)
+    stiffness: Float[Array, ""] = eqx.field(converter=real, default=0.0)
+    constant: ClassVar[bool] = True
+
+    def __check_init__(self):
+        for name, unit in (("mass", "1/s"), ("stiffness", "s")):
+            _not_negative("Rayleigh", name, getattr(self, name), unit)
+
+    def matrix(self, problem, mass, u):
+        rest = jnp.zeros_like(u)
+        shape = geometry(
+            problem.space, problem.kinematics, problem.formulation, problem.mesh.points
+        )
+        body = asm.assemble(
+            problem.space, shape, problem.material, problem.kinematics, rest, rest
+        )
+        return self.mass * mass + self.stiffness * body.values
+
+
+class KelvinVoigt(AbstractDamping):
+    """Viscous second Piola-Kirchhoff stress 2 `viscosity` dE/dt, E the Green strain.
+
+    `viscosity` [Pa s], a number or one per cell, over the shear modulus is the time of
+    relaxation; small vibrations at the angular frequency w have the damping ratio
+    w viscosity / (2 mu). Rotations cost nothing.
+    """
+
+    viscosity: Float[Array, "..."] = eqx.field(converter=real)
+    constant: ClassVar[bool] = False
+
+    def __check_init__(self):
+        _not_negative("KelvinVoigt", "viscosity", self.viscosity, "Pa s")
+
+    def check(self, problem):
+        if self.viscosity.shape not in ((), (problem.mesh.num_cells,)):
+            raise ValueError(
+                f"fem.simulate: KelvinVoigt has a viscosity of shape {self.viscosity.shape}, "
+                f"need () or ({problem.mesh.num_cells},): a number or one per cell."
+            )
+        if isinstance(problem.mesh.element, PolyN):
+            raise ValueError("fem.simulate: KelvinVoigt got polygons, need cells of one shape. "
+                             "Use Rayleigh, or another mesh.")  # fmt: skip
+
+    def matrix(self, problem, mass, u):
+        rates = strain_rates(problem, u)  # strains, nodes * dim, quad, cells
+        points = quadrature_points(problem.mesh, problem.kinematics)
+        weights = 2 * points.volumes * jnp.atleast_1d(self.viscosity)[None]
+        cells = jnp.einsum("saqc,sbqc->cab", rates, rates * weights[None, None])
+        return sparse.assemble(problem.space.system, cells)
+
+
+def strain_rates(
+    problem: "Problem", u: Float[Array, "nodes dim"]
+) -> Float[Array, "strains cell_dofs quad cells"]:
+    """Rates of the Green strain by the velocities of a cell's nodes [1/m], entries off the
+    diagonal times the square root of 2."""
+    mesh, kinematics = problem.mesh, problem.kinematics
+    points = quadrature_points(mesh, kinematics)
+    F = deformation(mesh, kinematics, points, u)
+    G = _node_gradients(problem, points)  # nodes, columns, quad, cells
+    slots = kinematics.slots
+    dim, columns = mesh.element.dim, kinematics.num_columns
+    entry = {(s.row, s.col): number for number, s in enumerate(slots)}
+    rows = []
+    for j in range(columns):
+        for k in range(j, columns):
+            scale = 1.0 if j == k else 2.0**-0.5
+            per = [jnp.zeros_like(G[:, 0]) for _ in range(dim)]
+            for s in slots:  # dF[s] = G[node, s.column] v[s.component]
+                for a, b in ((j, k), (k, j)):
+                    if s.col == a and (s.row, b) in entry:
+                        weight = (0.5 if j == k else 1.0) * scale
+                        per[s.component] += weight * F[entry[s.row, b]][None] * G[:, s.column]
+            rows.append(jnp.stack(per, axis=1).reshape(-1, *G.shape[2:]))
+    return jnp.stack(rows)
+
+
+def _node_gradients(problem: "Problem", points) -> Float[Array, "nodes columns quad cells"]:
+    """Shape gradients in the order of the kinematics' columns."""
+    dim = problem.mesh.element.dim
+    slopes = jnp.asarray(points.tables.slopes[0])  # quad, nodes, dim
+    columns = [
+        sum(
+            slopes[:, :, d, None] * points.back[d][j][:, None]
+            for d in range(dim)
+            if not _absent(points.back[d][j])
+        )
+        for j in range(dim)
+    ]
+    if problem.kinematics.num_columns > dim:
+        values = jnp.asarray(points.tables.values[0])[:, :, None]
+        columns.append(values / points.position[0][:, None])
+    return jnp.moveaxis(jnp.stack(columns), 0, 1).transpose(2, 1, 0, 3)
+
+
+def _absent(entry) -> bool:
+    return isinstance(entry, float) and entry == 0.0
+
+
+def _not_negative(where: str, name: str, value, unit: str) -> None:
+    _check.finite(where, name, value, "Damping takes energy.")
+    if _check.is_concrete(value) and float(value.min()) < 0:
+        raise ValueError(
+            f"{where}: `{name}` must be 0 or more, got {value} {unit}. Damping takes energy."
+        )
+
+
+# Mass matrices: consistent in the pattern of the tangent, lumped on the diagonal
+
+
+def mass_matrix(problem: Problem) -> Float[Array, " nnz"]:
+    """Consistent mass matrix [kg], as values in the pattern `problem.space.system`.
+
+    `sparse.product(problem.space.system, mass_matrix(problem), v)` multiplies by it.
+    Differentiable in density, thickness and nodes.
+
+    Raises:
+        ValueError: If the material has no density.
+    """
+    scalar = _cell_masses(problem)
+    cells, nodes, _ = scalar.shape
+    dim = problem.mesh.element.dim
+    each = jnp.eye(dim, dtype=scalar.dtype)
+    full = scalar[:, :, None, :, None] * each[None, None, :, None, :]
+    size = nodes * dim
+    return sparse.assemble(problem.space.system, full.reshape(cells, size, size))
+
+
+def lumped_mass(problem: Problem) -> Float[Array, " dofs"]:
+    """Mass of every unknown [kg], the diagonal of the consistent matrix of each cell scaled
+    to its mass; positive for every element.
+
+    Raises:
+        ValueError: If the material has no density.
+    """
+    scalar = _cell_masses(problem)
+    diagonal = jnp.einsum("caa->ca", scalar)
+    total = jnp.sum(scalar, axis=(1, 2))
+    share = diagonal * (total / jnp.sum(diagonal, axis=1))[:, None]
+    zero = jnp.zeros(problem.mesh.num_nodes, share.dtype)
+    return jnp.repeat(zero.at[problem.mesh.cells].add(share), problem.mesh.element.dim)
+
+
+def total_mass(problem: Problem) -> Float[Array, ""]:
+    """Mass of the body [kg]."""
+    return jnp.sum(_cell_masses(problem))
+
+
+def _cell_masses(problem: Problem) -> Float[Array, "cells cell_nodes cell_nodes"]:
+    density = problem.material.density
+    if density is None:
+        raise ValueError(
+            "fem.mass_matrix: the material has no density, need one [kg/m^3]. Give `density` "
+            "to the material; rubber has about 1070."
+        )
+    tables = mass_tables(problem.mesh.element)
+    points = points_of(problem.mesh, problem.kinematics, tables)
+    weights = points.volumes * jnp.atleast_1d(jnp.asarray(density))[None]
+    N = jnp.asarray(tables.values)
+    if points.kinds is None:
+        return jnp.einsum("qa,qb,qc->cab", N[0], N[0], weights)
+    return jnp.einsum("cqa,cqb,qc->cab", N[points.kinds], N[points.kinds], weights)
+
+
+@cache
+def mass_tables(element: AbstractElement) -> Tables:
+    """Tables exact for products of two shape functions times a radius, on straight cells;
+    those of the stiffness for polygons, whose functions are rational."""
+    if isinstance(element, PolyN):
+        return quadrature_tables(element)
+    if isinstance(element, Quad4 | Quad8 | Quad9 | Hex8):
+        at, weights = quadrature(element, 2 * element.order + 3)
+    else:
+        bubble = {Tri7: 3, Tet15: 4}.get(type(element), element.order)
+        at, weights = _collapsed(element.dim, bubble + 2)
+    values, slopes = shape_functions(element, at), shape_gradients(element, at)
+    return Tables(values[None], slopes[None], weights[None])
+
+
+def _collapsed(dim: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss rule of the unit cube collapsed onto the unit simplex."""
+    x, w = np.polynomial.legendre.leggauss(count)
+    axes = np.meshgrid(*[(x + 1) / 2] * dim, indexing="ij")
+    weights = np.prod(np.meshgrid(*[w / 2] * dim, indexing="ij"), axis=0)
+    left, at = np.ones_like(weights), []
+    for axis, u in enumerate(axes):
+        at.append(u * left)
+        weights = weights * (1 - u) ** (dim - 1 - axis)
+        left = left * (1 - u)
+    return np.stack([a.ravel() for a in at], axis=1), weights.ravel()

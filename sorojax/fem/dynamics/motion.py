@@ -1,0 +1,147 @@
+"""A motion: states on a grid of times, with its energies."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from sorojax._display import displayed, number, outcome
+from sorojax._jax.trace_state import is_traced
+from sorojax.fem.dynamics.damping import mass_matrix
+from sorojax.fem.dynamics.newton import has_lists, lists_of, with_lists
+from sorojax.fem.dynamics.step import Dynamics, State, matter
+from sorojax.fem.problem import Problem, body, potential_energy
+from sorojax.math.linalg import sparse
+from sorojax.math.status import Status
+
+
+class Energies(eqx.Module):
+    """Energies [J] at the saved times.
+
+    `loads` is the potential of the loads with the values of the instant; `work` is what
+    loads and moving supports gave since the start, `dissipated` what damping took.
+    """
+
+    kinetic: Float[Array, " times"]
+    elastic: Float[Array, " times"]
+    loads: Float[Array, " times"]
+    work: Float[Array, " times"]
+    dissipated: Float[Array, " times"]
+
+    @property
+    def balance(self) -> Float[Array, " times"]:
+        """Kinetic and elastic energy minus what was given and taken [J]: constant but for
+        the error in time and what the method damps."""
+        return self.kinetic + self.elastic + self.dissipated - self.work
+
+
+@displayed
+class Motion(eqx.Module):
+    """States of a body in motion, and how the run ended.
+
+    Outside a trace a run that stops early is cut there; inside one it keeps its length and
+    is NaN from there on. `end` is the last state reached, to go on from; `points` are the
+    saved points of the grid of steps. `stats` is kept on the host and `None` inside a trace.
+    """
+
+    dynamics: Dynamics
+    states: State
+    points: Int[Array, " times"]
+    end: State
+    status: Status
+    stats: Any = eqx.field(static=True)  # MotionStats, None in a trace
+
+    def __len__(self) -> int:
+        return self.points.shape[0]
+
+    @property
+    def problem(self) -> Problem:
+        return self.dynamics.problem
+
+    @property
+    def times(self) -> Float[Array, " times"]:
+        """Saved times [s]."""
+        return self.states.time
+
+    @property
+    def displacements(self) -> Float[Array, "times nodes dim"]:
+        """Displacements [m]."""
+        return self.states.displacement
+
+    @property
+    def velocities(self) -> Float[Array, "times nodes dim"]:
+        """Velocities [m/s]."""
+        return self.states.velocity
+
+    @property
+    def accelerations(self) -> Float[Array, "times nodes dim"]:
+        """Accelerations of the method [m/s^2], of lower order than the velocities."""
+        return self.states.acceleration
+
+    @property
+    def energies(self) -> Energies:
+        """Energies at the saved times, computed when asked for."""
+        problem, lists = self.problem, None
+        if has_lists(problem) and not is_traced((problem, self.displacements)):
+            lists = lists_of(problem, self.displacements)
+        return _energies(self.dynamics, self.states, self.points, lists)
+
+    def _text(self) -> str:
+        u = self.displacements
+        largest = number(jnp.max(jnp.sqrt(jnp.sum(u**2, axis=-1))), "m") if u.size else "none"
+        return (
+            f"Motion: {len(self)} saved states, {outcome(self.status)}, largest displacement "
+            f"{largest}\n  time {number(self.times, 's')}"
+        )
+
+
+@eqx.filter_jit
+def _energies(dynamics: Dynamics, states: State, points, lists) -> Energies:
+    problem, mass = dynamics.problem, matter(dynamics).mass
+    moving, rest = eqx.partition(states, eqx.is_inexact_array)
+
+    def one(row) -> Energies:
+        state, index = eqx.combine(row[0], rest), row[1]
+        u, v = state.displacement, state.velocity.ravel()
+        loads = _loads_at(dynamics, state, index)
+        loads = loads if lists is None else with_lists(loads, row[2])
+        loaded = eqx.tree_at(lambda p: p.loads, body(problem), loads)
+        return Energies(
+            0.5 * jnp.sum(v * sparse.product(problem.space.system, mass, v)),
+            potential_energy(body(problem), u),
+            sum(
+                (load.stored(loaded, u) for load in loaded.loads), start=jnp.zeros((), u.dtype)
+            ),
+            state.work,
+            state.dissipated,
+        )
+
+    return jax.lax.map(one, (moving, points, lists))
+
+
+def _loads_at(dynamics: Dynamics, state: State, index) -> tuple:
+    """The loads at a point of the grid, as they remember."""
+    found = []
+    rows = zip(dynamics.problem.loads, dynamics.loads, state.memory, strict=True)
+    for load, row, before in rows:
+        value = load.value if row is None else row[index]
+        kept = load if before is None else before
+        found.append(eqx.tree_at(lambda load: load.value, kept, value))
+    return tuple(found)
+
+
+def momentum(motion: Motion) -> tuple[Float[Array, "times dim"], Float[Array, "times turns"]]:
+    """Linear momentum [N s] and angular momentum about the origin [N m s] at every saved
+    time, one component in the plane and three in space, with the consistent mass."""
+    problem = motion.problem
+    mass = mass_matrix(body(problem))
+
+    def one(u, v):
+        p = sparse.product(problem.space.system, mass, v.ravel()).reshape(v.shape)
+        x = problem.mesh.points + u
+        turns = x[:, 0] * p[:, 1] - x[:, 1] * p[:, 0] if x.shape[1] == 2 else jnp.cross(x, p)
+        return jnp.sum(p, axis=0), jnp.atleast_1d(jnp.sum(turns, axis=0))
+
+    return jax.vmap(one)(motion.displacements, motion.velocities)

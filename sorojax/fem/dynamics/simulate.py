@@ -1,0 +1,296 @@
+"""Motion of a body: the door to time integration."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax._jax.jit import once
+from sorojax._jax.trace_state import is_traced
+from sorojax._progress import report
+from sorojax._types import real
+from sorojax.fem.contact.friction import moving
+from sorojax.fem.contact.obstacle import Contact
+from sorojax.fem.dynamics.damping import AbstractDamping
+from sorojax.fem.dynamics.host import Control, Run, compiled_matter
+from sorojax.fem.dynamics.implicit_diff import MotionCall, recorded
+from sorojax.fem.dynamics.jit import replay
+from sorojax.fem.dynamics.methods import AbstractMethod, GeneralisedAlpha
+from sorojax.fem.dynamics.motion import Motion
+from sorojax.fem.dynamics.step import Dynamics, Mass, Matter, State, StepState
+from sorojax.fem.equilibrium.jit import known_mask
+from sorojax.fem.equilibrium.newton import Newton
+from sorojax.fem.loads.loads import AbstractLoad, remembers
+from sorojax.fem.problem import Problem, body, residual
+from sorojax.math.linalg import sparse
+from sorojax.math.status import Status
+from sorojax.mesh.mesh import Mesh
+
+History = Callable[[Float[Array, ""]], Array] | Float[Array, "grid ..."]
+Start = Motion | State | tuple[Float[Array, "nodes dim"], Float[Array, "nodes dim"]]
+
+
+class MotionError(RuntimeError):
+    """A motion could not go on; `motion` holds what was reached."""
+
+    def __init__(self, message: str, motion: Motion):
+        super().__init__(message)
+        self.motion = motion
+
+    def __reduce__(self):
+        return type(self), (str(self), self.motion)
+
+
+def simulate(
+    problem: Problem,
+    duration: float,
+    step: float,
+    *,
+    start: Start | None = None,
+    method: AbstractMethod | None = None,
+    damping: AbstractDamping | tuple[AbstractDamping, ...] = (),
+    mass: Mass = "consistent",
+    save: int | None = None,
+    adaptive: bool | float = False,
+    newton: Newton | None = None,
+    max_cuts: int = 14,
+    max_steps: int | None = None,
+    throw: bool = True,
+    **histories: History,
+) -> Motion:
+    """Motion of `problem` for `duration` [s] in steps of `step` [s].
+
+    Every step is the equilibrium of the body with its inertia and damping, solved by
+    Newton's method; one that does not converge, would invert a cell or takes a point through
+    the obstacle of a `Contact` is never accepted but halved, and steps grow again afterwards.
+
+    Args:
+        problem: What moves; its material needs a density.
+        duration: How long [s].
+        step: Size of the steps [s], shortened a little where `duration` asks for it.
+        start: A motion or its `end` to go on from, or displacement [m] and velocity [m/s];
+            at rest without displacement when omitted.
+        method: `GeneralisedAlpha(rho_inf)`, `Newmark(beta, gamma)` or `EnergyMomentum()`;
+            `GeneralisedAlpha(0.5)` when omitted.
+        damping: `Rayleigh(...)`, `KelvinVoigt(...)` or several of them.
+        mass: "consistent", or "lumped" on the diagonal.
+        save: Number of saved states, both ends included; every step's when omitted.
+        adaptive: Halve steps also where their estimated error is more than this share of
+            the largest displacement; `True` is 1e-3.
+        newton: Tolerances; `Newton()` when omitted.
+        max_cuts: How often a step may be halved in a row.
+        max_steps: Accepted steps at most; when omitted 256 times as many as asked for. Inside
+            a trace, where it is memory, 64 more, and 16 times as many with `adaptive`.
+        throw: Raise when a run outside a trace fails, otherwise report it in `status`.
+        **histories: Values of loads and of prescribed supports by name: functions of time
+            [s] or rows with one value for each end of a step. They are taken at the ends of
+            the steps and linear between them.
+
+    Raises:
+        MotionError: If `throw` and a step failed after all cuts.
+        ValueError: If a name, a shape or a number does not fit.
+    """
+    where = "fem.simulate"
+    _check.positive(where, "duration", duration, "s", "Give how long to simulate.")
+    _check.positive(where, "step", step, "s", "Take 1/50 of the period of interest.")
+    if mass not in ("consistent", "lumped"):
+        raise ValueError(f"{where}: got mass={mass!r}, need 'consistent' or 'lumped'.")
+    grid, every = _grid(where, duration, step, save)
+    size = real(duration) / grid
+    damping = (damping,) if isinstance(damping, AbstractDamping) else tuple(damping)
+    for term in damping:
+        term.check(problem)
+    method = GeneralisedAlpha() if method is None else method
+    begin = _begin_time(start)
+    times = begin + size * jnp.arange(grid + 1, dtype=size.dtype)
+    loads, supports = _rows(where, problem, histories, times)
+    scheme, rest = method.coefficients(), _rest(problem, loads)
+    dynamics = Dynamics(
+        problem, damping, scheme, loads, supports, rest, size, mass, method.conserves
+    )
+    begun = _state(where, dynamics, start)
+    # tangent and lists are no part of the motion, only of how it is computed
+    bare = dataclasses.replace(begun, tangent=None, listed=None)
+    dynamics = dataclasses.replace(dynamics, start=bare)
+    error = (1e-3 if adaptive is True else float(adaptive)) if adaptive else None
+    traced = is_traced((dynamics, jnp.zeros(())))
+    if max_steps is None and traced:
+        max_steps = grid + 64 if error is None else 16 * grid
+    max_steps = 256 * grid if max_steps is None else max_steps
+    newton = Newton() if newton is None else newton
+    control = Control(newton, max_cuts, error, max_steps)
+    if traced:
+        return _in_trace(dynamics, control, grid, every)
+    motion = _on_host(dynamics, control, grid, every, begun)
+    if throw and motion.stats.reason:
+        raise MotionError(
+            f"{where}: no step beyond {float(motion.end.time):.6g} s after "
+            f"{motion.stats.cuts} cuts ({motion.stats.reason}). Take shorter steps, lower the "
+            "load, or pass throw=False for the motion up to there.",
+            motion,
+        )
+    return motion
+
+
+def _on_host(
+    dynamics: Dynamics, control: Control, grid: int, every: int, begun: State
+) -> Motion:
+    run = Run(dynamics, control)
+    run.resume(begun)
+    states, points = [run.now], [0]
+    for index in range(grid):
+        if not run.advance(index):
+            break
+        if (index + 1) % every == 0:
+            states.append(run.now)
+            points.append(index + 1)
+        report("motion", index + 1, grid, iterations=run.iterations, cuts=run.cuts)
+
+    def column(first, *others):
+        if not eqx.is_inexact_array(first):
+            return first
+        return jnp.asarray(np.stack([np.asarray(x) for x in (first, *others)]))
+
+    stacked = jax.tree.map(column, *states).whole()
+    at = jnp.asarray(points, jnp.int32)
+    return Motion(dynamics, stacked, at, run.end(), run.status, run.stats())
+
+
+def _in_trace(dynamics: Dynamics, control: Control, grid: int, every: int) -> Motion:
+    record = recorded(MotionCall(dynamics, control, grid, control.max_steps))
+    states, end = replay(dynamics, record, grid, every)
+    at = jnp.arange(0, grid + 1, every, dtype=jnp.int32)
+    failed = record.counts[0] != 0
+    status = Status.where(failed, Status.not_converged, Status.successful)
+    return Motion(dynamics, states, at, end, status, None)
+
+
+def _grid(where: str, duration, step, save: int | None) -> tuple[int, int]:
+    """Number of steps, and of those between two saved states."""
+    if is_traced((duration, step)):
+        raise ValueError(
+            f"{where}: `duration` and `step` fix the number of steps and cannot be traced. "
+            "Pass Python numbers."
+        )
+    wanted = float(duration) / float(step)
+    if save is None:
+        return max(1, int(np.ceil(wanted * (1 - 1e-9)))), 1
+    if save < 2:
+        raise ValueError(f"{where}: `save` must be 2 or more, got {save}.")
+    every = max(1, int(np.ceil(wanted / (save - 1) * (1 - 1e-9))))
+    return every * (save - 1), every
+
+
+def _begin_time(start: Start | None):
+    if isinstance(start, Motion):
+        start = start.end
+    return start.time if isinstance(start, State) else jnp.zeros((), jnp.result_type(float))
+
+
+def _rest(problem: Problem, rows: tuple[Array | None, ...]) -> State:
+    zero = jnp.zeros_like(problem.mesh.points)
+    none = jnp.zeros((), zero.dtype)
+    first = zip(problem.loads, rows, strict=True)
+    memory = tuple(
+        _placed(load, row, problem.mesh) if remembers(load) else None for load, row in first
+    )
+    return State(none, zero, zero, zero, memory, none, none, jnp.ones_like(none))
+
+
+def _placed(load: AbstractLoad, row: Array | None, mesh: Mesh) -> AbstractLoad:
+    """`load` with its obstacle where the motion begins, unless friction holds on to it."""
+    if not isinstance(load, Contact):
+        return load
+    place = load.value if row is None else row[0]
+    if load.grip is not None and load.place is not None:
+        place = jnp.where(jnp.any(load.grip.pressure > 0), load.place, place)
+    return moving(load, mesh, place)
+
+
+def _state(where: str, dynamics: Dynamics, start: Start | None) -> State:
+    """The state to start from, with the acceleration that balances it."""
+    if isinstance(start, Motion):
+        start = start.end
+    if isinstance(start, State):
+        return start
+    state = dynamics.start
+    if start is not None:
+        u, v = (real(x) for x in start)
+        for name, x in (("displacement", u), ("velocity", v)):
+            _check.shape(where, f"start {name}", x, dynamics.problem.mesh.points.shape,
+                         "Give one vector per node.")  # fmt: skip
+            _check.finite(where, f"start {name}", x, "Use SI units.")
+        state = eqx.tree_at(lambda s: (s.displacement, s.velocity), state, (u, v))
+    return eqx.tree_at(lambda s: s.acceleration, state, _acceleration(dynamics, state))
+
+
+def _acceleration(dynamics: Dynamics, state: State) -> Float[Array, "nodes dim"]:
+    """Acceleration [m/s^2] that balances a state."""
+    matrix, rhs = _balance(dynamics, compiled_matter(dynamics), state)
+    system = dynamics.problem.space.system
+    if is_traced((matrix, rhs)):
+        a = sparse.solve(system, matrix, rhs)
+    else:
+        a = jnp.asarray(system.solver.solve(np.asarray(matrix), np.asarray(rhs)))
+    return a.reshape(state.displacement.shape)
+
+
+@once
+def _balance(dynamics: Dynamics, known: Matter, state: State):
+    problem, u = dynamics.problem, state.displacement
+    kept = (
+        load if before is None else before
+        for load, before in zip(problem.loads, state.memory, strict=True)
+    )
+    loads = tuple(
+        load if row is None else eqx.tree_at(lambda load: load.value, load, row[0])
+        for load, row in zip(kept, dynamics.loads, strict=True)
+    )
+    none = jnp.zeros((), u.dtype)
+    rest = StepState(u, state.velocity, u, none, u, state.time, none)
+    bare = body(problem)
+    loads = tuple(load.begun(bare, rest) for load in loads)
+    force = -residual(dataclasses.replace(problem, loads=loads), u).ravel()
+    v = state.velocity.ravel()
+    varying = [d.matrix(problem, known.mass, u) for d in dynamics.damping if not d.constant]
+    for values in varying if known.damping is None else [*varying, known.damping]:
+        force = force - sparse.product(problem.space.system, values, v)
+    mask = known_mask(problem.supports, *u.shape)
+    matrix = sparse.fix(problem.space.system, known.mass, mask)
+    return matrix, jnp.where(mask, jnp.zeros_like(force), force)
+
+
+def _rows(where: str, problem: Problem, histories: dict[str, Any], times):
+    """Values on the grid of times for the loads and supports that are named."""
+    loads = [load.name for load in problem.loads]
+    moving = [s.name if s.ramped is not None else None for s in problem.supports]
+    names = [*loads, *(name for name in moving if name is not None)]
+    if unknown := sorted(set(histories) - set(names)):
+        raise ValueError(
+            f"{where}: got values for {unknown}, need some of {sorted(set(names))}. Name a "
+            "load or a support with `name=`."
+        )
+
+    def row(name, want):
+        if name not in histories:
+            return None
+        given = histories[name]
+        values = jax.vmap(lambda t: real(given(t)))(times) if callable(given) else real(given)
+        _check.shape(where, name, values, (times.shape[0], *want),
+                     "Give a function of time, or a value for each end of a step.")  # fmt: skip
+        _check.finite(where, name, values, "Use SI units.")
+        return values
+
+    return (
+        tuple(row(load.name, load.value.shape) for load in problem.loads),
+        tuple(
+            None if s.ramped is None else row(s.name, getattr(s, s.ramped).shape)
+            for s in problem.supports
+        ),
+    )

@@ -1,0 +1,308 @@
+"""Equilibrium and load paths, differentiable in every number of the problem.
+
+The derivative is that of the implicit function at the converged state: one more
+back-substitution per direction, whatever steps the solver took to get there.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from sorojax import _check
+from sorojax._display import displayed, number, outcome
+from sorojax._jax.trace_state import evaluated_now, is_traced
+from sorojax._progress import report
+from sorojax._types import real
+from sorojax.fem.equilibrium.implicit_diff import Solve, equilibrium
+from sorojax.fem.equilibrium.jit import Begin
+from sorojax.fem.equilibrium.load_stepping import Stats, unloaded
+from sorojax.fem.equilibrium.newton import Newton
+from sorojax.fem.problem import Problem
+from sorojax.math.status import Status
+
+
+@displayed
+class Solution(eqx.Module):
+    """Displacement at equilibrium [m], or at the last converged fraction of the load.
+
+    Every array gets the batch axes of `jax.vmap` in front, so each lane has its own
+    `status`, `load_fraction` and Newton `iterations`. `stats` is kept on the host: the
+    record of the solve, under `vmap` a tuple with that of every lane in row-major order,
+    and `None` under `jit`, where it does not exist yet.
+    """
+
+    problem: Problem
+    displacement: Float[Array, "nodes dim"]
+    status: Status
+    stats: Any = eqx.field(static=True)  # Stats, one per lane under vmap, None under jit
+    load_fraction: Float[Array, ""] | None = None
+    iterations: Int[Array, ""] | None = None
+
+    def _text(self) -> str:
+        u = self.displacement
+        largest = number(jnp.max(jnp.sqrt(jnp.sum(u**2, axis=-1))), "m")
+        rows = [f"Solution: {outcome(self.status)}, largest displacement {largest}"]
+        if self.iterations is not None:
+            part = number(self.load_fraction)
+            rows.append(f"  {number(self.iterations)} iterations, load fraction {part}")
+        return "\n".join(rows + _unstable([self.stats]))
+
+
+@displayed
+class Path(eqx.Module):
+    """Equilibria along a load path: `values` of the load `name`, one state for each.
+
+    A path that stops early is cut there; under `jit` and `vmap` it keeps its length and
+    is NaN from there on. `stats` has one entry for each value, as in `Solution`; it is
+    `None` under `jit`.
+    """
+
+    problem: Problem
+    displacements: Float[Array, "steps nodes dim"]
+    values: Float[Array, "steps ..."]
+    name: str = eqx.field(static=True)
+    status: Status
+    stats: Any = eqx.field(static=True)  # one Stats per value, None under jit
+
+    def __len__(self) -> int:
+        return self.displacements.shape[0]
+
+    def _text(self) -> str:
+        u = self.displacements
+        largest = number(jnp.max(jnp.sqrt(jnp.sum(u**2, axis=-1))), "m") if u.size else "none"
+        return (
+            f"Path: {len(self)} states, {outcome(self.status)}, largest displacement "
+            f"{largest}\n  {self.name} {number(self.values)}"
+        ) + "".join(f"\n{row}" for row in _unstable(self.stats))
+
+
+def _unstable(records: Any) -> list[str]:
+    """What a print says of states that are in balance without being stable."""
+    steps = [r.steps[-1] for r in records or () if isinstance(r, Stats) and r.steps]
+    if not any(step.negative_eigenvalues > 0 for step in steps):
+        return []
+    counts = ", ".join(str(step.negative_eigenvalues) for step in steps)
+    return [f"  not stable: negative eigenvalues of the tangent {counts}; see `continuation`"]
+
+
+class ConvergenceError(RuntimeError):
+    """No equilibrium was found; `solution` holds the last converged state."""
+
+    def __init__(self, message: str, solution: Solution):
+        super().__init__(message)
+        self.solution = solution
+
+    def __reduce__(self):
+        return type(self), (str(self), self.solution)
+
+
+def solve(
+    problem: Problem,
+    *,
+    start: Float[Array, "nodes dim"] | None = None,
+    newton: Newton | None = None,
+    steps: int = 1,
+    max_cuts: int = 10,
+    throw: bool = True,
+) -> Solution:
+    """Static equilibrium of `problem`.
+
+    All loads and prescribed displacements grow together from zero, first in `steps` equal
+    steps; a step that fails is cut in half, and steps grow again on easy ground. The
+    answer does not depend on the steps unless the equilibrium is not unique.
+
+    Works under `jit`, `vmap`, `grad` and their compositions. `vmap` outside `jit` is the
+    fast way through many samples: a lane starts from its nearest solved neighbour where
+    that pays. A lane that fails leaves the others alone and has NaN for derivatives.
+
+    Args:
+        problem: What to solve; differentiable in each of its numbers.
+        start: Displacement to start from at full load, instead of stepping [m]; where it is
+            too far away the load is followed from rest. The answer has no derivative by it.
+        newton: Tolerances; `Newton()` when omitted.
+        steps: Number of equal load steps to try first.
+        max_cuts: How often a step may be halved in a row.
+        throw: Raise when no equilibrium is found, otherwise report it in `status`. Under
+            `jit` and `vmap` nothing is raised: look at `status`.
+
+    Raises:
+        ConvergenceError: If `throw` and a step failed after all cuts.
+    """
+    settings = (Newton() if newton is None else newton, steps, max_cuts)
+    return solved_and_kept(problem, start, settings, throw)[0]
+
+
+def solved_and_kept(
+    problem: Problem, start: Any, settings: tuple[Newton, int, int], throw: bool
+) -> tuple[Solution, Float[np.ndarray, "nodes dim"] | None]:
+    """`solve`, and the displacement on the host where that is known, which needs no operation
+    that a derivative would stage."""
+    call = Solve(problem, None if start is None else _begun(start), *settings)
+    u, counts, _ = equilibrium(call)
+    solution = Solution(problem, u, *_told(counts, call.stats))
+    _raise_if_failed("fem.solve", solution, throw)
+    return solution, call.record.displacement
+
+
+def _begun(start: Any) -> Begin:
+    if is_traced(start):
+        return Begin(jax.lax.stop_gradient(real(start)))
+    with evaluated_now():
+        return Begin(real(start))
+
+
+def _told(counts: Float[Array, " 4"], stats):
+    """Status, record, fraction of the load and iterations, from what is concrete at once:
+    every operation beside a derivative is staged with it."""
+    with evaluated_now(counts):
+        if isinstance(stats, Stats):
+            failed, fraction, iterations, _ = np.asarray(counts)
+            status = Status.not_converged if failed else Status.successful
+            return status, stats, jnp.asarray(fraction), jnp.asarray(np.int32(iterations))
+        return _status(counts[0] != 0), stats, counts[1], counts[2].astype(jnp.int32)
+
+
+def solve_path(
+    problem: Problem,
+    *,
+    newton: Newton | None = None,
+    max_cuts: int = 10,
+    throw: bool = True,
+    **values: Float[Array, "steps ..."],
+) -> Path:
+    """Equilibria for a row of values of one named load, the others held.
+
+    `solve_path(problem, air=jnp.linspace(0, 20 * kPa, 21))` sets the load named "air".
+
+    Args:
+        problem: The problem; differentiable in each of its numbers.
+        newton: Tolerances; `Newton()` when omitted.
+        max_cuts: How often a step between two values may be halved in a row.
+        throw: Raise when a value has no equilibrium, otherwise stop the path there. Under
+            `jit` and `vmap` nothing is raised: look at `status`.
+        **values: One load by name, with one value per state.
+
+    Raises:
+        ConvergenceError: If `throw` and a step failed after all cuts.
+        ValueError: If not exactly one existing load is named.
+    """
+    name, row = _named_values(problem, values)
+    newton = Newton() if newton is None else newton
+
+    # inside jit even a constant is traced: one compiled loop over the values then
+    if is_traced(jnp.zeros(())):
+        states, failed = _scan_path(problem, name, row, newton, max_cuts)
+        return Path(problem, states, row, name, _status(failed), None)
+    begin, states, stats, failed = None, [], [], jnp.asarray(False)
+    for k, value in enumerate(row):
+        target = with_load(problem, name, value)
+        call = Solve(target, begin, newton, 1, max_cuts, want_tangent=True)
+        u, counts, tangent = equilibrium(call)
+        record = call.stats
+        stats.append(record)
+        if not isinstance(record, Stats):
+            failed = failed | (counts[0] != 0)
+            u = at = jnp.where(failed, jnp.nan, u)
+        elif record.reason:
+            failed = jnp.asarray(True)
+            solution = Solution(target, u, Status.not_converged, record)
+            _raise_if_failed("fem.solve_path", solution, throw)
+            break
+        else:  # nothing to hide, and no operation that a derivative would stage
+            at = _begun(call.record.displacement).u
+        states.append(u)
+        begin = _fixed(Begin(at, (target.loads, target.supports), tangent))
+        lanes = (record,) if isinstance(record, Stats) else record or ()
+        report(
+            "equilibrium", k + 1, len(row), iterations=sum(lane.iterations for lane in lanes)
+        )
+    shape = (0, *problem.mesh.points.shape)
+    stacked = jnp.stack(states) if states else jnp.zeros(shape)
+    return Path(problem, stacked, row[: len(states)], name, _status(failed), tuple(stats))
+
+
+def _scan_path(
+    problem: Problem, name: str, row, newton: Newton, max_cuts: int
+) -> tuple[Float[Array, "steps nodes dim"], Bool[Array, ""]]:
+    """The same in a trace; NaN from the first failure on."""
+    rest = unloaded(problem)
+    u = jnp.zeros_like(problem.mesh.points)
+    # no finite tangent, no first guess
+    tangent = jnp.full(problem.space.system.num_values, jnp.nan, u.dtype)
+    terms, static = eqx.partition((rest.loads, rest.supports), eqx.is_inexact_array)
+
+    def advance(carry, value):
+        u, terms, tangent = jax.lax.stop_gradient(carry)
+        target = with_load(problem, name, value)
+        begin = Begin(u, eqx.combine(terms, static), tangent)
+        call = Solve(target, begin, newton, 1, max_cuts, want_tangent=True)
+        u, counts, tangent = equilibrium(call)
+        failed = counts[0] != 0
+        u = jnp.where(failed, jnp.nan, u)
+        terms = eqx.filter((target.loads, target.supports), eqx.is_inexact_array)
+        return (u, terms, tangent), (u, failed)
+
+    _, (states, failed) = jax.lax.scan(advance, (u, terms, tangent), row)
+    return states, jnp.any(failed)
+
+
+def _fixed(begin: Begin) -> Begin:
+    """`begin` without derivatives: an equilibrium does not depend on where it came from."""
+
+    def fixed(x):
+        moves = is_traced(x) and jnp.issubdtype(x.dtype, jnp.inexact)
+        return jax.lax.stop_gradient(x) if moves else x
+
+    return jax.tree.map(fixed, begin)
+
+
+def _status(failed: Bool[Array, "..."]) -> Status:
+    return Status.where(failed, Status.not_converged, Status.successful)
+
+
+def _named_values(problem: Problem, values: dict) -> tuple[str, Float[Array, "steps ..."]]:
+    names = [load.name for load in problem.loads]
+    if len(values) != 1 or next(iter(values)) not in names:
+        raise ValueError(
+            f"fem.solve_path: got values for {sorted(values)}, need exactly one of the loads "
+            f"{names}. Name a load with `name=`."
+        )
+    name, row = next(iter(values.items()))
+    row = real(row)
+    _check.finite("fem.solve_path", name, row, "Use SI units: jnp.linspace(0, 20 * kPa, 21).")
+    want = problem.loads[names.index(name)].value.shape
+    if row.shape[1:] != want or not row.shape:
+        raise ValueError(
+            f"fem.solve_path: `{name}` has shape {row.shape}, need (steps, *{want})."
+        )
+    return name, row
+
+
+def with_load(problem: Problem, name: str, value: Float[Array, "..."]) -> Problem:
+    """`problem` with the load called `name` set to `value`."""
+    names = [load.name for load in problem.loads]
+    if name not in names:
+        raise ValueError(
+            f"fem.with_load: no load is called {name!r}, need one of {names}. Set `name=` "
+            "where a load is made."
+        )
+    index = names.index(name)
+    # a weakly typed number would compile every kernel again
+    return eqx.tree_at(lambda p: p.loads[index].value, problem, real(value))
+
+
+def _raise_if_failed(where: str, solution: Solution, throw: bool) -> None:
+    stats = solution.stats
+    if not throw or not isinstance(stats, Stats) or not stats.reason:
+        return
+    done = stats.steps[-1].fraction if stats.steps else 0.0
+    raise ConvergenceError(
+        f"{where}: no equilibrium beyond {100 * done:.0f} % of the load after {stats.cuts} "
+        f"cuts ({stats.reason}). Lower the load, refine the mesh where it deforms most, or "
+        "pass throw=False for the last converged state.",
+        solution,
+    )

@@ -1,0 +1,1 @@
+"""Paths over limit points, bifurcations, buckling, vibration modes."""

@@ -1,0 +1,207 @@
+"""Public verbs compiled once per structure of their arguments.
+
+Compiled functions of large pytrees that stay the same from call to call.
+
+To take a problem apart costs as much as to evaluate its forces on a small mesh, to take a
+network apart a third of its step: it is done once, and calls hand over the list of arrays.
+
+Many items through one verb, in batches that stay in the cache.
+
+Work that XLA keeps apart from what uses it.
+
+On the CPU, XLA drops optimization barriers before it fuses loops; the work of a producer is
+then repeated in every entry that reads it, and a loop that holds the slice of an outer loop
+is not vectorised. What crosses a branch is written to memory once.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from sorojax import _check
+from sorojax._types import platform, real
+
+Verb = TypeVar("Verb", bound=Callable[..., Any])
+
+
+def door(verb: Verb) -> Verb:
+    """`verb` compiled by `eqx.filter_jit`, with floats and lists of numbers traced.
+
+    A Python float would otherwise be static and recompile at every new value. Integers
+    and booleans stay static: they choose loops and branches.
+    """
+    compiled = eqx.filter_jit(full_products(verb))
+
+    @functools.wraps(verb)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        args = tuple(_traced(value) for value in args)
+        return compiled(*args, **{name: _traced(value) for name, value in kwargs.items()})
+
+    return call  # type: ignore[return-value]
+
+
+def full_products(verb: Verb) -> Verb:
+    """`verb` whose products keep all digits of single precision.
+
+    By default JAX rounds the factors of such products to 10 bits on recent accelerators, where
+    an acceleration of a soft finger came out 14 % wrong. A precision that the user has
+    chosen by `jax_default_matmul_precision` is left alone.
+    """
+
+    @functools.wraps(verb)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        chosen = jax.config.jax_default_matmul_precision  # pyright: ignore[reportAttributeAccessIssue]
+        if platform() == "cpu" or chosen is not None:
+            return verb(*args, **kwargs)
+        with jax.default_matmul_precision("highest"):
+            return verb(*args, **kwargs)
+
+    return call  # type: ignore[return-value]
+
+
+def _traced(value: Any) -> Any:
+    is_list = isinstance(value, list | tuple) and len(value) > 0
+    if isinstance(value, float) or (
+        is_list and all(isinstance(entry, int | float) for entry in value)
+    ):
+        return real(value)
+    return value
+
+
+# Compiled functions of large pytrees that stay the same from call to call
+
+
+class _Form:
+    """All of a pytree but its arrays."""
+
+    def __init__(self, tree, others, others_tree):
+        self._parts = tree, others_tree, tuple(others)
+        self._hash = hash(self._parts)
+
+    def __hash__(self):
+        return self._hash
+
+    def __eq__(self, other):
+        return self is other or (isinstance(other, _Form) and self._parts == other._parts)
+
+    def whole(self, leaves) -> Any:
+        tree, others_tree, others = self._parts
+        if not others:
+            return jax.tree.unflatten(tree, leaves)
+        return eqx.combine(
+            jax.tree.unflatten(tree, leaves), jax.tree.unflatten(others_tree, others)
+        )
+
+
+@jax.tree_util.register_pytree_node_class
+class Split:
+    """A pytree, taken apart once; what a kernel gives as one it takes without a look."""
+
+    def __init__(self, tree: Any):
+        arrays, others = eqx.partition(tree, eqx.is_array)
+        self.leaves, form = jax.tree.flatten(arrays)
+        self.form = _Form(form, *jax.tree.flatten(others))
+
+    def whole(self) -> Any:
+        return self.form.whole(self.leaves)
+
+    def tree_flatten(self):
+        return self.leaves, self.form
+
+    @classmethod
+    def tree_unflatten(cls, form, leaves) -> "Split":
+        made = object.__new__(cls)
+        made.leaves, made.form = list(leaves), form
+        return made
+
+
+def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function(*trees, *arrays)` compiled, to be called as `(splits, *arrays)`."""
+
+    @jax.jit
+    def flat(splits: tuple[Split, ...], *arrays) -> Split:
+        return Split(function(*(split.whole() for split in splits), *arrays))
+
+    def call(splits: tuple[Split, ...], *arrays):
+        return flat(tuple(splits), *arrays).whole()
+
+    return call
+
+
+# Many items through one verb, in batches that stay in the cache
+
+
+CHUNK = 64  # items of a few kB each; more leave the cache of a core
+
+
+def batched(verb: Callable[..., Any], *, chunk: int = CHUNK) -> Callable[..., Any]:
+    """`verb` over the first axis of all its arguments, as `jax.vmap` but in chunks.
+
+    On a CPU the intermediate values of a whole batch travel through memory, those of a
+    chunk stay in the cache. Accelerators take the batch at once. What all items share is
+    closed over, and made once:
+
+        constants = rod.operators(finger)
+        batched(lambda q: rod.motion(finger, q, constants=constants).position)(many_q)
+
+    Args:
+        verb: Of arrays, or pytrees of them: models too.
+        chunk: Items at once on a CPU.
+
+    Raises:
+        ValueError: If the arguments do not have equally many items.
+    """
+    _check.positive("batched", "chunk", chunk, "items", "Give how many to take at once.")
+
+    def every(*items: Any) -> Any:
+        arrays, rest = eqx.partition(items, lambda x: isinstance(x, jax.Array | np.ndarray))
+        _check_counts(arrays)
+
+        def one(item: Any) -> Any:
+            return verb(*eqx.combine(item, rest))
+
+        def in_chunks(items: Any) -> Any:
+            return jax.lax.map(one, items, batch_size=chunk)
+
+        if len(jax.tree.leaves(arrays)[0]) <= chunk:
+            return jax.vmap(one)(arrays)
+        return jax.lax.platform_dependent(arrays, cpu=in_chunks, default=jax.vmap(one))
+
+    return every
+
+
+def _check_counts(arrays: Any) -> None:
+    counts = {leaf.shape[0] if leaf.ndim else 0 for leaf in jax.tree.leaves(arrays)}
+    if len(counts) != 1 or 0 in counts:
+        raise ValueError(
+            f"batched: got first axes of {sorted(counts)} items (0: none), need one count "
+            "for all. Close over what all items share."
+        )
+
+
+# Work that XLA keeps apart from what uses it
+
+
+Answer = TypeVar("Answer")
+Alone = Callable[[Callable[[], Any]], Any]
+
+
+def apart(always: Bool[Array, ""]) -> Alone:
+    """A function that calls `work()` by itself. `always` is true, but known at run time only:
+    where it is not, the answer is NaN."""
+
+    def alone(work: Callable[[], Answer]) -> Answer:
+        shapes = jax.eval_shape(work)
+
+        def never() -> Any:
+            return jax.tree.map(lambda s: jnp.full(s.shape, jnp.nan, s.dtype), shapes)
+
+        return jax.lax.cond(always, work, never)
+
+    return alone

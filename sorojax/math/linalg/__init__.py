@@ -1,0 +1,1 @@
+"""Linear systems: dense, banded, sparse, multigrid."""

@@ -1,0 +1,1 @@
+"""Time integration: explicit, linearly implicit, generalised-alpha, and the size of steps."""

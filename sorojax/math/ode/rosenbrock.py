@@ -1,0 +1,176 @@
+"""Rodas4: a stiff method that solves linear systems only, one matrix per step.
+
+Fixed steps of stiff systems at the price of two slopes and one small product each.
+"""
+
+from typing import Any, ClassVar
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.scipy
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from sorojax.math.ode.explicit import AbstractMethod, Step
+
+_GAMMA = 0.25
+_STAGES = (  # weights of the increments before, in the point where the slope is taken
+    (),
+    (1.544,),
+    (0.9466785280815826, 0.2557011698983284),
+    (3.314825187068521, 2.896124015972201, 0.9986419139977817),
+    (1.221224509226641, 6.019134481288629, 12.53708332932087, -0.6878860361058950),
+)
+_COUPLING = (  # weights of the same in the right-hand side, over h
+    (),
+    (-5.6688,),
+    (-2.430093356833875, -0.2063599157091915),
+    (-0.1073529058151375, -9.594562251023355, -20.47028614809616),
+    (7.496443313967647, -10.24680431464352, -33.99990352819905, 11.70890893206160),
+    (
+        8.083246795921522, -7.981132988064893, -31.52159432874371, 16.31930543123136,
+        -6.058818238834054,
+    ),
+)  # fmt: skip
+_TIMES = (0.0, 0.386, 0.21, 0.63, 1.0, 1.0)
+_TIME_SLOPES = (0.25, -0.1043, 0.1035, -0.03620000000000023, 0.0, 0.0)
+_DENSE = (
+    (
+        10.12623508344586, -7.487995877610167, -34.80091861555747, -7.992771707568823,
+        1.025137723295662,
+    ),
+    (
+        -0.6762803392806898, 6.087714651680015, 16.43084320892478, 24.76722511418386,
+        -6.594389125716872,
+    ),
+)  # fmt: skip
+
+
+class CubicWithin(dfx.AbstractLocalInterpolation):
+    """y between the ends of a step of Rodas4, of order 3."""
+
+    t0: Float[Array, ""]
+    t1: Float[Array, ""]
+    y0: object
+    y1: object
+    bend: object
+    twist: object
+
+    def evaluate(self, t0, t1=None, left=True):
+        if t1 is not None:
+            return jax.tree.map(lambda b, a: b - a, self.evaluate(t1), self.evaluate(t0))
+        length = self.t1 - self.t0
+        x = (t0 - self.t0) / jnp.where(length == 0, jnp.ones_like(length), length)
+
+        def between(y0, y1, bend, twist):
+            return (1 - x) * y0 + x * (y1 + (1 - x) * (bend + x * twist))
+
+        return jax.tree.map(between, self.y0, self.y1, self.bend, self.twist)
+
+
+class Rodas4(AbstractMethod):
+    """Rosenbrock method of order 4 with an estimate of order 3, L-stable and stiffly accurate.
+
+    The Jacobian of the field is exact, one product with a unit vector per state; a step
+    needs it once, one factorisation, six slopes and no iteration. For up to about 60 states
+    with eigenvalues of very different size: regulators, valves and filters beside a body.
+
+    Reference:
+        Hairer and Wanner, Solving Ordinary Differential Equations II, 1996, section IV.7.
+    """
+
+    num_order: ClassVar[int] = 4
+    interpolation_cls: ClassVar = CubicWithin
+
+    def begin(self, field, t, y, h):
+        return ()
+
+    def advance(self, field, t, y, h, memory):
+        flat, unravel = ravel_pytree(y)
+
+        def slope(t, x):
+            return ravel_pytree(field(t, unravel(x)))[0]
+
+        drift, jacobian = _derivatives(slope, t, flat)
+        eye = jnp.eye(flat.shape[0], dtype=flat.dtype)
+        # a step of no length stays where it is, in value and in derivative
+        length = jnp.where(h == 0, jnp.ones_like(h), h)
+        solve = _inverse(eye / (_GAMMA * length) - jacobian)
+        moves: list[Array] = []
+        point = flat
+        for k, coupling in enumerate(_COUPLING):
+            fresh = k < len(_STAGES)
+            point = flat + _sum(_STAGES[k], moves) if fresh else point + moves[-1]
+            right = slope(t + _TIMES[k] * h, point) + _sum(coupling, moves) / length
+            if _TIME_SLOPES[k]:
+                right = right + h * _TIME_SLOPES[k] * drift
+            moves.append(jnp.where(h == 0, jnp.zeros_like(flat), solve @ right))
+        bend, twist = (unravel(_sum(row, moves[:5])) for row in _DENSE)
+        new, error = unravel(point + moves[-1]), unravel(moves[-1])
+        return Step(new, error, (), {"bend": bend, "twist": twist})
+
+
+def _derivatives(slope, t, x) -> tuple[Array, Array]:
+    """Derivative of the slope in time, and its Jacobian, by forward mode."""
+    drift = jax.jvp(lambda t: slope(t, x), (t,), (jnp.ones_like(t),))[1]
+    return drift, jax.jacfwd(lambda x: slope(t, x))(x)
+
+
+def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """One factorisation and one solve; six products are then cheaper than six solves."""
+    eye = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
+    return jax.scipy.linalg.lu_solve(jax.scipy.linalg.lu_factor(matrix), eye)
+
+
+def _sum(weights, moves) -> Any:
+    parts = [weight * move for weight, move in zip(weights, moves, strict=True)]
+    return sum(parts[1:], start=parts[0]) if parts else 0.0
+
+
+# Fixed steps of stiff systems at the price of two slopes and one small product each
+
+
+_LINEARLY_IMPLICIT_GAMMA = 1 - 2**-0.5
+
+
+class Rosenbrock2(AbstractMethod):
+    """Method of order 2 for fixed steps, whose Jacobian may be old.
+
+    The order holds for any matrix, the stability for a matrix near the Jacobian: it is taken
+    once at the start of a run, which suits rods (constant stiffness and damping in their
+    coordinates) with slow changes of inertia, or at every saved instant or tick. With the
+    Jacobian of its own step the method is L-stable.
+
+    Attributes:
+        refresh: Take a new Jacobian at every saved instant or tick of a controller.
+
+    Reference:
+        Verwer, Spee, Blom, Hundsdorfer, A second-order Rosenbrock method applied to
+        photochemical dispersion problems, SIAM J. Sci. Comput. 20, 1999.
+    """
+
+    refresh: bool = eqx.field(static=True, default=False)
+    num_order: ClassVar[int] = 2
+    interpolation_cls: ClassVar = dfx.LocalLinearInterpolation
+
+    @property
+    def keeps(self) -> bool:
+        return not self.refresh
+
+    def begin(self, field, t, y, h):
+        flat, unravel = ravel_pytree(y)
+        jacobian = jax.jacfwd(lambda x: ravel_pytree(field(t, unravel(x)))[0])(flat)
+        eye = jnp.eye(flat.shape[0], dtype=flat.dtype)
+        return jnp.linalg.inv(eye - _LINEARLY_IMPLICIT_GAMMA * h * jacobian)
+
+    def advance(self, field, t, y, h, memory):
+        flat, unravel = ravel_pytree(y)
+
+        def slope(t, x):
+            return ravel_pytree(field(t, unravel(x)))[0]
+
+        first = memory @ slope(t, flat)
+        second = memory @ (slope(t + h, flat + h * first) - 2 * first)
+        return Step(unravel(flat + h * (1.5 * first + 0.5 * second)), None, memory, {})

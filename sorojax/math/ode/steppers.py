@@ -1,0 +1,325 @@
+"""Fixed-step integrators, for loops whose cost must be known beforehand."""
+
+import abc
+import functools
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from sorojax._types import real
+from sorojax.math.host import tell
+from sorojax.math.linalg.dense import solve_symmetric
+from sorojax.math.ode.explicit import (
+    DORMAND_PRINCE,
+    RK4,
+    Field,
+    dormand_prince_step as dormand_prince_step,
+    rk4_step as rk4_step,
+    rolled_step,
+)
+from sorojax.math.ode.step_control import (
+    Doubled,
+    after_start,
+    passes,
+    rows_between,
+    rows_too_long,
+    whole_rows,
+)
+
+
+class ContactTerms(NamedTuple):
+    """Contact apart from the other forces, for methods that treat it apart.
+
+    Attributes:
+        free: (t, q, v) -> (mass matrix, force without contact, moment).
+        near: (moment, h) -> whether a step of `h` about that moment may meet contact,
+            whether it is so long that it may gain energy, and whether it may in contact.
+        force: (t, q, v) -> (force, stiffness, damping) of the contacts.
+        passed: ((q, v) before, (q, v) after, h) -> whether anything went through anything.
+        energy: (q, v) -> energy of motion, and in contacts [J].
+        plain: (t, q, v) -> the forces without contact.
+        symmetric: Whether those matrices are.
+    """
+
+    free: Callable[[Array, Array, Array], tuple[Array, Array, Any]]
+    near: Callable[[Any, Array], tuple[Array, Array, Array]]
+    force: Callable[[Array, Array, Array], tuple[Array, Array, Array]]
+    passed: Callable[[tuple[Array, Array], tuple[Array, Array], Array], Array]
+    energy: Callable[[Array, Array], tuple[Array, Array]]
+    plain: Callable[[Array, Array, Array], Array]
+    symmetric: bool = True
+
+
+class SecondOrder(NamedTuple):
+    """Equations M(q) a = f(t, q, v) with the matrices an implicit method may lean on.
+
+    Where rates are not derivatives of coordinates (a pose with a quaternion), `retract`
+    and `rate` say how they move them.
+
+    Attributes:
+        equations: (t, q, v) -> (mass matrix, force).
+        stiffness: About - df/dq.
+        damping: About - df/dv.
+        linearised: (t, q, v) -> (mass matrix, force, stiffness, damping) where those
+            matrices change along the motion, as in contact.
+        retract: (q, increment of the rates' dimension) -> q moved; a sum if None.
+        rate: (q, v) -> dq/dt; v if None.
+        contact: Contact, which `equations` hold as well, apart; None without any.
+    """
+
+    equations: Callable[[Array, Array, Array], tuple[Array, Array]]
+    stiffness: Float[Array, "dof dof"]
+    damping: Float[Array, "dof dof"]
+    linearised: Callable[[Array, Array, Array], tuple[Array, Array, Array, Array]] | None = None
+    retract: Callable[[Array, Array], Array] | None = None
+    rate: Callable[[Array, Array], Array] | None = None
+    contact: ContactTerms | None = None
+
+
+class Kinematic(NamedTuple):
+    """Coordinates, rates and accelerations of a second-order system.
+
+    In contact, `resolved` says whether every step so far could be taken; where not, the state
+    is that before the step. `gained` is the energy that steps gained by themselves [J].
+    """
+
+    q: Float[Array, " coordinates"]
+    v: Float[Array, " dof"]
+    a: Float[Array, " dof"]
+    gained: Float[Array, ""] | None = None
+    resolved: Bool[Array, ""] | None = None
+
+
+class AbstractStepper(eqx.Module):
+    """A fixed-step method for second-order systems.
+
+    Attributes:
+        settles: Whether a step of no length finds the acceleration of its state.
+    """
+
+    settles: ClassVar[bool] = False
+
+    def begin(self, problem: SecondOrder, t, q: Array, v: Array) -> Kinematic:
+        """The state to begin with."""
+        return start(problem, t, q, v)
+
+    @abc.abstractmethod
+    def step(self, problem: SecondOrder, t, h, state: Kinematic) -> Kinematic:
+        """The state after a step of `h` [s] from `t` [s]."""
+
+
+def start(problem: SecondOrder, t, q: Array, v: Array) -> Kinematic:
+    """A state with the acceleration that belongs to (q, v)."""
+    return Kinematic(q, v, solve_symmetric(*problem.equations(t, q, v)))
+
+
+def linearised(problem: SecondOrder, t, q: Array, v: Array) -> tuple[Array, ...]:
+    """Mass matrix, force, stiffness and damping at (t, q, v)."""
+    if problem.linearised is not None:
+        return problem.linearised(t, q, v)
+    return *problem.equations(t, q, v), problem.stiffness, problem.damping
+
+
+class GeneralisedAlpha(AbstractStepper):
+    """Generalised-alpha with approximate Newton passes: implicit, second order.
+
+    Its cost is known beforehand. `math.alpha.GeneralisedAlpha`, for any y' = f(t, y), solves
+    every step to a tolerance, with line search, and cuts steps that do not converge.
+
+    Attributes:
+        rho_inf: What an oscillation much faster than the step keeps of its size in one
+            step: 1 keeps and 0 kills fast modes [-].
+        passes: Newton passes per step; 2 are as good as 3 on soft rods.
+
+    Reference:
+        Chung and Hulbert, J. Appl. Mech. 60, 1993.
+    """
+
+    rho_inf: Float[Array, ""] = eqx.field(converter=real, default=0.5)
+    passes: int = eqx.field(static=True, default=2)
+    settles: ClassVar[bool] = True
+
+    def step(self, problem, t, h, state):
+        rho = self.rho_inf
+        am, af = (2 * rho - 1) / (rho + 1), rho / (rho + 1)
+        gamma = 1 / 2 + af - am
+        beta = (gamma + 1 / 2) ** 2 / 4
+        am = jnp.where(h == 0, 0.0, am)  # nothing of the acceleration before
+        q, v, a = state[:3]
+        leap = h * v + h * h * (1 / 2 - beta) * a
+        surge = v + h * (1 - gamma) * a
+
+        def improve(_, new):
+            middle_q = move(problem, q, (1 - af) * (leap + h * h * beta * new))
+            middle_v = (1 - af) * (surge + h * gamma * new) + af * v
+            mass, force, stiffness, damping = linearised(
+                problem, t + (1 - af) * h, middle_q, middle_v
+            )
+            implicit = (1 - af) * (gamma * h * damping + beta * h**2 * stiffness)
+            residual = mass @ ((1 - am) * new + am * a) - force
+            return new - solve_symmetric((1 - am) * mass + implicit, residual)
+
+        new = jax.lax.fori_loop(0, self.passes, improve, a)
+        moved = move(problem, q, leap + h * h * beta * new)
+        return Kinematic(moved, surge + h * gamma * new, new)
+
+
+class ImplicitMidpoint(AbstractStepper):
+    """Implicit midpoint with approximate Newton passes: second order, time-reversible.
+
+    Attributes:
+        passes: Newton passes per step.
+    """
+
+    passes: int = eqx.field(static=True, default=2)
+    settles: ClassVar[bool] = True
+
+    def step(self, problem, t, h, state):
+        q, v, a = state[:3]
+
+        def improve(_, new):
+            half = v + h / 2 * new
+            middle = move(problem, q, h / 2 * half)
+            mass, force, stiffness, damping = linearised(problem, t + h / 2, middle, half)
+            implicit = mass + h / 2 * damping + h**2 / 4 * stiffness
+            return new - solve_symmetric(implicit, mass @ new - force)
+
+        new = jax.lax.fori_loop(0, self.passes, improve, a)
+        return Kinematic(move(problem, q, h * (v + h / 2 * new)), v + h * new, new)
+
+
+class TripleJump(AbstractStepper):
+    """Three implicit midpoint steps of h (1.35, -1.70, 1.35): order 4.
+
+    Attributes:
+        passes: Newton passes per midpoint step. Two suit damped rods; 3 keep order 4 where
+            velocity-product forces lead, as in free flight.
+
+    Reference:
+        Yoshida, Construction of higher order symplectic integrators, Phys. Lett. A 150, 1990.
+    """
+
+    passes: int = eqx.field(static=True, default=2)
+    settles: ClassVar[bool] = True
+
+    def step(self, problem, t, h, state):
+        midpoint, outer = ImplicitMidpoint(self.passes), 1 / (2 - 2 ** (1 / 3))
+        shares = h * jnp.array([outer, 1 - 2 * outer, outer], h.dtype)
+
+        def jump(carry, share):
+            t, state = carry
+            return (t + share, midpoint.step(problem, t, share, state)), None
+
+        (_, state), _ = jax.lax.scan(jump, (t, state), shares)
+        return state
+
+
+class AbstractExplicit(AbstractStepper):
+    """Methods that keep no acceleration."""
+
+    def begin(self, problem, t, q, v):
+        return Kinematic(q, v, jnp.zeros_like(v))
+
+
+class RungeKutta4(AbstractExplicit):
+    """Classical explicit method of order 4; unstable beyond h omega = 2.8."""
+
+    def step(self, problem, t, h, state):
+        return _explicit(RK4, problem, t, h, state)
+
+
+class DormandPrince(AbstractExplicit):
+    """Explicit method of order 5, for undamped motion at high accuracy."""
+
+    def step(self, problem, t, h, state):
+        return _explicit(DORMAND_PRINCE, problem, t, h, state)
+
+
+def move(problem: SecondOrder, q: Array, increment: Array) -> Array:
+    """Coordinates after an increment of the rates' dimension."""
+    return q + increment if problem.retract is None else problem.retract(q, increment)
+
+
+def vector_field(problem: SecondOrder) -> Field:
+    """(t, (q, v)) -> (dq/dt, dv/dt), for methods of first order."""
+
+    def field(t, y):
+        q, v = y
+        rate = v if problem.rate is None else problem.rate(q, v)
+        return rate, solve_symmetric(*problem.equations(t, q, v))
+
+    return field
+
+
+def _explicit(tableau, problem: SecondOrder, t, h, state: Kinematic) -> Kinematic:
+    field = vector_field(problem)
+    q, v = rolled_step(tableau, field, t, (state.q, state.v), h)
+    if problem.retract is not None:
+        q = problem.retract(q, jnp.zeros_like(v))  # back on the manifold
+    return Kinematic(q, v, state.a)
+
+
+def integrate(
+    stepper: AbstractStepper,
+    problem: SecondOrder,
+    q: Array,
+    v: Array,
+    *,
+    t: Float[Array, ""],
+    h: Float[Array, ""],
+    saves: int,
+    every: int,
+    label: str | None = None,
+    judged: bool = True,
+) -> tuple[Kinematic, Bool[Array, ""]]:
+    """The first state and those after each of `saves` runs of `every` steps, stacked, and
+    whether the steps were too long, if that is to be `judged`; with a `label` tells how far
+    it is, about a hundred times."""
+    judged = judged and problem.contact is None  # whose steps balance their own energy
+    rows = rows_between(saves, every, judged)
+    short, count = every // rows, saves * rows
+    plan, pause = passes(count, saves * every, judged), max(1, count // 100)
+    idle = stepper.settles and count >= _WORTH_IDLING
+
+    def advance(run: Doubled, one_pass):
+        number, part, first, length = one_pass
+        begun = run.begin(part)
+
+        def one(k, state):
+            at = t + (first * short + k * length) * h
+            return stepper.step(problem, at, length * h, state)
+
+        new = jax.lax.fori_loop(0, short, one, begun) if short > 1 else one(0, begun)
+        if label is not None:
+            due = (part == 0) & ((number % pause == 0) | (number == count))
+            tell_share = functools.partial(_tell_share, label, count)
+            jax.lax.cond(due, tell_share, lambda _: None, number)
+        return run.end(part, begun, new), new
+
+    made = (plan.row + 1, plan.part, plan.start.astype(h.dtype), plan.length.astype(h.dtype))
+    if idle:
+        # A run of steps of no length finds the first acceleration: equations written out a
+        # second time before the loop would compile for almost as long as the loop.
+        made = tuple(np.insert(column, 0, 0) for column in made)
+        begin = Kinematic(q, v, jnp.zeros_like(v))
+    else:
+        begin = stepper.begin(problem, t, q, v)
+    _, states = jax.lax.scan(advance, Doubled.at(begin), made)
+    if idle:
+        begin = jax.tree.map(lambda a: a[0], states)
+        states = jax.tree.map(lambda a: a[1:], states)
+    path = after_start(begin, whole_rows(plan, states))
+    too_long = rows_too_long(plan, [path.q], [states.q])
+    return jax.tree.map(lambda a: a[::rows], path), too_long
+
+
+_WORTH_IDLING = 20  # rows that one more is at most five per cent of
+
+
+def _tell_share(label: str, rows: int, number: Array) -> None:
+    tell(label, number / rows)

@@ -1,0 +1,1 @@
+"""Reference elements with their shape functions and quadrature."""

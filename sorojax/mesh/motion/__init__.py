@@ -1,0 +1,1 @@
+"""Node positions as a differentiable function of the shape."""

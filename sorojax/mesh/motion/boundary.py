@@ -1,0 +1,279 @@
+"""Where boundary nodes go when the shape changes, by the implicit-function rule.
+
+Points put where several sides of zero sets meet, on the host.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sorojax._jax.trace_state import evaluated_now
+from sorojax._types import integers, real
+from sorojax.sdf.base import AbstractSdf, cast, quotient
+from sorojax.sdf.query import shape_tangent
+from sorojax.sdf.sampling import values_and_gradients
+
+Fields = tuple[AbstractSdf, ...]
+# Parts of an edge at which the sides of a corner are looked at, one after the other.
+ZOOMS = (0.9, 0.5, 0.2, 0.06, 0.02, 6e-3, 2e-3, 5e-4, 1e-4, 1e-5, 1e-6)
+_MOST_STEPS = 40
+
+
+class FieldPlan(eqx.Module):
+    """One zero set: its smooth nodes with the direction in which each of them moves, and
+    for every side of a sharp node which one (by place) and a vector along the side."""
+
+    nodes: Int[Array, " smooth"] = eqx.field(converter=integers)
+    normal: Float[Array, "smooth dim"] = eqx.field(converter=real)
+    beside: Int[Array, " sides"] = eqx.field(converter=integers)
+    along: Float[Array, "sides dim"] = eqx.field(converter=real)
+
+
+class BoundaryPlan(eqx.Module):
+    """Sharp nodes (corners and ridges) and one plan per field, the boundary first.
+
+    A sharp node on a ridge, listed by place in `ridge`, stays in the plane across its
+    `tangent`; other sharp nodes lie where their sides meet.
+    """
+
+    sharp: Int[Array, " sharp"] = eqx.field(converter=integers)
+    ridge: Int[Array, " ridges"] = eqx.field(converter=integers)
+    tangent: Float[Array, "ridges dim"] = eqx.field(converter=real)
+    fields: tuple[FieldPlan, ...]
+
+
+def _field_at(field: AbstractSdf, p: Float[Array, "points dim"]) -> Float[Array, " points"]:
+    return cast(field, p.dtype).distance(*(p[:, i] for i in range(field.dim)))
+
+
+def _slopes_at(field: AbstractSdf, p: Float[Array, "points dim"]):
+    """Field and gradient in one pass over all directions, which compiles faster."""
+
+    def pushed(direction):
+        return jax.jvp(
+            lambda q: _field_at(field, q), (p,), (jnp.broadcast_to(direction, p.shape),)
+        )
+
+    return jax.vmap(pushed, out_axes=(None, 1))(jnp.eye(p.shape[1], dtype=p.dtype))
+
+
+@eqx.filter_custom_jvp
+def meet(
+    fields: Fields, plan: BoundaryPlan, start: Float[Array, "sharp dim"]
+) -> Float[Array, "sharp dim"]:
+    """Where the sides of each sharp node meet, ridge nodes abreast of `start`."""
+    with evaluated_now((fields, start)):
+        return _meet(fields, plan, start)[0]
+
+
+@meet.def_jvp
+def _meet_jvp(primals, tangents):
+    fields, plan, start = primals
+    with evaluated_now((fields, start)):
+        x, normals, slopes, seen = _meet(fields, plan, start)
+    start_dot = jnp.zeros_like(start) if tangents[2] is None else tangents[2]
+    return x, _meet_dot(fields, plan, normals, slopes, seen, tangents[0], start_dot)
+
+
+@eqx.filter_jit
+def _meet(fields: Fields, plan: BoundaryPlan, start):
+    zooms = jnp.asarray(ZOOMS, start.dtype)
+
+    def closer(i, state):
+        x = state[0]
+        normals, levels, slopes, seen = _sides_near(fields, plan, x, zooms[i])
+        back = jnp.sum(plan.tangent * (start - x)[plan.ridge], axis=1)
+        return x + _least_squares(plan, normals, levels, back), normals, slopes, seen
+
+    # What the last step saw is carried out: the field is compiled once.
+    count = sum(own.beside.shape[0] for own in plan.fields)
+    along = tuple(own.along.astype(start.dtype) for own in plan.fields)
+    slopes = jnp.zeros(count, start.dtype)
+    begin = (start, jnp.broadcast_to(slopes[:, None], (count, start.shape[1])), slopes, along)
+    return jax.lax.fori_loop(0, len(ZOOMS), closer, begin)
+
+
+@eqx.filter_jit
+def _meet_dot(fields, plan, normals, slopes, seen, fields_dot, start_dot):
+    def fields_at(fields):
+        return tuple(_field_at(f, p) for f, p in zip(fields, seen, strict=True))
+
+    f_dot = jnp.concatenate(shape_tangent(fields_at, fields, fields_dot))
+    across = jnp.sum(plan.tangent * start_dot[plan.ridge], axis=1)
+    return _least_squares(plan, normals, -f_dot / slopes, across)
+
+
+def _sides_near(fields: Fields, plan: BoundaryPlan, x, zoom):
+    """Sides beside the sharp nodes `x`: normal, how far x is from its plane, slope, place."""
+    sides, seen = [], []
+    for field, own in zip(fields, plan.fields, strict=True):
+        step = zoom * own.along
+        p = x[own.beside] + step
+        f, g = _slopes_at(field, p)
+        slope = jnp.sqrt(jnp.sum(g * g, axis=1))
+        slope = jnp.where(slope > 0, slope, jnp.ones_like(slope))
+        n = g / slope[:, None]
+        sides.append((n, jnp.sum(n * step, axis=1) - f / slope, slope))
+        seen.append(p)
+    normals, levels, slopes = (jnp.concatenate(part) for part in zip(*sides, strict=True))
+    return normals, levels, slopes, tuple(seen)
+
+
+def _least_squares(plan: BoundaryPlan, normals, levels, across):
+    """Step s of each sharp node with n . s = level for its sides, t . s = across."""
+    beside = jnp.concatenate([own.beside for own in plan.fields] + [plan.ridge])
+    rows = jnp.concatenate([normals, plan.tangent])
+    levels = jnp.concatenate([levels, across])
+    count, dim = plan.sharp.shape[0], rows.shape[1]
+    # The small identity decides where sides are parallel, and vanishes with the step.
+    matrix = jnp.broadcast_to(1e-9 * jnp.eye(dim, dtype=rows.dtype), (count, dim, dim))
+    matrix = matrix.at[beside].add(rows[:, :, None] * rows[:, None, :])
+    rhs = jnp.zeros((count, dim), rows.dtype).at[beside].add(rows * levels[:, None])
+    return _cramer(matrix, rhs)
+
+
+def _cramer(matrix: Float[Array, "n dim dim"], rhs: Float[Array, "n dim"]):
+    """Solutions of small systems; a library call would compile for a second."""
+    if rhs.shape[1] == 2:
+        (a, b), (c, d) = jnp.moveaxis(matrix, 0, 2)
+        x, y = rhs.T
+        return jnp.stack([d * x - b * y, a * y - c * x], axis=1) / (a * d - b * c)[:, None]
+    a, b, c = jnp.moveaxis(matrix, 2, 0)
+    cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
+    det = jnp.sum(a * cofactors[:, 0], axis=1)
+    return jnp.sum(cofactors * rhs[:, None, :], axis=2) / det[:, None]
+
+
+@eqx.filter_custom_jvp
+def slide(
+    fields: Fields, plan: BoundaryPlan, start: tuple[Float[Array, "smooth dim"], ...]
+) -> tuple[Float[Array, "smooth dim"], ...]:
+    """Smooth nodes of each field moved from `start` along their normals to the zero set."""
+    with evaluated_now((fields, start)):
+        return _slide(fields, plan, start)[0]
+
+
+@slide.def_jvp
+def _slide_jvp(primals, tangents):
+    fields, plan, start = primals
+    with evaluated_now((fields, start)):
+        x, slopes = _slide(fields, plan, start)
+    moving = jax.tree.map(
+        lambda s, dot: jnp.zeros_like(s) if dot is None else dot,
+        start, tangents[2], is_leaf=lambda leaf: leaf is None,
+    )  # fmt: skip
+    return x, _slide_dot(fields, plan, x, slopes, tangents[0], moving)
+
+
+@eqx.filter_jit
+def _slide(fields: Fields, plan: BoundaryPlan, start):
+    pairs = [
+        _slide_one(field, own.normal, x)
+        for field, own, x in zip(fields, plan.fields, start, strict=True)
+    ]
+    return tuple(x for x, _ in pairs), tuple(slope for _, slope in pairs)
+
+
+def _slide_one(field: AbstractSdf, normal, start):
+    tiny = 4 * jnp.finfo(start.dtype).eps
+
+    def descend(state):
+        x, _, _, count = state
+        f, slope = jax.jvp(lambda q: _field_at(field, q), (x,), (normal,))
+        new = x - quotient(f, slope)[:, None] * normal
+        far = jnp.max(jnp.abs(new - x), initial=0) > tiny * jnp.max(jnp.abs(x), initial=0)
+        return new, slope, far, count + 1
+
+    begin = (start, jnp.zeros_like(start[:, 0]), jnp.array(start.size > 0), 0)
+    final = jax.lax.while_loop(lambda s: s[2] & (s[3] < _MOST_STEPS), descend, begin)
+    return final[:2]
+
+
+@eqx.filter_jit
+def _slide_dot(fields, plan, x, slopes, fields_dot, start_dot):
+    def fields_at(both):
+        return tuple(_field_at(f, p) for f, p in zip(*both, strict=True))
+
+    f_dot = shape_tangent(fields_at, (fields, x), (fields_dot, start_dot))
+    return tuple(
+        dot - quotient(f, slope)[:, None] * own.normal
+        for dot, f, slope, own in zip(start_dot, f_dot, slopes, plan.fields, strict=True)
+    )
+
+
+# Points put where several sides of zero sets meet, on the host
+
+
+SETTLE_ZOOMS = (0.5, 0.25, 0.1, 0.03, 0.01, 1e-3, 1e-4, 1e-5)
+_NO_ROWS = np.zeros((0, 3))
+
+
+class Sides(NamedTuple):
+    """Sides that points lie on, one row each.
+
+    Attributes:
+        point: (n,) which point.
+        field: (n,) which zero set.
+        along: (n, 3) from the point along the side [m]; zero where the set is smooth.
+    """
+
+    point: np.ndarray
+    field: np.ndarray
+    along: np.ndarray
+
+    def of(self, points: np.ndarray, count: int) -> "Sides":
+        """The sides of some `points` of `count`, renumbered in their order."""
+        place = np.full(count, -1)
+        place[points] = np.arange(len(points))
+        own = place[self.point] >= 0
+        return Sides(place[self.point[own]], self.field[own], self.along[own])
+
+
+def no_sides() -> Sides:
+    return Sides(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)))
+
+
+def joined(*parts: Sides) -> Sides:
+    return Sides(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+
+def normals_near(fields: tuple[AbstractSdf, ...], x, sides: Sides, zoom: float):
+    """Unit normals of sides looked at from `zoom` of their vectors away, and how far the
+    points are from their tangent planes."""
+    step = zoom * sides.along
+    p = x[sides.point] + step
+    f, g = np.zeros(len(p)), np.zeros_like(p)
+    for i, field in enumerate(fields):
+        own = sides.field == i
+        f[own], g[own] = values_and_gradients(field, p[own])
+    slope = np.maximum(np.linalg.norm(g, axis=1), 1e-9)
+    n = g / slope[:, None]
+    return n, (n * step).sum(axis=1) - f / slope
+
+
+def settle(
+    fields: tuple[AbstractSdf, ...],
+    x,
+    sides: Sides,
+    zooms=SETTLE_ZOOMS,
+    ridge=(),
+    tangent=_NO_ROWS,
+) -> np.ndarray:
+    """`x` (points, 3) moved by the shortest way to where their sides meet; those listed in
+    `ridge` stay in the planes across their `tangent`."""
+    start, x, ridge = np.asarray(x, dtype=float), np.array(x, dtype=float), list(ridge)
+    for zoom in zooms if len(x) else ():
+        n, level = normals_near(fields, x, sides, zoom)
+        matrix = np.broadcast_to(1e-11 * np.eye(3), (len(x), 3, 3)).copy()
+        np.add.at(matrix, sides.point, n[:, :, None] * n[:, None, :])
+        rhs = np.zeros_like(x)
+        np.add.at(rhs, sides.point, n * level[:, None])
+        if ridge:
+            matrix[ridge] += tangent[:, :, None] * tangent[:, None, :]
+            rhs[ridge] += tangent * ((start - x)[ridge] * tangent).sum(axis=1, keepdims=True)
+        x += np.linalg.solve(matrix, rhs[..., None])[..., 0]
+    return x

@@ -1,0 +1,305 @@
+"""Node positions as a differentiable function of a shape, on a fixed topology.
+
+Whether the boundary of a mesh can follow its shape, and whether it did.
+"""
+
+import warnings
+from collections import OrderedDict
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sorojax._jax.trace_state import is_traced
+from sorojax._types import integers, real
+from sorojax.mesh.elements.elements import PolyN, facet_corners
+from sorojax.mesh.elements.shape_functions import nodes as reference_nodes, shape_functions
+from sorojax.mesh.mesh import Mesh, boundary_facets
+from sorojax.mesh.motion.boundary import ZOOMS, BoundaryPlan, Sides, meet, settle, slide
+from sorojax.mesh.motion.plan import (
+    Harmonic,
+    harmonic,
+    laplace_cells,
+    laplace_graph,
+    linear_element,
+    plan_outline,
+    plan_surface,
+    spread,
+)
+from sorojax.mesh.quality import least_corner
+from sorojax.mesh.resolution import thinnest
+from sorojax.mesh.sizes import Sizes
+from sorojax.sdf.base import AbstractSdf
+from sorojax.sdf.sampling import values_and_gradients
+
+_OFF = 1e-3  # of an edge: distance from the zero set of a node that was to be on it
+_FAR = 0.25  # of an edge: motion of a corner beyond which its sides may be taken for others
+_ROUNDS = 5  # of taking nodes from ridges
+_NAMED = 24  # nodes at most of which the thinnest place is named
+_LOST = 0.5  # of the size: how far a sharp node may settle from where it is
+
+
+def movable(where: str, fields: tuple[AbstractSdf, ...], mesh: Mesh, size: Sizes) -> Mesh:
+    """A solid mesh whose corners and ridge nodes settle where they are.
+
+    Their sides are looked at from the facets beside them: where these are as long as a wall
+    is thick, another surface is seen, and `move` would take it for theirs. Such nodes of the
+    boundary count as those of a chamfer: they stay, and are no longer in "ridges" and
+    "corners". Where interfaces meet the boundary there is an error.
+    """
+    for _ in range(_ROUNDS):
+        lost = _unsettled(fields, mesh, size)
+        if not len(lost):
+            return mesh
+        names = ("ridges", "corners")
+        kept = {k: np.setdiff1d(mesh.node_sets[k], lost) for k in names if k in mesh.node_sets}
+        fewer = eqx.tree_at(lambda m: m.node_sets, mesh, {**mesh.node_sets, **kept})
+        if all(len(kept[k]) == len(mesh.node_sets[k]) for k in kept):
+            break
+        mesh = fewer
+    x = np.asarray(mesh.points)[lost]
+    name, at, thick = min(
+        (thinnest(field, x[:_NAMED], size.largest) for field in fields), key=lambda f: f[2]
+    )
+    raise ValueError(
+        f"{where}: {len(lost)} nodes of sharp edges are beside a {name}, a layer or a bend "
+        f"too narrow for the cells, the thinnest near {at} m about {thick:.2g} m thick. "
+        "Lower `size` to the thinnest wall or layer or less, or thicken it."
+    )
+
+
+def _unsettled(fields: tuple[AbstractSdf, ...], mesh: Mesh, size: Sizes) -> np.ndarray:
+    """Corners and ridge nodes that do not settle where they are."""
+    plan = plan_surface(mesh, len(fields) - 1).plan
+    sharp = np.asarray(plan.sharp)
+    x = np.asarray(mesh.points)[sharp]
+    count = [len(own.beside) for own in plan.fields]
+    sides = Sides(
+        np.concatenate([own.beside for own in plan.fields]).astype(int),
+        np.repeat(np.arange(len(fields)), count),
+        np.concatenate([own.along for own in plan.fields]),
+    )
+    found = settle(fields, x, sides, ZOOMS, np.asarray(plan.ridge), np.asarray(plan.tangent))
+    off = np.linalg.norm(found - x, axis=1) / size(x)
+    return sharp[~(off < _LOST)]
+
+
+def check_followed(
+    plan: BoundaryPlan, fields: tuple[AbstractSdf, ...], mesh: Mesh, moved: np.ndarray
+) -> None:
+    """Raise if nodes of the boundary missed their zero sets; warn if corners went far."""
+    before, edge = np.asarray(mesh.points), _edges(mesh)
+    for field, own in zip(fields, plan.fields, strict=True):
+        nodes = np.concatenate([own.nodes, np.unique(np.asarray(plan.sharp)[own.beside])])
+        f, g = values_and_gradients(field, moved[nodes])
+        off = np.abs(f) / np.maximum(np.linalg.norm(g, axis=1), 1e-3)
+        lost = np.flatnonzero(~(off < _OFF * edge[nodes]))
+        if len(lost):
+            raise ValueError(
+                f"move: {len(lost)} nodes miss the new surface, the first near "
+                f"{moved[nodes[lost[0]]]} m by {off[lost[0]]:.2g} m: the shape changes by more "
+                "than this mesh can follow. Change it less, or mesh the new shape."
+            )
+    sharp = np.asarray(plan.sharp)
+    share = np.linalg.norm(moved[sharp] - before[sharp], axis=1) / edge[sharp]
+    if share.max(initial=0) > _FAR:
+        warnings.warn(
+            f"move: a corner or ridge near {before[sharp[share.argmax()]]} m moves by "
+            f"{share.max():.2f} of the edges beside it, need {_FAR:g} or less for certain "
+            "derivatives. Mesh the new shape, or move in smaller steps of a new mesh each.",
+            stacklevel=3,
+        )
+
+
+def _edges(mesh: Mesh) -> np.ndarray:
+    """Shortest side of the boundary beside each node [m]; infinite off the boundary."""
+    points, count = np.asarray(mesh.points), facet_corners(mesh.element)
+    groups = [boundary_facets(mesh)]
+    groups += [np.asarray(f) for n, f in mesh.facet_sets.items() if n.startswith("interface_")]
+    facets = np.concatenate(groups)
+    corners = facets[:, :count]
+    length = np.linalg.norm(points[np.roll(corners, -1, axis=1)] - points[corners], axis=2)
+    shortest = np.full(len(points), np.inf)
+    np.minimum.at(shortest, facets, np.repeat(length.min(axis=1)[:, None], facets.shape[1], 1))
+    return shortest
+
+
+# Node positions as a differentiable function of a shape, on a fixed topology
+
+
+def move(mesh: Mesh, shape: AbstractSdf, *, interfaces: tuple[AbstractSdf, ...] = ()) -> Mesh:
+    """`mesh` with its nodes moved to fit `shape`, differentiable in the parameters.
+
+    Corners move to where their sides meet, nodes on the ridges of a solid stay on both
+    sides, the others move along the normal of `mesh` from a place between the shifted
+    corners. Interior nodes follow by one Laplace solve with the stiffness of `mesh`;
+    straight sides stay straight. A mesh moved to its own shape stays as it is.
+
+    The topology does not change: corners may move by a quarter of the edges beside them
+    from where they are in `mesh`, and normals turn by less than a right angle. Outside a
+    trace a warning tells when corners go farther, and nodes that miss the new surface are
+    refused; under a trace `distortion` tells when to mesh anew.
+
+    Args:
+        mesh: A concrete mesh whose boundary nodes lie on the zero set, as `triangulate`
+            and `tetrahedralise` make it; node sets "corners" and "ridges" are used where
+            it has them, sharp turns of the boundary otherwise.
+        shape: The new shape, of the same structure; may be traced.
+        interfaces: The new interfaces, in the order given to the mesher.
+
+    Raises:
+        ValueError: If the mesh is traced, made of polygons, has other interfaces, or
+            (outside a trace) if a cell would turn inside out or a node miss the surface.
+    """
+    if is_traced(mesh):
+        raise ValueError(
+            "move: the mesh is traced, need concrete points and cells. Build it outside jit "
+            "and trace only the parameters of the shape."
+        )
+    if isinstance(mesh.element, PolyN):
+        raise ValueError(
+            f"move: got {mesh.element.name} cells, need triangles, quadrilaterals, "
+            "tetrahedra or hexahedra. Mesh with triangulate."
+        )
+    fields = (shape, *interfaces)
+    if any(field.dim != mesh.element.dim for field in fields):
+        raise ValueError(
+            f"move: the mesh is {mesh.element.dim}-D, the fields are "
+            f"{[field.dim for field in fields]}-D. Pass the shape it was made from."
+        )
+    motion = _prepared(mesh, len(interfaces))
+    points = moved_points(motion, fields, mesh.points)
+    if not is_traced(points):
+        _check_upright(np.asarray(points), mesh)
+        check_followed(motion.border, fields, mesh, np.asarray(points))
+    return eqx.tree_at(lambda m: m.points, mesh, points)
+
+
+def _check_upright(points: np.ndarray, mesh: Mesh) -> None:
+    corners = np.asarray(mesh.cells)[:, : mesh.element.num_corners]
+    least = least_corner(points[corners], linear_element(mesh.element))
+    if not np.all(least > 0):
+        where = points[corners[np.argmin(np.nan_to_num(least, nan=-np.inf))]].mean(axis=0)
+        do = "triangulate" if mesh.element.dim == 2 else "mesh"
+        raise ValueError(
+            f"move: a cell turns inside out near {where} m: the shape changes by more than "
+            f"this mesh can follow. Change it less, or {do} the new shape."
+        )
+
+
+class _Motion(eqx.Module):
+    """What is known of a mesh before the shape is: plans, Laplace problems, straight sides.
+
+    `middles` are nodes that follow the corners `parents` of a cell with `weights`; those
+    in `bent` are put on the surface afterwards.
+    """
+
+    border: BoundaryPlan
+    ridges: Harmonic | None
+    surface: Harmonic | None
+    inside: Harmonic | None
+    middles: Int[Array, " middles"] = eqx.field(converter=integers)
+    parents: Int[Array, "middles corners"] = eqx.field(converter=integers)
+    weights: Float[Array, "middles corners"] = eqx.field(converter=real)
+    bent: Int[Array, " bent"] = eqx.field(converter=integers)
+
+
+def moved_points(
+    motion: _Motion, fields: tuple[AbstractSdf, ...], points: Float[Array, "nodes dim"]
+) -> Float[Array, "nodes dim"]:
+    """Points of a mesh after its boundary has followed `fields`."""
+    border, sharp = motion.border, None
+    if len(border.sharp):
+        sharp = meet(fields, border, points[border.sharp])
+        if motion.ridges is not None:
+            sharp = meet(fields, border, _ridge_guess(motion, points, sharp))
+    starts = _side_guess(motion, points, sharp)
+    return _everywhere(motion, points, sharp, slide(fields, border, starts))
+
+
+@eqx.filter_jit
+def _ridge_guess(motion: _Motion, points, sharp):
+    assert motion.ridges is not None
+    shift = _follow(motion, spread(motion.ridges, _shift(motion, points, sharp)))
+    at = motion.border.sharp
+    return (points + shift)[at]
+
+
+@eqx.filter_jit
+def _side_guess(motion: _Motion, points, sharp):
+    shift = _shift(motion, points, sharp)
+    if motion.surface is not None:
+        shift = _follow(motion, spread(motion.surface, shift))
+    return tuple((points + shift)[own.nodes] for own in motion.border.fields)
+
+
+@eqx.filter_jit
+def _everywhere(motion: _Motion, points, sharp, landed):
+    shift = _shift(motion, points, sharp)
+    for own, x in zip(motion.border.fields, landed, strict=True):
+        shift = shift.at[own.nodes].set(x - points[own.nodes])
+    on_boundary = shift[motion.bent]
+    if motion.inside is not None:
+        shift = spread(motion.inside, shift)
+    return points + _follow(motion, shift).at[motion.bent].set(on_boundary)
+
+
+def _shift(motion: _Motion, points, sharp):
+    shift = jnp.zeros_like(points)
+    if sharp is None:
+        return shift
+    at = motion.border.sharp
+    return shift.at[at].set(sharp - points[at])
+
+
+def _follow(motion: _Motion, shift):
+    """`shift` with that of all mid-side nodes interpolated from their cells."""
+    if not len(motion.middles):
+        return shift
+    between = jnp.einsum("mk,mki->mi", motion.weights, shift[motion.parents])
+    return shift.at[motion.middles].set(between)
+
+
+def _motion(mesh: Mesh, num_interfaces: int) -> _Motion:
+    points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
+    element, linear = mesh.element, linear_element(mesh.element)
+    plan = (plan_outline if element.dim == 2 else plan_surface)(mesh, num_interfaces)
+    known = np.zeros(mesh.num_nodes, bool)
+    known[plan.corners] = True
+    ridges = None
+    if len(plan.ridges):
+        ridges = harmonic(plan.ridges, laplace_graph(points, plan.ridges), known)
+    known[np.asarray(plan.plan.sharp)] = True
+    surface = harmonic(plan.faces, laplace_graph(points, plan.faces), known)
+    for own in plan.plan.fields:
+        known[np.asarray(own.nodes)] = True
+    corners = cells[:, : element.num_corners]
+    inside = harmonic(corners, laplace_cells(points, corners, linear), known)
+    others = cells[:, element.num_corners :]
+    middles, place = np.unique(others, return_index=True)
+    cell, column = np.divmod(place, max(others.shape[1], 1))
+    share = shape_functions(linear, reference_nodes(element)[element.num_corners :])
+    bent = middles[known[middles]]
+    return _Motion(
+        plan.plan, ridges, surface, inside, middles, corners[cell], share[column], bent
+    )
+
+
+_recent: OrderedDict[tuple[int, int, int], Any] = OrderedDict()
+
+
+def _prepared(mesh: Mesh, num_interfaces: int) -> _Motion:
+    """What `moved_points` needs of `mesh`, kept for the last few meshes."""
+    key = (id(mesh.points), id(mesh.cells), num_interfaces)
+    if key not in _recent:
+        # Concrete work, also when called under the user's trace.
+        with jax.ensure_compile_time_eval():
+            # The arrays are kept alive, so that their ids stay theirs.
+            _recent[key] = (_motion(mesh, num_interfaces), mesh.points, mesh.cells)
+        if len(_recent) > 4:
+            _recent.popitem(last=False)
+    _recent.move_to_end(key)
+    return _recent[key][0]

@@ -1,0 +1,1 @@
+"""Plane meshes: outlines, triangles, polygons."""

@@ -1,0 +1,161 @@
+"""From a plane shape to triangles: exact boundary, hexagonal inside, curved sides.
+
+Six-node triangles made from three-node ones, and whether they are valid.
+"""
+
+import numpy as np
+
+from sorojax import _check
+from sorojax._types import real
+from sorojax.mesh.elements.elements import Tri3, Tri6
+from sorojax.mesh.mesh import Mesh
+from sorojax.mesh.plane.delaunay import Missing, fill
+from sorojax.mesh.plane.outline import Outline, outline, split
+from sorojax.mesh.resolution import bulging, raise_if_thin, raise_thin, unseen
+from sorojax.mesh.sizes import SizeFunction, Sizes, sizes
+from sorojax.sdf.base import AbstractSdf
+from sorojax.sdf.sampling import EmptyShape, finite_box, land, raise_empty
+
+
+def with_middles(
+    points: np.ndarray, cells: np.ndarray, edges: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points and cells with a node in the middle of every side, and those of `edges`."""
+    corners = [facet[:2] for facet in Tri6().facets]
+    sides = np.sort(np.concatenate([cells[:, list(c)] for c in corners]), axis=1)
+    n = len(points)
+    keys, number = np.unique(sides @ [n, 1], return_inverse=True)
+    ends = np.stack(np.divmod(keys, n), axis=-1)
+    middles = points[ends].mean(axis=1)
+    columns = n + number.reshape(3, -1).T
+    on_edges = n + np.searchsorted(keys, np.sort(edges, axis=1) @ [n, 1])
+    return np.concatenate([points, middles]), np.concatenate([cells, columns], 1), on_edges
+
+
+def least_jacobian(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Lower bound of det dx/dxi in each six-node triangle over twice its area.
+
+    The determinant is a quadratic polynomial: its smallest Bernstein coefficient
+    bounds it from below.
+    """
+    x = points[cells]
+    at_nodes = np.stack([_determinant(x, *node) for node in _NODES], axis=1)
+    middles = 2 * at_nodes[:, 3:] - (at_nodes[:, :3] + np.roll(at_nodes[:, :3], -1, 1)) / 2
+    return np.minimum(at_nodes[:, :3].min(axis=1), middles.min(axis=1)) / _scale(x)
+
+
+_NODES = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.5))
+
+
+def _scale(x: np.ndarray) -> np.ndarray:
+    a, b = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]
+    return np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+
+def _determinant(x: np.ndarray, r: float, s: float) -> np.ndarray:
+    t = 1 - r - s
+    dr = np.array([1 - 4 * t, 4 * r - 1, 0, 4 * (t - r), 4 * s, -4 * s])
+    ds = np.array([1 - 4 * t, 0, 4 * s - 1, -4 * r, 4 * r, 4 * (t - s)])
+    a, b = np.einsum("cni,n->ci", x, dr), np.einsum("cni,n->ci", x, ds)
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+# From a plane shape to triangles: exact boundary, hexagonal inside, curved sides
+
+
+_LOOKS = (4, 8, 24)  # points within a size where the shape is looked at: more if in doubt
+_REPAIRS = 6  # rounds of splitting edges that cross
+
+
+def triangulate(
+    shape: AbstractSdf,
+    *,
+    size: float | SizeFunction,
+    order: int = 1,
+    interfaces: tuple[AbstractSdf, ...] = (),
+    iterations: int = 6,
+) -> Mesh:
+    """Triangles that fill a plane shape.
+
+    Boundary points lie on the zero set to rounding, corners included; edges turn at
+    most about 45 degrees on fillets and are split where walls are thinner than they
+    are long. With `order=2` the sides on the boundary and on interfaces are curved.
+
+    Node sets of the result: "corners" (also where curves cross) and "interface_0",
+    ...; facet sets: "boundary" and "interface_0", ....
+
+    Args:
+        shape: A concrete, bounded plane shape.
+        size: Wanted length of the sides [m]: a number, or a function of points (n, 2)
+            that returns one length per point, such as `grade(...)`.
+        order: 1 for `Tri3`, 2 for `Tri6`.
+        interfaces: Shapes whose zero sets become sides of the mesh inside `shape`.
+        iterations: Smoothing steps; more give slightly rounder triangles.
+
+    Raises:
+        ValueError: If the shape is empty, unbounded, traced, or not resolved by `size`.
+    """
+    if order not in (1, 2):
+        raise ValueError(
+            f"triangulate: `order` is {order}, need 1 (Tri3) or 2 (Tri6). Other degrees "
+            "do not exist."
+        )
+    _check.float64("triangulate", real(0.0))
+    box = finite_box("triangulate", shape, 2)
+    lengths = sizes("triangulate", size, *box)
+    interfaces = tuple(interfaces)
+    lines, points, cells = _filled(shape, interfaces, lengths, box, iterations)
+    if order == 1:
+        return Mesh(points, cells, Tri3(), *_sets(lines, lines.edges, len(interfaces)))
+    return _curved((shape, *interfaces), lines, points, cells)
+
+
+def _filled(shape, interfaces, lengths: Sizes, box, iterations: int):
+    """`(lines, points, cells)`; the outline is drawn from nearer where it is in doubt."""
+    for looks in _LOOKS:
+        try:
+            lines = outline(shape, interfaces, lengths, looks)
+            if not len(lines.edges):
+                raise_empty("triangulate", *box, lengths.smallest / looks)
+        except EmptyShape:
+            if looks < _LOOKS[-1]:
+                continue
+            raise_if_thin("triangulate", shape, *box, lengths)
+            raise
+        if looks < _LOOKS[-1] and bulging((shape, *interfaces), lines, lengths):
+            continue
+        doubt = unseen(shape, lines, lengths, *box)
+        for _ in range(_REPAIRS if not len(doubt) else 0):
+            try:
+                return lines, *fill(shape, lines, lengths, iterations)
+            except Missing as found:
+                doubt = lines.points[lines.edges[found.edges]].mean(axis=1)
+                lines = split((shape, *interfaces), lines, found.edges)
+    raise_thin("triangulate", (shape, *interfaces), doubt, lengths)
+
+
+def _curved(fields, lines: Outline, points, cells) -> Mesh:
+    """The quadratic mesh, middles of outline edges moved onto their zero sets."""
+    points, cells, middles = with_middles(points, cells, lines.edges)
+    for i, field in enumerate(fields):
+        mine = middles[lines.owner == i]
+        points[mine] = land(field, points[mine])
+    worst = least_jacobian(points, cells)
+    if worst.min() <= 0:
+        where = points[cells[worst.argmin()]].mean(axis=0)
+        raise ValueError(
+            f"triangulate: a curved side turns its triangle inside out near {where} m. "
+            "Lower `size` so that the bend is resolved."
+        )
+    facets = np.concatenate([lines.edges, middles[:, None]], axis=1)
+    return Mesh(points, cells, Tri6(), *_sets(lines, facets, len(fields) - 1))
+
+
+def _sets(lines: Outline, facets: np.ndarray, count: int):
+    nodes = {"corners": np.flatnonzero(lines.corner)}
+    sides = {"boundary": facets[lines.owner == 0]}
+    for i in range(count):
+        mine = facets[lines.owner == i + 1]
+        nodes[f"interface_{i}"] = np.unique(mine)
+        sides[f"interface_{i}"] = mine
+    return nodes, sides

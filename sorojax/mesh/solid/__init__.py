@@ -1,0 +1,1 @@
+"""Solid meshes: tetrahedra on a lattice, their edges, interfaces and quality."""

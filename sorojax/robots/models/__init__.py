@@ -1,0 +1,1 @@
+"""Simulation models of the printable robots."""

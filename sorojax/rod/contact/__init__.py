@@ -1,0 +1,1 @@
+"""Contact with shapes, rods, links and itself."""

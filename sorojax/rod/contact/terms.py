@@ -1,0 +1,148 @@
+"""The contacts among the forces on a rod, apart from the others, for steppers."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from sorojax.math.ode.steppers import ContactTerms
+from sorojax.rod.contact.obstacle import AbstractContact, Linearised, twice_turn, twice_way
+from sorojax.rod.dynamics.fields import Motion
+from sorojax.rod.forces.forces import AbstractForce, total_force
+
+# twice the turn [rad], and twice the way over the length of a rod, that make a step long
+_TURN, _SHARE = 0.6, 0.02
+_SWIFT = 0.2  # twice the way over the narrowest radius that makes it swift
+
+
+def has_contact(forces: tuple[AbstractForce, ...]) -> bool:
+    """Whether a contact is listed, so that a stepper must treat it apart."""
+    return any(isinstance(force, AbstractContact) for force in forces)
+
+
+def contact_terms(
+    forces: tuple[AbstractForce, ...],
+    at: Callable[[Array, Array], Motion],
+    inertia: Callable[[Any], tuple[Array, Array]],
+) -> ContactTerms:
+    """The listed contacts, and the equations without them.
+
+    Args:
+        forces: Generalised forces, contacts among them.
+        at: (q, v) -> motion.
+        inertia: motion -> (mass matrix, Coriolis force).
+    """
+    plain = tuple(force for force in forces if not isinstance(force, AbstractContact))
+    contacts = tuple(force for force in forces if isinstance(force, AbstractContact))
+
+    def force(t, q, v):
+        moment = at(q, v)
+        return linearised(contacts, t, moment)
+
+    def passed(before, after, h):
+        return any_of([passed_by(contact, h, (before,), (after,)) for contact in contacts])
+
+    def stored(moment):
+        return sum(contact.stored(moment) for contact in contacts)
+
+    def near(moment, h):
+        rows = [reached(contact, h, moment) for contact in contacts]
+        return tuple(any_of(flags) for flags in zip(*rows, strict=True))
+
+    parts = Parts(lambda t, moment: total_force(plain, t, moment), passed, stored)
+    return terms_of(parts, near, force, at, inertia)
+
+
+class Parts(NamedTuple):
+    """What `ContactTerms` are made of.
+
+    Attributes:
+        plain: (t, motion) -> the forces without contacts.
+        passed: (motion before, motion after, h) -> whether anything went through anything.
+        stored: motion -> energy in contacts.
+    """
+
+    plain: Callable[[Array, Any], Array]
+    passed: Callable[[Any, Any, Array], Array]
+    stored: Callable[[Any], Any]
+
+
+def terms_of(
+    parts: Parts,
+    near: Callable,
+    force: Callable,
+    at: Callable[[Array, Array], Any],
+    inertia: Callable[[Any], tuple[Array, Array]],
+    symmetric: bool = True,
+) -> ContactTerms:
+    """The terms by (q, v), from those by motion."""
+
+    def free(t, q, v):
+        moment = at(q, v)
+        mass, coriolis = inertia(moment)
+        return mass, parts.plain(t, moment) - coriolis, moment
+
+    def passed(before, after, h):
+        return parts.passed(*still((at(*before), at(*after))), h)
+
+    def energy(q, v):
+        moment = at(q, v)
+        mass, _ = inertia(moment)
+        return still((v @ mass @ v / 2, parts.stored(moment)))
+
+    def plain(t, q, v):
+        return still(parts.plain(t, at(q, v)))
+
+    return ContactTerms(free, near, force, passed, energy, plain, symmetric)
+
+
+def reached(contact: Any, h: Float[Array, ""], *bodies: Any) -> tuple[Array, Array, Array]:
+    """Whether a contact may act within a step of `h` [s]; whether the step is so long that it
+    may gain energy by itself; and whether it is, against the size of what meets, in contact."""
+    ways = sum((twice_way(body, h) for body in bodies), start=0 * h)
+    is_long = any_of([long(body, h) for body in bodies])
+    return contact.is_near(*bodies, h), is_long, ways > _SWIFT * contact.narrowest
+
+
+def long(moment: Any, h: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether any section turns, or moves, far within a step of `h` [s]."""
+    turns = twice_turn(moment, h) > _TURN
+    if not isinstance(moment, Motion):
+        return turns
+    return turns | (twice_way(moment, h) > _SHARE * moment.rod.length)
+
+
+def passed_by(
+    contact: Any, h: Float[Array, ""], before: tuple, after: tuple
+) -> Bool[Array, ""]:
+    """Whether in a step of `h` [s] one body of a contact went through the other, at one test
+    if they are far."""
+    contact = still(contact)
+    is_near = contact.is_near(*before, h) | contact.is_near(*after, h)
+    return jax.lax.cond(
+        is_near, lambda: contact.passed(before, after), lambda: jnp.zeros((), bool)
+    )
+
+
+def any_of(flags: Sequence[Array]) -> Bool[Array, ""]:
+    return jnp.any(jnp.stack(flags))
+
+
+def still(tree: Any) -> Any:
+    """`tree` without derivatives."""
+    numbers, rest = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(jax.lax.stop_gradient(numbers), rest)
+
+
+def linearised(
+    contacts: tuple[AbstractContact, ...], t: Float[Array, ""], motion: Motion
+) -> Linearised:
+    """Sum of one or more contacts with their stiffness and damping."""
+    total = contacts[0].linearised(t, motion)
+    for contact in contacts[1:]:
+        term = contact.linearised(t, motion)
+        total = Linearised(*(a + b for a, b in zip(total, term, strict=True)))
+    return total

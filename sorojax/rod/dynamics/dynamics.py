@@ -1,0 +1,296 @@
+"""Equations of motion of a rod or assembly: M a + coriolis = sum of generalised forces.
+
+These are doors: each compiles once per structure of the model and its forces. Loops use
+`motion`, `inertia` and `total_force` directly, with `operators` taken outside.
+
+Energy and momentum of a rod or assembly, and the matrix behind its Coriolis force.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sorojax._types import Numbers, real
+from sorojax.math.compiled import batched, door, full_products
+from sorojax.math.linalg.dense import solve_symmetric
+from sorojax.rod.dynamics.composite import part_columns
+from sorojax.rod.dynamics.fields import Motion
+from sorojax.rod.dynamics.moving import mass_jacobian, mass_position
+from sorojax.rod.dynamics.points import moment_of
+from sorojax.rod.dynamics.tree import AssemblyMotion, part_motion
+from sorojax.rod.forces import loads
+from sorojax.rod.forces.forces import Gravity
+from sorojax.rod.model.assembly import Assembly, is_flat, rate, slices
+from sorojax.rod.model.link import LinkMotion
+from sorojax.rod.model.model import Model, inertia, motion, operators
+from sorojax.rod.model.rod import Rod
+
+Coordinates = Float[Array, " coordinates"]
+Rates = Float[Array, " dof"]
+Forces = tuple[loads.Load, ...]
+
+
+@door
+def mass_matrix(model: Model, q: Coordinates) -> Float[Array, "dof dof"]:
+    """Inertia of the model in its coordinates."""
+    return inertia(motion(model, q))[0]
+
+
+@door
+def coriolis_force(model: Model, q: Coordinates, v: Rates) -> Rates:
+    """C(q, v) v: what velocity alone adds to the left of the equations of motion."""
+    return inertia(motion(model, q, v))[1]
+
+
+@door
+def gravity_force(model: Model, q: Coordinates, gravity: Numbers | None = None) -> Rates:
+    """Gradient of the gravitational energy, on the left of the equations of motion.
+
+    Args:
+        model: The rod or assembly.
+        q: Coordinates.
+        gravity: [m/s^2]; by default 9.81 against the last axis.
+    """
+    return -loads.weight(Gravity(gravity), _zero(q), motion(model, q))
+
+
+@door
+def bias_force(model: Model, q: Coordinates, v: Rates, gravity: Numbers | None = None) -> Rates:
+    """C(q, v) v + g(q), what a computed-torque controller cancels."""
+    moment = motion(model, q, v)
+    return inertia(moment)[1] - loads.weight(Gravity(gravity), _zero(q), moment)
+
+
+@door
+def stiffness_matrix(model: Model) -> Float[Array, "dof dof"]:
+    """Stiffness of the linear elasticity of rods and joints."""
+    return operators(model).stiffness
+
+
+@door
+def elastic_force(model: Model, q: Coordinates) -> Rates:
+    """K q, on the left of the equations of motion."""
+    moment = motion(model, q)
+    return -loads.total_force((), _zero(q), moment)
+
+
+@door
+def damping_matrix(model: Model, forces: Forces) -> Float[Array, "dof dof"]:
+    """Sum of the damping terms among `forces` and of the dampers of joints."""
+    return loads.damping_matrix(forces, model, operators(model))
+
+
+@door
+def forward_dynamics(
+    model: Model,
+    q: Float[Array, "*states coordinates"],
+    v: Float[Array, "*states dof"],
+    forces: Forces = (),
+    *,
+    t=0.0,
+) -> Float[Array, "*states dof"]:
+    """Acceleration of the coordinates, of one state or many.
+
+    States along a first axis of `q` and `v` are taken in chunks that stay in the cache of a
+    CPU, those of `jax.vmap` at once. For many models, or a loop around this verb, use
+    `sorojax.math.compiled.batched`.
+
+    Args:
+        model: The rod or assembly.
+        q: Coordinates, or those of many states.
+        v: Their rates, of the same states.
+        forces: Generalised forces; elasticity acts unless one replaces it.
+        t: Time [s].
+
+    Raises:
+        ValueError: If the shapes do not fit the model or each other.
+    """
+    constants, t = operators(model), real(t)
+
+    def one(q, v):
+        return acceleration(model, constants, t, q, v, forces)
+
+    if np.ndim(q) == 1 and np.ndim(v) == 1:
+        return one(q, v)
+    return batched(one)(q, v)
+
+
+@full_products
+def acceleration(
+    model: Model,
+    constants: Any,
+    t: Float[Array, ""],
+    q: Coordinates,
+    v: Rates,
+    forces: Forces,
+) -> Rates:
+    """`forward_dynamics` without a door, for loops that hold `operators(model)`."""
+    moment = motion(model, q, v, constants=constants)
+    mass, coriolis = inertia(moment)
+    return solve_symmetric(mass, loads.total_force(forces, t, moment) - coriolis)
+
+
+@door
+def inverse_dynamics(
+    model: Model, q: Coordinates, v: Rates, a: Rates, forces: Forces = (), *, t=0.0
+) -> Rates:
+    """Generalised force that an actuator must add to reach the acceleration `a`."""
+    moment = motion(model, q, v)
+    mass, coriolis = inertia(moment)
+    return mass @ a + coriolis - loads.total_force(forces, real(t), moment)
+
+
+class VectorField(eqx.Module):
+    """(t, (q, v), args) -> (dq/dt, dv/dt): the right-hand side that diffrax integrates.
+
+    The field is a pytree: `diffrax.ODETerm(vector_field(rod, forces))` is differentiable
+    in the rod and its forces.
+    """
+
+    model: Model
+    constants: Any
+    forces: Forces
+
+    def __call__(self, t: Any, state: tuple[Array, Array], args: Any = None):
+        q, v = state
+        t = jnp.asarray(t, q.dtype)
+        a = acceleration(self.model, self.constants, t, q, v, self.forces)
+        return coordinate_rate(self.model, q, v), a
+
+
+def vector_field(model: Model, forces: Forces = ()) -> VectorField:
+    """The equations of first order of a model, for any solver of diffrax."""
+    return VectorField(model, operators(model), forces)
+
+
+def coordinate_rate(model: Model, q: Coordinates, v: Rates) -> Coordinates:
+    """dq/dt; v itself but for quaternions."""
+    if isinstance(model, Assembly) and not is_flat(model):
+        return rate(model, q, v)
+    return v
+
+
+def _zero(q: Coordinates) -> Float[Array, ""]:
+    return jnp.zeros((), q.dtype)
+
+
+# Energy and momentum of a rod or assembly, and the matrix behind its Coriolis force
+
+
+@door
+def kinetic_energy(
+    model: Model, q: Float[Array, " coordinates"], v: Float[Array, " dof"]
+) -> Float[Array, ""]:
+    """v' M v / 2 [J]."""
+    return v @ inertia(motion(model, q))[0] @ v / 2
+
+
+@door
+def potential_energy(
+    model: Model, q: Float[Array, " coordinates"], gravity: Numbers | None = None
+) -> Float[Array, ""]:
+    """Linear elastic energy [J], and that of the weight in `gravity` [m/s^2] if given."""
+    moment = motion(model, q)
+    strains = _strain_coordinates(model, q)
+    energy = strains @ moment.operators.stiffness @ strains / 2
+    if gravity is None:
+        return energy
+    g = real(gravity)
+    for part, _ in _parts(moment):
+        energy = energy - jnp.sum(
+            part.operators.mass[:, None] * g[None, :] * mass_position(part)
+        )
+    return energy
+
+
+@door
+def momentum(
+    model: Model, q: Float[Array, " coordinates"], v: Float[Array, " dof"]
+) -> Float[Array, " twist"]:
+    """Angular momentum about the origin [kg m^2/s], then linear momentum [kg m/s]."""
+    total = None
+    for part, _ in _parts(motion(model, q, v)):
+        mass, rotary, linear, local = _rows(part)
+        velocity = linear @ part.v
+        push = mass[:, None] * velocity
+        spin = jnp.einsum("pij,pj->pi", rotary, local @ part.v)
+        if spin.shape[1] == 3:
+            spin = jnp.einsum("pij,pj->pi", part.directors, spin)
+        angular = spin + moment_of(mass_position(part), push)
+        term = jnp.concatenate([jnp.sum(angular, axis=0), jnp.sum(push, axis=0)])
+        total = term if total is None else total + term
+    assert total is not None
+    return total
+
+
+@door
+def coriolis_matrix(
+    model: Model, q: Float[Array, " coordinates"], v: Float[Array, " dof"]
+) -> Float[Array, "dof dof"]:
+    """C(q, v) with C v the Coriolis force, and dM/dt - 2 C skew-symmetric.
+
+    Reference:
+        Murray, Li, Sastry, A Mathematical Introduction to Robotic Manipulation, 1994,
+        section 4.3, for the property; here section by section, in axes of the section.
+    """
+
+    def rows(q):
+        moment = motion(model, q)
+        found = []
+        for part, columns in _parts(moment):
+            mass, rotary, linear, local = _rows(part)
+            if columns is not None:
+                linear, local = linear @ columns, local @ columns
+            found.append((mass, rotary, linear, local))
+        return found
+
+    now, rates = jax.jvp(rows, (q,), (coordinate_rate(model, q, v),))
+    total = jnp.zeros((v.shape[0],) * 2, q.dtype)
+    for (mass, rotary, linear, local), (_, _, moving, turning) in zip(now, rates, strict=True):
+        total = total + jnp.einsum("p,pin,pim->nm", mass, linear, moving)
+        torque = jnp.einsum("pij,pjm->pim", rotary, turning)
+        if local.shape[1] == 3:
+            spun = jnp.einsum("pij,pj->pi", rotary, local @ v)
+            torque = torque - jnp.cross(spun[:, :, None], local, axis=1)
+        total = total + jnp.einsum("pin,pim->nm", local, torque)
+    return total
+
+
+def _parts(
+    moment: Motion | AssemblyMotion,
+) -> list[tuple[Motion | LinkMotion, Float[Array, "own dof"] | None]]:
+    """The parts in the world frame, with their columns per rate of the model."""
+    if isinstance(moment, Motion):
+        return [(moment, None)]
+    columns = part_columns(moment)
+    return [(part_motion(moment, k), columns[k]) for k in range(len(columns))]
+
+
+def _rows(part: Motion | LinkMotion) -> tuple[Array, Array, Array, Array]:
+    """Mass and rotary inertia of each section; Jacobians, the angular one in its axes."""
+    angular = part.angular_jacobian
+    local = angular
+    if angular.shape[1] == 3:
+        local = jnp.einsum("pji,pjn->pin", part.directors, angular)
+    if isinstance(part, LinkMotion):
+        rotary = part.rotary[None]
+    else:
+        rotary = jax.vmap(jnp.diag)(part.operators.rotary.T)
+    return part.operators.mass, rotary, mass_jacobian(part), local
+
+
+def _strain_coordinates(model: Model, q: Array) -> Float[Array, " dof"]:
+    """Coordinates in the order of the rates; quaternions, which store no energy, as zero."""
+    if isinstance(model, Rod) or is_flat(model):
+        return q
+    pieces = []
+    for part, at in zip(model.parts, slices(model), strict=True):
+        count = part.joint.num_dof(model.group)
+        flat = part.joint.num_coordinates(model.group) == count
+        pieces.append(q[at.joint_q] if flat else jnp.zeros(count, q.dtype))
+        pieces.append(q[at.rod_q])
+    return jnp.concatenate(pieces)

@@ -1,0 +1,196 @@
+"""Where the rod is: strains, poses, Jacobians."""
+
+from typing import overload
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax._types import Numbers, real
+from sorojax.math.compiled import door
+from sorojax.math.lie import homogeneous
+from sorojax.math.quadrature import integration_rows, interpolation_rows
+from sorojax.rod.dynamics.composite import bias_accelerations, part_columns
+from sorojax.rod.dynamics.fields import Motion, operators, rest_along
+from sorojax.rod.dynamics.moving import cross, turned
+from sorojax.rod.dynamics.points import Points
+from sorojax.rod.dynamics.tree import AssemblyMotion, bias_rates, part_motion, rod_motion
+from sorojax.rod.model.assembly import Assembly
+from sorojax.rod.model.link import LinkMotion
+from sorojax.rod.model.model import Model, inertia as inertia, motion as motion
+from sorojax.rod.model.rod import Rod, strain_names
+
+_TIP = np.ones(1)
+
+Poses = Float[Array, "points h h"]
+Jacobians = Float[Array, "points twist dof"]
+
+
+@door
+def strain(
+    rod: Rod, q: Float[Array, " dof"], s: Numbers | None = None
+) -> Float[Array, "points strain"]:
+    """Strain of the section: curvatures [1/m], then stretch and shears [-].
+
+    Args:
+        rod: The rod.
+        q: Coordinates.
+        s: Where, in [0, 1]; the Gauss nodes if omitted.
+    """
+    constants = operators(rod)
+    rows = constants.strain_rows if s is None else rod.basis(real(s).astype(q.dtype))
+    change = dict(zip(rod.basis.active, rows @ q, strict=True))
+    rest, points = rest_along(constants), rows.shape[1]
+    if s is not None and rest.shape[0] > 1:
+        at = interpolation_rows(rod.quadrature, real(s).astype(q.dtype))
+        rest = jnp.asarray(at, q.dtype) @ rest
+    parts = [
+        jnp.broadcast_to(rest[:, k], (points,)) + change.get(name, jnp.zeros(points, q.dtype))
+        for k, name in enumerate(strain_names(rod.group))
+    ]
+    return jnp.stack(parts, axis=1)
+
+
+@overload
+def forward_kinematics(model: Rod, q: Array, s: Numbers | None = None) -> Poses: ...
+@overload
+def forward_kinematics(
+    model: Assembly, q: Array, s: Numbers | None = None
+) -> dict[str, Poses]: ...
+@door
+def forward_kinematics(
+    model: Model, q: Float[Array, " coordinates"], s: Numbers | None = None
+) -> Poses | dict[str, Poses]:
+    """Poses of the sections: local to base frame, positions in m.
+
+    Args:
+        model: The rod; of an assembly the poses of every part by name, one for a link.
+        q: Coordinates.
+        s: Where, in [0, 1]; the Gauss nodes if omitted.
+    """
+    if isinstance(model, Assembly):
+        return {name: _poses(part, s) for name, part in _parts(motion(model, q))}
+    return _poses(rod_motion(model, q), s)
+
+
+@overload
+def tip_pose(model: Rod, q: Array) -> Float[Array, "h h"]: ...
+@overload
+def tip_pose(model: Assembly, q: Array) -> dict[str, Float[Array, "h h"]]: ...
+@door
+def tip_pose(model: Model, q: Float[Array, " coordinates"]):
+    """Pose of the last section, of every part by name: local to base frame, position in m."""
+    if isinstance(model, Assembly):
+        return {name: _poses(part, _TIP)[0] for name, part in _parts(motion(model, q))}
+    return _poses(rod_motion(model, q), _TIP)[0]
+
+
+@overload
+def jacobian(model: Rod, q: Array, s: Numbers | None = None) -> Jacobians: ...
+@overload
+def jacobian(model: Assembly, q: Array, s: Numbers | None = None) -> dict[str, Jacobians]: ...
+@door
+def jacobian(
+    model: Model, q: Float[Array, " coordinates"], s: Numbers | None = None
+) -> Jacobians | dict[str, Jacobians]:
+    """Twists of the sections per coordinate rate, angular velocity first, world frame.
+
+    Args:
+        model: The rod; of an assembly the Jacobians of every part by name, one for a link.
+        q: Coordinates.
+        s: Where, in [0, 1]; the Gauss nodes if omitted.
+    """
+    if isinstance(model, Rod):
+        return _jacobian(rod_motion(model, q), s)
+    moment = motion(model, q)
+    return {
+        name: _jacobian(part, s) @ columns
+        for (name, part), columns in zip(_parts(moment), part_columns(moment), strict=True)
+    }
+
+
+@door
+def jacobian_rate_product(
+    model: Model,
+    q: Float[Array, " coordinates"],
+    v: Float[Array, " dof"],
+    s: Numbers | None = None,
+) -> Float[Array, "points twist"] | dict[str, Float[Array, "points twist"]]:
+    """dJ/dt v: accelerations of the sections that velocity alone makes, world frame.
+
+    Args:
+        model: The rod; of an assembly those of every part by name, one for a link.
+        q: Coordinates.
+        v: Their rates.
+        s: Where, in [0, 1]; the Gauss nodes if omitted.
+    """
+    if isinstance(model, Rod):
+        return _rate_product(rod_motion(model, q, v), s, None)
+    moment = motion(model, q, v)
+    ground = zip(_parts(moment), moment.frames, bias_accelerations(moment), strict=True)
+    found = {}
+    for (name, part), frame, local in ground:
+        rot = model.group.rotation_dim
+        start = None if local is None else _turned_twist(frame.rotation, local, rot)
+        found[name] = _rate_product(part, s, start)
+    return found
+
+
+def tip_angle(moment: Motion) -> Float[Array, ""]:
+    """Angle of the last section of a planar rod on its base [rad], continuous past half a
+    turn."""
+    if moment.rod.group.space_dim != 2:
+        raise ValueError("tip_angle: needs a planar rod, got a spatial one. Use tip_pose.")
+    bending = moment.angular_rate[:, 0] @ moment.q
+    return moment.operators.weights @ (bending + rest_along(moment.operators)[:, 0])
+
+
+def _parts(moment: AssemblyMotion) -> list[tuple[str, Motion | LinkMotion]]:
+    names = moment.assembly.names
+    return [(name, part_motion(moment, k)) for k, name in enumerate(names)]
+
+
+def _poses(moment: Motion | LinkMotion, s) -> Poses:
+    if isinstance(moment, LinkMotion):
+        return homogeneous(moment.base.directors, moment.base.position)[None]
+    if s is None:
+        return homogeneous(moment.directors, moment.position)
+    at = Points(moment, _rows(moment.rod, s))
+    return homogeneous(at.directors, at.position)
+
+
+def _jacobian(moment: Motion | LinkMotion, s) -> Jacobians:
+    if isinstance(moment, LinkMotion):
+        return moment.tip_jacobian[None]
+    at = moment if s is None else Points(moment, _rows(moment.rod, s))
+    return jnp.concatenate([at.angular_jacobian, at.linear_jacobian], axis=1)
+
+
+def _rate_product(
+    moment: Motion | LinkMotion, s, start: Float[Array, " twist"] | None
+) -> Float[Array, "points twist"]:
+    """Velocity-product accelerations, on a base that has the acceleration `start`."""
+    if isinstance(moment, LinkMotion):
+        return jnp.zeros_like(moment.v)[None] if start is None else start[None]
+    rows = moment.operators.integration if s is None else _rows(moment.rod, s)
+    angular, linear = (rows @ rate for rate in bias_rates(moment))
+    if start is not None:
+        rot, at = angular.shape[1], Points(moment, rows)
+        assert moment.base is not None
+        arms = at.position - moment.base.position[None]
+        angular = angular + start[None, :rot]
+        linear = linear + start[None, rot:] + cross(start[:rot], arms)
+    return jnp.concatenate([angular, linear], axis=1)
+
+
+def _turned_twist(rotation: Array, twist: Array, rot: int) -> Array:
+    spin = turned(rotation, twist[None, :rot, None])[0, :, 0]
+    return jnp.concatenate([spin, rotation @ twist[rot:]])
+
+
+def _rows(rod: Rod, s) -> Float[Array, "points quad"]:
+    """Integration weights from the base to each s [m]."""
+    s = s if s is _TIP else real(s).astype(rod.length.dtype)
+    _check.shape("rod", "s", s, (None,), "Give a list of points in [0, 1].")
+    return rod.length * jnp.asarray(integration_rows(rod.quadrature, s), rod.length.dtype)

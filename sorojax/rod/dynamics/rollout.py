@@ -1,0 +1,143 @@
+"""Motion of a rod or assembly with a fixed step: the fast path, for known forces."""
+
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax._display import displayed, number, outcome
+from sorojax._types import Numbers, real
+from sorojax.math.compiled import full_products
+from sorojax.math.ode.contact_midpoint import ContactMidpoint
+from sorojax.math.ode.step_control import judged_status
+from sorojax.math.ode.steppers import AbstractStepper, GeneralisedAlpha, SecondOrder, integrate
+from sorojax.math.status import Status
+from sorojax.rod.contact.assembly_terms import any_contact, contacts_of
+from sorojax.rod.dynamics.dynamics import Forces
+from sorojax.rod.forces.loads import damping_matrix, on_model, tangent_stiffness, total_force
+from sorojax.rod.model.assembly import is_flat, rate, retract
+from sorojax.rod.model.model import Model, inertia, motion, operators
+from sorojax.rod.model.rod import Rod
+from sorojax.rod.statics.validity import checked_status
+
+
+@displayed
+class Rollout(eqx.Module):
+    """A motion sampled in time: time [s], coordinates and their rates."""
+
+    time: Float[Array, " time"]
+    q: Float[Array, "time coordinates"]
+    v: Float[Array, "time dof"]
+    status: Status
+
+    def _text(self) -> str:
+        return (
+            f"Rollout: {self.time.shape[0]} saved moments of {self.q.shape[-1]} coordinates, "
+            f"{outcome(self.status)}\n  time {number(self.time, 's')}, q {number(self.q)}"
+        )
+
+
+def rollout(
+    model: Model,
+    q: Float[Array, " coordinates"],
+    v: Float[Array, " dof"],
+    forces: Forces = (),
+    *,
+    step: Numbers,
+    saves: int,
+    every: int = 1,
+    t=0.0,
+    stepper: AbstractStepper | None = None,
+    progress: bool = False,
+    check: bool = True,
+) -> Rollout:
+    """Move the model from (q, v) by `saves * every` steps.
+
+    Args:
+        model: The rod or assembly.
+        q: Coordinates at `t`.
+        v: Their rates.
+        forces: Generalised forces.
+        step: Length of one step [s]; 1e-3 to 5e-3 suit soft fingers.
+        saves: Number of saved moments after the first.
+        every: Steps between two of them.
+        t: Start [s].
+        stepper: `GeneralisedAlpha()` by default, `ContactMidpoint()` if a contact is among
+            the forces; `RungeKutta4()` or `DormandPrince()` for undamped motion at high
+            accuracy.
+        progress: Report progress while running; of rods under `vmap` in one report.
+        check: Make some of the steps again by two of half the length, and end as `unstable`
+            where errors add up to the motion: a twentieth of the time of a run of 160 steps
+            or more, four to six half steps of a shorter one. Runs of fewer than 8 steps are
+            not judged.
+    """
+    if saves < 0 or every < 1:
+        raise ValueError(
+            f"rollout: got saves={saves} and every={every}, need 0 and 1 or more. They count "
+            "moments and steps."
+        )
+    if stepper is None:
+        stepper = ContactMidpoint() if any_contact(forces) else GeneralisedAlpha()
+    label = "rollout" if progress else None
+    return _rollout(
+        model, q, v, forces, real(step), real(t), stepper, saves, every, label, check
+    )
+
+
+@eqx.filter_jit
+@full_products
+def _rollout(model, q, v, forces, step, t, stepper, saves, every, label, check) -> Rollout:
+    step, t, stepper = _like(q, (step, t, stepper))
+    problem = second_order(model, q, forces)
+    path, too_long = integrate(
+        stepper, problem, q, v, t=t, h=step, saves=saves, every=every, label=label,
+        judged=check,
+    )  # fmt: skip
+    fine = jnp.all(jnp.isfinite(path.q)) & jnp.all(jnp.isfinite(path.v))
+    status = Status.where(fine, Status.successful, Status.not_finite)
+    if path.resolved is not None:
+        status = Status.where(jnp.all(path.resolved), status, Status.unresolved)
+    time = t + step * every * jnp.arange(saves + 1, dtype=step.dtype)
+    if check:
+        status = checked_status(judged_status(status, too_long), model, path.q)
+    return Rollout(time, path.q, path.v, status)
+
+
+def _like(q, tree):
+    """`tree` with its numbers in the precision of the coordinates."""
+    return jax.tree.map(lambda x: x.astype(q.dtype) if eqx.is_inexact_array(x) else x, tree)
+
+
+def second_order(
+    model: Model,
+    q: Float[Array, " coordinates"],
+    forces: Forces,
+) -> SecondOrder:
+    """The equations of the model, with its stiffness at `q` and its damping."""
+    constants, forces = operators(model), on_model(forces, model)
+
+    def at(q, v):
+        return motion(model, q, v, constants=constants)
+
+    # What the equations make on their way would pass through the stores of all loops in
+    # reverse mode, in memory and in the compiled program.
+    @functools.partial(jax.checkpoint, prevent_cse=False)
+    def equations(t, q, v):
+        moment = at(q, v)
+        mass, coriolis = inertia(moment)
+        return mass, total_force(forces, t, moment) - coriolis
+
+    stiffness = tangent_stiffness(forces, motion(model, q, constants=constants))
+    damping = damping_matrix(forces, model, constants)
+    tree: Any = None if isinstance(model, Rod) or is_flat(model) else model
+    return SecondOrder(
+        equations,
+        stiffness,
+        damping,
+        retract=tree and functools.partial(retract, tree),
+        rate=tree and functools.partial(rate, tree),
+        contact=contacts_of(model, forces, at, inertia),
+    )

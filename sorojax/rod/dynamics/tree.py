@@ -1,0 +1,345 @@
+"""An assembly at one moment: batches of equal rods, and the tree that carries them.
+
+Each part is seen in its own frame: its columns are the twist of the frame and its own
+coordinates, so the cost of a rod does not grow with what carries it. Only the tree knows
+the coordinates of the assembly: twists pass outwards, inertia and loads inwards.
+
+Reference:
+    Featherstone, Rigid Body Dynamics Algorithms, 2008, chapters 5 and 6, for the passes.
+
+The planar or the spatial equations, as the group of a rod asks.
+
+Rows of equal structure worked on one after the other: a program holds the work once.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax.math.quadrature import integration_rows
+from sorojax.rod.dynamics import moving, planar, spatial
+from sorojax.rod.dynamics.fields import Motion, Operators, operators
+from sorojax.rod.dynamics.points import Points
+from sorojax.rod.model.assembly import (
+    Assembly,
+    dtype_of,
+    num_coordinates,
+    num_dof,
+    parents,
+    slices,
+)
+from sorojax.rod.model.link import LinkOperators, link_motion, link_operators, place_link
+from sorojax.rod.model.rod import Rod
+
+_KERNEL = {2: planar, 3: spatial}
+
+
+def rod_motion(
+    rod: Rod,
+    q: Float[Array, " dof"],
+    v: Float[Array, " dof"] | None = None,
+    constants: Operators | None = None,
+) -> Motion:
+    """The fields of a rod clamped at the origin."""
+    do = f"The rod has {rod.basis.num_dof} coordinates, ordered as its basis."
+    _check.shape("rod", "q", q, (rod.basis.num_dof,), do)
+    constants = operators(rod) if constants is None else constants
+    v = jnp.zeros_like(q) if v is None else v
+    return _KERNEL[rod.group.space_dim].motion(rod, constants, q, v)
+
+
+def rod_inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:
+    """Mass matrix and Coriolis force of a moment."""
+    return _KERNEL[moment.rod.group.space_dim].inertia(moment)
+
+
+def bias_rates(moment: Motion) -> tuple[Float[Array, "quad rot"], Float[Array, "quad dim"]]:
+    """d/ds of the accelerations at zero coordinate acceleration, angular and linear."""
+    return _KERNEL[moment.rod.group.space_dim].bias_rates(moment)
+
+
+# An assembly at one moment: batches of equal rods, and the tree that carries them
+
+
+class AssemblyOperators(NamedTuple):
+    """Constant arrays of an assembly.
+
+    Attributes:
+        parts: Those of each part.
+        batches: Those of equal rods, stacked.
+        rows: Integrals from the base of the carrier to each mount [m].
+        stiffness, damping: Linear elasticity of rods and joints, damping of joints.
+    """
+
+    parts: tuple[Operators | LinkOperators, ...]
+    batches: tuple[Operators, ...]
+    rows: tuple[Float[Array, "1 quad"] | None, ...]
+    stiffness: Float[Array, "dof dof"]
+    damping: Float[Array, "dof dof"]
+
+
+class Mount(NamedTuple):
+    """How a part moves on its carrier.
+
+    Attributes:
+        carried: Twist of the part per twist and coordinate of the carrier; the ground has none.
+        axes: Twist of the part per rate of the joint.
+        turn: Rotation from the carrier's frame to the part's.
+        joint_axes: Twist per rate of the joint along the carrier's axes.
+        arm: From the section of the carrier to the part, along the carrier's axes [m]; None of
+            a part that sits there.
+        spin: Angular Jacobian of that section in the columns of the carrier.
+    """
+
+    carried: Float[Array, "twist carrier"]
+    axes: Float[Array, "twist joint"]
+    turn: Float[Array, "dim dim"]
+    joint_axes: Float[Array, "twist joint"]
+    arm: Float[Array, " dim"] | None
+    spin: Float[Array, "rot carrier"]
+
+
+class Frame(NamedTuple):
+    """Where the frame of a part is in the world, and its twist along its own axes."""
+
+    rotation: Float[Array, "dim dim"]
+    position: Float[Array, " dim"]
+    twist: Float[Array, " twist"]
+
+
+class AssemblyMotion(eqx.Module):
+    """An assembly at one moment; forces see its parts by `part_motion`.
+
+    Attributes:
+        assembly: The assembly.
+        operators: Its constants.
+        q, v: Coordinates and rates.
+        batches: Motions of equal rods, clamped in their own frames, stacked.
+        mounts, frames: How each part is carried, and where it is.
+    """
+
+    assembly: Assembly
+    operators: AssemblyOperators
+    q: Float[Array, " coordinates"]
+    v: Float[Array, " dof"]
+    batches: tuple[Motion, ...]
+    mounts: tuple[Mount, ...]
+    frames: tuple[Frame, ...]
+
+
+def batches(assembly: Assembly) -> tuple[tuple[int, ...], ...]:
+    """Indices of the rods of equal structure, which are computed together."""
+    kinds: list = []
+    found: list[list[int]] = []
+    for index, part in enumerate(assembly.parts):
+        if isinstance(part.body, Rod):
+            leaves, structure = jax.tree.flatten(part.body)
+            kind = (structure, [(leaf.shape, leaf.dtype) for leaf in leaves])
+            if kind not in kinds:
+                kinds.append(kind)
+                found.append([])
+            found[kinds.index(kind)].append(index)
+    return tuple(tuple(members) for members in found)
+
+
+def assembly_operators(assembly: Assembly) -> AssemblyOperators:
+    """The constant arrays of `assembly`; differentiable in all its leaves."""
+    dtype, total = dtype_of(assembly), num_dof(assembly)
+    parts, rows = [], []
+    stiffness, damping = jnp.zeros((total, total), dtype), jnp.zeros((total, total), dtype)
+    for part, on, at in zip(assembly.parts, parents(assembly), slices(assembly), strict=True):
+        body = part.body
+        own = operators(body) if isinstance(body, Rod) else link_operators(body, dtype)
+        parts.append(own)
+        carrier = None if on is None else assembly.parts[on].body
+        rows.append(_rows(carrier, part.s) if isinstance(carrier, Rod) else None)
+        spring, damper = part.joint.matrices(assembly.group, dtype)
+        stiffness = stiffness.at[at.joint_v, at.joint_v].set(spring)
+        damping = damping.at[at.joint_v, at.joint_v].set(damper)
+        if isinstance(body, Rod):
+            stiffness = stiffness.at[at.rod_v, at.rod_v].set(own.stiffness)
+    stacks = tuple(
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), *(parts[k] for k in members))
+        for members in batches(assembly)
+    )
+    return AssemblyOperators(tuple(parts), stacks, tuple(rows), stiffness, damping)
+
+
+def assembly_motion(
+    assembly: Assembly,
+    q: Float[Array, " coordinates"],
+    v: Float[Array, " dof"] | None = None,
+    constants: AssemblyOperators | None = None,
+) -> AssemblyMotion:
+    """The fields of all parts at (q, v)."""
+    count = num_coordinates(assembly)
+    do = f"The assembly has {count} coordinates and {num_dof(assembly)} rates; see `rest`."
+    _check.shape("assembly", "q", q, (count,), do)
+    v = jnp.zeros(num_dof(assembly), q.dtype) if v is None else v
+    _check.shape("assembly", "v", v, (num_dof(assembly),), do)
+    constants = assembly_operators(assembly) if constants is None else constants
+    places = slices(assembly)
+    moments = []
+    for members, stack in zip(batches(assembly), constants.batches, strict=True):
+        rod = assembly.parts[members[0]].body
+        assert isinstance(rod, Rod)
+        own_q = jnp.stack([q[places[k].rod_q] for k in members])
+        own_v = jnp.stack([v[places[k].rod_v] for k in members])
+        every = eqx.filter_vmap(lambda c, q, v, rod=rod: rod_motion(rod, q, v, c))
+        moments.append(every(stack, own_q, own_v))
+    blank = AssemblyMotion(assembly, constants, q, v, tuple(moments), (), ())
+    mounts, frames = _carry(blank)
+    return AssemblyMotion(assembly, constants, q, v, tuple(moments), mounts, frames)
+
+
+def clamped(moment: AssemblyMotion, index: int) -> Motion:
+    """The motion of a rod in its own frame, clamped there."""
+    for members, stack in zip(batches(moment.assembly), moment.batches, strict=True):
+        if index in members:
+            one = _member(stack, members.index(index))
+            own = moment.operators.parts[index]
+            both = (moment.assembly.parts[index].body, own)
+            return eqx.tree_at(lambda m: (m.rod, m.operators), one, both)
+    raise ValueError(f"assembly: `{moment.assembly.names[index]}` is a link, need a rod.")
+
+
+def _member(stack: Motion, at: int) -> Motion:
+    return jax.tree.map(lambda leaf: leaf[at] if eqx.is_array(leaf) else leaf, stack)
+
+
+def part_motion(moment: AssemblyMotion, index: int) -> Any:
+    """A part in the world frame, a `Motion` or a `LinkMotion`; its columns are its own twist
+    and coordinates."""
+    rotation, position, twist = moment.frames[index]
+    body = moment.assembly.parts[index].body
+    if isinstance(body, Rod):
+        return moving.place(moving.release(clamped(moment, index), twist), rotation, position)
+    constants = moment.operators.parts[index]
+    assert isinstance(constants, LinkOperators)
+    return place_link(link_motion(body, constants, twist), rotation, position)
+
+
+Section = tuple[Array, Array, Array, Array]
+
+
+def _sections(moment: AssemblyMotion) -> list[Section]:
+    """Rotation, position and Jacobians (angular, linear) of what carries each part, in the
+    frame of the carrier and its columns; those on equal rods together."""
+    group, dtype = moment.assembly.group, moment.q.dtype
+    dim, rot, twist = group.space_dim, group.rotation_dim, group.algebra_dim
+    eye, on = jnp.asarray(np.eye(twist), dtype), parents(moment.assembly)
+    ground = (jnp.asarray(np.eye(dim), dtype), jnp.zeros(dim, dtype), eye[:rot], eye[rot:])
+    found: list[Section] = [ground] * len(on)
+    weights = {k: rows for k, rows in enumerate(moment.operators.rows) if rows is not None}
+    for members, stack in zip(batches(moment.assembly), moment.batches, strict=True):
+        carried = [k for k in weights if on[k] in members]
+        if not carried:
+            continue
+        places = [members.index(on[k]) for k in carried]
+        rows = jnp.stack([weights[k] for k in carried])
+        every = eqx.filter_vmap(_section)(_members(stack, places), rows)
+        for nth, k in enumerate(carried):
+            rotation, centre, angular, linear = (field[nth] for field in every)
+            found[k] = rotation, centre, angular, linear
+    return found
+
+
+def _section(moment: Motion, rows: Float[Array, "1 quad"]) -> Section:
+    at, dim = Points(moment, rows), moment.tangent.shape[1]
+    centre, angular = at.position[0], at.angular_jacobian[0]
+    rot, dtype = angular.shape[0], angular.dtype
+    eye = jnp.asarray(np.eye(rot + dim), dtype)
+    linear = eye[rot:].at[:, :rot].set(moving.levers(centre[None])[0])
+    angular = jnp.concatenate([eye[:rot], angular], axis=1)
+    linear = jnp.concatenate([linear, at.linear_jacobian[0]], axis=1)
+    return at.directors[0], centre, angular, linear
+
+
+def _members(stack: Motion, places: list[int]) -> Motion:
+    first, count = places[0], len(places)
+    # A slice is a view, a gather a loop.
+    in_row = places == list(range(first, first + count))
+    at = slice(first, first + count) if in_row else np.array(places)
+    return jax.tree.map(lambda leaf: leaf[at] if eqx.is_array(leaf) else leaf, stack)
+
+
+def _carry(moment: AssemblyMotion) -> tuple[tuple[Mount, ...], tuple[Frame, ...]]:
+    """The pass from the ground outwards: poses and twists."""
+    assembly, mounts, frames = moment.assembly, [], []
+    places, carriers = slices(assembly), _sections(moment)
+    for index, on in enumerate(parents(assembly)):
+        mount, position = _mount(moment, index, on, carriers[index])
+        v = moment.v[places[index].joint_v]
+        twist, rotation = mount.axes @ v, mount.turn
+        if on is not None:
+            carrier = frames[on]
+            own = jnp.concatenate([carrier.twist, moment.v[places[on].rod_v]])
+            twist = twist + mount.carried @ own
+            rotation, moved = moving.turned_pose(carrier.rotation, rotation, position)
+            position = carrier.position + moved
+        mounts.append(mount)
+        frames.append(Frame(rotation, position, twist))
+    return tuple(mounts), tuple(frames)
+
+
+def _mount(
+    moment: AssemblyMotion, index: int, on: int | None, carrier: Section
+) -> tuple[Mount, Array]:
+    """The mount of a part, and its position in the frame of the carrier."""
+    assembly, dtype = moment.assembly, moment.q.dtype
+    part, group = assembly.parts[index], assembly.group
+    dim, rot = group.space_dim, group.rotation_dim
+    rotation, centre, angular, linear = carrier
+    arm = None
+    if part.offset is not None:
+        offset = part.offset.astype(dtype)
+        rotation, arm = moving.turned_pose(rotation, offset[:dim, :dim], offset[:dim, dim])
+    turn = rotation
+    if part.joint.num_dof(group) > 0:
+        turned_by, shift = part.joint.pose(group, moment.q[slices(assembly)[index].joint_q])
+        turn, shift = moving.turned_pose(rotation, turned_by, shift)
+        arm = shift if arm is None else arm + shift
+    along = moving.turned_twists(rotation, part.joint.axes(group, dtype), rot)
+    axes = moving.turned_twists(turn.T, along, rot)
+    if on is None:
+        angular, linear = angular[:, :0], linear[:, :0]
+    if arm is not None:
+        centre, linear = centre + arm, linear + moving.swept_by(arm, angular)
+    carried = moving.turned_twists(turn.T, jnp.concatenate([angular, linear]), rot)
+    return Mount(carried, axes, turn, along, arm, angular), centre
+
+
+def _rows(carrier: Rod, s: Array) -> Float[Array, "1 quad"]:
+    rows = integration_rows(carrier.quadrature, s.astype(carrier.length.dtype)[None])
+    return carrier.length * jnp.asarray(rows, carrier.length.dtype)
+
+
+# Rows of equal structure worked on one after the other: a program holds the work once
+
+
+def each(function: Callable[..., Any], rows: Sequence[tuple[Any, ...]]) -> list[Any]:
+    """`[function(*row) for row in rows]`; rows that differ in numbers alone share a loop."""
+    groups: dict[Any, list[int]] = {}
+    parted = [eqx.partition(row, eqx.is_array) for row in rows]
+    for place, (arrays, rest) in enumerate(parted):
+        leaves, form = jax.tree.flatten(arrays)
+        others, rest_form = jax.tree.flatten(rest)
+        kinds = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+        groups.setdefault((form, kinds, rest_form, tuple(others)), []).append(place)
+    found: list[Any] = [None] * len(rows)
+    for places in groups.values():
+        if len(places) == 1:
+            found[places[0]] = function(*rows[places[0]])
+            continue
+        rest = parted[places[0]][1]
+        stacked = jax.tree.map(lambda *x: jnp.stack(x), *(parted[k][0] for k in places))
+        answers = jax.lax.map(lambda row, rest=rest: function(*eqx.combine(row, rest)), stacked)
+        for nth, place in enumerate(places):
+            found[place] = jax.tree.map(lambda leaf, nth=nth: leaf[nth], answers)
+    return found

@@ -1,0 +1,304 @@
+"""Generalised forces on a rod, listed in a tuple: what is absent costs nothing.
+
+To add one, subclass the family that fits:
+
+* `AbstractForce`: any force, a function of time and the `Motion` of the rod; `points`
+  gives poses, velocities and Jacobians at any s, and takes forces put there.
+* `AbstractElastic`: an elastic law that replaces the rod's own linear one.
+* `AbstractDamping`: a constant matrix; implicit steppers use it in their iteration.
+* `AbstractPressureMap`: the work of a fluid; its pressure comes from a network, or from
+  `Pressurised(map, pressure)`. `AbstractChamber` is the one with rigid walls.
+
+A nonlinear law of the section: moments and forces from strains, by a user function.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax._types import optional_real, real
+from sorojax.math.quadrature import gauss_legendre
+from sorojax.rod.dynamics.fields import Motion, operators
+from sorojax.rod.dynamics.moving import mass_jacobian
+from sorojax.rod.dynamics.points import from_own, own
+from sorojax.rod.model.rod import Rod, strain_names
+
+EARTH = 9.81  # m/s^2
+
+
+class AbstractForce(eqx.Module):
+    """A generalised force, on the side of the loads: M a + coriolis = sum of forces.
+
+    `motion` is the rod at one moment, a `rod.Motion`. It offers:
+
+    * `motion.q`, `motion.v`: coordinates and their rates, `(dof,)`;
+    * `motion.rod`: the rod, with `length` [m], `section`, `material`, `group`, `basis`;
+    * at the Gauss nodes, world frame: `position` `(quad, dim)` [m], `directors`
+      `(quad, dim, dim)`, `tangent` `(quad, dim)`, `linear_jacobian` `(quad, dim, dof)`,
+      `angular_jacobian` `(quad, rot, dof)`, and the weights `motion.operators.weights`
+      `(quad,)` [m] that integrate along the rod;
+    * `motion.tip_jacobian` `(twist, dof)`: twist of the tip per rate, angular first;
+    * `rod.points(motion, s)`: position, velocity, spin, directors and Jacobians at any s in
+      [0, 1].
+
+    What is not read is never computed. A force of 2 N/m along y, all along the rod:
+
+        class SideWind(rod.AbstractForce):
+            def __call__(self, t, motion):
+                weights = motion.operators.weights
+                return 2.0 * weights @ motion.linear_jacobian[:, 1]
+    """
+
+    @abc.abstractmethod
+    def __call__(self, t: Float[Array, ""], motion: Motion) -> Float[Array, " dof"]:
+        """Force [N m, N] that does work on the coordinate rates; power is force @ v [W].
+
+        Args:
+            t: Time [s].
+            motion: The rod at this time.
+        """
+
+    def on_rod(self, rod: Rod) -> "AbstractForce":
+        """The same force on `rod` alone: loops make here, once, what does not move."""
+        return self
+
+
+class AbstractElastic(AbstractForce):
+    """An elastic law in place of the linear `-K q`.
+
+    Implement `restoring_force`; `__call__` is given.
+    """
+
+    @abc.abstractmethod
+    def restoring_force(self, q: Float[Array, " dof"]) -> Float[Array, " dof"]:
+        """Derivative of the stored energy [J] in q; `K q` for a linear law."""
+
+    def __call__(self, t, motion):
+        return -from_own(motion, self.restoring_force(own(motion, motion.q)))
+
+
+class AbstractDamping(AbstractForce):
+    """Linear damping by a constant matrix."""
+
+    @abc.abstractmethod
+    def matrix(self, stiffness: Float[Array, "dof dof"]) -> Float[Array, "dof dof"]:
+        """Damping matrix, given the linear stiffness of the rod."""
+
+    def __call__(self, t, motion):
+        matrix = self.matrix(motion.operators.stiffness)
+        return -from_own(motion, matrix @ own(motion, motion.v))
+
+
+class AbstractPressureMap(eqx.Module):
+    """Fluid chambers in the rod, one or several ports.
+
+    One function W(q, p) gives the force dW/dq and the volume dW/dp, so that no energy is
+    lost between fluid and rod. What is left of dV/dp at fixed q is the compliance of the
+    walls, one number per port: ports must not stretch each other's walls.
+    """
+
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        ports: ClassVar[tuple[int, ...]]
+
+    @abc.abstractmethod
+    def coenergy(
+        self, q: Float[Array, " dof"], pressure: Float[Array, "*ports"]
+    ) -> Float[Array, ""]:
+        """W(q, p) [J] at gauge pressure [Pa]; zero at zero pressure."""
+
+
+class AbstractChamber(AbstractPressureMap):
+    """Chambers whose volume depends on q alone: W = p . V(q)."""
+
+    @abc.abstractmethod
+    def volume(self, q: Float[Array, " dof"]) -> Float[Array, "*ports"]:
+        """Enclosed volume [m^3], scalar or one per port."""
+
+    def coenergy(self, q, pressure):
+        return jnp.sum(pressure * self.volume(q))
+
+
+class LinearElastic(AbstractElastic):
+    """Elasticity K q with a matrix of its own, e.g. identified from data."""
+
+    stiffness: Float[Array, "dof dof"] = eqx.field(converter=real)
+
+    def restoring_force(self, q):
+        return self.stiffness @ q
+
+
+class Damping(AbstractDamping):
+    """Kelvin-Voigt damping D = time K of the rod's linear stiffness K.
+
+    Attributes:
+        time: Retardation time, viscosity over modulus [s].
+    """
+
+    time: Float[Array, ""] = eqx.field(converter=real)
+
+    def matrix(self, stiffness):
+        return self.time * stiffness
+
+
+class Gravity(AbstractForce):
+    """Weight of the rod.
+
+    Attributes:
+        acceleration: [m/s^2] in the base frame; by default 9.81 against the last axis.
+    """
+
+    acceleration: Float[Array, " dim"] | None = eqx.field(converter=optional_real, default=None)
+
+    def __call__(self, t, motion):
+        g = gravity_or_earth(self.acceleration, motion)
+        loads = motion.operators.mass[:, None] * g[None, :]
+        return loads.reshape(-1) @ mass_jacobian(motion).reshape(-1, motion.q.shape[0])
+
+
+class TipWrench(AbstractForce):
+    """A dead wrench on the last section: its world components never turn.
+
+    `PointWrench` and `LineWrench` act elsewhere, or turn with the section.
+
+    Attributes:
+        wrench: Moment [N m], then force [N]: (m_z, f_x, f_y) for a planar rod.
+    """
+
+    wrench: Float[Array, " twist"] = eqx.field(converter=real)
+
+    def __call__(self, t, motion):
+        return self.wrench @ motion.tip_jacobian
+
+
+class Pressurised(AbstractForce):
+    """A pressure map at a given gauge pressure [Pa], scalar or one per port."""
+
+    chamber: AbstractPressureMap
+    pressure: Float[Array, "*ports"] = eqx.field(converter=real)
+
+    def __call__(self, t, motion):
+        force = jax.grad(self.chamber.coenergy)(own(motion, motion.q), self.pressure)
+        return from_own(motion, force)
+
+
+def total_force(
+    forces: tuple[AbstractForce, ...], t: Float[Array, ""], motion: Motion
+) -> Float[Array, " dof"]:
+    """Sum of the listed forces and of the rod's elasticity if none replaces it."""
+    unbound = [type(f).__name__ for f in forces if isinstance(f, AbstractPressureMap)]
+    if unbound:
+        raise ValueError(
+            f"rod: the pressure map {unbound[0]} has no pressure. Wrap it, "
+            "Pressurised(map, 10 * kPa), or list it in a RodBody and wire its pressure."
+        )
+    total = None
+    if not any(isinstance(force, AbstractElastic) for force in forces):
+        total = -from_own(motion, motion.operators.stiffness @ own(motion, motion.q))
+    for force in forces:
+        term = force(t, motion)
+        total = term if total is None else total + term
+    assert total is not None
+    return total
+
+
+def tangent_stiffness(
+    forces: tuple[AbstractForce, ...], motion: Motion
+) -> Float[Array, "dof dof"]:
+    """Elastic stiffness at the coordinates of `motion`, replaced laws included."""
+    laws = [force for force in forces if isinstance(force, AbstractElastic)]
+    if not laws:
+        return motion.operators.stiffness
+    q = own(motion, motion.q)
+    return sum_matrices(jax.jacfwd(law.restoring_force)(q) for law in laws)
+
+
+def damping_matrix(
+    forces: tuple[AbstractForce, ...], stiffness: Float[Array, "dof dof"]
+) -> Float[Array, "dof dof"]:
+    """Sum of the listed dampings; zeros without one."""
+    listed = [force for force in forces if isinstance(force, AbstractDamping)]
+    if not listed:
+        return jnp.zeros_like(stiffness)
+    return sum_matrices(force.matrix(stiffness) for force in listed)
+
+
+def sum_matrices(matrices: Any) -> Array:
+    first, *rest = matrices
+    for matrix in rest:
+        first = first + matrix
+    return first
+
+
+def gravity_or_earth(acceleration: Array | None, motion: Motion) -> Float[Array, " dim"]:
+    if acceleration is not None:
+        return acceleration
+    dim = motion.tangent.shape[1]
+    return jnp.array([0.0] * (dim - 1) + [-EARTH], motion.q.dtype)
+
+
+# A nonlinear law of the section: moments and forces from strains, by a user function
+
+
+class SectionLaw(AbstractElastic):
+    """Elasticity from a function of the strain of the section, from `section_law`.
+
+    Attributes:
+        stress: (strain change, s) -> moments [N m], then forces [N].
+        rows: Strain per coordinate at the Gauss nodes.
+        weights: Gauss weights [m].
+        s: The nodes in [0, 1].
+    """
+
+    stress: Callable[[Float[Array, " strain"], Float[Array, ""]], Float[Array, " strain"]]
+    rows: Float[Array, "quad strain dof"]
+    weights: Float[Array, " quad"]
+    s: Float[Array, " quad"]
+
+    def restoring_force(self, q):
+        stress = jax.vmap(self.stress)(self.rows @ q, self.s)
+        do = "Return one moment or force per strain of the rod."
+        _check.shape("SectionLaw", "stress", stress, self.rows.shape[:2], do)
+        loads = (self.weights[:, None] * stress).reshape(-1)
+        return loads @ self.rows.reshape(-1, q.shape[0])
+
+
+def section_law(
+    rod: Rod,
+    stress: Callable[[Float[Array, " strain"], Float[Array, ""]], Float[Array, " strain"]],
+) -> SectionLaw:
+    """An elastic law for `rod` in place of its linear one.
+
+    Args:
+        rod: The rod; build the law again where it changes.
+        stress: (strain beyond that at rest, s) -> moments [N m] and forces [N], both in the
+            order of `strain_names(rod.group)`. The gradient of an energy per length keeps
+            energy.
+    """
+    rows, weights, s = _rows(rod)
+    return SectionLaw(stress, rows, weights, s)
+
+
+@eqx.filter_jit
+def _rows(rod: Rod) -> tuple[Array, Array, Array]:
+    """Strain per coordinate at the Gauss nodes, their weights [m] and places."""
+    constants = operators(rod)
+    active = dict(zip(rod.basis.active, constants.strain_rows, strict=True))
+    none = jnp.zeros(constants.strain_rows.shape[1:], rod.length.dtype)
+    rows = jnp.stack([active.get(name, none) for name in strain_names(rod.group)], axis=1)
+    s = jnp.asarray(gauss_legendre(rod.quadrature)[0], rod.length.dtype)
+    return rows, constants.weights, s
+
+
+class EnergyLaw(eqx.Module):
+    """The stress of an energy per length [J/m], a function of (strain, s)."""
+
+    energy: Callable[[Float[Array, " strain"], Float[Array, ""]], Float[Array, ""]]
+
+    def __call__(self, strain: Float[Array, " strain"], s: Float[Array, ""]) -> Array:
+        return jax.grad(self.energy)(strain, s)

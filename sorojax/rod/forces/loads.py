@@ -1,0 +1,267 @@
+"""Forces on assemblies: which part each acts on, and their sum in the coordinates.
+
+A `Gravity` or a damping that is listed by itself acts on every part; any other force names
+its part: `On("finger", TipWrench(...))`.
+
+Forces whose numbers change with time.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax._types import real
+from sorojax.rod.dynamics.composite import gather
+from sorojax.rod.dynamics.fields import Motion
+from sorojax.rod.dynamics.moving import release
+from sorojax.rod.dynamics.tree import AssemblyMotion, batches, clamped, part_motion
+from sorojax.rod.forces import forces as one
+from sorojax.rod.forces.forces import (
+    AbstractDamping,
+    AbstractElastic,
+    AbstractForce,
+    AbstractPressureMap,
+    Gravity,
+    Pressurised,
+)
+from sorojax.rod.model.assembly import Assembly, index_of, slices
+from sorojax.rod.model.link import Link, LinkMotion, LinkOperators, link_motion
+from sorojax.rod.model.rod import Rod
+
+_SHAPE_ONLY = (AbstractElastic, AbstractDamping, Pressurised, AbstractPressureMap)
+
+
+class On(eqx.Module):
+    """A force on one part, named as in the assembly."""
+
+    part: str = eqx.field(static=True)
+    force: AbstractForce | AbstractPressureMap
+
+
+class AbstractPairForce(eqx.Module):
+    """A force between two parts."""
+
+    @abc.abstractmethod
+    def __call__(
+        self, t: Float[Array, ""], first: Motion | LinkMotion, second: Motion | LinkMotion
+    ) -> tuple[Float[Array, " first"], Float[Array, " second"]]:
+        """Generalised forces in the columns of each motion."""
+
+
+class Between(eqx.Module):
+    """A force between two parts, named as in the assembly."""
+
+    first: str = eqx.field(static=True)
+    second: str = eqx.field(static=True)
+    force: AbstractPairForce
+
+
+class JointEffort(eqx.Module):
+    """Effort of an actuator in the joint of a part: torque [N m] or force [N] per rate."""
+
+    part: str = eqx.field(static=True)
+    effort: Float[Array, "*joint"] = eqx.field(converter=real)
+
+
+Load = AbstractForce | On | Between | JointEffort
+
+
+def total_force(
+    forces: tuple[Load, ...], t: Float[Array, ""], motion: Motion | AssemblyMotion
+) -> Float[Array, " dof"]:
+    """Sum of the listed forces and of the elasticity of rods and joints."""
+    if isinstance(motion, Motion):
+        return one.total_force(_plain(forces), t, motion)
+    check(motion.assembly, forces)
+    loads: list = [_part_load(forces, t, motion, k) for k in range(len(motion.frames))]
+    for force in forces:
+        if isinstance(force, Gravity):
+            _add(loads, dict(enumerate(_weights(motion, force, t))))
+        elif isinstance(force, Between):
+            ends = [index_of(motion.assembly, name) for name in (force.first, force.second)]
+            pair = force.force(t, *(part_motion(motion, k) for k in ends))
+            _add(loads, dict(zip(ends, pair, strict=True)))
+    total = gather(motion, loads)
+    for term in _joint_forces(forces, motion):
+        total = total + term
+    return total
+
+
+def on_model(forces: tuple[Load, ...], model: Rod | Assembly) -> tuple[Load, ...]:
+    """The forces on `model` alone: what does not move is made, once before a loop."""
+    if isinstance(model, Rod):
+        return tuple(_on_body(force, model) for force in _plain(forces))
+    check(model, forces)
+    return tuple(
+        On(force.part, _on_body(force.force, model.parts[index_of(model, force.part)].body))
+        if isinstance(force, On)
+        else force
+        for force in forces
+    )
+
+
+def _on_body(force: Any, body: Any) -> Any:
+    fits = isinstance(body, Rod) and isinstance(force, AbstractForce)
+    return force.on_rod(body) if fits else force
+
+
+def weight(
+    gravity: Gravity, t: Float[Array, ""], motion: Motion | AssemblyMotion
+) -> Float[Array, " dof"]:
+    """Generalised force of gravity alone."""
+    if isinstance(motion, Motion):
+        return gravity(t, motion)
+    return gather(motion, list(_weights(motion, gravity, t)))
+
+
+def tangent_stiffness(
+    forces: tuple[Load, ...], motion: Motion | AssemblyMotion
+) -> Float[Array, "dof dof"]:
+    """Elastic stiffness at the coordinates of `motion`, replaced laws included."""
+    if isinstance(motion, Motion):
+        return one.tangent_stiffness(_plain(forces), motion)
+    stiffness = motion.operators.stiffness
+    for k, at in enumerate(slices(motion.assembly)):
+        listed = _on(forces, motion.assembly, k)
+        if any(isinstance(force, AbstractElastic) for force in listed):
+            own = one.tangent_stiffness(listed, clamped(motion, k))
+            stiffness = stiffness.at[at.rod_v, at.rod_v].set(own)
+    return stiffness
+
+
+def damping_matrix(
+    forces: tuple[Load, ...], model: Rod | Assembly, constants
+) -> Float[Array, "dof dof"]:
+    """Sum of the dampings of rods and joints; zeros without one."""
+    if isinstance(model, Rod):
+        return one.damping_matrix(_plain(forces), constants.stiffness)
+    damping = constants.damping
+    for k, at in enumerate(slices(model)):
+        if isinstance(model.parts[k].body, Rod):
+            own = one.damping_matrix(_on(forces, model, k), constants.parts[k].stiffness)
+            damping = damping.at[at.rod_v, at.rod_v].set(own)
+    return damping
+
+
+def check(assembly: Assembly, forces: tuple[Load, ...]) -> None:
+    """Refuse names of no part, and forces that do not say where they act."""
+    for force in forces:
+        names = (
+            (force.part,)
+            if isinstance(force, On | JointEffort)
+            else (force.first, force.second)
+            if isinstance(force, Between)
+            else ()
+        )
+        for name in names:
+            index_of(assembly, name)
+        if not names and not isinstance(force, Gravity | AbstractDamping):
+            raise ValueError(
+                f"assembly: the force {type(force).__name__} names no part, need one of "
+                f"{', '.join(assembly.names)}. Wrap it: On(name, force)."
+            )
+
+
+def _on(forces: tuple[Load, ...], assembly: Assembly, index: int) -> tuple:
+    """What acts on one part alone, its share of a common damping included."""
+    name, found = assembly.names[index], []
+    is_rod = isinstance(assembly.parts[index].body, Rod)
+    for force in forces:
+        if isinstance(force, On) and force.part == name:
+            found.append(force.force)
+        elif isinstance(force, AbstractDamping) and is_rod:
+            found.append(force)
+    return tuple(found)
+
+
+def _plain(forces: tuple[Load, ...]) -> Any:
+    """What may act on a single rod."""
+    for force in forces:
+        if isinstance(force, On | Between | JointEffort):
+            raise ValueError(
+                f"rod: got {type(force).__name__}, which names a part, need a plain force. A "
+                "single rod has no parts: leave the name out, or build an assembly."
+            )
+    return forces
+
+
+def _part_load(forces, t, motion: AssemblyMotion, index: int) -> Array | None:
+    """Loads of one part in its columns, with the elasticity of a rod."""
+    listed = _on(forces, motion.assembly, index)
+    if isinstance(motion.operators.parts[index], LinkOperators):
+        terms = [force(t, part_motion(motion, index)) for force in listed]
+        return one.sum_matrices(terms) if terms else None
+    shape: Any = tuple(force for force in listed if isinstance(force, _SHAPE_ONLY))
+    own = one.total_force(shape, t, clamped(motion, index))
+    load = jnp.pad(own, (motion.assembly.group.algebra_dim, 0))
+    for force in listed:
+        if not isinstance(force, _SHAPE_ONLY):
+            load = load + force(t, part_motion(motion, index))
+    return load
+
+
+def _weights(motion: AssemblyMotion, gravity: Gravity, t) -> list[Array]:
+    """Weight of each part in its columns; equal rods together, seen from their frames."""
+    count = len(motion.frames)
+    dim = motion.assembly.group.space_dim
+    g = jnp.array([0.0] * (dim - 1) + [-one.EARTH], motion.q.dtype)
+    g = g if gravity.acceleration is None else gravity.acceleration
+    local = [frame.rotation.T @ g for frame in motion.frames]
+    found: list = [None] * count
+    weigh: Any = Gravity  # it reads links as it reads rods
+    for members, stack in zip(batches(motion.assembly), motion.batches, strict=True):
+        twists = jnp.stack([motion.frames[k].twist for k in members])
+        every = eqx.filter_vmap(lambda m, twist, g: Gravity(g)(t, release(m, twist)))
+        weights = every(stack, twists, jnp.stack([local[k] for k in members]))
+        for place, k in enumerate(members):
+            found[k] = weights[place]
+    for k, constants in enumerate(motion.operators.parts):
+        if isinstance(constants, LinkOperators):
+            link, twist = motion.assembly.parts[k].body, motion.frames[k].twist
+            assert isinstance(link, Link)
+            found[k] = weigh(local[k])(t, link_motion(link, constants, twist))
+    return found
+
+
+def _joint_forces(forces, motion: AssemblyMotion) -> list[Float[Array, " dof"]]:
+    """Springs, dampers and actuators of the joints."""
+    assembly, found = motion.assembly, []
+    for part, at in zip(assembly.parts, slices(assembly), strict=True):
+        effort = part.joint.effort(motion.q[at.joint_q], motion.v[at.joint_v])
+        if effort is not None:
+            found.append(jnp.zeros_like(motion.v).at[at.joint_v].set(effort))
+    for force in forces:
+        if isinstance(force, JointEffort):
+            at = slices(assembly)[index_of(assembly, force.part)]
+            found.append(jnp.zeros_like(motion.v).at[at.joint_v].set(force.effort))
+    return found
+
+
+def _add(loads: list, terms: dict[int, Array]) -> None:
+    for k, term in terms.items():
+        loads[k] = term if loads[k] is None else loads[k] + term
+
+
+# Forces whose numbers change with time
+
+
+class Varying(AbstractForce):
+    """A force made anew at every instant from a signal: `make(signal(t))`.
+
+    `Varying(TipWrench, wave)` is a tip wrench that follows `wave`, any function of time
+    [s]; with a module as the signal its numbers are differentiable and never retrace.
+
+    Attributes:
+        make: From the value of the signal to a force.
+        signal: From time [s] to what `make` takes, e.g. a reference of `systems`.
+    """
+
+    make: Callable[[Any], AbstractForce] = eqx.field(static=True)
+    signal: Callable[[Float[Array, ""]], Any]
+
+    def __call__(self, t, motion):
+        return self.make(self.signal(t))(t, motion)

@@ -1,0 +1,1 @@
+"""What a rod or an assembly is: strain bases, sections, links, joints."""

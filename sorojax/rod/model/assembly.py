@@ -1,0 +1,211 @@
+"""Assemblies: a tree of rods and rigid links with joints between them."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax._arguments import axis_lengths
+from sorojax._display import displayed
+from sorojax._types import optional_real, real
+from sorojax.rod.model.joint import AbstractJoint, Fixed, Group
+from sorojax.rod.model.link import Link
+from sorojax.rod.model.rod import Rod
+
+
+class Part(eqx.Module):
+    """A rod or a link, and what it is mounted on.
+
+    Attributes:
+        body: The rod or link; its frame starts at the base of the rod.
+        joint: How it moves on its mount.
+        on: Name of the part that carries it; None for the ground.
+        offset: Pose of the joint in the frame that carries it, homogeneous, position [m]:
+            that of the link, or of the section at `s` of the rod. The same if omitted.
+        s: Where on a rod that carries it, in [0, 1].
+    """
+
+    body: Rod | Link
+    joint: AbstractJoint = eqx.field(default_factory=Fixed)
+    on: str | None = eqx.field(static=True, default=None)
+    offset: Float[Array, "h h"] | None = eqx.field(converter=optional_real, default=None)
+    s: Float[Array, ""] = eqx.field(converter=real, default=1.0)
+
+    def __check_init__(self):
+        if _check.is_concrete(self.s) and not 0 <= float(self.s) <= 1:
+            raise ValueError(f"Part: `s` is {self.s}, need a point of the rod in [0, 1].")
+
+
+@displayed
+class Assembly(eqx.Module):
+    """A tree of parts. The coordinates are those of the parts in their order: of the joint,
+    then of the rod.
+
+    Attributes:
+        group: `SE2()` or `SE3()`.
+        names: Names of the parts; a part comes after what carries it.
+        parts: The parts.
+    """
+
+    group: Group
+    names: tuple[str, ...] = eqx.field(static=True)
+    parts: tuple[Part, ...]
+
+    def __check_init__(self):
+        if not self.parts:
+            raise ValueError("assembly: got no part, need one or more. Name it: arm=Part(rod).")
+        for index, (name, part) in enumerate(zip(self.names, self.parts, strict=True)):
+            _check_part(self.group, name, part, self.names[:index])
+
+    def __getitem__(self, name: str) -> Part:
+        return self.parts[index_of(self, name)]
+
+    def _text(self) -> str:
+        rows = [f"Assembly in {type(self.group).__name__}: {num_coordinates(self)} coordinates"]
+        for name, part in zip(self.names, self.parts, strict=True):
+            where = f"on {part.on}" if part.on else "on the ground"
+            kind, joint = type(part.body).__name__, type(part.joint).__name__
+            rows.append(f"  {name}: {kind}, {joint} joint {where}")
+        return "\n".join(rows)
+
+
+class Slices(NamedTuple):
+    """Where a part has its numbers: q of joint and rod, v of joint and rod."""
+
+    joint_q: slice
+    rod_q: slice
+    joint_v: slice
+    rod_v: slice
+
+
+def assembly(group: Group, **parts: Part) -> Assembly:
+    """A tree of named parts: `assembly(SE3(), palm=Part(link, Free()), thumb=Part(rod,
+    on="palm", offset=pose))`, each after what carries it."""
+    return Assembly(group, tuple(parts), tuple(parts.values()))
+
+
+def serial(*rods: Rod, joint: AbstractJoint | None = None) -> Assembly:
+    """Rods end to end, clamped to each other: `segment_0`, `segment_1`, ...
+
+    Args:
+        *rods: The segments, from the base on.
+        joint: Between the ground and the first; clamped if omitted.
+    """
+    if not rods:
+        raise ValueError("serial: got no rod, need one or more.")
+    first = Part(rods[0], Fixed() if joint is None else joint)
+    others = [Part(rod, on=f"segment_{k}") for k, rod in enumerate(rods[1:])]
+    names = tuple(f"segment_{k}" for k in range(len(rods)))
+    return Assembly(rods[0].group, names, (first, *others))
+
+
+def index_of(assembly: Assembly, name: str) -> int:
+    """Position of a part in the order of the parts."""
+    if name not in assembly.names:
+        raise ValueError(
+            f"assembly: there is no part `{name}`, need one of {', '.join(assembly.names)}."
+        )
+    return assembly.names.index(name)
+
+
+def parents(assembly: Assembly) -> tuple[int | None, ...]:
+    """Index of the carrier of each part."""
+    names = assembly.names
+    return tuple(None if p.on is None else names.index(p.on) for p in assembly.parts)
+
+
+def slices(assembly: Assembly) -> tuple[Slices, ...]:
+    """Where each part has its coordinates and rates."""
+    found, q, v, group = [], 0, 0, assembly.group
+    for part in assembly.parts:
+        body = part.body.basis.num_dof if isinstance(part.body, Rod) else 0
+        # by its class, as a module makes an object of each method that is taken from it
+        joint, kind = part.joint, type(part.joint)
+        jq, jv = kind.num_coordinates(joint, group), kind.num_dof(joint, group)
+        ends = (slice(q, q + jq), slice(q + jq, q + jq + body))
+        rates = (slice(v, v + jv), slice(v + jv, v + jv + body))
+        found.append(Slices(*ends, *rates))
+        q, v = q + jq + body, v + jv + body
+    return tuple(found)
+
+
+def num_coordinates(model: Rod | Assembly) -> int:
+    """Length of q."""
+    return model.basis.num_dof if isinstance(model, Rod) else slices(model)[-1].rod_q.stop
+
+
+def num_dof(model: Rod | Assembly) -> int:
+    """Length of v, and of generalised forces."""
+    return model.basis.num_dof if isinstance(model, Rod) else slices(model)[-1].rod_v.stop
+
+
+@axis_lengths(Rod)
+@axis_lengths(Assembly)
+def _(model: Rod | Assembly) -> dict[str, int]:
+    return {"coordinates": num_coordinates(model), "dof": num_dof(model)}
+
+
+def rest(model: Rod | Assembly) -> Float[Array, " coordinates"]:
+    """Coordinates at which rods are unstrained and joints at rest."""
+    dtype = dtype_of(model)
+    if isinstance(model, Rod):
+        return jnp.zeros(model.basis.num_dof, dtype)
+    pieces = []
+    for part, place in zip(model.parts, slices(model), strict=True):
+        pieces.append(part.joint.rest(model.group, dtype))
+        pieces.append(jnp.zeros(place.rod_q.stop - place.rod_q.start, dtype))
+    return jnp.concatenate(pieces)
+
+
+def retract(assembly: Assembly, q: Array, increment: Array) -> Float[Array, " coordinates"]:
+    """Coordinates after an increment of the dimension of the rates."""
+    pieces = []
+    for part, place in zip(assembly.parts, slices(assembly), strict=True):
+        moved = q[place.joint_q], increment[place.joint_v]
+        pieces.append(part.joint.retract(assembly.group, *moved))
+        pieces.append(q[place.rod_q] + increment[place.rod_v])
+    return jnp.concatenate(pieces)
+
+
+def rate(assembly: Assembly, q: Array, v: Array) -> Float[Array, " coordinates"]:
+    """dq/dt at the rates v."""
+    pieces = []
+    for part, place in zip(assembly.parts, slices(assembly), strict=True):
+        pieces.append(part.joint.rate(assembly.group, q[place.joint_q], v[place.joint_v]))
+        pieces.append(v[place.rod_v])
+    return jnp.concatenate(pieces)
+
+
+def is_flat(assembly: Assembly) -> bool:
+    """Whether dq/dt = v for every joint."""
+    return num_coordinates(assembly) == num_dof(assembly)
+
+
+def dtype_of(model: Rod | Assembly):
+    """Type of the numbers of the model."""
+    if isinstance(model, Rod):
+        return model.length.dtype
+    kinds = [p.body.length if isinstance(p.body, Rod) else p.body.mass for p in model.parts]
+    return np.result_type(*(kind.dtype for kind in kinds))
+
+
+def _check_part(group: Group, name: str, part: Part, before: tuple[str, ...]) -> None:
+    where = f"assembly: part `{name}`"
+    if part.on is not None and part.on not in before:
+        raise ValueError(
+            f"{where} is on `{part.on}`, need one of the parts before it "
+            f"({', '.join(before) or 'none'}). List the carrier first."
+        )
+    body_group = part.body.group if isinstance(part.body, Rod) else group
+    if type(body_group) is not type(group):
+        raise ValueError(
+            f"{where} is a {type(body_group).__name__} rod, need {type(group).__name__} as "
+            "the assembly has. Give all rods one group."
+        )
+    if part.offset is not None:
+        size = group.space_dim + 1
+        do = "Give a homogeneous matrix, e.g. sorojax.math.lie.homogeneous(R, p)."
+        _check.shape(where, "offset", part.offset, (size, size), do)

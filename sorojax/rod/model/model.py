@@ -1,0 +1,68 @@
+"""A rod or an assembly: the same words for both, chosen when a program is traced."""
+
+from typing import TypeAlias, overload
+
+from jaxtyping import Array, Float
+
+from sorojax.math.compiled import full_products
+from sorojax.rod.dynamics.composite import assembly_inertia
+from sorojax.rod.dynamics.fields import Motion, Operators, operators as rod_operators
+from sorojax.rod.dynamics.tree import (
+    AssemblyMotion,
+    AssemblyOperators,
+    assembly_motion,
+    assembly_operators,
+    rod_inertia,
+    rod_motion,
+)
+from sorojax.rod.model.assembly import Assembly
+from sorojax.rod.model.rod import Rod
+
+Model: TypeAlias = Rod | Assembly
+
+
+@overload
+def operators(model: Rod) -> Operators: ...
+@overload
+def operators(model: Assembly) -> AssemblyOperators: ...
+@full_products
+def operators(model: Rod | Assembly):
+    """The constant arrays of a model, once before a loop; differentiable in its leaves."""
+    return rod_operators(model) if isinstance(model, Rod) else assembly_operators(model)
+
+
+@overload
+def motion(model: Rod, q: Array, v: Array | None = None, *, constants=None) -> Motion: ...
+@overload
+def motion(
+    model: Assembly, q: Array, v: Array | None = None, *, constants=None
+) -> AssemblyMotion: ...
+@full_products
+def motion(
+    model: Rod | Assembly,
+    q: Float[Array, " coordinates"],
+    v: Float[Array, " dof"] | None = None,
+    *,
+    constants=None,
+):
+    """The fields of a model at (q, v), which forces and inertia read.
+
+    Args:
+        model: The rod or assembly.
+        q: Coordinates.
+        v: Their rates; zero if omitted.
+        constants: `operators(model)`, if a loop has them already.
+    """
+    if isinstance(model, Assembly):
+        return assembly_motion(model, q, v, constants)
+    return rod_motion(model, q, v, constants)
+
+
+@full_products
+def inertia(
+    moment: Motion | AssemblyMotion,
+) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:
+    """Mass matrix and Coriolis force of a moment."""
+    if isinstance(moment, AssemblyMotion):
+        return assembly_inertia(moment)
+    return rod_inertia(moment)

@@ -1,0 +1,1 @@
+"""Equilibria, load paths and inverse kinematics."""

@@ -1,0 +1,313 @@
+"""Equilibria under loads that are applied in steps.
+
+Equilibria along a curve in coordinates and load: over limit points.
+
+Reference:
+    Riks, "An incremental approach to the solution of snapping and buckling problems",
+    Int. J. Solids and Structures 15, 1979.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from sorojax._types import Numbers, real
+from sorojax.math.compiled import door
+from sorojax.math.host import tell
+from sorojax.math.implicit_root import implicit_root
+from sorojax.math.status import Status
+from sorojax.rod.forces.loads import Load, total_force
+from sorojax.rod.model.assembly import dtype_of
+from sorojax.rod.model.model import Model, motion, operators
+from sorojax.rod.statics.equilibrium import (
+    Search,
+    ended,
+    first_guess,
+    newton,
+    prepare,
+    stability,
+)
+from sorojax.rod.statics.tangent import (
+    increments,
+    linearised,
+    moved,
+    negative_eigenvalues,
+    squared,
+)
+from sorojax.rod.statics.validity import checked_status
+
+Loading = Callable[[Array], tuple[Load, ...]]
+
+
+class EquilibriumPath(eqx.Module):
+    """Coordinates at rest under each load, how each search ended, and its iterations.
+
+    Where a search fails, the path stops: the rest of `q` repeats the last equilibrium
+    and says so in `status`. A state that is in balance without being stable is an
+    `unstable_equilibrium`; the path goes on.
+    """
+
+    q: Float[Array, "steps coordinates"]
+    status: Status
+    num_iterations: Int[Array, " steps"]
+
+
+@door
+def equilibrium_path(
+    model: Model,
+    loading: Loading,
+    factors: Float[Array, "steps *loads"],
+    q: Float[Array, " coordinates"] | None = None,
+    *,
+    begin: Numbers | None = None,
+    t=0.0,
+    tolerance=1e-10,
+    max_iterations: int = 25,
+    max_cuts: int = 8,
+    progress: bool = False,
+) -> EquilibriumPath:
+    """Equilibria at given load factors, each started from the one before.
+
+    A step whose search fails is cut in halves, all in one compiled loop. Differentiable as
+    `equilibrium` is, in all that `loading` holds.
+
+    Args:
+        model: The rod or assembly.
+        loading: Takes a factor, or a row of pressures, to the forces. Define it once: a new
+            function compiles anew.
+        factors: Load factors, or one row of them for each step.
+        q: Equilibrium to start from; at rest if omitted.
+        begin: Factors at `q`; zero if omitted.
+        t: Time at which the forces act [s].
+        tolerance: As of `equilibrium`.
+        max_iterations: Limit of one search.
+        max_cuts: How often a step may be halved.
+        progress: Report progress while running; under `vmap` in one report.
+
+    Raises:
+        ValueError: If `q` has the wrong shape.
+    """
+    constants, dtype = operators(model), dtype_of(model)
+    factors, t = real(factors).astype(dtype), real(t).astype(dtype)
+    guess = first_guess("equilibrium_path", model, q)
+    search = prepare(model, constants, tolerance, max_iterations)
+    first = jnp.zeros_like(factors[0]) if begin is None else real(begin).astype(dtype)
+
+    def residual(q: Array, factor: Array) -> Array:
+        return -total_force(loading(factor), t, motion(model, q, constants=constants))
+
+    shares = jnp.linspace(0.0, 1.0, len(factors) + 1, dtype=dtype)[1:]
+
+    def find(_, guesses):
+        def advance(state, row):
+            (q, last, alive), (target, share) = state, row
+            new, done, count, unstable = _step(
+                residual, q, last, target, alive, search, max_cuts
+            )
+            if progress:
+                tell("equilibrium path", share)
+            ends = tuple(x.astype(dtype) for x in (done, count, unstable))
+            return (new, target, done), (new, ends)
+
+        start = (guesses[0], first, jnp.array(True))
+        return jax.lax.scan(advance, start, (factors, shares))[1]
+
+    def balance(q):
+        return jax.vmap(lambda q, f: squared(model, q, residual(q, f)))(q, factors)
+
+    guesses = jnp.broadcast_to(guess, (factors.shape[0], guess.shape[0]))
+    rest, (done, count, unstable) = implicit_root(
+        balance, guesses, find, _solve_rows, has_aux=True
+    )
+    status = jax.vmap(lambda done, unstable, *values: ended(done, *values, unstable=unstable))(
+        done, unstable, rest, jax.vmap(residual)(rest, factors)
+    )
+    status = jax.vmap(lambda x, q: checked_status(x, model, q))(status, rest)
+    return EquilibriumPath(rest, status, count.astype(jnp.int32))
+
+
+def _step(residual, q: Array, last: Array, target: Array, alive, search: Search, max_cuts: int):
+    """From the equilibrium `q` at `last` to `target`, in as few parts as converge."""
+    whole = jnp.ones((), q.dtype)
+    shortest = 0.5**max_cuts
+
+    def going(state):
+        _, at, part, *_ = state
+        return alive & (at < 1) & (part >= shortest)
+
+    def advance(state):
+        q, at, part, count, slope = state
+        aim = jnp.minimum(at + part, whole)
+        factor = last + aim * (target - last)
+        found = newton(lambda q: residual(q, factor), q, search)
+        good = found.done
+        new = jnp.where(good, found.q, q), jnp.where(good, aim, at)
+        slope = jnp.where(good, found.slope, slope)
+        return *new, jnp.where(good, 2 * part, part / 2), count + found.count, slope
+
+    state = (q, 0 * whole, whole, jnp.array(0, dtype=jnp.int32), search.metric)
+    q, at, _, count, slope = jax.lax.while_loop(going, advance, state)
+    _, unstable = stability(slope, search)
+    return q, alive & (at >= 1), count, unstable
+
+
+def _solve_rows(linear, right: Float[Array, "steps unknowns"]) -> Array:
+    """The steps do not see each other: one small system each, all at once."""
+    eye = jnp.eye(right.shape[1], dtype=right.dtype)
+    columns = jax.vmap(lambda e: linear(jnp.broadcast_to(e, right.shape)))(eye)
+    return jnp.linalg.solve(jnp.moveaxis(columns, 0, 2), right[:, :, None])[:, :, 0]
+
+
+# Equilibria along a curve in coordinates and load: over limit points
+
+
+_ITERATIONS = 12
+_EASY = 5  # corrections below which the next step is longer
+
+
+class ArcPath(eqx.Module):
+    """A path of equilibria.
+
+    Attributes:
+        q: Coordinates; where a step fails the path stops and repeats its last point.
+        factor: Load factors.
+        negative: Negative eigenvalues of the tangent; 0 is stable under dead loads.
+        status: How each step ended.
+    """
+
+    q: Float[Array, "steps coordinates"]
+    factor: Float[Array, " steps"]
+    negative: Int[Array, " steps"]
+    status: Status
+
+
+class _Point(NamedTuple):
+    q: Array
+    factor: Array
+    direction: Array  # of the path: increments, then the factor, of unit length
+    length: Array
+    alive: Array
+
+
+@door
+def arc_length_path(
+    model: Model,
+    loading: Loading,
+    q: Float[Array, " coordinates"] | None = None,
+    *,
+    factor=0.0,
+    first=0.1,
+    steps: int = 50,
+    longest=2.0,
+    t=0.0,
+    tolerance=1e-10,
+    max_cuts: int = 10,
+    progress: bool = False,
+) -> ArcPath:
+    """Equilibria one arc length apart, through limit points, where the load turns back.
+
+    Lengths are measured in elastic energy, so that a step of the factor and the answer of
+    the rod to it at the start count the same. Steps shrink where the search is hard and
+    grow where it is easy. Not differentiable: start `equilibrium` from a point of it.
+
+    Args:
+        model: The rod or assembly.
+        loading: Takes a factor to the forces.
+        q: Where to start the search for the first equilibrium; at rest if omitted.
+        factor: Load factor there.
+        first: Step of the factor at the start; negative to unload.
+        steps: Number of steps.
+        longest: Longest step relative to the first.
+        t: Time at which the forces act [s].
+        tolerance: Distance from equilibrium relative to the first step.
+        max_cuts: How often a step may be halved.
+        progress: Report progress while running; under `vmap` in one report.
+    """
+    constants, dtype = operators(model), dtype_of(model)
+    factor, first, longest, t = (real(x).astype(dtype) for x in (factor, first, longest, t))
+    search = prepare(model, constants, tolerance, 50)
+
+    def residual(q: Array, factor: Array) -> Array:
+        return -total_force(loading(factor), t, motion(model, q, constants=constants))
+
+    def tangent(q, factor):
+        """Residual, its tangent and its change with the factor."""
+        one = jnp.ones_like(factor)
+        value, slope = linearised(lambda q: residual(q, factor), model, q)
+        return value, slope, jax.jvp(lambda f: residual(q, f), (factor,), (one,))[1]
+
+    start = newton(
+        lambda q: residual(q, factor), first_guess("arc_length_path", model, q), search
+    )
+    _, slope, rate = tangent(start.q, factor)
+    answer = -jnp.linalg.solve(slope, rate)
+    unit = answer @ search.metric @ answer
+    # Lengths squared: increments in energy over `unit`, the factor as it is.
+    weights = jnp.pad(search.metric / unit, (0, 1)).at[-1, -1].set(1.0)
+    direction = _unit(jnp.append(answer, 1.0), weights) * jnp.sign(first)
+    begin = jnp.abs(first) * jnp.sqrt(jnp.asarray(2.0, dtype))
+
+    def correct(point: _Point, length):
+        """The equilibrium on the plane across the path at `length`."""
+        normal = weights @ point.direction
+
+        def at(shift):
+            return moved(model, point.q, shift[:-1]), point.factor + shift[-1]
+
+        def improve(state):
+            shift, _, count = state
+            value, slope, rate = tangent(*at(shift))
+            # The tangent is taken at the shifted place; increments add up to first order.
+            matrix = jnp.concatenate([jnp.append(slope, rate[:, None], axis=1), normal[None]])
+            gap = jnp.append(value, normal @ shift - length)
+            step = -jnp.linalg.solve(matrix, gap)
+            return shift + step, jnp.sqrt(step @ weights @ step), count + 1
+
+        def searching(state):
+            _, size, count = state
+            return (size > search.tolerance * begin) & (count < _ITERATIONS)
+
+        state = (length * point.direction, jnp.inf * begin, jnp.array(0))
+        shift, size, count = jax.lax.while_loop(searching, improve, state)
+        near = jnp.sqrt(shift @ weights @ shift) < 3 * length  # the same branch
+        return *at(shift), (size <= search.tolerance * begin) & near, count
+
+    def advance(point: _Point, share):
+        def going(state):
+            _, _, length, done, _ = state
+            return point.alive & ~done & (length > begin * 0.5**max_cuts)
+
+        def attempt(state):
+            _, _, length, _, _ = state
+            q, factor, done, count = correct(point, length)
+            return q, factor, jnp.where(done, length, length / 2), done, count
+
+        state = (point.q, point.factor, point.length, jnp.array(False), jnp.array(0))
+        q, factor, length, done, count = jax.lax.while_loop(going, attempt, state)
+        q, factor = jnp.where(done, q, point.q), jnp.where(done, factor, point.factor)
+        _, slope, rate = tangent(q, factor)
+        border = jnp.concatenate([
+            jnp.append(slope, rate[:, None], axis=1), (weights @ point.direction)[None]
+        ])  # fmt: skip
+        right = jnp.zeros_like(point.direction).at[-1].set(1.0)
+        direction = _unit(jnp.linalg.solve(border, right), weights)
+        length = jnp.where(count <= _EASY, 1.5 * length, length)
+        new = _Point(q, factor, direction, jnp.minimum(length, longest * begin), done)
+        negative = negative_eigenvalues(slope, search.metric)
+        if progress:
+            tell("arc length path", share)
+        return new, (q, factor, negative, ended(done, increments(model, q), rate))
+
+    point = _Point(start.q, factor, direction, begin, start.done)
+    shares = jnp.linspace(0.0, 1.0, steps + 1, dtype=dtype)[1:]
+    _, (q, factors, negative, status) = jax.lax.scan(advance, point, shares)
+    status = jax.vmap(lambda x, q: checked_status(x, model, q))(status, q)
+    return ArcPath(q, factors, negative, status)
+
+
+def _unit(vector: Array, weights: Array) -> Array:
+    return vector / jnp.sqrt(vector @ weights @ vector)

@@ -1,0 +1,1 @@
+"""Areas, volumes and moments of shapes."""

@@ -1,0 +1,1 @@
+"""Shapes from shapes: combined, moved, bent, lifted into space."""

@@ -1,0 +1,317 @@
+"""Boolean combinations of shapes: bounds of the true distance, Lipschitz as their parts.
+
+Smooth combinations: what rounds a joint, how deep it dips, how smooth it is.
+"""
+
+import abc
+import functools
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax import _check
+from sorojax._types import real
+from sorojax.sdf.base import (
+    AbstractSdf,
+    Box,
+    Exactness,
+    Number,
+    absolute,
+    maximum,
+    minimum,
+    positive_part,
+    steepest,
+)
+
+
+def check_same_dim(where: str, shapes: tuple[AbstractSdf, ...]) -> None:
+    if len({shape.dim for shape in shapes}) != 1:
+        raise ValueError(
+            f"{where}: got shapes of dimension {[shape.dim for shape in shapes]}, need at "
+            "least one shape and one dimension. Combine plane with plane, solid with solid."
+        )
+
+
+def hull(boxes: list[Box], low: Callable, high: Callable) -> Box:
+    lower = functools.reduce(low, (box[0] for box in boxes))
+    return lower, functools.reduce(high, (box[1] for box in boxes))
+
+
+class Union(AbstractSdf):
+    """Inside any of `shapes`; the distance is exact outside them."""
+
+    shapes: tuple[AbstractSdf, ...] = eqx.field(converter=tuple)
+
+    def __check_init__(self):
+        check_same_dim("Union", self.shapes)
+
+    @property
+    def dim(self) -> int:
+        return self.shapes[0].dim
+
+    @property
+    def lipschitz(self) -> Number:
+        return steepest(*(shape.lipschitz for shape in self.shapes))
+
+    @property
+    def exactness(self) -> Exactness:
+        return Exactness(all(s.exactness.outside for s in self.shapes), False)
+
+    def distance(self, *x):
+        return functools.reduce(minimum, (shape.distance(*x) for shape in self.shapes))
+
+    def bounding_box(self) -> Box:
+        return self.level_box(0.0)
+
+    def level_box(self, level) -> Box:
+        boxes = [shape.level_box(level) for shape in self.shapes]
+        return hull(boxes, jnp.minimum, jnp.maximum)
+
+
+class Intersection(AbstractSdf):
+    """Inside all of `shapes`; the distance is exact inside them."""
+
+    shapes: tuple[AbstractSdf, ...] = eqx.field(converter=tuple)
+
+    def __check_init__(self):
+        check_same_dim("Intersection", self.shapes)
+
+    @property
+    def dim(self) -> int:
+        return self.shapes[0].dim
+
+    @property
+    def lipschitz(self) -> Number:
+        return steepest(*(shape.lipschitz for shape in self.shapes))
+
+    @property
+    def exactness(self) -> Exactness:
+        return Exactness(False, all(s.exactness.inside for s in self.shapes))
+
+    def distance(self, *x):
+        return functools.reduce(maximum, (shape.distance(*x) for shape in self.shapes))
+
+    def bounding_box(self) -> Box:
+        return self.level_box(0.0)
+
+    def level_box(self, level) -> Box:
+        boxes = [shape.level_box(level) for shape in self.shapes]
+        return hull(boxes, jnp.maximum, jnp.minimum)
+
+
+class Difference(AbstractSdf):
+    """Inside `base` and outside `removed`."""
+
+    base: AbstractSdf
+    removed: AbstractSdf
+
+    def __check_init__(self):
+        check_same_dim("Difference", (self.base, self.removed))
+
+    @property
+    def dim(self) -> int:
+        return self.base.dim
+
+    @property
+    def lipschitz(self) -> Number:
+        return steepest(self.base.lipschitz, self.removed.lipschitz)
+
+    @property
+    def exactness(self) -> Exactness:
+        return Exactness(False, self.base.exactness.inside and self.removed.exactness.outside)
+
+    def distance(self, *x):
+        return maximum(self.base.distance(*x), -self.removed.distance(*x))
+
+    def bounding_box(self) -> Box:
+        return self.base.bounding_box()
+
+    def level_box(self, level) -> Box:
+        return self.base.level_box(level)
+
+
+def union(*shapes: AbstractSdf) -> Union:
+    """One flat `Union` of `shapes`, so that long sums do not nest."""
+    flat = (s.shapes if isinstance(s, Union) else (s,) for s in shapes)
+    return Union(sum(flat, start=()))
+
+
+def intersection(*shapes: AbstractSdf) -> Intersection:
+    """One flat `Intersection` of `shapes`."""
+    flat = (s.shapes if isinstance(s, Intersection) else (s,) for s in shapes)
+    return Intersection(sum(flat, start=()))
+
+
+# Smooth combinations: what rounds a joint, how deep it dips, how smooth it is
+
+
+class AbstractBlend(eqx.Module):
+    """A smooth minimum of two fields over a width k [m].
+
+    Attributes:
+        dip: Largest depth below the sharp minimum, reached at equal fields, over k.
+        continuity: Number of continuous derivatives.
+        slope: Factor on the larger Lipschitz constant of the parts.
+    """
+
+    dip: eqx.AbstractClassVar[float]
+    continuity: eqx.AbstractClassVar[float]
+    slope: eqx.AbstractClassVar[float]
+
+    @abc.abstractmethod
+    def __call__(self, a: Array, b: Array, k: Array) -> Array:
+        """Blended minimum [m] of the fields `a` and `b` [m]."""
+
+
+class Quadratic(AbstractBlend):
+    """Parabola where |a - b| < k: C1, dip k/4."""
+
+    dip: ClassVar[float] = 1 / 4
+    continuity: ClassVar[float] = 1
+    slope: ClassVar[float] = 1.0
+
+    def __call__(self, a, b, k):
+        h = positive_part(k - absolute(a - b))
+        return minimum(a, b) - h * h / (4 * k)
+
+
+class Cubic(AbstractBlend):
+    """Cubic where |a - b| < k: C2, dip k/6."""
+
+    dip: ClassVar[float] = 1 / 6
+    continuity: ClassVar[float] = 2
+    slope: ClassVar[float] = 1.0
+
+    def __call__(self, a, b, k):
+        h = positive_part(k - absolute(a - b)) / k
+        return minimum(a, b) - h * h * h * k / 6
+
+
+class Circular(AbstractBlend):
+    """Circular arc between orthogonal faces where |a - b| < k: C1, dip (1 - 1/sqrt 2) k."""
+
+    dip: ClassVar[float] = 1 - math.sqrt(0.5)
+    continuity: ClassVar[float] = 1
+    slope: ClassVar[float] = 1.0
+
+    def __call__(self, a, b, k):
+        h = positive_part(k - absolute(a - b)) / k
+        return minimum(a, b) - k / 2 * (1 + h - jnp.sqrt(1 + h * (2 - h)))
+
+
+class Exponential(AbstractBlend):
+    """-k ln(exp(-a/k) + exp(-b/k)): smooth, dip k ln 2, not local."""
+
+    dip: ClassVar[float] = math.log(2)
+    continuity: ClassVar[float] = math.inf
+    slope: ClassVar[float] = 1.0
+
+    def __call__(self, a, b, k):
+        return minimum(a, b) - k * jnp.log1p(jnp.exp(-absolute(a - b) / k))
+
+
+class Chamfer(AbstractBlend):
+    """Flat face that cuts k off both sides of a right angle: C0, dip k/sqrt 2."""
+
+    dip: ClassVar[float] = math.sqrt(0.5)
+    continuity: ClassVar[float] = 0
+    # Where both fields rise in the same direction, their scaled sum is steeper.
+    slope: ClassVar[float] = math.sqrt(2)
+
+    def __call__(self, a, b, k):
+        return minimum(minimum(a, b), (a + b - k) * math.sqrt(0.5))
+
+
+def _check_blend(shape: "AbstractBlended") -> None:
+    where = type(shape).__name__
+    check_same_dim(where, (shape.first, shape.second))
+    _check.positive(where, "k", shape.k, "m", "Use `|`, `&` or `-` for a sharp edge.")
+
+
+class AbstractBlended(AbstractSdf):
+    """Two shapes joined by a blend of width `k` [m]."""
+
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        first: ClassVar[AbstractSdf]
+        second: ClassVar[AbstractSdf]
+        k: ClassVar[Float[Array, ""]]
+        blend: ClassVar[AbstractBlend]
+
+    @property
+    def dim(self) -> int:
+        return self.first.dim
+
+    @property
+    def lipschitz(self) -> Number:
+        slope = steepest(self.first.lipschitz, self.second.lipschitz)
+        return slope * self.blend.slope
+
+    @abc.abstractmethod
+    def level_box(self, level: Number) -> Box: ...
+
+    def bounding_box(self) -> Box:
+        return self.level_box(0.0)
+
+
+class SmoothUnion(AbstractBlended):
+    """Union with a fillet where the fields differ by less than `k` [m].
+
+    The default blend is quadratic: C1, deepest by k/4 where both fields are equal.
+    """
+
+    first: AbstractSdf
+    second: AbstractSdf
+    k: Float[Array, ""] = eqx.field(converter=real)
+    blend: AbstractBlend = Quadratic()
+
+    def __check_init__(self):
+        _check_blend(self)
+
+    def distance(self, *x):
+        return self.blend(self.first.distance(*x), self.second.distance(*x), self.k)
+
+    def level_box(self, level) -> Box:
+        level = level + self.blend.dip * self.k
+        boxes: list[Box] = [self.first.level_box(level), self.second.level_box(level)]
+        return hull(boxes, jnp.minimum, jnp.maximum)
+
+
+class SmoothIntersection(AbstractBlended):
+    """Intersection whose edges are rounded off where the fields differ by less than `k`."""
+
+    first: AbstractSdf
+    second: AbstractSdf
+    k: Float[Array, ""] = eqx.field(converter=real)
+    blend: AbstractBlend = Quadratic()
+
+    def __check_init__(self):
+        _check_blend(self)
+
+    def distance(self, *x):
+        return -self.blend(-self.first.distance(*x), -self.second.distance(*x), self.k)
+
+    def level_box(self, level) -> Box:
+        boxes: list[Box] = [self.first.level_box(level), self.second.level_box(level)]
+        return hull(boxes, jnp.maximum, jnp.minimum)
+
+
+class SmoothDifference(AbstractBlended):
+    """`first` without `second`; the edges between them are rounded off over `k` [m]."""
+
+    first: AbstractSdf
+    second: AbstractSdf
+    k: Float[Array, ""] = eqx.field(converter=real)
+    blend: AbstractBlend = Quadratic()
+
+    def __check_init__(self):
+        _check_blend(self)
+
+    def distance(self, *x):
+        return -self.blend(-self.first.distance(*x), self.second.distance(*x), self.k)
+
+    def level_box(self, level) -> Box:
+        return self.first.level_box(level)

@@ -1,0 +1,1 @@
+"""Primitive shapes, in the plane and in space."""

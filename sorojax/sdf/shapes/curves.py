@@ -1,0 +1,393 @@
+"""Bodies along curves in the plane or in space: polyline, Bezier, spline, helix.
+
+A tube along a smooth curve through points.
+
+The nearest of many pieces: a search without derivatives, then one piece with them.
+
+Which piece is nearest does not vary with small changes, so only the winner is
+differentiated: a gradient costs one piece, and a tie takes the first.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from sorojax._types import real
+from sorojax.sdf.base import (
+    AbstractSdf,
+    Box,
+    Exactness,
+    check_lengths,
+    clip,
+    maximum,
+    minimum,
+    norm,
+    quotient,
+    root,
+)
+from sorojax.sdf.shapes.bars import segment_square
+
+
+def nearest(
+    measure: Callable[..., Array], table: Any, x: tuple[Array, ...]
+) -> Int[Array, "..."]:
+    """Index of the row of `table` (a pytree of arrays) with the least `measure(row, *x)`."""
+    return scan_rows(measure, table, x, lambda _, *x: jnp.zeros_like(x[0]))[0]
+
+
+def scan_rows(
+    measure: Callable[..., Array], table: Any, x: tuple[Array, ...], extra: Callable
+) -> tuple[Int[Array, "..."], Array]:
+    """Nearest row and the sum of `extra(row, *x)` over all rows, in one pass."""
+    table, x = jax.lax.stop_gradient((table, x))
+    count = jax.tree.leaves(table)[0].shape[0]
+    start = (
+        jnp.full_like(x[0], jnp.inf),
+        jnp.zeros(x[0].shape, jnp.int32),
+        jnp.zeros_like(x[0]),
+    )
+
+    def visit(i, state):
+        best, index, total = state
+        row = jax.tree.map(lambda a: a[i], table)
+        value = measure(row, *x)
+        closer = value < best
+        index = jnp.where(closer, jnp.asarray(i, jnp.int32), index)
+        return jnp.where(closer, value, best), index, total + extra(row, *x)
+
+    _, index, total = jax.lax.fori_loop(0, count, visit, start)
+    return index, total
+
+
+def take(table: Any, index: Int[Array, "..."]) -> tuple[tuple[Array, ...], ...]:
+    """Rows of `table` at `index`: for each (n, dim) array one array per axis."""
+    return tuple(tuple(a[index, i] for i in range(a.shape[1])) for a in table)
+
+
+# Bodies along curves in the plane or in space: polyline, Bezier, spline, helix
+
+
+TUBE = Exactness(outside=True, inside=False)  # where a tube meets itself it is deeper
+
+
+def check_points(shape: AbstractSdf, points: Array, least: int) -> None:
+    where = type(shape).__name__
+    size = jnp.shape(points)
+    if len(size) != 2 or size[1] not in (2, 3) or size[0] < least:
+        raise ValueError(
+            f"{where}: `points` has shape {size}, need at least {least} rows of (x, y) or "
+            "(x, y, z). One row per point, in order."
+        )
+
+
+class Polyline(AbstractSdf):
+    """All points within `width` / 2 of the line through `points` [m]; a tube in space."""
+
+    points: Float[Array, "points dim"] = eqx.field(converter=real)
+    width: Float[Array, ""] = eqx.field(converter=real)
+    closed: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        check_points(self, self.points, 2)
+        check_lengths(self, "width")
+
+    @property
+    def dim(self) -> int:
+        return self.points.shape[1]
+
+    @property
+    def exactness(self) -> Exactness:
+        return TUBE
+
+    def distance(self, *x):
+        a = self.points
+        b = jnp.roll(a, -1, axis=0)
+        table = (a, b) if self.closed else (a[:-1], b[:-1])
+        index = nearest(lambda row, *x: segment_square(x, *row), table, x)
+        return root(segment_square(x, *take(table, index))) - self.width / 2
+
+    def bounding_box(self) -> Box:
+        half = self.width / 2
+        return jnp.min(self.points, axis=0) - half, jnp.max(self.points, axis=0) + half
+
+
+class Bezier(AbstractSdf):
+    """Quadratic Bezier curve of three control `points` [m], `width` [m] across."""
+
+    points: Float[Array, "3 dim"] = eqx.field(converter=real)
+    width: Float[Array, ""] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        check_points(self, self.points, 3)
+        if self.points.shape[0] != 3:
+            raise ValueError(
+                f"Bezier: `points` has {self.points.shape[0]} rows, need 3. Join several "
+                "curves by `|`, or use a Spline."
+            )
+        check_lengths(self, "width")
+
+    @property
+    def dim(self) -> int:
+        return self.points.shape[1]
+
+    @property
+    def exactness(self) -> Exactness:
+        return TUBE
+
+    def distance(self, *x):
+        return bezier_distance(self.points, x) - self.width / 2
+
+    def bounding_box(self) -> Box:
+        half = self.width / 2
+        return jnp.min(self.points, axis=0) - half, jnp.max(self.points, axis=0) + half
+
+
+class Parabola(AbstractSdf):
+    """The piece |x| <= `half_width` of y = `bend` x^2, `width` [m] across; bend in 1/m."""
+
+    bend: Float[Array, ""] = eqx.field(converter=real)
+    half_width: Float[Array, ""] = eqx.field(converter=real)
+    width: Float[Array, ""] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        check_lengths(self, "half_width", "width")
+
+    @property
+    def dim(self) -> int:
+        return 2
+
+    @property
+    def exactness(self) -> Exactness:
+        return TUBE
+
+    def distance(self, x, y):
+        return bezier_distance(self._control(), (x, y)) - self.width / 2
+
+    def _control(self) -> Float[Array, "3 2"]:
+        w, rise = self.half_width, self.bend * self.half_width**2
+        return jnp.stack(
+            [jnp.stack([-w, rise]), jnp.stack([0 * w, -rise]), jnp.stack([w, rise])]
+        )
+
+    def bounding_box(self) -> Box:
+        half, rise = self.width / 2, self.bend * self.half_width**2
+        lower = jnp.stack([-self.half_width, jnp.minimum(rise, 0)]) - half
+        return lower, jnp.stack([self.half_width, jnp.maximum(rise, 0)]) + half
+
+
+def bezier_distance(points: Float[Array, "3 dim"], x: tuple[Array, ...]) -> Array:
+    """Distance [m] to a quadratic Bezier curve: the nearer foot seen from either end.
+
+    The slope of the squared distance is a cubic; Newton's method from outside its
+    roots runs to the first and to the last of them without passing.
+    """
+    curve = [
+        (points[0, i], 2 * (points[1, i] - points[0, i]),
+         points[0, i] - 2 * points[1, i] + points[2, i])
+        for i in range(len(x))
+    ]  # fmt: skip
+
+    def slope(t, x):
+        first = second = jnp.zeros_like(t)
+        for c, (p, q, r) in zip(x, curve, strict=True):
+            gap, speed = p + t * (q + t * r) - c, q + 2 * t * r
+            first = first + gap * speed
+            second = second + speed * speed + 2 * gap * r
+        return first, second
+
+    best = None
+    for end in (0.0, 1.0):
+        t = foot(slope, jnp.full_like(x[0], end), x, 12)
+        square = sum(
+            ((p + t * (q + t * r) - c) ** 2 for c, (p, q, r) in zip(x, curve, strict=True)),
+            start=jnp.zeros_like(t),
+        )
+        best = square if best is None else minimum(best, square)
+    return root(best)
+
+
+def foot(
+    slope, start: Array, x: tuple[Array, ...], steps: int, end: Array | float = 1.0
+) -> Array:
+    """Parameter in [0, end] where `slope(t, x)` = (s, ds/dt) has s = 0, or the nearer end.
+
+    The last step alone carries derivatives: that is the implicit-function rule.
+    """
+
+    def newton(t, x):
+        first, second = slope(t, x)
+        return t - quotient(first, jnp.where(second > 0, second, jnp.zeros_like(second)))
+
+    held = jax.lax.stop_gradient(x)
+    last = jax.lax.stop_gradient(end)
+
+    def step(_, t):
+        return clip(newton(t, held), 0.0, last)
+
+    start = clip(jax.lax.stop_gradient(start), 0.0, last)
+    t = jax.lax.stop_gradient(jax.lax.fori_loop(0, steps, step, start))
+    return clip(newton(t, x), 0.0, end)
+
+
+class Helix(AbstractSdf):
+    """Wire of `width` [m] wound about z at `radius` [m], `pitch` [m] per turn, from z = 0."""
+
+    radius: Float[Array, ""] = eqx.field(converter=real)
+    pitch: Float[Array, ""] = eqx.field(converter=real)
+    turns: Float[Array, ""] = eqx.field(converter=real)
+    width: Float[Array, ""] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        check_lengths(self, "radius", "pitch", "turns", "width")
+
+    @property
+    def dim(self) -> int:
+        return 3
+
+    @property
+    def exactness(self) -> Exactness:
+        return TUBE
+
+    def distance(self, x, y, z):
+        lead, whole = self.pitch / (2 * math.pi), 2 * math.pi
+        end = whole * self.turns
+
+        def slope(t, x):
+            c, s = self.radius * jnp.cos(t), self.radius * jnp.sin(t)
+            first = x[0] * s - x[1] * c + lead * (lead * t - x[2])
+            return first, x[0] * c + x[1] * s + lead * lead
+
+        def gap(t):
+            c, s = self.radius * jnp.cos(t), self.radius * jnp.sin(t)
+            return norm(x - c, y - s, z - lead * t)
+
+        # The closest point lies on the winding just below or just above the point;
+        # from the angle of the point Newton's method runs up to it without passing.
+        px, py, pz = jax.lax.stop_gradient((x, y, z))
+        angle = jnp.arctan2(py, px)
+        below = jnp.floor((pz / jax.lax.stop_gradient(lead) - angle) / whole)
+        first = jnp.ceil(-angle / whole)
+        last = jnp.floor((jax.lax.stop_gradient(end) - angle) / whole)
+        best = minimum(gap(jnp.zeros_like(x)), gap(end + jnp.zeros_like(x)))
+        for turn in (below, below + 1):
+            start = angle + whole * clip(turn, first, maximum(first, last))
+            best = minimum(best, gap(foot(slope, start, (x, y, z), 12, end)))
+        return best - self.width / 2
+
+    def bounding_box(self) -> Box:
+        reach, half = self.radius + self.width / 2, self.width / 2
+        lower = jnp.stack([-reach, -reach, -half])
+        return lower, jnp.stack([reach, reach, self.pitch * self.turns + half])
+
+
+# A tube along a smooth curve through points
+
+
+_PARTS = 6  # of each piece, short enough to hold one closest point
+
+
+def _slope(t, x, curve):
+    """First and second derivative in t of half the squared distance to the cubic."""
+    first = second = jnp.zeros_like(t)
+    for c, (p, q, r, s) in zip(x, curve, strict=True):
+        gap, speed = p + t * (q + t * (r + t * s)) - c, q + t * (2 * r + 3 * t * s)
+        first = first + gap * speed
+        second = second + speed * speed + gap * (2 * r + 6 * t * s)
+    return first, second
+
+
+def _nearest_time(pieces, start, x):
+    """Parameter of the closest point within one part, from that of its chord."""
+    curve = tuple(zip(*pieces, strict=True))
+    end = start + 1 / _PARTS
+
+    def at(t):
+        return tuple(p + t * (q + t * (r + t * s)) for p, q, r, s in curve)
+
+    a, b = at(start), at(end)
+    zero = jnp.zeros_like(x[0])
+    dot = sum(((c - p) * (q - p) for c, p, q in zip(x, a, b, strict=True)), start=zero)
+    square = sum(((q - p) ** 2 for p, q in zip(a, b, strict=True)), start=zero)
+    t = start + clip(quotient(dot, square), 0.0, 1.0) / _PARTS
+    for _ in range(3):
+        first, second = _slope(t, x, curve)
+        t = t - quotient(first, jnp.where(second > 0, second, zero))
+        t = jnp.where(t < start, start, jnp.where(t > end, end, t))
+    return t
+
+
+def _square(pieces, start, x):
+    curve = tuple(zip(*pieces, strict=True))
+    t = _nearest_time(pieces, start, x)
+    gaps = (p + t * (q + t * (r + t * s)) - c for c, (p, q, r, s) in zip(x, curve, strict=True))
+    return sum((g * g for g in gaps), start=jnp.zeros_like(t))
+
+
+class Spline(AbstractSdf):
+    """Tube of `width` [m] along the cubic curve (Catmull-Rom) through `points` [m].
+
+    The closest point is searched on six parts of every piece by Newton's method: exact
+    outside unless one part bends around a point with two closest points.
+    """
+
+    points: Float[Array, "points dim"] = eqx.field(converter=real)
+    width: Float[Array, ""] = eqx.field(converter=real)
+    closed: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        check_points(self, self.points, 3)
+        check_lengths(self, "width")
+
+    @property
+    def dim(self) -> int:
+        return self.points.shape[1]
+
+    @property
+    def exactness(self) -> Exactness:
+        return Exactness(outside=True, inside=False)
+
+    def _pieces(self) -> tuple[Float[Array, "pieces dim"], ...]:
+        """Coefficients of 1, t, t^2, t^3 of every piece, t in [0, 1]."""
+        p = self.points
+        if self.closed:
+            before, after = jnp.roll(p, 1, axis=0), jnp.roll(p, -1, axis=0)
+            start, end = p, after
+            tangent = (after - before) / 2
+            leave, arrive = tangent, jnp.roll(tangent, -1, axis=0)
+        else:
+            middle = (p[2:] - p[:-2]) / 2
+            tangent = jnp.concatenate([(p[1] - p[0])[None], middle, (p[-1] - p[-2])[None]])
+            start, end, leave, arrive = p[:-1], p[1:], tangent[:-1], tangent[1:]
+        square = 3 * (end - start) - 2 * leave - arrive
+        return start, leave, square, 2 * (start - end) + leave + arrive
+
+    def distance(self, *x):
+        pieces = self._pieces()
+        count = pieces[0].shape[0]
+        t = jnp.arange(_PARTS, dtype=x[0].dtype) / _PARTS
+        table = (tuple(jnp.repeat(c, _PARTS, axis=0) for c in pieces), jnp.tile(t, count))
+        index = nearest(lambda row, *x: _square(*row, x), table, x)
+        held = jax.lax.stop_gradient((table, x))
+        near = _nearest_time(take(held[0][0], index), held[0][1][index], held[1])
+        curve = tuple(zip(*take(pieces, index // _PARTS), strict=True))
+
+        at = foot(lambda t, x: _slope(t, x, curve), near, x, 8)
+        gaps = (
+            p + at * (q + at * (r + at * s)) - c
+            for c, (p, q, r, s) in zip(x, curve, strict=True)
+        )
+        return norm(*gaps) - self.width / 2
+
+    def bounding_box(self) -> Box:
+        # A piece lies in the hull of its four Bezier points.
+        start, leave, square, cube = self._pieces()
+        end = start + leave + square + cube
+        arrive = leave + 2 * square + 3 * cube
+        hull = jnp.concatenate([start, end, start + leave / 3, end - arrive / 3])
+        half = self.width / 2
+        return jnp.min(hull, axis=0) - half, jnp.max(hull, axis=0) + half

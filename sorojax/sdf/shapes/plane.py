@@ -1,0 +1,435 @@
+"""Plane shapes; every field here is the exact distance.
+
+Plane shapes with their centre at the origin; move them with `translate`.
+
+Whether a polygon touches itself.
+"""
+
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from sorojax import _check
+from sorojax._types import Numbers, real
+from sorojax.sdf.base import (
+    BOUND,
+    EXACT,
+    AbstractSdf,
+    Box,
+    Exactness,
+    absolute,
+    check_lengths,
+    maximum,
+    minimum,
+    norm,
+    positive_part,
+    quotient,
+    root,
+    sector,
+    segment_side,
+)
+
+
+def touching_edges(vertices: np.ndarray) -> tuple[int, int] | None:
+    """Two edges of a closed polygon that meet away from a shared corner, or None."""
+    a, b = vertices, np.roll(vertices, -1, axis=0)
+    count = len(a)
+    lower, upper = np.minimum(a, b), np.maximum(a, b)
+    for i in range(count):
+        later = np.arange(i + 1, count)
+        near = np.all((lower[later] <= upper[i]) & (upper[later] >= lower[i]), axis=1)
+        for j in later[near]:
+            if _meet(a[i], b[i], a[j], b[j], next_to=j == i + 1 or (i == 0 and j == count - 1)):
+                return i, int(j)
+    return None
+
+
+def _meet(a, b, c, d, next_to: bool) -> bool:
+    if next_to:
+        # Neighbours share a corner; they touch elsewhere where one folds back on the other.
+        first, second = b - a, d - c
+        return abs(_cross(first, second)) == 0 and first @ second < 0
+    sides = (
+        _cross(b - a, c - a),
+        _cross(b - a, d - a),
+        _cross(d - c, a - c),
+        _cross(d - c, b - c),
+    )
+    return sides[0] * sides[1] <= 0 and sides[2] * sides[3] <= 0
+
+
+def _cross(u, v) -> float:
+    return float(u[0] * v[1] - u[1] * v[0])
+
+
+# Plane shapes; every field here is the exact distance
+
+
+class AbstractPlaneShape(AbstractSdf):
+    """A shape in the plane with an exact distance."""
+
+    @property
+    def dim(self) -> int:
+        return 2
+
+    @property
+    def exactness(self) -> Exactness:
+        return EXACT
+
+
+class Circle(AbstractPlaneShape):
+    """Disc of `radius` [m] about `center` [m]."""
+
+    center: Float[Array, "2"] = eqx.field(converter=real)
+    radius: Float[Array, ""] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        _check.shape("Circle", "center", self.center, (2,), "Give (x, y).")
+        _check.positive("Circle", "radius", self.radius, "m", "Give a length above zero.")
+
+    def distance(self, x, y):
+        return norm(x - self.center[0], y - self.center[1]) - self.radius
+
+    def bounding_box(self) -> Box:
+        return self.center - self.radius, self.center + self.radius
+
+
+class Rectangle(AbstractPlaneShape):
+    """Box from `lower` to `upper` [m]; `radius` [m] rounds its corners inside it."""
+
+    lower: Float[Array, "2"] = eqx.field(converter=real)
+    upper: Float[Array, "2"] = eqx.field(converter=real)
+    radius: Float[Array, ""] = eqx.field(converter=real, default=0.0)
+
+    def __check_init__(self):
+        check_box("Rectangle", self.lower, self.upper, self.radius, 2)
+
+    def distance(self, x, y):
+        center, half = (self.lower + self.upper) / 2, (self.upper - self.lower) / 2
+        a = absolute(x - center[0]) - half[0] + self.radius
+        b = absolute(y - center[1]) - half[1] + self.radius
+        inner = minimum(maximum(a, b), jnp.zeros_like(a))
+        return inner + norm(positive_part(a), positive_part(b)) - self.radius
+
+    def bounding_box(self) -> Box:
+        return self.lower, self.upper
+
+
+def check_box(where: str, lower, upper, radius, dim: int) -> None:
+    """Raise a `ValueError` unless the corners and the rounding make a box."""
+    for name, corner in (("lower", lower), ("upper", upper)):
+        _check.shape(where, name, corner, (dim,), f"Give {dim} coordinates.")
+    if not all(_check.is_concrete(v) for v in (lower, upper, radius)):
+        return
+    sides = np.asarray(upper) - np.asarray(lower)
+    if not np.all(sides > 0):
+        raise ValueError(
+            f"{where}: `upper` must lie above `lower`, got {np.asarray(lower)} m and "
+            f"{np.asarray(upper)} m. Swap them or give a positive extent."
+        )
+    if not 0 <= float(radius) <= sides.min() / 2 * (1 + 1e-12):
+        raise ValueError(
+            f"{where}: `radius` must lie between 0 and half the shorter side "
+            f"({sides.min() / 2:g} m), got {float(radius):g} m. Round it less."
+        )
+
+
+class HalfPlane(AbstractPlaneShape):
+    """Everything behind the line through `point` [m] whose outward normal is `normal`."""
+
+    point: Float[Array, "2"] = eqx.field(converter=real)
+    normal: Float[Array, "2"] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        _check.shape("HalfPlane", "point", self.point, (2,), "Give (x, y).")
+        _check.shape("HalfPlane", "normal", self.normal, (2,), "Give (x, y).")
+        if _check.is_concrete(self.normal) and not np.any(np.asarray(self.normal)):
+            raise ValueError("HalfPlane: `normal` is zero. Give the outward direction.")
+
+    def distance(self, x, y):
+        n = self.normal / norm(self.normal[0], self.normal[1])
+        return (x - self.point[0]) * n[0] + (y - self.point[1]) * n[1]
+
+    def bounding_box(self) -> Box:
+        # Only a line along an axis bounds a coordinate.
+        across = self.normal[::-1] == 0
+        infinity = jnp.full_like(self.point, jnp.inf)
+        lower = jnp.where(across & (self.normal < 0), self.point, -infinity)
+        return lower, jnp.where(across & (self.normal > 0), self.point, infinity)
+
+
+class Polygon(AbstractPlaneShape):
+    """Simple polygon of `vertices` [m] in either orientation."""
+
+    vertices: Float[Array, "corners 2"] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        _check.shape("Polygon", "vertices", self.vertices, (None, 2), "One row per corner.")
+        if self.vertices.shape[0] < 3:
+            raise ValueError(
+                f"Polygon: `vertices` has {self.vertices.shape[0]} rows, a polygon needs at "
+                "least 3. List each corner once, in order."
+            )
+        if _check.is_concrete(self.vertices):
+            edges = touching_edges(np.asarray(self.vertices))
+            if edges is not None:
+                raise ValueError(
+                    f"Polygon: edges {edges[0]} and {edges[1]} touch, need a simple polygon. "
+                    "Put its corners in order, or join several polygons by `|`."
+                )
+
+    def distance(self, x, y):
+        shape = (1,) * x.ndim + (-1,)
+        ax, ay = (self.vertices[:, i].reshape(shape) for i in (0, 1))
+        bx, by = jnp.roll(ax, -1, -1), jnp.roll(ay, -1, -1)
+        ex, ey = bx - ax, by - ay
+        length = norm(ex, ey)
+        px, py = x[..., None] - ax, y[..., None] - ay
+        t = quotient(px * ex + py * ey, length**2 + jnp.zeros_like(px))
+        clipped = minimum(maximum(t, jnp.zeros_like(t)), jnp.ones_like(t))
+        square = (px - clipped * ex) ** 2 + (py - clipped * ey) ** 2
+        turn = jnp.where(jnp.sum(ax * by - ay * bx) > 0, 1, -1).astype(x.dtype)
+        side = turn * quotient(px * ey - py * ex, length + jnp.zeros_like(px))
+        nearest = jnp.argmin(square, axis=-1, keepdims=True)
+
+        def pick(a):
+            return jnp.take_along_axis(a, nearest, axis=-1)[..., 0]
+
+        # Beside an edge the side of its line gives distance and sign, with a slope on
+        # the boundary itself, where the root has none.
+        beside = pick((t >= 0) & (t <= 1))
+        sign = jnp.where(_inside(py, px, ey, ex), -1, 1).astype(x.dtype)
+        return jnp.where(beside, pick(side), sign * root(pick(square)))
+
+    def bounding_box(self) -> Box:
+        return jnp.min(self.vertices, axis=0), jnp.max(self.vertices, axis=0)
+
+
+def _inside(py, px, ey, ex) -> Bool[Array, "..."]:
+    """Whether a ray to the right crosses an odd number of edges."""
+    # The height over the next corner by the same subtraction as there: rounding must agree.
+    crosses = (py >= 0) != (jnp.roll(py, -1, -1) >= 0)
+    right = (px * ey - py * ex) * jnp.where(ey > 0, 1, -1).astype(px.dtype) < 0
+    return jnp.sum(crosses & right, axis=-1) % 2 == 1
+
+
+# Plane shapes with their centre at the origin; move them with `translate`
+
+
+def _centred(*half: Array) -> Box:
+    upper = jnp.stack(half)
+    return -upper, upper
+
+
+def _check_count(shape: "RegularPolygon | Star") -> None:
+    if shape.count < 3:
+        raise ValueError(
+            f"{type(shape).__name__}: `count` must be at least 3, got {shape.count}. "
+            "Give the number of corners."
+        )
+
+
+class RegularPolygon(AbstractPlaneShape):
+    """Polygon of `count` equal sides, its corners at `radius` [m], one side facing +x."""
+
+    radius: Float[Array, ""] = eqx.field(converter=real)
+    count: int = eqx.field(static=True)
+
+    def __check_init__(self):
+        check_lengths(self, "radius")
+        _check_count(self)
+
+    def distance(self, x, y):
+        half = math.pi / self.count
+        across, along = sector(x, y, self.count)
+        across = across - self.radius * math.cos(half)
+        past = absolute(along) - self.radius * math.sin(half)
+        corner = norm(across, positive_part(past))
+        return jnp.where((past <= 0) | (across <= 0), across, corner)
+
+    def bounding_box(self) -> Box:
+        return _centred(self.radius, self.radius)
+
+
+class Star(AbstractPlaneShape):
+    """Star of `count` tips at `radius` [m], the first on +x, notches at `inner_radius`."""
+
+    radius: Float[Array, ""] = eqx.field(converter=real)
+    inner_radius: Float[Array, ""] = eqx.field(converter=real)
+    count: int = eqx.field(static=True)
+
+    def __check_init__(self):
+        check_lengths(self, "radius", "inner_radius")
+        _check_count(self)
+        if _check.is_concrete(self.radius) and _check.is_concrete(self.inner_radius):
+            _check.between(
+                "Star", "inner_radius", self.inner_radius, 0, float(self.radius), "m",
+                "Exchange the two radii.",
+            )  # fmt: skip
+
+    def distance(self, x, y):
+        half = math.pi / self.count
+        x, y = sector(x, y, self.count)
+        zero = jnp.zeros_like(self.radius)
+        notch = (self.inner_radius * math.cos(half), self.inner_radius * math.sin(half))
+        return segment_side(x, absolute(y), notch, (self.radius, zero))
+
+    def bounding_box(self) -> Box:
+        return _centred(self.radius, self.radius)
+
+
+class Ring(AbstractPlaneShape):
+    """Annulus from `inner_radius` to `radius` [m]."""
+
+    inner_radius: Float[Array, ""] = eqx.field(converter=real)
+    radius: Float[Array, ""] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        check_lengths(self, "radius", "inner_radius")
+
+    def distance(self, x, y):
+        r = norm(x, y)
+        return maximum(r - self.radius, self.inner_radius - r)
+
+    def bounding_box(self) -> Box:
+        return _centred(self.radius, self.radius)
+
+
+class Arc(AbstractPlaneShape):
+    """Arc of `radius` [m] within `half_angle` [rad] of +x, `width` [m] thick, round ends."""
+
+    radius: Float[Array, ""] = eqx.field(converter=real)
+    half_angle: Float[Array, ""] = eqx.field(converter=real)
+    width: Float[Array, ""] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        check_lengths(self, "radius", "width")
+        _check_half_angle(self)
+
+    def distance(self, x, y):
+        y = absolute(y)
+        c, s = jnp.cos(self.half_angle), jnp.sin(self.half_angle)
+        end = norm(x - c * self.radius, y - s * self.radius)
+        along = absolute(norm(x, y) - self.radius)
+        return jnp.where(c * y <= s * x, along, end) - self.width / 2
+
+    def bounding_box(self) -> Box:
+        reach = self.radius + self.width / 2
+        return _centred(reach, reach)
+
+    @property
+    def exactness(self) -> Exactness:
+        # Where the ends meet, the inside is deeper than half a width.
+        return Exactness(outside=True, inside=False)
+
+
+def _check_half_angle(shape: "Arc | Pie") -> None:
+    _check.between(
+        type(shape).__name__, "half_angle", shape.half_angle, 0, math.pi, "rad",
+        "Use a Ring or a Circle for a whole turn.",
+    )  # fmt: skip
+
+
+class Pie(AbstractPlaneShape):
+    """Sector of a disc of `radius` [m] within `half_angle` [rad] of +x."""
+
+    radius: Float[Array, ""] = eqx.field(converter=real)
+    half_angle: Float[Array, ""] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        check_lengths(self, "radius")
+        _check_half_angle(self)
+
+    def distance(self, x, y):
+        zero = jnp.zeros_like(self.radius)
+        c, s = jnp.cos(self.half_angle), jnp.sin(self.half_angle)
+        edge = segment_side(x, absolute(y), (zero, zero), (c * self.radius, s * self.radius))
+        return maximum(norm(x, y) - self.radius, edge)
+
+    def bounding_box(self) -> Box:
+        return _centred(self.radius, self.radius)
+
+
+class Vesica(AbstractPlaneShape):
+    """Lens between two arcs, `width` [m] wide along x and `height` [m] high along y."""
+
+    width: Float[Array, ""] = eqx.field(converter=real)
+    height: Float[Array, ""] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        check_lengths(self, "width", "height")
+        if _check.is_concrete(self.width) and _check.is_concrete(self.height):
+            _check.between(
+                "Vesica", "width", self.width, 0, float(self.height) * (1 + 1e-9), "m",
+                "Exchange them and turn the shape by `rotate`.",
+            )  # fmt: skip
+
+    def distance(self, x, y):
+        a, b = self.width / 2, self.height / 2
+        x, y = absolute(x), absolute(y)
+        shift = (b * b - a * a) / (2 * a)  # from the origin to the centre of an arc
+        tip = (y - b) * shift > x * b
+        return jnp.where(tip, norm(x, y - b), norm(x + shift, y) - (a + shift))
+
+    def bounding_box(self) -> Box:
+        return _centred(self.width / 2, self.height / 2)
+
+
+class Squircle(AbstractSdf):
+    """Superellipse |x|^n + |y|^n = radius^n, n = `power` above 2; a bound of the distance."""
+
+    radius: Float[Array, ""] = eqx.field(converter=real)
+    power: Float[Array, ""] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        check_lengths(self, "radius")
+        _check.between(
+            "Squircle", "power", self.power, 2, math.inf, "", "Use a Circle for power 2."
+        )
+
+    @property
+    def dim(self) -> int:
+        return 2
+
+    @property
+    def exactness(self) -> Exactness:
+        return BOUND
+
+    def distance(self, x, y):
+        # The n-norm has a slope of length 1 or less for n above 2, so this is a bound;
+        # it is homogeneous, and scaling by the larger coordinate keeps powers small.
+        x, y = absolute(x), absolute(y)
+        large = maximum(x, y)
+        some = large > 0
+        safe = jnp.where(some, large, jnp.ones_like(large))
+        u, v = (_power(c / safe, self.power) for c in (x, y))
+        length = safe * jnp.exp(jnp.log(u + v) / self.power)
+        return jnp.where(some, length, jnp.zeros_like(large)) - self.radius
+
+    def bounding_box(self) -> Box:
+        return _centred(self.radius, self.radius)
+
+    def level_box(self, level) -> Box:
+        return _centred(self.radius + level, self.radius + level)
+
+
+def _power(base: Array, power: Array) -> Array:
+    """base^power with zero slopes where the base is zero."""
+    some = base > 0
+    safe = jnp.where(some, base, jnp.ones_like(base))
+    return jnp.where(some, jnp.exp(power * jnp.log(safe)), jnp.zeros_like(base))
+
+
+def triangle(a: Numbers, b: Numbers, c: Numbers) -> Polygon:
+    """Triangle of three corners [m]."""
+    return Polygon(jnp.stack([real(a), real(b), real(c)]))
+
+
+def trapezoid(width: Numbers, top_width: Numbers, height: Numbers) -> Polygon:
+    """Symmetric trapezoid about the origin, `width` wide below, `top_width` above [m]."""
+    low, high, rise = real(width) / 2, real(top_width) / 2, real(height) / 2
+    corners = [(-low, -rise), (low, -rise), (high, rise), (-high, rise)]
+    return Polygon(jnp.stack([jnp.stack(corner) for corner in corners]))

@@ -1,0 +1,1 @@
+"""The zero set: contours, marching cubes, dual contouring, reports."""

@@ -1,0 +1,160 @@
+"""What is wrong with a surface, and what it encloses."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sorojax.sdf.surface.marching import Surface
+from sorojax.sdf.trimesh.rays import crossing_triangles, least_wall
+
+
+class SurfaceReport(NamedTuple):
+    """Findings about a triangle surface.
+
+    Attributes:
+        open_edges: (n, 2) vertices of edges with one triangle.
+        crowded_edges: (n, 2) vertices of edges with more than two triangles.
+        turned_edges: (n, 2) vertices of edges whose two triangles face opposite ways.
+        pinched_vertices: Vertices where two sheets touch in one point.
+        degenerate: Triangles that repeat a vertex.
+        num_shells: Connected parts.
+        genus: Number of handles, all shells together; -1 for an open surface.
+        crossings: (n, 2) triangles that share no vertex and pass through each other; at most
+            1000 of them.
+        wall_thickness: Smallest distance [m] through the body along inward normals, between
+            sides that face away from each other within 25 degrees; infinite for an open
+            surface, and where no such sides are.
+        volume: Enclosed volume [m^3], negative where triangles face inwards.
+        area: Surface area [m^2].
+    """
+
+    open_edges: np.ndarray
+    crowded_edges: np.ndarray
+    turned_edges: np.ndarray
+    pinched_vertices: np.ndarray
+    degenerate: np.ndarray
+    num_shells: int
+    genus: int
+    volume: float
+    area: float
+    crossings: np.ndarray
+    wall_thickness: float
+
+    def __repr__(self) -> str:
+        faults = (
+            "open_edges", "crowded_edges", "turned_edges", "pinched_vertices", "degenerate",
+            "crossings",
+        )  # fmt: skip
+        found = [f"{len(getattr(self, f))} {f}" for f in faults if len(getattr(self, f))]
+        return (
+            f"SurfaceReport: {self.num_shells} shell(s) of genus {self.genus}, volume "
+            f"{self.volume:.4g} m^3, area {self.area:.4g} m^2, wall {self.wall_thickness:.4g} "
+            f"m\n  {', '.join(found) or 'no fault found'}"
+        )
+
+    @property
+    def watertight(self) -> bool:
+        """Whether every edge joins two triangles that face the same way."""
+        bad = (self.open_edges, self.crowded_edges, self.turned_edges, self.degenerate)
+        return not any(len(found) for found in bad)
+
+    @property
+    def printable(self) -> bool:
+        """Whether it is manifold and no two triangles pass through each other."""
+        return self.manifold and not len(self.crossings)
+
+    @property
+    def manifold(self) -> bool:
+        """Whether it is watertight and no two sheets touch in a vertex."""
+        return self.watertight and not len(self.pinched_vertices)
+
+
+def surface_report(surface: Surface) -> SurfaceReport:
+    """Check a surface: open, crowded and turned edges, shells, genus, volume, area.
+
+    Raises:
+        ValueError: If a triangle names a vertex that is not there, or a vertex is not
+            finite.
+    """
+    vertices, triangles = _checked(surface)
+    t = triangles
+    degenerate = np.flatnonzero(
+        (t[:, 0] == t[:, 1]) | (t[:, 1] == t[:, 2]) | (t[:, 2] == t[:, 0])
+    )
+    half = np.stack([t, np.roll(t, -1, axis=1)], axis=-1).reshape(-1, 2)
+    ordered = np.sort(half, axis=1)
+    name = ordered[:, 0] * max(len(vertices), 1) + ordered[:, 1]
+    _, first, edge, uses = np.unique(
+        name, return_index=True, return_inverse=True, return_counts=True
+    )
+    balance = np.bincount(edge, np.where(half[:, 0] < half[:, 1], 1, -1), len(first))
+    edges = ordered[first]
+    turned = edges[(uses == 2) & (balance != 0)]
+    shells, used, fans = _parts(t, edge, uses, len(vertices))
+    corners = vertices[t]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    euler = used - len(edges) + len(t)
+    closed = not np.any(uses != 2)
+    return SurfaceReport(
+        open_edges=edges[uses == 1],
+        crowded_edges=edges[uses > 2],
+        turned_edges=turned,
+        pinched_vertices=np.flatnonzero(fans > 1),
+        degenerate=degenerate,
+        num_shells=shells,
+        genus=shells - euler // 2 if closed else -1,
+        volume=float((corners.mean(axis=1) * normal).sum() / 3),
+        area=float(np.sqrt((normal * normal).sum(axis=1)).sum()),
+        crossings=crossing_triangles(vertices, t),
+        wall_thickness=least_wall(vertices, t) if closed and len(t) else np.inf,
+    )
+
+
+def _checked(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    vertices = np.asarray(surface.vertices, dtype=float).reshape(-1, 3)
+    triangles = np.asarray(surface.triangles).astype(np.int64).reshape(-1, 3)
+    wrong = ((triangles < 0) | (triangles >= len(vertices))).any(axis=1)
+    if wrong.any():
+        row = int(np.flatnonzero(wrong)[0])
+        raise ValueError(
+            f"surface_report: triangle {row} is {triangles[row].tolist()}, need rows of the "
+            f"{len(vertices)} vertices. Read the file again or rebuild the surface."
+        )
+    lost = ~np.isfinite(vertices).all(axis=1)
+    if lost.any():
+        raise ValueError(
+            f"surface_report: {int(lost.sum())} vertices are not finite, the first is number "
+            f"{int(np.flatnonzero(lost)[0])}. Remove them or rebuild the surface."
+        )
+    return vertices, triangles
+
+
+def _parts(t, edge, uses, count) -> tuple[int, int, np.ndarray]:
+    """Number of shells, of vertices used, and of triangle fans around each vertex."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    # Corners of triangles, joined to the same corner of the triangle across an edge.
+    corner = np.arange(3 * len(t)).reshape(-1, 3)
+    order = np.argsort(edge, kind="stable")
+    pair = order[np.isin(edge[order], np.flatnonzero(uses == 2))].reshape(-1, 2)
+    row, side = np.divmod(pair, 3)
+    ends = [corner[row[:, k], side[:, k]] for k in (0, 1)]
+    tails = [corner[row[:, k], (side[:, k] + 1) % 3] for k in (0, 1)]
+    flat = t.ravel()
+    same = flat[ends[0]] == flat[ends[1]]
+    join = np.concatenate(
+        [
+            np.stack([ends[0], np.where(same, ends[1], tails[1])]),
+            np.stack([tails[0], np.where(same, tails[1], ends[1])]),
+        ],
+        axis=1,
+    )
+    size = 3 * len(t)
+    graph = coo_array((np.ones(join.shape[1]), (join[0], join[1])), shape=(size, size))
+    fan = connected_components(graph, directed=False)[1] if size else np.zeros(0, int)
+    firsts = np.unique(fan, return_index=True)[1]
+    fans = np.bincount(flat[firsts], minlength=count) if size else np.zeros(count, int)
+    faces = coo_array((np.ones(len(row)), (row[:, 0], row[:, 1])), shape=2 * (len(t),))
+    shells = connected_components(faces, directed=False)[0] if len(t) else 0
+    return int(shells), len(np.unique(flat)), fans

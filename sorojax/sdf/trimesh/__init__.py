@@ -1,0 +1,1 @@
+"""Closed triangle meshes as shapes: the closest triangle, the side, rays."""

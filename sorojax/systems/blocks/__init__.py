@@ -1,0 +1,1 @@
+"""Blocks: rods, bodies, fluidics, signals."""

@@ -1,0 +1,263 @@
+"""A rod as a block: pressure in, volume and tip out.
+
+An assembly as a block: pressures of its rods in, volumes, tips and joint efforts.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax._types import optional_real
+from sorojax.math.linalg.dense import solve_symmetric
+from sorojax.math.status import Status
+from sorojax.rod import (
+    AbstractForce,
+    AbstractPressureMap,
+    Assembly,
+    JointEffort,
+    Motion,
+    On,
+    Pressurised,
+    Rod,
+    acceleration,
+    inertia,
+    motion,
+    num_coordinates,
+    num_dof,
+    operators,
+    rest,
+    slices,
+    tip_angle,
+    tip_pose,
+    total_force,
+)
+from sorojax.rod.dynamics.dynamics import coordinate_rate
+from sorojax.rod.forces.loads import Load
+from sorojax.rod.model.assembly import index_of
+from sorojax.rod.statics.validity import checked_status
+from sorojax.systems.blocks.block import AbstractBlock, Input, Output
+
+
+class RodBody(AbstractBlock):
+    """A rod with its forces; the state is {q, v}.
+
+    A pressure map among the forces opens the ports `pressure`, `volume`, `volume_rate` (at
+    held pressure) and `compliance` of the walls. All come from the same potential as the
+    force, so no energy is lost between fluid and rod.
+
+    Attributes:
+        rod: The rod.
+        forces: Its forces; at most one pressure map (of one or several ports).
+        q, v: Coordinates and rates at the start; zero if omitted.
+        driven: Open an input `effort`, a generalised force from outside.
+    """
+
+    rod: Rod
+    forces: tuple[AbstractForce | AbstractPressureMap, ...] = ()
+    q: Float[Array, " dof"] | None = eqx.field(converter=optional_real, default=None)
+    v: Float[Array, " dof"] | None = eqx.field(converter=optional_real, default=None)
+    driven: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        maps = [f for f in self.forces if isinstance(f, AbstractPressureMap)]
+        if len(maps) > 1:
+            raise ValueError(
+                f"RodBody: got {len(maps)} pressure maps, need at most one. Return several "
+                "volumes from one map: it then has one port per chamber."
+            )
+
+    @property
+    def inputs(self):
+        chamber = self._chamber()
+        effort = {"effort": Input(None, self._dof(), 0.0)} if self.driven else {}
+        if chamber is None:
+            return effort
+        return effort | {"pressure": Input("Pa", chamber.ports, default=0.0)}
+
+    @property
+    def outputs(self):
+        dim = self.rod.group.space_dim
+        ports = {"tip_position": Output("m", (dim,)), "q": Output(None, self._dof())}
+        ports["v"] = Output(None, self._dof())
+        if dim == 2:
+            ports["tip_angle"] = Output("rad")
+        chamber = self._chamber()
+        if chamber is not None:
+            needs = frozenset({"pressure"})
+            units = {"volume": "m^3", "volume_rate": "m^3/s", "compliance": "m^3/Pa"}
+            ports |= {name: Output(unit, chamber.ports, needs) for name, unit in units.items()}
+        return ports
+
+    def initial_state(self):
+        zero = jnp.zeros(self._dof(), self.rod.length.dtype)
+        return {
+            "q": zero if self.q is None else self.q,
+            "v": zero if self.v is None else self.v,
+        }
+
+    def output(self, name, t, state, inputs):
+        q, v = state["q"], state["v"]
+        if name in ("q", "v"):
+            return state[name]
+        if name == "tip_position":
+            return tip_pose(self.rod, q)[:-1, -1]
+        if name == "tip_angle":
+            return tip_angle(motion(self.rod, q))
+        chamber = self._chamber()
+        assert chamber is not None
+        pressure = inputs["pressure"]
+        volume = jax.grad(chamber.coenergy, argnums=1)
+        if name == "compliance":
+            one = jnp.ones_like(pressure)
+            return jax.jvp(lambda p: volume(q, p), (pressure,), (one,))[1]
+        value, rate = jax.jvp(lambda q: volume(q, pressure), (q,), (v,))
+        return value if name == "volume" else rate
+
+    def vector_field(self, t, state, inputs):
+        moment = motion(self.rod, state["q"], state["v"])
+        mass, coriolis = inertia(moment)
+        force = total_force(self._bound(inputs), t, moment)
+        if self.driven:
+            force = force + inputs["effort"]
+        return {"q": state["v"], "v": solve_symmetric(mass, force - coriolis)}
+
+    def path_status(self, path):
+        return checked_status(Status.successful, self.rod, path["q"])
+
+    def _bound(self, inputs) -> tuple[AbstractForce, ...]:
+        return tuple(
+            Pressurised(force, inputs["pressure"])
+            if isinstance(force, AbstractPressureMap)
+            else force
+            for force in self.forces
+        )
+
+    def _chamber(self) -> AbstractPressureMap | None:
+        maps = (f for f in self.forces if isinstance(f, AbstractPressureMap))
+        return next(maps, None)
+
+    def _dof(self) -> tuple[int]:
+        return (self.rod.basis.num_dof,)
+
+
+def body_motion(body: RodBody, state) -> Motion:
+    """The fields of the rod in a state of the body, for pictures and energies."""
+    return motion(body.rod, state["q"], state["v"])
+
+
+# An assembly as a block: pressures of its rods in, volumes, tips and joint efforts
+
+
+_FLUID = {"volume": "m^3", "volume_rate": "m^3/s", "compliance": "m^3/Pa"}
+
+
+class AssemblyBody(AbstractBlock):
+    """An assembly with its forces; the state is {q, v}.
+
+    Ports of a part are named after it. A pressure map, `On("finger", map)`, opens
+    `finger_pressure`, `finger_volume`, `finger_volume_rate` (at held pressure) and
+    `finger_compliance`, all from one potential. A driven joint opens `wrist_effort`. Each
+    part has `finger_position`, of its tip or of the frame of a link.
+
+    Attributes:
+        assembly: The assembly.
+        forces: Its forces; at most one pressure map per rod.
+        driven: Parts whose joints take an effort from outside.
+        q, v: Coordinates and rates at the start; at rest if omitted.
+    """
+
+    assembly: Assembly
+    forces: tuple[Load, ...] = ()
+    driven: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
+    q: Float[Array, " coordinates"] | None = eqx.field(converter=optional_real, default=None)
+    v: Float[Array, " dof"] | None = eqx.field(converter=optional_real, default=None)
+
+    def __check_init__(self):
+        names = [part for part, _ in _maps(self.forces)]
+        twice = {name for name in names if names.count(name) > 1}
+        if twice:
+            raise ValueError(
+                f"AssemblyBody: `{min(twice)}` has {names.count(min(twice))} pressure maps, "
+                "need at most one per rod. Return several volumes from one map."
+            )
+        for name in (*names, *self.driven):
+            index_of(self.assembly, name)
+
+    @property
+    def inputs(self):
+        ports = {f"{k}_pressure": Input("Pa", m.ports, 0.0) for k, m in self._maps().items()}
+        for name in self.driven:
+            ports[f"{name}_effort"] = Input(None, (self._joint_dof(name),), 0.0)
+        return ports
+
+    @property
+    def outputs(self):
+        dim = self.assembly.group.space_dim
+        ports = {f"{name}_position": Output("m", (dim,)) for name in self.assembly.names}
+        ports["q"] = Output(None, (num_coordinates(self.assembly),))
+        for name, chamber in self._maps().items():
+            needs = frozenset({f"{name}_pressure"})
+            for kind, unit in _FLUID.items():
+                ports[f"{name}_{kind}"] = Output(unit, chamber.ports, needs)
+        return ports
+
+    def initial_state(self):
+        start = rest(self.assembly)
+        zero = jnp.zeros(num_dof(self.assembly), start.dtype)
+        return {
+            "q": start if self.q is None else self.q,
+            "v": zero if self.v is None else self.v,
+        }
+
+    def output(self, name, t, state, inputs):
+        q, v = state["q"], state["v"]
+        if name == "q":
+            return q
+        for part, chamber in self._maps().items():
+            kind = name.removeprefix(f"{part}_")
+            if name != kind and kind in _FLUID:
+                at = slices(self.assembly)[index_of(self.assembly, part)]
+                own = (q[at.rod_q], v[at.rod_v])
+                return _fluid(chamber, kind, *own, inputs[f"{part}_pressure"])
+        return tip_pose(self.assembly, q)[name.removesuffix("_position")][:-1, -1]
+
+    def vector_field(self, t, state, inputs):
+        q, v, constants = state["q"], state["v"], operators(self.assembly)
+        a = acceleration(self.assembly, constants, t, q, v, self.acting(inputs))
+        return {"q": coordinate_rate(self.assembly, q, v), "v": a}
+
+    def path_status(self, path):
+        return checked_status(Status.successful, self.assembly, path["q"])
+
+    def acting(self, inputs) -> tuple[Load, ...]:
+        """The forces under given inputs: maps with their pressures, joints with efforts."""
+        plain = tuple(force for force in self.forces if not _maps((force,)))
+        bound = tuple(
+            On(part, Pressurised(chamber, inputs[f"{part}_pressure"]))
+            for part, chamber in self._maps().items()
+        )
+        driven = tuple(JointEffort(name, inputs[f"{name}_effort"]) for name in self.driven)
+        return (*plain, *bound, *driven)
+
+    def _maps(self) -> dict[str, AbstractPressureMap]:
+        return dict(_maps(self.forces))
+
+    def _joint_dof(self, name: str) -> int:
+        return self.assembly[name].joint.num_dof(self.assembly.group)
+
+
+def _maps(forces: tuple[Load, ...]) -> list[tuple[str, AbstractPressureMap]]:
+    """The pressure maps, with the parts that they are on."""
+    on = [force for force in forces if isinstance(force, On)]
+    return [(f.part, f.force) for f in on if isinstance(f.force, AbstractPressureMap)]
+
+
+def _fluid(chamber: AbstractPressureMap, kind: str, q: Array, v: Array, pressure: Array):
+    volume = jax.grad(chamber.coenergy, argnums=1)
+    if kind == "volume":
+        return volume(q, pressure)
+    if kind == "compliance":
+        one = jnp.ones_like(pressure)
+        return jax.jvp(lambda p: volume(q, p), (pressure,), (one,))[1]
+    return jax.jvp(lambda q: volume(q, pressure), (q,), (v,))[1]

@@ -1,0 +1,241 @@
+"""The method for networks with large bodies: those implicitly, all else along with them."""
+
+from typing import Any, ClassVar, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from sorojax import fem
+from sorojax._types import real
+from sorojax.fem.dynamics.step import Interval, Matter, State, begin_step, end_step
+from sorojax.fem.equilibrium.jit import prepare_traced
+from sorojax.fem.equilibrium.linear import Prepared
+from sorojax.math.ode.explicit import AbstractMethod, RungeKutta4, Step, repeat
+from sorojax.math.ode.step_control import cut
+from sorojax.systems.blocks.fem_body import FemBody, acceleration
+from sorojax.systems.integrate.fem_step import (
+    Drives,
+    Equations,
+    Fields,
+    Stage,
+    balanced,
+    loaded_step,
+)
+from sorojax.systems.integrate.march import Rate
+from sorojax.systems.network import Network, at_time, inputs_of, rates_of
+
+Names = tuple[str, ...]
+
+
+class _Known(NamedTuple):
+    """What a body keeps for a whole run."""
+
+    matter: Matter
+    prepared: Prepared
+
+
+class Memory(NamedTuple):
+    """What the method carries: acceleration and what loads remember, by body; and what it
+    keeps."""
+
+    bodies: dict[str, State]
+    known: dict[str, _Known]
+
+
+class _Given(NamedTuple):
+    """All that a part of a step depends on: the state before it, and the part."""
+
+    method: "Coupled"
+    network: Network
+    inputs: dict[str, Any]
+    known: dict[str, _Known]
+    t: Float[Array, ""]
+    h: Float[Array, ""]
+    y: dict[str, PyTree]
+    bodies: dict[str, State]
+
+
+class Coupled(AbstractMethod):
+    """Fixed steps of networks with `FemBody` blocks: generalised-alpha for the bodies, an
+    own method for the rest, both solved together in every step.
+
+    Within a step the nodes move along straight lines; on that way the other blocks are
+    integrated by `rest`, and what their ports then say are the loads of the bodies at the
+    end. Newton's method solves for displacements and loads at once, whatever the
+    stiffness of a gas beside that of the walls: there is no iteration between the parts that
+    could diverge. Of order 2. A step that does not converge, or would invert a cell, is
+    halved, at most `max_cuts` times in a row, and never accepted.
+
+    Differentiable, forward and in reverse, in everything that the network holds: one tangent
+    per step, at its solution. The bodies stand in the network itself, not in one within it.
+
+    Attributes:
+        rho_inf: Of the bodies: what an oscillation much faster than the step keeps of its
+            size in one step.
+        rest: Method of all other blocks; `Rodas4()` where a regulator, a valve or a filter
+            is much faster than the step.
+        substeps: Steps of `rest` in a step.
+        newton: Tolerances.
+        max_cuts: How often a part of a step may be halved in a row.
+    """
+
+    rho_inf: Float[Array, ""] = eqx.field(converter=real, default=0.5)
+    rest: AbstractMethod = eqx.field(default_factory=RungeKutta4)
+    substeps: int = eqx.field(static=True, default=1)
+    newton: fem.Newton = eqx.field(default_factory=fem.Newton)
+    max_cuts: int = eqx.field(static=True, default=10)
+    num_order: ClassVar[int] = 2
+    interpolation_cls: ClassVar = dfx.LocalLinearInterpolation
+
+    @property
+    def carries(self) -> bool:
+        return True
+
+    def begin(self, field, t, y, h) -> Memory:
+        network, inputs = _network(field)
+        names = bodies_of(network)
+        own = inputs_of(network, t, y, at_time(inputs, t), names)
+        known, states = {}, {}
+        for name in names:
+            block = _block(network, name)
+            dynamics = block.dynamics(
+                fem.GeneralisedAlpha(0.5).coefficients(), jnp.ones_like(t)
+            )
+            known[name] = _Known(block.matter(), prepare_traced(block.problem))
+            loaded = block.loaded(block.values(own[name]))
+            u, v = y[name]["u"], y[name]["v"]
+            a = acceleration(block, loaded, known[name].matter, u, v)
+            states[name] = eqx.tree_at(lambda s: s.acceleration, dynamics.start, a)
+        return Memory(states, known)
+
+    def advance(self, field, t, y, h, memory):
+        network, inputs = _network(field)
+        given = (self, network, inputs, memory.known, t)
+        (new, bodies), converged = cut(
+            _attempt, self.max_cuts, given, jnp.asarray(h), (y, memory.bodies)
+        )
+        return Step(new, None, Memory(bodies, memory.known), {}, converged)
+
+
+def bodies_of(block: Any) -> Names:
+    """Names of the large bodies of a network."""
+    blocks = block.blocks if isinstance(block, Network) else {}
+    return tuple(name for name, one in blocks.items() if isinstance(one, FemBody))
+
+
+def _network(field) -> tuple[Network, dict[str, Any]]:
+    block = field.block if isinstance(field, Rate) else None
+    if not isinstance(block, Network) or not bodies_of(block):
+        raise ValueError(
+            "Coupled: got no network with a FemBody block, need one, in fixed steps. Call "
+            "simulate(network, duration, step=...), with the bodies in the network itself."
+        )
+    return block, dict(field.inputs)
+
+
+def _block(network: Network, name: str) -> FemBody:
+    block = network.blocks[name]
+    assert isinstance(block, FemBody)
+    return block
+
+
+def _attempt(given, offset, size, state):
+    """A part of a step: everything after it, and whether it converged."""
+    method, network, inputs, known, t = given
+    now = _Given(method, network, inputs, known, t + offset, size, *state)
+    u, w, converged = balanced(Equations(_stages, _answer), method.newton, now)
+    new, bodies = {}, {}
+    for name, stage in _stages(now).items():
+        end = _ended(now, name, stage, u[name], w[name])
+        bodies[name] = end
+        new[name] = {
+            "u": end.displacement, "v": end.velocity, "work": end.work,
+            "dissipated": end.dissipated,
+        }  # fmt: skip
+    rest = _marched(now, u)
+    return ({name: {**new, **rest}[name] for name in now.y}, bodies), converged
+
+
+def _stages(now: _Given) -> dict[str, Stage]:
+    """The bodies at the start of a step."""
+    names = bodies_of(now.network)
+    own = inputs_of(now.network, now.t, now.y, at_time(now.inputs, now.t), names)
+    scheme = fem.GeneralisedAlpha(now.method.rho_inf).coefficients()
+    stages = {}
+    for name in names:
+        block, state = _block(now.network, name), _state(now, name)
+        drives = block.values(own[name])
+        dynamics = block.dynamics(scheme, now.h)
+        dynamics = eqx.tree_at(lambda d: d.problem, dynamics, block.loaded(drives))
+        step = begin_step(dynamics, now.known[name].matter, state, _whole(now.h))
+        stages[name] = Stage(dynamics, now.known[name].prepared, state, step, drives)
+    return stages
+
+
+def _whole(h) -> Interval:
+    return Interval(jnp.zeros((), jnp.int32), jnp.zeros_like(h), jnp.ones_like(h))
+
+
+def _state(now: _Given, name: str) -> State:
+    y, kept = now.y[name], now.bodies[name]
+    return State(
+        now.t, y["u"], y["v"], kept.acceleration, kept.memory, y["work"], y["dissipated"],
+        kept.share,
+    )  # fmt: skip
+
+
+def _ended(now: _Given, name: str, stage: Stage, u, w) -> State:
+    step, matter = loaded_step(stage, w), now.known[name].matter
+    return end_step(stage.dynamics, matter, stage.state, _whole(now.h), step, u)
+
+
+def _answer(now: _Given, u: Fields) -> Drives:
+    """Loads of the bodies at the end of a step, when they move to `u`."""
+    network, t = now.network, now.t + now.h
+    names = bodies_of(network)
+    y = {**_marched(now, u), **_after(now, u)}
+    own = inputs_of(network, t, y, at_time(now.inputs, t), names)
+    return {name: _block(network, name).values(own[name]) for name in names}
+
+
+def _marched(now: _Given, u: Fields) -> dict[str, PyTree]:
+    """The other blocks at the end of a step."""
+    names = tuple(name for name in now.y if name not in u)
+    start = {name: now.y[name] for name in names}
+    if not jax.tree.leaves(start):
+        return start
+
+    def rate(t, x):
+        y = {**x, **_between(now, u, (t - now.t) / now.h)}
+        return rates_of(now.network, t, y, at_time(now.inputs, t), names)
+
+    count = now.method.substeps
+    return repeat(now.method.rest, rate, now.t, start, now.h / count, count)
+
+
+def _between(now: _Given, u: Fields, share) -> dict[str, PyTree]:
+    """States of the bodies within a step: nodes move along straight lines at the mean
+    velocity, so that rates of volumes are those of the volumes, however long the step."""
+    af = fem.GeneralisedAlpha(now.method.rho_inf).coefficients().af
+    found = {}
+    for name, at in u.items():
+        start = now.y[name]
+        move = (at - start["u"]) / (1 - af)
+        found[name] = {**start, "u": start["u"] + share * move, "v": move / now.h}
+    return found
+
+
+def _after(now: _Given, u: Fields) -> dict[str, PyTree]:
+    """States of the bodies at the end of a step."""
+    scheme = fem.GeneralisedAlpha(now.method.rho_inf).coefficients()
+    h, found = now.h, {}
+    for name, at in u.items():
+        start, a = now.y[name], now.bodies[name].acceleration
+        move = (at - start["u"]) / (1 - scheme.af)
+        late = (move - h * start["v"]) / (scheme.beta * h**2) - (1 / (2 * scheme.beta) - 1) * a
+        v = start["v"] + h * ((1 - scheme.gamma) * a + scheme.gamma * late)
+        found[name] = {**start, "u": start["u"] + move, "v": v}
+    return found

@@ -1,0 +1,270 @@
+"""Integration of one block: flat states, runs that stop at their last good state.
+
+Progress of an adaptive run, told to the listener of the framework.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from sorojax.math import host as told
+from sorojax.math.ode.explicit import AbstractMethod
+from sorojax.math.ode.step_control import Control, Seam
+from sorojax.math.status import Status
+from sorojax.systems.blocks.block import AbstractBlock
+from sorojax.systems.network import at_time
+
+
+class Meter(dfx.AbstractProgressMeter):
+    """Reports every hundredth of the time from `start` to `end`, of a run whose steps may
+    lead further, at most to `far`; of lanes that run at once their mean."""
+
+    start: Float[Array, ""]
+    far: Float[Array, ""]
+    end: Float[Array, ""]
+    label: str = eqx.field(static=True, default="simulate")
+
+    def init(self):
+        return jnp.zeros_like(self.end)
+
+    def step(self, state, progress):
+        passed = jax.lax.stop_gradient(progress * (self.far - self.start))
+        share = jnp.minimum(passed / (self.end - self.start), 1.0).astype(state.dtype)
+        # one number for all lanes, so that the condition stays one under `vmap`
+        share, last = told.mean_of_lanes(share), told.largest_of_lanes(state)
+        due = (share >= last + 0.01) | ((share >= 1.0) & (last < 1.0))
+        jax.lax.cond(due, lambda x: told.tell(self.label, x), lambda _: None, share)
+        return jnp.where(due, share, last)
+
+    def close(self, state):
+        pass
+
+
+# Integration of one block: flat states, runs that stop at their last good state
+
+
+_FAR = 1e30  # s, beyond the end of every run
+
+
+class Motion(NamedTuple):
+    """States on a grid of times, held from `reached` [s] on if the run ended before.
+
+    Attributes:
+        path: States, with a leading time axis.
+        last: The state at `reached`: the end, an event, or the last good state.
+        triggered: Which of the events ended the run.
+        dense: The continuous solution, if asked for.
+        memory: Of a method that keeps one for the whole run.
+    """
+
+    path: PyTree
+    last: PyTree
+    reached: Float[Array, ""]
+    status: Status
+    steps: Int[Array, ""]
+    rejected: Int[Array, ""]
+    triggered: Bool[Array, " events"]
+    dense: Any
+    memory: Any = None
+
+
+class Resume(NamedTuple):
+    """From where a run goes on: the last step, and the memory of the method before it."""
+
+    seam: Seam
+    memory: Any
+
+
+class FlatField(eqx.Module):
+    """The rate of the state as one vector: fewer and larger kernels than a tree of states."""
+
+    unravel: Callable[[Array], PyTree] = eqx.field(static=True)
+
+    def __call__(self, t: Any, x: Array, args: Any) -> Array:
+        block, inputs, *_ = args
+        t = jnp.asarray(t, x.dtype)
+        return ravel_pytree(block.vector_field(t, self.unravel(x), at_time(inputs, t)))[0]
+
+
+class Conditions(NamedTuple):
+    """Signals (t, state, block, inputs) -> number that end a run as they cross zero, and
+    which way they cross: True rising, False falling, None either; `last` is the number of
+    that which has just happened, so that it does not happen again at once."""
+
+    signals: tuple[Callable[..., Array], ...] = ()
+    rising: tuple[bool | None, ...] = ()
+    last: Int[Array, ""] | None = None
+
+
+_NO_CONDITIONS = Conditions()
+
+
+def adaptive(
+    block: AbstractBlock,
+    inputs: Mapping[str, Any],
+    state: PyTree,
+    time: Float[Array, " time"],
+    solver: dfx.AbstractSolver,
+    control: dfx.AbstractStepSizeController,
+    *,
+    max_steps: int,
+    adjoint: dfx.AbstractAdjoint | None = None,
+    start: Float[Array, ""] | None = None,
+    conditions: Conditions = _NO_CONDITIONS,
+    dense: bool = False,
+    progress: bool | str = False,
+    seam: Resume | None = None,
+) -> Motion:
+    """Run from `start`, by default time[0], to time[-1]; what the grid holds before `start`
+    is the first state. With a `seam` go on from there.
+
+    Steps are not shortened to end at time[-1], which is interpolated, unless there are
+    conditions: so that a run that is cut in two takes the steps of the whole one.
+    """
+    start = time[0] if start is None else start
+    flat, unravel = ravel_pytree(state)
+    inputs = explicit_inputs(inputs, start)
+    control, end = flat_tolerances(control, state), time[-1]
+    going: Any = control
+    free = isinstance(control, Control) and not conditions.signals
+    further = {}
+    if free:
+        longest = jnp.min(jnp.diff(time))
+        control = going = going.to_end(time[-1], longest)
+        end = jnp.full_like(end, _FAR)
+    if seam is not None:
+        start, flat = seam.seam.time, seam.seam.state
+        further = {"dt0": seam.seam.step, "controller_state": going.begun(seam.seam)}
+        further["solver_state"] = None if seam.memory is None else (seam.memory, seam.memory)
+    solution = dfx.diffeqsolve(
+        dfx.ODETerm(FlatField(unravel)),
+        solver,
+        start,
+        end,
+        further.pop("dt0", None),
+        flat,
+        args=(block, inputs, _sides(conditions, block, inputs, state, start)),
+        saveat=dfx.SaveAt(
+            subs=[dfx.SubSaveAt(ts=jnp.maximum(time, start)), dfx.SubSaveAt(t1=True)],
+            dense=dense,
+            solver_state=free,
+            controller_state=free,
+        ),
+        stepsize_controller=control,
+        max_steps=max_steps,
+        adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+        event=_event(conditions, unravel),
+        throw=False,
+        progress_meter=_meter(progress, start, end, time[-1]),
+        **further,
+    )
+    assert solution.ys is not None and solution.ts is not None
+    saved = jnp.isfinite(solution.ts[0])
+    last = solution.ys[1][0]
+    path = jnp.where(saved[:, None], solution.ys[0], last)
+    reached, status = solution.ts[1][0], _status(solution.result)
+    if free:  # the last step may have gone further
+        last = jnp.where(saved[-1], path[-1], last)
+        reached = jnp.minimum(reached, time[-1])
+    masks = jax.tree.leaves(solution.event_mask)
+    triggered = jnp.stack(masks) if masks else jnp.zeros(0, bool)
+    return Motion(
+        jax.vmap(unravel)(path),
+        unravel(last),
+        reached,
+        status,
+        jnp.asarray(solution.stats["num_steps"]),
+        jnp.asarray(solution.stats["num_rejected_steps"]),
+        triggered,
+        solution.interpolation,
+        _seam(solution, solver) if free else None,
+    )
+
+
+def _meter(progress: bool | str, start, far, end) -> dfx.AbstractProgressMeter:
+    if not progress:
+        return dfx.NoProgressMeter()
+    return Meter(start, far, end, progress if isinstance(progress, str) else "simulate")
+
+
+def _seam(solution: dfx.Solution, solver: dfx.AbstractSolver) -> Resume:
+    """Where the last step began, and what it began with."""
+    own: Any = solution.solver_state if isinstance(solver, AbstractMethod) else (None, None)
+    pace: Any = solution.controller_state
+    return Resume(pace.last, own[1])
+
+
+def explicit_inputs(inputs: Mapping[str, Any], t) -> dict[str, Any]:
+    """Functions of time with the arrays that they close over as leaves."""
+    plain = {k for k, v in inputs.items() if callable(v) and not isinstance(v, eqx.Module)}
+    return {k: eqx.filter_closure_convert(v, t) if k in plain else v for k, v in inputs.items()}
+
+
+def flat_tolerances(control: dfx.AbstractStepSizeController, state: PyTree):
+    """The control with tolerances that are trees of the state made flat like the state."""
+
+    def spread(value):
+        if jax.tree.structure(value) == jax.tree.structure(0.0):
+            return value
+        full = jax.tree.map(lambda a, x: jnp.broadcast_to(a, x.shape), value, state)
+        return ravel_pytree(full)[0]
+
+    if not isinstance(control, dfx.AbstractAdaptiveStepSizeController):
+        return control
+    tolerances = (spread(control.rtol), spread(control.atol))
+    return eqx.tree_at(lambda c: (c.rtol, c.atol), control, tolerances)
+
+
+def _sides(conditions: Conditions, block, inputs, state, start):
+    """On which side of zero each signal is just after the start, by its rate: where an event
+    has just happened, its value there is round-off."""
+    if conditions.last is None:
+        return None
+    rate = block.vector_field(start, state, at_time(inputs, start))
+
+    def side(signal):
+        def value(t, state):
+            return signal(t, state, block, at_time(inputs, t))
+
+        return jax.jvp(value, (start, state), (jnp.ones_like(start), rate))[1]
+
+    signs = [1e-12 * jnp.sign(side(signal)) for signal in conditions.signals]
+    return jax.lax.stop_gradient((start, conditions.last, jnp.stack(signs)))
+
+
+def _event(conditions: Conditions, unravel) -> dfx.Event | None:
+    if not conditions.signals:
+        return None
+
+    def watch(number, signal):
+        def value(t, y, args, **_):
+            block, inputs, sides = args
+            t = jnp.asarray(t, y.dtype)
+            found = signal(t, unravel(y), block, at_time(inputs, t))
+            if sides is None:
+                return found
+            start, last, side = sides
+            return jnp.where((t == start) & (last == number), side[number], found)
+
+        return value
+
+    watched = [watch(k, signal) for k, signal in enumerate(conditions.signals)]
+    if len(watched) == 1:  # bisection finds one root and cannot miss it
+        bisect = optx.Bisection(rtol=1e-12, atol=1e-12, flip="detect")
+        return dfx.Event(watched[0], bisect, conditions.rising[0])
+    newton = optx.Newton(rtol=1e-10, atol=1e-10)
+    return dfx.Event(watched, newton, list(conditions.rising))
+
+
+def _status(result: dfx.RESULTS) -> Status:
+    good = (result == dfx.RESULTS.successful) | (result == dfx.RESULTS.event_occurred)
+    spent = result == dfx.RESULTS.max_steps_reached
+    failed = Status.where(spent, Status.max_steps, Status.not_finite)
+    return Status.where(good, Status.successful, failed)

@@ -1,0 +1,376 @@
+"""Figures of modes, backbones, signals and material fits.
+
+Snapshots of a backbone: where it is, and how it is strained along its length.
+
+How accurate at what cost: convergence under refinement, work against precision.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sorojax._jax.jit import once
+from sorojax.material import AbstractHyperelastic, TensileFit, strain_energy_density
+from sorojax.reduction import Backbone
+from sorojax.rod import Rod, StrainBasis, columns, forward_kinematics
+from sorojax.view import style
+from sorojax.view.picture import Panel, Picture
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+Signals = Mapping[str, Mapping[str, Any]]
+
+_SYMBOL = {
+    "kappa_x": r"twist $\kappa_x$",
+    "kappa_y": r"curvature $\kappa_y$",
+    "kappa_z": r"curvature $\kappa_z$",
+    "sigma_x": r"stretch $\sigma_x$",
+    "sigma_y": r"shear $\sigma_y$",
+    "sigma_z": r"shear $\sigma_z$",
+}
+
+
+def show_modes(
+    basis: StrainBasis,
+    length: float | Float[Array, ""],
+    *,
+    energy: Mapping[str, float | Sequence[float]] | None = None,
+    title: str = "",
+) -> "Figure":
+    """Strain modes along the arc length, one panel per active strain.
+
+    Args:
+        basis: The modes.
+        length: Rest length of the rod [m].
+        energy: Captured share in [0, 1] per strain, in total (`captured_energy`) or as
+            one number per mode.
+        title: Title of the figure.
+    """
+    s = np.linspace(0.0, 1.0, 801)
+    values = np.asarray(basis(s))
+    count = len(basis.active)
+    figure = style.new_figure(8.5, 0.6 + 2.9 * count)
+    panels = figure.subplots(count, 1, sharex=True, squeeze=False).ravel()
+    for row, (panel, name) in enumerate(zip(panels, basis.active, strict=True)):
+        shapes = values[row][:, columns(basis, name)].T
+        share = np.ravel((energy or {}).get(name, ()))
+        for k, (shape, colour) in enumerate(
+            zip(shapes, style.shades(len(shapes)), strict=True)
+        ):
+            part = f", {_percent(share[k])}" if len(share) == len(shapes) > 1 else ""
+            panel.plot(s * 1e3 * float(length), shape, color=colour, lw=1.9,
+                       label=f"mode {k + 1}{part}")  # fmt: skip
+        total = (
+            f": {_percent(share.sum())} of the squared strain captured" if share.size else ""
+        )
+        unit = "1/m" if name.startswith("kappa") else "-"
+        style.dress(panel, "", f"shape [-], $q$ in [{unit}]", f"{_SYMBOL[name]}{total}")
+        panel.axhline(0.0, color=style.GREY, lw=0.8, zorder=1)
+        style.legend(panel, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    panels[-1].set_xlabel("arc length [mm]", fontsize=style.LABEL, color=style.INK)
+    panels[-1].set_xlim(0.0, 1e3 * float(length))
+    style.title(figure, title)
+    return figure
+
+
+def backbone_errors(
+    backbone: Backbone, rod: Rod, qs: Float[Array, "steps dof"]
+) -> Float[Array, " steps"]:
+    """Mean distance between backbone and rod over their samples, per snapshot [m]."""
+    gap = _rod_lines(rod, qs, backbone.s) - backbone.positions
+    return jnp.mean(jnp.sqrt(jnp.sum(gap**2, axis=2)), axis=1)
+
+
+@once
+def _rod_lines(rod: Rod, qs, s) -> Float[Array, "steps samples 2"]:
+    return jax.lax.map(lambda q: forward_kinematics(rod, q, s)[:, :2, 2], qs)
+
+
+def show_backbones(
+    backbone: Backbone,
+    rod: Rod,
+    qs: Float[Array, "steps dof"],
+    *,
+    pressures: Float[Any, " steps"] | None = None,
+    bar: float = 1e-3,
+    title: str = "",
+) -> "Figure":
+    """Backbones of the solid against those of a rod, and the distance between them.
+
+    Args:
+        backbone: Snapshots, from `strain_along`.
+        rod: The rod that should follow them.
+        qs: Coordinates of the rod at the snapshots.
+        pressures: Pressure of each snapshot [Pa]; counted if omitted.
+        bar: The largest error that is accepted [m].
+        title: Title of the figure.
+    """
+    steps = len(backbone.positions)
+    solid = 1e3 * np.asarray(backbone.positions)
+    line = 1e3 * np.asarray(_rod_lines(rod, qs, backbone.s))
+    load = np.arange(steps) if pressures is None else np.asarray(pressures) / 1e3
+    unit = "step" if pressures is None else "kPa"
+    figure = style.new_figure(10.0, 4.4)
+    left, right = figure.subplots(1, 2, width_ratios=[1.25, 1])
+    shown = np.unique(np.round(np.linspace(0, steps - 1, 6)).astype(int))
+    for k, colour in zip(shown, style.shades(len(shown)), strict=True):
+        left.plot(*solid[k].T, color=colour, lw=3.4, alpha=0.55, label=f"{load[k]:.3g} {unit}")
+        last = k == shown[-1]
+        left.plot(*line[k].T, color=style.INK, lw=1.1, ls=(0, (4, 2)),
+                  label="rod" if last else None)  # fmt: skip
+    style.dress(left, "x [mm]", "y [mm]", "backbone: solid in colour, rod dashed")
+    left.set_aspect("equal", adjustable="datalim")
+    style.legend(left, loc="best")
+    error = 1e3 * np.asarray(backbone_errors(backbone, rod, qs))
+    right.plot(load, error, color=style.COLOURS[0], lw=1.8, marker="o", ms=3.5)
+    right.axhline(1e3 * bar, color=style.COLOURS[1], lw=1.3, ls=(0, (4, 2)))
+    right.annotate(
+        f"bar: {1e3 * bar:g} mm", (load[0], 1e3 * bar), (0, -4), fontsize=style.SMALL,
+        textcoords="offset points", va="top", color=style.COLOURS[1],
+    )  # fmt: skip
+    across = "load step" if pressures is None else "pressure [kPa]"
+    largest = f"largest mean error {error.max():.2g} mm"
+    style.dress(right, across, "mean position error [mm]", largest)
+    right.set_ylim(0.0, 1.12 * max(1e3 * bar, float(error.max())))
+    style.title(figure, title)
+    return figure
+
+
+def show_signals(time: Float[Any, " time"], panels: Signals, *, title: str = "") -> "Figure":
+    """Signals over time, one panel per entry, what belongs together in one panel.
+
+    Args:
+        time: Instants [s].
+        panels: `{"tip angle [deg]": {"reference": y0, "rod": y1}, ...}`; a name with
+            "reference", "target" or "setpoint" is drawn dashed and dark.
+        title: Title of the figure.
+    """
+    time = np.asarray(time)
+    figure = style.new_figure(8.5, 0.7 + 2.0 * len(panels))
+    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False).ravel()
+    for panel, (label, signals) in zip(axes, panels.items(), strict=True):
+        draw_signals(panel, time, label, signals)
+        style.legend(panel, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    axes[-1].set_xlabel("time [s]", fontsize=style.LABEL, color=style.INK)
+    axes[-1].set_xlim(time[0], time[-1])
+    figure.align_ylabels(list(axes))
+    style.title(figure, title)
+    return figure
+
+
+def draw_signals(axes: Any, time: np.ndarray, label: str, signals: Mapping[str, Any]) -> dict:
+    """Draw one panel and return its lines by name."""
+    lines, styles = {}, style.line_styles(signals)
+    for name, values in signals.items():
+        values = np.asarray(values)
+        if values.shape != time.shape:
+            raise ValueError(
+                f"show_signals: `{name}` has shape {values.shape}, `time` has {time.shape}. "
+                "Give one number per instant; split vectors into several names."
+            )
+        above = 3 if styles[name]["color"] == style.REFERENCE else 2
+        (lines[name],) = axes.plot(time, values, label=name, zorder=above, **styles[name])
+    style.dress(axes, "", label)
+    return lines
+
+
+def show_curve(
+    fit: TensileFit | AbstractHyperelastic,
+    strain: Float[Any, " points"],
+    stress: Float[Any, " points"],
+    *,
+    title: str = "",
+) -> "Figure":
+    """Measured tensile points and the curve of a material, taken as incompressible.
+
+    Args:
+        fit: A fit from `fit_tensile`, or a material.
+        strain: Measured engineering strain [-].
+        stress: Measured engineering stress [Pa].
+        title: Title of the figure.
+    """
+    material = fit.material if isinstance(fit, TensileFit) else fit
+    stretch = 1 + np.asarray(strain, float)
+    low, high = min(1.0, stretch.min()), stretch.max()
+    at = np.linspace(low, high + 0.04 * (high - low), 200)
+    figure = style.new_figure(6.5, 4.2)
+    axes = figure.add_subplot()
+    curve = np.asarray(_tensile_stress(material, jnp.asarray(at)))
+    name = type(material).__name__
+    note = f", rms {fit.rms / 1e3:.3g} kPa" if isinstance(fit, TensileFit) else ""
+    axes.plot(at, curve / 1e3, color=style.COLOURS[0], lw=1.9, label=f"{name}{note}")
+    axes.plot(stretch, np.asarray(stress) / 1e3, "o", color=style.COLOURS[1], ms=6.5,
+              label="measured", zorder=3)  # fmt: skip
+    style.dress(axes, "stretch [-]", "engineering stress [kPa]")
+    axes.set_ylim(bottom=min(0.0, 1.05 * float(np.min(stress)) / 1e3))
+    style.legend(axes, loc="upper left")
+    style.title(figure, title)
+    return figure
+
+
+@eqx.filter_jit
+def _tensile_stress(
+    material: AbstractHyperelastic, stretch: Float[Array, " points"]
+) -> Float[Array, " points"]:
+    """Slope of the energy along isochoric uniaxial stretch [Pa]."""
+
+    def energy(stretch):
+        across = 1 / jnp.sqrt(stretch)
+        F = ((stretch, 0.0, 0.0), (0.0, across, 0.0), (0.0, 0.0, across))
+        return strain_energy_density(material, F)
+
+    return jax.vmap(jax.grad(energy))(stretch)
+
+
+def _percent(share: float) -> str:
+    """A share in percent that never rounds up to 100."""
+    digits = 2 if share < 0.9999 else 4
+    cut = np.floor(100 * float(share) * 10**digits + 1e-9) / 10**digits
+    return f"{cut:.{digits}f} %"
+
+
+# Snapshots of a backbone: where it is, and how it is strained along its length
+
+
+_MOST = 8  # snapshots that are drawn
+
+
+def show_snapshots(backbone: Backbone, *, title: str = "") -> Picture:
+    """Snapshots in the plane of their widest motion, and the strain that changes most, each
+    from pale to dark in their order.
+
+    Args:
+        backbone: From `reduction.strain_along`.
+        title: Title of the figure.
+    """
+    places, s = 1e3 * np.asarray(backbone.positions), np.asarray(backbone.s)
+    up = 1 + int(np.argmax(np.ptp(places[:, :, 1:], axis=(0, 1))))
+    change = np.asarray(backbone.change)
+    bends = [k for k, name in enumerate(backbone.names) if name.startswith("kappa")]
+    most = bends[int(np.argmax(np.abs(change[:, :, bends]).max(axis=(0, 1))))]
+    name = backbone.names[most]
+    figure = style.new_figure(9.0, 3.8)
+    left, right = figure.subplots(1, 2, width_ratios=[1.2, 1])
+    shown = np.unique(np.round(np.linspace(0, len(places) - 1, _MOST)).astype(int))
+    for k, colour in zip(shown, style.shades(len(shown))[::-1], strict=True):
+        left.plot(places[k, :, 0], places[k, :, up], color=colour, lw=2.0)
+        right.plot(s, change[k, :, most], color=colour, lw=1.7, label=f"snapshot {k}")
+    style.dress(left, "x [mm]", f"{'xyz'[up]} [mm]")
+    left.set_aspect("equal", adjustable="datalim")
+    style.dress(right, "place along the backbone [-]", f"change of {name} [1/m]")
+    style.legend(right, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    length = 1e3 * float(backbone.length)
+    style.title(figure, title or f"{len(places)} snapshots of a backbone of {length:.3g} mm")
+    return Picture(figure, (Panel(left), Panel(right)))
+
+
+# How accurate at what cost: convergence under refinement, work against precision
+
+
+_MARKS = "osD^vPX"
+
+
+@dataclass(frozen=True, eq=False)
+class Convergence:
+    """Errors of some methods as something is refined.
+
+    Attributes:
+        sizes: Sizes of cells or steps.
+        errors: One row per method, as long as `sizes`.
+        size_label: Name and unit of the sizes.
+        error_label: Name and unit of the errors.
+    """
+
+    sizes: Float[Any, " sizes"]
+    errors: Mapping[str, Float[Any, " sizes"]]
+    size_label: str = "size of cells [mm]"
+    error_label: str = "relative error [-]"
+
+    def orders(self) -> dict[str, float]:
+        """Order of each method between its two finest sizes."""
+        order = np.argsort(np.asarray(self.sizes, float))[:2]
+        size = np.asarray(self.sizes, float)[order]
+        found = {}
+        for name, error in self.errors.items():
+            fine, coarse = np.asarray(error, float)[order]
+            found[name] = float(np.log(coarse / fine) / np.log(size[1] / size[0]))
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class WorkPrecision:
+    """Errors of some methods and what each run cost.
+
+    Attributes:
+        runs: For each method times [s] and errors, of equal length.
+        cost_label: Name and unit of the cost.
+        error_label: Name and unit of the errors.
+    """
+
+    runs: Mapping[str, tuple[Float[Any, " runs"], Float[Any, " runs"]]]
+    cost_label: str = "time [s]"
+    error_label: str = "relative error [-]"
+
+
+def show_convergence(data: Convergence, *, title: str = "") -> Picture:
+    """Errors over sizes on logarithmic axes, with the order of each method."""
+    figure = style.new_figure(6.5, 4.6)
+    axes = figure.add_subplot()
+    size = np.asarray(data.sizes, float)
+    along = np.argsort(size)
+    for k, (name, order) in enumerate(data.orders().items()):
+        error = np.asarray(data.errors[name], float)
+        _positive(name, size, error)
+        colour = style.COLOURS[k % len(style.COLOURS)]
+        axes.plot(size[along], error[along], color=colour, marker=_MARKS[k % 7], ms=5, lw=1.6,
+                  label=f"{name}: order {order:.2f}")  # fmt: skip
+    _logarithmic(axes, data.size_label, data.error_label)
+    return _finished(figure, axes, title)
+
+
+def show_work_precision(data: WorkPrecision, *, title: str = "") -> Picture:
+    """Error over cost on logarithmic axes; lower and further left is better."""
+    figure = style.new_figure(6.5, 4.6)
+    axes = figure.add_subplot()
+    for k, (name, (cost, error)) in enumerate(data.runs.items()):
+        cost, error = np.asarray(cost, float), np.asarray(error, float)
+        _positive(name, cost, error)
+        along = np.argsort(cost)
+        axes.plot(cost[along], error[along], color=style.COLOURS[k % len(style.COLOURS)],
+                  marker=_MARKS[k % 7], ms=5, lw=1.6, label=name)  # fmt: skip
+    _logarithmic(axes, data.cost_label, data.error_label)
+    return _finished(figure, axes, title)
+
+
+def _positive(name: str, *rows: np.ndarray) -> None:
+    lengths = {row.shape for row in rows}
+    if len(lengths) > 1 or any(row.ndim != 1 for row in rows):
+        raise ValueError(
+            f"view.show: `{name}` has rows of shapes {sorted(lengths)}, need two of one length."
+        )
+    if not all(np.all(row[np.isfinite(row)] > 0) for row in rows):
+        raise ValueError(
+            f"view.show: `{name}` has values that are not positive, logarithmic axes need "
+            "positive ones. Take absolute values; leave out exact zeros."
+        )
+
+
+def _logarithmic(axes: Any, x: str, y: str) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    style.dress(axes, x, y)
+    axes.grid(True, which="minor", color=style.LIGHT, linewidth=0.3)
+
+
+def _finished(figure, axes, title: str) -> Picture:
+    style.legend(axes, loc="best")
+    style.title(figure, title)
+    return Picture(figure, (Panel(axes),))

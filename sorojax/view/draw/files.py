@@ -1,0 +1,226 @@
+"""Pictures of what is in a file: surfaces, meshes with results, saved motions."""
+
+import inspect
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from sorojax import io
+from sorojax.mesh import Mesh
+from sorojax.view import style
+from sorojax.view.draw.meshes import edge_lines, show_cells
+from sorojax.view.draw.runs import time_plots
+from sorojax.view.draw.shapes import show_surface
+from sorojax.view.film.film import Film
+from sorojax.view.panels import panels
+from sorojax.view.picture import Picture
+from sorojax.view.raster.camera import View
+from sorojax.view.raster.scene import (
+    Coloured,
+    Part,
+    Scene,
+    Surface,
+    joint_extent,
+    readable,
+    robust_scale,
+)
+from sorojax.view.raster.shell import on_triangles, shell
+from sorojax.view.show import options as drawn_by, show, show_scene
+
+_SURFACES = (".stl", ".obj", ".ply")
+_UNITS = {"von_mises": "Pa", "pressure": "Pa", "displacement": "m", "energy": "J"}
+_MOST = 8  # lines in one panel
+
+
+def show_file(
+    path: str | Path,
+    *,
+    field: str | None = None,
+    unit: float | None = None,
+    wire: bool = False,
+    view: View = "iso",
+    renderer: str = "auto",
+    title: str = "",
+) -> Picture:
+    """What is in a file.
+
+    Args:
+        path: A surface (.stl, .obj, .ply), a mesh or a result that meshio reads (.vtu, .vtk,
+            .msh, .inp, ...), a series of results (.pvd), or what `io.save` wrote (.npz).
+        field: Which values of a result; the first scalar ones if omitted.
+        unit: What 1 in the file means [m]; mm for surfaces, else m.
+        wire: Draw the triangles or cells.
+        view: Camera of what is solid.
+        renderer: Of what is solid.
+        title: Title; the name of the file if omitted.
+
+    Raises:
+        ValueError: If the file is damaged, of no known kind, or has no such field.
+    """
+    path = Path(path)
+    kind, name = path.suffix.lower(), title or Path(path).name
+    if kind in _SURFACES:
+        surface = io.import_surface(path, unit=unit)
+        return show_surface(
+            surface, wire=wire, view=view, renderer=renderer,
+            title=title or f"{path.name}: {len(surface.triangles)} triangles",
+        )  # fmt: skip
+    if kind == ".npz":
+        return _saved(path, name, field=field, view=view, renderer=renderer, wire=wire)
+    scale = 1.0 if unit is None else unit
+    if kind == ".pvd":
+        states = [_state(file, field, scale) for file in _series(path)]
+        chosen = np.unique(np.round(np.linspace(0, len(states) - 1, 6)).astype(int))
+        scenes = joint_extent(_scenes([states[k] for k in chosen], wire))
+        names = [f"state {k}" for k in chosen]
+        return panels(scenes, names, view=view, renderer=renderer, title=name)
+    state = _state(path, field, scale)
+    if state.values is None and np.allclose(state.moved, 0):
+        options: dict[str, Any] = {"view": view, "renderer": renderer}
+        return show_cells(state.mesh, title=title, **options)
+    scene = _scenes([state], wire)[0]
+    scene = Scene(scene.parts, scene.scale, name)
+    return show_scene(scene, view=view, renderer=renderer)
+
+
+def animate_file(
+    path: str | Path, *, field: str | None = None, unit: float = 1.0, fps: float = 10.0,
+    **options: Any,
+) -> Film:  # fmt: skip
+    """A film of a series of results (.pvd); options of `animate`."""
+    from sorojax.view.film.animation import Track, animate
+
+    states = [_state(file, field, unit) for file in _series(Path(path))]
+    scenes = joint_extent(_scenes(states, False))
+    time = np.arange(len(states), dtype=float)
+    track = Track(time, lambda k: scenes[k], scenes[0].scale, "steps", scenes[0].box)
+    return animate(track, fps=fps, speed=fps, **options)
+
+
+class _State:
+    """One result: the mesh, where its nodes went, what colours it."""
+
+    def __init__(self, mesh: Mesh, moved: Float[np.ndarray, "nodes dim"], values, label: str):
+        self.mesh, self.moved, self.values, self.label = mesh, moved, values, label
+
+
+def _state(path: Path, field: str | None, unit: float) -> _State:
+    import meshio
+
+    mesh = io.import_mesh(path, unit=unit)
+    whole = meshio.read(path)
+    dim = mesh.element.dim
+    at_nodes = {
+        k: np.asarray(v) for k, v in whole.point_data.items() if len(v) == mesh.num_nodes
+    }
+    at_cells = {k: np.concatenate([np.asarray(block) for block in v])
+                for k, v in whole.cell_data.items()}  # fmt: skip
+    at_cells = {k: v for k, v in at_cells.items() if len(v) == mesh.num_cells}
+    given = at_nodes.get("displacement")
+    moved = np.zeros(mesh.points.shape) if given is None else unit * given[:, :dim]
+    known = {k: v for k, v in (at_nodes | at_cells).items() if not k.startswith("vtk")}
+    scalars = [k for k, v in known.items() if v.ndim == 1 and v.dtype.kind in "fiu"]
+    if field is None:
+        field = next(iter(scalars), "displacement" if given is not None else None)
+    if field is None:
+        return _State(mesh, moved, None, "")
+    if field not in known:
+        raise ValueError(
+            f"show: {path} has no field {field!r}, it has {', '.join(known) or 'none'}. Name "
+            "one of these."
+        )
+    values = known[field].astype(float)
+    values = (
+        values if values.ndim == 1 else np.linalg.norm(values.reshape(len(values), -1), axis=1)
+    )
+    values = unit * values if field == "displacement" else values
+    return _State(mesh, moved, values, field)
+
+
+def _scenes(states: list[_State], wire: bool) -> list[Scene]:
+    """One scene per result, on one scale of colours."""
+    label = states[0].label
+    scale, rows = None, [None] * len(states)
+    if states[0].values is not None:
+        name = label.replace("_", " ")
+        found = [Coloured(state.values, name, _UNITS.get(label, "")) for state in states]
+        rows, text = readable(found)
+        scale = robust_scale(text, rows)
+    scenes = []
+    for state, row in zip(states, rows, strict=True):
+        mesh, seen = state.mesh, shell(state.mesh)
+        points = np.asarray(mesh.points) + state.moved
+        value = None if row is None else on_triangles(mesh, seen, row)[0]
+        parts: list[Part] = [
+            Surface(points, seen.triangles, values=value, wire=seen.wire if wire else None),
+            edge_lines(mesh, points, colour=style.INK, width=0.7),
+        ]
+        if not np.allclose(state.moved, 0):
+            rest = np.asarray(mesh.points)
+            parts.insert(0, edge_lines(mesh, rest, colour=style.GREY, width=0.8))
+        scenes.append(Scene(tuple(parts), scale))
+    return scenes
+
+
+def _series(path: Path) -> list[Path]:
+    """Files of a collection of VTK, in its folder."""
+    text = path.read_bytes()
+    if b"<!ENTITY" in text or b"<!DOCTYPE" in text:
+        raise ValueError(f"show: {path} declares entities, need a plain collection of VTK.")
+    try:
+        sets = ET.fromstring(text).iter("DataSet")
+        files = [path.parent / str(entry.get("file")) for entry in sets]
+    except ET.ParseError as error:
+        raise ValueError(f"show: {path} is damaged ({error}). Write it again.") from error
+    inside = path.parent.resolve()
+    files = [file for file in files if file.resolve().is_relative_to(inside)]
+    if not files:
+        raise ValueError(f"show: {path} lists no file beside it. Keep the .vtu files with it.")
+    return files
+
+
+def _saved(path: Path, title: str, **options: Any) -> Picture:
+    """Everything in a file of `io.save` that has one entry per instant, over time; where
+    there is no time, or a body of finite elements, what was saved, as `show` draws it."""
+    arrays = io.leaves(path)
+    times = [
+        name for name in arrays if re.search(r"\btimes?\W*$", name) and arrays[name].ndim == 1
+    ]
+    is_body = any(name.startswith((".dynamics", ".problem")) for name in arrays)
+    if not times or is_body:
+        return _drawn(path, arrays, title, options)
+    time = arrays[times[0]]
+    groups: dict[str, dict[str, np.ndarray]] = {}
+    for name, array in arrays.items():
+        is_row = (
+            array.ndim in (1, 2) and array.shape[0] == len(time) and array.dtype.kind == "f"
+        )
+        if not is_row or name in times or array.size > _MOST * len(time):
+            continue
+        short = re.sub(r"^\.(outputs|states?)\b|[\[\]']", "", name).lstrip(".")
+        rows = array.reshape(len(time), -1)
+        several = rows.shape[1] > 1
+        groups[short] = {f"{short}[{k}]" if several else short: rows[:, k]
+                         for k in range(rows.shape[1])}  # fmt: skip
+    if not groups:
+        return _drawn(path, arrays, title, options)
+    return time_plots(time, groups, "", title)
+
+
+def _drawn(path: Path, arrays: dict[str, np.ndarray], title: str, options: dict) -> Picture:
+    """`show` with those options that it takes for what was saved."""
+    thing = io.load(path)
+    try:
+        known = inspect.signature(drawn_by(thing)).parameters
+    except TypeError as error:
+        listed = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
+        raise ValueError(
+            f"show: {path} holds a {type(thing).__name__} of {listed}, need a noun or result "
+            "of sorojax, or a time to draw over. Load it with io.load."
+        ) from error
+    given = {"title": title} | {k: v for k, v in options.items() if v}
+    return show(thing, **{k: v for k, v in given.items() if k in known})

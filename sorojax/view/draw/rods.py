@@ -1,0 +1,286 @@
+"""Rods and assemblies: tubes with their real section, threads, directors, contact forces.
+
+Given forces and moments on rods, and their weight, as arrows and arcs.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from sorojax import rod as R
+from sorojax.rod import Assembly, Rod
+from sorojax.sdf import AbstractSdf, Surface as Triangles
+from sorojax.view import style
+from sorojax.view.draw.loads import turning
+from sorojax.view.draw.rod_loads import (
+    acting,
+    contact_parts,
+    outlines_of,
+    size_of,
+    thread_parts,
+)
+from sorojax.view.draw.shapes import shape_scene
+from sorojax.view.picture import Picture
+from sorojax.view.raster.camera import View
+from sorojax.view.raster.glyphs import ball_triangles, tube
+from sorojax.view.raster.scene import Arrows, Dots, Lines, Part, Scene, Surface, short
+from sorojax.view.show import show_scene
+
+_ALONG = 9  # arrows of a force per length
+_LENGTH, _RADIUS = 0.2, 0.07  # of the body: the longest arrow, an arc
+
+Poses = Mapping[str, Float[np.ndarray, "stations h h"]]
+
+
+def wrench_parts(
+    poses: Poses, s: Float[np.ndarray, " stations"], forces: Sequence[Any], size: float
+) -> list[Part]:
+    """What `forces` hold of wrenches and gravity.
+
+    Args:
+        poses: Of the sections of every part, by name; "" where there is one rod.
+        s: Where along a part they are, in [0, 1].
+        forces: As given to the verbs of rods.
+        size: Of the body [m]; arrows of one force share one scale, those of different
+            forces do not compare.
+    """
+    parts: list[Part] = []
+    for force in forces:
+        name, inner = (force.part, force.force) if isinstance(force, R.On) else ("", force)
+        if isinstance(inner, R.Gravity):
+            chosen = (
+                [np.asarray(poses[name])] if name else [np.asarray(p) for p in poses.values()]
+            )
+            parts += _weight(inner, chosen, size)
+        elif isinstance(inner, R.TipWrench | R.PointWrench | R.LineWrench) and name in poses:
+            parts += _wrench(inner, np.asarray(poses[name]), s, size)
+    return parts
+
+
+def _weight(gravity: R.Gravity, poses: list[np.ndarray], size: float) -> list[Part]:
+    dim = poses[0].shape[1] - 1
+    earth = np.zeros(dim)
+    earth[-1] = -9.81
+    value = earth if gravity.acceleration is None else np.asarray(gravity.acceleration)
+    strength = float(np.linalg.norm(value))
+    if not strength > 0:
+        return []
+    middle = np.mean([pose[:, :dim, dim].mean(axis=0) for pose in poses], axis=0)
+    vector = value * (_LENGTH * size / strength)
+    return [Arrows(middle[None], vector[None], style.GREY, f"gravity: {strength:.3g} m/s$^2$")]
+
+
+def _wrench(force: Any, poses: np.ndarray, s: np.ndarray, size: float) -> list[Part]:
+    """Arrows of the force and an arc of the moment, where they act."""
+    dim = poses.shape[1] - 1
+    spread = isinstance(force, R.LineWrench)
+    at = np.linspace(0, 1, _ALONG) if spread else np.atleast_1d(float(getattr(force, "s", 1.0)))
+    rows = _values(force.wrench, at)
+    nearest = np.argmin(np.abs(at[:, None] - s[None]), axis=1)
+    places = np.stack([np.interp(at, s, poses[:, k, dim]) for k in range(dim)], axis=1)
+    moments, pulls = rows[:, :-dim], rows[:, -dim:]
+    if getattr(force, "follower", False):
+        turn = poses[nearest, :dim, :dim]
+        pulls = np.einsum("sij,sj->si", turn, pulls)
+        moments = np.einsum("sij,sj->si", turn, moments) if dim == 3 else moments
+    per = "/m" if spread else ""
+    parts: list[Part] = []
+    strength = np.linalg.norm(pulls, axis=1)
+    if (most := float(strength.max())) > 0:
+        name = f"force: {short(most, 'N' + per)}"
+        parts.append(Arrows(places, pulls * (_LENGTH * size / most), style.LOAD, name))
+    strength = np.linalg.norm(moments, axis=1)
+    if (most := float(strength.max())) > 0:
+        name = f"moment: {short(most, 'N' if spread else 'N m')}"
+        for k in np.flatnonzero(strength > 1e-9 * most):
+            axis = moments[k] if dim == 3 else float(moments[k, 0])
+            radius = _RADIUS * size * float(strength[k]) / most
+            parts += turning(places[k], axis, radius, style.COLOURS[4], name)
+    return parts
+
+
+def _values(wrench: Any, at: np.ndarray) -> np.ndarray:
+    """One row of components per place."""
+    if callable(wrench):
+        return np.asarray(jax.vmap(wrench)(jnp.asarray(at)))
+    return np.broadcast_to(np.asarray(wrench), (len(at), *np.shape(wrench)))
+
+
+# Rods and assemblies: tubes with their real section, threads, directors, contact forces
+
+
+_STATIONS = 61
+_SEE_THROUGH = 0.45
+
+Shapes = Mapping[str, AbstractSdf | Triangles]
+
+
+def show_rod(
+    model: Rod | Assembly,
+    q: Float[Any, "*states coordinates"] | None = None,
+    *,
+    forces: Sequence[Any] = (),
+    section: AbstractSdf | None = None,
+    shapes: Shapes | None = None,
+    directors: bool = False,
+    view: View = "iso",
+    renderer: str = "auto",
+    title: str = "",
+) -> Picture:
+    """A rod or an assembly of rods and links at coordinates `q`.
+
+    Args:
+        model: The rod or assembly.
+        q: Coordinates; at rest if omitted. Several rows draw several states, the last in
+            full.
+        forces: As given to its verbs: tendons and chambers are drawn in their place,
+            contacts as arrows with what is touched, wrenches and weight as arrows and arcs.
+        section: Plane shape of the section (y, z), where constants do not tell it.
+        shapes: Bodies of links by name, a solid shape or triangles in the frame of the
+            link; without one a link is the ellipsoid of its inertia.
+        directors: Draw the axes of some sections, x red, y green, z blue.
+        view: Camera of a spatial model.
+        renderer: Of a spatial model.
+        title: Title of the figure.
+    """
+    scene = rod_scene(
+        model,
+        q,
+        forces=forces,
+        section=section,
+        shapes=shapes,
+        directors=directors,
+        title=title,
+    )
+    return show_scene(scene, view=view, renderer=renderer)
+
+
+def rod_scene(
+    model: Rod | Assembly,
+    q: Float[Any, "*states coordinates"] | None = None,
+    *,
+    forces: Sequence[Any] = (),
+    section: AbstractSdf | None = None,
+    shapes: Shapes | None = None,
+    directors: bool = False,
+    title: str = "",
+) -> Scene:
+    """As `show_rod`, before it is drawn."""
+    rest = R.rest(model)
+    q = np.asarray(rest) if q is None else np.asarray(q)
+    rows = np.atleast_2d(q)
+    if rows.shape[1] != rest.shape[0]:
+        raise ValueError(
+            f"view.show: `q` has shape {q.shape}, the model has {rest.shape[0]} coordinates. "
+            "Give one row per state."
+        )
+    parts: list[Part] = []
+    for k, row in enumerate(rows):
+        last = k == len(rows) - 1
+        shade = None if last else 0.75 - 0.5 * k / len(rows)
+        parts += _state(model, row, forces if last else (), section, shapes, directors and last,
+                        shade)  # fmt: skip
+    return Scene(tuple(parts), title=title)
+
+
+def _state(model, q, forces, section, shapes, directors: bool, shade) -> list[Part]:
+    s = np.linspace(0.0, 1.0, _STATIONS)
+    poses = R.forward_kinematics(model, jnp.asarray(q, float), s)
+    bodies: dict[str, Any] = (
+        {name: part.body for name, part in zip(model.names, model.parts, strict=True)}
+        if isinstance(model, Assembly)
+        else {"": model}
+    )
+    where = poses if isinstance(poses, dict) else {"": poses}
+    found = acting(model, forces)
+    inside = any(found.threads.values())
+    opacity = _SEE_THROUGH if inside or directors else 1.0
+    colour = style.BODY if shade is None else _mixed(shade)
+    parts: list[Part] = []
+    for name, body in bodies.items():
+        pose = np.asarray(where[name])
+        if isinstance(body, Rod):
+            parts += _rod(body, pose, s, section, colour, opacity)
+            parts += thread_parts(body, found.threads.get(name, ()), pose, s)
+            if directors:
+                parts += director_parts(pose[::10], 0.06 * float(body.length))
+        else:
+            parts += _link(name, body, pose[0], shapes, colour)
+    parts += contact_parts(model, q, found)
+    return parts + wrench_parts(where, s, forces, size_of(model))
+
+
+def _rod(body: Rod, pose, s, section, colour: str, opacity: float) -> list[Part]:
+    outer, hole = outlines_of(body, s, section)
+    dim = pose.shape[1] - 1
+    centres, turn = pose[:, :dim, dim], pose[:, :dim, :dim]
+    if dim == 2:
+        return _band(centres, turn[:, :, 1], outer[:, :, 0], hole, colour, opacity)
+    across = np.swapaxes(turn[:, :, 1:], 1, 2)
+    points, triangles = tube(centres, across, outer, inner=hole)
+    return [Surface(points, triangles, colour, opacity=opacity)]
+
+
+def _band(centres, across, y, hole, colour: str, opacity: float) -> list[Part]:
+    """A planar rod as what one sees from its side."""
+    left = centres + y.max(axis=1)[:, None] * across
+    right = centres + y.min(axis=1)[:, None] * across
+    points, count = np.concatenate([left, right]), len(centres)
+    a = np.arange(count - 1)
+    triangles = np.concatenate([np.stack([a + 1, a, a + count], 1),
+                                np.stack([a + 1, a + count, a + count + 1], 1)])  # fmt: skip
+    ring = np.concatenate([left, right[::-1], left[:1]])
+    parts: list[Part] = [Surface(points, triangles, colour), Lines([ring], style.INK, 0.9)]
+    if hole is not None:
+        inner = hole[:, :, 0].max(axis=1)[:, None] * across
+        parts.append(Lines([centres + inner, centres - inner], style.GREY, 0.8, dashed=True))
+    if opacity < 1:
+        parts.append(Lines([centres], style.GREY, 0.7, dashed=True))
+    return parts
+
+
+def _link(name: str, body, pose: np.ndarray, shapes: Shapes | None, colour: str) -> list[Part]:
+    dim = pose.shape[0] - 1
+    turn, place = pose[:dim, :dim], pose[:dim, dim]
+    shape = (shapes or {}).get(name)
+    if shape is not None:
+        surface = shape_scene(shape).parts[0] if isinstance(shape, AbstractSdf) else None
+        points = surface.points if surface is not None else shape.vertices  # type: ignore
+        triangles = surface.triangles if surface is not None else shape.triangles  # type: ignore
+        return [Surface(np.asarray(points) @ turn.T + place, triangles, colour)]
+    centre = np.zeros(dim) if body.center is None else np.asarray(body.center)
+    mass, inertia = float(body.mass), np.asarray(body.inertia)
+    middle = turn @ centre + place
+    if dim == 2:
+        radius = np.sqrt(2 * float(inertia) / mass)  # of a disc
+        angle = np.linspace(0, 2 * np.pi, 61)
+        ring = middle + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        fan = np.stack([np.arange(1, 59), np.arange(2, 60), np.zeros(58, int)], axis=1)
+        return [Surface(ring, fan, colour), Lines([ring], style.INK, 0.9), Dots(place[None])]
+    moments, axes = (inertia, np.eye(3)) if inertia.ndim == 1 else np.linalg.eigh(inertia)
+    moments = np.broadcast_to(moments, 3)
+    square = 2.5 / mass * (moments.sum() - 2 * moments)
+    half = np.sqrt(np.maximum(square, 0.04 * square.max()))
+    points, triangles = ball_triangles(np.zeros((1, 3)), 1.0, corners=36)
+    return [Surface((points * half) @ axes.T @ turn.T + middle, triangles, colour)]
+
+
+def director_parts(poses: Float[np.ndarray, "sections h h"], length: float) -> list[Part]:
+    """The axes of some sections, `length` [m] long."""
+    dim = poses.shape[1] - 1
+    starts = poses[:, :dim, dim]
+    colours = ("#c0392b", "#1e8449", "#1f5fa8")
+    return [
+        Arrows(starts, length * poses[:, :dim, k], colours[k], name=f"director {'xyz'[k]}")
+        for k in range(dim)
+    ]
+
+
+def _mixed(share: float) -> str:
+    from matplotlib.colors import to_hex, to_rgb
+
+    return to_hex(tuple((1 - share) * np.array(to_rgb(style.BODY)) + share))

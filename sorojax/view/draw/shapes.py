@@ -1,0 +1,231 @@
+"""Implicit shapes: contours of the distance, shaded surfaces, slices.
+
+Distances of shapes as filled contours: of plane shapes, and in sections of solid ones.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sorojax.sdf import AbstractSdf, Surface as Triangles, contour, isosurface
+from sorojax.sdf.sampling import finite_box, values
+from sorojax.view import style
+from sorojax.view.picture import Panel, Picture
+from sorojax.view.raster.camera import View
+from sorojax.view.raster.scene import Lines, Part, Scene, Surface
+from sorojax.view.show import show_scene
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+_AXES = {"x": 0, "y": 1, "z": 2}
+
+
+def show_sdf(shape: AbstractSdf, *, resolution: int = 300, title: str = "") -> "Figure":
+    """A plane shape: filled contours of its distance and the zero set as a line."""
+    lower, upper = finite_box("show_sdf", shape, 2)
+    step = float(np.max(upper - lower)) / resolution
+    margin = 0.06 * resolution * step
+    ranges = zip(lower - margin, upper + margin + step, strict=True)
+    x, y = np.meshgrid(*(np.arange(low, high, step) for low, high in ranges))
+    f = values(shape, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
+    figure, axes = _contours(x, y, f, lower - margin, upper + margin, title)
+    for run in _runs(shape, step):
+        axes.plot(*(1e3 * run).T, color=style.INK, lw=1.5, solid_joinstyle="miter")
+    style.dress_plane(axes, 1e3 * lower, 1e3 * upper)
+    return figure
+
+
+def show_slice(
+    shape: AbstractSdf, slice: dict[str, float], resolution: int = 300, title: str = ""
+) -> Picture:
+    """The distance of a solid shape in a plane across one axis, with the zero line."""
+    if len(slice) != 1 or next(iter(slice)) not in _AXES:
+        raise ValueError(
+            f'view.show: got slice={slice}, need one axis with its place [m]: {{"z": 0.01}}.'
+        )
+    name, place = next(iter(slice.items()))
+    across = _AXES[name]
+    lower, upper = finite_box("view.show", shape, 3)
+    rest = [axis for axis in range(3) if axis != across]
+    low, high = lower[rest], upper[rest]
+    margin = 0.06 * float(np.max(high - low))
+    low, high = low - margin, high + margin
+    count = np.maximum((high - low) / np.max(high - low) * resolution, 16).astype(int)
+    x, y = np.meshgrid(
+        *(np.linspace(a, b, n) for a, b, n in zip(low, high, count, strict=True))
+    )
+    points = np.full((x.size, 3), float(place))
+    points[:, rest[0]], points[:, rest[1]] = x.ravel(), y.ravel()
+    f = values(shape, points).reshape(x.shape)
+    title = title or f"{name} = {1e3 * float(place):g} mm"
+    figure, axes = _contours(x, y, f, low, high, title)
+    if f.min() < 0 < f.max():
+        axes.contour(1e3 * x, 1e3 * y, f, levels=[0.0], colors=style.INK, linewidths=1.5)
+    style.dress_plane(axes, 1e3 * low, 1e3 * high, *(f"{'xyz'[k]} [mm]" for k in rest))
+    return Picture(figure, (Panel(axes),))
+
+
+def _runs(shape: AbstractSdf, size: float) -> list[np.ndarray]:
+    """Closed curves of a plane shape, the first point repeated at the end."""
+    return [
+        np.concatenate([c.points, c.points[:1]]) if c.closed else c.points
+        for c in contour(shape, size)
+    ]
+
+
+def _contours(x, y, f, lower, upper, title: str) -> "tuple[Figure, Axes]":
+    """Filled contours of a distance over a grid [m], in a figure for the box around it."""
+    figure = style.new_figure(9.0, style.height_for(9.0, lower, upper))
+    axes = figure.add_subplot()
+    norm, levels = _two_sided(1e3 * float(f.min()), 1e3 * float(f.max()))
+    filled = axes.contourf(1e3 * x, 1e3 * y, 1e3 * f, levels=levels, cmap="RdBu_r", norm=norm)
+    style.colour_bar(
+        figure, filled, axes, "signed distance [mm]", format="%g", shrink=0.9, pad=0.02,
+        ticks=levels[::2] if len(levels) > 12 else levels, spacing="uniform",
+    )  # fmt: skip
+    style.title(figure, title)
+    return figure, axes
+
+
+def _two_sided(low: float, high: float) -> tuple[Any, np.ndarray]:
+    """Colours and round levels on each side of zero, where the depths may differ a lot."""
+    from matplotlib.colors import TwoSlopeNorm
+    from matplotlib.ticker import MaxNLocator
+
+    inside = np.array(MaxNLocator(6).tick_values(min(low, -1e-9), 0.0))
+    outside = np.array(MaxNLocator(6).tick_values(0.0, max(high, 1e-9)))
+    levels = np.concatenate([inside[inside < 0], outside[outside >= 0]])
+    return TwoSlopeNorm(0.0, levels[0], levels[-1]), levels
+
+
+# Implicit shapes: contours of the distance, shaded surfaces, slices
+
+
+def show_shape(
+    shape: AbstractSdf,
+    *,
+    slice: dict[str, float] | None = None,
+    size: float | None = None,
+    filled: bool = False,
+    view: View = "iso",
+    renderer: str = "auto",
+    resolution: int = 300,
+    title: str = "",
+) -> Picture:
+    """A plane shape by its distance, a solid one by its surface or a slice.
+
+    Args:
+        shape: What to draw; it must be bounded.
+        slice: Where to cut a solid shape, e.g. `{"z": 10 * mm}`.
+        size: Edge of the cells of the surface of a solid shape [m]; a 72nd of it if omitted.
+        filled: Draw a plane shape without the distance around it.
+        view: Camera of a solid shape.
+        renderer: Of a solid shape.
+        resolution: Points along the longer side of a plane picture.
+        title: Title of the figure.
+    """
+    if shape.dim == 3 and slice is None:
+        return show_scene(shape_scene(shape, size, title), view=view, renderer=renderer)
+    if shape.dim == 3:
+        assert slice is not None
+        return show_slice(shape, slice, resolution, title)
+    if filled:
+        return show_scene(shape_scene(shape, size, title))
+    figure = show_sdf(shape, resolution=resolution, title=title)
+    return Picture(figure, (Panel(figure.axes[0]),))
+
+
+def shape_scene(shape: AbstractSdf, size: float | None = None, title: str = "") -> Scene:
+    """The surface of a solid shape, or a plane shape filled."""
+    lower, upper = finite_box("view.show", shape, shape.dim)
+    longest = float(np.max(upper - lower))
+    if shape.dim == 2:
+        return Scene((_filled(shape, longest / 300 if size is None else size),), title=title)
+    return Scene((shape_surface(shape, longest / 72 if size is None else size),), title=title)
+
+
+def shape_surface(shape: AbstractSdf, size: float, **look: Any) -> Surface:
+    """A solid shape as a part of a scene, with its `colour`, `opacity` and `name`."""
+    surface = _surface(shape, size)
+    return Surface(surface.vertices, surface.triangles, **look)
+
+
+def _surface(shape: AbstractSdf, size: float) -> Triangles:
+    """With its sharp edges, or rounded where walls are too thin for them."""
+    try:
+        return isosurface(shape, size, "dual_contouring")
+    except ValueError:
+        return isosurface(shape, size)
+
+
+def surface_scene(surface: Triangles, title: str = "", wire: bool = False) -> Scene:
+    """Triangles in space, plain."""
+    sides = np.ones(surface.triangles.shape, bool) if wire else None
+    return Scene((Surface(surface.vertices, surface.triangles, wire=sides),), title=title)
+
+
+def show_surface(
+    surface: Triangles,
+    *,
+    wire: bool = False,
+    view: View = "iso",
+    renderer: str = "auto",
+    title: str = "",
+) -> Picture:
+    """A triangle surface, e.g. from `sdf.isosurface` or `io.import_surface`."""
+    if not title:
+        title = f"{len(surface.triangles)} triangles, {len(surface.vertices)} vertices"
+    return show_scene(surface_scene(surface, title, wire), view=view, renderer=renderer)
+
+
+def obstacle_part(
+    obstacle: AbstractSdf, points: np.ndarray, size: float, shift: np.ndarray | None = None
+) -> list[Part]:
+    """What a body touches, as far as it is near: by marching over a box around it."""
+    lower, upper = points.min(axis=0) - 0.12 * size, points.max(axis=0) + 0.12 * size
+    if shift is not None:
+        lower, upper = lower - shift, upper - shift
+    moved = np.zeros(len(lower)) if shift is None else shift
+    if len(lower) == 2:
+        runs = [run + moved for run in level_lines(obstacle, lower, upper)]
+        return [Lines(runs, style.OBSTACLE, 3.0, name="obstacle")] if runs else []
+    vertices, triangles = level_surface(obstacle, lower, upper)
+    if not len(triangles):
+        return []
+    return [Surface(vertices + moved, triangles, style.OBSTACLE, opacity=0.6, name="obstacle")]
+
+
+def level_surface(shape: AbstractSdf, lower: np.ndarray, upper: np.ndarray, count: int = 44):
+    """Zero surface of a solid field in a box, open where the box cuts it."""
+    from skimage.measure import marching_cubes
+
+    axes = [np.linspace(a, b, count) for a, b in zip(lower, upper, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    f = values(shape, grid.reshape(-1, 3)).reshape(count, count, count)
+    if not f.min() < 0 < f.max():
+        return np.zeros((0, 3)), np.zeros((0, 3), int)
+    step = tuple((upper - lower) / (count - 1))
+    vertices, triangles, _, _ = marching_cubes(f, 0.0, spacing=step)
+    return vertices + lower, triangles[:, ::-1]
+
+
+def level_lines(shape: AbstractSdf, lower: np.ndarray, upper: np.ndarray, count: int = 160):
+    """Zero lines of a plane field in a box; the shape may be unbounded."""
+    from skimage.measure import find_contours
+
+    step = (upper - lower) / (count - 1)
+    x, y = np.meshgrid(*(np.linspace(a, b, count) for a, b in zip(lower, upper, strict=True)))
+    f = values(shape, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
+    return [lower + run[:, ::-1] * step for run in find_contours(f, 0.0)]
+
+
+def _filled(shape: AbstractSdf, size: float) -> Surface:
+    """The inside of a plane shape as triangles, along its exact outline."""
+    from sorojax.mesh import triangulate
+
+    lower, upper = finite_box("view.show", shape, 2)
+    mesh = triangulate(shape, size=max(size, float(np.max(upper - lower)) / 60))
+    return Surface(np.asarray(mesh.points), np.asarray(mesh.cells))

@@ -1,0 +1,325 @@
+"""Deformed bodies: equilibria, load paths, motions and vibration modes.
+
+Values to colour a body by: fields known by name, functions and arrays.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sorojax import fem
+from sorojax.fem import Modes, Problem
+from sorojax.mesh import cell_areas, cell_volumes
+from sorojax.view import style
+from sorojax.view.draw.loads import load_parts, support_parts, wall_parts
+from sorojax.view.draw.meshes import edge_lines
+from sorojax.view.panels import panels
+from sorojax.view.picture import Picture
+from sorojax.view.raster.camera import View
+from sorojax.view.raster.scene import (
+    Coloured,
+    Part,
+    Scale,
+    Scene,
+    Surface,
+    joint_extent,
+    readable,
+    robust_scale,
+    short,
+)
+from sorojax.view.raster.shell import Shell, on_triangles, shell
+from sorojax.view.show import show_scene
+
+NodalField = Callable[[Problem, Float[Array, "nodes dim"]], Float[Array, " nodes"]]
+Field = str | NodalField | Float[Any, " values"] | None
+
+
+@eqx.filter_jit
+def nodal_von_mises(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, " nodes"]:
+    """Von Mises stress at the nodes, averaged between cells [kPa]."""
+    return fem.nodal_average(problem, fem.von_mises_stress(problem, u)) / 1e3
+
+
+@eqx.filter_jit
+def _mean_stress(problem: Problem, u) -> Float[Array, " nodes"]:
+    sigma = fem.cauchy_stress(problem, u)
+    return fem.nodal_average(problem, jnp.trace(sigma, axis1=-2, axis2=-1) / 3)
+
+
+@eqx.filter_jit
+def _largest_stretch(problem: Problem, u) -> Float[Array, " nodes"]:
+    F = fem.deformation_gradient(problem, u)
+    C = jnp.swapaxes(F, -1, -2) @ F
+    return fem.nodal_average(problem, jnp.sqrt(jnp.linalg.eigvalsh(C)[..., -1]))
+
+
+def _energy_density(problem: Problem, u) -> Float[np.ndarray, " cells"]:
+    mesh = problem.mesh
+    size = cell_areas(mesh) if mesh.element.dim == 2 else cell_volumes(mesh)
+    depth = getattr(problem.kinematics, "thickness", 1.0)
+    return np.asarray(fem.strain_energy(problem, u)) / np.asarray(size * depth)
+
+
+_NAMED: dict[str, tuple[str, str, Callable[..., Any]]] = {
+    "von_mises": ("von Mises stress", "Pa", lambda p, u: 1e3 * nodal_von_mises(p, u)),
+    "pressure": ("mean stress", "Pa", _mean_stress),
+    "displacement": ("displacement", "m", lambda p, u: jnp.sqrt(jnp.sum(u**2, axis=1))),
+    "x": ("displacement along x", "m", lambda p, u: u[:, 0]),
+    "y": ("displacement along y", "m", lambda p, u: u[:, 1]),
+    "z": ("displacement along z", "m", lambda p, u: u[:, 2]),
+    "stretch": ("largest stretch", "-", _largest_stretch),
+    "energy": ("strain energy density", "J/m^3", _energy_density),
+}
+
+
+def evaluate(
+    problem: Problem, u: Float[Array, "nodes dim"], field: Field, label: str = ""
+) -> Coloured | None:
+    """The field of a body at displacement `u` [m].
+
+    Args:
+        problem: The body.
+        u: Displacement of its nodes.
+        field: "von_mises", "pressure" (mean stress, tension positive), "displacement", "x",
+            "y", "z", "stretch", "energy"; `field(problem, u)` or an array, one value per
+            node or per cell; None for no field.
+        label: Name and unit of a function or an array.
+
+    Raises:
+        ValueError: If there is no field of that name.
+    """
+    if field is None:
+        return None
+    if isinstance(field, str):
+        if field not in _NAMED:
+            raise ValueError(
+                f"view: got field={field!r}, need one of {', '.join(_NAMED)}, a function of "
+                "(problem, u), or an array."
+            )
+        name, unit, function = _NAMED[field]
+        return Coloured(np.asarray(function(problem, u)), label or name, "" if label else unit)
+    values = field(problem, u) if callable(field) else field
+    return Coloured(np.asarray(values), label, "")
+
+
+# Deformed bodies: equilibria, load paths, motions and vibration modes
+
+
+_UNITS = {
+    fem.Pressure: "Pa", fem.Traction: "Pa", fem.Force: "N", fem.Tendon: "N", fem.Cable: "m",
+    fem.Gravity: "m/s$^2$", fem.Contact: "m", fem.Torque: "N m", fem.Spring: "m",
+}  # fmt: skip
+_CLEAR = 0.4  # opacity of a body whose walls under pressure are seen through it
+
+
+def show_problem(problem: Problem, *, view: View = "iso", renderer: str = "auto",
+                 title: str = "") -> Picture:  # fmt: skip
+    """The body at rest with its cells, supports and loads."""
+    return show_scene(problem_scene(problem, title), view=view, renderer=renderer)
+
+
+def problem_scene(problem: Problem, title: str = "") -> Scene:
+    """As `show_problem`, before it is drawn."""
+    still = np.zeros(problem.mesh.points.shape)
+    mesh, points = problem.mesh, np.asarray(problem.mesh.points)
+    seen = shell(mesh)
+    walls = wall_parts(problem, points) if mesh.element.dim == 3 else []
+    clear = _CLEAR if walls else 1.0
+    parts: list[Part] = [
+        *walls, Surface(points, seen.triangles, wire=seen.wire, opacity=clear)
+    ]  # fmt: skip
+    parts += [edge_lines(mesh, points, colour=style.INK, width=0.9)]
+    parts += support_parts(problem, still) + load_parts(problem, still)
+    name = f"{mesh.num_cells} cells {mesh.element.name}, {problem.space.num_dofs} unknowns"
+    return Scene(tuple(parts), title=title or name)
+
+
+def show_solution(
+    solution: Any,
+    *,
+    field: Field = "von_mises",
+    label: str = "",
+    limits: tuple[float, float] | None = None,
+    rest: bool = True,
+    loads: bool = True,
+    wire: bool = False,
+    view: View = "iso",
+    renderer: str = "auto",
+    title: str = "",
+) -> Picture:
+    """An equilibrium: the deformed body, its outline at rest, supports and loads.
+
+    Args:
+        solution: From `fem.solve`.
+        field: What colours it: a name ("von_mises", "pressure", "displacement", "stretch",
+            "energy"), a function of (problem, u), an array per node or cell, or None.
+        label: Name and unit of a function or an array.
+        limits: Ends of the colour scale, in the unit that the bar shows.
+        rest: Draw the outline of the body at rest.
+        loads: Draw supports and loads.
+        wire: Draw the cells.
+        view: Camera of a solid body.
+        renderer: Of a solid body.
+        title: Title of the figure.
+    """
+    scene = solution_scene(
+        solution, title, field=field, label=label, limits=limits, rest=rest, loads=loads,
+        wire=wire,
+    )  # fmt: skip
+    return show_scene(scene, view=view, renderer=renderer)
+
+
+def solution_scene(solution: Any, title: str = "", **options: Any) -> Scene:
+    """As `show_solution`, before it is drawn."""
+    u = np.asarray(solution.displacement)
+    (scene,) = body_scenes([solution.problem], [u], **options)
+    return replace(scene, title=title)
+
+
+def show_path(
+    path: Any,
+    *,
+    states: Sequence[int] | None = None,
+    view: View = "iso",
+    renderer: str = "auto",
+    title: str = "",
+    **options: Any,
+) -> Picture:
+    """States along a load path, a continuation or a motion, one panel each, on one scale.
+
+    Args:
+        path: From `fem.solve_path`, `fem.volume_path`, `fem.continuation` or `fem.simulate`.
+        states: Which of them; up to six, evenly spaced, if omitted.
+        view: Camera of a solid body.
+        renderer: Of a solid body.
+        title: Title of the figure.
+        **options: As of `show_solution`; supports and loads are left out.
+    """
+    chosen = chosen_states("view.show", len(path), states)
+    moved = np.asarray(path.displacements)
+    problems = [problem_at(path, k) for k in chosen]
+    options = {"loads": False} | options
+    scenes = joint_extent(body_scenes(problems, [moved[k] for k in chosen], **options))
+    names = [state_name(path, k) for k in chosen]
+    return panels(scenes, names, view=view, renderer=renderer, title=title)
+
+
+def show_vibration(
+    modes: Modes, *, share: float = 0.12, view: View = "iso", renderer: str = "auto",
+    title: str = "",
+) -> Picture:  # fmt: skip
+    """Mode shapes, drawn with a largest displacement of `share` of the body, and their
+    frequencies."""
+    mesh, base = modes.problem.mesh, np.asarray(modes.displacement)
+    points = np.asarray(mesh.points)
+    size = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
+    seen = shell(mesh)
+    scenes, names = [], []
+    scale = Scale("amplitude [-]", 0.0, 1.0)
+    for k, shape in enumerate(np.asarray(modes.shapes)):
+        length = np.linalg.norm(shape, axis=1)
+        drawn = points + base + shape * (share * size / length.max())
+        parts: list[Part] = [edge_lines(mesh, points + base, colour=style.GREY, width=0.8)]
+        parts.append(Surface(drawn, seen.triangles, values=length / length.max()))
+        parts.append(edge_lines(mesh, drawn, colour=style.INK, width=0.7))
+        scenes.append(Scene(tuple(parts), scale))
+        names.append(f"mode {k + 1}: {_frequency(modes, k)}")
+    return panels(joint_extent(scenes), names, view=view, renderer=renderer, title=title)
+
+
+def body_scenes(
+    problems: Sequence[Problem],
+    moved: Sequence[Float[np.ndarray, "nodes dim"]],
+    *,
+    field: Field = "von_mises",
+    label: str = "",
+    limits: tuple[float, float] | None = None,
+    rest: bool = True,
+    loads: bool = True,
+    wire: bool = False,
+) -> list[Scene]:
+    """One scene per state of a body, on one scale of colours."""
+    mesh = problems[0].mesh
+    seen, points = shell(mesh), np.asarray(mesh.points)
+    rows = [
+        evaluate(p, jnp.asarray(u), field, label) for p, u in zip(problems, moved, strict=True)
+    ]
+    found = [row for row in rows if row is not None]
+    scale, values = coloured(found, limits) if found else (None, [None] * len(rows))
+    scenes = []
+    for problem, u, value in zip(problems, moved, values, strict=True):
+        parts = _body(problem, points + u, seen, value, wire)
+        if rest:
+            parts.insert(0, edge_lines(mesh, points, colour=style.GREY, width=0.8))
+        if loads:
+            parts += support_parts(problem, u) + load_parts(problem, u)
+        scenes.append(Scene(tuple(parts), scale))
+    return scenes
+
+
+def coloured(
+    rows: list[Coloured], limits: tuple[float, float] | None
+) -> tuple[Scale, list[np.ndarray]]:
+    """The values of all states in a readable unit, and the scale that they share."""
+    values, label = readable(rows)
+    return robust_scale(label, values, limits=limits), values
+
+
+def _body(problem: Problem, points, seen: Shell, value, wire: bool) -> list[Part]:
+    mesh = problem.mesh
+    on = None if value is None else on_triangles(mesh, seen, value)[0]
+    body = Surface(points, seen.triangles, values=on, wire=seen.wire if wire else None)
+    return [body, edge_lines(mesh, points, colour=style.INK, width=0.7)]
+
+
+def chosen_states(where: str, count: int, states: Sequence[int] | None) -> list[int]:
+    """States to draw: those asked for, or up to six."""
+    if not count:
+        raise ValueError(f"{where}: the path has no state. Look at its status.")
+    if states is None:
+        return np.unique(np.round(np.linspace(0, count - 1, 7)).astype(int))[-6:].tolist()
+    wrong = [k for k in states if not -count <= k < count]
+    if wrong or not states:
+        raise ValueError(
+            f"{where}: `states` is {list(states)}, there are states 0 to {count - 1}. Choose "
+            "one or more of them."
+        )
+    return [k % count for k in states]
+
+
+def problem_at(path: Any, k: int) -> Problem:
+    """The problem with the load of state `k` of a path."""
+    if isinstance(path, fem.VolumePath):
+        return fem.with_load(path.problem, path.name, path.pressures[k])
+    if isinstance(path, fem.Path) or (getattr(path, "name", None) is not None):
+        return fem.with_load(path.problem, path.name, path.values[k])
+    return path.problem
+
+
+def state_name(path: Any, k: int) -> str:
+    """What tells a state from the others: its load, its factor or its time."""
+    if isinstance(path, fem.Motion):
+        return f"{float(path.times[k]):.4g} s"
+    if isinstance(path, fem.VolumePath):
+        pressure = short(float(path.pressures[k]), "Pa")
+        return f"{1e6 * float(path.volumes[k]):.4g} ml at {pressure}"
+    name = getattr(path, "name", None)
+    value = np.asarray(path.values[k])
+    if name is None:
+        return f"load factor {float(value):.3g}"
+    load = next(load for load in path.problem.loads if load.name == name)
+    unit = next((u for kind, u in _UNITS.items() if isinstance(load, kind)), "")
+    if value.ndim:
+        return f"|{name}| = {short(float(np.linalg.norm(value)), unit)}"
+    if isinstance(load, fem.Pressure):
+        return short(float(value), unit)
+    return f"{name} = {short(float(value), unit)}"
+
+
+def _frequency(modes: Modes, k: int) -> str:
+    return f"{float(modes.frequencies[k]):.4g} Hz"

@@ -1,0 +1,293 @@
+"""`animate`: a film of any result that moves, one scene per instant."""
+
+import abc
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from sorojax.view import style
+from sorojax.view.film.film import Film, Frame, frames_at
+from sorojax.view.raster.camera import View, camera_at
+from sorojax.view.raster.plane import bar_beside, draw_plane, name_parts
+from sorojax.view.raster.scene import Scale, Scene
+from sorojax.view.raster.solid import (
+    annotate,
+    chosen_renderer,
+    frame as frame_of,
+    lens_of,
+    picture_of,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Scenes at instants: what a film is made of.
+
+    Attributes:
+        time: Instants [s], or any number that rises.
+        scene: `scene(k)` is that of instant k.
+        scale: Of all scenes, if they have values.
+        unit: Of `time`, for the stamp; empty for seconds that are not stamped.
+        extent: Lower and upper corner [m] of all scenes; found from them if omitted.
+        name: Heading of the panel.
+    """
+
+    time: Float[np.ndarray, " instants"]
+    scene: Callable[[int], Scene]
+    scale: Scale | None = None
+    unit: str = "s"
+    extent: tuple[np.ndarray, np.ndarray] | None = None
+    name: str = ""
+
+
+def animate(
+    result: Any,
+    *,
+    beside: Any = None,
+    names: Sequence[str] = (),
+    fps: float = 20.0,
+    speed: float | None = None,
+    view: View = "iso",
+    renderer: str = "auto",
+    samples: int = 1,
+    stamp: bool = True,
+    size: tuple[int, int] = (640, 480),
+    title: str = "",
+    **options: Any,
+) -> Film:
+    """A film of a motion; `.save("name.mp4")` or `.gif` writes it.
+
+    Args:
+        result: A motion, load path or continuation of a body, modes, the `Rollout` or
+            `Trajectory` of a rod (with `model=` or `network=`), or a `Track`.
+        beside: A second result or `Track`, e.g. what was measured, drawn at the same
+            instants in a panel of its own.
+        names: Headings of the panels.
+        fps: Frames per second.
+        speed: Of the film over that of the motion: 1 in real time, 0.1 in slow motion. A
+            path without time takes 3 s.
+        view: A preset, a `Camera`, or a path of them, `orbit()` or `between(a, b)`.
+        renderer: Of solid pictures: "auto", "own" or "pyvista".
+        samples: Per pixel and direction, of the own renderer; 2 is smoother and slower.
+        stamp: Write the time into the picture.
+        size: Width and height [pixels].
+        title: Heading of the film.
+        **options: What to draw, as of `show`: `field=`, `limits=`, `forces=`, `section=`.
+
+    Raises:
+        TypeError: If the result does not move.
+        ValueError: If times do not rise or a frame cannot be drawn.
+    """
+    from sorojax.view.film.tracks import track_of
+
+    tracks = [track_of(result, **options)]
+    if beside is not None:
+        tracks.append(track_of(beside, **options))
+        tracks = _alike(tracks)
+    tracks = [replace(t, name=name) for t, name in zip(tracks, names, strict=False)] or tracks
+    main = tracks[0]
+    if speed is None:
+        speed = 1.0 if main.unit in ("s", "") else float(np.ptp(main.time)) / 3.0 or 1.0
+    chosen = frames_at(main.time, fps, float(speed))
+    stage = _Solid if main.scene(0).dim == 3 else _Plane
+    drawn = stage(tracks, chosen, view, renderer, samples, stamp, size, title)
+    return Film(drawn.frame, len(chosen), fps)
+
+
+def _alike(tracks: list[Track]) -> list[Track]:
+    """One box and one scale of colours for panels that are to be compared."""
+    boxes = [_extent(track) for track in tracks]
+    extent = (np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0))
+    scales = [track.scale for track in tracks if track.scale is not None]
+    scale = scales[0] if scales else None
+    if len(scales) == 2 and scales[0].label == scales[1].label:
+        scale = replace(scales[0], low=min(s.low for s in scales),
+                        high=max(s.high for s in scales))  # fmt: skip
+    return [replace(t, extent=extent, scale=scale if t.scale is not None else None)
+            for t in tracks]  # fmt: skip
+
+
+def _extent(track: Track) -> tuple[np.ndarray, np.ndarray]:
+    """Box around the scenes of all instants, from at most 60 of them."""
+    if track.extent is not None:
+        return track.extent
+    some = np.unique(np.linspace(0, len(track.time) - 1, 60).astype(int))
+    boxes = [track.scene(int(k)).box for k in some]
+    return np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
+
+
+class _Stage(abc.ABC):
+    """A figure of which only the panels and the stamp are drawn again."""
+
+    def __init__(self, tracks, chosen, view, renderer, samples, stamp, size, title):
+        self.tracks, self.chosen, self.view, self.samples = tracks, chosen, view, samples
+        self.renderer, self.stamp, self.title = renderer, stamp, title
+        self.boxes = [_extent(track) for track in tracks]
+        self.figure = style.new_figure(size[0] / 100, size[1] / 100, layout=self.layout)
+        self.figure.set_dpi(100)
+        self.prepare()
+
+    layout: Any = None
+
+    @abc.abstractmethod
+    def prepare(self) -> None:
+        """Draw what stands still."""
+
+    @abc.abstractmethod
+    def frame(self, k: int) -> Frame:
+        """Frame k of the film."""
+
+    def scene(self, track: Track, k: int) -> Scene:
+        """The scene nearest to the instant of frame k, with the scale and box of the film."""
+        time = self.tracks[0].time[self.chosen[k]]
+        at = int(self.chosen[k]) if track is self.tracks[0] else _nearest(track.time, time)
+        made = track.scene(at)
+        return replace(made, scale=track.scale, title="")
+
+    def share(self, k: int) -> float:
+        return k / max(len(self.chosen) - 1, 1)
+
+    def stamped(self, k: int) -> str:
+        """The time or the load of frame k."""
+        track = self.tracks[0]
+        value = float(track.time[self.chosen[k]])
+        if not self.stamp or not track.unit:
+            return ""
+        digits = max(0, 2 - int(np.floor(np.log10(max(np.ptp(track.time), 1e-9)))))
+        return f"{value:.{min(digits, 6)}f} {track.unit}"
+
+
+def _nearest(time: np.ndarray, at: float) -> int:
+    return int(np.argmin(np.abs(time - at)))
+
+
+class _Plane(_Stage):
+    """Panels of matplotlib; axes, bars and names stand still."""
+
+    layout = "constrained"
+
+    def prepare(self) -> None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        boxes = [(1e3 * low, 1e3 * high) for low, high in self.boxes]
+        span = boxes[0][1] - boxes[0][0]
+        wide = span[0] > 1.6 * span[1]
+        count = len(self.tracks)
+        grid = (count, 1) if wide else (1, count)
+        self.axes = list(self.figure.subplots(*grid, squeeze=False).ravel())
+        for axes, track, (low, high) in zip(self.axes, self.tracks, boxes, strict=True):
+            style.dress_plane(axes, low, high)
+            axes.set_title(track.name, fontsize=style.LABEL, color=style.INK, loc="center")
+            first = self.scene(track, 0)
+            sketch = draw_plane(axes, first)
+            name_parts(axes, first)
+            for artist in sketch:  # the legend keeps copies
+                artist.remove()
+        scale = next((t.scale for t in self.tracks if t.scale is not None), None)
+        if scale is not None:
+            bar_beside(self.figure, self.axes, scale)
+        style.title(self.figure, self.title)
+        self.text = self.axes[0].text(
+            0.0, 1.02, self.stamped(len(self.chosen) - 1), transform=self.axes[0].transAxes,
+            fontsize=style.LABEL, color=style.INK, family="monospace", va="bottom",
+        )  # fmt: skip
+        self.canvas = FigureCanvasAgg(self.figure)
+        self.text.set_animated(True)
+        self.canvas.draw()
+        self.figure.set_layout_engine("none")
+        self.canvas.draw()
+        self.still = self.canvas.copy_from_bbox(self.figure.bbox)
+
+    def frame(self, k: int) -> Frame:
+        self.canvas.restore_region(self.still)
+        renderer = self.canvas.get_renderer()
+        for axes, track in zip(self.axes, self.tracks, strict=True):
+            for artist in draw_plane(axes, self.scene(track, k)):
+                artist.set_animated(True)
+                artist.draw(renderer)
+                artist.remove()
+        self.text.set_text(self.stamped(k))
+        self.text.draw(renderer)
+        return np.asarray(self.canvas.buffer_rgba())[:, :, :3].copy()
+
+
+class _Solid(_Stage):
+    """Shaded pictures put into a frame that is drawn once."""
+
+    def prepare(self) -> None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        chosen_renderer(self.renderer)
+        self.firsts = [track.scene(0).parts for track in self.tracks]
+        self.places, count = [], len(self.tracks)
+        first = replace(self.scene(self.tracks[0], 0), title=self.title)
+        whole, _ = frame_of(self.figure, first)
+        place = whole.get_position()
+        whole.remove()
+        heading = 0.05 if any(track.name for track in self.tracks) else 0.0
+        for k, track in enumerate(self.tracks):
+            wide = place.width / count
+            axes = self.figure.add_axes(
+                (place.x0 + k * wide, place.y0, wide, place.height - heading)
+            )
+            box = axes.get_window_extent()
+            size = int(box.width), int(box.height)
+            corner = int(box.x0), int(round(self.figure.bbox.height - box.y1))
+            lens = self._lens(track, size, 0.0)
+            axes.set_xlim(0, size[0])
+            axes.set_ylim(size[1], 0)
+            axes.axis("off")
+            axes.set_title(track.name, fontsize=style.LABEL, color=style.INK)
+            if k == 0 and not callable(self.view):
+                annotate(self.figure, axes, first, lens)
+            self.places.append((corner, size))
+        self.canvas = FigureCanvasAgg(self.figure)
+        self.canvas.draw()
+        self.still = np.asarray(self.canvas.buffer_rgba())[:, :, :3].copy()
+        self.text = self.figure.text(
+            0.015,
+            0.965,
+            "",
+            fontsize=style.LABEL,
+            color=style.INK,
+            family="monospace",
+            va="top",
+        )
+        self.text.set_animated(True)
+
+    def _lens(self, track: Track, size: tuple[int, int], share: float):
+        index = self.tracks.index(track)
+        whole = Scene(self.firsts[index], extent=self.boxes[index])
+        return lens_of([whole], camera_at(self.view, share), size)
+
+    def frame(self, k: int) -> Frame:
+        picture = self.still.copy()
+        for track, ((x, y), size) in zip(self.tracks, self.places, strict=True):
+            lens = self._lens(track, size, self.share(k))
+            seen = picture_of(self.scene(track, k), lens, renderer=self.renderer,
+                              samples=self.samples, dots_per_point=100 / 72)  # fmt: skip
+            part = picture[y : y + size[1], x : x + size[0]]
+            # names and axes stay in front: they are darker than the paper of the picture
+            np.minimum(part, seen[: part.shape[0], : part.shape[1]], out=part)
+        if text := self.stamped(k):
+            self.text.set_text(text)
+            picture = self._written(picture)
+        return picture
+
+    def _written(self, picture: Frame) -> Frame:
+        """The stamp drawn over the picture."""
+        renderer = self.canvas.get_renderer()
+        renderer.clear()
+        self.text.draw(renderer)
+        ink = np.asarray(self.canvas.buffer_rgba()).astype(np.uint16)
+        share = ink[:, :, 3:]
+        rows = np.flatnonzero(share.any(axis=(1, 2)))
+        if not len(rows):
+            return picture
+        at = slice(rows[0], rows[-1] + 1)
+        mixed = (ink[at, :, :3] * share[at] + picture[at] * (255 - share[at])) // 255
+        picture[at] = mixed.astype(np.uint8)
+        return picture

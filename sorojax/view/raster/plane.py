@@ -1,0 +1,207 @@
+"""Plane scenes drawn with matplotlib, in mm.
+
+From a plane mesh to what a drawing library takes: triangles, outlines, paths [mm].
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sorojax.mesh import Mesh
+from sorojax.view import style
+from sorojax.view.raster.scene import Arrows, Dots, Lines, Part, Scale, Scene, Surface
+from sorojax.view.raster.shell import shell
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.path import Path as Outline
+
+
+_RINGS = {
+    "Tri6": (0, 3, 1, 4, 2, 5), "Tri7": (0, 3, 1, 4, 2, 5),
+    "Quad8": (0, 4, 1, 5, 2, 6, 3, 7), "Quad9": (0, 4, 1, 5, 2, 6, 3, 7),
+}  # fmt: skip
+
+
+def flat_triangles(where: str, mesh: Mesh) -> Int[np.ndarray, "triangles 3"]:
+    """Node numbers of flat triangles that cover the cells of a plane mesh."""
+    if mesh.element.dim != 2:
+        raise ValueError(
+            f"{where}: got a mesh of {mesh.element.name}, need a plane one. Draw it with "
+            "view.show."
+        )
+    return shell(mesh).triangles
+
+
+def cell_rings(mesh: Mesh) -> Int[np.ndarray, "cells cell_nodes"]:
+    """Nodes around each cell in order, mid-side nodes between the corners."""
+    cells = np.asarray(mesh.cells)
+    ring = _RINGS.get(mesh.element.name)
+    return cells if ring is None else cells[:, list(ring)]
+
+
+def loops(facets: Int[Any, "facets facet_nodes"]) -> list[Int[np.ndarray, " nodes"]]:
+    """Closed runs of facets as node numbers in order, mid-side nodes in place."""
+    facets = np.asarray(facets)
+    leaving: dict[int, list[int]] = {}
+    for number, start in enumerate(facets[:, 0].tolist()):
+        leaving.setdefault(start, []).append(number)
+    found = []
+    while leaving:
+        node, ring = next(iter(leaving)), []
+        while node in leaving:
+            number = leaving[node].pop()
+            if not leaving[node]:
+                del leaving[node]
+            ring += [facets[number, 0], *facets[number, 2:]]
+            node = int(facets[number, 1])
+        found.append(np.array(ring))
+    return found
+
+
+def as_path(points: Float[np.ndarray, "nodes 2"], rings: list[np.ndarray]) -> "Outline":
+    """Closed rings as one path: holes run the other way round and stay empty."""
+    from matplotlib.path import Path as Outline
+
+    codes, corners = [], []
+    for ring in rings:
+        codes += [Outline.MOVETO, *[Outline.LINETO] * (len(ring) - 1), Outline.CLOSEPOLY]
+        corners += [points[ring], points[ring[:1]]]
+    return Outline(np.concatenate(corners), codes)
+
+
+def box(*points: Float[np.ndarray, "... 2"]) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner of the box around all points."""
+    flat = [np.asarray(p).reshape(-1, 2) for p in points]
+    lower = np.min([p.min(axis=0) for p in flat], axis=0)
+    return lower, np.max([p.max(axis=0) for p in flat], axis=0)
+
+
+# Plane scenes drawn with matplotlib, in mm
+
+
+def plane_figure(scene: Scene, *, width: float = 9.0) -> "tuple[Figure, Axes]":
+    """One plane scene with axes, colour bar and names."""
+    lower, upper = (1e3 * corner for corner in scene.box)
+    figure = style.new_figure(width, style.height_for(width, lower, upper))
+    axes = figure.add_subplot()
+    draw_plane(axes, scene)
+    style.dress_plane(axes, lower, upper)
+    if scene.scale is not None:
+        bar_beside(figure, axes, scene.scale)
+    name_parts(axes, scene)
+    style.title(figure, scene.title)
+    if scene.note:
+        axes.set_title(scene.note, fontsize=style.LABEL, color=style.INK, loc="left")
+    return figure, axes
+
+
+def draw_plane(axes: "Axes", scene: Scene) -> "list[Artist]":
+    """Put every part into `axes`; the artists, in the order they are drawn."""
+    made: list[Any] = []
+    for part in scene.parts:
+        made += _draw(axes, part, scene.scale)
+    return made
+
+
+def bar_beside(figure: "Figure", axes: Any, scale: Scale, **options: Any) -> Any:
+    """A colour bar that takes its room from `axes`."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    painted = ScalarMappable(Normalize(scale.low, scale.high), scale.colours)
+    look = {"shrink": 0.9, "aspect": 30, "pad": 0.02, "extend": scale.extend} | options
+    label = scale.label + ("\n(arrow: the highest 0.5 %)" if scale.extend == "max" else "")
+    return style.colour_bar(figure, painted, axes, label, **look)
+
+
+def name_parts(axes: "Axes", scene: Scene) -> None:
+    """A legend of the parts that have names, above the axes."""
+    named = [part.name for part in scene.parts if part.name]
+    if named:
+        style.legend(
+            axes, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2,
+            ncols=min(len(set(named)), 4),
+        )  # fmt: skip
+
+
+def _draw(axes: "Axes", part: Part, scale: Scale | None) -> list:
+    label = part.name or "_"
+    if isinstance(part, Surface):
+        return _surface(axes, part, scale, label)
+    if isinstance(part, Lines):
+        return _lines(axes, part, label)
+    if isinstance(part, Dots):
+        x, y = 1e3 * part.points.T
+        return axes.plot(x, y, "o", color=part.colour, ms=part.size, label=label, mew=0)
+    return _arrows(axes, part, label)
+
+
+def _surface(axes: "Axes", part: Surface, scale: Scale | None, label: str) -> list:
+    from matplotlib.collections import LineCollection, PolyCollection
+    from matplotlib.patches import PathPatch
+
+    points, triangles = 1e3 * np.asarray(part.points), np.asarray(part.triangles)
+    artists: list[Any] = []
+    if part.values is not None and scale is not None:
+        artists.append(_painted(axes, points, triangles, np.asarray(part.values), scale))
+    elif isinstance(part.colour, str):
+        path = as_path(points, loops(rim(triangles)))
+        patch = PathPatch(path, facecolor=part.colour, edgecolor="none", alpha=part.opacity,
+                          label=label)  # fmt: skip
+        artists.append(axes.add_patch(patch))
+    else:
+        faces = PolyCollection(list(points[triangles]), facecolors=part.colour, label=label,
+                               edgecolors="face", linewidths=0.2)  # fmt: skip
+        artists.append(axes.add_collection(faces, autolim=False))
+    if part.wire is not None:
+        ends = np.concatenate(
+            [triangles[part.wire[:, k]][:, [k, (k + 1) % 3]] for k in range(3)]
+        )
+        ends = np.unique(np.sort(ends, axis=1), axis=0)
+        wire = LineCollection(list(points[ends]), colors=style.GREY, linewidths=0.35)
+        artists.append(axes.add_collection(wire, autolim=False))
+    return artists
+
+
+def _painted(axes: Any, points, triangles, values, scale: Scale):
+    per_point = len(values) == len(points) and len(values) != len(triangles)
+    options = {"cmap": scale.colours, "vmin": scale.low, "vmax": scale.high, "rasterized": True}
+    x, y = points.T
+    if per_point:
+        return axes.tripcolor(x, y, triangles, values, shading="gouraud", **options)
+    return axes.tripcolor(x, y, triangles, facecolors=values, **options)
+
+
+def _lines(axes: "Axes", part: Lines, label: str) -> list:
+    from matplotlib.collections import LineCollection
+
+    runs = [1e3 * np.asarray(run) for run in part.runs]
+    dashes: Any = (0, (4, 2)) if part.dashed else "solid"
+    made = LineCollection(runs, colors=part.colour, linewidths=part.width, linestyles=dashes,
+                          label=label, capstyle="round", joinstyle="round")  # fmt: skip
+    return [axes.add_collection(made, autolim=False)]
+
+
+def _arrows(axes: "Axes", part: Arrows, label: str) -> list:
+    x, y = 1e3 * part.starts.T
+    u, v = 1e3 * part.vectors.T
+    made = axes.quiver(
+        x, y, u, v, angles="xy", scale_units="xy", scale=1.0, color=part.colour, units="dots",
+        width=1.1 * axes.figure.dpi / 72, headwidth=4.5, headlength=5.5, headaxislength=5.0,
+        zorder=4,
+    )  # fmt: skip
+    if part.name:
+        axes.plot([], [], color=part.colour, marker=">", lw=1.5, ms=5, label=label)
+    return [made]
+
+
+def rim(triangles: np.ndarray) -> np.ndarray:
+    """Sides of one triangle only, with the triangle on the left."""
+    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    size = int(triangles.max(initial=0)) + 1
+    forward, back = sides @ np.array([size, 1]), sides @ np.array([1, size])
+    return sides[~np.isin(forward, back)]

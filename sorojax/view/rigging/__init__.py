@@ -1,0 +1,1 @@
+"""Surfaces carried by rods and links."""
