@@ -121,6 +121,11 @@ def test_the_import_rule_catches(line, tmp_path, monkeypatch):
     assert len(wrong_imports(file)) == 1
 
 
+def test_a_folder_has_at_most_fourteen_modules():
+    folders = [CORE, *(d for d in CORE.rglob("*") if d.is_dir())]
+    assert not [d.name for d in folders if len(list(d.glob("*.py"))) > 14]
+
+
 def test_a_checker_sees_arguments_in_their_order():
     """`eqx.AbstractVar` is a field for type checkers, the first of the signature they see:
     `if TYPE_CHECKING:` with `ClassVar` is none."""
