@@ -115,6 +115,7 @@ def bellows_problem(
     depth: float = 20 * mm,
     gravity: Numbers | None = None,
     pushed: Sequence[int] = (),
+    formulation: fem.Displacement | fem.LinearPressure | None = None,
 ) -> fem.Problem:
     """Clamped at its left end, with a pressure called "air" [Pa] in all chambers.
 
@@ -126,6 +127,7 @@ def bellows_problem(
         gravity: Acceleration [m/s^2]; a load called "gravity" where it is given.
         pushed: Bellows, counted from the clamp from 0 on, whose backs carry forces called
             "push_0", "push_2" and so on [N], zero to begin with.
+        formulation: As of `fem.problem`.
 
     Raises:
         ValueError: If there is no such bellow.
@@ -143,4 +145,5 @@ def bellows_problem(
         kinematics=fem.PlaneStrain(depth),
         supports=(fem.Fixed(clamped),),
         loads=tuple(loads),
+        formulation=formulation,
     )
