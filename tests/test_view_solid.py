@@ -181,7 +181,7 @@ def test_light_by_pixel_is_as_good_as_light_by_sample(opacity, monkeypatch):
     )  # fmt: skip
     lit = []
     true = S._shade_colours
-    monkeypatch.setattr(S, "_colours", lambda *a: lit.append(len(a[1])) or true(*a))
+    monkeypatch.setattr(S, "_shade_colours", lambda *a: lit.append(len(a[1])) or true(*a))
     quick, _ = picture(scene, "iso", (160, 160))
     assert sum(lit) < 0.7 * 4 * 160**2
     monkeypatch.setattr(S, "_rough", lambda *_: np.ones((160, 160), bool))
