@@ -45,7 +45,7 @@ def test_the_force_on_both_is_the_slope_of_the_energy():
     @jax.jit
     def at(move):
         here = R.motion(pair, q + move, v)
-        touch = contact.touch(*(R.tree.part_motion(here, k) for k in (0, 1)))
+        touch = contact.touch(*(R.part_motion(here, k) for k in (0, 1)))
         energy = touch.weights @ law.energy(touch.gap)
         forces = [
             R.total_force(f, T0, here) for f in ((R.Between("rod", "stone", contact),), ())
@@ -126,7 +126,7 @@ def test_two_rods_are_no_rod_and_link():
     pair, q, v, contact = touching(SE2(), sdf.Circle([0.0, 0.0], 0.01), LAW)
     here = R.motion(pair, q, v)
     with pytest.raises(ValueError, match="need a rod and then a link"):
-        contact(T0, *(R.tree.part_motion(here, k) for k in (1, 0)))
+        contact(T0, *(R.part_motion(here, k) for k in (1, 0)))
 
 
 def test_a_varying_wrench_is_the_one_of_the_moment():

@@ -32,7 +32,7 @@ def values_of(of: sparse.SparseSymmetric, shift: float) -> np.ndarray:
 @pytest.mark.parametrize("mkl", [True, False])
 def test_solutions(mkl, monkeypatch):
     if not mkl:
-        monkeypatch.setattr(banded.pardiso, "library", lambda: None)
+        monkeypatch.setattr(banded, "library", lambda: None)
     given = system(12, 3)
     starts, cols = pattern(given)
     order = banded.narrow_order(starts, cols)

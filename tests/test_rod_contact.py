@@ -67,7 +67,7 @@ def dropped(points, q, v):
     path = R.rollout(body, q, v, forces, step=1e-3, saves=100, every=2)
 
     def report(q, v):
-        motion = R.tree.part_motion(R.motion(body, q, v), 0)
+        motion = R.part_motion(R.motion(body, q, v), 0)
         energy = R.kinetic_energy(body, q, v) + R.potential_energy(body, q, G)
         energy = energy + sum(R.contact_energy(face, motion) for face in faces)
         return energy, jnp.max(jnp.stack([R.penetration(face, motion) for face in faces]))
@@ -153,15 +153,15 @@ def test_rods_that_cross_press_against_each_other():
     def at(q):
         def energy(q):
             pair, motion = crossed(q)
-            bodies = [R.tree.part_motion(motion, k) for k in (0, 1)]
+            bodies = [R.part_motion(motion, k) for k in (0, 1)]
             found = R.rod_contact.touches(contact, *bodies)
             return sum(R.pressing.energy(contact.law, touch) for touch in found)
 
         pair, motion = crossed(q)
         plain = R.total_force((), T0, motion)
         force = R.total_force((R.Between("top", "low", contact),), T0, motion) - plain
-        held = R.HeldRod(contact, R.tree.part_motion(motion, 1))
-        alone = held(T0, R.tree.part_motion(motion, 0))
+        held = R.HeldRod(contact, R.part_motion(motion, 1))
+        alone = held(T0, R.part_motion(motion, 0))
         return jax.grad(energy)(q), force, alone
 
     slope, force, alone = at(jnp.array([1.0, 0.5, 0.3, 0.1, -1.0, 0.2, 0.4, 0.0]))

@@ -134,7 +134,7 @@ import os
 os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 import jax, jax.numpy as jnp, numpy as np
 jax.config.update("jax_enable_x64", True)
-from sorojax.math import sparse
+from sorojax.math.linalg import sparse
 n = 100_000
 system = sparse.from_cells(n, np.stack([np.arange(n - 1), np.arange(1, n)], 1))
 values = jnp.where(system.rows == system.cols, 3.0, -1.0)

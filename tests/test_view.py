@@ -259,7 +259,7 @@ def test_the_report_is_one_file(film):
 LOADED = """
 import sys, sorojax.view
 first = sorted({"matplotlib", "PIL"} & sys.modules.keys())
-import sorojax.view.shapes, sorojax.view.solid  # what a solid shape is drawn with
+import sorojax.view.draw.shapes, sorojax.view.raster.solid  # what a solid shape is drawn with
 solvers = {"matplotlib", "diffrax", "sorojax.fem", "sorojax.rod"}
 print(first, sorted(solvers & sys.modules.keys()))
 """
