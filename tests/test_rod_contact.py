@@ -10,6 +10,8 @@ from sorojax import rod as R, sdf
 from sorojax.contact import LinePenalty
 from sorojax.math.lie import SE2, SE3
 from sorojax.math.status import Status
+from sorojax.rod.contact.obstacle import energy as energy_of_touch
+from sorojax.rod.contact.rods import touches
 
 RADIUS = 6e-3
 FINGER = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2000.0)
@@ -154,8 +156,8 @@ def test_rods_that_cross_press_against_each_other():
         def energy(q):
             pair, motion = crossed(q)
             bodies = [R.part_motion(motion, k) for k in (0, 1)]
-            found = R.rod_contact.touches(contact, *bodies)
-            return sum(R.pressing.energy(contact.law, touch) for touch in found)
+            found = touches(contact, *bodies)
+            return sum(energy_of_touch(contact.law, touch) for touch in found)
 
         pair, motion = crossed(q)
         plain = R.total_force((), T0, motion)
