@@ -1,6 +1,5 @@
 """Sweeps: the same result hash whatever dies on the way."""
 
-import importlib.util
 import os
 import signal
 import subprocess
@@ -156,10 +155,6 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(
-    importlib.util.find_spec("distributed") is None,
-    reason="no Dask here: it comes with the extra `sweep`",
-)
 def test_dask_survives_killed_workers_a_killed_driver_and_a_damaged_file(tmp_path, serial):
     def drive(deadly):
         script = tmp_path / "driver.py"

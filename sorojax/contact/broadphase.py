@@ -1,9 +1,4 @@
-"""Which points can be left out because an obstacle is far away.
-
-Broad phase by balls: bodies that cannot touch, found by one number each.
-
-Broad phase among facets, on the host: for each the few others that it may meet.
-"""
+"""Which points can be left out because an obstacle is far away."""
 
 import jax.numpy as jnp
 import numpy as np

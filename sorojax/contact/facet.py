@@ -3,8 +3,6 @@
 A facet is felt a little beyond its rim, with a weight that falls smoothly across it; the
 weights of facets that continue each other add up to one. So the surface of many facets
 has no kinks, and one that ends lets go smoothly.
-
-Contact of points, each with an area of its own, with one static obstacle.
 """
 
 from typing import NamedTuple

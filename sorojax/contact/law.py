@@ -1,7 +1,4 @@
-"""The contact law: a smooth pressure that grows with penetration.
-
-The law of contact along a line: force per length, friction and damping.
-"""
+"""The contact law: a smooth pressure that grows with penetration."""
 
 import equinox as eqx
 import jax

@@ -1,16 +1,6 @@
 """STL: loose triangles without a unit, binary or as text.
 
-OBJ: vertices and faces as text.
-
-PLY: vertices and triangles, binary or as text.
-
 3MF: a zipped model that states its unit.
-
-GLB (binary glTF 2.0): for viewers on the web.
-
-SVG: curves of a plane shape, in millimetres.
-
-From what a surface file holds to a surface: limits, merged corners, checked indices.
 """
 
 import io

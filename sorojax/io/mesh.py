@@ -1,8 +1,6 @@
 """Meshes to and from files of other programs, through meshio.
 
 Names of cells in files. The order of nodes is that of VTK on both sides.
-
-Node sets, facet sets and regions as values and sets of a file, and back.
 """
 
 import contextlib

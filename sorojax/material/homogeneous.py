@@ -3,8 +3,6 @@
 Faces without grips are free: the stretch across is found by Newton's method on the
 energy, whatever the material's compressibility. The stress is NaN where none is found.
 Made for isotropic materials; a `FibreReinforced` one may lie along the first axis.
-
-Where an energy stops being one of a stable rubber.
 """
 
 import math

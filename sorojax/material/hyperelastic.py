@@ -1,7 +1,4 @@
-"""Stored energies; stress and tangent follow by differentiation.
-
-Laws of the volume ratio; all have the bulk modulus K as their curvature at J = 1.
-"""
+"""Stored energies; stress and tangent follow by differentiation."""
 
 import abc
 import functools

@@ -3,8 +3,6 @@
 Every energy splits as Psi = W(I1_bar, I2_bar) + K U(J) with the physical bulk modulus K;
 `volumetric` chooses U, (J - 1)^2 / 2 unless told otherwise.
 
-Ogden's rubber in powers of the principal stretches.
-
 Sums of powers of the principal values of C, smooth where they coincide.
 
 With b half the exponent of a stretch, sum_i x_i^b over the eigenvalues x_i of the

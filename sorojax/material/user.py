@@ -1,7 +1,4 @@
-"""Stored energies that the user writes as a function.
-
-Solids whose energy does not split into change of shape and change of volume.
-"""
+"""Stored energies that the user writes as a function."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,13 +1,9 @@
-"""Public verbs compiled once per structure of their arguments.
+"""Compiled functions: public verbs, large pytrees, batches, and what is kept out of fusion.
 
-Compiled functions of large pytrees that stay the same from call to call.
+Public verbs are compiled once per structure of their arguments.
 
 To take a problem apart costs as much as to evaluate its forces on a small mesh, to take a
 network apart a third of its step: it is done once, and calls hand over the list of arrays.
-
-Many items through one verb, in batches that stay in the cache.
-
-Work that XLA keeps apart from what uses it.
 
 On the CPU, XLA drops optimization barriers before it fuses loops; the work of a producer is
 then repeated in every entry that reads it, and a loop that holds the slice of an outer loop

@@ -1,6 +1,4 @@
-"""Progress from inside compiled programs, told to the listener of the framework.
-
-Independent work of the host at the same time: compilers and BLAS leave Python to others.
+"""What runs on the host beside compiled programs: progress, threads, SciPy's searches.
 
 SciPy's neighbour searches and triangulations, imported at first use: importing them costs
 as much as the rest of the package.
@@ -66,7 +64,7 @@ def together(*works: Callable[[], Any]) -> list[Any]:
         return [first(), *(other.result() for other in others)]
 
 
-# SciPy's neighbour searches and triangulations, imported at first use: importing them costs
+# SciPy's neighbour searches and triangulations, imported at first use
 
 
 Points = Float[np.ndarray, "points dim"]

@@ -1,9 +1,5 @@
 """Planar and spatial rigid motions as leafless markers. Twists are angular first.
 
-Logarithms of rigid motions, and how they change.
-
-Rotation of a frame whose curvature varies along a cell, by a Magnus expansion.
-
 Unit quaternions, scalar first, as tuples of four arrays of any one shape.
 
 Tuples of component arrays fuse into few elementwise kernels; stacked arrays do not.

@@ -3,8 +3,6 @@
 A rule is a node count, or a `Quadrature` where the integrand is smooth between known
 breaks only. Everything here depends on the rule alone, so it is computed on the host,
 cached, and enters a program as a constant.
-
-Polynomials of a few given coefficients.
 """
 
 import functools

@@ -1,7 +1,4 @@
-"""Areas and volumes of cells and cavities, differentiable in the points of a mesh.
-
-Where points lie in a mesh, and what nodal fields are there.
-"""
+"""Areas and volumes of cells and cavities, differentiable in the points of a mesh."""
 
 from typing import Any, NamedTuple
 

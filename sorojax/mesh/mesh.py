@@ -1,9 +1,4 @@
-"""The mesh: points, cells and named sets.
-
-Mid-side nodes on straight sides, for any quadratic cell.
-
-Several bodies as one mesh.
-"""
+"""The mesh: points, cells and named sets."""
 
 from typing import Any
 

@@ -1,7 +1,4 @@
-"""How good the cells of a mesh are.
-
-How far motion has spoilt a mesh, and when to build a new one.
-"""
+"""How good the cells of a mesh are."""
 
 from typing import Any, NamedTuple
 

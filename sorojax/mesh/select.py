@@ -1,7 +1,4 @@
-"""Nodes, cells and facets of a mesh chosen by place; all results are host arrays.
-
-Connected pieces of the boundary: outer surfaces and the chambers they enclose.
-"""
+"""Nodes, cells and facets of a mesh chosen by place; all results are host arrays."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -1,11 +1,4 @@
-"""Regular meshes of boxes.
-
-Cells between given lines, and a mesh without some of its cells.
-
-Solid meshes from plane ones: extruded, revolved, swept along frames.
-
-A mesh and its mirror image as one mesh, node for node the same on both sides.
-"""
+"""Regular meshes of boxes."""
 
 from collections.abc import Sequence
 from itertools import permutations

@@ -1,7 +1,4 @@
-"""The uniform section that carries the mass of a body along a curve.
-
-The weight of a solid on the rod that stands in for it.
-"""
+"""The uniform section that carries the mass of a body along a curve."""
 
 import equinox as eqx
 import jax

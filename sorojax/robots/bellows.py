@@ -1,7 +1,4 @@
-"""A planar bellows actuator: a row of air chambers on a strain-limiting layer.
-
-The bellows actuator as a boundary value problem on its cross-section.
-"""
+"""A planar bellows actuator: a row of air chambers on a strain-limiting layer."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,8 +1,6 @@
 """A crawler: three groups of air chambers on a stiff sole, inflated one after the other.
 
 Reference: Shepherd et al., "Multigait soft robot", PNAS 108, 2011.
-
-The rhythm of legs.
 """
 
 from typing import Any, NamedTuple

@@ -1,13 +1,4 @@
-"""A soft finger: a round bellows with a spine on one side and a rounded tip.
-
-The hand: a palm with five soft fingers, each with an air supply of its own.
-
-The manipulator: three round bellows around a hollow core, with a three-finger gripper.
-
-The planar actuator: two round bellows side by side between two plates.
-
-The bending actuator: a row of box-shaped bellows on a layer that does not stretch.
-"""
+"""A soft finger: a round bellows with a spine on one side and a rounded tip."""
 
 import equinox as eqx
 import jax.numpy as jnp

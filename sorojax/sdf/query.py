@@ -5,8 +5,6 @@ Fields of many points at full speed: compiled once per power of two.
 A field made of scalars becomes one loop per output, which reads the coordinates and
 writes the result; normals of rows, and a field that searches or holds a table per point,
 go in chunks that stay in the cache.
-
-Local geometry of level sets: tangent frames, curvature, the closest point.
 """
 
 import functools

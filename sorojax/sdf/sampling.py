@@ -1,7 +1,4 @@
-"""Fields sampled on the host: two compiled kernels of fixed size per kind of shape.
-
-Points of a shape: random ones inside and on the surface, and regular grids.
-"""
+"""Fields sampled on the host: two compiled kernels of fixed size per kind of shape."""
 
 from typing import NoReturn
 

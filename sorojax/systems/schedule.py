@@ -1,7 +1,4 @@
-"""Checks of a wiring and the order in which its ports are evaluated.
-
-Algebraic loops: torn wires, and the root find that makes them consistent.
-"""
+"""Checks of a wiring and the order in which its ports are evaluated."""
 
 from collections.abc import Callable, Iterable, Mapping
 

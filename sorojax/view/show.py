@@ -1,7 +1,4 @@
-"""`show`: one verb that draws any noun; what draws it is loaded when it is first asked for.
-
-Scenes as pictures, and nouns as scenes: what `show` draws, to be put together anew.
-"""
+"""`show`: one verb that draws any noun; what draws it is loaded when it is first asked for."""
 
 import functools
 import importlib

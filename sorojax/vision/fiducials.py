@@ -2,8 +2,6 @@
 
 Corners come from the edges: on normals of each side the gradient-weighted place of the
 edge, a total least squares line through them, and the intersections of neighbouring lines.
-
-Intrinsics of a camera from pictures of a ChArUco board.
 """
 
 from collections.abc import Iterable, Mapping

@@ -1,7 +1,4 @@
-"""Markers with identities, followed from frame to frame.
-
-Markers in the images of a camera, as a loop wants them: places, whenever it asks.
-"""
+"""Markers with identities, followed from frame to frame."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -233,7 +233,7 @@ def flooded(flood: Flood, density: Float[Array, " cells"]) -> Bool[Array, " cell
     return jax.lax.while_loop(lambda state: state[1], spread, start)[0]
 
 
-# A pressure that seeps through a design: full in the void that a source reaches, gone
+# A pressure that seeps through a design
 
 
 class Darcy(eqx.Module):

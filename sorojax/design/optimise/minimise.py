@@ -1,7 +1,4 @@
-"""The optimisation loop: any differentiable function of a pytree, constraints, any method.
-
-The designs of a run, for pictures and films of it.
-"""
+"""The optimisation loop: any differentiable function of a pytree, constraints, any method."""
 
 from collections.abc import Callable, Sequence
 from typing import Any

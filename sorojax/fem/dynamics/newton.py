@@ -8,8 +8,6 @@ Inertia and damping of a step by products on the host.
 
 A product there takes a quarter of the time of the compiled one, which scatters every entry of
 the pattern twice.
-
-Lists of near facets that follow a motion, on the host.
 """
 
 import dataclasses

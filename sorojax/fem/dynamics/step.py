@@ -4,8 +4,6 @@ Forces act at one displacement u within the step. Velocity and acceleration ther
 in u, so that inertia and damping are quadratic potentials beside those of the loads.
 
 What a load may know about the time step that it acts in.
-
-Inertia and damping of one time step, as a quadratic potential.
 """
 
 import dataclasses

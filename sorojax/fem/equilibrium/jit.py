@@ -2,8 +2,6 @@
 
 Every pass of the loop assembles once and does one thing: accept the load level, cut it,
 shorten the last move or take a Newton step with the direct solver behind a callback.
-
-Stiffness of single cells at rest, for bodies whose cells differ by a factor.
 """
 
 from typing import Any, NamedTuple

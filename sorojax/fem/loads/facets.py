@@ -1,7 +1,4 @@
-"""Integrals over facets: the sides of plane cells, the faces of solid ones.
-
-Load stiffness: small dense matrices of groups of nodes, scattered into the tangent.
-"""
+"""Integrals over facets: the sides of plane cells, the faces of solid ones."""
 
 from collections.abc import Callable
 from functools import cache

@@ -3,8 +3,6 @@
 Every load here is conservative, so the tangent stays symmetric. A follower pressure is
 conservative on a closed cavity, on a run of facets whose ends cannot move, and on one cut
 by planes of symmetry.
-
-A torque on a set of nodes, as the potential of their mean rotation.
 """
 
 import abc

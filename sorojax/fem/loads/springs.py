@@ -1,7 +1,4 @@
-"""Springs: from node to node, from nodes to the ground, and a bed of linear springs.
-
-Tendons: cables without friction through points of the body.
-"""
+"""Springs: from node to node, from nodes to the ground, and a bed of linear springs."""
 
 from typing import TYPE_CHECKING, ClassVar
 

@@ -121,7 +121,7 @@ def _state_at(loading, prepared, first: PathState, s: float, newton) -> PathStat
     )
 
 
-# Paths of equilibria over limit points and through bifurcations, their critical points
+# Paths of equilibria over limit points and through bifurcations
 
 
 Until = Callable[[np.ndarray, float], bool]

@@ -7,8 +7,6 @@ thread; phases are called one by one so that the symbolic analysis is reused.
 Reference: oneMKL Developer Reference, "oneMKL PARDISO - Parallel Direct Sparse
 Solver Interface".
 
-The fall-back direct solver: SciPy's SuperLU in symmetric mode (BSD).
-
 Cholesky of matrices with a narrow band: small or slender bodies in the plane.
 
 A sparse factor of a few thousand unknowns spends most of its time on its own bookkeeping. In

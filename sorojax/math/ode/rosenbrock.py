@@ -1,7 +1,4 @@
-"""Rodas4: a stiff method that solves linear systems only, one matrix per step.
-
-Fixed steps of stiff systems at the price of two slopes and one small product each.
-"""
+"""Rodas4: a stiff method that solves linear systems only, one matrix per step."""
 
 from typing import Any, ClassVar
 

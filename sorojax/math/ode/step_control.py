@@ -1,7 +1,5 @@
 """Step size control of adaptive runs: proportional-integral, tolerances per component.
 
-Steps that may fail: halved until they converge, and grown again afterwards.
-
 Whether the steps of a run are short enough: a few of them made again as two halves.
 
 A run of fixed steps is a scan over its rows, of one or more steps each. Of some rows the scan

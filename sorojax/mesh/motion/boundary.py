@@ -1,7 +1,4 @@
-"""Where boundary nodes go when the shape changes, by the implicit-function rule.
-
-Points put where several sides of zero sets meet, on the host.
-"""
+"""Where boundary nodes go when the shape changes, by the implicit-function rule."""
 
 from typing import NamedTuple
 

@@ -1,11 +1,4 @@
-"""Displacements spread from some nodes of a mesh, curve or surface over all others.
-
-What `move` needs to know about the outline of a plane mesh, worked out on the host.
-
-What `move` needs to know about the surface of a solid mesh, worked out on the host.
-
-Sides between the facets of a surface: which are sharp, and the patches they bound.
-"""
+"""Displacements spread from some nodes of a mesh, curve or surface over all others."""
 
 from typing import NamedTuple
 

@@ -1,7 +1,4 @@
-"""Flat tetrahedra at the surface taken away, as an exchange of a diagonal of the surface.
-
-Better places for the nodes of the worst tetrahedra.
-"""
+"""Flat tetrahedra at the surface taken away, as an exchange of a diagonal of the surface."""
 
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ A lattice of tetrahedra graded by bisection of longest edges.
 
 Reference: Arnold, Mukherjee and Pouly, Locally adapted tetrahedral meshes using bisection,
     SIAM J. Sci. Comput. 22 (2000).
-
-Numbers of tetrahedra: volumes, dihedral angles, radius ratios.
 """
 
 from typing import NamedTuple

@@ -277,7 +277,7 @@ class Snapper:
         return joined(*self.parts.values()) if self.parts else no_sides()
 
 
-# Sharp edges and corners of a solid in its tetrahedra: nodes of the surface moved onto
+# Sharp edges and corners of a solid in its tetrahedra
 
 
 _TURNS = 2  # rounds of splitting

@@ -8,8 +8,6 @@ they do in the solid, so the numbers are those of the drawing and hold no correc
 Reference: Kolpakov, Calculation of the characteristics of thin elastic rods with a periodic
 structure, J. Appl. Math. Mech. 55, 1991.
 
-The cells of bellows, fingers and the bending actuator.
-
 What a cell answers beyond small strains: its energy to the fourth order.
 
 The energy is stationary in the displacements inside of the cell. So those of first order give

@@ -1,7 +1,4 @@
-"""A body with its air: reservoirs and regulators wired to an assembly, as a board sees it.
-
-A rod behind valves: the smallest model that a board can drive.
-"""
+"""A body with its air: reservoirs and regulators wired to an assembly, as a board sees it."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple

@@ -1,8 +1,6 @@
 """Contact of a rod with a fixed obstacle, and what all contacts of rods share.
 
 How far bodies get within a step.
-
-Forces between surfaces that touch, on the points of the bodies that carry them.
 """
 
 import abc

@@ -1,7 +1,5 @@
 """Contact between two rods of an assembly, or of a rod with one that is held.
 
-Contact of a rod with itself.
-
 The point of one centre line that is closest to each point of another.
 """
 

@@ -2,8 +2,6 @@
 
 These are doors: each compiles once per structure of the model and its forces. Loops use
 `motion`, `inertia` and `total_force` directly, with `operators` taken outside.
-
-Energy and momentum of a rod or assembly, and the matrix behind its Coriolis force.
 """
 
 from typing import Any

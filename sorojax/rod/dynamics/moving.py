@@ -1,7 +1,4 @@
-"""A rod on a moving base: its fields with the columns of the base, in any frame.
-
-Where the mass of the sections is, beside the axis of the rod.
-"""
+"""A rod on a moving base: its fields with the columns of the base, in any frame."""
 
 from typing import Any
 

@@ -8,8 +8,6 @@ Reference:
     Featherstone, Rigid Body Dynamics Algorithms, 2008, chapters 5 and 6, for the passes.
 
 The planar or the spatial equations, as the group of a rod asks.
-
-Rows of equal structure worked on one after the other: a program holds the work once.
 """
 
 from collections.abc import Callable, Sequence

@@ -8,8 +8,6 @@ To add one, subclass the family that fits:
 * `AbstractDamping`: a constant matrix; implicit steppers use it in their iteration.
 * `AbstractPressureMap`: the work of a fluid; its pressure comes from a network, or from
   `Pressurised(map, pressure)`. `AbstractChamber` is the one with rigid walls.
-
-A nonlinear law of the section: moments and forces from strains, by a user function.
 """
 
 import abc

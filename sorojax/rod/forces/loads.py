@@ -2,8 +2,6 @@
 
 A `Gravity` or a damping that is listed by itself acts on every part; any other force names
 its part: `On("finger", TipWrench(...))`.
-
-Forces whose numbers change with time.
 """
 
 import abc

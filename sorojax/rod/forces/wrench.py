@@ -1,7 +1,4 @@
-"""Given moments and forces on a rod: at a section, or per length.
-
-A fluid around a rod: buoyancy and drag.
-"""
+"""Given moments and forces on a rod: at a section, or per length."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,4 @@
-"""Joints between the parts of an assembly: how a frame moves on another.
-
-The screw: one coordinate turns and advances.
-"""
+"""Joints between the parts of an assembly: how a frame moves on another."""
 
 import abc
 

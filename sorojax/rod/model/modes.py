@@ -1,9 +1,4 @@
-"""Modes that a user gives: as functions of s, or as samples.
-
-Combinations of modes: orthonormal ones, and smooth ones fitted to samples.
-
-B-splines: local, positive modes of any smoothness.
-"""
+"""Modes that a user gives: as functions of s, or as samples."""
 
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -1,7 +1,4 @@
-"""Modes that are smooth along the whole rod: polynomials and Fourier series.
-
-Modes that live on one stretch of the rod each.
-"""
+"""Modes that are smooth along the whole rod: polynomials and Fourier series."""
 
 import math
 from collections.abc import Sequence

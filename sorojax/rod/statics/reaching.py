@@ -1,7 +1,4 @@
-"""Steps of inverse kinematics: damped least squares, its null space, bounds.
-
-What holds at the answer of inverse kinematics, from which its derivative follows.
-"""
+"""Steps of inverse kinematics: damped least squares, its null space, bounds."""
 
 from typing import Any, NamedTuple
 

@@ -1,7 +1,4 @@
-"""Boolean combinations of shapes: bounds of the true distance, Lipschitz as their parts.
-
-Smooth combinations: what rounds a joint, how deep it dips, how smooth it is.
-"""
+"""Boolean combinations of shapes: bounds of the true distance, Lipschitz as their parts."""
 
 import abc
 import functools

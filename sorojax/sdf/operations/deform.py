@@ -3,8 +3,6 @@
 A map that stretches more and more away from the shape is followed only near it: the
 point is first moved into a box around the shape, and beyond that box the distance to
 the box takes over. So one constant holds in the whole space.
-
-Shapes mixed, roughened and scaled by axis: bounds of the distance.
 """
 
 import abc

@@ -1,7 +1,4 @@
-"""Shapes moved, scaled, thickened, hollowed and repeated.
-
-Rotation in space about any axis.
-"""
+"""Shapes moved, scaled, thickened, hollowed and repeated."""
 
 import abc
 import functools

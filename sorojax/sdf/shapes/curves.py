@@ -1,7 +1,5 @@
 """Bodies along curves in the plane or in space: polyline, Bezier, spline, helix.
 
-A tube along a smooth curve through points.
-
 The nearest of many pieces: a search without derivatives, then one piece with them.
 
 Which piece is nearest does not vary with small changes, so only the winner is

@@ -1,9 +1,4 @@
-"""Regions between closed outlines, and text drawn by them.
-
-Solids with triangular faces: octahedron, pyramid, any closed triangle mesh.
-
-Shapes from arrays: images, distances on a grid, height maps.
-"""
+"""Regions between closed outlines, and text drawn by them."""
 
 import functools
 import itertools

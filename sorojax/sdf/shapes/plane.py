@@ -1,7 +1,5 @@
 """Plane shapes; every field here is the exact distance.
 
-Plane shapes with their centre at the origin; move them with `translate`.
-
 Whether a polygon touches itself.
 """
 

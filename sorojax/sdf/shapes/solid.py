@@ -1,7 +1,4 @@
-"""Solid shapes; every field here is the exact distance.
-
-Solids with their centre at the origin and their axis along z, with exact distances.
-"""
+"""Solid shapes; every field here is the exact distance."""
 
 import equinox as eqx
 import jax.numpy as jnp

@@ -4,8 +4,6 @@ A grid edge that goes through a wall while both its ends lie outside would leave
 of its ends then counts as inside: the wall stays whole and grows by half a cell at most, its
 planes are still the true ones. Gaps between two nodes inside are kept open in the same way.
 So the thin rims stay whole at which sheets run out; walls of even thickness are refused.
-
-Nodes that count to the side of a wall or a gap, so that it stays whole.
 """
 
 from typing import NamedTuple

@@ -1,7 +1,4 @@
-"""One triangle in space: distance, side and solid angle at separate coordinate arrays.
-
-Which triangles can be the closest one within each cube of an octree.
-"""
+"""One triangle in space: distance, side and solid angle at separate coordinate arrays."""
 
 import functools
 

@@ -1,7 +1,4 @@
-"""Rays through triangles, on the host, and the thinnest wall between them.
-
-Triangles that pass through each other.
-"""
+"""Rays through triangles, on the host, and the thinnest wall between them."""
 
 import numpy as np
 

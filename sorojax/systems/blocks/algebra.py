@@ -1,9 +1,4 @@
-"""Blocks without physics: sums, gains, functions, lags and sensors.
-
-Signals of time, and the block that puts one on a wire.
-
-Paths through waypoints, of a point or of several signals at once.
-"""
+"""Blocks without physics: sums, gains, functions, lags and sensors."""
 
 import abc
 import math

@@ -1,7 +1,4 @@
-"""Blocks: state-space systems with named, typed ports.
-
-Identical blocks as one: stacked and evaluated side by side, not written out.
-"""
+"""Blocks: state-space systems with named, typed ports."""
 
 import abc
 from collections.abc import Mapping, Sequence

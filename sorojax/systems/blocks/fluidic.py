@@ -1,8 +1,6 @@
 """Pneumatics: a gas volume and the valve that feeds it.
 
 Ports carry gauge pressure [Pa]; the gas law is written in absolute pressure.
-
-Valves: an opening that lags its command and lets gas through by pressure.
 """
 
 import math

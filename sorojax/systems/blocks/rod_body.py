@@ -1,7 +1,4 @@
-"""A rod as a block: pressure in, volume and tip out.
-
-An assembly as a block: pressures of its rods in, volumes, tips and joint efforts.
-"""
+"""A rod as a block: pressure in, volume and tip out."""
 
 import equinox as eqx
 import jax

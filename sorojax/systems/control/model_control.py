@@ -2,10 +2,6 @@
 
 All are memoryless. As a controller: `law(t, (q, v), ()) -> (effort, ())`; in a network:
 inputs `q` and `v`, output `effort`, for a body with `driven=True`.
-
-A controller that knows the model as a force on its rod: closed loops in `rod.rollout`.
-
-What a law at the tip of a rod asked for along a motion, and what it got.
 """
 
 import abc

@@ -1,9 +1,4 @@
-"""Figures of modes, backbones, signals and material fits.
-
-Snapshots of a backbone: where it is, and how it is strained along its length.
-
-How accurate at what cost: convergence under refinement, work against precision.
-"""
+"""Figures of modes, backbones, signals and material fits."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What holds a body and what acts on it, as parts of a scene.
 
-Loads that are no arrows: torques, springs, beds, rigid parts, walls of cavities.
-
 Signs of what acts without an arrow of its own: coils of springs, arcs of turning.
 """
 

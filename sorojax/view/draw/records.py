@@ -1,7 +1,5 @@
 """What is told rather than built: mesh quality, sweeps, tracks of markers, moving surfaces,
 boundary curves.
-
-Robots from their dimensions: the body, and the air that moves it.
 """
 
 from typing import Any

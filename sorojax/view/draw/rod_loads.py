@@ -1,7 +1,4 @@
-"""What acts on rods: threads through them, and forces where they touch something.
-
-Outlines of cross-sections, found again from the constants that a rod keeps of them.
-"""
+"""What acts on rods: threads through them, and forces where they touch something."""
 
 import math
 from collections.abc import Sequence

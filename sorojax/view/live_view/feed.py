@@ -5,8 +5,6 @@ viewer that is slow, hung or gone costs it nothing. When the process that feeds 
 whatever way, the viewer ends too.
 
 A place in shared memory where the latest frame wins: writing never waits.
-
-A live view in viser (extra `live`): orbit, pick, and add to its scene.
 """
 
 import contextlib

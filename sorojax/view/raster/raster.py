@@ -1,9 +1,5 @@
 """Which triangle every pixel sees: a depth buffer over spans of rows, in NumPy.
 
-Parts of a scene as loose triangles in pixels, ready for the depth buffer.
-
-What a pixel looks like: the colour of the triangle that it sees, light, lines of cells.
-
 A solid scene as a picture with smooth edges; NumPy alone.
 
 Which triangle is seen is found for every sample of every pixel. Light is dear and changes

@@ -2,8 +2,6 @@
 
 Verbs that know the nouns of other floors make a `Scene`; `plane` draws it with matplotlib,
 `solid` shades it in space.
-
-Values with their unit, and the unit that makes their numbers short.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,4 @@
-"""Solid scenes in a figure: the shaded picture, its colour bar, scale, axes and names.
-
-Solid scenes by pyvista, through the same lens as the own renderer.
-"""
+"""Solid scenes in a figure: the shaded picture, its colour bar, scale, axes and names."""
 
 import importlib
 import warnings

@@ -2,8 +2,6 @@
 
 Between two stations of a rod the strain is taken as constant, so that a section lies at
 `pose exp(fraction twist)`: exact for constant strain, second order in the distance otherwise.
-
-Which section of which part carries a point.
 """
 
 import functools

@@ -1,7 +1,4 @@
-"""Pages that show moving surfaces in any browser: one file, offline, no library inside.
-
-Actors as an animated GLB file.
-"""
+"""Pages that show moving surfaces in any browser: one file, offline, no library inside."""
 
 import html
 import json
