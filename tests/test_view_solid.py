@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sorojax.view import Camera, between, orbit
-from sorojax.view.raster import glyphs, raster as S, raster as soup, solid
+from sorojax.view.raster import glyphs, raster as S, solid
 from sorojax.view.raster.camera import box_corners, camera_at, fit
 from sorojax.view.raster.raster import barycentric, rasterise
 from sorojax.view.raster.scene import Arrows, Dots, Lines, Scale, Scene, Surface
@@ -180,8 +180,8 @@ def test_light_by_pixel_is_as_good_as_light_by_sample(opacity, monkeypatch):
         Scale("x", 0.0, 1.0),
     )  # fmt: skip
     lit = []
-    true = S._shade_colours
-    monkeypatch.setattr(S, "_shade_colours", lambda *a: lit.append(len(a[1])) or true(*a))
+    true = S._lit_colours
+    monkeypatch.setattr(S, "_lit_colours", lambda *a: lit.append(len(a[1])) or true(*a))
     quick, _ = picture(scene, "iso", (160, 160))
     assert sum(lit) < 0.7 * 4 * 160**2
     monkeypatch.setattr(S, "_rough", lambda *_: np.ones((160, 160), bool))
@@ -191,7 +191,7 @@ def test_light_by_pixel_is_as_good_as_light_by_sample(opacity, monkeypatch):
 
 def test_normals_are_smooth_but_across_edges():
     points, triangles = glyphs.ball_triangles(np.zeros((1, 3)), 1.0, corners=24)
-    normals = soup.corner_normals(points, triangles)
+    normals = S.corner_normals(points, triangles)
     out = np.einsum("nci,nci->nc", normals, points[triangles])
     area = np.linalg.norm(np.cross(*(points[triangles[:, k]] - points[triangles[:, 0]]
                                      for k in (1, 2))), axis=1)  # fmt: skip
@@ -200,7 +200,7 @@ def test_normals_are_smooth_but_across_edges():
     centres = np.array([[0.0, 0, 0], [3, 0, 0]])
     across = np.broadcast_to(np.eye(3)[1:], (2, 2, 3))
     bar = glyphs.tube(centres, across, np.broadcast_to(square, (2, 4, 2)))
-    flat = soup.corner_normals(*bar)
+    flat = S.corner_normals(*bar)
     assert np.allclose(np.abs(flat).max(axis=2), 1.0)  # each along one axis
 
 

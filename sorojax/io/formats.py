@@ -14,23 +14,22 @@ import numpy as np
 
 from sorojax.sdf import Curve, Surface
 
-_THREEMF_HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n'
-_THREEMF_TYPES = (
-    _THREEMF_HEAD
-    + '<Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types">'
+_XML_HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n'
+_CONTENT_TYPES = (
+    _XML_HEAD + '<Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types">'
     '<Default Extension="rels" '
     'ContentType="application/vnd.openxmlformats-package.relationships+xml"/>'
     '<Default Extension="model" '
     'ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/></Types>'
 )
 _LINKS = (
-    _THREEMF_HEAD
+    _XML_HEAD
     + '<Relationships xmlns="http://schemas.openxmlformats.org/package/2006/relationships">'
     '<Relationship Target="/3D/3dmodel.model" Id="rel0" '
     'Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relationships>'
 )
 _MODEL = (
-    _THREEMF_HEAD + '<model unit="millimeter" xml:lang="en-US" '
+    _XML_HEAD + '<model unit="millimeter" xml:lang="en-US" '
     'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"><resources>'
     '<object id="1" type="model"><mesh>\n<vertices>\n'
 )
@@ -42,7 +41,7 @@ _TAIL = (
 def write_threemf(file: BinaryIO, surface: Surface) -> None:
     """The package, in millimetres."""
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as package:
-        package.writestr("[Content_Types].xml", _THREEMF_TYPES)
+        package.writestr("[Content_Types].xml", _CONTENT_TYPES)
         package.writestr("_rels/.rels", _LINKS)
         with package.open("3D/3dmodel.model", "w", force_zip64=True) as raw:
             model = io.BufferedWriter(raw, 1 << 20)  # type: ignore[arg-type]
@@ -348,7 +347,7 @@ def read_ply(data: bytes, where: str, unit: float) -> Surface:
     order, elements = _header(data[:end].decode("ascii", "replace"), where)
     body = data[start:]
     if order is None:
-        return _ply_read_text(body, elements, where, unit)
+        return _read_ply_text(body, elements, where, unit)
     points = faces = None
     offset = 0
     for element in elements:
@@ -415,7 +414,7 @@ def _record(element: _Element, order: str, where: str) -> np.dtype:
     return np.dtype(fields)
 
 
-def _ply_read_text(body: bytes, elements: list[_Element], where: str, unit: float) -> Surface:
+def _read_ply_text(body: bytes, elements: list[_Element], where: str, unit: float) -> Surface:
     lines = body.split(b"\n")
     tables, row = {}, 0
     for element in elements:

@@ -72,7 +72,7 @@ def read(content: bytes, max_bytes: int) -> Arrays:
             if len(set(names)) < len(names):
                 raise Damaged("two entries have one name")
             return {
-                name: __archive_array(archive.read(entry))
+                name: _array_of(archive.read(entry))
                 for name, entry in zip(names, entries, strict=True)
             }
     except (Damaged, TooLarge):
@@ -81,7 +81,7 @@ def read(content: bytes, max_bytes: int) -> Arrays:
         raise Damaged(str(error) or type(error).__name__) from error
 
 
-def __archive_array(data: bytes) -> np.ndarray:
+def _array_of(data: bytes) -> np.ndarray:
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
     if version not in _HEADERS:

@@ -10,17 +10,12 @@ import numpy as np
 from sorojax import _check
 from sorojax.io import (
     _files,
-    formats as glb,
-    formats as obj,
-    formats as ply,
-    formats as stl,
-    formats as svg,
-    formats as threemf,
+    formats,
 )
 from sorojax.sdf import Curve, Surface
 from sorojax.units import mm
 
-_READERS = {".stl": stl.read_stl, ".obj": obj.read_obj, ".ply": ply.read_ply}
+_READERS = {".stl": formats.read_stl, ".obj": formats.read_obj, ".ply": formats.read_ply}
 _SMALLEST, _LARGEST = 1e-3, 100.0  # m, of a part whose unit is not given
 _WRITTEN = (".stl", ".obj", ".ply", ".3mf", ".glb")
 
@@ -57,12 +52,12 @@ def export_surface(
     _check.positive(where, "unit", unit, "m", "Write unit=sorojax.units.mm.")
     writers = {
         ".stl": functools.partial(
-            stl.write_stl_text if text else stl.write_stl, scale=1 / unit
+            formats.write_stl_text if text else formats.write_stl, scale=1 / unit
         ),
-        ".obj": functools.partial(obj.write_obj, scale=1 / unit),
-        ".ply": functools.partial(ply.write_ply, scale=1 / unit, text=text),
-        ".3mf": threemf.write_threemf,
-        ".glb": glb.write_glb,
+        ".obj": functools.partial(formats.write_obj, scale=1 / unit),
+        ".ply": functools.partial(formats.write_ply, scale=1 / unit, text=text),
+        ".3mf": formats.write_threemf,
+        ".glb": formats.write_glb,
     }
     _files.write(file, lambda stream: writers[kind](stream, surface=checked))
     return file
@@ -84,7 +79,7 @@ def export_contour(
         )
     for curve in curves:
         _check.finite(where, "curves", curve.points, "Check the parameters of the shape.")
-    _files.write(file, lambda stream: svg.write_svg(stream, curves))
+    _files.write(file, lambda stream: formats.write_svg(stream, curves))
 
 
 def import_surface(

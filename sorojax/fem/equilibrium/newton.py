@@ -136,7 +136,7 @@ class Secants:
 # Shortening Newton steps that run past the place where a contact or friction gives way
 
 
-_LINE_SEARCH_MOST = (
+_MOST_CHANGE = (
     1.1  # change of the slope, over what the whole energy needs, that a step may bring
 )
 _LEAST = 0.4  # and that a shortened one brings
@@ -211,7 +211,7 @@ def _searched(slope: Callable[[Array], Array], looks: Array, fall: Array) -> Flo
         slopes = jnp.where(looking, search.slopes.at[at].set(here), search.slopes)
         found = next_._replace(change=(here - slopes[0]) / fall)
         looked = search._replace(slopes=slopes)
-        met = jnp.argmax(changes(looked) > _LINE_SEARCH_MOST)
+        met = jnp.argmax(changes(looked) > _MOST_CHANGE)
         share, change = looks[1:][met], changes(looked)[met]
         looked = looked._replace(high=share, above=change, share=share, change=change)
         found = jax.tree.map(lambda a, b: jnp.where(looking, a, b), looked, found)
@@ -219,10 +219,10 @@ def _searched(slope: Callable[[Array], Array], looks: Array, fall: Array) -> Flo
 
     def unfit(search: _Search):
         # where the residual does not fall along the step there is nothing to go by
-        return (fall > 0) & jnp.any(changes(search) > _LINE_SEARCH_MOST)
+        return (fall > 0) & jnp.any(changes(search) > _MOST_CHANGE)
 
     def running(search: _Search):
-        fits = (search.change >= _LEAST) & (search.change <= _LINE_SEARCH_MOST)
+        fits = (search.change >= _LEAST) & (search.change <= _MOST_CHANGE)
         wide = search.high - search.low > 1e-12 * search.high
         trying = unfit(search) & ~fits & (search.count < num + _TRIALS) & wide
         return (search.count < num) | trying
@@ -235,7 +235,7 @@ def _searched(slope: Callable[[Array], Array], looks: Array, fall: Array) -> Flo
 
 def _next(search: _Search, trials: Array) -> _Search:
     """The interval with the last trial as one of its ends, and where to try next."""
-    far = search.change > _LINE_SEARCH_MOST
+    far = search.change > _MOST_CHANGE
     low = jnp.where(far, search.low, search.share)
     high = jnp.where(far, search.share, search.high)
     below = jnp.where(far, search.below, search.change)

@@ -24,9 +24,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sorojax.math.linalg import (
-    host_solvers as banded,
-    host_solvers as pardiso,
-    host_solvers as superlu,
+    host_solvers,
 )
 from sorojax.math.linalg.conjugate_gradient import Iterative, IterativeBackend, IterativeFactor
 
@@ -111,14 +109,19 @@ class SymmetricProduct:
 
 
 _NUM_FACTORS = 4
-Factor = pardiso.PardisoFactor | superlu.SuperLUFactor | banded.BandedFactor | IterativeFactor
+Factor = (
+    host_solvers.PardisoFactor
+    | host_solvers.SuperLUFactor
+    | host_solvers.BandedFactor
+    | IterativeFactor
+)
 
 
 def available_solvers() -> dict[str, str]:
     """Direct solvers found on this machine, best first, with their versions."""
     import scipy
 
-    mkl = pardiso.version()
+    mkl = host_solvers.version()
     found = {"pardiso": f"MKL {mkl}"} if mkl else {}
     return found | {"superlu": f"SciPy {scipy.__version__}"}
 
@@ -130,11 +133,11 @@ def _backend():
             f"SOROJAX_SOLVER is {asked!r}, need 'pardiso' or 'superlu'. Unset it for the "
             "best solver found."
         )
-    if asked != "superlu" and pardiso.library() is not None:
-        return pardiso.Pardiso
+    if asked != "superlu" and host_solvers.library() is not None:
+        return host_solvers.Pardiso
     if asked == "pardiso":
         raise ValueError("SOROJAX_SOLVER is 'pardiso': install sorojax[pardiso] first.")
-    return superlu.SuperLU
+    return host_solvers.SuperLU
 
 
 class DirectSolver:
@@ -282,10 +285,10 @@ def direct_solver_of(key, rows, cols, owned: bool = False) -> DirectSolver:
     def analysed(starts, cols):
         general = _backend()(starts, cols, _NUM_FACTORS)
         asked = os.environ.get("SOROJAX_SOLVER")
-        order = None if asked else banded.narrow_order(starts, cols)
+        order = None if asked else host_solvers.narrow_order(starts, cols)
         if order is None:
             return general
-        return banded.Banded(general, order, starts, cols, _NUM_FACTORS)
+        return host_solvers.Banded(general, order, starts, cols, _NUM_FACTORS)
 
     return solver_of(key, rows, cols, analysed, owned)
 

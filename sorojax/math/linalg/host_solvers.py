@@ -315,7 +315,7 @@ def _factor(lower: Float[np.ndarray, "size band"]) -> bool:
         return info == 0
     info = ctypes.c_int(0)
     mkl.dpbtrf(
-        b"L", _number(size), _number(width - 1), _banded_pointer(lower), _number(width),
+        b"L", _number(size), _number(width - 1), _pointer(lower), _number(width),
         ctypes.byref(info),
     )  # fmt: skip
     return info.value == 0
@@ -332,10 +332,6 @@ def _solve(lower: Float[np.ndarray, "size band"], b: np.ndarray) -> None:
         rows[:] = dpbtrs(lower.T, rows.T, lower=1)[0].T
         return
     mkl.dpbtrs(
-        b"L", _number(size), _number(width - 1), _number(len(rows)), _banded_pointer(lower),
-        _number(width), _banded_pointer(rows), _number(size), ctypes.byref(ctypes.c_int(0)),
+        b"L", _number(size), _number(width - 1), _number(len(rows)), _pointer(lower),
+        _number(width), _pointer(rows), _number(size), ctypes.byref(ctypes.c_int(0)),
     )  # fmt: skip
-
-
-def _banded_pointer(array: np.ndarray):
-    return ctypes.c_void_p(array.ctypes.data)

@@ -129,7 +129,7 @@ def _sum(weights, moves) -> Any:
 # Fixed steps of stiff systems at the price of two slopes and one small product each
 
 
-_LINEARLY_IMPLICIT_GAMMA = 1 - 2**-0.5
+_GAMMA_OF_ORDER_2 = 1 - 2**-0.5
 
 
 class Rosenbrock2(AbstractMethod):
@@ -160,7 +160,7 @@ class Rosenbrock2(AbstractMethod):
         flat, unravel = ravel_pytree(y)
         jacobian = jax.jacfwd(lambda x: ravel_pytree(field(t, unravel(x)))[0])(flat)
         eye = jnp.eye(flat.shape[0], dtype=flat.dtype)
-        return jnp.linalg.inv(eye - _LINEARLY_IMPLICIT_GAMMA * h * jacobian)
+        return jnp.linalg.inv(eye - _GAMMA_OF_ORDER_2 * h * jacobian)
 
     def advance(self, field, t, y, h, memory):
         flat, unravel = ravel_pytree(y)

@@ -299,7 +299,7 @@ def plan_surface(mesh: Mesh, num_interfaces: int) -> Border:
     known = _marked(mesh)
     sides = surface_sides(points, faces, owner, known)
     allowed = _most_sides(mesh, faces, owner, known)
-    corners, ridge, tangent, chamfers = _surface_plan_sharp_nodes(points, faces, sides, allowed)
+    corners, ridge, tangent, chamfers = _sharp_nodes_of_surface(points, faces, sides, allowed)
     bent = _curved(points, faces, middles)
     on_ridge = bent & sides.sharp[sides.number]
     if bent.any():
@@ -346,7 +346,7 @@ def _most_sides(mesh: Mesh, faces, owner, known: np.ndarray | None) -> np.ndarra
     return most
 
 
-def _surface_plan_sharp_nodes(points, faces, sides: Sides, allowed: np.ndarray):
+def _sharp_nodes_of_surface(points, faces, sides: Sides, allowed: np.ndarray):
     """Corners, ridge nodes, the direction in which sharp nodes see no side, and the patches
     that are none of the `allowed` number of sides of their node."""
     n = len(points)

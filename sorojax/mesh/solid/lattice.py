@@ -276,7 +276,7 @@ def radius_ratios(x: np.ndarray) -> np.ndarray:
 # A lattice of tetrahedra graded by bisection of longest edges
 
 
-_BISECT_EDGES = np.array(((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)))
+_TET_EDGES = np.array(((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)))
 _COARSE = 1.12  # pitch of a cell over the wanted one: a bisection takes it to 0.9
 _UNIT = 2**12  # steps per cube: lengths are compared as whole numbers
 _MOST_CELLS = 10_000_000
@@ -323,7 +323,7 @@ class _Parts:
         return self.start + self.step * self.at
 
     def _keys(self, cells: np.ndarray) -> np.ndarray:
-        pairs = np.sort(cells[:, _BISECT_EDGES], axis=2)
+        pairs = np.sort(cells[:, _TET_EDGES], axis=2)
         return pairs[..., 0] << 32 | pairs[..., 1]
 
     def pitches(self) -> np.ndarray:
@@ -344,7 +344,7 @@ class _Parts:
     def bisect(self, split: np.ndarray) -> None:
         cells, rows = self.cells[split], np.arange(int(split.sum()))
         keys, x = self._keys(cells), self.at[cells]
-        gap = x[:, _BISECT_EDGES[:, 0]] - x[:, _BISECT_EDGES[:, 1]]
+        gap = x[:, _TET_EDGES[:, 0]] - x[:, _TET_EDGES[:, 1]]
         square = (gap * gap).sum(axis=2)
         # Of edges of one length the same is taken from every side.
         longest = np.where(square == square.max(axis=1, keepdims=True), keys, -1).argmax(axis=1)
@@ -360,7 +360,7 @@ class _Parts:
         self.ends, self.middle = ends[order], middle[order]
         node = self.middle[np.searchsorted(self.ends, own)]
         halves = [cells.copy(), cells.copy()]
-        for half, end in zip(halves, _BISECT_EDGES[longest].T, strict=True):
+        for half, end in zip(halves, _TET_EDGES[longest].T, strict=True):
             half[rows, end] = node
         self.cells = np.concatenate([self.cells[~split], *halves])
         self._drop()

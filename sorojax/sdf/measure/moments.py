@@ -172,13 +172,13 @@ def volume(shape: AbstractSdf, resolution: int = 128) -> Float[Array, ""]:
     Reference:
         Min and Gibou 2007, Geometric integration over irregular domains, for the cut cells.
     """
-    rule = _solid_measure_rule("volume", shape, resolution, 0)
+    rule = _solid_rule("volume", shape, resolution, 0)
     return frame(shape, rule.resolution)[1] ** 3 * moments(shape, rule)[0]
 
 
 def solid_centroid(shape: AbstractSdf, resolution: int = 128) -> Float[Array, "3"]:
     """Centroid [m] of a solid shape, differentiable as `volume` is."""
-    rule = _solid_measure_rule("centroid", shape, resolution, 1)
+    rule = _solid_rule("centroid", shape, resolution, 1)
     m = moments(shape, rule)
     return middle_of_mass(m, *frame(shape, rule.resolution))
 
@@ -201,7 +201,7 @@ def inertia_tensor(
         density: Mass per volume [kg/m^3].
         resolution: Cells along the longest side of its bounding box.
     """
-    rule = _solid_measure_rule("inertia_tensor", shape, resolution, 2)
+    rule = _solid_rule("inertia_tensor", shape, resolution, 2)
     size = frame(shape, rule.resolution)[1]
     return real(density) * _inertia(moments(shape, rule), size)
 
@@ -216,7 +216,7 @@ def _inertia(m: Float[Array, "10"], size: Float[Array, ""]) -> Float[Array, "3 3
     return size**5 * (jnp.trace(second) * identity - second)
 
 
-def _solid_measure_rule(where: str, shape: AbstractSdf, resolution: int, order: int) -> Rule:
+def _solid_rule(where: str, shape: AbstractSdf, resolution: int, order: int) -> Rule:
     if shape.dim != 3:
         raise ValueError(
             f"{where}: the shape is {shape.dim}-D, need 3-D. Use sdf.area, sdf.centroid and "

@@ -122,7 +122,7 @@ def _places(corners: np.ndarray, area: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 _MOST = 1000  # pairs that are listed
-_TRIANGLE_PAIRS_PIECE = 20_000
+_PAIRS_AT_ONCE = 20_000
 
 
 def _circles(vertices, triangles) -> tuple[np.ndarray, np.ndarray]:
@@ -147,8 +147,8 @@ def crossing_triangles(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarra
         own = np.flatnonzero(rank == size)
         small = np.flatnonzero(rank <= size)
         tree = KDTree(centers[small])
-        for start in range(0, len(own), _TRIANGLE_PAIRS_PIECE):
-            rows = own[start : start + _TRIANGLE_PAIRS_PIECE]
+        for start in range(0, len(own), _PAIRS_AT_ONCE):
+            rows = own[start : start + _PAIRS_AT_ONCE]
             lists = tree.query_ball_point(centers[rows], reach[rows] + 2.0 ** float(size))
             first = np.repeat(rows, [len(x) for x in lists])
             second = small[np.concatenate([np.asarray(x, int) for x in lists])]

@@ -69,7 +69,7 @@ def modal_basis(
     mass = body.matter().mass
     chosen = _orthonormal(problem.space.system, mass, np.asarray(first))
     if bending:
-        more = _modal_basis_derivatives(problem, u, jnp.asarray(chosen).reshape(-1, *u.shape))
+        more = _shape_derivatives(problem, u, jnp.asarray(chosen).reshape(-1, *u.shape))
         chosen = _orthonormal(
             problem.space.system, mass, np.concatenate([chosen, np.asarray(more)])
         )
@@ -105,7 +105,7 @@ def _answers(body: FemBody, u) -> Float[Array, "loads nodes dim"]:
     return found.reshape(-1, *u.shape)
 
 
-def _modal_basis_derivatives(problem: fem.Problem, u, shapes) -> Float[Array, "pairs dofs"]:
+def _shape_derivatives(problem: fem.Problem, u, shapes) -> Float[Array, "pairs dofs"]:
     """How each shape changes, in equilibrium, on the way along another."""
     first, second = np.triu_indices(shapes.shape[0])
 

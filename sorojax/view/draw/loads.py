@@ -19,7 +19,7 @@ from sorojax.view.raster.scene import Arrows, Dots, Lines, Part, Surface, short
 
 _SWING = np.array([0.0, 0, 1, -1, 1, -1, 1, -1, 0, 0])
 _ALONG = np.concatenate([[0.0], np.linspace(0.2, 0.8, 8), [1.0]])
-_MARKS_TURN = 1.5 * np.pi  # rad, of an arc
+_ARC = 1.5 * np.pi  # rad, of an arc
 
 
 def coil(
@@ -46,9 +46,9 @@ def turning(
         along = np.asarray(axis) / np.linalg.norm(axis)
         first = across(along)
         second = np.cross(along, first)
-    angle = np.linspace(0.0, _MARKS_TURN, 49)
+    angle = np.linspace(0.0, _ARC, 49)
     arc = centre + radius * (np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second))
-    ahead = np.cos(_MARKS_TURN) * second - np.sin(_MARKS_TURN) * first
+    ahead = np.cos(_ARC) * second - np.sin(_ARC) * first
     head = Arrows(arc[-1:], 0.45 * radius * ahead[None], colour)
     return [Lines([arc], colour, 1.6, name=name), head]
 

@@ -474,7 +474,7 @@ def shade(
     layers = _layers(scene, fine, points)
 
     def lit(at: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-        return _shade_colours(layers, at, scene, fine, points, samples)
+        return _lit_colours(layers, at, scene, fine, points, samples)
 
     row = width * samples * np.arange(samples)
     within = (row[:, None] + np.arange(samples)).ravel()
@@ -507,7 +507,7 @@ def _layers(scene: Scene, lens: Lens, points: float) -> list[_Layer]:
     return layers
 
 
-def _shade_colours(layers, at, scene: Scene, lens: Lens, points: float, samples: int):
+def _lit_colours(layers, at, scene: Scene, lens: Lens, points: float, samples: int):
     """Red, green and blue of the samples `at`: every layer over the one below."""
     colours = np.ones((len(at), 3), np.float32)
     for soup, seen, edge, opacity in layers:
