@@ -141,7 +141,7 @@ def test_balance_past_the_critical_load_is_called_unstable_unless_the_load_follo
         path = R.equilibrium_path(rod, lambda f: (loads[0],), jnp.ones(2), begin=1.0)
         return [R.equilibrium(rod, (load,)).status for load in loads], path.status
 
-    (dead, following), path = ends(jnp.array(3.0))
+    (dead, following), path = ends(jnp.array(6.0))
     assert dead == Status.unstable_equilibrium and following == Status.successful
     assert str(path) == "Status(unstable_equilibrium: 2)"
     (dead, following), path = ends(jnp.array(0.9))
