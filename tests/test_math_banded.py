@@ -79,6 +79,6 @@ def test_a_solver_that_was_asked_for_is_used(monkeypatch):
     monkeypatch.setenv("SOROJAX_SOLVER", "superlu")
     given = system(9, 2)
     values = values_of(given, 30.0)
-    assert isinstance(given.solver.factor(values), direct.superlu.SuperLUFactor)
+    assert isinstance(given.solver.factor(values), banded.SuperLUFactor)
     x = sparse.solve(given, jnp.asarray(values), jnp.ones(given.size))
     np.testing.assert_allclose(dense(given, values) @ np.asarray(x), 1.0, rtol=1e-10)
