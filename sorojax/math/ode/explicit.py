@@ -68,6 +68,12 @@ class AbstractMethod(dfx.AbstractSolver):
         Such a method answers for its own failures: what it yields is finite."""
         return False
 
+    @property
+    def takes_vector(self) -> bool:
+        """Whether the state of a run may come as one vector, which makes fewer and larger
+        kernels: not to a method that looks at the names within it."""
+        return not self.carries
+
     def order(self, terms) -> int:
         return self.num_order
 
@@ -271,6 +277,10 @@ class SemiImplicitEuler(AbstractMethod):
     positions: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=("q",))
     num_order: ClassVar[int] = 1
     interpolation_cls: ClassVar = dfx.LocalLinearInterpolation
+
+    @property
+    def takes_vector(self) -> bool:
+        return False
 
     def begin(self, field, t, y, h):
         return ()

@@ -1,11 +1,12 @@
 """Fixed steps of one block between instants: runs whose cost is known beforehand."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from sorojax.math.host import tell
@@ -24,6 +25,9 @@ from sorojax.math.status import Status
 from sorojax.systems.blocks.block import AbstractBlock
 from sorojax.systems.integrate.integrate import Motion, explicit_inputs
 from sorojax.systems.network import at_time
+
+#: Makes a tree of a state that is one vector; None where it is a tree.
+Unravel = Callable[[Array], PyTree] | None
 
 
 def fixed(
@@ -44,7 +48,8 @@ def fixed(
     count = time.shape[0] - 1
     judged = judged and not method.carries
     parts = rows_between(count, substeps, judged)
-    move, short = interval_of(substeps // parts), interval / parts
+    state, unravel = as_vector(method, state)
+    move, short = interval_of(substeps // parts, unravel), interval / parts
     if memory is None:
         memory = move.begin((method, block, inputs, time[0], state), short)
     plan = passes(count * parts, substeps * count, judged)
@@ -72,15 +77,23 @@ def fixed(
     )  # fmt: skip
     run, states = jax.lax.scan(advance, Doubled.at(start), made)
     end = run.now
-    path = after_start(state, whole_rows(plan, states))
+    path = as_trees(unravel, after_start(state, whole_rows(plan, states)))
+    states = as_trees(unravel, states)
     too_long = rows_too_long(plan, positions(path), positions(states))
     path = jax.tree.map(lambda a: a[::parts], path)
     steps = jnp.asarray(substeps * count)
     none = jnp.zeros(0, bool)
     return Motion(
-        path, end.state, end.reached, judged_status(end.status, too_long), steps,
-        jnp.zeros_like(steps), none, None, end.memory,
-    )  # fmt: skip
+        path,
+        as_tree(unravel, end.state),
+        end.reached,
+        judged_status(end.status, too_long),
+        steps,
+        jnp.zeros_like(steps),
+        none,
+        None,
+        end.memory,
+    )
 
 
 class Walk(NamedTuple):
@@ -114,27 +127,50 @@ class Walk(NamedTuple):
         return Status.where(self.good, Status.successful, failed)
 
 
+def as_vector(method: AbstractMethod, state: PyTree) -> tuple[PyTree, Unravel]:
+    """The state as `method` takes it in a run, and what makes it a tree again."""
+    if method.takes_vector and jax.tree.leaves(state):
+        return ravel_pytree(state)
+    return state, None
+
+
+def as_tree(unravel: Unravel, state: PyTree) -> PyTree:
+    """A state that `as_vector` gave as the tree that it was."""
+    return state if unravel is None else unravel(state)
+
+
+def as_trees(unravel: Unravel, states: PyTree) -> PyTree:
+    """The same of states with a leading axis of time."""
+    return states if unravel is None else jax.vmap(unravel)(states)
+
+
 class Rate(eqx.Module):
-    """The rate of a block under inputs, for methods that may look at the block."""
+    """The rate of a block under inputs, for methods that may look at the block; of a state
+    that is one vector if there is an `unravel`."""
 
     block: AbstractBlock
     inputs: Mapping[str, Any]
+    unravel: Unravel = eqx.field(static=True, default=None)
 
     def __call__(self, t, state):
-        return self.block.vector_field(t, state, at_time(self.inputs, t))
+        tree = as_tree(self.unravel, state)
+        rate = self.block.vector_field(t, tree, at_time(self.inputs, t))
+        return rate if self.unravel is None else ravel_pytree(rate)[0]
 
 
 class interval_of(eqx.Module):
     """Moves a state by a number of steps that share an interval."""
 
     substeps: int = eqx.field(static=True)
+    unravel: Unravel = eqx.field(static=True, default=None)
 
     def begin(self, given, interval):
         """What the method keeps or carries through the whole run, if it does."""
         method, block, inputs, t, state = given
         if not (method.keeps or method.carries):
             return None
-        return method.begin(Rate(block, inputs), t, state, interval / self.substeps)
+        rate = Rate(block, inputs, self.unravel)
+        return method.begin(rate, t, state, interval / self.substeps)
 
     def taken(self, given, interval) -> tuple[PyTree, Any, Array]:
         """State, memory and whether all went well, with derivatives wherever it ends."""
@@ -147,4 +183,5 @@ class interval_of(eqx.Module):
     def __call__(self, given, interval):
         method, block, inputs, t, state, memory = given
         h = interval / self.substeps
-        return repeated(method, Rate(block, inputs), t, state, h, self.substeps, memory)
+        rate = Rate(block, inputs, self.unravel)
+        return repeated(method, rate, t, state, h, self.substeps, memory)

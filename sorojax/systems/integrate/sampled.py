@@ -22,7 +22,7 @@ from sorojax.math.ode.step_control import (
     whole_rows,
 )
 from sorojax.systems.integrate.integrate import explicit_inputs
-from sorojax.systems.integrate.march import Walk, interval_of
+from sorojax.systems.integrate.march import Walk, as_tree, as_trees, as_vector, interval_of
 from sorojax.systems.integrate.simulate import (
     Trajectory,
     default_method,
@@ -122,13 +122,14 @@ def simulate_sampled(
 @eqx.filter_jit
 def _run(network, loops, state, before, inputs, period, first, settings) -> Trajectory:
     (ticks, substeps, method, progress), (memories, held, kept) = settings, before
-    move = interval_of(substeps)
     state = network.initial_state() if state is None else state
+    state, unravel = as_vector(method, state)
+    move = interval_of(substeps, unravel)
     inputs = explicit_inputs(inputs, period)
     time = period * (first + jnp.arange(ticks + 1, dtype=jnp.int32)).astype(period.dtype)
 
     def signals(t, state, held):
-        return outputs(network, t, state, {**at_time(inputs, t), **held})
+        return outputs(network, t, as_tree(unravel, state), {**at_time(inputs, t), **held})
 
     def call(tick, t, state, memories, held):
         seen = signals(t, state, held)
@@ -180,6 +181,7 @@ def _run(network, loops, state, before, inputs, period, first, settings) -> Traj
     ended = run.now
     good, reached = finite((states, values)) & ended.good, jnp.minimum(ended.reached, time[-1])
     path = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), states, ended.state)
+    states, path, ends = (as_trees(unravel, of) for of in (states, path, ends))
     too_long = rows_too_long(plan, positions(path), positions(ends))
     status = judged_status(ended._replace(good=good).status, too_long)
     status = within_model(network, status, states)
