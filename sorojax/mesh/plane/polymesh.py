@@ -335,22 +335,37 @@ def polymesher(
     iterations: int = 60,
     on_step: Callable[[int, float], None] | None = None,
 ) -> Mesh:
-    """About `count` convex polygons that fill a plane shape.
+    """About `count` convex polygons that fill a plane shape: an even Voronoi diagram.
 
-    Cells of curved boundaries end in chords, one per cell; cells are split at re-entrant
-    corners, at holes inside them, and where a thin gap divides them, so the mesh may
-    have more than `count`. Node set "corners", facet set "boundary".
+    Lloyd's method moves seeds to the centroids of their cells. Cells of curved boundaries end
+    in chords, one per cell; cells are split at re-entrant corners, at holes inside them, and
+    where a thin gap divides them, so the mesh may have more than `count`. Node set "corners",
+    facet set "boundary".
 
     Args:
         shape: A concrete, bounded plane shape.
-        count: Number of Voronoi seeds.
+        count: Number of Voronoi seeds, 2 or more.
         key: Random key of the first seeds.
         iterations: Most steps of Lloyd's method.
         on_step: Called with the number of each step and its Lloyd error: the shift of
-            the seeds over the size of a cell, weighted by area.
+            the seeds over the size of a cell, weighted by area. Nothing is called by default.
+
+    Returns:
+        The mesh, points [m].
 
     Raises:
-        ValueError: If the shape is empty, unbounded or traced, or `count` is below 2.
+        ValueError: If the shape is not plane, empty, unbounded or traced, or `count` is below
+            2.
+
+    Example:
+        >>> plate = sdf.Rectangle([0, 0], [40 * mm, 10 * mm])
+        >>> cells = mesh.polymesher(plate, 8, key=jax.random.key(0), iterations=5)
+        >>> cells.num_cells
+        8
+
+    Reference:
+        Talischi, Paulino, Pereira and Menezes, PolyMesher: a general-purpose mesh generator for
+        polygonal elements written in Matlab, Struct. Multidisc. Optim. 45, 2012.
     """
     if count < 2:
         raise ValueError(f"polymesher: `count` is {count}, need at least 2 cells.")
