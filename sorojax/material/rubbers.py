@@ -170,15 +170,30 @@ def locking_stretch(gent: Gent) -> Float[Array, "..."]:
 def neo_hookean(
     *, young_modulus: float, poisson_ratio: float, density: float | None = None
 ) -> NeoHookean:
-    """A `NeoHookean` from engineering constants.
+    """A neo-Hookean rubber from the two constants of small strains.
+
+    W = mu/2 (I1_bar - 3) + K (J - 1)^2 / 2 with mu = E / (2 (1 + nu)) and
+    K = E / (3 (1 - 2 nu)), the isochoric invariant I1_bar = J^(-2/3) tr F'F.
 
     Args:
-        young_modulus: Small-strain modulus [Pa].
-        poisson_ratio: Small-strain ratio, below 0.5.
-        density: Mass per reference volume [kg/m^3].
+        young_modulus: Young's modulus E of small strains [Pa], positive.
+        poisson_ratio: Poisson's ratio nu of small strains [-], in (-1, 0.5).
+        density: Mass per reference volume [kg/m^3]; None where no weight or inertia is needed.
+
+    Returns:
+        The material.
 
     Raises:
         ValueError: If a number is out of range.
+
+    Example:
+        >>> rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45)
+        >>> print(f"{float(rubber.shear_modulus) / kPa:.1f} kPa")
+        344.8 kPa
+
+    Reference:
+        Bonet and Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2008,
+        section 6.4.
     """
     _check.positive("neo_hookean", "young_modulus", young_modulus, "Pa", checks.MODULUS)
     checks.poisson_ratio("neo_hookean", poisson_ratio)
