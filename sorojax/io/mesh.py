@@ -245,12 +245,21 @@ def export_mesh(
     Args:
         path: File name; its ending gives the format.
         mesh: The mesh; plane ones get z = 0 where a format has no plane.
-        unit: What 1 in the file means [m].
-        root: Folder that the file must lie in, links followed.
+        unit: What 1 in the file means [m]; a metre by default.
+        root: Folder that the file must lie in, links followed; any by default.
+
+    Returns:
+        None.
 
     Raises:
         ValueError: If the format is unknown or cannot hold the cells, or the path leaves
             `root`.
+
+    Example:
+        >>> plate = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1))
+        >>> io.export_mesh("plate.vtu", plate, unit=mm)
+        >>> io.import_mesh("plate.vtu", unit=mm).num_cells
+        8
     """
     where = "export_mesh"
     file = _files.inside(where, path, root)
