@@ -131,8 +131,8 @@ def minimise_shape(
         ...     return 1e6 * 10 * mm * mesh.cell_areas(problem.mesh).sum()
         >>> found = design.minimise_shape(
         ...     volume, jnp.array(14 * mm), lambda h: sdf.Rectangle([0, 0], [40 * mm, h]),
-        ...     build, mesher=cells, steps=6, optimiser=design.MMA(10 * mm, 15 * mm),
-        ...     constraints=(lambda problem, height: 5 - volume(problem, height),))
+        ...     build, mesher=cells, optimiser=design.MMA(10 * mm, 15 * mm), steps=6,
+        ...     constraints=(lambda problem, h: 5 - volume(problem, h),), tolerance=1e-5)
         >>> print(f"{float(found.design) / mm:.1f} mm")
         12.5 mm
     """
