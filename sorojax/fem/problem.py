@@ -1,9 +1,8 @@
-"""The boundary value problem: a noun, and the constructor that checks it.
+"""The boundary value problem, the constructor that checks it, and its total potential energy.
 
-Total potential energy in a form made for differentiation by parameters.
-
-The derivative of the residual in any leaf of the problem, forward or reverse, costs a few
-elementwise passes between two products with the shape gradients.
+The energy is written for differentiation by parameters: the derivative of the residual in any
+number of the problem, forward or reverse, costs a few elementwise passes between two products
+with the shape gradients.
 """
 
 import copy

@@ -1,6 +1,5 @@
-"""Stresses and forces of an equilibrium.
-
-Continuous stresses at the nodes by superconvergent patch recovery, and energy per cell.
+"""Stresses, forces and energies of an equilibrium; continuous stresses at the nodes by
+superconvergent patch recovery.
 
 Reference: Zienkiewicz, Zhu, "The superconvergent patch recovery and a posteriori error
 estimates, part 1", IJNME 33, 1992.

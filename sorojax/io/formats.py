@@ -1,6 +1,5 @@
-"""STL: loose triangles without a unit, binary or as text.
-
-3MF: a zipped model that states its unit.
+"""Surface formats: 3MF, GLB and SVG to write; STL, OBJ and PLY to write and read, with merged
+corners and checked indices.
 """
 
 import io

@@ -1,6 +1,5 @@
-"""Meshes to and from files of other programs, through meshio.
-
-Names of cells in files. The order of nodes is that of VTK on both sides.
+"""Meshes to and from files of other programs, through meshio. The order of nodes is that of
+VTK on both sides.
 """
 
 import contextlib

@@ -1,11 +1,8 @@
-"""States, motions and results in files: every bit back, nothing executed.
+"""States, motions and results in files: zips of plain arrays and a JSON header, bit for bit.
 
-What a saved tree is made of, as JSON: data classes of sorojax by name, and never code.
-
-A class is looked up among those that the packages below define for data: nothing is
-imported by a name from a file, no constructor runs, and functions are not written at all.
-
-Zips of plain arrays, read without trusting a byte of them.
+Nothing is executed on reading: classes are looked up among the data classes of the packages
+below, nothing is imported by a name from a file, no constructor runs, functions are not
+written at all, and every length in a file is checked before memory is taken.
 """
 
 import dataclasses

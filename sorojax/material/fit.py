@@ -1,6 +1,4 @@
-"""Hyperelastic coefficients from uniaxial tensile tests.
-
-Incompressible tensile curves of the rubbers and how each is fitted.
+"""Hyperelastic coefficients from uniaxial tensile tests, of incompressible rubbers.
 
 A curve is linear in its moduli; exponents and the locking measure are found around that
 linear problem (variable projection).

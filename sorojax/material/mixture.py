@@ -1,4 +1,4 @@
-"""Stiffer and softer, mixed, and different from region to region."""
+"""Scaled and mixed materials, and materials that differ from region to region."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,16 +1,13 @@
-"""Rubbers in the invariants of the isochoric deformation.
+"""Isotropic rubbers in the invariants of the isochoric deformation.
 
 Every energy splits as Psi = W(I1_bar, I2_bar) + K U(J) with the physical bulk modulus K;
-`volumetric` chooses U, (J - 1)^2 / 2 unless told otherwise.
-
-Sums of powers of the principal values of C, smooth where they coincide.
-
-With b half the exponent of a stretch, sum_i x_i^b over the eigenvalues x_i of the
-isochoric C is an analytic function of its invariants, although no single eigenvalue is.
-It is Cauchy's integral of z^b p'(z)/p(z) with p the characteristic polynomial, taken by
-the trapezoidal rule on an ellipse in the plane of log z. No eigenvalue is computed, all
-derivatives are finite and right, and the error falls geometrically with the nodes:
-rounding for stretches up to 10 in tension and 5 in equibiaxial tension.
+`volumetric` chooses U, (J - 1)^2 / 2 by default. `Ogden` needs sums of powers of the principal
+stretches: with b half the exponent, sum_i x_i^b over the eigenvalues x_i of the isochoric C is
+an analytic function of its invariants, although no single eigenvalue is. It is Cauchy's
+integral of z^b p'(z)/p(z) with p the characteristic polynomial, taken by the trapezoidal rule
+on an ellipse in the plane of log z. All derivatives are finite and right, also where
+eigenvalues coincide, and the error falls geometrically with the nodes: rounding for stretches
+up to 10 in tension and 5 in equibiaxial tension.
 
 Reference: Hale, Higham & Trefethen, SIAM J. Numer. Anal. 46, 2008.
 """

@@ -1,7 +1,5 @@
-"""What runs on the host beside compiled programs: progress, threads, SciPy's searches.
-
-SciPy's neighbour searches and triangulations, imported at first use: importing them costs
-as much as the rest of the package.
+"""Work on the host beside compiled programs: progress messages, threads, and SciPy's neighbour
+searches and triangulations, which are imported at first use.
 """
 
 from collections.abc import Callable

@@ -1,6 +1,6 @@
-"""The strains of a material line of a solid: what a rod in its place would feel.
+"""The strains of a material curve of a solid, as a rod in its place would have them.
 
-Strain of a row of section poses: twists from pose to pose, safe at any turn.
+Twists from section to section by the logarithm of the relative motion, safe at any angle.
 """
 
 import equinox as eqx

@@ -1,8 +1,9 @@
-r"""A rod's elastic law, pressure map and section, identified from a FEM load path.
+r"""A rod's elastic law, pressure map and section, identified from a FEM load path, and its
+damping from a motion.
 
 At every equilibrium of the path the solid answers a generalised force on the strain
 coordinates q with its condensed stiffness, one back-substitution per coordinate on the
-tangent that the solve left behind. A co-energy
+tangent. A co-energy
 
     Psi*(q, p) = g(p).q + p q'Cq / 2 + h(p) - q'Kq / 2
 
@@ -10,16 +11,13 @@ is fitted to stiffness, equilibrium and enclosed volume together: K - p C is the
 stiffness, dPsi*/dq = 0 the equilibrium, and dPsi*/dp the volume. One potential gives force
 and volume, so no energy is lost between gas and rod.
 
-The damping of a rod, identified from its motion.
-
-The equations of motion are tested with windows in time: over a window that begins and ends
-with weight zero,
+For the damping the equations of motion are tested with windows in time: over a window w that
+begins and ends with weight zero,
 
     D \int w v dt = \int (w f + w' M v) dt,
 
 where f holds all forces but damping. No acceleration of the samples is needed. D is the
-symmetric matrix that fits all windows best, one block for each strain, without the part that
-would add energy.
+symmetric positive semidefinite matrix that fits all windows best, one block for each strain.
 
 Reference:
     Messenger and Bortz, Weak SINDy for partial differential equations, J. Comput. Phys. 443,

@@ -1,10 +1,8 @@
-"""What a shape can be asked at points: slope, normal, closest point.
+"""The field of a shape and its geometry at points: gradient, normal, curvature, closest point.
 
-Fields of many points at full speed: compiled once per power of two.
-
-A field made of scalars becomes one loop per output, which reads the coordinates and
-writes the result; normals of rows, and a field that searches or holds a table per point,
-go in chunks that stay in the cache.
+Fields of many points are compiled once per power of two. A field made of scalars becomes one
+loop per output, which reads the coordinates and writes the result; normals of rows, and a
+field that searches or holds a table per point, go in chunks that stay in the cache.
 """
 
 import functools

@@ -1,16 +1,14 @@
-"""`sweep`: one function over many designs in chunks that are made once.
+"""`sweep`: one function over many designs in chunks, each computed once and kept in a folder
+under a key of all that determines it.
 
-A folder of results, each under the key of what made it, whole or not there.
-
-Where chunks run: anything with `submit(function, *args)` that returns a future.
-
-On one machine, with processes:
+Chunks run in anything with `submit(function, *args)` that returns a future. On one machine,
+with processes:
 
     from concurrent.futures import ProcessPoolExecutor
     sweep(function, designs, store, ProcessPoolExecutor(mp_context=get_context("spawn")))
 
 Workers need the precision of their driver: set JAX_ENABLE_X64=1 in the environment, which
-they inherit. JAX makes pickled arrays single in a process that has not got it.
+they inherit. JAX makes pickled arrays single precision in a process without it.
 
 With Dask, the official extra `sorojax[sweep]`, two lines locally and two for a queue:
 

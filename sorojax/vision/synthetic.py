@@ -1,4 +1,4 @@
-"""Pictures with known answers: discs, markers and boards, with blur, noise and hiding."""
+"""Pictures with known answers: discs, markers and boards, with blur, noise and occlusion."""
 
 from typing import NamedTuple
 

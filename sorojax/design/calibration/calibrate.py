@@ -1,9 +1,8 @@
-"""Parameters of any model from several experiments at once.
+"""Parameters of any model from several experiments: Levenberg-Marquardt within bounds.
 
-Levenberg-Marquardt within bounds, for residuals that solve equilibria on the host.
-
-A library for traced functions would compile every experiment as one program with callbacks,
-which no cache keeps, and takes no bounds; the residuals here are called as they are.
+Residuals may solve equilibria on the host and are called as they are. A library for traced
+functions would compile every experiment as one program with callbacks, which no cache keeps,
+and takes no bounds.
 
 References:
     More, "The Levenberg-Marquardt algorithm: implementation and theory", Lecture Notes in

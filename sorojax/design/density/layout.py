@@ -1,8 +1,5 @@
-"""From the variables of a design to the densities of its cells.
-
-Cells that share a variable: mirrored and repeated layouts.
-
-Stiffness as a function of density.
+"""From design variables to densities of cells (symmetry, filter, projection), and stiffness
+as a function of density.
 
 References:
     Bendsoe, Sigmund, Topology Optimization, 2003.

@@ -1,5 +1,6 @@
-"""The optimisation of a drawing: nodes follow its dimensions, the mesh is built anew when it
-has to be, and the optimiser never notices."""
+"""Optimisation of the dimensions of a drawing: nodes follow them, the mesh is built anew when
+it has to be, and the memory of the optimiser goes on.
+"""
 
 import warnings
 from collections.abc import Callable, Sequence

@@ -1,13 +1,10 @@
 """Newton's method for one time step, on the host.
 
 A factor is kept from iteration to iteration and from step to step as long as each solve
-with it takes the residual down well: a residual and a back-substitution cost a fraction of
-a tangent and its factor. A step that raises the energy is shortened.
-
-Inertia and damping of a step by products on the host.
-
-A product there takes a quarter of the time of the compiled one, which scatters every entry of
-the pattern twice.
+with it reduces the residual well: a residual and a back-substitution cost a fraction of
+a tangent and its factor. A step that raises the energy is shortened. Products with inertia
+and damping are made on the host, in a quarter of the time of compiled ones, which scatter
+every entry of the pattern twice.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""Motion of a body: the door to time integration."""
+"""`simulate`: motion of a body in time, with its loads and supports as functions of time."""
 
 import dataclasses
 from collections.abc import Callable

@@ -1,9 +1,8 @@
-"""One time step as a problem of equilibrium, and the state after it; pure functions.
+"""One time step as a problem of equilibrium, and the state after it, as pure functions.
 
 Forces act at one displacement u within the step. Velocity and acceleration there are affine
-in u, so that inertia and damping are quadratic potentials beside those of the loads.
-
-What a load may know about the time step that it acts in.
+in u, so that inertia and damping are quadratic potentials beside those of the loads, which
+may depend on the state at the begin of the step (`StepState`).
 """
 
 import dataclasses

@@ -1,9 +1,7 @@
-"""Equilibrium with closed cavities, differentiable by the implicit function theorem.
+"""Equilibrium of bodies with closed cavities, differentiable by the implicit function theorem.
 
-Closed cavities: what is inside them, and equilibrium with it.
-
-The pressure of a cavity is an unknown that a law of its contents determines: a given
-volume of liquid, or a gas. The tangent is bordered by one row per cavity.
+The pressure of a cavity is an unknown that its contents determine: a given volume of liquid,
+or a gas. The tangent is bordered by one row per cavity.
 """
 
 import abc

@@ -1,7 +1,5 @@
-"""Paths of equilibria over limit points and through bifurcations, their critical points
-located, and the branches that leave them.
-
-Limit points and bifurcations between two states of a path.
+"""Paths of equilibria over limit points and through bifurcations: their critical points are
+located between two states, and the branches that leave them can be followed.
 """
 
 from collections.abc import Callable

@@ -1,6 +1,5 @@
-"""Small vibrations about an equilibrium, and motion reduced to a few of their modes.
-
-How eigenvalues and shapes move with the numbers of a problem.
+"""Small vibrations about an equilibrium, motion reduced to a few modes, and derivatives of
+eigenvalues and shapes in the numbers of a problem.
 
 Reference: Nelson, "Simplified calculation of eigenvector derivatives", AIAA Journal 14,
 1976.

@@ -1,15 +1,12 @@
-"""Step size control of adaptive runs: proportional-integral, tolerances per component.
+"""Length of time steps: proportional-integral control of adaptive runs, halving of steps that
+fail, and a check of runs with fixed steps by step doubling.
 
-Whether the steps of a run are short enough: a few of them made again as two halves.
-
-A run of fixed steps is a scan over its rows, of one or more steps each. Of some rows the scan
-makes two more passes, from the same state by steps of half the length. Their distance from the
-rows is the error of these rows; a run whose errors add up to as much as its motion is
+The check computes some steps again from the same state by two of half the length; their
+distance is the error of these steps. A run whose errors add up to as much as its motion is
 unstable.
 
 Reference:
-    Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, 1993, section II.4,
-    for the estimate by step doubling.
+    Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, 1993, section II.4.
 """
 
 from collections.abc import Callable

@@ -1,6 +1,5 @@
-"""Node positions as a differentiable function of a shape, on a fixed topology.
-
-Whether the boundary of a mesh can follow its shape, and whether it did.
+"""Node positions as a differentiable function of a shape on a fixed topology, and whether the
+boundary of a mesh can follow its shape, and did.
 """
 
 import warnings

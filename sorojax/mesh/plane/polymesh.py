@@ -1,15 +1,12 @@
-"""Polygonal meshes: Voronoi cells evened out by Lloyd's method, cut at the boundary.
+"""Polygonal meshes: Voronoi cells made even by Lloyd's method and cut by the boundary polygon.
 
-Reference: Talischi, Paulino, Pereira, Menezes, PolyMesher, SMO 45, 2012. There seeds are
-mirrored at the boundary, which fails in walls thinner than a cell; here the cells are
-cut by the boundary polygon, which is exact for every number of cells.
+In PolyMesher seeds are mirrored at the boundary, which fails in walls thinner than a cell; a
+cut is exact for every number of cells. Cells that are not convex are split without new
+points: holes are joined to the outside, ears cut off, and triangles merged again.
 
-Voronoi cells of seeds, cut by a polygon whose sides each lie within one cell.
-
-Polygons with holes split into convex ones, without new points.
-
-Holes are joined to the outside by bridges, ears are cut off, and triangles are merged
-again where the result is convex (Hertel and Mehlhorn, 1983).
+References:
+    Talischi, Paulino, Pereira and Menezes, PolyMesher, SMO 45, 2012.
+    Hertel and Mehlhorn, Fast triangulation of simple polygons, LNCS 158, 1983.
 """
 
 from collections.abc import Callable

@@ -1,6 +1,5 @@
-"""From a plane shape to triangles: exact boundary, hexagonal inside, curved sides.
-
-Six-node triangles made from three-node ones, and whether they are valid.
+"""Triangles of a plane shape: points on the exact boundary, hexagonal inside, and with six
+nodes curved sides, checked for inverted cells.
 """
 
 import numpy as np

@@ -1,6 +1,5 @@
-"""From a solid shape to conforming tetrahedra, without a surface in between.
-
-Ten-node tetrahedra on a shape, and the named sets of a solid mesh.
+"""Conforming tetrahedra of a solid shape, linear or with ten nodes, and the named sets of the
+mesh. No surface mesh is made in between.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""A body with its air: reservoirs and regulators wired to an assembly, as a board sees it."""
+"""A body with its air supply: the reservoirs and regulators that a valve board drives."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple

@@ -1,6 +1,5 @@
-"""Contact of a rod with a fixed obstacle, and what all contacts of rods share.
-
-How far bodies get within a step.
+"""Contact of a rod with a fixed obstacle, how far bodies move in a step, and what all
+contacts of rods share.
 """
 
 import abc

@@ -1,7 +1,7 @@
 """Equations of motion of a rod or assembly: M a + coriolis = sum of generalised forces.
 
-These are doors: each compiles once per structure of the model and its forces. Loops use
-`motion`, `inertia` and `total_force` directly, with `operators` taken outside.
+Each function compiles once per structure of the model and its forces. Loops use `motion`,
+`inertia` and `total_force` directly, with `operators` taken outside.
 """
 
 from typing import Any

@@ -1,4 +1,4 @@
-"""A rod or an assembly: the same words for both, chosen when a program is traced."""
+"""Functions of a rod or an assembly, which choose between the two when a program is traced."""
 
 from typing import TypeAlias, overload
 

@@ -1,4 +1,4 @@
-"""The rod: what a user chose about it, and nothing else."""
+"""The rod: basis, section, material and length, from which everything else is computed."""
 
 import dataclasses
 import math

@@ -1,6 +1,5 @@
-"""Equilibria under loads that are applied in steps.
-
-Equilibria along a curve in coordinates and load: over limit points.
+"""Equilibria under loads that are applied in steps, and along a curve in coordinates and load,
+over limit points.
 
 Reference:
     Riks, "An incremental approach to the solution of snapping and buckling problems",

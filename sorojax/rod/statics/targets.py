@@ -1,4 +1,4 @@
-"""What inverse kinematics is asked for: where sections shall be, and what they shall avoid."""
+"""Targets of inverse kinematics (positions, poses, directions, surfaces) and obstacles."""
 
 import abc
 from typing import TYPE_CHECKING, ClassVar, NamedTuple

@@ -1,16 +1,10 @@
-"""Area, centroid and second moments of plane shapes, differentiable in their parameters.
+"""Area, volume, centroid, second moments and inertia of shapes, with the derivative of the
+computed number itself.
 
-Moments of shapes with the derivative of the computed number itself.
-
-The grid rides on the bounding box: in cells from the middle of the box it stands still, so a
-derivative needs only that of the field at fixed places of this frame, box and all. What is
-differentiated is the discrete sum, hence it agrees with its differences at any resolution.
-
-Volume, centroid and inertia of solid shapes, differentiable in their parameters.
-
-Smooth shapes: six-node triangles on the surface, of fourth order in the cell. Shapes with
-edges, narrow gaps or small fillets: cells that halve there. The derivative is that of the
-computed number, whatever the resolution.
+Smooth solids are measured by six-node triangles on the surface, to fourth order in the cell;
+plane shapes and solids with edges, narrow gaps or small fillets by cells that halve there. The
+grid moves with the bounding box, so a derivative needs only that of the field at fixed places
+of that frame, and agrees with finite differences at any resolution.
 """
 
 import warnings

@@ -1,6 +1,5 @@
-"""The zero set of a solid shape as triangles.
-
-Marching cubes on the blocks a surface crosses, packed into one small volume.
+"""The zero set of a solid shape as triangles, by marching cubes on the blocks that the surface
+crosses, packed into one small volume.
 """
 
 import importlib.util

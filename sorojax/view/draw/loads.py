@@ -1,6 +1,5 @@
-"""What holds a body and what acts on it, as parts of a scene.
-
-Signs of what acts without an arrow of its own: coils of springs, arcs of turning.
+"""Supports and loads of a body as parts of a scene: arrows, coils for springs, arcs for
+torques.
 """
 
 import jax.numpy as jnp

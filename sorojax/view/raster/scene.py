@@ -1,7 +1,7 @@
-"""What is to be drawn, before anything draws it: surfaces, lines, arrows and dots [m].
+"""A scene to draw: surfaces, lines, arrows and dots [m], without a drawing library.
 
-Verbs that know the nouns of other floors make a `Scene`; `plane` draws it with matplotlib,
-`solid` shades it in space.
+Functions that know the nouns of other packages make a `Scene`; `plane` draws it with
+matplotlib, `solid` shades it in space.
 """
 
 from collections.abc import Sequence
