@@ -190,7 +190,7 @@ def load_potential(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Arra
 
 
 def body_at(problem: Problem, points: Points) -> Body:
-    """What the energy at the quadrature points of all cells is made of."""
+    """Data of the energy at the quadrature points of all cells."""
     material = jax.tree.map(
         lambda leaf: leaf[None] if jnp.ndim(leaf) == 1 else leaf, problem.material
     )

@@ -130,7 +130,7 @@ class Gent(AbstractHyperelastic):
     Beyond 99 % of `locking` (Jm [-]) the logarithm continues as its second-order Taylor
     polynomial, so that the energy is finite and twice continuously differentiable
     everywhere and a solver can come back; results there are not Gent's.
-    `locking_stretch` tells where the limit is.
+    `locking_stretch` gives the limit.
 
     Reference: Gent, Rubber Chem. Technol. 69, 1996.
     """

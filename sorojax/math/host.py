@@ -46,7 +46,7 @@ largest_of_lanes = _over_lanes(lambda x: jnp.max(x, axis=0))
 
 
 def together(*works: Callable[[], Any]) -> list[Any]:
-    """What `works`, each of concrete numbers, answer; each in a thread of its own.
+    """Results of `works`, functions of concrete numbers, each in a thread of its own.
 
     Precision and default device of the caller hold in all of them.
     """

@@ -59,7 +59,7 @@ class Linearisation(NamedTuple):
 
 
 class Damping(eqx.Module):
-    """What the method remembers: the damping, its growth at the next failure, and the
+    """Memory of the method: the damping, its growth at the next failure, and the
     largest length of each column of the Jacobian so far."""
 
     value: Float[Array, ""] = eqx.field(converter=real)

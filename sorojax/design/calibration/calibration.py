@@ -74,7 +74,7 @@ class Experiment(eqx.Module):
 
 
 def predicted(experiment: Experiment, parameters: PyTree) -> Float[np.ndarray, "..."]:
-    """What the model says.
+    """The prediction of the model.
 
     Raises:
         ValueError: If it has another shape than what was measured.
@@ -106,7 +106,7 @@ def sensitivity(
 
 
 def evaluated(function: Callable[[], Answer]) -> Answer | None:
-    """What `function` returns, None where the model has no answer."""
+    """Value of `function`, None where the model has no equilibrium or motion."""
     try:
         return function()
     except (ConvergenceError, MotionError):

@@ -184,7 +184,7 @@ class Flood(eqx.Module):
 
 
 def flood(mesh: Mesh, sources: Numbers, *, threshold: float = 0.1) -> Flood:
-    """What is needed to flood the void of designs on `mesh`.
+    """Data to flood the void of designs on `mesh`.
 
     Args:
         mesh: The cells.

@@ -235,7 +235,7 @@ class Values(NamedTuple):
 
 
 class MMAState(eqx.Module):
-    """What the method remembers: asymptotes, the last two designs, how often it was called,
+    """Memory of the method: asymptotes, the last two designs, how often it was called,
     and how curved its functions must be (GCMMA)."""
 
     low: Float[Array, " n"]
@@ -247,7 +247,7 @@ class MMAState(eqx.Module):
 
 
 class AbstractMMA(eqx.Module):
-    """What both versions share: bounds, asymptotes and the convex functions."""
+    """Common part of both versions: bounds, asymptotes and the convex functions."""
 
     if TYPE_CHECKING:  # fields that subclasses have, in their own order
         lower: ClassVar[Float[Array, "..."]]

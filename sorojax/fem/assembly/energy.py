@@ -324,7 +324,7 @@ def _geometric_places(kind: type[AbstractKinematics]) -> dict[tuple[int, int], t
 
 
 class Body(NamedTuple):
-    """What the energy of a block of cells is made of."""
+    """Data of the energy of a block of cells."""
 
     material: AbstractHyperelastic
     kinematics: AbstractKinematics

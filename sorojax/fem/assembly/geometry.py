@@ -226,7 +226,7 @@ def geometry(
 
 
 def _of_kinds(table, kinds):
-    """The table of every lane, with the lane axis last (of length 1 if all are alike)."""
+    """The table of every lane, with the lane axis last (of length 1 if all are equal)."""
     if kinds is None:
         return jnp.moveaxis(table, 0, -1)
     return jnp.moveaxis(table[kinds], 0, -1)

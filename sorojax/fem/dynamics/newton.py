@@ -31,7 +31,7 @@ Values = Float[np.ndarray, " nnz"]
 
 
 class Numbers(NamedTuple):
-    """What inertia and damping of a step depend on.
+    """Data of the inertia and damping of a step.
 
     Attributes:
         damping: C [N s/m], where it is not the same in every step.
@@ -93,7 +93,7 @@ class HostInertia:
         return self._pull - self._matrix @ (u - self.origin).ravel()
 
     def taken(self, u: Float[np.ndarray, "nodes dim"]) -> float:
-        """What damping takes in a step whose forces act at `u` [J]."""
+        """Energy that damping dissipates in a step whose forces act at `u` [J]."""
         if not self._damped:
             return 0.0
         moved = (u - self.origin).ravel()
@@ -363,7 +363,7 @@ class StepSolver:
                 secants.add((u - before).ravel(), change)
 
     def _to_move(self, u, held):
-        """What known unknowns have to move yet [m], and whether any has."""
+        """Remaining prescribed displacement [m], and whether there is any."""
         if self.free:
             return 0.0, False
         move = np.where(self.known, held - u.ravel(), 0.0)

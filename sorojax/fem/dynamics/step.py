@@ -274,7 +274,7 @@ def _work(dynamics: Dynamics, step: Step, loads, u_alpha, d) -> Float[Array, ""]
 
 
 def _taken(dynamics: Dynamics, step: Step, v_alpha, d) -> Float[Array, ""]:
-    """What damping takes in a step [J]."""
+    """Energy that damping dissipates in a step [J]."""
     if step.matrix is None:
         return jnp.zeros((), d.dtype)
     return jnp.sum(_times(dynamics, step.matrix, v_alpha) * d.ravel())

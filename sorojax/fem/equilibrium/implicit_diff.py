@@ -45,7 +45,7 @@ from sorojax.math.linalg import sparse
 
 
 class _Record:
-    """What the host found: one log per solve, lanes in row-major order; none in a trace.
+    """Record of solves on the host: one log each, lanes in row-major order; none in a trace.
     `displacement` is that of a single solve [m]."""
 
     def __init__(self):
@@ -111,7 +111,7 @@ class Solve:
         """The problem in two: the numbers that move and all else, and how they move; `dots`
         are those of the traced leaves.
 
-        What stays is left out of the derivative, so that it costs nothing.
+        Numbers without a derivative are left out, so that they cost nothing.
         """
         count = self.num_problem_leaves
         moved = {
@@ -145,7 +145,7 @@ class Solve:
 
 
 class Equilibrium(NamedTuple):
-    """What the map is made of: the numbers that move, all others, and the state.
+    """Data of the map: the numbers that move, all others, and the state.
 
     `values` are those of the tangent; the first of the `counts` of the solve is one where the
     state is no equilibrium, which has no derivative.

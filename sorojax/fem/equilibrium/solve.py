@@ -81,7 +81,7 @@ class Path(eqx.Module):
 
 
 def _unstable(records: Any) -> list[str]:
-    """What a print says of states that are in balance without being stable."""
+    """Lines of a print about states that are in balance without being stable."""
     steps = [r.steps[-1] for r in records or () if isinstance(r, Stats) and r.steps]
     if not any(step.negative_eigenvalues > 0 for step in steps):
         return []

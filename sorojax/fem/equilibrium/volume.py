@@ -29,7 +29,7 @@ from sorojax.math.status import Status
 
 
 class AbstractContents(eqx.Module):
-    """What fills a cavity: the volume that it takes at a pressure."""
+    """The contents of a cavity: the volume that they take at a pressure."""
 
     @abc.abstractmethod
     def volume_at(self, pressure: Float[Array, ""]) -> Float[Array, ""]:

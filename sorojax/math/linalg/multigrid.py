@@ -495,7 +495,7 @@ def _coarse_inverse(maps: Hierarchy, blocks: Float[Array, "blocks a a"]) -> Arra
 
 
 def cycle(levels: Multigrid, r: Float[Array, "nodes unknowns"]) -> Array:
-    """What the preconditioner makes of a residual: one V-cycle from zero."""
+    """The preconditioner applied to a residual: one V-cycle from zero."""
     return _cycle(levels.grids, levels.coarse, r)
 
 

@@ -19,7 +19,7 @@ Field = Callable[[Time, Any], Any]
 
 
 class Step(NamedTuple):
-    """What a step yields.
+    """Result of a step.
 
     Attributes:
         y: The state after it.

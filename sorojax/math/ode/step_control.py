@@ -47,7 +47,7 @@ def _paced(seam: Seam) -> Seam:
 
 
 class _Pace(NamedTuple):
-    """What the control remembers: error of the last step, rejections in a row and attempts,
+    """Memory of the control: error of the last step, rejections in a row and attempts,
     and, in a run with an `end`, the step under way and the last one taken."""
 
     before: Float[Array, ""]
@@ -237,7 +237,7 @@ def cut(
     afterwards. A part that did not converge is never accepted: where the end is not reached
     the state before the step comes back, and False.
 
-    Derivatives are those of the parts that were taken, as if chosen beforehand. `attempt`
+    Derivatives are those of the parts that were taken; their choice has none. `attempt`
     closes over nothing that is differentiated.
     """
     walk = _walked(attempt, max_cuts, given, h, state)

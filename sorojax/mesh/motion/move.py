@@ -200,7 +200,7 @@ def _check_upright(points: np.ndarray, mesh: Mesh) -> None:
 
 
 class _Motion(eqx.Module):
-    """What is known of a mesh before the shape is: plans, Laplace problems, straight sides.
+    """The part of a move that no shape enters: plans, Laplace problems, straight sides.
 
     `middles` are nodes that follow the corners `parents` of a cell with `weights`; those
     in `bent` are put on the surface afterwards.

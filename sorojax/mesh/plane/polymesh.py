@@ -385,7 +385,7 @@ def polymesher(
 def _cloud(shape, lower, upper, count: int) -> tuple[np.ndarray, float]:
     """Points of a fine grid inside `shape`, and their area [m^2]."""
     pitch = float(np.sqrt((upper - lower).prod() / (count * _SAMPLES)))
-    for _ in range(2):  # the first grid tells which part of the box is filled
+    for _ in range(2):  # the first grid shows which part of the box is filled
         axes = [np.arange(lower[i] + pitch / 2, upper[i] + pitch / 2, pitch) for i in range(2)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
         inside = grid[values(shape, grid) < 0]

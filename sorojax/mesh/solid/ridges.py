@@ -283,7 +283,7 @@ _THIN = np.cos(np.deg2rad(12.0))  # poorest dihedral angle that a split may make
 
 
 class Features(NamedTuple):
-    """What is known of the nodes on ridges.
+    """The nodes on ridges.
 
     Attributes:
         sides: The two sides of every ridge node, three or more of every corner.

@@ -77,7 +77,7 @@ class Port(NamedTuple):
 
 @displayed
 class Model(eqx.Module):
-    """A robot as a network that takes set-points and tells pressures.
+    """A robot as a network that takes set-points and returns pressures.
 
     Attributes:
         network: Blocks `body`, and `NAME_air` and `NAME_valve` of every port.
@@ -134,7 +134,7 @@ def supplied(
     """A body with a reservoir and a regulator at every port.
 
     Args:
-        body: An `AssemblyBody`, a `FemBody`, or any block that takes `PART_pressure` and tells
+        body: An `AssemblyBody`, a `FemBody`, or any block that takes `PART_pressure` and gives
             `PART_volume` and `PART_volume_rate` of every part that a port names.
         ports: By name.
         supply: Tubes and regulators; `Supply()` if omitted.

@@ -134,7 +134,7 @@ def tangent(
 
 
 def coupling(law: LinePenalty, touch: Touch) -> Float[Array, "dof dof"] | float:
-    """What friction adds to the stiffness as it grows with pressure; not symmetric."""
+    """Stiffness from friction that grows with pressure; not symmetric."""
     if law.friction is None:
         return 0.0
     velocity = _velocity(law, touch)

@@ -139,7 +139,7 @@ def acceleration(
     v: Rates,
     forces: Forces,
 ) -> Rates:
-    """`forward_dynamics` without a door, for loops that hold `operators(model)`."""
+    """`forward_dynamics` uncompiled, for loops that hold `operators(model)`."""
     moment = motion(model, q, v, constants=constants)
     mass, coriolis = inertia(moment)
     return solve_symmetric(mass, loads.total_force(forces, t, moment) - coriolis)

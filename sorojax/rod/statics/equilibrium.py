@@ -54,7 +54,7 @@ class Equilibrium(eqx.Module):
 
 
 class Search(NamedTuple):
-    """What a Newton search needs to know beside its residual.
+    """Settings and scales of a Newton search.
 
     Attributes:
         model: The rod or assembly.
@@ -187,7 +187,7 @@ def newton(residual: Residual, guess: Array, search: Search) -> Found:
             return length, size(residual(moved(search.model, q, length * step)))
 
         one = jnp.ones((), q.dtype)
-        # A step of rounding cannot be told from noise: it is taken as it is.
+        # A step of rounding is nothing but noise: it is taken as it is.
         first = jax.lax.cond(small, lambda: (one, 0 * start), lambda: at(one))
         length, value = jax.lax.while_loop(too_long, lambda trial: at(trial[0] / 2), first)
         good = value <= start

@@ -262,7 +262,7 @@ def _down(here: Rows, push) -> Float[Array, " dof"]:
 
 
 def _promise(here: Rows, push, increment: Array) -> Float[Array, ""]:
-    """What a step would leave of the squared error if all were linear."""
+    """Squared error after a step of the linear model."""
     error, jacobian = all_rows(here, push)
     left = error - jacobian @ increment
     return left @ left

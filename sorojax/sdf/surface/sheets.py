@@ -312,7 +312,7 @@ def _cross(shape, lower, size, nodes, axis, a, b):
     f, slope = value_and_gradient(shape, at(t))
     length = jnp.maximum(jnp.sqrt((slope * slope).sum(axis=1)), 1e-12)
     normal = slope / length[:, None]
-    # What regula falsi leaves, where the field has a kink on the edge, Newton takes away.
+    # Where the field has a kink on the edge, Newton removes the error of regula falsi.
     move = jnp.clip(f / size / length, -0.5, 0.5)
     offset = t[:, None] * step - move[:, None] * normal
     return offset.astype(jnp.float32), normal.astype(jnp.float32)

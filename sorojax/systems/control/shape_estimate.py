@@ -184,7 +184,7 @@ class ShapeFilter(eqx.Module):
 
 
 class Filtered(eqx.Module):
-    """What a filter knows: coordinates, rates, their covariance, and since when.
+    """State of a filter: coordinates, rates, their covariance, and since when.
 
     Attributes:
         missed: Updates since a marker was last seen; the estimate is `stale` from three on.

@@ -241,7 +241,7 @@ def _facet_frames(problem: Problem, facets: np.ndarray, points: np.ndarray):
 
 
 def _thinned(facets: np.ndarray) -> np.ndarray:
-    """At most so many facets that their arrows can be told apart."""
+    """At most so many facets that their arrows can be distinguished."""
     step = max(1, len(facets) // _MOST)
     return facets[::step]
 

@@ -151,7 +151,7 @@ def robust_scale(
     limits: tuple[float, float] | None = None,
     cut: float = 99.5,
 ) -> Scale:
-    """One scale for all `values`; a peak above the percentile `cut` is cut, and told."""
+    """One scale for all `values`; a peak above the percentile `cut` is cut, with a note."""
     flat = np.concatenate([np.ravel(v) for v in values])
     flat = flat[np.isfinite(flat)]
     if limits is not None:
