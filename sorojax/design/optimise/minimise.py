@@ -104,7 +104,8 @@ def minimise(
         optimiser: `MMA()` by default, whose variables lie between 0 and 1; `GCMMA`,
             `OptimalityCriteria`, or any optax optimiser (without constraints).
         steps: Most steps.
-        tolerance: Largest change of a variable at which to stop, in its unit.
+        tolerance: Largest change of a variable at which to stop, in its unit; with a
+            `schedule` all steps are taken.
         schedule: Further arguments of loss and constraints at step k = 0, 1, ...: for
             continuation, `lambda k: (sharpness(k),)`. None by default.
         change_gradient: Replaces the gradient of the loss, from design and gradient; the exact
