@@ -17,7 +17,7 @@ Noun = TypeVar("Noun")
 
 
 def replace(noun: Noun, where: Callable[[Noun], Any], value: Any) -> Noun:
-    """`noun` with the leaf or subtree that `where` selects replaced by `value`.
+    """`noun` with the number, array or module that `where` selects replaced by `value`.
 
     Numbers become strongly typed arrays, so that a new value never retraces and
     always has a gradient. Modules and functions are put in as they are. Nouns along the way
@@ -27,11 +27,20 @@ def replace(noun: Noun, where: Callable[[Noun], Any], value: Any) -> Noun:
         noun: Any module of the framework.
         where: Selects what to replace, `lambda p: p.material.shear_modulus`; a tuple selects
             several.
-        value: The new number, array or module; for several a tuple of them.
+        value: The new number, array or module, in the unit of the old; for several a tuple.
+
+    Returns:
+        The new noun; the old one is unchanged.
 
     Raises:
         TypeError: If the value is of another kind than what it replaces.
         ValueError: If the constructor of a noun refuses it.
+
+    Example:
+        >>> ball = sdf.Circle([0, 0], 10 * mm)
+        >>> larger = sj.replace(ball, lambda shape: shape.radius, 12 * mm)
+        >>> print(f"{float(larger(jnp.zeros(2))) / mm:.1f} mm")
+        -12.0 mm
     """
     if not callable(where):
         raise TypeError(

@@ -1,4 +1,4 @@
-"""What to say of an argument of a wrong kind: got - need - do."""
+"""Error messages about arguments of a wrong kind, in the form got - need - do."""
 
 import functools
 import inspect

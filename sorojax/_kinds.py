@@ -1,4 +1,4 @@
-"""What an annotation asks for, as a test of values: kinds of arguments."""
+"""Kinds of arguments: the tests of values that annotations ask for."""
 
 import collections.abc
 import dataclasses
@@ -346,7 +346,7 @@ def converted(annotation: Any, converter: Callable[[Any], Any], scope: dict[str,
         except (ArithmeticError, AttributeError, LookupError, TypeError):
             return False
         except ValueError as error:
-            return _is_spoken(error)  # the converter itself tells what is wrong
+            return _is_spoken(error)  # the converter itself says what is wrong
         return kind.accepts(made)
 
     return dataclasses.replace(kind, test=test, always=set())

@@ -1,4 +1,4 @@
-"""Loops in real time: JAX answers in the thread that asks.
+"""Loops in real time: JAX runs small programs in the thread that calls them.
 
 Rests on the option `jax_cpu_enable_async_dispatch`, which JAX documents, and on
 `jax._src.xla_bridge.backends_are_initialized`, without which a call that comes too late is

@@ -20,7 +20,7 @@ def check() -> None:
 
 
 def installed(name: str) -> str | None:
-    """The version of a package; `None` if there is none, "" if nothing tells it."""
+    """The version of a package; `None` if there is none, "" if it is unknown."""
     try:
         return metadata.version(name) or ""
     except metadata.PackageNotFoundError:
@@ -37,7 +37,7 @@ def _wrong(jax: str | None, jaxlib: str | None) -> str | None:
         if version is None:
             return f"found no {name}, need jax {OLDEST} or newer with its jaxlib"
     own, lib = _release(jax or ""), _release(jaxlib or "")
-    if own and own < _release(OLDEST):  # a version that nothing tells is taken as it is
+    if own and own < _release(OLDEST):  # an unknown version is taken as it is
         return f"found jax {jax}, need jax {OLDEST} or newer"
     if own and own < lib:
         return f"found jaxlib {jaxlib} beside jax {jax}, need a jax as new"

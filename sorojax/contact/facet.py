@@ -1,8 +1,8 @@
-"""How high a point stands over a facet: sides in the plane, flat triangles in space.
+"""The gap of a point over a facet: sides in the plane, flat triangles in space.
 
-A facet is felt a little beyond its rim, with a weight that falls smoothly across it; the
+A facet acts a little beyond its rim, with a weight that falls smoothly across it; the
 weights of facets that continue each other add up to one. So the surface of many facets
-has no kinks, and one that ends lets go smoothly.
+has no kinks, and contact ends smoothly at a free rim.
 """
 
 from typing import NamedTuple

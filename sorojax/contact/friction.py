@@ -11,7 +11,7 @@ from sorojax._types import real
 
 
 class Grip(NamedTuple):
-    """What friction knows of each point, in the frame of the obstacle.
+    """State of friction at each point, in the frame of the obstacle.
 
     Where the spring has no force [m], the pressure [Pa] and the normal that friction is
     taken at, the stiffness of the dashpot over a step [Pa/m] and where it has no force.

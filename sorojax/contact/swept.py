@@ -1,4 +1,4 @@
-"""What goes through an obstacle, or through another body, in a step."""
+"""Whether points pass through an obstacle, or through another body, in a step."""
 
 from typing import NamedTuple
 

@@ -1,14 +1,10 @@
-"""What a design is judged by: numbers of an equilibrium, differentiable in the design.
+"""Objectives of a design: numbers of an equilibrium, differentiable in the design.
 
-`graded` puts a design into a problem; `Follower` solves it, from the last design's
-displacement where that is near enough.
-
-The stable state that a body falls into when the equilibrium that it had is gone.
-
-Designs under large loads reach their buckling load while they are optimised. Beyond it
-Newton's method has nothing near to converge to, and a load path ends at a limit point; the
-body snaps. Here its energy falls, step by step, by Newton's method with a shift that keeps
-the tangent positive definite.
+`graded` puts a design into a problem; `Follower` solves it, from the displacement of the last
+design where that is near enough. Designs under large loads reach their buckling load while
+they are optimised; beyond it the load path ends at a limit point and the body snaps.
+`settled` finds the stable state that it then falls into: its energy is minimised by Newton's
+method with a shift that keeps the tangent positive definite.
 
 Reference: Nocedal, Wright, "Numerical Optimization", 2nd ed., 2006, sections 3.2 and 3.4.
 """

@@ -134,7 +134,7 @@ def pneunet_cell(
 
     The reference does not tell pressure, volume, springs or passive parts. Here its sides
     and its roof are solid, where the next cells are glued and so that no design leaks, and
-    its base, the layer that hardly stretches; left and right half are alike.
+    its base, the layer that hardly stretches; the right half mirrors the left.
 
     Args:
         rubber: The material; `presets.flexible_80a()` if omitted.

@@ -1,4 +1,4 @@
-"""What `fem.problem` refuses, before any long computation."""
+"""Checks of what `fem.problem` is given, before any long computation."""
 
 import warnings
 from typing import Any

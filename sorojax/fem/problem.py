@@ -1,9 +1,8 @@
-"""The boundary value problem: a noun, and the constructor that checks it.
+"""The boundary value problem, the constructor that checks it, and its total potential energy.
 
-Total potential energy in a form made for differentiation by parameters.
-
-The derivative of the residual in any leaf of the problem, forward or reverse, costs a few
-elementwise passes between two products with the shape gradients.
+The energy is written for differentiation by parameters: the derivative of the residual in any
+number of the problem, forward or reverse, costs a few elementwise passes between two products
+with the shape gradients.
 """
 
 import copy
@@ -112,28 +111,47 @@ def problem(
     solver: str | ConjugateGradient = "direct",
     free: bool = False,
 ) -> Problem:
-    """A checked boundary value problem.
+    """A checked boundary value problem: a hyperelastic body, how it is held and what loads it.
+
+    Its equilibrium is a stationary point of the stored energy of the cells plus the potential
+    of the loads (total Lagrangian). What can be checked without solving is checked here.
 
     Args:
-        mesh: Cells in the reference configuration; points may be traced, cells not.
-        material: Stored energy; its leaves are numbers or arrays with one entry per cell.
+        mesh: Cells in the reference configuration, points [m]; points may be traced, cells not.
+        material: Stored energy per reference volume [J/m^3]; its numbers are scalars or arrays
+            with one entry per cell.
         kinematics: `PlaneStrain(thickness)`, `PlaneStress(thickness)` or `Axisymmetric()`
-            for a plane mesh; `Solid()`, the default, in space.
-        supports: `Fixed(nodes)`, `Prescribed(nodes, displacement)`, `Rotated(...)`.
+            for a plane mesh, thickness [m]; `Solid()`, the default, in space.
+        supports: `Fixed(nodes)`, `Prescribed(nodes, displacement)` [m], `Rotated(...)`.
         loads: `Pressure`, `Traction`, `Force`, `Torque`, `Gravity`, `Spring`, `Foundation`,
-            `Tendon`, `Cable`, `Contact` and `rigid(mesh, nodes)`.
-        formulation: How the pressure varies in a cell. When omitted `LinearPressure()` for
+            `Tendon`, `Cable`, `Contact` and `rigid(mesh, nodes)`; none by default.
+        formulation: How the pressure varies in a cell. By default `LinearPressure()` for
             Tri7, Quad9 and Tet15, `ConstantPressure()` for Quad4, Hex8 and polygons, and
             `Displacement()` for the rest and in plane stress.
         space: The mesh's `space(mesh, loads)`, to share between problems on the same
-            topology.
-        solver: How linear systems are solved, as in `space`, unless one is given.
+            topology; made anew by default.
+        solver: How linear systems are solved, unless `space` says so: "direct",
+            "conjugate_gradient" or `ConjugateGradient(...)`.
         free: Accept a body that could move rigidly, for `simulate`.
+
+    Returns:
+        The problem; every number in it can carry a derivative.
 
     Raises:
         ValueError: If the body could move rigidly, a set is empty, a cell is inverted, the
-            material does not fit the mesh, the formulation would lock or oscillate, or a
-            pressure acts on an open run of facets.
+            material does not fit the mesh, the formulation would lock or oscillate, a
+            pressure acts on an open run of facets, or the points are not float64.
+
+    Example:
+        >>> bar = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1),
+        ...                      element=mesh.Quad9())
+        >>> rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45, density=1000)
+        >>> problem = fem.problem(
+        ...     bar, rubber, kinematics=fem.PlaneStrain(10 * mm),
+        ...     supports=(fem.Fixed(bar.node_sets["left"]),),
+        ...     loads=(fem.Force(bar.node_sets["right"], [0, -0.02], name="push"),))
+        >>> problem.space.num_dofs
+        54
     """
     _check.float64("fem.problem", mesh.points)
     supports, loads = tuple(supports), tuple(loads)
@@ -172,7 +190,7 @@ def load_potential(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Arra
 
 
 def body_at(problem: Problem, points: Points) -> Body:
-    """What the energy at the quadrature points of all cells is made of."""
+    """Data of the energy at the quadrature points of all cells."""
     material = jax.tree.map(
         lambda leaf: leaf[None] if jnp.ndim(leaf) == 1 else leaf, problem.material
     )

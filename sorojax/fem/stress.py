@@ -1,6 +1,5 @@
-"""Stresses and forces of an equilibrium.
-
-Continuous stresses at the nodes by superconvergent patch recovery, and energy per cell.
+"""Stresses, forces and energies of an equilibrium; continuous stresses at the nodes by
+superconvergent patch recovery.
 
 Reference: Zienkiewicz, Zhu, "The superconvergent patch recovery and a posteriori error
 estimates, part 1", IJNME 33, 1992.
@@ -58,7 +57,32 @@ def _deformation_gradient(problem: Problem, u) -> Float[Array, "cells cell_nodes
 def cauchy_stress(
     problem: Problem, u: Float[Array, "nodes dim"]
 ) -> Float[Array, "cells cell_nodes 3 3"]:
-    """sigma = P F' / J at the nodes of every cell [Pa], not averaged between cells."""
+    """Cauchy stress sigma = P F' / J at the nodes of every cell, not averaged between cells.
+
+    P is the first Piola-Kirchhoff stress dW/dF. Where cells carry a pressure of their own,
+    it is that pressure, extended to the nodes. `nodal_stress` recovers a continuous field.
+
+    Args:
+        problem: The problem, for its mesh, material and formulation.
+        u: Displacement of the nodes [m].
+
+    Returns:
+        Stress [Pa], three-dimensional also in the plane.
+
+    Example:
+        >>> bar = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1),
+        ...                      element=mesh.Quad9())
+        >>> rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45, density=1000)
+        >>> problem = fem.problem(bar, rubber, kinematics=fem.PlaneStrain(10 * mm),
+        ...                       supports=(fem.Fixed(bar.node_sets["left"]),))
+        >>> u = jnp.zeros_like(bar.points).at[:, 0].set(0.01 * bar.points[:, 0])  # 1 %
+        >>> print(f"{float(fem.cauchy_stress(problem, u)[0, 0, 0, 0]) / kPa:.1f} kPa")
+        37.9 kPa
+
+    Reference:
+        Bonet and Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2008,
+        section 5.5.
+    """
     return _cauchy_stress(body(problem), u)
 
 
@@ -126,7 +150,27 @@ def _extended(problem: Problem, inside: Points, points: Points):
 def von_mises_stress(
     problem: Problem, u: Float[Array, "nodes dim"]
 ) -> Float[Array, "cells cell_nodes"]:
-    """Von Mises stress at the nodes of every cell [Pa]; zero, with a zero slope, at rest."""
+    """Von Mises stress sqrt(3/2 s:s) at the nodes of every cell, s the deviator of sigma.
+
+    Not averaged between cells. At rest it is zero, with zero for its derivative.
+
+    Args:
+        problem: The problem, for its mesh, material and formulation.
+        u: Displacement of the nodes [m].
+
+    Returns:
+        Stress [Pa] at the nodes of every cell.
+
+    Example:
+        >>> bar = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1),
+        ...                      element=mesh.Quad9())
+        >>> rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45, density=1000)
+        >>> problem = fem.problem(bar, rubber, kinematics=fem.PlaneStrain(10 * mm),
+        ...                       supports=(fem.Fixed(bar.node_sets["left"]),))
+        >>> u = jnp.zeros_like(bar.points).at[:, 0].set(0.01 * bar.points[:, 0])  # 1 %
+        >>> print(f"{float(fem.von_mises_stress(problem, u)[0, 0]) / kPa:.2f} kPa")
+        6.82 kPa
+    """
     return _von_mises(cauchy_stress(problem, u))
 
 

@@ -1,6 +1,5 @@
-"""Moving surfaces to GLB files, for Blender, viewers on the web and slides.
-
-Moving surfaces as binary glTF 2.0: morph targets for shapes, node poses for bodies.
+"""Moving surfaces as binary glTF 2.0 (GLB), for Blender, viewers on the web and slides: morph
+targets for shapes, node poses for bodies.
 """
 
 import json

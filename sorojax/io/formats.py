@@ -1,6 +1,5 @@
-"""STL: loose triangles without a unit, binary or as text.
-
-3MF: a zipped model that states its unit.
+"""Surface formats: 3MF, GLB and SVG to write; STL, OBJ and PLY to write and read, with merged
+corners and checked indices.
 """
 
 import io
@@ -204,7 +203,7 @@ def _pieces(surface: Surface, scale: float):
 
 
 def read_stl(data: bytes, where: str, unit: float) -> Surface:
-    """Surface of an STL file, told apart by its length, as both kinds may say `solid`."""
+    """Surface of an STL file; its length says which kind it is, as both may say `solid`."""
     count = int.from_bytes(data[_HEAD : _HEAD + 4], "little")
     need = _HEAD + 4 + count * _RECORD.itemsize
     if len(data) >= _HEAD + 4 and need == len(data):

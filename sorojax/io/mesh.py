@@ -1,6 +1,5 @@
-"""Meshes to and from files of other programs, through meshio.
-
-Names of cells in files. The order of nodes is that of VTK on both sides.
+"""Meshes to and from files of other programs, through meshio. The order of nodes is that of
+VTK on both sides.
 """
 
 import contextlib
@@ -245,12 +244,21 @@ def export_mesh(
     Args:
         path: File name; its ending gives the format.
         mesh: The mesh; plane ones get z = 0 where a format has no plane.
-        unit: What 1 in the file means [m].
-        root: Folder that the file must lie in, links followed.
+        unit: What 1 in the file means [m]; a metre by default.
+        root: Folder that the file must lie in, links followed; any by default.
+
+    Returns:
+        None.
 
     Raises:
         ValueError: If the format is unknown or cannot hold the cells, or the path leaves
             `root`.
+
+    Example:
+        >>> plate = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1))
+        >>> io.export_mesh("plate.vtu", plate, unit=mm)
+        >>> io.import_mesh("plate.vtu", unit=mm).num_cells
+        8
     """
     where = "export_mesh"
     file = _files.inside(where, path, root)

@@ -1,4 +1,4 @@
-"""Foreign surfaces to tetrahedra by other programs, where `tetrahedralise` is not enough."""
+"""Tetrahedra of surfaces by other programs, where `tetrahedralise` is not enough."""
 
 import shutil
 import subprocess

@@ -1,11 +1,8 @@
-"""States, motions and results in files: every bit back, nothing executed.
+"""States, motions and results in files: zips of plain arrays and a JSON header, bit for bit.
 
-What a saved tree is made of, as JSON: data classes of sorojax by name, and never code.
-
-A class is looked up among those that the packages below define for data: nothing is
-imported by a name from a file, no constructor runs, and functions are not written at all.
-
-Zips of plain arrays, read without trusting a byte of them.
+Nothing is executed on reading: classes are looked up among the data classes of the packages
+below, nothing is imported by a name from a file, no constructor runs, functions are not
+written at all, and every length in a file is checked before memory is taken.
 """
 
 import dataclasses
@@ -328,11 +325,20 @@ def save(path: str | os.PathLike, tree: Any, *, root: str | os.PathLike | None =
 
     Args:
         path: File name, usually `*.npz`.
-        tree: Any pytree.
-        root: Folder that the file must lie in.
+        tree: Any pytree; numbers are written in the units they have.
+        root: Folder that the file must lie in; any by default.
+
+    Returns:
+        None.
 
     Raises:
-        ValueError: If there is nothing that could be written.
+        ValueError: If there is nothing that could be written, or the path leaves `root`.
+
+    Example:
+        >>> plate = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1))
+        >>> io.save("plate.npz", plate)
+        >>> io.load("plate.npz").num_cells
+        8
     """
     target = _files.inside("io.save", path, root)
     numbers = _leaves(tree)
@@ -367,14 +373,17 @@ def load(
     root: str | os.PathLike | None = None,
     max_bytes: int = _files.MAX_BYTES,
 ) -> Any:
-    """Read what `save` wrote.
+    """Read what `save` wrote, without running any code from the file.
 
     Args:
         path: File name.
-        like: A tree of the same structure; its numbers are replaced, the rest is kept. If
-            omitted the tree is built as it was saved, without any constructor or function.
-        root: Folder that the file must lie in.
+        like: A tree of the same structure; its numbers are replaced, the rest is kept. By
+            default the tree is built as it was saved, without any constructor or function.
+        root: Folder that the file must lie in; any by default.
         max_bytes: Larger files, and files that unpack to more, are refused.
+
+    Returns:
+        The tree, bit for bit.
 
     Raises:
         ValueError: If the file is damaged or newer than this version; without `like`, if it
@@ -382,7 +391,9 @@ def load(
             `like`.
 
     Example:
-        `io.save("s.npz", fem.solve(problem))`, later `view.show(io.load("s.npz"))`
+        >>> io.save("state.npz", {"q": jnp.array([0.5, 1.0])})
+        >>> io.load("state.npz")["q"].tolist()
+        [0.5, 1.0]
     """
     found = _read("io.load", path, root, max_bytes)
     if like is None:

@@ -96,14 +96,23 @@ def import_surface(
 
     Args:
         path: File name; its ending gives the format.
-        unit: What 1 in the file means [m]. If omitted a millimetre, and a surface whose
+        unit: What 1 in the file means [m]. By default a millimetre, and a surface whose
             longest side is then not between 1 mm and 100 m is refused.
-        root: Folder that the file must lie in, links followed.
+        root: Folder that the file must lie in, links followed; any by default.
         max_bytes: Larger files are refused unread.
+
+    Returns:
+        Vertices [m] and triangles.
 
     Raises:
         ValueError: If the file is no surface, truncated, damaged or too large, of a size
             that needs its unit, or the path leaves `root`.
+
+    Example:
+        >>> ball = sdf.isosurface(sdf.Sphere([0, 0, 0], 10 * mm), size=2 * mm)
+        >>> _ = io.export_surface("ball.stl", ball)  # in millimetres
+        >>> len(io.import_surface("ball.stl").triangles) == len(ball.triangles)
+        True
     """
     file = _files.inside("import_surface", path, root)
     kind = _ending("import_surface", file.suffix, tuple(_READERS))

@@ -1,4 +1,4 @@
-"""Checks that the materials share."""
+"""Checks of the numbers of materials."""
 
 from typing import Any
 

@@ -1,6 +1,4 @@
-"""Hyperelastic coefficients from uniaxial tensile tests.
-
-Incompressible tensile curves of the rubbers and how each is fitted.
+"""Hyperelastic coefficients from uniaxial tensile tests, of incompressible rubbers.
 
 A curve is linear in its moduli; exponents and the locking measure are found around that
 linear problem (variable projection).
@@ -207,9 +205,9 @@ def fit_tensile(
     poisson_ratio: float = 0.49,
     density: float | None = None,
 ) -> TensileFit:
-    """Coefficients by least squares on engineering stress.
+    """Coefficients of a rubber by least squares on a tensile test.
 
-    The bar is taken as incompressible, for `Yeoh`
+    The bar is taken as incompressible. Its engineering stress at the stretch l is, for `Yeoh`,
     sigma = 2 (l - l^-2) (c1 + 2 c2 x + 3 c3 x^2) with x = l^2 + 2/l - 3; `poisson_ratio`
     only sets the bulk modulus of the result. Repeats count equally whatever their
     number of points. `Ogden` and `Gent` always come out stable: mu_p alpha_p > 0 (terms
@@ -218,22 +216,33 @@ def fit_tensile(
 
     Args:
         strain: Engineering strain [-], 1.0 is 100 %; or one list per repeat.
-        stress: Engineering stress [Pa]; or one list per repeat.
+        stress: Engineering stress [Pa], force over the area at rest; or one list per repeat.
         model: NeoHookean, MooneyRivlin, Yeoh, Gent or Ogden.
-        terms: Terms of `Ogden`, 1 to 3.
+        terms: Terms of `Ogden`, 1 to 3; other models ignore it.
         stable: Allow no negative coefficient, so that the fit is stable everywhere.
-        weights: Weight per point; 1 everywhere unless given.
-        poisson_ratio: Small-strain ratio of the returned material, below 0.5.
-        density: Mass per reference volume [kg/m^3].
+        weights: Weight per point [-], shaped as `stress`; 1 everywhere by default.
+        poisson_ratio: Poisson's ratio of the returned material at small strains [-], below 0.5.
+        density: Mass per reference volume [kg/m^3]; unknown by default.
+
+    Returns:
+        The material with its errors and the strain that it was fitted to.
 
     Raises:
-        ValueError: If there are too few points, they look like MPa, kPa, percent or
-            stretch, they do not determine a material with
-            a positive modulus, or the fit is unstable within the measured deformation
-            in tension, equibiaxial tension or pure shear.
+        ValueError: If there are too few points; if they look like MPa, kPa, percent or
+            stretch; if they do not determine a material with a positive modulus; or if the fit
+            is unstable within the measured deformation in tension, equibiaxial tension or
+            pure shear.
 
-    Reference: Yeoh, Rubber Chem. Technol. 66, 1993; Ogden, Saccomandi & Sgura, Comput.
-    Mech. 34, 2004.
+    Example:
+        >>> strain = np.array([0.5, 1.0, 2.0, 3.0])
+        >>> stress = np.array([214.0, 437.0, 960.0, 1530.0]) * kPa
+        >>> fit = material.fit_tensile(strain, stress)
+        >>> print(f"c1 = {float(fit.material.c1) / kPa:.1f} kPa")
+        c1 = 97.8 kPa
+
+    Reference:
+        Yeoh, Rubber Chem. Technol. 66, 1993; Ogden, Saccomandi and Sgura, Comput. Mech. 34,
+        2004.
     """
     checks.poisson_ratio("fit_tensile", poisson_ratio)
     need = _needed(model, terms)

@@ -1,4 +1,4 @@
-"""Growth, swelling and thermal expansion: a rest state that has moved."""
+"""Growth, swelling and thermal expansion: a rest state that is not the reference one."""
 
 from typing import Any
 

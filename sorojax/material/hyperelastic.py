@@ -29,7 +29,7 @@ class AbstractHyperelastic(eqx.Module):
 
     @abc.abstractmethod
     def isochoric_energy(self, F: Tensor) -> Entry:
-        """What depends on F otherwise than through J alone, per reference volume [J/m^3]."""
+        """The part that depends on F not only through J, per reference volume [J/m^3]."""
 
     @abc.abstractmethod
     def volumetric_energy(self, J: Entry) -> Entry:

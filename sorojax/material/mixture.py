@@ -1,4 +1,4 @@
-"""Stiffer and softer, mixed, and different from region to region."""
+"""Scaled and mixed materials, and materials that differ from region to region."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -113,20 +113,30 @@ def by_region(
     base: AbstractHyperelastic,
     materials: Mapping[str, AbstractHyperelastic],
 ) -> AbstractHyperelastic:
-    """One material for the whole mesh that is another one in some regions.
+    """One material for the whole mesh with other materials in some regions.
 
     Materials of one class become that class with one number per cell, at no extra cost;
     of different classes a `Mixed` with weights 1 and 0, which evaluates each class once.
 
     Args:
-        num_cells: Cells of the mesh.
+        num_cells: Number of cells of the mesh.
         regions: Cell numbers of every named region; names without a material keep `base`.
         base: Material of all other cells.
         materials: Material of a region by its name.
 
+    Returns:
+        A material whose parameters have one entry per cell, or a `Mixed`.
+
     Raises:
         ValueError: If a name is unknown, cells lie outside the mesh or in two regions,
             or only some of the materials have a density.
+
+    Example:
+        >>> soft = material.neo_hookean(young_modulus=1e5, poisson_ratio=0.45)
+        >>> stiff = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45)
+        >>> body = material.by_region(4, {"layer": np.array([0, 1])}, soft, {"layer": stiff})
+        >>> (body.shear_modulus / kPa).round(1).tolist()
+        [344.8, 344.8, 34.5, 34.5]
     """
     members = _members(num_cells, regions, materials)
     known = [m.density is not None for m in (base, *materials.values())]

@@ -1,16 +1,13 @@
-"""Rubbers in the invariants of the isochoric deformation.
+"""Isotropic rubbers in the invariants of the isochoric deformation.
 
 Every energy splits as Psi = W(I1_bar, I2_bar) + K U(J) with the physical bulk modulus K;
-`volumetric` chooses U, (J - 1)^2 / 2 unless told otherwise.
-
-Sums of powers of the principal values of C, smooth where they coincide.
-
-With b half the exponent of a stretch, sum_i x_i^b over the eigenvalues x_i of the
-isochoric C is an analytic function of its invariants, although no single eigenvalue is.
-It is Cauchy's integral of z^b p'(z)/p(z) with p the characteristic polynomial, taken by
-the trapezoidal rule on an ellipse in the plane of log z. No eigenvalue is computed, all
-derivatives are finite and right, and the error falls geometrically with the nodes:
-rounding for stretches up to 10 in tension and 5 in equibiaxial tension.
+`volumetric` chooses U, (J - 1)^2 / 2 by default. `Ogden` needs sums of powers of the principal
+stretches: with b half the exponent, sum_i x_i^b over the eigenvalues x_i of the isochoric C is
+an analytic function of its invariants, although no single eigenvalue is. It is Cauchy's
+integral of z^b p'(z)/p(z) with p the characteristic polynomial, taken by the trapezoidal rule
+on an ellipse in the plane of log z. All derivatives are finite and right, also where
+eigenvalues coincide, and the error falls geometrically with the nodes: rounding for stretches
+up to 10 in tension and 5 in equibiaxial tension.
 
 Reference: Hale, Higham & Trefethen, SIAM J. Numer. Anal. 46, 2008.
 """
@@ -133,7 +130,7 @@ class Gent(AbstractHyperelastic):
     Beyond 99 % of `locking` (Jm [-]) the logarithm continues as its second-order Taylor
     polynomial, so that the energy is finite and twice continuously differentiable
     everywhere and a solver can come back; results there are not Gent's.
-    `locking_stretch` tells where the limit is.
+    `locking_stretch` gives the limit.
 
     Reference: Gent, Rubber Chem. Technol. 69, 1996.
     """
@@ -170,15 +167,30 @@ def locking_stretch(gent: Gent) -> Float[Array, "..."]:
 def neo_hookean(
     *, young_modulus: float, poisson_ratio: float, density: float | None = None
 ) -> NeoHookean:
-    """A `NeoHookean` from engineering constants.
+    """A neo-Hookean rubber from the two constants of small strains.
+
+    W = mu/2 (I1_bar - 3) + K (J - 1)^2 / 2 with mu = E / (2 (1 + nu)) and
+    K = E / (3 (1 - 2 nu)), the isochoric invariant I1_bar = J^(-2/3) tr F'F.
 
     Args:
-        young_modulus: Small-strain modulus [Pa].
-        poisson_ratio: Small-strain ratio, below 0.5.
-        density: Mass per reference volume [kg/m^3].
+        young_modulus: Young's modulus E of small strains [Pa], positive.
+        poisson_ratio: Poisson's ratio nu of small strains [-], in (-1, 0.5).
+        density: Mass per reference volume [kg/m^3]; None where no weight or inertia is needed.
+
+    Returns:
+        The material.
 
     Raises:
         ValueError: If a number is out of range.
+
+    Example:
+        >>> rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45)
+        >>> print(f"{float(rubber.shear_modulus) / kPa:.1f} kPa")
+        344.8 kPa
+
+    Reference:
+        Bonet and Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2008,
+        section 6.4.
     """
     _check.positive("neo_hookean", "young_modulus", young_modulus, "Pa", checks.MODULUS)
     checks.poisson_ratio("neo_hookean", poisson_ratio)

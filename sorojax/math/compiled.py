@@ -1,13 +1,10 @@
-"""Compiled functions: public verbs, large pytrees, batches, and what is kept out of fusion.
+"""Compilation of public functions: once per structure of their arguments, for large trees that
+stay the same from call to call, in batches that stay in the cache, and with barriers.
 
-Public verbs are compiled once per structure of their arguments.
-
-To take a problem apart costs as much as to evaluate its forces on a small mesh, to take a
-network apart a third of its step: it is done once, and calls hand over the list of arrays.
-
-On the CPU, XLA drops optimization barriers before it fuses loops; the work of a producer is
-then repeated in every entry that reads it, and a loop that holds the slice of an outer loop
-is not vectorised. What crosses a branch is written to memory once.
+To flatten a problem costs as much as to evaluate its forces on a small mesh, so it is done
+once and calls pass the list of arrays. On the CPU, XLA drops optimisation barriers before it
+fuses loops and then repeats the work of a producer in every entry that reads it; what crosses
+a branch is written to memory once.
 """
 
 import functools

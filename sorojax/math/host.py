@@ -1,7 +1,5 @@
-"""What runs on the host beside compiled programs: progress, threads, SciPy's searches.
-
-SciPy's neighbour searches and triangulations, imported at first use: importing them costs
-as much as the rest of the package.
+"""Work on the host beside compiled programs: progress messages, threads, and SciPy's neighbour
+searches and triangulations, which are imported at first use.
 """
 
 from collections.abc import Callable
@@ -48,7 +46,7 @@ largest_of_lanes = _over_lanes(lambda x: jnp.max(x, axis=0))
 
 
 def together(*works: Callable[[], Any]) -> list[Any]:
-    """What `works`, each of concrete numbers, answer; each in a thread of its own.
+    """Results of `works`, functions of concrete numbers, each in a thread of its own.
 
     Precision and default device of the caller hold in all of them.
     """

@@ -1,7 +1,7 @@
 """Roots whose derivative is that of the implicit function, whatever search finds them.
 
-For `jax.lax.custom_root`, which since jax 0.12 (0.12.0.1 was tried) hands `tangent_solve` a
-map whose Jacobian by `jax.jacobian` is wrong, without an error.
+Used in place of `jax.lax.custom_root`, which since jax 0.12 (0.12.0.1 was tried) hands
+`tangent_solve` a map whose Jacobian by `jax.jacobian` is wrong, without an error.
 """
 
 from collections.abc import Callable

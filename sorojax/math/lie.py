@@ -1,8 +1,7 @@
-"""Planar and spatial rigid motions as leafless markers. Twists are angular first.
+"""Planar and spatial rigid motions (SE(2), SE(3)), twists angular first, and unit quaternions.
 
-Unit quaternions, scalar first, as tuples of four arrays of any one shape.
-
-Tuples of component arrays fuse into few elementwise kernels; stacked arrays do not.
+Quaternions are scalar first, as tuples of four arrays of any one shape: tuples of component
+arrays fuse into few elementwise kernels, stacked arrays do not.
 """
 
 import functools

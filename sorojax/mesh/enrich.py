@@ -34,10 +34,23 @@ def enrich(mesh: Mesh) -> Mesh:
     geometry is unchanged, and old nodes keep their numbers. A node set gains the centres of
     the faces, and of the cells, all of whose nodes it holds.
 
-    Raises:
-        ValueError: For other cells, or if the cells are traced.
+    Args:
+        mesh: A mesh of `Tri6`, `Quad8` or `Tet10` cells.
 
-    Reference: Crouzeix & Raviart, RAIRO 7 (R3), 1973.
+    Returns:
+        The mesh with more nodes.
+
+    Raises:
+        ValueError: If the mesh has other cells, or if they are traced.
+
+    Example:
+        >>> plain = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1), order=2)
+        >>> mesh.enrich(plain).element.name, mesh.enrich(plain).num_nodes - plain.num_nodes
+        ('Tri7', 8)
+
+    Reference:
+        Crouzeix and Raviart, Conforming and nonconforming finite element methods for solving
+        the stationary Stokes equations, RAIRO 7 (R3), 1973.
     """
     if is_traced(mesh.cells):
         raise ValueError("enrich: `mesh.cells` is traced. Enrich the mesh outside jit.")

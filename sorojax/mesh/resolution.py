@@ -1,4 +1,4 @@
-"""Whether a mesh has seen all of its shape, and what is too thin where it has not."""
+"""Whether a mesh resolves all of its shape, and which walls are too thin where it does not."""
 
 from typing import NoReturn
 

@@ -22,10 +22,22 @@ Facets = Int[np.ndarray, "facets facet_nodes"]
 
 
 def nodes_where(mesh: Mesh, predicate: Predicate) -> Nodes:
-    """Nodes whose point satisfies `predicate(p)`, as in `lambda p: p[0] <= 0`.
+    """Nodes whose point satisfies a condition.
 
     A node that should lie at 0 may lie at 1e-18: compare with a tolerance where the
     place is the result of a computation.
+
+    Args:
+        mesh: A concrete mesh.
+        predicate: Takes a point [m] to True or False, as in `lambda p: p[0] < 1e-9`.
+
+    Returns:
+        Node numbers in rising order; empty if there are none.
+
+    Example:
+        >>> plate = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1))
+        >>> mesh.nodes_where(plate, lambda p: p[0] < 1e-9).tolist()
+        [0, 1]
     """
     return np.flatnonzero(_holds(mesh.points, predicate))
 
@@ -43,13 +55,26 @@ def facets_where(mesh: Mesh, predicate: Predicate) -> Facets:
 
 
 def facets_on(mesh: Mesh, shape: AbstractSdf, tol: float | None = None) -> Facets:
-    """Boundary facets, as node numbers, that lie on the zero set of `shape`.
+    """Boundary facets that lie on the zero set of a shape.
 
     Args:
         mesh: A mesh; the outline of `shape` should be part of its boundary.
         shape: For example the chambers that were cut out of the body.
         tol: Largest distance of a corner from the zero set [m]; 1e-6 of the extent of
-            the mesh when omitted.
+            the mesh by default.
+
+    Returns:
+        Facets as rows of node numbers, oriented as by `boundary_facets`; empty if there are
+        none.
+
+    Example:
+        >>> hole = sdf.Circle([5 * mm, 5 * mm], 2 * mm)
+        >>> body = sdf.Rectangle([0, 0], [10 * mm, 10 * mm]) - hole
+        >>> cells = mesh.triangulate(body, size=2 * mm)
+        >>> facets = mesh.facets_on(cells, hole)
+        >>> radii = np.linalg.norm(cells.points[facets[:, 0]] - 5 * mm, axis=1)
+        >>> bool(len(facets) > 3), bool(np.allclose(radii, 2 * mm))
+        (True, True)
     """
     points = np.asarray(mesh.points)
     if tol is None:

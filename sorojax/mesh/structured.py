@@ -41,17 +41,31 @@ def rectangle(
     order: int = 1,
     element: AbstractElement | None = None,
 ) -> Mesh:
-    """Triangles or quadrilaterals in a box.
+    """Triangles or quadrilaterals on a regular grid in a rectangle.
 
     Triangles come two per grid cell with alternating diagonals. Node sets and facet
     sets: "left", "right", "bottom", "top"; node set "corners".
 
     Args:
-        lower: Lower left corner [m].
-        upper: Upper right corner [m].
+        lower: Lower left corner (x, y) [m].
+        upper: Upper right corner (x, y) [m].
         divisions: Grid cells along x and y.
         order: 1 for `Tri3`, 2 for `Tri6` with straight sides; `element` overrides it.
-        element: `Tri3()`, `Tri6()`, `Tri7()`, `Quad4()`, `Quad8()` or `Quad9()`.
+        element: `Tri3()`, `Tri6()`, `Tri7()`, `Quad4()`, `Quad8()` or `Quad9()`; as `order`
+            says by default.
+
+    Returns:
+        The mesh, points [m].
+
+    Raises:
+        ValueError: If the corners are not finite or `upper` is not above `lower`, a division
+            is below 1, or order or element are none of those above.
+
+    Example:
+        >>> bar = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1),
+        ...                      element=mesh.Quad9())
+        >>> bar.num_cells, bar.num_nodes, len(bar.node_sets["left"])
+        (4, 27, 3)
     """
     lower, upper = _corners("rectangle", lower, upper, divisions, 2)
     if order not in (1, 2):
@@ -78,16 +92,32 @@ def box(
     divisions: tuple[int, int, int],
     element: AbstractElement | None = None,
 ) -> Mesh:
-    """Hexahedra, or tetrahedra six per grid cell, in a cuboid.
+    """Hexahedra, or tetrahedra six per grid cell, on a regular grid in a cuboid.
 
     Node sets and facet sets: "left", "right" (x), "front", "back" (y), "bottom", "top"
     (z); node set "corners".
 
     Args:
-        lower: Lower corner [m].
-        upper: Upper corner [m].
+        lower: Lower corner (x, y, z) [m].
+        upper: Upper corner (x, y, z) [m].
         divisions: Grid cells along x, y and z.
         element: `Hex8()` (default), `Tet4()`, `Tet10()` or `Tet15()`.
+
+    Returns:
+        The mesh, points [m].
+
+    Raises:
+        ValueError: If the corners are not finite or `upper` is not above `lower`, a division
+            is below 1, or the element is none of those above.
+
+    Example:
+        >>> block = mesh.box([0, 0, 0], [40 * mm, 10 * mm, 10 * mm], divisions=(4, 1, 1))
+        >>> block.num_cells, block.num_nodes, len(block.facet_sets["top"])
+        (4, 20, 4)
+
+    Reference:
+        Kuhn, Some combinatorial lemmas in topology, IBM J. Res. Dev. 4, 1960, for the six
+        tetrahedra of a cube.
     """
     lower, upper = _corners("box", lower, upper, divisions, 3)
     element = element or Hex8()
@@ -238,10 +268,28 @@ def kept(mesh: Mesh, cells: Int[np.ndarray, " kept"]) -> Mesh:
 
 
 def extrude(mesh: Mesh, height: float, *, layers: int) -> Mesh:
-    """`mesh` drawn along z from 0 to `height` [m].
+    """Solid mesh from a plane one, in layers along z.
 
     Quadrilaterals become `Hex8`, triangles `Tet4` (three per prism). Facet sets of the
     sides carry over, "start" and "end" are the caps; node sets hold all layers.
+
+    Args:
+        mesh: A plane mesh of `Tri3` or `Quad4` cells.
+        height: Extent from z = 0 on [m]; positive.
+        layers: Number of layers of cells.
+
+    Returns:
+        The solid mesh, points [m].
+
+    Raises:
+        ValueError: If `height` or `layers` is not positive, or the mesh is traced or has other
+            cells.
+
+    Example:
+        >>> plate = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1))
+        >>> block = mesh.extrude(plate, 6 * mm, layers=2)
+        >>> block.element.name, block.num_cells
+        ('Tet4', 48)
     """
     if not height > 0:
         raise ValueError(f"extrude: `height` is {height} m, need a positive length.")

@@ -1,6 +1,6 @@
-"""The strains of a material line of a solid: what a rod in its place would feel.
+"""The strains of a material curve of a solid, as a rod in its place would have them.
 
-Strain of a row of section poses: twists from pose to pose, safe at any turn.
+Twists from section to section by the logarithm of the relative motion, safe at any angle.
 """
 
 import equinox as eqx
@@ -264,25 +264,46 @@ def strain_along(
     arm: float | None = None,
     up: Numbers | None = None,
 ) -> Backbone:
-    """Backbone snapshots of a load path along a material curve; outside `jit`
-    differentiable in the displacements of the path.
+    """Strains of a material curve of a solid along a load path, as of a rod in its place.
+
+    The twist from section to section is the logarithm of the relative motion, divided by the
+    rest length between them. Differentiable in the displacements of the path, outside `jit`.
 
     Args:
         path: Equilibria, from `fem.solve_path`.
-        curve: A `Line` or any `Curve` in the reference configuration; its start should be
+        curve: A `Line` or any `Curve` in the reference configuration [m]; its start should be
             held fast.
         samples: Equally spaced samples along the curve; about one per cell.
-        arm: How far beside the curve the fibres lie that tell how a section turns [m]. In
-            space a fiftieth of the length by default; without it a plane section follows
-            the tangent and has no shear.
-        up: In space, a direction near which local z of the first section points.
+        arm: Distance from the curve to the neighbouring material points whose motion gives
+            the rotation of a section [m]. In space a fiftieth of the length by default; in the
+            plane none by default: a section then follows the tangent and has no shear.
+        up: In space, a direction near which local z of the first section points [-]; by default
+            the axis of space that is most across the curve.
+
+    Returns:
+        Positions [m] and strains (curvatures [1/m], stretch and shears [-]) of every state.
 
     Raises:
-        ValueError: If the curve, or the fibres beside it, leave the mesh.
+        ValueError: If the curve, or the points beside it, leave the mesh, or there are fewer
+            than 3 samples.
+
+    Example:
+        >>> grid = mesh.rectangle([0, 0], [60 * mm, 12 * mm], divisions=(6, 4),
+        ...                       element=mesh.Quad4())
+        >>> tube = mesh.kept(grid, np.delete(np.arange(24), [6, 10, 14, 18]))  # with a chamber
+        >>> wall = mesh.facets_on(tube, sdf.Rectangle([10 * mm, 6 * mm], [50 * mm, 9 * mm]))
+        >>> problem = fem.problem(
+        ...     tube, material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45, density=1000),
+        ...     kinematics=fem.PlaneStrain(20 * mm), loads=(fem.Pressure(wall, name="air"),),
+        ...     supports=(fem.Fixed(tube.node_sets["left"]),))
+        >>> path = fem.solve_path(problem, air=jnp.linspace(0, 3 * kPa, 4))
+        >>> line = reduction.Line([0, 2 * mm], [60 * mm, 2 * mm])
+        >>> backbone = reduction.strain_along(path, line, samples=13)
+        >>> backbone.strain.shape, backbone.names
+        ((4, 13, 3), ('kappa_z', 'sigma_x', 'sigma_y'))
 
     Reference:
-        Caasenbrood et al., Sorotoki, IEEE Access 2024, algorithm 1; twists by the
-        logarithm of the motion between sections instead of differences of matrices.
+        Caasenbrood, Pogromsky and Nijmeijer, Sorotoki, IEEE Access 12, 2024, algorithm 1.
     """
     at = probe(path.problem.mesh, curve, samples, arm=arm, up=up)
     positions, strain = _snapshots(at, path.displacements)

@@ -1,8 +1,9 @@
-r"""A rod's elastic law, pressure map and section, identified from a FEM load path.
+r"""A rod's elastic law, pressure map and section, identified from a FEM load path, and its
+damping from a motion.
 
 At every equilibrium of the path the solid answers a generalised force on the strain
 coordinates q with its condensed stiffness, one back-substitution per coordinate on the
-tangent that the solve left behind. A co-energy
+tangent. A co-energy
 
     Psi*(q, p) = g(p).q + p q'Cq / 2 + h(p) - q'Kq / 2
 
@@ -10,16 +11,13 @@ is fitted to stiffness, equilibrium and enclosed volume together: K - p C is the
 stiffness, dPsi*/dq = 0 the equilibrium, and dPsi*/dp the volume. One potential gives force
 and volume, so no energy is lost between gas and rod.
 
-The damping of a rod, identified from its motion.
-
-The equations of motion are tested with windows in time: over a window that begins and ends
-with weight zero,
+For the damping the equations of motion are tested with windows in time: over a window w that
+begins and ends with weight zero,
 
     D \int w v dt = \int (w f + w' M v) dt,
 
 where f holds all forces but damping. No acceleration of the samples is needed. D is the
-symmetric matrix that fits all windows best, one block for each strain, without the part that
-would add energy.
+symmetric positive semidefinite matrix that fits all windows best, one block for each strain.
 
 Reference:
     Messenger and Bortz, Weak SINDy for partial differential equations, J. Comput. Phys. 443,
@@ -132,18 +130,45 @@ def identify(
     arm: float | None = None,
     up: Numbers | None = None,
 ) -> Fit:
-    """Identify a rod along `curve` from a path of pressures.
+    """Identify elastic law, pressure map and section of a rod along `curve` from a load path.
+
+    At every state the solid answers generalised forces on the strain coordinates q with its
+    condensed stiffness (H K^-1 H')^-1, K the tangent and H = dq/du. A co-energy
+    g(p).q + p q'Cq / 2 + h(p) - q'Kq / 2 is fitted to stiffness, equilibrium and enclosed
+    volume.
 
     Args:
-        path: Equilibria for values of one `Pressure` load.
+        path: Equilibria for values of one `Pressure` load [Pa].
         basis: Modes, e.g. from `pod_basis`.
         backbone: Snapshots of the same path along `curve`.
-        curve: The material curve, in the plane or in space.
+        curve: The material curve [m], in the plane or in space.
         degree: Highest power of the pressure in the map.
-        arm, up: As given to `strain_along`.
+        arm: Distance of the points beside the curve [m], as given to `strain_along`.
+        up: Direction of local z of the first section [-], as given to `strain_along`.
+
+    Returns:
+        Section, length, elastic law and pressure map of the rod, and the misfit of both.
 
     Raises:
-        ValueError: If the path is not driven by a pressure, or has too few states.
+        ValueError: If the path is not driven by a pressure, or has fewer than `degree` + 2
+            states.
+
+    Example:
+        >>> grid = mesh.rectangle([0, 0], [60 * mm, 12 * mm], divisions=(6, 4),
+        ...                       element=mesh.Quad4())
+        >>> tube = mesh.kept(grid, np.delete(np.arange(24), [6, 10, 14, 18]))  # with a chamber
+        >>> wall = mesh.facets_on(tube, sdf.Rectangle([10 * mm, 6 * mm], [50 * mm, 9 * mm]))
+        >>> problem = fem.problem(
+        ...     tube, material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45, density=1000),
+        ...     kinematics=fem.PlaneStrain(20 * mm), loads=(fem.Pressure(wall, name="air"),),
+        ...     supports=(fem.Fixed(tube.node_sets["left"]),))
+        >>> path = fem.solve_path(problem, air=jnp.linspace(0, 3 * kPa, 4))
+        >>> line = reduction.Line([0, 2 * mm], [60 * mm, 2 * mm])
+        >>> backbone = reduction.strain_along(path, line, samples=13)
+        >>> basis = reduction.pod_basis(backbone, modes={"kappa_z": 1})
+        >>> fit = reduction.identify(path, basis, backbone, line, degree=2)
+        >>> print(f"{float(fit.length) / mm:.1f} mm, {fit.elastic.stiffness.shape}")
+        60.0 mm, (1, 1)
     """
     problem, load = path.problem, _pressure(path)
     if len(path) < degree + 2:

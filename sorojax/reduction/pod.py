@@ -33,18 +33,35 @@ def pod_basis(
     modes: dict[str, int] | dict[str, float],
     within: AbstractModes | None = None,
 ) -> StrainBasis:
-    """Modes that hold most of the snapshots' strain, orthonormal on [0, 1].
+    """A strain basis of the modes that hold most of the strain of snapshots.
+
+    Proper orthogonal decomposition, strain by strain: left singular vectors of the snapshots,
+    orthonormal on [0, 1].
 
     Args:
         backbone: Snapshots, from `strain_along`.
         modes: Number of modes per strain, as `{"kappa_z": 3}`, or the share of the squared
-            strain that they must hold, as `{"kappa_z": 0.999}`.
+            strain that they must hold [-], as `{"kappa_z": 0.999}`.
         within: Smooth functions that the modes are combined of, e.g. `Legendre(12)`; fewer
             Gauss nodes then resolve them. By default they are linear between samples.
 
+    Returns:
+        The basis; a coordinate has the unit of its strain, [1/m] or [-].
+
     Raises:
-        ValueError: If a strain is unknown, or there are fewer independent snapshots than
-            modes.
+        ValueError: If a strain is unknown, there are fewer independent snapshots than
+            modes, or `within` has more functions than there are samples.
+
+    Example:
+        >>> s = jnp.linspace(0.0, 1.0, 13)
+        >>> strain = jnp.stack([s, 0 * s + 1, 0 * s], axis=1)[None] * jnp.ones((4, 1, 1))
+        >>> backbone = reduction.Backbone(s, jnp.array(0.06), jnp.zeros((4, 13, 2)), strain)
+        >>> basis = reduction.pod_basis(backbone, modes={"kappa_z": 1})
+        >>> print(f"{float(basis(np.array([1.0]))[0, 0, 0]):.2f}")  # sqrt(3) s
+        1.73
+
+    Reference:
+        Caasenbrood, Pogromsky and Nijmeijer, Sorotoki, IEEE Access 12, 2024, section V-D4.
     """
     basis = {}
     for name, wanted in modes.items():

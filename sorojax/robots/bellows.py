@@ -114,20 +114,33 @@ def bellows_problem(
     pushed: Sequence[int] = (),
     formulation: fem.Displacement | fem.LinearPressure | None = None,
 ) -> fem.Problem:
-    """Clamped at its left end, with a pressure called "air" [Pa] in all chambers.
+    """A bellows actuator as a boundary value problem on its side view, in plane strain.
+
+    It is clamped at its left end, with a pressure called "air" [Pa] in all chambers.
 
     Args:
-        actuator: Its dimensions; concrete.
-        cells: Of `mesh.triangulate(actuator.body(), ...)`.
-        rubber: One material, or one value per cell.
+        actuator: Its dimensions [m]; concrete.
+        cells: The mesh, of `mesh.triangulate(actuator.body(), ...)`.
+        rubber: One material, or one with a value per cell.
         depth: Width across the plane of the side view [m].
-        gravity: Acceleration [m/s^2]; a load called "gravity" where it is given.
-        pushed: Bellows, counted from the clamp from 0 on, whose backs carry forces called
-            "push_0", "push_2" and so on [N], zero to begin with.
-        formulation: As of `fem.problem`.
+        gravity: Acceleration (x, y) [m/s^2], a load called "gravity"; no weight by default.
+        pushed: Numbers of bellows, counted from the clamp from 0 on, whose backs carry forces
+            called "push_0", "push_2" and so on [N], zero to begin with; none by default.
+        formulation: As of `fem.problem`, whose default it has.
+
+    Returns:
+        The problem.
 
     Raises:
-        ValueError: If there is no such bellow.
+        ValueError: If there is no such bellow, or as `fem.problem`.
+
+    Example:
+        >>> actuator = robots.BellowsActuator(num_bellows=2)
+        >>> cells = mesh.enrich(mesh.triangulate(actuator.body(), size=3 * mm, order=2))
+        >>> rubber = presets.dragon_skin_30()
+        >>> problem = robots.bellows_problem(actuator, cells, rubber, pushed=[1])
+        >>> [load.name for load in problem.loads]
+        ['air', 'push_1']
     """
     loads: list[Any] = [fem.Pressure(mesh.facets_on(cells, actuator.chambers()), name="air")]
     if gravity is not None:

@@ -1,4 +1,4 @@
-"""A soft finger: a round bellows with a spine on one side and a rounded tip."""
+"""Printable robots: a soft finger, a hand, a manipulator, and planar and bending actuators."""
 
 import equinox as eqx
 import jax.numpy as jnp

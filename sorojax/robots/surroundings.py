@@ -1,6 +1,5 @@
-"""A robot among other bodies: where it is mounted, what it touches, and how it moves then.
-
-Things that robots are put together from: bodies in a ring, cylinders to hold.
+"""A robot among other bodies: its mounting, the contacts with things around it, and its motion
+in them; and bodies to arrange and to hold.
 """
 
 from collections.abc import Callable, Sequence

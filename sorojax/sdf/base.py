@@ -1,9 +1,8 @@
-"""The abstract signed distance: negative inside, in metres.
+"""The abstract signed distance, negative inside and in metres, and scalar functions whose
+first and second derivatives are finite everywhere.
 
-Scalar building blocks whose first and second derivatives are finite everywhere.
-
-`where` picks one branch at a tie, so a gradient there is one-sided instead of an
-average of two, and it is several times faster than `maximum` on a CPU.
+At a tie `where` picks one branch, so a derivative there is one-sided instead of an average of
+two; it is also several times faster than `maximum` on a CPU.
 """
 
 from __future__ import annotations

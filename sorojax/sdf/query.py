@@ -1,10 +1,8 @@
-"""What a shape can be asked at points: slope, normal, closest point.
+"""The field of a shape and its geometry at points: gradient, normal, curvature, closest point.
 
-Fields of many points at full speed: compiled once per power of two.
-
-A field made of scalars becomes one loop per output, which reads the coordinates and
-writes the result; normals of rows, and a field that searches or holds a table per point,
-go in chunks that stay in the cache.
+Fields of many points are compiled once per power of two. A field made of scalars becomes one
+loop per output, which reads the coordinates and writes the result; normals of rows, and a
+field that searches or holds a table per point, go in chunks that stay in the cache.
 """
 
 import functools
@@ -31,7 +29,24 @@ def bounding_box(shape: AbstractSdf) -> Box:
 
 
 def gradient(shape: AbstractSdf, p: Points) -> Points:
-    """Slope of the field at `p` [-]; at an edge that of one of its sides."""
+    """Gradient of the signed distance, by one forward-mode derivative per axis.
+
+    It points out of the shape and has length one where the field is the exact distance. At an
+    edge, where the field has no gradient, it is that of one of the sides.
+
+    Args:
+        shape: Any shape; may be traced.
+        p: Points [m], any number of leading axes.
+
+    Returns:
+        The gradient [-] at each point.
+
+    Example:
+        >>> disc = sdf.Circle([0, 0], 10 * mm)
+        >>> slope = sdf.gradient(disc, jnp.array([30 * mm, 40 * mm]))
+        >>> print(f"{float(slope[0]):.3f} {float(slope[1]):.3f}")
+        0.600 0.800
+    """
     return value_and_gradient(shape, real(p))[1]
 
 

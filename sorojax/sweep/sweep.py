@@ -1,16 +1,14 @@
-"""`sweep`: one function over many designs in chunks that are made once.
+"""`sweep`: one function over many designs in chunks, each computed once and kept in a folder
+under a key of all that determines it.
 
-A folder of results, each under the key of what made it, whole or not there.
-
-Where chunks run: anything with `submit(function, *args)` that returns a future.
-
-On one machine, with processes:
+Chunks run in anything with `submit(function, *args)` that returns a future. On one machine,
+with processes:
 
     from concurrent.futures import ProcessPoolExecutor
     sweep(function, designs, store, ProcessPoolExecutor(mp_context=get_context("spawn")))
 
 Workers need the precision of their driver: set JAX_ENABLE_X64=1 in the environment, which
-they inherit. JAX makes pickled arrays single in a process that has not got it.
+they inherit. JAX makes pickled arrays single precision in a process without it.
 
 With Dask, the official extra `sorojax[sweep]`, two lines locally and two for a queue:
 
@@ -180,7 +178,7 @@ def sweep(
     version: str | None = None,
     retries: int = 3,
 ) -> Swept:
-    """Call `function(block)` for blocks of designs, skipping those in the store.
+    """Call `function(block)` for blocks of designs, skipping those whose results are stored.
 
     Inside, `function` may use `vmap`, `simulate_batch` or `shard_map` over its block. With
     `config` it is called as `function(block, config)`; with `seed`, a last argument is a
@@ -193,18 +191,34 @@ def sweep(
     Args:
         function: Pure, importable by the workers; returns arrays by name, each with the
             leading axis of the block.
-        designs: A pytree of arrays with a leading axis of designs.
+        designs: A pytree of arrays with a leading axis of designs, in the units of `function`.
         store: Where results are kept; a folder that all workers see.
-        executor: Anything with `submit`: serial if omitted, a process pool, a Dask client.
+        executor: Anything with `submit`: a process pool, a Dask client; one chunk after the
+            other in this process by default.
         chunk: Designs per call.
         config: What else the result depends on; JSON, or it must have a faithful `repr`.
-        seed: Of random results.
-        version: Name of the code; the version of sorojax and the source of the function if
-            omitted. Give one where the function calls code of your own that changes.
+            Nothing by default.
+        seed: Seed of random results; none by default.
+        version: Name of the code; by default the version of sorojax and the source of the
+            function. Give one where the function calls code of your own that changes.
         retries: How often a chunk that fails is tried in all.
+
+    Returns:
+        Results of all designs by name, and how many chunks were computed and found.
 
     Raises:
         RuntimeError: If a chunk failed `retries` times; what is done stays in the store.
+        ValueError: If the designs have no common leading axis, `chunk` is below 1, or the
+            source of `function` cannot be read and no `version` is given.
+        TypeError: If `executor` has no `submit`.
+
+    Example:
+        >>> def squares(block):
+        ...     return {"square": block**2}
+        >>> store = sweep.Store("results")
+        >>> found = sweep.sweep(squares, np.arange(4.0), store, chunk=2, version="1")
+        >>> found.result["square"].tolist()
+        [0.0, 1.0, 4.0, 9.0]
     """
     blocks = _blocks(designs, chunk)
     code = _code(function) if version is None else version

@@ -29,16 +29,30 @@ def _pairs(wires: Mapping[str, str] | tuple) -> tuple[tuple[str, str], ...]:
 
 @displayed
 class Network(AbstractBlock):
-    """Blocks side by side, their inputs wired to outputs.
+    """Blocks side by side, their inputs wired to outputs: x' = f(t, x, u) for all of them.
 
-    The state is one dictionary entry per block. Wiring decides what is traced: an output
-    that nothing reads costs nothing.
+    The state is one dictionary entry per block. Wiring decides what is computed: an output
+    that nothing reads costs nothing. A network is a block itself.
 
     Attributes:
         blocks: Blocks by name.
-        wires: `{"block.input": "block.output"}`; an input has one driver.
-        exposed: Inputs that the user of the network supplies, `("block.input", ...)`.
+        wires: `{"block.input": "block.output"}`, of equal unit and shape; an input has one
+            driver.
+        exposed: Inputs that the user of the network supplies, `("block.input", ...)`; none by
+            default.
         solve_loops: Solve algebraic loops at every evaluation instead of refusing them.
+
+    Raises:
+        ValueError: If a name is unknown, an input has no driver or two, units or shapes do not
+            fit, or there is an algebraic loop and `solve_loops` is off.
+        TypeError: If the ports of a block are no dict.
+
+    Example:
+        >>> network = systems.Network(
+        ...     {"valve": systems.Lag(0.1), "tube": systems.Lag(0.02)},
+        ...     wires={"tube.a": "valve.value"}, exposed=("valve.a",))
+        >>> sorted(network.outputs)
+        ['tube.value', 'valve.value']
     """
 
     blocks: dict[str, AbstractBlock]

@@ -1,4 +1,4 @@
-"""What contacts did along a motion of rods: how deep, how hard, and what they moved."""
+"""Contacts along a motion of rods: their overlaps, normal forces and generalised forces."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -87,18 +87,23 @@ def show(thing: Any, *at: Any, **options: Any) -> Picture:
     `show.register(Type, function)` adds a noun.
 
     Args:
-        thing: What to draw.
+        thing: What to draw; lengths in [m], shown in mm.
         *at: Coordinates, of a rod, an assembly or a block that holds one.
         **options: Of the function that draws it: `view.options(thing)` is that function.
             Solid pictures take `view=` ("iso", "front", "top", ..., or a `Camera`) and
             `renderer=`; bodies take `field=`; all take `title=`.
+
+    Returns:
+        A picture, with `save(path)`, `figure` and `png`.
 
     Raises:
         TypeError: If nothing is known about the type.
         ValueError: If the thing cannot be drawn: unbounded, traced, or not finite.
 
     Example:
-        `view.show(solution, field="von_mises").save("finger.pdf")`
+        >>> plate = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1))
+        >>> view.show(plate, title="A plate").save("plate.svg").name
+        'plate.svg'
     """
     draw = _known(thing)
     try:

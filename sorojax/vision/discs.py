@@ -1,6 +1,5 @@
-"""Coloured discs in an image: fast search, sub-pixel centres, and the circular Hough way.
-
-Colours of markers: where they are, and how much of a pixel they cover.
+"""Coloured discs in an image: their colours, a fast search with sub-pixel centres, and the
+circular Hough transform.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,6 @@
-"""A robot before a camera: balls in space, in colour and depth, near ones before far ones."""
+"""A synthetic scene before a camera: balls in space, in colour and depth, nearer ones in
+front.
+"""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Pictures with known answers: discs, markers and boards, with blur, noise and hiding."""
+"""Pictures with known answers: discs, markers and boards, with blur, noise and occlusion."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ PAINTS = ((40.0, 40.0, 210.0), (45.0, 190.0, 50.0), (205.0, 70.0, 40.0))
 
 
 class Disturbance(NamedTuple):
-    """What a lens and a sensor do: blur [px] and noise [grey levels], standard deviations."""
+    """Errors of lens and sensor: blur [px] and noise [grey levels], standard deviations."""
 
     blur: float = 0.8
     noise: float = 4.0
@@ -105,7 +105,7 @@ def photograph(
     disturbance: Disturbance,
     random: np.random.Generator,
 ) -> Image:
-    """What the sensor makes of a canvas."""
+    """The image that a sensor makes of a canvas."""
     cv2 = opencv()
     if disturbance.blur > 0:
         canvas = cv2.GaussianBlur(canvas, (0, 0), disturbance.blur)

@@ -1,4 +1,4 @@
-"""The stages of the main job, told as they happen, and its results on disk."""
+"""The stages of the main job, reported as they happen, and its results on disk."""
 
 import shutil
 import tempfile

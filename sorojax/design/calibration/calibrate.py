@@ -1,9 +1,8 @@
-"""Parameters of any model from several experiments at once.
+"""Parameters of any model from several experiments: Levenberg-Marquardt within bounds.
 
-Levenberg-Marquardt within bounds, for residuals that solve equilibria on the host.
-
-A library for traced functions would compile every experiment as one program with callbacks,
-which no cache keeps, and takes no bounds; the residuals here are called as they are.
+Residuals may solve equilibria on the host and are called as they are. A library for traced
+functions would compile every experiment as one program with callbacks, which no cache keeps,
+and takes no bounds.
 
 References:
     More, "The Levenberg-Marquardt algorithm: implementation and theory", Lecture Notes in
@@ -60,7 +59,7 @@ class Linearisation(NamedTuple):
 
 
 class Damping(eqx.Module):
-    """What the method remembers: the damping, its growth at the next failure, and the
+    """Memory of the method: the damping, its growth at the next failure, and the
     largest length of each column of the Jacobian so far."""
 
     value: Float[Array, ""] = eqx.field(converter=real)
@@ -230,30 +229,47 @@ def calibrate(
     on_step: Callable[[CalibrationStep], None] | None = None,
     resume: CalibrationStep | None = None,
 ) -> Calibration:
-    """The parameters whose predictions lie nearest to all experiments, in units of the noise.
+    """The parameters whose predictions are nearest to all experiments, in units of the noise.
 
-    Levenberg-Marquardt with exact derivatives: every experiment is solved once for a step,
-    and all parameters share its factorisation. Trial parameters at which a model has no
-    equilibrium count as a step that was too long. For tensile tables of a rubber
-    `material.fit_tensile` is quicker, and tells up to which stretch the fit is stable.
+    min over p of sum ((predicted(p) - measured) / noise)^2 by Levenberg-Marquardt with exact
+    derivatives: every experiment is solved once for a step, and all parameters share its
+    factorisation. Trial parameters at which a model has no equilibrium count as a step that was
+    too long. For tensile tables of a rubber `material.fit_tensile` is quicker, and says up to
+    which stretch the fit is stable.
 
     Args:
         experiments: The records to fit.
-        start: First guess, a pytree of floating-point arrays.
-        lower, upper: Bounds, like `start`, with one number for each of its parts, or one
-            number for all.
+        start: First guess, a pytree of floating-point arrays, in the units of the model.
+        lower: Lower bounds, like `start`, with one number for each of its parts, or one number
+            for all; none by default.
+        upper: Upper bounds, in the same form.
         logarithmic: Which parameters are fitted by their logarithm: those that are positive
             and known to a factor only, such as moduli. A bool, or bools like `start`.
-        hold_out: Further records, which are only predicted.
+        hold_out: Further records, which are only predicted; none by default.
         steps: Most steps, each with one evaluation of every experiment.
         tolerance: Relative decrease of the misfit, and largest change of a scaled parameter,
-            at which to stop.
-        on_step: Called after every accepted step: progress, checkpoints.
+            at which to stop [-].
+        on_step: Called after every accepted step: progress, checkpoints. Nothing by default.
         resume: A step to go on from instead of `start`.
+
+    Returns:
+        Parameters, their covariance, and the experiments beside their predictions.
 
     Raises:
         ValueError: If a prediction is not finite or has another shape than its record, or a
             first guess lies outside its bounds or is not positive where it has to be.
+
+    Example:
+        >>> time = jnp.linspace(0.0, 1.0, 5)
+        >>> decay = design.Experiment(lambda rate: jnp.exp(-rate * time), jnp.exp(-2 * time),
+        ...                           noise=0.01)
+        >>> found = design.calibrate([decay], jnp.array(1.0))
+        >>> print(f"{float(found.parameters):.3f} +- {float(found.standard_errors):.3f} 1/s")
+        2.000 +- 0.031 1/s
+
+    Reference:
+        More, The Levenberg-Marquardt algorithm: implementation and theory, Lecture Notes in
+        Mathematics 630, 1978; Seber and Wild, Nonlinear Regression, 1989, for the covariance.
     """
     experiments = tuple(experiments)
     if not experiments:

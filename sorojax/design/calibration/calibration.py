@@ -1,11 +1,11 @@
-"""What a calibration found: parameters, how well they are known, and what was not seen.
+"""Experiments (what was measured, how accurately, and what a model predicts), and the result
+of a calibration: parameters, their uncertainty, and the combinations that no reading
+determines.
 
 Uncertainties are those of the linearised model: with the noise n_i of every reading and
 r_i = (predicted - measured) / n_i the covariance is (J'J)^-1 for J = dr/dp.
 
 Reference: Seber & Wild, Nonlinear Regression, 1989, chapters 2 and 5.
-
-Experiments: what was measured, how well, and what a model says to it.
 """
 
 import functools
@@ -74,7 +74,7 @@ class Experiment(eqx.Module):
 
 
 def predicted(experiment: Experiment, parameters: PyTree) -> Float[np.ndarray, "..."]:
-    """What the model says.
+    """The prediction of the model.
 
     Raises:
         ValueError: If it has another shape than what was measured.
@@ -106,7 +106,7 @@ def sensitivity(
 
 
 def evaluated(function: Callable[[], Answer]) -> Answer | None:
-    """What `function` returns, None where the model has no answer."""
+    """Value of `function`, None where the model has no equilibrium or motion."""
     try:
         return function()
     except (ConvergenceError, MotionError):

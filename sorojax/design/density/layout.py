@@ -1,8 +1,5 @@
-"""From the variables of a design to the densities of its cells.
-
-Cells that share a variable: mirrored and repeated layouts.
-
-Stiffness as a function of density.
+"""From design variables to densities of cells (symmetry, filter, projection), and stiffness
+as a function of density.
 
 References:
     Bendsoe, Sigmund, Topology Optimization, 2003.
@@ -151,20 +148,37 @@ def layout(
     void: Int[Any, " cells"] = (),
     threshold: float = 0.5,
 ) -> Layout:
-    """The map from variables to the densities of the cells of `mesh`.
+    """The map from design variables in [0, 1] to the densities of the cells of `mesh`.
+
+    Symmetry, then a filter of weighted means, then a smoothed step (Heaviside projection).
 
     Args:
-        mesh: The cells.
-        radius: Of a cone filter [m]; `smooth` takes any filter instead.
-        smooth: A filter made before, a periodic one for example.
-        symmetries: `Mirrored` and `Repeated`, applied in their order.
-        solid: Cells that are solid in every design.
-        void: Cells that are empty in every design.
-        threshold: Of the projection.
+        mesh: The cells, points [m].
+        radius: Radius of a cone filter [m]; no filter by default.
+        smooth: Any filter in its place, a periodic one for example.
+        symmetries: `Mirrored` and `Repeated`, applied in their order; none by default.
+        solid: Numbers of the cells that are solid in every design; none by default.
+        void: Numbers of the cells that are empty in every design; none by default.
+        threshold: Filtered density at which the projection steps [-].
+
+    Returns:
+        A function of the variables, and of the sharpness of the projection, to one density per
+        cell [-].
 
     Raises:
         ValueError: If `radius` and `smooth` are both given, a cell is solid and void, or the
-            mesh has not the symmetry.
+            mesh does not have the symmetry.
+
+    Example:
+        >>> cells = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1),
+        ...                        element=mesh.Quad4())
+        >>> density = design.layout(cells, radius=15 * mm, solid=np.array([0]))
+        >>> density(jnp.array([0.0, 0.0, 0.0, 1.0])).round(2).tolist()
+        [1.0, 0.2, 0.2, 0.75]
+
+    Reference:
+        Wang, Lazarov and Sigmund, On projection methods, convergence and robust formulations in
+        topology optimization, Struct. Multidisc. Optim. 43, 2011.
     """
     if radius is not None and smooth is not None:
         raise ValueError("layout: got `radius` and `smooth`, need at most one. Drop one.")

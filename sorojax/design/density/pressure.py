@@ -1,28 +1,21 @@
-"""A pressure inside the cells of a fixed mesh, whatever their density.
+"""Fluid pressure on a design whose walls move: in the void that a source can reach (`flood`),
+or by the flow through a porous body (`darcy`).
 
 A cell that fills its volume with a gas of pressure p gains p times the volume that it grows
-by. Between cells of one pressure the forces cancel, so what remains acts where the pressure
-ends: on the walls of the cavity, along their deformed normals, wherever a design puts them.
-
-The void that a source can reach: the chamber of a design while it changes.
-
-Reference: Caasenbrood, Pogromsky, Nijmeijer, "A computational design framework for
-pressure-driven soft robots through nonlinear topology optimization", RoboSoft, 2020.
-
-A pressure that seeps through a design: full in the void that a source reaches, gone
-behind a wall of solid.
-
-The body is taken as porous, its permeability and the drainage of its solid part smooth
-functions of density, so that the field and the walls that it presses on are differentiable
-in a design. With p the share of the pressure of the sources,
+by. Between cells of one pressure the forces cancel, so the rest acts where the pressure ends:
+on the walls of the cavity, along their deformed normals. In the porous model permeability
+and drainage of the solid are smooth functions of density d, so that field and walls are
+differentiable in a design. With p the share of the pressure of the sources,
 
     div(K(d) grad p) = D(d) p,   K = 1 - (1 - tight) H(d),   D = (ln r / depth)^2 tight H(d),
 
 and in a solid wall the share falls to r = `remainder` within `depth`.
 
-Reference: Kumar, Frouws, Langelaar, "Topology optimization of fluidic pressure-loaded
-structures and compliant mechanisms using the Darcy method", Struct. Multidisc. Optim. 61,
-2020.
+References:
+    Caasenbrood, Pogromsky, Nijmeijer, "A computational design framework for
+    pressure-driven soft robots through nonlinear topology optimization", RoboSoft, 2020.
+    Kumar, Frouws, Langelaar, "Topology optimization of fluidic pressure-loaded structures
+    and compliant mechanisms using the Darcy method", Struct. Multidisc. Optim. 61, 2020.
 """
 
 from typing import Any
@@ -191,7 +184,7 @@ class Flood(eqx.Module):
 
 
 def flood(mesh: Mesh, sources: Numbers, *, threshold: float = 0.1) -> Flood:
-    """What is needed to flood the void of designs on `mesh`.
+    """Data to flood the void of designs on `mesh`.
 
     Args:
         mesh: The cells.

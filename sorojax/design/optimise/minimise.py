@@ -92,27 +92,45 @@ def minimise(
 ) -> Optimised:
     """The design at which `loss` is least while every constraint stays at or below zero.
 
-    Functions are called outside `jit`, so they may solve equilibria; jit them where they
-    can be.
+    min f(x) subject to g_i(x) <= 0, by the method of moving asymptotes unless another optimiser
+    is given. Functions are called outside `jit`, so they may solve equilibria; jit them where
+    they can be.
 
     Args:
-        loss: Function of the design; differentiable in it.
-        start: Where to begin, a pytree of floating-point arrays.
-        constraints: Functions of the design, numbers or vectors, <= 0 where allowed.
-        optimiser: `MMA()` if omitted; `GCMMA`, `OptimalityCriteria`, or any optax optimiser
-            (without constraints).
+        loss: Function of the design that returns a number; differentiable in it.
+        start: Where to begin, a pytree of floating-point arrays in the units of the design.
+        constraints: Functions of the design, numbers or vectors, <= 0 where allowed; none by
+            default.
+        optimiser: `MMA()` by default, whose variables lie between 0 and 1; `GCMMA`,
+            `OptimalityCriteria`, or any optax optimiser (without constraints).
         steps: Most steps.
-        tolerance: Largest change of a variable at which to stop.
+        tolerance: Largest change of a variable at which to stop, in its unit; with a
+            `schedule` all steps are taken.
         schedule: Further arguments of loss and constraints at step k = 0, 1, ...: for
-            continuation, `lambda k: (sharpness(k),)`.
-        change_gradient: Replaces the gradient of the loss, from design and gradient.
-        scale: What the objective is divided by for MMA; its size at the start if omitted.
-        on_step: Called after every step: pictures, checkpoints.
+            continuation, `lambda k: (sharpness(k),)`. None by default.
+        change_gradient: Replaces the gradient of the loss, from design and gradient; the exact
+            one by default.
+        scale: What the objective is divided by for MMA, in its unit; its size at the start by
+            default.
+        on_step: Called after every step: pictures, checkpoints. Nothing by default.
         resume: A step to go on from instead of `start`.
+
+    Returns:
+        Design, objective, constraints, how the search ended and its history.
 
     Raises:
         ValueError: If something is not finite at the start, or an optax optimiser gets
             constraints.
+
+    Example:
+        >>> found = design.minimise(lambda x: jnp.sum((x - 0.7) ** 2), jnp.array([0.2, 0.9]),
+        ...                         constraints=(lambda x: x[0] + x[1] - 1,), steps=30)
+        >>> found.design.round(2).tolist()
+        [0.5, 0.5]
+
+    Reference:
+        Svanberg, The method of moving asymptotes - a new method for structural optimization,
+        Int. J. Numer. Meth. Engng 24, 1987.
     """
     optimiser = MMA() if optimiser is None else optimiser
     constraints = tuple(constraints)

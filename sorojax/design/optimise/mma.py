@@ -1,22 +1,21 @@
 """The method of moving asymptotes and its globally convergent version.
 
-A step replaces objective and constraints by separable convex functions with asymptotes on
-both sides of each variable, and solves that problem by a primal-dual interior-point method
-whose systems have the size of the number of constraints.
+A step replaces objective and constraints by separable convex functions with asymptotes L and
+U on both sides of each variable,
+
+    min sum p_0/(U - x) + q_0/(x - L) + z + sum c y + y^2/2, so that
+    sum p_i/(U - x) + q_i/(x - L) - y_i <= b_i, least <= x <= most, y >= 0, z >= 0,
+
+and solves that problem by a primal-dual interior-point method whose systems have the size of
+the number of constraints.
 
 References:
     Svanberg, "The method of moving asymptotes - a new method for structural
     optimization", Int. J. Numer. Meth. Engng 24, 1987.
     Svanberg, "A class of globally convergent optimization methods based on conservative
     convex separable approximations", SIAM J. Optim. 12, 2002.
-
-The separable convex problem of one step of moving asymptotes.
-
-min sum p_0/(U - x) + q_0/(x - L) + z + sum c y + y^2/2, so that
-    sum p_i/(U - x) + q_i/(x - L) - y_i <= b_i, least <= x <= most, y >= 0, z >= 0.
-
-Reference: Svanberg, "MMA and GCMMA - two methods for nonlinear optimization", KTH
-Stockholm, 2007, for the perturbed optimality conditions and their reduction.
+    Svanberg, "MMA and GCMMA - two methods for nonlinear optimization", KTH Stockholm, 2007,
+    for the perturbed optimality conditions and their reduction.
 """
 
 import abc
@@ -236,7 +235,7 @@ class Values(NamedTuple):
 
 
 class MMAState(eqx.Module):
-    """What the method remembers: asymptotes, the last two designs, how often it was called,
+    """Memory of the method: asymptotes, the last two designs, how often it was called,
     and how curved its functions must be (GCMMA)."""
 
     low: Float[Array, " n"]
@@ -248,7 +247,7 @@ class MMAState(eqx.Module):
 
 
 class AbstractMMA(eqx.Module):
-    """What both versions share: bounds, asymptotes and the convex functions."""
+    """Common part of both versions: bounds, asymptotes and the convex functions."""
 
     if TYPE_CHECKING:  # fields that subclasses have, in their own order
         lower: ClassVar[Float[Array, "..."]]

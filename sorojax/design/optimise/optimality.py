@@ -1,12 +1,11 @@
-"""The optimality-criteria method: the baseline for compliance under one volume constraint.
-
-Reference: Sigmund, "A 99 line topology optimization code written in Matlab", Struct.
-Multidisc. Optim. 21, 2001.
-
-The functions of an optimisation over a flat vector, with their derivatives.
+"""The optimality-criteria method, the baseline for compliance under one volume constraint, and
+the functions of an optimisation over a flat vector with their derivatives.
 
 Functions that are compiled themselves run in one program with everything around them: a step
 of a small layout takes about as long as to start a program.
+
+Reference: Sigmund, "A 99 line topology optimization code written in Matlab", Struct.
+Multidisc. Optim. 21, 2001.
 """
 
 from collections.abc import Callable, Sequence

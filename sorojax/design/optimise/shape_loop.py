@@ -1,5 +1,6 @@
-"""The optimisation of a drawing: nodes follow its dimensions, the mesh is built anew when it
-has to be, and the optimiser never notices."""
+"""Optimisation of the dimensions of a drawing: nodes follow them, the mesh is built anew when
+it has to be, and the memory of the optimiser goes on.
+"""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -88,29 +89,53 @@ def minimise_shape(
     on_step: Callable[[ShapeStep], None] | None = None,
     resume: ShapeStep | None = None,
 ) -> OptimisedShape:
-    """The dimensions at which a number of an equilibrium is least.
+    """The dimensions of a drawing at which a number of an equilibrium is least.
 
     The cells stay while nodes follow the drawing (`mesh.move`), so the derivative is exact,
-    by one more back-substitution. After a step that spoils a cell, or goes farther than the
-    nodes can follow, the new shape is meshed; the memory of the optimiser is of the
-    dimensions and goes on.
+    at the cost of one more back-substitution. After a step that spoils a cell, or goes farther
+    than the nodes can follow, the new shape is meshed; the memory of the optimiser belongs to
+    the dimensions and goes on.
 
     Args:
         loss: From the problem with moved nodes, and the dimensions, to a number: of an
             equilibrium, a path, modes of vibration or a closed loop.
-        start: First dimensions, a pytree of floating-point arrays.
+        start: First dimensions, a pytree of floating-point arrays, lengths in [m].
         drawing: From dimensions to the shape, or to a tuple of it and its interfaces.
         build: From a mesh to the problem; called anew for every mesh.
         size: Wanted length of the sides [m].
         order: Degree of the cells.
         mesher: In place of `size` and `order`: from what `drawing` returns to a mesh.
-        constraints: Functions like the loss, numbers or vectors, <= 0 where allowed.
-        optimiser, steps, tolerance, scale: As in `minimise`.
-        on_step: Called after every step: pictures, checkpoints.
+        constraints: Functions like the loss, numbers or vectors, <= 0 where allowed; none by
+            default.
+        optimiser: As in `minimise`; `MMA()` by default, whose variables lie between 0 and 1.
+        steps: Most steps.
+        tolerance: Largest change of a dimension at which to stop, in its unit.
+        scale: What the objective is divided by for MMA, in its unit; its size at the start by
+            default.
+        on_step: Called after every step: pictures, checkpoints. Nothing by default.
         resume: A step to go on from; gives the bits of the run that was not stopped.
+
+    Returns:
+        Dimensions, objective, history, and the problem at these dimensions.
 
     Raises:
         ValueError: If neither `size` nor `mesher` is given, or as `minimise` and the mesher.
+
+    Example:
+        >>> def cells(drawing):
+        ...     return mesh.rectangle([0, 0], drawing.upper, divisions=(4, 1), order=2)
+        >>> def build(bar):  # held on its left
+        ...     rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45)
+        ...     return fem.problem(bar, rubber, kinematics=fem.PlaneStrain(10 * mm),
+        ...                        supports=(fem.Fixed(bar.node_sets["left"]),))
+        >>> def volume(problem, height):  # [cm^3]
+        ...     return 1e6 * 10 * mm * mesh.cell_areas(problem.mesh).sum()
+        >>> found = design.minimise_shape(
+        ...     volume, jnp.array(14 * mm), lambda h: sdf.Rectangle([0, 0], [40 * mm, h]),
+        ...     build, mesher=cells, optimiser=design.MMA(10 * mm, 15 * mm), steps=6,
+        ...     constraints=(lambda problem, h: 5 - volume(problem, h),), tolerance=1e-5)
+        >>> print(f"{float(found.design) / mm:.1f} mm")
+        12.5 mm
     """
     if (size is None) == (mesher is None):
         raise ValueError(

@@ -1,13 +1,9 @@
-"""Compiled assembly: internal force and tangent values in one pass over blocks.
+"""Compiled assembly: internal force and tangent values in one pass over blocks of cells.
 
 Arrays have the cell axis last. Displacement gradients, stresses and tangents are
-elementwise code; the contraction with the shape gradients accumulates one quadrature
-point at a time, so that a block stays in the cache.
-
-Cell forces and matrices of a block from stresses and tangents at its points.
-
-All points are summed in one expression, so that an entry of a cell matrix is written once;
-with sums kept in memory from point to point their traffic costs more than the arithmetic.
+elementwise code. Points are accumulated one at a time for forces, so that a block stays in
+the cache, and in one expression for cell matrices, whose partial sums would cost more in
+memory traffic than in arithmetic.
 """
 
 import functools

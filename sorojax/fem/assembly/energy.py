@@ -1,27 +1,16 @@
-"""Stress and tangent at points, elementwise on the kept entries of F.
+"""Stress and tangent dP/dF at quadrature points, elementwise on the entries of F that can
+differ from the identity; entries that are absent cost nothing.
 
-The tangent may take its geometric parts from a pressure and an isochoric second
+Energies of the first isochoric invariant have a closed form, others are differentiated at the
+point. The tangent may take its geometric parts from a pressure and an isochoric second
 Piola-Kirchhoff stress that are extrapolated linearly from the previous iterate (mixed
-integration point method): the residual is untouched, and Newton's method for nearly
-incompressible solids needs a fraction of the iterations. The rotation of a cell within
+integration point method): the residual is unchanged, and Newton's method for nearly
+incompressible solids needs a fraction of the iterations, since the rotation of a cell within
 an iterate is second order in the update but enters J multiplied by the bulk modulus.
 
 Reference: Magisano, Leonetti, Garcea, "How to improve efficiency and robustness of the
 Newton method in geometrically non-linear structural problem discretized via
 displacement-based finite elements", CMAME 313, 2017.
-
-Three-by-three algebra on the entries of a tensor; what is absent costs nothing.
-
-Energy of the change of shape, its stress and its tangent, over arrays of entries of F.
-
-Energies of the first isochoric invariant have a closed form; any other energy is
-differentiated at the point.
-
-dP/dF at the points of a block, between kept entries of F.
-
-The part that the law of the material fills comes as one dense array for each pair of
-displacement components; the geometric part, most of which is absent, is added entry by
-entry where an entry is read.
 """
 
 from functools import cache, reduce
@@ -335,7 +324,7 @@ def _geometric_places(kind: type[AbstractKinematics]) -> dict[tuple[int, int], t
 
 
 class Body(NamedTuple):
-    """What the energy of a block of cells is made of."""
+    """Data of the energy of a block of cells."""
 
     material: AbstractHyperelastic
     kinematics: AbstractKinematics

@@ -1,11 +1,8 @@
-"""Shape gradients and volumes of the quadrature points, in blocks of cells.
+"""Shape tables, shape gradients and volumes at the quadrature points, in blocks of cells.
 
-Shape tables of a mesh: one for all cells, or for polygons one per number of corners.
-
-Sums over polygons that their quadrature has to get right.
-
-The shape functions of a polygon are rational, so no rule integrates them exactly. Corrected
-by integrals over its straight sides a linear displacement is an equilibrium.
+Polygons have one table per number of corners. Their shape functions are rational, so no rule
+integrates them exactly; gradients are corrected by integrals over straight sides, so that a
+linear displacement is an equilibrium.
 
 Reference: Talischi, Pereira, Menezes, Paulino, "Gradient correction for polygonal and
 polyhedral finite elements", IJNME 102, 2015.
@@ -229,7 +226,7 @@ def geometry(
 
 
 def _of_kinds(table, kinds):
-    """The table of every lane, with the lane axis last (of length 1 if all are alike)."""
+    """The table of every lane, with the lane axis last (of length 1 if all are equal)."""
     if kinds is None:
         return jnp.moveaxis(table, 0, -1)
     return jnp.moveaxis(table[kinds], 0, -1)

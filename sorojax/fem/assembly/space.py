@@ -1,12 +1,10 @@
-"""What depends on the topology of a mesh only: blocks of cells and the sparse pattern.
+"""The displacement space of a mesh (blocks of cells, sparse pattern), and the formulations
+that keep cells from volumetric locking.
 
-Built on the host, outside any trace, once per mesh.
-
-Which pressures a cell can carry: the remedy against volumetric locking.
-
-The volume ratio J is projected onto constants or linear functions of each cell (weighted by
-reference volume), theta = pi J, and the energy is W(F) + U(theta). Its derivative is
-the pressure p = pi U'(theta), so the unknowns stay displacements, and the tangent stays
+The space depends on the topology only and is built on the host once per mesh. In a mixed
+formulation the volume ratio J is projected onto constants or linear functions of each cell
+(weighted by reference volume), theta = pi J, and the energy is W(F) + U(theta). Its derivative
+is the pressure p = pi U'(theta), so the unknowns stay displacements, and the tangent stays
 symmetric, positive definite at stable states.
 
 Reference: Simo, Taylor, Pister, "Variational and projection methods for the volume

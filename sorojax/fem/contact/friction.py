@@ -1,10 +1,9 @@
-"""What a contact remembers from step to step: friction, and overlap that is let out.
+"""The state of a contact between steps: friction, and overlap that is relaxed.
 
-Pressure and normal of friction are those that a point felt in the step before, which keeps the
-tangent symmetric. So the impulse of friction on points that slide is the coefficient times the
-normal one, a step later, whether steps resolve an impact or not.
-
-A contact that has touched nothing yet, and one in a motion that begins.
+Pressure and normal of friction are those of the step before, which keeps the tangent
+symmetric. So the friction impulse on sliding points is the coefficient times the normal
+impulse, one step later, whether steps resolve an impact or not. Also the state of a contact
+that has touched nothing yet, and of one in a motion that begins.
 """
 
 import dataclasses

@@ -1,6 +1,5 @@
-"""Contact of a body with a shape that does not deform.
-
-Facets in contact: their areas, their size, the law that suits them, and their order.
+"""Contact of a body with a shape that does not deform: its facets, their areas and sizes, and
+the penalty law that suits them.
 """
 
 import dataclasses

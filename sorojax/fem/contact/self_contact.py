@@ -1,6 +1,5 @@
-"""Contact of deformable surfaces with each other: self-contact, and body with body.
-
-Facets on the two sides of one wall, which are near each other but never meet.
+"""Contact of deformable surfaces with each other: self-contact and contact of two bodies.
+Facets on the two sides of one wall, which are near each other but never meet, are excluded.
 """
 
 import dataclasses

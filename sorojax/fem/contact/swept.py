@@ -1,4 +1,4 @@
-"""Whether a step took points of a body through an obstacle, or gained energy in contact."""
+"""Whether a step moved points of a body through an obstacle, or gained energy in contact."""
 
 import jax
 import jax.numpy as jnp

@@ -1,6 +1,5 @@
-"""Damping of a moving body: matrices C in the pattern of the tangent, force -C v.
-
-Mass matrices: consistent in the pattern of the tangent, lumped on the diagonal.
+"""Mass matrices, consistent or lumped on the diagonal, and damping matrices C, force -C v, in
+the sparsity pattern of the tangent.
 
 Reference: Hinton, Rock, Zienkiewicz, "A note on mass lumping and related processes in
 the finite element method", Earthquake Engineering & Structural Dynamics 4, 1976.

@@ -1,4 +1,6 @@
-"""A motion on the host: steps of the grid, halved where they fail or err, grown again."""
+"""Time integration on the host: steps of a grid, halved where they fail or their error is too
+large, and grown again.
+"""
 
 import dataclasses
 from collections.abc import Callable

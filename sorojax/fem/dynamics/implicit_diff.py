@@ -1,10 +1,10 @@
-"""A motion as a function of the numbers of its dynamics, for every transformation.
+"""Motion as one differentiable operation of the numbers of its dynamics.
 
-One operation stands for the run: with concrete numbers it steps on the host, lane after
-lane under `vmap`; inside a trace it becomes the loop of `dynamics_traced`. Its derivative
-is that of the discrete equations, step by step with the exact tangent at each solved
-displacement: one assembly, one factor and one back-substitution for each direction. In
-reverse the solved displacements are the checkpoints.
+With concrete numbers it steps on the host, one batch member after another under `vmap`; inside
+a trace it is the compiled loop of `jit`. Its derivative is that of the discrete equations,
+step by step with the exact tangent at each solved displacement: one assembly, one factor and
+one back-substitution for each direction. In reverse the solved displacements are the
+checkpoints.
 """
 
 from typing import Any

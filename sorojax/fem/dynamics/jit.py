@@ -1,7 +1,7 @@
-"""A motion inside a trace: the rules of `dynamics_host` as one loop, and its replay.
+"""A motion inside a trace: the step rules of `host` as one compiled loop, and its replay.
 
-A motion is known by the displacements that its steps solved for: all else follows from them
-by sums, so that nothing but these is kept for a derivative.
+All states follow by sums from the displacements that the steps solved for, so only these are
+kept for a derivative.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Time integration methods of second order, as coefficients of one family.
+"""Time integration methods of second order.
 
 A step from n to n + 1 of size h solves, with x_c = (1 - c) x_(n+1) + c x_n,
 
@@ -6,19 +6,15 @@ A step from n to n + 1 of size h solves, with x_c = (1 - c) x_(n+1) + c x_n,
     u_(n+1) = u_n + h v_n + h^2 ((1/2 - beta) a_n + beta a_(n+1)),
     v_(n+1) = v_n + h ((1 - gamma) a_n + gamma a_(n+1)).
 
+The energy-momentum method takes the stress dE/dC at the mean C = F'F of the states before and
+after, plus the multiple of the increment of C that makes its work the increment of energy.
+
 References:
     Chung, Hulbert, "A time integration algorithm for structural dynamics with improved
     numerical dissipation: the generalized-alpha method", J. Appl. Mech. 60, 1993.
     Newmark, "A method of computation for structural dynamics", J. Eng. Mech. 85, 1959.
-
-Stresses that conserve energy over a step: the discrete gradient of the stored energy.
-
-The stored energy of a cell is a function of C = F'F at its points. With the mean C of the
-states before and after, the stress is dE/dC there plus the multiple of the increment of C
-that makes its work the increment of energy.
-
-Reference: Gonzalez, "Exact energy and momentum conserving algorithms for general models in
-nonlinear elasticity", CMAME 190, 2000.
+    Gonzalez, "Exact energy and momentum conserving algorithms for general models in
+    nonlinear elasticity", CMAME 190, 2000.
 """
 
 import abc

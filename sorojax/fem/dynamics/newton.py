@@ -1,13 +1,10 @@
 """Newton's method for one time step, on the host.
 
 A factor is kept from iteration to iteration and from step to step as long as each solve
-with it takes the residual down well: a residual and a back-substitution cost a fraction of
-a tangent and its factor. A step that raises the energy is shortened.
-
-Inertia and damping of a step by products on the host.
-
-A product there takes a quarter of the time of the compiled one, which scatters every entry of
-the pattern twice.
+with it reduces the residual well: a residual and a back-substitution cost a fraction of
+a tangent and its factor. A step that raises the energy is shortened. Products with inertia
+and damping are made on the host, in a quarter of the time of compiled ones, which scatter
+every entry of the pattern twice.
 """
 
 import dataclasses
@@ -34,7 +31,7 @@ Values = Float[np.ndarray, " nnz"]
 
 
 class Numbers(NamedTuple):
-    """What inertia and damping of a step depend on.
+    """Data of the inertia and damping of a step.
 
     Attributes:
         damping: C [N s/m], where it is not the same in every step.
@@ -96,7 +93,7 @@ class HostInertia:
         return self._pull - self._matrix @ (u - self.origin).ravel()
 
     def taken(self, u: Float[np.ndarray, "nodes dim"]) -> float:
-        """What damping takes in a step whose forces act at `u` [J]."""
+        """Energy that damping dissipates in a step whose forces act at `u` [J]."""
         if not self._damped:
             return 0.0
         moved = (u - self.origin).ravel()
@@ -366,7 +363,7 @@ class StepSolver:
                 secants.add((u - before).ravel(), change)
 
     def _to_move(self, u, held):
-        """What known unknowns have to move yet [m], and whether any has."""
+        """Remaining prescribed displacement [m], and whether there is any."""
         if self.free:
             return 0.0, False
         move = np.where(self.known, held - u.ravel(), 0.0)

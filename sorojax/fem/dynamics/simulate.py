@@ -1,4 +1,4 @@
-"""Motion of a body: the door to time integration."""
+"""`simulate`: motion of a body in time, with its loads and supports as functions of time."""
 
 import dataclasses
 from collections.abc import Callable
@@ -64,37 +64,57 @@ def simulate(
     throw: bool = True,
     **histories: History,
 ) -> Motion:
-    """Motion of `problem` for `duration` [s] in steps of `step` [s].
+    """Motion of a body in time: M u'' + C u' + f_int(u) = f_ext(t).
 
-    Every step is the equilibrium of the body with its inertia and damping, solved by
-    Newton's method; one that does not converge, would invert a cell or takes a point through
-    the obstacle of a `Contact` is never accepted but halved, and steps grow again afterwards.
+    Implicit steps of second order (generalised-alpha by default). Every step is the equilibrium
+    of the body with its inertia and damping, found by Newton's method; one that does not
+    converge, would invert a cell or takes a point through the obstacle of a `Contact` is
+    halved, and steps grow again afterwards.
 
     Args:
         problem: What moves; its material needs a density.
         duration: How long [s].
-        step: Size of the steps [s], shortened a little where `duration` asks for it.
+        step: Size of the steps [s], shortened a little so that they divide `duration`.
         start: A motion or its `end` to go on from, or displacement [m] and velocity [m/s];
-            at rest without displacement when omitted.
+            at rest without displacement by default.
         method: `GeneralisedAlpha(rho_inf)`, `Newmark(beta, gamma)` or `EnergyMomentum()`;
-            `GeneralisedAlpha(0.5)` when omitted.
-        damping: `Rayleigh(...)`, `KelvinVoigt(...)` or several of them.
+            `GeneralisedAlpha(0.5)` by default.
+        damping: `Rayleigh(...)`, `KelvinVoigt(...)` or several of them; none by default.
         mass: "consistent", or "lumped" on the diagonal.
-        save: Number of saved states, both ends included; every step's when omitted.
+        save: Number of saved states, both ends included; every step's by default.
         adaptive: Halve steps also where their estimated error is more than this share of
-            the largest displacement; `True` is 1e-3.
-        newton: Tolerances; `Newton()` when omitted.
+            the largest displacement [-]; `True` is 1e-3.
+        newton: Tolerances; `Newton()` by default.
         max_cuts: How often a step may be halved in a row.
-        max_steps: Accepted steps at most; when omitted 256 times as many as asked for. Inside
-            a trace, where it is memory, 64 more, and 16 times as many with `adaptive`.
+        max_steps: Accepted steps at most; by default 256 times as many as `duration` / `step`.
+            Inside a trace, where memory is reserved for them, 64 more than asked for, and 16
+            times as many with `adaptive`.
         throw: Raise when a run outside a trace fails, otherwise report it in `status`.
-        **histories: Values of loads and of prescribed supports by name: functions of time
-            [s] or rows with one value for each end of a step. They are taken at the ends of
-            the steps and linear between them.
+        **histories: Values of loads and of prescribed supports by name, in their units:
+            functions of time [s] or arrays with one value for each end of a step. They are
+            taken at the ends of the steps and linear between them.
+
+    Returns:
+        States at the saved times, their energies, and how the run ended.
 
     Raises:
         MotionError: If `throw` and a step failed after all cuts.
         ValueError: If a name, a shape or a number does not fit.
+
+    Example:
+        >>> bar = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1),
+        ...                      element=mesh.Quad9())
+        >>> rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45, density=1000)
+        >>> problem = fem.problem(
+        ...     bar, rubber, kinematics=fem.PlaneStrain(10 * mm),
+        ...     supports=(fem.Fixed(bar.node_sets["left"]),), loads=(fem.Gravity(),))
+        >>> motion = fem.simulate(problem, duration=0.02, step=5e-3)
+        >>> print(f"{float(motion.displacements[-1, :, 1].min()) / mm:.2f} mm")
+        -0.58 mm
+
+    Reference:
+        Chung and Hulbert, A time integration algorithm for structural dynamics with improved
+        numerical dissipation: the generalized-alpha method, J. Appl. Mech. 60, 1993.
     """
     where = "fem.simulate"
     _check.positive(where, "duration", duration, "s", "Give how long to simulate.")

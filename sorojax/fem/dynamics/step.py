@@ -1,9 +1,8 @@
-"""One time step as a problem of equilibrium, and the state after it; pure functions.
+"""One time step as a problem of equilibrium, and the state after it, as pure functions.
 
 Forces act at one displacement u within the step. Velocity and acceleration there are affine
-in u, so that inertia and damping are quadratic potentials beside those of the loads.
-
-What a load may know about the time step that it acts in.
+in u, so that inertia and damping are quadratic potentials beside those of the loads, which
+may depend on the state at the begin of the step (`StepState`).
 """
 
 import dataclasses
@@ -275,7 +274,7 @@ def _work(dynamics: Dynamics, step: Step, loads, u_alpha, d) -> Float[Array, ""]
 
 
 def _taken(dynamics: Dynamics, step: Step, v_alpha, d) -> Float[Array, ""]:
-    """What damping takes in a step [J]."""
+    """Energy that damping dissipates in a step [J]."""
     if step.matrix is None:
         return jnp.zeros((), d.dtype)
     return jnp.sum(_times(dynamics, step.matrix, v_alpha) * d.ravel())

@@ -1,16 +1,9 @@
-"""One solve as data: its arrays, all that is no array, and the record of how it went.
+"""Equilibrium as one differentiable operation of the numbers of a problem.
 
-Equilibrium as a function of the numbers of a problem, for every transformation.
-
-One operation stands for the solve. With concrete numbers it follows the load path on the
-host, lane after lane under `vmap`; inside a trace it becomes the loop of `traced`. Its
-derivative is that of the implicit function (`response`).
-
-How an equilibrium answers to small changes of its numbers: a linear map and its transpose.
-
-The map is R_u du = -R_p dp. With concrete numbers it is one operation, so that tracing a
-derivative stages one operation; the work is done in whichever direction is asked for: one
-compiled program, one factor and one back-substitution.
+With concrete numbers the operation follows the load path on the host, one batch member after
+another under `vmap`; inside a trace it is the compiled loop of `jit`. Its derivative is that
+of the implicit function, R_u du = -R_p dp, and its transpose: one compiled program, one factor
+and one back-substitution, in whichever direction it is asked for.
 """
 
 import copy
@@ -52,7 +45,7 @@ from sorojax.math.linalg import sparse
 
 
 class _Record:
-    """What the host found: one log per solve, lanes in row-major order; none in a trace.
+    """Record of solves on the host: one log each, lanes in row-major order; none in a trace.
     `displacement` is that of a single solve [m]."""
 
     def __init__(self):
@@ -118,7 +111,7 @@ class Solve:
         """The problem in two: the numbers that move and all else, and how they move; `dots`
         are those of the traced leaves.
 
-        What stays is left out of the derivative, so that it costs nothing.
+        Numbers without a derivative are left out, so that they cost nothing.
         """
         count = self.num_problem_leaves
         moved = {
@@ -152,7 +145,7 @@ class Solve:
 
 
 class Equilibrium(NamedTuple):
-    """What the map is made of: the numbers that move, all others, and the state.
+    """Data of the map: the numbers that move, all others, and the state.
 
     `values` are those of the tangent; the first of the `counts` of the solve is one where the
     state is no equilibrium, which has no derivative.

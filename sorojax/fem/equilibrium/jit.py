@@ -1,7 +1,8 @@
-"""Following an equilibrium inside a trace: the rules of `follow` and `newton` as one loop.
+"""Load stepping and Newton's method inside a trace, as one compiled loop.
 
-Every pass of the loop assembles once and does one thing: accept the load level, cut it,
-shorten the last move or take a Newton step with the direct solver behind a callback.
+The rules are those of `load_stepping` and `newton`. Every pass assembles once and does one
+thing: accept the load level, halve it, shorten the last update or take a Newton step with the
+direct solver behind a callback.
 """
 
 from typing import Any, NamedTuple

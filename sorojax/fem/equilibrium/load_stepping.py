@@ -1,12 +1,10 @@
-"""Following an equilibrium from one load to another, on the host, in adaptive steps.
+"""Equilibrium by adaptive load steps on the host, of one problem or of a batch of variants.
 
-Equilibria of many variants of one problem, one after another on the host.
-
-All lanes share the pattern and its symbolic analysis, and the geometry where no lane
-moves a node. A lane starts from its nearest solved neighbour where that pays: the
-neighbour's tangent gives the first guess. What comes out is the equilibrium that its own
-load path leads to: only a stable neighbour serves, and an answer that needs many
-iterations or is not stable itself is thrown away and the load path followed from rest.
+All members of a batch share the pattern and its symbolic analysis, and the geometry where
+none moves a node. A member starts from its nearest solved neighbour where that saves
+iterations: the neighbour's tangent gives the first guess. The result is the equilibrium of
+its own load path: only a stable neighbour serves, and an answer that needs many iterations or
+is not stable is discarded and the load path followed from rest.
 """
 
 from collections.abc import Callable, Iterator, Sequence

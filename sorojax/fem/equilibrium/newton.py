@@ -1,26 +1,16 @@
 """Newton's method at one load level, on the host around compiled kernels.
 
-A step is accepted only if the smallest volume ratio keeps a tenth of its value; else it
+A step is accepted only if the smallest volume ratio keeps a tenth of its value; otherwise it
 is shortened by a closed form. The residual of thin rubber walls may rise by orders of
-magnitude in the first iteration, so it is not forced to fall: the answer is judged by
-update and residual together, and a state that did not converge is never returned as one.
-
-When the factor of an earlier iteration solves for a step of Newton's method.
-
-Quasi-Newton steps: a kept factor, corrected by what the last iterations taught.
-
-A contact that closes or opens changes the tangent by little in rank. The BFGS updates of an
-old factor follow it for one back-substitution and a few scalar products each.
+magnitude in the first iteration, so it need not fall: convergence is judged by update and
+residual together. Steps along which a contact or friction changes its state are shortened by
+a line search on the energy of these loads alone. Where contacts close or open, the tangent
+changes by little in rank: BFGS updates correct a factor of an earlier iteration.
 
 References:
     Matthies, Strang, "The solution of nonlinear finite element equations", Int. J. Num.
     Meth. Eng. 14, 1979.
     Nocedal, Wright, Numerical Optimization, 2006, algorithm 7.4.
-
-Shortening Newton steps that run past the place where a contact or friction gives way.
-
-Only the energy of those loads is searched along a step. That of a nearly incompressible
-body misleads: in thin walls it rises steeply in iterations that are good all the same.
 """
 
 from collections import deque

@@ -81,7 +81,7 @@ class Path(eqx.Module):
 
 
 def _unstable(records: Any) -> list[str]:
-    """What a print says of states that are in balance without being stable."""
+    """Lines of a print about states that are in balance without being stable."""
     steps = [r.steps[-1] for r in records or () if isinstance(r, Stats) and r.steps]
     if not any(step.negative_eigenvalues > 0 for step in steps):
         return []
@@ -109,28 +109,48 @@ def solve(
     max_cuts: int = 10,
     throw: bool = True,
 ) -> Solution:
-    """Static equilibrium of `problem`.
+    """Static equilibrium of `problem` by Newton's method on the residual of virtual work.
 
     All loads and prescribed displacements grow together from zero, first in `steps` equal
-    steps; a step that fails is cut in half, and steps grow again on easy ground. The
-    answer does not depend on the steps unless the equilibrium is not unique.
+    steps; a step that fails is halved, and steps grow again where iterations are few. The
+    answer does not depend on the steps unless the equilibrium is not unique. Its derivative is
+    that of the implicit function: K du = -dR/dp dp with the tangent K at the solution.
 
     Works under `jit`, `vmap`, `grad` and their compositions. `vmap` outside `jit` is the
-    fast way through many samples: a lane starts from its nearest solved neighbour where
-    that pays. A lane that fails leaves the others alone and has NaN for derivatives.
+    fast way through many samples: each may start from its nearest solved neighbour. A sample
+    that fails does not disturb the others and has NaN for derivatives.
 
     Args:
         problem: What to solve; differentiable in each of its numbers.
-        start: Displacement to start from at full load, instead of stepping [m]; where it is
-            too far away the load is followed from rest. The answer has no derivative by it.
-        newton: Tolerances; `Newton()` when omitted.
+        start: Displacement [m] to start from at full load; where it is too far away the loads
+            are stepped from rest. The answer has no derivative with respect to it. By
+            default the loads grow from zero.
+        newton: Tolerances; `Newton()` by default.
         steps: Number of equal load steps to try first.
         max_cuts: How often a step may be halved in a row.
         throw: Raise when no equilibrium is found, otherwise report it in `status`. Under
-            `jit` and `vmap` nothing is raised: look at `status`.
+            `jit` and `vmap` nothing is raised: check `status`.
+
+    Returns:
+        The displacement [m], how the search ended, and a record of its steps.
 
     Raises:
         ConvergenceError: If `throw` and a step failed after all cuts.
+
+    Example:
+        >>> bar = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1),
+        ...                      element=mesh.Quad9())
+        >>> rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45, density=1000)
+        >>> problem = fem.problem(
+        ...     bar, rubber, kinematics=fem.PlaneStrain(10 * mm),
+        ...     supports=(fem.Fixed(bar.node_sets["left"]),),
+        ...     loads=(fem.Force(bar.node_sets["right"], [0, -0.02], name="push"),))
+        >>> solution = fem.solve(problem)
+        >>> print(f"{float(solution.displacement[:, 1].min()) / mm:.2f} mm")
+        -0.44 mm
+
+    Reference:
+        Wriggers, Nonlinear Finite Element Methods, 2008, chapter 5.
     """
     settings = (Newton() if newton is None else newton, steps, max_cuts)
     return solved_and_kept(problem, start, settings, throw)[0]
@@ -174,21 +194,39 @@ def solve_path(
     throw: bool = True,
     **values: Float[Array, "steps ..."],
 ) -> Path:
-    """Equilibria for a row of values of one named load, the others held.
+    """Equilibria for a sequence of values of one named load, the others held.
 
-    `solve_path(problem, air=jnp.linspace(0, 20 * kPa, 21))` sets the load named "air".
+    Newton's method from state to state with the tangent as predictor; a step that fails is
+    halved. Every state is differentiable as that of `solve`.
 
     Args:
         problem: The problem; differentiable in each of its numbers.
-        newton: Tolerances; `Newton()` when omitted.
+        newton: Tolerances; `Newton()` by default.
         max_cuts: How often a step between two values may be halved in a row.
         throw: Raise when a value has no equilibrium, otherwise stop the path there. Under
-            `jit` and `vmap` nothing is raised: look at `status`.
-        **values: One load by name, with one value per state.
+            `jit` and `vmap` nothing is raised: check `status`.
+        **values: One load by name, with one value per state in the unit of the load, as in
+            `solve_path(problem, air=jnp.linspace(0, 20 * kPa, 21))`.
+
+    Returns:
+        Displacements [m], values, and how each search ended.
 
     Raises:
         ConvergenceError: If `throw` and a step failed after all cuts.
-        ValueError: If not exactly one existing load is named.
+        ValueError: If not exactly one existing load is named, or its values have the wrong
+            shape or are not finite.
+
+    Example:
+        >>> bar = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1),
+        ...                      element=mesh.Quad9())
+        >>> rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45, density=1000)
+        >>> problem = fem.problem(
+        ...     bar, rubber, kinematics=fem.PlaneStrain(10 * mm),
+        ...     supports=(fem.Fixed(bar.node_sets["left"]),),
+        ...     loads=(fem.Force(bar.node_sets["right"], [0, -0.02], name="push"),))
+        >>> path = fem.solve_path(problem, push=jnp.array([[0, -0.01], [0, -0.02]]))
+        >>> [round(float(u[:, 1].min()) / mm, 2) for u in path.displacements]
+        [-0.22, -0.44]
     """
     name, row = _named_values(problem, values)
     newton = Newton() if newton is None else newton

@@ -1,9 +1,7 @@
-"""Equilibrium with closed cavities, differentiable by the implicit function theorem.
+"""Equilibrium of bodies with closed cavities, differentiable by the implicit function theorem.
 
-Closed cavities: what is inside them, and equilibrium with it.
-
-The pressure of a cavity is an unknown that a law of its contents determines: a given
-volume of liquid, or a gas. The tangent is bordered by one row per cavity.
+The pressure of a cavity is an unknown that its contents determine: a given volume of liquid,
+or a gas. The tangent is bordered by one row per cavity.
 """
 
 import abc
@@ -31,7 +29,7 @@ from sorojax.math.status import Status
 
 
 class AbstractContents(eqx.Module):
-    """What fills a cavity: the volume that it takes at a pressure."""
+    """The contents of a cavity: the volume that they take at a pressure."""
 
     @abc.abstractmethod
     def volume_at(self, pressure: Float[Array, ""]) -> Float[Array, ""]:
@@ -251,26 +249,48 @@ def solve_volume(
     throw: bool = True,
     **contents: AbstractContents | float,
 ) -> CavitySolution:
-    """Static equilibrium of a body whose cavities hold given contents.
+    """Static equilibrium of a body whose cavities hold a given volume or a sealed gas.
 
-    `solve_volume(problem, air=20e-6)` gives the cavity of the `Pressure` called "air" a
-    volume, `air=Gas(15e-6)` seals it with air at rest; its pressure is found. States past
+    The pressure of each cavity is an unknown beside the displacements; one equation per cavity
+    says that its volume is that of its contents (a bordered Newton system). States past
     the largest pressure are reached like any other. The values that these loads have in
     `problem` do not matter; other loads and supports act as they are.
 
     Args:
         problem: Differentiable in each of its numbers, as are the contents.
-        start: A solution of the same mesh to start from, instead of rest. The answer has no
-            derivative by it.
-        newton: Tolerances; `Newton()` when omitted.
+        start: A solution of the same mesh to start from; at rest by default. The answer has no
+            derivative with respect to it.
+        newton: Tolerances; `Newton()` by default.
         steps: Number of equal steps of the volume to try first.
         max_cuts: How often a step may be halved in a row.
         throw: Raise when no equilibrium is found, otherwise report it in `status`.
-        **contents: By name of a load: a volume [m^3], `Liquid` or `Gas`.
+        **contents: By name of a `Pressure`: a volume [m^3] that is prescribed, `Liquid(...)`,
+            or `Gas(15e-6)` for 15 cm^3 of air sealed at ambient pressure.
+
+    Returns:
+        Displacement [m], gauge pressures [Pa] and volumes [m^3] of the cavities, and how the
+        search ended.
 
     Raises:
         ConvergenceError: If `throw` and a step failed after all cuts.
         ValueError: If a name is no pressure of the problem, or under `jit` or `vmap`.
+
+    Example:
+        >>> grid = mesh.rectangle([0, 0], [60 * mm, 12 * mm], divisions=(6, 4),
+        ...                       element=mesh.Quad4())
+        >>> tube = mesh.kept(grid, np.delete(np.arange(24), [6, 10, 14, 18]))  # with a chamber
+        >>> wall = mesh.facets_on(tube, sdf.Rectangle([10 * mm, 6 * mm], [50 * mm, 9 * mm]))
+        >>> problem = fem.problem(
+        ...     tube, material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45, density=1000),
+        ...     kinematics=fem.PlaneStrain(20 * mm), loads=(fem.Pressure(wall, name="air"),),
+        ...     supports=(fem.Fixed(tube.node_sets["left"]),))
+        >>> filled = fem.solve_volume(problem, air=2.8e-6)  # 2.4 cm^3 at rest
+        >>> print(f"{float(filled.pressures[0]) / kPa:.2f} kPa")
+        0.61 kPa
+
+    Reference:
+        Crisfield, A fast incremental/iterative solution procedure that handles "snap-through",
+        Computers & Structures 13, 1981, for the bordered system.
     """
     names, filled = _checked(problem, contents)
     log = Log(Newton() if newton is None else newton, steps, max_cuts)

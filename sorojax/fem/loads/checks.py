@@ -1,4 +1,4 @@
-"""What `fem.problem` refuses of loads."""
+"""Checks of the loads that `fem.problem` is given."""
 
 import dataclasses
 from typing import Any

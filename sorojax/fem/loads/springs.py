@@ -1,4 +1,6 @@
-"""Springs: from node to node, from nodes to the ground, and a bed of linear springs."""
+"""Springs from node to node and from nodes to the ground, a bed of linear springs, tendons and
+cables.
+"""
 
 from typing import TYPE_CHECKING, ClassVar
 

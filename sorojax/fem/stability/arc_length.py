@@ -1,25 +1,22 @@
-"""Steps of given length along a path of equilibria, over limit points.
+"""Arc-length steps along a path of equilibria, and Newton's method with a few further
+unknowns.
 
-The unknowns are the displacement and a load factor. A step ends on the plane that is
-normal to the path at its start, at a given distance of displacement.
-
-Reference: Riks, "An incremental approach to the solution of snapping and buckling
-problems", Int. J. Solids and Structures 15, 1979.
-
-Newton's method for equilibrium together with a few further unknowns.
-
-The unknowns y, a load factor or the pressures of cavities, obey one further equation
-each. The bordered system
+The unknowns are the displacement and a load factor (or the pressures of cavities) y, which
+obey one further equation each. An arc-length step ends on the plane that is normal to the
+path at its start, at a given distance of displacement. The bordered system
 
     [K  B] [du]     [R]
     [C' D] [dy] = - [c]
 
 is solved by block elimination: all right-hand sides take one factor of K, whose
 sparse pattern stays that of the mesh. K may be indefinite; it is singular only at
-isolated points of a path, on which no iterate falls but by accident.
+isolated points of a path.
 
-Reference: Crisfield, "A fast incremental/iterative solution procedure that handles
-snap-through", Computers & Structures 13, 1981.
+References:
+    Riks, "An incremental approach to the solution of snapping and buckling problems",
+    Int. J. Solids and Structures 15, 1979.
+    Crisfield, "A fast incremental/iterative solution procedure that handles
+    snap-through", Computers & Structures 13, 1981.
 """
 
 from collections.abc import Callable

@@ -29,21 +29,41 @@ def critical_loads(
     factor: float = 0.0,
     count: int = 1,
 ) -> CriticalLoads:
-    """Linear buckling: (K + (f - factor) dK/df) phi = 0 about an equilibrium.
+    """Linear buckling about an equilibrium: (K + (f - factor) dK/df) phi = 0.
 
-    dK/df is the derivative of the tangent along the path of equilibria. A prediction: the
-    nearer to the critical point the state, the better. `continuation` finds the point. Found
-    on the host from concrete numbers; no derivative goes through.
+    dK/df is the derivative of the tangent along the path of equilibria, by central differences.
+    The result is a prediction: the nearer the state is to the critical point, the better.
+    `continuation` finds the point itself. Runs on the host with concrete numbers; it has no
+    derivative.
 
     Args:
         problem: Its loads and supports at factor one.
-        name: The load that grows; all loads and prescribed displacements when omitted.
-        displacement: A stable equilibrium at `factor` [m]; at rest when omitted.
-        factor: Load factor of `displacement`.
+        name: The load that grows; all loads and prescribed displacements by default.
+        displacement: A stable equilibrium at `factor` [m]; zero by default.
+        factor: Load factor of `displacement` [-].
         count: Number of critical factors above `factor`.
 
+    Returns:
+        Critical load factors [-], nearest first, and modes with a largest entry of one; fewer
+        than `count` where the load does not reduce the stiffness.
+
     Raises:
-        ValueError: If the state is unstable, or no load has that name.
+        ValueError: If the state is unstable, the displacement has the wrong shape, or no load
+            has that name.
+
+    Example:
+        >>> column = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1),
+        ...                         element=mesh.Quad9())
+        >>> rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45, density=1000)
+        >>> problem = fem.problem(
+        ...     column, rubber, kinematics=fem.PlaneStrain(10 * mm),
+        ...     supports=(fem.Fixed(column.node_sets["left"]),),
+        ...     loads=(fem.Force(column.node_sets["right"], [-1, 0]),))
+        >>> print(f"{float(fem.critical_loads(problem).factors[0]):.2f} N")  # Euler: 1.61 N
+        1.60 N
+
+    Reference:
+        Bathe, Finite Element Procedures, 1996, section 6.8.2.
     """
     where = "fem.critical_loads"
     u = jnp.zeros_like(problem.mesh.points) if displacement is None else real(displacement)

@@ -1,7 +1,5 @@
-"""Paths of equilibria over limit points and through bifurcations, their critical points
-located, and the branches that leave them.
-
-Limit points and bifurcations between two states of a path.
+"""Paths of equilibria over limit points and through bifurcations: their critical points are
+located between two states, and the branches that leave them can be followed.
 """
 
 from collections.abc import Callable
@@ -178,28 +176,49 @@ def continuation(
     max_cuts: int = 10,
     locate_critical_points: bool = True,
 ) -> Continuation:
-    """The path of equilibria of a growing load, by steps of arc length.
+    """The path of equilibria under a growing load, by arc-length steps.
 
-    Neither load nor displacement is prescribed: where the load has a maximum the path goes
-    on down, through unstable states too. The last state is where `until` first holds, by
-    default the first at or beyond the full load. Found on the host from concrete numbers; no
-    derivative goes through.
+    A step has a given length of displacement; the load factor is an unknown. So where the load
+    has a maximum the path goes on down, through unstable states too. The last state is where
+    `until` first holds. Runs on the host with concrete numbers; it has no derivative.
 
     Args:
         problem: Its loads and supports at factor one.
-        name: The load that grows; all loads and prescribed displacements when omitted.
-        step: Load factor of the first step; later ones follow the iterations.
-        largest_step: Largest movement of a node between two states [m].
+        name: The load that grows; all loads and prescribed displacements by default.
+        step: Load factor of the first step [-]; later ones follow the iterations.
+        largest_step: Largest movement of a node between two states [m]; no limit by default.
         max_states: States at most, the first included.
-        until: Tells from displacement [m] and load factor whether to stop.
+        until: Says from displacement [m] and load factor whether to stop; by default at the
+            first state at or beyond the full load.
         start: A path to go on with, or one of its critical points: a bifurcation is left
-            along its mode, in the opposite direction if `step` is negative.
-        newton: Tolerances; `Newton()` when omitted.
+            along its mode, in the opposite direction if `step` is negative. At rest by
+            default.
+        newton: Tolerances; `Newton()` by default.
         max_cuts: How often a step may be halved in a row.
         locate_critical_points: Find limit points and bifurcations between states.
 
+    Returns:
+        Displacements [m], load factors, stability and critical points along the path; its
+        `status` says whether it was stopped by a step that failed.
+
     Raises:
-        ValueError: If no load has that name, or a step is no number.
+        ValueError: If no load has that name, or a step is zero or not finite.
+
+    Example:
+        >>> bar = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1),
+        ...                      element=mesh.Quad9())
+        >>> rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45, density=1000)
+        >>> problem = fem.problem(
+        ...     bar, rubber, kinematics=fem.PlaneStrain(10 * mm),
+        ...     supports=(fem.Fixed(bar.node_sets["left"]),),
+        ...     loads=(fem.Force(bar.node_sets["right"], [0, -0.02], name="push"),))
+        >>> path = fem.continuation(problem, step=0.5)
+        >>> bool(path.factors[-1] >= 1), path.negative_eigenvalues.tolist()[-1]
+        (True, 0)
+
+    Reference:
+        Riks, An incremental approach to the solution of snapping and buckling problems, Int. J.
+        Solids Structures 15, 1979; Crisfield, Comput. Struct. 13, 1981.
     """
     where = "fem.continuation"
     loading = Loading(where, problem, name)

@@ -1,6 +1,5 @@
-"""Small vibrations about an equilibrium, and motion reduced to a few of their modes.
-
-How eigenvalues and shapes move with the numbers of a problem.
+"""Small vibrations about an equilibrium, motion reduced to a few modes, and derivatives of
+eigenvalues and shapes in the numbers of a problem.
 
 Reference: Nelson, "Simplified calculation of eigenvector derivatives", AIAA Journal 14,
 1976.
@@ -193,16 +192,35 @@ def eigenmodes(
     """The lowest vibration modes about an equilibrium: K phi = omega^2 M phi.
 
     K is the tangent there, load stiffness included, and may be indefinite. Eigenvalues and
-    shapes are differentiable in every number of the problem and in the displacement, so pass
-    that of `fem.solve` for derivatives that see the equilibrium move; outside `jit`.
+    shapes are differentiable in every number of the problem and in the displacement: pass
+    that of `fem.solve` for derivatives that include the change of the equilibrium. Not under
+    `jit`.
 
     Args:
-        problem: The body with the loads that hold it there.
-        displacement: The equilibrium [m]; at rest when omitted.
+        problem: The body with the loads that hold it there; its material needs a density.
+        displacement: The equilibrium [m]; zero by default.
         count: Number of modes.
 
+    Returns:
+        Eigenvalues omega^2 [1/s^2], rising, and shapes of unit modal mass [1/sqrt(kg)].
+
     Raises:
-        ValueError: If the material has no density, or `count` is no possible number.
+        ValueError: If the material has no density, the displacement has another shape than the
+            points of the mesh, or `count` is not between 1 and the number of free unknowns.
+
+    Example:
+        >>> bar = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1),
+        ...                      element=mesh.Quad9())
+        >>> rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45, density=1000)
+        >>> problem = fem.problem(bar, rubber, kinematics=fem.PlaneStrain(10 * mm),
+        ...                       supports=(fem.Fixed(bar.node_sets["left"]),))
+        >>> modes = fem.eigenmodes(problem, count=1)
+        >>> print(f"{float(modes.frequencies[0]):.1f} Hz")
+        33.8 Hz
+
+    Reference:
+        Ericsson and Ruhe, The spectral transformation Lanczos method, Math. Comp. 35, 1980;
+        Nelson, Simplified calculation of eigenvector derivatives, AIAA J. 14, 1976.
     """
     return _modes("fem.eigenmodes", problem, displacement, count, True)
 

@@ -2,7 +2,7 @@
 
 It does what a direct factorisation does for a symmetric system, without leaving the
 device: the answer, derivatives and batches by transformations, and a count of negative
-eigenvalues. A system that is not solved is told apart from one that is.
+eigenvalues. The status says whether a system is solved.
 """
 
 import functools
@@ -63,7 +63,7 @@ class Found(NamedTuple):
 
 
 class _State(NamedTuple):
-    """`exact` tells that r is b - A x itself and not carried along."""
+    """`exact` says whether r is b - A x itself or its update."""
 
     x: Array
     r: Array

@@ -1,6 +1,5 @@
-"""Small dense products and symmetric solves.
-
-The inverse cube root, by a first guess from the bits of a number and Newton-like steps.
+"""Small dense products and symmetric solves, and the inverse cube root (a first guess from the
+bits of a number, then Householder's iteration).
 
 References: Lomont, "Fast inverse square root", 2003, for the guess; Householder, "The
 Numerical Treatment of a Single Nonlinear Equation", 1970, for steps of higher order.

@@ -1,12 +1,11 @@
-"""Solvers on the host: symbolic analysis, the last few factors, who owns them.
-
-Solutions of a linear system by the factor of a neighbouring one.
+"""Direct solvers of one sparsity pattern on the host: the symbolic analysis, the last few
+factors, and solutions by the factor of a neighbouring matrix.
 
 The matrix of the last iterations of Newton's method, or of an adjoint, differs little from
 one that is factored already: conjugate gradients preconditioned with that factor need two or
-three back-substitutions, each a fraction of what a factor costs. Both matrices must be
-positive definite; where the one asked for is not, a search direction or the spectrum that the
-iteration sees (Lanczos) tells.
+three back-substitutions, each a fraction of the cost of a factor. Both matrices must be
+positive definite; where the new one is not, a search direction or the spectrum that the
+iteration sees (Lanczos) shows it.
 
 Reference: Saad, "Iterative Methods for Sparse Linear Systems", 2nd ed., 2003, chapters 6, 9.
 """

@@ -1,18 +1,14 @@
-"""Sparse Cholesky and LDL' through the MKL Pardiso of the `mkl` package.
+"""Direct solvers of sparse symmetric systems on the host: MKL Pardiso, SciPy's SuperLU, and
+banded Cholesky.
 
-oneMKL is closed source but redistributable and optional (the extra `pardiso`).
-The library is found in the package's own file list, loaded once and held to one
-thread; phases are called one by one so that the symbolic analysis is reused.
-
-Reference: oneMKL Developer Reference, "oneMKL PARDISO - Parallel Direct Sparse
-Solver Interface".
-
-Cholesky of matrices with a narrow band: small or slender bodies in the plane.
-
-A sparse factor of a few thousand unknowns spends most of its time on its own bookkeeping. In
-an order that follows the body from end to end it is one call of LAPACK.
+oneMKL is closed source but redistributable and optional (the extra `pardiso`). The library is
+found in the file list of the `mkl` package, loaded once and held to one thread; phases are
+called one by one so that the symbolic analysis is reused. A sparse factor of a few thousand
+unknowns spends most of its time on bookkeeping: small or slender bodies in the plane, in an
+order from end to end, are one banded call of LAPACK.
 
 References:
+    oneMKL Developer Reference, "oneMKL PARDISO - Parallel Direct Sparse Solver Interface".
     Anderson et al., "LAPACK Users' Guide", 3rd ed., 1999: dpbtrf, dpbtrs.
     Gibbs, Poole, Stockmeyer, "An algorithm for reducing the bandwidth and profile of a sparse
     matrix", SIAM J. Numer. Anal. 13, 1976: levels from the far end of a body.

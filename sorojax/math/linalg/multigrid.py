@@ -1,24 +1,16 @@
-"""Multigrid by smoothed aggregation: the index maps of all levels, once per mesh.
+"""Multigrid by smoothed aggregation, as a preconditioner in pure JAX: index maps of all
+levels, made once per mesh, and the numbers on them.
 
 Neighbouring nodes form aggregates, and the rigid motions of an aggregate are the unknowns
-of one node of the next level, which sits at its centre. So the tentative prolongation is a
-closed form of where the centres are, on every level.
+of one node of the next level, at its centre; so the tentative prolongation is a closed form.
+One cycle is a symmetric positive definite map also where the matrix is not definite: the
+smoother is a Chebyshev polynomial that is positive on both sides of zero, and the coarsest
+matrix enters by the absolute values of its eigenvalues. Conjugate gradients can then go on
+and count negative eigenvalues. Lists of different length are stored on lines of fixed width,
+longer ones on several lines whose sums are added: all work is gathers and sums along lines.
 
 Reference: Vanek, Mandel, Brezina, Algebraic multigrid by smoothed aggregation for second
 and fourth order elliptic problems, Computing 56 (1996).
-
-Multigrid as a preconditioner: numbers on the index maps of `aggregation`, in pure JAX.
-
-One cycle is a symmetric positive definite map also where the matrix is not definite: the
-smoother is a Chebyshev polynomial that is positive on both sides of zero, and the coarsest
-matrix enters by the absolute values of its eigenvalues. So conjugate gradients can go on
-and see how many eigenvalues are negative.
-
-Lists of different length as arrays: rows of blocks, and sums of products of blocks.
-
-A list lies on a line of fixed width; a longer one goes on on further lines, whose sums are
-added to its own. All work is then gathers and sums along lines, which suits accelerators
-as well as vector units; a few long rows (ties of a rigid part) do not widen all others.
 """
 
 from typing import NamedTuple
@@ -503,7 +495,7 @@ def _coarse_inverse(maps: Hierarchy, blocks: Float[Array, "blocks a a"]) -> Arra
 
 
 def cycle(levels: Multigrid, r: Float[Array, "nodes unknowns"]) -> Array:
-    """What the preconditioner makes of a residual: one V-cycle from zero."""
+    """The preconditioner applied to a residual: one V-cycle from zero."""
     return _cycle(levels.grids, levels.coarse, r)
 
 

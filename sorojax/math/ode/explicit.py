@@ -1,6 +1,5 @@
-"""Explicit methods for y' = f(t, y), y any pytree, with their stages written out.
-
-One step interface for y' = f(t, y): in loops of fixed ticks, and in diffrax.
+"""The interface of one step for y' = f(t, y), y any pytree, in loops of fixed ticks and in
+diffrax, and explicit Runge-Kutta methods with their stages written out.
 """
 
 import abc
@@ -20,7 +19,7 @@ Field = Callable[[Time, Any], Any]
 
 
 class Step(NamedTuple):
-    """What a step yields.
+    """Result of a step.
 
     Attributes:
         y: The state after it.

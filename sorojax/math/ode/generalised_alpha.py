@@ -46,10 +46,10 @@ class GeneralisedAlpha(AbstractMethod):
     """Generalised-alpha for systems of first and second order, as they stand in a network.
 
     An oscillation much faster than the step keeps `rho_inf` of its size in one step. Positions
-    and velocities of a body are stepped alike, which is the method for structures without its
-    overshoot, and pressures, filters and controllers beside them. Every step is solved by
-    Newton's method with the exact Jacobian and a line search; one that does not converge is
-    halved, at most `max_cuts` times in a row, and never accepted.
+    and velocities of a body are stepped by one rule, which is the method for structures
+    without its overshoot, and pressures, filters and controllers beside them. Every step is
+    solved by Newton's method with the exact Jacobian and a line search; one that does not
+    converge is halved, at most `max_cuts` times in a row, and never accepted.
 
     Attributes:
         rho_inf: 1 keeps fast oscillations, 0 removes them.

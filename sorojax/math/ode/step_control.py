@@ -1,15 +1,12 @@
-"""Step size control of adaptive runs: proportional-integral, tolerances per component.
+"""Length of time steps: proportional-integral control of adaptive runs, halving of steps that
+fail, and a check of runs with fixed steps by step doubling.
 
-Whether the steps of a run are short enough: a few of them made again as two halves.
-
-A run of fixed steps is a scan over its rows, of one or more steps each. Of some rows the scan
-makes two more passes, from the same state by steps of half the length. Their distance from the
-rows is the error of these rows; a run whose errors add up to as much as its motion is
+The check computes some steps again from the same state by two of half the length; their
+distance is the error of these steps. A run whose errors add up to as much as its motion is
 unstable.
 
 Reference:
-    Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, 1993, section II.4,
-    for the estimate by step doubling.
+    Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, 1993, section II.4.
 """
 
 from collections.abc import Callable
@@ -50,7 +47,7 @@ def _paced(seam: Seam) -> Seam:
 
 
 class _Pace(NamedTuple):
-    """What the control remembers: error of the last step, rejections in a row and attempts,
+    """Memory of the control: error of the last step, rejections in a row and attempts,
     and, in a run with an `end`, the step under way and the last one taken."""
 
     before: Float[Array, ""]
@@ -240,7 +237,7 @@ def cut(
     afterwards. A part that did not converge is never accepted: where the end is not reached
     the state before the step comes back, and False.
 
-    Derivatives are those of the parts that were taken, as if chosen beforehand. `attempt`
+    Derivatives are those of the parts that were taken; their choice has none. `attempt`
     closes over nothing that is differentiated.
     """
     walk = _walked(attempt, max_cuts, given, h, state)

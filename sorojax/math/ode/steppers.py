@@ -1,4 +1,4 @@
-"""Fixed-step integrators, for loops whose cost must be known beforehand."""
+"""Fixed-step integrators of second-order equations, M a = f, for loops of known cost."""
 
 import abc
 import functools

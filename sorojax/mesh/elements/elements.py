@@ -1,4 +1,4 @@
-"""Reference elements: leafless markers that carry node order and facets.
+"""Reference elements: static objects without arrays that know node order and facets.
 
 Corners come first, then mid-side nodes. In the plane corners run counter-clockwise and
 a facet is listed as its two corners, domain on the left, then its mid-side node. In

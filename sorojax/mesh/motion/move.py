@@ -1,6 +1,5 @@
-"""Node positions as a differentiable function of a shape, on a fixed topology.
-
-Whether the boundary of a mesh can follow its shape, and whether it did.
+"""Node positions as a differentiable function of a shape on a fixed topology, and whether the
+boundary of a mesh can follow its shape, and did.
 """
 
 import warnings
@@ -131,28 +130,38 @@ def _edges(mesh: Mesh) -> np.ndarray:
 
 
 def move(mesh: Mesh, shape: AbstractSdf, *, interfaces: tuple[AbstractSdf, ...] = ()) -> Mesh:
-    """`mesh` with its nodes moved to fit `shape`, differentiable in the parameters.
+    """`mesh` with its nodes moved to fit `shape`, differentiable in the parameters of `shape`.
 
     Corners move to where their sides meet, nodes on the ridges of a solid stay on both
     sides, the others move along the normal of `mesh` from a place between the shifted
     corners. Interior nodes follow by one Laplace solve with the stiffness of `mesh`;
-    straight sides stay straight. A mesh moved to its own shape stays as it is.
+    straight sides stay straight. A mesh moved to its own shape stays as it is. Derivatives are
+    those of the implicit function f(x) = 0 on the boundary.
 
     The topology does not change: corners may move by a quarter of the edges beside them
     from where they are in `mesh`, and normals turn by less than a right angle. Outside a
-    trace a warning tells when corners go farther, and nodes that miss the new surface are
-    refused; under a trace `distortion` tells when to mesh anew.
+    trace a warning says when corners go farther, and nodes that miss the new surface are
+    refused; under a trace check `distortion` to see when to mesh again.
 
     Args:
         mesh: A concrete mesh whose boundary nodes lie on the zero set, as `triangulate`
             and `tetrahedralise` make it; node sets "corners" and "ridges" are used where
             it has them, sharp turns of the boundary otherwise.
         shape: The new shape, of the same structure; may be traced.
-        interfaces: The new interfaces, in the order given to the mesher.
+        interfaces: The new interfaces, in the order given to the mesher; none by default.
+
+    Returns:
+        The same cells and sets with new points [m].
 
     Raises:
         ValueError: If the mesh is traced, made of polygons, has other interfaces, or
             (outside a trace) if a cell would turn inside out or a node miss the surface.
+
+    Example:
+        >>> cells = mesh.triangulate(sdf.Rectangle([0, 0], [40 * mm, 10 * mm]), size=5 * mm)
+        >>> wider = mesh.move(cells, sdf.Rectangle([0, 0], [40 * mm, 11 * mm]))
+        >>> print(f"{float(wider.points[:, 1].max()) / mm:.1f} mm")
+        11.0 mm
     """
     if is_traced(mesh):
         raise ValueError(
@@ -191,7 +200,7 @@ def _check_upright(points: np.ndarray, mesh: Mesh) -> None:
 
 
 class _Motion(eqx.Module):
-    """What is known of a mesh before the shape is: plans, Laplace problems, straight sides.
+    """The part of a move that no shape enters: plans, Laplace problems, straight sides.
 
     `middles` are nodes that follow the corners `parents` of a cell with `weights`; those
     in `bent` are put on the surface afterwards.

@@ -155,7 +155,7 @@ def facet_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def surface_sides(points, faces, owner, known: np.ndarray | None = None) -> Sides:
     """Sides of `faces` (facets, corners), sharp where two owners or more than two facets
-    meet, or where normals turn by much; `known` tells the nodes that lie on ridges."""
+    meet, or where normals turn by much; `known` holds the nodes that lie on ridges."""
     count, n = faces.shape[1], len(points)
     a, b = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     keys, number = np.unique(

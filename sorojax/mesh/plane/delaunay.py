@@ -1,11 +1,9 @@
-"""Interior points of a plane mesh: hexagonal seeds smoothed over Delaunay triangles.
+"""Triangles inside a closed outline: hexagonal seeds, smoothed over Delaunay triangles, better
+places for the inner nodes of the worst triangles, and edges of the outline put in by
+exchanging diagonals.
 
-Better places for the inner nodes of the worst triangles, on a fixed topology.
-
-Triangles of points that keep given edges, and those inside a closed outline of them.
-
-Edges that a Delaunay triangulation lacks are put in by exchanging diagonals (Sloan, A fast
-algorithm for generating constrained Delaunay triangulations, 1993).
+Reference: Sloan, A fast algorithm for generating constrained Delaunay triangulations,
+Computers & Structures 47, 1993.
 """
 
 from collections import deque

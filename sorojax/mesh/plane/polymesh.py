@@ -1,15 +1,12 @@
-"""Polygonal meshes: Voronoi cells evened out by Lloyd's method, cut at the boundary.
+"""Polygonal meshes: Voronoi cells made even by Lloyd's method and cut by the boundary polygon.
 
-Reference: Talischi, Paulino, Pereira, Menezes, PolyMesher, SMO 45, 2012. There seeds are
-mirrored at the boundary, which fails in walls thinner than a cell; here the cells are
-cut by the boundary polygon, which is exact for every number of cells.
+In PolyMesher seeds are mirrored at the boundary, which fails in walls thinner than a cell; a
+cut is exact for every number of cells. Cells that are not convex are split without new
+points: holes are joined to the outside, ears cut off, and triangles merged again.
 
-Voronoi cells of seeds, cut by a polygon whose sides each lie within one cell.
-
-Polygons with holes split into convex ones, without new points.
-
-Holes are joined to the outside by bridges, ears are cut off, and triangles are merged
-again where the result is convex (Hertel and Mehlhorn, 1983).
+References:
+    Talischi, Paulino, Pereira and Menezes, PolyMesher, SMO 45, 2012.
+    Hertel and Mehlhorn, Fast triangulation of simple polygons, LNCS 158, 1983.
 """
 
 from collections.abc import Callable
@@ -335,22 +332,37 @@ def polymesher(
     iterations: int = 60,
     on_step: Callable[[int, float], None] | None = None,
 ) -> Mesh:
-    """About `count` convex polygons that fill a plane shape.
+    """About `count` convex polygons that fill a plane shape: an even Voronoi diagram.
 
-    Cells of curved boundaries end in chords, one per cell; cells are split at re-entrant
-    corners, at holes inside them, and where a thin gap divides them, so the mesh may
-    have more than `count`. Node set "corners", facet set "boundary".
+    Lloyd's method moves seeds to the centroids of their cells. Cells of curved boundaries end
+    in chords, one per cell; cells are split at re-entrant corners, at holes inside them, and
+    where a thin gap divides them, so the mesh may have more than `count`. Node set "corners",
+    facet set "boundary".
 
     Args:
         shape: A concrete, bounded plane shape.
-        count: Number of Voronoi seeds.
+        count: Number of Voronoi seeds, 2 or more.
         key: Random key of the first seeds.
         iterations: Most steps of Lloyd's method.
         on_step: Called with the number of each step and its Lloyd error: the shift of
-            the seeds over the size of a cell, weighted by area.
+            the seeds over the size of a cell, weighted by area. Nothing is called by default.
+
+    Returns:
+        The mesh, points [m].
 
     Raises:
-        ValueError: If the shape is empty, unbounded or traced, or `count` is below 2.
+        ValueError: If the shape is not plane, empty, unbounded or traced, or `count` is below
+            2.
+
+    Example:
+        >>> plate = sdf.Rectangle([0, 0], [40 * mm, 10 * mm])
+        >>> cells = mesh.polymesher(plate, 8, key=jax.random.key(0), iterations=5)
+        >>> cells.num_cells
+        8
+
+    Reference:
+        Talischi, Paulino, Pereira and Menezes, PolyMesher: a general-purpose mesh generator for
+        polygonal elements written in Matlab, Struct. Multidisc. Optim. 45, 2012.
     """
     if count < 2:
         raise ValueError(f"polymesher: `count` is {count}, need at least 2 cells.")
@@ -373,7 +385,7 @@ def polymesher(
 def _cloud(shape, lower, upper, count: int) -> tuple[np.ndarray, float]:
     """Points of a fine grid inside `shape`, and their area [m^2]."""
     pitch = float(np.sqrt((upper - lower).prod() / (count * _SAMPLES)))
-    for _ in range(2):  # the first grid tells which part of the box is filled
+    for _ in range(2):  # the first grid shows which part of the box is filled
         axes = [np.arange(lower[i] + pitch / 2, upper[i] + pitch / 2, pitch) for i in range(2)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
         inside = grid[values(shape, grid) < 0]

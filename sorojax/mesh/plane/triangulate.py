@@ -1,6 +1,5 @@
-"""From a plane shape to triangles: exact boundary, hexagonal inside, curved sides.
-
-Six-node triangles made from three-node ones, and whether they are valid.
+"""Triangles of a plane shape: points on the exact boundary, hexagonal inside, and with six
+nodes curved sides, checked for inverted cells.
 """
 
 import numpy as np
@@ -77,9 +76,10 @@ def triangulate(
 ) -> Mesh:
     """Triangles that fill a plane shape.
 
-    Boundary points lie on the zero set to rounding, corners included; edges turn at
-    most about 45 degrees on fillets and are split where walls are thinner than they
-    are long. With `order=2` the sides on the boundary and on interfaces are curved.
+    Boundary points lie on the zero set to rounding, corners included; edges turn by at
+    most about 45 degrees on fillets and are split where walls are thinner than the edges
+    are long. The inside starts from a hexagonal pattern and is smoothed over constrained
+    Delaunay triangles. With `order=2` the sides on the boundary and on interfaces are curved.
 
     Node sets of the result: "corners" (also where curves cross) and "interface_0",
     ...; facet sets: "boundary" and "interface_0", ....
@@ -89,11 +89,27 @@ def triangulate(
         size: Wanted length of the sides [m]: a number, or a function of points (n, 2)
             that returns one length per point, such as `grade(...)`.
         order: 1 for `Tri3`, 2 for `Tri6`.
-        interfaces: Shapes whose zero sets become sides of the mesh inside `shape`.
+        interfaces: Shapes whose zero sets become sides of the mesh inside `shape`; none by
+            default.
         iterations: Smoothing steps; more give slightly rounder triangles.
 
+    Returns:
+        The mesh, points [m].
+
     Raises:
-        ValueError: If the shape is empty, unbounded, traced, or not resolved by `size`.
+        ValueError: If the shape is not plane, empty, unbounded, traced, or not resolved by
+            `size`; without float64; or if a curved side would invert its triangle.
+
+    Example:
+        >>> plate = sdf.Rectangle([0, 0], [40 * mm, 10 * mm])
+        >>> cells = mesh.triangulate(plate, size=5 * mm)
+        >>> print(f"{float(mesh.cell_areas(cells).sum()) / mm**2:.3f} mm^2")
+        400.000 mm^2
+
+    Reference:
+        Persson and Strang, A simple mesh generator in MATLAB, SIAM Review 46, 2004, for
+        meshes of signed distances; Sloan, A fast algorithm for generating constrained Delaunay
+        triangulations, Computers & Structures 47, 1993, for edges that must exist.
     """
     if order not in (1, 2):
         raise ValueError(

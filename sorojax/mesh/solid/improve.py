@@ -1,4 +1,4 @@
-"""Flat tetrahedra at the surface taken away, as an exchange of a diagonal of the surface."""
+"""Removal of flat tetrahedra at the surface, which exchanges a diagonal of the surface."""
 
 from typing import NamedTuple
 

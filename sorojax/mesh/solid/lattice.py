@@ -1,11 +1,10 @@
-"""The body-centred cubic lattice over a solid, and tetrahedra cut at its surface.
+"""The body-centred cubic lattice over a solid: graded by bisection of longest edges where a
+size asks for it, and cut into tetrahedra at the surface.
 
-Reference: Labelle and Shewchuk, Isosurface stuffing, SIGGRAPH 2007.
-
-A lattice of tetrahedra graded by bisection of longest edges.
-
-Reference: Arnold, Mukherjee and Pouly, Locally adapted tetrahedral meshes using bisection,
-    SIAM J. Sci. Comput. 22 (2000).
+References:
+    Labelle and Shewchuk, Isosurface stuffing, SIGGRAPH 2007.
+    Arnold, Mukherjee and Pouly, Locally adapted tetrahedral meshes using bisection, SIAM J.
+    Sci. Comput. 22, 2000.
 """
 
 from typing import NamedTuple

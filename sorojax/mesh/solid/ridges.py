@@ -1,7 +1,5 @@
-"""Sharp edges and corners of a solid in its tetrahedra: nodes of the surface moved onto
-the ridge wherever an edge of the surface would cut it off.
-
-Nodes of the surface of tetrahedra put on the ridges that edges would cut off.
+"""Sharp edges and corners of a solid in its tetrahedra: surface nodes are moved onto the ridge
+wherever an edge of the surface mesh would cut it off.
 """
 
 import itertools
@@ -285,7 +283,7 @@ _THIN = np.cos(np.deg2rad(12.0))  # poorest dihedral angle that a split may make
 
 
 class Features(NamedTuple):
-    """What is known of the nodes on ridges.
+    """The nodes on ridges.
 
     Attributes:
         sides: The two sides of every ridge node, three or more of every corner.

@@ -1,6 +1,5 @@
-"""From a solid shape to conforming tetrahedra, without a surface in between.
-
-Ten-node tetrahedra on a shape, and the named sets of a solid mesh.
+"""Conforming tetrahedra of a solid shape, linear or with ten nodes, and the named sets of the
+mesh. No surface mesh is made in between.
 """
 
 import numpy as np
@@ -142,11 +141,11 @@ def tetrahedralise(
 ) -> Mesh:
     """Tetrahedra that fill a solid shape.
 
-    A body-centred cubic lattice is snapped to the surface and cut by it, nodes are put on
-    sharp edges and corners, then nodes of the worst cells are moved. Boundary nodes lie on
-    the zero set; a sharp edge is chamfered within one cell where cells would degenerate.
-    Facet sets: "boundary" and "interface_0", ...; node sets: "ridges" and "corners" of
-    sharp edges, and "interface_0", ...; regions: "inside_0", ... of the cells within each
+    A body-centred cubic lattice is snapped to the surface and cut by it (isosurface stuffing),
+    nodes are put on sharp edges and corners, then nodes of the worst cells are moved. Boundary
+    nodes lie on the zero set; a sharp edge is chamfered within one cell where cells would
+    degenerate. Facet sets: "boundary" and "interface_0", ...; node sets: "ridges" and "corners"
+    of sharp edges, and "interface_0", ...; regions: "inside_0", ... of the cells within each
     interface.
 
     Args:
@@ -155,14 +154,28 @@ def tetrahedralise(
             is thin and cells get too flat all the same, a finer lattice is tried, down to
             0.7 of it. A function of points (n, 3) that returns one length per point, such as
             `grade(...)`, halves the edges of the lattice where it is small.
-        order: 1 for `Tet4`, 2 for `Tet10` with mid-sides of the surface on the zero set
+        order: 1 for `Tet4`, 2 for `Tet10` with mid-side nodes of the surface on the zero set
             wherever the cells stay valid.
-        interfaces: Shapes whose zero sets become facets of the mesh inside `shape`.
+        interfaces: Shapes whose zero sets become facets of the mesh inside `shape`; none by
+            default.
         rounds: Smoothing steps on the worst cells.
 
+    Returns:
+        The mesh, points [m].
+
     Raises:
-        ValueError: If the shape is empty, unbounded, traced, or has walls thinner than
-            `size` can follow; if an interface misses the shape.
+        ValueError: If the shape is not solid, empty, unbounded, traced, or has walls thinner
+            than `size` can follow; if an interface misses the shape.
+
+    Example:
+        >>> block = sdf.Box([0, 0, 0], [20 * mm, 10 * mm, 10 * mm])
+        >>> cells = mesh.tetrahedralise(block, size=5 * mm)
+        >>> print(f"{float(mesh.cell_volumes(cells).sum()) / mm**3:.1f} mm^3")
+        2000.0 mm^3
+
+    Reference:
+        Labelle and Shewchuk, Isosurface stuffing: fast tetrahedral meshes with good dihedral
+        angles, SIGGRAPH 2007.
     """
     where = "tetrahedralise"
     if order not in (1, 2):

@@ -1,20 +1,16 @@
-"""One period of a body as a section of a rod: stiffness, push of its gas, mass.
+"""One period of a body as a section of a rod: stiffness, force of its gas, mass.
 
 A body that repeats along x and is its own mirror image about the middle of each period is
 solved between two planes of symmetry, on which a uniform strain e + k1 y + k2 z is
-prescribed and nothing else; gas presses on the walls in between. Folds and chambers yield as
-they do in the solid, so the numbers are those of the drawing and hold no correction.
+prescribed and nothing else; gas presses on the walls in between. Beyond small strains the
+energy is expanded to the fourth order: it is stationary in the inner displacements, so those
+of first order give the third order, and those of second order, one solution each of the same
+linear system, the fourth: of material, geometry and a gas that follows the walls.
 
-Reference: Kolpakov, Calculation of the characteristics of thin elastic rods with a periodic
-structure, J. Appl. Math. Mech. 55, 1991.
-
-What a cell answers beyond small strains: its energy to the fourth order.
-
-The energy is stationary in the displacements inside of the cell. So those of first order give
-it to the third order, and those of second order, one solution each of the same linear system,
-to the fourth: of the material, of the geometry, and of a gas that follows the walls.
-
-Reference: Koiter, On the stability of elastic equilibrium, Delft, 1945.
+References:
+    Kolpakov, Calculation of the characteristics of thin elastic rods with a periodic
+    structure, J. Appl. Math. Mech. 55, 1991.
+    Koiter, On the stability of elastic equilibrium, Delft, 1945.
 """
 
 from collections.abc import Callable

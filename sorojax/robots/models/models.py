@@ -44,7 +44,7 @@ DAMPING = 3e-3  # s, of a silicone beam let go: arXiv:2201.12560, 0.05 of critic
 
 
 class Making(NamedTuple):
-    """What every model is made with."""
+    """Settings that all models share."""
 
     material: AbstractHyperelastic
     supply: Supply
@@ -78,7 +78,7 @@ def model(
     cell does at large strains: 2 to 3 % off solid finite elements up to 50 kPa. Cells of the
     bending actuator and of fingers answer linearly: the actuator turns by 2 % too much at
     5 kPa and 5 % at 30 kPa.
-    `model(BendingActuator()).network` takes `actuator_valve.setpoint` [Pa] and tells
+    `model(BendingActuator()).network` takes `actuator_valve.setpoint` [Pa] and gives
     `actuator_air.pressure` and `body.tip_position`.
 
     Args:

@@ -92,7 +92,7 @@ def side_by_side(cell: Cell, places: Float[Array, "columns 2"], length) -> Bundl
 
 
 class Stretched(eqx.Module):
-    """What columns store beyond linear answers, at the nodes of a rod.
+    """Energy of columns beyond the linear response, at the nodes of a rod.
 
     Attributes:
         rows: Stretch of each column per coordinate, at every node.

@@ -1,4 +1,4 @@
-"""A body with its air: reservoirs and regulators wired to an assembly, as a board sees it."""
+"""A body with its air supply: the reservoirs and regulators that a valve board drives."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -77,7 +77,7 @@ class Port(NamedTuple):
 
 @displayed
 class Model(eqx.Module):
-    """A robot as a network that takes set-points and tells pressures.
+    """A robot as a network that takes set-points and returns pressures.
 
     Attributes:
         network: Blocks `body`, and `NAME_air` and `NAME_valve` of every port.
@@ -134,7 +134,7 @@ def supplied(
     """A body with a reservoir and a regulator at every port.
 
     Args:
-        body: An `AssemblyBody`, a `FemBody`, or any block that takes `PART_pressure` and tells
+        body: An `AssemblyBody`, a `FemBody`, or any block that takes `PART_pressure` and gives
             `PART_volume` and `PART_volume_rate` of every part that a port names.
         ports: By name.
         supply: Tubes and regulators; `Supply()` if omitted.
@@ -199,19 +199,39 @@ def stepper(
     renew: int = 4,
     method: AbstractMethod | None = None,
 ) -> tuple[Advance, Running]:
-    """The model as something that a valve board drives: `advance(running, setpoint, dt) ->
-    (running, pressures [Pa])`, compiled, and where it starts.
+    """A model of a robot as a compiled function that a valve board drives step by step.
+
+    `advance(running, setpoint, dt) -> (running, pressures)` takes set-points and gives gauge
+    pressures [Pa], one per regulator. The network is integrated by a Rosenbrock method of order
+    2, or as `Coupled` where there are finite elements.
 
     Args:
         model: The robot.
-        period: Of every call [s].
-        substeps: Steps of the method in one.
+        period: Time of every call [s]; `dt` must equal it.
+        substeps: Steps of the method in one call.
         renew: Calls that share a Jacobian, of methods that may use an old one.
-        method: `Coupled()` for finite elements, `Rosenbrock2(refresh=True)` for others, if
-            omitted.
+        method: By default `Coupled()` for finite elements, `Rosenbrock2(refresh=True)` for
+            others.
+
+    Returns:
+        `advance`, and what it starts from.
 
     Raises:
+        ValueError: If `period` is not positive; by `advance`, if `dt` is not `period`.
         RuntimeError: By `advance`, if a step does not converge.
+
+    Example:
+        >>> finger = rod.rod(SE2(), rod.chebyshev(kappa_z=3), rod.circle(5 * mm), length=0.1,
+        ...                  young_modulus=1e6, poisson_ratio=0.5, density=1000)
+        >>> tube = rod.thread_chambers(finger, rod.Straight([3 * mm, 0]), 20e-6)
+        >>> body = systems.AssemblyBody(rod.assembly(SE2(), finger=rod.Part(finger)),
+        ...                             (rod.On("finger", tube), rod.Damping(0.05)))
+        >>> port = robots.Port(("finger",), volume=2e-6, low=0.0, high=50 * kPa)
+        >>> advance, running = robots.stepper(robots.supplied(body, {"air": port}), 0.02)
+        >>> for _ in range(5):
+        ...     running, pressure = advance(running, [10 * kPa], 0.02)
+        >>> print(f"{float(pressure[0]) / kPa:.1f} kPa")
+        10.0 kPa
     """
     method = _method(model.network) if method is None else method
     _check.positive("stepper", "period", period, "s", "5 ms is period=5e-3.")

@@ -1,4 +1,4 @@
-"""Contacts among the forces on an assembly, apart from the others, for steppers."""
+"""The contacts among the forces on an assembly, separated from the others, for steppers."""
 
 from collections.abc import Callable
 from typing import Any

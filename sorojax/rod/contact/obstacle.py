@@ -1,6 +1,5 @@
-"""Contact of a rod with a fixed obstacle, and what all contacts of rods share.
-
-How far bodies get within a step.
+"""Contact of a rod with a fixed obstacle, how far bodies move in a step, and what all
+contacts of rods share.
 """
 
 import abc
@@ -135,7 +134,7 @@ def tangent(
 
 
 def coupling(law: LinePenalty, touch: Touch) -> Float[Array, "dof dof"] | float:
-    """What friction adds to the stiffness as it grows with pressure; not symmetric."""
+    """Stiffness from friction that grows with pressure; not symmetric."""
     if law.friction is None:
         return 0.0
     velocity = _velocity(law, touch)

@@ -1,6 +1,5 @@
-"""Contact between two rods of an assembly, or of a rod with one that is held.
-
-The point of one centre line that is closest to each point of another.
+"""Contact between two rods of an assembly, or of a rod with one that is held, at the points of
+one centre line that are closest to those of another.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""The contacts among the forces on a rod, apart from the others, for steppers."""
+"""The contacts among the forces on a rod, separated from the others, for steppers."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple

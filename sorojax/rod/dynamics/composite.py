@@ -1,6 +1,5 @@
-"""Inertia and loads of an assembly, from those of its parts.
-
-How fast each part of an assembly moves per rate of its coordinates.
+"""Composite inertia and loads of an assembly from those of its parts, and the Jacobian of each
+part in the coordinates of the assembly.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
 """Equations of motion of a rod or assembly: M a + coriolis = sum of generalised forces.
 
-These are doors: each compiles once per structure of the model and its forces. Loops use
-`motion`, `inertia` and `total_force` directly, with `operators` taken outside.
+Each function compiles once per structure of the model and its forces. Loops use `motion`,
+`inertia` and `total_force` directly, with `operators` taken outside.
 """
 
 from typing import Any
@@ -91,21 +91,34 @@ def forward_dynamics(
     *,
     t=0.0,
 ) -> Float[Array, "*states dof"]:
-    """Acceleration of the coordinates, of one state or many.
+    """Acceleration of the coordinates, q'' = M(q)^-1 (forces - c(q, q')), of one state or many.
 
     States along a first axis of `q` and `v` are taken in chunks that stay in the cache of a
-    CPU, those of `jax.vmap` at once. For many models, or a loop around this verb, use
+    CPU, those of `jax.vmap` at once. For many models, or a loop around this function, use
     `sorojax.math.compiled.batched`.
 
     Args:
         model: The rod or assembly.
-        q: Coordinates, or those of many states.
-        v: Their rates, of the same states.
-        forces: Generalised forces; elasticity acts unless one replaces it.
+        q: Coordinates, or those of many states; curvature modes in [1/m].
+        v: Their rates, per second, of the same states.
+        forces: Generalised forces; elasticity acts unless one replaces it. None by default.
         t: Time [s].
+
+    Returns:
+        Second derivatives of the coordinates, units of q per s^2.
 
     Raises:
         ValueError: If the shapes do not fit the model or each other.
+
+    Example:
+        >>> finger = rod.rod(SE2(), rod.chebyshev(kappa_z=3), rod.circle(5 * mm), length=0.1,
+        ...                  young_modulus=1e6, poisson_ratio=0.5, density=1000)
+        >>> a = rod.forward_dynamics(finger, jnp.zeros(3), jnp.zeros(3), (rod.Gravity(),))
+        >>> a.shape, bool(a[0] < 0)
+        ((3,), True)
+
+    Reference:
+        Featherstone, Rigid Body Dynamics Algorithms, 2008, chapter 6.
     """
     constants, t = operators(model), real(t)
 
@@ -126,7 +139,7 @@ def acceleration(
     v: Rates,
     forces: Forces,
 ) -> Rates:
-    """`forward_dynamics` without a door, for loops that hold `operators(model)`."""
+    """`forward_dynamics` uncompiled, for loops that hold `operators(model)`."""
     moment = motion(model, q, v, constants=constants)
     mass, coriolis = inertia(moment)
     return solve_symmetric(mass, loads.total_force(forces, t, moment) - coriolis)

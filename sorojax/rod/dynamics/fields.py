@@ -1,4 +1,6 @@
-"""What forces and inertia see of a rod: constants of a rod, fields of a moment."""
+"""What forces and inertia read of a rod: its constants, and the fields of its state at one
+time.
+"""
 
 from typing import NamedTuple
 

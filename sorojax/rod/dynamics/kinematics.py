@@ -62,12 +62,33 @@ def forward_kinematics(
 def forward_kinematics(
     model: Model, q: Float[Array, " coordinates"], s: Numbers | None = None
 ) -> Poses | dict[str, Poses]:
-    """Poses of the sections: local to base frame, positions in m.
+    """Poses of the cross-sections, from local to base frame.
+
+    g' = g xi^ integrated along the rod from its base: rotations by exponentials of the strain
+    over the intervals between Gauss nodes (Magnus), positions by spectral integration.
 
     Args:
-        model: The rod; of an assembly the poses of every part by name, one for a link.
-        q: Coordinates.
-        s: Where, in [0, 1]; the Gauss nodes if omitted.
+        model: The rod or assembly.
+        q: Coordinates; curvature modes in [1/m].
+        s: Where, a list of points in [0, 1]; the Gauss nodes by default.
+
+    Returns:
+        Homogeneous matrices, positions [m]; of an assembly those of every part by name, one for
+        a link.
+
+    Raises:
+        ValueError: If `s` is no list of points.
+
+    Example:
+        >>> finger = rod.rod(SE2(), rod.chebyshev(kappa_z=3), rod.circle(5 * mm), length=0.1,
+        ...                  young_modulus=1e6, poisson_ratio=0.5, density=1000)
+        >>> poses = rod.forward_kinematics(finger, jnp.array([10.0, 0.0, 0.0]), [0.5, 1.0])
+        >>> (poses[:, :2, 2] / mm).round(2).tolist()  # an arc of radius 100 mm
+        [[47.94, 12.24], [84.15, 45.97]]
+
+    Reference:
+        Boyer, Lebastard, Candelier and Renda, Dynamics of continuum and soft robots: a strain
+        parameterization based approach, IEEE T-RO 37, 2021.
     """
     if isinstance(model, Assembly):
         return {name: _poses(part, s) for name, part in _parts(motion(model, q))}
@@ -80,7 +101,23 @@ def tip_pose(model: Rod, q: Array) -> Float[Array, "h h"]: ...
 def tip_pose(model: Assembly, q: Array) -> dict[str, Float[Array, "h h"]]: ...
 @door
 def tip_pose(model: Model, q: Float[Array, " coordinates"]):
-    """Pose of the last section, of every part by name: local to base frame, position in m."""
+    """Pose of the last cross-section, from local to base frame.
+
+    `forward_kinematics` at s = 1.
+
+    Args:
+        model: The rod or assembly.
+        q: Coordinates; curvature modes in [1/m].
+
+    Returns:
+        A homogeneous matrix, position [m]; of an assembly those of every part by name.
+
+    Example:
+        >>> finger = rod.rod(SE2(), rod.chebyshev(kappa_z=3), rod.circle(5 * mm), length=0.1,
+        ...                  young_modulus=1e6, poisson_ratio=0.5, density=1000)
+        >>> (rod.tip_pose(finger, jnp.zeros(3))[:2, 2] / mm).round(2).tolist()
+        [100.0, 0.0]
+    """
     if isinstance(model, Assembly):
         return {name: _poses(part, _TIP)[0] for name, part in _parts(motion(model, q))}
     return _poses(rod_motion(model, q), _TIP)[0]

@@ -54,25 +54,48 @@ def rollout(
     progress: bool = False,
     check: bool = True,
 ) -> Rollout:
-    """Move the model from (q, v) by `saves * every` steps.
+    """Motion of a rod or assembly by `saves * every` steps of fixed length.
+
+    M(q) q'' + c(q, q') = sum of generalised forces, compiled as one loop. Forces must be known
+    functions of time and motion; a rod in a loop with air and controllers is a block of a
+    `systems.Network`.
 
     Args:
         model: The rod or assembly.
-        q: Coordinates at `t`.
-        v: Their rates.
-        forces: Generalised forces.
+        q: Coordinates at `t`; curvature modes in [1/m].
+        v: Their rates, per second.
+        forces: Generalised forces beside elasticity; none by default.
         step: Length of one step [s]; 1e-3 to 5e-3 suit soft fingers.
-        saves: Number of saved moments after the first.
+        saves: Number of saved states after the first.
         every: Steps between two of them.
-        t: Start [s].
+        t: Time of the start [s].
         stepper: `GeneralisedAlpha()` by default, `ContactMidpoint()` if a contact is among
             the forces; `RungeKutta4()` or `DormandPrince()` for undamped motion at high
             accuracy.
         progress: Report progress while running; of rods under `vmap` in one report.
-        check: Make some of the steps again by two of half the length, and end as `unstable`
+        check: Compute some of the steps again by two of half the length, and end as `unstable`
             where errors add up to the motion: a twentieth of the time of a run of 160 steps
             or more, four to six half steps of a shorter one. Runs of fewer than 8 steps are
             not judged.
+
+    Returns:
+        Times [s], coordinates, rates, and how the run ended. Nothing is raised where it fails:
+        check `status`.
+
+    Raises:
+        ValueError: If `saves` is negative or `every` below 1.
+
+    Example:
+        >>> finger = rod.rod(SE2(), rod.chebyshev(kappa_z=3), rod.circle(5 * mm), length=0.1,
+        ...                  young_modulus=1e6, poisson_ratio=0.5, density=1000)
+        >>> path = rod.rollout(finger, jnp.zeros(3), jnp.zeros(3), (rod.Gravity(),),
+        ...                    step=2e-3, saves=10)
+        >>> print(f"{float(path.time[-1]):.3f} s, {path.q.shape}")
+        0.020 s, (11, 3)
+
+    Reference:
+        Chung and Hulbert, J. Appl. Mech. 60, 1993, for generalised-alpha; Hairer, Norsett and
+        Wanner, Solving Ordinary Differential Equations I, 1993, section II.4, for the check.
     """
     if saves < 0 or every < 1:
         raise ValueError(

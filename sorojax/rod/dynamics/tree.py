@@ -1,13 +1,13 @@
-"""An assembly at one moment: batches of equal rods, and the tree that carries them.
+"""State of an assembly at one time: rods of equal structure in batches, and the tree that
+carries them.
 
 Each part is seen in its own frame: its columns are the twist of the frame and its own
-coordinates, so the cost of a rod does not grow with what carries it. Only the tree knows
-the coordinates of the assembly: twists pass outwards, inertia and loads inwards.
+coordinates, so the cost of a rod does not grow with the length of the chain that carries it.
+Only the tree knows the coordinates of the assembly: twists pass outwards, inertia and loads
+inwards. A rod takes the planar or the spatial equations according to its group.
 
 Reference:
     Featherstone, Rigid Body Dynamics Algorithms, 2008, chapters 5 and 6, for the passes.
-
-The planar or the spatial equations, as the group of a rod asks.
 """
 
 from collections.abc import Callable, Sequence

@@ -165,7 +165,7 @@ def check(assembly: Assembly, forces: tuple[Load, ...]) -> None:
 
 
 def _on(forces: tuple[Load, ...], assembly: Assembly, index: int) -> tuple:
-    """What acts on one part alone, its share of a common damping included."""
+    """Forces on one part alone, its share of a common damping included."""
     name, found = assembly.names[index], []
     is_rod = isinstance(assembly.parts[index].body, Rod)
     for force in forces:
@@ -177,7 +177,7 @@ def _on(forces: tuple[Load, ...], assembly: Assembly, index: int) -> tuple:
 
 
 def _plain(forces: tuple[Load, ...]) -> Any:
-    """What may act on a single rod."""
+    """Forces that may act on a single rod."""
     for force in forces:
         if isinstance(force, On | Between | JointEffort):
             raise ValueError(

@@ -1,1 +1,1 @@
-"""What a rod or an assembly is: strain bases, sections, links, joints."""
+"""Model of a rod or an assembly: strain bases, sections, links, joints."""

@@ -82,8 +82,32 @@ class Slices(NamedTuple):
 
 
 def assembly(group: Group, **parts: Part) -> Assembly:
-    """A tree of named parts: `assembly(SE3(), palm=Part(link, Free()), thumb=Part(rod,
-    on="palm", offset=pose))`, each after what carries it."""
+    """A tree of rods and rigid links with joints between them.
+
+    Args:
+        group: `SE2()` for a planar, `SE3()` for a spatial assembly, that of all its rods.
+        **parts: Parts by name, each after the one that carries it: a rod or link, its joint,
+            the name of the part that it is mounted on (the ground by default) and its offset.
+
+    Returns:
+        The assembly; its coordinates are those of the parts in their order, of the joint before
+        those of the rod.
+
+    Raises:
+        ValueError: If there is no part, one comes before the part that carries it, or a rod or
+            link is of another group.
+
+    Example:
+        >>> finger = rod.rod(SE2(), rod.chebyshev(kappa_z=3), rod.circle(5 * mm), length=0.1,
+        ...                  young_modulus=1e6, poisson_ratio=0.5, density=1000)
+        >>> chain = rod.assembly(SE2(), lower=rod.Part(finger, rod.Revolute()),
+        ...                      upper=rod.Part(finger, on="lower"))
+        >>> rod.num_coordinates(chain)
+        7
+
+    Reference:
+        Featherstone, Rigid Body Dynamics Algorithms, 2008, chapter 4.
+    """
     return Assembly(group, tuple(parts), tuple(parts.values()))
 
 

@@ -38,7 +38,7 @@ class AbstractModes(eqx.Module):
 
     @property
     def least(self) -> int:
-        """Gauss nodes between breaks below which two shapes of the modes look alike."""
+        """Gauss nodes between breaks below which modes cannot be distinguished."""
         return -(-self.count // (len(self.breaks) + 1))
 
     @abc.abstractmethod

@@ -1,4 +1,4 @@
-"""A rod or an assembly: the same words for both, chosen when a program is traced."""
+"""Functions of a rod or an assembly, which choose between the two when a program is traced."""
 
 from typing import TypeAlias, overload
 
@@ -27,7 +27,25 @@ def operators(model: Rod) -> Operators: ...
 def operators(model: Assembly) -> AssemblyOperators: ...
 @full_products
 def operators(model: Rod | Assembly):
-    """The constant arrays of a model, once before a loop; differentiable in its leaves."""
+    """The arrays of a model that do not depend on its coordinates: stiffness, mass per length,
+    values of the strain basis and integration weights at the Gauss nodes.
+
+    Loops compute them once and hand them to `motion`; all other functions of this package do so
+    by themselves. Differentiable in the numbers of the model.
+
+    Args:
+        model: The rod or assembly.
+
+    Returns:
+        `Operators` of a rod, `AssemblyOperators` of an assembly.
+
+    Example:
+        >>> finger = rod.rod(SE2(), rod.chebyshev(kappa_z=3), rod.circle(5 * mm), length=0.1,
+        ...                  young_modulus=1e6, poisson_ratio=0.5, density=1000)
+        >>> stiffness = rod.operators(finger).stiffness  # E I L of the constant mode
+        >>> print(f"{float(stiffness[0, 0]):.2e} N m^3")
+        4.91e-05 N m^3
+    """
     return rod_operators(model) if isinstance(model, Rod) else assembly_operators(model)
 
 

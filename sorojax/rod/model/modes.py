@@ -357,15 +357,28 @@ def _rise(s, low: float, high: float):
 def bspline(
     *, degree: int = 3, knots: Sequence[float] | None = None, **modes: int
 ) -> StrainBasis:
-    """Clamped B-splines per strain: `bspline(kappa_y=6, kappa_z=6, degree=3)`.
+    """A strain basis of clamped B-splines per strain, as `bspline(kappa_z=6, degree=3)`.
 
     Args:
         degree: Polynomial degree between knots.
         knots: Inner knots in (0, 1); equally spaced by default.
-        modes: Number of splines per strain, inner knots + degree + 1.
+        **modes: Number of splines by strain, inner knots + degree + 1; names as in
+            `chebyshev`.
+
+    Returns:
+        The basis; a coordinate has the unit of its strain, [1/m] or [-].
 
     Raises:
-        ValueError: If a number of splines does not fit degree and knots.
+        ValueError: If a strain is unknown, none is named, or a number of splines does not fit
+            degree and knots.
+
+    Example:
+        >>> basis = rod.bspline(kappa_z=4, degree=2)
+        >>> basis.breaks, basis.num_dof
+        ((0.5,), 4)
+
+    Reference:
+        de Boor, A Practical Guide to Splines, 1978, for the recursion.
     """
     basis = {}
     for name, count in each_count("bspline", modes).items():

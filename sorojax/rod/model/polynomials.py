@@ -81,7 +81,24 @@ class Fourier(AbstractModes):
 
 
 def chebyshev(**modes: int) -> StrainBasis:
-    """Chebyshev modes per strain: `chebyshev(kappa_y=3, kappa_z=3)`."""
+    """A strain basis of Chebyshev polynomials of the first kind, T_k(2 s - 1), per strain.
+
+    Args:
+        **modes: Number of polynomials by strain: `kappa_x` (twist), `kappa_y`, `kappa_z`
+            (bending), `sigma_x` (stretch), `sigma_y`, `sigma_z` (shear). Strains that are not
+            named keep their rest value.
+
+    Returns:
+        The basis; a coordinate has the unit of its strain, [1/m] or [-].
+
+    Raises:
+        ValueError: If a strain is unknown, none is named, or a number is below 1.
+
+    Example:
+        >>> basis = rod.chebyshev(kappa_z=3, sigma_x=1)
+        >>> basis.active, basis.num_dof
+        (('kappa_z', 'sigma_x'), 4)
+    """
     return _basis("chebyshev", Chebyshev, modes)
 
 
@@ -182,7 +199,26 @@ def piecewise(basis: StrainBasis, segments: int | Sequence[float]) -> StrainBasi
 
 
 def piecewise_constant(**segments: int) -> StrainBasis:
-    """Constant strains on equal segments: `piecewise_constant(kappa_y=3, kappa_z=3)`."""
+    """A strain basis of constant strains on equal segments (piecewise constant strain).
+
+    Args:
+        **segments: Number of segments by strain, names as in `chebyshev`.
+
+    Returns:
+        The basis; a coordinate is the strain of one segment, [1/m] or [-].
+
+    Raises:
+        ValueError: If a strain is unknown, none is named, or a number is below 1.
+
+    Example:
+        >>> basis = rod.piecewise_constant(kappa_z=2)
+        >>> basis(np.array([0.25, 0.75]))[0].tolist()
+        [[1.0, 0.0], [0.0, 1.0]]
+
+    Reference:
+        Renda, Boyer, Dias and Seneviratne, Discrete Cosserat approach for multisection soft
+        manipulator dynamics, IEEE T-RO 34, 2018.
+    """
     counts = each_count("piecewise_constant", segments)
     return StrainBasis({k: Piecewise(Legendre(1), _joints(n)) for k, n in counts.items()})
 

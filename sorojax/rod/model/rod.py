@@ -1,4 +1,4 @@
-"""The rod: what a user chose about it, and nothing else."""
+"""The rod: basis, section, material and length, from which everything else is computed."""
 
 import dataclasses
 import math
@@ -146,24 +146,48 @@ def rod(
     nodes: int | None = None,
     breaks: Sequence[float] = (),
 ) -> Rod[G]:
-    """A rod from a basis, a section and a material or its three constants.
+    """A Cosserat rod whose strains are combinations of modes, clamped at its base.
+
+    xi(s) = xi_0(s) + B(s) q: curvatures, stretch and shears along s in [0, 1] are a rest strain
+    plus the strain basis times the coordinates q (piecewise or global strain parametrisation).
+    Without a rest strain the rod is straight along local x.
 
     Args:
         group: `SE2()` for a planar, `SE3()` for a spatial rod.
         basis: Active strains and their modes, e.g. `chebyshev(kappa_z=3)`.
-        section: e.g. `circle(6 * mm)`, or a function that takes points s in [0, 1] to a
-            section with one value per point, e.g. `taper(circle, 6 * mm, 3 * mm)`.
-        material: `Elastic` constants; otherwise give the three that follow.
+        section: Cross-section, e.g. `circle(6 * mm)`, or a function that takes points s in
+            [0, 1] to a section with one value per point, e.g. `taper(circle, 6 * mm, 3 * mm)`.
+        material: `Elastic` constants, as `elastic(...)` makes them; by default the three
+            numbers below.
         length: Rest length [m].
-        young_modulus: [Pa], a number or a function of s.
-        poisson_ratio: [-], as `young_modulus`.
-        density: [kg/m^3], as `young_modulus`.
-        rest_strain: Strain of the unloaded rod, curvatures [1/m] first: one value per
-            strain, or a function of s that gives (points, strains).
+        young_modulus: Young's modulus [Pa], a number or a function of s.
+        poisson_ratio: Poisson's ratio [-], a number or a function of s.
+        density: Mass per volume [kg/m^3], a number or a function of s.
+        rest_strain: Strain of the unloaded rod, curvatures [1/m] before stretch and shears
+            [-]: one value per strain, or a function of s that gives (points, strains).
+            Straight and unstretched by default.
         nodes: Gauss nodes; by default what resolves the modes, and coils of the rest strain
             where its numbers are known. Add some when the rod bends by turns. With breaks a
             multiple of the spans.
-        breaks: Where section or rest strain jump or kink, in (0, 1).
+        breaks: Where section or rest strain jump or kink, in (0, 1); nowhere by default.
+
+    Returns:
+        The rod.
+
+    Raises:
+        ValueError: If there is neither `material` nor all three constants, a number is out of
+            range, the basis has strains that the group has not, or `nodes` are too few for the
+            modes or no multiple of the spans.
+
+    Example:
+        >>> finger = rod.rod(SE2(), rod.chebyshev(kappa_z=3), rod.circle(5 * mm), length=0.1,
+        ...                  young_modulus=1e6, poisson_ratio=0.5, density=1000)
+        >>> finger.basis.num_dof, finger.basis.active
+        (3, ('kappa_z',))
+
+    Reference:
+        Boyer, Lebastard, Candelier and Renda, Dynamics of continuum and soft robots: a strain
+        parameterization based approach, IEEE T-RO 37, 2021.
     """
     given = {
         "young_modulus": young_modulus,

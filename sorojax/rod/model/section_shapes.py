@@ -28,11 +28,28 @@ from sorojax.sdf.sampling import finite_box
 
 
 def circle(radius: Numbers, *, shear_factor=9 / 10) -> Section:
-    """A disc of `radius` [m].
+    """A circular cross-section: area pi r^2, second moments pi r^4 / 4, torsion constant twice
+    that.
+
+    Args:
+        radius: Radius r [m]; with one value per point for a rod that tapers.
+        shear_factor: Shear area over area [-]; 9/10, that of an incompressible solid, by
+            default.
+
+    Returns:
+        The constants of the section.
+
+    Raises:
+        ValueError: If the radius is not positive.
+
+    Example:
+        >>> section = rod.circle(5 * mm)
+        >>> print(f"{float(section.area) / mm**2:.2f} mm^2")
+        78.54 mm^2
 
     Reference:
-        Shear factor 6 (1 + nu) / (7 + 6 nu), here of an incompressible solid: Cowper,
-        The shear coefficient in Timoshenko's beam theory, J. Appl. Mech. 33, 1966.
+        Shear factor 6 (1 + nu) / (7 + 6 nu): Cowper, The shear coefficient in Timoshenko's
+        beam theory, J. Appl. Mech. 33, 1966.
     """
     radius = _length("circle", "radius", radius, "Give the outer radius.")
     return Section(*_disc(radius), shear_factor=shear_factor)

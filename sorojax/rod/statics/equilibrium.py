@@ -54,7 +54,7 @@ class Equilibrium(eqx.Module):
 
 
 class Search(NamedTuple):
-    """What a Newton search needs to know beside its residual.
+    """Settings and scales of a Newton search.
 
     Attributes:
         model: The rod or assembly.
@@ -90,22 +90,38 @@ def equilibrium(
     tolerance=1e-10,
     max_iterations: int = 50,
 ) -> Equilibrium:
-    """Coordinates at which the forces vanish; differentiable in model and forces.
+    """Static equilibrium: coordinates at which the generalised forces vanish.
 
-    Newton with the exact tangent and a line search on the residual, measured by the
-    elastic energy that it would store. The derivative is that of the solution, not of the
-    iterations. Where the search fails, `equilibrium_path` applies the load in steps.
+    Newton's method with the exact tangent and a line search on the residual, measured by the
+    elastic energy that it would store. The derivative in model and forces is that of the
+    implicit function, not of the iterations. Where the search fails, `equilibrium_path` applies
+    the load in steps.
 
     Args:
         model: The rod or assembly.
-        forces: Generalised forces.
-        q: First guess; at rest if omitted.
+        forces: Generalised forces beside elasticity: `Gravity()`, `TipWrench(...)`,
+            `Tendons(...)`, contacts, ...; none by default.
+        q: First guess, curvature modes in [1/m]; at rest by default.
         t: Time at which the forces act [s].
-        tolerance: Size of the last step relative to q, both in elastic energy norm.
+        tolerance: Size of the last step relative to q, both in elastic energy norm [-].
         max_iterations: Limit of the search.
+
+    Returns:
+        Coordinates, how the search ended, and the number of negative eigenvalues of the tangent
+        (0 where stable). Nothing is raised where no equilibrium is found: check `status`.
 
     Raises:
         ValueError: If `q` has the wrong shape.
+
+    Example:
+        >>> finger = rod.rod(SE2(), rod.chebyshev(kappa_z=3), rod.circle(5 * mm), length=0.1,
+        ...                  young_modulus=1e6, poisson_ratio=0.5, density=1000)
+        >>> rest = rod.equilibrium(finger, (rod.Gravity(),))
+        >>> print(f"{float(rod.tip_pose(finger, rest.q)[1, 2]) / mm:.1f} mm")
+        -19.0 mm
+
+    Reference:
+        Nocedal and Wright, Numerical Optimization, 2006, chapter 11.
     """
     constants, t = operators(model), real(t).astype(dtype_of(model))
     guess = first_guess("equilibrium", model, q)
@@ -171,7 +187,7 @@ def newton(residual: Residual, guess: Array, search: Search) -> Found:
             return length, size(residual(moved(search.model, q, length * step)))
 
         one = jnp.ones((), q.dtype)
-        # A step of rounding cannot be told from noise: it is taken as it is.
+        # A step of rounding is nothing but noise: it is taken as it is.
         first = jax.lax.cond(small, lambda: (one, 0 * start), lambda: at(one))
         length, value = jax.lax.while_loop(too_long, lambda trial: at(trial[0] / 2), first)
         good = value <= start

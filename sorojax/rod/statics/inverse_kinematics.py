@@ -69,27 +69,47 @@ def inverse_kinematics(
 ) -> Reached:
     """Coordinates that meet the targets, or come as close as the model can.
 
-    Damped least squares. Obstacles and limits are bounds: they hold at the answer, the
-    targets as far as they let. Where the targets leave freedom, the step in the true null
-    space seeks the equilibrium under `forces`, so that the answer does not depend on the first
-    guess. Differentiable in model, targets, obstacles, limits and forces, by the conditions
-    that hold at the answer: not where the search was stopped before.
+    Damped least squares (Levenberg-Marquardt). Obstacles and limits are inequality constraints:
+    they hold at the answer, and the targets are met as far as they allow. Where the targets
+    leave freedom, the step in the null space of their Jacobian seeks the equilibrium under
+    `forces`, so that the answer does not depend on the first guess. Differentiable in model,
+    targets, obstacles, limits and forces by the optimality conditions at the answer, unless the
+    search was stopped before it converged.
 
     Args:
         model: The rod or assembly.
-        targets: One or more.
-        q: First guess, e.g. the last answer; at rest if omitted.
-        obstacles: What sections must stay clear of.
-        limits: Lowest and highest coordinates, each a number or one per rate.
-        forces: Seek their equilibrium in the null space: `()` for least elastic energy, the
-            default where the targets have fewer components than there are rates.
+        targets: One or more of `Position`, `Pose`, `Direction`, `OnSurface`.
+        q: First guess, e.g. the last answer; at rest by default.
+        obstacles: Shapes that sections must stay clear of, as `Clear(...)`; none by default.
+        limits: Lowest and highest coordinates, each a number or one per rate, in the units of
+            the coordinates; no limits by default.
+        forces: Seek the equilibrium under these in the null space: `()` for least elastic
+            energy, which is the default where the targets have fewer components than there are
+            rates.
         t: Time at which the forces act [s].
-        accuracy: Error at which targets count as met, relative to the length.
-        iterations: Take just so many steps, without tests: for real time.
+        accuracy: Error at which targets count as met, relative to the length [-].
+        iterations: Take exactly this many steps, without tests, as loops in real time need; by
+            default as many as convergence takes.
         max_iterations: Limit of the search otherwise.
 
+    Returns:
+        Coordinates, how the search ended, the error [m] and the overlap with obstacles [m].
+        Nothing is raised where a target is out of reach: check `status`.
+
     Raises:
-        ValueError: If shapes do not fit, or the model has no part of a target's name.
+        ValueError: If there is no target, shapes do not fit, or the model has no part of a
+            target's name.
+
+    Example:
+        >>> finger = rod.rod(SE2(), rod.chebyshev(kappa_z=3), rod.circle(5 * mm), length=0.1,
+        ...                  young_modulus=1e6, poisson_ratio=0.5, density=1000)
+        >>> reach = rod.inverse_kinematics(finger, rod.Position([80 * mm, 40 * mm]))
+        >>> (rod.tip_pose(finger, reach.q)[:2, 2] / mm).round(2).tolist()
+        [80.0, 40.0]
+
+    Reference:
+        Nocedal and Wright, Numerical Optimization, 2006, chapters 10 and 17; Caasenbrood,
+        Pogromsky and Nijmeijer, Sorotoki, IEEE Access 12, 2024, eq. 21 to 23.
     """
     targets = (targets,) if isinstance(targets, AbstractTarget) else tuple(targets)
     if not targets:
@@ -242,7 +262,7 @@ def _down(here: Rows, push) -> Float[Array, " dof"]:
 
 
 def _promise(here: Rows, push, increment: Array) -> Float[Array, ""]:
-    """What a step would leave of the squared error if all were linear."""
+    """Squared error after a step of the linear model."""
     error, jacobian = all_rows(here, push)
     left = error - jacobian @ increment
     return left @ left

@@ -1,6 +1,5 @@
-"""Equilibria under loads that are applied in steps.
-
-Equilibria along a curve in coordinates and load: over limit points.
+"""Equilibria under loads that are applied in steps, and along a curve in coordinates and load,
+over limit points.
 
 Reference:
     Riks, "An incremental approach to the solution of snapping and buckling problems",
@@ -70,26 +69,40 @@ def equilibrium_path(
     max_cuts: int = 8,
     progress: bool = False,
 ) -> EquilibriumPath:
-    """Equilibria at given load factors, each started from the one before.
+    """Equilibria at given load factors, each search started from the equilibrium before.
 
-    A step whose search fails is cut in halves, all in one compiled loop. Differentiable as
+    A step whose search fails is halved, all in one compiled loop. Differentiable as
     `equilibrium` is, in all that `loading` holds.
 
     Args:
         model: The rod or assembly.
-        loading: Takes a factor, or a row of pressures, to the forces. Define it once: a new
-            function compiles anew.
-        factors: Load factors, or one row of them for each step.
-        q: Equilibrium to start from; at rest if omitted.
-        begin: Factors at `q`; zero if omitted.
+        loading: Takes a factor [-], or a row of pressures [Pa], to the forces. Define it once:
+            a new function compiles anew.
+        factors: Load factors, or one row of them for each step, in the unit that `loading`
+            takes.
+        q: Equilibrium to start from; at rest by default.
+        begin: Factors at `q`; zero by default.
         t: Time at which the forces act [s].
-        tolerance: As of `equilibrium`.
+        tolerance: Size of the last step relative to q, both in elastic energy norm [-].
         max_iterations: Limit of one search.
         max_cuts: How often a step may be halved.
         progress: Report progress while running; under `vmap` in one report.
 
+    Returns:
+        Coordinates at each factor and how each search ended. The path stops at a search that
+        fails: the rest repeats the last equilibrium and says so in `status`.
+
     Raises:
         ValueError: If `q` has the wrong shape.
+
+    Example:
+        >>> finger = rod.rod(SE2(), rod.chebyshev(kappa_z=3), rod.circle(5 * mm), length=0.1,
+        ...                  young_modulus=1e6, poisson_ratio=0.5, density=1000)
+        >>> def loading(factor):
+        ...     return (rod.Gravity([0.0, -9.81 * factor]),)
+        >>> path = rod.equilibrium_path(finger, loading, jnp.array([0.5, 1.0]))
+        >>> [round(float(rod.tip_pose(finger, q)[1, 2]) / mm, 1) for q in path.q]
+        [-9.7, -19.0]
     """
     constants, dtype = operators(model), dtype_of(model)
     factors, t = real(factors).astype(dtype), real(t).astype(dtype)

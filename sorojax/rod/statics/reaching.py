@@ -259,7 +259,7 @@ def _stacked(pairs) -> tuple[Array, Array]:
 
 
 class Ends(NamedTuple):
-    """What inverse kinematics finds.
+    """Unknowns of inverse kinematics.
 
     Attributes:
         q: Coordinates.
@@ -303,7 +303,7 @@ def balanced(model: Model, tasks: Tasks, at, q: Array, push) -> Ends:
 
 
 def conditions(model: Model, tasks: Tasks, at, ends: Ends) -> Ends:
-    """What vanishes at the answer: the downhill force of all tasks that no bound holds,
+    """Optimality conditions, zero at the answer: the downhill force of tasks no bound holds,
     the gaps of the bounds that do, and errors against their balance."""
     q, push, balance = ends
     here = at(q)
@@ -333,7 +333,7 @@ def conditions(model: Model, tasks: Tasks, at, ends: Ends) -> Ends:
 
 
 def _share(tasks: Tasks, here: Rows, push) -> tuple[Array, Array]:
-    """What turns the pull into the units of the errors, and what counts as nothing."""
+    """Factor from the pull to the units of the errors, and the size that counts as zero."""
     _, rows_now = all_rows(here, push)
     scaled, tiny = scaled_metric(tasks, rows_now.T @ rows_now)
     return jnp.trace(scaled) / jnp.trace(tasks.metric), tiny

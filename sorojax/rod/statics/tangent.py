@@ -1,4 +1,4 @@
-"""What searches over coordinates share: increments, tangents, a metric and its units.
+"""Common part of searches over coordinates: increments, tangents, a metric and its units.
 
 Coordinates may outnumber rates, as a quaternion does: searches step in the rates'
 dimension, and a root is found in as many equations as there are coordinates.

@@ -1,4 +1,4 @@
-"""What inverse kinematics is asked for: where sections shall be, and what they shall avoid."""
+"""Targets of inverse kinematics (positions, poses, directions, surfaces) and obstacles."""
 
 import abc
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
@@ -35,7 +35,7 @@ class AbstractTarget(eqx.Module):
 
     @abc.abstractmethod
     def errors(self, group: SE2 | SE3, frames: Frames) -> Errors:
-        """What is missing [m], and how much of it each rate makes up for."""
+        """Error to the target [m], and its derivative by each rate, with the sign changed."""
 
 
 class Position(AbstractTarget):
@@ -167,7 +167,7 @@ class Clear(eqx.Module):
     part: str | None = eqx.field(static=True, default=None)
 
     def gaps(self, frames: Frames) -> Errors:
-        """What is left of the distance [m], and how it changes with each rate."""
+        """Distance beyond the required one [m], and its derivative by each rate."""
         gap, slope = jax.vmap(jax.value_and_grad(self.obstacle))(frames.position)
         change = jnp.sum(slope[:, :, None] * frames.linear_jacobian, axis=1)
         return gap - self.distance, change

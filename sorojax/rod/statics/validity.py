@@ -1,4 +1,4 @@
-"""Whether an answer lies within what a rod model describes: right side out, and resolved."""
+"""Whether an answer lies within what a rod model describes: not inverted, and resolved."""
 
 from typing import Any
 

@@ -1,16 +1,10 @@
-"""Area, centroid and second moments of plane shapes, differentiable in their parameters.
+"""Area, volume, centroid, second moments and inertia of shapes, with the derivative of the
+computed number itself.
 
-Moments of shapes with the derivative of the computed number itself.
-
-The grid rides on the bounding box: in cells from the middle of the box it stands still, so a
-derivative needs only that of the field at fixed places of this frame, box and all. What is
-differentiated is the discrete sum, hence it agrees with its differences at any resolution.
-
-Volume, centroid and inertia of solid shapes, differentiable in their parameters.
-
-Smooth shapes: six-node triangles on the surface, of fourth order in the cell. Shapes with
-edges, narrow gaps or small fillets: cells that halve there. The derivative is that of the
-computed number, whatever the resolution.
+Smooth solids are measured by six-node triangles on the surface, to fourth order in the cell;
+plane shapes and solids with edges, narrow gaps or small fillets by cells that halve there. The
+grid moves with the bounding box, so a derivative needs only that of the field at fixed places
+of that frame, and agrees with finite differences at any resolution.
 """
 
 import warnings
@@ -157,20 +151,32 @@ def _smooth(shape, rule, middle, size, extent, slope) -> Moments:
 
 
 def volume(shape: AbstractSdf, resolution: int = 128) -> Float[Array, ""]:
-    """Volume [m^3] of a solid shape, differentiable in its parameters.
+    """Volume of a solid shape, differentiable in its parameters.
 
-    The shape must be concrete: use it outside `jit` (`jax.grad` and `jax.jvp` are fine).
+    Smooth shapes are integrated over a closed surface of six-node triangles, to fourth order in
+    the cell. Shapes with edges, narrow gaps or small fillets are integrated over cells that the
+    surface cuts, halved where the field bends. The derivative is that of the computed number.
     Warns where details finer than the smallest cells could change the result by 0.1 %.
 
     Args:
-        shape: A bounded solid shape.
-        resolution: Cells along the longest side of its bounding box.
+        shape: A bounded solid shape, concrete: outside `jit`, inside `jax.grad` or `jax.jvp`.
+        resolution: Cells along the longest side of its bounding box, 8 to 1024.
+
+    Returns:
+        The volume [m^3].
 
     Raises:
-        ValueError: If the shape is empty, unbounded or traced by `jit`.
+        ValueError: If the shape is not solid, empty, unbounded or traced by `jit`, or if
+            `resolution` is out of range.
+
+    Example:
+        >>> ball = sdf.Sphere([0, 0, 0], 10 * mm)
+        >>> print(f"{float(sdf.volume(ball, resolution=16)) / 1e-6:.3f} cm^3")
+        4.189 cm^3
 
     Reference:
-        Min and Gibou 2007, Geometric integration over irregular domains, for the cut cells.
+        Min and Gibou, Geometric integration over irregular domains with application to
+        level-set methods, J. Comput. Phys. 226, 2007, for the cut cells.
     """
     rule = _solid_rule("volume", shape, resolution, 0)
     return frame(shape, rule.resolution)[1] ** 3 * moments(shape, rule)[0]
@@ -236,13 +242,29 @@ _CELLS = 512  # along the longest side; halved eight times at corners and narrow
 
 
 def area(shape: AbstractSdf) -> Float[Array, ""]:
-    """Area [m^2] of a plane shape, differentiable in its parameters.
+    """Area of a plane shape, differentiable in its parameters.
 
-    Counted by cells that the boundary cuts; the derivative is that of the counted number.
-    The shape must be concrete: use it outside `jit` (`jax.grad` and `jax.jvp` are fine).
+    The integral over the cells that the boundary cuts, 512 along the longest side of the
+    bounding box and halved at corners and narrow gaps. The derivative is that of the computed
+    number.
+
+    Args:
+        shape: A bounded plane shape, concrete: outside `jit`, inside `jax.grad` or `jax.jvp`.
+
+    Returns:
+        The area [m^2].
 
     Raises:
-        ValueError: If the shape is empty, unbounded or traced by `jit`.
+        ValueError: If the shape is not plane, empty, unbounded or traced by `jit`.
+
+    Example:
+        >>> plate = sdf.Rectangle([0, 0], [20 * mm, 10 * mm]) - sdf.Circle([0, 0], 5 * mm)
+        >>> print(f"{float(sdf.area(plate)) / mm**2:.3f} mm^2")  # 200 - 25 pi / 4
+        180.365 mm^2
+
+    Reference:
+        Min and Gibou, Geometric integration over irregular domains with application to
+        level-set methods, J. Comput. Phys. 226, 2007.
     """
     m = moments(shape, _rule("area", shape, 0))
     return frame(shape, _CELLS)[1] ** 2 * m[0]

@@ -1,13 +1,10 @@
-"""Moments of the inside of simplices cut by a linear field, and their slope in its values.
+"""Moments of the inside of simplices cut by a linear field, and of closed surfaces of six-node
+triangles, with their derivative in the nodal values of the field.
 
-The derivative of an integral over the inside is minus that over the cut facet of the
-moved level, divided by the slope: with nodal values f_i, of the shape function of node i.
-
-Integrals over closed surfaces of six-node triangles, with their slope in the field.
-
-Corners lie where grid edges meet the surface and middles of sides straight above the middle
-of their two corners; so each node follows from the field on a line that stays where it is,
-and the derivative is that of the integral itself.
+The derivative of an integral over the inside is minus that over the cut facet of the moved
+level, divided by the gradient. Corners of six-node triangles lie where grid edges meet the
+surface, mid-side nodes straight above the middle of their two corners: each node follows from
+the field on a line that stays where it is, and the derivative is that of the integral itself.
 """
 
 import itertools

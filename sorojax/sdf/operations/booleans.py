@@ -132,7 +132,25 @@ class Difference(AbstractSdf):
 
 
 def union(*shapes: AbstractSdf) -> Union:
-    """One flat `Union` of `shapes`, so that long sums do not nest."""
+    """Union of shapes: the pointwise minimum of their fields, as `a | b`.
+
+    Unions among the arguments are taken apart, so that long sums do not nest. The field
+    is the exact distance outside the shapes where theirs is, and a bound inside.
+
+    Args:
+        *shapes: One or more shapes of one dimension.
+
+    Returns:
+        The union.
+
+    Raises:
+        ValueError: If there is no shape, or plane and solid ones are mixed.
+
+    Example:
+        >>> row = sdf.union(*(sdf.Circle([x * mm, 0], 4 * mm) for x in (0, 5, 10)))
+        >>> print(f"{float(row(jnp.array([12 * mm, 0.0]))) / mm:.1f} mm")
+        -2.0 mm
+    """
     flat = (s.shapes if isinstance(s, Union) else (s,) for s in shapes)
     return Union(sum(flat, start=()))
 
@@ -255,9 +273,28 @@ class AbstractBlended(AbstractSdf):
 
 
 class SmoothUnion(AbstractBlended):
-    """Union with a fillet where the fields differ by less than `k` [m].
+    """Union with a fillet where the two fields differ by less than `k`.
 
-    The default blend is quadratic: C1, deepest by k/4 where both fields are equal.
+    The default blend is quadratic, with one continuous derivative and a fillet that is k/4 deep
+    where both fields are equal: min(a, b) - max(k - |a - b|, 0)^2 / (4 k).
+
+    Attributes:
+        first: One shape.
+        second: Another of the same dimension.
+        k: Width of the blend [m], positive.
+        blend: `Quadratic()`, `Cubic()`, `Circular()`, `Exponential()` or `Chamfer()`.
+
+    Raises:
+        ValueError: If `k` is not positive, or one shape is plane and the other solid.
+
+    Example:
+        >>> floor, wall = sdf.HalfPlane([0, 0], [0, 1]), sdf.HalfPlane([0, 0], [1, 0])
+        >>> joint = sdf.SmoothUnion(floor, wall, 4 * mm)
+        >>> print(f"{float(joint(jnp.array([0.0, 0.0]))) / mm:.1f} mm")  # k/4 inside
+        -1.0 mm
+
+    Reference:
+        Quilez, Smooth minimum, 2013, for the polynomial blends.
     """
 
     first: AbstractSdf

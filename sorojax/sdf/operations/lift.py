@@ -231,12 +231,44 @@ class PolarRepeated(AbstractWrapped):
 
 
 def extrude(profile: AbstractSdf, height: Numbers) -> Extruded:
-    """A plane shape drawn out along z from 0 to `height` [m]."""
+    """A plane shape as a prism along z.
+
+    Args:
+        profile: Plane shape in x and y.
+        height: Extent of the prism, from z = 0 on [m]; positive.
+
+    Returns:
+        The solid; its field is as exact as that of `profile`.
+
+    Raises:
+        ValueError: If the profile is not plane, or `height` is not positive.
+
+    Example:
+        >>> pin = sdf.extrude(sdf.Circle([0, 0], 4 * mm), 50 * mm)
+        >>> print(f"{float(pin(jnp.array([0.0, 0.0, 60 * mm]))) / mm:.1f} mm")
+        10.0 mm
+    """
     return Extruded(profile, height)
 
 
 def revolve(profile: AbstractSdf) -> Revolved:
-    """A plane shape turned about its y axis, which becomes z; x >= 0 is what turns."""
+    """A plane shape as a solid of revolution: x becomes the radius, y becomes z.
+
+    Args:
+        profile: Plane shape; only its part at x >= 0 counts.
+
+    Returns:
+        The solid. Its field is as exact as that of `profile` where the profile lies at x >= 0
+        and is not traced, and a bound of the distance otherwise.
+
+    Raises:
+        ValueError: If the profile is not plane.
+
+    Example:
+        >>> ring = sdf.revolve(sdf.Circle([20 * mm, 0], 5 * mm))  # a torus
+        >>> print(f"{float(ring(jnp.array([0.0, 20 * mm, 0.0]))) / mm:.1f} mm")
+        -5.0 mm
+    """
     if is_traced(profile):
         return Revolved(profile, clear=False)
     return Revolved(profile, clear=bool(profile.bounding_box()[0][0] >= 0))

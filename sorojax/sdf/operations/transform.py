@@ -212,12 +212,42 @@ class Repeated(AbstractWrapped):
 
 
 def translate(shape: AbstractSdf, offset: Numbers) -> Translated:
-    """`shape` moved by `offset` [m]."""
+    """`shape` moved: f(x - offset).
+
+    Args:
+        shape: Any shape.
+        offset: Displacement [m], one entry per axis.
+
+    Returns:
+        The moved shape; its field is as exact as that of `shape`.
+
+    Raises:
+        ValueError: If `offset` has not one entry per axis.
+
+    Example:
+        >>> moved = sdf.translate(sdf.Circle([0, 0], 4 * mm), [10 * mm, 0])
+        >>> print(f"{float(moved(jnp.array([10 * mm, 0.0]))) / mm:.1f} mm")
+        -4.0 mm
+    """
     return Translated(shape, offset)
 
 
 def rotate(shape: AbstractSdf, angle: Numbers, center=(0.0, 0.0)) -> Rotated:
-    """`shape` turned by `angle` [rad] about `center` [m]; in space about the z axis."""
+    """`shape` turned counter-clockwise; a solid about an axis parallel to z.
+
+    Args:
+        shape: Any shape; `turn` takes solids about any other axis.
+        angle: Angle [rad].
+        center: Point (x, y) that stays where it is [m]; the origin by default.
+
+    Returns:
+        The turned shape; its field is as exact as that of `shape`.
+
+    Example:
+        >>> upright = sdf.rotate(sdf.Rectangle([0, 0], [20 * mm, 4 * mm]), np.pi / 2)
+        >>> print(f"{float(upright(jnp.array([-2 * mm, 10 * mm]))) / mm:.1f} mm")
+        -2.0 mm
+    """
     return Rotated(shape, angle, center)
 
 
@@ -227,7 +257,23 @@ def scale(shape: AbstractSdf, factor: Numbers) -> Scaled:
 
 
 def offset(shape: AbstractSdf, thickness: Numbers) -> Offset:
-    """`shape` grown by `thickness` [m]; convex corners become round for exact fields."""
+    """`shape` grown on all sides, its level set at `thickness`: f(x) - thickness.
+
+    Convex corners of an exact distance become round. Growing keeps the distance exact outside,
+    shrinking keeps it inside.
+
+    Args:
+        shape: Any shape.
+        thickness: How far the surface moves outward [m]; inward where negative.
+
+    Returns:
+        The grown shape.
+
+    Example:
+        >>> grown = sdf.offset(sdf.Circle([0, 0], 10 * mm), 2 * mm)
+        >>> print(f"{float(grown(jnp.array([0.0, 0.0]))) / mm:.1f} mm")
+        -12.0 mm
+    """
     return Offset(shape, thickness)
 
 

@@ -1,9 +1,7 @@
 """Bodies along curves in the plane or in space: polyline, Bezier, spline, helix.
 
-The nearest of many pieces: a search without derivatives, then one piece with them.
-
-Which piece is nearest does not vary with small changes, so only the winner is
-differentiated: a gradient costs one piece, and a tie takes the first.
+The nearest piece of a curve is found without derivatives, since it does not change with small
+changes, and only that piece is differentiated; a tie takes the first.
 """
 
 import math

@@ -1,4 +1,6 @@
-"""Regions between closed outlines, and text drawn by them."""
+"""Shapes from data: outlines and text, solids with triangular faces, images, distances on a
+grid and height maps.
+"""
 
 import functools
 import itertools

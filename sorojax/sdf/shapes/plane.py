@@ -1,7 +1,4 @@
-"""Plane shapes; every field here is the exact distance.
-
-Whether a polygon touches itself.
-"""
+"""Plane shapes, all with the exact distance as their field."""
 
 import math
 

@@ -26,17 +26,26 @@ class Curve(NamedTuple):
 
 
 def contour(shape: AbstractSdf, size: float) -> list[Curve]:
-    """Closed boundary curves of a plane shape.
+    """Boundary curves of a plane shape as polygons.
 
-    Points lie on the zero set to rounding; corners are found where the normal jumps
-    and located as the meeting point of the two sides.
+    Marching squares find the curves; their points are then moved onto the zero set to
+    rounding. A corner is where the normal jumps; it is put where the two sides meet.
 
     Args:
         shape: A concrete, bounded plane shape.
-        size: Distance between points [m]; features finer than that may be missed.
+        size: Distance between points [m]; finer features may be missed.
+
+    Returns:
+        Closed curves with the inside on their left: the outline and one curve per hole.
 
     Raises:
-        ValueError: If the shape is empty, unbounded or traced.
+        ValueError: If `size` is not positive, or the shape is not plane, empty, unbounded or
+            traced.
+
+    Example:
+        >>> curves = sdf.contour(sdf.Rectangle([0, 0], [20 * mm, 10 * mm]), size=1 * mm)
+        >>> len(curves), int(curves[0].corner.sum())
+        (1, 4)
     """
     if not size > 0:
         raise ValueError(f"contour: `size` must be positive, got {size} m.")

@@ -1,17 +1,17 @@
-"""Dual contouring: one vertex per sheet and cell, placed by the planes of its crossings.
-
-Ju et al. 2002 for the vertices; the sheets make the surface manifold (Schaefer et al. 2007).
-The blocks go through in groups, so that only crossings and the result are held for all.
-
-Where the vertices of dual contouring lie: the points nearest to sets of planes.
-
-Triangles of dual contouring that cannot pass through each other.
+"""Dual contouring: one vertex per sheet and cell, at the point nearest to the planes of its
+crossings, and triangles that do not cross each other.
 
 The quadrilateral around a grid edge has one vertex in each of four cells. Together the four
 tetrahedra between the edge and the sides of the quadrilateral are its envelope, and those of
 two edges overlap nowhere as long as their vertices are shared: triangles inside their
-envelopes do not cross (Ju and Udeshi 2006). Two triangles are taken if they stay inside; else
-four around the point where the edge meets the surface, which always do.
+envelopes do not cross. Two triangles are taken if they stay inside; else four around the
+point where the edge meets the surface, which always do. Blocks are processed in groups, so
+that only crossings and the result are in memory for all.
+
+References:
+    Ju et al., Dual contouring of Hermite data, SIGGRAPH 2002, for the vertices.
+    Schaefer, Ju and Warren, Manifold dual contouring, IEEE TVCG 13, 2007, for the sheets.
+    Ju and Udeshi, Intersection-free contouring on an octree grid, Pacific Graphics 2006.
 """
 
 from collections.abc import Iterator

@@ -1,6 +1,5 @@
-"""The zero set of a solid shape as triangles.
-
-Marching cubes on the blocks a surface crosses, packed into one small volume.
+"""The zero set of a solid shape as triangles, by marching cubes on the blocks that the surface
+crosses, packed into one small volume.
 """
 
 import importlib.util
@@ -165,15 +164,15 @@ def isosurface(
     size: float,
     method: Literal["marching_cubes", "dual_contouring"] = "marching_cubes",
 ) -> Surface:
-    """Closed, manifold boundary surface of a solid shape.
+    """Closed, manifold boundary surface of a solid shape as triangles.
 
     Only blocks of cells that the Lipschitz constant of the shape cannot exclude are
     evaluated. Walls and gaps thinner than `size` may be lost by marching cubes. Dual
-    contouring keeps those of `size` and more whole, and the thin rims at which sheets run
-    out, up to half a cell thicker. Walls of even thickness between 0.2 and 1 `size` it
-    refuses where it sees them pass between nodes; thinner ones may be lost without a word,
-    so choose `size` no larger than the thinnest wall. Its triangles do not pass through
-    each other but where several sheets share a cell.
+    contouring keeps those of `size` and more whole, and also the rims of walls that get
+    thinner towards their end, up to half a cell thicker than drawn. It refuses walls of even
+    thickness between 0.2 and 1 `size` where it sees that they pass between nodes; thinner ones
+    may be lost without an error, so choose `size` no larger than the thinnest wall. Its
+    triangles do not cross each other except in cells that several sheets of the surface share.
 
     Args:
         shape: A concrete, bounded solid shape.
@@ -182,10 +181,24 @@ def isosurface(
             edges where vtk is installed); "dual_contouring" puts one vertex per sheet
             into a cell, which keeps sharp edges and corners.
 
+    Returns:
+        Vertices [m] and triangles, normals outward.
+
     Raises:
-        ValueError: If the shape is empty, unbounded or traced, its field varies faster
-            than its Lipschitz constant says, or dual contouring meets a wall of 0.2 to 1
-            `size` that passes between nodes.
+        ValueError: If the shape is not solid, empty, unbounded or traced, its field varies
+            faster than its Lipschitz constant says, or dual contouring meets a wall of 0.2 to
+            1 `size` that passes between nodes.
+
+    Example:
+        >>> surface = sdf.isosurface(sdf.Sphere([0, 0, 0], 10 * mm), size=2 * mm)
+        >>> radii = np.linalg.norm(surface.vertices, axis=1)
+        >>> bool(np.allclose(radii, 10 * mm, rtol=0, atol=0.1 * mm))
+        True
+
+    Reference:
+        Lorensen and Cline, Marching cubes, SIGGRAPH 1987; Ju et al., Dual contouring of
+        Hermite data, SIGGRAPH 2002; Schaefer, Ju and Warren, Manifold dual contouring, IEEE
+        TVCG 13, 2007.
     """
     if method not in _METHODS:
         raise ValueError(f"isosurface: `method` is {method!r}, need one of {list(_METHODS)}.")

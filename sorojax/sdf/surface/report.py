@@ -1,4 +1,4 @@
-"""What is wrong with a surface, and what it encloses."""
+"""Checks of a triangulated surface, and the volume that it encloses."""
 
 from typing import NamedTuple
 

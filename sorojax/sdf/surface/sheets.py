@@ -1,18 +1,16 @@
-"""How many sheets of surface pass through a cell, and which cell edges each one cuts.
+"""Cells that hold surface, where it meets grid edges, and how many sheets of it pass through a
+cell.
 
 Around every face the crossings are joined in pairs; the loops that arise are the sheets.
-On a face with four crossings the field in its middle tells whether the pairs part the inside
-corners or the outside ones. Where the two cells on both sides would each join the pairs to one
-sheet, the face would make an edge of four triangles, so there the other pairs are taken: that
-splits the sheet of either cell, hence comes to an end.
+On a face with four crossings the field in its middle decides whether the pairs separate the
+inside corners or the outside ones. Where the two cells on both sides would each join the pairs
+to one sheet, the face would make an edge of four triangles, so there the other pairs are
+taken: that splits the sheet of either cell, and hence terminates.
 
 Corner i + 2j + 4k of a cell; edge 4a + d + 2e runs along axis a at offsets d and e along
-the axes a + 1 and a + 2; face 2f + s lies across axis f on side s.
-
-Cells that hold surface and where it meets grid edges, group by group of blocks.
-
-A cell is named by 512 times its block's row plus its place in the block; a grid edge by the
-cell at whose first corner it begins, and its axis. Corner i + 2j + 4k of a cell.
+the axes a + 1 and a + 2; face 2f + s lies across axis f on side s. A cell is named by 512
+times its block's row plus its place in the block; a grid edge by the cell at whose first
+corner it begins, and its axis.
 """
 
 import functools
@@ -314,7 +312,7 @@ def _cross(shape, lower, size, nodes, axis, a, b):
     f, slope = value_and_gradient(shape, at(t))
     length = jnp.maximum(jnp.sqrt((slope * slope).sum(axis=1)), 1e-12)
     normal = slope / length[:, None]
-    # What regula falsi leaves, where the field has a kink on the edge, Newton takes away.
+    # Where the field has a kink on the edge, Newton removes the error of regula falsi.
     move = jnp.clip(f / size / length, -0.5, 0.5)
     offset = t[:, None] * step - move[:, None] * normal
     return offset.astype(jnp.float32), normal.astype(jnp.float32)

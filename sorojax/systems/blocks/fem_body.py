@@ -176,7 +176,7 @@ class FemBody(AbstractBlock):
         return matter(self.dynamics(fem.GeneralisedAlpha().coefficients(), jnp.ones(())))
 
     def dynamics(self, scheme: Coefficients, h: Float[Array, ""]) -> Dynamics:
-        """What a step of `h` [s] of this body depends on."""
+        """Data of a step of `h` [s] of this body."""
         zero = jnp.zeros_like(self.problem.mesh.points)
         none = jnp.zeros((), zero.dtype)
         memory = tuple(load if remembers(load) else None for load in self.problem.loads)

@@ -1,6 +1,7 @@
-"""A finite-element body in a few shapes, as a block with the ports of the full one.
+"""A finite-element body reduced to a few shapes, as a block with the ports of the full one.
 
-Shapes that a body moves in: eigenmodes, answers to its loads, and how both bend.
+The shapes are eigenmodes, static responses to its loads, and their derivatives, which hold
+how both change at large displacements.
 """
 
 import abc

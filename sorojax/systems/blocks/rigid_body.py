@@ -13,7 +13,7 @@ from sorojax.systems.blocks.block import AbstractBlock, Input, Output
 
 
 class Touch(eqx.Module):
-    """What a body touches: points of its surface against an obstacle.
+    """Contact of a body: points of its surface against an obstacle.
 
     Attributes:
         obstacle: A shape that does not move, in the frame of the world.

@@ -33,7 +33,7 @@ class AbstractController(AbstractBlock):
 
 
 class PIDMemory(NamedTuple):
-    """What a sampled PID carries from call to call."""
+    """Memory of a sampled PID between calls."""
 
     integral: Scalar
     filtered: Scalar

@@ -144,7 +144,7 @@ class TipSpring(eqx.Module):
         rod: The rod.
         point: Where the tip should be [m].
         stiffness: [N/m].
-        posture: Stiffness in the coordinates, which settles what the tip leaves open.
+        posture: Stiffness in the coordinates, for those that the tip does not determine.
     """
 
     rod: Rod

@@ -1,15 +1,12 @@
-"""The shape of a rod from markers on it, frame by frame.
+"""The shape of a rod from markers on it, frame by frame or filtered through its dynamics.
 
 Pure and compiled once, so one object serves recorded, simulated and live data. A marker
 that was not seen is NaN and counts for nothing.
 
-Reference:
+References:
     Caasenbrood, Pogromsky, Nijmeijer, "Sorotoki: a Matlab toolkit for design, modeling,
     and control of soft robots", IEEE Access 12, 2024, section VI-E.
-
-The motion of a rod from markers on it, filtered through its dynamics.
-
-Reference: Simon, Optimal State Estimation, 2006, chapter 13.
+    Simon, Optimal State Estimation, 2006, chapter 13.
 """
 
 import equinox as eqx
@@ -187,7 +184,7 @@ class ShapeFilter(eqx.Module):
 
 
 class Filtered(eqx.Module):
-    """What a filter knows: coordinates, rates, their covariance, and since when.
+    """State of a filter: coordinates, rates, their covariance, and since when.
 
     Attributes:
         missed: Updates since a marker was last seen; the estimate is `stale` from three on.

@@ -42,33 +42,48 @@ def simulate_batch(
     devices: Sequence[Any] | None = None,
     progress: bool = False,
 ) -> Trajectory:
-    """Run `make(design)` for every design, differentiable in the designs.
+    """Time simulation of `make(design)` for many designs at once, differentiable in them.
 
     All members run together by an explicit method with a cap on its steps, an eighth more
-    than what four pilots take. Members that hit it run again, one by one, by a stiff method.
-    A member that fails holds its last good state, has its own status and counters and the
-    gradient zero; the others do not notice, in value or in gradient.
+    than what four pilot members take. Members that reach it run again, one by one, by a stiff
+    method. A member that fails holds its last good state, has its own status and counters and
+    the gradient zero; the others are unchanged, in value and in gradient.
 
     Args:
         make: A function of one design that gives the network.
-        designs: A pytree whose leaves have a leading axis of members.
-        duration: [s].
-        inputs: Values or references for the exposed inputs of all members.
+        designs: A pytree of arrays with a leading axis of members.
+        duration: How long [s].
+        inputs: Values or references for the exposed inputs of all members, in the units of
+            their ports.
         save: Number of saved instants, both ends included.
-        rtol, atol, max_step: As in `simulate`.
+        rtol: Relative tolerance [-], as in `simulate`.
+        atol: Absolute tolerance, in the unit of each state, as in `simulate`.
+        max_step: Longest step [s]; no limit by default.
         cheap_steps: Limit of steps of the explicit method, also for the pilots.
         max_steps: Limit of steps of the stiff method.
-        solver: `Tsit5()` if omitted.
-        stiff_solver: `Rodas4()` if omitted.
+        solver: Explicit method; `Tsit5()` by default.
+        stiff_solver: Stiff method; `Rodas4()` by default.
         adjoint: As in `simulate`.
         devices: Share the members among these devices; their number divides that of the
-            members.
+            members. One device by default.
         progress: Report progress while running: how far all members are on average, then how
-            many of them have been looked at for the stiff method.
+            many of them have been checked for the stiff method.
 
     Returns:
-        A trajectory whose leaves, status and stats have a leading axis of members; the
-        stats say in `stiff` who ran again.
+        A trajectory whose arrays, status and stats have a leading axis of members; the
+        stats say in `stiff` which ran again.
+
+    Raises:
+        ValueError: If the designs have no common leading axis, or the devices do not divide
+            it.
+
+    Example:
+        >>> def valve(time):
+        ...     return systems.Network({"valve": systems.Lag(time)}, {}, exposed=("valve.a",))
+        >>> runs = systems.simulate_batch(valve, jnp.array([0.1, 0.2]), 0.2, save=2,
+        ...                               inputs={"valve.a": 1.0})
+        >>> runs["valve.value"][:, -1].round(3).tolist()  # 1 - exp(-2), 1 - exp(-1)
+        [0.865, 0.632]
     """
     _check.positive("simulate_batch", "duration", duration, "s", "Give the end time.")
     designs = jax.tree.map(real, designs)

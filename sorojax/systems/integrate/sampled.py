@@ -71,29 +71,47 @@ def simulate_sampled(
     progress: bool = False,
     resume: Trajectory | None = None,
 ) -> Trajectory:
-    """Run a network under sampled controllers, the very objects that drive the bench.
+    """Time simulation of a network under sampled controllers; commands are held between calls.
 
-    Time is counted in whole ticks of `period`, so that no call is lost or doubled however
-    long the run. Differentiable; a run that fails holds its last good state.
+    The controllers are the objects that also run on the bench. Time is counted in whole ticks
+    of `period`, so that no call is lost or doubled however long the run. Differentiable; a run
+    that fails holds its last good state.
 
     Args:
         network: The network; the inputs that are commanded are exposed.
         controller: A controller, or a tuple of `Sampled` of several rates.
-        duration: [s], rounded to whole periods.
+        duration: How long [s], rounded to whole periods.
         period: Length of a tick [s]; time between calls of a single controller.
         measurement: Output that a single controller reads, `"body.tip_angle"`.
         command: Exposed input that it drives, `"valve.setpoint"`.
         substeps: Steps of the method in a tick.
-        method: `RungeKutta4()` if omitted, `Coupled()` where there is a `FemBody`; `Rodas4()`
+        method: `RungeKutta4()` by default, `Coupled()` where there is a `FemBody`; `Rodas4()`
             for stiff networks.
-        state: Where the network starts.
-        memory: What a single controller remembers; `controller.start` if omitted.
-        inputs: Values or references for the other exposed inputs.
+        state: Where the network starts; `network.initial_state()` by default.
+        memory: What a single controller remembers; `controller.start` by default.
+        inputs: Values or references for the other exposed inputs, in the units of their ports.
         progress: Report progress while running.
-        resume: A motion to go on from; two halves give the bits of the whole.
+        resume: A run to go on from; two halves give the bits of the whole.
 
     Returns:
-        States and outputs at the ticks, outputs with the commands just given.
+        States and outputs at the ticks [s], outputs with the commands just given.
+
+    Raises:
+        ValueError: If a port does not exist, a commanded one is not exposed, `period` is not
+            positive, it or `duration` is traced, or a controller has no `start` and `memory` is
+            not given.
+        TypeError: If the controller is no function.
+
+    Example:
+        >>> network = systems.Network({"valve": systems.Lag(0.1)}, {}, exposed=("valve.a",))
+        >>> pid = systems.PID(4.0, reference=systems.Constant(1.0))
+        >>> run = systems.simulate_sampled(network, pid, 0.5, period=0.01, substeps=2,
+        ...                                measurement="valve.value", command="valve.a")
+        >>> print(f"{float(run['valve.value'][-1]):.3f}")  # 4 / (1 + 4)
+        0.800
+
+    Reference:
+        Astrom and Wittenmark, Computer-Controlled Systems, 1997, chapter 2.
     """
     loops = _loops(controller, measurement, command)
     for loop in loops:

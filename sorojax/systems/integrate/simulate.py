@@ -100,39 +100,58 @@ def simulate(
     resume: Trajectory | None = None,
     throw: bool = True,
 ) -> Trajectory:
-    """Run a network for `duration` [s] from t = 0; differentiable in all its leaves.
+    """Time simulation of a network, x' = f(t, x, u(t)) from t = 0.
 
-    A run that fails holds its last good state, which has finite derivatives.
+    Adaptive explicit Runge-Kutta (Tsitouras 5(4)) by default, through diffrax. Differentiable
+    in every number of the network, its inputs and its start. A run that fails holds its last
+    good state, which has finite derivatives.
 
     Args:
         network: The network.
-        duration: [s].
-        state: Where to start; `network.initial_state()` if omitted.
-        inputs: Values or references (functions of time) for the exposed inputs.
+        duration: How long [s].
+        state: Where to start; `network.initial_state()` by default.
+        inputs: Values or references (functions of time) for the exposed inputs, in the units of
+            their ports.
         save: Number of saved instants, both ends included.
-        step: A fixed step [s]; adaptive if omitted.
-        rtol: Relative tolerance of the adaptive run: a number, or a tree like the state.
+        step: A fixed step [s]; adaptive by default.
+        rtol: Relative tolerance of the adaptive run [-]: a number, or a tree like the state.
         atol: Absolute tolerance, in the unit of each state: a number, or such a tree.
-        max_step: Longest adaptive step [s]. Keeps an event that comes and goes from being
-            stepped over, and two events from falling into one step, where the first
-            listed would win.
-        solver: `Tsit5()` if omitted, `RungeKutta4()` with a fixed step, `Coupled()` where
+        max_step: Longest adaptive step [s]; no limit by default. It keeps an event that comes
+            and goes from being stepped over, and two events from falling into one step, where
+            the first listed would win.
+        solver: By default `Tsit5()`, `RungeKutta4()` with a fixed step, `Coupled()` where
             there is a `FemBody`. `Rodas4()` where a regulator, a valve or a filter is far
             faster than the body.
         max_steps: Limit of adaptive steps.
-        events: Ends of the run, and resets of its state.
+        events: Ends of the run, and resets of its state; none by default.
         max_events: Most resets.
         adjoint: How diffrax differentiates; by default reverse mode with checkpoints.
             `diffrax.ForwardMode()` for derivatives in a few parameters.
         dense: Keep the continuous solution, for `state_at`; takes memory by `max_steps`.
         progress: Report progress while running, which costs a little.
-        resume: A motion to go on from, with the state and the time of its end. Two halves
+        resume: A run to go on from, with the state and the time of its end. Two halves
             give the bits of the whole, with fixed steps and, without events, adaptively: the
             size of the step goes on too.
         throw: Raise when a run outside a transformation fails; False returns the status.
 
+    Returns:
+        Times [s], states and outputs at the saved instants, and how the run ended.
+
     Raises:
         RuntimeError: If the run failed and `throw` is set.
+        ValueError: If `duration` is not positive, `save` is below 2, a fixed `step` comes with
+            events or `dense`, or `state` with `resume`.
+
+    Example:
+        >>> network = systems.Network({"valve": systems.Lag(0.1)}, {}, exposed=("valve.a",))
+        >>> run = systems.simulate(network, 0.1, inputs={"valve.a": 1.0}, save=2)
+        >>> print(f"{float(run['valve.value'][-1]):.4f}")  # 1 - 1/e
+        0.6321
+
+    Reference:
+        Tsitouras, Runge-Kutta pairs of order 5(4) satisfying only the first column simplifying
+        assumption, Comput. Math. Appl. 62, 2011; Kidger, On Neural Differential Equations,
+        2021, for diffrax.
     """
     _check.positive("simulate", "duration", duration, "s", "Give the end time.")
     if save < 2:

@@ -1,6 +1,5 @@
-"""What searches found, drawn on what was searched: buckling, rods posed, shapes, fits.
-
-Small nouns: sections, strain modes, materials, bodies as blocks.
+"""Sections, strain bases, materials and bodies as blocks; and results of searches, drawn on
+what was searched: buckling, posed rods, optimised shapes, fits.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Figures of modes, backbones, signals and material fits."""
+"""Figures of modes, backbones and their strains, signals, material fits, and convergence."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Pictures of what is in a file: surfaces, meshes with results, saved motions."""
+"""Pictures of files: surfaces, meshes with results, saved motions."""
 
 import inspect
 import re

@@ -1,6 +1,5 @@
-"""What holds a body and what acts on it, as parts of a scene.
-
-Signs of what acts without an arrow of its own: coils of springs, arcs of turning.
+"""Supports and loads of a body as parts of a scene: arrows, coils for springs, arcs for
+torques.
 """
 
 import jax.numpy as jnp
@@ -242,7 +241,7 @@ def _facet_frames(problem: Problem, facets: np.ndarray, points: np.ndarray):
 
 
 def _thinned(facets: np.ndarray) -> np.ndarray:
-    """At most so many facets that their arrows can be told apart."""
+    """At most so many facets that their arrows can be distinguished."""
     step = max(1, len(facets) // _MOST)
     return facets[::step]
 

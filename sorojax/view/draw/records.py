@@ -1,5 +1,5 @@
-"""What is told rather than built: mesh quality, sweeps, tracks of markers, moving surfaces,
-boundary curves.
+"""Mesh quality, sweeps, tracks of markers, moving surfaces, boundary curves, and robots from
+their dimensions.
 """
 
 from typing import Any

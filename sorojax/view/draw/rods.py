@@ -1,6 +1,5 @@
-"""Rods and assemblies: tubes with their real section, threads, directors, contact forces.
-
-Given forces and moments on rods, and their weight, as arrows and arcs.
+"""Rods and assemblies: tubes with their real section, threads, directors, contact forces, and
+given forces, moments and weight as arrows and arcs.
 """
 
 from collections.abc import Mapping, Sequence

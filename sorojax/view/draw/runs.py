@@ -1,4 +1,4 @@
-"""What happened over time, over steps and over designs: signals, histories, densities."""
+"""Results over time, steps and designs: signals, histories, densities."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

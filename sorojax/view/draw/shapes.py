@@ -1,7 +1,4 @@
-"""Implicit shapes: contours of the distance, shaded surfaces, slices.
-
-Distances of shapes as filled contours: of plane shapes, and in sections of solid ones.
-"""
+"""Implicit shapes: shaded surfaces, contours of the distance, and sections of solids."""
 
 from typing import TYPE_CHECKING, Any
 

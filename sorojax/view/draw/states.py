@@ -1,6 +1,5 @@
-"""Deformed bodies: equilibria, load paths, motions and vibration modes.
-
-Values to colour a body by: fields known by name, functions and arrays.
+"""Deformed bodies (equilibria, load paths, motions, vibration modes) and the fields that
+colour them: fields known by name, functions and arrays.
 """
 
 from collections.abc import Callable, Sequence

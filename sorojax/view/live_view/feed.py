@@ -1,10 +1,8 @@
-"""Looking at a robot while it runs: a process of its own draws the latest frame.
+"""A live view of a robot: a process of its own draws the latest frame.
 
-The loop that feeds it copies a few numbers into memory and goes on; it never waits, and a
-viewer that is slow, hung or gone costs it nothing. When the process that feeds it ends, in
-whatever way, the viewer ends too.
-
-A place in shared memory where the latest frame wins: writing never waits.
+The loop that feeds it copies a few numbers into shared memory, where the latest frame
+replaces the one before, and goes on; it never waits, and a viewer that is slow, hung or gone
+costs it nothing. When the process that feeds it ends, the viewer ends too.
 """
 
 import contextlib

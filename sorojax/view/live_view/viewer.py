@@ -1,7 +1,7 @@
 """The viewer process: `python -m sorojax.view.live_view.viewer SLOTS`, started by `view.live`.
 
-It reads its sink from the standard input, which then only tells, by its end, that the
-process that feeds it is gone.
+It reads its sink from the standard input, whose end then signals that the process that feeds
+it is gone.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""Where a solid picture is taken from: presets, paths, and the way to the pixels."""
+"""Cameras of solid pictures: presets, paths, and projection to pixels."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Triangles of what is drawn again and again: tubes, arrows, balls."""
+"""Triangles of tubes, arrows and balls."""
 
 import functools
 

@@ -1,6 +1,5 @@
-"""Plane scenes drawn with matplotlib, in mm.
-
-From a plane mesh to what a drawing library takes: triangles, outlines, paths [mm].
+"""Plane scenes drawn with matplotlib, in mm, and a plane mesh as triangles, outlines and
+paths.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -1,9 +1,8 @@
-"""Which triangle every pixel sees: a depth buffer over spans of rows, in NumPy.
+"""A solid scene as a picture with smooth edges, by a depth buffer over spans of rows; NumPy
+alone.
 
-A solid scene as a picture with smooth edges; NumPy alone.
-
-Which triangle is seen is found for every sample of every pixel. Light is dear and changes
-slowly, so it is worked out once per pixel, and for all samples only where they differ.
+The visible triangle is found for every sample of every pixel. Light is expensive and changes
+slowly, so it is computed once per pixel, and for all samples only where they differ.
 """
 
 from typing import NamedTuple

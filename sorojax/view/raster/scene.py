@@ -1,7 +1,7 @@
-"""What is to be drawn, before anything draws it: surfaces, lines, arrows and dots [m].
+"""A scene to draw: surfaces, lines, arrows and dots [m], without a drawing library.
 
-Verbs that know the nouns of other floors make a `Scene`; `plane` draws it with matplotlib,
-`solid` shades it in space.
+Functions that know the nouns of other packages make a `Scene`; `plane` draws it with
+matplotlib, `solid` shades it in space.
 """
 
 from collections.abc import Sequence
@@ -151,7 +151,7 @@ def robust_scale(
     limits: tuple[float, float] | None = None,
     cut: float = 99.5,
 ) -> Scale:
-    """One scale for all `values`; a peak above the percentile `cut` is cut, and told."""
+    """One scale for all `values`; a peak above the percentile `cut` is cut, with a note."""
     flat = np.concatenate([np.ravel(v) for v in values])
     flat = flat[np.isfinite(flat)]
     if limits is not None:

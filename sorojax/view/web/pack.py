@@ -1,9 +1,9 @@
-"""Numbers of a film as few bytes: int16 steps from frame to frame, deflated.
+"""Numbers of a film as few bytes: int16 differences from frame to frame, deflated.
 
 A column of numbers is cut to 65535 levels between its ends. The first frame is kept, of the
-others the change from where the two before lead to, or from the one before, whichever packs
-smaller; low and high bytes go apart, and all through zlib. A browser undoes it with its own
-DecompressionStream.
+others the difference from a linear prediction of the two before, or from the one before,
+whichever packs smaller; low and high bytes are separated, and all goes through zlib. A browser
+undoes it with its own DecompressionStream.
 """
 
 import base64
