@@ -80,8 +80,7 @@ def cauchy_stress(
         37.9 kPa
 
     Reference:
-        Bonet and Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2008,
-        section 5.5.
+        Bonet and Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2008.
     """
     return _cauchy_stress(body(problem), u)
 

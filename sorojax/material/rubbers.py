@@ -189,8 +189,7 @@ def neo_hookean(
         344.8 kPa
 
     Reference:
-        Bonet and Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2008,
-        section 6.4.
+        Bonet and Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2008.
     """
     _check.positive("neo_hookean", "young_modulus", young_modulus, "Pa", checks.MODULUS)
     checks.poisson_ratio("neo_hookean", poisson_ratio)

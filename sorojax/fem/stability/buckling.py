@@ -63,7 +63,7 @@ def critical_loads(
         1.60 N
 
     Reference:
-        Bathe, Finite Element Procedures, 1996, section 6.8.2.
+        Bathe, Finite Element Procedures, 1996.
     """
     where = "fem.critical_loads"
     u = jnp.zeros_like(problem.mesh.points) if displacement is None else real(displacement)
