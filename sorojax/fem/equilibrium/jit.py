@@ -36,10 +36,11 @@ class Begin(NamedTuple):
 
 class Outcome(NamedTuple):
     """Displacement, tangent values there (empty unless asked for), and as floats, so that
-    one rule serves every output: failed or not, fraction of the load, iterations, cuts."""
+    one rule serves every output: failed or not, fraction of the load, iterations, cuts and
+    load steps."""
 
     u: Float[Array, "nodes dim"]
-    counts: Float[Array, " 4"]
+    counts: Float[Array, " 5"]
     tangent: Float[Array, " nnz"]
 
 
@@ -59,6 +60,7 @@ class _State(NamedTuple):
     step: Float[Array, ""]
     iterations: Int[Array, ""]
     total: Int[Array, ""]
+    levels: Int[Array, ""]
     cuts: Int[Array, ""]
     failures: Int[Array, ""]
     running: Bool[Array, ""]
@@ -127,7 +129,7 @@ def follow_traced(
         return _next(problem, prepared, state, level, max_cuts)
 
     end = jax.lax.while_loop(lambda state: state.running, one_pass, state)
-    numbers = (end.done < 1.0, end.done, end.total, end.cuts)
+    numbers = (end.done < 1.0, end.done, end.total, end.cuts, end.levels)
     counts = jnp.stack([jnp.asarray(n, end.u.dtype) for n in numbers])
     return Outcome(end.start, counts, end.tangent)
 
@@ -156,7 +158,7 @@ def _initial(problem: Problem, begin: Begin | None, steps: int) -> _State:
     return _State(
         u=u, before=u, start=u, tangent=tangent, predict=predict, moved=false, shortened=false,
         update=zero + jnp.inf, done=zero, goal=_goal(zero, step), step=step,
-        iterations=none, total=none, cuts=none, failures=none,
+        iterations=none, total=none, levels=none, cuts=none, failures=none,
         running=jnp.all(jnp.isfinite(u)),
     )  # fmt: skip
 
@@ -249,6 +251,7 @@ def _accepted(state: _State, level: _Level, smooth: bool) -> _State:
         before=state.u, start=state.u, tangent=level.values, done=state.goal, step=step,
         predict=jnp.asarray(smooth),
         goal=_goal(state.goal, step), total=state.total + state.iterations,
+        levels=state.levels + 1,
         failures=jnp.zeros_like(state.failures), running=state.goal < 1.0,
     )  # fmt: skip
     return _fresh(state)
