@@ -237,7 +237,8 @@ def test_largest_step_keeps_a_tenth_of_every_volume(getkey):
     prepared = prepare(problem)
     du = 0.05 * jax.random.normal(getkey(), problem.mesh.points.shape)
     zero = jnp.zeros_like(du)
-    fraction = asm.largest_step(problem.space, prepared.geometry, problem.kinematics, zero, du)
+    args = (problem.space, prepared.geometry, problem.kinematics, zero)
+    fraction = asm.largest_step(*args, du, keep=0.1)
     state = linearise(problem, prepared, fraction * du, zero)
     beyond = linearise(problem, prepared, fraction / 0.75 * du, zero)
     assert 0 < fraction < 1 and state.volume_ratio >= 0.1 > beyond.volume_ratio

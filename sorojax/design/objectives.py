@@ -23,6 +23,7 @@ from sorojax.design.density.void import InterpolatedEnergy, interpolated_energy
 from sorojax.fem import Newton, Path, Problem, Solution
 from sorojax.fem.equilibrium.linear import Prepared, constrain, linearise, prepare
 from sorojax.fem.equilibrium.newton import safe_fraction
+from sorojax.fem.equilibrium.rules import SAFE
 from sorojax.fem.equilibrium.solve import solved_and_kept
 from sorojax.fem.loads.loads import AbstractLoad, mean_rotation
 from sorojax.fem.problem import exchanged, load_potential, potential_energy
@@ -32,7 +33,6 @@ from sorojax.math.linalg.sparse import SparseSymmetric
 _FIRST, _GROWTH, _SHRINK = 1e-3, 4.0, 0.25  # of the shift, relative to the diagonal at rest
 _DESCENT = 1e-4  # share of the decrease by the slope that a step has to bring
 _HALVINGS = 12
-_SAFE = 0.9  # what `safe_fraction` returns where no cell comes near to inverting
 
 
 def settled(
@@ -68,8 +68,8 @@ def settled(
             continue
         du = factor.solve(np.asarray(rhs)).reshape(u.shape)
         slope = -float(np.vdot(np.asarray(rhs), du))
-        share = safe_fraction(problem, prepared, u, du)
-        share = share if share < _SAFE else 1.0
+        share = float(safe_fraction(problem, prepared, u, du))
+        share = share if share < SAFE else 1.0  # as it is where no cell comes near to inverting
         for _ in range(_HALVINGS):
             new = float(potential_energy(problem, jnp.asarray(u + share * du)))
             if new <= energy + _DESCENT * share * slope + 1e-12 * abs(energy):

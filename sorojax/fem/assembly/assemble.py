@@ -228,7 +228,7 @@ def largest_step(
     kinematics: AbstractKinematics,
     u: Float[Array, "nodes dim"],
     du: Float[Array, "nodes dim"],
-    keep: float = 0.1,
+    keep: float,
     share: Float[Array, "..."] | None = None,
 ) -> Float[Array, ""]:
     """Largest sampled fraction of `du`, at most 1, up to which J >= keep * J(u) everywhere.

@@ -15,7 +15,6 @@ from sorojax.fem.assembly import assemble as asm
 from sorojax.fem.assembly.geometry import Geometry
 from sorojax.fem.contact.swept import gains, passed_through
 from sorojax.fem.dynamics.newton import (
-    LEAST_VOLUME,
     UNSOUND,
     Found,
     HostInertia,
@@ -37,12 +36,14 @@ from sorojax.fem.dynamics.step import (
     end_step,
     matter,
 )
+from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import prepare
 from sorojax.fem.equilibrium.newton import Newton
 from sorojax.fem.loads.loads import AbstractLoad
 from sorojax.fem.problem import Problem, body, load_force
 from sorojax.fem.supports import known_values
 from sorojax.math.compiled import Split, kernel
+from sorojax.math.ode.step_control import halved, may_double
 from sorojax.math.status import Status
 
 _CALM = 0.8  # a step whose forces act at more of every volume does not get near to that
@@ -144,16 +145,15 @@ class Run:
             ends = np.int32(index), np.float64(done), np.float64(end)
             new = self._step(Interval(*ends))  # type: ignore[arg-type]
             if new is None:
-                failures += 1
+                share, failures, goes_on = halved(self.share, failures, self.control.max_cuts)
                 self.cuts += 1
-                if failures > self.control.max_cuts:
+                if not goes_on:
                     return False
-                self.share /= 2
+                self.share = share
                 continue
             self.now, done, failures = new, end, 0
-            wide = 2 * self.share
-            if self._easy and wide <= 1.0 and done % wide == 0.0:
-                self.share = wide
+            if self._easy and may_double(self.share, done):
+                self.share *= 2
         self.reason = ""
         return True
 
@@ -177,20 +177,20 @@ class Run:
             self.reason = "a point goes through an obstacle"
         elif gained:
             self.reason = "a contact gives energy to the body"
-        elif not (found.volume > _CALM or self._kept(start, displacement) > LEAST_VOLUME):
-            self.reason = "a cell loses most of its volume"
+        elif not (found.volume > _CALM or self._keeps_volume(start, displacement)):
+            self.reason = UNSOUND
         else:
             self.reason = ""
         if self.reason:
             return None
-        self._easy = found.iterations <= 6 * self.control.newton.max_iterations // 4
+        ratio = 0.0
         if self.control.error is not None:
-            scale = float(jnp.max(jnp.abs(displacement))) + 0.01 * float(self.prepared.length)
-            ratio = float(error) / (self.control.error * scale)
-            if not ratio <= 1.0:
+            args = self.control.error, np.asarray(displacement), float(self.prepared.length)
+            ratio = rules.error_ratio(float(error), *args)
+            if not rules.error_fits(ratio):
                 self.reason = f"an error of a step of {float(error):.3g} m"
                 return None
-            self._easy = self._easy and ratio < 0.1
+        self._easy = rules.is_easy(found.iterations, self.control.newton, ratio)
         self.steps += 1
         self.rows.append((int(interval.index), *_ends(interval), found.u))
         return new
@@ -204,12 +204,12 @@ class Run:
             work += float(found.residual[known] @ moved[known])
         return work
 
-    def _kept(self, u, new) -> float:
-        """Least share of its volume that a cell keeps in a step to displacement `new`, which
-        is further than where its forces act."""
+    def _keeps_volume(self, u, new) -> bool:
+        """Whether no cell loses most of its volume in a step to displacement `new`, which is
+        further than where its forces act."""
         problem = self.dynamics.problem
         args = (problem.space, self.prepared.geometry, problem.kinematics)
-        return float(asm.kept_volume(*args, u, new - u))
+        return rules.keeps_volume(float(asm.kept_volume(*args, u, new - u)))
 
     def _solve(self, start, held: np.ndarray) -> Found:
         found = self.solver.solve(np.asarray(start), held)

@@ -14,7 +14,6 @@ from jaxtyping import Array, Bool, Float, Int
 from sorojax.fem.assembly import assemble as asm
 from sorojax.fem.contact.swept import gains, passed_through
 from sorojax.fem.dynamics.host import Control, step_error
-from sorojax.fem.dynamics.newton import LEAST_VOLUME
 from sorojax.fem.dynamics.step import (
     Dynamics,
     Interval,
@@ -25,8 +24,10 @@ from sorojax.fem.dynamics.step import (
     matter,
     with_terms,
 )
+from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.jit import Begin, follow_traced, prepare_traced
 from sorojax.fem.equilibrium.linear import Prepared
+from sorojax.math.ode.step_control import halved, may_double
 
 
 class Record(NamedTuple):
@@ -86,30 +87,29 @@ def _attempt(dynamics, known, prepared: Prepared, control: Control, state, inter
     problem = with_terms(dynamics.problem, step.terms)
 
     def solved(guess):
-        found = follow_traced(problem, Begin(guess), control.newton, 1, 0, prepared)
+        found = follow_traced(problem, Begin(guess, step.terms), control.newton, 1, 0, prepared)
         return found.u, found.counts
 
     start = state.displacement
     args = (problem.space, prepared.geometry, problem.kinematics, start, step.predicted - start)
-    sound = asm.kept_volume(*args) > LEAST_VOLUME
+    sound = rules.keeps_volume(asm.kept_volume(*args))
     u, counts = solved(jnp.where(sound, step.predicted, start))
     again = (counts[0] != 0) & sound
     u, counts = jax.lax.cond(again, lambda: solved(start), lambda: (u, counts))
     new = end_step(dynamics, known, state, interval, step, u)
     through = passed_through(dynamics.problem, step.terms[0], new.displacement)
-    keeps = asm.kept_volume(*args[:4], new.displacement - start) > LEAST_VOLUME
+    keeps = rules.keeps_volume(asm.kept_volume(*args[:4], new.displacement - start))
     gained = gains(dynamics, known, state, step, new, u)
-    fine, easy = (counts[0] == 0) & ~through & ~gained & keeps, jnp.asarray(True)
+    fine, ratio = (counts[0] == 0) & ~through & ~gained & keeps, 0.0
     if control.error is not None:
-        scale = jnp.max(jnp.abs(new.displacement)) + 0.01 * prepared.length
-        ratio = step_error(dynamics, interval, state, new) / (control.error * scale)
-        fine, easy = fine & (ratio <= 1.0), ratio < 0.1
-    return u, new, fine, easy, counts[2]
+        error = step_error(dynamics, interval, state, new)
+        ratio = rules.error_ratio(error, control.error, new.displacement, prepared.length)
+        fine = fine & rules.error_fits(ratio)
+    return u, new, fine, rules.is_easy(counts[2], control.newton, ratio), counts[2]
 
 
 def _next(walk: _Walk, interval, u, new, fine, easy, count, max_cuts, grid, rows) -> _Walk:
-    wide, at_end = 2 * walk.share, interval.end >= 1.0
-    grows = easy & (wide <= 1.0) & (jnp.remainder(interval.end, wide) == 0.0)
+    at_end, grows = interval.end >= 1.0, easy & may_double(walk.share, interval.end)
     row = jnp.minimum(walk.row, rows - 1)
     entry = jnp.stack([interval.index.astype(u.dtype), interval.begin, interval.end])
     index = walk.index + at_end.astype(jnp.int32)
@@ -117,17 +117,15 @@ def _next(walk: _Walk, interval, u, new, fine, easy, count, max_cuts, grid, rows
         state=new,
         index=index,
         done=jnp.where(at_end, jnp.zeros_like(interval.end), interval.end),
-        share=jnp.where(grows, wide, walk.share),
+        share=jnp.where(grows, 2 * walk.share, walk.share),
         failures=jnp.zeros_like(walk.failures),
         row=walk.row + 1,
         u=walk.u.at[row].set(u),
         steps=walk.steps.at[row].set(entry),
         running=(index < grid) & (walk.row + 1 < rows),
     )
-    cut = walk._replace(
-        share=walk.share / 2, failures=walk.failures + 1, cuts=walk.cuts + 1,
-        running=walk.failures < max_cuts,
-    )  # fmt: skip
+    share, failures, running = halved(walk.share, walk.failures, max_cuts)
+    cut = walk._replace(share=share, failures=failures, cuts=walk.cuts + 1, running=running)
     chosen = jax.tree.map(lambda a, b: jnp.where(fine, a, b), accepted, cut)
     return chosen._replace(iterations=walk.iterations + count)
 

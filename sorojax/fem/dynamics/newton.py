@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from sorojax.fem.assembly import assemble as asm
 from sorojax.fem.contact.self_contact import SelfContact, with_partners
 from sorojax.fem.contact.statics import updated
+from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import Prepared, add_load_stiffness
 from sorojax.fem.equilibrium.newton import Newton, Secants, safe_fraction
 from sorojax.fem.loads.loads import AbstractLoad
@@ -195,9 +196,6 @@ def longest_share(problem: Problem, du: Nodal) -> Float[Array, ""]:
 
 #: A kept factor is given up where the residual keeps more than this share in an iteration.
 _SLOW = 0.2
-_SLOPE_TURNED, _MAX_SHORTENINGS = 0.5, 12
-#: A guess that leaves a cell less of its volume is none to start from.
-LEAST_VOLUME = 0.1
 UNSOUND = "a cell loses most of its volume"
 
 
@@ -320,22 +318,23 @@ class StepSolver:
         """Equilibrium of the step near `guess`, where known unknowns are `held`."""
         settings, u, before, fresh, size = self.newton, guess, guess, 0, np.inf
         now = self._balance(u, self.inertia.origin)
-        if not now.volume_ratio > LEAST_VOLUME:
+        if not rules.keeps_volume(now.volume_ratio):
             return Found(u, now.residual, now.load, 0, 0, self.kept, UNSOUND)
         volume = now.volume_ratio
         last, refactor, iterations, secants = np.inf, self.kept is None, 0, Secants()
         while True:
             move, moves = self._to_move(u, held)
             norm, reference = now.norm, now.reference
-            if not (np.isfinite(norm) and now.volume_ratio > 0):
+            if not rules.sound(norm, now.volume_ratio):
                 return self._failed(u, iterations, fresh, "an element inverts")
             largest = self.kept.largest if self.kept else 0.0
             rounding = 2 * np.finfo(float).eps * largest * now.length
-            small = norm <= settings.residual_tolerance * reference or norm <= rounding
-            if small and size < settings.step_tolerance and not moves:
+            small = rules.balanced(norm, reference, rounding, settings.residual_tolerance)
+            if rules.converged(small, size, not moves, settings):
                 found = u, now.residual, now.load, iterations, fresh
                 return Found(*found, self.kept, "", volume)
-            if fresh >= settings.max_iterations or iterations >= 6 * settings.max_iterations:
+            exhausted = iterations >= rules.MOST_ITERATIONS * settings.max_iterations
+            if exhausted or rules.exhausted(fresh, settings):
                 reason = f"no convergence in {iterations} Newton iterations"
                 return self._failed(u, iterations, fresh, reason)
             slow = iterations > 0 and norm > _SLOW * last and not small
@@ -366,8 +365,7 @@ class StepSolver:
         """Remaining prescribed displacement [m], and whether there is any."""
         if self.free:
             return 0.0, False
-        move = np.where(self.known, held - u.ravel(), 0.0)
-        move[np.abs(move) <= 1e-12 * np.abs(held).max(initial=0.0)] = 0.0
+        move = rules.left_to_move(np.where(self.known, held - u.ravel(), 0.0), held)
         return move, bool(np.any(move))
 
     def _renew(self, u, before) -> bool:
@@ -423,20 +421,19 @@ class StepSolver:
             du = float(longest_share(self._problem, jnp.asarray(du))) * du
         new = u + du
         now = self._balance(new, u)
-        if not now.volume_ratio > 0.1:
-            du = safe_fraction(self._problem, self.prepared, u, du) * du
+        if not rules.keeps_volume(now.volume_ratio):
+            du = float(safe_fraction(self._problem, self.prepared, u, du)) * du
             new = u + du
             now = self._balance(new, u)
-        # without load the displacement is rounding alone, which never gets relatively small
-        size = np.abs(du).max() / (np.abs(new).max() + 1e-6 * self.length)
-        if slope is None or not slope < 0:
+        size = rules.relative_size(du, new, self.length)
+        if slope is None:
             return new, now, size
         share = 1.0
-        for _ in range(_MAX_SHORTENINGS):
+        for _ in range(rules.MAX_SHORTENINGS):
             end = float(np.where(self.known, 0.0, now.residual) @ du.ravel())
-            if not end > _SLOPE_TURNED * -slope:
+            if not rules.turned(slope, end):
                 break
-            share *= slope / (slope - end)
+            share = rules.shortened(share, slope, end)
             new = u + share * du
             now = self._balance(new, u)
         return new, now, share * size

@@ -155,7 +155,7 @@ class Equilibrium(NamedTuple):
     rest: Problem
     u: Float[Array, "nodes dim"]
     values: Float[Array, " nnz"]
-    counts: Float[Array, " 4"]
+    counts: Float[Array, " 5"]
 
 
 def response(at: Equilibrium, rates: Problem) -> Float[Array, "nodes dim"]:
@@ -406,7 +406,8 @@ def _from_guess(problem: Problem, guess: Start, log: Log) -> np.ndarray:
 def _outcome(call: Solve, u: np.ndarray, log: Log) -> Outcome:
     stats = log.stats()
     done = stats.steps[-1].fraction if stats.steps else 0.0
-    counts = np.array([bool(log.reason), done, stats.iterations, stats.cuts], u.dtype)
+    numbers = bool(log.reason), done, stats.iterations, stats.cuts, len(stats.steps)
+    counts = np.array(numbers, u.dtype)
     tangent = np.zeros(call.num_values, u.dtype)
     if call.num_values and not log.reason:
         tangent = log.end.tangent.values  # type: ignore[union-attr]
@@ -443,7 +444,7 @@ def _lanes_on_host(leaves, call: Solve, lead, batched) -> list[jax.Array]:
 
 def _shapes(*leaves, call: Solve, lead, batched):
     dtype = jnp.result_type(float)
-    shapes = (call.shape, (4,), (call.num_values,))
+    shapes = (call.shape, (5,), (call.num_values,))
     return [jax.ShapeDtypeStruct((*lead, *shape), dtype) for shape in shapes]
 
 

@@ -1,6 +1,6 @@
 """Load stepping and Newton's method inside a trace, as one compiled loop.
 
-The rules are those of `load_stepping` and `newton`. Every pass assembles once and does one
+The `rules` are those of the driver on the host. Every pass assembles once and does one
 thing: accept the load level, halve it, shorten the last update or take a Newton step with the
 direct solver behind a callback.
 """
@@ -13,22 +13,22 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax._jax.trace_state import is_traced
-from sorojax.fem.assembly import assemble as asm
 from sorojax.fem.assembly.assemble import cell_matrices
 from sorojax.fem.assembly.geometry import geometry
 from sorojax.fem.assembly.space import Space
-from sorojax.fem.equilibrium.linear import Linearised, Prepared, constrain, linearise, prepare
+from sorojax.fem.equilibrium import rules
+from sorojax.fem.equilibrium.linear import Prepared, constrain, linearise, prepare
 from sorojax.fem.equilibrium.load_stepping import between, unloaded
-from sorojax.fem.equilibrium.newton import Newton, overshoots, share_of_step
+from sorojax.fem.equilibrium.newton import Newton, overshoots, safe_fraction, share_of_step
 from sorojax.fem.problem import Problem
 from sorojax.fem.supports import known_components, known_values
-from sorojax.material.hyperelastic import finite_share
 from sorojax.math.linalg import sparse
 
 
 class Begin(NamedTuple):
-    """Where to start from: a displacement [m], the loads and supports it balances (those of
-    the problem itself when `None`) and the values of the tangent there, if known."""
+    """Where to start from: a displacement [m], the loads and supports it balances and the
+    values of the tangent there, if known. Without loads and supports it is a guess of the
+    end, and the load is followed from rest if it is too far away."""
 
     u: Float[Array, "nodes dim"]
     terms: tuple | None = None
@@ -37,15 +37,17 @@ class Begin(NamedTuple):
 
 class Outcome(NamedTuple):
     """Displacement, tangent values there (empty unless asked for), and as floats, so that
-    one rule serves every output: failed or not, fraction of the load, iterations, cuts."""
+    one rule serves every output: failed or not, fraction of the load, iterations, cuts and
+    load steps."""
 
     u: Float[Array, "nodes dim"]
-    counts: Float[Array, " 4"]
+    counts: Float[Array, " 5"]
     tangent: Float[Array, " nnz"]
 
 
 class _State(NamedTuple):
-    """`u` is the trial, `start` the last equilibrium, at the fraction `done` of the load."""
+    """`u` is the trial, `start` the last equilibrium on the `way`; `guess` while a guess of
+    the end is tried."""
 
     u: Float[Array, "nodes dim"]
     before: Float[Array, "nodes dim"]
@@ -54,14 +56,11 @@ class _State(NamedTuple):
     predict: Bool[Array, ""]
     moved: Bool[Array, ""]
     shortened: Bool[Array, ""]
+    guess: Bool[Array, ""]
     update: Float[Array, ""]
-    done: Float[Array, ""]
-    goal: Float[Array, ""]
-    step: Float[Array, ""]
+    way: rules.LoadSteps
     iterations: Int[Array, ""]
     total: Int[Array, ""]
-    cuts: Int[Array, ""]
-    failures: Int[Array, ""]
     running: Bool[Array, ""]
 
 
@@ -123,20 +122,21 @@ def follow_traced(
     state = _initial(problem, begin, steps)
 
     def one_pass(state: _State) -> _State:
-        here = between(first, problem, state.goal)  # pyright: ignore[reportArgumentType]
+        here = between(first, problem, rules.goal(state.way))
         level = _examine(here, prepared, state, newton)
-        return _next(problem, prepared, state, level, max_cuts)
+        return _next(problem, prepared, state, level, steps, max_cuts)
 
     end = jax.lax.while_loop(lambda state: state.running, one_pass, state)
-    numbers = (end.done < 1.0, end.done, end.total, end.cuts)
+    way = end.way
+    numbers = (way.done < 1.0, way.done, end.total, way.cuts, way.accepted)
     counts = jnp.stack([jnp.asarray(n, end.u.dtype) for n in numbers])
     return Outcome(end.start, counts, end.tangent)
 
 
 def _first(problem: Problem, begin: Begin | None) -> Problem:
-    if begin is None:
+    if begin is None or begin.terms is None:
         return unloaded(problem)
-    return problem if begin.terms is None else with_terms(problem, begin.terms)
+    return with_terms(problem, begin.terms)
 
 
 def with_terms(problem: Problem, terms: tuple) -> Problem:
@@ -149,25 +149,24 @@ def _initial(problem: Problem, begin: Begin | None, steps: int) -> _State:
     points = problem.mesh.points
     u = jnp.zeros_like(points) if begin is None else jnp.asarray(begin.u, points.dtype)
     tangent = None if begin is None else begin.tangent
-    predict = jnp.asarray(tangent is not None and _smooth(problem))
+    predict = jnp.asarray(tangent is not None and rules.predicts(problem.loads))
+    guess = begin is not None and begin.terms is None
     if tangent is None:
         tangent = jnp.zeros(problem.space.system.num_values, points.dtype)
-    false, zero = jnp.asarray(False), jnp.zeros((), points.dtype)
-    none, step = jnp.asarray(0, jnp.int32), jnp.asarray(1.0 / steps, points.dtype)
+    false, none = jnp.asarray(False), jnp.asarray(0, jnp.int32)
     return _State(
         u=u, before=u, start=u, tangent=tangent, predict=predict, moved=false, shortened=false,
-        update=zero + jnp.inf, done=zero, goal=_goal(zero, step), step=step,
-        iterations=none, total=none, cuts=none, failures=none,
+        guess=jnp.asarray(guess), update=jnp.asarray(jnp.inf, points.dtype),
+        way=_way(1 if guess else steps, points.dtype), iterations=none, total=none,
         running=jnp.all(jnp.isfinite(u)),
     )  # fmt: skip
 
 
-def _smooth(problem: Problem) -> bool:
-    return all(load.smooth for load in problem.loads)
-
-
-def _goal(done, step):
-    return jnp.where(done + step < 1.0 - 1e-9, done + step, jnp.ones_like(done))
+def _way(steps: int, dtype) -> rules.LoadSteps:
+    return jax.tree.map(
+        lambda n: jnp.asarray(n, dtype if isinstance(n, float) else jnp.int32),
+        rules.first_step(steps),
+    )
 
 
 def _examine(here: Problem, prepared: Prepared, state: _State, newton: Newton) -> _Level:
@@ -175,13 +174,15 @@ def _examine(here: Problem, prepared: Prepared, state: _State, newton: Newton) -
     found = linearise(here, prepared, state.u, state.before)
     wanted = known_values(here.supports, *state.u.shape)
     move = jnp.where(prepared.known, wanted - state.u.ravel(), jnp.zeros_like(wanted))
-    tiny = jnp.abs(move) <= 1e-12 * jnp.max(jnp.abs(wanted))
-    move = jnp.where(state.moved & tiny, jnp.zeros_like(move), move)
-    collapsed = state.moved & ~state.shortened & ~(found.volume_ratio > 0.1)
-    valid = jnp.isfinite(found.residual_norm) & (found.volume_ratio > 0)
-    small = _is_small(found, newton) & (state.update < newton.step_tolerance)
-    converged = ~collapsed & valid & small & ~state.predict & ~jnp.any(move != 0)
-    exhausted = (state.iterations >= newton.max_iterations) & ~state.predict
+    move = rules.left_to_move(move, wanted)
+    still = ~jnp.any(move != 0)
+    collapsed = state.moved & ~state.shortened & ~rules.keeps_volume(found.volume_ratio)
+    norm, tolerance = found.residual_norm, newton.residual_tolerance
+    valid = rules.sound(norm, found.volume_ratio)
+    small = rules.balanced(norm, found.reference, found.rounding, tolerance)
+    answer = rules.converged(small, state.update, still, newton) & ~state.predict
+    converged = ~collapsed & valid & answer
+    exhausted = rules.exhausted(state.iterations, newton) & ~state.predict
     failed = ~collapsed & ~converged & (~valid | exhausted)
     values = jnp.where(state.predict, state.tangent, found.values)
 
@@ -200,43 +201,36 @@ def _examine(here: Problem, prepared: Prepared, state: _State, newton: Newton) -
     du, usable = jax.lax.cond(seek, direction, nothing)
     if overshoots(here):
         share = share_of_step(here, prepared.known, found.residual, state.u, du)
-        free = seek & ~state.predict & ~jnp.any(move != 0)
+        free = seek & ~state.predict & still
         du = jnp.where(free, share, jnp.ones_like(share)) * du
     # a singular tangent ends the level, except that of the first guess
     failed = failed | (seek & ~usable & ~state.predict)
     return _Level(collapsed, converged, failed, seek & ~failed, usable, du, found.values)
 
 
-def _is_small(found: Linearised, newton: Newton):
-    loaded = found.reference > 0
-    scale = jnp.where(loaded, found.reference, jnp.ones_like(found.reference))
-    ratio = found.residual_norm / scale
-    return (ratio < newton.residual_tolerance) | (found.residual_norm < found.rounding)
+def _next(problem, prepared, state: _State, level: _Level, steps: int, max_cuts: int) -> _State:
+    whole = state.u - state.before
 
-
-def _next(problem, prepared, state: _State, level: _Level, max_cuts: int) -> _State:
     def shorter():
-        du = state.u - state.before
-        args = (problem.space, prepared.geometry, problem.kinematics, state.before, du)
-        share = finite_share(problem.material)
-        return state.before + 0.9 * asm.largest_step(*args, share=share) * du
+        return state.before + safe_fraction(problem, prepared, state.before, whole) * whole
 
     short = jax.lax.cond(level.collapsed, shorter, lambda: state.u)
     new = state.u + level.du
-    scale = jnp.max(jnp.abs(new)) + 1e-9 * prepared.length
-    update = jnp.max(jnp.abs(level.du)) / scale
+    update = rules.relative_size(level.du, new, prepared.length)
     update = jnp.where(level.usable, update, jnp.full_like(update, jnp.inf))
     moved = state._replace(
         u=new, before=state.u, predict=jnp.asarray(False), moved=jnp.asarray(True),
         shortened=jnp.asarray(False), update=update,
         iterations=state.iterations + jnp.where(state.predict, 0, 1).astype(jnp.int32),
     )  # fmt: skip
-    shortened = state._replace(u=short, shortened=jnp.asarray(True))
+    # how small it is, is asked of the step that Newton's method wanted
+    update = rules.relative_size(whole, short, prepared.length)
+    shortened = state._replace(u=short, shortened=jnp.asarray(True), update=update)
     branches = (
         (level.stepped, moved),
         (level.collapsed, shortened),
-        (level.converged, _accepted(state, level, _smooth(problem))),
-        (level.failed, _cut(state, max_cuts)),
+        (level.converged, _accepted(state, level, rules.predicts(problem.loads))),
+        (level.failed, _cut(state, steps, max_cuts)),
     )
     chosen = state
     for taken, branch in branches:
@@ -244,23 +238,25 @@ def _next(problem, prepared, state: _State, level: _Level, max_cuts: int) -> _St
     return chosen
 
 
-def _accepted(state: _State, level: _Level, smooth: bool) -> _State:
-    step = jnp.where(state.iterations <= 5, 1.5 * state.step, state.step)
+def _accepted(state: _State, level: _Level, predicts: bool) -> _State:
+    way = rules.accept(state.way, state.iterations)
     state = state._replace(
-        before=state.u, start=state.u, tangent=level.values, done=state.goal, step=step,
-        predict=jnp.asarray(smooth),
-        goal=_goal(state.goal, step), total=state.total + state.iterations,
-        failures=jnp.zeros_like(state.failures), running=state.goal < 1.0,
+        before=state.u, start=state.u, tangent=level.values, way=way,
+        predict=jnp.asarray(predicts), guess=jnp.asarray(False),
+        total=state.total + state.iterations, running=way.done < 1.0,
     )  # fmt: skip
     return _fresh(state)
 
 
-def _cut(state: _State, max_cuts: int) -> _State:
-    step, failures = (state.goal - state.done) / 2, state.failures + 1
+def _cut(state: _State, steps: int, max_cuts: int) -> _State:
+    """After a load step that failed: a shorter one, or the first one where it was a guess."""
+    from_rest = state.guess
+    u = jnp.where(from_rest, jnp.zeros_like(state.start), state.start)
+    shorter, first = rules.cut(state.way), _way(steps, state.u.dtype)
+    way = jax.tree.map(lambda a, b: jnp.where(from_rest, a, b), first, shorter)
     state = state._replace(
-        u=state.start, before=state.start, step=step, goal=_goal(state.done, step),
-        predict=jnp.asarray(False), failures=failures,
-        cuts=state.cuts + 1, running=failures <= max_cuts,
+        u=u, before=u, start=u, way=way, predict=jnp.asarray(False), guess=jnp.asarray(False),
+        running=from_rest | rules.goes_on(shorter, steps, max_cuts),
     )  # fmt: skip
     return _fresh(state)
 

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sorojax._progress import report
+from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import Linearised, Prepared, prepare
 from sorojax.fem.equilibrium.newton import Newton, newton_solve
 from sorojax.fem.problem import Problem
@@ -85,33 +86,27 @@ def begin_at(problem: Problem, begin: Start | np.ndarray | None) -> Start:
 def follow(problem: Problem, begin: Start, log: Log) -> np.ndarray:
     """Step from `begin` to `problem`, halving steps that fail."""
     prepared = prepare(problem)
-    u, tangent, done, size, failures = begin.u, begin.tangent, 0.0, 1.0 / log.num_steps, 0
-    kept = None
-    least = 0.99 * size / 2 ** (log.max_cuts + 1)
-    while done < 1.0:
-        goal = min(1.0, done + size) if done + size < 1.0 - 1e-9 else 1.0
+    u, tangent, kept, way = begin.u, begin.tangent, None, rules.first_step(log.num_steps)
+    while way.done < 1.0:
+        goal = rules.goal(way)
         here = problem if goal == 1.0 else between(begin.problem, problem, goal)
         known = np.asarray(known_values(here.supports, *u.shape))
         result = newton_solve(here, prepared, u, known, log.newton, tangent, kept)
         if result.reason:
-            failures += 1
-            log.cuts += 1
-            size, tangent, kept = (goal - done) / 2, None, None
-            # at a limit point single steps go on for ever, each shorter than the one before
-            if failures > log.max_cuts or size < least:
+            way, tangent, kept = rules.cut(way), None, None
+            log.cuts = way.cuts
+            if not rules.goes_on(way, log.num_steps, log.max_cuts):
                 log.reason = result.reason
                 return u
             continue
-        u, tangent, done, failures = result.u, result.linearised, goal, 0
-        kept = result.kept
+        u, tangent, kept = result.u, result.linearised, result.kept
+        way = rules.accept(way, result.iterations)
         log.steps.append(
             LoadStep(goal, result.iterations, result.residual, result.negative_eigenvalues)
         )
         log.end = Start(u, problem, tangent)
         if len(log.steps) + log.cuts > 1:  # one step is no wait worth a line
-            report("load", done, 1.0, iterations=result.iterations, cuts=log.cuts)
-        if result.iterations <= 5:
-            size *= 1.5
+            report("load", goal, 1.0, iterations=result.iterations, cuts=log.cuts)
     return u
 
 

@@ -3,7 +3,7 @@
 A step is accepted only if the smallest volume ratio keeps a tenth of its value; otherwise it
 is shortened by a closed form. The residual of thin rubber walls may rise by orders of
 magnitude in the first iteration, so it need not fall: convergence is judged by update and
-residual together. Steps along which a contact or friction changes its state are shortened by
+residual together (`rules`). Steps along which a contact or friction changes its state are shortened by
 a line search on the energy of these loads alone. Where contacts close or open, the tangent
 changes by little in rank: BFGS updates correct a factor of an earlier iteration.
 
@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float
 
 from sorojax._jax.jit import once
 from sorojax.fem.assembly import assemble as asm
+from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import Linearised, Neighbour, Prepared, linearise, step
 from sorojax.fem.problem import Problem, unsupported
 from sorojax.material.hyperelastic import finite_share
@@ -276,31 +277,31 @@ def newton_solve(
     kept: KeptFactor | None = None,
 ) -> Iterate:
     """Equilibrium near `start`. `tangent`, of a neighbouring equilibrium, gives a first
-    guess at the price of a few back-substitutions with the factor `kept` from there, unless
-    a load has kinks: the points that an obstacle moved into have no stiffness yet."""
+    guess at the price of a few back-substitutions with the factor `kept` from there."""
     u, before = start, start
     state = _linearise(problem, prepared, u, before)
     known = np.asarray(prepared.known)
-    move = np.where(known, known_values - u.ravel(), 0.0)
+    move = _left_to_move(known, known_values, u)
     iterations, negative, size = 0, 0, np.inf
     if kept is None:
         kept = KeptFactor(known, problem.mesh.element.dim, settings.residual_tolerance)
-    if tangent is not None and all(load.smooth for load in problem.loads):
+    if tangent is not None and rules.predicts(problem.loads):
         near = kept.near(u, 1.0, 0.0)
         du, negative, new = step(problem, prepared, tangent.values, state.residual, move, near)
         kept.renew(new, u)
         if du is not None:
             u, before, state, size = _advance(problem, prepared, u, du)
-            move = np.where(known, known_values - u.ravel(), 0.0)
+            move = _left_to_move(known, known_values, u)
     while True:
         norm, reference = float(state.residual_norm), float(state.reference)
-        ratio = norm / reference if reference > 0 else norm
-        if not (np.isfinite(norm) and float(state.volume_ratio) > 0):
+        ratio = rules.imbalance(norm, reference)
+        if not rules.sound(norm, float(state.volume_ratio)):
             return Iterate(u, None, iterations, ratio, negative, "an element inverts")
-        small = ratio < settings.residual_tolerance or norm < float(state.rounding)
-        if small and size < settings.step_tolerance and not np.any(move):
+        tolerance, still = settings.residual_tolerance, not np.any(move)
+        small = rules.balanced(norm, reference, float(state.rounding), tolerance)
+        if rules.converged(small, size, still, settings):
             return Iterate(u, state, iterations, ratio, negative, "", kept)
-        if iterations == settings.max_iterations:
+        if rules.exhausted(iterations, settings):
             reason = f"no convergence in {iterations} Newton iterations"
             return Iterate(u, None, iterations, ratio, negative, reason)
         near = kept.near(u, ratio, size)
@@ -310,12 +311,15 @@ def newton_solve(
             reason = problem.space.system.unsolved
             return Iterate(u, None, iterations, ratio, negative, reason)
         iterations += 1
-        if overshoots(problem) and not np.any(move):
+        if overshoots(problem) and still:
             args = (problem, prepared.known, state.residual, jnp.asarray(u), jnp.asarray(du))
             du = float(share_of_step(*args)) * du
         u, before, state, size = _advance(problem, prepared, u, du)
-        move = np.where(known, known_values - u.ravel(), 0.0)
-        move[np.abs(move) <= 1e-12 * np.abs(known_values).max()] = 0.0
+        move = _left_to_move(known, known_values, u)
+
+
+def _left_to_move(known: np.ndarray, known_values: np.ndarray, u: np.ndarray) -> np.ndarray:
+    return rules.left_to_move(np.where(known, known_values - u.ravel(), 0.0), known_values)
 
 
 def _linearise(problem, prepared, u: np.ndarray, before: np.ndarray) -> Linearised:
@@ -326,22 +330,15 @@ def _advance(problem: Problem, prepared: Prepared, u: np.ndarray, du: np.ndarray
     """The state after a step, shortened where a cell would collapse."""
     new = u + du
     state = _linearise(problem, prepared, new, u)
-    if not float(state.volume_ratio) > 0.1:
-        new = u + safe_fraction(problem, prepared, u, du) * du
+    if not rules.keeps_volume(float(state.volume_ratio)):
+        new = u + float(safe_fraction(problem, prepared, u, du)) * du
         state = _linearise(problem, prepared, new, u)
-    return new, u, state, relative_size(prepared, new, du)
+    return new, u, state, rules.relative_size(du, new, float(prepared.length))
 
 
-def safe_fraction(problem: Problem, prepared: Prepared, u: np.ndarray, du: np.ndarray) -> float:
-    """Fraction of a step that keeps more than a tenth of every volume."""
-    fraction = asm.largest_step(
-        problem.space, prepared.geometry, problem.kinematics, jnp.asarray(u), jnp.asarray(du),
-        share=finite_share(problem.material),
-    )  # fmt: skip
-    return 0.9 * float(fraction)
-
-
-def relative_size(prepared: Prepared, u: np.ndarray, du: np.ndarray) -> float:
-    """Largest entry of a step over that of the displacement."""
-    # without load the displacement is rounding alone, which never gets relatively small
-    return np.abs(du).max() / (np.abs(u).max() + 1e-6 * float(prepared.length))
+def safe_fraction(problem: Problem, prepared: Prepared, u, du) -> Float[Array, ""]:
+    """Fraction of a step `du` [m] from `u` [m] that keeps enough of every volume."""
+    args = (problem.space, prepared.geometry, problem.kinematics, jnp.asarray(u))
+    share = finite_share(problem.material)
+    longest = asm.largest_step(*args, jnp.asarray(du), keep=rules.LEAST_VOLUME, share=share)
+    return rules.SAFE * longest

@@ -30,9 +30,9 @@ class Solution(eqx.Module):
     """Displacement at equilibrium [m], or at the last converged fraction of the load.
 
     Every array gets the batch axes of `jax.vmap` in front, so each lane has its own
-    `status`, `load_fraction` and Newton `iterations`. `stats` is kept on the host: the
-    record of the solve, under `vmap` a tuple with that of every lane in row-major order,
-    and `None` under `jit`, where it does not exist yet.
+    `status`, `load_fraction`, Newton `iterations`, accepted `load_steps` and `cuts`. `stats`
+    is kept on the host: the record of the solve, under `vmap` a tuple with that of every lane
+    in row-major order, and `None` under `jit`, where it does not exist yet.
     """
 
     problem: Problem
@@ -41,6 +41,8 @@ class Solution(eqx.Module):
     stats: Any = eqx.field(static=True)  # Stats, one per lane under vmap, None under jit
     load_fraction: Float[Array, ""] | None = None
     iterations: Int[Array, ""] | None = None
+    load_steps: Int[Array, ""] | None = None
+    cuts: Int[Array, ""] | None = None
 
     def _text(self) -> str:
         u = self.displacement
@@ -175,15 +177,17 @@ def _begun(start: Any) -> Begin:
         return Begin(real(start))
 
 
-def _told(counts: Float[Array, " 4"], stats):
-    """Status, record, fraction of the load and iterations, from what is concrete at once:
-    every operation beside a derivative is staged with it."""
+def _told(counts: Float[Array, " 5"], stats):
+    """Status, record, fraction of the load, iterations, load steps and cuts, from what is
+    concrete at once: every operation beside a derivative is staged with it."""
     with evaluated_now(counts):
         if isinstance(stats, Stats):
-            failed, fraction, iterations, _ = np.asarray(counts)
+            failed, fraction, *whole = np.asarray(counts)
             status = Status.not_converged if failed else Status.successful
-            return status, stats, jnp.asarray(fraction), jnp.asarray(np.int32(iterations))
-        return _status(counts[0] != 0), stats, counts[1], counts[2].astype(jnp.int32)
+            iterations, cuts, steps = map(jnp.asarray, np.asarray(whole, np.int32))
+            return status, stats, jnp.asarray(fraction), iterations, steps, cuts
+        whole = counts.astype(jnp.int32)
+        return _status(counts[0] != 0), stats, counts[1], whole[2], whole[4], whole[3]
 
 
 def solve_path(

@@ -17,6 +17,7 @@ from sorojax._display import displayed, number, outcome
 from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax._progress import report
 from sorojax._types import real
+from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import linearise, prepare
 from sorojax.fem.equilibrium.load_stepping import LoadStep, Log, Stats, between, unloaded
 from sorojax.fem.equilibrium.newton import Newton
@@ -154,9 +155,9 @@ def follow_contents(
     prepared = prepare(problem)
     u, pressures = np.asarray(begin.u), np.asarray(begin.pressures)
     first = begin_volumes(problem, names, jnp.asarray(u))
-    done, size, failures = 0.0, 1.0 / log.num_steps, 0
-    while done < 1.0:
-        goal = done + size if done + size < 1.0 - 1e-9 else 1.0
+    way = rules.first_step(log.num_steps)
+    while way.done < 1.0:
+        goal = rules.goal(way)
 
         def at(u, y, goal=goal):
             here = with_pressures(between(begin.problem, problem, goal), names, jnp.asarray(y))
@@ -165,18 +166,15 @@ def follow_contents(
 
         found = newton_bordered(at, prepared, u, pressures, log.newton)
         if found.reason:
-            failures += 1
-            log.cuts += 1
-            if failures > log.max_cuts:
+            way = rules.cut(way)
+            log.cuts = way.cuts
+            if not rules.goes_on(way, log.num_steps, log.max_cuts):
                 log.reason = found.reason
                 return u, pressures
-            size = (goal - done) / 2
             continue
-        u, pressures, done, failures = found.u, found.y, goal, 0
+        u, pressures, way = found.u, found.y, rules.accept(way, found.iterations)
         log.steps.append(LoadStep(goal, found.iterations, found.residual, -1))
-        report("contents", done, 1.0, iterations=found.iterations, cuts=log.cuts)
-        if found.iterations <= 5:
-            size *= 1.5
+        report("contents", goal, 1.0, iterations=found.iterations, cuts=log.cuts)
     return u, pressures
 
 

@@ -28,9 +28,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import Linearised, Prepared, linearise
 from sorojax.fem.equilibrium.load_stepping import between, unloaded
-from sorojax.fem.equilibrium.newton import Newton, relative_size, safe_fraction
+from sorojax.fem.equilibrium.newton import Newton, safe_fraction
 from sorojax.fem.problem import Problem, load_force
 from sorojax.fem.supports import known_values
 from sorojax.math.linalg import sparse
@@ -112,9 +113,9 @@ def schur_complement(border: Border, rates: np.ndarray) -> np.ndarray:
 def unknown_move(prepared: Prepared, border: Border, u: np.ndarray) -> np.ndarray:
     """How far the supports are from where they should be [m]."""
     known = np.asarray(border.known)
-    move = np.where(np.asarray(prepared.known), known - u.ravel(), 0.0)
-    move[np.abs(move) <= 1e-12 * np.abs(known).max()] = 0.0
-    return move
+    return rules.left_to_move(
+        np.where(np.asarray(prepared.known), known - u.ravel(), 0.0), known
+    )
 
 
 def newton_bordered(
@@ -129,15 +130,16 @@ def newton_bordered(
     iterations, size = 0, np.inf
     while True:
         norm, reference = float(state.residual_norm), float(state.reference)
-        ratio = norm / reference if reference > 0 else norm
-        if not (np.isfinite(norm) and float(state.volume_ratio) > 0):
+        ratio = rules.imbalance(norm, reference)
+        if not rules.sound(norm, float(state.volume_ratio)):
             return BorderedIterate(u, y, None, iterations, ratio, "an element inverts")
         move = unknown_move(prepared, border, u)
-        small = ratio < settings.residual_tolerance or norm < float(state.rounding)
+        tolerance, still = settings.residual_tolerance, not np.any(move)
+        small = rules.balanced(norm, reference, float(state.rounding), tolerance)
         closed = np.all(np.abs(border.gap) <= 1e-9 * np.asarray(border.scale))
-        if small and closed and size < settings.step_tolerance and not np.any(move):
+        if closed and rules.converged(small, size, still, settings):
             return BorderedIterate(u, y, state, iterations, ratio, "")
-        if iterations == settings.max_iterations:
+        if rules.exhausted(iterations, settings):
             reason = f"no convergence in {iterations} Newton iterations"
             return BorderedIterate(u, y, None, iterations, ratio, reason)
         step = _step(problem, prepared, state, border, move)
@@ -147,7 +149,7 @@ def newton_bordered(
         du, dy = step[0].reshape(u.shape), step[1]
         before = u
         u, y, problem, border, state = _advance(at, prepared, problem, u, y, du, dy)
-        size = relative_size(prepared, u, u - before)
+        size = rules.relative_size(u - before, u, float(prepared.length))
 
 
 def _step(problem, prepared, state, border, move) -> tuple[np.ndarray, np.ndarray] | None:
@@ -169,9 +171,9 @@ def _advance(at: At, prepared: Prepared, problem: Problem, u, y, du, dy):
         new_u, new_y = u + fraction * du, y + fraction * dy
         new_problem, border = at(new_u, new_y)
         state = linearise(new_problem, prepared, jnp.asarray(new_u), jnp.asarray(u))
-        if fraction < 1.0 or float(state.volume_ratio) > 0.1:
+        if fraction < 1.0 or rules.keeps_volume(float(state.volume_ratio)):
             return new_u, new_y, new_problem, border, state
-        fraction = safe_fraction(problem, prepared, u, du)
+        fraction = float(safe_fraction(problem, prepared, u, du))
 
 
 # Steps of given length along a path of equilibria, over limit points
@@ -286,4 +288,4 @@ def _inside(loading: Loading, prepared: Prepared, start: PathState, u: np.ndarra
     """The guess, or the start where the guess would invert a cell."""
     problem = loading.at(start.factor)
     state = linearise(problem, prepared, jnp.asarray(u), jnp.asarray(start.u))
-    return u if float(state.volume_ratio) > 0.1 else start.u
+    return u if rules.keeps_volume(float(state.volume_ratio)) else start.u

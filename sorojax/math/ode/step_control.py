@@ -290,22 +290,29 @@ def _held(walk: _Walk, new: PyTree, old: PyTree):
     return jax.tree.map(lambda a, b: jnp.where(reached, a, b), new, old), reached
 
 
+def halved(share, failures, max_cuts: int):
+    """Size of the part after one that failed, failures in a row, and whether to go on."""
+    return share / 2, failures + 1, failures < max_cuts
+
+
+def may_double(share, end):
+    """Whether a part twice as large as `share` of a step may follow at `end`: it fits in."""
+    return (2 * share <= 1.0) & (end % (2 * share) == 0.0)
+
+
 def _walked(attempt: Attempt, max_cuts: int, given, h, state) -> _Walk:
     def one_pass(walk: _Walk) -> _Walk:
         new, converged = attempt(given, walk.done * h, walk.share * h, walk.state)
         fine = _fine(new, converged)
         end = walk.done + walk.share
-        wide = 2 * walk.share
-        grows = (wide <= 1.0) & (jnp.remainder(end, wide) == 0.0)
+        grown = jnp.where(may_double(walk.share, end), 2 * walk.share, walk.share)
         accepted = _Walk(
-            new, end, jnp.where(grows, wide, walk.share), jnp.zeros_like(walk.failures),
-            walk.row + 1, walk.ends.at[walk.row].set(end),
-            (end < 1.0) & (walk.row + 1 < _ROWS),
+            new, end, grown, jnp.zeros_like(walk.failures), walk.row + 1,
+            walk.ends.at[walk.row].set(end), (end < 1.0) & (walk.row + 1 < _ROWS),
         )  # fmt: skip
-        halved = walk._replace(
-            share=walk.share / 2, failures=walk.failures + 1, running=walk.failures < max_cuts
-        )
-        return jax.tree.map(lambda a, b: jnp.where(fine, a, b), accepted, halved)
+        share, failures, running = halved(walk.share, walk.failures, max_cuts)
+        cut = walk._replace(share=share, failures=failures, running=running)
+        return jax.tree.map(lambda a, b: jnp.where(fine, a, b), accepted, cut)
 
     zero, none = jnp.zeros_like(h), jnp.zeros((), jnp.int32)
     ends = jnp.zeros(_ROWS, h.dtype)

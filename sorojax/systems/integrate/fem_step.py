@@ -23,7 +23,9 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from sorojax import fem
 from sorojax.fem.dynamics.step import Dynamics, State, Step, with_terms
+from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import Linearised, Prepared, linearise
+from sorojax.fem.equilibrium.newton import safe_fraction
 from sorojax.fem.problem import load_force, residual
 from sorojax.fem.supports import known_values
 from sorojax.math.linalg import sparse
@@ -32,10 +34,6 @@ from sorojax.systems.blocks.fem_body import with_values
 
 Drives = dict[str, dict[str, Array]]  # values of driven loads, by body and load
 Fields = dict[str, Float[Array, "nodes dim"]]
-
-_COLLAPSED = 0.1  # of the volume of a cell, that a Newton step has to keep
-_TURNED = 0.5  # share of its slope at the start, that the energy may rise with at the end
-_SHORTENINGS = 12
 
 
 class Stage(NamedTuple):
@@ -156,22 +154,29 @@ def _judged(equations, newton, given, stages, unravel, now: _Pass, problems, fou
     forces = {k: _free(s.prepared.known, found[k].residual) for k, s in stages.items()}
     rise = sum(jnp.sum(forces[k] * now.du[k].ravel()) for k in stages)
     kept = jnp.min(jnp.stack([x.volume_ratio for x in found.values()]))
-    finite = jnp.all(jnp.isfinite(jnp.stack([x.residual_norm for x in found.values()])))
-    stepped = now.iterations > 0
-    collapsed = ~(kept > _COLLAPSED) | ~finite
-    turned = (now.slope < 0) & (rise > -_TURNED * now.slope)
-    first = ~stepped & collapsed  # the prediction is no good: start from where the step does
-    shorten = stepped & (collapsed | turned) & (now.shortenings < _SHORTENINGS)
+    fine = rules.sound(jnp.max(jnp.stack([x.residual_norm for x in found.values()])), kept)
+    stepped, collapsed = now.iterations > 0, ~rules.keeps_volume(kept)
+    # the prediction is no good: start from where the step does
+    first = ~stepped & (collapsed | ~fine)
+    shorten = collapsed | rules.turned(now.slope, rise)
+    shorten = stepped & shorten & (now.shortenings < rules.MAX_SHORTENINGS)
 
     def again():
-        fraction = jnp.where(collapsed, 0.4, now.slope / (now.slope - rise))
-        share = now.share * jnp.clip(fraction, 0.1, 0.9)
+        def safe():
+            fractions = [
+                safe_fraction(problems[k], s.prepared, now.base[k], now.share * now.du[k])
+                for k, s in stages.items()
+            ]
+            return now.share * jnp.min(jnp.stack(fractions))
+
+        shorter = rules.shortened(now.share, now.slope, rise)
+        share = jax.lax.cond(collapsed & ~first, safe, lambda: shorter)
         share = jnp.where(first, jnp.zeros_like(share), share)
         u = jax.tree.map(lambda a, b: a + share * b, now.base, now.du)
         count = now.iterations + jnp.where(first, 1, 0).astype(jnp.int32)
         return now._replace(
             u=u, w=now.base_w + share * now.dw, share=share, iterations=count,
-            shortenings=now.shortenings + 1, update=jnp.full_like(now.update, jnp.inf),
+            shortenings=now.shortenings + 1,
         )  # fmt: skip
 
     def examined():
@@ -182,9 +187,8 @@ def _judged(equations, newton, given, stages, unravel, now: _Pass, problems, fou
         moves = {k: _move(s.prepared.known, held[k], now.u[k]) for k, s in stages.items()}
         small = _small(newton, stages, unravel, problems, found, now.u, values, gap)
         settled = ~jnp.any(jnp.stack([jnp.any(move != 0) for move in moves.values()]))
-        fine = finite & (kept > 0)
-        converged = fine & small & settled & (now.update < newton.step_tolerance)
-        stop = converged | ~fine | (now.iterations >= newton.max_iterations)
+        converged = fine & rules.converged(small, now.update, settled, newton)
+        stop = converged | ~fine | rules.exhausted(now.iterations, newton)
 
         def step():
             return _solved(
@@ -194,14 +198,15 @@ def _judged(equations, newton, given, stages, unravel, now: _Pass, problems, fou
 
         still = (jax.tree.map(jnp.zeros_like, now.u), jnp.zeros_like(now.w))
         du, dw = jax.lax.cond(stop, lambda: still, step)
-        sizes = jax.tree.map(lambda u: jnp.max(jnp.abs(u)), (du, now.u))
-        update = jnp.max(jnp.stack([
-            sizes[0][k] / (sizes[1][k] + 1e-6 * s.prepared.length) for k, s in stages.items()
-        ]))  # fmt: skip
+        new = jax.tree.map(jnp.add, now.u, du)
+        sizes = [
+            rules.relative_size(du[k], new[k], s.prepared.length) for k, s in stages.items()
+        ]
+        update = jnp.max(jnp.stack(sizes))
         slope = sum(jnp.sum(forces[k] * du[k].ravel()) for k in stages)
         slope = jnp.where(settled, slope, jnp.zeros_like(slope))
         return _Pass(
-            jax.tree.map(jnp.add, now.u, du), now.w + dw,
+            new, now.w + dw,
             now.u, now.w, du, dw, jnp.ones_like(now.share), slope,
             jnp.zeros_like(now.shortenings), now.iterations + 1, update, converged, ~stop,
         )  # fmt: skip
@@ -215,8 +220,7 @@ def _free(known, force):
 
 def _move(known, held, u):
     """How far the supports are from where they should be [m]."""
-    move = jnp.where(known, held - u.ravel(), jnp.zeros_like(held))
-    return jnp.where(jnp.abs(move) <= 1e-12 * jnp.max(jnp.abs(held)), 0.0, move)
+    return rules.left_to_move(jnp.where(known, held - u.ravel(), jnp.zeros_like(held)), held)
 
 
 def _small(newton, stages, unravel, problems, found: dict[str, Linearised], u, values, gap):
@@ -231,8 +235,9 @@ def _small(newton, stages, unravel, problems, found: dict[str, Linearised], u, v
 
         lack = jax.jvp(force, (values[name],), (missed,))[1]
         lack = jnp.max(jnp.abs(_free(stage.prepared.known, lack)), initial=0.0)
-        most = jnp.maximum(newton.residual_tolerance * state.reference, state.rounding)
-        fits.append((state.residual_norm <= most) & (lack <= most))
+        allowed = state.reference, state.rounding, newton.residual_tolerance
+        norm = jnp.maximum(state.residual_norm, lack)  # of which neither may be NaN
+        fits.append(rules.balanced(norm, *allowed))
     return jnp.all(jnp.stack(fits))
 
 
