@@ -3,9 +3,9 @@
 A step is accepted only if the smallest volume ratio keeps a tenth of its value; otherwise it
 is shortened by a closed form. The residual of thin rubber walls may rise by orders of
 magnitude in the first iteration, so it need not fall: convergence is judged by update and
-residual together (`rules`). Steps along which a contact or friction changes its state are shortened by
-a line search on the energy of these loads alone. Where contacts close or open, the tangent
-changes by little in rank: BFGS updates correct a factor of an earlier iteration.
+residual together (`rules`). Steps along which a contact or friction changes its state are
+shortened by a line search on the energy of these loads alone. Where contacts close or open,
+the tangent changes by little in rank: BFGS updates correct a factor of an earlier iteration.
 
 References:
     Matthies, Strang, "The solution of nonlinear finite element equations", Int. J. Num.
