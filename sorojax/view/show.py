@@ -28,7 +28,7 @@ _DRAWN_BY = {
     "sorojax.rod.model.rod.Rod": ("draw.rods", "show_rod"),
     "sorojax.rod.model.assembly.Assembly": ("draw.rods", "show_rod"),
     "sorojax.rod.model.section.Section": ("draw.answers", "show_section"),
-    "sorojax.rod.model.basis.StrainBasis": ("draw.answers", "show_basis"),
+    "sorojax.rod.model.basis.StrainBasis": ("draw.figures", "show_basis"),
     "sorojax.rod.dynamics.rollout.Rollout": ("draw.runs", "show_rollout"),
     "sorojax.rod.statics.equilibrium.Equilibrium": ("draw.answers", "show_posed"),
     "sorojax.rod.statics.path.EquilibriumPath": ("draw.answers", "show_posed"),

@@ -6,17 +6,23 @@ Small nouns: sections, strain modes, materials, bodies as blocks.
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from sorojax.design import Calibration, OptimisedShape, Part
 from sorojax.fem import CriticalLoads, CriticalPoint, Problem
-from sorojax.material import AbstractHyperelastic, TensileFit, uniaxial_stress
+from sorojax.material import (
+    AbstractHyperelastic,
+    TensileFit,
+    strain_energy_density,
+    uniaxial_stress,
+)
 from sorojax.mesh import Repaired
-from sorojax.rod import Assembly, Rod, Section, StrainBasis
+from sorojax.rod import Assembly, Rod, Section
 from sorojax.view import style
-from sorojax.view.draw.figures import show_modes
 from sorojax.view.draw.meshes import edge_lines, show_cells
 from sorojax.view.draw.rod_loads import section_outline
 from sorojax.view.draw.rods import show_rod
@@ -54,12 +60,6 @@ def show_section(section: Section, *, title: str = "") -> Picture:
     return Picture(figure, (Panel(axes),))
 
 
-def show_basis(basis: StrainBasis, *, length: float = 1.0, **options: Any) -> Picture:
-    """Strain modes along a rod of `length` [m]; options of `show_modes`."""
-    figure = show_modes(basis, length, **options)
-    return Picture(figure, tuple(Panel(axes) for axes in figure.axes))
-
-
 def show_material(
     material: AbstractHyperelastic,
     *,
@@ -76,11 +76,17 @@ def show_material(
         title: Title of the figure.
     """
     stretch = np.linspace(*stretches, 121)
-    stress = np.asarray(uniaxial_stress(material, jnp.asarray(stretch))) / 1e3
+    stress = np.asarray(uniaxial_stress(material, jnp.asarray(stretch)))
+    return _tensile(material, stretch, stress, points, title)
+
+
+def _tensile(material: AbstractHyperelastic, stretch, stress, points, title: str) -> Picture:
+    """Stress [Pa] over stretch, with measured strains and stresses if given."""
     figure = style.new_figure(6.5, 4.2)
     axes = figure.add_subplot()
     axes.axhline(0.0, color=style.GREY, lw=0.8)
-    axes.plot(stretch, stress, color=style.COLOURS[0], lw=1.9, label=type(material).__name__)
+    axes.plot(stretch, stress / 1e3, color=style.COLOURS[0], lw=1.9,
+              label=type(material).__name__)  # fmt: skip
     if points is not None:
         axes.plot(1 + np.asarray(points[0]), np.asarray(points[1]) / 1e3, "o",
                   color=style.COLOURS[1], ms=6, label="measured")  # fmt: skip
@@ -195,7 +201,8 @@ def show_part(part: Part, **options: Any) -> Picture:
 def show_fit(
     fit: TensileFit, *, points: tuple[Any, Any] | None = None, title: str = ""
 ) -> Picture:
-    """Stress over stretch of a fitted material, as far as it was fitted.
+    """Stress over stretch of a fitted material, as far as it was fitted and, as in the fit,
+    taken as incompressible.
 
     Args:
         fit: From `material.fit_tensile`.
@@ -204,8 +211,23 @@ def show_fit(
     """
     low, high = fit.strain_range
     text = f"{fit.rms / 1e3:.3g} kPa rms, {100 * fit.relative_rms:.2g} %"
-    ends = 1 + min(low, 0.0), 1 + high
-    return show_material(fit.material, stretches=ends, points=points, title=title or text)
+    stretch = np.linspace(1 + min(low, 0.0), 1 + high, 121)
+    stress = np.asarray(_isochoric_stress(fit.material, jnp.asarray(stretch)))
+    return _tensile(fit.material, stretch, stress, points, title or text)
+
+
+@eqx.filter_jit
+def _isochoric_stress(
+    material: AbstractHyperelastic, stretch: Float[Array, " points"]
+) -> Float[Array, " points"]:
+    """Slope of the energy along isochoric uniaxial stretch [Pa]."""
+
+    def energy(stretch):
+        across = 1 / jnp.sqrt(stretch)
+        F = ((stretch, 0.0, 0.0), (0.0, across, 0.0), (0.0, 0.0, across))
+        return strain_energy_density(material, F)
+
+    return jax.vmap(jax.grad(energy))(stretch)
 
 
 def show_calibration(found: Calibration, *, title: str = "") -> Picture:

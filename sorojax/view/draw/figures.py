@@ -1,25 +1,19 @@
-"""Figures of modes, backbones, signals and material fits."""
+"""Figures of strain modes, backbones, signals, and of error over size and cost."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax._jax.jit import once
-from sorojax.material import AbstractHyperelastic, TensileFit, strain_energy_density
 from sorojax.reduction import Backbone
 from sorojax.rod import Rod, StrainBasis, columns, forward_kinematics
 from sorojax.view import style
 from sorojax.view.picture import Panel, Picture
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 Signals = Mapping[str, Mapping[str, Any]]
 
@@ -33,13 +27,13 @@ _SYMBOL = {
 }
 
 
-def show_modes(
+def show_basis(
     basis: StrainBasis,
-    length: float | Float[Array, ""],
     *,
+    length: float | Float[Array, ""] = 1.0,
     energy: Mapping[str, float | Sequence[float]] | None = None,
     title: str = "",
-) -> "Figure":
+) -> Picture:
     """Strain modes along the arc length, one panel per active strain.
 
     Args:
@@ -73,7 +67,7 @@ def show_modes(
     panels[-1].set_xlabel("arc length [mm]", fontsize=style.LABEL, color=style.INK)
     panels[-1].set_xlim(0.0, 1e3 * float(length))
     style.title(figure, title)
-    return figure
+    return Picture(figure, tuple(Panel(panel) for panel in panels))
 
 
 def backbone_errors(
@@ -97,7 +91,7 @@ def show_backbones(
     pressures: Float[Any, " steps"] | None = None,
     bar: float = 1e-3,
     title: str = "",
-) -> "Figure":
+) -> Picture:
     """Backbones of the solid against those of a rod, and the distance between them.
 
     Args:
@@ -136,10 +130,10 @@ def show_backbones(
     style.dress(right, across, "mean position error [mm]", largest)
     right.set_ylim(0.0, 1.12 * max(1e3 * bar, float(error.max())))
     style.title(figure, title)
-    return figure
+    return Picture(figure, (Panel(left), Panel(right)))
 
 
-def show_signals(time: Float[Any, " time"], panels: Signals, *, title: str = "") -> "Figure":
+def show_signals(time: Float[Any, " time"], panels: Signals, *, title: str = "") -> Picture:
     """Signals over time, one panel per entry, what belongs together in one panel.
 
     Args:
@@ -149,21 +143,23 @@ def show_signals(time: Float[Any, " time"], panels: Signals, *, title: str = "")
         title: Title of the figure.
     """
     time = np.asarray(time)
-    figure = style.new_figure(8.5, 0.7 + 2.0 * len(panels))
-    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False).ravel()
+    high = [max(1.6, 0.34 * len(lines)) for lines in panels.values()]
+    figure = style.new_figure(9.0, 0.7 + sum(high))
+    axes = figure.subplots(
+        len(panels), 1, sharex=True, squeeze=False, height_ratios=high
+    ).ravel()
     for panel, (label, signals) in zip(axes, panels.items(), strict=True):
-        draw_signals(panel, time, label, signals)
+        _draw_signals(panel, time, label, signals)
         style.legend(panel, loc="center left", bbox_to_anchor=(1.0, 0.5))
     axes[-1].set_xlabel("time [s]", fontsize=style.LABEL, color=style.INK)
     axes[-1].set_xlim(time[0], time[-1])
     figure.align_ylabels(list(axes))
     style.title(figure, title)
-    return figure
+    return Picture(figure, tuple(Panel(panel) for panel in axes))
 
 
-def draw_signals(axes: Any, time: np.ndarray, label: str, signals: Mapping[str, Any]) -> dict:
-    """Draw one panel and return its lines by name."""
-    lines, styles = {}, style.line_styles(signals)
+def _draw_signals(axes: Any, time: np.ndarray, label: str, signals: Mapping[str, Any]) -> None:
+    styles = style.line_styles(signals)
     for name, values in signals.items():
         values = np.asarray(values)
         if values.shape != time.shape:
@@ -172,57 +168,8 @@ def draw_signals(axes: Any, time: np.ndarray, label: str, signals: Mapping[str, 
                 "Give one number per instant; split vectors into several names."
             )
         above = 3 if styles[name]["color"] == style.REFERENCE else 2
-        (lines[name],) = axes.plot(time, values, label=name, zorder=above, **styles[name])
+        axes.plot(time, values, label=name, zorder=above, **styles[name])
     style.dress(axes, "", label)
-    return lines
-
-
-def show_curve(
-    fit: TensileFit | AbstractHyperelastic,
-    strain: Float[Any, " points"],
-    stress: Float[Any, " points"],
-    *,
-    title: str = "",
-) -> "Figure":
-    """Measured tensile points and the curve of a material, taken as incompressible.
-
-    Args:
-        fit: A fit from `fit_tensile`, or a material.
-        strain: Measured engineering strain [-].
-        stress: Measured engineering stress [Pa].
-        title: Title of the figure.
-    """
-    material = fit.material if isinstance(fit, TensileFit) else fit
-    stretch = 1 + np.asarray(strain, float)
-    low, high = min(1.0, stretch.min()), stretch.max()
-    at = np.linspace(low, high + 0.04 * (high - low), 200)
-    figure = style.new_figure(6.5, 4.2)
-    axes = figure.add_subplot()
-    curve = np.asarray(_tensile_stress(material, jnp.asarray(at)))
-    name = type(material).__name__
-    note = f", rms {fit.rms / 1e3:.3g} kPa" if isinstance(fit, TensileFit) else ""
-    axes.plot(at, curve / 1e3, color=style.COLOURS[0], lw=1.9, label=f"{name}{note}")
-    axes.plot(stretch, np.asarray(stress) / 1e3, "o", color=style.COLOURS[1], ms=6.5,
-              label="measured", zorder=3)  # fmt: skip
-    style.dress(axes, "stretch [-]", "engineering stress [kPa]")
-    axes.set_ylim(bottom=min(0.0, 1.05 * float(np.min(stress)) / 1e3))
-    style.legend(axes, loc="upper left")
-    style.title(figure, title)
-    return figure
-
-
-@eqx.filter_jit
-def _tensile_stress(
-    material: AbstractHyperelastic, stretch: Float[Array, " points"]
-) -> Float[Array, " points"]:
-    """Slope of the energy along isochoric uniaxial stretch [Pa]."""
-
-    def energy(stretch):
-        across = 1 / jnp.sqrt(stretch)
-        F = ((stretch, 0.0, 0.0), (0.0, across, 0.0), (0.0, 0.0, across))
-        return strain_energy_density(material, F)
-
-    return jax.vmap(jax.grad(energy))(stretch)
 
 
 def _percent(share: float) -> str:

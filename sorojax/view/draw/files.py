@@ -12,8 +12,8 @@ from jaxtyping import Float
 from sorojax import io
 from sorojax.mesh import Mesh
 from sorojax.view import style
+from sorojax.view.draw.figures import show_signals
 from sorojax.view.draw.meshes import edge_lines, show_cells
-from sorojax.view.draw.runs import time_plots
 from sorojax.view.draw.shapes import show_surface
 from sorojax.view.film.film import Film
 from sorojax.view.panels import panels
@@ -208,7 +208,7 @@ def _saved(path: Path, title: str, **options: Any) -> Picture:
                          for k in range(rows.shape[1])}  # fmt: skip
     if not groups:
         return _drawn(path, arrays, title, options)
-    return time_plots(time, groups, "", title)
+    return show_signals(time, groups, title=title)
 
 
 def _drawn(path: Path, arrays: dict[str, np.ndarray], title: str, options: dict) -> Picture:

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 _AXES = {"x": 0, "y": 1, "z": 2}
 
 
-def show_sdf(shape: AbstractSdf, *, resolution: int = 300, title: str = "") -> "Figure":
+def _show_plane(shape: AbstractSdf, resolution: int, title: str) -> Picture:
     """A plane shape: filled contours of its distance and the zero set as a line."""
-    lower, upper = finite_box("show_sdf", shape, 2)
+    lower, upper = finite_box("view.show", shape, 2)
     step = float(np.max(upper - lower)) / resolution
     margin = 0.06 * resolution * step
     ranges = zip(lower - margin, upper + margin + step, strict=True)
@@ -35,11 +35,11 @@ def show_sdf(shape: AbstractSdf, *, resolution: int = 300, title: str = "") -> "
     for run in _runs(shape, step):
         axes.plot(*(1e3 * run).T, color=style.INK, lw=1.5, solid_joinstyle="miter")
     style.dress_plane(axes, 1e3 * lower, 1e3 * upper)
-    return figure
+    return Picture(figure, (Panel(axes),))
 
 
-def show_slice(
-    shape: AbstractSdf, slice: dict[str, float], resolution: int = 300, title: str = ""
+def _show_slice(
+    shape: AbstractSdf, slice: dict[str, float], resolution: int, title: str
 ) -> Picture:
     """The distance of a solid shape in a plane across one axis, with the zero line."""
     if len(slice) != 1 or next(iter(slice)) not in _AXES:
@@ -131,11 +131,10 @@ def show_shape(
         return show_scene(shape_scene(shape, size, title), view=view, renderer=renderer)
     if shape.dim == 3:
         assert slice is not None
-        return show_slice(shape, slice, resolution, title)
+        return _show_slice(shape, slice, resolution, title)
     if filled:
         return show_scene(shape_scene(shape, size, title))
-    figure = show_sdf(shape, resolution=resolution, title=title)
-    return Picture(figure, (Panel(figure.axes[0]),))
+    return _show_plane(shape, resolution, title)
 
 
 def shape_scene(shape: AbstractSdf, size: float | None = None, title: str = "") -> Scene:

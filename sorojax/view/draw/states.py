@@ -40,7 +40,7 @@ Field = str | NodalField | Float[Any, " values"] | None
 
 
 @eqx.filter_jit
-def nodal_von_mises(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, " nodes"]:
+def _nodal_von_mises(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, " nodes"]:
     """Von Mises stress at the nodes, averaged between cells [kPa]."""
     return fem.nodal_average(problem, fem.von_mises_stress(problem, u)) / 1e3
 
@@ -66,7 +66,7 @@ def _energy_density(problem: Problem, u) -> Float[np.ndarray, " cells"]:
 
 
 _NAMED: dict[str, tuple[str, str, Callable[..., Any]]] = {
-    "von_mises": ("von Mises stress", "Pa", lambda p, u: 1e3 * nodal_von_mises(p, u)),
+    "von_mises": ("von Mises stress", "Pa", lambda p, u: 1e3 * _nodal_von_mises(p, u)),
     "pressure": ("mean stress", "Pa", _mean_stress),
     "displacement": ("displacement", "m", lambda p, u: jnp.sqrt(jnp.sum(u**2, axis=1))),
     "x": ("displacement along x", "m", lambda p, u: u[:, 0]),
