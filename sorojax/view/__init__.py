@@ -23,7 +23,7 @@ from sorojax.view.show import options as options, scene_of as scene_of, show as 
 from sorojax.view.style import png as png
 
 _NAMES = {
-    "draw.figures": (
+    "draw.plots": (
         "Convergence",
         "WorkPrecision",
         "backbone_errors",
@@ -80,14 +80,14 @@ _NAMES = {
 _MODULE = {name: module for module, names in _NAMES.items() for name in names}
 
 if TYPE_CHECKING:
-    from sorojax.view.draw.figures import (
+    from sorojax.view.draw.files import animate_file as animate_file, show_file as show_file
+    from sorojax.view.draw.plots import (
         Convergence as Convergence,
         WorkPrecision as WorkPrecision,
         backbone_errors as backbone_errors,
         show_backbones as show_backbones,
         show_signals as show_signals,
     )
-    from sorojax.view.draw.files import animate_file as animate_file, show_file as show_file
     from sorojax.view.film.animation import Track as Track, animate as animate
     from sorojax.view.film.film import Film as Film, animate_figure as animate_figure
     from sorojax.view.live_view.feed import Feed as Feed, Viser as Viser, live as live

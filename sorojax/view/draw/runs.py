@@ -10,8 +10,8 @@ from sorojax.design import History, Optimised
 from sorojax.mesh import Mesh
 from sorojax.systems import AbstractBlock, Trajectory
 from sorojax.view import style
-from sorojax.view.draw.figures import show_signals
 from sorojax.view.draw.meshes import mesh_scene
+from sorojax.view.draw.plots import show_signals
 from sorojax.view.panels import panels
 from sorojax.view.picture import Panel, Picture
 from sorojax.view.raster.scene import Scale, Scene, Surface

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sorojax.sdf import AbstractSdf, Surface as Triangles, contour, isosurface
+from sorojax.sdf import AbstractSdf, Curve, Surface as Triangles, contour, isosurface
 from sorojax.sdf.sampling import finite_box, values
 from sorojax.view import style
 from sorojax.view.picture import Panel, Picture
@@ -18,6 +18,8 @@ from sorojax.view.show import show_scene
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from sorojax.io import MovingSurface
 
 
 _AXES = {"x": 0, "y": 1, "z": 2}
@@ -228,3 +230,49 @@ def _filled(shape: AbstractSdf, size: float) -> Surface:
     lower, upper = finite_box("view.show", shape, 2)
     mesh = triangulate(shape, size=max(size, float(np.max(upper - lower)) / 60))
     return Surface(np.asarray(mesh.points), np.asarray(mesh.cells))
+
+
+# Parts, moving surfaces, boundary curves
+
+
+def show_part(part: Any, **options: Any) -> Picture:
+    """A part made of densities, by its shape; options of a shape."""
+    if part.shape.dim == 2:
+        options = {"filled": True} | options
+    return show_shape(part.shape, **options)
+
+
+def show_moving(
+    surface: "MovingSurface",
+    *,
+    frame: int = -1,
+    view: View = "iso",
+    renderer: str = "auto",
+    title: str = "",
+) -> Picture:
+    """A moving surface in one of its frames, the last one if omitted."""
+    points = np.asarray(surface.points)
+    points = points[frame if len(points) > 1 else 0]
+    if surface.poses is not None:
+        pose = np.asarray(surface.poses)[frame]
+        points = points @ pose[:3, :3].T + pose[:3, 3]
+    part = Surface(points, np.asarray(surface.triangles))
+    scene = Scene((part,), title=title or surface.name)
+    return show_scene(scene, view=view, renderer=renderer)
+
+
+def show_curve(curve: Curve, *, title: str = "") -> Picture:
+    """A piece of a boundary with its points; corners are marked."""
+    points = np.asarray(curve.points)
+    lower, upper = 1e3 * points.min(axis=0), 1e3 * points.max(axis=0)
+    figure = style.new_figure(6.0, style.height_for(6.0, lower, upper))
+    axes = figure.add_subplot()
+    line = np.concatenate([points, points[:1]]) if curve.closed else points
+    axes.plot(*(1e3 * line).T, color=style.COLOURS[0], lw=1.6, marker=".", ms=3)
+    axes.plot(*(1e3 * points[np.asarray(curve.corner)]).T, "o", color=style.COLOURS[1], ms=6,
+              label="corners")  # fmt: skip
+    style.dress_plane(axes, lower, upper)
+    if np.any(curve.corner):
+        style.legend(axes, loc="best")
+    style.title(figure, title or f"{len(points)} points")
+    return Picture(figure, (Panel(axes),))

@@ -13,11 +13,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import fem
-from sorojax.fem import Modes, Problem
+from sorojax.design import OptimisedShape
+from sorojax.fem import CriticalLoads, CriticalPoint, Modes, Problem
 from sorojax.mesh import cell_areas, cell_volumes
 from sorojax.view import style
 from sorojax.view.draw.loads import load_parts, support_parts, wall_parts
-from sorojax.view.draw.meshes import edge_lines
+from sorojax.view.draw.meshes import Body
 from sorojax.view.panels import panels
 from sorojax.view.picture import Picture
 from sorojax.view.raster.camera import View
@@ -32,7 +33,6 @@ from sorojax.view.raster.scene import (
     robust_scale,
     short,
 )
-from sorojax.view.raster.shell import Shell, on_triangles, shell
 from sorojax.view.show import show_scene
 
 NodalField = Callable[[Problem, Float[Array, "nodes dim"]], Float[Array, " nodes"]]
@@ -126,14 +126,11 @@ def show_problem(problem: Problem, *, view: View = "iso", renderer: str = "auto"
 def problem_scene(problem: Problem, title: str = "") -> Scene:
     """As `show_problem`, before it is drawn."""
     still = np.zeros(problem.mesh.points.shape)
-    mesh, points = problem.mesh, np.asarray(problem.mesh.points)
-    seen = shell(mesh)
+    mesh, points, body = problem.mesh, np.asarray(problem.mesh.points), Body(problem.mesh)
     walls = wall_parts(problem, points) if mesh.element.dim == 3 else []
     clear = _CLEAR if walls else 1.0
-    parts: list[Part] = [
-        *walls, Surface(points, seen.triangles, wire=seen.wire, opacity=clear)
-    ]  # fmt: skip
-    parts += [edge_lines(mesh, points, colour=style.INK, width=0.9)]
+    skin = Surface(points, body.shell.triangles, wire=body.shell.wire, opacity=clear)
+    parts: list[Part] = [*walls, skin, body.edges(points, style.INK, 0.9)]
     parts += support_parts(problem, still) + load_parts(problem, still)
     name = f"{mesh.num_cells} cells {mesh.element.name}, {problem.space.num_dofs} unknowns"
     return Scene(tuple(parts), title=title or name)
@@ -177,8 +174,8 @@ def show_solution(
 def solution_scene(solution: Any, title: str = "", **options: Any) -> Scene:
     """As `show_solution`, before it is drawn."""
     u = np.asarray(solution.displacement)
-    (scene,) = body_scenes([solution.problem], [u], **options)
-    return replace(scene, title=title)
+    scene_at, _ = body_scenes([solution.problem], [u], **options)
+    return replace(scene_at(0), title=title)
 
 
 def show_path(
@@ -204,7 +201,8 @@ def show_path(
     moved = np.asarray(path.displacements)
     problems = [problem_at(path, k) for k in chosen]
     options = {"loads": False} | options
-    scenes = joint_extent(body_scenes(problems, [moved[k] for k in chosen], **options))
+    scene_at, _ = body_scenes(problems, moved[chosen], **options)
+    scenes = joint_extent([scene_at(k) for k in range(len(chosen))])
     names = [state_name(path, k) for k in chosen]
     return panels(scenes, names, view=view, renderer=renderer, title=title)
 
@@ -215,26 +213,59 @@ def show_vibration(
 ) -> Picture:  # fmt: skip
     """Mode shapes, drawn with a largest displacement of `share` of the body, and their
     frequencies."""
-    mesh, base = modes.problem.mesh, np.asarray(modes.displacement)
-    points = np.asarray(mesh.points)
-    size = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
-    seen = shell(mesh)
-    scenes, names = [], []
-    scale = Scale("amplitude [-]", 0.0, 1.0)
-    for k, shape in enumerate(np.asarray(modes.shapes)):
-        length = np.linalg.norm(shape, axis=1)
-        drawn = points + base + shape * (share * size / length.max())
-        parts: list[Part] = [edge_lines(mesh, points + base, colour=style.GREY, width=0.8)]
-        parts.append(Surface(drawn, seen.triangles, values=length / length.max()))
-        parts.append(edge_lines(mesh, drawn, colour=style.INK, width=0.7))
-        scenes.append(Scene(tuple(parts), scale))
-        names.append(f"mode {k + 1}: {_frequency(modes, k)}")
+    base = np.asarray(modes.problem.mesh.points) + np.asarray(modes.displacement)
+    body = Body(modes.problem.mesh)
+    scenes = [body.mode(base, shape, share) for shape in np.asarray(modes.shapes)]
+    names = [f"mode {k + 1}: {_frequency(modes, k)}" for k in range(len(scenes))]
     return panels(joint_extent(scenes), names, view=view, renderer=renderer, title=title)
+
+
+def show_buckling(
+    found: CriticalLoads | CriticalPoint,
+    *,
+    problem: Problem,
+    share: float = 0.12,
+    view: View = "iso",
+    renderer: str = "auto",
+    title: str = "",
+) -> Picture:
+    """The modes in which a body buckles, with their load factors.
+
+    Args:
+        found: From `fem.critical_loads`, or a point of a `fem.continuation`.
+        problem: The body.
+        share: Largest displacement of a mode, of the size of the body.
+        view: Camera of a solid body.
+        renderer: Of a solid body.
+        title: Title of the figure.
+    """
+    base, body = np.asarray(problem.mesh.points), Body(problem.mesh)
+    if isinstance(found, CriticalPoint):
+        base, shapes = base + np.asarray(found.displacement), np.asarray(found.shape)[None]
+        names = [f"{found.kind} at load factor {float(found.factor):.4g}"]
+    else:
+        shapes = np.asarray(found.shapes)
+        names = [f"mode {k + 1}: load factor {f:.4g}"
+                 for k, f in enumerate(np.asarray(found.factors))]  # fmt: skip
+    if not len(shapes):
+        raise ValueError(
+            "view.show: there is no critical load ahead of the state. Ask for more modes, or "
+            "turn the load round."
+        )
+    scenes = [body.mode(base, shape, share) for shape in shapes]
+    return panels(joint_extent(scenes), names, view=view, renderer=renderer, title=title)
+
+
+def show_optimised_shape(found: OptimisedShape, *, title: str = "", **options: Any) -> Picture:
+    """The body with the best dimensions; `found.optimised` has the history."""
+    steps = len(np.asarray(found.optimised.history["objective"]))
+    text = f"objective {float(found.objective):.4g} after {steps} steps"
+    return show_problem(found.problem, title=title or text, **options)
 
 
 def body_scenes(
     problems: Sequence[Problem],
-    moved: Sequence[Float[np.ndarray, "nodes dim"]],
+    moved: Float[np.ndarray, "states nodes dim"] | Sequence[np.ndarray],
     *,
     field: Field = "von_mises",
     label: str = "",
@@ -242,39 +273,32 @@ def body_scenes(
     rest: bool = True,
     loads: bool = True,
     wire: bool = False,
-) -> list[Scene]:
-    """One scene per state of a body, on one scale of colours."""
-    mesh = problems[0].mesh
-    seen, points = shell(mesh), np.asarray(mesh.points)
+) -> tuple[Callable[[int], Scene], Scale | None]:
+    """The scene of each state of a body, made when it is asked for, and the scale of colours
+    of all."""
+    body, points = Body(problems[0].mesh), np.asarray(problems[0].mesh.points)
     rows = [
         evaluate(p, jnp.asarray(u), field, label) for p, u in zip(problems, moved, strict=True)
     ]
     found = [row for row in rows if row is not None]
     scale, values = coloured(found, limits) if found else (None, [None] * len(rows))
-    scenes = []
-    for problem, u, value in zip(problems, moved, values, strict=True):
-        parts = _body(problem, points + u, seen, value, wire)
-        if rest:
-            parts.insert(0, edge_lines(mesh, points, colour=style.GREY, width=0.8))
+
+    def scene(k: int) -> Scene:
+        problem, u = problems[k], moved[k]
+        parts = body.parts(points + u, values[k], rest=points if rest else None, wire=wire)
         if loads:
             parts += support_parts(problem, u) + load_parts(problem, u)
-        scenes.append(Scene(tuple(parts), scale))
-    return scenes
+        return Scene(tuple(parts), scale)
+
+    return scene, scale
 
 
 def coloured(
-    rows: list[Coloured], limits: tuple[float, float] | None
+    rows: list[Coloured], limits: tuple[float, float] | None = None
 ) -> tuple[Scale, list[np.ndarray]]:
     """The values of all states in a readable unit, and the scale that they share."""
     values, label = readable(rows)
     return robust_scale(label, values, limits=limits), values
-
-
-def _body(problem: Problem, points, seen: Shell, value, wire: bool) -> list[Part]:
-    mesh = problem.mesh
-    on = None if value is None else on_triangles(mesh, seen, value)[0]
-    body = Surface(points, seen.triangles, values=on, wire=seen.wire if wire else None)
-    return [body, edge_lines(mesh, points, colour=style.INK, width=0.7)]
 
 
 def chosen_states(where: str, count: int, states: Sequence[int] | None) -> list[int]:
