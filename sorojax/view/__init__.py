@@ -42,14 +42,12 @@ _NAMES = {
         "Film",
         "animate_figure",
     ),
-    "live_view.feed": (
+    "live_view": (
+        "AbstractSink",
         "Feed",
+        "Recording",
         "Viser",
         "live",
-    ),
-    "live_view.sinks": (
-        "AbstractSink",
-        "Recording",
     ),
     "report": (
         "Number",
@@ -90,10 +88,12 @@ if TYPE_CHECKING:
     )
     from sorojax.view.film.animation import Track as Track, animate as animate
     from sorojax.view.film.film import Film as Film, animate_figure as animate_figure
-    from sorojax.view.live_view.feed import Feed as Feed, Viser as Viser, live as live
-    from sorojax.view.live_view.sinks import (
+    from sorojax.view.live_view import (
         AbstractSink as AbstractSink,
+        Feed as Feed,
         Recording as Recording,
+        Viser as Viser,
+        live as live,
     )
     from sorojax.view.report import (
         Number as Number,

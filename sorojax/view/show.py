@@ -6,8 +6,7 @@ import inspect
 from typing import Any
 
 from sorojax import _explain
-from sorojax.view.picture import Panel, Picture
-from sorojax.view.raster.camera import View
+from sorojax.view.picture import Picture
 from sorojax.view.raster.scene import Scene
 
 #: Noun, module of this floor, function. The class itself is not imported.
@@ -69,7 +68,7 @@ _DRAWN_BY = {
     "sorojax.view.rigging.rig.Rig": ("draw.rods", "show_rig"),
     "sorojax.view.draw.plots.Convergence": ("draw.plots", "show_convergence"),
     "sorojax.view.draw.plots.WorkPrecision": ("draw.plots", "show_work_precision"),
-    "sorojax.view.raster.scene.Scene": ("show", "show_scene"),
+    "sorojax.view.raster.scene.Scene": ("picture", "show_scene"),
 }
 
 
@@ -135,7 +134,7 @@ def _known(thing: Any) -> Any:
     )
 
 
-# Scenes as pictures, and nouns as scenes: what `show` draws, to be put together anew
+# Nouns as scenes: what `show` draws, to be put together anew
 
 
 #: Noun, module of this floor, function that makes its scene.
@@ -149,25 +148,6 @@ _SCENES = {
     "sorojax.rod.model.rod.Rod": ("draw.rods", "rod_scene"),
     "sorojax.rod.model.assembly.Assembly": ("draw.rods", "rod_scene"),
 }
-
-
-def show_scene(scene: Scene, *, view: View = "iso", renderer: str = "auto") -> Picture:
-    """One scene, in the plane with axes or shaded in space.
-
-    Args:
-        scene: From `scene_of`, or put together from `Surface`, `Lines`, `Arrows` and `Dots`.
-        view: Camera of a solid scene.
-        renderer: Of a solid scene.
-    """
-    if scene.dim == 2:
-        from sorojax.view.raster.plane import plane_figure
-
-        figure, axes = plane_figure(scene)
-        return Picture(figure, (Panel(axes),))
-    from sorojax.view.raster.solid import solid_figure
-
-    figure, lens = solid_figure(scene, view=view, renderer=renderer)
-    return Picture(figure, (Panel(figure.axes[0], lens),))
 
 
 def scene_of(thing: Any, *at: Any, **options: Any) -> Scene:

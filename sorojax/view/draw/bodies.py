@@ -19,8 +19,7 @@ from sorojax.mesh import cell_areas, cell_volumes
 from sorojax.view import style
 from sorojax.view.draw.loads import load_parts, support_parts, wall_parts
 from sorojax.view.draw.meshes import Body
-from sorojax.view.panels import panels
-from sorojax.view.picture import Picture
+from sorojax.view.picture import Picture, panels, show_scene
 from sorojax.view.raster.camera import View
 from sorojax.view.raster.scene import (
     Coloured,
@@ -33,7 +32,6 @@ from sorojax.view.raster.scene import (
     robust_scale,
     short,
 )
-from sorojax.view.show import show_scene
 
 NodalField = Callable[[Problem, Float[Array, "nodes dim"]], Float[Array, " nodes"]]
 Field = str | NodalField | Float[Any, " values"] | None

@@ -16,15 +16,14 @@ from sorojax.view.draw.meshes import Body, show_cells
 from sorojax.view.draw.plots import show_signals
 from sorojax.view.draw.shapes import show_surface
 from sorojax.view.film.film import Film
-from sorojax.view.panels import panels
-from sorojax.view.picture import Picture
+from sorojax.view.picture import Picture, panels, show_scene
 from sorojax.view.raster.camera import View
 from sorojax.view.raster.scene import (
     Coloured,
     Scene,
     joint_extent,
 )
-from sorojax.view.show import options as drawn_by, show, show_scene
+from sorojax.view.show import options as drawn_by, show
 
 _SURFACES = (".stl", ".obj", ".ply")
 _UNITS = {"von_mises": "Pa", "pressure": "Pa", "displacement": "m", "energy": "J"}

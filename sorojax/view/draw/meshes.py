@@ -14,11 +14,10 @@ from sorojax.mesh.elements.elements import facet_element
 from sorojax.mesh.mesh import facet_table
 from sorojax.mesh.quality import cell_ratios
 from sorojax.view import style
-from sorojax.view.picture import Panel, Picture
+from sorojax.view.picture import Panel, Picture, show_scene
 from sorojax.view.raster.camera import View
 from sorojax.view.raster.plane import loops
 from sorojax.view.raster.scene import Dots, Lines, Part, Scale, Scene, Surface, robust_scale
-from sorojax.view.show import show_scene
 
 Template = tuple[tuple[tuple[int, int, int], tuple[bool, bool, bool]], ...]
 

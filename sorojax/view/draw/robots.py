@@ -10,10 +10,9 @@ from sorojax.sdf import AbstractSdf, contour, offset
 from sorojax.sdf.sampling import finite_box
 from sorojax.view import style
 from sorojax.view.draw.shapes import shape_surface
-from sorojax.view.picture import Picture
+from sorojax.view.picture import Picture, show_scene
 from sorojax.view.raster.camera import View
 from sorojax.view.raster.scene import Lines, Part, Scene, Surface
-from sorojax.view.show import show_scene
 
 _CLEAR = 0.45
 _CELLS = {2: 600, 3: 110}  # along the body, by dimension: walls and slots are thin

@@ -25,12 +25,11 @@ from sorojax.view.draw.rod_loads import (
     thread_parts,
 )
 from sorojax.view.draw.shapes import shape_scene
-from sorojax.view.picture import Panel, Picture
+from sorojax.view.picture import Panel, Picture, show_scene
 from sorojax.view.raster.camera import View
 from sorojax.view.raster.glyphs import ball_triangles, tube
 from sorojax.view.raster.scene import Arrows, Dots, Lines, Part, Scene, Surface, short
 from sorojax.view.rigging.rig import Rig, pose as posed_rig
-from sorojax.view.show import show_scene
 
 _ALONG = 9  # arrows of a force per length
 _LENGTH, _RADIUS = 0.2, 0.07  # of the body: the longest arrow, an arc

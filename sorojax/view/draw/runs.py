@@ -12,8 +12,7 @@ from sorojax.systems import AbstractBlock, Trajectory
 from sorojax.view import style
 from sorojax.view.draw.meshes import mesh_scene
 from sorojax.view.draw.plots import show_signals
-from sorojax.view.panels import panels
-from sorojax.view.picture import Panel, Picture
+from sorojax.view.picture import Panel, Picture, panels
 from sorojax.view.raster.scene import Scale, Scene, Surface
 
 _MOST = 8  # lines in one panel

@@ -10,10 +10,9 @@ import numpy as np
 from sorojax.sdf import AbstractSdf, Curve, Surface as Triangles, contour, isosurface
 from sorojax.sdf.sampling import finite_box, values
 from sorojax.view import style
-from sorojax.view.picture import Panel, Picture
+from sorojax.view.picture import Panel, Picture, show_scene
 from sorojax.view.raster.camera import View
 from sorojax.view.raster.scene import Lines, Part, Scene, Surface
-from sorojax.view.show import show_scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
