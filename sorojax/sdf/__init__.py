@@ -108,7 +108,6 @@ from sorojax.sdf.shapes.data import (
     outlines as outlines,
     text as text,
 )
-from sorojax.sdf.shapes.ellipsoid import Ellipsoid as Ellipsoid
 from sorojax.sdf.shapes.plane import (
     Arc as Arc,
     Circle as Circle,
@@ -131,6 +130,7 @@ from sorojax.sdf.shapes.solid import (
     CappedTorus as CappedTorus,
     Cone as Cone,
     Cylinder as Cylinder,
+    Ellipsoid as Ellipsoid,
     HexagonalPrism as HexagonalPrism,
     InfiniteCylinder as InfiniteCylinder,
     Sphere as Sphere,

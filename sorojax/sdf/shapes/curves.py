@@ -8,7 +8,7 @@ differentiated: a gradient costs one piece, and a tie takes the first.
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -89,6 +89,7 @@ class Polyline(AbstractSdf):
     points: Float[Array, "points dim"] = eqx.field(converter=real)
     width: Float[Array, ""] = eqx.field(converter=real)
     closed: bool = eqx.field(static=True, default=False)
+    exactness: ClassVar[Exactness] = TUBE
 
     def __check_init__(self):
         check_points(self, self.points, 2)
@@ -97,10 +98,6 @@ class Polyline(AbstractSdf):
     @property
     def dim(self) -> int:
         return self.points.shape[1]
-
-    @property
-    def exactness(self) -> Exactness:
-        return TUBE
 
     def distance(self, *x):
         a = self.points
@@ -119,6 +116,7 @@ class Bezier(AbstractSdf):
 
     points: Float[Array, "3 dim"] = eqx.field(converter=real)
     width: Float[Array, ""] = eqx.field(converter=real)
+    exactness: ClassVar[Exactness] = TUBE
 
     def __check_init__(self):
         check_points(self, self.points, 3)
@@ -132,10 +130,6 @@ class Bezier(AbstractSdf):
     @property
     def dim(self) -> int:
         return self.points.shape[1]
-
-    @property
-    def exactness(self) -> Exactness:
-        return TUBE
 
     def distance(self, *x):
         return bezier_distance(self.points, x) - self.width / 2
@@ -151,17 +145,11 @@ class Parabola(AbstractSdf):
     bend: Float[Array, ""] = eqx.field(converter=real)
     half_width: Float[Array, ""] = eqx.field(converter=real)
     width: Float[Array, ""] = eqx.field(converter=real)
+    dim: ClassVar[int] = 2
+    exactness: ClassVar[Exactness] = TUBE
 
     def __check_init__(self):
         check_lengths(self, "half_width", "width")
-
-    @property
-    def dim(self) -> int:
-        return 2
-
-    @property
-    def exactness(self) -> Exactness:
-        return TUBE
 
     def distance(self, x, y):
         return bezier_distance(self._control(), (x, y)) - self.width / 2
@@ -239,17 +227,11 @@ class Helix(AbstractSdf):
     pitch: Float[Array, ""] = eqx.field(converter=real)
     turns: Float[Array, ""] = eqx.field(converter=real)
     width: Float[Array, ""] = eqx.field(converter=real)
+    dim: ClassVar[int] = 3
+    exactness: ClassVar[Exactness] = TUBE
 
     def __check_init__(self):
         check_lengths(self, "radius", "pitch", "turns", "width")
-
-    @property
-    def dim(self) -> int:
-        return 3
-
-    @property
-    def exactness(self) -> Exactness:
-        return TUBE
 
     def distance(self, x, y, z):
         lead, whole = self.pitch / (2 * math.pi), 2 * math.pi
@@ -336,6 +318,7 @@ class Spline(AbstractSdf):
     points: Float[Array, "points dim"] = eqx.field(converter=real)
     width: Float[Array, ""] = eqx.field(converter=real)
     closed: bool = eqx.field(static=True, default=False)
+    exactness: ClassVar[Exactness] = Exactness(outside=True, inside=False)
 
     def __check_init__(self):
         check_points(self, self.points, 3)
@@ -344,10 +327,6 @@ class Spline(AbstractSdf):
     @property
     def dim(self) -> int:
         return self.points.shape[1]
-
-    @property
-    def exactness(self) -> Exactness:
-        return Exactness(outside=True, inside=False)
 
     def _pieces(self) -> tuple[Float[Array, "pieces dim"], ...]:
         """Coefficients of 1, t, t^2, t^3 of every piece, t in [0, 1]."""
