@@ -136,8 +136,12 @@ from sorojax.sdf.shapes.solid import (
     Sphere as Sphere,
     Torus as Torus,
 )
-from sorojax.sdf.surface.contour import Curve as Curve, contour as contour
-from sorojax.sdf.surface.marching import Surface as Surface, isosurface as isosurface
+from sorojax.sdf.surface.marching import (
+    Curve as Curve,
+    Surface as Surface,
+    contour as contour,
+    isosurface as isosurface,
+)
 from sorojax.sdf.surface.report import (
     SurfaceReport as SurfaceReport,
     surface_report as surface_report,

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from sorojax.robots import Crawler
-from sorojax.robots.crawler import PORTS
+from sorojax.robots.locomotion import PORTS
 from sorojax.sdf import AbstractSdf, contour, offset
 from sorojax.sdf.sampling import finite_box
 from sorojax.view import style
