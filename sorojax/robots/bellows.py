@@ -12,6 +12,7 @@ from sorojax import _check, fem, mesh
 from sorojax._display import displayed
 from sorojax._types import Numbers, real
 from sorojax.material import AbstractHyperelastic
+from sorojax.robots.printable import check_metres
 from sorojax.sdf import AbstractSdf, HalfPlane, Rectangle, repeat
 from sorojax.units import mm
 
@@ -39,11 +40,7 @@ class BellowsActuator(eqx.Module):
     num_bellows: int = eqx.field(static=True, default=5)
 
     def __check_init__(self):
-        for name in ("wall_thickness", "bellow_width", "gap", "base", "roof", "fillet"):
-            _check.between(
-                "BellowsActuator", name, getattr(self, name), 0.0, 1.0, "m",
-                "Lengths are in metres: write 2 * mm.",
-            )  # fmt: skip
+        check_metres(self, "wall_thickness", "bellow_width", "gap", "base", "roof", "fillet")
         if _check.is_concrete(self.wall_thickness) and _check.is_concrete(self.bellow_width):
             width = float(self.bellow_width - 2 * self.wall_thickness)
             if width < 2 * float(self.fillet):
@@ -176,11 +173,7 @@ class PneuNet(eqx.Module):
     num_chambers: int = eqx.field(static=True, default=14)
 
     def __check_init__(self):
-        for name in ("pitch", "chamber_width", "slot_width", "height"):
-            _check.between(
-                "PneuNet", name, getattr(self, name), 0.0, 1.0, "m",
-                "Lengths are in metres: write 2 * mm.",
-            )  # fmt: skip
+        check_metres(self, "pitch", "chamber_width", "slot_width", "height")
         if not _check.is_concrete(self.pitch):
             return
         wall = float(self.pitch - self.chamber_width - self.slot_width) / 2

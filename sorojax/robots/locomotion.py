@@ -14,6 +14,7 @@ from sorojax import _check, fem, mesh
 from sorojax._display import displayed
 from sorojax._types import real
 from sorojax.material import AbstractHyperelastic, by_region, neo_hookean
+from sorojax.robots.printable import check_metres
 from sorojax.sdf import AbstractSdf, Capsule, HalfPlane, Rectangle, repeat, rotate, translate
 from sorojax.units import MPa, deg, kPa, mm
 
@@ -40,11 +41,9 @@ class Crawler(eqx.Module):
     num_chambers: int = eqx.field(static=True, default=11)
 
     def __check_init__(self):
-        for name in ("height", "base", "sole_thickness", "chamber_width", "wall_thickness"):
-            _check.between(
-                "Crawler", name, getattr(self, name), 0.0, 1.0, "m",
-                "Lengths are in metres: write 2 * mm.",
-            )  # fmt: skip
+        check_metres(
+            self, "height", "base", "sole_thickness", "chamber_width", "wall_thickness"
+        )
         if not _check.is_concrete(self.length):
             return
         roof = float(self.height - self.base - self.chamber_height)
@@ -286,11 +285,9 @@ class Walker(eqx.Module):
     num_pairs: int = eqx.field(static=True, default=3)
 
     def __check_init__(self):
-        for name in ("spacing", "reach", "leg_width", "spine_thickness", "weight_diagonal"):
-            _check.between(
-                "Walker", name, getattr(self, name), 0.0, 1.0, "m",
-                "Lengths are in metres: write 2 * mm.",
-            )  # fmt: skip
+        check_metres(
+            self, "spacing", "reach", "leg_width", "spine_thickness", "weight_diagonal"
+        )
         _check.between("Walker", "toe_start", self.toe_start, 0.0, 1.0, "",
                        "Give the share of the leg above its toe.")  # fmt: skip
 

@@ -32,6 +32,15 @@ from sorojax.units import deg, mm
 # Parts that the printable robots share: round bellows, and shapes laid along an axis.
 
 
+def check_metres(robot: eqx.Module, *names: str) -> None:
+    """Raise a `ValueError` unless the named lengths are above zero and below a metre."""
+    for name in names:
+        _check.between(
+            type(robot).__name__, name, getattr(robot, name), 0.0, 1.0, "m",
+            "Lengths are in metres: write 2 * mm.",
+        )  # fmt: skip
+
+
 @displayed
 class Bellows(eqx.Module):
     """A round bellows standing on z = 0, closed at both ends [m].
@@ -50,11 +59,7 @@ class Bellows(eqx.Module):
     num_folds: int = eqx.field(static=True, default=7)
 
     def __check_init__(self):
-        for name in ("outer_radius", "inner_radius", "pitch", "wall_thickness", "cap"):
-            _check.between(
-                "Bellows", name, getattr(self, name), 0.0, 1.0, "m",
-                "Lengths are in metres: write 2 * mm.",
-            )  # fmt: skip
+        check_metres(self, "outer_radius", "inner_radius", "pitch", "wall_thickness", "cap")
         if _check.is_concrete(self.fold_height) and _check.is_concrete(self.wall_thickness):
             hollow = float(self.fold_height - 2 * self.wall_thickness)
             open_ = float(self.pitch - self.fold_height)
@@ -162,11 +167,7 @@ class Finger(eqx.Module):
     spine_thickness: Float[Array, ""] = eqx.field(converter=real, default=3 * mm)
 
     def __check_init__(self):
-        for name in ("tip_radius", "spine_width", "spine_thickness"):
-            _check.between(
-                "Finger", name, getattr(self, name), 0.0, 1.0, "m",
-                "Lengths are in metres: write 2 * mm.",
-            )  # fmt: skip
+        check_metres(self, "tip_radius", "spine_width", "spine_thickness")
 
     @property
     def length(self) -> Float[Array, ""]:
@@ -224,11 +225,7 @@ class Hand(eqx.Module):
     port_radius: Float[Array, ""] = eqx.field(converter=real, default=1.5 * mm)
 
     def __check_init__(self):
-        for name in ("palm_width", "palm_length", "palm_thickness", "finger_spacing"):
-            _check.between(
-                "Hand", name, getattr(self, name), 0.0, 1.0, "m",
-                "Lengths are in metres: write 90 * mm.",
-            )  # fmt: skip
+        check_metres(self, "palm_width", "palm_length", "palm_thickness", "finger_spacing")
 
     def places(self) -> dict[str, tuple[Float[Array, "3"], Float[Array, ""]]]:
         """Where each finger has its foot [m], and its angle about z [rad]."""
@@ -305,11 +302,7 @@ class Manipulator(eqx.Module):
     fillet: Float[Array, ""] = eqx.field(converter=real, default=1 * mm)
 
     def __check_init__(self):
-        for name in ("center_distance", "finger_distance", "plate_radius", "core_radius"):
-            _check.between(
-                "Manipulator", name, getattr(self, name), 0.0, 1.0, "m",
-                "Lengths are in metres: write 20 * mm.",
-            )  # fmt: skip
+        check_metres(self, "center_distance", "finger_distance", "plate_radius", "core_radius")
         radius = self.bellows.outer_radius
         if _check.is_concrete(self.center_distance) and _check.is_concrete(radius):
             between = float(self.center_distance * 3**0.5 - 2 * radius)
@@ -400,11 +393,7 @@ class PlanarActuator(eqx.Module):
     fillet: Float[Array, ""] = eqx.field(converter=real, default=1 * mm)
 
     def __check_init__(self):
-        for name in ("spacing", "plate_thickness", "port_radius"):
-            _check.between(
-                "PlanarActuator", name, getattr(self, name), 0.0, 1.0, "m",
-                "Lengths are in metres: write 2 * mm.",
-            )  # fmt: skip
+        check_metres(self, "spacing", "plate_thickness", "port_radius")
         if _check.is_concrete(self.spacing) and _check.is_concrete(self.bellows.outer_radius):
             between = float(self.spacing - 2 * self.bellows.outer_radius)
             if between <= 0:
@@ -462,11 +451,7 @@ class BendingActuator(eqx.Module):
     num_bellows: int = eqx.field(static=True, default=8)
 
     def __check_init__(self):
-        for name in ("width", "height", "base", "pitch", "gap", "wall_thickness"):
-            _check.between(
-                "BendingActuator", name, getattr(self, name), 0.0, 1.0, "m",
-                "Lengths are in metres: write 2 * mm.",
-            )  # fmt: skip
+        check_metres(self, "width", "height", "base", "pitch", "gap", "wall_thickness")
         if _check.is_concrete(self.pitch) and _check.is_concrete(self.wall_thickness):
             hollow = float(self.pitch - self.gap - 2 * self.wall_thickness)
             if hollow <= 0:
