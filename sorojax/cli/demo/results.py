@@ -9,8 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax import fem, material, systems, view
-from sorojax.cli.demo.design import DEPTH, LAYER_STIFFNESS, Design, Sensitivity
-from sorojax.cli.demo.loop import DAMPING_TIME, Reduced, Tracking
+from sorojax.cli.demo.design import (
+    DAMPING_TIME,
+    DEPTH,
+    LAYER_STIFFNESS,
+    Design,
+    Reduced,
+    Sensitivity,
+    Tracking,
+)
 from sorojax.math.lie import homogeneous
 from sorojax.mesh import chambers
 from sorojax.units import kPa, mm
