@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from sorojax.cli.demo.loop import controller, reference_angle
+from sorojax.cli.demo.design import controller, reference_angle
 from sorojax_hardware import (
     Clock,
     MemoryBoard,

@@ -193,7 +193,7 @@ def test_a_failed_export_leaves_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "a.stl"
     io.export_surface(path, BOX)
     before = path.read_bytes()
-    monkeypatch.setattr("sorojax.io.formats._pieces", lambda *_: 1 / 0)
+    monkeypatch.setattr("sorojax.io.surface._pieces", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         io.export_surface(path, BOX)
     assert path.read_bytes() == before and os.listdir(tmp_path) == ["a.stl"]

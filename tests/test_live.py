@@ -19,8 +19,8 @@ import pytest
 
 from sorojax import rod as R, view
 from sorojax.math.lie import SE2
-from sorojax.view.live_view.feed import Slots
-from sorojax.view.live_view.viewer import follow
+from sorojax.view.live_view import Slots
+from sorojax.view.viewer import follow
 
 ROOT = Path(__file__).parent.parent
 

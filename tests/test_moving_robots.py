@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sorojax import fem, mesh, robots, sdf
-from sorojax.robots.crawler import PORTS, crawler_mesh
+from sorojax.robots.locomotion import PORTS, crawler_mesh
 from sorojax.units import kPa, mm
 from tests.scripts import main_of
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from sorojax import SE2, SE3, fem, material, mesh, reduction, rod
-from sorojax.reduction.backbone import line_strain, pose_strain, section_axes
-from sorojax.reduction.curve import reference
+from sorojax.reduction.backbone import line_strain, pose_strain, reference, section_axes
 from sorojax.reduction.pod import weights
 from sorojax.units import kPa, mm
 

@@ -15,7 +15,7 @@ from sorojax.math.lie import SE2, SE3
 from sorojax.robots.models import cell as models_cells
 from sorojax.robots.models.cell import Cell
 from sorojax.robots.models.rods import body, column, side_by_side
-from sorojax.robots.parts import LaidAlong
+from sorojax.robots.printable import LaidAlong
 from sorojax.units import kPa, mm
 from sorojax_board.bench import STEP
 from sorojax_hardware import LocalBoard, SimulatedClock, run_loop, simulated

@@ -85,50 +85,50 @@ def path(beam):
 
 @pytest.mark.versions
 def test_deformed_shapes_show_the_stress(path):
-    figure = view.show_deformed(path, title="beam")
+    figure = view.show(path, title="beam").figure
     assert 0.08 < ink(figure) < 0.7 and has_margin(figure)
     assert has(figure, (68, 1, 84)) and has(figure, (253, 231, 37))  # both ends of the map
     titles = [axes.get_title() for axes in figure.axes[:3]]
-    assert titles == ["pull = 0", "pull = 1", "pull = 2"]
+    assert titles == ["pull = 0 kPa", "pull = 1 Pa", "pull = 2 Pa"]
     assert "kPa" in figure.axes[-1].get_ylabel()
 
 
 def test_deformed_shapes_take_another_field_and_reject_a_missing_state(path):
-    figure = view.show_deformed(
-        path, [-1], field=lambda problem, u: 1e3 * u[:, 1], label="deflection [mm]"
-    )
+    figure = view.show(
+        path, states=[-1], field=lambda problem, u: 1e3 * u[:, 1], label="deflection [mm]"
+    ).figure
     assert len(figure.axes) == 2 and "deflection [mm]" in figure.axes[-1].get_ylabel()
-    with pytest.raises(ValueError, match="has states 0 to 2"):
-        view.show_deformed(path, [3])
+    with pytest.raises(ValueError, match="there are states 0 to 2"):
+        view.show(path, states=[3])
 
 
 @pytest.mark.parametrize("per", ["node", "cell", None])
 def test_a_mesh_is_drawn_with_its_cells(beam, per):
     count = {"node": beam.num_nodes, "cell": beam.num_cells, None: 0}[per]
-    figure = view.show_mesh(beam, np.arange(count) if per else None, label="number [-]")
+    field = np.arange(count) if per else None
+    figure = view.show(beam, field=field, label="number [-]").figure
     assert ink(figure) > 0.1 and has_margin(figure)
     assert has(figure, (68, 1, 84)) == bool(per)
 
 
 def test_a_field_of_the_wrong_length_is_named(beam):
     with pytest.raises(ValueError, match="one value per node"):
-        view.show_mesh(beam, np.zeros(3))
+        view.show(beam, field=np.zeros(3))
 
 
 def test_a_shape_shows_both_sides_and_its_zero_set():
     ring = sdf.Circle([0.0, 0.0], 0.02) - sdf.Circle([0.0, 0.0], 0.008)
-    figure = view.show_sdf(ring)
+    figure = view.show(ring).figure
     image = pixels(figure)
     assert has_margin(figure) and has(figure, INK, least=300)
     blue, red = image[..., 2] - image[..., 0] > 60, image[..., 0] - image[..., 2] > 60
     assert blue.sum() > 2000 and red.sum() > 2000
-    with pytest.raises(ValueError, match="2-D"):
-        view.show_sdf(sdf.Sphere([0.0, 0.0, 0.0], 0.01))
 
 
 def test_modes_have_a_panel_per_strain():
     basis = R.chebyshev(kappa_z=3, sigma_x=1)
-    figure = view.show_modes(basis, LENGTH, energy={"kappa_z": 0.9999999, "sigma_x": 0.5})
+    energy = {"kappa_z": 0.9999999, "sigma_x": 0.5}
+    figure = view.show(basis, length=LENGTH, energy=energy).figure
     assert len(figure.axes) == 2 and has_margin(figure)
     assert "99.9999 %" in figure.axes[0].get_title(loc="left")
     assert "1/m" in figure.axes[0].get_ylabel() and "mm" in figure.axes[1].get_xlabel()
@@ -142,7 +142,7 @@ def test_backbone_errors_are_those_of_the_picture(rod):
     backbone = Backbone(s, jnp.asarray(LENGTH), shifted, jnp.zeros((3, 21, 3)))
     errors = view.backbone_errors(backbone, rod, qs)
     assert np.allclose(errors, 5e-4, rtol=1e-12)
-    figure = view.show_backbones(backbone, rod, qs, pressures=np.array([0.0, 1e4, 2e4]))
+    figure = view.show_backbones(backbone, rod, qs, pressures=np.array([0.0, 1e4, 2e4])).figure
     drawn = figure.axes[1].lines[0].get_ydata()
     assert np.allclose(drawn, 0.5) and has_margin(figure)
     assert has(figure, ORANGE) and has(figure, INK)
@@ -154,7 +154,7 @@ def test_signals_keep_references_apart():
         "tip angle [deg]": {"reference": time, "rod": time**2},
         "pressure [kPa]": {"chamber": 20 * time},
     }
-    figure = view.show_signals(time, panels)
+    figure = view.show_signals(time, panels).figure
     assert [axes.get_ylabel() for axes in figure.axes] == list(panels)
     assert figure.axes[0].lines[0].get_linestyle() != figure.axes[0].lines[1].get_linestyle()
     assert has_margin(figure) and has(figure, (0, 114, 178))
@@ -165,8 +165,8 @@ def test_signals_keep_references_apart():
 def test_a_material_fit_passes_its_points():
     strain, stress = material.presets.DRAGON_SKIN_30_POINTS
     fit = material.fit_tensile(strain, stress, density=1080.0)
-    figure = view.show_curve(fit, strain, stress)
-    stretch, curve = figure.axes[0].lines[0].get_data()
+    figure = view.show(fit, points=(strain, stress)).figure
+    stretch, curve = figure.axes[0].lines[1].get_data()
     c = fit.material
     x = stretch**2 + 2 / stretch - 3
     exact = 2 * (stretch - stretch**-2) * (c.c1 + 2 * c.c2 * x + 3 * c.c3 * x**2)
@@ -175,18 +175,20 @@ def test_a_material_fit_passes_its_points():
 
 
 @pytest.fixture(scope="module")
-def film(beam, tmp_path_factory):
+def film(beam):
     time = np.linspace(0.0, 0.4, 41)
     states = np.stack([np.asarray(beam.points) + bend(beam, 1e-6 + 40 * t) for t in time])
-    tip = states[:, M.nearest_node(beam, [LENGTH, 0.0])]
+    body = view.scene_of(beam).parts[0]
+    scale = view.Scale("pressure [kPa]", 0.0, 20.0, colours="OrRd")
+
+    def scene(k):
+        colour = np.full(beam.num_nodes, 50 * time[k])
+        return view.Scene((view.Surface(states[k], body.triangles, values=colour),))
+
+    made = view.animate(view.Track(time, scene, scale), size=(640, 400), title="bending")
     seen = []
     with _progress.listen(seen.append):
-        made = view.film_of_mesh(
-            beam, states, time=time, pressure=2e4 * time, caption="bending",
-            cavities=M.boundary_facets(beam), lines={"target": view.ray(tip, 5 * time, 0.01)},
-            signals={"tip angle [deg]": {"reference": time, "rod": time**2}},
-            path=tmp_path_factory.mktemp("film") / "film.gif",
-        )  # fmt: skip
+        assert made.gif
     return made, seen
 
 
@@ -211,23 +213,10 @@ def test_a_film_moves_in_real_time(film):
     assert len(made.gif) < 3e5
 
 
-def test_a_film_with_a_colour_field(beam):
-    states = np.stack([np.asarray(beam.points)] * 2)
-    made = view.film_of_mesh(
-        beam, states, time=np.array([0.0, 0.05]), field=np.ones((2, beam.num_nodes)),
-        field_label="stress [kPa]",
-    )  # fmt: skip
-    assert made.frames == 2 and has(made.gif, (253, 231, 37), least=1000)
-
-
-def test_a_film_names_what_does_not_fit(beam):
-    states = np.stack([np.asarray(beam.points)] * 3)
-    with pytest.raises(ValueError, match="one entry per instant"):
-        view.film_of_mesh(beam, states, time=np.arange(2.0))
-    with pytest.raises(ValueError, match="NaN"):
-        view.film_of_mesh(beam, states * np.nan, time=np.arange(3.0))
+def test_a_film_names_times_that_do_not_rise(beam):
+    scene = view.scene_of(beam)
     with pytest.raises(ValueError, match="rise strictly"):
-        view.film_of_mesh(beam, states, time=np.zeros(3))
+        view.animate(view.Track(np.zeros(3), lambda k: scene))
 
 
 def test_the_report_is_one_file(film):

@@ -8,7 +8,7 @@ import sorojax as sj
 from sorojax import fem, material, mesh as M, robots, rod as R, sdf, view
 from sorojax.math.status import Status
 from sorojax.view import style
-from sorojax.view.draw.records import air_of, robot_scene
+from sorojax.view.draw.robots import air_of, robot_scene
 from sorojax.view.raster.scene import Surface
 from tests.test_view_show import is_whole, near, patch, pixels, words
 

@@ -9,9 +9,9 @@ from sorojax.math.lie import SE2, SE3, homogeneous
 from sorojax.math.status import Status
 from sorojax.reduction import Backbone
 from sorojax.view import style
+from sorojax.view.draw.bodies import show_problem
 from sorojax.view.draw.loads import coil, load_parts, support_parts, turning
 from sorojax.view.draw.rods import rod_scene, wrench_parts
-from sorojax.view.draw.states import show_problem
 from sorojax.view.film.tracks import track_of
 from sorojax.view.raster.scene import Arrows, Dots, Lines
 from tests.test_view_show import is_whole, near, pixels, words

@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.harness import Row, Timing
 from sorojax import vision
 from sorojax.vision import Discs, Disturbance
-from sorojax.vision._opencv import opencv
+from sorojax.vision.camera import opencv
 
 COLOURS = (vision.RED, vision.GREEN, vision.BLUE)
 #: Method, bar on the time of a 1280 x 720 picture [s], bar on the error [px, rms].

@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.harness import Row, Timing
 from sorojax import vision
 from sorojax.vision import Camera, Disturbance, Pose
-from sorojax.vision._opencv import opencv
+from sorojax.vision.camera import opencv
 
 SIZE, PICTURES = 0.05, 20
 BARS = {"corner, px rms": 0.05, "place, m median": 1e-4}

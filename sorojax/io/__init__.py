@@ -6,8 +6,11 @@ from sorojax.io.animation import (
     export_animation as export_animation,
 )
 from sorojax.io.fields import export_fields as export_fields
-from sorojax.io.mesh import export_mesh as export_mesh, import_mesh as import_mesh
-from sorojax.io.mesh_surface import mesh_surface as mesh_surface
+from sorojax.io.mesh import (
+    export_mesh as export_mesh,
+    import_mesh as import_mesh,
+    mesh_surface as mesh_surface,
+)
 from sorojax.io.state import leaves as leaves, load as load, save as save
 from sorojax.io.surface import (
     export_contour as export_contour,

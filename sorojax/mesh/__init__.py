@@ -31,12 +31,12 @@ from sorojax.mesh.mesh import (
 )
 from sorojax.mesh.motion.move import move as move
 from sorojax.mesh.plane.polymesh import polymesher as polymesher
-from sorojax.mesh.plane.trace import (
+from sorojax.mesh.plane.triangulate import (
     from_image as from_image,
     from_polygon as from_polygon,
     image_shape as image_shape,
+    triangulate as triangulate,
 )
-from sorojax.mesh.plane.triangulate import triangulate as triangulate
 from sorojax.mesh.quality import (
     Distortion as Distortion,
     Quality as Quality,

@@ -1,16 +1,18 @@
-"""A planar bellows actuator: a row of air chambers on a strain-limiting layer."""
+"""Plane bending actuators: bellows on a strain-limiting layer, and a PneuNet."""
 
 from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check, fem, mesh
 from sorojax._display import displayed
 from sorojax._types import Numbers, real
 from sorojax.material import AbstractHyperelastic
+from sorojax.robots.printable import check_metres
 from sorojax.sdf import AbstractSdf, HalfPlane, Rectangle, repeat
 from sorojax.units import mm
 
@@ -38,11 +40,7 @@ class BellowsActuator(eqx.Module):
     num_bellows: int = eqx.field(static=True, default=5)
 
     def __check_init__(self):
-        for name in ("wall_thickness", "bellow_width", "gap", "base", "roof", "fillet"):
-            _check.between(
-                "BellowsActuator", name, getattr(self, name), 0.0, 1.0, "m",
-                "Lengths are in metres: write 2 * mm.",
-            )  # fmt: skip
+        check_metres(self, "wall_thickness", "bellow_width", "gap", "base", "roof", "fillet")
         if _check.is_concrete(self.wall_thickness) and _check.is_concrete(self.bellow_width):
             width = float(self.bellow_width - 2 * self.wall_thickness)
             if width < 2 * float(self.fillet):
@@ -157,3 +155,105 @@ def bellows_problem(
         loads=tuple(loads),
         formulation=formulation,
     )
+
+
+# A PneuNet: upright air chambers between slots whose walls come to touch, on a thin layer.
+#
+# Reference: Mosadegh et al., "Pneumatic networks for soft robotics that actuate rapidly",
+# Adv. Funct. Mater. 24, 2014.
+
+
+@displayed
+class PneuNet(eqx.Module):
+    """Dimensions of the side view [m]; x runs along it from its clamp, y is 0 underneath.
+
+    Narrow slots part the chambers above `notch`; under air neighbouring walls meet, and the
+    upper side grows longer than the lower one. A flat strip goes on beyond the last chamber.
+    The defaults are 117 x 20 mm with 14 chambers.
+    """
+
+    pitch: Float[Array, ""] = eqx.field(converter=real, default=7.47 * mm)
+    first: Float[Array, ""] = eqx.field(converter=real, default=7.2 * mm)
+    chamber_width: Float[Array, ""] = eqx.field(converter=real, default=1.84 * mm)
+    slot_width: Float[Array, ""] = eqx.field(converter=real, default=0.55 * mm)
+    layer: Float[Array, ""] = eqx.field(converter=real, default=1.75 * mm)
+    floor: Float[Array, ""] = eqx.field(converter=real, default=3.54 * mm)
+    notch: Float[Array, ""] = eqx.field(converter=real, default=10.9 * mm)
+    roof: Float[Array, ""] = eqx.field(converter=real, default=17.49 * mm)
+    height: Float[Array, ""] = eqx.field(converter=real, default=20 * mm)
+    end: Float[Array, ""] = eqx.field(converter=real, default=6.7 * mm)
+    strip: Float[Array, ""] = eqx.field(converter=real, default=5.7 * mm)
+    num_chambers: int = eqx.field(static=True, default=14)
+
+    def __check_init__(self):
+        check_metres(self, "pitch", "chamber_width", "slot_width", "height")
+        if not _check.is_concrete(self.pitch):
+            return
+        wall = float(self.pitch - self.chamber_width - self.slot_width) / 2
+        levels = [0, *(float(y) for y in (self.layer, self.floor, self.notch, self.roof))]
+        rises = min(np.diff([*levels, float(self.height)]))
+        if min(wall, rises) <= 0 or self.num_chambers < 2:
+            raise ValueError(
+                f"PneuNet: got walls of {wall * 1e3:.3g} mm between chambers and slots, "
+                f"levels {', '.join(f'{1e3 * y:.3g}' for y in levels[1:])} mm below a height "
+                f"of {float(self.height) * 1e3:.3g} mm and {self.num_chambers} chambers, need "
+                "walls above zero, rising levels and two or more chambers. Widen the pitch or "
+                "order layer, floor, notch, roof and height."
+            )
+
+    @property
+    def length(self) -> Float[Array, ""]:
+        """With the strip at its end [m]."""
+        return self._last + self.strip
+
+    @property
+    def middles(self) -> Float[Array, " chambers"]:
+        """Where the chambers are [m]."""
+        return self.first + self.pitch * jnp.arange(self.num_chambers, dtype=self.pitch.dtype)
+
+    @property
+    def _last(self) -> Float[Array, ""]:
+        return self.first + (self.num_chambers - 1) * self.pitch + self.end
+
+    def chambers(self) -> AbstractSdf:
+        """The air."""
+        left = self.first - self.chamber_width / 2
+        return self._row(left, self.chamber_width, self.floor, self.roof, self.num_chambers)
+
+    def slots(self) -> AbstractSdf:
+        """The gaps between the chambers, open at the top."""
+        left = self.first + (self.pitch - self.slot_width) / 2
+        top = 1.05 * self.height
+        return self._row(left, self.slot_width, self.notch, top, self.num_chambers - 1)
+
+    def _row(self, left, width, low, high, count: int) -> AbstractSdf:
+        one = Rectangle(jnp.stack([left, low]), jnp.stack([left + width, high]))
+        step = jnp.stack([self.pitch, jnp.zeros_like(self.pitch)])
+        return repeat(one, step, count, separate=True)
+
+    def body(self) -> AbstractSdf:
+        """The rubber."""
+        zero = jnp.zeros((2,), self.pitch.dtype)
+        block = Rectangle(zero, jnp.stack([self._last, self.height]))
+        foot = Rectangle(zero, jnp.stack([self.length, self.floor]))
+        return (block | foot) - self.chambers() - self.slots()
+
+
+def pneunet_mesh(pneunet: PneuNet) -> mesh.Mesh:
+    """Quad8 cells between the lines of the drawing, two across a wall; region "layer"."""
+    x = np.asarray(pneunet.middles)
+    half, pitch = float(pneunet.chamber_width) / 2, float(pneunet.pitch)
+    slot, gap = x[:-1] + pitch / 2, float(pneunet.slot_width) / 2
+    inner = [x + far for size in (half, pitch / 3.1) for far in (-size, size)]
+    last, length = float(pneunet.first + x[-1] - x[0] + pneunet.end), float(pneunet.length)
+    ends = [0.0, 0.43 * float(pneunet.first), last, length]
+    layer, floor, notch, roof, height = (
+        float(getattr(pneunet, name)) for name in ("layer", "floor", "notch", "roof", "height")
+    )
+    upper = np.linspace(notch, roof, 4)[1:], [(roof + height) / 2, height]
+    y = np.concatenate([[0, layer], np.linspace(floor, notch, 4), *upper])
+    lines = np.unique(np.concatenate([*inner, slot - gap, slot + gap, ends]))
+    grid = mesh.between_lines(lines, y, element=mesh.Quad8())
+    made = mesh.kept(grid, mesh.cells_inside(grid, pneunet.body()))
+    below = mesh.cells_where(made, lambda p: p[1] < layer)
+    return mesh.Mesh(made.points, made.cells, made.element, regions={"layer": below})

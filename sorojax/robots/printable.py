@@ -1,4 +1,6 @@
-"""Printable robots: a soft finger, a hand, a manipulator, and planar and bending actuators."""
+"""Printable robots: round bellows, finger, hand, manipulator, planar and bending actuator."""
+
+import functools
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,10 +10,148 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._display import displayed
 from sorojax._types import real
-from sorojax.robots.parts import Bellows, LaidAlong, Placed, pipe
-from sorojax.sdf import AbstractSdf, Box, Sphere, repeat, rotate, translate, union
+from sorojax.sdf import (
+    AbstractSdf,
+    Box,
+    Rectangle,
+    SmoothUnion,
+    Sphere,
+    offset,
+    repeat,
+    rotate,
+    translate,
+    union,
+)
+from sorojax.sdf.base import minimum
+from sorojax.sdf.operations.booleans import hull
+from sorojax.sdf.operations.lift import revolve
+from sorojax.sdf.operations.transform import AbstractWrapped
 from sorojax.sdf.shapes.solid import Cylinder, Torus
 from sorojax.units import deg, mm
+
+# Parts that the printable robots share: round bellows, and shapes laid along an axis.
+
+
+def check_metres(robot: eqx.Module, *names: str) -> None:
+    """Raise a `ValueError` unless the named lengths are above zero and below a metre."""
+    for name in names:
+        _check.between(
+            type(robot).__name__, name, getattr(robot, name), 0.0, 1.0, "m",
+            "Lengths are in metres: write 2 * mm.",
+        )  # fmt: skip
+
+
+@displayed
+class Bellows(eqx.Module):
+    """A round bellows standing on z = 0, closed at both ends [m].
+
+    `num_folds` folds of `outer_radius` stand `pitch` apart on a tube of `inner_radius`;
+    the wall is at least `wall_thickness` everywhere, the ends are `cap` thick.
+    """
+
+    outer_radius: Float[Array, ""] = eqx.field(converter=real, default=12 * mm)
+    inner_radius: Float[Array, ""] = eqx.field(converter=real, default=7 * mm)
+    pitch: Float[Array, ""] = eqx.field(converter=real, default=8 * mm)
+    fold_height: Float[Array, ""] = eqx.field(converter=real, default=4.8 * mm)
+    wall_thickness: Float[Array, ""] = eqx.field(converter=real, default=1.2 * mm)
+    cap: Float[Array, ""] = eqx.field(converter=real, default=3 * mm)
+    fillet: Float[Array, ""] = eqx.field(converter=real, default=1.5 * mm)
+    num_folds: int = eqx.field(static=True, default=7)
+
+    def __check_init__(self):
+        check_metres(self, "outer_radius", "inner_radius", "pitch", "wall_thickness", "cap")
+        if _check.is_concrete(self.fold_height) and _check.is_concrete(self.wall_thickness):
+            hollow = float(self.fold_height - 2 * self.wall_thickness)
+            open_ = float(self.pitch - self.fold_height)
+            if hollow <= 0 or open_ <= 0:
+                raise ValueError(
+                    f"Bellows: folds are hollow by {hollow * 1e3:.3g} mm and stand "
+                    f"{open_ * 1e3:.3g} mm apart, need both above zero. Choose `fold_height` "
+                    "between two walls and the pitch."
+                )
+
+    @property
+    def length(self) -> Float[Array, ""]:
+        return self.num_folds * self.pitch + 2 * self.cap
+
+    def _profile(self) -> AbstractSdf:
+        """Half section and its mirror image: x is the radius, y the height."""
+        middle = self.cap + self.pitch / 2
+        half = self.fold_height / 2
+        fold = Rectangle(
+            [-self.outer_radius, middle - half], [self.outer_radius, middle + half], 0.9 * half
+        )
+        zero = jnp.zeros_like(self.length)
+        tube = Rectangle([-self.inner_radius, zero], [self.inner_radius, self.length])
+        folds = repeat(fold, [0.0, self.pitch], self.num_folds, separate=True)
+        return SmoothUnion(folds, tube, self.fillet)
+
+    def solid(self) -> AbstractSdf:
+        """The bellows without its hollow."""
+        return revolve(self._profile())
+
+    def chamber(self) -> AbstractSdf:
+        """The hollow."""
+        wide = 2 * self.outer_radius
+        between = Rectangle([-wide, self.cap], [wide, self.length - self.cap])
+        return revolve(offset(self._profile(), -self.wall_thickness) & between)
+
+
+class LaidAlong(AbstractWrapped):
+    """`shape` turned so that its z axis lies along `axis` (0: x, 1: y) of the world."""
+
+    shape: AbstractSdf
+    axis: int = eqx.field(static=True)
+
+    @property
+    def exactness(self):
+        return self.shape.exactness
+
+    def distance(self, *x):
+        return self.shape.distance(*(x[(self.axis + 1 + i) % 3] for i in range(3)))
+
+    def level_box(self, level):
+        lower, upper = self.shape.level_box(level)
+        return jnp.roll(lower, self.axis + 1), jnp.roll(upper, self.axis + 1)
+
+
+class Placed(AbstractWrapped):
+    """Copies of `shape`, each turned about z by an angle [rad] and then moved [m].
+
+    One evaluation over a leading axis: the program stays as small as one copy.
+    """
+
+    shape: AbstractSdf
+    angles: Float[Array, " copies"] = eqx.field(converter=real)
+    offsets: Float[Array, "copies 3"] = eqx.field(converter=real)
+
+    def distance(self, x, y, z):
+        wide = (-1,) + (1,) * x.ndim
+        c, s = jnp.cos(self.angles).reshape(wide), jnp.sin(self.angles).reshape(wide)
+        dx, dy, dz = (
+            a[None] - self.offsets[:, i].reshape(wide) for i, a in enumerate((x, y, z))
+        )
+        copies = self.shape.distance(c * dx + s * dy, c * dy - s * dx, dz)
+        return functools.reduce(minimum, (copies[k] for k in range(len(self.angles))))
+
+    def level_box(self, level):
+        copies = [
+            translate(rotate(self.shape, a), o).level_box(level)
+            for a, o in zip(self.angles, self.offsets, strict=True)
+        ]
+        return hull(copies, jnp.minimum, jnp.maximum)
+
+
+def pipe(radius, start, length, axis: int) -> AbstractSdf:
+    """A cylinder [m] from `start` that runs `length` along `axis`, backwards if negative."""
+    start, length = real(start), real(length)
+    upright = Cylinder(radius, jnp.abs(length))
+    turned = upright if axis == 2 else LaidAlong(upright, axis)
+    along = jnp.zeros(3, start.dtype).at[axis].set(length / 2)
+    return translate(turned, start + along)
+
+
+# A soft finger: a round bellows with a spine on one side and a rounded tip.
 
 
 @displayed
@@ -27,11 +167,7 @@ class Finger(eqx.Module):
     spine_thickness: Float[Array, ""] = eqx.field(converter=real, default=3 * mm)
 
     def __check_init__(self):
-        for name in ("tip_radius", "spine_width", "spine_thickness"):
-            _check.between(
-                "Finger", name, getattr(self, name), 0.0, 1.0, "m",
-                "Lengths are in metres: write 2 * mm.",
-            )  # fmt: skip
+        check_metres(self, "tip_radius", "spine_width", "spine_thickness")
 
     @property
     def length(self) -> Float[Array, ""]:
@@ -89,11 +225,7 @@ class Hand(eqx.Module):
     port_radius: Float[Array, ""] = eqx.field(converter=real, default=1.5 * mm)
 
     def __check_init__(self):
-        for name in ("palm_width", "palm_length", "palm_thickness", "finger_spacing"):
-            _check.between(
-                "Hand", name, getattr(self, name), 0.0, 1.0, "m",
-                "Lengths are in metres: write 90 * mm.",
-            )  # fmt: skip
+        check_metres(self, "palm_width", "palm_length", "palm_thickness", "finger_spacing")
 
     def places(self) -> dict[str, tuple[Float[Array, "3"], Float[Array, ""]]]:
         """Where each finger has its foot [m], and its angle about z [rad]."""
@@ -170,11 +302,7 @@ class Manipulator(eqx.Module):
     fillet: Float[Array, ""] = eqx.field(converter=real, default=1 * mm)
 
     def __check_init__(self):
-        for name in ("center_distance", "finger_distance", "plate_radius", "core_radius"):
-            _check.between(
-                "Manipulator", name, getattr(self, name), 0.0, 1.0, "m",
-                "Lengths are in metres: write 20 * mm.",
-            )  # fmt: skip
+        check_metres(self, "center_distance", "finger_distance", "plate_radius", "core_radius")
         radius = self.bellows.outer_radius
         if _check.is_concrete(self.center_distance) and _check.is_concrete(radius):
             between = float(self.center_distance * 3**0.5 - 2 * radius)
@@ -265,11 +393,7 @@ class PlanarActuator(eqx.Module):
     fillet: Float[Array, ""] = eqx.field(converter=real, default=1 * mm)
 
     def __check_init__(self):
-        for name in ("spacing", "plate_thickness", "port_radius"):
-            _check.between(
-                "PlanarActuator", name, getattr(self, name), 0.0, 1.0, "m",
-                "Lengths are in metres: write 2 * mm.",
-            )  # fmt: skip
+        check_metres(self, "spacing", "plate_thickness", "port_radius")
         if _check.is_concrete(self.spacing) and _check.is_concrete(self.bellows.outer_radius):
             between = float(self.spacing - 2 * self.bellows.outer_radius)
             if between <= 0:
@@ -327,11 +451,7 @@ class BendingActuator(eqx.Module):
     num_bellows: int = eqx.field(static=True, default=8)
 
     def __check_init__(self):
-        for name in ("width", "height", "base", "pitch", "gap", "wall_thickness"):
-            _check.between(
-                "BendingActuator", name, getattr(self, name), 0.0, 1.0, "m",
-                "Lengths are in metres: write 2 * mm.",
-            )  # fmt: skip
+        check_metres(self, "width", "height", "base", "pitch", "gap", "wall_thickness")
         if _check.is_concrete(self.pitch) and _check.is_concrete(self.wall_thickness):
             hollow = float(self.pitch - self.gap - 2 * self.wall_thickness)
             if hollow <= 0:

@@ -108,7 +108,6 @@ from sorojax.sdf.shapes.data import (
     outlines as outlines,
     text as text,
 )
-from sorojax.sdf.shapes.ellipsoid import Ellipsoid as Ellipsoid
 from sorojax.sdf.shapes.plane import (
     Arc as Arc,
     Circle as Circle,
@@ -131,13 +130,18 @@ from sorojax.sdf.shapes.solid import (
     CappedTorus as CappedTorus,
     Cone as Cone,
     Cylinder as Cylinder,
+    Ellipsoid as Ellipsoid,
     HexagonalPrism as HexagonalPrism,
     InfiniteCylinder as InfiniteCylinder,
     Sphere as Sphere,
     Torus as Torus,
 )
-from sorojax.sdf.surface.contour import Curve as Curve, contour as contour
-from sorojax.sdf.surface.marching import Surface as Surface, isosurface as isosurface
+from sorojax.sdf.surface.marching import (
+    Curve as Curve,
+    Surface as Surface,
+    contour as contour,
+    isosurface as isosurface,
+)
 from sorojax.sdf.surface.report import (
     SurfaceReport as SurfaceReport,
     surface_report as surface_report,

@@ -2,7 +2,7 @@
 
 import abc
 import math
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -36,19 +36,18 @@ class AbstractSurfaceLattice(AbstractSdf):
     F is steepest and thicker elsewhere.
     """
 
-    if TYPE_CHECKING:  # fields that subclasses have, in their own order
-        period: ClassVar[Float[Array, ""]]
-        thickness: ClassVar[Float[Array, ""]]
-        level: ClassVar[Float[Array, ""]]
-    bound: eqx.AbstractClassVar[float]
+    period: Float[Array, ""] = eqx.field(converter=real)
+    thickness: Float[Array, ""] = eqx.field(converter=real)
+    level: Float[Array, ""] = eqx.field(converter=real, default=0.0)
+    bound: ClassVar[float]
+    dim: ClassVar[int] = 3
+
+    def __check_init__(self):
+        check_lengths(self, "period", "thickness")
 
     @abc.abstractmethod
     def surface(self, x: Array, y: Array, z: Array) -> Array:
         """F at the phases x, y, z [rad]."""
-
-    @property
-    def dim(self) -> int:
-        return 3
 
     def distance(self, x, y, z):
         w = 2 * math.pi / self.period
@@ -62,13 +61,7 @@ class AbstractSurfaceLattice(AbstractSdf):
 class Gyroid(AbstractSurfaceLattice):
     """Gyroid walls: `period` and `thickness` in m."""
 
-    period: Float[Array, ""] = eqx.field(converter=real)
-    thickness: Float[Array, ""] = eqx.field(converter=real)
-    level: Float[Array, ""] = eqx.field(converter=real, default=0.0)
     bound: ClassVar[float] = math.sqrt(3)
-
-    def __check_init__(self):
-        check_lengths(self, "period", "thickness")
 
     def surface(self, x, y, z):
         sin, cos = jnp.sin, jnp.cos
@@ -78,13 +71,7 @@ class Gyroid(AbstractSurfaceLattice):
 class SchwarzP(AbstractSurfaceLattice):
     """Schwarz primitive walls: `period` and `thickness` in m."""
 
-    period: Float[Array, ""] = eqx.field(converter=real)
-    thickness: Float[Array, ""] = eqx.field(converter=real)
-    level: Float[Array, ""] = eqx.field(converter=real, default=0.0)
     bound: ClassVar[float] = math.sqrt(3)
-
-    def __check_init__(self):
-        check_lengths(self, "period", "thickness")
 
     def surface(self, x, y, z):
         return jnp.cos(x) + jnp.cos(y) + jnp.cos(z)
@@ -93,13 +80,7 @@ class SchwarzP(AbstractSurfaceLattice):
 class Diamond(AbstractSurfaceLattice):
     """Schwarz diamond walls: `period` and `thickness` in m."""
 
-    period: Float[Array, ""] = eqx.field(converter=real)
-    thickness: Float[Array, ""] = eqx.field(converter=real)
-    level: Float[Array, ""] = eqx.field(converter=real, default=0.0)
     bound: ClassVar[float] = math.sqrt(3)
-
-    def __check_init__(self):
-        check_lengths(self, "period", "thickness")
 
     def surface(self, x, y, z):
         return jnp.cos(z) * jnp.sin(x + y) + jnp.sin(z) * jnp.cos(x - y)
@@ -108,13 +89,7 @@ class Diamond(AbstractSurfaceLattice):
 class Neovius(AbstractSurfaceLattice):
     """Neovius walls: `period` and `thickness` in m."""
 
-    period: Float[Array, ""] = eqx.field(converter=real)
-    thickness: Float[Array, ""] = eqx.field(converter=real)
-    level: Float[Array, ""] = eqx.field(converter=real, default=0.0)
     bound: ClassVar[float] = 7.0
-
-    def __check_init__(self):
-        check_lengths(self, "period", "thickness")
 
     def surface(self, x, y, z):
         a, b, c = jnp.cos(x), jnp.cos(y), jnp.cos(z)
@@ -124,13 +99,7 @@ class Neovius(AbstractSurfaceLattice):
 class Lidinoid(AbstractSurfaceLattice):
     """Lidinoid walls: `period` and `thickness` in m."""
 
-    period: Float[Array, ""] = eqx.field(converter=real)
-    thickness: Float[Array, ""] = eqx.field(converter=real)
-    level: Float[Array, ""] = eqx.field(converter=real, default=0.0)
     bound: ClassVar[float] = 1.5 * math.sqrt(3)
-
-    def __check_init__(self):
-        check_lengths(self, "period", "thickness")
 
     def surface(self, x, y, z):
         sin, cos = jnp.sin, jnp.cos
@@ -146,13 +115,7 @@ class Lidinoid(AbstractSurfaceLattice):
 class Iwp(AbstractSurfaceLattice):
     """Schoen's I-WP walls: `period` and `thickness` in m."""
 
-    period: Float[Array, ""] = eqx.field(converter=real)
-    thickness: Float[Array, ""] = eqx.field(converter=real)
-    level: Float[Array, ""] = eqx.field(converter=real, default=0.0)
     bound: ClassVar[float] = 3 * math.sqrt(3)
-
-    def __check_init__(self):
-        check_lengths(self, "period", "thickness")
 
     def surface(self, x, y, z):
         a, b, c = jnp.cos(x), jnp.cos(y), jnp.cos(z)
@@ -167,18 +130,14 @@ class AbstractBeamLattice(AbstractSdf):
     in which the nearest beam lies too; `beams` are those of the wedge over period/2.
     """
 
-    if TYPE_CHECKING:  # fields that subclasses have, in their own order
-        period: ClassVar[Float[Array, ""]]
-        width: ClassVar[Float[Array, ""]]
-    beams: eqx.AbstractClassVar[tuple]
+    period: Float[Array, ""] = eqx.field(converter=real)
+    width: Float[Array, ""] = eqx.field(converter=real)
+    beams: ClassVar[tuple]
+    dim: ClassVar[int] = 3
+    exactness: ClassVar[Exactness] = Exactness(outside=True, inside=False)
 
-    @property
-    def dim(self) -> int:
-        return 3
-
-    @property
-    def exactness(self) -> Exactness:
-        return Exactness(outside=True, inside=False)
+    def __check_init__(self):
+        check_lengths(self, "period", "width")
 
     def distance(self, x, y, z):
         half = self.period / 2
@@ -205,37 +164,22 @@ class AbstractBeamLattice(AbstractSdf):
 class BccLattice(AbstractBeamLattice):
     """Body-centred cubic beams: from the corners of every cell to its middle."""
 
-    period: Float[Array, ""] = eqx.field(converter=real)
-    width: Float[Array, ""] = eqx.field(converter=real)
     beams: ClassVar[tuple] = (((0, 0, 0), (1, 1, 1)),)
-
-    def __check_init__(self):
-        check_lengths(self, "period", "width")
 
 
 class OctetLattice(AbstractBeamLattice):
     """Octet truss: beams between the nearest nodes of a face-centred cubic lattice."""
 
-    period: Float[Array, ""] = eqx.field(converter=real)
-    width: Float[Array, ""] = eqx.field(converter=real)
     beams: ClassVar[tuple] = (((0, 0, 0), (1, 1, 0)), ((1, 1, 0), (1, 0.5, 0.5)))
-
-    def __check_init__(self):
-        check_lengths(self, "period", "width")
 
 
 class KelvinLattice(AbstractBeamLattice):
     """Kelvin foam: the edges of truncated octahedra that fill space."""
 
-    period: Float[Array, ""] = eqx.field(converter=real)
-    width: Float[Array, ""] = eqx.field(converter=real)
     beams: ClassVar[tuple] = (
         ((1, 0.5, 0), (1, 0.25, 0.25)),
         ((1, 0.5, 0), (0.75, 0.75, 0)),
     )
-
-    def __check_init__(self):
-        check_lengths(self, "period", "width")
 
 
 class VoronoiFoam(AbstractSdf):
@@ -243,6 +187,7 @@ class VoronoiFoam(AbstractSdf):
 
     seeds: Float[Array, "seeds dim"] = eqx.field(converter=real)
     thickness: Float[Array, ""] = eqx.field(converter=real)
+    exactness: ClassVar[Exactness] = Exactness(outside=True, inside=False)
 
     def __check_init__(self):
         check_lengths(self, "thickness")
@@ -256,10 +201,6 @@ class VoronoiFoam(AbstractSdf):
     @property
     def dim(self) -> int:
         return self.seeds.shape[1]
-
-    @property
-    def exactness(self) -> Exactness:
-        return Exactness(outside=True, inside=False)
 
     def distance(self, *x):
         table = (self.seeds,)

@@ -23,45 +23,31 @@ from sorojax.view.show import options as options, scene_of as scene_of, show as 
 from sorojax.view.style import png as png
 
 _NAMES = {
-    "draw.bodies": (
-        "show_deformed",
-        "show_mesh",
-    ),
-    "draw.figures": (
+    "draw.plots": (
         "Convergence",
         "WorkPrecision",
         "backbone_errors",
         "show_backbones",
-        "show_curve",
-        "show_modes",
         "show_signals",
     ),
     "draw.files": (
         "animate_file",
         "show_file",
     ),
-    "draw.shapes": ("show_sdf",),
-    "draw.states": ("nodal_von_mises",),
     "film.animation": (
         "Track",
         "animate",
-    ),
-    "film.body_film": (
-        "film_of_mesh",
-        "ray",
     ),
     "film.film": (
         "Film",
         "animate_figure",
     ),
-    "live_view.feed": (
+    "live_view": (
+        "AbstractSink",
         "Feed",
+        "Recording",
         "Viser",
         "live",
-    ),
-    "live_view.sinks": (
-        "AbstractSink",
-        "Recording",
     ),
     "report": (
         "Number",
@@ -92,26 +78,22 @@ _NAMES = {
 _MODULE = {name: module for module, names in _NAMES.items() for name in names}
 
 if TYPE_CHECKING:
-    from sorojax.view.draw.bodies import show_deformed as show_deformed, show_mesh as show_mesh
-    from sorojax.view.draw.figures import (
+    from sorojax.view.draw.files import animate_file as animate_file, show_file as show_file
+    from sorojax.view.draw.plots import (
         Convergence as Convergence,
         WorkPrecision as WorkPrecision,
         backbone_errors as backbone_errors,
         show_backbones as show_backbones,
-        show_curve as show_curve,
-        show_modes as show_modes,
         show_signals as show_signals,
     )
-    from sorojax.view.draw.files import animate_file as animate_file, show_file as show_file
-    from sorojax.view.draw.shapes import show_sdf as show_sdf
-    from sorojax.view.draw.states import nodal_von_mises as nodal_von_mises
     from sorojax.view.film.animation import Track as Track, animate as animate
-    from sorojax.view.film.body_film import film_of_mesh as film_of_mesh, ray as ray
     from sorojax.view.film.film import Film as Film, animate_figure as animate_figure
-    from sorojax.view.live_view.feed import Feed as Feed, Viser as Viser, live as live
-    from sorojax.view.live_view.sinks import (
+    from sorojax.view.live_view import (
         AbstractSink as AbstractSink,
+        Feed as Feed,
         Recording as Recording,
+        Viser as Viser,
+        live as live,
     )
     from sorojax.view.report import (
         Number as Number,

@@ -1,7 +1,10 @@
-"""What `show` returns: a figure that a notebook displays and that can be written."""
+"""Scenes as pictures: one, or several side by side on one scale.
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+A picture is what `show` returns: a figure that a notebook displays and that can be written.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from sorojax.view import style
-from sorojax.view.raster.camera import Lens
+from sorojax.view.raster.camera import Lens, View, box_corners, camera_at, fit
+from sorojax.view.raster.plane import bar_beside, draw_plane, name_parts, plane_figure
+from sorojax.view.raster.scene import Scene
+from sorojax.view.raster.solid import bar_of, draw_solid, lens_of, solid_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -80,4 +86,94 @@ class Picture:
         return f"Picture: {wide:.0f} x {high:.0f} pixels; .save('name.png'), .figure"
 
 
-Drawn = Callable[..., Picture]
+def show_scene(scene: Scene, *, view: View = "iso", renderer: str = "auto") -> Picture:
+    """One scene, in the plane with axes or shaded in space.
+
+    Args:
+        scene: From `scene_of`, or put together from `Surface`, `Lines`, `Arrows` and `Dots`.
+        view: Camera of a solid scene.
+        renderer: Of a solid scene.
+    """
+    if scene.dim == 2:
+        figure, axes = plane_figure(scene)
+        return Picture(figure, (Panel(axes),))
+    figure, lens = solid_figure(scene, view=view, renderer=renderer)
+    return Picture(figure, (Panel(figure.axes[0], lens),))
+
+
+def panels(
+    scenes: Sequence[Scene],
+    names: Sequence[str],
+    *,
+    view: View = "iso",
+    renderer: str = "auto",
+    title: str = "",
+    width: float = 10.0,
+) -> Picture:
+    """One panel per scene, all with the scale of the first and the same view."""
+    if scenes[0].dim == 2:
+        return _plane(scenes, names, title, width)
+    return _solid(scenes, names, view, renderer, title, width)
+
+
+def _plane(scenes, names, title: str, width: float) -> Picture:
+    lower, upper = (1e3 * corner for corner in scenes[0].box)
+    span = np.maximum(upper - lower, 1e-9)
+    aspect = float(span[1] / span[0])
+    rows, columns = _grid(len(scenes), aspect)
+    height = min(0.7 + rows * (0.35 + aspect * (width - 1.4) / columns), 12.0)
+    figure = style.new_figure(width, max(height, 2.7 if scenes[0].scale else 2.0))
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+    for spare in grid[len(scenes) :]:
+        spare.remove()
+    for axes, scene, name in zip(grid, scenes, names, strict=False):
+        draw_plane(axes, scene)
+        style.dress_plane(axes, lower, upper)
+        axes.set_title(name, fontsize=style.LABEL, color=style.INK)
+        axes.label_outer()
+    name_parts(grid[columns - 1], scenes[0])
+    if scenes[0].scale is not None:
+        bar_beside(figure, list(grid[: len(scenes)]), scenes[0].scale)
+    style.title(figure, title)
+    return Picture(figure, tuple(Panel(axes) for axes in grid[: len(scenes)]))
+
+
+def _solid(scenes, names, view: View, renderer: str, title: str, width: float) -> Picture:
+    corners = box_corners(*scenes[0].box)
+    flat = fit(camera_at(view), corners, (100, 100)).raw(corners)[:, :2]
+    span = flat.max(axis=0) - flat.min(axis=0)
+    aspect = float(np.clip(span[1] / max(span[0], 1e-12), 0.3, 1.6))
+    rows, columns = _grid(len(scenes), aspect)
+    right = 1.05 if scenes[0].scale is not None else 0.1
+    each = (width - right) / columns
+    head = 0.45 if title else 0.1
+    height = head + rows * (0.28 + aspect * each)
+    figure = style.new_figure(width, height, layout="none")
+    drawn = []
+    for k, (scene, name) in enumerate(zip(scenes, names, strict=True)):
+        row, column = divmod(k, columns)
+        low = height - head - (row + 1) * (0.28 + aspect * each)
+        place = (column * each / width, low / height, each / width, aspect * each / height)
+        axes = figure.add_axes(place)
+        box = axes.get_window_extent()
+        size = max(int(round(box.width)), 16), max(int(round(box.height)), 16)
+        lens = lens_of([scenes[0]] if scene.extent is not None else scenes, view, size)
+        draw_solid(figure, axes, replace(scene, title=""), renderer=renderer, lens=lens)
+        figure.text(
+            (column + 0.5) * each / width, (low + aspect * each) / height, name,
+            ha="center", va="bottom", fontsize=style.LABEL, color=style.INK,
+        )  # fmt: skip
+        drawn.append(Panel(axes, lens))
+    if scenes[0].scale is not None:
+        place = (1 - 0.95 / width, 0.15, 0.16 / width, 0.7)
+        bar_of(figure, scenes[0].scale, figure.add_axes(place))
+    if title:
+        figure.text(0.5, 1 - 0.12 / height, title, ha="center", va="top", fontsize=style.TITLE,
+                    color=style.INK, fontweight="bold")  # fmt: skip
+    return Picture(figure, tuple(drawn))
+
+
+def _grid(count: int, aspect: float) -> tuple[int, int]:
+    """Rows and columns: wide bodies in two columns, others in three."""
+    columns = min(count, 2 if aspect < 0.4 else 3)
+    return -(-count // columns), columns

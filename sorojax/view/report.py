@@ -7,12 +7,13 @@ from html import escape
 from typing import TYPE_CHECKING, Union
 
 from sorojax.view.film.film import Film
+from sorojax.view.picture import Picture
 from sorojax.view.style import png
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Picture = Union["Figure", Film, bytes]
+Drawn = Union["Figure", Picture, Film, bytes]
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Section:
 
     heading: str
     text: str = ""
-    pictures: Sequence[tuple[str, Picture]] = ()
+    pictures: Sequence[tuple[str, Drawn]] = ()
     numbers: Sequence[Number] = ()
 
 
@@ -42,7 +43,7 @@ def html_report(title: str, sections: Sequence[Section], *, lead: str = "") -> s
     Args:
         title: Title of the page.
         sections: `Section`s; their pictures are `(caption, figure)`, where a figure is a
-            matplotlib figure, a `Film`, or the bytes of a PNG or GIF file.
+            `Picture`, a matplotlib figure, a `Film`, or the bytes of a PNG or GIF file.
         lead: Short text under the title.
     """
     body = "\n".join(_section(section, k) for k, section in enumerate(sections))
@@ -80,9 +81,11 @@ def _paragraphs(text: str, kind: str = "") -> str:
     return "\n".join(f"{tag}{escape(block)}</p>" for block in blocks)
 
 
-def _picture(caption: str, picture: Picture) -> str:
+def _picture(caption: str, picture: Drawn) -> str:
     if isinstance(picture, Film):
         data = picture.gif
+    elif isinstance(picture, Picture):
+        data = picture.png
     else:
         data = picture if isinstance(picture, bytes) else png(picture)
     kind = "gif" if data.startswith(b"GIF8") else "png"

@@ -6,8 +6,7 @@ import inspect
 from typing import Any
 
 from sorojax import _explain
-from sorojax.view.picture import Panel, Picture
-from sorojax.view.raster.camera import View
+from sorojax.view.picture import Picture
 from sorojax.view.raster.scene import Scene
 
 #: Noun, module of this floor, function. The class itself is not imported.
@@ -15,61 +14,61 @@ _DRAWN_BY = {
     "sorojax.sdf.base.AbstractSdf": ("draw.shapes", "show_shape"),
     "sorojax.sdf.surface.marching.Surface": ("draw.shapes", "show_surface"),
     "sorojax.mesh.mesh.Mesh": ("draw.meshes", "show_cells"),
-    "sorojax.fem.problem.Problem": ("draw.states", "show_problem"),
-    "sorojax.fem.equilibrium.solve.Solution": ("draw.states", "show_solution"),
-    "sorojax.fem.equilibrium.volume.CavitySolution": ("draw.states", "show_solution"),
-    "sorojax.fem.equilibrium.solve.Path": ("draw.states", "show_path"),
-    "sorojax.fem.equilibrium.volume.VolumePath": ("draw.states", "show_path"),
-    "sorojax.fem.stability.continuation.Continuation": ("draw.states", "show_path"),
-    "sorojax.fem.dynamics.motion.Motion": ("draw.states", "show_path"),
-    "sorojax.fem.stability.modal.Modes": ("draw.states", "show_vibration"),
-    "sorojax.fem.stability.buckling.CriticalLoads": ("draw.answers", "show_buckling"),
-    "sorojax.fem.stability.continuation.CriticalPoint": ("draw.answers", "show_buckling"),
+    "sorojax.fem.problem.Problem": ("draw.bodies", "show_problem"),
+    "sorojax.fem.equilibrium.solve.Solution": ("draw.bodies", "show_solution"),
+    "sorojax.fem.equilibrium.volume.CavitySolution": ("draw.bodies", "show_solution"),
+    "sorojax.fem.equilibrium.solve.Path": ("draw.bodies", "show_path"),
+    "sorojax.fem.equilibrium.volume.VolumePath": ("draw.bodies", "show_path"),
+    "sorojax.fem.stability.continuation.Continuation": ("draw.bodies", "show_path"),
+    "sorojax.fem.dynamics.motion.Motion": ("draw.bodies", "show_path"),
+    "sorojax.fem.stability.modal.Modes": ("draw.bodies", "show_vibration"),
+    "sorojax.fem.stability.buckling.CriticalLoads": ("draw.bodies", "show_buckling"),
+    "sorojax.fem.stability.continuation.CriticalPoint": ("draw.bodies", "show_buckling"),
     "sorojax.rod.model.rod.Rod": ("draw.rods", "show_rod"),
     "sorojax.rod.model.assembly.Assembly": ("draw.rods", "show_rod"),
-    "sorojax.rod.model.section.Section": ("draw.answers", "show_section"),
-    "sorojax.rod.model.basis.StrainBasis": ("draw.answers", "show_basis"),
+    "sorojax.rod.model.section.Section": ("draw.rods", "show_section"),
+    "sorojax.rod.model.basis.StrainBasis": ("draw.plots", "show_basis"),
     "sorojax.rod.dynamics.rollout.Rollout": ("draw.runs", "show_rollout"),
-    "sorojax.rod.statics.equilibrium.Equilibrium": ("draw.answers", "show_posed"),
-    "sorojax.rod.statics.path.EquilibriumPath": ("draw.answers", "show_posed"),
-    "sorojax.rod.statics.path.ArcPath": ("draw.answers", "show_posed"),
-    "sorojax.rod.statics.inverse_kinematics.Reached": ("draw.answers", "show_posed"),
-    "sorojax.material.hyperelastic.AbstractHyperelastic": ("draw.answers", "show_material"),
-    "sorojax.reduction.backbone.Backbone": ("draw.figures", "show_snapshots"),
-    "sorojax.robots.bellows.BellowsActuator": ("draw.records", "show_robot"),
-    "sorojax.robots.printable.BendingActuator": ("draw.records", "show_robot"),
-    "sorojax.robots.crawler.Crawler": ("draw.records", "show_robot"),
-    "sorojax.robots.printable.Finger": ("draw.records", "show_robot"),
-    "sorojax.robots.printable.Hand": ("draw.records", "show_robot"),
-    "sorojax.robots.printable.Manipulator": ("draw.records", "show_robot"),
-    "sorojax.robots.parts.Bellows": ("draw.records", "show_robot"),
-    "sorojax.robots.printable.PlanarActuator": ("draw.records", "show_robot"),
-    "sorojax.robots.pneunet.PneuNet": ("draw.records", "show_robot"),
-    "sorojax.robots.walker.Walker": ("draw.records", "show_robot"),
-    "sorojax.robots.models.supply.Model": ("draw.answers", "show_model"),
-    "sorojax.systems.blocks.rod_body.RodBody": ("draw.answers", "show_body"),
-    "sorojax.systems.blocks.rod_body.AssemblyBody": ("draw.answers", "show_body"),
+    "sorojax.rod.statics.equilibrium.Equilibrium": ("draw.rods", "show_posed"),
+    "sorojax.rod.statics.path.EquilibriumPath": ("draw.rods", "show_posed"),
+    "sorojax.rod.statics.path.ArcPath": ("draw.rods", "show_posed"),
+    "sorojax.rod.statics.inverse_kinematics.Reached": ("draw.rods", "show_posed"),
+    "sorojax.material.hyperelastic.AbstractHyperelastic": ("draw.plots", "show_material"),
+    "sorojax.reduction.backbone.Backbone": ("draw.plots", "show_snapshots"),
+    "sorojax.robots.bellows.BellowsActuator": ("draw.robots", "show_robot"),
+    "sorojax.robots.printable.BendingActuator": ("draw.robots", "show_robot"),
+    "sorojax.robots.locomotion.Crawler": ("draw.robots", "show_robot"),
+    "sorojax.robots.printable.Finger": ("draw.robots", "show_robot"),
+    "sorojax.robots.printable.Hand": ("draw.robots", "show_robot"),
+    "sorojax.robots.printable.Manipulator": ("draw.robots", "show_robot"),
+    "sorojax.robots.printable.Bellows": ("draw.robots", "show_robot"),
+    "sorojax.robots.printable.PlanarActuator": ("draw.robots", "show_robot"),
+    "sorojax.robots.bellows.PneuNet": ("draw.robots", "show_robot"),
+    "sorojax.robots.locomotion.Walker": ("draw.robots", "show_robot"),
+    "sorojax.robots.models.models.Model": ("draw.rods", "show_model"),
+    "sorojax.systems.blocks.rod_body.RodBody": ("draw.rods", "show_body"),
+    "sorojax.systems.blocks.rod_body.AssemblyBody": ("draw.rods", "show_body"),
     "sorojax.systems.blocks.block.AbstractBlock": ("draw.networks", "show_network"),
     "sorojax.systems.integrate.simulate.Trajectory": ("draw.runs", "show_trajectory"),
     "sorojax.design.optimise.minimise.Optimised": ("draw.runs", "show_optimised"),
     "sorojax.design.optimise.minimise.History": ("draw.runs", "show_history"),
     "sorojax.design.optimise.shape_loop.OptimisedShape": (
-        "draw.answers",
+        "draw.bodies",
         "show_optimised_shape",
     ),
-    "sorojax.design.part.Part": ("draw.answers", "show_part"),
-    "sorojax.design.calibration.calibration.Calibration": ("draw.answers", "show_calibration"),
-    "sorojax.material.fit.TensileFit": ("draw.answers", "show_fit"),
-    "sorojax.mesh.repair.Repaired": ("draw.answers", "show_repaired"),
-    "sorojax.mesh.quality.Quality": ("draw.records", "show_quality"),
-    "sorojax.sdf.surface.contour.Curve": ("draw.records", "show_curve"),
-    "sorojax.io.animation.MovingSurface": ("draw.records", "show_moving"),
-    "sorojax.sweep.sweep.Swept": ("draw.records", "show_sweep"),
-    "sorojax.vision.tracking.Tracks": ("draw.records", "show_tracks"),
-    "sorojax.view.rigging.rig.Rig": ("draw.answers", "show_rig"),
-    "sorojax.view.draw.figures.Convergence": ("draw.figures", "show_convergence"),
-    "sorojax.view.draw.figures.WorkPrecision": ("draw.figures", "show_work_precision"),
-    "sorojax.view.raster.scene.Scene": ("show", "show_scene"),
+    "sorojax.design.part.Part": ("draw.shapes", "show_part"),
+    "sorojax.design.calibration.calibration.Calibration": ("draw.plots", "show_calibration"),
+    "sorojax.material.fit.TensileFit": ("draw.plots", "show_fit"),
+    "sorojax.mesh.repair.Repaired": ("draw.meshes", "show_repaired"),
+    "sorojax.mesh.quality.Quality": ("draw.meshes", "show_quality"),
+    "sorojax.sdf.surface.marching.Curve": ("draw.shapes", "show_curve"),
+    "sorojax.io.animation.MovingSurface": ("draw.shapes", "show_moving"),
+    "sorojax.sweep.sweep.Swept": ("draw.plots", "show_sweep"),
+    "sorojax.vision.discs.Tracks": ("draw.plots", "show_tracks"),
+    "sorojax.view.rigging.rig.Rig": ("draw.rods", "show_rig"),
+    "sorojax.view.draw.plots.Convergence": ("draw.plots", "show_convergence"),
+    "sorojax.view.draw.plots.WorkPrecision": ("draw.plots", "show_work_precision"),
+    "sorojax.view.raster.scene.Scene": ("picture", "show_scene"),
 }
 
 
@@ -140,7 +139,7 @@ def _known(thing: Any) -> Any:
     )
 
 
-# Scenes as pictures, and nouns as scenes: what `show` draws, to be put together anew
+# Nouns as scenes: what `show` draws, to be put together anew
 
 
 #: Noun, module of this floor, function that makes its scene.
@@ -148,31 +147,12 @@ _SCENES = {
     "sorojax.sdf.base.AbstractSdf": ("draw.shapes", "shape_scene"),
     "sorojax.sdf.surface.marching.Surface": ("draw.shapes", "surface_scene"),
     "sorojax.mesh.mesh.Mesh": ("draw.meshes", "mesh_scene"),
-    "sorojax.fem.problem.Problem": ("draw.states", "problem_scene"),
-    "sorojax.fem.equilibrium.solve.Solution": ("draw.states", "solution_scene"),
-    "sorojax.fem.equilibrium.volume.CavitySolution": ("draw.states", "solution_scene"),
+    "sorojax.fem.problem.Problem": ("draw.bodies", "problem_scene"),
+    "sorojax.fem.equilibrium.solve.Solution": ("draw.bodies", "solution_scene"),
+    "sorojax.fem.equilibrium.volume.CavitySolution": ("draw.bodies", "solution_scene"),
     "sorojax.rod.model.rod.Rod": ("draw.rods", "rod_scene"),
     "sorojax.rod.model.assembly.Assembly": ("draw.rods", "rod_scene"),
 }
-
-
-def show_scene(scene: Scene, *, view: View = "iso", renderer: str = "auto") -> Picture:
-    """One scene, in the plane with axes or shaded in space.
-
-    Args:
-        scene: From `scene_of`, or put together from `Surface`, `Lines`, `Arrows` and `Dots`.
-        view: Camera of a solid scene.
-        renderer: Of a solid scene.
-    """
-    if scene.dim == 2:
-        from sorojax.view.raster.plane import plane_figure
-
-        figure, axes = plane_figure(scene)
-        return Picture(figure, (Panel(axes),))
-    from sorojax.view.raster.solid import solid_figure
-
-    figure, lens = solid_figure(scene, view=view, renderer=renderer)
-    return Picture(figure, (Panel(figure.axes[0], lens),))
 
 
 def scene_of(thing: Any, *at: Any, **options: Any) -> Scene:

@@ -17,10 +17,14 @@ from sorojax.vision.discs import (
     RED as RED,
     Colour as Colour,
     Discs as Discs,
+    MarkerStream as MarkerStream,
+    Tracks as Tracks,
     colour_mask as colour_mask,
     find_discs as find_discs,
+    follow as follow,
     hough_discs as hough_discs,
     refine_discs as refine_discs,
+    start_tracks as start_tracks,
 )
 from sorojax.vision.fiducials import (
     CharucoBoard as CharucoBoard,
@@ -31,20 +35,15 @@ from sorojax.vision.fiducials import (
     marker_pose as marker_pose,
     world_frame as world_frame,
 )
-from sorojax.vision.scene import Balls as Balls, draw_balls as draw_balls
 from sorojax.vision.synthetic import (
+    Balls as Balls,
     Disturbance as Disturbance,
     background as background,
+    draw_balls as draw_balls,
     draw_discs as draw_discs,
     draw_plane as draw_plane,
     fiducial_picture as fiducial_picture,
     photograph as photograph,
-)
-from sorojax.vision.tracking import (
-    MarkerStream as MarkerStream,
-    Tracks as Tracks,
-    follow as follow,
-    start_tracks as start_tracks,
 )
 
 _check_package(__name__)

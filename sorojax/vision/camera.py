@@ -7,9 +7,10 @@ Reference: D. C. Brown, "Close-range camera calibration", Photogrammetric Engine
 1971; the order k1 k2 p1 p2 k3 of the coefficients is that of OpenCV and RealSense.
 """
 
+import functools
 import json
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -154,3 +155,22 @@ def load_camera(path: str | Path) -> Camera:
             "again."
         )
     return camera
+
+
+# OpenCV, loaded where an image is looked at.
+
+
+@functools.cache
+def opencv() -> Any:
+    """The module `cv2`.
+
+    Raises:
+        ImportError: If it is not installed.
+    """
+    try:
+        import cv2
+    except ImportError as missing:
+        raise ImportError(
+            "sorojax.vision: need OpenCV. pip install 'sorojax[vision]'"
+        ) from missing
+    return cv2

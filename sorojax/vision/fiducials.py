@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sorojax._progress import report
-from sorojax.vision._opencv import opencv
-from sorojax.vision.camera import Camera, Pose
+from sorojax.vision.camera import Camera, Pose, opencv
 
 
 class Fiducials(NamedTuple):

@@ -1,4 +1,4 @@
-"""Drawing, rubber, mesh and problem of the bellows actuator."""
+"""The bellows actuator: drawing, rubber, mesh and problem; its rod and the closed loop."""
 
 from typing import NamedTuple
 
@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sorojax import fem, material, mesh, robots, sdf
+from sorojax import SE2, fem, material, mesh, reduction, robots, rod, sdf, systems
 from sorojax.robots import BellowsActuator
-from sorojax.units import kPa, mm
+from sorojax.units import kPa, ml, mm
 
 DEPTH = 20 * mm
 LAYER_STIFFNESS = 10.0
@@ -135,3 +135,132 @@ def _difference(design: Design, path: fem.Path, h: float) -> float:
         return float(tip_rotation(changed, design, path))
 
     return (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * h)
+
+
+# The rod that stands in for the solid, and the closed loop around it.
+
+
+#: Retardation time of the rubber [s]; an assumption, no measurement is public.
+DAMPING_TIME = 0.01
+
+
+class Reduced(NamedTuple):
+    """Backbone snapshots, strain modes, identified laws and the rod with them."""
+
+    backbone: reduction.Backbone
+    basis: rod.StrainBasis
+    captured: dict[str, float]
+    fit: reduction.Fit
+    rod: rod.Rod
+    forces: tuple
+    states: Float[Array, "steps dof"]
+    errors: Float[np.ndarray, " steps"]
+
+
+def reduce(design: Design, path: fem.Path) -> Reduced:
+    """Three bending modes from the path, and the rod's own equilibrium at every pressure.
+
+    `errors` is the mean distance [m] between the rod's backbone and that of the solid.
+    """
+    a = design.actuator
+    middle = a.layer_thickness / 2
+    line = reduction.Line([0.0, middle], [a.length, middle])
+    backbone = reduction.strain_along(path, line)
+    basis = reduction.pod_basis(backbone, modes={"kappa_z": 3})
+    fit = reduction.identify(path, basis, backbone, line)
+    body = rod.rod(
+        SE2(), basis, fit.section, rod.elastic(design.tensile.material), length=fit.length
+    )
+    states = [jnp.zeros(basis.num_dof)]
+    for pressure in path.values:
+        loads = (fit.elastic, rod.Pressurised(fit.pressure, pressure))
+        states.append(rod.equilibrium(body, loads, states[-1]).q)
+    q = jnp.stack(states[1:])
+    poses = jax.vmap(lambda q: rod.forward_kinematics(body, q, backbone.s))(q)
+    gap = jnp.linalg.norm(poses[:, :, :2, 2] - backbone.positions, axis=-1)
+    forces = (fit.elastic, fit.pressure, fit.damping(DAMPING_TIME))
+    return Reduced(
+        backbone,
+        basis,
+        reduction.captured_energy(backbone, basis),
+        fit,
+        body,
+        forces,
+        q,
+        np.asarray(jnp.mean(gap, axis=1)),
+    )
+
+
+def reference_angle(full: float, duration: float) -> systems.SmoothRamp:
+    """Three moves within `duration` [s], in shares of the angle `full` [rad]."""
+    times = np.array([0.0, 0.1, 0.3, 0.46, 0.62, 0.78, 0.94])
+    shares = np.array([0.0, 0.0, 0.6, 0.6, 0.25, 0.25, 0.8])
+    return systems.SmoothRamp(duration * times, shares * full)
+
+
+def controller(
+    full: float, top: float, reference: systems.AbstractReference | None = None
+) -> systems.PID:
+    """PID from the tip angle [rad] to a pressure [Pa], for an actuator that reaches the angle
+    `full` at the pressure `top`."""
+    per_angle = top / full
+    return systems.PID(
+        proportional=0.5 * per_angle,
+        integral_gain=8.0 * per_angle,
+        derivative=0.05 * per_angle,
+        feed_forward=0.9 * per_angle,
+        low=0.0,
+        high=1.2 * top,
+        filter_time=0.01,
+        reference=reference,
+    )
+
+
+def closed_loop(reduced: Reduced, path: fem.Path, duration: float) -> systems.Network:
+    """Reservoir, regulator, rod and PID: the tip follows a reference angle."""
+    full = float(_tip_angle(reduced, -1))
+    reference = systems.Source(reference_angle(full, duration), unit="rad")
+    pid = controller(full, float(path.values[-1]))
+    return systems.Network(
+        blocks={
+            "target": reference,
+            "pid": pid,
+            "valve": systems.Regulator(1.5e-8, integral_gain=3e-8, max_flow=3e-5),
+            "air": systems.Reservoir(dead_volume=2 * ml),
+            "body": systems.RodBody(reduced.rod, reduced.forces),
+        },
+        wires={
+            "pid.reference": "target.value",
+            "pid.measurement": "body.tip_angle",
+            "valve.setpoint": "pid.command",
+            "valve.pressure": "air.pressure",
+            "air.mass_flow": "valve.mass_flow",
+            "air.volume": "body.volume",
+            "air.volume_rate": "body.volume_rate",
+            "air.compliance": "body.compliance",
+            "body.pressure": "air.pressure",
+        },
+    )
+
+
+class Tracking(NamedTuple):
+    """How well the tip followed its reference [rad]."""
+
+    rms: float
+    final: float
+    peak_pressure: float
+    steps: int
+
+
+def tracking(film: systems.Trajectory) -> Tracking:
+    error = film["body.tip_angle"] - film["target.value"]
+    return Tracking(
+        float(jnp.sqrt(jnp.mean(error**2))),
+        float(jnp.abs(error[-1])),
+        float(jnp.max(film["air.pressure"])),
+        int(film.stats["steps"]),
+    )
+
+
+def _tip_angle(reduced: Reduced, step: int) -> Float[Array, ""]:
+    return rod.tip_angle(rod.motion(reduced.rod, reduced.states[step]))

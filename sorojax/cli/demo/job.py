@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax import fem
-from sorojax.cli.demo import design as designs, loop as loops
+from sorojax.cli.demo import design as designs
 from sorojax.cli.demo.results import Results, numbers, pictures, write
 from sorojax.systems import simulate
 from sorojax.units import kPa, mm
@@ -48,12 +48,12 @@ def run(out: Path, quick: bool = False) -> int:
         per_mm = np.degrees(slope.gradient["wall_thickness"]) * mm
         tell(f"{per_mm:.3f} deg/mm of wall, central differences off by {slope.error:.1e}")
     with clock.stage("strain modes and rod") as tell:
-        reduced = loops.reduce(design, path)
+        reduced = designs.reduce(design, path)
         tell(f"3 bending modes, backbone within {reduced.errors.max() / mm:.3f} mm")
     with clock.stage("closed loop") as tell:
-        network = loops.closed_loop(reduced, path, duration)
+        network = designs.closed_loop(reduced, path, duration)
         film = simulate(network, duration, save=int(100 * duration) + 1)
-        tracking = loops.tracking(film)
+        tracking = designs.tracking(film)
         tell(
             f"{duration:g} s in {tracking.steps} steps, rms {np.degrees(tracking.rms):.2f} deg"
         )

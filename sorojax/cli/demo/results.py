@@ -9,9 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax import fem, material, systems, view
-from sorojax.cli.demo.design import DEPTH, LAYER_STIFFNESS, Design, Sensitivity
-from sorojax.cli.demo.loop import DAMPING_TIME, Reduced, Tracking
+from sorojax.cli.demo.design import (
+    DAMPING_TIME,
+    DEPTH,
+    LAYER_STIFFNESS,
+    Design,
+    Reduced,
+    Sensitivity,
+    Tracking,
+)
 from sorojax.math.lie import homogeneous
+from sorojax.mesh import chambers
 from sorojax.units import kPa, mm
 
 
@@ -101,42 +109,58 @@ def pictures(r: Results) -> dict[str, Any]:
     flow = {"mass flow [mg/s]": {"valve": 1e6 * np.asarray(film["valve.mass_flow"])}}
     points = material.presets.DRAGON_SKIN_30_POINTS
     return {
-        "rubber.png": view.show_curve(r.design.tensile, *points),
-        "deformed.png": view.show_deformed(r.path),
-        "modes.png": view.show_modes(r_.basis, r_.fit.length, energy=r_.captured),
+        "rubber.png": view.show(r.design.tensile, points=points),
+        "deformed.png": view.show(r.path),
+        "modes.png": view.show(r_.basis, length=r_.fit.length, energy=r_.captured),
         "backbones.png": view.show_backbones(
             r_.backbone, r_.rod, r_.states, pressures=r.path.values
         ),
         "loop.png": view.show_signals(time, signals | flow),
-        "actuator.gif": _film(r, signals),
+        "actuator.gif": _film(r),
     }
 
 
-def _film(r: Results, signals) -> view.Film:
-    mesh, actuator = r.design.problem.mesh, r.design.actuator
+def _film(r: Results) -> view.Film:
+    """The mesh on the rod, its chambers coloured by pressure, and the wanted direction."""
+    mesh, actuator, film = r.design.problem.mesh, r.design.actuator, r.film
     middle = float(actuator.layer_thickness) / 2
     base = homogeneous(jnp.eye(2), jnp.array([0.0, middle]))
     skin = view.bind(mesh.points, r.reduced.rod, base=base)
-    positions = jax.lax.map(lambda q: view.deform(skin, r.reduced.rod, q), r.film["body.q"])
-    tip = np.asarray(r.film["body.tip_position"]) + np.array([0.0, middle])
-    target = view.ray(tip, np.asarray(r.film["target.value"]), 15 * mm)
-    return view.film_of_mesh(
-        mesh,
-        positions,
-        time=r.film.time,
-        pressure=r.film["air.pressure"],
-        cavities=r.design.chamber_facets,
-        lines={"wanted direction": target},
-        signals={"bending [deg]": signals["bending [deg]"]},
-        caption="closed loop on the bending angle",
+    moved = jax.lax.map(lambda q: view.deform(skin, r.reduced.rod, q), film["body.q"])
+    moved, angle = np.asarray(moved), np.asarray(film["target.value"])
+    tip = np.asarray(film["body.tip_position"]) + np.array([0.0, middle])
+    ahead = tip + 15 * mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    pressure = np.asarray(film["air.pressure"]) / kPa
+    scale = view.Scale("pressure [kPa]", 0.0, max(float(pressure.max()), 1e-3), colours="OrRd")
+    body = view.scene_of(mesh).parts[0]
+    assert isinstance(body, view.Surface)
+    found = chambers(mesh)
+    air = np.concatenate(
+        [_fan(np.asarray(found.mesh.facet_sets[name])) for name in found.volumes]
     )
+
+    def scene(k: int) -> view.Scene:
+        solid = view.Surface(moved[k], body.triangles)
+        inside = view.Surface(moved[k], air, values=np.full(len(air), pressure[k]))
+        wanted = view.Lines(
+            [np.stack([tip[k], ahead[k]])], dashed=True, name="wanted direction"
+        )
+        return view.Scene((solid, inside, wanted))
+
+    track = view.Track(np.asarray(film.time), scene, scale)
+    return view.animate(track, title="closed loop on the bending angle")
+
+
+def _fan(facets: np.ndarray) -> np.ndarray:
+    """Triangles over a loop of facets, as node numbers."""
+    return np.column_stack([np.full(len(facets) - 2, facets[0, 0]), facets[1:-1, :2]])
 
 
 def write(folder: Path, drawn: dict[str, Any], tables, seconds: dict[str, float]) -> None:
     """Pictures, `result.json` and `report.html` in `folder`."""
     files: dict[str, bytes] = {}
     for name, picture in drawn.items():
-        files[name] = picture.gif if name.endswith(".gif") else view.png(picture)
+        files[name] = picture.gif if name.endswith(".gif") else picture.png
         (folder / name).write_bytes(files[name])
     result: dict[str, Any] = {
         section: {n.name: {"value": n.value, "unit": n.unit, "bar": n.bar, "holds": n.holds}

@@ -7,7 +7,6 @@ points, and a facet lists its corners counter-clockwise as seen from outside. Th
 order is that of VTK and meshio.
 """
 
-import abc
 from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
@@ -26,9 +25,9 @@ class AbstractElement(eqx.Module):
         facets: ClassVar[Facets]
 
     @property
-    @abc.abstractmethod
     def name(self) -> str:
         """Name used by messages and files."""
+        return type(self).__name__
 
 
 class Tri3(AbstractElement):
@@ -40,10 +39,6 @@ class Tri3(AbstractElement):
     order: ClassVar[int] = 1
     facets: ClassVar[Facets] = ((0, 1), (1, 2), (2, 0))
 
-    @property
-    def name(self) -> str:
-        return "Tri3"
-
 
 class Tri6(AbstractElement):
     """Quadratic triangle; sides may be curved."""
@@ -53,10 +48,6 @@ class Tri6(AbstractElement):
     num_corners: ClassVar[int] = 3
     order: ClassVar[int] = 2
     facets: ClassVar[Facets] = ((0, 1, 3), (1, 2, 4), (2, 0, 5))
-
-    @property
-    def name(self) -> str:
-        return "Tri6"
 
 
 class Tri7(AbstractElement):
@@ -68,10 +59,6 @@ class Tri7(AbstractElement):
     order: ClassVar[int] = 2
     facets: ClassVar[Facets] = Tri6.facets
 
-    @property
-    def name(self) -> str:
-        return "Tri7"
-
 
 class Quad4(AbstractElement):
     """Bilinear quadrilateral."""
@@ -81,10 +68,6 @@ class Quad4(AbstractElement):
     num_corners: ClassVar[int] = 4
     order: ClassVar[int] = 1
     facets: ClassVar[Facets] = ((0, 1), (1, 2), (2, 3), (3, 0))
-
-    @property
-    def name(self) -> str:
-        return "Quad4"
 
 
 class Quad8(AbstractElement):
@@ -96,10 +79,6 @@ class Quad8(AbstractElement):
     order: ClassVar[int] = 2
     facets: ClassVar[Facets] = ((0, 1, 4), (1, 2, 5), (2, 3, 6), (3, 0, 7))
 
-    @property
-    def name(self) -> str:
-        return "Quad8"
-
 
 class Quad9(AbstractElement):
     """Biquadratic quadrilateral; the last node is at its centre."""
@@ -109,10 +88,6 @@ class Quad9(AbstractElement):
     num_corners: ClassVar[int] = 4
     order: ClassVar[int] = 2
     facets: ClassVar[Facets] = Quad8.facets
-
-    @property
-    def name(self) -> str:
-        return "Quad9"
 
 
 class PolyN(AbstractElement):
@@ -152,10 +127,6 @@ class Tet4(AbstractElement):
     order: ClassVar[int] = 1
     facets: ClassVar[Facets] = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2))
 
-    @property
-    def name(self) -> str:
-        return "Tet4"
-
 
 class Tet10(AbstractElement):
     """Quadratic tetrahedron; mid-sides of (0,1), (1,2), (2,0), (0,3), (1,3), (2,3)."""
@@ -171,10 +142,6 @@ class Tet10(AbstractElement):
         (0, 3, 2, 7, 9, 6),
     )
 
-    @property
-    def name(self) -> str:
-        return "Tet10"
-
 
 class Tet15(AbstractElement):
     """Quadratic tetrahedron with nodes in its faces, then one at its centre."""
@@ -186,10 +153,6 @@ class Tet15(AbstractElement):
     facets: ClassVar[Facets] = tuple(
         (*facet, 10 + number) for number, facet in enumerate(Tet10.facets)
     )
-
-    @property
-    def name(self) -> str:
-        return "Tet15"
 
 
 class Hex8(AbstractElement):
@@ -207,10 +170,6 @@ class Hex8(AbstractElement):
         (2, 3, 7, 6),
         (3, 0, 4, 7),
     )
-
-    @property
-    def name(self) -> str:
-        return "Hex8"
 
 
 def facet_corners(element: AbstractElement) -> int:

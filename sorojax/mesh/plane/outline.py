@@ -8,7 +8,7 @@ from sorojax.math.host import KDTree
 from sorojax.mesh.sizes import Sizes
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sampling import land, values, values_and_gradients
-from sorojax.sdf.surface.contour import Curve, contour, level_curves
+from sorojax.sdf.surface.marching import Curve, contour, level_curves
 
 _MAX_TURN = np.deg2rad(44.0)  # of one edge on a fillet
 _GRADING = 0.35  # growth of the edge length per distance

@@ -23,7 +23,7 @@ from sorojax.mesh.elements.elements import PolyN
 from sorojax.mesh.mesh import Mesh, boundary_facets
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sampling import finite_box, raise_empty, values
-from sorojax.sdf.surface.contour import contour
+from sorojax.sdf.surface.marching import contour
 
 _BENT = 1.08  # length of a piece of the boundary over its chord that asks for a point
 

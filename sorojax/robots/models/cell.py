@@ -28,8 +28,7 @@ from sorojax._types import real
 from sorojax.material import AbstractHyperelastic, small_strain_moduli
 from sorojax.material.kinematics import from_matrix
 from sorojax.robots.models.grid import Grid, Piece, cut_grid
-from sorojax.robots.parts import Bellows, LaidAlong
-from sorojax.robots.printable import BendingActuator, Finger
+from sorojax.robots.printable import Bellows, BendingActuator, Finger, LaidAlong
 from sorojax.sdf import AbstractSdf
 
 _BLOCK = 400  # boxes at a time

@@ -4,7 +4,7 @@ import abc
 import functools
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -38,13 +38,13 @@ def hull(boxes: list[Box], low: Callable, high: Callable) -> Box:
     return lower, functools.reduce(high, (box[1] for box in boxes))
 
 
-class Union(AbstractSdf):
-    """Inside any of `shapes`; the distance is exact outside them."""
+class AbstractCombination(AbstractSdf):
+    """Several `shapes` of one dimension as one."""
 
     shapes: tuple[AbstractSdf, ...] = eqx.field(converter=tuple)
 
     def __check_init__(self):
-        check_same_dim("Union", self.shapes)
+        check_same_dim(type(self).__name__, self.shapes)
 
     @property
     def dim(self) -> int:
@@ -53,6 +53,13 @@ class Union(AbstractSdf):
     @property
     def lipschitz(self) -> Number:
         return steepest(*(shape.lipschitz for shape in self.shapes))
+
+    def bounding_box(self) -> Box:
+        return self.level_box(0.0)
+
+
+class Union(AbstractCombination):
+    """Inside any of `shapes`; the distance is exact outside them."""
 
     @property
     def exactness(self) -> Exactness:
@@ -61,29 +68,13 @@ class Union(AbstractSdf):
     def distance(self, *x):
         return functools.reduce(minimum, (shape.distance(*x) for shape in self.shapes))
 
-    def bounding_box(self) -> Box:
-        return self.level_box(0.0)
-
     def level_box(self, level) -> Box:
         boxes = [shape.level_box(level) for shape in self.shapes]
         return hull(boxes, jnp.minimum, jnp.maximum)
 
 
-class Intersection(AbstractSdf):
+class Intersection(AbstractCombination):
     """Inside all of `shapes`; the distance is exact inside them."""
-
-    shapes: tuple[AbstractSdf, ...] = eqx.field(converter=tuple)
-
-    def __check_init__(self):
-        check_same_dim("Intersection", self.shapes)
-
-    @property
-    def dim(self) -> int:
-        return self.shapes[0].dim
-
-    @property
-    def lipschitz(self) -> Number:
-        return steepest(*(shape.lipschitz for shape in self.shapes))
 
     @property
     def exactness(self) -> Exactness:
@@ -91,9 +82,6 @@ class Intersection(AbstractSdf):
 
     def distance(self, *x):
         return functools.reduce(maximum, (shape.distance(*x) for shape in self.shapes))
-
-    def bounding_box(self) -> Box:
-        return self.level_box(0.0)
 
     def level_box(self, level) -> Box:
         boxes = [shape.level_box(level) for shape in self.shapes]
@@ -241,20 +229,18 @@ class Chamfer(AbstractBlend):
         return minimum(minimum(a, b), (a + b - k) * math.sqrt(0.5))
 
 
-def _check_blend(shape: "AbstractBlended") -> None:
-    where = type(shape).__name__
-    check_same_dim(where, (shape.first, shape.second))
-    _check.positive(where, "k", shape.k, "m", "Use `|`, `&` or `-` for a sharp edge.")
-
-
 class AbstractBlended(AbstractSdf):
     """Two shapes joined by a blend of width `k` [m]."""
 
-    if TYPE_CHECKING:  # fields that subclasses have, in their own order
-        first: ClassVar[AbstractSdf]
-        second: ClassVar[AbstractSdf]
-        k: ClassVar[Float[Array, ""]]
-        blend: ClassVar[AbstractBlend]
+    first: AbstractSdf
+    second: AbstractSdf
+    k: Float[Array, ""] = eqx.field(converter=real)
+    blend: AbstractBlend = Quadratic()
+
+    def __check_init__(self):
+        where = type(self).__name__
+        check_same_dim(where, (self.first, self.second))
+        _check.positive(where, "k", self.k, "m", "Use `|`, `&` or `-` for a sharp edge.")
 
     @property
     def dim(self) -> int:
@@ -297,14 +283,6 @@ class SmoothUnion(AbstractBlended):
         Quilez, Smooth minimum, 2013, for the polynomial blends.
     """
 
-    first: AbstractSdf
-    second: AbstractSdf
-    k: Float[Array, ""] = eqx.field(converter=real)
-    blend: AbstractBlend = Quadratic()
-
-    def __check_init__(self):
-        _check_blend(self)
-
     def distance(self, *x):
         return self.blend(self.first.distance(*x), self.second.distance(*x), self.k)
 
@@ -317,14 +295,6 @@ class SmoothUnion(AbstractBlended):
 class SmoothIntersection(AbstractBlended):
     """Intersection whose edges are rounded off where the fields differ by less than `k`."""
 
-    first: AbstractSdf
-    second: AbstractSdf
-    k: Float[Array, ""] = eqx.field(converter=real)
-    blend: AbstractBlend = Quadratic()
-
-    def __check_init__(self):
-        _check_blend(self)
-
     def distance(self, *x):
         return -self.blend(-self.first.distance(*x), -self.second.distance(*x), self.k)
 
@@ -335,14 +305,6 @@ class SmoothIntersection(AbstractBlended):
 
 class SmoothDifference(AbstractBlended):
     """`first` without `second`; the edges between them are rounded off over `k` [m]."""
-
-    first: AbstractSdf
-    second: AbstractSdf
-    k: Float[Array, ""] = eqx.field(converter=real)
-    blend: AbstractBlend = Quadratic()
-
-    def __check_init__(self):
-        _check_blend(self)
 
     def distance(self, *x):
         return -self.blend(-self.first.distance(*x), self.second.distance(*x), self.k)

@@ -8,6 +8,7 @@ the box takes over. So one constant holds in the whole space.
 import abc
 import math
 from collections.abc import Callable
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -60,10 +61,7 @@ class Twisted(AbstractSdf):
 
     shape: AbstractSdf
     rate: Float[Array, ""] = eqx.field(converter=real)
-
-    @property
-    def dim(self) -> int:
-        return 3
+    dim: ClassVar[int] = 3
 
     def _domain(self) -> Box:
         lower, upper = self.shape.bounding_box()
@@ -102,6 +100,7 @@ class Tapered(AbstractSdf):
 
     shape: AbstractSdf
     rate: Float[Array, ""] = eqx.field(converter=real)
+    dim: ClassVar[int] = 3
 
     def __check_init__(self):
         lower, upper = self._domain()
@@ -113,10 +112,6 @@ class Tapered(AbstractSdf):
                     f"{float(lower[2]):g} m and {float(upper[2]):g} m, need more than 0. "
                     "Lower `rate`, or cut the shape."
                 )
-
-    @property
-    def dim(self) -> int:
-        return 3
 
     def _domain(self) -> Box:
         lower, upper = self.shape.bounding_box()

@@ -1,7 +1,9 @@
 """Solids from plane shapes, and shapes mirrored, stretched and arranged in a circle."""
 
+import abc
 import functools
 import math
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -29,23 +31,31 @@ from sorojax.sdf.operations.transform import AbstractWrapped, repeat, turned_box
 from sorojax.sdf.shapes.bars import check_direction
 
 
-class Extruded(AbstractSdf):
-    """A plane shape drawn out along z from 0 to `height` [m]."""
+class AbstractFromProfile(AbstractSdf):
+    """A solid made of a plane shape, as steep as it."""
 
     profile: AbstractSdf
+    dim: ClassVar[int] = 3
+
+    @property
+    def lipschitz(self) -> Number:
+        return self.profile.lipschitz
+
+    @abc.abstractmethod
+    def level_box(self, level: Number) -> Box: ...
+
+    def bounding_box(self) -> Box:
+        return self.level_box(0.0)
+
+
+class Extruded(AbstractFromProfile):
+    """A plane shape drawn out along z from 0 to `height` [m]."""
+
     height: Float[Array, ""] = eqx.field(converter=real)
 
     def __check_init__(self):
         _check_plane("extrude", self.profile)
         _check.positive("extrude", "height", self.height, "m", "Give a length above zero.")
-
-    @property
-    def dim(self) -> int:
-        return 3
-
-    @property
-    def lipschitz(self) -> Number:
-        return self.profile.lipschitz
 
     @property
     def exactness(self) -> Exactness:
@@ -56,9 +66,6 @@ class Extruded(AbstractSdf):
         beyond = jnp.where(z >= half, z - self.height, -z)
         return box_distance(across, beyond)
 
-    def bounding_box(self) -> Box:
-        return self.level_box(0.0)
-
     def level_box(self, level) -> Box:
         lower, upper = self.profile.level_box(level)
         zero = jnp.zeros((1,), lower.dtype)
@@ -68,26 +75,17 @@ class Extruded(AbstractSdf):
         )
 
 
-class Revolved(AbstractSdf):
+class Revolved(AbstractFromProfile):
     """A plane shape turned about z: its x is the distance from the axis, its y is z.
 
     What the profile holds at negative x is left out; the distance is exact where the
     profile lies at x >= 0 or is symmetric, and a bound otherwise.
     """
 
-    profile: AbstractSdf
     clear: bool = eqx.field(static=True)
 
     def __check_init__(self):
         _check_plane("revolve", self.profile)
-
-    @property
-    def dim(self) -> int:
-        return 3
-
-    @property
-    def lipschitz(self) -> Number:
-        return self.profile.lipschitz
 
     @property
     def exactness(self) -> Exactness:
@@ -96,9 +94,6 @@ class Revolved(AbstractSdf):
 
     def distance(self, x, y, z):
         return self.profile.distance(norm(x, y), z)
-
-    def bounding_box(self) -> Box:
-        return self.level_box(0.0)
 
     def level_box(self, level) -> Box:
         lower, upper = self.profile.level_box(level)

@@ -1,5 +1,7 @@
 """Bodies along straight lines, in the plane or in space."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -58,6 +60,7 @@ class Slab(AbstractSdf):
     point: Float[Array, " dim"] = eqx.field(converter=real)
     normal: Float[Array, " dim"] = eqx.field(converter=real)
     thickness: Float[Array, ""] = eqx.field(converter=real)
+    exactness: ClassVar[Exactness] = EXACT
 
     def __check_init__(self):
         check_point(self, "point", "normal")
@@ -67,10 +70,6 @@ class Slab(AbstractSdf):
     @property
     def dim(self) -> int:
         return self.point.shape[0]
-
-    @property
-    def exactness(self) -> Exactness:
-        return EXACT
 
     def distance(self, *x):
         return absolute(_height(x, self.point, self.normal)) - self.thickness / 2
@@ -90,19 +89,13 @@ class HalfSpace(AbstractSdf):
 
     point: Float[Array, "3"] = eqx.field(converter=real)
     normal: Float[Array, "3"] = eqx.field(converter=real)
+    dim: ClassVar[int] = 3
+    exactness: ClassVar[Exactness] = EXACT
 
     def __check_init__(self):
         _check.shape("HalfSpace", "point", self.point, (3,), "Give (x, y, z).")
         _check.shape("HalfSpace", "normal", self.normal, (3,), "Give (x, y, z).")
         check_direction("HalfSpace", self.normal)
-
-    @property
-    def dim(self) -> int:
-        return 3
-
-    @property
-    def exactness(self) -> Exactness:
-        return EXACT
 
     def distance(self, *x):
         return _height(x, self.point, self.normal)
@@ -137,6 +130,7 @@ class Strut(AbstractSdf):
     start: Float[Array, " dim"] = eqx.field(converter=real)
     end: Float[Array, " dim"] = eqx.field(converter=real)
     width: Float[Array, ""] = eqx.field(converter=real)
+    exactness: ClassVar[Exactness] = EXACT
 
     def __check_init__(self):
         check_point(self, "start", "end")
@@ -146,10 +140,6 @@ class Strut(AbstractSdf):
     @property
     def dim(self) -> int:
         return self.start.shape[0]
-
-    @property
-    def exactness(self) -> Exactness:
-        return EXACT
 
     def distance(self, *x):
         along, across, length = along_and_across(x, self.start, self.end)
@@ -170,6 +160,7 @@ class Capsule(AbstractSdf):
     start: Float[Array, " dim"] = eqx.field(converter=real)
     end: Float[Array, " dim"] = eqx.field(converter=real)
     radius: Float[Array, ""] = eqx.field(converter=real)
+    exactness: ClassVar[Exactness] = EXACT
 
     def __check_init__(self):
         check_point(self, "start", "end")
@@ -178,10 +169,6 @@ class Capsule(AbstractSdf):
     @property
     def dim(self) -> int:
         return self.start.shape[0]
-
-    @property
-    def exactness(self) -> Exactness:
-        return EXACT
 
     def distance(self, *x):
         a = tuple(self.start[i] for i in range(self.dim))
@@ -222,6 +209,7 @@ class RoundCone(AbstractSdf):
     end: Float[Array, " dim"] = eqx.field(converter=real)
     start_radius: Float[Array, ""] = eqx.field(converter=real)
     end_radius: Float[Array, ""] = eqx.field(converter=real)
+    exactness: ClassVar[Exactness] = EXACT
 
     def __check_init__(self):
         check_point(self, "start", "end")
@@ -238,10 +226,6 @@ class RoundCone(AbstractSdf):
     @property
     def dim(self) -> int:
         return self.start.shape[0]
-
-    @property
-    def exactness(self) -> Exactness:
-        return EXACT
 
     def distance(self, *x):
         along, across, length = along_and_across(x, self.start, self.end)

@@ -6,7 +6,7 @@ changes, and only that piece is differentiated; a tie takes the first.
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -87,6 +87,7 @@ class Polyline(AbstractSdf):
     points: Float[Array, "points dim"] = eqx.field(converter=real)
     width: Float[Array, ""] = eqx.field(converter=real)
     closed: bool = eqx.field(static=True, default=False)
+    exactness: ClassVar[Exactness] = TUBE
 
     def __check_init__(self):
         check_points(self, self.points, 2)
@@ -95,10 +96,6 @@ class Polyline(AbstractSdf):
     @property
     def dim(self) -> int:
         return self.points.shape[1]
-
-    @property
-    def exactness(self) -> Exactness:
-        return TUBE
 
     def distance(self, *x):
         a = self.points
@@ -117,6 +114,7 @@ class Bezier(AbstractSdf):
 
     points: Float[Array, "3 dim"] = eqx.field(converter=real)
     width: Float[Array, ""] = eqx.field(converter=real)
+    exactness: ClassVar[Exactness] = TUBE
 
     def __check_init__(self):
         check_points(self, self.points, 3)
@@ -130,10 +128,6 @@ class Bezier(AbstractSdf):
     @property
     def dim(self) -> int:
         return self.points.shape[1]
-
-    @property
-    def exactness(self) -> Exactness:
-        return TUBE
 
     def distance(self, *x):
         return bezier_distance(self.points, x) - self.width / 2
@@ -149,17 +143,11 @@ class Parabola(AbstractSdf):
     bend: Float[Array, ""] = eqx.field(converter=real)
     half_width: Float[Array, ""] = eqx.field(converter=real)
     width: Float[Array, ""] = eqx.field(converter=real)
+    dim: ClassVar[int] = 2
+    exactness: ClassVar[Exactness] = TUBE
 
     def __check_init__(self):
         check_lengths(self, "half_width", "width")
-
-    @property
-    def dim(self) -> int:
-        return 2
-
-    @property
-    def exactness(self) -> Exactness:
-        return TUBE
 
     def distance(self, x, y):
         return bezier_distance(self._control(), (x, y)) - self.width / 2
@@ -237,17 +225,11 @@ class Helix(AbstractSdf):
     pitch: Float[Array, ""] = eqx.field(converter=real)
     turns: Float[Array, ""] = eqx.field(converter=real)
     width: Float[Array, ""] = eqx.field(converter=real)
+    dim: ClassVar[int] = 3
+    exactness: ClassVar[Exactness] = TUBE
 
     def __check_init__(self):
         check_lengths(self, "radius", "pitch", "turns", "width")
-
-    @property
-    def dim(self) -> int:
-        return 3
-
-    @property
-    def exactness(self) -> Exactness:
-        return TUBE
 
     def distance(self, x, y, z):
         lead, whole = self.pitch / (2 * math.pi), 2 * math.pi
@@ -334,6 +316,7 @@ class Spline(AbstractSdf):
     points: Float[Array, "points dim"] = eqx.field(converter=real)
     width: Float[Array, ""] = eqx.field(converter=real)
     closed: bool = eqx.field(static=True, default=False)
+    exactness: ClassVar[Exactness] = Exactness(outside=True, inside=False)
 
     def __check_init__(self):
         check_points(self, self.points, 3)
@@ -342,10 +325,6 @@ class Spline(AbstractSdf):
     @property
     def dim(self) -> int:
         return self.points.shape[1]
-
-    @property
-    def exactness(self) -> Exactness:
-        return Exactness(outside=True, inside=False)
 
     def _pieces(self) -> tuple[Float[Array, "pieces dim"], ...]:
         """Coefficients of 1, t, t^2, t^3 of every piece, t in [0, 1]."""

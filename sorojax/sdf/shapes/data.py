@@ -6,6 +6,7 @@ import functools
 import itertools
 import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -389,6 +390,7 @@ class HeightMap(AbstractSdf):
     heights: Float[Array, "x y"] = eqx.field(converter=real)
     origin: Float[Array, "2"] = eqx.field(converter=real)
     spacing: Float[Array, "2"] = eqx.field(converter=real)
+    dim: ClassVar[int] = 3
 
     def __check_init__(self):
         _check.shape("HeightMap", "heights", self.heights, (None, None), "Index x first.")
@@ -400,10 +402,6 @@ class HeightMap(AbstractSdf):
                 f"HeightMap: `heights` has shape {self.heights.shape}, need at least 2 nodes "
                 "per axis. Use a HalfSpace for a level plane."
             )
-
-    @property
-    def dim(self) -> int:
-        return 3
 
     @property
     def lipschitz(self) -> Number:

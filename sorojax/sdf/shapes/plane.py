@@ -1,6 +1,7 @@
 """Plane shapes, all with the exact distance as their field."""
 
 import math
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -66,13 +67,8 @@ def _cross(u, v) -> float:
 class AbstractPlaneShape(AbstractSdf):
     """A shape in the plane with an exact distance."""
 
-    @property
-    def dim(self) -> int:
-        return 2
-
-    @property
-    def exactness(self) -> Exactness:
-        return EXACT
+    dim: ClassVar[int] = 2
+    exactness: ClassVar[Exactness] = EXACT
 
 
 class Circle(AbstractPlaneShape):
@@ -378,20 +374,14 @@ class Squircle(AbstractSdf):
 
     radius: Float[Array, ""] = eqx.field(converter=real)
     power: Float[Array, ""] = eqx.field(converter=real)
+    dim: ClassVar[int] = 2
+    exactness: ClassVar[Exactness] = BOUND
 
     def __check_init__(self):
         check_lengths(self, "radius")
         _check.between(
             "Squircle", "power", self.power, 2, math.inf, "", "Use a Circle for power 2."
         )
-
-    @property
-    def dim(self) -> int:
-        return 2
-
-    @property
-    def exactness(self) -> Exactness:
-        return BOUND
 
     def distance(self, x, y):
         # The n-norm has a slope of length 1 or less for n above 2, so this is a bound;

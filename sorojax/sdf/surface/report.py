@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sorojax.sdf.surface.marching import Surface
-from sorojax.sdf.trimesh.rays import crossing_triangles, least_wall
+from sorojax.sdf.trimesh.tree import crossing_triangles, least_wall
 
 
 class SurfaceReport(NamedTuple):

@@ -1,165 +1,347 @@
-"""Figures of meshes and deformed bodies."""
+"""Deformed bodies: equilibria, load paths, motions and vibration modes.
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+Values to colour a body by: fields known by name, functions and arrays.
+"""
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from sorojax import fem
-from sorojax.fem import Path
-from sorojax.mesh import Mesh, boundary_facets
+from sorojax.design import OptimisedShape
+from sorojax.fem import CriticalLoads, CriticalPoint, Modes, Problem
+from sorojax.mesh import cell_areas, cell_volumes
 from sorojax.view import style
-from sorojax.view.draw.states import NodalField, nodal_von_mises
-from sorojax.view.raster.plane import as_path, box, cell_rings, flat_triangles, loops
-from sorojax.view.raster.shell import on_triangles, shell
+from sorojax.view.draw.loads import load_parts, support_parts, wall_parts
+from sorojax.view.draw.meshes import Body
+from sorojax.view.picture import Picture, panels, show_scene
+from sorojax.view.raster.camera import View
+from sorojax.view.raster.scene import (
+    Coloured,
+    Part,
+    Scale,
+    Scene,
+    Surface,
+    joint_extent,
+    readable,
+    robust_scale,
+    short,
+)
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+NodalField = Callable[[Problem, Float[Array, "nodes dim"]], Float[Array, " nodes"]]
+Field = str | NodalField | Float[Any, " values"] | None
 
 
-def show_deformed(
-    path: Path,
-    states: Sequence[int] | None = None,
-    *,
-    field: NodalField | None = None,
-    label: str = "von Mises stress [kPa]",
-    title: str = "",
-) -> "Figure":
-    """Deformed shapes along a load path, one panel each, the rest shape in grey.
+@eqx.filter_jit
+def _nodal_von_mises(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, " nodes"]:
+    """Von Mises stress at the nodes, averaged between cells [kPa]."""
+    return fem.nodal_average(problem, fem.von_mises_stress(problem, u)) / 1e3
 
-    Colours share one scale that ends at the 99.5th percentile of what is shown, so that
-    a peak in a corner does not wash the picture out; the bar says so by an arrow.
+
+@eqx.filter_jit
+def _mean_stress(problem: Problem, u) -> Float[Array, " nodes"]:
+    sigma = fem.cauchy_stress(problem, u)
+    return fem.nodal_average(problem, jnp.trace(sigma, axis1=-2, axis2=-1) / 3)
+
+
+@eqx.filter_jit
+def _largest_stretch(problem: Problem, u) -> Float[Array, " nodes"]:
+    F = fem.deformation_gradient(problem, u)
+    C = jnp.swapaxes(F, -1, -2) @ F
+    return fem.nodal_average(problem, jnp.sqrt(jnp.linalg.eigvalsh(C)[..., -1]))
+
+
+def _energy_density(problem: Problem, u) -> Float[np.ndarray, " cells"]:
+    mesh = problem.mesh
+    size = cell_areas(mesh) if mesh.element.dim == 2 else cell_volumes(mesh)
+    depth = getattr(problem.kinematics, "thickness", 1.0)
+    return np.asarray(fem.strain_energy(problem, u)) / np.asarray(size * depth)
+
+
+_NAMED: dict[str, tuple[str, str, Callable[..., Any]]] = {
+    "von_mises": ("von Mises stress", "Pa", lambda p, u: 1e3 * _nodal_von_mises(p, u)),
+    "pressure": ("mean stress", "Pa", _mean_stress),
+    "displacement": ("displacement", "m", lambda p, u: jnp.sqrt(jnp.sum(u**2, axis=1))),
+    "x": ("displacement along x", "m", lambda p, u: u[:, 0]),
+    "y": ("displacement along y", "m", lambda p, u: u[:, 1]),
+    "z": ("displacement along z", "m", lambda p, u: u[:, 2]),
+    "stretch": ("largest stretch", "-", _largest_stretch),
+    "energy": ("strain energy density", "J/m^3", _energy_density),
+}
+
+
+def evaluate(
+    problem: Problem, u: Float[Array, "nodes dim"], field: Field, label: str = ""
+) -> Coloured | None:
+    """The field of a body at displacement `u` [m].
 
     Args:
-        path: From `fem.solve_path`.
-        states: Which states of the path; six evenly spaced loaded ones if omitted.
-        field: `field(problem, u)` gives the value at every node; von Mises in kPa if
-            omitted.
-        label: Name and unit of the field.
+        problem: The body.
+        u: Displacement of its nodes.
+        field: "von_mises", "pressure" (mean stress, tension positive), "displacement", "x",
+            "y", "z", "stretch", "energy"; `field(problem, u)` or an array, one value per
+            node or per cell; None for no field.
+        label: Name and unit of a function or an array.
+
+    Raises:
+        ValueError: If there is no field of that name.
+    """
+    if field is None:
+        return None
+    if isinstance(field, str):
+        if field not in _NAMED:
+            raise ValueError(
+                f"view: got field={field!r}, need one of {', '.join(_NAMED)}, a function of "
+                "(problem, u), or an array."
+            )
+        name, unit, function = _NAMED[field]
+        return Coloured(np.asarray(function(problem, u)), label or name, "" if label else unit)
+    values = field(problem, u) if callable(field) else field
+    return Coloured(np.asarray(values), label, "")
+
+
+# Deformed bodies: equilibria, load paths, motions and vibration modes
+
+
+_UNITS = {
+    fem.Pressure: "Pa", fem.Traction: "Pa", fem.Force: "N", fem.Tendon: "N", fem.Cable: "m",
+    fem.Gravity: "m/s$^2$", fem.Contact: "m", fem.Torque: "N m", fem.Spring: "m",
+}  # fmt: skip
+_CLEAR = 0.4  # opacity of a body whose walls under pressure are seen through it
+
+
+def show_problem(problem: Problem, *, view: View = "iso", renderer: str = "auto",
+                 title: str = "") -> Picture:  # fmt: skip
+    """The body at rest with its cells, supports and loads."""
+    return show_scene(problem_scene(problem, title), view=view, renderer=renderer)
+
+
+def problem_scene(problem: Problem, title: str = "") -> Scene:
+    """As `show_problem`, before it is drawn."""
+    still = np.zeros(problem.mesh.points.shape)
+    mesh, points, body = problem.mesh, np.asarray(problem.mesh.points), Body(problem.mesh)
+    walls = wall_parts(problem, points) if mesh.element.dim == 3 else []
+    clear = _CLEAR if walls else 1.0
+    skin = Surface(points, body.shell.triangles, wire=body.shell.wire, opacity=clear)
+    parts: list[Part] = [*walls, skin, body.edges(points, style.INK, 0.9)]
+    parts += support_parts(problem, still) + load_parts(problem, still)
+    name = f"{mesh.num_cells} cells {mesh.element.name}, {problem.space.num_dofs} unknowns"
+    return Scene(tuple(parts), title=title or name)
+
+
+def show_solution(
+    solution: Any,
+    *,
+    field: Field = "von_mises",
+    label: str = "",
+    limits: tuple[float, float] | None = None,
+    rest: bool = True,
+    loads: bool = True,
+    wire: bool = False,
+    view: View = "iso",
+    renderer: str = "auto",
+    title: str = "",
+) -> Picture:
+    """An equilibrium: the deformed body, its outline at rest, supports and loads.
+
+    Args:
+        solution: From `fem.solve`.
+        field: What colours it: a name ("von_mises", "pressure", "displacement", "stretch",
+            "energy"), a function of (problem, u), an array per node or cell, or None.
+        label: Name and unit of a function or an array.
+        limits: Ends of the colour scale, in the unit that the bar shows.
+        rest: Draw the outline of the body at rest.
+        loads: Draw supports and loads.
+        wire: Draw the cells.
+        view: Camera of a solid body.
+        renderer: Of a solid body.
         title: Title of the figure.
     """
-    triangles = flat_triangles("show_deformed", path.problem.mesh)
-    field = nodal_von_mises if field is None else field
-    chosen = _chosen_states(path, states)
-    rest = 1e3 * np.asarray(path.problem.mesh.points)
-    shapes = [rest + 1e3 * np.asarray(path.displacements[k]) for k in chosen]
-    colours = [np.asarray(field(path.problem, path.displacements[k])) for k in chosen]
-    low, high, extend = _robust_limits(np.stack(colours))
-    lower, upper = box(rest, *shapes)
-    span = upper - lower
-    figure, panels = _panels(len(chosen), float(span[1] / span[0]))
-    rings = loops(boundary_facets(path.problem.mesh))
-    painted: Any = None
-    for panel, k, points, colour in zip(panels, chosen, shapes, colours, strict=True):
-        _outline(panel, rest, rings, style.GREY, 0.7)
-        paint: Any = panel.tripcolor  # its stub knows no triangles
-        painted = paint(
-            points[:, 0], points[:, 1], triangles, colour,
-            shading="gouraud", cmap=style.FIELD, vmin=low, vmax=high, rasterized=True,
-        )  # fmt: skip
-        _outline(panel, points, rings, style.INK, 0.5)
-        style.dress_plane(panel, lower, upper)
-        panel.set_title(_state_name(path, k), fontsize=style.LABEL, color=style.INK)
-        panel.label_outer()
-    note = "\n(arrow: the highest 0.5 %)" if extend == "max" else ""
-    style.colour_bar(
-        figure, painted, panels, label + note, extend=extend, shrink=0.9, aspect=30, pad=0.02
-    )
-    style.title(figure, title)
-    return figure
+    scene = solution_scene(
+        solution, title, field=field, label=label, limits=limits, rest=rest, loads=loads,
+        wire=wire,
+    )  # fmt: skip
+    return show_scene(scene, view=view, renderer=renderer)
 
 
-def show_mesh(
-    mesh: Mesh,
-    field: Float[Any, " values"] | None = None,
+def solution_scene(solution: Any, title: str = "", **options: Any) -> Scene:
+    """As `show_solution`, before it is drawn."""
+    u = np.asarray(solution.displacement)
+    scene_at, _ = body_scenes([solution.problem], [u], **options)
+    return replace(scene_at(0), title=title)
+
+
+def show_path(
+    path: Any,
     *,
-    label: str = "",
+    states: Sequence[int] | None = None,
+    view: View = "iso",
+    renderer: str = "auto",
     title: str = "",
-) -> "Figure":
-    """The cells of a plane mesh, coloured by a value per node or per cell if given."""
-    from matplotlib.collections import PolyCollection
+    **options: Any,
+) -> Picture:
+    """States along a load path, a continuation or a motion, one panel each, on one scale.
 
-    triangles = flat_triangles("show_mesh", mesh)
-    points = 1e3 * np.asarray(mesh.points)
-    lower, upper = box(points)
-    figure = style.new_figure(9.0, style.height_for(9.0, lower, upper))
-    axes = figure.add_subplot()
-    if field is None:
-        faces = "#e8f1f8"
+    Args:
+        path: From `fem.solve_path`, `fem.volume_path`, `fem.continuation` or `fem.simulate`.
+        states: Which of them; up to six, evenly spaced, if omitted.
+        view: Camera of a solid body.
+        renderer: Of a solid body.
+        title: Title of the figure.
+        **options: As of `show_solution`; supports and loads are left out.
+    """
+    chosen = chosen_states("view.show", len(path), states)
+    moved = np.asarray(path.displacements)
+    problems = [problem_at(path, k) for k in chosen]
+    options = {"loads": False} | options
+    scene_at, _ = body_scenes(problems, moved[chosen], **options)
+    scenes = joint_extent([scene_at(k) for k in range(len(chosen))])
+    names = [state_name(path, k) for k in chosen]
+    return panels(scenes, names, view=view, renderer=renderer, title=title)
+
+
+def show_vibration(
+    modes: Modes, *, share: float = 0.12, view: View = "iso", renderer: str = "auto",
+    title: str = "",
+) -> Picture:  # fmt: skip
+    """Mode shapes, drawn with a largest displacement of `share` of the body, and their
+    frequencies."""
+    base = np.asarray(modes.problem.mesh.points) + np.asarray(modes.displacement)
+    body = Body(modes.problem.mesh)
+    scenes = [body.mode(base, shape, share) for shape in np.asarray(modes.shapes)]
+    names = [f"mode {k + 1}: {_frequency(modes, k)}" for k in range(len(scenes))]
+    return panels(joint_extent(scenes), names, view=view, renderer=renderer, title=title)
+
+
+def show_buckling(
+    found: CriticalLoads | CriticalPoint,
+    *,
+    problem: Problem,
+    share: float = 0.12,
+    view: View = "iso",
+    renderer: str = "auto",
+    title: str = "",
+) -> Picture:
+    """The modes in which a body buckles, with their load factors.
+
+    Args:
+        found: From `fem.critical_loads`, or a point of a `fem.continuation`.
+        problem: The body.
+        share: Largest displacement of a mode, of the size of the body.
+        view: Camera of a solid body.
+        renderer: Of a solid body.
+        title: Title of the figure.
+    """
+    base, body = np.asarray(problem.mesh.points), Body(problem.mesh)
+    if isinstance(found, CriticalPoint):
+        base, shapes = base + np.asarray(found.displacement), np.asarray(found.shape)[None]
+        names = [f"{found.kind} at load factor {float(found.factor):.4g}"]
     else:
-        faces = "none"
-        _paint(figure, axes, mesh, points, triangles, np.asarray(field), label)
-    cells = PolyCollection(
-        list(points[cell_rings(mesh)]), facecolors=faces, edgecolors=style.GREY, linewidths=0.3
-    )
-    axes.add_collection(cells, autolim=False)
-    _outline(axes, points, loops(boundary_facets(mesh)), style.INK, 0.9)
-    style.dress_plane(axes, lower, upper)
-    count = f"{mesh.num_cells} cells {mesh.element.name}, {mesh.num_nodes} nodes"
-    style.title(figure, title or count)
-    return figure
+        shapes = np.asarray(found.shapes)
+        names = [f"mode {k + 1}: load factor {f:.4g}"
+                 for k, f in enumerate(np.asarray(found.factors))]  # fmt: skip
+    if not len(shapes):
+        raise ValueError(
+            "view.show: there is no critical load ahead of the state. Ask for more modes, or "
+            "turn the load round."
+        )
+    scenes = [body.mode(base, shape, share) for shape in shapes]
+    return panels(joint_extent(scenes), names, view=view, renderer=renderer, title=title)
 
 
-def _chosen_states(path: Path, states: Sequence[int] | None) -> list[int]:
-    last = len(path) - 1
+def show_optimised_shape(found: OptimisedShape, *, title: str = "", **options: Any) -> Picture:
+    """The body with the best dimensions; `found.optimised` has the history."""
+    steps = len(np.asarray(found.optimised.history["objective"]))
+    text = f"objective {float(found.objective):.4g} after {steps} steps"
+    return show_problem(found.problem, title=title or text, **options)
+
+
+def body_scenes(
+    problems: Sequence[Problem],
+    moved: Float[np.ndarray, "states nodes dim"] | Sequence[np.ndarray],
+    *,
+    field: Field = "von_mises",
+    label: str = "",
+    limits: tuple[float, float] | None = None,
+    rest: bool = True,
+    loads: bool = True,
+    wire: bool = False,
+) -> tuple[Callable[[int], Scene], Scale | None]:
+    """The scene of each state of a body, made when it is asked for, and the scale of colours
+    of all."""
+    body, points = Body(problems[0].mesh), np.asarray(problems[0].mesh.points)
+    rows = [
+        evaluate(p, jnp.asarray(u), field, label) for p, u in zip(problems, moved, strict=True)
+    ]
+    found = [row for row in rows if row is not None]
+    scale, values = coloured(found, limits) if found else (None, [None] * len(rows))
+
+    def scene(k: int) -> Scene:
+        problem, u = problems[k], moved[k]
+        parts = body.parts(points + u, values[k], rest=points if rest else None, wire=wire)
+        if loads:
+            parts += support_parts(problem, u) + load_parts(problem, u)
+        return Scene(tuple(parts), scale)
+
+    return scene, scale
+
+
+def coloured(
+    rows: list[Coloured], limits: tuple[float, float] | None = None
+) -> tuple[Scale, list[np.ndarray]]:
+    """The values of all states in a readable unit, and the scale that they share."""
+    values, label = readable(rows)
+    return robust_scale(label, values, limits=limits), values
+
+
+def chosen_states(where: str, count: int, states: Sequence[int] | None) -> list[int]:
+    """States to draw: those asked for, or up to six."""
+    if not count:
+        raise ValueError(f"{where}: the path has no state. Look at its status.")
     if states is None:
-        return np.unique(np.round(np.linspace(0, last, 7)).astype(int))[-6:].tolist()
-    wrong = [k for k in states if not -last - 1 <= k <= last]
+        return np.unique(np.round(np.linspace(0, count - 1, 7)).astype(int))[-6:].tolist()
+    wrong = [k for k in states if not -count <= k < count]
     if wrong or not states:
         raise ValueError(
-            f"show_deformed: `states` is {list(states)}, the path has states 0 to {last}. "
-            "Choose one or more of them."
+            f"{where}: `states` is {list(states)}, there are states 0 to {count - 1}. Choose "
+            "one or more of them."
         )
-    return [k % (last + 1) for k in states]
+    return [k % count for k in states]
 
 
-def _robust_limits(colours: np.ndarray) -> tuple[float, float, str]:
-    """Limits of the colour scale and which ends of it are cut."""
-    low, high = float(colours.min()), float(np.percentile(colours, 99.5))
-    if low >= 0:
-        low = 0.0
-    if high <= low:
-        return low, low + 1.0, "neither"
-    return low, high, "max" if colours.max() > high else "neither"
+def problem_at(path: Any, k: int) -> Problem:
+    """The problem with the load of state `k` of a path."""
+    if isinstance(path, fem.VolumePath):
+        return fem.with_load(path.problem, path.name, path.pressures[k])
+    if isinstance(path, fem.Path) or (getattr(path, "name", None) is not None):
+        return fem.with_load(path.problem, path.name, path.values[k])
+    return path.problem
 
 
-def _state_name(path: Path, k: int) -> str:
-    load = next(load for load in path.problem.loads if load.name == path.name)
+def state_name(path: Any, k: int) -> str:
+    """What tells a state from the others: its load, its factor or its time."""
+    if isinstance(path, fem.Motion):
+        return f"{float(path.times[k]):.4g} s"
+    if isinstance(path, fem.VolumePath):
+        pressure = short(float(path.pressures[k]), "Pa")
+        return f"{1e6 * float(path.volumes[k]):.4g} ml at {pressure}"
+    name = getattr(path, "name", None)
     value = np.asarray(path.values[k])
+    if name is None:
+        return f"load factor {float(value):.3g}"
+    load = next(load for load in path.problem.loads if load.name == name)
+    unit = next((u for kind, u in _UNITS.items() if isinstance(load, kind)), "")
     if value.ndim:
-        return f"state {k}"
+        return f"|{name}| = {short(float(np.linalg.norm(value)), unit)}"
     if isinstance(load, fem.Pressure):
-        return f"{float(value) / 1e3:.3g} kPa"
-    return f"{path.name} = {float(value):.3g}"
+        return short(float(value), unit)
+    return f"{name} = {short(float(value), unit)}"
 
 
-def _panels(count: int, aspect: float) -> "tuple[Figure, list[Axes]]":
-    """Small multiples, wide bodies in two columns, others in three."""
-    columns = min(count, 2 if aspect < 0.4 else 3)
-    rows = -(-count // columns)
-    width = 10.0
-    height = 0.7 + rows * (0.35 + aspect * (width - 1.4) / columns)
-    figure = style.new_figure(width, min(height, 12.0))
-    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
-    for spare in grid[count:]:
-        spare.remove()
-    return figure, list(grid[:count])
-
-
-def _outline(axes: "Axes", points: np.ndarray, rings: list, colour: str, width: float) -> None:
-    from matplotlib.patches import PathPatch
-
-    line = PathPatch(as_path(points, rings), fill=False, edgecolor=colour, linewidth=width)
-    axes.add_patch(line)
-
-
-def _paint(figure, axes, mesh: Mesh, points, triangles, field: np.ndarray, label: str) -> None:
-    values, per_node = on_triangles(mesh, shell(mesh), field)
-    options: Any = {"shading": "gouraud"} if per_node else {"facecolors": values}
-    given = (values,) if per_node else ()
-    painted = axes.tripcolor(
-        points[:, 0], points[:, 1], triangles, *given, cmap=style.FIELD, **options
-    )
-    style.colour_bar(figure, painted, axes, label, shrink=0.8, pad=0.02)
+def _frequency(modes: Modes, k: int) -> str:
+    return f"{float(modes.frequencies[k]):.4g} Hz"

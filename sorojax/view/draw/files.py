@@ -11,25 +11,19 @@ from jaxtyping import Float
 
 from sorojax import io
 from sorojax.mesh import Mesh
-from sorojax.view import style
-from sorojax.view.draw.meshes import edge_lines, show_cells
-from sorojax.view.draw.runs import time_plots
+from sorojax.view.draw.bodies import coloured
+from sorojax.view.draw.meshes import Body, show_cells
+from sorojax.view.draw.plots import show_signals
 from sorojax.view.draw.shapes import show_surface
 from sorojax.view.film.film import Film
-from sorojax.view.panels import panels
-from sorojax.view.picture import Picture
+from sorojax.view.picture import Picture, panels, show_scene
 from sorojax.view.raster.camera import View
 from sorojax.view.raster.scene import (
     Coloured,
-    Part,
     Scene,
-    Surface,
     joint_extent,
-    readable,
-    robust_scale,
 )
-from sorojax.view.raster.shell import on_triangles, shell
-from sorojax.view.show import options as drawn_by, show, show_scene
+from sorojax.view.show import options as drawn_by, show
 
 _SURFACES = (".stl", ".obj", ".ply")
 _UNITS = {"von_mises": "Pa", "pressure": "Pa", "displacement": "m", "energy": "J"}
@@ -148,20 +142,12 @@ def _scenes(states: list[_State], wire: bool) -> list[Scene]:
     if states[0].values is not None:
         name = label.replace("_", " ")
         found = [Coloured(state.values, name, _UNITS.get(label, "")) for state in states]
-        rows, text = readable(found)
-        scale = robust_scale(text, rows)
+        scale, rows = coloured(found)
     scenes = []
     for state, row in zip(states, rows, strict=True):
-        mesh, seen = state.mesh, shell(state.mesh)
-        points = np.asarray(mesh.points) + state.moved
-        value = None if row is None else on_triangles(mesh, seen, row)[0]
-        parts: list[Part] = [
-            Surface(points, seen.triangles, values=value, wire=seen.wire if wire else None),
-            edge_lines(mesh, points, colour=style.INK, width=0.7),
-        ]
-        if not np.allclose(state.moved, 0):
-            rest = np.asarray(mesh.points)
-            parts.insert(0, edge_lines(mesh, rest, colour=style.GREY, width=0.8))
+        points = np.asarray(state.mesh.points)
+        rest = None if np.allclose(state.moved, 0) else points
+        parts = Body(state.mesh).parts(points + state.moved, row, rest=rest, wire=wire)
         scenes.append(Scene(tuple(parts), scale))
     return scenes
 
@@ -208,7 +194,7 @@ def _saved(path: Path, title: str, **options: Any) -> Picture:
                          for k in range(rows.shape[1])}  # fmt: skip
     if not groups:
         return _drawn(path, arrays, title, options)
-    return time_plots(time, groups, "", title)
+    return show_signals(time, groups, title=title)
 
 
 def _drawn(path: Path, arrays: dict[str, np.ndarray], title: str, options: dict) -> Picture:

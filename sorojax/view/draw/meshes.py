@@ -1,19 +1,196 @@
-"""Meshes: cells by quality, region, facet set or any field; in the plane and in space."""
+"""Meshes: cells by quality, region, facet set or any field; in the plane and in space.
 
-from typing import Any
+The triangles that cover a mesh, its cells in the plane, its boundary in space, and bodies of
+meshes in any state.
+"""
+
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
-from sorojax.mesh import Mesh, boundary_facets
+from sorojax.mesh import Mesh, PolyN, Quality, Repaired, boundary_facets, valences
+from sorojax.mesh.elements.elements import facet_element
+from sorojax.mesh.mesh import facet_table
 from sorojax.mesh.quality import cell_ratios
 from sorojax.view import style
-from sorojax.view.picture import Picture
+from sorojax.view.picture import Panel, Picture, show_scene
 from sorojax.view.raster.camera import View
 from sorojax.view.raster.plane import loops
 from sorojax.view.raster.scene import Dots, Lines, Part, Scale, Scene, Surface, robust_scale
-from sorojax.view.raster.shell import Shell, on_triangles, outline, shell
-from sorojax.view.show import show_scene
+
+Template = tuple[tuple[tuple[int, int, int], tuple[bool, bool, bool]], ...]
+
+_T, _F = True, False
+_TEMPLATES: dict[str, Template] = {
+    "Tri3": (((0, 1, 2), (_T, _T, _T)),),
+    "Tri6": (
+        ((0, 3, 5), (_T, _F, _T)), ((3, 1, 4), (_T, _T, _F)),
+        ((5, 4, 2), (_F, _T, _T)), ((3, 4, 5), (_F, _F, _F)),
+    ),
+    "Tri7": tuple(((a, b, 6), (_T, _F, _F)) for a, b in
+                  ((0, 3), (3, 1), (1, 4), (4, 2), (2, 5), (5, 0))),
+    "Quad4": (((0, 1, 2), (_T, _T, _F)), ((0, 2, 3), (_F, _T, _T))),
+    "Quad8": (
+        *(((b, k, a), (_T, _T, _F)) for k, a, b in
+          ((0, 4, 7), (1, 5, 4), (2, 6, 5), (3, 7, 6))),
+        ((4, 5, 6), (_F, _F, _F)), ((4, 6, 7), (_F, _F, _F)),
+    ),
+    "Quad9": tuple(((a, b, 8), (_T, _F, _F)) for a, b in
+                   ((0, 4), (4, 1), (1, 5), (5, 2), (2, 6), (6, 3), (3, 7), (7, 0))),
+}  # fmt: skip
+
+
+class Shell(NamedTuple):
+    """What is seen of a mesh.
+
+    Attributes:
+        triangles: Node numbers.
+        cells: The cell that each belongs to.
+        wire: Which sides are sides of cells.
+        facets: Row of `boundary_facets` that each belongs to; empty in the plane.
+    """
+
+    triangles: Int[np.ndarray, "triangles 3"]
+    cells: Int[np.ndarray, " triangles"]
+    wire: Bool[np.ndarray, "triangles 3"]
+    facets: Int[np.ndarray, " triangles"]
+
+
+def shell(mesh: Mesh) -> Shell:
+    """Flat triangles over the cells of a plane mesh or the boundary of a solid one."""
+    if isinstance(mesh.element, PolyN):
+        return _fans(np.asarray(mesh.cells), valences(mesh))
+    if mesh.element.dim == 2:
+        found = _split(mesh.element.name, np.asarray(mesh.cells))
+        return Shell(found[0], found[1], found[2], np.zeros(0, int))
+    table, first, count, _ = facet_table(mesh)
+    outer = np.sort(first[count == 1])
+    element = facet_element(mesh.element)
+    triangles, facets, wire = _split(element.name, table[outer])
+    return Shell(triangles, outer[facets] % mesh.num_cells, wire, facets)
+
+
+def _split(name: str, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Triangles, the row of each, and its drawn sides; the triangles of a row together."""
+    template = _TEMPLATES[name]
+    corners = np.array([part for part, _ in template])
+    sides = np.array([flags for _, flags in template])
+    triangles = rows[:, corners].reshape(-1, 3)
+    owner = np.repeat(np.arange(len(rows)), len(template))
+    return triangles, owner, np.tile(sides, (len(rows), 1))
+
+
+def _fans(cells: np.ndarray, corners: np.ndarray) -> Shell:
+    count = cells.shape[1] - 2
+    middle = np.arange(1, count + 1)
+    triangles = np.stack(
+        [np.repeat(cells[:, :1], count, 1), cells[:, middle], cells[:, middle + 1]], axis=2
+    )
+    real = middle[None] + 1 < corners[:, None]
+    first = np.broadcast_to(middle == 1, real.shape)
+    last = middle[None] + 2 == corners[:, None]
+    wire = np.stack([first, np.ones_like(first), last], axis=2)
+    owner = np.broadcast_to(np.arange(len(cells))[:, None], real.shape)
+    return Shell(triangles[real], owner[real], wire[real], np.zeros(0, int))
+
+
+def outline(mesh: Mesh, angle: float = 30.0) -> Int[np.ndarray, "sides 2"]:
+    """Pairs of nodes that tell the shape: the boundary in the plane; in space the sides of
+    the boundary where it turns by more than `angle` [deg]."""
+    seen = shell(mesh)
+    sides = np.concatenate([seen.triangles[:, [k, (k + 1) % 3]] for k in range(3)])
+    owner = np.tile(np.arange(len(seen.triangles)), 3)
+    keys = np.sort(sides, axis=1) @ np.array([mesh.num_nodes, 1])
+    _, first, number, count = np.unique(
+        keys, return_index=True, return_inverse=True, return_counts=True
+    )
+    if mesh.element.dim == 2:
+        return sides[first[count == 1]]
+    points = np.asarray(mesh.points)
+    a, b, c = (points[seen.triangles[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
+    total = np.zeros((len(first), 3))
+    np.add.at(total, number, normal[owner])
+    # two normals at an angle t add up to 2 cos(t / 2)
+    bent = (count == 2) & (np.linalg.norm(total, axis=1) < 2 * np.cos(np.deg2rad(angle) / 2))
+    return sides[first[bent | (count == 1)]]
+
+
+def on_triangles(mesh: Mesh, seen: Shell, field: np.ndarray) -> np.ndarray:
+    """A field per node as it is, one per cell as one value per triangle.
+
+    Raises:
+        ValueError: If its length is neither.
+    """
+    field = np.asarray(field)
+    if field.shape == (mesh.num_nodes,):
+        return field
+    if field.shape == (mesh.num_cells,):
+        return field[seen.cells]
+    raise ValueError(
+        f"view: `field` has shape {field.shape}, need one value per node, "
+        f"({mesh.num_nodes},), or per cell, ({mesh.num_cells},)."
+    )
+
+
+class Body:
+    """A mesh to be drawn in many states: its triangles and the sides that tell its shape are
+    found once."""
+
+    def __init__(self, mesh: Mesh):
+        self.mesh, self.shell, self.sides = mesh, shell(mesh), outline(mesh)
+
+    def edges(self, points: Float[np.ndarray, "nodes dim"], colour: str, width: float) -> Lines:
+        """The sides, with the nodes at `points` [m]."""
+        sides = self.sides if len(self.sides) else np.zeros((1, 2), int)
+        return Lines(list(points[sides]), colour, width)
+
+    def parts(
+        self,
+        points: Float[np.ndarray, "nodes dim"],
+        values: Float[np.ndarray, " values"] | None = None,
+        *,
+        rest: Float[np.ndarray, "nodes dim"] | None = None,
+        wire: bool = False,
+    ) -> list[Part]:
+        """The body with its nodes at `points` [m], coloured by a value per node or per cell,
+        and its outline at `rest`."""
+        if values is not None:
+            values = on_triangles(self.mesh, self.shell, values)
+        cells = self.shell.wire if wire else None
+        parts: list[Part] = [
+            Surface(points, self.shell.triangles, values=values, wire=cells),
+            self.edges(points, style.INK, 0.7),
+        ]
+        return parts if rest is None else [self.edges(rest, style.GREY, 0.8), *parts]
+
+    def mode(
+        self,
+        base: Float[np.ndarray, "nodes dim"],
+        shape: Float[np.ndarray, "nodes dim"],
+        share: float,
+    ) -> Scene:
+        """A mode about `base` [m], its largest displacement `share` of the body."""
+        moved, amplitude = scaled_mode(base, shape, share)
+        return Scene(tuple(self.parts(base + moved, amplitude, rest=base)), AMPLITUDE)
+
+
+#: The scale of pictures of modes.
+AMPLITUDE = Scale("amplitude [-]", 0.0, 1.0)
+
+
+def scaled_mode(base: np.ndarray, shape: np.ndarray, share: float):
+    """A mode with a largest displacement of `share` of the body, and its amplitude from 0
+    to 1."""
+    length = np.linalg.norm(shape, axis=1)
+    size = float(np.linalg.norm(np.ptp(base, axis=0)))
+    return shape * (share * size / length.max()), length / length.max()
+
+
+# Meshes as pictures: cells by quality, region, facet set or any field
+
 
 _PALE = 0.55  # how far the colours of regions are mixed with white
 
@@ -68,7 +245,7 @@ def mesh_scene(
         field, label = cell_ratios(mesh), label or "shape of the cell [-], 1 is the best"
         limits = (0.0, 1.0) if limits is None else limits
     if field is not None:
-        values, _ = on_triangles(mesh, seen, np.asarray(field))
+        values = on_triangles(mesh, seen, np.asarray(field))
         scale = robust_scale(label, [values], limits=limits)
     plain: list[Part] = [Surface(points, seen.triangles, colour, values, seen.wire)]
     if by == "region":
@@ -90,17 +267,6 @@ def _outlines(mesh: Mesh, points: np.ndarray) -> list[Part]:
         return []
     rings = loops(boundary_facets(mesh))
     return [Lines([points[np.append(ring, ring[0])] for ring in rings], style.INK, 0.9)]
-
-
-def edge_lines(
-    mesh: Mesh, points: np.ndarray, ends: np.ndarray | None = None, **look: Any
-) -> Lines:
-    """The edges that tell the shape of a mesh whose nodes are at `points` [m]; `ends` is
-    `outline(mesh)`, found once for many."""
-    ends = outline(mesh) if ends is None else ends
-    if not len(ends):
-        ends = np.zeros((1, 2), int)
-    return Lines(list(points[ends]), **look)
 
 
 def _regions(mesh: Mesh, seen: Shell, points: np.ndarray) -> list[Part]:
@@ -169,3 +335,25 @@ def _colour(k: int, pale: bool = False) -> str:
 
     colour = np.array(to_rgb(style.COLOURS[k % len(style.COLOURS)]))
     return to_hex(tuple((1 - _PALE) * colour + _PALE if pale else colour))
+
+
+def show_repaired(repaired: Repaired, **options: Any) -> Picture:
+    """The mesh that was repaired; options of a mesh."""
+    return show_cells(repaired.mesh, **options)
+
+
+def show_quality(found: Quality, *, title: str = "") -> Picture:
+    """How many cells have which radius ratio, and the smallest and largest angle."""
+    figure = style.new_figure(6.0, 4.0)
+    axes = figure.add_subplot()
+    counts = np.asarray(found.histogram, float)
+    edges = np.linspace(0, 1, len(counts) + 1)
+    axes.bar(edges[:-1], counts, np.diff(edges), align="edge", color=style.COLOURS[0],
+             edgecolor="white")  # fmt: skip
+    axes.axvline(found.mean_radius_ratio, color=style.COLOURS[1], lw=1.6, label="mean")
+    low, high = np.rad2deg(found.min_angle), np.rad2deg(found.max_angle)
+    text = f"{found.num_cells} cells, angles {low:.1f} to {high:.1f} deg"
+    style.dress(axes, "radius ratio [-]", "cells", title or text)
+    axes.set_xlim(0, 1)
+    style.legend(axes, loc="upper left")
+    return Picture(figure, (Panel(axes),))

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sorojax import rod as R
-from sorojax.rod import Assembly, Rod
+from sorojax.rod import Assembly, Rod, Section
 from sorojax.sdf import AbstractSdf, Surface as Triangles
 from sorojax.view import style
 from sorojax.view.draw.loads import turning
@@ -19,15 +19,16 @@ from sorojax.view.draw.rod_loads import (
     acting,
     contact_parts,
     outlines_of,
+    section_outline,
     size_of,
     thread_parts,
 )
 from sorojax.view.draw.shapes import shape_scene
-from sorojax.view.picture import Picture
+from sorojax.view.picture import Panel, Picture, show_scene
 from sorojax.view.raster.camera import View
 from sorojax.view.raster.glyphs import ball_triangles, tube
 from sorojax.view.raster.scene import Arrows, Dots, Lines, Part, Scene, Surface, short
-from sorojax.view.show import show_scene
+from sorojax.view.rigging.rig import Rig, pose as posed_rig
 
 _ALONG = 9  # arrows of a force per length
 _LENGTH, _RADIUS = 0.2, 0.07  # of the body: the longest arrow, an arc
@@ -283,3 +284,84 @@ def _mixed(share: float) -> str:
     from matplotlib.colors import to_hex, to_rgb
 
     return to_hex(tuple((1 - share) * np.array(to_rgb(style.BODY)) + share))
+
+
+# Bodies of networks and robots, where a search ended, rigs, sections
+
+
+_POSES = 5  # that are drawn of a path
+
+
+def show_body(body: Any, q: Any = None, **options: Any) -> Picture:
+    """The rod or assembly of a block with its forces, at its start; options of `show_rod`."""
+    model = body.rod if hasattr(body, "rod") else body.assembly
+    q = body.q if q is None else q
+    return show_rod(model, q, **({"forces": body.forces} | options))
+
+
+def show_model(model: Any, q: Any = None, **options: Any) -> Picture:
+    """The body of a model of a robot; options of `show_rod`. Its `network` is a diagram."""
+    return show_body(model.network.blocks["body"], q, **options)
+
+
+def show_posed(
+    found: Any, *, model: Rod | Assembly, title: str = "", **options: Any
+) -> Picture:
+    """A rod or an assembly where a search ended: at rest under its forces, or at a target.
+
+    Args:
+        found: From `rod.static_equilibrium`, `rod.inverse_kinematics` or a path of them.
+        model: What was searched.
+        title: Title of the figure; how the search ended if omitted.
+        **options: As of `show_rod`.
+    """
+    q = np.asarray(found.q)
+    if q.ndim == 2 and len(q) > _POSES:
+        q = q[np.unique(np.round(np.linspace(0, len(q) - 1, _POSES)).astype(int))]
+    return show_rod(model, q, title=title or _told(found), **options)
+
+
+def _told(found: Any) -> str:
+    """The error or the load factor that a search ended with."""
+    if hasattr(found, "error"):
+        return f"error {float(found.error):.3g}"
+    factor = np.atleast_1d(np.asarray(getattr(found, "factor", ())))
+    return f"load factor to {float(factor[-1]):.4g}" if factor.size else ""
+
+
+def show_rig(
+    rig: Rig,
+    q: Float[Any, " coordinates"] | None = None,
+    *,
+    view: View = "iso",
+    renderer: str = "auto",
+    title: str = "",
+) -> Picture:
+    """The surface of a rig at coordinates `q`, at rest if omitted."""
+    triangles = np.asarray(rig.triangles)
+    surface = Surface(np.asarray(posed_rig(rig, q)), triangles)
+    text = f"{len(triangles)} triangles on {type(rig.model).__name__.lower()}"
+    return show_scene(Scene((surface,), title=title or text), view=view, renderer=renderer)
+
+
+def show_section(section: Section, *, title: str = "") -> Picture:
+    """A cross-section with its constants; of the middle node if it varies."""
+    outer, hole = section_outline(section)
+    figure = style.new_figure(5.0, 4.4)
+    axes = figure.add_subplot()
+    axes.fill(*(1e3 * outer.T), color=style.BODY, ec=style.INK, lw=1.0)
+    if hole is not None:
+        axes.fill(*(1e3 * hole.T), color="white", ec=style.INK, lw=1.0)
+    style.dress_plane(axes, 1e3 * outer.min(axis=0), 1e3 * outer.max(axis=0),
+                      "local y [mm]", "local z [mm]")  # fmt: skip
+    facts = {"A": (section.area, 1e6, "mm$^2$"),
+             "$I_y$": (section.second_moment_y, 1e12, "mm$^4$"),
+             "$I_z$": (section.second_moment_z, 1e12, "mm$^4$"),
+             "J": (section.torsion_constant, 1e12, "mm$^4$")}  # fmt: skip
+    text = "   ".join(
+        f"{name} {float(np.median(np.asarray(value))) * factor:.4g} {unit}"
+        for name, (value, factor, unit) in facts.items()
+    )
+    axes.set_title(text, fontsize=style.SMALL - 1, color=style.INK)
+    style.title(figure, title)
+    return Picture(figure, (Panel(axes),))

@@ -10,10 +10,9 @@ from sorojax.design import History, Optimised
 from sorojax.mesh import Mesh
 from sorojax.systems import AbstractBlock, Trajectory
 from sorojax.view import style
-from sorojax.view.draw.figures import draw_signals
 from sorojax.view.draw.meshes import mesh_scene
-from sorojax.view.panels import panels
-from sorojax.view.picture import Panel, Picture
+from sorojax.view.draw.plots import show_signals
+from sorojax.view.picture import Panel, Picture, panels
 from sorojax.view.raster.scene import Scale, Scene, Surface
 
 _MOST = 8  # lines in one panel
@@ -63,7 +62,14 @@ def show_trajectory(
             if target in lines:
                 factor = _SHOWN.get(units.get(target) or "", (1.0, ""))[0]
                 lines[f"{source} (reference)"] = factor * np.asarray(known[source])
-    return time_plots(np.asarray(film.time), _named(groups), _ended(film), title)
+    if not groups:
+        raise ValueError(
+            "view.show: the trajectory has no output that is a number or a short vector. Pass "
+            "names= or draw its state yourself."
+        )
+    note = _ended(film)
+    title = f"{title} ({note})" if title and note else title or note
+    return show_signals(film.time, _named(groups), title=title)
 
 
 def _is_drawn(values: Any) -> bool:
@@ -98,30 +104,6 @@ def _ended(film: Trajectory) -> str:
     return f"stopped after {float(film.stats['reached']):.4g} s"
 
 
-def time_plots(
-    time: np.ndarray, groups: Mapping[str, Mapping[str, np.ndarray]], note: str, title: str
-) -> Picture:
-    """One panel per group of signals over one axis of time."""
-    if not groups:
-        raise ValueError(
-            "view.show: the trajectory has no output that is a number or a short vector. Pass "
-            "names= or draw its state yourself."
-        )
-    high = [max(1.6, 0.34 * len(lines)) for lines in groups.values()]
-    figure = style.new_figure(9.0, 0.7 + sum(high))
-    axes = figure.subplots(
-        len(groups), 1, sharex=True, squeeze=False, height_ratios=high
-    ).ravel()
-    for panel, (label, lines) in zip(axes, groups.items(), strict=True):
-        draw_signals(panel, time, label, lines)
-        style.legend(panel, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    axes[-1].set_xlabel("time [s]", fontsize=style.LABEL, color=style.INK)
-    axes[-1].set_xlim(time[0], time[-1])
-    figure.align_ylabels(list(axes))
-    style.title(figure, f"{title} ({note})" if title and note else title or note)
-    return Picture(figure, tuple(Panel(axes) for axes in axes))
-
-
 def show_rollout(film: Any, *, title: str = "") -> Picture:
     """Coordinates of a rod and their rates over time."""
     q, v = np.asarray(film.q), np.asarray(film.v)
@@ -129,7 +111,7 @@ def show_rollout(film: Any, *, title: str = "") -> Picture:
         "coordinates": {f"q[{k}]": q[:, k] for k in range(min(q.shape[1], _MOST))},
         "rates [1/s]": {f"v[{k}]": v[:, k] for k in range(min(v.shape[1], _MOST))},
     }
-    return time_plots(np.asarray(film.time), groups, "", title)
+    return show_signals(film.time, groups, title=title)
 
 
 def show_optimised(

@@ -4,25 +4,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sorojax.sdf import AbstractSdf, Surface as Triangles, contour, isosurface
+from sorojax.sdf import AbstractSdf, Curve, Surface as Triangles, contour, isosurface
 from sorojax.sdf.sampling import finite_box, values
 from sorojax.view import style
-from sorojax.view.picture import Panel, Picture
+from sorojax.view.picture import Panel, Picture, show_scene
 from sorojax.view.raster.camera import View
 from sorojax.view.raster.scene import Lines, Part, Scene, Surface
-from sorojax.view.show import show_scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from sorojax.io import MovingSurface
+
 
 _AXES = {"x": 0, "y": 1, "z": 2}
 
 
-def show_sdf(shape: AbstractSdf, *, resolution: int = 300, title: str = "") -> "Figure":
+def _show_plane(shape: AbstractSdf, resolution: int, title: str) -> Picture:
     """A plane shape: filled contours of its distance and the zero set as a line."""
-    lower, upper = finite_box("show_sdf", shape, 2)
+    lower, upper = finite_box("view.show", shape, 2)
     step = float(np.max(upper - lower)) / resolution
     margin = 0.06 * resolution * step
     ranges = zip(lower - margin, upper + margin + step, strict=True)
@@ -32,11 +33,11 @@ def show_sdf(shape: AbstractSdf, *, resolution: int = 300, title: str = "") -> "
     for run in _runs(shape, step):
         axes.plot(*(1e3 * run).T, color=style.INK, lw=1.5, solid_joinstyle="miter")
     style.dress_plane(axes, 1e3 * lower, 1e3 * upper)
-    return figure
+    return Picture(figure, (Panel(axes),))
 
 
-def show_slice(
-    shape: AbstractSdf, slice: dict[str, float], resolution: int = 300, title: str = ""
+def _show_slice(
+    shape: AbstractSdf, slice: dict[str, float], resolution: int, title: str
 ) -> Picture:
     """The distance of a solid shape in a plane across one axis, with the zero line."""
     if len(slice) != 1 or next(iter(slice)) not in _AXES:
@@ -128,11 +129,10 @@ def show_shape(
         return show_scene(shape_scene(shape, size, title), view=view, renderer=renderer)
     if shape.dim == 3:
         assert slice is not None
-        return show_slice(shape, slice, resolution, title)
+        return _show_slice(shape, slice, resolution, title)
     if filled:
         return show_scene(shape_scene(shape, size, title))
-    figure = show_sdf(shape, resolution=resolution, title=title)
-    return Picture(figure, (Panel(figure.axes[0]),))
+    return _show_plane(shape, resolution, title)
 
 
 def shape_scene(shape: AbstractSdf, size: float | None = None, title: str = "") -> Scene:
@@ -226,3 +226,49 @@ def _filled(shape: AbstractSdf, size: float) -> Surface:
     lower, upper = finite_box("view.show", shape, 2)
     mesh = triangulate(shape, size=max(size, float(np.max(upper - lower)) / 60))
     return Surface(np.asarray(mesh.points), np.asarray(mesh.cells))
+
+
+# Parts, moving surfaces, boundary curves
+
+
+def show_part(part: Any, **options: Any) -> Picture:
+    """A part made of densities, by its shape; options of a shape."""
+    if part.shape.dim == 2:
+        options = {"filled": True} | options
+    return show_shape(part.shape, **options)
+
+
+def show_moving(
+    surface: "MovingSurface",
+    *,
+    frame: int = -1,
+    view: View = "iso",
+    renderer: str = "auto",
+    title: str = "",
+) -> Picture:
+    """A moving surface in one of its frames, the last one if omitted."""
+    points = np.asarray(surface.points)
+    points = points[frame if len(points) > 1 else 0]
+    if surface.poses is not None:
+        pose = np.asarray(surface.poses)[frame]
+        points = points @ pose[:3, :3].T + pose[:3, 3]
+    part = Surface(points, np.asarray(surface.triangles))
+    scene = Scene((part,), title=title or surface.name)
+    return show_scene(scene, view=view, renderer=renderer)
+
+
+def show_curve(curve: Curve, *, title: str = "") -> Picture:
+    """A piece of a boundary with its points; corners are marked."""
+    points = np.asarray(curve.points)
+    lower, upper = 1e3 * points.min(axis=0), 1e3 * points.max(axis=0)
+    figure = style.new_figure(6.0, style.height_for(6.0, lower, upper))
+    axes = figure.add_subplot()
+    line = np.concatenate([points, points[:1]]) if curve.closed else points
+    axes.plot(*(1e3 * line).T, color=style.COLOURS[0], lw=1.6, marker=".", ms=3)
+    axes.plot(*(1e3 * points[np.asarray(curve.corner)]).T, "o", color=style.COLOURS[1], ms=6,
+              label="corners")  # fmt: skip
+    style.dress_plane(axes, lower, upper)
+    if np.any(curve.corner):
+        style.legend(axes, loc="best")
+    style.title(figure, title or f"{len(points)} points")
+    return Picture(figure, (Panel(axes),))

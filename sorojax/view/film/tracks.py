@@ -13,14 +13,11 @@ from sorojax.mesh import Mesh
 from sorojax.rod import Assembly, Rod, Rollout
 from sorojax.sdf import AbstractSdf
 from sorojax.systems import AssemblyBody, Network, RodBody, Trajectory
-from sorojax.view import style
-from sorojax.view.draw.loads import load_parts, support_parts
-from sorojax.view.draw.meshes import edge_lines
+from sorojax.view.draw.bodies import body_scenes, problem_at
+from sorojax.view.draw.meshes import AMPLITUDE, Body, on_triangles, scaled_mode, shell
 from sorojax.view.draw.rods import rod_scene
-from sorojax.view.draw.states import Field, coloured, evaluate, problem_at
 from sorojax.view.film.animation import Track
-from sorojax.view.raster.scene import Part, Scale, Scene, Surface, robust_scale
-from sorojax.view.raster.shell import on_triangles, outline, shell
+from sorojax.view.raster.scene import Scale, Scene, Surface, robust_scale
 
 
 def track_of(result: Any, **options: Any) -> Track:
@@ -55,53 +52,24 @@ def positions_track(
     name: str = "",
 ) -> Track:
     """A film of a mesh whose nodes are at `positions` [m], e.g. a skin or measured points."""
-    seen, sides, moved = shell(mesh), outline(mesh), np.asarray(positions)
+    body, moved = Body(mesh), np.asarray(positions)
     rows = None if field is None else np.asarray(field)
     scale = None if rows is None else robust_scale(label, list(rows), limits=limits)
 
     def scene(k: int) -> Scene:
-        value = None if rows is None else on_triangles(mesh, seen, rows[k])[0]
-        body = Surface(moved[k], seen.triangles, values=value)
-        edges = edge_lines(mesh, moved[k], sides, colour=style.INK, width=0.7)
-        return Scene((body, edges), scale)
+        return Scene(tuple(body.parts(moved[k], None if rows is None else rows[k])), scale)
 
     flat = moved.reshape(-1, moved.shape[-1])
     box = np.nanmin(flat, axis=0), np.nanmax(flat, axis=0)
     return Track(np.asarray(time, float), scene, scale, extent=box, name=name)
 
 
-def _body_track(
-    result: Any,
-    *,
-    field: Field = "von_mises",
-    label: str = "",
-    limits: tuple[float, float] | None = None,
-    rest: bool = True,
-    loads: bool = False,
-    wire: bool = False,
-) -> Track:
+def _body_track(result: Any, *, loads: bool = False, **options: Any) -> Track:
     """A body in motion, or along a load path with the value of the load in the place of
     time."""
-    mesh, moved = result.problem.mesh, np.asarray(result.displacements)
-    points, seen = np.asarray(mesh.points), shell(mesh)
-    rows = [evaluate(problem_at(result, k), moved[k], field, label) for k in range(len(moved))]
-    found = [row for row in rows if row is not None]
-    scale, values = coloured(found, limits) if found else (None, [None] * len(rows))
-    sides = outline(mesh)
-    still = edge_lines(mesh, points, sides, colour=style.GREY, width=0.8)
-
-    def scene(k: int) -> Scene:
-        value, u = values[k], moved[k]
-        on = None if value is None else on_triangles(mesh, seen, value)[0]
-        parts: list[Part] = [still] if rest else []
-        parts.append(Surface(points + u, seen.triangles, values=on,
-                             wire=seen.wire if wire else None))  # fmt: skip
-        parts.append(edge_lines(mesh, points + u, sides, colour=style.INK, width=0.7))
-        if loads:
-            problem = problem_at(result, k)
-            parts += support_parts(problem, u) + load_parts(problem, u)
-        return Scene(tuple(parts), scale)
-
+    points, moved = np.asarray(result.problem.mesh.points), np.asarray(result.displacements)
+    problems = [problem_at(result, k) for k in range(len(moved))]
+    scene, scale = body_scenes(problems, moved, loads=loads, **options)
     flat = np.concatenate([points, (points + moved).reshape(-1, points.shape[1])])
     box = flat.min(axis=0), flat.max(axis=0)
     time, unit = _clock(result)
@@ -115,7 +83,7 @@ def _layout_track(history: History, *, name: str = "") -> Track:
     scale = Scale("density [-]", 0.0, 1.0, colours="Greys")
 
     def scene(k: int) -> Scene:
-        body = Surface(points, seen.triangles, values=on_triangles(mesh, seen, rows[k])[0])
+        body = Surface(points, seen.triangles, values=on_triangles(mesh, seen, rows[k]))
         return Scene((body,), scale)
 
     box = points.min(axis=0), points.max(axis=0)
@@ -144,24 +112,18 @@ def _steps(count: int) -> tuple[np.ndarray, str]:
 
 def _mode_track(modes: Modes, *, mode: int = 0, share: float = 0.12, cycles: int = 2) -> Track:
     """One mode swinging `cycles` times, a second each."""
-    mesh, base = modes.problem.mesh, np.asarray(modes.displacement)
-    points, seen, sides = np.asarray(mesh.points) + base, shell(mesh), outline(mesh)
-    size = float(np.linalg.norm(np.ptp(points, axis=0)))
-    shape = np.asarray(modes.shapes[mode])
-    length = np.linalg.norm(shape, axis=1)
-    swing = shape * (share * size / length.max())
-    scale = Scale("amplitude [-]", 0.0, 1.0)
+    body = Body(modes.problem.mesh)
+    points = np.asarray(modes.problem.mesh.points) + np.asarray(modes.displacement)
+    swing, amplitude = scaled_mode(points, np.asarray(modes.shapes[mode]), share)
     time = np.arange(40 * cycles + 1) / 40
 
     def scene(k: int) -> Scene:
         moved = points + np.sin(2 * np.pi * time[k]) * swing
-        body = Surface(moved, seen.triangles, values=length / length.max())
-        edges = edge_lines(mesh, moved, sides, colour=style.INK, width=0.7)
-        return Scene((body, edges), scale)
+        return Scene(tuple(body.parts(moved, amplitude)), AMPLITUDE)
 
     both = np.concatenate([points + swing, points - swing])
     name = f"mode {mode + 1}: {float(modes.frequencies[mode]):.4g} Hz, slowed down"
-    return Track(time, scene, scale, "", (both.min(axis=0), both.max(axis=0)), name)
+    return Track(time, scene, AMPLITUDE, "", (both.min(axis=0), both.max(axis=0)), name)
 
 
 def _rod_track(

@@ -8,9 +8,10 @@ from jaxtyping import Array, Float, Int
 
 from sorojax import _check
 from sorojax.fem import Motion, Path, Problem, Solution
-from sorojax.mesh import Mesh, boundary_facets
+from sorojax.mesh import Mesh
 from sorojax.sdf import Surface
 from sorojax.view import style
+from sorojax.view.draw.meshes import shell
 from sorojax.view.rigging.rig import Rig, pose
 
 NodalField = Callable[[Problem, Float[Array, "nodes dim"]], Float[Array, " nodes"]]
@@ -153,24 +154,5 @@ def mesh_triangles(
 ) -> tuple[Int[np.ndarray, " nodes"], Int[np.ndarray, "triangles 3"]]:
     """Nodes on the surface of a mesh, and flat triangles of them that face outwards; all
     nodes of a plane mesh."""
-    if mesh.element.dim == 3:
-        facets = boundary_facets(mesh)
-        corners = mesh.element.num_corners
-    else:
-        facets, corners = np.asarray(mesh.cells), mesh.element.num_corners + 1
-    flat = np.concatenate([facets[:, list(t)] for t in _split(facets.shape[1], corners)])
-    flat = flat[(flat[:, 0] != flat[:, 1]) & (flat[:, 1] != flat[:, 2])]
-    nodes, rows = np.unique(flat, return_inverse=True)
+    nodes, rows = np.unique(shell(mesh).triangles, return_inverse=True)
     return nodes, rows.reshape(-1, 3)
-
-
-def _split(count: int, corners: int) -> list[tuple[int, int, int]]:
-    """Flat triangles of a face with `count` nodes, of a cell with `corners` corners."""
-    if corners == 4 and count >= 6:  # triangles with nodes on their sides
-        return [(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)]
-    if corners == 4:
-        return [(0, 1, 2)]
-    if count in (8, 9):
-        middle = [(4, 5, 7), (5, 6, 7)]
-        return [(0, 4, 7), (4, 1, 5), (5, 2, 6), (6, 3, 7), *middle]
-    return [(0, k, k + 1) for k in range(1, count - 1)]

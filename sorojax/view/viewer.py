@@ -1,4 +1,4 @@
-"""The viewer process: `python -m sorojax.view.live_view.viewer SLOTS`, started by `view.live`.
+"""The viewer process: `python -m sorojax.view.viewer SLOTS`, started by `view.live`.
 
 It reads its sink from the standard input, whose end then signals that the process that feeds
 it is gone.
@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from sorojax._cache import enable_compilation_cache
-from sorojax.view.live_view.feed import Slots
-from sorojax.view.live_view.sinks import AbstractSink
+from sorojax.view.live_view import AbstractSink, Slots
 
 _NICE = 5
 

@@ -1,8 +1,8 @@
-"""Figures of modes, backbones and their strains, signals, material fits, and convergence."""
+"""Plots: strain modes, backbones, signals, errors, materials, calibrations, sweeps."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,15 +11,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax._jax.jit import once
-from sorojax.material import AbstractHyperelastic, TensileFit, strain_energy_density
+from sorojax.design import Calibration
+from sorojax.material import (
+    AbstractHyperelastic,
+    TensileFit,
+    strain_energy_density,
+    uniaxial_stress,
+)
 from sorojax.reduction import Backbone
 from sorojax.rod import Rod, StrainBasis, columns, forward_kinematics
 from sorojax.view import style
 from sorojax.view.picture import Panel, Picture
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 Signals = Mapping[str, Mapping[str, Any]]
 
@@ -33,13 +35,13 @@ _SYMBOL = {
 }
 
 
-def show_modes(
+def show_basis(
     basis: StrainBasis,
-    length: float | Float[Array, ""],
     *,
+    length: float | Float[Array, ""] = 1.0,
     energy: Mapping[str, float | Sequence[float]] | None = None,
     title: str = "",
-) -> "Figure":
+) -> Picture:
     """Strain modes along the arc length, one panel per active strain.
 
     Args:
@@ -73,7 +75,7 @@ def show_modes(
     panels[-1].set_xlabel("arc length [mm]", fontsize=style.LABEL, color=style.INK)
     panels[-1].set_xlim(0.0, 1e3 * float(length))
     style.title(figure, title)
-    return figure
+    return Picture(figure, tuple(Panel(panel) for panel in panels))
 
 
 def backbone_errors(
@@ -97,7 +99,7 @@ def show_backbones(
     pressures: Float[Any, " steps"] | None = None,
     bar: float = 1e-3,
     title: str = "",
-) -> "Figure":
+) -> Picture:
     """Backbones of the solid against those of a rod, and the distance between them.
 
     Args:
@@ -136,10 +138,10 @@ def show_backbones(
     style.dress(right, across, "mean position error [mm]", largest)
     right.set_ylim(0.0, 1.12 * max(1e3 * bar, float(error.max())))
     style.title(figure, title)
-    return figure
+    return Picture(figure, (Panel(left), Panel(right)))
 
 
-def show_signals(time: Float[Any, " time"], panels: Signals, *, title: str = "") -> "Figure":
+def show_signals(time: Float[Any, " time"], panels: Signals, *, title: str = "") -> Picture:
     """Signals over time, one panel per entry, what belongs together in one panel.
 
     Args:
@@ -149,21 +151,23 @@ def show_signals(time: Float[Any, " time"], panels: Signals, *, title: str = "")
         title: Title of the figure.
     """
     time = np.asarray(time)
-    figure = style.new_figure(8.5, 0.7 + 2.0 * len(panels))
-    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False).ravel()
+    high = [max(1.6, 0.34 * len(lines)) for lines in panels.values()]
+    figure = style.new_figure(9.0, 0.7 + sum(high))
+    axes = figure.subplots(
+        len(panels), 1, sharex=True, squeeze=False, height_ratios=high
+    ).ravel()
     for panel, (label, signals) in zip(axes, panels.items(), strict=True):
-        draw_signals(panel, time, label, signals)
+        _draw_signals(panel, time, label, signals)
         style.legend(panel, loc="center left", bbox_to_anchor=(1.0, 0.5))
     axes[-1].set_xlabel("time [s]", fontsize=style.LABEL, color=style.INK)
     axes[-1].set_xlim(time[0], time[-1])
     figure.align_ylabels(list(axes))
     style.title(figure, title)
-    return figure
+    return Picture(figure, tuple(Panel(panel) for panel in axes))
 
 
-def draw_signals(axes: Any, time: np.ndarray, label: str, signals: Mapping[str, Any]) -> dict:
-    """Draw one panel and return its lines by name."""
-    lines, styles = {}, style.line_styles(signals)
+def _draw_signals(axes: Any, time: np.ndarray, label: str, signals: Mapping[str, Any]) -> None:
+    styles = style.line_styles(signals)
     for name, values in signals.items():
         values = np.asarray(values)
         if values.shape != time.shape:
@@ -172,57 +176,8 @@ def draw_signals(axes: Any, time: np.ndarray, label: str, signals: Mapping[str, 
                 "Give one number per instant; split vectors into several names."
             )
         above = 3 if styles[name]["color"] == style.REFERENCE else 2
-        (lines[name],) = axes.plot(time, values, label=name, zorder=above, **styles[name])
+        axes.plot(time, values, label=name, zorder=above, **styles[name])
     style.dress(axes, "", label)
-    return lines
-
-
-def show_curve(
-    fit: TensileFit | AbstractHyperelastic,
-    strain: Float[Any, " points"],
-    stress: Float[Any, " points"],
-    *,
-    title: str = "",
-) -> "Figure":
-    """Measured tensile points and the curve of a material, taken as incompressible.
-
-    Args:
-        fit: A fit from `fit_tensile`, or a material.
-        strain: Measured engineering strain [-].
-        stress: Measured engineering stress [Pa].
-        title: Title of the figure.
-    """
-    material = fit.material if isinstance(fit, TensileFit) else fit
-    stretch = 1 + np.asarray(strain, float)
-    low, high = min(1.0, stretch.min()), stretch.max()
-    at = np.linspace(low, high + 0.04 * (high - low), 200)
-    figure = style.new_figure(6.5, 4.2)
-    axes = figure.add_subplot()
-    curve = np.asarray(_tensile_stress(material, jnp.asarray(at)))
-    name = type(material).__name__
-    note = f", rms {fit.rms / 1e3:.3g} kPa" if isinstance(fit, TensileFit) else ""
-    axes.plot(at, curve / 1e3, color=style.COLOURS[0], lw=1.9, label=f"{name}{note}")
-    axes.plot(stretch, np.asarray(stress) / 1e3, "o", color=style.COLOURS[1], ms=6.5,
-              label="measured", zorder=3)  # fmt: skip
-    style.dress(axes, "stretch [-]", "engineering stress [kPa]")
-    axes.set_ylim(bottom=min(0.0, 1.05 * float(np.min(stress)) / 1e3))
-    style.legend(axes, loc="upper left")
-    style.title(figure, title)
-    return figure
-
-
-@eqx.filter_jit
-def _tensile_stress(
-    material: AbstractHyperelastic, stretch: Float[Array, " points"]
-) -> Float[Array, " points"]:
-    """Slope of the energy along isochoric uniaxial stretch [Pa]."""
-
-    def energy(stretch):
-        across = 1 / jnp.sqrt(stretch)
-        F = ((stretch, 0.0, 0.0), (0.0, across, 0.0), (0.0, 0.0, across))
-        return strain_energy_density(material, F)
-
-    return jax.vmap(jax.grad(energy))(stretch)
 
 
 def _percent(share: float) -> str:
@@ -235,7 +190,7 @@ def _percent(share: float) -> str:
 # Snapshots of a backbone: where it is, and how it is strained along its length
 
 
-_MOST = 8  # snapshots that are drawn
+_SNAPSHOTS = 8  # that are drawn
 
 
 def show_snapshots(backbone: Backbone, *, title: str = "") -> Picture:
@@ -254,7 +209,7 @@ def show_snapshots(backbone: Backbone, *, title: str = "") -> Picture:
     name = backbone.names[most]
     figure = style.new_figure(9.0, 3.8)
     left, right = figure.subplots(1, 2, width_ratios=[1.2, 1])
-    shown = np.unique(np.round(np.linspace(0, len(places) - 1, _MOST)).astype(int))
+    shown = np.unique(np.round(np.linspace(0, len(places) - 1, _SNAPSHOTS)).astype(int))
     for k, colour in zip(shown, style.shades(len(shown))[::-1], strict=True):
         left.plot(places[k, :, 0], places[k, :, up], color=colour, lw=2.0)
         right.plot(s, change[k, :, most], color=colour, lw=1.7, label=f"snapshot {k}")
@@ -368,4 +323,177 @@ def _logarithmic(axes: Any, x: str, y: str) -> None:
 def _finished(figure, axes, title: str) -> Picture:
     style.legend(axes, loc="best")
     style.title(figure, title)
+    return Picture(figure, (Panel(axes),))
+
+
+# Materials and their fits, calibrations, sweeps, tracks of markers
+
+
+_PANELS = 9  # of a sweep
+_TINT = "#b8b8b8"  # of markers that were not seen
+
+
+def show_material(
+    material: AbstractHyperelastic,
+    *,
+    stretches: tuple[float, float] = (0.7, 2.0),
+    points: tuple[Sequence[float], Sequence[float]] | None = None,
+    title: str = "",
+) -> Picture:
+    """Engineering stress of a uniaxial test.
+
+    Args:
+        material: A stored energy whose numbers are uniform.
+        stretches: First and last stretch [-].
+        points: Measured engineering strains [-] and stresses [Pa].
+        title: Title of the figure.
+    """
+    stretch = np.linspace(*stretches, 121)
+    stress = np.asarray(uniaxial_stress(material, jnp.asarray(stretch)))
+    return _tensile(material, stretch, stress, points, title)
+
+
+def _tensile(material: AbstractHyperelastic, stretch, stress, points, title: str) -> Picture:
+    """Stress [Pa] over stretch, with measured strains and stresses if given."""
+    figure = style.new_figure(6.5, 4.2)
+    axes = figure.add_subplot()
+    axes.axhline(0.0, color=style.GREY, lw=0.8)
+    axes.plot(stretch, stress / 1e3, color=style.COLOURS[0], lw=1.9,
+              label=type(material).__name__)  # fmt: skip
+    if points is not None:
+        axes.plot(1 + np.asarray(points[0]), np.asarray(points[1]) / 1e3, "o",
+                  color=style.COLOURS[1], ms=6, label="measured")  # fmt: skip
+    style.dress(axes, "stretch [-]", "engineering stress [kPa]")
+    style.legend(axes, loc="upper left")
+    style.title(figure, title)
+    return Picture(figure, (Panel(axes),))
+
+
+def show_fit(
+    fit: TensileFit, *, points: tuple[Any, Any] | None = None, title: str = ""
+) -> Picture:
+    """Stress over stretch of a fitted material, as far as it was fitted and, as in the fit,
+    taken as incompressible.
+
+    Args:
+        fit: From `material.fit_tensile`.
+        points: Measured engineering strains [-] and stresses [Pa].
+        title: Title of the figure; the error of the fit if omitted.
+    """
+    low, high = fit.strain_range
+    text = f"{fit.rms / 1e3:.3g} kPa rms, {100 * fit.relative_rms:.2g} %"
+    stretch = np.linspace(1 + min(low, 0.0), 1 + high, 121)
+    stress = np.asarray(_isochoric_stress(fit.material, jnp.asarray(stretch)))
+    return _tensile(fit.material, stretch, stress, points, title or text)
+
+
+@eqx.filter_jit
+def _isochoric_stress(
+    material: AbstractHyperelastic, stretch: Float[Array, " points"]
+) -> Float[Array, " points"]:
+    """Slope of the energy along isochoric uniaxial stretch [Pa]."""
+
+    def energy(stretch):
+        across = 1 / jnp.sqrt(stretch)
+        F = ((stretch, 0.0, 0.0), (0.0, across, 0.0), (0.0, 0.0, across))
+        return strain_energy_density(material, F)
+
+    return jax.vmap(jax.grad(energy))(stretch)
+
+
+def show_calibration(found: Calibration, *, title: str = "") -> Picture:
+    """Every record beside its prediction, with twice the standard deviation that the
+    parameters leave it; records that were held out have it in their name."""
+    checks = [(check, "") for check in found.experiments]
+    checks += [(check, ", held out") for check in found.held_out]
+    columns = min(len(checks), 3)
+    rows = -(-len(checks) // columns)
+    figure = style.new_figure(max(5.0, 3.6 * columns), 0.5 + 2.7 * rows)
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    for spare in grid[len(checks) :]:
+        spare.remove()
+    for axes, (check, note) in zip(grid, checks, strict=False):
+        predicted, error, wide = (
+            np.ravel(np.asarray(x, float))
+            for x in (check.predicted, check.error, 2 * np.asarray(check.expected))
+        )
+        reading = np.arange(len(predicted))
+        wide = np.broadcast_to(wide, predicted.shape)
+        axes.fill_between(reading, predicted - wide, predicted + wide, alpha=0.2,
+                          color=style.COLOURS[0], lw=0)  # fmt: skip
+        axes.plot(reading, predicted - error, "o", ms=3.5, color=style.COLOURS[1], mew=0,
+                  label="measured")  # fmt: skip
+        axes.plot(reading, predicted, color=style.COLOURS[0], lw=1.6, label="predicted")
+        style.dress(axes, "reading", "", f"{check.name}{note}: {check.rms:.3g} of the noise")
+    style.legend(grid[0], loc="best")
+    style.title(figure, title)
+    return Picture(figure, tuple(Panel(axes) for axes in grid[: len(checks)]))
+
+
+def show_sweep(swept: Any, *, title: str = "") -> Picture:
+    """Results over the number of the design, one panel per name; of arrays their range.
+
+    Args:
+        swept: From `sweep.sweep`.
+        title: Title of the figure.
+    """
+    named = {k: np.asarray(v, float) for k, v in swept.result.items() if _is_number(v)}
+    if not named:
+        raise ValueError(
+            f"view.show: the sweep holds no numbers, but {sorted(swept.result)}. Return arrays "
+            "of numbers from the function."
+        )
+    names = list(named)[:_PANELS]
+    columns = min(len(names), 3)
+    rows = -(-len(names) // columns)
+    figure = style.new_figure(max(5.0, 3.6 * columns), 0.4 + 2.7 * rows)
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    for spare in grid[len(names) :]:
+        spare.remove()
+    for axes, name in zip(grid, names, strict=False):
+        values = named[name].reshape(len(named[name]), -1)
+        design = np.arange(len(values))
+        if values.shape[1] == 1:
+            axes.plot(design, values[:, 0], "o", ms=3.5, mew=0, color=style.COLOURS[0])
+        else:
+            axes.fill_between(design, values.min(1), values.max(1), alpha=0.3, lw=0,
+                              color=style.COLOURS[0])  # fmt: skip
+            axes.plot(design, values.mean(1), color=style.COLOURS[0], lw=1.4)
+        style.dress(axes, "design", "", name)
+    left = len(named) - len(names)
+    more = f", {left} more names" if left else ""
+    style.title(figure, title or f"{len(next(iter(named.values())))} designs{more}")
+    return Picture(figure, tuple(Panel(axes) for axes in grid[: len(names)]))
+
+
+def _is_number(values) -> bool:
+    array = np.asarray(values)
+    return array.ndim > 0 and array.size > 0 and np.issubdtype(array.dtype, np.number)
+
+
+def show_tracks(tracks: Any, *, title: str = "") -> Picture:
+    """Markers where they are or are predicted, with the way of the next frame; grey those that
+    were not seen.
+
+    Args:
+        tracks: From `vision.track`.
+        title: Title of the figure.
+    """
+    figure = style.new_figure(6.0, 5.0)
+    axes = figure.add_subplot()
+    for number, (centre, radius) in enumerate(
+        zip(tracks.discs.centre, tracks.discs.radius, strict=True)
+    ):
+        seen = tracks.unseen[number] == 0
+        colour = style.COLOURS[number % len(style.COLOURS)] if seen else _TINT
+        turn = np.linspace(0, 2 * np.pi, 65)
+        edge = centre + radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        axes.fill(edge[:, 0], edge[:, 1], color=colour, alpha=0.8 if seen else 0.4, lw=0)
+        axes.annotate("", centre + tracks.velocity[number], centre,
+                      arrowprops={"arrowstyle": "->", "color": style.INK})  # fmt: skip
+        axes.text(*centre, str(number), ha="center", va="center", color="white")
+    text = f"{len(tracks.unseen)} markers, {int(np.sum(tracks.stale))} stale"
+    style.dress(axes, "x [px]", "y [px]", title or text)
+    axes.set_aspect("equal")
+    axes.invert_yaxis()  # as in the image
     return Picture(figure, (Panel(axes),))

@@ -1,1 +1,0 @@
-"""Looking at a robot while it runs."""
