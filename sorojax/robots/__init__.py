@@ -21,13 +21,15 @@ from sorojax.robots.locomotion import (
 )
 from sorojax.robots.models.cell import Cell as Cell, unit_cell as unit_cell
 from sorojax.robots.models.models import (
+    bench as bench,
+    model as model,
+    printed_rubber as printed_rubber,
+)
+from sorojax.robots.models.supply import (
     Model as Model,
     Port as Port,
     RodBehindValves as RodBehindValves,
     Supply as Supply,
-    bench as bench,
-    model as model,
-    printed_rubber as printed_rubber,
     rod_stepper as rod_stepper,
     stepper as stepper,
     supplied as supplied,

@@ -20,7 +20,7 @@ from sorojax.math.lie import homogeneous
 from sorojax.math.ode.contact_midpoint import ContactMidpoint
 from sorojax.math.ode.explicit import finite
 from sorojax.math.ode.steppers import AbstractStepper
-from sorojax.robots.models.models import Model
+from sorojax.robots.models.supply import Model
 from sorojax.rod import Assembly, Free, Link, LinkObstacle, Part, Rod, assembly, tip_pose
 from sorojax.rod.forces.loads import Load
 from sorojax.rod.model.assembly import index_of

@@ -45,7 +45,7 @@ _DRAWN_BY = {
     "sorojax.robots.printable.PlanarActuator": ("draw.robots", "show_robot"),
     "sorojax.robots.bellows.PneuNet": ("draw.robots", "show_robot"),
     "sorojax.robots.locomotion.Walker": ("draw.robots", "show_robot"),
-    "sorojax.robots.models.models.Model": ("draw.rods", "show_model"),
+    "sorojax.robots.models.supply.Model": ("draw.rods", "show_model"),
     "sorojax.systems.blocks.rod_body.RodBody": ("draw.rods", "show_body"),
     "sorojax.systems.blocks.rod_body.AssemblyBody": ("draw.rods", "show_body"),
     "sorojax.systems.blocks.block.AbstractBlock": ("draw.networks", "show_network"),
