@@ -8,16 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax.math.lie import SE3
-from sorojax.rod import (
-    Gravity,
-    Operators,
-    Rod,
-    acceleration,
-    chebyshev,
-    circle,
-    motion,
-    rod,
-)
+from sorojax.rod import Gravity, Rod, acceleration, chebyshev, circle, motion, rod
+from sorojax.rod.dynamics.fields import Operators
 from sorojax.units import MPa, mm
 
 LENGTH = 80 * mm

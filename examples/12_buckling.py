@@ -37,8 +37,8 @@ def square(coarser: float) -> mesh.Mesh:
         return coarser * np.minimum(np.minimum(0.3 * mm + 0.12 * neck, corner), 0.85 * mm)
 
     cut = sdf.Rectangle((0, 0), (SIDE / 2, SIDE / 2)) - holes
-    half = mesh.mirrored(mesh.triangulate(cut, size=size, order=2), 0, SIDE / 2)
-    return mesh.mirrored(half, 1, SIDE / 2)
+    half = mesh.mirror(mesh.triangulate(cut, size=size, order=2), 0, SIDE / 2)
+    return mesh.mirror(half, 1, SIDE / 2)
 
 
 def pressed(cells: mesh.Mesh, strain: float) -> fem.Problem:

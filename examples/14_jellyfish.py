@@ -46,7 +46,7 @@ def lay(angle, q):
     ball, skinned = sdf.Sphere(center, RADIUS), sdf.Sphere(center, RADIUS + THICKNESS / 2)
     outer, everywhere = jnp.linspace(0.6, 1.0, 9), jnp.linspace(0.0, 1.0, 49)
     aims = sdf.project(skinned, rod.forward_kinematics(finger, q, outer)[:, :3, 3])
-    clear = rod.Clear(ball, everywhere[1:], THICKNESS / 2)
+    clear = rod.ObstacleConstraint(ball, everywhere[1:], THICKNESS / 2)
     found = rod.inverse_kinematics(finger, rod.Position(aims, outer), q, obstacles=(clear,))
     line = rod.forward_kinematics(finger, found.q, jnp.linspace(0.0, 1.0, 401))[:, :3, 3]
     tip = base[:3, :3] @ line[-1] + base[:3, 3]
@@ -84,7 +84,7 @@ def draw(angles, q, file: Path) -> None:
     }
     palm = sdf.translate(sdf.Cylinder(PALM + 4 * mm, 4 * mm), [0, 0, 2 * mm])
     hand = rod.assembly(sj.SE3(), **fingers)
-    scene = sj.view.joined(
+    scene = sj.view.merge_scenes(
         *(sj.view.scene_of(shape) for shape in (sdf.Sphere(CENTER, RADIUS), palm)),
         sj.view.scene_of(hand, np.asarray(q).ravel()),
     )

@@ -40,9 +40,12 @@ def scene(size):
     """The robot with air and valves, hung over a cylinder on the floor, and the contacts."""
     thing, floor = robots.standing_cylinder(MASS, RADIUS, HEIGHT, FLOOR)
     touch = rod.LinkContact(sj.sdf.Cylinder(RADIUS, HEIGHT), SPINE, GRIP, points=16)
-    contacts = *(rod.Between(f, "cylinder", touch) for f in FINGERS), rod.On("cylinder", floor)
+    contacts = (
+        *(rod.PairForce(f, "cylinder", touch) for f in FINGERS),
+        rod.PartForce("cylinder", floor),
+    )
     made, up = robots.model(robots.Manipulator(), size=size), robots.upside_down(BEAM)
-    return robots.surrounded(made, contacts, mount=up, cylinder=thing), contacts
+    return robots.with_contacts(made, contacts, mount=up, cylinder=thing), contacts
 
 
 def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, float]:
@@ -71,7 +74,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     ))  # fmt: skip
 
     film = robots.replay(whole, valves.states, ("cylinder", "plate"))
-    seen = systems.touching(whole, contacts, film.q, film.v, ["cylinder"])
+    seen = systems.contact_history(whole, contacts, film.q, film.v, ["cylinder"])
     *fingers, floor = np.asarray(seen.overlap).T
     force = np.asarray(seen.effort)[:, : len(fingers), -1].sum(axis=1)  # what lifts it
     thing, plate = film.poses["cylinder"], film.poses["plate"]

@@ -63,17 +63,21 @@ def run(joint, radius, length, depth, mass, command, step, saves):
         young_modulus=1e6, poisson_ratio=0.3, density=2000, nodes=6,
     )  # fmt: skip
     fingers = robots.ring(finger, 4, 37.5 * mm)
-    thing = rod.Part(robots.cylinder(mass, radius, length), joint, offset=robots.below(depth))
+    thing = rod.Part(
+        robots.cylinder(mass, radius, length), joint, offset=robots.pose_below(depth)
+    )
     model = rod.assembly(sj.SE3(), **fingers, thing=thing)
     touch = rod.LinkContact(sj.sdf.Cylinder(radius, length), 6 * mm, GRIP, points=24)
-    touches = tuple(rod.Between(name, "thing", touch) for name in fingers)
-    air = rod.Varying(functools.partial(rod.PointWrench, follower=True), Chambers(*command))
-    own = [rod.On(name, air) for name in fingers]
-    carried = rod.On("thing", rod.Varying(rod.Gravity, table))
+    touches = tuple(rod.PairForce(name, "thing", touch) for name in fingers)
+    air = rod.TimeVaryingForce(
+        functools.partial(rod.PointWrench, follower=True), Chambers(*command)
+    )
+    own = [rod.PartForce(name, air) for name in fingers]
+    carried = rod.PartForce("thing", rod.TimeVaryingForce(rod.Gravity, table))
     q, v = rod.rest(model), jnp.zeros(rod.num_dof(model))
     forces = (rod.Damping(0.03), rod.Gravity(), carried, *own, *touches)
     path = rod.rollout(model, q, v, forces, step=step, saves=saves, stepper=HELD)
-    seen = systems.touching(model, touches, path.q[-50:], path.v[-50:])
+    seen = systems.contact_history(model, touches, path.q[-50:], path.v[-50:])
     return model, path, jnp.mean(jnp.sum(seen.effort[..., -1], axis=1))
 
 

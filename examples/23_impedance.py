@@ -69,7 +69,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
             rod, start, jnp.zeros(6), (lossy, touch, sj.systems.ControlForce(law)),
             step=SAVED / every, saves=round(6.0 / SAVED), every=every, stepper=stepper,
         )  # fmt: skip
-        return path, sj.systems.touching(rod, (touch,), path.q, path.v)
+        return path, sj.systems.contact_history(rod, (touch,), path.q, path.v)
 
     first, seen = run(spring(APPROACH))
     k = int(jnp.argmax(seen.overlap > 0))
@@ -77,7 +77,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     control = spring(switch)
     path, seen = run(control)
 
-    goal, tips, effort = sj.systems.followed(control, path)
+    goal, tips, effort = sj.systems.tracking(control, path)
     off = sj.sdf.project(sj.sdf.offset(solid, HALF), goal) - tips
     off, effort, push = (np.linalg.norm(x, axis=1) for x in (off, effort, seen.push[:, 0]))
     time, asked = np.asarray(path.time), STIFFNESS * np.linalg.norm(goal - tips, axis=1)

@@ -13,15 +13,16 @@ from sorojax._jax import versions as _versions
 
 _versions.check()  # before anything imports JAX
 
-from sorojax import units as units
+from sorojax import units
 from sorojax._arguments import public as _public
-from sorojax._cache import enable_compilation_cache as enable_compilation_cache
-from sorojax._edit import replace as replace
+from sorojax._cache import enable_compilation_cache
+from sorojax._edit import replace
 from sorojax._jax import devices as _devices
-from sorojax._jax.jit import compiled as compiled, jit as jit
-from sorojax._jax.low_latency import enable_low_latency as enable_low_latency
-from sorojax._progress import listen as listen, silent as silent
-from sorojax.math.lie import SE2 as SE2, SE3 as SE3
+from sorojax._jax.jit import compiled, jit
+from sorojax._jax.low_latency import enable_low_latency
+from sorojax._progress import listen, silent
+from sorojax.math.lie import SE2, SE3
+from sorojax.math.status import Status
 
 _devices.leave_out_absent()
 for _name in ("compiled", "jit", "listen"):
@@ -29,28 +30,34 @@ for _name in ("compiled", "jit", "listen"):
 
 __version__ = "0.1.0"
 
-_FLOORS = {
+_FLOORS = (
     "contact", "design", "fem", "io", "material", "math", "mesh", "reduction", "robots", "rod",
     "sdf", "sweep", "systems", "view", "vision",
-}  # fmt: skip
+)  # fmt: skip
+__all__ = [  # noqa: RUF022
+    "SE2", "SE3", "Status", "compiled", "enable_compilation_cache", "enable_low_latency", "jit",
+    "listen", "replace", "silent", "units",
+    "contact", "design", "fem", "io", "material", "math", "mesh", "reduction", "robots", "rod",
+    "sdf", "sweep", "systems", "view", "vision",
+]  # fmt: skip
 
 if TYPE_CHECKING:
     from sorojax import (
-        contact as contact,
-        design as design,
-        fem as fem,
-        io as io,
-        material as material,
-        math as math,
-        mesh as mesh,
-        reduction as reduction,
-        robots as robots,
-        rod as rod,
-        sdf as sdf,
-        sweep as sweep,
-        systems as systems,
-        view as view,
-        vision as vision,
+        contact,
+        design,
+        fem,
+        io,
+        material,
+        math,
+        mesh,
+        reduction,
+        robots,
+        rod,
+        sdf,
+        sweep,
+        systems,
+        view,
+        vision,
     )
 
 
@@ -62,4 +69,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_FLOORS})
+    return sorted([*__all__, "__version__"])

@@ -205,11 +205,13 @@ def _has_constructor(noun: type) -> bool:
 
 
 def check_package(package: str) -> None:
-    """Let the public functions and constructors of a package check their arguments."""
+    """Let the functions and constructors in `__all__` of a package check their arguments, and
+    `dir` of it list these names alone."""
     names = vars(sys.modules[package])
-    for name, value in list(names.items()):
-        if not name.startswith("_"):
-            names[name] = public(package, name, value)
+    names["__dir__"] = lambda: sorted(names["__all__"])
+    for name in names["__all__"]:
+        if name in names:  # the others are imported when they are first asked for
+            names[name] = public(package, name, names[name])
 
 
 def public(package: str, name: str, value: Any) -> Any:

@@ -1,12 +1,16 @@
 """The house: what may import what, what an import costs, how long a file may be."""
 
 import ast
+import importlib
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+
+import sorojax
 
 ROOT = Path(__file__).parent.parent
 CORE, HARDWARE = ROOT / "sorojax", ROOT / "hardware"
@@ -279,3 +283,27 @@ def test_no_module_hides_a_public_name():
         cwd=ROOT, capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert done.stdout == ""
+
+
+def packages() -> list[ModuleType]:
+    names = sorted(path.parent.name for path in CORE.glob("*/__init__.py"))
+    return [
+        importlib.import_module(f"sorojax.{name}") for name in names if name in sorojax.__all__
+    ]
+
+
+def test_a_package_shows_its_public_names_only():
+    for package in packages():
+        assert dir(package) == sorted(package.__all__), package
+        found = [name for name in package.__all__ if not hasattr(package, name)]
+        assert not found, (package, found)
+
+
+def test_a_class_has_one_public_path():
+    paths: dict[type, list[str]] = {}
+    for package in (sorojax, *packages()):
+        for name in package.__all__:
+            value = getattr(package, name)
+            if isinstance(value, type):
+                paths.setdefault(value, []).append(f"{package.__name__}.{name}")
+    assert len(paths) > 200 and not [names for names in paths.values() if len(names) > 1]

@@ -60,7 +60,7 @@ def test_known_parameters_come_back():
     found = fitted(records())
     assert found.status == Status.successful and found.names == ("offset", "rate", "size")
     assert np.allclose(flat(found), [-0.3, 1.5, 2.0], rtol=1e-9)
-    assert found.misfit < 1e-16 and found.freedom == 8 and design.unseen(found) == ()
+    assert found.misfit < 1e-16 and found.freedom == 8 and design.unidentifiable(found) == ()
     assert np.all(np.diff(found.history["misfit"]) < 0)
 
 
@@ -128,14 +128,14 @@ def test_what_no_experiment_sees_is_named():
     with silent():
         found = design.calibrate((truth,), start)
     assert found.status == Status.successful
-    (blind,) = design.unseen(found)
+    (blind,) = design.unidentifiable(found)
     assert np.allclose(list(blind.weights.values()), np.sqrt(0.5)) and "density" in str(blind)
     assert np.all(np.isinf(np.diag(found.covariance))) and np.all(np.isnan(found.correlation))
     assert np.isclose(found.parameters["density"] / found.parameters["modulus"], 0.5)
     scale = design.Experiment(jax.jit(lambda p: p["density"]), 1.0, 0.02)
     with silent():
         both = design.calibrate((truth, scale), start, hold_out=(truth,))
-    assert design.unseen(both) == () and np.isclose(both.parameters["modulus"], 2.0)
+    assert design.unidentifiable(both) == () and np.isclose(both.parameters["modulus"], 2.0)
     assert np.isclose(both.standard_errors["density"], 0.02)
     assert "held out" in str(both) and "modulus" in str(both)
 
@@ -149,7 +149,7 @@ def test_a_record_held_out_is_predicted_with_its_uncertainty():
     rows = np.stack([grad[name] for name in found.names], axis=1)
     assert np.allclose(check.expected, np.sqrt(np.diag(rows @ found.covariance @ rows.T)))
     assert np.isclose(check.rms, np.sqrt(np.mean((check.error / other.noise) ** 2)))
-    assert design.checked(found, (other,))[0].rms == check.rms
+    assert design.validate(found, (other,))[0].rms == check.rms
 
 
 def test_parameters_without_an_answer_are_steps_too_long():

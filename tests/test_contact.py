@@ -8,6 +8,10 @@ import pytest
 
 from benchmarks.cases import fem_contact
 from sorojax import contact, fem, material, mesh, sdf
+from sorojax.contact.broadphase import clearance, far as contact_far
+from sorojax.contact.facet import contacts, gaps as contact_gaps
+from sorojax.contact.friction import no_grip
+from sorojax.contact.swept import passes
 from sorojax.units import mm
 
 LAW = contact.Penalty(2e7, 1e-5)
@@ -54,10 +58,10 @@ def test_points_that_go_through_a_wall_are_seen():
     x, to, sway, seen = (jnp.array(column) for column in zip(*ways, strict=True))
     before = jnp.stack([x, 0 * x], axis=1) * mm
     after = jnp.stack([to, sway], axis=1) * mm
-    assert jnp.array_equal(contact.passes(wall, before, after), seen)
-    assert not jnp.any(contact.passes(wall, before - 1.0, after - 1.0))
+    assert jnp.array_equal(passes(wall, before, after), seen)
+    assert not jnp.any(passes(wall, before - 1.0, after - 1.0))
     hole = sdf.HalfPlane([0.0, 0.0], [1.0, 0.0]) | sdf.HalfPlane([1 * mm, 0.0], [-1.0, 0.0])
-    assert not jnp.any(contact.passes(hole, before[:7], after[:7]) & (x[:7] > -0.5))
+    assert not jnp.any(passes(hole, before[:7], after[:7]) & (x[:7] > -0.5))
 
 
 @pytest.mark.versions
@@ -67,9 +71,9 @@ def test_forces_are_slopes_of_the_energy_and_balance():
     areas, shift = jnp.array([1e-6, 2e-6, 3e-6]), jnp.array([0.0, 1e-5, 0.0])
 
     def energy(points, shift):
-        return jnp.sum(areas * LAW.energy(contact.gaps(ball, points, shift)))
+        return jnp.sum(areas * LAW.energy(contact_gaps(ball, points, shift)))
 
-    found = contact.contacts(LAW, ball, points, areas, shift)
+    found = contacts(LAW, ball, points, areas, shift)
     slope, on_ball = jax.grad(energy, argnums=(0, 1))(points, shift)
     assert jnp.allclose(found.force, -slope, rtol=1e-12, atol=1e-18)
     assert jnp.allclose(found.total, on_ball, rtol=1e-12, atol=1e-18)
@@ -81,11 +85,11 @@ def test_what_is_far_is_never_inside(getkey):
     clouds = 0.03 * jax.random.normal(getkey(), (200, 1, 3)) + 0.004 * jax.random.normal(
         getkey(), (200, 5, 3)
     )
-    skipped = jax.vmap(lambda cloud: contact.far(ball, cloud))(clouds)
+    skipped = jax.vmap(lambda cloud: contact_far(ball, cloud))(clouds)
     assert 0 < jnp.sum(skipped) < 200
     assert jnp.all(jnp.min(ball(clouds), axis=1)[skipped] > 0)
     # nor if it moves by less than what it has room for
-    room = jax.vmap(lambda cloud: contact.clearance(ball, cloud, jnp.array(1e-3)))(clouds)
+    room = jax.vmap(lambda cloud: clearance(ball, cloud, jnp.array(1e-3)))(clouds)
     way = jax.random.normal(getkey(), clouds.shape)
     way = 0.999 * room[:, None, None] * way / jnp.linalg.norm(way, axis=2, keepdims=True)
     assert jnp.any(room > 0)
@@ -93,8 +97,8 @@ def test_what_is_far_is_never_inside(getkey):
     # as large as one value can tell: from the middle of the points, less the farthest of them
     corners = jnp.array([[0.02, 0.03, 0.0], [0.04, 0.05, 0.0]])
     want = jnp.hypot(0.03, 0.04) - 0.01 - 0.01 * jnp.sqrt(2.0)
-    assert jnp.allclose(contact.clearance(ball, corners), want, rtol=1e-12)
-    near = contact.clearance(ball, corners, jnp.array(1e-3))
+    assert jnp.allclose(clearance(ball, corners), want, rtol=1e-12)
+    near = clearance(ball, corners, jnp.array(1e-3))
     assert jnp.allclose(near, want - 1e-3, rtol=1e-12)
 
 
@@ -203,7 +207,7 @@ def test_bad_contacts_are_refused(change, message):
 def test_a_point_without_pressure_has_no_stiffness_where_it_stands():
     """Its slope there is that of free motion, as it is beside that place."""
     law, at = contact.Coulomb(0.5, 2.0**20), jnp.asarray([0.5, 0.25])
-    grip = contact.no_grip(at)
+    grip = no_grip(at)
     for slope in (jax.hessian(law.energy, argnums=1), jax.jacobian(law.traction, argnums=1)):
         assert np.all(np.asarray(slope(grip, at)) == 0)
     pressed = grip._replace(pressure=jnp.asarray(2.0))

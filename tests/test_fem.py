@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import fem, material, mesh
+from sorojax import Status, fem, material, mesh
 from sorojax.fem.assembly import assemble as asm
 from sorojax.fem.equilibrium.linear import linearise, prepare
 from sorojax.mesh import Mesh
@@ -206,7 +206,7 @@ def test_answer_does_not_depend_on_the_load_steps():
 def test_a_path_has_small_residuals_and_needs_few_iterations():
     path = fem.solve_path(_ring(), air=jnp.linspace(0, 20 * kPa, 5))
     steps = [step for stats in path.stats for step in stats.steps]
-    assert path.status == fem.Status.successful and len(path) == 5
+    assert path.status == Status.successful and len(path) == 5
     assert max(step.residual for step in steps) < 1e-8
     assert sum(step.iterations for step in steps) <= 20
     assert all(step.negative_eigenvalues == 0 for step in steps)
@@ -217,7 +217,7 @@ def test_a_load_beyond_reach_keeps_the_last_converged_state():
     with pytest.raises(fem.ConvergenceError, match="no equilibrium beyond") as error:
         fem.solve(problem, max_cuts=2)
     solution = fem.solve(problem, max_cuts=2, throw=False)
-    assert solution.status == fem.Status.not_converged and solution.stats.reason
+    assert solution.status == Status.not_converged and solution.stats.reason
     assert jnp.all(jnp.isfinite(solution.displacement))
     assert jnp.array_equal(error.value.solution.displacement, solution.displacement)
 

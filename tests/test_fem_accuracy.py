@@ -11,6 +11,7 @@ from scipy.optimize import brentq
 from benchmarks import cook, thick
 from benchmarks.manufactured import error, placed
 from sorojax import fem, material, mesh
+from sorojax.fem.assembly.space import Space
 
 BULK = 30.0
 NEO_HOOKEAN, YEOH = (0.5, 0.0, 0.0), (0.5, 0.08, 0.02)
@@ -44,7 +45,7 @@ def _closed_form(coefficients, stretches) -> tuple[np.ndarray, np.ndarray]:
 
 
 @cache
-def _space(solid: bool) -> fem.Space:
+def _space(solid: bool) -> Space:
     return fem.space(CUBE if solid else SHEET)
 
 

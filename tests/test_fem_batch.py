@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from sorojax import fem, material, mesh
+from sorojax import Status, fem, material, mesh
 
 GRID = mesh.rectangle([0, 0], [0.03, 0.01], divisions=(3, 1), order=1)
 PROBLEM = fem.problem(
@@ -53,7 +53,7 @@ def loop():
     """Every lane alone: value, failed, gradients."""
     lanes = [_both(s, p) for s, p in zip(SHEARS, PULLS, strict=True)]
     value = jnp.stack([lane[0][0] for lane in lanes])
-    failed = jnp.stack([lane[0][1] == fem.Status.not_converged for lane in lanes])
+    failed = jnp.stack([lane[0][1] == Status.not_converged for lane in lanes])
     return value, failed, [jnp.stack([lane[1][k] for lane in lanes]) for k in range(2)]
 
 
@@ -61,7 +61,7 @@ def _check_lanes(found, loop):
     (value, status), slopes = found
     wanted, failed, wanted_slopes = loop
     assert jnp.array_equal(failed, FAILS)
-    assert jnp.array_equal(status == fem.Status.not_converged, FAILS)
+    assert jnp.array_equal(status == Status.not_converged, FAILS)
     assert _close(value[~FAILS], wanted[~FAILS])
     for slope, want in zip(slopes, wanted_slopes, strict=True):
         assert _close(slope[~FAILS], want[~FAILS], 1e-8)
@@ -111,7 +111,7 @@ def test_nested_batches_keep_their_axes():
     pulls = jnp.array([1e4, 2e4])
     nested = jax.vmap(jax.vmap(_solve, (None, 0)), (0, None))(SHEARS[:3], pulls)
     assert nested.displacement.shape == (3, 2, *GRID.points.shape)
-    assert len(nested.stats) == 6 and jnp.all(nested.status == fem.Status.successful)
+    assert len(nested.stats) == 6 and jnp.all(nested.status == Status.successful)
     alone = _solve(SHEARS[2], pulls[1]).displacement
     assert _close(nested.displacement[2, 1], alone)
 
@@ -155,7 +155,7 @@ def test_paths_in_a_batch_and_in_one_program():
     lanes = jax.vmap(path)(SHEARS[:2])
     (_, states), slope = jax.jit(jax.value_and_grad(cost, has_aux=True))(SHEARS[1])
     assert _close(lanes.displacements, jnp.stack([a[0][1] for a in alone]))
-    assert (lanes.status == fem.Status.successful).tolist() == [True, True]
+    assert (lanes.status == Status.successful).tolist() == [True, True]
     assert _close(states, alone[1][0][1]) and jnp.allclose(slope, alone[1][1], rtol=1e-8)
 
 
@@ -169,7 +169,7 @@ def test_a_path_that_fails_in_a_batch_is_nan_from_there_on():
     found = jax.vmap(path)(scale)
     finite = jnp.isfinite(found.displacements).all(axis=(2, 3))
     assert finite.tolist() == [[True, True, True], [True, False, False]]
-    assert (found.status == fem.Status.not_converged).tolist() == [False, True]
+    assert (found.status == Status.not_converged).tolist() == [False, True]
 
 
 def test_a_start_may_differ_between_lanes():

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import contact, fem, material, mesh, sdf
+from sorojax import Status, contact, fem, material, mesh, sdf
+from sorojax.contact.friction import Grip, no_grip
 from sorojax.fem.contact.friction import moving
 from sorojax.fem.dynamics.step import StepState
 from sorojax.units import mm
@@ -45,7 +46,7 @@ def test_the_step_of_friction_has_a_potential_and_a_memory():
     key = jax.random.key(0)
     normal = jnp.array([0.6, 0.8])
     anchor, back, position = 1e-5 * jax.random.normal(key, (3, 40, 2))
-    grip = contact.Grip(
+    grip = Grip(
         anchor, jnp.linspace(0, 4e3, 40), jnp.broadcast_to(normal, (40, 2)),
         jnp.linspace(1e8, 0, 40), back,
     )  # fmt: skip
@@ -62,12 +63,12 @@ def test_the_step_of_friction_has_a_potential_and_a_memory():
     before = before - (before @ normal)[:, None] * normal[None]
     together = 1e8 * spring + grip.drag[:, None] * (spring - before)
     assert jnp.allclose(together, -traction, rtol=1e-9, atol=1e-9)
-    rest = contact.Grip(anchor, jnp.full(40, 1e9), grip.normal, 0 * grip.drag, back)
+    rest = Grip(anchor, jnp.full(40, 1e9), grip.normal, 0 * grip.drag, back)
     moved = position - anchor
     assert jnp.allclose(
         LAW.stretch(rest, position), moved - (moved @ normal)[:, None] * normal[None]
     )
-    curvature = jax.hessian(lambda x: jnp.sum(LAW.energy(contact.no_grip(x), x)))(position[0])
+    curvature = jax.hessian(lambda x: jnp.sum(LAW.energy(no_grip(x), x)))(position[0])
     assert jnp.all(curvature == 0)  # nothing of a point that does not touch, NaN neither
 
 
@@ -78,7 +79,7 @@ def pulled(problem, ways, start=None):
         problem = fem.with_load(problem, "pull", jnp.array([1.0, 0.0]) * way)
         u = fem.solve(problem, start=u).displacement
         states.append((problem, u))
-        problem = fem.advanced(problem, u)
+        problem = fem.update_friction(problem, u)
     return states, problem
 
 
@@ -115,7 +116,7 @@ def test_a_moving_obstacle_takes_the_block_along():
         u = fem.solve(problem, start=u).displacement
         top = float(u[np.asarray(problem.loads[1].nodes), 0].mean())
         assert abs(top / min(way, LIMIT) - 1) < 0.01
-        problem = fem.advanced(problem, u)
+        problem = fem.update_friction(problem, u)
 
 
 def test_friction_carries_gradients_through_its_memory():
@@ -136,7 +137,7 @@ def test_friction_carries_gradients_through_its_memory():
         for way in (0.0, 2 * LIMIT, 2 * LIMIT, 0.8 * LIMIT):
             problem = fem.with_load(problem, "pull", jnp.array([1.0, 0.0]) * way)
             u = fem.solve(problem, start=u, newton=tight).displacement
-            problem = fem.advanced(problem, u)
+            problem = fem.update_friction(problem, u)
         return 1e3 * jnp.mean(u[:, 0])
 
     ones = dict.fromkeys(places, jnp.array(1.0))
@@ -161,7 +162,7 @@ def test_offsets_bound_the_overlap_whatever_the_stiffness():
     with pytest.raises(fem.ConvergenceError, match="max_updates"):
         fem.solve_contact(soft, penetration=1e-15, max_updates=1)
     left = fem.solve_contact(soft, penetration=1e-15, max_updates=0, throw=False)
-    assert bool(left.status == fem.Status.not_converged)
+    assert bool(left.status == Status.not_converged)
 
 
 @pytest.mark.parametrize("name", ["friction", "friction_velocity", "friction_stiffness"])
@@ -229,7 +230,7 @@ def test_on_a_slope_a_block_sticks_without_creep_or_slides_as_coulomb_says():
         return fem.simulate(free_block(), 0.2, 2e-3, save=5, gravity=gravity)
 
     held = tilted(0.9975)
-    turns = fem.switching(held, 0.05)
+    turns = fem.contact_switching(held, 0.05)
     assert bool(turns.near[-1]) and not bool(turns.switched[-1])
     assert 0 < float(turns.slip[-1]) < 0.05 and float(turns.gap[-1]) > 0
     speed = np.abs(np.asarray(held.velocities)[-1]).max()
@@ -237,7 +238,7 @@ def test_on_a_slope_a_block_sticks_without_creep_or_slides_as_coulomb_says():
     slid = np.asarray(held.displacements)[:, :, 0].mean(axis=1)
     assert 0 < slid[-1] < 3e-5  # the springs of friction and the shear of the block
     free = tilted(1.05)
-    assert bool(jnp.any(fem.switching(free).switched[1:]))
+    assert bool(jnp.any(fem.contact_switching(free).switched[1:]))
     velocity = np.asarray(free.velocities)[:, :, 0].mean(axis=1)
     steep = 1.05 * np.arctan(FRICTION)
     slope = 9.81 * (np.sin(steep) - FRICTION * np.cos(steep))

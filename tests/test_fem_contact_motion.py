@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import fem, material, mesh, sdf
+from sorojax import Status, fem, material, mesh, sdf
 from sorojax.units import mm
 
 HEIGHT = 11 * mm  # of the centre
@@ -148,7 +148,7 @@ def test_at_a_hundred_metres_per_second_nothing_gets_through_a_wall_of_a_millime
     assert float(motion.velocities[-1, :, 1].mean()) > 50.0  # it has bounced
     # a contact far too soft to hold it stops the run instead
     soft = shot(plate(WALL, 1e9, 1e10), 5e-4, 2.5e-4, throw=False)
-    assert bool(soft.status == fem.Status.not_converged) and risen(soft) < 1e-3
+    assert bool(soft.status == Status.not_converged) and risen(soft) < 1e-3
     assert float((soft.problem.mesh.points + soft.end.displacement)[:, 1].min()) > -1 * mm
 
 

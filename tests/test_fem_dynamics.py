@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import fem, material, mesh
+from sorojax import Status, fem, material, mesh
 from sorojax.fem.equilibrium.linear import linearise, prepare
 from sorojax.fem.equilibrium.newton import Secants
 from sorojax.io.fields import export_fields
@@ -199,7 +199,7 @@ def test_a_step_a_hundred_times_too_large_settles(mode):
     problem = _beam(loads=(fem.Traction(GRID.facet_sets["right"], pull, name="pull"),))
     still = fem.solve(problem).displacement
     motion = fem.simulate(problem, 60 * period, 2 * period)  # a step is 100 fiftieths
-    assert motion.status == fem.Status.successful
+    assert motion.status == Status.successful
     assert float(jnp.max(jnp.abs(motion.displacements))) < 3 * float(jnp.max(jnp.abs(still)))
     np.testing.assert_allclose(motion.displacements[-1], still, atol=1e-2 * np.abs(still).max())
 
@@ -210,7 +210,7 @@ def test_steps_are_cut_where_they_fail_and_grow_again():
         _beam(), 0.05, 0.01, save=2, newton=fem.Newton(max_iterations=2), throw=False,
         pull=lambda t: jnp.stack([0 * t, jnp.where(t > 0.015, 1.5e4, 0.0)]),
     )  # fmt: skip
-    assert motion.status == fem.Status.successful
+    assert motion.status == Status.successful
     assert motion.stats.cuts > 0
     assert motion.stats.steps > 5
     assert float(motion.end.share) <= 1.0
@@ -261,7 +261,7 @@ def test_lanes_have_their_own_status():
     """A lane without a number fails alone; the others are what they are alone."""
     lanes = jnp.stack([THETA, 1.1 * THETA, THETA.at[2].set(jnp.nan)])
     tips, status = jax.vmap(_numbers)(lanes)
-    assert (status == fem.Status.successful).tolist() == [True, True, False]
+    assert (status == Status.successful).tolist() == [True, True, False]
     np.testing.assert_allclose(tips[0], _numbers(THETA)[0], rtol=1e-9)
     np.testing.assert_allclose(tips[1], _numbers(1.1 * THETA)[0], rtol=1e-9)
     assert np.isnan(tips[2])
@@ -269,7 +269,7 @@ def test_lanes_have_their_own_status():
 
 def test_inside_a_trace_it_is_the_same_motion(slope):
     tip, status = jax.jit(_numbers)(THETA)
-    assert status == fem.Status.successful
+    assert status == Status.successful
     np.testing.assert_allclose(tip, _numbers(THETA)[0], rtol=1e-9)
 
 
@@ -331,7 +331,7 @@ def test_a_run_that_fails_says_so():
             _beam(), 0.01, 1e-3, max_cuts=1, newton=fem.Newton(max_iterations=1),
             pull=lambda t: jnp.stack([0 * t, 1e7 * t]),
         )  # fmt: skip
-    assert caught.value.motion.status == fem.Status.not_converged
+    assert caught.value.motion.status == Status.not_converged
 
 
 def test_the_conserving_method_has_no_derivative():

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import fem, material, mesh, sdf
+from sorojax import Status, fem, material, mesh, sdf
 from sorojax.units import mm
 
 GRID = mesh.rectangle([0, 0], [1, 1], divisions=(8, 1), element=mesh.Quad4())
@@ -94,7 +94,7 @@ def beam() -> fem.Problem:
 def dragged_block() -> fem.Problem:
     """A block that is dragged after it was pressed on the floor."""
     pressed = block(shear=0.0)
-    pressed = fem.advanced(pressed, fem.solve(pressed).displacement)
+    pressed = fem.update_friction(pressed, fem.solve(pressed).displacement)
     return fem.with_load(pressed, "weight", jnp.array([8e4, -1e5]))
 
 
@@ -141,7 +141,7 @@ def test_a_trace_goes_the_way_of_the_host(name):
     problem, start = make(), None if start is None else start()
     u, status, counts = told(problem, start)
     traced_u, traced_status, traced_counts = in_trace(problem, start)
-    assert (status == fem.Status.successful) == found == bool(counts[0] == 1.0)
+    assert (status == Status.successful) == found == bool(counts[0] == 1.0)
     assert status == traced_status
     assert traced_counts.tolist() == counts.tolist()
     rounding = 1e-12 * jnp.max(jnp.abs(problem.mesh.points))

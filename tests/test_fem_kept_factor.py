@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import fem, material, mesh
+from sorojax import Status, fem, material, mesh
 from sorojax.fem.equilibrium import newton as kept_factor
 from sorojax.units import MPa, kPa
 
@@ -27,7 +27,7 @@ def pushed(column, values):
     """Displacements of a path, its factorisations, iterations and negative eigenvalues."""
     before = column.space.system.solver.num_factorisations
     path = fem.solve_path(column, push=jnp.asarray(values))
-    assert path.status == fem.Status.successful
+    assert path.status == Status.successful
     steps = [step for stats in path.stats for step in stats.steps]
     return (
         np.asarray(path.displacements),

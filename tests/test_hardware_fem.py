@@ -42,7 +42,7 @@ def tube():
     port = robots.Port(("tube",), gas, -10 * kPa, 50 * kPa)
     # a leak of 2 % a second and a short tube
     supply = robots.Supply(leakage=0.02, tube_volume=2e-6)
-    model = robots.supplied(body, {"tube": port}, supply)
+    model = robots.with_pneumatics(body, {"tube": port}, supply)
     return problem, skin, model, robots.stepper(model, PERIOD, substeps=1)
 
 

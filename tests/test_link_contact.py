@@ -48,7 +48,7 @@ def test_the_force_on_both_is_the_slope_of_the_energy():
         touch = contact.touch(*(R.part_motion(here, k) for k in (0, 1)))
         energy = touch.weights @ law.energy(touch.gap)
         forces = [
-            R.total_force(f, T0, here) for f in ((R.Between("rod", "stone", contact),), ())
+            R.total_force(f, T0, here) for f in ((R.PairForce("rod", "stone", contact),), ())
         ]
         return energy, forces[0] - forces[1]
 
@@ -66,7 +66,9 @@ def test_no_force_comes_from_nowhere():
     @jax.jit
     def push(q, v):
         here = R.motion(pair, q, v)
-        ends = [R.total_force(f, T0, here) for f in ((R.Between("rod", "stone", contact),), ())]
+        ends = [
+            R.total_force(f, T0, here) for f in ((R.PairForce("rod", "stone", contact),), ())
+        ]
         return ends[0] - ends[1]
 
     force = np.asarray(push(q, v))
@@ -89,7 +91,7 @@ def test_a_block_slides_as_far_as_friction_lets_it(stepper):
     contact = R.LinkObstacle(floor, corners, [half, half], LAW)
     block = R.assembly(SE2(), block=R.Part(R.Link(0.05, 1e-5), R.Free()))
     q, v = jnp.array([0.0, 0.0, half]), jnp.array([0.0, speed, 0.0])
-    forces = (R.Gravity(), R.On("block", contact))
+    forces = (R.Gravity(), R.PartForce("block", contact))
     path = R.rollout(block, q, v, forces, step=1e-3, saves=100, stepper=stepper)
     assert float(path.q[-1, 1]) == pytest.approx(speed**2 / (2 * 0.5 * 9.81), rel=0.02)
     sunk = half - np.asarray(path.q)[:, 2]
@@ -108,7 +110,7 @@ def test_one_loop_for_both_solutions_gives_the_same_path(monkeypatch):
     contact = R.LinkObstacle(floor, corners, [half, half], LAW)
     block = R.assembly(SE2(), block=R.Part(R.Link(0.05, 1e-5), R.Free()))
     q, v = jnp.array([0.0, 0.0, 1.2 * half]), jnp.array([0.0, 0.1, 0.0])
-    forces = (R.Gravity(), R.On("block", contact))
+    forces = (R.Gravity(), R.PartForce("block", contact))
 
     def path():
         jax.clear_caches()
@@ -137,11 +139,11 @@ def test_a_varying_wrench_is_the_one_of_the_moment():
     def wrench(t):
         return jnp.stack([0 * t, 0 * t, ramp(t)])
 
-    force = R.Varying(R.TipWrench, wrench)
+    force = R.TimeVaryingForce(R.TipWrench, wrench)
     for t in (0.0, 0.3, 2.0):
         now = jnp.asarray(t)
         assert jnp.array_equal(force(now, here), R.TipWrench(wrench(now))(now, here))
-    assert eqx.tree_equal(force, R.Varying(R.TipWrench, wrench))
+    assert eqx.tree_equal(force, R.TimeVaryingForce(R.TipWrench, wrench))
 
 
 def test_a_screw_is_a_hinge_or_a_slide_and_both():

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import fem, material, mesh
+from sorojax import Status, fem, material, mesh
 from sorojax.fem.checks import rigid_modes
 from sorojax.fem.equilibrium.linear import linearise, prepare
 from sorojax.math.linalg import conjugate_gradient as cg, multigrid as block_rows, sparse
@@ -242,7 +242,7 @@ def test_lanes_in_one_program_that_never_calls_the_host():
     def lanes(problem, pulls):
         def one(pull):
             (_, found), slopes = _slopes(problem, SHEAR, pull)
-            return found.displacement, found.status == fem.Status.successful, slopes
+            return found.displacement, found.status == Status.successful, slopes
 
         return jax.vmap(one)(pulls)
 

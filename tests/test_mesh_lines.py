@@ -21,7 +21,7 @@ def test_a_mesh_and_its_image_are_one(element):
     part = M.Mesh(
         part.points, part.cells, element, part.node_sets, part.facet_sets, {"all": [0]}
     )
-    both = M.mirrored(part, 0, 2.0)
+    both = M.mirror(part, 0, 2.0)
     assert not inside_out(both)
     plane = np.abs(np.asarray(part.points)[:, 0] - 2.0) < 1e-12
     assert both.num_nodes == 2 * part.num_nodes - plane.sum()
@@ -49,9 +49,9 @@ def test_the_image_of_a_cell_is_a_cell_of_the_same_kind():
 def test_a_mesh_across_the_plane_has_no_image():
     part = M.rectangle([0.0, 0.0], [1.0, 1.0], divisions=(2, 2))
     with pytest.raises(ValueError, match="need all of it on one side"):
-        M.mirrored(part, 1, 0.5)
+        M.mirror(part, 1, 0.5)
     with pytest.raises(ValueError, match="got polygons"):
-        M.mirrored(M.Mesh(np.eye(3, 2), [[0, 1, 2]], M.PolyN(3)), 0, 0.0)
+        M.mirror(M.Mesh(np.eye(3, 2), [[0, 1, 2]], M.PolyN(3)), 0, 0.0)
 
 
 @pytest.mark.parametrize("element", [M.Quad8(), M.Tri3(), M.Hex8()])
@@ -71,7 +71,7 @@ def test_cells_lie_between_the_lines(element):
 
 def test_what_is_left_keeps_its_names():
     grid = M.between_lines([0, 1, 2, 3], [0, 1, 2], element=M.Quad4())
-    cut = M.kept(
+    cut = M.submesh(
         grid, M.cells_inside(grid, sdf.Rectangle([0, 0], [3, 2]) - sdf.Circle([2.5, 1.5], 0.3))
     )
     assert cut.num_cells == 5
@@ -79,4 +79,4 @@ def test_what_is_left_keeps_its_names():
     top = np.asarray(cut.points)[np.asarray(cut.node_sets["top"])]
     assert np.all(top[:, 1] == 2) and len(top) == 3
     with pytest.raises(ValueError, match="got no cells"):
-        M.kept(grid, np.array([], int))
+        M.submesh(grid, np.array([], int))

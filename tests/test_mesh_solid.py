@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sorojax import mesh as M, sdf
+from sorojax.mesh.mesh import valences
 from sorojax.mesh.plane.polymesh import is_convex
 
 RING = sdf.Circle([0, 0], 1) - sdf.Circle([0, 0], 0.5)
@@ -41,7 +42,7 @@ def test_voronoi_cells_are_convex_and_fill_the_shape(name, count):
     mesh = M.polymesher(
         shape, count, key=jax.random.key(0), on_step=lambda _, e: errors.append(e)
     )
-    x, cells, valence = np.asarray(mesh.points), np.asarray(mesh.cells), M.valences(mesh)
+    x, cells, valence = np.asarray(mesh.points), np.asarray(mesh.cells), valences(mesh)
     assert all(is_convex(x, c[:n].tolist()) for c, n in zip(cells, valence, strict=True))
     areas = np.asarray(M.cell_areas(mesh))
     outline = M.enclosed_volume(mesh, M.boundary_facets(mesh))

@@ -140,7 +140,7 @@ def test_a_layout_becomes_a_part_that_performs_as_promised(layout, tmp_path):
     made = design.part(grid, density, folds=(design.Mirror(0, 0.0),))
     assert made.volume == pytest.approx(LENGTH * HEIGHT * 0.5, rel=2e-3)
     surface = sdf.isosurface(design.solid(made, 5.0), 0.5, "dual_contouring")
-    report = design.reanalysed(made, stiffness, promised, size=0.8, order=2, surface=surface)
+    report = design.reanalyse(made, stiffness, promised, size=0.8, order=2, surface=surface)
     assert report.ratio == pytest.approx(1.0, abs=0.05)
     assert report.quality.area == pytest.approx(made.volume, rel=2e-3)
     assert report.quality.watertight and report.surface.watertight

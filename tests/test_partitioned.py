@@ -25,7 +25,7 @@ def finger():
         poisson_ratio=0.4, density=1100.0, nodes=6,
     )  # fmt: skip
     body = R.assembly(SE2(), finger=R.Part(rod))
-    forces = (R.Gravity(), R.Damping(0.02), R.On("finger", Bladder()))
+    forces = (R.Gravity(), R.Damping(0.02), R.PartForce("finger", Bladder()))
     kinds = ("volume", "volume_rate", "compliance")
     return systems.Network(
         {"body": systems.AssemblyBody(body, forces), "air": systems.Reservoir(),

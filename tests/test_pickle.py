@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 
 import sorojax as sj
-from sorojax import fem, material, mesh, rod, sdf, sweep, systems
+from sorojax import fem, material, mesh, rod, sdf, systems
 from sorojax._cache import enable_compilation_cache
 from sorojax.fem.dynamics.simulate import MotionError
 from sorojax.math.status import Status
+from sorojax.sweep.sweep import Swept
 
 WAYS = {"pickle": lambda x: pickle.loads(pickle.dumps(x)), "deepcopy": copy.deepcopy}
 FLOORS = sorted(sj._FLOORS)
@@ -109,7 +110,7 @@ def run():
 
 
 def swept():
-    return sweep.Swept({"y": np.arange(3.0)}, ("a",), 1, 0, "0")
+    return Swept({"y": np.arange(3.0)}, ("a",), 1, 0, "0")
 
 
 def fitted():

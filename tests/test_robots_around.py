@@ -53,10 +53,10 @@ def test_what_contacts_did_is_what_they_give():
     model = R.assembly(sj.SE2(), arm=R.Part(finger), ball=link)
     ground = R.ObstacleContact(sdf.HalfPlane([0.0, -0.0045], [0.0, 1.0]), 0.005, law, points=9)
     grip = R.LinkContact(sdf.Circle([0.0, 0.0], 0.0075), 0.005, law, points=9)
-    contacts = R.On("arm", ground), R.Between("arm", "ball", grip)
+    contacts = R.PartForce("arm", ground), R.PairForce("arm", "ball", grip)
     q = jnp.stack([R.rest(model), R.rest(model).at[0].set(2.0)])
     v = jnp.zeros((2, R.num_dof(model))).at[:, -2].set(0.01)
-    seen = systems.touching(model, contacts, q, v)
+    seen = systems.contact_history(model, contacts, q, v)
     assert np.isclose(seen.overlap[0, 0], 0.005 - 0.0045, rtol=1e-9)
     assert np.isclose(seen.overlap[0, 1], 0.0125 - 0.012, rtol=1e-9)
     for k in range(2):
@@ -69,16 +69,16 @@ def test_what_contacts_did_is_what_they_give():
     assert seen.effort[0, 1, -2] < 0 == seen.effort[0, 0, -2]  # friction brakes the ball
     at = {"arm": [0, 1], "ball": [2, 3, 4]}
     for parts in (["ball"], ["arm"], ["ball", "arm"]):
-        some = systems.touching(model, contacts, q, v, parts)
+        some = systems.contact_history(model, contacts, q, v, parts)
         chosen = [k for name in parts for k in at[name]]
         assert np.allclose(some.effort, seen.effort[..., chosen], rtol=0, atol=1e-12)
         assert np.array_equal(some.overlap, seen.overlap)
     with pytest.raises(ValueError, match="there is no part `leg`"):
-        systems.touching(model, contacts, q, v, ["leg"])
+        systems.contact_history(model, contacts, q, v, ["leg"])
     with pytest.raises(ValueError, match=r"got the parts \['arm'\] of a rod"):
-        systems.touching(finger, (ground,), q[:, :2], v[:, :2], ["arm"])
+        systems.contact_history(finger, (ground,), q[:, :2], v[:, :2], ["arm"])
     with pytest.raises(TypeError, match="got a Gravity, need contacts"):
-        systems.touching(model, (R.Gravity(),), q, v)
+        systems.contact_history(model, (R.Gravity(),), q, v)
 
 
 def test_a_pneunet_is_meshed_between_its_lines():

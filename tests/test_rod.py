@@ -20,6 +20,7 @@ from sorojax.math.ode.steppers import (
 )
 from sorojax.math.quadrature import gauss_legendre
 from sorojax.math.status import Status
+from sorojax.rod.model.modes import SampledModes
 
 FINGER = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2000.0)
 DISC = R.circle(6e-3, shear_factor=27 / 28)
@@ -346,7 +347,7 @@ def test_planar_rod_is_the_spatial_one_restricted():
 def test_sampled_modes_reproduce_the_modes_they_sample():
     s = np.linspace(0, 1, 201)
     exact = R.chebyshev(kappa_z=3)
-    sampled = R.StrainBasis({"kappa_z": R.SampledModes(s, exact(s)[0])})
+    sampled = R.StrainBasis({"kappa_z": SampledModes(s, exact(s)[0])})
     assert planar(sampled).nodes == 48
     q, v = drawn_state(3)
     smooth, broken = planar(nodes=24), planar(sampled, nodes=24)
@@ -453,6 +454,6 @@ def test_messages_name_the_remedy():
     with pytest.raises(ValueError, match=r"need \(3\)"):
         R.mass_matrix(planar(), jnp.zeros(2))
     with pytest.raises(ValueError, match="must rise strictly"):
-        R.SampledModes([0.0, 0.5, 0.5], np.zeros((3, 1)))
+        SampledModes([0.0, 0.5, 0.5], np.zeros((3, 1)))
     with pytest.raises(ValueError, match="has 0.5"):
         R.Elastic(1e6, 0.7, 1000.0)

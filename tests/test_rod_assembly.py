@@ -91,7 +91,7 @@ def everything(model, q, v):
     found["momentum"] = R.momentum(model, q, v)
     found["weight"] = R.gravity_force(model, q, DOWN)
     found["elastic"] = R.elastic_force(model, q)
-    moment, pushes = R.motion(model, q, v), (R.On("finger", R.TipWrench(WRENCH)),)
+    moment, pushes = R.motion(model, q, v), (R.PartForce("finger", R.TipWrench(WRENCH)),)
     found["pushed"] = R.total_force(pushes, q[0], moment) - R.total_force((), q[0], moment)
     return found
 
@@ -339,9 +339,9 @@ def test_forces_act_on_the_parts_that_they_name():
     wrench = jnp.array([0.3, 1.0, 2.0])
     cases = {
         "idle": (),
-        "end": (R.On("end", R.TipWrench(wrench)),),
-        "body": (R.On("body", R.TipWrench(wrench)),),
-        "damped": (R.Damping(0.02), R.On("end", R.Damping(0.01))),
+        "end": (R.PartForce("end", R.TipWrench(wrench)),),
+        "body": (R.PartForce("body", R.TipWrench(wrench)),),
+        "damped": (R.Damping(0.02), R.PartForce("end", R.Damping(0.01))),
         "pushed": (R.JointEffort("body", [3.0]),),
         "weight": (R.Gravity(down),),
     }
@@ -382,7 +382,7 @@ def test_pair_forces_pull_against_each_other():
             return jnp.sum((ends[1] - ends[0]) ** 2) / 2
 
         moment = R.motion(model, q)
-        spring = (R.Between("body", "end", Spring()),)
+        spring = (R.PairForce("body", "end", Spring()),)
         force = R.total_force(spring, q[0], moment) - R.total_force((), q[0], moment)
         return force, -jax.grad(energy)(q)
 
@@ -401,7 +401,7 @@ class Bellows(R.AbstractChamber):
 
 def test_an_assembly_is_a_block_of_a_network():
     model, bellows = tree(SE2()), Bellows(jnp.array([2e-8, 1e-8, 0.0]))
-    forces = (R.On("end", bellows), R.Damping(0.01))
+    forces = (R.PartForce("end", bellows), R.Damping(0.01))
     body = S.AssemblyBody(model, forces, driven=("root",))
     wires = {"body.end_pressure": "pump.value", "body.root_effort": "motor.value"}
     blocks = {
@@ -416,7 +416,7 @@ def test_an_assembly_is_a_block_of_a_network():
 
     @jax.jit
     def both(q):
-        bound = (R.On("end", R.Pressurised(bellows, 2e3)), R.Damping(0.01))
+        bound = (R.PartForce("end", R.Pressurised(bellows, 2e3)), R.Damping(0.01))
         bound = (*bound, R.JointEffort("root", [0.01]))
         now = {**state, "body": {"q": q, "v": 0 * q}}
         rate = network.vector_field(0 * q[0], now)["body"]["v"]
@@ -447,7 +447,7 @@ def test_messages_name_the_remedy():
     with pytest.raises(ValueError, match="Wrap it"):
         R.forward_dynamics(model, q, v, (R.TipWrench(jnp.zeros(3)),))
     with pytest.raises(ValueError, match="no part `thumbs`"):
-        R.forward_dynamics(model, q, v, (R.On("thumbs", R.Gravity()),))
+        R.forward_dynamics(model, q, v, (R.PartForce("thumbs", R.Gravity()),))
     with pytest.raises(ValueError, match="see `rest`"):
         R.mass_matrix(model, jnp.zeros(12))
     with pytest.raises(ValueError, match="three moments"):

@@ -17,6 +17,7 @@ from sorojax.math.quadrature import (
     integration_rows,
     interpolation_rows,
 )
+from sorojax.rod.model.modes import Combined, SampledModes
 
 FINGER = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2000.0)
 DISC = R.circle(6e-3)
@@ -46,7 +47,7 @@ BASES = {
     "module": R.functions(kappa_z=Wave(jnp.array(3.0))),
     "sampled": R.StrainBasis(
         {
-            "kappa_z": R.SampledModes(
+            "kappa_z": SampledModes(
                 np.linspace(0, 1, 11), np.linspace(0, 1, 11)[:, None] ** [1, 3]
             )
         }
@@ -55,9 +56,7 @@ BASES = {
 
 
 def kinks(modes):
-    return (
-        R.SampledModes(modes.s, modes.values).s[1:-1] if hasattr(modes, "s") else modes.breaks
-    )
+    return SampledModes(modes.s, modes.values).s[1:-1] if hasattr(modes, "s") else modes.breaks
 
 
 @pytest.mark.parametrize("name", BASES)
@@ -219,7 +218,7 @@ def test_a_taper_does_not_depend_on_the_nodes():
 def test_smooth_modes_of_samples_keep_the_order_of_the_rotations():
     s = np.linspace(0, 1, 41)
     exact = R.chebyshev(kappa_y=3)
-    sampled = R.StrainBasis({"kappa_y": R.SampledModes(s, exact(s)[0])})
+    sampled = R.StrainBasis({"kappa_y": SampledModes(s, exact(s)[0])})
     smooth = R.fitted(sampled, R.Legendre(8))
     rods = [R.rod(SE3(), b, DISC, nodes=16, **FINGER) for b in (exact, smooth)]
     every = jax.jit(lambda q: [R.forward_kinematics(r, q, [0.5, 1.0]) for r in rods])
@@ -259,7 +258,7 @@ def make(basis=None, **options):
         (lambda: R.BSpline((0.5, 0.2)), "need numbers that rise inside"),
         (lambda: R.functions(kappa_z=lambda s: s), r"shape \(3,\), need \(3, 1\)"),
         (lambda: R.orthonormalise(R.functions(kappa_z=[np.sin, np.sin])), "depend on each"),
-        (lambda: R.Combined(R.Legendre(2), np.zeros((3, 1))), r"need \(2, modes\)"),
+        (lambda: Combined(R.Legendre(2), np.zeros((3, 1))), r"need \(2, modes\)"),
         (lambda: make(R.chebyshev(kappa_z=9), nodes=6), "need 9 or more there to tell the 9"),
         (lambda: make(R.piecewise_constant(kappa_z=3), nodes=20), "need a multiple of 3"),
         (lambda: make(nodes=1), "need 3 or more"),

@@ -65,7 +65,7 @@ def dropped(points, q, v):
     rod = R.rod(SE2(), R.chebyshev(kappa_z=2), R.circle(RADIUS), nodes=8, **FINGER)
     body = R.assembly(SE2(), rod=R.Part(rod, R.Free()))
     faces = corner(points)
-    forces = (R.Gravity(), *(R.On("rod", face) for face in faces))
+    forces = (R.Gravity(), *(R.PartForce("rod", face) for face in faces))
     path = R.rollout(body, q, v, forces, step=1e-3, saves=100, every=2)
 
     def report(q, v):
@@ -161,7 +161,7 @@ def test_rods_that_cross_press_against_each_other():
 
         pair, motion = crossed(q)
         plain = R.total_force((), T0, motion)
-        force = R.total_force((R.Between("top", "low", contact),), T0, motion) - plain
+        force = R.total_force((R.PairForce("top", "low", contact),), T0, motion) - plain
         held = R.HeldRod(contact, R.part_motion(motion, 1))
         alone = held(T0, R.part_motion(motion, 0))
         return jax.grad(energy)(q), force, alone

@@ -100,7 +100,7 @@ def test_limits_and_obstacles_hold_at_the_answer():
     def find(x, bound, distance):
         return R.inverse_kinematics(
             FLAT, R.Position(x), limits=(-bound, bound),
-            obstacles=(R.Clear(ball, everywhere, distance),), forces=(),
+            obstacles=(R.ObstacleConstraint(ball, everywhere, distance),), forces=(),
         )  # fmt: skip
 
     goal = jnp.array([0.07, 0.02])
@@ -145,7 +145,10 @@ def test_answers_are_differentiable_and_batched():
     def find(x):
         goal = jnp.stack([x, 0.02 + 0 * x])
         found = R.inverse_kinematics(
-            FLAT, R.Position(goal), obstacles=(R.Clear(ball, everywhere, 3e-3),), forces=()
+            FLAT,
+            R.Position(goal),
+            obstacles=(R.ObstacleConstraint(ball, everywhere, 3e-3),),
+            forces=(),
         )
         return found.q
 
@@ -187,7 +190,9 @@ def test_a_grasp_closes_from_rest_without_penetration():
         skinned = sdf.Sphere(center, 0.04 + skin)
         aims = jax.vmap(lambda p: sdf.project(skinned, p))(hanging)
         found = R.inverse_kinematics(
-            ARM, R.Position(aims[8:], s[8:]), obstacles=(R.Clear(jellyfish, s[1:], skin + sag),)
+            ARM,
+            R.Position(aims[8:], s[8:]),
+            obstacles=(R.ObstacleConstraint(jellyfish, s[1:], skin + sag),),
         )
         fine = R.forward_kinematics(ARM, found.q, jnp.linspace(0.0, 1.0, 200))[:, :3, 3]
         return found, jax.vmap(jellyfish)(fine), jax.vmap(jellyfish)(hanging)

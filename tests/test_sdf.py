@@ -8,6 +8,7 @@ import pytest
 
 import sorojax as sj
 from sorojax import sdf
+from sorojax.sdf.operations.booleans import Intersection, Union
 
 SQUARE = sdf.Rectangle([-1, -1], [1, 1])
 SHAPES = [
@@ -206,5 +207,5 @@ def test_messages_name_the_remedy():
 
 def test_a_combination_of_one_shape_is_that_shape():
     ball = sdf.Sphere([0.0, 0.0, 0.0], 1.0)
-    for both in (sdf.Intersection((ball,)), sdf.Union((ball,))):
+    for both in (Intersection((ball,)), Union((ball,))):
         assert both.dim == 3 and both(jnp.zeros(3)) == -1.0

@@ -62,7 +62,7 @@ def stacked(**options) -> fem.Problem:
         divisions=(4, 2),
         element=mesh.Quad4(),
     )
-    both = mesh.joined(low=low, high=high)
+    both = mesh.merge(low=low, high=high)
     facets, nodes = both.facet_sets, both.node_sets
     return fem.problem(
         both,
@@ -136,14 +136,16 @@ def test_contact_of_bodies_carries_gradients():
 def test_lists_follow_the_motion():
     problem = stacked(reach=1 * mm)
     rest = jnp.zeros_like(problem.mesh.points)
-    assert fem.updated(problem, rest) is problem
+    assert fem.update_contact_pairs(problem, rest) is problem
     moved = rest.at[problem.mesh.node_sets["high"], 0].set(9 * mm)
-    slid = fem.updated(problem, moved)
+    slid = fem.update_contact_pairs(problem, moved)
     pairs = [
         np.asarray(p.loads[1].partners)[np.asarray(p.loads[1].real)] for p in (problem, slid)
     ]
     assert pairs[1].size < pairs[0].size
-    far = fem.updated(problem, rest.at[problem.mesh.node_sets["high"], 1].set(9 * mm))
+    far = fem.update_contact_pairs(
+        problem, rest.at[problem.mesh.node_sets["high"], 1].set(9 * mm)
+    )
     assert not bool(jnp.any(far.loads[1].real))
     pressed = moved.at[problem.mesh.node_sets["high"], 1].set(-0.2 * mm)
     state = fem.contact_state(slid, pressed, "touch")
@@ -151,7 +153,7 @@ def test_lists_follow_the_motion():
     assert np.allclose(state.gap[state.active], -0.1 * mm, rtol=1e-9)
     prepare(slid)  # the tangent has room for the new pairs
     with pytest.raises(ValueError, match="concrete"):
-        jax.jit(lambda u: fem.updated(problem, u).loads[1].partners)(rest)
+        jax.jit(lambda u: fem.update_contact_pairs(problem, u).loads[1].partners)(rest)
 
 
 def test_the_back_of_a_wall_is_no_partner_but_its_neighbour_is():
@@ -180,7 +182,7 @@ def test_lists_follow_a_motion():
     high = mesh.rectangle(
         [0, 3.05 * mm], [4 * mm, 6.05 * mm], divisions=(2, 1), element=mesh.Quad4()
     )
-    both = mesh.joined(low=low, high=high)
+    both = mesh.merge(low=low, high=high)
     facets, nodes = both.facet_sets, both.node_sets
     touch = fem.SelfContact(facets["low.top"], facets["high.bottom"], reach=2 * mm)
     rubber = material.neo_hookean(young_modulus=YOUNG, poisson_ratio=0.0, density=1000.0)
@@ -241,4 +243,4 @@ def test_bodies_of_different_cells_are_not_joined():
     quads = mesh.rectangle([0, 0], [1.0, 1.0], divisions=(1, 1), element=mesh.Quad4())
     tris = mesh.rectangle([0, 0], [1.0, 1.0], divisions=(1, 1), element=mesh.Tri3())
     with pytest.raises(ValueError, match="one kind of cells"):
-        mesh.joined(a=quads, b=tris)
+        mesh.merge(a=quads, b=tris)

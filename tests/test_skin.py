@@ -8,6 +8,7 @@ import pytest
 from sorojax import rod as R, sdf, view
 from sorojax.math.lie import SE2, SE3, homogeneous, rotation_columns
 from sorojax.view.rigging import modifiers
+from sorojax.view.rigging.rig import placed
 
 LENGTH = 0.06
 RUBBER = {"young_modulus": 1e5, "poisson_ratio": 0.49, "density": 1e3}
@@ -180,12 +181,12 @@ def test_bodies_are_placed_by_quaternions():
     points, where = rng.normal(size=(5, 3)), rng.normal(size=(4, 3))
     q = rng.normal(size=(4, 4))
     q /= np.linalg.norm(q, axis=1, keepdims=True)
-    moved = view.placed(points, where, q)
+    moved = placed(points, where, q)
     for k in range(4):
         R_k = np.stack([np.array(c) for c in rotation_columns(tuple(q[k]))], axis=1)
         assert np.allclose(moved[k], points @ R_k.T + where[k], rtol=0, atol=1e-14)
-    assert np.allclose(view.placed(points, where[0], q[0]), moved[0], rtol=0, atol=1e-15)
-    assert np.allclose(view.placed(points, where), points + where[:, None], rtol=0, atol=1e-15)
+    assert np.allclose(placed(points, where[0], q[0]), moved[0], rtol=0, atol=1e-15)
+    assert np.allclose(placed(points, where), points + where[:, None], rtol=0, atol=1e-15)
 
 
 BAR = np.stack(np.meshgrid(np.linspace(0, 1, 9), [-0.1, 0.1], [-0.1, 0.1]), -1).reshape(-1, 3)

@@ -12,6 +12,9 @@ import sorojax as sj
 from sorojax import design, fem, mesh, robots, rod, systems, vision
 from sorojax.design.pneunet import body, body_of
 from sorojax.math.status import Status
+from sorojax.robots.models.supply import Model
+from sorojax.robots.surroundings import InContact
+from sorojax.rod.dynamics.rollout import Rollout
 from sorojax.units import kPa, mm
 from sorojax_hardware import SimulatedClock, run_loop, simulated_board
 from sorojax_hardware.protocols import Image
@@ -24,7 +27,7 @@ BEAM = rod.rod(
 
 
 def test_poses_of_what_hangs():
-    assert np.allclose(robots.below(0.2) @ jnp.array([0, 0, 0, 1.0]), [0, 0, -0.2, 1])
+    assert np.allclose(robots.pose_below(0.2) @ jnp.array([0, 0, 0, 1.0]), [0, 0, -0.2, 1])
     turned = robots.upside_down(0.3) @ jnp.array([0.1, 0.2, 0.05, 1.0])
     assert np.allclose(turned, [0.1, -0.2, 0.25, 1])
 
@@ -33,10 +36,10 @@ def test_a_robot_hangs_over_a_cylinder():
     link = robots.cylinder(0.1, 10 * mm, 20 * mm)
     own = rod.assembly(sj.SE3(), arm=rod.Part(link), hand=rod.Part(link, on="arm"))
     network = systems.Network({"body": systems.AssemblyBody(own)}, {}, ())
-    model = robots.Model(network, (), (), [], [])
+    model = Model(network, (), (), [], [])
     thing, floor = robots.standing_cylinder(0.05, 20 * mm, 40 * mm, LAW)
-    made = robots.surrounded(
-        model, (rod.On("thing", floor),), mount=robots.upside_down(0.3), thing=thing
+    made = robots.with_contacts(
+        model, (rod.PartForce("thing", floor),), mount=robots.upside_down(0.3), thing=thing
     )
     whole = made.assembly
     q = rod.rest(whole)
@@ -46,10 +49,12 @@ def test_a_robot_hangs_over_a_cylinder():
         assert np.allclose(poses[name][:3, 2], [0, 0, z])
     middle = robots.middle(whole, q, ["arm", "hand"])
     assert np.allclose(middle, [0, 0, 0.3]) and np.isclose(poses["thing"][2, 3], 20 * mm)
-    seen = systems.touching(whole, (rod.On("thing", floor),), q[None], jnp.zeros((1, 6)))
+    seen = systems.contact_history(
+        whole, (rod.PartForce("thing", floor),), q[None], jnp.zeros((1, 6))
+    )
     assert abs(seen.overlap[0, 0]) < 1e-12  # it stands
     network = SimpleNamespace(state={"body": {"q": q, "v": jnp.zeros(6)}})
-    states = [robots.InContact(network)] * 3  # type: ignore[arg-type]
+    states = [InContact(network)] * 3  # type: ignore[arg-type]
     film, few = robots.replay(whole, states), robots.replay(whole, states, ["thing"])
     assert set(film.poses) == {"arm", "hand", "thing"} and set(few.poses) == {"thing"}
     assert np.array_equal(few.q, jnp.stack([q] * 3)) and few.v.shape == (3, 6)
@@ -58,7 +63,7 @@ def test_a_robot_hangs_over_a_cylinder():
     with pytest.raises(ValueError, match="there is no part `leg`"):
         robots.replay(whole, states, ["leg"])
     with pytest.raises(ValueError, match="has a part called `arm` already"):
-        robots.surrounded(model, (), arm=thing)
+        robots.with_contacts(model, (), arm=thing)
 
 
 def test_a_rod_behind_a_simulated_board_keeps_its_states():
@@ -136,8 +141,8 @@ def test_what_an_impedance_asked_for_along_a_motion():
     goal = systems.Waypoints([0.0, 1.0], [[80 * mm, 0.0], [70 * mm, 10 * mm]])
     law = systems.CartesianImpedance(BEAM, (rod.Damping(0.02),), goal, 10.0, 0.5)
     time, q = jnp.array([0.0, 0.5]), jnp.array([[0.0, 0.0], [3.0, 1.0]])
-    path = rod.Rollout(time, q, 0.1 * q, Status.successful)
-    done = systems.followed(law, path)
+    path = Rollout(time, q, 0.1 * q, Status.successful)
+    done = systems.tracking(law, path)
     assert np.allclose(done.goal[1], [75 * mm, 5 * mm])
     assert np.allclose(done.tip[0], [80 * mm, 0.0])
     assert np.allclose(done.effort[1], law.effort(time[1], q[1], 0.1 * q[1]), rtol=1e-9)

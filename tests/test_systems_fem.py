@@ -178,8 +178,8 @@ def test_shapes_are_orthonormal_in_the_mass_and_hold_the_answer_to_a_load(basis)
 
 
 def test_a_reduced_body_has_the_volumes_and_forces_of_the_full_one(basis):
-    full, small = tube(), S.reduced(tube(), basis)
-    exact = S.reduced(tube(), basis, order=None)
+    full, small = tube(), S.modal_body(tube(), basis)
+    exact = S.modal_body(tube(), basis, order=None)
     way = jnp.linspace(1.0, -1.0, len(basis)) * 1e-7
     errors = []
     for q in (way, 2 * way):
@@ -203,7 +203,7 @@ def test_a_reduced_body_breathes_like_the_full_one(basis, breath):
     change = jnp.max(jnp.abs(film["tube.volume"] - film["tube.volume"][0]))
     missed = []
     for order in (1, 3):
-        small = S.reduced(tube(speed=3.0), basis, order=order)
+        small = S.modal_body(tube(speed=3.0), basis, order=order)
         network = S.Network({"tube": small, "air": S.Reservoir()}, WIRES)
         found = S.simulate(network, 4e-4, save=SAVE, rtol=1e-7, atol=1e-10)
         missed.append(jnp.max(jnp.abs(found["tube.volume"] - film["tube.volume"])) / change)
@@ -226,7 +226,7 @@ def test_the_tendon_of_a_reduced_body_does_not_push():
         loads=(pulled,),
     )  # fmt: skip
     body = S.FemBody(problem, driven=("tendon",))
-    small = S.reduced(body, S.modal_basis(body, 1, bending=False), order=1)
+    small = S.modal_body(body, S.modal_basis(body, 1, bending=False), order=1)
     rest = small.initial_state()
     pull, push, none = (
         small.vector_field(0.0, rest, {"tendon": jnp.asarray(value)})["v"]

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from sorojax import _progress, fem, material, mesh as M, rod as R, sdf, view
+from sorojax.fem.equilibrium.solve import Path
 from sorojax.math.lie import SE2
 from sorojax.math.status import Status
-from sorojax.reduction import Backbone
+from sorojax.reduction.backbone import Backbone
 
 LENGTH = 0.06
 ORANGE, INK = (213, 94, 0), (31, 36, 48)
@@ -80,7 +81,7 @@ def path(beam):
     )  # fmt: skip
     states = jnp.asarray(np.stack([0 * bend(beam, 1.0)] + [bend(beam, k) for k in (5.0, 15.0)]))
     values = jnp.array([0.0, 1.0, 2.0])
-    return fem.Path(problem, states, values, "pull", Status.successful, ())
+    return Path(problem, states, values, "pull", Status.successful, ())
 
 
 @pytest.mark.versions

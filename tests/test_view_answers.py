@@ -6,7 +6,12 @@ import pytest
 
 import sorojax as sj
 from sorojax import fem, material, mesh as M, robots, rod as R, sdf, view
+from sorojax.fem.stability.buckling import CriticalLoads
+from sorojax.fem.stability.continuation import CriticalPoint
 from sorojax.math.status import Status
+from sorojax.mesh.repair import Repaired
+from sorojax.rod.statics.inverse_kinematics import IKResult
+from sorojax.rod.statics.path import EquilibriumPath
 from sorojax.view import style
 from sorojax.view.draw.robots import air_of, robot_scene
 from sorojax.view.raster.scene import Surface
@@ -66,16 +71,16 @@ def test_buckling_is_drawn_on_the_body():
     y = mesh.points[:, 1] / 0.06
     first = jnp.stack([y**2, 0 * y], axis=1)
     second = jnp.stack([jnp.sin(3 * y), 0 * y], axis=1)
-    found = fem.CriticalLoads(jnp.array([1.5, 4.0]), jnp.stack([first, second]))
+    found = CriticalLoads(jnp.array([1.5, 4.0]), jnp.stack([first, second]))
     shown = view.show(found, problem=problem)
     assert is_whole(shown) and len(shown.panels) == 2
     assert "mode 1: load factor 1.5" in words(shown) and "4" in words(shown)
     tip = np.array([[0.0025, 0.06]]) + np.array([[0.12 * np.hypot(0.005, 0.06), 0.0]])
     inside = patch(shown, pixels(shown), tip - [0, 5e-4])
     assert near(inside, (253, 231, 37), 60).mean() > 0.3  # the largest amplitude
-    point = fem.CriticalPoint("bifurcation", jnp.array(1.2), 0 * mesh.points, first, 1)
+    point = CriticalPoint("bifurcation", jnp.array(1.2), 0 * mesh.points, first, 1)
     assert "bifurcation at load factor 1.2" in words(view.show(point, problem=problem))
-    none = fem.CriticalLoads(jnp.zeros(0), jnp.zeros((0, *mesh.points.shape)))
+    none = CriticalLoads(jnp.zeros(0), jnp.zeros((0, *mesh.points.shape)))
     with pytest.raises(ValueError, match="no critical load"):
         view.show(none, problem=problem)
 
@@ -84,13 +89,13 @@ def test_answers_of_rods_are_posed():
     arm = R.rod(sj.SE2(), R.chebyshev(kappa_z=2), R.circle(0.005), length=0.1,
                 young_modulus=1e5, poisson_ratio=0.4, density=1e3, nodes=6)  # fmt: skip
     q = jnp.array([8.0, 0.0])
-    found = R.Reached(q, Status.successful, jnp.array(2e-6), jnp.array(0.0), jnp.array(4))
+    found = IKResult(q, Status.successful, jnp.array(2e-6), jnp.array(0.0), jnp.array(4))
     shown = view.show(found, model=arm)
     assert is_whole(shown) and "error 2e-06" in words(shown)
     tip = np.asarray(R.forward_kinematics(arm, q, [0.97]))[0, :2, 2]
     assert near(patch(shown, pixels(shown), tip[None]), rgb(style.BODY)).mean() > 0.5
     rows = jnp.linspace(0, 1, 9)[:, None] * q[None]
-    path = R.EquilibriumPath(rows, Status.successful, jnp.ones(9, int))
+    path = EquilibriumPath(rows, Status.successful, jnp.ones(9, int))
     assert len(view.show(path, model=arm).figure.axes[0].patches) == 5
 
 
@@ -108,13 +113,13 @@ def test_a_rig_a_part_and_a_fit_are_shown():
     assert (stretch[0], stretch[-1]) == (1.0, 2.0) and len(axes.lines[2].get_xdata()) == 11
     assert stress[-1] == pytest.approx(100, rel=0.4)
     flat = sdf.Rectangle([0.0, 0.0], [0.03, 0.01])
-    repaired = M.Repaired(M.rectangle([0, 0], [1, 1], divisions=(2, 2)), *np.zeros((3, 0)))
+    repaired = Repaired(M.rectangle([0, 0], [1, 1], divisions=(2, 2)), *np.zeros((3, 0)))
     assert "8 cells Tri3" in words(view.show(repaired))
     assert isinstance(view.scene_of(flat).parts[0], Surface)
 
 
 def test_records_stand_beside_their_predictions():
-    from sorojax.design import Calibration, Check
+    from sorojax.design.calibration.calibration import Calibration, Check
 
     line, off = np.linspace(0, 1, 5), np.array([0.1, -0.1, np.nan, 0.1, -0.1])
     checks = [Check(name, line, off, rms, 0.05 * np.ones(5)) for name, rms in

@@ -19,8 +19,11 @@ from sorojax import (
     view,
 )  # fmt: skip
 from sorojax.cli.main import main
+from sorojax.fem.equilibrium.solve import Path
+from sorojax.fem.stability.modal import Modes
 from sorojax.math.lie import SE2, SE3
 from sorojax.math.status import Status
+from sorojax.rod.dynamics.rollout import Rollout
 from sorojax.view.film.tracks import positions_track, track_of
 from sorojax.view.raster.scene import Surface
 
@@ -44,7 +47,7 @@ def path(beam):
     x = np.asarray(beam.points)[:, 0]
     shapes = [np.stack([0 * x, -k * 0.005 * (x / LENGTH) ** 2], axis=1) for k in range(5)]
     pulls = jnp.zeros((5, 2)).at[:, 1].set(-9.81 * jnp.arange(5.0) / 4)
-    return fem.Path(problem, jnp.asarray(np.stack(shapes)), pulls, "gravity",
+    return Path(problem, jnp.asarray(np.stack(shapes)), pulls, "gravity",
                     Status.successful, ())  # fmt: skip
 
 
@@ -133,7 +136,7 @@ def test_a_path_without_time_takes_three_seconds(path):
 def test_a_rod_and_a_mode_and_moved_nodes_are_filmed(beam, path):
     arm = R.rod(SE3(), R.chebyshev(kappa_y=1), R.circle(0.008), length=0.12,
                 young_modulus=1e5, poisson_ratio=0.4, density=1e3)  # fmt: skip
-    run = R.Rollout(jnp.linspace(0, 1, 5), jnp.linspace(0, 10, 5)[:, None], jnp.zeros((5, 1)),
+    run = Rollout(jnp.linspace(0, 1, 5), jnp.linspace(0, 10, 5)[:, None], jnp.zeros((5, 1)),
                     Status.successful)  # fmt: skip
     film = view.animate(run, model=arm, fps=4, renderer="own", view="front", size=(200, 150))
     low = [np.flatnonzero(np.any(film.draw(k)[20:, 60:] < 200, axis=(1, 2))).max()
@@ -141,7 +144,7 @@ def test_a_rod_and_a_mode_and_moved_nodes_are_filmed(beam, path):
     assert film.frames == 5 and low[0] != low[1]
     with pytest.raises(ValueError, match="Pass model="):
         view.animate(run)
-    modes = fem.Modes(path.problem, 0 * path.displacements[0], jnp.array([400.0]),
+    modes = Modes(path.problem, 0 * path.displacements[0], jnp.array([400.0]),
                       path.displacements[-1:])  # fmt: skip
     swing = view.animate(modes, fps=8, size=(200, 150))
     assert swing.frames == 17 and not np.array_equal(swing.draw(2), swing.draw(6))

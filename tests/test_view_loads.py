@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from sorojax import fem, material, mesh as M, rod as R, view
+from sorojax.fem.equilibrium.volume import CavitySolution, VolumePath
 from sorojax.math.lie import SE2, SE3, homogeneous
 from sorojax.math.status import Status
-from sorojax.reduction import Backbone
+from sorojax.reduction.backbone import Backbone
 from sorojax.view import style
 from sorojax.view.draw.bodies import show_problem
 from sorojax.view.draw.loads import coil, load_parts, support_parts, turning
@@ -113,7 +114,7 @@ def test_a_cavity_in_a_solid_is_seen_through_it():
     assert "under pressure" in words(picture) and "air: 20 kPa" in words(picture)
     red, green, blue = np.moveaxis(pixels(picture), 2, 0)
     assert np.sum((red > green + 15) & (green >= blue - 5)) > 500  # the wall, seen through
-    closed = fem.CavitySolution(
+    closed = CavitySolution(
         problem, 0 * body.points, jnp.array([2e4]), jnp.array([3e-6]), ("air",),
         Status.successful, None,
     )  # fmt: skip
@@ -132,7 +133,7 @@ def test_moved_supports_are_told_from_held_ones():
 def test_volumes_of_a_cavity_name_the_states_of_a_path():
     problem = loaded(2, fem.Pressure(M.boundary_facets(beam(2)), 1e3, name="air"))
     shapes = jnp.stack([0 * beam(2).points, 0.05 * beam(2).points])
-    path = fem.VolumePath(problem, shapes, jnp.array([1e-5, 2e-5]), jnp.array([1e3, 3e3]),
+    path = VolumePath(problem, shapes, jnp.array([1e-5, 2e-5]), jnp.array([1e3, 3e3]),
                           "air", Status.successful, ())  # fmt: skip
     picture = view.show(path, field=None)
     assert "10 ml at 1 kPa" in words(picture) and "20 ml at 3 kPa" in words(picture)
@@ -185,7 +186,7 @@ def test_wrenches_find_the_part_that_they_name(arm):
     offset = homogeneous(jnp.eye(3), jnp.array([0.03, 0.0, 0.0]))
     hand = R.assembly(SE3(), palm=R.Part(R.Link(0.05, [2e-5, 2e-5, 3e-5])),
                       finger=R.Part(arm, on="palm", offset=offset))  # fmt: skip
-    wrench = R.On("finger", R.TipWrench([0.0, 0.0, 0.0, 0.0, 0.3, 0.0]))
+    wrench = R.PartForce("finger", R.TipWrench([0.0, 0.0, 0.0, 0.0, 0.3, 0.0]))
     scene = rod_scene(hand, forces=(wrench,))
     (arrow,) = [part for part in scene.parts if isinstance(part, Arrows)]
     assert np.allclose(arrow.starts[0], [0.15, 0.0, 0.0]) and arrow.name == "force: 0.3 N"

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from sorojax import io, mesh, sdf, view
-from sorojax.sweep import Swept
+from sorojax.sweep.sweep import Swept
 from sorojax.view import style
-from sorojax.vision import Discs, Tracks
+from sorojax.vision import Discs
+from sorojax.vision.discs import Tracks
 from tests.test_view_answers import rgb
 from tests.test_view_show import is_whole, near, patch, pixels, words
 

@@ -10,7 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import contact, design, fem, material, mesh as M, rod as R, sdf, systems, view
+from sorojax import contact, fem, material, mesh as M, rod as R, sdf, systems, view
+from sorojax.design.optimise.minimise import Optimised
+from sorojax.fem.equilibrium.solve import Path
+from sorojax.fem.stability.modal import Modes
 from sorojax.math.lie import SE2, SE3, homogeneous
 from sorojax.math.status import Status
 from sorojax.view.draw import bodies, networks, rod_loads as sections
@@ -277,7 +280,7 @@ def test_states_of_a_path_share_one_scale(dim, plane, solid):
     problem = plane if dim == 2 else solid
     shapes = jnp.stack([bent(problem.mesh, share) for share in (0.0, 0.15, 0.3)])
     pulls = jnp.zeros((3, dim)).at[:, -1].set(jnp.array([0.0, -150.0, -300.0]))
-    path = fem.Path(problem, shapes, pulls, "pull", Status.successful, ())
+    path = Path(problem, shapes, pulls, "pull", Status.successful, ())
     picture = view.show(path, field="displacement", title="path")
     assert is_whole(picture) and len(picture.panels) == 3
     for name in ("|pull| = 0 kPa", "|pull| = 150 Pa", "|pull| = 300 Pa"):
@@ -297,7 +300,7 @@ def test_states_of_a_path_share_one_scale(dim, plane, solid):
 def test_modes_have_their_frequencies(dim, plane, solid):
     problem = plane if dim == 2 else solid
     shape = bent(problem.mesh, 1.0)
-    modes = fem.Modes(problem, 0 * shape, jnp.array([400.0, 900.0]) * np.pi**2,
+    modes = Modes(problem, 0 * shape, jnp.array([400.0, 900.0]) * np.pi**2,
                       jnp.stack([shape, shape[:, ::-1]]))  # fmt: skip
     picture = view.show(modes)
     assert is_whole(picture) and len(picture.panels) == 2
@@ -456,7 +459,7 @@ def test_an_optimisation_shows_its_history_or_its_layout(beam):
                "change": 0.5 ** np.arange(5)}  # fmt: skip
     corners = np.asarray(beam.points)[np.asarray(beam.cells)[:, :3]]
     density = (corners[:, :, 0].mean(axis=1) / LENGTH) ** 4
-    done = design.Optimised(jnp.asarray(density), jnp.asarray(0.2), -jnp.ones(2),
+    done = Optimised(jnp.asarray(density), jnp.asarray(0.2), -jnp.ones(2),
                             Status.max_steps, history, None)  # fmt: skip
     picture = view.show(done)
     assert len(picture.panels) == 3 and "objective 0.2 after 5 steps" in words(picture)
@@ -541,7 +544,7 @@ def test_nouns_print_what_matters(beam, plane, arm, loop):
 def test_scenes_are_put_together_anew(plane):
     ball, arm = sdf.Sphere([0.0, 0.0, 0.0], 0.01), np.array([[0.0, 0, 0], [0, 0, 0.03]])
     lone = view.scene_of(ball, size=0.004)
-    both = view.joined(lone, view.Scene((view.Lines([arm]),)), title="ball on a stick")
+    both = view.merge_scenes(lone, view.Scene((view.Lines([arm]),)), title="ball on a stick")
     assert len(both.parts) == 2 and both.title == "ball on a stick"
     shown = view.show(both, view="front", renderer="own")
     lower, upper = both.box

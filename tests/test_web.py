@@ -14,9 +14,12 @@ from patches import patch
 
 from benchmarks.cases import view_web
 from sorojax import fem, material, mesh as M, view
+from sorojax.fem.equilibrium.solve import Path
 from sorojax.math.status import Status
 from sorojax.sdf import Surface, surface_report
+from sorojax.view.rigging.rig import placed
 from sorojax.view.web.actor import mesh_triangles
+from sorojax.view.web.page import Page
 
 needs_chromium = pytest.mark.skipif(
     chromium.found() is None,
@@ -58,7 +61,7 @@ def test_a_grasp_is_a_small_page(grasp):
     assert len(page.html.encode()) < 12e6
     assert "http://" not in page.html and "https://" not in page.html
     assert "<title>grasp &lt;3&gt;</title>" in page.html
-    assert "MB" in repr(page) and "srcdoc" in view.Page("<p>")._repr_html_()
+    assert "MB" in repr(page) and "srcdoc" in Page("<p>")._repr_html_()
 
 
 def test_a_page_keeps_points_to_its_resolution(grasp):
@@ -87,7 +90,7 @@ def wave():
         loads=(fem.Traction(M.boundary_facets(mesh)[:2], [0.0, 0.0], name="pull"),),
     )  # fmt: skip
     u = jnp.stack([k * mesh.points * jnp.array([[0.1, -0.05]]) for k in range(3)])
-    return fem.Path(problem, u, jnp.array([0.0, 1.0, 2.0]), "pull", Status.successful, ())
+    return Path(problem, u, jnp.array([0.0, 1.0, 2.0]), "pull", Status.successful, ())
 
 
 def test_a_result_brings_its_times_and_colours(wave):
@@ -192,7 +195,7 @@ def test_quaternions_of_a_file_turn_like_the_matrices():
     q = rng.normal(size=(50, 4))
     q[:4] = np.eye(4)  # half turns and none
     q /= np.linalg.norm(q, axis=1, keepdims=True)
-    turned = np.asarray(view.placed(np.eye(3), np.zeros((50, 3)), q[:, [3, 0, 1, 2]]))
+    turned = np.asarray(placed(np.eye(3), np.zeros((50, 3)), q[:, [3, 0, 1, 2]]))
     found = _quaternions(turned.swapaxes(1, 2))
     assert np.allclose(np.abs(np.sum(found * q, axis=1)), 1.0, rtol=0, atol=1e-12)
     assert np.all(np.sum(found[1:] * found[:-1], axis=1) >= 0)

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 import sorojax as sj
-from sorojax import design, fem, material, mesh, rod, sdf, systems, view
+from sorojax import Status, design, fem, material, mesh, rod, sdf, systems, view
 from sorojax.mesh.enrich import with_centres
+from sorojax.rod.statics.equilibrium import Equilibrium
 
 RUBBER = material.neo_hookean(young_modulus=1e5, poisson_ratio=0.4, density=1e3)
 SQUARE = mesh.rectangle([0, 0], [1, 1], divisions=(1, 1))
@@ -354,7 +355,7 @@ def test_facets_of_a_curved_wall_are_found_and_follow_enrich(hollow):
 
 
 def test_a_status_prints_its_name():
-    status = fem.Status
+    status = Status
     each = jax.vmap(lambda good: status.where(good, status.successful, status.max_steps))
     assert repr(status.successful) == "Status(successful)"
     three = each(jnp.array([True, False, True]))
@@ -383,6 +384,6 @@ def test_surfaces_and_sweeps_print_in_a_few_lines():
 
 def test_a_picture_without_its_model_is_told():
     zero = jnp.zeros((), int)
-    found = rod.Equilibrium(Q, fem.Status.successful, zero, zero)
+    found = Equilibrium(Q, Status.successful, zero, zero)
     assert "'model'" in call(view.show, found)
     assert "colour" in call(view.show, ROD, colour=3)

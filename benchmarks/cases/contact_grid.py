@@ -14,6 +14,7 @@ from sorojax import rod as R, sdf
 from sorojax.contact import LinePenalty
 from sorojax.math.lie import SE2
 from sorojax.math.status import Status
+from sorojax.rod.dynamics.fields import Motion
 
 STEPS = (2e-5, 2e-4, 1e-3)  # [s]
 SAVES, BETWEEN = 150, 16  # steps of a run; places between two of them that are looked at
@@ -49,7 +50,7 @@ def on_shape(wall):
     contact = R.ObstacleContact(
         obstacle=shape, radius=RADIUS, law=LAW, points=64, caps="both"
     )  # fmt: skip
-    return R.assembly(SE2(), rod=flier(RADIUS)), (R.On("rod", contact),)
+    return R.assembly(SE2(), rod=flier(RADIUS)), (R.PartForce("rod", contact),)
 
 
 def on_rod(wall):
@@ -57,7 +58,7 @@ def on_rod(wall):
     contact = R.RodContact(
         jnp.stack([RADIUS + 0 * wall, wall / 2]), LAW, points=64, caps="both"
     )
-    return model, (R.Between("rod", "other", contact),)
+    return model, (R.PairForce("rod", "other", contact),)
 
 
 def on_link(wall):
@@ -66,7 +67,7 @@ def on_link(wall):
     model = R.assembly(SE2(), rod=flier(RADIUS), plate=R.Part(link, R.Free()))
     half = jnp.stack([0 * wall + SPAN / 2, wall / 2])
     contact = R.LinkContact(sdf.Rectangle(-half, half), RADIUS, LAW, points=64, caps="both")
-    return model, (R.Between("rod", "plate", contact),)
+    return model, (R.PairForce("rod", "plate", contact),)
 
 
 def on_itself(wall):
@@ -110,7 +111,7 @@ def below(moment, wall):
 
 def crossed(moment, wall):
     other = R.part_motion(moment, 1)
-    if isinstance(other, R.Motion):
+    if isinstance(other, Motion):
         return cross(line_of(R.part_motion(moment, 0)), line_of(other))
     ends = jnp.array([[-SPAN / 2, 0.0], [SPAN / 2, 0.0]])
     plate = other.base.position[None] + ends @ other.base.directors.T

@@ -38,7 +38,7 @@ def on_a_shape(wall):
 
 def on_a_plate(wall):
     """A plate over a wider one, both free."""
-    shape = mesh.joined(
+    shape = mesh.merge(
         a=plate([20 * mm, 5 * mm], (4, 1), [0, GAP]),
         b=plate([40 * mm, wall], (8, 1), [-10 * mm, -wall]),
     )

@@ -7,7 +7,7 @@ import numpy as np
 
 from benchmarks.bellows import case_a
 from benchmarks.harness import Row, measure, measure_calls
-from sorojax import fem
+from sorojax import Status, fem
 from sorojax.math.linalg import sparse
 from sorojax.units import kPa, mm
 
@@ -49,7 +49,7 @@ def rows():
     error = float(jnp.max(jnp.abs(lanes.displacement - alone)) / jnp.max(jnp.abs(alone)))
     ratio = min(batch.runs) / min(loop.runs)
     method = {"method": "vmap", "factorisations": counts[1], "of_loop": round(ratio, 3)}
-    failed = int(np.sum(lanes.status == fem.Status.not_converged))
+    failed = int(np.sum(lanes.status == Status.not_converged))
     yield Row(
         "sorojax", settings | method | {"failed": failed}, **batch.columns(),
         reference="loop", error=error, bar=0.9 * min(loop.runs),

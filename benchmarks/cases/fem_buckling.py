@@ -8,6 +8,7 @@ import numpy as np
 
 from benchmarks.harness import Row, measure_calls
 from sorojax import fem, material, mesh, sdf
+from sorojax.fem.stability.modal import Modes
 from sorojax.units import kPa, mm
 
 #: Converged answers of an independent code on uniform six-node triangles down to 0.25 mm:
@@ -40,7 +41,7 @@ def square() -> mesh.Mesh:
         return np.minimum(np.minimum(at_neck, at_corner), 0.85 * mm)
 
     quarter = mesh.triangulate(shape, size=size, order=2)
-    return mesh.mirrored(mesh.mirrored(quarter, 0, SIDE / 2), 1, SIDE / 2)
+    return mesh.mirror(mesh.mirror(quarter, 0, SIDE / 2), 1, SIDE / 2)
 
 
 def _pairs(x, y):
@@ -61,7 +62,7 @@ def compressed(cells: mesh.Mesh, strain: float) -> fem.Problem:
     return fem.problem(cells, rubber, kinematics=fem.PlaneStrain(1.0), supports=supports)
 
 
-def lowest_mode(cells: mesh.Mesh, strain: float) -> fem.Modes:
+def lowest_mode(cells: mesh.Mesh, strain: float) -> Modes:
     """Lowest eigenvalue of the tangent of the perfect structure, and its mode."""
     problem = compressed(cells, strain)
     return fem.tangent_modes(problem, fem.solve(problem, steps=2).displacement)

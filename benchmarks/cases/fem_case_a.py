@@ -8,6 +8,7 @@ from benchmarks.bellows import PRESSURES, RUBBER, case_a, tip_errors
 from benchmarks.harness import Row, measure_calls, quick
 from sorojax import fem, material
 from sorojax.cli.demo.design import LAYER_STIFFNESS
+from sorojax.fem.equilibrium.solve import Path
 from sorojax.units import kPa, mm
 
 NOTE = "converged solution, worst of 5, 10, 15 and 20 kPa"
@@ -55,7 +56,7 @@ def _far(problem: fem.Problem, size: float) -> Row:
     return Row("sorojax", settings | {"to": "40 kPa in two steps"}, **timing.columns())
 
 
-def _settings(problem: fem.Problem, size: float, path: fem.Path) -> dict:
+def _settings(problem: fem.Problem, size: float, path: Path) -> dict:
     return {
         "size_mm": size,
         "element": problem.mesh.element.name,

@@ -6,7 +6,7 @@ import numpy as np
 from benchmarks.harness import Row, measure_calls
 from benchmarks.manufactured import NodalForces
 from sorojax import fem, material, mesh, sdf
-from sorojax.contact import Contacts
+from sorojax.contact.facet import Contacts
 from sorojax.units import mm
 
 NOTE = "Hertz, line contact on a half-space at the computed force"

@@ -5,6 +5,7 @@ import numpy as np
 from benchmarks import peers
 from benchmarks.harness import Row, measure_calls, missing, quick
 from sorojax import mesh, sdf
+from sorojax.mesh.quality import Quality
 
 #: Outer and inner radius, size of cells and seconds, by name.
 SCENES = {"ball": (1.0, 0.0, 0.12, 1.0), "shell": (15.6, 14.4, 0.8, 3.0)}
@@ -30,7 +31,7 @@ def rows():
         yield _gmsh(name, volume)
 
 
-def _shape_numbers(name: str, quality: mesh.Quality) -> dict:
+def _shape_numbers(name: str, quality: Quality) -> dict:
     angle = round(float(np.rad2deg(quality.min_angle)), 1)
     return {"scene": name, "tetrahedra": quality.num_cells, "dihedral_deg": angle}
 

@@ -5,6 +5,7 @@ import numpy as np
 from benchmarks import peers
 from benchmarks.harness import Row, measure_calls, missing, quick
 from sorojax import mesh, sdf
+from sorojax.mesh.quality import Quality
 from sorojax.units import mm
 
 BAR = 0.3  # s for 3000 triangles
@@ -33,7 +34,7 @@ def outlines() -> dict[str, np.ndarray]:
     return {"outer": outer * mm, "inner": np.concatenate([ends, rooms[1:-1]]) * mm}
 
 
-def _shape_numbers(quality: mesh.Quality) -> dict:
+def _shape_numbers(quality: Quality) -> dict:
     return {
         "triangles": quality.num_cells,
         "angle_deg": round(float(np.rad2deg(quality.min_angle)), 1),

@@ -19,8 +19,8 @@ from sorojax.rod import (
     Free,
     Gravity,
     ObstacleContact,
-    On,
     Part,
+    PartForce,
     SelfContact,
     assembly,
     chebyshev,
@@ -91,7 +91,7 @@ def fallen(count):
     body = assembly(SE2(), rod=Part(rod, Free()))
     faces = sdf.Rectangle([-1.0, -1.0], [1.0, 0.0]), sdf.Rectangle([0.09, -1.0], [1.0, 1.0])
     options = {"radius": 6e-3, "law": LAW, "points": count, "caps": "both"}
-    corner = (On("rod", ObstacleContact(obstacle=face, **options)) for face in faces)
+    corner = (PartForce("rod", ObstacleContact(obstacle=face, **options)) for face in faces)
     q, v = jnp.array([-0.6, 0.0, 0.06, 0.0, 0.0]), jnp.array([0.0, 0.4, 0.0, 0.0, 0.0])
     path = rollout(body, q, v, (Gravity(), *corner), step=6.25e-5, saves=100, every=32)
     at = jnp.array([0.0, 0.5, 1.0])

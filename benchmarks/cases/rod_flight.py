@@ -13,8 +13,8 @@ from sorojax.rod import (
     AbstractForce,
     Free,
     LinearElastic,
-    On,
     Part,
+    PartForce,
     Section,
     assembly,
     chebyshev,
@@ -87,7 +87,7 @@ def drift(momenta):
 
 def rows():
     model, law = spaghetti()
-    forces = (On("rod", law), On("rod", Pulse(WRENCH)))
+    forces = (PartForce("rod", law), PartForce("rod", Pulse(WRENCH)))
     for stepper, h in STEPS:
         run = lambda model: fly(model, forces, stepper, h)  # noqa: B023, E731
         timing = measure(run, model, repeats=2)

@@ -8,6 +8,7 @@ import numpy as np
 
 from benchmarks.harness import Row
 from sorojax import io, robots, sdf
+from sorojax.sdf.surface.report import SurfaceReport
 from sorojax.units import mm
 
 BALL = sdf.Sphere([0.0, 0.0, 0.0], 1.0)
@@ -68,7 +69,7 @@ def bodies() -> dict[str, tuple[sdf.AbstractSdf, float]]:
     return {kind.__name__: (kind().body(), size) for kind, size in sizes.items()}
 
 
-def read_back(shape, size: float, method, folder: Path) -> tuple[sdf.SurfaceReport, int]:
+def read_back(shape, size: float, method, folder: Path) -> tuple[SurfaceReport, int]:
     """What the written file holds, and its number of triangles."""
     io.export_surface(folder / "part.stl", sdf.isosurface(shape, size, method))
     surface = io.import_surface(folder / "part.stl")

@@ -76,7 +76,7 @@ def rows():
     yield Row("sorojax", {"body": "fem.simulate", **size}, **timing.per(STEPS).columns())
     basis = systems.modal_basis(full, MODES)
     for order in (1, 3):
-        small = network(systems.reduced(full, basis, order=order))
+        small = network(systems.modal_body(full, basis, order=order))
 
         def go(small=small):
             return systems.simulate(

@@ -10,6 +10,7 @@ from sorojax import view
 from sorojax.math.lie import SE3, homogeneous
 from sorojax.rod import Part, assembly, chebyshev, circle, rod
 from sorojax.sdf import Sphere, isosurface
+from sorojax.view.web.actor import Actor
 
 LENGTH, RADIUS, BALL = 0.12, 0.008, 0.035  # m
 FRAMES, SECONDS = 200, 4.0
@@ -47,7 +48,7 @@ def closing(frames: int = FRAMES) -> np.ndarray:
     return q.reshape(frames, -1)
 
 
-def actors(around: int = 48, stations: int = 67, frames: int = FRAMES) -> list[view.Actor]:
+def actors(around: int = 48, stations: int = 67, frames: int = FRAMES) -> list[Actor]:
     """The fingers, and a ball that rises once they hold it."""
     model = hand()
     fingers = view.rig(model, around=around, stations=stations)

@@ -8,6 +8,7 @@ from benchmarks.harness import Row, Timing
 from sorojax import vision
 from sorojax.vision import Camera, Disturbance, Pose
 from sorojax.vision.camera import opencv
+from sorojax.vision.fiducials import Fiducials
 
 SIZE, PICTURES = 0.05, 20
 BARS = {"corner, px rms": 0.05, "place, m median": 1e-4}
@@ -53,7 +54,7 @@ def _opencv_subpix(image):
     settings.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
     words = aruco.getPredefinedDictionary(aruco.DICT_6X6_250)
     corners, ids, _ = aruco.ArucoDetector(words, settings).detectMarkers(image)
-    return vision.Fiducials(ids.ravel(), np.array(corners, float).reshape(-1, 4, 2))
+    return Fiducials(ids.ravel(), np.array(corners, float).reshape(-1, 4, 2))
 
 
 def _run(find, camera: Camera, scenes):

@@ -3,8 +3,8 @@
 `graded` puts a design into a problem; `Follower` solves it, from the displacement of the last
 design where that is near enough. Designs under large loads reach their buckling load while
 they are optimised; beyond it the load path ends at a limit point and the body snaps.
-`settled` finds the stable state that it then falls into: its energy is minimised by Newton's
-method with a shift that keeps the tangent positive definite.
+`relax_to_minimum` finds the stable state that it then falls into: its energy is minimised by
+Newton's method with a shift that keeps the tangent positive definite.
 
 Reference: Nocedal, Wright, "Numerical Optimization", 2nd ed., 2006, sections 3.2 and 3.4.
 """
@@ -20,11 +20,11 @@ from jaxtyping import Array, Float, Int
 from sorojax._jax.host_call import tell_host
 from sorojax._jax.trace_state import is_traced
 from sorojax.design.density.void import InterpolatedEnergy, interpolated_energy
-from sorojax.fem import Newton, Path, Problem, Solution
+from sorojax.fem import Newton, Problem, Solution
 from sorojax.fem.equilibrium.linear import Prepared, constrain, linearise, prepare
 from sorojax.fem.equilibrium.newton import safe_fraction
 from sorojax.fem.equilibrium.rules import SAFE
-from sorojax.fem.equilibrium.solve import solved_and_kept
+from sorojax.fem.equilibrium.solve import Path, solved_and_kept
 from sorojax.fem.loads.loads import AbstractLoad, mean_rotation
 from sorojax.fem.problem import exchanged, load_potential, potential_energy
 from sorojax.material.hyperelastic import AbstractHyperelastic
@@ -35,7 +35,7 @@ _DESCENT = 1e-4  # share of the decrease by the slope that a step has to bring
 _HALVINGS = 12
 
 
-def settled(
+def relax_to_minimum(
     problem: Problem, u: Float[Any, "nodes dim"], *, steps: int = 100, tolerance: float = 1e-6
 ) -> tuple[Float[np.ndarray, "nodes dim"], bool]:
     """A state of least energy downhill of the displacement `u` [m], and whether it was
@@ -221,9 +221,9 @@ class Follower:
     Newton's method starts at full load from the last displacement, and follows the load from
     rest where that does not converge: the equilibria agree unless a design has several. Where
     the load path ends too, the last equilibrium has buckled, and the body falls from there
-    into a stable one (`settled`; not under `jit`). Derivatives are those of `fem.solve`, none
-    of them by where a solve starts from. An equilibrium that is not found has NaN for
-    derivatives, on which `minimise` stops.
+    into a stable one (`relax_to_minimum`; not under `jit`). Derivatives are those of
+    `fem.solve`, none of them by where a solve starts from. An equilibrium that is not found
+    has NaN for derivatives, on which `minimise` stops.
     """
 
     def __init__(self, *, newton: Newton | None = None, steps: int = 1, max_cuts: int = 4):
@@ -256,7 +256,7 @@ class Follower:
         here = eqx.combine(jax.lax.stop_gradient(moving), rest)
         if is_traced((here, solution.load_fraction)):
             return solution, None
-        u, stable = settled(here, start)
+        u, stable = relax_to_minimum(here, start)
         if not stable:
             return solution, None
         return self._solved(problem, u)

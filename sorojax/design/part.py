@@ -258,7 +258,7 @@ class PartReport(NamedTuple):
     __repr__ = __str__
 
 
-def reanalysed(
+def reanalyse(
     made: Part,
     performance: Callable[[Mesh], float],
     promised: float,

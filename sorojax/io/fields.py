@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax import _check, fem
+from sorojax.fem.equilibrium.solve import Path as FemPath
 from sorojax.io import _files
 from sorojax.mesh.elements.elements import PolyN, Tet15
 from sorojax.mesh.mesh import valences
@@ -25,7 +26,7 @@ FIELDS = ("von_mises", "pressure", "stress", "principal", "energy", "reaction")
 def export_fields(
     path: str | os.PathLike,
     problem: fem.Problem,
-    states: fem.Solution | fem.Path | fem.Motion | np.ndarray,
+    states: fem.Solution | FemPath | fem.Motion | np.ndarray,
     *,
     fields: Sequence[str] = ("von_mises", "pressure"),
     deformed: bool = False,
@@ -90,7 +91,7 @@ def _states(where, problem, states, times):
     """Displacements (states, nodes, dim), the problem of each, and their times."""
     problems = None
     moments = times
-    if isinstance(states, fem.Path):
+    if isinstance(states, FemPath):
         moved = np.asarray(states.displacements)
         problems = [fem.with_load(problem, states.name, value) for value in states.values]
         if times is None and states.values.ndim == 1:

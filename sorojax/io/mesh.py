@@ -16,9 +16,10 @@ import numpy as np
 from sorojax import _check, mesh as M
 from sorojax.io import _files
 from sorojax.io.surface import export_surface
-from sorojax.mesh import Mesh, Repaired, Tet4, repair
+from sorojax.mesh import Mesh, Tet4, repair
 from sorojax.mesh.elements.elements import AbstractElement, PolyN
 from sorojax.mesh.mesh import boundary_facets
+from sorojax.mesh.repair import Repaired
 from sorojax.sdf import Surface, surface_report
 
 _TYPES = {

@@ -6,6 +6,7 @@ written at all, and every length in a file is checked before memory is taken.
 """
 
 import dataclasses
+import functools
 import hashlib
 import importlib
 import inspect
@@ -13,7 +14,7 @@ import io
 import json
 import math
 import os
-import sys
+import pkgutil
 import zipfile
 from collections.abc import Callable
 from typing import Any, BinaryIO, NamedTuple
@@ -174,7 +175,7 @@ def _name(cls: type, place: str) -> str:
     home = cls.__module__.split(".")
     if home[0] == "sorojax" and len(home) > 1:
         own = cls.__qualname__
-        for name in (f"{home[1]}.{own}", ".".join((*home[1:], own))):  # a public one first
+        for name in (f"{home[1]}.{own}", ".".join((*home[1:], own))):  # the short one first
             if _class(name) is cls:
                 return name
     what = cls.__qualname__ if home == ["builtins"] else f"{cls.__module__}.{cls.__qualname__}"
@@ -183,17 +184,35 @@ def _name(cls: type, place: str) -> str:
 
 def _class(name: Any) -> type | None:
     """The data class of that name, `None` where sorojax has no such one."""
-    package, *inner, own = str(name).split(".") if "." in str(name) else ("", "")
-    if package not in _PACKAGES:
-        return None
-    importlib.import_module(f"sorojax.{package}")
-    module = sys.modules.get(".".join(("sorojax", package, *inner)))
-    found = vars(module).get(own) if module is not None else None
+    package = str(name).partition(".")[0]
+    return _data_classes(package).get(name) if package in _PACKAGES else None
+
+
+@functools.cache
+def _data_classes(package: str) -> dict[str, type]:
+    """By the name of the package and their own, which a file can be read by when modules
+    have moved; where several have that name, and none is public, by that of the module too."""
+    home = importlib.import_module(f"sorojax.{package}")
+    walked = pkgutil.walk_packages(home.__path__, f"{home.__name__}.")
+    named: dict[str, list[type]] = {}
+    found = {}
+    for module in (importlib.import_module(entry.name) for entry in walked):
+        for own, value in vars(module).items():
+            if _is_data(value, module.__name__, own):
+                named.setdefault(f"{package}.{own}", []).append(value)
+                found[f"{module.__name__}.{own}".removeprefix("sorojax.")] = value
+    for name, classes in named.items():
+        public = getattr(home, name.partition(".")[2], None)
+        if len(classes) == 1 or public in classes:
+            found[name] = public if public in classes else classes[0]
+    return found
+
+
+def _is_data(found: Any, module: str, own: str) -> bool:
     if not inspect.isclass(found) or inspect.isabstract(found):
-        return None
-    is_own = found.__module__.startswith(f"sorojax.{package}.") and found.__qualname__ == own
-    is_data = issubclass(found, eqx.Module | eqx.Enumeration) or bool(_fields(found))
-    return found if is_own and is_data else None
+        return False
+    is_own = found.__module__ == module and found.__qualname__ == own
+    return is_own and (issubclass(found, eqx.Module | eqx.Enumeration) or bool(_fields(found)))
 
 
 def built(node: Any, arrays: Arrays) -> Any:

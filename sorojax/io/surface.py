@@ -16,7 +16,8 @@ from sorojax import _check
 from sorojax.io import (
     _files,
 )
-from sorojax.sdf import Curve, Surface
+from sorojax.sdf import Surface
+from sorojax.sdf.surface.marching import Curve
 from sorojax.units import mm
 
 # 3MF: a zipped model that states its unit

@@ -4,15 +4,15 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from sorojax._arguments import check_package as _check_package, public as _public
-from sorojax.math.lie import SE2 as SE2, SE3 as SE3
-from sorojax.math.status import Status as Status
 
 if TYPE_CHECKING:
-    from sorojax.math.ode.steppers import (
-        DormandPrince as DormandPrince,
-        GeneralisedAlpha as GeneralisedAlpha,
-        RungeKutta4 as RungeKutta4,
-    )
+    from sorojax.math.ode.steppers import DormandPrince, GeneralisedAlpha, RungeKutta4
+
+__all__ = [
+    "DormandPrince",
+    "GeneralisedAlpha",
+    "RungeKutta4",
+]
 
 _check_package(__name__)
 _STEPPERS = {"DormandPrince", "GeneralisedAlpha", "RungeKutta4"}
@@ -24,7 +24,3 @@ def __getattr__(name: str) -> Any:
         value = getattr(importlib.import_module("sorojax.math.ode.steppers"), name)
         return _public(__name__, name, value)
     raise AttributeError(f"module 'sorojax.math' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_STEPPERS})

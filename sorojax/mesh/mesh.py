@@ -150,7 +150,7 @@ def with_side_nodes(
 # Several bodies as one mesh
 
 
-def joined(**bodies: Mesh) -> Mesh:
+def merge(**bodies: Mesh) -> Mesh:
     """One mesh of several bodies that share no nodes, for contact between them.
 
     `joined(finger=a, ball=b)` names the cells of each body in `regions`, its nodes in
@@ -163,7 +163,7 @@ def joined(**bodies: Mesh) -> Mesh:
     kinds = {type(body.element).__name__ for body in bodies.values()}
     if len(kinds) != 1:
         raise ValueError(
-            f"mesh.joined: got bodies of {sorted(kinds)}, need one kind of cells for all. "
+            f"mesh.merge: got bodies of {sorted(kinds)}, need one kind of cells for all. "
             "Mesh them alike."
         )
     nodes, cells, node_sets, facet_sets, regions = 0, [], {}, {}, {}

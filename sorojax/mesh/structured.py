@@ -242,7 +242,7 @@ def between_lines(
     )  # fmt: skip
 
 
-def kept(mesh: Mesh, cells: Int[np.ndarray, " kept"]) -> Mesh:
+def submesh(mesh: Mesh, cells: Int[np.ndarray, " kept"]) -> Mesh:
     """The mesh with the listed cells only, and the nodes that they use.
 
     Node sets and regions keep what is left of them; facet sets, whose facets may have gone,
@@ -250,7 +250,7 @@ def kept(mesh: Mesh, cells: Int[np.ndarray, " kept"]) -> Mesh:
     """
     chosen = np.asarray(cells)
     if not len(chosen):
-        raise ValueError("mesh.kept: got no cells, need one or more.")
+        raise ValueError("mesh.submesh: got no cells, need one or more.")
     used, inverse = np.unique(np.asarray(mesh.cells)[chosen], return_inverse=True)
     node_sets = {
         name: np.flatnonzero(np.isin(used, np.asarray(ids)))
@@ -416,7 +416,7 @@ def _carry_sets(mesh: Mesh, solid: Mesh, station, base, stations: int, closed: b
 _SAME = 1e-9  # of the extent: on the plane
 
 
-def mirrored(mesh: Mesh, axis: int, at: float) -> Mesh:
+def mirror(mesh: Mesh, axis: int, at: float) -> Mesh:
     """`mesh` with its image behind the plane x[axis] = `at` [m]; both share the nodes on it.
 
     A mesh without symmetry has no bifurcation, only an imperfection. Nodes on the plane are
@@ -430,7 +430,7 @@ def mirrored(mesh: Mesh, axis: int, at: float) -> Mesh:
         `mirrored(mirrored(quarter, 0, 20 * mm), 1, 20 * mm)` is the whole square.
     """
     if isinstance(mesh.element, PolyN):
-        raise ValueError("mesh.mirrored: got polygons, need another kind of cells.")
+        raise ValueError("mesh.mirror: got polygons, need another kind of cells.")
     points = np.array(mesh.points)
     slack = _SAME * float(np.ptp(points, axis=0).max())
     _check_side(points[:, axis] - at, slack)
@@ -475,6 +475,6 @@ def _facets(mesh: Mesh, ids, shared, number) -> np.ndarray:
 def _check_side(away: np.ndarray, slack: float) -> None:
     if away.min() < -slack and away.max() > slack:
         raise ValueError(
-            f"mesh.mirrored: the mesh reaches from {away.min():.3g} to {away.max():.3g} m "
+            f"mesh.mirror: the mesh reaches from {away.min():.3g} to {away.max():.3g} m "
             "about the plane, need all of it on one side. Mesh one half only."
         )

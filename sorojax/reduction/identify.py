@@ -279,7 +279,7 @@ def identify(
     Example:
         >>> grid = mesh.rectangle([0, 0], [60 * mm, 12 * mm], divisions=(6, 4),
         ...                       element=mesh.Quad4())
-        >>> tube = mesh.kept(grid, np.delete(np.arange(24), [6, 10, 14, 18]))  # with a chamber
+        >>> tube = mesh.submesh(grid, np.delete(np.arange(24), [6, 10, 14, 18]))  # a chamber
         >>> wall = mesh.facets_on(tube, sdf.Rectangle([10 * mm, 6 * mm], [50 * mm, 9 * mm]))
         >>> problem = fem.problem(
         ...     tube, material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45, density=1000),

@@ -10,14 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax.reduction.backbone import PLANAR, Backbone
-from sorojax.rod import (
-    AbstractModes,
-    Combined,
-    SampledModes,
-    StrainBasis,
-    orthonormalise,
-)
+from sorojax.rod import AbstractModes, StrainBasis, orthonormalise
 from sorojax.rod.model.basis import STRAINS
+from sorojax.rod.model.modes import Combined, SampledModes
 
 
 @jax.jit

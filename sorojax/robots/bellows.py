@@ -254,6 +254,6 @@ def pneunet_mesh(pneunet: PneuNet) -> mesh.Mesh:
     y = np.concatenate([[0, layer], np.linspace(floor, notch, 4), *upper])
     lines = np.unique(np.concatenate([*inner, slot - gap, slot + gap, ends]))
     grid = mesh.between_lines(lines, y, element=mesh.Quad8())
-    made = mesh.kept(grid, mesh.cells_inside(grid, pneunet.body()))
+    made = mesh.submesh(grid, mesh.cells_inside(grid, pneunet.body()))
     below = mesh.cells_where(made, lambda p: p[1] < layer)
     return mesh.Mesh(made.points, made.cells, made.element, regions={"layer": below})

@@ -25,7 +25,8 @@ from sorojax.rod import Assembly, Free, Link, LinkObstacle, Part, Rod, assembly,
 from sorojax.rod.forces.loads import Load
 from sorojax.rod.model.assembly import index_of
 from sorojax.sdf import HalfSpace
-from sorojax.systems import AssemblyBody, Parted, partitioned
+from sorojax.systems import AssemblyBody, partitioned
+from sorojax.systems.integrate.partitioned import PartitionedState
 
 
 def ring(
@@ -71,7 +72,7 @@ def _hanging(angle: float, radius: Float[Array, ""]) -> Float[Array, "4 4"]:
     return homogeneous(turn, radius * jnp.stack([c, s, zero]))
 
 
-def below(depth: Float[Array, ""] | float) -> Float[Array, "4 4"]:
+def pose_below(depth: Float[Array, ""] | float) -> Float[Array, "4 4"]:
     """Pose of what hangs `depth` [m] below the middle of a ring, not turned."""
     depth = real(depth)
     zero = jnp.zeros_like(depth)
@@ -127,7 +128,7 @@ def rim(
 # A robot among other bodies: where it is mounted, what it touches, and how it moves then
 
 
-def surrounded(
+def with_contacts(
     model: Model,
     forces: tuple[Load, ...],
     *,
@@ -178,7 +179,7 @@ def standing_cylinder(
         height: [m].
         law: Between its lower rim and the floor.
     """
-    part = Part(cylinder(mass, radius, height), Free(), offset=below(-height / 2))
+    part = Part(cylinder(mass, radius, height), Free(), offset=pose_below(-height / 2))
     floor = HalfSpace([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     points, lengths = rim(radius, -height / 2)
     return part, LinkObstacle(obstacle=floor, points=points, lengths=lengths, law=law)
@@ -195,7 +196,7 @@ def middle(
 class InContact(NamedTuple):
     """A robot of `contact_stepper` at one moment."""
 
-    network: Parted
+    network: PartitionedState
 
     @property
     def q(self) -> Float[Array, " coordinates"]:
@@ -254,7 +255,7 @@ def contact_stepper(
     """`robots.stepper` of a robot that touches things, by `systems.partitioned`.
 
     Args:
-        model: The robot, of `surrounded` for example.
+        model: The robot, of `with_contacts` for example.
         period: Of every call [s].
         substeps: Steps in one.
         stepper: Of the body; one for grasps if omitted: a `ContactMidpoint` that keeps

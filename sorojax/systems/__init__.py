@@ -1,97 +1,121 @@
 """Systems: blocks with ports, networks of them, and their simulation."""
 
 from sorojax._arguments import check_package as _check_package
-from sorojax.math.ode.explicit import (
-    RungeKutta4 as RungeKutta4,
-    SemiImplicitEuler as SemiImplicitEuler,
-    Tsit5 as Tsit5,
-)
-from sorojax.math.ode.generalised_alpha import GeneralisedAlpha as GeneralisedAlpha
-from sorojax.math.ode.rosenbrock import Rodas4 as Rodas4, Rosenbrock2 as Rosenbrock2
+from sorojax.math.ode.explicit import RungeKutta4, SemiImplicitEuler, Tsit5
+from sorojax.math.ode.generalised_alpha import GeneralisedAlpha
+from sorojax.math.ode.rosenbrock import Rodas4, Rosenbrock2
 from sorojax.systems.blocks.algebra import (
-    AbstractReference as AbstractReference,
-    Constant as Constant,
-    Function as Function,
-    Lag as Lag,
-    Sensor as Sensor,
-    Sine as Sine,
-    SmoothRamp as SmoothRamp,
-    Source as Source,
-    Step as Step,
-    Waypoints as Waypoints,
-    gain as gain,
-    sum_of as sum_of,
+    AbstractReference,
+    Constant,
+    Function,
+    Lag,
+    Sensor,
+    Sine,
+    SmoothRamp,
+    Source,
+    Step,
+    Waypoints,
+    gain,
+    sum_of,
 )
-from sorojax.systems.blocks.block import (
-    AbstractBlock as AbstractBlock,
-    Input as Input,
-    Output as Output,
-    Stack as Stack,
-    stack as stack,
-)
-from sorojax.systems.blocks.fem_body import FemBody as FemBody
-from sorojax.systems.blocks.fluidic import (
-    Regulator as Regulator,
-    Reservoir as Reservoir,
-    Valve as Valve,
-)
-from sorojax.systems.blocks.modal_body import (
-    Basis as Basis,
-    ModalBody as ModalBody,
-    displacement as displacement,
-    modal_basis as modal_basis,
-    reduced as reduced,
-)
-from sorojax.systems.blocks.rigid_body import RigidBody as RigidBody, Touch as Touch
-from sorojax.systems.blocks.rod_body import (
-    AssemblyBody as AssemblyBody,
-    RodBody as RodBody,
-    body_motion as body_motion,
-)
-from sorojax.systems.control.controller import (
-    PID as PID,
-    AbstractController as AbstractController,
-    PIDMemory as PIDMemory,
-)
+from sorojax.systems.blocks.block import AbstractBlock, Input, Output, Stack, stack
+from sorojax.systems.blocks.fem_body import FemBody
+from sorojax.systems.blocks.fluidic import Regulator, Reservoir, Valve
+from sorojax.systems.blocks.modal_body import displacement, modal_basis, modal_body
+from sorojax.systems.blocks.rigid_body import RigidBody, Touch
+from sorojax.systems.blocks.rod_body import AssemblyBody, RodBody, body_motion
+from sorojax.systems.contact_history import contact_history
+from sorojax.systems.control.controller import PID, AbstractController
 from sorojax.systems.control.model_control import (
-    CartesianImpedance as CartesianImpedance,
-    Compensation as Compensation,
-    ComputedTorque as ComputedTorque,
-    ControlForce as ControlForce,
-    EnergyShaping as EnergyShaping,
-    FeedForward as FeedForward,
-    Followed as Followed,
-    TipSpring as TipSpring,
-    followed as followed,
+    CartesianImpedance,
+    Compensation,
+    ComputedTorque,
+    ControlForce,
+    EnergyShaping,
+    FeedForward,
+    TipSpring,
+    tracking,
 )
 from sorojax.systems.control.shape_estimate import (
-    Filtered as Filtered,
-    Markers as Markers,
-    Shape as Shape,
-    ShapeFilter as ShapeFilter,
-    estimate_shape as estimate_shape,
-    start_filter as start_filter,
-    update_filter as update_filter,
+    Markers,
+    ShapeFilter,
+    estimate_shape,
+    start_filter,
+    update_filter,
 )
-from sorojax.systems.integrate.batch import simulate_batch as simulate_batch
-from sorojax.systems.integrate.coupled import Coupled as Coupled
-from sorojax.systems.integrate.event import Event as Event, Happened as Happened
-from sorojax.systems.integrate.partitioned import Parted as Parted, partitioned as partitioned
-from sorojax.systems.integrate.sampled import (
-    Sampled as Sampled,
-    simulate_sampled as simulate_sampled,
-)
-from sorojax.systems.integrate.simulate import (
-    Trajectory as Trajectory,
-    last_state as last_state,
-    simulate as simulate,
-    state_at as state_at,
-)
-from sorojax.systems.network import (
-    Network as Network,
-    as_term as as_term,
-    outputs as outputs,
-)
-from sorojax.systems.touching import Touching as Touching, touching as touching
+from sorojax.systems.integrate.batch import simulate_batch
+from sorojax.systems.integrate.coupled import Coupled
+from sorojax.systems.integrate.event import Event
+from sorojax.systems.integrate.partitioned import partitioned
+from sorojax.systems.integrate.sampled import Sampled, simulate_sampled
+from sorojax.systems.integrate.simulate import Trajectory, last_state, simulate, state_at
+from sorojax.systems.network import Network, as_term, outputs
+
+__all__ = [
+    "AbstractBlock",
+    "AbstractController",
+    "AbstractReference",
+    "AssemblyBody",
+    "CartesianImpedance",
+    "Compensation",
+    "ComputedTorque",
+    "Constant",
+    "ControlForce",
+    "Coupled",
+    "EnergyShaping",
+    "Event",
+    "FeedForward",
+    "FemBody",
+    "Function",
+    "GeneralisedAlpha",
+    "Input",
+    "Lag",
+    "Markers",
+    "Network",
+    "Output",
+    "PID",
+    "Regulator",
+    "Reservoir",
+    "RigidBody",
+    "RodBody",
+    "Rodas4",
+    "Rosenbrock2",
+    "RungeKutta4",
+    "Sampled",
+    "SemiImplicitEuler",
+    "Sensor",
+    "ShapeFilter",
+    "Sine",
+    "SmoothRamp",
+    "Source",
+    "Stack",
+    "Step",
+    "TipSpring",
+    "Touch",
+    "Trajectory",
+    "Tsit5",
+    "Valve",
+    "Waypoints",
+    "as_term",
+    "body_motion",
+    "contact_history",
+    "displacement",
+    "estimate_shape",
+    "gain",
+    "last_state",
+    "modal_basis",
+    "modal_body",
+    "outputs",
+    "partitioned",
+    "simulate",
+    "simulate_batch",
+    "simulate_sampled",
+    "stack",
+    "start_filter",
+    "state_at",
+    "sum_of",
+    "tracking",
+    "update_filter",
+]
 
 _check_package(__name__)

@@ -169,7 +169,7 @@ def scene_of(thing: Any, *at: Any, **options: Any) -> Scene:
         TypeError: If `thing` has no scene.
 
     Example:
-        `view.show(view.joined(view.scene_of(ball), view.scene_of(hand, q)), view="top")`
+        `view.show(view.merge_scenes(view.scene_of(ball), view.scene_of(hand, q)), view="top")`
     """
     for kind in type(thing).__mro__:
         entry = _SCENES.get(f"{kind.__module__}.{kind.__qualname__}")

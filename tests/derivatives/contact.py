@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax import contact as C, sdf
+from sorojax.contact.facet import contacts, gaps
 from tests.derivatives.case import Case
 
 NONE = {
@@ -18,15 +19,15 @@ LAW = C.Penalty(1e7, 1e-3)
 RUB = C.Coulomb(0.4, 1e6)
 
 CASES = {
-    "gaps": Case(lambda at: C.gaps(*at), (BALL, POINTS, jnp.array([1e-3, 0, 2e-3]))),
+    "gaps": Case(lambda at: gaps(*at), (BALL, POINTS, jnp.array([1e-3, 0, 2e-3]))),
     "contacts": Case(
-        lambda at: C.contacts(*at),
+        lambda at: contacts(*at),
         (LAW, BALL, POINTS, jnp.full(3, 1e-4), jnp.array([1e-3, 0.0, 2e-3])),
         step=1e-6,
         rtol=1e-6,
     ),
     "contacts of spheres": Case(
-        lambda at: C.contacts(*at[:-1], offset=at[-1]),
+        lambda at: contacts(*at[:-1], offset=at[-1]),
         (LAW, BALL, 1.1 * POINTS, jnp.full(3, 1e-4), jnp.full(3, 5e-3)),
         step=1e-6,
         rtol=1e-6,

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sorojax import design, fem, material, mesh
+from sorojax import Status, design, fem, material, mesh
 from sorojax.design import pneunet
 from sorojax.design.calibration.calibration import sensitivity
+from sorojax.fem.equilibrium.solve import Path
 from tests.derivatives.case import Case
 from tests.derivatives.fem import SHARP, drawn, uneven
 
@@ -181,9 +182,7 @@ def judged(verb, *more):
 
 
 def path_error(problem, u, targets):
-    path = fem.Path(
-        problem, jnp.stack([u, 2 * u]), targets, "force", fem.Status.successful, None
-    )
+    path = Path(problem, jnp.stack([u, 2 * u]), targets, "force", Status.successful, None)
     return design.path_error(path, RIGHT, targets)
 
 

@@ -76,7 +76,7 @@ def touching(radius=1.05, **options):
 
 
 def two_plates():
-    both = mesh.joined(
+    both = mesh.merge(
         upper=mesh.rectangle([0.03, 0.46], [0.83, 0.9], divisions=(1, 1)),
         lower=mesh.rectangle([0, 0], [1.0, 0.5], divisions=(1, 1)),
     )
@@ -154,7 +154,7 @@ CASES = {
 def after_friction():
     """Some points held and some sliding since the state that friction knows of."""
     problem, u = moved(TERMS["Contact with friction"]())
-    gripped = fem.advanced(problem, u)
+    gripped = fem.update_friction(problem, u)
     return Case(lambda at: fem.residual(*at), (gripped, u + 5e-3), step=1e-5, forward=False)
 
 
@@ -207,7 +207,7 @@ MEASURES = {
     ),
     "contact_state": (fem.contact_state, TERMS["Contact"]),
     "overlap": (fem.overlap, TERMS["Contact"]),
-    "advanced": (fem.advanced, TERMS["Contact with friction"]),
+    "advanced": (fem.update_friction, TERMS["Contact with friction"]),
     "with_imperfection": (
         lambda p, u: fem.with_imperfection(p, u, jnp.sum(p.kinematics.thickness)), plate,
     ),
@@ -376,7 +376,7 @@ def modal(verb):
 
     def make():
         modes = fem.eigenmodes(loaded(), count=2)
-        shape = (2,) if verb is fem.expand else PLATE.points.shape
+        shape = (2,) if verb is fem.modal_displacement else PLATE.points.shape
         return Case(at, (modes, jnp.asarray(drawn(1.0, shape))), jit=False, forward=False)
 
     return make
@@ -412,7 +412,7 @@ CASES |= {
         lambda: moved(TERMS["Pressure"]()), lambda at: fem.tangent_modes(*at, 2)
     ),
     "residual of a sheet and its stiffness": at_state(stiffness_along, sheet),
-    "expand": modal(fem.expand),
+    "expand": modal(fem.modal_displacement),
     "modal_coordinates": modal(fem.modal_coordinates),
     "modal_force": modal(fem.modal_force),
     "simulate": lambda: moving(PULLED(), ALPHA, VISCOUS),

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax import mesh as M, sdf
+from sorojax.sdf.operations.booleans import Difference
 from tests.derivatives.case import Case
 
 NONE = {
@@ -28,7 +29,7 @@ SIZES = ([0.0, 0.0], [3.0, 2.0], [1.4, 1.0], 0.5)
 
 def frame(lower, upper, center, radius):
     """Its corners stay sharp: at no radius their slope has two sides."""
-    return sdf.Difference(sdf.Rectangle(lower, upper), sdf.Circle(center, radius))
+    return Difference(sdf.Rectangle(lower, upper), sdf.Circle(center, radius))
 
 
 FRAME = frame(*SIZES)

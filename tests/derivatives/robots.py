@@ -51,7 +51,7 @@ def pressures(numbers):
 
 
 CASES = {
-    "below": Case(robots.below, 0.3),
+    "below": Case(robots.pose_below, 0.3),
     "upside_down": Case(robots.upside_down, 0.3),
     "cylinder": Case(lambda at: robots.cylinder(*at), (0.3, 0.02, 0.05)),
     "ring": Case(hung, 0.04),

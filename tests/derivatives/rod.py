@@ -97,7 +97,7 @@ def dynamics(at):
     model, q, v, wrench = at
     forces = (R.Gravity(DOWN), R.Damping(0.02), R.TipWrench(wrench))
     if not isinstance(model, R.Rod):
-        forces = tuple(R.On("finger", force) for force in forces)
+        forces = tuple(R.PartForce("finger", force) for force in forces)
     a = R.forward_dynamics(model, q, v, forces)
     field = R.vector_field(model, forces)
     return (
@@ -169,7 +169,7 @@ def laws(at):
         return stiffness * (strain + 3 * strain**3) * (1 + s)
 
     section = R.section_law(model, stress)
-    varying = R.Varying(lambda x: R.TipWrench(x * WRENCH), lambda t: tension * t**2)
+    varying = R.TimeVaryingForce(lambda x: R.TipWrench(x * WRENCH), lambda t: tension * t**2)
     push = R.Actuation(lambda q: jnp.stack([q, q**2], axis=1), jnp.stack([tension, -tension]))
     plain = R.total_force((), T, here)
     return (
@@ -212,7 +212,7 @@ def pair_of(other):
 def stone(at):
     law, shape, q, v = at
     pair = pair_of(R.Link(0.05, 1e-5))
-    contact = R.Between("rod", "stone", R.LinkContact(shape, 6e-3, law, points=16))
+    contact = R.PairForce("rod", "stone", R.LinkContact(shape, 6e-3, law, points=16))
     here = R.motion(pair, q, v)
     return R.total_force((contact,), T, here) - R.total_force((), T, here)
 
@@ -220,7 +220,7 @@ def stone(at):
 def two_rods(at):
     law, radii, q, v = at
     pair = pair_of(COIL)
-    contact = R.Between("rod", "stone", R.RodContact(radii, law, points=24))
+    contact = R.PairForce("rod", "stone", R.RodContact(radii, law, points=24))
     here = R.motion(pair, q, v)
     return R.total_force((contact,), T, here) - R.total_force((), T, here)
 
@@ -274,7 +274,7 @@ def goal(at=GOAL, model=FLAT, **numbers):
 
 
 def clear(ball):
-    return (R.Clear(ball, EVERYWHERE, 3e-3),)
+    return (R.ObstacleConstraint(ball, EVERYWHERE, 3e-3),)
 
 
 def between(bound):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from sorojax import fem, material, mesh, rod as R, sdf, systems as S
 from sorojax.contact import LinePenalty
 from sorojax.math.lie import SE2
+from sorojax.rod.dynamics.rollout import Rollout
 from tests.derivatives.case import Case
 
 NONE = {
@@ -112,8 +113,8 @@ def efforts(at):
 
 def moments(at):
     law, q, v = at
-    still = R.Rollout(jnp.array([0.1, 0.2]), jnp.stack([q, 2 * q]), jnp.stack([v, v]), None)
-    return S.followed(law, still)
+    still = Rollout(jnp.array([0.1, 0.2]), jnp.stack([q, 2 * q]), jnp.stack([v, v]), None)
+    return S.tracking(law, still)
 
 
 FLOOR = sdf.Rectangle([-1.0, -1.0], [1.0, -0.005])
@@ -122,7 +123,7 @@ FLOOR = sdf.Rectangle([-1.0, -1.0], [1.0, -0.005])
 def pressed(at):
     law, q, v = at
     contact = R.ObstacleContact(FLOOR, 6e-3, law, points=16)
-    found = S.touching(FINGER, (contact,), q[None], v[None])
+    found = S.contact_history(FINGER, (contact,), q[None], v[None])
     return found.overlap, found.push, found.effort
 
 
@@ -158,7 +159,7 @@ def few_shapes():
     body, basis = solid()
 
     def call(at):
-        modal = S.reduced(at[0], basis)
+        modal = S.modal_body(at[0], basis)
         return modal.vector_field(T, {"q": at[1], "v": 0.1 * at[1]}, {}), S.displacement(
             basis, at[1]
         )

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import fem, material, mesh
+from sorojax import Status, fem, material, mesh
 from sorojax.mesh import Mesh
 
 RUBBER = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.49, density=1000.0)
@@ -52,7 +52,7 @@ def test_no_step_goes_where_a_cell_would_vanish():
     """Squeezed flat in one step: cut, or given up with the last state that is in balance."""
     answer = fem.solve(block(RUBBER, -1e9), max_cuts=4, throw=False)
     assert jnp.all(jnp.isfinite(answer.displacement))
-    assert answer.status == fem.Status.not_converged
+    assert answer.status == Status.not_converged
     assert 0 <= answer.load_fraction < 1 and answer.stats.reason
 
 
@@ -61,7 +61,7 @@ def test_no_step_goes_where_a_cell_would_vanish():
 def test_a_start_inside_out_or_in_one_line_is_left_for_rest(scale):
     start = other_side(scale)
     answer = fem.solve(block(), start=start, throw=False)
-    assert answer.status == fem.Status.successful
+    assert answer.status == Status.successful
     rest = fem.solve(block())
     assert jnp.allclose(answer.displacement, rest.displacement, rtol=0, atol=1e-9)
 
@@ -141,7 +141,7 @@ def test_a_load_a_hundred_times_the_step_that_converges():
     problem = block(pull=-5e5)
     small = fem.solve(problem, steps=100)
     large = fem.solve(problem, max_cuts=10, throw=False)
-    assert large.status == fem.Status.successful
+    assert large.status == Status.successful
     assert jnp.allclose(large.displacement, small.displacement, rtol=0, atol=1e-8)
 
 

@@ -9,6 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import SE2, fem, material, mesh, reduction, robots, rod, sdf, systems
+from sorojax.fem.equilibrium.solve import Path
+from sorojax.material.fit import TensileFit
+from sorojax.reduction.backbone import Backbone
+from sorojax.reduction.identify import Fit
 from sorojax.robots import BellowsActuator
 from sorojax.units import kPa, ml, mm
 
@@ -22,7 +26,7 @@ class Design(NamedTuple):
     """The actuator, its rubber and the boundary value problem on its cross-section."""
 
     actuator: BellowsActuator
-    tensile: material.TensileFit
+    tensile: TensileFit
     problem: fem.Problem
     area: float
     meshed_area: float
@@ -82,7 +86,7 @@ class Sensitivity(NamedTuple):
         return abs(self.gradient["wall_thickness"] / self.difference - 1)
 
 
-def sensitivity(design: Design, path: fem.Path) -> Sensitivity:
+def sensitivity(design: Design, path: Path) -> Sensitivity:
     """d(tip rotation)/d(dimensions) by reverse mode, through mesh motion and equilibrium."""
     value, slopes = jax.value_and_grad(lambda a: tip_rotation(a, design, path))(design.actuator)
     names = (
@@ -101,7 +105,7 @@ def sensitivity(design: Design, path: fem.Path) -> Sensitivity:
     )
 
 
-def tip_rotation(actuator: BellowsActuator, design: Design, path: fem.Path) -> Float[Array, ""]:
+def tip_rotation(actuator: BellowsActuator, design: Design, path: Path) -> Float[Array, ""]:
     """Rotation of the end face [rad] at the last pressure of `path`, negative when the
     actuator curls towards its layer."""
     flat = design.problem.mesh
@@ -128,7 +132,7 @@ def end_face(design: Design) -> tuple[int, int]:
     )
 
 
-def _difference(design: Design, path: fem.Path, h: float) -> float:
+def _difference(design: Design, path: Path, h: float) -> float:
     def at(k: int) -> float:
         wall = design.actuator.wall_thickness + k * h
         changed = eqx.tree_at(lambda a: a.wall_thickness, design.actuator, wall)
@@ -147,17 +151,17 @@ DAMPING_TIME = 0.01
 class Reduced(NamedTuple):
     """Backbone snapshots, strain modes, identified laws and the rod with them."""
 
-    backbone: reduction.Backbone
+    backbone: Backbone
     basis: rod.StrainBasis
     captured: dict[str, float]
-    fit: reduction.Fit
+    fit: Fit
     rod: rod.Rod
     forces: tuple
     states: Float[Array, "steps dof"]
     errors: Float[np.ndarray, " steps"]
 
 
-def reduce(design: Design, path: fem.Path) -> Reduced:
+def reduce(design: Design, path: Path) -> Reduced:
     """Three bending modes from the path, and the rod's own equilibrium at every pressure.
 
     `errors` is the mean distance [m] between the rod's backbone and that of the solid.
@@ -216,7 +220,7 @@ def controller(
     )
 
 
-def closed_loop(reduced: Reduced, path: fem.Path, duration: float) -> systems.Network:
+def closed_loop(reduced: Reduced, path: Path, duration: float) -> systems.Network:
     """Reservoir, regulator, rod and PID: the tip follows a reference angle."""
     full = float(_tip_angle(reduced, -1))
     reference = systems.Source(reference_angle(full, duration), unit="rad")

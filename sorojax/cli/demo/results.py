@@ -18,16 +18,18 @@ from sorojax.cli.demo.design import (
     Sensitivity,
     Tracking,
 )
+from sorojax.fem.equilibrium.solve import Path as FemPath
 from sorojax.math.lie import homogeneous
 from sorojax.mesh import chambers
 from sorojax.units import kPa, mm
+from sorojax.view.film.film import Film
 
 
 class Results(NamedTuple):
     """What the stages found."""
 
     design: Design
-    path: fem.Path
+    path: FemPath
     slope: Sensitivity
     reduced: Reduced
     film: systems.Trajectory
@@ -120,7 +122,7 @@ def pictures(r: Results) -> dict[str, Any]:
     }
 
 
-def _film(r: Results) -> view.Film:
+def _film(r: Results) -> Film:
     """The mesh on the rod, its chambers coloured by pressure, and the wanted direction."""
     mesh, actuator, film = r.design.problem.mesh, r.design.actuator, r.film
     middle = float(actuator.layer_thickness) / 2

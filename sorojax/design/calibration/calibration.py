@@ -270,13 +270,13 @@ class Calibration(eqx.Module):
             f"  {name:<20s} {float(p):.5g} +- {e:.2g}{'  at its bound' * bool(bound)}"
             for name, p, e, bound in zip(self.names, values, errors, self.at_bound, strict=True)
         ]
-        rows += [f"  not seen: {each}" for each in unseen(self)]
+        rows += [f"  not seen: {each}" for each in unidentifiable(self)]
         rows += [f"  {check}" for check in self.experiments]
         rows += [f"  held out, {check}" for check in self.held_out]
         return "\n".join(rows)
 
 
-def unseen(calibration: Calibration, limit: float = 1.0) -> tuple[Combination, ...]:
+def unidentifiable(calibration: Calibration, limit: float = 1.0) -> tuple[Combination, ...]:
     """Combinations of parameters that the experiments do not tell to better than `limit`.
 
     A standard deviation of 1 is a factor of e for logarithmic parameters and the size of the
@@ -294,7 +294,9 @@ def unseen(calibration: Calibration, limit: float = 1.0) -> tuple[Combination, .
     return tuple(found)
 
 
-def checked(calibration: Calibration, experiments: tuple[Experiment, ...]) -> tuple[Check, ...]:
+def validate(
+    calibration: Calibration, experiments: tuple[Experiment, ...]
+) -> tuple[Check, ...]:
     """Further records beside their predictions: held out, they tell what the model is worth.
 
     Each takes one solve and one back-substitution for every parameter.

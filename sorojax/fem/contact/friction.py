@@ -14,7 +14,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sorojax.contact import Grip, clearance, far, gaps, no_grip
+from sorojax.contact.broadphase import clearance, far
+from sorojax.contact.facet import gaps
+from sorojax.contact.friction import Grip, no_grip
 from sorojax.fem.loads.facets import blockwise, facet_tables
 from sorojax.mesh.mesh import Mesh
 

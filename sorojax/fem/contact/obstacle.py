@@ -14,7 +14,10 @@ from jaxtyping import Array, Float, Int
 from sorojax import _check
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import integers, optional_real, real
-from sorojax.contact import Contacts, Coulomb, Grip, Penalty, contacts, far, gaps
+from sorojax.contact import Coulomb, Penalty
+from sorojax.contact.broadphase import far
+from sorojax.contact.facet import Contacts, contacts, gaps
+from sorojax.contact.friction import Grip
 from sorojax.fem.contact.friction import Start, at_end, felt, gripped, released, untouched
 from sorojax.fem.loads.facets import CurvedPart, facet_tables, group_energy, normals
 from sorojax.fem.loads.loads import AbstractLoad

@@ -14,9 +14,9 @@ from jaxtyping import Array, Bool, Float, Int
 from sorojax import _check
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import integers, optional_real, real
-from sorojax.contact import Contacts, Penalty
+from sorojax.contact import Penalty
 from sorojax.contact.broadphase import close_pairs, listed
-from sorojax.contact.facet import over, pieces, shared
+from sorojax.contact.facet import Contacts, over, pieces, shared
 from sorojax.fem.checks import check_ids
 from sorojax.fem.contact.friction import at_end
 from sorojax.fem.contact.obstacle import areas_of, compact, default_law, mean_size
@@ -86,7 +86,7 @@ class SelfContact(AbstractLoad):
     `updated(problem, u)` makes them anew. A point counts as inside up to a depth of
     `reach`, and where the surfaces face each other.
 
-    Two sets belong to one mesh, `mesh.joined(first, second)` for two bodies. `value` [m] is
+    Two sets belong to one mesh, `mesh.merge(first, second)` for two bodies. `value` [m] is
     a clearance kept between the surfaces. `reach` is twice the mean size of the facets when
     omitted; `stiffness`, `smoothing` and `offset` are those of `Contact`.
     """

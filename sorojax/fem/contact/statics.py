@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from sorojax._jax.jit import once
 from sorojax._jax.trace_state import is_traced
 from sorojax._progress import report
-from sorojax.contact import Contacts
+from sorojax.contact.facet import Contacts
 from sorojax.fem.assembly.space import space
 from sorojax.fem.contact.friction import settled
 from sorojax.fem.contact.obstacle import Contact
@@ -25,7 +25,7 @@ from sorojax.math.status import Status
 Touching = Contact | SelfContact
 
 
-def advanced(problem: Problem, u: Float[Array, "nodes dim"]) -> Problem:
+def update_friction(problem: Problem, u: Float[Array, "nodes dim"]) -> Problem:
     """`problem` after the equilibrium `u` [m], with friction that knows of it.
 
     Friction of the next `solve` is taken at the pressures of `u`, and pulls towards where
@@ -34,7 +34,7 @@ def advanced(problem: Problem, u: Float[Array, "nodes dim"]) -> Problem:
         for force in forces:
             pulled = fem.with_load(problem, "pull", force)
             u = fem.solve(pulled, start=u).displacement
-            problem = fem.advanced(pulled, u)
+            problem = fem.update_friction(pulled, u)
 
     Differentiable; loads without memory stay as they are.
     """
@@ -85,7 +85,7 @@ def solve_contact(
         if not traced and (found <= penetration or bool(solution.status != Status.successful)):
             return solution
         lifted = _lifted(solution.problem, solution.displacement)
-        lifted = lifted if traced else updated(lifted, solution.displacement)
+        lifted = lifted if traced else update_contact_pairs(lifted, solution.displacement)
         solution = solve(lifted, start=solution.displacement, throw=throw, **options)
         found = overlap(solution.problem, solution.displacement)
         if not traced:
@@ -124,7 +124,7 @@ def _state(load: Touching, problem: Problem, u: Float[Array, "nodes dim"]) -> Co
     return load.state(problem, u)
 
 
-def updated(problem: Problem, u: Float[Array, "nodes dim"]) -> Problem:
+def update_contact_pairs(problem: Problem, u: Float[Array, "nodes dim"]) -> Problem:
     """`problem` whose self-contacts list the facets that are near each other at `u` [m].
 
     The sparse pattern, and with it the analysis of the solver, stays as long as it has room
@@ -136,8 +136,8 @@ def updated(problem: Problem, u: Float[Array, "nodes dim"]) -> Problem:
     """
     if is_traced((problem, u)):
         raise ValueError(
-            "fem.updated: got traced positions, need concrete ones. Call it between solves, "
-            "outside jit, grad and vmap."
+            "fem.update_contact_pairs: got traced positions, need concrete ones. Call it "
+            "between solves, outside jit, grad and vmap."
         )
     loads = tuple(
         with_partners(load, problem.mesh, np.asarray(u))

@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sorojax.contact import far, passes
+from sorojax.contact.broadphase import far
+from sorojax.contact.swept import passes
 from sorojax.fem.contact.obstacle import Contact
 from sorojax.fem.contact.self_contact import SelfContact
 from sorojax.fem.dynamics.step import Dynamics, Matter, State, Step

@@ -10,7 +10,7 @@ from sorojax.fem.dynamics.motion import Motion
 from sorojax.fem.problem import body
 
 
-class Switching(eqx.Module):
+class ContactSwitching(eqx.Module):
     """What the points of all contacts of a motion did up to each saved time.
 
     The slope of friction jumps where a point begins to slide or to hold; that of the pressure
@@ -33,7 +33,9 @@ class Switching(eqx.Module):
     near: Bool[Array, " times"]
 
 
-def switching(motion: Motion, share: float | Float[Array, ""] = 1e-3) -> Switching:
+def contact_switching(
+    motion: Motion, share: float | Float[Array, ""] = 1e-3
+) -> ContactSwitching:
     """How near `motion` came to switching points, at its saved times; save every step to see
     all of them. Runs inside `jit`, `grad` (as auxiliary output) and `vmap`.
 
@@ -42,14 +44,14 @@ def switching(motion: Motion, share: float | Float[Array, ""] = 1e-3) -> Switchi
     """
     if not any(isinstance(load, Contact) for load in motion.problem.loads):
         raise ValueError(
-            "fem.switching: got a motion without fem.Contact, need one. Contacts of bodies "
-            "with each other have no friction and a smooth pressure."
+            "fem.contact_switching: got a motion without fem.Contact, need one. Contacts of "
+            "bodies with each other have no friction and a smooth pressure."
         )
     return _switching(motion, jnp.asarray(share, motion.displacements.dtype))
 
 
 @eqx.filter_jit
-def _switching(motion: Motion, share) -> Switching:
+def _switching(motion: Motion, share) -> ContactSwitching:
     moving, rest = eqx.partition(motion.states.memory, eqx.is_inexact_array)
     problem = body(motion.problem)
 
@@ -65,7 +67,7 @@ def _switching(motion: Motion, share) -> Switching:
     turned |= touches[1:] & touches[:-1] & (slides[1:] != slides[:-1])
     turned = jnp.concatenate([begins, turned])
     near = (jnp.abs(gap) < share * smooth) | (slip < share)
-    return Switching(
+    return ContactSwitching(
         jnp.min(jnp.abs(gap), axis=1), jnp.min(slip, axis=1), jnp.any(turned, axis=1),
         jnp.any(near, axis=1),
     )  # fmt: skip

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from sorojax.fem.assembly import assemble as asm
 from sorojax.fem.contact.self_contact import SelfContact, with_partners
-from sorojax.fem.contact.statics import updated
+from sorojax.fem.contact.statics import update_contact_pairs
 from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import Prepared, add_load_stiffness
 from sorojax.fem.equilibrium.newton import Newton, Secants, safe_fraction
@@ -147,7 +147,7 @@ def listed_at(problem: Problem, now: Nodal, listed: Nodal | None) -> tuple[Probl
     they were made at: `listed` as long as no facet has moved much from there."""
     if listed is not None and not _outdated(problem, np.asarray(now - listed)):
         return problem, listed
-    return updated(problem, now), now
+    return update_contact_pairs(problem, now), now
 
 
 def _outdated(problem: Problem, moved: np.ndarray) -> bool:

@@ -276,7 +276,7 @@ def _signed(shapes: np.ndarray) -> np.ndarray:
     return (flat * np.sign(largest)).reshape(shapes.shape)
 
 
-def expand(
+def modal_displacement(
     modes: Modes, coordinates: Float[Array, "... modes"]
 ) -> Float[Array, "... nodes dim"]:
     """Displacement [m] of modal coordinates q: u = u_0 + sum_k q_k phi_k."""

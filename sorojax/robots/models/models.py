@@ -27,19 +27,10 @@ from sorojax.robots.models.supply import (
     Running,
     Supply,
     stepper,
-    supplied,
+    with_pneumatics,
 )
 from sorojax.robots.printable import BendingActuator, Finger, Hand, Manipulator, PlanarActuator
-from sorojax.rod import (
-    Assembly,
-    Gravity,
-    Link,
-    On,
-    Part,
-    assembly,
-    chebyshev,
-    constant,
-)
+from sorojax.rod import Assembly, Gravity, Link, Part, PartForce, assembly, chebyshev, constant
 from sorojax.sdf import Box, Cylinder, HalfSpace, translate
 from sorojax.systems import (
     AssemblyBody,
@@ -156,7 +147,7 @@ def _(robot: BendingActuator, making: Making) -> Model:
         tip=Part(tip, on="actuator", offset=_placed(jnp.eye(2), jnp.stack([half, zero]))),
     )  # fmt: skip
     port = Port(("actuator",), made.chambers.rest[0], -10 * kPa, 100 * kPa)
-    return supplied(_moving(whole, actuator=made), {"actuator": port}, making.supply)
+    return with_pneumatics(_moving(whole, actuator=made), {"actuator": port}, making.supply)
 
 
 @_model.register
@@ -176,7 +167,7 @@ def _(robot: PlanarActuator, making: Making) -> Model:
         SE2(), bellows=Part(made.rod, offset=upright), plate=Part(_flat(plate), on="bellows")
     )
     port = Port(("bellows",), made.chambers.rest, -10 * kPa, 50 * kPa, count=2)
-    return supplied(_moving(whole, bellows=made), {"bellows": port}, making.supply)
+    return with_pneumatics(_moving(whole, bellows=made), {"bellows": port}, making.supply)
 
 
 @_model.register
@@ -195,7 +186,7 @@ def _(robot: Hand, making: Making) -> Model:
         ports[name] = Port(
             (name,), one.body.chambers.rest[0], -10 * kPa, 60 * kPa, dead=one.dead
         )
-    return supplied(_moving(assembly(SE3(), **parts), **bodies), ports, making.supply)
+    return with_pneumatics(_moving(assembly(SE3(), **parts), **bodies), ports, making.supply)
 
 
 @_model.register
@@ -231,7 +222,7 @@ def _(robot: Manipulator, making: Making) -> Model:
             fingers, 3 * one.body.chambers.rest[0], -30 * kPa, 60 * kPa, dead=3 * one.dead
         ),
     }
-    return supplied(_moving(assembly(SE3(), **parts), **bodies), ports, making.supply)
+    return with_pneumatics(_moving(assembly(SE3(), **parts), **bodies), ports, making.supply)
 
 
 class StandingFinger(NamedTuple):
@@ -274,7 +265,7 @@ def _upper_plate(robot: Manipulator):
 def _moving(whole: Assembly, **bodies: Body) -> AssemblyBody:
     listed: list[Any] = [Gravity()]
     for name, one in bodies.items():
-        listed += [On(name, force) for force in (*one.forces, one.chambers)]
+        listed += [PartForce(name, force) for force in (*one.forces, one.chambers)]
     return AssemblyBody(whole, tuple(listed))
 
 

@@ -134,7 +134,7 @@ class Model(eqx.Module):
         return jnp.concatenate(found)
 
 
-def supplied(
+def with_pneumatics(
     body: AbstractBlock, ports: Mapping[str, Port], supply: Supply | None = None
 ) -> Model:
     """A body with a reservoir and a regulator at every port.
@@ -231,9 +231,9 @@ def stepper(
         ...                  young_modulus=1e6, poisson_ratio=0.5, density=1000)
         >>> tube = rod.thread_chambers(finger, rod.Straight([3 * mm, 0]), 20e-6)
         >>> body = systems.AssemblyBody(rod.assembly(SE2(), finger=rod.Part(finger)),
-        ...                             (rod.On("finger", tube), rod.Damping(0.05)))
+        ...                             (rod.PartForce("finger", tube), rod.Damping(0.05)))
         >>> port = robots.Port(("finger",), volume=2e-6, low=0.0, high=50 * kPa)
-        >>> advance, running = robots.stepper(robots.supplied(body, {"air": port}), 0.02)
+        >>> advance, running = robots.stepper(robots.with_pneumatics(body, {"air": port}), 0.02)
         >>> for _ in range(5):
         ...     running, pressure = advance(running, [10 * kPa], 0.02)
         >>> print(f"{float(pressure[0]) / kPa:.1f} kPa")

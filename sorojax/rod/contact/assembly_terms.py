@@ -21,7 +21,7 @@ from sorojax.rod.contact.terms import (
 )
 from sorojax.rod.dynamics.composite import part_columns
 from sorojax.rod.dynamics.tree import AssemblyMotion, each, part_motion
-from sorojax.rod.forces.loads import Between, Load, On, check, total_force
+from sorojax.rod.forces.loads import Load, PairForce, PartForce, check, total_force
 from sorojax.rod.model.assembly import index_of
 from sorojax.rod.model.rod import Rod
 
@@ -99,12 +99,12 @@ def any_contact(forces: tuple[Load, ...]) -> bool:
 
 
 def _is_contact(force: Load) -> bool:
-    inner = force.force if isinstance(force, On | Between) else force
+    inner = force.force if isinstance(force, PartForce | PairForce) else force
     return isinstance(inner, (AbstractContact, *PAIRS))
 
 
-def _parts(model: Any, force: On | Between) -> tuple[int, ...]:
-    names = (force.part,) if isinstance(force, On) else (force.first, force.second)
+def _parts(model: Any, force: PartForce | PairForce) -> tuple[int, ...]:
+    names = (force.part,) if isinstance(force, PartForce) else (force.first, force.second)
     return tuple(index_of(model, name) for name in names)
 
 

@@ -33,7 +33,7 @@ from sorojax.rod.model.rod import Rod
 _SHAPE_ONLY = (AbstractElastic, AbstractDamping, Pressurised, AbstractPressureMap)
 
 
-class On(eqx.Module):
+class PartForce(eqx.Module):
     """A force on one part, named as in the assembly."""
 
     part: str = eqx.field(static=True)
@@ -50,7 +50,7 @@ class AbstractPairForce(eqx.Module):
         """Generalised forces in the columns of each motion."""
 
 
-class Between(eqx.Module):
+class PairForce(eqx.Module):
     """A force between two parts, named as in the assembly."""
 
     first: str = eqx.field(static=True)
@@ -65,7 +65,7 @@ class JointEffort(eqx.Module):
     effort: Float[Array, "*joint"] = eqx.field(converter=real)
 
 
-Load = AbstractForce | On | Between | JointEffort
+Load = AbstractForce | PartForce | PairForce | JointEffort
 
 
 def total_force(
@@ -79,7 +79,7 @@ def total_force(
     for force in forces:
         if isinstance(force, Gravity):
             _add(loads, dict(enumerate(_weights(motion, force, t))))
-        elif isinstance(force, Between):
+        elif isinstance(force, PairForce):
             ends = [index_of(motion.assembly, name) for name in (force.first, force.second)]
             pair = force.force(t, *(part_motion(motion, k) for k in ends))
             _add(loads, dict(zip(ends, pair, strict=True)))
@@ -95,8 +95,10 @@ def on_model(forces: tuple[Load, ...], model: Rod | Assembly) -> tuple[Load, ...
         return tuple(_on_body(force, model) for force in _plain(forces))
     check(model, forces)
     return tuple(
-        On(force.part, _on_body(force.force, model.parts[index_of(model, force.part)].body))
-        if isinstance(force, On)
+        PartForce(
+            force.part, _on_body(force.force, model.parts[index_of(model, force.part)].body)
+        )
+        if isinstance(force, PartForce)
         else force
         for force in forces
     )
@@ -150,9 +152,9 @@ def check(assembly: Assembly, forces: tuple[Load, ...]) -> None:
     for force in forces:
         names = (
             (force.part,)
-            if isinstance(force, On | JointEffort)
+            if isinstance(force, PartForce | JointEffort)
             else (force.first, force.second)
-            if isinstance(force, Between)
+            if isinstance(force, PairForce)
             else ()
         )
         for name in names:
@@ -169,7 +171,7 @@ def _on(forces: tuple[Load, ...], assembly: Assembly, index: int) -> tuple:
     name, found = assembly.names[index], []
     is_rod = isinstance(assembly.parts[index].body, Rod)
     for force in forces:
-        if isinstance(force, On) and force.part == name:
+        if isinstance(force, PartForce) and force.part == name:
             found.append(force.force)
         elif isinstance(force, AbstractDamping) and is_rod:
             found.append(force)
@@ -179,7 +181,7 @@ def _on(forces: tuple[Load, ...], assembly: Assembly, index: int) -> tuple:
 def _plain(forces: tuple[Load, ...]) -> Any:
     """Forces that may act on a single rod."""
     for force in forces:
-        if isinstance(force, On | Between | JointEffort):
+        if isinstance(force, PartForce | PairForce | JointEffort):
             raise ValueError(
                 f"rod: got {type(force).__name__}, which names a part, need a plain force. A "
                 "single rod has no parts: leave the name out, or build an assembly."
@@ -247,7 +249,7 @@ def _add(loads: list, terms: dict[int, Array]) -> None:
 # Forces whose numbers change with time
 
 
-class Varying(AbstractForce):
+class TimeVaryingForce(AbstractForce):
     """A force made anew at every instant from a signal: `make(signal(t))`.
 
     `Varying(TipWrench, wave)` is a tip wrench that follows `wave`, any function of time

@@ -28,14 +28,14 @@ from sorojax.rod.statics import reaching as answer
 from sorojax.rod.statics.equilibrium import first_guess
 from sorojax.rod.statics.reaching import Rows, Tasks, all_rows, pushed, rows, step
 from sorojax.rod.statics.tangent import increments, linearised, metric, moved
-from sorojax.rod.statics.targets import AbstractTarget, Clear
+from sorojax.rod.statics.targets import AbstractTarget, ObstacleConstraint
 from sorojax.rod.statics.validity import checked_status
 
 _DAMPING = 1e-3  # at the first step, relative to the mean square of the Jacobian
 _DRIFT_ERROR = 0.1  # error that a step in the null space may make, against its length
 
 
-class Reached(eqx.Module):
+class IKResult(eqx.Module):
     """Where inverse kinematics ended.
 
     Attributes:
@@ -59,14 +59,14 @@ def inverse_kinematics(
     targets: AbstractTarget | tuple[AbstractTarget, ...],
     q: Float[Array, " coordinates"] | None = None,
     *,
-    obstacles: tuple[Clear, ...] = (),
+    obstacles: tuple[ObstacleConstraint, ...] = (),
     limits: Sequence[Numbers] | None = None,
     forces: tuple[Load, ...] | None = None,
     t=0.0,
     accuracy=1e-6,
     iterations: int | None = None,
     max_iterations: int = 200,
-) -> Reached:
+) -> IKResult:
     """Coordinates that meet the targets, or come as close as the model can.
 
     Damped least squares (Levenberg-Marquardt). Obstacles and limits are inequality constraints:
@@ -161,7 +161,7 @@ def inverse_kinematics(
     finite = jnp.all(jnp.isfinite(found)) & jnp.isfinite(error)
     status = Status.where(finite, status, Status.not_finite)
     status = checked_status(status, model, found)
-    return Reached(found, status, error, overlap, count.astype(jnp.int32))
+    return IKResult(found, status, error, overlap, count.astype(jnp.int32))
 
 
 def _fixed(model, tasks: Tasks, at, q: Array, push, iterations: int):

@@ -17,7 +17,7 @@ from sorojax.rod.model.assembly import index_of
 from sorojax.rod.model.link import LinkMotion
 from sorojax.rod.model.model import Model
 from sorojax.rod.statics.tangent import increments, squared
-from sorojax.rod.statics.targets import AbstractTarget, Clear, Frames
+from sorojax.rod.statics.targets import AbstractTarget, Frames, ObstacleConstraint
 
 _ROUNDING = 16  # units in the last place that a coordinate on its limit may be away
 OBSTACLE_WEIGHT = 30.0  # of a bound against a target; sets how fast bounds are met
@@ -38,7 +38,7 @@ class Tasks(NamedTuple):
     """
 
     targets: tuple[AbstractTarget, ...]
-    obstacles: tuple[Clear, ...]
+    obstacles: tuple[ObstacleConstraint, ...]
     forces: tuple[Load, ...] | None
     limits: Limits | None
     metric: Float[Array, "dof dof"]
@@ -217,7 +217,9 @@ def _held(matrix: Array, free: Array, diagonal: float = 0.0) -> Array:
     return kept + jnp.diag((1 - free) * (diagonal * jnp.trace(matrix) / matrix.shape[0]))
 
 
-def _frames(moment: Motion | AssemblyMotion, task: AbstractTarget | Clear) -> Frames:
+def _frames(
+    moment: Motion | AssemblyMotion, task: AbstractTarget | ObstacleConstraint
+) -> Frames:
     """The sections of a task."""
     if isinstance(moment, Motion):
         if task.part is not None:

@@ -151,7 +151,7 @@ class OnSurface(AbstractTarget):
         return self.weight * (self.distance - gap), self.weight * made
 
 
-class Clear(eqx.Module):
+class ObstacleConstraint(eqx.Module):
     """Sections that stay outside an obstacle: a bound, not a wish.
 
     Attributes:

@@ -211,7 +211,7 @@ class ProjectedForce(AbstractModalForce):
 
 
 class ModalBody(AbstractBlock):
-    """A body that moves in the shapes of a basis; made by `reduced`. The state is {q, v}.
+    """A body that moves in the shapes of a basis; made by `modal_body`. The state is {q, v}.
 
     Ports are those of the `FemBody` that it stands for, and `q`. Some tens of states of
     moderate stiffness: `Rosenbrock2()` or `Rodas4()` step it.
@@ -291,7 +291,7 @@ def displacement(basis: Basis, q: Modes) -> Float[Array, "nodes dim"]:
     return basis.displacement + jnp.tensordot(q, basis.shapes, 1)
 
 
-def reduced(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBody:
+def modal_body(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBody:
     """The body in the shapes of `basis`; differentiable in the numbers of the body.
 
     Args:

@@ -6,7 +6,8 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import optional_real, real
-from sorojax.contact import Penalty, contacts
+from sorojax.contact import Penalty
+from sorojax.contact.facet import contacts
 from sorojax.math.lie import rotation_columns
 from sorojax.sdf.base import AbstractSdf
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output

@@ -13,8 +13,7 @@ from sorojax.rod import (
     AbstractPressureMap,
     Assembly,
     JointEffort,
-    Motion,
-    On,
+    PartForce,
     Pressurised,
     Rod,
     acceleration,
@@ -30,6 +29,7 @@ from sorojax.rod import (
     total_force,
 )
 from sorojax.rod.dynamics.dynamics import coordinate_rate
+from sorojax.rod.dynamics.fields import Motion
 from sorojax.rod.forces.loads import Load
 from sorojax.rod.model.assembly import index_of
 from sorojax.rod.statics.validity import checked_status
@@ -231,7 +231,7 @@ class AssemblyBody(AbstractBlock):
         """The forces under given inputs: maps with their pressures, joints with efforts."""
         plain = tuple(force for force in self.forces if not _maps((force,)))
         bound = tuple(
-            On(part, Pressurised(chamber, inputs[f"{part}_pressure"]))
+            PartForce(part, Pressurised(chamber, inputs[f"{part}_pressure"]))
             for part, chamber in self._maps().items()
         )
         driven = tuple(JointEffort(name, inputs[f"{name}_effort"]) for name in self.driven)
@@ -246,7 +246,7 @@ class AssemblyBody(AbstractBlock):
 
 def _maps(forces: tuple[Load, ...]) -> list[tuple[str, AbstractPressureMap]]:
     """The pressure maps, with the parts that they are on."""
-    on = [force for force in forces if isinstance(force, On)]
+    on = [force for force in forces if isinstance(force, PartForce)]
     return [(f.part, f.force) for f in on if isinstance(f.force, AbstractPressureMap)]
 
 

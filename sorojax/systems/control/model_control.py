@@ -17,9 +17,7 @@ from sorojax.math.compiled import door
 from sorojax.math.linalg.dense import solve_symmetric
 from sorojax.rod import (
     AbstractForce,
-    Motion,
     Rod,
-    Rollout,
     inertia,
     jacobian,
     jacobian_rate_product,
@@ -27,6 +25,8 @@ from sorojax.rod import (
     tip_pose,
     total_force,
 )
+from sorojax.rod.dynamics.fields import Motion
+from sorojax.rod.dynamics.rollout import Rollout
 from sorojax.systems.blocks.algebra import AbstractReference
 from sorojax.systems.blocks.block import Input, Output
 from sorojax.systems.control.controller import AbstractController
@@ -255,7 +255,7 @@ class ControlForce(AbstractForce):
 # What a law at the tip of a rod asked for along a motion, and what it got
 
 
-class Followed(NamedTuple):
+class Tracking(NamedTuple):
     """A law and its rod at the moments of a motion.
 
     Attributes:
@@ -270,10 +270,10 @@ class Followed(NamedTuple):
 
 
 @door
-def followed(law: CartesianImpedance, path: Rollout) -> Followed:
+def tracking(law: CartesianImpedance, path: Rollout) -> Tracking:
     """Set-points, tips and efforts of `law` along the motion `path` of its rod."""
 
     def at(t, q, v):
-        return Followed(law.reference(t), tip_pose(law.rod, q)[:-1, -1], law.effort(t, q, v))
+        return Tracking(law.reference(t), tip_pose(law.rod, q)[:-1, -1], law.effort(t, q, v))
 
     return jax.vmap(at)(path.time, path.q, path.v)

@@ -183,7 +183,7 @@ class ShapeFilter(eqx.Module):
             _check.positive("ShapeFilter", name, getattr(self, name), "", "See its docstring.")
 
 
-class Filtered(eqx.Module):
+class FilterState(eqx.Module):
     """State of a filter: coordinates, rates, their covariance, and since when.
 
     Attributes:
@@ -205,7 +205,7 @@ class Filtered(eqx.Module):
 
 def start_filter(
     estimator: ShapeFilter, q: Float[Array, " dof"] | None = None, *, spread=0.1
-) -> Filtered:
+) -> FilterState:
     """A filter at rest at `q` (zero if omitted).
 
     `spread` is how far off that may be: the displacement of the tip over the length.
@@ -215,7 +215,7 @@ def start_filter(
     size = spread * sizes(rod, q)
     covariance = jnp.diag(jnp.concatenate([size, size / estimator.period]) ** 2)
     nothing = jnp.zeros((), q.dtype)
-    return Filtered(
+    return FilterState(
         q, jnp.zeros_like(q), covariance, jnp.zeros((), jnp.int32), nothing, Status.successful
     )
 
@@ -223,12 +223,12 @@ def start_filter(
 @door
 def update_filter(
     estimator: ShapeFilter,
-    last: Filtered,
+    last: FilterState,
     positions: Float[Array, "markers dim"] | None = None,
     *,
     forces: Forces = (),
     t=0.0,
-) -> Filtered:
+) -> FilterState:
     """The estimate one period later, with what the camera saw by then, or without.
 
     Without markers (None, or all NaN) it is the prediction, with a growing covariance.
@@ -251,7 +251,7 @@ def update_filter(
     if positions is not None:
         state, covariance, error, seen = _corrected(estimator, state, covariance, positions)
         missed = jnp.where(seen > 0, jnp.zeros_like(missed), missed)
-    new = Filtered(state[:dof], state[dof:], covariance, missed, error, Status.successful)
+    new = FilterState(state[:dof], state[dof:], covariance, missed, error, Status.successful)
     fine = jnp.all(jnp.isfinite(state)) & jnp.all(jnp.isfinite(covariance))
     kept = jax.tree.map(
         lambda a, b: jnp.where(fine, a, b), eqx.filter(new, eqx.is_array), last

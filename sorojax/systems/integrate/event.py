@@ -29,7 +29,7 @@ class Event(eqx.Module):
     rising: bool | None = eqx.field(static=True, default=None)
 
 
-class Happened(eqx.Module):
+class EventLog(eqx.Module):
     """The events of a run: how many, when [s] (infinite beyond), and which of the events."""
 
     count: Array
@@ -47,7 +47,7 @@ def run_with_events(
     events: tuple[Event, ...],
     most: int,
     **options: Any,
-) -> tuple[Motion, Happened]:
+) -> tuple[Motion, EventLog]:
     """A run in at most `most` + 1 pieces, joined on one grid."""
     conditions = Conditions(
         tuple(_signal(event.signal) for event in events),
@@ -96,7 +96,7 @@ def run_with_events(
     motion = Motion(
         path, last, reached, status, jnp.sum(steps), jnp.sum(rejected), hits[-1:], None
     )
-    return motion, Happened(jnp.sum(hits), when, which)
+    return motion, EventLog(jnp.sum(hits), when, which)
 
 
 def _signal(signal: Signal | str) -> Signal:

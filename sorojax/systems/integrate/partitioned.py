@@ -22,7 +22,7 @@ from sorojax.systems.blocks.rod_body import AssemblyBody
 from sorojax.systems.network import Network, inputs_of, rates_of
 
 
-class Parted(NamedTuple):
+class PartitionedState(NamedTuple):
     """A network at one moment.
 
     Attributes:
@@ -41,7 +41,7 @@ class Parted(NamedTuple):
     resolved: Bool[Array, ""]
 
 
-Move = Callable[[Parted, Signals], Parted]
+Move = Callable[[PartitionedState, Signals], PartitionedState]
 
 
 def partitioned(
@@ -52,7 +52,7 @@ def partitioned(
     substeps: int = 1,
     stepper: AbstractStepper | None = None,
     method: AbstractMethod | None = None,
-) -> tuple[Move, Parted]:
+) -> tuple[Move, PartitionedState]:
     """`move(parted, inputs) -> parted`, compiled, which advances by `period`, and the start.
 
     In every step the body moves under the signals that the other blocks had, then they move
@@ -82,9 +82,9 @@ def partitioned(
     h = real(period / substeps)
     fixed, state = Split((network, h, stepper, method)), network.initial_state()
     still, zero = jnp.zeros_like(state[body]["v"]), jnp.zeros_like(h)
-    start = Parted(state, still, zero, zero, jnp.array(True))
+    start = PartitionedState(state, still, zero, zero, jnp.array(True))
 
-    def move(parted: Parted, inputs: Signals) -> Parted:
+    def move(parted: PartitionedState, inputs: Signals) -> PartitionedState:
         given = {name: jnp.asarray(value, h.dtype) for name, value in inputs.items()}
         return _move(fixed, parted, given, body, substeps)
 
@@ -92,10 +92,12 @@ def partitioned(
 
 
 @once
-def _move(fixed: Split, parted: Parted, inputs, name: str, count: int) -> Parted:
+def _move(
+    fixed: Split, parted: PartitionedState, inputs, name: str, count: int
+) -> PartitionedState:
     network, h, stepper, method = fixed.whole()
 
-    def one(_, now: Parted) -> Parted:
+    def one(_, now: PartitionedState) -> PartitionedState:
         body = network.blocks[name]
         own = inputs_of(network, now.time, now.state, inputs, (name,))[name]
         q, v = now.state[name]["q"], now.state[name]["v"]
@@ -105,8 +107,8 @@ def _move(fixed: Split, parted: Parted, inputs, name: str, count: int) -> Parted
         state = now.state | {name: {"q": new.q, "v": new.v}}
         state = _others(network, now.time, state, inputs, h, method, name)
         if new.resolved is None or new.gained is None:  # without contact
-            return Parted(state, new.a, now.time + h, now.gained, now.resolved)
-        moved = Parted(state, new.a, now.time + h, new.gained, new.resolved)
+            return PartitionedState(state, new.a, now.time + h, now.gained, now.resolved)
+        moved = PartitionedState(state, new.a, now.time + h, new.gained, new.resolved)
         held = now._replace(resolved=new.resolved)
         return jax.tree.map(lambda a, b: jnp.where(new.resolved, a, b), moved, held)
 

@@ -20,7 +20,7 @@ from sorojax.math.ode.explicit import AbstractMethod, RungeKutta4, Tsit5, finite
 from sorojax.math.ode.step_control import Control
 from sorojax.math.status import Status
 from sorojax.systems.integrate.coupled import Coupled, bodies_of
-from sorojax.systems.integrate.event import Event, Happened, run_with_events
+from sorojax.systems.integrate.event import Event, EventLog, run_with_events
 from sorojax.systems.integrate.integrate import Motion, Resume, adaptive
 from sorojax.systems.integrate.march import fixed
 from sorojax.systems.network import Network, at_time, outputs
@@ -48,7 +48,7 @@ class Trajectory(eqx.Module):
     status: Status
     stats: dict[str, Array]
     memory: Any = None
-    happened: Happened | None = None
+    happened: EventLog | None = None
     dense: dfx.DenseInterpolation | None = None
 
     def __getitem__(self, name: str) -> Array:

@@ -13,8 +13,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import fem
-from sorojax.design import OptimisedShape
-from sorojax.fem import CriticalLoads, CriticalPoint, Modes, Problem
+from sorojax.design.optimise.shape_loop import OptimisedShape
+from sorojax.fem import Problem
+from sorojax.fem.equilibrium.solve import Path
+from sorojax.fem.equilibrium.volume import VolumePath
+from sorojax.fem.stability.buckling import CriticalLoads
+from sorojax.fem.stability.continuation import CriticalPoint
+from sorojax.fem.stability.modal import Modes
 from sorojax.mesh import cell_areas, cell_volumes
 from sorojax.view import style
 from sorojax.view.draw.loads import load_parts, support_parts, wall_parts
@@ -316,9 +321,9 @@ def chosen_states(where: str, count: int, states: Sequence[int] | None) -> list[
 
 def problem_at(path: Any, k: int) -> Problem:
     """The problem with the load of state `k` of a path."""
-    if isinstance(path, fem.VolumePath):
+    if isinstance(path, VolumePath):
         return fem.with_load(path.problem, path.name, path.pressures[k])
-    if isinstance(path, fem.Path) or (getattr(path, "name", None) is not None):
+    if isinstance(path, Path) or (getattr(path, "name", None) is not None):
         return fem.with_load(path.problem, path.name, path.values[k])
     return path.problem
 
@@ -327,7 +332,7 @@ def state_name(path: Any, k: int) -> str:
     """What tells a state from the others: its load, its factor or its time."""
     if isinstance(path, fem.Motion):
         return f"{float(path.times[k]):.4g} s"
-    if isinstance(path, fem.VolumePath):
+    if isinstance(path, VolumePath):
         pressure = short(float(path.pressures[k]), "Pa")
         return f"{1e6 * float(path.volumes[k]):.4g} ml at {pressure}"
     name = getattr(path, "name", None)

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from sorojax import fem
 from sorojax.fem import Problem
 from sorojax.fem.loads.loads import AbstractLoad
+from sorojax.fem.loads.rigid import Rigid
 from sorojax.fem.supports import AbstractSupport, known_components
 from sorojax.mesh.elements.elements import facet_corners
 from sorojax.mesh.measure import Locations
@@ -80,7 +81,7 @@ def marks_of(
     if isinstance(load, fem.Foundation):
         name = f"{load.name}: {_stiffness(load)}"
         return [Dots(points[np.asarray(load.nodes)], _SPRING, 4.0, name)]
-    if isinstance(load, fem.Rigid):
+    if isinstance(load, Rigid):
         return _rigid(load, points)
     if isinstance(load, fem.SelfContact):
         sides = [load.facets] if load.others is None else [load.facets, load.others]
@@ -122,7 +123,7 @@ def _springs(problem: Problem, load: fem.Spring, points: Points, size: float) ->
     return parts if to_nodes else [*parts, Dots(far, style.HOLD, 4.0)]
 
 
-def _rigid(load: fem.Rigid, points: Points) -> list[Part]:
+def _rigid(load: Rigid, points: Points) -> list[Part]:
     """The nodes, and bars between those that carry the others."""
     first, second = np.triu_indices(len(load.leaders), 1)
     ends = points[np.asarray(load.leaders)]

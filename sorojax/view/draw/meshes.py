@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sorojax.mesh import Mesh, PolyN, Quality, Repaired, boundary_facets, valences
+from sorojax.mesh import Mesh, PolyN, boundary_facets
 from sorojax.mesh.elements.elements import facet_element
-from sorojax.mesh.mesh import facet_table
-from sorojax.mesh.quality import cell_ratios
+from sorojax.mesh.mesh import facet_table, valences
+from sorojax.mesh.quality import Quality, cell_ratios
+from sorojax.mesh.repair import Repaired
 from sorojax.view import style
 from sorojax.view.picture import Panel, Picture, show_scene
 from sorojax.view.raster.camera import View

@@ -11,14 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax._jax.jit import once
-from sorojax.design import Calibration
-from sorojax.material import (
-    AbstractHyperelastic,
-    TensileFit,
-    strain_energy_density,
-    uniaxial_stress,
-)
-from sorojax.reduction import Backbone
+from sorojax.design.calibration.calibration import Calibration
+from sorojax.material import AbstractHyperelastic, strain_energy_density, uniaxial_stress
+from sorojax.material.fit import TensileFit
+from sorojax.reduction.backbone import Backbone
 from sorojax.rod import Rod, StrainBasis, columns, forward_kinematics
 from sorojax.view import style
 from sorojax.view.picture import Panel, Picture

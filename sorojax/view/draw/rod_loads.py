@@ -14,6 +14,7 @@ from sorojax import rod as R
 from sorojax.math.quadrature import interpolation_rows
 from sorojax.rod import Assembly, Rod, Section
 from sorojax.rod.forces.routing import Thread
+from sorojax.rod.forces.tendons import ThreadChambers
 from sorojax.sdf import AbstractSdf, contour
 from sorojax.sdf.sampling import finite_box
 from sorojax.view import style
@@ -48,8 +49,10 @@ def acting(model: Rod | Assembly, forces: Sequence[Any]) -> Acting:
     threads: dict[str, list[Drawn]] = {}
     contacts, pairs = [], []
     for force in forces:
-        part, inner = (force.part, force.force) if isinstance(force, R.On) else ("", force)
-        if isinstance(inner, R.Between):
+        part, inner = (
+            (force.part, force.force) if isinstance(force, R.PartForce) else ("", force)
+        )
+        if isinstance(inner, R.PairForce):
             pairs.append(inner)
         elif isinstance(inner, R.AbstractContact):
             contacts.append((part, inner))
@@ -71,7 +74,7 @@ def _threads(body: Rod, force: Any) -> list[Drawn]:
     chamber, pressure = force, None
     if isinstance(force, R.Pressurised):
         chamber, pressure = force.chamber, np.atleast_1d(np.asarray(force.pressure))
-    if not isinstance(chamber, R.ThreadChambers):
+    if not isinstance(chamber, ThreadChambers):
         return []
     found = []
     for k, (thread, area) in enumerate(zip(chamber.threads, chamber.areas, strict=True)):

@@ -50,7 +50,9 @@ def wrench_parts(
     """
     parts: list[Part] = []
     for force in forces:
-        name, inner = (force.part, force.force) if isinstance(force, R.On) else ("", force)
+        name, inner = (
+            (force.part, force.force) if isinstance(force, R.PartForce) else ("", force)
+        )
         if isinstance(inner, R.Gravity):
             chosen = (
                 [np.asarray(poses[name])] if name else [np.asarray(p) for p in poses.values()]

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sorojax.design import History, Optimised
+from sorojax.design import History
+from sorojax.design.optimise.minimise import Optimised
 from sorojax.mesh import Mesh
 from sorojax.systems import AbstractBlock, Trajectory
 from sorojax.view import style

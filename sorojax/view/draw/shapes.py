@@ -4,8 +4,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sorojax.sdf import AbstractSdf, Curve, Surface as Triangles, contour, isosurface
+from sorojax.sdf import AbstractSdf, Surface as Triangles, contour, isosurface
 from sorojax.sdf.sampling import finite_box, values
+from sorojax.sdf.surface.marching import Curve
 from sorojax.view import style
 from sorojax.view.picture import Panel, Picture, show_scene
 from sorojax.view.raster.camera import View

@@ -8,9 +8,14 @@ from jaxtyping import Float
 
 from sorojax import fem
 from sorojax.design import History
-from sorojax.fem import Continuation, Modes, Motion, Path, VolumePath
+from sorojax.fem import Motion
+from sorojax.fem.equilibrium.solve import Path
+from sorojax.fem.equilibrium.volume import VolumePath
+from sorojax.fem.stability.continuation import Continuation
+from sorojax.fem.stability.modal import Modes
 from sorojax.mesh import Mesh
-from sorojax.rod import Assembly, Rod, Rollout
+from sorojax.rod import Assembly, Rod
+from sorojax.rod.dynamics.rollout import Rollout
 from sorojax.sdf import AbstractSdf
 from sorojax.systems import AssemblyBody, Network, RodBody, Trajectory
 from sorojax.view.draw.bodies import body_scenes, problem_at

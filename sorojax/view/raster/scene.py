@@ -129,7 +129,7 @@ def box_of(parts: Sequence[Part]) -> tuple[np.ndarray, np.ndarray]:
     return points.min(axis=0), points.max(axis=0)
 
 
-def joined(*scenes: Scene, title: str = "") -> Scene:
+def merge_scenes(*scenes: Scene, title: str = "") -> Scene:
     """One scene of the parts of all, with the first scale that one of them has."""
     parts = tuple(part for scene in scenes for part in scene.parts)
     scale = next((scene.scale for scene in scenes if scene.scale is not None), None)

@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
-from sorojax.fem import Motion, Path, Problem, Solution
+from sorojax.fem import Motion, Problem, Solution
+from sorojax.fem.equilibrium.solve import Path
 from sorojax.mesh import Mesh
 from sorojax.sdf import Surface
 from sorojax.view import style

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sorojax import fem
+from sorojax.fem.equilibrium.solve import Path as FemPath
 from sorojax.io.animation import MovingSurface, export_animation
 from sorojax.view import style
 from sorojax.view.web.actor import Actor, actor, checked
@@ -263,7 +264,7 @@ def limits_of(actors: Sequence[Actor]) -> tuple[float, float]:
 def _times(things, time, clock: str, unit: str, frames: int) -> tuple[list[str], list[float]]:
     """What the page writes at each frame, and when it shows it [s]."""
     if time is None:
-        results = [t for t in things if isinstance(t, fem.Motion | fem.Path)]
+        results = [t for t in things if isinstance(t, fem.Motion | FemPath)]
         first = results[0] if results else None
         if isinstance(first, fem.Motion):
             time = first.times

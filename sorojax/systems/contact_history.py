@@ -14,10 +14,9 @@ from sorojax._types import real
 from sorojax.rod import (
     AbstractContact,
     Assembly,
-    Between,
     LinkContact,
-    Motion,
-    On,
+    PairForce,
+    PartForce,
     Rod,
     RodContact,
     motion,
@@ -26,11 +25,12 @@ from sorojax.rod import (
 from sorojax.rod.contact.obstacle import Touch
 from sorojax.rod.contact.rods import touches
 from sorojax.rod.dynamics.composite import columns_of
+from sorojax.rod.dynamics.fields import Motion
 from sorojax.rod.dynamics.tree import each
 from sorojax.rod.model.assembly import index_of, num_dof, slices
 
 
-class Touching(eqx.Module):
+class ContactHistory(eqx.Module):
     """Contacts at some moments.
 
     Attributes:
@@ -46,13 +46,13 @@ class Touching(eqx.Module):
     effort: Float[Array, "moments contacts dof"]
 
 
-def touching(
+def contact_history(
     model: Rod | Assembly,
     contacts: tuple[Any, ...],
     q: Float[Array, "moments coordinates"],
     v: Float[Array, "moments dof"],
     parts: Sequence[str] | None = None,
-) -> Touching:
+) -> ContactHistory:
     """Overlaps and forces of `contacts` along a motion.
 
     Args:
@@ -81,18 +81,18 @@ def touching(
 
 
 @once
-def _along(model, contacts, rates: tuple[int, ...], q, v) -> Touching:
+def _along(model, contacts, rates: tuple[int, ...], q, v) -> ContactHistory:
     def at(q, v):
         here = motion(model, q, v)
         rows = each(_seen, [_seated(contact, here, rates) for contact in contacts])
-        return Touching(*(jnp.stack(column) for column in zip(*rows, strict=True)))
+        return ContactHistory(*(jnp.stack(column) for column in zip(*rows, strict=True)))
 
     return jax.lax.map(lambda row: at(*row), (q, v))
 
 
 def _inner(contact: Any) -> Any:
     """A contact without its place."""
-    return contact.force if isinstance(contact, On | Between) else contact
+    return contact.force if isinstance(contact, PartForce | PairForce) else contact
 
 
 def _check_kind(contact: Any) -> None:
@@ -109,7 +109,9 @@ def _seated(contact: Any, here: Any, rates: tuple[int, ...]) -> tuple[Any, ...]:
     inner, nothing = _inner(contact), jnp.zeros(len(rates), here.v.dtype)
     if isinstance(here, Motion):
         return inner, (jnp.eye(len(rates), dtype=here.v.dtype),), nothing, here
-    names = (contact.part,) if isinstance(contact, On) else (contact.first, contact.second)
+    names = (
+        (contact.part,) if isinstance(contact, PartForce) else (contact.first, contact.second)
+    )
     places = [here.assembly.names.index(name) for name in names]
     columns = columns_of(here, np.array(rates, int))
     own = tuple(columns[k] for k in places)
