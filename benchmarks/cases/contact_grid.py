@@ -14,7 +14,7 @@ from sorojax import rod as R, sdf
 from sorojax.contact import LinePenalty
 from sorojax.math.lie import SE2
 from sorojax.math.status import Status
-from sorojax.rod.dynamics.fields import Motion
+from sorojax.rod.dynamics.fields import RodState
 
 STEPS = (2e-5, 2e-4, 1e-3)  # [s]
 SAVES, BETWEEN = 150, 16  # steps of a run; places between two of them that are looked at
@@ -111,7 +111,7 @@ def below(moment, wall):
 
 def crossed(moment, wall):
     other = R.part_motion(moment, 1)
-    if isinstance(other, Motion):
+    if isinstance(other, RodState):
         return cross(line_of(R.part_motion(moment, 0)), line_of(other))
     ends = jnp.array([[-SPAN / 2, 0.0], [SPAN / 2, 0.0]])
     plate = other.base.position[None] + ends @ other.base.directors.T

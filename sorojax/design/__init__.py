@@ -34,11 +34,11 @@ from sorojax.design.part import Mirror, Part, Repeat, part, reanalyse, solid
 from sorojax.design.pneunet import optimise_pneunet, pneunet_cell
 
 __all__ = [
+    "GCMMA",
+    "MMA",
     "Experiment",
     "Follower",
-    "GCMMA",
     "History",
-    "MMA",
     "Mirror",
     "Mirrored",
     "OptimalityCriteria",

@@ -26,6 +26,7 @@ from sorojax.rod.dynamics.dynamics import (
     stiffness_matrix,
     vector_field,
 )
+from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.kinematics import (
     forward_kinematics,
     jacobian,
@@ -36,7 +37,7 @@ from sorojax.rod.dynamics.kinematics import (
 )
 from sorojax.rod.dynamics.points import points
 from sorojax.rod.dynamics.rollout import rollout, second_order
-from sorojax.rod.dynamics.tree import part_motion
+from sorojax.rod.dynamics.tree import AssemblyState, part_motion
 from sorojax.rod.forces.forces import (
     AbstractChamber,
     AbstractDamping,
@@ -136,6 +137,7 @@ __all__ = [
     "AbstractTarget",
     "Actuation",
     "Assembly",
+    "AssemblyState",
     "BSpline",
     "Bernstein",
     "Buoyancy",
@@ -173,6 +175,7 @@ __all__ = [
     "Revolute",
     "Rod",
     "RodContact",
+    "RodState",
     "Routed",
     "Screw",
     "Section",

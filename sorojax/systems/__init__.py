@@ -52,6 +52,7 @@ from sorojax.systems.integrate.simulate import Trajectory, last_state, simulate,
 from sorojax.systems.network import Network, as_term, outputs
 
 __all__ = [
+    "PID",
     "AbstractBlock",
     "AbstractController",
     "AbstractReference",
@@ -73,7 +74,6 @@ __all__ = [
     "Markers",
     "Network",
     "Output",
-    "PID",
     "Regulator",
     "Reservoir",
     "RigidBody",

@@ -25,7 +25,7 @@ from sorojax.rod import (
 from sorojax.rod.contact.obstacle import Touch
 from sorojax.rod.contact.rods import touches
 from sorojax.rod.dynamics.composite import columns_of
-from sorojax.rod.dynamics.fields import Motion
+from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.tree import each
 from sorojax.rod.model.assembly import index_of, num_dof, slices
 
@@ -107,7 +107,7 @@ def _seated(contact: Any, here: Any, rates: tuple[int, ...]) -> tuple[Any, ...]:
     """A contact, the columns per rate of the bodies that it is on, an effort of nothing, and
     these bodies."""
     inner, nothing = _inner(contact), jnp.zeros(len(rates), here.v.dtype)
-    if isinstance(here, Motion):
+    if isinstance(here, RodState):
         return inner, (jnp.eye(len(rates), dtype=here.v.dtype),), nothing, here
     names = (
         (contact.part,) if isinstance(contact, PartForce) else (contact.first, contact.second)

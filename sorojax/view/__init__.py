@@ -78,7 +78,6 @@ if TYPE_CHECKING:
     from sorojax.view.web.page import to_glb, to_html
 
 __all__ = [
-    "Picture",
     "AbstractSink",
     "Arrows",
     "Camera",
@@ -87,6 +86,7 @@ __all__ = [
     "Feed",
     "Lines",
     "Number",
+    "Picture",
     "Recording",
     "Scale",
     "Scene",

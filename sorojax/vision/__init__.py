@@ -45,16 +45,16 @@ from sorojax.vision.synthetic import (
 
 __all__ = [
     "BLUE",
+    "GREEN",
+    "RED",
     "Balls",
     "Camera",
     "CharucoBoard",
     "Colour",
     "Discs",
     "Disturbance",
-    "GREEN",
     "MarkerStream",
     "Pose",
-    "RED",
     "background",
     "calibrate",
     "colour_mask",

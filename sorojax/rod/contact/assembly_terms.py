@@ -20,7 +20,7 @@ from sorojax.rod.contact.terms import (
     terms_of,
 )
 from sorojax.rod.dynamics.composite import part_columns
-from sorojax.rod.dynamics.tree import AssemblyMotion, each, part_motion
+from sorojax.rod.dynamics.tree import AssemblyState, each, part_motion
 from sorojax.rod.forces.loads import Load, PairForce, PartForce, check, total_force
 from sorojax.rod.model.assembly import index_of
 from sorojax.rod.model.rod import Rod
@@ -48,7 +48,7 @@ def contacts_of(
     plain = tuple(force for force in forces if not _is_contact(force))
     where = [(_parts(model, force), force.force) for force in touching]
 
-    def near(moment: AssemblyMotion, h):
+    def near(moment: AssemblyState, h):
         def one(contact, *bodies):
             return reached(contact, h, *bodies)
 

@@ -27,11 +27,11 @@ from sorojax.rod.contact.obstacle import (
     travel,
     twice_turn,
 )
-from sorojax.rod.dynamics.fields import Motion
+from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.moving import levers
 from sorojax.rod.dynamics.points import safe_norm, spin_cross
 from sorojax.rod.forces.loads import AbstractPairForce
-from sorojax.rod.model.link import LinkMotion
+from sorojax.rod.model.link import LinkState
 from sorojax.sdf.base import AbstractSdf
 
 
@@ -43,7 +43,7 @@ class LinkPoints(eqx.Module):
         position: Where they are [m].
     """
 
-    motion: LinkMotion
+    motion: LinkState
     position: Float[Array, "points dim"]
 
     @property
@@ -153,7 +153,7 @@ class LinkContact(AbstractPairForce):
         at, _, _ = line(rod, self.radius, self.points, self.caps)
         return (at.position - link.base.position[None]) @ link.base.directors
 
-    def linearised(self, t: Float[Array, ""], first: Motion, second: LinkMotion) -> Linearised:
+    def linearised(self, t: Float[Array, ""], first: RodState, second: LinkState) -> Linearised:
         """Force, stiffness and damping over the columns of both, one after the other.
 
         The stiffness has what friction gains with pressure, and is not symmetric: a grip
@@ -230,7 +230,7 @@ def _unit(normal: Float[Array, "points dim"]) -> Float[Array, "points dim"]:
 
 
 def _check_kinds(first: Any, second: Any) -> None:
-    if not (isinstance(first, Motion) and isinstance(second, LinkMotion)):
+    if not (isinstance(first, RodState) and isinstance(second, LinkState)):
         raise ValueError(
             f"LinkContact: got a {type(first).__name__} and a {type(second).__name__}, need a "
             "rod and then a link. Write Between(rod, link, LinkContact(...)); two rods have "

@@ -17,24 +17,24 @@ from sorojax.contact.broadphase import near
 from sorojax.contact.law import LinePenalty
 from sorojax.contact.swept import passes
 from sorojax.math.compiled import door
-from sorojax.rod.dynamics.fields import Motion
+from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.points import Points, moment_of, points, safe_norm, spin_cross
 from sorojax.rod.forces.forces import AbstractForce
-from sorojax.rod.model.link import LinkMotion
+from sorojax.rod.model.link import LinkState
 from sorojax.sdf.base import AbstractSdf
 
 _SURGE = 100.0  # acceleration that a broad phase allows for within a step [m/s^2]
 
 
-def travel(moment: Motion | LinkMotion, h: Float[Array, ""]) -> Float[Array, ""]:
+def travel(moment: RodState | LinkState, h: Float[Array, ""]) -> Float[Array, ""]:
     """How far [m] any section, or the frame of a link, may move within a step of `h` [s]."""
     return twice_way(moment, h) + _SURGE * h**2
 
 
-def twice_way(moment: Motion | LinkMotion, h: Float[Array, ""]) -> Float[Array, ""]:
+def twice_way(moment: RodState | LinkState, h: Float[Array, ""]) -> Float[Array, ""]:
     """Twice what the fastest section, or the frame of a link, moves in `h` [s] as it moves
     now [m]."""
-    if isinstance(moment, LinkMotion):
+    if isinstance(moment, LinkState):
         velocity = (moment.base.linear_jacobian @ moment.v)[None]
     else:
         velocity = moment.linear_jacobian.reshape(-1, moment.v.shape[0]) @ moment.v
@@ -42,7 +42,7 @@ def twice_way(moment: Motion | LinkMotion, h: Float[Array, ""]) -> Float[Array, 
     return 2 * h * jnp.sqrt(jnp.max(jnp.sum(velocity**2, axis=1)))
 
 
-def twice_turn(moment: Motion | LinkMotion, h: Float[Array, ""]) -> Float[Array, ""]:
+def twice_turn(moment: RodState | LinkState, h: Float[Array, ""]) -> Float[Array, ""]:
     """Twice what the section that spins fastest turns in `h` [s] as it moves now [rad]."""
     spin = moment.angular_jacobian.reshape(-1, moment.v.shape[0]) @ moment.v
     spin = spin.reshape(moment.angular_jacobian.shape[:2])
@@ -229,18 +229,18 @@ class AbstractContact(AbstractForce):
         """Least radius of what meets [m]."""
 
     @abc.abstractmethod
-    def is_near(self, motion: Motion, h: Float[Array, ""]) -> Bool[Array, ""]:
+    def is_near(self, motion: RodState, h: Float[Array, ""]) -> Bool[Array, ""]:
         """Whether anything may touch within a step of `h` [s]; `False` is certain."""
 
     @abc.abstractmethod
-    def touch(self, motion: Motion) -> Touch:
+    def touch(self, motion: RodState) -> Touch:
         """The contacts and the sides that take their force, all of one motion."""
 
     @abc.abstractmethod
-    def passed(self, before: tuple[Motion], after: tuple[Motion]) -> Bool[Array, ""]:
+    def passed(self, before: tuple[RodState], after: tuple[RodState]) -> Bool[Array, ""]:
         """Whether anything went through anything in a step from one motion to another."""
 
-    def stored(self, motion: Motion) -> Float[Array, ""]:
+    def stored(self, motion: RodState) -> Float[Array, ""]:
         """Energy [J]."""
         return energy(self.law, self.touch(motion))
 
@@ -251,7 +251,7 @@ class AbstractContact(AbstractForce):
         none = jnp.zeros_like(motion.v)
         return jax.lax.cond(self.is_near(motion, _now(motion)), force, lambda: none)
 
-    def linearised(self, t: Float[Array, ""], motion: Motion) -> Linearised:
+    def linearised(self, t: Float[Array, ""], motion: RodState) -> Linearised:
         """The force with its stiffness and damping."""
         zero = jnp.zeros_like(motion.v)
         none = jnp.zeros((zero.shape[0],) * 2, zero.dtype)
@@ -315,13 +315,13 @@ class ObstacleContact(AbstractContact):
 
 
 @door
-def contact_energy(contact: AbstractContact, motion: Motion) -> Float[Array, ""]:
+def contact_energy(contact: AbstractContact, motion: RodState) -> Float[Array, ""]:
     """Energy stored in a contact [J]."""
     return contact.stored(motion)
 
 
 @door
-def penetration(contact: AbstractContact, motion: Motion) -> Float[Array, ""]:
+def penetration(contact: AbstractContact, motion: RodState) -> Float[Array, ""]:
     """Largest overlap of the surfaces [m]; zero without contact."""
     gap = contact.touch(motion).gap
     return jnp.maximum(-jnp.min(gap), jnp.zeros((), gap.dtype))
@@ -345,7 +345,7 @@ def check_line(contact, radius: Array) -> None:
 
 
 def line(
-    motion: Motion, radius: Array, count: int, caps: str
+    motion: RodState, radius: Array, count: int, caps: str
 ) -> tuple[Points, Float[Array, " points"], Float[Array, " points"]]:
     """Midpoints of `count` parts, then the round ends; their lengths and radii.
 
@@ -364,7 +364,7 @@ def stations(count: int, caps: str) -> np.ndarray:
     return np.concatenate([(np.arange(count) + 0.5) / count, ends])
 
 
-def reach_of(motion: Motion) -> tuple[Float[Array, " dim"], Float[Array, ""]]:
+def reach_of(motion: RodState) -> tuple[Float[Array, " dim"], Float[Array, ""]]:
     """Centre and radius [m] of a ball that holds the centre line.
 
     About the middle of the arc length: no other point needs to be known.
@@ -385,7 +385,7 @@ def sum_sides(forces: tuple[Array, ...]) -> Float[Array, " dof"]:
     return total
 
 
-def _now(motion: Motion) -> Float[Array, ""]:
+def _now(motion: RodState) -> Float[Array, ""]:
     return jnp.zeros((), motion.q.dtype)
 
 

@@ -29,10 +29,10 @@ from sorojax.rod.contact.obstacle import (
     tangent,
     travel,
 )
-from sorojax.rod.dynamics.fields import Motion
+from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.points import Points, curvature, safe_norm
 from sorojax.rod.forces.loads import AbstractPairForce
-from sorojax.rod.model.link import LinkMotion
+from sorojax.rod.model.link import LinkState
 
 _NEWTON = 2
 _STEEPEST = 0.2  # least curvature of the distance that a Newton step may lean on
@@ -55,14 +55,14 @@ class Curve(NamedTuple):
     count: int
 
 
-def curve(motion: Motion, count: int) -> Curve:
+def curve(motion: RodState, count: int) -> Curve:
     """The centre line of the rod in `count` cubics."""
     rule, ends = motion.rod.quadrature, np.linspace(0.0, 1.0, count + 1)
     places, slopes = integration_rows(rule, ends), interpolation_rows(rule, ends)
     return Curve(np.asarray(places), np.asarray(slopes), count)
 
 
-def ends(motion: Motion, count: int) -> Float[Array, "ends dim"]:
+def ends(motion: RodState, count: int) -> Float[Array, "ends dim"]:
     """The ends of the `count` cubics of a rod [m]."""
     table = jnp.asarray(curve(motion, count).places, motion.q.dtype)
     place = motion.rod.length * (table @ motion.tangent)
@@ -70,7 +70,7 @@ def ends(motion: Motion, count: int) -> Float[Array, "ends dim"]:
 
 
 def closest(
-    motion: Motion,
+    motion: RodState,
     line: Curve,
     to: Float[Array, "points dim"],
     allowed: Bool[Array, "points ends"] | None = None,
@@ -280,7 +280,7 @@ class RodContact(AbstractPairForce):
         return jnp.min(self.radii)
 
     def is_near(
-        self, first: Motion | LinkMotion, second: Motion | LinkMotion, h: Array
+        self, first: RodState | LinkState, second: RodState | LinkState, h: Array
     ) -> Bool[Array, ""]:
         """Whether the rods may touch within a step of `h` [s]; `False` is certain."""
         first, second = rod_of(first), rod_of(second)
@@ -290,7 +290,7 @@ class RodContact(AbstractPairForce):
         return jnp.sum((a - b) ** 2) <= reach**2
 
     def linearised(
-        self, t: Float[Array, ""], first: Motion | LinkMotion, second: Motion | LinkMotion
+        self, t: Float[Array, ""], first: RodState | LinkState, second: RodState | LinkState
     ) -> Linearised:
         """Force, stiffness and damping over the columns of both, one after the other."""
         first, second = rod_of(first), rod_of(second)
@@ -310,7 +310,7 @@ class RodContact(AbstractPairForce):
         is_near = self.is_near(first, second, jnp.zeros((), first.q.dtype))
         return jax.lax.cond(is_near, full, lambda: Linearised(none[0], none, none))
 
-    def stored(self, first: Motion | LinkMotion, second: Motion | LinkMotion) -> Array:
+    def stored(self, first: RodState | LinkState, second: RodState | LinkState) -> Array:
         """Energy [J]."""
         one, two = touches(self, rod_of(first), rod_of(second))
         return energy(self.law, one) + energy(self.law, two)
@@ -331,7 +331,7 @@ class HeldRod(AbstractContact):
     """
 
     pair: RodContact
-    held: Motion
+    held: RodState
 
     @property
     def law(self) -> LinePenalty:  # type: ignore[override]
@@ -360,21 +360,21 @@ class HeldRod(AbstractContact):
 _FIELDS = ("gap", "weights")
 
 
-def touches(pair: RodContact, first: Motion, second: Motion) -> tuple[Touch, Touch]:
+def touches(pair: RodContact, first: RodState, second: RodState) -> tuple[Touch, Touch]:
     """Contacts of the points of the first rod, then of the second; each has the sides
     (searching rod, searched rod)."""
     return _search(pair, 0, first, second), _search(pair, 1, second, first)
 
 
-def _search(pair: RodContact, index: int, mine: Motion, other: Motion) -> Touch:
+def _search(pair: RodContact, index: int, mine: RodState, other: RodState) -> Touch:
     at, weights, radius = line(mine, pair.radii[index], pair.points, pair.caps)
     found = closest(other, curve(other, pair.points), at.position)
     return meeting(at, found, radius, pair.radii[1 - index], weights / 2)
 
 
-def rod_of(body: Motion | LinkMotion) -> Motion:
+def rod_of(body: RodState | LinkState) -> RodState:
     """The motion of a part that must be a rod."""
-    if not isinstance(body, Motion):
+    if not isinstance(body, RodState):
         raise ValueError(
             "RodContact: one of the parts is a rigid link, need two rods. Give the shape of "
             "a link that does not move as an obstacle: On(name, ObstacleContact(...))."

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from sorojax.math.ode.steppers import ContactTerms
 from sorojax.rod.contact.obstacle import AbstractContact, Linearised, twice_turn, twice_way
-from sorojax.rod.dynamics.fields import Motion
+from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.forces.forces import AbstractForce, total_force
 
 # twice the turn [rad], and twice the way over the length of a rod, that make a step long
@@ -25,7 +25,7 @@ def has_contact(forces: tuple[AbstractForce, ...]) -> bool:
 
 def contact_terms(
     forces: tuple[AbstractForce, ...],
-    at: Callable[[Array, Array], Motion],
+    at: Callable[[Array, Array], RodState],
     inertia: Callable[[Any], tuple[Array, Array]],
 ) -> ContactTerms:
     """The listed contacts, and the equations without them.
@@ -110,7 +110,7 @@ def reached(contact: Any, h: Float[Array, ""], *bodies: Any) -> tuple[Array, Arr
 def long(moment: Any, h: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether any section turns, or moves, far within a step of `h` [s]."""
     turns = twice_turn(moment, h) > _TURN
-    if not isinstance(moment, Motion):
+    if not isinstance(moment, RodState):
         return turns
     return turns | (twice_way(moment, h) > _SHARE * moment.rod.length)
 
@@ -138,7 +138,7 @@ def still(tree: Any) -> Any:
 
 
 def linearised(
-    contacts: tuple[AbstractContact, ...], t: Float[Array, ""], motion: Motion
+    contacts: tuple[AbstractContact, ...], t: Float[Array, ""], motion: RodState
 ) -> Linearised:
     """Sum of one or more contacts with their stiffness and damping."""
     total = contacts[0].linearised(t, motion)

@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax.rod.dynamics.moving import cross, release, turned_twists
-from sorojax.rod.dynamics.tree import AssemblyMotion, Mount, batches, bias_rates, rod_inertia
+from sorojax.rod.dynamics.tree import AssemblyState, Mount, batches, bias_rates, rod_inertia
 from sorojax.rod.model.assembly import parents, slices
 from sorojax.rod.model.link import Link, LinkOperators, link_inertia, link_motion
 
 
-def part_columns(moment: AssemblyMotion) -> tuple[Float[Array, "own dof"], ...]:
+def part_columns(moment: AssemblyState) -> tuple[Float[Array, "own dof"], ...]:
     """Twist and coordinates of each part per rate of the assembly."""
     dof = moment.v.shape[0]
     still = jnp.zeros((moment.assembly.group.algebra_dim, dof), moment.v.dtype)
@@ -24,7 +24,7 @@ def part_columns(moment: AssemblyMotion) -> tuple[Float[Array, "own dof"], ...]:
 
 
 def columns_of(
-    moment: AssemblyMotion, rates: Int[np.ndarray, " some"]
+    moment: AssemblyState, rates: Int[np.ndarray, " some"]
 ) -> list[Float[Array, "own some"] | None]:
     """The same per rate in `rates` alone; None of what these do not move."""
     assembly, found = moment.assembly, []
@@ -48,7 +48,7 @@ def columns_of(
 
 
 def assembly_inertia(
-    moment: AssemblyMotion,
+    moment: AssemblyState,
 ) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:
     """Mass matrix and Coriolis force; cost of order dof^2 beyond that of the parts."""
     carriers, size = parents(moment.assembly), moment.assembly.group.algebra_dim
@@ -72,7 +72,7 @@ def assembly_inertia(
 
 
 def gather(
-    moment: AssemblyMotion, loads: Sequence[Float[Array, " own"] | None]
+    moment: AssemblyState, loads: Sequence[Float[Array, " own"] | None]
 ) -> Float[Array, " dof"]:
     """Generalised force of loads on the parts, each in the columns of its part: the pass
     inwards. None is no load."""
@@ -92,7 +92,7 @@ def gather(
     return jnp.concatenate(pieces[::-1])
 
 
-def part_inertias(moment: AssemblyMotion) -> tuple[list[Array], list[Array]]:
+def part_inertias(moment: AssemblyState) -> tuple[list[Array], list[Array]]:
     """Mass matrix and Coriolis force of each part in its own columns and frame."""
     assembly, size = moment.assembly, moment.assembly.group.algebra_dim
     masses: list = [None] * len(assembly.parts)
@@ -115,7 +115,7 @@ def part_inertias(moment: AssemblyMotion) -> tuple[list[Array], list[Array]]:
     return masses, biases
 
 
-def bias_accelerations(moment: AssemblyMotion) -> tuple[Float[Array, " twist"] | None, ...]:
+def bias_accelerations(moment: AssemblyState) -> tuple[Float[Array, " twist"] | None, ...]:
     """Acceleration of each frame at zero coordinate acceleration, along its own axes; None
     on the ground, where there is none."""
     assembly, found = moment.assembly, []
@@ -133,7 +133,7 @@ def bias_accelerations(moment: AssemblyMotion) -> tuple[Float[Array, " twist"] |
     return tuple(found)
 
 
-def _rates_of_carriers(moment: AssemblyMotion) -> dict[int, tuple[Array, Array]]:
+def _rates_of_carriers(moment: AssemblyState) -> dict[int, tuple[Array, Array]]:
     """`bias_rates` of the rods that carry parts, equal rods together."""
     carriers, found = set(parents(moment.assembly)), {}
     for members, stack in zip(batches(moment.assembly), moment.batches, strict=True):
@@ -148,7 +148,7 @@ def _rates_of_carriers(moment: AssemblyMotion) -> dict[int, tuple[Array, Array]]
 
 
 def _section_bias(
-    moment: AssemblyMotion, index: int, on: int, rates: tuple[Array, Array] | None
+    moment: AssemblyState, index: int, on: int, rates: tuple[Array, Array] | None
 ) -> Float[Array, " twist"]:
     """Acceleration of a part on a carrier whose frame and coordinates do not accelerate."""
     mount, at = moment.mounts[index], slices(moment.assembly)

@@ -16,14 +16,14 @@ from sorojax._types import Numbers, real
 from sorojax.math.compiled import batched, door, full_products
 from sorojax.math.linalg.dense import solve_symmetric
 from sorojax.rod.dynamics.composite import part_columns
-from sorojax.rod.dynamics.fields import Motion
+from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.moving import mass_jacobian, mass_position
 from sorojax.rod.dynamics.points import moment_of
-from sorojax.rod.dynamics.tree import AssemblyMotion, part_motion
+from sorojax.rod.dynamics.tree import AssemblyState, part_motion
 from sorojax.rod.forces import loads
 from sorojax.rod.forces.forces import Gravity
 from sorojax.rod.model.assembly import Assembly, is_flat, rate, slices
-from sorojax.rod.model.link import LinkMotion
+from sorojax.rod.model.link import LinkState
 from sorojax.rod.model.model import Model, inertia, motion, operators
 from sorojax.rod.model.rod import Rod
 
@@ -272,22 +272,22 @@ def coriolis_matrix(
 
 
 def _parts(
-    moment: Motion | AssemblyMotion,
-) -> list[tuple[Motion | LinkMotion, Float[Array, "own dof"] | None]]:
+    moment: RodState | AssemblyState,
+) -> list[tuple[RodState | LinkState, Float[Array, "own dof"] | None]]:
     """The parts in the world frame, with their columns per rate of the model."""
-    if isinstance(moment, Motion):
+    if isinstance(moment, RodState):
         return [(moment, None)]
     columns = part_columns(moment)
     return [(part_motion(moment, k), columns[k]) for k in range(len(columns))]
 
 
-def _rows(part: Motion | LinkMotion) -> tuple[Array, Array, Array, Array]:
+def _rows(part: RodState | LinkState) -> tuple[Array, Array, Array, Array]:
     """Mass and rotary inertia of each section; Jacobians, the angular one in its axes."""
     angular = part.angular_jacobian
     local = angular
     if angular.shape[1] == 3:
         local = jnp.einsum("pji,pjn->pin", part.directors, angular)
-    if isinstance(part, LinkMotion):
+    if isinstance(part, LinkState):
         rotary = part.rotary[None]
     else:
         rotary = jax.vmap(jnp.diag)(part.operators.rotary.T)

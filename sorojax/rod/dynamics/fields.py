@@ -62,7 +62,7 @@ class Base(eqx.Module):
     linear_jacobian: Float[Array, "dim dof"]
 
 
-class Motion(eqx.Module):
+class RodState(eqx.Module):
     """A rod at one moment: coordinates, and fields at the Gauss nodes, world frame.
 
     What a force does not read is never computed. An integral along the rod is

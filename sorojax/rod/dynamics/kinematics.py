@@ -12,12 +12,12 @@ from sorojax.math.compiled import door
 from sorojax.math.lie import homogeneous
 from sorojax.math.quadrature import integration_rows, interpolation_rows
 from sorojax.rod.dynamics.composite import bias_accelerations, part_columns
-from sorojax.rod.dynamics.fields import Motion, operators, rest_along
+from sorojax.rod.dynamics.fields import RodState, operators, rest_along
 from sorojax.rod.dynamics.moving import cross, turned
 from sorojax.rod.dynamics.points import Points
-from sorojax.rod.dynamics.tree import AssemblyMotion, bias_rates, part_motion, rod_motion
+from sorojax.rod.dynamics.tree import AssemblyState, bias_rates, part_motion, rod_motion
 from sorojax.rod.model.assembly import Assembly
-from sorojax.rod.model.link import LinkMotion
+from sorojax.rod.model.link import LinkState
 from sorojax.rod.model.model import Model, inertia as inertia, motion as motion
 from sorojax.rod.model.rod import Rod, strain_names
 
@@ -174,7 +174,7 @@ def jacobian_rate_product(
     return found
 
 
-def tip_angle(moment: Motion) -> Float[Array, ""]:
+def tip_angle(moment: RodState) -> Float[Array, ""]:
     """Angle of the last section of a planar rod on its base [rad], continuous past half a
     turn."""
     if moment.rod.group.space_dim != 2:
@@ -183,13 +183,13 @@ def tip_angle(moment: Motion) -> Float[Array, ""]:
     return moment.operators.weights @ (bending + rest_along(moment.operators)[:, 0])
 
 
-def _parts(moment: AssemblyMotion) -> list[tuple[str, Motion | LinkMotion]]:
+def _parts(moment: AssemblyState) -> list[tuple[str, RodState | LinkState]]:
     names = moment.assembly.names
     return [(name, part_motion(moment, k)) for k, name in enumerate(names)]
 
 
-def _poses(moment: Motion | LinkMotion, s) -> Poses:
-    if isinstance(moment, LinkMotion):
+def _poses(moment: RodState | LinkState, s) -> Poses:
+    if isinstance(moment, LinkState):
         return homogeneous(moment.base.directors, moment.base.position)[None]
     if s is None:
         return homogeneous(moment.directors, moment.position)
@@ -197,18 +197,18 @@ def _poses(moment: Motion | LinkMotion, s) -> Poses:
     return homogeneous(at.directors, at.position)
 
 
-def _jacobian(moment: Motion | LinkMotion, s) -> Jacobians:
-    if isinstance(moment, LinkMotion):
+def _jacobian(moment: RodState | LinkState, s) -> Jacobians:
+    if isinstance(moment, LinkState):
         return moment.tip_jacobian[None]
     at = moment if s is None else Points(moment, _rows(moment.rod, s))
     return jnp.concatenate([at.angular_jacobian, at.linear_jacobian], axis=1)
 
 
 def _rate_product(
-    moment: Motion | LinkMotion, s, start: Float[Array, " twist"] | None
+    moment: RodState | LinkState, s, start: Float[Array, " twist"] | None
 ) -> Float[Array, "points twist"]:
     """Velocity-product accelerations, on a base that has the acceleration `start`."""
-    if isinstance(moment, LinkMotion):
+    if isinstance(moment, LinkState):
         return jnp.zeros_like(moment.v)[None] if start is None else start[None]
     rows = moment.operators.integration if s is None else _rows(moment.rod, s)
     angular, linear = (rows @ rate for rate in bias_rates(moment))

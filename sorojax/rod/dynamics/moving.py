@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax.math.lie import cross_columns
-from sorojax.rod.dynamics.fields import Base, Motion
+from sorojax.rod.dynamics.fields import Base, RodState
 
 
-def release(moment: Motion, twist: Float[Array, " base"]) -> Motion:
+def release(moment: RodState, twist: Float[Array, " base"]) -> RodState:
     """The clamped rod of `moment` on a base that moves with `twist`, in axes of the base.
 
     The columns of the twist come first. Its equations of motion hold for a base without
@@ -58,8 +58,8 @@ def release(moment: Motion, twist: Float[Array, " base"]) -> Motion:
 
 
 def place(
-    moment: Motion, rotation: Float[Array, "dim dim"], position: Float[Array, " dim"]
-) -> Motion:
+    moment: RodState, rotation: Float[Array, "dim dim"], position: Float[Array, " dim"]
+) -> RodState:
     """A released motion in a frame in which the base stands at (rotation, position)."""
     base = moment.base
     assert base is not None

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax.rod.dynamics.fields import (
-    Motion,
     Operators,
+    RodState,
     integrated,
     is_curvature,
     local_axis,
@@ -16,7 +16,7 @@ from sorojax.rod.dynamics.points import own
 from sorojax.rod.model.rod import Rod
 
 
-def motion(rod: Rod, constants: Operators, q: Array, v: Array) -> Motion:
+def motion(rod: Rod, constants: Operators, q: Array, v: Array) -> RodState:
     """Fields of the rod at the Gauss nodes."""
     per_coordinate = _at_nodes(rod, jnp.cumsum(constants.moments[0, 0], axis=0))
     angle = per_coordinate @ q
@@ -33,7 +33,7 @@ def motion(rod: Rod, constants: Operators, q: Array, v: Array) -> Motion:
         else:
             axis = axes[name == "sigma_y"]
             linear_rate = linear_rate + axis[:, :, None] * rows[:, None, :]
-    return Motion(
+    return RodState(
         rod,
         constants,
         q,
@@ -47,7 +47,7 @@ def motion(rod: Rod, constants: Operators, q: Array, v: Array) -> Motion:
     )
 
 
-def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:
+def inertia(moment: RodState) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:
     """Mass matrix and Coriolis force by one product J' [S J | F]."""
     constants, v = moment.operators, moment.v
     dof = v.shape[0]
@@ -65,13 +65,13 @@ def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof
     return product[:, :dof], product[:, dof]
 
 
-def bias_rates(moment: Motion) -> tuple[Float[Array, "quad 1"], Float[Array, "quad 2"]]:
+def bias_rates(moment: RodState) -> tuple[Float[Array, "quad 1"], Float[Array, "quad 2"]]:
     """d/ds of the accelerations at zero coordinate acceleration, angular and linear."""
     spin = moment.angular_jacobian @ moment.v
     return jnp.zeros_like(spin), _bias_rate(moment, spin)
 
 
-def _bias_rate(moment: Motion, spin: Float[Array, "quad 1"]) -> Float[Array, "quad 2"]:
+def _bias_rate(moment: RodState, spin: Float[Array, "quad 1"]) -> Float[Array, "quad 2"]:
     rate = spin * _turn(moment.tangent)
     for name, rows in zip(moment.rod.basis.active, moment.operators.strain_rows, strict=True):
         if not is_curvature(name):

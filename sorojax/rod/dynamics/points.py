@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from sorojax.math.lie import cross_columns
 from sorojax.math.quadrature import integration_rows
-from sorojax.rod.dynamics.fields import Motion, rest_along
+from sorojax.rod.dynamics.fields import RodState, rest_along
 
 
 class Points(eqx.Module):
@@ -21,7 +21,7 @@ class Points(eqx.Module):
         rows: Weights that integrate a field from the base to each point [m].
     """
 
-    motion: Motion
+    motion: RodState
     rows: Float[Array, "points quad"]
 
     @property
@@ -88,18 +88,18 @@ class Points(eqx.Module):
         return total
 
 
-def points(motion: Motion, s: Float[Array, " points"] | np.ndarray) -> Points:
+def points(motion: RodState, s: Float[Array, " points"] | np.ndarray) -> Points:
     """The points of `motion` at `s` in [0, 1]; a NumPy `s` makes constants."""
     rows = jnp.asarray(integration_rows(motion.rod.quadrature, s), motion.q.dtype)
     return Points(motion, motion.rod.length * rows)
 
 
-def nodes(motion: Motion) -> Points:
+def nodes(motion: RodState) -> Points:
     """The points of `motion` at its Gauss nodes."""
     return Points(motion, motion.operators.integration)
 
 
-def curvature(motion: Motion) -> Float[Array, "quad rot"]:
+def curvature(motion: RodState) -> Float[Array, "quad rot"]:
     """Curvature at the Gauss nodes [1/m], world frame (planar: about z)."""
     change = motion.angular_rate @ motion.q
     rest = rest_along(motion.operators)
@@ -131,13 +131,13 @@ def _written_out(left: Array, right: Array) -> Array:
     return jnp.sum(left[:, :, :, None] * right[:, None], axis=2)
 
 
-def own(motion: Motion, values: Float[Array, " dof"]) -> Float[Array, " own"]:
+def own(motion: RodState, values: Float[Array, " dof"]) -> Float[Array, " own"]:
     """The entries of `values` that belong to the strains, not to a moving base."""
     ahead = values.shape[0] - motion.rod.basis.num_dof
     return values if ahead == 0 else values[ahead:]
 
 
-def from_own(motion: Motion, force: Float[Array, " own"]) -> Float[Array, " dof"]:
+def from_own(motion: RodState, force: Float[Array, " own"]) -> Float[Array, " dof"]:
     """A generalised force on the strains in all columns of `motion`."""
     ahead = motion.q.shape[0] - force.shape[0]
     return force if ahead == 0 else jnp.pad(force, (ahead, 0))

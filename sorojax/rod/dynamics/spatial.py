@@ -17,8 +17,8 @@ from sorojax.math.lie import (
     rotation_vector,
 )
 from sorojax.rod.dynamics.fields import (
-    Motion,
     Operators,
+    RodState,
     integrated,
     is_curvature,
     local_axis,
@@ -29,7 +29,7 @@ from sorojax.rod.dynamics.points import own
 from sorojax.rod.model.rod import Rod
 
 
-def motion(rod: Rod, constants: Operators, q: Array, v: Array) -> Motion:
+def motion(rod: Rod, constants: Operators, q: Array, v: Array) -> RodState:
     """Fields of the rod at the Gauss nodes."""
     axes = _directors(rod, constants, q)
     angular_rate, shape_rate = _strain_rates(rod, constants, axes)
@@ -38,7 +38,7 @@ def motion(rod: Rod, constants: Operators, q: Array, v: Array) -> Motion:
     linear_rate = cross_columns(angular, tangent[:, :, None])
     if shape_rate is not None:
         linear_rate = linear_rate + shape_rate
-    return Motion(
+    return RodState(
         rod,
         constants,
         q,
@@ -52,7 +52,7 @@ def motion(rod: Rod, constants: Operators, q: Array, v: Array) -> Motion:
     )
 
 
-def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:
+def inertia(moment: RodState) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:
     """Mass matrix and Coriolis force by one product [S J | F]' J."""
     constants, dof = moment.operators, moment.v.shape[0]
     spin, _, angular, inner = _bias_rates(moment)
@@ -75,7 +75,7 @@ def inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof
     return product[:dof], product[dof]
 
 
-def bias_rates(moment: Motion) -> tuple[Float[Array, "quad 3"], Float[Array, "quad 3"]]:
+def bias_rates(moment: RodState) -> tuple[Float[Array, "quad 3"], Float[Array, "quad 3"]]:
     """d/ds of the accelerations at zero coordinate acceleration, angular and linear."""
     _, swing, _, inner = _bias_rates(moment)
     return swing, inner
@@ -123,7 +123,7 @@ def _tangent(rod: Rod, constants: Operators, axes: list[Array], q: Array) -> Arr
     return tangent
 
 
-def _bias_rates(moment: Motion) -> tuple[Array, Array, Array, Array]:
+def _bias_rates(moment: RodState) -> tuple[Array, Array, Array, Array]:
     """Spin; `bias_rates` of the angles, the integral of these, `bias_rates` of positions."""
     constants, rod = moment.operators, moment.rod
     axes = jnp.unstack(moment.directors, axis=2)

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax.math.quadrature import integration_rows
 from sorojax.rod.dynamics import moving, planar, spatial
-from sorojax.rod.dynamics.fields import Motion, Operators, operators
+from sorojax.rod.dynamics.fields import Operators, RodState, operators
 from sorojax.rod.dynamics.points import Points
 from sorojax.rod.model.assembly import (
     Assembly,
@@ -43,7 +43,7 @@ def rod_motion(
     q: Float[Array, " dof"],
     v: Float[Array, " dof"] | None = None,
     constants: Operators | None = None,
-) -> Motion:
+) -> RodState:
     """The fields of a rod clamped at the origin."""
     do = f"The rod has {rod.basis.num_dof} coordinates, ordered as its basis."
     _check.shape("rod", "q", q, (rod.basis.num_dof,), do)
@@ -52,12 +52,12 @@ def rod_motion(
     return _KERNEL[rod.group.space_dim].motion(rod, constants, q, v)
 
 
-def rod_inertia(moment: Motion) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:
+def rod_inertia(moment: RodState) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:
     """Mass matrix and Coriolis force of a moment."""
     return _KERNEL[moment.rod.group.space_dim].inertia(moment)
 
 
-def bias_rates(moment: Motion) -> tuple[Float[Array, "quad rot"], Float[Array, "quad dim"]]:
+def bias_rates(moment: RodState) -> tuple[Float[Array, "quad rot"], Float[Array, "quad dim"]]:
     """d/ds of the accelerations at zero coordinate acceleration, angular and linear."""
     return _KERNEL[moment.rod.group.space_dim].bias_rates(moment)
 
@@ -111,7 +111,7 @@ class Frame(NamedTuple):
     twist: Float[Array, " twist"]
 
 
-class AssemblyMotion(eqx.Module):
+class AssemblyState(eqx.Module):
     """An assembly at one moment; forces see its parts by `part_motion`.
 
     Attributes:
@@ -126,7 +126,7 @@ class AssemblyMotion(eqx.Module):
     operators: AssemblyOperators
     q: Float[Array, " coordinates"]
     v: Float[Array, " dof"]
-    batches: tuple[Motion, ...]
+    batches: tuple[RodState, ...]
     mounts: tuple[Mount, ...]
     frames: tuple[Frame, ...]
 
@@ -174,7 +174,7 @@ def assembly_motion(
     q: Float[Array, " coordinates"],
     v: Float[Array, " dof"] | None = None,
     constants: AssemblyOperators | None = None,
-) -> AssemblyMotion:
+) -> AssemblyState:
     """The fields of all parts at (q, v)."""
     count = num_coordinates(assembly)
     do = f"The assembly has {count} coordinates and {num_dof(assembly)} rates; see `rest`."
@@ -191,12 +191,12 @@ def assembly_motion(
         own_v = jnp.stack([v[places[k].rod_v] for k in members])
         every = eqx.filter_vmap(lambda c, q, v, rod=rod: rod_motion(rod, q, v, c))
         moments.append(every(stack, own_q, own_v))
-    blank = AssemblyMotion(assembly, constants, q, v, tuple(moments), (), ())
+    blank = AssemblyState(assembly, constants, q, v, tuple(moments), (), ())
     mounts, frames = _carry(blank)
-    return AssemblyMotion(assembly, constants, q, v, tuple(moments), mounts, frames)
+    return AssemblyState(assembly, constants, q, v, tuple(moments), mounts, frames)
 
 
-def clamped(moment: AssemblyMotion, index: int) -> Motion:
+def clamped(moment: AssemblyState, index: int) -> RodState:
     """The motion of a rod in its own frame, clamped there."""
     for members, stack in zip(batches(moment.assembly), moment.batches, strict=True):
         if index in members:
@@ -207,12 +207,12 @@ def clamped(moment: AssemblyMotion, index: int) -> Motion:
     raise ValueError(f"assembly: `{moment.assembly.names[index]}` is a link, need a rod.")
 
 
-def _member(stack: Motion, at: int) -> Motion:
+def _member(stack: RodState, at: int) -> RodState:
     return jax.tree.map(lambda leaf: leaf[at] if eqx.is_array(leaf) else leaf, stack)
 
 
-def part_motion(moment: AssemblyMotion, index: int) -> Any:
-    """A part in the world frame, a `Motion` or a `LinkMotion`; its columns are its own twist
+def part_motion(moment: AssemblyState, index: int) -> Any:
+    """A part in the world frame, a `RodState` or a `LinkState`; its columns are its own twist
     and coordinates."""
     rotation, position, twist = moment.frames[index]
     body = moment.assembly.parts[index].body
@@ -226,7 +226,7 @@ def part_motion(moment: AssemblyMotion, index: int) -> Any:
 Section = tuple[Array, Array, Array, Array]
 
 
-def _sections(moment: AssemblyMotion) -> list[Section]:
+def _sections(moment: AssemblyState) -> list[Section]:
     """Rotation, position and Jacobians (angular, linear) of what carries each part, in the
     frame of the carrier and its columns; those on equal rods together."""
     group, dtype = moment.assembly.group, moment.q.dtype
@@ -248,7 +248,7 @@ def _sections(moment: AssemblyMotion) -> list[Section]:
     return found
 
 
-def _section(moment: Motion, rows: Float[Array, "1 quad"]) -> Section:
+def _section(moment: RodState, rows: Float[Array, "1 quad"]) -> Section:
     at, dim = Points(moment, rows), moment.tangent.shape[1]
     centre, angular = at.position[0], at.angular_jacobian[0]
     rot, dtype = angular.shape[0], angular.dtype
@@ -259,7 +259,7 @@ def _section(moment: Motion, rows: Float[Array, "1 quad"]) -> Section:
     return at.directors[0], centre, angular, linear
 
 
-def _members(stack: Motion, places: list[int]) -> Motion:
+def _members(stack: RodState, places: list[int]) -> RodState:
     first, count = places[0], len(places)
     # A slice is a view, a gather a loop.
     in_row = places == list(range(first, first + count))
@@ -267,7 +267,7 @@ def _members(stack: Motion, places: list[int]) -> Motion:
     return jax.tree.map(lambda leaf: leaf[at] if eqx.is_array(leaf) else leaf, stack)
 
 
-def _carry(moment: AssemblyMotion) -> tuple[tuple[Mount, ...], tuple[Frame, ...]]:
+def _carry(moment: AssemblyState) -> tuple[tuple[Mount, ...], tuple[Frame, ...]]:
     """The pass from the ground outwards: poses and twists."""
     assembly, mounts, frames = moment.assembly, [], []
     places, carriers = slices(assembly), _sections(moment)
@@ -287,7 +287,7 @@ def _carry(moment: AssemblyMotion) -> tuple[tuple[Mount, ...], tuple[Frame, ...]
 
 
 def _mount(
-    moment: AssemblyMotion, index: int, on: int | None, carrier: Section
+    moment: AssemblyState, index: int, on: int | None, carrier: Section
 ) -> tuple[Mount, Array]:
     """The mount of a part, and its position in the frame of the carrier."""
     assembly, dtype = moment.assembly, moment.q.dtype

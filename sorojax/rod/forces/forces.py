@@ -2,7 +2,7 @@
 
 To add one, subclass the family that fits:
 
-* `AbstractForce`: any force, a function of time and the `Motion` of the rod; `points`
+* `AbstractForce`: any force, a function of time and the `RodState` of the rod; `points`
   gives poses, velocities and Jacobians at any s, and takes forces put there.
 * `AbstractElastic`: an elastic law that replaces the rod's own linear one.
 * `AbstractDamping`: a constant matrix; implicit steppers use it in their iteration.
@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._types import optional_real, real
 from sorojax.math.quadrature import gauss_legendre
-from sorojax.rod.dynamics.fields import Motion, operators
+from sorojax.rod.dynamics.fields import RodState, operators
 from sorojax.rod.dynamics.moving import mass_jacobian
 from sorojax.rod.dynamics.points import from_own, own
 from sorojax.rod.model.rod import Rod, strain_names
@@ -33,7 +33,7 @@ EARTH = 9.81  # m/s^2
 class AbstractForce(eqx.Module):
     """A generalised force, on the side of the loads: M a + coriolis = sum of forces.
 
-    `motion` is the rod at one moment, a `rod.Motion`. It offers:
+    `motion` is the rod at one moment, a `rod.RodState`. It offers:
 
     * `motion.q`, `motion.v`: coordinates and their rates, `(dof,)`;
     * `motion.rod`: the rod, with `length` [m], `section`, `material`, `group`, `basis`;
@@ -54,7 +54,7 @@ class AbstractForce(eqx.Module):
     """
 
     @abc.abstractmethod
-    def __call__(self, t: Float[Array, ""], motion: Motion) -> Float[Array, " dof"]:
+    def __call__(self, t: Float[Array, ""], motion: RodState) -> Float[Array, " dof"]:
         """Force [N m, N] that does work on the coordinate rates; power is force @ v [W].
 
         Args:
@@ -186,7 +186,7 @@ class Pressurised(AbstractForce):
 
 
 def total_force(
-    forces: tuple[AbstractForce, ...], t: Float[Array, ""], motion: Motion
+    forces: tuple[AbstractForce, ...], t: Float[Array, ""], motion: RodState
 ) -> Float[Array, " dof"]:
     """Sum of the listed forces and of the rod's elasticity if none replaces it."""
     unbound = [type(f).__name__ for f in forces if isinstance(f, AbstractPressureMap)]
@@ -206,7 +206,7 @@ def total_force(
 
 
 def tangent_stiffness(
-    forces: tuple[AbstractForce, ...], motion: Motion
+    forces: tuple[AbstractForce, ...], motion: RodState
 ) -> Float[Array, "dof dof"]:
     """Elastic stiffness at the coordinates of `motion`, replaced laws included."""
     laws = [force for force in forces if isinstance(force, AbstractElastic)]
@@ -233,7 +233,7 @@ def sum_matrices(matrices: Any) -> Array:
     return first
 
 
-def gravity_or_earth(acceleration: Array | None, motion: Motion) -> Float[Array, " dim"]:
+def gravity_or_earth(acceleration: Array | None, motion: RodState) -> Float[Array, " dim"]:
     if acceleration is not None:
         return acceleration
     dim = motion.tangent.shape[1]

@@ -14,9 +14,9 @@ from jaxtyping import Array, Float
 
 from sorojax._types import real
 from sorojax.rod.dynamics.composite import gather
-from sorojax.rod.dynamics.fields import Motion
+from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.moving import release
-from sorojax.rod.dynamics.tree import AssemblyMotion, batches, clamped, part_motion
+from sorojax.rod.dynamics.tree import AssemblyState, batches, clamped, part_motion
 from sorojax.rod.forces import forces as one
 from sorojax.rod.forces.forces import (
     AbstractDamping,
@@ -27,7 +27,7 @@ from sorojax.rod.forces.forces import (
     Pressurised,
 )
 from sorojax.rod.model.assembly import Assembly, index_of, slices
-from sorojax.rod.model.link import Link, LinkMotion, LinkOperators, link_motion
+from sorojax.rod.model.link import Link, LinkOperators, LinkState, link_motion
 from sorojax.rod.model.rod import Rod
 
 _SHAPE_ONLY = (AbstractElastic, AbstractDamping, Pressurised, AbstractPressureMap)
@@ -45,7 +45,7 @@ class AbstractPairForce(eqx.Module):
 
     @abc.abstractmethod
     def __call__(
-        self, t: Float[Array, ""], first: Motion | LinkMotion, second: Motion | LinkMotion
+        self, t: Float[Array, ""], first: RodState | LinkState, second: RodState | LinkState
     ) -> tuple[Float[Array, " first"], Float[Array, " second"]]:
         """Generalised forces in the columns of each motion."""
 
@@ -69,10 +69,10 @@ Load = AbstractForce | PartForce | PairForce | JointEffort
 
 
 def total_force(
-    forces: tuple[Load, ...], t: Float[Array, ""], motion: Motion | AssemblyMotion
+    forces: tuple[Load, ...], t: Float[Array, ""], motion: RodState | AssemblyState
 ) -> Float[Array, " dof"]:
     """Sum of the listed forces and of the elasticity of rods and joints."""
-    if isinstance(motion, Motion):
+    if isinstance(motion, RodState):
         return one.total_force(_plain(forces), t, motion)
     check(motion.assembly, forces)
     loads: list = [_part_load(forces, t, motion, k) for k in range(len(motion.frames))]
@@ -110,19 +110,19 @@ def _on_body(force: Any, body: Any) -> Any:
 
 
 def weight(
-    gravity: Gravity, t: Float[Array, ""], motion: Motion | AssemblyMotion
+    gravity: Gravity, t: Float[Array, ""], motion: RodState | AssemblyState
 ) -> Float[Array, " dof"]:
     """Generalised force of gravity alone."""
-    if isinstance(motion, Motion):
+    if isinstance(motion, RodState):
         return gravity(t, motion)
     return gather(motion, list(_weights(motion, gravity, t)))
 
 
 def tangent_stiffness(
-    forces: tuple[Load, ...], motion: Motion | AssemblyMotion
+    forces: tuple[Load, ...], motion: RodState | AssemblyState
 ) -> Float[Array, "dof dof"]:
     """Elastic stiffness at the coordinates of `motion`, replaced laws included."""
-    if isinstance(motion, Motion):
+    if isinstance(motion, RodState):
         return one.tangent_stiffness(_plain(forces), motion)
     stiffness = motion.operators.stiffness
     for k, at in enumerate(slices(motion.assembly)):
@@ -189,7 +189,7 @@ def _plain(forces: tuple[Load, ...]) -> Any:
     return forces
 
 
-def _part_load(forces, t, motion: AssemblyMotion, index: int) -> Array | None:
+def _part_load(forces, t, motion: AssemblyState, index: int) -> Array | None:
     """Loads of one part in its columns, with the elasticity of a rod."""
     listed = _on(forces, motion.assembly, index)
     if isinstance(motion.operators.parts[index], LinkOperators):
@@ -204,7 +204,7 @@ def _part_load(forces, t, motion: AssemblyMotion, index: int) -> Array | None:
     return load
 
 
-def _weights(motion: AssemblyMotion, gravity: Gravity, t) -> list[Array]:
+def _weights(motion: AssemblyState, gravity: Gravity, t) -> list[Array]:
     """Weight of each part in its columns; equal rods together, seen from their frames."""
     count = len(motion.frames)
     dim = motion.assembly.group.space_dim
@@ -227,7 +227,7 @@ def _weights(motion: AssemblyMotion, gravity: Gravity, t) -> list[Array]:
     return found
 
 
-def _joint_forces(forces, motion: AssemblyMotion) -> list[Float[Array, " dof"]]:
+def _joint_forces(forces, motion: AssemblyState) -> list[Float[Array, " dof"]]:
     """Springs, dampers and actuators of the joints."""
     assembly, found = motion.assembly, []
     for part, at in zip(assembly.parts, slices(assembly), strict=True):

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._types import optional_real, real
 from sorojax.math.quadrature import gauss_legendre
-from sorojax.rod.dynamics.fields import Motion
+from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.points import Points, nodes, points, safe_norm
 from sorojax.rod.forces.forces import AbstractForce, gravity_or_earth
 
@@ -74,7 +74,7 @@ def _apply(at: Points, loads: Float[Array, "points twist"], follower: bool) -> A
     return at.generalised(force, moment)
 
 
-def _check_wrench(where: str, wrench, motion: Motion) -> None:
+def _check_wrench(where: str, wrench, motion: RodState) -> None:
     size = motion.angular_rate.shape[1] + motion.tangent.shape[1]
     do = "Give the moment, then the force; a planar rod takes (m_z, f_x, f_y)."
     _check.shape(where, "wrench", wrench, (size,), do)

@@ -48,8 +48,8 @@ class LinkOperators(NamedTuple):
     mass_offset: None = None
 
 
-class LinkMotion(eqx.Module):
-    """A link at one moment, read like the `Motion` of a rod with one section: its centre of
+class LinkState(eqx.Module):
+    """A link at one moment, read like the `RodState` of a rod with one section: its centre of
     mass. The columns of the Jacobians are the twist of its frame; q is zero.
 
     `tip_jacobian` is that of the frame of the link.
@@ -116,17 +116,17 @@ def link_operators(link: Link, dtype) -> LinkOperators:
 
 def link_motion(
     link: Link, constants: LinkOperators, twist: Float[Array, " twist"]
-) -> LinkMotion:
+) -> LinkState:
     """The link moving with `twist`, in its own axes."""
     rot = {3: 1, 6: 3}[twist.shape[0]]
     eye = jnp.asarray(np.eye(twist.shape[0]), twist.dtype)
     dim = twist.shape[0] - rot
     home = jnp.asarray(np.eye(dim), twist.dtype), jnp.zeros(dim, twist.dtype)
     base = Base(*home, eye[:rot], eye[rot:])
-    return LinkMotion(link, constants, jnp.zeros_like(twist), twist, base)
+    return LinkState(link, constants, jnp.zeros_like(twist), twist, base)
 
 
-def place_link(moment: LinkMotion, rotation: Array, position: Array) -> LinkMotion:
+def place_link(moment: LinkState, rotation: Array, position: Array) -> LinkState:
     """A motion in own axes in a frame in which the link stands at (rotation, position)."""
     base = moment.base
     placed = Base(
@@ -135,11 +135,11 @@ def place_link(moment: LinkMotion, rotation: Array, position: Array) -> LinkMoti
         turned(rotation, base.angular_jacobian[None])[0],
         turned(rotation, base.linear_jacobian[None])[0],
     )
-    return LinkMotion(moment.link, moment.operators, moment.q, moment.v, placed)
+    return LinkState(moment.link, moment.operators, moment.q, moment.v, placed)
 
 
 def link_inertia(
-    moment: LinkMotion,
+    moment: LinkState,
 ) -> tuple[Float[Array, "twist twist"], Float[Array, " twist"]]:
     """Mass matrix and Coriolis force of a link about its frame, in its own axes."""
     rot, dim = moment.base.angular_jacobian.shape[0], moment.base.position.shape[0]

@@ -6,10 +6,10 @@ from jaxtyping import Array, Float
 
 from sorojax.math.compiled import full_products
 from sorojax.rod.dynamics.composite import assembly_inertia
-from sorojax.rod.dynamics.fields import Motion, Operators, operators as rod_operators
+from sorojax.rod.dynamics.fields import Operators, RodState, operators as rod_operators
 from sorojax.rod.dynamics.tree import (
-    AssemblyMotion,
     AssemblyOperators,
+    AssemblyState,
     assembly_motion,
     assembly_operators,
     rod_inertia,
@@ -50,11 +50,11 @@ def operators(model: Rod | Assembly):
 
 
 @overload
-def motion(model: Rod, q: Array, v: Array | None = None, *, constants=None) -> Motion: ...
+def motion(model: Rod, q: Array, v: Array | None = None, *, constants=None) -> RodState: ...
 @overload
 def motion(
     model: Assembly, q: Array, v: Array | None = None, *, constants=None
-) -> AssemblyMotion: ...
+) -> AssemblyState: ...
 @full_products
 def motion(
     model: Rod | Assembly,
@@ -78,9 +78,9 @@ def motion(
 
 @full_products
 def inertia(
-    moment: Motion | AssemblyMotion,
+    moment: RodState | AssemblyState,
 ) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:
     """Mass matrix and Coriolis force of a moment."""
-    if isinstance(moment, AssemblyMotion):
+    if isinstance(moment, AssemblyState):
         return assembly_inertia(moment)
     return rod_inertia(moment)

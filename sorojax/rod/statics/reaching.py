@@ -9,12 +9,12 @@ from jaxtyping import Array, Bool, Float
 
 from sorojax.math.linalg.dense import product, solve_symmetric
 from sorojax.rod.dynamics.composite import part_columns
-from sorojax.rod.dynamics.fields import Motion
+from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.points import Points, points
-from sorojax.rod.dynamics.tree import AssemblyMotion, part_motion
+from sorojax.rod.dynamics.tree import AssemblyState, part_motion
 from sorojax.rod.forces.loads import Load, total_force
 from sorojax.rod.model.assembly import index_of
-from sorojax.rod.model.link import LinkMotion
+from sorojax.rod.model.link import LinkState
 from sorojax.rod.model.model import Model
 from sorojax.rod.statics.tangent import increments, squared
 from sorojax.rod.statics.targets import AbstractTarget, Frames, ObstacleConstraint
@@ -56,9 +56,9 @@ class Rows(NamedTuple):
     pull: Float[Array, " dof"] | None
 
 
-def rows(tasks: Tasks, t: Array, moment: Motion | AssemblyMotion) -> Rows:
+def rows(tasks: Tasks, t: Array, moment: RodState | AssemblyState) -> Rows:
     """The tasks at a moment."""
-    group = moment.rod.group if isinstance(moment, Motion) else moment.assembly.group
+    group = moment.rod.group if isinstance(moment, RodState) else moment.assembly.group
     pairs = [task.errors(group, _frames(moment, task)) for task in tasks.targets]
     gaps = [task.gaps(_frames(moment, task)) for task in tasks.obstacles]
     pull = None if tasks.forces is None else total_force(tasks.forces, t, moment)
@@ -218,10 +218,10 @@ def _held(matrix: Array, free: Array, diagonal: float = 0.0) -> Array:
 
 
 def _frames(
-    moment: Motion | AssemblyMotion, task: AbstractTarget | ObstacleConstraint
+    moment: RodState | AssemblyState, task: AbstractTarget | ObstacleConstraint
 ) -> Frames:
     """The sections of a task."""
-    if isinstance(moment, Motion):
+    if isinstance(moment, RodState):
         if task.part is not None:
             raise ValueError(
                 f"inverse_kinematics: a target names the part `{task.part}`, a single rod has "
@@ -239,10 +239,10 @@ def _frames(
     return Frames(frames.directors, frames.position, angular, linear)
 
 
-def _sections(moment: Motion | LinkMotion, s: Array) -> Frames:
+def _sections(moment: RodState | LinkState, s: Array) -> Frames:
     at = (
         moment.base
-        if isinstance(moment, LinkMotion)
+        if isinstance(moment, LinkState)
         else points(moment, s.astype(moment.q.dtype))
     )
     if isinstance(at, Points):

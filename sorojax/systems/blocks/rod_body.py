@@ -29,7 +29,7 @@ from sorojax.rod import (
     total_force,
 )
 from sorojax.rod.dynamics.dynamics import coordinate_rate
-from sorojax.rod.dynamics.fields import Motion
+from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.forces.loads import Load
 from sorojax.rod.model.assembly import index_of
 from sorojax.rod.statics.validity import checked_status
@@ -138,7 +138,7 @@ class RodBody(AbstractBlock):
         return (self.rod.basis.num_dof,)
 
 
-def body_motion(body: RodBody, state) -> Motion:
+def body_motion(body: RodBody, state) -> RodState:
     """The fields of the rod in a state of the body, for pictures and energies."""
     return motion(body.rod, state["q"], state["v"])
 

@@ -25,7 +25,7 @@ from sorojax.rod import (
     tip_pose,
     total_force,
 )
-from sorojax.rod.dynamics.fields import Motion
+from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.rollout import Rollout
 from sorojax.systems.blocks.algebra import AbstractReference
 from sorojax.systems.blocks.block import Input, Output
@@ -218,7 +218,7 @@ class FeedForward(AbstractLaw):
 
     def effort(self, t, q, v):
         target, rate, acceleration = wanted(self.reference, t)
-        moment: Motion = motion(self.rod, target, rate)
+        moment: RodState = motion(self.rod, target, rate)
         mass, coriolis = inertia(moment)
         return mass @ acceleration + coriolis - total_force(self.forces, t, moment)
 

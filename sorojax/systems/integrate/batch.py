@@ -17,7 +17,7 @@ from sorojax.math.ode.explicit import Tsit5
 from sorojax.math.ode.rosenbrock import Rodas4
 from sorojax.math.ode.step_control import Control
 from sorojax.math.status import Status
-from sorojax.systems.integrate.integrate import Motion, adaptive
+from sorojax.systems.integrate.integrate import Integration, adaptive
 from sorojax.systems.integrate.simulate import Trajectory, film_of, instants
 from sorojax.systems.network import Network
 
@@ -138,7 +138,7 @@ def _two_passes(run, designs) -> Trajectory:
     zero = jnp.zeros((), jnp.int32)
     time = instants(zero, duration / (save - 1), save)
 
-    def go(design, solver, control, most, label=None) -> Motion:
+    def go(design, solver, control, most, label=None) -> Integration:
         network = make(design)
         state = network.initial_state()
         motion = adaptive(
@@ -169,7 +169,7 @@ def _two_passes(run, designs) -> Trajectory:
     return eqx.tree_at(lambda film: film.stats, film, film.stats | {"stiff": again})
 
 
-def _cap(go: Callable[[Any], Motion], designs: PyTree, most: int) -> Array:
+def _cap(go: Callable[[Any], Integration], designs: PyTree, most: int) -> Array:
     """An eighth more steps than the slowest of some members that are not stiff.
 
     Members march together, so every step of the slowest costs a step of all.
@@ -183,7 +183,7 @@ def _cap(go: Callable[[Any], Motion], designs: PyTree, most: int) -> Array:
     return jnp.minimum(9 * slowest // 8 + 10, most).astype(jnp.int32)
 
 
-def _still(motion: Motion) -> Motion:
+def _still(motion: Integration) -> Integration:
     """The motions, without derivatives where they failed."""
     good = motion.status == Status.successful
 

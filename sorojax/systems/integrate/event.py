@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from sorojax.math.status import Status
-from sorojax.systems.integrate.integrate import Conditions, Motion, adaptive
+from sorojax.systems.integrate.integrate import Conditions, Integration, adaptive
 from sorojax.systems.network import Network
 
 Signal = Callable[[Float[Array, ""], PyTree, Any, Mapping[str, Any]], Float[Array, ""]]
@@ -47,7 +47,7 @@ def run_with_events(
     events: tuple[Event, ...],
     most: int,
     **options: Any,
-) -> tuple[Motion, EventLog]:
+) -> tuple[Integration, EventLog]:
     """A run in at most `most` + 1 pieces, joined on one grid."""
     conditions = Conditions(
         tuple(_signal(event.signal) for event in events),
@@ -93,7 +93,7 @@ def run_with_events(
     path, last, reached, finished, status, _ = carry
     hits, when, which, steps, rejected = logs
     status = Status.where(finished, status, Status.max_events)
-    motion = Motion(
+    motion = Integration(
         path, last, reached, status, jnp.sum(steps), jnp.sum(rejected), hits[-1:], None
     )
     return motion, EventLog(jnp.sum(hits), when, which)

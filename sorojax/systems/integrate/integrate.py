@@ -53,7 +53,7 @@ class Meter(dfx.AbstractProgressMeter):
 _FAR = 1e30  # s, beyond the end of every run
 
 
-class Motion(NamedTuple):
+class Integration(NamedTuple):
     """States on a grid of times, held from `reached` [s] on if the run ended before.
 
     Attributes:
@@ -121,7 +121,7 @@ def adaptive(
     dense: bool = False,
     progress: bool | str = False,
     seam: Resume | None = None,
-) -> Motion:
+) -> Integration:
     """Run from `start`, by default time[0], to time[-1]; what the grid holds before `start`
     is the first state. With a `seam` go on from there.
 
@@ -175,7 +175,7 @@ def adaptive(
         reached = jnp.minimum(reached, time[-1])
     masks = jax.tree.leaves(solution.event_mask)
     triggered = jnp.stack(masks) if masks else jnp.zeros(0, bool)
-    return Motion(
+    return Integration(
         jax.vmap(unravel)(path),
         unravel(last),
         reached,

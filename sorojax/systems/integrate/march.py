@@ -23,7 +23,7 @@ from sorojax.math.ode.step_control import (
 )
 from sorojax.math.status import Status
 from sorojax.systems.blocks.block import AbstractBlock
-from sorojax.systems.integrate.integrate import Motion, explicit_inputs
+from sorojax.systems.integrate.integrate import Integration, explicit_inputs
 from sorojax.systems.network import at_time
 
 #: Makes a tree of a state that is one vector; None where it is a tree.
@@ -41,7 +41,7 @@ def fixed(
     memory: Any = None,
     progress: bool = False,
     judged: bool = True,
-) -> Motion:
+) -> Integration:
     """Run by `substeps` steps in every interval between saved instants; if `judged`, ends as
     `unstable` where the steps were too long (`math.ode.step_control`)."""
     inputs = explicit_inputs(inputs, time[0])
@@ -83,7 +83,7 @@ def fixed(
     path = jax.tree.map(lambda a: a[::parts], path)
     steps = jnp.asarray(substeps * count)
     none = jnp.zeros(0, bool)
-    return Motion(
+    return Integration(
         path,
         as_tree(unravel, end.state),
         end.reached,

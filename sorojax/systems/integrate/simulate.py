@@ -21,7 +21,7 @@ from sorojax.math.ode.step_control import Control
 from sorojax.math.status import Status
 from sorojax.systems.integrate.coupled import Coupled, bodies_of
 from sorojax.systems.integrate.event import Event, EventLog, run_with_events
-from sorojax.systems.integrate.integrate import Motion, Resume, adaptive
+from sorojax.systems.integrate.integrate import Integration, Resume, adaptive
 from sorojax.systems.integrate.march import fixed
 from sorojax.systems.network import Network, at_time, outputs
 
@@ -225,7 +225,7 @@ def instants(first: Array, interval: Array, save: int) -> Float[Array, " time"]:
     return interval * (first + jnp.arange(save, dtype=jnp.int32)).astype(interval.dtype)
 
 
-def film_of(network, time, inputs, motion: Motion, happened=None) -> Trajectory:
+def film_of(network, time, inputs, motion: Integration, happened=None) -> Trajectory:
     """The motion with every output."""
 
     def one(moment):
