@@ -50,7 +50,7 @@ ROOMS = {
 }
 
 EQUIVALENT = {
-    "sorojax/rod/model/section_shapes.py factor: r[:, None] / jnp.max(r) "
+    "sorojax/rod/model/section.py factor: r[:, None] / jnp.max(r) "
     "-> (r[:, None] * jnp.max(r))": (
         "the scale of functions that a least-squares fit combines"
     ),

@@ -17,7 +17,7 @@ from sorojax.math.quadrature import (
     integration_rows,
     interpolation_rows,
 )
-from sorojax.rod.model.modes import Combined, SampledModes
+from sorojax.rod.model.basis import Combined, SampledModes
 
 FINGER = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2000.0)
 DISC = R.circle(6e-3)

@@ -11,8 +11,7 @@ from jaxtyping import Array, Float
 
 from sorojax.reduction.backbone import PLANAR, Backbone
 from sorojax.rod import AbstractModes, StrainBasis, orthonormalise
-from sorojax.rod.model.basis import STRAINS
-from sorojax.rod.model.modes import Combined, SampledModes
+from sorojax.rod.model.basis import STRAINS, Combined, SampledModes
 
 
 @jax.jit

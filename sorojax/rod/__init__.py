@@ -44,10 +44,14 @@ from sorojax.rod.forces.forces import (
     AbstractElastic,
     AbstractForce,
     AbstractPressureMap,
+    Buoyancy,
     Damping,
+    Drag,
     EnergyLaw,
     Gravity,
     LinearElastic,
+    LineWrench,
+    PointWrench,
     Pressurised,
     TipWrench,
     section_law,
@@ -60,17 +64,18 @@ from sorojax.rod.forces.loads import (
     TimeVaryingForce,
     total_force,
 )
-from sorojax.rod.forces.routing import (
+from sorojax.rod.forces.tendons import (
     AbstractRoute,
+    Actuation,
     Converging,
     Helical,
     Routed,
     Straight,
+    Tendons,
+    thread_chambers,
     thread_lengths,
     thread_rates,
 )
-from sorojax.rod.forces.tendons import Actuation, Tendons, thread_chambers
-from sorojax.rod.forces.wrench import Buoyancy, Drag, LineWrench, PointWrench
 from sorojax.rod.model.assembly import (
     Assembly,
     Part,
@@ -81,11 +86,19 @@ from sorojax.rod.model.assembly import (
     serial,
     slices,
 )
-from sorojax.rod.model.basis import AbstractModes, StrainBasis, columns
+from sorojax.rod.model.basis import (
+    AbstractModes,
+    BSpline,
+    StrainBasis,
+    bspline,
+    columns,
+    fitted,
+    functions,
+    orthonormalise,
+)
 from sorojax.rod.model.joint import AbstractJoint, Fixed, Free, Prismatic, Revolute, Screw
 from sorojax.rod.model.link import Link
 from sorojax.rod.model.model import inertia, motion, operators
-from sorojax.rod.model.modes import BSpline, bspline, fitted, functions, orthonormalise
 from sorojax.rod.model.polynomials import (
     Bernstein,
     Chebyshev,
@@ -101,15 +114,17 @@ from sorojax.rod.model.polynomials import (
     piecewise_linear,
 )
 from sorojax.rod.model.rod import Elastic, Rod, elastic, rod, strain_names
-from sorojax.rod.model.section import Section, scaled, taper
-from sorojax.rod.model.section_shapes import (
+from sorojax.rod.model.section import (
+    Section,
     circle,
     ellipse,
     from_mesh,
     from_shape,
     rectangle,
     ring,
+    scaled,
     squircle,
+    taper,
 )
 from sorojax.rod.statics.equilibrium import equilibrium
 from sorojax.rod.statics.inverse_kinematics import inverse_kinematics

@@ -4,21 +4,25 @@ from sorojax._arguments import check_package as _check_package
 from sorojax.math.ode.explicit import RungeKutta4, SemiImplicitEuler, Tsit5
 from sorojax.math.ode.generalised_alpha import GeneralisedAlpha
 from sorojax.math.ode.rosenbrock import Rodas4, Rosenbrock2
-from sorojax.systems.blocks.algebra import (
+from sorojax.systems.blocks.block import (
+    AbstractBlock,
     AbstractReference,
     Constant,
     Function,
+    Input,
     Lag,
+    Output,
     Sensor,
     Sine,
     SmoothRamp,
     Source,
+    Stack,
     Step,
     Waypoints,
     gain,
+    stack,
     sum_of,
 )
-from sorojax.systems.blocks.block import AbstractBlock, Input, Output, Stack, stack
 from sorojax.systems.blocks.fem_body import FemBody
 from sorojax.systems.blocks.fluidic import Regulator, Reservoir, Valve
 from sorojax.systems.blocks.modal_body import displacement, modal_basis, modal_body
@@ -45,7 +49,7 @@ from sorojax.systems.control.shape_estimate import (
 )
 from sorojax.systems.integrate.batch import simulate_batch
 from sorojax.systems.integrate.coupled import Coupled
-from sorojax.systems.integrate.event import Event
+from sorojax.systems.integrate.integrate import Event
 from sorojax.systems.integrate.partitioned import partitioned
 from sorojax.systems.integrate.sampled import Sampled, simulate_sampled
 from sorojax.systems.integrate.simulate import Trajectory, last_state, simulate, state_at

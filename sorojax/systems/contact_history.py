@@ -24,9 +24,8 @@ from sorojax.rod import (
 )
 from sorojax.rod.contact.obstacle import Touch
 from sorojax.rod.contact.rods import touches
-from sorojax.rod.dynamics.composite import columns_of
 from sorojax.rod.dynamics.fields import RodState
-from sorojax.rod.dynamics.tree import each
+from sorojax.rod.dynamics.tree import columns_of, each
 from sorojax.rod.model.assembly import index_of, num_dof, slices
 
 

@@ -15,11 +15,10 @@ from jaxtyping import Array, Float
 from sorojax._types import Numbers, real
 from sorojax.math.compiled import batched, door, full_products
 from sorojax.math.linalg.dense import solve_symmetric
-from sorojax.rod.dynamics.composite import part_columns
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.moving import mass_jacobian, mass_position
 from sorojax.rod.dynamics.points import moment_of
-from sorojax.rod.dynamics.tree import AssemblyState, part_motion
+from sorojax.rod.dynamics.tree import AssemblyState, part_columns, part_motion
 from sorojax.rod.forces import loads
 from sorojax.rod.forces.forces import Gravity
 from sorojax.rod.model.assembly import Assembly, is_flat, rate, slices

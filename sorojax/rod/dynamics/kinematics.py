@@ -11,11 +11,17 @@ from sorojax._types import Numbers, real
 from sorojax.math.compiled import door
 from sorojax.math.lie import homogeneous
 from sorojax.math.quadrature import integration_rows, interpolation_rows
-from sorojax.rod.dynamics.composite import bias_accelerations, part_columns
 from sorojax.rod.dynamics.fields import RodState, operators, rest_along
 from sorojax.rod.dynamics.moving import cross, turned
 from sorojax.rod.dynamics.points import Points
-from sorojax.rod.dynamics.tree import AssemblyState, bias_rates, part_motion, rod_motion
+from sorojax.rod.dynamics.tree import (
+    AssemblyState,
+    bias_accelerations,
+    bias_rates,
+    part_columns,
+    part_motion,
+    rod_motion,
+)
 from sorojax.rod.model.assembly import Assembly
 from sorojax.rod.model.link import LinkState
 from sorojax.rod.model.model import Model, inertia as inertia, motion as motion

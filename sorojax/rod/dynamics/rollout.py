@@ -15,13 +15,13 @@ from sorojax.math.ode.contact_midpoint import ContactMidpoint
 from sorojax.math.ode.step_control import judged_status
 from sorojax.math.ode.steppers import AbstractStepper, GeneralisedAlpha, SecondOrder, integrate
 from sorojax.math.status import Status
-from sorojax.rod.contact.assembly_terms import any_contact, contacts_of
+from sorojax.rod.contact.terms import any_contact, contacts_of
 from sorojax.rod.dynamics.dynamics import Forces
 from sorojax.rod.forces.loads import damping_matrix, on_model, tangent_stiffness, total_force
 from sorojax.rod.model.assembly import is_flat, rate, retract
 from sorojax.rod.model.model import Model, inertia, motion, operators
 from sorojax.rod.model.rod import Rod
-from sorojax.rod.statics.validity import checked_status
+from sorojax.rod.statics.equilibrium import checked_status
 
 
 @displayed

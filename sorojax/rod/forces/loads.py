@@ -13,10 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax._types import real
-from sorojax.rod.dynamics.composite import gather
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.moving import release
-from sorojax.rod.dynamics.tree import AssemblyState, batches, clamped, part_motion
+from sorojax.rod.dynamics.tree import AssemblyState, batches, clamped, gather, part_motion
 from sorojax.rod.forces import forces as one
 from sorojax.rod.forces.forces import (
     AbstractDamping,

@@ -1,18 +1,248 @@
-"""Actuators that act along threads, and input maps by function."""
+"""Threads through a rod: their routing, lengths and slopes; tendons that pull on them.
 
+The tangent of a thread, seen from the section, is affine in the strain. So its length
+depends on the coordinates of the rod alone, and every derivative is exact.
+"""
+
+import abc
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import Numbers, optional_real, real
-from sorojax.rod.dynamics.points import from_own, own
+from sorojax.math.compiled import door
+from sorojax.math.lie import cross_columns
+from sorojax.math.quadrature import (
+    Quadrature,
+    gauss_legendre,
+    integration_matrix,
+    interpolation_rows,
+)
+from sorojax.rod.dynamics.fields import operators, rest_along
+from sorojax.rod.dynamics.points import from_own, own, safe_norm
 from sorojax.rod.forces.forces import AbstractChamber, AbstractForce
-from sorojax.rod.forces.routing import AbstractRoute, Thread, pull, thread, thread_length
-from sorojax.rod.model.rod import Rod
+from sorojax.rod.model.basis import STRAINS
+from sorojax.rod.model.rod import Rod, strain_names
+
+
+class AbstractRoute(eqx.Module):
+    """A thread: its place in the section along the rod, from `start` to `stop` in [0, 1].
+
+    `nodes` is the number of Gauss points between two breaks of the strain basis.
+    """
+
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        start: ClassVar[float]
+        stop: ClassVar[float]
+        nodes: ClassVar[int]
+
+    def __check_init__(self):
+        if not 0 <= self.start < self.stop <= 1:
+            raise ValueError(
+                f"{type(self).__name__}: runs from {self.start} to {self.stop}, need "
+                "0 <= start < stop <= 1. Divide the arc length [m] by that of the rod."
+            )
+
+    @abc.abstractmethod
+    def offset(self, s: Float[Array, ""]) -> Float[Array, "2"]:
+        """Local (y, z) of the thread at `s` [m]; a planar rod bends in y."""
+
+
+class Straight(AbstractRoute):
+    """A thread along the rod at a constant `place` (y, z) [m] in the section."""
+
+    place: Float[Array, "2"] = eqx.field(converter=real)
+    start: float = eqx.field(static=True, default=0.0)
+    stop: float = eqx.field(static=True, default=1.0)
+    nodes: int = eqx.field(static=True, default=12)
+
+    def offset(self, s):
+        return jnp.broadcast_to(self.place, (2,))
+
+
+class Converging(AbstractRoute):
+    """A thread whose place (y, z) [m] moves linearly from that at the base to that at the
+    end of the rod, whatever part of it the thread takes."""
+
+    first: Float[Array, "2"] = eqx.field(converter=real)
+    last: Float[Array, "2"] = eqx.field(converter=real)
+    start: float = eqx.field(static=True, default=0.0)
+    stop: float = eqx.field(static=True, default=1.0)
+    nodes: int = eqx.field(static=True, default=16)
+
+    def offset(self, s):
+        return (1 - s) * self.first + s * self.last
+
+
+class Helical(AbstractRoute):
+    """A thread that winds about the axis of the rod.
+
+    Attributes:
+        radius: Distance from the axis [m].
+        turns: Turns over the whole rod, positive about local x [-].
+        phase: Angle from local y at the base [rad].
+    """
+
+    radius: Float[Array, ""] = eqx.field(converter=real)
+    turns: Float[Array, ""] = eqx.field(converter=real)
+    phase: Float[Array, ""] = eqx.field(converter=real, default=0.0)
+    start: float = eqx.field(static=True, default=0.0)
+    stop: float = eqx.field(static=True, default=1.0)
+    nodes: int = eqx.field(static=True, default=32)
+
+    def offset(self, s):
+        angle = self.phase + 2 * np.pi * self.turns * s
+        return self.radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+
+
+class Routed(AbstractRoute):
+    """A thread at `place(s)` -> (y, z) [m], any smooth function of s in [0, 1]."""
+
+    place: Callable[[Array], Array]
+    start: float = eqx.field(static=True, default=0.0)
+    stop: float = eqx.field(static=True, default=1.0)
+    nodes: int = eqx.field(static=True, default=32)
+
+    def offset(self, s):
+        return real(self.place(s)).astype(s.dtype)
+
+
+class Thread(NamedTuple):
+    """A routing in one rod: what of its tangent and curvature is constant, what linear in q.
+
+    Attributes:
+        weights: Gauss weights [m].
+        tangent, tangent_rows: d place / ds along the axes of the section [-].
+        curvature, curvature_rows: Curvature of the rod there [1/m].
+        rule: Where the points are.
+        span: Length of rod that the thread takes [m].
+    """
+
+    weights: Float[Array, " points"]
+    tangent: Float[Array, "points 3"]
+    tangent_rows: Float[Array, "points 3 dof"]
+    curvature: Float[Array, "points 3"]
+    curvature_rows: Float[Array, "points 3 dof"]
+    rule: Quadrature
+    span: Float[Array, ""]
+
+
+def thread(rod: Rod, route: AbstractRoute) -> Thread:
+    """The routing in `rod`; differentiable in both."""
+    dtype, share = rod.length.dtype, route.stop - route.start
+    inner = [(b - route.start) / share for b in rod.quadrature.breaks]
+    rule = Quadrature(route.nodes, tuple(b for b in inner if 0 < b < 1))
+    s = route.start + share * gauss_legendre(rule)[0]
+    place, slope = jax.vmap(lambda s: jax.jvp(route.offset, (s,), (jnp.ones_like(s),)))(
+        jnp.asarray(s, dtype)
+    )
+    _check.shape(type(route).__name__, "place", place[0], (2,), "Give (y, z) in metres.")
+    rest, rows = _strains(rod, s)
+    arm = jnp.pad(place, ((0, 0), (1, 0)))
+    tangent = rest[:, 3:] + jnp.pad(slope, ((0, 0), (1, 0))) / rod.length
+    bent = cross_columns(rows[:, :3], arm[:, :, None])
+    return Thread(
+        weights=rod.length * share * jnp.asarray(gauss_legendre(rule)[1], dtype),
+        tangent=tangent + cross_columns(rest[:, :3], arm),
+        tangent_rows=rows[:, 3:] + bent,
+        curvature=rest[:, :3],
+        curvature_rows=rows[:, :3],
+        rule=rule,
+        span=rod.length * share,
+    )
+
+
+def thread_length(thread: Thread, q: Float[Array, " dof"]) -> Float[Array, ""]:
+    """Length [m] of a thread; its gradient is the arm of its tension."""
+    return thread.weights @ safe_norm(thread.tangent + thread.tangent_rows @ q)
+
+
+@door
+def thread_lengths(
+    rod: Rod, routes: tuple[AbstractRoute, ...], q: Float[Array, " dof"]
+) -> Float[Array, " threads"]:
+    """Lengths [m] of the threads in `rod`."""
+    return jnp.stack([thread_length(thread(rod, route), q) for route in routes])
+
+
+@door
+def thread_rates(
+    rod: Rod,
+    routes: tuple[AbstractRoute, ...],
+    q: Float[Array, " dof"],
+    v: Float[Array, " dof"],
+) -> Float[Array, " threads"]:
+    """Rates [m/s] of the lengths of the threads."""
+    return jax.jvp(lambda q: thread_lengths(rod, routes, q), (q,), (v,))[1]
+
+
+def pull(
+    thread: Thread, q: Float[Array, " dof"], friction: Float[Array, ""] | None = None
+) -> Float[Array, " dof"]:
+    """Generalised force per tension at the base end [m]: minus the slope of the length.
+
+    With a `friction` coefficient [-] the tension falls by exp(-friction * angle) along the
+    thread, for a thread that is drawn towards the base.
+
+    Reference:
+        Euler and Eytelwein's capstan equation.
+    """
+    tangent = thread.tangent + thread.tangent_rows @ q
+    size = safe_norm(tangent)
+    unit = tangent / size[:, None]
+    weights = thread.weights
+    if friction is not None:
+        weights = weights * jnp.exp(-friction * _turned(thread, q, unit))
+    loads = weights[:, None] * unit
+    return -loads.reshape(-1) @ thread.tangent_rows.reshape(-1, q.shape[0])
+
+
+def _turned(thread: Thread, q: Array, unit: Array) -> Float[Array, " points"]:
+    """Angle [rad] by which the thread has turned between its start and each point."""
+    dtype = q.dtype
+    slope = jnp.asarray(_differentiation(thread.rule), dtype) @ unit / thread.span
+    curvature = thread.curvature + thread.curvature_rows @ q
+    bending = safe_norm(slope + cross_columns(curvature, unit))
+    return thread.span * (jnp.asarray(integration_matrix(thread.rule), dtype) @ bending)
+
+
+def _differentiation(rule: Quadrature) -> np.ndarray:
+    """Derivatives at the nodes of what is known there, span by span, per unit of [0, 1]."""
+    nodes = gauss_legendre(rule.count)[0]
+    differences = nodes[:, None] - nodes[None, :] + np.eye(rule.count)
+    products = np.prod(differences, axis=1)
+    matrix = products[:, None] / (products[None, :] * differences)
+    np.fill_diagonal(matrix, 0.0)
+    np.fill_diagonal(matrix, -np.sum(matrix, axis=1))
+    whole = np.zeros((rule.num_nodes, rule.num_nodes))
+    for k, size in enumerate(np.diff(rule.edges)):
+        block = slice(k * rule.count, (k + 1) * rule.count)
+        whole[block, block] = matrix / size
+    return whole
+
+
+def _strains(rod: Rod, s: np.ndarray) -> tuple[Array, Array]:
+    """Rest strain (points, 6) and strain per coordinate (points, 6, dof) at `s`."""
+    dtype, names = rod.length.dtype, strain_names(rod.group)
+    rest = rest_along(operators(rod))
+    if rest.shape[0] > 1:
+        rest = jnp.asarray(interpolation_rows(rod.quadrature, s), dtype) @ rest
+    active = dict(zip(rod.basis.active, jnp.asarray(rod.basis(s), dtype), strict=True))
+    none = jnp.zeros((len(s), rod.basis.num_dof), dtype)
+    columns = [
+        jnp.broadcast_to(rest[:, names.index(name)], (len(s),))
+        if name in names
+        else jnp.zeros(len(s), dtype)
+        for name in STRAINS
+    ]
+    return jnp.stack(columns, 1), jnp.stack([active.get(n, none) for n in STRAINS], 1)
+
 
 Signal = Float[Array, " inputs"] | Callable[[Array], Array]
 

@@ -5,11 +5,11 @@ from typing import TypeAlias, overload
 from jaxtyping import Array, Float
 
 from sorojax.math.compiled import full_products
-from sorojax.rod.dynamics.composite import assembly_inertia
 from sorojax.rod.dynamics.fields import Operators, RodState, operators as rod_operators
 from sorojax.rod.dynamics.tree import (
     AssemblyOperators,
     AssemblyState,
+    assembly_inertia,
     assembly_motion,
     assembly_operators,
     rod_inertia,

@@ -11,12 +11,12 @@ import numpy as np
 from sorojax.math.quadrature import chebyshev_values, legendre_values
 from sorojax.rod.model.basis import (
     AbstractModes,
+    BSpline,
     StrainBasis,
     checked_breaks,
     each_count,
     merged,
 )
-from sorojax.rod.model.modes import BSpline
 
 
 class Chebyshev(AbstractModes):

@@ -1,7 +1,12 @@
-"""Equilibrium of a rod or an assembly under its forces."""
+"""Equilibrium of a rod or an assembly under its forces; whether an answer lies within what a
+rod model describes; increments, tangents and units, which all searches over coordinates share.
+
+Coordinates may outnumber rates, as a quaternion does: searches step in the rates' dimension,
+and a root is found in as many equations as there are coordinates.
+"""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,21 +18,228 @@ from sorojax import _check
 from sorojax._types import real
 from sorojax.math.compiled import door
 from sorojax.math.implicit_root import implicit_root
+from sorojax.math.quadrature import gauss_legendre, interpolation_rows
 from sorojax.math.status import Status
+from sorojax.rod.dynamics.fields import is_curvature, operators as rod_operators, rest_along
+from sorojax.rod.dynamics.tree import rod_motion
 from sorojax.rod.forces.loads import Load, total_force
-from sorojax.rod.model.assembly import dtype_of, num_coordinates, rest as at_rest
-from sorojax.rod.model.model import Model, motion, operators
-from sorojax.rod.statics.tangent import (
-    increments,
-    is_unstable,
-    linearised,
-    metric,
-    moved,
-    negative_eigenvalues,
-    squared,
-    unit_energy,
+from sorojax.rod.model.assembly import (
+    dtype_of,
+    is_flat,
+    num_coordinates,
+    num_dof,
+    rest,
+    rest as at_rest,
+    retract,
+    slices,
 )
-from sorojax.rod.statics.validity import checked_status
+from sorojax.rod.model.model import Model, inertia, motion, operators
+from sorojax.rod.model.rod import Rod, strain_names
+
+_RESOLVED = 1e-3  # of the length: what the quadrature may leave of a rod's tip
+_LONGEST = 10.0  # stretch [-]: no solid of a soft robot keeps together beyond
+
+
+def checked_status(
+    status: Status, model: Model, path: Float[Array, "*states coordinates"]
+) -> Status:
+    """`status`, or what is wrong with an answer that is called successful.
+
+    It is `inverted` where a rod is turned inside out, `outside_model` where it is stretched
+    more than tenfold, `unresolved` where twice as many nodes would put its tip elsewhere. Of a
+    path the last is looked for at the most strained state alone.
+
+    Args:
+        status: Of the search or run.
+        model: The rod or assembly.
+        path: Coordinates of the answer, or of all saved states.
+    """
+    model, path = jax.lax.stop_gradient((model, jnp.atleast_2d(path)))
+    good = status == Status.successful
+    for rod, at in _rods(model):
+        own = path[:, at]
+        largest = own[jnp.argmax(jnp.sum(own**2, axis=1))] if len(own) > 1 else own[0]
+        stretch, least = jax.vmap(lambda q: _stretches(rod, q))(own)  # noqa: B023
+        for wrong, found in (
+            (~is_resolved(rod, largest), Status.unresolved),
+            (jnp.any(stretch > _LONGEST), Status.outside_model),
+            (jnp.any(least <= 0), Status.inverted),
+        ):
+            status = Status.where(good & wrong, found, status)
+    return status
+
+
+def _stretches(rod: Rod, q: Array) -> tuple[Float[Array, " quad"], Float[Array, " quad"]]:
+    """Stretch at every node, along the axis and the least at the distance from it that the
+    section has in the mean (its radius of gyration)."""
+    strain = _strain(rod, q)
+    section, zero = rod.section, jnp.zeros((), q.dtype)
+    about_y = strain.get("kappa_y", zero) ** 2 * section.second_moment_y
+    about_z = strain.get("kappa_z", zero) ** 2 * section.second_moment_z
+    bent = jnp.sqrt((about_y + about_z) / section.area)
+    return strain["sigma_x"], strain["sigma_x"] - bent
+
+
+def is_resolved(rod: Rod, q: Float[Array, " dof"]) -> Bool[Array, ""]:
+    """Whether twice as many nodes would move the tip by less than a thousandth of the length
+    of the rod."""
+    distance = _tip(finer(rod), q) - _tip(rod, q)
+    return jnp.sum(distance**2) <= (_RESOLVED * rod.length) ** 2
+
+
+def finer(rod: Rod) -> Rod:
+    """The shape of the rod at twice as many nodes; its section and material are means."""
+    mean: Any = lambda x: jnp.mean(x, keepdims=False)  # noqa: E731
+    section, material = jax.tree.map(mean, (rod.section, rod.material))
+    rest, count = rod.rest_strain, 2 * rod.nodes
+    twice = Rod(rod.group, rod.basis, section, material, rod.length, None, count, rod.breaks)
+    if rest is None or rest.ndim == 1:
+        varied = rest
+    else:
+        nodes, _ = gauss_legendre(twice.quadrature)
+        varied = rest @ jnp.asarray(interpolation_rows(rod.quadrature, nodes), rest.dtype).T
+    return Rod(rod.group, rod.basis, section, material, rod.length, varied, count, rod.breaks)
+
+
+def _strain(rod: Rod, q: Array) -> dict[str, Float[Array, " quad"]]:
+    constants = rod_operators(rod)
+    change = dict(zip(rod.basis.active, constants.strain_rows @ q, strict=True))
+    rest = rest_along(constants)
+    return {
+        name: rest[:, k] + change.get(name, jnp.zeros((), q.dtype))
+        for k, name in enumerate(strain_names(rod.group))
+    }
+
+
+def _tip(rod: Rod, q: Array) -> Float[Array, " dim"]:
+    moment = rod_motion(rod, q)
+    return moment.operators.weights @ moment.tangent
+
+
+def _rods(model: Model) -> list[tuple[Rod, slice]]:
+    """The rods of a model, and where their coordinates are."""
+    if isinstance(model, Rod):
+        return [(model, slice(None))]
+    parts = zip(model.parts, slices(model), strict=True)
+    return [(p.body, at.rod_q) for p, at in parts if isinstance(p.body, Rod)]
+
+
+_INERTIA_SHARE = 1e-6  # of the mean square frequency, for joints without a spring
+
+
+def moved(model: Model, q: Array, increment: Float[Array, " dof"]) -> Array:
+    """Coordinates after an increment."""
+    return q + increment if isinstance(model, Rod) else retract(model, q, increment)
+
+
+def squared(model: Model, q: Array, residual: Float[Array, " dof"]) -> Array:
+    """As many equations as coordinates: the residual along the coordinates that it can
+    move, and the norm of a quaternion along the one it cannot."""
+    if isinstance(model, Rod) or is_flat(model):
+        return residual
+    still = jnp.zeros_like(residual)
+    normal, along = jax.jvp(lambda d: retract(model, q, d), (still,), (residual,))
+    return along + q - normal
+
+
+def increments(model: Model, q: Array) -> Float[Array, " dof"]:
+    """The coordinates in the places of their rates; zero where those are others."""
+    if isinstance(model, Rod) or is_flat(model):
+        return q
+    own = jnp.zeros(num_dof(model), q.dtype)
+    for at in slices(model):
+        own = own.at[at.rod_v].set(q[at.rod_q])
+        if at.joint_q.stop - at.joint_q.start == at.joint_v.stop - at.joint_v.start:
+            own = own.at[at.joint_v].set(q[at.joint_q])
+    return own
+
+
+def linearised(
+    residual: Callable[[Array], Array], model: Model, q: Array
+) -> tuple[Float[Array, " dof"], Float[Array, "dof dof"]]:
+    """A residual and its exact tangent, one forward pass for all columns."""
+
+    def along(increment):
+        value = residual(moved(model, q, increment))
+        return value, value
+
+    still = jnp.zeros(num_dof(model), q.dtype)
+    slope, value = jax.jacfwd(along, has_aux=True)(still)
+    return value, slope
+
+
+def negative_eigenvalues(
+    slope: Float[Array, "dof dof"], metric: Float[Array, "dof dof"]
+) -> Int[Array, ""]:
+    """Of the symmetric part, beyond rounding."""
+    slope = _scaled(slope, metric)
+    values = jnp.linalg.eigvalsh((slope + slope.T) / 2)
+    rounding = 32 * jnp.finfo(slope.dtype).eps * jnp.max(jnp.abs(values))
+    return jnp.sum(values < -rounding, dtype=jnp.int32)
+
+
+def is_unstable(
+    slope: Float[Array, "dof dof"], metric: Float[Array, "dof dof"], negative: Int[Array, ""]
+) -> Bool[Array, ""]:
+    """Whether a state of this tangent is surely left.
+
+    Under loads that have a potential by a negative eigenvalue. Loads that follow the body make
+    the tangent unsymmetric; then one real negative eigenvalue, as a negative determinant tells:
+    the symmetric part may have one where the state is stable.
+
+    Reference: Bolotin, "Nonconservative Problems of the Theory of Elastic Stability", 1963.
+    """
+    slope = _scaled(slope, metric)
+    share = float(jnp.finfo(slope.dtype).eps) ** 0.5
+    apart = jnp.max(jnp.abs(slope - slope.T)) > share * jnp.max(jnp.abs(slope))
+    sign, _ = jnp.linalg.slogdet(slope)
+    return (negative > 0) & (~apart | (sign < 0))
+
+
+def _scaled(slope: Array, metric: Array) -> Array:
+    """Without units: strains and bends differ by many orders."""
+    scale = jnp.sqrt(jnp.diag(metric))
+    return slope / (scale[:, None] * scale[None])
+
+
+def metric(model: Model, constants) -> Float[Array, "dof dof"]:
+    """Positive matrix that measures increments in energy.
+
+    The elastic stiffness; in an assembly with a share of the inertia at rest, as a joint
+    without a spring has none.
+    """
+    stiffness = constants.stiffness
+    if isinstance(model, Rod):
+        return stiffness
+    mass, _ = inertia(motion(model, rest(model), constants=constants))
+    square = jnp.trace(jnp.linalg.solve(mass, stiffness)) / stiffness.shape[0]
+    share = jnp.where(square > 0, _INERTIA_SHARE * square, jnp.ones_like(square))
+    return stiffness + share * mass
+
+
+def unit_energy(model: Model, metric: Float[Array, "dof dof"]) -> Float[Array, ""]:
+    """Size of `metric` at a bend of one radian and a strain of one."""
+    return jnp.diag(metric) @ _units(model) ** 2
+
+
+def _units(model: Model) -> Float[Array, " dof"]:
+    if isinstance(model, Rod):
+        one = jnp.ones((), model.length.dtype)
+        return jnp.concatenate(
+            [
+                jnp.full(
+                    model.basis.modes[name].count,
+                    one / model.length if is_curvature(name) else one,
+                )
+                for name in model.basis.active
+            ]
+        )
+    units = jnp.ones(num_dof(model), dtype_of(model))
+    for part, at in zip(model.parts, slices(model), strict=True):
+        if isinstance(part.body, Rod):
+            units = units.at[at.rod_v].set(_units(part.body))
+    return units
+
 
 _DECREASE = 1e-4  # Armijo: share of the promised decrease that a step must give
 _SHORTEST = 1e-3  # of a Newton step

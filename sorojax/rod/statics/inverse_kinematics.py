@@ -25,11 +25,16 @@ from sorojax.rod.model.assembly import dtype_of, num_dof
 from sorojax.rod.model.model import Model, motion, operators
 from sorojax.rod.model.rod import Rod
 from sorojax.rod.statics import reaching as answer
-from sorojax.rod.statics.equilibrium import first_guess
+from sorojax.rod.statics.equilibrium import (
+    checked_status,
+    first_guess,
+    increments,
+    linearised,
+    metric,
+    moved,
+)
 from sorojax.rod.statics.reaching import Rows, Tasks, all_rows, pushed, rows, step
-from sorojax.rod.statics.tangent import increments, linearised, metric, moved
 from sorojax.rod.statics.targets import AbstractTarget, ObstacleConstraint
-from sorojax.rod.statics.validity import checked_status
 
 _DAMPING = 1e-3  # at the first step, relative to the mean square of the Jacobian
 _DRIFT_ERROR = 0.1  # error that a step in the null space may make, against its length

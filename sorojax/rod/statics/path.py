@@ -24,20 +24,18 @@ from sorojax.rod.model.assembly import dtype_of
 from sorojax.rod.model.model import Model, motion, operators
 from sorojax.rod.statics.equilibrium import (
     Search,
+    checked_status,
     ended,
     first_guess,
-    newton,
-    prepare,
-    stability,
-)
-from sorojax.rod.statics.tangent import (
     increments,
     linearised,
     moved,
     negative_eigenvalues,
+    newton,
+    prepare,
     squared,
+    stability,
 )
-from sorojax.rod.statics.validity import checked_status
 
 Loading = Callable[[Array], tuple[Load, ...]]
 

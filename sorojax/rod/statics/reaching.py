@@ -8,15 +8,14 @@ from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Bool, Float
 
 from sorojax.math.linalg.dense import product, solve_symmetric
-from sorojax.rod.dynamics.composite import part_columns
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.points import Points, points
-from sorojax.rod.dynamics.tree import AssemblyState, part_motion
+from sorojax.rod.dynamics.tree import AssemblyState, part_columns, part_motion
 from sorojax.rod.forces.loads import Load, total_force
 from sorojax.rod.model.assembly import index_of
 from sorojax.rod.model.link import LinkState
 from sorojax.rod.model.model import Model
-from sorojax.rod.statics.tangent import increments, squared
+from sorojax.rod.statics.equilibrium import increments, squared
 from sorojax.rod.statics.targets import AbstractTarget, Frames, ObstacleConstraint
 
 _ROUNDING = 16  # units in the last place that a coordinate on its limit may be away

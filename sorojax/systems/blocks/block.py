@@ -1,15 +1,19 @@
-"""Blocks: state-space systems with named, typed ports."""
+"""Blocks: state-space systems with named, typed ports; those without physics: sums, gains,
+functions, lags and sensors."""
 
 import abc
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
+from sorojax import _check
 from sorojax._display import displayed
+from sorojax._types import Numbers, real
 from sorojax.math.status import Status
 
 
@@ -149,3 +153,270 @@ def stack(blocks: Sequence[AbstractBlock]) -> Stack:
 def _kind(block: AbstractBlock):
     leaves, structure = jax.tree.flatten(block)
     return structure, tuple((jnp.shape(x), jnp.result_type(x)) for x in leaves)
+
+
+class Function(AbstractBlock):
+    """value = function(a, b, ...) of its inputs, in the order of their names.
+
+    Attributes:
+        function: Any function of arrays; one that is a module may be differentiated.
+        ports: Names of the inputs.
+        shape, unit: Of the output.
+        input_shape, input_unit: Of every input.
+    """
+
+    function: Callable[..., Any]
+    ports: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=("a",))
+    shape: tuple[int, ...] = eqx.field(static=True, converter=tuple, default=())
+    unit: str | None = eqx.field(static=True, default=None)
+    input_shape: tuple[int, ...] = eqx.field(static=True, converter=tuple, default=())
+    input_unit: str | None = eqx.field(static=True, default=None)
+
+    @property
+    def inputs(self):
+        return {name: Input(self.input_unit, self.input_shape) for name in self.ports}
+
+    @property
+    def outputs(self):
+        return {"value": Output(self.unit, self.shape, frozenset(self.ports))}
+
+    def initial_state(self):
+        return {}
+
+    def output(self, name, t, state, inputs):
+        return self.function(*(inputs[port] for port in self.ports))
+
+    def vector_field(self, t, state, inputs):
+        return {}
+
+
+class Weighted(eqx.Module):
+    """Sum of its arguments with weights."""
+
+    weights: Float[Array, " terms"] = eqx.field(converter=real)
+
+    def __call__(self, *terms):
+        return sum(self.weights[k] * term for k, term in enumerate(terms))
+
+
+def sum_of(weights: Numbers, *, shape=(), unit: str | None = None) -> Function:
+    """A block that adds inputs `a`, `b`, ... with one weight each; -1 subtracts."""
+    law = Weighted(weights)
+    ports = tuple("abcdefghijklmnop"[: law.weights.shape[0]])
+    return Function(law, ports, shape, unit, shape, unit)
+
+
+def gain(factor: Numbers, *, shape=(), unit: str | None = None, input_unit: str | None = None):
+    """A block that multiplies its input `a`; the units say what the factor turns into what."""
+    return Function(Weighted([factor]), ("a",), shape, unit, shape, input_unit)
+
+
+class Lag(AbstractBlock):
+    """First-order lag: time y' = input - y; its output breaks algebraic loops.
+
+    Attributes:
+        time: Time constant [s].
+        start: Output at the start, which gives the shape.
+        unit: Of input and output.
+    """
+
+    time: Float[Array, ""] = eqx.field(converter=real)
+    start: Float[Array, "..."] = eqx.field(converter=real, default=0.0)
+    unit: str | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        _check.positive("Lag", "time", self.time, "s", "Wire straight through instead.")
+
+    @property
+    def inputs(self):
+        return {"a": Input(self.unit, self.start.shape)}
+
+    @property
+    def outputs(self):
+        return {"value": Output(self.unit, self.start.shape)}
+
+    def initial_state(self):
+        return self.start
+
+    def output(self, name, t, state, inputs):
+        return state
+
+    def vector_field(self, t, state, inputs):
+        return (inputs["a"] - state) / self.time
+
+
+class Sensor(AbstractBlock):
+    """A measurement with offset and white noise, sampled and held.
+
+    The noise of a sample depends on `key` and on its number alone, so a run can be repeated,
+    and gone on with, to the bit. Read at the rate of the sensor or slower.
+
+    Attributes:
+        noise: Standard deviation, in the unit of the signal.
+        period: Time between samples of the noise [s].
+        key: Typed random key.
+        offset: Added to every value.
+        shape, unit: Of the signal.
+    """
+
+    noise: Float[Array, "..."] = eqx.field(converter=real)
+    period: Float[Array, ""] = eqx.field(converter=real)
+    key: Key[Array, ""] = eqx.field(kw_only=True)
+    offset: Float[Array, "..."] = eqx.field(converter=real, default=0.0)
+    shape: tuple[int, ...] = eqx.field(static=True, converter=tuple, default=())
+    unit: str | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        _check.positive("Sensor", "period", self.period, "s", "1 ms is period=1e-3.")
+
+    @property
+    def inputs(self):
+        return {"a": Input(self.unit, self.shape)}
+
+    @property
+    def outputs(self):
+        return {"value": Output(self.unit, self.shape, frozenset({"a"}))}
+
+    def initial_state(self):
+        return {}
+
+    def output(self, name, t: Any, state, inputs):
+        # half a millionth, so that a sample taken on time counts as its own
+        number = jnp.floor(t / self.period + 5e-7).astype(jnp.uint32)
+        draw = jax.random.normal(jax.random.fold_in(self.key, number), self.shape, t.dtype)
+        return inputs["a"] + self.offset + self.noise * draw
+
+    def vector_field(self, t, state, inputs):
+        return {}
+
+
+# Signals of time, and the block that puts one on a wire
+
+
+class AbstractReference(eqx.Module):
+    """A signal of time [s]."""
+
+    @abc.abstractmethod
+    def __call__(self, t: Float[Array, ""]) -> Float[Array, "..."]:
+        """Value at `t`."""
+
+
+class Constant(AbstractReference):
+    """The same value at all times."""
+
+    value: Float[Array, "..."] = eqx.field(converter=real)
+
+    def __call__(self, t):
+        return self.value
+
+
+class Step(AbstractReference):
+    """From `before` to `after` at `time` [s]."""
+
+    after: Float[Array, "..."] = eqx.field(converter=real)
+    time: Float[Array, ""] = eqx.field(converter=real, default=0.0)
+    before: Float[Array, "..."] = eqx.field(converter=real, default=0.0)
+
+    def __call__(self, t):
+        return jnp.where(t < self.time, self.before, self.after)
+
+
+class Sine(AbstractReference):
+    """offset + amplitude sin(2 pi frequency t + phase); frequency in Hz, phase in rad."""
+
+    amplitude: Float[Array, "..."] = eqx.field(converter=real)
+    frequency: Float[Array, ""] = eqx.field(converter=real)
+    offset: Float[Array, "..."] = eqx.field(converter=real, default=0.0)
+    phase: Float[Array, ""] = eqx.field(converter=real, default=0.0)
+
+    def __call__(self, t):
+        angle = 2 * math.pi * self.frequency * t + self.phase
+        return self.offset + self.amplitude * jnp.sin(angle)
+
+
+class SmoothRamp(AbstractReference):
+    """Through waypoints with zero rate and zero acceleration at each.
+
+    Attributes:
+        times: Rising times of the waypoints [s].
+        values: One value per waypoint, held before the first and after the last.
+    """
+
+    times: Float[Array, " points"] = eqx.field(converter=real)
+    values: Float[Array, " points"] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        do = "Give one value per waypoint, and two waypoints or more."
+        _check.shape("SmoothRamp", "values", self.values, self.times.shape, do)
+        if self.times.shape[0] < 2:
+            raise ValueError(f"SmoothRamp: got {self.times.shape[0]} waypoint. {do}")
+        rises = jnp.diff(self.times)
+        _check.positive("SmoothRamp", "diff(times)", rises, "s", "Sort the waypoints.")
+
+    def __call__(self, t):
+        last = self.times.shape[0] - 1
+        right = jnp.clip(jnp.searchsorted(self.times, t), 1, last)
+        start, end = self.times[right - 1], self.times[right]
+        x = jnp.clip((t - start) / (end - start), 0, 1)
+        share = x**3 * (10 + x * (6 * x - 15))
+        return self.values[right - 1] + share * (self.values[right] - self.values[right - 1])
+
+
+class Source(AbstractBlock):
+    """Puts a reference on a wire, as output `value` in `unit`."""
+
+    reference: AbstractReference
+    unit: str | None = eqx.field(static=True, default=None)
+
+    @property
+    def inputs(self):
+        return {}
+
+    @property
+    def outputs(self):
+        shape = eqx.filter_eval_shape(self.reference, jnp.zeros(())).shape
+        return {"value": Output(self.unit, shape)}
+
+    def initial_state(self):
+        return {}
+
+    def output(self, name, t, state, inputs):
+        return self.reference(t)
+
+    def vector_field(self, t, state, inputs):
+        return {}
+
+
+# Paths through waypoints, of a point or of several signals at once
+
+
+class Waypoints(AbstractReference):
+    """Straight from waypoint to waypoint; two at the same time make a jump.
+
+    Attributes:
+        times: Of the waypoints [s], none before the one in front of it.
+        values: One row each, held before the first and after the last.
+        smooth: Stop at every waypoint, without a jump of rate or acceleration.
+    """
+
+    times: Float[Array, " points"] = eqx.field(converter=real)
+    values: Float[Array, "points ..."] = eqx.field(converter=real)
+    smooth: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        do = "Give one row of values per time."
+        _check.shape("Waypoints", "times", self.times, self.values.shape[:1], do)
+        if _check.is_concrete(self.times) and bool(jnp.any(jnp.diff(self.times) < 0)):
+            raise ValueError(
+                f"Waypoints: `times` are {self.times} s, need each at or after the one before. "
+                "Sort the waypoints."
+            )
+
+    def __call__(self, t):
+        last = self.times.shape[0] - 1
+        after = jnp.clip(jnp.searchsorted(self.times, t, side="right"), 1, last)
+        start, length = self.times[after - 1], self.times[after] - self.times[after - 1]
+        share = (t - start) / jnp.where(length > 0, length, jnp.ones_like(length))
+        share = jnp.where(length > 0, jnp.clip(share, 0, 1), jnp.ones_like(share))
+        share = share**3 * (10 + share * (6 * share - 15)) if self.smooth else share
+        return self.values[after - 1] + share * (self.values[after] - self.values[after - 1])

@@ -32,7 +32,7 @@ from sorojax.rod.dynamics.dynamics import coordinate_rate
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.forces.loads import Load
 from sorojax.rod.model.assembly import index_of
-from sorojax.rod.statics.validity import checked_status
+from sorojax.rod.statics.equilibrium import checked_status
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output
 
 

@@ -14,8 +14,7 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import real
-from sorojax.systems.blocks.algebra import AbstractReference
-from sorojax.systems.blocks.block import AbstractBlock, Input, Output
+from sorojax.systems.blocks.block import AbstractBlock, AbstractReference, Input, Output
 
 Scalar = Float[Array, ""]
 

@@ -27,8 +27,7 @@ from sorojax.rod import (
 )
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.rollout import Rollout
-from sorojax.systems.blocks.algebra import AbstractReference
-from sorojax.systems.blocks.block import Input, Output
+from sorojax.systems.blocks.block import AbstractReference, Input, Output
 from sorojax.systems.control.controller import AbstractController
 
 Effort = Float[Array, " dof"]

@@ -20,8 +20,14 @@ from sorojax.math.ode.explicit import AbstractMethod, RungeKutta4, Tsit5, finite
 from sorojax.math.ode.step_control import Control
 from sorojax.math.status import Status
 from sorojax.systems.integrate.coupled import Coupled, bodies_of
-from sorojax.systems.integrate.event import Event, EventLog, run_with_events
-from sorojax.systems.integrate.integrate import Integration, Resume, adaptive
+from sorojax.systems.integrate.integrate import (
+    Event,
+    EventLog,
+    Integration,
+    Resume,
+    adaptive,
+    run_with_events,
+)
 from sorojax.systems.integrate.march import fixed
 from sorojax.systems.network import Network, at_time, outputs
 

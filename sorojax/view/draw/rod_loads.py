@@ -13,8 +13,7 @@ from jaxtyping import Float
 from sorojax import rod as R
 from sorojax.math.quadrature import interpolation_rows
 from sorojax.rod import Assembly, Rod, Section
-from sorojax.rod.forces.routing import Thread
-from sorojax.rod.forces.tendons import ThreadChambers
+from sorojax.rod.forces.tendons import Thread, ThreadChambers
 from sorojax.sdf import AbstractSdf, contour
 from sorojax.sdf.sampling import finite_box
 from sorojax.view import style
