@@ -39,7 +39,7 @@ Listener = Callable[[Progress], None]
 
 @dataclass(frozen=True)
 class View:
-    """What a bar shows: a line of text, and whether it is the last of its call."""
+    """The display of a bar: a line of text, and whether it is the last of its call."""
 
     text: str
     fraction: float

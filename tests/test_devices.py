@@ -13,7 +13,7 @@ from benchmarks.fingers import finger, random_states
 from benchmarks.single import narrow
 from sorojax import fem, mesh, rod as R
 from sorojax.fem.equilibrium.linear import linearise, prepare
-from sorojax.math import compiled as door_module
+from sorojax.math import compiled as compiled_module
 
 
 @pytest.mark.parametrize("name", ["device.fem", "device.rods", "device.sdf"])
@@ -53,12 +53,12 @@ def test_an_accelerator_takes_all_cells_at_once_with_the_same_tangent(monkeypatc
 
 def test_products_of_single_precision_keep_its_digits(monkeypatch):
     def trace(x):
-        verb = door_module.door(lambda x: x @ x)
+        verb = compiled_module.jit_public(lambda x: x @ x)
         return str(jax.make_jaxpr(lambda x: verb(x))(x))
 
     x = jnp.ones((2, 2), jnp.float32)
     assert "HIGHEST" not in trace(x)
-    monkeypatch.setattr(door_module, "platform", lambda: "gpu")
+    monkeypatch.setattr(compiled_module, "platform", lambda: "gpu")
     assert "HIGHEST" in trace(x)
     with jax.default_matmul_precision("bfloat16"):
         assert "HIGHEST" not in trace(x)
@@ -83,7 +83,7 @@ def rounded_factors(monkeypatch):
     jax.clear_caches()
 
 
-@pytest.mark.parametrize("by", ["door", "field"])
+@pytest.mark.parametrize("by", ["jit_public", "field"])
 @pytest.mark.parametrize("device", ["gpu", "cpu"])
 def test_rods_in_single_precision_where_factors_are_rounded(
     by, device, rounded_factors, monkeypatch
@@ -91,9 +91,9 @@ def test_rods_in_single_precision_where_factors_are_rounded(
     body, (q, *_), (v, *_) = finger(8), *random_states(1)
     gravity = (R.Gravity(),)
     exact = R.forward_dynamics(body, jnp.asarray(q), jnp.asarray(v), gravity)
-    monkeypatch.setattr(door_module, "platform", lambda: device)
+    monkeypatch.setattr(compiled_module, "platform", lambda: device)
     body, q, v = narrow((body, jnp.asarray(q), jnp.asarray(v)))
-    if by == "door":
+    if by == "jit_public":
         found = jax.jit(lambda *x: R.forward_dynamics(*x, gravity))(body, q, v)
     else:
         found = jax.jit(lambda body, *x: R.vector_field(body, gravity)(0.0, x)[1])(body, q, v)

@@ -61,9 +61,9 @@ def _own_renderer():
     """The same pictures with and without the extra, and no warning."""
     from sorojax.view.raster import solid
 
-    before, solid._told = solid._told, True
+    before, solid._warned = solid._warned, True
     yield
-    solid._told = before
+    solid._warned = before
 
 
 @pytest.fixture(scope="module")

@@ -222,7 +222,7 @@ def test_a_tube_is_closed_and_faces_out(hole):
 
 def test_without_pyvista_one_warning_is_given(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setattr(solid, "_told", False)
+    monkeypatch.setattr(solid, "_warned", False)
     with pytest.warns(UserWarning, match="pyvista is not installed"):
         assert solid.chosen_renderer("auto") == "own"
     assert solid.chosen_renderer("auto") == "own"  # and no second one

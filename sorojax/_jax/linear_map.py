@@ -39,7 +39,7 @@ class LinearMap(Protocol):
 
 
 def pushed(rates: Sequence[Array], by: LinearMap) -> list[Array]:
-    """What `by` makes of `rates`."""
+    """The image of `rates` under `by`."""
     return _push(*rates, by=by)
 
 

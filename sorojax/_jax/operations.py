@@ -30,7 +30,7 @@ _missing = [where for where in _NAMES if _found[where[1]] is None]
 
 
 class Rules(NamedTuple):
-    """What an operation is; each function gets the arrays, and the parameters by name.
+    """An operation by its functions; each gets the arrays, and the parameters by name.
 
     Attributes:
         run: Its results for concrete arrays, at once.

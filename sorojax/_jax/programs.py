@@ -1,4 +1,4 @@
-"""What a function does, read from its program, to leave out what is not needed.
+"""Which operations a function uses, read from its program, to leave out the others.
 
 Rests on `jax.extend.core.Var`, `Jaxpr` and `ClosedJaxpr`. Without them the answers are those
 that are right for every function.

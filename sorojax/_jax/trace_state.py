@@ -1,4 +1,4 @@
-"""What JAX is doing at this moment: which values are abstract, whether a transformation runs.
+"""The state of tracing: which values are abstract, whether a transformation runs.
 
 Rests on `jax.core.Tracer`, `jax.core.eval_context` and
 `jax.extend.core.get_opaque_trace_state`.

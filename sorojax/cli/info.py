@@ -1,4 +1,4 @@
-"""What is installed here and what it runs on."""
+"""`sorojax info`: installed versions and devices."""
 
 import os
 import platform

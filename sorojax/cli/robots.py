@@ -84,9 +84,9 @@ def _unit(name: str) -> float:
     return deg if "angle" in name or name == "splay" else mm
 
 
-def _changed(robot, told: list[str]):
+def _changed(robot, changes: list[str]):
     known = _dimensions(robot)
-    for text in told:
+    for text in changes:
         name, _, value = text.partition("=")
         if name not in known:
             raise ValueError(f"no dimension {name!r}, need one of {', '.join(known)}")

@@ -136,7 +136,8 @@ def work_of_loads(
 
 
 def _loaded(problem: Problem, names: tuple[str, ...] | None) -> Problem:
-    """What a work is made of: no stiffness, whose derivative is zero and not for nothing."""
+    """The fields that a work depends on: no stiffness, whose derivative would be zero at full
+    cost."""
     chosen = [
         load for load in problem.loads
         if (not load.holds if names is None else load.name in names)

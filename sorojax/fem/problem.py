@@ -64,7 +64,7 @@ class Problem(eqx.Module):
 
 
 def _described(load: AbstractLoad) -> str:
-    """What a load acts on, and the entries that it adds to the tangent."""
+    """The nodes that a load acts on, and the entries that it adds to the tangent."""
     text = f"{type(load).__name__} '{load.name}'"
     for what in ("facets", "nodes"):
         if (ids := getattr(load, what, None)) is not None:

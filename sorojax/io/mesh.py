@@ -76,7 +76,7 @@ _PHYSICAL, _BETWEEN = "gmsh:physical", " + "
 
 
 class Parts(NamedTuple):
-    """What a file holds beside points and cells."""
+    """The content of a file beside points and cells."""
 
     blocks: list
     point_data: dict

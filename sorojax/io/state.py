@@ -105,7 +105,7 @@ _PLAIN = (type(None), bool, int, float, str)
 
 
 class NotPlain(ValueError):
-    """What cannot be written as JSON and arrays; the message names it."""
+    """A value that cannot be written as JSON and arrays; the message names it."""
 
 
 def described(tree: Any) -> tuple[Any, dict[str, Any]]:
@@ -477,7 +477,7 @@ def _digest(array: np.ndarray) -> str:
 
 
 class _Saved(NamedTuple):
-    """What a file holds."""
+    """The content of a file."""
 
     leaves: dict[str, np.ndarray]
     statics: dict[str, np.ndarray]
@@ -527,7 +527,7 @@ def _damaged(where: str, path, why: Exception) -> ValueError:
 
 
 def _header(where: str, target, text: np.ndarray | None) -> dict[str, Any]:
-    """What the file says of its arrays."""
+    """The table of the arrays in the file."""
     try:
         header = json.loads(b"" if text is None else text.tobytes())
     except (ValueError, RecursionError) as error:

@@ -23,7 +23,7 @@ from sorojax._types import platform, real
 Verb = TypeVar("Verb", bound=Callable[..., Any])
 
 
-def door(verb: Verb) -> Verb:
+def jit_public(verb: Verb) -> Verb:
     """`verb` compiled by `eqx.filter_jit`, with floats and lists of numbers traced.
 
     A Python float would otherwise be static and recompile at every new value. Integers

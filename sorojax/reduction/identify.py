@@ -220,7 +220,7 @@ class ConstantDamping(AbstractDamping):
 
 
 class Fit(eqx.Module):
-    """What a rod needs to stand in for the solid, and how well it was found.
+    """The laws of a rod that stands in for the solid, and how well they were found.
 
     Attributes:
         section: Mean section: mass and rotary inertia about the line.

@@ -270,7 +270,7 @@ class Hand(eqx.Module):
         return self._each(self._supply(self.finger), self._supply(self.thumb))
 
     def body(self) -> AbstractSdf:
-        """What is printed, in one piece."""
+        """The printed shape, in one piece."""
         return (self.palm() | self.fingers()) - self.chambers()
 
 
@@ -364,7 +364,7 @@ class Manipulator(eqx.Module):
         return union(*(translate(plate, jnp.stack([zero, zero, z])) for z in (low, high)))
 
     def body(self) -> AbstractSdf:
-        """What is printed."""
+        """The printed shape."""
         zero = jnp.zeros_like(self.core_radius)
         bellows = self._around(self.bellows.solid(), self.center_distance, 0.0, 0.0)
         fingers = self._around(
@@ -424,7 +424,7 @@ class PlanarActuator(eqx.Module):
         )
 
     def body(self) -> AbstractSdf:
-        """What is printed."""
+        """The printed shape."""
         return (self._both(self.bellows.solid()) | self.plates()) - self.chambers()
 
 
@@ -493,5 +493,5 @@ class BendingActuator(eqx.Module):
         return row | slab | neck
 
     def body(self) -> AbstractSdf:
-        """What is printed."""
+        """The printed shape."""
         return self.solid() - self.chambers()

@@ -273,7 +273,7 @@ def contact_stepper(
     inputs, fixed = model.inputs, (Split(model),)
 
     @kernel
-    def told(model, state, resolved):
+    def observed(model, state, resolved):
         return model.pressure(state), finite(state) & resolved
 
     def advance(now: InContact, setpoint: Any, dt: float):
@@ -283,7 +283,7 @@ def contact_stepper(
                 "this step."
             )
         moved = move(now.network, inputs(np.asarray(setpoint)))
-        pressure, good = told(fixed, moved.state, moved.resolved)
+        pressure, good = observed(fixed, moved.state, moved.resolved)
         if not good:
             raise RuntimeError(
                 f"contact_stepper: the robot does not get through {period:g} s at set-points "

@@ -31,7 +31,7 @@ _SLOTS = 3
 
 
 class Frame(NamedTuple):
-    """What was sent: its number from 1 on, the time [s] and the values."""
+    """One message: its number from 1 on, the time [s] and the values."""
 
     number: int
     time: float

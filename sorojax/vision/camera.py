@@ -139,9 +139,9 @@ def load_camera(path: str | Path) -> Camera:
         ValueError: If the file does not hold a camera.
     """
     try:
-        told = json.loads(Path(path).read_text())
-        told["distortion"] = tuple(float(k) for k in told["distortion"])
-        camera = Camera(**told)
+        record = json.loads(Path(path).read_text())
+        record["distortion"] = tuple(float(k) for k in record["distortion"])
+        camera = Camera(**record)
         numbers = np.array(
             [*camera[:4], *camera.distortion, camera.width, camera.height], float
         )

@@ -26,7 +26,7 @@ from sorojax.view.film.film import Film
 
 
 class Results(NamedTuple):
-    """What the stages found."""
+    """Results of all stages."""
 
     design: Design
     path: FemPath

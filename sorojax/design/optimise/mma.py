@@ -341,9 +341,9 @@ def _update(method, x, values: Values, state: MMAState):
 @jax.jit
 def _stiffen(method, x, proposal, values, found, state):
     low, high = _asymptotes(method, x, state)
-    told = _approximation(method, x, values, state, low, high)
+    model = _approximation(method, x, values, state, low, high)
     true = jnp.concatenate([found[0][None], found[1]])
-    above = true - (told.at(proposal) - jnp.concatenate([told.shift_objective, told.right]))
+    above = true - (model.at(proposal) - jnp.concatenate([model.shift_objective, model.right]))
     span = method.upper - method.lower + jnp.zeros_like(x)
     away = (high - low) * (proposal - x) ** 2
     away = jnp.sum(away / ((high - proposal) * (proposal - low) * span))

@@ -145,7 +145,7 @@ def shape_stress(
 
 
 class ShapeVectors(NamedTuple):
-    """What dP/dF is made of, where the energy is one of the first isochoric invariant: an outer
+    """The parts of dP/dF, where the energy is one of the first isochoric invariant: an outer
     product of `half` and C = dJ/dF with its transpose, `second` times that of the slopes of the
     invariant (`None`: the energy is linear in it), a multiple `flat` of unity, and `weight`
     times d2J / dF dF."""

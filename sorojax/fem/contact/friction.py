@@ -131,7 +131,7 @@ def gripped(
 
 
 def felt(load: "Contact", problem: "Problem", u: Nodal) -> Felt:
-    """What the points feel where a step from `u` begins, from `load` as the last step left
+    """Contact of the points where a step from `u` begins, from `load` as the last step left
     it; nothing where a block of facets was and is far from the obstacle."""
     law, shift, start, bound = load.law, load.shift(), load.start, load.obstacle.lipschitz
     assert load.place is not None

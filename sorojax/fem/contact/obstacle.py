@@ -196,7 +196,7 @@ class Contact(AbstractLoad):
         return xp.asarray(self.facets)
 
     def state(self, problem, u: Float[Array, "nodes dim"]) -> Contacts:
-        """What the quadrature points feel from the obstacle."""
+        """Contact of the quadrature points with the obstacle."""
         points = self.points_of(problem, u)
         areas = areas_of(problem, self.facets)
         flat = points.reshape(-1, points.shape[-1])

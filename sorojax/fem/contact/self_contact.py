@@ -311,7 +311,7 @@ class SelfContact(AbstractLoad):
         return jax.lax.cond(jnp.sum(spread**2) > most**2, looked, lambda: jnp.array(False))
 
     def state(self, problem, u: Float[Array, "nodes dim"]) -> Contacts:
-        """What the quadrature points of both sides feel from the other one."""
+        """Contact of the quadrature points of each side with the other one."""
         part, near = self.curved_part(problem), self._near(problem)
         x = (problem.mesh.points + u)[part.groups]
         areas, real, offset, _ = part.data

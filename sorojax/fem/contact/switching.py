@@ -11,7 +11,7 @@ from sorojax.fem.problem import body
 
 
 class ContactSwitching(eqx.Module):
-    """What the points of all contacts of a motion did up to each saved time.
+    """Contact states of all points of a motion up to each saved time.
 
     The slope of friction jumps where a point begins to slide or to hold; that of the pressure
     grows within the smoothing of the contact where a point touches or lets go. Derivatives

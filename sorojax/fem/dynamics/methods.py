@@ -110,7 +110,7 @@ _SMALL = 1e-2  # increments of C whose energy Gauss's rule integrates exactly
 
 
 class Conserving(AbstractLoad):
-    """What the force of the discrete gradient has more than that of the mean state, for the
+    """The force of the discrete gradient minus that of the mean state, for the
     step from `before`. Its stiffness is left out, so that the tangent stays symmetric."""
 
     before: Float[Array, "nodes dim"]

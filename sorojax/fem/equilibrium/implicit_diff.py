@@ -331,7 +331,7 @@ _equilibrium.defjvp(_derivative, symbolic_zeros=True)
 
 
 def _linearised_at(call: Solve, traced, dots, u, counts, values):
-    """What makes du of R(u, params) = 0, with prescribed displacements moving along."""
+    """The rule for du of R(u, params) = 0, with prescribed displacements moving along."""
     leaves = call.complete(traced)
     params, rest, rates = call.moving(leaves, dots)
     if call.settings[0].step_tolerance > _SHARP:

@@ -65,7 +65,7 @@ class _State(NamedTuple):
 
 
 class _Level(NamedTuple):
-    """What one pass found at the trial state; exactly one of the first four is true."""
+    """Outcome of one pass at the trial state; exactly one of the first four is true."""
 
     collapsed: Bool[Array, ""]
     converged: Bool[Array, ""]

@@ -17,7 +17,7 @@ from sorojax.math.linalg import sparse
 
 
 class Prepared(NamedTuple):
-    """What one solve computes once: shape gradients, known unknowns, slots of load stiffness,
+    """Computed once per solve: shape gradients, known unknowns, slots of load stiffness,
     and the size of the largest cell [m]."""
 
     geometry: Geometry

@@ -62,7 +62,7 @@ class KeptFactor:
     def near(
         self, u: Float[np.ndarray, "nodes dim"], ratio: float, size: float
     ) -> Neighbour | None:
-        """What to solve with at `u`, where the residual is `ratio` of the load and the last
+        """The linear solver at `u`, where the residual is `ratio` of the load and the last
         step was `size` of the displacement; 0 where no eigenvalues are asked for."""
         if self._factor is None or not 0 < ratio < np.inf:
             return None

@@ -165,7 +165,7 @@ def solved_and_kept(
     that a derivative would stage."""
     call = Solve(problem, None if start is None else _begun(start), *settings)
     u, counts, _ = equilibrium(call)
-    solution = Solution(problem, u, *_told(counts, call.stats))
+    solution = Solution(problem, u, *_counted(counts, call.stats))
     _raise_if_failed("fem.solve", solution, throw)
     return solution, call.record.displacement
 
@@ -177,7 +177,7 @@ def _begun(start: Any) -> Begin:
         return Begin(real(start))
 
 
-def _told(counts: Float[Array, " 5"], stats):
+def _counted(counts: Float[Array, " 5"], stats):
     """Status, record, fraction of the load, iterations, load steps and cuts, from what is
     concrete at once: every operation beside a derivative is staged with it."""
     with evaluated_now(counts):

@@ -40,8 +40,8 @@ class CriticalPoint(eqx.Module):
 def locate(
     loading: Loading, prepared: Prepared, first: PathState, last: PathState, newton: Newton
 ) -> list[CriticalPoint]:
-    """What lies between two neighbouring states: a limit point where the load turns, a
-    bifurcation where the tangent loses or gains an eigenvalue otherwise."""
+    """Critical points between two neighbouring states: a limit point where the load turns,
+    a bifurcation where the tangent loses or gains an eigenvalue otherwise."""
     turned = first.slope * last.slope < 0
     counts = first.negative_eigenvalues, last.negative_eigenvalues
     changes = abs(counts[1] - counts[0]) if min(counts) >= 0 else 0

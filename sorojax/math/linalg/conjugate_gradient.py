@@ -237,7 +237,7 @@ def _iterate_rows(levels: Multigrid, rows, tolerance: float, max_iterations: int
 
 
 class IterativeBackend:
-    """What `DirectSolver` keeps factors of."""
+    """The class whose factors `DirectSolver` keeps."""
 
     name = "conjugate_gradient"
 

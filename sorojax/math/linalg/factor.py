@@ -161,7 +161,7 @@ class DirectSolver:
 
     @property
     def recipe(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, Iterative | None]:
-        """What it is made of: key, pattern by rows, and what iterates, if anything does."""
+        """The fields as a tree: key, pattern by rows, and the iterative solver, if any."""
         iterates = isinstance(self._solver, IterativeBackend)
         return self._key, *self._pattern, self._solver.solver if iterates else None
 

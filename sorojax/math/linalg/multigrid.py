@@ -450,7 +450,7 @@ def _diagonal(level: Level, blocks: Float[Array, "blocks a a"]) -> Float[Array, 
 
 
 def _nothing(size: Array) -> Array:
-    """What is zero to rounding beside the largest entry."""
+    """Whether entries are zero to rounding beside the largest one."""
     return 100 * jnp.finfo(size.dtype).eps * jnp.max(size)
 
 

@@ -119,7 +119,7 @@ class SparseSymmetric(eqx.Module):
 
     @property
     def unsolved(self) -> str:
-        """What it means that a system has no answer."""
+        """The error message for a system without a solution."""
         if self.iterative is None:
             return "the tangent is singular"
         most = self.iterative.settings.max_iterations

@@ -142,7 +142,7 @@ def _balance(problem: SecondOrder, at: _At, state: Kinematic, end: Kinematic, in
 
 
 def _solve_apart(problem: SecondOrder, at: _At, state: Kinematic, method: ContactMidpoint):
-    """What is near, and the mean acceleration without contact, or with it if that is."""
+    """Whether contact is near, and the mean acceleration: with contact if it is."""
     assert problem.contact is not None
     new, moment = state.a, None
     for _ in range(method.passes):
@@ -241,7 +241,7 @@ def _free_at(problem: SecondOrder, at: _At, state: Kinematic, new: Array):
 
 
 def _newton(problem: SecondOrder, at: _At, mass: Array, residual: Array) -> Array:
-    """What the acceleration is too large by, without contact."""
+    """Excess of the acceleration, without contact."""
     implicit = mass + at.part * problem.damping + at.part**2 * problem.stiffness
     return solve_symmetric(implicit, residual)
 

@@ -80,7 +80,7 @@ class AbstractMethod(dfx.AbstractSolver):
         return terms.vf(t0, y0, args)
 
     def init(self, terms, t0, t1, y0, args):
-        """What the first step starts from, twice: the solver keeps what its next step and
+        """The start of the first step, twice: the solver keeps what its next step and
         what its last step started from, so that a run may go on from within a step."""
         now = self.begin(_field(terms, args), jnp.asarray(t0), y0, jnp.asarray(t1 - t0))
         return now, now

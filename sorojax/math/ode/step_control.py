@@ -103,7 +103,7 @@ class Control(dfx.AbstractAdaptiveStepSizeController):
         )
 
     def begun(self, seam: Seam) -> _Pace:
-        """What to remember in order to take the step of `seam` again and go on."""
+        """The memory needed to take the step of `seam` again and go on."""
         seam = _paced(seam)
         counts = jnp.stack([seam.rejected, jnp.zeros_like(seam.rejected)])
         return _Pace(seam.before, counts, seam.step, seam)
@@ -349,7 +349,7 @@ _ROUNDING = 0.6  # power of the unit roundoff: what two ways of a step may diffe
 
 
 class Passes(NamedTuple):
-    """What a scan makes, in order.
+    """The outputs of a scan, in order.
 
     Attributes:
         row: Number of the row.
@@ -384,7 +384,7 @@ class Doubled(NamedTuple):
         return cls(state, state, state)
 
     def begin(self, part: Array) -> PyTree:
-        """What a pass starts from."""
+        """The start of a pass."""
         before, middle = jax.lax.stop_gradient((self.before, self.middle))
         again = _where(part == 1, before, middle)
         return _where(part == 0, self.now, again)
@@ -434,7 +434,7 @@ def rows_too_long(plan: Passes, path: list[Array], states: list[Array]) -> Bool[
 
 
 def whole_rows(plan: Passes, states: PyTree) -> PyTree:
-    """What was stacked over all passes, for those of whole rows."""
+    """The outputs stacked over all passes, for those of whole rows."""
     whole = np.flatnonzero(plan.part == 0)
     if len(whole) == len(plan.part):
         return states

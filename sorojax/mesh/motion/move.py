@@ -301,7 +301,7 @@ _recent: OrderedDict[tuple[int, int, int], Any] = OrderedDict()
 
 
 def _prepared(mesh: Mesh, num_interfaces: int) -> _Motion:
-    """What `moved_points` needs of `mesh`, kept for the last few meshes."""
+    """The plan of `moved_points` for `mesh`, kept for the last few meshes."""
     key = (id(mesh.points), id(mesh.cells), num_interfaces)
     if key not in _recent:
         # Concrete work, also when called under the user's trace.

@@ -107,8 +107,8 @@ _ABREAST = (0.1, 0.01, 1e-3, 1e-4)  # zooms for nodes that are near their ridge 
 
 
 class Surface(NamedTuple):
-    """What holds nodes: fields, which one a smooth node lies on (or -1), and nodes on
-    several sides."""
+    """The surfaces that hold nodes: fields, which one a smooth node lies on (or -1), and
+    nodes on several sides."""
 
     fields: tuple[AbstractSdf, ...]
     owner: np.ndarray

@@ -233,7 +233,7 @@ def _blocks(stiffness: Array, shear: Array) -> Array:
 
 
 def rigid(shape: AbstractSdf, origin, axes, density, *, resolution: int = 64) -> Link:
-    """What does not bend, as a link.
+    """The stiff part, as a link.
 
     Args:
         shape: The solid.

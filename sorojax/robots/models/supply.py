@@ -129,8 +129,8 @@ class Model(eqx.Module):
         found = []
         for name in self.ports:
             air = self.network.blocks[f"{name}_air"]
-            told = air.output("pressure", jnp.zeros(()), state[f"{name}_air"], {})
-            found.append(jnp.atleast_1d(told))
+            pressure = air.output("pressure", jnp.zeros(()), state[f"{name}_air"], {})
+            found.append(jnp.atleast_1d(pressure))
         return jnp.concatenate(found)
 
 

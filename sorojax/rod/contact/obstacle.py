@@ -16,7 +16,7 @@ from sorojax._types import real
 from sorojax.contact.broadphase import near
 from sorojax.contact.law import LinePenalty
 from sorojax.contact.swept import passes
-from sorojax.math.compiled import door
+from sorojax.math.compiled import jit_public
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.points import Points, moment_of, points, safe_norm, spin_cross
 from sorojax.rod.forces.forces import AbstractForce
@@ -314,13 +314,13 @@ class ObstacleContact(AbstractContact):
         return jnp.any(passes(self.obstacle, start.position, end.position, radius))
 
 
-@door
+@jit_public
 def contact_energy(contact: AbstractContact, motion: RodState) -> Float[Array, ""]:
     """Energy stored in a contact [J]."""
     return contact.stored(motion)
 
 
-@door
+@jit_public
 def penetration(contact: AbstractContact, motion: RodState) -> Float[Array, ""]:
     """Largest overlap of the surfaces [m]; zero without contact."""
     gap = contact.touch(motion).gap

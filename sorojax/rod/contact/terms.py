@@ -64,7 +64,7 @@ def contact_terms(
 
 
 class Parts(NamedTuple):
-    """What `ContactTerms` are made of.
+    """The parts of `ContactTerms`.
 
     Attributes:
         plain: (t, motion) -> the forces without contacts.

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax._types import Numbers, real
-from sorojax.math.compiled import batched, door, full_products
+from sorojax.math.compiled import batched, full_products, jit_public
 from sorojax.math.linalg.dense import solve_symmetric
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.moving import mass_jacobian, mass_position
@@ -31,19 +31,19 @@ Rates = Float[Array, " dof"]
 Forces = tuple[loads.Load, ...]
 
 
-@door
+@jit_public
 def mass_matrix(model: Model, q: Coordinates) -> Float[Array, "dof dof"]:
     """Inertia of the model in its coordinates."""
     return inertia(motion(model, q))[0]
 
 
-@door
+@jit_public
 def coriolis_force(model: Model, q: Coordinates, v: Rates) -> Rates:
     """C(q, v) v: what velocity alone adds to the left of the equations of motion."""
     return inertia(motion(model, q, v))[1]
 
 
-@door
+@jit_public
 def gravity_force(model: Model, q: Coordinates, gravity: Numbers | None = None) -> Rates:
     """Gradient of the gravitational energy, on the left of the equations of motion.
 
@@ -55,33 +55,33 @@ def gravity_force(model: Model, q: Coordinates, gravity: Numbers | None = None) 
     return -loads.weight(Gravity(gravity), _zero(q), motion(model, q))
 
 
-@door
+@jit_public
 def bias_force(model: Model, q: Coordinates, v: Rates, gravity: Numbers | None = None) -> Rates:
     """C(q, v) v + g(q), what a computed-torque controller cancels."""
     moment = motion(model, q, v)
     return inertia(moment)[1] - loads.weight(Gravity(gravity), _zero(q), moment)
 
 
-@door
+@jit_public
 def stiffness_matrix(model: Model) -> Float[Array, "dof dof"]:
     """Stiffness of the linear elasticity of rods and joints."""
     return operators(model).stiffness
 
 
-@door
+@jit_public
 def elastic_force(model: Model, q: Coordinates) -> Rates:
     """K q, on the left of the equations of motion."""
     moment = motion(model, q)
     return -loads.total_force((), _zero(q), moment)
 
 
-@door
+@jit_public
 def damping_matrix(model: Model, forces: Forces) -> Float[Array, "dof dof"]:
     """Sum of the damping terms among `forces` and of the dampers of joints."""
     return loads.damping_matrix(forces, model, operators(model))
 
 
-@door
+@jit_public
 def forward_dynamics(
     model: Model,
     q: Float[Array, "*states coordinates"],
@@ -144,7 +144,7 @@ def acceleration(
     return solve_symmetric(mass, loads.total_force(forces, t, moment) - coriolis)
 
 
-@door
+@jit_public
 def inverse_dynamics(
     model: Model, q: Coordinates, v: Rates, a: Rates, forces: Forces = (), *, t=0.0
 ) -> Rates:
@@ -191,7 +191,7 @@ def _zero(q: Coordinates) -> Float[Array, ""]:
 # Energy and momentum of a rod or assembly, and the matrix behind its Coriolis force
 
 
-@door
+@jit_public
 def kinetic_energy(
     model: Model, q: Float[Array, " coordinates"], v: Float[Array, " dof"]
 ) -> Float[Array, ""]:
@@ -199,7 +199,7 @@ def kinetic_energy(
     return v @ inertia(motion(model, q))[0] @ v / 2
 
 
-@door
+@jit_public
 def potential_energy(
     model: Model, q: Float[Array, " coordinates"], gravity: Numbers | None = None
 ) -> Float[Array, ""]:
@@ -217,7 +217,7 @@ def potential_energy(
     return energy
 
 
-@door
+@jit_public
 def momentum(
     model: Model, q: Float[Array, " coordinates"], v: Float[Array, " dof"]
 ) -> Float[Array, " twist"]:
@@ -237,7 +237,7 @@ def momentum(
     return total
 
 
-@door
+@jit_public
 def coriolis_matrix(
     model: Model, q: Float[Array, " coordinates"], v: Float[Array, " dof"]
 ) -> Float[Array, "dof dof"]:

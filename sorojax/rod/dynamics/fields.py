@@ -1,6 +1,4 @@
-"""What forces and inertia read of a rod: its constants, and the fields of its state at one
-time.
-"""
+"""The state of a rod as forces and inertia read it: its constants, and its fields at one time."""
 
 from typing import NamedTuple
 

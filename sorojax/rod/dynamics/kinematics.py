@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import Numbers, real
-from sorojax.math.compiled import door
+from sorojax.math.compiled import jit_public
 from sorojax.math.lie import homogeneous
 from sorojax.math.quadrature import integration_rows, interpolation_rows
 from sorojax.rod.dynamics.fields import RodState, operators, rest_along
@@ -33,7 +33,7 @@ Poses = Float[Array, "points h h"]
 Jacobians = Float[Array, "points twist dof"]
 
 
-@door
+@jit_public
 def strain(
     rod: Rod, q: Float[Array, " dof"], s: Numbers | None = None
 ) -> Float[Array, "points strain"]:
@@ -64,7 +64,7 @@ def forward_kinematics(model: Rod, q: Array, s: Numbers | None = None) -> Poses:
 def forward_kinematics(
     model: Assembly, q: Array, s: Numbers | None = None
 ) -> dict[str, Poses]: ...
-@door
+@jit_public
 def forward_kinematics(
     model: Model, q: Float[Array, " coordinates"], s: Numbers | None = None
 ) -> Poses | dict[str, Poses]:
@@ -105,7 +105,7 @@ def forward_kinematics(
 def tip_pose(model: Rod, q: Array) -> Float[Array, "h h"]: ...
 @overload
 def tip_pose(model: Assembly, q: Array) -> dict[str, Float[Array, "h h"]]: ...
-@door
+@jit_public
 def tip_pose(model: Model, q: Float[Array, " coordinates"]):
     """Pose of the last cross-section, from local to base frame.
 
@@ -133,7 +133,7 @@ def tip_pose(model: Model, q: Float[Array, " coordinates"]):
 def jacobian(model: Rod, q: Array, s: Numbers | None = None) -> Jacobians: ...
 @overload
 def jacobian(model: Assembly, q: Array, s: Numbers | None = None) -> dict[str, Jacobians]: ...
-@door
+@jit_public
 def jacobian(
     model: Model, q: Float[Array, " coordinates"], s: Numbers | None = None
 ) -> Jacobians | dict[str, Jacobians]:
@@ -153,7 +153,7 @@ def jacobian(
     }
 
 
-@door
+@jit_public
 def jacobian_rate_product(
     model: Model,
     q: Float[Array, " coordinates"],

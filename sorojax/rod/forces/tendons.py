@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import Numbers, optional_real, real
-from sorojax.math.compiled import door
+from sorojax.math.compiled import jit_public
 from sorojax.math.lie import cross_columns
 from sorojax.math.quadrature import (
     Quadrature,
@@ -163,7 +163,7 @@ def thread_length(thread: Thread, q: Float[Array, " dof"]) -> Float[Array, ""]:
     return thread.weights @ safe_norm(thread.tangent + thread.tangent_rows @ q)
 
 
-@door
+@jit_public
 def thread_lengths(
     rod: Rod, routes: tuple[AbstractRoute, ...], q: Float[Array, " dof"]
 ) -> Float[Array, " threads"]:
@@ -171,7 +171,7 @@ def thread_lengths(
     return jnp.stack([thread_length(thread(rod, route), q) for route in routes])
 
 
-@door
+@jit_public
 def thread_rates(
     rod: Rod,
     routes: tuple[AbstractRoute, ...],

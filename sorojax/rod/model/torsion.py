@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
-from sorojax.math.compiled import door
+from sorojax.math.compiled import jit_public
 from sorojax.math.linalg import sparse
 from sorojax.math.quadrature import gauss_legendre
 from sorojax.mesh.elements.elements import Tri3, Tri6
@@ -32,7 +32,7 @@ _RULE = 5  # Gauss points per side of the collapsed square: degree 8
 
 
 class PlaneConstants(NamedTuple):
-    """What a rod needs of its section, about the centroid; y is the first axis.
+    """Constants of a section, about the centroid; y is the first axis.
 
     Attributes:
         area: [m^2].
@@ -78,7 +78,7 @@ def principal_angle(moments: Float[Array, "2 2"]) -> Float[Array, ""]:
     return jnp.arctan2(2 * moments[0, 1], moments[0, 0] - moments[1, 1]) / 2
 
 
-@door
+@jit_public
 def shear_factors(
     constants: PlaneConstants, poisson_ratio
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:

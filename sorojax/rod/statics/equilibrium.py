@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sorojax import _check
 from sorojax._types import real
-from sorojax.math.compiled import door
+from sorojax.math.compiled import jit_public
 from sorojax.math.implicit_root import implicit_root
 from sorojax.math.quadrature import gauss_legendre, interpolation_rows
 from sorojax.math.status import Status
@@ -292,7 +292,7 @@ class Found(NamedTuple):
     count: Int[Array, ""]
 
 
-@door
+@jit_public
 def equilibrium(
     model: Model,
     forces: tuple[Load, ...] = (),

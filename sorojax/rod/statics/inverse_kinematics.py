@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from sorojax import _check
 from sorojax._types import Numbers, real
-from sorojax.math.compiled import door
+from sorojax.math.compiled import jit_public
 from sorojax.math.implicit_root import implicit_root
 from sorojax.math.status import Status
 from sorojax.rod.forces.loads import Load
@@ -58,7 +58,7 @@ class IKResult(eqx.Module):
     num_iterations: Int[Array, ""]
 
 
-@door
+@jit_public
 def inverse_kinematics(
     model: Model,
     targets: AbstractTarget | tuple[AbstractTarget, ...],

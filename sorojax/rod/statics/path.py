@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sorojax._types import Numbers, real
-from sorojax.math.compiled import door
+from sorojax.math.compiled import jit_public
 from sorojax.math.host import tell
 from sorojax.math.implicit_root import implicit_root
 from sorojax.math.status import Status
@@ -53,7 +53,7 @@ class EquilibriumPath(eqx.Module):
     num_iterations: Int[Array, " steps"]
 
 
-@door
+@jit_public
 def equilibrium_path(
     model: Model,
     loading: Loading,
@@ -204,7 +204,7 @@ class _Point(NamedTuple):
     alive: Array
 
 
-@door
+@jit_public
 def arc_length_path(
     model: Model,
     loading: Loading,

@@ -339,7 +339,7 @@ def _(primals, tangents):
 
 
 def _excess(t: Array, p: tuple[Array, ...], radii: tuple[Array, ...]) -> tuple[Array, Array]:
-    """What the sum is above 1, and its slope in t."""
+    """The excess of the sum over 1, and its slope in t."""
     terms = [(r * c / (t + r * r)) ** 2 for c, r in zip(p, radii, strict=True)]
     rates = [-2 * q / (t + r * r) for q, r in zip(terms, radii, strict=True)]
     return sum(terms[1:], start=terms[0]) - 1, sum(rates[1:], start=rates[0])

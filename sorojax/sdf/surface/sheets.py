@@ -195,7 +195,7 @@ _ARRIVED = np.stack(
 
 
 class Crossings(NamedTuple):
-    """What a group of blocks contributes.
+    """The contribution of a group of blocks.
 
     Attributes:
         cells: (n,) names of the cells that hold both signs, ascending.

@@ -76,7 +76,7 @@ class AbstractBlock(eqx.Module):
         """Rate of the state, of its structure; `inputs` holds every input."""
 
     def path_status(self, path: PyTree) -> Status | None:
-        """What is wrong with a run through the states `path`, with a leading time axis, e.g.
+        """The defect of a run through the states `path`, with a leading time axis, e.g.
         `Status.outside_model`; None where there is nothing to look at."""
         del path
         return None

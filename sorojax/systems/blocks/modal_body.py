@@ -356,7 +356,7 @@ def _damping(body: FemBody, basis: Basis) -> Float[Array, "modes modes"]:
 
 
 def _work(body: FemBody, name: str, basis: Basis) -> Polynomial:
-    """What a driven load works on, to third order: all of a volume."""
+    """The displacement that a driven load does work on, to third order: all of a volume."""
     load = body.drives[name]
 
     def potential(value, q):

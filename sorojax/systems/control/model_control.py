@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax._types import real
-from sorojax.math.compiled import door
+from sorojax.math.compiled import jit_public
 from sorojax.math.linalg.dense import solve_symmetric
 from sorojax.rod import (
     AbstractForce,
@@ -268,7 +268,7 @@ class Tracking(NamedTuple):
     effort: Float[Array, "moments dof"]
 
 
-@door
+@jit_public
 def tracking(law: CartesianImpedance, path: Rollout) -> Tracking:
     """Set-points, tips and efforts of `law` along the motion `path` of its rod."""
 

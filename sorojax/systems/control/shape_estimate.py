@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from sorojax import _check
 from sorojax._types import real
-from sorojax.math.compiled import door
+from sorojax.math.compiled import jit_public
 from sorojax.math.linalg.dense import product, solve_columns, solve_symmetric
 from sorojax.math.status import Status
 from sorojax.rod import Rod, inertia, motion, operators, total_force
@@ -65,7 +65,7 @@ class Shape(eqx.Module):
     status: Status
 
 
-@door
+@jit_public
 def estimate_shape(
     markers: Markers,
     positions: Float[Array, "markers dim"],
@@ -220,7 +220,7 @@ def start_filter(
     )
 
 
-@door
+@jit_public
 def update_filter(
     estimator: ShapeFilter,
     last: FilterState,

@@ -31,14 +31,14 @@ Names = tuple[str, ...]
 
 
 class _Known(NamedTuple):
-    """What a body keeps for a whole run."""
+    """Constants of a body for a whole run."""
 
     matter: Matter
     prepared: Prepared
 
 
 class Memory(NamedTuple):
-    """What the method carries: acceleration and what loads remember, by body; and what it
+    """The memory of the method: acceleration and memory of loads, by body; and what it
     keeps."""
 
     bodies: dict[str, State]

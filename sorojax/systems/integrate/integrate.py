@@ -12,7 +12,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from sorojax.math import host as told
+from sorojax.math import host
 from sorojax.math.ode.explicit import AbstractMethod
 from sorojax.math.ode.step_control import Control, Seam
 from sorojax.math.status import Status
@@ -36,9 +36,9 @@ class Meter(dfx.AbstractProgressMeter):
         passed = jax.lax.stop_gradient(progress * (self.far - self.start))
         share = jnp.minimum(passed / (self.end - self.start), 1.0).astype(state.dtype)
         # one number for all lanes, so that the condition stays one under `vmap`
-        share, last = told.mean_of_lanes(share), told.largest_of_lanes(state)
+        share, last = host.mean_of_lanes(share), host.largest_of_lanes(state)
         due = (share >= last + 0.01) | ((share >= 1.0) & (last < 1.0))
-        jax.lax.cond(due, lambda x: told.tell(self.label, x), lambda _: None, share)
+        jax.lax.cond(due, lambda x: host.tell(self.label, x), lambda _: None, share)
         return jnp.where(due, share, last)
 
     def close(self, state):

@@ -118,7 +118,7 @@ class Walk(NamedTuple):
 
     @property
     def held(self) -> tuple[PyTree, Any, Array]:
-        """What an interval yields after one that failed."""
+        """The output of an interval after one that failed."""
         return self.state, self.memory, self.solved
 
     @property
@@ -165,7 +165,7 @@ class interval_of(eqx.Module):
     unravel: Unravel = eqx.field(static=True, default=None)
 
     def begin(self, given, interval):
-        """What the method keeps or carries through the whole run, if it does."""
+        """The memory of the method through the whole run, if it has one."""
         method, block, inputs, t, state = given
         if not (method.keeps or method.carries):
             return None

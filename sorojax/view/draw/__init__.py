@@ -1,1 +1,1 @@
-"""What is drawn of each kind of object."""
+"""How each kind of object is drawn."""

@@ -329,7 +329,7 @@ def problem_at(path: Any, k: int) -> Problem:
 
 
 def state_name(path: Any, k: int) -> str:
-    """What tells a state from the others: its load, its factor or its time."""
+    """The label of a state: its load, its factor or its time."""
     if isinstance(path, fem.Motion):
         return f"{float(path.times[k]):.4g} s"
     if isinstance(path, VolumePath):

@@ -40,7 +40,7 @@ def show_file(
     renderer: str = "auto",
     title: str = "",
 ) -> Picture:
-    """What is in a file.
+    """The content of a file.
 
     Args:
         path: A surface (.stl, .obj, .ply), a mesh or a result that meshio reads (.vtu, .vtk,

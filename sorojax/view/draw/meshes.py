@@ -43,7 +43,7 @@ _TEMPLATES: dict[str, Template] = {
 
 
 class Shell(NamedTuple):
-    """What is seen of a mesh.
+    """The visible part of a mesh.
 
     Attributes:
         triangles: Node numbers.

@@ -1,4 +1,4 @@
-"""What acts on rods: threads through them, and forces where they touch something."""
+"""Loads on rods: threads through them, and forces where they touch something."""
 
 import math
 from collections.abc import Sequence
@@ -44,7 +44,7 @@ class Acting(NamedTuple):
 
 
 def acting(model: Rod | Assembly, forces: Sequence[Any]) -> Acting:
-    """What of `forces` has a place to be drawn at."""
+    """Those of `forces` that have a place to be drawn at."""
     threads: dict[str, list[Drawn]] = {}
     contacts, pairs = [], []
     for force in forces:

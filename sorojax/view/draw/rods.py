@@ -39,7 +39,7 @@ Poses = Mapping[str, Float[np.ndarray, "stations h h"]]
 def wrench_parts(
     poses: Poses, s: Float[np.ndarray, " stations"], forces: Sequence[Any], size: float
 ) -> list[Part]:
-    """What `forces` hold of wrenches and gravity.
+    """The wrenches and the gravity among `forces`.
 
     Args:
         poses: Of the sections of every part, by name; "" where there is one rod.
@@ -320,10 +320,10 @@ def show_posed(
     q = np.asarray(found.q)
     if q.ndim == 2 and len(q) > _POSES:
         q = q[np.unique(np.round(np.linspace(0, len(q) - 1, _POSES)).astype(int))]
-    return show_rod(model, q, title=title or _told(found), **options)
+    return show_rod(model, q, title=title or _outcome(found), **options)
 
 
-def _told(found: Any) -> str:
+def _outcome(found: Any) -> str:
     """The error or the load factor that a search ended with."""
     if hasattr(found, "error"):
         return f"error {float(found.error):.3g}"

@@ -182,7 +182,7 @@ def show_surface(
 def obstacle_part(
     obstacle: AbstractSdf, points: np.ndarray, size: float, shift: np.ndarray | None = None
 ) -> list[Part]:
-    """What a body touches, as far as it is near: by marching over a box around it."""
+    """The obstacle of a body, as far as it is near: by marching over a box around it."""
     lower, upper = points.min(axis=0) - 0.12 * size, points.max(axis=0) + 0.12 * size
     if shift is not None:
         lower, upper = lower - shift, upper - shift

@@ -20,7 +20,7 @@ _NOTHING = np.iinfo(np.int64).max
 
 
 class Seen(NamedTuple):
-    """What a picture shows.
+    """The pixels of a picture.
 
     Attributes:
         triangle: Number of the nearest triangle, -1 where there is none.
@@ -489,7 +489,7 @@ def shade(
 
 
 def _layers(scene: Scene, lens: Lens, points: float) -> list[_Layer]:
-    """What is opaque, and before it what is clear."""
+    """The opaque layer, and the transparent one before it."""
     numbered: list[tuple[int, Part]] = list(enumerate(scene.parts))
     clear = [pair for pair in numbered if isinstance(pair[1], Surface) and pair[1].opacity < 1]
     solid = [pair for pair in numbered if pair not in clear]

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-_told = False
+_warned = False
 
 
 def picture_of(
@@ -56,7 +56,7 @@ def picture_of(
 
 def chosen_renderer(renderer: str) -> str:
     """ "pyvista" or "own"; tells once that the extra is missing."""
-    global _told
+    global _warned
     if renderer not in ("auto", "own", "pyvista"):
         raise ValueError(
             f'view: got renderer={renderer!r}, need "auto", "own" or "pyvista". Leave it out.'
@@ -72,8 +72,8 @@ def chosen_renderer(renderer: str) -> str:
             'view: pyvista is not installed. Run pip install "sorojax[view]", or leave '
             "`renderer` out."
         )
-    if not _told:
-        _told = True
+    if not _warned:
+        _warned = True
         warnings.warn(
             "view: pyvista is not installed, solid pictures are shaded by sorojax's own "
             'renderer. Run pip install "sorojax[view]" for pyvista, or pass renderer="own".',

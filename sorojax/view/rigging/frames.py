@@ -182,7 +182,7 @@ def _based(poses, base: Array | None):
 
 
 def _cross(turn: Components, v: Components) -> tuple[Array, ...]:
-    """What turning with `turn`, one number in a plane, does to v."""
+    """The rate of v when it turns with `turn`, one number in a plane."""
     if len(v) == 2:
         return (-turn[0] * v[1], turn[0] * v[0])
     return (

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from sorojax import _check
 from sorojax._types import real
-from sorojax.math.compiled import door
+from sorojax.math.compiled import jit_public
 from sorojax.math.lie import homogeneous
 from sorojax.view.rigging.frames import carry, pose_rows
 
@@ -24,7 +24,7 @@ Axis = Literal["x", "y", "z"]
 _AXES = ("x", "y", "z")
 
 
-@door
+@jit_public
 def bend(
     points: Points, curvature, *, along: Axis = "x", towards: Axis = "y", start=None, end=None
 ) -> Points:
@@ -55,7 +55,7 @@ def bend(
     return points.at[:, j].set(arc_j + ahead * sine + across * cosine)
 
 
-@door
+@jit_public
 def twist(points: Points, rate, *, along: Axis = "x", start=None, end=None) -> Points:
     """Turn sections about an axis by an angle that grows by `rate` [rad/m] along it.
 
@@ -99,7 +99,7 @@ def _taper(points: Points, factor, i: int, start, end) -> Points:
     return scaled.at[:, i].set(points[:, i])
 
 
-@door
+@jit_public
 def sweep(
     points: Points, curve: Float[Array, "knots 3"], *, along: Axis = "x", up=None
 ) -> Points:

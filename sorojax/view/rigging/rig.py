@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from sorojax import _check
 from sorojax._display import displayed
 from sorojax._types import integers, real
-from sorojax.math.compiled import door
+from sorojax.math.compiled import jit_public
 from sorojax.math.quadrature import interpolation_rows
 from sorojax.rod import Assembly, Link, Rod, num_coordinates, rest
 from sorojax.sdf import Surface
@@ -112,7 +112,7 @@ def _poses(rig: Rig, qs: Float[Array, "frames coordinates"]):
     return jax.lax.map(lambda q: deform(rig.skin, rig.model, q), qs)
 
 
-@door
+@jit_public
 def placed(
     points: Float[Array, "points dim"],
     position: Float[Array, "*frames dim"],

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from sorojax import _check
 from sorojax._types import optional_real, real
-from sorojax.math.compiled import door
+from sorojax.math.compiled import jit_public
 from sorojax.rod import Assembly, Rod, rest
 from sorojax.view.rigging.frames import (
     Held,
@@ -143,7 +143,7 @@ def hold(
     )
 
 
-@door
+@jit_public
 def deform(
     skin: Skin, model: Rod | Assembly, q: Float[Array, " coordinates"]
 ) -> Float[Array, "points dim"]:

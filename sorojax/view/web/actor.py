@@ -1,4 +1,4 @@
-"""What moves in a film for the web: surfaces with a place, a shape or a colour per frame."""
+"""Actors of a film for the web: surfaces with a place, a shape or a colour per frame."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -262,7 +262,7 @@ def limits_of(actors: Sequence[Actor]) -> tuple[float, float]:
 
 
 def _times(things, time, clock: str, unit: str, frames: int) -> tuple[list[str], list[float]]:
-    """What the page writes at each frame, and when it shows it [s]."""
+    """The text of each frame, and when the page shows it [s]."""
     if time is None:
         results = [t for t in things if isinstance(t, fem.Motion | FemPath)]
         first = results[0] if results else None
