@@ -1,4 +1,4 @@
-"""The state of a rod as forces and inertia read it: its constants, and its fields at one time."""
+"""The state of a rod as forces and inertia read it: constants, and fields at one time."""
 
 from typing import NamedTuple
 
