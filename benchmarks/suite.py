@@ -68,6 +68,9 @@ ROWS = {
     "pictures": Cases(("view.skin",), ("view.film", "view.web")),
     "single precision": Cases(("precision.single",)),
     "what a scene does not need": Cases(("skip.features",)),
+    "wrong answers": Cases(
+        (), ("contact.grid", "contact.solids", "systems.steps", "mesh.fuzz")
+    ),
     "accelerators": Cases((), ("device.fem", "device.rods", "device.sdf")),
     "scaling": Cases(("scaling.rod", "scaling.fem", "scaling.batch"), ("scaling.design",)),
 }
