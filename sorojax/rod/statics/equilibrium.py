@@ -284,11 +284,12 @@ class Search(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Where a search ended, and the tangent of its last step."""
+    """Where a search ended, the tangent of its last step, whether its residual was finite."""
 
     q: Float[Array, " coordinates"]
     slope: Float[Array, "dof dof"]
     done: Bool[Array, ""]
+    finite: Bool[Array, ""]
     count: Int[Array, ""]
 
 
@@ -345,13 +346,13 @@ def equilibrium(
     def find(_, guess):
         found = newton(residual, guess, search)
         # What comes with a root has a derivative of zero, so it is floating.
-        ends = (found.done, found.count, *stability(found.slope, search))
+        ends = (found.done, found.finite, found.count, *stability(found.slope, search))
         return found.q, tuple(x.astype(guess.dtype) for x in ends)
 
-    rest, (done, count, negative, unstable) = implicit_root(
+    rest, (done, finite, count, negative, unstable) = implicit_root(
         lambda q: squared(model, q, residual(q)), guess, find, _solve_tangent, has_aux=True
     )
-    status = checked_status(ended(done, rest, residual(rest), unstable=unstable), model, rest)
+    status = checked_status(ended(done, rest, finite=finite, unstable=unstable), model, rest)
     return Equilibrium(rest, status, count.astype(jnp.int32), negative.astype(jnp.int32))
 
 
@@ -382,7 +383,7 @@ def newton(residual: Residual, guess: Array, search: Search) -> Found:
         return force @ cho_solve(factor, force)
 
     def improve(state):
-        q, _, _, _, count = state
+        q, *_, count = state
         force, slope = linearised(residual, search.model, q)
         step = -jnp.linalg.solve(slope, force)
         shape = increments(search.model, q)
@@ -395,25 +396,26 @@ def newton(residual: Residual, guess: Array, search: Search) -> Found:
             enough = value <= (1 - 2 * _DECREASE * length) * start
             return ~enough & (length > _SHORTEST)
 
-        def at(length):
+        def half(trial):
+            length = trial[0] / 2
             return length, size(residual(moved(search.model, q, length * step)))
 
-        one = jnp.ones((), q.dtype)
-        # A step of rounding is nothing but noise: it is taken as it is.
-        first = jax.lax.cond(small, lambda: (one, 0 * start), lambda: at(one))
-        length, value = jax.lax.while_loop(too_long, lambda trial: at(trial[0] / 2), first)
+        # A step of rounding is nothing but noise: it is taken as it is. Any other is tried
+        # first as a whole; the loop holds the only trial, so that it is compiled once.
+        begin = jnp.where(small, 1.0, 2.0).astype(q.dtype), jnp.where(small, 0, jnp.inf) + start
+        length, value = jax.lax.while_loop(too_long, half, begin)
         good = value <= start
         new = jnp.where(good, moved(search.model, q, length * step), q)
-        return new, slope, small & good, ~good, count + 1
+        return new, slope, small & good, ~good, jnp.isfinite(start), count + 1
 
     def searching(state):
-        _, _, done, stuck, count = state
+        _, _, done, stuck, _, count = state
         return ~done & ~stuck & (count < search.max_iterations)
 
     no = jnp.array(False)
-    begin = (guess, search.metric, no, no, jnp.array(0, dtype=jnp.int32))
-    q, slope, done, _, count = jax.lax.while_loop(searching, improve, begin)
-    return Found(q, slope, done & jnp.all(jnp.isfinite(q)), count)
+    begin = (guess, search.metric, no, no, ~no, jnp.array(0, dtype=jnp.int32))
+    q, slope, done, _, finite, count = jax.lax.while_loop(searching, improve, begin)
+    return Found(q, slope, done & jnp.all(jnp.isfinite(q)), finite, count)
 
 
 def stability(
@@ -424,11 +426,11 @@ def stability(
     return negative, is_unstable(slope, search.metric, negative)
 
 
-def ended(done: Array, *values: Array, unstable: Array | bool = False) -> Status:
-    """The status of a search, given what must be finite."""
-    finite = jnp.array(True)
-    for value in values:
-        finite = finite & jnp.all(jnp.isfinite(value))
+def ended(
+    done: Array, q: Array, *, finite: Array | bool = True, unstable: Array | bool = False
+) -> Status:
+    """The status of a search that ended at `q`."""
+    finite = jnp.asarray(finite).astype(bool) & jnp.all(jnp.isfinite(q))
     failed = Status.where(finite, Status.not_converged, Status.not_finite)
     good = Status.where(
         jnp.asarray(unstable).astype(bool), Status.unstable_equilibrium, Status.successful

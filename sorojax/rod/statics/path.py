@@ -27,7 +27,6 @@ from sorojax.rod.statics.equilibrium import (
     checked_status,
     ended,
     first_guess,
-    increments,
     linearised,
     moved,
     negative_eigenvalues,
@@ -116,12 +115,10 @@ def equilibrium_path(
     def find(_, guesses):
         def advance(state, row):
             (q, last, alive), (target, share) = state, row
-            new, done, count, unstable = _step(
-                residual, q, last, target, alive, search, max_cuts
-            )
+            new, done, *more = _step(residual, q, last, target, alive, search, max_cuts)
             if progress:
                 tell("equilibrium path", share)
-            ends = tuple(x.astype(dtype) for x in (done, count, unstable))
+            ends = tuple(x.astype(dtype) for x in (done, *more))
             return (new, target, done), (new, ends)
 
         start = (guesses[0], first, jnp.array(True))
@@ -131,11 +128,11 @@ def equilibrium_path(
         return jax.vmap(lambda q, f: squared(model, q, residual(q, f)))(q, factors)
 
     guesses = jnp.broadcast_to(guess, (factors.shape[0], guess.shape[0]))
-    rest, (done, count, unstable) = implicit_root(
+    rest, (done, finite, count, unstable) = implicit_root(
         balance, guesses, find, _solve_rows, has_aux=True
     )
-    status = jax.vmap(lambda done, unstable, *values: ended(done, *values, unstable=unstable))(
-        done, unstable, rest, jax.vmap(residual)(rest, factors)
+    status = jax.vmap(lambda done, q, f, u: ended(done, q, finite=f, unstable=u))(
+        done, rest, finite, unstable
     )
     status = jax.vmap(lambda x, q: checked_status(x, model, q))(status, rest)
     return EquilibriumPath(rest, status, count.astype(jnp.int32))
@@ -151,19 +148,20 @@ def _step(residual, q: Array, last: Array, target: Array, alive, search: Search,
         return alive & (at < 1) & (part >= shortest)
 
     def advance(state):
-        q, at, part, count, slope = state
+        q, at, part, _, count, slope = state
         aim = jnp.minimum(at + part, whole)
         factor = last + aim * (target - last)
         found = newton(lambda q: residual(q, factor), q, search)
         good = found.done
         new = jnp.where(good, found.q, q), jnp.where(good, aim, at)
         slope = jnp.where(good, found.slope, slope)
-        return *new, jnp.where(good, 2 * part, part / 2), count + found.count, slope
+        part = jnp.where(good, 2 * part, part / 2)
+        return *new, part, found.finite, count + found.count, slope
 
-    state = (q, 0 * whole, whole, jnp.array(0, dtype=jnp.int32), search.metric)
-    q, at, _, count, slope = jax.lax.while_loop(going, advance, state)
+    state = (q, 0 * whole, whole, jnp.array(True), jnp.array(0, jnp.int32), search.metric)
+    q, at, _, finite, count, slope = jax.lax.while_loop(going, advance, state)
     _, unstable = stability(slope, search)
-    return q, alive & (at >= 1), count, unstable
+    return q, alive & (at >= 1), finite, count, unstable
 
 
 def _solve_rows(linear, right: Float[Array, "steps unknowns"]) -> Array:
@@ -311,7 +309,7 @@ def arc_length_path(
         negative = negative_eigenvalues(slope, search.metric)
         if progress:
             tell("arc length path", share)
-        return new, (q, factor, negative, ended(done, increments(model, q), rate))
+        return new, (q, factor, negative, ended(done, jnp.append(q, rate)))
 
     point = _Point(start.q, factor, direction, begin, start.done)
     shares = jnp.linspace(0.0, 1.0, steps + 1, dtype=dtype)[1:]
