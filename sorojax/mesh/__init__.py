@@ -1,19 +1,21 @@
 """Meshes: from an implicit shape to cells, and back to what is on them."""
 
 from sorojax._arguments import check_package as _check_package
-from sorojax.mesh.elements.elements import (
-    AbstractElement as AbstractElement,
-    Hex8 as Hex8,
-    PolyN as PolyN,
-    Quad4 as Quad4,
-    Quad8 as Quad8,
-    Quad9 as Quad9,
+from sorojax.mesh.elements.base import AbstractElement as AbstractElement
+from sorojax.mesh.elements.polygon import PolyN as PolyN
+from sorojax.mesh.elements.simplex import (
     Tet4 as Tet4,
     Tet10 as Tet10,
     Tet15 as Tet15,
     Tri3 as Tri3,
     Tri6 as Tri6,
     Tri7 as Tri7,
+)
+from sorojax.mesh.elements.tensor import (
+    Hex8 as Hex8,
+    Quad4 as Quad4,
+    Quad8 as Quad8,
+    Quad9 as Quad9,
 )
 from sorojax.mesh.enrich import enrich as enrich
 from sorojax.mesh.measure import (

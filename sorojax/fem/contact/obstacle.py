@@ -19,7 +19,7 @@ from sorojax.fem.contact.friction import Start, at_end, felt, gripped, released,
 from sorojax.fem.loads.facets import CurvedPart, facet_tables, group_energy, normals
 from sorojax.fem.loads.loads import AbstractLoad
 from sorojax.material.hyperelastic import small_strain_moduli
-from sorojax.mesh.elements.elements import facet_corners
+from sorojax.mesh.elements.base import facet_corners
 from sorojax.sdf.base import AbstractSdf
 
 _TOGETHER = 32  # facets that the broad phase judges by one ball
