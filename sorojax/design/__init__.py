@@ -61,6 +61,10 @@ from sorojax.design.objectives import (
     settled as settled,
     work_of_loads as work_of_loads,
 )
+from sorojax.design.optimise.base import (
+    AbstractOptimiser as AbstractOptimiser,
+    Values as Values,
+)
 from sorojax.design.optimise.minimise import (
     History as History,
     Optimised as Optimised,
@@ -71,7 +75,6 @@ from sorojax.design.optimise.mma import (
     GCMMA as GCMMA,
     MMA as MMA,
     MMAState as MMAState,
-    Values as Values,
 )
 from sorojax.design.optimise.optimality import OptimalityCriteria as OptimalityCriteria
 from sorojax.design.optimise.shape_loop import (
