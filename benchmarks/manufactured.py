@@ -11,7 +11,7 @@ from sorojax._types import real
 from sorojax.fem.assembly.space import AbstractFormulation
 from sorojax.fem.loads.loads import AbstractLoad
 from sorojax.mesh import Mesh
-from sorojax.mesh.elements.shape_functions import quadrature, shape_functions, shape_gradients
+from sorojax.mesh.elements.base import quadrature, shape_functions, shape_gradients
 
 
 class NodalForces(AbstractLoad):

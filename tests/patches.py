@@ -4,7 +4,6 @@ import numpy as np
 
 from sorojax import mesh
 from sorojax.mesh import Mesh
-from sorojax.mesh.enrich import plain_element
 from sorojax.mesh.mesh import with_side_nodes
 
 
@@ -13,8 +12,8 @@ def patch(element: mesh.AbstractElement, lower=(0.0, 0.0, 0.0), seed: int = 0) -
     lower = np.array(lower[: element.dim])
     if isinstance(element, mesh.PolyN):
         return Mesh(lower + _POLYGON_POINTS, _POLYGONS, element)
-    plain = plain_element(element) or element
-    upper, linear = lower + 1, _linear(plain)
+    plain = element.plain or element
+    upper, linear = lower + 1, element.linear()
     if element.dim == 2:
         grid = mesh.rectangle(lower, upper, divisions=(3, 2), element=linear)
     else:
@@ -26,11 +25,6 @@ def patch(element: mesh.AbstractElement, lower=(0.0, 0.0, 0.0), seed: int = 0) -
         points, cells = with_side_nodes(points, cells, plain)
     made = Mesh(points, cells, plain)
     return made if plain == element else mesh.enrich(made)
-
-
-def _linear(element: mesh.AbstractElement) -> mesh.AbstractElement:
-    corners = {(2, 3): mesh.Tri3(), (2, 4): mesh.Quad4(), (3, 4): mesh.Tet4()}
-    return corners.get((element.dim, element.num_corners), mesh.Hex8())
 
 
 def _polygon_patch() -> tuple[np.ndarray, np.ndarray]:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import sorojax as sj
 from benchmarks.cases import fem_contact
 from sorojax import contact, fem, material, mesh, sdf
 from sorojax.contact.broadphase import clearance, far as contact_far
@@ -206,9 +207,21 @@ def test_bad_contacts_are_refused(change, message):
 
 def test_a_point_without_pressure_has_no_stiffness_where_it_stands():
     """Its slope there is that of free motion, as it is beside that place."""
-    law, at = contact.Coulomb(0.5, 2.0**20), jnp.asarray([0.5, 0.25])
+    law, at = contact.SpringSlider(contact.Coulomb(0.5), 2.0**20), jnp.asarray([0.5, 0.25])
     grip = no_grip(at)
     for slope in (jax.hessian(law.energy, argnums=1), jax.jacobian(law.traction, argnums=1)):
         assert np.all(np.asarray(slope(grip, at)) == 0)
     pressed = grip._replace(pressure=jnp.asarray(2.0))
     assert np.allclose(jax.hessian(law.energy, argnums=1)(pressed, at), 2.0**20 * np.eye(2))
+
+
+def test_a_number_is_the_coefficient_of_coulombs_law():
+    law = contact.LinePenalty(1e6, 1e-5, friction=0.5)
+    assert isinstance(law.friction, contact.Coulomb) and law.friction.coefficient == 0.5
+    changed = sj.replace(law, lambda law: law.friction, 0.3)
+    assert isinstance(changed.friction, contact.Coulomb)
+    assert changed.friction.coefficient == 0.3
+    with pytest.raises(ValueError, match="`coefficient` must be positive, got -1"):
+        contact.LinePenalty(1e6, 1e-5, friction=-1.0)
+    with pytest.raises(TypeError, match="friction"):
+        contact.LinePenalty(1e6, 1e-5, friction="dry")  # type: ignore

@@ -16,7 +16,7 @@ from sorojax.units import mm
 
 FRICTION, WEIGHT, LENGTH, DEPTH = 0.5, 981.0, 20 * mm, 0.03  # [-], N/m^3, m, m
 FLOOR = sdf.HalfPlane([0.0, 0.0], [0.0, 1.0])
-LAW = contact.Coulomb(FRICTION, 1e8, 1e-3)
+LAW = contact.SpringSlider(contact.Coulomb(FRICTION), 1e8, 1e-3)
 
 
 def block(pull=(0.0, 0.0), stiffness=None, friction=FRICTION) -> fem.Problem:
@@ -122,7 +122,7 @@ def test_a_moving_obstacle_takes_the_block_along():
 def test_friction_carries_gradients_through_its_memory():
     base = block()
     places = {
-        "friction": lambda p: p.loads[2].friction,
+        "friction": lambda p: p.loads[2].friction.coefficient,
         "stiffness": lambda p: p.loads[2].stiffness,
         "spring": lambda p: p.loads[1].stiffness,
     }
@@ -168,8 +168,9 @@ def test_offsets_bound_the_overlap_whatever_the_stiffness():
 @pytest.mark.parametrize("name", ["friction", "friction_velocity", "friction_stiffness"])
 def test_bad_friction_is_refused(name):
     problem = block()
-    floor = dataclasses.replace(problem.loads[2], grip=None, **{name: -1.0})
-    with pytest.raises(ValueError, match=f"{name}.*must be positive"):
+    what = "Coulomb: `coefficient`" if name == "friction" else name
+    with pytest.raises(ValueError, match=f"{what}.*must be positive"):
+        floor = dataclasses.replace(problem.loads[2], grip=None, **{name: -1.0})
         floor.check("Contact 'floor'", problem.mesh, problem.kinematics)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sorojax import mesh as M, sdf
-from sorojax.mesh.elements import shape_functions as tables
+from sorojax.mesh.elements import base as tables
 
 CELLS = (
     M.Tri3(), M.Tri6(), M.Quad4(), M.Quad8(), M.PolyN(3), M.PolyN(5), M.PolyN(8), M.Tet4(),

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from sorojax import fem, material, mesh
-from sorojax.contact.facet import over, pieces, shared
+from sorojax.contact.facet import over, shared
 from sorojax.fem.contact.self_contact import through_own_wall
 from sorojax.fem.equilibrium.linear import prepare
+from sorojax.mesh.elements.base import flat_triangles
 from sorojax.units import mm
 
 WIDTH, YOUNG, PRESSURE = 12 * mm, 1e5, 2e3
@@ -36,7 +37,7 @@ def test_a_point_stands_over_a_side(bow):
 
 def test_triangles_that_continue_each_other_share_one_weight():
     corners = jnp.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    both = corners[pieces(4, 3)]
+    both = corners[flat_triangles(mesh.Quad4())]
 
     @jax.vmap
     def seen(point):

@@ -93,7 +93,7 @@ def _slopes():
     def way(theta):
         amplitude, lag, friction, scale = theta
         given = eqx.tree_at(
-            lambda p: (p.loads[-1].friction, p.material.shear_modulus),
+            lambda p: (p.loads[-1].friction.coefficient, p.material.shear_modulus),
             problem, (friction, scale * modulus),
         )  # fmt: skip
         gait = crawler_gait(amplitude, lag=lag)

@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.harness import Row
 from sorojax import fem, mesh, rod, sdf
 from sorojax.math.lie import SE2
-from sorojax.mesh.elements.elements import Tet10
+from sorojax.mesh.elements.simplex import Tet10
 from sorojax.robots import Bellows, BendingActuator, printed_rubber, unit_cell
 from sorojax.robots.models.cell import bellows_cell
 from sorojax.robots.models.rods import Body, body, column, side_by_side

@@ -1,10 +1,12 @@
 """Contact with implicit shapes: gaps, pressures and forces at points."""
 
 from sorojax._arguments import check_package as _check_package
-from sorojax.contact.friction import Coulomb
+from sorojax.contact.friction import AbstractFriction, Coulomb, SpringSlider
 from sorojax.contact.law import LinePenalty, Penalty
 
 __all__ = [
+    "AbstractFriction",
+    "SpringSlider",
     "Coulomb",
     "LinePenalty",
     "Penalty",

@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from sorojax.contact.law import Penalty
 from sorojax.sdf.base import AbstractSdf
@@ -24,22 +23,6 @@ class Over(NamedTuple):
     height: Float[Array, ""]
     weight: Float[Array, ""]
     normal: Float[Array, " dim"]
-
-
-def pieces(num_nodes: int, dim: int) -> Int[np.ndarray, "pieces nodes"]:
-    """Nodes of the pieces that a facet consists of: itself in the plane, triangles in
-    space."""
-    if dim == 2:
-        return np.arange(num_nodes)[None]
-    return np.asarray(_TRIANGLES[num_nodes])
-
-
-_TRIANGLES = {
-    3: [[0, 1, 2]],
-    4: [[0, 1, 2], [0, 2, 3]],
-    6: [[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]],
-    7: [[0, 3, 6], [3, 1, 6], [1, 4, 6], [4, 2, 6], [2, 5, 6], [5, 0, 6]],
-}
 
 
 def over(piece: Float[Array, "nodes dim"], point: Float[Array, " dim"]) -> Over:

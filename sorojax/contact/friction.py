@@ -1,5 +1,9 @@
-"""Coulomb friction with true stick: a slider in a row with a spring and a dashpot."""
+"""Friction: how much traction a pressure can hold, and true stick up to that limit.
 
+A new law is a class with `limit`, exported by `sorojax.contact`.
+"""
+
+import abc
 from typing import NamedTuple
 
 import equinox as eqx
@@ -7,7 +11,39 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import Numbers, real
+
+
+class AbstractFriction(eqx.Module):
+    """A friction law: the traction up to which a point holds, and at which it slides."""
+
+    @abc.abstractmethod
+    def limit(self, pressure: Float[Array, "*points"]) -> Float[Array, "*points"]:
+        """Greatest tangential traction under a normal pressure, which is never negative: both
+        per area [Pa], or per length of a rod [N/m]. It is zero without pressure."""
+
+
+class Coulomb(AbstractFriction):
+    """The traction is at most `coefficient` [-] times the pressure."""
+
+    coefficient: Float[Array, ""] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        do = "Leave friction out for none."
+        _check.positive("contact.Coulomb", "coefficient", self.coefficient, "-", do)
+
+    def limit(self, pressure):
+        return self.coefficient * pressure
+
+
+def friction_law(given: AbstractFriction | Numbers | None) -> AbstractFriction | None:
+    """The law that a user means: a number is the coefficient of Coulomb's."""
+    if given is None or isinstance(given, AbstractFriction):
+        return given
+    return Coulomb(given)
+
+
+# True stick: a slider in a row with a spring and a dashpot
 
 
 class Grip(NamedTuple):
@@ -24,8 +60,8 @@ class Grip(NamedTuple):
     back: Float[Array, "*points dim"]
 
 
-class Coulomb(eqx.Module):
-    """Friction per reference area, of at most `coefficient` times the pressure.
+class SpringSlider(eqx.Module):
+    """Friction per reference area, of at most what the `law` allows.
 
     A point hangs on a spring of `stiffness` [Pa/m] that slides when the limit is reached:
     held points come to rest, they do not creep. A dashpot beside the spring, which alone
@@ -37,19 +73,19 @@ class Coulomb(eqx.Module):
     of the spring to the limit.
     """
 
-    coefficient: Float[Array, ""] = eqx.field(converter=real)
+    law: AbstractFriction
     stiffness: Float[Array, ""] = eqx.field(converter=real)
     velocity: Float[Array, ""] = eqx.field(converter=real, default=1e-3)
 
     def __check_init__(self):
-        for name, unit in (("coefficient", "-"), ("stiffness", "Pa/m"), ("velocity", "m/s")):
+        for name, unit in (("stiffness", "Pa/m"), ("velocity", "m/s")):
             do = "The stiffness of the penalty suits the stiffness, 1e-3 m/s the velocity."
-            _check.positive("contact.Coulomb", name, getattr(self, name), unit, do)
+            _check.positive("contact.SpringSlider", name, getattr(self, name), unit, do)
 
     def energy(self, grip: Grip, position: Float[Array, "*points dim"]) -> Float[Array, "..."]:
         """Potential of a step per area [J/m^2]; friction is minus its slope."""
         whole, away = self._trial(grip, position)
-        limit = self.coefficient * grip.pressure
+        limit = self.law.limit(grip.pressure)
         square = jnp.sum(away**2, axis=-1)
         held = whole**2 * square <= limit**2
         length = jnp.sqrt(jnp.where(held, jnp.ones_like(square), square))
@@ -61,7 +97,7 @@ class Coulomb(eqx.Module):
     ) -> Float[Array, "*points dim"]:
         """Force of the obstacle on the points per area [Pa]."""
         whole, away = self._trial(grip, position)
-        limit = self.coefficient * grip.pressure
+        limit = self.law.limit(grip.pressure)
         square = jnp.sum(away**2, axis=-1)
         held = whole**2 * square <= limit**2
         length = jnp.sqrt(jnp.where(held, jnp.ones_like(square), square))
@@ -74,7 +110,7 @@ class Coulomb(eqx.Module):
         """Pull of spring and dashpot over the limit: points hold below 1 and slide above;
         infinite without pressure."""
         whole, away = self._trial(grip, position)
-        limit = self.coefficient * grip.pressure
+        limit = self.law.limit(grip.pressure)
         touches = limit > 0
         pull = whole * jnp.sqrt(jnp.sum(away**2, axis=-1))
         return jnp.where(touches, pull / jnp.where(touches, limit, 1.0), jnp.inf)

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import optional_real, real
+from sorojax.contact.friction import AbstractFriction, friction_law
 
 
 class Penalty(eqx.Module):
@@ -129,7 +130,7 @@ class LinePenalty(eqx.Module):
         stiffness: [N/m^2]; five Young's moduli of the rod is a start, fifty for impacts.
         smoothing: Depth at which the full stiffness is reached [m]; 0.2 % of the radius
             of the rod is a start.
-        friction: Coulomb coefficient [-]; None costs nothing.
+        friction: Friction law, or the coefficient [-] of Coulomb's; None costs nothing.
         slip: Speed below which friction is viscous [m/s].
         damping: Growth of the normal force with the closing speed [s/m], after Hunt and
             Crossley; None costs nothing.
@@ -140,7 +141,7 @@ class LinePenalty(eqx.Module):
 
     stiffness: Float[Array, ""] = eqx.field(converter=real)
     smoothing: Float[Array, ""] = eqx.field(converter=real)
-    friction: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
+    friction: AbstractFriction | None = eqx.field(converter=friction_law, default=None)
     slip: Float[Array, ""] = eqx.field(converter=real, default=1e-3)
     damping: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
 
@@ -148,11 +149,9 @@ class LinePenalty(eqx.Module):
         do = "Five to fifty Young's moduli suit the stiffness, 0.2 % of the radius the depth."
         for name, unit in (("stiffness", "N/m^2"), ("smoothing", "m"), ("slip", "m/s")):
             _check.positive("contact.LinePenalty", name, getattr(self, name), unit, do)
-        for name, unit in (("friction", "-"), ("damping", "s/m")):
-            value = getattr(self, name)
-            if value is not None:
-                do = "Leave it out for none."
-                _check.positive("contact.LinePenalty", name, value, unit, do)
+        if self.damping is not None:
+            do = "Leave it out for none."
+            _check.positive("contact.LinePenalty", "damping", self.damping, "s/m", do)
 
     def energy(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:
         """Stored energy per length [J/m] at a gap [m], negative where bodies overlap."""
@@ -178,12 +177,13 @@ class LinePenalty(eqx.Module):
         return jnp.maximum(1 - self.damping * rate, jnp.zeros_like(rate))
 
     def drag(
-        self, normal_force: Float[Array, "..."], sliding: Float[Array, "... dim"]
+        self, pressure: Float[Array, "..."], sliding: Float[Array, "... dim"]
     ) -> Float[Array, "..."]:
-        """Friction per sliding velocity [N s/m^2]: mu N / sqrt(|v|^2 + slip^2)."""
+        """Friction per length and sliding velocity [N s/m^2], at a normal force per length p
+        [N/m]: limit(p) / sqrt(|v|^2 + slip^2)."""
         assert self.friction is not None
         speed = jnp.sqrt(jnp.sum(sliding**2, axis=-1) + self.slip**2)
-        return self.friction * normal_force / speed
+        return self.friction.limit(pressure) / speed
 
     def _parts(self, gap):
         """Share of the smooth start that is used, and the depth beyond it."""

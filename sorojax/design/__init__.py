@@ -26,14 +26,16 @@ from sorojax.design.objectives import (
     rotation,
     work_of_loads,
 )
+from sorojax.design.optimise.base import AbstractOptimiser, Values
 from sorojax.design.optimise.minimise import History, minimise
-from sorojax.design.optimise.mma import GCMMA, MMA, Values
+from sorojax.design.optimise.mma import GCMMA, MMA
 from sorojax.design.optimise.optimality import OptimalityCriteria
 from sorojax.design.optimise.shape_loop import minimise_shape
 from sorojax.design.part import Mirror, Part, Repeat, part, reanalyse, solid
 from sorojax.design.pneunet import optimise_pneunet, pneunet_cell
 
 __all__ = [
+    "AbstractOptimiser",
     "GCMMA",
     "MMA",
     "Experiment",

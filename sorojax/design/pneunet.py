@@ -38,7 +38,7 @@ from sorojax.fem.problem import exchanged
 from sorojax.material import presets
 from sorojax.material.hyperelastic import AbstractHyperelastic
 from sorojax.mesh import rectangle
-from sorojax.mesh.elements.elements import Quad4
+from sorojax.mesh.elements.tensor import Quad4
 from sorojax.mesh.mesh import boundary_facets
 from sorojax.units import kPa, mm
 

@@ -21,8 +21,8 @@ from sorojax.fem.assembly.space import (
 from sorojax.fem.kinematics import AbstractKinematics, Axisymmetric
 from sorojax.fem.supports import AbstractSupport, known_components, known_dofs
 from sorojax.material.hyperelastic import AbstractHyperelastic, small_strain_moduli
-from sorojax.mesh.elements.elements import PolyN, Quad9, Tet4, Tet15, Tri3, Tri7
-from sorojax.mesh.elements.shape_functions import nodes as reference_nodes, shape_gradients
+from sorojax.mesh.elements.base import nodes as reference_nodes, shape_gradients
+from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.mesh import Mesh
 
 #: Ratio of bulk to shear modulus above which a pressure at every point locks.
@@ -100,12 +100,12 @@ def formulation(mesh: Mesh, kinematics: AbstractKinematics, given: AbstractFormu
             "fem.problem: plane stress has no pressure of its own, got "
             f"{type(given).__name__}. Leave `formulation` out."
         )
-    if isinstance(given, ConstantPressure) and isinstance(element, Tri3 | Tet4):
+    if isinstance(given, ConstantPressure) and element.num_nodes == element.dim + 1:
         raise ValueError(
             f"fem.problem: a constant pressure in {element.name} is the displacement element "
             "and locks. Use order=2 and mesh.enrich, or quadrilaterals."
         )
-    if isinstance(given, LinearPressure) and not isinstance(element, Tri7 | Quad9 | Tet15):
+    if isinstance(given, LinearPressure) and not element.pressure_order:
         raise ValueError(
             f"fem.problem: a linear pressure in {element.name} is not stable, need Tri7, Quad9 "
             "or Tet15. Call mesh.enrich(mesh) first, or use fem.ConstantPressure()."

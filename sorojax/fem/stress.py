@@ -29,13 +29,14 @@ from sorojax.fem.kinematics import PlaneStress
 from sorojax.fem.loads.facets import cavity_volume
 from sorojax.fem.problem import Problem, body, body_at, residual
 from sorojax.material.kinematics import Entry, Tensor, determinant
-from sorojax.mesh.elements.elements import AbstractElement, Hex8, PolyN, Quad4, Quad8, Quad9
-from sorojax.mesh.elements.shape_functions import (
+from sorojax.mesh.elements.base import (
+    AbstractElement,
     nodes as reference_nodes,
-    quadrature,
     shape_functions,
     shape_gradients,
 )
+from sorojax.mesh.elements.polygon import PolyN
+from sorojax.mesh.elements.tensor import AbstractHypercube
 from sorojax.mesh.measure import check_some
 from sorojax.mesh.mesh import Mesh, boundary_facets
 
@@ -231,8 +232,6 @@ _enclosed_volume = jax.jit(cavity_volume)
 # Continuous stresses at the nodes by superconvergent patch recovery, and energy per cell
 
 
-_BILINEAR = Quad4 | Hex8
-_PRODUCTS = _BILINEAR | Quad8 | Quad9
 _SURE = 0.02  # smallest singular value of a fit over the largest
 
 
@@ -274,9 +273,9 @@ def patches(mesh: Mesh) -> Patches:
     rings, powers, count = _rings(mesh, cells), _powers(mesh.element), at.shape[1]
     edge = np.zeros(mesh.num_nodes, bool)
     edge[np.unique(boundary_facets(mesh))] = True
-    inner = len(_inner_points(mesh.element))
-    by_mean = np.full(mesh.num_nodes, isinstance(mesh.element, _BILINEAR))
-    by_mean |= edge & isinstance(mesh.element, _PRODUCTS)
+    inner = len(mesh.element.stress_points())
+    product = isinstance(mesh.element, AbstractHypercube)
+    by_mean = (edge | (mesh.element.order == 1)) & product
 
     def at_node(node):
         if by_mean[node]:
@@ -333,21 +332,11 @@ def sample_points(mesh: Mesh) -> Float[Array, "cells samples dim"]:
 
 
 def _sample_table(element: AbstractElement) -> Tables:
-    at = _inner_points(element)
-    if isinstance(element, _PRODUCTS):
+    at = element.stress_points()
+    if isinstance(element, AbstractHypercube):
         at = np.concatenate([at, reference_nodes(element)])
     tables = shape_functions(element, at), shape_gradients(element, at), np.ones(len(at))
     return Tables(*(table[None] for table in tables))
-
-
-def _inner_points(element: AbstractElement) -> np.ndarray:
-    """Points of reduced integration, where stresses are the most accurate."""
-    if isinstance(element, _BILINEAR):
-        return np.zeros((1, element.dim))
-    if isinstance(element, Quad8 | Quad9):
-        line = np.array([-1.0, 1.0]) / np.sqrt(3)
-        return np.array(list(itertools.product(line, repeat=2)))
-    return quadrature(element, element.order).points
 
 
 def _mean(

@@ -12,14 +12,9 @@ import numpy as np
 from sorojax import _check, fem
 from sorojax.fem.equilibrium.solve import Path as FemPath
 from sorojax.io import _files
-from sorojax.mesh.elements.elements import PolyN, Tet15
+from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.mesh import valences
 
-_TYPES = {
-    "Tri3": "triangle", "Tri6": "triangle6", "Tri7": "triangle7", "Quad4": "quad",
-    "Quad8": "quad8", "Quad9": "quad9", "Tet4": "tetra", "Tet10": "tetra10",
-    "Tet15": "tetra10", "Hex8": "hexahedron",
-}  # fmt: skip
 FIELDS = ("von_mises", "pressure", "stress", "principal", "energy", "reaction")
 
 
@@ -39,7 +34,8 @@ def export_fields(
     A `.vtu` file holds one state (the last one of a path); a `.pvd` file lists one `.vtu`
     file per state, NAME_0000.vtu and so on beside it, with their times. Files of the same
     names are replaced, each whole or not at all, the collection last. Cells go as the VTK
-    type of the same nodes; Tet15 is written as Tet10, without its inner nodes.
+    type of the same nodes; Tri7 and Tet15, for which there is none, are written as Tri6 and
+    Tet10, without their inner nodes.
 
     Args:
         path: File name, ending in .vtu or .pvd.
@@ -165,8 +161,8 @@ def _blocks(mesh):
             for ids in [np.flatnonzero(corners == n)]
         ]
     else:
-        inner = 10 if isinstance(mesh.element, Tet15) else cells.shape[1]
-        blocks = [(_TYPES[mesh.element.name], cells[:, :inner], np.arange(len(cells)))]
+        known = mesh.element if mesh.element.cell_type else mesh.element.plain
+        blocks = [(known.cell_type, cells[:, : known.num_nodes], np.arange(len(cells)))]
     kept = np.unique(np.concatenate([block.ravel() for _, block, _ in blocks]))
     number = np.zeros(mesh.num_nodes, int)
     number[kept] = np.arange(len(kept))

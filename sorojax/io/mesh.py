@@ -13,37 +13,35 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from sorojax import _check, mesh as M
+from sorojax import _check
 from sorojax.io import _files
 from sorojax.io.surface import export_surface
 from sorojax.mesh import Mesh, Tet4, repair
-from sorojax.mesh.elements.elements import AbstractElement, PolyN
+from sorojax.mesh.elements.base import AbstractElement, exported_elements, facet_element
+from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.mesh import boundary_facets
 from sorojax.mesh.repair import Repaired
 from sorojax.sdf import Surface, surface_report
 
-_TYPES = {
-    "Tri3": "triangle", "Tri6": "triangle6", "Quad4": "quad", "Quad8": "quad8",
-    "Quad9": "quad9", "Tet4": "tetra", "Tet10": "tetra10", "Hex8": "hexahedron",
-    "Hex20": "hexahedron20",
-}  # fmt: skip
-_FACETS = {
-    "Tri3": "line", "Tri6": "line3", "Quad4": "line", "Quad8": "line3", "Quad9": "line3",
-    "Tet4": "triangle", "Tet10": "triangle6", "Hex8": "quad", "Hex20": "quad8",
-}  # fmt: skip
 _DIMS = {"vertex": 0, "line": 1, "triangle": 2, "quad": 2, "polygon": 2}
 
 
+def _types() -> dict[str, type[AbstractElement]]:
+    """Elements by the name of the cell in files."""
+    return {kind.cell_type: kind for kind in exported_elements() if kind.cell_type}
+
+
 def type_of(where: str, element: AbstractElement) -> str:
-    if isinstance(element, PolyN):
-        return "polygon"
-    if element.name not in _TYPES:
-        raise ValueError(f"{where}: got {element.name} cells, need one of {', '.join(_TYPES)}.")
-    return _TYPES[element.name]
+    if element.cell_type is None:
+        names = ", ".join(kind.__name__ for kind in _types().values())
+        raise ValueError(f"{where}: got {element.name} cells, need one of {names}.")
+    return element.cell_type
 
 
-def facet_type_of(element: AbstractElement) -> str:
-    return "line" if isinstance(element, PolyN) else _FACETS[element.name]
+def facet_type_of(where: str, element: AbstractElement) -> str:
+    if element.dim == 2:
+        return "line" if element.order == 1 else "line3"
+    return type_of(where, facet_element(element))
 
 
 def kind_of(name: str) -> str:
@@ -59,12 +57,11 @@ def topological_dim(name: str) -> int:
 def element_of(where: str, name: str, count: int) -> AbstractElement:
     if name == "polygon":
         return PolyN(count)
-    for own, foreign in _TYPES.items():
-        if foreign == name and hasattr(M, own):
-            return getattr(M, own)()
+    if name in _types():
+        return _types()[name]()
     raise ValueError(
-        f"{where}: the file has {name} cells, need one of {', '.join(_TYPES.values())}. Mesh "
-        "the part with one of these."
+        f"{where}: the file has {name} cells, need one of {', '.join(_types())}. Mesh the part "
+        "with one of these."
     )
 
 
@@ -273,7 +270,7 @@ def export_mesh(
     _check.finite(where, "points", points, "Repair the mesh first.")
     if points.shape[1] == 2:
         points = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
-    parts = packed(mesh, facet_type_of(mesh.element), suffix)
+    parts = packed(mesh, facet_type_of(where, mesh.element), suffix)
     if suffix not in _DATA | {".inp"}:
         parts = Parts([], {}, {}, {}, {}, {})
     import meshio

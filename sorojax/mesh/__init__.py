@@ -1,20 +1,10 @@
 """Meshes: from an implicit shape to cells, and back to what is on them."""
 
 from sorojax._arguments import check_package as _check_package
-from sorojax.mesh.elements.elements import (
-    AbstractElement,
-    Hex8,
-    PolyN,
-    Quad4,
-    Quad8,
-    Quad9,
-    Tet4,
-    Tet10,
-    Tet15,
-    Tri3,
-    Tri6,
-    Tri7,
-)
+from sorojax.mesh.elements.base import AbstractElement
+from sorojax.mesh.elements.polygon import PolyN
+from sorojax.mesh.elements.simplex import Tet4, Tet10, Tet15, Tri3, Tri6, Tri7
+from sorojax.mesh.elements.tensor import Hex8, Quad4, Quad8, Quad9
 from sorojax.mesh.enrich import enrich
 from sorojax.mesh.measure import cell_areas, cell_volumes, enclosed_volume, locate
 from sorojax.mesh.mesh import Mesh, boundary_facets, merge

@@ -4,26 +4,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax._jax.trace_state import is_traced
-from sorojax.mesh.elements.elements import (
+from sorojax.mesh.elements.base import (
     AbstractElement,
-    Quad8,
-    Quad9,
-    Tet10,
-    Tet15,
-    Tri6,
-    Tri7,
+    exported_elements,
     facet_corners,
+    nodes as reference_nodes,
+    shape_functions,
 )
-from sorojax.mesh.elements.shape_functions import nodes as reference_nodes, shape_functions
 from sorojax.mesh.mesh import Mesh
-
-_RICHER: dict[type, AbstractElement] = {Tri6: Tri7(), Quad8: Quad9(), Tet10: Tet15()}
-
-
-def plain_element(element: AbstractElement) -> AbstractElement | None:
-    """The element that `enrich` makes `element` from; `None` if it makes none."""
-    found = [plain() for plain, richer in _RICHER.items() if richer == element]
-    return found[0] if found else None
 
 
 def enrich(mesh: Mesh) -> Mesh:
@@ -54,10 +42,11 @@ def enrich(mesh: Mesh) -> Mesh:
     """
     if is_traced(mesh.cells):
         raise ValueError("enrich: `mesh.cells` is traced. Enrich the mesh outside jit.")
-    if type(mesh.element) not in _RICHER:
-        names = ", ".join(kind.__name__ for kind in _RICHER)
+    richer = {kind.plain.name: kind() for kind in exported_elements() if kind.plain}
+    if mesh.element.name not in richer:
+        names = ", ".join(richer)
         raise ValueError(f"enrich: got {mesh.element.name} cells, need one of {names}.")
-    element = _RICHER[type(mesh.element)]
+    element = richer[mesh.element.name]
     cells = np.asarray(mesh.cells)
     new = reference_nodes(element)[mesh.element.num_nodes :]
     at = jnp.asarray(shape_functions(mesh.element, new), mesh.points.dtype)

@@ -10,13 +10,14 @@ from jaxtyping import Array, Float, Int
 from sorojax import _check
 from sorojax._jax.trace_state import is_traced
 from sorojax.math.host import KDTree
-from sorojax.mesh.elements.elements import Hex8, PolyN, Quad4, Quad8, Quad9, facet_element
-from sorojax.mesh.elements.shape_functions import (
+from sorojax.mesh.elements.base import (
+    facet_element,
     nodes,
     quadrature,
     shape_functions,
     shape_gradients,
 )
+from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.mesh import Mesh
 
 
@@ -52,7 +53,7 @@ def cell_volumes(mesh: Mesh) -> Float[Array, " cells"]:
 
 @eqx.filter_jit
 def _volumes(mesh: Mesh) -> Float[Array, " cells"]:
-    rule = quadrature(mesh.element, 3)
+    rule = quadrature(mesh.element, max(3, mesh.element.stiffness_degree))
     slopes = jnp.asarray(shape_gradients(mesh.element, rule.points), mesh.points.dtype)
     x = mesh.points[mesh.cells]
     total = jnp.zeros_like(x[:, 0, 0])
@@ -151,7 +152,7 @@ def locate(mesh: Mesh, points: Float[np.ndarray, "points dim"]) -> Locations:
     centres = X[cells[:, : mesh.element.num_corners]].mean(axis=1)
     near = KDTree(centres).query(points, k=min(24, len(cells)))[1].reshape(len(points), -1)
     xi = _reference_coordinates(mesh, X[cells[near]], points)
-    inside = _depth(mesh, xi)
+    inside = mesh.element.depth(xi)
     best = np.argmax(inside, axis=1)
     rows = np.arange(len(points))
     if (outside := np.flatnonzero(inside[rows, best] < -1e-6)).size:
@@ -161,13 +162,6 @@ def locate(mesh: Mesh, points: Float[np.ndarray, "points dim"]) -> Locations:
         )
     weights = shape_functions(mesh.element, xi[rows, best])
     return Locations(jnp.asarray(cells[near[rows, best]]), jnp.asarray(weights))
-
-
-def _depth(mesh: Mesh, xi: np.ndarray) -> np.ndarray:
-    """How far reference points lie inside the cell; negative outside."""
-    if isinstance(mesh.element, Quad4 | Quad8 | Quad9 | Hex8):
-        return 1 - np.abs(xi).max(axis=-1)
-    return np.minimum(xi.min(axis=-1), 1 - xi.sum(axis=-1))
 
 
 def _reference_coordinates(mesh: Mesh, corners, points, iterations: int = 4):

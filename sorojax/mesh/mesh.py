@@ -12,7 +12,7 @@ from sorojax._arguments import sized
 from sorojax._display import displayed, number
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import integers, real
-from sorojax.mesh.elements.elements import AbstractElement, Quad8, Tet10, Tri6, facet_corners
+from sorojax.mesh.elements.base import AbstractElement, facet_corners, side_ends
 
 
 def _int_sets(sets: dict[str, Any]) -> dict[str, jax.Array]:
@@ -127,18 +127,11 @@ def valences(mesh: Mesh) -> Int[np.ndarray, " cells"]:
 # Mid-side nodes on straight sides, for any quadratic cell
 
 
-_SIDES = {
-    Tri6: ((0, 1), (1, 2), (2, 0)),
-    Quad8: ((0, 1), (1, 2), (2, 3), (3, 0)),
-    Tet10: ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)),
-}
-
-
 def with_side_nodes(
     points: np.ndarray, cells: np.ndarray, element: AbstractElement
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points and cells of the quadratic `element` from those of its corners."""
-    sides = _SIDES[type(element)]
+    sides = side_ends(element)
     ends = np.sort(np.concatenate([cells[:, list(s)] for s in sides]), axis=1)
     n = len(points)
     keys, number = np.unique(ends[:, 0] * np.int64(n) + ends[:, 1], return_inverse=True)

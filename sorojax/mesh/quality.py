@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from sorojax.mesh.elements.elements import AbstractElement, Hex8, PolyN, Tet4, Tet10, Tri3, Tri6
+from sorojax.mesh.elements.base import AbstractElement, facet_corners
+from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.measure import cell_areas as cell_areas, cell_volumes
 from sorojax.mesh.mesh import Mesh, boundary_facets, facet_table, valences
-from sorojax.mesh.motion.plan import linear_element
 from sorojax.mesh.solid.lattice import dihedral_cosines, radius_ratios
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.measure.moments import area
@@ -25,7 +25,7 @@ class Quality(NamedTuple):
         min_angle: Smallest angle between straight sides, in space between faces [rad].
         mean_radius_ratio: Mean over the cells of `dim` r_in / r_circ, 1 for equilateral
             ones. Other cells than triangles and tetrahedra: of 4 pi area over perimeter
-            squared, 1 for regular polygons, or of the least scaled Jacobian (Hex8).
+            squared, 1 for regular polygons, or of the least scaled Jacobian (hexahedra).
         area: Area of all cells [m^2], curved sides included; in space their volume [m^3].
         num_nodes: Nodes.
         num_cells: Cells.
@@ -99,10 +99,10 @@ def is_watertight(mesh: Mesh) -> bool:
     """Whether no facet has more than two cells and the boundary closes on itself."""
     if facet_table(mesh)[2].max(initial=0) > 2:
         return False
-    corners = boundary_facets(mesh)[:, : 2 if mesh.element.dim == 2 else None]
+    count = facet_corners(mesh.element)
+    corners = boundary_facets(mesh)[:, :count]
     if mesh.element.dim == 2:
         return bool((np.bincount(corners.ravel()) % 2 == 0).all())
-    count = 4 if isinstance(mesh.element, Hex8) else 3
     ends = np.concatenate([corners[:, [i, (i + 1) % count]] for i in range(count)])
     keys = ends.astype(np.int64) @ np.array([mesh.num_nodes, 1])
     back = ends.astype(np.int64) @ np.array([1, mesh.num_nodes])
@@ -111,16 +111,16 @@ def is_watertight(mesh: Mesh) -> bool:
 
 def _angles_and_ratios(mesh: Mesh) -> tuple[float, float, np.ndarray]:
     x = np.asarray(mesh.points)[np.asarray(mesh.cells)[:, : mesh.element.num_corners]]
-    if isinstance(mesh.element, Tet4 | Tet10):
+    if mesh.element.dim == 3 and mesh.element.num_corners == 4:
         angle = np.arccos(np.clip(dihedral_cosines(x), -1, 1))
         return float(angle.min()), float(angle.max()), radius_ratios(x)
-    if isinstance(mesh.element, Hex8):
+    if mesh.element.dim == 3:
         return _hexahedra(x)
-    count = valences(mesh)
+    count, triangles = valences(mesh), mesh.element.num_corners == 3
     low, high, ratio = np.inf, 0.0, np.zeros(len(x))
     for n in np.unique(count):
         mine = count == n
-        angle, ratio[mine] = _polygons(x[mine, :n], isinstance(mesh.element, Tri3 | Tri6))
+        angle, ratio[mine] = _polygons(x[mine, :n], triangles)
         low, high = min(low, angle.min()), max(high, angle.max())
     return float(low), float(high), ratio
 
@@ -227,7 +227,7 @@ def _size(x: Any, numpy: Any) -> Any:
 def _size_and_shape(mesh: Mesh) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     corners = mesh.points[mesh.cells[:, : mesh.element.num_corners]]
     sizes, shapes = [], []
-    for simplex in corner_simplices(linear_element(mesh.element)):
+    for simplex in corner_simplices(mesh.element.linear()):
         x = corners[:, jnp.asarray(simplex)]
         pairs = [(i, j) for i in range(len(simplex)) for j in range(i)]
         square = sum(jnp.sum((x[:, i] - x[:, j]) ** 2, axis=1) for i, j in pairs)

@@ -7,25 +7,10 @@ import numpy as np
 
 from sorojax._types import Numbers
 from sorojax.math.host import KDTree
-from sorojax.mesh.elements.elements import (
-    AbstractElement,
-    Hex8,
-    PolyN,
-    Quad4,
-    Quad8,
-    Tet4,
-    Tet10,
-    Tri3,
-    Tri6,
-)
+from sorojax.mesh.elements.base import AbstractElement, mirror_order
+from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.measure import cell_areas, cell_volumes
 from sorojax.mesh.mesh import Mesh
-
-_MIRROR = {
-    Tri3: (0, 2, 1), Tri6: (0, 2, 1, 5, 4, 3), Quad4: (0, 3, 2, 1),
-    Quad8: (0, 3, 2, 1, 7, 6, 5, 4), Tet4: (0, 2, 1, 3),
-    Tet10: (0, 2, 1, 3, 6, 5, 4, 7, 9, 8), Hex8: (0, 3, 2, 1, 4, 7, 6, 5),
-}  # fmt: skip
 
 
 class Repaired(NamedTuple):
@@ -94,7 +79,7 @@ def repair(
             ring = list(dict.fromkeys(new[k].tolist()))[::-1]
             new[k] = ring + [ring[-1]] * (new.shape[1] - len(ring))
     else:
-        new[turned] = new[turned][:, _MIRROR[type(element)]]
+        new[turned] = new[turned][:, mirror_order(element)]
     return Repaired(Mesh(mesh.points, jnp.asarray(new), element), merged, removed, turned)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sorojax._types import Numbers
-from sorojax.mesh.elements.elements import facet_corners
+from sorojax.mesh.elements.base import facet_corners
 from sorojax.mesh.measure import enclosed_volume
 from sorojax.mesh.mesh import Mesh, boundary_facets, facet_table
 from sorojax.sdf.base import AbstractSdf

@@ -9,28 +9,18 @@ from jaxtyping import Float, Int
 
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import Numbers
-from sorojax.mesh.elements.elements import (
+from sorojax.mesh.elements.base import (
     AbstractElement,
-    Hex8,
-    PolyN,
-    Quad4,
-    Quad8,
-    Quad9,
-    Tet4,
-    Tet10,
-    Tet15,
-    Tri3,
-    Tri6,
-    Tri7,
+    exported_elements,
     facet_element,
+    mirror_order,
 )
-from sorojax.mesh.elements.shape_functions import nodes as reference_nodes
-from sorojax.mesh.enrich import enrich, plain_element
+from sorojax.mesh.elements.polygon import PolyN
+from sorojax.mesh.elements.simplex import AbstractSimplex, Tet4, Tri3, Tri6
+from sorojax.mesh.elements.tensor import AbstractHypercube, Hex8, Quad4
+from sorojax.mesh.enrich import enrich
 from sorojax.mesh.mesh import Mesh, boundary_facets, with_side_nodes
 from sorojax.mesh.solid.lattice import signed_volumes, wedge
-
-_PLANE = (Tri3, Tri6, Tri7, Quad4, Quad8, Quad9)
-_SOLID = (Hex8, Tet4, Tet10, Tet15)
 
 
 def rectangle(
@@ -71,13 +61,12 @@ def rectangle(
     if order not in (1, 2):
         raise ValueError(f"rectangle: `order` is {order}, need 1 (Tri3) or 2 (Tri6).")
     element = element or (Tri3() if order == 1 else Tri6())
-    _known("rectangle", element, _PLANE)
-    if plain := plain_element(element):
+    _check_element("rectangle", element, 2)
+    if plain := element.plain:
         return enrich(rectangle(lower, upper, divisions=divisions, element=plain))
     nx, ny = divisions
     points = _grid(lower, upper, divisions)
-    quads = isinstance(element, Quad4 | Quad8)
-    cells = _quads(nx, ny) if quads else _split_grid(nx, ny)
+    cells = _quads(nx, ny) if element.num_corners == 4 else _split_grid(nx, ny)
     if element.order == 2:
         points, cells = with_side_nodes(points, cells, element)
     names = (("left", "right"), ("bottom", "top"))
@@ -121,12 +110,12 @@ def box(
     """
     lower, upper = _corners("box", lower, upper, divisions, 3)
     element = element or Hex8()
-    _known("box", element, _SOLID)
-    if plain := plain_element(element):
+    _check_element("box", element, 3)
+    if plain := element.plain:
         return enrich(box(lower, upper, divisions=divisions, element=plain))
     points = _grid(lower, upper, divisions)
     corner = _cube_corners(divisions)
-    if isinstance(element, Hex8):
+    if element.num_corners == 8:
         order = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
         order += [(i, j, 1) for i, j, _ in order]
         cells = np.stack([corner[c] for c in order], axis=1)
@@ -154,8 +143,10 @@ def _corners(where: str, lower, upper, divisions, dim: int):
     return lower, upper
 
 
-def _known(where: str, element: AbstractElement, kinds: tuple[type, ...]) -> None:
-    if not isinstance(element, kinds):
+def _check_element(where: str, element: AbstractElement, dim: int) -> None:
+    families = AbstractSimplex | AbstractHypercube
+    if element.dim != dim or not isinstance(element, families):
+        kinds = [k for k in exported_elements() if k.dim == dim and issubclass(k, families)]
         names = ", ".join(kind.__name__ for kind in kinds)
         raise ValueError(f"{where}: `element` is {element.name}, need one of {names}.")
 
@@ -443,7 +434,7 @@ def mirror(mesh: Mesh, axis: int, at: float) -> Mesh:
     facets = {name: _facets(mesh, ids, shared, number) for name, ids in mesh.facet_sets.items()}
     return Mesh(
         np.concatenate([points, image]),
-        np.concatenate([cells, number[cells[:, turned(mesh.element)]]]),
+        np.concatenate([cells, number[cells[:, mirror_order(mesh.element)]]]),
         mesh.element,
         {name: np.unique(np.concatenate([ids, number[np.asarray(ids)]]))
          for name, ids in mesh.node_sets.items()},
@@ -453,22 +444,13 @@ def mirror(mesh: Mesh, axis: int, at: float) -> Mesh:
     )  # fmt: skip
 
 
-def turned(element: AbstractElement) -> Int[np.ndarray, " nodes"]:
-    """Order of the nodes in which the mirror image of a cell is a cell."""
-    here = reference_nodes(element)
-    image = here.copy()
-    image[:, [0, 1]] = here[:, [1, 0]]
-    apart = np.abs(image[:, None] - here[None]).sum(axis=2)
-    return apart.argmin(axis=1)
-
-
 def _facets(mesh: Mesh, ids, shared, number) -> np.ndarray:
     facets = np.asarray(ids)
     facets = facets[~shared[facets].all(axis=1)]
     if mesh.element.dim == 2:
         order = np.array([1, 0, *range(2, facets.shape[1])])
     else:
-        order = turned(facet_element(mesh.element))
+        order = mirror_order(facet_element(mesh.element))
     return np.concatenate([facets, number[facets[:, order]]])
 
 

@@ -16,7 +16,7 @@ NONE = {
 BALL = sdf.Sphere([0.0, 0.0, 0.0], 0.05)
 POINTS = 0.05 * jnp.asarray(np.eye(3)[[0, 1, 2]] * [[0.96], [1.0], [1.02]]) + 1e-3
 LAW = C.Penalty(1e7, 1e-3)
-RUB = C.Coulomb(0.4, 1e6)
+RUB = C.SpringSlider(C.Coulomb(0.4), 1e6)
 
 CASES = {
     "gaps": Case(lambda at: gaps(*at), (BALL, POINTS, jnp.array([1e-3, 0, 2e-3]))),

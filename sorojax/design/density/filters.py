@@ -19,7 +19,8 @@ from jaxtyping import Array, Float, Int
 from sorojax import _check
 from sorojax._types import Numbers, real
 from sorojax.math.linalg import sparse
-from sorojax.mesh.elements.elements import Quad4, Tri3
+from sorojax.mesh.elements.simplex import Tri3
+from sorojax.mesh.elements.tensor import Quad4
 from sorojax.mesh.mesh import Mesh
 
 
@@ -135,11 +136,7 @@ def helmholtz_filter(
     Raises:
         ValueError: If the cells are not Tri3 or Quad4, or the ends of a period do not match.
     """
-    from sorojax.mesh.elements.shape_functions import (
-        quadrature,
-        shape_functions,
-        shape_gradients,
-    )
+    from sorojax.mesh.elements.base import quadrature, shape_functions, shape_gradients
 
     _check.positive("helmholtz_filter", "radius", radius, "m", "About two cells is usual.")
     if not isinstance(mesh.element, Tri3 | Quad4):

@@ -16,7 +16,7 @@ from sorojax.fem.equilibrium.jit import assembled, stiffness_at_rest
 from sorojax.fem.problem import load_force
 from sorojax.fem.supports import known_dofs
 from sorojax.math.linalg import sparse
-from sorojax.mesh.elements.elements import AbstractElement
+from sorojax.mesh.elements.base import AbstractElement
 
 
 class Linear(eqx.Module):

@@ -1,7 +1,7 @@
 """The optimisation loop: any differentiable function of a pytree, constraints, any method."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -15,13 +15,13 @@ from sorojax import _check
 from sorojax._display import displayed, number, outcome
 from sorojax._progress import report
 from sorojax._types import real
-from sorojax.design.optimise.mma import GCMMA, MMA, Values
-from sorojax.design.optimise.optimality import OptimalityCriteria, Task
+from sorojax.design.optimise.base import AbstractOptimiser, Values
+from sorojax.design.optimise.mma import MMA
+from sorojax.design.optimise.optimality import Task
 from sorojax.math.status import Status
 from sorojax.mesh.mesh import Mesh
 
-Optimiser = MMA | GCMMA | OptimalityCriteria | optax.GradientTransformation
-_INNER = 15  # proposals of GCMMA for one step
+Optimiser = AbstractOptimiser | optax.GradientTransformation
 _HELD = 1e-3  # overshoot of a constraint that counts as none
 _RETREATS = 4  # halvings of a step that leads to where a function is not defined
 
@@ -102,7 +102,8 @@ def minimise(
         constraints: Functions of the design, numbers or vectors, <= 0 where allowed; none by
             default.
         optimiser: `MMA()` by default, whose variables lie between 0 and 1; `GCMMA`,
-            `OptimalityCriteria`, or any optax optimiser (without constraints).
+            `OptimalityCriteria`, another `AbstractOptimiser`, or any optax optimiser (without
+            constraints).
         steps: Most steps.
         tolerance: Largest change of a variable at which to stop, in its unit; with a
             `schedule` all steps are taken.
@@ -132,14 +133,10 @@ def minimise(
         Svanberg, The method of moving asymptotes - a new method for structural optimization,
         Int. J. Numer. Meth. Engng 24, 1987.
     """
-    optimiser = MMA() if optimiser is None else optimiser
+    method = MMA() if optimiser is None else optimiser
+    if isinstance(method, optax.GradientTransformation):
+        method = _Optax(method)
     constraints = tuple(constraints)
-    plain = isinstance(optimiser, optax.GradientTransformation)
-    if plain and constraints:
-        raise ValueError(
-            "minimise: an optax optimiser takes no constraints. Use MMA() or GCMMA(), or add a "
-            "penalty to the loss."
-        )
     _check.finite("minimise", "start", ravel_pytree(start)[0], "Check the first design.")
     flat, back = _as_vector(jax.tree.map(real, start))
     task = Task(loss, constraints, back, schedule, change_gradient)
@@ -167,9 +164,8 @@ def minimise(
             break
         size = real(_size(flat, values) if scale is None else scale) if size is None else size
         if memory is None:
-            m = values.constraints.shape[0]
-            memory = optimiser.init(flat) if plain else optimiser.init(flat, m)  # type: ignore
-        new, memory = _advance(optimiser, task, k, flat, values, memory, size)
+            memory = method.init(flat, values.constraints.shape[0])
+        new, memory = _advance(method, task, k, flat, values, memory, size)
         change = float(np.max(np.abs(np.asarray(new) - np.asarray(flat))))
         last, flat = flat, new
         step = Step(k + 1, back(flat), values.objective, values.constraints,
@@ -199,26 +195,35 @@ def _broken(held: Array, columns: dict[str, np.ndarray]) -> bool:
     return bool(np.any(np.asarray(held) > _HELD * largest))
 
 
-def _advance(optimiser, task: Task, k: int, flat, values: Values, memory, scale):
-    if isinstance(optimiser, optax.GradientTransformation):
+class _Optax(AbstractOptimiser):
+    """An optimiser of optax, which takes no constraints."""
+
+    scaled: ClassVar[bool] = False
+    transformation: optax.GradientTransformation = eqx.field(static=True)
+
+    def init(self, x, constraints):
+        if constraints:
+            raise ValueError(
+                "minimise: an optax optimiser takes no constraints. Use MMA() or GCMMA(), or "
+                "add a penalty to the loss."
+            )
+        return self.transformation.init(x)
+
+    def update(self, x, values, memory, evaluate):
         with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
-            updates, memory = optimiser.update(values.gradient, memory, flat)
-            return jnp.asarray(optax.apply_updates(flat, updates)), memory
-    if isinstance(optimiser, OptimalityCriteria):  # the same for any scale
-        return optimiser.update(flat, values, memory)
-    scaled = _scaled(values, scale)
-    if not isinstance(optimiser, GCMMA):
-        return optimiser.update(flat, scaled, memory)
-    memory = optimiser.begin(flat, scaled, memory)
-    new, after = optimiser.update(flat, scaled, memory)
-    for _ in range(_INNER):
-        objective, held = task.plain(new, k)
-        found = (objective / scale, held)
-        memory, above = optimiser.stiffen(flat, new, scaled, found, memory)
-        if bool(above):
-            break
-        new, after = optimiser.update(flat, scaled, memory)
-    return new, after
+            updates, memory = self.transformation.update(values.gradient, memory, x)
+            return jnp.asarray(optax.apply_updates(x, updates)), memory
+
+
+def _advance(method: AbstractOptimiser, task: Task, k: int, flat, values: Values, memory, size):
+    if method.scaled:
+        values = _scaled(values, size)
+
+    def evaluate(x):
+        objective, held = task.plain(x, k)
+        return objective / size if method.scaled else objective, held
+
+    return method.update(flat, values, memory, evaluate)
 
 
 @jax.jit

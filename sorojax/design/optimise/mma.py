@@ -27,7 +27,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sorojax._types import real
+from sorojax.design.optimise.base import AbstractOptimiser, Values
 
+_INNER = 15  # proposals of GCMMA for one step
 _PRICE = 1000.0  # of breaking a constraint, against objectives of order one to a hundred
 
 
@@ -225,15 +227,6 @@ def _longest(task: Approximation, at: _Point, move: _Point) -> Array:
 # The method of moving asymptotes and its globally convergent version
 
 
-class Values(NamedTuple):
-    """Objective and constraints (each <= 0) at one design, with their derivatives."""
-
-    objective: Float[Array, ""]
-    gradient: Float[Array, " n"]
-    constraints: Float[Array, " m"]
-    slopes: Float[Array, "m n"]
-
-
 class MMAState(eqx.Module):
     """Memory of the method: asymptotes, the last two designs, how often it was called,
     and how curved its functions must be (GCMMA)."""
@@ -246,7 +239,7 @@ class MMAState(eqx.Module):
     curvature: Float[Array, " functions"]
 
 
-class AbstractMMA(eqx.Module):
+class AbstractMMA(AbstractOptimiser):
     """Common part of both versions: bounds, asymptotes and the convex functions."""
 
     if TYPE_CHECKING:  # fields that subclasses have, in their own order
@@ -265,11 +258,11 @@ class AbstractMMA(eqx.Module):
             x, x, x, x, jnp.zeros((), jnp.int32), jnp.ones(constraints + 1, x.dtype)
         )
 
-    def update(
+    def propose(
         self, x: Float[Array, " n"], values: Values, state: MMAState
     ) -> tuple[Float[Array, " n"], MMAState]:
-        """The next design, and the state to pass on."""
-        return _update(self, real(x), Values(*map(real, values)), state)
+        """The design that minimises the convex functions, and the state after it."""
+        return _propose(self, real(x), Values(*map(real, values)), state)
 
 
 class MMA(AbstractMMA):
@@ -292,12 +285,15 @@ class MMA(AbstractMMA):
     def _curvature(self, state, values, span):
         return jnp.full_like(state.curvature, 1e-5)
 
+    def update(self, x, values, memory, evaluate=None):
+        return self.propose(x, values, memory)
+
 
 class GCMMA(AbstractMMA):
     """Moving asymptotes whose functions are made to lie above the true ones.
 
-    `minimise` evaluates each proposal and asks again with more curvature (`stiffen`) until
-    they do, so the objective of feasible designs never rises.
+    Each proposal is evaluated and made again with more curvature (`stiffen`) until they do, so
+    the objective of feasible designs never rises.
     """
 
     lower: Float[Array, "..."] = eqx.field(converter=real, default=0.0)
@@ -309,6 +305,16 @@ class GCMMA(AbstractMMA):
 
     def _curvature(self, state, values, span):
         return state.curvature
+
+    def update(self, x, values, memory, evaluate):
+        memory = self.begin(x, values, memory)
+        new, after = self.propose(x, values, memory)
+        for _ in range(_INNER):
+            memory, above = self.stiffen(x, new, values, evaluate(new), memory)
+            if bool(above):
+                break
+            new, after = self.propose(x, values, memory)
+        return new, after
 
     def begin(self, x: Float[Array, " n"], values: Values, state: MMAState) -> MMAState:
         """The state at the start of an outer step: curvature by the gradients there."""
@@ -331,7 +337,7 @@ class GCMMA(AbstractMMA):
 
 
 @jax.jit
-def _update(method, x, values: Values, state: MMAState):
+def _propose(method, x, values: Values, state: MMAState):
     low, high = _asymptotes(method, x, state)
     answer = solve_subproblem(_approximation(method, x, values, state, low, high))
     new = MMAState(low, high, x, state.last, state.count + 1, state.curvature)

@@ -9,7 +9,7 @@ Multidisc. Optim. 21, 2001.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -18,13 +18,13 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from sorojax._types import real
-from sorojax.design.optimise.mma import Values
+from sorojax.design.optimise.base import AbstractOptimiser, Values
 
 _FAR = 60.0  # beyond every gain: how far the logarithm of the price may go
 _EXACT, _MOST = 1e-14, 100  # change of the logarithm of the price at which to stop, and steps
 
 
-class OptimalityCriteria(eqx.Module):
+class OptimalityCriteria(AbstractOptimiser):
     """Scales each variable by how much it gains against what it costs.
 
     One constraint, taken as linear; the objective should fall with every variable.
@@ -35,6 +35,7 @@ class OptimalityCriteria(eqx.Module):
         damping: Exponent of the scaling; 0.3 for mechanisms.
     """
 
+    scaled: ClassVar[bool] = False
     lower: Float[Array, "..."] = eqx.field(converter=real, default=0.0)
     upper: Float[Array, "..."] = eqx.field(converter=real, default=1.0)
     move: Float[Array, ""] = eqx.field(converter=real, default=0.2)
@@ -51,8 +52,7 @@ class OptimalityCriteria(eqx.Module):
                 f"OptimalityCriteria: got {constraints} constraints, need one. Use MMA."
             )
 
-    def update(self, x: Float[Array, " n"], values: Values, state: None):
-        """The next design; None is the state."""
+    def update(self, x, values, memory=None, evaluate=None):
         return _update(self, x, values), None
 
 

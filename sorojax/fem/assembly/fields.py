@@ -23,7 +23,7 @@ from sorojax.fem.assembly.geometry import (
 from sorojax.fem.assembly.space import AbstractFormulation, Modes, modes
 from sorojax.fem.kinematics import AbstractKinematics, identity
 from sorojax.material.kinematics import Entry, Tensor, determinant
-from sorojax.mesh.elements.elements import PolyN
+from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.mesh import Mesh
 
 

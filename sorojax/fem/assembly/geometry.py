@@ -21,14 +21,15 @@ from sorojax.fem.assembly.energy import Entries, inverse
 from sorojax.fem.assembly.space import AbstractFormulation, Space, lanes, modes
 from sorojax.fem.kinematics import AbstractKinematics, Axisymmetric, identity
 from sorojax.material.kinematics import Tensor, determinant
-from sorojax.mesh.elements.elements import AbstractElement, PolyN
-from sorojax.mesh.elements.shape_functions import (
+from sorojax.mesh.elements.base import (
+    AbstractElement,
     Quadrature,
     nodes,
     quadrature,
     shape_functions,
     shape_gradients,
 )
+from sorojax.mesh.elements.polygon import PolyN
 
 
 class Tables(NamedTuple):
@@ -46,6 +47,11 @@ class Tables(NamedTuple):
 def quadrature_tables(element: AbstractElement) -> Tables:
     """Tables at the quadrature points of the stiffness."""
     return _tables(element, "quadrature")
+
+
+def mass_tables(element: AbstractElement) -> Tables:
+    """Tables at the quadrature points of the mass."""
+    return _tables(element, "mass")
 
 
 def node_tables(element: AbstractElement) -> Tables:
@@ -72,6 +78,8 @@ def _tables(element: AbstractElement, at: str) -> Tables:
 def _rule(element: AbstractElement, at: str) -> Quadrature:
     if at == "quadrature":
         return quadrature(element)
+    if at == "mass":
+        return element.mass_quadrature()
     return Quadrature(nodes(element), np.ones(element.num_nodes))
 
 

@@ -25,16 +25,8 @@ from sorojax._types import platform
 from sorojax.fem.kinematics import AbstractKinematics
 from sorojax.material.kinematics import Entry
 from sorojax.math.linalg import sparse
-from sorojax.mesh.elements.elements import (
-    AbstractElement,
-    Hex8,
-    PolyN,
-    Quad4,
-    Quad9,
-    Tet4,
-    Tet15,
-    Tri7,
-)
+from sorojax.mesh.elements.base import AbstractElement
+from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.mesh import Mesh, valences
 
 
@@ -74,7 +66,7 @@ def lanes_per_block(element: AbstractElement, num_cells: int) -> int:
     (measured), on an accelerator as many as there are threads to take them."""
     if platform() != "cpu":
         return -(-num_cells // -(-num_cells // _WIDEST))
-    if isinstance(element, Tet4) or (element.dim == 2 and element.order == 1):
+    if element.order == 1 and (element.dim == 2 or element.num_corners == 4):
         return 256
     return 128 if element.dim == 2 else 32
 
@@ -219,13 +211,9 @@ def default_formulation(
     element: AbstractElement, kinematics: AbstractKinematics
 ) -> AbstractFormulation:
     """The formulation of `element` that does not lock, or else `Displacement()`."""
-    if not kinematics.has_volume:
+    if not kinematics.has_volume or element.pressure_order is None:
         return Displacement()
-    if isinstance(element, Tri7 | Quad9 | Tet15):
-        return LinearPressure()
-    if isinstance(element, Quad4 | Hex8 | PolyN):
-        return ConstantPressure()
-    return Displacement()
+    return LinearPressure() if element.pressure_order else ConstantPressure()
 
 
 def modes(

@@ -116,12 +116,12 @@ def gripped(
     """`load` for the step from `u`, where its points feel `feels`, in which they move at
     `rate * (x - back)`, relative to an obstacle that has moved from its last place to `value`
     within `step` [s]."""
-    friction = load.friction_law
+    slider = load.slider
     assert load.grip is not None and load.place is not None
     start = load.points_of(problem, u) - load.place[None, None]
-    anchor = start - friction.stretch(load.grip, start)
+    anchor = start - slider.stretch(load.grip, start)
     pressure = feels.pressure
-    drag = friction.coefficient * pressure * rate / friction.velocity
+    drag = slider.law.limit(pressure) * rate / slider.velocity
     still = rate <= 0
     speed = (load.value - load.place) / jnp.where(still, 1.0, step)
     lead = jnp.where(still, jnp.zeros_like(speed), speed / jnp.where(still, 1.0, rate))

@@ -14,15 +14,15 @@ from jaxtyping import Array, Float, Int
 from sorojax import _check
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import integers, optional_real, real
-from sorojax.contact import Coulomb, Penalty
+from sorojax.contact import AbstractFriction, Penalty, SpringSlider
 from sorojax.contact.broadphase import far
 from sorojax.contact.facet import Contacts, contacts, gaps
-from sorojax.contact.friction import Grip
+from sorojax.contact.friction import Grip, friction_law
 from sorojax.fem.contact.friction import Start, at_end, felt, gripped, released, untouched
 from sorojax.fem.loads.facets import CurvedPart, facet_tables, group_energy, normals
 from sorojax.fem.loads.loads import AbstractLoad
 from sorojax.material.hyperelastic import small_strain_moduli
-from sorojax.mesh.elements.elements import facet_corners
+from sorojax.mesh.elements.base import facet_corners
 from sorojax.sdf.base import AbstractSdf
 
 _TOGETHER = 32  # facets that the broad phase judges by one ball
@@ -91,11 +91,12 @@ class Contact(AbstractLoad):
     stiffness: the law is linear beyond pressures of E / 2000. Under
     `solve_path(problem, name=positions)` the obstacle moves.
 
-    With `friction` [-] the contact follows `contact.Coulomb`; `friction_stiffness` [Pa/m] is
-    the stiffness when omitted, so that held points give way by the coefficient times the
-    overlap, and `friction_velocity` [m/s] that of its dashpot. Friction has a memory:
-    `simulate` keeps it; in statics `solve` takes friction at the pressures that the load
-    knows of, none at first, and `advanced(problem, u)` lets it know of an equilibrium.
+    `friction` is a law, or the coefficient [-] of Coulomb's; the contact follows it by a
+    `contact.SpringSlider`. `friction_stiffness` [Pa/m] is the stiffness when omitted, so that
+    held points give way by the coefficient times the overlap, and `friction_velocity` [m/s]
+    that of its dashpot. Friction has a memory: `simulate` keeps it; in statics `solve` takes
+    friction at the pressures that the load knows of, none at first, and
+    `advanced(problem, u)` lets it know of an equilibrium.
 
     Points that are deep inside when a motion begins are let out at `release_velocity` [m/s],
     not shot out; with `None` the whole overlap pushes at once. In a step the pressure is
@@ -119,7 +120,7 @@ class Contact(AbstractLoad):
     smoothing: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
     value: Float[Array, " dim"] = eqx.field(converter=optional_real, default=None)  # type: ignore
     name: str = eqx.field(static=True, default="contact")
-    friction: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
+    friction: AbstractFriction | None = eqx.field(converter=friction_law, default=None)
     friction_velocity: Float[Array, ""] = eqx.field(converter=real, default=1e-3)
     friction_stiffness: Float[Array, ""] | None = eqx.field(
         converter=optional_real, default=None
@@ -146,13 +147,13 @@ class Contact(AbstractLoad):
         return Penalty(self.stiffness, self.smoothing)
 
     @property
-    def friction_law(self) -> Coulomb:
+    def slider(self) -> SpringSlider:
         if self.friction is None or self.friction_stiffness is None:
             raise ValueError(
-                f"fem.Contact '{self.name}': got no friction, need a coefficient. Give "
+                f"fem.Contact '{self.name}': got no friction, need a law. Give "
                 "friction=0.5 and take the load of the problem, problem.loads."
             )
-        return Coulomb(self.friction, self.friction_stiffness, self.friction_velocity)
+        return SpringSlider(self.friction, self.friction_stiffness, self.friction_velocity)
 
     def shift(self) -> Float[Array, "facets quad"] | None:
         """How far before the surface pressure starts [m]."""
@@ -184,7 +185,7 @@ class Contact(AbstractLoad):
         if self.grip is None:
             return energy
         points = self.points_of(problem, u) - self.value[None, None]
-        held = self.friction_law.stored(self.grip, points)
+        held = self.slider.stored(self.grip, points)
         return energy + jnp.sum(areas_of(problem, self.facets) * held)
 
     def curved_part(self, problem):
@@ -205,7 +206,7 @@ class Contact(AbstractLoad):
         found = contacts(self.law, self.obstacle, flat, areas.ravel(), self.value, offset)
         if self.grip is None:
             return found
-        traction = self.friction_law.traction(self.grip, points - self.value[None, None])
+        traction = self.slider.traction(self.grip, points - self.value[None, None])
         friction = (areas[..., None] * traction).reshape(flat.shape)
         return found._replace(force=found.force + friction, friction=friction)
 
@@ -248,7 +249,7 @@ class Contact(AbstractLoad):
                 mean = law.energy_of_step(before - start.shift[row], gap)
                 density = self.share * (ending * density + (1 - ending) * mean)
             if grip is not None:
-                density = density + self.friction_law.energy(grip, position)
+                density = density + self.slider.energy(grip, position)
             return jnp.sum(areas * density)
 
         return energy
@@ -312,7 +313,6 @@ class Contact(AbstractLoad):
             )
         for what, number, unit in (
             ("stiffness", self.stiffness, "Pa/m"), ("smoothing", self.smoothing, "m"),
-            ("friction", self.friction, "-"),
             ("friction_velocity", self.friction_velocity, "m/s"),
             ("friction_stiffness", self.friction_stiffness, "Pa/m"),
             ("release_velocity", self.release_velocity, "m/s"),

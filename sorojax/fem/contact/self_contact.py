@@ -16,13 +16,13 @@ from sorojax._jax.trace_state import is_traced
 from sorojax._types import integers, optional_real, real
 from sorojax.contact import Penalty
 from sorojax.contact.broadphase import close_pairs, listed
-from sorojax.contact.facet import Contacts, over, pieces, shared
+from sorojax.contact.facet import Contacts, over, shared
 from sorojax.fem.checks import check_ids
 from sorojax.fem.contact.friction import at_end
 from sorojax.fem.contact.obstacle import areas_of, compact, default_law, mean_size
 from sorojax.fem.loads.facets import CurvedPart, facet_tables, group_energy, normals
 from sorojax.fem.loads.loads import AbstractLoad
-from sorojax.mesh.elements.elements import facet_corners
+from sorojax.mesh.elements.base import facet_corners, facet_element, flat_triangles
 from sorojax.mesh.mesh import Mesh
 
 
@@ -195,9 +195,10 @@ class SelfContact(AbstractLoad):
     def _near(self, problem):
         """Heights of the quadrature points of a facet over its candidates, weights and
         normals of these."""
-        tables, dim = facet_tables(problem.mesh.element), problem.mesh.element.dim
+        element = problem.mesh.element
+        tables, dim = facet_tables(element), element.dim
         values, width = jnp.asarray(tables.values), self.facets.shape[1]
-        parts = pieces(width, dim)
+        parts = np.arange(width)[None] if dim == 2 else flat_triangles(facet_element(element))
 
         def near(x, real):
             points = values @ x[:width]

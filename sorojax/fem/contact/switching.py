@@ -83,7 +83,7 @@ def _points(load: Contact, problem, u: Float[Array, "nodes dim"]):
     if load.grip is None:
         return gap, smooth, jnp.full_like(gap, jnp.inf), gap < 0, jnp.zeros(gap.shape, bool)
     acted = load.acted(problem, u) - load.value[None, None]
-    loading = load.friction_law.loading(load.grip, acted).ravel()
+    loading = load.slider.loading(load.grip, acted).ravel()
     pressed = load.grip.pressure.ravel() > 0
     slip = jnp.where(pressed, jnp.abs(loading - 1), jnp.inf)
     return gap, smooth, slip, gap < 0, pressed & (loading > 1)

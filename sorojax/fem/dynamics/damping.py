@@ -6,32 +6,20 @@ the finite element method", Earthquake Engineering & Structural Dynamics 4, 1976
 """
 
 import abc
-from functools import cache
 from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import real
 from sorojax.fem.assembly import assemble as asm
 from sorojax.fem.assembly.fields import deformation, points_of, quadrature_points
-from sorojax.fem.assembly.geometry import Tables, geometry, quadrature_tables
+from sorojax.fem.assembly.geometry import geometry, mass_tables
 from sorojax.fem.problem import Problem
 from sorojax.math.linalg import sparse
-from sorojax.mesh.elements.elements import (
-    AbstractElement,
-    Hex8,
-    PolyN,
-    Quad4,
-    Quad8,
-    Quad9,
-    Tet15,
-    Tri7,
-)
-from sorojax.mesh.elements.shape_functions import quadrature, shape_functions, shape_gradients
+from sorojax.mesh.elements.polygon import PolyN
 
 if TYPE_CHECKING:
     from sorojax.fem.problem import Problem
@@ -222,31 +210,3 @@ def _cell_masses(problem: Problem) -> Float[Array, "cells cell_nodes cell_nodes"
     if points.kinds is None:
         return jnp.einsum("qa,qb,qc->cab", N[0], N[0], weights)
     return jnp.einsum("cqa,cqb,qc->cab", N[points.kinds], N[points.kinds], weights)
-
-
-@cache
-def mass_tables(element: AbstractElement) -> Tables:
-    """Tables exact for products of two shape functions times a radius, on straight cells;
-    those of the stiffness for polygons, whose functions are rational."""
-    if isinstance(element, PolyN):
-        return quadrature_tables(element)
-    if isinstance(element, Quad4 | Quad8 | Quad9 | Hex8):
-        at, weights = quadrature(element, 2 * element.order + 3)
-    else:
-        bubble = {Tri7: 3, Tet15: 4}.get(type(element), element.order)
-        at, weights = _collapsed(element.dim, bubble + 2)
-    values, slopes = shape_functions(element, at), shape_gradients(element, at)
-    return Tables(values[None], slopes[None], weights[None])
-
-
-def _collapsed(dim: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss rule of the unit cube collapsed onto the unit simplex."""
-    x, w = np.polynomial.legendre.leggauss(count)
-    axes = np.meshgrid(*[(x + 1) / 2] * dim, indexing="ij")
-    weights = np.prod(np.meshgrid(*[w / 2] * dim, indexing="ij"), axis=0)
-    left, at = np.ones_like(weights), []
-    for axis, u in enumerate(axes):
-        at.append(u * left)
-        weights = weights * (1 - u) ** (dim - 1 - axis)
-        left = left * (1 - u)
-    return np.stack([a.ravel() for a in at], axis=1), weights.ravel()

@@ -16,7 +16,7 @@ from sorojax.fem.loads.loads import AbstractLoad, Force, Gravity, Pressure, Trac
 from sorojax.fem.loads.springs import Cable, Foundation, Tendon
 from sorojax.material.hyperelastic import AbstractHyperelastic
 from sorojax.math.linalg import sparse
-from sorojax.mesh.enrich import plain_element, with_centres
+from sorojax.mesh.enrich import with_centres
 from sorojax.mesh.mesh import Mesh
 
 
@@ -26,7 +26,7 @@ def enriched(mesh: Mesh, load: AbstractLoad) -> AbstractLoad:
     for what in ("facets", "others"):
         facets = getattr(load, what, None)
         count = len(mesh.element.facets[0])
-        if facets is None or is_traced(facets) or plain_element(mesh.element) is None:
+        if facets is None or is_traced(facets) or mesh.element.plain is None:
             continue
         if mesh.element.dim == 3 and facets.ndim == 2 and facets.shape[1] == count - 1:
             new[what] = with_centres(mesh, facets)

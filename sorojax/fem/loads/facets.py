@@ -11,8 +11,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax.fem.kinematics import AbstractKinematics, Axisymmetric
-from sorojax.mesh.elements.elements import AbstractElement, facet_corners, facet_element
-from sorojax.mesh.elements.shape_functions import (
+from sorojax.mesh.elements.base import (
+    AbstractElement,
+    facet_corners,
+    facet_element,
     quadrature,
     shape_functions,
     shape_gradients,

@@ -1,77 +1,163 @@
-"""Tables of quadrilaterals and hexahedra."""
+"""Quadrilaterals and hexahedra: they fill [-1, 1] on each axis."""
+
+from itertools import product
+from typing import ClassVar
 
 import numpy as np
 
-from sorojax.mesh.elements.elements import AbstractElement, Quad8, Quad9
-from sorojax.mesh.elements.simplex import Quadrature
+from sorojax.mesh.elements.base import AbstractElement, Facets, Quadrature, side_ends
 
 _SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-_MIDDLES = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+_CUBE = np.concatenate(
+    [np.concatenate([_SQUARE, np.full((4, 1), z)], axis=1) for z in (-1.0, 1.0)]
+)
 
 
-def nodes(element: AbstractElement) -> np.ndarray:
-    if element.dim == 3:
-        layers = [np.concatenate([_SQUARE, np.full((4, 1), z)], axis=1) for z in (-1.0, 1.0)]
-        return np.concatenate(layers)
-    extra = {Quad8: [_MIDDLES], Quad9: [_MIDDLES, np.zeros((1, 2))]}
-    return np.concatenate([_SQUARE, *extra.get(type(element), [])])
+class AbstractHypercube(AbstractElement):
+    """A quadrilateral or hexahedron; Gauss rules are products of those of a line."""
+
+    def linear(self):
+        return Quad4() if self.dim == 2 else Hex8()
+
+    def nodes(self):
+        corners = _corners(self)
+        middles = [corners[list(ends)].mean(0)[None] for ends in side_ends(self)]
+        inner = np.zeros((self.num_nodes - len(corners) - len(middles), self.dim))
+        return np.concatenate([corners, *middles, inner])
+
+    def quadrature(self, degree):
+        x, w = np.polynomial.legendre.leggauss(degree // 2 + 1)
+        points = np.stack(np.meshgrid(*[x] * self.dim, indexing="ij"), -1)
+        weights = np.prod(np.stack(np.meshgrid(*[w] * self.dim, indexing="ij"), -1), -1)
+        return Quadrature(points.reshape(-1, self.dim), weights.ravel())
+
+    def mass_quadrature(self):
+        return self.quadrature(2 * self.order + 3)
+
+    def depth(self, at):
+        return 1 - np.abs(at).max(axis=-1)
+
+    def stress_points(self):
+        line = np.array([-1.0, 1.0]) / np.sqrt(3) if self.order == 2 else np.zeros(1)
+        return np.array(list(product(line, repeat=self.dim)))
 
 
-def shape_functions(element: AbstractElement, at: np.ndarray) -> np.ndarray:
-    corners = nodes(element)[: element.num_corners]
-    if isinstance(element, Quad9):
-        return np.prod(_lagrange(at), axis=2)
-    product = np.prod(1 + at[:, None] * corners, axis=2) / 2**element.dim
-    if not isinstance(element, Quad8):
-        return product
-    x, y = at[:, :1], at[:, 1:]
-    bend = (x * corners[:, 0] + y * corners[:, 1]) - 1
-    return np.concatenate([product * bend, _bumps(x, y)], axis=1)
+class Quad4(AbstractHypercube):
+    """Bilinear quadrilateral."""
+
+    dim: ClassVar[int] = 2
+    num_nodes: ClassVar[int] = 4
+    num_corners: ClassVar[int] = 4
+    order: ClassVar[int] = 1
+    facets: ClassVar[Facets] = ((0, 1), (1, 2), (2, 3), (3, 0))
+    stiffness_degree: ClassVar[int] = 3
+    cell_type: ClassVar[str | None] = "quad"
+    pressure_order: ClassVar[int | None] = 0
+
+    def shape_functions(self, at):
+        return _multilinear(self, at)
+
+    def shape_gradients(self, at):
+        return _multilinear_slopes(self, at)
 
 
-def _lagrange(at: np.ndarray) -> np.ndarray:
-    """Factors of the nine functions, one per axis: (points, nodes, 2)."""
-    x, of = at[:, None], nodes(Quad9())
-    return np.where(of == 0, 1 - x**2, x * (x + of) / 2)
+class Quad8(AbstractHypercube):
+    """Serendipity quadrilateral; sides may be curved."""
+
+    dim: ClassVar[int] = 2
+    num_nodes: ClassVar[int] = 8
+    num_corners: ClassVar[int] = 4
+    order: ClassVar[int] = 2
+    facets: ClassVar[Facets] = ((0, 1, 4), (1, 2, 5), (2, 3, 6), (3, 0, 7))
+    stiffness_degree: ClassVar[int] = 5
+    cell_type: ClassVar[str | None] = "quad8"
+
+    def shape_functions(self, at):
+        x, y = at[:, :1], at[:, 1:]
+        u, v = (1 - x**2) / 2, (1 - y**2) / 2
+        middles = [u * (1 - y), v * (1 + x), u * (1 + y), v * (1 - x)]
+        bend = at @ _SQUARE.T - 1
+        return np.concatenate([_multilinear(self, at) * bend, *middles], axis=1)
+
+    def shape_gradients(self, at):
+        x, y = at[:, :1], at[:, 1:]
+        u, v = (1 - x**2) / 2, (1 - y**2) / 2
+        bend = at @ _SQUARE.T - 1
+        corners = _multilinear_slopes(self, at) * bend[..., None]
+        corners = corners + _multilinear(self, at)[..., None] * _SQUARE
+        along_x = np.concatenate([-x * (1 - y), v, -x * (1 + y), -v], axis=1)
+        along_y = np.concatenate([-u, -y * (1 + x), u, -y * (1 - x)], axis=1)
+        return np.concatenate([corners, np.stack([along_x, along_y], axis=2)], axis=1)
 
 
-def _lagrange_slope(at: np.ndarray) -> np.ndarray:
-    x, of = at[:, None], nodes(Quad9())
-    return np.where(of == 0, -2 * x, x + of / 2)
+class Quad9(AbstractHypercube):
+    """Biquadratic quadrilateral; the last node is at its centre."""
 
+    dim: ClassVar[int] = 2
+    num_nodes: ClassVar[int] = 9
+    num_corners: ClassVar[int] = 4
+    order: ClassVar[int] = 2
+    facets: ClassVar[Facets] = Quad8.facets
+    stiffness_degree: ClassVar[int] = 5
+    cell_type: ClassVar[str | None] = "quad9"
+    pressure_order: ClassVar[int | None] = 1
+    plain: ClassVar[AbstractElement | None] = Quad8()
 
-def _bumps(x, y) -> np.ndarray:
-    u, v = (1 - x**2) / 2, (1 - y**2) / 2
-    return np.concatenate([u * (1 - y), v * (1 + x), u * (1 + y), v * (1 - x)], axis=1)
+    def shape_functions(self, at):
+        return np.prod(self._factors(at), axis=2)
 
-
-def shape_gradients(element: AbstractElement, at: np.ndarray) -> np.ndarray:
-    corners = nodes(element)[: element.num_corners]
-    if isinstance(element, Quad9):
-        value, slope = _lagrange(at), _lagrange_slope(at)
+    def shape_gradients(self, at):
+        x, of = at[:, None], self.nodes()
+        value, slope = self._factors(at), np.where(of == 0, -2 * x, x + of / 2)
         return np.stack([slope[..., 0] * value[..., 1], value[..., 0] * slope[..., 1]], axis=2)
+
+    def _factors(self, at):
+        """Factors of the nine functions, one per axis: (points, nodes, 2)."""
+        x, of = at[:, None], self.nodes()
+        return np.where(of == 0, 1 - x**2, x * (x + of) / 2)
+
+
+class Hex8(AbstractHypercube):
+    """Trilinear hexahedron: bottom face counter-clockwise from above, then the top."""
+
+    dim: ClassVar[int] = 3
+    num_nodes: ClassVar[int] = 8
+    num_corners: ClassVar[int] = 8
+    order: ClassVar[int] = 1
+    facets: ClassVar[Facets] = (
+        (0, 3, 2, 1),
+        (4, 5, 6, 7),
+        (0, 1, 5, 4),
+        (1, 2, 6, 5),
+        (2, 3, 7, 6),
+        (3, 0, 4, 7),
+    )
+    facet_element: ClassVar[AbstractElement | None] = Quad4()
+    stiffness_degree: ClassVar[int] = 3
+    cell_type: ClassVar[str | None] = "hexahedron"
+    pressure_order: ClassVar[int | None] = 0
+
+    def shape_functions(self, at):
+        return _multilinear(self, at)
+
+    def shape_gradients(self, at):
+        return _multilinear_slopes(self, at)
+
+
+def _corners(element: AbstractHypercube) -> np.ndarray:
+    return _SQUARE if element.dim == 2 else _CUBE
+
+
+def _multilinear(element: AbstractHypercube, at: np.ndarray) -> np.ndarray:
+    """Products of linear functions of each axis, one for each corner."""
+    return np.prod(1 + at[:, None] * _corners(element), axis=2) / 2**element.dim
+
+
+def _multilinear_slopes(element: AbstractHypercube, at: np.ndarray) -> np.ndarray:
+    corners = _corners(element)
     factors = 1 + at[:, None] * corners
     slopes = []
     for i in range(element.dim):
         others = np.prod(np.delete(factors, i, axis=2), axis=2)
         slopes.append(corners[:, i] * others / 2**element.dim)
-    gradient = np.stack(slopes, axis=2)
-    if not isinstance(element, Quad8):
-        return gradient
-    x, y = at[:, :1], at[:, 1:]
-    bend = (x * corners[:, 0] + y * corners[:, 1]) - 1
-    value = np.prod(factors, axis=2) / 4
-    gradient = gradient * bend[..., None] + value[..., None] * corners
-    u, v = (1 - x**2) / 2, (1 - y**2) / 2
-    along_x = np.concatenate([-x * (1 - y), v, -x * (1 + y), -v], axis=1)
-    along_y = np.concatenate([-u, -y * (1 + x), u, -y * (1 - x)], axis=1)
-    return np.concatenate([gradient, np.stack([along_x, along_y], axis=2)], axis=1)
-
-
-def quadrature(element: AbstractElement, degree: int | None = None) -> Quadrature:
-    if degree is None:
-        degree = 5 if element.order == 2 else 3
-    x, w = np.polynomial.legendre.leggauss(degree // 2 + 1)
-    points = np.stack(np.meshgrid(*[x] * element.dim, indexing="ij"), -1)
-    weights = np.prod(np.stack(np.meshgrid(*[w] * element.dim, indexing="ij"), -1), -1)
-    return Quadrature(points.reshape(-1, element.dim), weights.ravel())
+    return np.stack(slopes, axis=2)

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float, Int
 
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import integers, real
-from sorojax.mesh.elements.elements import PolyN, facet_corners
-from sorojax.mesh.elements.shape_functions import nodes as reference_nodes, shape_functions
+from sorojax.mesh.elements.base import facet_corners, nodes as reference_nodes, shape_functions
+from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.mesh import Mesh, boundary_facets
 from sorojax.mesh.motion.boundary import ZOOMS, BoundaryPlan, Sides, meet, settle, slide
 from sorojax.mesh.motion.plan import (
@@ -23,7 +23,6 @@ from sorojax.mesh.motion.plan import (
     harmonic,
     laplace_cells,
     laplace_graph,
-    linear_element,
     plan_outline,
     plan_surface,
     spread,
@@ -189,7 +188,7 @@ def move(mesh: Mesh, shape: AbstractSdf, *, interfaces: tuple[AbstractSdf, ...] 
 
 def _check_upright(points: np.ndarray, mesh: Mesh) -> None:
     corners = np.asarray(mesh.cells)[:, : mesh.element.num_corners]
-    least = least_corner(points[corners], linear_element(mesh.element))
+    least = least_corner(points[corners], mesh.element.linear())
     if not np.all(least > 0):
         where = points[corners[np.argmin(np.nan_to_num(least, nan=-np.inf))]].mean(axis=0)
         do = "triangulate" if mesh.element.dim == 2 else "mesh"
@@ -274,7 +273,7 @@ def _follow(motion: _Motion, shift):
 
 def _motion(mesh: Mesh, num_interfaces: int) -> _Motion:
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
-    element, linear = mesh.element, linear_element(mesh.element)
+    element, linear = mesh.element, mesh.element.linear()
     plan = (plan_outline if element.dim == 2 else plan_surface)(mesh, num_interfaces)
     known = np.zeros(mesh.num_nodes, bool)
     known[plan.corners] = True

@@ -10,19 +10,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sorojax._types import integers
 from sorojax.math.linalg import sparse
-from sorojax.mesh.elements.elements import (
+from sorojax.mesh.elements.base import (
     AbstractElement,
-    Hex8,
-    Quad4,
-    Tet4,
-    Tri3,
     facet_corners,
+    quadrature,
+    shape_gradients,
 )
-from sorojax.mesh.elements.shape_functions import quadrature, shape_gradients
 from sorojax.mesh.mesh import Mesh, boundary_facets
 from sorojax.mesh.motion.boundary import BoundaryPlan, FieldPlan
-
-_LINEAR = {(2, 3): Tri3, (2, 4): Quad4, (3, 4): Tet4, (3, 8): Hex8}
 
 
 class Harmonic(eqx.Module):
@@ -83,11 +78,6 @@ def spread(
 
     inside = jax.vmap(one, 1, 1)(displacement[problem.nodes])
     return displacement.at[problem.nodes].set(inside)
-
-
-def linear_element(element: AbstractElement) -> AbstractElement:
-    """The element with the corners of `element` and no other nodes."""
-    return _LINEAR[element.dim, element.num_corners]()
 
 
 def laplace_cells(points: np.ndarray, cells: np.ndarray, element: AbstractElement):

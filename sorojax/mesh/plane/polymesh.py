@@ -19,7 +19,7 @@ from sorojax import _check
 from sorojax._progress import report
 from sorojax._types import real
 from sorojax.math.host import KDTree, Voronoi
-from sorojax.mesh.elements.elements import PolyN
+from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.mesh import Mesh, boundary_facets
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sampling import finite_box, raise_empty, values

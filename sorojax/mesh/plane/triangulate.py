@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from sorojax import _check
 from sorojax._types import Numbers, real
-from sorojax.mesh.elements.elements import Tri3, Tri6
+from sorojax.mesh.elements.simplex import Tri3, Tri6
 from sorojax.mesh.mesh import Mesh
 from sorojax.mesh.plane.delaunay import Missing, fill
 from sorojax.mesh.plane.outline import Outline, outline, split

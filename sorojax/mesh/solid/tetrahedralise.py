@@ -9,12 +9,8 @@ import numpy as np
 from sorojax import _check
 from sorojax._progress import report
 from sorojax._types import real
-from sorojax.mesh.elements.elements import Tet4, Tet10
-from sorojax.mesh.elements.shape_functions import (
-    nodes as reference_nodes,
-    quadrature,
-    shape_gradients,
-)
+from sorojax.mesh.elements.base import nodes as reference_nodes, quadrature, shape_gradients
+from sorojax.mesh.elements.simplex import Tet4, Tet10
 from sorojax.mesh.mesh import Mesh, boundary_facets, with_side_nodes
 from sorojax.mesh.motion.boundary import SETTLE_ZOOMS as ZOOMS, Sides, normals_near, settle
 from sorojax.mesh.motion.move import movable

@@ -89,17 +89,17 @@ def energy(law: LinePenalty, touch: Touch) -> Float[Array, ""]:
 
 def press(law: LinePenalty, touch: Touch) -> tuple[Float[Array, " dof"], ...]:
     """Generalised force on each side."""
-    force = touch.weights * law.pressure(touch.gap)
+    pressure = law.pressure(touch.gap)
     if law.friction is None and law.damping is None:
-        load = force[:, None] * touch.normal
+        load = (touch.weights * pressure)[:, None] * touch.normal
         return tuple(side.points.generalised(side.sign * load) for side in touch.sides)
     velocity = _velocity(law, touch)
-    force = force * law.approach(jnp.sum(touch.normal * velocity, axis=1))
-    load = force[:, None] * touch.normal
+    pressure = pressure * law.approach(jnp.sum(touch.normal * velocity, axis=1))
+    load = (touch.weights * pressure)[:, None] * touch.normal
     if law.friction is None:
         return tuple(side.points.generalised(side.sign * load) for side in touch.sides)
     sliding, size = _sliding(touch, velocity)
-    load = load - law.drag(force * size, sliding)[:, None] * sliding
+    load = load - (touch.weights * law.drag(pressure * size, sliding))[:, None] * sliding
     return tuple(
         side.points.generalised(side.sign * load, side.sign * moment_of(side.arm, load))
         for side in touch.sides
@@ -140,8 +140,10 @@ def coupling(law: LinePenalty, touch: Touch) -> Float[Array, "dof dof"] | float:
     velocity = _velocity(law, touch)
     sliding, size = _sliding(touch, velocity)
     approach = law.approach(jnp.sum(touch.normal * velocity, axis=1))
-    growth = touch.weights * law.slope(touch.gap) * approach * size
-    load = law.drag(growth, sliding)[:, None] * sliding
+    pressure, growth = law.pressure(touch.gap), law.slope(touch.gap)
+    at, along = pressure * approach * size, growth * approach * size
+    drag = jax.jvp(lambda pressure: law.drag(pressure, sliding), (at,), (along,))[1]
+    load = (touch.weights * drag)[:, None] * sliding
     across = jnp.sum(_surface_rows(touch) * load[:, :, None], axis=1)
     along = _rows(touch, lambda side: side.points.linear_jacobian, touch.normal)
     return -(across.T @ along)

@@ -24,8 +24,8 @@ from sorojax._types import real
 from sorojax.math.compiled import jit_public
 from sorojax.math.linalg import sparse
 from sorojax.math.quadrature import gauss_legendre
-from sorojax.mesh.elements.elements import Tri3, Tri6
-from sorojax.mesh.elements.shape_functions import shape_functions, shape_gradients
+from sorojax.mesh.elements.base import shape_functions, shape_gradients
+from sorojax.mesh.elements.simplex import Tri3, Tri6
 from sorojax.mesh.mesh import Mesh
 
 _RULE = 5  # Gauss points per side of the collapsed square: degree 8

@@ -11,7 +11,7 @@ from sorojax.fem import Problem
 from sorojax.fem.loads.loads import AbstractLoad
 from sorojax.fem.loads.rigid import Rigid
 from sorojax.fem.supports import AbstractSupport, known_components
-from sorojax.mesh.elements.elements import facet_corners
+from sorojax.mesh.elements.base import facet_corners
 from sorojax.mesh.measure import Locations
 from sorojax.view import style
 from sorojax.view.draw.shapes import obstacle_part

@@ -10,7 +10,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sorojax.mesh import Mesh, PolyN, boundary_facets
-from sorojax.mesh.elements.elements import facet_element
+from sorojax.mesh.elements.base import (
+    AbstractElement,
+    facet_element,
+    flat_triangles,
+    outline_nodes,
+)
 from sorojax.mesh.mesh import facet_table, valences
 from sorojax.mesh.quality import Quality, cell_ratios
 from sorojax.mesh.repair import Repaired
@@ -19,27 +24,6 @@ from sorojax.view.picture import Panel, Picture, show_scene
 from sorojax.view.raster.camera import View
 from sorojax.view.raster.plane import loops
 from sorojax.view.raster.scene import Dots, Lines, Part, Scale, Scene, Surface, robust_scale
-
-Template = tuple[tuple[tuple[int, int, int], tuple[bool, bool, bool]], ...]
-
-_T, _F = True, False
-_TEMPLATES: dict[str, Template] = {
-    "Tri3": (((0, 1, 2), (_T, _T, _T)),),
-    "Tri6": (
-        ((0, 3, 5), (_T, _F, _T)), ((3, 1, 4), (_T, _T, _F)),
-        ((5, 4, 2), (_F, _T, _T)), ((3, 4, 5), (_F, _F, _F)),
-    ),
-    "Tri7": tuple(((a, b, 6), (_T, _F, _F)) for a, b in
-                  ((0, 3), (3, 1), (1, 4), (4, 2), (2, 5), (5, 0))),
-    "Quad4": (((0, 1, 2), (_T, _T, _F)), ((0, 2, 3), (_F, _T, _T))),
-    "Quad8": (
-        *(((b, k, a), (_T, _T, _F)) for k, a, b in
-          ((0, 4, 7), (1, 5, 4), (2, 6, 5), (3, 7, 6))),
-        ((4, 5, 6), (_F, _F, _F)), ((4, 6, 7), (_F, _F, _F)),
-    ),
-    "Quad9": tuple(((a, b, 8), (_T, _F, _F)) for a, b in
-                   ((0, 4), (4, 1), (1, 5), (5, 2), (2, 6), (6, 3), (3, 7), (7, 0))),
-}  # fmt: skip
 
 
 class Shell(NamedTuple):
@@ -63,22 +47,24 @@ def shell(mesh: Mesh) -> Shell:
     if isinstance(mesh.element, PolyN):
         return _fans(np.asarray(mesh.cells), valences(mesh))
     if mesh.element.dim == 2:
-        found = _split(mesh.element.name, np.asarray(mesh.cells))
+        found = _split(mesh.element, np.asarray(mesh.cells))
         return Shell(found[0], found[1], found[2], np.zeros(0, int))
     table, first, count, _ = facet_table(mesh)
     outer = np.sort(first[count == 1])
-    element = facet_element(mesh.element)
-    triangles, facets, wire = _split(element.name, table[outer])
+    triangles, facets, wire = _split(facet_element(mesh.element), table[outer])
     return Shell(triangles, outer[facets] % mesh.num_cells, wire, facets)
 
 
-def _split(name: str, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _split(
+    element: AbstractElement, rows: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Triangles, the row of each, and its drawn sides; the triangles of a row together."""
-    template = _TEMPLATES[name]
-    corners = np.array([part for part, _ in template])
-    sides = np.array([flags for _, flags in template])
+    corners, ring = flat_triangles(element), outline_nodes(element)
+    pairs = set(zip(ring, [*ring[1:], ring[0]], strict=True))
+    ends = [zip(part, np.roll(part, -1), strict=True) for part in corners.tolist()]
+    sides = np.array([[(a, b) in pairs for a, b in part] for part in ends])
     triangles = rows[:, corners].reshape(-1, 3)
-    owner = np.repeat(np.arange(len(rows)), len(template))
+    owner = np.repeat(np.arange(len(rows)), len(corners))
     return triangles, owner, np.tile(sides, (len(rows), 1))
 
 
