@@ -39,10 +39,19 @@ def name(device: Device) -> str:
 
 
 def compared(
-    what: str, function: Callable[..., Any], args: tuple, *, count: int, of: str,
-    error_of: Callable[[Any], float], bar: float | None, reference: str,
-    devices: list[Device], double: bool = True, calls: int = 1,
-) -> Iterator[Row]:  # fmt: skip
+    what: str,
+    function: Callable[..., Any],
+    args: tuple,
+    *,
+    count: int,
+    of: str,
+    error_of: Callable[[Any], float],
+    bar: float | None,
+    reference: str,
+    devices: list[Device],
+    double: bool = True,
+    calls: int = 1,
+) -> Iterator[Row]:
     """A row for each device: seconds per call and item, and the error there.
 
     Args:
@@ -59,13 +68,19 @@ def compared(
             timing = measure(function, *here, repeats=5, keep=programs.append).per(calls)
             error = error_of(programs[0](*here))
         settings = named(what, device, double) | {
-            "against": of, of: count,
+            "against": of,
+            of: count,
             "ns an item": round(min(timing.runs) / count * 1e9, 4),
-        }  # fmt: skip
+        }
         yield Row(
-            "sorojax", settings, **timing.columns(), error=error, reference=reference,
-            bar=bar, bar_on="error",
-        )  # fmt: skip
+            "sorojax",
+            settings,
+            **timing.columns(),
+            error=error,
+            reference=reference,
+            bar=bar,
+            bar_on="error",
+        )
 
 
 def named(what: str, device: Device, double: bool = True) -> dict[str, Any]:

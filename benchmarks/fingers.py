@@ -19,9 +19,15 @@ MODES = 3
 def finger(nodes: int) -> Rod:
     """The rod with `nodes` Gauss nodes."""
     return rod(
-        SE3(), chebyshev(kappa_y=MODES, kappa_z=MODES), circle(6 * mm), length=LENGTH,
-        young_modulus=1 * MPa, poisson_ratio=0.3, density=2000.0, nodes=nodes,
-    )  # fmt: skip
+        SE3(),
+        chebyshev(kappa_y=MODES, kappa_z=MODES),
+        circle(6 * mm),
+        length=LENGTH,
+        young_modulus=1 * MPa,
+        poisson_ratio=0.3,
+        density=2000.0,
+        nodes=nodes,
+    )
 
 
 def accelerate(rod: Rod, constants: Operators, q, v):

@@ -22,9 +22,15 @@ WIRES = {
 def finger(length) -> systems.Network:
     """A finger with its gas: 11 states."""
     body = rod.rod(
-        SE2(), rod.chebyshev(kappa_z=MODES), rod.circle(6 * mm), length=length,
-        young_modulus=1 * MPa, poisson_ratio=0.4, density=1100.0, nodes=8,
-    )  # fmt: skip
+        SE2(),
+        rod.chebyshev(kappa_z=MODES),
+        rod.circle(6 * mm),
+        length=length,
+        young_modulus=1 * MPa,
+        poisson_ratio=0.4,
+        density=1100.0,
+        nodes=8,
+    )
     chamber = rod.thread_chambers(body, rod.Straight((3 * mm,)), AREA)
     block = systems.RodBody(body, (chamber, rod.Gravity(), rod.Damping(0.02)))
     blocks = {"body": block, "air": systems.Reservoir(dead_volume=2e-6)}

@@ -25,9 +25,11 @@ def left_out() -> Row | None:
 
 
 def measure(
-    function: Callable[..., Any], *args: Any, repeats: int = 9,
+    function: Callable[..., Any],
+    *args: Any,
+    repeats: int = 9,
     keep: Callable[[Any], Any] | None = None,
-) -> Timing:  # fmt: skip
+) -> Timing:
     """Compile a JAX function for the shapes of `args`, then time it.
 
     The arguments are inputs of the program: XLA cannot fold them. `keep` is handed the
@@ -45,9 +47,11 @@ def measure(
 
 
 def measure_together(
-    functions: dict[str, Callable[..., Any]], *args: Any, repeats: int = 9,
+    functions: dict[str, Callable[..., Any]],
+    *args: Any,
+    repeats: int = 9,
     results: dict[str, Any] | None = None,
-) -> dict[str, Timing]:  # fmt: skip
+) -> dict[str, Timing]:
     """As `measure`, of several functions of the same arguments whose ratios matter.
 
     They run in turn, there and back, so that all meet the same machine. What they yield is

@@ -56,8 +56,9 @@ def body(
     make = mesh.rectangle if dim == 2 else mesh.box
     grid = make([0] * dim, [1] * dim, divisions=(divisions,) * dim, element=element)  # type: ignore
     bump = jnp.prod(jnp.sin(jnp.pi * grid.points), axis=1, keepdims=True)
-    return placed(Mesh(grid.points + 0.1 * bump, grid.cells, element), poisson_ratio,
-                  formulation, side)  # fmt: skip
+    return placed(
+        Mesh(grid.points + 0.1 * bump, grid.cells, element), poisson_ratio, formulation, side
+    )
 
 
 def placed(cells: Mesh, poisson_ratio, formulation=None, side=1.0, space=None) -> fem.Problem:

@@ -29,9 +29,14 @@ def timed(go, *arguments, **options) -> tuple[Timing, Any]:
 
 
 def against_felupe(
-    run: Callable[..., fem.Motion], problem: fem.Problem, damping: Any, steps: int, step: float,
-    gait: dict[str, Any], element: str,
-):  # fmt: skip
+    run: Callable[..., fem.Motion],
+    problem: fem.Problem,
+    damping: Any,
+    steps: int,
+    step: float,
+    gait: dict[str, Any],
+    element: str,
+):
     """Rows of ours and of felupe's, by SciPy's solver and by Pardiso.
 
     `run(problem, duration, step)` moves the problem from rest, one metre deep, on a floor
@@ -47,19 +52,41 @@ def against_felupe(
     arrays, law, found = _arrays(problem, damping, steps, step, gait), problem.loads[-1], []
     assert isinstance(law, fem.Contact)
     for solver in ("superlu", "pardiso"):
-        found.append(peers.row(
-            "felupe", "motion", arrays, error, "sorojax, largest difference over largest",
-            element=element, step=step, rho_inf=0.5, tolerance=1e-6, max_iterations=60,
-            solver=solver, **{name: float(getattr(law, name)) for name in LAW},
-        ))  # fmt: skip
+        found.append(
+            peers.row(
+                "felupe",
+                "motion",
+                arrays,
+                error,
+                "sorojax, largest difference over largest",
+                element=element,
+                step=step,
+                rho_inf=0.5,
+                tolerance=1e-6,
+                max_iterations=60,
+                solver=solver,
+                **{name: float(getattr(law, name)) for name in LAW},
+            )
+        )
         start = time.process_time()
         run(*runs)
         timing = Timing(timing.compile_s, (*timing.runs, time.process_time() - start))
-    settings = {"dof": problem.space.num_dofs, "steps": steps, "step_ms": 1e3 * step,
-                "solver": problem.space.system.solver.name}  # fmt: skip
+    settings = {
+        "dof": problem.space.num_dofs,
+        "steps": steps,
+        "step_ms": 1e3 * step,
+        "solver": problem.space.system.solver.name,
+    }
     share = None if found[0].run_s is None else statistics.median(timing.runs) / found[0].run_s
-    yield Row("sorojax", settings, **timing.columns(), error=share, bar=BAR, bar_on="error",
-              reference="time over that of felupe with SciPy's solver")  # fmt: skip
+    yield Row(
+        "sorojax",
+        settings,
+        **timing.columns(),
+        error=share,
+        bar=BAR,
+        bar_on="error",
+        reference="time over that of felupe with SciPy's solver",
+    )
     yield from found
 
 

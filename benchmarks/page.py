@@ -90,8 +90,11 @@ def html(
         f"<p>{escape(machine())}</p><p class=small>Medians over repeats on one pinned "
         "core, every case in its own process, every peer in its own environment. "
         "compile: XLA without a persistent cache, or the first call.</p>"
-        + _quick(left_out) + "".join(parts) + tables.peers() + "</html>\n"
-    )  # fmt: skip
+        + _quick(left_out)
+        + "".join(parts)
+        + tables.peers()
+        + "</html>\n"
+    )
 
 
 def _quick(left_out: Iterable[str]) -> str:

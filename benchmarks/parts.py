@@ -30,8 +30,9 @@ def parts() -> dict:
     )
     made["block"] = _box(trimesh, 20, 10, 6), 6.0
     made["hollow chamfered block"] = (
-        _cut(trimesh, _chamfered(trimesh, 24, 3), _chamfered(trimesh, 20, 3)), 2.0
-    )  # fmt: skip
+        _cut(trimesh, _chamfered(trimesh, 24, 3), _chamfered(trimesh, 20, 3)),
+        2.0,
+    )
     for folds, around in ((3, 32), (4, 64), (3, 400)):
         made[f"bellows, {folds} folds, {around} facets"] = _bellows(trimesh, folds, around), 1.8
     ball = trimesh.creation.uv_sphere(12, count=[150, 320])
@@ -70,10 +71,14 @@ def _bosses(trimesh):
     shell = _cut(trimesh, _box(trimesh, 36, 26, 14), _box(trimesh, 32, 22, 14, up=2))
     bosses = [
         _moved(trimesh.creation.cylinder(3.5, 9, sections=32), x, y, -1.5)
-        for x in (-11, 11) for y in (-6, 6)
-    ]  # fmt: skip
-    drills = [_moved(trimesh.creation.cylinder(1.5, 8, sections=24), x, y, 1.0)
-              for x in (-11, 11) for y in (-6, 6)]  # fmt: skip
+        for x in (-11, 11)
+        for y in (-6, 6)
+    ]
+    drills = [
+        _moved(trimesh.creation.cylinder(1.5, 8, sections=24), x, y, 1.0)
+        for x in (-11, 11)
+        for y in (-6, 6)
+    ]
     return _cut(trimesh, trimesh.boolean.union([shell, *bosses], engine="manifold"), *drills)
 
 
@@ -89,6 +94,4 @@ def _bellows(trimesh, folds, around):
     z = np.linspace(0, 8.0 * folds, 8 * folds + 1)
     r = 10 - 1.2 * np.cos(2 * np.pi * z / 8)
     outer, inner = np.stack([r + 2.2, z], axis=1), np.stack([r, z], axis=1)[::-1]
-    return trimesh.creation.revolve(
-        np.concatenate([inner, outer, inner[:1]]), sections=around
-    )  # fmt: skip
+    return trimesh.creation.revolve(np.concatenate([inner, outer, inner[:1]]), sections=around)

@@ -12,9 +12,14 @@ RUBBER = material.NeoHookean(200 * kPa, 10 * MPa, density=1080.0)
 
 def actuator(num_bellows: int = 4) -> BellowsActuator:
     return BellowsActuator(
-        wall_thickness=1 * mm, bellow_width=7 * mm, gap=0.55 * mm, base=2.5 * mm,
-        roof=1.5 * mm, fillet=0.25 * mm, num_bellows=num_bellows,
-    )  # fmt: skip
+        wall_thickness=1 * mm,
+        bellow_width=7 * mm,
+        gap=0.55 * mm,
+        base=2.5 * mm,
+        roof=1.5 * mm,
+        fillet=0.25 * mm,
+        num_bellows=num_bellows,
+    )
 
 
 def pneunet(
@@ -30,9 +35,13 @@ def pneunet(
     walls = mesh.facets_on(cells, shape.notches())
     contact = fem.SelfContact(walls, stiffness=stiffness, reach=0.8 * mm, name="walls")
     return fem.problem(
-        cells, base.material, kinematics=base.kinematics, supports=base.supports,
-        loads=(*base.loads, contact), formulation=base.formulation,
-    )  # fmt: skip
+        cells,
+        base.material,
+        kinematics=base.kinematics,
+        supports=base.supports,
+        loads=(*base.loads, contact),
+        formulation=base.formulation,
+    )
 
 
 def tip_turn(problem: fem.Problem, u) -> float:

@@ -111,9 +111,16 @@ def solver_run(solver: dfx.AbstractSolver, control, duration: float = 1.0):
             return ravel_pytree(network.vector_field(t, unravel(x)))[0]
 
         solution = dfx.diffeqsolve(
-            dfx.ODETerm(field), solver, 0.0, duration, None, start, args=network,
-            stepsize_controller=control, max_steps=400_000,
-        )  # fmt: skip
+            dfx.ODETerm(field),
+            solver,
+            0.0,
+            duration,
+            None,
+            start,
+            args=network,
+            stepsize_controller=control,
+            max_steps=400_000,
+        )
         assert solution.ys is not None
         return unravel(solution.ys[0])["finger"]["q"], solution.stats["num_steps"]
 
@@ -132,9 +139,14 @@ def reference(gain, duration: float = 1.0) -> np.ndarray:
 
     rate, slope = jax.jit(field), jax.jit(jax.jacfwd(field, 1))
     found = solve_ivp(
-        lambda t, x: np.asarray(rate(t, x)), (0.0, duration), np.asarray(start),
-        method="Radau", rtol=1e-11, atol=1e-13, jac=lambda t, x: np.asarray(slope(t, x)),
-    )  # fmt: skip
+        lambda t, x: np.asarray(rate(t, x)),
+        (0.0, duration),
+        np.asarray(start),
+        method="Radau",
+        rtol=1e-11,
+        atol=1e-13,
+        jac=lambda t, x: np.asarray(slope(t, x)),
+    )
     return np.asarray(unravel(jnp.asarray(found.y[:, -1]))["finger"]["q"])
 
 

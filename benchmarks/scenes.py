@@ -58,9 +58,12 @@ RUBBER = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45, density=100
 def _solid(rubber: Any = RUBBER, loads: tuple = ()):
     """Residual and tangent of a block."""
     problem = fem.problem(
-        GRID, rubber, kinematics=fem.PlaneStrain(1.0), loads=loads,
+        GRID,
+        rubber,
+        kinematics=fem.PlaneStrain(1.0),
+        loads=loads,
         supports=(fem.Fixed(GRID.node_sets["left"]),),
-    )  # fmt: skip
+    )
     prepared = prepare(problem)
     arrays, static = eqx.partition((problem, prepared), eqx.is_array)
 
@@ -78,9 +81,10 @@ def _loop(air: bool = False, logged: bool = False):
     forces = (R.thread_chambers(body, R.Straight([4e-3, 0.0]), 2e-5), R.Damping(0.01))
     finger: dict[str, Any] = {"finger": S.RodBody(body, forces if air else forces[1:])}
     wires = {
-        "finger.pressure": "air.pressure", "air.volume": "finger.volume",
+        "finger.pressure": "air.pressure",
+        "air.volume": "finger.volume",
         "air.volume_rate": "finger.volume_rate",
-    }  # fmt: skip
+    }
     if air:
         finger["air"] = S.Reservoir()
     network = S.Network(finger, wires if air else {})

@@ -22,12 +22,15 @@ def contents(rows: dict[str, list[list[Line]]]) -> str:
         bars = [line["holds"] for line in lines if line["holds"] is not None]
         codes = dict.fromkeys(line["code"] for line in lines if line["run_s"] is not None)
         none = dict.fromkeys(x["code"] for x in lines if "reason" in x["settings"])
-        body.append((
-            f'<a href="#{anchor(row)}">{escape(row)}</a>',
-            escape(", ".join(case[0]["case"] for case in cases)),
-            f"{sum(bars)} of {len(bars)}" if bars else "-",
-            escape(", ".join(codes)), escape(", ".join(none) or "-"),
-        ))  # fmt: skip
+        body.append(
+            (
+                f'<a href="#{anchor(row)}">{escape(row)}</a>',
+                escape(", ".join(case[0]["case"] for case in cases)),
+                f"{sum(bars)} of {len(bars)}" if bars else "-",
+                escape(", ".join(codes)),
+                escape(", ".join(none) or "-"),
+            )
+        )
     return _table(("row", "cases", "bars met", "codes", "did not run"), body)
 
 

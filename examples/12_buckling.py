@@ -119,8 +119,13 @@ def draw(rest, full, path, widths, first, file: Path) -> None:
     for row, (modes, name) in enumerate(((rest, "0 %"), (full, "12.5 %"))):
         for k, shape in enumerate(np.asarray(modes.shapes)):
             shape = 3 * mm * shape / np.abs(shape).max()
-            show(grid[row, k], np.asarray(modes.displacement) + shape, shape[:, 0],
-                 f"mode {k + 1} at {name}", (-3 * mm, 3 * mm))  # fmt: skip
+            show(
+                grid[row, k],
+                np.asarray(modes.displacement) + shape,
+                shape[:, 0],
+                f"mode {k + 1} at {name}",
+                (-3 * mm, 3 * mm),
+            )
     bent = np.asarray(path.displacements[-1])
     show(
         grid[2, 0],

@@ -64,14 +64,26 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
 
     way = jax.vmap(asked)(WAY[:, 1:4] * mm, WAY[:, 4] * kPa)
     pid = systems.PID(
-        0.0, integral_gain=[5.0, 5.0, 5.0, 0.0], feed_forward=1.0, tracking_time=0.025,
-        reference=systems.Waypoints(WAY[:, 0], way, smooth=True), low=made.low, high=made.high,
-    )  # fmt: skip
-    ticks = list(run_loop(
-        board, board.clock, jax.jit(lambda *now: pid(*now)), pid.start(0.0, jnp.zeros(4)),
-        duration=WAY[-1, 0], period=1e-2, limits=limits,
-        measure=lambda *_: asked(tips(valves.state.q), 0.0),
-    ))  # fmt: skip
+        0.0,
+        integral_gain=[5.0, 5.0, 5.0, 0.0],
+        feed_forward=1.0,
+        tracking_time=0.025,
+        reference=systems.Waypoints(WAY[:, 0], way, smooth=True),
+        low=made.low,
+        high=made.high,
+    )
+    ticks = list(
+        run_loop(
+            board,
+            board.clock,
+            jax.jit(lambda *now: pid(*now)),
+            pid.start(0.0, jnp.zeros(4)),
+            duration=WAY[-1, 0],
+            period=1e-2,
+            limits=limits,
+            measure=lambda *_: asked(tips(valves.state.q), 0.0),
+        )
+    )
 
     film = robots.replay(whole, valves.states, ("cylinder", "plate"))
     seen = systems.contact_history(whole, contacts, film.q, film.v, ["cylinder"])

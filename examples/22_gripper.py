@@ -59,9 +59,15 @@ def run(joint, radius, length, depth, mass, command, step, saves):
     """The robot, its motion, and the contact force [N] or moment [N m] that the thing takes
     along the axis, the mean of the last 50 steps."""
     finger = rod.rod(
-        sj.SE3(), rod.chebyshev(kappa_y=2, kappa_z=2), rod.circle(6 * mm), length=80 * mm,
-        young_modulus=1e6, poisson_ratio=0.3, density=2000, nodes=6,
-    )  # fmt: skip
+        sj.SE3(),
+        rod.chebyshev(kappa_y=2, kappa_z=2),
+        rod.circle(6 * mm),
+        length=80 * mm,
+        young_modulus=1e6,
+        poisson_ratio=0.3,
+        density=2000,
+        nodes=6,
+    )
     fingers = robots.ring(finger, 4, 37.5 * mm)
     thing = rod.Part(
         robots.cylinder(mass, radius, length), joint, offset=robots.pose_below(depth)

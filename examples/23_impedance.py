@@ -43,10 +43,15 @@ def wall():
 
 def arm():
     return sj.rod.rod(
-        sj.SE2(), sj.rod.piecewise_constant(kappa_z=6), sj.rod.rectangle(60 * mm, 2 * HALF),
-        length=378 * mm, young_modulus=5 * MPa, poisson_ratio=0.33,
-        density=0.334 / (63 * 60 * 20 * mm**3), nodes=12,
-    )  # fmt: skip
+        sj.SE2(),
+        sj.rod.piecewise_constant(kappa_z=6),
+        sj.rod.rectangle(60 * mm, 2 * HALF),
+        length=378 * mm,
+        young_modulus=5 * MPa,
+        poisson_ratio=0.33,
+        density=0.334 / (63 * 60 * 20 * mm**3),
+        nodes=12,
+    )
 
 
 def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, float]:
@@ -66,9 +71,15 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
 
     def run(law):
         path = sj.rod.rollout(
-            rod, start, jnp.zeros(6), (lossy, touch, sj.systems.ControlForce(law)),
-            step=SAVED / every, saves=round(6.0 / SAVED), every=every, stepper=stepper,
-        )  # fmt: skip
+            rod,
+            start,
+            jnp.zeros(6),
+            (lossy, touch, sj.systems.ControlForce(law)),
+            step=SAVED / every,
+            saves=round(6.0 / SAVED),
+            every=every,
+            stepper=stepper,
+        )
         return path, sj.systems.contact_history(rod, (touch,), path.q, path.v)
 
     first, seen = run(spring(APPROACH))

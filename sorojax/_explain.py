@@ -255,8 +255,10 @@ def wrong_numbers(
             continue
         is_open = any(dim.startswith(("*", "...")) for dim in kind.dims)
         if not is_open and rank(value) != len(kind.dims):
-            return ValueError(f"{where}: got {got(value)} for `{name}`, need {kind.need}. "
-                              "Give one row for each.")  # fmt: skip
+            return ValueError(
+                f"{where}: got {got(value)} for `{name}`, need {kind.need}. "
+                "Give one row for each."
+            )
         if isinstance(value, list | tuple | range):
             made = "np.array(..., int)" if kind.is_whole else "jnp.array"
             return TypeError(

@@ -98,8 +98,10 @@ def rank(value: Any) -> int | None:
             return 1
         ranks = {rank(item) for item in value}
         rows = [item for item in value if isinstance(item, list | tuple) or _is_array(item)]
-        lengths = {np.shape(row)[0] if _is_array(row) and np.ndim(row) else _length(row)
-                   for row in rows}  # fmt: skip
+        lengths = {
+            np.shape(row)[0] if _is_array(row) and np.ndim(row) else _length(row)
+            for row in rows
+        }
         if len(ranks) > 1 or None in ranks or len(lengths) > 1:
             return None  # no numbers, or rows of different lengths
         return 1 + next(iter(ranks), 0)  # type: ignore[operator]
@@ -222,10 +224,14 @@ def _any_of(kinds: list[Kind]) -> Kind:
     nouns = [kind.noun for kind in spoken if kind.noun]
     items = [kind.item for kind in spoken if kind.item]
     return Kind(
-        lambda value: any(kind.accepts(value) for kind in kinds), need,
-        nouns[0] if nouns else None, items[0] if items else None,
-        spoken[0].dims if len(spoken) == 1 else None, spoken[0].is_whole, always,
-    )  # fmt: skip
+        lambda value: any(kind.accepts(value) for kind in kinds),
+        need,
+        nouns[0] if nouns else None,
+        items[0] if items else None,
+        spoken[0].dims if len(spoken) == 1 else None,
+        spoken[0].is_whole,
+        always,
+    )
 
 
 def _function(count: int) -> Kind:

@@ -41,8 +41,12 @@ DEEPEST = 3  # loops and branches inside of others
 BATCH = 250  # programs of one process
 THREADED = 4  # every so many batches run in threads
 ENOUGH = 0.6  # of the programs have a kernel, or the others show little
-BAD = {"abort": "aborts", "result": "wrong results", "dtype": "wrong dtypes",
-       "error": "other errors"}  # fmt: skip
+BAD = {
+    "abort": "aborts",
+    "result": "wrong results",
+    "dtype": "wrong dtypes",
+    "error": "other errors",
+}
 FATAL = ("Check failed", "LLVM ERROR", "Assertion", "terminate called", "Error")
 ROOT = Path(__file__).parent.parent
 Shape = tuple[int, ...]
@@ -112,8 +116,11 @@ def fit(draw: Draw, x: Any, shape: Shape) -> Any:
         return flat[(jnp.arange(size) * 3 + 1) % x.size].reshape(shape)
     if x.size >= size:
         return lax.slice(flat, (x.size - size,), (x.size,)).reshape(shape)
-    return (jnp.resize(x, shape) if draw.chance(0.5)
-            else jnp.pad(flat, (0, size - x.size)).reshape(shape))  # fmt: skip
+    return (
+        jnp.resize(x, shape)
+        if draw.chance(0.5)
+        else jnp.pad(flat, (0, size - x.size)).reshape(shape)
+    )
 
 
 def cast(draw: Draw, x: Any, kind: str) -> Any:

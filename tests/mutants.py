@@ -214,9 +214,13 @@ def _pass(what: Sequence[Path | str], copy_of: Path, workers: int) -> bool:
     path = os.pathsep.join(str(copy_of / part) for part in ("", "hardware", "hardware/pi"))
     try:
         done = subprocess.run(
-            command, cwd=copy_of, env={**os.environ, "PYTHONPATH": path}, timeout=LIMIT,
-            capture_output=True, check=False,
-        )  # fmt: skip
+            command,
+            cwd=copy_of,
+            env={**os.environ, "PYTHONPATH": path},
+            timeout=LIMIT,
+            capture_output=True,
+            check=False,
+        )
         return done.returncode == 0
     except subprocess.TimeoutExpired:
         return False  # a loop without end is seen

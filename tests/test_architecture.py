@@ -35,8 +35,12 @@ NOT_PROMISED = (
     "jaxlib",
 )  # fmt: skip
 CALLBACKS_AND_OPTIONS = {
-    "pure_callback", "io_callback", "compiler_options", "Primitive", "set_xla_metadata",
-}  # fmt: skip
+    "pure_callback",
+    "io_callback",
+    "compiler_options",
+    "Primitive",
+    "set_xla_metadata",
+}
 ONLY_WHERE_USED = {"cv2", "pyvista", "skimage", "meshio", "matplotlib", "pyrealsense2"}
 MAX_LINES = 600
 LONGER: set[str] = set()  # files of numbers and nothing else
@@ -253,8 +257,11 @@ def test_import_is_cheap_and_sets_no_flag():
     for _ in range(3):
         done = subprocess.run(
             [sys.executable, "-c", IMPORT_COST],
-            cwd=ROOT, capture_output=True, text=True, check=True,
-        )  # fmt: skip
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
         seconds, below, changed, loaded = done.stdout.strip().split(";")
         assert (changed, loaded) == ("[]", "[]")
         shares.append(float(seconds) / float(below))
@@ -280,8 +287,11 @@ def test_no_module_hides_a_public_name():
     floors = [name for name in FLOOR if (CORE / name).is_dir()]
     done = subprocess.run(
         [sys.executable, "-c", HIDDEN, *floors],
-        cwd=ROOT, capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert done.stdout == ""
 
 

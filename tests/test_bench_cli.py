@@ -86,10 +86,20 @@ def test_a_model_of_ones_own_is_served(tmp_path):
     (tmp_path / "desk_model.py").write_text(MODEL)
     path = ":".join([str(tmp_path), *filter(None, sys.path)])
     child = subprocess.Popen(
-        [sys.executable, "-m", "sorojax_hardware", "serve", "--model", "desk_model:lag",
-         "--port", "0"],
-        stdout=subprocess.PIPE, text=True, env={"PYTHONPATH": path},
-    )  # fmt: skip
+        [
+            sys.executable,
+            "-m",
+            "sorojax_hardware",
+            "serve",
+            "--model",
+            "desk_model:lag",
+            "--port",
+            "0",
+        ],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={"PYTHONPATH": path},
+    )
     try:
         line = child.stdout.readline()  # type: ignore
         assert line.startswith("simulated desk_model:lag on 127.0.0.1:")

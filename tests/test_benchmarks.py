@@ -69,8 +69,11 @@ def run(folder, name):
 def test_list_names_every_case():
     done = subprocess.run(
         [sys.executable, "-m", "benchmarks", "--list"],
-        cwd=Path(__file__).parent.parent, capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        cwd=Path(__file__).parent.parent,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     listed = dict(text.split(maxsplit=1) for text in done.stdout.splitlines())
     assert listed.keys() == discover.cases().keys()
     assert {"rod.acceleration", "rod.simulation"} <= listed.keys()
@@ -173,8 +176,9 @@ def test_suite_names_cases_that_exist_and_groups_all():
     assert sorted(n for names in groups.values() for n in names) == sorted(known)
     assert list(groups)[0] == "rod statics" and "fem.cook" in groups["near incompressibility"]
     assert suite.grouped(["my.case", "rod.ik"]) == {
-        "inverse kinematics and estimator": ["rod.ik"], suite.FURTHER: ["my.case"]
-    }  # fmt: skip
+        "inverse kinematics and estimator": ["rod.ik"],
+        suite.FURTHER: ["my.case"],
+    }
 
 
 def test_exponents_come_from_the_sizes_and_shortest_runs():
@@ -200,10 +204,13 @@ def test_peak_is_what_a_call_holds_at_most():
 def test_page_shows_features_peers_and_bars(monkeypatch, tmp_path):
     monkeypatch.setenv("SOROJAX_PEERS", str(tmp_path))
     pair = [
-        Row("sorojax", {"feature": "gravity", "scene": scene, "instructions": 9 + k,
-                        "flops": 100.0 * k}, run_s=1e-6 * (1 + k))
+        Row(
+            "sorojax",
+            {"feature": "gravity", "scene": scene, "instructions": 9 + k, "flops": 100.0 * k},
+            run_s=1e-6 * (1 + k),
+        )
         for k, scene in enumerate(("without", "with"))
-    ]  # fmt: skip
+    ]
     bars = [Row("sorojax", {}, run_s=1.0, bar=2.0), Row("sorojax", {}, run_s=3.0, bar=2.0)]
     lines = [line("skip.features", row) for row in pair]
     text = page.html(lines + [line("rod.statics", row) for row in bars])

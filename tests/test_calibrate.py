@@ -210,8 +210,9 @@ def test_wrong_records_are_refused():
     with pytest.raises(ValueError, match="must be positive"):
         design.Experiment(decay, jnp.zeros(9), 0.0)
     with pytest.raises(ValueError, match="shape \\(9,\\), need \\(4,\\)"), silent():
-        design.calibrate((design.Experiment(decay, jnp.zeros(4), 1.0),), GUESS,
-                         logarithmic=False)  # fmt: skip
+        design.calibrate(
+            (design.Experiment(decay, jnp.zeros(4), 1.0),), GUESS, logarithmic=False
+        )
 
 
 BEAM = mesh.rectangle([0, 0], [0.1, 0.02], divisions=(5, 1), element=mesh.Quad4())
@@ -239,9 +240,14 @@ def hanging(p, weight):
 def bent(p, force):
     """Tip of a rod under its own weight and a dead force across it [N]."""
     body = R.rod(
-        SE2(), R.chebyshev(kappa_z=2), R.circle(6e-3), length=0.08,
-        young_modulus=p["young"], poisson_ratio=0.4, density=p["density"],
-    )  # fmt: skip
+        SE2(),
+        R.chebyshev(kappa_z=2),
+        R.circle(6e-3),
+        length=0.08,
+        young_modulus=p["young"],
+        poisson_ratio=0.4,
+        density=p["density"],
+    )
     wrench = R.TipWrench(jnp.stack([0 * force, 0 * force, force]))
     rest = R.equilibrium(body, (wrench, R.Gravity([0.0, 9.81])))
     return R.tip_pose(body, rest.q)[:2, 2]
@@ -251,10 +257,12 @@ def bent(p, force):
 def filled(p, gain):
     """Pressure behind a lag, driven by a step."""
     network = S.Network(
-        {"in": S.Source(S.Constant(p["density"]), unit="Pa"),
-         "lag": S.Lag(p["young"] / 2e5 * gain, unit="Pa")},
+        {
+            "in": S.Source(S.Constant(p["density"]), unit="Pa"),
+            "lag": S.Lag(p["young"] / 2e5 * gain, unit="Pa"),
+        },
         {"lag.a": "in.value"},
-    )  # fmt: skip
+    )
     return S.simulate(network, 1.0, save=5, step=0.02)["lag.value"][1:]
 
 

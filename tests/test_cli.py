@@ -20,8 +20,11 @@ ROOT = Path(__file__).parent.parent
 def command(*words, **environment):
     return subprocess.run(
         [sys.executable, "-m", "sorojax", *words],
-        cwd=ROOT, capture_output=True, text=True, env=os.environ | environment,
-    )  # fmt: skip
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        env=os.environ | environment,
+    )
 
 
 def test_version_is_that_of_the_package():

@@ -26,9 +26,13 @@ def beam_deflection(x):
 def test_svanbergs_beam(method):
     """Krister Svanberg, Int. J. Numer. Meth. Engng 24, 1987, section 5.2: 1.340."""
     found = design.minimise(
-        beam_weight, jnp.full(5, 5.0), constraints=(beam_deflection,), optimiser=method,
-        steps=60, tolerance=1e-6,
-    )  # fmt: skip
+        beam_weight,
+        jnp.full(5, 5.0),
+        constraints=(beam_deflection,),
+        optimiser=method,
+        steps=60,
+        tolerance=1e-6,
+    )
     want = [6.0160, 5.3092, 4.4943, 3.5015, 2.1527]
     assert np.allclose(found.design, want, atol=2e-3) and abs(found.objective - 1.33996) < 1e-5
     assert float(found.constraints[0]) < 1e-6 and found.status == Status.successful
@@ -43,9 +47,13 @@ def test_svanbergs_two_balls(method):
         return lambda x: module.sum((x - module.array(centre)) ** 2) - 9
 
     found = design.minimise(
-        lambda x: jnp.sum(x**2), jnp.array([4.0, 3.0, 2.0]), optimiser=method, steps=60,
-        constraints=tuple(map(outside, centres)), tolerance=1e-7,
-    )  # fmt: skip
+        lambda x: jnp.sum(x**2),
+        jnp.array([4.0, 3.0, 2.0]),
+        optimiser=method,
+        steps=60,
+        constraints=tuple(map(outside, centres)),
+        tolerance=1e-7,
+    )
     bounds = [{"type": "ineq", "fun": lambda x, c=c: -outside(c, np)(x)} for c in centres]
     peer = scipy.optimize.minimize(
         lambda x: np.sum(x**2), [4.0, 3.0, 2.0], constraints=bounds, method="SLSQP", tol=1e-12
@@ -60,8 +68,13 @@ def test_gcmma_never_rises_where_mma_may():
         return jnp.sum(x**2) + 0.5 * jnp.sum(jnp.cos(12 * x))
 
     start = jnp.array([0.9, -0.8, 0.4])
-    careful = design.minimise(rough, start, optimiser=design.GCMMA(-1.0, 1.0), steps=30,
-                              constraints=(lambda x: jnp.sum(x) - 5,))  # fmt: skip
+    careful = design.minimise(
+        rough,
+        start,
+        optimiser=design.GCMMA(-1.0, 1.0),
+        steps=30,
+        constraints=(lambda x: jnp.sum(x) - 5,),
+    )
     fall = np.diff(careful.history["objective"])
     assert np.all(fall <= 1e-7 * abs(careful.history["objective"][0]))
     assert careful.objective < rough(start) - 0.5
@@ -69,9 +82,12 @@ def test_gcmma_never_rises_where_mma_may():
 
 def test_a_step_beyond_where_a_function_is_defined_is_halved_until_it_is_not():
     found = design.minimise(
-        lambda x: jnp.sum(-x - 0.01 * jnp.log(0.6 - x)), jnp.full(2, 0.5),
-        optimiser=design.MMA(0.0, 1.0), constraints=(lambda x: jnp.sum(x) - 5,), steps=30,
-    )  # fmt: skip
+        lambda x: jnp.sum(-x - 0.01 * jnp.log(0.6 - x)),
+        jnp.full(2, 0.5),
+        optimiser=design.MMA(0.0, 1.0),
+        constraints=(lambda x: jnp.sum(x) - 5,),
+        steps=30,
+    )
     assert found.status != Status.not_finite and jnp.all(jnp.abs(found.design - 0.55) < 0.05)
 
 
@@ -99,9 +115,11 @@ def test_curvature_of_gcmma_after_a_proposal_that_was_too_good():
 
 def test_a_problem_without_a_feasible_point_ends_at_the_least_bad():
     found = design.minimise(
-        lambda x: jnp.sum(x), jnp.array([0.5]), steps=40,
+        lambda x: jnp.sum(x),
+        jnp.array([0.5]),
+        steps=40,
         constraints=(lambda x: 0.8 - x, lambda x: x - 0.2),
-    )  # fmt: skip
+    )
     assert np.allclose(found.constraints, 0.3, atol=0.02)
 
 
@@ -109,21 +127,31 @@ def test_a_problem_without_a_feasible_point_ends_at_the_least_bad():
 def test_any_optax_optimiser_and_any_pytree():
     start = {"a": jnp.array([2.0, -1.0]), "b": jnp.array(3.0)}
     found = design.minimise(
-        lambda x: jnp.sum(x["a"] ** 2) + (x["b"] - 1) ** 2, start,
-        optimiser=optax.adam(0.1), steps=400, tolerance=1e-8,
-    )  # fmt: skip
+        lambda x: jnp.sum(x["a"] ** 2) + (x["b"] - 1) ** 2,
+        start,
+        optimiser=optax.adam(0.1),
+        steps=400,
+        tolerance=1e-8,
+    )
     assert np.allclose(found.design["a"], 0, atol=1e-3) and abs(found.design["b"] - 1) < 1e-3
     with pytest.raises(ValueError, match="optax optimiser takes no constraints"):
-        design.minimise(beam_weight, jnp.ones(5), constraints=(beam_deflection,),
-                        optimiser=optax.adam(0.1))  # fmt: skip
+        design.minimise(
+            beam_weight, jnp.ones(5), constraints=(beam_deflection,), optimiser=optax.adam(0.1)
+        )
 
 
 def test_stopped_and_resumed_gives_the_same_bits():
     def run(steps, resume=None):
         return design.minimise(
-            beam_weight, jnp.full(5, 5.0), constraints=(beam_deflection,), steps=steps,
-            optimiser=design.MMA(1.0, 10.0), tolerance=0.0, scale=1.0, resume=resume,
-        )  # fmt: skip
+            beam_weight,
+            jnp.full(5, 5.0),
+            constraints=(beam_deflection,),
+            steps=steps,
+            optimiser=design.MMA(1.0, 10.0),
+            tolerance=0.0,
+            scale=1.0,
+            resume=resume,
+        )
 
     whole, half = run(12), run(6)
     rest = run(12, half.last)
@@ -136,9 +164,11 @@ def test_values_that_break_are_named_or_stop_the_run():
         design.minimise(lambda x: jnp.sum(jnp.log(x)), jnp.array([-1.0]))
     with silent():
         found = design.minimise(
-            lambda x: jnp.sum(x) + 0 * jnp.sum(jnp.log(x - 0.4)), jnp.array([0.9]),
-            optimiser=optax.sgd(0.3), steps=10,
-        )  # fmt: skip
+            lambda x: jnp.sum(x) + 0 * jnp.sum(jnp.log(x - 0.4)),
+            jnp.array([0.9]),
+            optimiser=optax.sgd(0.3),
+            steps=10,
+        )
     assert found.status == Status.not_finite and np.all(np.isfinite(found.design))
 
 
@@ -188,9 +218,13 @@ def mbb(nx, ny):
     push = fem.Force(jnp.array([mesh.nearest_node(grid, [0.0, ny])]), [0.0, -1.0])
     stuff = material.neo_hookean(young_modulus=1.0, poisson_ratio=0.3)
     return fem.problem(
-        grid, stuff, kinematics=fem.PlaneStress(1.0), supports=(left, foot), loads=(push,),
+        grid,
+        stuff,
+        kinematics=fem.PlaneStress(1.0),
+        supports=(left, foot),
+        loads=(push,),
         formulation=fem.Displacement(),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -204,10 +238,13 @@ def test_small_displacements_are_those_of_the_nonlinear_body(small):
     factor = jnp.linspace(0.3, 1.0, 72)
     u = design.displacement(model, factor)
     soft = fem.problem(
-        problem.mesh, material.Scaled(problem.material, 1e6 * factor), loads=problem.loads,
-        kinematics=problem.kinematics, supports=problem.supports,
+        problem.mesh,
+        material.Scaled(problem.material, 1e6 * factor),
+        loads=problem.loads,
+        kinematics=problem.kinematics,
+        supports=problem.supports,
         formulation=fem.Displacement(),
-    )  # fmt: skip
+    )
     exact = 1e6 * fem.solve(soft).displacement
     assert np.max(np.abs(u - exact)) < 1e-3 * np.max(np.abs(u))
 
@@ -243,9 +280,10 @@ def test_a_displacement_moves_with_cells_loads_and_springs(small):
 
     def end(scale):
         changed = eqx.tree_at(
-            lambda m: (m.stiffness, m.others), model,
+            lambda m: (m.stiffness, m.others),
+            model,
             (scale[0] * model.stiffness, scale[1] * model.stiffness.max() + model.others),
-        )  # fmt: skip
+        )
         u = design.displacement(changed, factor, scale[2] * model.force)
         return u.ravel() @ way
 
@@ -263,9 +301,13 @@ def test_compiled_functions_and_others_take_the_same_steps():
     for make in (lambda f: f, jax.jit):
         loss, held, changed = map(make, functions)
         found = design.minimise(
-            loss, jnp.full(5, 5.0), constraints=(held,), optimiser=design.MMA(1.0, 10.0),
-            change_gradient=changed, steps=5,
-        )  # fmt: skip
+            loss,
+            jnp.full(5, 5.0),
+            constraints=(held,),
+            optimiser=design.MMA(1.0, 10.0),
+            change_gradient=changed,
+            steps=5,
+        )
         designs.append(found.design)
     assert np.allclose(*designs, rtol=1e-12)
 
@@ -299,9 +341,14 @@ def test_the_mbb_beam(kind, want):
         changed = lambda x, g: design.sensitivity_filtered(smooth, x, g)  # noqa: E731
     with silent():
         found = design.minimise(
-            loss, jnp.full(1200, 0.5), constraints=(volume,), steps=200, tolerance=0.01,
-            optimiser=design.OptimalityCriteria(), change_gradient=changed,
-        )  # fmt: skip
+            loss,
+            jnp.full(1200, 0.5),
+            constraints=(volume,),
+            steps=200,
+            tolerance=0.01,
+            optimiser=design.OptimalityCriteria(),
+            change_gradient=changed,
+        )
     assert float(found.history["objective"][-1]) == pytest.approx(want, rel=5e-3)
     assert abs(float(found.constraints[0])) < 1e-3
 
@@ -315,10 +362,13 @@ def inverter(nx, ny):
     held = (fem.Fixed(grid.node_sets["top"], components=(1,)), fem.Fixed(corner))
     springs = fem.Spring(ends, ground, 0.1)
     problem = fem.problem(
-        grid, material.neo_hookean(young_modulus=1.0, poisson_ratio=0.3), supports=held,
-        kinematics=fem.PlaneStress(1.0), loads=(fem.Force(ends[:1], [1.0, 0.0]), springs),
+        grid,
+        material.neo_hookean(young_modulus=1.0, poisson_ratio=0.3),
+        supports=held,
+        kinematics=fem.PlaneStress(1.0),
+        loads=(fem.Force(ends[:1], [1.0, 0.0]), springs),
         formulation=fem.Displacement(),
-    )  # fmt: skip
+    )
     return problem, ends[1]
 
 
@@ -331,8 +381,13 @@ def test_the_force_inverter():
     volume = jax.jit(lambda x: 10 * (jnp.mean(x) - 0.3))
     with silent():
         found = design.minimise(
-            out, jnp.full(800, 0.3), constraints=(volume,), steps=120, tolerance=0.01,
-            optimiser=design.MMA(1e-3, 1.0, move=0.1), scale=0.1,
+            out,
+            jnp.full(800, 0.3),
+            constraints=(volume,),
+            steps=120,
+            tolerance=0.01,
+            optimiser=design.MMA(1e-3, 1.0, move=0.1),
+            scale=0.1,
             change_gradient=lambda x, g: design.sensitivity_filtered(smooth, x, g),
-        )  # fmt: skip
+        )
     assert float(found.objective) < -1.113 and abs(float(found.constraints[0])) < 0.02

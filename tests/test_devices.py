@@ -28,9 +28,17 @@ def test_both_devices_have_a_row_with_their_error():
     exact = devices.on_cpu(jnp.sin, x)
     for double, error in ((True, 0.0), (False, 1e-7)):
         rows = devices.compared(
-            "sine", jnp.sin, (x,), count=8, of="points", error_of=devices.relative(exact),
-            bar=1e-6, reference="CPU", devices=[cpu, cpu], double=double,
-        )  # fmt: skip
+            "sine",
+            jnp.sin,
+            (x,),
+            count=8,
+            of="points",
+            error_of=devices.relative(exact),
+            bar=1e-6,
+            reference="CPU",
+            devices=[cpu, cpu],
+            double=double,
+        )
         for row in rows:
             assert row.holds and row.error <= error
             assert row.settings["device"] == "one CPU core"

@@ -63,8 +63,10 @@ def run(program: str, tmp_path: Path, plug_in: str = "", **environment: str):
     own = {"PYTHONPATH": path, "SOROJAX_CACHE": str(tmp_path / "cache"), "JAX_PLATFORMS": ""}
     done = subprocess.run(
         [sys.executable, "-c", program],
-        env=os.environ | own | environment, capture_output=True, text=True,
-    )  # fmt: skip
+        env=os.environ | own | environment,
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout, done.stderr
 

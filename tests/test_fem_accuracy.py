@@ -60,9 +60,12 @@ def _pulled(cells, kinematics, coefficients, stretches) -> tuple[fem.Problem, fe
             moved = fem.Prescribed(cells.node_sets[name], [stretch - 1], components=(axis,))
             supports.append(moved)
     problem = fem.problem(
-        cells, material.Yeoh(*coefficients, BULK), kinematics=kinematics,
-        supports=tuple(supports), space=_space(cells is CUBE),
-    )  # fmt: skip
+        cells,
+        material.Yeoh(*coefficients, BULK),
+        kinematics=kinematics,
+        supports=tuple(supports),
+        space=_space(cells is CUBE),
+    )
     return problem, fem.solve(problem, newton=TIGHT)
 
 

@@ -191,8 +191,9 @@ def _renumbered(order):
     moved = jax.tree.map(lambda ids: number[ids], sets)
     grid = eqx.tree_at(
         lambda m: (m.points, m.cells, m.node_sets, m.facet_sets),
-        GRID, (GRID.points[order], *moved),
-    )  # fmt: skip
+        GRID,
+        (GRID.points[order], *moved),
+    )
     return fem.problem(
         grid,
         PROBLEM.material,

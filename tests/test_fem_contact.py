@@ -31,11 +31,12 @@ def block(pull=(0.0, 0.0), stiffness=None, friction=FRICTION) -> fem.Problem:
         loads=(
             fem.Traction(shape.facet_sets["top"], (0.0, -1e3), name="weight"),
             fem.Foundation(top, jnp.array([10.0, 1e-6]), jnp.asarray(pull), name="pull"),
-            fem.Contact(shape.facet_sets["bottom"], FLOOR, stiffness, name="floor",
-                        friction=friction),
+            fem.Contact(
+                shape.facet_sets["bottom"], FLOOR, stiffness, name="floor", friction=friction
+            ),
         ),
         formulation=fem.Displacement(),
-    )  # fmt: skip
+    )
 
 
 NORMAL = 1e3 * LENGTH * DEPTH  # N
@@ -47,9 +48,12 @@ def test_the_step_of_friction_has_a_potential_and_a_memory():
     normal = jnp.array([0.6, 0.8])
     anchor, back, position = 1e-5 * jax.random.normal(key, (3, 40, 2))
     grip = Grip(
-        anchor, jnp.linspace(0, 4e3, 40), jnp.broadcast_to(normal, (40, 2)),
-        jnp.linspace(1e8, 0, 40), back,
-    )  # fmt: skip
+        anchor,
+        jnp.linspace(0, 4e3, 40),
+        jnp.broadcast_to(normal, (40, 2)),
+        jnp.linspace(1e8, 0, 40),
+        back,
+    )
     traction = LAW.traction(grip, position)
     slope = jax.grad(lambda x: jnp.sum(LAW.energy(grip, x)))(position)
     assert jnp.allclose(traction, -slope, rtol=1e-12, atol=1e-12)

@@ -27,9 +27,14 @@ def ring(friction=0.5, young_modulus=1e6) -> fem.Problem:
     )
     touch = fem.Contact(mesh.facets_on(RING, OUTSIDE), FLOOR, friction=friction, name="floor")
     return fem.problem(
-        RING, rubber, kinematics=fem.PlaneStrain(1.0), supports=(),
-        loads=(fem.Gravity(), touch), formulation=fem.Displacement(), free=True,
-    )  # fmt: skip
+        RING,
+        rubber,
+        kinematics=fem.PlaneStrain(1.0),
+        supports=(),
+        loads=(fem.Gravity(), touch),
+        formulation=fem.Displacement(),
+        free=True,
+    )
 
 
 def bounce(problem, duration=0.04, step=2.5e-4, speed=(0.3, -0.5), spin=-40.0, **options):
@@ -118,9 +123,14 @@ def plate(obstacle, young_modulus, stiffness=None) -> fem.Problem:
     )
     touch = fem.Contact(shape.facet_sets["bottom"], obstacle, stiffness, name="wall")
     return fem.problem(
-        shape, rubber, kinematics=fem.PlaneStrain(0.03), supports=(), loads=(touch,),
-        formulation=fem.Displacement(), free=True,
-    )  # fmt: skip
+        shape,
+        rubber,
+        kinematics=fem.PlaneStrain(0.03),
+        supports=(),
+        loads=(touch,),
+        formulation=fem.Displacement(),
+        free=True,
+    )
 
 
 def shot(problem, duration, step, height=10 * mm, **options) -> fem.Motion:
@@ -176,9 +186,13 @@ def _way(theta):
     speed, fall, friction, young = theta
     problem = ring(friction, young)
     motion = bounce(
-        problem, 6e-3, 2.5e-4, jnp.stack([speed, -fall]), save=2,
+        problem,
+        6e-3,
+        2.5e-4,
+        jnp.stack([speed, -fall]),
+        save=2,
         newton=fem.Newton(residual_tolerance=1e-12),
-    )  # fmt: skip
+    )
     return jnp.mean(motion.displacements[-1, :, 0])
 
 
@@ -214,8 +228,9 @@ def test_a_run_that_goes_on_in_a_new_process_is_the_whole_run_to_the_last_bit(tm
     eqx.tree_serialise_leaves(begin, half.end)
     subprocess.run(
         [sys.executable, "-c", SCRIPT, str(begin), str(end)],
-        cwd=Path(__file__).parent.parent, check=True,
-    )  # fmt: skip
+        cwd=Path(__file__).parent.parent,
+        check=True,
+    )
     again = eqx.tree_deserialise_leaves(end, whole.end)
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(whole.end), strict=True):
         assert np.array_equal(a, b)

@@ -27,10 +27,14 @@ def _beam(young_modulus=1e6, held=True, loads=None) -> fem.Problem:
         young_modulus=young_modulus, poisson_ratio=0.45, density=1000.0
     )
     return fem.problem(
-        GRID, rubber, kinematics=fem.PlaneStrain(1.0), space=SPACE, free=not held,
+        GRID,
+        rubber,
+        kinematics=fem.PlaneStrain(1.0),
+        space=SPACE,
+        free=not held,
         supports=(fem.Fixed(GRID.node_sets["left"]),) if held else (),
         loads=(pull,) if loads is None else loads,
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -81,9 +85,13 @@ def flight():
     turn = jnp.stack([-(X[:, 1] - 0.005), X[:, 0] - 0.03], axis=1)
     v = 40.0 * turn + jnp.asarray([1.0, 0.5])[None] + 0.5 * jnp.sin(40 * X)
     return fem.simulate(
-        _beam(held=False), 0.04, 2e-3, start=(jnp.zeros_like(X), v),
-        method=fem.EnergyMomentum(), newton=EXACT,
-    )  # fmt: skip
+        _beam(held=False),
+        0.04,
+        2e-3,
+        start=(jnp.zeros_like(X), v),
+        method=fem.EnergyMomentum(),
+        newton=EXACT,
+    )
 
 
 def test_free_flight_keeps_momentum(flight):
@@ -105,10 +113,14 @@ def test_free_flight_keeps_energy(flight):
 def test_work_and_damping_close_the_balance():
     """What loads give and damping takes is what the body has, with a follower of time."""
     motion = fem.simulate(
-        _beam(), 0.02, 5e-4, method=fem.EnergyMomentum(), newton=EXACT,
+        _beam(),
+        0.02,
+        5e-4,
+        method=fem.EnergyMomentum(),
+        newton=EXACT,
         damping=(fem.Rayleigh(5.0, 1e-4), fem.KelvinVoigt(50.0)),
         pull=lambda t: jnp.stack([jnp.zeros_like(t), 4e3 * jnp.sin(300 * t)]),
-    )  # fmt: skip
+    )
     e = motion.energies
     total = float(jnp.max(jnp.abs(e.work)))
     assert float(e.dissipated[-1]) > 0.01 * total
@@ -122,9 +134,12 @@ def test_rayleigh_damping_has_the_ratio_of_its_docstring(mode, kind):
     omega, ratio = 2 * np.pi / period, 0.05
     given = {"mass": 2 * ratio * omega, "stiffness": 2 * ratio / omega}
     motion = fem.simulate(
-        _beam(), 2 * period, period / 60, start=(shape, 0 * shape),
+        _beam(),
+        2 * period,
+        period / 60,
+        start=(shape, 0 * shape),
         damping=fem.Rayleigh(**{kind: given[kind]}),
-    )  # fmt: skip
+    )
     found = -np.log(_tip(motion)[-1] / _tip(motion)[0]) / (4 * np.pi)
     assert abs(found / ratio - 1) < 0.02
 
@@ -145,9 +160,14 @@ def test_viscosity_does_not_resist_rotation():
     rates = []
     for damping in (fem.KelvinVoigt(100.0), fem.Rayleigh(stiffness=3e-4)):
         motion = fem.simulate(
-            _beam(held=False), 0.04, 1e-3, start=(0 * X, 5.0 * turn),
-            method=fem.GeneralisedAlpha(1.0), damping=damping, save=2,
-        )  # fmt: skip
+            _beam(held=False),
+            0.04,
+            1e-3,
+            start=(0 * X, 5.0 * turn),
+            method=fem.GeneralisedAlpha(1.0),
+            damping=damping,
+            save=2,
+        )
         rates.append(float(motion.energies.dissipated[-1] / motion.energies.kinetic[0]))
     assert rates[0] < 1e-3 < 0.1 < rates[1], rates
 
@@ -162,9 +182,14 @@ def test_lumped_mass_and_prescribed_motion():
     tips = []
     for mass in ("consistent", "lumped"):
         motion = fem.simulate(
-            shaken, 0.02, 5e-4, mass=mass, save=11, method=fem.GeneralisedAlpha(1.0),
+            shaken,
+            0.02,
+            5e-4,
+            mass=mass,
+            save=11,
+            method=fem.GeneralisedAlpha(1.0),
             clamp=lambda t: jnp.stack([0 * t, 2e-3 * (1 - jnp.cos(300 * t))]),
-        )  # fmt: skip
+        )
         e = motion.energies
         assert len(motion) == 11
         assert float(e.work[-1]) > 0
@@ -176,9 +201,13 @@ def test_lumped_mass_and_prescribed_motion():
 def test_a_run_in_two_parts_is_the_whole_run_to_the_last_bit():
     def run(count, start):
         return fem.simulate(
-            _beam(), count / 1024, 1 / 1024, start=start, damping=fem.KelvinVoigt(30.0),
+            _beam(),
+            count / 1024,
+            1 / 1024,
+            start=start,
+            damping=fem.KelvinVoigt(30.0),
             pull=lambda t: jnp.stack([0 * t, 3e3 + 0 * t]),
-        )  # fmt: skip
+        )
 
     whole, half = run(24, None), run(12, None)
     file = io.BytesIO()
@@ -207,9 +236,14 @@ def test_a_step_a_hundred_times_too_large_settles(mode):
 def test_steps_are_cut_where_they_fail_and_grow_again():
     """A sudden load that no single step of this size takes."""
     motion = fem.simulate(
-        _beam(), 0.05, 0.01, save=2, newton=fem.Newton(max_iterations=2), throw=False,
+        _beam(),
+        0.05,
+        0.01,
+        save=2,
+        newton=fem.Newton(max_iterations=2),
+        throw=False,
         pull=lambda t: jnp.stack([0 * t, jnp.where(t > 0.015, 1.5e4, 0.0)]),
-    )  # fmt: skip
+    )
     assert motion.status == Status.successful
     assert motion.stats.cuts > 0
     assert motion.stats.steps > 5
@@ -234,10 +268,15 @@ def _numbers(theta):
     young, viscosity, amplitude, speed = theta
     v = jnp.zeros_like(X).at[:, 1].set(speed * (X[:, 0] / 0.1) ** 2)
     motion = fem.simulate(
-        _beam(young), 4e-3, 5e-4, start=(jnp.zeros_like(X), v), newton=EXACT, save=3,
+        _beam(young),
+        4e-3,
+        5e-4,
+        start=(jnp.zeros_like(X), v),
+        newton=EXACT,
+        save=3,
         damping=fem.KelvinVoigt(viscosity),
         pull=lambda t: jnp.stack([jnp.zeros_like(t), amplitude * jnp.sin(200 * t)]),
-    )  # fmt: skip
+    )
     return motion.displacements[-1, TIP, 1], motion.status
 
 
@@ -328,9 +367,13 @@ def test_bad_input_names_the_remedy(change, message):
 def test_a_run_that_fails_says_so():
     with pytest.raises(fem.MotionError, match="Take shorter steps") as caught:
         fem.simulate(
-            _beam(), 0.01, 1e-3, max_cuts=1, newton=fem.Newton(max_iterations=1),
+            _beam(),
+            0.01,
+            1e-3,
+            max_cuts=1,
+            newton=fem.Newton(max_iterations=1),
             pull=lambda t: jnp.stack([0 * t, 1e7 * t]),
-        )  # fmt: skip
+        )
     assert caught.value.motion.status == Status.not_converged
 
 

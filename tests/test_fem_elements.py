@@ -47,11 +47,14 @@ def _cases():
 
 CASES = [
     pytest.param(
-        element, kinematics, formulation, marks=pytest.mark.slow if slow else (),
+        element,
+        kinematics,
+        formulation,
+        marks=pytest.mark.slow if slow else (),
         id=f"{element.name}-{type(kinematics).__name__}-{type(formulation).__name__}",
     )
     for element, kinematics, formulation, slow in _cases()
-]  # fmt: skip
+]
 
 
 def _look(problem, prepared, states, directions, tilted):
@@ -131,9 +134,12 @@ def test_element(element, kinematics, formulation):
     cells = patch(element, (1.0, 0.0, 0.0))
     edge = np.unique(mesh.boundary_facets(cells))
     problem = fem.problem(
-        cells, RUBBER, kinematics=kinematics, supports=(fem.Fixed(edge),),
+        cells,
+        RUBBER,
+        kinematics=kinematics,
+        supports=(fem.Fixed(edge),),
         formulation=formulation,
-    )  # fmt: skip
+    )
     random = np.random.default_rng(0)
     X = np.asarray(cells.points)
     linear = X @ _gradient(kinematics).T
@@ -180,9 +186,12 @@ def _problem(element, kinematics=None, formulation=None, rubber=RUBBER):
     kinematics = kinematics or (STRAIN if element.dim == 2 else None)
     edge = np.unique(mesh.boundary_facets(cells))
     return fem.problem(
-        cells, rubber, kinematics=kinematics, supports=(fem.Fixed(edge),),
+        cells,
+        rubber,
+        kinematics=kinematics,
+        supports=(fem.Fixed(edge),),
         formulation=formulation,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize(

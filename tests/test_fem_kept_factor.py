@@ -18,9 +18,8 @@ def column():
     below = grid.node_sets["bottom"]
     loads = (fem.Traction(grid.facet_sets["top"], [0.0, -1 * kPa], name="push"),)
     return fem.problem(
-        grid, RUBBER, kinematics=fem.PlaneStrain(1.0), supports=(fem.Fixed(below),),
-        loads=loads,
-    )  # fmt: skip
+        grid, RUBBER, kinematics=fem.PlaneStrain(1.0), supports=(fem.Fixed(below),), loads=loads
+    )
 
 
 def pushed(column, values):

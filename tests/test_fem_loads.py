@@ -226,18 +226,24 @@ def test_pressure_between_two_planes_that_miss_the_origin_has_a_potential():
     pushed = fem.Pressure(grid.facet_sets["right"], 0.3 * RUBBER.shear_modulus)
     arguments = {"kinematics": fem.PlaneStrain(1.0), "formulation": fem.Displacement()}
     problem = fem.problem(
-        grid, RUBBER, supports=(*slide, fem.Fixed(walls["left"], components=(0,))),
-        loads=(pushed,), **arguments,
-    )  # fmt: skip
+        grid,
+        RUBBER,
+        supports=(*slide, fem.Fixed(walls["left"], components=(0,))),
+        loads=(pushed,),
+        **arguments,
+    )
     solution = fem.solve(problem, newton=fem.Newton(residual_tolerance=1e-12))
     stress = fem.cauchy_stress(problem, solution.displacement)[..., 0, 0]
     assert jnp.allclose(stress, -pushed.value, rtol=1e-10)
     assert solution.stats.iterations <= 6
     with pytest.raises(ValueError, match="depends on the way"):
         fem.problem(
-            grid, RUBBER, supports=(slide[0], fem.Fixed(walls["left"])), loads=(pushed,),
+            grid,
+            RUBBER,
+            supports=(slide[0], fem.Fixed(walls["left"])),
+            loads=(pushed,),
             **arguments,
-        )  # fmt: skip
+        )
 
 
 @pytest.mark.parametrize("element", [mesh.Quad8(), mesh.Tri6(), mesh.Hex8()])
@@ -293,8 +299,9 @@ def test_recovered_stress_beats_the_average(element):
 def test_results_go_to_vtu_and_pvd(tmp_path):
     problem = _only(force={})
     path = fem.solve_path(problem, force=jnp.array([[0.0, 1e-3], [0.0, 2e-3]]))
-    files = io.export_fields("run.pvd", problem, path, fields=io.fields.FIELDS,
-                             times=[0.5, 1.0], root=tmp_path)  # fmt: skip
+    files = io.export_fields(
+        "run.pvd", problem, path, fields=io.fields.FIELDS, times=[0.5, 1.0], root=tmp_path
+    )
     assert [file.name for file in files] == ["run_0000.vtu", "run_0001.vtu", "run.pvd"]
     assert 'timestep="0.5"' in files[-1].read_text()
     import meshio
@@ -351,9 +358,13 @@ def test_bad_supports_and_spaces_are_refused():
         _problem(supports=(fem.Prescribed(LEFT, np.array([np.nan, 0.0])),))
     with pytest.raises(ValueError, match="no room for Torque"):
         fem.problem(
-            BEAM, RUBBER, kinematics=fem.PlaneStrain(1.0), supports=(fem.Fixed(LEFT),),
-            loads=(fem.Torque(RIGHT, 1.0),), space=fem.space(BEAM),
-        )  # fmt: skip
+            BEAM,
+            RUBBER,
+            kinematics=fem.PlaneStrain(1.0),
+            supports=(fem.Fixed(LEFT),),
+            loads=(fem.Torque(RIGHT, 1.0),),
+            space=fem.space(BEAM),
+        )
 
 
 @pytest.mark.parametrize("element", [mesh.Tet4(), mesh.Tet10(), mesh.Hex8()])

@@ -58,9 +58,11 @@ def _stretches(problem: fem.Problem, displacements) -> np.ndarray:
 
 def _limit(thickness: float) -> tuple[float, float]:
     found = minimize_scalar(
-        lambda x: -_sphere_pressure(x, thickness), bounds=(1.1, 2), method="bounded",
+        lambda x: -_sphere_pressure(x, thickness),
+        bounds=(1.1, 2),
+        method="bounded",
         options={"xatol": 1e-10},
-    )  # fmt: skip
+    )
     return found.x, -found.fun
 
 
@@ -183,9 +185,12 @@ def column():
     rubber = material.neo_hookean(young_modulus=YOUNG, poisson_ratio=POISSON, density=DENSITY)
     push = fem.Traction(grid.facet_sets["right"], [-EULER / HEIGHT, 0.0], name="push")
     return fem.problem(
-        grid, rubber, kinematics=fem.PlaneStrain(1.0),
-        supports=(fem.Fixed(grid.node_sets["left"]),), loads=(push,),
-    )  # fmt: skip
+        grid,
+        rubber,
+        kinematics=fem.PlaneStrain(1.0),
+        supports=(fem.Fixed(grid.node_sets["left"]),),
+        loads=(push,),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -223,9 +228,13 @@ def test_a_solution_past_the_critical_load_says_that_it_is_not_stable(column):
 def test_the_buckled_branch_is_stable_and_goes_to_either_side(column, buckled, side):
     (point,) = buckled.critical_points
     branch = fem.continuation(
-        column, "push", start=point, step=side * 20.0, largest_step=0.1,
+        column,
+        "push",
+        start=point,
+        step=side * 20.0,
+        largest_step=0.1,
         until=lambda u, _: np.abs(u[:, 1]).max() > 0.3,
-    )  # fmt: skip
+    )
     tip = mesh.nearest_node(column.mesh, [LENGTH, 0.0])
     sideways = np.asarray(branch.displacements[1:, tip, 1])
     assert np.all(side * np.sign(point.shape[tip, 1]) * sideways > 0)

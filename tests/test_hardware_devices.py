@@ -271,8 +271,9 @@ def test_a_server_that_is_killed_is_an_error_and_can_be_found_again():
 
     @contextlib.contextmanager
     def process(port):
-        child = subprocess.Popen([*command, port], stdout=subprocess.PIPE, text=True,
-                                 env={"PYTHONPATH": path})  # fmt: skip
+        child = subprocess.Popen(
+            [*command, port], stdout=subprocess.PIPE, text=True, env={"PYTHONPATH": path}
+        )
         try:
             yield child, child.stdout.readline().rsplit(":", 1)[1].strip()  # type: ignore
         finally:

@@ -31,11 +31,16 @@ def tube():
     grid = mesh.rectangle([5e-3, 0], [8e-3, 4e-3], divisions=(2, 1), order=2)
     rubber = material.neo_hookean(young_modulus=0.3e6, poisson_ratio=0.45, density=1000.0)
     problem = fem.problem(
-        grid, rubber, kinematics=fem.Axisymmetric(), space=fem.space(grid),
-        supports=(fem.Fixed(grid.node_sets["bottom"], (1,)),
-                  fem.Fixed(grid.node_sets["top"], (1,))),
+        grid,
+        rubber,
+        kinematics=fem.Axisymmetric(),
+        space=fem.space(grid),
+        supports=(
+            fem.Fixed(grid.node_sets["bottom"], (1,)),
+            fem.Fixed(grid.node_sets["top"], (1,)),
+        ),
         loads=(fem.Pressure(grid.facet_sets["left"], name="tube"),),
-    )  # fmt: skip
+    )
     skin = mesh.nearest_node(grid, (8e-3, 0.0))
     body = S.FemBody(problem, fem.KelvinVoigt(300.0), markers={"skin": skin})
     gas = volume(problem, problem.loads[0], jnp.zeros_like(grid.points))
@@ -53,17 +58,30 @@ def test_a_solid_behind_a_board_swells_as_statics_has_it(tube):
     board = LocalBoard(limits, valves, clock)
     board.arm()
     ticks = list(
-        run_loop(board, clock, lambda t, p, s: (30 * kPa, s), None, duration=0.4, period=0.01,
-                 limits=(0.0, 50 * kPa))
-    )  # fmt: skip
+        run_loop(
+            board,
+            clock,
+            lambda t, p, s: (30 * kPa, s),
+            None,
+            duration=0.4,
+            period=0.01,
+            limits=(0.0, 50 * kPa),
+        )
+    )
     pressure = np.array([tick.pressure[0] for tick in ticks])
     assert pressure[1] < 25 * kPa and np.allclose(pressure[-10:], 30 * kPa, atol=400)
     moved = float(valves.state.state["body"]["u"][skin, 0])
     load = fem.Pressure(problem.loads[0].facets, float(valves.pressure[0]))
-    still = fem.solve(fem.problem(
-        problem.mesh, problem.material, kinematics=fem.Axisymmetric(), space=problem.space,
-        supports=problem.supports, loads=(load,),
-    ))  # fmt: skip
+    still = fem.solve(
+        fem.problem(
+            problem.mesh,
+            problem.material,
+            kinematics=fem.Axisymmetric(),
+            space=problem.space,
+            supports=problem.supports,
+            loads=(load,),
+        )
+    )
     assert moved == pytest.approx(float(still.displacement[skin, 0]), rel=0.01)
     assert moved > 1e-4
     clock.sleep_until(clock.now() + 0.8)

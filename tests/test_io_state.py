@@ -91,7 +91,7 @@ class Foreign(eqx.Module):
         (Foreign(jnp.ones(2)), "the tree is a .*test_io_state.Foreign"),
         ({"x": jnp.ones(2), "s": {1, 2}}, r"`\['s'\]` is a set"),
     ],
-)  # fmt: skip
+)
 def test_what_is_more_than_data_of_sorojax_needs_like(tree, why, tmp_path):
     io.save(tmp_path / "a.npz", tree)
     with pytest.raises(ValueError, match=f"arrays only \\({why}\\), need .* as `like`"):

@@ -204,9 +204,11 @@ def unused_arguments(text):
         elif " = " in line:
             lines.append(line)
     calls = [
-        line for lines in bodies.values() for line in lines
+        line
+        for lines in bodies.values()
+        for line in lines
         if " call(" in line and 'small_call="true"' in line
-    ]  # fmt: skip
+    ]
     assert calls
     reached = inside(calls)
     for name in reached:
@@ -231,9 +233,15 @@ def uses(lines, name):
 def test_a_filter_with_constants_among_its_arguments_compiles():
     """It once ended the process."""
     model = R.rod(
-        sj.SE2(), R.chebyshev(kappa_z=1), R.circle(6e-3), nodes=4, length=0.08,
-        young_modulus=1e6, poisson_ratio=0.3, density=1100.0,
-    )  # fmt: skip
+        sj.SE2(),
+        R.chebyshev(kappa_z=1),
+        R.circle(6e-3),
+        nodes=4,
+        length=0.08,
+        young_modulus=1e6,
+        poisson_ratio=0.3,
+        density=1100.0,
+    )
     at = jnp.array([0.5, 1.0])
     estimator = ShapeFilter(Markers(model, at), 1 / 60)
     seen = R.forward_kinematics(model, jnp.array([3.0]), at)[:, :2, 2]
@@ -284,7 +292,7 @@ def test_an_adaptive_run_is_one_kernel(batched):
         control = dfx.PIDController(rtol=1e-6, atol=1e-8)
         run = dfx.diffeqsolve(
             dfx.ODETerm(field), Tsit5(), 0.0, 2.0, 0.01, start, stepsize_controller=control
-        )  # fmt: skip
+        )
         return run.ys, run.stats["num_steps"]
 
     function, x = (jax.vmap(swing), jnp.array([9.0, 5.0])) if batched else (swing, X[-1] * 10)

@@ -27,9 +27,11 @@ print(resource.getrusage(resource.RUSAGE_THREAD).ru_nvcsw - before)
 
 def run(asked: str):
     return subprocess.run(
-        [sys.executable, "-c", PROGRAM.format(asked=asked)], capture_output=True, text=True,
+        [sys.executable, "-c", PROGRAM.format(asked=asked)],
+        capture_output=True,
+        text=True,
         env=os.environ | {"NPROC": "2", "PJRT_NPROC": "2"},
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts the waits of one thread")

@@ -24,8 +24,11 @@ TESTS = (
 def run(without, *command):
     return subprocess.run(
         [sys.executable, *command],
-        cwd=ROOT, env=os.environ | {SWITCH: without}, capture_output=True, text=True,
-    )  # fmt: skip
+        cwd=ROOT,
+        env=os.environ | {SWITCH: without},
+        capture_output=True,
+        text=True,
+    )
 
 
 def test_the_same_tests_pass_by_public_names_alone():

@@ -54,8 +54,10 @@ def test_loops_in_kernels_use_them(kind):
 
     text = str(
         jax.jit(kernels.one_kernel(swing), compiler_options=kernels.OPTIONS)
-        .lower(x).compile().as_text()
-    )  # fmt: skip
+        .lower(x)
+        .compile()
+        .as_text()
+    )
     library = " sine(" in text or " cosine(" in text
     assert library == (kind == "float32")
     eps = float(np.finfo(kind).eps)

@@ -74,8 +74,10 @@ def test_an_old_jax_ends_the_import_with_one_error(tmp_path):
         (tmp_path / f"{name}.py").write_text("raise AttributeError('imported')\n")
     done = subprocess.run(
         [sys.executable, "-c", "import sorojax"],
-        env={"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}, capture_output=True, text=True,
-    )  # fmt: skip
+        env={"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1] == (
         "ImportError: sorojax: found jax 0.6.2, need jax 0.10.2 or newer. "

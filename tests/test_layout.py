@@ -80,9 +80,13 @@ def test_void_may_fold_and_changes_nothing():
         )
         left = fem.Fixed(mesh.nodes_where(body, lambda p: p[0] <= 0))
         made = fem.problem(
-            body, stuff, kinematics=fem.PlaneStrain(1.0), supports=(left,), loads=loads,
+            body,
+            stuff,
+            kinematics=fem.PlaneStrain(1.0),
+            supports=(left,),
+            loads=loads,
             formulation=fem.Displacement(),
-        )  # fmt: skip
+        )
         with silent():
             return made, fem.solve(made, steps=2)
 
@@ -107,12 +111,17 @@ def body(force=0.0, pressure=0.0):
     """A beam held at the left with an inlet in its middle and springs at its end."""
     air = design.void_pressure(GRID, jnp.zeros(72), pressure, name="air")
     return fem.problem(
-        GRID, design.interpolated_energy(RUBBER, jnp.ones(72)), kinematics=KINEMATICS,
+        GRID,
+        design.interpolated_energy(RUBBER, jnp.ones(72)),
+        kinematics=KINEMATICS,
         supports=(fem.Fixed(GRID.node_sets["left"]),),
-        loads=(fem.Force(TIP, [0.0, -force], name="push"), air,
-               fem.Foundation(END, 1e-3, name="out")),
+        loads=(
+            fem.Force(TIP, [0.0, -force], name="push"),
+            air,
+            fem.Foundation(END, 1e-3, name="out"),
+        ),
         formulation=fem.ConstantPressure(),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -120,9 +129,13 @@ def plans():
     plan = design.layout(GRID, radius=1.5, solid=np.arange(2), void=np.array([70]))
     basin = design.flood(GRID, HOLE[:1], threshold=0.3)
     seep = design.darcy(
-        GRID, body().space, KINEMATICS, sources=np.asarray(GRID.cells)[HOLE[0]],
-        drains=np.asarray(GRID.facet_sets["top"]).ravel(), depth=2.0,
-    )  # fmt: skip
+        GRID,
+        body().space,
+        KINEMATICS,
+        sources=np.asarray(GRID.cells)[HOLE[0]],
+        drains=np.asarray(GRID.facet_sets["top"]).ravel(),
+        depth=2.0,
+    )
     return plan, basin, seep
 
 
@@ -214,11 +227,13 @@ def test_a_pressure_in_void_is_that_on_the_walls_of_a_cavity():
     place = {n: k for k, n in enumerate(nodes)}
     end = jnp.array([place[n] for n in END.tolist()])
     alone = fem.problem(
-        small, RUBBER, kinematics=KINEMATICS,
+        small,
+        RUBBER,
+        kinematics=KINEMATICS,
         supports=(fem.Fixed(mesh.nodes_where(small, lambda p: p[0] <= 0)),),
         loads=(fem.Pressure(walls, 0.05, name="air"), fem.Foundation(end, 1e-3)),
         formulation=fem.ConstantPressure(),
-    )  # fmt: skip
+    )
     u = fem.solve(alone).displacement
     assert np.abs(u).max() > 0.05
     assert np.allclose(np.asarray(within)[nodes], u, atol=1e-6 * np.abs(u).max())
@@ -226,9 +241,12 @@ def test_a_pressure_in_void_is_that_on_the_walls_of_a_cavity():
 
 @pytest.mark.parametrize(
     ("element", "kinematics"),
-    [(mesh.Tri6(), fem.PlaneStrain(2.0)), (mesh.Quad4(), fem.Axisymmetric()),
-     (mesh.Hex8(), fem.Solid())],
-)  # fmt: skip
+    [
+        (mesh.Tri6(), fem.PlaneStrain(2.0)),
+        (mesh.Quad4(), fem.Axisymmetric()),
+        (mesh.Hex8(), fem.Solid()),
+    ],
+)
 def test_the_stiffness_of_a_pressure_in_void(element, kinematics):
     """Against differences of its force, in every kinematics."""
     if element.dim == 2:
@@ -238,9 +256,14 @@ def test_the_stiffness_of_a_pressure_in_void(element, kinematics):
     share = jnp.linspace(0.2, 1.0, grid.num_nodes)
     load = design.void_pressure(grid, share, 0.3, per="node", name="air")
     made = fem.problem(
-        grid, RUBBER, kinematics=kinematics, supports=(), loads=(load,), free=True,
+        grid,
+        RUBBER,
+        kinematics=kinematics,
+        supports=(),
+        loads=(load,),
+        free=True,
         formulation=fem.Displacement(),
-    )  # fmt: skip
+    )
     u = 0.1 * jnp.sin(3 * grid.points)
     way = jnp.cos(2 * grid.points)
     system, none = made.space.system, jnp.zeros(made.space.system.num_values)
@@ -275,9 +298,13 @@ def test_darcy_is_full_in_void_and_gone_behind_a_wall(plans):
     """In a thick wall the share falls exponentially, to a tenth within the depth."""
     strip = mesh.rectangle([0, 0], [40.0, 1.0], divisions=(160, 1), element=mesh.Quad4())
     seep = design.darcy(
-        strip, fem.space(strip), KINEMATICS, sources=strip.node_sets["left"], depth=2.0,
+        strip,
+        fem.space(strip),
+        KINEMATICS,
+        sources=strip.node_sets["left"],
+        depth=2.0,
         drains=strip.node_sets["right"],
-    )  # fmt: skip
+    )
     x = np.asarray(strip.points)[:, 0]
     middle = x[np.asarray(strip.cells)].mean(axis=1)
     share = np.asarray(seep(jnp.asarray(np.where(middle < 20, 0.0, 1.0))))
@@ -349,8 +376,9 @@ def test_one_constraint_by_its_multiplier_is_the_interior_point_answer(right):
     random = np.random.default_rng(1)
     p, q = (jnp.asarray(random.uniform(1e-3, 1.0, (2, 30))) for _ in range(2))
     one = jnp.ones(30)
-    task = Approximation(p, q.at[1].set(1e-3), -one, 2 * one, 0 * one, one,
-                         10 * jnp.array([right]), jnp.zeros(1))  # fmt: skip
+    task = Approximation(
+        p, q.at[1].set(1e-3), -one, 2 * one, 0 * one, one, 10 * jnp.array([right]), jnp.zeros(1)
+    )
     dual, interior = jax.jit(solve_dual)(task), jax.jit(solve_primal_dual)(task)
     # the interior point stays a little away from its bounds
     assert np.allclose(dual, interior, atol=1e-4)
@@ -369,9 +397,12 @@ def test_a_follower_starts_from_the_last_design_and_history_keeps_the_designs():
 
     with silent():
         found = design.minimise(
-            loss, jnp.full(72, 0.5), constraints=(lambda x: jnp.mean(plan(x)) - 0.5,), steps=4,
+            loss,
+            jnp.full(72, 0.5),
+            constraints=(lambda x: jnp.mean(plan(x)) - 0.5,),
+            steps=4,
             on_step=history,
-        )  # fmt: skip
+        )
     assert np.all(np.diff(found.history["objective"]) < 0)
     assert history.densities.shape == (2, 72) and history.steps == [1, 3]
     assert len(view.show(history).panels) == 2

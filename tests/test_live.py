@@ -135,9 +135,12 @@ os._exit(1)
 def test_a_viewer_ends_when_its_loop_dies(tmp_path):
     file = tmp_path / "seen.npz"
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT, str(file)], cwd=ROOT, capture_output=True, text=True,
+        [sys.executable, "-c", SCRIPT, str(file)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
         check=False,
-    )  # fmt: skip
+    )
     assert done.returncode == 1
     limit = time.monotonic() + 20.0
     slots = Path(done.stdout.strip())
@@ -156,9 +159,14 @@ def test_a_sink_that_cannot_start_is_named(tmp_path):
 @pytest.fixture(scope="module")
 def rig():
     rod = R.rod(
-        SE2(), R.constant("kappa_z"), R.circle(0.005),
-        length=0.06, young_modulus=1e5, poisson_ratio=0.49, density=1e3,
-    )  # fmt: skip
+        SE2(),
+        R.constant("kappa_z"),
+        R.circle(0.005),
+        length=0.06,
+        young_modulus=1e5,
+        poisson_ratio=0.49,
+        density=1e3,
+    )
     return view.rig(rod, around=6, stations=5)
 
 

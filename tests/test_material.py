@@ -23,8 +23,10 @@ def _cubic(first, second, a, b):
 def _cubic_of_gradient(F, a, b):
     return _cubic(
         material.kinematics.isochoric_first_invariant(F),
-        material.kinematics.isochoric_second_invariant(F), a, b,
-    )  # fmt: skip
+        material.kinematics.isochoric_second_invariant(F),
+        a,
+        b,
+    )
 
 
 ISOTROPIC = {
@@ -262,10 +264,16 @@ def along(rubber, F, H):
 @pytest.mark.parametrize(
     "stretches",
     [
-        (1, 1, 1), (1 + 1e-9, 1, 1 - 1e-9), (1.04, 1.0, 0.97), (2, 2**-0.5, 2**-0.5),
-        (0.5, 2**0.5, 2**0.5 + 1e-7), (3, 3, 1 / 9), (2.0, 1.2, 0.5), (5, 0.5, 0.4),
+        (1, 1, 1),
+        (1 + 1e-9, 1, 1 - 1e-9),
+        (1.04, 1.0, 0.97),
+        (2, 2**-0.5, 2**-0.5),
+        (0.5, 2**0.5, 2**0.5 + 1e-7),
+        (3, 3, 1 / 9),
+        (2.0, 1.2, 0.5),
+        (5, 0.5, 0.4),
     ],
-)  # fmt: skip
+)
 def test_ogden_is_smooth_where_stretches_coincide(stretches, getkey):
     # the exponents 2 and -2 are Mooney-Rivlin, which has no principal stretches
     ogden = material.Ogden((8e4, -2e4), (2.0, -2.0), K)
@@ -578,8 +586,13 @@ def test_data_in_other_units_or_quantities_are_refused(name):
     for other in (1e-6, -1e-6):
         with pytest.raises(ValueError, match="stress is .*, need Pa, .*MPa by 1e6"):
             material.fit_tensile(STRAIN, stress * other, **options)
-    stretches = (1 + STRAIN, 1 + np.append(0.0, STRAIN), np.linspace(1.1, 4, 9),
-                 np.linspace(0.6, 1.8, 9), np.linspace(0.5, 0.95, 9))  # fmt: skip
+    stretches = (
+        1 + STRAIN,
+        1 + np.append(0.0, STRAIN),
+        np.linspace(1.1, 4, 9),
+        np.linspace(0.6, 1.8, 9),
+        np.linspace(0.5, 0.95, 9),
+    )
     for stretch in stretches:
         with pytest.raises(ValueError, match="stress vanishes at a strain of .*Subtract 1"):
             material.fit_tensile(stretch, incompressible(rubber, stretch), **options)
@@ -645,7 +658,7 @@ BASE = ISOTROPIC["NeoHookean"]
             "divide percent",
         ),
     ],
-)  # fmt: skip
+)
 @pytest.mark.stress(16)
 def test_bad_numbers_name_the_remedy(call, message):
     with pytest.raises(ValueError, match=message):

@@ -74,7 +74,8 @@ def test_what_comes_with_the_root_has_no_derivative():
         return x[0] + total, done
 
     (value, slope), done = (
-        jax.value_and_grad(lambda s: at(s)[0])(jnp.asarray(2.0)), at(jnp.asarray(2.0))[1]
-    )  # fmt: skip
+        jax.value_and_grad(lambda s: at(s)[0])(jnp.asarray(2.0)),
+        at(jnp.asarray(2.0))[1],
+    )
     np.testing.assert_allclose([value, slope], [0.5 + 1.5, -0.25])
     assert bool(done)

@@ -176,9 +176,15 @@ def test_derivatives_of_compiled_lanes_are_those_of_a_loop(call, shared, own):
 @pytest.mark.stress(92)
 def test_a_mass_matrix_of_as_many_lanes_as_nodes_has_its_derivative():
     rod = R.rod(
-        SE2(), R.chebyshev(kappa_z=2), R.circle(6e-3), length=0.08, nodes=8,
-        young_modulus=1e6, poisson_ratio=0.3, density=2000.0,
-    )  # fmt: skip
+        SE2(),
+        R.chebyshev(kappa_z=2),
+        R.circle(6e-3),
+        length=0.08,
+        nodes=8,
+        young_modulus=1e6,
+        poisson_ratio=0.3,
+        density=2000.0,
+    )
     states = jnp.asarray(np.random.default_rng(0).normal(size=(8, 2)))
 
     def total(length):

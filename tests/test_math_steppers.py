@@ -31,11 +31,17 @@ def swing(t, y):
 @eqx.filter_jit
 def solve(solver, control, start=START, adjoint=None, field=swing, end=1.0):
     return dfx.diffeqsolve(
-        dfx.ODETerm(lambda t, y, args: field(t, y)), solver, 0.0, end, None, start,
-        stepsize_controller=control, saveat=dfx.SaveAt(ts=jnp.linspace(0.0, end, 5)),
+        dfx.ODETerm(lambda t, y, args: field(t, y)),
+        solver,
+        0.0,
+        end,
+        None,
+        start,
+        stepsize_controller=control,
+        saveat=dfx.SaveAt(ts=jnp.linspace(0.0, end, 5)),
         adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
         throw=False,
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -97,8 +103,14 @@ def test_semi_implicit_euler_keeps_energy_where_explicit_euler_gains():
     assert abs(float(end["q"] ** 2 + end["v"] ** 2) - 1) < 0.11
     assert (1 + 0.1**2) ** 10_000 > 1e40  # by explicit Euler
     with pytest.raises(ValueError, match="no leaf of the state"):
-        repeat(SemiImplicitEuler(), lambda t, y: -y, jnp.array(0.0), 1.0 * jnp.ones(2),
-               jnp.array(0.1), 1)  # fmt: skip
+        repeat(
+            SemiImplicitEuler(),
+            lambda t, y: -y,
+            jnp.array(0.0),
+            1.0 * jnp.ones(2),
+            jnp.array(0.1),
+            1,
+        )
 
 
 def test_tolerances_may_differ_between_components():
@@ -211,9 +223,14 @@ def _stored(q):
 def test_generalised_alpha_is_a_solver_of_diffrax(exact):
     def run(method):
         return dfx.diffeqsolve(
-            dfx.ODETerm(lambda t, y, args: swing(t, y)), method, 0.0, 1.0, 0.01, START,
+            dfx.ODETerm(lambda t, y, args: swing(t, y)),
+            method,
+            0.0,
+            1.0,
+            0.01,
+            START,
             throw=False,
-        )  # fmt: skip
+        )
 
     solution = run(GeneralisedAlpha())
     assert solution.result == dfx.RESULTS.successful

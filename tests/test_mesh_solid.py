@@ -21,8 +21,11 @@ def pneunet():
     return sdf.Rectangle([0, 0], [90, 18]) - cuts - (cells | sdf.Rectangle([3, 4], [87, 5.5]))
 
 
-DOMAINS = {"ring": (RING, 0.06, 0.75 * np.pi), "square": (SQUARE, 0.07, 4 - np.pi / 4),
-           "pneunet": (pneunet(), 0.75, 832.0)}  # fmt: skip
+DOMAINS = {
+    "ring": (RING, 0.06, 0.75 * np.pi),
+    "square": (SQUARE, 0.07, 4 - np.pi / 4),
+    "pneunet": (pneunet(), 0.75, 832.0),
+}
 
 
 @pytest.mark.parametrize("part", [1, 0.6, 0.5])

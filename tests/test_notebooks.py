@@ -98,5 +98,6 @@ def test_a_kernel_runs_a_notebook():
 
     book = nbformat.read(FOLDER / "estimator.ipynb", as_version=4)
     NotebookClient(book, timeout=300, resources={"metadata": {"path": str(ROOT)}}).execute()
-    assert "median of an update" in shown([dict(cell) for cell in book.cells
-                                           if cell.cell_type == "code"])  # fmt: skip
+    assert "median of an update" in shown(
+        [dict(cell) for cell in book.cells if cell.cell_type == "code"]
+    )

@@ -84,8 +84,12 @@ def test_wrong_calls_are_refused():
     with pytest.raises(ValueError, match="share between 0 and 1"):
         design.part(GRID, np.ones(256), volume=1.5)
     with pytest.raises(ValueError, match="need `whole`"):
-        design.part(GRID, disc(GRID, 0.3, [0, 0]), folds=(design.Mirror(0, 0.0),),
-                    domain=sdf.Circle([0, 0], 2.0))  # fmt: skip
+        design.part(
+            GRID,
+            disc(GRID, 0.3, [0, 0]),
+            folds=(design.Mirror(0, 0.0),),
+            domain=sdf.Circle([0, 0], 2.0),
+        )
     with pytest.raises(ValueError, match="shape \\(3,\\)"):
         design.part(GRID, np.ones(3))
     with pytest.raises(ValueError, match="thickness"):
@@ -104,10 +108,13 @@ def beam(cells):
         cells, lambda p: (p[0] > LENGTH - 1e-9) & (jnp.abs(p[1] - HEIGHT / 2) < 1 + 1e-9)
     )
     return fem.problem(
-        cells, RUBBER, kinematics=fem.PlaneStress(1.0), formulation=fem.Displacement(),
+        cells,
+        RUBBER,
+        kinematics=fem.PlaneStress(1.0),
+        formulation=fem.Displacement(),
         supports=(fem.Fixed(mesh.nodes_where(cells, lambda p: p[0] < 1e-9)),),
         loads=(fem.Force(end, [0.0, -1.0]),),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -123,10 +130,13 @@ def layout():
     volume = jax.jit(lambda x, b: jnp.mean(density(x, b)) - 0.5)
     with silent():
         found = design.minimise(
-            loss, jnp.full(300, 0.5), constraints=(volume,), steps=48,
+            loss,
+            jnp.full(300, 0.5),
+            constraints=(volume,),
+            steps=48,
             optimiser=design.MMA(0.0, 1.0, move=0.2),
             schedule=lambda k: (jnp.asarray(min(2.0 ** (k // 8), 32.0)),),
-        )  # fmt: skip
+        )
     return grid, np.asarray(density(found.design, 32.0)), float(found.objective)
 
 

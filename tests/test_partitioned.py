@@ -21,20 +21,32 @@ class Bladder(R.AbstractChamber):
 def finger():
     """A finger with its gas and its valve."""
     rod = R.rod(
-        SE2(), R.constant("kappa_z"), R.circle(5 * mm), length=80 * mm, young_modulus=1e6,
-        poisson_ratio=0.4, density=1100.0, nodes=6,
-    )  # fmt: skip
+        SE2(),
+        R.constant("kappa_z"),
+        R.circle(5 * mm),
+        length=80 * mm,
+        young_modulus=1e6,
+        poisson_ratio=0.4,
+        density=1100.0,
+        nodes=6,
+    )
     body = R.assembly(SE2(), finger=R.Part(rod))
     forces = (R.Gravity(), R.Damping(0.02), R.PartForce("finger", Bladder()))
     kinds = ("volume", "volume_rate", "compliance")
     return systems.Network(
-        {"body": systems.AssemblyBody(body, forces), "air": systems.Reservoir(),
-         "valve": systems.Regulator(4e-9, integral_gain=2e-8)},
-        {"air.mass_flow": "valve.mass_flow", "valve.pressure": "air.pressure",
-         "body.finger_pressure": "air.pressure"}
+        {
+            "body": systems.AssemblyBody(body, forces),
+            "air": systems.Reservoir(),
+            "valve": systems.Regulator(4e-9, integral_gain=2e-8),
+        },
+        {
+            "air.mass_flow": "valve.mass_flow",
+            "valve.pressure": "air.pressure",
+            "body.finger_pressure": "air.pressure",
+        }
         | {f"air.{kind}": f"body.finger_{kind}" for kind in kinds},
         ("valve.setpoint",),
-    )  # fmt: skip
+    )
 
 
 def test_it_moves_as_the_whole_network_does():

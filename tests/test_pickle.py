@@ -79,10 +79,12 @@ def beam(pull=1e3):
     cells = mesh.rectangle([0, 0], [2, 1], divisions=(2, 1))
     rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.4, density=1e3)
     return fem.problem(
-        cells, rubber, kinematics=fem.PlaneStrain(1.0),
+        cells,
+        rubber,
+        kinematics=fem.PlaneStrain(1.0),
         supports=(fem.Fixed(cells.node_sets["left"]),),
         loads=(fem.Traction(cells.facet_sets["right"], (pull, 0.0)),),
-    )  # fmt: skip
+    )
 
 
 def tip(problem):
@@ -95,8 +97,15 @@ def iterated(problem):
 
 
 def planar_rod():
-    return rod.rod(sj.SE2(), rod.chebyshev(kappa_z=2), rod.circle(5e-3), length=0.1,
-                   young_modulus=1e5, poisson_ratio=0.5, density=1e3)  # fmt: skip
+    return rod.rod(
+        sj.SE2(),
+        rod.chebyshev(kappa_z=2),
+        rod.circle(5e-3),
+        length=0.1,
+        young_modulus=1e5,
+        poisson_ratio=0.5,
+        density=1e3,
+    )
 
 
 def body():

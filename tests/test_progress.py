@@ -163,9 +163,15 @@ def test_meshing_tells_how_far_it_is():
 
 
 FINGER = rod.rod(
-    SE2(), rod.chebyshev(kappa_z=1), rod.circle(0.01), length=0.1, young_modulus=1e5,
-    poisson_ratio=0.4, density=1e3, nodes=4,
-)  # fmt: skip
+    SE2(),
+    rod.chebyshev(kappa_z=1),
+    rod.circle(0.01),
+    length=0.1,
+    young_modulus=1e5,
+    poisson_ratio=0.4,
+    density=1e3,
+    nodes=4,
+)
 
 
 def swing(q, progress):
@@ -210,9 +216,14 @@ def lag_to_one(pace):
 
 def batch(paces, progress):
     return systems.simulate_batch(
-        lag_to_one, paces, 1.0, inputs={"lag.a": 1.0}, save=3, cheap_steps=100,
+        lag_to_one,
+        paces,
+        1.0,
+        inputs={"lag.a": 1.0},
+        save=3,
+        cheap_steps=100,
         progress=progress,
-    )  # fmt: skip
+    )
 
 
 def test_a_batch_tells_its_mean_and_who_ran_again():
@@ -229,8 +240,9 @@ def test_a_batch_tells_its_mean_and_who_ran_again():
     assert jnp.array_equal(loud["lag.value"], quiet["lag.value"])
 
 
-@pytest.mark.parametrize("call", [lambda p: swing(jnp.ones(1), p), lambda p: batch(
-    jnp.array([0.1, 0.2]), p)])  # fmt: skip
+@pytest.mark.parametrize(
+    "call", [lambda p: swing(jnp.ones(1), p), lambda p: batch(jnp.array([0.1, 0.2]), p)]
+)
 def test_a_compiled_run_without_progress_has_no_callback(call):
     silent_one, loud = (str(jax.make_jaxpr(lambda p=p: call(p))()) for p in (False, True))
     assert "debug_callback" not in silent_one and "debug_callback" in loud

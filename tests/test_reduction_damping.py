@@ -8,9 +8,15 @@ from sorojax import SE2, reduction, rod as R
 from sorojax.math.ode.steppers import TripleJump
 
 BODY = R.rod(
-    SE2(), R.chebyshev(kappa_z=2, sigma_x=1), R.circle(6e-3), length=0.1,
-    young_modulus=1e5, poisson_ratio=0.3, density=1000.0, nodes=6,
-)  # fmt: skip
+    SE2(),
+    R.chebyshev(kappa_z=2, sigma_x=1),
+    R.circle(6e-3),
+    length=0.1,
+    young_modulus=1e5,
+    poisson_ratio=0.3,
+    density=1000.0,
+    nodes=6,
+)
 SHARES = np.array([[0.012, 0.004, 0.0], [0.004, 0.009, 0.0], [0.0, 0.0, 0.003]])
 SIZE = np.sqrt(np.diag(np.asarray(R.stiffness_matrix(BODY))))
 TRUE = SIZE[:, None] * SHARES * SIZE  # retardation times of the modes [s]
@@ -24,9 +30,7 @@ def forces(share):
 @pytest.fixture(scope="module")
 def swing():
     q = jnp.array([6.0, -4.0, 0.05])
-    return R.rollout(
-        BODY, q, 0 * q, forces(1.0), step=5e-4, saves=1000, stepper=TripleJump()
-    )  # fmt: skip
+    return R.rollout(BODY, q, 0 * q, forces(1.0), step=5e-4, saves=1000, stepper=TripleJump())
 
 
 @pytest.mark.parametrize("rates", [True, False])

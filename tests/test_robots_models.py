@@ -23,9 +23,13 @@ from sorojax_hardware import LocalBoard, SimulatedClock, run_loop, simulated
 RUBBER = robots.printed_rubber()
 CELL = Cell(
     stiffness=[[400.0, -1.5, 0.0], [-1.5, 0.016, 0.0], [0.0, 0.0, 0.004]],
-    push=[1.2e-4, 2e-7, 0.0], gas=1e-4, compliance=1e-9, solid=1e-4,
-    second_moments=[3e-9, 2e-9], center=[-1.5 * mm, 0.0],
-)  # fmt: skip
+    push=[1.2e-4, 2e-7, 0.0],
+    gas=1e-4,
+    compliance=1e-9,
+    solid=1e-4,
+    second_moments=[3e-9, 2e-9],
+    center=[-1.5 * mm, 0.0],
+)
 
 
 @pytest.fixture
@@ -41,9 +45,7 @@ def tube():
     air = LaidAlong(sdf.Cylinder(inner, 100 * mm), 0)
     body = LaidAlong(sdf.Cylinder(outer, 100 * mm), 0) - air
     rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45)
-    cell = robots.unit_cell(
-        body, air, (0.0, 6 * mm), rubber, size=1.5 * mm, mirrors=(1, 2)
-    )  # fmt: skip
+    cell = robots.unit_cell(body, air, (0.0, 6 * mm), rubber, size=1.5 * mm, mirrors=(1, 2))
     return rubber, cell, np.pi * (outer**2 - inner**2), np.pi * inner**2
 
 
@@ -78,8 +80,9 @@ def test_the_tube_at_large_strains_is_that_of_a_uniform_stretch(tube):
         return shear / 2 * (first - 3) + bulk / 2 * (J - 1) ** 2
 
     e = 0.1 * np.cos(np.linspace(0, np.pi, 13))
-    wide = np.array([minimize_scalar(functools.partial(energy, x), (0.9, 1.1), tol=1e-13).x
-                     for x in e])  # fmt: skip
+    wide = np.array(
+        [minimize_scalar(functools.partial(energy, x), (0.9, 1.1), tol=1e-13).x for x in e]
+    )
 
     def derivatives(values):
         fit = Polynomial.fit(e, values, 12)
@@ -96,8 +99,9 @@ def test_the_tube_at_large_strains_is_that_of_a_uniform_stretch(tube):
 def test_what_columns_store_beyond_linear_answers():
     """Force and volume of a rod of one column, from one energy."""
     third, fourth = [4e3, 5e-5, -2e-10, -2e-16], [2e4, 2e-4, -2e-10, 3e-16, -1e-21]
-    cell = eqx.tree_at(lambda c: (c.third, c.fourth), CELL,
-                       (jnp.array(third), jnp.array(fourth)))  # fmt: skip
+    cell = eqx.tree_at(
+        lambda c: (c.third, c.fourth), CELL, (jnp.array(third), jnp.array(fourth))
+    )
     one = side_by_side(cell, jnp.zeros((1, 2)), 0.08)
     made = body(SE2(), R.constant("sigma_x"), one, 0.08, RUBBER, damping=0.0, single=False)
     e, p = 0.02, 40 * kPa
@@ -216,9 +220,16 @@ def test_a_printed_actuator_behind_a_board():
     board = LocalBoard(limits, valves, clock)
     board.arm()
     ticks = list(
-        run_loop(board, clock, lambda t, p, s: (40 * kPa, s), None, duration=0.6, period=0.01,
-                 limits=board.board.settings.limits[0][:2])
-    )  # fmt: skip
+        run_loop(
+            board,
+            clock,
+            lambda t, p, s: (40 * kPa, s),
+            None,
+            duration=0.6,
+            period=0.01,
+            limits=board.board.settings.limits[0][:2],
+        )
+    )
     assert limits.limits[0][:2] == (-10 * kPa, 100 * kPa)
     pressure = np.array([tick.pressure[0] for tick in ticks])
     assert np.allclose(pressure[-10:], 40 * kPa, atol=5 * 80) and pressure[2] < 20 * kPa

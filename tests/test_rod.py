@@ -222,9 +222,15 @@ def test_jacobian_is_the_derivative_of_the_pose(general):
 def test_energy_is_conserved_without_damping():
     rod, g = planar(), jnp.array([0.0, -9.81])
     path = R.rollout(
-        rod, jnp.zeros(3), jnp.zeros(3), (R.Gravity(),),
-        step=2.5e-4, saves=20, every=200, stepper=DormandPrince(),
-    )  # fmt: skip
+        rod,
+        jnp.zeros(3),
+        jnp.zeros(3),
+        (R.Gravity(),),
+        step=2.5e-4,
+        saves=20,
+        every=200,
+        stepper=DormandPrince(),
+    )
     total = jax.vmap(lambda q, v: R.kinetic_energy(rod, q, v) + R.potential_energy(rod, q, g))(
         path.q, path.v
     )
@@ -244,9 +250,15 @@ def test_energy_is_conserved_without_damping():
 def test_steppers_reach_the_reference_motion(stepper, step, error):
     # The spatial finger of the reference bends in one plane.
     path = R.rollout(
-        planar(), jnp.zeros(3), jnp.zeros(3), (R.Gravity(), R.Damping(0.01)),
-        step=step, saves=5, every=round(0.1 / step), stepper=stepper,
-    )  # fmt: skip
+        planar(),
+        jnp.zeros(3),
+        jnp.zeros(3),
+        (R.Gravity(), R.Damping(0.01)),
+        step=step,
+        saves=5,
+        every=round(0.1 / step),
+        stepper=stepper,
+    )
     tip = R.tip_pose(planar(), path.q[-1])[:2, 2]
     reference = jnp.array([7.917524e-2, -1.071715e-2])
     assert path.status == Status.successful
@@ -258,9 +270,15 @@ def test_any_solver_of_diffrax_moves_the_rod():
     rod, rest = planar(), jnp.zeros(3)
     term = dfx.ODETerm(R.vector_field(rod, (R.Gravity(), R.Damping(0.01))))
     solution = dfx.diffeqsolve(
-        term, dfx.Tsit5(), 0.0, 0.5, 1e-4, (rest, rest), max_steps=100_000,
+        term,
+        dfx.Tsit5(),
+        0.0,
+        0.5,
+        1e-4,
+        (rest, rest),
+        max_steps=100_000,
         stepsize_controller=dfx.PIDController(rtol=1e-7, atol=1e-7),
-    )  # fmt: skip
+    )
     assert solution.ys is not None
     tip = R.tip_pose(rod, solution.ys[0][0])[:2, 2]
     assert jnp.linalg.norm(tip - jnp.array([7.917524e-2, -1.071715e-2])) < 1e-6 * 0.08

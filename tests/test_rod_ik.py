@@ -99,9 +99,12 @@ def test_limits_and_obstacles_hold_at_the_answer():
     @eqx.filter_jit
     def find(x, bound, distance):
         return R.inverse_kinematics(
-            FLAT, R.Position(x), limits=(-bound, bound),
-            obstacles=(R.ObstacleConstraint(ball, everywhere, distance),), forces=(),
-        )  # fmt: skip
+            FLAT,
+            R.Position(x),
+            limits=(-bound, bound),
+            obstacles=(R.ObstacleConstraint(ball, everywhere, distance),),
+            forces=(),
+        )
 
     goal = jnp.array([0.07, 0.02])
     found = find(goal, jnp.array(1e3), jnp.array(3e-3))
@@ -120,12 +123,20 @@ def test_an_answer_on_its_limits_has_the_least_energy_there():
     reach = jax.jit(lambda q: R.tip_pose(FLAT, q)[:2, 2] - goal)
     slope = jax.jit(jax.jacfwd(reach))
     least = minimize(
-        lambda q: 1e3 * q @ stiffness @ q, np.array([2.0, 2.9, -10.0, -12.0]), method="SLSQP",
-        jac=lambda q: 2e3 * stiffness @ q, bounds=list(zip(-bound, bound, strict=True)),
-        constraints=[{"type": "eq", "fun": lambda q: 1e2 * np.asarray(reach(q)),
-                      "jac": lambda q: 1e2 * np.asarray(slope(q))}],
+        lambda q: 1e3 * q @ stiffness @ q,
+        np.array([2.0, 2.9, -10.0, -12.0]),
+        method="SLSQP",
+        jac=lambda q: 2e3 * stiffness @ q,
+        bounds=list(zip(-bound, bound, strict=True)),
+        constraints=[
+            {
+                "type": "eq",
+                "fun": lambda q: 1e2 * np.asarray(reach(q)),
+                "jac": lambda q: 1e2 * np.asarray(slope(q)),
+            }
+        ],
         options={"ftol": 1e-15},
-    )  # fmt: skip
+    )
     find = jax.jit(
         lambda x: R.inverse_kinematics(FLAT, R.Position(x), limits=(-bound, bound), forces=())
     )
@@ -162,9 +173,15 @@ def test_answers_are_differentiable_and_batched():
 # The grasp of a jellyfish: six fingers of 120 mm from the rim of a palm, a ball of 40 mm
 # whose centre is 60 mm below.
 ARM = R.rod(
-    SE3(), R.chebyshev(kappa_y=3, kappa_z=3), R.rectangle(4e-3, 1e-3), length=0.12,
-    young_modulus=1e6, poisson_ratio=0.49, density=1070.0, nodes=10,
-)  # fmt: skip
+    SE3(),
+    R.chebyshev(kappa_y=3, kappa_z=3),
+    R.rectangle(4e-3, 1e-3),
+    length=0.12,
+    young_modulus=1e6,
+    poisson_ratio=0.49,
+    density=1070.0,
+    nodes=10,
+)
 
 
 def test_a_grasp_closes_from_rest_without_penetration():
@@ -173,11 +190,13 @@ def test_a_grasp_closes_from_rest_without_penetration():
     def mount(angle):
         """The frame of a finger that hangs from the rim, its x axis down."""
         turn = jnp.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
-        about = jnp.stack([
-            jnp.stack([jnp.cos(angle), -jnp.sin(angle), 0 * angle]),
-            jnp.stack([jnp.sin(angle), jnp.cos(angle), 0 * angle]),
-            jnp.array([0.0, 0.0, 1.0]),
-        ])  # fmt: skip
+        about = jnp.stack(
+            [
+                jnp.stack([jnp.cos(angle), -jnp.sin(angle), 0 * angle]),
+                jnp.stack([jnp.sin(angle), jnp.cos(angle), 0 * angle]),
+                jnp.array([0.0, 0.0, 1.0]),
+            ]
+        )
         return about @ turn, about @ jnp.array([0.045, 0.0, 0.0])
 
     def grasp(angle):

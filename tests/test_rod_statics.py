@@ -68,9 +68,15 @@ class Pin(R.AbstractForce):
 
 TURN = 1.2  # of the arch [rad]
 ARCH = R.rod(
-    SE2(), R.chebyshev(kappa_z=5), R.rectangle(1e-2, 1e-3), length=0.1, young_modulus=1e6,
-    poisson_ratio=0.4, density=1e3, rest_strain=[-TURN / 0.1, 1.0, 0.0],
-)  # fmt: skip
+    SE2(),
+    R.chebyshev(kappa_z=5),
+    R.rectangle(1e-2, 1e-3),
+    length=0.1,
+    young_modulus=1e6,
+    poisson_ratio=0.4,
+    density=1e3,
+    rest_strain=[-TURN / 0.1, 1.0, 0.0],
+)
 
 
 def press(factor):
@@ -84,9 +90,9 @@ def press(factor):
 def test_an_arch_snaps_through():
     path = R.arc_length_path(ARCH, press, first=0.1, steps=60, longest=1.5)
     assert jnp.all(path.status._value == Status.successful._value)
-    rest = jax.jit(jax.vmap(
-        lambda q, f: R.total_force(press(f), 0.0, R.motion(ARCH, q))
-    ))(path.q, path.factor)  # fmt: skip
+    rest = jax.jit(jax.vmap(lambda q, f: R.total_force(press(f), 0.0, R.motion(ARCH, q))))(
+        path.q, path.factor
+    )
     stiffness = R.stiffness_matrix(ARCH)
     assert jnp.abs(rest).max() < 1e-8 * jnp.abs(stiffness @ path.q[-1]).max()
     # It turns back at limit points, is unstable between, and stable on the other side.

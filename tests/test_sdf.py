@@ -85,9 +85,11 @@ def test_elongated_disc_is_a_rounded_rectangle_inside_too(getkey):
     p = jax.random.uniform(getkey(), (2000, 2), minval=-3, maxval=3)
     drawn = sdf.elongate(sdf.Circle([0, 0], 0.5), [3.0, 2.0])
     assert jnp.allclose(
-        evaluate(drawn, p), evaluate(sdf.Rectangle([-2, -1.5], [2, 1.5], 0.5), p),
-        rtol=0, atol=1e-14,
-    )  # fmt: skip
+        evaluate(drawn, p),
+        evaluate(sdf.Rectangle([-2, -1.5], [2, 1.5], 0.5), p),
+        rtol=0,
+        atol=1e-14,
+    )
 
 
 def test_text_has_the_area_and_the_holes_of_its_letters():

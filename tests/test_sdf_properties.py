@@ -17,34 +17,44 @@ point = st.tuples(number, number).map(list)
 LEAVES = st.one_of(
     st.builds(sdf.Circle, point, length),
     st.builds(lambda p, a, b: sdf.Rectangle(p, [p[0] + a, p[1] + b]), point, length, length),
-    st.builds(lambda p, r, n: sdf.translate(sdf.Star(r, r / 2, n), p), point, length,
-              st.integers(3, 6)),
-)  # fmt: skip
+    st.builds(
+        lambda p, r, n: sdf.translate(sdf.Star(r, r / 2, n), p),
+        point,
+        length,
+        st.integers(3, 6),
+    ),
+)
 
 
 def grow(parts):
     two = st.tuples(parts, parts)
     return st.one_of(
-        two.map(lambda s: s[0] | s[1]), two.map(lambda s: s[0] & s[1]),
+        two.map(lambda s: s[0] | s[1]),
+        two.map(lambda s: s[0] & s[1]),
         two.map(lambda s: s[0] - s[1]),
         st.builds(lambda s, k: sdf.SmoothUnion(*s, k, sdf.Cubic()), two, length),
         st.builds(lambda s, k: sdf.SmoothDifference(*s, k), two, length),
         st.builds(lambda s, k: sdf.SmoothUnion(*s, k, sdf.Chamfer()), two, length),
-        st.builds(sdf.rotate, parts, number, point), st.builds(sdf.offset, parts, length),
+        st.builds(sdf.rotate, parts, number, point),
+        st.builds(sdf.offset, parts, length),
         st.builds(lambda s, t: sdf.shell(s, t / 4), parts, length),
         st.builds(lambda s, a, b: sdf.stretch(s, [2 * a, 2 * b]), parts, length, length),
-        st.builds(sdf.scale, parts, length), st.builds(lambda s: sdf.mirror(s, [1, 2]), parts),
+        st.builds(sdf.scale, parts, length),
+        st.builds(lambda s: sdf.mirror(s, [1, 2]), parts),
         st.builds(lambda s: sdf.polar_repeat(s, 3), parts),
-    )  # fmt: skip
+    )
 
 
 TREES = st.recursive(LEAVES, grow, max_leaves=3)
 
 
 @settings(
-    max_examples=12, deadline=None, derandomize=True, database=None,
+    max_examples=12,
+    deadline=None,
+    derandomize=True,
+    database=None,
     suppress_health_check=list(HealthCheck),
-)  # fmt: skip
+)
 @given(TREES)
 def test_random_trees_keep_their_promises(shape):
     p = jnp.asarray(POINTS)
@@ -101,8 +111,9 @@ def test_curvature_and_frame_of_curved_bodies():
     r = jnp.linalg.norm(p, axis=1)
     assert jnp.allclose(sdf.curvature(ball, p), 1 / r)
     assert jnp.allclose(sdf.gaussian_curvature(ball, p), 1 / r**2)
-    assert jnp.allclose(sdf.curvature(sdf.Circle([0, 0], 0.5), p[:, :2]),
-                        1 / jnp.linalg.norm(p[:, :2], axis=1))  # fmt: skip
+    assert jnp.allclose(
+        sdf.curvature(sdf.Circle([0, 0], 0.5), p[:, :2]), 1 / jnp.linalg.norm(p[:, :2], axis=1)
+    )
     axes = sdf.frame(ball, p)
     assert jnp.allclose(axes @ axes.mT, jnp.eye(3)[None], atol=1e-14)
     assert jnp.allclose(jnp.linalg.det(axes), 1)
@@ -191,8 +202,9 @@ def test_mesh_by_its_tree_is_as_by_every_face():
     for held in (listed, eqx.tree_at(lambda m: m.vertices, listed, moved.vertices)):
         exact = plain(eqx.tree_at(lambda m: m.tree, held, mesh.tree), q)
         assert jnp.allclose(plain(held, q), exact, rtol=0, atol=1e-12)
-    loose = sdf.TriangleMesh(vertices[faces[:, ::-1]].reshape(-1, 3),
-                             np.arange(3 * len(faces)).reshape(-1, 3))  # fmt: skip
+    loose = sdf.TriangleMesh(
+        vertices[faces[:, ::-1]].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
+    )
     assert loose.tree is not None
     assert jnp.allclose(values(loose, p)[0], values(mesh, p)[0], rtol=0, atol=1e-12)
     assert sdf.TriangleMesh(vertices, faces[1:]).tree is None
@@ -246,7 +258,7 @@ def test_new_numbers_do_not_retrace():
         (lambda: sdf.text(" ", 1), "Write something"),
         (lambda: sdf.extrude(sdf.Sphere([0, 0, 0], 1), 1), "plane shape"),
     ],
-)  # fmt: skip
+)
 def test_bad_input_names_the_remedy(build, remedy):
     with pytest.raises(ValueError, match=remedy):
         build()

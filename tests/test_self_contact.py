@@ -80,7 +80,7 @@ def stacked(**options) -> fem.Problem:
             fem.Foundation(nodes["high.top"], jnp.array([0.0, 1e-3]), name="soft"),
         ),
         formulation=fem.Displacement(),
-    )  # fmt: skip
+    )
 
 
 def test_a_stack_of_blocks_passes_the_pressure_on():
@@ -188,9 +188,14 @@ def test_lists_follow_a_motion():
     touch = fem.SelfContact(facets["low.top"], facets["high.bottom"], reach=2 * mm)
     rubber = material.neo_hookean(young_modulus=YOUNG, poisson_ratio=0.0, density=1000.0)
     problem = fem.problem(
-        both, rubber, kinematics=fem.PlaneStrain(), loads=(touch,), free=True,
-        supports=(fem.Fixed(nodes["low.bottom"]),), formulation=fem.Displacement(),
-    )  # fmt: skip
+        both,
+        rubber,
+        kinematics=fem.PlaneStrain(),
+        loads=(touch,),
+        free=True,
+        supports=(fem.Fixed(nodes["low.bottom"]),),
+        formulation=fem.Displacement(),
+    )
     u, v = np.zeros(both.points.shape), np.zeros(both.points.shape)
     v[nodes["high"]] = [1.5, -0.3]
 

@@ -185,9 +185,15 @@ def test_a_camera_that_is_gone_for_two_seconds_does_not_hold_up_the_loop(swing):
         return pressure
 
     ticks = run_loop(
-        MemoryBoard(clock, 1), clock, lambda t, p, s: (0.0, s), None,
-        duration=160 * PERIOD, period=PERIOD, limits=(0, 1), measure=measure,
-    )  # fmt: skip
+        MemoryBoard(clock, 1),
+        clock,
+        lambda t, p, s: (0.0, s),
+        None,
+        duration=160 * PERIOD,
+        period=PERIOD,
+        limits=(0, 1),
+        measure=measure,
+    )
     seen_by(camera, latest, 1, seen(swing.q[60]))
     for k, tick in enumerate(ticks, start=1):
         assert tick.late < 1e-9

@@ -35,9 +35,12 @@ def mapped(shape):
     first = (9 * np.arange(4)[:, None] + np.arange(8)[None]).ravel()
     cells = np.stack([first, first + 9, first + 10, first + 1], axis=1)
     return mesh.Mesh(
-        points, cells, mesh.Quad4(), {"corners": np.array([0, 8, 36, 40, 44])},
+        points,
+        cells,
+        mesh.Quad4(),
+        {"corners": np.array([0, 8, 36, 40, 44])},
         {"boundary": mesh.boundary_facets(mesh.Mesh(points, cells, mesh.Quad4()))},
-    )  # fmt: skip
+    )
 
 
 def pulled(cells):
@@ -45,11 +48,16 @@ def pulled(cells):
     feet = [mesh.nodes_where(cells, lambda p, i=i: p[i] < 1e-9) for i in (0, 1)]
     sides = [mesh.facets_where(cells, lambda p, i=i: p[i] > 1 - 1e-9) for i in (0, 1)]
     return fem.problem(
-        cells, STUFF, kinematics=fem.PlaneStress(1.0), formulation=fem.Displacement(),
+        cells,
+        STUFF,
+        kinematics=fem.PlaneStress(1.0),
+        formulation=fem.Displacement(),
         supports=tuple(fem.Fixed(n, components=(i,)) for i, n in enumerate(feet)),
-        loads=(fem.Traction(sides[0], [1e-4, 0.0], name="right"),
-               fem.Traction(sides[1], [0.0, 1e-4], name="top")),
-    )  # fmt: skip
+        loads=(
+            fem.Traction(sides[0], [1e-4, 0.0], name="right"),
+            fem.Traction(sides[1], [0.0, 1e-4], name="top"),
+        ),
+    )
 
 
 RIGHT, TOP = np.arange(36, 41), np.arange(40, 45)  # nodes of the outer sides
@@ -68,9 +76,11 @@ def opening(_, p):
 
 START = {"a": jnp.asarray(0.42), "b": jnp.asarray(0.25)}
 LOOP = dict(
-    mesher=mapped, constraints=(opening,), optimiser=design.MMA(0.15, 0.6, move=0.1),
+    mesher=mapped,
+    constraints=(opening,),
+    optimiser=design.MMA(0.15, 0.6, move=0.1),
     tolerance=2e-3,
-)  # fmt: skip
+)
 
 
 @pytest.fixture(scope="module")
@@ -103,9 +113,15 @@ def test_stopped_in_the_middle_and_read_from_a_file_it_goes_on_alike(whole, tmp_
     half = io.load(tmp_path / "step.npz", half)
     with silent():
         rest = design.minimise_shape(
-            yielding, START, plate, pulled, steps=14, resume=half,
-            scale=float(found.history["objective"][0]), **LOOP,
-        )  # fmt: skip
+            yielding,
+            START,
+            plate,
+            pulled,
+            steps=14,
+            resume=half,
+            scale=float(found.history["objective"][0]),
+            **LOOP,
+        )
     assert rest.num_meshes == found.num_meshes
     for name in ("a", "b"):
         assert rest.design[name] == found.design[name]
@@ -115,10 +131,15 @@ def test_any_optax_optimiser_drives_a_drawing():
     """To a wanted yielding by one dimension."""
     with silent():
         found = design.minimise_shape(
-            lambda problem, p: (yielding(problem, p) - 2.4) ** 2, {"a": jnp.asarray(0.35)},
-            lambda p: plate({"a": p["a"], "b": p["a"]}), pulled, mesher=mapped,
-            optimiser=optax.sgd(0.01), steps=25, tolerance=1e-5,
-        )  # fmt: skip
+            lambda problem, p: (yielding(problem, p) - 2.4) ** 2,
+            {"a": jnp.asarray(0.35)},
+            lambda p: plate({"a": p["a"], "b": p["a"]}),
+            pulled,
+            mesher=mapped,
+            optimiser=optax.sgd(0.01),
+            steps=25,
+            tolerance=1e-5,
+        )
     assert found.optimised.status == Status.successful and float(found.objective) < 1e-7
 
 
@@ -126,9 +147,15 @@ def test_any_optax_optimiser_drives_a_drawing():
 def test_unstructured_meshes_are_built_anew_on_the_way(whole):
     with silent():
         found = design.minimise_shape(
-            yielding_by_energy, START, plate, pulled, size=0.25, order=1, steps=14,
+            yielding_by_energy,
+            START,
+            plate,
+            pulled,
+            size=0.25,
+            order=1,
+            steps=14,
             **{name: value for name, value in LOOP.items() if name != "mesher"},
-        )  # fmt: skip
+        )
     assert found.num_meshes > 1
     assert found.design["a"] == pytest.approx(0.3, abs=6e-3)
     assert float(found.objective) == pytest.approx(float(whole[0].objective), rel=0.02)
@@ -224,9 +251,13 @@ def tracking(p):
 @eqx.filter_jit
 def _run(body):
     pid = S.PID(
-        0.3, 0.3, start_measurement=0.0, filter_time=0.5, measurement_unit="m",
+        0.3,
+        0.3,
+        start_measurement=0.0,
+        filter_time=0.5,
+        measurement_unit="m",
         reference=S.Constant(1.0),
-    )  # fmt: skip
+    )
     loop = S.Network(
         {"body": body, "pid": pid},
         {"pid.measurement": "body.tip", "body.pressure": "pid.command"},

@@ -21,9 +21,15 @@ from sorojax_hardware.protocols import Image
 
 LAW = sj.contact.LinePenalty(stiffness=1e8, smoothing=5e-6)
 BEAM = rod.rod(
-    sj.SE2(), rod.chebyshev(kappa_z=2), rod.circle(5 * mm), length=80 * mm,
-    young_modulus=0.6e6, poisson_ratio=0.45, density=1080.0, nodes=4,
-)  # fmt: skip
+    sj.SE2(),
+    rod.chebyshev(kappa_z=2),
+    rod.circle(5 * mm),
+    length=80 * mm,
+    young_modulus=0.6e6,
+    poisson_ratio=0.45,
+    density=1080.0,
+    nodes=4,
+)
 
 
 def test_poses_of_what_hangs():
@@ -72,15 +78,23 @@ def test_a_rod_behind_a_simulated_board_keeps_its_states():
         return rod.Damping(0.02), chamber
 
     board, valves = simulated_board(
-        *robots.rod_stepper(BEAM, loads, lag=0.03), (-20 * kPa, 60 * kPa), keep=True,
-        noise=0.0, resolution=0.0,
-    )  # fmt: skip
+        *robots.rod_stepper(BEAM, loads, lag=0.03),
+        (-20 * kPa, 60 * kPa),
+        keep=True,
+        noise=0.0,
+        resolution=0.0,
+    )
     assert isinstance(board.clock, SimulatedClock) and board.num_ports == 1
     board.write_pressure(np.array([10 * kPa]))
     ticks = run_loop(
-        board, board.clock, lambda t, p, _: (10 * kPa, None), None, duration=0.1, period=0.01,
+        board,
+        board.clock,
+        lambda t, p, _: (10 * kPa, None),
+        None,
+        duration=0.1,
+        period=0.01,
         limits=(-20 * kPa, 60 * kPa),
-    )  # fmt: skip
+    )
     assert len(list(ticks)) == 10
     states = valves.states or []
     pressures = np.array([float(state.pressure[0]) for state in states])
@@ -166,8 +180,9 @@ def test_forces_on_the_backs_of_bellows():
 
 @pytest.mark.parametrize("chamber", ["darcy", "flood"])
 def test_a_cell_from_variables_is_that_from_their_densities(chamber):
-    cell = design.pneunet_cell(divisions=(5, 10), radius=4 * mm, wall=3 * mm, base=3 * mm,
-                               chamber=chamber)  # fmt: skip
+    cell = design.pneunet_cell(
+        divisions=(5, 10), radius=4 * mm, wall=3 * mm, base=3 * mm, chamber=chamber
+    )
     sharpness = jnp.asarray(4.0)
     one = body_of(cell, cell.start, sharpness)
     other = body(cell, cell.plan(cell.start, sharpness))

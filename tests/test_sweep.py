@@ -160,10 +160,13 @@ def test_dask_survives_killed_workers_a_killed_driver_and_a_damaged_file(tmp_pat
         script = tmp_path / "driver.py"
         script.write_text(DRIVER.format(folder=str(tmp_path), deadly=deadly))
         return subprocess.run(
-            [sys.executable, str(script)], cwd=ROOT, capture_output=True, text=True,
+            [sys.executable, str(script)],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
             timeout=200,
             env={**os.environ, "PYTHONPATH": str(ROOT), "SWEEP_DELAY": "0.2"},
-        )  # fmt: skip
+        )
 
     done = drive(True)
     assert done.returncode == -signal.SIGKILL and "killed" in done.stdout, done.stderr[-2000:]

@@ -73,9 +73,14 @@ class Breath(S.AbstractBlock):
 def make_body(**options):
     basis = R.chebyshev(kappa_z=2)
     rod = R.rod(
-        SE2(), basis, R.rectangle(25e-3, 20e-3),
-        length=0.117, young_modulus=2e5, poisson_ratio=0.49, density=1070.0,
-    )  # fmt: skip
+        SE2(),
+        basis,
+        R.rectangle(25e-3, 20e-3),
+        length=0.117,
+        young_modulus=2e5,
+        poisson_ratio=0.49,
+        density=1070.0,
+    )
     chamber = Bellows(1.5e-5, [2e-7, 5e-8])
     return S.RodBody(rod, (chamber, R.Gravity(), R.Damping(0.02)), **options)
 
@@ -115,9 +120,11 @@ def test_gas_sealed_behind_yielding_walls_keeps_absolute_pressure_times_volume()
     body = make_body()
     rigid = body.forces[0]
     walls = StretchyBellows(rigid, 2e-10)
-    body = S.RodBody(body.rod, (walls, *body.forces[1:]), q=jnp.array([20.0, 5.0, 0.0])[
-        : body.rod.basis.num_dof
-    ])  # fmt: skip
+    body = S.RodBody(
+        body.rod,
+        (walls, *body.forces[1:]),
+        q=jnp.array([20.0, 5.0, 0.0])[: body.rod.basis.num_dof],
+    )
     ports = ("volume", "volume_rate", "compliance")
     wires = {f"air.{port}": f"body.{port}" for port in ports} | {
         "body.pressure": "air.pressure"
@@ -264,9 +271,14 @@ def test_one_controller_runs_wired_and_sampled(loop):
 
 def test_a_spatial_body_swings_like_its_rollout():
     rod = R.rod(
-        SE3(), R.chebyshev(kappa_y=1), R.circle(6e-3),
-        length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2000.0,
-    )  # fmt: skip
+        SE3(),
+        R.chebyshev(kappa_y=1),
+        R.circle(6e-3),
+        length=0.08,
+        young_modulus=1e6,
+        poisson_ratio=0.3,
+        density=2000.0,
+    )
     forces = (R.Gravity(), R.Damping(0.01))
     film = S.simulate(S.Network({"body": S.RodBody(rod, forces)}, {}), 0.1, save=3, rtol=1e-8)
     path = R.rollout(rod, jnp.zeros(1), jnp.zeros(1), forces, step=2e-4, saves=2, every=250)

@@ -116,9 +116,15 @@ def test_sensors_repeat_their_noise_and_have_the_stated_spread():
 def fingers(count):
     def one(length):
         body = R.rod(
-            SE2(), R.chebyshev(kappa_z=2), R.circle(6e-3), length=length,
-            young_modulus=1e6, poisson_ratio=0.4, density=1100.0, nodes=4,
-        )  # fmt: skip
+            SE2(),
+            R.chebyshev(kappa_z=2),
+            R.circle(6e-3),
+            length=length,
+            young_modulus=1e6,
+            poisson_ratio=0.4,
+            density=1100.0,
+            nodes=4,
+        )
         return S.RodBody(body, (R.Gravity(), R.Damping(0.02)), driven=True)
 
     return [one(0.07 + 0.01 * k) for k in range(count)]
@@ -140,10 +146,13 @@ def test_a_stack_equals_its_blocks_and_is_traced_once():
     assert stacked.outputs["tip_position"] == S.Output("m", (3, 2))
     network = S.Network({"f": stacked}, {})
     sizes = [
-        len(jax.make_jaxpr(lambda x, n=n: n.vector_field(0.0, x, {"effort": 0 * x["v"]}))(
-            n.initial_state()).eqns)
+        len(
+            jax.make_jaxpr(lambda x, n=n: n.vector_field(0.0, x, {"effort": 0 * x["v"]}))(
+                n.initial_state()
+            ).eqns
+        )
         for n in (S.stack(blocks[:2]), stacked)
-    ]  # fmt: skip
+    ]
     assert sizes[0] == sizes[1] and network.inputs == {}
     with pytest.raises(ValueError, match="2 structures"):
         S.stack([blocks[0], S.Reservoir()])
@@ -221,9 +230,15 @@ def test_a_ball_comes_to_rest_on_a_floor():
 # Controllers that know the model
 
 REST = R.rod(
-    SE2(), R.chebyshev(kappa_z=3), R.circle(6e-3), length=0.1,
-    young_modulus=2e5, poisson_ratio=0.4, density=1100.0, nodes=6,
-)  # fmt: skip
+    SE2(),
+    R.chebyshev(kappa_z=3),
+    R.circle(6e-3),
+    length=0.1,
+    young_modulus=2e5,
+    poisson_ratio=0.4,
+    density=1100.0,
+    nodes=6,
+)
 FORCES = (R.Gravity(), R.Damping(0.02))
 GOAL = S.Constant([4.0, -2.0, 1.0])
 STEADY = S.Constant([0.09, 0.02])

@@ -26,20 +26,29 @@ WIRES = {
 def tube_problem(modulus):
     rubber = material.neo_hookean(young_modulus=modulus, poisson_ratio=0.45, density=1000.0)
     return fem.problem(
-        GRID, rubber, kinematics=fem.Axisymmetric(), space=SPACE,
-        supports=(fem.Fixed(GRID.node_sets["bottom"], (1,)),
-                  fem.Fixed(GRID.node_sets["top"], (1,))),
+        GRID,
+        rubber,
+        kinematics=fem.Axisymmetric(),
+        space=SPACE,
+        supports=(
+            fem.Fixed(GRID.node_sets["bottom"], (1,)),
+            fem.Fixed(GRID.node_sets["top"], (1,)),
+        ),
         loads=(fem.Pressure(GRID.facet_sets["left"]),),
-    )  # fmt: skip
+    )
 
 
 def tube(modulus=1e6, damping=0.0, speed=0.0):
     """A length of a rubber tube between two plates, four cells, that breathes at `speed`."""
     corner = mesh.nearest_node(GRID, (8e-3, 0.0))
     return S.FemBody(
-        tube_problem(modulus), fem.Rayleigh(damping), markers={"skin": corner},
-        u=jnp.zeros_like(GRID.points), v=speed * _breathing(), energies=True,
-    )  # fmt: skip
+        tube_problem(modulus),
+        fem.Rayleigh(damping),
+        markers={"skin": corner},
+        u=jnp.zeros_like(GRID.points),
+        v=speed * _breathing(),
+        energies=True,
+    )
 
 
 @functools.cache
@@ -222,9 +231,12 @@ def test_the_tendon_of_a_reduced_body_does_not_push():
     pulled = fem.Tendon(fem.route(GRID, np.array([[5e-3, 2e-3], [8e-3, 2e-3]])))
     held = (fem.Fixed(GRID.node_sets["bottom"], (1,)),)
     problem = fem.problem(
-        GRID, tube_problem(1e6).material, kinematics=fem.Axisymmetric(), supports=held,
+        GRID,
+        tube_problem(1e6).material,
+        kinematics=fem.Axisymmetric(),
+        supports=held,
         loads=(pulled,),
-    )  # fmt: skip
+    )
     body = S.FemBody(problem, driven=("tendon",))
     small = S.modal_body(body, S.modal_basis(body, 1, bending=False), order=1)
     rest = small.initial_state()
@@ -244,10 +256,12 @@ def bellows():
     cells = mesh.triangulate(actuator.body(), size=2e-3, order=2)
     rubber = material.NeoHookean(4e5, 4e6, density=1080.0)
     problem = fem.problem(
-        cells, rubber, kinematics=fem.PlaneStrain(20e-3),
+        cells,
+        rubber,
+        kinematics=fem.PlaneStrain(20e-3),
         supports=(fem.Fixed(mesh.nodes_where(cells, lambda p: p[0] < 1e-9)),),
         loads=(fem.Pressure(mesh.facets_on(cells, actuator.chambers()), name="air"),),
-    )  # fmt: skip
+    )
     tip = mesh.nearest_node(cells, (float(actuator.length), 0.0))
     return S.FemBody(problem, fem.Rayleigh(5.0, 1e-3), markers={"tip": tip})
 

@@ -26,9 +26,15 @@ NOMINAL = jnp.array([-2e4, 2e5, 0.12])  # gain [Pa/rad], modulus [Pa], length [m
 def loop(parameters):
     gain, modulus, length = parameters
     body = R.rod(
-        SE2(), R.chebyshev(kappa_z=2), R.rectangle(25e-3, 12e-3), length=length,
-        young_modulus=modulus, poisson_ratio=0.49, density=1070.0, nodes=4,
-    )  # fmt: skip
+        SE2(),
+        R.chebyshev(kappa_z=2),
+        R.rectangle(25e-3, 12e-3),
+        length=length,
+        young_modulus=modulus,
+        poisson_ratio=0.49,
+        density=1070.0,
+        nodes=4,
+    )
     chamber = R.thread_chambers(body, R.Straight((4e-3,)), 1e-4)
     blocks = {
         "body": S.RodBody(body, (chamber, R.Gravity(), R.Damping(0.01))),
@@ -102,18 +108,25 @@ def test_the_duffing_attractor_has_its_period(gamma, periods):
 
 def test_the_attractor_is_chaotic_between_the_windows():
     every, rounds = 2 * np.pi / 1.2, 200
-    film = S.simulate(S.Network({"d": Duffing(0.5)}, {}), every * rounds, save=rounds + 1,
-                      rtol=1e-9, atol=1e-11)  # fmt: skip
+    film = S.simulate(
+        S.Network({"d": Duffing(0.5)}, {}),
+        every * rounds,
+        save=rounds + 1,
+        rtol=1e-9,
+        atol=1e-11,
+    )
     seen = np.asarray(film["d.x"])[-60:]
     assert all(np.abs(seen[k:] - seen[:-k]).max() > 0.1 for k in range(1, 11))
     assert np.abs(film["d.x"]).max() < 2.0 and seen.min() < 0 < seen.max()
 
 
 def test_dense_output_is_the_motion_between_the_saved_instants():
-    film = S.simulate(S.Network({"d": Duffing(0.2)}, {}), 5.0, save=2, dense=True,
-                      max_steps=400, rtol=1e-8)  # fmt: skip
-    fine = S.simulate(S.Network({"d": Duffing(0.2)}, {}), 5.0, save=6, rtol=1e-10,
-                      adjoint=dfx.ForwardMode())  # fmt: skip
+    film = S.simulate(
+        S.Network({"d": Duffing(0.2)}, {}), 5.0, save=2, dense=True, max_steps=400, rtol=1e-8
+    )
+    fine = S.simulate(
+        S.Network({"d": Duffing(0.2)}, {}), 5.0, save=6, rtol=1e-10, adjoint=dfx.ForwardMode()
+    )
     for k in (1, 3):
         there = S.state_at(film, fine.time[k])["d"]["q"]
         assert jnp.isclose(there, fine["d.x"][k], rtol=0, atol=1e-6)

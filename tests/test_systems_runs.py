@@ -80,8 +80,9 @@ BOUNCE = S.Event("ball.height", bounce, rising=False)
 
 @pytest.fixture(scope="module")
 def bounced():
-    return S.simulate(S.Network({"ball": Ball()}, {}), 1.2, save=25, events=(BOUNCE,),
-                      max_events=4)  # fmt: skip
+    return S.simulate(
+        S.Network({"ball": Ball()}, {}), 1.2, save=25, events=(BOUNCE,), max_events=4
+    )
 
 
 # Events
@@ -104,8 +105,14 @@ def test_a_ball_bounces_when_and_how_it_should(bounced):
 def test_a_terminating_event_holds_the_state_and_has_the_exact_gradient():
     def landing(height):
         network = S.Network({"ball": Ball(height)}, {})
-        film = S.simulate(network, 1.0, save=3, events=(S.Event("ball.height"),),
-                          max_events=1, adjoint=dfx.ForwardMode())  # fmt: skip
+        film = S.simulate(
+            network,
+            1.0,
+            save=3,
+            events=(S.Event("ball.height"),),
+            max_events=1,
+            adjoint=dfx.ForwardMode(),
+        )
         return film.stats["reached"], film
 
     slope, film = jax.jacfwd(landing, has_aux=True)(jnp.array(1.0))
@@ -238,8 +245,9 @@ def test_controllers_run_at_their_own_rates():
 
 @pytest.mark.stress(50)
 def test_no_tick_is_lost_in_a_long_run():
-    film = S.simulate_sampled(PLANT, RATES[:1], 20.0, period=1e-3, substeps=1,
-                              inputs={"fast.push": 0.0})  # fmt: skip
+    film = S.simulate_sampled(
+        PLANT, RATES[:1], 20.0, period=1e-3, substeps=1, inputs={"fast.push": 0.0}
+    )
     assert film["slow.push"][-1] == 4001 and jnp.isclose(film.time[-1], 20.0, rtol=1e-15)
 
 
@@ -357,9 +365,12 @@ def run(script, **environment):
     flags = os.environ.get("XLA_FLAGS", "")
     extra = environment.pop("XLA_FLAGS", "")
     done = subprocess.run(
-        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True,
+        [sys.executable, "-c", script],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
         env={**os.environ, "XLA_FLAGS": f"{flags} {extra}".strip()},
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stderr[-3000:]
 
 

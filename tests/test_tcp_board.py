@@ -90,10 +90,17 @@ def test_the_loop_runs_over_the_wire_and_leaves_a_record(patient_desk, tmp_path)
         with tick_recorder(tmp_path / "run.log", 2, who="test") as record:
             ticks = list(
                 run_loop(
-                    board, WallClock(), lambda t, p, s: (30 * kPa, s + 1), 0, duration=0.4,
-                    period=0.005, limits=(0.0, 60 * kPa), slew=1e6, record=record,
+                    board,
+                    WallClock(),
+                    lambda t, p, s: (30 * kPa, s + 1),
+                    0,
+                    duration=0.4,
+                    period=0.005,
+                    limits=(0.0, 60 * kPa),
+                    slew=1e6,
+                    record=record,
                 )
-            )  # fmt: skip
+            )
         assert board.report.state is State.VENTED  # the loop vents
     columns, about = load_record(tmp_path / "run.log")
     assert about == {"who": "test"} and len(columns["time"]) == len(ticks)
@@ -290,8 +297,18 @@ def test_a_loop_that_is_too_late_gives_up():
         return 0.0, state
 
     with pytest.raises(Overrun, match="overran 4 others"):
-        list(run_loop(board, clock, slow, None, duration=1.0, period=0.011, limits=(0, 1),
-                      max_skipped=3))  # fmt: skip
+        list(
+            run_loop(
+                board,
+                clock,
+                slow,
+                None,
+                duration=1.0,
+                period=0.011,
+                limits=(0, 1),
+                max_skipped=3,
+            )
+        )
     assert np.all(board.setpoint == 0)
     with pytest.raises(ValueError, match="slew"):
         run_loop(board, clock, slow, None, duration=1, period=1, limits=(0, 1), slew=0.0)
@@ -367,9 +384,13 @@ def test_every_number_of_the_configuration_has_a_range(tmp_path, key):
 @pytest.mark.parametrize(
     ("told", "names"),
     [
-        ([], "the file is []"), ({}, "no `ports`"), ({"ports": {}}, "`ports` is {}"),
-        ({"ports": []}, "`ports` has 0"), ({"ports": PORTS * 33}, "`ports` has 33"),
-        ({"ports": [3]}, "`ports[0]` is 3"), ({"ports": [{"low": 0}]}, "no `high`"),
+        ([], "the file is []"),
+        ({}, "no `ports`"),
+        ({"ports": {}}, "`ports` is {}"),
+        ({"ports": []}, "`ports` has 0"),
+        ({"ports": PORTS * 33}, "`ports` has 33"),
+        ({"ports": [3]}, "`ports[0]` is 3"),
+        ({"ports": [{"low": 0}]}, "no `high`"),
         ({"ports": PORTS, "rump": 1}, "unknown key `rump`"),
         ({"ports": PORTS, "wiring": [{"bus": 1, "pin": 2}]}, "unknown key `pin`"),
         ({"ports": PORTS * 2, "wiring": [WIRE]}, "`wiring` has 1 entries"),
@@ -377,7 +398,7 @@ def test_every_number_of_the_configuration_has_a_range(tmp_path, key):
         ({"ports": PORTS * 2, "wiring": [WIRE, WIRE | {"dac": 97}]}, "`wiring[1].adc`"),
         ({"ports": PORTS, "plausible": 3}, "`plausible` is 3"),
     ],
-)  # fmt: skip
+)
 def test_another_configuration_is_named(tmp_path, told, names):
     config = tmp_path / "board.json"
     config.write_text(json.dumps(told))
@@ -401,8 +422,10 @@ def test_the_program_serves_and_ends_on_request():
     path = ":".join(filter(None, sys.path))
     child = subprocess.Popen(
         [sys.executable, "-m", "sorojax_board", "--port", "0"],
-        stdout=subprocess.PIPE, text=True, env={"PYTHONPATH": path},
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        text=True,
+        env={"PYTHONPATH": path},
+    )
     try:
         line = child.stdout.readline()  # type: ignore
         with TcpBoard(port=int(line.rsplit(":", 1)[1]), timeout=5.0) as board:
@@ -423,8 +446,9 @@ def test_the_board_needs_nothing_but_python():
     )
     run = subprocess.run(
         [sys.executable, "-I", "-c", f"import sys; sys.path.insert(0, {str(root)!r})\n{code}"],
-        capture_output=True, text=True,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+    )
     assert run.stdout.strip() == "[]", run.stderr
 
 

@@ -31,9 +31,15 @@ def beam():
 def rod():
     basis = R.chebyshev(kappa_z=2)
     return R.rod(
-        SE2(), basis, R.rectangle(0.01, 0.02),
-        length=LENGTH, young_modulus=1e5, poisson_ratio=0.49, density=1e3, nodes=24,
-    )  # fmt: skip
+        SE2(),
+        basis,
+        R.rectangle(0.01, 0.02),
+        length=LENGTH,
+        young_modulus=1e5,
+        poisson_ratio=0.49,
+        density=1e3,
+        nodes=24,
+    )
 
 
 @functools.cache
@@ -65,8 +71,9 @@ def bend(mesh, kappa):
     """Displacement of a straight body along x bent to a constant curvature."""
     x, y = np.asarray(mesh.points).T
     angle = kappa * x
-    moved = np.stack([(1 / kappa - y) * np.sin(angle),
-                      1 / kappa - (1 / kappa - y) * np.cos(angle)], axis=1)  # fmt: skip
+    moved = np.stack(
+        [(1 / kappa - y) * np.sin(angle), 1 / kappa - (1 / kappa - y) * np.cos(angle)], axis=1
+    )
     return moved - np.asarray(mesh.points)
 
 
@@ -74,11 +81,12 @@ def bend(mesh, kappa):
 def path(beam):
     facets = M.facets_where(beam, lambda p: jnp.abs(p[0] - LENGTH) < 1e-9)
     problem = fem.problem(
-        beam, material.neo_hookean(young_modulus=1e5, poisson_ratio=0.4),
+        beam,
+        material.neo_hookean(young_modulus=1e5, poisson_ratio=0.4),
         kinematics=fem.PlaneStrain(0.02),
         supports=(fem.Fixed(M.nodes_where(beam, lambda p: p[0] < 1e-9)),),
         loads=(fem.Traction(facets, [0.0, 0.0], name="pull"),),
-    )  # fmt: skip
+    )
     states = jnp.asarray(np.stack([0 * bend(beam, 1.0)] + [bend(beam, k) for k in (5.0, 15.0)]))
     values = jnp.array([0.0, 1.0, 2.0])
     return Path(problem, states, values, "pull", Status.successful, ())
@@ -227,14 +235,17 @@ def test_the_report_is_one_file(film):
         "A <robot>",
         [
             view.Section("Motion", "One & two.\n\nThree.", [("film", film[0]), ("x", figure)]),
-            view.Section("Numbers", numbers=[
-                view.Number("error", 1.23456e-7, "m", "< 1 mm", True),
-                view.Number("gradient", 0.5, "-", "< 0.1", False),
-                view.Number("cells", 2545),
-            ]),
+            view.Section(
+                "Numbers",
+                numbers=[
+                    view.Number("error", 1.23456e-7, "m", "< 1 mm", True),
+                    view.Number("gradient", 0.5, "-", "< 0.1", False),
+                    view.Number("cells", 2545),
+                ],
+            ),
         ],
         lead="By <one> command.",
-    )  # fmt: skip
+    )
     assert "A &lt;robot&gt;" in html and "By &lt;one&gt;" in html and "<robot>" not in html
     assert not re.search(r"(src|href)\s*=\s*[\"'](?!data:|#)", html)
     assert "http" not in html and "url(" not in html and "<script" not in html

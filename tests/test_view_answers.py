@@ -65,9 +65,11 @@ def test_a_solid_robot_is_clear_around_its_air():
 def test_buckling_is_drawn_on_the_body():
     mesh = M.rectangle([0.0, 0.0], [0.005, 0.06], divisions=(1, 12), order=2)
     problem = fem.problem(
-        mesh, material.neo_hookean(young_modulus=1e5, poisson_ratio=0.4),
-        kinematics=fem.PlaneStrain(0.02), supports=(fem.Fixed(mesh.node_sets["bottom"]),),
-    )  # fmt: skip
+        mesh,
+        material.neo_hookean(young_modulus=1e5, poisson_ratio=0.4),
+        kinematics=fem.PlaneStrain(0.02),
+        supports=(fem.Fixed(mesh.node_sets["bottom"]),),
+    )
     y = mesh.points[:, 1] / 0.06
     first = jnp.stack([y**2, 0 * y], axis=1)
     second = jnp.stack([jnp.sin(3 * y), 0 * y], axis=1)
@@ -86,8 +88,16 @@ def test_buckling_is_drawn_on_the_body():
 
 
 def test_answers_of_rods_are_posed():
-    arm = R.rod(sj.SE2(), R.chebyshev(kappa_z=2), R.circle(0.005), length=0.1,
-                young_modulus=1e5, poisson_ratio=0.4, density=1e3, nodes=6)  # fmt: skip
+    arm = R.rod(
+        sj.SE2(),
+        R.chebyshev(kappa_z=2),
+        R.circle(0.005),
+        length=0.1,
+        young_modulus=1e5,
+        poisson_ratio=0.4,
+        density=1e3,
+        nodes=6,
+    )
     q = jnp.array([8.0, 0.0])
     found = IKResult(q, Status.successful, jnp.array(2e-6), jnp.array(0.0), jnp.array(4))
     shown = view.show(found, model=arm)
@@ -100,8 +110,16 @@ def test_answers_of_rods_are_posed():
 
 
 def test_a_rig_a_part_and_a_fit_are_shown():
-    arm = R.rod(sj.SE3(), R.chebyshev(kappa_y=1), R.circle(0.008), length=0.1,
-                young_modulus=1e5, poisson_ratio=0.4, density=1e3, nodes=6)  # fmt: skip
+    arm = R.rod(
+        sj.SE3(),
+        R.chebyshev(kappa_y=1),
+        R.circle(0.008),
+        length=0.1,
+        young_modulus=1e5,
+        poisson_ratio=0.4,
+        density=1e3,
+        nodes=6,
+    )
     rig = view.rig(arm, around=8, stations=9)
     shown = view.show(rig, jnp.array([9.0]), view="front", renderer="own")
     tip = np.asarray(R.forward_kinematics(arm, jnp.array([9.0]), [0.97]))[0, :3, 3]
@@ -122,13 +140,27 @@ def test_records_stand_beside_their_predictions():
     from sorojax.design.calibration.calibration import Calibration, Check
 
     line, off = np.linspace(0, 1, 5), np.array([0.1, -0.1, np.nan, 0.1, -0.1])
-    checks = [Check(name, line, off, rms, 0.05 * np.ones(5)) for name, rms in
-              (("pull", 1.1), ("push", 0.9))]  # fmt: skip
+    checks = [
+        Check(name, line, off, rms, 0.05 * np.ones(5))
+        for name, rms in (("pull", 1.1), ("push", 0.9))
+    ]
     none = np.zeros(0)
     found = Calibration(
-        {"E": jnp.array(1e5)}, Status.successful, np.eye(1), 4.0, 3, ("E",), none > 0, none > 0,
-        none, np.zeros((0, 1)), (checks[0],), (checks[1],), {}, None,
-    )  # fmt: skip
+        {"E": jnp.array(1e5)},
+        Status.successful,
+        np.eye(1),
+        4.0,
+        3,
+        ("E",),
+        none > 0,
+        none > 0,
+        none,
+        np.zeros((0, 1)),
+        (checks[0],),
+        (checks[1],),
+        {},
+        None,
+    )
     shown = view.show(found)
     assert is_whole(shown) and "pull: 1.1 of the noise" in words(shown)
     assert "push, held out: 0.9" in words(shown)

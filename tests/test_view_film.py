@@ -17,7 +17,7 @@ from sorojax import (
     sdf,
     systems,
     view,
-)  # fmt: skip
+)
 from sorojax.cli.main import main
 from sorojax.fem.equilibrium.solve import Path
 from sorojax.fem.stability.modal import Modes
@@ -38,25 +38,32 @@ def beam():
 @pytest.fixture(scope="module")
 def path(beam):
     problem = fem.problem(
-        beam, material.neo_hookean(young_modulus=1e5, poisson_ratio=0.3, density=1e3),
+        beam,
+        material.neo_hookean(young_modulus=1e5, poisson_ratio=0.3, density=1e3),
         kinematics=fem.PlaneStrain(0.02),
         supports=(fem.Fixed(M.nodes_where(beam, lambda p: p[0] < 1e-9)),),
         loads=(fem.Gravity([0.0, -9.81]),),
         formulation=fem.Displacement(),
-    )  # fmt: skip
+    )
     x = np.asarray(beam.points)[:, 0]
     shapes = [np.stack([0 * x, -k * 0.005 * (x / LENGTH) ** 2], axis=1) for k in range(5)]
     pulls = jnp.zeros((5, 2)).at[:, 1].set(-9.81 * jnp.arange(5.0) / 4)
-    return Path(problem, jnp.asarray(np.stack(shapes)), pulls, "gravity",
-                    Status.successful, ())  # fmt: skip
+    return Path(problem, jnp.asarray(np.stack(shapes)), pulls, "gravity", Status.successful, ())
 
 
 def triangle_at(place, dim=3):
     """A triangle whose corner is at x = place."""
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]])
     points[:, 0] += place
-    return view.Scene((Surface(points[:, :3] if dim == 3 else points[:, [0, 2]],
-                               np.array([[0, 1, 2]]), "#0072B2"),))  # fmt: skip
+    return view.Scene(
+        (
+            Surface(
+                points[:, :3] if dim == 3 else points[:, [0, 2]],
+                np.array([[0, 1, 2]]),
+                "#0072B2",
+            ),
+        )
+    )
 
 
 def track(dim=3, count=11, last=1.0):
@@ -81,8 +88,9 @@ def test_a_film_moves_and_stands_still_where_nothing_does(dim):
     frames = [film.draw(k) for k in (0, 5, 10)]
     assert frames[0].shape == (240, 320, 3) and frames[0].dtype == np.uint8
     places = [middle(frame) for frame in frames]
-    assert places[1] - places[0] > 40 and np.isclose(places[2] - places[1],
-                                                     places[1] - places[0], atol=3)  # fmt: skip
+    assert places[1] - places[0] > 40 and np.isclose(
+        places[2] - places[1], places[1] - places[0], atol=3
+    )
     changed = np.any(frames[0] != frames[2], axis=2)
     assert 0.01 < changed.mean() < 0.5
     assert np.array_equal(film.draw(5), frames[1])  # whatever was drawn before
@@ -105,8 +113,9 @@ def test_slow_motion_and_stamp():
 def test_two_results_side_by_side_at_the_same_instants(dim):
     wide = {"size": (400, 200), "view": "front", "renderer": "own"}
     slower = view.Track(np.linspace(0, 1, 3), lambda k: triangle_at(1.0 * k, dim))
-    film = view.animate(track(dim), beside=slower, names=("measured", "simulated"), fps=10,
-                        **wide)  # fmt: skip
+    film = view.animate(
+        track(dim), beside=slower, names=("measured", "simulated"), fps=10, **wide
+    )
     frame = blue(film.draw(10))
     halves = (frame[:, :200], frame[:, 200:]) if dim == 3 else (frame[:100], frame[100:])
     assert all(half.sum() > 50 for half in halves)
@@ -117,8 +126,9 @@ def test_two_results_side_by_side_at_the_same_instants(dim):
 
 def test_a_camera_that_moves():
     still = view.Track(np.linspace(0, 1, 5), lambda k: triangle_at(0.0))
-    film = view.animate(still, view=view.orbit("front", turns=0.25), fps=4, renderer="own",
-                        size=(160, 120))  # fmt: skip
+    film = view.animate(
+        still, view=view.orbit("front", turns=0.25), fps=4, renderer="own", size=(160, 120)
+    )
     widths = [np.flatnonzero(blue(film.draw(k)).any(axis=0)).size for k in (0, 2)]
     edge = np.flatnonzero(np.any(film.draw(4) < 200, axis=(0, 2))).size
     assert widths[0] > widths[1] and edge < film.draw(4).shape[1]
@@ -134,18 +144,31 @@ def test_a_path_without_time_takes_three_seconds(path):
 
 
 def test_a_rod_and_a_mode_and_moved_nodes_are_filmed(beam, path):
-    arm = R.rod(SE3(), R.chebyshev(kappa_y=1), R.circle(0.008), length=0.12,
-                young_modulus=1e5, poisson_ratio=0.4, density=1e3)  # fmt: skip
-    run = Rollout(jnp.linspace(0, 1, 5), jnp.linspace(0, 10, 5)[:, None], jnp.zeros((5, 1)),
-                    Status.successful)  # fmt: skip
+    arm = R.rod(
+        SE3(),
+        R.chebyshev(kappa_y=1),
+        R.circle(0.008),
+        length=0.12,
+        young_modulus=1e5,
+        poisson_ratio=0.4,
+        density=1e3,
+    )
+    run = Rollout(
+        jnp.linspace(0, 1, 5),
+        jnp.linspace(0, 10, 5)[:, None],
+        jnp.zeros((5, 1)),
+        Status.successful,
+    )
     film = view.animate(run, model=arm, fps=4, renderer="own", view="front", size=(200, 150))
-    low = [np.flatnonzero(np.any(film.draw(k)[20:, 60:] < 200, axis=(1, 2))).max()
-           for k in (0, 4)]  # fmt: skip
+    low = [
+        np.flatnonzero(np.any(film.draw(k)[20:, 60:] < 200, axis=(1, 2))).max() for k in (0, 4)
+    ]
     assert film.frames == 5 and low[0] != low[1]
     with pytest.raises(ValueError, match="Pass model="):
         view.animate(run)
-    modes = Modes(path.problem, 0 * path.displacements[0], jnp.array([400.0]),
-                      path.displacements[-1:])  # fmt: skip
+    modes = Modes(
+        path.problem, 0 * path.displacements[0], jnp.array([400.0]), path.displacements[-1:]
+    )
     swing = view.animate(modes, fps=8, size=(200, 150))
     assert swing.frames == 17 and not np.array_equal(swing.draw(2), swing.draw(6))
     moved = np.asarray(beam.points)[None] + np.asarray(path.displacements)
@@ -234,8 +257,15 @@ def swung(rod, qs):
 @pytest.mark.parametrize("drawn", ["mesh", "shape"])
 def test_a_trajectory_carries_a_skin(beam, drawn):
     """The skin starts where the rod does, lies along it, and bends to its curvature."""
-    rod = R.rod(SE2(), R.chebyshev(kappa_z=1), R.rectangle(0.01, 0.02), length=LENGTH,
-                young_modulus=1e5, poisson_ratio=0.4, density=1e3)  # fmt: skip
+    rod = R.rod(
+        SE2(),
+        R.chebyshev(kappa_z=1),
+        R.rectangle(0.01, 0.02),
+        length=LENGTH,
+        young_modulus=1e5,
+        poisson_ratio=0.4,
+        density=1e3,
+    )
     kappa = np.pi / 2 / LENGTH
     network, film = swung(rod, [[0.0], [kappa / 2], [kappa]])
     skin = beam if drawn == "mesh" else sdf.Rectangle([0.0, -0.005], [LENGTH, 0.005])
@@ -245,8 +275,9 @@ def test_a_trajectory_carries_a_skin(beam, drawn):
     assert np.allclose(first, rest, rtol=0, atol=1e-12)
     x, y = rest.T
     angle = kappa * x
-    arc = np.stack([(1 / kappa - y) * np.sin(angle), 1 / kappa - (1 / kappa - y) *
-                    np.cos(angle)], axis=1)  # fmt: skip
+    arc = np.stack(
+        [(1 / kappa - y) * np.sin(angle), 1 / kappa - (1 / kappa - y) * np.cos(angle)], axis=1
+    )
     assert np.allclose(last, arc, rtol=0, atol=1e-4 * LENGTH)
     shown = view.animate(film, network=network, skin=skin, fps=2, size=(200, 150))
     assert shown.frames == 3
@@ -254,8 +285,15 @@ def test_a_trajectory_carries_a_skin(beam, drawn):
 
 
 def test_a_trajectory_needs_to_know_what_moved(beam):
-    rod = R.rod(SE2(), R.chebyshev(kappa_z=1), R.rectangle(0.01, 0.02), length=LENGTH,
-                young_modulus=1e5, poisson_ratio=0.4, density=1e3)  # fmt: skip
+    rod = R.rod(
+        SE2(),
+        R.chebyshev(kappa_z=1),
+        R.rectangle(0.01, 0.02),
+        length=LENGTH,
+        young_modulus=1e5,
+        poisson_ratio=0.4,
+        density=1e3,
+    )
     network, film = swung(rod, [[0.0], [1.0]])
     with pytest.raises(ValueError, match="Pass network="):
         view.animate(film)

@@ -53,9 +53,12 @@ def test_torques_springs_and_rigid_parts_are_drawn(dim):
         beam(dim), lambda p: (p[-1] < -0.005 + 1e-9) if dim == 2 else p[-1] < 1e-9
     )
     problem = loaded(
-        dim, fem.Torque(tip(dim), 2e-3, axis), fem.Spring(tip(dim)[:1], ground, 40.0),
-        fem.Foundation(bed, 5.0), fem.rigid(beam(dim), tip(dim)),
-    )  # fmt: skip
+        dim,
+        fem.Torque(tip(dim), 2e-3, axis),
+        fem.Spring(tip(dim)[:1], ground, 40.0),
+        fem.Foundation(bed, 5.0),
+        fem.rigid(beam(dim), tip(dim)),
+    )
     picture = view.show(problem, **({} if dim == 2 else {"view": "front", "renderer": "own"}))
     assert is_whole(picture)
     for name in ("torque: 0.002 N m", "spring: 40 N/m", "foundation: 5 N/m", "rigid"):
@@ -103,21 +106,31 @@ def test_a_cavity_in_a_solid_is_seen_through_it():
     used, cells = np.unique(np.asarray(box.cells)[~hollow], return_inverse=True)
     body = M.Mesh(np.asarray(box.points)[used], cells.reshape(-1, 8), box.element)
     inside = M.facets_where(
-        body, lambda p: jnp.all(jnp.abs(p - jnp.array([0.03, 0.015, 0.015])) < 0.0139)
-        | (jnp.abs(p[0] - 0.03) < 0.021) & (jnp.abs(p[1:] - 0.015).max() < 0.0051),
-    )  # fmt: skip
+        body,
+        lambda p: (
+            jnp.all(jnp.abs(p - jnp.array([0.03, 0.015, 0.015])) < 0.0139)
+            | (jnp.abs(p[0] - 0.03) < 0.021) & (jnp.abs(p[1:] - 0.015).max() < 0.0051)
+        ),
+    )
     problem = fem.problem(
-        body, RUBBER, supports=(fem.Fixed(M.nodes_where(body, lambda p: p[0] < 1e-9)),),
+        body,
+        RUBBER,
+        supports=(fem.Fixed(M.nodes_where(body, lambda p: p[0] < 1e-9)),),
         loads=(fem.Pressure(inside, 2e4, name="air"),),
-    )  # fmt: skip
+    )
     picture = show_problem(problem, renderer="own")
     assert "under pressure" in words(picture) and "air: 20 kPa" in words(picture)
     red, green, blue = np.moveaxis(pixels(picture), 2, 0)
     assert np.sum((red > green + 15) & (green >= blue - 5)) > 500  # the wall, seen through
     closed = CavitySolution(
-        problem, 0 * body.points, jnp.array([2e4]), jnp.array([3e-6]), ("air",),
-        Status.successful, None,
-    )  # fmt: skip
+        problem,
+        0 * body.points,
+        jnp.array([2e4]),
+        jnp.array([3e-6]),
+        ("air",),
+        Status.successful,
+        None,
+    )
     assert "air: 20 kPa" in words(view.show(closed, field=None, renderer="own"))
     assert repr(closed).splitlines()[1] == "  air: 2e+04 Pa in 3e-06 m^3"
 
@@ -133,8 +146,15 @@ def test_moved_supports_are_told_from_held_ones():
 def test_volumes_of_a_cavity_name_the_states_of_a_path():
     problem = loaded(2, fem.Pressure(M.boundary_facets(beam(2)), 1e3, name="air"))
     shapes = jnp.stack([0 * beam(2).points, 0.05 * beam(2).points])
-    path = VolumePath(problem, shapes, jnp.array([1e-5, 2e-5]), jnp.array([1e3, 3e3]),
-                          "air", Status.successful, ())  # fmt: skip
+    path = VolumePath(
+        problem,
+        shapes,
+        jnp.array([1e-5, 2e-5]),
+        jnp.array([1e3, 3e3]),
+        "air",
+        Status.successful,
+        (),
+    )
     picture = view.show(path, field=None)
     assert "10 ml at 1 kPa" in words(picture) and "20 ml at 3 kPa" in words(picture)
     assert track_of(path, field=None).unit == "ml"
@@ -184,8 +204,11 @@ def test_a_follower_turns_with_its_section():
 
 def test_wrenches_find_the_part_that_they_name(arm):
     offset = homogeneous(jnp.eye(3), jnp.array([0.03, 0.0, 0.0]))
-    hand = R.assembly(SE3(), palm=R.Part(R.Link(0.05, [2e-5, 2e-5, 3e-5])),
-                      finger=R.Part(arm, on="palm", offset=offset))  # fmt: skip
+    hand = R.assembly(
+        SE3(),
+        palm=R.Part(R.Link(0.05, [2e-5, 2e-5, 3e-5])),
+        finger=R.Part(arm, on="palm", offset=offset),
+    )
     wrench = R.PartForce("finger", R.TipWrench([0.0, 0.0, 0.0, 0.0, 0.3, 0.0]))
     scene = rod_scene(hand, forces=(wrench,))
     (arrow,) = [part for part in scene.parts if isinstance(part, Arrows)]

@@ -83,17 +83,22 @@ def problem_of(mesh):
     pull = jnp.zeros(dim).at[-1].set(-300.0)
     place = [0.03, 0.0] if dim == 2 else [0.03, 0.01, -0.02]
     return fem.problem(
-        mesh, material.neo_hookean(young_modulus=1e5, poisson_ratio=0.4, density=1e3),
+        mesh,
+        material.neo_hookean(young_modulus=1e5, poisson_ratio=0.4, density=1e3),
         kinematics=fem.PlaneStrain(0.02) if dim == 2 else None,
         supports=(fem.Fixed(M.nodes_where(mesh, lambda p: p[0] < 1e-9)),),
         loads=(
-            fem.Traction(tip, pull, name="pull"), fem.Gravity(0.03 * pull),
-            fem.Tendon(fem.route(mesh, [[0.01, *[0.001] * (dim - 1)],
-                                        [0.05, *[0.001] * (dim - 1)]]), 2.0),
-            fem.Contact(roof, sdf.Circle([0.03, 0.012], 0.004) if dim == 2
-                        else sdf.Sphere(place, 0.015)),
+            fem.Traction(tip, pull, name="pull"),
+            fem.Gravity(0.03 * pull),
+            fem.Tendon(
+                fem.route(mesh, [[0.01, *[0.001] * (dim - 1)], [0.05, *[0.001] * (dim - 1)]]),
+                2.0,
+            ),
+            fem.Contact(
+                roof, sdf.Circle([0.03, 0.012], 0.004) if dim == 2 else sdf.Sphere(place, 0.015)
+            ),
         ),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -163,8 +168,12 @@ def test_triangles_cover_the_cells_of_a_plane_mesh(kind):
         mesh = M.rectangle([0, 0], [2, 1], divisions=(3, 2), order=1 if kind == "Tri3" else 2)
         mesh = M.enrich(mesh) if kind == "Tri7" else mesh
     else:
-        mesh = M.rectangle([0, 0], [2, 1], divisions=(3, 2), element={"Quad4": M.Quad4,
-                           "Quad8": M.Quad8, "Quad9": M.Quad9}[kind]())  # fmt: skip
+        mesh = M.rectangle(
+            [0, 0],
+            [2, 1],
+            divisions=(3, 2),
+            element={"Quad4": M.Quad4, "Quad8": M.Quad8, "Quad9": M.Quad9}[kind](),
+        )
     seen, points = shell(mesh), np.asarray(mesh.points)
     a, b, c = (points[seen.triangles[:, k]] for k in range(3))
     area = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
@@ -172,8 +181,9 @@ def test_triangles_cover_the_cells_of_a_plane_mesh(kind):
     per_cell = np.bincount(seen.cells, area, minlength=mesh.num_cells)
     assert np.allclose(per_cell, M.cell_areas(mesh), rtol=1e-12)
     # every side of a cell is drawn: their length is that of the boundary once, inside twice
-    sides = np.concatenate([seen.triangles[seen.wire[:, k]][:, [k, (k + 1) % 3]]
-                            for k in range(3)])  # fmt: skip
+    sides = np.concatenate(
+        [seen.triangles[seen.wire[:, k]][:, [k, (k + 1) % 3]] for k in range(3)]
+    )
     length = np.linalg.norm(points[sides[:, 0]] - points[sides[:, 1]], axis=1).sum()
     rim = outline(mesh)
     around = np.linalg.norm(points[rim[:, 0]] - points[rim[:, 1]], axis=1).sum()
@@ -189,8 +199,12 @@ def test_the_shell_of_a_solid_mesh_faces_out(element):
     if element == "Hex8":
         mesh = M.box([0, 0, 0], [1, 1, 1], divisions=(2, 1, 1))
     else:
-        mesh = M.box([0, 0, 0], [1, 1, 1], divisions=(2, 1, 1), element=M.Tet10()
-                     if element != "Tet4" else M.Tet4())  # fmt: skip
+        mesh = M.box(
+            [0, 0, 0],
+            [1, 1, 1],
+            divisions=(2, 1, 1),
+            element=M.Tet10() if element != "Tet4" else M.Tet4(),
+        )
         mesh = M.enrich(mesh) if element == "Tet15" else mesh
     assert mesh.element.name == element
     seen, points = shell(mesh), np.asarray(mesh.points)
@@ -206,17 +220,29 @@ def test_the_shell_of_a_solid_mesh_faces_out(element):
 def test_a_mesh_tells_its_sets(by, dim, beam, block):
     mesh = beam if dim == 2 else block
     right = M.cells_where(mesh, lambda p: p[0] > LENGTH / 2)
-    mesh = M.Mesh(mesh.points, mesh.cells, mesh.element, mesh.node_sets, mesh.facet_sets,
-                  {"front half": right})  # fmt: skip
+    mesh = M.Mesh(
+        mesh.points,
+        mesh.cells,
+        mesh.element,
+        mesh.node_sets,
+        mesh.facet_sets,
+        {"front half": right},
+    )
     picture = view.show(mesh, by=by, renderer="own") if dim == 3 else view.show(mesh, by=by)
     assert is_whole(picture)
     names = {"quality": "best", "region": "front half", "facets": "left", "nodes": "left"}
     assert names[by] in words(picture)
     if by == "region":
         image = pixels(picture)
-        half, rest = (p.astype(int) for p in picture.pixels(
-            [[0.046, *([0.0013] if dim == 2 else [0.0, 0.013])],
-             [0.016, *([0.0013] if dim == 2 else [0.0, 0.013])]]))  # fmt: skip
+        half, rest = (
+            p.astype(int)
+            for p in picture.pixels(
+                [
+                    [0.046, *([0.0013] if dim == 2 else [0.0, 0.013])],
+                    [0.016, *([0.0013] if dim == 2 else [0.0, 0.013])],
+                ]
+            )
+        )
         blue = image[half[1], half[0]]
         assert blue[2] - blue[0] > 40 > abs(np.ptp(image[rest[1], rest[0]]))
 
@@ -253,8 +279,7 @@ def test_a_solution_is_coloured_where_it_is(dim, plane, solid):
     places = low if dim == 2 else [[x, 0.0, z] for x, z in low]
     none, most = (image[y, x] for x, y in picture.pixels(places).astype(int))
     assert none[2] > none[1] and most[0] > 150 and most[2] < 90  # purple to yellow
-    without = view.show(found, **options, rest=False,
-                        **({} if dim == 2 else {"view": "front"}))  # fmt: skip
+    without = view.show(found, **options, rest=False, **({} if dim == 2 else {"view": "front"}))
     bare = pixels(without)
     corner = [[0.05, 0.005]] if dim == 2 else [[0.05, 0.0, 0.02]]
     assert patch(picture, image, corner).min() < 200
@@ -272,7 +297,10 @@ def test_fields_have_names_units_and_limits(plane):
     with pytest.raises(ValueError, match="need one of von_mises"):
         view.show(found, field="colour")
     assert (short(12500.0, "Pa"), short(0.0, "Pa"), short(2e6, "Pa")) == (
-        "12.5 kPa", "0 kPa", "2 MPa")  # fmt: skip
+        "12.5 kPa",
+        "0 kPa",
+        "2 MPa",
+    )
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -287,8 +315,9 @@ def test_states_of_a_path_share_one_scale(dim, plane, solid):
         assert name in words(picture)
     image = pixels(picture)
     middle = [0.055, -0.25 * LENGTH] if dim == 2 else [0.055, 0.0, -0.22 * LENGTH]
-    drawn = [image[y, x] for k in range(3)
-             for x, y in picture.pixels([middle], panel=k).astype(int)]  # fmt: skip
+    drawn = [
+        image[y, x] for k in range(3) for x, y in picture.pixels([middle], panel=k).astype(int)
+    ]
     assert drawn[0].min() > 200 and drawn[2].min() < 120  # only the last reaches there
     assert len(view.show(path, field=None, states=[-1]).panels) == 1
     with pytest.raises(ValueError, match="states 0 to 2"):
@@ -300,8 +329,12 @@ def test_states_of_a_path_share_one_scale(dim, plane, solid):
 def test_modes_have_their_frequencies(dim, plane, solid):
     problem = plane if dim == 2 else solid
     shape = bent(problem.mesh, 1.0)
-    modes = Modes(problem, 0 * shape, jnp.array([400.0, 900.0]) * np.pi**2,
-                      jnp.stack([shape, shape[:, ::-1]]))  # fmt: skip
+    modes = Modes(
+        problem,
+        0 * shape,
+        jnp.array([400.0, 900.0]) * np.pi**2,
+        jnp.stack([shape, shape[:, ::-1]]),
+    )
     picture = view.show(modes)
     assert is_whole(picture) and len(picture.panels) == 2
     assert "mode 1: 10 Hz" in words(picture) and "mode 2: 15 Hz" in words(picture)
@@ -328,8 +361,9 @@ def test_threads_directors_and_pressures_are_inside_a_clear_tube(arm):
     routes = (R.Straight([-0.003, 0.003]), R.Straight([-0.003, -0.003]))
     chambers = R.thread_chambers(arm, routes, [1e-5, 2e-5])
     forces = (R.Tendons(R.Helical(0.005, 1.0), 1.5), R.Pressurised(chambers, [2e4, 1e4]))
-    picture = view.show(arm, jnp.array([6.0, 0, 0, 0]), forces=forces, directors=True,
-                        view="right")  # fmt: skip
+    picture = view.show(
+        arm, jnp.array([6.0, 0, 0, 0]), forces=forces, directors=True, view="right"
+    )
     assert is_whole(picture)
     for name in ("tendon: 1.5 N", "chamber: 20 kPa", "chamber: 10 kPa", "director x"):
         assert name in words(picture)
@@ -365,10 +399,13 @@ def test_a_planar_rod_is_a_band_with_its_states():
 @pytest.mark.parametrize(
     "section, corners",
     [
-        (R.circle(0.008), 0), (R.ring(0.009, 0.006), 0), (R.ellipse(0.009, 0.005), 0),
-        (R.rectangle(0.02, 0.01), 0), (R.squircle(0.008, 5.0), 0),
+        (R.circle(0.008), 0),
+        (R.ring(0.009, 0.006), 0),
+        (R.ellipse(0.009, 0.005), 0),
+        (R.rectangle(0.02, 0.01), 0),
+        (R.squircle(0.008, 5.0), 0),
     ],
-)  # fmt: skip
+)
 def test_an_outline_has_the_constants_of_its_section(section, corners):
     outer, hole = sections.section_outline(section)
 
@@ -411,11 +448,19 @@ def test_an_assembly_is_drawn_with_its_links(arm):
 def loop():
     lag = systems.Lag(0.1)
     return systems.Network(
-        {"target": systems.Source(systems.Step(1.0)), "pid": systems.PID(2.0), "lag": lag,
-         "last": systems.Lag(0.2)},
-        {"pid.reference": "target.value", "pid.measurement": "last.value",
-         "lag.a": "pid.command", "last.a": "lag.value"},
-    )  # fmt: skip
+        {
+            "target": systems.Source(systems.Step(1.0)),
+            "pid": systems.PID(2.0),
+            "lag": lag,
+            "last": systems.Lag(0.2),
+        },
+        {
+            "pid.reference": "target.value",
+            "pid.measurement": "last.value",
+            "lag.a": "pid.command",
+            "last.a": "lag.value",
+        },
+    )
 
 
 def test_a_network_shows_blocks_ports_and_wires(loop):
@@ -430,16 +475,23 @@ def test_a_network_shows_blocks_ports_and_wires(loop):
     )
     columns = {name: x for name, (x, _) in places.items()}
     assert columns["target"] < columns["pid"] < columns["lag"] < columns["last"]
-    ends = [line.get_xydata()[-1] for line in picture.panels[0].axes.lines
-            if len(line.get_xydata()) > 2]  # fmt: skip
+    ends = [
+        line.get_xydata()[-1]
+        for line in picture.panels[0].axes.lines
+        if len(line.get_xydata()) > 2
+    ]
     assert len(ends) == len(loop.wires)
     assert is_whole(view.show(loop.blocks["pid"]), 0.01)
 
 
 def test_a_trajectory_has_panels_by_unit(loop):
     time = jnp.linspace(0.0, 1.0, 21)
-    outputs = {"lag.y": time, "pid.command": 1 - time, "target.value": jnp.ones(21),
-               "last.y": jnp.stack([time, time**2], axis=1)}  # fmt: skip
+    outputs = {
+        "lag.y": time,
+        "pid.command": 1 - time,
+        "target.value": jnp.ones(21),
+        "last.y": jnp.stack([time, time**2], axis=1),
+    }
     stats = {"steps": jnp.asarray(20), "rejected": jnp.asarray(0), "reached": time[-1]}
     film = systems.Trajectory(time, {}, outputs, Status.successful, stats)
     picture = view.show(film)
@@ -447,27 +499,31 @@ def test_a_trajectory_has_panels_by_unit(loop):
     assert "last.y[1]" in words(picture) and len(picture.panels) == 3  # both y in one
     chosen = view.show(film, names=["lag.y"], references={"lag.y": "target.value"})
     assert len(chosen.panels) == 1 and "target.value (reference)" in words(chosen)
-    stopped = eqx.tree_at(lambda f: (f.status, f.stats["reached"]), film,
-                          (Status.not_finite, jnp.asarray(0.5)))  # fmt: skip
+    stopped = eqx.tree_at(
+        lambda f: (f.status, f.stats["reached"]), film, (Status.not_finite, jnp.asarray(0.5))
+    )
     assert "stopped after 0.5 s" in words(view.show(stopped))
     with pytest.raises(ValueError, match="no output 'x'"):
         view.show(film, names=["x"])
 
 
 def test_an_optimisation_shows_its_history_or_its_layout(beam):
-    history = {"objective": 1 / np.arange(1.0, 6), "constraints": -np.ones((5, 2)),
-               "change": 0.5 ** np.arange(5)}  # fmt: skip
+    history = {
+        "objective": 1 / np.arange(1.0, 6),
+        "constraints": -np.ones((5, 2)),
+        "change": 0.5 ** np.arange(5),
+    }
     corners = np.asarray(beam.points)[np.asarray(beam.cells)[:, :3]]
     density = (corners[:, :, 0].mean(axis=1) / LENGTH) ** 4
-    done = Optimised(jnp.asarray(density), jnp.asarray(0.2), -jnp.ones(2),
-                            Status.max_steps, history, None)  # fmt: skip
+    done = Optimised(
+        jnp.asarray(density), jnp.asarray(0.2), -jnp.ones(2), Status.max_steps, history, None
+    )
     picture = view.show(done)
     assert len(picture.panels) == 3 and "objective 0.2 after 5 steps" in words(picture)
     layout = view.show(done, mesh=beam, densities=np.stack([0.5 + 0 * density, density]))
     image = pixels(layout)
     assert len(layout.panels) == 2 and "step 2" in words(layout)
-    last, first = (layout.pixels([[x, 0.0012]], panel=1)[0].astype(int)
-                   for x in (0.059, 0.001))  # fmt: skip
+    last, first = (layout.pixels([[x, 0.0012]], panel=1)[0].astype(int) for x in (0.059, 0.001))
     assert image[last[1], last[0]].max() < 60 and image[first[1], first[0]].min() > 200
     with pytest.raises(ValueError, match="one .*per cell"):
         view.show(done, mesh=beam, densities=np.zeros(3))

@@ -175,10 +175,11 @@ def test_light_by_pixel_is_as_good_as_light_by_sample(opacity, monkeypatch):
     scene = Scene(
         (
             Surface(SQUARE, TWO, values=SQUARE[:, 0], wire=wire),
-            Surface(*ball, "#c08060", opacity=opacity), line,
+            Surface(*ball, "#c08060", opacity=opacity),
+            line,
         ),
         Scale("x", 0.0, 1.0),
-    )  # fmt: skip
+    )
     lit = []
     true = S._lit_colours
     monkeypatch.setattr(S, "_lit_colours", lambda *a: lit.append(len(a[1])) or true(*a))
@@ -193,8 +194,9 @@ def test_normals_are_smooth_but_across_edges():
     points, triangles = glyphs.ball_triangles(np.zeros((1, 3)), 1.0, corners=24)
     normals = S.corner_normals(points, triangles)
     out = np.einsum("nci,nci->nc", normals, points[triangles])
-    area = np.linalg.norm(np.cross(*(points[triangles[:, k]] - points[triangles[:, 0]]
-                                     for k in (1, 2))), axis=1)  # fmt: skip
+    area = np.linalg.norm(
+        np.cross(*(points[triangles[:, k]] - points[triangles[:, 0]] for k in (1, 2))), axis=1
+    )
     assert out[area > 1e-12].min() > 0.98
     square = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
     centres = np.array([[0.0, 0, 0], [3, 0, 0]])
@@ -240,6 +242,8 @@ def test_both_renderers_see_the_same():
     scene = Scene((Surface(points, triangles), Lines([np.array([[-1.0, 0, 2], [4, 0, 2]])])))
     for camera in (Camera(), Camera(opening=0.0), Camera(30, 60, opening=60)):
         lens = solid.lens_of([scene], camera, (160, 120))
-        masks = [np.any(image < 235, axis=2) for image in
-                 (S.shade(scene, lens), screenshot(scene, lens, 1.4))]  # fmt: skip
+        masks = [
+            np.any(image < 235, axis=2)
+            for image in (S.shade(scene, lens), screenshot(scene, lens, 1.4))
+        ]
         assert np.mean(masks[0] != masks[1]) < 0.02 * np.mean(masks[0]) + 0.005

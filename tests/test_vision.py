@@ -81,8 +81,11 @@ def test_an_empty_picture_has_no_discs(level):
 def test_two_hundred_discs_are_all_found():
     random = np.random.default_rng(2)
     grid = np.stack(np.meshgrid(np.arange(20), np.arange(10)), axis=-1).reshape(-1, 2)
-    true = Discs(24.0 + 30 * grid + random.uniform(-2, 2, (200, 2)), np.full(200, 8.0),
-                 np.arange(200) % 3)  # fmt: skip
+    true = Discs(
+        24.0 + 30 * grid + random.uniform(-2, 2, (200, 2)),
+        np.full(200, 8.0),
+        np.arange(200) % 3,
+    )
     discs = vision.find_discs(picture_of(true, random), COLOURS)
     assert len(discs.radius) == 200 and errors(discs, true).max() < 0.2
 
@@ -122,8 +125,10 @@ def markers_at(random, camera, size=0.05):
     for number in range(4):
         turn = cv2.Rodrigues(random.uniform(-0.5, 0.5, 3))[0] @ np.diag([1.0, -1, -1])
         side = np.array([2 * (number % 2) - 1, 2 * (number // 2) - 1])
-        place = [*(side * (0.09, 0.06) + random.uniform(-0.01, 0.01, 2)),
-                 random.uniform(0.4, 0.5)]  # fmt: skip
+        place = [
+            *(side * (0.09, 0.06) + random.uniform(-0.01, 0.01, 2)),
+            random.uniform(0.4, 0.5),
+        ]
         poses[number] = Pose(turn, np.array(place))
         picture = vision.fiducial_picture(number)
         canvas = vision.draw_plane(canvas, camera, poses[number], picture, (1.25 * size,) * 2)
@@ -192,7 +197,7 @@ def test_pixels_and_points():
         assert np.max(np.abs(vision.project(lens, points) - pixels)) < 1e-9
     true = cv2.projectPoints(
         points, np.zeros(3), np.zeros(3), bent.matrix, np.array(bent.distortion)
-    )[0]  # fmt: skip
+    )[0]
     assert np.max(np.abs(true[:, 0] - pixels)) < 1e-9
     assert np.all(np.isnan(vision.deproject(camera, pixels[:2], np.array([0.0, -1.0]))))
     assert np.all(np.isnan(vision.project(camera, np.array([0.1, 0.1, -1.0]))))

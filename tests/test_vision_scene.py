@@ -106,8 +106,9 @@ def test_a_recorded_run_gives_the_bits_of_the_simulated_one(simulated):
     run, folder = simulated
     again = watched(FolderCamera(folder, rate=RATE).read)
     assert len(again) == FRAMES
-    assert all(a == b and np.array_equal(p, q)
-               for (a, p), (b, q) in zip(run, again, strict=True))  # fmt: skip
+    assert all(
+        a == b and np.array_equal(p, q) for (a, p), (b, q) in zip(run, again, strict=True)
+    )
 
 
 def test_so_does_a_camera_read_by_a_thread(simulated):

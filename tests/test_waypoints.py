@@ -27,9 +27,15 @@ def test_waypoints_are_joined_by_straight_lines_and_jumps():
 
 def test_a_controller_as_a_force_holds_a_rod_where_it_should_be():
     rod = R.rod(
-        SE2(), R.chebyshev(kappa_z=2), R.circle(5e-3), length=0.1, young_modulus=1e6,
-        poisson_ratio=0.4, density=1100.0, nodes=6,
-    )  # fmt: skip
+        SE2(),
+        R.chebyshev(kappa_z=2),
+        R.circle(5e-3),
+        length=0.1,
+        young_modulus=1e6,
+        poisson_ratio=0.4,
+        density=1100.0,
+        nodes=6,
+    )
     goal = jnp.array([6.0, -2.0])
     law = systems.ComputedTorque(rod, (R.Gravity(),), systems.Constant(goal), 400.0, 40.0)
     forces = (R.Gravity(), systems.ControlForce(law))
@@ -47,18 +53,25 @@ def test_weight_beside_the_line_is_that_of_the_solid():
     cells = M.rectangle([0.0, 0.0], [length, height], divisions=(10, 2), element=M.Quad8())
     rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.4, density=1000.0)
     problem = fem.problem(
-        cells, rubber, kinematics=fem.PlaneStrain(0.01),
+        cells,
+        rubber,
+        kinematics=fem.PlaneStrain(0.01),
         supports=(fem.Fixed(M.named(cells, "left")),),
-    )  # fmt: skip
+    )
     line = reduction.Line([0.0, 0.002], [length, 0.002])
     weight = reduction.offset_weight(problem, line, [9.81, -1.0])
     mass = 1000.0 * length * height * 0.01
     assert float(weight.mass) == pytest.approx(mass)
     assert float(weight.arm) == pytest.approx(0.008)
     rod = R.rod(
-        SE2(), R.constant("kappa_z", "sigma_x"), R.rectangle(0.01, height), length=length,
-        young_modulus=1e6, poisson_ratio=0.4, density=1000.0,
-    )  # fmt: skip
+        SE2(),
+        R.constant("kappa_z", "sigma_x"),
+        R.rectangle(0.01, height),
+        length=length,
+        young_modulus=1e6,
+        poisson_ratio=0.4,
+        density=1000.0,
+    )
     force = weight(jnp.zeros(()), R.motion(rod, jnp.zeros(2)))
     # per curvature the section at s turns by s L and moves by (s L)^2 / 2, per stretch by s L
     stretch = mass * 9.81 * length / 2

@@ -25,8 +25,9 @@ needs_chromium = pytest.mark.skipif(
     chromium.found() is None,
     reason=f"no browser on the PATH, looked for {', '.join(chromium.NAMES)}",
 )
-SQUARE = Surface(np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]),
-                 np.array([[0, 1, 2], [0, 2, 3]]))  # fmt: skip
+SQUARE = Surface(
+    np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
+)
 
 
 @pytest.fixture(scope="module")
@@ -84,11 +85,12 @@ def wave():
     """A result of fem on a plane mesh: a strip that is pulled, with a value at each node."""
     mesh = M.rectangle([0.0, 0.0], [0.1, 0.02], divisions=(10, 2), order=2)
     problem = fem.problem(
-        mesh, material.neo_hookean(young_modulus=1e5, poisson_ratio=0.4),
+        mesh,
+        material.neo_hookean(young_modulus=1e5, poisson_ratio=0.4),
         kinematics=fem.PlaneStrain(0.02),
         supports=(fem.Fixed(M.nodes_where(mesh, lambda p: p[0] <= 0)),),
         loads=(fem.Traction(M.boundary_facets(mesh)[:2], [0.0, 0.0], name="pull"),),
-    )  # fmt: skip
+    )
     u = jnp.stack([k * mesh.points * jnp.array([[0.1, -0.05]]) for k in range(3)])
     return Path(problem, u, jnp.array([0.0, 1.0, 2.0]), "pull", Status.successful, ())
 
@@ -155,15 +157,22 @@ def read(scene, body, index):
     kind = {5126: "<f4", 5125: "<u4", 5122: "<i2", 5121: "u1"}[entry["componentType"]]
     here = scene["bufferViews"][entry["bufferView"]]
     stride = here.get("byteStride", width * np.dtype(kind).itemsize)
-    rows = np.ndarray((entry["count"], width), kind, body, here["byteOffset"],
-                      (stride, np.dtype(kind).itemsize))  # fmt: skip
+    rows = np.ndarray(
+        (entry["count"], width),
+        kind,
+        body,
+        here["byteOffset"],
+        (stride, np.dtype(kind).itemsize),
+    )
     return rows / np.iinfo(kind).max if entry.get("normalized") else rows
 
 
 def test_a_glb_file_moves_as_the_actors(grasp, tmp_path):
     fingers, ball = grasp[0]
-    actors = [fingers._replace(points=fingers.points[::49]),
-              ball._replace(poses=ball.poses[::49])]  # fmt: skip
+    actors = [
+        fingers._replace(points=fingers.points[::49]),
+        ball._replace(poses=ball.poses[::49]),
+    ]
     path = view.to_glb(tmp_path / "grasp.glb", *actors, time=0.1 * np.arange(5))
     scene, body = glb_of(path)
     fingers, _, ball, carrier, root = scene["nodes"]
@@ -215,10 +224,13 @@ def test_a_browser_plays_the_page(grasp, tmp_path):
         assert 0.1 < np.mean(~paper) < 0.6  # something is drawn, with room around it
         red, green, blue = np.moveaxis(first, 2, 0)
         assert np.sum((red > green + 60) & (green > blue)) > 2000  # the ball
-        high, wide = (np.flatnonzero(np.any((red > green + 60) & (green > blue), axis=k))
-                      for k in (1, 0))  # fmt: skip
-        tab.run("(s => {s.value = 120; s.dispatchEvent(new Event('input'))})"
-                "(document.getElementById('scrub'))")  # fmt: skip
+        high, wide = (
+            np.flatnonzero(np.any((red > green + 60) & (green > blue), axis=k)) for k in (1, 0)
+        )
+        tab.run(
+            "(s => {s.value = 120; s.dispatchEvent(new Event('input'))})"
+            "(document.getElementById('scrub'))"
+        )
         later = tab.picture()
         assert tab.run("viewer.state.frame") == 120
         assert "t = 2.41 s" in tab.run("document.getElementById('stamp').textContent")

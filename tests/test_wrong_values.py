@@ -29,9 +29,14 @@ PROBLEM = fem.problem(
 U = jnp.zeros_like(SQUARE.points)
 BASIS = rod.constant("kappa_z")
 ROD = rod.rod(
-    sj.SE2(), BASIS, rod.circle(0.01), length=0.1, young_modulus=1e5, poisson_ratio=0.4,
+    sj.SE2(),
+    BASIS,
+    rod.circle(0.01),
+    length=0.1,
+    young_modulus=1e5,
+    poisson_ratio=0.4,
     density=1e3,
-)  # fmt: skip
+)
 Q = jnp.zeros(1)
 DISC = sdf.Circle([0.0, 0.0], 1.0)
 NETWORK = systems.Network({"lag": systems.Lag(0.1)}, {}, ("lag.a",))
@@ -298,9 +303,12 @@ def test_tendons_do_not_push():
     way = fem.route(SQUARE, [[0.1, 0.2], [0.9, 0.3]])
     assert "Tendons pull" in call(fem.Tendon, way, -5.0)
     pulled = fem.problem(
-        SQUARE, RUBBER, kinematics=fem.PlaneStrain(), supports=(HELD,),
+        SQUARE,
+        RUBBER,
+        kinematics=fem.PlaneStrain(),
+        supports=(HELD,),
         loads=(fem.Tendon(way, 5.0),),
-    )  # fmt: skip
+    )
     pushed = fem.with_load(pulled, "tendon", -5.0)
     assert float(jnp.abs(fem.residual(pulled, U)).max()) > 1.0
     assert float(jnp.abs(fem.residual(pushed, U)).max()) == 0.0

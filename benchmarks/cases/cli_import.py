@@ -25,8 +25,11 @@ def rows():
     def once(more: str) -> float:
         done = subprocess.run(
             [sys.executable, "-c", PROGRAM.format(more=more)],
-            capture_output=True, text=True, check=True, env=keeps_byte_code,
-        )  # fmt: skip
+            capture_output=True,
+            text=True,
+            check=True,
+            env=keeps_byte_code,
+        )
         return float(done.stdout)
 
     for floors, more in MORE.items():

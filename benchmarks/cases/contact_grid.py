@@ -47,9 +47,7 @@ def flier(radius):
 
 def on_shape(wall):
     shape = sdf.Rectangle(jnp.stack([0 * wall - 1.0, -wall]), jnp.array([1.0, 0.0]))
-    contact = R.ObstacleContact(
-        obstacle=shape, radius=RADIUS, law=LAW, points=64, caps="both"
-    )  # fmt: skip
+    contact = R.ObstacleContact(obstacle=shape, radius=RADIUS, law=LAW, points=64, caps="both")
     return R.assembly(SE2(), rod=flier(RADIUS)), (R.PartForce("rod", contact),)
 
 
@@ -72,9 +70,14 @@ def on_link(wall):
 
 def on_itself(wall):
     model = R.rod(
-        SE2(), R.chebyshev(kappa_z=3), R.circle(wall / 2), length=0.2, nodes=20,
-        rest_strain=[29.0, 1.0, 0.0], **SOFT,
-    )  # fmt: skip
+        SE2(),
+        R.chebyshev(kappa_z=3),
+        R.circle(wall / 2),
+        length=0.2,
+        nodes=20,
+        rest_strain=[29.0, 1.0, 0.0],
+        **SOFT,
+    )
     return model, (R.SelfContact(wall / 2, LAW, points=128),)
 
 
@@ -184,10 +187,18 @@ def rows():
                 "through": len(through), "which": "; ".join(through),
             }  # fmt: skip
             yield Row(
-                "sorojax", settings | {"quantity": "through"}, error=len(through) / len(ratios),
-                reference="none", bar=0.0, bar_on="error",
-            )  # fmt: skip
+                "sorojax",
+                settings | {"quantity": "through"},
+                error=len(through) / len(ratios),
+                reference="none",
+                bar=0.0,
+                bar_on="error",
+            )
             yield Row(
-                "sorojax", settings | {"quantity": "energy after over before"},
-                error=max(ratios), reference="1", bar=GAINED, bar_on="error",
-            )  # fmt: skip
+                "sorojax",
+                settings | {"quantity": "energy after over before"},
+                error=max(ratios),
+                reference="1",
+                bar=GAINED,
+                bar_on="error",
+            )

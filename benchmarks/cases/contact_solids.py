@@ -22,9 +22,14 @@ def plate(size, divisions, corner):
 
 def body(shape, *loads):
     return fem.problem(
-        shape, RUBBER, kinematics=fem.PlaneStrain(0.03), supports=(), loads=loads,
-        formulation=fem.Displacement(), free=True,
-    )  # fmt: skip
+        shape,
+        RUBBER,
+        kinematics=fem.PlaneStrain(0.03),
+        supports=(),
+        loads=loads,
+        formulation=fem.Displacement(),
+        free=True,
+    )
 
 
 def on_a_shape(wall):
@@ -102,14 +107,25 @@ def rows():
                     through += [where] if left <= 0 else []
                     ratios.append(float(most))
             settings = {
-                "kind": kind, "step": step, "runs": len(SPEEDS) * len(WALLS),
-                "unresolved": len(unresolved), "which": "; ".join(through + unresolved),
-            }  # fmt: skip
+                "kind": kind,
+                "step": step,
+                "runs": len(SPEEDS) * len(WALLS),
+                "unresolved": len(unresolved),
+                "which": "; ".join(through + unresolved),
+            }
             yield Row(
-                "sorojax", settings | {"quantity": "through"}, error=float(len(through)),
-                reference="none", bar=0.0, bar_on="error",
-            )  # fmt: skip
+                "sorojax",
+                settings | {"quantity": "through"},
+                error=float(len(through)),
+                reference="none",
+                bar=0.0,
+                bar_on="error",
+            )
             yield Row(
-                "sorojax", settings | {"quantity": "energy after over before"},
-                error=max(ratios), reference="1", bar=GAINED, bar_on="error",
-            )  # fmt: skip
+                "sorojax",
+                settings | {"quantity": "energy after over before"},
+                error=max(ratios),
+                reference="1",
+                bar=GAINED,
+                bar_on="error",
+            )

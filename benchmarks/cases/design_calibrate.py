@@ -44,9 +44,10 @@ def record(load: float) -> design.Experiment:
 
     def predict(p):
         rubber = material.neo_hookean(
-            young_modulus=p["young_modulus"], poisson_ratio=POISSON_RATIO,
+            young_modulus=p["young_modulus"],
+            poisson_ratio=POISSON_RATIO,
             density=problem.material.density,  # pyright: ignore[reportArgumentType]
-        )  # fmt: skip
+        )
         body = dataclasses.replace(problem, material=rubber)
         still = fem.solve(body).displacement
         drops = -still[markers, 1] / mm
@@ -109,5 +110,12 @@ def _fit(name: str, experiments, hold_out):
             if kind == "held out":
                 yield Row("sorojax", settings, run_s=seconds, error=error, reference=HELD_OUT)
                 continue
-            yield Row("sorojax", settings, run_s=seconds, error=error, reference=NOTE,
-                      bar=1.0, bar_on="error")  # fmt: skip
+            yield Row(
+                "sorojax",
+                settings,
+                run_s=seconds,
+                error=error,
+                reference=NOTE,
+                bar=1.0,
+                bar_on="error",
+            )

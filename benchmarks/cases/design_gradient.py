@@ -45,10 +45,23 @@ def rows():
             settings = {"objective": name, "start": begin, "densities": objective.start.size,
                         "value_ms": 1e3 * value, "gradient_ms": 1e3 * (both - value),
                         "slope_error": wrong}  # fmt: skip
-            yield Row("sorojax", settings, run_s=both, error=both / value - 1, bar=MOST,
-                      bar_on="error", reference="share of the forward solve")  # fmt: skip
-            yield Row("sorojax", settings | {"what": "slope"}, error=wrong, bar=AGREES,
-                      bar_on="error", reference="central differences")  # fmt: skip
+            yield Row(
+                "sorojax",
+                settings,
+                run_s=both,
+                error=both / value - 1,
+                bar=MOST,
+                bar_on="error",
+                reference="share of the forward solve",
+            )
+            yield Row(
+                "sorojax",
+                settings | {"what": "slope"},
+                error=wrong,
+                bar=AGREES,
+                bar_on="error",
+                reference="central differences",
+            )
 
 
 def objectives() -> dict[str, Objective]:
@@ -109,10 +122,13 @@ def _cantilever() -> fem.Problem:
     grid = mesh.rectangle([0, 0], [1.0, 0.5], divisions=GRID, element=mesh.Quad4())
     tip = jnp.array([mesh.nearest_node(grid, [1.0, 0.25])])
     return fem.problem(
-        grid, material.neo_hookean(young_modulus=1e7, poisson_ratio=0.4),
-        kinematics=fem.PlaneStrain(0.1), supports=(fem.Fixed(grid.node_sets["left"]),),
-        loads=(fem.Force(tip, [0.0, -500.0], name="push"),), formulation=fem.Displacement(),
-    )  # fmt: skip
+        grid,
+        material.neo_hookean(young_modulus=1e7, poisson_ratio=0.4),
+        kinematics=fem.PlaneStrain(0.1),
+        supports=(fem.Fixed(grid.node_sets["left"]),),
+        loads=(fem.Force(tip, [0.0, -500.0], name="push"),),
+        formulation=fem.Displacement(),
+    )
 
 
 def _inflated(chamber: str, begins: tuple[str, ...] = ("warm", "rest")) -> Objective:

@@ -31,30 +31,64 @@ def rows():
                     "converged": bool(found.status == Status.successful)}  # fmt: skip
         error = None if want is None else abs(settings["compliance"] / want - 1)
         timing = (float(np.median(seconds[3:])), min(seconds), max(seconds[3:]))
-        yield Row("sorojax", settings, seconds[0], *timing, error=error,
-                  bar=STEP if nx == 60 else None,
-                  reference="published compliance; time of a step")  # fmt: skip
-        yield Row("sorojax", settings | {"what": "step over solve and gradient"}, error=over,
-                  bar=OVER, bar_on="error", reference="processor time of both")  # fmt: skip
+        yield Row(
+            "sorojax",
+            settings,
+            seconds[0],
+            *timing,
+            error=error,
+            bar=STEP if nx == 60 else None,
+            reference="published compliance; time of a step",
+        )
+        yield Row(
+            "sorojax",
+            settings | {"what": "step over solve and gradient"},
+            error=over,
+            bar=OVER,
+            bar_on="error",
+            reference="processor time of both",
+        )
         if error is not None:
-            yield Row("sorojax", settings | {"what": "compliance"}, error=error, bar=5e-3,
-                      bar_on="error", reference="published compliance")  # fmt: skip
+            yield Row(
+                "sorojax",
+                settings | {"what": "compliance"},
+                error=error,
+                bar=5e-3,
+                bar_on="error",
+                reference="published compliance",
+            )
     found, seconds, _ = _inverter(40, 20)
     reached = float(found.objective)
-    settings = {"layout": "force inverter", "cells": "40 x 20", "output": reached,
-                "steps": len(seconds)}  # fmt: skip
+    settings = {
+        "layout": "force inverter",
+        "cells": "40 x 20",
+        "output": reached,
+        "steps": len(seconds),
+    }
     timing = (float(np.median(seconds[3:])), min(seconds), max(seconds[3:]))
     missing = max(0.0, 1 - reached / INVERTER)
-    yield Row("sorojax", settings, seconds[0], *timing, error=missing, bar=0.0,
-              bar_on="error", reference="published output; error: what is missing")  # fmt: skip
+    yield Row(
+        "sorojax",
+        settings,
+        seconds[0],
+        *timing,
+        error=missing,
+        bar=0.0,
+        bar_on="error",
+        reference="published output; error: what is missing",
+    )
 
 
 def _problem(grid, supports, loads):
     stuff = material.neo_hookean(young_modulus=1.0, poisson_ratio=0.3)
     return fem.problem(
-        grid, stuff, kinematics=fem.PlaneStress(1.0), supports=supports, loads=loads,
+        grid,
+        stuff,
+        kinematics=fem.PlaneStress(1.0),
+        supports=supports,
+        loads=loads,
         formulation=fem.Displacement(),
-    )  # fmt: skip
+    )
 
 
 def _grid(nx: int, ny: int):
@@ -77,9 +111,13 @@ def _timed(loss, volume, cells: int, fraction: float, **options):
 
     with silent():
         found = design.minimise(
-            loss, jnp.full(cells, fraction), constraints=(volume,), tolerance=0.01,
-            on_step=tick, **options,
-        )  # fmt: skip
+            loss,
+            jnp.full(cells, fraction),
+            constraints=(volume,),
+            tolerance=0.01,
+            on_step=tick,
+            **options,
+        )
     seconds, work = np.array(spent).T
     return found, seconds, float(np.median(work[3:]) / np.median(alone[3:]))
 
@@ -103,9 +141,14 @@ def _beam(nx: int, ny: int, radius: float, kind: str):
         changed = jax.jit(lambda x, g: design.sensitivity_filtered(smooth, x, g))
     loss = jax.jit(lambda x: design.compliance(model, interpolation(dense(x))))
     return _timed(
-        loss, jax.jit(lambda x: jnp.mean(dense(x)) - 0.5), nx * ny, 0.5, steps=400,
-        optimiser=design.OptimalityCriteria(), change_gradient=changed,
-    )  # fmt: skip
+        loss,
+        jax.jit(lambda x: jnp.mean(dense(x)) - 0.5),
+        nx * ny,
+        0.5,
+        steps=400,
+        optimiser=design.OptimalityCriteria(),
+        change_gradient=changed,
+    )
 
 
 def _inverter(nx: int, ny: int):
@@ -119,7 +162,11 @@ def _inverter(nx: int, ny: int):
     smooth, interpolation = design.cone_filter(grid, 1.2), design.Simp(3.0, 1e-9)
     return _timed(
         jax.jit(lambda x: design.displacement(model, interpolation(x))[ends[1], 0]),
-        jax.jit(lambda x: 10 * (jnp.mean(x) - 0.3)), nx * ny, 0.3, steps=150, scale=0.1,
+        jax.jit(lambda x: 10 * (jnp.mean(x) - 0.3)),
+        nx * ny,
+        0.3,
+        steps=150,
+        scale=0.1,
         optimiser=design.MMA(1e-3, 1.0, move=0.1),
         change_gradient=jax.jit(lambda x, g: design.sensitivity_filtered(smooth, x, g)),
-    )  # fmt: skip
+    )

@@ -34,12 +34,20 @@ def rows():
             x, state = method.update(x, here, state)
             jax.block_until_ready(x)
             seconds.append(time.perf_counter() - start)
-        settings = {"variables": variables, "constraints": constraints,
-                    "objective": float(values(x).objective)}  # fmt: skip
+        settings = {
+            "variables": variables,
+            "constraints": constraints,
+            "objective": float(values(x).objective),
+        }
         yield Row(
-            "sorojax", settings, seconds[0], float(np.median(seconds[1:])), min(seconds[1:]),
-            max(seconds[1:]), bar=bar,
-        )  # fmt: skip
+            "sorojax",
+            settings,
+            seconds[0],
+            float(np.median(seconds[1:])),
+            min(seconds[1:]),
+            max(seconds[1:]),
+            bar=bar,
+        )
     yield _share()
 
 
@@ -59,7 +67,19 @@ def _share() -> Row:
         evaluated.append(middle - start)
         updated.append(time.process_time() - middle)
     update, solve = float(np.median(updated[2:])), float(np.median(evaluated[2:]))
-    settings = {"variables": count, "constraints": 1, "what": "share of a step",
-                "solve_and_gradient_s": solve, "update_s": update}  # fmt: skip
-    return Row("sorojax", settings, run_s=update, error=update / (update + solve), bar=SHARE,
-               bar_on="error", reference="one linear solve with gradient")  # fmt: skip
+    settings = {
+        "variables": count,
+        "constraints": 1,
+        "what": "share of a step",
+        "solve_and_gradient_s": solve,
+        "update_s": update,
+    }
+    return Row(
+        "sorojax",
+        settings,
+        run_s=update,
+        error=update / (update + solve),
+        bar=SHARE,
+        bar_on="error",
+        reference="one linear solve with gradient",
+    )

@@ -32,19 +32,33 @@ def rows():
                     "volume": float(jnp.mean(density)), "status": str(found.status),
                     "grey": float(design.greyness(density))}  # fmt: skip
         timing = (float(np.median(seconds[3:])), min(seconds), max(seconds[3:]))
-        yield Row("sorojax", settings, seconds[0], *timing, error=abs(reached / published - 1),
-                  bar=WITHIN, bar_on="error",
-                  reference="Wang, Lazarov, Sigmund, Jensen 2014; time of a step")  # fmt: skip
+        yield Row(
+            "sorojax",
+            settings,
+            seconds[0],
+            *timing,
+            error=abs(reached / published - 1),
+            bar=WITHIN,
+            bar_on="error",
+            reference="Wang, Lazarov, Sigmund, Jensen 2014; time of a step",
+        )
         for what, make in (("without void", alone), ("on finer cells", split)):
             body = make(force, density)
             found = fem.solve(body, steps=6, throw=False)
             again = float(design.work_of_loads(body, found.displacement))
             reached_load = float(np.asarray(found.load_fraction))
-            told = settings | {"what": what, "compliance_kJ": again / 1e3,
-                               "over_published": again / published - 1,
-                               "load_fraction": reached_load}  # fmt: skip
-            yield Row("sorojax", told, error=abs(again / reached - 1),
-                      reference="the same design as it was optimised, no bar")  # fmt: skip
+            told = settings | {
+                "what": what,
+                "compliance_kJ": again / 1e3,
+                "over_published": again / published - 1,
+                "load_fraction": reached_load,
+            }
+            yield Row(
+                "sorojax",
+                told,
+                error=abs(again / reached - 1),
+                reference="the same design as it was optimised, no bar",
+            )
 
 
 def alone(force: float, density) -> fem.Problem:
@@ -91,10 +105,13 @@ def cantilever(force: float, nx: int = 120, ny: int = 30) -> fem.Problem:
 def body_of(force: float, grid: mesh.Mesh, left) -> fem.Problem:
     end = jnp.array([mesh.nearest_node(grid, [1.0, 0.125])])
     return fem.problem(
-        grid, material.st_venant_kirchhoff(young_modulus=3e9, poisson_ratio=0.4),
-        kinematics=fem.PlaneStrain(0.1), supports=(fem.Fixed(left),),
-        loads=(fem.Force(end, [0.0, -force]),), formulation=fem.Displacement(),
-    )  # fmt: skip
+        grid,
+        material.st_venant_kirchhoff(young_modulus=3e9, poisson_ratio=0.4),
+        kinematics=fem.PlaneStrain(0.1),
+        supports=(fem.Fixed(left),),
+        loads=(fem.Force(end, [0.0, -force]),),
+        formulation=fem.Displacement(),
+    )
 
 
 def optimised(force: float, steps: int = STEPS):
@@ -129,8 +146,12 @@ def optimised(force: float, steps: int = STEPS):
 
     with silent():
         found = design.minimise(
-            compliance, jnp.full(plan.num_variables, 0.5), constraints=(volume,), steps=steps,
-            schedule=lambda k: tuple(map(jnp.asarray, continuation(k))), on_step=tick,
+            compliance,
+            jnp.full(plan.num_variables, 0.5),
+            constraints=(volume,),
+            steps=steps,
+            schedule=lambda k: tuple(map(jnp.asarray, continuation(k))),
+            on_step=tick,
             optimiser=design.MMA(move=0.1),
-        )  # fmt: skip
+        )
     return found, seconds, density(found.design, jnp.asarray(continuation(steps)[1]))

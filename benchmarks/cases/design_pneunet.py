@@ -23,7 +23,7 @@ def rows():
         with silent():
             found = design.optimise_pneunet(
                 cell, steps=STEPS, on_step=lambda _, t=ticks: t.append(time.perf_counter())
-            )  # fmt: skip
+            )
         seconds = np.diff(ticks)
         density = cell.plan(found.design, sharpness(STEPS - 1, STEPS))
         objective = found.history["objective"]
@@ -34,12 +34,33 @@ def rows():
             "steps_that_rise": int(np.sum(np.diff(objective) > 0)),
             "whole_s": round(ticks[-1] - start, 1),
         }  # fmt: skip
-        yield Row("sorojax", settings, seconds[0], float(np.median(seconds[3:])),
-                  float(seconds.min()), float(seconds[3:].max()), error=ticks[-1] - start,
-                  bar=MOST, bar_on="error", reference="seconds in all")  # fmt: skip
+        yield Row(
+            "sorojax",
+            settings,
+            seconds[0],
+            float(np.median(seconds[3:])),
+            float(seconds.min()),
+            float(seconds[3:].max()),
+            error=ticks[-1] - start,
+            bar=MOST,
+            bar_on="error",
+            reference="seconds in all",
+        )
         slack = abs(float(jnp.max(found.constraints)))
-        yield Row("sorojax", settings | {"what": "volume constraint"}, error=slack, bar=ACTIVE,
-                  bar_on="error", reference="active")  # fmt: skip
+        yield Row(
+            "sorojax",
+            settings | {"what": "volume constraint"},
+            error=slack,
+            bar=ACTIVE,
+            bar_on="error",
+            reference="active",
+        )
         grey = float(design.greyness(density))
-        yield Row("sorojax", settings | {"what": "grey measure"}, error=grey, bar=GREY,
-                  bar_on="error", reference="black and white")  # fmt: skip
+        yield Row(
+            "sorojax",
+            settings | {"what": "grey measure"},
+            error=grey,
+            bar=GREY,
+            bar_on="error",
+            reference="black and white",
+        )

@@ -84,10 +84,14 @@ def _rows(device, problem, exact):
         if exact is not None and what not in exact:
             exact[what] = jax.jit(call)(arrays)
         yield from devices.compared(
-            f"{what}, {element}", call, (arrays,), **settings,
+            f"{what}, {element}",
+            call,
+            (arrays,),
+            **settings,
             error_of=devices.relative(exact[what]) if exact else lambda _: float("nan"),
-            bar=SAME if exact else None, reference="CPU" if exact else "",
-        )  # fmt: skip
+            bar=SAME if exact else None,
+            reference="CPU" if exact else "",
+        )
     system = iterating(problem).space.system
     held = constrain(system, values, force, prepared.known, jnp.zeros_like(force))
 
@@ -97,9 +101,14 @@ def _rows(device, problem, exact):
 
     call, arrays = _apart(solution, (system, *held))
     yield from devices.compared(
-        f"linear system, {element}", call, (arrays,), **settings, error_of=missed, bar=ERROR,
+        f"linear system, {element}",
+        call,
+        (arrays,),
+        **settings,
+        error_of=missed,
+        bar=ERROR,
         reference="what is left of the right-hand side",
-    )  # fmt: skip
+    )
     yield _equilibrium(device, problem, prepared, exact)
 
 
@@ -118,15 +127,22 @@ def _equilibrium(device, problem, prepared, exact):
     found = linearise(problem, prepared, u, u)
     solver = problem.space.system.means if cpu else "conjugate gradients"
     settings = devices.named(f"equilibrium, {problem.mesh.element.name}", device) | {
-        "against": "dof", "dof": problem.space.num_dofs, "solver": solver,
+        "against": "dof",
+        "dof": problem.space.num_dofs,
+        "solver": solver,
         "unbalanced": float(found.residual_norm / found.reference),
-    }  # fmt: skip
+    }
     if cpu or exact is None:
         return Row("sorojax", settings, **timing.columns())
     return Row(
-        "sorojax", settings, **timing.columns(), reference="direct solver", bar=ERROR,
-        error=devices.relative(exact["equilibrium"])(u), bar_on="error",
-    )  # fmt: skip
+        "sorojax",
+        settings,
+        **timing.columns(),
+        reference="direct solver",
+        bar=ERROR,
+        error=devices.relative(exact["equilibrium"])(u),
+        bar_on="error",
+    )
 
 
 def rows():

@@ -26,10 +26,19 @@ def rows():
         exact = devices.on_cpu(function, body, q, v)
         for double in (True, False):
             for count, states, where in (
-                (SHARED, (q, v), [cpu, *others]), (large, many, others),
-            ):  # fmt: skip
+                (SHARED, (q, v), [cpu, *others]),
+                (large, many, others),
+            ):
                 yield from devices.compared(
-                    what, function, (body, *states), count=count, of="members", calls=calls,
-                    error_of=devices.relative(exact), bar=ERRORS[double], double=double,
-                    reference="CPU in double precision", devices=where,
-                )  # fmt: skip
+                    what,
+                    function,
+                    (body, *states),
+                    count=count,
+                    of="members",
+                    calls=calls,
+                    error_of=devices.relative(exact),
+                    bar=ERRORS[double],
+                    double=double,
+                    reference="CPU in double precision",
+                    devices=where,
+                )

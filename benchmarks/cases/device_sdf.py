@@ -31,10 +31,14 @@ def rows():
                 # single precision chooses another side of an edge: no normal is wrong there
                 told = what == "field" or double
                 yield from devices.compared(
-                    what, function, (shape, jnp.tile(few, (times, 1))),
-                    count=times * csg.POINTS, of="points", double=double,
+                    what,
+                    function,
+                    (shape, jnp.tile(few, (times, 1))),
+                    count=times * csg.POINTS,
+                    of="points",
+                    double=double,
                     error_of=devices.relative(truth[what]),
                     bar=ERRORS[double] if told else None,
                     reference="NumPy in double precision" if what == "field" else "CPU",
                     devices=[cpu, *others] if times == 1 else others,
-                )  # fmt: skip
+                )

@@ -71,9 +71,13 @@ def _settings(problem: fem.Problem) -> dict:
 def _row(problem, timing, bar, error) -> Row:
     per_cell = timing.per(problem.space.num_cells).columns()
     return Row(
-        "sorojax", _settings(problem), **per_cell, bar=bar,
-        error=error, reference=None if error is None else NOTE,
-    )  # fmt: skip
+        "sorojax",
+        _settings(problem),
+        **per_cell,
+        bar=bar,
+        error=error,
+        reference=None if error is None else NOTE,
+    )
 
 
 def _way(problem: fem.Problem) -> np.ndarray:
@@ -91,9 +95,14 @@ def _ask(peer: str, problem: fem.Problem, repeats: int):
     }
     try:
         return peers.call(
-            peer, "assembly", arrays, element=problem.mesh.element.name, repeats=repeats,
-            mu=float(rubber.shear_modulus), bulk=float(rubber.bulk_modulus),  # type: ignore
-        )  # fmt: skip
+            peer,
+            "assembly",
+            arrays,
+            element=problem.mesh.element.name,
+            repeats=repeats,
+            mu=float(rubber.shear_modulus),
+            bulk=float(rubber.bulk_modulus),  # type: ignore
+        )
     except peers.PeerMissing as reason:
         return str(reason)
 

@@ -51,9 +51,13 @@ def rows():
     method = {"method": "vmap", "factorisations": counts[1], "of_loop": round(ratio, 3)}
     failed = int(np.sum(lanes.status == Status.not_converged))
     yield Row(
-        "sorojax", settings | method | {"failed": failed}, **batch.columns(),
-        reference="loop", error=error, bar=0.9 * min(loop.runs),
-    )  # fmt: skip
+        "sorojax",
+        settings | method | {"failed": failed},
+        **batch.columns(),
+        reference="loop",
+        error=error,
+        bar=0.9 * min(loop.runs),
+    )
     yield from _callback(problem)
 
 
@@ -67,9 +71,12 @@ def _callback(problem: fem.Problem):
     inside = measure(lambda v, b: sparse.solve(system, v, b), values, b, repeats=51)
     settings = {"dof": system.size, "nnz": system.num_values}
     yield Row(
-        "sorojax", settings | {"method": "solve on the host"}, **direct.columns(),
-        reference="", error=None,
-    )  # fmt: skip
+        "sorojax",
+        settings | {"method": "solve on the host"},
+        **direct.columns(),
+        reference="",
+        error=None,
+    )
     cost = min(inside.runs) - min(direct.runs)
     settings |= {"method": "solve in a program", "callback_ms": round(1e3 * cost, 3)}
     yield Row("sorojax", settings, **inside.columns(), reference="", error=None)

@@ -95,6 +95,11 @@ def rows():
                 "drop_mm": round(float(values.mean()), 3),
             }
             yield Row(
-                "sorojax", settings, **timing.columns(), reference=NOTE,
-                error=float(error), bar=1.0, bar_on="error",
-            )  # fmt: skip
+                "sorojax",
+                settings,
+                **timing.columns(),
+                reference=NOTE,
+                error=float(error),
+                bar=1.0,
+                bar_on="error",
+            )

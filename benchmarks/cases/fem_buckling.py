@@ -105,20 +105,31 @@ def rows():
     located = [0.125 * float(point.factor) for point in found.critical_points]
     yield Row(
         "sorojax",
-        settings | {"quantity": "first bifurcations, located on the path", "value": located,
-                    "iterations": found.stats.iterations},
-        **timing.columns(), reference="",
-    )  # fmt: skip
+        settings
+        | {
+            "quantity": "first bifurcations, located on the path",
+            "value": located,
+            "iterations": found.stats.iterations,
+        },
+        **timing.columns(),
+        reference="",
+    )
     first, second = zeros(cells)
-    yield _row(settings, "critical strain, columns leaning, from nearby", second,
-               CRITICAL_STRAIN)  # fmt: skip
+    yield _row(
+        settings, "critical strain, columns leaning, from nearby", second, CRITICAL_STRAIN
+    )
     yield Row(
         "sorojax",
-        settings | {"quantity": "critical strain, ellipses: the square leaves its path here",
-                    "value": first},
-        error=first / second, bar=1.0, bar_on="error",
+        settings
+        | {
+            "quantity": "critical strain, ellipses: the square leaves its path here",
+            "value": first,
+        },
+        error=first / second,
+        bar=1.0,
+        bar_on="error",
         reference="own; over that of the leaning columns",
-    )  # fmt: skip
+    )
 
 
 def zeros(cells: mesh.Mesh) -> tuple[float, float]:
@@ -144,7 +155,10 @@ def leans(shape) -> bool:
 
 def _row(settings: dict, quantity: str, value: float, wanted: float) -> Row:
     return Row(
-        "sorojax", settings | {"quantity": quantity, "value": value},
-        reference=f"{NOTE}: {wanted}", error=abs(value / wanted - 1), bar=5e-3,
+        "sorojax",
+        settings | {"quantity": quantity, "value": value},
+        reference=f"{NOTE}: {wanted}",
+        error=abs(value / wanted - 1),
+        bar=5e-3,
         bar_on="error",
-    )  # fmt: skip
+    )

@@ -40,9 +40,14 @@ def _row(problem: fem.Problem, size: float, bar: float | None) -> Row:
     settings = _settings(problem, size, path)
     settings["error_percent_at_5_10_15_20_kPa"] = [round(100 * float(e), 4) for e in errors]
     return Row(
-        "sorojax", settings, **timing.columns(), error=float(errors.max()),
-        reference=NOTE, bar=bar, bar_on="error" if size < COARSE else "run_s",
-    )  # fmt: skip
+        "sorojax",
+        settings,
+        **timing.columns(),
+        error=float(errors.max()),
+        reference=NOTE,
+        bar=bar,
+        bar_on="error" if size < COARSE else "run_s",
+    )
 
 
 def _far(problem: fem.Problem, size: float) -> Row:

@@ -108,5 +108,12 @@ def rows():
         }
         error = abs(float(state.pressure.max()) / peak - 1)
         bar = 0.02 if divisions == 48 else None
-        yield Row("sorojax", settings, **timing.columns(), reference=NOTE, error=error,
-                  bar=bar, bar_on="error")  # fmt: skip
+        yield Row(
+            "sorojax",
+            settings,
+            **timing.columns(),
+            reference=NOTE,
+            error=error,
+            bar=bar,
+            bar_on="error",
+        )

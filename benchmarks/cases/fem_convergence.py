@@ -46,6 +46,9 @@ def rows():
                 "order_of_the_functions": order,
             }
             yield Row(
-                "sorojax", settings, **timing.columns(), error=found,
+                "sorojax",
+                settings,
+                **timing.columns(),
+                error=found,
                 reference="manufactured displacement, root mean square",
-            )  # fmt: skip
+            )

@@ -55,6 +55,11 @@ def _row(problem: fem.Problem, n: int, poisson_ratio: float, bar: float | None) 
         "deviation_percent": round(100 * error, 3),
     }
     return Row(
-        "sorojax", settings, **timing.columns(), error=abs(error), reference=wanted, bar=bar,
+        "sorojax",
+        settings,
+        **timing.columns(),
+        error=abs(error),
+        reference=wanted,
+        bar=bar,
         bar_on="error",
-    )  # fmt: skip
+    )

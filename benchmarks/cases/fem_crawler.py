@@ -52,12 +52,16 @@ def _changes(problem, second: fem.Motion):
     law: Any = problem.loads[-1]
     stiffer = eqx.tree_at(
         lambda p: (p.loads[-1].stiffness, p.loads[-1].friction_stiffness),
-        problem, (2 * law.stiffness, 2 * law.friction_stiffness),
-    )  # fmt: skip
+        problem,
+        (2 * law.stiffness, 2 * law.friction_stiffness),
+    )
     rest = run(problem, 2 / FREQUENCY - 1.0, STEP, start=second)
     base = cycles(problem, second, rest)
-    yield Row("sorojax", _told("as it is", problem, base), reference="no bar: what others "
-              "are compared with")  # fmt: skip
+    yield Row(
+        "sorojax",
+        _told("as it is", problem, base),
+        reference="no bar: what others are compared with",
+    )
     halved = crawler_problem(Crawler(), size=SIZE / 2, across=2)
     coarse = crawler_problem(Crawler(), size=2 * SIZE)
     for name, case, step, count, bar in (
@@ -69,8 +73,15 @@ def _changes(problem, second: fem.Motion):
         timing, motion = timed(run, case, count / FREQUENCY, step)
         found = cycles(case, motion)
         error = float(abs(found.ways[-1] / base.ways[count - 1] - 1))
-        yield Row("sorojax", _told(name, case, found), **timing.columns(), error=error,
-                  bar=bar, bar_on="error", reference=f"cycle {count} of: as it is")  # fmt: skip
+        yield Row(
+            "sorojax",
+            _told(name, case, found),
+            **timing.columns(),
+            error=error,
+            bar=bar,
+            bar_on="error",
+            reference=f"cycle {count} of: as it is",
+        )
 
 
 def _told(name, case, found) -> dict[str, Any]:
@@ -94,8 +105,9 @@ def _slopes():
         amplitude, lag, friction, scale = theta
         given = eqx.tree_at(
             lambda p: (p.loads[-1].friction.coefficient, p.material.shear_modulus),
-            problem, (friction, scale * modulus),
-        )  # fmt: skip
+            problem,
+            (friction, scale * modulus),
+        )
         gait = crawler_gait(amplitude, lag=lag)
         motion = run(given, GRADIENT_STEPS * STEP, STEP, gait, newton=newton, save=2)
         return moved(given, motion)[-1, 0]
@@ -109,7 +121,18 @@ def _slopes():
         d = jnp.zeros(4).at[k].set(1e-4 * theta[k])
         change = float(way(theta + d) - way(theta - d)) / (2 * float(d[k]))
         errors.append(abs(slope[k] / change - 1))
-    settings = {"of": "gradient", "steps": GRADIENT_STEPS, "dof": problem.space.num_dofs,
-                "errors": [float(f"{e:.2g}") for e in errors]}  # fmt: skip
-    return Row("sorojax", settings, run_s=took, error=max(errors), bar=1e-3, bar_on="error",
-               reference="central differences")  # fmt: skip
+    settings = {
+        "of": "gradient",
+        "steps": GRADIENT_STEPS,
+        "dof": problem.space.num_dofs,
+        "errors": [float(f"{e:.2g}") for e in errors],
+    }
+    return Row(
+        "sorojax",
+        settings,
+        run_s=took,
+        error=max(errors),
+        bar=1e-3,
+        bar_on="error",
+        reference="central differences",
+    )

@@ -29,9 +29,12 @@ def beam(divisions, young_modulus=1e6, weight=9.81):
     )
     gravity = jnp.stack([jnp.zeros(()), -jnp.asarray(weight)])
     return fem.problem(
-        body, rubber, kinematics=fem.PlaneStrain(20 * mm),
-        supports=(fem.Fixed(body.node_sets["left"]),), loads=(fem.Gravity(gravity),),
-    )  # fmt: skip
+        body,
+        rubber,
+        kinematics=fem.PlaneStrain(20 * mm),
+        supports=(fem.Fixed(body.node_sets["left"]),),
+        loads=(fem.Gravity(gravity),),
+    )
 
 
 def run(problem, steps=STEPS):
@@ -102,6 +105,11 @@ def rows():
         "of": "gradient",
     }
     yield Row(
-        "sorojax", settings, **timing.columns(), reference="central differences",
-        error=max(errors), bar=1e-6, bar_on="error",
-    )  # fmt: skip
+        "sorojax",
+        settings,
+        **timing.columns(),
+        reference="central differences",
+        error=max(errors),
+        bar=1e-6,
+        bar_on="error",
+    )

@@ -58,8 +58,14 @@ def rows():
         off = abs(found["acceleration_m_s2"] - found["theory_m_s2"])
         # the error of the threshold that this error of the acceleration stands for
         error = off / (9.81 * np.cos(share * np.arctan(FRICTION)) * FRICTION)
-        yield Row("sorojax", found, error=error, bar=0.005, bar_on="error",
-                  reference="Coulomb: g (sin - mu cos)")  # fmt: skip
+        yield Row(
+            "sorojax",
+            found,
+            error=error,
+            bar=0.005,
+            bar_on="error",
+            reference="Coulomb: g (sin - mu cos)",
+        )
     yield from _far()
     if not quick("steps in motion with a far contact"):
         yield from _far_in_motion()
@@ -99,9 +105,15 @@ def _far():
     for name, timing in timed.items():
         extra = min(timing.runs) / base - 1
         bar = None if name == "none" else 0.05
-        yield Row("sorojax", {"contact": name, "dof": problem.space.num_dofs,
-                              "extra": round(extra, 4)}, **timing.columns(), error=extra,
-                  bar=bar, bar_on="error", reference="assembly without contact")  # fmt: skip
+        yield Row(
+            "sorojax",
+            {"contact": name, "dof": problem.space.num_dofs, "extra": round(extra, 4)},
+            **timing.columns(),
+            error=extra,
+            bar=bar,
+            bar_on="error",
+            reference="assembly without contact",
+        )
 
 
 def _far_in_motion(steps: int = 20, repeats: int = 9):
@@ -136,6 +148,12 @@ def _far_in_motion(steps: int = 20, repeats: int = 9):
             "extra": round(extra, 4),
         }
         timing = Timing(compile_s[name], tuple(took))
-        yield Row("sorojax", settings, **timing.columns(), error=extra,
-                  bar=None if name == "none" else 0.05, bar_on="error",
-                  reference="a step without contact")  # fmt: skip
+        yield Row(
+            "sorojax",
+            settings,
+            **timing.columns(),
+            error=extra,
+            bar=None if name == "none" else 0.05,
+            bar_on="error",
+            reference="a step without contact",
+        )

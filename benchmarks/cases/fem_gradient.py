@@ -42,9 +42,12 @@ def _rows(size: float):
     settings = {"dof": problem.space.num_dofs, "parameters": factor.size}
     count = {"factorisations": factorisations(alone)}
     yield Row(
-        "sorojax", settings | {"method": "solve"} | count, **solve.columns(), reference="",
+        "sorojax",
+        settings | {"method": "solve"} | count,
+        **solve.columns(),
+        reference="",
         error=None,
-    )  # fmt: skip
+    )
     start = fem.solve(problem, newton=tight).displacement
     gradient = np.asarray(jax.grad(height)(factor))
     way = np.random.default_rng(0).standard_normal(factor.size) * 0.1
@@ -59,10 +62,14 @@ def _rows(size: float):
         "extra_iterations": round(extra / min(iteration.runs), 2),
     }
     yield Row(
-        "sorojax", settings, **both.columns(),
+        "sorojax",
+        settings,
+        **both.columns(),
         reference="central differences of order 4 on a random direction",
-        error=abs(float(gradient @ way) / slope - 1), bar=1e-6, bar_on="error",
-    )  # fmt: skip
+        error=abs(float(gradient @ way) / slope - 1),
+        bar=1e-6,
+        bar_on="error",
+    )
 
 
 def _iteration(problem: fem.Problem):

@@ -39,10 +39,14 @@ def cylinder(size: float, stiffness: float = 1.0) -> fem.Problem:
             fem.Fixed(mesh.nodes_where(cells, lambda p: p[1] > -1e-9), components=(1,)),
         ),
         loads=(
-            fem.Contact(round_side, sdf.HalfPlane([0.0, -RADIUS], [0.0, 1.0]),
-                        10 * stiffness * YOUNG / size, name="plane"),
+            fem.Contact(
+                round_side,
+                sdf.HalfPlane([0.0, -RADIUS], [0.0, 1.0]),
+                10 * stiffness * YOUNG / size,
+                name="plane",
+            ),
         ),
-    )  # fmt: skip
+    )
     return problem
 
 
@@ -86,5 +90,12 @@ def rows():
             "errors": np.round(errors, 4).tolist(),
             "overlap_over_approach": round(overlap / float(rises[-1]), 5),
         }
-        yield Row("sorojax", settings, **timing.columns(), reference=NOTE,
-                  error=float(np.abs(errors).max()), bar=0.02, bar_on="error")  # fmt: skip
+        yield Row(
+            "sorojax",
+            settings,
+            **timing.columns(),
+            reference=NOTE,
+            error=float(np.abs(errors).max()),
+            bar=0.02,
+            bar_on="error",
+        )

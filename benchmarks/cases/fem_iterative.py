@@ -89,9 +89,14 @@ def _systems(element: mesh.AbstractElement, side: int):
         told = settings | {"iterations": factor.count(rhs)}
         error = float(np.max(np.abs(x - exact)) / np.max(np.abs(exact)))
         yield Row(
-            "sorojax", told, **timing.columns(), error=error, reference="direct solver",
-            bar=1e-8, bar_on="error",
-        )  # fmt: skip
+            "sorojax",
+            told,
+            **timing.columns(),
+            error=error,
+            reference="direct solver",
+            bar=1e-8,
+            bar_on="error",
+        )
         rough = sparse.ConjugateGradient().newton_tolerance
         told |= {"part": "Newton step", "iterations": factor.count(rhs, rough)}
         timing = cpu_timing(lambda f=factor: f.step(rhs), 3)
@@ -136,9 +141,14 @@ def _solves(name: str, problem: fem.Problem):
             "solver": solver.space.system.means,
         }
         yield Row(
-            "sorojax", settings, **timing.columns(), error=error, reference="direct solver",
-            bar=1e-9, bar_on="error",
-        )  # fmt: skip
+            "sorojax",
+            settings,
+            **timing.columns(),
+            error=error,
+            reference="direct solver",
+            bar=1e-9,
+            bar_on="error",
+        )
 
 
 def varied(problem: fem.Problem):
@@ -168,6 +178,11 @@ def _path(problem: fem.Problem):
             "solver": solver.space.system.means,
         }
         yield Row(
-            "sorojax", settings, **timing.columns(), error=error, reference="direct solver",
-            bar=1e-9, bar_on="error",
-        )  # fmt: skip
+            "sorojax",
+            settings,
+            **timing.columns(),
+            error=error,
+            reference="direct solver",
+            bar=1e-9,
+            bar_on="error",
+        )

@@ -47,10 +47,13 @@ def rows():
                 "fastest_of_each": min(runs) / min(timing.runs),
             }
             yield Row(
-                "sorojax", settings | faster, **timing.columns(), bar=median(runs) / bar,
+                "sorojax",
+                settings | faster,
+                **timing.columns(),
+                bar=median(runs) / bar,
                 error=float(jnp.max(jnp.abs(u - found)) / jnp.max(jnp.abs(u))),
                 reference=f"felupe after {ITERATIONS} iterations",
-            )  # fmt: skip
+            )
             yield Row("felupe", settings | told, 0.0, median(runs), runs[0], runs[-1])
         yield from _parts(problem, settings)
 
@@ -92,10 +95,15 @@ def _felupe(problem: fem.Problem):
     }
     try:
         return peers.call(
-            "felupe", "newton", arrays, element=problem.mesh.element.name, repeats=2,
-            iterations=ITERATIONS, mu=float(rubber.shear_modulus),  # type: ignore
+            "felupe",
+            "newton",
+            arrays,
+            element=problem.mesh.element.name,
+            repeats=2,
+            iterations=ITERATIONS,
+            mu=float(rubber.shear_modulus),  # type: ignore
             bulk=float(rubber.bulk_modulus),  # type: ignore
-        )  # fmt: skip
+        )
     except peers.PeerMissing as reason:
         return str(reason)
 

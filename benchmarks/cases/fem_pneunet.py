@@ -16,9 +16,11 @@ GAP = 0.55 * mm
 def rows():
     turns = {}
     for size, touching, stiffness in (
-        (0.8 * mm, False, 1.0), (0.8 * mm, True, 1.0), (0.8 * mm, True, 2.0),
+        (0.8 * mm, False, 1.0),
+        (0.8 * mm, True, 1.0),
+        (0.8 * mm, True, 2.0),
         (0.5 * mm, True, 1.0),
-    ):  # fmt: skip
+    ):
         problem = pneunet(size, touching, num_bellows=3)
         if touching:
             walls = problem.loads[1]
@@ -51,5 +53,12 @@ def rows():
             error = max(float(s.penetration) for s in states) / size
             bar, reference = 0.05, "overlap over the size of a cell"
             settings["change_of_turn"] = found[-1] / turns[0.8 * mm, True, 1.0] - 1
-        yield Row("sorojax", settings, **timing.columns(), reference=reference, error=error,
-                  bar=bar, bar_on="error")  # fmt: skip
+        yield Row(
+            "sorojax",
+            settings,
+            **timing.columns(),
+            reference=reference,
+            error=error,
+            bar=bar,
+            bar_on="error",
+        )

@@ -128,6 +128,11 @@ def rows():
                 "damping_ratio": round(found[1], 4),
             }
             yield Row(
-                "sorojax", settings, **timing.columns(), reference=NOTE,
-                error=float(error), bar=1.0, bar_on="error",
-            )  # fmt: skip
+                "sorojax",
+                settings,
+                **timing.columns(),
+                reference=NOTE,
+                error=float(error),
+                bar=1.0,
+                bar_on="error",
+            )

@@ -59,10 +59,14 @@ def _row(problem: fem.Problem, body: str, divisions, wanted: float, bar) -> Row:
         "iterations": solution.stats.iterations,
     }
     return Row(
-        "sorojax", settings, **timing.columns(),
-        error=abs(wall_displacement(problem, solution) / wanted - 1), reference=wanted,
-        bar=bar, bar_on="error",
-    )  # fmt: skip
+        "sorojax",
+        settings,
+        **timing.columns(),
+        error=abs(wall_displacement(problem, solution) / wanted - 1),
+        reference=wanted,
+        bar=bar,
+        bar_on="error",
+    )
 
 
 def _incompressible():

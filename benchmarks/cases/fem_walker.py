@@ -47,9 +47,13 @@ def plain(problem: fem.Problem) -> fem.Problem:
     corners = np.asarray(cells.cells)[:, :6]
     bare = mesh.Mesh(cells.points[: corners.max() + 1], corners, mesh.Tri6())
     return fem.problem(
-        bare, problem.material, kinematics=problem.kinematics, supports=(),
-        loads=problem.loads, free=True,
-    )  # fmt: skip
+        bare,
+        problem.material,
+        kinematics=problem.kinematics,
+        supports=(),
+        loads=problem.loads,
+        free=True,
+    )
 
 
 def fall(problem: fem.Problem, duration: float, step: float, **options: Any) -> fem.Motion:
@@ -65,8 +69,9 @@ def rows():
     law: Any = problem.loads[-1]
     stiffer = eqx.tree_at(
         lambda p: (p.loads[-1].stiffness, p.loads[-1].friction_stiffness),
-        problem, (2 * law.stiffness, 2 * law.friction_stiffness),
-    )  # fmt: skip
+        problem,
+        (2 * law.stiffness, 2 * law.friction_stiffness),
+    )
     finer = walker_problem(walker, size=FINE)
     for name, case, step, bar in (
         ("as it is", problem, STEP, None),
@@ -97,6 +102,15 @@ def rows():
             "iterations": round(motion.stats.iterations / motion.stats.steps, 1),
             "cuts": motion.stats.cuts,
         }
-        yield Row("sorojax", settings, ready - start, took, took, took,
-                  float(abs(found.mean() / base - 1)), "frequency of the first row", bar,
-                  "error")  # fmt: skip
+        yield Row(
+            "sorojax",
+            settings,
+            ready - start,
+            took,
+            took,
+            took,
+            float(abs(found.mean() / base - 1)),
+            "frequency of the first row",
+            bar,
+            "error",
+        )

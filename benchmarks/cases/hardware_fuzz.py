@@ -36,16 +36,23 @@ class _Valves:
 
 def rows():
     for name, attack in (
-        ("board, framed", _framed), ("board, raw stream", _raw), ("client", _client)
-    ):  # fmt: skip
+        ("board, framed", _framed),
+        ("board, raw stream", _raw),
+        ("client", _client),
+    ):
         start = process_time()
         escaped, forged, held, outside = attack(random.Random(0))
         settings_ = {"decoder": name, "streams": STREAMS, "most_bytes_held": held}
         yield Row(
-            "sorojax", settings_, 0.0, *(3 * [(process_time() - start) / STREAMS]),
-            error=float(escaped + forged + outside), bar=0.0, bar_on="error",
+            "sorojax",
+            settings_,
+            0.0,
+            *(3 * [(process_time() - start) / STREAMS]),
+            error=float(escaped + forged + outside),
+            bar=0.0,
+            bar_on="error",
             reference="exceptions, forged frames and commands outside the limits",
-        )  # fmt: skip
+        )
 
 
 def _mutated(dice: random.Random, frames: list[bytes]) -> bytes:

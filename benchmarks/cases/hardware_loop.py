@@ -37,8 +37,16 @@ def rows():
 
 def _estimator():
     """Markers of a bent finger, frame by frame, and the compiled estimate."""
-    finger = rod(SE2(), chebyshev(kappa_z=3), circle(6e-3), length=0.08, young_modulus=1e6,
-                 poisson_ratio=0.3, density=1100.0, nodes=8)  # fmt: skip
+    finger = rod(
+        SE2(),
+        chebyshev(kappa_z=3),
+        circle(6e-3),
+        length=0.08,
+        young_modulus=1e6,
+        poisson_ratio=0.3,
+        density=1100.0,
+        nodes=8,
+    )
     markers = Markers(finger, S)
     bends = 12 * np.sin(np.linspace(0, 2 * np.pi, 64))
     frames = [
@@ -66,10 +74,15 @@ def _loop(port: int) -> Row:
         before, spent = _processors(), process_time()
         ticks = list(
             run_loop(
-                board, WallClock(), controller, start, duration=DURATION, period=1 / RATE,
+                board,
+                WallClock(),
+                controller,
+                start,
+                duration=DURATION,
+                period=1 / RATE,
                 limits=(0.0, 50e3),
             )
-        )  # fmt: skip
+        )
         used, spent = _used(before), process_time() - spent
         refused, late, state = board.report.refused, board.late, board.report
     report = deadlines(ticks, 1 / RATE)
@@ -83,10 +96,16 @@ def _loop(port: int) -> Row:
         "p50_period_error": float(np.median(error)),
     }  # fmt: skip
     return Row(
-        "sorojax", settings, 0.0, float(np.percentile(error, 99)), float(error.min()),
-        float(error.max()), error=float(report.num_skipped + refused), bar=BAR,
+        "sorojax",
+        settings,
+        0.0,
+        float(np.percentile(error, 99)),
+        float(error.min()),
+        float(error.max()),
+        error=float(report.num_skipped + refused),
+        bar=BAR,
         reference="99th percentile of the error of a period; error: samples lost",
-    )  # fmt: skip
+    )
 
 
 def _processors() -> np.ndarray | None:

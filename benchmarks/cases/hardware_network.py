@@ -27,16 +27,28 @@ while True:
 
 
 def rows():
-    for kind in ("client killed", "network cut", "network frozen", "network delayed",
-                 "server ended"):  # fmt: skip
+    for kind in (
+        "client killed",
+        "network cut",
+        "network frozen",
+        "network delayed",
+        "server ended",
+    ):
         found = [_once(kind) for _ in range(TIMES)]
         took = [seconds for seconds, _ in found]
         told = sorted({reason for _, reason in found})
         yield Row(
-            "sorojax", {"failure": kind, "runs": TIMES, "told": told}, 0.0, median(took),
-            min(took), max(took), error=max(took), bar=BAR, bar_on="error",
+            "sorojax",
+            {"failure": kind, "runs": TIMES, "told": told},
+            0.0,
+            median(took),
+            min(took),
+            max(took),
+            error=max(took),
+            bar=BAR,
+            bar_on="error",
             reference="from the failure to 0.5 kPa, worst run [s]",
-        )  # fmt: skip
+        )
 
 
 def _once(kind: str) -> tuple[float, str]:

@@ -33,13 +33,29 @@ def rows():
         }
         run = (process_time() - start) / sum(count.values())
         yield Row(
-            "sorojax", settings, 0.0, run, run, run, error=refused, bar=most, bar_on="error",
+            "sorojax",
+            settings,
+            0.0,
+            run,
+            run,
+            run,
+            error=refused,
+            bar=most,
+            bar_on="error",
             reference="share of ordinary bodies that are refused",
-        )  # fmt: skip
+        )
         yield Row(
-            "sorojax", settings, 0.0, run, run, run, error=float(wrong), bar=0.0,
-            bar_on="error", reference="exceptions, errors without thickness, too much memory",
-        )  # fmt: skip
+            "sorojax",
+            settings,
+            0.0,
+            run,
+            run,
+            run,
+            error=float(wrong),
+            bar=0.0,
+            bar_on="error",
+            reference="exceptions, errors without thickness, too much memory",
+        )
 
     yield from _parts()
 
@@ -70,9 +86,14 @@ def _parts():
         angle = round(float(np.rad2deg(quality.min_angle)), 1)
         settings |= {"tetrahedra": quality.num_cells, "dihedral_deg": angle}
         yield Row(
-            "sorojax", settings, runs[0] - runs[1], *(3 * [runs[1]]),
-            error=abs(quality.area / body.volume - 1), reference="the volume", bar=PART_BAR,
-        )  # fmt: skip
+            "sorojax",
+            settings,
+            runs[0] - runs[1],
+            *(3 * [runs[1]]),
+            error=abs(quality.area / body.volume - 1),
+            reference="the volume",
+            bar=PART_BAR,
+        )
 
 
 def _random(dim: int, kinds: int, each: int, sizes) -> collections.Counter:

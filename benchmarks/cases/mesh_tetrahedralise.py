@@ -25,9 +25,13 @@ def rows():
         quality = mesh.quality(made[-1])
         volume = 4 / 3 * np.pi * (outer**3 - inner**3)
         yield Row(
-            "sorojax", _shape_numbers(name, quality), **timing.columns(),
-            error=abs(quality.area / volume - 1), reference="the volume", bar=bar,
-        )  # fmt: skip
+            "sorojax",
+            _shape_numbers(name, quality),
+            **timing.columns(),
+            error=abs(quality.area / volume - 1),
+            reference="the volume",
+            bar=bar,
+        )
         yield _gmsh(name, volume)
 
 
@@ -48,6 +52,12 @@ def _gmsh(name: str, volume: float) -> Row:
     quality = mesh.quality(mesh.Mesh(found["points"], found["cells"], mesh.Tet4()))
     runs = sorted(answer["runs"])
     return Row(
-        "gmsh", _shape_numbers(name, quality) | {"version": answer["version"]}, 0.0,
-        runs[len(runs) // 2], runs[0], runs[-1], abs(quality.area / volume - 1), "the volume",
-    )  # fmt: skip
+        "gmsh",
+        _shape_numbers(name, quality) | {"version": answer["version"]},
+        0.0,
+        runs[len(runs) // 2],
+        runs[0],
+        runs[-1],
+        abs(quality.area / volume - 1),
+        "the volume",
+    )

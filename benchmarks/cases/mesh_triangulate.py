@@ -51,10 +51,15 @@ def _gmsh(size: float) -> Row:
     quality = mesh.quality(mesh.Mesh(found["points"], found["cells"], mesh.Tri3()))
     runs = sorted(answer["runs"])
     return Row(
-        "gmsh", _shape_numbers(quality) | {"version": answer["version"]}, 0.0,
-        runs[len(runs) // 2], runs[0], runs[-1], abs(quality.area / AREA - 1),
+        "gmsh",
+        _shape_numbers(quality) | {"version": answer["version"]},
+        0.0,
+        runs[len(runs) // 2],
+        runs[0],
+        runs[-1],
+        abs(quality.area / AREA - 1),
         "the area 832 mm^2",
-    )  # fmt: skip
+    )
 
 
 def rows():

@@ -17,6 +17,10 @@ def rows():
             timing = measure_calls(lambda k=asked, s=single: evaluate(k, s))
             checked = {"error": error(asked), "bar": asked.bound} if single else {}
             yield Row(
-                "sorojax", settings | {"precision": name}, **timing.columns(), **checked,
-                bar_on="error", reference="the same kernel in double precision",
-            )  # fmt: skip
+                "sorojax",
+                settings | {"precision": name},
+                **timing.columns(),
+                **checked,
+                bar_on="error",
+                reference="the same kernel in double precision",
+            )

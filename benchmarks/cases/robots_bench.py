@@ -24,17 +24,29 @@ def rows():
     for robot in ROBOTS:
         code = "import sys; from benchmarks.cases.robots_bench import told; told(sys.argv[1])"
         own = {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
-        run = subprocess.run([sys.executable, "-c", code, robot], check=True, text=True,
-                             stdout=subprocess.PIPE, env=os.environ | own)  # fmt: skip
+        run = subprocess.run(
+            [sys.executable, "-c", code, robot],
+            check=True,
+            text=True,
+            stdout=subprocess.PIPE,
+            env=os.environ | own,
+        )
         yield _row(robot, **json.loads(run.stdout.splitlines()[-1]))
 
 
 def _row(robot: str, first, run, ports, off, state) -> Row:
     settings = {"robot": robot, "ports": ports, "off_setpoint": off, "real_time": run < BAR}
     return Row(
-        "sorojax", settings, first, run, run, run, error=float(state != "VENTED"), bar=BAR,
+        "sorojax",
+        settings,
+        first,
+        run,
+        run,
+        run,
+        error=float(state != "VENTED"),
+        bar=BAR,
         reference="CPU seconds per simulated second; error: the board tripped",
-    )  # fmt: skip
+    )
 
 
 def told(robot: str) -> None:
@@ -52,10 +64,16 @@ def told(robot: str) -> None:
         return 0.5 * high * (1 - np.cos(2 * np.pi * t + 0.5 * phase)), state
 
     start, late = time.process_time(), []
-    for tick in run_loop(board, clock, wave, None, duration=DURATION, period=PERIOD,
-                         limits=(low, high)):  # fmt: skip
+    for tick in run_loop(
+        board, clock, wave, None, duration=DURATION, period=PERIOD, limits=(low, high)
+    ):
         late.append(float(np.max(np.abs(tick.pressure - tick.setpoint))))
     run = (time.process_time() - start) / DURATION
-    found = {"first": first, "run": run, "ports": len(high), "off": max(late),
-             "state": board.board.state.name}  # fmt: skip
+    found = {
+        "first": first,
+        "run": run,
+        "ports": len(high),
+        "off": max(late),
+        "state": board.board.state.name,
+    }
     print(json.dumps(found))

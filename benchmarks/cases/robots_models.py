@@ -28,10 +28,20 @@ def rows():
     ):
         solid, found = study(pressures)
         for pressure, true, got in zip(pressures, solid, found, strict=True):
-            settings = {"what": name, "pressure": f"{pressure / kPa:g} kPa", "solid": true,
-                        "rod": got}  # fmt: skip
-            yield Row("sorojax", settings, error=abs(got / true - 1), bar=BAR, bar_on="error",
-                      reference="fem.solve_path of the whole body")  # fmt: skip
+            settings = {
+                "what": name,
+                "pressure": f"{pressure / kPa:g} kPa",
+                "solid": true,
+                "rod": got,
+            }
+            yield Row(
+                "sorojax",
+                settings,
+                error=abs(got / true - 1),
+                bar=BAR,
+                bar_on="error",
+                reference="fem.solve_path of the whole body",
+            )
 
 
 def bellows(pressures) -> tuple[np.ndarray, np.ndarray]:
@@ -59,8 +69,15 @@ def bellows(pressures) -> tuple[np.ndarray, np.ndarray]:
     moved = np.asarray(path.displacements)[:, ends, 1]
     solid = (moved[:, 1] - moved[:, 0]) / float(part.num_folds * part.pitch)
     cell = bellows_cell(part, rubber)
-    made = body(SE2(), rod.constant("sigma_x"), side_by_side(cell, jnp.zeros((1, 2)), 1.0), 1.0,
-                rubber, damping=0.0, single=False)  # fmt: skip
+    made = body(
+        SE2(),
+        rod.constant("sigma_x"),
+        side_by_side(cell, jnp.zeros((1, 2)), 1.0),
+        1.0,
+        rubber,
+        damping=0.0,
+        single=False,
+    )
     return solid, np.array([float(_rest(made, jnp.full(1, p))[0]) for p in pressures])
 
 
@@ -89,10 +106,23 @@ def bending(pressures) -> tuple[np.ndarray, np.ndarray]:
     across = points[:, high] - points[:, low]
     turned = np.arctan2(across[:, 0], across[:, 2])
     pitch = float(part.pitch)
-    cell = unit_cell(solid, air, (1.5 * pitch, 2 * pitch), rubber,
-                     size=float(part.wall_thickness) / 2, mirrors=(1,))  # fmt: skip
-    made = body(SE2(), rod.chebyshev(kappa_z=3, sigma_x=1), column(cell), length - pitch,
-                rubber, damping=0.0, plane=2)  # fmt: skip
+    cell = unit_cell(
+        solid,
+        air,
+        (1.5 * pitch, 2 * pitch),
+        rubber,
+        size=float(part.wall_thickness) / 2,
+        mirrors=(1,),
+    )
+    made = body(
+        SE2(),
+        rod.chebyshev(kappa_z=3, sigma_x=1),
+        column(cell),
+        length - pitch,
+        rubber,
+        damping=0.0,
+        plane=2,
+    )
     turns = [rod.tip_angle(rod.motion(made.rod, _rest(made, p))) for p in pressures]
     return turned, -np.array(turns, float)
 
@@ -127,8 +157,10 @@ def _tetrahedra(part: BendingActuator, solid: sdf.AbstractSdf) -> mesh.Mesh:
     counts = (len(x) - 1, len(y) - 1, len(z) - 1)
     grid = mesh.box([0.0] * 3, [float(n) for n in counts], divisions=counts, element=Tet10())
     at = np.asarray(grid.points)
-    points = np.stack([np.interp(at[:, k], np.arange(len(line)), line)
-                       for k, line in enumerate(lines)], axis=1)  # fmt: skip
+    points = np.stack(
+        [np.interp(at[:, k], np.arange(len(line)), line) for k, line in enumerate(lines)],
+        axis=1,
+    )
     cells = np.asarray(grid.cells)
     middle = points[cells[:, :4]].mean(axis=1)
     kept = cells[np.asarray(sdf.evaluate(solid, jnp.asarray(middle))) < 0]

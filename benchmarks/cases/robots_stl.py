@@ -19,9 +19,11 @@ STL = 2e-8  # m, rounding of a coordinate of 0.2 m in single precision, on both 
 #: Thinnest wall asked for, and the smallest radius of a wall that bulges [m]: of its folds, 0.9
 #: of half their heights.
 WALLS = {
-    robots.BendingActuator: (1.6 * mm, np.inf), robots.PlanarActuator: (1.2 * mm, 2.16 * mm),
-    robots.Hand: (1.2 * mm, 2.25 * mm), robots.Manipulator: (1.2 * mm, 2.16 * mm),
-}  # fmt: skip
+    robots.BendingActuator: (1.6 * mm, np.inf),
+    robots.PlanarActuator: (1.2 * mm, 2.16 * mm),
+    robots.Hand: (1.2 * mm, 2.25 * mm),
+    robots.Manipulator: (1.2 * mm, 2.16 * mm),
+}
 
 
 def rows():
@@ -43,18 +45,36 @@ def _checked(kind, wall: float, radius: float, folder: Path):
         "thinnest_wall": report.wall_thickness,
     }  # fmt: skip
     wrong = float(not report.manifold) + len(report.crossings)
-    yield Row("sorojax", settings | {"what": "open, crowded, turned, pinched, crossing"}, 0.0,
-              seconds, seconds, seconds, error=wrong, bar=0.0, bar_on="error",
-              reference="the file read back")  # fmt: skip
+    yield Row(
+        "sorojax",
+        settings | {"what": "open, crowded, turned, pinched, crossing"},
+        0.0,
+        seconds,
+        seconds,
+        seconds,
+        error=wrong,
+        bar=0.0,
+        bar_on="error",
+        reference="the file read back",
+    )
     lost = _inscribed(radius)
-    yield Row("sorojax", {"robot": name, "what": "wall missing [m]", "smallest_radius": radius},
-              error=max(wall - report.wall_thickness, 0.0),
-              bar=min(lost, MOST_LOST * wall), bar_on="error",
-              reference=f"{wall / mm:g} mm asked for")  # fmt: skip
+    yield Row(
+        "sorojax",
+        {"robot": name, "what": "wall missing [m]", "smallest_radius": radius},
+        error=max(wall - report.wall_thickness, 0.0),
+        bar=min(lost, MOST_LOST * wall),
+        bar_on="error",
+        reference=f"{wall / mm:g} mm asked for",
+    )
     volume = float(sdf.volume(body, RESOLUTION))
-    yield Row("sorojax", {"robot": name, "what": "volume [m^3]", "volume": volume},
-              error=abs(report.volume / volume - 1), bar=VOLUME_BAR, bar_on="error",
-              reference=f"quadrature of the drawing, {RESOLUTION} cells")  # fmt: skip
+    yield Row(
+        "sorojax",
+        {"robot": name, "what": "volume [m^3]", "volume": volume},
+        error=abs(report.volume / volume - 1),
+        bar=VOLUME_BAR,
+        bar_on="error",
+        reference=f"quadrature of the drawing, {RESOLUTION} cells",
+    )
 
 
 def _inscribed(radius: float) -> float:

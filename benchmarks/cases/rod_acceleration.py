@@ -50,12 +50,22 @@ def rows():
         off = error({"a": at(rod, q, v)})
         for by, timing in timings.items():
             yield Row(
-                "sorojax", {"nodes": nodes, "by": by}, **timing.per(CALLS).columns(),
-                error=off, reference=REFERENCE,
+                "sorojax",
+                {"nodes": nodes, "by": by},
+                **timing.per(CALLS).columns(),
+                error=off,
+                reference=REFERENCE,
                 bar=BAR if nodes == 8 else None,
-            )  # fmt: skip
+            )
     for nodes in (8,) if quick("soromox with 12 nodes") else (8, 12):
         yield peers.row(
-            "soromox", "acceleration", {"q": q, "v": v}, error, REFERENCE,
-            nodes=nodes, modes=MODES, calls=CALLS, repeats=5,
-        )  # fmt: skip
+            "soromox",
+            "acceleration",
+            {"q": q, "v": v},
+            error,
+            REFERENCE,
+            nodes=nodes,
+            modes=MODES,
+            calls=CALLS,
+            repeats=5,
+        )

@@ -26,6 +26,11 @@ def rows():
             size = LENGTH if name == "tip" else jnp.abs(fine[name]).max()
             error = float(jnp.abs(verb(rod) - fine[name]).max() / size)
             yield Row(
-                "sorojax", {"nodes": nodes, "verb": name}, **timing.columns(), error=error,
-                reference=REFERENCE, bar=BARS[name] if nodes == 8 else None, bar_on="error",
-            )  # fmt: skip
+                "sorojax",
+                {"nodes": nodes, "verb": name},
+                **timing.columns(),
+                error=error,
+                reference=REFERENCE,
+                bar=BARS[name] if nodes == 8 else None,
+                bar_on="error",
+            )

@@ -28,9 +28,15 @@ PLANAR_BAR = 0.45  # share of the spatial acceleration
 
 def planar_finger():
     return rod(
-        SE2(), chebyshev(kappa_z=MODES), circle(6 * mm), length=LENGTH,
-        young_modulus=1 * MPa, poisson_ratio=0.3, density=2000.0, nodes=8,
-    )  # fmt: skip
+        SE2(),
+        chebyshev(kappa_z=MODES),
+        circle(6 * mm),
+        length=LENGTH,
+        young_modulus=1 * MPa,
+        poisson_ratio=0.3,
+        density=2000.0,
+        nodes=8,
+    )
 
 
 def fingers(radii):
@@ -38,9 +44,15 @@ def fingers(radii):
 
     def one(radius):
         return rod(
-            SE3(), chebyshev(kappa_y=MODES, kappa_z=MODES), circle(radius), length=LENGTH,
-            young_modulus=1 * MPa, poisson_ratio=0.3, density=2000.0, nodes=8,
-        )  # fmt: skip
+            SE3(),
+            chebyshev(kappa_y=MODES, kappa_z=MODES),
+            circle(radius),
+            length=LENGTH,
+            young_modulus=1 * MPa,
+            poisson_ratio=0.3,
+            density=2000.0,
+            nodes=8,
+        )
 
     return jax.vmap(one)(radii)
 
@@ -77,9 +89,11 @@ def compared(timings: dict[str, Timing], by: str):
     times = {name: timing.per(CALLS).columns() for name, timing in timings.items()}
     yield Row("sorojax", {"dof": 6, "states": 1, "by": by}, **times["spatial"])
     yield Row(
-        "sorojax", {"dof": 3, "states": 1, "by": by}, **times["planar"],
+        "sorojax",
+        {"dof": 3, "states": 1, "by": by},
+        **times["planar"],
         bar=PLANAR_BAR * times["spatial"]["run_s"],
-    )  # fmt: skip
+    )
 
 
 def rows():
@@ -90,8 +104,9 @@ def rows():
             "spatial": lambda both: loop(both[0], q[0], v[0]),
             "planar": lambda both: loop(both[1], q[0, :MODES], v[0, :MODES]),
         },
-        (spatial, planar), repeats=15,
-    )  # fmt: skip
+        (spatial, planar),
+        repeats=15,
+    )
     yield from compared(alone, "jax.jit")
     programs = {
         "spatial": functools.partial(jit(loop), spatial, q[0], v[0]),
@@ -101,11 +116,14 @@ def rows():
     batches = {"vmap": together, "forward_dynamics": by_door}
     for name, timing in measure_together(batches, spatial, q, v, repeats=60).items():
         yield Row(
-            "sorojax", {"dof": 6, "states": STATES, "by": name},
-            **timing.per(STATES).columns(), bar=ITEM_BAR,
-        )  # fmt: skip
+            "sorojax",
+            {"dof": 6, "states": STATES, "by": name},
+            **timing.per(STATES).columns(),
+            bar=ITEM_BAR,
+        )
     rods = fingers(jnp.linspace(4 * mm, 8 * mm, STATES))
     yield Row(
-        "sorojax", {"dof": 6, "rods": STATES, "by": "batched"},
+        "sorojax",
+        {"dof": 6, "rods": STATES, "by": "batched"},
         **measure(many_rods, rods, q, v, repeats=60).per(STATES).columns(),
-    )  # fmt: skip
+    )

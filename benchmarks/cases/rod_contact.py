@@ -73,9 +73,16 @@ def coiling(stiffness):
     """
     radius = 3e-3
     rod = make_rod(
-        SE2(), chebyshev(kappa_z=3), circle(radius), length=0.2, young_modulus=1e6,
-        poisson_ratio=0.3, density=2000.0, nodes=20, rest_strain=[34.0, 1.0, 0.0],
-    )  # fmt: skip
+        SE2(),
+        chebyshev(kappa_z=3),
+        circle(radius),
+        length=0.2,
+        young_modulus=1e6,
+        poisson_ratio=0.3,
+        density=2000.0,
+        nodes=20,
+        rest_strain=[34.0, 1.0, 0.0],
+    )
     law = LinePenalty(stiffness, smoothing=6e-6)
     contact = SelfContact(radius=radius, law=law, points=96)
     q = jnp.array([-9.0, 4.0, 0.5])
@@ -122,9 +129,13 @@ def rows():
     for name, scene in (("stone", lying), ("fall", fallen)):
         largest, mean = doubled(scene)
         yield Row(
-            "sorojax", {"scene": name, "points": "32, 64", "mean": round(mean, 5)},
-            error=largest, reference="travel", bar=DOUBLED_BAR, bar_on="error",
-        )  # fmt: skip
+            "sorojax",
+            {"scene": name, "points": "32, 64", "mean": round(mean, 5)},
+            error=largest,
+            reference="travel",
+            bar=DOUBLED_BAR,
+            bar_on="error",
+        )
     rod = finger(8)
     q = jnp.zeros(rod.basis.num_dof)
     cases = (("none", None), ("far", -0.2), ("itself", "itself"), ("met", -0.015))
@@ -150,6 +161,11 @@ def compared(timings, steps, settings):
         extra, timing = min(timing.runs) / plain - 1, timing.per(steps)
         is_barred = name == "far" and not settings
         yield Row(
-            "sorojax", {"obstacle": name} | settings, **timing.columns(), error=extra,
-            reference="extra over none", bar=BAR if is_barred else None, bar_on="error",
-        )  # fmt: skip
+            "sorojax",
+            {"obstacle": name} | settings,
+            **timing.columns(),
+            error=extra,
+            reference="extra over none",
+            bar=BAR if is_barred else None,
+            bar_on="error",
+        )

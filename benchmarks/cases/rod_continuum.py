@@ -44,9 +44,15 @@ CABLES = ((10, "implicitfast", 2e-4), (20, "RK4", 2e-4), (40, "RK4", 1e-4))
 def finger(bend, stretch, shear):
     basis = chebyshev(kappa_z=bend, sigma_x=stretch, sigma_y=shear)
     return rod(
-        SE2(), basis, circle(6 * mm, shear_factor=27 / 28), length=LENGTH,
-        young_modulus=1 * MPa, poisson_ratio=0.3, density=2000.0, nodes=bend + 5,
-    )  # fmt: skip
+        SE2(),
+        basis,
+        circle(6 * mm, shear_factor=27 / 28),
+        length=LENGTH,
+        young_modulus=1 * MPa,
+        poisson_ratio=0.3,
+        density=2000.0,
+        nodes=bend + 5,
+    )
 
 
 def tips(body, q):
@@ -60,9 +66,15 @@ def stepped(step):
     def run(body):
         rest = jnp.zeros(body.basis.num_dof)
         path = rollout(
-            body, rest, rest, (Gravity(),), step=step, saves=SAVES, every=round(SAVE / step),
+            body,
+            rest,
+            rest,
+            (Gravity(),),
+            step=step,
+            saves=SAVES,
+            every=round(SAVE / step),
             stepper=GeneralisedAlpha(1.0),
-        )  # fmt: skip
+        )
         return tips(body, path.q[1:])
 
     return run
@@ -72,11 +84,17 @@ def stepped(step):
 def reference(body):
     rest = jnp.zeros(body.basis.num_dof)
     solution = dfx.diffeqsolve(
-        dfx.ODETerm(vector_field(body, (Gravity(),))), dfx.Dopri8(), 0.0, DURATION, 1e-5,
-        (rest, rest), saveat=dfx.SaveAt(ts=jnp.arange(1, SAVES + 1) * SAVE),
-        max_steps=1_000_000, adjoint=dfx.ForwardMode(),
+        dfx.ODETerm(vector_field(body, (Gravity(),))),
+        dfx.Dopri8(),
+        0.0,
+        DURATION,
+        1e-5,
+        (rest, rest),
+        saveat=dfx.SaveAt(ts=jnp.arange(1, SAVES + 1) * SAVE),
+        max_steps=1_000_000,
+        adjoint=dfx.ForwardMode(),
         stepsize_controller=dfx.PIDController(rtol=1e-9, atol=1e-9),
-    )  # fmt: skip
+    )
     assert solution.ys is not None
     return tips(body, solution.ys[0])
 
@@ -96,9 +114,14 @@ def rows():
         timing = measure(run, body, repeats=5, keep=programs.append)
         settings = {"modes": modes, "step": step}
         yield Row(
-            "sorojax", settings, **timing.columns(), error=error(programs[0](body)),
-            reference=REFERENCE, bar=ERROR_BAR, bar_on="error",
-        )  # fmt: skip
+            "sorojax",
+            settings,
+            **timing.columns(),
+            error=error(programs[0](body)),
+            reference=REFERENCE,
+            bar=ERROR_BAR,
+            bar_on="error",
+        )
         if number == 0:
             settings |= {"bar": "time"}
             yield Row("sorojax", settings, **timing.columns(), bar=TIME_BAR)
@@ -110,8 +133,25 @@ def _peers(error):
     some = slice(1, 2) if quick("peers but with 20 elements or links") else slice(None)
     common = {"duration": DURATION, "save_dt": SAVE, "repeats": 3}
     for elements, share in ELASTICA[some]:
-        yield peers.row("pyelastica", "simulation", {}, error, REFERENCE,
-                        elements=elements, share=share, **common)  # fmt: skip
+        yield peers.row(
+            "pyelastica",
+            "simulation",
+            {},
+            error,
+            REFERENCE,
+            elements=elements,
+            share=share,
+            **common,
+        )
     for links, method, dt in CABLES[some]:
-        yield peers.row("mujoco", "simulation", {}, error, REFERENCE,
-                        links=links, method=method, dt=dt, **common)  # fmt: skip
+        yield peers.row(
+            "mujoco",
+            "simulation",
+            {},
+            error,
+            REFERENCE,
+            links=links,
+            method=method,
+            dt=dt,
+            **common,
+        )

@@ -30,9 +30,15 @@ def own(rod, stepper, step):
     """Tips by a fixed-step method (times, 3) [m]."""
     rest, constants = jnp.zeros(rod.basis.num_dof), operators(rod)
     path = rollout(
-        rod, rest, rest, FORCES, step=step, saves=SAVES, every=round(SAVE / step),
+        rod,
+        rest,
+        rest,
+        FORCES,
+        step=step,
+        saves=SAVES,
+        every=round(SAVE / step),
         stepper=stepper,
-    )  # fmt: skip
+    )
     return jax.vmap(lambda q: tip(rod, constants, q))(path.q[1:])
 
 
@@ -43,11 +49,17 @@ def reference():
 
     def solve(rod):
         solution = dfx.diffeqsolve(
-            dfx.ODETerm(vector_field(rod, FORCES)), dfx.Dopri8(), 0.0, DURATION, 1e-4,
-            (rest, rest), saveat=dfx.SaveAt(ts=jnp.arange(1, SAVES + 1) * SAVE),
+            dfx.ODETerm(vector_field(rod, FORCES)),
+            dfx.Dopri8(),
+            0.0,
+            DURATION,
+            1e-4,
+            (rest, rest),
+            saveat=dfx.SaveAt(ts=jnp.arange(1, SAVES + 1) * SAVE),
             stepsize_controller=dfx.PIDController(rtol=1e-10, atol=1e-10),
-            max_steps=1_000_000, adjoint=dfx.ForwardMode(),
-        )  # fmt: skip
+            max_steps=1_000_000,
+            adjoint=dfx.ForwardMode(),
+        )
         assert solution.ys is not None
         return jax.vmap(lambda q: tip(rod, operators(rod), q))(solution.ys[0])
 
@@ -73,6 +85,8 @@ def rows():
                 yield Row(
                     "sorojax",
                     {"nodes": 8, "method": type(stepper).__name__, "step": h, "by": by},
-                    **timing.columns(), error=float(np.sqrt(np.mean(distance**2))),
-                    reference=REFERENCE, bar=BAR if barred else None,
-                )  # fmt: skip
+                    **timing.columns(),
+                    error=float(np.sqrt(np.mean(distance**2))),
+                    reference=REFERENCE,
+                    bar=BAR if barred else None,
+                )

@@ -31,9 +31,15 @@ STEPS = (
 def path(rod, stepper, step):
     rest = jnp.zeros(rod.basis.num_dof)
     run = rollout(
-        rod, rest, rest, (Gravity(),), step=step, saves=round(DURATION / SAVE),
-        every=round(SAVE / step), stepper=stepper,
-    )  # fmt: skip
+        rod,
+        rest,
+        rest,
+        (Gravity(),),
+        step=step,
+        saves=round(DURATION / SAVE),
+        every=round(SAVE / step),
+        stepper=stepper,
+    )
     return run.q, run.v
 
 
@@ -53,6 +59,11 @@ def rows():
         timing = measure(run, rod, repeats=2)
         settings = {"nodes": 8, "method": type(stepper).__name__, "step": h}
         yield Row(
-            "sorojax", settings, **timing.columns(), error=drift(rod, *jax.jit(run)(rod)),
-            reference=REFERENCE, bar=bar, bar_on="error",
-        )  # fmt: skip
+            "sorojax",
+            settings,
+            **timing.columns(),
+            error=drift(rod, *jax.jit(run)(rod)),
+            reference=REFERENCE,
+            bar=bar,
+            bar_on="error",
+        )

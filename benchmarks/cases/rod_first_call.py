@@ -36,9 +36,12 @@ BARS = {"build": 0.1, "acceleration": 2.5, "acceleration from the cache": 0.4}
 def once(cache: str) -> dict[str, float]:
     """Seconds of each part in a process of its own."""
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM], env=os.environ | {"SOROJAX_CACHE": cache},
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        [sys.executable, "-c", PROGRAM],
+        env=os.environ | {"SOROJAX_CACHE": cache},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     return json.loads(done.stdout.splitlines()[-1])
 
 
@@ -52,6 +55,10 @@ def rows():
         seconds["acceleration from the cache"].append(second["acceleration"])
     for name, runs in seconds.items():
         yield Row(
-            "sorojax", {"first": name}, run_s=statistics.median(runs), run_s_min=min(runs),
-            run_s_max=max(runs), bar=BARS[name],
-        )  # fmt: skip
+            "sorojax",
+            {"first": name},
+            run_s=statistics.median(runs),
+            run_s_min=min(runs),
+            run_s_max=max(runs),
+            bar=BARS[name],
+        )

@@ -56,9 +56,15 @@ def spaghetti():
     )
     unit = Section(1.0, 10.0, 10.0, 10.0, 1.0)
     beam = rod(
-        SE3(), basis, unit, length=LENGTH, young_modulus=1.0, poisson_ratio=0.0, density=1.0,
+        SE3(),
+        basis,
+        unit,
+        length=LENGTH,
+        young_modulus=1.0,
+        poisson_ratio=0.0,
+        density=1.0,
         nodes=NODES,
-    )  # fmt: skip
+    )
     constants = operators(beam)
     shapes, weights = constants.strain_rows, constants.weights
     gram = jnp.einsum("aqm,q,aqn->amn", shapes, weights, shapes)
@@ -72,9 +78,15 @@ def fly(model, forces, stepper, step):
     """Momenta from the end of the pulse on, every half second."""
     zero = jnp.zeros(num_dof(model))
     path = rollout(
-        model, rest(model), zero, forces, step=step, saves=20, every=round(0.5 / step),
+        model,
+        rest(model),
+        zero,
+        forces,
+        step=step,
+        saves=20,
+        every=round(0.5 / step),
         stepper=stepper,
-    )  # fmt: skip
+    )
     return jax.vmap(lambda q, v: momentum(model, q, v))(path.q[10:], path.v[10:])
 
 
@@ -94,6 +106,11 @@ def rows():
         settings = {"dof": num_dof(model), "method": type(stepper).__name__, "step": h}
         barred = isinstance(stepper, DormandPrince)
         yield Row(
-            "sorojax", settings, **timing.columns(), error=drift(jax.jit(run)(model)),
-            reference=REFERENCE, bar=BAR if barred else None, bar_on="error",
-        )  # fmt: skip
+            "sorojax",
+            settings,
+            **timing.columns(),
+            error=drift(jax.jit(run)(model)),
+            reference=REFERENCE,
+            bar=BAR if barred else None,
+            bar_on="error",
+        )

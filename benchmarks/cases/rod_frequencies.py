@@ -29,9 +29,13 @@ def rows():
     spatial = finger(8)
     for modes in (3, 4, 5, 6):
         beam = rod(
-            SE2(), chebyshev(kappa_z=modes), spatial.section, spatial.material, length=LENGTH,
+            SE2(),
+            chebyshev(kappa_z=modes),
+            spatial.section,
+            spatial.material,
+            length=LENGTH,
             nodes=modes + 8,
-        )  # fmt: skip
+        )
         # The rotary inertia goes with the section, the stiffness with E I: scale them apart.
         thin = replace(beam, lambda r: r.section.second_moment_z, 1e-15)
         ratio = beam.section.second_moment_z / 1e-15
@@ -43,7 +47,11 @@ def rows():
         for number in (1, 2):
             error = abs(float(found[number - 1]) / EXACT[number - 1] - 1)
             yield Row(
-                "sorojax", {"modes": modes, "frequency": number}, **timing.columns(),
-                error=error, reference=REFERENCE, bar=BARS[number] if modes == 6 else None,
+                "sorojax",
+                {"modes": modes, "frequency": number},
+                **timing.columns(),
+                error=error,
+                reference=REFERENCE,
+                bar=BARS[number] if modes == 6 else None,
                 bar_on="error",
-            )  # fmt: skip
+            )

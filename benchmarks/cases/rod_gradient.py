@@ -34,9 +34,15 @@ START = {"young": 1 * MPa, "radius": 6 * mm, "length": 80 * mm, "place": 4 * mm,
 
 def make(p):
     return rod(
-        SE3(), chebyshev(kappa_y=3, kappa_z=3), circle(p["radius"]), length=p["length"],
-        young_modulus=p["young"], poisson_ratio=0.3, density=2000.0, nodes=8,
-    )  # fmt: skip
+        SE3(),
+        chebyshev(kappa_y=3, kappa_z=3),
+        circle(p["radius"]),
+        length=p["length"],
+        young_modulus=p["young"],
+        poisson_ratio=0.3,
+        density=2000.0,
+        nodes=8,
+    )
 
 
 def tip(p):
@@ -85,11 +91,19 @@ def rows():
             error = max(abs(float(found[k] * p[k]) - wanted[k]) for k in p) / scale
             settings = {"of": name, "mode": mode}
             yield Row(
-                "sorojax", settings, **timings["sorojax.jit"].columns(), error=error,
-                reference="central differences, order 4", bar=BAR, bar_on="error",
-            )  # fmt: skip
+                "sorojax",
+                settings,
+                **timings["sorojax.jit"].columns(),
+                error=error,
+                reference="central differences, order 4",
+                bar=BAR,
+                bar_on="error",
+            )
             for by, timing in timings.items():
                 yield Row(
-                    "sorojax", settings | {"bar": "compile", "by": by}, **timing.columns(),
-                    bar=COMPILE_BAR, bar_on="compile_s",
-                )  # fmt: skip
+                    "sorojax",
+                    settings | {"bar": "compile", "by": by},
+                    **timing.columns(),
+                    bar=COMPILE_BAR,
+                    bar_on="compile_s",
+                )

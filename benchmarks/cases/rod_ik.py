@@ -56,9 +56,18 @@ def latency(nodes: int, null_space: bool, by: str):
     for percent, bar in BARS.items():
         yield Row(
             "sorojax",
-            {"nodes": nodes, "null_space": null_space, "by": by, "percentile": percent,
-             "calls": CALLS[by]},
-            compile_s=first, run_s=float(np.percentile(seconds, percent)),
-            run_s_min=min(seconds), run_s_max=max(seconds), error=max(errors),
-            reference=REFERENCE, bar=bar if by == "compiled" else None,
-        )  # fmt: skip
+            {
+                "nodes": nodes,
+                "null_space": null_space,
+                "by": by,
+                "percentile": percent,
+                "calls": CALLS[by],
+            },
+            compile_s=first,
+            run_s=float(np.percentile(seconds, percent)),
+            run_s_min=min(seconds),
+            run_s_max=max(seconds),
+            error=max(errors),
+            reference=REFERENCE,
+            bar=bar if by == "compiled" else None,
+        )

@@ -30,9 +30,15 @@ def own(rod, stepper, step):
     """Tips by a fixed-step method of sorojax (times, 3) [m]."""
     rest, constants = jnp.zeros(rod.basis.num_dof), operators(rod)
     path = rollout(
-        rod, rest, rest, (Gravity(),), step=step, saves=SAVES, every=round(SAVE / step),
+        rod,
+        rest,
+        rest,
+        (Gravity(),),
+        step=step,
+        saves=SAVES,
+        every=round(SAVE / step),
         stepper=stepper,
-    )  # fmt: skip
+    )
     return jax.vmap(lambda q: tip(rod, constants, q))(path.q[1:])
 
 
@@ -46,10 +52,17 @@ def stock(rod, solver, controller, dt0):
 
     rest = jnp.zeros(rod.basis.num_dof)
     solution = dfx.diffeqsolve(
-        dfx.ODETerm(field), solver, 0.0, DURATION, dt0, (rest, rest),
-        saveat=dfx.SaveAt(ts=jnp.arange(1, SAVES + 1) * SAVE), max_steps=1_000_000,
-        stepsize_controller=controller, adjoint=dfx.ForwardMode(),
-    )  # fmt: skip
+        dfx.ODETerm(field),
+        solver,
+        0.0,
+        DURATION,
+        dt0,
+        (rest, rest),
+        saveat=dfx.SaveAt(ts=jnp.arange(1, SAVES + 1) * SAVE),
+        max_steps=1_000_000,
+        stepsize_controller=controller,
+        adjoint=dfx.ForwardMode(),
+    )
     assert solution.ys is not None
     return jax.vmap(lambda q: tip(rod, constants, q))(solution.ys[0])
 
@@ -95,6 +108,15 @@ def rows():
         yield row("diffrax", "Tsit5", h, lambda rod: stock(rod, dfx.Tsit5(), fixed, h))  # noqa: B023
     for h in () if quick("soromox: it is in rod.acceleration") else peer_steps:
         yield peers.row(
-            "soromox", "simulation", {}, error, REFERENCE,
-            nodes=8, modes=MODES, duration=DURATION, dt=h, save_dt=SAVE, repeats=3,
-        )  # fmt: skip
+            "soromox",
+            "simulation",
+            {},
+            error,
+            REFERENCE,
+            nodes=8,
+            modes=MODES,
+            duration=DURATION,
+            dt=h,
+            save_dt=SAVE,
+            repeats=3,
+        )

@@ -80,14 +80,21 @@ def bend(modes, case):
     """An arc of 45 degrees, loaded out of its plane."""
     twisting, load = case
     section = Section(
-        area=1.0, second_moment_y=1 / 12, second_moment_z=1 / 12,
-        torsion_constant=twisting / 5e6, shear_factor=1.0,
-    )  # fmt: skip
+        area=1.0,
+        second_moment_y=1 / 12,
+        second_moment_z=1 / 12,
+        torsion_constant=twisting / 5e6,
+        shear_factor=1.0,
+    )
     body = rod(
-        SE3(), every(modes), section, Elastic(1e7, 0.0, 1.0),
-        length=100 * np.pi / 4, rest_strain=[0.0, 0.0, 0.01, 1.0, 0.0, 0.0],
+        SE3(),
+        every(modes),
+        section,
+        Elastic(1e7, 0.0, 1.0),
+        length=100 * np.pi / 4,
+        rest_strain=[0.0, 0.0, 0.01, 1.0, 0.0, 0.0],
         nodes=modes + 8,
-    )  # fmt: skip
+    )
     return at_rest(body, [0.0] * 5 + [float(load)]), 1.0
 
 
@@ -96,15 +103,20 @@ def princeton(modes, case):
     load, angle = case[0], np.deg2rad(case[1])
     height, thick = 12.7e-3, 3.2024e-3
     section = Section(
-        area=height * thick, second_moment_y=thick * height**3 / 12,
+        area=height * thick,
+        second_moment_y=thick * height**3 / 12,
         second_moment_z=height * thick**3 / 12,
         torsion_constant=height * thick**3 / 3 * (1 - 0.63 * thick / height),
         shear_factor=5 / 6,
-    )  # fmt: skip
+    )
     body = rod(
-        SE3(), every(modes), section, Elastic(71.7e9, 0.31, 2700.0),
-        length=0.508, nodes=modes + 8,
-    )  # fmt: skip
+        SE3(),
+        every(modes),
+        section,
+        Elastic(71.7e9, 0.31, 2700.0),
+        length=0.508,
+        nodes=modes + 8,
+    )
     force = [0.0, load * np.sin(angle), load * np.cos(angle)]
     return at_rest(body, [0.0, 0.0, 0.0, *force]), 1.0
 
@@ -147,9 +159,14 @@ def rows():
             assert timing is not None
             settings = {"case": name, "modes": modes, "iterations": count, "converged": ended}
             yield Row(
-                "sorojax", settings, **timing.columns(), error=worst, reference=REFERENCE[name],
-                bar=bar if modes == table[-1] else None, bar_on="error",
-            )  # fmt: skip
+                "sorojax",
+                settings,
+                **timing.columns(),
+                error=worst,
+                reference=REFERENCE[name],
+                bar=bar if modes == table[-1] else None,
+                bar_on="error",
+            )
 
 
 def error(name, found, expected):

@@ -29,9 +29,15 @@ def ends(body, q, v):
 
     def one(q, v):
         path = rollout(
-            body, q, v, (Gravity(),), step=STEP, saves=1, every=STEPS,
+            body,
+            q,
+            v,
+            (Gravity(),),
+            step=STEP,
+            saves=1,
+            every=STEPS,
             stepper=GeneralisedAlpha(1.0),
-        )  # fmt: skip
+        )
         return path.q[-1]
 
     return batched(one)(q, v)
@@ -44,6 +50,8 @@ def rows():
     kinds = ("accelerations", accelerations, 1), ("steps", ends, STEPS)
     for name, function, calls in kinds[1:] if quick("accelerations: in rod.batch") else kinds:
         yield from scaling.rows(
-            name, "members", 1.0,
+            name,
+            "members",
+            1.0,
             (scaling.program(n, function, body, q[:n], v[:n], calls=calls) for n in sizes),
-        )  # fmt: skip
+        )

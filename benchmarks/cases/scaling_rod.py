@@ -16,9 +16,15 @@ MODES, NODES, SEGMENTS = (2, 4, 8, 16, 32), (8, 16, 32, 64, 128), (1, 2, 4, 8)
 def slender(modes: int, nodes: int):
     """The finger D1 with so many modes of each of its two curvatures."""
     return rod(
-        SE3(), chebyshev(kappa_y=modes, kappa_z=modes), circle(6 * mm), length=LENGTH,
-        young_modulus=1 * MPa, poisson_ratio=0.3, density=2000.0, nodes=nodes,
-    )  # fmt: skip
+        SE3(),
+        chebyshev(kappa_y=modes, kappa_z=modes),
+        circle(6 * mm),
+        length=LENGTH,
+        young_modulus=1 * MPa,
+        poisson_ratio=0.3,
+        density=2000.0,
+        nodes=nodes,
+    )
 
 
 def point(size, model):

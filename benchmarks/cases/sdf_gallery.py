@@ -63,9 +63,11 @@ def shapes() -> dict[str, sdf.AbstractSdf]:
 def bodies() -> dict[str, tuple[sdf.AbstractSdf, float]]:
     """The robots with the size of their cells [m], below their thinnest wall or gap."""
     sizes = {
-        robots.BendingActuator: 1.2 * mm, robots.PlanarActuator: 1.2 * mm,
-        robots.Hand: 1.2 * mm, robots.Manipulator: 1.0 * mm,
-    }  # fmt: skip
+        robots.BendingActuator: 1.2 * mm,
+        robots.PlanarActuator: 1.2 * mm,
+        robots.Hand: 1.2 * mm,
+        robots.Manipulator: 1.0 * mm,
+    }
     return {kind.__name__: (kind().body(), size) for kind, size in sizes.items()}
 
 
@@ -101,6 +103,11 @@ def rows():
                 "pinched": len(found.pinched_vertices), "crossings": len(found.crossings),
             }  # fmt: skip
             yield Row(
-                "sorojax", settings, run_s=took, error=float(wrong), bar=0, bar_on="error",
+                "sorojax",
+                settings,
+                run_s=took,
+                error=float(wrong),
+                bar=0,
+                bar_on="error",
                 reference="edges of the file that do not join two triangles",
-            )  # fmt: skip
+            )

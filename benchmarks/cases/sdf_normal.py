@@ -32,11 +32,13 @@ def exact_normal(p: np.ndarray) -> np.ndarray:
     bore = -across / np.linalg.norm(across, axis=1, keepdims=True)
     a, b, c = np.abs(p).T - 0.75
     depth = np.minimum(np.maximum(a, np.maximum(b, c)), 0)
-    fields = np.stack([
-        np.linalg.norm(p, axis=1) - 1,
-        depth + np.linalg.norm(out, axis=1),
-        0.5 - np.linalg.norm(across, axis=1),
-    ])  # fmt: skip
+    fields = np.stack(
+        [
+            np.linalg.norm(p, axis=1) - 1,
+            depth + np.linalg.norm(out, axis=1),
+            0.5 - np.linalg.norm(across, axis=1),
+        ]
+    )
     return np.choose(np.argmax(fields, axis=0)[:, None], [ball, cube, bore])
 
 
@@ -66,10 +68,13 @@ def rows():
             # Rounding decides between two faces at an edge: those points do not count.
             error = float(np.quantile(np.abs(found - exact), 0.9999))
             yield Row(
-                "sorojax", {"points": POINTS, "method": f"{dtype}, {name}"}, **timing.columns(),
-                error=error, reference="closed form",
+                "sorojax",
+                {"points": POINTS, "method": f"{dtype}, {name}"},
+                **timing.columns(),
+                error=error,
+                reference="closed form",
                 bar=POINTS / RATE / 1e6 if dtype == "float32" else None,
-            )  # fmt: skip
+            )
     p = points("float64")
     timing = measure_calls(lambda: by_differences(p))
     error = float(np.quantile(np.abs(by_differences(p)[1] - exact_normal(p)), 0.9999))

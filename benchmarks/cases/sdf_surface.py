@@ -122,6 +122,12 @@ def rows():
 
 def _row(code, settings, runs, peak, error, **bar) -> Row:
     return Row(
-        code, {"cells": CELLS, "peak_MB": peak, **settings}, run_s=runs[len(runs) // 2],
-        run_s_min=runs[0], run_s_max=runs[-1], error=error, reference=REFERENCE, **bar,
-    )  # fmt: skip
+        code,
+        {"cells": CELLS, "peak_MB": peak, **settings},
+        run_s=runs[len(runs) // 2],
+        run_s_min=runs[0],
+        run_s_max=runs[-1],
+        error=error,
+        reference=REFERENCE,
+        **bar,
+    )

@@ -33,10 +33,13 @@ def rows():
             for name, run in seconds.items()
         }
         yield Row(
-            "sorojax", {"points": POINTS, "method": dtype, **times}, **ours.columns(),
-            error=error, reference="NumPy in float64",
+            "sorojax",
+            {"points": POINTS, "method": dtype, **times},
+            **ours.columns(),
+            error=error,
+            reference="NumPy in float64",
             bar=min(POINTS / rate / 1e6, seconds["node by node"] / ratio),
-        )  # fmt: skip
+        )
         for name, form in PEERS.items():
             error = float(np.abs(form(p) - exact).max())
             settings = {"points": POINTS, "method": f"{dtype}, {name}"}
@@ -44,7 +47,11 @@ def rows():
     p = points("float64")
     exact = in_numpy(p)
     yield peers.row(
-        "sdf_fork", "value", {"points": p},
-        lambda arrays: float(np.abs(arrays["field"] - exact).max()), "NumPy in float64",
-        method="float64", repeats=5,
-    )  # fmt: skip
+        "sdf_fork",
+        "value",
+        {"points": p},
+        lambda arrays: float(np.abs(arrays["field"] - exact).max()),
+        "NumPy in float64",
+        method="float64",
+        repeats=5,
+    )

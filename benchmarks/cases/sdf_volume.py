@@ -70,6 +70,11 @@ def rows():
 def _row(what, cells, timing, error, bar) -> Row:
     columns = timing.columns() if timing else {}
     return Row(
-        "sorojax", {"method": what, "cells": cells}, **columns, error=error,
-        reference="exact", bar=bar, bar_on="error",
-    )  # fmt: skip
+        "sorojax",
+        {"method": what, "cells": cells},
+        **columns,
+        error=error,
+        reference="exact",
+        bar=bar,
+        bar_on="error",
+    )

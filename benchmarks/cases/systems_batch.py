@@ -45,7 +45,8 @@ def rows():
         yield Row(
             "sorojax",
             {"batch": name, "run again": int(film.stats["stiff"].sum())},
-            **timing.columns(), error=error(end, want) if stiff else None,
+            **timing.columns(),
+            error=error(end, want) if stiff else None,
             reference="Radau of SciPy, the stiff member" if stiff else None,
             bar=RATIO * times["all easy"].columns()["run_s"] if stiff else None,
-        )  # fmt: skip
+        )

@@ -37,8 +37,10 @@ def rows():
         code = name.removesuffix(".jit")
         by = "jax.jit" if name == code else name
         yield Row(
-            code, {"method": "Tsit5", "gain": GAIN, "steps": counts[name], "by": by},
-            **timing.columns(), error=error(ends[name][0], want),
+            code,
+            {"method": "Tsit5", "gain": GAIN, "steps": counts[name], "by": by},
+            **timing.columns(),
+            error=error(ends[name][0], want),
             reference="Radau of SciPy to 1e-11, modes at 1 s",
             bar=bar if code == "sorojax" else None,
-        )  # fmt: skip
+        )

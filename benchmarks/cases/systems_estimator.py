@@ -36,8 +36,16 @@ REFERENCE = "worst tip, 31 unknown contacts on a rod of six modes, 0.2 mm noise 
 
 
 def _finger(modes: int, nodes: int):
-    return rod(SE2(), chebyshev(kappa_z=modes), circle(6e-3), length=0.08, young_modulus=1e6,
-               poisson_ratio=0.3, density=1100.0, nodes=nodes)  # fmt: skip
+    return rod(
+        SE2(),
+        chebyshev(kappa_z=modes),
+        circle(6e-3),
+        length=0.08,
+        young_modulus=1e6,
+        poisson_ratio=0.3,
+        density=1100.0,
+        nodes=nodes,
+    )
 
 
 def rows():
@@ -83,11 +91,22 @@ def _latency(what: str, call, first: float, error: float | None):
         seconds.append(time.perf_counter() - start)
     for percent, bar in BARS.items():
         yield Row(
-            "sorojax", {"what": what, "modes": 3, "markers": 4, "percentile": percent,
-                        "calls": CALLS}, first,
-            float(np.percentile(seconds, percent)), min(seconds), max(seconds), error=error,
-            reference=REFERENCE if error is not None else None, bar=bar,
-        )  # fmt: skip
+            "sorojax",
+            {"what": what, "modes": 3, "markers": 4, "percentile": percent, "calls": CALLS},
+            first,
+            float(np.percentile(seconds, percent)),
+            min(seconds),
+            max(seconds),
+            error=error,
+            reference=REFERENCE if error is not None else None,
+            bar=bar,
+        )
     if error is not None:
-        yield Row("sorojax", {"what": "tip error"}, error=error, bar=1e-3, bar_on="error",
-                  reference=REFERENCE)  # fmt: skip
+        yield Row(
+            "sorojax",
+            {"what": "tip error"},
+            error=error,
+            bar=1e-3,
+            bar_on="error",
+            reference=REFERENCE,
+        )

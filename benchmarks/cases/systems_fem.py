@@ -21,11 +21,12 @@ def body() -> systems.FemBody:
     actuator = BellowsActuator()
     cells = mesh.triangulate(actuator.body(), size=1.5 * mm, order=2)
     problem = fem.problem(
-        cells, material.NeoHookean(400 * kPa, 4 * MPa, density=1080.0),
+        cells,
+        material.NeoHookean(400 * kPa, 4 * MPa, density=1080.0),
         kinematics=fem.PlaneStrain(20 * mm),
         supports=(fem.Fixed(mesh.nodes_where(cells, lambda p: p[0] < 1e-9)),),
         loads=(fem.Pressure(mesh.facets_on(cells, actuator.chambers()), name="air"),),
-    )  # fmt: skip
+    )
     tip = mesh.nearest_node(cells, (float(actuator.length), 0.0))
     return systems.FemBody(problem, fem.Rayleigh(5.0, 1e-3), markers={"tip": tip})
 
@@ -69,9 +70,12 @@ def rows():
     (_, node), *_ = full.markers
     missed = float(np.abs(alone()[node] - moved[-1]).max()) / scale
     yield Row(
-        "sorojax", {"body": "full, with air", **size}, **timing.per(STEPS).columns(),
-        error=missed, reference="fem.simulate under its pressures, tip over its largest move",
-    )  # fmt: skip
+        "sorojax",
+        {"body": "full, with air", **size},
+        **timing.per(STEPS).columns(),
+        error=missed,
+        reference="fem.simulate under its pressures, tip over its largest move",
+    )
     timing = measure_calls(alone, 3)
     yield Row("sorojax", {"body": "fem.simulate", **size}, **timing.per(STEPS).columns())
     basis = systems.modal_basis(full, MODES)
@@ -80,9 +84,12 @@ def rows():
 
         def go(small=small):
             return systems.simulate(
-                small, DURATION, save=STEPS + 1, step=STEP / 4,
+                small,
+                DURATION,
+                save=STEPS + 1,
+                step=STEP / 4,
                 solver=systems.Rosenbrock2(refresh=True),
-            )["body.tip_position"]  # fmt: skip
+            )["body.tip_position"]
 
         tip = jax.block_until_ready(go())
         timing = measure_calls(go, 3)
@@ -92,4 +99,4 @@ def rows():
             **timing.per(STEPS).columns(),
             error=float(np.abs((tip - tip[0]) - moved).max()) / scale,
             reference="the full body, tip over its largest move",
-        )  # fmt: skip
+        )

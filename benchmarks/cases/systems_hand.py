@@ -24,9 +24,13 @@ PORT = "fingers.air.mass_flow"
 def second(network, substeps=SUBSTEPS, refresh=False):
     grip = systems.Sampled(Grip(), "fingers.air.pressure", PORT)
     film = systems.simulate_sampled(
-        network, grip, 1.0, period=PERIOD, substeps=substeps,
+        network,
+        grip,
+        1.0,
+        period=PERIOD,
+        substeps=substeps,
         method=systems.Rosenbrock2(refresh),
-    )  # fmt: skip
+    )
     return film["fingers.body.tip_position"]
 
 
@@ -78,17 +82,23 @@ def rows():
     got = np.asarray(second(network))
     timing = measure(second, network, repeats=15)
     yield Row(
-        "sorojax", {"as": "stack", "substeps": SUBSTEPS}, **timing.columns(), bar=BAR,
-        error=float(np.abs(got - fine).max()), reference="16 substeps, tips in m",
-    )  # fmt: skip
+        "sorojax",
+        {"as": "stack", "substeps": SUBSTEPS},
+        **timing.columns(),
+        bar=BAR,
+        error=float(np.abs(got - fine).max()),
+        reference="16 substeps, tips in m",
+    )
     state = jax.tree.map(lambda x: x + 0.01 * jnp.abs(x), network.initial_state())
     times = measure_together(loops(), network, state, jnp.full(5, 1e-7), repeats=15)
     bar = RATIO * times["monolith"].columns()["run_s"] / CALLS
     for name, timing in times.items():
         yield Row(
-            "sorojax", {"as": name, "of": "one vector field"}, **timing.per(CALLS).columns(),
+            "sorojax",
+            {"as": name, "of": "one vector field"},
+            **timing.per(CALLS).columns(),
             bar=bar if name == "network" else None,
-        )  # fmt: skip
+        )
     apart = separate()
     flow = {name: jnp.asarray(1e-7) for name in apart.inputs}
 

@@ -100,9 +100,15 @@ def network_runs(scenes, method) -> tuple[Callable, Callable]:
     def reference():
         def one(*given):
             film = systems.simulate(
-                make(*given), 1.0, save=SAVES + 1, rtol=1e-9, atol=1e-12, throw=False,
-                solver=systems.Rodas4(), max_steps=100_000,
-            )  # fmt: skip
+                make(*given),
+                1.0,
+                save=SAVES + 1,
+                rtol=1e-9,
+                atol=1e-12,
+                throw=False,
+                solver=systems.Rodas4(),
+                max_steps=100_000,
+            )
             return positions(film.state)
 
         return jax.jit(lambda *x: jax.lax.map(lambda y: one(*y), x))(*numbers)
@@ -118,15 +124,20 @@ def rods(draw, stepper):
     def go(step, saves, every, stepper):
         def one(modulus, radius, damping):
             body = rod.rod(
-                SE2(), rod.chebyshev(kappa_z=2, sigma_x=1), rod.circle(radius), length=0.12,
-                young_modulus=modulus, poisson_ratio=0.45, density=1100.0, nodes=6,
-            )  # fmt: skip
+                SE2(),
+                rod.chebyshev(kappa_z=2, sigma_x=1),
+                rod.circle(radius),
+                length=0.12,
+                young_modulus=modulus,
+                poisson_ratio=0.45,
+                density=1100.0,
+                nodes=6,
+            )
             forces = rod.Gravity(), rod.Damping(damping)
             rest = jnp.zeros(body.basis.num_dof)
             path = rod.rollout(
-                body, rest, rest, forces, step=step, saves=saves,
-                every=every, stepper=stepper,
-            )  # fmt: skip
+                body, rest, rest, forces, step=step, saves=saves, every=every, stepper=stepper
+            )
             return [path.q], path.status
 
         return jax.jit(jax.vmap(one))(*map(jnp.asarray, numbers))
@@ -183,6 +194,10 @@ def rows():
     wrong, early = {"what": "wrong and successful"}, {"what": "accurate and flagged, share"}
     for settings, error, bar in ((wrong, missed, 0.0), (early, flagged, 0.01)):
         yield Row(
-            "sorojax", settings, error=float(error), bar=bar, bar_on="error",
+            "sorojax",
+            settings,
+            error=float(error),
+            bar=bar,
+            bar_on="error",
             reference=REFERENCE,
-        )  # fmt: skip
+        )

@@ -43,6 +43,8 @@ def rows():
         yield Row(
             "sorojax" if own else "diffrax",
             {"method": name, "gain": GAIN, "rtol": rtol, "steps": steps},
-            **timing.columns(), error=got,
-            reference="Radau of SciPy to 1e-11, modes at 1 s", bar=bar if own else None,
-        )  # fmt: skip
+            **timing.columns(),
+            error=got,
+            reference="Radau of SciPy to 1e-11, modes at 1 s",
+            bar=bar if own else None,
+        )

@@ -25,8 +25,14 @@ def film(renderer: str):
     instants = np.linspace(0, 1, FRAMES)
     kappa = (np.pi / LENGTH) * instants[:, None] + 1e-6
     angle = kappa * x
-    places = np.stack([(1 / kappa - z) * np.sin(angle), np.broadcast_to(y, angle.shape),
-                       1 / kappa - (1 / kappa - z) * np.cos(angle)], axis=2)  # fmt: skip
+    places = np.stack(
+        [
+            (1 / kappa - z) * np.sin(angle),
+            np.broadcast_to(y, angle.shape),
+            1 / kappa - (1 / kappa - z) * np.cos(angle),
+        ],
+        axis=2,
+    )
     strain = 100 * np.abs(kappa * z)
     track = positions_track(body, places, instants, field=strain, label="strain [%]")
     return view.animate(track, fps=FRAMES - 1, renderer=renderer, size=SIZE)

@@ -49,9 +49,11 @@ def once(kind: str, cache: str) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         done = subprocess.run(
             [sys.executable, "-c", PROGRAM, kind, f"{folder}/first.png"],
-            env=os.environ | {"SOROJAX_CACHE": cache}, capture_output=True, text=True,
+            env=os.environ | {"SOROJAX_CACHE": cache},
+            capture_output=True,
+            text=True,
             check=True,
-        )  # fmt: skip
+        )
     return json.loads(done.stdout.splitlines()[-1])
 
 
@@ -63,6 +65,11 @@ def rows():
         whole = [run["whole"] for run in runs]
         settings = {"first": kind, "of which show": statistics.median(r["show"] for r in runs)}
         yield Row(
-            "sorojax", settings, compile_s=max(0.0, cold - statistics.median(whole)),
-            run_s=statistics.median(whole), run_s_min=min(whole), run_s_max=max(whole), bar=BAR,
-        )  # fmt: skip
+            "sorojax",
+            settings,
+            compile_s=max(0.0, cold - statistics.median(whole)),
+            run_s=statistics.median(whole),
+            run_s_min=min(whole),
+            run_s_max=max(whole),
+            bar=BAR,
+        )

@@ -17,9 +17,14 @@ REFERENCE = "largest distance from the exact sections, relative to the length"
 
 def finger():
     return rod(
-        SE3(), chebyshev(kappa_x=1, kappa_y=3, kappa_z=3), circle(RADIUS), length=LENGTH,
-        young_modulus=1e5, poisson_ratio=0.49, density=1e3,
-    )  # fmt: skip
+        SE3(),
+        chebyshev(kappa_x=1, kappa_y=3, kappa_z=3),
+        circle(RADIUS),
+        length=LENGTH,
+        young_modulus=1e5,
+        poisson_ratio=0.49,
+        density=1e3,
+    )
 
 
 def cloud() -> tuple[np.ndarray, np.ndarray]:
@@ -53,9 +58,13 @@ def rows():
         timing = measure(view.deform, *args, repeats=50)
         settings = {"vertices": VERTICES, "parts": 1, "numbers": kind}
         yield Row(
-            "sorojax", settings, **timing.columns(), error=far if kind == "float64" else None,
-            reference=REFERENCE, bar=BAR,
-        )  # fmt: skip
+            "sorojax",
+            settings,
+            **timing.columns(),
+            error=far if kind == "float64" else None,
+            reference=REFERENCE,
+            bar=BAR,
+        )
     hand = assembly(SE3(), **{f"finger_{k}": Part(model, offset=_at(k)) for k in range(3)})
     points = points + np.array([0.0, GAP, 0.0]) * (np.arange(VERTICES) % 3 - 1)[:, None]
     shared = view.bind(points, hand, blend=RADIUS)

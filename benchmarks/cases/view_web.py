@@ -20,9 +20,14 @@ BAR = 12.0  # MB
 def hand():
     """Three fingers that hang from z = 0 around a ball."""
     finger = rod(
-        SE3(), chebyshev(kappa_y=3, kappa_z=2), circle(RADIUS), length=LENGTH,
-        young_modulus=1e5, poisson_ratio=0.49, density=1e3,
-    )  # fmt: skip
+        SE3(),
+        chebyshev(kappa_y=3, kappa_z=2),
+        circle(RADIUS),
+        length=LENGTH,
+        young_modulus=1e5,
+        poisson_ratio=0.49,
+        density=1e3,
+    )
     parts = {}
     for k in range(3):
         turn = 2 * np.pi * k / 3
@@ -70,6 +75,10 @@ def rows():
     seconds = time.perf_counter() - start
     settings = {"triangles": triangles, "frames": FRAMES, "seconds_to_write": round(seconds, 2)}
     yield Row(
-        "sorojax", settings, error=len(page.html.encode()) / 1e6, reference="MB of the file",
-        bar=BAR, bar_on="error",
-    )  # fmt: skip
+        "sorojax",
+        settings,
+        error=len(page.html.encode()) / 1e6,
+        reference="MB of the file",
+        bar=BAR,
+        bar_on="error",
+    )

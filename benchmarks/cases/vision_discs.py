@@ -26,11 +26,23 @@ def rows():
             told = settings | {"rate": 1 / np.median(runs), "missed": missed}
             fast = bar if width == 1280 else None
             timing = Timing(0.0, tuple(runs)).columns()
-            yield Row("sorojax", told, **timing, error=error, bar=fast,
-                      reference="centres drawn, px rms; CPU time")  # fmt: skip
+            yield Row(
+                "sorojax",
+                told,
+                **timing,
+                error=error,
+                bar=fast,
+                reference="centres drawn, px rms; CPU time",
+            )
             if bar_error is not None:
-                yield Row("sorojax", settings | {"what": "error"}, error=error, bar=bar_error,
-                          bar_on="error", reference="centres drawn, px rms")  # fmt: skip
+                yield Row(
+                    "sorojax",
+                    settings | {"what": "error"},
+                    error=error,
+                    bar=bar_error,
+                    bar_on="error",
+                    reference="centres drawn, px rms",
+                )
 
 
 def _scene(random, width, height):

@@ -18,8 +18,14 @@ def rows():
     cv2 = opencv()
     cv2.setNumThreads(1)
     for width, height in ((640, 480), (1280, 720)):
-        camera = Camera(0.95 * width, 0.95 * width, width / 2 - 0.5, height / 2 - 0.5,
-                        width=width, height=height)  # fmt: skip
+        camera = Camera(
+            0.95 * width,
+            0.95 * width,
+            width / 2 - 0.5,
+            height / 2 - 0.5,
+            width=width,
+            height=height,
+        )
         random = np.random.default_rng(0)
         scenes = [_scene(random, camera) for _ in range(PICTURES)]
         for code in ("sorojax", "opencv"):
@@ -29,8 +35,15 @@ def rows():
                 settings = {"picture": f"{width} x {height}", "markers": 4, "what": what}
                 bar = BARS[what] if code == "sorojax" and width == 640 else None
                 timing = Timing(0.0, tuple(runs)).columns()
-                yield Row(code, settings, **timing, error=error, bar=bar, bar_on="error",
-                          reference="drawn at 0.4 to 0.5 m")  # fmt: skip
+                yield Row(
+                    code,
+                    settings,
+                    **timing,
+                    error=error,
+                    bar=bar,
+                    bar_on="error",
+                    reference="drawn at 0.4 to 0.5 m",
+                )
 
 
 def _scene(random, camera: Camera):

@@ -74,9 +74,13 @@ def _run(peer: str, folder: Path, limit: float) -> None:
 
 
 def row(
-    peer: str, task: str, arrays: dict[str, np.ndarray], error: Any, reference: Any,
+    peer: str,
+    task: str,
+    arrays: dict[str, np.ndarray],
+    error: Any,
+    reference: Any,
     **options: Any,
-) -> Row:  # fmt: skip
+) -> Row:
     """The row of a peer; `error` is a function of the arrays that it answers.
 
     The script answers `compile_s` and `runs`, seconds per call.
@@ -88,6 +92,12 @@ def row(
     runs = sorted(answer["runs"])
     told = {key: answer[key] for key in ("version", "solver", "iterations") if key in answer}
     return Row(
-        peer, options | told, answer["compile_s"],
-        runs[len(runs) // 2], runs[0], runs[-1], error(result), reference,
-    )  # fmt: skip
+        peer,
+        options | told,
+        answer["compile_s"],
+        runs[len(runs) // 2],
+        runs[0],
+        runs[-1],
+        error(result),
+        reference,
+    )

@@ -267,8 +267,11 @@ def assembly(request, arrays):
         runs.append(time.process_time() - start)
     way = arrays["way"].ravel()
     upper = sp.triu(tangent, 1)
-    return {"compile_s": 0.0, "runs": runs}, {"residual": residual, "product": tangent @ way,
-                                             "entries": upper.nnz}  # fmt: skip
+    return {"compile_s": 0.0, "runs": runs}, {
+        "residual": residual,
+        "product": tangent @ way,
+        "entries": upper.nnz,
+    }
 
 
 def newton(request, arrays):

@@ -39,10 +39,15 @@ def simulation(request, arrays):
     start = time.perf_counter()
     links, step = request["links"], request["dt"]
     text = SCENE.format(
-        step=step, integrator=request["method"], points=links + 1, length=LENGTH,
-        shear_modulus=MODULUS / 2 / (1 + RATIO), young_modulus=MODULUS, radius=RADIUS,
+        step=step,
+        integrator=request["method"],
+        points=links + 1,
+        length=LENGTH,
+        shear_modulus=MODULUS / 2 / (1 + RATIO),
+        young_modulus=MODULUS,
+        radius=RADIUS,
         density=DENSITY,
-    )  # fmt: skip
+    )
     model = mujoco.MjModel.from_xml_string(text)
     built, runs = time.perf_counter() - start, []
     every, saves = (

@@ -24,9 +24,16 @@ def finger(elements):
     """The clamped rod along x with its weight."""
     scene = Scene()
     rod = ea.CosseratRod.straight_rod(
-        elements, np.zeros(3), np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), LENGTH,
-        RADIUS, DENSITY, youngs_modulus=MODULUS, shear_modulus=MODULUS / 2 / (1 + RATIO),
-    )  # fmt: skip
+        elements,
+        np.zeros(3),
+        np.array([1.0, 0.0, 0.0]),
+        np.array([0.0, 1.0, 0.0]),
+        LENGTH,
+        RADIUS,
+        DENSITY,
+        youngs_modulus=MODULUS,
+        shear_modulus=MODULUS / 2 / (1 + RATIO),
+    )
     scene.append(rod)
     scene.constrain(rod).using(
         ea.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,)

@@ -33,9 +33,11 @@ def surface(request, arrays):
     for _ in range(request["repeats"]):
         start = time.perf_counter()
         found = shape.generate(
-            step=request["side"] / request["cells"], bounds=((-half,) * 3, (half,) * 3),
-            workers=1, verbose=False,
-        )  # fmt: skip
+            step=request["side"] / request["cells"],
+            bounds=((-half,) * 3, (half,) * 3),
+            workers=1,
+            verbose=False,
+        )
         runs.append(time.perf_counter() - start)
     return {"compile_s": 0.0, "runs": runs}, {"corners": np.array(found)}
 

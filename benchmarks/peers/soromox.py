@@ -21,9 +21,13 @@ from soromox.systems.gvs import GVS, GVSSegment, StrainBasisSpec  # noqa: E402
 
 def finger(num_nodes, num_modes):
     link = LinkSpec.circular(
-        length=0.08, radius=0.006, young_modulus=1e6, poisson_ratio=0.3, density=2000.0,
+        length=0.08,
+        radius=0.006,
+        young_modulus=1e6,
+        poisson_ratio=0.3,
+        density=2000.0,
         reference_strain=[0.0, 0.0, 0.0, 1.0, 0.0, 0.0],
-    )  # fmt: skip
+    )
     segment = GVSSegment(
         link=link,
         joint=JointSpec(type="fixed"),
@@ -73,9 +77,12 @@ def simulation(request, arrays):
 
     def tips(y):
         states = robot.rollout_to(
-            SystemState(t=0.0, y=y), t1=request["duration"], solver_dt=request["dt"],
-            save_dt=request["save_dt"], max_steps=None,
-        )  # fmt: skip
+            SystemState(t=0.0, y=y),
+            t1=request["duration"],
+            solver_dt=request["dt"],
+            save_dt=request["save_dt"],
+            max_steps=None,
+        )
         half = y.size // 2
         pose = jax.vmap(lambda y: robot.forward_kinematics(y[:half], robot.length))
         return pose(states.y)[:, :3, 3]

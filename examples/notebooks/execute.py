@@ -24,9 +24,11 @@ def execute(file: Path) -> float:
     book = nbformat.read(file, as_version=4)
     start = time.perf_counter()
     client = NotebookClient(
-        book, timeout=TIME_LIMIT, record_timing=False,
+        book,
+        timeout=TIME_LIMIT,
+        record_timing=False,
         resources={"metadata": {"path": str(HERE.parent.parent)}},
-    )  # fmt: skip
+    )
     client.execute()
     spent = time.perf_counter() - start
     book.metadata = {

@@ -168,17 +168,26 @@ def _wave(asked) -> int:
             if log is not None:
                 log.close()
     late = deadlines(ticks, _PERIOD)
-    print(f"\n{late.num_ticks} ticks, {late.num_skipped} left out, {late.num_behind} more than "
-          f"a period late; late by a median of "
-          f"{late.median_late * 1e3:.2f} ms, p99 {late.p99_late * 1e3:.2f} ms")  # fmt: skip
+    print(
+        f"\n{late.num_ticks} ticks, {late.num_skipped} left out, {late.num_behind} more than "
+        f"a period late; late by a median of "
+        f"{late.median_late * 1e3:.2f} ms, p99 {late.p99_late * 1e3:.2f} ms"
+    )
     return 0
 
 
 def _run(board: TcpBoard, controller, state, seconds: float, slew=np.inf, record=None):
     return run_loop(
-        board, WallClock(), controller, state, duration=seconds, period=_PERIOD,
-        limits=board.limits, slew=slew, record=record,
-    )  # fmt: skip
+        board,
+        WallClock(),
+        controller,
+        state,
+        duration=seconds,
+        period=_PERIOD,
+        limits=board.limits,
+        slew=slew,
+        record=record,
+    )
 
 
 def _show(t: float, text: str) -> None:

@@ -28,15 +28,19 @@ def add_serve(make: Callable[..., argparse.ArgumentParser]) -> None:
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--robot", choices=ROBOTS, help="one of the printable robots")
     what.add_argument(
-        "--model", metavar="MODULE:FUNCTION",
+        "--model",
+        metavar="MODULE:FUNCTION",
         help="a model of your own: function(period [s]) -> (advance, state, limits), the "
         "first two as ModelValves takes them, limits [Pa] a pair per port",
-    )  # fmt: skip
+    )
     parser.add_argument("--port", type=int, default=PORT)
     parser.add_argument("--host", default="127.0.0.1", help="address to bind")
     parser.add_argument("--key", type=Path, help="file with the shared key, mode 0600")
-    parser.add_argument("--legacy", action="store_true",
-                        help=f"also the raw float64 stream on port {LEGACY_PORT}")  # fmt: skip
+    parser.add_argument(
+        "--legacy",
+        action="store_true",
+        help=f"also the raw float64 stream on port {LEGACY_PORT}",
+    )
     parser.add_argument("--period", type=float, default=5.0, help="step of the model [ms]")
 
 
@@ -47,9 +51,12 @@ def serve(asked: argparse.Namespace) -> int:
         importlib.import_module("sorojax").enable_compilation_cache()
     valves, settings = simulated(asked.robot, asked.model, asked.period * 1e-3)
     server = Server(
-        Board(settings, valves), key=read_key(asked.key), host=asked.host, port=asked.port,
+        Board(settings, valves),
+        key=read_key(asked.key),
+        host=asked.host,
+        port=asked.port,
         legacy_port=LEGACY_PORT if asked.legacy else None,
-    )  # fmt: skip
+    )
     run_server(server, f"simulated {asked.robot or asked.model} on {asked.host}")
     return 0
 

@@ -16,9 +16,13 @@ def add(commands) -> None:
     parser.add_argument("--size", type=float, default=0.5, help="of a cell [mm]")
     parser.add_argument("--wall", type=float, help="least wall to accept [mm]")
     parser.add_argument(
-        "--set", action="append", default=[], metavar="DIMENSION=VALUE", dest="dimensions",
+        "--set",
+        action="append",
+        default=[],
+        metavar="DIMENSION=VALUE",
+        dest="dimensions",
         help="another dimension [mm, degrees for angles]; `--list` names them",
-    )  # fmt: skip
+    )
     parser.add_argument("--list", action="store_true", help="print the dimensions and stop")
     parser.set_defaults(run=run)
 
@@ -58,9 +62,11 @@ def _robot(name: str):
     from sorojax import robots
 
     kinds = {
-        "bending": robots.BendingActuator, "planar": robots.PlanarActuator,
-        "hand": robots.Hand, "manipulator": robots.Manipulator,
-    }  # fmt: skip
+        "bending": robots.BendingActuator,
+        "planar": robots.PlanarActuator,
+        "hand": robots.Hand,
+        "manipulator": robots.Manipulator,
+    }
     return kinds[name]()
 
 

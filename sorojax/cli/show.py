@@ -13,15 +13,16 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("show", help="picture of a surface, mesh or result file")
     parser.add_argument("file", type=Path, help=".stl .obj .ply .vtu .pvd .msh .npz ...")
     parser.add_argument(
-        "--out", type=Path, help="what to write: .png .pdf .svg, .gif or .mp4 of a .pvd "
+        "--out",
+        type=Path,
+        help="what to write: .png .pdf .svg, .gif or .mp4 of a .pvd "
         "(default: FILE.png in this folder)",
-    )  # fmt: skip
+    )
     parser.add_argument("--field", help="values that colour it, e.g. von_mises")
     parser.add_argument(
         "--unit", type=float, metavar="M", help="1 in the file in metres (surfaces: 0.001)"
     )
-    parser.add_argument("--view", default="iso",
-                        help="iso front back left right top bottom")  # fmt: skip
+    parser.add_argument("--view", default="iso", help="iso front back left right top bottom")
     parser.add_argument("--wire", action="store_true", help="draw cells")
     parser.add_argument("--open", action="store_true", help="open it where a display is")
     parser.set_defaults(run=run)

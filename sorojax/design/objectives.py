@@ -139,9 +139,10 @@ def _loaded(problem: Problem, names: tuple[str, ...] | None) -> Problem:
     """The fields that a work depends on: no stiffness, whose derivative would be zero at full
     cost."""
     chosen = [
-        load for load in problem.loads
+        load
+        for load in problem.loads
         if (not load.holds if names is None else load.name in names)
-    ]  # fmt: skip
+    ]
     return exchanged(problem, supports=(), loads=tuple(chosen), material=solid_of(problem))
 
 

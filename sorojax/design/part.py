@@ -251,8 +251,10 @@ class PartReport(NamedTuple):
         ]
         if self.surface is not None:
             state = "watertight" if self.surface.watertight else "NOT watertight"
-            rows.append(f"surface {state}, {self.surface.num_shells} shells, genus "
-                        f"{self.surface.genus}, {self.surface.volume:.6g} m^3")  # fmt: skip
+            rows.append(
+                f"surface {state}, {self.surface.num_shells} shells, genus "
+                f"{self.surface.genus}, {self.surface.volume:.6g} m^3"
+            )
         return "\n".join(rows)
 
     __repr__ = __str__
@@ -281,9 +283,14 @@ def reanalyse(
     mesh = fill(made.cell, size=size, order=order)
     checked = None if surface is None else sdf.surface_report(surface)
     return PartReport(
-        float(promised), float(performance(mesh)), mesh, quality(mesh), made.wanted,
-        made.volume, checked,
-    )  # fmt: skip
+        float(promised),
+        float(performance(mesh)),
+        mesh,
+        quality(mesh),
+        made.wanted,
+        made.volume,
+        checked,
+    )
 
 
 def solid(made: Part, thickness: float | None = None) -> AbstractSdf:

@@ -161,11 +161,15 @@ def pneunet_cell(
     rubber = presets.flexible_80a() if rubber is None else rubber
     left, right = (np.asarray(grid.node_sets[side]) for side in ("left", "right"))
     made = problem(
-        grid, interpolated_energy(rubber, jnp.ones(grid.num_cells)), kinematics=kinematics,
+        grid,
+        interpolated_energy(rubber, jnp.ones(grid.num_cells)),
+        kinematics=kinematics,
         supports=(Fixed(left),),
-        loads=(void_pressure(grid, jnp.zeros(grid.num_cells), pressure, name="air"),
-               Foundation(right, output_stiffness / len(right), name="spring")),
-    )  # fmt: skip
+        loads=(
+            void_pressure(grid, jnp.zeros(grid.num_cells), pressure, name="air"),
+            Foundation(right, output_stiffness / len(right), name="spring"),
+        ),
+    )
     middle = np.asarray(size) / 2
     centres = np.asarray(grid.points)[np.asarray(grid.cells)].mean(axis=1)
     away = np.linalg.norm(centres - middle, axis=1)
@@ -187,9 +191,13 @@ def pneunet_cell(
     rest = (volume * len(start) - np.sum(held)) / np.sum(start[~held])
     start[~held] *= np.clip(rest, 0.0, 1.0)
     return PneuNetCell(
-        made, plan, _chamber(chamber, grid, made, core, radius), jnp.asarray(selector),
-        plan.variables(jnp.asarray(start)), volume,
-    )  # fmt: skip
+        made,
+        plan,
+        _chamber(chamber, grid, made, core, radius),
+        jnp.asarray(selector),
+        plan.variables(jnp.asarray(start)),
+        volume,
+    )
 
 
 def _chamber(kind: str, grid, made: Problem, core, radius: float) -> Flood | Darcy:
@@ -242,9 +250,16 @@ def optimise_pneunet(
 
     def run(until, method, begin):
         return minimise(
-            loss, cell.start, constraints=(held,), optimiser=method, steps=until, scale=scale,
-            schedule=lambda k: (sharpness(k, steps),), on_step=on_step, resume=begin,
-        )  # fmt: skip
+            loss,
+            cell.start,
+            constraints=(held,),
+            optimiser=method,
+            steps=until,
+            scale=scale,
+            schedule=lambda k: (sharpness(k, steps),),
+            on_step=on_step,
+            resume=begin,
+        )
 
     scale = 0.01 * float(jnp.sqrt(jnp.sum(cell.plan.volumes)))
     histories = []

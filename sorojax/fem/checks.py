@@ -185,8 +185,12 @@ def supports(
             )
         check_ids(where, support.nodes, mesh.num_nodes)
         _check_components(where, support, dim)
-        _check.finite("fem.problem", f"{where} displacement", support.displacement,
-                      "Give displacements in metres.")  # fmt: skip
+        _check.finite(
+            "fem.problem",
+            f"{where} displacement",
+            support.displacement,
+            "Give displacements in metres.",
+        )
     known = known_dofs(given, mesh.num_nodes, dim)
     if isinstance(kinematics, Axisymmetric) and not is_traced(mesh.points):
         _check_axis(np.asarray(mesh.points), known)

@@ -155,8 +155,9 @@ def problem(
     """
     _check.float64("fem.problem", mesh.points)
     supports, loads = tuple(supports), tuple(loads)
-    kinematics = checks.kinematics(mesh, kinematics if mesh.element.dim == 2 or kinematics
-                                   else Solid())  # fmt: skip
+    kinematics = checks.kinematics(
+        mesh, kinematics if mesh.element.dim == 2 or kinematics else Solid()
+    )
     checks.cells(mesh)
     checks.material(mesh, material)
     if formulation is None:

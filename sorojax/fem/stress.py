@@ -97,8 +97,10 @@ def stress_at(
     """Cauchy stress at `points` of every cell [Pa]."""
     F = _full(problem, points, deformation(problem.mesh, problem.kinematics, points, u))
     material = body_at(problem, points).material
-    entries = jax.tree.map(lambda e: jnp.broadcast_to(jnp.asarray(e, points.volumes.dtype),
-                                                      points.volumes.shape), F)  # fmt: skip
+    entries = jax.tree.map(
+        lambda e: jnp.broadcast_to(jnp.asarray(e, points.volumes.dtype), points.volumes.shape),
+        F,
+    )
     P = jax.grad(lambda F: jnp.sum(material.isochoric_energy(F)))(entries)
     J = determinant(entries)
     matrix_P, matrix_F = (stack_matrix(T, points.volumes) for T in (P, entries))

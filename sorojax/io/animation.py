@@ -49,8 +49,10 @@ class _Document:
     def view(self, data: np.ndarray, target: int | None = None, stride: int = 0) -> int:
         content = np.ascontiguousarray(data).tobytes()
         view: dict[str, Any] = {
-            "buffer": 0, "byteOffset": self.size, "byteLength": len(content)
-        }  # fmt: skip
+            "buffer": 0,
+            "byteOffset": self.size,
+            "byteLength": len(content),
+        }
         view |= {"target": target} if target else {}
         view |= {"byteStride": stride} if stride else {}
         self.views.append(view)
@@ -93,10 +95,14 @@ def write(
         mesh, centre, half = _mesh(document, shape)
         meshes.append(mesh)
         scaled = len(nodes)
-        nodes.append({
-            "mesh": len(meshes) - 1, "name": shape.name,
-            "translation": centre.tolist(), "scale": half.tolist(),
-        })  # fmt: skip
+        nodes.append(
+            {
+                "mesh": len(meshes) - 1,
+                "name": shape.name,
+                "translation": centre.tolist(),
+                "scale": half.tolist(),
+            }
+        )
         if len(shape.points) > 1:
             frames = len(shape.points)
             animate(scaled, "weights", np.eye(frames)[:, 1:], "SCALAR")

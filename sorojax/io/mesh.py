@@ -224,9 +224,10 @@ def _named(data: dict, prefix: str):
 _DATA = {".vtu", ".vtk", ".xdmf", ".xmf", ".msh"}  # formats that carry values of cells
 _SURFACES = {".stl", ".obj", ".ply", ".off", ".svg"}  # meshio drops cells or planes there
 _OPTIONS = {
-    ".msh": {"file_format": "gmsh22"}, ".xdmf": {"data_format": "XML"},
+    ".msh": {"file_format": "gmsh22"},
+    ".xdmf": {"data_format": "XML"},
     ".xmf": {"data_format": "XML"},
-}  # fmt: skip
+}
 
 
 def export_mesh(
@@ -277,9 +278,14 @@ def export_mesh(
 
     blocks = [(type_of(where, mesh.element), np.asarray(mesh.cells)), *parts.blocks]
     whole = meshio.Mesh(
-        points, blocks, point_data=parts.point_data, cell_data=parts.cell_data,
-        point_sets=parts.point_sets, cell_sets=parts.cell_sets, field_data=parts.field_data,
-    )  # fmt: skip
+        points,
+        blocks,
+        point_data=parts.point_data,
+        cell_data=parts.cell_data,
+        point_sets=parts.point_sets,
+        cell_sets=parts.cell_sets,
+        field_data=parts.field_data,
+    )
     _write(where, file, whole, suffix)
 
 
@@ -490,9 +496,12 @@ def _by_pytetwild(surface: Surface, size: float, timeout: float) -> Mesh:
         ) from reason
     extent = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
     points, cells = tetrahedralize(
-        surface.vertices, surface.triangles.astype(np.int32), optimize=True,
-        edge_length_fac=min(size / extent, 1.0), quiet=True,
-    )  # fmt: skip
+        surface.vertices,
+        surface.triangles.astype(np.int32),
+        optimize=True,
+        edge_length_fac=min(size / extent, 1.0),
+        quiet=True,
+    )
     if not len(cells):
         raise ValueError(
             "mesh_surface: pytetwild found no inside. Check that the triangles face outwards, "

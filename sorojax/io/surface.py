@@ -365,9 +365,10 @@ def read_ply(data: bytes, where: str, unit: float) -> Surface:
         left = len(body) - offset
         if element.count * record.itemsize > left:
             _refuse(
-                where, f"{element.count} rows of `{element.name}` take "
-                f"{element.count * record.itemsize} bytes, {left} are left"
-            )  # fmt: skip
+                where,
+                f"{element.count} rows of `{element.name}` take "
+                f"{element.count * record.itemsize} bytes, {left} are left",
+            )
         table = np.frombuffer(body, record, element.count, offset)
         offset += table.nbytes
         if element.name == "vertex":

@@ -40,6 +40,11 @@ def finite(where: str, **coefficients: Any) -> None:
 
 def poisson_ratio(where: str, value: Any) -> None:
     _check.between(
-        where, "poisson_ratio", value, -1.0, 0.5, "",
+        where,
+        "poisson_ratio",
+        value,
+        -1.0,
+        0.5,
+        "",
         "For a nearly incompressible rubber use 0.49: at 0.5 the bulk modulus is infinite.",
-    )  # fmt: skip
+    )

@@ -95,9 +95,10 @@ class InvariantEnergy(AbstractHyperelastic):
         checks.mass("InvariantEnergy", self.density)
         three = jnp.asarray(3.0, self.bulk_modulus.dtype)
         _check_energy(
-            "InvariantEnergy", self.parameters,
+            "InvariantEnergy",
+            self.parameters,
             lambda: self.function(three, three, *self.parameters),
-        )  # fmt: skip
+        )
 
     def isochoric_energy(self, F: Tensor) -> Entry:
         first, second = isochoric_first_invariant(F), isochoric_second_invariant(F)

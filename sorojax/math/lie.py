@@ -159,12 +159,14 @@ def _half_turn(rotation: Float[Array, "3 3"]) -> tuple[Array, Float[Array, "3"]]
     """Unit quaternion with a real part that is not negative."""
     (a, b, c), (d, e, f), (g, h, i) = rotation
     x, y, z = h - f, c - g, d - b
-    rows = jnp.stack([
-        jnp.stack([1 + a + e + i, x, y, z]),
-        jnp.stack([x, 1 + a - e - i, b + d, c + g]),
-        jnp.stack([y, b + d, 1 - a + e - i, f + h]),
-        jnp.stack([z, c + g, f + h, 1 - a - e + i]),
-    ])  # fmt: skip
+    rows = jnp.stack(
+        [
+            jnp.stack([1 + a + e + i, x, y, z]),
+            jnp.stack([x, 1 + a - e - i, b + d, c + g]),
+            jnp.stack([y, b + d, 1 - a + e - i, f + h]),
+            jnp.stack([z, c + g, f + h, 1 - a - e + i]),
+        ]
+    )
     row = rows[jnp.argmax(jnp.diagonal(rows))]
     unit = row / jnp.sqrt(row @ row)
     unit = jnp.where(unit[0] < 0, -unit, unit)
@@ -205,9 +207,9 @@ def _half_cotangent(angle: Array) -> Array:
 def _planar_change(twist: Float[Array, "3"]) -> Float[Array, "3 3"]:
     angle, x, y = twist
     o = jnp.zeros_like(x)
-    adjoint = jnp.stack([
-        jnp.stack([o, o, o]), jnp.stack([y, o, -angle]), jnp.stack([-x, angle, o]),
-    ])  # fmt: skip
+    adjoint = jnp.stack(
+        [jnp.stack([o, o, o]), jnp.stack([y, o, -angle]), jnp.stack([-x, angle, o])]
+    )
     # adjoint^3 = -angle^2 adjoint
     small = jnp.abs(angle) < 1e-2
     safe = jnp.where(small, jnp.ones_like(angle), angle)

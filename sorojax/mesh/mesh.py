@@ -73,8 +73,10 @@ class Mesh(eqx.Module):
 
     def _text(self) -> str:
         count = f"Mesh: {self.num_cells} {self.element.name} cells, {self.num_nodes} nodes"
-        box = (f"{axis} {number(self.points[:, k])}" for k, axis in
-               zip(range(self.element.dim), "xyz", strict=False))  # fmt: skip
+        box = (
+            f"{axis} {number(self.points[:, k])}"
+            for k, axis in zip(range(self.element.dim), "xyz", strict=False)
+        )
         rows = [count, f"  box [m]     {', '.join(box)}"]
         kinds = {
             "node sets": self.node_sets,

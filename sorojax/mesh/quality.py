@@ -76,10 +76,18 @@ def quality(mesh: Mesh, shape: AbstractSdf | None = None) -> Quality:
         error = total / float(area(shape) if plane else _volume(shape)) - 1
     tenths = np.histogram(ratio, bins=10, range=(0, 1 + 1e-9))[0]
     return Quality(
-        low, float(ratio.mean()), total, mesh.num_nodes, mesh.num_cells, high,
-        tuple(tenths.tolist()), is_watertight(mesh), error,
-        tuple(np.argsort(ratio, kind="stable")[:_WORST].tolist()), tuple(inverted.tolist()),
-    )  # fmt: skip
+        low,
+        float(ratio.mean()),
+        total,
+        mesh.num_nodes,
+        mesh.num_cells,
+        high,
+        tuple(tenths.tolist()),
+        is_watertight(mesh),
+        error,
+        tuple(np.argsort(ratio, kind="stable")[:_WORST].tolist()),
+        tuple(inverted.tolist()),
+    )
 
 
 def _volume(shape: AbstractSdf):
@@ -162,9 +170,17 @@ _SIMPLICES = {
     3: ((0, 1, 2),),
     (2, 4): ((0, 1, 3), (1, 2, 0), (2, 3, 1), (3, 0, 2)),
     (3, 4): ((0, 1, 2, 3),),
-    8: ((0, 1, 3, 4), (1, 2, 0, 5), (2, 3, 1, 6), (3, 0, 2, 7),
-        (4, 7, 5, 0), (5, 4, 6, 1), (6, 5, 7, 2), (7, 6, 4, 3)),
-}  # fmt: skip
+    8: (
+        (0, 1, 3, 4),
+        (1, 2, 0, 5),
+        (2, 3, 1, 6),
+        (3, 0, 2, 7),
+        (4, 7, 5, 0),
+        (5, 4, 6, 1),
+        (6, 5, 7, 2),
+        (7, 6, 4, 3),
+    ),
+}
 
 
 class Distortion(NamedTuple):

@@ -259,7 +259,11 @@ def chambers(mesh: Mesh) -> Chambers:
     sets = {name: loop for name, (_, _, loop) in zip(names, found, strict=True)}
     volumes = {name: volume for name, (_, volume, _) in zip(names, found, strict=True)}
     named = Mesh(
-        mesh.points, mesh.cells, mesh.element, mesh.node_sets, mesh.facet_sets | sets,
+        mesh.points,
+        mesh.cells,
+        mesh.element,
+        mesh.node_sets,
+        mesh.facet_sets | sets,
         mesh.regions,
-    )  # fmt: skip
+    )
     return Chambers(named, volumes)

@@ -228,9 +228,7 @@ def between_lines(
     grid = make([0.0] * element.dim, counts, divisions=counts, element=element)
     steps = np.asarray(grid.points).T
     points = [np.interp(s, np.arange(len(p)), p) for s, p in zip(steps, places, strict=True)]
-    return Mesh(
-        np.stack(points, axis=1), grid.cells, element, grid.node_sets, grid.facet_sets
-    )  # fmt: skip
+    return Mesh(np.stack(points, axis=1), grid.cells, element, grid.node_sets, grid.facet_sets)
 
 
 def submesh(mesh: Mesh, cells: Int[np.ndarray, " kept"]) -> Mesh:
@@ -436,12 +434,16 @@ def mirror(mesh: Mesh, axis: int, at: float) -> Mesh:
         np.concatenate([points, image]),
         np.concatenate([cells, number[cells[:, mirror_order(mesh.element)]]]),
         mesh.element,
-        {name: np.unique(np.concatenate([ids, number[np.asarray(ids)]]))
-         for name, ids in mesh.node_sets.items()},
+        {
+            name: np.unique(np.concatenate([ids, number[np.asarray(ids)]]))
+            for name, ids in mesh.node_sets.items()
+        },
         facets,
-        {name: np.concatenate([ids, np.asarray(ids) + len(cells)])
-         for name, ids in mesh.regions.items()},
-    )  # fmt: skip
+        {
+            name: np.concatenate([ids, np.asarray(ids) + len(cells)])
+            for name, ids in mesh.regions.items()
+        },
+    )
 
 
 def _facets(mesh: Mesh, ids, shared, number) -> np.ndarray:

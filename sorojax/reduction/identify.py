@@ -97,9 +97,14 @@ def mean_section(
     else:
         about_y = area * kinematics.thickness**2 / 12
     return Section(
-        area, about_y, about_z, about_y + about_z, 5 / 6,
-        mass_offset_y=offsets[0], mass_offset_z=offsets[1] if len(offsets) > 1 else None,
-    )  # fmt: skip
+        area,
+        about_y,
+        about_z,
+        about_y + about_z,
+        5 / 6,
+        mass_offset_y=offsets[0],
+        mass_offset_z=offsets[1] if len(offsets) > 1 else None,
+    )
 
 
 @jax.jit
@@ -205,9 +210,11 @@ class PressureMap(AbstractPressureMap):
     def coenergy(self, q: Float[Array, " dof"], pressure: Float[Array, ""]) -> Float[Array, ""]:
         x = pressure / self.scale
         push = _powers(x, self.force.shape[0]) @ self.force
-        return push @ q + pressure * (q @ self.coupling @ q) / 2 + (
-            _powers(x, self.walls.shape[0]) @ self.walls
-        )  # fmt: skip
+        return (
+            push @ q
+            + pressure * (q @ self.coupling @ q) / 2
+            + (_powers(x, self.walls.shape[0]) @ self.walls)
+        )
 
 
 class ConstantDamping(AbstractDamping):

@@ -112,9 +112,11 @@ def crawler_mesh(crawler: Crawler, size: float, across: int = 1) -> mesh.Mesh:
     marks = [0.0, float(crawler.sole_thickness), float(crawler.base), top]
     y = _divided(np.array([*marks, float(crawler.height)]), size, across)
     grid = mesh.rectangle(
-        [0, 0], [len(x) - 1, len(y) - 1], divisions=(len(x) - 1, len(y) - 1),
+        [0, 0],
+        [len(x) - 1, len(y) - 1],
+        divisions=(len(x) - 1, len(y) - 1),
         element=mesh.Quad8(),
-    )  # fmt: skip
+    )
     at = np.asarray(grid.points)
     points = np.stack(
         [np.interp(at[:, k], np.arange(len(line)), line) for k, line in enumerate((x, y))], 1
@@ -176,13 +178,20 @@ def crawler_problem(
         for k, name in enumerate(PORTS)
     )
     floor = fem.Contact(
-        mesh.facets_where(cells, outside), HalfPlane([0.0, 0.0], [0.0, 1.0]), stiffness,
-        friction=friction, name="floor",
-    )  # fmt: skip
+        mesh.facets_where(cells, outside),
+        HalfPlane([0.0, 0.0], [0.0, 1.0]),
+        stiffness,
+        friction=friction,
+        name="floor",
+    )
     return fem.problem(
-        cells, rubber, kinematics=fem.PlaneStrain(depth), supports=(),
-        loads=(fem.Gravity(), *air, floor), free=True,
-    )  # fmt: skip
+        cells,
+        rubber,
+        kinematics=fem.PlaneStrain(depth),
+        supports=(),
+        loads=(fem.Gravity(), *air, floor),
+        free=True,
+    )
 
 
 def crawler_gait(
@@ -288,8 +297,15 @@ class Walker(eqx.Module):
         check_metres(
             self, "spacing", "reach", "leg_width", "spine_thickness", "weight_diagonal"
         )
-        _check.between("Walker", "toe_start", self.toe_start, 0.0, 1.0, "",
-                       "Give the share of the leg above its toe.")  # fmt: skip
+        _check.between(
+            "Walker",
+            "toe_start",
+            self.toe_start,
+            0.0,
+            1.0,
+            "",
+            "Give the share of the leg above its toe.",
+        )
 
     @property
     def apex_height(self) -> Float[Array, ""]:
@@ -402,10 +418,18 @@ def walker_problem(
     rubber = walker_rubber() if rubber is None else rubber
     pull = 9.81 * jnp.stack([jnp.sin(real(slope)), -jnp.cos(real(slope))])
     floor = fem.Contact(
-        mesh.facets_where(cells, underside), HalfPlane([0.0, 0.0], [0.0, 1.0]), stiffness,
-        friction=friction, friction_velocity=friction_velocity, name="floor",
-    )  # fmt: skip
+        mesh.facets_where(cells, underside),
+        HalfPlane([0.0, 0.0], [0.0, 1.0]),
+        stiffness,
+        friction=friction,
+        friction_velocity=friction_velocity,
+        name="floor",
+    )
     return fem.problem(
-        mesh.enrich(cells), rubber, kinematics=fem.PlaneStrain(depth), supports=(),
-        loads=(fem.Gravity(pull), floor), free=True,
-    )  # fmt: skip
+        mesh.enrich(cells),
+        rubber,
+        kinematics=fem.PlaneStrain(depth),
+        supports=(),
+        loads=(fem.Gravity(pull), floor),
+        free=True,
+    )

@@ -36,9 +36,14 @@ def check_metres(robot: eqx.Module, *names: str) -> None:
     """Raise a `ValueError` unless the named lengths are above zero and below a metre."""
     for name in names:
         _check.between(
-            type(robot).__name__, name, getattr(robot, name), 0.0, 1.0, "m",
+            type(robot).__name__,
+            name,
+            getattr(robot, name),
+            0.0,
+            1.0,
+            "m",
             "Lengths are in metres: write 2 * mm.",
-        )  # fmt: skip
+        )
 
 
 @displayed
@@ -158,10 +163,18 @@ def pipe(radius, start, length, axis: int) -> AbstractSdf:
 class Finger(eqx.Module):
     """Dimensions [m]; it stands on z = 0 and bends towards its spine at -x."""
 
-    bellows: Bellows = eqx.field(default_factory=lambda: Bellows(
-        outer_radius=9 * mm, inner_radius=5.6 * mm, pitch=8 * mm, fold_height=4.8 * mm,
-        wall_thickness=1.2 * mm, cap=2.5 * mm, fillet=1.2 * mm, num_folds=9,
-    ))  # fmt: skip
+    bellows: Bellows = eqx.field(
+        default_factory=lambda: Bellows(
+            outer_radius=9 * mm,
+            inner_radius=5.6 * mm,
+            pitch=8 * mm,
+            fold_height=4.8 * mm,
+            wall_thickness=1.2 * mm,
+            cap=2.5 * mm,
+            fillet=1.2 * mm,
+            num_folds=9,
+        )
+    )
     tip_radius: Float[Array, ""] = eqx.field(converter=real, default=7.5 * mm)
     spine_width: Float[Array, ""] = eqx.field(converter=real, default=9 * mm)
     spine_thickness: Float[Array, ""] = eqx.field(converter=real, default=3 * mm)
@@ -188,9 +201,10 @@ class Finger(eqx.Module):
         outside = -b.outer_radius - self.spine_thickness / 3
         end = b.length - b.cap - b.pitch / 2
         spine = Box(
-            [outside, -half, zero], [outside + self.spine_thickness, half, end],
+            [outside, -half, zero],
+            [outside + self.spine_thickness, half, end],
             self.spine_thickness / 4,
-        )  # fmt: skip
+        )
         return b.solid() | tip | spine
 
 
@@ -205,14 +219,36 @@ class Hand(eqx.Module):
     -z and take -10 to 60 kPa; their ports open on the back of the hand.
     """
 
-    finger: Finger = eqx.field(default_factory=lambda: Finger(bellows=Bellows(
-        outer_radius=9 * mm, inner_radius=5.6 * mm, pitch=8.6 * mm, fold_height=5 * mm,
-        wall_thickness=1.2 * mm, cap=2.5 * mm, fillet=1.2 * mm, num_folds=9,
-    ), tip_radius=7.6 * mm))  # fmt: skip
-    thumb: Finger = eqx.field(default_factory=lambda: Finger(bellows=Bellows(
-        outer_radius=9 * mm, inner_radius=5.6 * mm, pitch=8.4 * mm, fold_height=5 * mm,
-        wall_thickness=1.2 * mm, cap=2.5 * mm, fillet=1.2 * mm, num_folds=8,
-    ), tip_radius=7.8 * mm))  # fmt: skip
+    finger: Finger = eqx.field(
+        default_factory=lambda: Finger(
+            bellows=Bellows(
+                outer_radius=9 * mm,
+                inner_radius=5.6 * mm,
+                pitch=8.6 * mm,
+                fold_height=5 * mm,
+                wall_thickness=1.2 * mm,
+                cap=2.5 * mm,
+                fillet=1.2 * mm,
+                num_folds=9,
+            ),
+            tip_radius=7.6 * mm,
+        )
+    )
+    thumb: Finger = eqx.field(
+        default_factory=lambda: Finger(
+            bellows=Bellows(
+                outer_radius=9 * mm,
+                inner_radius=5.6 * mm,
+                pitch=8.4 * mm,
+                fold_height=5 * mm,
+                wall_thickness=1.2 * mm,
+                cap=2.5 * mm,
+                fillet=1.2 * mm,
+                num_folds=8,
+            ),
+            tip_radius=7.8 * mm,
+        )
+    )
     palm_width: Float[Array, ""] = eqx.field(converter=real, default=90 * mm)
     palm_length: Float[Array, ""] = eqx.field(converter=real, default=114 * mm)
     palm_thickness: Float[Array, ""] = eqx.field(converter=real, default=26 * mm)
@@ -286,13 +322,24 @@ class Manipulator(eqx.Module):
     cables. The gripper closes around objects of 40 mm.
     """
 
-    bellows: Bellows = eqx.field(default_factory=lambda: Bellows(
-        outer_radius=13 * mm, inner_radius=8 * mm, num_folds=9,
-    ))  # fmt: skip
-    finger: Finger = eqx.field(default_factory=lambda: Finger(bellows=Bellows(
-        outer_radius=8 * mm, inner_radius=5 * mm, pitch=8 * mm, fold_height=4.8 * mm,
-        wall_thickness=1.2 * mm, cap=2.5 * mm, fillet=1.2 * mm, num_folds=5,
-    ), tip_radius=6.5 * mm))  # fmt: skip
+    bellows: Bellows = eqx.field(
+        default_factory=lambda: Bellows(outer_radius=13 * mm, inner_radius=8 * mm, num_folds=9)
+    )
+    finger: Finger = eqx.field(
+        default_factory=lambda: Finger(
+            bellows=Bellows(
+                outer_radius=8 * mm,
+                inner_radius=5 * mm,
+                pitch=8 * mm,
+                fold_height=4.8 * mm,
+                wall_thickness=1.2 * mm,
+                cap=2.5 * mm,
+                fillet=1.2 * mm,
+                num_folds=5,
+            ),
+            tip_radius=6.5 * mm,
+        )
+    )
     center_distance: Float[Array, ""] = eqx.field(converter=real, default=20 * mm)
     finger_distance: Float[Array, ""] = eqx.field(converter=real, default=28 * mm)
     plate_radius: Float[Array, ""] = eqx.field(converter=real, default=37 * mm)
@@ -480,9 +527,10 @@ class BendingActuator(eqx.Module):
         """The actuator without its hollows."""
         half, zero = self.width / 2, jnp.zeros_like(self.width)
         block = Box(
-            [self.gap / 2, -half, zero], [self.pitch - self.gap / 2, half, self.height],
+            [self.gap / 2, -half, zero],
+            [self.pitch - self.gap / 2, half, self.height],
             self.fillet,
-        )  # fmt: skip
+        )
         slab = Box([zero, -half, zero], [self.length, half, self.base], self.fillet)
         quarter, w = self.width / 4, self.wall_thickness
         neck = Box(

@@ -68,7 +68,7 @@ def _hanging(angle: float, radius: Float[Array, ""]) -> Float[Array, "4 4"]:
             jnp.stack([zero, -s, c]),
             jnp.stack([-one, zero, zero]),
         ]
-    )  # fmt: skip
+    )
     return homogeneous(turn, radius * jnp.stack([c, s, zero]))
 
 

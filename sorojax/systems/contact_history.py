@@ -72,8 +72,10 @@ def contact_history(
     rates = tuple(range(num_dof(model)))
     if parts is not None:
         if isinstance(model, Rod):
-            raise ValueError(f"touching: got the parts {list(parts)} of a rod, which has none. "
-                             "Leave them out.")  # fmt: skip
+            raise ValueError(
+                f"touching: got the parts {list(parts)} of a rod, which has none. "
+                "Leave them out."
+            )
         places = [slices(model)[index_of(model, name)] for name in parts]
         rates = tuple(k for at in places for own in (at.joint_v, at.rod_v) for k in rates[own])
     return _along(model, contacts, rates, real(q), real(v))

@@ -328,8 +328,10 @@ def live(what: Rig | AbstractSink, **options: Any) -> Feed:
     slots = Slots.new(sink.size)
     process = subprocess.Popen(
         [sys.executable, "-m", "sorojax.view.viewer", str(slots.path)],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=_environment(),
-    )  # fmt: skip
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env=_environment(),
+    )
     assert process.stdin is not None and process.stdout is not None
     late = threading.Timer(_START, process.kill)
     late.start()
@@ -401,9 +403,12 @@ class Viser(AbstractSink):
             self._server = viser.ViserServer("127.0.0.1", self.port, self.title, verbose=False)
         self._server.scene.set_up_direction("+z")
         self._mesh = self._server.scene.add_mesh_simple(
-            "/robot", self._points(None), np.asarray(self.rig.triangles),
-            color=tuple(bytes.fromhex(style.BODY[1:])), side="double",
-        )  # fmt: skip
+            "/robot",
+            self._points(None),
+            np.asarray(self.rig.triangles),
+            color=tuple(bytes.fromhex(style.BODY[1:])),
+            side="double",
+        )
         self._stamp = self._server.gui.add_text("time", "waiting", disabled=True)
         return f"http://127.0.0.1:{self._server.get_port()}/"
 

@@ -160,16 +160,29 @@ def _solid(scenes, names, view: View, renderer: str, title: str, width: float) -
         lens = lens_of([scenes[0]] if scene.extent is not None else scenes, view, size)
         draw_solid(figure, axes, replace(scene, title=""), renderer=renderer, lens=lens)
         figure.text(
-            (column + 0.5) * each / width, (low + aspect * each) / height, name,
-            ha="center", va="bottom", fontsize=style.LABEL, color=style.INK,
-        )  # fmt: skip
+            (column + 0.5) * each / width,
+            (low + aspect * each) / height,
+            name,
+            ha="center",
+            va="bottom",
+            fontsize=style.LABEL,
+            color=style.INK,
+        )
         drawn.append(Panel(axes, lens))
     if scenes[0].scale is not None:
         place = (1 - 0.95 / width, 0.15, 0.16 / width, 0.7)
         bar_of(figure, scenes[0].scale, figure.add_axes(place))
     if title:
-        figure.text(0.5, 1 - 0.12 / height, title, ha="center", va="top", fontsize=style.TITLE,
-                    color=style.INK, fontweight="bold")  # fmt: skip
+        figure.text(
+            0.5,
+            1 - 0.12 / height,
+            title,
+            ha="center",
+            va="top",
+            fontsize=style.TITLE,
+            color=style.INK,
+            fontweight="bold",
+        )
     return Picture(figure, tuple(drawn))
 
 

@@ -51,9 +51,12 @@ def html_report(title: str, sections: Sequence[Section], *, lead: str = "") -> s
         f'<a href="#s{k}">{escape(section.heading)}</a>' for k, section in enumerate(sections)
     )
     return _PAGE.format(
-        title=escape(title), style=_STYLE, lead=_paragraphs(lead, "lead"), links=links,
+        title=escape(title),
+        style=_STYLE,
+        lead=_paragraphs(lead, "lead"),
+        links=links,
         body=body,
-    )  # fmt: skip
+    )
 
 
 def format_number(value: float | int | str) -> str:

@@ -55,8 +55,9 @@ def project(camera: Camera, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarr
     """Pixels of points in the camera frame [m]; NaN behind the camera."""
     points = np.asarray(points, float)
     depth = points[..., 2:]
-    plane = np.divide(points[..., :2], depth, where=depth > 0, out=np.full(
-        points[..., :2].shape, np.nan))  # fmt: skip
+    plane = np.divide(
+        points[..., :2], depth, where=depth > 0, out=np.full(points[..., :2].shape, np.nan)
+    )
     return _distorted(camera, plane) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
 
 

@@ -132,9 +132,15 @@ def hough_discs(
     for index, colour in enumerate(colours):
         smooth = cv2.GaussianBlur(masked(hsv, colour), (0, 0), 1.2)
         circles = cv2.HoughCircles(
-            smooth, cv2.HOUGH_GRADIENT, 1, 2 * low, param1=150, param2=14,
-            minRadius=low, maxRadius=high,
-        )  # fmt: skip
+            smooth,
+            cv2.HOUGH_GRADIENT,
+            1,
+            2 * low,
+            param1=150,
+            param2=14,
+            minRadius=low,
+            maxRadius=high,
+        )
         for x, y, r in [] if circles is None else circles.reshape(-1, 3):
             found.append((float(x), float(y), float(r), index))
     discs = _discs(found)

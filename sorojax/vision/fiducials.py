@@ -51,9 +51,12 @@ def marker_pose(camera: Camera, corners: Float[np.ndarray, "4 2"], size: float) 
     """Pose of one marker of side `size` [m] in the camera frame."""
     cv2 = opencv()
     _, turn, place = cv2.solvePnP(
-        marker_corners(size), corners, camera.matrix, np.array(camera.distortion),
+        marker_corners(size),
+        corners,
+        camera.matrix,
+        np.array(camera.distortion),
         flags=cv2.SOLVEPNP_IPPE_SQUARE,
-    )  # fmt: skip
+    )
     return Pose(cv2.Rodrigues(turn)[0], place.ravel())
 
 

@@ -34,9 +34,12 @@ SIMP = design.Simp(3.0, 1e-3)
 
 def body(*loads, rubber=RUBBER):
     return fem.problem(
-        GRID, rubber, kinematics=fem.PlaneStrain(0.7), supports=(fem.Fixed(LEFT),),
+        GRID,
+        rubber,
+        kinematics=fem.PlaneStrain(0.7),
+        supports=(fem.Fixed(LEFT),),
         loads=loads or (PULL,),
-    )  # fmt: skip
+    )
 
 
 def of_density(verb, *more, **options):
@@ -56,8 +59,11 @@ def through(make):
 def planned():
     mirrored = design.layout(
         mesh.rectangle([0, 0], [1.2, 0.8], divisions=(3, 2), element=mesh.Quad4()),
-        radius=0.5, solid=[0], void=[5], symmetries=(design.Mirrored(0, 0.6),),
-    )  # fmt: skip
+        radius=0.5,
+        solid=[0],
+        void=[5],
+        symmetries=(design.Mirrored(0, 0.6),),
+    )
     numbers = jnp.asarray([0.0, 1.0, 0.3, 0.7]), jnp.asarray(4.0)
     return Case(lambda at: at[0](*at[1:]), (mirrored, *numbers), forward=False, step=1e-4)
 
@@ -197,10 +203,11 @@ CASES |= {
         lambda problem, u, output, w: design.mechanism(
             problem, u, output, output_weight=w[0], work_weight=w[1]
         ),
-        jnp.asarray(0.3), jnp.asarray([2.0, 0.5]),
+        jnp.asarray(0.3),
+        jnp.asarray([2.0, 0.5]),
     ),
     "path_error": judged(path_error, jnp.asarray([[1.0, 0.3], [0.9, 0.4]])),
-}  # fmt: skip
+}
 
 
 # ---- whole designs

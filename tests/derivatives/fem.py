@@ -253,12 +253,14 @@ def loaded(**options):
     turned = fem.Rotated(RIGHT, PLATE.points[RIGHT], 0.05, [1.5, 0.3])
     lifts = fem.Prescribed(RIGHT[:1], 0.05, components=(1,))
     return plate(
-        fem.Traction(ABOVE, [0.01, -0.03]), fem.Pressure(BELOW, 0.02),
+        fem.Traction(ABOVE, [0.01, -0.03]),
+        fem.Pressure(BELOW, 0.02),
         fem.Gravity([0.02, 0.03]),
         fem.Cable(fem.route(PLATE, WAY), 0.5, -0.3, name="slack"),
         fem.Cable(fem.route(PLATE, WAY[1:]), 0.5, 0.1),
-        supports=(fem.Fixed(LEFT), fem.Fixed(LEFT[:1], (0,)), turned, lifts), **options,
-    )  # fmt: skip
+        supports=(fem.Fixed(LEFT), fem.Fixed(LEFT[:1], (0,)), turned, lifts),
+        **options,
+    )
 
 
 def built(at):
@@ -304,9 +306,12 @@ def hanging():
 
 CASES["solve at rest over a ball with friction"] = hanging
 CASES["problem"] = lambda: Case(
-    built, (PLATE.points, (jnp.asarray(0.4), jnp.asarray(2.0)), jnp.asarray([0.02, 0.01])),
-    step=1e-4, forward=False, jit=False,
-)  # fmt: skip
+    built,
+    (PLATE.points, (jnp.asarray(0.4), jnp.asarray(2.0)), jnp.asarray([0.02, 0.01])),
+    step=1e-4,
+    forward=False,
+    jit=False,
+)
 
 
 def along_path(at):
@@ -392,9 +397,16 @@ def moving(problem, method, damping=(), measure=None, **options):
     def at(numbers):
         own, method, damping, row, start = numbers
         motion = fem.simulate(
-            eqx.combine(own, problem), 0.6, 0.2, start=start, method=method, damping=damping,
-            newton=SHARP, **options, **{name: row},
-        )  # fmt: skip
+            eqx.combine(own, problem),
+            0.6,
+            0.2,
+            start=start,
+            method=method,
+            damping=damping,
+            newton=SHARP,
+            **options,
+            **{name: row},
+        )
         if measure is not None:
             return measure(motion)
         return motion.displacements, motion.velocities, motion.energies

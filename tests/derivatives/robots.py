@@ -30,9 +30,15 @@ FEET = mesh.rectangle([-0.02, 0.0], [0.08, 0.013], divisions=(4, 1))
 def hand(radius):
     """Rods that hang from a circle."""
     finger = rod.rod(
-        sj.SE3(), rod.chebyshev(kappa_z=1), rod.circle(0.005), length=0.1, young_modulus=1e5,
-        poisson_ratio=0.4, density=1e3, nodes=4,
-    )  # fmt: skip
+        sj.SE3(),
+        rod.chebyshev(kappa_z=1),
+        rod.circle(0.005),
+        length=0.1,
+        young_modulus=1e5,
+        poisson_ratio=0.4,
+        density=1e3,
+        nodes=4,
+    )
     return rod.assembly(sj.SE3(), **robots.ring(finger, 2, radius))
 
 

@@ -54,10 +54,17 @@ MADE = {
 SMOOTH = {
     verb.__name__: at_points(verb, RING, near(RING, SPACE))
     for verb in (
-        sdf.closest_point, sdf.curvature, sdf.evaluate, sdf.frame, sdf.gaussian_curvature,
-        sdf.gradient, sdf.hessian, sdf.normal, sdf.value_and_normal,
+        sdf.closest_point,
+        sdf.curvature,
+        sdf.evaluate,
+        sdf.frame,
+        sdf.gaussian_curvature,
+        sdf.gradient,
+        sdf.hessian,
+        sdf.normal,
+        sdf.value_and_normal,
     )
-}  # fmt: skip
+}
 PAIRS = [
     (name, shape) for shapes in (*GALLERY.values(), MADE) for name, shape in shapes.items()
 ]

@@ -17,9 +17,15 @@ NONE = {
 
 SLOW = ("simulate_batch",)
 FINGER = R.rod(
-    SE2(), R.chebyshev(kappa_z=2), R.circle(6e-3), length=0.08, nodes=8,
-    young_modulus=1e6, poisson_ratio=0.3, density=2000.0,
-)  # fmt: skip
+    SE2(),
+    R.chebyshev(kappa_z=2),
+    R.circle(6e-3),
+    length=0.08,
+    nodes=8,
+    young_modulus=1e6,
+    poisson_ratio=0.3,
+    density=2000.0,
+)
 FORCES = (R.Gravity([0.0, -9.81]), R.Damping(0.02))
 Q, V, T = jnp.array([4.0, -2.0]), jnp.array([10.0, 20.0]), jnp.asarray(0.3)
 GOAL = S.Sine([1.0, 2.0], 3.0, [0.5, 0.1], 0.2)

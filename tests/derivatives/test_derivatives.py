@@ -10,10 +10,18 @@ from tests.derivatives.case import check
 FLOORS = {
     floor: importlib.import_module(f"tests.derivatives.{floor}")
     for floor in (
-        "contact", "design", "fem", "material", "mesh", "reduction", "robots", "rod", "sdf",
+        "contact",
+        "design",
+        "fem",
+        "material",
+        "mesh",
+        "reduction",
+        "robots",
+        "rod",
+        "sdf",
         "systems",
     )
-}  # fmt: skip
+}
 CASES = [
     pytest.param(
         floor, name, marks=pytest.mark.slow if name in getattr(module, "SLOW", ()) else ()

@@ -252,9 +252,14 @@ def _rubber(x, y, r):
 
 def _rod(x, y, r):
     body = R.rod(
-        SE2(), R.constant("kappa_z"), R.circle(r), length=x, young_modulus=1e6,
-        poisson_ratio=y, density=1000.0,
-    )  # fmt: skip
+        SE2(),
+        R.constant("kappa_z"),
+        R.circle(r),
+        length=x,
+        young_modulus=1e6,
+        poisson_ratio=y,
+        density=1000.0,
+    )
     return (body.length,), x > 0 and r > 0
 
 

@@ -118,9 +118,10 @@ def test_the_slope_on_the_surface_is_that_of_a_face():
 def test_boxes_hold_their_shapes():
     round_ = sdf.Sphere(O, 1.0)
     for shape, reach in (
-        (sdf.shell(round_, 0.4), 1.2), (sdf.offset(round_, 0.3), 1.3),
+        (sdf.shell(round_, 0.4), 1.2),
+        (sdf.offset(round_, 0.3), 1.3),
         (sdf.shell(sdf.offset(round_, 0.1), 0.2), 1.2),
-    ):  # fmt: skip
+    ):
         lower, upper = (np.asarray(corner) for corner in shape.bounding_box())
         np.testing.assert_allclose(upper, reach, rtol=1e-12)
         np.testing.assert_allclose(lower, -reach, rtol=1e-12)

@@ -81,10 +81,12 @@ def test_bending_does_not_lock(nu):
     grid = mesh.enrich(mesh.rectangle([0, 0], [25, 1], divisions=(50, 2), order=2))
     rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=nu)
     problem = fem.problem(
-        grid, rubber, kinematics=fem.PlaneStrain(1.0),
+        grid,
+        rubber,
+        kinematics=fem.PlaneStrain(1.0),
         supports=(fem.Fixed(grid.node_sets["left"]),),
         loads=(fem.Traction(grid.facet_sets["right"], [0.0, 0.1]),),
-    )  # fmt: skip
+    )
     answer = fem.solve(problem)
     tip = answer.displacement[grid.node_sets["right"], 1].mean()
     beam = 25.0**3 / 3 / (1e6 / (1 - nu**2) / 12) + 25 / (5 / 6 * 1e6 / 2 / (1 + nu))

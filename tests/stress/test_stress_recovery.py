@@ -54,9 +54,12 @@ def test_the_root_of_an_ellipse(element, size, most):
     """NAFEMS LE1: 92.7 MPa at (2, 0)."""
     grid = ring(element, 2 * size, 3 * size, ellipse(2.0, 1.0), ellipse(3.25, 2.75))
     problem = fem.problem(
-        grid, STEEL, kinematics=fem.PlaneStress(THICK), supports=halves(grid),
+        grid,
+        STEEL,
+        kinematics=fem.PlaneStress(THICK),
+        supports=halves(grid),
         loads=(fem.Pressure(grid.facet_sets["right"], -10e6),),
-    )  # fmt: skip
+    )
     recovered, mean = errors(problem, nearest(grid, [2.0, 0.0]), 1, 92.7e6)
     assert recovered <= mean * (1 + 1e-9) and recovered < most
 
@@ -70,9 +73,7 @@ def test_the_rim_of_a_hole(element, size):
     outer = np.asarray(grid.node_sets["right"])
     moved = _kirsch(np.asarray(grid.points)[outer])
     supports = (*halves(grid, outer), fem.Prescribed(outer, moved))
-    problem = fem.problem(
-        grid, STEEL, kinematics=fem.PlaneStress(THICK), supports=supports
-    )  # fmt: skip
+    problem = fem.problem(grid, STEEL, kinematics=fem.PlaneStress(THICK), supports=supports)
     recovered, mean = errors(problem, nearest(grid, [0.0, 1.0]), 0, 3e6)
     assert recovered <= mean * (1 + 1e-9) and recovered < 0.04
 

@@ -29,8 +29,9 @@ def vessel(volume=1e-4, target=3e3, **regulator) -> S.Network:
 
 
 def finger(nodes=6, **modes) -> R.Rod:
-    return R.rod(SE2(), R.chebyshev(**(modes or {"kappa_z": 2})), R.circle(10e-3), nodes=nodes,
-                 **SOFT)  # fmt: skip
+    return R.rod(
+        SE2(), R.chebyshev(**(modes or {"kappa_z": 2})), R.circle(10e-3), nodes=nodes, **SOFT
+    )
 
 
 @pytest.mark.stress(81)
@@ -48,14 +49,24 @@ def test_a_network_beyond_stability_says_so(save, step, good):
 @pytest.mark.parametrize("stepper", [steppers.RungeKutta4(), steppers.DormandPrince()])
 def test_a_rod_beyond_stability_says_so(stepper):
     rod, rest = finger(), jnp.zeros(2)
-    fastest = jnp.sqrt(jnp.max(jnp.linalg.eigvals(jnp.linalg.solve(
-        R.inertia(R.motion(rod, rest))[0], R.operators(rod).stiffness
-    )).real))  # fmt: skip
+    fastest = jnp.sqrt(
+        jnp.max(
+            jnp.linalg.eigvals(
+                jnp.linalg.solve(R.inertia(R.motion(rod, rest))[0], R.operators(rod).stiffness)
+            ).real
+        )
+    )
     for share, saves, every, good in ((0.2, 20, 40, True), (3.0, 3, 20, False)):
         run = R.rollout(
-            rod, rest, rest, (R.Gravity((0.0, -9.81)),), step=1.4 * share / fastest,
-            saves=saves, every=every, stepper=stepper,
-        )  # fmt: skip
+            rod,
+            rest,
+            rest,
+            (R.Gravity((0.0, -9.81)),),
+            step=1.4 * share / fastest,
+            saves=saves,
+            every=every,
+            stepper=stepper,
+        )
         assert (run.status == Status.successful) == good
 
 

@@ -21,17 +21,27 @@ INSTALLER = Path(__file__).parent / "raspberry_pi"
 
 def arguments() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m sorojax_board", description=__doc__)
-    parser.add_argument("--backend", choices=("bench", "i2c"), default="bench",
-                        help="valves in memory, or the real ones")  # fmt: skip
+    parser.add_argument(
+        "--backend",
+        choices=("bench", "i2c"),
+        default="bench",
+        help="valves in memory, or the real ones",
+    )
     parser.add_argument("--host", default="127.0.0.1", help="address to bind")
     parser.add_argument("--port", type=int, default=PORT)
     parser.add_argument("--key", type=Path, help="file with the shared key, mode 0600")
     parser.add_argument("--config", type=Path, help="JSON: ports, watchdog, ramp, wiring, ...")
-    parser.add_argument("--legacy", action="store_true",
-                        help=f"also the raw float64 stream on port {LEGACY_PORT}")  # fmt: skip
+    parser.add_argument(
+        "--legacy",
+        action="store_true",
+        help=f"also the raw float64 stream on port {LEGACY_PORT}",
+    )
     parser.add_argument("--new-key", type=Path, help="write a new key there and stop")
-    parser.add_argument("--installer", action="store_true",
-                        help="print where that of a Raspberry Pi is and stop")  # fmt: skip
+    parser.add_argument(
+        "--installer",
+        action="store_true",
+        help="print where that of a Raspberry Pi is and stop",
+    )
     return parser
 
 
@@ -80,10 +90,13 @@ def main(argv: list[str] | None = None) -> int:
         else:
             backend = BenchValves(len(chosen.limits))
         server = Server(
-            Board(chosen, backend), key=read_key(asked.key), host=asked.host, port=asked.port,
+            Board(chosen, backend),
+            key=read_key(asked.key),
+            host=asked.host,
+            port=asked.port,
             legacy_port=LEGACY_PORT if asked.legacy else None,
             on_close=lambda reason: print(f"connection closed: {reason}", flush=True),
-        )  # fmt: skip
+        )
     except (OSError, ValueError, ImportError) as wrong:
         print(f"sorojax_board: {wrong}", file=sys.stderr)
         return 2

@@ -175,6 +175,11 @@ class Board:
 
     def report(self) -> Report:
         return Report(
-            *self._followed, self.state, self.fault, self.refused,
-            tuple(self._pressure), tuple(self._setpoint), tuple(self._flags),
-        )  # fmt: skip
+            *self._followed,
+            self.state,
+            self.fault,
+            self.refused,
+            tuple(self._pressure),
+            tuple(self._setpoint),
+            tuple(self._flags),
+        )

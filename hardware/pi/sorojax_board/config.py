@@ -142,8 +142,10 @@ def read_config(path: Path | None) -> tuple[Settings, tuple[Wiring, ...]]:
             f"{where}: not JSON ({wrong}), need JSON. Correct that place."
         ) from wrong
     _keys(where, "the file", told, {"ports"}, {*_BOARD, "plausible", "wiring"})
-    limits = tuple(Limits(**{"slew": 2e6} | port) for port in _entries(
-        where, "ports", told.pop("ports"), {"low", "high"}, {"slew"}))  # fmt: skip
+    limits = tuple(
+        Limits(**{"slew": 2e6} | port)
+        for port in _entries(where, "ports", told.pop("ports"), {"low", "high"}, {"slew"})
+    )
     given = told.pop("wiring", None)
     wiring = PLATFORM if given is None else tuple(_wires(where, given))
     made = Settings(limits, **told)

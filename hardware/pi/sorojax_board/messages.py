@@ -146,9 +146,15 @@ def unpack_report(payload: bytes) -> Report:
     flags = tuple(Flag(byte & 3) for byte in payload[_REPORT.size + 8 * ports :])
     try:
         return Report(
-            sequence, time, State(state), Fault(fault), refused,
-            numbers[:ports], numbers[ports:], flags,
-        )  # fmt: skip
+            sequence,
+            time,
+            State(state),
+            Fault(fault),
+            refused,
+            numbers[:ports],
+            numbers[ports:],
+            flags,
+        )
     except ValueError as wrong:
         raise Malformed(str(wrong)) from wrong
 

@@ -66,9 +66,12 @@ def bellows_problem(
     stiff = np.ones(cells.num_cells)
     stiff[mesh.cells_where(cells, lambda p: layer(p) < 0)] = LAYER_STIFFNESS
     return robots.bellows_problem(
-        actuator, cells, material.Scaled(rubber, stiff), depth=depth,
+        actuator,
+        cells,
+        material.Scaled(rubber, stiff),
+        depth=depth,
         formulation=fem.Displacement(),  # stiffer by some 1.5 %: two cells through a wall
-    )  # fmt: skip
+    )
 
 
 class Sensitivity(NamedTuple):

@@ -165,10 +165,12 @@ def write(folder: Path, drawn: dict[str, Any], tables, seconds: dict[str, float]
         files[name] = picture.gif if name.endswith(".gif") else picture.png
         (folder / name).write_bytes(files[name])
     result: dict[str, Any] = {
-        section: {n.name: {"value": n.value, "unit": n.unit, "bar": n.bar, "holds": n.holds}
-                  for n in rows}
+        section: {
+            n.name: {"value": n.value, "unit": n.unit, "bar": n.bar, "holds": n.holds}
+            for n in rows
+        }
         for section, rows in tables.items()
-    }  # fmt: skip
+    }
     result["seconds"] = {name: round(value, 3) for name, value in seconds.items()}
     (folder / "result.json").write_text(json.dumps(result, indent=2) + "\n")
     (folder / "report.html").write_text(_report(files, tables), encoding="utf-8")
@@ -183,28 +185,36 @@ def _report(files: dict[str, bytes], tables) -> str:
         "A bellows actuator, from its drawing to a closed loop",
         [
             section(
-                "Closed loop", _TEXT["loop"], "loop",
+                "Closed loop",
+                _TEXT["loop"],
+                "loop",
                 ("actuator.gif", "The rod model, dressed in the mesh, in real time."),
                 ("loop.png", "Bending, chamber pressure and mass flow."),
             ),
             section(
-                "Equilibrium under pressure", _TEXT["equilibrium"], "equilibrium",
+                "Equilibrium under pressure",
+                _TEXT["equilibrium"],
+                "equilibrium",
                 ("deformed.png", "Deformed cross-sections, coloured by stress."),
             ),
             section("Gradient", _TEXT["gradient"], "gradient"),
             section(
-                "Strain modes and rod", _TEXT["rod"], "rod",
+                "Strain modes and rod",
+                _TEXT["rod"],
+                "rod",
                 ("modes.png", "Curvature modes of the snapshots."),
                 ("backbones.png", "Backbones of solid and rod, and their distance."),
             ),
             section("Mesh", _TEXT["mesh"], "mesh"),
             section(
-                "Rubber", _TEXT["rubber"], "rubber",
+                "Rubber",
+                _TEXT["rubber"],
+                "rubber",
                 ("rubber.png", "Measured points and fitted curve."),
             ),
         ],
         lead=_TEXT["lead"],
-    )  # fmt: skip
+    )
 
 
 def _volume(problem, u, facets) -> float:

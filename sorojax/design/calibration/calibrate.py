@@ -296,17 +296,26 @@ def calibrate(
     def accepted(step: Iterate):
         nonlocal last
         last = CalibrationStep(
-            step.count, task.parameters(step.x), jnp.asarray(2 * step.at.cost),
-            jnp.asarray(step.change), step.damping,
-        )  # fmt: skip
+            step.count,
+            task.parameters(step.x),
+            jnp.asarray(2 * step.at.cost),
+            jnp.asarray(step.change),
+            step.damping,
+        )
         history.append((2 * step.at.cost, float(step.change)))
         if on_step is not None:
             on_step(last)
 
     x, at, status = least_squares(
-        evaluate, x, at, task.box, Tolerances(tolerance, tolerance),
-        steps=range(first, steps), damping=damping, accepted=accepted,
-    )  # fmt: skip
+        evaluate,
+        x,
+        at,
+        task.box,
+        Tolerances(tolerance, tolerance),
+        steps=range(first, steps),
+        damping=damping,
+        accepted=accepted,
+    )
     free = ~task.box.held(x, at.jacobian.T @ at.residual)
     values, rows = spectrum(at.jacobian, free)
     slope = task.slopes(x)
@@ -315,12 +324,21 @@ def calibrate(
     parameters = task.parameters(x)
     columns = list(zip(*history, strict=True)) or [(), ()]
     return Calibration(
-        parameters, status, covariance, 2 * at.cost, len(at.residual) - int(free.sum()),
-        task.names, task.logarithmic, (x <= task.box.lower) | (x >= task.box.upper),
-        values, rows, tuple(compared(e, parameters, covariance) for e in experiments),
+        parameters,
+        status,
+        covariance,
+        2 * at.cost,
+        len(at.residual) - int(free.sum()),
+        task.names,
+        task.logarithmic,
+        (x <= task.box.lower) | (x >= task.box.upper),
+        values,
+        rows,
+        tuple(compared(e, parameters, covariance) for e in experiments),
         tuple(compared(e, parameters, covariance) for e in hold_out),
-        {"misfit": np.array(columns[0]), "change": np.array(columns[1])}, last,
-    )  # fmt: skip
+        {"misfit": np.array(columns[0]), "change": np.array(columns[1])},
+        last,
+    )
 
 
 class _Task(NamedTuple):

@@ -194,9 +194,14 @@ def layout(
     if radius is not None:
         smooth = cone_filter(mesh, radius)
     return Layout(
-        jnp.asarray(number, jnp.int32), smooth, jnp.asarray(masks[0]), jnp.asarray(masks[1]),
-        volumes, threshold, count,
-    )  # fmt: skip
+        jnp.asarray(number, jnp.int32),
+        smooth,
+        jnp.asarray(masks[0]),
+        jnp.asarray(masks[1]),
+        volumes,
+        threshold,
+        count,
+    )
 
 
 def _mask(mesh: Mesh, name: str, ids) -> Bool[np.ndarray, " cells"]:

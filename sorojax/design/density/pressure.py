@@ -101,8 +101,13 @@ class VoidPressure(AbstractLoad):
 
     def check(self, where, mesh, kinematics):
         want = (mesh.num_cells, mesh.cells.shape[1])
-        _check.shape("fem.problem", f"{where} share", self.share, want,
-                     "Make it with design.void_pressure(mesh, share).")  # fmt: skip
+        _check.shape(
+            "fem.problem",
+            f"{where} share",
+            self.share,
+            want,
+            "Make it with design.void_pressure(mesh, share).",
+        )
 
 
 def void_pressure(

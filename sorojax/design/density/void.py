@@ -48,8 +48,13 @@ class InterpolatedEnergy(AbstractHyperelastic):
 
     def __check_init__(self):
         checks.leaves("InterpolatedEnergy", self)
-        _check.positive("InterpolatedEnergy", "factor", self.factor, "",
-                        "Give the void 1e-6 of the stiffness, for example.")  # fmt: skip
+        _check.positive(
+            "InterpolatedEnergy",
+            "factor",
+            self.factor,
+            "",
+            "Give the void 1e-6 of the stiffness, for example.",
+        )
 
     @property
     def density(self):  # the mass is that of the base
@@ -62,12 +67,13 @@ class InterpolatedEnergy(AbstractHyperelastic):
         )
         part: Any = tuple(
             tuple(
-                plus(times(slope[i][j], self.share), 1.0) if i == j
+                plus(times(slope[i][j], self.share), 1.0)
+                if i == j
                 else times(slope[i][j], self.share)
                 for j in range(3)
             )
             for i in range(3)
-        )  # fmt: skip
+        )
         small = _small_strain_energy(*_moduli(self.base), slope)  # type: ignore[arg-type]
         finite = self.base.isochoric_energy(part)
         return self.factor * (finite + (1 - self.share**2) * small)

@@ -168,11 +168,18 @@ def minimise(
         new, memory = _advance(method, task, k, flat, values, memory, size)
         change = float(np.max(np.abs(np.asarray(new) - np.asarray(flat))))
         last, flat = flat, new
-        step = Step(k + 1, back(flat), values.objective, values.constraints,
-                    jnp.asarray(change), memory)  # fmt: skip
+        step = Step(
+            k + 1, back(flat), values.objective, values.constraints, jnp.asarray(change), memory
+        )
         history.append((float(values.objective), np.asarray(values.constraints), change))
-        report("minimise", k + 1, steps, objective=history[-1][0], change=change,
-               constraint=float(np.max(history[-1][1], initial=-np.inf)))  # fmt: skip
+        report(
+            "minimise",
+            k + 1,
+            steps,
+            objective=history[-1][0],
+            change=change,
+            constraint=float(np.max(history[-1][1], initial=-np.inf)),
+        )
         if on_step is not None:
             on_step(step)
         if change <= tolerance and schedule is None:

@@ -125,10 +125,16 @@ def solve_primal_dual(task: Approximation) -> Float[Array, " n"]:
     one, x = jnp.ones(m, dtype), (task.least + task.most) / 2
     room = jnp.maximum(task.most - task.least, 1e-12)
     start = _Point(
-        x, one, jnp.ones((), dtype), one,
-        jnp.maximum(1.0, 2 / room), jnp.maximum(1.0, 2 / room),
-        jnp.maximum(one, _PRICE / 2), jnp.ones((), dtype), one,
-    )  # fmt: skip
+        x,
+        one,
+        jnp.ones((), dtype),
+        one,
+        jnp.maximum(1.0, 2 / room),
+        jnp.maximum(1.0, 2 / room),
+        jnp.maximum(one, _PRICE / 2),
+        jnp.ones((), dtype),
+        one,
+    )
 
     def tighten(state):
         point, epsilon = state
@@ -204,13 +210,16 @@ def _direction(task: Approximation, at: _Point, epsilon) -> _Point:
     y = (lam - dy) / stiff_y
     z = (epsilon / at.z - 1) * at.z / at.zeta
     return _Point(
-        x, y, z, lam,
+        x,
+        y,
+        z,
+        lam,
         epsilon / left - at.xsi - at.xsi * x / left,
         epsilon / right - at.eta + at.eta * x / right,
         epsilon / at.y - at.mu - at.mu * y / at.y,
         epsilon / at.z - at.zeta - at.zeta * z / at.z,
         epsilon / at.lam - at.s - at.s * lam / at.lam,
-    )  # fmt: skip
+    )
 
 
 def _longest(task: Approximation, at: _Point, move: _Point) -> Array:
@@ -384,7 +393,12 @@ def _approximation(method, x, values: Values, state, low, high) -> Approximation
     q = (x - low)[None] ** 2 * (0.001 * up + 1.001 * down + curve)
     here = p @ (1 / (high - x)) + q @ (1 / (x - low))
     return Approximation(
-        p, q, low, high,
-        jnp.maximum(least, method.lower), jnp.minimum(most, method.upper),
-        here[1:] - values.constraints, here[:1] - values.objective,
-    )  # fmt: skip
+        p,
+        q,
+        low,
+        high,
+        jnp.maximum(least, method.lower),
+        jnp.minimum(most, method.upper),
+        here[1:] - values.constraints,
+        here[:1] - values.objective,
+    )

@@ -164,10 +164,16 @@ def minimise_shape(
             on_step(last)
 
     found = minimise(
-        followed(loss), start, constraints=tuple(map(followed, constraints)),
-        optimiser=optimiser, steps=steps, tolerance=tolerance, scale=scale, on_step=after,
+        followed(loss),
+        start,
+        constraints=tuple(map(followed, constraints)),
+        optimiser=optimiser,
+        steps=steps,
+        tolerance=tolerance,
+        scale=scale,
+        on_step=after,
         resume=None if resume is None else resume.step,
-    )  # fmt: skip
+    )
     assert last is not None
     return OptimisedShape(
         found, follower.problem(found.design), follower.num_meshes, tuple(remeshed), last

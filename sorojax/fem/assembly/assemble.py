@@ -43,11 +43,13 @@ def block_matrix(
     alone: Alone,
 ) -> tuple[Force, Float[Array, "entries lanes"]]:
     """Sums over points of P G and of G' A G, the latter in the order of `block_entries`."""
-    weighted, bent, pull = alone(lambda: (
-        gradients * body.volumes[:, None, None],
-        _stiff_gradients(kinematics, answer.tangent, gradients),
-        answer.stress * body.volumes[None],
-    ))  # fmt: skip
+    weighted, bent, pull = alone(
+        lambda: (
+            gradients * body.volumes[:, None, None],
+            _stiff_gradients(kinematics, answer.tangent, gradients),
+            answer.stress * body.volumes[None],
+        )
+    )
     shares = alone(lambda: _shares(kinematics, answer, body, weighted))
 
     def contract():
@@ -173,10 +175,12 @@ def assemble(
         block, nodes, slots = part
         alone = apart(block.cells[0, 0] >= 0)
         body = _body(block, constant, kinematics)
-        F, F_before = alone(lambda: tuple(
-            deformation_gradient(kinematics, lanes(x, block.cells), block.gradients)
-            for x in (u, u_before)
-        ))  # fmt: skip
+        F, F_before = alone(
+            lambda: tuple(
+                deformation_gradient(kinematics, lanes(x, block.cells), block.gradients)
+                for x in (u, u_before)
+            )
+        )
         share = finite_share(body.material)
         J, J_before = (checked_volume_ratio(kinematics, x, share) for x in (F, F_before))
         answer = response(body, F, F_before, alone)

@@ -91,10 +91,14 @@ def _padded(kind: AbstractElement, rule: Quadrature, num_points: int, num_nodes:
     """Tables with the last point repeated without weight, and nodes that do nothing."""
     values, slopes = _at(kind, rule)
     more = num_points - len(rule.weights)
-    values = np.pad(np.concatenate([values, values[-1:].repeat(more, 0)]),
-                    ((0, 0), (0, num_nodes - kind.num_nodes)))  # fmt: skip
-    slopes = np.pad(np.concatenate([slopes, slopes[-1:].repeat(more, 0)]),
-                    ((0, 0), (0, num_nodes - kind.num_nodes), (0, 0)))  # fmt: skip
+    values = np.pad(
+        np.concatenate([values, values[-1:].repeat(more, 0)]),
+        ((0, 0), (0, num_nodes - kind.num_nodes)),
+    )
+    slopes = np.pad(
+        np.concatenate([slopes, slopes[-1:].repeat(more, 0)]),
+        ((0, 0), (0, num_nodes - kind.num_nodes), (0, 0)),
+    )
     return values, slopes, np.pad(rule.weights, (0, more))
 
 

@@ -60,9 +60,12 @@ def moving(load: "Contact", mesh: Mesh, place: Float[Array, " dim"]) -> "Contact
     none = jnp.zeros_like(_at_rest(load, mesh)[..., 0])
     one = jnp.ones((), none.dtype)
     load = dataclasses.replace(
-        load, place=place, began=mesh.points[load.facets], share=one,
+        load,
+        place=place,
+        began=mesh.points[load.facets],
+        share=one,
         start=Start(place, none, none[:, 0]),
-    )  # fmt: skip
+    )
     if load.release_velocity is None:
         return load
     return dataclasses.replace(load, sunk=none, fresh=one)

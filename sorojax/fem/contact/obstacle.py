@@ -312,15 +312,17 @@ class Contact(AbstractLoad):
                 f"mesh has {mesh.element.dim}. Use a shape of the same space."
             )
         for what, number, unit in (
-            ("stiffness", self.stiffness, "Pa/m"), ("smoothing", self.smoothing, "m"),
+            ("stiffness", self.stiffness, "Pa/m"),
+            ("smoothing", self.smoothing, "m"),
             ("friction_velocity", self.friction_velocity, "m/s"),
             ("friction_stiffness", self.friction_stiffness, "Pa/m"),
             ("release_velocity", self.release_velocity, "m/s"),
-        ):  # fmt: skip
+        ):
             if number is None:
                 continue
-            _check.positive("fem.problem", f"{where} {what}", number, unit,
-                            "Leave it out for the default.")  # fmt: skip
+            _check.positive(
+                "fem.problem", f"{where} {what}", number, unit, "Leave it out for the default."
+            )
 
 
 def _sum(*terms: Array | None) -> Array | None:

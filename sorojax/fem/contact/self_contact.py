@@ -238,10 +238,12 @@ class SelfContact(AbstractLoad):
         made = dataclasses.replace(self, facets=compact(mesh, self.facets), others=others)
         law = default_law(mesh, material, made.rows(), self.stiffness, self.smoothing)
         made = dataclasses.replace(
-            made, stiffness=law[0], smoothing=law[1],
+            made,
+            stiffness=law[0],
+            smoothing=law[1],
             reach=2 * mean_size(mesh, made.rows()) if self.reach is None else self.reach,
             candidates=self.candidates or _CANDIDATES[mesh.element.dim],
-        )  # fmt: skip
+        )
         return with_partners(made, mesh, np.zeros(mesh.points.shape))
 
     def _fits(self, mesh) -> bool:
@@ -254,12 +256,18 @@ class SelfContact(AbstractLoad):
 
     def check(self, where, mesh, kinematics):
         for what, number, unit in (
-            ("stiffness", self.stiffness, "Pa/m"), ("smoothing", self.smoothing, "m"),
+            ("stiffness", self.stiffness, "Pa/m"),
+            ("smoothing", self.smoothing, "m"),
             ("reach", self.reach, "m"),
-        ):  # fmt: skip
+        ):
             if number is not None:
-                _check.positive("fem.problem", f"{where} {what}", number, unit,
-                                "Leave it out for the default.")  # fmt: skip
+                _check.positive(
+                    "fem.problem",
+                    f"{where} {what}",
+                    number,
+                    unit,
+                    "Leave it out for the default.",
+                )
         if self.others is None:
             return
         if self.others.ndim != 2 or self.others.shape[1] != self.facets.shape[1]:
@@ -329,8 +337,9 @@ class SelfContact(AbstractLoad):
         points = jnp.einsum("qa,fai->fqi", values, x[:, :width])
         flat = [a.reshape(-1, dim) for a in (points, mean, force)]
         pressure = jnp.sum(weight * pressure, axis=2).ravel()
-        return Contacts(flat[0], gap.ravel(), pressure, flat[1], flat[2],
-                        jnp.zeros_like(flat[2]))  # fmt: skip
+        return Contacts(
+            flat[0], gap.ravel(), pressure, flat[1], flat[2], jnp.zeros_like(flat[2])
+        )
 
 
 def with_partners(load: SelfContact, mesh, u: np.ndarray) -> SelfContact:

@@ -68,9 +68,11 @@ def _switching(motion: Motion, share) -> ContactSwitching:
     turned = jnp.concatenate([begins, turned])
     near = (jnp.abs(gap) < share * smooth) | (slip < share)
     return ContactSwitching(
-        jnp.min(jnp.abs(gap), axis=1), jnp.min(slip, axis=1), jnp.any(turned, axis=1),
+        jnp.min(jnp.abs(gap), axis=1),
+        jnp.min(slip, axis=1),
+        jnp.any(turned, axis=1),
         jnp.any(near, axis=1),
-    )  # fmt: skip
+    )
 
 
 def _points(load: Contact, problem, u: Float[Array, "nodes dim"]):

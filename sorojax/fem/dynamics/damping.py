@@ -88,8 +88,10 @@ class KelvinVoigt(AbstractDamping):
                 f"need () or ({problem.mesh.num_cells},): a number or one per cell."
             )
         if isinstance(problem.mesh.element, PolyN):
-            raise ValueError("fem.simulate: KelvinVoigt got polygons, need cells of one shape. "
-                             "Use Rayleigh, or another mesh.")  # fmt: skip
+            raise ValueError(
+                "fem.simulate: KelvinVoigt got polygons, need cells of one shape. "
+                "Use Rayleigh, or another mesh."
+            )
 
     def matrix(self, problem, mass, u):
         rates = strain_rates(problem, u)  # strains, nodes * dim, quad, cells

@@ -72,11 +72,18 @@ def run_traced(dynamics: Dynamics, control: Control, grid: int, rows: int) -> Re
     none = jnp.asarray(0, jnp.int32)
     shape = (rows, *dynamics.problem.mesh.points.shape)
     walk = _Walk(
-        state=moving, index=none, done=zero, share=zero + 1, failures=none, row=none,
-        iterations=zero, cuts=none, u=jnp.zeros(shape, zero.dtype),
+        state=moving,
+        index=none,
+        done=zero,
+        share=zero + 1,
+        failures=none,
+        row=none,
+        iterations=zero,
+        cuts=none,
+        u=jnp.zeros(shape, zero.dtype),
         steps=jnp.zeros((rows, 3), zero.dtype),
         running=jnp.all(jnp.isfinite(dynamics.start.displacement)),
-    )  # fmt: skip
+    )
     end = jax.lax.while_loop(lambda walk: walk.running, one_pass, walk)
     numbers = (end.index < grid, end.row, end.iterations, end.cuts)
     return Record(end.u, end.steps, jnp.stack([jnp.asarray(n, zero.dtype) for n in numbers]))

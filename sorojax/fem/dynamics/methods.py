@@ -61,8 +61,15 @@ class GeneralisedAlpha(AbstractMethod):
     conserves: ClassVar[bool] = False
 
     def __check_init__(self):
-        _check.between("GeneralisedAlpha", "rho_inf", self.rho_inf, -1e-12, 1 + 1e-12, "",
-                       "1 keeps fast oscillations, 0 removes them.")  # fmt: skip
+        _check.between(
+            "GeneralisedAlpha",
+            "rho_inf",
+            self.rho_inf,
+            -1e-12,
+            1 + 1e-12,
+            "",
+            "1 keeps fast oscillations, 0 removes them.",
+        )
 
     def coefficients(self):
         af = self.rho_inf / (1 + self.rho_inf)

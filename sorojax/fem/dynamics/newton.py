@@ -294,9 +294,13 @@ class StepSolver:
     """Solves the steps of one motion; remembers the last tangent."""
 
     def __init__(
-        self, prepared: Prepared, problem: Problem, newton: Newton, inertia: HostInertia,
+        self,
+        prepared: Prepared,
+        problem: Problem,
+        newton: Newton,
+        inertia: HostInertia,
         dead: np.ndarray,
-    ):  # fmt: skip
+    ):
         self.prepared, self.newton, self._problem = prepared, newton, problem
         self.system = problem.space.system
         self.solver, self.sees = self.system.solver, has_lists(problem)

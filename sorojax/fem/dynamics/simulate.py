@@ -243,8 +243,13 @@ def _state(where: str, dynamics: Dynamics, start: Start | None) -> State:
     if start is not None:
         u, v = (real(x) for x in start)
         for name, x in (("displacement", u), ("velocity", v)):
-            _check.shape(where, f"start {name}", x, dynamics.problem.mesh.points.shape,
-                         "Give one vector per node.")  # fmt: skip
+            _check.shape(
+                where,
+                f"start {name}",
+                x,
+                dynamics.problem.mesh.points.shape,
+                "Give one vector per node.",
+            )
             _check.finite(where, f"start {name}", x, "Use SI units.")
         state = eqx.tree_at(lambda s: (s.displacement, s.velocity), state, (u, v))
     return eqx.tree_at(lambda s: s.acceleration, state, _acceleration(dynamics, state))
@@ -302,8 +307,13 @@ def _rows(where: str, problem: Problem, histories: dict[str, Any], times):
             return None
         given = histories[name]
         values = jax.vmap(lambda t: real(given(t)))(times) if callable(given) else real(given)
-        _check.shape(where, name, values, (times.shape[0], *want),
-                     "Give a function of time, or a value for each end of a step.")  # fmt: skip
+        _check.shape(
+            where,
+            name,
+            values,
+            (times.shape[0], *want),
+            "Give a function of time, or a value for each end of a step.",
+        )
         _check.finite(where, name, values, "Use SI units.")
         return values
 

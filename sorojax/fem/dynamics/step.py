@@ -251,10 +251,15 @@ def end_step(
     if taken is None:
         taken = _taken(dynamics, step, (1 - c.af) * v_new + c.af * v, d)
     return State(
-        time=state.time + h, displacement=u + d, velocity=v_new, acceleration=a_new,
-        memory=memory, work=state.work + work, dissipated=state.dissipated + taken,
+        time=state.time + h,
+        displacement=u + d,
+        velocity=v_new,
+        acceleration=a_new,
+        memory=memory,
+        work=state.work + work,
+        dissipated=state.dissipated + taken,
         share=state.share,
-    )  # fmt: skip
+    )
 
 
 def _work(dynamics: Dynamics, step: Step, loads, u_alpha, d) -> Float[Array, ""]:

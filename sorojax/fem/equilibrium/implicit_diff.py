@@ -115,9 +115,10 @@ class Solve:
         """
         count = self.num_problem_leaves
         moved = {
-            k: dot for k, dot in zip(self.traced, dots, strict=True)
+            k: dot
+            for k, dot in zip(self.traced, dots, strict=True)
             if k < count and not isinstance(dot, SymbolicZero)
-        }  # fmt: skip
+        }
         all_leaves, none = range(len(leaves)), [None] * len(self._all)
         rest = [leaves[k] if k < count and k not in moved else None for k in all_leaves]
         params = [leaves[k] if k in moved else None for k in all_leaves]

@@ -155,11 +155,20 @@ def _initial(problem: Problem, begin: Begin | None, steps: int) -> _State:
         tangent = jnp.zeros(problem.space.system.num_values, points.dtype)
     false, none = jnp.asarray(False), jnp.asarray(0, jnp.int32)
     return _State(
-        u=u, before=u, start=u, tangent=tangent, predict=predict, moved=false, shortened=false,
-        guess=jnp.asarray(guess), update=jnp.asarray(jnp.inf, points.dtype),
-        way=_way(1 if guess else steps, points.dtype), iterations=none, total=none,
+        u=u,
+        before=u,
+        start=u,
+        tangent=tangent,
+        predict=predict,
+        moved=false,
+        shortened=false,
+        guess=jnp.asarray(guess),
+        update=jnp.asarray(jnp.inf, points.dtype),
+        way=_way(1 if guess else steps, points.dtype),
+        iterations=none,
+        total=none,
         running=jnp.all(jnp.isfinite(u)),
-    )  # fmt: skip
+    )
 
 
 def _way(steps: int, dtype) -> rules.LoadSteps:
@@ -219,10 +228,14 @@ def _next(problem, prepared, state: _State, level: _Level, steps: int, max_cuts:
     update = rules.relative_size(level.du, new, prepared.length)
     update = jnp.where(level.usable, update, jnp.full_like(update, jnp.inf))
     moved = state._replace(
-        u=new, before=state.u, predict=jnp.asarray(False), moved=jnp.asarray(True),
-        shortened=jnp.asarray(False), update=update,
+        u=new,
+        before=state.u,
+        predict=jnp.asarray(False),
+        moved=jnp.asarray(True),
+        shortened=jnp.asarray(False),
+        update=update,
         iterations=state.iterations + jnp.where(state.predict, 0, 1).astype(jnp.int32),
-    )  # fmt: skip
+    )
     # how small it is, is asked of the step that Newton's method wanted
     update = rules.relative_size(whole, short, prepared.length)
     shortened = state._replace(u=short, shortened=jnp.asarray(True), update=update)
@@ -241,10 +254,15 @@ def _next(problem, prepared, state: _State, level: _Level, steps: int, max_cuts:
 def _accepted(state: _State, level: _Level, predicts: bool) -> _State:
     way = rules.accept(state.way, state.iterations)
     state = state._replace(
-        before=state.u, start=state.u, tangent=level.values, way=way,
-        predict=jnp.asarray(predicts), guess=jnp.asarray(False),
-        total=state.total + state.iterations, running=way.done < 1.0,
-    )  # fmt: skip
+        before=state.u,
+        start=state.u,
+        tangent=level.values,
+        way=way,
+        predict=jnp.asarray(predicts),
+        guess=jnp.asarray(False),
+        total=state.total + state.iterations,
+        running=way.done < 1.0,
+    )
     return _fresh(state)
 
 
@@ -255,18 +273,24 @@ def _cut(state: _State, steps: int, max_cuts: int) -> _State:
     shorter, first = rules.cut(state.way), _way(steps, state.u.dtype)
     way = jax.tree.map(lambda a, b: jnp.where(from_rest, a, b), first, shorter)
     state = state._replace(
-        u=u, before=u, start=u, way=way, predict=jnp.asarray(False), guess=jnp.asarray(False),
+        u=u,
+        before=u,
+        start=u,
+        way=way,
+        predict=jnp.asarray(False),
+        guess=jnp.asarray(False),
         running=from_rest | rules.goes_on(shorter, steps, max_cuts),
-    )  # fmt: skip
+    )
     return _fresh(state)
 
 
 def _fresh(state: _State) -> _State:
     return state._replace(
-        moved=jnp.asarray(False), shortened=jnp.asarray(False),
+        moved=jnp.asarray(False),
+        shortened=jnp.asarray(False),
         update=jnp.full_like(state.update, jnp.inf),
         iterations=jnp.zeros_like(state.iterations),
-    )  # fmt: skip
+    )
 
 
 # Stiffness of single cells at rest, for bodies whose cells differ by a factor

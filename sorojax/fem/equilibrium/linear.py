@@ -141,9 +141,10 @@ def constrain(
 ) -> tuple[Float[Array, " nnz"], Float[Array, " dofs"]]:
     """Matrix and right-hand side of a Newton step in which known unknowns move by `move`."""
     moved = jax.lax.cond(  # most steps move no support
-        jnp.any(move != 0), lambda: sparse.product(system, values, move),
+        jnp.any(move != 0),
+        lambda: sparse.product(system, values, move),
         lambda: jnp.zeros_like(residual),
-    )  # fmt: skip
+    )
     rhs = -residual - moved
     return sparse.fix(system, values, known), jnp.where(known, jnp.zeros_like(rhs), rhs)
 

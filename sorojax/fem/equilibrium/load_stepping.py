@@ -131,9 +131,10 @@ def _with_terms(first: Problem, mix, last: Problem) -> Problem:
         if b.ramped is None:
             return b
         return eqx.tree_at(
-            lambda support: getattr(support, b.ramped), b,
+            lambda support: getattr(support, b.ramped),
+            b,
             moved(getattr(a, b.ramped), getattr(b, b.ramped)),
-        )  # fmt: skip
+        )
 
     loads = tuple(loaded(a, b) for a, b in zip(first.loads, last.loads, strict=True))
     supports = tuple(held(a, b) for a, b in zip(first.supports, last.supports, strict=True))

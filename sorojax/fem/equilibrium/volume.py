@@ -66,8 +66,13 @@ class Gas(AbstractContents):
     def __check_init__(self):
         _check.positive("Gas", "volume", self.volume, "m^3", "Write 20e-6, for example.")
         _check.positive("Gas", "exponent", self.exponent, "", "1 is isothermal, 1.4 adiabatic.")
-        _check.positive("Gas", "pressure + ambient", self.pressure + self.ambient, "Pa",
-                        "A gas cannot pull.")  # fmt: skip
+        _check.positive(
+            "Gas",
+            "pressure + ambient",
+            self.pressure + self.ambient,
+            "Pa",
+            "A gas cannot pull.",
+        )
 
     def volume_at(self, pressure):
         ratio = (self.pressure + self.ambient) / (pressure + self.ambient)
@@ -208,8 +213,9 @@ class CavitySolution(eqx.Module):
 
     def _text(self) -> str:
         size = jnp.linalg.norm(self.displacement, axis=1).max()
-        rows = [f"CavitySolution: {outcome(self.status)}, largest displacement "
-                f"{number(size, 'm')}"]  # fmt: skip
+        rows = [
+            f"CavitySolution: {outcome(self.status)}, largest displacement {number(size, 'm')}"
+        ]
         for name, p, volume in zip(self.names, self.pressures, self.volumes, strict=True):
             rows.append(f"  {name}: {number(p, 'Pa')} in {number(volume, 'm^3')}")
         return "\n".join(rows)
@@ -333,9 +339,13 @@ def volume_path(
     for k, volume in enumerate(wanted):
         begin = found[-1] if found else None
         solution = solve_volume(
-            problem, start=begin, newton=newton, max_cuts=max_cuts, throw=False,
+            problem,
+            start=begin,
+            newton=newton,
+            max_cuts=max_cuts,
+            throw=False,
             **{name: Liquid(volume)},  # type: ignore[arg-type]
-        )  # fmt: skip
+        )
         status, stats = solution.status, solution.stats
         if stats.reason:
             break
@@ -345,9 +355,14 @@ def volume_path(
     states = jnp.stack([s.displacement for s in found]) if found else jnp.zeros((0, *shape))
     pressures = jnp.concatenate([s.pressures for s in found]) if found else jnp.zeros(0)
     return VolumePath(
-        problem, states, wanted[: len(found)], pressures, name, status,
+        problem,
+        states,
+        wanted[: len(found)],
+        pressures,
+        name,
+        status,
         tuple(s.stats for s in found) + ((stats,) if stats.reason else ()),
-    )  # fmt: skip
+    )
 
 
 def _checked(problem: Problem, contents: dict) -> tuple[Names, tuple[AbstractContents, ...]]:

@@ -123,8 +123,9 @@ def parallel_to_ends(
     """The loads, pressures with a field of divergence one along the planes of their ends."""
     if is_traced((mesh.points, given)) or isinstance(kinematics, Axisymmetric):
         return given
-    return tuple(_parallel(mesh, load, known) if isinstance(load, Pressure) else load
-                 for load in given)  # fmt: skip
+    return tuple(
+        _parallel(mesh, load, known) if isinstance(load, Pressure) else load for load in given
+    )
 
 
 def _parallel(mesh: Mesh, load: Pressure, known) -> Pressure:

@@ -81,13 +81,22 @@ class Rigid(AbstractLoad):
         if mesh.element.dim == 2:
             middle = tuple(jnp.mean(mesh.points, axis=0))
             length = jnp.asarray(kinematics.depth(middle))
-        return eqx.tree_at(lambda load: load.stiffness, self, _STIFFNESS * modulus * length,
-                           is_leaf=lambda leaf: leaf is None)  # fmt: skip
+        return eqx.tree_at(
+            lambda load: load.stiffness,
+            self,
+            _STIFFNESS * modulus * length,
+            is_leaf=lambda leaf: leaf is None,
+        )
 
     def check(self, where, mesh, kinematics):
         if self.stiffness is not None:
-            _check.positive("fem.problem", f"{where} stiffness", self.stiffness, "N/m",
-                            "Leave it out for 10^4 times that of the material.")  # fmt: skip
+            _check.positive(
+                "fem.problem",
+                f"{where} stiffness",
+                self.stiffness,
+                "N/m",
+                "Leave it out for 10^4 times that of the material.",
+            )
 
 
 def rigid(

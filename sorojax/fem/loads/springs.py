@@ -46,9 +46,11 @@ class Spring(AbstractLoad):
     @eqx.filter_jit
     def _ends(self, X) -> tuple[Float[Array, "springs dim"], Float[Array, " springs"]]:
         """Reference position of the far ends, and how far away they are [m]."""
-        ends = X[self.ends] if self._to_nodes else jnp.broadcast_to(
-            jnp.atleast_2d(self.ends), (self.nodes.size, X.shape[1])
-        )  # fmt: skip
+        ends = (
+            X[self.ends]
+            if self._to_nodes
+            else jnp.broadcast_to(jnp.atleast_2d(self.ends), (self.nodes.size, X.shape[1]))
+        )
         return ends, jnp.sqrt(jnp.sum((X[self.nodes] - ends) ** 2, axis=1))
 
     def potential(self, problem, u):
@@ -56,9 +58,11 @@ class Spring(AbstractLoad):
         rest = length - self.value
         if self._to_nodes:
             ends = ends + u[self.ends]
-        return jnp.sum(_stretch_energy(
-            problem.mesh.points[self.nodes] + u[self.nodes] - ends, rest, self.stiffness
-        ))  # fmt: skip
+        return jnp.sum(
+            _stretch_energy(
+                problem.mesh.points[self.nodes] + u[self.nodes] - ends, rest, self.stiffness
+            )
+        )
 
     def curved_part(self, problem):
         ends, length = self._ends(problem.mesh.points)
@@ -81,8 +85,13 @@ class Spring(AbstractLoad):
         return np.stack([np.asarray(self.nodes), np.asarray(self.ends)], axis=1)
 
     def check(self, where, mesh, kinematics):
-        _check.positive("fem.problem", f"{where} stiffness", self.stiffness, "N/m",
-                        "A spring pulls its ends together.")  # fmt: skip
+        _check.positive(
+            "fem.problem",
+            f"{where} stiffness",
+            self.stiffness,
+            "N/m",
+            "A spring pulls its ends together.",
+        )
         count, dim = self.nodes.size, mesh.element.dim
         want = ((count,),) if self._to_nodes else ((dim,), (count, dim))
         if self.ends.shape not in want:
@@ -282,8 +291,13 @@ class Cable(AbstractLoad):
         return np.asarray(self.route.nodes).reshape(1, -1)
 
     def check(self, where, mesh, kinematics):
-        _check.positive("fem.problem", f"{where} stiffness", self.stiffness, "N/m",
-                        "Give axial stiffness over length, EA / L.")  # fmt: skip
+        _check.positive(
+            "fem.problem",
+            f"{where} stiffness",
+            self.stiffness,
+            "N/m",
+            "Give axial stiffness over length, EA / L.",
+        )
 
 
 def tension(problem: "Problem", u: Float[Array, "nodes dim"], name: str) -> Float[Array, ""]:

@@ -105,9 +105,12 @@ def _point(
     modes = tangent_modes(here, jnp.asarray(state.u), number)
     shape = modes.shapes[int(np.argmin(np.abs(modes.eigenvalues)))]
     return CriticalPoint(
-        kind, jnp.asarray(state.factor), jnp.asarray(state.u),
-        shape / jnp.max(jnp.abs(shape)), number - 1,
-    )  # fmt: skip
+        kind,
+        jnp.asarray(state.factor),
+        jnp.asarray(state.u),
+        shape / jnp.max(jnp.abs(shape)),
+        number - 1,
+    )
 
 
 def _state_at(loading, prepared, first: PathState, s: float, newton) -> PathState | None:
@@ -233,8 +236,14 @@ def continuation(
     while not walk.reason and walk.wants_more(max_states, until):
         if walk.step() and locate_critical_points:
             walk.locate()
-        report("continuation", len(walk.states), max_states, factor=walk.states[-1].factor,
-               negative=walk.states[-1].negative_eigenvalues, cuts=walk.cuts)  # fmt: skip
+        report(
+            "continuation",
+            len(walk.states),
+            max_states,
+            factor=walk.states[-1].factor,
+            negative=walk.states[-1].negative_eigenvalues,
+            cuts=walk.cuts,
+        )
     report("continuation", 1, 1, factor=walk.states[-1].factor)
     return walk.result()
 
@@ -297,9 +306,13 @@ class _Walk:
             state, reason = None, found.reason
             if not reason:
                 state = tangent_state(
-                    self.loading, self.prepared, found.u, found.y[0], here.direction,
+                    self.loading,
+                    self.prepared,
+                    found.u,
+                    found.y[0],
+                    here.direction,
                     found.linearised,
-                )  # fmt: skip
+                )
                 reason = "" if state is not None else "the tangent is singular"
             if state is not None and self._turns(here, state) and failures < _RESOLVED:
                 state = None
@@ -343,6 +356,10 @@ class _Walk:
             jnp.stack([jnp.asarray(s.u) for s in self.states]),
             jnp.asarray([s.factor for s in self.states]),
             jnp.asarray([s.negative_eigenvalues for s in self.states]),
-            tuple(self.critical), self.loading.name, status,
-            Stats(tuple(self.steps), self.cuts, self.reason), self.length, self.states[-1],
-        )  # fmt: skip
+            tuple(self.critical),
+            self.loading.name,
+            status,
+            Stats(tuple(self.steps), self.cuts, self.reason),
+            self.length,
+            self.states[-1],
+        )

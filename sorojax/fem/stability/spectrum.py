@@ -113,9 +113,14 @@ def _near_zero(pencil: Pencil, stiffness, metric, count: int):
     inverse = spla.LinearOperator((size, size), matvec=lambda b: solve(pencil, b), dtype=float)
     start = np.random.default_rng(0).standard_normal(size)
     return spla.eigsh(
-        stiffness, k=count, M=metric, sigma=pencil.shift, OPinv=inverse, v0=start,
+        stiffness,
+        k=count,
+        M=metric,
+        sigma=pencil.shift,
+        OPinv=inverse,
+        v0=start,
         ncv=min(size, max(2 * count + 1, 20)),
-    )  # fmt: skip
+    )
 
 
 def lowest_of_pair(pencil: Pencil, other: np.ndarray, count: int):
@@ -135,9 +140,14 @@ def lowest_of_pair(pencil: Pencil, other: np.ndarray, count: int):
         )
         start = np.random.default_rng(0).standard_normal(size)
         values, vectors = spla.eigsh(
-            other, k=count, M=stiffness, Minv=inverse, which="SA", v0=start,
+            other,
+            k=count,
+            M=stiffness,
+            Minv=inverse,
+            which="SA",
+            v0=start,
             ncv=min(size, max(4 * count, 40)),
-        )  # fmt: skip
+        )
     order = np.argsort(values)[:count]
     return values[order], _embed(pencil, vectors[:, order])
 

@@ -41,8 +41,13 @@ class ConjugateGradient(eqx.Module):
 
     def __check_init__(self):
         for name in ("tolerance", "newton_tolerance", "max_iterations", "coarsest"):
-            _check.positive("ConjugateGradient", name, getattr(self, name), "",
-                            "Leave it out for the default.")  # fmt: skip
+            _check.positive(
+                "ConjugateGradient",
+                name,
+                getattr(self, name),
+                "",
+                "Leave it out for the default.",
+            )
 
 
 class Iterative(eqx.Module):
@@ -113,20 +118,31 @@ def iterate(
         return _State(
             x=jnp.where(small, s.x, s.x + share * way),
             r=jnp.where(check, b - image, s.r - share * image),
-            way=way, size=size, goal=goal, exact=check,
+            way=way,
+            size=size,
+            goal=goal,
+            exact=check,
             started_again=s.started_again | check,
             iterations=jnp.where(converged, s.iterations, iterations),
             negative=jnp.where(converged, s.negative, s.negative + bent.astype(jnp.int32)),
             converged=converged,
             running=~converged & (check | jnp.isfinite(share)) & (iterations <= max_iterations),
-        )  # fmt: skip
+        )
 
     zero, false, none = jnp.zeros((), b.dtype), jnp.asarray(False), jnp.asarray(0, jnp.int32)
     start = _State(
-        x=jnp.zeros_like(b), r=b, way=jnp.zeros_like(b), size=zero, goal=zero, exact=~false,
-        started_again=false, iterations=none, negative=none, converged=false,
+        x=jnp.zeros_like(b),
+        r=b,
+        way=jnp.zeros_like(b),
+        size=zero,
+        goal=zero,
+        exact=~false,
+        started_again=false,
+        iterations=none,
+        negative=none,
+        converged=false,
         running=jnp.all(jnp.isfinite(b)),
-    )  # fmt: skip
+    )
     end = jax.lax.while_loop(lambda s: s.running, one_pass, start)
     return Found(end.x.ravel(), end.converged, end.iterations, end.negative)
 

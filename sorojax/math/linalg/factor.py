@@ -244,9 +244,10 @@ class DirectSolver:
         kept = [
             (np.max(np.abs(owner[::_FEW] - values[::_FEW]), initial=0.0), factor)
             for owner, factor in self._slots.values()
-            if factor is not None and not isinstance(factor, IterativeFactor)
+            if factor is not None
+            and not isinstance(factor, IterativeFactor)
             and factor.negative_eigenvalues == 0
-        ]  # fmt: skip
+        ]
         return min(kept, key=lambda pair: pair[0], default=(0.0, None))[1]
 
     def solve_with_inertia(self, values: np.ndarray, b: np.ndarray) -> tuple:

@@ -88,10 +88,22 @@ class _Phases:
         error = ctypes.c_int(0)
         assert self.lib is not None
         self.lib.pardiso(
-            self._memory, self._count, _number(slot + 1), self._kind, _number(phase),
-            self._size, _pointer(values), *self._pattern, None, _number(num_rhs),
-            self._params, self._quiet, _pointer(b), _pointer(x), ctypes.byref(error),
-        )  # fmt: skip
+            self._memory,
+            self._count,
+            _number(slot + 1),
+            self._kind,
+            _number(phase),
+            self._size,
+            _pointer(values),
+            *self._pattern,
+            None,
+            _number(num_rhs),
+            self._params,
+            self._quiet,
+            _pointer(b),
+            _pointer(x),
+            ctypes.byref(error),
+        )
         return error.value
 
     def __del__(self):
@@ -311,9 +323,13 @@ def _factor(lower: Float[np.ndarray, "size band"]) -> bool:
         return info == 0
     info = ctypes.c_int(0)
     mkl.dpbtrf(
-        b"L", _number(size), _number(width - 1), _pointer(lower), _number(width),
+        b"L",
+        _number(size),
+        _number(width - 1),
+        _pointer(lower),
+        _number(width),
         ctypes.byref(info),
-    )  # fmt: skip
+    )
     return info.value == 0
 
 
@@ -328,6 +344,13 @@ def _solve(lower: Float[np.ndarray, "size band"], b: np.ndarray) -> None:
         rows[:] = dpbtrs(lower.T, rows.T, lower=1)[0].T
         return
     mkl.dpbtrs(
-        b"L", _number(size), _number(width - 1), _number(len(rows)), _pointer(lower),
-        _number(width), _pointer(rows), _number(size), ctypes.byref(ctypes.c_int(0)),
-    )  # fmt: skip
+        b"L",
+        _number(size),
+        _number(width - 1),
+        _number(len(rows)),
+        _pointer(lower),
+        _number(width),
+        _pointer(rows),
+        _number(size),
+        ctypes.byref(ctypes.c_int(0)),
+    )

@@ -324,11 +324,17 @@ def _level(graph: _Graph, nodes: _Nodes, groups: np.ndarray, unknowns: int):
         prolonged=jnp.asarray(wide.rows, jnp.int32),
         prolongation=rows(wide.rows, wide.cols, graph.count),
         restriction=_renumbered(back, turned),
-        applied=products(applied[by_product], first[by_product], second[by_product], count,
-                         len(far.rows)),
-        galerkin=products(galerkin[by_entry], low[by_entry], high[by_entry], len(wide.rows),
-                          len(next_graph.rows)),
-    )  # fmt: skip
+        applied=products(
+            applied[by_product], first[by_product], second[by_product], count, len(far.rows)
+        ),
+        galerkin=products(
+            galerkin[by_entry],
+            low[by_entry],
+            high[by_entry],
+            len(wide.rows),
+            len(next_graph.rows),
+        ),
+    )
     return level, next_graph, coarse
 
 

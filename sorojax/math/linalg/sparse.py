@@ -203,15 +203,25 @@ def from_pattern(
         keys.append(pattern_key(i, k, more))
     starts = np.searchsorted(i, np.arange(size + 1))
     return SparseSymmetric(
-        rows, cols, slots, jnp.asarray(np.stack(keys).reshape(key.shape)), iterative, size,
+        rows,
+        cols,
+        slots,
+        jnp.asarray(np.stack(keys).reshape(key.shape)),
+        iterative,
+        size,
         _kept_again(keys[-1], starts, k, iterative, _double()),
-    )  # fmt: skip
+    )
 
 
 def _placed(points, num_nodes: int, components: int) -> Float[np.ndarray, "nodes components"]:
     if points is None or is_traced(points) or np.shape(points) != (num_nodes, components):
-        got = "none" if points is None else "traced ones" if is_traced(points) else (
-            f"those of shape {np.shape(points)}")  # fmt: skip
+        got = (
+            "none"
+            if points is None
+            else "traced ones"
+            if is_traced(points)
+            else (f"those of shape {np.shape(points)}")
+        )
         raise ValueError(
             f"from_cells: got points {got}, need concrete ones of shape ({num_nodes}, "
             f"{components}) for the multigrid of ConjugateGradient. Build the system outside "

@@ -73,8 +73,15 @@ class GeneralisedAlpha(AbstractMethod):
     interpolation_cls: ClassVar = dfx.LocalLinearInterpolation
 
     def __check_init__(self):
-        _check.between("GeneralisedAlpha", "rho_inf", self.rho_inf, -1e-12, 1 + 1e-12, "",
-                       "1 keeps fast oscillations, 0 removes them.")  # fmt: skip
+        _check.between(
+            "GeneralisedAlpha",
+            "rho_inf",
+            self.rho_inf,
+            -1e-12,
+            1 + 1e-12,
+            "",
+            "1 keeps fast oscillations, 0 removes them.",
+        )
 
     @property
     def carries(self) -> bool:
@@ -167,9 +174,15 @@ def _newton(part: _Part) -> tuple[PyTree, Bool[Array, ""]]:
         stop = converged | ~fine | (now.count >= part.method.max_iterations)
         move = jax.lax.cond(stop, lambda: jnp.zeros_like(trial), lambda: step(trial, found))
         taken = _Search(
-            trial, found, move, jnp.ones_like(now.share), now.count + 1,
-            jnp.zeros_like(now.shortened), converged, ~stop,
-        )  # fmt: skip
+            trial,
+            found,
+            move,
+            jnp.ones_like(now.share),
+            now.count + 1,
+            jnp.zeros_like(now.shortened),
+            converged,
+            ~stop,
+        )
         return jax.tree.map(lambda a, b: jnp.where(stuck, a, b), shorter, taken)
 
     guess = start + part.h * ravel_pytree(part.rate)[0]

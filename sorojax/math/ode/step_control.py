@@ -307,9 +307,14 @@ def _walked(attempt: Attempt, max_cuts: int, given, h, state) -> _Walk:
         end = walk.done + walk.share
         grown = jnp.where(may_double(walk.share, end), 2 * walk.share, walk.share)
         accepted = _Walk(
-            new, end, grown, jnp.zeros_like(walk.failures), walk.row + 1,
-            walk.ends.at[walk.row].set(end), (end < 1.0) & (walk.row + 1 < _ROWS),
-        )  # fmt: skip
+            new,
+            end,
+            grown,
+            jnp.zeros_like(walk.failures),
+            walk.row + 1,
+            walk.ends.at[walk.row].set(end),
+            (end < 1.0) & (walk.row + 1 < _ROWS),
+        )
         share, failures, running = halved(walk.share, walk.failures, max_cuts)
         cut = walk._replace(share=share, failures=failures, running=running)
         return jax.tree.map(lambda a, b: jnp.where(fine, a, b), accepted, cut)

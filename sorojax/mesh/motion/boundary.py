@@ -161,8 +161,10 @@ def _slide_jvp(primals, tangents):
         x, slopes = _slide(fields, plan, start)
     moving = jax.tree.map(
         lambda s, dot: jnp.zeros_like(s) if dot is None else dot,
-        start, tangents[2], is_leaf=lambda leaf: leaf is None,
-    )  # fmt: skip
+        start,
+        tangents[2],
+        is_leaf=lambda leaf: leaf is None,
+    )
     return x, _slide_dot(fields, plan, x, slopes, tangents[0], moving)
 
 

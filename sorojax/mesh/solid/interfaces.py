@@ -245,8 +245,9 @@ def _extended(owner, features: Features, sides: Sides, points):
     new = Sides(base + sides.point[several], sides.field[several], sides.along[several])
     ridge = np.concatenate([features.ridge, count > 1])
     corner = np.concatenate([features.corner, count > 2])
-    return owner, Features(joined(features.sides, new) if several.any() else features.sides,
-                           ridge, corner, points)  # fmt: skip
+    return owner, Features(
+        joined(features.sides, new) if several.any() else features.sides, ridge, corner, points
+    )
 
 
 def whole(points, cells, skin, features: Features) -> Parts:

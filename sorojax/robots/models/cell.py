@@ -118,10 +118,16 @@ def _motion(piece: Piece, fields) -> _Motion:
     second = {(a, b): (t[a] * t[b] - mixed[a, b]) / 2 for a, b in _TWO}
     third = {
         # of two matrices the trace of a product of three does not depend on their order
-        (a, b, c): (t[a] * t[b] * t[c] + 2 * chain[a, b, c]
-                    - t[a] * mixed[b, c] - t[b] * mixed[a, c] - t[c] * mixed[a, b]) / 6
+        (a, b, c): (
+            t[a] * t[b] * t[c]
+            + 2 * chain[a, b, c]
+            - t[a] * mixed[b, c]
+            - t[b] * mixed[a, c]
+            - t[c] * mixed[a, b]
+        )
+        / 6
         for a, b, c in _THREE
-    }  # fmt: skip
+    }
     return _Motion(slopes, H, t, second, third)
 
 
@@ -181,8 +187,10 @@ def _volume(bulk: float, modes: np.ndarray, solid: np.ndarray, now: _Motion):
     first: dict[Index, int] = {(a,): a for a in range(2)}
     second = {index: 2 + k for k, index in enumerate(_TWO)}
     third = {index: 5 + k for k, index in enumerate(_THREE)}
-    three = [2 * sum(work[first[one], second[rest]] for one, rest in _split(index))
-             for index in _THREE]  # fmt: skip
+    three = [
+        2 * sum(work[first[one], second[rest]] for one, rest in _split(index))
+        for index in _THREE
+    ]
     twice = work[2:5, 2:5]
     four = [
         4 * _paired(twice, index)
@@ -202,10 +210,14 @@ def _gas(pressures, gas: np.ndarray, now: _Motion):
     """Of the volume of the gas, less its pressure."""
     swept = {index: float(np.sum(gas * now.second[index])) for index in _TWO}
     swept |= {index: float(np.sum(gas * now.third[index])) for index in _THREE}
-    three = [-2 * sum(pressures[one[0]] * swept[rest] for one, rest in _split(index))
-             for index in _THREE]  # fmt: skip
-    four = [-6 * sum(pressures[one[0]] * swept[rest] for one, rest in _split(index))
-            for index in _FOUR]  # fmt: skip
+    three = [
+        -2 * sum(pressures[one[0]] * swept[rest] for one, rest in _split(index))
+        for index in _THREE
+    ]
+    four = [
+        -6 * sum(pressures[one[0]] * swept[rest] for one, rest in _split(index))
+        for index in _FOUR
+    ]
     stresses = [
         -2 * (_cofactor(now, b, pressures[a] * gas) + _cofactor(now, a, pressures[b] * gas))
         for a, b in _TWO
@@ -298,22 +310,28 @@ def unit_cell(
     fields, none = _uniform(points, center), np.zeros_like(points)
     odd = [_odd(case, mirrors) for case in range(3)]
     held = [_held(points, grid.active, length, mirrors, parity) for parity in odd]
-    answers = [grid.displacement(known, field, none)
-               for known, field in zip(held, fields, strict=True)]  # fmt: skip
+    answers = [
+        grid.displacement(known, field, none) for known, field in zip(held, fields, strict=True)
+    ]
     bulge = grid.displacement(held[0], none, grid.swelling)
     forces = [grid.force(u) for u in answers]
     even = np.array([[odd[i] == odd[j] for j in range(3)] for i in range(3)])
     stiffness = np.array([[np.sum(f * u) for u in answers] for f in forces]) * even
-    push = [0.0 if parity else np.sum(grid.swelling * u)
-            for parity, u in zip(odd, answers, strict=True)]  # fmt: skip
+    push = [
+        0.0 if parity else np.sum(grid.swelling * u)
+        for parity, u in zip(odd, answers, strict=True)
+    ]
     whole, third, fourth = 2.0 ** len(mirrors) / length, np.zeros(4), np.zeros(5)
     if len(mirrors) == 2:
         # a pressure of which the walls store as much as of a unit strain
         scale = np.sqrt(stiffness[0, 0] / np.sum(grid.swelling * bulge))
         third, fourth = energy_series(
-            grid, material, (answers[0], scale * bulge), (0.0, scale),
+            grid,
+            material,
+            (answers[0], scale * bulge),
+            (0.0, scale),
             lambda load: grid.displacement(held[0], none, load),
-        )  # fmt: skip
+        )
         third, fourth = third / scale ** np.arange(4), fourth / scale ** np.arange(5)
     return Cell(
         stiffness=whole * stiffness,
@@ -358,10 +376,14 @@ def _held(points, active, length: float, mirrors, odd) -> Bool[np.ndarray, "node
         for component in {0, 1, 2} - {axis} if axis in odd else {axis}:
             known[on, component] = True
     zero, one = np.zeros(len(points)), np.ones(len(points))
-    rigid = np.stack([
-        np.stack([zero, one, zero], 1), np.stack([zero, zero, one], 1),
-        np.stack([zero, -points[:, 2], points[:, 1]], 1) / np.ptp(points),
-    ], axis=-1).reshape(-1, 3)  # fmt: skip
+    rigid = np.stack(
+        [
+            np.stack([zero, one, zero], 1),
+            np.stack([zero, zero, one], 1),
+            np.stack([zero, -points[:, 2], points[:, 1]], 1) / np.ptp(points),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
     flat = (known & active[:, None]).ravel()
     free_to_move = np.repeat(active, 3)
     for _ in range(3):

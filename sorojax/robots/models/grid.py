@@ -124,8 +124,9 @@ def cut_grid(
         part = share * np.prod(edges) / _FINE**3
         some_solid = part.sum(axis=1) > 1e-6 * np.prod(edges)
         active[some] = some_solid
-        for box, row in zip(some[some_solid], _matrices(fine, part[some_solid], shear, bulk),
-                            strict=True):  # fmt: skip
+        for box, row in zip(
+            some[some_solid], _matrices(fine, part[some_solid], shear, bulk), strict=True
+        ):
             rows[box] = row + _VOID * matrix
         empty = (1 - air_share) * np.prod(edges) / _FINE**3
         # the exact whole less what is sampled as solid: nodes in the gas then feel nothing
@@ -154,10 +155,16 @@ def cut_grid(
     used = np.zeros(len(points), bool)
     used[cells[boxes]] = True
     return Grid(
-        points, used, system, values, swelling.reshape(-1, 3),
-        content + float(len(full_gas) * np.prod(edges)), np.concatenate(volumes),
-        np.concatenate(places), tuple(pieces),
-    )  # fmt: skip
+        points,
+        used,
+        system,
+        values,
+        swelling.reshape(-1, 3),
+        content + float(len(full_gas) * np.prod(edges)),
+        np.concatenate(volumes),
+        np.concatenate(places),
+        tuple(pieces),
+    )
 
 
 def _all_gas(cells, exact: Samples, whole) -> Piece:

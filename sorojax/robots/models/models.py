@@ -111,8 +111,12 @@ def bench(name: str, period: float = 5e-3, **options: Any) -> tuple[Advance, Run
     Raises:
         ValueError: If there is no such robot.
     """
-    kinds = {"bending": BendingActuator, "planar": PlanarActuator, "hand": Hand,
-             "manipulator": Manipulator}  # fmt: skip
+    kinds = {
+        "bending": BendingActuator,
+        "planar": PlanarActuator,
+        "hand": Hand,
+        "manipulator": Manipulator,
+    }
     if name not in kinds:
         raise ValueError(f"robots.bench: got {name!r}, need one of {', '.join(kinds)}.")
     made = model(kinds[name](), **options)
@@ -133,9 +137,14 @@ def _(robot: BendingActuator, making: Making) -> Model:
     zero, middle = jnp.zeros_like(half), cell.center[1]
     # walls turn the slab about the gap between them: half a pitch at each end has no such gap
     made = body(
-        SE2(), chebyshev(kappa_z=making.modes, sigma_x=1), column(cell),
-        robot.length - robot.pitch, making.material, damping=making.damping, plane=2,
-    )  # fmt: skip
+        SE2(),
+        chebyshev(kappa_z=making.modes, sigma_x=1),
+        column(cell),
+        robot.length - robot.pitch,
+        making.material,
+        damping=making.damping,
+        plane=2,
+    )
     front = Box(
         jnp.stack([robot.length - half, -robot.width, -half]),
         jnp.stack([robot.length, robot.width, 2 * robot.height]),
@@ -143,9 +152,10 @@ def _(robot: BendingActuator, making: Making) -> Model:
     end = jnp.stack([robot.length, zero, middle])
     tip = _flat(rigid(robot.body() & front, end, LYING, making.density))
     whole = assembly(
-        SE2(), actuator=Part(made.rod, offset=_placed(jnp.eye(2), jnp.stack([half, middle]))),
+        SE2(),
+        actuator=Part(made.rod, offset=_placed(jnp.eye(2), jnp.stack([half, middle]))),
         tip=Part(tip, on="actuator", offset=_placed(jnp.eye(2), jnp.stack([half, zero]))),
-    )  # fmt: skip
+    )
     port = Port(("actuator",), made.chambers.rest[0], -10 * kPa, 100 * kPa)
     return with_pneumatics(_moving(whole, actuator=made), {"actuator": port}, making.supply)
 
@@ -158,9 +168,13 @@ def _(robot: PlanarActuator, making: Making) -> Model:
     # local y of the rod points against x of the drawing, to which it stands upright
     places = jnp.stack([jnp.stack([half, zero]), jnp.stack([-half, zero])])
     made = body(
-        SE2(), constant("kappa_z", "sigma_x", "sigma_y"), side_by_side(cell, places, length),
-        length, making.material, damping=making.damping,
-    )  # fmt: skip
+        SE2(),
+        constant("kappa_z", "sigma_x", "sigma_y"),
+        side_by_side(cell, places, length),
+        length,
+        making.material,
+        damping=making.damping,
+    )
     plate = rigid(_end_plate(robot), [0.0, 0.0, b.cap + length], STANDING, making.density)
     upright = _placed(jnp.array([[0.0, -1.0], [1.0, 0.0]]), [0.0, b.cap])
     whole = assembly(
@@ -199,10 +213,13 @@ def _(robot: Manipulator, making: Making) -> Model:
     length, angles = b.num_folds * b.pitch, 2 * np.pi / 3 * jnp.arange(3.0)
     around = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1)
     made = body(
-        SE3(), constant("kappa_y", "kappa_z", "sigma_x", "sigma_y", "sigma_z"),
-        side_by_side(cell, robot.center_distance * around, length), length, making.material,
+        SE3(),
+        constant("kappa_y", "kappa_z", "sigma_x", "sigma_y", "sigma_z"),
+        side_by_side(cell, robot.center_distance * around, length),
+        length,
+        making.material,
         damping=making.damping,
-    )  # fmt: skip
+    )
     end = jnp.stack([zero, zero, b.cap + length])
     plate = rigid(_upper_plate(robot), end, STANDING, making.density)
     upright = _placed(STANDING, jnp.stack([zero, zero, b.cap]))
@@ -238,9 +255,13 @@ def _finger(finger: Finger, start, making: Making) -> StandingFinger:
     b, cell = finger.bellows, finger_cell(finger, making.material, making.size)
     end, zero = b.length - b.cap, jnp.zeros_like(b.cap)
     made = body(
-        SE3(), chebyshev(kappa_y=1, kappa_z=making.modes, sigma_x=1), column(cell),
-        end - start, making.material, damping=making.damping,
-    )  # fmt: skip
+        SE3(),
+        chebyshev(kappa_y=1, kappa_z=making.modes, sigma_x=1),
+        column(cell),
+        end - start,
+        making.material,
+        damping=making.damping,
+    )
     base = jnp.stack([cell.center[0], zero, start])
     axis = base.at[2].set(end)
     beyond = HalfSpace(jnp.stack([zero, zero, end]), [0.0, 0.0, -1.0])

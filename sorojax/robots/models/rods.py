@@ -60,9 +60,14 @@ class Bundle(eqx.Module):
 def column(cell: Cell) -> Bundle:
     """One column, with linear answers."""
     return Bundle(
-        cell.stiffness, cell.push[None], cell.gas[None], cell.compliance[None], cell.solid,
-        cell.second_moments, jnp.eye(1, 3, dtype=cell.push.dtype),
-    )  # fmt: skip
+        cell.stiffness,
+        cell.push[None],
+        cell.gas[None],
+        cell.compliance[None],
+        cell.solid,
+        cell.second_moments,
+        jnp.eye(1, 3, dtype=cell.push.dtype),
+    )
 
 
 def side_by_side(cell: Cell, places: Float[Array, "columns 2"], length) -> Bundle:
@@ -208,9 +213,12 @@ def _body(group, basis, bundle, length, material, damping, plane, single) -> Bod
         along = jnp.einsum("pb,bqj->pqj", bundle.arms @ turn[:3][:, at], rows)
         beyond = Stretched(along, weights, _coefficients(bundle.third, bundle.fourth))
     chambers = Chambers(
-        push=push, rest=length * bundle.gas, compliance=length * bundle.compliance,
-        ports=ports, beyond=beyond,
-    )  # fmt: skip
+        push=push,
+        rest=length * bundle.gas,
+        compliance=length * bundle.compliance,
+        ports=ports,
+        beyond=beyond,
+    )
     lossy = ConstantDamping(damping * stiffness)
     return Body(made, (LinearElastic(stiffness), lossy), chambers)
 

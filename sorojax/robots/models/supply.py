@@ -151,9 +151,8 @@ def with_pneumatics(
     for name, port in ports.items():
         dead = supply.tube_volume + port.dead
         air = Reservoir(
-            dead_volume=dead, exponent=supply.exponent, ports=port.count,
-            leakage=supply.leakage,
-        )  # fmt: skip
+            dead_volume=dead, exponent=supply.exponent, ports=port.count, leakage=supply.leakage
+        )
         volume = jnp.max(port.volume) + dead
         gain = supply.bandwidth * volume / (air.gas_constant * air.temperature)
         valve = Regulator(gain, max_flow=supply.max_flow, ports=port.count)
@@ -163,8 +162,10 @@ def with_pneumatics(
         for part in port.parts:
             wires[f"body.{part}_pressure"] = f"{name}_air.pressure"
         for kind, unit in (
-            ("volume", "m^3"), ("volume_rate", "m^3/s"), ("compliance", "m^3/Pa")
-        ):  # fmt: skip
+            ("volume", "m^3"),
+            ("volume_rate", "m^3/s"),
+            ("compliance", "m^3/Pa"),
+        ):
             sources = [
                 f"body.{part}_{kind}" for part in port.parts if f"{part}_{kind}" in body.outputs
             ]

@@ -198,10 +198,13 @@ def contacts_of(
             )
 
         rows = [
-            (contact, jnp.concatenate([columns[k] for k in parts]),
-             *(part_motion(moment, k) for k in parts))
+            (
+                contact,
+                jnp.concatenate([columns[k] for k in parts]),
+                *(part_motion(moment, k) for k in parts),
+            )
             for parts, contact in where
-        ]  # fmt: skip
+        ]
         return tuple(_sum(parts) for parts in zip(*each(one, rows), strict=True))
 
     def passed(before, after, h):

@@ -116,9 +116,8 @@ def _rollout(model, q, v, forces, step, t, stepper, saves, every, label, check) 
     step, t, stepper = _like(q, (step, t, stepper))
     problem = second_order(model, q, forces)
     path, too_long = integrate(
-        stepper, problem, q, v, t=t, h=step, saves=saves, every=every, label=label,
-        judged=check,
-    )  # fmt: skip
+        stepper, problem, q, v, t=t, h=step, saves=saves, every=every, label=label, judged=check
+    )
     fine = jnp.all(jnp.isfinite(path.q)) & jnp.all(jnp.isfinite(path.v))
     status = Status.where(fine, Status.successful, Status.not_finite)
     if path.resolved is not None:

@@ -299,9 +299,9 @@ def arc_length_path(
         q, factor, length, done, count = jax.lax.while_loop(going, attempt, state)
         q, factor = jnp.where(done, q, point.q), jnp.where(done, factor, point.factor)
         _, slope, rate = tangent(q, factor)
-        border = jnp.concatenate([
-            jnp.append(slope, rate[:, None], axis=1), (weights @ point.direction)[None]
-        ])  # fmt: skip
+        border = jnp.concatenate(
+            [jnp.append(slope, rate[:, None], axis=1), (weights @ point.direction)[None]]
+        )
         right = jnp.zeros_like(point.direction).at[-1].set(1.0)
         direction = _unit(jnp.linalg.solve(border, right), weights)
         length = jnp.where(count <= _EASY, 1.5 * length, length)

@@ -200,8 +200,10 @@ def pushed(at: Rows, push: Array | None, increment: Array) -> Array | None:
 
 def bound_to(limits: Limits, own: Array, down: Array) -> tuple[Array, Array]:
     """Which coordinates rest on their lower and upper limits, but for rounding."""
-    low, high = (x + way * _ROUNDING * jnp.finfo(own.dtype).eps * jnp.abs(x)
-                 for x, way in zip(limits, (1, -1), strict=True))  # fmt: skip
+    low, high = (
+        x + way * _ROUNDING * jnp.finfo(own.dtype).eps * jnp.abs(x)
+        for x, way in zip(limits, (1, -1), strict=True)
+    )
     return (own <= low) & (down < 0), (own >= high) & (down > 0)
 
 

@@ -172,8 +172,11 @@ def _wedges(x, f, order, at, moments, steep) -> None:
     one = np.zeros((2, len(f), 4))
     one[0, :, 0] = one[1, :, 1] = 1
     near, far = (one[0], cut[:, 0], cut[:, 1]), (one[1], cut[:, 2], cut[:, 3])
-    for row in ((near[0], near[1], near[2], far[2]), (near[0], near[1], far[1], far[2]),
-                (near[0], far[0], far[1], far[2])):  # fmt: skip
+    for row in (
+        (near[0], near[1], near[2], far[2]),
+        (near[0], near[1], far[1], far[2]),
+        (near[0], far[0], far[1], far[2]),
+    ):
         corners = np.stack(row, axis=1)
         whole, found = simplex_moments(corners @ x, order)
         moments[at] += found

@@ -144,8 +144,9 @@ class Mirrored(AbstractWrapped):
         shift = 2 * jnp.sum(self.point * n) * n
         return hull(
             [(lower, upper), turned_box((lower, upper), reflect, shift)],
-            jnp.minimum, jnp.maximum,
-        )  # fmt: skip
+            jnp.minimum,
+            jnp.maximum,
+        )
 
 
 class Elongated(AbstractWrapped):
@@ -220,9 +221,7 @@ class PolarRepeated(AbstractWrapped):
         lower, upper = self.shape.level_box(level)
         far = jnp.maximum(jnp.abs(lower[:2]), jnp.abs(upper[:2]))
         radius = jnp.sqrt(jnp.sum(far**2))[None].repeat(2)
-        return (
-            jnp.concatenate([-radius, lower[2:]]), jnp.concatenate([radius, upper[2:]])
-        )  # fmt: skip
+        return (jnp.concatenate([-radius, lower[2:]]), jnp.concatenate([radius, upper[2:]]))
 
 
 def extrude(profile: AbstractSdf, height: Numbers) -> Extruded:

@@ -171,10 +171,13 @@ def bezier_distance(points: Float[Array, "3 dim"], x: tuple[Array, ...]) -> Arra
     roots runs to the first and to the last of them without passing.
     """
     curve = [
-        (points[0, i], 2 * (points[1, i] - points[0, i]),
-         points[0, i] - 2 * points[1, i] + points[2, i])
+        (
+            points[0, i],
+            2 * (points[1, i] - points[0, i]),
+            points[0, i] - 2 * points[1, i] + points[2, i],
+        )
         for i in range(len(x))
-    ]  # fmt: skip
+    ]
 
     def slope(t, x):
         first = second = jnp.zeros_like(t)

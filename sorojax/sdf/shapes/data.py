@@ -421,5 +421,6 @@ class HeightMap(AbstractSdf):
         top = jnp.max(self.heights) + level
         infinity = jnp.full_like(top, math.inf)
         return (
-            jnp.stack([-infinity, -infinity, -infinity]), jnp.stack([infinity, infinity, top])
-        )  # fmt: skip
+            jnp.stack([-infinity, -infinity, -infinity]),
+            jnp.stack([infinity, infinity, top]),
+        )

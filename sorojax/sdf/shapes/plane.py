@@ -257,9 +257,14 @@ class Star(AbstractPlaneShape):
         _check_count(self)
         if _check.is_concrete(self.radius) and _check.is_concrete(self.inner_radius):
             _check.between(
-                "Star", "inner_radius", self.inner_radius, 0, float(self.radius), "m",
+                "Star",
+                "inner_radius",
+                self.inner_radius,
+                0,
+                float(self.radius),
+                "m",
                 "Exchange the two radii.",
-            )  # fmt: skip
+            )
 
     def distance(self, x, y):
         half = math.pi / self.count
@@ -319,9 +324,14 @@ class Arc(AbstractPlaneShape):
 
 def _check_half_angle(shape: "Arc | Pie") -> None:
     _check.between(
-        type(shape).__name__, "half_angle", shape.half_angle, 0, math.pi, "rad",
+        type(shape).__name__,
+        "half_angle",
+        shape.half_angle,
+        0,
+        math.pi,
+        "rad",
         "Use a Ring or a Circle for a whole turn.",
-    )  # fmt: skip
+    )
 
 
 class Pie(AbstractPlaneShape):
@@ -354,9 +364,14 @@ class Vesica(AbstractPlaneShape):
         check_lengths(self, "width", "height")
         if _check.is_concrete(self.width) and _check.is_concrete(self.height):
             _check.between(
-                "Vesica", "width", self.width, 0, float(self.height) * (1 + 1e-9), "m",
+                "Vesica",
+                "width",
+                self.width,
+                0,
+                float(self.height) * (1 + 1e-9),
+                "m",
                 "Exchange them and turn the shape by `rotate`.",
-            )  # fmt: skip
+            )
 
     def distance(self, x, y):
         a, b = self.width / 2, self.height / 2

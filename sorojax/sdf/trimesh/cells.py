@@ -24,9 +24,7 @@ def dot(a: Vector, b: Vector) -> Array:
 
 
 def cross(a: Vector, b: Vector) -> Vector:
-    return (
-        a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-    )  # fmt: skip
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def over(p: Vector, a: Vector, b: Vector, c: Vector, slack: float = 0.0) -> tuple[Array, Array]:

@@ -78,9 +78,12 @@ class TriangleTree(eqx.Module):
         return _walk(triangles, boxes, p, best, slot, ~whole)
 
     def inside(
-        self, vertices: Float[Array, "vertices 3"], faces: Int[Array, "faces 3"],
-        index: Int[Array, " points"], p: Vector,
-    ) -> Bool[Array, " points"]:  # fmt: skip
+        self,
+        vertices: Float[Array, "vertices 3"],
+        faces: Int[Array, "faces 3"],
+        index: Int[Array, " points"],
+        p: Vector,
+    ) -> Bool[Array, " points"]:
         """Whether p lies behind the normal at the closest point of the face `index`."""
         triangles = vertices[faces]
         face, edge, corner = self._normals(triangles)

@@ -253,9 +253,7 @@ def update_filter(
         missed = jnp.where(seen > 0, jnp.zeros_like(missed), missed)
     new = FilterState(state[:dof], state[dof:], covariance, missed, error, Status.successful)
     fine = jnp.all(jnp.isfinite(state)) & jnp.all(jnp.isfinite(covariance))
-    kept = jax.tree.map(
-        lambda a, b: jnp.where(fine, a, b), eqx.filter(new, eqx.is_array), last
-    )  # fmt: skip
+    kept = jax.tree.map(lambda a, b: jnp.where(fine, a, b), eqx.filter(new, eqx.is_array), last)
     status = Status.where(fine, Status.successful, Status.not_finite)
     missed = jnp.where(fine, missed, last.missed + 1)
     return eqx.tree_at(lambda x: (x.missed, x.status), kept, (missed, status))

@@ -142,9 +142,16 @@ def _two_passes(run, designs) -> Trajectory:
         network = make(design)
         state = network.initial_state()
         motion = adaptive(
-            network, inputs, state, time, solver, control, max_steps=most, adjoint=adjoint,
+            network,
+            inputs,
+            state,
+            time,
+            solver,
+            control,
+            max_steps=most,
+            adjoint=adjoint,
             progress=progress and (label or False),
-        )  # fmt: skip
+        )
         return motion._replace(memory=None)  # which differs between the methods
 
     cap = _cap(lambda design: go(design, cheap, control, cheap_steps), designs, cheap_steps)

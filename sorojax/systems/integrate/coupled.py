@@ -152,9 +152,11 @@ def _attempt(given, offset, size, state):
         end = _ended(now, name, stage, u[name], w[name])
         bodies[name] = end
         new[name] = {
-            "u": end.displacement, "v": end.velocity, "work": end.work,
+            "u": end.displacement,
+            "v": end.velocity,
+            "work": end.work,
             "dissipated": end.dissipated,
-        }  # fmt: skip
+        }
     rest = _marched(now, u)
     return ({name: {**new, **rest}[name] for name in now.y}, bodies), converged
 
@@ -182,9 +184,15 @@ def _whole(h) -> Interval:
 def _state(now: _Given, name: str) -> State:
     y, kept = now.y[name], now.bodies[name]
     return State(
-        now.t, y["u"], y["v"], kept.acceleration, kept.memory, y["work"], y["dissipated"],
+        now.t,
+        y["u"],
+        y["v"],
+        kept.acceleration,
+        kept.memory,
+        y["work"],
+        y["dissipated"],
         kept.share,
-    )  # fmt: skip
+    )
 
 
 def _ended(now: _Given, name: str, stage: Stage, u, w) -> State:

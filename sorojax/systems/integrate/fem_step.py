@@ -132,9 +132,20 @@ def _newton(equations: Equations, newton: fem.Newton, given):
     zero, none = jnp.zeros((), w.dtype), jnp.zeros((), jnp.int32)
     still = jax.tree.map(jnp.zeros_like, start)
     begin = _Pass(
-        {k: s.step.predicted for k, s in stages.items()}, w, start, w, still, 0 * w,
-        zero + 1, zero, none, none, zero + jnp.inf, jnp.array(False), jnp.array(True),
-    )  # fmt: skip
+        {k: s.step.predicted for k, s in stages.items()},
+        w,
+        start,
+        w,
+        still,
+        0 * w,
+        zero + 1,
+        zero,
+        none,
+        none,
+        zero + jnp.inf,
+        jnp.array(False),
+        jnp.array(True),
+    )
 
     def one(now: _Pass) -> _Pass:
         values = unravel(now.w)
@@ -175,9 +186,12 @@ def _judged(equations, newton, given, stages, unravel, now: _Pass, problems, fou
         u = jax.tree.map(lambda a, b: a + share * b, now.base, now.du)
         count = now.iterations + jnp.where(first, 1, 0).astype(jnp.int32)
         return now._replace(
-            u=u, w=now.base_w + share * now.dw, share=share, iterations=count,
+            u=u,
+            w=now.base_w + share * now.dw,
+            share=share,
+            iterations=count,
             shortenings=now.shortenings + 1,
-        )  # fmt: skip
+        )
 
     def examined():
         values = unravel(now.w)
@@ -192,9 +206,16 @@ def _judged(equations, newton, given, stages, unravel, now: _Pass, problems, fou
 
         def step():
             return _solved(
-                equations, given, {k: found[k].values for k in stages}, stages, now.u, values,
-                {k: found[k].residual for k in stages}, moves, gap,
-            )  # fmt: skip
+                equations,
+                given,
+                {k: found[k].values for k in stages},
+                stages,
+                now.u,
+                values,
+                {k: found[k].residual for k in stages},
+                moves,
+                gap,
+            )
 
         still = (jax.tree.map(jnp.zeros_like, now.u), jnp.zeros_like(now.w))
         du, dw = jax.lax.cond(stop, lambda: still, step)
@@ -206,10 +227,20 @@ def _judged(equations, newton, given, stages, unravel, now: _Pass, problems, fou
         slope = sum(jnp.sum(forces[k] * du[k].ravel()) for k in stages)
         slope = jnp.where(settled, slope, jnp.zeros_like(slope))
         return _Pass(
-            new, now.w + dw,
-            now.u, now.w, du, dw, jnp.ones_like(now.share), slope,
-            jnp.zeros_like(now.shortenings), now.iterations + 1, update, converged, ~stop,
-        )  # fmt: skip
+            new,
+            now.w + dw,
+            now.u,
+            now.w,
+            du,
+            dw,
+            jnp.ones_like(now.share),
+            slope,
+            jnp.zeros_like(now.shortenings),
+            now.iterations + 1,
+            update,
+            converged,
+            ~stop,
+        )
 
     return jax.lax.cond(shorten | first, again, examined)
 

@@ -313,23 +313,32 @@ def run_with_events(
     def piece(carry, _):
         path, state, start, done, status, last = carry
         part = adaptive(
-            block, inputs, state, time, solver, control, start=start,
-            conditions=conditions._replace(last=last), **options,
-        )  # fmt: skip
+            block,
+            inputs,
+            state,
+            time,
+            solver,
+            control,
+            start=start,
+            conditions=conditions._replace(last=last),
+            **options,
+        )
         hit = jnp.any(part.triggered) & ~done
         which = jnp.argmax(part.triggered).astype(jnp.int32)
         new = _reset(events, which, part.reached, part.last)
         later = (time >= start) & ~done
         path = jax.tree.map(
             lambda a, b: jnp.where(later.reshape(-1, *[1] * (a.ndim - 1)), b, a),
-            path, part.path,
-        )  # fmt: skip
+            path,
+            part.path,
+        )
         ends = jnp.stack([jnp.asarray(event.reset is None) for event in events])[which]
         status = Status.where(done, status, part.status)
         finished = done | ~hit | ends
         held = done | ~hit
-        state = jax.tree.map(lambda a, b, c: jnp.where(done, c, jnp.where(held, b, a)),
-                             new, part.last, state)  # fmt: skip
+        state = jax.tree.map(
+            lambda a, b, c: jnp.where(done, c, jnp.where(held, b, a)), new, part.last, state
+        )
         reached = jnp.where(done, start, part.reached)
         steps = jnp.where(done, jnp.zeros_like(part.steps), part.steps)
         rejected = jnp.where(done, jnp.zeros_like(part.steps), part.rejected)

@@ -73,8 +73,11 @@ def fixed(
     start = Walk(state, memory, finite(state), jnp.array(True), time[0])
     within = plan.start - plan.row // parts * parts
     made = (
-        plan.row, plan.part, within.astype(interval.dtype), plan.length.astype(interval.dtype)
-    )  # fmt: skip
+        plan.row,
+        plan.part,
+        within.astype(interval.dtype),
+        plan.length.astype(interval.dtype),
+    )
     run, states = jax.lax.scan(advance, Doubled.at(start), made)
     end = run.now
     path = as_trees(unravel, after_start(state, whole_rows(plan, states)))

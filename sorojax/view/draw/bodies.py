@@ -120,8 +120,9 @@ _UNITS = {
 _CLEAR = 0.4  # opacity of a body whose walls under pressure are seen through it
 
 
-def show_problem(problem: Problem, *, view: View = "iso", renderer: str = "auto",
-                 title: str = "") -> Picture:  # fmt: skip
+def show_problem(
+    problem: Problem, *, view: View = "iso", renderer: str = "auto", title: str = ""
+) -> Picture:
     """The body at rest with its cells, supports and loads."""
     return show_scene(problem_scene(problem, title), view=view, renderer=renderer)
 
@@ -168,9 +169,15 @@ def show_solution(
         title: Title of the figure.
     """
     scene = solution_scene(
-        solution, title, field=field, label=label, limits=limits, rest=rest, loads=loads,
+        solution,
+        title,
+        field=field,
+        label=label,
+        limits=limits,
+        rest=rest,
+        loads=loads,
         wire=wire,
-    )  # fmt: skip
+    )
     return show_scene(scene, view=view, renderer=renderer)
 
 
@@ -211,9 +218,13 @@ def show_path(
 
 
 def show_vibration(
-    modes: Modes, *, share: float = 0.12, view: View = "iso", renderer: str = "auto",
+    modes: Modes,
+    *,
+    share: float = 0.12,
+    view: View = "iso",
+    renderer: str = "auto",
     title: str = "",
-) -> Picture:  # fmt: skip
+) -> Picture:
     """Mode shapes, drawn with a largest displacement of `share` of the body, and their
     frequencies."""
     base = np.asarray(modes.problem.mesh.points) + np.asarray(modes.displacement)
@@ -248,8 +259,10 @@ def show_buckling(
         names = [f"{found.kind} at load factor {float(found.factor):.4g}"]
     else:
         shapes = np.asarray(found.shapes)
-        names = [f"mode {k + 1}: load factor {f:.4g}"
-                 for k, f in enumerate(np.asarray(found.factors))]  # fmt: skip
+        names = [
+            f"mode {k + 1}: load factor {f:.4g}"
+            for k, f in enumerate(np.asarray(found.factors))
+        ]
     if not len(shapes):
         raise ValueError(
             "view.show: there is no critical load ahead of the state. Ask for more modes, or "

@@ -60,9 +60,12 @@ def show_file(
     if kind in _SURFACES:
         surface = io.import_surface(path, unit=unit)
         return show_surface(
-            surface, wire=wire, view=view, renderer=renderer,
+            surface,
+            wire=wire,
+            view=view,
+            renderer=renderer,
             title=title or f"{path.name}: {len(surface.triangles)} triangles",
-        )  # fmt: skip
+        )
     if kind == ".npz":
         return _saved(path, name, field=field, view=view, renderer=renderer, wire=wire)
     scale = 1.0 if unit is None else unit
@@ -82,9 +85,13 @@ def show_file(
 
 
 def animate_file(
-    path: str | Path, *, field: str | None = None, unit: float = 1.0, fps: float = 10.0,
+    path: str | Path,
+    *,
+    field: str | None = None,
+    unit: float = 1.0,
+    fps: float = 10.0,
     **options: Any,
-) -> Film:  # fmt: skip
+) -> Film:
     """A film of a series of results (.pvd); options of `animate`."""
     from sorojax.view.film.animation import Track, animate
 
@@ -111,8 +118,10 @@ def _state(path: Path, field: str | None, unit: float) -> _State:
     at_nodes = {
         k: np.asarray(v) for k, v in whole.point_data.items() if len(v) == mesh.num_nodes
     }
-    at_cells = {k: np.concatenate([np.asarray(block) for block in v])
-                for k, v in whole.cell_data.items()}  # fmt: skip
+    at_cells = {
+        k: np.concatenate([np.asarray(block) for block in v])
+        for k, v in whole.cell_data.items()
+    }
     at_cells = {k: v for k, v in at_cells.items() if len(v) == mesh.num_cells}
     given = at_nodes.get("displacement")
     moved = np.zeros(mesh.points.shape) if given is None else unit * given[:, :dim]
@@ -190,8 +199,9 @@ def _saved(path: Path, title: str, **options: Any) -> Picture:
         short = re.sub(r"^\.(outputs|states?)\b|[\[\]']", "", name).lstrip(".")
         rows = array.reshape(len(time), -1)
         several = rows.shape[1] > 1
-        groups[short] = {f"{short}[{k}]" if several else short: rows[:, k]
-                         for k in range(rows.shape[1])}  # fmt: skip
+        groups[short] = {
+            f"{short}[{k}]" if several else short: rows[:, k] for k in range(rows.shape[1])
+        }
     if not groups:
         return _drawn(path, arrays, title, options)
     return show_signals(time, groups, title=title)

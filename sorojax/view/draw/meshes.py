@@ -266,8 +266,15 @@ def _regions(mesh: Mesh, seen: Shell, points: np.ndarray) -> list[Part]:
         left &= ~mine
         at = mine[seen.cells]
         if at.any():
-            parts.append(Surface(points, seen.triangles[at], _colour(k, pale=True),
-                                 wire=seen.wire[at], name=name))  # fmt: skip
+            parts.append(
+                Surface(
+                    points,
+                    seen.triangles[at],
+                    _colour(k, pale=True),
+                    wire=seen.wire[at],
+                    name=name,
+                )
+            )
     rest = left[seen.cells]
     if rest.any() or not parts:
         parts.insert(0, Surface(points, seen.triangles[rest], style.BODY, wire=seen.wire[rest]))
@@ -335,8 +342,14 @@ def show_quality(found: Quality, *, title: str = "") -> Picture:
     axes = figure.add_subplot()
     counts = np.asarray(found.histogram, float)
     edges = np.linspace(0, 1, len(counts) + 1)
-    axes.bar(edges[:-1], counts, np.diff(edges), align="edge", color=style.COLOURS[0],
-             edgecolor="white")  # fmt: skip
+    axes.bar(
+        edges[:-1],
+        counts,
+        np.diff(edges),
+        align="edge",
+        color=style.COLOURS[0],
+        edgecolor="white",
+    )
     axes.axvline(found.mean_radius_ratio, color=style.COLOURS[1], lw=1.6, label="mean")
     low, high = np.rad2deg(found.min_angle), np.rad2deg(found.max_angle)
     text = f"{found.num_cells} cells, angles {low:.1f} to {high:.1f} deg"

@@ -51,8 +51,15 @@ def show_network(network: AbstractBlock, *, title: str = "") -> Picture:
             path = _bend(start, end)
         _wire(axes, path, colours[source])
     if title:
-        axes.text((right) / 2, 0.35, title, ha="center", fontsize=style.TITLE, color=style.INK,
-                  fontweight="bold")  # fmt: skip
+        axes.text(
+            (right) / 2,
+            0.35,
+            title,
+            ha="center",
+            fontsize=style.TITLE,
+            color=style.INK,
+            fontweight="bold",
+        )
     return Picture(figure, (Panel(axes),))
 
 
@@ -155,12 +162,31 @@ def _box(axes: Any, name: str, block, ports: Ports, place, wires, exposed: set[s
     x, y = place
     high = _height(ports)
     look = {"boxstyle": "round,pad=0,rounding_size=0.08", "linewidth": 1.0}
-    axes.add_patch(FancyBboxPatch((x, y - high), _WIDE, high, facecolor="#f3f6fa",
-                                  edgecolor=style.GREY, **look))  # fmt: skip
-    axes.text(x + _WIDE / 2, y - 0.17, name, ha="center", va="center", fontsize=style.LABEL,
-              color=style.INK, fontweight="bold")  # fmt: skip
-    axes.text(x + _WIDE / 2, y - 0.37, type(block).__name__, ha="center", va="center",
-              fontsize=style.SMALL - 1, color=style.GREY, style="italic")  # fmt: skip
+    axes.add_patch(
+        FancyBboxPatch(
+            (x, y - high), _WIDE, high, facecolor="#f3f6fa", edgecolor=style.GREY, **look
+        )
+    )
+    axes.text(
+        x + _WIDE / 2,
+        y - 0.17,
+        name,
+        ha="center",
+        va="center",
+        fontsize=style.LABEL,
+        color=style.INK,
+        fontweight="bold",
+    )
+    axes.text(
+        x + _WIDE / 2,
+        y - 0.37,
+        type(block).__name__,
+        ha="center",
+        va="center",
+        fontsize=style.SMALL - 1,
+        color=style.GREY,
+        style="italic",
+    )
     for side in (0, 1):
         for row, (port, unit) in enumerate(ports[side]):
             at = y - _HEAD - _ROW * (row + 0.5)
@@ -170,16 +196,28 @@ def _box(axes: Any, name: str, block, ports: Ports, place, wires, exposed: set[s
             text = f"{port} [{unit}]" if unit else port
             alone = row >= len(ports[1 - side])
             text = _cut(text, 28 if alone else 17)
-            axes.text(edge + (0.09 if side == 0 else -0.09), at, text,
-                      ha="left" if side == 0 else "right", va="center",
-                      fontsize=style.SMALL - 1.5, color=style.INK)  # fmt: skip
+            axes.text(
+                edge + (0.09 if side == 0 else -0.09),
+                at,
+                text,
+                ha="left" if side == 0 else "right",
+                va="center",
+                fontsize=style.SMALL - 1.5,
+                color=style.INK,
+            )
             if side == 0 and full in exposed:
                 _wire(axes, np.array([[edge - 0.6, at], [edge, at]]), style.LOAD)
             elif side == 0 and full not in wires:
                 default = block.inputs[port].default
-                axes.text(edge - 0.08, at, "open" if default is None else f"{default:g}",
-                          ha="right", va="center", fontsize=style.SMALL - 2,
-                          color=style.GREY)  # fmt: skip
+                axes.text(
+                    edge - 0.08,
+                    at,
+                    "open" if default is None else f"{default:g}",
+                    ha="right",
+                    va="center",
+                    fontsize=style.SMALL - 2,
+                    color=style.GREY,
+                )
 
 
 def _cut(text: str, most: int) -> str:

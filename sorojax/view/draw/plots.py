@@ -59,8 +59,13 @@ def show_basis(
             zip(shapes, style.shades(len(shapes)), strict=True)
         ):
             part = f", {_percent(share[k])}" if len(share) == len(shapes) > 1 else ""
-            panel.plot(s * 1e3 * float(length), shape, color=colour, lw=1.9,
-                       label=f"mode {k + 1}{part}")  # fmt: skip
+            panel.plot(
+                s * 1e3 * float(length),
+                shape,
+                color=colour,
+                lw=1.9,
+                label=f"mode {k + 1}{part}",
+            )
         total = (
             f": {_percent(share.sum())} of the squared strain captured" if share.size else ""
         )
@@ -117,8 +122,9 @@ def show_backbones(
     for k, colour in zip(shown, style.shades(len(shown)), strict=True):
         left.plot(*solid[k].T, color=colour, lw=3.4, alpha=0.55, label=f"{load[k]:.3g} {unit}")
         last = k == shown[-1]
-        left.plot(*line[k].T, color=style.INK, lw=1.1, ls=(0, (4, 2)),
-                  label="rod" if last else None)  # fmt: skip
+        left.plot(
+            *line[k].T, color=style.INK, lw=1.1, ls=(0, (4, 2)), label="rod" if last else None
+        )
     style.dress(left, "x [mm]", "y [mm]", "backbone: solid in colour, rod dashed")
     left.set_aspect("equal", adjustable="datalim")
     style.legend(left, loc="best")
@@ -126,9 +132,14 @@ def show_backbones(
     right.plot(load, error, color=style.COLOURS[0], lw=1.8, marker="o", ms=3.5)
     right.axhline(1e3 * bar, color=style.COLOURS[1], lw=1.3, ls=(0, (4, 2)))
     right.annotate(
-        f"bar: {1e3 * bar:g} mm", (load[0], 1e3 * bar), (0, -4), fontsize=style.SMALL,
-        textcoords="offset points", va="top", color=style.COLOURS[1],
-    )  # fmt: skip
+        f"bar: {1e3 * bar:g} mm",
+        (load[0], 1e3 * bar),
+        (0, -4),
+        fontsize=style.SMALL,
+        textcoords="offset points",
+        va="top",
+        color=style.COLOURS[1],
+    )
     across = "load step" if pressures is None else "pressure [kPa]"
     largest = f"largest mean error {error.max():.2g} mm"
     style.dress(right, across, "mean position error [mm]", largest)
@@ -276,8 +287,15 @@ def show_convergence(data: Convergence, *, title: str = "") -> Picture:
         error = np.asarray(data.errors[name], float)
         _positive(name, size, error)
         colour = style.COLOURS[k % len(style.COLOURS)]
-        axes.plot(size[along], error[along], color=colour, marker=_MARKS[k % 7], ms=5, lw=1.6,
-                  label=f"{name}: order {order:.2f}")  # fmt: skip
+        axes.plot(
+            size[along],
+            error[along],
+            color=colour,
+            marker=_MARKS[k % 7],
+            ms=5,
+            lw=1.6,
+            label=f"{name}: order {order:.2f}",
+        )
     _logarithmic(axes, data.size_label, data.error_label)
     return _finished(figure, axes, title)
 
@@ -290,8 +308,15 @@ def show_work_precision(data: WorkPrecision, *, title: str = "") -> Picture:
         cost, error = np.asarray(cost, float), np.asarray(error, float)
         _positive(name, cost, error)
         along = np.argsort(cost)
-        axes.plot(cost[along], error[along], color=style.COLOURS[k % len(style.COLOURS)],
-                  marker=_MARKS[k % 7], ms=5, lw=1.6, label=name)  # fmt: skip
+        axes.plot(
+            cost[along],
+            error[along],
+            color=style.COLOURS[k % len(style.COLOURS)],
+            marker=_MARKS[k % 7],
+            ms=5,
+            lw=1.6,
+            label=name,
+        )
     _logarithmic(axes, data.cost_label, data.error_label)
     return _finished(figure, axes, title)
 
@@ -354,11 +379,18 @@ def _tensile(material: AbstractHyperelastic, stretch, stress, points, title: str
     figure = style.new_figure(6.5, 4.2)
     axes = figure.add_subplot()
     axes.axhline(0.0, color=style.GREY, lw=0.8)
-    axes.plot(stretch, stress / 1e3, color=style.COLOURS[0], lw=1.9,
-              label=type(material).__name__)  # fmt: skip
+    axes.plot(
+        stretch, stress / 1e3, color=style.COLOURS[0], lw=1.9, label=type(material).__name__
+    )
     if points is not None:
-        axes.plot(1 + np.asarray(points[0]), np.asarray(points[1]) / 1e3, "o",
-                  color=style.COLOURS[1], ms=6, label="measured")  # fmt: skip
+        axes.plot(
+            1 + np.asarray(points[0]),
+            np.asarray(points[1]) / 1e3,
+            "o",
+            color=style.COLOURS[1],
+            ms=6,
+            label="measured",
+        )
     style.dress(axes, "stretch [-]", "engineering stress [kPa]")
     style.legend(axes, loc="upper left")
     style.title(figure, title)
@@ -415,10 +447,18 @@ def show_calibration(found: Calibration, *, title: str = "") -> Picture:
         )
         reading = np.arange(len(predicted))
         wide = np.broadcast_to(wide, predicted.shape)
-        axes.fill_between(reading, predicted - wide, predicted + wide, alpha=0.2,
-                          color=style.COLOURS[0], lw=0)  # fmt: skip
-        axes.plot(reading, predicted - error, "o", ms=3.5, color=style.COLOURS[1], mew=0,
-                  label="measured")  # fmt: skip
+        axes.fill_between(
+            reading, predicted - wide, predicted + wide, alpha=0.2, color=style.COLOURS[0], lw=0
+        )
+        axes.plot(
+            reading,
+            predicted - error,
+            "o",
+            ms=3.5,
+            color=style.COLOURS[1],
+            mew=0,
+            label="measured",
+        )
         axes.plot(reading, predicted, color=style.COLOURS[0], lw=1.6, label="predicted")
         style.dress(axes, "reading", "", f"{check.name}{note}: {check.rms:.3g} of the noise")
     style.legend(grid[0], loc="best")
@@ -452,8 +492,9 @@ def show_sweep(swept: Any, *, title: str = "") -> Picture:
         if values.shape[1] == 1:
             axes.plot(design, values[:, 0], "o", ms=3.5, mew=0, color=style.COLOURS[0])
         else:
-            axes.fill_between(design, values.min(1), values.max(1), alpha=0.3, lw=0,
-                              color=style.COLOURS[0])  # fmt: skip
+            axes.fill_between(
+                design, values.min(1), values.max(1), alpha=0.3, lw=0, color=style.COLOURS[0]
+            )
             axes.plot(design, values.mean(1), color=style.COLOURS[0], lw=1.4)
         style.dress(axes, "design", "", name)
     left = len(named) - len(names)
@@ -485,8 +526,12 @@ def show_tracks(tracks: Any, *, title: str = "") -> Picture:
         turn = np.linspace(0, 2 * np.pi, 65)
         edge = centre + radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
         axes.fill(edge[:, 0], edge[:, 1], color=colour, alpha=0.8 if seen else 0.4, lw=0)
-        axes.annotate("", centre + tracks.velocity[number], centre,
-                      arrowprops={"arrowstyle": "->", "color": style.INK})  # fmt: skip
+        axes.annotate(
+            "",
+            centre + tracks.velocity[number],
+            centre,
+            arrowprops={"arrowstyle": "->", "color": style.INK},
+        )
         axes.text(*centre, str(number), ha="center", va="center", color="white")
     text = f"{len(tracks.unseen)} markers, {int(np.sum(tracks.stale))} stale"
     style.dress(axes, "x [px]", "y [px]", title or text)

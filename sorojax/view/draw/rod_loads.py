@@ -66,10 +66,14 @@ def _threads(body: Rod, force: Any) -> list[Drawn]:
     if isinstance(force, R.Tendons):
         tension = None if callable(force.tension) else np.asarray(force.tension)
         return [
-            _routed(route, style.COLOURS[3], None,
-                    "tendon" if tension is None else f"tendon: {short(float(tension[k]), 'N')}")
+            _routed(
+                route,
+                style.COLOURS[3],
+                None,
+                "tendon" if tension is None else f"tendon: {short(float(tension[k]), 'N')}",
+            )
             for k, route in enumerate(force.routes)
-        ]  # fmt: skip
+        ]
     chamber, pressure = force, None
     if isinstance(force, R.Pressurised):
         chamber, pressure = force.chamber, np.atleast_1d(np.asarray(force.pressure))
@@ -130,8 +134,9 @@ def thread_parts(body: Rod, threads: Sequence[Drawn], pose, s: np.ndarray) -> li
         nearest = np.clip(np.searchsorted(s, at), 1, len(s) - 1)
         share = (at - s[nearest - 1]) / (s[nearest] - s[nearest - 1])
         both = pose[nearest - 1] + share[:, None, None] * (pose[nearest] - pose[nearest - 1])
-        line = both[:, :dim, dim] + np.einsum("sij,sj->si", both[:, :dim, 1:dim],
-                                              place[:, : dim - 1])  # fmt: skip
+        line = both[:, :dim, dim] + np.einsum(
+            "sij,sj->si", both[:, :dim, 1:dim], place[:, : dim - 1]
+        )
         if thread.radius is None or dim == 2:
             width = 2.0 if thread.radius is None else 4.0
             parts.append(Lines([line], thread.colour, width, name=thread.name))

@@ -184,8 +184,9 @@ def rod_scene(
     for k, row in enumerate(rows):
         last = k == len(rows) - 1
         shade = None if last else 0.75 - 0.5 * k / len(rows)
-        parts += _state(model, row, forces if last else (), section, shapes, directors and last,
-                        shade)  # fmt: skip
+        parts += _state(
+            model, row, forces if last else (), section, shapes, directors and last, shade
+        )
     return Scene(tuple(parts), title=title)
 
 
@@ -233,8 +234,9 @@ def _band(centres, across, y, hole, colour: str, opacity: float) -> list[Part]:
     right = centres + y.min(axis=1)[:, None] * across
     points, count = np.concatenate([left, right]), len(centres)
     a = np.arange(count - 1)
-    triangles = np.concatenate([np.stack([a + 1, a, a + count], 1),
-                                np.stack([a + 1, a + count, a + count + 1], 1)])  # fmt: skip
+    triangles = np.concatenate(
+        [np.stack([a + 1, a, a + count], 1), np.stack([a + 1, a + count, a + count + 1], 1)]
+    )
     ring = np.concatenate([left, right[::-1], left[:1]])
     parts: list[Part] = [Surface(points, triangles, colour), Lines([ring], style.INK, 0.9)]
     if hole is not None:
@@ -354,12 +356,15 @@ def show_section(section: Section, *, title: str = "") -> Picture:
     axes.fill(*(1e3 * outer.T), color=style.BODY, ec=style.INK, lw=1.0)
     if hole is not None:
         axes.fill(*(1e3 * hole.T), color="white", ec=style.INK, lw=1.0)
-    style.dress_plane(axes, 1e3 * outer.min(axis=0), 1e3 * outer.max(axis=0),
-                      "local y [mm]", "local z [mm]")  # fmt: skip
-    facts = {"A": (section.area, 1e6, "mm$^2$"),
-             "$I_y$": (section.second_moment_y, 1e12, "mm$^4$"),
-             "$I_z$": (section.second_moment_z, 1e12, "mm$^4$"),
-             "J": (section.torsion_constant, 1e12, "mm$^4$")}  # fmt: skip
+    style.dress_plane(
+        axes, 1e3 * outer.min(axis=0), 1e3 * outer.max(axis=0), "local y [mm]", "local z [mm]"
+    )
+    facts = {
+        "A": (section.area, 1e6, "mm$^2$"),
+        "$I_y$": (section.second_moment_y, 1e12, "mm$^4$"),
+        "$I_z$": (section.second_moment_z, 1e12, "mm$^4$"),
+        "J": (section.torsion_constant, 1e12, "mm$^4$"),
+    }
     text = "   ".join(
         f"{name} {float(np.median(np.asarray(value))) * factor:.4g} {unit}"
         for name, (value, factor, unit) in facts.items()

@@ -169,8 +169,9 @@ def show_history(
         steps: Which of the kept ones; up to six, evenly spaced, if omitted.
         title: Title of the figure.
     """
-    return show_densities(history.mesh, history.densities, steps=steps, title=title,
-                          counts=history.steps)  # fmt: skip
+    return show_densities(
+        history.mesh, history.densities, steps=steps, title=title, counts=history.steps
+    )
 
 
 def show_densities(

@@ -82,9 +82,16 @@ def _contours(x, y, f, lower, upper, title: str) -> "tuple[Figure, Axes]":
     norm, levels = _two_sided(1e3 * float(f.min()), 1e3 * float(f.max()))
     filled = axes.contourf(1e3 * x, 1e3 * y, 1e3 * f, levels=levels, cmap="RdBu_r", norm=norm)
     style.colour_bar(
-        figure, filled, axes, "signed distance [mm]", format="%g", shrink=0.9, pad=0.02,
-        ticks=levels[::2] if len(levels) > 12 else levels, spacing="uniform",
-    )  # fmt: skip
+        figure,
+        filled,
+        axes,
+        "signed distance [mm]",
+        format="%g",
+        shrink=0.9,
+        pad=0.02,
+        ticks=levels[::2] if len(levels) > 12 else levels,
+        spacing="uniform",
+    )
     style.title(figure, title)
     return figure, axes
 
@@ -266,8 +273,13 @@ def show_curve(curve: Curve, *, title: str = "") -> Picture:
     axes = figure.add_subplot()
     line = np.concatenate([points, points[:1]]) if curve.closed else points
     axes.plot(*(1e3 * line).T, color=style.COLOURS[0], lw=1.6, marker=".", ms=3)
-    axes.plot(*(1e3 * points[np.asarray(curve.corner)]).T, "o", color=style.COLOURS[1], ms=6,
-              label="corners")  # fmt: skip
+    axes.plot(
+        *(1e3 * points[np.asarray(curve.corner)]).T,
+        "o",
+        color=style.COLOURS[1],
+        ms=6,
+        label="corners",
+    )
     style.dress_plane(axes, lower, upper)
     if np.any(curve.corner):
         style.legend(axes, loc="best")

@@ -104,10 +104,12 @@ def _alike(tracks: list[Track]) -> list[Track]:
     scales = [track.scale for track in tracks if track.scale is not None]
     scale = scales[0] if scales else None
     if len(scales) == 2 and scales[0].label == scales[1].label:
-        scale = replace(scales[0], low=min(s.low for s in scales),
-                        high=max(s.high for s in scales))  # fmt: skip
-    return [replace(t, extent=extent, scale=scale if t.scale is not None else None)
-            for t in tracks]  # fmt: skip
+        scale = replace(
+            scales[0], low=min(s.low for s in scales), high=max(s.high for s in scales)
+        )
+    return [
+        replace(t, extent=extent, scale=scale if t.scale is not None else None) for t in tracks
+    ]
 
 
 def _extent(track: Track) -> tuple[np.ndarray, np.ndarray]:
@@ -191,9 +193,15 @@ class _Plane(_Stage):
             bar_beside(self.figure, self.axes, scale)
         style.title(self.figure, self.title)
         self.text = self.axes[0].text(
-            0.0, 1.02, self.stamped(len(self.chosen) - 1), transform=self.axes[0].transAxes,
-            fontsize=style.LABEL, color=style.INK, family="monospace", va="bottom",
-        )  # fmt: skip
+            0.0,
+            1.02,
+            self.stamped(len(self.chosen) - 1),
+            transform=self.axes[0].transAxes,
+            fontsize=style.LABEL,
+            color=style.INK,
+            family="monospace",
+            va="bottom",
+        )
         self.canvas = FigureCanvasAgg(self.figure)
         self.text.set_animated(True)
         self.canvas.draw()
@@ -267,8 +275,13 @@ class _Solid(_Stage):
         picture = self.still.copy()
         for track, ((x, y), size) in zip(self.tracks, self.places, strict=True):
             lens = self._lens(track, size, self.share(k))
-            seen = picture_of(self.scene(track, k), lens, renderer=self.renderer,
-                              samples=self.samples, dots_per_point=100 / 72)  # fmt: skip
+            seen = picture_of(
+                self.scene(track, k),
+                lens,
+                renderer=self.renderer,
+                samples=self.samples,
+                dots_per_point=100 / 72,
+            )
             part = picture[y : y + size[1], x : x + size[0]]
             # names and axes stay in front: they are darker than the paper of the picture
             np.minimum(part, seen[: part.shape[0], : part.shape[1]], out=part)

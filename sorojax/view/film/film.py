@@ -157,9 +157,15 @@ def _gif(film: Film, every: int) -> bytes:
         report(film.label, len(pictures), count)
     buffer = io.BytesIO()
     pictures[0].save(
-        buffer, "GIF", save_all=True, append_images=pictures[1:], loop=0, optimize=False,
-        duration=round(100 * every / film.fps) * 10, disposal=1,
-    )  # fmt: skip
+        buffer,
+        "GIF",
+        save_all=True,
+        append_images=pictures[1:],
+        loop=0,
+        optimize=False,
+        duration=round(100 * every / film.fps) * 10,
+        disposal=1,
+    )
     return buffer.getvalue()
 
 
@@ -190,9 +196,14 @@ def _encode(film: Film, path: Path) -> None:
     size = (wide - wide % 2, high - high % 2)  # the format has pairs of pixels only
     vp9 = path.suffix.lower() == ".webm"
     writer = imageio_ffmpeg.write_frames(
-        str(path), size, fps=film.fps, macro_block_size=1, quality=None if vp9 else 7,
-        codec="libvpx-vp9" if vp9 else "libx264", pix_fmt_out="yuv420p",
-    )  # fmt: skip
+        str(path),
+        size,
+        fps=film.fps,
+        macro_block_size=1,
+        quality=None if vp9 else 7,
+        codec="libvpx-vp9" if vp9 else "libx264",
+        pix_fmt_out="yuv420p",
+    )
     writer.send(None)
     try:
         for frame in film:

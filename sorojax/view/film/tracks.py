@@ -164,10 +164,15 @@ def _network_track(
             "view.animate: a Trajectory holds states only. Pass network=, what was simulated, "
             "or model=, the rod."
         )
-    bodies = {} if network is None else {
-        name: part for name, part in network.blocks.items()
-        if isinstance(part, RodBody | AssemblyBody)
-    }  # fmt: skip
+    bodies = (
+        {}
+        if network is None
+        else {
+            name: part
+            for name, part in network.blocks.items()
+            if isinstance(part, RodBody | AssemblyBody)
+        }
+    )
     name = block or next(iter(bodies), None)
     if name is None:
         name = next(

@@ -96,9 +96,10 @@ def arrow_triangles(
     head = np.minimum(0.45 * length, 6.0 * radius)
     thin = head / (6.0 * radius) * radius
     along_at = np.where(
-        shape[None, :, 0] <= 1, shape[None, :, 0] * (length - head)[:, None],
+        shape[None, :, 0] <= 1,
+        shape[None, :, 0] * (length - head)[:, None],
         (length - head)[:, None] + (shape[None, :, 0] - 1) * head[:, None],
-    )  # fmt: skip
+    )
     local = np.concatenate(
         [along_at[:, :, None], shape[None, :, 1:] * thin[:, None, None]], axis=2
     )

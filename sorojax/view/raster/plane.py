@@ -85,9 +85,12 @@ def name_parts(axes: "Axes", scene: Scene) -> None:
     named = [part.name for part in scene.parts if part.name]
     if named:
         style.legend(
-            axes, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2,
+            axes,
+            loc="lower right",
+            bbox_to_anchor=(1.0, 1.0),
+            borderaxespad=0.2,
             ncols=min(len(set(named)), 4),
-        )  # fmt: skip
+        )
 
 
 def _draw(axes: "Axes", part: Part, scale: Scale | None) -> list:
@@ -112,12 +115,18 @@ def _surface(axes: "Axes", part: Surface, scale: Scale | None, label: str) -> li
         artists.append(_painted(axes, points, triangles, np.asarray(part.values), scale))
     elif isinstance(part.colour, str):
         path = as_path(points, loops(rim(triangles)))
-        patch = PathPatch(path, facecolor=part.colour, edgecolor="none", alpha=part.opacity,
-                          label=label)  # fmt: skip
+        patch = PathPatch(
+            path, facecolor=part.colour, edgecolor="none", alpha=part.opacity, label=label
+        )
         artists.append(axes.add_patch(patch))
     else:
-        faces = PolyCollection(list(points[triangles]), facecolors=part.colour, label=label,
-                               edgecolors="face", linewidths=0.2)  # fmt: skip
+        faces = PolyCollection(
+            list(points[triangles]),
+            facecolors=part.colour,
+            label=label,
+            edgecolors="face",
+            linewidths=0.2,
+        )
         artists.append(axes.add_collection(faces, autolim=False))
     if part.wire is not None:
         ends = np.concatenate(
@@ -143,8 +152,15 @@ def _lines(axes: "Axes", part: Lines, label: str) -> list:
 
     runs = [1e3 * np.asarray(run) for run in part.runs]
     dashes: Any = (0, (4, 2)) if part.dashed else "solid"
-    made = LineCollection(runs, colors=part.colour, linewidths=part.width, linestyles=dashes,
-                          label=label, capstyle="round", joinstyle="round")  # fmt: skip
+    made = LineCollection(
+        runs,
+        colors=part.colour,
+        linewidths=part.width,
+        linestyles=dashes,
+        label=label,
+        capstyle="round",
+        joinstyle="round",
+    )
     return [axes.add_collection(made, autolim=False)]
 
 
@@ -152,10 +168,21 @@ def _arrows(axes: "Axes", part: Arrows, label: str) -> list:
     x, y = 1e3 * part.starts.T
     u, v = 1e3 * part.vectors.T
     made = axes.quiver(
-        x, y, u, v, angles="xy", scale_units="xy", scale=1.0, color=part.colour, units="dots",
-        width=1.1 * axes.figure.dpi / 72, headwidth=4.5, headlength=5.5, headaxislength=5.0,
+        x,
+        y,
+        u,
+        v,
+        angles="xy",
+        scale_units="xy",
+        scale=1.0,
+        color=part.colour,
+        units="dots",
+        width=1.1 * axes.figure.dpi / 72,
+        headwidth=4.5,
+        headlength=5.5,
+        headaxislength=5.0,
         zorder=4,
-    )  # fmt: skip
+    )
     if part.name:
         axes.plot([], [], color=part.colour, marker=">", lw=1.5, ms=5, label=label)
     return [made]

@@ -133,11 +133,14 @@ def barycentric(
     area = np.where(np.abs(area) > 1e-12, area, 1.0)
     table = np.stack(
         [
-            (y[:, 2] - y[:, 0]) / area, (x[:, 0] - x[:, 2]) / area,
-            (y[:, 0] - y[:, 1]) / area, (x[:, 1] - x[:, 0]) / area,
-            x[:, 0] - 0.5, y[:, 0] - 0.5,
+            (y[:, 2] - y[:, 0]) / area,
+            (x[:, 0] - x[:, 2]) / area,
+            (y[:, 0] - y[:, 1]) / area,
+            (x[:, 1] - x[:, 0]) / area,
+            x[:, 0] - 0.5,
+            y[:, 0] - 0.5,
         ]
-    ).astype(np.float32)  # fmt: skip
+    ).astype(np.float32)
     across = column.astype(np.float32) - table[4][triangle]
     down = row.astype(np.float32) - table[5][triangle]
     second = table[0][triangle] * across + table[1][triangle] * down
@@ -236,8 +239,9 @@ def corner_normals(points: np.ndarray, triangles: np.ndarray) -> Float[np.ndarra
     sharp = np.zeros(len(points), bool)
     sharp[triangles[turned]] = True
     rows = np.flatnonzero(sharp.take(corner))
-    mean[rows] = _beside_creases(corner[rows], across.take(rows // 3, axis=0),
-                                 face.take(rows // 3, axis=0))  # fmt: skip
+    mean[rows] = _beside_creases(
+        corner[rows], across.take(rows // 3, axis=0), face.take(rows // 3, axis=0)
+    )
     return mean.reshape(-1, 3, 3)
 
 
@@ -281,9 +285,11 @@ def _ribbons(number: int, part: Lines, lens: Lens, width: float) -> Soup:
     side = np.stack([-unit[:, 1], unit[:, 0]], axis=1) * max(width, 1.0) / 2
     more = unit * max(width, 1.0) / 2 * (0.0 if part.dashed else 1.0)
     flat = [
-        starts[:, :2] - more - side, ends[:, :2] + more - side,
-        ends[:, :2] + more + side, starts[:, :2] - more + side,
-    ]  # fmt: skip
+        starts[:, :2] - more - side,
+        ends[:, :2] + more - side,
+        ends[:, :2] + more + side,
+        starts[:, :2] - more + side,
+    ]
     ahead = 1.5 * max(width, 1.0) / lens.scale
     depth = [starts[:, 2], ends[:, 2], ends[:, 2], starts[:, 2]]
     corners = [np.column_stack([f, d - ahead]) for f, d in zip(flat, depth, strict=True)]
@@ -467,8 +473,14 @@ def shade(
         dots_per_point: Pixels that a point of print has.
     """
     width, height = lens.size
-    fine = Lens(lens.camera, lens.centre, lens.distance, (width * samples, height * samples),
-                lens.scale * samples, lens.shift * samples)  # fmt: skip
+    fine = Lens(
+        lens.camera,
+        lens.centre,
+        lens.distance,
+        (width * samples, height * samples),
+        lens.scale * samples,
+        lens.shift * samples,
+    )
     points = dots_per_point * samples
     layers = _layers(scene, fine, points)
 
@@ -563,9 +575,11 @@ def _outlined(soup: Soup, seen: Seen) -> Bool[np.ndarray, "height width"]:
     jump = np.float32(_FAR * max(float(inside.max() - inside.min()), 1e-12))
     whole, ahead, behind = slice(None), slice(1, None), slice(None, -1)
     for mine, other in (
-        ((ahead, whole), (behind, whole)), ((behind, whole), (ahead, whole)),
-        ((whole, ahead), (whole, behind)), ((whole, behind), (whole, ahead)),
-    ):  # fmt: skip
+        ((ahead, whole), (behind, whole)),
+        ((behind, whole), (ahead, whole)),
+        ((whole, ahead), (whole, behind)),
+        ((whole, behind), (whole, ahead)),
+    ):
         stands = depth[other] > depth[mine] + jump
         edge[mine] |= stands if covered is None else stands & ~covered[other]
     return edge

@@ -132,9 +132,15 @@ def frame(
         drawn = bar_of(figure, scene.scale, figure.add_axes(place))
     if heading:
         figure.text(
-            0.5, 1 - 0.1 / height, heading, ha="center", va="top", fontsize=style.TITLE,
-            color=style.INK, fontweight="bold",
-        )  # fmt: skip
+            0.5,
+            1 - 0.1 / height,
+            heading,
+            ha="center",
+            va="top",
+            fontsize=style.TITLE,
+            color=style.INK,
+            fontweight="bold",
+        )
     return axes, drawn
 
 
@@ -163,19 +169,41 @@ def annotate(figure: "Figure", axes: "Axes", scene: Scene, lens: Lens, note: str
         colour = ("#c0392b", "#1e8449", "#1f5fa8")[k]
         tip = corner + step
         axes.plot(*np.stack([corner, tip]).T, color=colour, lw=1.4, solid_capstyle="round")
-        axes.text(*(corner + 1.35 * step), "xyz"[k], color=colour, fontsize=style.SMALL,
-                  ha="center", va="center")  # fmt: skip
+        axes.text(
+            *(corner + 1.35 * step),
+            "xyz"[k],
+            color=colour,
+            fontsize=style.SMALL,
+            ha="center",
+            va="center",
+        )
     length = _round_length(0.22 * width / lens.scale)
     start = 4.2 * unit
-    axes.plot([start, start + length * lens.scale], [height - 0.6 * unit] * 2,
-              color=style.INK, lw=2.0, solid_capstyle="butt")  # fmt: skip
+    axes.plot(
+        [start, start + length * lens.scale],
+        [height - 0.6 * unit] * 2,
+        color=style.INK,
+        lw=2.0,
+        solid_capstyle="butt",
+    )
     axes.text(
-        start + length * lens.scale + 0.4 * unit, height - 0.6 * unit, _length_text(length),
-        fontsize=style.SMALL, color=style.INK, va="center",
-    )  # fmt: skip
+        start + length * lens.scale + 0.4 * unit,
+        height - 0.6 * unit,
+        _length_text(length),
+        fontsize=style.SMALL,
+        color=style.INK,
+        va="center",
+    )
     if text := note or scene.note:
-        axes.text(width - 0.4 * unit, height - 0.6 * unit, text, fontsize=style.SMALL,
-                  color=style.INK, ha="right", va="center")  # fmt: skip
+        axes.text(
+            width - 0.4 * unit,
+            height - 0.6 * unit,
+            text,
+            fontsize=style.SMALL,
+            color=style.INK,
+            ha="right",
+            va="center",
+        )
     _names(axes, scene)
 
 
@@ -195,10 +223,16 @@ def _names(axes: "Axes", scene: Scene) -> None:
         )
     if shown:
         axes.legend(
-            handles=list(shown.values()), frameon=False, fontsize=style.SMALL,
-            labelcolor=style.INK, loc="lower left", bbox_to_anchor=(0.0, 1.0),
-            borderaxespad=0.1, ncols=min(len(shown), 4), columnspacing=1.2,
-        )  # fmt: skip
+            handles=list(shown.values()),
+            frameon=False,
+            fontsize=style.SMALL,
+            labelcolor=style.INK,
+            loc="lower left",
+            bbox_to_anchor=(0.0, 1.0),
+            borderaxespad=0.1,
+            ncols=min(len(shown), 4),
+            columnspacing=1.2,
+        )
 
 
 def _round_length(length: float) -> float:
@@ -275,12 +309,20 @@ def _add(plotter, part: Part, scene: Scene, lens: Lens, dots_per_point: float) -
         if not runs:
             return
         starts = np.cumsum([0, *map(len, runs)])
-        cells = [np.r_[len(run), at + np.arange(len(run))]
-                 for run, at in zip(runs, starts, strict=False)]  # fmt: skip
+        cells = [
+            np.r_[len(run), at + np.arange(len(run))]
+            for run, at in zip(runs, starts, strict=False)
+        ]
         ahead = 1.5 * reach * max(part.width, 1.0) * lens.camera.axes[2]
         lines = pv.PolyData(np.concatenate(runs) + ahead, lines=np.concatenate(cells))
-        plotter.add_mesh(lines, color=part.colour, line_width=part.width * dots_per_point,
-                         lighting=False, reset_camera=False, render=False)  # fmt: skip
+        plotter.add_mesh(
+            lines,
+            color=part.colour,
+            line_width=part.width * dots_per_point,
+            lighting=False,
+            reset_camera=False,
+            render=False,
+        )
         return
     if isinstance(part, Arrows):
         surface = Surface(*arrow_triangles(part.starts, part.vectors, 1.1 * reach), part.colour)
@@ -297,8 +339,15 @@ def _add(plotter, part: Part, scene: Scene, lens: Lens, dots_per_point: float) -
         cells = np.column_stack([np.full(len(ends), 2), ends]).ravel()
         ahead = 1.5 * reach * lens.camera.axes[2]
         wire = pv.PolyData(np.asarray(surface.points, float) + ahead, lines=cells)
-        plotter.add_mesh(wire, color="#1f2430", line_width=0.7 * dots_per_point, opacity=0.6,
-                         lighting=False, reset_camera=False, render=False)  # fmt: skip
+        plotter.add_mesh(
+            wire,
+            color="#1f2430",
+            line_width=0.7 * dots_per_point,
+            opacity=0.6,
+            lighting=False,
+            reset_camera=False,
+            render=False,
+        )
 
 
 def _add_surface(plotter, pv, part: Surface, scene: Scene) -> None:
