@@ -70,6 +70,7 @@ def main(picture: str | None = None) -> dict[str, float]:
 def draw(finger, path, file: Path) -> None:
     """The finger while it closes on the ball."""
     import matplotlib.pyplot as plt
+    from matplotlib.patches import Circle
 
     s = jnp.linspace(0.0, 1.0, 60)
     poses = jax.vmap(lambda q: sj.rod.forward_kinematics(finger, q, s))(path.q) / mm
@@ -81,7 +82,7 @@ def draw(finger, path, file: Path) -> None:
         outline = jnp.concatenate([upper, lower[::-1]])
         axes.fill(*outline.T, color="#2a6f97", alpha=0.5 * shade, lw=0)
         axes.plot(*middle.T, color="#012a4a", alpha=shade, lw=1)
-    axes.add_patch(plt.Circle((84, 22), 14, color="#e76f51"))
+    axes.add_patch(Circle((84, 22), 14, color="#e76f51"))
     axes.set(aspect="equal", xlabel="x [mm]", ylabel="y [mm]")
     axes.set_title("A tendon closes a tapered finger on a ball")
     figure.tight_layout()

@@ -102,6 +102,7 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
 def draw(rest, full, path, widths, first, file: Path) -> None:
     """Four modes at rest and at 12.5 %, the square past buckling, and its width."""
     import matplotlib.pyplot as plt
+    from matplotlib.tri import Triangulation
 
     figure = plt.figure(figsize=(11, 8.2), layout="constrained")
     grid = figure.add_gridspec(3, 4)
@@ -111,7 +112,13 @@ def draw(rest, full, path, widths, first, file: Path) -> None:
     def show(place, u, values, name, limits):
         axes = figure.add_subplot(place)
         x, y = (points + u).T / mm
-        axes.tripcolor(x, y, corners, values, cmap="coolwarm", clim=limits, shading="gouraud")
+        axes.tripcolor(
+            Triangulation(x, y, corners),
+            values,
+            cmap="coolwarm",
+            clim=limits,
+            shading="gouraud",
+        )
         axes.set(aspect="equal", xlim=(-5, 45), ylim=(-1, 41))
         axes.set_title(name, fontsize=10)
         axes.set_axis_off()

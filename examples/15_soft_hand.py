@@ -160,12 +160,13 @@ def draw(film, angle, pressure, file: Path) -> None:
         axes.set_axis_off()
     names = "thumb", "first", "second", "third", "fourth"
     panels = (pressure / kPa, "pressure [kPa]"), (angle / deg, "angle of the tip [deg]")
-    for column, (values, label) in enumerate(panels):
-        axes = figure.add_subplot(grid[1, 2 * column : 2 * column + 2])
+    below = [figure.add_subplot(grid[1, at : at + 2]) for at in (0, 2)]
+    for axes, (values, label) in zip(below, panels, strict=True):
         for k, name in enumerate(names):
             axes.plot(film.time, values[:, k], label=name, lw=1.3)
         axes.set(xlabel="time [s]", ylabel=label)
-    axes.legend(frameon=False, ncols=5, fontsize=9, loc="lower right", bbox_to_anchor=(1, 1))
+    right = below[1]
+    right.legend(frameon=False, ncols=5, fontsize=9, loc="lower right", bbox_to_anchor=(1, 1))
     figure.savefig(file, dpi=100)
     plt.close(figure)
 

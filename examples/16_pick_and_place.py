@@ -85,7 +85,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
         )
     )
 
-    film = robots.replay(whole, valves.states, ("cylinder", "plate"))
+    film = robots.replay(whole, valves.states or (), ("cylinder", "plate"))
     seen = systems.contact_history(whole, contacts, film.q, film.v, ["cylinder"])
     *fingers, floor = np.asarray(seen.overlap).T
     force = np.asarray(seen.effort)[:, : len(fingers), -1].sum(axis=1)  # what lifts it
@@ -95,7 +95,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     held = np.einsum("tij,ti->tj", plate[:, :3, :3], place - plate[:, :3, 3])[free]
     if picture is not None:
         draw(whole, film.q, time, place, force, ticks, picture)
-    return {
+    numbers = {
         "lift [mm]": -floor[free].min() / mm,
         "contact forces over weight, carried": force[free].mean() / (9.81 * MASS),
         "moved in the grip [mm]": np.linalg.norm(held - held[0], axis=1).max() / mm,
@@ -107,6 +107,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
         "overlap with the floor, greatest [mm]": floor.max() / mm,
         "gripper lets go [mm]": -np.max(fingers, axis=0)[-1] / mm,
     }
+    return {name: float(value) for name, value in numbers.items()}
 
 
 def draw(whole, q, time, place, force, ticks, file) -> None:

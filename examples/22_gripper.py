@@ -92,7 +92,9 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     saves, told, films = round(seconds / step), {}, {}
 
     def do(name, joint, size, *command):
-        films[name] = (*run(joint, *jnp.array(size), jnp.array(command), step, saves), size)
+        radius, length, depth, mass = jnp.array(size)
+        found = run(joint, radius, length, depth, mass, jnp.array(command), step, saves)
+        films[name] = (*found, size)
         return films[name][1:3]
 
     for name, size in THINGS.items():
@@ -130,7 +132,7 @@ def draw(films, file) -> None:
             x, _, z = np.asarray(poses[finger])[:, :3, 3].T / mm
             axis.plot(x, z, color="#2a6f97", alpha=shade, lw=9, solid_capstyle="round")
         middle = np.asarray(poses["thing"])[0, :3, 3] / mm
-        corner = middle[[0, 2]] - np.array([radius, length / 2]) / mm
+        corner = middle[0] - radius / mm, middle[2] - length / 2 / mm
         box = Rectangle(corner, 2 * radius / mm, length / mm, color="#e76f51", alpha=0.8)
         axis.add_patch(box)
         title = "bolt" if name == "left" else name

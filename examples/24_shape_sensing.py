@@ -69,8 +69,9 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     @functools.partial(jax.jit, static_argnums=0)
     def estimate(balanced, q, tip, pressure):
         forces = (fit.elastic, heavy, sj.rod.Pressurised(fit.pressure, pressure))
-        target, given = sj.rod.Position(tip), {"forces": forces} if balanced else {}
-        q = sj.rod.inverse_kinematics(rod, target, q, iterations=20, **given).q
+        q = sj.rod.inverse_kinematics(
+            rod, sj.rod.Position(tip), q, forces=forces if balanced else None, iterations=20
+        ).q
         return q, sj.rod.forward_kinematics(rod, q, truth.s)[:, :2, 2]
 
     lines, spent = [], []
@@ -84,7 +85,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
         lines.append(np.stack(told))
     off = np.linalg.norm(np.stack(lines) - true, axis=3) / mm
     if picture is not None:
-        draw(true, tip, *lines, *off, picture)
+        draw(true, tip, lines[0], lines[1], off[0], off[1], picture)
     middle = len(truth.s) // 2
     return {
         "largest error of the tip [mm]": float(off[0, :, -1].max()),

@@ -100,7 +100,7 @@ def _ask(peer: str, problem: fem.Problem, repeats: int):
             arrays,
             element=problem.mesh.element.name,
             repeats=repeats,
-            mu=float(rubber.shear_modulus),
+            mu=float(rubber.shear_modulus),  # type: ignore
             bulk=float(rubber.bulk_modulus),  # type: ignore
         )
     except peers.PeerMissing as reason:
