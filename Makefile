@@ -50,6 +50,7 @@ stress: $(VENV)/.test
 lint: $(VENV)/.dev
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
+	$(PY) -m tests.user_code
 	$(PY) -m pyright --pythonpath $(PY)
 
 bench: $(VENV)/.run
