@@ -31,7 +31,7 @@ from sorojax.design.density.pressure import (
 )
 from sorojax.design.density.void import InterpolatedEnergy, interpolated_energy
 from sorojax.design.objectives import Follower, replaced_load, solid_of
-from sorojax.design.optimise.minimise import Optimised, Step, minimise
+from sorojax.design.optimise.minimise import DesignStep, Optimised, minimise
 from sorojax.design.optimise.mma import MMA
 from sorojax.fem import Fixed, Foundation, PlaneStrain, Problem, problem
 from sorojax.fem.problem import exchanged
@@ -222,8 +222,8 @@ def optimise_pneunet(
     *,
     steps: int = 100,
     move: float = 0.05,
-    on_step: Callable[[Step], None] | None = None,
-    resume: Step | None = None,
+    on_step: Callable[[DesignStep], None] | None = None,
+    resume: DesignStep | None = None,
 ) -> Optimised:
     """The chamber that turns the right side most, by moving asymptotes.
 

@@ -26,7 +26,7 @@ _HELD = 1e-3  # overshoot of a constraint that counts as none
 _RETREATS = 4  # halvings of a step that leads to where a function is not defined
 
 
-class Step(eqx.Module):
+class DesignStep(eqx.Module):
     """One step, as `on_step` sees it; also what `minimise` starts again from.
 
     Attributes:
@@ -65,7 +65,7 @@ class Optimised(eqx.Module):
     constraints: Float[Array, " m"]
     status: Status
     history: dict[str, Float[np.ndarray, "steps *columns"]]
-    last: Step
+    last: DesignStep
 
     def _text(self) -> str:
         count = len(self.history["objective"])
@@ -87,8 +87,8 @@ def minimise(
     schedule: Callable[[int], tuple] | None = None,
     change_gradient: Callable[[PyTree, PyTree], PyTree] | None = None,
     scale: float | None = None,
-    on_step: Callable[[Step], None] | None = None,
-    resume: Step | None = None,
+    on_step: Callable[[DesignStep], None] | None = None,
+    resume: DesignStep | None = None,
 ) -> Optimised:
     """The design at which `loss` is least while every constraint stays at or below zero.
 
@@ -168,7 +168,7 @@ def minimise(
         new, memory = _advance(method, task, k, flat, values, memory, size)
         change = float(np.max(np.abs(np.asarray(new) - np.asarray(flat))))
         last, flat = flat, new
-        step = Step(
+        step = DesignStep(
             k + 1, back(flat), values.objective, values.constraints, jnp.asarray(change), memory
         )
         history.append((float(values.objective), np.asarray(values.constraints), change))
@@ -270,20 +270,20 @@ class History:
     the cells, `view.show(history)` draws some of them and `view.animate(history)` all.
 
     Args:
-        density: From a `Step` to the densities of its design.
+        density: From a `DesignStep` to the densities of its design.
         every: Steps from one that is kept to the next.
         mesh: The cells.
     """
 
     def __init__(
-        self, density: Callable[[Step], Any], every: int = 1, *, mesh: Mesh | None = None
+        self, density: Callable[[DesignStep], Any], every: int = 1, *, mesh: Mesh | None = None
     ):
         self._density, self._every, self._mesh = density, every, mesh
         self.steps: list[int] = []
         self.objectives: list[float] = []
         self._rows: list[np.ndarray] = []
 
-    def __call__(self, step: Step) -> None:
+    def __call__(self, step: DesignStep) -> None:
         if (step.count - 1) % self._every:
             return
         self.steps.append(step.count)

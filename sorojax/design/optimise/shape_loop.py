@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PyTree
 
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
-from sorojax.design.optimise.minimise import Optimised, Optimiser, Step, minimise
+from sorojax.design.optimise.minimise import DesignStep, Optimised, Optimiser, minimise
 from sorojax.fem import Problem
 from sorojax.mesh.mesh import Mesh
 from sorojax.mesh.motion.move import move
@@ -35,7 +35,7 @@ class ShapeStep(eqx.Module):
         remeshed: Whether this step built one.
     """
 
-    step: Step
+    step: DesignStep
     meshed: PyTree
     num_meshes: int = eqx.field(static=True)
     remeshed: bool = eqx.field(static=True)
@@ -154,7 +154,7 @@ def minimise_shape(
     def followed(function):
         return lambda p: function(follower.problem(p), p)
 
-    def after(step: Step):
+    def after(step: DesignStep):
         nonlocal last
         new = follower.prepare(step.design)
         if new:

@@ -8,7 +8,7 @@ from sorojax.contact.broadphase import far
 from sorojax.contact.swept import passes
 from sorojax.fem.contact.obstacle import Contact
 from sorojax.fem.contact.self_contact import SelfContact
-from sorojax.fem.dynamics.step import Dynamics, Matter, State, Step
+from sorojax.fem.dynamics.step import Dynamics, Matter, State, TimeStep
 from sorojax.fem.loads.facets import blockwise, facet_tables
 from sorojax.fem.problem import Problem, body, potential_energy
 from sorojax.math.linalg import sparse
@@ -32,7 +32,7 @@ _GAIN = 5e-4  # of the energy before and after a step together, that it may gain
 
 
 def gains(
-    dynamics: Dynamics, known: Matter, state: State, step: Step, new: State, u: Nodal
+    dynamics: Dynamics, known: Matter, state: State, step: TimeStep, new: State, u: Nodal
 ) -> Bool[Array, ""]:
     """Whether the energies of body and contacts grew by more than the work of the other
     loads and of the supports, in a step whose forces act at displacement `u` [m]."""

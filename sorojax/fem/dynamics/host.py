@@ -31,7 +31,7 @@ from sorojax.fem.dynamics.step import (
     Interval,
     Matter,
     State,
-    Step,
+    TimeStep,
     begin_step,
     end_step,
     matter,
@@ -280,7 +280,7 @@ def _begin(fixed: tuple[Dynamics, Matter, Geometry], state: State, interval: Int
 
 
 @kernel
-def _end(fixed, state: State, step: Step, interval: Interval, u, work, taken):
+def _end(fixed, state: State, step: TimeStep, interval: Interval, u, work, taken):
     dynamics, known, _ = fixed
     new = end_step(dynamics, known, state, interval, step, u, work, taken)
     through = passed_through(dynamics.problem, step.terms[0], new.displacement)

@@ -171,7 +171,7 @@ class Interval(NamedTuple):
     end: Float[Array, ""]
 
 
-class Step(NamedTuple):
+class TimeStep(NamedTuple):
     """A step to solve. `matrix` is the damping matrix; `terms` are the loads and supports of
     its problem of equilibrium; `target` are displacements known at the end. Inertia pulls by
     the mass times `drive` [m/s^2] minus the damping times `lead` [m/s], the velocity where
@@ -195,7 +195,7 @@ def matter(dynamics: Dynamics) -> Matter:
     return Matter(mass, sum(constant[1:], start=constant[0]) if constant else None)
 
 
-def begin_step(dynamics: Dynamics, known: Matter, state: State, interval: Interval) -> Step:
+def begin_step(dynamics: Dynamics, known: Matter, state: State, interval: Interval) -> TimeStep:
     """The problem of equilibrium of a step."""
     c = dynamics.scheme
     h = _size(dynamics, interval)
@@ -221,7 +221,7 @@ def begin_step(dynamics: Dynamics, known: Matter, state: State, interval: Interv
     predicted = guess
     if all(load.smooth for load in dynamics.problem.loads):
         predicted = guess + (1 - c.af) * h**2 / 2 * a  # that of an impact is not the next one
-    return Step((loads + extra, supports), guess, predicted, damping, target, lead, drive)
+    return TimeStep((loads + extra, supports), guess, predicted, damping, target, lead, drive)
 
 
 def end_step(
@@ -229,7 +229,7 @@ def end_step(
     known: Matter,
     state: State,
     interval: Interval,
-    step: Step,
+    step: TimeStep,
     u_alpha: Float[Array, "nodes dim"],
     work: Float[Array, ""] | None = None,
     taken: Float[Array, ""] | None = None,
@@ -262,7 +262,7 @@ def end_step(
     )
 
 
-def _work(dynamics: Dynamics, step: Step, loads, u_alpha, d) -> Float[Array, ""]:
+def _work(dynamics: Dynamics, step: TimeStep, loads, u_alpha, d) -> Float[Array, ""]:
     """Work [J] of loads and supports in a step, with the forces that the step takes."""
     problem = with_terms(dynamics.problem, step.terms)
 
@@ -278,7 +278,7 @@ def _work(dynamics: Dynamics, step: Step, loads, u_alpha, d) -> Float[Array, ""]
     return work + jnp.sum(jnp.where(mask, reaction * d, jnp.zeros_like(d)))
 
 
-def _taken(dynamics: Dynamics, step: Step, v_alpha, d) -> Float[Array, ""]:
+def _taken(dynamics: Dynamics, step: TimeStep, v_alpha, d) -> Float[Array, ""]:
     """Energy that damping dissipates in a step [J]."""
     if step.matrix is None:
         return jnp.zeros((), d.dtype)

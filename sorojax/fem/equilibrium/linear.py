@@ -149,7 +149,7 @@ def constrain(
     return sparse.fix(system, values, known), jnp.where(known, jnp.zeros_like(rhs), rhs)
 
 
-class Step(NamedTuple):
+class NewtonStep(NamedTuple):
     """A Newton step [m] on the host, `None` if the tangent is singular or the iterative solver
     does not get there; the number of negative eigenvalues; the factor, if a new one."""
 
@@ -173,7 +173,7 @@ def step(
     residual: Float[Array, " dofs"],
     move: Float[np.ndarray, " dofs"],
     near: Neighbour | None = None,
-) -> Step:
+) -> NewtonStep:
     """The Newton step at a tangent, by a `near` factor where that converges at once."""
     system = problem.space.system
     matrix, rhs = constrain(system, values, residual, prepared.known, move)
@@ -183,14 +183,14 @@ def step(
         factor, start, tolerance = near
         du = system.solver.solve_by(factor, matrix, rhs, start, tolerance)
         if du is not None:
-            return Step((du + move).reshape(shape), 0, None)
+            return NewtonStep((du + move).reshape(shape), 0, None)
     factor = system.solver.factor(matrix)
     if factor is None:
-        return Step(None, -1, None)
+        return NewtonStep(None, -1, None)
     if isinstance(factor, sparse.IterativeFactor):
         du, negative = factor.step(rhs)
         if du is None:
-            return Step(None, -1, None)
-        return Step((du + move).reshape(shape), negative, None)
+            return NewtonStep(None, -1, None)
+        return NewtonStep((du + move).reshape(shape), negative, None)
     du = factor.solve(rhs)
-    return Step((du + move).reshape(shape), factor.negative_eigenvalues, factor)
+    return NewtonStep((du + move).reshape(shape), factor.negative_eigenvalues, factor)

@@ -18,7 +18,7 @@ Time = Float[Array, ""]
 Field = Callable[[Time, Any], Any]
 
 
-class Step(NamedTuple):
+class MethodStep(NamedTuple):
     """Result of a step.
 
     Attributes:
@@ -53,7 +53,7 @@ class AbstractMethod(dfx.AbstractSolver):
         """Memory before a first step of `h`, or after a jump of the field."""
 
     @abc.abstractmethod
-    def advance(self, field: Field, t: Time, y: PyTree, h: Time, memory: PyTree) -> Step:
+    def advance(self, field: Field, t: Time, y: PyTree, h: Time, memory: PyTree) -> MethodStep:
         """A step of `h` from `t`."""
 
     @property
@@ -168,7 +168,7 @@ def _field(terms: dfx.AbstractTerm, args: Any) -> Field:
     return _Rate(terms, args)
 
 
-def _advance(given, h) -> Step:
+def _advance(given, h) -> MethodStep:
     method, terms, args, t, y, memory = given
     return method.advance(_field(terms, args), t, y, h, memory)
 
@@ -246,7 +246,7 @@ class Tsit5(AbstractMethod):
         slopes.append(field(t + h, new))
         error = jax.tree.map(lambda e: h * e, _sum(_TSIT5_ERROR, slopes))
         shifts = jax.tree.map(lambda *k: h * jnp.stack(k), *slopes)
-        return Step(new, error, slopes[-1], {"k": shifts})
+        return MethodStep(new, error, slopes[-1], {"k": shifts})
 
 
 class RungeKutta4(AbstractMethod):
@@ -259,7 +259,7 @@ class RungeKutta4(AbstractMethod):
         return ()
 
     def advance(self, field, t, y, h, memory):
-        return Step(explicit_step(RK4, field, t, y, h), None, (), {})
+        return MethodStep(explicit_step(RK4, field, t, y, h), None, (), {})
 
 
 class SemiImplicitEuler(AbstractMethod):
@@ -298,7 +298,7 @@ class SemiImplicitEuler(AbstractMethod):
         early = jax.tree.map(lambda x, k, late: x if late else x + h * k, y, field(t, y), last)
         rates = field(t, early)
         new = jax.tree.map(lambda x, k, late: x + h * k if late else x, early, rates, last)
-        return Step(new, None, (), {})
+        return MethodStep(new, None, (), {})
 
 
 def rk4_step(field: Field, t: Float[Array, ""], y: PyTree, h: Float[Array, ""]) -> Any:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from sorojax import _check
 from sorojax._types import real
-from sorojax.math.ode.explicit import AbstractMethod, Step
+from sorojax.math.ode.explicit import AbstractMethod, MethodStep
 from sorojax.math.ode.step_control import cut, filled
 
 _SHORTENINGS = 10
@@ -93,7 +93,7 @@ class GeneralisedAlpha(AbstractMethod):
     def advance(self, field, t, y, h, memory):
         given = (field, self, t)
         (new, rate), converged = cut(_attempt, self.max_cuts, given, h, (y, memory))
-        return Step(new, None, rate, {}, converged)
+        return MethodStep(new, None, rate, {}, converged)
 
     def weights(self) -> tuple[Array, Array, Array]:
         """Of the new rate, of the new state, and of the new rate in the state's update."""

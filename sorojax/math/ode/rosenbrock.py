@@ -10,7 +10,7 @@ import jax.scipy
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from sorojax.math.ode.explicit import AbstractMethod, Step
+from sorojax.math.ode.explicit import AbstractMethod, MethodStep
 
 _GAMMA = 0.25
 _STAGES = (  # weights of the increments before, in the point where the slope is taken
@@ -112,7 +112,7 @@ class Rodas4(AbstractMethod):
             moves.append(jnp.where(h == 0, jnp.zeros_like(flat), solve @ right))
         bend, twist = (unravel(_sum(row, moves[:5])) for row in _DENSE)
         new, error = unravel(point + moves[-1]), unravel(moves[-1])
-        return Step(new, error, (), {"bend": bend, "twist": twist})
+        return MethodStep(new, error, (), {"bend": bend, "twist": twist})
 
 
 def _derivatives(slope, t, x) -> tuple[Array, Array]:
@@ -176,4 +176,4 @@ class Rosenbrock2(AbstractMethod):
 
         first = memory @ slope(t, flat)
         second = memory @ (slope(t + h, flat + h * first) - 2 * first)
-        return Step(unravel(flat + h * (1.5 * first + 0.5 * second)), None, memory, {})
+        return MethodStep(unravel(flat + h * (1.5 * first + 0.5 * second)), None, memory, {})

@@ -81,7 +81,7 @@ def all_rows(at: Rows, push: Array | None, ahead: Array | None = None) -> tuple[
     return error, jnp.concatenate([at.jacobian, change])
 
 
-class Step(NamedTuple):
+class IKStep(NamedTuple):
     """An increment, the share that the secondary task has in it, and what it is worth.
 
     Attributes:
@@ -101,7 +101,7 @@ class Step(NamedTuple):
 
 def step(
     tasks: Tasks, own: Array, at: Rows, push: Array | None, damping, pull_gain, hessian=None
-) -> Step:
+) -> IKStep:
     """One damped least-squares step with the secondary task in the null space.
 
     Args:
@@ -137,7 +137,7 @@ def step(
 
 def _step(
     tasks: Tasks, own: Array, at: Rows, active, damping, pull_gain, hessian, held=None
-) -> Step:
+) -> IKStep:
     error, jacobian = active
     down, square = error @ jacobian, product(jacobian.T, jacobian)
     scaled, tiny = scaled_metric(tasks, square)
@@ -173,7 +173,7 @@ def _step(
         outward = jnp.logical_or(*bound_to(tasks.limits, own, increment))
         increment = jnp.clip(increment, low - own, high - own)
     size = jnp.sqrt(increment @ scaled @ increment)
-    return Step(increment, size, drift, slope, outward)
+    return IKStep(increment, size, drift, slope, outward)
 
 
 def _newton(hessian: Array, right: Array, otherwise: Array) -> Array:

@@ -13,7 +13,7 @@ from sorojax._types import real
 from sorojax.fem.dynamics.step import Interval, Matter, State, begin_step, end_step
 from sorojax.fem.equilibrium.jit import prepare_traced
 from sorojax.fem.equilibrium.linear import Prepared
-from sorojax.math.ode.explicit import AbstractMethod, RungeKutta4, Step, repeat
+from sorojax.math.ode.explicit import AbstractMethod, MethodStep, RungeKutta4, repeat
 from sorojax.math.ode.step_control import cut
 from sorojax.systems.blocks.fem_body import FemBody, acceleration
 from sorojax.systems.integrate.fem_step import (
@@ -117,7 +117,7 @@ class Coupled(AbstractMethod):
         (new, bodies), converged = cut(
             _attempt, self.max_cuts, given, jnp.asarray(h), (y, memory.bodies)
         )
-        return Step(new, None, Memory(bodies, memory.known), {}, converged)
+        return MethodStep(new, None, Memory(bodies, memory.known), {}, converged)
 
 
 def bodies_of(block: Any) -> Names:

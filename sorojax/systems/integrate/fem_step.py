@@ -22,7 +22,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from sorojax import fem
-from sorojax.fem.dynamics.step import Dynamics, State, Step, with_terms
+from sorojax.fem.dynamics.step import Dynamics, State, TimeStep, with_terms
 from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import Linearised, Prepared, linearise
 from sorojax.fem.equilibrium.newton import safe_fraction
@@ -42,7 +42,7 @@ class Stage(NamedTuple):
     dynamics: Dynamics
     prepared: Prepared
     state: State
-    step: Step
+    step: TimeStep
     drives: dict[str, Array]
 
 
@@ -119,7 +119,7 @@ def _loaded(stage: Stage, values: dict[str, Array]) -> fem.Problem:
     return with_terms(stage.dynamics.problem, (with_values(loads, now), supports))
 
 
-def loaded_step(stage: Stage, values: dict[str, Array]) -> Step:
+def loaded_step(stage: Stage, values: dict[str, Array]) -> TimeStep:
     """The step with its driven loads on the way to `values`."""
     problem = _loaded(stage, values)
     return stage.step._replace(terms=(problem.loads, problem.supports))
