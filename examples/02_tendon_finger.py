@@ -44,14 +44,9 @@ def main(picture: str | None = None) -> dict[str, float]:
     touch = sj.rod.ObstacleContact(ball, thickness, law, points=48)
     pulled = sj.rod.Tendons(route, lambda t: pull * jnp.minimum(t / 0.5, 1.0))
     path = sj.rod.rollout(
-        finger,
-        jnp.zeros(5),
-        jnp.zeros(5),
-        (pulled, touch, sj.rod.Damping(0.02)),
-        step=STEP,
-        saves=FRAMES,
-        every=20,
-    )
+        finger, jnp.zeros(5), jnp.zeros(5), (pulled, touch, sj.rod.Damping(0.02)),
+        step=STEP, saves=FRAMES, every=20,
+    )  # fmt: skip
     depth = sj.rod.penetration(touch, sj.rod.motion(finger, path.q[-1]))
     if picture is not None:
         draw(finger, path, Path(picture))

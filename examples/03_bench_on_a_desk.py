@@ -27,15 +27,9 @@ COLOURS = (vision.RED, vision.GREEN, vision.BLUE, vision.RED)
 
 def make_finger(modes: int, stiffer: float = 1.0):
     return sj.rod.rod(
-        sj.SE2(),
-        sj.rod.chebyshev(kappa_z=modes),
-        sj.rod.circle(5 * mm),
-        length=80 * mm,
-        young_modulus=stiffer * 0.6e6,
-        poisson_ratio=0.45,
-        density=1080.0,
-        nodes=8,
-    )
+        sj.SE2(), sj.rod.chebyshev(kappa_z=modes), sj.rod.circle(5 * mm), length=80 * mm,
+        young_modulus=stiffer * 0.6e6, poisson_ratio=0.45, density=1080.0, nodes=8,
+    )  # fmt: skip
 
 
 def loads(modes: int, pressure):
@@ -84,15 +78,9 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
         return height
 
     for _ in run_loop(
-        board,
-        board.clock,
-        jax.jit(lambda *now: pid(*now)),
-        pid.start(0.0, 0.0),
-        period=1 / RATE,
-        limits=LIMITS,
-        duration=2.5 if quick else 6.0,
-        measure=measure,
-    ):
+        board, board.clock, jax.jit(lambda *now: pid(*now)), pid.start(0.0, 0.0),
+        period=1 / RATE, limits=LIMITS, duration=2.5 if quick else 6.0, measure=measure,
+    ):  # fmt: skip
         pass
     t, wanted, told, true = np.array(log).T
     if picture is not None:

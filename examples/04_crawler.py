@@ -27,9 +27,8 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
     ends = np.interp(PERIOD * np.arange(cycles + 1), np.asarray(motion.times), centre[:, 0])
     floor = problem.loads[-1]
     assert isinstance(floor, fem.Contact)
-    deepest = jnp.min(
-        jax.lax.map(lambda u: floor.points_of(problem, u)[..., 1].min(), motion.displacements)
-    )
+    deepest = jnp.min(jax.lax.map(lambda u: floor.points_of(problem, u)[..., 1].min(),
+                                  motion.displacements))  # fmt: skip
     if picture is not None:
         draw(problem, motion, centre, Path(picture))
     return {

@@ -33,15 +33,9 @@ def shapes():
 def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
     flat, solid = shapes()
     left, carved = flat[-1], solid[-1]
-    counted = (
-        {}
-        if quick
-        else {
-            "volume over its exact value, less 1": float(
-                sdf.volume(carved) / UNIT**3 / SPACE - 1
-            )
-        }
-    )
+    counted = {} if quick else {
+        "volume over its exact value, less 1": float(sdf.volume(carved) / UNIT**3 / SPACE - 1)
+    }  # fmt: skip
 
     # Inside, the field is the distance to the nearest point of the outline.
     inside = sdf.sample_interior(left, 200, key=jax.random.key(0))

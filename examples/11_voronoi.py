@@ -27,12 +27,9 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
     def after(steps: int) -> mesh.Mesh:
         shifts.clear()
         return mesh.polymesher(
-            shape,
-            CELLS,
-            key=jax.random.key(0),
-            iterations=steps,
+            shape, CELLS, key=jax.random.key(0), iterations=steps,
             on_step=lambda step, error: shifts.append(error),
-        )
+        )  # fmt: skip
 
     stages = (0, 2, 16, 60) if quick else (0, 1, 4, 16, 32, 60)
     meshes = [after(steps) for steps in stages]

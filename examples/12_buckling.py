@@ -112,13 +112,8 @@ def draw(rest, full, path, widths, first, file: Path) -> None:
     def show(place, u, values, name, limits):
         axes = figure.add_subplot(place)
         x, y = (points + u).T / mm
-        axes.tripcolor(
-            Triangulation(x, y, corners),
-            values,
-            cmap="coolwarm",
-            clim=limits,
-            shading="gouraud",
-        )
+        cut = Triangulation(x, y, corners)
+        axes.tripcolor(cut, values, cmap="coolwarm", clim=limits, shading="gouraud")
         axes.set(aspect="equal", xlim=(-5, 45), ylim=(-1, 41))
         axes.set_title(name, fontsize=10)
         axes.set_axis_off()
@@ -126,13 +121,8 @@ def draw(rest, full, path, widths, first, file: Path) -> None:
     for row, (modes, name) in enumerate(((rest, "0 %"), (full, "12.5 %"))):
         for k, shape in enumerate(np.asarray(modes.shapes)):
             shape = 3 * mm * shape / np.abs(shape).max()
-            show(
-                grid[row, k],
-                np.asarray(modes.displacement) + shape,
-                shape[:, 0],
-                f"mode {k + 1} at {name}",
-                (-3 * mm, 3 * mm),
-            )
+            show(grid[row, k], np.asarray(modes.displacement) + shape, shape[:, 0],
+                 f"mode {k + 1} at {name}", (-3 * mm, 3 * mm))  # fmt: skip
     bent = np.asarray(path.displacements[-1])
     show(
         grid[2, 0],

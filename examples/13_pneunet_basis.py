@@ -30,8 +30,7 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
     stiff[cells.regions["layer"]] = 10.0
     under = mesh.facets_where(cells, lambda p: p[1] < 1e-9)
     problem = fem.problem(
-        cells,
-        material.Scaled(material.presets.dragon_skin_30(), stiff),
+        cells, material.Scaled(material.presets.dragon_skin_30(), stiff),
         kinematics=fem.PlaneStrain(20 * mm),
         supports=(fem.Fixed(mesh.nodes_where(cells, lambda p: p[0] < 1e-9)),),
         loads=(
@@ -39,7 +38,7 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
             fem.SelfContact(mesh.facets_on(cells, robot.slots()), reach=0.8 * mm, name="walls"),
             fem.Contact(under, sdf.Circle(CENTRE, RADIUS), name="cylinder"),
         ),
-    )
+    )  # fmt: skip
     path = fem.solve_path(problem, air=jnp.linspace(0, 40 * kPa, 9 if quick else 21))
 
     line = reduction.Line([0.0, layer / 2], [length, layer / 2])
@@ -47,14 +46,9 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
     basis = reduction.pod_basis(backbone, modes={"kappa_z": 3})
     q = reduction.coordinates(backbone, basis)
     body = rod.rod(
-        sj.SE2(),
-        basis,
-        rod.rectangle(20 * mm, layer),
-        length=backbone.length,
-        young_modulus=1.0,
-        poisson_ratio=0.4,
-        density=1.0,
-    )
+        sj.SE2(), basis, rod.rectangle(20 * mm, layer), length=backbone.length,
+        young_modulus=1.0, poisson_ratio=0.4, density=1.0,
+    )  # fmt: skip
     errors = sj.view.backbone_errors(backbone, body, q)
     s, shapes = np.asarray(backbone.s), np.asarray(basis.modes["kappa_z"](backbone.s))
     if picture is not None:
@@ -109,12 +103,8 @@ def draw(robot, path, backbone, body, q, shapes, file: Path) -> None:
         ends = middle + np.array([-0.5, 0.5]) * float(robot.chamber_width)
         right.axvspan(*ends / mm, color="#d9dce1")
     for k, colour in enumerate(("#2a6f97", "#e76f51", "#e9b44c")):
-        right.plot(
-            np.asarray(backbone.s * backbone.length) / mm,
-            shapes[:, k],
-            color=colour,
-            label=f"mode {k + 1}",
-        )
+        right.plot(np.asarray(backbone.s * backbone.length) / mm, shapes[:, k], color=colour,
+                   label=f"mode {k + 1}")  # fmt: skip
     right.set(xlabel="along the actuator [mm], chambers in grey", ylabel="curvature [-]")
     right.legend(frameon=False)
     figure.savefig(file, dpi=100)

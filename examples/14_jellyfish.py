@@ -25,15 +25,9 @@ ROUNDS = 3
 
 def make_finger():
     return rod.rod(
-        sj.SE3(),
-        rod.chebyshev(kappa_y=3, kappa_z=3),
-        rod.rectangle(4 * mm, THICKNESS),
-        length=120 * mm,
-        young_modulus=0.7 * MPa,
-        poisson_ratio=0.49,
-        density=1070.0,
-        nodes=10,
-    )
+        sj.SE3(), rod.chebyshev(kappa_y=3, kappa_z=3), rod.rectangle(4 * mm, THICKNESS),
+        length=120 * mm, young_modulus=0.7 * MPa, poisson_ratio=0.49, density=1070.0, nodes=10,
+    )  # fmt: skip
 
 
 def mount(angle):

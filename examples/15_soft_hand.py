@@ -41,28 +41,19 @@ class Chamber(rod.AbstractChamber):
 
 def finger(length) -> systems.Network:
     body = rod.rod(
-        sj.SE2(),
-        rod.chebyshev(kappa_z=MODES),
-        rod.rectangle(*SECTION),
-        length=length,
-        young_modulus=1.5 * MPa,
-        poisson_ratio=0.45,
-        density=1100.0,
-        nodes=8,
-    )
+        sj.SE2(), rod.chebyshev(kappa_z=MODES), rod.rectangle(*SECTION), length=length,
+        young_modulus=1.5 * MPa, poisson_ratio=0.45, density=1100.0, nodes=8,
+    )  # fmt: skip
     upright = rod.Gravity([-9.81, 0.0])
     blocks = {
-        "valve": systems.Regulator(4e-9, integral_gain=2e-8),
-        "air": systems.Reservoir(),
+        "valve": systems.Regulator(4e-9, integral_gain=2e-8), "air": systems.Reservoir(),
         "body": systems.RodBody(body, (Chamber(length), upright, rod.Damping(0.02))),
-    }
+    }  # fmt: skip
     wires = {
-        "valve.pressure": "air.pressure",
-        "air.mass_flow": "valve.mass_flow",
-        "air.volume": "body.volume",
-        "air.volume_rate": "body.volume_rate",
+        "valve.pressure": "air.pressure", "air.mass_flow": "valve.mass_flow",
+        "air.volume": "body.volume", "air.volume_rate": "body.volume_rate",
         "body.pressure": "air.pressure",
-    }
+    }  # fmt: skip
     return systems.Network(blocks, wires, exposed=("valve.setpoint",))
 
 
@@ -82,18 +73,13 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
     network = systems.Network({"fingers": hand}, {}, ("fingers.valve.setpoint",))
     loop = systems.Sampled(Waves(), "fingers.air.pressure", "fingers.valve.setpoint")
     film = systems.simulate_sampled(
-        network,
-        loop,
-        3.0 if quick else 5.0,
-        period=PERIOD,
-        substeps=2,
+        network, loop, 3.0 if quick else 5.0, period=PERIOD, substeps=2,
         method=systems.Rosenbrock2(),
-    )
+    )  # fmt: skip
 
     late = np.asarray(film.time) > film.time[-1] - 2 * 2 * math.pi / RATE  # two whole periods
-    angle, pressure = (
-        np.asarray(film[f"fingers.{name}"]) for name in ("body.tip_angle", "air.pressure")
-    )
+    angle, pressure = (np.asarray(film[f"fingers.{name}"]) for name in
+                       ("body.tip_angle", "air.pressure"))  # fmt: skip
     wave = np.exp(-1j * RATE * np.asarray(film.time))[late] @ angle[late]
     behind = -np.diff(np.unwrap(np.angle(wave))) / deg
     grown = np.asarray(film["fingers.body.volume_rate"]) * (pressure + 101325)
@@ -127,14 +113,9 @@ def draw(film, angle, pressure, file: Path) -> None:
 
     def body(length):
         return rod.rod(
-            sj.SE3(),
-            rod.chebyshev(kappa_z=MODES),
-            rod.rectangle(*SECTION),
-            length=length,
-            young_modulus=1.0,
-            poisson_ratio=0.4,
-            density=1.0,
-        )
+            sj.SE3(), rod.chebyshev(kappa_z=MODES), rod.rectangle(*SECTION), length=length,
+            young_modulus=1.0, poisson_ratio=0.4, density=1.0,
+        )  # fmt: skip
 
     parts = {f"f{k}": rod.Part(body(LENGTHS[k]), offset=place(k)) for k in range(5)}
     figure = plt.figure(figsize=(11, 7), layout="constrained")
@@ -149,11 +130,8 @@ def draw(film, angle, pressure, file: Path) -> None:
     low = np.min([scene.box[0] for scene in scenes], axis=0)
     high = np.max([scene.box[1] for scene in scenes], axis=0)
     for column, (k, scene) in enumerate(zip(moments, scenes, strict=True)):
-        shown = sj.view.show(
-            dataclasses.replace(scene, extent=(low, high)),
-            view=sj.view.Camera(-40.0, 15.0),
-            renderer="own",
-        )
+        shown = sj.view.show(dataclasses.replace(scene, extent=(low, high)),
+                             view=sj.view.Camera(-40.0, 15.0), renderer="own")  # fmt: skip
         axes = figure.add_subplot(grid[0, column])
         axes.imshow(plt.imread(io.BytesIO(shown.png)))
         axes.set_title(f"{float(film.time[k]):.2f} s")
@@ -165,8 +143,9 @@ def draw(film, angle, pressure, file: Path) -> None:
         for k, name in enumerate(names):
             axes.plot(film.time, values[:, k], label=name, lw=1.3)
         axes.set(xlabel="time [s]", ylabel=label)
-    right = below[1]
-    right.legend(frameon=False, ncols=5, fontsize=9, loc="lower right", bbox_to_anchor=(1, 1))
+    below[1].legend(
+        frameon=False, ncols=5, fontsize=9, loc="lower right", bbox_to_anchor=(1, 1)
+    )
     figure.savefig(file, dpi=100)
     plt.close(figure)
 

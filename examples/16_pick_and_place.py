@@ -17,6 +17,7 @@ import numpy as np
 
 import sorojax as sj
 from sorojax import robots, rod, systems
+from sorojax.rod import PairForce, PartForce
 from sorojax.units import kPa, mm
 from sorojax_hardware import run_loop, simulated_board
 
@@ -40,10 +41,7 @@ def scene(size):
     """The robot with air and valves, hung over a cylinder on the floor, and the contacts."""
     thing, floor = robots.standing_cylinder(MASS, RADIUS, HEIGHT, FLOOR)
     touch = rod.LinkContact(sj.sdf.Cylinder(RADIUS, HEIGHT), SPINE, GRIP, points=16)
-    contacts = (
-        *(rod.PairForce(f, "cylinder", touch) for f in FINGERS),
-        rod.PartForce("cylinder", floor),
-    )
+    contacts = *(PairForce(f, "cylinder", touch) for f in FINGERS), PartForce("cylinder", floor)
     made, up = robots.model(robots.Manipulator(), size=size), robots.upside_down(BEAM)
     return robots.with_contacts(made, contacts, mount=up, cylinder=thing), contacts
 
@@ -64,26 +62,14 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
 
     way = jax.vmap(asked)(WAY[:, 1:4] * mm, WAY[:, 4] * kPa)
     pid = systems.PID(
-        0.0,
-        integral_gain=[5.0, 5.0, 5.0, 0.0],
-        feed_forward=1.0,
-        tracking_time=0.025,
-        reference=systems.Waypoints(WAY[:, 0], way, smooth=True),
-        low=made.low,
-        high=made.high,
-    )
-    ticks = list(
-        run_loop(
-            board,
-            board.clock,
-            jax.jit(lambda *now: pid(*now)),
-            pid.start(0.0, jnp.zeros(4)),
-            duration=WAY[-1, 0],
-            period=1e-2,
-            limits=limits,
-            measure=lambda *_: asked(tips(valves.state.q), 0.0),
-        )
-    )
+        0.0, integral_gain=[5.0, 5.0, 5.0, 0.0], feed_forward=1.0, tracking_time=0.025,
+        reference=systems.Waypoints(WAY[:, 0], way, smooth=True), low=made.low, high=made.high,
+    )  # fmt: skip
+    ticks = list(run_loop(
+        board, board.clock, jax.jit(lambda *now: pid(*now)), pid.start(0.0, jnp.zeros(4)),
+        duration=WAY[-1, 0], period=1e-2, limits=limits,
+        measure=lambda *_: asked(tips(valves.state.q), 0.0),
+    ))  # fmt: skip
 
     film = robots.replay(whole, valves.states or (), ("cylinder", "plate"))
     seen = systems.contact_history(whole, contacts, film.q, film.v, ["cylinder"])
@@ -95,7 +81,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     held = np.einsum("tij,ti->tj", plate[:, :3, :3], place - plate[:, :3, 3])[free]
     if picture is not None:
         draw(whole, film.q, time, place, force, ticks, picture)
-    numbers = {
+    return jax.tree.map(float, {
         "lift [mm]": -floor[free].min() / mm,
         "contact forces over weight, carried": force[free].mean() / (9.81 * MASS),
         "moved in the grip [mm]": np.linalg.norm(held - held[0], axis=1).max() / mm,
@@ -106,8 +92,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
         "overlap with fingers, greatest [mm]": np.max(fingers) / mm,
         "overlap with the floor, greatest [mm]": floor.max() / mm,
         "gripper lets go [mm]": -np.max(fingers, axis=0)[-1] / mm,
-    }
-    return {name: float(value) for name, value in numbers.items()}
+    })  # fmt: skip
 
 
 def draw(whole, q, time, place, force, ticks, file) -> None:

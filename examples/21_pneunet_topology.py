@@ -28,12 +28,10 @@ def bent(body, count, size, pressures):
     """Shapes of a chain clamped on its left, on a mesh of its own, with air in its chambers."""
     solid = mesh.chambers(mesh.triangulate(body, size=size, order=2))
     problem = fem.problem(
-        solid.mesh,
-        material.presets.flexible_80a(),
-        kinematics=fem.PlaneStrain(DEPTH),
+        solid.mesh, material.presets.flexible_80a(), kinematics=fem.PlaneStrain(DEPTH),
         supports=(fem.Fixed(mesh.nodes_where(solid.mesh, lambda p: p[0] < 1e-9)),),
         loads=(fem.Pressure(solid.largest(count), name="air"),),
-    )
+    )  # fmt: skip
     return fem.solve_path(problem, air=pressures)
 
 

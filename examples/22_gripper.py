@@ -20,7 +20,8 @@ from jaxtyping import Array
 
 import sorojax as sj
 from sorojax import robots, rod, systems
-from sorojax.math.ode.contact_midpoint import ContactMidpoint
+from sorojax.math import ContactMidpoint
+from sorojax.rod import PairForce, Part, PartForce, TimeVaryingForce
 from sorojax.units import mm
 
 GRASP, WALK = 0.03, 0.02  # N m
@@ -55,31 +56,21 @@ def table(t):
 
 
 @functools.partial(sj.jit, kernels=False)
-def run(joint, radius, length, depth, mass, command, step, saves):
+def run(joint, command, step, saves, radius, length, depth, mass):
     """The robot, its motion, and the contact force [N] or moment [N m] that the thing takes
     along the axis, the mean of the last 50 steps."""
     finger = rod.rod(
-        sj.SE3(),
-        rod.chebyshev(kappa_y=2, kappa_z=2),
-        rod.circle(6 * mm),
-        length=80 * mm,
-        young_modulus=1e6,
-        poisson_ratio=0.3,
-        density=2000,
-        nodes=6,
-    )
+        sj.SE3(), rod.chebyshev(kappa_y=2, kappa_z=2), rod.circle(6 * mm), length=80 * mm,
+        young_modulus=1e6, poisson_ratio=0.3, density=2000, nodes=6,
+    )  # fmt: skip
     fingers = robots.ring(finger, 4, 37.5 * mm)
-    thing = rod.Part(
-        robots.cylinder(mass, radius, length), joint, offset=robots.pose_below(depth)
-    )
+    thing = Part(robots.cylinder(mass, radius, length), joint, offset=robots.pose_below(depth))
     model = rod.assembly(sj.SE3(), **fingers, thing=thing)
     touch = rod.LinkContact(sj.sdf.Cylinder(radius, length), 6 * mm, GRIP, points=24)
-    touches = tuple(rod.PairForce(name, "thing", touch) for name in fingers)
-    air = rod.TimeVaryingForce(
-        functools.partial(rod.PointWrench, follower=True), Chambers(*command)
-    )
-    own = [rod.PartForce(name, air) for name in fingers]
-    carried = rod.PartForce("thing", rod.TimeVaryingForce(rod.Gravity, table))
+    touches = tuple(PairForce(name, "thing", touch) for name in fingers)
+    push = functools.partial(rod.PointWrench, follower=True)
+    own = [PartForce(name, TimeVaryingForce(push, Chambers(*command))) for name in fingers]
+    carried = PartForce("thing", TimeVaryingForce(rod.Gravity, table))
     q, v = rod.rest(model), jnp.zeros(rod.num_dof(model))
     forces = (rod.Damping(0.03), rod.Gravity(), carried, *own, *touches)
     path = rod.rollout(model, q, v, forces, step=step, saves=saves, stepper=HELD)
@@ -92,9 +83,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     saves, told, films = round(seconds / step), {}, {}
 
     def do(name, joint, size, *command):
-        radius, length, depth, mass = jnp.array(size)
-        found = run(joint, radius, length, depth, mass, jnp.array(command), step, saves)
-        films[name] = (*found, size)
+        films[name] = (*run(joint, jnp.array(command), step, saves, *jnp.array(size)), size)
         return films[name][1:3]
 
     for name, size in THINGS.items():

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import sorojax as sj
-from sorojax.math.ode.contact_midpoint import ContactMidpoint
+from sorojax.math import ContactMidpoint
 from sorojax.units import MPa, mm
 
 SAVED = 8e-3  # s between saved moments
@@ -43,15 +43,10 @@ def wall():
 
 def arm():
     return sj.rod.rod(
-        sj.SE2(),
-        sj.rod.piecewise_constant(kappa_z=6),
-        sj.rod.rectangle(60 * mm, 2 * HALF),
-        length=378 * mm,
-        young_modulus=5 * MPa,
-        poisson_ratio=0.33,
-        density=0.334 / (63 * 60 * 20 * mm**3),
-        nodes=12,
-    )
+        sj.SE2(), sj.rod.piecewise_constant(kappa_z=6), sj.rod.rectangle(60 * mm, 2 * HALF),
+        length=378 * mm, young_modulus=5 * MPa, poisson_ratio=0.33,
+        density=0.334 / (63 * 60 * 20 * mm**3), nodes=12,
+    )  # fmt: skip
 
 
 def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, float]:
@@ -71,15 +66,9 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
 
     def run(law):
         path = sj.rod.rollout(
-            rod,
-            start,
-            jnp.zeros(6),
-            (lossy, touch, sj.systems.ControlForce(law)),
-            step=SAVED / every,
-            saves=round(6.0 / SAVED),
-            every=every,
-            stepper=stepper,
-        )
+            rod, start, jnp.zeros(6), (lossy, touch, sj.systems.ControlForce(law)),
+            step=SAVED / every, saves=round(6.0 / SAVED), every=every, stepper=stepper,
+        )  # fmt: skip
         return path, sj.systems.contact_history(rod, (touch,), path.q, path.v)
 
     first, seen = run(spring(APPROACH))

@@ -69,9 +69,8 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     @functools.partial(jax.jit, static_argnums=0)
     def estimate(balanced, q, tip, pressure):
         forces = (fit.elastic, heavy, sj.rod.Pressurised(fit.pressure, pressure))
-        q = sj.rod.inverse_kinematics(
-            rod, sj.rod.Position(tip), q, forces=forces if balanced else None, iterations=20
-        ).q
+        target, own = sj.rod.Position(tip), forces if balanced else None
+        q = sj.rod.inverse_kinematics(rod, target, q, forces=own, iterations=20).q
         return q, sj.rod.forward_kinematics(rod, q, truth.s)[:, :2, 2]
 
     lines, spent = [], []

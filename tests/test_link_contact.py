@@ -8,9 +8,9 @@ import pytest
 
 from sorojax import rod as R, sdf
 from sorojax.contact import LinePenalty
+from sorojax.math import ContactMidpoint
 from sorojax.math.lie import SE2, SE3, homogeneous
 from sorojax.math.ode import contact_midpoint as contact_stepper
-from sorojax.math.ode.contact_midpoint import ContactMidpoint
 from sorojax.systems import SmoothRamp
 
 T0 = jnp.zeros(())

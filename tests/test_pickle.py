@@ -18,6 +18,7 @@ import sorojax as sj
 from sorojax import fem, material, mesh, rod, sdf, systems
 from sorojax._cache import enable_compilation_cache
 from sorojax.fem.dynamics.simulate import MotionError
+from sorojax.io import state
 from sorojax.math.status import Status
 from sorojax.sweep.sweep import Swept
 
@@ -26,7 +27,11 @@ FLOORS = sorted(sj._FLOORS)
 
 
 def public_classes():
-    """Every public class that holds data, by its public name."""
+    """Every class that holds data and is public or, as results are, written to files."""
+    for package in state._PACKAGES:
+        for name, cls in state._data_classes(package).items():
+            if name.count(".") == 1 and not cls.__name__.startswith("_") and fields(cls):
+                yield name, cls
     for floor in FLOORS:
         package = importlib.import_module(f"sorojax.{floor}")
         for name, cls in sorted(vars(package).items()):

@@ -11,8 +11,8 @@ from benchmarks.fingers import finger
 from benchmarks.harness import Row, measure_together
 from sorojax import sdf
 from sorojax.contact import LinePenalty
+from sorojax.math import ContactMidpoint
 from sorojax.math.lie import SE2
-from sorojax.math.ode.contact_midpoint import ContactMidpoint
 from sorojax.math.ode.steppers import start
 from sorojax.rod import (
     Damping,

@@ -32,7 +32,7 @@ _DRAWN_BY = {
     "sorojax.rod.statics.equilibrium.Equilibrium": ("draw.rods", "show_posed"),
     "sorojax.rod.statics.path.EquilibriumPath": ("draw.rods", "show_posed"),
     "sorojax.rod.statics.path.ArcPath": ("draw.rods", "show_posed"),
-    "sorojax.rod.statics.inverse_kinematics.Reached": ("draw.rods", "show_posed"),
+    "sorojax.rod.statics.inverse_kinematics.IKResult": ("draw.rods", "show_posed"),
     "sorojax.material.hyperelastic.AbstractHyperelastic": ("draw.plots", "show_material"),
     "sorojax.reduction.backbone.Backbone": ("draw.plots", "show_snapshots"),
     "sorojax.robots.bellows.BellowsActuator": ("draw.robots", "show_robot"),

@@ -16,11 +16,11 @@ NONE = {
     "topology, on the host: pairs of nodes, patches of cells, cells that hold points": (
         "space patches route rigid"
     ),
-    "lists which facets are near, from concrete positions; refuses traced ones": "updated",
+    "lists which facets are near, at concrete positions only": "update_contact_pairs",
     "paths and predictions found on the host; their docstrings promise no derivative": (
         "continuation critical_loads"
     ),
-    "tells where the derivative of a motion jumps": "switching",
+    "tells where the derivative of a motion jumps": "contact_switching",
 }
 
 RUBBER = material.neo_hookean(young_modulus=1.0, poisson_ratio=0.4, density=1.3)
@@ -207,7 +207,7 @@ MEASURES = {
     ),
     "contact_state": (fem.contact_state, TERMS["Contact"]),
     "overlap": (fem.overlap, TERMS["Contact"]),
-    "advanced": (fem.update_friction, TERMS["Contact with friction"]),
+    "update_friction": (fem.update_friction, TERMS["Contact with friction"]),
     "with_imperfection": (
         lambda p, u: fem.with_imperfection(p, u, jnp.sum(p.kinematics.thickness)), plate,
     ),
@@ -424,7 +424,7 @@ CASES |= {
         lambda: moved(TERMS["Pressure"]()), lambda at: fem.tangent_modes(*at, 2)
     ),
     "residual of a sheet and its stiffness": at_state(stiffness_along, sheet),
-    "expand": modal(fem.modal_displacement),
+    "modal_displacement": modal(fem.modal_displacement),
     "modal_coordinates": modal(fem.modal_coordinates),
     "modal_force": modal(fem.modal_force),
     "simulate": lambda: moving(PULLED(), ALPHA, VISCOUS),

@@ -12,14 +12,14 @@ from tests.derivatives.case import Case
 
 NONE = {
     "makes a mesh on the host: `move` carries it on as a function of the shape": (
-        "between_lines box extrude from_image from_polygon image_shape joined kept mirrored "
+        "between_lines box extrude from_image from_polygon image_shape merge submesh mirror "
         "polymesher rectangle repair revolve sweep tetrahedralise triangulate"
     ),
     "a size for a mesher": "grade",
     "facets, cells, nodes, sets and places, chosen on the host": (
         "boundary_facets boundary_loops cells_connected cells_inside cells_where chambers "
         "facets_on facets_where locate named nearest_node nodes_in_box nodes_inside "
-        "nodes_on_line nodes_where valences"
+        "nodes_on_line nodes_where"
     ),
     "numbers of a report, on the host": "quality",
 }

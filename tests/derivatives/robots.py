@@ -13,7 +13,7 @@ NONE = {
         "bellows_problem crawler_problem walker_problem pneunet_mesh"
     ),
     "robots put together on the host, from cells solved there: slopes are those of systems": (
-        "model unit_cell supplied surrounded standing_cylinder rim"
+        "model unit_cell with_pneumatics with_contacts standing_cylinder rim"
     ),
     "what a board drives, step by step on the host": (
         "bench stepper rod_stepper contact_stepper"
@@ -57,7 +57,7 @@ def pressures(numbers):
 
 
 CASES = {
-    "below": Case(robots.pose_below, 0.3),
+    "pose_below": Case(robots.pose_below, 0.3),
     "upside_down": Case(robots.upside_down, 0.3),
     "cylinder": Case(lambda at: robots.cylinder(*at), (0.3, 0.02, 0.05)),
     "ring": Case(hung, 0.04),

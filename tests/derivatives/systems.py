@@ -202,8 +202,8 @@ CASES = {
     "gain, sum_of": Case(algebra, (2.0, jnp.array([1.0, -1.0]), jnp.asarray(3.0))),
     "stack": Case(equal, (0.02, 0.03)),
     "effort of each law": Case(efforts, (LAWS, Q, V), step=1e-4, reverse=False),
-    "followed": Case(moments, (IMPEDANCE, Q, V), step=1e-4, reverse=False),
-    "touching": Case(
+    "tracking": Case(moments, (IMPEDANCE, Q, V), step=1e-4, reverse=False),
+    "contact_history": Case(
         pressed, (LinePenalty(5e5, 2e-5, friction=0.3), -Q, V), step=1e-6, rtol=1e-5
     ),
     "body_motion": Case(
@@ -211,5 +211,5 @@ CASES = {
     ),
     "estimate_shape": Case(seen, (PLACES, 1e-3), step=1e-4, rtol=1e-5),
     "start_filter, update_filter": Case(filtered, (Q, PLACES), step=1e-4),
-    "reduced, displacement": few_shapes,
+    "modal_body, displacement": few_shapes,
 }
