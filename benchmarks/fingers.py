@@ -16,11 +16,11 @@ LENGTH = 80 * mm
 MODES = 3
 
 
-def finger(nodes: int) -> Rod:
-    """The rod with `nodes` Gauss nodes."""
+def finger(nodes: int, modes: int = MODES) -> Rod:
+    """The rod with `nodes` Gauss nodes, and so many modes of each of its two curvatures."""
     return rod(
         SE3(),
-        chebyshev(kappa_y=MODES, kappa_z=MODES),
+        chebyshev(kappa_y=modes, kappa_z=modes),
         circle(6 * mm),
         length=LENGTH,
         young_modulus=1 * MPa,

@@ -34,7 +34,7 @@ _FLOORS = (
     "contact", "design", "fem", "io", "material", "math", "mesh", "reduction", "robots", "rod",
     "sdf", "sweep", "systems", "view", "vision",
 )  # fmt: skip
-__all__ = [  # noqa: RUF022
+__all__ = [
     "SE2", "SE3", "Status", "compiled", "enable_compilation_cache", "enable_low_latency", "jit",
     "listen", "replace", "silent", "units",
     "contact", "design", "fem", "io", "material", "math", "mesh", "reduction", "robots", "rod",

@@ -12,6 +12,7 @@ import pytest
 
 from sorojax import fem, io, mesh, view
 from sorojax.cli.main import main
+from sorojax.fem.equilibrium.solve import Path
 from sorojax.io import state as _structure
 from sorojax.math.status import Status
 from tests.test_pickle import SCENES, beam, iterated, same, tip
@@ -180,6 +181,16 @@ def test_a_file_can_name_nothing_but_data_classes_of_sorojax():
         assert cls.__module__.startswith("sorojax.") and not issubclass(cls, BaseException)
         assert issubclass(cls, eqx.Module | eqx.Enumeration) or _structure._fields(cls)
         assert not hasattr(cls, "__del__")
+
+
+def test_a_class_is_found_by_its_name_in_a_file_wherever_its_module_stands():
+    for package in _structure._PACKAGES:
+        classes = set(_structure._data_classes(package).values())
+        assert classes or package == "contact"
+        for cls in classes:
+            name = _structure._name(cls, "")
+            assert _structure._class(name) is cls and name.startswith(f"{package}."), name
+    assert _structure._name(Path, "") == "fem.Path"  # not public, and no other has its name
 
 
 @pytest.mark.stress(60)

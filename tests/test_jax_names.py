@@ -5,10 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import pytest
 
 from sorojax import _jax
 from sorojax._jax.optional import SWITCH, optional, reason
+from sorojax._jax.versions import is_tested
 
 pytestmark = pytest.mark.versions
 ROOT = Path(__file__).parent.parent
@@ -29,6 +31,12 @@ def run(without, *command):
         capture_output=True,
         text=True,
     )
+
+
+@pytest.mark.skipif(not is_tested(jax.__version__), reason="a jax that was not tested yet")
+def test_every_fast_path_is_on_where_jax_was_tested():
+    """Tests of a fast path that is off are left out: none is, on a tested jax."""
+    assert set(_jax.fast_paths().values()) == {"on"}
 
 
 def test_the_same_tests_pass_by_public_names_alone():

@@ -4,7 +4,7 @@ import re
 import tomllib
 from pathlib import Path
 
-import pytest
+from hatchling.builders.wheel import WheelBuilder
 
 import sorojax
 from sorojax._jax.versions import TESTED
@@ -33,9 +33,7 @@ def test_the_board_finds_its_installer(capsys):
 
 
 def test_the_builder_takes_packages_with_their_data():
-    wheel = pytest.importorskip("hatchling.builders.wheel")
-    pytest.importorskip("hatch_fancy_pypi_readme")
-    builder = wheel.WheelBuilder(str(ROOT))
+    builder = WheelBuilder(str(ROOT))
     taken = {file.distribution_path for file in builder.recurse_included_files()}
     expected = {
         "sorojax_board/raspberry_pi/board.json",

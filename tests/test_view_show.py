@@ -1,5 +1,6 @@
 """`show`: every noun is drawn, off-screen, whole, with the colours and names it should have."""
 
+import importlib
 import io
 import subprocess
 import sys
@@ -631,3 +632,11 @@ def test_simulating_and_printing_load_no_drawing_library():
     done = subprocess.run([sys.executable, "-c", QUIET], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_every_class_that_is_drawn_exists():
+    """They are listed by name, so that a picture of a shape does not import the solvers."""
+    for path, (module, function) in sys.modules["sorojax.view.show"]._DRAWN_BY.items():
+        home, _, name = path.rpartition(".")
+        assert getattr(importlib.import_module(home), name).__module__ == home, path
+        assert callable(getattr(importlib.import_module(f"sorojax.view.{module}"), function))

@@ -309,7 +309,7 @@ def arc_length_path(
         negative = negative_eigenvalues(slope, search.metric)
         if progress:
             tell("arc length path", share)
-        return new, (q, factor, negative, ended(done, jnp.append(q, rate)))
+        return new, (q, factor, negative, ended(done, q, finite=jnp.all(jnp.isfinite(rate))))
 
     point = _Point(start.q, factor, direction, begin, start.done)
     shares = jnp.linspace(0.0, 1.0, steps + 1, dtype=dtype)[1:]
