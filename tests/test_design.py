@@ -91,6 +91,36 @@ def test_a_step_beyond_where_a_function_is_defined_is_halved_until_it_is_not():
     assert found.status != Status.not_finite and jnp.all(jnp.abs(found.design - 0.55) < 0.05)
 
 
+@pytest.mark.parametrize(
+    ("objective", "best"),
+    [
+        (lambda x: x - 0.05 * jnp.log(x), 0.05),
+        (lambda x: x**2 + 1 / jnp.sqrt(x), 0.25**0.4),
+        (lambda x: jnp.where(x > 0, 1e-3 / x + x**2, jnp.nan), 5e-4 ** (1 / 3)),
+    ],
+)
+def test_gcmma_proposes_again_nearer_where_a_function_is_not_defined(objective, best):
+    found = design.minimise(
+        lambda x: jnp.sum(objective(x)),
+        jnp.array([1.9, 1.5]),
+        optimiser=design.GCMMA(-50.0, 2.0),  # the functions end at 0
+        tolerance=1e-4,
+    )
+    assert found.status == Status.successful
+    assert np.allclose(found.design, best, atol=1e-3)
+
+
+def test_a_search_without_a_finite_proposal_says_so_and_keeps_its_design():
+    start = jnp.array([1.9, 1.5])
+    found = design.minimise(
+        lambda x: jnp.where(jnp.all(x == start), jnp.sum(x**2), jnp.nan),
+        start,
+        optimiser=design.GCMMA(-50.0, 2.0),
+    )
+    assert found.status == Status.not_finite
+    assert np.array_equal(found.design, start) and np.isfinite(found.objective)
+
+
 def test_curvature_of_gcmma_after_a_proposal_that_was_too_good():
     """min(10 rho, 1.1 (rho + delta)), Svanberg 2002, eq. 4.12, with delta by the closed form of
     one variable between asymptotes at 0 and 1."""

@@ -55,7 +55,8 @@ class Optimised(eqx.Module):
         constraints: At `design`, each <= 0 if it holds.
         status: `successful` when the change fell below the tolerance, `out_of_reach` when it
             did with a constraint broken, `max_steps` when the steps ran out first,
-            `not_finite` when a value broke; the last good design then.
+            `not_finite` when a value broke, after shorter steps too; the last good design
+            then.
         history: Objective, constraints (m columns) and change of every step.
         last: The last step; pass it as `resume` to go on.
     """
@@ -187,11 +188,19 @@ def minimise(
             break
     if status == Status.not_finite:
         flat = last
-    objective, held = task.last(flat, max(len(history) + first - 1, 0))
+    k_last = max(len(history) + first - 1, 0)
+    objective, held = task.last(flat, k_last)
+    if last is not None and not _all_finite(objective, held):
+        status = Status.not_finite
+        objective, held = task.last(flat := last, k_last)
     columns = _columns(history)
     if status == Status.successful and _broken(held, columns):
         status = Status.out_of_reach
     return Optimised(back(flat), objective, held, status, columns, step)  # type: ignore
+
+
+def _all_finite(objective: Array, held: Array) -> bool:
+    return bool(jnp.isfinite(objective) & jnp.all(jnp.isfinite(held)))
 
 
 def _broken(held: Array, columns: dict[str, np.ndarray]) -> bool:

@@ -30,6 +30,7 @@ from sorojax._types import real
 from sorojax.design.optimise.base import AbstractOptimiser, Values
 
 _INNER = 15  # proposals of GCMMA for one step
+_CLOSER = 3.0  # times the curvature after a proposal that is not finite; 3**15 is 1e7
 _PRICE = 1000.0  # of breaking a constraint, against objectives of order one to a hundred
 
 
@@ -302,7 +303,8 @@ class GCMMA(AbstractMMA):
     """Moving asymptotes whose functions are made to lie above the true ones.
 
     Each proposal is evaluated and made again with more curvature (`stiffen`) until they do, so
-    the objective of feasible designs never rises.
+    the objective of feasible designs never rises. A proposal where a function is not finite
+    counts as one where they do not.
     """
 
     lower: Float[Array, "..."] = eqx.field(converter=real, default=0.0)
@@ -341,7 +343,8 @@ class GCMMA(AbstractMMA):
         state: MMAState,
     ) -> tuple[MMAState, Array]:
         """More curvature where a function lies above its approximation at `proposal`, where
-        objective and constraints were found; and whether none does."""
+        objective and constraints were found, of all functions where one is not finite; and
+        whether none does."""
         return _stiffen(self, x, proposal, values, found, state)
 
 
@@ -362,9 +365,12 @@ def _stiffen(method, x, proposal, values, found, state):
     span = method.upper - method.lower + jnp.zeros_like(x)
     away = (high - low) * (proposal - x) ** 2
     away = jnp.sum(away / ((high - proposal) * (proposal - low) * span))
-    short = above > 1e-7 * jnp.maximum(jnp.abs(true), 1e-7)
+    # Where a function is not defined all get stiffer: the next proposal is closer.
+    outside = ~jnp.all(jnp.isfinite(true))
+    short = outside | (above > 1e-7 * jnp.maximum(jnp.abs(true), 1e-7))
     more = state.curvature + above / jnp.maximum(away, 1e-30)
     more = jnp.minimum(1.1 * more, 10 * state.curvature)
+    more = jnp.where(outside, _CLOSER * state.curvature, more)
     curvature = jnp.where(short, more, state.curvature)
     return eqx.tree_at(lambda s: s.curvature, state, curvature), ~jnp.any(short)
 
