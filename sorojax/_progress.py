@@ -151,6 +151,23 @@ def report(label: str, done: float, total: float, **numbers: float) -> None:
 
 
 @contextlib.contextmanager
+def reported_if_long(label: str, total: float) -> Iterator[Callable[..., None]]:
+    """A function like `report` of how much is done, silent in the first second of the block;
+    what it told ends with all being done."""
+    start, told = time.monotonic(), False
+
+    def tell(done: float, **numbers: float) -> None:
+        nonlocal told
+        if time.monotonic() - start >= _WORTH:
+            told = True
+            report(label, done, total, **numbers)
+
+    yield tell
+    if told:
+        report(label, total, total)
+
+
+@contextlib.contextmanager
 def listen(listener: Listener | None) -> Iterator[None]:
     """Send progress to `listener` inside the block."""
     global _listener

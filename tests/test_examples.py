@@ -23,6 +23,10 @@ def test_a_tendon_finger_closes_on_a_ball():
     assert 0 < numbers["overlap over thickness [%]"] < 0.5
 
 
+def test_the_readme_says_how_programs_are_kept_for_the_next_run():
+    assert "sj.enable_compilation_cache()" in (ROOT / "README.md").read_text()
+
+
 def test_the_program_of_the_readme_prints_what_it_says(capsys):
     (program,) = re.findall(
         r"```python\n(import jax;.*?)```", (ROOT / "README.md").read_text(), re.S

@@ -214,7 +214,9 @@ def test_a_path_has_small_residuals_and_needs_few_iterations():
 
 def test_a_load_beyond_reach_keeps_the_last_converged_state():
     problem = _ring(5e8)
-    with pytest.raises(fem.ConvergenceError, match="no equilibrium beyond") as error:
+    with pytest.raises(
+        fem.ConvergenceError, match="no equilibrium.*solve_volume.*arc length"
+    ) as error:
         fem.solve(problem, max_cuts=2)
     solution = fem.solve(problem, max_cuts=2, throw=False)
     assert solution.status == Status.not_converged and solution.stats.reason

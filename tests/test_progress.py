@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import SE2, _progress, listen, mesh, rod, sdf, silent, systems
+from sorojax import SE2, _progress, fem, listen, material, mesh, rod, sdf, silent, systems
 from sorojax._progress import Notebook, Progress, Terminal, Watch, report
 
 
@@ -160,6 +160,26 @@ def test_meshing_tells_how_far_it_is():
     ended = np.array([p.fraction == 1.0 for p in mine])
     assert np.all((steps == 1) | (steps < 0) | ended[1:])  # a second series starts anew
     assert ended[-1]
+
+
+def test_a_long_search_for_an_equilibrium_tells_its_iterations(monkeypatch):
+    square = mesh.rectangle([0, 0], [1.0, 1.0], divisions=(2, 2), element=mesh.Quad9())
+    rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45, density=1e3)
+    problem = fem.problem(
+        square,
+        rubber,
+        kinematics=fem.PlaneStrain(1.0),
+        supports=(fem.Fixed(square.node_sets["left"]),),
+        loads=(fem.Force(square.node_sets["right"], [0.0, -1e3]),),
+    )
+    for worth, count in ((60.0, 0), (0.0, 2)):
+        told = []
+        monkeypatch.setattr(_progress, "_WORTH", worth)
+        with listen(told.append):
+            fem.solve(problem)
+        mine = [p for p in told if p.label == "newton"]
+        assert len(mine) >= count and bool(mine) == bool(count)
+    assert mine[-1].fraction == 1.0 and mine[0].numbers["imbalance"] > 0
 
 
 FINGER = rod.rod(

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from sorojax._progress import report
+from sorojax._progress import report, reported_if_long
 from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import Linearised, Prepared, prepare
 from sorojax.fem.equilibrium.newton import Newton, newton_solve
@@ -91,7 +91,8 @@ def follow(problem: Problem, begin: Start, log: Log) -> np.ndarray:
         goal = rules.goal(way)
         here = problem if goal == 1.0 else between(begin.problem, problem, goal)
         known = np.asarray(known_values(here.supports, *u.shape))
-        result = newton_solve(here, prepared, u, known, log.newton, tangent, kept)
+        with reported_if_long("newton", log.newton.max_iterations) as tell:
+            result = newton_solve(here, prepared, u, known, log.newton, tangent, kept, tell)
         if result.reason:
             way, tangent, kept = rules.cut(way), None, None
             log.cuts = way.cuts

@@ -275,9 +275,11 @@ def newton_solve(
     settings: Newton,
     tangent: Linearised | None = None,
     kept: KeptFactor | None = None,
+    tell: Callable[..., None] = lambda done, imbalance: None,
 ) -> Iterate:
     """Equilibrium near `start`. `tangent`, of a neighbouring equilibrium, gives a first
-    guess at the price of a few back-substitutions with the factor `kept` from there."""
+    guess at the price of a few back-substitutions with the factor `kept` from there. `tell`
+    is called with the number of every iteration."""
     u, before = start, start
     state = _linearise(problem, prepared, u, before)
     known = np.asarray(prepared.known)
@@ -311,6 +313,7 @@ def newton_solve(
             reason = problem.space.system.unsolved
             return Iterate(u, None, iterations, ratio, negative, reason)
         iterations += 1
+        tell(iterations, imbalance=ratio)
         if overshoots(problem) and still:
             args = (problem, prepared.known, state.residual, jnp.asarray(u), jnp.asarray(du))
             du = float(share_of_step(*args)) * du

@@ -344,7 +344,9 @@ def _raise_if_failed(where: str, solution: Solution, throw: bool) -> None:
     done = stats.steps[-1].fraction if stats.steps else 0.0
     raise ConvergenceError(
         f"{where}: no equilibrium beyond {100 * done:.0f} % of the load after {stats.cuts} "
-        f"cuts ({stats.reason}). Lower the load, refine the mesh where it deforms most, or "
-        "pass throw=False for the last converged state.",
+        f"cuts ({stats.reason}). Lower the load, or refine the mesh where it deforms most. "
+        "Where the body gives way, as a balloon past its highest pressure, give the volume of "
+        "the cavity (fem.solve_volume), or follow the branch by arc length "
+        "(fem.continuation). throw=False returns the last converged state.",
         solution,
     )
