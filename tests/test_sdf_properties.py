@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from sorojax import sdf
 from sorojax.sdf.query import value_and_normal_at
+from sorojax.sdf.trimesh.tree import order_by_halving
 
 POINTS = np.random.default_rng(3).uniform(-2, 2, (256, 2))
 number = st.floats(-0.8, 0.8).map(lambda v: round(v, 3))
@@ -208,6 +209,25 @@ def test_mesh_by_its_tree_is_as_by_every_face():
     assert loose.tree is not None
     assert jnp.allclose(values(loose, p)[0], values(mesh, p)[0], rtol=0, atol=1e-12)
     assert sdf.TriangleMesh(vertices, faces[1:]).tree is None
+
+
+def test_middle_of_a_dense_ball_where_every_triangle_may_be_closest(getkey):
+    vertices, faces = sdf.isosurface(sdf.Sphere([0.0, 0, 0], 1.0), size=0.04)
+    mesh = sdf.TriangleMesh(vertices, faces, lists=True)
+    assert len(faces) > 10_000 and not bool(jnp.all(mesh.tree.cells.whole))
+    reach = jnp.repeat(jnp.array([1e-6, 0.1, 0.5, 0.9, 1.0, 1.5, 9.0]), 30)
+    way = jax.random.normal(getkey(), (len(reach), 3))
+    p = reach[:, None] * way / jnp.linalg.norm(way, axis=1, keepdims=True)
+    found = eqx.filter_jit(jax.vmap(jax.value_and_grad(lambda p, mesh: mesh(p)), (0, None)))
+    every = eqx.tree_at(lambda m: m.tree, mesh, None, is_leaf=lambda t: t is mesh.tree)
+    for f, exact in zip(found(p, mesh), found(p, every), strict=True):
+        assert jnp.allclose(f, exact, rtol=0, atol=1e-12)
+
+
+def test_filled_up_rows_of_a_tree_name_no_triangle_more_than_twice(getkey):
+    # 65 triangles fill 128 places: sixty-three copies of one made points near it slow.
+    order = order_by_halving(np.asarray(jax.random.normal(getkey(), (65, 3))))
+    assert set(np.bincount(order)) == {1, 2}
 
 
 @pytest.mark.stress(37)

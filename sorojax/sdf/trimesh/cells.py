@@ -100,7 +100,7 @@ MOST = 128  # triangles in a list that is complete
 _SPLIT = 64  # triangles in a list that asks for smaller cubes
 _COARSE, _DEPTH = 3, 10  # halvings of the largest cube before a close look, and at all
 _WORK = 400  # pairs of cube and triangle looked at, for each triangle of the mesh
-_HELD = 1 << 22  # of those pairs at once, of some 100 bytes each
+_HELD = 1 << 21  # of those pairs at once, of some 100 bytes each
 _REACH = 0.6  # half an edge of the largest cube over the longest side of the mesh
 _PIECE = 1 << 14
 _LATTICE = np.array([[i // 9, i // 3 % 3, i % 3] for i in range(27)])
@@ -179,13 +179,14 @@ def triangle_cells(
     named, balls = 0, _balls(triangles)
     finest = max(float(balls[1].mean()), edge / 2**_DEPTH)
     while True:
-        owner, face = _close(low, edge, balls, *pairs)
+        owner, face, apart, gap = _close(low, edge, balls, *pairs)
         below = np.ones((len(face), 8), bool)
         if depth >= _COARSE:
-            owner, face, below = _possible(low, edge, triangles, owner, face)
+            owner, face, apart, below = _possible(low, edge, triangles, owner, face)
         count = np.bincount(owner, minlength=len(low))
         split = np.flatnonzero(count > (_SPLIT if edge > finest else len(triangles)))
-        split = split[np.argsort(-count[split], kind="stable")]
+        # Near the surface lists get short, and most points are asked for there.
+        split = split[np.argsort(gap[split], kind="stable")]
         split = np.sort(split[np.cumsum(count[split]) <= min(left, _HELD)])
         left -= int(count[split].sum())
         number = np.full(len(low), -1)
@@ -195,19 +196,20 @@ def triangle_cells(
         child[-1] = np.where(ends, -named - np.cumsum(ends), nodes + 8 * number)
         named += int(ends.sum())
         kept = ends[owner]
-        lists.append((count[ends], face[kept]))
+        lists.append(_shortened(count[ends], owner[kept], face[kept], apart[kept]))
         if not len(split):
             break
         edge, depth = edge / 2, depth + 1
         low = (low[split, None] + edge * _CORNERS).reshape(-1, 3).astype(low.dtype)
         pairs = _handed_down(number[owner[~kept]], face[~kept], below[~kept])
         child.append(np.zeros(len(low), np.int64))
-    count, whole, entries = _packed(lists)
+    count, entries = (np.concatenate(column) for column in zip(*lists, strict=True))
+    start = np.concatenate([[0], np.cumsum(np.minimum(count, MOST))])
     bits = {4: jnp.int32, 8: jnp.int64}[vertices.dtype.itemsize]
     return TriangleCells(
         child=jnp.asarray(np.concatenate(child), jnp.int32),
-        start=jnp.asarray(np.concatenate([[0], np.cumsum(count)]), jnp.int32),
-        whole=jnp.asarray(whole),
+        start=jnp.asarray(start, jnp.int32),
+        whole=jnp.asarray(count <= MOST),
         slots=jnp.asarray(slots[entries], jnp.int32),
         made=jax.lax.bitcast_convert_type(vertices, bits),
         depth=depth,
@@ -222,12 +224,11 @@ def _handed_down(owner: np.ndarray, face: np.ndarray, below: np.ndarray):
     return child[order], face[np.concatenate(rows)][order]
 
 
-def _packed(lists) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lengths of lists, whether each is whole, and entries; too long ones are cut."""
-    count = np.concatenate([c for c, _ in lists])
-    entries = np.concatenate([f for _, f in lists])
-    place = np.arange(len(entries)) - np.repeat(np.cumsum(count) - count, count)
-    return np.minimum(count, MOST), count <= MOST, entries[place < MOST]
+def _shortened(count, owner, face, apart) -> tuple[np.ndarray, np.ndarray]:
+    """True lengths of lists, and their entries: of each the nearest, at most `MOST`."""
+    order = np.lexsort((apart, owner))
+    place = np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)
+    return count, face[order[place < MOST]]
 
 
 def _balls(triangles) -> tuple[np.ndarray, np.ndarray]:
@@ -238,19 +239,22 @@ def _balls(triangles) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _close(low, edge: float, balls, owner, face):
-    """The pairs of cube and triangle that the balls about both do not rule out."""
+    """The pairs of cube and triangle that the balls about both do not rule out, how far
+    apart their middles are [m], and how far each cube's middle is from all balls [m]."""
     square = np.zeros(len(face), low.dtype)
     for k in range(3):
         square += ((low[:, k] + edge / 2)[owner] - balls[0][k][face]) ** 2
     apart = np.sqrt(square)
-    nearest = np.minimum.reduceat(apart, np.searchsorted(owner, np.arange(len(low))))
-    kept = apart - balls[1][face] <= (nearest + 1.0001 * 3**0.5 * edge)[owner]
-    return owner[kept], face[kept]
+    start = np.searchsorted(owner, np.arange(len(low)))
+    least = apart - balls[1][face]
+    kept = least <= (np.minimum.reduceat(apart, start) + 1.0001 * 3**0.5 * edge)[owner]
+    gap = np.minimum.reduceat(least, start)
+    return owner[kept], face[kept], apart[kept], gap
 
 
 def _possible(low, edge: float, triangles, owner, face):
     """The pairs of cube and triangle where the triangle may be closest to a point of it,
-    and in which eighths of the cube.
+    its distance from the middle [m], and in which eighths of the cube.
 
     A triangle is further away than a plane between it and the middle of the cube. The one
     nearest to the middle rules it out if it is below this plane at all corners: its
@@ -273,7 +277,7 @@ def _possible(low, edge: float, triangles, owner, face):
         functools.partial(_open, sides), (plane, slice(None)), (upper.reshape(-1, 27), owner)
     )
     kept = below.any(axis=1)
-    return owner[kept], face[kept], below[kept]
+    return owner[kept], face[kept], distance[kept], below[kept]
 
 
 @jax.jit
@@ -289,7 +293,7 @@ def _seen(p, triangle):
     at = tuple(p[:, k] for k in range(3))
     a, b, c = (tuple(triangle[:, i, k] for k in range(3)) for i in range(3))
     away = jnp.stack(minus(at, foot(at, a, b, c)[0]), axis=1)
-    distance = root(triangle_square(at, a, b, c))
+    distance = jnp.linalg.norm(away, axis=1)
     safe = jnp.where(distance > 0, distance, jnp.ones_like(distance))
     return distance, away / safe[:, None]
 

@@ -121,7 +121,7 @@ def _grouped(a: Array, size: int) -> Array:
 
 def _walk(triangles: Float[Array, "slots 3 3"], boxes: tuple, p: Vector, best, slot, open_):
     """Slot of the closest triangle, where that is `open_`: the squared distance `best` of
-    `slot` bounds the search, or a near leaf if there is none."""
+    `slot` and a near leaf bound the search."""
     leaves = len(triangles) // LEAF
     parts = tuple(triangles[:, i] for i in range(3))
 
@@ -164,8 +164,8 @@ def _walk(triangles: Float[Array, "slots 3 3"], boxes: tuple, p: Vector, best, s
     root = jnp.ones(p[0].shape, jnp.int32)
     if leaves == 1:
         return look(root, best, slot)[1]
-    blind = jnp.any(open_ & jnp.isinf(best))
-    steps = jnp.where(blind, leaves.bit_length() - 1, 0)
+    # Also where a list was cut: its cube may be large, and what it holds far away.
+    steps = jnp.where(jnp.any(open_), leaves.bit_length() - 1, 0)
     closest = jax.lax.fori_loop(0, steps, descend, root)
     best, slot = look(closest, best, slot)
     start = (jnp.where(open_, 2 * root, root), best, slot)
@@ -239,7 +239,8 @@ def order_by_halving(centres: np.ndarray) -> np.ndarray:
     """Rows of `centres` halved again and again across their longest side, padded."""
     count = len(centres)
     leaves = 1 << max(0, -(-count // LEAF) - 1).bit_length()
-    order = np.minimum(np.arange(leaves * LEAF), count - 1)[None]
+    # Spread evenly: copies of one triangle would all be looked at by points close to it.
+    order = (np.arange(leaves * LEAF) * count // (leaves * LEAF))[None]
     while order.shape[1] > LEAF:
         at = centres[order]
         axis = np.argmax(np.ptp(at, axis=1), axis=1)
