@@ -120,7 +120,7 @@ def _step(problem: SecondOrder, at: Span, state: Kinematic, method: ContactMidpo
     )
     kept, gained = jax.lax.cond(
         long | swift & (search.contact > 0),
-        lambda: _balance(problem, at, state, end, inner),
+        lambda: _balance(problem, at, (state, end), inner, near),
         lambda: (np.True_, 0 * at.h),
     )
     return (*end[:3], state.gained + gained), ~passed & kept
@@ -153,16 +153,18 @@ def passed_on_way(problem: SecondOrder, at: Span, state: Kinematic, inner: Array
     return jax.lax.while_loop(lambda run: (run[0] < parts) & ~run[1], look, begin)[1]
 
 
-def _balance(problem: SecondOrder, at: Span, state: Kinematic, end: Kinematic, inner: Array):
+def _balance(
+    problem: SecondOrder, at: Span, ends: tuple[Kinematic, Kinematic], inner: Array, near: Array
+):
     """Whether the energies of motion and contact grew by no more than the work of the other
     forces, but for small shares of them, in this step and in all; and what they gained."""
     contact = problem.contact
     assert contact is not None
-    state, end, inner = jax.lax.stop_gradient((state, end, inner))
+    (state, end), inner = jax.lax.stop_gradient((ends, inner))
     assert state.gained is not None
     middle = move(problem, state.q, at.part * inner)
     work = at.h * (inner @ contact.plain(at.t + at.part, middle, inner))
-    (moving, stored), (moves, stores) = (contact.energy(*x[:2]) for x in (state, end))
+    (moving, stored), (moves, stores) = (contact.energy(*x[:2], near) for x in (state, end))
     gained = moves + stores - moving - stored - work
     size = moving + stored + moves + stores
     most = jnp.where(stores > 0, _GAIN, _FREE_GAIN) * size
