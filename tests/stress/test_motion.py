@@ -10,8 +10,10 @@ from benchmarks.cases import contact_grid
 from sorojax import rod as R, sdf, systems as S
 from sorojax.contact import LinePenalty
 from sorojax.math.lie import SE2
-from sorojax.math.ode.steppers import GeneralisedAlpha, RungeKutta4
+from sorojax.math.ode.contact_midpoint import Span, passed_on_way
+from sorojax.math.ode.steppers import GeneralisedAlpha, Kinematic, RungeKutta4
 from sorojax.math.status import Status
+from sorojax.rod.dynamics.rollout import second_order
 
 RADIUS = 6e-3
 FINGER = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2000.0)
@@ -118,6 +120,22 @@ def test_nothing_is_jumped_over(impact, kind, speed, wall, step):
     status, through, most = impact(kind, speed, wall, step)
     assert status == Status.successful and not through
     assert most <= contact_grid.GAINED
+
+
+@pytest.mark.stress(78)
+def test_a_rod_that_goes_through_itself_and_out_again_in_one_step_is_seen():
+    """Its shape turns by a whole turn on the way, which chords of the step do not show."""
+    wall, h = jnp.asarray(3.5e-3), jnp.asarray(1e-3)
+    model, forces = contact_grid.on_itself(wall)
+    begin, end = jnp.array([56.7, -5.1, 70.8]), jnp.array([18.6, -26.5, -0.1])
+    scene = contact_grid.SCENES["itself"]
+    assert contact_grid.met_between(scene, model, wall, begin[None], end[None])[0]
+    rate, problem = (end - begin) / h, second_order(model, begin, forces)
+    state = Kinematic(begin, rate, 0 * rate)
+    for long, seen in ((True, True), (False, False)):
+        step = Span(0 * h, h, h / 2)
+        found = passed_on_way(problem, step, state, rate, jnp.array(long))
+        assert bool(found) == seen
 
 
 @pytest.mark.stress(79)

@@ -22,6 +22,7 @@ from sorojax.math.ode.steppers import (
 _SHORTER = 0.4  # of a Newton step that did not help
 _CUTS = 7  # halvings of a step in a row
 _GAIN, _FREE_GAIN = 1e-3, 1e-2  # of its energy, that a long step may gain in contact, apart
+_HALVES = 6  # of the way of a step, at most, that is looked at in parts
 _LEAST = 1e-5  # of it, however much was gained before
 
 
@@ -66,11 +67,11 @@ class ContactMidpoint(AbstractStepper):
         if problem.contact is None:
             return ImplicitMidpoint(self.passes).step(problem, t, h, state)
         if state.resolved is None:  # a loop that could not tell of a step that is held
-            at = _At(t, h, self.theta * h)
+            at = Span(t, h, self.theta * h)
             return Kinematic(*_step(problem, at, _with_record(state), self)[0][:3])
 
         def whole(t, h, *state):
-            return _step(problem, _At(t, h, self.theta * h), Kinematic(*state), self)
+            return _step(problem, Span(t, h, self.theta * h), Kinematic(*state), self)
 
         t, begun = jnp.asarray(t, h.dtype), state[:4]
         method, numbers = jax.closure_convert(whole, t, h, *begun)
@@ -95,7 +96,7 @@ def _with_record(state: Kinematic) -> Kinematic:
     return Kinematic(*state[:3], jnp.zeros((), state.v.dtype), jnp.array(True))
 
 
-class _At(NamedTuple):
+class Span(NamedTuple):
     """A step: its start [s], its length, and the part of it at which most forces act."""
 
     t: Array
@@ -103,7 +104,7 @@ class _At(NamedTuple):
     part: Array
 
 
-def _step(problem: SecondOrder, at: _At, state: Kinematic, method: ContactMidpoint):
+def _step(problem: SecondOrder, at: Span, state: Kinematic, method: ContactMidpoint):
     """The state after a step, without its flag, and whether the step can be taken."""
     contact = problem.contact
     assert contact is not None
@@ -114,26 +115,56 @@ def _step(problem: SecondOrder, at: _At, state: Kinematic, method: ContactMidpoi
     new = search.best
     inner = state.v + at.part * new
     end = Kinematic(move(problem, state.q, at.h * inner), state.v + at.h * new, new)
-    ways = jax.lax.stop_gradient((state[:2], end[:2]))
-    passed = jax.lax.cond(near, lambda: contact.passed(*ways, at.h), lambda: np.False_)
+    passed = jax.lax.cond(
+        near, lambda: passed_on_way(problem, at, state, inner, long), lambda: np.False_
+    )
     kept, gained = jax.lax.cond(
         long | swift & (search.contact > 0),
-        lambda: _balance(problem, at, state, end, inner),
+        lambda: _balance(problem, at, (state, end), inner, near),
         lambda: (np.True_, 0 * at.h),
     )
     return (*end[:3], state.gained + gained), ~passed & kept
 
 
-def _balance(problem: SecondOrder, at: _At, state: Kinematic, end: Kinematic, inner: Array):
+def passed_on_way(problem: SecondOrder, at: Span, state: Kinematic, inner: Array, long: Array):
+    """Whether anything went through anything on the way of a step of mean rate `inner`, which
+    is looked at in as many parts, in halves of halves, as it takes for none to be long."""
+    contact = problem.contact
+    assert contact is not None
+    at, q, inner = jax.lax.stop_gradient((at, state.q, inner))
+
+    def place(share):
+        return move(problem, q, share * at.h * inner), inner
+
+    def count():
+        moment = jax.lax.stop_gradient(contact.free(at.t + at.part, *place(0.5))[2])
+        sizes = at.h / 2.0 ** jnp.arange(_HALVES, dtype=at.h.dtype)
+        is_long = jax.vmap(lambda h: contact.near(moment, h)[1])(sizes)
+        return 2.0 ** jnp.sum(is_long.astype(sizes.dtype))
+
+    parts = jax.lax.cond(long, count, lambda: jnp.ones((), at.h.dtype))
+
+    def look(run):
+        k, _ = run
+        ways = place(k / parts), place((k + 1) / parts)
+        return k + 1, contact.passed(*ways, at.h / parts)
+
+    begin = jnp.zeros_like(parts), jnp.zeros((), bool)
+    return jax.lax.while_loop(lambda run: (run[0] < parts) & ~run[1], look, begin)[1]
+
+
+def _balance(
+    problem: SecondOrder, at: Span, ends: tuple[Kinematic, Kinematic], inner: Array, near: Array
+):
     """Whether the energies of motion and contact grew by no more than the work of the other
     forces, but for small shares of them, in this step and in all; and what they gained."""
     contact = problem.contact
     assert contact is not None
-    state, end, inner = jax.lax.stop_gradient((state, end, inner))
+    (state, end), inner = jax.lax.stop_gradient((ends, inner))
     assert state.gained is not None
     middle = move(problem, state.q, at.part * inner)
     work = at.h * (inner @ contact.plain(at.t + at.part, middle, inner))
-    (moving, stored), (moves, stores) = (contact.energy(*x[:2]) for x in (state, end))
+    (moving, stored), (moves, stores) = (contact.energy(*x[:2], near) for x in (state, end))
     gained = moves + stores - moving - stored - work
     size = moving + stored + moves + stores
     most = jnp.where(stores > 0, _GAIN, _FREE_GAIN) * size
@@ -141,7 +172,7 @@ def _balance(problem: SecondOrder, at: _At, state: Kinematic, end: Kinematic, in
     return gained <= jnp.maximum(most, _LEAST * size), jax.lax.stop_gradient(gained)
 
 
-def _solve_apart(problem: SecondOrder, at: _At, state: Kinematic, method: ContactMidpoint):
+def _solve_apart(problem: SecondOrder, at: Span, state: Kinematic, method: ContactMidpoint):
     """Whether contact is near, and the mean acceleration: with contact if it is."""
     assert problem.contact is not None
     new, moment = state.a, None
@@ -170,7 +201,7 @@ class _Search(NamedTuple):
 
 
 def _solve_touching(
-    problem: SecondOrder, at: _At, state: Kinematic, new: Array, method: ContactMidpoint
+    problem: SecondOrder, at: Span, state: Kinematic, new: Array, method: ContactMidpoint
 ):
     """Newton with contact."""
 
@@ -186,7 +217,7 @@ def _solve_touching(
     return jax.lax.fori_loop(0, method.contact_passes, loop, _search_from(new))
 
 
-def _solve_together(problem: SecondOrder, at: _At, state: Kinematic, method: ContactMidpoint):
+def _solve_together(problem: SecondOrder, at: Span, state: Kinematic, method: ContactMidpoint):
     """As `_solve_apart` where both solutions begin at the acceleration before: one loop whose
     first pass tells whether contact is near, so that the program holds the equations once."""
     contact = problem.contact
@@ -232,7 +263,7 @@ def _judged(
     return jax.tree.map(lambda a, b: jnp.where(better, a, b), accepted, shortened)
 
 
-def _free_at(problem: SecondOrder, at: _At, state: Kinematic, new: Array):
+def _free_at(problem: SecondOrder, at: Span, state: Kinematic, new: Array):
     """Mass, force without contact and motion within a step of mean acceleration `new`."""
     assert problem.contact is not None
     inner = state.v + at.part * new
@@ -240,14 +271,14 @@ def _free_at(problem: SecondOrder, at: _At, state: Kinematic, new: Array):
     return problem.contact.free(at.t + at.part, middle, inner)
 
 
-def _newton(problem: SecondOrder, at: _At, mass: Array, residual: Array) -> Array:
+def _newton(problem: SecondOrder, at: Span, mass: Array, residual: Array) -> Array:
     """Excess of the acceleration, without contact."""
     implicit = mass + at.part * problem.damping + at.part**2 * problem.stiffness
     return solve_symmetric(implicit, residual)
 
 
 def _touching(
-    problem: SecondOrder, at: _At, state: Kinematic, new: Array, mass: Array, force: Array
+    problem: SecondOrder, at: Span, state: Kinematic, new: Array, mass: Array, force: Array
 ) -> tuple[Array, Array, Array]:
     """Size of the residual with contact, the Newton step, and the size of the contact
     forces: normal ones at the end of the step, all others, `force` beside them, within it."""

@@ -41,7 +41,7 @@ class ContactTerms(NamedTuple):
             whether it is so long that it may gain energy, and whether it may in contact.
         force: (t, q, v) -> (force, stiffness, damping) of the contacts.
         passed: ((q, v) before, (q, v) after, h) -> whether anything went through anything.
-        energy: (q, v) -> energy of motion, and in contacts [J].
+        energy: (q, v, near) -> energy of motion, and in contacts [J], none if not `near`.
         plain: (t, q, v) -> the forces without contact.
         symmetric: Whether those matrices are.
     """
@@ -50,7 +50,7 @@ class ContactTerms(NamedTuple):
     near: Callable[[Any, Array], tuple[Array, Array, Array]]
     force: Callable[[Array, Array, Array], tuple[Array, Array, Array]]
     passed: Callable[[tuple[Array, Array], tuple[Array, Array], Array], Array]
-    energy: Callable[[Array, Array], tuple[Array, Array]]
+    energy: Callable[[Array, Array, Array], tuple[Array, Array]]
     plain: Callable[[Array, Array, Array], Array]
     symmetric: bool = True
 

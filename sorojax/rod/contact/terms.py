@@ -95,10 +95,12 @@ def terms_of(
     def passed(before, after, h):
         return parts.passed(*still((at(*before), at(*after))), h)
 
-    def energy(q, v):
-        moment = at(q, v)
+    def energy(q, v, near):
+        moment = still(at(q, v))
         mass, _ = inertia(moment)
-        return still((v @ mass @ v / 2, parts.stored(moment)))
+        none = jnp.zeros((), q.dtype)
+        stored = jax.lax.cond(near, lambda: still(parts.stored(moment)), lambda: none)
+        return still(v @ mass @ v / 2), stored
 
     def plain(t, q, v):
         return still(parts.plain(t, at(q, v)))
