@@ -40,14 +40,24 @@ def not_negative(where: str, name: str, value: Any, unit: str, do: str) -> None:
 
 
 def between(
-    where: str, name: str, value: Any, low: float, high: float, unit: str, do: str
+    where: str,
+    name: str,
+    value: Any,
+    low: float,
+    high: float,
+    unit: str,
+    do: str,
+    ends: str = "()",
 ) -> None:
-    """Raise a `ValueError` unless `low < value < high` everywhere."""
+    """Raise a `ValueError` unless every entry of `value` lies between `low` and `high`, which
+    belong to the interval where `ends` has square brackets."""
     if is_concrete(value):
         numbers = np.asarray(value)
-        if not (np.all(numbers > low) and np.all(numbers < high)):
+        above = numbers >= low if ends[0] == "[" else numbers > low
+        below = numbers <= high if ends[1] == "]" else numbers < high
+        if not (np.all(above) and np.all(below)):
             raise ValueError(
-                f"{where}: `{name}` must lie in ({low:g}, {high:g}) {unit}, "
+                f"{where}: `{name}` must lie in {ends[0]}{low:g}, {high:g}{ends[1]} {unit}, "
                 f"got {_short(value)} {unit}. {do}"
             )
 

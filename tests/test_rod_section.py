@@ -159,3 +159,13 @@ def test_scaling_and_tapering():
 def test_bad_input_names_the_remedy(wrong, message):
     with pytest.raises(ValueError, match=message):
         wrong()
+
+
+def test_ends_of_intervals_are_taken_in_single_precision():
+    half, two, one = np.float32([0.5, 2.0, 1.0])
+    made = R.Elastic(np.float32(1e6), half, np.float32(1e3))
+    assert made.poisson_ratio.dtype == jnp.float32 and made.poisson_ratio == 0.5
+    R.squircle(one, two)
+    R.PointWrench(np.zeros(6, np.float32), s=one)
+    with pytest.raises(ValueError, match=r"must lie in \(-1, 0.5\]"):
+        R.Elastic(1e6, 0.51, 1e3)

@@ -316,7 +316,7 @@ class PointWrench(AbstractForce):
     follower: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
-        _check.between("PointWrench", "s", self.s, -1e-12, 1 + 1e-12, "-", "0 is the base.")
+        _check.between("PointWrench", "s", self.s, 0, 1, "-", "0 is the base.", "[]")
 
     def __call__(self, t, motion):
         _check_wrench("PointWrench", self.wrench, motion)

@@ -45,7 +45,7 @@ class Elastic(eqx.Module):
         _check.positive(where, "young_modulus", self.young_modulus, "Pa", "Use units.kPa.")
         _check.positive(where, "density", self.density, "kg/m^3", "Rubber has about 1070.")
         do = "An incompressible rubber has 0.5."
-        _check.between(where, "poisson_ratio", self.poisson_ratio, -1, 0.5 + 1e-12, "-", do)
+        _check.between(where, "poisson_ratio", self.poisson_ratio, -1, 0.5, "-", do, "(]")
 
 
 def elastic(material: AbstractHyperelastic) -> Elastic:

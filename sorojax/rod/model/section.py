@@ -261,7 +261,7 @@ def squircle(radius: Numbers, power: Numbers, *, shear_factor=5 / 6) -> Section:
     """
     radius = _length("squircle", "radius", radius, "Give half the side.")
     n = real(power)
-    _check.between("squircle", "power", n, 2 - 1e-12, 50, "", "Use rectangle for more.")
+    _check.between("squircle", "power", n, 2, 50, "", "Use rectangle for more.", "[)")
     area, second, torsion = _squircle(n)
     return Section(
         area=area * radius**2,
