@@ -190,7 +190,6 @@ class Contact(AbstractLoad):
     def stretch(self, problem, u, place) -> Float[Array, "facets quad dim"]:
         """Lengths of the springs of friction [m] after a step to `u` [m], in which forces
         acted with the obstacle at `place` [m]."""
-        assert self.grip is not None
         share = 1.0 if self.share is None else self.share
         return self.slider.stretch(self.grip, self.acted(problem, u) - place[None, None], share)
 

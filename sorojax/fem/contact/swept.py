@@ -76,7 +76,7 @@ def _drags(contacts: list) -> Bool[Array, ""]:
     moves = [
         jnp.any(load.value != load.start.place)
         for load in contacts
-        if isinstance(load, Contact) and load.grip is not None and load.start is not None
+        if isinstance(load, Contact) and load.grip is not None
     ]
     return jnp.any(jnp.stack(moves)) if moves else jnp.zeros((), bool)
 
