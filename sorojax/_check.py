@@ -50,11 +50,13 @@ def between(
     ends: str = "()",
 ) -> None:
     """Raise a `ValueError` unless every entry of `value` lies between `low` and `high`, which
-    belong to the interval where `ends` has square brackets."""
+    belong to the interval, and values that rounding moved beyond, where `ends` has square
+    brackets."""
     if is_concrete(value):
         numbers = np.asarray(value)
-        above = numbers >= low if ends[0] == "[" else numbers > low
-        below = numbers <= high if ends[1] == "]" else numbers < high
+        slack = float(np.finfo(np.result_type(numbers, np.float32)).eps) ** 0.75
+        above = numbers >= low - slack if ends[0] == "[" else numbers > low
+        below = numbers <= high + slack if ends[1] == "]" else numbers < high
         if not (np.all(above) and np.all(below)):
             raise ValueError(
                 f"{where}: `{name}` must lie in {ends[0]}{low:g}, {high:g}{ends[1]} {unit}, "

@@ -9,7 +9,9 @@ import pytest
 
 from sorojax._jax import devices
 
-pytestmark = pytest.mark.skipif(devices._any_plug_in(), reason="has an accelerator")
+pytestmark = pytest.mark.skipif(
+    devices._any_plug_in(), reason="an accelerator is installed, whose absence is tested"
+)
 ROOT = Path(__file__).parent.parent
 REGISTERS = """
 def initialize():

@@ -40,7 +40,9 @@ def test_no_call_waits_for_another_thread():
     assert waits[0] > 60 and waits[1] < 10
 
 
-@pytest.mark.skipif(low_latency._has_started is None, reason="nothing tells that JAX runs")
+@pytest.mark.skipif(
+    low_latency._has_started is None, reason="this JAX does not tell that it runs"
+)
 def test_it_is_refused_once_jax_has_started():
     done = run("jax.numpy.ones(3); sj.enable_low_latency()")
     assert done.returncode != 0 and "JAX has started already" in done.stderr

@@ -167,5 +167,6 @@ def test_ends_of_intervals_are_taken_in_single_precision():
     assert made.poisson_ratio.dtype == jnp.float32 and made.poisson_ratio == 0.5
     R.squircle(one, two)
     R.PointWrench(np.zeros(6, np.float32), s=one)
+    R.PointWrench(np.zeros(6), s=1 + 1e-15)  # as sums of shares come out
     with pytest.raises(ValueError, match=r"must lie in \(-1, 0.5\]"):
         R.Elastic(1e6, 0.51, 1e3)

@@ -25,6 +25,7 @@ from sorojax.rod.dynamics.rollout import second_order
 STEPS = (2e-5, 2e-4, 1e-3)  # [s]
 SAVES, BETWEEN = 150, 16  # steps of a run; places between two of them that are looked at
 SEEDS, ASIDE = (0, 1), 0.15  # how far speeds, walls and steps lie beside the grid, at random
+SMALLEST = 2.0**-20  # part of a step
 GAINED = 1.001  # of the energy before, at most
 RADIUS, SPAN, TILT, ROOM = 6e-3, 0.08, 0.3, 3e-3
 LAW = LinePenalty(stiffness=5e7, smoothing=6e-6)
@@ -218,6 +219,8 @@ def in_parts(one, step, state):
         way = share * step * (state.v + new.v) / 2
         if not np.allclose(new.q - state.q, way, rtol=0, atol=1e-9 * abs(new.q).max()):
             share /= 2
+            if share < SMALLEST:
+                raise ValueError(f"contact.grid: no part of a step of {step} s moves straight.")
             continue
         state, done, met = new, done + share, met | bool(meets)
         share *= 2 if may_double(share, done) else 1
@@ -256,19 +259,16 @@ def rows_of(name, scene, run, seed):
             "which": "; ".join(through),
         }
         settings |= {} if seed is None else {"beside the grid by seed": seed}
-        yield Row(
-            "sorojax",
-            settings | {"quantity": "through"},
-            error=len(through) / len(ratios),
-            reference="none",
-            bar=0.0,
-            bar_on="error",
-        )
-        yield Row(
-            "sorojax",
-            settings | {"quantity": "energy after over before"},
-            error=max(ratios),
-            reference="1",
-            bar=GAINED,
-            bar_on="error",
-        )
+        yield from outcomes(settings, len(through) / len(ratios), max(ratios))
+
+
+def outcomes(settings, through: float, energy: float):
+    """The two rows of a set of impacts: what got through, and the largest energy after over
+    that before."""
+    found = {
+        "through": (through, "none", 0.0),
+        "energy after over before": (energy, "1", GAINED),
+    }
+    for quantity, (error, reference, bar) in found.items():
+        at = settings | {"quantity": quantity}
+        yield Row("sorojax", at, error=error, reference=reference, bar=bar, bar_on="error")
