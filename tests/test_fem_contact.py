@@ -72,6 +72,14 @@ def test_the_step_of_friction_has_a_potential_and_a_memory():
     assert jnp.allclose(
         LAW.stretch(rest, position), moved - (moved @ normal)[:, None] * normal[None]
     )
+    # what forces at a later half of the step do on its way, springs have lost, or more
+    pressure = jnp.linspace(0, 4e3, 40)
+    held = grip._replace(anchor=back - LAW.bounded(before, pressure))
+    for share in (0.5, 0.8, 1.0):
+        way = (position - back) / share
+        rise = LAW.stored(LAW.stretch(held, position, share)) - LAW.stored(back - held.anchor)
+        lost = -jnp.sum(LAW.traction(held, position) * way, axis=1) - rise
+        assert jnp.min(lost) > -1e-12 * jnp.max(lost)
     curvature = jax.hessian(lambda x: jnp.sum(LAW.energy(no_grip(x), x)))(position[0])
     assert jnp.all(curvature == 0)  # nothing of a point that does not touch, NaN neither
 

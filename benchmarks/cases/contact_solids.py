@@ -1,5 +1,8 @@
-"""Impacts of finite elements on a wall, on another body and on themselves, over speeds, walls
-and steps, without friction: what gets through, and the largest energy over that before."""
+"""Impacts of finite elements on a wall, on another body and on themselves, and oblique ones
+on a wall with friction, over speeds, walls and steps: what gets through, and the largest energy
+over that before."""
+
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -31,13 +34,16 @@ def body(shape, *loads):
     )
 
 
-def on_a_shape(wall):
-    """A plate over a wall; how fast it falls, and by how much its underside stays above."""
+def on_a_shape(wall, friction=None):
+    """A plate over a wall; how fast it falls, aslant with friction, and by how much its
+    underside stays above."""
     shape = plate([20 * mm, 5 * mm], (4, 1), [0, GAP])
-    under, obstacle = shape.facet_sets["bottom"], sdf.Rectangle([-0.1, -wall], [0.1, 0.0])
+    under, obstacle = shape.facet_sets["bottom"], sdf.Rectangle([-3.0, -wall], [3.0, 0.0])
     ids = np.unique(under)
     falls = jnp.zeros_like(shape.points).at[:, 1].set(-1.0)
-    return body(shape, fem.Contact(under, obstacle)), falls, lambda x: x[:, ids, 1].min() + wall
+    falls = falls if friction is None else falls.at[:, 0].set(1.0)
+    problem = body(shape, fem.Contact(under, obstacle, friction=friction))
+    return problem, falls, lambda x: x[:, ids, 1].min() + wall
 
 
 def on_a_plate(wall):
@@ -76,7 +82,13 @@ def on_itself(wall):
     return body(shape, fem.SelfContact(facets.reshape(-1, 2))), closes, apart
 
 
-SCENES = {"shape": on_a_shape, "body": on_a_plate, "itself": on_itself}
+SCENES = {
+    "shape": on_a_shape,
+    "shape, friction 0.3": partial(on_a_shape, friction=0.3),
+    "shape, friction 0.8": partial(on_a_shape, friction=0.8),
+    "body": on_a_plate,
+    "itself": on_itself,
+}
 
 
 def impact(scene, speed, wall, step):

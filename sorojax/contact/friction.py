@@ -50,7 +50,8 @@ class Grip(NamedTuple):
     """State of friction at each point, in the frame of the obstacle.
 
     Where the spring has no force [m], the pressure [Pa] and the normal that friction is
-    taken at, the stiffness of the dashpot over a step [Pa/m] and where it has no force.
+    taken at, the stiffness of the dashpot over a step [Pa/m], and where the point was when
+    the step began [m], where the dashpot has no force.
     """
 
     anchor: Float[Array, "*points dim"]
@@ -67,10 +68,15 @@ class SpringSlider(eqx.Module):
     held points come to rest, they do not creep. A dashpot beside the spring, which alone
     reaches the limit at `velocity` [m/s], stops them from ringing.
 
-    Given the pressure the increment of a step has a potential, so tangents are symmetric.
+    Given the pressure the increment of a step has a potential, so tangents are symmetric. Its
+    work on the way of a step is at most what the springs lose, whatever the step, where
+    forces act in its second half.
 
-    Reference: Wriggers, Computational Contact Mechanics, 2006, section 6.2, for the return
-    of the spring to the limit.
+    References:
+        Wriggers, Computational Contact Mechanics, 2006, section 6.2, for the return of the
+        spring to the limit.
+        Simo, Hughes, Computational Inelasticity, 1998, section 1.7, for the return in the
+        middle of a step.
     """
 
     law: AbstractFriction
@@ -116,16 +122,30 @@ class SpringSlider(eqx.Module):
         return jnp.where(touches, pull / jnp.where(touches, limit, 1.0), jnp.inf)
 
     def stretch(
-        self, grip: Grip, position: Float[Array, "*points dim"]
+        self,
+        grip: Grip,
+        position: Float[Array, "*points dim"],
+        share: Float[Array, ""] | float = 1.0,
     ) -> Float[Array, "*points dim"]:
-        """Length of the spring [m] after a step that ended at `position`."""
+        """Length of the spring [m] after a step in which points were at `position` after a
+        `share` of it, when forces acted."""
         before = _across(grip.back - grip.anchor, grip.normal)
         pull = grip.drag[..., None] * before - self.traction(grip, position)
-        return pull / (self.stiffness + grip.drag)[..., None]
+        return before + (pull / (self.stiffness + grip.drag)[..., None] - before) / share
 
-    def stored(self, grip: Grip, position: Float[Array, "*points dim"]) -> Float[Array, "..."]:
-        """Energy in the spring per area [J/m^2]."""
-        return self.stiffness / 2 * jnp.sum(self.stretch(grip, position) ** 2, axis=-1)
+    def bounded(
+        self, stretch: Float[Array, "*points dim"], pressure: Float[Array, "*points"]
+    ) -> Float[Array, "*points dim"]:
+        """A `stretch` [m] that a `pressure` [Pa] can hold: a spring beyond slides back."""
+        longest = self.law.limit(pressure) / self.stiffness
+        square = jnp.sum(stretch**2, axis=-1)
+        held = square <= longest**2
+        length = jnp.sqrt(jnp.where(held, jnp.ones_like(square), square))
+        return jnp.where(held, jnp.ones_like(square), longest / length)[..., None] * stretch
+
+    def stored(self, stretch: Float[Array, "*points dim"]) -> Float[Array, "..."]:
+        """Energy in a spring of length `stretch` [m] per area [J/m^2]."""
+        return self.stiffness / 2 * jnp.sum(stretch**2, axis=-1)
 
     def _trial(self, grip: Grip, position):
         """Stiffness of spring and dashpot together, and how far the point is from where

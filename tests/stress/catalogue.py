@@ -98,4 +98,5 @@ CASES = {
     92: "derivatives of compiled functions in lanes: those of a loop",
     93: "a motion that is gone on with: the slopes of what came before",
     94: "a column past its critical load: in balance, and called unstable",
+    95: "oblique impacts of solids with friction, in few steps: no energy is gained",
 }

@@ -2,8 +2,8 @@
 
 Pressure and normal of friction are those of the step before, which keeps the tangent
 symmetric. So the friction impulse on sliding points is the coefficient times the normal
-impulse, one step later, whether steps resolve an impact or not. Also the state of a contact
-that has touched nothing yet, and of one in a motion that begins.
+impulse, one step later, whether steps resolve an impact or not, and are cut or not. Also the
+state of a contact that has touched nothing yet, and of one in a motion that begins.
 """
 
 import dataclasses
@@ -22,16 +22,19 @@ from sorojax.mesh.mesh import Mesh
 
 if TYPE_CHECKING:
     from sorojax.fem.contact.obstacle import Contact
+    from sorojax.fem.dynamics.step import StepState
     from sorojax.fem.problem import Problem
 
 
 class Start(NamedTuple):
     """Where a step of a contact begins: place of the obstacle, how far before its surface
-    pressure starts, and how far points of a facet may move until one feels it [m]."""
+    pressure starts, how far points of a facet may move until one feels it [m], and the size
+    of the step [s], zero before a motion."""
 
     place: Float[Array, " dim"]
     shift: Float[Array, "facets quad"]
     clear: Float[Array, " facets"]
+    step: Float[Array, ""]
 
 
 def at_end(share: Float[Array, ""]) -> Float[Array, ""]:
@@ -64,7 +67,7 @@ def moving(load: "Contact", mesh: Mesh, place: Float[Array, " dim"]) -> "Contact
         place=place,
         began=mesh.points[load.facets],
         share=one,
-        start=Start(place, none, none[:, 0]),
+        start=Start(place, none, none[:, 0], 0 * one),
     )
     if load.release_velocity is None:
         return load
@@ -108,29 +111,37 @@ def released(
 
 
 def gripped(
-    load: "Contact",
-    problem: "Problem",
-    u: Nodal,
-    back: Nodal,
-    rate: Float[Array, ""],
-    step: Float[Array, ""],
-    feels: Felt,
+    load: "Contact", problem: "Problem", u: Nodal, step: "StepState | None", feels: Felt
 ) -> "Contact":
-    """`load` for the step from `u`, where its points feel `feels`, in which they move at
-    `rate * (x - back)`, relative to an obstacle that has moved from its last place to `value`
-    within `step` [s]."""
-    slider = load.slider
-    assert load.grip is not None and load.place is not None
-    start = load.points_of(problem, u) - load.place[None, None]
-    anchor = start - slider.stretch(load.grip, start)
-    pressure = feels.pressure
-    drag = slider.law.limit(pressure) * rate / slider.velocity
-    still = rate <= 0
-    speed = (load.value - load.place) / jnp.where(still, 1.0, step)
-    lead = jnp.where(still, jnp.zeros_like(speed), speed / jnp.where(still, 1.0, rate))
-    away = load.points_of(problem, back) + (lead - load.value)[None, None]
-    grip = Grip(anchor, pressure, feels.normal, drag, away)
+    """`load`, as the last step left it, with friction of the step from `u`, where its points
+    feel `feels`; its obstacle has moved from its last place to `value`. At rest without one."""
+    slider, share = load.slider, 1.0 if step is None else step.share
+    assert load.place is not None
+    place = load.value - share * (load.value - load.place)  # where the step begins
+    back = load.points_of(problem, u) - place[None, None]
+    pressure = feels.pressure if step is None else _kept_impulse(load, problem, u, step, feels)
+    anchor = back - slider.bounded(load.stretch(problem, u, load.place), pressure)
+    limit = slider.law.limit(pressure)
+    drag = jnp.zeros_like(limit)
+    if step is not None:
+        rests = step.step <= 0
+        rate = jnp.where(rests, 0.0, 1 / jnp.where(rests, 1.0, step.step))
+        drag = limit * rate / (slider.velocity * share)
+    grip = Grip(anchor, pressure, feels.normal, drag, back)
     return eqx.tree_at(lambda load: (load.grip, load.place), load, (grip, load.value))
+
+
+def _kept_impulse(
+    load: "Contact", problem: "Problem", u: Nodal, step: "StepState", feels: Felt
+) -> Float[Array, "facets quad"]:
+    """Pressure of points [Pa] that has over a step, where they slid in the last one, the
+    impulse that it had in that, of another size if steps are cut or grow."""
+    assert load.grip is not None and load.place is not None and load.start is not None
+    same = (load.start.step <= 0) | (step.step <= 0)
+    ratio = jnp.where(same, 1.0, load.start.step / jnp.where(same, 1.0, step.step))
+    acted = load.acted(problem, u) - load.place[None, None]
+    slid = load.slider.loading(load.grip, acted) > 1
+    return jnp.where(slid, ratio * feels.pressure, feels.pressure)
 
 
 def felt(load: "Contact", problem: "Problem", u: Nodal) -> Felt:
@@ -182,6 +193,5 @@ def felt(load: "Contact", problem: "Problem", u: Nodal) -> Felt:
 @eqx.filter_jit
 def settled(load: "Contact", problem: "Problem", u: Nodal) -> "Contact":
     """`load` after an equilibrium `u`, ready for the next one."""
-    zero = jnp.zeros((), u.dtype)
-    feels = felt(load, problem, u)
-    return gripped(load, problem, u, u, zero, zero, feels)
+    load = dataclasses.replace(load, place=load.value)
+    return gripped(load, problem, u, None, felt(load, problem, u))

@@ -184,9 +184,15 @@ class Contact(AbstractLoad):
         energy = bare.potential(problem, u)
         if self.grip is None:
             return energy
-        points = self.points_of(problem, u) - self.value[None, None]
-        held = self.slider.stored(self.grip, points)
+        held = self.slider.stored(self.stretch(problem, u, self.value))
         return energy + jnp.sum(areas_of(problem, self.facets) * held)
+
+    def stretch(self, problem, u, place) -> Float[Array, "facets quad dim"]:
+        """Lengths of the springs of friction [m] after a step to `u` [m], in which forces
+        acted with the obstacle at `place` [m]."""
+        assert self.grip is not None
+        share = 1.0 if self.share is None else self.share
+        return self.slider.stretch(self.grip, self.acted(problem, u) - place[None, None], share)
 
     def curved_part(self, problem):
         rows = jnp.arange(self.facets.shape[0])
@@ -225,11 +231,13 @@ class Contact(AbstractLoad):
         assert self.start is not None and self.place is not None
         shift = jnp.zeros_like(self.start.shift) if shift is None else shift
         feels = felt(load, problem, step.u)
-        start = Start(self.place, shift, feels.clear)
-        load = dataclasses.replace(load, began=began, share=share, start=start)
-        if load.grip is None:
-            return dataclasses.replace(load, place=self.value)
-        return gripped(load, problem, step.u, step.back, step.rate, step.step, feels)
+        size = jnp.broadcast_to(jnp.asarray(step.step, began.dtype), ())
+        start = Start(self.place, shift, feels.clear, size)
+        if load.grip is not None:
+            load = gripped(load, problem, step.u, step, feels)
+        return dataclasses.replace(
+            load, began=began, share=share, start=start, place=self.value
+        )
 
     def _energy(self, problem):
         values, law = jnp.asarray(facet_tables(problem.mesh.element).values), self.law

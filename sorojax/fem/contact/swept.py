@@ -1,12 +1,14 @@
 """Whether a step moved points of a body through an obstacle, or gained energy in contact."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sorojax.contact.broadphase import far
 from sorojax.contact.swept import passes
-from sorojax.fem.contact.obstacle import Contact
+from sorojax.fem.contact.obstacle import Contact, areas_of
 from sorojax.fem.contact.self_contact import SelfContact
 from sorojax.fem.dynamics.step import Dynamics, Matter, State, TimeStep
 from sorojax.fem.loads.facets import blockwise, facet_tables
@@ -34,31 +36,49 @@ _GAIN = 5e-4  # of the energy before and after a step together, that it may gain
 def gains(
     dynamics: Dynamics, known: Matter, state: State, step: TimeStep, new: State, u: Nodal
 ) -> Bool[Array, ""]:
-    """Whether the energies of body and contacts grew by more than the work of the other
-    loads and of the supports, in a step whose forces act at displacement `u` [m]."""
+    """Whether the energies of body, contacts and springs of friction grew by more than the
+    work of the other loads and of the supports, in a step whose forces act at displacement
+    `u` [m]. Not judged where an obstacle with friction moves, whose work momentum follows late.
+    """
     contacts = [load for load in step.terms[0] if isinstance(load, Contact | SelfContact)]
-    if not contacts or any(_rubs(load) for load in contacts):
+    if not contacts:
         return jnp.zeros((), bool)
     problem = body(dynamics.problem)
 
-    def energy(at: State):
+    def energy(at: State, stored):
         v = at.velocity.ravel()
         moving = v @ sparse.product(problem.space.system, known.mass, v) / 2
-        stored = sum(load.stored(problem, at.displacement) for load in contacts)
-        return moving + potential_energy(problem, at.displacement) + stored
+        held = sum(stored(load, problem, at.displacement) for load in contacts)
+        return moving + potential_energy(problem, at.displacement) + held
 
     def pushing(u):
         return sum((load.potential(problem, u) for load in contacts), start=0.0)
 
-    (before, after), way = (energy(state), energy(new)), new.displacement - state.displacement
+    before = energy(state, _at_first)
+    after = energy(new, lambda load, problem, u: load.stored(problem, u))
+    way = new.displacement - state.displacement
     pushed = -jax.jvp(pushing, (u,), (way,))[1]
-    return after - before - (new.work - state.work - pushed) > _GAIN * (before + after)
+    gained = after - before - (new.work - state.work - pushed) > _GAIN * (before + after)
+    return gained & ~_drags(contacts)
 
 
-def _rubs(load: Contact | SelfContact) -> bool:
-    """Whether a contact has friction, whose springs hold less in short steps: there steps are
-    not cut for their energy, which would change the answer."""
-    return isinstance(load, Contact) and load.grip is not None
+def _at_first(load: Contact | SelfContact, problem: Problem, u: Nodal):
+    """Energy of a contact where a step begins [J]."""
+    if isinstance(load, SelfContact) or load.grip is None:
+        return load.stored(problem, u)
+    bare = dataclasses.replace(load, grip=None)
+    held = load.slider.stored(load.grip.back - load.grip.anchor)
+    return bare.stored(problem, u) + jnp.sum(areas_of(problem, load.facets) * held)
+
+
+def _drags(contacts: list) -> Bool[Array, ""]:
+    """Whether an obstacle with friction moves in a step."""
+    moves = [
+        jnp.any(load.value != load.start.place)
+        for load in contacts
+        if isinstance(load, Contact) and load.grip is not None and load.start is not None
+    ]
+    return jnp.any(jnp.stack(moves)) if moves else jnp.zeros((), bool)
 
 
 def _jumped(load: Contact, problem: Problem, u) -> Bool[Array, ""]:
