@@ -29,7 +29,7 @@ def pneunet(
     walls of neighbouring chambers push on each other."""
     shape = actuator(num_bellows)
     cells = mesh.triangulate(shape.body(), size=size, order=2, interfaces=(shape.layer(),))
-    base = bellows_problem(shape, cells, RUBBER, 1.0)
+    base = bellows_problem(shape, cells, RUBBER, 1.0, fem.Displacement())
     if not touching:
         return base
     walls = mesh.facets_on(cells, shape.notches())

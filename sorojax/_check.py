@@ -4,8 +4,9 @@ Each check looks at concrete values only: inside a JAX transformation it passes,
 because there a value cannot be known, and statuses report instead.
 """
 
-from collections.abc import Sequence
-from typing import Any
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any, get_args
 
 import jax.numpy as jnp
 import numpy as np
@@ -73,6 +74,28 @@ def shape(where: str, name: str, value: Any, want: Sequence[int | None], do: str
     if not fits:
         need = "(" + ", ".join("any" if w is None else str(w) for w in want) + ")"
         raise ValueError(f"{where}: `{name}` has shape {got}, need {need}. {do}")
+
+
+def axes(noun: Any) -> Iterator[tuple[str, str, int]]:
+    """Field, name and length of the axes of arrays that hold one vector of a named space, as
+    `Float[Array, " dim"]`."""
+    for field in dataclasses.fields(noun):
+        value = getattr(noun, field.name)
+        for each in (field.type, *get_args(field.type)):
+            names = getattr(each, "dim_str", "").split()
+            if len(names) == 1 and names[0].isalpha() and len(np.shape(value)) == 1:
+                yield field.name, names[0], np.shape(value)[0]
+
+
+def in_space(where: str, noun: Any, **lengths: int) -> None:
+    """Raise a `ValueError` if a vector of `noun` has another length than that of its axis
+    among `lengths`."""
+    for field, axis, length in axes(noun):
+        if lengths.get(axis, length) != length:
+            raise ValueError(
+                f"{where}: `{field}` of {type(noun).__name__} has {length} numbers, need "
+                f"{lengths[axis]}. Give one for each axis of the space."
+            )
 
 
 def float64(where: str, value: Any) -> None:

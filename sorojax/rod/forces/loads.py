@@ -12,6 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sorojax import _check
 from sorojax._types import real
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.moving import release
@@ -72,7 +73,7 @@ def total_force(
 ) -> Float[Array, " dof"]:
     """Sum of the listed forces and of the elasticity of rods and joints."""
     if isinstance(motion, RodState):
-        return one.total_force(_plain(forces), t, motion)
+        return one.total_force(_plain(forces, motion.rod.group), t, motion)
     check(motion.assembly, forces)
     loads: list = [_part_load(forces, t, motion, k) for k in range(len(motion.frames))]
     for force in forces:
@@ -91,7 +92,7 @@ def total_force(
 def on_model(forces: tuple[Load, ...], model: Rod | Assembly) -> tuple[Load, ...]:
     """The forces on `model` alone: what does not move is made, once before a loop."""
     if isinstance(model, Rod):
-        return tuple(_on_body(force, model) for force in _plain(forces))
+        return tuple(_on_body(force, model) for force in _plain(forces, model.group))
     check(model, forces)
     return tuple(
         PartForce(
@@ -149,6 +150,7 @@ def damping_matrix(
 def check(assembly: Assembly, forces: tuple[Load, ...]) -> None:
     """Refuse names of no part, and forces that do not say where they act."""
     for force in forces:
+        _in_space("assembly", force, assembly.group)
         names = (
             (force.part,)
             if isinstance(force, PartForce | JointEffort)
@@ -177,15 +179,22 @@ def _on(forces: tuple[Load, ...], assembly: Assembly, index: int) -> tuple:
     return tuple(found)
 
 
-def _plain(forces: tuple[Load, ...]) -> Any:
-    """Forces that may act on a single rod."""
+def _plain(forces: tuple[Load, ...], group: Any = None) -> Any:
+    """Forces that may act on a single rod, with vectors of its `group` where that is given."""
     for force in forces:
         if isinstance(force, PartForce | PairForce | JointEffort):
             raise ValueError(
                 f"rod: got {type(force).__name__}, which names a part, need a plain force. A "
                 "single rod has no parts: leave the name out, or build an assembly."
             )
+        if group is not None:
+            _in_space("rod", force, group)
     return forces
+
+
+def _in_space(where: str, force: Load, group: Any) -> None:
+    each = force.force if isinstance(force, PartForce) else force
+    _check.in_space(where, each, dim=group.space_dim, twist=group.algebra_dim)
 
 
 def _part_load(forces, t, motion: AssemblyState, index: int) -> Array | None:
