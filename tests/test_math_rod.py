@@ -1,5 +1,6 @@
 """Quadrature, rotations, small solves and steppers."""
 
+import functools
 from dataclasses import replace
 
 import jax
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from sorojax import rod as R
-from sorojax.math.compiled import batched
+from sorojax.math.compiled import batched, chunked_lanes
 from sorojax.math.lie import (
     FROM_MOMENTS,
     SE2,
@@ -145,6 +146,36 @@ def test_chunks_need_as_many_items_of_all():
         batched(jnp.add)(jnp.zeros(3), jnp.zeros(()))
     with pytest.raises(ValueError, match="`chunk` must be positive"):
         batched(jnp.add, chunk=0)
+
+
+@pytest.mark.versions
+@pytest.mark.parametrize("count", [5, 301])
+def test_lanes_in_chunks_and_their_derivatives(count):
+    """Where an argument is shared, a whole number, or no array."""
+
+    def plain(item, shift, power, name):
+        return jnp.sin(item["x"]).sum() * shift**power
+
+    def total(verb, x, shift):
+        return jax.vmap(lambda x: verb({"x": x}, shift, jnp.asarray(3), "two"))(x)
+
+    def square(verb, x, shift):
+        return jnp.sum(total(verb, x, shift) ** 2)
+
+    x, shift = jnp.linspace(0.0, 1.0, 2 * count).reshape(count, 2), jnp.asarray([1.5, 2.5])
+    verb = chunked_lanes(plain)
+    loops = str(jax.make_jaxpr(lambda x: total(verb, x, shift[0]))(x)).count("scan")
+    assert (loops > 0) == (count > 128)
+    for change, of in (
+        (jax.jit, total),
+        (lambda f: jax.jacfwd(f, argnums=1), total),
+        (lambda f: jax.jit(jax.grad(f, argnums=(0, 1))), square),
+        (lambda f: jax.hessian(f, argnums=1), square),
+    ):
+        found, want = (change(functools.partial(of, v))(x, shift[0]) for v in (verb, plain))
+        jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-13), found, want)
+    twice = jax.vmap(functools.partial(total, verb), (None, 0))(x, shift)
+    np.testing.assert_allclose(twice, [total(plain, x, each) for each in shift], rtol=1e-14)
 
 
 @pytest.mark.versions

@@ -27,6 +27,7 @@ from sorojax.rod import (
 )
 from sorojax.units import MPa, mm
 
+WORKERS = 1  # nothing here calls the host
 DURATION, SAVE = 0.5, 0.01  # s
 SAVES = round(DURATION / SAVE)
 PUBLISHED_TIP = np.array([7.999048e-2, -1.01831e-3])  # m at 0.5 s, by another code

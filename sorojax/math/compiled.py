@@ -169,6 +169,38 @@ def batched(verb: Callable[..., Any], *, chunk: int = CHUNK) -> Callable[..., An
     return every
 
 
+def chunked_lanes(verb: Verb) -> Verb:
+    """`verb`, whose lanes by `jax.vmap` are taken in chunks too; all at once in a derivative.
+
+    Without this an acceleration of a rod in 1024 states by `jax.vmap` takes 1.4 times as long.
+    """
+
+    @functools.wraps(verb)
+    def call(*args: Any) -> Any:
+        arrays, rest = eqx.partition(args, eqx.is_array)
+        leaves, tree = jax.tree.flatten(arrays)
+
+        def plain(*leaves: Array) -> Any:
+            return verb(*eqx.combine(jax.tree.unflatten(tree, leaves), rest))
+
+        lanes = jax.custom_batching.custom_vmap(plain)
+
+        @lanes.def_vmap
+        def _(count: int, moves: list[bool], *leaves: Array):
+            def one(lane: dict[int, Array]) -> Any:
+                return plain(*(lane.get(k, x) for k, x in enumerate(leaves)))
+
+            moving = {k: x for k, x in enumerate(leaves) if moves[k]}
+            found = batched(one)(moving) if count > 2 * CHUNK else jax.vmap(one)(moving)
+            return found, jax.tree.map(lambda _: True, found)
+
+        outer = jax.custom_jvp(lanes)
+        outer.defjvp(lambda values, rates: jax.jvp(plain, values, rates))
+        return outer(*leaves)
+
+    return call  # type: ignore[return-value]
+
+
 def _check_counts(arrays: Any) -> None:
     counts = {leaf.shape[0] if leaf.ndim else 0 for leaf in jax.tree.leaves(arrays)}
     if len(counts) != 1 or 0 in counts:

@@ -1,7 +1,7 @@
 """Length of time steps: proportional-integral control of adaptive runs, halving of steps that
 fail, and a check of runs with fixed steps by step doubling.
 
-The check computes some steps again from the same state by two of half the length; their
+The check computes some steps from the same state by two of half the length too; their
 distance is the error of these steps. A run whose errors add up to as much as its motion is
 unstable.
 
@@ -342,11 +342,11 @@ def _replay(attempt: Attempt, ends, given, h, state) -> PyTree:
     return jax.lax.scan(part, state, (starts, ends))[0]
 
 
-# Whether the steps of a run are short enough: a few of them made again as two halves
+# Whether the steps of a run are short enough: a few of them made as two halves too
 
 
 _FEWEST_ROWS = 160  # where a run has as many steps, so that checks cost a twentieth at most
-_ROWS_PER_CHECK = 80
+_ROWS_PER_CHECK = 160
 _FEWEST_STEPS = 8  # of a run that is judged
 _LIMIT = 0.7  # of the motion
 _COARSE = 0.4  # of what a row moved: then errors no longer follow the order of a method
@@ -358,7 +358,7 @@ class Passes(NamedTuple):
 
     Attributes:
         row: Number of the row.
-        part: 0 the whole row, 1 its first half again, 2 its second half again.
+        part: 1 and 2 the halves of a row that is judged, 0 the whole row, after them.
     """
 
     row: np.ndarray
@@ -374,30 +374,31 @@ class Passes(NamedTuple):
         """Where a pass begins, in rows."""
         return self.row + np.where(self.part == 2, 0.5, 0.0)
 
+    @property
+    def opens(self) -> np.ndarray:
+        """Whether a pass is the first one of its row."""
+        return np.diff(self.row, prepend=-1) > 0
+
 
 class Doubled(NamedTuple):
-    """The state of a run that repeats some of its rows: now, before the last row, and in the
-    middle of the row that is being repeated."""
+    """The state of a run that takes some of its rows by halves too: now, and where the last
+    pass ended."""
 
     now: PyTree
-    before: PyTree
-    middle: PyTree
+    last: PyTree
 
     @classmethod
     def at(cls, state: PyTree) -> "Doubled":
         """A run that begins."""
-        return cls(state, state, state)
+        return cls(state, jax.lax.stop_gradient(state))
 
     def begin(self, part: Array) -> PyTree:
         """The start of a pass."""
-        before, middle = jax.lax.stop_gradient((self.before, self.middle))
-        again = _where(part == 1, before, middle)
-        return _where(part == 0, self.now, again)
+        return _where(part == 2, self.last, self.now)
 
-    def end(self, part: Array, begun: PyTree, new: PyTree) -> "Doubled":
-        """The same after a pass from `begun` to `new`."""
-        whole = part == 0
-        return Doubled(_where(whole, new, self.now), _where(whole, begun, self.before), new)
+    def end(self, part: Array, new: PyTree) -> "Doubled":
+        """The same after a pass to `new`."""
+        return Doubled(_where(part == 0, new, self.now), jax.lax.stop_gradient(new))
 
 
 def rows_between(saves: int, every: int, judged: bool) -> int:
@@ -417,7 +418,7 @@ def passes(rows: int, steps: int, judged: bool) -> Passes:
         again = np.unique(np.linspace(0, rows - 1, min(count, rows)).round().astype(np.int32))
         row = np.concatenate([row, again, again])
         part = np.concatenate([part, np.ones_like(again), np.full_like(again, 2)])
-        order = np.lexsort((part, row))
+        order = np.lexsort(((part - 1) % 3, row))
         row, part = row[order], part[order]
     return Passes(row, part)
 

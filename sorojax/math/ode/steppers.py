@@ -299,7 +299,7 @@ def integrate(
             due = (part == 0) & ((number % pause == 0) | (number == count))
             tell_share = functools.partial(_tell_share, label, count)
             jax.lax.cond(due, tell_share, lambda _: None, number)
-        return run.end(part, begun, new), new
+        return run.end(part, new), new
 
     made = (plan.row + 1, plan.part, plan.start.astype(h.dtype), plan.length.astype(h.dtype))
     if idle:

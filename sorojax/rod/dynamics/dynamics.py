@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax._types import Numbers, real
-from sorojax.math.compiled import batched, full_products, jit_public
+from sorojax.math.compiled import batched, chunked_lanes, full_products, jit_public
 from sorojax.math.linalg.dense import solve_symmetric
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.moving import mass_jacobian, mass_position
@@ -92,9 +92,9 @@ def forward_dynamics(
 ) -> Float[Array, "*states dof"]:
     """Acceleration of the coordinates, q'' = M(q)^-1 (forces - c(q, q')), of one state or many.
 
-    States along a first axis of `q` and `v` are taken in chunks that stay in the cache of a
-    CPU, those of `jax.vmap` at once. For many models, or a loop around this function, use
-    `sorojax.math.compiled.batched`.
+    States along a first axis of `q` and `v`, and models and states by `jax.vmap`, are taken in
+    chunks that stay in the cache of a CPU. A loop around this function keeps its lanes at
+    once: give the loop to `sorojax.math.compiled.batched`.
 
     Args:
         model: The rod or assembly.
@@ -129,6 +129,7 @@ def forward_dynamics(
     return batched(one)(q, v)
 
 
+@chunked_lanes
 @full_products
 def acceleration(
     model: Model,

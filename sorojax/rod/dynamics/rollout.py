@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from sorojax._display import displayed, number, outcome
 from sorojax._types import Numbers, real
-from sorojax.math.compiled import full_products
+from sorojax.math.compiled import chunked_lanes, full_products
 from sorojax.math.ode.contact_midpoint import ContactMidpoint
 from sorojax.math.ode.step_control import judged_status
 from sorojax.math.ode.steppers import AbstractStepper, GeneralisedAlpha, SecondOrder, integrate
@@ -133,6 +133,14 @@ def _like(q, tree):
     return jax.tree.map(lambda x: x.astype(q.dtype) if eqx.is_inexact_array(x) else x, tree)
 
 
+@chunked_lanes
+def _equations(model, constants, forces, t, q, v):
+    """Inertia of the model, and the force that is left to accelerate it."""
+    moment = motion(model, q, v, constants=constants)
+    mass, coriolis = inertia(moment)
+    return mass, total_force(forces, t, moment) - coriolis
+
+
 def second_order(
     model: Model,
     q: Float[Array, " coordinates"],
@@ -148,9 +156,7 @@ def second_order(
     # reverse mode, in memory and in the compiled program.
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def equations(t, q, v):
-        moment = at(q, v)
-        mass, coriolis = inertia(moment)
-        return mass, total_force(forces, t, moment) - coriolis
+        return _equations(model, constants, forces, t, q, v)
 
     stiffness = tangent_stiffness(forces, motion(model, q, constants=constants))
     damping = damping_matrix(forces, model, constants)

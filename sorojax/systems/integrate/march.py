@@ -66,7 +66,7 @@ def fixed(
         new = walk.after(moved, t + h)
         if progress:
             tell("simulate", (number + 1) / (count * parts))
-        return run.end(part, walk, new), new.state
+        return run.end(part, new), new.state
 
     if method.carries:  # a step is large beside what it starts from
         advance = jax.checkpoint(advance, prevent_cse=False)  # pyright: ignore[reportPrivateImportUsage]

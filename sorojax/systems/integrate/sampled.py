@@ -159,11 +159,11 @@ def _run(network, loops, state, before, inputs, period, first, settings) -> Traj
 
     def advance(carry, one_pass):
         run, memories, held, kept = carry
-        row, part, start, length = one_pass
+        row, opens, part, start, length = one_pass
         tick, walk, h = first + row, run.begin(part), length * period
         t = period * (first.astype(period.dtype) + start)
-        # The call at the seam was made before; a pass that repeats a tick keeps its commands.
-        called = ((tick == first) & (first > 0)) | (part > 0)
+        # The call at the seam was made before; further passes of a tick keep its commands.
+        called = ((tick == first) & (first > 0)) | ~opens
         memories, held = jax.lax.cond(
             called,
             lambda: (memories, held),
@@ -171,7 +171,7 @@ def _run(network, loops, state, before, inputs, period, first, settings) -> Traj
         )
         given = (method, network, {**inputs, **held}, t, walk.state, walk.memory)
         new = walk.after(move.taken(given, h), t + h)
-        run = run.end(part, walk, new)
+        run = run.end(part, new)
         kept = jax.tree.map(lambda a, b: jnp.where(part == 0, a, b), walk.memory, kept)
         if progress:
             tell("simulate", row / ticks)
@@ -192,7 +192,8 @@ def _run(network, loops, state, before, inputs, period, first, settings) -> Traj
     walk = Walk(state, kept, finite(state), jnp.array(True), time[0])
     plan = passes(ticks + 1, (ticks + 1) * substeps, not method.carries)
     dtype = period.dtype
-    made = (plan.row, plan.part, plan.start.astype(dtype), plan.length.astype(dtype))
+    places = plan.start.astype(dtype), plan.length.astype(dtype)
+    made = (plan.row, plan.opens, plan.part, *places)
     carry, (seen, ends) = jax.lax.scan(advance, (Doubled.at(walk), memories, held, kept), made)
     states, values, memories, held = whole_rows(plan, seen)
     run, *_, kept = carry
