@@ -98,6 +98,12 @@ def in_space(where: str, noun: Any, **lengths: int) -> None:
             )
 
 
+def same_space(where: str, old: Any, new: Any) -> None:
+    """Raise a `ValueError` if a vector of `new` is of another space than that of `old`."""
+    space = {axis: n for _, axis, n in axes(old) if axis in ("dim", "twist")}
+    in_space(where, new, **space)
+
+
 def float64(where: str, value: Any) -> None:
     """Raise a `ValueError` unless `value` is float64."""
     if value.dtype != jnp.float64:

@@ -109,8 +109,7 @@ def _as_constructed(old: Any, new: Any) -> Any:
             raise _explain.refusal(where, field.name, kind, after)
         after = _as_constructed(before, after)
         object.__setattr__(made, field.name, field.metadata.get("converter", _same)(after))
-    space = {axis: length for _, axis, length in _check.axes(old) if axis in ("dim", "twist")}
-    _check.in_space("replace", made, **space)
+    _check.same_space("replace", old, made)
     for each in type(made).__mro__:
         if "__check_init__" in each.__dict__:
             each.__check_init__(made)

@@ -317,6 +317,28 @@ def test_tendons_do_not_push():
 
 
 @pytest.mark.stress(66)
+def test_vectors_are_of_the_space_that_they_act_in():
+    pushed = fem.problem(
+        SQUARE,
+        RUBBER,
+        kinematics=fem.PlaneStrain(),
+        supports=(HELD,),
+        loads=(fem.Force([2, 3], [0.0, 1.0], name="push"),),
+    )
+    weight, tip = rod.Gravity([0.0, 0.0, -9.81]), rod.TipWrench(np.zeros(6))
+    rest = jnp.zeros(ROD.basis.num_dof)
+    for verb, *given in (
+        (sj.replace, pushed, lambda p: p.loads[0].value, [0.0, 1.0, 2.0]),
+        (fem.with_load, pushed, "push", [0.0, 1.0, 2.0]),
+        (rod.equilibrium, ROD, (weight,)),
+        (rod.forward_dynamics, ROD, rest, rest, (tip,)),
+    ):
+        assert "need" in call(verb, *given)
+    lanes = sj.replace(pushed, lambda p: p.loads[0].value, np.ones((3, 2)))
+    assert lanes.loads[0].value.shape == (3, 2)  # for jax.vmap
+
+
+@pytest.mark.stress(66)
 def test_an_edit_is_converted_and_checked_as_by_the_constructor():
     wrench = sj.replace(rod.TipWrench(np.zeros(3)), lambda load: load.wrench, (0, 1, 2)).wrench
     assert isinstance(wrench, jax.Array) and wrench.shape == (3,)

@@ -334,7 +334,9 @@ def with_load(problem: Problem, name: str, value: Float[Array, "..."]) -> Proble
         )
     index = names.index(name)
     # a weakly typed number would compile every kernel again
-    return eqx.tree_at(lambda p: p.loads[index].value, problem, real(value))
+    made = eqx.tree_at(lambda p: p.loads[index].value, problem, real(value))
+    _check.same_space("fem.with_load", problem.loads[index], made.loads[index])
+    return made
 
 
 def _raise_if_failed(where: str, solution: Solution, throw: bool) -> None:
