@@ -93,8 +93,8 @@ def forward_dynamics(
     """Acceleration of the coordinates, q'' = M(q)^-1 (forces - c(q, q')), of one state or many.
 
     States along a first axis of `q` and `v`, and models and states by `jax.vmap`, are taken in
-    chunks that stay in the cache of a CPU. A loop around this function keeps its lanes at
-    once: give the loop to `sorojax.math.compiled.batched`.
+    chunks that stay in the cache of a CPU, also within a loop; lanes of a derivative are taken
+    at once. `sorojax.math.compiled.batched` takes whole loops and derivatives in chunks.
 
     Args:
         model: The rod or assembly.
