@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _OPTIONS = (
@@ -26,6 +27,11 @@ _OPTIONS = (
 def found() -> str | None:
     """Path of a Chromium of this machine."""
     return next((path for name in NAMES if (path := shutil.which(name))), None)
+
+
+needed = pytest.mark.skipif(
+    found() is None, reason=f"no browser on the PATH, looked for {', '.join(NAMES)}"
+)
 
 
 class Tab:

@@ -191,7 +191,7 @@ def test_a_page_follows_the_loop(rig):
     assert not feed.alive and not os.path.exists(feed._slots.path)
 
 
-@pytest.mark.skipif(chromium.found() is None, reason="no Chromium on the PATH")
+@chromium.needed
 def test_a_browser_shows_the_loop(rig):
     with view.live(rig) as feed, chromium.tab() as tab:
         feed.send(0.0, [0.0])

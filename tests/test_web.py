@@ -21,10 +21,6 @@ from sorojax.view.rigging.rig import placed
 from sorojax.view.web.actor import mesh_triangles
 from sorojax.view.web.page import Page
 
-needs_chromium = pytest.mark.skipif(
-    chromium.found() is None,
-    reason=f"no browser on the PATH, looked for {', '.join(chromium.NAMES)}",
-)
 SQUARE = Surface(
     np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
 )
@@ -210,7 +206,7 @@ def test_quaternions_of_a_file_turn_like_the_matrices():
     assert np.all(np.sum(found[1:] * found[:-1], axis=1) >= 0)
 
 
-@needs_chromium
+@chromium.needed
 def test_a_browser_plays_the_page(grasp, tmp_path):
     file = grasp[1].save(tmp_path / "grasp.html")
     with chromium.tab() as tab:
@@ -247,7 +243,7 @@ def test_a_browser_plays_the_page(grasp, tmp_path):
     assert 0.9 < np.ptp(wide) / np.ptp(high) < 1.1  # a ball is round
 
 
-@needs_chromium
+@chromium.needed
 def test_a_browser_shows_colours_where_they_belong(wave, tmp_path):
     made = view.actor(wave, field=lambda problem, u: problem.mesh.points[:, 0])
     file = view.to_html(made, label="place [m]", limits=(0.0, 0.1)).save(tmp_path / "a.html")

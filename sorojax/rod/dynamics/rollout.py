@@ -75,7 +75,7 @@ def rollout(
         progress: Report progress while running; of rods under `vmap` in one report.
         check: Compute some of the steps again by two of half the length, and end as `unstable`
             where errors add up to the motion: a twentieth of the time of a run of 160 steps
-            or more, four to six half steps of a shorter one. Runs of fewer than 8 steps are
+            or more, four half steps of a shorter one. Runs of fewer than 8 steps are
             not judged.
 
     Returns:
