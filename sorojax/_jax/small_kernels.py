@@ -60,7 +60,7 @@ _KINDS = {
 _LOOPS = {"scan", "while"}
 _INLINED = {
     "checkpoint", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call",
-    "custom_vjp_call_jaxpr", "jit", "pjit", "remat", "remat2",
+    "custom_vjp_call_jaxpr", "custom_vmap_call", "jit", "pjit", "remat", "remat2",
 }  # fmt: skip
 # In a kernel a library would be called for every entry.
 _FAST = {"sin": sine, "cos": cosine}
