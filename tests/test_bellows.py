@@ -23,6 +23,11 @@ def test_tip_lies_within_0_3_percent_of_the_converged_solution(path):
     assert tip_errors(path.problem, path.displacements)[1:].max() < 3e-3
 
 
+def test_linear_pressures_are_taken_where_they_are_asked_for():
+    assert isinstance(case_a(2 * mm, linear_pressure=True).formulation, fem.LinearPressure)
+    assert isinstance(case_a(2 * mm).formulation, fem.Displacement)
+
+
 def test_every_accepted_state_is_an_equilibrium_and_is_found_fast(path):
     steps = [step for stats in path.stats for step in stats.steps]
     assert max(step.residual for step in steps) < 1e-8

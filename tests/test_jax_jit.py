@@ -301,3 +301,30 @@ def test_an_adaptive_run_is_one_kernel(batched):
     assert jnp.array_equal(steps, count)
     for name in ("x", "v"):
         np.testing.assert_allclose(found[name], exact[name], rtol=0, atol=1e-12)
+
+
+@marked
+@pytest.mark.parametrize("run", ["acceleration", "rollout"])
+def test_loops_over_the_dynamics_of_a_rod_are_kernels(run):
+    """Whose functions have rules of their own for derivatives and lanes."""
+    body = R.rod(
+        sj.SE2(),
+        R.chebyshev(kappa_z=2),
+        R.circle(5e-3),
+        length=0.1,
+        young_modulus=1e6,
+        poisson_ratio=0.5,
+        density=1e3,
+    )
+    weight = (R.Gravity(),)
+
+    def loop(q):
+        def one(_, q):
+            return q + 1e-9 * R.forward_dynamics(body, q, 0.0 * q, weight)
+
+        if run == "acceleration":
+            return jax.lax.fori_loop(0, 5, one, q)
+        return R.rollout(body, q, 0.0 * q, weight, step=1e-3, saves=4, every=2).q[-1]
+
+    assert has_mark(loop, X[:2])
+    np.testing.assert_allclose(sj.jit(loop)(X[:2]), jax.jit(loop)(X[:2]), rtol=1e-10)

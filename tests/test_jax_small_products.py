@@ -8,6 +8,7 @@ from jax.test_util import check_grads
 
 from sorojax._jax import small_products
 from sorojax._jax.small_products import LARGEST, LARGEST_BATCH, product_p, with_sums
+from sorojax.math.compiled import chunked_lanes
 from sorojax.math.ode.explicit import rk4_step
 
 pytestmark = [
@@ -114,3 +115,14 @@ def test_a_product_outside_of_jit_is_the_library_one():
     numbers |= dict(preferred_element_type=None, out_sharding=None)
     a, b = jnp.arange(6.0).reshape(2, 3), jnp.ones(3)
     np.testing.assert_array_equal(product_p.bind(a, b, **numbers), a @ b)
+
+
+def test_products_behind_rules_for_derivatives_and_lanes_become_sums_too():
+    """As those of a rod's acceleration."""
+    verb = chunked_lanes(lambda x, y: y @ x)
+    x, y = jnp.arange(3.0), jnp.ones((2, 3))
+    program = jax.make_jaxpr(lambda x, y: with_sums(verb, x, y)(x, y))(x, y)
+    assert "small_product" in str(program) and "dot_general" not in str(program)
+    every = jax.vmap(lambda x: with_sums(verb, x, y)(x, y))(jnp.stack([x, 2 * x]))
+    np.testing.assert_allclose(every, [y @ x, 2 * y @ x])
+    np.testing.assert_allclose(jax.jacrev(lambda x: with_sums(verb, x, y)(x, y))(x), y)

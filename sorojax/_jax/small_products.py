@@ -19,7 +19,13 @@ from sorojax._jax.trace_state import outside_transformations
 
 LARGEST = 36  # multiplications in a product
 LARGEST_BATCH = 128  # in all lanes: beyond that, factors computed again cost more
-_INLINED = "jit", "pjit"
+# Calls, and where their program is.
+_INLINED = {
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vmap_call": "call",
+}
 
 _NAMES = (
     ("jax.extend.core", "Primitive"),
@@ -66,10 +72,11 @@ def _replaced(equation: Any) -> Any:
     if name == "dot_general" and _is_small(*(var.aval for var in equation.invars), **params):
         return equation.replace(primitive=product_p)
     if name in _INLINED:
-        inner = _with_sums(params["jaxpr"].jaxpr)
-        if inner is not params["jaxpr"].jaxpr:
-            closed = _found["ClosedJaxpr"](inner, params["jaxpr"].consts)
-            return equation.replace(params=params | {"jaxpr": closed})
+        where = _INLINED[name]
+        inner = _with_sums(params[where].jaxpr)
+        if inner is not params[where].jaxpr:
+            closed = _found["ClosedJaxpr"](inner, params[where].consts)
+            return equation.replace(params=params | {where: closed})
     return equation
 
 
