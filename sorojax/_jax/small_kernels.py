@@ -14,7 +14,6 @@ programs of `jax.extend.core`. A jaxlib that is not among `PROVEN` gets the plai
 
 import functools
 from collections.abc import Callable
-from importlib import metadata
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -26,6 +25,7 @@ from sorojax._jax.optional import optional, reason
 from sorojax._jax.small_products import multiplications
 from sorojax._jax.trace_state import is_tracer, outside_transformations
 from sorojax._jax.trigonometry import cosine, sine
+from sorojax._jax.versions import installed
 
 #: Releases of jaxlib on which random programs agree with the plain ones (`make fuzz`).
 PROVEN = ("0.10.2", "0.12.0.1")
@@ -36,7 +36,7 @@ LONGEST = 4000  # operations in a loop: beyond that one kernel compiles slowly
 LARGEST_GIVEN = 1024  # numbers in an argument: batches of states are no small arrays
 MARK = {"xla_cpu_small_call": "true", "inlineable": "false"}
 NO_MARK = {"xla_cpu_small_call": "false", "inlineable": "true"}  # of what a kernel calls
-_JAXLIB = metadata.version("jaxlib")
+_JAXLIB = installed("jaxlib") or ""
 # No kernel can hold products by that library.
 OPTIONS: dict[str, Any] = {"xla_cpu_experimental_ynn_fusion_type": ""}
 if _JAXLIB.startswith("0.10."):

@@ -2,6 +2,7 @@
 
 import importlib.util
 import re
+import sys
 from importlib import metadata
 
 OLDEST = "0.10.2"
@@ -21,6 +22,8 @@ def check() -> None:
 
 def installed(name: str) -> str | None:
     """The version of a package; `None` if there is none, "" if it is unknown."""
+    if known := getattr(sys.modules.get(name), "__version__", None):
+        return known  # a millisecond less than to read its files
     try:
         return metadata.version(name) or ""
     except metadata.PackageNotFoundError:

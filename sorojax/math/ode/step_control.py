@@ -346,7 +346,7 @@ def _replay(attempt: Attempt, ends, given, h, state) -> PyTree:
 
 
 _FEWEST_ROWS = 160  # where a run has as many steps, so that checks cost a twentieth at most
-_ROWS_PER_CHECK = 160
+_ROWS_PER_CHECK = 400
 _FEWEST_STEPS = 8  # of a run that is judged
 _LIMIT = 0.7  # of the motion
 _COARSE = 0.4  # of what a row moved: then errors no longer follow the order of a method

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from sorojax._display import displayed, number, outcome
 from sorojax._types import Numbers, real
-from sorojax.math.compiled import chunked_lanes, full_products
+from sorojax.math.compiled import chunked_lanes, full_products, jit_trees
 from sorojax.math.ode.contact_midpoint import ContactMidpoint
 from sorojax.math.ode.step_control import judged_status
 from sorojax.math.ode.steppers import AbstractStepper, GeneralisedAlpha, SecondOrder, integrate
@@ -110,7 +110,7 @@ def rollout(
     )
 
 
-@eqx.filter_jit
+@jit_trees
 @full_products
 def _rollout(model, q, v, forces, step, t, stepper, saves, every, label, check) -> Rollout:
     step, t, stepper = _like(q, (step, t, stepper))
