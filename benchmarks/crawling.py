@@ -15,13 +15,15 @@ FREQUENCY, DAMPING = 1.25, fem.Rayleigh(mass=1.0, stiffness=1e-3)
 GAIT = crawler_gait(8 * kPa, FREQUENCY)
 
 
-def run(problem: fem.Problem, duration: float, step: float, gait=None, **options) -> fem.Motion:
+def run(
+    problem: fem.Problem, duration: float, step: float, gait=None, **options
+) -> fem.Trajectory:
     """The crawler on its floor from rest."""
     gait = GAIT if gait is None else gait
     return fem.simulate(problem, duration, step, damping=DAMPING, **options, **gait)
 
 
-def moved(problem: fem.Problem, motion: fem.Motion) -> Float[Array, "times 2"]:
+def moved(problem: fem.Problem, motion: fem.Trajectory) -> Float[Array, "times 2"]:
     """Displacement of the centre of mass [m]."""
     weights = fem.lumped_mass(problem)[::2]
     shares = weights / jnp.sum(weights)
@@ -36,10 +38,10 @@ class Cycles(NamedTuple):
     cuts: int
 
 
-def cycles(problem: fem.Problem, *motions: fem.Motion) -> Cycles:
+def cycles(problem: fem.Problem, *motions: fem.Trajectory) -> Cycles:
     """Whole cycles of the gait in a motion from rest, and in those that go on from it."""
     x = np.concatenate([np.asarray(moved(problem, motion))[:, 0] for motion in motions])
-    times = np.concatenate([np.asarray(motion.times) for motion in motions])
+    times = np.concatenate([np.asarray(motion.time) for motion in motions])
     count = round(float(times[-1]) * FREQUENCY)
     ends = np.interp(np.arange(count + 1) / FREQUENCY, times, x)
     floor = problem.loads[-1]

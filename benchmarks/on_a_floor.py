@@ -29,7 +29,7 @@ def timed(go, *arguments, **options) -> tuple[Timing, Any]:
 
 
 def against_felupe(
-    run: Callable[..., fem.Motion],
+    run: Callable[..., fem.Trajectory],
     problem: fem.Problem,
     damping: Any,
     steps: int,

@@ -64,7 +64,7 @@ ROWS = {
     ),
     "inverse kinematics and estimator": Cases(("rod.ik", "systems.estimator")),
     "gradients": Cases(("fem.gradient",), ("rod.gradient",)),
-    "start": Cases(("cli.import", "rod.first_call"), ("view.first",)),
+    "start": Cases(("cli.import", "rod.first_call"), ("cold.calls", "view.first")),
     "pictures": Cases(("view.skin",), ("view.film", "view.web")),
     "single precision": Cases(("precision.single",)),
     "what a scene does not need": Cases(("skip.features",)),

@@ -24,7 +24,7 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
 
     shares = fem.lumped_mass(problem)[::2] / fem.total_mass(problem)
     centre = np.asarray(jnp.einsum("n,tni->ti", shares, motion.displacements)) / mm
-    ends = np.interp(PERIOD * np.arange(cycles + 1), np.asarray(motion.times), centre[:, 0])
+    ends = np.interp(PERIOD * np.arange(cycles + 1), np.asarray(motion.time), centre[:, 0])
     floor = problem.loads[-1]
     assert isinstance(floor, fem.Contact)
     deepest = jnp.min(jax.lax.map(lambda u: floor.points_of(problem, u)[..., 1].min(),
@@ -46,7 +46,7 @@ def draw(problem, motion, centre, file: Path) -> None:
 
     facets = np.asarray(sj.mesh.boundary_facets(problem.mesh))[:, [0, 2, 1]]
     positions = np.asarray(problem.mesh.points + motion.displacements) / mm
-    times = np.asarray(motion.times)
+    times = np.asarray(motion.time)
     figure, axes = plt.subplots(5, 1, figsize=(7, 6), height_ratios=[1, 1, 1, 1, 2])
     for k, share in enumerate((0.0, 0.25, 0.5, 0.75)):
         now = positions[np.searchsorted(times, (times[-1] // PERIOD - 1 + share) * PERIOD)]

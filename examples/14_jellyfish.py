@@ -50,7 +50,7 @@ def lay(angle, q):
     found = rod.inverse_kinematics(finger, rod.Position(aims, outer), q, obstacles=(clear,))
     line = rod.forward_kinematics(finger, found.q, jnp.linspace(0.0, 1.0, 401))[:, :3, 3]
     tip = base[:3, :3] @ line[-1] + base[:3, 3]
-    return found.q, found.num_iterations, ball(line) - THICKNESS / 2, tip
+    return found.q, found.iterations, ball(line) - THICKNESS / 2, tip
 
 
 def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:

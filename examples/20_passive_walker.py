@@ -20,7 +20,7 @@ from sorojax.units import deg, mm, ms
 RUBBER, SLOPE, DROP = fem.KelvinVoigt(800.0), 30 * deg, 3 * mm
 
 
-def walk(duration: float, step: float, method=None, **floor: Any) -> fem.Motion:
+def walk(duration: float, step: float, method=None, **floor: Any) -> fem.Trajectory:
     """From rest, a little above the slope."""
     floor = {"slope": SLOPE, "friction": 0.7} | floor
     problem = robots.walker_problem(robots.Walker(), size=2.5 * mm, **floor)
@@ -29,10 +29,10 @@ def walk(duration: float, step: float, method=None, **floor: Any) -> fem.Motion:
     return fem.simulate(problem, duration, step, start=start, damping=RUBBER, method=method)
 
 
-def legs(motion: fem.Motion):
+def legs(motion: fem.Trajectory):
     """Angles of the pairs of legs [rad], and their gait."""
     angles = robots.pair_angles(robots.Walker(), motion.problem.mesh, motion.displacements)
-    return np.asarray(angles), robots.gait(np.asarray(motion.times), np.asarray(angles))
+    return np.asarray(angles), robots.gait(np.asarray(motion.time), np.asarray(angles))
 
 
 #: What is changed, and the frequency of the gait in the first 0.4 s told.
@@ -52,7 +52,7 @@ CASES = {
 def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
     motion = walk(0.4 if quick else 0.7, (2 if quick else 1) * ms)
     angles, gait = legs(motion)
-    times, problem = np.asarray(motion.times), motion.problem
+    times, problem = np.asarray(motion.time), motion.problem
     front = mesh.nearest_node(problem.mesh, np.asarray(robots.Walker().bottoms())[-1])
     path = np.asarray(motion.displacements[:, front]) / mm
     forward, late = np.diff(path[len(times) // 2 :, 0]), angles[len(times) // 2 :] / deg
@@ -83,7 +83,7 @@ def draw(problem, motion, angles, path, others, numbers, file: Path) -> None:
     """Moments of a period, angles, the way of the front foot, and what changes the rhythm."""
     import matplotlib.pyplot as plt
 
-    times = np.asarray(motion.times)
+    times = np.asarray(motion.time)
     facets = np.asarray(mesh.boundary_facets(problem.mesh))[:, [0, 2, 1]]
     positions = np.asarray(problem.mesh.points + motion.displacements) / mm
     turn = np.array([[np.cos(SLOPE), -np.sin(SLOPE)], [np.sin(SLOPE), np.cos(SLOPE)]])

@@ -2,19 +2,40 @@
 benchmarks; never switched on by an import.
 
 Whoever can write to the cache can run code in the process that reads it, so the
-directory belongs to one user and to nobody else.
+directory belongs to one user and to nobody else. Compiled programs hold instructions of the
+processor, so each type of processor has a folder of its own.
 """
 
+import hashlib
 import os
+import platform
 import stat
 import warnings
 from pathlib import Path
 
 
 def cache_directory() -> Path:
-    """Where compiled programs are kept: `$SOROJAX_CACHE/jax`, by default
-    `$XDG_CACHE_HOME/sorojax/jax` or `~/.cache/sorojax/jax`."""
-    return _root() / "jax"
+    """Where compiled programs for this type of processor are kept: in `$SOROJAX_CACHE/jax`, by
+    default in `$XDG_CACHE_HOME/sorojax/jax` or `~/.cache/sorojax/jax`."""
+    return _root() / "jax" / _processor()
+
+
+def cached_programs() -> tuple[int, float]:
+    """How many compiled programs are kept for this type of processor, and their size [MB]."""
+    files = [path for path in cache_directory().glob("*-cache") if path.is_file()]
+    return len(files), sum(path.stat().st_size for path in files) / 1e6
+
+
+def clear_compilation_cache() -> int:
+    """Delete the compiled programs for all types of processor; how many files there were."""
+    folder, count = _root() / "jax", 0
+    for path in sorted(folder.rglob("*"), reverse=True):
+        if path.is_dir() and not path.is_symlink():
+            path.rmdir()
+        else:
+            path.unlink()
+            count += 1
+    return count
 
 
 def enable_compilation_cache() -> Path | None:
@@ -51,10 +72,20 @@ def _root() -> Path:
     return Path(base).expanduser().absolute() / "sorojax"
 
 
+def _processor() -> str:
+    """A name for this type of processor."""
+    rows = [platform.processor()]
+    if (listed := Path("/proc/cpuinfo")).exists():
+        named = ("model name", "flags", "Features", "CPU part")
+        rows += [row for row in listed.read_text().splitlines() if row.startswith(named)]
+    digest = hashlib.sha256("\n".join(sorted(set(rows))).encode()).hexdigest()
+    return f"{platform.machine()}-{digest[:12]}"
+
+
 def _private_directory() -> Path:
     root, directory = _root(), cache_directory()
     root.parent.mkdir(parents=True, exist_ok=True)
-    for path in (root, directory):
+    for path in (root, directory.parent, directory):
         path.mkdir(mode=0o700, exist_ok=True)
         _refuse_shared(path)
         path.chmod(0o700)

@@ -87,7 +87,7 @@ def cache(tmp_path, monkeypatch):
     )
     before = {name: getattr(jax.config, name) for name in names}
     monkeypatch.setenv("SOROJAX_CACHE", str(tmp_path / "cache"))
-    yield tmp_path / "cache" / "jax"
+    yield cache_directory()
     for name, value in before.items():
         jax.config.update(name, value)
 
@@ -98,7 +98,8 @@ def test_cache_is_private(cache):
         assert enable_compilation_cache() == cache
     finally:
         os.umask(old)
-    assert [p.stat().st_mode & 0o777 for p in (cache, cache.parent)] == [0o700, 0o700]
+    folders = cache, cache.parent, cache.parent.parent
+    assert [path.stat().st_mode & 0o777 for path in folders] == [0o700] * 3
     assert jax.config.jax_compilation_cache_dir == str(cache)
 
 
@@ -120,7 +121,7 @@ def test_cache_that_others_write_is_refused(cache, mode):
 
 
 def test_cache_that_is_a_link_is_refused(cache, tmp_path):
-    cache.parent.mkdir(mode=0o700)
+    cache.parent.mkdir(mode=0o700, parents=True)
     cache.symlink_to(tmp_path)
     with pytest.raises(ValueError, match="link or belongs to someone else"):
         enable_compilation_cache()
@@ -136,10 +137,41 @@ def test_cache_that_cannot_be_made_warns(tmp_path, monkeypatch):
 def test_cache_follows_the_user_directories(monkeypatch, tmp_path):
     monkeypatch.delenv("SOROJAX_CACHE", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert cache_directory() == tmp_path / "sorojax" / "jax"
+    assert cache_directory().parent == tmp_path / "sorojax" / "jax"
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert cache_directory() == tmp_path / ".cache" / "sorojax" / "jax"
+    assert cache_directory().parent == tmp_path / ".cache" / "sorojax" / "jax"
+
+
+def test_programs_of_another_type_of_processor_stay_apart(cache, monkeypatch):
+    monkeypatch.setattr("platform.processor", lambda: "of another make")
+    assert cache_directory() != cache and cache_directory().parent == cache.parent
+
+
+def test_cache_is_warmed_by_the_demo(cache, monkeypatch, capsys):
+    def run(folder, quick):
+        assert folder.is_dir() and not quick
+        (cache / "jit_step-1-cache").touch()
+        return 0
+
+    monkeypatch.setattr("sorojax.cli.demo.run", run)
+    assert main(["cache", "--warm"]) == 0
+    assert "1 programs more" in capsys.readouterr().out
+
+
+def test_cache_is_counted_and_cleared(cache, capsys):
+    cache.mkdir(parents=True)
+    (cache / "jit_step-1-cache").write_bytes(bytes(2_000_000))
+    (cache / "jit_step-1-atime").write_bytes(bytes(8))
+    assert main(["cache", "--info"]) == 0
+    told = capsys.readouterr().out
+    assert str(cache) in told and "1 programs, 2.0 MB" in told
+    assert main(["cache", "--clear"]) == 0
+    assert "2 files deleted" in capsys.readouterr().out
+    assert cache.parent.is_dir() and not any(cache.parent.iterdir())
+    assert main(["cache", "--clear"]) == 0
+    assert main(["cache"]) == 0
+    assert "0 programs" in capsys.readouterr().out
 
 
 def test_a_robot_is_written_with_its_checks(tmp_path, capsys):

@@ -110,6 +110,32 @@ def test_gcmma_proposes_again_nearer_where_a_function_is_not_defined(objective, 
     assert np.allclose(found.design, best, atol=1e-3)
 
 
+@pytest.mark.parametrize("double", [True, False])
+def test_gcmma_calls_no_search_successful_that_rounding_ended(double):
+    """The objective ends with a slope of minus infinity at 0, its optimum is at 1e-4."""
+    with jax.enable_x64(double):
+        found = design.minimise(
+            lambda x: jnp.sum(x - 0.02 * jnp.sqrt(x)),
+            jnp.array([1.9, 1.5]),
+            optimiser=design.GCMMA(-50.0, 2.0),
+            tolerance=1e-4,
+        )
+    assert found.status == Status.successful
+    assert np.allclose(found.design, 1e-4, atol=1e-3)
+
+
+def test_gcmma_that_finds_no_step_is_not_converged():
+    """An objective with noise, which every proposal seems to lie below."""
+    calls = iter(range(10**6))
+    found = design.minimise(
+        lambda x: jnp.sum(x) + jnp.asarray(1e-2 * next(calls)),
+        jnp.array([1.9, 1.5]),
+        optimiser=design.GCMMA(-50.0, 2.0),
+        tolerance=1e-4,
+    )
+    assert found.status == Status.not_converged
+
+
 def test_a_search_without_a_finite_proposal_says_so_and_keeps_its_design():
     start = jnp.array([1.9, 1.5])
     found = design.minimise(

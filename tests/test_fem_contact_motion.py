@@ -44,7 +44,7 @@ def bounce(problem, duration=0.04, step=2.5e-4, speed=(0.3, -0.5), spin=-40.0, *
     return fem.simulate(problem, duration, step, start=start, **options)
 
 
-def total(motion: fem.Motion) -> np.ndarray:
+def total(motion: fem.Trajectory) -> np.ndarray:
     """Energy of the body, its weight and its contact [J]."""
     e = motion.energies
     return np.asarray(e.kinetic + e.elastic + e.loads)
@@ -65,7 +65,7 @@ def _rubbing(floor, problem, old, new):
     return jnp.sum(force * way.reshape(force.shape))
 
 
-def rubbed(motion: fem.Motion) -> float:
+def rubbed(motion: fem.Trajectory) -> float:
     """Work of friction [J], of the forces on the ways of its points in every step."""
     floors, u, work = motion.states.memory[-1], motion.displacements, 0.0
     for k in range(1, len(motion)):
@@ -102,11 +102,11 @@ def test_a_conserving_method_keeps_the_energy_of_a_bouncing_ring():
     assert float(motion.energies.loads.max()) > 0.01 * energy[0]  # it was in contact
 
 
-def share_of_the_impulse(motion: fem.Motion) -> float:
+def share_of_the_impulse(motion: fem.Trajectory) -> float:
     """Of what the floor gave along it, over what it gave across."""
     linear = np.asarray(fem.momentum(motion)[0])
     along, across = linear[-1] - linear[0]
-    across += 9.81 * float(fem.total_mass(motion.problem) * motion.times[-1])
+    across += 9.81 * float(fem.total_mass(motion.problem) * motion.time[-1])
     return -along / across
 
 
@@ -176,7 +176,7 @@ def plate(obstacle, young_modulus, stiffness=None, friction=None, *loads) -> fem
     )
 
 
-def shot(problem, duration, step, height=10 * mm, **options) -> fem.Motion:
+def shot(problem, duration, step, height=10 * mm, **options) -> fem.Trajectory:
     """Down at 100 m/s."""
     rest = jnp.zeros_like(problem.mesh.points)
     start = rest.at[:, 1].set(height), rest.at[:, 1].set(-100.0)
@@ -186,7 +186,7 @@ def shot(problem, duration, step, height=10 * mm, **options) -> fem.Motion:
 WALL = sdf.Rectangle([-0.1, -1 * mm], [0.1, 0.0])
 
 
-def risen(motion: fem.Motion) -> float:
+def risen(motion: fem.Trajectory) -> float:
     """Share of its energy that a body was given by nobody."""
     energy = total(motion)
     assert np.all(np.isfinite(energy))

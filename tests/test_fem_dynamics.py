@@ -45,7 +45,7 @@ def mode():
     return shape, 1 / float(modes.frequencies[0])
 
 
-def _tip(motion: fem.Motion) -> np.ndarray:
+def _tip(motion: fem.Trajectory) -> np.ndarray:
     return np.asarray(motion.displacements[:, TIP, 1])
 
 
@@ -61,7 +61,7 @@ def test_free_vibration_is_of_order_two_in_time(mode, method):
         motion = fem.simulate(
             _beam(), 1.25 * period, period / count, start=(shape, 0 * shape), method=method
         )
-        angle = 2 * np.pi * np.asarray(motion.times) / period
+        angle = 2 * np.pi * np.asarray(motion.time) / period
         errors.append(np.abs(_tip(motion) - _tip(motion)[0] * np.cos(angle)).max() / 1e-4)
     assert 3.4 < errors[0] / errors[1] < 4.6, errors
     assert errors[1] < 0.05
@@ -71,7 +71,7 @@ def test_the_frequency_of_a_clamped_beam(mode):
     """Zero crossings against the first mode, from 50 steps per period on within 0.5 %."""
     shape, period = mode
     motion = fem.simulate(_beam(), 2.5 * period, period / 50, start=(shape, 0 * shape))
-    times, tip = np.asarray(motion.times), _tip(motion)
+    times, tip = np.asarray(motion.time), _tip(motion)
     k = np.flatnonzero(tip[:-1] * tip[1:] < 0)
     crossings = times[k] - tip[k] * (times[k + 1] - times[k]) / (tip[k + 1] - tip[k])
     found = 2 * (crossings[-1] - crossings[0]) / (len(crossings) - 1)
@@ -343,7 +343,7 @@ def test_a_motion_becomes_a_series_of_files(tmp_path):
         "beam.pvd"
     ]
     listed = files[-1].read_text()
-    assert all(f'timestep="{float(t)!r}"' in listed for t in motion.times)
+    assert all(f'timestep="{float(t)!r}"' in listed for t in motion.time)
 
 
 @pytest.mark.parametrize(

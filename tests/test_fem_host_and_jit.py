@@ -20,7 +20,7 @@ def wall(height, load, rise=0.0, poisson_ratio=0.3, formulation=None) -> fem.Pro
     loads = [*np.atleast_1d(load), 0.0, 0.0][:3]
     return fem.problem(
         mesh.Mesh(points, GRID.cells, GRID.element),
-        material.neo_hookean(young_modulus=1e6, poisson_ratio=poisson_ratio),
+        material.neo_hookean(young_modulus=1e6, poisson_ratio=poisson_ratio, density=1000),
         kinematics=fem.PlaneStrain(1.0),
         supports=(fem.Fixed(nodes["left"]), fem.Fixed(nodes["right"])),
         loads=tuple(
@@ -64,7 +64,7 @@ def block(shear=5e4) -> fem.Problem:
     floor = sdf.HalfPlane([0.0, 0.0], [0.0, 1.0])
     return fem.problem(
         shape,
-        material.neo_hookean(young_modulus=1e6, poisson_ratio=0.3),
+        material.neo_hookean(young_modulus=1e6, poisson_ratio=0.3, density=1000),
         kinematics=fem.PlaneStrain(0.03),
         supports=(),
         loads=(
@@ -147,3 +147,60 @@ def test_a_trace_goes_the_way_of_the_host(name):
     rounding = 1e-12 * jnp.max(jnp.abs(problem.mesh.points))
     largest = jnp.max(jnp.abs(u))
     assert jnp.max(jnp.abs(traced_u - u)) <= 1e-8 * largest + rounding
+
+
+# Motion: the problem, the velocity of all nodes [m/s], duration and step [s], options
+
+
+def thrown(problem, x=0.0, y=0.0):
+    points = problem.mesh.points
+    return jnp.zeros_like(points), jnp.zeros_like(points) + jnp.array([x, y])
+
+
+def lifted(problem, x, y):
+    """Two millimetres over where it is, and thrown."""
+    _, speed = thrown(problem, x, y)
+    return jnp.zeros_like(speed).at[:, 1].set(2 * mm), speed
+
+
+MOTIONS = {
+    "wall vibrates": (lambda: wall(10 * mm, 1e4), None, 4e-3, 1e-3, {}),
+    "steps follow their error": (
+        lambda: wall(10 * mm, 1e4), None, 1e-2, 2.5e-3, {"adaptive": 1e-2},
+    ),
+    "thin wall is thrown off": (lambda: wall(1 * mm, 1e5), None, 5e-3, 5e-3, {}),
+    "wall is crushed": (lambda: wall(50 * mm, 1e8), None, 1e-2, 1e-2, {"max_cuts": 2}),
+    "block meets a floor": (
+        lambda: block(shear=0.0), lambda p: lifted(p, 0.0, -5.0), 2e-3, 5e-4, {},
+    ),
+    "block slides on a floor": (
+        lambda: block(shear=0.0), lambda p: thrown(p, 1.0), 2e-3, 5e-4, {},
+    ),
+    "energy is conserved": (
+        lambda: wall(5 * mm, 1e4), None, 4e-3, 1e-3, {"method": fem.EnergyMomentum()},
+    ),
+}  # fmt: skip
+
+
+def moved(problem, start, duration, step, options):
+    motion = fem.simulate(problem, duration, step, start=start, throw=False, **options)
+    counts = jnp.stack([motion.steps, motion.cuts])
+    return motion.end.displacement, motion.status, counts
+
+
+moved_in_trace = eqx.filter_jit(moved)
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_a_motion_in_a_trace_takes_the_steps_of_the_host(name):
+    make, start, duration, step, options = MOTIONS[name]
+    problem = make()
+    start = None if start is None else start(problem)
+    u, status, counts = moved(problem, start, duration, step, options)
+    traced_u, traced_status, traced_counts = moved_in_trace(
+        problem, start, duration, step, options
+    )
+    assert status == traced_status
+    assert (status == Status.successful) == (name != "wall is crushed")
+    assert traced_counts.tolist() == counts.tolist()
+    assert jnp.max(jnp.abs(traced_u - u)) <= 1e-6 * jnp.max(jnp.abs(u))

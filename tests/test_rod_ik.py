@@ -266,7 +266,7 @@ def test_an_axis_is_turned_while_a_section_stays_put():
     assert jnp.allclose(end[:3, 3], place, rtol=0, atol=1e-8)
     # The null space has a say out of reach, too, and must not keep the search awake.
     found, _ = turn(far)
-    assert found.status == Status.out_of_reach and found.num_iterations < 60
+    assert found.status == Status.out_of_reach and found.iterations < 60
     assert 1e-3 < found.error < 1.8e-3
 
 
@@ -301,7 +301,7 @@ def test_the_least_energy_has_first_and_second_derivatives():
         return found, slope, bend, jax.vmap(lambda x: exact(found.q, x))(near)
 
     found, slope, bend, e = both(jnp.array(0.07))
-    assert found.status == Status.successful and found.num_iterations < 40
+    assert found.status == Status.successful and found.iterations < 40
     first = (e[0] - 8 * e[1] + 8 * e[3] - e[4]) / 12e-4
     second = (-e[0] + 16 * e[1] - 30 * e[2] + 16 * e[3] - e[4]) / 12e-8
     assert jnp.abs(slope / first - 1) < 1e-7 and jnp.abs(bend / second - 1) < 1e-6

@@ -91,14 +91,15 @@ def test_an_arch_snaps_through():
     path = R.arc_length_path(ARCH, press, first=0.1, steps=60, longest=1.5)
     assert jnp.all(path.status._value == Status.successful._value)
     rest = jax.jit(jax.vmap(lambda q, f: R.total_force(press(f), 0.0, R.motion(ARCH, q))))(
-        path.q, path.factor
+        path.q, path.factors
     )
     stiffness = R.stiffness_matrix(ARCH)
     assert jnp.abs(rest).max() < 1e-8 * jnp.abs(stiffness @ path.q[-1]).max()
     # It turns back at limit points, is unstable between, and stable on the other side.
-    turns = jnp.diff(jnp.sign(jnp.diff(path.factor)))
+    turns = jnp.diff(jnp.sign(jnp.diff(path.factors)))
     assert jnp.sum(turns < 0) >= 1 and jnp.sum(turns > 0) >= 1
-    assert path.negative[0] == 0 and path.negative.max() >= 1 and path.negative[-1] == 0
+    negative = path.negative_eigenvalues
+    assert negative[0] == 0 and negative.max() >= 1 and negative[-1] == 0
 
 
 def test_an_assembly_hangs_as_the_rod_it_is_made_of():

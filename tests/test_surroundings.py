@@ -14,7 +14,7 @@ from sorojax.design.pneunet import body, body_of
 from sorojax.math.status import Status
 from sorojax.robots.models.supply import Model
 from sorojax.robots.surroundings import InContact
-from sorojax.rod.dynamics.rollout import Rollout
+from sorojax.rod.dynamics.rollout import Trajectory
 from sorojax.units import kPa, mm
 from sorojax_hardware import SimulatedClock, run_loop, simulated_board
 from sorojax_hardware.protocols import Image
@@ -155,7 +155,7 @@ def test_what_an_impedance_asked_for_along_a_motion():
     goal = systems.Waypoints([0.0, 1.0], [[80 * mm, 0.0], [70 * mm, 10 * mm]])
     law = systems.CartesianImpedance(BEAM, (rod.Damping(0.02),), goal, 10.0, 0.5)
     time, q = jnp.array([0.0, 0.5]), jnp.array([[0.0, 0.0], [3.0, 1.0]])
-    path = Rollout(time, q, 0.1 * q, Status.successful)
+    path = Trajectory(time, q, 0.1 * q, Status.successful)
     done = systems.tracking(law, path)
     assert np.allclose(done.goal[1], [75 * mm, 5 * mm])
     assert np.allclose(done.tip[0], [80 * mm, 0.0])

@@ -10,8 +10,8 @@ from sorojax.fem.stability.buckling import CriticalLoads
 from sorojax.fem.stability.continuation import CriticalPoint
 from sorojax.math.status import Status
 from sorojax.mesh.repair import Repaired
-from sorojax.rod.statics.inverse_kinematics import IKResult
-from sorojax.rod.statics.path import EquilibriumPath
+from sorojax.rod.statics.equilibrium import Solution
+from sorojax.rod.statics.path import Path
 from sorojax.view import style
 from sorojax.view.draw.robots import air_of, robot_scene
 from sorojax.view.raster.scene import Surface
@@ -99,13 +99,14 @@ def test_answers_of_rods_are_posed():
         nodes=6,
     )
     q = jnp.array([8.0, 0.0])
-    found = IKResult(q, Status.successful, jnp.array(2e-6), jnp.array(0.0), jnp.array(4))
+    found = Solution(q, Status.successful, jnp.array(4), error=jnp.array(2e-6))
     shown = view.show(found, model=arm)
     assert is_whole(shown) and "error 2e-06" in words(shown)
     tip = np.asarray(R.forward_kinematics(arm, q, [0.97]))[0, :2, 2]
     assert near(patch(shown, pixels(shown), tip[None]), rgb(style.BODY)).mean() > 0.5
     rows = jnp.linspace(0, 1, 9)[:, None] * q[None]
-    path = EquilibriumPath(rows, Status.successful, jnp.ones(9, int))
+    ones = jnp.ones(9, int)
+    path = Path(rows, Status.successful, rows[:, 0], 0 * ones, ones)
     assert len(view.show(path, model=arm).figure.axes[0].patches) == 5
 
 

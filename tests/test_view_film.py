@@ -23,7 +23,7 @@ from sorojax.fem.equilibrium.solve import Path
 from sorojax.fem.stability.modal import Modes
 from sorojax.math.lie import SE2, SE3
 from sorojax.math.status import Status
-from sorojax.rod.dynamics.rollout import Rollout
+from sorojax.rod.dynamics.rollout import Trajectory
 from sorojax.view.film.tracks import positions_track, track_of
 from sorojax.view.raster.scene import Surface
 
@@ -105,7 +105,7 @@ def test_slow_motion_and_stamp():
     assert added[:24, :80].sum() > 20 and not added[24:].any() and not added[:, 80:].any()
     with pytest.raises(ValueError, match="positive speed"):
         view.animate(track(), speed=0.0)
-    with pytest.raises(TypeError, match="got a float, need a Motion"):
+    with pytest.raises(TypeError, match="got a float, need a Trajectory"):
         view.animate(1.0)
 
 
@@ -153,7 +153,7 @@ def test_a_rod_and_a_mode_and_moved_nodes_are_filmed(beam, path):
         poisson_ratio=0.4,
         density=1e3,
     )
-    run = Rollout(
+    run = Trajectory(
         jnp.linspace(0, 1, 5),
         jnp.linspace(0, 10, 5)[:, None],
         jnp.zeros((5, 1)),

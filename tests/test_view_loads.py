@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sorojax import fem, material, mesh as M, rod as R, view
-from sorojax.fem.equilibrium.volume import CavitySolution, VolumePath
+from sorojax.fem.equilibrium.solve import Path
 from sorojax.math.lie import SE2, SE3, homogeneous
 from sorojax.math.status import Status
 from sorojax.reduction.backbone import Backbone
@@ -122,14 +122,14 @@ def test_a_cavity_in_a_solid_is_seen_through_it():
     assert "under pressure" in words(picture) and "air: 20 kPa" in words(picture)
     red, green, blue = np.moveaxis(pixels(picture), 2, 0)
     assert np.sum((red > green + 15) & (green >= blue - 5)) > 500  # the wall, seen through
-    closed = CavitySolution(
+    closed = fem.Solution(
         problem,
         0 * body.points,
-        jnp.array([2e4]),
-        jnp.array([3e-6]),
-        ("air",),
         Status.successful,
         None,
+        cavities=("air",),
+        pressures=jnp.array([2e4]),
+        volumes=jnp.array([3e-6]),
     )
     assert "air: 20 kPa" in words(view.show(closed, field=None, renderer="own"))
     assert repr(closed).splitlines()[1] == "  air: 2e+04 Pa in 3e-06 m^3"
@@ -146,19 +146,12 @@ def test_moved_supports_are_told_from_held_ones():
 def test_volumes_of_a_cavity_name_the_states_of_a_path():
     problem = loaded(2, fem.Pressure(M.boundary_facets(beam(2)), 1e3, name="air"))
     shapes = jnp.stack([0 * beam(2).points, 0.05 * beam(2).points])
-    path = VolumePath(
-        problem,
-        shapes,
-        jnp.array([1e-5, 2e-5]),
-        jnp.array([1e3, 3e3]),
-        "air",
-        Status.successful,
-        (),
-    )
+    volumes, pressures = jnp.array([1e-5, 2e-5]), jnp.array([1e3, 3e3])
+    path = Path(problem, shapes, volumes, "air", Status.successful, (), pressures)
     picture = view.show(path, field=None)
     assert "10 ml at 1 kPa" in words(picture) and "20 ml at 3 kPa" in words(picture)
     assert track_of(path, field=None).unit == "ml"
-    assert repr(path).startswith("VolumePath: 2 states, successful")
+    assert repr(path).startswith("Path: 2 states, successful")
 
 
 ROD = {"length": 0.12, "young_modulus": 1e5, "poisson_ratio": 0.49, "density": 1e3}

@@ -54,7 +54,7 @@ def record(load: float) -> design.Experiment:
         damping = fem.KelvinVoigt(p["viscosity"])
         motion = fem.simulate(body, DURATION, STEP, damping=damping)
         heights = motion.displacements[:, tip, 1]
-        return jnp.concatenate([drops, swing(motion.times, heights, frequency)])
+        return jnp.concatenate([drops, swing(motion.time, heights, frequency)])
 
     measured = np.concatenate([np.mean(DROPS[load], axis=0), [frequency, ratio]])
     noise = np.concatenate([NOISE, [FREQUENCY_NOISE * frequency, RATIO_NOISE * ratio]])

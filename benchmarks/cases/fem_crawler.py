@@ -33,7 +33,7 @@ def rows():
     yield _slopes()
 
 
-def _second(problem, step, timing: Timing, motion: fem.Motion) -> Row:
+def _second(problem, step, timing: Timing, motion: fem.Trajectory) -> Row:
     """One second of motion."""
     stats, took = motion.stats, timing.runs[0]
     settings = {
@@ -47,7 +47,7 @@ def _second(problem, step, timing: Timing, motion: fem.Motion) -> Row:
     return Row("sorojax", settings, **timing.columns(), bar=60.0)
 
 
-def _changes(problem, second: fem.Motion):
+def _changes(problem, second: fem.Trajectory):
     """Way of a cycle under other numbers; other cells by their first cycle."""
     law: Any = problem.loads[-1]
     stiffer = eqx.tree_at(

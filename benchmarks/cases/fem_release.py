@@ -69,7 +69,7 @@ def released(problem, viscosity, duration=1.0, step=2e-3):
     place = np.full(points.shape[1], WIDTH / 2)
     place[0] = LENGTH
     tip = np.argmin(np.linalg.norm(points - place, axis=1))
-    return np.asarray(motion.times), np.asarray(motion.displacements)[:, tip, -1]
+    return np.asarray(motion.time), np.asarray(motion.displacements)[:, tip, -1]
 
 
 def damped_cosine(times, heights, frequency):

@@ -26,7 +26,7 @@ DAMPING = fem.KelvinVoigt(800.0)
 PEER_STEP, PEER_STEPS, PLAIN = 1e-3 / 3, 90, fem.Rayleigh(stiffness=2e-3)
 
 
-def walk(problem: fem.Problem, step: float = STEP, **options: Any) -> fem.Motion:
+def walk(problem: fem.Problem, step: float = STEP, **options: Any) -> fem.Trajectory:
     """From rest, a little above the slope."""
     rest = jnp.zeros_like(problem.mesh.points)
     start = rest.at[:, 1].set(DROP), rest
@@ -56,7 +56,7 @@ def plain(problem: fem.Problem) -> fem.Problem:
     )
 
 
-def fall(problem: fem.Problem, duration: float, step: float, **options: Any) -> fem.Motion:
+def fall(problem: fem.Problem, duration: float, step: float, **options: Any) -> fem.Trajectory:
     """From rest, with all feet on the slope."""
     return fem.simulate(problem, duration, step, damping=PLAIN, **options)
 
@@ -84,7 +84,7 @@ def rows():
         motion = walk(case, step)
         took = time.process_time() - ready
         angles = np.asarray(pair_angles(walker, case.mesh, motion.displacements))
-        walked = gait(np.asarray(motion.times), angles)
+        walked = gait(np.asarray(motion.time), angles)
         found, late = walked.frequencies, angles[len(angles) // 2 :]
         base = found.mean() if base is None else base
         weights = fem.lumped_mass(case)[::2]

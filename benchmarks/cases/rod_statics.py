@@ -155,7 +155,7 @@ def rows():
                 found = np.asarray(tip(rest.q)) / scale
                 worst = max(worst, error(name, found, np.array(expected)))
                 ended = ended and bool(rest.status == Status.successful)
-                count = max(count, int(rest.num_iterations))
+                count = max(count, int(rest.iterations))
             assert timing is not None
             settings = {"case": name, "modes": modes, "iterations": count, "converged": ended}
             yield Row(

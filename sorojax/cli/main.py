@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from sorojax.cli import calibrate, robots, show
+from sorojax.cli import cache, calibrate, robots, show
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -16,7 +16,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     was raised.
     """
     arguments = _parser().parse_args(argv)
-    if arguments.run in (robots.run, show.run):
+    warms = arguments.run is cache.run and arguments.warm
+    if arguments.run in (robots.run, show.run) or warms:
         _start_jax()
     if os.environ.get("SOROJAX_DEBUG"):
         return arguments.run(arguments)
@@ -46,7 +47,7 @@ def _parser() -> argparse.ArgumentParser:
 
     info = commands.add_parser("info", help="versions, devices, solvers, cache")
     info.set_defaults(run=_info)
-    for command in (robots, calibrate, show):
+    for command in (robots, calibrate, show, cache):
         command.add(commands)
     return parser
 

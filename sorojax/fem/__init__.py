@@ -20,9 +20,9 @@ from sorojax.fem.dynamics.damping import (
     total_mass,
 )
 from sorojax.fem.dynamics.methods import EnergyMomentum, GeneralisedAlpha, Newmark
-from sorojax.fem.dynamics.motion import Motion, momentum
 from sorojax.fem.dynamics.simulate import MotionError, simulate
 from sorojax.fem.dynamics.step import State
+from sorojax.fem.dynamics.trajectory import Trajectory, momentum
 from sorojax.fem.equilibrium.newton import Newton
 from sorojax.fem.equilibrium.solve import (
     ConvergenceError,
@@ -95,7 +95,6 @@ __all__ = [
     "KelvinVoigt",
     "LinearPressure",
     "Liquid",
-    "Motion",
     "MotionError",
     "Newmark",
     "Newton",
@@ -114,6 +113,7 @@ __all__ = [
     "Tendon",
     "Torque",
     "Traction",
+    "Trajectory",
     "cauchy_stress",
     "contact_state",
     "contact_switching",

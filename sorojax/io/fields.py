@@ -21,7 +21,7 @@ FIELDS = ("von_mises", "pressure", "stress", "principal", "energy", "reaction")
 def export_fields(
     path: str | os.PathLike,
     problem: fem.Problem,
-    states: fem.Solution | FemPath | fem.Motion | np.ndarray,
+    states: fem.Solution | FemPath | fem.Trajectory | np.ndarray,
     *,
     fields: Sequence[str] = ("von_mises", "pressure"),
     deformed: bool = False,
@@ -89,12 +89,12 @@ def _states(where, problem, states, times):
     moments = times
     if isinstance(states, FemPath):
         moved = np.asarray(states.displacements)
-        problems = [fem.with_load(problem, states.name, value) for value in states.values]
+        problems = [states.problem_at(k) for k in range(len(states))]
         if times is None and states.values.ndim == 1:
             moments = np.asarray(states.values).tolist()
-    elif isinstance(states, fem.Motion):
+    elif isinstance(states, fem.Trajectory):
         moved = np.asarray(states.displacements)
-        moments = np.asarray(states.times).tolist() if times is None else times
+        moments = np.asarray(states.time).tolist() if times is None else times
     elif isinstance(states, fem.Solution):
         moved = np.asarray(states.displacement)[None]
     else:

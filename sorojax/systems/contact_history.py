@@ -58,7 +58,7 @@ def contact_history(
         model: The rod or assembly.
         contacts: As given to its verbs: contacts of a rod, `On(part, contact)` and
             `Between(first, second, contact)`.
-        q: Coordinates, e.g. of a `Rollout`.
+        q: Coordinates, e.g. of a rod's trajectory.
         v: Rates; they set the friction.
         parts: Of an assembly, those over whose rates to tell the efforts, one part after
             the other; all if omitted. Few compile faster.

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from sorojax import fem, material, mesh, rod as R, sdf, systems as S
 from sorojax.contact import LinePenalty
 from sorojax.math.lie import SE2
-from sorojax.rod.dynamics.rollout import Rollout
+from sorojax.rod.dynamics.rollout import Trajectory
 from tests.derivatives.case import Case
 
 NONE = {
@@ -119,7 +119,7 @@ def efforts(at):
 
 def moments(at):
     law, q, v = at
-    still = Rollout(jnp.array([0.1, 0.2]), jnp.stack([q, 2 * q]), jnp.stack([v, v]), None)
+    still = Trajectory(jnp.array([0.1, 0.2]), jnp.stack([q, 2 * q]), jnp.stack([v, v]), None)
     return S.tracking(law, still)
 
 

@@ -117,13 +117,13 @@ def test_a_column_below_at_and_above_its_critical_load():
     straight, bowed, none = jnp.zeros(4), jnp.array([10.0, 0.0, 0.0, 0.0]), jnp.array(0.0)
     below = pushed(jnp.array(0.9), none, bowed)
     assert below.status == Status.successful and jnp.abs(below.q).max() < 1e-6
-    assert below.negative == 0
+    assert below.negative_eigenvalues == 0
     # Straight is in balance still, and the answer says that it is not stable.
     above = pushed(jnp.array(1.1), none, straight)
-    assert above.status == Status.unstable_equilibrium and above.negative == 1
+    assert above.status == Status.unstable_equilibrium and above.negative_eigenvalues == 1
     for side in (none, jnp.array(1e-6)):
         bent = pushed(jnp.array(1.1), side, bowed)
-        assert bent.status == Status.successful and bent.negative == 0
+        assert bent.status == Status.successful and bent.negative_eigenvalues == 0
         assert jnp.abs(bent.q).max() > 1.0
 
 

@@ -54,3 +54,8 @@ class AbstractOptimiser(eqx.Module):
             evaluate: Objective and constraints at another design, without derivatives: a call
                 costs a solve.
         """
+
+    def is_settled(self, memory: PyTree, tolerance: float) -> bool:
+        """Whether a step smaller than `tolerance`, after which `memory` is passed on, says that
+        the search is over; it does unless a method shortens its steps for other reasons."""
+        return True

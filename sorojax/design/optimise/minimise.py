@@ -23,6 +23,7 @@ from sorojax.mesh.mesh import Mesh
 
 Optimiser = AbstractOptimiser | optax.GradientTransformation
 _HELD = 1e-3  # overshoot of a constraint that counts as none
+_STUCK = 5  # small steps in a row that are no end of a search
 _RETREATS = 4  # halvings of a step that leads to where a function is not defined
 
 
@@ -54,9 +55,9 @@ class Optimised(eqx.Module):
         objective: At `design`.
         constraints: At `design`, each <= 0 if it holds.
         status: `successful` when the change fell below the tolerance, `out_of_reach` when it
-            did with a constraint broken, `max_steps` when the steps ran out first,
-            `not_finite` when a value broke, after shorter steps too; the last good design
-            then.
+            did with a constraint broken, `not_converged` when it did because the method could
+            find no longer step, `max_steps` when the steps ran out first, `not_finite` when a
+            value broke, after shorter steps too; the last good design then.
         history: Objective, constraints (m columns) and change of every step.
         last: The last step; pass it as `resume` to go on.
     """
@@ -144,7 +145,7 @@ def minimise(
     first, memory = 0, None
     if resume is not None:
         flat, memory, first = ravel_pytree(resume.design)[0], resume.memory, resume.count
-    values, size, last, history, step = None, None, flat, [], resume
+    values, size, last, history, step, stuck = None, None, flat, [], resume, 0
     status = Status.max_steps
     for k in range(first, steps):
         values, finite = task.found(flat, k)
@@ -183,9 +184,12 @@ def minimise(
         )
         if on_step is not None:
             on_step(step)
-        if change <= tolerance and schedule is None:
-            status = Status.successful
-            break
+        stuck = stuck + 1 if change <= tolerance else 0
+        if stuck and schedule is None:
+            settled = method.is_settled(memory, tolerance)
+            if settled or stuck == _STUCK:
+                status = Status.successful if settled else Status.not_converged
+                break
     if status == Status.not_finite:
         flat = last
     k_last = max(len(history) + first - 1, 0)

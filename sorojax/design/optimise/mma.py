@@ -31,6 +31,8 @@ from sorojax.design.optimise.base import AbstractOptimiser, Values
 
 _INNER = 15  # proposals of GCMMA for one step
 _CLOSER = 3.0  # times the curvature after a proposal that is not finite; 3**15 is 1e7
+_FARTHER = 10.0  # times a small step: a first proposal beyond says that functions are not met
+_ROUNDING = 4  # of rounding, of the terms of an approximation: what a function may lie above it
 _PRICE = 1000.0  # of breaking a constraint, against objectives of order one to a hundred
 
 
@@ -238,8 +240,8 @@ def _longest(task: Approximation, at: _Point, move: _Point) -> Array:
 
 
 class MMAState(eqx.Module):
-    """Memory of the method: asymptotes, the last two designs, how often it was called,
-    and how curved its functions must be (GCMMA)."""
+    """Memory of the method: asymptotes, the last two designs, how often it was called; and for
+    GCMMA how curved its functions must be, and the largest change of its first proposal."""
 
     low: Float[Array, " n"]
     high: Float[Array, " n"]
@@ -247,6 +249,7 @@ class MMAState(eqx.Module):
     before: Float[Array, " n"]
     count: Int[Array, ""]
     curvature: Float[Array, " functions"]
+    proposed: Float[Array, ""]
 
 
 class AbstractMMA(AbstractOptimiser):
@@ -264,9 +267,8 @@ class AbstractMMA(AbstractOptimiser):
     def init(self, x: Float[Array, " n"], constraints: int) -> MMAState:
         """State before the first step from `x` with so many constraints."""
         x = real(x)
-        return MMAState(
-            x, x, x, x, jnp.zeros((), jnp.int32), jnp.ones(constraints + 1, x.dtype)
-        )
+        curvature = jnp.ones(constraints + 1, x.dtype)
+        return MMAState(x, x, x, x, jnp.zeros((), jnp.int32), curvature, jnp.zeros((), x.dtype))
 
     def propose(
         self, x: Float[Array, " n"], values: Values, state: MMAState
@@ -320,12 +322,16 @@ class GCMMA(AbstractMMA):
     def update(self, x, values, memory, evaluate):
         memory = self.begin(x, values, memory)
         new, after = self.propose(x, values, memory)
+        memory = eqx.tree_at(lambda s: s.proposed, memory, jnp.max(jnp.abs(new - x)))
         for _ in range(_INNER):
             memory, above = self.stiffen(x, new, values, evaluate(new), memory)
             if bool(above):
                 break
             new, after = self.propose(x, values, memory)
-        return new, after
+        return new, eqx.tree_at(lambda s: s.proposed, after, memory.proposed)
+
+    def is_settled(self, memory, tolerance):
+        return float(memory.proposed) <= _FARTHER * tolerance
 
     def begin(self, x: Float[Array, " n"], values: Values, state: MMAState) -> MMAState:
         """The state at the start of an outer step: curvature by the gradients there."""
@@ -352,7 +358,7 @@ class GCMMA(AbstractMMA):
 def _propose(method, x, values: Values, state: MMAState):
     low, high = _asymptotes(method, x, state)
     answer = solve_subproblem(_approximation(method, x, values, state, low, high))
-    new = MMAState(low, high, x, state.last, state.count + 1, state.curvature)
+    new = MMAState(low, high, x, state.last, state.count + 1, state.curvature, state.proposed)
     return answer, new
 
 
@@ -361,13 +367,16 @@ def _stiffen(method, x, proposal, values, found, state):
     low, high = _asymptotes(method, x, state)
     model = _approximation(method, x, values, state, low, high)
     true = jnp.concatenate([found[0][None], found[1]])
-    above = true - (model.at(proposal) - jnp.concatenate([model.shift_objective, model.right]))
+    sums, shift = model.at(proposal), jnp.concatenate([model.shift_objective, model.right])
+    above = true - (sums - shift)
     span = method.upper - method.lower + jnp.zeros_like(x)
     away = (high - low) * (proposal - x) ** 2
     away = jnp.sum(away / ((high - proposal) * (proposal - low) * span))
     # Where a function is not defined all get stiffer: the next proposal is closer.
     outside = ~jnp.all(jnp.isfinite(true))
-    short = outside | (above > 1e-7 * jnp.maximum(jnp.abs(true), 1e-7))
+    noise = float(jnp.finfo(x.dtype).eps) * (sums + jnp.abs(shift) + jnp.abs(true))
+    allowed = jnp.maximum(1e-7 * jnp.maximum(jnp.abs(true), 1e-7), _ROUNDING * noise)
+    short = outside | (above > allowed)
     more = state.curvature + above / jnp.maximum(away, 1e-30)
     more = jnp.minimum(1.1 * more, 10 * state.curvature)
     more = jnp.where(outside, _CLOSER * state.curvature, more)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sorojax.fem.contact.obstacle import Contact
-from sorojax.fem.dynamics.motion import Motion
+from sorojax.fem.dynamics.trajectory import Trajectory
 from sorojax.fem.problem import body
 
 
@@ -34,7 +34,7 @@ class ContactSwitching(eqx.Module):
 
 
 def contact_switching(
-    motion: Motion, share: float | Float[Array, ""] = 1e-3
+    motion: Trajectory, share: float | Float[Array, ""] = 1e-3
 ) -> ContactSwitching:
     """How near `motion` came to switching points, at its saved times; save every step to see
     all of them. Runs inside `jit`, `grad` (as auxiliary output) and `vmap`.
@@ -51,7 +51,7 @@ def contact_switching(
 
 
 @eqx.filter_jit
-def _switching(motion: Motion, share) -> ContactSwitching:
+def _switching(motion: Trajectory, share) -> ContactSwitching:
     moving, rest = eqx.partition(motion.states.memory, eqx.is_inexact_array)
     problem = body(motion.problem)
 

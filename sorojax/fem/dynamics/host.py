@@ -222,6 +222,15 @@ def _ends(interval: Interval) -> tuple[float, float]:
     return float(interval.begin), float(interval.end)
 
 
+def ended(dynamics: Dynamics, known: Matter, state: State, interval, step: TimeStep, u, *sums):
+    """The state after a step whose equilibrium is `u`, an estimate of its error [m], whether a
+    point went through an obstacle, and whether a contact gave energy; `sums` of `end_step`."""
+    new = end_step(dynamics, known, state, interval, step, u, *sums)
+    through = passed_through(dynamics.problem, step.terms[0], new.displacement)
+    gained = gains(dynamics, known, state, step, new, u)
+    return new, step_error(dynamics, interval, state, new), through, gained
+
+
 def step_error(dynamics: Dynamics, interval: Interval, state: State, new: State):
     """Estimate of the local error of a step [m]: what the acceleration's change has more in
     the exact displacement.
@@ -282,8 +291,5 @@ def _begin(fixed: tuple[Dynamics, Matter, Geometry], state: State, interval: Int
 @kernel
 def _end(fixed, state: State, step: TimeStep, interval: Interval, u, work, taken):
     dynamics, known, _ = fixed
-    new = end_step(dynamics, known, state, interval, step, u, work, taken)
-    through = passed_through(dynamics.problem, step.terms[0], new.displacement)
-    gained = gains(dynamics, known, state, step, new, u)
-    error = step_error(dynamics, interval, state, new)
-    return Split(new), new.displacement, error, through, gained
+    new, *found = ended(dynamics, known, state, interval, step, u, work, taken)
+    return Split(new), new.displacement, *found

@@ -12,8 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax.fem.assembly import assemble as asm
-from sorojax.fem.contact.swept import gains, passed_through
-from sorojax.fem.dynamics.host import Control, step_error
+from sorojax.fem.dynamics.host import Control, ended
 from sorojax.fem.dynamics.step import (
     Dynamics,
     Interval,
@@ -103,13 +102,10 @@ def _attempt(dynamics, known, prepared: Prepared, control: Control, state, inter
     u, counts = solved(jnp.where(sound, step.predicted, start))
     again = (counts[0] != 0) & sound
     u, counts = jax.lax.cond(again, lambda: solved(start), lambda: (u, counts))
-    new = end_step(dynamics, known, state, interval, step, u)
-    through = passed_through(dynamics.problem, step.terms[0], new.displacement)
+    new, error, through, gained = ended(dynamics, known, state, interval, step, u)
     keeps = rules.keeps_volume(asm.kept_volume(*args[:4], new.displacement - start))
-    gained = gains(dynamics, known, state, step, new, u)
     fine, ratio = (counts[0] == 0) & ~through & ~gained & keeps, 0.0
     if control.error is not None:
-        error = step_error(dynamics, interval, state, new)
         ratio = rules.error_ratio(error, control.error, new.displacement, prepared.length)
         fine = fine & rules.error_fits(ratio)
     return u, new, fine, rules.is_easy(counts[2], control.newton, ratio), counts[2]

@@ -22,8 +22,8 @@ from sorojax.fem.dynamics.host import Control, Run, compiled_matter
 from sorojax.fem.dynamics.implicit_diff import MotionCall, recorded
 from sorojax.fem.dynamics.jit import replay
 from sorojax.fem.dynamics.methods import AbstractMethod, GeneralisedAlpha
-from sorojax.fem.dynamics.motion import Motion
 from sorojax.fem.dynamics.step import Dynamics, Mass, Matter, State, StepState
+from sorojax.fem.dynamics.trajectory import Trajectory
 from sorojax.fem.equilibrium.jit import known_mask
 from sorojax.fem.equilibrium.newton import Newton
 from sorojax.fem.loads.loads import AbstractLoad, remembers
@@ -33,13 +33,13 @@ from sorojax.math.status import Status
 from sorojax.mesh.mesh import Mesh
 
 History = Callable[[Float[Array, ""]], Array] | Float[Array, "grid ..."]
-Start = Motion | State | tuple[Float[Array, "nodes dim"], Float[Array, "nodes dim"]]
+Start = Trajectory | State | tuple[Float[Array, "nodes dim"], Float[Array, "nodes dim"]]
 
 
 class MotionError(RuntimeError):
     """A motion could not go on; `motion` holds what was reached."""
 
-    def __init__(self, message: str, motion: Motion):
+    def __init__(self, message: str, motion: Trajectory):
         super().__init__(message)
         self.motion = motion
 
@@ -63,7 +63,7 @@ def simulate(
     max_steps: int | None = None,
     throw: bool = True,
     **histories: History,
-) -> Motion:
+) -> Trajectory:
     """Motion of a body in time: M u'' + C u' + f_int(u) = f_ext(t).
 
     Implicit steps of second order (generalised-alpha by default). Every step is the equilibrium
@@ -160,7 +160,7 @@ def simulate(
 
 def _on_host(
     dynamics: Dynamics, control: Control, grid: int, every: int, begun: State
-) -> Motion:
+) -> Trajectory:
     run = Run(dynamics, control)
     run.resume(begun)
     states, points = [run.now], [0]
@@ -179,16 +179,19 @@ def _on_host(
 
     stacked = jax.tree.map(column, *states).whole()
     at = jnp.asarray(points, jnp.int32)
-    return Motion(dynamics, stacked, at, run.end(), run.status, run.stats())
+    stats = run.stats()
+    counts = (jnp.asarray(n) for n in (stats.steps, stats.iterations, stats.cuts))
+    return Trajectory(dynamics, stacked, at, run.end(), run.status, *counts, stats)
 
 
-def _in_trace(dynamics: Dynamics, control: Control, grid: int, every: int) -> Motion:
+def _in_trace(dynamics: Dynamics, control: Control, grid: int, every: int) -> Trajectory:
     record = recorded(MotionCall(dynamics, control, grid, control.max_steps))
     states, end = replay(dynamics, record, grid, every)
     at = jnp.arange(0, grid + 1, every, dtype=jnp.int32)
-    failed = record.counts[0] != 0
-    status = Status.where(failed, Status.not_converged, Status.successful)
-    return Motion(dynamics, states, at, end, status, None)
+    failed, *counts = (record.counts[k] for k in range(4))
+    status = Status.where(failed != 0, Status.not_converged, Status.successful)
+    counts = (jax.lax.stop_gradient(n).astype(int) for n in counts)
+    return Trajectory(dynamics, states, at, end, status, *counts, None)
 
 
 def _grid(where: str, duration, step, save: int | None) -> tuple[int, int]:
@@ -208,7 +211,7 @@ def _grid(where: str, duration, step, save: int | None) -> tuple[int, int]:
 
 
 def _begin_time(start: Start | None):
-    if isinstance(start, Motion):
+    if isinstance(start, Trajectory):
         start = start.end
     return start.time if isinstance(start, State) else jnp.zeros((), jnp.result_type(float))
 
@@ -235,7 +238,7 @@ def _placed(load: AbstractLoad, row: Array | None, mesh: Mesh) -> AbstractLoad:
 
 def _state(where: str, dynamics: Dynamics, start: Start | None) -> State:
     """The state to start from, with the acceleration that balances it."""
-    if isinstance(start, Motion):
+    if isinstance(start, Trajectory):
         start = start.end
     if isinstance(start, State):
         return start

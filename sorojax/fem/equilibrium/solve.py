@@ -30,7 +30,9 @@ class Solution(eqx.Module):
     """Displacement at equilibrium [m], or at the last converged fraction of the load.
 
     Every array gets the batch axes of `jax.vmap` in front, so each lane has its own
-    `status`, `load_fraction`, Newton `iterations`, accepted `load_steps` and `cuts`. `stats`
+    `status`, `load_fraction`, Newton `iterations`, accepted `load_steps` and `cuts`. Of
+    `cavities` whose contents are given `pressures` are gauge pressures [Pa], as in `problem`,
+    and `volumes` in m^3. `stats`
     is kept on the host: the record of the solve, under `vmap` a tuple with that of every lane
     in row-major order, and `None` under `jit`, where it does not exist yet.
     """
@@ -43,6 +45,9 @@ class Solution(eqx.Module):
     iterations: Int[Array, ""] | None = None
     load_steps: Int[Array, ""] | None = None
     cuts: Int[Array, ""] | None = None
+    cavities: tuple[str, ...] = eqx.field(static=True, default=())
+    pressures: Float[Array, " cavities"] | None = None
+    volumes: Float[Array, " cavities"] | None = None
 
     def _text(self) -> str:
         u = self.displacement
@@ -51,12 +56,17 @@ class Solution(eqx.Module):
         if self.iterations is not None:
             part = number(self.load_fraction)
             rows.append(f"  {number(self.iterations)} iterations, load fraction {part}")
+        for k, name in enumerate(self.cavities):
+            assert self.pressures is not None and self.volumes is not None
+            p, volume = number(self.pressures[..., k], "Pa"), self.volumes[..., k]
+            rows.append(f"  {name}: {p} in {number(volume, 'm^3')}")
         return "\n".join(rows + _unstable([self.stats]))
 
 
 @displayed
 class Path(eqx.Module):
-    """Equilibria along a load path: `values` of the load `name`, one state for each.
+    """Equilibria along a path: `values` of the load `name`, or of the volume of that cavity
+    [m^3], whose gauge `pressures` [Pa] are found; one state for each.
 
     A path that stops early is cut there; under `jit` and `vmap` it keeps its length and
     is NaN from there on. `stats` has one entry for each value, as in `Solution`; it is
@@ -66,12 +76,20 @@ class Path(eqx.Module):
     problem: Problem
     displacements: Float[Array, "steps nodes dim"]
     values: Float[Array, "steps ..."]
-    name: str = eqx.field(static=True)
+    name: str | None = eqx.field(static=True)  # none of a continuation under all loads
     status: Status
     stats: Any = eqx.field(static=True)  # one Stats per value, None under jit
+    pressures: Float[Array, " steps"] | None = None
 
     def __len__(self) -> int:
         return self.displacements.shape[0]
+
+    def problem_at(self, k: int) -> Problem:
+        """The problem with the load of state `k`."""
+        if self.name is None:
+            return self.problem
+        values = self.values if self.pressures is None else self.pressures
+        return with_load(self.problem, self.name, values[k])
 
     def _text(self) -> str:
         u = self.displacements

@@ -13,20 +13,18 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._display import displayed, number, outcome
 from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax._progress import report
 from sorojax._types import real
 from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import linearise, prepare
-from sorojax.fem.equilibrium.load_stepping import LoadStep, Log, Stats, between, unloaded
+from sorojax.fem.equilibrium.load_stepping import LoadStep, Log, between, unloaded
 from sorojax.fem.equilibrium.newton import Newton
-from sorojax.fem.equilibrium.solve import ConvergenceError
+from sorojax.fem.equilibrium.solve import ConvergenceError, Path, Solution
 from sorojax.fem.problem import Problem, load_force, load_potential, residual
 from sorojax.fem.stability.arc_length import Border, newton_bordered
 from sorojax.fem.supports import known_values
 from sorojax.math.linalg import sparse
-from sorojax.math.status import Status
 
 
 class AbstractContents(eqx.Module):
@@ -198,61 +196,16 @@ def pressure_force_rate(
 # Equilibrium with closed cavities, differentiable by the implicit function theorem
 
 
-@displayed
-class CavitySolution(eqx.Module):
-    """Equilibrium with the contents of cavities: `problem` has the pressures found, gauge
-    [Pa]; `volumes` [m^3] are those of the cavities `names`."""
-
-    problem: Problem
-    displacement: Float[Array, "nodes dim"]
-    pressures: Float[Array, " cavities"]
-    volumes: Float[Array, " cavities"]
-    names: Names = eqx.field(static=True)
-    status: Status
-    stats: Stats = eqx.field(static=True)
-
-    def _text(self) -> str:
-        size = jnp.linalg.norm(self.displacement, axis=1).max()
-        rows = [
-            f"CavitySolution: {outcome(self.status)}, largest displacement {number(size, 'm')}"
-        ]
-        for name, p, volume in zip(self.names, self.pressures, self.volumes, strict=True):
-            rows.append(f"  {name}: {number(p, 'Pa')} in {number(volume, 'm^3')}")
-        return "\n".join(rows)
-
-
-@displayed
-class VolumePath(eqx.Module):
-    """Equilibria for a row of volumes [m^3] of one cavity, and its pressures [Pa]."""
-
-    problem: Problem
-    displacements: Float[Array, "steps nodes dim"]
-    volumes: Float[Array, " steps"]
-    pressures: Float[Array, " steps"]
-    name: str = eqx.field(static=True)
-    status: Status
-    stats: tuple[Stats, ...] = eqx.field(static=True)
-
-    def __len__(self) -> int:
-        return self.volumes.shape[0]
-
-    def _text(self) -> str:
-        return (
-            f"VolumePath: {len(self)} states, {outcome(self.status)}\n  {self.name} from "
-            f"{number(self.volumes, 'm^3')}, pressure {number(self.pressures, 'Pa')}"
-        )
-
-
 def solve_volume(
     problem: Problem,
     *,
-    start: CavitySolution | None = None,
+    start: Solution | None = None,
     newton: Newton | None = None,
     steps: int = 1,
     max_cuts: int = 10,
     throw: bool = True,
     **contents: AbstractContents | float,
-) -> CavitySolution:
+) -> Solution:
     """Static equilibrium of a body whose cavities hold a given volume or a sealed gas.
 
     The pressure of each cavity is an unknown beside the displacements; one equation per cavity
@@ -301,8 +254,15 @@ def solve_volume(
     begin = _begin(problem, names, start)
     u, pressures = _equilibrium(problem, names, filled, begin, log)
     found = with_pressures(problem, names, pressures)
-    solution = CavitySolution(
-        found, u, pressures, volumes(found, names, u), names, log.status, log.stats()
+    filled_to = volumes(found, names, u)
+    solution = Solution(
+        found,
+        u,
+        log.status,
+        log.stats(),
+        cavities=names,
+        pressures=pressures,
+        volumes=filled_to,
     )
     if throw and log.reason:
         done = log.steps[-1].fraction if log.steps else 0.0
@@ -310,7 +270,7 @@ def solve_volume(
             f"fem.solve_volume: no equilibrium beyond {100 * done:.0f} % of the change of "
             f"volume after {log.cuts} cuts ({log.reason}). Give less volume, refine the mesh, "
             "or pass throw=False for the last converged state.",
-            solution,  # type: ignore[arg-type]
+            solution,
         )
     return solution
 
@@ -321,7 +281,7 @@ def volume_path(
     newton: Newton | None = None,
     max_cuts: int = 10,
     **row: Float[Array, " steps"],
-) -> VolumePath:
+) -> Path:
     """Equilibria for a row of volumes [m^3] of one cavity: the curve of a balloon, over its
     largest pressure. The path stops where a volume has no equilibrium; see `status`.
 
@@ -353,16 +313,10 @@ def volume_path(
         report("volume", k + 1, len(wanted), iterations=stats.iterations)
     shape = problem.mesh.points.shape
     states = jnp.stack([s.displacement for s in found]) if found else jnp.zeros((0, *shape))
-    pressures = jnp.concatenate([s.pressures for s in found]) if found else jnp.zeros(0)
-    return VolumePath(
-        problem,
-        states,
-        wanted[: len(found)],
-        pressures,
-        name,
-        status,
-        tuple(s.stats for s in found) + ((stats,) if stats.reason else ()),
-    )
+    rows = [s.pressures for s in found if s.pressures is not None]
+    pressures = jnp.concatenate(rows) if rows else jnp.zeros(0)
+    record = tuple(s.stats for s in found) + ((stats,) if stats.reason else ())
+    return Path(problem, states, wanted[: len(found)], name, status, record, pressures)
 
 
 def _checked(problem: Problem, contents: dict) -> tuple[Names, tuple[AbstractContents, ...]]:
@@ -379,7 +333,7 @@ def _checked(problem: Problem, contents: dict) -> tuple[Names, tuple[AbstractCon
     return tuple(contents), filled
 
 
-def _begin(problem: Problem, names: Names, start: CavitySolution | None) -> CavityStart:
+def _begin(problem: Problem, names: Names, start: Solution | None) -> CavityStart:
     if start is not None:
         order = [load.name for load in start.problem.loads]
         values = [start.problem.loads[order.index(name)].value for name in names]

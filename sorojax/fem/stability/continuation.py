@@ -15,6 +15,7 @@ from sorojax._progress import report
 from sorojax.fem.equilibrium.linear import Prepared, prepare
 from sorojax.fem.equilibrium.load_stepping import LoadStep, Log, Stats, begin_at, follow
 from sorojax.fem.equilibrium.newton import Newton
+from sorojax.fem.equilibrium.solve import Path
 from sorojax.fem.problem import Problem
 from sorojax.fem.stability.arc_length import Loading, PathState, arc_step, tangent_state
 from sorojax.fem.stability.modal import tangent_modes
@@ -132,31 +133,16 @@ _RESOLVED = 4  # cuts after which a turn is one of the path, not of the step
 
 
 @displayed
-class Continuation(eqx.Module):
-    """States along a path: `factors` of the load, `values` of the named one, and the number
-    of negative eigenvalues of the tangent (0 where stable, -1 unknown)."""
+class Continuation(Path):
+    """A path over limit points: `factors` of the load, which are the `values` too where all
+    loads grow together, and the number of negative eigenvalues of the tangent (0 where stable,
+    -1 unknown)."""
 
-    problem: Problem
-    displacements: Float[Array, "states nodes dim"]
-    factors: Float[Array, " states"]
-    negative_eigenvalues: Int[Array, " states"]
-    critical_points: tuple[CriticalPoint, ...]
-    name: str | None = eqx.field(static=True)
-    status: Status
-    stats: Stats = eqx.field(static=True)
-    length: float = eqx.field(static=True)
-    end: PathState
-
-    def __len__(self) -> int:
-        return self.factors.shape[0]
-
-    @property
-    def values(self) -> Float[Array, "states ..."]:
-        """Values of the named load; the factors when all loads grow together."""
-        if self.name is None:
-            return self.factors
-        load = next(load for load in self.problem.loads if load.name == self.name)
-        return jnp.tensordot(self.factors, load.value, axes=0)
+    factors: Float[Array, " states"] = eqx.field(kw_only=True)
+    negative_eigenvalues: Int[Array, " states"] = eqx.field(kw_only=True)
+    critical_points: tuple[CriticalPoint, ...] = eqx.field(kw_only=True)
+    length: float = eqx.field(static=True, kw_only=True)
+    end: PathState = eqx.field(kw_only=True)
 
     def _text(self) -> str:
         return (
@@ -351,15 +337,22 @@ class _Walk:
 
     def result(self) -> Continuation:
         status = Status.not_converged if self.reason else Status.successful
+        name, problem = self.loading.name, self.loading.full
+        factors = jnp.asarray([s.factor for s in self.states])
+        values = factors
+        if name is not None:
+            load = next(load for load in problem.loads if load.name == name)
+            values = jnp.tensordot(factors, load.value, axes=0)
         return Continuation(
-            self.loading.full,
+            problem,
             jnp.stack([jnp.asarray(s.u) for s in self.states]),
-            jnp.asarray([s.factor for s in self.states]),
-            jnp.asarray([s.negative_eigenvalues for s in self.states]),
-            tuple(self.critical),
-            self.loading.name,
+            values,
+            name,
             status,
             Stats(tuple(self.steps), self.cuts, self.reason),
-            self.length,
-            self.states[-1],
+            factors=factors,
+            negative_eigenvalues=jnp.asarray([s.negative_eigenvalues for s in self.states]),
+            critical_points=tuple(self.critical),
+            length=self.length,
+            end=self.states[-1],
         )

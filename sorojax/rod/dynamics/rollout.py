@@ -25,7 +25,7 @@ from sorojax.rod.statics.equilibrium import checked_status
 
 
 @displayed
-class Rollout(eqx.Module):
+class Trajectory(eqx.Module):
     """A motion sampled in time: time [s], coordinates and their rates."""
 
     time: Float[Array, " time"]
@@ -35,8 +35,9 @@ class Rollout(eqx.Module):
 
     def _text(self) -> str:
         return (
-            f"Rollout: {self.time.shape[0]} saved moments of {self.q.shape[-1]} coordinates, "
-            f"{outcome(self.status)}\n  time {number(self.time, 's')}, q {number(self.q)}"
+            f"Trajectory: {self.time.shape[0]} saved moments of {self.q.shape[-1]} "
+            f"coordinates, {outcome(self.status)}\n"
+            f"  time {number(self.time, 's')}, q {number(self.q)}"
         )
 
 
@@ -53,7 +54,7 @@ def rollout(
     stepper: AbstractStepper | None = None,
     progress: bool = False,
     check: bool = True,
-) -> Rollout:
+) -> Trajectory:
     """Motion of a rod or assembly by `saves * every` steps of fixed length.
 
     M(q) q'' + c(q, q') = sum of generalised forces, compiled as one loop. Forces must be known
@@ -112,7 +113,7 @@ def rollout(
 
 @jit_trees
 @full_products
-def _rollout(model, q, v, forces, step, t, stepper, saves, every, label, check) -> Rollout:
+def _rollout(model, q, v, forces, step, t, stepper, saves, every, label, check) -> Trajectory:
     step, t, stepper = _like(q, (step, t, stepper))
     problem = second_order(model, q, forces)
     path, too_long = integrate(
@@ -125,7 +126,7 @@ def _rollout(model, q, v, forces, step, t, stepper, saves, every, label, check) 
     time = t + step * every * jnp.arange(saves + 1, dtype=step.dtype)
     if check:
         status = checked_status(judged_status(status, too_long), model, path.q)
-    return Rollout(time, path.q, path.v, status)
+    return Trajectory(time, path.q, path.v, status)
 
 
 def _like(q, tree):

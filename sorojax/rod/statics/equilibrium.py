@@ -15,6 +15,7 @@ from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax import _check
+from sorojax._display import displayed, number, outcome
 from sorojax._types import real
 from sorojax.math.compiled import jit_public
 from sorojax.math.implicit_root import implicit_root
@@ -247,22 +248,33 @@ _SHORTEST = 1e-3  # of a Newton step
 Residual = Callable[[Array], Array]
 
 
-class Equilibrium(eqx.Module):
-    """Where a search for rest ended.
+@displayed
+class Solution(eqx.Module):
+    """The state at which a search over coordinates ended.
 
     Attributes:
         q: Coordinates.
         status: How it ended.
-        num_iterations: Of Newton.
-        negative: Negative eigenvalues of the symmetric part of the tangent; 0 is stable. A
-            straight column past its critical load has one, and the status
+        iterations: Of Newton's method, or of inverse kinematics.
+        negative_eigenvalues: Of an equilibrium: how many the symmetric part of the tangent
+            has; 0 is stable. A straight column past its critical load has one, and the status
             `unstable_equilibrium`.
+        error: Of inverse kinematics: norm of the weighted errors of all targets [m].
+        overlap: Of inverse kinematics: by how much the worst section misses its distance to
+            an obstacle [m].
     """
 
     q: Float[Array, " coordinates"]
     status: Status
-    num_iterations: Int[Array, ""]
-    negative: Int[Array, ""]
+    iterations: Int[Array, ""]
+    negative_eigenvalues: Int[Array, ""] | None = None
+    error: Float[Array, ""] | None = None
+    overlap: Float[Array, ""] | None = None
+
+    def _text(self) -> str:
+        ways = f"{outcome(self.status)} after {number(self.iterations)} iterations"
+        error = "" if self.error is None else f", error {number(self.error, 'm')}"
+        return f"Solution: {ways}, q {number(self.q)}{error}"
 
 
 class Search(NamedTuple):
@@ -302,7 +314,7 @@ def equilibrium(
     t=0.0,
     tolerance=1e-10,
     max_iterations: int = 50,
-) -> Equilibrium:
+) -> Solution:
     """Static equilibrium: coordinates at which the generalised forces vanish.
 
     Newton's method with the exact tangent and a line search on the residual, measured by the
@@ -353,7 +365,7 @@ def equilibrium(
         lambda q: squared(model, q, residual(q)), guess, find, _solve_tangent, has_aux=True
     )
     status = checked_status(ended(done, rest, finite=finite, unstable=unstable), model, rest)
-    return Equilibrium(rest, status, count.astype(jnp.int32), negative.astype(jnp.int32))
+    return Solution(rest, status, count.astype(jnp.int32), negative.astype(jnp.int32))
 
 
 def first_guess(where: str, model: Model, q: Array | None) -> Float[Array, " coordinates"]:

@@ -9,11 +9,10 @@ Reference:
 import functools
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import Numbers, real
@@ -26,6 +25,7 @@ from sorojax.rod.model.model import Model, motion, operators
 from sorojax.rod.model.rod import Rod
 from sorojax.rod.statics import reaching as answer
 from sorojax.rod.statics.equilibrium import (
+    Solution,
     checked_status,
     first_guess,
     increments,
@@ -38,24 +38,6 @@ from sorojax.rod.statics.targets import AbstractTarget, ObstacleConstraint
 
 _DAMPING = 1e-3  # at the first step, relative to the mean square of the Jacobian
 _DRIFT_ERROR = 0.1  # error that a step in the null space may make, against its length
-
-
-class IKResult(eqx.Module):
-    """Where inverse kinematics ended.
-
-    Attributes:
-        q: Coordinates.
-        status: `successful`, or `out_of_reach` where `q` is the closest there is.
-        error: Norm of the weighted errors of all targets [m].
-        overlap: By how much the worst section misses its distance to an obstacle [m].
-        num_iterations: Of the search.
-    """
-
-    q: Float[Array, " coordinates"]
-    status: Status
-    error: Float[Array, ""]
-    overlap: Float[Array, ""]
-    num_iterations: Int[Array, ""]
 
 
 @jit_public
@@ -71,7 +53,7 @@ def inverse_kinematics(
     accuracy=1e-6,
     iterations: int | None = None,
     max_iterations: int = 200,
-) -> IKResult:
+) -> Solution:
     """Coordinates that meet the targets, or come as close as the model can.
 
     Damped least squares (Levenberg-Marquardt). Obstacles and limits are inequality constraints:
@@ -99,7 +81,8 @@ def inverse_kinematics(
 
     Returns:
         Coordinates, how the search ended, the error [m] and the overlap with obstacles [m].
-        Nothing is raised where a target is out of reach: check `status`.
+        Nothing is raised where a target is out of reach: `status` is `out_of_reach` then, and
+        the coordinates are the closest there are.
 
     Raises:
         ValueError: If there is no target, shapes do not fit, or the model has no part of a
@@ -166,7 +149,8 @@ def inverse_kinematics(
     finite = jnp.all(jnp.isfinite(found)) & jnp.isfinite(error)
     status = Status.where(finite, status, Status.not_finite)
     status = checked_status(status, model, found)
-    return IKResult(found, status, error, overlap, count.astype(jnp.int32))
+    count = count.astype(jnp.int32)
+    return Solution(found, status, count, error=error, overlap=overlap)
 
 
 def _fixed(model, tasks: Tasks, at, q: Array, push, iterations: int):

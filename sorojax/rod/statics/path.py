@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from sorojax._display import displayed, number, outcome
 from sorojax._types import Numbers, real
 from sorojax.math.compiled import jit_public
 from sorojax.math.host import tell
@@ -39,17 +40,35 @@ from sorojax.rod.statics.equilibrium import (
 Loading = Callable[[Array], tuple[Load, ...]]
 
 
-class EquilibriumPath(eqx.Module):
-    """Coordinates at rest under each load, how each search ended, and its iterations.
+@displayed
+class Path(eqx.Module):
+    """Equilibria along a path of loads.
 
     Where a search fails, the path stops: the rest of `q` repeats the last equilibrium
     and says so in `status`. A state that is in balance without being stable is an
     `unstable_equilibrium`; the path goes on.
+
+    Attributes:
+        q: Coordinates.
+        status: How each search ended.
+        factors: Load factors, one or a row of them for each step.
+        negative_eigenvalues: Of the symmetric part of the tangent; 0 is stable under dead
+            loads.
+        iterations: Of Newton's method; of a path by arc lengths the corrections.
     """
 
     q: Float[Array, "steps coordinates"]
     status: Status
-    num_iterations: Int[Array, " steps"]
+    factors: Float[Array, "steps *loads"]
+    negative_eigenvalues: Int[Array, " steps"]
+    iterations: Int[Array, " steps"]
+
+    def _text(self) -> str:
+        count = self.q.shape[0]
+        return (
+            f"Path: {count} states, {outcome(self.status)}, q {number(self.q)}\n  factors "
+            f"{number(self.factors)}, negative eigenvalues {number(self.negative_eigenvalues)}"
+        )
 
 
 @jit_public
@@ -65,7 +84,7 @@ def equilibrium_path(
     max_iterations: int = 25,
     max_cuts: int = 8,
     progress: bool = False,
-) -> EquilibriumPath:
+) -> Path:
     """Equilibria at given load factors, each search started from the equilibrium before.
 
     A step whose search fails is halved, all in one compiled loop. Differentiable as
@@ -128,14 +147,15 @@ def equilibrium_path(
         return jax.vmap(lambda q, f: squared(model, q, residual(q, f)))(q, factors)
 
     guesses = jnp.broadcast_to(guess, (factors.shape[0], guess.shape[0]))
-    rest, (done, finite, count, unstable) = implicit_root(
+    rest, (done, finite, count, negative, unstable) = implicit_root(
         balance, guesses, find, _solve_rows, has_aux=True
     )
     status = jax.vmap(lambda done, q, f, u: ended(done, q, finite=f, unstable=u))(
         done, rest, finite, unstable
     )
     status = jax.vmap(lambda x, q: checked_status(x, model, q))(status, rest)
-    return EquilibriumPath(rest, status, count.astype(jnp.int32))
+    counts = (x.astype(jnp.int32) for x in (negative, count))
+    return Path(rest, status, factors, *counts)
 
 
 def _step(residual, q: Array, last: Array, target: Array, alive, search: Search, max_cuts: int):
@@ -160,8 +180,7 @@ def _step(residual, q: Array, last: Array, target: Array, alive, search: Search,
 
     state = (q, 0 * whole, whole, jnp.array(True), jnp.array(0, jnp.int32), search.metric)
     q, at, _, finite, count, slope = jax.lax.while_loop(going, advance, state)
-    _, unstable = stability(slope, search)
-    return q, alive & (at >= 1), finite, count, unstable
+    return q, alive & (at >= 1), finite, count, *stability(slope, search)
 
 
 def _solve_rows(linear, right: Float[Array, "steps unknowns"]) -> Array:
@@ -176,22 +195,6 @@ def _solve_rows(linear, right: Float[Array, "steps unknowns"]) -> Array:
 
 _ITERATIONS = 12
 _EASY = 5  # corrections below which the next step is longer
-
-
-class ArcPath(eqx.Module):
-    """A path of equilibria.
-
-    Attributes:
-        q: Coordinates; where a step fails the path stops and repeats its last point.
-        factor: Load factors.
-        negative: Negative eigenvalues of the tangent; 0 is stable under dead loads.
-        status: How each step ended.
-    """
-
-    q: Float[Array, "steps coordinates"]
-    factor: Float[Array, " steps"]
-    negative: Int[Array, " steps"]
-    status: Status
 
 
 class _Point(NamedTuple):
@@ -216,7 +219,7 @@ def arc_length_path(
     tolerance=1e-10,
     max_cuts: int = 10,
     progress: bool = False,
-) -> ArcPath:
+) -> Path:
     """Equilibria one arc length apart, through limit points, where the load turns back.
 
     Lengths are measured in elastic energy, so that a step of the factor and the answer of
@@ -309,13 +312,14 @@ def arc_length_path(
         negative = negative_eigenvalues(slope, search.metric)
         if progress:
             tell("arc length path", share)
-        return new, (q, factor, negative, ended(done, q, finite=jnp.all(jnp.isfinite(rate))))
+        end = ended(done, q, finite=jnp.all(jnp.isfinite(rate)))
+        return new, (q, end, factor, negative, count.astype(jnp.int32))
 
     point = _Point(start.q, factor, direction, begin, start.done)
     shares = jnp.linspace(0.0, 1.0, steps + 1, dtype=dtype)[1:]
-    _, (q, factors, negative, status) = jax.lax.scan(advance, point, shares)
+    _, (q, status, *rest) = jax.lax.scan(advance, point, shares)
     status = jax.vmap(lambda x, q: checked_status(x, model, q))(status, q)
-    return ArcPath(q, factors, negative, status)
+    return Path(q, status, *rest)
 
 
 def _unit(vector: Array, weights: Array) -> Array:

@@ -127,8 +127,8 @@ class Reservoir(AbstractBlock):
     def _rate(self, pressure, inputs, volume, growth, compliance):
         whole = volume + self.dead_volume
         flow = inputs["mass_flow"]
-        left = jnp.clip(pressure / _THIN, 0.0, 1.0)
-        flow = jnp.where(flow < 0, left * flow, flow)
+        left = jnp.where(pressure > 0, pressure / _THIN, jnp.zeros_like(pressure))
+        flow = jnp.where((flow < 0) & (pressure < _THIN), left * flow, flow)
         supply = self.gas_constant * self.temperature * flow
         lost = self.leakage * (pressure - self.atmosphere) * whole
         stretch = self.exponent * pressure * compliance

@@ -26,7 +26,7 @@ from sorojax.rod import (
     total_force,
 )
 from sorojax.rod.dynamics.fields import RodState
-from sorojax.rod.dynamics.rollout import Rollout
+from sorojax.rod.dynamics.rollout import Trajectory
 from sorojax.systems.blocks.block import AbstractReference, Input, Output
 from sorojax.systems.control.controller import AbstractController
 
@@ -269,7 +269,7 @@ class Tracking(NamedTuple):
 
 
 @jit_public
-def tracking(law: CartesianImpedance, path: Rollout) -> Tracking:
+def tracking(law: CartesianImpedance, path: Trajectory) -> Tracking:
     """Set-points, tips and efforts of `law` along the motion `path` of its rod."""
 
     def at(t, q, v):

@@ -16,7 +16,6 @@ from sorojax import fem
 from sorojax.design.optimise.shape_loop import OptimisedShape
 from sorojax.fem import Problem
 from sorojax.fem.equilibrium.solve import Path
-from sorojax.fem.equilibrium.volume import VolumePath
 from sorojax.fem.stability.buckling import CriticalLoads
 from sorojax.fem.stability.continuation import CriticalPoint
 from sorojax.fem.stability.modal import Modes
@@ -209,7 +208,7 @@ def show_path(
     """
     chosen = chosen_states("view.show", len(path), states)
     moved = np.asarray(path.displacements)
-    problems = [problem_at(path, k) for k in chosen]
+    problems = problems_of(path, chosen)
     options = {"loads": False} | options
     scene_at, _ = body_scenes(problems, moved[chosen], **options)
     scenes = joint_extent([scene_at(k) for k in range(len(chosen))])
@@ -332,22 +331,18 @@ def chosen_states(where: str, count: int, states: Sequence[int] | None) -> list[
     return [k % count for k in states]
 
 
-def problem_at(path: Any, k: int) -> Problem:
-    """The problem with the load of state `k` of a path."""
-    if isinstance(path, VolumePath):
-        return fem.with_load(path.problem, path.name, path.pressures[k])
-    if isinstance(path, Path) or (getattr(path, "name", None) is not None):
-        return fem.with_load(path.problem, path.name, path.values[k])
-    return path.problem
+def problems_of(path: Any, states: Sequence[int]) -> list[Problem]:
+    """The problems of states of a path, with their loads, or of a motion."""
+    return [path.problem_at(k) if isinstance(path, Path) else path.problem for k in states]
 
 
 def state_name(path: Any, k: int) -> str:
     """The label of a state: its load, its factor or its time."""
-    if isinstance(path, fem.Motion):
-        return f"{float(path.times[k]):.4g} s"
-    if isinstance(path, VolumePath):
+    if isinstance(path, fem.Trajectory):
+        return f"{float(path.time[k]):.4g} s"
+    if path.pressures is not None:
         pressure = short(float(path.pressures[k]), "Pa")
-        return f"{1e6 * float(path.volumes[k]):.4g} ml at {pressure}"
+        return f"{1e6 * float(path.values[k]):.4g} ml at {pressure}"
     name = getattr(path, "name", None)
     value = np.asarray(path.values[k])
     if name is None:

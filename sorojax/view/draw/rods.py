@@ -314,7 +314,7 @@ def show_posed(
     """A rod or an assembly where a search ended: at rest under its forces, or at a target.
 
     Args:
-        found: From `rod.static_equilibrium`, `rod.inverse_kinematics` or a path of them.
+        found: From `rod.equilibrium`, `rod.inverse_kinematics` or a path of them.
         model: What was searched.
         title: Title of the figure; how the search ended if omitted.
         **options: As of `show_rod`.
@@ -327,10 +327,11 @@ def show_posed(
 
 def _outcome(found: Any) -> str:
     """The error or the load factor that a search ended with."""
-    if hasattr(found, "error"):
+    if getattr(found, "error", None) is not None:
         return f"error {float(found.error):.3g}"
-    factor = np.atleast_1d(np.asarray(getattr(found, "factor", ())))
-    return f"load factor to {float(factor[-1]):.4g}" if factor.size else ""
+    factors = np.asarray(getattr(found, "factors", ()))
+    is_row = factors.ndim == 1 and factors.size > 0
+    return f"load factor to {float(factors[-1]):.4g}" if is_row else ""
 
 
 def show_rig(

@@ -61,8 +61,8 @@ def animate(
     """A film of a motion; `.save("name.mp4")` or `.gif` writes it.
 
     Args:
-        result: A motion, load path or continuation of a body, modes, the `Rollout` or
-            `Trajectory` of a rod (with `model=` or `network=`), or a `Track`.
+        result: A trajectory of a body, a rod (with `model=`) or a network (with `network=`), a
+            path of a body, modes, the history of a design, or a `Track`.
         beside: A second result or `Track`, e.g. what was measured, drawn at the same
             instants in a panel of its own.
         names: Headings of the panels.

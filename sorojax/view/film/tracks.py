@@ -8,17 +8,14 @@ from jaxtyping import Float
 
 from sorojax import fem
 from sorojax.design import History
-from sorojax.fem import Motion
 from sorojax.fem.equilibrium.solve import Path
-from sorojax.fem.equilibrium.volume import VolumePath
-from sorojax.fem.stability.continuation import Continuation
 from sorojax.fem.stability.modal import Modes
 from sorojax.mesh import Mesh
 from sorojax.rod import Assembly, Rod
-from sorojax.rod.dynamics.rollout import Rollout
+from sorojax.rod.dynamics.rollout import Trajectory as RodTrajectory
 from sorojax.sdf import AbstractSdf
 from sorojax.systems import AssemblyBody, Network, RodBody, Trajectory
-from sorojax.view.draw.bodies import body_scenes, problem_at
+from sorojax.view.draw.bodies import body_scenes, problems_of
 from sorojax.view.draw.meshes import AMPLITUDE, Body, on_triangles, scaled_mode, shell
 from sorojax.view.draw.rods import rod_scene
 from sorojax.view.film.animation import Track
@@ -29,20 +26,19 @@ def track_of(result: Any, **options: Any) -> Track:
     """The scenes of a result; options are those of the kind of result."""
     if isinstance(result, Track):
         return result
-    if isinstance(result, Path | VolumePath | Continuation | Motion):
+    if isinstance(result, Path | fem.Trajectory):
         return _body_track(result, **options)
     if isinstance(result, Modes):
         return _mode_track(result, **options)
     if isinstance(result, History):
         return _layout_track(result, **options)
-    if isinstance(result, Rollout):
+    if isinstance(result, RodTrajectory):
         return _rod_track(np.asarray(result.time), np.asarray(result.q), **options)
     if isinstance(result, Trajectory):
         return _network_track(result, **options)
     raise TypeError(
-        f"view.animate: got a {type(result).__name__}, need a Motion, Path, Continuation, "
-        "Modes, History, Rollout, Trajectory or Track. Make a Track of scenes for what else "
-        "moves."
+        f"view.animate: got a {type(result).__name__}, need a Trajectory, Path, Modes, "
+        "History or Track. Make a Track of scenes for what else moves."
     )
 
 
@@ -73,7 +69,7 @@ def _body_track(result: Any, *, loads: bool = False, **options: Any) -> Track:
     """A body in motion, or along a load path with the value of the load in the place of
     time."""
     points, moved = np.asarray(result.problem.mesh.points), np.asarray(result.displacements)
-    problems = [problem_at(result, k) for k in range(len(moved))]
+    problems = problems_of(result, range(len(moved)))
     scene, scale = body_scenes(problems, moved, loads=loads, **options)
     flat = np.concatenate([points, (points + moved).reshape(-1, points.shape[1])])
     box = flat.min(axis=0), flat.max(axis=0)
@@ -97,10 +93,10 @@ def _layout_track(history: History, *, name: str = "") -> Track:
 
 def _clock(result: Any) -> tuple[np.ndarray, str]:
     """Times of a motion; along a path its number where the load does not just rise."""
-    if isinstance(result, Motion):
-        return np.asarray(result.times), "s"
-    if isinstance(result, VolumePath):
-        volumes = 1e6 * np.asarray(result.volumes)
+    if isinstance(result, fem.Trajectory):
+        return np.asarray(result.time), "s"
+    if result.pressures is not None:
+        volumes = 1e6 * np.asarray(result.values)
         return (volumes, "ml") if np.all(np.diff(volumes) > 0) else _steps(len(volumes))
     values = np.asarray(result.values, float)
     if values.ndim == 1 and np.all(np.diff(values) > 0):
@@ -136,8 +132,8 @@ def _rod_track(
 ) -> Track:
     if model is None:
         raise ValueError(
-            "view.animate: a Rollout holds coordinates only. Pass model=, the rod or assembly "
-            "that moved."
+            "view.animate: the trajectory of a rod holds coordinates only. Pass model=, the "
+            "rod or assembly that moved."
         )
     held = model
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
-from sorojax.fem import Motion, Problem, Solution
+from sorojax.fem import Problem, Solution, Trajectory
 from sorojax.fem.equilibrium.solve import Path
 from sorojax.mesh import Mesh
 from sorojax.sdf import Surface
@@ -75,7 +75,7 @@ def actor(
     if isinstance(thing, Rig):
         points = np.asarray(pose(thing, q))
         triangles = np.asarray(thing.triangles)
-    elif isinstance(thing, Path | Motion | Solution):
+    elif isinstance(thing, Path | Trajectory | Solution):
         return _of_result(thing, field, values, colour, name)
     elif isinstance(thing, Mesh):
         moved = np.zeros((1, *thing.points.shape)) if displacements is None else displacements

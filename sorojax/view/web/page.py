@@ -264,12 +264,12 @@ def limits_of(actors: Sequence[Actor]) -> tuple[float, float]:
 def _times(things, time, clock: str, unit: str, frames: int) -> tuple[list[str], list[float]]:
     """The text of each frame, and when the page shows it [s]."""
     if time is None:
-        results = [t for t in things if isinstance(t, fem.Motion | FemPath)]
+        results = [t for t in things if isinstance(t, fem.Trajectory | FemPath)]
         first = results[0] if results else None
-        if isinstance(first, fem.Motion):
-            time = first.times
+        if isinstance(first, fem.Trajectory):
+            time = first.time
         elif first is not None and first.values.ndim == 1:
-            time, clock, unit = first.values, first.name, ""
+            time, clock, unit = first.values, first.name or "load factor", ""
     if time is None:
         stamps = [f"{k + 1} / {frames}" for k in range(frames)] if frames > 1 else [""]
         return stamps, np.linspace(0, _LOOP, frames).tolist()

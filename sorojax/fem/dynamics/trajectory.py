@@ -38,12 +38,13 @@ class Energies(eqx.Module):
 
 
 @displayed
-class Motion(eqx.Module):
+class Trajectory(eqx.Module):
     """States of a body in motion, and how the run ended.
 
     Outside a trace a run that stops early is cut there; inside one it keeps its length and
     is NaN from there on. `end` is the last state reached, to go on from; `points` are the
-    saved points of the grid of steps. `stats` is kept on the host and `None` inside a trace.
+    saved points of the grid of steps. `steps` were accepted, `cuts` were halved, in Newton
+    `iterations`. `stats` is kept on the host and `None` inside a trace.
     """
 
     dynamics: Dynamics
@@ -51,6 +52,9 @@ class Motion(eqx.Module):
     points: Int[Array, " times"]
     end: State
     status: Status
+    steps: Int[Array, ""]
+    iterations: Int[Array, ""]
+    cuts: Int[Array, ""]
     stats: Any = eqx.field(static=True)  # MotionStats, None in a trace
 
     def __len__(self) -> int:
@@ -61,7 +65,7 @@ class Motion(eqx.Module):
         return self.dynamics.problem
 
     @property
-    def times(self) -> Float[Array, " times"]:
+    def time(self) -> Float[Array, " times"]:
         """Saved times [s]."""
         return self.states.time
 
@@ -92,8 +96,8 @@ class Motion(eqx.Module):
         u = self.displacements
         largest = number(jnp.max(jnp.sqrt(jnp.sum(u**2, axis=-1))), "m") if u.size else "none"
         return (
-            f"Motion: {len(self)} saved states, {outcome(self.status)}, largest displacement "
-            f"{largest}\n  time {number(self.times, 's')}"
+            f"Trajectory: {len(self)} saved states, {outcome(self.status)}, largest "
+            f"displacement {largest}\n  time {number(self.time, 's')}"
         )
 
 
@@ -132,7 +136,9 @@ def _loads_at(dynamics: Dynamics, state: State, index) -> tuple:
     return tuple(found)
 
 
-def momentum(motion: Motion) -> tuple[Float[Array, "times dim"], Float[Array, "times turns"]]:
+def momentum(
+    motion: Trajectory,
+) -> tuple[Float[Array, "times dim"], Float[Array, "times turns"]]:
     """Linear momentum [N s] and angular momentum about the origin [N m s] at every saved
     time, one component in the plane and three in space, with the consistent mass."""
     problem = motion.problem
