@@ -16,6 +16,7 @@ from sorojax.rod.contact.obstacle import (
     AbstractContact,
     Linearised,
     Side,
+    Step,
     Touch,
     check_line,
     coupling,
@@ -111,14 +112,13 @@ class LinkContact(AbstractPairForce):
             return press(self.law, self.touch(first, second))
 
         none = jnp.zeros_like(first.v), jnp.zeros_like(second.v)
-        now = jnp.zeros((), first.q.dtype)
-        return jax.lax.cond(self.is_near(first, second, now), forces, lambda: none)
+        return jax.lax.cond(self.is_near(first, second, 0.0), forces, lambda: none)
 
     @property
     def narrowest(self) -> Float[Array, ""]:
         return jnp.min(self.radius)
 
-    def is_near(self, first: Any, second: Any, h: Float[Array, ""]) -> Bool[Array, ""]:
+    def is_near(self, first: Any, second: Any, h: Step) -> Bool[Array, ""]:
         """Whether they may touch within a step of `h` [s]; `False` is certain."""
         _check_kinds(first, second)
         centre, reach = reach_of(first)
@@ -169,7 +169,7 @@ class LinkContact(AbstractPairForce):
             force = jnp.concatenate(press(self.law, touch))
             return Linearised(force, stiffness, none if damping is None else damping)
 
-        is_near = self.is_near(first, second, jnp.zeros((), zero.dtype))
+        is_near = self.is_near(first, second, 0.0)
         return jax.lax.cond(is_near, full, lambda: Linearised(zero, none, none))
 
 

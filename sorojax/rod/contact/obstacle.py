@@ -25,15 +25,25 @@ from sorojax.sdf.base import AbstractSdf
 
 _SURGE = 100.0  # acceleration that a broad phase allows for within a step [m/s^2]
 
+#: Length of a step [s]; 0.0, a Python number, asks for the moment alone and costs nothing.
+Step = Float[Array, ""] | float
 
-def travel(moment: RodState | LinkState, h: Float[Array, ""]) -> Float[Array, ""]:
+
+def is_now(h: Step) -> bool:
+    """Whether no step is asked about, but the moment alone."""
+    return isinstance(h, float) and h == 0.0
+
+
+def travel(moment: RodState | LinkState, h: Step) -> Float[Array, ""] | float:
     """How far [m] any section, or the frame of a link, may move within a step of `h` [s]."""
     return twice_way(moment, h) + _SURGE * h**2
 
 
-def twice_way(moment: RodState | LinkState, h: Float[Array, ""]) -> Float[Array, ""]:
+def twice_way(moment: RodState | LinkState, h: Step) -> Float[Array, ""] | float:
     """Twice what the fastest section, or the frame of a link, moves in `h` [s] as it moves
     now [m]."""
+    if is_now(h):
+        return 0.0
     if isinstance(moment, LinkState):
         velocity = (moment.base.linear_jacobian @ moment.v)[None]
     else:
@@ -42,8 +52,10 @@ def twice_way(moment: RodState | LinkState, h: Float[Array, ""]) -> Float[Array,
     return 2 * h * jnp.sqrt(jnp.max(jnp.sum(velocity**2, axis=1)))
 
 
-def twice_turn(moment: RodState | LinkState, h: Float[Array, ""]) -> Float[Array, ""]:
+def twice_turn(moment: RodState | LinkState, h: Step) -> Float[Array, ""] | float:
     """Twice what the section that spins fastest turns in `h` [s] as it moves now [rad]."""
+    if is_now(h):
+        return 0.0
     spin = moment.angular_jacobian.reshape(-1, moment.v.shape[0]) @ moment.v
     spin = spin.reshape(moment.angular_jacobian.shape[:2])
     return 2 * h * jnp.sqrt(jnp.max(jnp.sum(spin**2, axis=1)))
@@ -231,7 +243,7 @@ class AbstractContact(AbstractForce):
         """Least radius of what meets [m]."""
 
     @abc.abstractmethod
-    def is_near(self, motion: RodState, h: Float[Array, ""]) -> Bool[Array, ""]:
+    def is_near(self, motion: RodState, h: Step) -> Bool[Array, ""]:
         """Whether anything may touch within a step of `h` [s]; `False` is certain."""
 
     @abc.abstractmethod
@@ -251,7 +263,7 @@ class AbstractContact(AbstractForce):
             return sum_sides(press(self.law, self.touch(motion)))
 
         none = jnp.zeros_like(motion.v)
-        return jax.lax.cond(self.is_near(motion, _now(motion)), force, lambda: none)
+        return jax.lax.cond(self.is_near(motion, 0.0), force, lambda: none)
 
     def linearised(self, t: Float[Array, ""], motion: RodState) -> Linearised:
         """The force with its stiffness and damping."""
@@ -266,8 +278,9 @@ class AbstractContact(AbstractForce):
             force = sum_sides(press(self.law, touch))
             return Linearised(force, _fold(stiffness, count), damping)
 
-        is_near = self.is_near(motion, _now(motion))
-        return jax.lax.cond(is_near, full, lambda: Linearised(zero, none, none))
+        return jax.lax.cond(
+            self.is_near(motion, 0.0), full, lambda: Linearised(zero, none, none)
+        )
 
 
 class ObstacleContact(AbstractContact):
@@ -385,10 +398,6 @@ def sum_sides(forces: tuple[Array, ...]) -> Float[Array, " dof"]:
     for force in forces[1:]:
         total = total + force
     return total
-
-
-def _now(motion: RodState) -> Float[Array, ""]:
-    return jnp.zeros((), motion.q.dtype)
 
 
 def _fold(matrix: Array, count: int) -> Float[Array, "dof dof"]:

@@ -19,9 +19,11 @@ from sorojax.rod.contact.obstacle import (
     AbstractContact,
     Linearised,
     Side,
+    Step,
     Touch,
     check_line,
     energy,
+    is_now,
     line,
     press,
     reach_of,
@@ -198,7 +200,9 @@ class SelfContact(AbstractContact):
         # A curve that turns by less than this keeps its chords longer than a diameter.
         turn = 2 * np.arccos(2 / self.apart) * _TURN_MARGIN
         bends = motion.angular_rate @ motion.v
-        total = safe_norm(curvature(motion)) + 2 * h * safe_norm(bends)
+        total = safe_norm(curvature(motion))
+        if not is_now(h):
+            total = total + 2 * h * safe_norm(bends)
         return motion.operators.weights @ total > turn
 
     def passed(self, before, after):
@@ -272,15 +276,14 @@ class RodContact(AbstractPairForce):
             return _forces(self.law, *touches(self, first, second))
 
         none = jnp.zeros_like(first.v), jnp.zeros_like(second.v)
-        far = jnp.zeros((), first.q.dtype)
-        return jax.lax.cond(self.is_near(first, second, far), forces, lambda: none)
+        return jax.lax.cond(self.is_near(first, second, 0.0), forces, lambda: none)
 
     @property
     def narrowest(self) -> Float[Array, ""]:
         return jnp.min(self.radii)
 
     def is_near(
-        self, first: RodState | LinkState, second: RodState | LinkState, h: Array
+        self, first: RodState | LinkState, second: RodState | LinkState, h: Step
     ) -> Bool[Array, ""]:
         """Whether the rods may touch within a step of `h` [s]; `False` is certain."""
         first, second = rod_of(first), rod_of(second)
@@ -307,7 +310,7 @@ class RodContact(AbstractPairForce):
             forces = jnp.concatenate(_forces(self.law, one, two))
             return Linearised(forces, stiffness, damping)
 
-        is_near = self.is_near(first, second, jnp.zeros((), first.q.dtype))
+        is_near = self.is_near(first, second, 0.0)
         return jax.lax.cond(is_near, full, lambda: Linearised(none[0], none, none))
 
     def stored(self, first: RodState | LinkState, second: RodState | LinkState) -> Array:

@@ -1,0 +1,30 @@
+"""First calls of common verbs in fresh processes: without a cache, and with one that is filled.
+
+Scenes are built before; what they compile (a mesh, say) is no part of the first call. Second
+calls compile nothing.
+"""
+
+import tempfile
+from pathlib import Path
+
+from benchmarks.cold import CALLS, FROM_CACHE, measured
+from benchmarks.harness import Row, quick
+
+FEW = ("rod.equilibrium", "fem.solve", "systems.simulate")
+
+
+def rows():
+    few = quick("gradients, lanes, layouts")
+    for name, (_, bar) in CALLS.items():
+        if few and name not in FEW:
+            continue
+        with tempfile.TemporaryDirectory() as cache:
+            empty, filled = (measured(name, Path(cache)) for _ in range(2))
+        counts = {"programs": empty.programs, "operations": empty.operations}
+        yield Row(
+            "sorojax", {"call": name, "cache": "empty"} | counts, run_s=empty.first, bar=bar
+        )
+        yield Row(
+            "sorojax", {"call": name, "cache": "filled"}, run_s=filled.first, bar=FROM_CACHE
+        )
+        yield Row("sorojax", {"call": name, "cache": "second call"}, run_s=empty.second)
