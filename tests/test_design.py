@@ -128,7 +128,7 @@ def test_gcmma_that_finds_no_step_is_not_converged():
     """An objective with noise, which every proposal seems to lie below."""
     calls = iter(range(10**6))
     found = design.minimise(
-        lambda x: jnp.sum(x) + jnp.asarray(1e-2 * next(calls)),
+        lambda x: jnp.sum(x**2) + jnp.asarray(1e-2 * next(calls)),
         jnp.array([1.9, 1.5]),
         optimiser=design.GCMMA(-50.0, 2.0),
         tolerance=1e-4,

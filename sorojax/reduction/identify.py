@@ -36,7 +36,7 @@ from sorojax._types import Numbers, real
 from sorojax.fem.assembly.fields import quadrature_points
 from sorojax.fem.dynamics.damping import lumped_mass
 from sorojax.fem.equilibrium.linear import linearise, prepare
-from sorojax.fem.equilibrium.solve import Path, with_load
+from sorojax.fem.equilibrium.solve import Path
 from sorojax.fem.kinematics import PlaneStrain, Solid
 from sorojax.fem.loads.loads import Pressure
 from sorojax.fem.problem import Problem
@@ -310,9 +310,8 @@ def identify(
     q = np.asarray(coordinates(backbone, basis))
     at = probe(problem.mesh, curve, len(backbone.s), arm=arm, up=up)
     volumes, condensed = [], []
-    for u, value in zip(path.displacements, path.values, strict=True):
-        here = with_load(problem, path.name, value)
-        condensed.append(_condensed_stiffness(here, u, at, basis))
+    for k, u in enumerate(path.displacements):
+        condensed.append(_condensed_stiffness(path.problem_at(k), u, at, basis))
         volumes.append(float(enclosed_volume(problem, u, load.facets)))
         report("identify", len(volumes), len(p))
     K, C = _affine(p, np.stack(condensed))
@@ -353,8 +352,8 @@ def condensed_stiffness(
     """
     at = probe(path.problem.mesh, curve, samples, arm=arm, up=up)
     found = [
-        _condensed_stiffness(with_load(path.problem, path.name, value), u, at, basis)
-        for u, value in zip(path.displacements, path.values, strict=True)
+        _condensed_stiffness(path.problem_at(k), u, at, basis)
+        for k, u in enumerate(path.displacements)
     ]
     return np.stack(found)
 

@@ -55,7 +55,7 @@ class AbstractOptimiser(eqx.Module):
                 costs a solve.
         """
 
-    def is_settled(self, memory: PyTree, tolerance: float) -> bool:
-        """Whether a step smaller than `tolerance`, after which `memory` is passed on, says that
-        the search is over; it does unless a method shortens its steps for other reasons."""
+    def is_settled(self, memory: PyTree) -> bool:
+        """Whether a small step, after which `memory` is passed on, says that the search is
+        over; it does unless a method shortens its steps for other reasons."""
         return True

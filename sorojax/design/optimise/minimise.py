@@ -186,7 +186,7 @@ def minimise(
             on_step(step)
         stuck = stuck + 1 if change <= tolerance else 0
         if stuck and schedule is None:
-            settled = method.is_settled(memory, tolerance)
+            settled = method.is_settled(memory)
             if settled or stuck == _STUCK:
                 status = Status.successful if settled else Status.not_converged
                 break

@@ -24,14 +24,13 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from sorojax._types import real
 from sorojax.design.optimise.base import AbstractOptimiser, Values
 
 _INNER = 15  # proposals of GCMMA for one step
 _CLOSER = 3.0  # times the curvature after a proposal that is not finite; 3**15 is 1e7
-_FARTHER = 10.0  # times a small step: a first proposal beyond says that functions are not met
 _ROUNDING = 4  # of rounding, of the terms of an approximation: what a function may lie above it
 _PRICE = 1000.0  # of breaking a constraint, against objectives of order one to a hundred
 
@@ -241,7 +240,7 @@ def _longest(task: Approximation, at: _Point, move: _Point) -> Array:
 
 class MMAState(eqx.Module):
     """Memory of the method: asymptotes, the last two designs, how often it was called; and for
-    GCMMA how curved its functions must be, and the largest change of its first proposal."""
+    GCMMA how curved its functions must be, and whether they lay above the true ones."""
 
     low: Float[Array, " n"]
     high: Float[Array, " n"]
@@ -249,7 +248,7 @@ class MMAState(eqx.Module):
     before: Float[Array, " n"]
     count: Int[Array, ""]
     curvature: Float[Array, " functions"]
-    proposed: Float[Array, ""]
+    held: Bool[Array, ""]
 
 
 class AbstractMMA(AbstractOptimiser):
@@ -268,7 +267,7 @@ class AbstractMMA(AbstractOptimiser):
         """State before the first step from `x` with so many constraints."""
         x = real(x)
         curvature = jnp.ones(constraints + 1, x.dtype)
-        return MMAState(x, x, x, x, jnp.zeros((), jnp.int32), curvature, jnp.zeros((), x.dtype))
+        return MMAState(x, x, x, x, jnp.zeros((), jnp.int32), curvature, jnp.array(True))
 
     def propose(
         self, x: Float[Array, " n"], values: Values, state: MMAState
@@ -322,16 +321,16 @@ class GCMMA(AbstractMMA):
     def update(self, x, values, memory, evaluate):
         memory = self.begin(x, values, memory)
         new, after = self.propose(x, values, memory)
-        memory = eqx.tree_at(lambda s: s.proposed, memory, jnp.max(jnp.abs(new - x)))
         for _ in range(_INNER):
-            memory, above = self.stiffen(x, new, values, evaluate(new), memory)
-            if bool(above):
+            memory, held = self.stiffen(x, new, values, evaluate(new), memory)
+            after = eqx.tree_at(lambda s: s.held, after, held)
+            if bool(held):
                 break
             new, after = self.propose(x, values, memory)
-        return new, eqx.tree_at(lambda s: s.proposed, after, memory.proposed)
+        return new, after
 
-    def is_settled(self, memory, tolerance):
-        return float(memory.proposed) <= _FARTHER * tolerance
+    def is_settled(self, memory):
+        return bool(memory.held)
 
     def begin(self, x: Float[Array, " n"], values: Values, state: MMAState) -> MMAState:
         """The state at the start of an outer step: curvature by the gradients there."""
@@ -358,7 +357,8 @@ class GCMMA(AbstractMMA):
 def _propose(method, x, values: Values, state: MMAState):
     low, high = _asymptotes(method, x, state)
     answer = solve_subproblem(_approximation(method, x, values, state, low, high))
-    new = MMAState(low, high, x, state.last, state.count + 1, state.curvature, state.proposed)
+    count, held = state.count + 1, jnp.array(False)
+    new = MMAState(low, high, x, state.last, count, state.curvature, held)
     return answer, new
 
 

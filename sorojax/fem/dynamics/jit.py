@@ -93,7 +93,9 @@ def _attempt(dynamics, known, prepared: Prepared, control: Control, state, inter
     problem = with_terms(dynamics.problem, step.terms)
 
     def solved(guess):
-        found = follow_traced(problem, Begin(guess, step.terms), control.newton, 1, 0, prepared)
+        found = follow_traced(
+            problem, Begin(guess, step.terms), control.newton, 1, 0, prepared, True
+        )
         return found.u, found.counts
 
     start = state.displacement

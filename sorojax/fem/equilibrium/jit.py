@@ -20,7 +20,7 @@ from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import Prepared, constrain, linearise, prepare
 from sorojax.fem.equilibrium.load_stepping import between, unloaded
 from sorojax.fem.equilibrium.newton import Newton, overshoots, safe_fraction, share_of_step
-from sorojax.fem.problem import Problem
+from sorojax.fem.problem import Problem, residual
 from sorojax.fem.supports import known_components, known_values
 from sorojax.math.linalg import sparse
 
@@ -115,15 +115,17 @@ def follow_traced(
     steps: int,
     max_cuts: int,
     prepared: Prepared | None = None,
+    moves: bool = False,
 ) -> Outcome:
-    """Step from `begin` to `problem`, halving steps that fail; every number may be traced."""
+    """Step from `begin` to `problem`, halving steps that fail; every number may be traced. Of
+    a body that `moves` all steps of Newton's method are judged by the energy at their ends."""
     first = _first(problem, begin)
     prepared = prepare_traced(problem) if prepared is None else prepared
     state = _initial(problem, begin, steps)
 
     def one_pass(state: _State) -> _State:
         here = between(first, problem, rules.goal(state.way))
-        level = _examine(here, prepared, state, newton)
+        level = _examine(here, prepared, state, newton, moves)
         return _next(problem, prepared, state, level, steps, max_cuts)
 
     end = jax.lax.while_loop(lambda state: state.running, one_pass, state)
@@ -178,7 +180,9 @@ def _way(steps: int, dtype) -> rules.LoadSteps:
     )
 
 
-def _examine(here: Problem, prepared: Prepared, state: _State, newton: Newton) -> _Level:
+def _examine(
+    here: Problem, prepared: Prepared, state: _State, newton: Newton, moves: bool
+) -> _Level:
     """Judge the trial state and, where it is worth it, find the Newton step from there."""
     found = linearise(here, prepared, state.u, state.before)
     wanted = known_values(here.supports, *state.u.shape)
@@ -208,13 +212,36 @@ def _examine(here: Problem, prepared: Prepared, state: _State, newton: Newton) -
 
     seek = ~(collapsed | converged | failed)
     du, usable = jax.lax.cond(seek, direction, nothing)
-    if overshoots(here):
-        share = share_of_step(here, prepared.known, found.residual, state.u, du)
+    if moves or overshoots(here):
+        search = _share_by_energy if moves else share_of_step
+        share = search(here, prepared.known, found.residual, state.u, du)
         free = seek & ~state.predict & still
         du = jnp.where(free, share, jnp.ones_like(share)) * du
     # a singular tangent ends the level, except that of the first guess
     failed = failed | (seek & ~usable & ~state.predict)
     return _Level(collapsed, converged, failed, seek & ~failed, usable, du, found.values)
+
+
+def _share_by_energy(here: Problem, known, start, u, du) -> Float[Array, ""]:
+    """Share of a Newton step `du` [m] from `u`, of the residual `start`, at whose end the
+    energy does not rise too steeply."""
+    way = jnp.where(known, jnp.zeros_like(start), du.ravel())
+    slope = jnp.sum(start * way)
+
+    def end(share):
+        return jnp.sum(residual(here, u + share * du).ravel() * way)
+
+    def shorter(state):
+        share, at_end, count = state
+        share = rules.shortened(share, slope, at_end)
+        return share, end(share), count + 1
+
+    def too_far(state):
+        return rules.turned(slope, state[1]) & (state[2] < rules.MAX_SHORTENINGS)
+
+    shares = [load.longest_share(du) for load in here.loads]
+    whole = jnp.min(jnp.stack([jnp.ones((), du.dtype), *shares]))
+    return jax.lax.while_loop(too_far, shorter, (whole, end(whole), 0))[0]
 
 
 def _next(problem, prepared, state: _State, level: _Level, steps: int, max_cuts: int) -> _State:

@@ -118,7 +118,7 @@ def reached(contact: Any, h: Float[Array, ""], *bodies: Any) -> tuple[Array, Arr
 
 def long(moment: Any, h: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether any section turns, or moves, far within a step of `h` [s]."""
-    turns = twice_turn(moment, h) > _TURN
+    turns = jnp.asarray(twice_turn(moment, h) > _TURN)
     if not isinstance(moment, RodState):
         return turns
     return turns | (twice_way(moment, h) > _SHARE * moment.rod.length)
