@@ -31,7 +31,6 @@ _HOW = {
     "a class": "Give the class itself, without making an object of it.",
     "a random key": "Make one by jax.random.key(0).",
 }
-_INSTALLED = tuple({sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")})
 _NEEDS_NUMBERS = (
     jax.errors.ConcretizationTypeError,
     jax.errors.TracerArrayConversionError,
@@ -289,7 +288,13 @@ def _is_raw(traceback: TracebackType | None) -> bool:
 
 def _is_installed(code: CodeType) -> bool:
     """Whether a library or Python itself holds it."""
-    return code.co_filename.startswith((*_INSTALLED, "<frozen "))
+    return code.co_filename.startswith(_installed())
+
+
+@functools.cache
+def _installed() -> tuple[str, ...]:
+    places = {sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")}
+    return (*places, "<frozen ")
 
 
 def _traced_place(bound: Mapping[str, Any]) -> str:

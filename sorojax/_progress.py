@@ -12,22 +12,21 @@ import math
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from typing import Any, TextIO
+from collections.abc import Callable, Iterator, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple, TextIO
 
 _PAUSE = 0.1  # s between two pictures of a bar
 _WORTH = 1.0  # s that a call must have taken for its last line to stay
 
 
-@dataclass(frozen=True)
-class Progress:
+class Progress(NamedTuple):
     """How far a call is: `done` of `total`, with the numbers that matter."""
 
     label: str
     done: float
     total: float
-    numbers: dict[str, float] = field(default_factory=dict)
+    numbers: Mapping[str, float] = MappingProxyType({})
 
     @property
     def fraction(self) -> float:
@@ -37,8 +36,7 @@ class Progress:
 Listener = Callable[[Progress], None]
 
 
-@dataclass(frozen=True)
-class View:
+class View(NamedTuple):
     """The display of a bar: a line of text, and whether it is the last of its call."""
 
     text: str
