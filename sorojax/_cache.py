@@ -27,14 +27,16 @@ def cached_programs() -> tuple[int, float]:
 
 
 def clear_compilation_cache() -> int:
-    """Delete the compiled programs for all types of processor; how many files there were."""
+    """Delete the compiled programs for all types of processor, and nothing else that may stand
+    there; how many there were."""
     folder, count = _root() / "jax", 0
-    for path in sorted(folder.rglob("*"), reverse=True):
-        if path.is_dir() and not path.is_symlink():
-            path.rmdir()
-        else:
+    for pattern in ("*-cache", "*-atime", "*/*-cache", "*/*-atime"):
+        for path in folder.glob(pattern):
             path.unlink()
-            count += 1
+            count += path.name.endswith("-cache")
+    for path in folder.glob(f"{platform.machine()}-*"):
+        if path.is_dir() and not path.is_symlink() and not any(path.iterdir()):
+            path.rmdir()
     return count
 
 

@@ -29,13 +29,19 @@ def displayed(noun: Noun) -> Noun:
         except ValueError:  # unbounded, not finite: the text remains
             return None
 
+    noun._repr_png_ = _repr_png_  # type: ignore[attr-defined]
+    return printed(noun)
+
+
+def printed(noun: Noun) -> Noun:
+    """A class whose instances are printed so, but drawn only with what they do not hold."""
+
     def __repr__(self: Any) -> str:
         try:
             return self._text() if hasattr(self, "_text") else fields(self)
         except (TypeError, ValueError, AttributeError, IndexError):
             return eqx.tree_pformat(self)  # transformations put other things into leaves
 
-    noun._repr_png_ = _repr_png_  # type: ignore[attr-defined]
     if "__repr__" not in vars(noun):
         noun.__repr__ = __repr__  # type: ignore[assignment]
     return noun

@@ -100,6 +100,7 @@ def test_an_arch_snaps_through():
     assert jnp.sum(turns < 0) >= 1 and jnp.sum(turns > 0) >= 1
     negative = path.negative_eigenvalues
     assert negative[0] == 0 and negative.max() >= 1 and negative[-1] == 0
+    assert repr(path).startswith("Path: 60 states, successful")
 
 
 def test_an_assembly_hangs_as_the_rod_it_is_made_of():
@@ -110,6 +111,10 @@ def test_an_assembly_hangs_as_the_rod_it_is_made_of():
     rest = R.equilibrium(pair, (R.Gravity(),))
     assert rest.status == Status.successful
     assert jnp.allclose(R.tip_pose(pair, rest.q)["segment_1"], tip, rtol=0, atol=1e-6)
+    assert repr(rest).startswith("Solution: successful after ") and "iterations, q" in repr(
+        rest
+    )
+    assert not hasattr(rest, "_repr_png_")  # a picture of it needs the model
     lost = R.equilibrium(whole, (R.Gravity([0.0, jnp.nan]),))
     assert lost.status == Status.not_finite
 

@@ -23,7 +23,7 @@ def add(commands) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     if arguments.clear:
-        print(f"{clear_compilation_cache()} files deleted")
+        print(f"{clear_compilation_cache()} programs deleted")
     elif arguments.warm:
         return _warm()
     else:

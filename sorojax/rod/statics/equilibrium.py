@@ -15,7 +15,7 @@ from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax import _check
-from sorojax._display import displayed, number, outcome
+from sorojax._display import number, outcome, printed
 from sorojax._types import real
 from sorojax.math.compiled import jit_public
 from sorojax.math.implicit_root import implicit_root
@@ -248,7 +248,7 @@ _SHORTEST = 1e-3  # of a Newton step
 Residual = Callable[[Array], Array]
 
 
-@displayed
+@printed
 class Solution(eqx.Module):
     """The state at which a search over coordinates ended.
 

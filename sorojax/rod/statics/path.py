@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from sorojax._display import displayed, number, outcome
+from sorojax._display import number, outcome, printed
 from sorojax._types import Numbers, real
 from sorojax.math.compiled import jit_public
 from sorojax.math.host import tell
@@ -40,7 +40,7 @@ from sorojax.rod.statics.equilibrium import (
 Loading = Callable[[Array], tuple[Load, ...]]
 
 
-@displayed
+@printed
 class Path(eqx.Module):
     """Equilibria along a path of loads.
 
