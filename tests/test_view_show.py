@@ -17,7 +17,7 @@ from sorojax.fem.equilibrium.solve import Path
 from sorojax.fem.stability.modal import Modes
 from sorojax.math.lie import SE2, SE3, homogeneous
 from sorojax.math.status import Status
-from sorojax.view.draw import bodies, networks, rod_loads as sections
+from sorojax.view.draw import networks, rod_loads as sections
 from sorojax.view.draw.meshes import outline, shell
 from sorojax.view.draw.rod_loads import acting
 from sorojax.view.raster.scene import short
@@ -323,7 +323,7 @@ def test_states_of_a_path_share_one_scale(dim, plane, solid):
     assert len(view.show(path, field=None, states=[-1]).panels) == 1
     with pytest.raises(ValueError, match="states 0 to 2"):
         view.show(path, states=[7])
-    assert bodies.problem_at(path, 1).loads[0].value[-1] == -150.0
+    assert path.problem_at(1).loads[0].value[-1] == -150.0
 
 
 @pytest.mark.parametrize("dim", [2, 3])
