@@ -1,8 +1,8 @@
-"""First calls in fresh processes: `python -m benchmarks.cold NAME CACHE PROGRAMS`.
+"""First calls in fresh processes: `python -m benchmarks.cold NAME [PROGRAMS]`.
 
 Every scene is built before the clock starts, and JAX has run an operation. What is timed is
-the first call and the second; where CACHE is a folder, programs are kept there. JAX writes the
-programs that it compiles to the folder PROGRAMS, where their operations are counted.
+the first call and the second, with the cache of `SOROJAX_CACHE`. With a folder PROGRAMS JAX
+writes there what it compiles, whose operations are counted; that takes time of its own.
 """
 
 import json
@@ -19,11 +19,16 @@ Call = Callable[[], Any]
 
 
 class Cold(NamedTuple):
-    """What a process found: seconds of two calls, programs compiled and their operations."""
+    """Seconds of the first call and of the second."""
 
     first: float
     second: float
-    programs: int
+
+
+class Programs(NamedTuple):
+    """How many programs two calls compile, and their operations."""
+
+    count: int
     operations: int
 
 
@@ -216,19 +221,30 @@ FROM_CACHE = 1.0  # s, the bar of all of them with a filled cache
 
 def measured(name: str, cache: Path) -> Cold:
     """Both calls in a process of their own."""
+    return Cold(*_told(cache, name))
+
+
+def counted(name: str, cache: Path) -> Programs:
+    """What both calls compile, in a process of their own."""
     with tempfile.TemporaryDirectory() as programs:
-        done = subprocess.run(
-            [sys.executable, "-m", "benchmarks.cold", name, str(cache), programs],
-            env=os.environ | {"SOROJAX_CACHE": str(cache)},
-            capture_output=True,
-            text=True,
-        )
+        _told(cache, name, programs)
+        texts = [path.read_text() for path in Path(programs).glob("*.mlir")]
+    return Programs(len(texts), sum(text.count(" = ") for text in texts))
+
+
+def _told(cache: Path, *words: str) -> list[float]:
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.cold", *words],
+        env=os.environ | {"SOROJAX_CACHE": str(cache)},
+        capture_output=True,
+        text=True,
+    )
     if done.returncode:
-        raise RuntimeError(f"cold: {name} failed.\n{done.stderr[-2000:]}")
-    return Cold(*json.loads(done.stdout.splitlines()[-1]))
+        raise RuntimeError(f"cold: {words[0]} failed.\n{done.stderr[-2000:]}")
+    return json.loads(done.stdout.splitlines()[-1])
 
 
-def _main(name: str, cache: str, programs: str) -> None:
+def _main(name: str, programs: str | None = None) -> None:
     import jax
 
     import sorojax as sj
@@ -237,15 +253,14 @@ def _main(name: str, cache: str, programs: str) -> None:
     jax.block_until_ready(jax.numpy.zeros(3) + 1)
     call = CALLS[name][0]()
     sj.enable_compilation_cache()
-    jax.config.update("jax_dump_ir_to", programs)
+    if programs is not None:
+        jax.config.update("jax_dump_ir_to", programs)
     seconds = []
     for _ in range(2):
         start = time.perf_counter()
         jax.block_until_ready(call())
         seconds.append(time.perf_counter() - start)
-    texts = [path.read_text() for path in Path(programs).glob("*.mlir")]
-    operations = sum(text.count(" = ") for text in texts)
-    print(json.dumps([*seconds, len(texts), operations]))
+    print(json.dumps(seconds))
 
 
 if __name__ == "__main__":

@@ -10,7 +10,9 @@ from scipy.special import ellipk
 
 from sorojax import Status, fem, material, mesh
 from sorojax._progress import listen
+from sorojax.fem.equilibrium.jit import known_mask
 from sorojax.fem.equilibrium.load_stepping import Stats
+from sorojax.fem.problem import load_force
 from sorojax.math.linalg import sparse
 
 BULK = 1e5  # over the shear modulus: the closed form is incompressible
@@ -111,6 +113,16 @@ def test_volume_control_finds_the_states_of_the_arc(balloon):
     assert found.status == Status.successful
     assert jnp.allclose(found.pressures, path.factors[picked], rtol=1e-8)
     assert jnp.allclose(found.displacements, path.displacements[picked], atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["air", None])
+def test_problems_of_a_path_have_the_loads_of_its_states(name):
+    path = fem.continuation(_sphere(0.2), name, step=0.08, max_states=3)
+    for k in (1, 2):
+        problem, u = path.problem_at(k), path.displacements[k]
+        free = ~np.asarray(known_mask(problem.supports, *u.shape)).reshape(u.shape)
+        force = np.asarray(fem.residual(problem, u)).reshape(u.shape)[free]
+        assert np.abs(force).max() < 1e-7 * np.abs(load_force(problem, u)).max()
 
 
 def test_a_path_goes_on_where_it_ended(balloon):

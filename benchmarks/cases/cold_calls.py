@@ -7,7 +7,7 @@ calls compile nothing.
 import tempfile
 from pathlib import Path
 
-from benchmarks.cold import CALLS, FROM_CACHE, measured
+from benchmarks.cold import CALLS, FROM_CACHE, counted, measured
 from benchmarks.harness import Row, quick
 
 FEW = ("rod.equilibrium", "fem.solve", "systems.simulate")
@@ -20,7 +20,8 @@ def rows():
             continue
         with tempfile.TemporaryDirectory() as cache:
             empty, filled = (measured(name, Path(cache)) for _ in range(2))
-        counts = {"programs": empty.programs, "operations": empty.operations}
+            programs = counted(name, Path(cache))
+        counts = {"programs": programs.count, "operations": programs.operations}
         yield Row(
             "sorojax", {"call": name, "cache": "empty"} | counts, run_s=empty.first, bar=bar
         )

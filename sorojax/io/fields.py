@@ -1,5 +1,6 @@
 """Results on meshes to VTU files, one for a state, a PVD collection for a path."""
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -89,7 +90,8 @@ def _states(where, problem, states, times):
     moments = times
     if isinstance(states, FemPath):
         moved = np.asarray(states.displacements)
-        problems = [states.problem_at(k) for k in range(len(states))]
+        path = dataclasses.replace(states, problem=problem)
+        problems = [path.problem_at(k) for k in range(len(path))]
         if times is None and states.values.ndim == 1:
             moments = np.asarray(states.values).tolist()
     elif isinstance(states, fem.Trajectory):

@@ -94,7 +94,7 @@ def _attempt(dynamics, known, prepared: Prepared, control: Control, state, inter
 
     def solved(guess):
         found = follow_traced(
-            problem, Begin(guess, step.terms), control.newton, 1, 0, prepared, True
+            problem, Begin(guess, step.terms), control.newton, 1, 0, prepared, moves=True
         )
         return found.u, found.counts
 

@@ -17,10 +17,10 @@ from sorojax.fem.assembly.assemble import cell_matrices
 from sorojax.fem.assembly.geometry import geometry
 from sorojax.fem.assembly.space import Space
 from sorojax.fem.equilibrium import rules
-from sorojax.fem.equilibrium.linear import Prepared, constrain, linearise, prepare
+from sorojax.fem.equilibrium.linear import Linearised, Prepared, constrain, linearise, prepare
 from sorojax.fem.equilibrium.load_stepping import between, unloaded
 from sorojax.fem.equilibrium.newton import Newton, overshoots, safe_fraction, share_of_step
-from sorojax.fem.problem import Problem, residual
+from sorojax.fem.problem import Problem
 from sorojax.fem.supports import known_components, known_values
 from sorojax.math.linalg import sparse
 
@@ -47,7 +47,8 @@ class Outcome(NamedTuple):
 
 class _State(NamedTuple):
     """`u` is the trial, `start` the last equilibrium on the `way`; `guess` while a guess of
-    the end is tried."""
+    the end is tried. `share` of the last step was taken, at whose start the energy has the
+    `slope` along it [J], zero where that is not judged, after so many `shortenings`."""
 
     u: Float[Array, "nodes dim"]
     before: Float[Array, "nodes dim"]
@@ -61,19 +62,27 @@ class _State(NamedTuple):
     way: rules.LoadSteps
     iterations: Int[Array, ""]
     total: Int[Array, ""]
+    slope: Float[Array, ""]
+    share: Float[Array, ""]
+    shortenings: Int[Array, ""]
     running: Bool[Array, ""]
 
 
 class _Level(NamedTuple):
-    """Outcome of one pass at the trial state; exactly one of the first four is true."""
+    """Outcome of one pass at the trial state; exactly one of the first five is true. `slope`
+    belongs to the next step `du`, `share` is what is to be taken of the last one where it
+    `overran`: where the energy has turned before its end."""
 
     collapsed: Bool[Array, ""]
+    overran: Bool[Array, ""]
     converged: Bool[Array, ""]
     failed: Bool[Array, ""]
     stepped: Bool[Array, ""]
     usable: Bool[Array, ""]
     du: Float[Array, "nodes dim"]
     values: Float[Array, " nnz"]
+    slope: Float[Array, ""]
+    share: Float[Array, ""]
 
 
 def prepare_traced(problem: Problem) -> Prepared:
@@ -169,6 +178,9 @@ def _initial(problem: Problem, begin: Begin | None, steps: int) -> _State:
         way=_way(1 if guess else steps, points.dtype),
         iterations=none,
         total=none,
+        slope=jnp.zeros((), points.dtype),
+        share=jnp.ones((), points.dtype),
+        shortenings=none,
         running=jnp.all(jnp.isfinite(u)),
     )
 
@@ -194,9 +206,15 @@ def _examine(
     valid = rules.sound(norm, found.volume_ratio)
     small = rules.balanced(norm, found.reference, found.rounding, tolerance)
     answer = rules.converged(small, state.update, still, newton) & ~state.predict
-    converged = ~collapsed & valid & answer
+    overran, share = jnp.asarray(False), state.share
+    if moves:
+        end = _slope(prepared, found, state.u - state.before) / state.share
+        more = state.moved & ~collapsed & (state.shortenings < rules.MAX_SHORTENINGS)
+        overran = more & rules.turned(state.slope, end)
+        share = rules.shortened(state.share, state.slope, end)
+    converged = ~collapsed & ~overran & valid & answer
     exhausted = rules.exhausted(state.iterations, newton) & ~state.predict
-    failed = ~collapsed & ~converged & (~valid | exhausted)
+    failed = ~collapsed & ~overran & ~converged & (~valid | exhausted)
     values = jnp.where(state.predict, state.tangent, found.values)
 
     def direction():
@@ -210,38 +228,27 @@ def _examine(
     def nothing():
         return jnp.zeros_like(state.u), jnp.asarray(True)
 
-    seek = ~(collapsed | converged | failed)
+    seek = ~(collapsed | overran | converged | failed)
     du, usable = jax.lax.cond(seek, direction, nothing)
-    if moves or overshoots(here):
-        search = _share_by_energy if moves else share_of_step
-        share = search(here, prepared.known, found.residual, state.u, du)
+    slope = jnp.zeros_like(state.slope)
+    if moves:
+        seen = [load.longest_share(du) for load in here.loads]
+        du = jnp.min(jnp.stack([jnp.ones_like(slope), *seen])) * du
+        slope = jnp.where(still, _slope(prepared, found, du), slope)
+    elif overshoots(here):
+        part = share_of_step(here, prepared.known, found.residual, state.u, du)
         free = seek & ~state.predict & still
-        du = jnp.where(free, share, jnp.ones_like(share)) * du
+        du = jnp.where(free, part, jnp.ones_like(part)) * du
     # a singular tangent ends the level, except that of the first guess
     failed = failed | (seek & ~usable & ~state.predict)
-    return _Level(collapsed, converged, failed, seek & ~failed, usable, du, found.values)
+    judged = (collapsed, overran, converged, failed, seek & ~failed)
+    return _Level(*judged, usable, du, found.values, slope, share)
 
 
-def _share_by_energy(here: Problem, known, start, u, du) -> Float[Array, ""]:
-    """Share of a Newton step `du` [m] from `u`, of the residual `start`, at whose end the
-    energy does not rise too steeply."""
-    way = jnp.where(known, jnp.zeros_like(start), du.ravel())
-    slope = jnp.sum(start * way)
-
-    def end(share):
-        return jnp.sum(residual(here, u + share * du).ravel() * way)
-
-    def shorter(state):
-        share, at_end, count = state
-        share = rules.shortened(share, slope, at_end)
-        return share, end(share), count + 1
-
-    def too_far(state):
-        return rules.turned(slope, state[1]) & (state[2] < rules.MAX_SHORTENINGS)
-
-    shares = [load.longest_share(du) for load in here.loads]
-    whole = jnp.min(jnp.stack([jnp.ones((), du.dtype), *shares]))
-    return jax.lax.while_loop(too_far, shorter, (whole, end(whole), 0))[0]
+def _slope(prepared: Prepared, found: Linearised, du) -> Float[Array, ""]:
+    """Slope of the energy along `du` [J], of the displacements that supports leave free."""
+    residual = jnp.where(prepared.known, jnp.zeros_like(found.residual), found.residual)
+    return jnp.sum(residual * du.ravel())
 
 
 def _next(problem, prepared, state: _State, level: _Level, steps: int, max_cuts: int) -> _State:
@@ -262,12 +269,23 @@ def _next(problem, prepared, state: _State, level: _Level, steps: int, max_cuts:
         shortened=jnp.asarray(False),
         update=update,
         iterations=state.iterations + jnp.where(state.predict, 0, 1).astype(jnp.int32),
+        slope=level.slope,
+        share=jnp.ones_like(state.share),
+        shortenings=jnp.zeros_like(state.shortenings),
     )
     # how small it is, is asked of the step that Newton's method wanted
     update = rules.relative_size(whole, short, prepared.length)
     shortened = state._replace(u=short, shortened=jnp.asarray(True), update=update)
+    less = level.share / state.share
+    overran = state._replace(
+        u=state.before + less * whole,
+        update=less * state.update,
+        share=level.share,
+        shortenings=state.shortenings + 1,
+    )
     branches = (
         (level.stepped, moved),
+        (level.overran, overran),
         (level.collapsed, shortened),
         (level.converged, _accepted(state, level, rules.predicts(problem.loads))),
         (level.failed, _cut(state, steps, max_cuts)),
@@ -317,6 +335,9 @@ def _fresh(state: _State) -> _State:
         shortened=jnp.asarray(False),
         update=jnp.full_like(state.update, jnp.inf),
         iterations=jnp.zeros_like(state.iterations),
+        slope=jnp.zeros_like(state.slope),
+        share=jnp.ones_like(state.share),
+        shortenings=jnp.zeros_like(state.shortenings),
     )
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from sorojax._progress import report, reported_if_long
 from sorojax.fem.equilibrium import rules
@@ -116,7 +116,7 @@ def unloaded(problem: Problem) -> Problem:
     return _with_terms(problem, lambda _, b: jnp.zeros_like(b), problem)
 
 
-def between(first: Problem, last: Problem, fraction: float) -> Problem:
+def between(first: Problem, last: Problem, fraction: float | Float[Array, ""]) -> Problem:
     """Loads and supports between two problems on the same body."""
     return _with_terms(first, lambda a, b: a + fraction * (b - a), last)
 

@@ -19,7 +19,7 @@ from sorojax._progress import report
 from sorojax._types import real
 from sorojax.fem.equilibrium.implicit_diff import Solve, equilibrium
 from sorojax.fem.equilibrium.jit import Begin
-from sorojax.fem.equilibrium.load_stepping import Stats, unloaded
+from sorojax.fem.equilibrium.load_stepping import Stats, between, unloaded
 from sorojax.fem.equilibrium.newton import Newton
 from sorojax.fem.problem import Problem
 from sorojax.math.status import Status
@@ -85,9 +85,9 @@ class Path(eqx.Module):
         return self.displacements.shape[0]
 
     def problem_at(self, k: int) -> Problem:
-        """The problem with the load of state `k`."""
+        """The problem with the loads of state `k`."""
         if self.name is None:
-            return self.problem
+            return between(unloaded(self.problem), self.problem, self.values[k])
         values = self.values if self.pressures is None else self.pressures
         return with_load(self.problem, self.name, values[k])
 

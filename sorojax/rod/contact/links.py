@@ -16,7 +16,7 @@ from sorojax.rod.contact.obstacle import (
     AbstractContact,
     Linearised,
     Side,
-    Step,
+    StepSize,
     Touch,
     check_line,
     coupling,
@@ -118,7 +118,7 @@ class LinkContact(AbstractPairForce):
     def narrowest(self) -> Float[Array, ""]:
         return jnp.min(self.radius)
 
-    def is_near(self, first: Any, second: Any, h: Step) -> Bool[Array, ""]:
+    def is_near(self, first: Any, second: Any, h: StepSize) -> Bool[Array, ""]:
         """Whether they may touch within a step of `h` [s]; `False` is certain."""
         _check_kinds(first, second)
         centre, reach = reach_of(first)

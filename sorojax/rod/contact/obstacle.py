@@ -26,20 +26,20 @@ from sorojax.sdf.base import AbstractSdf
 _SURGE = 100.0  # acceleration that a broad phase allows for within a step [m/s^2]
 
 #: Length of a step [s]; 0.0, a Python number, asks for the moment alone and costs nothing.
-Step = Float[Array, ""] | float
+StepSize = Float[Array, ""] | float
 
 
-def is_now(h: Step) -> bool:
+def is_now(h: StepSize) -> bool:
     """Whether no step is asked about, but the moment alone."""
     return isinstance(h, float) and h == 0.0
 
 
-def travel(moment: RodState | LinkState, h: Step) -> Float[Array, ""] | float:
+def travel(moment: RodState | LinkState, h: StepSize) -> Float[Array, ""] | float:
     """How far [m] any section, or the frame of a link, may move within a step of `h` [s]."""
     return twice_way(moment, h) + _SURGE * h**2
 
 
-def twice_way(moment: RodState | LinkState, h: Step) -> Float[Array, ""] | float:
+def twice_way(moment: RodState | LinkState, h: StepSize) -> Float[Array, ""] | float:
     """Twice what the fastest section, or the frame of a link, moves in `h` [s] as it moves
     now [m]."""
     if is_now(h):
@@ -52,7 +52,7 @@ def twice_way(moment: RodState | LinkState, h: Step) -> Float[Array, ""] | float
     return 2 * h * jnp.sqrt(jnp.max(jnp.sum(velocity**2, axis=1)))
 
 
-def twice_turn(moment: RodState | LinkState, h: Step) -> Float[Array, ""] | float:
+def twice_turn(moment: RodState | LinkState, h: StepSize) -> Float[Array, ""] | float:
     """Twice what the section that spins fastest turns in `h` [s] as it moves now [rad]."""
     if is_now(h):
         return 0.0
@@ -243,7 +243,7 @@ class AbstractContact(AbstractForce):
         """Least radius of what meets [m]."""
 
     @abc.abstractmethod
-    def is_near(self, motion: RodState, h: Step) -> Bool[Array, ""]:
+    def is_near(self, motion: RodState, h: StepSize) -> Bool[Array, ""]:
         """Whether anything may touch within a step of `h` [s]; `False` is certain."""
 
     @abc.abstractmethod

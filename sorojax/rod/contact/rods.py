@@ -19,7 +19,7 @@ from sorojax.rod.contact.obstacle import (
     AbstractContact,
     Linearised,
     Side,
-    Step,
+    StepSize,
     Touch,
     check_line,
     energy,
@@ -283,7 +283,7 @@ class RodContact(AbstractPairForce):
         return jnp.min(self.radii)
 
     def is_near(
-        self, first: RodState | LinkState, second: RodState | LinkState, h: Step
+        self, first: RodState | LinkState, second: RodState | LinkState, h: StepSize
     ) -> Bool[Array, ""]:
         """Whether the rods may touch within a step of `h` [s]; `False` is certain."""
         first, second = rod_of(first), rod_of(second)
