@@ -16,7 +16,7 @@ import pytest
 import sorojax as sj
 from sorojax import Status, design, fem, material, mesh, rod, sdf, systems, view
 from sorojax.mesh.enrich import with_centres
-from sorojax.rod.statics.equilibrium import Equilibrium
+from sorojax.rod.statics.equilibrium import Solution
 
 RUBBER = material.neo_hookean(young_modulus=1e5, poisson_ratio=0.4, density=1e3)
 SQUARE = mesh.rectangle([0, 0], [1, 1], divisions=(1, 1))
@@ -414,6 +414,6 @@ def test_surfaces_and_sweeps_print_in_a_few_lines():
 
 def test_a_picture_without_its_model_is_told():
     zero = jnp.zeros((), int)
-    found = Equilibrium(Q, Status.successful, zero, zero)
+    found = Solution(Q, Status.successful, zero, zero)
     assert "'model'" in call(view.show, found)
     assert "colour" in call(view.show, ROD, colour=3)
