@@ -136,16 +136,21 @@ def _places(element: AbstractElement) -> Int[np.ndarray, "cell_dofs cell_dofs"]:
     return place[np.ix_(order, order)]
 
 
-@jax.custom_jvp
+@eqx.filter_jit
 def compliance(model: Linear, factor: Float[Array, " cells"]) -> Float[Array, ""]:
     """Work of the loads f'u [J]: small where the body is stiff.
 
     Differentiable in `model` and `factor`; its gradient takes no further solve.
     """
+    return _work(model, factor)
+
+
+@jax.custom_jvp
+def _work(model: Linear, factor) -> Float[Array, ""]:
     return jnp.sum(model.force * displacement(model, factor))
 
 
-def _compliance_derivative(primals, tangents):
+def _work_derivative(primals, tangents):
     model, factor = primals
     model_dot, factor_dot = tangents
     u = displacement(model, factor)
@@ -159,4 +164,4 @@ def _compliance_derivative(primals, tangents):
     return jnp.sum(model.force * u), slope
 
 
-compliance.defjvp(_compliance_derivative, symbolic_zeros=True)
+_work.defjvp(_work_derivative, symbolic_zeros=True)

@@ -219,7 +219,7 @@ def cell_matrices(
         F = alone(
             lambda: deformation_gradient(kinematics, lanes(u, block.cells), block.gradients)
         )
-        answer = response(body, F, F, alone)
+        answer = response(body, F, None, alone)
         return block_matrix(kinematics, answer, body, block.gradients, alone)[1]
 
     return jax.lax.map(work, blocks)

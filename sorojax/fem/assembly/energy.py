@@ -139,7 +139,7 @@ def shape_stress(
     """Its first Piola-Kirchhoff stress [Pa]."""
     W = _closed_form(material, kinematics)
     if W is None:
-        return jax.grad(lambda F: jnp.sum(shape_energy(material, kinematics, F)))(F)
+        return kinematics.shape_stress(material, F)
     x, slopes = _first_invariant(kinematics, F)
     return _slope(W)(x)[None] * slopes
 
@@ -168,8 +168,7 @@ def shape_response(
     """Stress P [Pa], and dP/dF or what it is made of [Pa]."""
     W = _closed_form(material, kinematics)
     if W is None:
-        stress = shape_stress(material, kinematics, F)
-        return stress, _differentiated(material, kinematics, F)
+        return _differentiated(material, kinematics, F)
     inverse, scale, I1, C = _parts(kinematics, F)
     x, slopes = _first_invariant(kinematics, F)
     first, second = _slope(W)(x), None
@@ -196,7 +195,7 @@ def _differentiated(material, kinematics: AbstractKinematics, F: Entries):
         return jax.jvp(lambda F: shape_stress(material, kinematics, F), (F,), (direction,))
 
     units = jnp.broadcast_to(unit, (num, *F.shape))
-    return jax.vmap(lambda direction: column(direction)[1])(units)
+    return jax.vmap(column, out_axes=(None, 0))(units)
 
 
 def _closed_form(material: AbstractHyperelastic, kinematics: AbstractKinematics):
@@ -226,6 +225,7 @@ def _first_invariant(kinematics: AbstractKinematics, F: Entries) -> tuple[Entry,
 
 
 _NEXT = (1, 2, 0)
+_Pairs = tuple[Entry | None, ...]  # of the columns that `stress_pairs` lists
 Block = Float[Array, "rows cols quad lanes"]
 
 
@@ -242,7 +242,7 @@ def point_tangent(
     F: Entries,
     shape: Shape,
     weight: Entry | None,
-    S: tuple[Entry, ...],
+    S: _Pairs,
 ) -> Tangent:
     """dP/dF of `shape`, plus `weight` times d2J / dF dF, plus `S` between the entries of one
     row of F."""
@@ -250,11 +250,15 @@ def point_tangent(
     if weight is not None:
         tilted = (*(weight * entry for entry in F), weight)
     if isinstance(shape, ShapeVectors):
-        pairs = stress_pairs(type(kinematics))
-        S = tuple(s + shape.flat if i == j else s for s, (i, j) in zip(S, pairs, strict=True))
+        pairs = zip(S, stress_pairs(type(kinematics)), strict=True)
+        S = tuple(_sum(s, shape.flat) if i == j else s for s, (i, j) in pairs)
     rows = [[e for e, _ in entries_of(kinematics, i)] for i in range(kinematics.dim)]
     blocks = [_block(shape, rows[i], rows[k]) for i, k in component_pairs(kinematics.dim)]
     return Tangent(tuple(blocks), (*tilted, *S))
+
+
+def _sum(a: Entry | None, b: Entry) -> Entry:
+    return b if a is None else a + b
 
 
 def _block(shape: Shape, rows: list[int], cols: list[int]) -> Block:
@@ -359,11 +363,20 @@ def pressure(body: Body, F: Entries) -> Entry:
     return project(body.modes, body.volumes, slope)
 
 
-def response(body: Body, F: Entries, F_before: Entries, alone: Alone) -> Response:
+def response(body: Body, F: Entries, F_before: Entries | None, alone: Alone) -> Response:
     """P and dP/dF, the geometric parts of dP/dF from stresses extrapolated out of
-    `F_before`. With `F_before` equal to `F` the tangent is the exact derivative."""
+    `F_before`. Without it the tangent is the exact derivative."""
+    if F_before is None:
+        law = alone(lambda: _law(body, F))
+        p = None if law.volumetric is None else law.volumetric[0]
+        straight = (None,) * len(stress_pairs(type(body.kinematics)))
+        return alone(lambda: _with_tangent(body, F, law, p, straight))
     law, before = alone(lambda: (_law(body, F), _before(body, F_before, F - F_before)))
-    return alone(lambda: _with_tangent(body, F, F_before, law, before))
+    return alone(
+        lambda: _with_tangent(
+            body, F, law, before.p, _geometric_stress(body, F, F_before, law.P, before)
+        )
+    )
 
 
 class _Law(NamedTuple):
@@ -404,11 +417,10 @@ def _before(body: Body, F: Entries, step: Entries) -> _Before:
     return _Before(P, rate, p + p_rate)
 
 
-def _with_tangent(body: Body, F, F_before, law: _Law, before: _Before) -> Response:
-    weight = law.shape.weight if isinstance(law.shape, ShapeVectors) else None
-    if before.p is not None:
-        weight = before.p if weight is None else weight + before.p
-    S = _geometric_stress(body, F, F_before, law.P, before)
+def _with_tangent(body: Body, F, law: _Law, weight: Entry | None, S: _Pairs) -> Response:
+    """Of the `law`, `weight` times d2J / dF dF and `S` between the entries of a row."""
+    if isinstance(law.shape, ShapeVectors):
+        weight = _sum(weight, law.shape.weight)
     tangent = point_tangent(body.kinematics, F, law.shape, weight, S)
     if law.volumetric is None:
         return Response(law.P, tangent, None, None)

@@ -17,10 +17,17 @@ from sorojax.fem.assembly.assemble import cell_matrices
 from sorojax.fem.assembly.geometry import geometry
 from sorojax.fem.assembly.space import Space
 from sorojax.fem.equilibrium import rules
-from sorojax.fem.equilibrium.linear import Linearised, Prepared, constrain, linearise, prepare
+from sorojax.fem.equilibrium.linear import (
+    Linearised,
+    Prepared,
+    constrain,
+    linearise,
+    load_stiffness,
+    prepare,
+)
 from sorojax.fem.equilibrium.load_stepping import between, unloaded
 from sorojax.fem.equilibrium.newton import Newton, overshoots, safe_fraction, share_of_step
-from sorojax.fem.problem import Problem
+from sorojax.fem.problem import Problem, unsupported
 from sorojax.fem.supports import known_components, known_values
 from sorojax.math.linalg import sparse
 
@@ -354,9 +361,7 @@ def stiffness_at_rest(
     cells = cell_matrices(
         problem.space, prepared.geometry, problem.material, problem.kinematics, rest
     )
-    one = jnp.ones(problem.space.num_cells)
-    whole = linearise(problem, prepared, rest, rest).values
-    return cells, whole - assembled(problem.space, cells, one)
+    return cells, load_stiffness(unsupported(problem), prepared, rest)
 
 
 @eqx.filter_jit

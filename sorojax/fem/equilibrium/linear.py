@@ -131,6 +131,15 @@ def add_load_stiffness(problem: Problem, prepared: Prepared, u, values: Array) -
     return values
 
 
+@eqx.filter_jit
+def load_stiffness(
+    problem: Problem, prepared: Prepared, u: Float[Array, "nodes dim"]
+) -> Float[Array, " nnz"]:
+    """What the loads of an `unsupported` problem add to the tangent at `u` [N/m]."""
+    nothing = jnp.zeros(problem.space.system.num_values, u.dtype)
+    return add_load_stiffness(problem, prepared, u, nothing)
+
+
 @jax.jit
 def constrain(
     system: sparse.SparseSymmetric,
