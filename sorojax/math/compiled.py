@@ -262,11 +262,12 @@ def apart(always: Bool[Array, ""]) -> Alone:
     where it is not, the answer is NaN."""
 
     def alone(work: Callable[[], Answer]) -> Answer:
-        shapes = jax.eval_shape(work)
+        once = jax.jit(work, inline=True)  # traced for the shapes, and not again
+        shapes = jax.eval_shape(once)
 
         def never() -> Any:
             return jax.tree.map(lambda s: jnp.full(s.shape, jnp.nan, s.dtype), shapes)
 
-        return jax.lax.cond(always, work, never)
+        return jax.lax.cond(always, once, never)
 
     return alone
