@@ -228,33 +228,46 @@ def moved_points(
     return _everywhere(motion, points, sharp, slide(fields, border, starts))
 
 
-@eqx.filter_jit
 def _ridge_guess(motion: _Motion, points, sharp):
     assert motion.ridges is not None
-    shift = _follow(motion, spread(motion.ridges, _shift(motion, points, sharp)))
-    at = motion.border.sharp
-    return (points + shift)[at]
+    shift = spread(motion.ridges, _shift(motion, points, sharp))
+    return (points + _follow(motion, shift))[motion.border.sharp]
 
 
-@eqx.filter_jit
 def _side_guess(motion: _Motion, points, sharp):
     shift = _shift(motion, points, sharp)
     if motion.surface is not None:
         shift = _follow(motion, spread(motion.surface, shift))
+    return _beside(motion, points, shift)
+
+
+def _everywhere(motion: _Motion, points, sharp, landed):
+    shift = boundary = _boundary_shift(motion, points, sharp, landed)
+    if motion.inside is not None:
+        shift = spread(motion.inside, shift)
+    return _put(motion, points, shift, boundary)
+
+
+@eqx.filter_jit
+def _beside(motion: _Motion, points, shift):
     return tuple((points + shift)[own.nodes] for own in motion.border.fields)
 
 
 @eqx.filter_jit
-def _everywhere(motion: _Motion, points, sharp, landed):
+def _boundary_shift(motion: _Motion, points, sharp, landed):
     shift = _shift(motion, points, sharp)
     for own, x in zip(motion.border.fields, landed, strict=True):
         shift = shift.at[own.nodes].set(x - points[own.nodes])
-    on_boundary = shift[motion.bent]
-    if motion.inside is not None:
-        shift = spread(motion.inside, shift)
-    return points + _follow(motion, shift).at[motion.bent].set(on_boundary)
+    return shift
 
 
+@eqx.filter_jit
+def _put(motion: _Motion, points, shift, boundary):
+    bent = motion.bent
+    return points + _follow(motion, shift).at[bent].set(boundary[bent])
+
+
+@eqx.filter_jit
 def _shift(motion: _Motion, points, sharp):
     shift = jnp.zeros_like(points)
     if sharp is None:
@@ -263,6 +276,7 @@ def _shift(motion: _Motion, points, sharp):
     return shift.at[at].set(sharp - points[at])
 
 
+@eqx.filter_jit
 def _follow(motion: _Motion, shift):
     """`shift` with that of all mid-side nodes interpolated from their cells."""
     if not len(motion.middles):

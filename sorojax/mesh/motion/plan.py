@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from sorojax._jax.linear_map import pushed
+from sorojax._jax.trace_state import is_traced
 from sorojax._types import integers
 from sorojax.math.linalg import sparse
 from sorojax.mesh.elements.base import (
@@ -63,11 +65,63 @@ def _assembled(system, stiffness, held):
     return values, sparse.fix(system, values, held)
 
 
-@eqx.filter_jit
 def spread(
     problem: Harmonic, displacement: Float[Array, "nodes dim"]
 ) -> Float[Array, "nodes dim"]:
     """`displacement`, with that of the free nodes of `problem` made harmonic."""
+    if is_traced(problem):
+        return _spread(problem, displacement)
+    return pushed([displacement], _Spread(problem, displacement))[0]
+
+
+class _Spread:
+    """`spread` as a `LinearMap`: outside `jit` it is solved without a program, as one that
+    calls the host would be compiled anew in every process."""
+
+    def __init__(self, problem: Harmonic, like: Float[Array, "nodes dim"]):
+        self._problem = problem
+        self.inputs = self.outputs = (jax.ShapeDtypeStruct(like.shape, like.dtype),)
+
+    def push(self, displacement) -> tuple:
+        return (_spread(self._problem, displacement),)
+
+    def pull(self, change) -> list:
+        return list(jax.linear_transpose(self.push, *self.inputs)((change,)))
+
+    def push_now(self, displacement) -> tuple:
+        own, held = self._own(displacement)
+        pull = self._product(np.where(held, own, 0.0))
+        return self._whole(displacement, np.where(held, own, -self._solved(pull)))
+
+    def pull_now(self, change) -> tuple:
+        own, held = self._own(change)
+        pull = self._product(self._solved(own))
+        return self._whole(change, np.where(held, own - pull, 0.0))
+
+    def _own(self, nodal) -> tuple[np.ndarray, np.ndarray]:
+        """Values at the nodes of the problem, and which of these are held."""
+        at = np.asarray(self._problem.nodes)
+        return np.asarray(nodal)[at], np.asarray(self._problem.held)[:, None]
+
+    def _whole(self, nodal, own: np.ndarray) -> tuple[Array]:
+        """`nodal` with the values `own` at the nodes of the problem."""
+        whole = np.array(nodal)
+        whole[np.asarray(self._problem.nodes)] = own
+        return (jnp.asarray(whole),)
+
+    def _solved(self, force: np.ndarray) -> np.ndarray:
+        """Of the free nodes by `force` on them; zero at the held ones."""
+        free = np.where(np.asarray(self._problem.held)[:, None], 0.0, force)
+        solver = self._problem.system.solver
+        return solver.solve(np.asarray(self._problem.fixed_values), free.T).T
+
+    def _product(self, x: np.ndarray) -> np.ndarray:
+        system, values = self._problem.system, np.asarray(self._problem.values)
+        return sparse.product_on_host(system, values, x)
+
+
+@eqx.filter_jit
+def _spread(problem: Harmonic, displacement):
     system, held = problem.system, problem.held
 
     def one(known):
