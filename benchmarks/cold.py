@@ -51,65 +51,69 @@ def spatial_finger():
     return finger, jnp.array([0.0, 1e-4, 2e-4, 0.0, 1e-2, 2e-2])
 
 
-def at_rest(wrench):
-    from sorojax import rod
-
-    finger, _ = spatial_finger()
-    return rod.equilibrium(finger, (rod.TipWrench(wrench),)).q
-
-
-def equilibrium() -> Call:
+def at_rest() -> tuple[Callable[[Any], Any], Any]:
+    """Coordinates of the finger at rest as a function of its wrench, and a wrench."""
     from sorojax import rod
 
     finger, wrench = spatial_finger()
-    return lambda: rod.equilibrium(finger, (rod.TipWrench(wrench),)).q
+    return lambda wrench: rod.equilibrium(finger, (rod.TipWrench(wrench),)).q, wrench
+
+
+def equilibrium() -> Call:
+    rest, wrench = at_rest()
+    return lambda: rest(wrench)
 
 
 def equilibrium_forward() -> Call:
     import jax
 
-    _, wrench = spatial_finger()
-    return lambda: jax.jacfwd(at_rest)(wrench)
+    rest, wrench = at_rest()
+    return lambda: jax.jacfwd(rest)(wrench)
 
 
 def equilibrium_reverse() -> Call:
     import jax
 
-    _, wrench = spatial_finger()
-    return lambda: jax.jacrev(at_rest)(wrench)
+    rest, wrench = at_rest()
+    return lambda: jax.jacrev(rest)(wrench)
 
 
 def equilibrium_lanes() -> Call:
     import jax
     import jax.numpy as jnp
 
-    _, wrench = spatial_finger()
+    rest, wrench = at_rest()
     wrenches = jnp.linspace(0.0, 1.0, 1000)[:, None] * wrench[None]
-    return lambda: jax.vmap(at_rest)(wrenches)
+    return lambda: jax.vmap(rest)(wrenches)
 
 
-def drop(young_modulus=None):
-    """Coordinates of the finger half a second after its release."""
+def drop() -> Callable[[Any], Any]:
+    """Coordinates of the finger half a second after its release, by Young's modulus [Pa]."""
     import jax.numpy as jnp
 
     from sorojax import replace, rod
 
     finger, _ = spatial_finger()
-    if young_modulus is not None:
-        finger = replace(finger, lambda r: r.material.young_modulus, young_modulus)
     still = jnp.zeros(11)
-    return rod.rollout(finger, still, still, (rod.Gravity(),), step=2e-3, saves=250).q
+
+    def dropped(young_modulus):
+        softer = replace(finger, lambda r: r.material.young_modulus, young_modulus)
+        return rod.rollout(softer, still, still, (rod.Gravity(),), step=2e-3, saves=250).q
+
+    return dropped
 
 
 def rollout() -> Call:
-    return drop
+    dropped = drop()
+    return lambda: dropped(1e6)
 
 
 def rollout_gradient() -> Call:
     import jax
     import jax.numpy as jnp
 
-    return lambda: jax.grad(lambda young: jnp.sum(drop(young)[-1]))(jnp.array(1e6))
+    dropped = drop()
+    return lambda: jax.grad(lambda young: jnp.sum(dropped(young)[-1]))(jnp.array(1e6))
 
 
 def actuator():

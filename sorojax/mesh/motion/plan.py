@@ -131,7 +131,7 @@ def _spread(problem: Harmonic, displacement):
         return known + sparse.solve(system, problem.fixed_values, pull)
 
     inside = jax.vmap(one, 1, 1)(displacement[problem.nodes])
-    return displacement.at[problem.nodes].set(inside)
+    return displacement.at[problem.nodes].set(inside, unique_indices=True)
 
 
 def laplace_cells(points: np.ndarray, cells: np.ndarray, element: AbstractElement):
