@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
 Function = Callable[[Array], Array]
@@ -44,17 +45,26 @@ def implicit_root(
     def root(numbers: Any, constants: Any, guess: Array) -> tuple[Array, Any]:
         return jax.tree.map(jnp.asarray, method(guess, *constants))  # constants are numbers
 
-    @root.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
+    def derivative(primals: Any, tangents: Any) -> Any:
         numbers, rates = primals[0], tangents[0]
         x, more = root(*primals)
-        _, change = jax.jvp(lambda *numbers: equation(x, *numbers), numbers, rates)
+        moving = [k for k, rate in enumerate(rates) if not isinstance(rate, SymbolicZero)]
+
+        def moved(*values: Array) -> Array:
+            own = dict(zip(moving, values, strict=True))
+            return equation(x, *(own.get(k, number) for k, number in enumerate(numbers)))
 
         def linear(rate: Array) -> Array:
             return jax.jvp(lambda x: equation(x, *numbers), (x,), (rate,))[1]
 
-        return (x, more), (-tangent_solve(linear, change), jax.tree.map(_still, more))
+        still = jax.tree.map(_still, more)
+        if not moving:
+            return (x, more), (jnp.zeros_like(x), still)
+        own = tuple(zip(*((numbers[k], rates[k]) for k in moving), strict=True))
+        change = jax.jvp(moved, *own)[1]
+        return (x, more), (-tangent_solve(linear, change), still)
 
+    root.defjvp(derivative, symbolic_zeros=True)
     x, more = root(tuple(numbers), tuple(constants), guess)
     return (x, more) if has_aux else x
 

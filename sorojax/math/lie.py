@@ -268,10 +268,14 @@ def exponential(vector: Vector) -> Quaternion:
 def rotation_columns(q: Quaternion) -> tuple[Vector, Vector, Vector]:
     """Columns of the rotation matrix of a unit quaternion."""
     w, x, y, z = q
+    twice_x, twice_y, twice_z = 2 * x, 2 * y, 2 * z
+    xx, yy, zz = twice_x * x, twice_y * y, twice_z * z
+    xy, xz, yz = twice_x * y, twice_x * z, twice_y * z
+    wx, wy, wz = twice_x * w, twice_y * w, twice_z * w
     return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+        (1 - (yy + zz), xy + wz, xz - wy),
+        (xy - wz, 1 - (xx + zz), yz + wx),
+        (xz + wy, yz - wx, 1 - (xx + yy)),
     )
 
 
