@@ -69,6 +69,11 @@ def implicit_root(
     return (x, more) if has_aux else x
 
 
+def matrix_of(linear: Function, like: Array) -> Array:
+    """The matrix of a linear map of vectors `like`, column by column in one pass."""
+    return jax.vmap(linear, out_axes=1)(jnp.eye(like.shape[0], dtype=like.dtype))
+
+
 def _still(x: Array) -> Any:
     """A rate of zero."""
     if jnp.issubdtype(x.dtype, jnp.inexact):

@@ -18,7 +18,7 @@ from sorojax import _check
 from sorojax._display import number, outcome, printed
 from sorojax._types import real
 from sorojax.math.compiled import jit_public
-from sorojax.math.implicit_root import implicit_root
+from sorojax.math.implicit_root import implicit_root, matrix_of
 from sorojax.math.quadrature import gauss_legendre, interpolation_rows
 from sorojax.math.status import Status
 from sorojax.rod.dynamics.fields import is_curvature, operators as rod_operators, rest_along
@@ -451,5 +451,4 @@ def ended(
 
 
 def _solve_tangent(linear, right: Array) -> Array:
-    columns = jax.vmap(linear, out_axes=1)(jnp.eye(right.shape[0], dtype=right.dtype))
-    return jnp.linalg.solve(columns, right)
+    return jnp.linalg.solve(matrix_of(linear, right), right)

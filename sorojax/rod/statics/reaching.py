@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Bool, Float
 
+from sorojax.math.implicit_root import matrix_of
 from sorojax.math.linalg.dense import product, solve_symmetric
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.points import Points, points
@@ -349,7 +350,7 @@ def _active(push: Array, here: Rows) -> Array:
 
 def smallest_change(linear, right: Array, tasks: Tasks, size: int) -> Array:
     """The smallest change of q that the conditions ask for, where they leave freedom."""
-    matrix = jax.jacobian(linear)(right)
+    matrix = matrix_of(linear, right)
     if tasks.forces is None:
         place = jnp.arange(right.shape[0]) < size
         metric = jnp.eye(size, dtype=right.dtype)
