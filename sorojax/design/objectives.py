@@ -50,16 +50,13 @@ def relax_to_minimum(
         tolerance: Largest unbalanced force over the largest load or reaction.
     """
     prepared, u = prepare(problem), np.asarray(u)
-    still = jnp.zeros(u.size)
     size = _diagonal(problem.space.system, _linearised(problem, prepared, 0 * u).values)
     shift, state = 0.0, _linearised(problem, prepared, u)
     energy = float(potential_energy(problem, jnp.asarray(u)))
     for _ in range(steps):
         done = float(state.residual_norm) <= tolerance * float(state.reference)
         values = state.values + (0.0 if done else shift) * size
-        matrix, rhs = constrain(
-            problem.space.system, values, state.residual, prepared.known, still
-        )
+        matrix, rhs = constrain(problem.space.system, values, state.residual, prepared.known)
         factor = problem.space.system.solver.factor(np.asarray(matrix))
         if done:
             return u, factor is not None and not factor.negative_eigenvalues

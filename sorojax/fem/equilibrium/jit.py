@@ -226,7 +226,12 @@ def _examine(
 
     def direction():
         system = here.space.system
-        matrix, rhs = constrain(system, values, found.residual, prepared.known, move)
+        pull = jax.lax.cond(  # most steps move no support
+            jnp.any(move != 0),
+            lambda: sparse.product(system, values, move),
+            lambda: jnp.zeros_like(move),
+        )
+        matrix, rhs = constrain(system, values, found.residual + pull, prepared.known)
         x, negative = sparse.solve_with_inertia(system, matrix, rhs)
         usable = negative >= 0
         du = jnp.where(usable, x + move, jnp.zeros_like(x))

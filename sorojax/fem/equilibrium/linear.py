@@ -146,15 +146,10 @@ def constrain(
     values: Float[Array, " nnz"],
     residual: Float[Array, " dofs"],
     known: Bool[Array, " dofs"],
-    move: Float[Array, " dofs"],
 ) -> tuple[Float[Array, " nnz"], Float[Array, " dofs"]]:
-    """Matrix and right-hand side of a Newton step in which known unknowns move by `move`."""
-    moved = jax.lax.cond(  # most steps move no support
-        jnp.any(move != 0),
-        lambda: sparse.product(system, values, move),
-        lambda: jnp.zeros_like(residual),
-    )
-    rhs = -residual - moved
+    """Matrix and right-hand side of a Newton step in which known unknowns stay. Where they
+    move, the tangent times their move is part of the `residual`."""
+    rhs = -residual
     return sparse.fix(system, values, known), jnp.where(known, jnp.zeros_like(rhs), rhs)
 
 
@@ -185,7 +180,10 @@ def step(
 ) -> NewtonStep:
     """The Newton step at a tangent, by a `near` factor where that converges at once."""
     system = problem.space.system
-    matrix, rhs = constrain(system, values, residual, prepared.known, move)
+    if np.any(move != 0):
+        pull = sparse.product_on_host(system, np.asarray(values), move[:, None])
+        residual = residual + pull[:, 0]
+    matrix, rhs = constrain(system, values, residual, prepared.known)
     matrix, rhs = np.asarray(matrix), np.asarray(rhs)
     shape = -1, problem.mesh.element.dim
     if near is not None:
