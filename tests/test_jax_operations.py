@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax._jax import host_call as host_calls, linear_map as linear_maps, operations
+from sorojax._jax import host_call as host_calls, operations
 from sorojax._jax.host_call import host_call, tell_host
 from sorojax._jax.operations import Rules
+from sorojax.math import linear_map as linear_maps
 
 pytestmark = pytest.mark.versions
 

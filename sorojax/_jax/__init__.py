@@ -9,6 +9,7 @@ rests on and does without it where it is missing: slower, with the same numbers.
 def fast_paths() -> dict[str, str]:
     """Each fast path that needs such a name, as "on" or "off: why"."""
     from sorojax._jax import (
+        diffrax_checks,
         host_call,
         operations,
         programs,
@@ -17,5 +18,13 @@ def fast_paths() -> dict[str, str]:
         trace_state,
     )
 
-    rooms = (host_call, operations, programs, small_kernels, small_products, trace_state)
+    rooms = (
+        diffrax_checks,
+        host_call,
+        operations,
+        programs,
+        small_kernels,
+        small_products,
+        trace_state,
+    )
     return {room.__name__.rpartition(".")[2]: room.status() for room in rooms}

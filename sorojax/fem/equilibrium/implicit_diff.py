@@ -17,7 +17,6 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
-from sorojax._jax.linear_map import pushed
 from sorojax._jax.operations import Rules, operation
 from sorojax._jax.trace_state import evaluated_now, is_traced, is_tracer
 from sorojax.fem.equilibrium.jit import (
@@ -42,6 +41,7 @@ from sorojax.fem.equilibrium.newton import Newton
 from sorojax.fem.problem import Problem, potential_energy, residual, unsupported
 from sorojax.fem.supports import known_dofs, known_values
 from sorojax.math.linalg import sparse
+from sorojax.math.linear_map import pushed
 
 
 class _Record:

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sorojax._jax.linear_map import pushed
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import integers
 from sorojax.math.linalg import sparse
+from sorojax.math.linear_map import pushed
 from sorojax.mesh.elements.base import (
     AbstractElement,
     facet_corners,
@@ -82,21 +82,21 @@ class _Spread:
         self._problem = problem
         self.inputs = self.outputs = (jax.ShapeDtypeStruct(like.shape, like.dtype),)
 
-    def push(self, displacement) -> tuple:
-        return (_spread(self._problem, displacement),)
+    def push(self, *displacements) -> tuple:
+        return (_spread(self._problem, *displacements),)
 
-    def pull(self, change) -> list:
-        return list(jax.linear_transpose(self.push, *self.inputs)((change,)))
+    def pull(self, *changes) -> list:
+        return list(jax.linear_transpose(self.push, *self.inputs)(changes))
 
-    def push_now(self, displacement) -> tuple:
-        own, held = self._own(displacement)
+    def push_now(self, *displacements) -> tuple:
+        own, held = self._own(displacements[0])
         pull = self._product(np.where(held, own, 0.0))
-        return self._whole(displacement, np.where(held, own, -self._solved(pull)))
+        return self._whole(displacements[0], np.where(held, own, -self._solved(pull)))
 
-    def pull_now(self, change) -> tuple:
-        own, held = self._own(change)
+    def pull_now(self, *changes) -> tuple:
+        own, held = self._own(changes[0])
         pull = self._product(self._solved(own))
-        return self._whole(change, np.where(held, own - pull, 0.0))
+        return self._whole(changes[0], np.where(held, own - pull, 0.0))
 
     def _own(self, nodal) -> tuple[np.ndarray, np.ndarray]:
         """Values at the nodes of the problem, and which of these are held."""

@@ -12,6 +12,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from sorojax._jax import diffrax_checks
 from sorojax.math import host
 from sorojax.math.ode.explicit import AbstractMethod
 from sorojax.math.ode.step_control import Control, Seam
@@ -141,33 +142,36 @@ def adaptive(
         start, flat = seam.seam.time, seam.seam.state
         further = {"dt0": seam.seam.step, "controller_state": going.begun(seam.seam)}
         further["solver_state"] = None if seam.memory is None else (seam.memory, seam.memory)
-    solution = dfx.diffeqsolve(
-        dfx.ODETerm(FlatField(unravel)),
-        solver,
-        start,
-        end,
-        further.pop("dt0", None),
-        flat,
-        args=(block, inputs, _sides(conditions, block, inputs, state, start)),
-        saveat=dfx.SaveAt(
-            subs=[dfx.SubSaveAt(ts=jnp.maximum(time, start)), dfx.SubSaveAt(t1=True)],
-            dense=dense,
-            solver_state=free,
-            controller_state=free,
-        ),
-        stepsize_controller=control,
-        max_steps=max_steps,
-        adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
-        event=_event(conditions, unravel),
-        throw=False,
-        progress_meter=_meter(progress, start, end, time[-1]),
-        **further,
-    )
+    with diffrax_checks.left_out():
+        solution = dfx.diffeqsolve(
+            dfx.ODETerm(FlatField(unravel)),
+            solver,
+            start,
+            end,
+            further.pop("dt0", None),
+            flat,
+            args=(block, inputs, _sides(conditions, block, inputs, state, start)),
+            saveat=dfx.SaveAt(
+                subs=[dfx.SubSaveAt(ts=jnp.maximum(time, start)), dfx.SubSaveAt(t1=True)],
+                dense=dense,
+                solver_state=free,
+                controller_state=free,
+            ),
+            stepsize_controller=control,
+            max_steps=max_steps,
+            adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+            event=_event(conditions, unravel),
+            throw=False,
+            progress_meter=_meter(progress, start, end, time[-1]),
+            **further,
+        )
     assert solution.ys is not None and solution.ts is not None
     saved = jnp.isfinite(solution.ts[0])
     last = solution.ys[1][0]
     path = jnp.where(saved[:, None], solution.ys[0], last)
     reached, status = solution.ts[1][0], _status(solution.result)
+    backwards = jnp.any(time[1:] < time[:-1])
+    status = Status.where(backwards, Status.not_finite, status)
     if free:  # the last step may have gone further
         last = jnp.where(saved[-1], path[-1], last)
         reached = jnp.minimum(reached, time[-1])

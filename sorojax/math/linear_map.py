@@ -1,8 +1,7 @@
 """Linear maps of arrays that are one operation in a trace, and so are their transposes.
 
 Staging the operations of a derivative takes longer than a small solve. What is staged here
-is one operation; the work is done in whichever direction is asked for. Rests on
-`sorojax._jax.operations`.
+is one operation; the work is done in whichever direction is asked for.
 """
 
 from collections.abc import Callable, Sequence
