@@ -60,8 +60,8 @@ def implicit_root(
         still = jax.tree.map(_still, more)
         if not moving:
             return (x, more), (jnp.zeros_like(x), still)
-        own = tuple(zip(*((numbers[k], rates[k]) for k in moving), strict=True))
-        change = jax.jvp(moved, *own)[1]
+        values, dots = ([each[k] for k in moving] for each in (numbers, rates))
+        change = jax.jvp(moved, values, dots)[1]
         return (x, more), (-tangent_solve(linear, change), still)
 
     root.defjvp(derivative, symbolic_zeros=True)
