@@ -21,8 +21,6 @@ from sorojax._jax import devices as _devices
 from sorojax._jax.jit import compiled, jit
 from sorojax._jax.low_latency import enable_low_latency
 from sorojax._progress import listen, silent
-from sorojax.math.lie import SE2, SE3
-from sorojax.math.status import Status
 
 _devices.leave_out_absent()
 for _name in ("compiled", "jit", "listen"):
@@ -34,6 +32,7 @@ _FLOORS = (
     "contact", "design", "fem", "io", "material", "math", "mesh", "reduction", "robots", "rod",
     "sdf", "sweep", "systems", "view", "vision",
 )  # fmt: skip
+_CLASSES = {"SE2": "math.lie", "SE3": "math.lie", "Status": "math.status"}
 __all__ = [
     "SE2", "SE3", "Status", "compiled", "enable_compilation_cache", "enable_low_latency", "jit",
     "listen", "replace", "silent", "units",
@@ -59,12 +58,18 @@ if TYPE_CHECKING:
         view,
         vision,
     )
+    from sorojax.math.lie import SE2, SE3
+    from sorojax.math.status import Status
 
 
 def __getattr__(name: str) -> Any:
-    """A floor is imported when it is first asked for."""
+    """A floor is imported when it is first asked for, and the classes that stand here too."""
     if name in _FLOORS:
         return importlib.import_module(f"sorojax.{name}")
+    if name in _CLASSES:
+        found = getattr(importlib.import_module(f"sorojax.{_CLASSES[name]}"), name)
+        globals()[name] = found
+        return found
     raise AttributeError(f"module 'sorojax' has no attribute {name!r}")
 
 
