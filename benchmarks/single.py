@@ -37,9 +37,11 @@ def narrow(tree: Any) -> Any:
     return jax.tree.map(cast, tree)
 
 
-def evaluate(kernel: Kernel, single: bool = True) -> Any:
-    """What the kernel yields, compiled."""
-    return eqx.filter_jit(kernel.function)(*(narrow(kernel.args) if single else kernel.args))
+def compiled(kernel: Kernel, single: bool = True) -> Callable[[], Any]:
+    """The kernel with its arguments in one precision, to be compiled at its first call."""
+    function, args = eqx.filter_jit(kernel.function), kernel.args
+    args = narrow(args) if single else args
+    return lambda: function(*args)
 
 
 def error(kernel: Kernel) -> float:
@@ -48,7 +50,7 @@ def error(kernel: Kernel) -> float:
     Raises:
         TypeError: If something of the result is not of single precision.
     """
-    got, want = evaluate(kernel), evaluate(kernel, single=False)
+    got, want = compiled(kernel)(), compiled(kernel, single=False)()
     worst = 0.0
     for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
         if a.dtype != jnp.float32:

@@ -1,7 +1,7 @@
 """What single precision costs in digits and saves in time, kernel by kernel."""
 
 from benchmarks.harness import Row, measure_calls, quick
-from benchmarks.single import KERNELS, error, evaluate, kernel
+from benchmarks.single import KERNELS, compiled, error, kernel
 
 #: One of each floor; all of them are held to their digits by `make stress`.
 FEW = ("sdf normal", "rod.tip_pose", "rod.forward_dynamics", "material.NeoHookean",
@@ -14,7 +14,7 @@ def rows():
             continue
         asked, settings = kernel(called), {"kernel": called}
         for name, single in (("double", False), ("single", True)):
-            timing = measure_calls(lambda k=asked, s=single: evaluate(k, s))
+            timing = measure_calls(compiled(asked, single), repeats=25)
             checked = {"error": error(asked), "bar": asked.bound} if single else {}
             yield Row(
                 "sorojax",
