@@ -2,6 +2,9 @@
 colours."""
 
 import importlib.util
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -247,3 +250,17 @@ def test_both_renderers_see_the_same():
             for image in (S.shade(scene, lens), screenshot(scene, lens, 1.4))
         ]
         assert np.mean(masks[0] != masks[1]) < 0.02 * np.mean(masks[0]) + 0.005
+
+
+def test_a_machine_without_a_display_is_not_told_so():
+    pytest.importorskip("pyvista", reason="the extra `view` is not installed")
+    draw = (
+        "from sorojax import mesh, view\n"
+        "print(len(view.show(mesh.box([0, 0, 0], [1, 1, 1], divisions=(1, 1, 1))).png) > 1000)"
+    )
+    without = {name: value for name, value in os.environ.items() if name != "DISPLAY"}
+    done = subprocess.run(
+        [sys.executable, "-c", draw], env=without, capture_output=True, text=True
+    )
+    assert done.returncode == 0 and "True" in done.stdout
+    assert "DISPLAY" not in done.stderr

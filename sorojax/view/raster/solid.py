@@ -1,8 +1,9 @@
 """Solid scenes in a figure: the shaded picture, its colour bar, scale, axes and names."""
 
+import contextlib
 import importlib
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -288,13 +289,26 @@ def screenshot(scene: Scene, lens: Lens, dots_per_point: float) -> UInt8[np.ndar
     return np.asarray(plotter.screenshot(return_img=True))[:, :, :3].copy()
 
 
+@contextlib.contextmanager
+def _told_of_errors_only() -> Iterator[None]:
+    logger: Any = importlib.import_module("vtkmodules.vtkCommonCore").vtkLogger
+    before = logger.GetCurrentVerbosityCutoff()
+    logger.SetStderrVerbosity(logger.VERBOSITY_ERROR)
+    try:
+        yield
+    finally:
+        logger.SetStderrVerbosity(before)
+
+
 def _plotter(size: tuple[int, int]) -> Any:
     pv: Any = importlib.import_module("pyvista")
     if size not in _held:
         for old in _held.values():
             old.close()
         _held.clear()
-        plotter = pv.Plotter(off_screen=True, window_size=list(size), lighting="light kit")
+        with _told_of_errors_only():  # without a display VTK warns that there is none
+            plotter = pv.Plotter(off_screen=True, window_size=list(size), lighting="light kit")
+            plotter.render()
         plotter.set_background("white")
         plotter.enable_anti_aliasing("msaa", multi_samples=4)
         _held[size] = plotter
