@@ -447,3 +447,24 @@ def test_the_force_inverter():
             change_gradient=lambda x, g: design.sensitivity_filtered(smooth, x, g),
         )
     assert float(found.objective) < -1.113 and abs(float(found.constraints[0])) < 0.02
+
+
+def test_the_stiffness_of_a_sheet_is_differentiated_by_its_material():
+    # the stretch out of the plane follows the material too, to second order
+    grid = mesh.rectangle([0, 0], [3, 1], divisions=(3, 1), element=mesh.Quad4())
+    pull = fem.Force([mesh.nearest_node(grid, [3.0, 0.0])], [0.0, -1.0])
+
+    def compliance(poisson_ratio):
+        sheet = fem.problem(
+            grid,
+            material.neo_hookean(young_modulus=10.0, poisson_ratio=poisson_ratio),
+            kinematics=fem.PlaneStress(1.0),
+            supports=(fem.Fixed(grid.node_sets["left"]),),
+            loads=(pull,),
+            formulation=fem.Displacement(),
+        )
+        return design.compliance(design.linear(sheet), jnp.ones(grid.num_cells))
+
+    slope, h = jax.grad(compliance)(0.3), 1e-5
+    difference = (compliance(0.3 + h) - compliance(0.3 - h)) / (2 * h)
+    assert np.isclose(slope, difference, rtol=1e-6)

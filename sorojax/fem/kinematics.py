@@ -54,12 +54,6 @@ class AbstractKinematics(eqx.Module):
         """Energy per reference volume that is not a function of J alone [J/m^3]."""
         return material.isochoric_energy(self.embed(F))
 
-    def shape_stress(
-        self, material: AbstractHyperelastic, F: Float[Array, "entries *points"]
-    ) -> Float[Array, "entries *points"]:
-        """Derivative of `shape_energy` by the kept entries [Pa]."""
-        return jax.grad(lambda F: jnp.sum(self.shape_energy(material, tuple(F))))(F)
-
 
 class PlaneStrain(AbstractKinematics):
     """No strain out of the plane; forces are those of a body `thickness` deep [m]."""
@@ -110,13 +104,6 @@ class PlaneStress(AbstractKinematics):
 
     def shape_energy(self, material: AbstractHyperelastic, F: Gradient) -> Entry:
         return _sheet_energy(material, F, self.thickness_stretch(material, F))
-
-    def shape_stress(
-        self, material: AbstractHyperelastic, F: Float[Array, "entries *points"]
-    ) -> Float[Array, "entries *points"]:
-        # the energy is least in the stretch: with it held the slope is the same
-        stretch = self.thickness_stretch(material, tuple(F))
-        return jax.grad(lambda F: jnp.sum(_sheet_energy(material, tuple(F), stretch)))(F)
 
     def thickness_stretch(self, material: AbstractHyperelastic, F: Gradient) -> Entry:
         """Stretch out of the plane at which the stress out of the plane vanishes."""

@@ -139,7 +139,7 @@ def shape_stress(
     """Its first Piola-Kirchhoff stress [Pa]."""
     W = _closed_form(material, kinematics)
     if W is None:
-        return kinematics.shape_stress(material, F)
+        return jax.grad(lambda F: jnp.sum(shape_energy(material, kinematics, F)))(F)
     x, slopes = _first_invariant(kinematics, F)
     return _slope(W)(x)[None] * slopes
 
