@@ -17,6 +17,7 @@ ROOT = Path(__file__).parent.parent
 TESTS = (
     "tests/test_jax_operations.py", "tests/test_jax_trace_state.py", "tests/test_jax_jit.py",
     "tests/test_jax_programs.py", "tests/test_jax_small_products.py",
+    "tests/test_jax_diffrax_checks.py",
     "tests/test_fem.py::test_gradient_of_a_prescribed_displacement",
     "tests/test_fem.py::test_second_derivatives_of_equilibrium",
     "tests/test_rod.py::test_batches_agree_with_single_calls",

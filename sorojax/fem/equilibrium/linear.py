@@ -181,8 +181,7 @@ def step(
     """The Newton step at a tangent, by a `near` factor where that converges at once."""
     system = problem.space.system
     if np.any(move != 0):
-        pull = sparse.product_on_host(system, np.asarray(values), move[:, None])
-        residual = residual + pull[:, 0]
+        residual = np.asarray(residual) + system.solver.product(np.asarray(values), move)
     matrix, rhs = constrain(system, values, residual, prepared.known)
     matrix, rhs = np.asarray(matrix), np.asarray(rhs)
     shape = -1, problem.mesh.element.dim

@@ -98,10 +98,10 @@ class SymmetricProduct:
         self._diagonal = indptr[:-1]
 
     def __call__(
-        self, values: Float[np.ndarray, " nnz"], x: Float[np.ndarray, " n"]
-    ) -> Float[np.ndarray, " n"]:
+        self, values: Float[np.ndarray, " nnz"], x: Float[np.ndarray, "n *columns"]
+    ) -> Float[np.ndarray, "n *columns"]:
         self._rows.data = self._columns.data = values
-        return self._rows @ x + self._columns @ x - values[self._diagonal] * x
+        return self._rows @ x + self._columns @ x - (values[self._diagonal] * x.T).T
 
 
 # Solvers on the host: symbolic analysis, the last few factors, who owns them
@@ -229,6 +229,13 @@ class DirectSolver:
             if not self.holds(factor):
                 return None
             return refined(factor, self._product_with(values), b, start, tolerance)
+
+    def product(
+        self, values: np.ndarray, x: Float[np.ndarray, "n *columns"]
+    ) -> Float[np.ndarray, "n *columns"]:
+        """A(values) x."""
+        with self._turn:
+            return self._product_with(np.asarray(values))(x)
 
     def holds(self, factor: Factor) -> bool:
         """Whether `factor` still is one of the last few."""

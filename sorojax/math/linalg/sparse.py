@@ -283,17 +283,6 @@ def product(
     return upper.at[system.cols].add(off * x[system.rows])
 
 
-def product_on_host(
-    system: SparseSymmetric, values: np.ndarray, x: Float[np.ndarray, "size columns"]
-) -> Float[np.ndarray, "size columns"]:
-    """`product` of some columns without a program."""
-    from scipy.sparse import coo_matrix
-
-    place = np.asarray(system.rows), np.asarray(system.cols)
-    upper = coo_matrix((values, place), shape=(system.size, system.size)).tocsr()
-    return upper @ x + upper.T @ x - upper.diagonal()[:, None] * x
-
-
 def fix(
     system: SparseSymmetric, values: Float[Array, " nnz"], fixed: Array
 ) -> Float[Array, " nnz"]:

@@ -116,8 +116,7 @@ class _Spread:
         return solver.solve(np.asarray(self._problem.fixed_values), free.T).T
 
     def _product(self, x: np.ndarray) -> np.ndarray:
-        system, values = self._problem.system, np.asarray(self._problem.values)
-        return sparse.product_on_host(system, values, x)
+        return self._problem.system.solver.product(np.asarray(self._problem.values), x)
 
 
 @eqx.filter_jit

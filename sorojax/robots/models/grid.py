@@ -49,10 +49,7 @@ class Grid(NamedTuple):
 
     def force(self, u: Float[np.ndarray, "nodes 3"]) -> Float[np.ndarray, "nodes 3"]:
         """Internal force [N] of a displacement [m]."""
-        rows, cols = np.asarray(self.system.rows), np.asarray(self.system.cols)
-        x, off = u.ravel(), np.where(rows == cols, 0.0, self.values)
-        force = np.bincount(rows, self.values * x[cols], x.size)
-        return (force + np.bincount(cols, off * x[rows], x.size)).reshape(u.shape)
+        return self.system.solver.product(self.values, u.ravel()).reshape(u.shape)
 
     def displacement(self, known, prescribed, load) -> Float[np.ndarray, "nodes 3"]:
         """At rest under `load` [N] with the known components as prescribed [m].

@@ -308,9 +308,9 @@ def _plotter(size: tuple[int, int]) -> Any:
         _held.clear()
         with _told_of_errors_only():  # without a display VTK warns that there is none
             plotter = pv.Plotter(off_screen=True, window_size=list(size), lighting="light kit")
+            plotter.set_background("white")
+            plotter.enable_anti_aliasing("msaa", multi_samples=4)
             plotter.render()
-        plotter.set_background("white")
-        plotter.enable_anti_aliasing("msaa", multi_samples=4)
         _held[size] = plotter
     return _held[size]
 
