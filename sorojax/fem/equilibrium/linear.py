@@ -144,7 +144,7 @@ def load_stiffness(
 def constrain(
     system: sparse.SparseSymmetric,
     values: Float[Array, " nnz"],
-    residual: Float[Array, " dofs"],
+    residual: Float[Array | np.ndarray, " dofs"],
     known: Bool[Array, " dofs"],
 ) -> tuple[Float[Array, " nnz"], Float[Array, " dofs"]]:
     """Matrix and right-hand side of a Newton step in which known unknowns stay. Where they
@@ -174,7 +174,7 @@ def step(
     problem: Problem,
     prepared: Prepared,
     values: Float[Array, " nnz"],
-    residual: Float[Array, " dofs"],
+    residual: Float[Array | np.ndarray, " dofs"],
     move: Float[np.ndarray, " dofs"],
     near: Neighbour | None = None,
 ) -> NewtonStep:
