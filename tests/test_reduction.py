@@ -8,7 +8,7 @@ import pytest
 
 from sorojax import SE2, SE3, fem, material, mesh, reduction, rod
 from sorojax.reduction.backbone import line_strain, pose_strain, reference, section_axes
-from sorojax.reduction.pod import weights
+from sorojax.reduction.pod import leading_directions, weights
 from sorojax.units import kPa, mm
 
 LENGTH = 60 * mm
@@ -257,6 +257,33 @@ def beam_path():
         loads=(fem.Traction(tip, name="pull", value=jnp.zeros(3)),),
     )
     return fem.solve_path(problem, pull=jnp.linspace(0, 1, 4)[:, None] * PULL[None])
+
+
+@pytest.mark.parametrize("sizes", [(1.0, 1e-3, 1e-5), (1.0, 1.0, 1e-5), (1.0, 1.0 + 1e-9, 0.0)])
+def test_modes_that_come_together_span_what_differences_say(sizes):
+    """Of equal singular values each mode turns at a bounded rate, and the projection on both
+    has its exact slope, the same compiled and not."""
+    draw = np.random.default_rng(0)
+    left = np.linalg.qr(draw.normal(size=(7, 3)))[0]
+    right = np.linalg.qr(draw.normal(size=(5, 3)))[0]
+    snapshots = jnp.asarray(left * np.array(sizes) @ right.T)
+    way = jnp.asarray(draw.normal(size=(7, 5)))
+
+    def projection(snapshots):
+        modes = leading_directions(snapshots, 2)
+        return modes @ modes.T
+
+    least = sorted(sizes)[1]
+    step = 1e-4 * least
+    ends = [projection(snapshots + k * step * way) for k in (-2, -1, 1, 2)]
+    seen = (8 * (ends[2] - ends[1]) - (ends[3] - ends[0])) / (12 * step)
+    for call in (projection, jax.jit(projection)):
+        found = jax.jvp(call, (snapshots,), (way,))[1]
+        assert np.allclose(found, seen, rtol=0, atol=1e-8 / least)
+        pulled = jax.vjp(call, snapshots)[1](seen)[0]
+        assert np.isclose(jnp.vdot(pulled, way), jnp.vdot(seen, seen), rtol=1e-8)
+    turns = jax.jvp(lambda a: leading_directions(a, 2), (snapshots,), (way,))[1]
+    assert np.all(np.isfinite(turns))
 
 
 def test_a_rod_stands_where_the_solid_in_space_stands(beam_path):

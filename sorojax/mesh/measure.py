@@ -1,16 +1,20 @@
 """Areas and volumes of cells and cavities, differentiable in the points of a mesh."""
 
+import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
 from sorojax._jax.trace_state import is_traced
+from sorojax._types import real
 from sorojax.math.host import KDTree
 from sorojax.mesh.elements.base import (
+    AbstractElement,
     facet_element,
     nodes,
     quadrature,
@@ -18,6 +22,7 @@ from sorojax.mesh.elements.base import (
     shape_gradients,
 )
 from sorojax.mesh.elements.polygon import PolyN
+from sorojax.mesh.elements.polynomials import traced_shape_functions
 from sorojax.mesh.mesh import Mesh
 
 
@@ -122,33 +127,60 @@ def _cross(a: Float[Array, "cells 2"], b: Float[Array, "cells 2"]) -> Float[Arra
 
 
 class Locations(NamedTuple):
-    """Nodes of the cells that hold the points, and the weights of these nodes."""
+    """Nodes of the cells that hold the points, the weights of these nodes, and the cells."""
 
     nodes: Int[Array, "points cell_nodes"]
     weights: Float[Array, "points cell_nodes"]
+    cells: Int[Array, " points"] | None = None
 
     def __call__(self, nodal: Float[Array, "nodes dim"]) -> Float[Array, "points dim"]:
         """Values of a nodal field at the points; differentiable in the field."""
         return jnp.einsum("pa,pai->pi", self.weights, nodal[self.nodes])
 
 
-def locate(mesh: Mesh, points: Float[np.ndarray, "points dim"]) -> Locations:
-    """The cells that hold `points` [m] of the reference configuration (on the host).
+def locate(
+    mesh: Mesh,
+    points: Float[Array | np.ndarray, "points dim"],
+    cells: Int[Array, " points"] | None = None,
+) -> Locations:
+    """The cells that hold `points` [m] of the reference configuration, and where in them.
+
+    Differentiable in the points and in the nodes: which cell holds a point is chosen on the
+    host, once, and has no derivative; the place inside the cell has.
+
+    Args:
+        mesh: Triangles, quadrilaterals or solid cells.
+        points: Where to look [m].
+        cells: Those chosen before, for a mesh with the same cells. Needed under `jit` and
+            `vmap`, where nothing can be chosen.
 
     Raises:
-        ValueError: If a point lies outside the mesh, the mesh is traced or its cells are
-            polygons.
+        ValueError: If a point lies outside the mesh, the cells are polygons, or mesh or
+            points are traced and no `cells` are given.
     """
     if isinstance(mesh.element, PolyN):
         raise ValueError("locate: got polygons, need triangles, quadrilaterals or solid cells.")
-    if is_traced(mesh):
-        raise ValueError("locate: the mesh is traced, need concrete points. Call it outside.")
-    points = np.atleast_2d(np.asarray(points, float))
+    if cells is None:
+        cells = jnp.asarray(cells_at(mesh, points))
+    nodes = mesh.cells[cells]
+    return Locations(nodes, _weights(mesh.points[nodes], real(points), mesh.element), cells)
+
+
+def cells_at(mesh: Mesh, points) -> Int[np.ndarray, " points"]:
+    """The cell that each point lies deepest in, among those near it."""
+    fixed = jax.lax.stop_gradient((mesh.points, points))
+    if is_traced((mesh.cells, fixed)):
+        raise ValueError(
+            "locate: the mesh or the points are traced, need concrete numbers to choose cells "
+            "by. Call it outside, or give the `cells` that a call outside has chosen."
+        )
+    X, points = (np.asarray(x, float) for x in fixed)
+    points = np.atleast_2d(points)
     _check.finite("locate", "points", points, "Give points in metres.")
     _check.shape("locate", "points", points, (None, mesh.element.dim), "One row per point.")
     if not len(points):
         raise ValueError("locate: got no point, need one or more. Give one row per point.")
-    X, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
+    cells = np.asarray(mesh.cells)
     centres = X[cells[:, : mesh.element.num_corners]].mean(axis=1)
     near = KDTree(centres).query(points, k=min(24, len(cells)))[1].reshape(len(points), -1)
     xi = _reference_coordinates(mesh, X[cells[near]], points)
@@ -160,8 +192,35 @@ def locate(mesh: Mesh, points: Float[np.ndarray, "points dim"]) -> Locations:
             f"locate: {outside.size} of {len(points)} points lie outside the mesh, the first "
             f"at {points[outside[0]]} m. Move the curve into the body."
         )
-    weights = shape_functions(mesh.element, xi[rows, best])
-    return Locations(jnp.asarray(cells[near[rows, best]]), jnp.asarray(weights))
+    return near[rows, best]
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _weights(
+    corners: Float[Array, "points cell_nodes dim"],
+    points: Float[Array, "points dim"],
+    element: AbstractElement,
+) -> Float[Array, "points cell_nodes"]:
+    """Shape functions where X(xi) = point, by Newton's method from the centre of the cell.
+
+    The last two steps alone are differentiated: one gives the first derivative at a
+    root, two the second.
+    """
+
+    def improved(corners, point, xi):
+        def gap(xi):
+            return point - traced_shape_functions(element, xi[None])[0] @ corners
+
+        return xi - jnp.linalg.solve(jax.jacfwd(gap)(xi), gap(xi))
+
+    def weights(corners, point):
+        xi, held = jnp.asarray(centre, corners.dtype), jax.lax.stop_gradient((corners, point))
+        xi = jax.lax.fori_loop(0, 5, lambda _, xi: jnp.clip(improved(*held, xi), -2, 3), xi)
+        xi = improved(corners, point, improved(corners, point, xi))
+        return traced_shape_functions(element, xi[None])[0]
+
+    centre = nodes(element)[: element.num_corners].mean(axis=0)
+    return jax.vmap(weights)(corners, points)
 
 
 def _reference_coordinates(mesh: Mesh, corners, points, iterations: int = 4):

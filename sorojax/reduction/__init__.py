@@ -8,12 +8,11 @@ from sorojax.reduction.backbone import (
     Line,
     strain_along,
 )
+from sorojax.reduction.damping import ConstantDamping, identify_damping
 from sorojax.reduction.identify import (
-    ConstantDamping,
     PressureMap,
     condensed_stiffness,
     identify,
-    identify_damping,
     mean_section,
     offset_weight,
 )

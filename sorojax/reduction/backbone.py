@@ -11,13 +11,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from sorojax import _check
 from sorojax._display import displayed, number
 from sorojax._types import Numbers, real
 from sorojax.fem.equilibrium.solve import Path
-from sorojax.mesh.measure import Locations, locate
+from sorojax.mesh.measure import Locations, cells_at, locate
+from sorojax.mesh.mesh import Mesh
 from sorojax.rod.model.basis import STRAINS
 
 # Material curves of a solid: where a rod's axis lies in the reference configuration.
@@ -73,14 +74,14 @@ class Reference(NamedTuple):
         frame: Columns are the axes of the section; the first is the tangent.
     """
 
-    s: Float[np.ndarray, " samples"]
-    length: float
-    position: Float[np.ndarray, "samples dim"]
-    frame: Float[np.ndarray, "samples dim dim"]
+    s: Float[Array, " samples"]
+    length: Float[Array, ""]
+    position: Float[Array, "samples dim"]
+    frame: Float[Array, "samples dim dim"]
 
 
 def reference(curve: AbstractCurve, samples: int, up=None) -> Reference:
-    """Samples of `curve` and its frames, on the host.
+    """Samples of `curve` and its frames, differentiable in the numbers of the curve.
 
     Args:
         curve: The curve.
@@ -97,57 +98,67 @@ def reference(curve: AbstractCurve, samples: int, up=None) -> Reference:
     """
     if samples < 3:
         raise ValueError(f"backbone: got {samples} samples, need 3 or more. 81 are usual.")
-    dense = np.linspace(0.0, 1.0, _DENSE)
-    velocity = _with_slope(curve, jnp.asarray(dense))[1]
-    speed = np.linalg.norm(np.asarray(velocity), axis=1)
-    if not speed.min() > 1e-9 * speed.max():
+    known, slowest, across = _reference(curve, samples, None if up is None else real(up))
+    if _check.is_concrete(slowest) and not slowest > 1e-9:
         raise ValueError(
             "backbone: the curve stands still at a point, need a smooth parametrisation."
         )
-    steps = np.diff(dense) * (speed[1:] + speed[:-1]) / 2
-    way = np.concatenate([[0.0], np.cumsum(steps)])
-    s = np.linspace(0, 1, samples)
-    position, slope = _with_slope(curve, jnp.asarray(np.interp(s * way[-1], way, dense)))
-    tangent = np.asarray(slope) / np.linalg.norm(np.asarray(slope), axis=1)[:, None]
-    position = np.asarray(position)
-    return Reference(s, float(way[-1]), position, _frames(position, tangent, up))
+    if _check.is_concrete(across) and not across > 1e-6:
+        raise ValueError(f"backbone: `up` is {up}, need a direction across the curve.")
+    return known
 
 
 @eqx.filter_jit
-def _with_slope(curve: AbstractCurve, s: Array) -> tuple[Array, Array]:
-    return jax.jvp(curve, (s,), (jnp.ones_like(s),))
+def _reference(curve: AbstractCurve, samples: int, up):
+    """The samples, the least speed over the largest, and how much of `up` is across."""
 
+    def with_slope(s):
+        return jax.jvp(curve, (s,), (jnp.ones_like(s),))
 
-def _frames(position: np.ndarray, tangent: np.ndarray, up) -> np.ndarray:
+    dense = jnp.linspace(0.0, 1.0, _DENSE)
+    speed = _lengths(with_slope(dense)[1])
+    way = jnp.cumsum((speed[1:] + speed[:-1]) / (2 * (_DENSE - 1)))
+    way = jnp.concatenate([jnp.zeros(1), way])
+    s = jnp.linspace(0.0, 1.0, samples)
+    position, slope = with_slope(jnp.interp(s * way[-1], way, dense))
+    tangent, size = slope / _lengths(slope)[:, None], jnp.ones(())
     if position.shape[1] == 2:
-        normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-        return np.stack([tangent, normal], axis=2)
-    across = [_start(tangent[0], up)]
-    for k in range(len(tangent) - 1):
-        chord = position[k + 1] - position[k]
-        normal, bent = (_mirror(v, chord) for v in (across[-1], tangent[k]))
-        across.append(_mirror(normal, tangent[k + 1] - bent))
-    z = np.stack(across)
-    return np.stack([tangent, np.cross(z, tangent), z], axis=2)
+        normal = jnp.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+        frame = jnp.stack([tangent, normal], axis=2)
+    else:
+        if up is None:
+            up = jnp.where(jnp.abs(tangent[0, 2]) < 0.9, jnp.eye(3)[2], jnp.eye(3)[1])
+        across = up - jnp.dot(up, tangent[0]) * tangent[0]
+        size = _lengths(across[None])[0]
+        frame = _without_twist(position, tangent, across / size)
+    return Reference(s, way[-1], position, frame), speed.min() / speed.max(), size
 
 
-def _start(tangent: np.ndarray, up) -> np.ndarray:
-    if up is None:
-        up = np.eye(3)[2] if abs(tangent[2]) < 0.9 else np.eye(3)[1]
-    across = np.asarray(up, float) - np.dot(up, tangent) * tangent
-    size = np.linalg.norm(across)
-    if not size > 1e-6:
-        raise ValueError(f"backbone: `up` is {up}, need a direction across the curve.")
-    return across / size
+def _lengths(vectors: Float[Array, "n dim"]) -> Float[Array, " n"]:
+    return jnp.sqrt(jnp.sum(vectors**2, axis=1))
 
 
-def _mirror(vector: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def _without_twist(position, tangent, z) -> Float[Array, "samples 3 3"]:
+    """Frames about the tangents, the first with the axis `z`, by two reflections a step."""
+
+    def advance(z, step):
+        chord, here, there = step
+        z, bent = _mirror(z, chord), _mirror(here, chord)
+        z = _mirror(z, there - bent)
+        return z, z
+
+    steps = jnp.diff(position, axis=0), tangent[:-1], tangent[1:]
+    z = jnp.concatenate([z[None], jax.lax.scan(advance, z, steps)[1]])
+    return jnp.stack([tangent, jnp.cross(z, tangent), z], axis=2)
+
+
+def _mirror(vector: Float[Array, "3"], normal: Float[Array, "3"]) -> Float[Array, "3"]:
     square = normal @ normal
-    return vector if square < 1e-28 else vector - 2 * (normal @ vector) / square * normal
+    small = square < 1e-28
+    safe = jnp.where(small, jnp.ones_like(square), square)
+    return jnp.where(small, vector, vector - 2 * (normal @ vector) / safe * normal)
 
 
-# The strains of a material line of a solid: what a rod in its place would feel.
-#
 # Strain of a row of section poses: twists from pose to pose, safe at any turn.
 
 
@@ -239,10 +250,10 @@ def section_axes(
 
 
 def _unit(vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    return vectors / jnp.sqrt(jnp.sum(vectors**2, axis=1, keepdims=True))
+    return vectors / _lengths(vectors)[:, None]
 
 
-# The strains of a material line of a solid: what a rod in its place would feel
+# The strains of a material curve of a solid: what a rod in its place would feel
 
 
 PLANAR = ("kappa_z", "sigma_x", "sigma_y")
@@ -254,6 +265,7 @@ class Backbone(eqx.Module):
 
     `strain` holds kappa_z [1/m], sigma_x and sigma_y [-] at the samples `s` in [0, 1], in
     space all six strains; `rest` is that of the unloaded curve, None for a straight one.
+    `cells` are those of the mesh that hold the samples, where there is a mesh.
     """
 
     s: Float[Array, " samples"]
@@ -261,6 +273,7 @@ class Backbone(eqx.Module):
     positions: Float[Array, "steps samples dim"]
     strain: Float[Array, "steps samples strain"]
     rest: Float[Array, "samples strain"] | None = None
+    cells: Int[Array, " points"] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -286,10 +299,10 @@ class Backbone(eqx.Module):
         straight = jnp.array([float(name == "sigma_x") for name in self.names])
         return jnp.broadcast_to(straight, self.strain.shape[1:])
 
-    def rest_strain(self, s: Float[Array, " points"]) -> Float[np.ndarray, "points strain"]:
+    def rest_strain(self, s: Float[Array, " points"]) -> Float[Array, "points strain"]:
         """Strain at rest between the samples: give it to `rod` as its `rest_strain`."""
-        columns = np.asarray(self.rest_or_straight).T
-        return np.stack([np.interp(s, self.s, column) for column in columns], axis=1)
+        columns = self.rest_or_straight.T
+        return jnp.stack([jnp.interp(s, self.s, column) for column in columns], axis=1)
 
 
 class Probe(eqx.Module):
@@ -330,39 +343,54 @@ class Probe(eqx.Module):
 
 
 def probe(
-    mesh, curve: AbstractCurve, samples: int = 81, *, arm: float | None = None, up=None
+    mesh: Mesh,
+    curve: AbstractCurve,
+    samples: int = 81,
+    *,
+    arm: float | None = None,
+    up: Numbers | None = None,
+    cells: Int[Array, " points"] | None = None,
 ) -> Probe:
     """Equally spaced samples of `curve` in `mesh`; see `strain_along`.
 
     Raises:
         ValueError: If the curve, or the fibres beside it, leave the mesh.
     """
+    if cells is None:
+        known = reference(curve, samples, up)
+        fibres = _fibres(known, arm)
+        try:
+            cells = jnp.asarray(cells_at(mesh, fibres.reshape(-1, fibres.shape[-1])))
+        except ValueError as error:
+            if len(fibres) == 1:
+                raise
+            beside = known.length / _ARM if arm is None else arm
+            raise ValueError(
+                f"strain_along: {error} The fibres lie {beside:.3g} m beside it: lower `arm`."
+            ) from None
+    return _probe(mesh, curve, samples, arm, None if up is None else real(up), cells)
+
+
+@eqx.filter_jit
+def _probe(mesh: Mesh, curve: AbstractCurve, samples: int, arm, up, cells) -> Probe:
     known = reference(curve, samples, up)
-    dim = known.position.shape[1]
-    if arm is None and dim == 3:
-        arm = known.length / 50
     fibres = _fibres(known, arm)
-    try:
-        locations = locate(mesh, fibres.reshape(-1, dim))
-    except ValueError as error:
-        if arm is None:
-            raise
-        raise ValueError(
-            f"strain_along: {error} The fibres lie {arm:.3g} m beside it: lower `arm`."
-        ) from None
-    base = jnp.asarray(known.frame[0])
-    return Probe(
-        locations, jnp.asarray(fibres), base, jnp.asarray(known.s), jnp.asarray(known.length)
-    )
+    locations = locate(mesh, fibres.reshape(-1, fibres.shape[-1]), cells)
+    return Probe(locations, fibres, known.frame[0], known.s, known.length)
 
 
-def _fibres(known: Reference, arm: float | None) -> np.ndarray:
-    rows = [known.position]
+_ARM = 50  # length over the distance of the fibres, in space
+
+
+def _fibres(known: Reference, arm) -> Float[Array, "fibres samples dim"]:
+    rows, dim = [known.position], known.position.shape[1]
+    if arm is None and dim == 3:
+        arm = known.length / _ARM
     if arm is not None:
-        for axis in range(1, known.position.shape[1]):
+        for axis in range(1, dim):
             side = arm * known.frame[:, :, axis]
             rows += [known.position + side, known.position - side]
-    return np.stack(rows)
+    return jnp.stack(rows)
 
 
 def line_strain(
@@ -398,11 +426,14 @@ def strain_along(
     samples: int = 81,
     arm: float | None = None,
     up: Numbers | None = None,
+    near: Backbone | None = None,
 ) -> Backbone:
     """Strains of a material curve of a solid along a load path, as of a rod in its place.
 
     The twist from section to section is the logarithm of the relative motion, divided by the
-    rest length between them. Differentiable in the displacements of the path, outside `jit`.
+    rest length between them. Differentiable in the displacements of the path, in the nodes of
+    its mesh and in the numbers of the curve. Which cell holds a sample is chosen once and
+    held: it has no derivative, the place inside the cell has.
 
     Args:
         path: Equilibria, from `fem.solve_path`.
@@ -414,6 +445,9 @@ def strain_along(
             plane none by default: a section then follows the tangent and has no shear.
         up: In space, a direction near which local z of the first section points [-]; by default
             the axis of space that is most across the curve.
+        near: A backbone of the same curve in a mesh with the same cells, whose samples stay
+            in the cells where they are there. Needed under `jit` and `vmap`, where no cell
+            can be chosen.
 
     Returns:
         Positions [m] and strains (curvatures [1/m], stretch and shears [-]) of every state.
@@ -440,12 +474,13 @@ def strain_along(
     Reference:
         Caasenbrood, Pogromsky and Nijmeijer, Sorotoki, IEEE Access 12, 2024, algorithm 1.
     """
-    at = probe(path.problem.mesh, curve, samples, arm=arm, up=up)
+    cells = None if near is None else near.cells
+    at = probe(path.problem.mesh, curve, samples, arm=arm, up=up, cells=cells)
     positions, strain = _snapshots(at, path.displacements)
     rest = None
     if not isinstance(curve, Line):
         rest = _snapshots(at, jnp.zeros_like(path.displacements[:1]))[1][0]
-    return Backbone(at.s, at.length, positions, strain, rest)
+    return Backbone(at.s, at.length, positions, strain, rest, at.locations.cells)
 
 
 @eqx.filter_jit

@@ -1,5 +1,4 @@
-r"""A rod's elastic law, pressure map and section, identified from a FEM load path, and its
-damping from a motion.
+"""A rod's elastic law, pressure map and section, identified from a FEM load path.
 
 At every equilibrium of the path the solid answers a generalised force on the strain
 coordinates q with its condensed stiffness, one back-substitution per coordinate on the
@@ -10,19 +9,9 @@ tangent. A co-energy
 is fitted to stiffness, equilibrium and enclosed volume together: K - p C is the condensed
 stiffness, dPsi*/dq = 0 the equilibrium, and dPsi*/dp the volume. One potential gives force
 and volume, so no energy is lost between gas and rod.
-
-For the damping the equations of motion are tested with windows in time: over a window w that
-begins and ends with weight zero,
-
-    D \int w v dt = \int (w f + w' M v) dt,
-
-where f holds all forces but damping. No acceleration of the samples is needed. D is the
-symmetric positive semidefinite matrix that fits all windows best, one block for each strain.
-
-Reference:
-    Messenger and Bortz, Weak SINDy for partial differential equations, J. Comput. Phys. 443,
-    2021, for tests with windows.
 """
+
+import functools
 
 import equinox as eqx
 import jax
@@ -30,38 +19,37 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sorojax import _check
 from sorojax._progress import report
 from sorojax._types import Numbers, real
 from sorojax.fem.assembly.fields import quadrature_points
 from sorojax.fem.dynamics.damping import lumped_mass
-from sorojax.fem.equilibrium.linear import linearise, prepare
+from sorojax.fem.equilibrium.response import tangent_solve
 from sorojax.fem.equilibrium.solve import Path
 from sorojax.fem.kinematics import PlaneStrain, Solid
 from sorojax.fem.loads.loads import Pressure
 from sorojax.fem.problem import Problem
 from sorojax.fem.stress import enclosed_volume
-from sorojax.math.host import KDTree
-from sorojax.math.linalg import sparse
-from sorojax.reduction.backbone import AbstractCurve, Backbone, Line, Probe, probe, reference
+from sorojax.math.linalg.dense import least_squares
+from sorojax.mesh.mesh import Mesh
+from sorojax.reduction.backbone import (
+    AbstractCurve,
+    Backbone,
+    Line,
+    Probe,
+    Reference,
+    probe,
+    reference,
+)
+from sorojax.reduction.damping import ConstantDamping
 from sorojax.reduction.pod import coordinates, project
 from sorojax.rod import (
-    AbstractDamping,
     AbstractForce,
     AbstractPressureMap,
     LinearElastic,
-    Rod,
     Section,
     StrainBasis,
-    inertia,
-    motion,
-    operators,
     points,
-    stiffness_matrix,
-    total_force,
 )
-from sorojax.rod.dynamics.dynamics import Forces
-from sorojax.rod.model.basis import columns
 
 # The uniform section that carries the mass of a body along a curve.
 
@@ -74,23 +62,25 @@ def mean_section(
 ) -> Section:
     """The section of a uniform rod along `curve` with the mass of the body, its mean offset
     from the curve and its rotary inertia about it. Of a solid the torsion constant is the
-    polar moment, an upper bound.
+    polar moment, an upper bound. Differentiable in the nodes and in the curve; which section a
+    point belongs to has no derivative.
 
     Raises:
         ValueError: If the body is neither plane strain nor solid.
     """
-    kinematics = problem.kinematics
-    if not isinstance(kinematics, PlaneStrain | Solid):
+    if not isinstance(problem.kinematics, PlaneStrain | Solid):
         raise ValueError(
-            f"mean_section: got {type(kinematics).__name__}, need PlaneStrain or Solid. Give "
-            "the rod a section of your own."
+            f"mean_section: got {type(problem.kinematics).__name__}, need PlaneStrain or "
+            "Solid. Give the rod a section of your own."
         )
-    known = reference(curve, _SAMPLES, up)
-    inside = quadrature_points(problem.mesh, kinematics)
+    return _mean_section(problem.mesh, problem.kinematics, reference(curve, _SAMPLES, up))
+
+
+@eqx.filter_jit
+def _mean_section(mesh: Mesh, kinematics: PlaneStrain | Solid, known: Reference) -> Section:
+    inside = quadrature_points(mesh, kinematics)
     points = jnp.moveaxis(inside.position, 0, -1).reshape(-1, kinematics.dim)
-    near = KDTree(known.position).query(np.asarray(jax.lax.stop_gradient(points)))[1]
-    axes = known.position[near], known.frame[near]
-    volume, offsets, moments = _moments(points, inside.volumes.reshape(-1), *axes)
+    volume, offsets, moments = _moments(points, inside.volumes.reshape(-1), known)
     area, about_z = volume / known.length, moments[0] / known.length
     if isinstance(kinematics, Solid):
         about_y = moments[1] / known.length
@@ -107,12 +97,18 @@ def mean_section(
     )
 
 
-@jax.jit
 def _moments(
-    points: Array, volumes: Array, places: Array, frames: Array
+    points: Float[Array, "points dim"], volumes: Float[Array, " points"], curve: Reference
 ) -> tuple[Array, list[Array], list[Array]]:
-    """Volume, its mean place along each axis of the section, and its second moments."""
-    local = jnp.einsum("pi,pij->pj", points - places, frames)
+    """Volume, its mean place along each axis of the section, and its second moments, each
+    point in the section of the sample of the curve that is nearest to it."""
+    places = jax.lax.stop_gradient(curve.position)
+
+    def nearest(point):
+        return jnp.argmin(jnp.sum((places - point[None]) ** 2, axis=1))
+
+    near = jax.lax.map(nearest, jax.lax.stop_gradient(points), batch_size=4096)
+    local = jnp.einsum("pi,pij->pj", points - curve.position[near], curve.frame[near])
     total, across = jnp.sum(volumes), [local[:, k] for k in range(1, local.shape[1])]
     means = [jnp.sum(volumes * x) / total for x in across]
     return total, means, [jnp.sum(volumes * x**2) for x in across]
@@ -153,39 +149,14 @@ def offset_weight(problem: Problem, line: Line, acceleration: Numbers) -> Offset
         line: Of the rod.
         acceleration: Of gravity [m/s^2].
     """
-    shares = np.asarray(lumped_mass(problem)).reshape(-1, 2)[:, 0]
-    start, end = np.asarray(line.start), np.asarray(line.end)
-    along = (end - start) / np.linalg.norm(end - start)
-    middle = shares @ np.asarray(problem.mesh.points) / shares.sum() - start
+    shares = lumped_mass(problem).reshape(-1, 2)[:, 0]
+    along = line.end - line.start
+    along = along / jnp.sqrt(jnp.sum(along**2))
+    middle = shares @ problem.mesh.points / shares.sum() - line.start
     return OffsetWeight(shares.sum(), along[0] * middle[1] - along[1] * middle[0], acceleration)
 
 
-# A rod's elastic law, pressure map and section, identified from a FEM load path.
-#
-# At every equilibrium of the path the solid answers a generalised force on the strain
-# coordinates q with its condensed stiffness, one back-substitution per coordinate on the
-# tangent that the solve left behind. A co-energy
-#
-#     Psi*(q, p) = g(p).q + p q'Cq / 2 + h(p) - q'Kq / 2
-#
-# is fitted to stiffness, equilibrium and enclosed volume together: K - p C is the condensed
-# stiffness, dPsi*/dq = 0 the equilibrium, and dPsi*/dp the volume. One potential gives force
-# and volume, so no energy is lost between gas and rod.
-#
-# The damping of a rod, identified from its motion.
-#
-# The equations of motion are tested with windows in time: over a window that begins and ends
-# with weight zero,
-#
-#     D \int w v dt = \int (w f + w' M v) dt,
-#
-# where f holds all forces but damping. No acceleration of the samples is needed. D is the
-# symmetric matrix that fits all windows best, one block for each strain, without the part that
-# would add energy.
-#
-# Reference:
-#     Messenger and Bortz, Weak SINDy for partial differential equations, J. Comput. Phys. 443,
-#     2021, for tests with windows.
+# The laws of the rod, identified from a FEM load path.
 
 
 class PressureMap(AbstractPressureMap):
@@ -217,15 +188,6 @@ class PressureMap(AbstractPressureMap):
         )
 
 
-class ConstantDamping(AbstractDamping):
-    """Linear damping by a constant matrix [N m s per coordinate rate]."""
-
-    coefficients: Float[Array, "dof dof"] = eqx.field(converter=real)
-
-    def matrix(self, stiffness):
-        return self.coefficients
-
-
 class Fit(eqx.Module):
     """The laws of a rod that stands in for the solid, and how well they were found.
 
@@ -242,8 +204,8 @@ class Fit(eqx.Module):
     length: Float[Array, ""]
     elastic: LinearElastic
     pressure: PressureMap
-    stiffness_error: float
-    volume_error: float
+    stiffness_error: Float[Array, ""]
+    volume_error: Float[Array, ""]
 
     def damping(self, time) -> ConstantDamping:
         """Kelvin-Voigt damping with a retardation `time` [s] of the identified stiffness."""
@@ -306,24 +268,28 @@ def identify(
             f"identify: the path holds {len(path)} states, need {degree + 2} for `degree` "
             f"{degree}. Solve at more pressures or lower `degree`."
         )
-    p = np.asarray(path.values)
-    q = np.asarray(coordinates(backbone, basis))
-    at = probe(problem.mesh, curve, len(backbone.s), arm=arm, up=up)
+    q = coordinates(backbone, basis)
+    at = _probe(path, curve, backbone, arm, up)
     volumes, condensed = [], []
     for k, u in enumerate(path.displacements):
         condensed.append(_condensed_stiffness(path.problem_at(k), u, at, basis))
-        volumes.append(float(enclosed_volume(problem, u, load.facets)))
-        report("identify", len(volumes), len(p))
-    K, C = _affine(p, np.stack(condensed))
-    pressure = _pressure_map(p, q, np.array(volumes), K, C, degree)
-    return Fit(
-        section=mean_section(problem, curve, up=up),
-        length=backbone.length,
-        elastic=LinearElastic(K),
-        pressure=pressure,
-        stiffness_error=_relative(K - p[:, None, None] * C - np.stack(condensed), condensed),
-        volume_error=_volume_error(pressure, p, q, np.array(volumes)),
+        volumes.append(enclosed_volume(problem, u, load.facets))
+        report("identify", len(volumes), len(path))
+    laws, errors = _fitted(
+        path.values, q, jnp.stack(volumes), jnp.stack(condensed), degree=degree
     )
+    return Fit(mean_section(problem, curve, up=up), backbone.length, *laws, *errors)
+
+
+def _probe(path: Path, curve, backbone: Backbone, arm, up) -> Probe:
+    """The samples of `backbone`; its cells are chosen again where other fibres are asked
+    for."""
+    cells, beside = backbone.cells, arm is not None or len(backbone.names) == 6
+    dim = path.problem.mesh.element.dim
+    fibres = 1 + 2 * (dim - 1) * beside
+    if cells is not None and len(cells) != fibres * len(backbone.s):
+        cells = None
+    return probe(path.problem.mesh, curve, len(backbone.s), arm=arm, up=up, cells=cells)
 
 
 def _pressure(path: Path) -> Pressure:
@@ -344,213 +310,64 @@ def condensed_stiffness(
     samples: int = 81,
     arm: float | None = None,
     up: Numbers | None = None,
-) -> Float[np.ndarray, "steps dof dof"]:
+    near: Backbone | None = None,
+) -> Float[Array, "steps dof dof"]:
     """Stiffness of the solid against forces on the coordinates, at each state of any path.
 
     That at rest is the elastic law of a rod: `LinearElastic(condensed_stiffness(...)[0])`.
-    The arguments are those of `strain_along`.
+    The arguments are those of `strain_along`. Differentiable in the numbers of the problem, the
+    displacements, the curve and the modes, once: see `tangent_solve`.
     """
-    at = probe(path.problem.mesh, curve, samples, arm=arm, up=up)
+    cells = None if near is None else near.cells
+    at = probe(path.problem.mesh, curve, samples, arm=arm, up=up, cells=cells)
     found = [
         _condensed_stiffness(path.problem_at(k), u, at, basis)
         for k, u in enumerate(path.displacements)
     ]
-    return np.stack(found)
+    return jnp.stack(found)
 
 
+@eqx.filter_jit
 def _condensed_stiffness(
     problem: Problem, u: Array, at: Probe, basis: StrainBasis
-) -> Float[np.ndarray, "dof dof"]:
+) -> Float[Array, "dof dof"]:
     """Stiffness against generalised forces on q at an equilibrium: (H K^-1 H')^-1."""
-    H = _coordinate_jacobian(at, basis, u).reshape(basis.num_dof, -1)
-    prepared = prepare(problem)
-    tangent = linearise(problem, prepared, u, u).values
-    matrix = sparse.fix(problem.space.system, tangent, prepared.known)
-    rows = np.where(np.asarray(prepared.known), 0.0, np.asarray(H))
-    answer = problem.space.system.solver.solve(np.asarray(matrix), rows)
-    compliance = rows @ answer.T
-    return np.linalg.inv((compliance + compliance.T) / 2)
+
+    def coordinates(u):
+        return project(at.strain(u), at.s, basis)
+
+    H = jax.jacrev(coordinates)(u).reshape(basis.num_dof, -1)
+    compliance = H @ tangent_solve(problem, u, H).T
+    return jnp.linalg.inv((compliance + compliance.T) / 2)
 
 
-@eqx.filter_jit
-def _coordinate_jacobian(at: Probe, basis: StrainBasis, u):
-    return jax.jacrev(lambda u: project(at.strain(u), at.s, basis))(u)
+@functools.partial(jax.jit, static_argnames="degree")
+def _fitted(p, q, volumes, condensed, *, degree: int):
+    """Elastic law and pressure map, and the misfit of stiffness and volume.
 
-
-def _affine(p: np.ndarray, stiffness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """K and C of the least-squares fit K - p C, symmetric."""
-    columns = np.stack([np.ones_like(p), -p], axis=1)
-    flat = stiffness.reshape(len(p), -1)
-    (K, C), *_ = np.linalg.lstsq(columns / np.abs(columns).max(0), flat, rcond=None)
-    scale = np.abs(columns).max(0)
-    shape = stiffness.shape[1:]
-    return (K / scale[0]).reshape(shape), (C / scale[1]).reshape(shape)
-
-
-def _pressure_map(p, q, volumes, K, C, degree) -> PressureMap:
-    """g from the equilibria, then h from the volumes that remain."""
-    scale = np.abs(p).max()
+    K and C of the least-squares fit K - p C, then g from the equilibria, then h from the
+    volumes that remain.
+    """
+    scale = jnp.max(jnp.abs(p))
     x = p / scale
+    linear = jnp.stack([jnp.ones_like(x), -x], axis=1)
+    K, C = least_squares(linear, condensed.reshape(len(p), -1)).reshape(2, *condensed.shape[1:])
+    C = C / scale
     push = q @ K - p[:, None] * (q @ C)
-    powers = np.stack([x**k for k in range(1, degree + 1)], axis=1)
-    force, *_ = np.linalg.lstsq(powers, push, rcond=None)
-    slopes = np.stack([k * x ** (k - 1) for k in range(1, degree + 1)], axis=1) / scale
-    bent = np.einsum("ki,ki->k", slopes @ force, q) + np.einsum("ki,ij,kj->k", q, C, q) / 2
-    walls, *_ = np.linalg.lstsq(slopes * scale, (volumes - bent) * scale, rcond=None)
-    return PressureMap(C, force, walls, scale)
-
-
-def _volume_error(pressure: PressureMap, p, q, volumes) -> float:
-    found = _volumes(pressure, jnp.asarray(q), jnp.asarray(p))
-    return float(np.max(np.abs(np.asarray(found) - volumes)) / np.ptp(volumes))
-
-
-@eqx.filter_jit
-def _volumes(pressure: PressureMap, q: Array, p: Array) -> Float[Array, " steps"]:
-    return jax.vmap(jax.grad(pressure.coenergy, argnums=1))(q, p)
-
-
-def _relative(error: np.ndarray, reference) -> float:
-    return float(np.max(np.abs(error)) / np.max(np.abs(np.stack(reference))))
+    powers = jnp.stack([x**k for k in range(1, degree + 1)], axis=1)
+    force = least_squares(powers, push)
+    slopes = jnp.stack([k * x ** (k - 1) for k in range(1, degree + 1)], axis=1)
+    bent = jnp.einsum("ki,ki->k", slopes @ force / scale, q)
+    bent = bent + jnp.einsum("ki,ij,kj->k", q, C, q) / 2
+    pressure = PressureMap(C, force, least_squares(slopes, (volumes - bent) * scale), scale)
+    misfit = jnp.max(jnp.abs(K[None] - p[:, None, None] * C[None] - condensed))
+    found = jax.vmap(jax.grad(pressure.coenergy, argnums=1))(q, p)
+    errors = (
+        misfit / jnp.max(jnp.abs(condensed)),
+        jnp.max(jnp.abs(found - volumes)) / jnp.ptp(volumes),
+    )
+    return (LinearElastic(K), pressure), errors
 
 
 def _powers(x: Float[Array, ""], count: int) -> Float[Array, " powers"]:
     return jnp.stack([x**k for k in range(1, count + 1)])
-
-
-# The damping of a rod, identified from its motion
-
-
-_FLAT = 8  # how flat a window ends; sums over samples are then as good as integrals
-_SEEN = 1e-9  # least share of the motion at which a shape of the damping can be told
-
-
-class DampingFit(eqx.Module):
-    """Damping found in a motion.
-
-    Attributes:
-        damping: As a force on the rod.
-        error: What it leaves unexplained of the force that damping must make [-].
-    """
-
-    damping: ConstantDamping
-    error: float
-
-
-def identify_damping(
-    rod: Rod,
-    t: Float[Array, " samples"],
-    q: Float[Array, "samples dof"],
-    forces: Forces = (),
-    *,
-    v: Float[Array, "samples dof"] | None = None,
-    window: int = 21,
-) -> DampingFit:
-    """Damping matrix, a block per active strain, of a rod that was seen to move so.
-
-    A free swing after a push will do, if it moves all coordinates. Coordinates of a FEM
-    solution come from `strain_along` and `coordinates`.
-
-    Args:
-        rod: The rod, with its mass and stiffness.
-        t: Equally spaced times [s], some twenty or more in a period of the fastest motion.
-        q: Coordinates at these.
-        forces: All forces on it but the damping; an elastic law replaces that of the rod.
-        v: Rates [per s]; differences of order 4 if omitted.
-        window: Samples in a window. More average noise away, up to about a period.
-
-    Raises:
-        ValueError: If times are not equally spaced, samples too few for a window, or a
-            strain does not move in as many ways as it has coordinates.
-    """
-    times, states = np.asarray(t, float), np.asarray(q, float)
-    _check.shape("identify_damping", "q", states, (len(times), rod.basis.num_dof), _ROWS)
-    step = _step(times, window)
-    rates = _differences(states, step) if v is None else np.asarray(v, float)
-    _check.shape("identify_damping", "v", rates, states.shape, _ROWS)
-    terms = _balance(rod, real(times), real(states), real(rates), forces)
-    stiffness = np.diag(np.asarray(stiffness_matrix(rod)))
-    momentum, force = (np.asarray(term) for term in terms)
-    weight, slope = _windows(len(times), window, step)
-    moved, lost = weight @ rates, weight @ force + slope @ momentum
-    size = np.sqrt(stiffness)  # forces and rates of all coordinates in one measure
-    moved, lost = moved * size, lost / size
-    matrix = np.zeros((rod.basis.num_dof,) * 2)
-    for name in rod.basis.active:
-        at = columns(rod.basis, name)
-        matrix[at, at] = _symmetric_fit(name, moved[:, at], lost[:, at])
-    left = np.linalg.norm(moved @ matrix - lost) / np.linalg.norm(lost)
-    return DampingFit(ConstantDamping(size[:, None] * matrix * size), float(left))
-
-
-_ROWS = "Give one row of all coordinates for each time."
-
-
-def _step(times: np.ndarray, window: int) -> float:
-    if window < 5 or len(times) < 2 * window:
-        raise ValueError(
-            f"identify_damping: got {len(times)} samples and a window of {window}, need a "
-            "window of 5 or more and twice its samples. Sample for longer or more often."
-        )
-    steps = np.diff(times)
-    if not np.allclose(steps, steps.mean(), rtol=1e-3, atol=0) or steps.mean() <= 0:
-        raise ValueError(
-            f"identify_damping: got steps of {steps.min():.3g} to {steps.max():.3g} s between "
-            "the samples, need equal ones. Interpolate to equally spaced times."
-        )
-    return float(steps.mean())
-
-
-@eqx.filter_jit
-def _balance(rod: Rod, t, q, v, forces) -> tuple[Array, Array]:
-    """Momentum M v, and the force that changes it but for damping, of each sample."""
-    constants = operators(rod)
-
-    def at(t, q, v):
-        moment = motion(rod, q, v, constants=constants)
-        mass, coriolis = inertia(moment)
-
-        def momentum(q):
-            return inertia(motion(rod, q, constants=constants))[0] @ v
-
-        _, growth = jax.jvp(momentum, (q,), (v,))
-        return mass @ v, total_force(forces, t, moment) - coriolis + growth
-
-    return jax.vmap(at)(t, q, v)
-
-
-def _windows(samples: int, window: int, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows that integrate with the weight of each window, and with its slope in time."""
-    half = (window - 1) / 2
-    x = np.arange(window) / half - 1
-    weight = step * (1 - x**2) ** _FLAT
-    slope = -2 * _FLAT * x * (1 - x**2) ** (_FLAT - 1) / half
-    starts = np.arange(0, samples - window + 1, max(1, window // 4))
-    rows = np.zeros((2, len(starts), samples))
-    for row, start in enumerate(starts):
-        rows[:, row, start : start + window] = weight, slope
-    return rows[0], rows[1]
-
-
-def _symmetric_fit(name: str, x: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The symmetric D of least |x D - b| without its negative part."""
-    squares, axes = np.linalg.eigh(x.T @ x)
-    if not squares[0] > _SEEN * squares[-1]:
-        raise ValueError(
-            f"identify_damping: the {len(squares)} coordinates of `{name}` move in fewer ways "
-            "than that, need all to move. Push the rod elsewhere or take fewer modes."
-        )
-    both = axes.T @ (x.T @ b + b.T @ x) @ axes
-    found = axes @ (both / (squares[:, None] + squares)) @ axes.T
-    values, directions = np.linalg.eigh(found)
-    return (directions * np.maximum(values, 0)) @ directions.T
-
-
-def _differences(q: np.ndarray, step: float) -> np.ndarray:
-    """Slopes at the samples, of order 4, by five of them."""
-    v = np.empty_like(q)
-    v[2:-2] = (8 * (q[3:-1] - q[1:-3]) - (q[4:] - q[:-4])) / 12
-    ends = np.array([[-25, 48, -36, 16, -3], [-3, -10, 18, -6, 1]]) / 12
-    v[:2] = ends @ q[:5]
-    v[-2:] = -(ends @ q[:-6:-1])[::-1]
-    return v / step

@@ -3,18 +3,21 @@
 Reference: Caasenbrood et al., Sorotoki, IEEE Access 2024, section V-D4.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax._jax.trace_state import is_traced
+from sorojax.math.linalg.dense import least_squares
 from sorojax.reduction.backbone import PLANAR, Backbone
 from sorojax.rod import AbstractModes, StrainBasis, orthonormalise
-from sorojax.rod.model.basis import STRAINS, Combined, SampledModes
+from sorojax.rod.model.basis import STRAINS, Combined, SampledModes, columns
 
 
-@jax.jit
 def weights(s: Float[Array, " samples"]) -> Float[Array, " samples"]:
     """Trapezoidal weights of samples in [0, 1]."""
     gaps = jnp.pad(jnp.diff(s), 1)
@@ -46,6 +49,11 @@ def pod_basis(
         ValueError: If a strain is unknown, there are fewer independent snapshots than
             modes, or `within` has more functions than there are samples.
 
+    Differentiable in the snapshots, with the number of modes and their signs held, also where
+    two singular values come together: a mode then turns at a bounded rate towards the other,
+    and what depends only on the functions that the modes span, as a reduced rod does, has its
+    exact derivative. See `leading_directions`.
+
     Example:
         >>> s = jnp.linspace(0.0, 1.0, 13)
         >>> strain = jnp.stack([s, 0 * s + 1, 0 * s], axis=1)[None] * jnp.ones((4, 1, 1))
@@ -58,48 +66,73 @@ def pod_basis(
         Caasenbrood, Pogromsky and Nijmeijer, Sorotoki, IEEE Access 12, 2024, section V-D4.
     """
     basis = {}
+    root = jnp.sqrt(weights(backbone.s))
     for name, wanted in modes.items():
         if name not in backbone.names:
             raise ValueError(
                 f"pod_basis: the strain `{name}` is not one of {', '.join(backbone.names)}. A "
                 "planar backbone bends about z."
             )
-        inner, columns = _shapes(backbone, name, within)
-        root = np.sqrt(np.asarray(weights(backbone.s)))
-        coefficients = np.linalg.lstsq(
-            root[:, None] * columns, (root * _snapshots(backbone, name)).T, rcond=None
-        )[0]
-        left, size, right = np.linalg.svd(coefficients, full_matrices=False)
-        rank = int(np.sum(size > 1e-10 * max(size[0], 1e-300)))
-        if isinstance(wanted, float) and 0 < wanted < 1:
-            shapes, parts = root[:, None] * (columns @ left), size[:, None] * right
-            wanted = _enough(name, wanted, (root * _snapshots(backbone, name)).T, shapes, parts)
-        count = _count(name, wanted, rank)
-        sign = np.sign((root**2) @ columns @ left[:, :count])
-        mix = left[:, :count] * np.where(sign < 0, -1, 1)
-        basis[name] = _modes(backbone, inner, columns, mix)
+        inner, values = _functions(backbone, name, within)
+        snapshots = _snapshots(backbone, name)
+        count = _count(name, wanted, *jax.lax.stop_gradient((root, values, snapshots)))
+        mix = _leading(root, values, snapshots, count)
+        basis[name] = _modes(backbone, inner, values, mix)
     return StrainBasis(basis)
 
 
-def _shapes(backbone: Backbone, name: str, within: AbstractModes | None):
+def _functions(backbone: Backbone, name: str, within: AbstractModes | None):
     """Functions in which the snapshots are written, and their values at the samples.
 
     Orthonormal ones: then singular vectors give orthonormal modes.
     """
-    root = np.sqrt(np.asarray(weights(backbone.s)))
+    s = backbone.s
     if within is None:
-        return None, np.diag(1 / root)
-    if within.count > len(backbone.s):
+        return None, jnp.diag(1 / jnp.sqrt(weights(s)))
+    if within.count > len(s):
         raise ValueError(
-            f"pod_basis: `within` has {within.count} modes, the backbone {len(backbone.s)} "
+            f"pod_basis: `within` has {within.count} modes, the backbone {len(s)} "
             "samples, need as many or more. Take more samples."
         )
     inner = orthonormalise(StrainBasis({name: within})).modes[name]
-    return inner, np.asarray(inner(np.asarray(backbone.s)))
+    return inner, jnp.asarray(inner(s))
 
 
-def _modes(backbone: Backbone, inner, columns: np.ndarray, mix: np.ndarray) -> AbstractModes:
-    return SampledModes(backbone.s, columns @ mix) if inner is None else Combined(inner, mix)
+@functools.partial(jax.jit, static_argnums=3)
+def _leading(root, values, snapshots, count: int) -> Float[Array, "functions count"]:
+    """Combinations of the functions, from most to least energy, their integrals positive."""
+    coefficients = least_squares(root[:, None] * values, root[:, None] * snapshots)
+    mix = leading_directions(coefficients, count)
+    return mix * jnp.where(root**2 @ values @ mix < 0, -1.0, 1.0)[None]
+
+
+def _modes(backbone: Backbone, inner, values: Array, mix: Array) -> AbstractModes:
+    return SampledModes(backbone.s, values @ mix) if inner is None else Combined(inner, mix)
+
+
+def _count(name: str, wanted: int | float, root, values, snapshots) -> int:
+    """The number of modes, from what is wanted: a number, or a share of the snapshots."""
+    is_number = isinstance(wanted, int | np.integer) and not isinstance(wanted, bool)
+    if is_traced((values, snapshots)):
+        if is_number:
+            return int(wanted)
+        raise ValueError(
+            f"pod_basis: asked for {wanted} of `{name}` of traced snapshots, need a number of "
+            "modes there. Choose it outside jit, by the length of a basis."
+        )
+    root, values, snapshots = (np.asarray(x) for x in (root, values, snapshots))
+    values, snapshots = root[:, None] * values, root[:, None] * snapshots
+    coefficients = np.linalg.lstsq(values, snapshots, rcond=None)[0]
+    left, size, right = np.linalg.svd(coefficients, full_matrices=False)
+    rank = int(np.sum(size > 1e-10 * max(size[0], 1e-300)))
+    if isinstance(wanted, float) and 0 < wanted < 1:
+        return _enough(name, wanted, snapshots, values @ left, size[:, None] * right)
+    if not is_number or wanted < 1 or wanted > rank:
+        raise ValueError(
+            f"pod_basis: asked for {wanted} modes of `{name}`, the snapshots hold 1 to "
+            f"{rank}. Add load steps or ask for fewer modes, or for a share below 1."
+        )
+    return int(wanted)
 
 
 def _enough(name: str, wanted: float, snapshots, shapes, parts) -> int:
@@ -116,25 +149,54 @@ def _enough(name: str, wanted: float, snapshots, shapes, parts) -> int:
     )
 
 
-def _count(name: str, wanted: int | float, rank: int) -> int:
-    if isinstance(wanted, bool | float) or wanted < 1 or wanted > rank:
-        raise ValueError(
-            f"pod_basis: asked for {wanted} modes of `{name}`, the snapshots hold 1 to "
-            f"{rank}. Add load steps or ask for fewer modes, or for a share below 1."
-        )
-    return int(wanted)
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def leading_directions(
+    snapshots: Float[Array, "rows snapshots"], count: int
+) -> Float[Array, "rows count"]:
+    r"""The first left singular vectors, orthonormal, with a derivative that stays finite.
+
+    A change dA turns vector j towards vector k, by
+
+        w_kj = (s_j u_k' dA v_j + s_k v_k' dA' u_j) / (s_j^2 - s_k^2).
+
+    Between two of the vectors asked for, w / d with d = s_j^2 - s_k^2 is taken as
+    w d / (d^2 + e^2): where two singular values come together the vectors may turn in their
+    plane at any rate, and what depends on the subspace alone, as a rod with its identified
+    laws does, does not see it. The e is 1e-6 of the product of both singular values. Where
+    the last that is asked for and the first that is not come together, the subspace itself
+    has no derivative, and none is made up.
+    """
+    return jnp.linalg.svd(snapshots)[0][:, :count]
 
 
-def captured_energy(backbone: Backbone, basis: StrainBasis) -> dict[str, float]:
+@leading_directions.defjvp
+def _leading_directions_jvp(count, primals, tangents):
+    (A,), (dA,) = primals, tangents
+    left, size, right = jnp.linalg.svd(A, full_matrices=True)
+    rows = A.shape[0]
+    values = jnp.zeros(rows, A.dtype).at[: len(size)].set(size)
+    seen = left.T @ dA @ right.T  # u_k' dA v_j
+    across = jnp.zeros((rows, max(A.shape)), A.dtype).at[:, : A.shape[1]].set(seen)
+    forward = across[:, :count] * values[None, :count]
+    back = values[:, None] * across[:count].T[:rows]
+    # as a product, so that it is zero between equal values whatever is fused
+    first, second = values[None, :count], values[:, None]
+    apart = (first - second) * (first + second)
+    blur = 1e-6 * first * second
+    inside = jnp.arange(rows)[:, None] < count
+    inverse = jnp.where(inside, apart, 1.0) / jnp.where(inside, apart**2 + blur**2, apart)
+    itself = jnp.eye(rows, count, dtype=bool)
+    turn = jnp.where(itself, 0.0, (forward + back) * jnp.where(itself, 0.0, inverse))
+    return left[:, :count], left @ turn
+
+
+def captured_energy(backbone: Backbone, basis: StrainBasis) -> dict[str, Float[Array, ""]]:
     """Share of the snapshots' squared strain that the basis holds, per strain."""
-    shares, q, start = {}, np.asarray(coordinates(backbone, basis)), 0
-    w = np.asarray(weights(backbone.s))
+    shares, q, w = {}, coordinates(backbone, basis), weights(backbone.s)
     for name in basis.active:
-        shapes = np.asarray(basis.modes[name](backbone.s))
-        held = q[:, start : start + shapes.shape[1]] @ shapes.T
-        start += shapes.shape[1]
-        total = np.sum(w * _snapshots(backbone, name) ** 2)
-        shares[name] = float(np.sum(w * held**2) / max(total, 1e-300))
+        held = q[:, columns(basis, name)] @ basis.modes[name](backbone.s).T
+        total = jnp.sum(w[:, None] * _snapshots(backbone, name) ** 2)
+        shares[name] = jnp.sum(w[None] * held**2) / jnp.maximum(total, 1e-300)
     return shares
 
 
@@ -157,5 +219,5 @@ def project(
     return jnp.concatenate(parts)
 
 
-def _snapshots(backbone: Backbone, name: str) -> Float[np.ndarray, "steps samples"]:
-    return np.asarray(backbone.change[:, :, backbone.names.index(name)])
+def _snapshots(backbone: Backbone, name: str) -> Float[Array, "samples steps"]:
+    return backbone.change[:, :, backbone.names.index(name)].T

@@ -1,6 +1,7 @@
 """Slopes of blocks, networks and motions in every number that they hold."""
 
 import functools
+from dataclasses import replace
 
 import jax.numpy as jnp
 
@@ -11,7 +12,6 @@ from sorojax.rod.dynamics.rollout import Trajectory
 from tests.derivatives.case import Case
 
 NONE = {
-    "shapes chosen on the host, by an eigenvalue problem": "modal_basis",
     "a film's reader, or a loop that moves on the host": "last_state partitioned",
 }
 
@@ -173,6 +173,19 @@ def few_shapes():
     return Case(call, (body, jnp.array([1e-3, 2e-3])), reverse=False, step=1e-4)
 
 
+def shapes(at):
+    """Eigenmodes, the answer to a pressure, and derivatives of these along each other."""
+    return S.modal_basis(at[0], 2, displacement=at[1]).shapes
+
+
+def inflated():
+    problem = solid()[0].problem
+    top = mesh.facets_where(problem.mesh, lambda p: p[1] > 0.01 - 1e-9)
+    problem = replace(problem, loads=(fem.Pressure(top, name="air"),))
+    u = 1e-4 * jnp.sin(jnp.arange(problem.mesh.points.size)).reshape(-1, 2)
+    return Case(shapes, (S.FemBody(problem), u), jit=False, rtol=1e-6, step=1e-4)
+
+
 CASES = {
     "simulate: adaptive": Case(
         ran(rtol=1e-10, atol=1e-10), (air(), INPUTS), rtol=1e-5, step=1e-4, forward=False
@@ -212,4 +225,5 @@ CASES = {
     "estimate_shape": Case(seen, (PLACES, 1e-3), step=1e-4, rtol=1e-5),
     "start_filter, update_filter": Case(filtered, (Q, PLACES), step=1e-4),
     "modal_body, displacement": few_shapes,
+    "modal_basis": inflated,
 }

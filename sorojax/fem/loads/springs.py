@@ -203,7 +203,8 @@ def route(mesh: Mesh, points: Float[np.ndarray, "points dim"]) -> Route:
             f"fem.route: points {gaps.argmin()} and {gaps.argmin() + 1} are the same. Leave "
             "one out."
         )
-    return Route(*locate(mesh, points))
+    nodes, weights, _ = locate(mesh, points)
+    return Route(nodes, weights)
 
 
 def tendon_length(mesh: Mesh, u: Float[Array, "nodes dim"], route: Route) -> Float[Array, ""]:

@@ -186,3 +186,14 @@ def _guess(x: Array) -> Array:
     high = (jax.lax.bitcast_convert_type(x, whole) >> half).astype(jnp.int32)
     third = (4 / 3 * one - less) - high.astype(x.dtype) / 3
     return jax.lax.bitcast_convert_type(third.astype(whole) << half, x.dtype)
+
+
+def least_squares(
+    matrix: Float[Array, "rows columns"], right: Float[Array, "rows *more"]
+) -> Float[Array, "columns *more"]:
+    """x of least |`matrix` x - `right`| for columns that do not depend on each other, by QR of
+    columns of unit length; differentiable in both."""
+    size = jnp.sqrt(jnp.sum(matrix**2, axis=0, keepdims=True))
+    Q, R = jnp.linalg.qr(matrix / size)
+    found = jax.scipy.linalg.solve_triangular(R, Q.T @ right)
+    return found / size.reshape(-1, *(1,) * (right.ndim - 1))

@@ -18,9 +18,9 @@ from jaxtyping import Array, Float
 from sorojax import fem
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
-from sorojax.fem.equilibrium.linear import linearise, prepare
+from sorojax.fem.equilibrium.response import tangent_solve
 from sorojax.fem.problem import load_force, potential_energy, residual
-from sorojax.math.linalg import sparse
+from sorojax.math.linalg.sparse import SparseSymmetric, product
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output
 from sorojax.systems.blocks.fem_body import FemBody, damping_force, port_of, with_values
 
@@ -45,7 +45,7 @@ def modal_basis(
     displacement: Float[Array, "nodes dim"] | None = None,
     bending: bool = True,
 ) -> Basis:
-    """Shapes for `reduced(body, basis)`, made once, on the host.
+    """Shapes for `modal_body(body, basis)`, made once.
 
     The lowest eigenmodes about an equilibrium; the static answer to each driven load, without
     which a pressure would find few modes to work on; and, with `bending`, the static
@@ -58,6 +58,10 @@ def modal_basis(
         displacement: The equilibrium [m]; at rest when omitted.
         bending: Add the derivatives: with n shapes up to n (n + 1) / 2 more.
 
+    Differentiable once outside `jit`, in the numbers of the body and in the displacement. Which
+    shapes are new enough to be kept has no derivative. Eigenmodes of one frequency have none of
+    their own; what depends only on the displacements that the shapes span has.
+
     Reference:
         Idelsohn, Cardona, A reduction method for nonlinear structural dynamic analysis,
         Comput. Methods Appl. Mech. Engrg. 49, 1985, for the derivatives.
@@ -67,26 +71,12 @@ def modal_basis(
     found = [fem.eigenmodes(problem, u, modes).shapes] if modes else []
     found.append(_answers(body, u))
     first = jnp.concatenate(found).reshape(-1, u.size)
-    mass = body.matter().mass
-    chosen = _orthonormal(problem.space.system, mass, np.asarray(first))
+    system, mass = problem.space.system, body.matter().mass
+    chosen = _orthonormal(system, mass, first)
     if bending:
-        more = _shape_derivatives(problem, u, jnp.asarray(chosen).reshape(-1, *u.shape))
-        chosen = _orthonormal(
-            problem.space.system, mass, np.concatenate([chosen, np.asarray(more)])
-        )
-    return Basis(u, jnp.asarray(chosen).reshape(-1, *u.shape))
-
-
-def _tangent(problem: fem.Problem, u) -> tuple[Array, Array]:
-    """Tangent at `u` with the supports applied, and which unknowns are known."""
-    prepared = prepare(problem)
-    values = linearise(problem, prepared, u, u).values
-    return sparse.fix(problem.space.system, values, prepared.known), prepared.known
-
-
-def _solved(problem, matrix, known, forces: Float[Array, "rows dofs"]) -> Array:
-    right = jnp.where(known[None], jnp.zeros_like(forces), forces)
-    return jax.vmap(lambda b: sparse.solve(problem.space.system, matrix, b))(right)
+        more = _shape_derivatives(problem, u, chosen.reshape(-1, *u.shape))
+        chosen = _orthonormal(system, mass, jnp.concatenate([chosen, more]))
+    return Basis(u, chosen.reshape(-1, *u.shape))
 
 
 def _answers(body: FemBody, u) -> Float[Array, "loads nodes dim"]:
@@ -102,7 +92,7 @@ def _answers(body: FemBody, u) -> Float[Array, "loads nodes dim"]:
 
     slopes = jax.jacfwd(force)(now)
     rows = [jnp.moveaxis(s, 0, -1).reshape(-1, u.size) for s in slopes.values()]
-    found = _solved(problem, *_tangent(problem, u), jnp.concatenate(rows))
+    found = tangent_solve(problem, u, jnp.concatenate(rows))
     return found.reshape(-1, *u.shape)
 
 
@@ -119,32 +109,47 @@ def _shape_derivatives(problem: fem.Problem, u, shapes) -> Float[Array, "pairs d
         return jax.jvp(along, (u,), (b,))[1].ravel()
 
     pairs = jnp.asarray(np.stack([first, second], axis=1))
-    forces = jax.jit(lambda pairs: jax.lax.map(curvature, pairs))(pairs)
-    return _solved(problem, *_tangent(problem, u), -forces)
+    forces = jax.lax.map(curvature, pairs)
+    return tangent_solve(problem, u, -forces)
 
 
-def _orthonormal(system, mass, rows: np.ndarray) -> np.ndarray:
-    """The rows one after the other, each without what those before it hold."""
+def _orthonormal(
+    system: SparseSymmetric, mass: Float[Array, " nnz"], rows: Float[Array, "rows dofs"]
+) -> Float[Array, "kept dofs"]:
+    """The rows one after the other, each without what those before it hold, by Gram and
+    Schmidt; a row that holds next to nothing new is left out.
+
+    The combinations are found on the host and held; what they make is orthonormal, so its
+    Cholesky factor is one, with the derivative of the method.
+    """
+    mix = _combinations(system, *(np.asarray(jax.lax.stop_gradient(x)) for x in (mass, rows)))
+    made = jnp.asarray(mix) @ rows
+    weighed = jax.vmap(lambda row: product(system, mass, row))(made)
+    factor = jnp.linalg.cholesky(made @ weighed.T)
+    return jax.scipy.linalg.solve_triangular(factor, made, lower=True)
+
+
+def _combinations(system, mass: np.ndarray, rows: np.ndarray) -> Float[np.ndarray, "kept rows"]:
+    """Coefficients of the rows in each of the orthonormal ones that are kept."""
     kept: list[np.ndarray] = []
     heavy: list[np.ndarray] = []
-    for row in rows:
-        size = _norm(system, mass, row)
+    mixes: list[np.ndarray] = []
+    for row, mix in zip(rows, np.eye(len(rows)), strict=True):
+        size = np.sqrt(max(system.solver.product(mass, row) @ row, 0.0))
         if not size > 0:
             continue
-        row = row / size
+        row, mix = row / size, mix / size
         for _ in range(2):
-            for one, weighed in zip(kept, heavy, strict=True):
-                row = row - (weighed @ row) * one
-        left = _norm(system, mass, row)
+            for one, weighed, its in zip(kept, heavy, mixes, strict=True):
+                share = weighed @ row
+                row, mix = row - share * one, mix - share * its
+        weighed = system.solver.product(mass, row)
+        left = np.sqrt(max(weighed @ row, 0.0))
         if left > _NEW:
             kept.append(row / left)
-            heavy.append(np.asarray(sparse.product(system, mass, jnp.asarray(kept[-1]))))
-    return np.stack(kept)
-
-
-def _norm(system, mass, row: np.ndarray) -> float:
-    weighed = np.asarray(sparse.product(system, mass, jnp.asarray(row)))
-    return float(np.sqrt(max(weighed @ row, 0.0)))
+            heavy.append(weighed / left)
+            mixes.append(mix / left)
+    return np.stack(mixes)
 
 
 # A finite-element body in a few shapes, as a block with the ports of the full one
@@ -345,7 +350,7 @@ def _place(body: FemBody, basis: Basis, node: int) -> Array:
 
 def _coordinates(body: FemBody, basis: Basis, field) -> Modes:
     """Coordinates of a field of the nodes, nearest in the mass."""
-    weighed = sparse.product(body.problem.space.system, body.matter().mass, field.ravel())
+    weighed = product(body.problem.space.system, body.matter().mass, field.ravel())
     return basis.shapes.reshape(len(basis), -1) @ weighed
 
 
