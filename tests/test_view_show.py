@@ -636,7 +636,10 @@ def test_simulating_and_printing_load_no_drawing_library():
 
 def test_every_class_that_is_drawn_exists():
     """They are listed by name, so that a picture of a shape does not import the solvers."""
-    for path, (module, function) in sys.modules["sorojax.view.show"]._DRAWN_BY.items():
-        home, _, name = path.rpartition(".")
-        assert getattr(importlib.import_module(home), name).__module__ == home, path
-        assert callable(getattr(importlib.import_module(f"sorojax.view.{module}"), function))
+    tables = sys.modules["sorojax.view.show"]
+    for function, nouns in (tables._PICTURES | tables._SCENES).items():
+        module, _, name = f"sorojax.view.{function}".rpartition(".")
+        assert callable(getattr(importlib.import_module(module), name))
+        for noun in nouns.split():
+            home, _, name = f"sorojax.{noun}".rpartition(".")
+            assert getattr(importlib.import_module(home), name).__module__ == home, noun

@@ -3,6 +3,7 @@
 import inspect
 import re
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from jaxtyping import Float
 from sorojax import io
 from sorojax.mesh import Mesh
 from sorojax.view.draw.bodies import coloured
-from sorojax.view.draw.meshes import Body, show_cells
+from sorojax.view.draw.meshes import Body, mesh_scene
 from sorojax.view.draw.plots import show_signals
 from sorojax.view.draw.shapes import show_surface
 from sorojax.view.film.film import Film
@@ -77,10 +78,9 @@ def show_file(
         return panels(scenes, names, view=view, renderer=renderer, title=name)
     state = _state(path, field, scale)
     if state.values is None and np.allclose(state.moved, 0):
-        options: dict[str, Any] = {"view": view, "renderer": renderer}
-        return show_cells(state.mesh, title=title, **options)
-    scene = _scenes([state], wire)[0]
-    scene = Scene(scene.parts, scene.scale, name)
+        scene = mesh_scene(state.mesh, title=title)
+    else:
+        scene = replace(_scenes([state], wire)[0], title=name)
     return show_scene(scene, view=view, renderer=renderer)
 
 

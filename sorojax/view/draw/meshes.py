@@ -20,8 +20,7 @@ from sorojax.mesh.mesh import facet_table, valences
 from sorojax.mesh.quality import Quality, cell_ratios
 from sorojax.mesh.repair import Repaired
 from sorojax.view import style
-from sorojax.view.picture import Panel, Picture, show_scene
-from sorojax.view.raster.camera import View
+from sorojax.view.picture import Panel, Picture
 from sorojax.view.raster.plane import loops
 from sorojax.view.raster.scene import Dots, Lines, Part, Scale, Scene, Surface, robust_scale
 
@@ -182,34 +181,6 @@ def scaled_mode(base: np.ndarray, shape: np.ndarray, share: float):
 _PALE = 0.55  # how far the colours of regions are mixed with white
 
 
-def show_cells(
-    mesh: Mesh,
-    *,
-    by: str | None = None,
-    field: Float[Any, " values"] | None = None,
-    label: str = "",
-    limits: tuple[float, float] | None = None,
-    view: View = "iso",
-    renderer: str = "auto",
-    title: str = "",
-) -> Picture:
-    """The cells of a mesh; of a solid one those at its boundary.
-
-    Args:
-        mesh: What to draw.
-        by: "quality", "region", "facets" or "nodes" to colour what has a name; plain if
-            omitted.
-        field: One value per node or per cell, instead of `by`.
-        label: Name and unit of the field.
-        limits: Ends of the colour scale.
-        view: Camera of a solid mesh.
-        renderer: Of a solid mesh.
-        title: Title; the kind and number of cells if omitted.
-    """
-    scene = mesh_scene(mesh, by=by, field=field, label=label, limits=limits, title=title)
-    return show_scene(scene, view=view, renderer=renderer)
-
-
 def mesh_scene(
     mesh: Mesh,
     *,
@@ -219,7 +190,17 @@ def mesh_scene(
     limits: tuple[float, float] | None = None,
     title: str = "",
 ) -> Scene:
-    """As `show_cells`, before it is drawn."""
+    """The cells of a mesh; of a solid one those at its boundary.
+
+    Args:
+        mesh: What to draw.
+        by: "quality", "region", "facets" or "nodes" to colour what has a name; plain if
+            omitted.
+        field: One value per node or per cell, instead of `by`.
+        label: Name and unit of the field.
+        limits: Ends of the colour scale.
+        title: Title; the kind and number of cells if omitted.
+    """
     if by not in (None, "quality", "region", "facets", "nodes"):
         raise ValueError(
             f'view.show: got by={by!r}, need "quality", "region", "facets" or "nodes". Pass '
@@ -331,9 +312,9 @@ def _colour(k: int, pale: bool = False) -> str:
     return to_hex(tuple((1 - _PALE) * colour + _PALE if pale else colour))
 
 
-def show_repaired(repaired: Repaired, **options: Any) -> Picture:
+def repaired_scene(repaired: Repaired, **options: Any) -> Scene:
     """The mesh that was repaired; options of a mesh."""
-    return show_cells(repaired.mesh, **options)
+    return mesh_scene(repaired.mesh, **options)
 
 
 def show_quality(found: Quality, *, title: str = "") -> Picture:

@@ -24,8 +24,7 @@ from sorojax.view.draw.rod_loads import (
     thread_parts,
 )
 from sorojax.view.draw.shapes import shape_scene
-from sorojax.view.picture import Panel, Picture, show_scene
-from sorojax.view.raster.camera import View
+from sorojax.view.picture import Panel, Picture
 from sorojax.view.raster.glyphs import ball_triangles, tube
 from sorojax.view.raster.scene import Arrows, Dots, Lines, Part, Scene, Surface, short
 from sorojax.view.rigging.rig import Rig, pose as posed_rig
@@ -121,7 +120,7 @@ _SEE_THROUGH = 0.45
 Shapes = Mapping[str, AbstractSdf | Triangles]
 
 
-def show_rod(
+def rod_scene(
     model: Rod | Assembly,
     q: Float[Any, "*states coordinates"] | None = None,
     *,
@@ -129,10 +128,8 @@ def show_rod(
     section: AbstractSdf | None = None,
     shapes: Shapes | None = None,
     directors: bool = False,
-    view: View = "iso",
-    renderer: str = "auto",
     title: str = "",
-) -> Picture:
+) -> Scene:
     """A rod or an assembly of rods and links at coordinates `q`.
 
     Args:
@@ -145,33 +142,8 @@ def show_rod(
         shapes: Bodies of links by name, a solid shape or triangles in the frame of the
             link; without one a link is the ellipsoid of its inertia.
         directors: Draw the axes of some sections, x red, y green, z blue.
-        view: Camera of a spatial model.
-        renderer: Of a spatial model.
         title: Title of the figure.
     """
-    scene = rod_scene(
-        model,
-        q,
-        forces=forces,
-        section=section,
-        shapes=shapes,
-        directors=directors,
-        title=title,
-    )
-    return show_scene(scene, view=view, renderer=renderer)
-
-
-def rod_scene(
-    model: Rod | Assembly,
-    q: Float[Any, "*states coordinates"] | None = None,
-    *,
-    forces: Sequence[Any] = (),
-    section: AbstractSdf | None = None,
-    shapes: Shapes | None = None,
-    directors: bool = False,
-    title: str = "",
-) -> Scene:
-    """As `show_rod`, before it is drawn."""
     rest = R.rest(model)
     q = np.asarray(rest) if q is None else np.asarray(q)
     rows = np.atleast_2d(q)
@@ -296,33 +268,31 @@ def _mixed(share: float) -> str:
 _POSES = 5  # that are drawn of a path
 
 
-def show_body(body: Any, q: Any = None, **options: Any) -> Picture:
-    """The rod or assembly of a block with its forces, at its start; options of `show_rod`."""
+def body_scene(body: Any, q: Any = None, **options: Any) -> Scene:
+    """The rod or assembly of a block with its forces, at its start; options of a rod."""
     model = body.rod if hasattr(body, "rod") else body.assembly
     q = body.q if q is None else q
-    return show_rod(model, q, **({"forces": body.forces} | options))
+    return rod_scene(model, q, **({"forces": body.forces} | options))
 
 
-def show_model(model: Any, q: Any = None, **options: Any) -> Picture:
-    """The body of a model of a robot; options of `show_rod`. Its `network` is a diagram."""
-    return show_body(model.network.blocks["body"], q, **options)
+def model_scene(model: Any, q: Any = None, **options: Any) -> Scene:
+    """The body of a model of a robot; options of a rod. Its `network` is a diagram."""
+    return body_scene(model.network.blocks["body"], q, **options)
 
 
-def show_posed(
-    found: Any, *, model: Rod | Assembly, title: str = "", **options: Any
-) -> Picture:
+def posed_scene(found: Any, *, model: Rod | Assembly, title: str = "", **options: Any) -> Scene:
     """A rod or an assembly where a search ended: at rest under its forces, or at a target.
 
     Args:
         found: From `rod.equilibrium`, `rod.inverse_kinematics` or a path of them.
         model: What was searched.
         title: Title of the figure; how the search ended if omitted.
-        **options: As of `show_rod`.
+        **options: As of a rod.
     """
     q = np.asarray(found.q)
     if q.ndim == 2 and len(q) > _POSES:
         q = q[np.unique(np.round(np.linspace(0, len(q) - 1, _POSES)).astype(int))]
-    return show_rod(model, q, title=title or _outcome(found), **options)
+    return rod_scene(model, q, title=title or _outcome(found), **options)
 
 
 def _outcome(found: Any) -> str:
@@ -334,19 +304,14 @@ def _outcome(found: Any) -> str:
     return f"load factor to {float(factors[-1]):.4g}" if is_row else ""
 
 
-def show_rig(
-    rig: Rig,
-    q: Float[Any, " coordinates"] | None = None,
-    *,
-    view: View = "iso",
-    renderer: str = "auto",
-    title: str = "",
-) -> Picture:
+def rig_scene(
+    rig: Rig, q: Float[Any, " coordinates"] | None = None, *, title: str = ""
+) -> Scene:
     """The surface of a rig at coordinates `q`, at rest if omitted."""
     triangles = np.asarray(rig.triangles)
     surface = Surface(np.asarray(posed_rig(rig, q)), triangles)
     text = f"{len(triangles)} triangles on {type(rig.model).__name__.lower()}"
-    return show_scene(Scene((surface,), title=title or text), view=view, renderer=renderer)
+    return Scene((surface,), title=title or text)
 
 
 def show_section(section: Section, *, title: str = "") -> Picture:

@@ -133,23 +133,21 @@ def show_shape(
         resolution: Points along the longer side of a plane picture.
         title: Title of the figure.
     """
-    if shape.dim == 3 and slice is None:
-        return show_scene(shape_scene(shape, size, title), view=view, renderer=renderer)
-    if shape.dim == 3:
-        assert slice is not None
+    if shape.dim == 2 and not filled:
+        return _show_plane(shape, resolution, title)
+    if shape.dim == 3 and slice is not None:
         return _show_slice(shape, slice, resolution, title)
-    if filled:
-        return show_scene(shape_scene(shape, size, title))
-    return _show_plane(shape, resolution, title)
+    return show_scene(shape_scene(shape, size, title), view=view, renderer=renderer)
 
 
 def shape_scene(shape: AbstractSdf, size: float | None = None, title: str = "") -> Scene:
     """The surface of a solid shape, or a plane shape filled."""
     lower, upper = finite_box("view.show", shape, shape.dim)
     longest = float(np.max(upper - lower))
-    if shape.dim == 2:
-        return Scene((_filled(shape, longest / 300 if size is None else size),), title=title)
-    return Scene((shape_surface(shape, longest / 72 if size is None else size),), title=title)
+    if size is None:
+        size = longest / (300 if shape.dim == 2 else 72)
+    part = _filled(shape, size) if shape.dim == 2 else shape_surface(shape, size)
+    return Scene((part,), title=title)
 
 
 def shape_surface(shape: AbstractSdf, size: float, **look: Any) -> Surface:
@@ -246,23 +244,14 @@ def show_part(part: Any, **options: Any) -> Picture:
     return show_shape(part.shape, **options)
 
 
-def show_moving(
-    surface: "MovingSurface",
-    *,
-    frame: int = -1,
-    view: View = "iso",
-    renderer: str = "auto",
-    title: str = "",
-) -> Picture:
+def moving_scene(surface: "MovingSurface", *, frame: int = -1, title: str = "") -> Scene:
     """A moving surface in one of its frames, the last one if omitted."""
     points = np.asarray(surface.points)
     points = points[frame if len(points) > 1 else 0]
     if surface.poses is not None:
         pose = np.asarray(surface.poses)[frame]
         points = points @ pose[:3, :3].T + pose[:3, 3]
-    part = Surface(points, np.asarray(surface.triangles))
-    scene = Scene((part,), title=title or surface.name)
-    return show_scene(scene, view=view, renderer=renderer)
+    return Scene((Surface(points, np.asarray(surface.triangles)),), title=title or surface.name)
 
 
 def show_curve(curve: Curve, *, title: str = "") -> Picture:
