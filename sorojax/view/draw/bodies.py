@@ -23,7 +23,7 @@ from sorojax.mesh import cell_areas, cell_volumes
 from sorojax.view import style
 from sorojax.view.draw.loads import load_parts, support_parts, wall_parts
 from sorojax.view.draw.meshes import Body
-from sorojax.view.picture import Picture, panels
+from sorojax.view.picture import Picture, panels, spread
 from sorojax.view.raster.camera import View
 from sorojax.view.raster.scene import (
     Coloured,
@@ -296,7 +296,7 @@ def chosen_states(where: str, count: int, states: Sequence[int] | None) -> list[
     if not count:
         raise ValueError(f"{where}: the path has no state. Look at its status.")
     if states is None:
-        return np.unique(np.round(np.linspace(0, count - 1, 7)).astype(int))[-6:].tolist()
+        return spread(count, 7)[-6:]
     wrong = [k for k in states if not -count <= k < count]
     if wrong or not states:
         raise ValueError(

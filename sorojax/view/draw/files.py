@@ -17,7 +17,7 @@ from sorojax.view.draw.meshes import Body, mesh_scene
 from sorojax.view.draw.plots import show_signals
 from sorojax.view.draw.shapes import show_surface
 from sorojax.view.film.film import Film
-from sorojax.view.picture import Picture, panels, show_scene
+from sorojax.view.picture import Picture, panels, show_scene, spread
 from sorojax.view.raster.camera import View
 from sorojax.view.raster.scene import (
     Coloured,
@@ -72,7 +72,7 @@ def show_file(
     scale = 1.0 if unit is None else unit
     if kind == ".pvd":
         states = [_state(file, field, scale) for file in _series(path)]
-        chosen = np.unique(np.round(np.linspace(0, len(states) - 1, 6)).astype(int))
+        chosen = spread(len(states), 6)
         scenes = joint_extent(_scenes([states[k] for k in chosen], wire))
         names = [f"state {k}" for k in chosen]
         return panels(scenes, names, view=view, renderer=renderer, title=name)

@@ -20,7 +20,7 @@ from sorojax.mesh.mesh import facet_table, valences
 from sorojax.mesh.quality import Quality, cell_ratios
 from sorojax.mesh.repair import Repaired
 from sorojax.view import style
-from sorojax.view.picture import Panel, Picture
+from sorojax.view.picture import Picture, plotted
 from sorojax.view.raster.plane import loops
 from sorojax.view.raster.scene import Dots, Lines, Part, Scale, Scene, Surface, robust_scale
 
@@ -247,15 +247,8 @@ def _regions(mesh: Mesh, seen: Shell, points: np.ndarray) -> list[Part]:
         left &= ~mine
         at = mine[seen.cells]
         if at.any():
-            parts.append(
-                Surface(
-                    points,
-                    seen.triangles[at],
-                    _colour(k, pale=True),
-                    wire=seen.wire[at],
-                    name=name,
-                )
-            )
+            colour, wire = _colour(k, pale=True), seen.wire[at]
+            parts.append(Surface(points, seen.triangles[at], colour, wire=wire, name=name))
     rest = left[seen.cells]
     if rest.any() or not parts:
         parts.insert(0, Surface(points, seen.triangles[rest], style.BODY, wire=seen.wire[rest]))
@@ -287,15 +280,9 @@ def _lifted(points: np.ndarray, triangles: np.ndarray, wire, colour: str, name: 
 
     normals = corner_normals(points, triangles)
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
-    corners = points[triangles] + 1.5e-3 * size * normals
-    count = len(triangles)
-    return Surface(
-        corners.reshape(-1, 3),
-        np.arange(3 * count).reshape(-1, 3),
-        colour,
-        wire=wire,
-        name=name,
-    )
+    corners = (points[triangles] + 1.5e-3 * size * normals).reshape(-1, 3)
+    loose = np.arange(len(corners)).reshape(-1, 3)
+    return Surface(corners, loose, colour, wire=wire, name=name)
 
 
 def _keys(facets: np.ndarray) -> np.ndarray:
@@ -323,18 +310,12 @@ def show_quality(found: Quality, *, title: str = "") -> Picture:
     axes = figure.add_subplot()
     counts = np.asarray(found.histogram, float)
     edges = np.linspace(0, 1, len(counts) + 1)
-    axes.bar(
-        edges[:-1],
-        counts,
-        np.diff(edges),
-        align="edge",
-        color=style.COLOURS[0],
-        edgecolor="white",
-    )
+    look = {"color": style.COLOURS[0], "edgecolor": "white"}
+    axes.bar(edges[:-1], counts, np.diff(edges), align="edge", **look)
     axes.axvline(found.mean_radius_ratio, color=style.COLOURS[1], lw=1.6, label="mean")
     low, high = np.rad2deg(found.min_angle), np.rad2deg(found.max_angle)
     text = f"{found.num_cells} cells, angles {low:.1f} to {high:.1f} deg"
     style.dress(axes, "radius ratio [-]", "cells", title or text)
     axes.set_xlim(0, 1)
     style.legend(axes, loc="upper left")
-    return Picture(figure, (Panel(axes),))
+    return plotted(figure, [axes])

@@ -18,7 +18,7 @@ from sorojax.sdf import AbstractSdf, contour
 from sorojax.sdf.sampling import finite_box
 from sorojax.view import style
 from sorojax.view.draw.shapes import obstacle_part
-from sorojax.view.raster.glyphs import line_tube
+from sorojax.view.raster.glyphs import circle, line_tube
 from sorojax.view.raster.scene import Arrows, Lines, Part, Surface, short
 
 _LENGTH = 0.25  # of the body, that of the longest arrow
@@ -261,7 +261,7 @@ def _from_constants(area, about_y, about_z, torsion) -> tuple[Outlines, Outlines
         high, wide = np.sqrt(12 * about_z / area), np.sqrt(12 * about_y / area)
         square = _square() / 2
         return square[None] * np.stack([high, wide], axis=1)[:, None], None
-    ring = _ring()
+    ring = circle(_CORNERS)
     if kind == "tube":
         mean, half = 2 * about_z / area, area / (2 * math.pi)
         outer = ring[None] * np.sqrt(mean + half)[:, None, None]
@@ -287,11 +287,6 @@ def _kind(area: float, about_y: float, about_z: float, torsion: float) -> str:
     return "squircle" if about_z / area**2 < 1 / 12 else "other"
 
 
-def _ring(count: int = _CORNERS) -> np.ndarray:
-    angle = 2 * np.pi * np.arange(count) / count
-    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
-
-
 def _square(count: int = _CORNERS) -> np.ndarray:
     """The square of side 2, its corners among the points."""
     at = np.linspace(-1, 1, count // 4, endpoint=False)
@@ -301,7 +296,7 @@ def _square(count: int = _CORNERS) -> np.ndarray:
 
 
 def _superellipse(power: float) -> np.ndarray:
-    ring = _ring()
+    ring = circle(_CORNERS)
     return np.sign(ring) * np.abs(ring) ** (2 / power)  # dense where it is round
 
 

@@ -24,7 +24,7 @@ from sorojax.view.draw.rod_loads import (
     thread_parts,
 )
 from sorojax.view.draw.shapes import shape_scene
-from sorojax.view.picture import Panel, Picture
+from sorojax.view.picture import Picture, plotted, spread
 from sorojax.view.raster.glyphs import ball_triangles, tube
 from sorojax.view.raster.scene import Arrows, Dots, Lines, Part, Scene, Surface, short
 from sorojax.view.rigging.rig import Rig, pose as posed_rig
@@ -291,7 +291,7 @@ def posed_scene(found: Any, *, model: Rod | Assembly, title: str = "", **options
     """
     q = np.asarray(found.q)
     if q.ndim == 2 and len(q) > _POSES:
-        q = q[np.unique(np.round(np.linspace(0, len(q) - 1, _POSES)).astype(int))]
+        q = q[spread(len(q), _POSES)]
     return rod_scene(model, q, title=title or _outcome(found), **options)
 
 
@@ -336,5 +336,4 @@ def show_section(section: Section, *, title: str = "") -> Picture:
         for name, (value, factor, unit) in facts.items()
     )
     axes.set_title(text, fontsize=style.SMALL - 1, color=style.INK)
-    style.title(figure, title)
-    return Picture(figure, (Panel(axes),))
+    return plotted(figure, [axes], title)

@@ -8,7 +8,7 @@ from sorojax.sdf import AbstractSdf, Surface as Triangles, contour, isosurface
 from sorojax.sdf.sampling import finite_box, values
 from sorojax.sdf.surface.marching import Curve
 from sorojax.view import style
-from sorojax.view.picture import Panel, Picture, show_scene
+from sorojax.view.picture import Picture, plotted, show_scene
 from sorojax.view.raster.camera import View
 from sorojax.view.raster.scene import Lines, Part, Scene, Surface
 
@@ -30,11 +30,11 @@ def _show_plane(shape: AbstractSdf, resolution: int, title: str) -> Picture:
     ranges = zip(lower - margin, upper + margin + step, strict=True)
     x, y = np.meshgrid(*(np.arange(low, high, step) for low, high in ranges))
     f = values(shape, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
-    figure, axes = _contours(x, y, f, lower - margin, upper + margin, title)
+    figure, axes = _contours(x, y, f, lower - margin, upper + margin)
     for run in _runs(shape, step):
         axes.plot(*(1e3 * run).T, color=style.INK, lw=1.5, solid_joinstyle="miter")
     style.dress_plane(axes, 1e3 * lower, 1e3 * upper)
-    return Picture(figure, (Panel(axes),))
+    return plotted(figure, [axes], title)
 
 
 def _show_slice(
@@ -59,12 +59,11 @@ def _show_slice(
     points = np.full((x.size, 3), float(place))
     points[:, rest[0]], points[:, rest[1]] = x.ravel(), y.ravel()
     f = values(shape, points).reshape(x.shape)
-    title = title or f"{name} = {1e3 * float(place):g} mm"
-    figure, axes = _contours(x, y, f, low, high, title)
+    figure, axes = _contours(x, y, f, low, high)
     if f.min() < 0 < f.max():
         axes.contour(1e3 * x, 1e3 * y, f, levels=[0.0], colors=style.INK, linewidths=1.5)
     style.dress_plane(axes, 1e3 * low, 1e3 * high, *(f"{'xyz'[k]} [mm]" for k in rest))
-    return Picture(figure, (Panel(axes),))
+    return plotted(figure, [axes], title or f"{name} = {1e3 * float(place):g} mm")
 
 
 def _runs(shape: AbstractSdf, size: float) -> list[np.ndarray]:
@@ -75,24 +74,15 @@ def _runs(shape: AbstractSdf, size: float) -> list[np.ndarray]:
     ]
 
 
-def _contours(x, y, f, lower, upper, title: str) -> "tuple[Figure, Axes]":
+def _contours(x, y, f, lower, upper) -> "tuple[Figure, Axes]":
     """Filled contours of a distance over a grid [m], in a figure for the box around it."""
     figure = style.new_figure(9.0, style.height_for(9.0, lower, upper))
     axes = figure.add_subplot()
     norm, levels = _two_sided(1e3 * float(f.min()), 1e3 * float(f.max()))
     filled = axes.contourf(1e3 * x, 1e3 * y, 1e3 * f, levels=levels, cmap="RdBu_r", norm=norm)
-    style.colour_bar(
-        figure,
-        filled,
-        axes,
-        "signed distance [mm]",
-        format="%g",
-        shrink=0.9,
-        pad=0.02,
-        ticks=levels[::2] if len(levels) > 12 else levels,
-        spacing="uniform",
-    )
-    style.title(figure, title)
+    ticks = levels[::2] if len(levels) > 12 else levels
+    look = {"format": "%g", "shrink": 0.9, "pad": 0.02, "spacing": "uniform", "ticks": ticks}
+    style.colour_bar(figure, filled, axes, "signed distance [mm]", **look)
     return figure, axes
 
 
@@ -262,15 +252,9 @@ def show_curve(curve: Curve, *, title: str = "") -> Picture:
     axes = figure.add_subplot()
     line = np.concatenate([points, points[:1]]) if curve.closed else points
     axes.plot(*(1e3 * line).T, color=style.COLOURS[0], lw=1.6, marker=".", ms=3)
-    axes.plot(
-        *(1e3 * points[np.asarray(curve.corner)]).T,
-        "o",
-        color=style.COLOURS[1],
-        ms=6,
-        label="corners",
-    )
+    corners = 1e3 * points[np.asarray(curve.corner)]
+    axes.plot(*corners.T, "o", color=style.COLOURS[1], ms=6, label="corners")
     style.dress_plane(axes, lower, upper)
     if np.any(curve.corner):
         style.legend(axes, loc="best")
-    style.title(figure, title or f"{len(points)} points")
-    return Picture(figure, (Panel(axes),))
+    return plotted(figure, [axes], title or f"{len(points)} points")

@@ -8,6 +8,12 @@ from jaxtyping import Float, Int
 Mesh = tuple[Float[np.ndarray, "points 3"], Int[np.ndarray, "triangles 3"]]
 
 
+def circle(corners: int) -> Float[np.ndarray, "corners 2"]:
+    """Corners on the circle of radius 1, counter-clockwise."""
+    angle = 2 * np.pi * np.arange(corners) / corners
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
 def tube(
     centres: Float[np.ndarray, "stations 3"],
     across: Float[np.ndarray, "stations 2 3"],
@@ -65,9 +71,8 @@ def line_tube(line: Float[np.ndarray, "points 3"], radius: float, corners: int =
     slope = np.gradient(line, axis=0)
     slope /= np.maximum(np.linalg.norm(slope, axis=1), 1e-300)[:, None]
     across = _carried(slope)
-    angle = 2 * np.pi * np.arange(corners) / corners
-    ring = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return tube(line, across, np.broadcast_to(ring, (len(line), corners, 2)))
+    rings = np.broadcast_to(radius * circle(corners), (len(line), corners, 2))
+    return tube(line, across, rings)
 
 
 def _carried(slope: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 3"]:
@@ -111,12 +116,10 @@ def arrow_triangles(
 @functools.cache
 def _arrow(corners: int = 12) -> Mesh:
     """Along x: 0 to 1 the shaft of radius 1, 1 to 2 the head."""
-    angle = 2 * np.pi * np.arange(corners) / corners
-    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     places = ((0.0, 0.0), (0.0, 1.0), (1.0, 1.0), (1.0, 2.4), (2.0, 0.0))
     centres = np.array([[x, 0.0, 0.0] for x, _ in places])
     across = np.broadcast_to(np.eye(3)[1:], (len(places), 2, 3))
-    outlines = np.stack([r * ring for _, r in places])
+    outlines = np.stack([radius * circle(corners) for _, radius in places])
     return tube(centres, across, outlines, closed=False)
 
 
@@ -132,10 +135,8 @@ def ball_triangles(
 
 @functools.cache
 def _ball(rings: int, corners: int) -> Mesh:
-    angle = 2 * np.pi * np.arange(corners) / corners
-    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     polar = np.linspace(0, np.pi, rings + 1)
     centres = np.stack([-np.cos(polar), 0 * polar, 0 * polar], axis=1)
     across = np.broadcast_to(np.eye(3)[1:], (rings + 1, 2, 3))
-    outlines = np.sin(polar)[:, None, None] * ring[None]
+    outlines = np.sin(polar)[:, None, None] * circle(corners)
     return tube(centres, across, outlines, closed=False)
