@@ -5,6 +5,7 @@ Figures are made without pyplot, so they need no display and may be drawn in thr
 
 import io
 from collections.abc import Iterable, Sequence
+from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -125,6 +126,12 @@ def shades(count: int) -> Sequence[Any]:
     from matplotlib import colormaps
 
     return [colormaps[FIELD](v) for v in np.linspace(0.0, 0.88, max(count, 1))]
+
+
+def asset(*names: str) -> str:
+    """Text of files in the folder `assets`, one after the other."""
+    folder = resources.files("sorojax.view") / "assets"
+    return "".join((folder / name).read_text(encoding="utf-8") for name in names)
 
 
 def png(figure: "Figure") -> bytes:

@@ -8,7 +8,6 @@ import re
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -229,19 +228,14 @@ def _ends(points: Float[np.ndarray, "frames points 3"]) -> tuple[np.ndarray, np.
 
 def filled(meta: dict[str, Any], packer: Packer) -> str:
     """The page with its data."""
-    assets = resources.files("sorojax.view") / "assets"
-
-    def read(*names: str) -> str:
-        return "".join((assets / name).read_text(encoding="utf-8") for name in names)
-
     parts = {
         "title": html.escape(meta["title"]),
-        "style": read("viewer.css"),
+        "style": style.asset("viewer.css"),
         "meta": json.dumps(meta, separators=(",", ":")).replace("<", "\\u003c"),
         "data": packer.text(),
-        "script": read("viewer.js", "camera.js", "player.js"),
+        "script": style.asset("viewer.js", "camera.js", "player.js"),
     }
-    return re.sub(r"\{(\w+)\}", lambda found: parts[found[1]], read("viewer.html"))
+    return re.sub(r"\{(\w+)\}", lambda found: parts[found[1]], style.asset("viewer.html"))
 
 
 def colours_of_map(count: int = 64) -> list[list[int]]:
