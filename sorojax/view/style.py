@@ -20,6 +20,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 INK, GREY, LIGHT = "#1f2430", "#8a8f98", "#d9dce1"
 REFERENCE = "#1f2430"
 FIELD, SIGNED = "viridis", "coolwarm"
+AXES = ("#c0392b", "#1e8449", "#1f5fa8")
 #: Bodies, what acts on them, what holds them, what they rest on.
 BODY, LOAD, HOLD, OBSTACLE = "#c9d3df", "#D55E00", "#1f2430", "#b9a888"
 
@@ -132,6 +133,13 @@ def asset(*names: str) -> str:
     """Text of files in the folder `assets`, one after the other."""
     folder = resources.files("sorojax.view") / "assets"
     return "".join((folder / name).read_text(encoding="utf-8") for name in names)
+
+
+def pale(colour: str, share: float) -> str:
+    """A colour with `share` of white."""
+    from matplotlib.colors import to_hex, to_rgb
+
+    return to_hex(tuple((1 - share) * np.array(to_rgb(colour)) + share))
 
 
 def png(figure: "Figure") -> bytes:

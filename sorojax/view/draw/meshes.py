@@ -247,7 +247,7 @@ def _regions(mesh: Mesh, seen: Shell, points: np.ndarray) -> list[Part]:
         left &= ~mine
         at = mine[seen.cells]
         if at.any():
-            colour, wire = _colour(k, pale=True), seen.wire[at]
+            colour, wire = style.pale(_colour(k), _PALE), seen.wire[at]
             parts.append(Surface(points, seen.triangles[at], colour, wire=wire, name=name))
     rest = left[seen.cells]
     if rest.any() or not parts:
@@ -292,11 +292,8 @@ def _keys(facets: np.ndarray) -> np.ndarray:
     return (least[:, 0] * size + least[:, 1]) * size + least[:, min(2, least.shape[1] - 1)]
 
 
-def _colour(k: int, pale: bool = False) -> str:
-    from matplotlib.colors import to_hex, to_rgb
-
-    colour = np.array(to_rgb(style.COLOURS[k % len(style.COLOURS)]))
-    return to_hex(tuple((1 - _PALE) * colour + _PALE if pale else colour))
+def _colour(k: int) -> str:
+    return style.COLOURS[k % len(style.COLOURS)]
 
 
 def repaired_scene(repaired: Repaired, **options: Any) -> Scene:

@@ -11,15 +11,15 @@ import numpy as np
 from jaxtyping import Float
 
 from sorojax import rod as R
-from sorojax.math.quadrature import interpolation_rows
 from sorojax.rod import Assembly, Rod, Section
 from sorojax.rod.forces.tendons import Thread, ThreadChambers
 from sorojax.sdf import AbstractSdf, contour
 from sorojax.sdf.sampling import finite_box
 from sorojax.view import style
 from sorojax.view.draw.shapes import obstacle_part
-from sorojax.view.raster.glyphs import circle, line_tube
+from sorojax.view.raster.glyphs import area_of, circle, line_tube
 from sorojax.view.raster.scene import Arrows, Lines, Part, Surface, short
+from sorojax.view.rigging.rig import constant_along
 
 _LENGTH = 0.25  # of the body, that of the longest arrow
 
@@ -215,6 +215,7 @@ def _normal_force(touch, law):
 # Outlines of cross-sections, found again from the constants that a rod keeps of them
 
 
+_CONSTANTS = ("area", "second_moment_y", "second_moment_z", "torsion_constant")
 _CORNERS = 48
 _CLOSE = 2e-3
 
@@ -230,28 +231,16 @@ def outlines_of(
     and torsion constant; any other section is drawn as the ellipse of its second moments,
     unless its `shape` is given, whose hole is drawn if it has just one.
     """
-    section = rod.section
-    count = len(s)
     if shape is not None:
-        return _drawn(shape, count)
-    names = ("area", "second_moment_y", "second_moment_z", "torsion_constant")
-    area, about_y, about_z, torsion = (_along(rod, getattr(section, name), s) for name in names)
-    return _from_constants(area, about_y, about_z, torsion)
+        return _drawn(shape, len(s))
+    return _from_constants(*(constant_along(rod, name, s) for name in _CONSTANTS))
 
 
 def section_outline(section: Section) -> tuple[np.ndarray, np.ndarray | None]:
     """Outline and hole of a section; of the middle node if it varies."""
-    names = ("area", "second_moment_y", "second_moment_z", "torsion_constant")
-    rows = (np.atleast_1d(np.asarray(getattr(section, name), float)) for name in names)
+    rows = (np.atleast_1d(np.asarray(getattr(section, name), float)) for name in _CONSTANTS)
     outer, hole = _from_constants(*(row[[len(row) // 2]] for row in rows))
     return outer[0], None if hole is None else hole[0]
-
-
-def _along(rod: Rod, value, s: np.ndarray) -> np.ndarray:
-    value = np.asarray(value, float)
-    if value.ndim == 0:
-        return np.full(len(s), float(value))
-    return np.asarray(interpolation_rows(rod.quadrature, s)) @ value
 
 
 def _from_constants(area, about_y, about_z, torsion) -> tuple[Outlines, Outlines | None]:
@@ -269,7 +258,7 @@ def _from_constants(area, about_y, about_z, torsion) -> tuple[Outlines, Outlines
     if kind == "squircle":
         power = _power(float(np.median(about_z / area**2)))
         shape = _superellipse(power)
-        size = np.sqrt(area / _shoelace(shape))
+        size = np.sqrt(area / area_of(shape))
         return shape[None] * size[:, None, None], None
     return ring[None] * np.stack([y, z], axis=1)[:, None], None
 
@@ -317,21 +306,16 @@ def _power(ratio: float) -> float:
     return (low + high) / 2
 
 
-def _shoelace(ring: np.ndarray) -> float:
-    y, z = ring.T
-    return 0.5 * float(np.sum(y * np.roll(z, -1) - np.roll(y, -1) * z))
-
-
 def _drawn(shape: AbstractSdf, count: int) -> tuple[Outlines, Outlines | None]:
     lower, upper = finite_box("view.show", shape, 2)
     curves = [c.points for c in contour(shape, float(np.max(upper - lower)) / 60) if c.closed]
-    curves = sorted(curves, key=lambda ring: -abs(_shoelace(ring)))
-    outer = curves[0] if _shoelace(curves[0]) > 0 else curves[0][::-1]
+    curves = sorted(curves, key=lambda ring: -abs(area_of(ring)))
+    outer = curves[0] if area_of(curves[0]) > 0 else curves[0][::-1]
     if len(curves) != 2:
         return np.broadcast_to(outer, (count, *outer.shape)), None
     corners = max(len(outer), len(curves[1]))
     outer, hole = _even(outer, corners), _even(curves[1], corners)
-    hole = hole if _shoelace(hole) > 0 else hole[::-1]
+    hole = hole if area_of(hole) > 0 else hole[::-1]
     turn = np.argmin(np.linalg.norm(hole - outer[0], axis=1))
     hole = np.roll(hole, -turn, axis=0)
     size = (count, *outer.shape)

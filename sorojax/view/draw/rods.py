@@ -25,9 +25,9 @@ from sorojax.view.draw.rod_loads import (
 )
 from sorojax.view.draw.shapes import shape_scene
 from sorojax.view.picture import Picture, plotted, spread
-from sorojax.view.raster.glyphs import ball_triangles, tube
+from sorojax.view.raster.glyphs import circle, tube
 from sorojax.view.raster.scene import Arrows, Dots, Lines, Part, Scene, Surface, short
-from sorojax.view.rigging.rig import Rig, pose as posed_rig
+from sorojax.view.rigging.rig import Rig, ellipsoid, pose as posed_rig
 
 _ALONG = 9  # arrows of a force per length
 _LENGTH, _RADIUS = 0.2, 0.07  # of the body: the longest arrow, an arc
@@ -155,7 +155,7 @@ def rod_scene(
     parts: list[Part] = []
     for k, row in enumerate(rows):
         last = k == len(rows) - 1
-        shade = None if last else 0.75 - 0.5 * k / len(rows)
+        shade = 0.0 if last else 0.75 - 0.5 * k / len(rows)
         parts += _state(
             model, row, forces if last else (), section, shapes, directors and last, shade
         )
@@ -174,7 +174,7 @@ def _state(model, q, forces, section, shapes, directors: bool, shade) -> list[Pa
     found = acting(model, forces)
     inside = any(found.threads.values())
     opacity = _SEE_THROUGH if inside or directors else 1.0
-    colour = style.BODY if shade is None else _mixed(shade)
+    colour = style.pale(style.BODY, shade)
     parts: list[Part] = []
     for name, body in bodies.items():
         pose = np.asarray(where[name])
@@ -228,38 +228,24 @@ def _link(name: str, body, pose: np.ndarray, shapes: Shapes | None, colour: str)
         points = surface.points if surface is not None else shape.vertices  # type: ignore
         triangles = surface.triangles if surface is not None else shape.triangles  # type: ignore
         return [Surface(np.asarray(points) @ turn.T + place, triangles, colour)]
-    centre = np.zeros(dim) if body.center is None else np.asarray(body.center)
-    mass, inertia = float(body.mass), np.asarray(body.inertia)
-    middle = turn @ centre + place
     if dim == 2:
-        radius = np.sqrt(2 * float(inertia) / mass)  # of a disc
-        angle = np.linspace(0, 2 * np.pi, 61)
-        ring = middle + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        centre = np.zeros(2) if body.center is None else np.asarray(body.center)
+        radius = np.sqrt(2 * float(body.inertia) / float(body.mass))  # of a disc
+        ring = turn @ centre + place + radius * circle(60)[[*range(60), 0]]
         fan = np.stack([np.arange(1, 59), np.arange(2, 60), np.zeros(58, int)], axis=1)
         return [Surface(ring, fan, colour), Lines([ring], style.INK, 0.9), Dots(place[None])]
-    moments, axes = (inertia, np.eye(3)) if inertia.ndim == 1 else np.linalg.eigh(inertia)
-    moments = np.broadcast_to(moments, 3)
-    square = 2.5 / mass * (moments.sum() - 2 * moments)
-    half = np.sqrt(np.maximum(square, 0.04 * square.max()))
-    points, triangles = ball_triangles(np.zeros((1, 3)), 1.0, corners=36)
-    return [Surface((points * half) @ axes.T @ turn.T + middle, triangles, colour)]
+    points, triangles = ellipsoid(body, 36, thinnest=0.2)
+    return [Surface(points @ turn.T + place, triangles, colour)]
 
 
 def director_parts(poses: Float[np.ndarray, "sections h h"], length: float) -> list[Part]:
     """The axes of some sections, `length` [m] long."""
     dim = poses.shape[1] - 1
     starts = poses[:, :dim, dim]
-    colours = ("#c0392b", "#1e8449", "#1f5fa8")
     return [
-        Arrows(starts, length * poses[:, :dim, k], colours[k], name=f"director {'xyz'[k]}")
+        Arrows(starts, length * poses[:, :dim, k], style.AXES[k], name=f"director {'xyz'[k]}")
         for k in range(dim)
     ]
-
-
-def _mixed(share: float) -> str:
-    from matplotlib.colors import to_hex, to_rgb
-
-    return to_hex(tuple((1 - share) * np.array(to_rgb(style.BODY)) + share))
 
 
 # Bodies of networks and robots, where a search ended, rigs, sections

@@ -158,8 +158,7 @@ def annotate(figure: "Figure", axes: "Axes", scene: Scene, lens: Lens) -> None:
     order = np.argsort(lens.camera.axes[2])
     for k in order:
         step = np.array([right[k], -up[k]]) * unit
-        colour = ("#c0392b", "#1e8449", "#1f5fa8")[k]
-        tip = corner + step
+        colour, tip = style.AXES[k], corner + step
         axes.plot(*np.stack([corner, tip]).T, color=colour, lw=1.4, solid_capstyle="round")
         style.write(axes, *(corner + 1.35 * step), "xyz"[k], color=colour)
     length = _round_length(0.22 * width / lens.scale)
