@@ -202,10 +202,10 @@ def _tube(rod: Rod, outline: Outline | None, around: int, stations: int):
     if outline is None:
         rings = section_axes(rod, s)[:, None] * circle(around)
     else:
-        outline = np.asarray(outline, float)
-        _check.shape("rig", "outline", outline, (None, 2), "Give (y, z) around it in metres.")
-        outline = outline if area_of(outline) >= 0 else outline[::-1]
-        rings = np.broadcast_to(outline, (stations, *outline.shape))
+        ring = np.asarray(outline, float)
+        _check.shape("rig", "outline", ring, (None, 2), "Give (y, z) around it in metres.")
+        ring = ring if area_of(ring) >= 0 else ring[::-1]
+        rings = np.broadcast_to(ring, (stations, *ring.shape))
     middles = rings.mean(axis=1)
     across = np.broadcast_to(np.eye(3)[1:], (stations, 2, 3))
     centres = np.column_stack([s, middles])
