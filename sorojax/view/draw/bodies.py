@@ -21,7 +21,7 @@ from sorojax.fem.stability.continuation import CriticalPoint
 from sorojax.fem.stability.modal import Modes
 from sorojax.mesh import cell_areas, cell_volumes
 from sorojax.view import style
-from sorojax.view.draw.loads import load_parts, support_parts, wall_parts
+from sorojax.view.draw.loads import load_parts, support_parts, unit_of, wall_parts
 from sorojax.view.draw.meshes import Body
 from sorojax.view.picture import Picture, panels, spread
 from sorojax.view.raster.camera import View
@@ -112,10 +112,6 @@ def evaluate(
 # Deformed bodies: equilibria, load paths, motions and vibration modes
 
 
-_UNITS = {
-    fem.Pressure: "Pa", fem.Traction: "Pa", fem.Force: "N", fem.Tendon: "N", fem.Cable: "m",
-    fem.Gravity: "m/s$^2$", fem.Contact: "m", fem.Torque: "N m", fem.Spring: "m",
-}  # fmt: skip
 _CLEAR = 0.4  # opacity of a body whose walls under pressure are seen through it
 
 
@@ -323,7 +319,7 @@ def state_name(path: Any, k: int) -> str:
     if name is None:
         return f"load factor {float(value):.3g}"
     load = next(load for load in path.problem.loads if load.name == name)
-    unit = next((u for kind, u in _UNITS.items() if isinstance(load, kind)), "")
+    unit = unit_of(load)
     if value.ndim:
         return f"|{name}| = {short(float(np.linalg.norm(value)), unit)}"
     if isinstance(load, fem.Pressure):

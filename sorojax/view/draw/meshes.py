@@ -307,7 +307,7 @@ def show_quality(found: Quality, *, title: str = "") -> Picture:
     axes = figure.add_subplot()
     counts = np.asarray(found.histogram, float)
     edges = np.linspace(0, 1, len(counts) + 1)
-    look = {"color": style.COLOURS[0], "edgecolor": "white"}
+    look: dict[str, Any] = {"color": style.COLOURS[0], "edgecolor": "white"}
     axes.bar(edges[:-1], counts, np.diff(edges), align="edge", **look)
     axes.axvline(found.mean_radius_ratio, color=style.COLOURS[1], lw=1.6, label="mean")
     low, high = np.rad2deg(found.min_angle), np.rad2deg(found.max_angle)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import brentq
 
 from sorojax import rod as R
 from sorojax.rod import Assembly, Rod, Section
@@ -48,9 +49,7 @@ def acting(model: Rod | Assembly, forces: Sequence[Any]) -> Acting:
     threads: dict[str, list[Drawn]] = {}
     contacts, pairs = [], []
     for force in forces:
-        part, inner = (
-            (force.part, force.force) if isinstance(force, R.PartForce) else ("", force)
-        )
+        part, inner = part_and_force(force)
         if isinstance(inner, R.PairForce):
             pairs.append(inner)
         elif isinstance(inner, R.AbstractContact):
@@ -62,18 +61,17 @@ def acting(model: Rod | Assembly, forces: Sequence[Any]) -> Acting:
     return Acting(threads, contacts, pairs)
 
 
+def part_and_force(force: Any) -> tuple[str, Any]:
+    """The name of the part that a force acts on, "" where it names none, and the force."""
+    return (force.part, force.force) if isinstance(force, R.PartForce) else ("", force)
+
+
 def _threads(body: Rod, force: Any) -> list[Drawn]:
     if isinstance(force, R.Tendons):
-        tension = None if callable(force.tension) else np.asarray(force.tension)
-        return [
-            _routed(
-                route,
-                style.COLOURS[3],
-                None,
-                "tendon" if tension is None else f"tendon: {short(float(tension[k]), 'N')}",
-            )
-            for k, route in enumerate(force.routes)
-        ]
+        names = ["tendon"] * len(force.routes)
+        if not callable(force.tension):
+            names = [f"tendon: {short(float(pull), 'N')}" for pull in force.tension]
+        return [_tendon(route, name) for route, name in zip(force.routes, names, strict=True)]
     chamber, pressure = force, None
     if isinstance(force, R.Pressurised):
         chamber, pressure = force.chamber, np.atleast_1d(np.asarray(force.pressure))
@@ -87,10 +85,9 @@ def _threads(body: Rod, force: Any) -> list[Drawn]:
     return found
 
 
-def _routed(route: R.AbstractRoute, colour: str, radius: float | None, name: str) -> Drawn:
-    s = jnp.linspace(route.start, route.stop, 61)
-    place = np.asarray(_places(route, s))
-    return Drawn(route.start, route.stop, place, radius, colour, name)
+def _tendon(route: R.AbstractRoute, name: str) -> Drawn:
+    place = np.asarray(_places(route, jnp.linspace(route.start, route.stop, 61)))
+    return Drawn(route.start, route.stop, place, None, style.COLOURS[3], name)
 
 
 @eqx.filter_jit
@@ -299,11 +296,9 @@ def _power(ratio: float) -> float:
 
         return integral(3.0, 1.0) / integral(1.0, 1.0) ** 2
 
-    low, high = 2.0, 50.0
-    for _ in range(50):
-        middle = (low + high) / 2
-        low, high = (middle, high) if found(middle) < ratio else (low, middle)
-    return (low + high) / 2
+    least, most = 2.0, 50.0
+    ratio = float(np.clip(ratio, found(least), found(most)))
+    return brentq(lambda power: found(power) - ratio, least, most)  # type: ignore[return-value]
 
 
 def _drawn(shape: AbstractSdf, count: int) -> tuple[Outlines, Outlines | None]:

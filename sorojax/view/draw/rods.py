@@ -19,11 +19,12 @@ from sorojax.view.draw.rod_loads import (
     acting,
     contact_parts,
     outlines_of,
+    part_and_force,
     section_outline,
     size_of,
     thread_parts,
 )
-from sorojax.view.draw.shapes import shape_scene
+from sorojax.view.draw.shapes import shape_scene, surface_scene
 from sorojax.view.picture import Picture, plotted, spread
 from sorojax.view.raster.glyphs import circle, tube
 from sorojax.view.raster.scene import Arrows, Dots, Lines, Part, Scene, Surface, short
@@ -49,14 +50,10 @@ def wrench_parts(
     """
     parts: list[Part] = []
     for force in forces:
-        name, inner = (
-            (force.part, force.force) if isinstance(force, R.PartForce) else ("", force)
-        )
+        name, inner = part_and_force(force)
         if isinstance(inner, R.Gravity):
-            chosen = (
-                [np.asarray(poses[name])] if name else [np.asarray(p) for p in poses.values()]
-            )
-            parts += _weight(inner, chosen, size)
+            chosen = [poses[name]] if name else poses.values()
+            parts += _weight(inner, [np.asarray(pose) for pose in chosen], size)
         elif isinstance(inner, R.TipWrench | R.PointWrench | R.LineWrench) and name in poses:
             parts += _wrench(inner, np.asarray(poses[name]), s, size)
     return parts
@@ -165,11 +162,9 @@ def rod_scene(
 def _state(model, q, forces, section, shapes, directors: bool, shade) -> list[Part]:
     s = np.linspace(0.0, 1.0, _STATIONS)
     poses = R.forward_kinematics(model, jnp.asarray(q, float), s)
-    bodies: dict[str, Any] = (
-        {name: part.body for name, part in zip(model.names, model.parts, strict=True)}
-        if isinstance(model, Assembly)
-        else {"": model}
-    )
+    bodies: dict[str, Any] = {"": model}
+    if isinstance(model, Assembly):
+        bodies = dict(zip(model.names, [part.body for part in model.parts], strict=True))
     where = poses if isinstance(poses, dict) else {"": poses}
     found = acting(model, forces)
     inside = any(found.threads.values())
@@ -224,10 +219,9 @@ def _link(name: str, body, pose: np.ndarray, shapes: Shapes | None, colour: str)
     turn, place = pose[:dim, :dim], pose[:dim, dim]
     shape = (shapes or {}).get(name)
     if shape is not None:
-        surface = shape_scene(shape).parts[0] if isinstance(shape, AbstractSdf) else None
-        points = surface.points if surface is not None else shape.vertices  # type: ignore
-        triangles = surface.triangles if surface is not None else shape.triangles  # type: ignore
-        return [Surface(np.asarray(points) @ turn.T + place, triangles, colour)]
+        make: Any = shape_scene if isinstance(shape, AbstractSdf) else surface_scene
+        surface = make(shape).parts[0]
+        return [Surface(surface.points @ turn.T + place, surface.triangles, colour)]
     if dim == 2:
         centre = np.zeros(2) if body.center is None else np.asarray(body.center)
         radius = np.sqrt(2 * float(body.inertia) / float(body.mass))  # of a disc
@@ -311,15 +305,12 @@ def show_section(section: Section, *, title: str = "") -> Picture:
     style.dress_plane(
         axes, 1e3 * outer.min(axis=0), 1e3 * outer.max(axis=0), "local y [mm]", "local z [mm]"
     )
-    facts = {
-        "A": (section.area, 1e6, "mm$^2$"),
-        "$I_y$": (section.second_moment_y, 1e12, "mm$^4$"),
-        "$I_z$": (section.second_moment_z, 1e12, "mm$^4$"),
-        "J": (section.torsion_constant, 1e12, "mm$^4$"),
-    }
-    text = "   ".join(
-        f"{name} {float(np.median(np.asarray(value))) * factor:.4g} {unit}"
-        for name, (value, factor, unit) in facts.items()
-    )
-    axes.set_title(text, fontsize=style.SMALL - 1, color=style.INK)
+    facts = [f"A {1e6 * float(np.median(section.area)):.4g} mm$^2$"]
+    for name, constant in (
+        ("$I_y$", section.second_moment_y),
+        ("$I_z$", section.second_moment_z),
+        ("J", section.torsion_constant),
+    ):
+        facts.append(f"{name} {1e12 * float(np.median(constant)):.4g} mm$^4$")
+    axes.set_title("   ".join(facts), fontsize=style.SMALL - 1, color=style.INK)
     return plotted(figure, [axes], title)

@@ -12,7 +12,7 @@ from sorojax.view import style
 from sorojax.view.film.film import Film, Frame, frames_at, renderer_of
 from sorojax.view.raster.camera import View, camera_at
 from sorojax.view.raster.plane import bar_beside, draw_plane, name_parts
-from sorojax.view.raster.scene import Scale, Scene
+from sorojax.view.raster.scene import Scale, Scene, box_around
 from sorojax.view.raster.solid import (
     annotate,
     chosen_renderer,
@@ -99,17 +99,13 @@ def animate(
 
 def _alike(tracks: list[Track]) -> list[Track]:
     """One box and one scale of colours for panels that are to be compared."""
-    boxes = [_extent(track) for track in tracks]
-    extent = (np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0))
+    extent = box_around([_extent(track) for track in tracks])
     scales = [track.scale for track in tracks if track.scale is not None]
     scale = scales[0] if scales else None
     if len(scales) == 2 and scales[0].label == scales[1].label:
-        scale = replace(
-            scales[0], low=min(s.low for s in scales), high=max(s.high for s in scales)
-        )
-    return [
-        replace(t, extent=extent, scale=scale if t.scale is not None else None) for t in tracks
-    ]
+        low, high = min(s.low for s in scales), max(s.high for s in scales)
+        scale = replace(scales[0], low=low, high=high)
+    return [replace(t, extent=extent, scale=t.scale and scale) for t in tracks]
 
 
 def _extent(track: Track) -> tuple[np.ndarray, np.ndarray]:
@@ -117,8 +113,7 @@ def _extent(track: Track) -> tuple[np.ndarray, np.ndarray]:
     if track.extent is not None:
         return track.extent
     some = np.unique(np.linspace(0, len(track.time) - 1, 60).astype(int))
-    boxes = [track.scene(int(k)).box for k in some]
-    return np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
+    return box_around([track.scene(int(k)).box for k in some])
 
 
 class _Stage(abc.ABC):

@@ -63,7 +63,7 @@ class Surface:
 
     @property
     def has_values_per_triangle(self) -> bool:
-        count = np.size(self.values)
+        count = 0 if self.values is None else len(self.values)
         return count == len(self.triangles) or count != len(self.points)
 
     @property
@@ -160,10 +160,14 @@ def merge_scenes(*scenes: Scene, title: str = "") -> Scene:
 
 def joint_extent(scenes: Sequence[Scene]) -> list[Scene]:
     """The scenes with one box and one scale, so that they compare."""
-    boxes = [scene.box for scene in scenes]
-    lower = np.min([low for low, _ in boxes], axis=0)
-    upper = np.max([high for _, high in boxes], axis=0)
-    return [replace(scene, extent=(lower, upper)) for scene in scenes]
+    extent = box_around([scene.box for scene in scenes])
+    return [replace(scene, extent=extent) for scene in scenes]
+
+
+def box_around(boxes: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner of the box around boxes."""
+    lower, upper = zip(*boxes, strict=True)
+    return np.min(lower, axis=0), np.max(upper, axis=0)
 
 
 def robust_scale(
