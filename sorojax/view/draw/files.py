@@ -15,7 +15,7 @@ from sorojax.mesh import Mesh
 from sorojax.view.draw.bodies import coloured
 from sorojax.view.draw.meshes import Body, mesh_scene
 from sorojax.view.draw.plots import show_signals
-from sorojax.view.draw.shapes import show_surface
+from sorojax.view.draw.shapes import surface_scene
 from sorojax.view.film.film import Film
 from sorojax.view.picture import Picture, panels, show_scene, spread
 from sorojax.view.raster.camera import View
@@ -56,13 +56,9 @@ def show_file(
     kind, name = path.suffix.lower(), title or Path(path).name
     if kind in _SURFACES:
         surface = io.import_surface(path, unit=unit)
-        return show_surface(
-            surface,
-            wire=wire,
-            view=view,
-            renderer=renderer,
-            title=title or f"{path.name}: {len(surface.triangles)} triangles",
-        )
+        text = f"{path.name}: {len(surface.triangles)} triangles"
+        scene = surface_scene(surface, title or text, wire)
+        return show_scene(scene, view=view, renderer=renderer)
     if kind == ".npz":
         return _saved(path, name, field=field, view=view, renderer=renderer, wire=wire)
     scale = 1.0 if unit is None else unit

@@ -19,20 +19,16 @@ if TYPE_CHECKING:
     from sorojax.io import MovingSurface
 
 
-_AXES = {"x": 0, "y": 1, "z": 2}
-
-
 def _show_plane(shape: AbstractSdf, resolution: int, title: str) -> Picture:
     """A plane shape: filled contours of its distance and the zero set as a line."""
     lower, upper = finite_box("view.show", shape, 2)
     step = float(np.max(upper - lower)) / resolution
     margin = 0.06 * resolution * step
     ranges = zip(lower - margin, upper + margin + step, strict=True)
-    x, y = np.meshgrid(*(np.arange(low, high, step) for low, high in ranges))
-    f = values(shape, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
-    figure, axes = _contours(x, y, f, lower - margin, upper + margin)
-    for run in _runs(shape, step):
-        axes.plot(*(1e3 * run).T, color=style.INK, lw=1.5, solid_joinstyle="miter")
+    x, y = (np.arange(low, high, step) for low, high in ranges)
+    figure, axes = _contours(x, y, _on_grid(shape, x, y).T, lower - margin, upper + margin)
+    for curve in contour(shape, step):
+        axes.plot(*_run(curve).T, color=style.INK, lw=1.5, solid_joinstyle="miter")
     style.dress_plane(axes, 1e3 * lower, 1e3 * upper)
     return plotted(figure, [axes], title)
 
@@ -41,24 +37,22 @@ def _show_slice(
     shape: AbstractSdf, slice: dict[str, float], resolution: int, title: str
 ) -> Picture:
     """The distance of a solid shape in a plane across one axis, with the zero line."""
-    if len(slice) != 1 or next(iter(slice)) not in _AXES:
+    if len(slice) != 1 or next(iter(slice)) not in ("x", "y", "z"):
         raise ValueError(
             f'view.show: got slice={slice}, need one axis with its place [m]: {{"z": 0.01}}.'
         )
     name, place = next(iter(slice.items()))
-    across = _AXES[name]
+    across = "xyz".index(name)
     lower, upper = finite_box("view.show", shape, 3)
     rest = [axis for axis in range(3) if axis != across]
     low, high = lower[rest], upper[rest]
     margin = 0.06 * float(np.max(high - low))
     low, high = low - margin, high + margin
     count = np.maximum((high - low) / np.max(high - low) * resolution, 16).astype(int)
-    x, y = np.meshgrid(
-        *(np.linspace(a, b, n) for a, b, n in zip(low, high, count, strict=True))
-    )
-    points = np.full((x.size, 3), float(place))
-    points[:, rest[0]], points[:, rest[1]] = x.ravel(), y.ravel()
-    f = values(shape, points).reshape(x.shape)
+    x, y = (np.linspace(a, b, n) for a, b, n in zip(low, high, count, strict=True))
+    grid = [x, y]
+    grid.insert(across, np.array([float(place)]))
+    f = _on_grid(shape, *grid).squeeze(axis=across).T
     figure, axes = _contours(x, y, f, low, high)
     if f.min() < 0 < f.max():
         axes.contour(1e3 * x, 1e3 * y, f, levels=[0.0], colors=style.INK, linewidths=1.5)
@@ -66,12 +60,16 @@ def _show_slice(
     return plotted(figure, [axes], title or f"{name} = {1e3 * float(place):g} mm")
 
 
-def _runs(shape: AbstractSdf, size: float) -> list[np.ndarray]:
-    """Closed curves of a plane shape, the first point repeated at the end."""
-    return [
-        np.concatenate([c.points, c.points[:1]]) if c.closed else c.points
-        for c in contour(shape, size)
-    ]
+def _on_grid(shape: AbstractSdf, *axes: np.ndarray) -> np.ndarray:
+    """A field at the points of a grid."""
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    return values(shape, grid.reshape(-1, len(axes))).reshape(grid.shape[:-1])
+
+
+def _run(curve: Curve) -> np.ndarray:
+    """The points of a curve [mm], the first again at the end of a closed one."""
+    points = 1e3 * np.asarray(curve.points)
+    return np.concatenate([points, points[:1]]) if curve.closed else points
 
 
 def _contours(x, y, f, lower, upper) -> "tuple[Figure, Axes]":
@@ -195,9 +193,7 @@ def level_surface(shape: AbstractSdf, lower: np.ndarray, upper: np.ndarray, coun
     """Zero surface of a solid field in a box, open where the box cuts it."""
     from skimage.measure import marching_cubes
 
-    axes = [np.linspace(a, b, count) for a, b in zip(lower, upper, strict=True)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    f = values(shape, grid.reshape(-1, 3)).reshape(count, count, count)
+    f = _on_grid(shape, *np.linspace(lower, upper, count).T)
     if not f.min() < 0 < f.max():
         return np.zeros((0, 3)), np.zeros((0, 3), int)
     step = tuple((upper - lower) / (count - 1))
@@ -209,10 +205,8 @@ def level_lines(shape: AbstractSdf, lower: np.ndarray, upper: np.ndarray, count:
     """Zero lines of a plane field in a box; the shape may be unbounded."""
     from skimage.measure import find_contours
 
-    step = (upper - lower) / (count - 1)
-    x, y = np.meshgrid(*(np.linspace(a, b, count) for a, b in zip(lower, upper, strict=True)))
-    f = values(shape, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
-    return [lower + run[:, ::-1] * step for run in find_contours(f, 0.0)]
+    f = _on_grid(shape, *np.linspace(lower, upper, count).T)
+    return [lower + run * (upper - lower) / (count - 1) for run in find_contours(f, 0.0)]
 
 
 def _filled(shape: AbstractSdf, size: float) -> Surface:
@@ -250,8 +244,7 @@ def show_curve(curve: Curve, *, title: str = "") -> Picture:
     lower, upper = 1e3 * points.min(axis=0), 1e3 * points.max(axis=0)
     figure = style.new_figure(6.0, style.height_for(6.0, lower, upper))
     axes = figure.add_subplot()
-    line = np.concatenate([points, points[:1]]) if curve.closed else points
-    axes.plot(*(1e3 * line).T, color=style.COLOURS[0], lw=1.6, marker=".", ms=3)
+    axes.plot(*_run(curve).T, color=style.COLOURS[0], lw=1.6, marker=".", ms=3)
     corners = 1e3 * points[np.asarray(curve.corner)]
     axes.plot(*corners.T, "o", color=style.COLOURS[1], ms=6, label="corners")
     style.dress_plane(axes, lower, upper)
