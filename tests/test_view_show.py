@@ -538,9 +538,9 @@ def test_charts_tell_orders_and_refuse_zeros():
     assert is_whole(picture) and "quadratic: order 3.00" in words(picture)
     work = view.WorkPrecision({"a": ([1, 2], [1e-2, 1e-4]), "b": ([2, 1], [1e-5, 1e-2])})
     assert is_whole(view.show(work)) and "time [s]" in words(view.show(work))
-    with pytest.raises(ValueError, match="not positive"):
+    with pytest.raises(ValueError, match="must be positive"):
         view.show(view.WorkPrecision({"a": ([1.0], [0.0])}))
-    with pytest.raises(ValueError, match="two of one length"):
+    with pytest.raises(ValueError, match="two rows of one length"):
         view.show(view.WorkPrecision({"a": ([1.0, 2.0], [0.1])}))
 
 

@@ -101,18 +101,11 @@ def _states(where, problem, states, times):
     moved = np.asarray(states, float)
     moved = moved[None] if moved.ndim == 2 else moved
     moments = own if times is None else times
-    want = tuple(problem.mesh.points.shape)
-    if moved.ndim != 3 or moved.shape[1:] != want or not len(moved):
-        raise ValueError(
-            f"{where}: states have shape {moved.shape}, need ({want[0]}, {want[1]}) or "
-            f"(states, {want[0]}, {want[1]}) with at least one state."
-        )
+    want = (None if len(moved) else 1, *problem.mesh.points.shape)
+    _check.shape(where, "states", moved, want, "Give one state or more.")
     _check.finite(where, "states", moved, "Leave out states that did not converge.")
     moments = np.arange(len(moved)) if moments is None else np.asarray(moments, float)
-    if len(moments) != len(moved):
-        raise ValueError(
-            f"{where}: got {len(moments)} times for {len(moved)} states. Give one per state."
-        )
+    _check.shape(where, "times", moments, (len(moved),), "Give one per state.")
     return moved, problems or [problem] * len(moved), moments
 
 

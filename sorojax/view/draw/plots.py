@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax import _check
 from sorojax._jax.jit import once
 from sorojax.design.calibration.calibration import Calibration
 from sorojax.material import AbstractHyperelastic, strain_energy_density, uniaxial_stress
@@ -161,11 +162,8 @@ def _draw_signals(axes: Any, time: np.ndarray, label: str, signals: Mapping[str,
     styles = style.line_styles(signals)
     for name, values in signals.items():
         values = np.asarray(values)
-        if values.shape != time.shape:
-            raise ValueError(
-                f"show_signals: `{name}` has shape {values.shape}, `time` has {time.shape}. "
-                "Give one number per instant; split vectors into several names."
-            )
+        do = "Give one number per instant; split vectors into several names."
+        _check.shape("show_signals", name, values, time.shape, do)
         above = 3 if styles[name]["color"] == style.REFERENCE else 2
         axes.plot(time, values, label=name, zorder=above, **styles[name])
     style.dress(axes, "", label)
@@ -292,16 +290,10 @@ def _logarithmic(runs: Mapping, names: dict[str, str], x: str, y: str, title: st
 
 
 def _positive(name: str, *rows: np.ndarray) -> None:
-    lengths = {row.shape for row in rows}
-    if len(lengths) > 1 or any(row.ndim != 1 for row in rows):
-        raise ValueError(
-            f"view.show: `{name}` has rows of shapes {sorted(lengths)}, need two of one length."
-        )
-    if not all(np.all(row[np.isfinite(row)] > 0) for row in rows):
-        raise ValueError(
-            f"view.show: `{name}` has values that are not positive, logarithmic axes need "
-            "positive ones. Take absolute values; leave out exact zeros."
-        )
+    for row in rows:
+        _check.shape("view.show", name, row, (rows[0].size,), "Give two rows of one length.")
+        do = "Logarithmic axes have no zero: take absolute values, leave out exact zeros."
+        _check.positive("view.show", name, row[np.isfinite(row)], "", do)
 
 
 # Materials and their fits, calibrations, sweeps, tracks of markers

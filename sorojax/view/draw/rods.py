@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from sorojax import rod as R
+from sorojax import _check, rod as R
 from sorojax.rod import Assembly, Rod, Section
 from sorojax.sdf import AbstractSdf, Surface as Triangles
 from sorojax.view import style
@@ -142,13 +142,9 @@ def rod_scene(
         title: Title of the figure.
     """
     rest = R.rest(model)
-    q = np.asarray(rest) if q is None else np.asarray(q)
-    rows = np.atleast_2d(q)
-    if rows.shape[1] != rest.shape[0]:
-        raise ValueError(
-            f"view.show: `q` has shape {q.shape}, the model has {rest.shape[0]} coordinates. "
-            "Give one row per state."
-        )
+    rows = np.atleast_2d(np.asarray(rest if q is None else q))
+    do = f"Give one row per state: the model has {len(rest)} coordinates."
+    _check.shape("view.show", "q", rows, (None, len(rest)), do)
     parts: list[Part] = []
     for k, row in enumerate(rows):
         last = k == len(rows) - 1

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from sorojax import _check
 from sorojax.design import History
 from sorojax.design.optimise.minimise import Optimised
 from sorojax.mesh import Mesh
@@ -191,11 +192,8 @@ def show_densities(
         title: Title of the figure.
     """
     rows = np.atleast_2d(np.asarray(densities))
-    if rows.shape[1] != mesh.num_cells:
-        raise ValueError(
-            f"view.show: densities have shape {rows.shape}, need (steps, {mesh.num_cells}), "
-            "one per cell."
-        )
+    do = "Give one per cell, in rows of steps."
+    _check.shape("view.show", "densities", rows, (None, mesh.num_cells), do)
     count = len(rows)
     chosen = spread(count, 6) if steps is None else [k % count for k in steps]
     scale = Scale("density [-]", 0.0, 1.0, colours="Greys")

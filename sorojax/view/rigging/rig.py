@@ -76,15 +76,12 @@ def rig(
         return Rig(model, skin, triangles)
     vertices, triangles = surface
     triangles = np.asarray(triangles)
-    if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.size == 0:
+    do = "Pass what import_surface or sdf.isosurface gives."
+    _check.shape("rig", "triangles", triangles, (None, 3), do)
+    if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(vertices):
         raise ValueError(
-            f"rig: `triangles` have shape {triangles.shape}, need (triangles, 3). Pass what "
-            "import_surface or sdf.isosurface gives."
-        )
-    if triangles.min() < 0 or triangles.max() >= len(vertices):
-        raise ValueError(
-            f"rig: triangles use vertices {triangles.min()} to {triangles.max()}, the surface "
-            f"has {len(vertices)}. Pass vertices and triangles of one surface."
+            f"rig: got {len(triangles)} triangles that must name some of {len(vertices)} "
+            "vertices. Pass vertices and triangles of one surface."
         )
     skin = bind(vertices, model, q, stations=stations, **options)
     return Rig(model, skin, triangles)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sorojax import fem
+from sorojax import _check, fem
 from sorojax.fem.equilibrium.solve import Path as FemPath
 from sorojax.io.animation import MovingSurface, export_animation
 from sorojax.view import style
@@ -268,11 +268,9 @@ def _times(things, time, clock: str, unit: str, frames: int) -> tuple[list[str],
         stamps = [f"{k + 1} / {frames}" for k in range(frames)] if frames > 1 else [""]
         return stamps, np.linspace(0, _LOOP, frames).tolist()
     time = np.asarray(time, float)
-    if time.shape != (frames,) or not np.all(np.isfinite(time)):
-        raise ValueError(
-            f"to_html: `time` has shape {time.shape}, need {frames} finite numbers, one per "
-            "frame."
-        )
+    do = f"Give {frames} finite numbers, one per frame."
+    _check.shape("to_html", "time", time, (frames,), do)
+    _check.finite("to_html", "time", time, do)
     digits = _digits(time)
     stamps = [f"{clock} = {value:.{digits}f} {unit}".rstrip() for value in time]
     if unit != "s" or np.any(np.diff(time) <= 0):
