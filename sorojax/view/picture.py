@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from sorojax.view import style
-from sorojax.view.raster.camera import Lens, View, box_corners, camera_at, fit
+from sorojax.view.raster import solid
+from sorojax.view.raster.camera import Lens, View
 from sorojax.view.raster.plane import bar_beside, draw_plane, name_parts, plane_figure
 from sorojax.view.raster.scene import Scene
-from sorojax.view.raster.solid import bar_of, draw_solid, lens_of, solid_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -103,7 +103,7 @@ def show_scene(scene: Scene, *, view: View = "iso", renderer: str = "auto") -> P
     if scene.dim == 2:
         figure, axes = plane_figure(scene)
         return plotted(figure, [axes], scene.title)
-    figure, lens = solid_figure(scene, view=view, renderer=renderer)
+    figure, lens = solid.solid_figure(scene, view=view, renderer=renderer)
     return Picture(figure, (Panel(figure.axes[0], lens),))
 
 
@@ -142,10 +142,7 @@ def _plane(scenes, names, title: str, width: float) -> Picture:
 
 
 def _solid(scenes, names, view: View, renderer: str, title: str, width: float) -> Picture:
-    corners = box_corners(*scenes[0].box)
-    flat = fit(camera_at(view), corners, (100, 100)).raw(corners)[:, :2]
-    span = flat.max(axis=0) - flat.min(axis=0)
-    aspect = float(np.clip(span[1] / max(span[0], 1e-12), 0.3, 1.6))
+    aspect = float(np.clip(solid.aspect_of(scenes[0], view), 0.3, 1.6))
     rows, columns = _grid(len(scenes), aspect)
     right = 1.05 if scenes[0].scale is not None else 0.1
     each = (width - right) / columns
@@ -158,16 +155,15 @@ def _solid(scenes, names, view: View, renderer: str, title: str, width: float) -
         low = height - head - (row + 1) * (0.28 + aspect * each)
         place = (column * each / width, low / height, each / width, aspect * each / height)
         axes = figure.add_axes(place)
-        box = axes.get_window_extent()
-        size = max(int(round(box.width)), 16), max(int(round(box.height)), 16)
-        lens = lens_of([scenes[0]] if scene.extent is not None else scenes, view, size)
-        draw_solid(figure, axes, replace(scene, title=""), renderer=renderer, lens=lens)
+        shown = scenes if scene.extent is None else scenes[:1]
+        lens = solid.lens_of(shown, view, solid.size_of(axes))
+        solid.draw_solid(figure, axes, replace(scene, title=""), renderer=renderer, lens=lens)
         middle, above = (column + 0.5) * each / width, (low + aspect * each) / height
         style.write(figure, middle, above, name, va="bottom", fontsize=style.LABEL)
         drawn.append(Panel(axes, lens))
     if scenes[0].scale is not None:
         place = (1 - 0.95 / width, 0.15, 0.16 / width, 0.7)
-        bar_of(figure, scenes[0].scale, figure.add_axes(place))
+        solid.bar_of(figure, scenes[0].scale, figure.add_axes(place))
     if title:
         style.heading(figure, 0.5, 1 - 0.12 / height, title)
     return Picture(figure, tuple(drawn))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from sorojax.view import style
-from sorojax.view.raster.camera import Camera, Lens, View, box_corners, camera_at, fit
+from sorojax.view.raster.camera import Lens, View, box_corners, camera_at, fit
 from sorojax.view.raster.glyphs import arrow_triangles, ball_triangles
 from sorojax.view.raster.raster import shade
 from sorojax.view.raster.scene import (
@@ -92,6 +92,12 @@ def lens_of(scenes: Sequence[Scene], view: View, size: tuple[int, int], share: f
     return fit(camera_at(view, share), points[np.all(np.isfinite(points), axis=1)], size)
 
 
+def size_of(axes: "Axes") -> tuple[int, int]:
+    """Width and height of a picture in `axes` [pixels]."""
+    box = axes.get_window_extent()
+    return max(int(round(box.width)), 16), max(int(round(box.height)), 16)
+
+
 def draw_solid(
     figure: "Figure",
     axes: "Axes",
@@ -102,8 +108,7 @@ def draw_solid(
     lens: Lens | None = None,
 ) -> Lens:
     """Shade `scene` into `axes`, whose place in the figure is final; returns the lens."""
-    box = axes.get_window_extent()
-    size = max(int(round(box.width)), 16), max(int(round(box.height)), 16)
+    size = size_of(axes)
     lens = lens_of([scene], view, size) if lens is None else lens
     picture = picture_of(scene, lens, renderer=renderer, dots_per_point=figure.dpi / 72)
     axes.set_xlim(0, size[0])
@@ -211,8 +216,9 @@ def solid_figure(
     height: float | None = None,
 ) -> "tuple[Figure, Lens]":
     """One solid scene in a figure of `width` inches."""
-    if height is None:
-        height = _height(scene, camera_at(view), width)
+    if height is None:  # what the picture asks for, from about half of the width to all of it
+        wanted = 0.9 + width * aspect_of(scene, view)
+        height = float(np.clip(wanted, 0.45 * width, width))
     figure = style.new_figure(width, height, layout="none")
     axes, _ = frame(figure, scene)
     lens = draw_solid(figure, axes, scene, view=view, renderer=renderer)
@@ -220,11 +226,12 @@ def solid_figure(
     return figure, lens
 
 
-def _height(scene: Scene, camera: Camera, width: float) -> float:
-    """As high as the picture asks for, between a third of the width and all of it."""
-    flat = fit(camera, box_corners(*scene.box), (100, 100)).raw(box_corners(*scene.box))[:, :2]
-    span = flat.max(axis=0) - flat.min(axis=0)
-    return float(np.clip(0.9 + width * span[1] / max(span[0], 1e-12), 0.45 * width, width))
+def aspect_of(scene: Scene, view: View) -> float:
+    """Height over width of what is seen of a scene."""
+    corners = box_corners(*scene.box)
+    flat = fit(camera_at(view), corners, (100, 100)).raw(corners)[:, :2]
+    wide, high = np.ptp(flat, axis=0)
+    return float(high / max(wide, 1e-12))
 
 
 # Solid scenes by pyvista, through the same lens as the own renderer
