@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from sorojax import io, mesh as M, sdf
+from sorojax import fem, io, material, mesh as M, sdf
 
 PLANE = (M.Tri3(), M.Tri6(), M.Quad4(), M.Quad8())
 SOLID = (M.Tet4(), M.Tet10(), M.Hex8())
@@ -90,3 +90,19 @@ def test_mixed_foreign_and_damaged_files_are_refused(tmp_path):
         io.import_mesh("../whole.vtu", root=tmp_path / "inner")
     with pytest.raises(ValueError, match="import_surface"):
         io.export_mesh(tmp_path / "a.stl", sample(M.Tri3()))
+
+
+def test_fields_on_polygons_keep_the_corners_of_each(tmp_path):
+    import meshio
+
+    mesh = M.polymesher(sdf.Rectangle([0, 0], [1, 1]), 9, key=jax.random.key(0))
+    rubber = material.neo_hookean(young_modulus=1e5, poisson_ratio=0.3)
+    held = fem.Fixed(M.nodes_where(mesh, lambda p: p[0] < 1e-9))
+    problem = fem.problem(mesh, rubber, kinematics=fem.PlaneStrain(), supports=(held,))
+    rest = np.zeros(mesh.points.shape)
+    (file,) = io.export_fields(tmp_path / "a.vtu", problem, rest, fields=("energy",))
+    read = meshio.read(file)
+    corners = M.mesh.valences(mesh)
+    counts = {block.data.shape[1]: len(block.data) for block in read.cells}
+    assert max(counts) > 4 and counts == {n: np.sum(corners == n) for n in np.unique(corners)}
+    assert sum(map(len, read.cell_data["energy"])) == mesh.num_cells

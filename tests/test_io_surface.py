@@ -40,6 +40,13 @@ def test_3mf_and_glb_hold_what_they_declare(tmp_path):
     io.export_surface(tmp_path / "a.3mf", BOX)
     with zipfile.ZipFile(tmp_path / "a.3mf") as package:
         model = xml.fromstring(package.read("3D/3dmodel.model"))
+        parts = [
+            xml.fromstring(package.read(n)) for n in ("[Content_Types].xml", "_rels/.rels")
+        ]
+    kinds = "http://schemas.openxmlformats.org/package/2006"
+    assert [part.tag for part in parts] == [
+        f"{{{kinds}/content-types}}Types", f"{{{kinds}/relationships}}Relationships"
+    ]  # fmt: skip
     space = "{http://schemas.microsoft.com/3dmanufacturing/core/2015/02}"
     assert model.get("unit") == "millimeter"
     assert len(list(model.iter(space + "vertex"))) == len(BOX.vertices)

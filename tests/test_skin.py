@@ -135,7 +135,7 @@ def test_skins_are_differentiable(spatial, cloud):
         (lambda rod: view.bind(np.full((2, 3), np.nan), rod), "finite"),
         (lambda rod: view.bind(np.zeros((2, 3)), rod, parts=("palm",)), "some of \\['rod'\\]"),
         (lambda rod: view.bind(np.zeros((2, 3)), rod, stations=2), "3 or more"),
-        (lambda rod: view.rig(rod, (np.zeros((2, 3)), [[0, 1, 2]])), "has 2"),
+        (lambda rod: view.rig(rod, (np.zeros((2, 3)), [[0, 1, 2]])), "some of 2"),
         (lambda rod: view.rig(rod, blend=0.01), "without a `surface`"),
         (lambda rod: view.pose(view.rig(rod), np.zeros(2)), "6 coordinates"),
     ],

@@ -52,7 +52,7 @@ def test_a_flat_robot_shows_its_air_inside_its_body():
 
 def test_a_solid_robot_is_clear_around_its_air():
     bellows = robots.Bellows(num_folds=2)
-    air, body = robot_scene(bellows, 1.6e-3).parts
+    air, body = robot_scene(bellows, size=1.6e-3).parts
     assert (air.name, body.opacity < 1) == ("air", True)
     assert np.ptp(air.points, axis=0).max() < np.ptp(body.points, axis=0).max()
     shown = view.show(bellows, size=1.6e-3, renderer="own")

@@ -10,7 +10,6 @@ from sorojax.math.lie import SE2, SE3, homogeneous
 from sorojax.math.status import Status
 from sorojax.reduction.backbone import Backbone
 from sorojax.view import style
-from sorojax.view.draw.bodies import show_problem
 from sorojax.view.draw.loads import coil, load_parts, support_parts, turning
 from sorojax.view.draw.rods import rod_scene, wrench_parts
 from sorojax.view.film.tracks import track_of
@@ -118,7 +117,7 @@ def test_a_cavity_in_a_solid_is_seen_through_it():
         supports=(fem.Fixed(M.nodes_where(body, lambda p: p[0] < 1e-9)),),
         loads=(fem.Pressure(inside, 2e4, name="air"),),
     )
-    picture = show_problem(problem, renderer="own")
+    picture = view.show(problem, renderer="own")
     assert "under pressure" in words(picture) and "air: 20 kPa" in words(picture)
     red, green, blue = np.moveaxis(pixels(picture), 2, 0)
     assert np.sum((red > green + 15) & (green >= blue - 5)) > 500  # the wall, seen through

@@ -538,9 +538,9 @@ def test_charts_tell_orders_and_refuse_zeros():
     assert is_whole(picture) and "quadratic: order 3.00" in words(picture)
     work = view.WorkPrecision({"a": ([1, 2], [1e-2, 1e-4]), "b": ([2, 1], [1e-5, 1e-2])})
     assert is_whole(view.show(work)) and "time [s]" in words(view.show(work))
-    with pytest.raises(ValueError, match="not positive"):
+    with pytest.raises(ValueError, match="must be positive"):
         view.show(view.WorkPrecision({"a": ([1.0], [0.0])}))
-    with pytest.raises(ValueError, match="two of one length"):
+    with pytest.raises(ValueError, match="two rows of one length"):
         view.show(view.WorkPrecision({"a": ([1.0, 2.0], [0.1])}))
 
 
@@ -636,7 +636,10 @@ def test_simulating_and_printing_load_no_drawing_library():
 
 def test_every_class_that_is_drawn_exists():
     """They are listed by name, so that a picture of a shape does not import the solvers."""
-    for path, (module, function) in sys.modules["sorojax.view.show"]._DRAWN_BY.items():
-        home, _, name = path.rpartition(".")
-        assert getattr(importlib.import_module(home), name).__module__ == home, path
-        assert callable(getattr(importlib.import_module(f"sorojax.view.{module}"), function))
+    tables = sys.modules["sorojax.view.show"]
+    for function, nouns in (tables._PICTURES | tables._SCENES).items():
+        module, _, name = f"sorojax.view.{function}".rpartition(".")
+        assert callable(getattr(importlib.import_module(module), name))
+        for noun in nouns.split():
+            home, _, name = f"sorojax.{noun}".rpartition(".")
+            assert getattr(importlib.import_module(home), name).__module__ == home, noun

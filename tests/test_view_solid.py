@@ -90,6 +90,22 @@ def test_views_and_paths():
         Camera(zoom=0.0)
 
 
+def test_triangles_without_a_place_leave_the_others_as_they_are():
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]])
+    known = Surface(
+        square, np.array([[0, 1, 2]]), values=np.array([0.2]), wire=np.ones((1, 3), bool)
+    )
+    torn = Surface(
+        np.concatenate([square, [[np.nan, 0, 0]]]),
+        np.array([[0, 4, 3], [0, 1, 2]]),
+        values=np.array([0.9, 0.2]),
+        wire=np.ones((2, 3), bool),
+    )
+    scale, box = Scale("share [-]", 0.0, 1.0), (np.zeros(3), np.ones(3))
+    shown = [picture(Scene((part,), scale, extent=box))[0] for part in (known, torn)]
+    assert np.array_equal(*shown) and shown[0].min() < 200
+
+
 def picture(scene, view="front", size=(80, 80), **options):
     lens = solid.lens_of([scene], view, size)
     return S.shade(scene, lens, **options), lens

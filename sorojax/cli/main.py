@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from sorojax import __version__
 from sorojax.cli import cache, calibrate, robots, show
 
 
@@ -16,8 +17,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     was raised.
     """
     arguments = _parser().parse_args(argv)
-    warms = arguments.run is cache.run and arguments.warm
-    if arguments.run in (robots.run, show.run) or warms:
+    if arguments.run not in (calibrate.run, cache.run) or getattr(arguments, "warm", False):
         _start_jax()
     if os.environ.get("SOROJAX_DEBUG"):
         return arguments.run(arguments)
@@ -35,7 +35,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="sorojax", description="Differentiable soft robots in JAX."
     )
-    parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
+    parser.add_argument("--version", action="version", version=f"sorojax {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
 
     demo = commands.add_parser("demo", help="from a drawing to a moving robot")
@@ -52,23 +52,13 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-class _Version(argparse.Action):
-    def __call__(self, parser, namespace, values, option_string=None):
-        from sorojax import __version__
-
-        print(f"sorojax {__version__}")
-        parser.exit()
-
-
 def _demo(arguments: argparse.Namespace) -> int:
-    _start_jax()
     from sorojax.cli import demo
 
     return demo.run(arguments.out, arguments.quick)
 
 
 def _info(arguments: argparse.Namespace) -> int:
-    _start_jax()
     from sorojax.cli.info import info
 
     rows = info()

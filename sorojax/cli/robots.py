@@ -5,13 +5,18 @@ import dataclasses
 import sys
 from pathlib import Path
 
-NAMES = ("bending", "planar", "hand", "manipulator")
+KINDS = {
+    "bending": "BendingActuator",
+    "planar": "PlanarActuator",
+    "hand": "Hand",
+    "manipulator": "Manipulator",
+}
 
 
 def add(commands) -> None:
     """The parser of the command."""
     parser = commands.add_parser("robots", help="a printable robot as STL, 3MF, PLY or OBJ")
-    parser.add_argument("name", choices=NAMES)
+    parser.add_argument("name", choices=KINDS)
     parser.add_argument("--out", type=Path, help="the file (default: NAME.stl)")
     parser.add_argument("--size", type=float, default=0.5, help="of a cell [mm]")
     parser.add_argument("--wall", type=float, help="least wall to accept [mm]")
@@ -33,17 +38,15 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         ValueError: If a dimension is unknown, or the body fails a check.
     """
-    from sorojax import io, sdf
+    from sorojax import io, robots, sdf
 
-    robot = _changed(_robot(arguments.name), arguments.dimensions)
+    robot = _changed(getattr(robots, KINDS[arguments.name])(), arguments.dimensions)
     if arguments.list:
         for name, value in _dimensions(robot).items():
             print(f"{name:<30} {value:g}")
         return 0
     out = arguments.out or Path(f"{arguments.name}.stl")
-    body = robot.body()  # type: ignore[attr-defined]
-    surface = sdf.isosurface(body, arguments.size * 1e-3)
-    io.export_surface(out, surface)
+    io.export_surface(out, sdf.isosurface(robot.body(), arguments.size * 1e-3))
     report = sdf.surface_report(io.import_surface(out))
     print(_described(report))
     if not report.watertight:
@@ -56,18 +59,6 @@ def run(arguments: argparse.Namespace) -> int:
         )
     print(f"wrote {out}", file=sys.stderr)
     return 0
-
-
-def _robot(name: str):
-    from sorojax import robots
-
-    kinds = {
-        "bending": robots.BendingActuator,
-        "planar": robots.PlanarActuator,
-        "hand": robots.Hand,
-        "manipulator": robots.Manipulator,
-    }
-    return kinds[name]()
 
 
 def _dimensions(robot, prefix: str = "") -> dict[str, float]:
@@ -100,10 +91,8 @@ def _changed(robot, changes: list[str]):
             number = float(value)
         except ValueError:
             raise ValueError(f"--set {text}: {value!r} is no number") from None
-        if not isinstance(known[name], int):
-            robot = _replaced(robot, name.split("."), number * _unit(name.split(".")[-1]))
-        else:
-            robot = _replaced(robot, name.split("."), round(number))
+        is_count, path = isinstance(known[name], int), name.split(".")
+        robot = _replaced(robot, path, round(number) if is_count else number * _unit(path[-1]))
     return robot
 
 

@@ -2,9 +2,8 @@
 
 import argparse
 import os
-import shutil
-import subprocess
 import sys
+import webbrowser
 from pathlib import Path
 
 
@@ -61,13 +60,8 @@ def _renderer() -> str:
 
 def _open(path: Path) -> None:
     """Hand the file to the viewer of the desktop, if there is one."""
-    if sys.platform == "win32":
-        os.startfile(path)
-        return
-    mac = sys.platform == "darwin"
-    program = shutil.which("open" if mac else "xdg-open")
-    shown = mac or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    if not program or not shown:
+    shown = "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
+    if sys.platform.startswith("linux") and not shown:  # not in a browser of the terminal
         print("there is no display to open it on", file=sys.stderr)
-        return
-    subprocess.run([program, str(path)], check=False)
+    else:
+        webbrowser.open(path.resolve().as_uri())

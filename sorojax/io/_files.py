@@ -1,11 +1,12 @@
 """Files that are checked before they are read and whole when they are written."""
 
+import contextlib
 import os
 import stat
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 MAX_BYTES = 2_000_000_000
 
@@ -40,7 +41,7 @@ def read(where: str, path: Path, max_bytes: int = MAX_BYTES) -> bytes:
         return file.read(max_bytes)
 
 
-def write(path: Path, fill: Callable[[BinaryIO], None]) -> None:
+def write(path: Path, fill: Callable[[BinaryIO], Any]) -> None:
     """Let `fill` write a temporary file beside `path`, then rename it to `path`.
 
     Nobody ever sees half a file, and an error leaves the old one as it was.
@@ -56,6 +57,15 @@ def write(path: Path, fill: Callable[[BinaryIO], None]) -> None:
     except BaseException:
         os.unlink(name)
         raise
+
+
+@contextlib.contextmanager
+def made_beside(path: Path) -> Iterator[Path]:
+    """The same for what writes files by their names: that of the one to write."""
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}.") as folder:
+        made = Path(folder) / path.name
+        yield made
+        os.replace(made, path)
 
 
 def _umask() -> int:

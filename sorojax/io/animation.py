@@ -14,8 +14,8 @@ from sorojax import _check
 from sorojax.io import _files
 
 _FLOAT, _UINT, _SHORT, _UBYTE = 5126, 5125, 5122, 5121
-_ARRAY, _INDEX = 34962, 34963
-_UPRIGHT = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]  # z up becomes y up
+ARRAY, _INDEX = 34962, 34963
+UPRIGHT = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]  # z up becomes y up
 
 
 class MovingSurface(NamedTuple):
@@ -37,7 +37,7 @@ class MovingSurface(NamedTuple):
     name: str
 
 
-class _Document:
+class Document:
     """The pieces of a file, and the bytes that they refer to."""
 
     def __init__(self) -> None:
@@ -66,12 +66,38 @@ class _Document:
         self.accessors.append(entry | more)
         return len(self.accessors) - 1
 
-    def floats(self, data: np.ndarray, of: str, ends: bool = False) -> int:
+    def floats(
+        self, data: np.ndarray, of: str, ends: bool = False, target: int | None = None
+    ) -> int:
         data = np.asarray(data, "<f4")
         rows = data.reshape(len(data), -1)
         more = {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()} if ends else {}
         count = data.size if of == "SCALAR" else len(data)
-        return self.accessor(self.view(data), _FLOAT, count, of, **more)
+        return self.accessor(self.view(data, target), _FLOAT, count, of, **more)
+
+    def indices(self, triangles: np.ndarray) -> int:
+        rows = np.asarray(triangles, "<u4")
+        return self.accessor(self.view(rows, _INDEX), _UINT, rows.size, "SCALAR")
+
+    def write(self, file: BinaryIO, nodes: list, meshes: list, **more: Any) -> None:
+        """The file, which shows the last of the nodes."""
+        scene = {
+            "asset": {"version": "2.0", "generator": "sorojax"},
+            "scene": 0,
+            "scenes": [{"nodes": [len(nodes) - 1]}],
+            "nodes": nodes,
+            "meshes": meshes,
+            "accessors": self.accessors,
+            "bufferViews": self.views,
+            "buffers": [{"byteLength": self.size}],
+        }
+        text = json.dumps(scene | more, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        total = 12 + 8 + len(text) + 8 + self.size
+        head = np.array([0x46546C67, 2, total, len(text), 0x4E4F534A], "<u4")
+        file.write(head.tobytes() + text)
+        file.write(np.array([self.size, 0x004E4942], "<u4").tobytes())
+        file.writelines(self.body)
 
 
 def write(
@@ -82,7 +108,7 @@ def write(
     Points are stored at 16 bits in the box of their motion (KHR_mesh_quantization), which a
     node scales back; between two frames viewers interpolate.
     """
-    document = _Document()
+    document = Document()
     nodes, meshes, channels, samplers = [], [], [], []
     clock = document.floats(times, "SCALAR", ends=True) if len(times) > 1 else -1
 
@@ -95,14 +121,8 @@ def write(
         mesh, centre, half = _mesh(document, shape)
         meshes.append(mesh)
         scaled = len(nodes)
-        nodes.append(
-            {
-                "mesh": len(meshes) - 1,
-                "name": shape.name,
-                "translation": centre.tolist(),
-                "scale": half.tolist(),
-            }
-        )
+        node = {"mesh": len(meshes) - 1, "name": shape.name}
+        nodes.append(node | {"translation": centre.tolist(), "scale": half.tolist()})
         if len(shape.points) > 1:
             frames = len(shape.points)
             animate(scaled, "weights", np.eye(frames)[:, 1:], "SCALAR")
@@ -116,46 +136,35 @@ def write(
             animate(scaled + 1, "rotation", turns, "VEC4")
             animate(scaled + 1, "translation", places, "VEC3")
     carriers = list(range(1, len(nodes), 2))
-    nodes.append({"rotation": _UPRIGHT, "children": carriers, "name": "sorojax"})
-    scene: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "sorojax"},
+    nodes.append({"rotation": UPRIGHT, "children": carriers, "name": "sorojax"})
+    rough = {"metallicFactor": 0.0, "roughnessFactor": 0.7}
+    more: dict[str, Any] = {
         "extensionsUsed": ["KHR_mesh_quantization"],
         "extensionsRequired": ["KHR_mesh_quantization"],
-        "scene": 0,
-        "scenes": [{"nodes": [len(nodes) - 1]}],
-        "nodes": nodes,
-        "meshes": meshes,
-        "materials": [{
-            "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.7},
-            "doubleSided": True,
-        }],
-        "accessors": document.accessors,
-        "bufferViews": document.views,
-        "buffers": [{"byteLength": document.size}],
-    }  # fmt: skip
+        "materials": [{"pbrMetallicRoughness": rough, "doubleSided": True}],
+    }
     if channels:
-        scene["animations"] = [{"channels": channels, "samplers": samplers, "name": "motion"}]
-    _container(file, scene, document)
+        more["animations"] = [{"channels": channels, "samplers": samplers, "name": "motion"}]
+    document.write(file, nodes, meshes, **more)
 
 
-def _mesh(document: _Document, shape: MovingSurface):
+def _mesh(document: Document, shape: MovingSurface):
     """A mesh with a morph target per later frame, and the box that scales it back."""
     points = shape.points
     low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
     centre, half = (low + high) / 2, (high - low) / 2
     half = np.where(half > 0, half, max(half.max(), 1e-9))
     levels = np.rint(32767 * np.clip((points - centre) / half, -1, 1)).astype(np.int32)
-    rows = np.asarray(shape.triangles, "<u4")
-    index = document.view(rows, _INDEX)
+    index = document.indices(shape.triangles)
     colours = np.broadcast_to(shape.colours, points.shape[1:]) ** 2.2  # the file's are linear
     colours = np.rint(255 * np.pad(colours, ((0, 0), (0, 1)), constant_values=1.0))
-    shades = document.view(colours.astype(np.uint8), _ARRAY, stride=4)
+    shades = document.view(colours.astype(np.uint8), ARRAY, stride=4)
     primitive: dict[str, Any] = {
         "attributes": {
             "POSITION": _shorts(document, levels[0]),
             "COLOR_0": document.accessor(shades, _UBYTE, len(colours), "VEC4", normalized=True),
         },
-        "indices": document.accessor(index, _UINT, rows.size, "SCALAR"),
+        "indices": index,
         "material": 0,
     }
     targets = [_steps(document, frame - levels[0]) for frame in levels[1:]]
@@ -166,15 +175,15 @@ def _mesh(document: _Document, shape: MovingSurface):
     return mesh, centre, half
 
 
-def _shorts(document: _Document, levels: Int[np.ndarray, "points 3"]) -> int:
+def _shorts(document: Document, levels: Int[np.ndarray, "points 3"]) -> int:
     """Normalised 16-bit numbers, each row on a multiple of four bytes."""
     wide = np.pad(levels, ((0, 0), (0, 1))).astype("<i2")
-    view = document.view(wide, _ARRAY, stride=8)
+    view = document.view(wide, ARRAY, stride=8)
     ends = {"min": levels.min(0).tolist(), "max": levels.max(0).tolist()}
     return document.accessor(view, _SHORT, len(levels), "VEC3", normalized=True, **ends)
 
 
-def _steps(document: _Document, steps: Int[np.ndarray, "points 3"]) -> int:
+def _steps(document: Document, steps: Int[np.ndarray, "points 3"]) -> int:
     """Displacements of a morph target; as floats where they leave 16 bits."""
     if np.abs(steps).max() <= 32767:
         return _shorts(document, steps)
@@ -202,16 +211,6 @@ def _quaternions(rotations: Float[np.ndarray, "frames 3 3"]) -> Float[np.ndarray
     flips = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0)
     q[1:] *= np.cumprod(flips)[:, None]
     return q
-
-
-def _container(file: BinaryIO, scene: dict[str, Any], document: _Document) -> None:
-    text = json.dumps(scene, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    total = 12 + 8 + len(text) + 8 + document.size
-    file.write(np.array([0x46546C67, 2, total, len(text), 0x4E4F534A], "<u4").tobytes() + text)
-    file.write(np.array([document.size, 0x004E4942], "<u4").tobytes())
-    for part in document.body:
-        file.write(part)
 
 
 # Moving surfaces to GLB files, for Blender, viewers on the web and slides

@@ -4,7 +4,7 @@ import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import jax.numpy as jnp
@@ -80,40 +80,32 @@ def export_fields(
         # a link in the folder must not lead out of it either
         target = part if root is None else _files.inside(where, part, root)
         _write(target, here, u, fields, deformed, unit)
-    _save(file, _collection(parts, moments).encode())
+    text = _collection(parts, moments).encode()
+    _files.write(file, lambda out: out.write(text))
     return [*parts, file]
 
 
 def _states(where, problem, states, times):
     """Displacements (states, nodes, dim), the problem of each, and their times."""
-    problems = None
-    moments = times
+    problems = own = None
     if isinstance(states, FemPath):
-        moved = np.asarray(states.displacements)
         path = dataclasses.replace(states, problem=problem)
         problems = [path.problem_at(k) for k in range(len(path))]
-        if times is None and states.values.ndim == 1:
-            moments = np.asarray(states.values).tolist()
+        own = states.values if states.values.ndim == 1 else None
     elif isinstance(states, fem.Trajectory):
-        moved = np.asarray(states.displacements)
-        moments = np.asarray(states.time).tolist() if times is None else times
+        own = states.time
+    if isinstance(states, FemPath | fem.Trajectory):
+        states = states.displacements
     elif isinstance(states, fem.Solution):
-        moved = np.asarray(states.displacement)[None]
-    else:
-        moved = np.asarray(states, float)
-        moved = moved[None] if moved.ndim == 2 else moved
-    want = tuple(problem.mesh.points.shape)
-    if moved.ndim != 3 or moved.shape[1:] != want or not len(moved):
-        raise ValueError(
-            f"{where}: states have shape {moved.shape}, need ({want[0]}, {want[1]}) or "
-            f"(states, {want[0]}, {want[1]}) with at least one state."
-        )
+        states = states.displacement
+    moved = np.asarray(states, float)
+    moved = moved[None] if moved.ndim == 2 else moved
+    moments = own if times is None else times
+    want = (None if len(moved) else 1, *problem.mesh.points.shape)
+    _check.shape(where, "states", moved, want, "Give one state or more.")
     _check.finite(where, "states", moved, "Leave out states that did not converge.")
-    moments = list(range(len(moved))) if moments is None else [float(t) for t in moments]
-    if len(moments) != len(moved):
-        raise ValueError(
-            f"{where}: got {len(moments)} times for {len(moved)} states. Give one per state."
-        )
+    moments = np.arange(len(moved)) if moments is None else np.asarray(moments, float)
+    _check.shape(where, "times", moments, (len(moved),), "Give one per state.")
     return moved, problems or [problem] * len(moved), moments
 
 
@@ -125,31 +117,14 @@ def _write(file: Path, problem, u, fields, deformed: bool, unit: float) -> None:
     at_nodes, at_cells = _values(problem, jnp.asarray(u), fields)
     order = np.concatenate([ids for _, _, ids in blocks])
     ends = np.cumsum([len(ids) for _, _, ids in blocks])[:-1]
-    point_data: dict[str, Any] = {"displacement": _three(u[kept]) / unit}
+    point_data = {"displacement": _three(u[kept]) / unit}
     point_data |= {name: field[kept] for name, field in at_nodes.items()}
-    cell_data: dict[str, Any] = {
-        name: np.split(field[order], ends) for name, field in at_cells.items()
-    }
-    whole = meshio.Mesh(
-        _three(points[kept]) / unit,
-        [(kind, cells) for kind, cells, _ in blocks],
-        point_data=point_data,
-        cell_data=cell_data,
-    )
-    made = file.with_name(f".{file.stem}.{os.getpid()}.vtu")
-    try:
+    cell_data = {name: np.split(field[order], ends) for name, field in at_cells.items()}
+    cells: list[Any] = [(kind, rows) for kind, rows, _ in blocks]
+    data: dict[str, Any] = {"point_data": point_data, "cell_data": cell_data}
+    whole = meshio.Mesh(_three(points[kept]) / unit, cells, **data)
+    with _files.made_beside(file) as made:
         whole.write(made)
-        content = made.read_bytes()
-    finally:
-        made.unlink(missing_ok=True)
-    _save(file, content)
-
-
-def _save(file: Path, content: bytes) -> None:
-    def fill(out: BinaryIO) -> None:
-        out.write(content)
-
-    _files.write(file, fill)
 
 
 def _blocks(mesh):
@@ -158,7 +133,7 @@ def _blocks(mesh):
     if isinstance(mesh.element, PolyN):
         corners = valences(mesh)
         blocks = [
-            (f"polygon{n}" if n > 4 else {3: "triangle", 4: "quad"}[n], cells[ids][:, :n], ids)
+            ({3: "triangle", 4: "quad"}.get(n, "polygon"), cells[ids][:, :n], ids)
             for n in np.unique(corners)
             for ids in [np.flatnonzero(corners == n)]
         ]

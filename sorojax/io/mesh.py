@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import tempfile
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,8 +22,6 @@ from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.mesh import boundary_facets
 from sorojax.mesh.repair import Repaired
 from sorojax.sdf import Surface, surface_report
-
-_DIMS = {"vertex": 0, "line": 1, "triangle": 2, "quad": 2, "polygon": 2}
 
 
 def _types() -> dict[str, type[AbstractElement]]:
@@ -44,16 +42,6 @@ def facet_type_of(where: str, element: AbstractElement) -> str:
     return type_of(where, facet_element(element))
 
 
-def kind_of(name: str) -> str:
-    """`name` without the number of corners that some readers put behind "polygon"."""
-    return "polygon" if name.startswith("polygon") else name
-
-
-def topological_dim(name: str) -> int:
-    stem = name.rstrip("0123456789")
-    return _DIMS.get(stem, 3)
-
-
 def element_of(where: str, name: str, count: int) -> AbstractElement:
     if name == "polygon":
         return PolyN(count)
@@ -72,55 +60,36 @@ _NODE, _FACET, _REGION = "node_set:", "facet_set:", "region:"
 _PHYSICAL, _BETWEEN = "gmsh:physical", " + "
 
 
-class Parts(NamedTuple):
-    """The content of a file beside points and cells."""
-
-    blocks: list
-    point_data: dict
-    cell_data: dict
-    point_sets: dict
-    cell_sets: dict
-    field_data: dict
-
-
-class Sets(NamedTuple):
-    nodes: dict[str, np.ndarray]
-    facets: dict[str, np.ndarray]
-    regions: dict[str, np.ndarray]
-
-
-def packed(mesh: Mesh, facet_type: str, suffix: str) -> Parts:
-    """Sets of `mesh`: as values of points and cells, or in INP files as sets."""
-    facets = [np.asarray(f) for f in mesh.facet_sets.values() if len(f)]
-    blocks, number, starts = [], {}, {}
+def packed(mesh: Mesh, facet_type: str, suffix: str) -> tuple[list, dict[str, dict]]:
+    """Sets of `mesh`, as values of points and cells or in INP files as sets: the cells that
+    they need, and what meshio calls the rest."""
+    facets = {name: np.asarray(f) for name, f in mesh.facet_sets.items() if len(f)}
+    blocks, number = [], {}
     if facets:
-        every = np.concatenate(facets)
+        every = np.concatenate(list(facets.values()))
         _, first, row = np.unique(
             np.sort(every, axis=1), axis=0, return_index=True, return_inverse=True
         )
         blocks = [(facet_type, every[first])]
-        stops = np.cumsum([len(f) for f in facets])
-        names = [name for name, f in mesh.facet_sets.items() if len(f)]
-        number = dict(zip(names, np.split(row.ravel(), stops[:-1]), strict=True))
-        starts = {name: number[name] for name in names}
+        stops = np.cumsum([len(f) for f in facets.values()])
+        number = dict(zip(facets, np.split(row.ravel(), stops[:-1]), strict=True))
     nodes = {name: np.asarray(ids) for name, ids in mesh.node_sets.items()}
     regions = {name: np.asarray(ids) for name, ids in mesh.regions.items()}
+    nothing = np.zeros(0, int)
+    lists = {n: [ids, nothing][: 1 + len(blocks)] for n, ids in regions.items()}
+    lists |= {n: [nothing, ids] for n, ids in number.items()}
     if suffix == ".inp":
-        nothing = np.zeros(0, int)
-        cell_sets = {name: [ids, *[nothing] * len(blocks)] for name, ids in regions.items()}
-        cell_sets |= {name: [nothing, ids] for name, ids in starts.items()}
-        return Parts(blocks, {}, {}, nodes, cell_sets, {})
+        return blocks, {"point_sets": nodes, "cell_sets": lists}
     size = mesh.num_cells, len(blocks[0][1]) if blocks else 0
     cell_data = {_REGION + n: _masks(size, 0, ids, blocks) for n, ids in regions.items()}
     cell_data |= {_FACET + n: _masks(size, 1, ids, blocks) for n, ids in number.items()}
+    data = {}
     point_data = {_NODE + n: _mask(mesh.num_nodes, ids) for n, ids in nodes.items()}
     if suffix == ".msh":
         point_data = {name: mask.astype(float) for name, mask in point_data.items()}
-        lists = {n: [ids, np.zeros(0, int)] for n, ids in regions.items()}
-        lists |= {n: [np.zeros(0, int), ids] for n, ids in number.items()}
-        tags, names = _physical(lists, size[: 1 + len(blocks)], mesh.element.dim)
-        return Parts(blocks, point_data, tags, {}, {}, names)
-    return Parts(blocks, point_data, cell_data, {}, {}, {})
+        cell_data, names = _physical(lists, size[: 1 + len(blocks)], mesh.element.dim)
+        data["field_data"] = names
+    return blocks, {"point_data": point_data, "cell_data": cell_data} | data
 
 
 def _physical(lists: dict, sizes, dim: int) -> tuple[dict, dict]:
@@ -153,24 +122,23 @@ def _masks(size, which: int, ids, blocks) -> list[np.ndarray]:
 
 def unpacked(
     raw: Any, own: list[int], facet_blocks: list[int], fixed: Repaired, count: int
-) -> Sets:
-    """Sets of a file that was read, in the numbers of the repaired mesh."""
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Node sets, facet sets and regions of a file that was read, in the numbers of the
+    repaired mesh."""
     new = np.full(count, -1)
     kept = np.setdiff1d(np.arange(count), np.concatenate([fixed.merged, fixed.removed]))
     new[kept] = np.arange(len(kept))
     nodes = {n: np.flatnonzero(v) for n, v in _named(raw.point_data, _NODE)}
     nodes |= {n: np.asarray(ids, int) for n, ids in raw.point_sets.items()}
-    lists = {
-        n: [np.flatnonzero(v) for v in values] for n, values in _named(raw.cell_data, _REGION)
-    }
-    lists |= {n: [np.flatnonzero(v) for v in vs] for n, vs in _named(raw.cell_data, _FACET)}
+    masks = [*_named(raw.cell_data, _REGION), *_named(raw.cell_data, _FACET)]
+    lists = {n: [np.flatnonzero(v) for v in values] for n, values in masks}
     lists |= {n: [_ids(v) for v in vs] for n, vs in raw.cell_sets.items()}
     for name, (group, _) in raw.field_data.items():
         tags = raw.cell_data.get(_PHYSICAL, [])
         rows = [np.flatnonzero(np.asarray(t) == group) for t in tags]
         for part in () if name.startswith("rest_") or not tags else name.split(_BETWEEN):
-            known = lists.get(part)
-            lists[part] = rows if known is None else _together(known, rows)
+            known = lists.get(part, rows)
+            lists[part] = [np.union1d(a, b) for a, b in zip(known, rows, strict=True)]
     _check_sets(nodes, lists, count, [len(block.data) for block in raw.cells])
     start = np.cumsum([0, *(len(raw.cells[i].data) for i in own)])
     regions, facets = {}, {}
@@ -182,7 +150,7 @@ def unpacked(
         if sum(map(len, sides)):
             facets[name] = new[np.concatenate(sides)]
     renumbered = {name: new[ids] for name, ids in nodes.items()}
-    return Sets({n: ids[ids >= 0] for n, ids in renumbered.items()}, facets, regions)
+    return {n: ids[ids >= 0] for n, ids in renumbered.items()}, facets, regions
 
 
 def _check_sets(nodes: dict, lists: dict, num_nodes: int, num_cells: list[int]) -> None:
@@ -204,10 +172,6 @@ def _unknown(name: str, kind: str, found: str) -> str:
         f"import_mesh: the set `{name}` names {kind} that the file does not hold, which has "
         f"{found}. Export it again."
     )
-
-
-def _together(first: list, second: list) -> list[np.ndarray]:
-    return [np.union1d(a, b) for a, b in zip(first, second, strict=True)]
 
 
 def _ids(value: Any) -> np.ndarray:
@@ -271,22 +235,14 @@ def export_mesh(
     _check.finite(where, "points", points, "Repair the mesh first.")
     if points.shape[1] == 2:
         points = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
-    parts = packed(mesh, facet_type_of(where, mesh.element), suffix)
-    if suffix not in _DATA | {".inp"}:
-        parts = Parts([], {}, {}, {}, {}, {})
+    cells: list[Any] = [(type_of(where, mesh.element), np.asarray(mesh.cells))]
+    data: dict[str, Any] = {}
+    if suffix in _DATA | {".inp"}:
+        blocks, data = packed(mesh, facet_type_of(where, mesh.element), suffix)
+        cells += blocks
     import meshio
 
-    blocks = [(type_of(where, mesh.element), np.asarray(mesh.cells)), *parts.blocks]
-    whole = meshio.Mesh(
-        points,
-        blocks,
-        point_data=parts.point_data,
-        cell_data=parts.cell_data,
-        point_sets=parts.point_sets,
-        cell_sets=parts.cell_sets,
-        field_data=parts.field_data,
-    )
-    _write(where, file, whole, suffix)
+    _write(where, file, meshio.Mesh(points, cells, **data), suffix)
 
 
 def import_mesh(
@@ -318,8 +274,8 @@ def import_mesh(
     _check.positive(where, "unit", unit, "m", "Write unit=sorojax.units.mm.")
     _files.read(where, file, max_bytes)
     raw = _read(where, file)
-    kinds = [kind_of(block.type) for block in raw.cells]
-    dims = [topological_dim(kind) for kind in kinds]
+    kinds = [block.type for block in raw.cells]
+    dims = [block.dim for block in raw.cells]
     most = max(dims, default=0)
     if most < 2:
         raise ValueError(
@@ -338,9 +294,9 @@ def import_mesh(
     points = _placed(where, file.name, np.asarray(raw.points, dtype=float), cells, most) * unit
     fixed = repair(points, cells, element, tol=0.0)
     facet_blocks = [i for i, dim in enumerate(dims) if dim == most - 1]
-    sets = unpacked(raw, own, facet_blocks, fixed, len(points))
-    facets = sets.facets or {"boundary": boundary_facets(fixed.mesh)}
-    return Mesh(fixed.mesh.points, fixed.mesh.cells, element, sets.nodes, facets, sets.regions)
+    nodes, facets, regions = unpacked(raw, own, facet_blocks, fixed, len(points))
+    facets = facets or {"boundary": boundary_facets(fixed.mesh)}
+    return Mesh(fixed.mesh.points, fixed.mesh.cells, element, nodes, facets, regions)
 
 
 def _ending(where: str, file: Path) -> str:
@@ -378,8 +334,7 @@ def _placed(where: str, name: str, points, cells, dim: int) -> np.ndarray:
 
 
 def _write(where: str, file: Path, whole, suffix: str) -> None:
-    with tempfile.TemporaryDirectory(dir=file.parent, prefix=f".{file.stem}.") as folder:
-        made = Path(folder) / file.name
+    with _files.made_beside(file) as made:
         try:
             with _quiet():
                 whole.write(made, **_OPTIONS.get(suffix, {}))
@@ -392,7 +347,6 @@ def _write(where: str, file: Path, whole, suffix: str) -> None:
                 f"{where}: {file.suffix} cannot hold this mesh ({_short(reason)}). Write a "
                 ".vtu file, which holds every cell and set."
             ) from reason
-        os.replace(made, file)
 
 
 def _read(where: str, file: Path):

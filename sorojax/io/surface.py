@@ -2,7 +2,6 @@
 
 import functools
 import io
-import json
 import os
 import re
 import zipfile
@@ -13,9 +12,8 @@ from typing import BinaryIO, NamedTuple, NoReturn
 import numpy as np
 
 from sorojax import _check
-from sorojax.io import (
-    _files,
-)
+from sorojax.io import _files
+from sorojax.io.animation import ARRAY, UPRIGHT, Document
 from sorojax.sdf import Surface
 from sorojax.sdf.surface.marching import Curve
 from sorojax.units import mm
@@ -25,14 +23,15 @@ from sorojax.units import mm
 
 _XML_HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n'
 _CONTENT_TYPES = (
-    _XML_HEAD + '<Types xmlns="http://schemas.openxmlorg/package/2006/content-types">'
+    _XML_HEAD + '<Types xmlns="http://schemas.openxmlformats.org/package/2006/content-types">'
     '<Default Extension="rels" '
     'ContentType="application/vnd.openxmlformats-package.relationships+xml"/>'
     '<Default Extension="model" '
     'ContentType="application/vnd.ms-package.3dmanufacturing-3dmodel+xml"/></Types>'
 )
 _LINKS = (
-    _XML_HEAD + '<Relationships xmlns="http://schemas.openxmlorg/package/2006/relationships">'
+    _XML_HEAD
+    + '<Relationships xmlns="http://schemas.openxmlformats.org/package/2006/relationships">'
     '<Relationship Target="/3D/3dmodel.model" Id="rel0" '
     'Type="http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"/></Relationships>'
 )
@@ -66,40 +65,14 @@ def write_threemf(file: BinaryIO, surface: Surface) -> None:
 # GLB (binary glTF 2.0): for viewers on the web
 
 
-_FLOAT, _UINT = 5126, 5125
-
-
 def write_glb(file: BinaryIO, surface: Surface) -> None:
     """One mesh in metres, turned so that z points up in viewers, where y does."""
-    points = surface.vertices.astype("<f4")
-    rows = surface.triangles.astype("<u4")
-    views = [
-        {"buffer": 0, "byteOffset": 0, "byteLength": points.nbytes, "target": 34962},
-        {"buffer": 0, "byteOffset": points.nbytes, "byteLength": rows.nbytes, "target": 34963},
-    ]
-    position = {
-        "bufferView": 0, "componentType": _FLOAT, "count": len(points), "type": "VEC3",
-        "min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist(),
-    }  # fmt: skip
-    index = {"bufferView": 1, "componentType": _UINT, "count": rows.size, "type": "SCALAR"}
-    scene = {
-        "asset": {"version": "2.0", "generator": "sorojax"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
-        "accessors": [position, index],
-        "bufferViews": views,
-        "buffers": [{"byteLength": points.nbytes + rows.nbytes}],
-    }
-    text = json.dumps(scene).encode()
-    text += b" " * (-len(text) % 4)
-    body = points.nbytes + rows.nbytes
-    header = np.array([0x46546C67, 2, 12 + 8 + len(text) + 8 + body], "<u4")
-    file.write(header.tobytes() + np.array([len(text), 0x4E4F534A], "<u4").tobytes() + text)
-    file.write(np.array([body, 0x004E4942], "<u4").tobytes())
-    file.write(points.tobytes())
-    file.write(rows.tobytes())
+    document = Document()
+    position = document.floats(surface.vertices, "VEC3", ends=True, target=ARRAY)
+    rows = document.indices(surface.triangles)
+    shape = {"attributes": {"POSITION": position}, "indices": rows}
+    nodes = [{"mesh": 0, "rotation": UPRIGHT}]
+    document.write(file, nodes, [{"primitives": [shape]}])
 
 
 # SVG: curves of a plane shape, in millimetres

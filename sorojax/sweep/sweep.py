@@ -32,7 +32,7 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -70,13 +70,8 @@ class Store:
         target = self.path(key)
         target.parent.mkdir(parents=True, exist_ok=True)
         check = np.frombuffer(digest(result).encode(), np.uint8)
-
-        named = {f"result.{name}": value for name, value in result.items()}
-
-        def fill(file):
-            _archive.write(file, named | {_CHECK: check})
-
-        _files.write(target, fill)
+        named = {f"result.{name}": value for name, value in result.items()} | {_CHECK: check}
+        _files.write(target, lambda file: _archive.write(file, named))
 
     def read(self, key: str) -> Arrays | None:
         """The result of a key; None if there is none, or a damaged one."""
@@ -154,7 +149,7 @@ class Swept:
     """
 
     result: Arrays
-    keys: tuple[str, ...] = field(repr=False)
+    keys: tuple[str, ...]
     computed: int
     found: int
     hash: str
@@ -222,17 +217,11 @@ def sweep(
     """
     blocks = _blocks(designs, chunk)
     code = _code(function) if version is None else version
-    jobs = {}
+    jobs, order = {}, []
     for number, block in enumerate(blocks):
         own = None if seed is None else _seed(seed, number)
-        key = _key(code, config, block, own)
-        extra = () if config is None else (config,)
-        extra = extra if own is None else (*extra, own)
-        jobs.setdefault(key, (block, extra))
-    order = tuple(
-        _key(code, config, b, None if seed is None else _seed(seed, n))
-        for n, b in enumerate(blocks)
-    )
+        order.append(_key(code, config, block, own))
+        jobs.setdefault(order[-1], (block, tuple(x for x in (config, own) if x is not None)))
     results = {key: found for key in jobs if (found := store.read(key)) is not None}
     known = len(results)
     _progress.report("sweep", known, len(jobs))
@@ -244,8 +233,9 @@ def sweep(
             "out, or give a concurrent.futures executor or sweep.dask_local(workers)."
         )
     _run_all(function, missing, results, store, executor, len(jobs), retries)
-    joined = _joined([results[key] for key in order])
-    return Swept(joined, order, len(missing), known, digest(joined))
+    parts = [results[key] for key in order]
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return Swept(joined, tuple(order), len(missing), known, digest(joined))
 
 
 def _run_all(function, missing, results, store, executor, total, retries) -> None:
@@ -316,10 +306,6 @@ def _blocks(designs: PyTree, chunk: int) -> list[PyTree]:
         jax.tree.map(lambda leaf, k=k: leaf[k : k + chunk], designs)
         for k in range(0, count, chunk)
     ]
-
-
-def _joined(results: list[Arrays]) -> Arrays:
-    return {k: np.concatenate([part[k] for part in results]) for k in results[0]}
 
 
 def _seed(seed: int, number: int) -> np.integer:

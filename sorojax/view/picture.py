@@ -3,7 +3,7 @@
 A picture is what `show` returns: a figure that a notebook displays and that can be written.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from sorojax.view import style
-from sorojax.view.raster.camera import Lens, View, box_corners, camera_at, fit
+from sorojax.view.raster import solid
+from sorojax.view.raster.camera import Lens, View
 from sorojax.view.raster.plane import bar_beside, draw_plane, name_parts, plane_figure
 from sorojax.view.raster.scene import Scene
-from sorojax.view.raster.solid import bar_of, draw_solid, lens_of, solid_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -86,6 +86,12 @@ class Picture:
         return f"Picture: {wide:.0f} x {high:.0f} pixels; .save('name.png'), .figure"
 
 
+def plotted(figure: "Figure", axes: "Iterable[Axes]", title: str = "") -> Picture:
+    """A figure whose plots in `axes` are complete."""
+    style.title(figure, title)
+    return Picture(figure, tuple(Panel(each) for each in axes))
+
+
 def show_scene(scene: Scene, *, view: View = "iso", renderer: str = "auto") -> Picture:
     """One scene, in the plane with axes or shaded in space.
 
@@ -96,8 +102,8 @@ def show_scene(scene: Scene, *, view: View = "iso", renderer: str = "auto") -> P
     """
     if scene.dim == 2:
         figure, axes = plane_figure(scene)
-        return Picture(figure, (Panel(axes),))
-    figure, lens = solid_figure(scene, view=view, renderer=renderer)
+        return plotted(figure, [axes], scene.title)
+    figure, lens = solid.solid_figure(scene, view=view, renderer=renderer)
     return Picture(figure, (Panel(figure.axes[0], lens),))
 
 
@@ -123,26 +129,20 @@ def _plane(scenes, names, title: str, width: float) -> Picture:
     rows, columns = _grid(len(scenes), aspect)
     height = min(0.7 + rows * (0.35 + aspect * (width - 1.4) / columns), 12.0)
     figure = style.new_figure(width, max(height, 2.7 if scenes[0].scale else 2.0))
-    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
-    for spare in grid[len(scenes) :]:
-        spare.remove()
-    for axes, scene, name in zip(grid, scenes, names, strict=False):
+    grid = style.grid(figure, len(scenes), columns, sharex=True, sharey=True)
+    for axes, scene, name in zip(grid, scenes, names, strict=True):
         draw_plane(axes, scene)
         style.dress_plane(axes, lower, upper)
         axes.set_title(name, fontsize=style.LABEL, color=style.INK)
         axes.label_outer()
     name_parts(grid[columns - 1], scenes[0])
     if scenes[0].scale is not None:
-        bar_beside(figure, list(grid[: len(scenes)]), scenes[0].scale)
-    style.title(figure, title)
-    return Picture(figure, tuple(Panel(axes) for axes in grid[: len(scenes)]))
+        bar_beside(figure, grid, scenes[0].scale)
+    return plotted(figure, grid, title)
 
 
 def _solid(scenes, names, view: View, renderer: str, title: str, width: float) -> Picture:
-    corners = box_corners(*scenes[0].box)
-    flat = fit(camera_at(view), corners, (100, 100)).raw(corners)[:, :2]
-    span = flat.max(axis=0) - flat.min(axis=0)
-    aspect = float(np.clip(span[1] / max(span[0], 1e-12), 0.3, 1.6))
+    aspect = float(np.clip(solid.aspect_of(scenes[0], view), 0.3, 1.6))
     rows, columns = _grid(len(scenes), aspect)
     right = 1.05 if scenes[0].scale is not None else 0.1
     each = (width - right) / columns
@@ -155,35 +155,23 @@ def _solid(scenes, names, view: View, renderer: str, title: str, width: float) -
         low = height - head - (row + 1) * (0.28 + aspect * each)
         place = (column * each / width, low / height, each / width, aspect * each / height)
         axes = figure.add_axes(place)
-        box = axes.get_window_extent()
-        size = max(int(round(box.width)), 16), max(int(round(box.height)), 16)
-        lens = lens_of([scenes[0]] if scene.extent is not None else scenes, view, size)
-        draw_solid(figure, axes, replace(scene, title=""), renderer=renderer, lens=lens)
-        figure.text(
-            (column + 0.5) * each / width,
-            (low + aspect * each) / height,
-            name,
-            ha="center",
-            va="bottom",
-            fontsize=style.LABEL,
-            color=style.INK,
-        )
+        shown = scenes if scene.extent is None else scenes[:1]
+        lens = solid.lens_of(shown, view, solid.size_of(axes))
+        solid.draw_solid(figure, axes, replace(scene, title=""), renderer=renderer, lens=lens)
+        middle, above = (column + 0.5) * each / width, (low + aspect * each) / height
+        style.write(figure, middle, above, name, va="bottom", fontsize=style.LABEL)
         drawn.append(Panel(axes, lens))
     if scenes[0].scale is not None:
         place = (1 - 0.95 / width, 0.15, 0.16 / width, 0.7)
-        bar_of(figure, scenes[0].scale, figure.add_axes(place))
+        solid.bar_of(figure, scenes[0].scale, figure.add_axes(place))
     if title:
-        figure.text(
-            0.5,
-            1 - 0.12 / height,
-            title,
-            ha="center",
-            va="top",
-            fontsize=style.TITLE,
-            color=style.INK,
-            fontweight="bold",
-        )
+        style.heading(figure, 0.5, 1 - 0.12 / height, title)
     return Picture(figure, tuple(drawn))
+
+
+def spread(count: int, most: int) -> list[int]:
+    """Up to `most` of `count` states, evenly spaced from the first to the last."""
+    return np.unique(np.round(np.linspace(0, count - 1, most)).astype(int)).tolist()
 
 
 def _grid(count: int, aspect: float) -> tuple[int, int]:

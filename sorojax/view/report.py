@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Union
 
 from sorojax.view.film.film import Film
 from sorojax.view.picture import Picture
-from sorojax.view.style import png
+from sorojax.view.style import asset, png
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,13 +50,9 @@ def html_report(title: str, sections: Sequence[Section], *, lead: str = "") -> s
     links = "".join(
         f'<a href="#s{k}">{escape(section.heading)}</a>' for k, section in enumerate(sections)
     )
-    return _PAGE.format(
-        title=escape(title),
-        style=_STYLE,
-        lead=_paragraphs(lead, "lead"),
-        links=links,
-        body=body,
-    )
+    parts = {"lead": _paragraphs(lead, "lead"), "links": links, "body": body}
+    look = "\n" + asset("report.css")
+    return asset("report.html").format(title=escape(title), style=look, **parts)
 
 
 def format_number(value: float | int | str) -> str:
@@ -119,59 +115,3 @@ def _mark(holds: bool | None) -> str:
         return ""
     word, sign = ("holds", "\u2713") if holds else ("missed", "\u2717")
     return f'<span class="{word}">{sign} {word}</span>'
-
-
-_PAGE = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>{style}</style>
-</head>
-<body>
-<header><h1>{title}</h1>
-{lead}
-<nav>{links}</nav></header>
-<main>
-{body}
-</main>
-</body>
-</html>
-"""
-
-_STYLE = """
-:root { color-scheme: light dark; --ink: #1f2430; --soft: #5b6270; --paper: #ffffff;
-  --rule: #e1e4e9; --accent: #0067a3; --good: #00734f; --bad: #b03a00; --row: #f6f7f9; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e6e8ec; --soft: #a3aab6;
-  --paper: #16181d; --rule: #333842; --accent: #6bb8ec; --good: #4cc79c; --bad: #f08a5d;
-  --row: #1d2027; } }
-* { box-sizing: border-box; }
-body { margin: 0; background: var(--paper); color: var(--ink);
-  font: 16px/1.55 system-ui, -apple-system, "Segoe UI", "Helvetica Neue", Arial, sans-serif; }
-header, main { max-width: 900px; margin: 0 auto; padding: 0 24px; }
-header { padding-top: 40px; }
-h1 { font-size: 30px; line-height: 1.2; margin: 0 0 8px; letter-spacing: -0.01em; }
-h2 { font-size: 21px; line-height: 1.3; margin: 40px 0 8px; padding-top: 16px;
-  border-top: 1px solid var(--rule); }
-p { margin: 8px 0; max-width: 68ch; }
-.lead { color: var(--soft); font-size: 18px; }
-nav { display: flex; flex-wrap: wrap; gap: 4px 18px; margin: 16px 0 0; font-size: 14px; }
-a { color: var(--accent); text-decoration: none; }
-a:hover { text-decoration: underline; }
-figure { margin: 16px 0; }
-img { display: block; max-width: 100%; height: auto; margin: 0 auto; padding: 8px;
-  background: #ffffff; border: 1px solid var(--rule); border-radius: 8px; }
-figcaption { color: var(--soft); font-size: 14px; margin-top: 6px; max-width: 78ch; }
-.table { overflow-x: auto; margin: 16px 0; }
-table { border-collapse: collapse; width: 100%; font-size: 15px;
-  font-variant-numeric: tabular-nums; }
-th { text-align: left; font-weight: 600; color: var(--soft); font-size: 13px; }
-th, td { padding: 6px 12px 6px 8px; border-bottom: 1px solid var(--rule); }
-tbody tr:nth-child(even) { background: var(--row); }
-.n { text-align: right; }
-.holds { color: var(--good); white-space: nowrap; }
-.missed { color: var(--bad); font-weight: 600; white-space: nowrap; }
-main { padding-bottom: 64px; }
-@media print { nav { display: none; } figure, tr { break-inside: avoid; } }
-"""

@@ -3,67 +3,61 @@
 import functools
 import importlib
 import inspect
+from collections.abc import Callable
 from typing import Any
 
 from sorojax import _explain
-from sorojax.view.picture import Picture
+from sorojax.view.picture import Picture, show_scene
 from sorojax.view.raster.scene import Scene
 
-#: Noun, module of this floor, function. The class itself is not imported.
-_DRAWN_BY = {
-    "sorojax.sdf.base.AbstractSdf": ("draw.shapes", "show_shape"),
-    "sorojax.sdf.surface.marching.Surface": ("draw.shapes", "show_surface"),
-    "sorojax.mesh.mesh.Mesh": ("draw.meshes", "show_cells"),
-    "sorojax.fem.problem.Problem": ("draw.bodies", "show_problem"),
-    "sorojax.fem.equilibrium.solve.Solution": ("draw.bodies", "show_solution"),
-    "sorojax.fem.equilibrium.solve.Path": ("draw.bodies", "show_path"),
-    "sorojax.fem.dynamics.trajectory.Trajectory": ("draw.bodies", "show_path"),
-    "sorojax.fem.stability.modal.Modes": ("draw.bodies", "show_vibration"),
-    "sorojax.fem.stability.buckling.CriticalLoads": ("draw.bodies", "show_buckling"),
-    "sorojax.fem.stability.continuation.CriticalPoint": ("draw.bodies", "show_buckling"),
-    "sorojax.rod.model.rod.Rod": ("draw.rods", "show_rod"),
-    "sorojax.rod.model.assembly.Assembly": ("draw.rods", "show_rod"),
-    "sorojax.rod.model.section.Section": ("draw.rods", "show_section"),
-    "sorojax.rod.model.basis.StrainBasis": ("draw.plots", "show_basis"),
-    "sorojax.rod.dynamics.rollout.Trajectory": ("draw.runs", "show_rollout"),
-    "sorojax.rod.statics.equilibrium.Solution": ("draw.rods", "show_posed"),
-    "sorojax.rod.statics.path.Path": ("draw.rods", "show_posed"),
-    "sorojax.material.hyperelastic.AbstractHyperelastic": ("draw.plots", "show_material"),
-    "sorojax.reduction.backbone.Backbone": ("draw.plots", "show_snapshots"),
-    "sorojax.robots.bellows.BellowsActuator": ("draw.robots", "show_robot"),
-    "sorojax.robots.printable.BendingActuator": ("draw.robots", "show_robot"),
-    "sorojax.robots.locomotion.Crawler": ("draw.robots", "show_robot"),
-    "sorojax.robots.printable.Finger": ("draw.robots", "show_robot"),
-    "sorojax.robots.printable.Hand": ("draw.robots", "show_robot"),
-    "sorojax.robots.printable.Manipulator": ("draw.robots", "show_robot"),
-    "sorojax.robots.printable.Bellows": ("draw.robots", "show_robot"),
-    "sorojax.robots.printable.PlanarActuator": ("draw.robots", "show_robot"),
-    "sorojax.robots.bellows.PneuNet": ("draw.robots", "show_robot"),
-    "sorojax.robots.locomotion.Walker": ("draw.robots", "show_robot"),
-    "sorojax.robots.models.supply.Model": ("draw.rods", "show_model"),
-    "sorojax.systems.blocks.rod_body.RodBody": ("draw.rods", "show_body"),
-    "sorojax.systems.blocks.rod_body.AssemblyBody": ("draw.rods", "show_body"),
-    "sorojax.systems.blocks.block.AbstractBlock": ("draw.networks", "show_network"),
-    "sorojax.systems.integrate.simulate.Trajectory": ("draw.runs", "show_trajectory"),
-    "sorojax.design.optimise.minimise.Optimised": ("draw.runs", "show_optimised"),
-    "sorojax.design.optimise.minimise.History": ("draw.runs", "show_history"),
-    "sorojax.design.optimise.shape_loop.OptimisedShape": (
-        "draw.bodies",
-        "show_optimised_shape",
-    ),
-    "sorojax.design.part.Part": ("draw.shapes", "show_part"),
-    "sorojax.design.calibration.calibration.Calibration": ("draw.plots", "show_calibration"),
-    "sorojax.material.fit.TensileFit": ("draw.plots", "show_fit"),
-    "sorojax.mesh.repair.Repaired": ("draw.meshes", "show_repaired"),
-    "sorojax.mesh.quality.Quality": ("draw.meshes", "show_quality"),
-    "sorojax.sdf.surface.marching.Curve": ("draw.shapes", "show_curve"),
-    "sorojax.io.animation.MovingSurface": ("draw.shapes", "show_moving"),
-    "sorojax.sweep.sweep.Swept": ("draw.plots", "show_sweep"),
-    "sorojax.vision.discs.Tracks": ("draw.plots", "show_tracks"),
-    "sorojax.view.rigging.rig.Rig": ("draw.rods", "show_rig"),
-    "sorojax.view.draw.plots.Convergence": ("draw.plots", "show_convergence"),
-    "sorojax.view.draw.plots.WorkPrecision": ("draw.plots", "show_work_precision"),
-    "sorojax.view.raster.scene.Scene": ("picture", "show_scene"),
+#: Functions of this floor, and the nouns that they draw: their classes are not imported.
+_PICTURES = {
+    "draw.shapes.show_shape": "sdf.base.AbstractSdf",
+    "draw.shapes.show_surface": "sdf.surface.marching.Surface",
+    "draw.shapes.show_curve": "sdf.surface.marching.Curve",
+    "draw.shapes.show_part": "design.part.Part",
+    "draw.meshes.show_quality": "mesh.quality.Quality",
+    "draw.bodies.show_path": "fem.equilibrium.solve.Path fem.dynamics.trajectory.Trajectory",
+    "draw.bodies.show_vibration": "fem.stability.modal.Modes",
+    "draw.bodies.show_buckling": "fem.stability.buckling.CriticalLoads "
+    "fem.stability.continuation.CriticalPoint",
+    "draw.rods.show_section": "rod.model.section.Section",
+    "draw.networks.show_network": "systems.blocks.block.AbstractBlock",
+    "draw.runs.show_rollout": "rod.dynamics.rollout.Trajectory",
+    "draw.runs.show_trajectory": "systems.integrate.simulate.Trajectory",
+    "draw.runs.show_optimised": "design.optimise.minimise.Optimised",
+    "draw.runs.show_history": "design.optimise.minimise.History",
+    "draw.plots.show_basis": "rod.model.basis.StrainBasis",
+    "draw.plots.show_material": "material.hyperelastic.AbstractHyperelastic",
+    "draw.plots.show_fit": "material.fit.TensileFit",
+    "draw.plots.show_snapshots": "reduction.backbone.Backbone",
+    "draw.plots.show_calibration": "design.calibration.calibration.Calibration",
+    "draw.plots.show_sweep": "sweep.sweep.Swept",
+    "draw.plots.show_tracks": "vision.discs.Tracks",
+    "draw.plots.show_convergence": "view.draw.plots.Convergence",
+    "draw.plots.show_work_precision": "view.draw.plots.WorkPrecision",
+    "picture.show_scene": "view.raster.scene.Scene",
+}
+#: The same of functions that make a scene.
+_SCENES = {
+    "draw.shapes.shape_scene": "sdf.base.AbstractSdf",
+    "draw.shapes.surface_scene": "sdf.surface.marching.Surface",
+    "draw.shapes.moving_scene": "io.animation.MovingSurface",
+    "draw.meshes.mesh_scene": "mesh.mesh.Mesh",
+    "draw.meshes.repaired_scene": "mesh.repair.Repaired",
+    "draw.bodies.problem_scene": "fem.problem.Problem",
+    "draw.bodies.solution_scene": "fem.equilibrium.solve.Solution",
+    "draw.bodies.optimised_shape_scene": "design.optimise.shape_loop.OptimisedShape",
+    "draw.rods.rod_scene": "rod.model.rod.Rod rod.model.assembly.Assembly",
+    "draw.rods.posed_scene": "rod.statics.equilibrium.Solution rod.statics.path.Path",
+    "draw.rods.model_scene": "robots.models.supply.Model",
+    "draw.rods.body_scene": "systems.blocks.rod_body.RodBody "
+    "systems.blocks.rod_body.AssemblyBody",
+    "draw.rods.rig_scene": "view.rigging.rig.Rig",
+    "draw.robots.robot_scene": "robots.bellows.BellowsActuator robots.bellows.PneuNet "
+    "robots.locomotion.Crawler robots.locomotion.Walker robots.printable.BendingActuator "
+    "robots.printable.Bellows robots.printable.Finger robots.printable.Hand "
+    "robots.printable.Manipulator robots.printable.PlanarActuator",
 }
 
 
@@ -122,35 +116,53 @@ def options(thing: Any) -> Any:
 
 
 def _known(thing: Any) -> Any:
+    """What draws `thing`."""
+    table = _SCENES | _PICTURES  # the latter where a noun has both
+    if (found := _listed(thing, table)) is None:
+        raise TypeError(
+            f"view.show: got a {type(thing).__name__}, need one of {_nouns(table)}. Register a "
+            "function for other types with view.show.register."
+        )
+    return found if found.__name__.startswith("show_") else _drawing(found)
+
+
+def _listed(thing: Any, table: dict[str, str]) -> Any:
+    """The function of a table for the class of `thing` or the nearest one above it."""
+    listed = {noun: function for function, nouns in table.items() for noun in nouns.split()}
     for kind in type(thing).__mro__:
-        entry = _DRAWN_BY.get(f"{kind.__module__}.{kind.__qualname__}")
-        if entry is not None:
-            module = importlib.import_module(f"sorojax.view.{entry[0]}")
-            return getattr(module, entry[1])
-    names = ", ".join(sorted(name.rsplit(".", 1)[1] for name in _DRAWN_BY))
-    raise TypeError(
-        f"view.show: got a {type(thing).__name__}, need one of {names}. Register a function "
-        "for other types with view.show.register."
-    )
+        path = f"{kind.__module__}.{kind.__qualname__}".removeprefix("sorojax.")
+        if path in listed:
+            module, _, function = listed[path].rpartition(".")
+            return getattr(importlib.import_module(f"sorojax.view.{module}"), function)
+    return None
+
+
+def _nouns(table: dict[str, str]) -> str:
+    names = {noun.rpartition(".")[2] for nouns in table.values() for noun in nouns.split()}
+    return ", ".join(sorted(names))
+
+
+@functools.cache
+def _drawing(make: Callable[..., Scene]) -> Callable[..., Picture]:
+    """The function that draws what `make` puts together, with the options of both."""
+
+    @functools.wraps(make)
+    def draw(*args: Any, view: Any = "iso", renderer: str = "auto", **options: Any) -> Picture:
+        return show_scene(make(*args, **options), view=view, renderer=renderer)
+
+    own = inspect.signature(make)
+    more = inspect.signature(show_scene).parameters
+    listed = [*own.parameters.values(), more["view"], more["renderer"]]
+    listed.sort(key=lambda parameter: parameter.kind)  # `**options` last
+    draw.__signature__ = own.replace(parameters=listed)  # type: ignore[attr-defined]
+    return draw
 
 
 # Nouns as scenes: what `show` draws, to be put together anew
 
 
-#: Noun, module of this floor, function that makes its scene.
-_SCENES = {
-    "sorojax.sdf.base.AbstractSdf": ("draw.shapes", "shape_scene"),
-    "sorojax.sdf.surface.marching.Surface": ("draw.shapes", "surface_scene"),
-    "sorojax.mesh.mesh.Mesh": ("draw.meshes", "mesh_scene"),
-    "sorojax.fem.problem.Problem": ("draw.bodies", "problem_scene"),
-    "sorojax.fem.equilibrium.solve.Solution": ("draw.bodies", "solution_scene"),
-    "sorojax.rod.model.rod.Rod": ("draw.rods", "rod_scene"),
-    "sorojax.rod.model.assembly.Assembly": ("draw.rods", "rod_scene"),
-}
-
-
 def scene_of(thing: Any, *at: Any, **options: Any) -> Scene:
-    """A shape, surface, mesh, problem, solution, rod or assembly before it is drawn.
+    """A shape, surface, mesh, body, rod, assembly, rig or robot before it is drawn.
 
     Its `parts` may be joined with those of other scenes and shown as one.
 
@@ -165,13 +177,9 @@ def scene_of(thing: Any, *at: Any, **options: Any) -> Scene:
     Example:
         `view.show(view.merge_scenes(view.scene_of(ball), view.scene_of(hand, q)), view="top")`
     """
-    for kind in type(thing).__mro__:
-        entry = _SCENES.get(f"{kind.__module__}.{kind.__qualname__}")
-        if entry is not None:
-            module = importlib.import_module(f"sorojax.view.{entry[0]}")
-            return getattr(module, entry[1])(thing, *at, **options)
-    names = ", ".join(sorted(name.rsplit(".", 1)[1] for name in _SCENES))
-    raise TypeError(
-        f"view.scene_of: got a {type(thing).__name__}, need one of {names}. Make a view.Scene "
-        "of its parts."
-    )
+    if (make := _listed(thing, _SCENES)) is None:
+        raise TypeError(
+            f"view.scene_of: got a {type(thing).__name__}, need one of {_nouns(_SCENES)}. Make "
+            "a view.Scene of its parts."
+        )
+    return make(thing, *at, **options)

@@ -5,6 +5,7 @@ Figures are made without pyplot, so they need no display and may be drawn in thr
 
 import io
 from collections.abc import Iterable, Sequence
+from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,16 +13,19 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.text import Text
 
 #: Okabe and Ito's palette, safe for colour-blind readers; black is kept for references.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 INK, GREY, LIGHT = "#1f2430", "#8a8f98", "#d9dce1"
 REFERENCE = "#1f2430"
 FIELD, SIGNED = "viridis", "coolwarm"
+AXES = ("#c0392b", "#1e8449", "#1f5fa8")
 #: Bodies, what acts on them, what holds them, what they rest on.
 BODY, LOAD, HOLD, OBSTACLE = "#c9d3df", "#D55E00", "#1f2430", "#b9a888"
 
 TITLE, LABEL, SMALL = 12.0, 10.0, 9.0
+DASHES = (0, (4, 2))
 _REFERENCE_WORDS = ("reference", "target", "setpoint", "set-point")
 
 
@@ -35,6 +39,14 @@ def new_figure(width: float, height: float, layout: Any = "constrained") -> "Fig
         figure.get_layout_engine().set(w_pad=0.08, h_pad=0.08)  # type: ignore[union-attr]
     FigureCanvasAgg(figure)
     return figure
+
+
+def grid(figure: "Figure", count: int, columns: int, **options: Any) -> "list[Axes]":
+    """`count` axes row by row."""
+    every = figure.subplots(-(-count // columns), columns, squeeze=False, **options).ravel()
+    for spare in every[count:]:
+        spare.remove()
+    return list(every[:count])
 
 
 def height_for(width: float, lower, upper) -> float:
@@ -73,6 +85,18 @@ def title(figure: "Figure", text: str) -> None:
         figure.suptitle(text, fontsize=TITLE, color=INK, fontweight="bold")
 
 
+def write(
+    on: Any, x: float, y: float, text: str, ha: str = "center", va: str = "center", **look: Any
+) -> "Text":
+    """Small dark text on axes or a figure, `look` as of matplotlib."""
+    return on.text(x, y, text, ha=ha, va=va, **({"fontsize": SMALL, "color": INK} | look))
+
+
+def heading(on: Any, x: float, y: float, text: str, va: str = "top") -> None:
+    """A title where the layout does not place it."""
+    write(on, x, y, text, va=va, fontsize=TITLE, fontweight="bold")
+
+
 def legend(axes: "Axes", **options: Any) -> None:
     """A legend without a frame; nothing if there is nothing to name."""
     if axes.get_legend_handles_labels()[1]:
@@ -92,7 +116,7 @@ def line_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     colours = iter(COLOURS * 4)
     for name in names:
         if any(word in name.lower() for word in _REFERENCE_WORDS):
-            styles[name] = {"color": REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 1.3}
+            styles[name] = {"color": REFERENCE, "linestyle": DASHES, "linewidth": 1.3}
         else:
             styles[name] = {"color": next(colours), "linewidth": 1.7}
     return styles
@@ -103,6 +127,19 @@ def shades(count: int) -> Sequence[Any]:
     from matplotlib import colormaps
 
     return [colormaps[FIELD](v) for v in np.linspace(0.0, 0.88, max(count, 1))]
+
+
+def asset(*names: str) -> str:
+    """Text of files in the folder `assets`, one after the other."""
+    folder = resources.files("sorojax.view") / "assets"
+    return "".join((folder / name).read_text(encoding="utf-8") for name in names)
+
+
+def pale(colour: str, share: float) -> str:
+    """A colour with `share` of white."""
+    from matplotlib.colors import to_hex, to_rgb
+
+    return to_hex(tuple((1 - share) * np.array(to_rgb(colour)) + share))
 
 
 def png(figure: "Figure") -> bytes:

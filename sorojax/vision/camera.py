@@ -143,11 +143,9 @@ def load_camera(path: str | Path) -> Camera:
         record = json.loads(Path(path).read_text())
         record["distortion"] = tuple(float(k) for k in record["distortion"])
         camera = Camera(**record)
-        numbers = np.array(
-            [*camera[:4], *camera.distortion, camera.width, camera.height], float
-        )
-        fine = len(camera.distortion) == 5 and np.all(np.isfinite(numbers))
-        fine = bool(fine and camera.fx > 0 and camera.fy > 0 and camera.width > 0)
+        numbers = [*camera[:4], *camera.distortion, camera.width, camera.height]
+        fine = len(numbers) == 11 and bool(np.all(np.isfinite(np.array(numbers, float))))
+        fine = fine and min(camera.fx, camera.fy, camera.width) > 0
     except (KeyError, TypeError, ValueError, UnicodeDecodeError):
         fine = False
     if not fine:
@@ -175,3 +173,19 @@ def opencv() -> Any:
             "sorojax.vision: need OpenCV. pip install 'sorojax[vision]'"
         ) from missing
     return cv2
+
+
+def marker_words(where: str, dictionary: str) -> Any:
+    """The ArUco dictionary of that name.
+
+    Raises:
+        ValueError: If OpenCV has no such one.
+    """
+    aruco = opencv().aruco
+    code = getattr(aruco, f"DICT_{dictionary.upper()}", None)
+    if code is None:
+        names = [name[5:] for name in dir(aruco) if name.startswith("DICT_")]
+        raise ValueError(
+            f"{where}: got dictionary {dictionary!r}, need one of {', '.join(names)}."
+        )
+    return aruco.getPredefinedDictionary(code)

@@ -131,18 +131,10 @@ def hough_discs(
     found = []
     for index, colour in enumerate(colours):
         smooth = cv2.GaussianBlur(masked(hsv, colour), (0, 0), 1.2)
-        circles = cv2.HoughCircles(
-            smooth,
-            cv2.HOUGH_GRADIENT,
-            1,
-            2 * low,
-            param1=150,
-            param2=14,
-            minRadius=low,
-            maxRadius=high,
-        )
-        for x, y, r in [] if circles is None else circles.reshape(-1, 3):
-            found.append((float(x), float(y), float(r), index))
+        limits = {"param1": 150, "param2": 14, "minRadius": low, "maxRadius": high}
+        circles = cv2.HoughCircles(smooth, cv2.HOUGH_GRADIENT, 1, 2 * low, **limits)
+        for circle in [] if circles is None else circles.reshape(-1, 3):
+            found.append((*circle, index))
     discs = _discs(found)
     return refine_discs(image, discs, colours) if refine else discs
 

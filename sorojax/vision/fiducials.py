@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sorojax._progress import report
-from sorojax.vision.camera import Camera, Pose, opencv
+from sorojax.vision.camera import Camera, Pose, marker_words, opencv
 
 
 class Fiducials(NamedTuple):
@@ -33,7 +33,8 @@ def find_fiducials(image: np.ndarray, dictionary: str = "6X6_250") -> Fiducials:
     """
     cv2 = opencv()
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
-    corners, ids, _ = _detector(dictionary).detectMarkers(grey)
+    words = marker_words("find_fiducials", dictionary)
+    corners, ids, _ = cv2.aruco.ArucoDetector(words).detectMarkers(grey)
     if ids is None:
         return Fiducials(np.zeros(0, int), np.zeros((0, 4, 2)))
     rough = np.array(corners, float).reshape(-1, 4, 2)
@@ -50,13 +51,9 @@ def marker_corners(size: float) -> Float[np.ndarray, "4 3"]:
 def marker_pose(camera: Camera, corners: Float[np.ndarray, "4 2"], size: float) -> Pose:
     """Pose of one marker of side `size` [m] in the camera frame."""
     cv2 = opencv()
-    _, turn, place = cv2.solvePnP(
-        marker_corners(size),
-        corners,
-        camera.matrix,
-        np.array(camera.distortion),
-        flags=cv2.SOLVEPNP_IPPE_SQUARE,
-    )
+    points, bent = marker_corners(size), np.array(camera.distortion)
+    method = cv2.SOLVEPNP_IPPE_SQUARE
+    _, turn, place = cv2.solvePnP(points, corners, camera.matrix, bent, flags=method)
     return Pose(cv2.Rodrigues(turn)[0], place.ravel())
 
 
@@ -85,17 +82,6 @@ def world_frame(
     turn, place = cv2.solvePnPRefineLM(points, pixels, camera.matrix, distortion, turn, place)
     left, _, right = np.linalg.svd(cv2.Rodrigues(turn)[0])
     return Pose(left @ right, place.ravel())
-
-
-def _detector(dictionary: str):
-    aruco = opencv().aruco
-    code = getattr(aruco, f"DICT_{dictionary.upper()}", None)
-    if code is None:
-        names = [name[5:] for name in dir(aruco) if name.startswith("DICT_")]
-        raise ValueError(
-            f"find_fiducials: got dictionary {dictionary!r}, need one of {', '.join(names)}."
-        )
-    return aruco.ArucoDetector(aruco.getPredefinedDictionary(code))
 
 
 def _refined(grey: np.ndarray, corners: np.ndarray) -> np.ndarray:
@@ -228,6 +214,5 @@ def calibrate(images: Iterable[np.ndarray], board: CharucoBoard) -> Camera:
 
 
 def _board(board: CharucoBoard):
-    aruco = opencv().aruco
-    words = aruco.getPredefinedDictionary(getattr(aruco, f"DICT_{board.dictionary.upper()}"))
-    return aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, words)
+    words, size = marker_words("CharucoBoard", board.dictionary), (board.columns, board.rows)
+    return opencv().aruco.CharucoBoard(size, board.square, board.marker, words)

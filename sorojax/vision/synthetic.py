@@ -5,8 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from sorojax.vision.camera import Camera, Pose, opencv, project, rays
+from sorojax.vision.camera import Camera, Pose, marker_words, opencv, project, rays
 from sorojax.vision.discs import Image
+from sorojax.vision.fiducials import marker_corners
 
 #: Blue, green, red of discs that the colours RED, GREEN and BLUE find.
 PAINTS = ((40.0, 40.0, 210.0), (45.0, 190.0, 50.0), (205.0, 70.0, 40.0))
@@ -62,12 +63,9 @@ def draw_plane(
     The picture's middle is the origin of `pose`, x to its right, y up. Exact: every sample
     of a pixel is followed back to the plane, distortion included.
     """
-    corners = np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
-    outline = project(camera, pose.apply(corners * [size[0] / 2, size[1] / 2, 0]))
-    (x0, y0), (x1, y1) = (
-        np.clip(np.floor(outline.min(axis=0)) - 1, 0, None).astype(int),
-        np.minimum(np.ceil(outline.max(axis=0)) + 2, canvas.shape[1::-1]).astype(int),
-    )
+    outline = project(camera, pose.apply(marker_corners(1.0) * [*size, 0]))
+    x0, y0 = np.clip(np.floor(outline.min(axis=0)) - 1, 0, None).astype(int)
+    x1, y1 = np.minimum(np.ceil(outline.max(axis=0)) + 2, canvas.shape[1::-1]).astype(int)
     canvas = canvas.copy()
     if x1 <= x0 or y1 <= y0:
         return canvas
@@ -92,10 +90,9 @@ def draw_plane(
 
 def fiducial_picture(number: int, dictionary: str = "6X6_250") -> np.ndarray:
     """A marker with a quiet zone of one square around it: 10 by 10 squares for 6X6."""
-    aruco = opencv().aruco
-    words = aruco.getPredefinedDictionary(getattr(aruco, f"DICT_{dictionary.upper()}"))
+    words = marker_words("fiducial_picture", dictionary)
     side = words.markerSize + 2
-    picture = aruco.generateImageMarker(words, number, side, borderBits=1)
+    picture = opencv().aruco.generateImageMarker(words, number, side, borderBits=1)
     return np.pad(picture, 1, constant_values=255)
 
 

@@ -67,13 +67,8 @@ def bellows_problem(
     layer = actuator.layer()
     stiff = np.ones(cells.num_cells)
     stiff[mesh.cells_where(cells, lambda p: layer(p) < 0)] = LAYER_STIFFNESS
-    return robots.bellows_problem(
-        actuator,
-        cells,
-        material.Scaled(rubber, stiff),
-        depth=depth,
-        formulation=formulation,
-    )
+    scaled = material.Scaled(rubber, stiff)
+    return robots.bellows_problem(actuator, cells, scaled, depth=depth, formulation=formulation)
 
 
 class Sensitivity(NamedTuple):
@@ -95,19 +90,10 @@ def sensitivity(design: Design, path: Path) -> Sensitivity:
     """d(tip rotation)/d(dimensions) by reverse mode, through mesh motion and equilibrium."""
     value, slopes = jax.value_and_grad(lambda a: tip_rotation(a, design, path))(design.actuator)
     names = (
-        "wall_thickness",
-        "bellow_width",
-        "gap",
-        "base",
-        "chamber_height",
-        "roof",
-        "fillet",
-    )
-    return Sensitivity(
-        float(value),
-        {name: float(getattr(slopes, name)) for name in names},
-        _difference(design, path, 10e-6),
-    )
+        "wall_thickness", "bellow_width", "gap", "base", "chamber_height", "roof", "fillet",
+    )  # fmt: skip
+    gradient = {name: float(getattr(slopes, name)) for name in names}
+    return Sensitivity(float(value), gradient, _difference(design, path, 10e-6))
 
 
 def tip_rotation(actuator: BellowsActuator, design: Design, path: Path) -> Float[Array, ""]:
@@ -122,19 +108,11 @@ def tip_rotation(actuator: BellowsActuator, design: Design, path: Path) -> Float
     )
     tight = fem.Newton(residual_tolerance=1e-12)
     solution = fem.solve(problem, start=path.displacements[-1], newton=tight)
-    low, high = end_face(design)
-    face = (problem.mesh.points + solution.displacement)[jnp.array([low, high])]
+    a = design.actuator
+    ends = [mesh.nearest_node(flat, [a.length, y]) for y in (0.0, a.height)]
+    face = (problem.mesh.points + solution.displacement)[jnp.array(ends)]
     across = face[1] - face[0]
     return jnp.arctan2(-across[0], across[1])
-
-
-def end_face(design: Design) -> tuple[int, int]:
-    """Lowest and highest node of the free end."""
-    a, flat = design.actuator, design.problem.mesh
-    return (
-        mesh.nearest_node(flat, [a.length, 0.0]),
-        mesh.nearest_node(flat, [a.length, a.height]),
-    )
 
 
 def _difference(design: Design, path: Path, h: float) -> float:

@@ -177,44 +177,12 @@ def write(folder: Path, drawn: dict[str, Any], tables, seconds: dict[str, float]
 
 
 def _report(files: dict[str, bytes], tables) -> str:
-    def section(heading, text, table, *pictures):
-        shown = [(caption, files[name]) for name, caption in pictures]
-        return view.Section(heading, text, shown, tables[table])
-
-    return view.html_report(
-        "A bellows actuator, from its drawing to a closed loop",
-        [
-            section(
-                "Closed loop",
-                _TEXT["loop"],
-                "loop",
-                ("actuator.gif", "The rod model, dressed in the mesh, in real time."),
-                ("loop.png", "Bending, chamber pressure and mass flow."),
-            ),
-            section(
-                "Equilibrium under pressure",
-                _TEXT["equilibrium"],
-                "equilibrium",
-                ("deformed.png", "Deformed cross-sections, coloured by stress."),
-            ),
-            section("Gradient", _TEXT["gradient"], "gradient"),
-            section(
-                "Strain modes and rod",
-                _TEXT["rod"],
-                "rod",
-                ("modes.png", "Curvature modes of the snapshots."),
-                ("backbones.png", "Backbones of solid and rod, and their distance."),
-            ),
-            section("Mesh", _TEXT["mesh"], "mesh"),
-            section(
-                "Rubber",
-                _TEXT["rubber"],
-                "rubber",
-                ("rubber.png", "Measured points and fitted curve."),
-            ),
-        ],
-        lead=_TEXT["lead"],
-    )
+    sections = []
+    for heading, key, captions in _SECTIONS:
+        shown = [(caption, files[name]) for name, caption in captions.items()]
+        sections.append(view.Section(heading, _TEXT[key], shown, tables[key]))
+    title = "A bellows actuator, from its drawing to a closed loop"
+    return view.html_report(title, sections, lead=_TEXT["lead"])
 
 
 def _volume(problem, u, facets) -> float:
@@ -225,6 +193,22 @@ def _deg_per_mm(slope: Sensitivity, name: str) -> float:
     return float(np.degrees(slope.gradient[name])) * mm
 
 
+_SECTIONS: tuple[tuple[str, str, dict[str, str]], ...] = (
+    ("Closed loop", "loop", {
+        "actuator.gif": "The rod model, dressed in the mesh, in real time.",
+        "loop.png": "Bending, chamber pressure and mass flow.",
+    }),
+    ("Equilibrium under pressure", "equilibrium", {
+        "deformed.png": "Deformed cross-sections, coloured by stress.",
+    }),
+    ("Gradient", "gradient", {}),
+    ("Strain modes and rod", "rod", {
+        "modes.png": "Curvature modes of the snapshots.",
+        "backbones.png": "Backbones of solid and rod, and their distance.",
+    }),
+    ("Mesh", "mesh", {}),
+    ("Rubber", "rubber", {"rubber.png": "Measured points and fitted curve."}),
+)  # fmt: skip
 _TEXT = {
     "lead": (
         "One run of sorojax demo: a cross-section drawn as a signed distance, meshed, "

@@ -21,9 +21,9 @@ from sorojax.fem.stability.continuation import CriticalPoint
 from sorojax.fem.stability.modal import Modes
 from sorojax.mesh import cell_areas, cell_volumes
 from sorojax.view import style
-from sorojax.view.draw.loads import load_parts, support_parts, wall_parts
+from sorojax.view.draw.loads import load_parts, support_parts, unit_of, wall_parts
 from sorojax.view.draw.meshes import Body
-from sorojax.view.picture import Picture, panels, show_scene
+from sorojax.view.picture import Picture, panels, spread
 from sorojax.view.raster.camera import View
 from sorojax.view.raster.scene import (
     Coloured,
@@ -112,22 +112,11 @@ def evaluate(
 # Deformed bodies: equilibria, load paths, motions and vibration modes
 
 
-_UNITS = {
-    fem.Pressure: "Pa", fem.Traction: "Pa", fem.Force: "N", fem.Tendon: "N", fem.Cable: "m",
-    fem.Gravity: "m/s$^2$", fem.Contact: "m", fem.Torque: "N m", fem.Spring: "m",
-}  # fmt: skip
 _CLEAR = 0.4  # opacity of a body whose walls under pressure are seen through it
 
 
-def show_problem(
-    problem: Problem, *, view: View = "iso", renderer: str = "auto", title: str = ""
-) -> Picture:
+def problem_scene(problem: Problem, *, title: str = "") -> Scene:
     """The body at rest with its cells, supports and loads."""
-    return show_scene(problem_scene(problem, title), view=view, renderer=renderer)
-
-
-def problem_scene(problem: Problem, title: str = "") -> Scene:
-    """As `show_problem`, before it is drawn."""
     still = np.zeros(problem.mesh.points.shape)
     mesh, points, body = problem.mesh, np.asarray(problem.mesh.points), Body(problem.mesh)
     walls = wall_parts(problem, points) if mesh.element.dim == 3 else []
@@ -139,7 +128,7 @@ def problem_scene(problem: Problem, title: str = "") -> Scene:
     return Scene(tuple(parts), title=title or name)
 
 
-def show_solution(
+def solution_scene(
     solution: Any,
     *,
     field: Field = "von_mises",
@@ -148,10 +137,8 @@ def show_solution(
     rest: bool = True,
     loads: bool = True,
     wire: bool = False,
-    view: View = "iso",
-    renderer: str = "auto",
     title: str = "",
-) -> Picture:
+) -> Scene:
     """An equilibrium: the deformed body, its outline at rest, supports and loads.
 
     Args:
@@ -163,27 +150,11 @@ def show_solution(
         rest: Draw the outline of the body at rest.
         loads: Draw supports and loads.
         wire: Draw the cells.
-        view: Camera of a solid body.
-        renderer: Of a solid body.
         title: Title of the figure.
     """
-    scene = solution_scene(
-        solution,
-        title,
-        field=field,
-        label=label,
-        limits=limits,
-        rest=rest,
-        loads=loads,
-        wire=wire,
-    )
-    return show_scene(scene, view=view, renderer=renderer)
-
-
-def solution_scene(solution: Any, title: str = "", **options: Any) -> Scene:
-    """As `show_solution`, before it is drawn."""
     u = np.asarray(solution.displacement)
-    scene_at, _ = body_scenes([solution.problem], [u], **options)
+    look = {"field": field, "label": label, "limits": limits, "rest": rest, "wire": wire}
+    scene_at, _ = body_scenes([solution.problem], [u], loads=loads, **look)
     return replace(scene_at(0), title=title)
 
 
@@ -204,7 +175,7 @@ def show_path(
         view: Camera of a solid body.
         renderer: Of a solid body.
         title: Title of the figure.
-        **options: As of `show_solution`; supports and loads are left out.
+        **options: As of a solution; supports and loads are left out.
     """
     chosen = chosen_states("view.show", len(path), states)
     moved = np.asarray(path.displacements)
@@ -271,11 +242,11 @@ def show_buckling(
     return panels(joint_extent(scenes), names, view=view, renderer=renderer, title=title)
 
 
-def show_optimised_shape(found: OptimisedShape, *, title: str = "", **options: Any) -> Picture:
+def optimised_shape_scene(found: OptimisedShape, *, title: str = "") -> Scene:
     """The body with the best dimensions; `found.optimised` has the history."""
     steps = len(np.asarray(found.optimised.history["objective"]))
     text = f"objective {float(found.objective):.4g} after {steps} steps"
-    return show_problem(found.problem, title=title or text, **options)
+    return problem_scene(found.problem, title=title or text)
 
 
 def body_scenes(
@@ -321,7 +292,7 @@ def chosen_states(where: str, count: int, states: Sequence[int] | None) -> list[
     if not count:
         raise ValueError(f"{where}: the path has no state. Look at its status.")
     if states is None:
-        return np.unique(np.round(np.linspace(0, count - 1, 7)).astype(int))[-6:].tolist()
+        return spread(count, 7)[-6:]
     wrong = [k for k in states if not -count <= k < count]
     if wrong or not states:
         raise ValueError(
@@ -348,7 +319,7 @@ def state_name(path: Any, k: int) -> str:
     if name is None:
         return f"load factor {float(value):.3g}"
     load = next(load for load in path.problem.loads if load.name == name)
-    unit = next((u for kind, u in _UNITS.items() if isinstance(load, kind)), "")
+    unit = unit_of(load)
     if value.ndim:
         return f"|{name}| = {short(float(np.linalg.norm(value)), unit)}"
     if isinstance(load, fem.Pressure):

@@ -3,8 +3,9 @@
 import inspect
 import re
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -12,17 +13,13 @@ from jaxtyping import Float
 from sorojax import io
 from sorojax.mesh import Mesh
 from sorojax.view.draw.bodies import coloured
-from sorojax.view.draw.meshes import Body, show_cells
+from sorojax.view.draw.meshes import Body, mesh_scene
 from sorojax.view.draw.plots import show_signals
-from sorojax.view.draw.shapes import show_surface
+from sorojax.view.draw.shapes import surface_scene
 from sorojax.view.film.film import Film
-from sorojax.view.picture import Picture, panels, show_scene
+from sorojax.view.picture import Picture, panels, show_scene, spread
 from sorojax.view.raster.camera import View
-from sorojax.view.raster.scene import (
-    Coloured,
-    Scene,
-    joint_extent,
-)
+from sorojax.view.raster.scene import Coloured, Scene, joint_extent
 from sorojax.view.show import options as drawn_by, show
 
 _SURFACES = (".stl", ".obj", ".ply")
@@ -59,28 +56,23 @@ def show_file(
     kind, name = path.suffix.lower(), title or Path(path).name
     if kind in _SURFACES:
         surface = io.import_surface(path, unit=unit)
-        return show_surface(
-            surface,
-            wire=wire,
-            view=view,
-            renderer=renderer,
-            title=title or f"{path.name}: {len(surface.triangles)} triangles",
-        )
+        text = f"{path.name}: {len(surface.triangles)} triangles"
+        scene = surface_scene(surface, title or text, wire)
+        return show_scene(scene, view=view, renderer=renderer)
     if kind == ".npz":
         return _saved(path, name, field=field, view=view, renderer=renderer, wire=wire)
     scale = 1.0 if unit is None else unit
     if kind == ".pvd":
         states = [_state(file, field, scale) for file in _series(path)]
-        chosen = np.unique(np.round(np.linspace(0, len(states) - 1, 6)).astype(int))
+        chosen = spread(len(states), 6)
         scenes = joint_extent(_scenes([states[k] for k in chosen], wire))
         names = [f"state {k}" for k in chosen]
         return panels(scenes, names, view=view, renderer=renderer, title=name)
     state = _state(path, field, scale)
     if state.values is None and np.allclose(state.moved, 0):
-        options: dict[str, Any] = {"view": view, "renderer": renderer}
-        return show_cells(state.mesh, title=title, **options)
-    scene = _scenes([state], wire)[0]
-    scene = Scene(scene.parts, scene.scale, name)
+        scene = mesh_scene(state.mesh, title=title)
+    else:
+        scene = replace(_scenes([state], wire)[0], title=name)
     return show_scene(scene, view=view, renderer=renderer)
 
 
@@ -102,11 +94,13 @@ def animate_file(
     return animate(track, fps=fps, speed=fps, **options)
 
 
-class _State:
+class _State(NamedTuple):
     """One result: the mesh, where its nodes went, what colours it."""
 
-    def __init__(self, mesh: Mesh, moved: Float[np.ndarray, "nodes dim"], values, label: str):
-        self.mesh, self.moved, self.values, self.label = mesh, moved, values, label
+    mesh: Mesh
+    moved: Float[np.ndarray, "nodes dim"]
+    values: Any
+    label: str
 
 
 def _state(path: Path, field: str | None, unit: float) -> _State:
@@ -115,13 +109,8 @@ def _state(path: Path, field: str | None, unit: float) -> _State:
     mesh = io.import_mesh(path, unit=unit)
     whole = meshio.read(path)
     dim = mesh.element.dim
-    at_nodes = {
-        k: np.asarray(v) for k, v in whole.point_data.items() if len(v) == mesh.num_nodes
-    }
-    at_cells = {
-        k: np.concatenate([np.asarray(block) for block in v])
-        for k, v in whole.cell_data.items()
-    }
+    at_nodes = {k: v for k, v in whole.point_data.items() if len(v) == mesh.num_nodes}
+    at_cells = {k: np.concatenate(blocks) for k, blocks in whole.cell_data.items()}
     at_cells = {k: v for k, v in at_cells.items() if len(v) == mesh.num_cells}
     given = at_nodes.get("displacement")
     moved = np.zeros(mesh.points.shape) if given is None else unit * given[:, :dim]
@@ -137,9 +126,8 @@ def _state(path: Path, field: str | None, unit: float) -> _State:
             "one of these."
         )
     values = known[field].astype(float)
-    values = (
-        values if values.ndim == 1 else np.linalg.norm(values.reshape(len(values), -1), axis=1)
-    )
+    if values.ndim > 1:
+        values = np.linalg.norm(values.reshape(len(values), -1), axis=1)
     values = unit * values if field == "displacement" else values
     return _State(mesh, moved, values, field)
 
@@ -191,17 +179,13 @@ def _saved(path: Path, title: str, **options: Any) -> Picture:
     time = arrays[times[0]]
     groups: dict[str, dict[str, np.ndarray]] = {}
     for name, array in arrays.items():
-        is_row = (
-            array.ndim in (1, 2) and array.shape[0] == len(time) and array.dtype.kind == "f"
-        )
+        is_row = array.ndim in (1, 2) and len(array) == len(time) and array.dtype.kind == "f"
         if not is_row or name in times or array.size > _MOST * len(time):
             continue
         short = re.sub(r"^\.(outputs|states?)\b|[\[\]']", "", name).lstrip(".")
-        rows = array.reshape(len(time), -1)
-        several = rows.shape[1] > 1
-        groups[short] = {
-            f"{short}[{k}]" if several else short: rows[:, k] for k in range(rows.shape[1])
-        }
+        columns = array.reshape(len(time), -1).T
+        lines = {f"{short}[{k}]": column for k, column in enumerate(columns)}
+        groups[short] = lines if len(columns) > 1 else {short: columns[0]}
     if not groups:
         return _drawn(path, arrays, title, options)
     return show_signals(time, groups, title=title)

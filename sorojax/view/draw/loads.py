@@ -69,11 +69,15 @@ _SPRING, _RIGID, _TURN, _WALL = (style.COLOURS[k] for k in (2, 0, 4, 1))
 Points = Float[np.ndarray, "nodes dim"]
 
 
-def marks_of(
-    problem: Problem, load: AbstractLoad, points: Points, size: float
-) -> list[Part] | None:
-    """The sign of a load on a body of `size` [m] whose nodes are at `points`, None for one
-    that has none here."""
+def _load(problem: Problem, load: AbstractLoad, points: Points, size: float) -> list[Part]:
+    """The sign of a load on a body of `size` [m] whose nodes are at `points`."""
+    if isinstance(load, fem.Tendon | fem.Cable):
+        line = np.asarray(Locations(load.route.nodes, load.route.weights)(jnp.asarray(points)))
+        pull = f": {short(float(load.value), 'N')}" if isinstance(load, fem.Tendon) else ""
+        return [Lines([line], style.COLOURS[3], 1.6, name=f"{load.name}{pull}")]
+    if isinstance(load, fem.Contact):
+        shift = None if load.value is None else np.asarray(load.value)
+        return obstacle_part(load.obstacle, points, size, shift)
     if isinstance(load, fem.Torque):
         return _torque(load, points, size)
     if isinstance(load, fem.Spring):
@@ -87,7 +91,7 @@ def marks_of(
         sides = [load.facets] if load.others is None else [load.facets, load.others]
         rings = _rings(problem, np.concatenate([np.asarray(side) for side in sides]), points)
         return [Lines(rings, style.OBSTACLE, 1.8, name=load.name)]
-    return None
+    return _arrows(problem, load, points, size)
 
 
 def wall_parts(problem: Problem, points: Points) -> list[Part]:
@@ -147,6 +151,10 @@ def _rings(problem: Problem, facets: np.ndarray, points: Points) -> list[np.ndar
 
 _LENGTH = 0.10  # of the body, that of the longest arrow of a load
 _MOST = 24  # arrows of one load
+_UNITS = {
+    fem.Pressure: "Pa", fem.Traction: "Pa", fem.Force: "N", fem.Tendon: "N", fem.Cable: "m",
+    fem.Gravity: "m/s$^2$", fem.Contact: "m", fem.Torque: "N m", fem.Spring: "m",
+}  # fmt: skip
 _SUPPORTS = {"held": style.HOLD, "sliding": style.GREY, "moved": style.COLOURS[3]}
 
 
@@ -180,52 +188,37 @@ def load_parts(problem: Problem, u: Float[np.ndarray, "nodes dim"]) -> list[Part
     return parts
 
 
-def _load(problem: Problem, load: AbstractLoad, points: np.ndarray, size: float) -> list[Part]:
-    if isinstance(load, fem.Tendon | fem.Cable):
-        line = np.asarray(Locations(load.route.nodes, load.route.weights)(jnp.asarray(points)))
-        pull = f": {short(float(load.value), 'N')}" if isinstance(load, fem.Tendon) else ""
-        return [Lines([line], style.COLOURS[3], 1.6, name=f"{load.name}{pull}")]
-    if isinstance(load, fem.Contact):
-        shift = None if load.value is None else np.asarray(load.value)
-        return obstacle_part(load.obstacle, points, size, shift)
-    marks = marks_of(problem, load, points, size)
-    if marks is not None:
-        return marks
-    found = _arrows(problem, load, points)
-    if found is None:
+def _arrows(problem: Problem, load: AbstractLoad, points: Points, size: float) -> list[Part]:
+    """Arrows in proportion to a load that has a direction, named with its size."""
+    value = np.asarray(getattr(load, "value", 0.0))
+    if isinstance(load, fem.Pressure):
+        starts, normals = _facet_frames(problem, _thinned(load.facets), points)
+        vectors, strength = -value * normals, float(value)
+    elif value.shape != (points.shape[1],):
         return []
-    starts, vectors, name = found
-    length = np.linalg.norm(vectors, axis=1)
-    if not len(length) or not length.max() > 0:
+    else:
+        if isinstance(load, fem.Traction):
+            starts, _ = _facet_frames(problem, _thinned(load.facets), points)
+        elif isinstance(load, fem.Force):
+            starts = points[np.asarray(load.nodes)].mean(axis=0)[None]
+        elif isinstance(load, fem.Gravity):
+            starts = points.mean(axis=0)[None]
+        else:
+            return []
+        vectors, strength = np.tile(value, (len(starts), 1)), float(np.linalg.norm(value))
+    longest = np.linalg.norm(vectors, axis=1).max(initial=0.0)
+    if not longest > 0:
         return []
-    vectors = vectors * (_LENGTH * size / length.max())
+    vectors = vectors * (_LENGTH * size / longest)
     if isinstance(load, fem.Pressure):  # pushes: the head is on the wall
         starts = starts - vectors
+    name = f"{load.name}: {short(strength, unit_of(load))}"
     return [Arrows(starts, vectors, style.LOAD, name)]
 
 
-def _arrows(problem: Problem, load: AbstractLoad, points: np.ndarray):
-    """Starts, vectors in proportion to the load, and a name with the size."""
-    if isinstance(load, fem.Pressure):
-        facets = _thinned(np.asarray(load.facets))
-        middle, normal = _facet_frames(problem, facets, points)
-        value = float(load.value)
-        return middle, -value * normal, f"{load.name}: {short(value, 'Pa')}"
-    value = np.asarray(getattr(load, "value", 0.0))
-    if value.shape != (points.shape[1],):
-        return None
-    size = float(np.linalg.norm(value))
-    if isinstance(load, fem.Traction):
-        facets = _thinned(np.asarray(load.facets))
-        middle, _ = _facet_frames(problem, facets, points)
-        return middle, np.tile(value, (len(middle), 1)), f"{load.name}: {short(size, 'Pa')}"
-    if isinstance(load, fem.Force):
-        at = points[np.asarray(load.nodes)].mean(axis=0)
-        return at[None], value[None], f"{load.name}: {short(size, 'N')}"
-    if isinstance(load, fem.Gravity):
-        middle = points.mean(axis=0)
-        return middle[None], value[None], f"{load.name}: {short(size, 'm/s$^2$')}"
-    return None
+def unit_of(load: AbstractLoad) -> str:
+    """What the value of a load is measured in."""
+    return next((unit for kind, unit in _UNITS.items() if isinstance(load, kind)), "")
 
 
 def _facet_frames(problem: Problem, facets: np.ndarray, points: np.ndarray):
@@ -241,10 +234,9 @@ def _facet_frames(problem: Problem, facets: np.ndarray, points: np.ndarray):
     return x.mean(axis=1), normal
 
 
-def _thinned(facets: np.ndarray) -> np.ndarray:
+def _thinned(facets) -> np.ndarray:
     """At most so many facets that their arrows can be distinguished."""
-    step = max(1, len(facets) // _MOST)
-    return facets[::step]
+    return np.asarray(facets)[:: max(1, len(facets) // _MOST)]
 
 
 def _kind(support: AbstractSupport, problem: Problem) -> str:

@@ -20,8 +20,7 @@ from sorojax.mesh.mesh import facet_table, valences
 from sorojax.mesh.quality import Quality, cell_ratios
 from sorojax.mesh.repair import Repaired
 from sorojax.view import style
-from sorojax.view.picture import Panel, Picture, show_scene
-from sorojax.view.raster.camera import View
+from sorojax.view.picture import Picture, plotted
 from sorojax.view.raster.plane import loops
 from sorojax.view.raster.scene import Dots, Lines, Part, Scale, Scene, Surface, robust_scale
 
@@ -182,34 +181,6 @@ def scaled_mode(base: np.ndarray, shape: np.ndarray, share: float):
 _PALE = 0.55  # how far the colours of regions are mixed with white
 
 
-def show_cells(
-    mesh: Mesh,
-    *,
-    by: str | None = None,
-    field: Float[Any, " values"] | None = None,
-    label: str = "",
-    limits: tuple[float, float] | None = None,
-    view: View = "iso",
-    renderer: str = "auto",
-    title: str = "",
-) -> Picture:
-    """The cells of a mesh; of a solid one those at its boundary.
-
-    Args:
-        mesh: What to draw.
-        by: "quality", "region", "facets" or "nodes" to colour what has a name; plain if
-            omitted.
-        field: One value per node or per cell, instead of `by`.
-        label: Name and unit of the field.
-        limits: Ends of the colour scale.
-        view: Camera of a solid mesh.
-        renderer: Of a solid mesh.
-        title: Title; the kind and number of cells if omitted.
-    """
-    scene = mesh_scene(mesh, by=by, field=field, label=label, limits=limits, title=title)
-    return show_scene(scene, view=view, renderer=renderer)
-
-
 def mesh_scene(
     mesh: Mesh,
     *,
@@ -219,7 +190,17 @@ def mesh_scene(
     limits: tuple[float, float] | None = None,
     title: str = "",
 ) -> Scene:
-    """As `show_cells`, before it is drawn."""
+    """The cells of a mesh; of a solid one those at its boundary.
+
+    Args:
+        mesh: What to draw.
+        by: "quality", "region", "facets" or "nodes" to colour what has a name; plain if
+            omitted.
+        field: One value per node or per cell, instead of `by`.
+        label: Name and unit of the field.
+        limits: Ends of the colour scale.
+        title: Title; the kind and number of cells if omitted.
+    """
     if by not in (None, "quality", "region", "facets", "nodes"):
         raise ValueError(
             f'view.show: got by={by!r}, need "quality", "region", "facets" or "nodes". Pass '
@@ -266,15 +247,8 @@ def _regions(mesh: Mesh, seen: Shell, points: np.ndarray) -> list[Part]:
         left &= ~mine
         at = mine[seen.cells]
         if at.any():
-            parts.append(
-                Surface(
-                    points,
-                    seen.triangles[at],
-                    _colour(k, pale=True),
-                    wire=seen.wire[at],
-                    name=name,
-                )
-            )
+            colour, wire = style.pale(_colour(k), _PALE), seen.wire[at]
+            parts.append(Surface(points, seen.triangles[at], colour, wire=wire, name=name))
     rest = left[seen.cells]
     if rest.any() or not parts:
         parts.insert(0, Surface(points, seen.triangles[rest], style.BODY, wire=seen.wire[rest]))
@@ -306,15 +280,9 @@ def _lifted(points: np.ndarray, triangles: np.ndarray, wire, colour: str, name: 
 
     normals = corner_normals(points, triangles)
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
-    corners = points[triangles] + 1.5e-3 * size * normals
-    count = len(triangles)
-    return Surface(
-        corners.reshape(-1, 3),
-        np.arange(3 * count).reshape(-1, 3),
-        colour,
-        wire=wire,
-        name=name,
-    )
+    corners = (points[triangles] + 1.5e-3 * size * normals).reshape(-1, 3)
+    loose = np.arange(len(corners)).reshape(-1, 3)
+    return Surface(corners, loose, colour, wire=wire, name=name)
 
 
 def _keys(facets: np.ndarray) -> np.ndarray:
@@ -324,16 +292,13 @@ def _keys(facets: np.ndarray) -> np.ndarray:
     return (least[:, 0] * size + least[:, 1]) * size + least[:, min(2, least.shape[1] - 1)]
 
 
-def _colour(k: int, pale: bool = False) -> str:
-    from matplotlib.colors import to_hex, to_rgb
-
-    colour = np.array(to_rgb(style.COLOURS[k % len(style.COLOURS)]))
-    return to_hex(tuple((1 - _PALE) * colour + _PALE if pale else colour))
+def _colour(k: int) -> str:
+    return style.COLOURS[k % len(style.COLOURS)]
 
 
-def show_repaired(repaired: Repaired, **options: Any) -> Picture:
+def repaired_scene(repaired: Repaired, **options: Any) -> Scene:
     """The mesh that was repaired; options of a mesh."""
-    return show_cells(repaired.mesh, **options)
+    return mesh_scene(repaired.mesh, **options)
 
 
 def show_quality(found: Quality, *, title: str = "") -> Picture:
@@ -342,18 +307,12 @@ def show_quality(found: Quality, *, title: str = "") -> Picture:
     axes = figure.add_subplot()
     counts = np.asarray(found.histogram, float)
     edges = np.linspace(0, 1, len(counts) + 1)
-    axes.bar(
-        edges[:-1],
-        counts,
-        np.diff(edges),
-        align="edge",
-        color=style.COLOURS[0],
-        edgecolor="white",
-    )
+    look: dict[str, Any] = {"color": style.COLOURS[0], "edgecolor": "white"}
+    axes.bar(edges[:-1], counts, np.diff(edges), align="edge", **look)
     axes.axvline(found.mean_radius_ratio, color=style.COLOURS[1], lw=1.6, label="mean")
     low, high = np.rad2deg(found.min_angle), np.rad2deg(found.max_angle)
     text = f"{found.num_cells} cells, angles {low:.1f} to {high:.1f} deg"
     style.dress(axes, "radius ratio [-]", "cells", title or text)
     axes.set_xlim(0, 1)
     style.legend(axes, loc="upper left")
-    return Picture(figure, (Panel(axes),))
+    return plotted(figure, [axes])

@@ -7,7 +7,7 @@ import numpy as np
 
 from sorojax.systems import AbstractBlock, Network
 from sorojax.view import style
-from sorojax.view.picture import Panel, Picture
+from sorojax.view.picture import Picture, plotted
 
 _WIDE, _ROW, _GAP, _BETWEEN = 2.1, 0.24, 0.45, 0.9  # inches
 _HEAD = 0.50
@@ -51,16 +51,8 @@ def show_network(network: AbstractBlock, *, title: str = "") -> Picture:
             path = _bend(start, end)
         _wire(axes, path, colours[source])
     if title:
-        axes.text(
-            (right) / 2,
-            0.35,
-            title,
-            ha="center",
-            fontsize=style.TITLE,
-            color=style.INK,
-            fontweight="bold",
-        )
-    return Picture(figure, (Panel(axes),))
+        style.heading(axes, right / 2, 0.35, title, va="baseline")
+    return plotted(figure, [axes])
 
 
 Ports = tuple[list[tuple[str, str]], list[tuple[str, str]]]
@@ -161,32 +153,13 @@ def _box(axes: Any, name: str, block, ports: Ports, place, wires, exposed: set[s
 
     x, y = place
     high = _height(ports)
-    look = {"boxstyle": "round,pad=0,rounding_size=0.08", "linewidth": 1.0}
-    axes.add_patch(
-        FancyBboxPatch(
-            (x, y - high), _WIDE, high, facecolor="#f3f6fa", edgecolor=style.GREY, **look
-        )
-    )
-    axes.text(
-        x + _WIDE / 2,
-        y - 0.17,
-        name,
-        ha="center",
-        va="center",
-        fontsize=style.LABEL,
-        color=style.INK,
-        fontweight="bold",
-    )
-    axes.text(
-        x + _WIDE / 2,
-        y - 0.37,
-        type(block).__name__,
-        ha="center",
-        va="center",
-        fontsize=style.SMALL - 1,
-        color=style.GREY,
-        style="italic",
-    )
+    look = {"facecolor": "#f3f6fa", "edgecolor": style.GREY, "linewidth": 1.0}
+    round_corners = "round,pad=0,rounding_size=0.08"
+    axes.add_patch(FancyBboxPatch((x, y - high), _WIDE, high, round_corners, **look))
+    middle, small = x + _WIDE / 2, style.SMALL
+    style.write(axes, middle, y - 0.17, name, fontsize=style.LABEL, fontweight="bold")
+    kind, look = type(block).__name__, {"color": style.GREY, "style": "italic"}
+    style.write(axes, middle, y - 0.37, kind, fontsize=small - 1, **look)
     for side in (0, 1):
         for row, (port, unit) in enumerate(ports[side]):
             at = y - _HEAD - _ROW * (row + 0.5)
@@ -196,28 +169,15 @@ def _box(axes: Any, name: str, block, ports: Ports, place, wires, exposed: set[s
             text = f"{port} [{unit}]" if unit else port
             alone = row >= len(ports[1 - side])
             text = _cut(text, 28 if alone else 17)
-            axes.text(
-                edge + (0.09 if side == 0 else -0.09),
-                at,
-                text,
-                ha="left" if side == 0 else "right",
-                va="center",
-                fontsize=style.SMALL - 1.5,
-                color=style.INK,
-            )
+            inside, ha = (0.09, "left") if side == 0 else (-0.09, "right")
+            style.write(axes, edge + inside, at, text, ha=ha, fontsize=small - 1.5)
             if side == 0 and full in exposed:
                 _wire(axes, np.array([[edge - 0.6, at], [edge, at]]), style.LOAD)
             elif side == 0 and full not in wires:
                 default = block.inputs[port].default
-                axes.text(
-                    edge - 0.08,
-                    at,
-                    "open" if default is None else f"{default:g}",
-                    ha="right",
-                    va="center",
-                    fontsize=style.SMALL - 2,
-                    color=style.GREY,
-                )
+                text = "open" if default is None else f"{default:g}"
+                look = {"ha": "right", "fontsize": small - 2, "color": style.GREY}
+                style.write(axes, edge - 0.08, at, text, **look)
 
 
 def _cut(text: str, most: int) -> str:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax import _check
 from sorojax._jax.jit import once
 from sorojax.design.calibration.calibration import Calibration
 from sorojax.material import AbstractHyperelastic, strain_energy_density, uniaxial_stress
@@ -17,7 +18,12 @@ from sorojax.material.fit import TensileFit
 from sorojax.reduction.backbone import Backbone
 from sorojax.rod import Rod, StrainBasis, columns, forward_kinematics
 from sorojax.view import style
-from sorojax.view.picture import Panel, Picture
+from sorojax.view.picture import Picture, plotted, spread
+from sorojax.view.raster.glyphs import circle
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Signals = Mapping[str, Mapping[str, Any]]
 
@@ -51,32 +57,23 @@ def show_basis(
     values = np.asarray(basis(s))
     count = len(basis.active)
     figure = style.new_figure(8.5, 0.6 + 2.9 * count)
-    panels = figure.subplots(count, 1, sharex=True, squeeze=False).ravel()
+    panels = style.grid(figure, count, 1, sharex=True)
     for row, (panel, name) in enumerate(zip(panels, basis.active, strict=True)):
         shapes = values[row][:, columns(basis, name)].T
         share = np.ravel((energy or {}).get(name, ()))
-        for k, (shape, colour) in enumerate(
-            zip(shapes, style.shades(len(shapes)), strict=True)
-        ):
+        along, shades = s * 1e3 * float(length), style.shades(len(shapes))
+        for k, (shape, colour) in enumerate(zip(shapes, shades, strict=True)):
             part = f", {_percent(share[k])}" if len(share) == len(shapes) > 1 else ""
-            panel.plot(
-                s * 1e3 * float(length),
-                shape,
-                color=colour,
-                lw=1.9,
-                label=f"mode {k + 1}{part}",
-            )
-        total = (
-            f": {_percent(share.sum())} of the squared strain captured" if share.size else ""
-        )
+            panel.plot(along, shape, color=colour, lw=1.9, label=f"mode {k + 1}{part}")
+        captured = f": {_percent(share.sum())} of the squared strain captured"
+        total = captured if share.size else ""
         unit = "1/m" if name.startswith("kappa") else "-"
         style.dress(panel, "", f"shape [-], $q$ in [{unit}]", f"{_SYMBOL[name]}{total}")
         panel.axhline(0.0, color=style.GREY, lw=0.8, zorder=1)
         style.legend(panel, loc="center left", bbox_to_anchor=(1.0, 0.5))
     panels[-1].set_xlabel("arc length [mm]", fontsize=style.LABEL, color=style.INK)
     panels[-1].set_xlim(0.0, 1e3 * float(length))
-    style.title(figure, title)
-    return Picture(figure, tuple(Panel(panel) for panel in panels))
+    return plotted(figure, panels, title)
 
 
 def backbone_errors(
@@ -118,34 +115,25 @@ def show_backbones(
     unit = "step" if pressures is None else "kPa"
     figure = style.new_figure(10.0, 4.4)
     left, right = figure.subplots(1, 2, width_ratios=[1.25, 1])
-    shown = np.unique(np.round(np.linspace(0, steps - 1, 6)).astype(int))
+    shown = spread(steps, 6)
     for k, colour in zip(shown, style.shades(len(shown)), strict=True):
         left.plot(*solid[k].T, color=colour, lw=3.4, alpha=0.55, label=f"{load[k]:.3g} {unit}")
-        last = k == shown[-1]
-        left.plot(
-            *line[k].T, color=style.INK, lw=1.1, ls=(0, (4, 2)), label="rod" if last else None
-        )
+        name = "rod" if k == shown[-1] else None
+        left.plot(*line[k].T, color=style.INK, lw=1.1, ls=style.DASHES, label=name)
     style.dress(left, "x [mm]", "y [mm]", "backbone: solid in colour, rod dashed")
     left.set_aspect("equal", adjustable="datalim")
     style.legend(left, loc="best")
     error = 1e3 * np.asarray(backbone_errors(backbone, rod, qs))
     right.plot(load, error, color=style.COLOURS[0], lw=1.8, marker="o", ms=3.5)
-    right.axhline(1e3 * bar, color=style.COLOURS[1], lw=1.3, ls=(0, (4, 2)))
-    right.annotate(
-        f"bar: {1e3 * bar:g} mm",
-        (load[0], 1e3 * bar),
-        (0, -4),
-        fontsize=style.SMALL,
-        textcoords="offset points",
-        va="top",
-        color=style.COLOURS[1],
-    )
+    right.axhline(1e3 * bar, color=style.COLOURS[1], lw=1.3, ls=style.DASHES)
+    look = {"textcoords": "offset points", "va": "top", "color": style.COLOURS[1]}
+    name = f"bar: {1e3 * bar:g} mm"
+    right.annotate(name, (load[0], 1e3 * bar), (0, -4), fontsize=style.SMALL, **look)
     across = "load step" if pressures is None else "pressure [kPa]"
     largest = f"largest mean error {error.max():.2g} mm"
     style.dress(right, across, "mean position error [mm]", largest)
     right.set_ylim(0.0, 1.12 * max(1e3 * bar, float(error.max())))
-    style.title(figure, title)
-    return Picture(figure, (Panel(left), Panel(right)))
+    return plotted(figure, [left, right], title)
 
 
 def show_signals(time: Float[Any, " time"], panels: Signals, *, title: str = "") -> Picture:
@@ -160,28 +148,22 @@ def show_signals(time: Float[Any, " time"], panels: Signals, *, title: str = "")
     time = np.asarray(time)
     high = [max(1.6, 0.34 * len(lines)) for lines in panels.values()]
     figure = style.new_figure(9.0, 0.7 + sum(high))
-    axes = figure.subplots(
-        len(panels), 1, sharex=True, squeeze=False, height_ratios=high
-    ).ravel()
+    axes = style.grid(figure, len(panels), 1, sharex=True, height_ratios=high)
     for panel, (label, signals) in zip(axes, panels.items(), strict=True):
         _draw_signals(panel, time, label, signals)
         style.legend(panel, loc="center left", bbox_to_anchor=(1.0, 0.5))
     axes[-1].set_xlabel("time [s]", fontsize=style.LABEL, color=style.INK)
     axes[-1].set_xlim(time[0], time[-1])
-    figure.align_ylabels(list(axes))
-    style.title(figure, title)
-    return Picture(figure, tuple(Panel(panel) for panel in axes))
+    figure.align_ylabels(axes)
+    return plotted(figure, axes, title)
 
 
 def _draw_signals(axes: Any, time: np.ndarray, label: str, signals: Mapping[str, Any]) -> None:
     styles = style.line_styles(signals)
     for name, values in signals.items():
         values = np.asarray(values)
-        if values.shape != time.shape:
-            raise ValueError(
-                f"show_signals: `{name}` has shape {values.shape}, `time` has {time.shape}. "
-                "Give one number per instant; split vectors into several names."
-            )
+        do = "Give one number per instant; split vectors into several names."
+        _check.shape("show_signals", name, values, time.shape, do)
         above = 3 if styles[name]["color"] == style.REFERENCE else 2
         axes.plot(time, values, label=name, zorder=above, **styles[name])
     style.dress(axes, "", label)
@@ -216,7 +198,7 @@ def show_snapshots(backbone: Backbone, *, title: str = "") -> Picture:
     name = backbone.names[most]
     figure = style.new_figure(9.0, 3.8)
     left, right = figure.subplots(1, 2, width_ratios=[1.2, 1])
-    shown = np.unique(np.round(np.linspace(0, len(places) - 1, _SNAPSHOTS)).astype(int))
+    shown = spread(len(places), _SNAPSHOTS)
     for k, colour in zip(shown, style.shades(len(shown))[::-1], strict=True):
         left.plot(places[k, :, 0], places[k, :, up], color=colour, lw=2.0)
         right.plot(s, change[k, :, most], color=colour, lw=1.7, label=f"snapshot {k}")
@@ -224,9 +206,8 @@ def show_snapshots(backbone: Backbone, *, title: str = "") -> Picture:
     left.set_aspect("equal", adjustable="datalim")
     style.dress(right, "place along the backbone [-]", f"change of {name} [1/m]")
     style.legend(right, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    length = 1e3 * float(backbone.length)
-    style.title(figure, title or f"{len(places)} snapshots of a backbone of {length:.3g} mm")
-    return Picture(figure, (Panel(left), Panel(right)))
+    text = f"{len(places)} snapshots of a backbone of {1e3 * float(backbone.length):.3g} mm"
+    return plotted(figure, [left, right], title or text)
 
 
 # How accurate at what cost: convergence under refinement, work against precision
@@ -279,72 +260,40 @@ class WorkPrecision:
 
 def show_convergence(data: Convergence, *, title: str = "") -> Picture:
     """Errors over sizes on logarithmic axes, with the order of each method."""
-    figure = style.new_figure(6.5, 4.6)
-    axes = figure.add_subplot()
-    size = np.asarray(data.sizes, float)
-    along = np.argsort(size)
-    for k, (name, order) in enumerate(data.orders().items()):
-        error = np.asarray(data.errors[name], float)
-        _positive(name, size, error)
-        colour = style.COLOURS[k % len(style.COLOURS)]
-        axes.plot(
-            size[along],
-            error[along],
-            color=colour,
-            marker=_MARKS[k % 7],
-            ms=5,
-            lw=1.6,
-            label=f"{name}: order {order:.2f}",
-        )
-    _logarithmic(axes, data.size_label, data.error_label)
-    return _finished(figure, axes, title)
+    runs = {name: (data.sizes, error) for name, error in data.errors.items()}
+    names = {name: f"{name}: order {order:.2f}" for name, order in data.orders().items()}
+    return _logarithmic(runs, names, data.size_label, data.error_label, title)
 
 
 def show_work_precision(data: WorkPrecision, *, title: str = "") -> Picture:
     """Error over cost on logarithmic axes; lower and further left is better."""
+    names = {name: name for name in data.runs}
+    return _logarithmic(data.runs, names, data.cost_label, data.error_label, title)
+
+
+def _logarithmic(runs: Mapping, names: dict[str, str], x: str, y: str, title: str) -> Picture:
+    """A line with marks for each run of an abscissa and an error."""
     figure = style.new_figure(6.5, 4.6)
     axes = figure.add_subplot()
-    for k, (name, (cost, error)) in enumerate(data.runs.items()):
-        cost, error = np.asarray(cost, float), np.asarray(error, float)
-        _positive(name, cost, error)
-        along = np.argsort(cost)
-        axes.plot(
-            cost[along],
-            error[along],
-            color=style.COLOURS[k % len(style.COLOURS)],
-            marker=_MARKS[k % 7],
-            ms=5,
-            lw=1.6,
-            label=name,
-        )
-    _logarithmic(axes, data.cost_label, data.error_label)
-    return _finished(figure, axes, title)
-
-
-def _positive(name: str, *rows: np.ndarray) -> None:
-    lengths = {row.shape for row in rows}
-    if len(lengths) > 1 or any(row.ndim != 1 for row in rows):
-        raise ValueError(
-            f"view.show: `{name}` has rows of shapes {sorted(lengths)}, need two of one length."
-        )
-    if not all(np.all(row[np.isfinite(row)] > 0) for row in rows):
-        raise ValueError(
-            f"view.show: `{name}` has values that are not positive, logarithmic axes need "
-            "positive ones. Take absolute values; leave out exact zeros."
-        )
-
-
-def _logarithmic(axes: Any, x: str, y: str) -> None:
+    for k, (name, (across, error)) in enumerate(runs.items()):
+        across, error = np.asarray(across, float), np.asarray(error, float)
+        _positive(name, across, error)
+        along = np.argsort(across)
+        look = {"color": style.COLOURS[k % 6], "marker": _MARKS[k % 7], "ms": 5, "lw": 1.6}
+        axes.plot(across[along], error[along], label=names[name], **look)
     axes.set_xscale("log")
     axes.set_yscale("log")
     style.dress(axes, x, y)
     axes.grid(True, which="minor", color=style.LIGHT, linewidth=0.3)
-
-
-def _finished(figure, axes, title: str) -> Picture:
     style.legend(axes, loc="best")
-    style.title(figure, title)
-    return Picture(figure, (Panel(axes),))
+    return plotted(figure, [axes], title)
+
+
+def _positive(name: str, *rows: np.ndarray) -> None:
+    for row in rows:
+        _check.shape("view.show", name, row, (rows[0].size,), "Give two rows of one length.")
+        do = "Logarithmic axes have no zero: take absolute values, leave out exact zeros."
+        _check.positive("view.show", name, row[np.isfinite(row)], "", do)
 
 
 # Materials and their fits, calibrations, sweeps, tracks of markers
@@ -379,22 +328,14 @@ def _tensile(material: AbstractHyperelastic, stretch, stress, points, title: str
     figure = style.new_figure(6.5, 4.2)
     axes = figure.add_subplot()
     axes.axhline(0.0, color=style.GREY, lw=0.8)
-    axes.plot(
-        stretch, stress / 1e3, color=style.COLOURS[0], lw=1.9, label=type(material).__name__
-    )
+    name = type(material).__name__
+    axes.plot(stretch, stress / 1e3, color=style.COLOURS[0], lw=1.9, label=name)
     if points is not None:
-        axes.plot(
-            1 + np.asarray(points[0]),
-            np.asarray(points[1]) / 1e3,
-            "o",
-            color=style.COLOURS[1],
-            ms=6,
-            label="measured",
-        )
+        strain, measured = np.asarray(points[0]), np.asarray(points[1]) / 1e3
+        axes.plot(1 + strain, measured, "o", color=style.COLOURS[1], ms=6, label="measured")
     style.dress(axes, "stretch [-]", "engineering stress [kPa]")
     style.legend(axes, loc="upper left")
-    style.title(figure, title)
-    return Picture(figure, (Panel(axes),))
+    return plotted(figure, [axes], title)
 
 
 def show_fit(
@@ -434,36 +375,25 @@ def show_calibration(found: Calibration, *, title: str = "") -> Picture:
     parameters leave it; records that were held out have it in their name."""
     checks = [(check, "") for check in found.experiments]
     checks += [(check, ", held out") for check in found.held_out]
-    columns = min(len(checks), 3)
-    rows = -(-len(checks) // columns)
-    figure = style.new_figure(max(5.0, 3.6 * columns), 0.5 + 2.7 * rows)
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    for spare in grid[len(checks) :]:
-        spare.remove()
-    for axes, (check, note) in zip(grid, checks, strict=False):
-        predicted, error, wide = (
-            np.ravel(np.asarray(x, float))
-            for x in (check.predicted, check.error, 2 * np.asarray(check.expected))
-        )
-        reading = np.arange(len(predicted))
-        wide = np.broadcast_to(wide, predicted.shape)
-        axes.fill_between(
-            reading, predicted - wide, predicted + wide, alpha=0.2, color=style.COLOURS[0], lw=0
-        )
-        axes.plot(
-            reading,
-            predicted - error,
-            "o",
-            ms=3.5,
-            color=style.COLOURS[1],
-            mew=0,
-            label="measured",
-        )
-        axes.plot(reading, predicted, color=style.COLOURS[0], lw=1.6, label="predicted")
+    figure, grid = _small_plots(len(checks))
+    blue, red = style.COLOURS[:2]
+    for axes, (check, note) in zip(grid, checks, strict=True):
+        rows = (check.predicted, check.error, 2 * np.asarray(check.expected))
+        predicted, error, wide = (np.ravel(np.asarray(row, float)) for row in rows)
+        at, wide = np.arange(len(predicted)), np.broadcast_to(wide, predicted.shape)
+        axes.fill_between(at, predicted - wide, predicted + wide, alpha=0.2, color=blue, lw=0)
+        axes.plot(at, predicted - error, "o", ms=3.5, color=red, mew=0, label="measured")
+        axes.plot(at, predicted, color=blue, lw=1.6, label="predicted")
         style.dress(axes, "reading", "", f"{check.name}{note}: {check.rms:.3g} of the noise")
     style.legend(grid[0], loc="best")
-    style.title(figure, title)
-    return Picture(figure, tuple(Panel(axes) for axes in grid[: len(checks)]))
+    return plotted(figure, grid, title)
+
+
+def _small_plots(count: int) -> "tuple[Figure, list[Axes]]":
+    """A figure with room for `count` plots, up to three in a row."""
+    columns = min(count, 3)
+    figure = style.new_figure(max(5.0, 3.6 * columns), 0.5 + 2.7 * -(-count // columns))
+    return figure, style.grid(figure, count, columns)
 
 
 def show_sweep(swept: Any, *, title: str = "") -> Picture:
@@ -480,27 +410,20 @@ def show_sweep(swept: Any, *, title: str = "") -> Picture:
             "of numbers from the function."
         )
     names = list(named)[:_PANELS]
-    columns = min(len(names), 3)
-    rows = -(-len(names) // columns)
-    figure = style.new_figure(max(5.0, 3.6 * columns), 0.4 + 2.7 * rows)
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    for spare in grid[len(names) :]:
-        spare.remove()
-    for axes, name in zip(grid, names, strict=False):
+    figure, grid = _small_plots(len(names))
+    colour = style.COLOURS[0]
+    for axes, name in zip(grid, names, strict=True):
         values = named[name].reshape(len(named[name]), -1)
-        design = np.arange(len(values))
+        at, low, high = np.arange(len(values)), values.min(1), values.max(1)
         if values.shape[1] == 1:
-            axes.plot(design, values[:, 0], "o", ms=3.5, mew=0, color=style.COLOURS[0])
+            axes.plot(at, low, "o", ms=3.5, mew=0, color=colour)
         else:
-            axes.fill_between(
-                design, values.min(1), values.max(1), alpha=0.3, lw=0, color=style.COLOURS[0]
-            )
-            axes.plot(design, values.mean(1), color=style.COLOURS[0], lw=1.4)
+            axes.fill_between(at, low, high, alpha=0.3, lw=0, color=colour)
+            axes.plot(at, values.mean(1), color=colour, lw=1.4)
         style.dress(axes, "design", "", name)
     left = len(named) - len(names)
     more = f", {left} more names" if left else ""
-    style.title(figure, title or f"{len(next(iter(named.values())))} designs{more}")
-    return Picture(figure, tuple(Panel(axes) for axes in grid[: len(names)]))
+    return plotted(figure, grid, title or f"{len(named[names[0]])} designs{more}")
 
 
 def _is_number(values) -> bool:
@@ -518,23 +441,16 @@ def show_tracks(tracks: Any, *, title: str = "") -> Picture:
     """
     figure = style.new_figure(6.0, 5.0)
     axes = figure.add_subplot()
-    for number, (centre, radius) in enumerate(
-        zip(tracks.discs.centre, tracks.discs.radius, strict=True)
-    ):
+    arrow = {"arrowstyle": "->", "color": style.INK}
+    for number, centre in enumerate(tracks.discs.centre):
         seen = tracks.unseen[number] == 0
         colour = style.COLOURS[number % len(style.COLOURS)] if seen else _TINT
-        turn = np.linspace(0, 2 * np.pi, 65)
-        edge = centre + radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-        axes.fill(edge[:, 0], edge[:, 1], color=colour, alpha=0.8 if seen else 0.4, lw=0)
-        axes.annotate(
-            "",
-            centre + tracks.velocity[number],
-            centre,
-            arrowprops={"arrowstyle": "->", "color": style.INK},
-        )
+        edge = centre + tracks.discs.radius[number] * circle(64)
+        axes.fill(*edge.T, color=colour, alpha=0.8 if seen else 0.4, lw=0)
+        axes.annotate("", centre + tracks.velocity[number], centre, arrowprops=arrow)
         axes.text(*centre, str(number), ha="center", va="center", color="white")
     text = f"{len(tracks.unseen)} markers, {int(np.sum(tracks.stale))} stale"
     style.dress(axes, "x [px]", "y [px]", title or text)
     axes.set_aspect("equal")
     axes.invert_yaxis()  # as in the image
-    return Picture(figure, (Panel(axes),))
+    return plotted(figure, [axes])

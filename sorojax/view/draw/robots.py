@@ -10,8 +10,6 @@ from sorojax.sdf import AbstractSdf, contour, offset
 from sorojax.sdf.sampling import finite_box
 from sorojax.view import style
 from sorojax.view.draw.shapes import shape_surface
-from sorojax.view.picture import Picture, show_scene
-from sorojax.view.raster.camera import View
 from sorojax.view.raster.scene import Lines, Part, Scene, Surface
 
 _CLEAR = 0.45
@@ -19,29 +17,15 @@ _CELLS = {2: 600, 3: 110}  # along the body, by dimension: walls and slots are t
 _AIR = (style.COLOURS[5], style.COLOURS[2], style.COLOURS[4])
 
 
-def show_robot(
-    robot: Any,
-    *,
-    size: float | None = None,
-    view: View = "iso",
-    renderer: str = "auto",
-    title: str = "",
-) -> Picture:
+def robot_scene(robot: Any, *, size: float | None = None, title: str = "") -> Scene:
     """A robot of `sorojax.robots` at rest: its body, clear in space, and its chambers.
 
     Args:
         robot: What is to be printed, by its dimensions.
         size: Edge of the cells of surfaces and outlines [m]; a 110th of a solid robot, a
             600th of a plane one if omitted.
-        view: Camera of a solid robot.
-        renderer: Of a solid robot.
         title: Title of the figure; the kind and the size of the robot if omitted.
     """
-    return show_scene(robot_scene(robot, size, title), view=view, renderer=renderer)
-
-
-def robot_scene(robot: Any, size: float | None = None, title: str = "") -> Scene:
-    """As `show_robot`, before it is drawn."""
     air = air_of(robot)
     body = robot.body() if hasattr(robot, "body") else robot.solid()
     lower, upper = finite_box("view.show", body, body.dim)

@@ -9,17 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import brentq
 
 from sorojax import rod as R
-from sorojax.math.quadrature import interpolation_rows
 from sorojax.rod import Assembly, Rod, Section
 from sorojax.rod.forces.tendons import Thread, ThreadChambers
 from sorojax.sdf import AbstractSdf, contour
 from sorojax.sdf.sampling import finite_box
 from sorojax.view import style
 from sorojax.view.draw.shapes import obstacle_part
-from sorojax.view.raster.glyphs import line_tube
+from sorojax.view.raster.glyphs import area_of, circle, line_tube
 from sorojax.view.raster.scene import Arrows, Lines, Part, Surface, short
+from sorojax.view.rigging.rig import constant_along
 
 _LENGTH = 0.25  # of the body, that of the longest arrow
 
@@ -48,9 +49,7 @@ def acting(model: Rod | Assembly, forces: Sequence[Any]) -> Acting:
     threads: dict[str, list[Drawn]] = {}
     contacts, pairs = [], []
     for force in forces:
-        part, inner = (
-            (force.part, force.force) if isinstance(force, R.PartForce) else ("", force)
-        )
+        part, inner = part_and_force(force)
         if isinstance(inner, R.PairForce):
             pairs.append(inner)
         elif isinstance(inner, R.AbstractContact):
@@ -62,18 +61,17 @@ def acting(model: Rod | Assembly, forces: Sequence[Any]) -> Acting:
     return Acting(threads, contacts, pairs)
 
 
+def part_and_force(force: Any) -> tuple[str, Any]:
+    """The name of the part that a force acts on, "" where it names none, and the force."""
+    return (force.part, force.force) if isinstance(force, R.PartForce) else ("", force)
+
+
 def _threads(body: Rod, force: Any) -> list[Drawn]:
     if isinstance(force, R.Tendons):
-        tension = None if callable(force.tension) else np.asarray(force.tension)
-        return [
-            _routed(
-                route,
-                style.COLOURS[3],
-                None,
-                "tendon" if tension is None else f"tendon: {short(float(tension[k]), 'N')}",
-            )
-            for k, route in enumerate(force.routes)
-        ]
+        names = ["tendon"] * len(force.routes)
+        if not callable(force.tension):
+            names = [f"tendon: {short(float(pull), 'N')}" for pull in force.tension]
+        return [_tendon(route, name) for route, name in zip(force.routes, names, strict=True)]
     chamber, pressure = force, None
     if isinstance(force, R.Pressurised):
         chamber, pressure = force.chamber, np.atleast_1d(np.asarray(force.pressure))
@@ -87,10 +85,9 @@ def _threads(body: Rod, force: Any) -> list[Drawn]:
     return found
 
 
-def _routed(route: R.AbstractRoute, colour: str, radius: float | None, name: str) -> Drawn:
-    s = jnp.linspace(route.start, route.stop, 61)
-    place = np.asarray(_places(route, s))
-    return Drawn(route.start, route.stop, place, radius, colour, name)
+def _tendon(route: R.AbstractRoute, name: str) -> Drawn:
+    place = np.asarray(_places(route, jnp.linspace(route.start, route.stop, 61)))
+    return Drawn(route.start, route.stop, place, None, style.COLOURS[3], name)
 
 
 @eqx.filter_jit
@@ -215,6 +212,7 @@ def _normal_force(touch, law):
 # Outlines of cross-sections, found again from the constants that a rod keeps of them
 
 
+_CONSTANTS = ("area", "second_moment_y", "second_moment_z", "torsion_constant")
 _CORNERS = 48
 _CLOSE = 2e-3
 
@@ -230,28 +228,16 @@ def outlines_of(
     and torsion constant; any other section is drawn as the ellipse of its second moments,
     unless its `shape` is given, whose hole is drawn if it has just one.
     """
-    section = rod.section
-    count = len(s)
     if shape is not None:
-        return _drawn(shape, count)
-    names = ("area", "second_moment_y", "second_moment_z", "torsion_constant")
-    area, about_y, about_z, torsion = (_along(rod, getattr(section, name), s) for name in names)
-    return _from_constants(area, about_y, about_z, torsion)
+        return _drawn(shape, len(s))
+    return _from_constants(*(constant_along(rod, name, s) for name in _CONSTANTS))
 
 
 def section_outline(section: Section) -> tuple[np.ndarray, np.ndarray | None]:
     """Outline and hole of a section; of the middle node if it varies."""
-    names = ("area", "second_moment_y", "second_moment_z", "torsion_constant")
-    rows = (np.atleast_1d(np.asarray(getattr(section, name), float)) for name in names)
+    rows = (np.atleast_1d(np.asarray(getattr(section, name), float)) for name in _CONSTANTS)
     outer, hole = _from_constants(*(row[[len(row) // 2]] for row in rows))
     return outer[0], None if hole is None else hole[0]
-
-
-def _along(rod: Rod, value, s: np.ndarray) -> np.ndarray:
-    value = np.asarray(value, float)
-    if value.ndim == 0:
-        return np.full(len(s), float(value))
-    return np.asarray(interpolation_rows(rod.quadrature, s)) @ value
 
 
 def _from_constants(area, about_y, about_z, torsion) -> tuple[Outlines, Outlines | None]:
@@ -261,7 +247,7 @@ def _from_constants(area, about_y, about_z, torsion) -> tuple[Outlines, Outlines
         high, wide = np.sqrt(12 * about_z / area), np.sqrt(12 * about_y / area)
         square = _square() / 2
         return square[None] * np.stack([high, wide], axis=1)[:, None], None
-    ring = _ring()
+    ring = circle(_CORNERS)
     if kind == "tube":
         mean, half = 2 * about_z / area, area / (2 * math.pi)
         outer = ring[None] * np.sqrt(mean + half)[:, None, None]
@@ -269,7 +255,7 @@ def _from_constants(area, about_y, about_z, torsion) -> tuple[Outlines, Outlines
     if kind == "squircle":
         power = _power(float(np.median(about_z / area**2)))
         shape = _superellipse(power)
-        size = np.sqrt(area / _shoelace(shape))
+        size = np.sqrt(area / area_of(shape))
         return shape[None] * size[:, None, None], None
     return ring[None] * np.stack([y, z], axis=1)[:, None], None
 
@@ -287,11 +273,6 @@ def _kind(area: float, about_y: float, about_z: float, torsion: float) -> str:
     return "squircle" if about_z / area**2 < 1 / 12 else "other"
 
 
-def _ring(count: int = _CORNERS) -> np.ndarray:
-    angle = 2 * np.pi * np.arange(count) / count
-    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
-
-
 def _square(count: int = _CORNERS) -> np.ndarray:
     """The square of side 2, its corners among the points."""
     at = np.linspace(-1, 1, count // 4, endpoint=False)
@@ -301,7 +282,7 @@ def _square(count: int = _CORNERS) -> np.ndarray:
 
 
 def _superellipse(power: float) -> np.ndarray:
-    ring = _ring()
+    ring = circle(_CORNERS)
     return np.sign(ring) * np.abs(ring) ** (2 / power)  # dense where it is round
 
 
@@ -315,28 +296,21 @@ def _power(ratio: float) -> float:
 
         return integral(3.0, 1.0) / integral(1.0, 1.0) ** 2
 
-    low, high = 2.0, 50.0
-    for _ in range(50):
-        middle = (low + high) / 2
-        low, high = (middle, high) if found(middle) < ratio else (low, middle)
-    return (low + high) / 2
-
-
-def _shoelace(ring: np.ndarray) -> float:
-    y, z = ring.T
-    return 0.5 * float(np.sum(y * np.roll(z, -1) - np.roll(y, -1) * z))
+    least, most = 2.0, 50.0
+    ratio = float(np.clip(ratio, found(least), found(most)))
+    return brentq(lambda power: found(power) - ratio, least, most)  # type: ignore[return-value]
 
 
 def _drawn(shape: AbstractSdf, count: int) -> tuple[Outlines, Outlines | None]:
     lower, upper = finite_box("view.show", shape, 2)
     curves = [c.points for c in contour(shape, float(np.max(upper - lower)) / 60) if c.closed]
-    curves = sorted(curves, key=lambda ring: -abs(_shoelace(ring)))
-    outer = curves[0] if _shoelace(curves[0]) > 0 else curves[0][::-1]
+    curves = sorted(curves, key=lambda ring: -abs(area_of(ring)))
+    outer = curves[0] if area_of(curves[0]) > 0 else curves[0][::-1]
     if len(curves) != 2:
         return np.broadcast_to(outer, (count, *outer.shape)), None
     corners = max(len(outer), len(curves[1]))
     outer, hole = _even(outer, corners), _even(curves[1], corners)
-    hole = hole if _shoelace(hole) > 0 else hole[::-1]
+    hole = hole if area_of(hole) > 0 else hole[::-1]
     turn = np.argmin(np.linalg.norm(hole - outer[0], axis=1))
     hole = np.roll(hole, -turn, axis=0)
     size = (count, *outer.shape)

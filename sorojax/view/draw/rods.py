@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from sorojax import rod as R
+from sorojax import _check, rod as R
 from sorojax.rod import Assembly, Rod, Section
 from sorojax.sdf import AbstractSdf, Surface as Triangles
 from sorojax.view import style
@@ -19,16 +19,16 @@ from sorojax.view.draw.rod_loads import (
     acting,
     contact_parts,
     outlines_of,
+    part_and_force,
     section_outline,
     size_of,
     thread_parts,
 )
-from sorojax.view.draw.shapes import shape_scene
-from sorojax.view.picture import Panel, Picture, show_scene
-from sorojax.view.raster.camera import View
-from sorojax.view.raster.glyphs import ball_triangles, tube
+from sorojax.view.draw.shapes import shape_scene, surface_scene
+from sorojax.view.picture import Picture, plotted, spread
+from sorojax.view.raster.glyphs import circle, tube
 from sorojax.view.raster.scene import Arrows, Dots, Lines, Part, Scene, Surface, short
-from sorojax.view.rigging.rig import Rig, pose as posed_rig
+from sorojax.view.rigging.rig import Rig, ellipsoid, pose as posed_rig
 
 _ALONG = 9  # arrows of a force per length
 _LENGTH, _RADIUS = 0.2, 0.07  # of the body: the longest arrow, an arc
@@ -50,14 +50,10 @@ def wrench_parts(
     """
     parts: list[Part] = []
     for force in forces:
-        name, inner = (
-            (force.part, force.force) if isinstance(force, R.PartForce) else ("", force)
-        )
+        name, inner = part_and_force(force)
         if isinstance(inner, R.Gravity):
-            chosen = (
-                [np.asarray(poses[name])] if name else [np.asarray(p) for p in poses.values()]
-            )
-            parts += _weight(inner, chosen, size)
+            chosen = [poses[name]] if name else poses.values()
+            parts += _weight(inner, [np.asarray(pose) for pose in chosen], size)
         elif isinstance(inner, R.TipWrench | R.PointWrench | R.LineWrench) and name in poses:
             parts += _wrench(inner, np.asarray(poses[name]), s, size)
     return parts
@@ -121,7 +117,7 @@ _SEE_THROUGH = 0.45
 Shapes = Mapping[str, AbstractSdf | Triangles]
 
 
-def show_rod(
+def rod_scene(
     model: Rod | Assembly,
     q: Float[Any, "*states coordinates"] | None = None,
     *,
@@ -129,10 +125,8 @@ def show_rod(
     section: AbstractSdf | None = None,
     shapes: Shapes | None = None,
     directors: bool = False,
-    view: View = "iso",
-    renderer: str = "auto",
     title: str = "",
-) -> Picture:
+) -> Scene:
     """A rod or an assembly of rods and links at coordinates `q`.
 
     Args:
@@ -145,45 +139,16 @@ def show_rod(
         shapes: Bodies of links by name, a solid shape or triangles in the frame of the
             link; without one a link is the ellipsoid of its inertia.
         directors: Draw the axes of some sections, x red, y green, z blue.
-        view: Camera of a spatial model.
-        renderer: Of a spatial model.
         title: Title of the figure.
     """
-    scene = rod_scene(
-        model,
-        q,
-        forces=forces,
-        section=section,
-        shapes=shapes,
-        directors=directors,
-        title=title,
-    )
-    return show_scene(scene, view=view, renderer=renderer)
-
-
-def rod_scene(
-    model: Rod | Assembly,
-    q: Float[Any, "*states coordinates"] | None = None,
-    *,
-    forces: Sequence[Any] = (),
-    section: AbstractSdf | None = None,
-    shapes: Shapes | None = None,
-    directors: bool = False,
-    title: str = "",
-) -> Scene:
-    """As `show_rod`, before it is drawn."""
     rest = R.rest(model)
-    q = np.asarray(rest) if q is None else np.asarray(q)
-    rows = np.atleast_2d(q)
-    if rows.shape[1] != rest.shape[0]:
-        raise ValueError(
-            f"view.show: `q` has shape {q.shape}, the model has {rest.shape[0]} coordinates. "
-            "Give one row per state."
-        )
+    rows = np.atleast_2d(np.asarray(rest if q is None else q))
+    do = f"Give one row per state: the model has {len(rest)} coordinates."
+    _check.shape("view.show", "q", rows, (None, len(rest)), do)
     parts: list[Part] = []
     for k, row in enumerate(rows):
         last = k == len(rows) - 1
-        shade = None if last else 0.75 - 0.5 * k / len(rows)
+        shade = 0.0 if last else 0.75 - 0.5 * k / len(rows)
         parts += _state(
             model, row, forces if last else (), section, shapes, directors and last, shade
         )
@@ -193,16 +158,14 @@ def rod_scene(
 def _state(model, q, forces, section, shapes, directors: bool, shade) -> list[Part]:
     s = np.linspace(0.0, 1.0, _STATIONS)
     poses = R.forward_kinematics(model, jnp.asarray(q, float), s)
-    bodies: dict[str, Any] = (
-        {name: part.body for name, part in zip(model.names, model.parts, strict=True)}
-        if isinstance(model, Assembly)
-        else {"": model}
-    )
+    bodies: dict[str, Any] = {"": model}
+    if isinstance(model, Assembly):
+        bodies = dict(zip(model.names, [part.body for part in model.parts], strict=True))
     where = poses if isinstance(poses, dict) else {"": poses}
     found = acting(model, forces)
     inside = any(found.threads.values())
     opacity = _SEE_THROUGH if inside or directors else 1.0
-    colour = style.BODY if shade is None else _mixed(shade)
+    colour = style.pale(style.BODY, shade)
     parts: list[Part] = []
     for name, body in bodies.items():
         pose = np.asarray(where[name])
@@ -252,42 +215,27 @@ def _link(name: str, body, pose: np.ndarray, shapes: Shapes | None, colour: str)
     turn, place = pose[:dim, :dim], pose[:dim, dim]
     shape = (shapes or {}).get(name)
     if shape is not None:
-        surface = shape_scene(shape).parts[0] if isinstance(shape, AbstractSdf) else None
-        points = surface.points if surface is not None else shape.vertices  # type: ignore
-        triangles = surface.triangles if surface is not None else shape.triangles  # type: ignore
-        return [Surface(np.asarray(points) @ turn.T + place, triangles, colour)]
-    centre = np.zeros(dim) if body.center is None else np.asarray(body.center)
-    mass, inertia = float(body.mass), np.asarray(body.inertia)
-    middle = turn @ centre + place
+        make: Any = shape_scene if isinstance(shape, AbstractSdf) else surface_scene
+        surface = make(shape).parts[0]
+        return [Surface(surface.points @ turn.T + place, surface.triangles, colour)]
     if dim == 2:
-        radius = np.sqrt(2 * float(inertia) / mass)  # of a disc
-        angle = np.linspace(0, 2 * np.pi, 61)
-        ring = middle + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        centre = np.zeros(2) if body.center is None else np.asarray(body.center)
+        radius = np.sqrt(2 * float(body.inertia) / float(body.mass))  # of a disc
+        ring = turn @ centre + place + radius * circle(60)[[*range(60), 0]]
         fan = np.stack([np.arange(1, 59), np.arange(2, 60), np.zeros(58, int)], axis=1)
         return [Surface(ring, fan, colour), Lines([ring], style.INK, 0.9), Dots(place[None])]
-    moments, axes = (inertia, np.eye(3)) if inertia.ndim == 1 else np.linalg.eigh(inertia)
-    moments = np.broadcast_to(moments, 3)
-    square = 2.5 / mass * (moments.sum() - 2 * moments)
-    half = np.sqrt(np.maximum(square, 0.04 * square.max()))
-    points, triangles = ball_triangles(np.zeros((1, 3)), 1.0, corners=36)
-    return [Surface((points * half) @ axes.T @ turn.T + middle, triangles, colour)]
+    points, triangles = ellipsoid(body, 36, thinnest=0.2)
+    return [Surface(points @ turn.T + place, triangles, colour)]
 
 
 def director_parts(poses: Float[np.ndarray, "sections h h"], length: float) -> list[Part]:
     """The axes of some sections, `length` [m] long."""
     dim = poses.shape[1] - 1
     starts = poses[:, :dim, dim]
-    colours = ("#c0392b", "#1e8449", "#1f5fa8")
     return [
-        Arrows(starts, length * poses[:, :dim, k], colours[k], name=f"director {'xyz'[k]}")
+        Arrows(starts, length * poses[:, :dim, k], style.AXES[k], name=f"director {'xyz'[k]}")
         for k in range(dim)
     ]
-
-
-def _mixed(share: float) -> str:
-    from matplotlib.colors import to_hex, to_rgb
-
-    return to_hex(tuple((1 - share) * np.array(to_rgb(style.BODY)) + share))
 
 
 # Bodies of networks and robots, where a search ended, rigs, sections
@@ -296,33 +244,31 @@ def _mixed(share: float) -> str:
 _POSES = 5  # that are drawn of a path
 
 
-def show_body(body: Any, q: Any = None, **options: Any) -> Picture:
-    """The rod or assembly of a block with its forces, at its start; options of `show_rod`."""
+def body_scene(body: Any, q: Any = None, **options: Any) -> Scene:
+    """The rod or assembly of a block with its forces, at its start; options of a rod."""
     model = body.rod if hasattr(body, "rod") else body.assembly
     q = body.q if q is None else q
-    return show_rod(model, q, **({"forces": body.forces} | options))
+    return rod_scene(model, q, **({"forces": body.forces} | options))
 
 
-def show_model(model: Any, q: Any = None, **options: Any) -> Picture:
-    """The body of a model of a robot; options of `show_rod`. Its `network` is a diagram."""
-    return show_body(model.network.blocks["body"], q, **options)
+def model_scene(model: Any, q: Any = None, **options: Any) -> Scene:
+    """The body of a model of a robot; options of a rod. Its `network` is a diagram."""
+    return body_scene(model.network.blocks["body"], q, **options)
 
 
-def show_posed(
-    found: Any, *, model: Rod | Assembly, title: str = "", **options: Any
-) -> Picture:
+def posed_scene(found: Any, *, model: Rod | Assembly, title: str = "", **options: Any) -> Scene:
     """A rod or an assembly where a search ended: at rest under its forces, or at a target.
 
     Args:
         found: From `rod.equilibrium`, `rod.inverse_kinematics` or a path of them.
         model: What was searched.
         title: Title of the figure; how the search ended if omitted.
-        **options: As of `show_rod`.
+        **options: As of a rod.
     """
     q = np.asarray(found.q)
     if q.ndim == 2 and len(q) > _POSES:
-        q = q[np.unique(np.round(np.linspace(0, len(q) - 1, _POSES)).astype(int))]
-    return show_rod(model, q, title=title or _outcome(found), **options)
+        q = q[spread(len(q), _POSES)]
+    return rod_scene(model, q, title=title or _outcome(found), **options)
 
 
 def _outcome(found: Any) -> str:
@@ -334,19 +280,14 @@ def _outcome(found: Any) -> str:
     return f"load factor to {float(factors[-1]):.4g}" if is_row else ""
 
 
-def show_rig(
-    rig: Rig,
-    q: Float[Any, " coordinates"] | None = None,
-    *,
-    view: View = "iso",
-    renderer: str = "auto",
-    title: str = "",
-) -> Picture:
+def rig_scene(
+    rig: Rig, q: Float[Any, " coordinates"] | None = None, *, title: str = ""
+) -> Scene:
     """The surface of a rig at coordinates `q`, at rest if omitted."""
     triangles = np.asarray(rig.triangles)
     surface = Surface(np.asarray(posed_rig(rig, q)), triangles)
     text = f"{len(triangles)} triangles on {type(rig.model).__name__.lower()}"
-    return show_scene(Scene((surface,), title=title or text), view=view, renderer=renderer)
+    return Scene((surface,), title=title or text)
 
 
 def show_section(section: Section, *, title: str = "") -> Picture:
@@ -360,16 +301,12 @@ def show_section(section: Section, *, title: str = "") -> Picture:
     style.dress_plane(
         axes, 1e3 * outer.min(axis=0), 1e3 * outer.max(axis=0), "local y [mm]", "local z [mm]"
     )
-    facts = {
-        "A": (section.area, 1e6, "mm$^2$"),
-        "$I_y$": (section.second_moment_y, 1e12, "mm$^4$"),
-        "$I_z$": (section.second_moment_z, 1e12, "mm$^4$"),
-        "J": (section.torsion_constant, 1e12, "mm$^4$"),
-    }
-    text = "   ".join(
-        f"{name} {float(np.median(np.asarray(value))) * factor:.4g} {unit}"
-        for name, (value, factor, unit) in facts.items()
-    )
-    axes.set_title(text, fontsize=style.SMALL - 1, color=style.INK)
-    style.title(figure, title)
-    return Picture(figure, (Panel(axes),))
+    facts = [f"A {1e6 * float(np.median(section.area)):.4g} mm$^2$"]
+    for name, constant in (
+        ("$I_y$", section.second_moment_y),
+        ("$I_z$", section.second_moment_z),
+        ("J", section.torsion_constant),
+    ):
+        facts.append(f"{name} {1e12 * float(np.median(constant)):.4g} mm$^4$")
+    axes.set_title("   ".join(facts), fontsize=style.SMALL - 1, color=style.INK)
+    return plotted(figure, [axes], title)

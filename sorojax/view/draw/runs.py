@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from sorojax import _check
 from sorojax.design import History
 from sorojax.design.optimise.minimise import Optimised
 from sorojax.mesh import Mesh
@@ -13,7 +14,7 @@ from sorojax.systems import AbstractBlock, Trajectory
 from sorojax.view import style
 from sorojax.view.draw.meshes import mesh_scene
 from sorojax.view.draw.plots import show_signals
-from sorojax.view.picture import Panel, Picture, panels
+from sorojax.view.picture import Picture, panels, plotted, spread
 from sorojax.view.raster.scene import Scale, Scene, Surface
 
 _MOST = 8  # lines in one panel
@@ -139,24 +140,23 @@ def show_optimised(
     if not held.shape[1]:
         names.remove("constraints")
     figure = style.new_figure(8.0, 0.6 + 1.8 * len(names))
-    axes = figure.subplots(len(names), 1, sharex=True, squeeze=False).ravel()
+    axes = style.grid(figure, len(names), 1, sharex=True)
     for panel, name in zip(axes, names, strict=True):
         rows = np.asarray(result.history[name]).reshape(len(step), -1)
         for k in range(min(rows.shape[1], _MOST)):
             label = f"constraint {k}" if name == "constraints" else None
             panel.plot(step, rows[:, k], color=style.COLOURS[k % 6], lw=1.7, label=label)
         if name == "constraints":
-            panel.axhline(0.0, color=style.INK, lw=0.9, ls=(0, (4, 2)))
+            panel.axhline(0.0, color=style.INK, lw=0.9, ls=style.DASHES)
         if name == "change" and np.all(rows > 0):
             panel.set_yscale("log")
         style.dress(panel, "", {"change": "largest change"}.get(name, name))
         if rows.shape[1] > 1:
             style.legend(panel, loc="center left", bbox_to_anchor=(1.0, 0.5))
     axes[-1].set_xlabel("step", fontsize=style.LABEL, color=style.INK)
-    figure.align_ylabels(list(axes))
+    figure.align_ylabels(axes)
     last = f"objective {float(result.objective):.4g} after {len(step)} steps"
-    style.title(figure, title or last)
-    return Picture(figure, tuple(Panel(panel) for panel in axes))
+    return plotted(figure, axes, title or last)
 
 
 def show_history(
@@ -192,14 +192,10 @@ def show_densities(
         title: Title of the figure.
     """
     rows = np.atleast_2d(np.asarray(densities))
-    if rows.shape[1] != mesh.num_cells:
-        raise ValueError(
-            f"view.show: densities have shape {rows.shape}, need (steps, {mesh.num_cells}), "
-            "one per cell."
-        )
+    do = "Give one per cell, in rows of steps."
+    _check.shape("view.show", "densities", rows, (None, mesh.num_cells), do)
     count = len(rows)
-    chosen = np.unique(np.round(np.linspace(0, count - 1, 6)).astype(int))
-    chosen = chosen if steps is None else np.asarray(steps) % count
+    chosen = spread(count, 6) if steps is None else [k % count for k in steps]
     scale = Scale("density [-]", 0.0, 1.0, colours="Greys")
     scenes = []
     for k in chosen:

@@ -8,7 +8,7 @@ from sorojax.sdf import AbstractSdf, Surface as Triangles, contour, isosurface
 from sorojax.sdf.sampling import finite_box, values
 from sorojax.sdf.surface.marching import Curve
 from sorojax.view import style
-from sorojax.view.picture import Panel, Picture, show_scene
+from sorojax.view.picture import Picture, plotted, show_scene
 from sorojax.view.raster.camera import View
 from sorojax.view.raster.scene import Lines, Part, Scene, Surface
 
@@ -19,80 +19,68 @@ if TYPE_CHECKING:
     from sorojax.io import MovingSurface
 
 
-_AXES = {"x": 0, "y": 1, "z": 2}
-
-
 def _show_plane(shape: AbstractSdf, resolution: int, title: str) -> Picture:
     """A plane shape: filled contours of its distance and the zero set as a line."""
     lower, upper = finite_box("view.show", shape, 2)
     step = float(np.max(upper - lower)) / resolution
     margin = 0.06 * resolution * step
     ranges = zip(lower - margin, upper + margin + step, strict=True)
-    x, y = np.meshgrid(*(np.arange(low, high, step) for low, high in ranges))
-    f = values(shape, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
-    figure, axes = _contours(x, y, f, lower - margin, upper + margin, title)
-    for run in _runs(shape, step):
-        axes.plot(*(1e3 * run).T, color=style.INK, lw=1.5, solid_joinstyle="miter")
+    x, y = (np.arange(low, high, step) for low, high in ranges)
+    figure, axes = _contours(x, y, _on_grid(shape, x, y).T, lower - margin, upper + margin)
+    for curve in contour(shape, step):
+        axes.plot(*_run(curve).T, color=style.INK, lw=1.5, solid_joinstyle="miter")
     style.dress_plane(axes, 1e3 * lower, 1e3 * upper)
-    return Picture(figure, (Panel(axes),))
+    return plotted(figure, [axes], title)
 
 
 def _show_slice(
     shape: AbstractSdf, slice: dict[str, float], resolution: int, title: str
 ) -> Picture:
     """The distance of a solid shape in a plane across one axis, with the zero line."""
-    if len(slice) != 1 or next(iter(slice)) not in _AXES:
+    if len(slice) != 1 or next(iter(slice)) not in ("x", "y", "z"):
         raise ValueError(
             f'view.show: got slice={slice}, need one axis with its place [m]: {{"z": 0.01}}.'
         )
     name, place = next(iter(slice.items()))
-    across = _AXES[name]
+    across = "xyz".index(name)
     lower, upper = finite_box("view.show", shape, 3)
     rest = [axis for axis in range(3) if axis != across]
     low, high = lower[rest], upper[rest]
     margin = 0.06 * float(np.max(high - low))
     low, high = low - margin, high + margin
     count = np.maximum((high - low) / np.max(high - low) * resolution, 16).astype(int)
-    x, y = np.meshgrid(
-        *(np.linspace(a, b, n) for a, b, n in zip(low, high, count, strict=True))
-    )
-    points = np.full((x.size, 3), float(place))
-    points[:, rest[0]], points[:, rest[1]] = x.ravel(), y.ravel()
-    f = values(shape, points).reshape(x.shape)
-    title = title or f"{name} = {1e3 * float(place):g} mm"
-    figure, axes = _contours(x, y, f, low, high, title)
+    x, y = (np.linspace(a, b, n) for a, b, n in zip(low, high, count, strict=True))
+    grid = [x, y]
+    grid.insert(across, np.array([float(place)]))
+    f = _on_grid(shape, *grid).squeeze(axis=across).T
+    figure, axes = _contours(x, y, f, low, high)
     if f.min() < 0 < f.max():
         axes.contour(1e3 * x, 1e3 * y, f, levels=[0.0], colors=style.INK, linewidths=1.5)
     style.dress_plane(axes, 1e3 * low, 1e3 * high, *(f"{'xyz'[k]} [mm]" for k in rest))
-    return Picture(figure, (Panel(axes),))
+    return plotted(figure, [axes], title or f"{name} = {1e3 * float(place):g} mm")
 
 
-def _runs(shape: AbstractSdf, size: float) -> list[np.ndarray]:
-    """Closed curves of a plane shape, the first point repeated at the end."""
-    return [
-        np.concatenate([c.points, c.points[:1]]) if c.closed else c.points
-        for c in contour(shape, size)
-    ]
+def _on_grid(shape: AbstractSdf, *axes: np.ndarray) -> np.ndarray:
+    """A field at the points of a grid."""
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    return values(shape, grid.reshape(-1, len(axes))).reshape(grid.shape[:-1])
 
 
-def _contours(x, y, f, lower, upper, title: str) -> "tuple[Figure, Axes]":
+def _run(curve: Curve) -> np.ndarray:
+    """The points of a curve [mm], the first again at the end of a closed one."""
+    points = 1e3 * np.asarray(curve.points)
+    return np.concatenate([points, points[:1]]) if curve.closed else points
+
+
+def _contours(x, y, f, lower, upper) -> "tuple[Figure, Axes]":
     """Filled contours of a distance over a grid [m], in a figure for the box around it."""
     figure = style.new_figure(9.0, style.height_for(9.0, lower, upper))
     axes = figure.add_subplot()
     norm, levels = _two_sided(1e3 * float(f.min()), 1e3 * float(f.max()))
     filled = axes.contourf(1e3 * x, 1e3 * y, 1e3 * f, levels=levels, cmap="RdBu_r", norm=norm)
-    style.colour_bar(
-        figure,
-        filled,
-        axes,
-        "signed distance [mm]",
-        format="%g",
-        shrink=0.9,
-        pad=0.02,
-        ticks=levels[::2] if len(levels) > 12 else levels,
-        spacing="uniform",
-    )
-    style.title(figure, title)
+    ticks = levels[::2] if len(levels) > 12 else levels
+    look = {"format": "%g", "shrink": 0.9, "pad": 0.02, "spacing": "uniform", "ticks": ticks}
+    style.colour_bar(figure, filled, axes, "signed distance [mm]", **look)
     return figure, axes
 
 
@@ -133,23 +121,21 @@ def show_shape(
         resolution: Points along the longer side of a plane picture.
         title: Title of the figure.
     """
-    if shape.dim == 3 and slice is None:
-        return show_scene(shape_scene(shape, size, title), view=view, renderer=renderer)
-    if shape.dim == 3:
-        assert slice is not None
+    if shape.dim == 2 and not filled:
+        return _show_plane(shape, resolution, title)
+    if shape.dim == 3 and slice is not None:
         return _show_slice(shape, slice, resolution, title)
-    if filled:
-        return show_scene(shape_scene(shape, size, title))
-    return _show_plane(shape, resolution, title)
+    return show_scene(shape_scene(shape, size, title), view=view, renderer=renderer)
 
 
 def shape_scene(shape: AbstractSdf, size: float | None = None, title: str = "") -> Scene:
     """The surface of a solid shape, or a plane shape filled."""
     lower, upper = finite_box("view.show", shape, shape.dim)
     longest = float(np.max(upper - lower))
-    if shape.dim == 2:
-        return Scene((_filled(shape, longest / 300 if size is None else size),), title=title)
-    return Scene((shape_surface(shape, longest / 72 if size is None else size),), title=title)
+    if size is None:
+        size = longest / (300 if shape.dim == 2 else 72)
+    part = _filled(shape, size) if shape.dim == 2 else shape_surface(shape, size)
+    return Scene((part,), title=title)
 
 
 def shape_surface(shape: AbstractSdf, size: float, **look: Any) -> Surface:
@@ -207,9 +193,7 @@ def level_surface(shape: AbstractSdf, lower: np.ndarray, upper: np.ndarray, coun
     """Zero surface of a solid field in a box, open where the box cuts it."""
     from skimage.measure import marching_cubes
 
-    axes = [np.linspace(a, b, count) for a, b in zip(lower, upper, strict=True)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    f = values(shape, grid.reshape(-1, 3)).reshape(count, count, count)
+    f = _on_grid(shape, *np.linspace(lower, upper, count).T)
     if not f.min() < 0 < f.max():
         return np.zeros((0, 3)), np.zeros((0, 3), int)
     step = tuple((upper - lower) / (count - 1))
@@ -221,10 +205,8 @@ def level_lines(shape: AbstractSdf, lower: np.ndarray, upper: np.ndarray, count:
     """Zero lines of a plane field in a box; the shape may be unbounded."""
     from skimage.measure import find_contours
 
-    step = (upper - lower) / (count - 1)
-    x, y = np.meshgrid(*(np.linspace(a, b, count) for a, b in zip(lower, upper, strict=True)))
-    f = values(shape, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(x.shape)
-    return [lower + run[:, ::-1] * step for run in find_contours(f, 0.0)]
+    f = _on_grid(shape, *np.linspace(lower, upper, count).T)
+    return [lower + run * (upper - lower) / (count - 1) for run in find_contours(f, 0.0)]
 
 
 def _filled(shape: AbstractSdf, size: float) -> Surface:
@@ -246,23 +228,14 @@ def show_part(part: Any, **options: Any) -> Picture:
     return show_shape(part.shape, **options)
 
 
-def show_moving(
-    surface: "MovingSurface",
-    *,
-    frame: int = -1,
-    view: View = "iso",
-    renderer: str = "auto",
-    title: str = "",
-) -> Picture:
+def moving_scene(surface: "MovingSurface", *, frame: int = -1, title: str = "") -> Scene:
     """A moving surface in one of its frames, the last one if omitted."""
     points = np.asarray(surface.points)
     points = points[frame if len(points) > 1 else 0]
     if surface.poses is not None:
         pose = np.asarray(surface.poses)[frame]
         points = points @ pose[:3, :3].T + pose[:3, 3]
-    part = Surface(points, np.asarray(surface.triangles))
-    scene = Scene((part,), title=title or surface.name)
-    return show_scene(scene, view=view, renderer=renderer)
+    return Scene((Surface(points, np.asarray(surface.triangles)),), title=title or surface.name)
 
 
 def show_curve(curve: Curve, *, title: str = "") -> Picture:
@@ -271,17 +244,10 @@ def show_curve(curve: Curve, *, title: str = "") -> Picture:
     lower, upper = 1e3 * points.min(axis=0), 1e3 * points.max(axis=0)
     figure = style.new_figure(6.0, style.height_for(6.0, lower, upper))
     axes = figure.add_subplot()
-    line = np.concatenate([points, points[:1]]) if curve.closed else points
-    axes.plot(*(1e3 * line).T, color=style.COLOURS[0], lw=1.6, marker=".", ms=3)
-    axes.plot(
-        *(1e3 * points[np.asarray(curve.corner)]).T,
-        "o",
-        color=style.COLOURS[1],
-        ms=6,
-        label="corners",
-    )
+    axes.plot(*_run(curve).T, color=style.COLOURS[0], lw=1.6, marker=".", ms=3)
+    corners = 1e3 * points[np.asarray(curve.corner)]
+    axes.plot(*corners.T, "o", color=style.COLOURS[1], ms=6, label="corners")
     style.dress_plane(axes, lower, upper)
     if np.any(curve.corner):
         style.legend(axes, loc="best")
-    style.title(figure, title or f"{len(points)} points")
-    return Picture(figure, (Panel(axes),))
+    return plotted(figure, [axes], title or f"{len(points)} points")

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from sorojax.view import style
-from sorojax.view.film.film import Film, Frame, frames_at
+from sorojax.view.film.film import Film, Frame, frames_at, renderer_of
 from sorojax.view.raster.camera import View, camera_at
 from sorojax.view.raster.plane import bar_beside, draw_plane, name_parts
-from sorojax.view.raster.scene import Scale, Scene
+from sorojax.view.raster.scene import Scale, Scene, box_around
 from sorojax.view.raster.solid import (
     annotate,
     chosen_renderer,
@@ -99,17 +99,13 @@ def animate(
 
 def _alike(tracks: list[Track]) -> list[Track]:
     """One box and one scale of colours for panels that are to be compared."""
-    boxes = [_extent(track) for track in tracks]
-    extent = (np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0))
+    extent = box_around([_extent(track) for track in tracks])
     scales = [track.scale for track in tracks if track.scale is not None]
     scale = scales[0] if scales else None
     if len(scales) == 2 and scales[0].label == scales[1].label:
-        scale = replace(
-            scales[0], low=min(s.low for s in scales), high=max(s.high for s in scales)
-        )
-    return [
-        replace(t, extent=extent, scale=scale if t.scale is not None else None) for t in tracks
-    ]
+        low, high = min(s.low for s in scales), max(s.high for s in scales)
+        scale = replace(scales[0], low=low, high=high)
+    return [replace(t, extent=extent, scale=t.scale and scale) for t in tracks]
 
 
 def _extent(track: Track) -> tuple[np.ndarray, np.ndarray]:
@@ -117,8 +113,7 @@ def _extent(track: Track) -> tuple[np.ndarray, np.ndarray]:
     if track.extent is not None:
         return track.extent
     some = np.unique(np.linspace(0, len(track.time) - 1, 60).astype(int))
-    boxes = [track.scene(int(k)).box for k in some]
-    return np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
+    return box_around([track.scene(int(k)).box for k in some])
 
 
 class _Stage(abc.ABC):
@@ -130,27 +125,24 @@ class _Stage(abc.ABC):
         self.boxes = [_extent(track) for track in tracks]
         self.figure = style.new_figure(size[0] / 100, size[1] / 100, layout=self.layout)
         self.figure.set_dpi(100)
-        self.prepare()
+        self.frame = self.prepare()
 
     layout: Any = None
 
     @abc.abstractmethod
-    def prepare(self) -> None:
-        """Draw what stands still."""
-
-    @abc.abstractmethod
-    def frame(self, k: int) -> Frame:
-        """Frame k of the film."""
+    def prepare(self) -> Callable[[int], Frame]:
+        """Draw what stands still; returns what draws frame k of the film."""
 
     def scene(self, track: Track, k: int) -> Scene:
         """The scene nearest to the instant of frame k, with the scale and box of the film."""
-        time = self.tracks[0].time[self.chosen[k]]
-        at = int(self.chosen[k]) if track is self.tracks[0] else _nearest(track.time, time)
-        made = track.scene(at)
-        return replace(made, scale=track.scale, title="")
+        at = int(self.chosen[k])
+        if track is not self.tracks[0]:
+            at = int(np.argmin(np.abs(track.time - self.tracks[0].time[at])))
+        return replace(track.scene(at), scale=track.scale, title="")
 
-    def share(self, k: int) -> float:
-        return k / max(len(self.chosen) - 1, 1)
+    def stamp_on(self, on: Any, x: float, y: float, va: str, **look: Any) -> Any:
+        look |= {"fontsize": style.LABEL, "family": "monospace"}
+        return style.write(on, x, y, self.stamped(0), ha="left", va=va, **look)
 
     def stamped(self, k: int) -> str:
         """The time or the load of frame k."""
@@ -162,18 +154,12 @@ class _Stage(abc.ABC):
         return f"{value:.{min(digits, 6)}f} {track.unit}"
 
 
-def _nearest(time: np.ndarray, at: float) -> int:
-    return int(np.argmin(np.abs(time - at)))
-
-
 class _Plane(_Stage):
     """Panels of matplotlib; axes, bars and names stand still."""
 
     layout = "constrained"
 
-    def prepare(self) -> None:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-
+    def prepare(self) -> Callable[[int], Frame]:
         boxes = [(1e3 * low, 1e3 * high) for low, high in self.boxes]
         span = boxes[0][1] - boxes[0][0]
         wide = span[0] > 1.6 * span[1]
@@ -192,42 +178,24 @@ class _Plane(_Stage):
         if scale is not None:
             bar_beside(self.figure, self.axes, scale)
         style.title(self.figure, self.title)
-        self.text = self.axes[0].text(
-            0.0,
-            1.02,
-            self.stamped(len(self.chosen) - 1),
-            transform=self.axes[0].transAxes,
-            fontsize=style.LABEL,
-            color=style.INK,
-            family="monospace",
-            va="bottom",
-        )
-        self.canvas = FigureCanvasAgg(self.figure)
-        self.text.set_animated(True)
-        self.canvas.draw()
-        self.figure.set_layout_engine("none")
-        self.canvas.draw()
-        self.still = self.canvas.copy_from_bbox(self.figure.bbox)
+        first = self.axes[0]
+        self.text = self.stamp_on(first, 0.0, 1.02, "bottom", transform=first.transAxes)
+        self.drawn: list[Any] = []
+        return renderer_of(self.figure, self._artists)
 
-    def frame(self, k: int) -> Frame:
-        self.canvas.restore_region(self.still)
-        renderer = self.canvas.get_renderer()
+    def _artists(self, k: int) -> list[Any]:
+        while self.drawn:
+            self.drawn.pop().remove()
         for axes, track in zip(self.axes, self.tracks, strict=True):
-            for artist in draw_plane(axes, self.scene(track, k)):
-                artist.set_animated(True)
-                artist.draw(renderer)
-                artist.remove()
+            self.drawn += draw_plane(axes, self.scene(track, k))
         self.text.set_text(self.stamped(k))
-        self.text.draw(renderer)
-        return np.asarray(self.canvas.buffer_rgba())[:, :, :3].copy()
+        return [*self.drawn, self.text]
 
 
 class _Solid(_Stage):
     """Shaded pictures put into a frame that is drawn once."""
 
-    def prepare(self) -> None:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-
+    def prepare(self) -> Callable[[int], Frame]:
         chosen_renderer(self.renderer)
         self.firsts = [track.scene(0).parts for track in self.tracks]
         self.places, count = [], len(self.tracks)
@@ -238,9 +206,8 @@ class _Solid(_Stage):
         heading = 0.05 if any(track.name for track in self.tracks) else 0.0
         for k, track in enumerate(self.tracks):
             wide = place.width / count
-            axes = self.figure.add_axes(
-                (place.x0 + k * wide, place.y0, wide, place.height - heading)
-            )
+            left = place.x0 + k * wide
+            axes = self.figure.add_axes((left, place.y0, wide, place.height - heading))
             box = axes.get_window_extent()
             size = int(box.width), int(box.height)
             corner = int(box.x0), int(round(self.figure.bbox.height - box.y1))
@@ -252,36 +219,24 @@ class _Solid(_Stage):
             if k == 0 and not callable(self.view):
                 annotate(self.figure, axes, first, lens)
             self.places.append((corner, size))
-        self.canvas = FigureCanvasAgg(self.figure)
+        self.canvas: Any = self.figure.canvas
         self.canvas.draw()
         self.still = np.asarray(self.canvas.buffer_rgba())[:, :, :3].copy()
-        self.text = self.figure.text(
-            0.015,
-            0.965,
-            "",
-            fontsize=style.LABEL,
-            color=style.INK,
-            family="monospace",
-            va="top",
-        )
-        self.text.set_animated(True)
+        self.text = self.stamp_on(self.figure, 0.015, 0.965, "top")
+        return self._frame
 
     def _lens(self, track: Track, size: tuple[int, int], share: float):
         index = self.tracks.index(track)
         whole = Scene(self.firsts[index], extent=self.boxes[index])
         return lens_of([whole], camera_at(self.view, share), size)
 
-    def frame(self, k: int) -> Frame:
+    def _frame(self, k: int) -> Frame:
         picture = self.still.copy()
+        share = k / max(len(self.chosen) - 1, 1)
+        look = {"renderer": self.renderer, "samples": self.samples, "dots_per_point": 100 / 72}
         for track, ((x, y), size) in zip(self.tracks, self.places, strict=True):
-            lens = self._lens(track, size, self.share(k))
-            seen = picture_of(
-                self.scene(track, k),
-                lens,
-                renderer=self.renderer,
-                samples=self.samples,
-                dots_per_point=100 / 72,
-            )
+            lens = self._lens(track, size, share)
+            seen = picture_of(self.scene(track, k), lens, **look)
             part = picture[y : y + size[1], x : x + size[0]]
             # names and axes stay in front: they are darker than the paper of the picture
             np.minimum(part, seen[: part.shape[0], : part.shape[1]], out=part)

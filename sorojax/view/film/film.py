@@ -119,10 +119,13 @@ def animate_figure(
             f"animate: got {frames} frames at {fps:g} per second, need 1 or more at up to 240. "
             "Show every second frame."
         )
-    return Film(_renderer(figure, update), frames, fps, label)
+    return Film(renderer_of(figure, update), frames, fps, label)
 
 
-def _renderer(figure: "Figure", update) -> Callable[[int], Frame]:
+def renderer_of(
+    figure: "Figure", update: Callable[[int], "Iterable[Artist]"]
+) -> Callable[[int], Frame]:
+    """What draws frame k of a film of `animate_figure`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     canvas = FigureCanvasAgg(figure)
@@ -156,16 +159,10 @@ def _gif(film: Film, every: int) -> bytes:
         pictures.append(picture.quantize(palette=palette, dither=Image.Dither.NONE))
         report(film.label, len(pictures), count)
     buffer = io.BytesIO()
-    pictures[0].save(
-        buffer,
-        "GIF",
-        save_all=True,
-        append_images=pictures[1:],
-        loop=0,
-        optimize=False,
-        duration=round(100 * every / film.fps) * 10,
-        disposal=1,
-    )
+    look = {"loop": 0, "optimize": False, "disposal": 1}
+    length = round(100 * every / film.fps) * 10
+    rest = pictures[1:]
+    pictures[0].save(buffer, "GIF", save_all=True, append_images=rest, duration=length, **look)
     return buffer.getvalue()
 
 
@@ -194,16 +191,11 @@ def _encode(film: Film, path: Path) -> None:
     imageio_ffmpeg: Any = importlib.import_module("imageio_ffmpeg")
     high, wide = film.draw(0).shape[:2]
     size = (wide - wide % 2, high - high % 2)  # the format has pairs of pixels only
-    vp9 = path.suffix.lower() == ".webm"
-    writer = imageio_ffmpeg.write_frames(
-        str(path),
-        size,
-        fps=film.fps,
-        macro_block_size=1,
-        quality=None if vp9 else 7,
-        codec="libvpx-vp9" if vp9 else "libx264",
-        pix_fmt_out="yuv420p",
-    )
+    look = {"codec": "libx264", "quality": 7}
+    if path.suffix.lower() == ".webm":
+        look = {"codec": "libvpx-vp9", "quality": None}
+    look |= {"macro_block_size": 1, "pix_fmt_out": "yuv420p"}
+    writer = imageio_ffmpeg.write_frames(str(path), size, fps=film.fps, **look)
     writer.send(None)
     try:
         for frame in film:

@@ -160,20 +160,10 @@ def _network_track(
             "view.animate: a Trajectory holds states only. Pass network=, what was simulated, "
             "or model=, the rod."
         )
-    bodies = (
-        {}
-        if network is None
-        else {
-            name: part
-            for name, part in network.blocks.items()
-            if isinstance(part, RodBody | AssemblyBody)
-        }
-    )
-    name = block or next(iter(bodies), None)
-    if name is None:
-        name = next(
-            k for k, state in film.state.items() if isinstance(state, dict) and "q" in state
-        )
+    blocks = {} if network is None else network.blocks
+    bodies = {k: part for k, part in blocks.items() if isinstance(part, RodBody | AssemblyBody)}
+    moving = (k for k, state in film.state.items() if isinstance(state, dict) and "q" in state)
+    name = block or next(iter(bodies), None) or next(moving)
     if model is None:
         if name not in bodies:
             raise ValueError(

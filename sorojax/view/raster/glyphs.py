@@ -8,6 +8,18 @@ from jaxtyping import Float, Int
 Mesh = tuple[Float[np.ndarray, "points 3"], Int[np.ndarray, "triangles 3"]]
 
 
+def circle(corners: int) -> Float[np.ndarray, "corners 2"]:
+    """Corners on the circle of radius 1, counter-clockwise."""
+    angle = 2 * np.pi * np.arange(corners) / corners
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def area_of(ring: Float[np.ndarray, "corners 2"]) -> float:
+    """Area inside a ring of corners, negative where they go clockwise."""
+    y, z = ring.T
+    return 0.5 * float(np.sum(y * np.roll(z, -1) - np.roll(y, -1) * z))
+
+
 def tube(
     centres: Float[np.ndarray, "stations 3"],
     across: Float[np.ndarray, "stations 2 3"],
@@ -22,41 +34,37 @@ def tube(
         centres: Of the sections [m].
         across: Local y and z of each section, as unit vectors.
         outlines: Corners (y, z) in each section [m], counter-clockwise about local x.
-        closed: Put lids on both ends.
+        closed: Put lids on both ends, each with a point in its middle.
         inner: Corners of a hole, as many as of the outline.
     """
+    points = _swept(centres, across, outlines)
+    count, corners = len(points), outlines.shape[1]
+    rings = np.arange(count).reshape(-1, corners)
+    triangles = [_between(rings[:-1], rings[1:])]
     if inner is not None:
-        outer, hole = tube(centres, across, outlines, closed=False), None
-        hole = tube(centres, across, inner, closed=False)
-        count, corners = len(outer[0]), outlines.shape[1]
-        turned = hole[1][:, ::-1] + count
-        triangles = [outer[1], turned]
-        if closed:
-            a, b = np.arange(corners), np.roll(np.arange(corners), -1)
-            for base, flip in ((0, True), (count - corners, False)):
-                ring = np.concatenate(
-                    [np.stack([a, b, b + count], 1), np.stack([a, b + count, a + count], 1)]
-                )
-                triangles.append((ring[:, ::-1] if flip else ring) + base)
-        return np.concatenate([outer[0], hole[0]]), np.concatenate(triangles)
-    stations, corners = outlines.shape[:2]
-    points = centres[:, None] + np.einsum("scj,sji->sci", outlines, across)
-    a = np.arange(stations - 1)[:, None] * corners + np.arange(corners)[None]
-    b = np.arange(stations - 1)[:, None] * corners + np.roll(np.arange(corners), -1)[None]
-    sides = [np.stack([a, b, b + corners], -1), np.stack([a, b + corners, a + corners], -1)]
-    triangles = [side.reshape(-1, 3) for side in sides]
-    points = points.reshape(-1, 3)
-    if closed:
-        ring = np.arange(corners)
-        last = (stations - 1) * corners
-        middle = len(points)
+        points = np.concatenate([points, _swept(centres, across, inner)])
+        holes = rings + count
+        ends = _between(holes[0], rings[0]), _between(rings[-1], holes[-1])
+        triangles += [_between(holes[1:], holes[:-1]), *ends]
+    elif closed:
         points = np.concatenate([points, centres[:1], centres[-1:]])
-        lid = np.stack([np.roll(ring, -1), ring, np.full(corners, middle)], axis=1)
-        triangles.append(lid)
-        end = np.stack([ring, np.roll(ring, -1), np.zeros(corners, int)], axis=1) + last
-        end[:, 2] = middle + 1
-        triangles.append(end)
+        triangles += [_fan(rings[0][::-1], count), _fan(rings[-1], count + 1)]
     return points, np.concatenate(triangles)
+
+
+def _swept(centres, across, outlines) -> Float[np.ndarray, "points 3"]:
+    return (centres[:, None] + np.einsum("scj,sji->sci", outlines, across)).reshape(-1, 3)
+
+
+def _between(first, second) -> Int[np.ndarray, "triangles 3"]:
+    """Triangles from rings of points to others."""
+    after, beyond = np.roll(first, -1, axis=-1), np.roll(second, -1, axis=-1)
+    halves = [np.stack([first, after, beyond], -1), np.stack([first, beyond, second], -1)]
+    return np.concatenate(halves).reshape(-1, 3)
+
+
+def _fan(ring, middle: int) -> Int[np.ndarray, "triangles 3"]:
+    return np.stack([ring, np.roll(ring, -1), np.full(len(ring), middle)], axis=1)
 
 
 def line_tube(line: Float[np.ndarray, "points 3"], radius: float, corners: int = 10) -> Mesh:
@@ -65,9 +73,8 @@ def line_tube(line: Float[np.ndarray, "points 3"], radius: float, corners: int =
     slope = np.gradient(line, axis=0)
     slope /= np.maximum(np.linalg.norm(slope, axis=1), 1e-300)[:, None]
     across = _carried(slope)
-    angle = 2 * np.pi * np.arange(corners) / corners
-    ring = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return tube(line, across, np.broadcast_to(ring, (len(line), corners, 2)))
+    rings = np.broadcast_to(radius * circle(corners), (len(line), corners, 2))
+    return tube(line, across, rings)
 
 
 def _carried(slope: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 3"]:
@@ -111,12 +118,10 @@ def arrow_triangles(
 @functools.cache
 def _arrow(corners: int = 12) -> Mesh:
     """Along x: 0 to 1 the shaft of radius 1, 1 to 2 the head."""
-    angle = 2 * np.pi * np.arange(corners) / corners
-    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     places = ((0.0, 0.0), (0.0, 1.0), (1.0, 1.0), (1.0, 2.4), (2.0, 0.0))
     centres = np.array([[x, 0.0, 0.0] for x, _ in places])
     across = np.broadcast_to(np.eye(3)[1:], (len(places), 2, 3))
-    outlines = np.stack([r * ring for _, r in places])
+    outlines = np.stack([radius * circle(corners) for _, radius in places])
     return tube(centres, across, outlines, closed=False)
 
 
@@ -124,18 +129,18 @@ def ball_triangles(
     centres: Float[np.ndarray, "balls 3"], radius: float, corners: int = 10
 ) -> Mesh:
     """Balls of `radius` [m]."""
-    shape, triangles = _ball(corners // 2 + 1, corners)
+    shape, triangles = ball(corners // 2 + 1, corners)
     points = np.asarray(centres, float)[:, None] + radius * shape[None]
     shift = np.arange(len(points))[:, None, None] * len(shape)
     return points.reshape(-1, 3), (triangles[None] + shift).reshape(-1, 3)
 
 
 @functools.cache
-def _ball(rings: int, corners: int) -> Mesh:
-    angle = 2 * np.pi * np.arange(corners) / corners
-    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    polar = np.linspace(0, np.pi, rings + 1)
+def ball(rows: int, corners: int) -> Mesh:
+    """A ball of radius 1 about the origin, in `rows` from pole to pole along x."""
+    polar = np.linspace(0, np.pi, rows + 1)[1:-1]
     centres = np.stack([-np.cos(polar), 0 * polar, 0 * polar], axis=1)
-    across = np.broadcast_to(np.eye(3)[1:], (rings + 1, 2, 3))
-    outlines = np.sin(polar)[:, None, None] * ring[None]
-    return tube(centres, across, outlines, closed=False)
+    across = np.broadcast_to(np.eye(3)[1:], (len(polar), 2, 3))
+    points, triangles = tube(centres, across, np.sin(polar)[:, None, None] * circle(corners))
+    points[-2:, 0] = -1.0, 1.0
+    return points, triangles

@@ -55,7 +55,6 @@ def plane_figure(scene: Scene, *, width: float = 9.0) -> "tuple[Figure, Axes]":
     if scene.scale is not None:
         bar_beside(figure, axes, scene.scale)
     name_parts(axes, scene)
-    style.title(figure, scene.title)
     if scene.note:
         axes.set_title(scene.note, fontsize=style.LABEL, color=style.INK, loc="left")
     return figure, axes
@@ -84,13 +83,8 @@ def name_parts(axes: "Axes", scene: Scene) -> None:
     """A legend of the parts that have names, above the axes."""
     named = [part.name for part in scene.parts if part.name]
     if named:
-        style.legend(
-            axes,
-            loc="lower right",
-            bbox_to_anchor=(1.0, 1.0),
-            borderaxespad=0.2,
-            ncols=min(len(set(named)), 4),
-        )
+        above = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.2}
+        style.legend(axes, ncols=min(len(set(named)), 4), **above)
 
 
 def _draw(axes: "Axes", part: Part, scale: Scale | None) -> list:
@@ -112,77 +106,44 @@ def _surface(axes: "Axes", part: Surface, scale: Scale | None, label: str) -> li
     points, triangles = 1e3 * np.asarray(part.points), np.asarray(part.triangles)
     artists: list[Any] = []
     if part.values is not None and scale is not None:
-        artists.append(_painted(axes, points, triangles, np.asarray(part.values), scale))
+        artists.append(_painted(axes, part, scale))
     elif isinstance(part.colour, str):
         path = as_path(points, loops(rim(triangles)))
-        patch = PathPatch(
-            path, facecolor=part.colour, edgecolor="none", alpha=part.opacity, label=label
-        )
-        artists.append(axes.add_patch(patch))
+        look = {"facecolor": part.colour, "edgecolor": "none", "alpha": part.opacity}
+        artists.append(axes.add_patch(PathPatch(path, label=label, **look)))
     else:
-        faces = PolyCollection(
-            list(points[triangles]),
-            facecolors=part.colour,
-            label=label,
-            edgecolors="face",
-            linewidths=0.2,
-        )
+        look: dict[str, Any] = {"edgecolors": "face", "linewidths": 0.2, "label": label}
+        faces = PolyCollection(list(points[triangles]), facecolors=part.colour, **look)
         artists.append(axes.add_collection(faces, autolim=False))
     if part.wire is not None:
-        ends = np.concatenate(
-            [triangles[part.wire[:, k]][:, [k, (k + 1) % 3]] for k in range(3)]
-        )
-        ends = np.unique(np.sort(ends, axis=1), axis=0)
-        wire = LineCollection(list(points[ends]), colors=style.GREY, linewidths=0.35)
+        wire = LineCollection(list(points[part.sides]), colors=style.GREY, linewidths=0.35)
         artists.append(axes.add_collection(wire, autolim=False))
     return artists
 
 
-def _painted(axes: Any, points, triangles, values, scale: Scale):
-    per_point = len(values) == len(points) and len(values) != len(triangles)
-    options = {"cmap": scale.colours, "vmin": scale.low, "vmax": scale.high, "rasterized": True}
-    x, y = points.T
-    if per_point:
-        return axes.tripcolor(x, y, triangles, values, shading="gouraud", **options)
-    return axes.tripcolor(x, y, triangles, facecolors=values, **options)
+def _painted(axes: Any, part: Surface, scale: Scale):
+    (x, y), values = 1e3 * np.asarray(part.points).T, np.asarray(part.values)
+    look = {"cmap": scale.colours, "vmin": scale.low, "vmax": scale.high, "rasterized": True}
+    if part.has_values_per_triangle:
+        return axes.tripcolor(x, y, part.triangles, facecolors=values, **look)
+    return axes.tripcolor(x, y, part.triangles, values, shading="gouraud", **look)
 
 
 def _lines(axes: "Axes", part: Lines, label: str) -> list:
     from matplotlib.collections import LineCollection
 
     runs = [1e3 * np.asarray(run) for run in part.runs]
-    dashes: Any = (0, (4, 2)) if part.dashed else "solid"
-    made = LineCollection(
-        runs,
-        colors=part.colour,
-        linewidths=part.width,
-        linestyles=dashes,
-        label=label,
-        capstyle="round",
-        joinstyle="round",
-    )
+    dashes: Any = style.DASHES if part.dashed else "solid"
+    look: dict[str, Any] = {"capstyle": "round", "joinstyle": "round", "linestyles": dashes}
+    made = LineCollection(runs, colors=part.colour, linewidths=part.width, label=label, **look)
     return [axes.add_collection(made, autolim=False)]
 
 
 def _arrows(axes: "Axes", part: Arrows, label: str) -> list:
-    x, y = 1e3 * part.starts.T
-    u, v = 1e3 * part.vectors.T
-    made = axes.quiver(
-        x,
-        y,
-        u,
-        v,
-        angles="xy",
-        scale_units="xy",
-        scale=1.0,
-        color=part.colour,
-        units="dots",
-        width=1.1 * axes.figure.dpi / 72,
-        headwidth=4.5,
-        headlength=5.5,
-        headaxislength=5.0,
-        zorder=4,
-    )
+    to_scale = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "units": "dots"}
+    head = {"headwidth": 4.5, "headlength": 5.5, "headaxislength": 5.0}
+    look = {"color": part.colour, "width": 1.1 * axes.figure.dpi / 72, "zorder": 4}
+    made = axes.quiver(*1e3 * part.starts.T, *1e3 * part.vectors.T, **to_scale, **head, **look)
     if part.name:
         axes.plot([], [], color=part.colour, marker=">", lw=1.5, ms=5, label=label)
     return [made]

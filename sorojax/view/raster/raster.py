@@ -5,7 +5,8 @@ The visible triangle is found for every sample of every pixel. Light is expensiv
 slowly, so it is computed once per pixel, and for all samples only where they differ.
 """
 
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -131,16 +132,11 @@ def barycentric(
     x, y = corners[:, :, 0], corners[:, :, 1]
     area = (x[:, 1] - x[:, 0]) * (y[:, 2] - y[:, 0]) - (x[:, 2] - x[:, 0]) * (y[:, 1] - y[:, 0])
     area = np.where(np.abs(area) > 1e-12, area, 1.0)
-    table = np.stack(
-        [
-            (y[:, 2] - y[:, 0]) / area,
-            (x[:, 0] - x[:, 2]) / area,
-            (y[:, 0] - y[:, 1]) / area,
-            (x[:, 1] - x[:, 0]) / area,
-            x[:, 0] - 0.5,
-            y[:, 0] - 0.5,
-        ]
-    ).astype(np.float32)
+    rows = [
+        (y[:, 2] - y[:, 0]) / area, (x[:, 0] - x[:, 2]) / area,
+        (y[:, 0] - y[:, 1]) / area, (x[:, 1] - x[:, 0]) / area, x[:, 0] - 0.5, y[:, 0] - 0.5,
+    ]  # fmt: skip
+    table = np.stack(rows).astype(np.float32)
     across = column.astype(np.float32) - table[4][triangle]
     down = row.astype(np.float32) - table[5][triangle]
     second = table[0][triangle] * across + table[1][triangle] * down
@@ -182,9 +178,7 @@ def soup_of(parts: list[tuple[int, Part]], lens: Lens, dots_per_point: float) ->
     pieces = [_piece(number, part, lens, dots_per_point) for number, part in parts]
     if not pieces:
         none = np.zeros((0, 3, 3))
-        return Soup(
-            none, none, none[:, 0], none[:, 0], *(none[:, 0, 0], none[:, 0]), none[:, 0, 0]
-        )
+        return _loose(0, none, none, none[:, 0])
     return Soup(*(np.concatenate(columns) for columns in zip(*pieces, strict=True)))
 
 
@@ -203,27 +197,26 @@ def _piece(number: int, part: Part, lens: Lens, dots_per_point: float) -> Soup:
 
 
 def _triangles(number: int, part: Surface, lens: Lens) -> Soup:
-    points = np.asarray(part.points, float)
-    triangles = np.asarray(part.triangles)
+    points, triangles = np.asarray(part.points, float), np.asarray(part.triangles)
+    whole: Any = slice(None)
     if not np.all(np.isfinite(points)):
-        triangles = triangles[np.all(np.isfinite(points[triangles]), axis=(1, 2))]
+        whole = np.all(np.isfinite(points[triangles]), axis=(1, 2))
         points = np.nan_to_num(points)
-    count = len(triangles)
-    values = np.full((count, 3), np.nan)
-    if part.values is not None:
-        given = np.asarray(part.values, float)
-        per_point = len(given) == len(points) and len(given) != len(part.triangles)
-        values = given[triangles] if per_point else np.repeat(given[:, None], 3, axis=1)
-    wire = np.zeros((count, 3)) if part.wire is None else np.asarray(part.wire, float)
-    return Soup(
-        lens(points)[triangles],
-        corner_normals(points, triangles),
-        values,
-        _colours(part.colour, count),
-        np.ones(count),
-        wire,
-        np.full(count, float(number)),
-    )
+    colour = _colours(part.colour, len(triangles))[whole]
+    values = None if part.values is None else part.corner_values[whole]
+    wire = None if part.wire is None else np.asarray(part.wire, float)[whole]
+    triangles = triangles[whole]
+    pixels, normals = lens(points)[triangles], corner_normals(points, triangles)
+    return _loose(number, pixels, normals, colour, values, wire)
+
+
+def _loose(number: int, pixels, normals, colour, values=None, wire=None, lit=True) -> Soup:
+    """Triangles of the part `number`; without values or drawn sides if none are given."""
+    count = len(pixels)
+    values = np.full((count, 3), np.nan) if values is None else values
+    wire = np.zeros((count, 3)) if wire is None else wire
+    part = np.full(count, float(number))
+    return Soup(pixels, normals, values, colour, np.full(count, float(lit)), wire, part)
 
 
 def corner_normals(points: np.ndarray, triangles: np.ndarray) -> Float[np.ndarray, "n 3 3"]:
@@ -279,32 +272,16 @@ def _ribbons(number: int, part: Lines, lens: Lens, width: float) -> Soup:
     ends = np.concatenate([run[1:] for run in runs])
     if part.dashed:
         starts, ends = _dashes(starts, ends, 4 * max(width, 1.0))
-    along = ends[:, :2] - starts[:, :2]
-    size = np.linalg.norm(along, axis=1)
-    unit = along / np.maximum(size, 1e-9)[:, None]
-    side = np.stack([-unit[:, 1], unit[:, 0]], axis=1) * max(width, 1.0) / 2
+    along = (ends - starts) * [1.0, 1.0, 0.0]
+    unit = along / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
+    side = np.cross([0.0, 0.0, 1.0], unit) * max(width, 1.0) / 2
     more = unit * max(width, 1.0) / 2 * (0.0 if part.dashed else 1.0)
-    flat = [
-        starts[:, :2] - more - side,
-        ends[:, :2] + more - side,
-        ends[:, :2] + more + side,
-        starts[:, :2] - more + side,
-    ]
-    ahead = 1.5 * max(width, 1.0) / lens.scale
-    depth = [starts[:, 2], ends[:, 2], ends[:, 2], starts[:, 2]]
-    corners = [np.column_stack([f, d - ahead]) for f, d in zip(flat, depth, strict=True)]
-    quads = np.stack(corners, axis=1)
+    starts, ends = starts - more, ends + more
+    quads = np.stack([starts - side, ends - side, ends + side, starts + side], axis=1)
+    quads[:, :, 2] -= 1.5 * max(width, 1.0) / lens.scale
     pixels = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    count = len(pixels)
-    return Soup(
-        pixels,
-        np.broadcast_to(lens.camera.axes[2], (count, 3, 3)),
-        np.full((count, 3), np.nan),
-        _colours(part.colour, count),
-        np.zeros(count),
-        np.zeros((count, 3)),
-        np.full(count, float(number)),
-    )
+    normals = np.broadcast_to(lens.camera.axes[2], pixels.shape)
+    return _loose(number, pixels, normals, _colours(part.colour, len(pixels)), lit=False)
 
 
 def _dashes(starts: np.ndarray, ends: np.ndarray, length: float):
@@ -395,9 +372,8 @@ def _lit(colour, soup: Soup, triangle, shares, axes) -> Float[np.ndarray, "n 3"]
     half = key + np.array([0, 0, 1.0])
     bright, weak = _facing(normal, key), _facing(normal, fill)
     gleam = _facing(normal, half / np.linalg.norm(half))
-    gleam = gleam**2
-    gleam = gleam**2
-    gleam = gleam**2
+    for _ in range(3):
+        gleam = gleam**2
     gleam = np.float32(_SHINE) * gleam * gleam * gleam  # to the power 24
     valued, lit = np.isfinite(soup.values[:, 0]), soup.lit > 0
 
@@ -473,14 +449,8 @@ def shade(
         dots_per_point: Pixels that a point of print has.
     """
     width, height = lens.size
-    fine = Lens(
-        lens.camera,
-        lens.centre,
-        lens.distance,
-        (width * samples, height * samples),
-        lens.scale * samples,
-        lens.shift * samples,
-    )
+    size = (width * samples, height * samples)
+    fine = replace(lens, size=size, scale=lens.scale * samples, shift=lens.shift * samples)
     points = dots_per_point * samples
     layers = _layers(scene, fine, points)
 

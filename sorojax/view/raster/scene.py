@@ -5,7 +5,7 @@ matplotlib, `solid` shades it in space.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,6 +53,28 @@ class Surface:
     opacity: float = 1.0
     name: str = ""
 
+    @property
+    def corner_values(self) -> Float[np.ndarray, "triangles 3"]:
+        """Values at the corners of the triangles."""
+        values = np.asarray(self.values, float)
+        if self.has_values_per_triangle:
+            return np.repeat(values[:, None], 3, axis=1)
+        return values[np.asarray(self.triangles)]
+
+    @property
+    def has_values_per_triangle(self) -> bool:
+        count = 0 if self.values is None else len(self.values)
+        return count == len(self.triangles) or count != len(self.points)
+
+    @property
+    def sides(self) -> Int[np.ndarray, "sides 2"]:
+        """Points that the lines of `wire` join."""
+        if self.wire is None:
+            return np.zeros((0, 2), int)
+        triangles, wire = np.asarray(self.triangles), np.asarray(self.wire, bool)
+        ends = [triangles[wire[:, k]][:, [k, (k + 1) % 3]] for k in range(3)]
+        return np.unique(np.sort(np.concatenate(ends), axis=1), axis=0)
+
 
 @dataclass(frozen=True, eq=False)
 class Lines:
@@ -96,7 +118,7 @@ class Scene:
     scale: Scale | None = None
     title: str = ""
     note: str = ""
-    extent: tuple[np.ndarray, np.ndarray] | None = field(default=None)
+    extent: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def dim(self) -> int:
@@ -138,10 +160,14 @@ def merge_scenes(*scenes: Scene, title: str = "") -> Scene:
 
 def joint_extent(scenes: Sequence[Scene]) -> list[Scene]:
     """The scenes with one box and one scale, so that they compare."""
-    boxes = [scene.box for scene in scenes]
-    lower = np.min([low for low, _ in boxes], axis=0)
-    upper = np.max([high for _, high in boxes], axis=0)
-    return [replace(scene, extent=(lower, upper)) for scene in scenes]
+    extent = box_around([scene.box for scene in scenes])
+    return [replace(scene, extent=extent) for scene in scenes]
+
+
+def box_around(boxes: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner of the box around boxes."""
+    lower, upper = zip(*boxes, strict=True)
+    return np.min(lower, axis=0), np.max(upper, axis=0)
 
 
 def robust_scale(
@@ -156,22 +182,24 @@ def robust_scale(
     flat = flat[np.isfinite(flat)]
     if limits is not None:
         low, high = map(float, limits)
-        ends = (bool(flat.size and flat.min() < low), bool(flat.size and flat.max() > high))
-        extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[ends]
-        return Scale(label, low, high, extend)
+        return Scale(label, low, high, _extend(flat, low, high))
     if not flat.size:
         return Scale(label, 0.0, 1.0)
     low, high = float(flat.min()), float(np.percentile(flat, cut))
     if low < 0 < high and min(-low, high) > 0.05 * max(-low, high):
         most = max(-float(np.percentile(flat, 100 - cut)), high)
-        cuts = (bool(flat.min() < -most), bool(flat.max() > most))
-        extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[cuts]
-        return Scale(label, -most, most, extend, style.SIGNED)
+        return Scale(label, -most, most, _extend(flat, -most, most), style.SIGNED)
     if low >= 0 and low < 0.5 * high:
         low = 0.0
     if high - low <= 1e-9 * max(abs(high), abs(low)):
         return Scale(label, low, low + max(1.0, abs(low)))
     return Scale(label, low, high, "max" if flat.max() > high else "neither")
+
+
+def _extend(values: np.ndarray, low: float, high: float) -> str:
+    """Which ends of a scale `values` go beyond, as matplotlib names them."""
+    below, above = np.any(values < low), np.any(values > high)
+    return ("both" if above else "min") if below else ("max" if above else "neither")
 
 
 # Values with their unit, and the unit that makes their numbers short

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from sorojax.view import style
-from sorojax.view.raster.camera import Camera, Lens, View, box_corners, camera_at, fit
+from sorojax.view.raster.camera import Lens, View, box_corners, camera_at, fit
 from sorojax.view.raster.glyphs import arrow_triangles, ball_triangles
 from sorojax.view.raster.raster import shade
 from sorojax.view.raster.scene import (
@@ -92,6 +92,12 @@ def lens_of(scenes: Sequence[Scene], view: View, size: tuple[int, int], share: f
     return fit(camera_at(view, share), points[np.all(np.isfinite(points), axis=1)], size)
 
 
+def size_of(axes: "Axes") -> tuple[int, int]:
+    """Width and height of a picture in `axes` [pixels]."""
+    box = axes.get_window_extent()
+    return max(int(round(box.width)), 16), max(int(round(box.height)), 16)
+
+
 def draw_solid(
     figure: "Figure",
     axes: "Axes",
@@ -102,8 +108,7 @@ def draw_solid(
     lens: Lens | None = None,
 ) -> Lens:
     """Shade `scene` into `axes`, whose place in the figure is final; returns the lens."""
-    box = axes.get_window_extent()
-    size = max(int(round(box.width)), 16), max(int(round(box.height)), 16)
+    size = size_of(axes)
     lens = lens_of([scene], view, size) if lens is None else lens
     picture = picture_of(scene, lens, renderer=renderer, dots_per_point=figure.dpi / 72)
     axes.set_xlim(0, size[0])
@@ -132,16 +137,7 @@ def frame(
         place = (right + 0.12 / width, low + 0.1 * (top - low), 0.16 / width, 0.8 * (top - low))
         drawn = bar_of(figure, scene.scale, figure.add_axes(place))
     if heading:
-        figure.text(
-            0.5,
-            1 - 0.1 / height,
-            heading,
-            ha="center",
-            va="top",
-            fontsize=style.TITLE,
-            color=style.INK,
-            fontweight="bold",
-        )
+        style.heading(figure, 0.5, 1 - 0.1 / height, heading)
     return axes, drawn
 
 
@@ -158,7 +154,7 @@ def bar_of(figure: "Figure", scale, axes: "Axes") -> Any:
     return bar
 
 
-def annotate(figure: "Figure", axes: "Axes", scene: Scene, lens: Lens, note: str = "") -> None:
+def annotate(figure: "Figure", axes: "Axes", scene: Scene, lens: Lens) -> None:
     """Directions of the axes, a bar of known length, and the names of the parts."""
     width, height = lens.size
     unit = 16 * figure.dpi / 72
@@ -167,44 +163,16 @@ def annotate(figure: "Figure", axes: "Axes", scene: Scene, lens: Lens, note: str
     order = np.argsort(lens.camera.axes[2])
     for k in order:
         step = np.array([right[k], -up[k]]) * unit
-        colour = ("#c0392b", "#1e8449", "#1f5fa8")[k]
-        tip = corner + step
+        colour, tip = style.AXES[k], corner + step
         axes.plot(*np.stack([corner, tip]).T, color=colour, lw=1.4, solid_capstyle="round")
-        axes.text(
-            *(corner + 1.35 * step),
-            "xyz"[k],
-            color=colour,
-            fontsize=style.SMALL,
-            ha="center",
-            va="center",
-        )
+        style.write(axes, *(corner + 1.35 * step), "xyz"[k], color=colour)
     length = _round_length(0.22 * width / lens.scale)
-    start = 4.2 * unit
-    axes.plot(
-        [start, start + length * lens.scale],
-        [height - 0.6 * unit] * 2,
-        color=style.INK,
-        lw=2.0,
-        solid_capstyle="butt",
-    )
-    axes.text(
-        start + length * lens.scale + 0.4 * unit,
-        height - 0.6 * unit,
-        _length_text(length),
-        fontsize=style.SMALL,
-        color=style.INK,
-        va="center",
-    )
-    if text := note or scene.note:
-        axes.text(
-            width - 0.4 * unit,
-            height - 0.6 * unit,
-            text,
-            fontsize=style.SMALL,
-            color=style.INK,
-            ha="right",
-            va="center",
-        )
+    start, end = 4.2 * unit, 4.2 * unit + length * lens.scale
+    low = height - 0.6 * unit
+    axes.plot([start, end], [low, low], color=style.INK, lw=2.0, solid_capstyle="butt")
+    style.write(axes, end + 0.4 * unit, low, _length_text(length), ha="left")
+    if scene.note:
+        style.write(axes, width - 0.4 * unit, low, scene.note, ha="right")
     _names(axes, scene)
 
 
@@ -223,17 +191,10 @@ def _names(axes: "Axes", scene: Scene) -> None:
             else Line2D([], [], color=colour, lw=2, label=part.name)
         )
     if shown:
-        axes.legend(
-            handles=list(shown.values()),
-            frameon=False,
-            fontsize=style.SMALL,
-            labelcolor=style.INK,
-            loc="lower left",
-            bbox_to_anchor=(0.0, 1.0),
-            borderaxespad=0.1,
-            ncols=min(len(shown), 4),
-            columnspacing=1.2,
-        )
+        place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.1}
+        look = {"frameon": False, "fontsize": style.SMALL, "labelcolor": style.INK}
+        columns = {"ncols": min(len(shown), 4), "columnspacing": 1.2}
+        axes.legend(handles=list(shown.values()), **place, **look, **columns)
 
 
 def _round_length(length: float) -> float:
@@ -255,8 +216,9 @@ def solid_figure(
     height: float | None = None,
 ) -> "tuple[Figure, Lens]":
     """One solid scene in a figure of `width` inches."""
-    if height is None:
-        height = _height(scene, camera_at(view), width)
+    if height is None:  # what the picture asks for, from about half of the width to all of it
+        wanted = 0.9 + width * aspect_of(scene, view)
+        height = float(np.clip(wanted, 0.45 * width, width))
     figure = style.new_figure(width, height, layout="none")
     axes, _ = frame(figure, scene)
     lens = draw_solid(figure, axes, scene, view=view, renderer=renderer)
@@ -264,11 +226,12 @@ def solid_figure(
     return figure, lens
 
 
-def _height(scene: Scene, camera: Camera, width: float) -> float:
-    """As high as the picture asks for, between a third of the width and all of it."""
-    flat = fit(camera, box_corners(*scene.box), (100, 100)).raw(box_corners(*scene.box))[:, :2]
-    span = flat.max(axis=0) - flat.min(axis=0)
-    return float(np.clip(0.9 + width * span[1] / max(span[0], 1e-12), 0.45 * width, width))
+def aspect_of(scene: Scene, view: View) -> float:
+    """Height over width of what is seen of a scene."""
+    corners = box_corners(*scene.box)
+    flat = fit(camera_at(view), corners, (100, 100)).raw(corners)[:, :2]
+    wide, high = np.ptp(flat, axis=0)
+    return float(high / max(wide, 1e-12))
 
 
 # Solid scenes by pyvista, through the same lens as the own renderer
@@ -318,25 +281,17 @@ def _plotter(size: tuple[int, int]) -> Any:
 def _add(plotter, part: Part, scene: Scene, lens: Lens, dots_per_point: float) -> None:
     pv: Any = importlib.import_module("pyvista")
     reach = dots_per_point / lens.scale
+    flat = {"lighting": False, "reset_camera": False, "render": False}
     if isinstance(part, Lines):
         runs = [np.asarray(run, float) for run in part.runs if len(run) > 1]
         if not runs:
             return
-        starts = np.cumsum([0, *map(len, runs)])
-        cells = [
-            np.r_[len(run), at + np.arange(len(run))]
-            for run, at in zip(runs, starts, strict=False)
-        ]
         ahead = 1.5 * reach * max(part.width, 1.0) * lens.camera.axes[2]
-        lines = pv.PolyData(np.concatenate(runs) + ahead, lines=np.concatenate(cells))
-        plotter.add_mesh(
-            lines,
-            color=part.colour,
-            line_width=part.width * dots_per_point,
-            lighting=False,
-            reset_camera=False,
-            render=False,
-        )
+        numbers = np.split(np.arange(sum(map(len, runs))), np.cumsum([*map(len, runs)])[:-1])
+        cells = np.concatenate([np.append(len(ids), ids) for ids in numbers])
+        lines = pv.PolyData(np.concatenate(runs) + ahead, lines=cells)
+        width = part.width * dots_per_point
+        plotter.add_mesh(lines, color=part.colour, line_width=width, **flat)
         return
     if isinstance(part, Arrows):
         surface = Surface(*arrow_triangles(part.starts, part.vectors, 1.1 * reach), part.colour)
@@ -345,23 +300,12 @@ def _add(plotter, part: Part, scene: Scene, lens: Lens, dots_per_point: float) -
     else:
         surface = part
     _add_surface(plotter, pv, surface, scene)
-    if surface.wire is not None and np.any(surface.wire):
-        ends = np.concatenate(
-            [surface.triangles[surface.wire[:, k]][:, [k, (k + 1) % 3]] for k in range(3)]
-        )
-        ends = np.unique(np.sort(ends, axis=1), axis=0)
+    if len(ends := surface.sides):
         cells = np.column_stack([np.full(len(ends), 2), ends]).ravel()
         ahead = 1.5 * reach * lens.camera.axes[2]
         wire = pv.PolyData(np.asarray(surface.points, float) + ahead, lines=cells)
-        plotter.add_mesh(
-            wire,
-            color="#1f2430",
-            line_width=0.7 * dots_per_point,
-            opacity=0.6,
-            lighting=False,
-            reset_camera=False,
-            render=False,
-        )
+        width = 0.7 * dots_per_point
+        plotter.add_mesh(wire, color=style.INK, line_width=width, opacity=0.6, **flat)
 
 
 def _add_surface(plotter, pv, part: Surface, scene: Scene) -> None:
@@ -381,9 +325,7 @@ def _add_surface(plotter, pv, part: Surface, scene: Scene) -> None:
         "specular": 0.15, "specular_power": 20, "reset_camera": False, "render": False,
     }  # fmt: skip
     if part.values is not None and scene.scale is not None:
-        values = np.asarray(part.values, float)
-        per_point = len(values) == len(part.points) and len(values) != len(triangles)
-        mesh["value"] = values[triangles].ravel() if per_point else np.repeat(values, 3)
+        mesh["value"] = part.corner_values.ravel()
         scale = scene.scale
         look |= {"scalars": "value", "cmap": scale.colours, "clim": (scale.low, scale.high),
                  "show_scalar_bar": False, "ambient": 0.35, "diffuse": 0.7}  # fmt: skip

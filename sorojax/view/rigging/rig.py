@@ -15,6 +15,7 @@ from sorojax.math.compiled import jit_public
 from sorojax.math.quadrature import interpolation_rows
 from sorojax.rod import Assembly, Link, Rod, num_coordinates, rest
 from sorojax.sdf import Surface
+from sorojax.view.raster.glyphs import area_of, ball, circle, tube
 from sorojax.view.rigging.frames import Held, carry, compiled_table, places
 from sorojax.view.rigging.skin import Skin, bind, deform, hold
 
@@ -75,15 +76,12 @@ def rig(
         return Rig(model, skin, triangles)
     vertices, triangles = surface
     triangles = np.asarray(triangles)
-    if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.size == 0:
+    do = "Pass what import_surface or sdf.isosurface gives."
+    _check.shape("rig", "triangles", triangles, (None, 3), do)
+    if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(vertices):
         raise ValueError(
-            f"rig: `triangles` have shape {triangles.shape}, need (triangles, 3). Pass what "
-            "import_surface or sdf.isosurface gives."
-        )
-    if triangles.min() < 0 or triangles.max() >= len(vertices):
-        raise ValueError(
-            f"rig: triangles use vertices {triangles.min()} to {triangles.max()}, the surface "
-            f"has {len(vertices)}. Pass vertices and triangles of one surface."
+            f"rig: got {len(triangles)} triangles that must name some of {len(vertices)} "
+            "vertices. Pass vertices and triangles of one surface."
         )
     skin = bind(vertices, model, q, stations=stations, **options)
     return Rig(model, skin, triangles)
@@ -155,17 +153,18 @@ def own_surface(
     table = np.asarray(compiled_table(model, q, stations, 3, base))
     where = places(model, stations)
     bodies = [model] if isinstance(model, Rod) else [part.body for part in model.parts]
-    parts = [
-        _tube(body, _outline_of(outline, place.name), around, stations)
-        if isinstance(body, Rod)
-        else _ellipsoid(body, around)
-        for body, place in zip(bodies, where, strict=True)
-    ]
+    parts = []
+    for body, place in zip(bodies, where, strict=True):
+        if isinstance(body, Rod):
+            own = outline.get(place.name) if isinstance(outline, dict) else outline
+            parts.append(_tube(body, own, around, stations))
+        else:
+            points, triangles = ellipsoid(body, around)
+            parts.append((np.zeros(len(points)), points, triangles))
     sizes = [len(s) for s, _, _ in parts]
+    s, local, triangles = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     starts = np.cumsum([0, *sizes[:-1]])
-    triangles = np.concatenate([t + k for (_, _, t), k in zip(parts, starts, strict=True)])
-    s = np.concatenate([p[0] for p in parts])
-    local = np.concatenate([p[1] for p in parts])
+    triangles += np.repeat(starts, [len(rows) for _, _, rows in parts])[:, None]
     count = len(s)
     part = np.repeat(np.arange(len(parts)), sizes)
     held = Held(np.arange(count), part, s, np.ones(count), np.ones(count, bool))
@@ -177,64 +176,44 @@ def section_axes(rod: Rod, s: Float[np.ndarray, " points"]) -> Float[np.ndarray,
     """Half axes along local y and z of the ellipse, full or hollow, that has the area and
     second moments of the section [m]."""
 
-    def along(value):
-        value = np.asarray(value, float)
-        rows = np.asarray(interpolation_rows(rod.quadrature, s)) if value.ndim else None
-        return np.full(len(s), float(value)) if rows is None else rows @ value
-
-    area = along(rod.section.area)
-    about_y, about_z = along(rod.section.second_moment_y), along(rod.section.second_moment_z)
+    names = ("area", "second_moment_y", "second_moment_z")
+    area, about_y, about_z = (constant_along(rod, name, s) for name in names)
     product = (4 * np.sqrt(about_y * about_z) / area + area / np.pi) / 2
     ratio = np.sqrt(about_z / about_y)
     return np.stack([np.sqrt(product * ratio), np.sqrt(product / ratio)], axis=1)
 
 
-def _outline_of(outline, name: str):
-    return outline.get(name) if isinstance(outline, dict) else outline
+def constant_along(
+    rod: Rod, name: str, s: Float[np.ndarray, " points"]
+) -> Float[np.ndarray, " points"]:
+    """A constant of the section of a rod at places along it."""
+    value = np.asarray(getattr(rod.section, name), float)
+    if value.ndim == 0:
+        return np.full(len(s), float(value))
+    return np.asarray(interpolation_rows(rod.quadrature, s)) @ value
 
 
 def _tube(rod: Rod, outline: Outline | None, around: int, stations: int):
     """Stations, local places and triangles of a closed tube, its ends with a middle."""
     s = np.linspace(0.0, 1.0, stations)
     if outline is None:
-        angle = 2 * np.pi * np.arange(around) / around
-        unit = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        rings = section_axes(rod, s)[:, None] * unit[None]
+        rings = section_axes(rod, s)[:, None] * circle(around)
     else:
-        outline = np.asarray(outline, float)
-        _check.shape("rig", "outline", outline, (None, 2), "Give (y, z) around it in metres.")
-        rings = np.broadcast_to(_counter_clockwise(outline), (stations, *outline.shape))
-    sides = rings.shape[1]
-    flat = np.concatenate(
-        [rings.reshape(-1, 2), rings[0].mean(0)[None], rings[-1].mean(0)[None]]
-    )
-    local = np.pad(flat, ((0, 0), (1, 0)))
-    where = np.concatenate([np.repeat(s, sides), [0.0, 1.0]])
-    k = np.arange(sides)
-    ahead = (k + 1) % sides
-    row = np.arange(stations - 1)[:, None] * sides
-    a, b, c, d = row + k, row + ahead, row + sides + k, row + sides + ahead
-    walls = np.concatenate(
-        [np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, d), (a, d, c))]
-    )
-    foot, top = stations * sides, (stations - 1) * sides
-    caps = [
-        np.stack([np.full(sides, foot), ahead, k], axis=1),
-        np.stack([np.full(sides, foot + 1), top + k, top + ahead], axis=1),
-    ]
-    return where, local, np.concatenate([walls, *caps])
+        ring = np.asarray(outline, float)
+        _check.shape("rig", "outline", ring, (None, 2), "Give (y, z) around it in metres.")
+        ring = ring if area_of(ring) >= 0 else ring[::-1]
+        rings = np.broadcast_to(ring, (stations, *ring.shape))
+    middles = rings.mean(axis=1)
+    across = np.broadcast_to(np.eye(3)[1:], (stations, 2, 3))
+    centres = np.column_stack([s, middles])
+    points, triangles = tube(centres, across, rings - middles[:, None])
+    return points[:, 0], points * [0.0, 1.0, 1.0], triangles
 
 
-def _counter_clockwise(outline: np.ndarray) -> np.ndarray:
-    y, z = outline.T
-    area = np.sum(y * np.roll(z, -1) - z * np.roll(y, -1))
-    return outline if area >= 0 else outline[::-1]
-
-
-def _ellipsoid(link: Link, around: int):
-    """The solid ellipsoid with the mass and moments of a link; a ball for a planar one."""
-    mass, inertia = float(link.mass), np.asarray(link.inertia, float)
-    axes = np.eye(3)
+def ellipsoid(link: Link, around: int, thinnest: float = 0.1):
+    """The solid ellipsoid with the mass and moments of a link, at least `thinnest` times as
+    thick as long; a ball for a planar one."""
+    mass, inertia, axes = float(link.mass), np.asarray(link.inertia, float), np.eye(3)
     if inertia.ndim == 0:
         half = np.full(3, np.sqrt(2.5 * inertia / mass))
     else:
@@ -243,38 +222,10 @@ def _ellipsoid(link: Link, around: int):
             moments, axes = np.linalg.eigh(inertia)
             axes = axes * np.sign(np.linalg.det(axes))
         squares = 2.5 / mass * (moments.sum() - 2 * moments)
-        half = np.sqrt(np.maximum(squares, 0.01 * squares.max()))
-    unit, triangles = _ball(around)
+        half = np.sqrt(np.maximum(squares, thinnest**2 * squares.max()))
+    unit, triangles = ball(max(around // 2, 3), around)
     centre = np.zeros(3) if link.center is None else np.asarray(link.center, float)
-    centre = np.pad(centre, (0, 3 - len(centre)))
-    return np.zeros(len(unit)), centre + (unit * half) @ axes.T, triangles
-
-
-def _ball(around: int) -> tuple[np.ndarray, Triangles]:
-    """Points of the unit sphere by rows of equal latitude, and its triangles."""
-    rows = max(around // 2, 3)
-    polar = np.pi * np.arange(1, rows) / rows
-    turn = 2 * np.pi * np.arange(around) / around
-    ring = np.stack(
-        [
-            np.outer(np.sin(polar), np.cos(turn)),
-            np.outer(np.sin(polar), np.sin(turn)),
-            np.outer(np.cos(polar), np.ones(around)),
-        ],
-        axis=-1,
-    ).reshape(-1, 3)
-    points = np.concatenate([ring, [[0.0, 0, 1], [0.0, 0, -1]]])
-    k = np.arange(around)
-    ahead = (k + 1) % around
-    row = np.arange(rows - 2)[:, None] * around
-    a, b, c, d = row + k, row + ahead, row + around + k, row + around + ahead
-    walls = [np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, c, d), (a, d, b))]
-    north, last = len(ring), (rows - 2) * around
-    caps = [
-        np.stack([np.full(around, north), k, ahead], axis=1),
-        np.stack([np.full(around, north + 1), last + ahead, last + k], axis=1),
-    ]
-    return points, np.concatenate([*walls, *caps])
+    return np.pad(centre, (0, 3 - len(centre))) + (unit * half) @ axes.T, triangles
 
 
 def _world(table, where, part, s, local) -> Float[np.ndarray, "points 3"]:

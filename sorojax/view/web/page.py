@@ -8,14 +8,13 @@ import re
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from sorojax import fem
+from sorojax import _check, fem
 from sorojax.fem.equilibrium.solve import Path as FemPath
 from sorojax.io.animation import MovingSurface, export_animation
 from sorojax.view import style
@@ -229,19 +228,14 @@ def _ends(points: Float[np.ndarray, "frames points 3"]) -> tuple[np.ndarray, np.
 
 def filled(meta: dict[str, Any], packer: Packer) -> str:
     """The page with its data."""
-    assets = resources.files("sorojax.view") / "assets"
-
-    def read(*names: str) -> str:
-        return "".join((assets / name).read_text(encoding="utf-8") for name in names)
-
     parts = {
         "title": html.escape(meta["title"]),
-        "style": read("viewer.css"),
+        "style": style.asset("viewer.css"),
         "meta": json.dumps(meta, separators=(",", ":")).replace("<", "\\u003c"),
         "data": packer.text(),
-        "script": read("viewer.js", "camera.js", "player.js"),
+        "script": style.asset("viewer.js", "camera.js", "player.js"),
     }
-    return re.sub(r"\{(\w+)\}", lambda found: parts[found[1]], read("viewer.html"))
+    return re.sub(r"\{(\w+)\}", lambda found: parts[found[1]], style.asset("viewer.html"))
 
 
 def colours_of_map(count: int = 64) -> list[list[int]]:
@@ -274,11 +268,9 @@ def _times(things, time, clock: str, unit: str, frames: int) -> tuple[list[str],
         stamps = [f"{k + 1} / {frames}" for k in range(frames)] if frames > 1 else [""]
         return stamps, np.linspace(0, _LOOP, frames).tolist()
     time = np.asarray(time, float)
-    if time.shape != (frames,) or not np.all(np.isfinite(time)):
-        raise ValueError(
-            f"to_html: `time` has shape {time.shape}, need {frames} finite numbers, one per "
-            "frame."
-        )
+    do = f"Give {frames} finite numbers, one per frame."
+    _check.shape("to_html", "time", time, (frames,), do)
+    _check.finite("to_html", "time", time, do)
     digits = _digits(time)
     stamps = [f"{clock} = {value:.{digits}f} {unit}".rstrip() for value in time]
     if unit != "s" or np.any(np.diff(time) <= 0):
