@@ -279,6 +279,19 @@ def rotation_columns(q: Quaternion) -> tuple[Vector, Vector, Vector]:
     )
 
 
+def rotation_matrix(q: Quaternion | Float[Array, "4"]) -> Float[Array, "3 3"]:
+    """That of a unit quaternion."""
+    w, x, y, z = q
+    return jnp.stack([jnp.stack(column) for column in rotation_columns((w, x, y, z))], axis=1)
+
+
+def plane_rotation(angle: Float[Array, "*points"]) -> Float[Array, "*points 2 2"]:
+    """Matrices of rotations in the plane by angles [rad]."""
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    columns = jnp.stack([cosine, sine], axis=-1), jnp.stack([-sine, cosine], axis=-1)
+    return jnp.stack(columns, axis=-1)
+
+
 def prefix_product(q: Quaternion) -> Quaternion:
     """Running products q_0, q_0 q_1, ... along the only axis, of shape (points,)."""
     # Written out, XLA repeats the chain in every entry from nine points on.

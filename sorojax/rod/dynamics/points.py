@@ -5,9 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sorojax.math.lie import cross_columns
+from sorojax.math.lie import cross_columns, plane_rotation
 from sorojax.math.quadrature import integration_rows
 from sorojax.rod.dynamics.fields import RodState, rest_along
+from sorojax.rod.dynamics.moving import spin_cross as spin_cross
+from sorojax.rod.model.rod import Rod
 
 
 class Points(eqx.Module):
@@ -90,8 +92,12 @@ class Points(eqx.Module):
 
 def points(motion: RodState, s: Float[Array, " points"] | np.ndarray) -> Points:
     """The points of `motion` at `s` in [0, 1]; a NumPy `s` makes constants."""
-    rows = jnp.asarray(integration_rows(motion.rod.quadrature, s), motion.q.dtype)
-    return Points(motion, motion.rod.length * rows)
+    return Points(motion, from_base(motion.rod, s))
+
+
+def from_base(rod: Rod, s: Float[Array, " points"] | np.ndarray) -> Float[Array, "points quad"]:
+    """Weights that integrate a field from the base of the rod to each `s` [m]."""
+    return rod.length * jnp.asarray(integration_rows(rod.quadrature, s), rod.length.dtype)
 
 
 def nodes(motion: RodState) -> Points:
@@ -114,9 +120,7 @@ def directors(points: Points) -> Float[Array, "points dim dim"]:
     dim = motion.tangent.shape[1]
     if dim == 2:
         angle = rows @ curvature(motion)[:, 0]
-        cosine, sine = jnp.cos(angle), jnp.sin(angle)
-        columns = jnp.stack([cosine, sine], 1), jnp.stack([-sine, cosine], 1)
-        turn = jnp.stack(columns, axis=-1)
+        turn = plane_rotation(angle)
         return turn if motion.base is None else motion.base.directors[None] @ turn
     slope = cross_columns(curvature(motion)[:, :, None], motion.directors)
     eye = jnp.eye(dim, dtype=motion.q.dtype)
@@ -148,15 +152,6 @@ def safe_norm(vectors: Float[Array, "*points dim"]) -> Float[Array, "*points"]:
     square = jnp.sum(vectors**2, axis=-1)
     far = square > 0
     return jnp.where(far, jnp.sqrt(jnp.where(far, square, jnp.ones_like(square))), 0.0)
-
-
-def spin_cross(
-    spin: Float[Array, "points rot"], arm: Float[Array, "points dim"]
-) -> Float[Array, "points dim"]:
-    """spin x arm, in the plane too."""
-    if arm.shape[-1] == 2:
-        return spin * jnp.stack([-arm[:, 1], arm[:, 0]], axis=1)
-    return jnp.cross(spin, arm)
 
 
 def moment_of(

@@ -21,7 +21,7 @@ from sorojax.math.compiled import jit_public
 from sorojax.math.implicit_root import implicit_root, matrix_of
 from sorojax.math.quadrature import gauss_legendre, interpolation_rows
 from sorojax.math.status import Status
-from sorojax.rod.dynamics.fields import is_curvature, operators as rod_operators, rest_along
+from sorojax.rod.dynamics.fields import is_curvature, strains_at
 from sorojax.rod.dynamics.tree import rod_motion
 from sorojax.rod.forces.loads import Load, total_force
 from sorojax.rod.model.assembly import (
@@ -73,8 +73,8 @@ def checked_status(
 def _stretches(rod: Rod, q: Array) -> tuple[Float[Array, " quad"], Float[Array, " quad"]]:
     """Stretch at every node, along the axis and the least at the distance from it that the
     section has in the mean (its radius of gyration)."""
-    strain = _strain(rod, q)
-    section, zero = rod.section, jnp.zeros((), q.dtype)
+    section, zero, (rest, rows) = rod.section, jnp.zeros((), q.dtype), strains_at(rod)
+    strain = dict(zip(strain_names(rod.group), (rest + rows @ q).T, strict=True))
     about_y = strain.get("kappa_y", zero) ** 2 * section.second_moment_y
     about_z = strain.get("kappa_z", zero) ** 2 * section.second_moment_z
     bent = jnp.sqrt((about_y + about_z) / section.area)
@@ -100,16 +100,6 @@ def finer(rod: Rod) -> Rod:
         nodes, _ = gauss_legendre(twice.quadrature)
         varied = rest @ jnp.asarray(interpolation_rows(rod.quadrature, nodes), rest.dtype).T
     return Rod(rod.group, rod.basis, section, material, rod.length, varied, count, rod.breaks)
-
-
-def _strain(rod: Rod, q: Array) -> dict[str, Float[Array, " quad"]]:
-    constants = rod_operators(rod)
-    change = dict(zip(rod.basis.active, constants.strain_rows @ q, strict=True))
-    rest = rest_along(constants)
-    return {
-        name: rest[:, k] + change.get(name, jnp.zeros((), q.dtype))
-        for k, name in enumerate(strain_names(rod.group))
-    }
 
 
 def _tip(rod: Rod, q: Array) -> Float[Array, " dim"]:
@@ -225,16 +215,10 @@ def unit_energy(model: Model, metric: Float[Array, "dof dof"]) -> Float[Array, "
 
 def _units(model: Model) -> Float[Array, " dof"]:
     if isinstance(model, Rod):
-        one = jnp.ones((), model.length.dtype)
-        return jnp.concatenate(
-            [
-                jnp.full(
-                    model.basis.modes[name].count,
-                    one / model.length if is_curvature(name) else one,
-                )
-                for name in model.basis.active
-            ]
-        )
+        basis, one = model.basis, jnp.ones((), model.length.dtype)
+        sizes = [one / model.length if is_curvature(name) else one for name in basis.active]
+        counts = [basis.modes[name].count for name in basis.active]
+        return jnp.concatenate([jnp.full(n, x) for n, x in zip(counts, sizes, strict=True)])
     units = jnp.ones(num_dof(model), dtype_of(model))
     for part, at in zip(model.parts, slices(model), strict=True):
         if isinstance(part.body, Rod):

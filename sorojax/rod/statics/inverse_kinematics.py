@@ -271,15 +271,8 @@ def _length(model: Model) -> Float[Array, ""]:
     """Length of the rods [m], one if there is none."""
     bodies = [model] if isinstance(model, Rod) else [part.body for part in model.parts]
     lengths = [body.length for body in bodies if isinstance(body, Rod)]
-    total = jnp.ones((), dtype_of(model)) if not lengths else max_of(lengths)
-    return jax.lax.stop_gradient(total)
-
-
-def max_of(values: list[Array]) -> Array:
-    largest = values[0]
-    for value in values[1:]:
-        largest = jnp.maximum(largest, value)
-    return largest
+    one = jnp.ones((), dtype_of(model))
+    return jax.lax.stop_gradient(functools.reduce(jnp.maximum, lengths) if lengths else one)
 
 
 def _limits(model: Model, limits, dtype):

@@ -263,6 +263,9 @@ def arc_length_path(
     direction = _unit(jnp.append(answer, 1.0), weights) * jnp.sign(first)
     begin = jnp.abs(first) * jnp.sqrt(jnp.asarray(2.0, dtype))
 
+    def bordered(slope, rate, normal):
+        return jnp.concatenate([jnp.append(slope, rate[:, None], axis=1), normal[None]])
+
     def correct(point: _Point, length):
         """The equilibrium on the plane across the path at `length`."""
         normal = weights @ point.direction
@@ -274,9 +277,8 @@ def arc_length_path(
             shift, _, count = state
             value, slope, rate = tangent(*at(shift))
             # The tangent is taken at the shifted place; increments add up to first order.
-            matrix = jnp.concatenate([jnp.append(slope, rate[:, None], axis=1), normal[None]])
             gap = jnp.append(value, normal @ shift - length)
-            step = -jnp.linalg.solve(matrix, gap)
+            step = -jnp.linalg.solve(bordered(slope, rate, normal), gap)
             return shift + step, jnp.sqrt(step @ weights @ step), count + 1
 
         def searching(state):
@@ -302,9 +304,7 @@ def arc_length_path(
         q, factor, length, done, count = jax.lax.while_loop(going, attempt, state)
         q, factor = jnp.where(done, q, point.q), jnp.where(done, factor, point.factor)
         _, slope, rate = tangent(q, factor)
-        border = jnp.concatenate(
-            [jnp.append(slope, rate[:, None], axis=1), (weights @ point.direction)[None]]
-        )
+        border = bordered(slope, rate, weights @ point.direction)
         right = jnp.zeros_like(point.direction).at[-1].set(1.0)
         direction = _unit(jnp.linalg.solve(border, right), weights)
         length = jnp.where(count <= _EASY, 1.5 * length, length)

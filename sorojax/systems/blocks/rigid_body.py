@@ -8,7 +8,7 @@ from sorojax import _check
 from sorojax._types import optional_real, real
 from sorojax.contact import Penalty
 from sorojax.contact.facet import contacts
-from sorojax.math.lie import rotation_columns
+from sorojax.math.lie import rotation_matrix
 from sorojax.sdf.base import AbstractSdf
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output
 
@@ -83,7 +83,7 @@ class RigidBody(AbstractBlock):
 
     def initial_state(self):
         quaternion = _unit(self.quaternion)
-        turn = _rotation(quaternion)
+        turn = rotation_matrix(quaternion)
         spin = turn @ (self.inertia * (turn.T @ self.angular_velocity))
         return {
             "q": jnp.concatenate([self.position, quaternion]),
@@ -119,12 +119,12 @@ class RigidBody(AbstractBlock):
         }
 
     def _velocities(self, q, p):
-        turn = _rotation(_unit(q[3:]))
+        turn = rotation_matrix(_unit(q[3:]))
         return turn @ ((turn.T @ p[:3]) / self.inertia), p[3:] / self.mass
 
     def _pushed(self, touch: Touch, q, omega, velocity):
         """Force and torque about the centre of mass of one set of contacts."""
-        arms = touch.points @ _rotation(_unit(q[3:])).T
+        arms = touch.points @ rotation_matrix(_unit(q[3:])).T
         found = contacts(touch.law, touch.obstacle, q[None, :3] + arms, touch.areas)
         speed = velocity[None] + jnp.cross(jnp.broadcast_to(omega, arms.shape), arms)
         closing = -jnp.sum(found.normal * speed, axis=1)
@@ -137,12 +137,6 @@ class RigidBody(AbstractBlock):
 
 def _unit(quaternion: Array) -> Array:
     return quaternion / jnp.sqrt(jnp.sum(quaternion**2))
-
-
-def _rotation(quaternion: Array) -> Array:
-    """Matrix from body to world."""
-    w, x, y, z = quaternion
-    return jnp.stack([jnp.stack(c) for c in rotation_columns((w, x, y, z))], axis=1)
 
 
 def _quaternion_rate(omega: Array, quaternion: Array) -> Array:
