@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax.math.quadrature import polynomial
+
 
 class SE2(eqx.Module):
     """Planar rigid motions; twist `[omega, v_x, v_y]`."""
@@ -186,8 +188,7 @@ def _even_terms(square: Array, half: Array, real: Array, sine: Array) -> tuple[A
 
 
 def _cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
-    (x, y, z), (u, v, w) = a, b
-    return jnp.stack([y * w - z * v, z * u - x * w, x * v - y * u])
+    return jnp.stack(cross(tuple(a), tuple(b)))  # type: ignore[arg-type]
 
 
 def _planar(pose: Float[Array, "3 3"]) -> Float[Array, "3"]:
@@ -306,10 +307,7 @@ def prefix_product(q: Quaternion) -> Quaternion:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _series(coefficients: tuple[float, ...], x: Float[Array, "..."]) -> Float[Array, "..."]:
-    total = jnp.full_like(x, coefficients[-1])
-    for coefficient in coefficients[-2::-1]:
-        total = total * x + coefficient
-    return total
+    return polynomial(coefficients, x)
 
 
 @_series.defjvp

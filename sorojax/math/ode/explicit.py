@@ -82,14 +82,14 @@ class AbstractMethod(dfx.AbstractSolver):
     def init(self, terms, t0, t1, y0, args):
         """The start of the first step, twice: the solver keeps what its next step and
         what its last step started from, so that a run may go on from within a step."""
-        now = self.begin(_field(terms, args), jnp.asarray(t0), y0, jnp.asarray(t1 - t0))
+        now = self.begin(_Rate(terms, args), jnp.asarray(t0), y0, jnp.asarray(t1 - t0))
         return now, now
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         t, h = jnp.asarray(t0), jnp.asarray(t1 - t0)
         now, _ = solver_state
         if made_jump is not False:
-            field = _field(terms, args)
+            field = _Rate(terms, args)
             now = jax.lax.cond(
                 made_jump, lambda: self.begin(field, t, y0, h), lambda: solver_state[0]
             )
@@ -164,13 +164,9 @@ class _Rate(eqx.Module):
         return self.terms.vf(t, y, self.args)
 
 
-def _field(terms: dfx.AbstractTerm, args: Any) -> Field:
-    return _Rate(terms, args)
-
-
 def _advance(given, h) -> MethodStep:
     method, terms, args, t, y, memory = given
-    return method.advance(_field(terms, args), t, y, h, memory)
+    return method.advance(_Rate(terms, args), t, y, h, memory)
 
 
 @eqx.filter_custom_jvp

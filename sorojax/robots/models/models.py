@@ -17,7 +17,7 @@ from sorojax._edit import replace
 from sorojax._types import Numbers, real
 from sorojax.material import AbstractHyperelastic
 from sorojax.math.host import together
-from sorojax.math.lie import SE2, SE3, homogeneous
+from sorojax.math.lie import SE2, SE3, homogeneous, plane_rotation
 from sorojax.robots.models.cell import bellows_cell, bending_cell, finger_cell
 from sorojax.robots.models.rods import Body, body, column, rigid, side_by_side
 from sorojax.robots.models.supply import (
@@ -301,6 +301,5 @@ def _placed(rotation, position) -> Array:
 
 
 def _about_z(angle) -> Array:
-    c, s = jnp.cos(real(angle)), jnp.sin(real(angle))
-    o = jnp.zeros_like(c)
-    return jnp.stack([jnp.stack(row) for row in ([c, -s, o], [s, c, o], [o, o, o + 1])])
+    angle = real(angle)
+    return jnp.eye(3, dtype=angle.dtype).at[:2, :2].set(plane_rotation(angle))

@@ -82,6 +82,16 @@ class AbstractBlock(eqx.Module):
         return None
 
 
+class AbstractStateless(AbstractBlock):
+    """A block without memory."""
+
+    def initial_state(self):
+        return {}
+
+    def vector_field(self, t, state, inputs):
+        return {}
+
+
 # Identical blocks as one: stacked and evaluated side by side, not written out
 
 
@@ -155,7 +165,7 @@ def _kind(block: AbstractBlock):
     return structure, tuple((jnp.shape(x), jnp.result_type(x)) for x in leaves)
 
 
-class Function(AbstractBlock):
+class Function(AbstractStateless):
     """value = function(a, b, ...) of its inputs, in the order of their names.
 
     Attributes:
@@ -180,14 +190,8 @@ class Function(AbstractBlock):
     def outputs(self):
         return {"value": Output(self.unit, self.shape, frozenset(self.ports))}
 
-    def initial_state(self):
-        return {}
-
     def output(self, name, t, state, inputs):
         return self.function(*(inputs[port] for port in self.ports))
-
-    def vector_field(self, t, state, inputs):
-        return {}
 
 
 class Weighted(eqx.Module):
@@ -245,7 +249,7 @@ class Lag(AbstractBlock):
         return (inputs["a"] - state) / self.time
 
 
-class Sensor(AbstractBlock):
+class Sensor(AbstractStateless):
     """A measurement with offset and white noise, sampled and held.
 
     The noise of a sample depends on `key` and on its number alone, so a run can be repeated,
@@ -277,17 +281,11 @@ class Sensor(AbstractBlock):
     def outputs(self):
         return {"value": Output(self.unit, self.shape, frozenset({"a"}))}
 
-    def initial_state(self):
-        return {}
-
     def output(self, name, t: Any, state, inputs):
         # half a millionth, so that a sample taken on time counts as its own
         number = jnp.floor(t / self.period + 5e-7).astype(jnp.uint32)
         draw = jax.random.normal(jax.random.fold_in(self.key, number), self.shape, t.dtype)
         return inputs["a"] + self.offset + self.noise * draw
-
-    def vector_field(self, t, state, inputs):
-        return {}
 
 
 # Signals of time, and the block that puts one on a wire
@@ -362,7 +360,7 @@ class SmoothRamp(AbstractReference):
         return self.values[right - 1] + share * (self.values[right] - self.values[right - 1])
 
 
-class Source(AbstractBlock):
+class Source(AbstractStateless):
     """Puts a reference on a wire, as output `value` in `unit`."""
 
     reference: AbstractReference
@@ -377,14 +375,8 @@ class Source(AbstractBlock):
         shape = eqx.filter_eval_shape(self.reference, jnp.zeros(())).shape
         return {"value": Output(self.unit, shape)}
 
-    def initial_state(self):
-        return {}
-
     def output(self, name, t, state, inputs):
         return self.reference(t)
-
-    def vector_field(self, t, state, inputs):
-        return {}
 
 
 # Paths through waypoints, of a point or of several signals at once

@@ -35,6 +35,8 @@ from sorojax.rod.model.assembly import index_of
 from sorojax.rod.statics.equilibrium import checked_status
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output
 
+_FLUID = {"volume": "m^3", "volume_rate": "m^3/s", "compliance": "m^3/Pa"}
+
 
 class RodBody(AbstractBlock):
     """A rod with its forces; the state is {q, v}.
@@ -82,8 +84,7 @@ class RodBody(AbstractBlock):
         chamber = self._chamber()
         if chamber is not None:
             needs = frozenset({"pressure"})
-            units = {"volume": "m^3", "volume_rate": "m^3/s", "compliance": "m^3/Pa"}
-            ports |= {name: Output(unit, chamber.ports, needs) for name, unit in units.items()}
+            ports |= {name: Output(unit, chamber.ports, needs) for name, unit in _FLUID.items()}
         return ports
 
     def initial_state(self):
@@ -103,13 +104,7 @@ class RodBody(AbstractBlock):
             return tip_angle(motion(self.rod, q))
         chamber = self._chamber()
         assert chamber is not None
-        pressure = inputs["pressure"]
-        volume = jax.grad(chamber.coenergy, argnums=1)
-        if name == "compliance":
-            one = jnp.ones_like(pressure)
-            return jax.jvp(lambda p: volume(q, p), (pressure,), (one,))[1]
-        value, rate = jax.jvp(lambda q: volume(q, pressure), (q,), (v,))
-        return value if name == "volume" else rate
+        return _fluid(chamber, name, q, v, inputs["pressure"])
 
     def vector_field(self, t, state, inputs):
         moment = motion(self.rod, state["q"], state["v"])
@@ -144,9 +139,6 @@ def body_motion(body: RodBody, state) -> RodState:
 
 
 # An assembly as a block: pressures of its rods in, volumes, tips and joint efforts
-
-
-_FLUID = {"volume": "m^3", "volume_rate": "m^3/s", "compliance": "m^3/Pa"}
 
 
 class AssemblyBody(AbstractBlock):

@@ -27,13 +27,13 @@ from sorojax.rod import (
 )
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.rollout import Trajectory
-from sorojax.systems.blocks.block import AbstractReference, Input, Output
+from sorojax.systems.blocks.block import AbstractReference, AbstractStateless, Input, Output
 from sorojax.systems.control.controller import AbstractController
 
 Effort = Float[Array, " dof"]
 
 
-class AbstractLaw(AbstractController):
+class AbstractLaw(AbstractStateless, AbstractController):
     """A static law from (t, q, v) to an effort in the coordinates of a rod."""
 
     if TYPE_CHECKING:  # fields that subclasses have, in their own order
@@ -53,14 +53,8 @@ class AbstractLaw(AbstractController):
         dof = (self.rod.basis.num_dof,)
         return {"effort": Output(None, dof, frozenset({"q", "v"}))}
 
-    def initial_state(self):
-        return {}
-
     def output(self, name, t, state, inputs):
         return self.effort(t, inputs["q"], inputs["v"])
-
-    def vector_field(self, t, state, inputs):
-        return {}
 
     def start(self, t, measurement):
         return ()

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import optional_real, real
 from sorojax.math.compiled import jit_public
 from sorojax.math.linalg.dense import product, solve_columns, solve_symmetric
 from sorojax.math.status import Status
@@ -39,7 +39,7 @@ class Markers(eqx.Module):
     rod: Rod
     s: Float[Array, " markers"] = eqx.field(converter=real)
     offset: Float[Array, "markers dim"] | None = eqx.field(
-        converter=lambda x: None if x is None else real(x), default=None
+        converter=optional_real, default=None
     )
 
     def __check_init__(self):
