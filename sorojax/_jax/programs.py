@@ -10,16 +10,15 @@ from typing import Any
 import jax
 from jaxtyping import Array
 
-from sorojax._jax.optional import optional, reason
+from sorojax._jax.optional import every
 
-_CORE = "jax.extend.core"
-_Var, _Jaxpr, _ClosedJaxpr = (optional(_CORE, n) for n in ("Var", "Jaxpr", "ClosedJaxpr"))
-_READABLE = None not in (_Var, _Jaxpr, _ClosedJaxpr)
+_found, _status = every(*(("jax.extend.core", n) for n in ("Var", "Jaxpr", "ClosedJaxpr")))
+_Var, _Jaxpr, _ClosedJaxpr = _found.values()
 
 
 def depends(function: Callable[[Array], Array], x: Array) -> bool:
     """Whether the value of `function` is computed from `x`; `False` where only the shape is."""
-    if not _READABLE:
+    if _status != "on":
         return True
     program = jax.make_jaxpr(function)(x).jaxpr
     reached = set(program.invars)
@@ -32,7 +31,7 @@ def depends(function: Callable[[Array], Array], x: Array) -> bool:
 def is_one_loop(function: Callable[..., Any], *x: Array) -> bool:
     """Whether `function` of arrays of one length is made of numbers of each entry alone: no
     search, no table of a row per entry."""
-    return _READABLE and _scalars(jax.make_jaxpr(function)(*x).jaxpr, len(x[0]))
+    return _status == "on" and _scalars(jax.make_jaxpr(function)(*x).jaxpr, len(x[0]))
 
 
 def _scalars(program: Any, count: int) -> bool:
@@ -49,7 +48,4 @@ def _scalars(program: Any, count: int) -> bool:
 
 def status() -> str:
     """Whether programs are read, for `sorojax info`."""
-    if _READABLE:
-        return "on"
-    missing = next(n for n in ("Var", "Jaxpr", "ClosedJaxpr") if optional(_CORE, n) is None)
-    return f"off: {reason(_CORE, missing)}"
+    return _status

@@ -7,8 +7,6 @@ back-substitution with the same factor. Factors are made on the host; conjugate 
 with multigrid stay in the program, and with it on an accelerator.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -207,12 +205,10 @@ def from_pattern(
     )
 
 
-def _placed(
-    points: Any, num_nodes: int, components: int
-) -> Float[np.ndarray, "nodes components"]:
+def _placed(points, num_nodes: int, components: int) -> Float[np.ndarray, "nodes components"]:
     if points is None or is_traced(points) or np.shape(points) != (num_nodes, components):
-        shape = "traced ones" if is_traced(points) else f"those of shape {np.shape(points)}"
-        got = "none" if points is None else shape
+        got = "none" if points is None else f"those of shape {np.shape(points)}"
+        got = "traced ones" if is_traced(points) else got
         raise ValueError(
             f"from_cells: got points {got}, need concrete ones of shape ({num_nodes}, "
             f"{components}) for the multigrid of ConjugateGradient. Build the system outside "

@@ -17,6 +17,7 @@ from sorojax.math.ode.explicit import (
     DORMAND_PRINCE,
     RK4,
     Field,
+    Tableau,
     dormand_prince_step as dormand_prince_step,
     rk4_step as rk4_step,
     rolled_step,
@@ -207,24 +208,31 @@ class TripleJump(AbstractStepper):
 
 
 class AbstractExplicit(AbstractStepper):
-    """Methods that keep no acceleration."""
+    """Runge-Kutta methods of a `tableau`, which keep no acceleration."""
+
+    tableau: eqx.AbstractClassVar[Tableau]
 
     def begin(self, problem, t, q, v):
         return Kinematic(q, v, jnp.zeros_like(v))
+
+    def step(self, problem, t, h, state):
+        field = vector_field(problem)
+        q, v = rolled_step(self.tableau, field, t, (state.q, state.v), h)
+        if problem.retract is not None:
+            q = problem.retract(q, jnp.zeros_like(v))  # back on the manifold
+        return Kinematic(q, v, state.a)
 
 
 class RungeKutta4(AbstractExplicit):
     """Classical explicit method of order 4; unstable beyond h omega = 2.8."""
 
-    def step(self, problem, t, h, state):
-        return _explicit(RK4, problem, t, h, state)
+    tableau: ClassVar[Tableau] = RK4
 
 
 class DormandPrince(AbstractExplicit):
     """Explicit method of order 5, for undamped motion at high accuracy."""
 
-    def step(self, problem, t, h, state):
-        return _explicit(DORMAND_PRINCE, problem, t, h, state)
+    tableau: ClassVar[Tableau] = DORMAND_PRINCE
 
 
 def move(problem: SecondOrder, q: Array, increment: Array) -> Array:
@@ -241,14 +249,6 @@ def vector_field(problem: SecondOrder) -> Field:
         return rate, solve_symmetric(*problem.equations(t, q, v))
 
     return field
-
-
-def _explicit(tableau, problem: SecondOrder, t, h, state: Kinematic) -> Kinematic:
-    field = vector_field(problem)
-    q, v = rolled_step(tableau, field, t, (state.q, state.v), h)
-    if problem.retract is not None:
-        q = problem.retract(q, jnp.zeros_like(v))  # back on the manifold
-    return Kinematic(q, v, state.a)
 
 
 def integrate(

@@ -5,7 +5,7 @@ inputs `q` and `v`, output `effort`, for a body with `driven=True`.
 """
 
 import abc
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -36,8 +36,8 @@ Effort = Float[Array, " dof"]
 class AbstractLaw(AbstractStateless, AbstractController):
     """A static law from (t, q, v) to an effort in the coordinates of a rod."""
 
-    if TYPE_CHECKING:  # fields that subclasses have, in their own order
-        rod: ClassVar[Rod]
+    rod: Rod
+    forces: tuple[AbstractForce, ...]
 
     @abc.abstractmethod
     def effort(self, t: Float[Array, ""], q: Effort, v: Effort) -> Effort:
@@ -73,8 +73,6 @@ class ComputedTorque(AbstractLaw):
         derivative: K_d [1/s].
     """
 
-    rod: Rod
-    forces: tuple[AbstractForce, ...]
     reference: AbstractReference
     proportional: Float[Array, "..."] = eqx.field(converter=real)
     derivative: Float[Array, "..."] = eqx.field(converter=real)
@@ -96,8 +94,6 @@ class Compensation(AbstractLaw):
         proportional, derivative: Stiffness and damping in the coordinates.
     """
 
-    rod: Rod
-    forces: tuple[AbstractForce, ...]
     reference: AbstractReference
     proportional: Float[Array, "..."] = eqx.field(converter=real)
     derivative: Float[Array, "..."] = eqx.field(converter=real)
@@ -120,8 +116,6 @@ class EnergyShaping(AbstractLaw):
         damping: In the coordinates; a number, or a vector.
     """
 
-    rod: Rod
-    forces: tuple[AbstractForce, ...]
     potential: eqx.Module
     damping: Float[Array, "..."] = eqx.field(converter=real)
 
@@ -168,8 +162,6 @@ class CartesianImpedance(AbstractLaw):
         2024, eq. 32 and 33.
     """
 
-    rod: Rod
-    forces: tuple[AbstractForce, ...]
     reference: AbstractReference
     stiffness: Float[Array, "..."] = eqx.field(converter=real)
     damping: Float[Array, "..."] = eqx.field(converter=real)
@@ -205,8 +197,6 @@ class FeedForward(AbstractLaw):
         reference: Coordinates over time.
     """
 
-    rod: Rod
-    forces: tuple[AbstractForce, ...]
     reference: AbstractReference
 
     def effort(self, t, q, v):
