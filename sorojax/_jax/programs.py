@@ -14,11 +14,12 @@ from sorojax._jax.optional import every
 
 _found, _status = every(*(("jax.extend.core", n) for n in ("Var", "Jaxpr", "ClosedJaxpr")))
 _Var, _Jaxpr, _ClosedJaxpr = _found.values()
+_READABLE = _status == "on"
 
 
 def depends(function: Callable[[Array], Array], x: Array) -> bool:
     """Whether the value of `function` is computed from `x`; `False` where only the shape is."""
-    if _status != "on":
+    if not _READABLE:
         return True
     program = jax.make_jaxpr(function)(x).jaxpr
     reached = set(program.invars)
@@ -31,7 +32,7 @@ def depends(function: Callable[[Array], Array], x: Array) -> bool:
 def is_one_loop(function: Callable[..., Any], *x: Array) -> bool:
     """Whether `function` of arrays of one length is made of numbers of each entry alone: no
     search, no table of a row per entry."""
-    return _status == "on" and _scalars(jax.make_jaxpr(function)(*x).jaxpr, len(x[0]))
+    return _READABLE and _scalars(jax.make_jaxpr(function)(*x).jaxpr, len(x[0]))
 
 
 def _scalars(program: Any, count: int) -> bool:

@@ -255,6 +255,12 @@ def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
     )
 
 
+def quaternion_rate(omega: Float[Array, "3"], q: Float[Array, "4"]) -> Float[Array, "4"]:
+    """Rate of a quaternion at an angular velocity in axes of the world."""
+    turning = (jnp.zeros_like(omega[0]), omega[0] / 2, omega[1] / 2, omega[2] / 2)
+    return jnp.stack(multiply(turning, (q[0], q[1], q[2], q[3])))
+
+
 def exponential(vector: Vector) -> Quaternion:
     """Quaternion of the rotation vector `vector` [rad], smooth at zero.
 

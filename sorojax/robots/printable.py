@@ -204,14 +204,12 @@ class Hand(eqx.Module):
 
     finger: Finger = eqx.field(
         default_factory=lambda: Finger(
-            bellows=_slim(pitch=8.6 * mm, fold_height=5 * mm, num_folds=9),
-            tip_radius=7.6 * mm,
+            bellows=_slim(pitch=8.6 * mm, fold_height=5 * mm, num_folds=9), tip_radius=7.6 * mm
         )
     )
     thumb: Finger = eqx.field(
         default_factory=lambda: Finger(
-            bellows=_slim(pitch=8.4 * mm, fold_height=5 * mm, num_folds=8),
-            tip_radius=7.8 * mm,
+            bellows=_slim(pitch=8.4 * mm, fold_height=5 * mm, num_folds=8), tip_radius=7.8 * mm
         )
     )
     palm_width: Float[Array, ""] = eqx.field(converter=real, default=90 * mm)

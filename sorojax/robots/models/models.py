@@ -32,9 +32,7 @@ from sorojax.robots.models.supply import (
 from sorojax.robots.printable import BendingActuator, Finger, Hand, Manipulator, PlanarActuator
 from sorojax.rod import Assembly, Gravity, Link, Part, PartForce, assembly, chebyshev, constant
 from sorojax.sdf import Box, Cylinder, HalfSpace, translate
-from sorojax.systems import (
-    AssemblyBody,
-)
+from sorojax.systems import AssemblyBody
 from sorojax.units import kPa
 
 #: Axes of a rod that stands along z of a drawing: its x points along z, its y along x.

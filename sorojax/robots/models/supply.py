@@ -16,12 +16,7 @@ from sorojax._types import real
 from sorojax.math.compiled import Split
 from sorojax.math.ode.explicit import AbstractMethod, finite, repeated
 from sorojax.math.ode.steppers import AbstractStepper, GeneralisedAlpha, start
-from sorojax.rod import (
-    Assembly,
-    Rod,
-    num_dof,
-    rest,
-)
+from sorojax.rod import Assembly, Rod, num_dof, rest
 from sorojax.rod.dynamics.rollout import second_order
 from sorojax.systems import (
     AbstractBlock,

@@ -9,11 +9,7 @@ from jaxtyping import Array, Float
 
 from sorojax.math.lie import FROM_MOMENTS
 from sorojax.math.linalg.dense import product
-from sorojax.math.quadrature import (
-    gauss_legendre,
-    integration_matrix,
-    interpolation_rows,
-)
+from sorojax.math.quadrature import gauss_legendre, integration_matrix, interpolation_rows
 from sorojax.rod.model.basis import STRAINS
 from sorojax.rod.model.rod import Rod, strain_names
 

@@ -1,5 +1,7 @@
 """Points along a rod in motion: where they are, how fast, and forces put on them."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ from jaxtyping import Array, Float
 
 from sorojax.math.lie import cross_columns, plane_rotation
 from sorojax.math.quadrature import integration_rows
-from sorojax.rod.dynamics.fields import RodState, rest_along
+from sorojax.rod.dynamics.fields import Base, RodState, rest_along
 from sorojax.rod.dynamics.moving import spin_cross as spin_cross
 from sorojax.rod.model.rod import Rod
 
@@ -29,8 +31,7 @@ class Points(eqx.Module):
     @property
     def position(self) -> Float[Array, "points dim"]:
         """Centres of the sections [m]."""
-        path, base = self.rows @ self.motion.tangent, self.motion.base
-        return path if base is None else path + base.position[None]
+        return self._beyond(self.motion.tangent, lambda base: base.position)
 
     @property
     def directors(self) -> Float[Array, "points dim dim"]:
@@ -40,32 +41,31 @@ class Points(eqx.Module):
     @property
     def angular_jacobian(self) -> Float[Array, "points rot dof"]:
         """Angular velocity per rate (planar: about z)."""
-        turn, base = jnp.tensordot(self.rows, self.motion.angular_rate, 1), self.motion.base
-        return turn if base is None else turn + base.angular_jacobian[None]
+        return self._beyond(self.motion.angular_rate, lambda base: base.angular_jacobian)
 
     @property
     def linear_jacobian(self) -> Float[Array, "points dim dof"]:
         """Velocity of the centres per rate."""
-        path, base = jnp.tensordot(self.rows, self.motion.linear_rate, 1), self.motion.base
-        return path if base is None else path + base.linear_jacobian[None]
+        return self._beyond(self.motion.linear_rate, lambda base: base.linear_jacobian)
 
     @property
     def velocity(self) -> Float[Array, "points dim"]:
         """Velocity of the centres [m/s]."""
-        moment = self.motion
-        path = self.rows @ (moment.linear_rate @ moment.v)
-        if moment.base is None:
-            return path
-        return path + (moment.base.linear_jacobian @ moment.v)[None]
+        v = self.motion.v
+        return self._beyond(self.motion.linear_rate @ v, lambda base: base.linear_jacobian @ v)
 
     @property
     def spin(self) -> Float[Array, "points rot"]:
         """Angular velocity of the sections [rad/s]."""
-        moment = self.motion
-        turn = self.rows @ (moment.angular_rate @ moment.v)
-        if moment.base is None:
-            return turn
-        return turn + (moment.base.angular_jacobian @ moment.v)[None]
+        v = self.motion.v
+        return self._beyond(
+            self.motion.angular_rate @ v, lambda base: base.angular_jacobian @ v
+        )
+
+    def _beyond(self, rate: Array, of_base: Callable[[Base], Array]) -> Array:
+        """A field at the points: that of the base and the integral of its rate."""
+        path, base = jnp.tensordot(self.rows, rate, 1), self.motion.base
+        return path if base is None else path + of_base(base)[None]
 
     def generalised(
         self,

@@ -16,13 +16,7 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._types import real
 from sorojax.rod.dynamics.fields import RodState
-from sorojax.rod.dynamics.tree import (
-    AssemblyState,
-    clamped,
-    gather,
-    in_own_frames,
-    part_motion,
-)
+from sorojax.rod.dynamics.tree import AssemblyState, clamped, gather, in_own_frames, part_motion
 from sorojax.rod.forces import forces as one
 from sorojax.rod.forces.forces import (
     AbstractDamping,
@@ -101,12 +95,10 @@ def on_model(forces: tuple[Load, ...], model: Rod | Assembly) -> tuple[Load, ...
         return tuple(_on_body(force, model) for force in _plain(forces, model.group))
     check(model, forces)
     return tuple(
-        PartForce(
-            force.part, _on_body(force.force, model.parts[index_of(model, force.part)].body)
-        )
-        if isinstance(force, PartForce)
-        else force
-        for force in forces
+        PartForce(f.part, _on_body(f.force, model[f.part].body))
+        if isinstance(f, PartForce)
+        else f
+        for f in forces
     )
 
 

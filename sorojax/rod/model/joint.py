@@ -9,7 +9,15 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import optional_real, real
-from sorojax.math.lie import SE2, SE3, exponential, multiply, plane_rotation, rotation_matrix
+from sorojax.math.lie import (
+    SE2,
+    SE3,
+    exponential,
+    multiply,
+    plane_rotation,
+    quaternion_rate,
+    rotation_matrix,
+)
 
 Group = SE2 | SE3
 
@@ -183,9 +191,7 @@ class Free(AbstractJoint):
     def rate(self, group, q, v):
         if group.space_dim == 2:
             return v
-        zero = jnp.zeros_like(v[0])
-        turning = multiply((zero, v[0] / 2, v[1] / 2, v[2] / 2), (q[0], q[1], q[2], q[3]))
-        return jnp.concatenate([jnp.stack(turning), v[3:]])
+        return jnp.concatenate([quaternion_rate(v, q), v[3:]])
 
 
 def _unit_quaternion(q: Array):

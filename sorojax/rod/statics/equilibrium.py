@@ -26,6 +26,7 @@ from sorojax.rod.dynamics.tree import rod_motion
 from sorojax.rod.forces.loads import Load, total_force
 from sorojax.rod.model.assembly import (
     dtype_of,
+    increments,
     is_flat,
     num_coordinates,
     num_dof,
@@ -118,31 +119,14 @@ def _rods(model: Model) -> list[tuple[Rod, slice]]:
 _INERTIA_SHARE = 1e-6  # of the mean square frequency, for joints without a spring
 
 
-def moved(model: Model, q: Array, increment: Float[Array, " dof"]) -> Array:
-    """Coordinates after an increment."""
-    return q + increment if isinstance(model, Rod) else retract(model, q, increment)
-
-
 def squared(model: Model, q: Array, residual: Float[Array, " dof"]) -> Array:
     """As many equations as coordinates: the residual along the coordinates that it can
     move, and the norm of a quaternion along the one it cannot."""
-    if isinstance(model, Rod) or is_flat(model):
+    if is_flat(model):
         return residual
     still = jnp.zeros_like(residual)
     normal, along = jax.jvp(lambda d: retract(model, q, d), (still,), (residual,))
     return along + q - normal
-
-
-def increments(model: Model, q: Array) -> Float[Array, " dof"]:
-    """The coordinates in the places of their rates; zero where those are others."""
-    if isinstance(model, Rod) or is_flat(model):
-        return q
-    own = jnp.zeros(num_dof(model), q.dtype)
-    for at in slices(model):
-        own = own.at[at.rod_v].set(q[at.rod_q])
-        if at.joint_q.stop - at.joint_q.start == at.joint_v.stop - at.joint_v.start:
-            own = own.at[at.joint_v].set(q[at.joint_q])
-    return own
 
 
 def linearised(
@@ -151,7 +135,7 @@ def linearised(
     """A residual and its exact tangent, one forward pass for all columns."""
 
     def along(increment):
-        value = residual(moved(model, q, increment))
+        value = residual(retract(model, q, increment))
         return value, value
 
     still = jnp.zeros(num_dof(model), q.dtype)
@@ -394,14 +378,14 @@ def newton(residual: Residual, guess: Array, search: Search) -> Found:
 
         def half(trial):
             length = trial[0] / 2
-            return length, size(residual(moved(search.model, q, length * step)))
+            return length, size(residual(retract(search.model, q, length * step)))
 
         # A step of rounding is nothing but noise: it is taken as it is. Any other is tried
         # first as a whole; the loop holds the only trial, so that it is compiled once.
         begin = jnp.where(small, 1.0, 2.0).astype(q.dtype), jnp.where(small, 0, jnp.inf) + start
         length, value = jax.lax.while_loop(too_long, half, begin)
         good = value <= start
-        new = jnp.where(good, moved(search.model, q, length * step), q)
+        new = jnp.where(good, retract(search.model, q, length * step), q)
         return new, slope, small & good, ~good, jnp.isfinite(start), count + 1
 
     def searching(state):

@@ -21,7 +21,7 @@ from sorojax.math.host import tell
 from sorojax.math.implicit_root import implicit_root
 from sorojax.math.status import Status
 from sorojax.rod.forces.loads import Load, total_force
-from sorojax.rod.model.assembly import dtype_of
+from sorojax.rod.model.assembly import dtype_of, retract
 from sorojax.rod.model.model import Model, motion, operators
 from sorojax.rod.statics.equilibrium import (
     Search,
@@ -29,7 +29,6 @@ from sorojax.rod.statics.equilibrium import (
     ended,
     first_guess,
     linearised,
-    moved,
     negative_eigenvalues,
     newton,
     prepare,
@@ -271,7 +270,7 @@ def arc_length_path(
         normal = weights @ point.direction
 
         def at(shift):
-            return moved(model, point.q, shift[:-1]), point.factor + shift[-1]
+            return retract(model, point.q, shift[:-1]), point.factor + shift[-1]
 
         def improve(state):
             shift, _, count = state

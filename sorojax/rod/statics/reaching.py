@@ -13,10 +13,10 @@ from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.points import points
 from sorojax.rod.dynamics.tree import AssemblyState, part_columns, part_motion
 from sorojax.rod.forces.loads import Load, total_force
-from sorojax.rod.model.assembly import index_of
+from sorojax.rod.model.assembly import increments, index_of
 from sorojax.rod.model.link import LinkState
 from sorojax.rod.model.model import Model
-from sorojax.rod.statics.equilibrium import increments, squared
+from sorojax.rod.statics.equilibrium import squared
 from sorojax.rod.statics.targets import AbstractTarget, Frames, ObstacleConstraint
 
 _ROUNDING = 16  # units in the last place that a coordinate on its limit may be away

@@ -8,7 +8,7 @@ from sorojax import _check
 from sorojax._types import optional_real, real
 from sorojax.contact import Penalty
 from sorojax.contact.facet import contacts
-from sorojax.math.lie import rotation_matrix
+from sorojax.math.lie import quaternion_rate, rotation_matrix
 from sorojax.sdf.base import AbstractSdf
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output
 
@@ -112,11 +112,8 @@ class RigidBody(AbstractBlock):
         for each in self.touch:
             push, moment = self._pushed(each, q, omega, velocity)
             force, torque = force + push, torque + moment
-        turn = _quaternion_rate(omega, q[3:])
-        return {
-            "q": jnp.concatenate([velocity, turn]),
-            "p": jnp.concatenate([torque, force]),
-        }
+        turn = quaternion_rate(omega, q[3:])
+        return {"q": jnp.concatenate([velocity, turn]), "p": jnp.concatenate([torque, force])}
 
     def _velocities(self, q, p):
         turn = rotation_matrix(_unit(q[3:]))
@@ -137,10 +134,3 @@ class RigidBody(AbstractBlock):
 
 def _unit(quaternion: Array) -> Array:
     return quaternion / jnp.sqrt(jnp.sum(quaternion**2))
-
-
-def _quaternion_rate(omega: Array, quaternion: Array) -> Array:
-    """Half the product of the angular velocity, in axes of the world, with the quaternion."""
-    scalar, vector = quaternion[0], quaternion[1:]
-    rate = scalar * omega + jnp.cross(omega, vector)
-    return jnp.concatenate([-(omega @ vector)[None], rate]) / 2

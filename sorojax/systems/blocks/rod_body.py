@@ -28,10 +28,9 @@ from sorojax.rod import (
     tip_pose,
     total_force,
 )
-from sorojax.rod.dynamics.dynamics import coordinate_rate
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.forces.loads import Load
-from sorojax.rod.model.assembly import index_of
+from sorojax.rod.model.assembly import index_of, rate
 from sorojax.rod.statics.equilibrium import checked_status
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output
 
@@ -214,7 +213,7 @@ class AssemblyBody(AbstractBlock):
     def vector_field(self, t, state, inputs):
         q, v, constants = state["q"], state["v"], operators(self.assembly)
         a = acceleration(self.assembly, constants, t, q, v, self.acting(inputs))
-        return {"q": coordinate_rate(self.assembly, q, v), "v": a}
+        return {"q": rate(self.assembly, q, v), "v": a}
 
     def path_status(self, path):
         return checked_status(Status.successful, self.assembly, path["q"])
