@@ -102,19 +102,6 @@ class AbstractMethod(dfx.AbstractSolver):
         return new.y, new.error, dense, (new.memory, now), ended
 
 
-def repeat(
-    method: AbstractMethod,
-    field: Field,
-    t: Time,
-    y: PyTree,
-    h: Time,
-    count: int,
-    memory: PyTree = None,
-) -> PyTree:
-    """y after `count` steps of `h` from `t`, with a memory made anew if none is given."""
-    return repeated(method, field, t, y, h, count, memory)[0]
-
-
 def repeated(
     method: AbstractMethod,
     field: Field,
@@ -124,9 +111,9 @@ def repeated(
     count: int,
     memory: PyTree = None,
 ) -> tuple[PyTree, PyTree, Array]:
-    """As `repeat`, with the memory at the end and whether all steps converged; the first
-    that does not is the last one taken. A method that carries its memory computes none
-    after it."""
+    """y after `count` steps of `h` from `t`, with a memory made anew if none is given, the
+    memory at the end, and whether all steps converged; the first that does not is the last one
+    taken. A method that carries its memory computes none after it."""
     memory = method.begin(field, t, y, h) if memory is None else memory
 
     def one(k, carry):
@@ -295,16 +282,6 @@ class SemiImplicitEuler(AbstractMethod):
         rates = field(t, early)
         new = jax.tree.map(lambda x, k, late: x + h * k if late else x, early, rates, last)
         return MethodStep(new, None, (), {})
-
-
-def rk4_step(field: Field, t: Float[Array, ""], y: PyTree, h: Float[Array, ""]) -> Any:
-    """One classical Runge-Kutta step of y' = field(t, y), order 4, any pytree."""
-    return explicit_step(RK4, field, t, y, h)
-
-
-def dormand_prince_step(field: Field, t: Float[Array, ""], y: PyTree, h) -> Any:
-    """One Dormand-Prince step of y' = field(t, y), order 5, any pytree."""
-    return explicit_step(DORMAND_PRINCE, field, t, y, h)
 
 
 def explicit_step(tableau: Tableau, field: Field, t, y: PyTree, h) -> Any:

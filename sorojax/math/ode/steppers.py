@@ -18,8 +18,6 @@ from sorojax.math.ode.explicit import (
     RK4,
     Field,
     Tableau,
-    dormand_prince_step as dormand_prince_step,
-    rk4_step as rk4_step,
     rolled_step,
 )
 from sorojax.math.ode.step_control import (

@@ -127,16 +127,12 @@ class Stack(AbstractBlock):
         return jax.vmap(lambda block: block.initial_state())(self.block)
 
     def output(self, name, t, state, inputs):
-        def one(block, state, inputs):
-            return block.output(name, t, state, inputs)
-
-        return jax.vmap(one)(self.block, state, dict(inputs))
+        each = jax.vmap(lambda block, x, u: block.output(name, t, x, u))
+        return each(self.block, state, dict(inputs))
 
     def vector_field(self, t, state, inputs):
-        def one(block, state, inputs):
-            return block.vector_field(t, state, inputs)
-
-        return jax.vmap(one)(self.block, state, dict(inputs))
+        each = jax.vmap(lambda block, x, u: block.vector_field(t, x, u))
+        return each(self.block, state, dict(inputs))
 
     def _one(self) -> AbstractBlock:
         """One of the blocks, for its ports: shapes in place of arrays."""
@@ -352,12 +348,7 @@ class SmoothRamp(AbstractReference):
         _check.positive("SmoothRamp", "diff(times)", rises, "s", "Sort the waypoints.")
 
     def __call__(self, t):
-        last = self.times.shape[0] - 1
-        right = jnp.clip(jnp.searchsorted(self.times, t), 1, last)
-        start, end = self.times[right - 1], self.times[right]
-        x = jnp.clip((t - start) / (end - start), 0, 1)
-        share = x**3 * (10 + x * (6 * x - 15))
-        return self.values[right - 1] + share * (self.values[right] - self.values[right - 1])
+        return _between(self.times, self.values, t, smooth=True)
 
 
 class Source(AbstractStateless):
@@ -405,10 +396,14 @@ class Waypoints(AbstractReference):
             )
 
     def __call__(self, t):
-        last = self.times.shape[0] - 1
-        after = jnp.clip(jnp.searchsorted(self.times, t, side="right"), 1, last)
-        start, length = self.times[after - 1], self.times[after] - self.times[after - 1]
-        share = (t - start) / jnp.where(length > 0, length, jnp.ones_like(length))
-        share = jnp.where(length > 0, jnp.clip(share, 0, 1), jnp.ones_like(share))
-        share = share**3 * (10 + share * (6 * share - 15)) if self.smooth else share
-        return self.values[after - 1] + share * (self.values[after] - self.values[after - 1])
+        return _between(self.times, self.values, t, self.smooth)
+
+
+def _between(times: Array, values: Array, t: Float[Array, ""], smooth: bool) -> Array:
+    """Values at `t` on the way from waypoint to waypoint."""
+    after = jnp.clip(jnp.searchsorted(times, t, side="right"), 1, times.shape[0] - 1)
+    start, length = times[after - 1], times[after] - times[after - 1]
+    share = (t - start) / jnp.where(length > 0, length, jnp.ones_like(length))
+    share = jnp.where(length > 0, jnp.clip(share, 0, 1), jnp.ones_like(share))
+    share = share**3 * (10 + share * (6 * share - 15)) if smooth else share
+    return values[after - 1] + share * (values[after] - values[after - 1])
