@@ -108,16 +108,13 @@ def _as_constructed(old: Any, new: Any) -> Any:
             where = f"replace: {type(new).__name__}"
             raise _explain.refusal(where, field.name, kind, after)
         after = _as_constructed(before, after)
-        object.__setattr__(made, field.name, field.metadata.get("converter", _same)(after))
+        convert = field.metadata.get("converter", lambda value: value)
+        object.__setattr__(made, field.name, convert(after))
     _check.same_space("replace", old, made)
     for each in type(made).__mro__:
         if "__check_init__" in each.__dict__:
             each.__check_init__(made)
     return made
-
-
-def _same(value: Any) -> Any:
-    return value
 
 
 def _is_same(old: Any, new: Any) -> bool:

@@ -6,7 +6,7 @@ import linecache
 import sys
 import sysconfig
 from collections.abc import Callable, Mapping
-from types import CodeType, TracebackType
+from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -278,17 +278,13 @@ def _is_raw(traceback: TracebackType | None) -> bool:
         frame = traceback.tb_frame
         module = frame.f_globals.get("__name__", "")
         ours = module.startswith("sorojax.") and module != "sorojax._arguments"
-        if ours or not (module.startswith("sorojax.") or _is_installed(frame.f_code)):
-            last = module, frame.f_code.co_filename, traceback.tb_lineno
+        file = frame.f_code.co_filename
+        if ours or not (module.startswith("sorojax.") or file.startswith(_installed())):
+            last = module, file, traceback.tb_lineno
         traceback = traceback.tb_next
     if not last[0].startswith("sorojax."):
         return False
     return not linecache.getline(last[1], last[2]).strip().startswith("raise ")
-
-
-def _is_installed(code: CodeType) -> bool:
-    """Whether a library or Python itself holds it."""
-    return code.co_filename.startswith(_installed())
 
 
 @functools.cache

@@ -14,7 +14,7 @@ from sorojax.math import linear_map as linear_maps
 pytestmark = pytest.mark.versions
 
 X = jnp.linspace(0.5, 1.5, 3)
-KINDS = ["public"] if operations._missing else ["primitive", "public"]
+KINDS = ["primitive", "public"] if operations.status() == "on" else ["public"]
 
 
 @pytest.fixture(params=KINDS)

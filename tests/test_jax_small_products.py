@@ -9,7 +9,7 @@ from jax.test_util import check_grads
 from sorojax._jax import small_products
 from sorojax._jax.small_products import LARGEST, LARGEST_BATCH, product_p, with_sums
 from sorojax.math.compiled import chunked_lanes
-from sorojax.math.ode.explicit import rk4_step
+from sorojax.math.ode.explicit import RK4, explicit_step
 
 pytestmark = [
     pytest.mark.versions,
@@ -93,7 +93,8 @@ def test_a_field_is_traced_once():
         return {"q": -y["q"], "none": None}
 
     start = {"q": jnp.ones(2), "none": None}
-    end = jax.jit(lambda y: rk4_step(field, jnp.zeros(()), y, jnp.asarray(0.1)))(start)
+    zero, h = jnp.zeros(()), jnp.asarray(0.1)
+    end = jax.jit(lambda y: explicit_step(RK4, field, zero, y, h))(start)
     assert len(calls) == 1 and end["none"] is None
     np.testing.assert_allclose(end["q"], np.exp(-0.1), rtol=1e-6)
 

@@ -22,7 +22,7 @@ from sorojax.math.lie import (
     skew,
 )
 from sorojax.math.linalg.dense import product, solve_columns, solve_symmetric
-from sorojax.math.ode.steppers import dormand_prince_step, rk4_step
+from sorojax.math.ode.explicit import DORMAND_PRINCE, RK4, explicit_step
 from sorojax.math.quadrature import (
     gauss_legendre,
     integration_matrix,
@@ -108,12 +108,13 @@ def test_symmetric_solve(dof, getkey):
     assert jnp.allclose(matrix @ solve_columns(matrix, many), many, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("step, order", [(rk4_step, 4), (dormand_prince_step, 5)])
-def test_explicit_steps_have_their_order(step, order):
+@pytest.mark.parametrize("tableau, order", [(RK4, 4), (DORMAND_PRINCE, 5)])
+def test_explicit_steps_have_their_order(tableau, order):
     def error(count):
         h, y = jnp.array(1.0 / count), (jnp.array(1.0), jnp.array(0.0))
         for k in range(count):
-            y = step(lambda t, y: (y[1] * jnp.cos(t) * 0 + y[1], -y[0]), k * h, y, h)
+            field = lambda t, y: (y[1] * jnp.cos(t) * 0 + y[1], -y[0])  # noqa: E731
+            y = explicit_step(tableau, field, k * h, y, h)
         return float(jnp.abs(y[0] - jnp.cos(1.0)))
 
     assert order - 0.5 < np.log2(error(4) / error(8)) < order + 1.2

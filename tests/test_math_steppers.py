@@ -7,10 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax.math.ode.explicit import RungeKutta4, SemiImplicitEuler, Tsit5, repeat, repeated
+from sorojax.math.ode.explicit import RungeKutta4, SemiImplicitEuler, Tsit5, repeated
 from sorojax.math.ode.generalised_alpha import GeneralisedAlpha
 from sorojax.math.ode.rosenbrock import Rodas4, Rosenbrock2
 from sorojax.math.ode.step_control import Control
+
+
+def repeat(*args):
+    return repeated(*args)[0]
+
 
 METHODS = (
     (Tsit5(), 5),

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sorojax._jax.optional import optional, reason
+from sorojax._jax.optional import every
 from sorojax._jax.trace_state import is_traced
 
-_NAMES = (
+_found, _status = every(
     ("jax.extend.core", "Primitive"),
     ("jax.core", "ShapedArray"),
     ("jax.interpreters.ad", "instantiate_zeros"),
@@ -25,8 +25,6 @@ _NAMES = (
     ("jax.interpreters.mlir", "lower_fun"),
     ("jax.interpreters.mlir", "register_lowering"),
 )
-_found: dict[str, Any] = {name: optional(module, name) for module, name in _NAMES}
-_missing = [where for where in _NAMES if _found[where[1]] is None]
 
 
 class Rules(NamedTuple):
@@ -56,7 +54,7 @@ class Rules(NamedTuple):
 
 def operation(name: str, rules: Rules) -> Callable[..., list[Any]]:
     """A function of arrays and hashable parameters that is one operation in every trace."""
-    return _public(rules) if _missing else _primitive(name, rules)
+    return _primitive(name, rules) if _status == "on" else _public(rules)
 
 
 def _public(rules: Rules) -> Callable[..., list[Any]]:
@@ -112,4 +110,4 @@ def _lower(one: Any, rules: Rules) -> None:
 
 def status() -> str:
     """Whether operations are primitives, for `sorojax info`."""
-    return f"off: {reason(*_missing[0])}" if _missing else "on"
+    return _status

@@ -19,6 +19,13 @@ def optional(module: str, name: str) -> Any:
         return None
 
 
+def every(*names: tuple[str, str]) -> tuple[dict[str, Any], str]:
+    """Modules' names with what they stand for, and "on", or "off: why" if one is missing."""
+    found = {name: optional(module, name) for module, name in names}
+    missing = [(module, name) for module, name in names if found[name] is None]
+    return found, f"off: {reason(*missing[0])}" if missing else "on"
+
+
 def reason(module: str, name: str) -> str:
     """Why `optional(module, name)` is `None`, for people."""
     try:

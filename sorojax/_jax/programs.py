@@ -10,11 +10,11 @@ from typing import Any
 import jax
 from jaxtyping import Array
 
-from sorojax._jax.optional import optional, reason
+from sorojax._jax.optional import every
 
-_CORE = "jax.extend.core"
-_Var, _Jaxpr, _ClosedJaxpr = (optional(_CORE, n) for n in ("Var", "Jaxpr", "ClosedJaxpr"))
-_READABLE = None not in (_Var, _Jaxpr, _ClosedJaxpr)
+_found, _status = every(*(("jax.extend.core", n) for n in ("Var", "Jaxpr", "ClosedJaxpr")))
+_Var, _Jaxpr, _ClosedJaxpr = _found.values()
+_READABLE = _status == "on"
 
 
 def depends(function: Callable[[Array], Array], x: Array) -> bool:
@@ -49,7 +49,4 @@ def _scalars(program: Any, count: int) -> bool:
 
 def status() -> str:
     """Whether programs are read, for `sorojax info`."""
-    if _READABLE:
-        return "on"
-    missing = next(n for n in ("Var", "Jaxpr", "ClosedJaxpr") if optional(_CORE, n) is None)
-    return f"off: {reason(_CORE, missing)}"
+    return _status

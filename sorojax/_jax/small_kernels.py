@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sorojax._jax.optional import optional, reason
+from sorojax._jax.optional import every
 from sorojax._jax.small_products import multiplications
 from sorojax._jax.trace_state import is_tracer, outside_transformations
 from sorojax._jax.trigonometry import cosine, sine
@@ -43,14 +43,13 @@ if _JAXLIB.startswith("0.10."):
     # They take longer to compile what is left, and gain nothing where arrays are small.
     OPTIONS["xla_cpu_use_fusion_emitters"] = False
 
-_NAMES = (
+_found, _status = every(
     ("jax.experimental.xla_metadata", "set_xla_metadata"),
     ("jax.core", "eval_jaxpr"),
     ("jax.extend.core", "Literal"),
     ("jax.extend.core", "Jaxpr"),
     ("jax.extend.core", "ClosedJaxpr"),
 )
-_found: dict[str, Any] = {name: optional(module, name) for module, name in _NAMES}
 
 _NUMBER = "float32"
 _KINDS = {
@@ -124,8 +123,7 @@ def status() -> str:
     """Whether loops become kernels, for `sorojax info`."""
     if _JAXLIB not in PROVEN:
         return f"off: not proven on jaxlib {_JAXLIB}, needs one of {', '.join(PROVEN)}"
-    missing = [where for where in _NAMES if _found[where[1]] is None]
-    return f"off: {reason(*missing[0])}" if missing else "on"
+    return _status
 
 
 _IS_PROVEN = status() == "on"

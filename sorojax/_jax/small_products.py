@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from sorojax._jax.optional import optional, reason
+from sorojax._jax.optional import every
 from sorojax._jax.trace_state import outside_transformations
 
 LARGEST = 36  # multiplications in a product
@@ -27,7 +27,7 @@ _INLINED = {
     "custom_vmap_call": "call",
 }
 
-_NAMES = (
+_found, _status = every(
     ("jax.extend.core", "Primitive"),
     ("jax.extend.core", "ClosedJaxpr"),
     ("jax.core", "ShapedArray"),
@@ -37,8 +37,6 @@ _NAMES = (
     ("jax.interpreters.mlir", "lower_fun"),
     ("jax.interpreters.mlir", "register_lowering"),
 )
-_found: dict[str, Any] = {name: optional(module, name) for module, name in _NAMES}
-_missing = [where for where in _NAMES if _found[where[1]] is None]
 
 
 def with_sums(field: Any, *args: Any) -> Any:
@@ -46,7 +44,7 @@ def with_sums(field: Any, *args: Any) -> Any:
 
     It is traced once for all its calls; run operation by operation, it stays as it is.
     """
-    if _missing or outside_transformations():
+    if _status != "on" or outside_transformations():
         return field
     closed, shapes = jax.make_jaxpr(field, return_shape=True)(*args)
     program = _with_sums(closed.jaxpr)
@@ -148,9 +146,9 @@ def _primitive() -> Any:
     return one
 
 
-product_p: Any = None if _missing else _primitive()
+product_p: Any = _primitive() if _status == "on" else None
 
 
 def status() -> str:
     """Whether small products become sums, for `sorojax info`."""
-    return f"off: {reason(*_missing[0])}" if _missing else "on"
+    return _status

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax.math.quadrature import polynomial
+
 
 class SE2(eqx.Module):
     """Planar rigid motions; twist `[omega, v_x, v_y]`."""
@@ -186,8 +188,7 @@ def _even_terms(square: Array, half: Array, real: Array, sine: Array) -> tuple[A
 
 
 def _cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
-    (x, y, z), (u, v, w) = a, b
-    return jnp.stack([y * w - z * v, z * u - x * w, x * v - y * u])
+    return jnp.stack(cross(tuple(a), tuple(b)))  # type: ignore[arg-type]
 
 
 def _planar(pose: Float[Array, "3 3"]) -> Float[Array, "3"]:
@@ -254,6 +255,12 @@ def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
     )
 
 
+def quaternion_rate(omega: Float[Array, "3"], q: Float[Array, "4"]) -> Float[Array, "4"]:
+    """Rate of a quaternion at an angular velocity in axes of the world."""
+    turning = (jnp.zeros_like(omega[0]), omega[0] / 2, omega[1] / 2, omega[2] / 2)
+    return jnp.stack(multiply(turning, (q[0], q[1], q[2], q[3])))
+
+
 def exponential(vector: Vector) -> Quaternion:
     """Quaternion of the rotation vector `vector` [rad], smooth at zero.
 
@@ -279,6 +286,19 @@ def rotation_columns(q: Quaternion) -> tuple[Vector, Vector, Vector]:
     )
 
 
+def rotation_matrix(q: Quaternion | Float[Array, "4"]) -> Float[Array, "3 3"]:
+    """That of a unit quaternion."""
+    w, x, y, z = q
+    return jnp.stack([jnp.stack(column) for column in rotation_columns((w, x, y, z))], axis=1)
+
+
+def plane_rotation(angle: Float[Array, "*points"]) -> Float[Array, "*points 2 2"]:
+    """Matrices of rotations in the plane by angles [rad]."""
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    columns = jnp.stack([cosine, sine], axis=-1), jnp.stack([-sine, cosine], axis=-1)
+    return jnp.stack(columns, axis=-1)
+
+
 def prefix_product(q: Quaternion) -> Quaternion:
     """Running products q_0, q_0 q_1, ... along the only axis, of shape (points,)."""
     # Written out, XLA repeats the chain in every entry from nine points on.
@@ -293,10 +313,7 @@ def prefix_product(q: Quaternion) -> Quaternion:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _series(coefficients: tuple[float, ...], x: Float[Array, "..."]) -> Float[Array, "..."]:
-    total = jnp.full_like(x, coefficients[-1])
-    for coefficient in coefficients[-2::-1]:
-        total = total * x + coefficient
-    return total
+    return polynomial(coefficients, x)
 
 
 @_series.defjvp

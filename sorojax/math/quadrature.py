@@ -57,7 +57,7 @@ def legendre_values(s: Values, degree: int) -> Values:
     rows = [x * 0 + 1, x]
     for m in range(1, degree):
         rows.append(((2 * m + 1) * x * rows[m] - m * rows[m - 1]) / (m + 1))
-    return _stack(rows[: degree + 1])
+    return array_module(s).stack(rows[: degree + 1])
 
 
 def chebyshev_values(s: Values, degree: int) -> Values:
@@ -66,7 +66,7 @@ def chebyshev_values(s: Values, degree: int) -> Values:
     rows = [x * 0 + 1, x]
     for _ in range(1, degree):
         rows.append(2 * x * rows[-1] - rows[-2])
-    return _stack(rows[: degree + 1])
+    return array_module(s).stack(rows[: degree + 1])
 
 
 @functools.lru_cache(maxsize=64)
@@ -95,7 +95,7 @@ def integration_rows(rule: Rule, s: Values) -> Values:
         float(size) * _integration_rows(rule.count, local)
         for size, local in zip(sizes, _local(rule, s), strict=True)
     ]
-    return _joined(parts)
+    return array_module(s).concatenate(parts, axis=1)
 
 
 def interpolation_rows(rule: Rule, s: Values) -> Values:
@@ -115,7 +115,7 @@ def interpolation_rows(rule: Rule, s: Values) -> Values:
             inside = inside & (s < edges[k + 1])
         rows = _interpolation_rows(rule.count, local)
         parts.append(rows * inside[:, None].astype(rows.dtype))
-    return _joined(parts)
+    return array_module(s).concatenate(parts, axis=1)
 
 
 @functools.lru_cache(maxsize=64)
@@ -130,7 +130,7 @@ def _integration_rows(count: int, s: Values) -> Values:
     values = legendre_values(s, count)
     # Integral of P_m from -1 to x is (P_{m+1} - P_{m-1}) / (2 m + 1); for m = 0, x + 1.
     below = [-values[0], *values[: count - 1]]
-    rises = _stack([values[m + 1] - below[m] for m in range(count)])
+    rises = array_module(s).stack([values[m + 1] - below[m] for m in range(count)])
     at_nodes = np.asarray(at_nodes, dtype=rises.dtype)
     return rises.T @ at_nodes / 2
 
@@ -146,7 +146,7 @@ def _interpolation_rows(count: int, s: Values) -> Values:
 def _local(rule: Quadrature, s: Values) -> list[Values]:
     """Coordinates of `s` in each span, held inside it except beyond 0 and 1."""
     edges, last = rule.edges, len(rule.breaks)
-    xp = jnp if isinstance(s, jax.Array) else np
+    xp = array_module(s)
     found = []
     for k in range(last + 1):
         local = (s - float(edges[k])) / float(edges[k + 1] - edges[k])
@@ -155,13 +155,9 @@ def _local(rule: Quadrature, s: Values) -> list[Values]:
     return found
 
 
-def _joined(parts: list) -> Any:
-    xp = jnp if isinstance(parts[0], jax.Array) else np
-    return xp.concatenate(parts, axis=1)
-
-
-def _stack(rows: list) -> Any:
-    return jnp.stack(rows) if isinstance(rows[0], jax.Array) else np.stack(rows)
+def array_module(values: Any) -> Any:
+    """What makes arrays of the kind of `values`: `jax.numpy` or NumPy."""
+    return jnp if isinstance(values, jax.Array) else np
 
 
 def _frozen(values: np.ndarray) -> np.ndarray:

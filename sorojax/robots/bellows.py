@@ -41,14 +41,10 @@ class BellowsActuator(eqx.Module):
 
     def __check_init__(self):
         check_metres(self, "wall_thickness", "bellow_width", "gap", "base", "roof", "fillet")
-        if _check.is_concrete(self.wall_thickness) and _check.is_concrete(self.bellow_width):
-            width = float(self.bellow_width - 2 * self.wall_thickness)
-            if width < 2 * float(self.fillet):
-                raise ValueError(
-                    f"BellowsActuator: walls leave a chamber {width * 1e3:.3g} mm wide, need "
-                    f"at least two fillets ({2e3 * float(self.fillet):.3g} mm). Make the "
-                    "walls thinner or the bellows wider."
-                )
+        left = self.bellow_width - 2 * self.wall_thickness - 2 * self.fillet
+        name = "bellow_width - 2 wall_thickness - 2 fillet"
+        do = "A chamber holds at least two fillets: thinner walls or wider bellows."
+        _check.not_negative("BellowsActuator", name, left, "m", do)
 
     @property
     def pitch(self) -> Float[Array, ""]:
@@ -187,19 +183,17 @@ class PneuNet(eqx.Module):
 
     def __check_init__(self):
         check_metres(self, "pitch", "chamber_width", "slot_width", "height")
-        if not _check.is_concrete(self.pitch):
-            return
-        wall = float(self.pitch - self.chamber_width - self.slot_width) / 2
-        levels = [0, *(float(y) for y in (self.layer, self.floor, self.notch, self.roof))]
-        rises = min(np.diff([*levels, float(self.height)]))
-        if min(wall, rises) <= 0 or self.num_chambers < 2:
-            raise ValueError(
-                f"PneuNet: got walls of {wall * 1e3:.3g} mm between chambers and slots, "
-                f"levels {', '.join(f'{1e3 * y:.3g}' for y in levels[1:])} mm below a height "
-                f"of {float(self.height) * 1e3:.3g} mm and {self.num_chambers} chambers, need "
-                "walls above zero, rising levels and two or more chambers. Widen the pitch or "
-                "order layer, floor, notch, roof and height."
-            )
+        walls = self.pitch - self.chamber_width - self.slot_width
+        name, do = (
+            "pitch - chamber_width - slot_width",
+            "Widen the pitch, for walls above zero.",
+        )
+        _check.positive("PneuNet", name, walls, "m", do)
+        levels = (0.0, self.layer, self.floor, self.notch, self.roof, self.height)
+        do = "They have to be rising levels: order layer, floor, notch, roof and height."
+        _check.positive("PneuNet", "steps between levels", jnp.diff(real(levels)), "m", do)
+        if self.num_chambers < 2:
+            raise ValueError(f"PneuNet: got {self.num_chambers} chambers, need two or more.")
 
     @property
     def length(self) -> Float[Array, ""]:

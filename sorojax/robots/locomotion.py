@@ -15,7 +15,16 @@ from sorojax._display import displayed
 from sorojax._types import real
 from sorojax.material import AbstractHyperelastic, by_region, neo_hookean
 from sorojax.robots.printable import check_metres
-from sorojax.sdf import AbstractSdf, Capsule, HalfPlane, Rectangle, repeat, rotate, translate
+from sorojax.sdf import (
+    AbstractSdf,
+    Capsule,
+    HalfPlane,
+    Rectangle,
+    repeat,
+    rotate,
+    translate,
+    union,
+)
 from sorojax.units import MPa, deg, kPa, mm
 
 PORTS = ("rear", "middle", "front")
@@ -44,17 +53,14 @@ class Crawler(eqx.Module):
         check_metres(
             self, "height", "base", "sole_thickness", "chamber_width", "wall_thickness"
         )
-        if not _check.is_concrete(self.length):
-            return
-        roof = float(self.height - self.base - self.chamber_height)
-        between = float(self.group_spacing - self.group_length)
-        ends = float(self.length - 2 * self.group_spacing - self.group_length) / 2
-        if min(roof, between, ends) <= 0:
-            raise ValueError(
-                f"Crawler: got a roof of {roof * 1e3:.3g} mm, {between * 1e3:.3g} mm between "
-                f"groups and {ends * 1e3:.3g} mm at the ends, need all above zero. Make "
-                "chambers smaller or the body larger."
-            )
+        left = {
+            "height of the roof": self.height - self.base - self.chamber_height,
+            "distance between groups": self.group_spacing - self.group_length,
+            "length of both ends": self.length - 2 * self.group_spacing - self.group_length,
+        }
+        for name, size in left.items():
+            do = "Make chambers smaller or the body larger."
+            _check.positive("Crawler", name, size, "m", do)
 
     @property
     def group_length(self) -> Float[Array, ""]:
@@ -111,25 +117,14 @@ def crawler_mesh(crawler: Crawler, size: float, across: int = 1) -> mesh.Mesh:
     top = float(crawler.base + crawler.chamber_height)
     marks = [0.0, float(crawler.sole_thickness), float(crawler.base), top]
     y = _divided(np.array([*marks, float(crawler.height)]), size, across)
-    grid = mesh.rectangle(
-        [0, 0],
-        [len(x) - 1, len(y) - 1],
-        divisions=(len(x) - 1, len(y) - 1),
-        element=mesh.Quad8(),
-    )
-    at = np.asarray(grid.points)
-    points = np.stack(
-        [np.interp(at[:, k], np.arange(len(line)), line) for k, line in enumerate((x, y))], 1
-    )
-    cells = np.asarray(grid.cells)
-    middle = points[cells[:, :4]].mean(axis=1)
+    grid = mesh.between_lines(x, y, element=mesh.Quad8())
+    middle = np.asarray(grid.points)[np.asarray(grid.cells)[:, :4]].mean(axis=1)
     number = np.searchsorted(np.concatenate(walls), middle[:, 0])
     in_group = (number % inner) % 2 == 1
     hollow = in_group & (middle[:, 1] > marks[2]) & (middle[:, 1] < top)
-    used, cells = np.unique(cells[~hollow], return_inverse=True)
-    cells = cells.reshape(-1, 8)
+    made = mesh.submesh(grid, np.flatnonzero(~hollow))
     sole = np.flatnonzero(middle[~hollow, 1] < marks[1])
-    return mesh.Mesh(points[used], cells, mesh.Quad8(), regions={"sole": sole})
+    return mesh.Mesh(made.points, made.cells, made.element, regions={"sole": sole})
 
 
 def _divided(lines: np.ndarray, size: float, least: int) -> np.ndarray:
@@ -297,15 +292,8 @@ class Walker(eqx.Module):
         check_metres(
             self, "spacing", "reach", "leg_width", "spine_thickness", "weight_diagonal"
         )
-        _check.between(
-            "Walker",
-            "toe_start",
-            self.toe_start,
-            0.0,
-            1.0,
-            "",
-            "Give the share of the leg above its toe.",
-        )
+        do = "Give the share of the leg above its toe."
+        _check.between("Walker", "toe_start", self.toe_start, 0.0, 1.0, "", do)
 
     @property
     def apex_height(self) -> Float[Array, ""]:
@@ -321,17 +309,14 @@ class Walker(eqx.Module):
         """The two legs of the first pair with their toes."""
         top, half, down = self.apex_height, self.leg_width / 2, self.reach
         zero, part = jnp.zeros_like(down), self.toe_start * down
-        bars = None
+        bars = []
         for side in (-1.0, 1.0):
-            leg = Capsule(jnp.stack([zero, top]), jnp.stack([side * down, top - down]), half)
-            toe = Capsule(
-                jnp.stack([side * part, top - part]),
-                jnp.stack([side * (2 * part - down), top - down]),
-                half,
-            )
-            bars = leg | toe if bars is None else bars | leg | toe
-        assert bars is not None
-        return bars
+            foot = jnp.stack([side * (2 * part - down), top - down])
+            bars += [
+                Capsule(jnp.stack([zero, top]), jnp.stack([side * down, top - down]), half),
+                Capsule(jnp.stack([side * part, top - part]), foot, half),
+            ]
+        return union(*bars)
 
     def body(self) -> AbstractSdf:
         """The rubber."""
@@ -411,14 +396,10 @@ def walker_problem(
 
     cells = mesh.triangulate(walker.body(), size=size_at, order=2)
     low = float(walker.leg_width) / 2
-
-    def underside(p):
-        return p[1] < low
-
     rubber = walker_rubber() if rubber is None else rubber
     pull = 9.81 * jnp.stack([jnp.sin(real(slope)), -jnp.cos(real(slope))])
     floor = fem.Contact(
-        mesh.facets_where(cells, underside),
+        mesh.facets_where(cells, lambda p: p[1] < low),
         HalfPlane([0.0, 0.0], [0.0, 1.0]),
         stiffness,
         friction=friction,

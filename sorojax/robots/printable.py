@@ -35,15 +35,8 @@ from sorojax.units import deg, mm
 def check_metres(robot: eqx.Module, *names: str) -> None:
     """Raise a `ValueError` unless the named lengths are above zero and below a metre."""
     for name in names:
-        _check.between(
-            type(robot).__name__,
-            name,
-            getattr(robot, name),
-            0.0,
-            1.0,
-            "m",
-            "Lengths are in metres: write 2 * mm.",
-        )
+        do = "Lengths are in metres: write 2 * mm."
+        _check.between(type(robot).__name__, name, getattr(robot, name), 0.0, 1.0, "m", do)
 
 
 @displayed
@@ -65,15 +58,11 @@ class Bellows(eqx.Module):
 
     def __check_init__(self):
         check_metres(self, "outer_radius", "inner_radius", "pitch", "wall_thickness", "cap")
-        if _check.is_concrete(self.fold_height) and _check.is_concrete(self.wall_thickness):
-            hollow = float(self.fold_height - 2 * self.wall_thickness)
-            open_ = float(self.pitch - self.fold_height)
-            if hollow <= 0 or open_ <= 0:
-                raise ValueError(
-                    f"Bellows: folds are hollow by {hollow * 1e3:.3g} mm and stand "
-                    f"{open_ * 1e3:.3g} mm apart, need both above zero. Choose `fold_height` "
-                    "between two walls and the pitch."
-                )
+        do = "Choose `fold_height` between two walls and the pitch."
+        hollow = self.fold_height - 2 * self.wall_thickness
+        _check.positive("Bellows", "fold_height - 2 wall_thickness", hollow, "m", do)
+        apart = self.pitch - self.fold_height
+        _check.positive("Bellows", "pitch - fold_height", apart, "m", do)
 
     @property
     def length(self) -> Float[Array, ""]:
@@ -159,22 +148,16 @@ def pipe(radius, start, length, axis: int) -> AbstractSdf:
 # A soft finger: a round bellows with a spine on one side and a rounded tip.
 
 
+_slim = functools.partial(
+    Bellows, outer_radius=9 * mm, inner_radius=5.6 * mm, cap=2.5 * mm, fillet=1.2 * mm
+)
+
+
 @displayed
 class Finger(eqx.Module):
     """Dimensions [m]; it stands on z = 0 and bends towards its spine at -x."""
 
-    bellows: Bellows = eqx.field(
-        default_factory=lambda: Bellows(
-            outer_radius=9 * mm,
-            inner_radius=5.6 * mm,
-            pitch=8 * mm,
-            fold_height=4.8 * mm,
-            wall_thickness=1.2 * mm,
-            cap=2.5 * mm,
-            fillet=1.2 * mm,
-            num_folds=9,
-        )
-    )
+    bellows: Bellows = eqx.field(default_factory=lambda: _slim(num_folds=9))
     tip_radius: Float[Array, ""] = eqx.field(converter=real, default=7.5 * mm)
     spine_width: Float[Array, ""] = eqx.field(converter=real, default=9 * mm)
     spine_thickness: Float[Array, ""] = eqx.field(converter=real, default=3 * mm)
@@ -221,32 +204,12 @@ class Hand(eqx.Module):
 
     finger: Finger = eqx.field(
         default_factory=lambda: Finger(
-            bellows=Bellows(
-                outer_radius=9 * mm,
-                inner_radius=5.6 * mm,
-                pitch=8.6 * mm,
-                fold_height=5 * mm,
-                wall_thickness=1.2 * mm,
-                cap=2.5 * mm,
-                fillet=1.2 * mm,
-                num_folds=9,
-            ),
-            tip_radius=7.6 * mm,
+            bellows=_slim(pitch=8.6 * mm, fold_height=5 * mm, num_folds=9), tip_radius=7.6 * mm
         )
     )
     thumb: Finger = eqx.field(
         default_factory=lambda: Finger(
-            bellows=Bellows(
-                outer_radius=9 * mm,
-                inner_radius=5.6 * mm,
-                pitch=8.4 * mm,
-                fold_height=5 * mm,
-                wall_thickness=1.2 * mm,
-                cap=2.5 * mm,
-                fillet=1.2 * mm,
-                num_folds=8,
-            ),
-            tip_radius=7.8 * mm,
+            bellows=_slim(pitch=8.4 * mm, fold_height=5 * mm, num_folds=8), tip_radius=7.8 * mm
         )
     )
     palm_width: Float[Array, ""] = eqx.field(converter=real, default=90 * mm)
@@ -327,16 +290,7 @@ class Manipulator(eqx.Module):
     )
     finger: Finger = eqx.field(
         default_factory=lambda: Finger(
-            bellows=Bellows(
-                outer_radius=8 * mm,
-                inner_radius=5 * mm,
-                pitch=8 * mm,
-                fold_height=4.8 * mm,
-                wall_thickness=1.2 * mm,
-                cap=2.5 * mm,
-                fillet=1.2 * mm,
-                num_folds=5,
-            ),
+            bellows=_slim(outer_radius=8 * mm, inner_radius=5 * mm, num_folds=5),
             tip_radius=6.5 * mm,
         )
     )
@@ -350,14 +304,9 @@ class Manipulator(eqx.Module):
 
     def __check_init__(self):
         check_metres(self, "center_distance", "finger_distance", "plate_radius", "core_radius")
-        radius = self.bellows.outer_radius
-        if _check.is_concrete(self.center_distance) and _check.is_concrete(radius):
-            between = float(self.center_distance * 3**0.5 - 2 * radius)
-            if between <= 0:
-                raise ValueError(
-                    f"Manipulator: the bellows overlap by {-between * 1e3:.3g} mm, need a gap. "
-                    "Make `center_distance` larger or the bellows thinner."
-                )
+        between = self.center_distance * 3**0.5 - 2 * self.bellows.outer_radius
+        do = "Or the bellows overlap: make `center_distance` larger or them thinner."
+        _check.positive("Manipulator", "distance between bellows", between, "m", do)
 
     @property
     def length(self) -> Float[Array, ""]:
@@ -441,13 +390,9 @@ class PlanarActuator(eqx.Module):
 
     def __check_init__(self):
         check_metres(self, "spacing", "plate_thickness", "port_radius")
-        if _check.is_concrete(self.spacing) and _check.is_concrete(self.bellows.outer_radius):
-            between = float(self.spacing - 2 * self.bellows.outer_radius)
-            if between <= 0:
-                raise ValueError(
-                    f"PlanarActuator: the bellows overlap by {-between * 1e3:.3g} mm, need a "
-                    "gap. Make `spacing` larger than two outer radii."
-                )
+        between = self.spacing - 2 * self.bellows.outer_radius
+        do = "Or the bellows overlap: make `spacing` larger than two outer radii."
+        _check.positive("PlanarActuator", "distance between bellows", between, "m", do)
 
     def _both(self, part: AbstractSdf) -> AbstractSdf:
         sides = jnp.stack([-self.spacing / 2, self.spacing / 2])
@@ -499,13 +444,9 @@ class BendingActuator(eqx.Module):
 
     def __check_init__(self):
         check_metres(self, "width", "height", "base", "pitch", "gap", "wall_thickness")
-        if _check.is_concrete(self.pitch) and _check.is_concrete(self.wall_thickness):
-            hollow = float(self.pitch - self.gap - 2 * self.wall_thickness)
-            if hollow <= 0:
-                raise ValueError(
-                    f"BendingActuator: chambers are {hollow * 1e3:.3g} mm long, need above "
-                    "zero. Make `wall_thickness` or `gap` smaller or `pitch` larger."
-                )
+        hollow = self.pitch - self.gap - 2 * self.wall_thickness
+        do = "So long the chambers are: make walls or `gap` smaller or `pitch` larger."
+        _check.positive("BendingActuator", "pitch - gap - 2 wall_thickness", hollow, "m", do)
 
     @property
     def length(self) -> Float[Array, ""]:

@@ -20,7 +20,7 @@ from sorojax.math.lie import homogeneous
 from sorojax.math.ode.contact_midpoint import ContactMidpoint
 from sorojax.math.ode.explicit import finite
 from sorojax.math.ode.steppers import AbstractStepper
-from sorojax.robots.models.supply import Model
+from sorojax.robots.models.supply import Model, check_moved, check_period
 from sorojax.rod import Assembly, Free, Link, LinkObstacle, Part, Rod, assembly, tip_pose
 from sorojax.rod.forces.loads import Load
 from sorojax.rod.model.assembly import index_of
@@ -62,13 +62,8 @@ def ring(
 def _hanging(angle: float, radius: Float[Array, ""]) -> Float[Array, "4 4"]:
     c, s = (f(jnp.asarray(angle, radius.dtype)) for f in (jnp.cos, jnp.sin))
     zero, one = jnp.zeros_like(c), jnp.ones_like(c)
-    turn = jnp.stack(
-        [
-            jnp.stack([zero, -c, -s]),
-            jnp.stack([zero, -s, c]),
-            jnp.stack([-one, zero, zero]),
-        ]
-    )
+    rows = [zero, -c, -s], [zero, -s, c], [-one, zero, zero]
+    turn = jnp.stack([jnp.stack(row) for row in rows])
     return homogeneous(turn, radius * jnp.stack([c, s, zero]))
 
 
@@ -277,18 +272,10 @@ def contact_stepper(
         return model.pressure(state), finite(state) & resolved
 
     def advance(now: InContact, setpoint: Any, dt: float):
-        if abs(dt - period) > 1e-9 * period:
-            raise ValueError(
-                f"contact_stepper: asked for {dt:g} s, made for {period:g} s. Make one for "
-                "this step."
-            )
+        check_period("contact_stepper", dt, period)
         moved = move(now.network, inputs(np.asarray(setpoint)))
         pressure, good = observed(fixed, moved.state, moved.resolved)
-        if not good:
-            raise RuntimeError(
-                f"contact_stepper: the robot does not get through {period:g} s at set-points "
-                f"of {np.asarray(setpoint)} Pa. Make more `substeps`."
-            )
+        check_moved("contact_stepper", good, period, setpoint)
         return InContact(moved), pressure
 
     return advance, InContact(start)

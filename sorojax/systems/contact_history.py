@@ -26,6 +26,7 @@ from sorojax.rod.contact.obstacle import Touch
 from sorojax.rod.contact.rods import touches
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.tree import columns_of, each
+from sorojax.rod.forces.loads import parts_of
 from sorojax.rod.model.assembly import index_of, num_dof, slices
 
 
@@ -110,10 +111,7 @@ def _seated(contact: Any, here: Any, rates: tuple[int, ...]) -> tuple[Any, ...]:
     inner, nothing = _inner(contact), jnp.zeros(len(rates), here.v.dtype)
     if isinstance(here, RodState):
         return inner, (jnp.eye(len(rates), dtype=here.v.dtype),), nothing, here
-    names = (
-        (contact.part,) if isinstance(contact, PartForce) else (contact.first, contact.second)
-    )
-    places = [here.assembly.names.index(name) for name in names]
+    places = [here.assembly.names.index(name) for name in parts_of(contact)]
     columns = columns_of(here, np.array(rates, int))
     own = tuple(columns[k] for k in places)
     return inner, own, nothing, *(part_motion(here, k) for k in places)

@@ -149,7 +149,8 @@ def _check_rate(network: Network, name: str, state: PyTree, rate: PyTree) -> Non
         return
     shapes = {jax.tree_util.keystr(path): jnp.shape(x) for path, x in want}
     rates = {jax.tree_util.keystr(path): jnp.shape(x) for path, x in got}
-    where = f"Network: `vector_field` of the block `{name}` ({_kind(network, name)})"
+    kind = type(network.blocks[name]).__name__
+    where = f"Network: `vector_field` of the block `{name}` ({kind})"
     for leaf in (*shapes, *rates):
         if leaf not in rates:
             raise ValueError(
@@ -166,10 +167,6 @@ def _check_rate(network: Network, name: str, state: PyTree, rate: PyTree) -> Non
                 f"{where} gives a rate of shape {rates[leaf]} for the state leaf `{leaf}`, "
                 f"need {shapes[leaf]}. Return it in the shape of the state."
             )
-
-
-def _kind(network: Network, name: str) -> str:
-    return type(network.blocks[name]).__name__
 
 
 def inputs_of(

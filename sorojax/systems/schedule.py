@@ -1,5 +1,6 @@
 """Checks of a wiring and the order in which its ports are evaluated."""
 
+import graphlib
 from collections.abc import Callable, Iterable, Mapping
 
 import jax
@@ -55,7 +56,7 @@ def evaluation_order(blocks: Blocks, wires: Wires) -> list[str]:
     """
     order, loop = _sorted(blocks, wires)
     if loop:
-        path = [name for name in reversed(loop) if name not in wires]
+        path = [name for name in loop if name not in wires]
         raise ValueError(
             f"Network: algebraic loop {' -> '.join([*path, path[0]])}: these outputs need each "
             "other at the same instant. Put a state (a filter, a reservoir) between them, or "
@@ -64,38 +65,20 @@ def evaluation_order(blocks: Blocks, wires: Wires) -> list[str]:
     return order
 
 
-def loop_of(blocks: Blocks, wires: Wires) -> tuple[str, ...]:
-    """Ports around one algebraic loop, each needing the next; empty without one."""
-    return _sorted(blocks, wires)[1]
-
-
-def _sorted(blocks: Blocks, wires: Wires) -> tuple[list[str], tuple[str, ...]]:
-    depends = _dependencies(blocks, wires)
-    order: list[str] = []
-    state: dict[str, bool] = {}  # False while on the path, True when placed
-
-    def place(name: str, path: tuple[str, ...]) -> tuple[str, ...]:
-        if state.get(name):
-            return ()
-        if name in state:
-            return path[path.index(name) :]
-        state[name] = False
-        for other in depends.get(name, ()):
-            if loop := place(other, (*path, name)):
-                return loop
-        state[name] = True
-        order.append(name)
-        return ()
-
-    for name in depends:
-        if loop := place(name, ()):
-            return order, loop
-    return order, ()
+def _sorted(blocks: Blocks, wires: Wires) -> tuple[list[str], list[str]]:
+    """Ports, each after what it needs, or those around an algebraic loop, in this order."""
+    try:
+        return list(graphlib.TopologicalSorter(_dependencies(blocks, wires)).static_order()), []
+    except graphlib.CycleError as error:
+        return [], error.args[1][1:]
 
 
 def needed(blocks: Blocks, wires: Wires, wanted: Iterable[str]) -> set[str]:
     """Ports that those `wanted` depend on at the same instant, and these."""
-    depends = _dependencies(blocks, wires)
+    return _reached(_dependencies(blocks, wires), wanted)
+
+
+def _reached(depends: Mapping[str, list[str]], wanted: Iterable[str]) -> set[str]:
     found: set[str] = set()
     left = list(wanted)
     while left:
@@ -111,20 +94,7 @@ def reachable_inputs(
 ) -> dict[str, frozenset[str]]:
     """For every output, the exposed inputs that it needs at the same instant."""
     depends = _dependencies(blocks, wires)
-    reached: dict[str, frozenset[str]] = {}
-
-    def collect(name: str, seen: set[str]) -> frozenset[str]:
-        if name in reached:
-            return reached[name]
-        if name in seen:
-            return frozenset()
-        seen.add(name)
-        parts = [collect(other, seen) for other in depends.get(name, ())]
-        return frozenset({name} & set(exposed)).union(*parts)
-
-    for name in depends:
-        reached[name] = collect(name, set())
-    return reached
+    return {name: frozenset(exposed) & _reached(depends, [name]) for name in depends}
 
 
 def _dependencies(blocks: Blocks, wires: Wires) -> dict[str, list[str]]:
@@ -178,7 +148,7 @@ def torn_wires(blocks: Blocks, wires: Wires) -> tuple[str, ...]:
     """Wired inputs to cut, one per loop, so that the rest can be evaluated in order."""
     left = dict(wires)
     torn: list[str] = []
-    while loop := loop_of(blocks, left):
+    while loop := _sorted(blocks, left)[1]:
         name = min(entry for entry in loop if entry in left)
         del left[name]
         torn.append(name)

@@ -41,13 +41,8 @@ class ConjugateGradient(eqx.Module):
 
     def __check_init__(self):
         for name in ("tolerance", "newton_tolerance", "max_iterations", "coarsest"):
-            _check.positive(
-                "ConjugateGradient",
-                name,
-                getattr(self, name),
-                "",
-                "Leave it out for the default.",
-            )
+            do = "Leave it out for the default."
+            _check.positive("ConjugateGradient", name, getattr(self, name), "", do)
 
 
 class Iterative(eqx.Module):

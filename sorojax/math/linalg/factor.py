@@ -22,9 +22,7 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Float, Int
 
-from sorojax.math.linalg import (
-    host_solvers,
-)
+from sorojax.math.linalg import host_solvers
 from sorojax.math.linalg.conjugate_gradient import Iterative, IterativeBackend, IterativeFactor
 
 _MOST = 8  # corrections: beyond, a new factor is cheaper
@@ -167,44 +165,39 @@ class DirectSolver:
 
     def factor(self, values: np.ndarray) -> Factor | None:
         """Factor of `values`, reused if a slot holds it; `None` if singular."""
+        values = np.asarray(values)
         with self._turn:
-            return self._factor(np.asarray(values))
-
-    def _factor(self, values: np.ndarray) -> Factor | None:
-        for slot, (owner, factor) in self._slots.items():
-            if owner is values or _equal(owner, values):
-                self._slots.move_to_end(slot)
-                return factor
-        if not np.all(np.isfinite(values)):
-            return None
-        slot = len(self._slots)
-        if slot == _NUM_FACTORS:
-            slot, _ = self._slots.popitem(last=False)
-        factor = self._solver.factor(values, slot)
-        self.num_factorisations += 1
-        if factor is not None:
-            self._slots[slot] = (values.copy(), factor)
-        else:  # keep the slot's number in circulation
-            self._slots[slot] = (np.full(1, np.nan), factor)  # type: ignore[arg-type]
-            self._slots.move_to_end(slot, last=False)
-        return factor
+            for slot, (owner, factor) in self._slots.items():
+                if owner is values or _equal(owner, values):
+                    self._slots.move_to_end(slot)
+                    return factor
+            if not np.all(np.isfinite(values)):
+                return None
+            slot = len(self._slots)
+            if slot == _NUM_FACTORS:
+                slot, _ = self._slots.popitem(last=False)
+            factor = self._solver.factor(values, slot)
+            self.num_factorisations += 1
+            if factor is not None:
+                self._slots[slot] = (values.copy(), factor)
+            else:  # keep the slot's number in circulation
+                self._slots[slot] = (np.full(1, np.nan), factor)  # type: ignore[arg-type]
+                self._slots.move_to_end(slot, last=False)
+            return factor
 
     def solve(self, values: np.ndarray, b: np.ndarray) -> np.ndarray:
         """x with A(values) x = b for any leading batch axes; NaN where singular."""
         values, b = np.asarray(values), np.asarray(b)
-        with self._turn:
-            return self._solve(values, b)
-
-    def _solve(self, values: np.ndarray, b: np.ndarray) -> np.ndarray:
         lead = np.broadcast_shapes(values.shape[:-1], b.shape[:-1])
-        if values.ndim == 1 or values.size == values.shape[-1]:
-            return self._solve_many(values.reshape(-1), b, lead)
-        values = np.broadcast_to(values, (*lead, values.shape[-1]))
-        b = np.broadcast_to(b, (*lead, b.shape[-1]))
-        x = np.empty(b.shape)
-        for index in np.ndindex(*lead):
-            x[index] = self._solve_many(values[index], b[index], ())
-        return x
+        with self._turn:
+            if values.ndim == 1 or values.size == values.shape[-1]:
+                return self._solve_many(values.reshape(-1), b, lead)
+            values = np.broadcast_to(values, (*lead, values.shape[-1]))
+            b = np.broadcast_to(b, (*lead, b.shape[-1]))
+            x = np.empty(b.shape)
+            for index in np.ndindex(*lead):
+                x[index] = self._solve_many(values[index], b[index], ())
+            return x
 
     def solve_near(self, values: np.ndarray, b: np.ndarray) -> np.ndarray:
         """x with A(values) x = b by the nearest factor that is there, refined, where that
@@ -213,7 +206,7 @@ class DirectSolver:
         with self._turn:
             near = self._nearest(values)
             x = None if near is None else refined(near, self._product_with(values), b)
-            return self._solve(values, b) if x is None else x
+            return self.solve(values, b) if x is None else x
 
     def solve_by(
         self,

@@ -63,9 +63,7 @@ def _kept_again(key, starts, cols, iterative: cg.Iterative | None, double: bool)
             "pickled, or its arrays lose digits. Set JAX_ENABLE_X64=1 for workers as well."
         )
     rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-    if iterative is not None:
-        return _Kept(_iterative_solver_of(key, rows, cols, iterative, owned=True))
-    return _Kept(direct_solver_of(key, rows, cols, owned=True))
+    return _Kept(_solver_of(key, rows, cols, iterative, owned=True))
 
 
 class SparseSymmetric(eqx.Module):
@@ -105,9 +103,7 @@ class SparseSymmetric(eqx.Module):
                 "SparseSymmetric.solver: got a traced system, need a concrete one. Use "
                 "sparse.solve inside jit and vmap."
             )
-        if self.iterative is not None:
-            return _iterative_solver_of(self.key, self.rows, self.cols, self.iterative)
-        return direct_solver_of(self.key, self.rows, self.cols)
+        return _solver_of(self.key, self.rows, self.cols, self.iterative)
 
     @property
     def means(self) -> str:
@@ -163,11 +159,7 @@ def from_cells(
         key=jnp.asarray(key),
         iterative=iterative,
         size=size,
-        _kept=_Kept(
-            direct_solver_of(key, rows, cols, owned=True)
-            if iterative is None
-            else _iterative_solver_of(key, rows, cols, iterative, owned=True)
-        ),
+        _kept=_Kept(_solver_of(key, rows, cols, iterative, owned=True)),
     )
 
 
@@ -215,13 +207,8 @@ def from_pattern(
 
 def _placed(points, num_nodes: int, components: int) -> Float[np.ndarray, "nodes components"]:
     if points is None or is_traced(points) or np.shape(points) != (num_nodes, components):
-        got = (
-            "none"
-            if points is None
-            else "traced ones"
-            if is_traced(points)
-            else (f"those of shape {np.shape(points)}")
-        )
+        got = "none" if points is None else f"those of shape {np.shape(points)}"
+        got = "traced ones" if is_traced(points) else got
         raise ValueError(
             f"from_cells: got points {got}, need concrete ones of shape ({num_nodes}, "
             f"{components}) for the multigrid of ConjugateGradient. Build the system outside "
@@ -230,9 +217,11 @@ def _placed(points, num_nodes: int, components: int) -> Float[np.ndarray, "nodes
     return np.asarray(points)
 
 
-def _iterative_solver_of(
-    key, rows, cols, iterative: cg.Iterative, owned: bool = False
+def _solver_of(
+    key, rows, cols, iterative: cg.Iterative | None, owned: bool = False
 ) -> DirectSolver:
+    if iterative is None:
+        return direct_solver_of(key, rows, cols, owned)
     return solver_of(key, rows, cols, lambda *_: cg.IterativeBackend(iterative), owned)
 
 

@@ -82,14 +82,14 @@ class AbstractMethod(dfx.AbstractSolver):
     def init(self, terms, t0, t1, y0, args):
         """The start of the first step, twice: the solver keeps what its next step and
         what its last step started from, so that a run may go on from within a step."""
-        now = self.begin(_field(terms, args), jnp.asarray(t0), y0, jnp.asarray(t1 - t0))
+        now = self.begin(_Rate(terms, args), jnp.asarray(t0), y0, jnp.asarray(t1 - t0))
         return now, now
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         t, h = jnp.asarray(t0), jnp.asarray(t1 - t0)
         now, _ = solver_state
         if made_jump is not False:
-            field = _field(terms, args)
+            field = _Rate(terms, args)
             now = jax.lax.cond(
                 made_jump, lambda: self.begin(field, t, y0, h), lambda: solver_state[0]
             )
@@ -102,19 +102,6 @@ class AbstractMethod(dfx.AbstractSolver):
         return new.y, new.error, dense, (new.memory, now), ended
 
 
-def repeat(
-    method: AbstractMethod,
-    field: Field,
-    t: Time,
-    y: PyTree,
-    h: Time,
-    count: int,
-    memory: PyTree = None,
-) -> PyTree:
-    """y after `count` steps of `h` from `t`, with a memory made anew if none is given."""
-    return repeated(method, field, t, y, h, count, memory)[0]
-
-
 def repeated(
     method: AbstractMethod,
     field: Field,
@@ -124,9 +111,9 @@ def repeated(
     count: int,
     memory: PyTree = None,
 ) -> tuple[PyTree, PyTree, Array]:
-    """As `repeat`, with the memory at the end and whether all steps converged; the first
-    that does not is the last one taken. A method that carries its memory computes none
-    after it."""
+    """y after `count` steps of `h` from `t`, with a memory made anew if none is given, the
+    memory at the end, and whether all steps converged; the first that does not is the last one
+    taken. A method that carries its memory computes none after it."""
     memory = method.begin(field, t, y, h) if memory is None else memory
 
     def one(k, carry):
@@ -164,13 +151,9 @@ class _Rate(eqx.Module):
         return self.terms.vf(t, y, self.args)
 
 
-def _field(terms: dfx.AbstractTerm, args: Any) -> Field:
-    return _Rate(terms, args)
-
-
 def _advance(given, h) -> MethodStep:
     method, terms, args, t, y, memory = given
-    return method.advance(_field(terms, args), t, y, h, memory)
+    return method.advance(_Rate(terms, args), t, y, h, memory)
 
 
 @eqx.filter_custom_jvp
@@ -299,16 +282,6 @@ class SemiImplicitEuler(AbstractMethod):
         rates = field(t, early)
         new = jax.tree.map(lambda x, k, late: x + h * k if late else x, early, rates, last)
         return MethodStep(new, None, (), {})
-
-
-def rk4_step(field: Field, t: Float[Array, ""], y: PyTree, h: Float[Array, ""]) -> Any:
-    """One classical Runge-Kutta step of y' = field(t, y), order 4, any pytree."""
-    return explicit_step(RK4, field, t, y, h)
-
-
-def dormand_prince_step(field: Field, t: Float[Array, ""], y: PyTree, h) -> Any:
-    """One Dormand-Prince step of y' = field(t, y), order 5, any pytree."""
-    return explicit_step(DORMAND_PRINCE, field, t, y, h)
 
 
 def explicit_step(tableau: Tableau, field: Field, t, y: PyTree, h) -> Any:

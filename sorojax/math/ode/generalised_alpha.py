@@ -73,15 +73,8 @@ class GeneralisedAlpha(AbstractMethod):
     interpolation_cls: ClassVar = dfx.LocalLinearInterpolation
 
     def __check_init__(self):
-        _check.between(
-            "GeneralisedAlpha",
-            "rho_inf",
-            self.rho_inf,
-            -1e-12,
-            1 + 1e-12,
-            "",
-            "1 keeps fast oscillations, 0 removes them.",
-        )
+        do = "1 keeps fast oscillations, 0 removes them."
+        _check.between("GeneralisedAlpha", "rho_inf", self.rho_inf, 0, 1, "", do, "[]")
 
     @property
     def carries(self) -> bool:

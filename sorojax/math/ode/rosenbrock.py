@@ -1,12 +1,12 @@
 """Rodas4: a stiff method that solves linear systems only, one matrix per step."""
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.scipy
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
@@ -91,16 +91,14 @@ class Rodas4(AbstractMethod):
         return ()
 
     def advance(self, field, t, y, h, memory):
-        flat, unravel = ravel_pytree(y)
-
-        def slope(t, x):
-            return ravel_pytree(field(t, unravel(x)))[0]
-
-        drift, jacobian = _derivatives(slope, t, flat)
+        slope, flat, unravel = _flat(field, y)
+        drift = jax.jvp(lambda t: slope(t, flat), (t,), (jnp.ones_like(t),))[1]
+        jacobian = jax.jacfwd(lambda x: slope(t, x))(flat)
         eye = jnp.eye(flat.shape[0], dtype=flat.dtype)
         # a step of no length stays where it is, in value and in derivative
         length = jnp.where(h == 0, jnp.ones_like(h), h)
-        solve = _inverse(eye / (_GAMMA * length) - jacobian)
+        # six products with an inverse are cheaper than six solves
+        solve = jnp.linalg.inv(eye / (_GAMMA * length) - jacobian)
         moves: list[Array] = []
         point = flat
         for k, coupling in enumerate(_COUPLING):
@@ -115,16 +113,14 @@ class Rodas4(AbstractMethod):
         return MethodStep(new, error, (), {"bend": bend, "twist": twist})
 
 
-def _derivatives(slope, t, x) -> tuple[Array, Array]:
-    """Derivative of the slope in time, and its Jacobian, by forward mode."""
-    drift = jax.jvp(lambda t: slope(t, x), (t,), (jnp.ones_like(t),))[1]
-    return drift, jax.jacfwd(lambda x: slope(t, x))(x)
+def _flat(field, y) -> tuple[Callable[[Any, Array], Array], Array, Callable[[Array], Any]]:
+    """The field of states as vectors, `y` as a vector, and what makes a tree of one."""
+    flat, unravel = ravel_pytree(y)
 
+    def slope(t, x):
+        return ravel_pytree(field(t, unravel(x)))[0]
 
-def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """One factorisation and one solve; six products are then cheaper than six solves."""
-    eye = jnp.eye(matrix.shape[0], dtype=matrix.dtype)
-    return jax.scipy.linalg.lu_solve(jax.scipy.linalg.lu_factor(matrix), eye)
+    return slope, flat, unravel
 
 
 def _sum(weights, moves) -> Any:
@@ -163,17 +159,13 @@ class Rosenbrock2(AbstractMethod):
         return not self.refresh
 
     def begin(self, field, t, y, h):
-        flat, unravel = ravel_pytree(y)
-        jacobian = jax.jacfwd(lambda x: ravel_pytree(field(t, unravel(x)))[0])(flat)
+        slope, flat, _ = _flat(field, y)
+        jacobian = jax.jacfwd(lambda x: slope(t, x))(flat)
         eye = jnp.eye(flat.shape[0], dtype=flat.dtype)
         return jnp.linalg.inv(eye - _GAMMA_OF_ORDER_2 * h * jacobian)
 
     def advance(self, field, t, y, h, memory):
-        flat, unravel = ravel_pytree(y)
-
-        def slope(t, x):
-            return ravel_pytree(field(t, unravel(x)))[0]
-
+        slope, flat, unravel = _flat(field, y)
         first = memory @ slope(t, flat)
         second = memory @ (slope(t + h, flat + h * first) - 2 * first)
         return MethodStep(unravel(flat + h * (1.5 * first + 0.5 * second)), None, memory, {})

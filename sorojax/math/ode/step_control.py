@@ -123,7 +123,8 @@ class Control(dfx.AbstractAdaptiveStepSizeController):
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, state):
         before, (rejected, made) = state.before, state.counts
-        ratio = jax.lax.stop_gradient(self._ratio(y0, y1_candidate, y_error))
+        size = jax.tree.map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), y0, y1_candidate)
+        ratio = jax.lax.stop_gradient(self._norm(y_error, size))
         keep = ratio < 1
         ratio = jnp.clip(
             jnp.where(jnp.isfinite(ratio), ratio, jnp.full_like(ratio, 1e30)), 1e-10
@@ -158,10 +159,6 @@ class Control(dfx.AbstractAdaptiveStepSizeController):
         counts = jnp.stack([rejected, made + 1])
         state = _Pace(jnp.where(keep, ratio, before), counts, step, last)
         return keep, start, start + h, False, state, ended
-
-    def _ratio(self, y0, y1, error):
-        size = jax.tree.map(lambda a, b: jnp.maximum(jnp.abs(a), jnp.abs(b)), y0, y1)
-        return self._norm(error, size)
 
     def _norm(self, tree, size):
         """Root mean square of `tree` in units of the tolerances at values of `size`."""

@@ -1,7 +1,6 @@
 """Fixed-step integrators of second-order equations, M a = f, for loops of known cost."""
 
 import abc
-import functools
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
@@ -18,8 +17,7 @@ from sorojax.math.ode.explicit import (
     DORMAND_PRINCE,
     RK4,
     Field,
-    dormand_prince_step as dormand_prince_step,
-    rk4_step as rk4_step,
+    Tableau,
     rolled_step,
 )
 from sorojax.math.ode.step_control import (
@@ -65,8 +63,6 @@ class SecondOrder(NamedTuple):
         equations: (t, q, v) -> (mass matrix, force).
         stiffness: About - df/dq.
         damping: About - df/dv.
-        linearised: (t, q, v) -> (mass matrix, force, stiffness, damping) where those
-            matrices change along the motion, as in contact.
         retract: (q, increment of the rates' dimension) -> q moved; a sum if None.
         rate: (q, v) -> dq/dt; v if None.
         contact: Contact, which `equations` hold as well, apart; None without any.
@@ -75,7 +71,6 @@ class SecondOrder(NamedTuple):
     equations: Callable[[Array, Array, Array], tuple[Array, Array]]
     stiffness: Float[Array, "dof dof"]
     damping: Float[Array, "dof dof"]
-    linearised: Callable[[Array, Array, Array], tuple[Array, Array, Array, Array]] | None = None
     retract: Callable[[Array, Array], Array] | None = None
     rate: Callable[[Array, Array], Array] | None = None
     contact: ContactTerms | None = None
@@ -118,13 +113,6 @@ def start(problem: SecondOrder, t, q: Array, v: Array) -> Kinematic:
     return Kinematic(q, v, solve_symmetric(*problem.equations(t, q, v)))
 
 
-def linearised(problem: SecondOrder, t, q: Array, v: Array) -> tuple[Array, ...]:
-    """Mass matrix, force, stiffness and damping at (t, q, v)."""
-    if problem.linearised is not None:
-        return problem.linearised(t, q, v)
-    return *problem.equations(t, q, v), problem.stiffness, problem.damping
-
-
 class GeneralisedAlpha(AbstractStepper):
     """Generalised-alpha with approximate Newton passes: implicit, second order.
 
@@ -157,12 +145,10 @@ class GeneralisedAlpha(AbstractStepper):
         def improve(_, new):
             middle_q = move(problem, q, (1 - af) * (leap + h * h * beta * new))
             middle_v = (1 - af) * (surge + h * gamma * new) + af * v
-            mass, force, stiffness, damping = linearised(
-                problem, t + (1 - af) * h, middle_q, middle_v
-            )
-            implicit = (1 - af) * (gamma * h * damping + beta * h**2 * stiffness)
+            mass, force = problem.equations(t + (1 - af) * h, middle_q, middle_v)
+            implicit = gamma * h * problem.damping + beta * h**2 * problem.stiffness
             residual = mass @ ((1 - am) * new + am * a) - force
-            return new - solve_symmetric((1 - am) * mass + implicit, residual)
+            return new - solve_symmetric((1 - am) * mass + (1 - af) * implicit, residual)
 
         new = jax.lax.fori_loop(0, self.passes, improve, a)
         moved = move(problem, q, leap + h * h * beta * new)
@@ -185,8 +171,8 @@ class ImplicitMidpoint(AbstractStepper):
         def improve(_, new):
             half = v + h / 2 * new
             middle = move(problem, q, h / 2 * half)
-            mass, force, stiffness, damping = linearised(problem, t + h / 2, middle, half)
-            implicit = mass + h / 2 * damping + h**2 / 4 * stiffness
+            mass, force = problem.equations(t + h / 2, middle, half)
+            implicit = mass + h / 2 * problem.damping + h**2 / 4 * problem.stiffness
             return new - solve_symmetric(implicit, mass @ new - force)
 
         new = jax.lax.fori_loop(0, self.passes, improve, a)
@@ -220,24 +206,31 @@ class TripleJump(AbstractStepper):
 
 
 class AbstractExplicit(AbstractStepper):
-    """Methods that keep no acceleration."""
+    """Runge-Kutta methods of a `tableau`, which keep no acceleration."""
+
+    tableau: eqx.AbstractClassVar[Tableau]
 
     def begin(self, problem, t, q, v):
         return Kinematic(q, v, jnp.zeros_like(v))
+
+    def step(self, problem, t, h, state):
+        field = vector_field(problem)
+        q, v = rolled_step(self.tableau, field, t, (state.q, state.v), h)
+        if problem.retract is not None:
+            q = problem.retract(q, jnp.zeros_like(v))  # back on the manifold
+        return Kinematic(q, v, state.a)
 
 
 class RungeKutta4(AbstractExplicit):
     """Classical explicit method of order 4; unstable beyond h omega = 2.8."""
 
-    def step(self, problem, t, h, state):
-        return _explicit(RK4, problem, t, h, state)
+    tableau: ClassVar[Tableau] = RK4
 
 
 class DormandPrince(AbstractExplicit):
     """Explicit method of order 5, for undamped motion at high accuracy."""
 
-    def step(self, problem, t, h, state):
-        return _explicit(DORMAND_PRINCE, problem, t, h, state)
+    tableau: ClassVar[Tableau] = DORMAND_PRINCE
 
 
 def move(problem: SecondOrder, q: Array, increment: Array) -> Array:
@@ -254,14 +247,6 @@ def vector_field(problem: SecondOrder) -> Field:
         return rate, solve_symmetric(*problem.equations(t, q, v))
 
     return field
-
-
-def _explicit(tableau, problem: SecondOrder, t, h, state: Kinematic) -> Kinematic:
-    field = vector_field(problem)
-    q, v = rolled_step(tableau, field, t, (state.q, state.v), h)
-    if problem.retract is not None:
-        q = problem.retract(q, jnp.zeros_like(v))  # back on the manifold
-    return Kinematic(q, v, state.a)
 
 
 def integrate(
@@ -297,8 +282,9 @@ def integrate(
         new = jax.lax.fori_loop(0, short, one, begun) if short > 1 else one(0, begun)
         if label is not None:
             due = (part == 0) & ((number % pause == 0) | (number == count))
-            tell_share = functools.partial(_tell_share, label, count)
-            jax.lax.cond(due, tell_share, lambda _: None, number)
+            jax.lax.cond(
+                due, lambda k, label=label: tell(label, k / count), lambda _: None, number
+            )
         return run.end(part, new), new
 
     made = (plan.row + 1, plan.part, plan.start.astype(h.dtype), plan.length.astype(h.dtype))
@@ -319,7 +305,3 @@ def integrate(
 
 
 _WORTH_IDLING = 20  # rows that one more is at most five per cent of
-
-
-def _tell_share(label: str, rows: int, number: Array) -> None:
-    tell(label, number / rows)

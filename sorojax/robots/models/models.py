@@ -17,7 +17,7 @@ from sorojax._edit import replace
 from sorojax._types import Numbers, real
 from sorojax.material import AbstractHyperelastic
 from sorojax.math.host import together
-from sorojax.math.lie import SE2, SE3, homogeneous
+from sorojax.math.lie import SE2, SE3, homogeneous, plane_rotation
 from sorojax.robots.models.cell import bellows_cell, bending_cell, finger_cell
 from sorojax.robots.models.rods import Body, body, column, rigid, side_by_side
 from sorojax.robots.models.supply import (
@@ -32,9 +32,7 @@ from sorojax.robots.models.supply import (
 from sorojax.robots.printable import BendingActuator, Finger, Hand, Manipulator, PlanarActuator
 from sorojax.rod import Assembly, Gravity, Link, Part, PartForce, assembly, chebyshev, constant
 from sorojax.sdf import Box, Cylinder, HalfSpace, translate
-from sorojax.systems import (
-    AssemblyBody,
-)
+from sorojax.systems import AssemblyBody
 from sorojax.units import kPa
 
 #: Axes of a rod that stands along z of a drawing: its x points along z, its y along x.
@@ -301,6 +299,5 @@ def _placed(rotation, position) -> Array:
 
 
 def _about_z(angle) -> Array:
-    c, s = jnp.cos(real(angle)), jnp.sin(real(angle))
-    o = jnp.zeros_like(c)
-    return jnp.stack([jnp.stack(row) for row in ([c, -s, o], [s, c, o], [o, o, o + 1])])
+    angle = real(angle)
+    return jnp.eye(3, dtype=angle.dtype).at[:2, :2].set(plane_rotation(angle))

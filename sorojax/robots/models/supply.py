@@ -16,24 +16,19 @@ from sorojax._types import real
 from sorojax.math.compiled import Split
 from sorojax.math.ode.explicit import AbstractMethod, finite, repeated
 from sorojax.math.ode.steppers import AbstractStepper, GeneralisedAlpha, start
-from sorojax.rod import (
-    Assembly,
-    Rod,
-    num_dof,
-    rest,
-)
+from sorojax.rod import Assembly, Rod, num_dof, rest
 from sorojax.rod.dynamics.rollout import second_order
 from sorojax.systems import (
     AbstractBlock,
     AssemblyBody,
     Coupled,
-    FemBody,
     Network,
     Regulator,
     Reservoir,
     Rosenbrock2,
     sum_of,
 )
+from sorojax.systems.integrate.coupled import bodies_of
 from sorojax.systems.integrate.march import Rate
 
 
@@ -240,7 +235,8 @@ def stepper(
         >>> print(f"{float(pressure[0]) / kPa:.1f} kPa")
         10.0 kPa
     """
-    method = _method(model.network) if method is None else method
+    if method is None:
+        method = Coupled() if bodies_of(model.network) else Rosenbrock2(refresh=True)
     _check.positive("stepper", "period", period, "s", "5 ms is period=5e-3.")
     h, zero, fixed = real(period / substeps), jnp.zeros(()), Split(model)
 
@@ -257,20 +253,13 @@ def stepper(
         return state, memory, model.pressure(state), good & finite(state)
 
     def advance(running, setpoint, dt):
-        if abs(dt - period) > 1e-9 * period:
-            raise ValueError(
-                f"stepper: asked for {dt:g} s, made for {period:g} s. Make one for this step."
-            )
+        check_period("stepper", dt, period)
         state, memory, age = running
         asked = jnp.asarray(setpoint, h.dtype)
         if age >= renew and not (method.keeps or method.carries):
             memory, age = begin(fixed, state, asked), 0
         state, memory, pressure, good = move(fixed, state, memory, asked)
-        if not good:
-            raise RuntimeError(
-                f"stepper: the robot does not get through {period:g} s at set-points of "
-                f"{np.asarray(setpoint)} Pa. Make more `substeps`."
-            )
+        check_moved("stepper", good, period, setpoint)
         return Running(state, memory, age + 1), pressure
 
     state, none = model.network.initial_state(), jnp.zeros(len(model.low))
@@ -279,9 +268,21 @@ def stepper(
     return advance, start
 
 
-def _method(network: Network) -> AbstractMethod:
-    solid = any(isinstance(block, FemBody) for block in network.blocks.values())
-    return Coupled() if solid else Rosenbrock2(refresh=True)
+def check_period(where: str, dt: float, period: float) -> None:
+    """Raise a `ValueError` if a call is to advance by another time than it was made for."""
+    if abs(dt - period) > 1e-9 * period:
+        raise ValueError(
+            f"{where}: asked for {dt:g} s, made for {period:g} s. Make one for this step."
+        )
+
+
+def check_moved(where: str, good: Array, period: float, setpoint: Any) -> None:
+    """Raise a `RuntimeError` unless all is `good` after a call."""
+    if not good:
+        raise RuntimeError(
+            f"{where}: the robot does not get through {period:g} s at set-points of "
+            f"{np.asarray(setpoint)} Pa. Make more `substeps`."
+        )
 
 
 # A rod behind valves: the smallest model that a board can drive

@@ -21,10 +21,9 @@ from sorojax.rod.dynamics.points import moment_of
 from sorojax.rod.dynamics.tree import AssemblyState, part_columns, part_motion
 from sorojax.rod.forces import loads
 from sorojax.rod.forces.forces import Gravity
-from sorojax.rod.model.assembly import Assembly, is_flat, rate, slices
+from sorojax.rod.model.assembly import increments, rate
 from sorojax.rod.model.link import LinkState
 from sorojax.rod.model.model import Model, inertia, motion, operators
-from sorojax.rod.model.rod import Rod
 
 Coordinates = Float[Array, " coordinates"]
 Rates = Float[Array, " dof"]
@@ -132,12 +131,7 @@ def forward_dynamics(
 @chunked_lanes
 @full_products
 def acceleration(
-    model: Model,
-    constants: Any,
-    t: Float[Array, ""],
-    q: Coordinates,
-    v: Rates,
-    forces: Forces,
+    model: Model, constants: Any, t: Float[Array, ""], q: Coordinates, v: Rates, forces: Forces
 ) -> Rates:
     """`forward_dynamics` uncompiled, for loops that hold `operators(model)`."""
     moment = motion(model, q, v, constants=constants)
@@ -170,19 +164,12 @@ class VectorField(eqx.Module):
         q, v = state
         t = jnp.asarray(t, q.dtype)
         a = acceleration(self.model, self.constants, t, q, v, self.forces)
-        return coordinate_rate(self.model, q, v), a
+        return rate(self.model, q, v), a
 
 
 def vector_field(model: Model, forces: Forces = ()) -> VectorField:
     """The equations of first order of a model, for any solver of diffrax."""
     return VectorField(model, operators(model), forces)
-
-
-def coordinate_rate(model: Model, q: Coordinates, v: Rates) -> Coordinates:
-    """dq/dt; v itself but for quaternions."""
-    if isinstance(model, Assembly) and not is_flat(model):
-        return rate(model, q, v)
-    return v
 
 
 def _zero(q: Coordinates) -> Float[Array, ""]:
@@ -206,7 +193,7 @@ def potential_energy(
 ) -> Float[Array, ""]:
     """Linear elastic energy [J], and that of the weight in `gravity` [m/s^2] if given."""
     moment = motion(model, q)
-    strains = _strain_coordinates(model, q)
+    strains = increments(model, q)
     energy = strains @ moment.operators.stiffness @ strains / 2
     if gravity is None:
         return energy
@@ -259,7 +246,7 @@ def coriolis_matrix(
             found.append((mass, rotary, linear, local))
         return found
 
-    now, rates = jax.jvp(rows, (q,), (coordinate_rate(model, q, v),))
+    now, rates = jax.jvp(rows, (q,), (rate(model, q, v),))
     total = jnp.zeros((v.shape[0],) * 2, q.dtype)
     for (mass, rotary, linear, local), (_, _, moving, turning) in zip(now, rates, strict=True):
         total = total + jnp.einsum("p,pin,pim->nm", mass, linear, moving)
@@ -292,16 +279,3 @@ def _rows(part: RodState | LinkState) -> tuple[Array, Array, Array, Array]:
     else:
         rotary = jax.vmap(jnp.diag)(part.operators.rotary.T)
     return part.operators.mass, rotary, mass_jacobian(part), local
-
-
-def _strain_coordinates(model: Model, q: Array) -> Float[Array, " dof"]:
-    """Coordinates in the order of the rates; quaternions, which store no energy, as zero."""
-    if isinstance(model, Rod) or is_flat(model):
-        return q
-    pieces = []
-    for part, at in zip(model.parts, slices(model), strict=True):
-        count = part.joint.num_dof(model.group)
-        flat = part.joint.num_coordinates(model.group) == count
-        pieces.append(q[at.joint_q] if flat else jnp.zeros(count, q.dtype))
-        pieces.append(q[at.rod_q])
-    return jnp.concatenate(pieces)

@@ -9,11 +9,7 @@ from jaxtyping import Array, Float
 
 from sorojax.math.lie import FROM_MOMENTS
 from sorojax.math.linalg.dense import product
-from sorojax.math.quadrature import (
-    gauss_legendre,
-    integration_matrix,
-    interpolation_rows,
-)
+from sorojax.math.quadrature import gauss_legendre, integration_matrix, interpolation_rows
 from sorojax.rod.model.basis import STRAINS
 from sorojax.rod.model.rod import Rod, strain_names
 
@@ -148,6 +144,22 @@ def rest_along(constants: Operators) -> Float[Array, "#quad strain"]:
     """Strain at q = 0 at the nodes, one row if it is constant."""
     rest = constants.rest_strain
     return rest[None] if rest.ndim == 1 else rest.T
+
+
+def strains_at(
+    rod: Rod, s: Float[Array, " points"] | np.ndarray | None = None
+) -> tuple[Float[Array, "#points strain"], Float[Array, "points strain dof"]]:
+    """Rest strain, one row if it is constant, and strain per coordinate at `s`, by default at
+    the nodes."""
+    constants, dtype = operators(rod), rod.length.dtype
+    rest, rows = rest_along(constants), constants.strain_rows
+    if s is not None:
+        rows = jnp.asarray(rod.basis(s), dtype)
+        if rest.shape[0] > 1:
+            rest = jnp.asarray(interpolation_rows(rod.quadrature, s), dtype) @ rest
+    active = dict(zip(rod.basis.active, rows, strict=True))
+    none = jnp.zeros(rows.shape[1:], dtype)
+    return rest, jnp.stack([active.get(name, none) for name in strain_names(rod.group)], axis=1)
 
 
 def _rest_strain(rod: Rod, dtype) -> Float[Array, "strain *quad"]:

@@ -10,10 +10,9 @@ from sorojax import _check
 from sorojax._types import Numbers, real
 from sorojax.math.compiled import jit_public
 from sorojax.math.lie import homogeneous
-from sorojax.math.quadrature import integration_rows, interpolation_rows
-from sorojax.rod.dynamics.fields import RodState, operators, rest_along
-from sorojax.rod.dynamics.moving import cross, turned
-from sorojax.rod.dynamics.points import Points
+from sorojax.rod.dynamics.fields import RodState, rest_along, strains_at
+from sorojax.rod.dynamics.moving import spin_cross, turned_twists
+from sorojax.rod.dynamics.points import Points, from_base
 from sorojax.rod.dynamics.tree import (
     AssemblyState,
     bias_accelerations,
@@ -25,7 +24,7 @@ from sorojax.rod.dynamics.tree import (
 from sorojax.rod.model.assembly import Assembly
 from sorojax.rod.model.link import LinkState
 from sorojax.rod.model.model import Model, inertia as inertia, motion as motion
-from sorojax.rod.model.rod import Rod, strain_names
+from sorojax.rod.model.rod import Rod
 
 _TIP = np.ones(1)
 
@@ -44,18 +43,8 @@ def strain(
         q: Coordinates.
         s: Where, in [0, 1]; the Gauss nodes if omitted.
     """
-    constants = operators(rod)
-    rows = constants.strain_rows if s is None else rod.basis(real(s).astype(q.dtype))
-    change = dict(zip(rod.basis.active, rows @ q, strict=True))
-    rest, points = rest_along(constants), rows.shape[1]
-    if s is not None and rest.shape[0] > 1:
-        at = interpolation_rows(rod.quadrature, real(s).astype(q.dtype))
-        rest = jnp.asarray(at, q.dtype) @ rest
-    parts = [
-        jnp.broadcast_to(rest[:, k], (points,)) + change.get(name, jnp.zeros(points, q.dtype))
-        for k, name in enumerate(strain_names(rod.group))
-    ]
-    return jnp.stack(parts, axis=1)
+    rest, rows = strains_at(rod, None if s is None else real(s).astype(q.dtype))
+    return rest + rows @ q
 
 
 @overload
@@ -174,8 +163,10 @@ def jacobian_rate_product(
     ground = zip(_parts(moment), moment.frames, bias_accelerations(moment), strict=True)
     found = {}
     for (name, part), frame, local in ground:
-        rot = model.group.rotation_dim
-        start = None if local is None else _turned_twist(frame.rotation, local, rot)
+        start = None
+        if local is not None:
+            rot = model.group.rotation_dim
+            start = turned_twists(frame.rotation, local[:, None], rot)[:, 0]
         found[name] = _rate_product(part, s, start)
     return found
 
@@ -223,17 +214,12 @@ def _rate_product(
         assert moment.base is not None
         arms = at.position - moment.base.position[None]
         angular = angular + start[None, :rot]
-        linear = linear + start[None, rot:] + cross(start[:rot], arms)
+        linear = linear + start[None, rot:] + spin_cross(start[None, :rot], arms)
     return jnp.concatenate([angular, linear], axis=1)
-
-
-def _turned_twist(rotation: Array, twist: Array, rot: int) -> Array:
-    spin = turned(rotation, twist[None, :rot, None])[0, :, 0]
-    return jnp.concatenate([spin, rotation @ twist[rot:]])
 
 
 def _rows(rod: Rod, s) -> Float[Array, "points quad"]:
     """Integration weights from the base to each s [m]."""
     s = s if s is _TIP else real(s).astype(rod.length.dtype)
     _check.shape("rod", "s", s, (None,), "Give a list of points in [0, 1].")
-    return rod.length * jnp.asarray(integration_rows(rod.quadrature, s), rod.length.dtype)
+    return from_base(rod, s)

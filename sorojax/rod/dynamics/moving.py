@@ -1,8 +1,8 @@
 """A rod on a moving base: its fields with the columns of the base, in any frame."""
 
+import dataclasses
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -18,42 +18,23 @@ def release(moment: RodState, twist: Float[Array, " base"]) -> RodState:
     acceleration; that of the base adds `mass_matrix[:, base] @ acceleration`.
     """
     quad, dim = moment.tangent.shape
-    rot = moment.angular_rate.shape[1]
-    eye, dtype = jnp.asarray(np.eye(dim), moment.q.dtype), moment.q.dtype
-    spin, none = jnp.asarray(np.eye(rot), dtype), jnp.zeros((rot, dim), dtype)
-    angular = jnp.concatenate([spin, none], axis=1)
-    linear = jnp.concatenate([jnp.zeros((dim, rot), dtype), eye], axis=1)
-    own = jnp.zeros((rot + dim, moment.q.shape[0]), dtype)
-    still = jnp.zeros((quad, dim, dim), dtype)
+    rot, dtype = moment.angular_rate.shape[1], moment.q.dtype
+    eye, still = jnp.asarray(np.eye(dim), dtype), jnp.zeros((quad, dim, dim), dtype)
+    spin = jnp.asarray(np.eye(rot, rot + dim), dtype)
+    spins = jnp.broadcast_to(spin, (quad, *spin.shape))
+    shifts = jnp.broadcast_to(eye, still.shape)
     arms, slopes = levers(moment.position), levers(moment.tangent)
-    base_linear = jnp.concatenate([arms, jnp.broadcast_to(eye, still.shape)], axis=2)
-    base_angular = jnp.broadcast_to(angular, (quad, rot, rot + dim))
-    return eqx.tree_at(
-        lambda m: (
-            m.q,
-            m.v,
-            m.angular_rate,
-            m.linear_rate,
-            m.angular_jacobian,
-            m.linear_jacobian,
-            m.base,
-        ),
+    columns = np.eye(rot + dim, rot + dim + moment.q.shape[0])
+    angular, linear = (jnp.asarray(x, dtype) for x in (columns[:rot], columns[rot:]))
+    return dataclasses.replace(
         moment,
-        (
-            jnp.concatenate([jnp.zeros_like(twist), moment.q]),
-            jnp.concatenate([twist, moment.v]),
-            _pad(moment.angular_rate, rot + dim),
-            jnp.concatenate([slopes, still, moment.linear_rate], axis=2),
-            jnp.concatenate([base_angular, moment.angular_jacobian], axis=2),
-            jnp.concatenate([base_linear, moment.linear_jacobian], axis=2),
-            Base(
-                eye,
-                jnp.zeros(dim, dtype),
-                jnp.concatenate([angular, own[:rot]], axis=1),
-                jnp.concatenate([linear, own[rot:]], axis=1),
-            ),
-        ),
-        is_leaf=lambda leaf: leaf is None,
+        q=jnp.concatenate([jnp.zeros_like(twist), moment.q]),
+        v=jnp.concatenate([twist, moment.v]),
+        angular_rate=jnp.pad(moment.angular_rate, ((0, 0), (0, 0), (rot + dim, 0))),
+        linear_rate=jnp.concatenate([slopes, still, moment.linear_rate], axis=2),
+        angular_jacobian=jnp.concatenate([spins, moment.angular_jacobian], axis=2),
+        linear_jacobian=jnp.concatenate([arms, shifts, moment.linear_jacobian], axis=2),
+        base=Base(eye, jnp.zeros(dim, dtype), angular, linear),
     )
 
 
@@ -61,34 +42,20 @@ def place(
     moment: RodState, rotation: Float[Array, "dim dim"], position: Float[Array, " dim"]
 ) -> RodState:
     """A released motion in a frame in which the base stands at (rotation, position)."""
-    base = moment.base
-    assert base is not None
-    return eqx.tree_at(
-        lambda m: (
-            m.directors,
-            m.tangent,
-            m.angular_rate,
-            m.linear_rate,
-            m.angular_jacobian,
-            m.linear_jacobian,
-            m.base,
-        ),
+    assert moment.base is not None
+    fields = ("directors", "angular_rate", "linear_rate", "angular_jacobian", "linear_jacobian")
+    return dataclasses.replace(
         moment,
-        (
-            turned(rotation, moment.directors),
-            turned(rotation, moment.tangent[:, :, None])[:, :, 0],
-            turned(rotation, moment.angular_rate),
-            turned(rotation, moment.linear_rate),
-            turned(rotation, moment.angular_jacobian),
-            turned(rotation, moment.linear_jacobian),
-            Base(
-                rotation,
-                position,
-                turned(rotation, base.angular_jacobian[None])[0],
-                turned(rotation, base.linear_jacobian[None])[0],
-            ),
-        ),
+        tangent=turned(rotation, moment.tangent[:, :, None])[:, :, 0],
+        base=placed(moment.base, rotation, position),
+        **{name: turned(rotation, getattr(moment, name)) for name in fields},
     )
+
+
+def placed(base: Base, rotation: Array, position: Array) -> Base:
+    """A base in own axes in a frame in which it stands at (rotation, position)."""
+    angular = turned(rotation, base.angular_jacobian[None])[0]
+    return Base(rotation, position, angular, turned(rotation, base.linear_jacobian[None])[0])
 
 
 def turned(
@@ -122,28 +89,31 @@ def turned_twists(rotation: Array, twists: Float[Array, "twist n"], rot: int) ->
 def levers(arm: Float[Array, "points dim"]) -> Float[Array, "points dim rot"]:
     """Matrices of spin -> spin x arm."""
     if arm.shape[1] == 2:
-        return jnp.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None]
+        return quarter_turned(arm)[:, :, None]
     x, y, z = jnp.unstack(arm, axis=1)
     o = jnp.zeros_like(x)
     return jnp.stack([o, z, -y, -z, o, x, y, -x, o], axis=1).reshape(-1, 3, 3)
 
 
-def swept_by(arm: Float[Array, " dim"], spins: Float[Array, "rot n"]) -> Float[Array, "dim n"]:
-    """Velocities of the end of an arm, of many spins."""
-    if arm.shape[0] == 2:
-        return levers(arm[None])[0] @ spins
-    return cross_columns(spins[None], arm[None, :, None])[0]
+def quarter_turned(vectors: Float[Array, "points 2"]) -> Float[Array, "points 2"]:
+    """z x each vector."""
+    return jnp.stack([-vectors[:, 1], vectors[:, 0]], axis=1)
 
 
-def cross(spin: Float[Array, " rot"], arms: Float[Array, "points dim"]) -> Array:
-    """spin x each arm, in the plane too."""
+def swept(
+    spins: Float[Array, "#points rot n"], arms: Float[Array, "points dim"]
+) -> Float[Array, "points dim n"]:
+    """spin x arm for every column of spins, in the plane too."""
     if arms.shape[1] == 2:
-        return levers(arms) @ spin
-    return cross_columns(spin[None], arms)
+        return quarter_turned(arms)[:, :, None] * spins
+    return cross_columns(spins, arms[:, :, None])
 
 
-def _pad(fields: Array, count: int) -> Array:
-    return jnp.pad(fields, ((0, 0), (0, 0), (count, 0)))
+def spin_cross(
+    spin: Float[Array, "#points rot"], arm: Float[Array, "points dim"]
+) -> Float[Array, "points dim"]:
+    """spin x arm, in the plane too."""
+    return swept(spin[:, :, None], arm)[:, :, 0]
 
 
 # Where the mass of the sections is, beside the axis of the rod
@@ -175,7 +145,7 @@ def on_arms(
     """Jacobians of the ends of arms."""
     if arms is None:
         return linear
-    return linear + levers(arms) @ moment.angular_jacobian
+    return linear + swept(moment.angular_jacobian, arms)
 
 
 def acceleration_on_arms(
@@ -187,6 +157,5 @@ def acceleration_on_arms(
     """Acceleration of the ends of arms: a + alpha x arm + spin x (spin x arm)."""
     if arms is None:
         return linear
-    velocity = (levers(arms) @ spin[:, :, None])[:, :, 0]
-    tangential = (levers(arms) @ angular[:, :, None])[:, :, 0]
-    return linear + tangential + (levers(velocity) @ spin[:, :, None])[:, :, 0]
+    velocity = spin_cross(spin, arms)
+    return linear + spin_cross(angular, arms) + spin_cross(spin, velocity)

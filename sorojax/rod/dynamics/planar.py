@@ -11,7 +11,12 @@ from sorojax.rod.dynamics.fields import (
     local_axis,
     rest_along,
 )
-from sorojax.rod.dynamics.moving import acceleration_on_arms, mass_arms, mass_jacobian
+from sorojax.rod.dynamics.moving import (
+    acceleration_on_arms,
+    mass_arms,
+    mass_jacobian,
+    quarter_turned,
+)
 from sorojax.rod.dynamics.points import own
 from sorojax.rod.model.rod import Rod
 
@@ -25,7 +30,7 @@ def motion(rod: Rod, constants: Operators, q: Array, v: Array) -> RodState:
     cosine, sine = jnp.cos(angle), jnp.sin(angle)
     axes = jnp.stack([cosine, sine], axis=1), jnp.stack([-sine, cosine], axis=1)
     tangent = _tangent(rod, constants, axes, q)
-    linear_rate = _turn(tangent)[:, :, None] * per_coordinate[:, None, :]
+    linear_rate = quarter_turned(tangent)[:, :, None] * per_coordinate[:, None, :]
     curvature = jnp.zeros_like(per_coordinate)
     for name, rows in zip(rod.basis.active, constants.strain_rows, strict=True):
         if is_curvature(name):
@@ -72,12 +77,12 @@ def bias_rates(moment: RodState) -> tuple[Float[Array, "quad 1"], Float[Array, "
 
 
 def _bias_rate(moment: RodState, spin: Float[Array, "quad 1"]) -> Float[Array, "quad 2"]:
-    rate = spin * _turn(moment.tangent)
+    rate = spin * quarter_turned(moment.tangent)
     for name, rows in zip(moment.rod.basis.active, moment.operators.strain_rows, strict=True):
         if not is_curvature(name):
             speed = rows @ own(moment, moment.v)
             rate = rate + 2 * moment.directors[:, :, local_axis(name)] * speed[:, None]
-    return spin * _turn(rate)
+    return spin * quarter_turned(rate)
 
 
 def _at_nodes(rod: Rod, cells: Float[Array, "cells *dof"]) -> Float[Array, "quad *dof"]:
@@ -91,8 +96,3 @@ def _tangent(rod: Rod, constants: Operators, axes, q: Array) -> Array:
         if not is_curvature(name):
             tangent = tangent + axes[name == "sigma_y"] * (rows @ q)[:, None]
     return tangent
-
-
-def _turn(vectors: Float[Array, "quad dim"]) -> Float[Array, "quad dim"]:
-    """z x each vector."""
-    return jnp.stack([-vectors[:, 1], vectors[:, 0]], axis=1)

@@ -1,13 +1,17 @@
 """Points along a rod in motion: where they are, how fast, and forces put on them."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sorojax.math.lie import cross_columns
+from sorojax.math.lie import cross_columns, plane_rotation
 from sorojax.math.quadrature import integration_rows
-from sorojax.rod.dynamics.fields import RodState, rest_along
+from sorojax.rod.dynamics.fields import Base, RodState, rest_along
+from sorojax.rod.dynamics.moving import spin_cross as spin_cross
+from sorojax.rod.model.rod import Rod
 
 
 class Points(eqx.Module):
@@ -27,8 +31,7 @@ class Points(eqx.Module):
     @property
     def position(self) -> Float[Array, "points dim"]:
         """Centres of the sections [m]."""
-        path, base = self.rows @ self.motion.tangent, self.motion.base
-        return path if base is None else path + base.position[None]
+        return self._beyond(self.motion.tangent, lambda base: base.position)
 
     @property
     def directors(self) -> Float[Array, "points dim dim"]:
@@ -38,32 +41,31 @@ class Points(eqx.Module):
     @property
     def angular_jacobian(self) -> Float[Array, "points rot dof"]:
         """Angular velocity per rate (planar: about z)."""
-        turn, base = jnp.tensordot(self.rows, self.motion.angular_rate, 1), self.motion.base
-        return turn if base is None else turn + base.angular_jacobian[None]
+        return self._beyond(self.motion.angular_rate, lambda base: base.angular_jacobian)
 
     @property
     def linear_jacobian(self) -> Float[Array, "points dim dof"]:
         """Velocity of the centres per rate."""
-        path, base = jnp.tensordot(self.rows, self.motion.linear_rate, 1), self.motion.base
-        return path if base is None else path + base.linear_jacobian[None]
+        return self._beyond(self.motion.linear_rate, lambda base: base.linear_jacobian)
 
     @property
     def velocity(self) -> Float[Array, "points dim"]:
         """Velocity of the centres [m/s]."""
-        moment = self.motion
-        path = self.rows @ (moment.linear_rate @ moment.v)
-        if moment.base is None:
-            return path
-        return path + (moment.base.linear_jacobian @ moment.v)[None]
+        v = self.motion.v
+        return self._beyond(self.motion.linear_rate @ v, lambda base: base.linear_jacobian @ v)
 
     @property
     def spin(self) -> Float[Array, "points rot"]:
         """Angular velocity of the sections [rad/s]."""
-        moment = self.motion
-        turn = self.rows @ (moment.angular_rate @ moment.v)
-        if moment.base is None:
-            return turn
-        return turn + (moment.base.angular_jacobian @ moment.v)[None]
+        v = self.motion.v
+        return self._beyond(
+            self.motion.angular_rate @ v, lambda base: base.angular_jacobian @ v
+        )
+
+    def _beyond(self, rate: Array, of_base: Callable[[Base], Array]) -> Array:
+        """A field at the points: that of the base and the integral of its rate."""
+        path, base = jnp.tensordot(self.rows, rate, 1), self.motion.base
+        return path if base is None else path + of_base(base)[None]
 
     def generalised(
         self,
@@ -90,8 +92,12 @@ class Points(eqx.Module):
 
 def points(motion: RodState, s: Float[Array, " points"] | np.ndarray) -> Points:
     """The points of `motion` at `s` in [0, 1]; a NumPy `s` makes constants."""
-    rows = jnp.asarray(integration_rows(motion.rod.quadrature, s), motion.q.dtype)
-    return Points(motion, motion.rod.length * rows)
+    return Points(motion, from_base(motion.rod, s))
+
+
+def from_base(rod: Rod, s: Float[Array, " points"] | np.ndarray) -> Float[Array, "points quad"]:
+    """Weights that integrate a field from the base of the rod to each `s` [m]."""
+    return rod.length * jnp.asarray(integration_rows(rod.quadrature, s), rod.length.dtype)
 
 
 def nodes(motion: RodState) -> Points:
@@ -114,9 +120,7 @@ def directors(points: Points) -> Float[Array, "points dim dim"]:
     dim = motion.tangent.shape[1]
     if dim == 2:
         angle = rows @ curvature(motion)[:, 0]
-        cosine, sine = jnp.cos(angle), jnp.sin(angle)
-        columns = jnp.stack([cosine, sine], 1), jnp.stack([-sine, cosine], 1)
-        turn = jnp.stack(columns, axis=-1)
+        turn = plane_rotation(angle)
         return turn if motion.base is None else motion.base.directors[None] @ turn
     slope = cross_columns(curvature(motion)[:, :, None], motion.directors)
     eye = jnp.eye(dim, dtype=motion.q.dtype)
@@ -148,15 +152,6 @@ def safe_norm(vectors: Float[Array, "*points dim"]) -> Float[Array, "*points"]:
     square = jnp.sum(vectors**2, axis=-1)
     far = square > 0
     return jnp.where(far, jnp.sqrt(jnp.where(far, square, jnp.ones_like(square))), 0.0)
-
-
-def spin_cross(
-    spin: Float[Array, "points rot"], arm: Float[Array, "points dim"]
-) -> Float[Array, "points dim"]:
-    """spin x arm, in the plane too."""
-    if arm.shape[-1] == 2:
-        return spin * jnp.stack([-arm[:, 1], arm[:, 0]], axis=1)
-    return jnp.cross(spin, arm)
 
 
 def moment_of(

@@ -20,7 +20,6 @@ from sorojax.rod.dynamics.dynamics import Forces
 from sorojax.rod.forces.loads import damping_matrix, on_model, tangent_stiffness, total_force
 from sorojax.rod.model.assembly import is_flat, rate, retract
 from sorojax.rod.model.model import Model, inertia, motion, operators
-from sorojax.rod.model.rod import Rod
 from sorojax.rod.statics.equilibrium import checked_status
 
 
@@ -142,11 +141,7 @@ def _equations(model, constants, forces, t, q, v):
     return mass, total_force(forces, t, moment) - coriolis
 
 
-def second_order(
-    model: Model,
-    q: Float[Array, " coordinates"],
-    forces: Forces,
-) -> SecondOrder:
+def second_order(model: Model, q: Float[Array, " coordinates"], forces: Forces) -> SecondOrder:
     """The equations of the model, with its stiffness at `q` and its damping."""
     constants, forces = operators(model), on_model(forces, model)
 
@@ -161,7 +156,7 @@ def second_order(
 
     stiffness = tangent_stiffness(forces, motion(model, q, constants=constants))
     damping = damping_matrix(forces, model, constants)
-    tree: Any = None if isinstance(model, Rod) or is_flat(model) else model
+    tree: Any = None if is_flat(model) else model
     return SecondOrder(
         equations,
         stiffness,

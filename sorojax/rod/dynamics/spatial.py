@@ -5,6 +5,8 @@ Reference:
     parameterization based approach, IEEE T-RO 37, 2021, for the model.
 """
 
+import functools
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -99,15 +101,20 @@ def _strain_rates(
     rod: Rod, constants: Operators, axes: list[Array]
 ) -> tuple[Array, Array | None]:
     """World-frame strain per coordinate, (quad, 3, dof): curvature, stretch and shear."""
-    curvature, shape = None, None
-    for name, rows in zip(rod.basis.active, constants.strain_rows, strict=True):
-        term = axes[local_axis(name)][:, :, None] * rows[:, None, :]
-        if is_curvature(name):
-            curvature = term if curvature is None else curvature + term
-        else:
-            shape = term if shape is None else shape + term
+    names = rod.basis.active
+    every = zip(names, constants.strain_rows, strict=True)
+    terms = [axes[local_axis(name)][:, :, None] * rows[:, None, :] for name, rows in every]
+    curvature, shape = _by_kind(names, terms)
     if curvature is None:
         curvature = jnp.zeros((rod.nodes, 3, rod.basis.num_dof), axes[0].dtype)
+    return curvature, shape
+
+
+def _by_kind(names: tuple[str, ...], terms: list[Array]) -> tuple[Array | None, Array | None]:
+    """Sums of the terms of curvatures, and of those of stretch and shear."""
+    turning = [term for name, term in zip(names, terms, strict=True) if is_curvature(name)]
+    others = [term for name, term in zip(names, terms, strict=True) if not is_curvature(name)]
+    curvature, shape = (functools.reduce(jnp.add, x) if x else None for x in (turning, others))
     return curvature, shape
 
 
@@ -128,13 +135,9 @@ def _bias_rates(moment: RodState) -> tuple[Array, Array, Array, Array]:
     constants, rod = moment.operators, moment.rod
     axes = jnp.unstack(moment.directors, axis=2)
     speeds = jnp.unstack(constants.strain_rows @ own(moment, moment.v))
-    curl, shape = None, None
-    for name, speed in zip(rod.basis.active, speeds, strict=True):
-        term = axes[local_axis(name)] * speed[:, None]
-        if is_curvature(name):
-            curl = term if curl is None else curl + term
-        else:
-            shape = term if shape is None else shape + term
+    every = zip(rod.basis.active, speeds, strict=True)
+    terms = [axes[local_axis(name)] * speed[:, None] for name, speed in every]
+    curl, shape = _by_kind(rod.basis.active, terms)
     curl = jnp.zeros_like(moment.tangent) if curl is None else curl
     spin = moment.angular_jacobian.reshape(-1, moment.v.shape[0]) @ moment.v
     spin = spin.reshape(curl.shape)

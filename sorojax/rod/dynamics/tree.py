@@ -10,7 +10,7 @@ Reference:
     Featherstone, Rigid Body Dynamics Algorithms, 2008, chapters 5 and 6, for the passes.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,11 +20,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
-from sorojax.math.quadrature import integration_rows
 from sorojax.rod.dynamics import moving, planar, spatial
 from sorojax.rod.dynamics.fields import Operators, RodState, operators
-from sorojax.rod.dynamics.moving import cross, release, turned_twists
-from sorojax.rod.dynamics.points import Points
+from sorojax.rod.dynamics.moving import release, spin_cross, turned_twists
+from sorojax.rod.dynamics.points import Points, from_base
 from sorojax.rod.model.assembly import (
     Assembly,
     dtype_of,
@@ -164,7 +163,7 @@ def assembly_operators(assembly: Assembly) -> AssemblyOperators:
         own = operators(body) if isinstance(body, Rod) else link_operators(body, dtype)
         parts.append(own)
         carrier = None if on is None else assembly.parts[on].body
-        rows.append(_rows(carrier, part.s) if isinstance(carrier, Rod) else None)
+        rows.append(from_base(carrier, part.s[None]) if isinstance(carrier, Rod) else None)
         spring, damper = part.joint.matrices(assembly.group, dtype)
         stiffness = stiffness.at[at.joint_v, at.joint_v].set(spring)
         damping = damping.at[at.joint_v, at.joint_v].set(damper)
@@ -208,15 +207,40 @@ def clamped(moment: AssemblyState, index: int) -> RodState:
     """The motion of a rod in its own frame, clamped there."""
     for members, stack in zip(batches(moment.assembly), moment.batches, strict=True):
         if index in members:
-            one = _member(stack, members.index(index))
+            one = _taken(stack, members.index(index))
             own = moment.operators.parts[index]
             both = (moment.assembly.parts[index].body, own)
             return eqx.tree_at(lambda m: (m.rod, m.operators), one, both)
     raise ValueError(f"assembly: `{moment.assembly.names[index]}` is a link, need a rod.")
 
 
-def _member(stack: RodState, at: int) -> RodState:
+def _taken(stack: RodState, at: int | slice | np.ndarray) -> RodState:
     return jax.tree.map(lambda leaf: leaf[at] if eqx.is_array(leaf) else leaf, stack)
+
+
+def in_own_frames(
+    moment: AssemblyState,
+    function: Callable[..., Any],
+    *more: Sequence[Array],
+    among: Collection[int] | None = None,
+) -> list[Any]:
+    """`function` of each part as it moves, in its own frame, and of its entries in `more`:
+    equal rods together, `among` those alone of whose kind one is among these, and no links."""
+    found: list[Any] = [None] * len(moment.frames)
+    rows = [frame.twist for frame in moment.frames], *more
+    for members, stack in zip(batches(moment.assembly), moment.batches, strict=True):
+        if among is not None and not set(among).intersection(members):
+            continue
+        every = eqx.filter_vmap(lambda m, twist, *rest: function(release(m, twist), *rest))
+        answers = every(stack, *(jnp.stack([row[k] for k in members]) for row in rows))
+        for place, k in enumerate(members):
+            found[k] = jax.tree.map(lambda leaf, place=place: leaf[place], answers)
+    for k, part in enumerate(moment.assembly.parts):
+        if among is None and isinstance(part.body, Link):
+            constants: Any = moment.operators.parts[k]
+            twist, *rest = (row[k] for row in rows)
+            found[k] = function(link_motion(part.body, constants, twist), *rest)
+    return found
 
 
 def part_motion(moment: AssemblyState, index: int) -> Any:
@@ -249,7 +273,10 @@ def _sections(moment: AssemblyState) -> list[Section]:
             continue
         places = [members.index(on[k]) for k in carried]
         rows = jnp.stack([weights[k] for k in carried])
-        every = eqx.filter_vmap(_section)(_members(stack, places), rows)
+        # A slice is a view, a gather a loop.
+        in_row = places == list(range(places[0], places[0] + len(places)))
+        at = slice(places[0], places[0] + len(places)) if in_row else np.array(places)
+        every = eqx.filter_vmap(_section)(_taken(stack, at), rows)
         for nth, k in enumerate(carried):
             rotation, centre, angular, linear = (field[nth] for field in every)
             found[k] = rotation, centre, angular, linear
@@ -265,14 +292,6 @@ def _section(moment: RodState, rows: Float[Array, "1 quad"]) -> Section:
     angular = jnp.concatenate([eye[:rot], angular], axis=1)
     linear = jnp.concatenate([linear, at.linear_jacobian[0]], axis=1)
     return at.directors[0], centre, angular, linear
-
-
-def _members(stack: RodState, places: list[int]) -> RodState:
-    first, count = places[0], len(places)
-    # A slice is a view, a gather a loop.
-    in_row = places == list(range(first, first + count))
-    at = slice(first, first + count) if in_row else np.array(places)
-    return jax.tree.map(lambda leaf: leaf[at] if eqx.is_array(leaf) else leaf, stack)
 
 
 def _carry(moment: AssemblyState) -> tuple[tuple[Mount, ...], tuple[Frame, ...]]:
@@ -316,14 +335,9 @@ def _mount(
     if on is None:
         angular, linear = angular[:, :0], linear[:, :0]
     if arm is not None:
-        centre, linear = centre + arm, linear + moving.swept_by(arm, angular)
+        centre, linear = centre + arm, linear + moving.swept(angular[None], arm[None])[0]
     carried = moving.turned_twists(turn.T, jnp.concatenate([angular, linear]), rot)
     return Mount(carried, axes, turn, along, arm, angular), centre
-
-
-def _rows(carrier: Rod, s: Array) -> Float[Array, "1 quad"]:
-    rows = integration_rows(carrier.quadrature, s.astype(carrier.length.dtype)[None])
-    return carrier.length * jnp.asarray(rows, carrier.length.dtype)
 
 
 # Rows of equal structure worked on one after the other: a program holds the work once
@@ -430,21 +444,11 @@ def gather(
 
 def part_inertias(moment: AssemblyState) -> tuple[list[Array], list[Array]]:
     """Mass matrix and Coriolis force of each part in its own columns and frame."""
-    assembly, size = moment.assembly, moment.assembly.group.algebra_dim
-    masses: list = [None] * len(assembly.parts)
-    biases: list = [None] * len(assembly.parts)
-    for members, stack in zip(batches(assembly), moment.batches, strict=True):
-        twists = jnp.stack([moment.frames[k].twist for k in members])
-        every = eqx.filter_vmap(lambda m, twist: rod_inertia(release(m, twist)))
-        mass, bias = every(stack, twists)
-        for place, k in enumerate(members):
-            masses[k], biases[k] = mass[place], bias[place]
-    for k, part in enumerate(assembly.parts):
-        constants = moment.operators.parts[k]
-        if isinstance(constants, LinkOperators):
-            assert isinstance(part.body, Link)
-            one = link_motion(part.body, constants, moment.frames[k].twist)
-            masses[k], biases[k] = link_inertia(one)
+    own = in_own_frames(
+        moment, lambda m: rod_inertia(m) if isinstance(m, RodState) else link_inertia(m)
+    )
+    masses, biases = ([pair[k] for pair in own] for k in range(2))
+    size = moment.assembly.group.algebra_dim
     for k, frame in enumerate(bias_accelerations(moment)):
         if frame is not None:
             biases[k] = biases[k] + masses[k][:, :size] @ frame
@@ -455,58 +459,34 @@ def bias_accelerations(moment: AssemblyState) -> tuple[Float[Array, " twist"] | 
     """Acceleration of each frame at zero coordinate acceleration, along its own axes; None
     on the ground, where there is none."""
     assembly, found = moment.assembly, []
-    rates = _rates_of_carriers(moment)
-    for index, on in enumerate(parents(assembly)):
-        mount = moment.mounts[index]
+    carriers = parents(assembly)
+    # Of all equal rods, not of the carriers: inertia needs the same, and XLA makes it once.
+    rates = in_own_frames(moment, bias_rates, among={on for on in carriers if on is not None})
+    for index, on in enumerate(carriers):
         if on is None:
             found.append(None)
             continue
         size, before = assembly.group.algebra_dim, found[on]
-        own = _section_bias(moment, index, on, rates.get(on))
+        own = _section_bias(moment, index, on, rates[on])
         if before is not None:
-            own = own + mount.carried[:, :size] @ before
+            own = own + moment.mounts[index].carried[:, :size] @ before
         found.append(own)
     return tuple(found)
-
-
-def _rates_of_carriers(moment: AssemblyState) -> dict[int, tuple[Array, Array]]:
-    """`bias_rates` of the rods that carry parts, equal rods together."""
-    carriers, found = set(parents(moment.assembly)), {}
-    for members, stack in zip(batches(moment.assembly), moment.batches, strict=True):
-        if carriers.isdisjoint(members):
-            continue
-        # Of all, not of the carriers: inertia needs the same, and XLA makes it once.
-        twists = jnp.stack([moment.frames[k].twist for k in members])
-        every = eqx.filter_vmap(lambda m, twist: bias_rates(release(m, twist)))
-        angular, linear = every(stack, twists)
-        found |= {k: (angular[place], linear[place]) for place, k in enumerate(members)}
-    return found
 
 
 def _section_bias(
     moment: AssemblyState, index: int, on: int, rates: tuple[Array, Array] | None
 ) -> Float[Array, " twist"]:
-    """Acceleration of a part on a carrier whose frame and coordinates do not accelerate."""
+    """Acceleration of a part on a carrier whose frame and coordinates do not accelerate: that
+    of the section that carries it, at the end of its arm; what is absent costs nothing."""
     mount, at = moment.mounts[index], slices(moment.assembly)
-    rot = moment.assembly.group.rotation_dim
-    own = jnp.concatenate([moment.frames[on].twist, moment.v[at[on].rod_v]])
-    spin = mount.spin @ own
-    rows, section = moment.operators.rows[index], None
-    if rows is not None and rates is not None:
-        section = rows[0] @ rates[0], rows[0] @ rates[1]
-    return _on_arm(mount, moment.v[at[index].joint_v], spin, section, rot)
-
-
-def _on_arm(
-    mount: Mount, v: Array, spin: Array, section: tuple[Array, Array] | None, rot: int
-) -> Float[Array, " twist"]:
-    """Acceleration at the end of the arm, from that of the section that carries it; what is
-    absent costs nothing."""
-    arm, angular = mount.arm, jnp.zeros_like(spin)
+    rot, arm, v = moment.assembly.group.rotation_dim, mount.arm, moment.v[at[index].joint_v]
+    spin = mount.spin @ jnp.concatenate([moment.frames[on].twist, moment.v[at[on].rod_v]])
+    rows, angular = moment.operators.rows[index], jnp.zeros_like(spin)
     linear = jnp.zeros(mount.turn.shape[0], spin.dtype)
     swept = None if arm is None else _cross(spin, arm)
-    if section is not None:
-        angular, linear = section
+    if rows is not None and rates is not None:
+        angular, linear = rows[0] @ rates[0], rows[0] @ rates[1]
         linear = linear if arm is None else linear + _cross(angular, arm)
     if v.shape[0] > 0:
         joint = mount.joint_axes @ v
@@ -518,4 +498,4 @@ def _on_arm(
 
 
 def _cross(spin: Float[Array, " rot"], arm: Float[Array, " dim"]) -> Float[Array, " dim"]:
-    return cross(spin, arm[None])[0]
+    return spin_cross(spin[None], arm[None])[0]

@@ -11,6 +11,7 @@ To add one, subclass the family that fits:
 """
 
 import abc
+import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -22,10 +23,10 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._types import optional_real, real
 from sorojax.math.quadrature import gauss_legendre
-from sorojax.rod.dynamics.fields import RodState, operators
+from sorojax.rod.dynamics.fields import RodState, operators, strains_at
 from sorojax.rod.dynamics.moving import mass_jacobian
 from sorojax.rod.dynamics.points import Points, from_own, nodes, own, points, safe_norm
-from sorojax.rod.model.rod import Rod, strain_names
+from sorojax.rod.model.rod import Rod
 
 EARTH = 9.81  # m/s^2
 
@@ -154,7 +155,7 @@ class Gravity(AbstractForce):
     acceleration: Float[Array, " dim"] | None = eqx.field(converter=optional_real, default=None)
 
     def __call__(self, t, motion):
-        g = gravity_or_earth(self.acceleration, motion)
+        g = gravity_or_earth(self.acceleration, motion.tangent.shape[1], motion.q.dtype)
         loads = motion.operators.mass[:, None] * g[None, :]
         return loads.reshape(-1) @ mass_jacobian(motion).reshape(-1, motion.q.shape[0])
 
@@ -195,49 +196,33 @@ def total_force(
             f"rod: the pressure map {unbound[0]} has no pressure. Wrap it, "
             "Pressurised(map, 10 * kPa), or list it in a RodBody and wire its pressure."
         )
-    total = None
+    terms = []
     if not any(isinstance(force, AbstractElastic) for force in forces):
-        total = -from_own(motion, motion.operators.stiffness @ own(motion, motion.q))
-    for force in forces:
-        term = force(t, motion)
-        total = term if total is None else total + term
-    assert total is not None
-    return total
+        terms.append(-from_own(motion, motion.operators.stiffness @ own(motion, motion.q)))
+    return functools.reduce(jnp.add, terms + [force(t, motion) for force in forces])
 
 
 def tangent_stiffness(
     forces: tuple[AbstractForce, ...], motion: RodState
 ) -> Float[Array, "dof dof"]:
     """Elastic stiffness at the coordinates of `motion`, replaced laws included."""
-    laws = [force for force in forces if isinstance(force, AbstractElastic)]
-    if not laws:
-        return motion.operators.stiffness
-    q = own(motion, motion.q)
-    return sum_matrices(jax.jacfwd(law.restoring_force)(q) for law in laws)
+    q, laws = own(motion, motion.q), [f for f in forces if isinstance(f, AbstractElastic)]
+    slopes = [jax.jacfwd(law.restoring_force)(q) for law in laws]
+    return functools.reduce(jnp.add, slopes) if slopes else motion.operators.stiffness
 
 
 def damping_matrix(
     forces: tuple[AbstractForce, ...], stiffness: Float[Array, "dof dof"]
 ) -> Float[Array, "dof dof"]:
     """Sum of the listed dampings; zeros without one."""
-    listed = [force for force in forces if isinstance(force, AbstractDamping)]
-    if not listed:
-        return jnp.zeros_like(stiffness)
-    return sum_matrices(force.matrix(stiffness) for force in listed)
+    listed = [f.matrix(stiffness) for f in forces if isinstance(f, AbstractDamping)]
+    return functools.reduce(jnp.add, listed) if listed else jnp.zeros_like(stiffness)
 
 
-def sum_matrices(matrices: Any) -> Array:
-    first, *rest = matrices
-    for matrix in rest:
-        first = first + matrix
-    return first
-
-
-def gravity_or_earth(acceleration: Array | None, motion: RodState) -> Float[Array, " dim"]:
+def gravity_or_earth(acceleration: Array | None, dim: int, dtype: Any) -> Float[Array, " dim"]:
     if acceleration is not None:
         return acceleration
-    dim = motion.tangent.shape[1]
-    return jnp.array([0.0] * (dim - 1) + [-EARTH], motion.q.dtype)
+    return jnp.array([0.0] * (dim - 1) + [-EARTH], dtype)
 
 
 # A nonlinear law of the section: moments and forces from strains, by a user function
@@ -278,19 +263,14 @@ def section_law(
             order of `strain_names(rod.group)`. The gradient of an energy per length keeps
             energy.
     """
-    rows, weights, s = _rows(rod)
-    return SectionLaw(stress, rows, weights, s)
+    s = jnp.asarray(gauss_legendre(rod.quadrature)[0], rod.length.dtype)
+    return SectionLaw(stress, *_rows(rod), s)
 
 
 @eqx.filter_jit
-def _rows(rod: Rod) -> tuple[Array, Array, Array]:
-    """Strain per coordinate at the Gauss nodes, their weights [m] and places."""
-    constants = operators(rod)
-    active = dict(zip(rod.basis.active, constants.strain_rows, strict=True))
-    none = jnp.zeros(constants.strain_rows.shape[1:], rod.length.dtype)
-    rows = jnp.stack([active.get(name, none) for name in strain_names(rod.group)], axis=1)
-    s = jnp.asarray(gauss_legendre(rod.quadrature)[0], rod.length.dtype)
-    return rows, constants.weights, s
+def _rows(rod: Rod) -> tuple[Array, Array]:
+    """Strain per coordinate at the Gauss nodes, and their weights [m]."""
+    return strains_at(rod)[1], operators(rod).weights
 
 
 class EnergyLaw(eqx.Module):
@@ -384,7 +364,7 @@ class Buoyancy(AbstractForce):
         _check.positive("Buoyancy", "density", self.density, "kg/m^3", "Water has 1000.")
 
     def __call__(self, t, motion):
-        g = gravity_or_earth(self.acceleration, motion)
+        g = gravity_or_earth(self.acceleration, motion.tangent.shape[1], motion.q.dtype)
         volume = motion.operators.mass / motion.rod.material.density
         loads = -self.density * volume[:, None] * g[None, :]
         return loads.reshape(-1) @ motion.linear_jacobian.reshape(-1, motion.q.shape[0])

@@ -5,6 +5,7 @@ its part: `On("finger", TipWrench(...))`.
 """
 
 import abc
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -15,8 +16,7 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._types import real
 from sorojax.rod.dynamics.fields import RodState
-from sorojax.rod.dynamics.moving import release
-from sorojax.rod.dynamics.tree import AssemblyState, batches, clamped, gather, part_motion
+from sorojax.rod.dynamics.tree import AssemblyState, clamped, gather, in_own_frames, part_motion
 from sorojax.rod.forces import forces as one
 from sorojax.rod.forces.forces import (
     AbstractDamping,
@@ -27,7 +27,7 @@ from sorojax.rod.forces.forces import (
     Pressurised,
 )
 from sorojax.rod.model.assembly import Assembly, index_of, slices
-from sorojax.rod.model.link import Link, LinkOperators, LinkState, link_motion
+from sorojax.rod.model.link import LinkOperators, LinkState
 from sorojax.rod.model.rod import Rod
 
 _SHAPE_ONLY = (AbstractElastic, AbstractDamping, Pressurised, AbstractPressureMap)
@@ -95,12 +95,10 @@ def on_model(forces: tuple[Load, ...], model: Rod | Assembly) -> tuple[Load, ...
         return tuple(_on_body(force, model) for force in _plain(forces, model.group))
     check(model, forces)
     return tuple(
-        PartForce(
-            force.part, _on_body(force.force, model.parts[index_of(model, force.part)].body)
-        )
-        if isinstance(force, PartForce)
-        else force
-        for force in forces
+        PartForce(f.part, _on_body(f.force, model[f.part].body))
+        if isinstance(f, PartForce)
+        else f
+        for f in forces
     )
 
 
@@ -115,7 +113,7 @@ def weight(
     """Generalised force of gravity alone."""
     if isinstance(motion, RodState):
         return gravity(t, motion)
-    return gather(motion, list(_weights(motion, gravity, t)))
+    return gather(motion, _weights(motion, gravity, t))
 
 
 def tangent_stiffness(
@@ -151,13 +149,7 @@ def check(assembly: Assembly, forces: tuple[Load, ...]) -> None:
     """Refuse names of no part, and forces that do not say where they act."""
     for force in forces:
         _in_space("assembly", force, assembly.group)
-        names = (
-            (force.part,)
-            if isinstance(force, PartForce | JointEffort)
-            else (force.first, force.second)
-            if isinstance(force, PairForce)
-            else ()
-        )
+        names = parts_of(force)
         for name in names:
             index_of(assembly, name)
         if not names and not isinstance(force, Gravity | AbstractDamping):
@@ -167,16 +159,22 @@ def check(assembly: Assembly, forces: tuple[Load, ...]) -> None:
             )
 
 
+def parts_of(force: Load) -> tuple[str, ...]:
+    """Names of the parts that a force is on; none of one that is on all."""
+    if isinstance(force, PairForce):
+        return force.first, force.second
+    return (force.part,) if isinstance(force, PartForce | JointEffort) else ()
+
+
 def _on(forces: tuple[Load, ...], assembly: Assembly, index: int) -> tuple:
     """Forces on one part alone, its share of a common damping included."""
-    name, found = assembly.names[index], []
-    is_rod = isinstance(assembly.parts[index].body, Rod)
-    for force in forces:
-        if isinstance(force, PartForce) and force.part == name:
-            found.append(force.force)
-        elif isinstance(force, AbstractDamping) and is_rod:
-            found.append(force)
-    return tuple(found)
+    name, is_rod = assembly.names[index], isinstance(assembly.parts[index].body, Rod)
+    return tuple(
+        force.force if isinstance(force, PartForce) else force
+        for force in forces
+        if (is_rod and isinstance(force, AbstractDamping))
+        or (isinstance(force, PartForce) and force.part == name)
+    )
 
 
 def _plain(forces: tuple[Load, ...], group: Any = None) -> Any:
@@ -202,7 +200,7 @@ def _part_load(forces, t, motion: AssemblyState, index: int) -> Array | None:
     listed = _on(forces, motion.assembly, index)
     if isinstance(motion.operators.parts[index], LinkOperators):
         terms = [force(t, part_motion(motion, index)) for force in listed]
-        return one.sum_matrices(terms) if terms else None
+        return functools.reduce(jnp.add, terms) if terms else None
     shape: Any = tuple(force for force in listed if isinstance(force, _SHAPE_ONLY))
     own = one.total_force(shape, t, clamped(motion, index))
     load = jnp.pad(own, (motion.assembly.group.algebra_dim, 0))
@@ -214,25 +212,10 @@ def _part_load(forces, t, motion: AssemblyState, index: int) -> Array | None:
 
 def _weights(motion: AssemblyState, gravity: Gravity, t) -> list[Array]:
     """Weight of each part in its columns; equal rods together, seen from their frames."""
-    count = len(motion.frames)
     dim = motion.assembly.group.space_dim
-    g = jnp.array([0.0] * (dim - 1) + [-one.EARTH], motion.q.dtype)
-    g = g if gravity.acceleration is None else gravity.acceleration
+    g = one.gravity_or_earth(gravity.acceleration, dim, motion.q.dtype)
     local = [frame.rotation.T @ g for frame in motion.frames]
-    found: list = [None] * count
-    weigh: Any = Gravity  # it reads links as it reads rods
-    for members, stack in zip(batches(motion.assembly), motion.batches, strict=True):
-        twists = jnp.stack([motion.frames[k].twist for k in members])
-        every = eqx.filter_vmap(lambda m, twist, g: Gravity(g)(t, release(m, twist)))
-        weights = every(stack, twists, jnp.stack([local[k] for k in members]))
-        for place, k in enumerate(members):
-            found[k] = weights[place]
-    for k, constants in enumerate(motion.operators.parts):
-        if isinstance(constants, LinkOperators):
-            link, twist = motion.assembly.parts[k].body, motion.frames[k].twist
-            assert isinstance(link, Link)
-            found[k] = weigh(local[k])(t, link_motion(link, constants, twist))
-    return found
+    return in_own_frames(motion, lambda part, g: Gravity(g)(t, part), local)
 
 
 def _joint_forces(forces, motion: AssemblyState) -> list[Float[Array, " dof"]]:

@@ -18,13 +18,8 @@ from sorojax import _check
 from sorojax._types import Numbers, optional_real, real
 from sorojax.math.compiled import jit_public
 from sorojax.math.lie import cross_columns
-from sorojax.math.quadrature import (
-    Quadrature,
-    gauss_legendre,
-    integration_matrix,
-    interpolation_rows,
-)
-from sorojax.rod.dynamics.fields import operators, rest_along
+from sorojax.math.quadrature import Quadrature, gauss_legendre, integration_matrix
+from sorojax.rod.dynamics.fields import strains_at
 from sorojax.rod.dynamics.points import from_own, own, safe_norm
 from sorojax.rod.forces.forces import AbstractChamber, AbstractForce
 from sorojax.rod.model.basis import STRAINS
@@ -229,19 +224,10 @@ def _differentiation(rule: Quadrature) -> np.ndarray:
 
 def _strains(rod: Rod, s: np.ndarray) -> tuple[Array, Array]:
     """Rest strain (points, 6) and strain per coordinate (points, 6, dof) at `s`."""
-    dtype, names = rod.length.dtype, strain_names(rod.group)
-    rest = rest_along(operators(rod))
-    if rest.shape[0] > 1:
-        rest = jnp.asarray(interpolation_rows(rod.quadrature, s), dtype) @ rest
-    active = dict(zip(rod.basis.active, jnp.asarray(rod.basis(s), dtype), strict=True))
-    none = jnp.zeros((len(s), rod.basis.num_dof), dtype)
-    columns = [
-        jnp.broadcast_to(rest[:, names.index(name)], (len(s),))
-        if name in names
-        else jnp.zeros(len(s), dtype)
-        for name in STRAINS
-    ]
-    return jnp.stack(columns, 1), jnp.stack([active.get(n, none) for n in STRAINS], 1)
+    rest, rows = strains_at(rod, s)
+    at = np.array([STRAINS.index(name) for name in strain_names(rod.group)])
+    blank = jnp.zeros((len(s), len(STRAINS), rod.basis.num_dof), rod.length.dtype)
+    return blank[:, :, 0].at[:, at].set(rest), blank.at[:, at].set(rows)
 
 
 Signal = Float[Array, " inputs"] | Callable[[Array], Array]

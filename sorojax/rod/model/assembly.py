@@ -1,6 +1,7 @@
 """Assemblies: a tree of rods and rigid links with joints between them."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -177,35 +178,66 @@ def rest(model: Rod | Assembly) -> Float[Array, " coordinates"]:
     dtype = dtype_of(model)
     if isinstance(model, Rod):
         return jnp.zeros(model.basis.num_dof, dtype)
+    return _by_part(
+        model,
+        lambda joint, at: joint.rest(model.group, dtype),
+        lambda at: jnp.zeros(at.rod_q.stop - at.rod_q.start, dtype),
+    )
+
+
+def retract(
+    model: Rod | Assembly, q: Array, increment: Float[Array, " dof"]
+) -> Float[Array, " coordinates"]:
+    """Coordinates after an increment."""
+    if is_flat(model):
+        return q + increment
+    return _by_part(
+        model,
+        lambda joint, at: joint.retract(model.group, q[at.joint_q], increment[at.joint_v]),
+        lambda at: q[at.rod_q] + increment[at.rod_v],
+    )
+
+
+def rate(model: Rod | Assembly, q: Array, v: Array) -> Float[Array, " coordinates"]:
+    """dq/dt at the rates v; v itself but for quaternions."""
+    if is_flat(model):
+        return v
+    return _by_part(
+        model,
+        lambda joint, at: joint.rate(model.group, q[at.joint_q], v[at.joint_v]),
+        lambda at: v[at.rod_v],
+    )
+
+
+def increments(model: Rod | Assembly, q: Array) -> Float[Array, " dof"]:
+    """The coordinates in the places of their rates; zero where those are others, as those of
+    a quaternion, which stores no energy."""
+    if is_flat(model):
+        return q
+
+    def of_joint(joint: AbstractJoint, at: Slices) -> Array:
+        count = at.joint_v.stop - at.joint_v.start
+        own = q[at.joint_q]
+        return own if own.shape[0] == count else jnp.zeros(count, q.dtype)
+
+    return _by_part(model, of_joint, lambda at: q[at.rod_q])
+
+
+def _by_part(
+    assembly: Any,
+    of_joint: Callable[[AbstractJoint, Slices], Array],
+    of_rod: Callable[[Slices], Array],
+) -> Array:
+    """One vector of what the joint and the rod of every part give."""
     pieces = []
-    for part, place in zip(model.parts, slices(model), strict=True):
-        pieces.append(part.joint.rest(model.group, dtype))
-        pieces.append(jnp.zeros(place.rod_q.stop - place.rod_q.start, dtype))
+    for part, at in zip(assembly.parts, slices(assembly), strict=True):
+        pieces += [of_joint(part.joint, at), of_rod(at)]
     return jnp.concatenate(pieces)
 
 
-def retract(assembly: Assembly, q: Array, increment: Array) -> Float[Array, " coordinates"]:
-    """Coordinates after an increment of the dimension of the rates."""
-    pieces = []
-    for part, place in zip(assembly.parts, slices(assembly), strict=True):
-        moved = q[place.joint_q], increment[place.joint_v]
-        pieces.append(part.joint.retract(assembly.group, *moved))
-        pieces.append(q[place.rod_q] + increment[place.rod_v])
-    return jnp.concatenate(pieces)
-
-
-def rate(assembly: Assembly, q: Array, v: Array) -> Float[Array, " coordinates"]:
-    """dq/dt at the rates v."""
-    pieces = []
-    for part, place in zip(assembly.parts, slices(assembly), strict=True):
-        pieces.append(part.joint.rate(assembly.group, q[place.joint_q], v[place.joint_v]))
-        pieces.append(v[place.rod_v])
-    return jnp.concatenate(pieces)
-
-
-def is_flat(assembly: Assembly) -> bool:
+def is_flat(model: Rod | Assembly) -> bool:
     """Whether dq/dt = v for every joint."""
-    return num_coordinates(assembly) == num_dof(assembly)
+    return num_coordinates(model) == num_dof(model)
 
 
 def dtype_of(model: Rod | Assembly):

@@ -15,7 +15,7 @@ from sorojax import _check
 from sorojax._display import displayed
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
-from sorojax.math.quadrature import Quadrature, gauss_legendre
+from sorojax.math.quadrature import Quadrature, array_module, gauss_legendre
 
 Points: TypeAlias = Float[Array, " points"] | np.ndarray
 
@@ -106,8 +106,7 @@ class StrainBasis(eqx.Module):
         for name in self.active:
             modes = self.modes[name]
             values, behind = modes(s), self.num_dof - offset - modes.count
-            xp = jnp if isinstance(values, jax.Array) else np
-            rows.append(xp.pad(values, ((0, 0), (offset, behind))))
+            rows.append(array_module(values).pad(values, ((0, 0), (offset, behind))))
             offset += modes.count
         is_traced = any(isinstance(row, jax.Array) for row in rows)
         return jnp.stack(rows) if is_traced else np.stack(rows)
@@ -194,10 +193,7 @@ class SampledModes(AbstractModes):
 @jax.jit
 def _interpolated(s: Array, values: Array, at: Array) -> Float[Array, "points modes"]:
     """Linear between samples, constant beyond the first and last."""
-    right = jnp.clip(jnp.searchsorted(s, at), 1, s.shape[0] - 1)
-    left = right - 1
-    fraction = jnp.clip((at - s[left]) / (s[right] - s[left]), 0, 1)[:, None]
-    return (1 - fraction) * values[left] + fraction * values[right]
+    return jax.vmap(jnp.interp, (None, None, 1), 1)(at, s, values)
 
 
 def _as_function(given: Any) -> Any:
@@ -280,10 +276,7 @@ def functions(
     """
     joints = checked_breaks("functions", breaks)
     own = {name: _as_function(f) for name, f in modes.items()}
-    modes_of: dict[str, AbstractModes] = {
-        k: _functions(f, nodes, joints) for k, f in own.items()
-    }
-    return StrainBasis(modes_of)
+    return StrainBasis({name: _functions(f, nodes, joints) for name, f in own.items()})
 
 
 def _functions(function: Any, nodes: int | None, joints: tuple[float, ...]) -> Functions:
@@ -466,7 +459,6 @@ class BSpline(AbstractModes):
         return max(4, self.degree + 2, -(-8 // spans))
 
     def __call__(self, s):
-        xp = jnp if isinstance(s, jax.Array) else np
         p = self.degree
         t = np.concatenate([np.zeros(p + 1), self.knots, np.ones(p + 1)]).tolist()
         rows = [self._indicator(s, t[k], t[k + 1]) for k in range(len(t) - 1)]
@@ -476,7 +468,7 @@ class BSpline(AbstractModes):
                 + (1 - _rise(s, t[k + 1], t[k + d + 1])) * rows[k + 1]
                 for k in range(len(rows) - 1)
             ]
-        return xp.stack(rows, axis=1)
+        return array_module(s).stack(rows, axis=1)
 
     def _indicator(self, s, low: float, high: float):
         if low == high:

@@ -1,6 +1,7 @@
 """Joints between the parts of an assembly: how a frame moves on another."""
 
 import abc
+import functools
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,7 +9,15 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import optional_real, real
-from sorojax.math.lie import SE2, SE3, exponential, multiply, rotation_columns
+from sorojax.math.lie import (
+    SE2,
+    SE3,
+    exponential,
+    multiply,
+    plane_rotation,
+    quaternion_rate,
+    rotation_matrix,
+)
 
 Group = SE2 | SE3
 
@@ -70,7 +79,34 @@ class Fixed(AbstractJoint):
         return jnp.eye(group.space_dim, dtype=q.dtype), jnp.zeros(group.space_dim, q.dtype)
 
 
-class Revolute(AbstractJoint):
+class AbstractAxial(AbstractJoint):
+    """One coordinate, along or about an axis, with a spring towards rest and a damper."""
+
+    axis: Float[Array, " dim"] | None = eqx.field(converter=optional_real, default=None)
+    stiffness: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
+    damping: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
+
+    def __check_init__(self):
+        axis = self.axis
+        if axis is not None and _check.is_concrete(axis) and not float(jnp.sum(axis**2)) > 0:
+            raise ValueError(
+                f"{type(self).__name__}: `axis` is {axis}, need a direction. Give e.g. "
+                "[0, 0, 1]."
+            )
+
+    def num_dof(self, group):
+        return 1
+
+    def matrices(self, group, dtype):
+        return _scalar(self.stiffness, dtype), _scalar(self.damping, dtype)
+
+    def effort(self, q, v):
+        pairs = (self.stiffness, q), (self.damping, v)
+        terms = [-k * x for k, x in pairs if k is not None]
+        return functools.reduce(jnp.add, terms) if terms else None
+
+
+class Revolute(AbstractAxial):
     """Rotation about an axis [rad].
 
     Attributes:
@@ -79,16 +115,6 @@ class Revolute(AbstractJoint):
         damping: [N m s/rad].
     """
 
-    axis: Float[Array, " dim"] | None = eqx.field(converter=optional_real, default=None)
-    stiffness: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
-    damping: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
-
-    def __check_init__(self):
-        _check_axis("Revolute", self.axis)
-
-    def num_dof(self, group):
-        return 1
-
     def axes(self, group, dtype):
         still = jnp.zeros(group.space_dim, dtype)
         return jnp.concatenate([self._spin(group, dtype), still])[:, None]
@@ -96,16 +122,10 @@ class Revolute(AbstractJoint):
     def pose(self, group, q):
         still = jnp.zeros(group.space_dim, q.dtype)
         if group.space_dim == 2:
-            return _plane_rotation(q[0]), still
+            return plane_rotation(q[0]), still
         cosine, sine = jnp.cos(q[0] / 2), jnp.sin(q[0] / 2)
         x, y, z = sine * self._spin(group, q.dtype)
-        return _matrix((cosine, x, y, z)), still
-
-    def matrices(self, group, dtype):
-        return _scalar(self.stiffness, dtype), _scalar(self.damping, dtype)
-
-    def effort(self, q, v):
-        return _effort(self.stiffness, q, self.damping, v)
+        return rotation_matrix((cosine, x, y, z)), still
 
     def _spin(self, group: Group, dtype) -> Array:
         if group.space_dim == 2:
@@ -113,7 +133,7 @@ class Revolute(AbstractJoint):
         return _unit(jnp.array([0.0, 0.0, 1.0]) if self.axis is None else self.axis, 3, dtype)
 
 
-class Prismatic(AbstractJoint):
+class Prismatic(AbstractAxial):
     """Translation along an axis [m].
 
     Attributes:
@@ -122,28 +142,12 @@ class Prismatic(AbstractJoint):
         damping: [N s/m].
     """
 
-    axis: Float[Array, " dim"] | None = eqx.field(converter=optional_real, default=None)
-    stiffness: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
-    damping: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
-
-    def __check_init__(self):
-        _check_axis("Prismatic", self.axis)
-
-    def num_dof(self, group):
-        return 1
-
     def axes(self, group, dtype):
         still = jnp.zeros(group.rotation_dim, dtype)
         return jnp.concatenate([still, self._along(group, dtype)])[:, None]
 
     def pose(self, group, q):
         return jnp.eye(group.space_dim, dtype=q.dtype), q[0] * self._along(group, q.dtype)
-
-    def matrices(self, group, dtype):
-        return _scalar(self.stiffness, dtype), _scalar(self.damping, dtype)
-
-    def effort(self, q, v):
-        return _effort(self.stiffness, q, self.damping, v)
 
     def _along(self, group: Group, dtype) -> Array:
         dim = group.space_dim
@@ -170,8 +174,8 @@ class Free(AbstractJoint):
 
     def pose(self, group, q):
         if group.space_dim == 2:
-            return _plane_rotation(q[0]), q[1:]
-        return _matrix(_unit_quaternion(q)), q[4:]
+            return plane_rotation(q[0]), q[1:]
+        return rotation_matrix(_unit_quaternion(q)), q[4:]
 
     def rest(self, group, dtype):
         rest = jnp.zeros(self.num_coordinates(group), dtype)
@@ -187,19 +191,7 @@ class Free(AbstractJoint):
     def rate(self, group, q, v):
         if group.space_dim == 2:
             return v
-        zero = jnp.zeros_like(v[0])
-        turning = multiply((zero, v[0] / 2, v[1] / 2, v[2] / 2), (q[0], q[1], q[2], q[3]))
-        return jnp.concatenate([jnp.stack(turning), v[3:]])
-
-
-def _plane_rotation(angle: Array) -> Float[Array, "2 2"]:
-    cosine, sine = jnp.cos(angle), jnp.sin(angle)
-    return jnp.stack([jnp.stack([cosine, -sine]), jnp.stack([sine, cosine])])
-
-
-def _matrix(quaternion) -> Float[Array, "3 3"]:
-    columns = rotation_columns(quaternion)
-    return jnp.stack([jnp.stack(column) for column in columns], axis=1)
+        return jnp.concatenate([quaternion_rate(v, q), v[3:]])
 
 
 def _unit_quaternion(q: Array):
@@ -217,16 +209,6 @@ def _unit(axis: Array, dim: int, dtype) -> Float[Array, " dim"]:
 def _scalar(value: Array | None, dtype) -> Float[Array, "1 1"]:
     value = real(0.0) if value is None else value
     return value.astype(dtype).reshape(1, 1)
-
-
-def _effort(stiffness: Array | None, q: Array, damping: Array | None, v: Array):
-    terms = [-k * x for k, x in ((stiffness, q), (damping, v)) if k is not None]
-    return sum(terms[1:], start=terms[0]) if terms else None
-
-
-def _check_axis(where: str, axis: Array | None) -> None:
-    if axis is not None and _check.is_concrete(axis) and not float(jnp.sum(axis**2)) > 0:
-        raise ValueError(f"{where}: `axis` is {axis}, need a direction. Give e.g. [0, 0, 1].")
 
 
 # The screw: one coordinate turns and advances
@@ -263,9 +245,7 @@ class Screw(AbstractJoint):
         return jnp.zeros((6, 1), dtype).at[2].set(self.turn).at[5].set(self.advance)
 
     def pose(self, group, q):
-        c, s = jnp.cos(self.turn * q[0]), jnp.sin(self.turn * q[0])
-        rows = jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
-        turned = jnp.eye(3, dtype=q.dtype).at[:2, :2].set(rows)
+        turned = jnp.eye(3, dtype=q.dtype).at[:2, :2].set(plane_rotation(self.turn * q[0]))
         return turned, jnp.zeros(3, q.dtype).at[2].set(self.advance * q[0])
 
     def matrices(self, group, dtype):

@@ -1,5 +1,6 @@
 """Rigid links: bodies of an assembly that do not bend."""
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,7 +11,7 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._types import optional_real, real
 from sorojax.rod.dynamics.fields import Base
-from sorojax.rod.dynamics.moving import cross, levers, swept_by, turned
+from sorojax.rod.dynamics.moving import levers, placed, spin_cross, swept
 
 
 class Link(eqx.Module):
@@ -81,10 +82,8 @@ class LinkState(eqx.Module):
 
     @property
     def linear_jacobian(self) -> Float[Array, "1 dim dof"]:
-        arm, linear = self._arm, self.base.linear_jacobian
-        if arm is not None:
-            linear = linear + swept_by(arm, self.base.angular_jacobian)
-        return linear[None]
+        arm, linear = self._arm, self.base.linear_jacobian[None]
+        return linear if arm is None else linear + swept(self.angular_jacobian, arm[None])
 
     @property
     def tip_jacobian(self) -> Float[Array, "twist dof"]:
@@ -128,14 +127,7 @@ def link_motion(
 
 def place_link(moment: LinkState, rotation: Array, position: Array) -> LinkState:
     """A motion in own axes in a frame in which the link stands at (rotation, position)."""
-    base = moment.base
-    placed = Base(
-        rotation,
-        position,
-        turned(rotation, base.angular_jacobian[None])[0],
-        turned(rotation, base.linear_jacobian[None])[0],
-    )
-    return LinkState(moment.link, moment.operators, moment.q, moment.v, placed)
+    return dataclasses.replace(moment, base=placed(moment.base, rotation, position))
 
 
 def link_inertia(
@@ -150,7 +142,7 @@ def link_inertia(
         arm = center(moment.link, moment.base.position)[None]
         lever = levers(arm)[0]
         turning, coupling = about + mass * lever.T @ lever, mass * lever
-        force = mass * cross(spin, cross(spin, arm))[0]
+        force = mass * spin_cross(spin[None], spin_cross(spin[None], arm))[0]
         torque = lever.T @ force
     if rot == 3:
         torque = torque + jnp.cross(spin, about @ spin)

@@ -4,11 +4,9 @@ import math
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from sorojax.math.quadrature import chebyshev_values, legendre_values
+from sorojax.math.quadrature import array_module, chebyshev_values, legendre_values
 from sorojax.rod.model.basis import (
     AbstractModes,
     BSpline,
@@ -55,7 +53,7 @@ class Bernstein(AbstractModes):
         return max(8, self.count + 4)
 
     def __call__(self, s):
-        degree, xp = self.count - 1, _numbers(s)
+        degree, xp = self.count - 1, array_module(s)
         rows = [
             math.comb(degree, k) * s**k * (1 - s) ** (degree - k) for k in range(self.count)
         ]
@@ -72,7 +70,7 @@ class Fourier(AbstractModes):
         return 8 + 4 * (self.count // 2)
 
     def __call__(self, s):
-        xp = _numbers(s)
+        xp = array_module(s)
         rows = [s * 0 + 1]
         for k in range(1, self.count):
             wave = 2 * math.pi * ((k + 1) // 2) * s
@@ -126,10 +124,6 @@ def _basis(where: str, kind: type, modes: dict[str, int]) -> StrainBasis:
     return StrainBasis({name: kind(n) for name, n in each_count(where, modes).items()})
 
 
-def _numbers(s):
-    return jnp if isinstance(s, jax.Array) else np
-
-
 # Modes that live on one stretch of the rod each
 
 
@@ -176,7 +170,7 @@ class Piecewise(AbstractModes):
             inside = s >= start if k else s < float(edges[1])
             if 0 < k < last:
                 inside = inside & (s < float(edges[k + 1]))
-            xp = jnp if isinstance(values, jax.Array) else np
+            xp = array_module(values)
             parts.append(xp.where(xp.asarray(inside)[:, None], values, xp.zeros_like(values)))
         return xp.concatenate(parts, axis=1)
 

@@ -189,11 +189,7 @@ def rod(
         Boyer, Lebastard, Candelier and Renda, Dynamics of continuum and soft robots: a strain
         parameterization based approach, IEEE T-RO 37, 2021.
     """
-    given = {
-        "young_modulus": young_modulus,
-        "poisson_ratio": poisson_ratio,
-        "density": density,
-    }
+    given = {"young_modulus": young_modulus, "poisson_ratio": poisson_ratio, "density": density}
     if material is None:
         missing = [name for name, value in given.items() if value is None]
         if missing:

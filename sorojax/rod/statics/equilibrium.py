@@ -21,11 +21,12 @@ from sorojax.math.compiled import jit_public
 from sorojax.math.implicit_root import implicit_root, matrix_of
 from sorojax.math.quadrature import gauss_legendre, interpolation_rows
 from sorojax.math.status import Status
-from sorojax.rod.dynamics.fields import is_curvature, operators as rod_operators, rest_along
+from sorojax.rod.dynamics.fields import is_curvature, strains_at
 from sorojax.rod.dynamics.tree import rod_motion
 from sorojax.rod.forces.loads import Load, total_force
 from sorojax.rod.model.assembly import (
     dtype_of,
+    increments,
     is_flat,
     num_coordinates,
     num_dof,
@@ -73,8 +74,8 @@ def checked_status(
 def _stretches(rod: Rod, q: Array) -> tuple[Float[Array, " quad"], Float[Array, " quad"]]:
     """Stretch at every node, along the axis and the least at the distance from it that the
     section has in the mean (its radius of gyration)."""
-    strain = _strain(rod, q)
-    section, zero = rod.section, jnp.zeros((), q.dtype)
+    section, zero, (rest, rows) = rod.section, jnp.zeros((), q.dtype), strains_at(rod)
+    strain = dict(zip(strain_names(rod.group), (rest + rows @ q).T, strict=True))
     about_y = strain.get("kappa_y", zero) ** 2 * section.second_moment_y
     about_z = strain.get("kappa_z", zero) ** 2 * section.second_moment_z
     bent = jnp.sqrt((about_y + about_z) / section.area)
@@ -102,16 +103,6 @@ def finer(rod: Rod) -> Rod:
     return Rod(rod.group, rod.basis, section, material, rod.length, varied, count, rod.breaks)
 
 
-def _strain(rod: Rod, q: Array) -> dict[str, Float[Array, " quad"]]:
-    constants = rod_operators(rod)
-    change = dict(zip(rod.basis.active, constants.strain_rows @ q, strict=True))
-    rest = rest_along(constants)
-    return {
-        name: rest[:, k] + change.get(name, jnp.zeros((), q.dtype))
-        for k, name in enumerate(strain_names(rod.group))
-    }
-
-
 def _tip(rod: Rod, q: Array) -> Float[Array, " dim"]:
     moment = rod_motion(rod, q)
     return moment.operators.weights @ moment.tangent
@@ -128,31 +119,14 @@ def _rods(model: Model) -> list[tuple[Rod, slice]]:
 _INERTIA_SHARE = 1e-6  # of the mean square frequency, for joints without a spring
 
 
-def moved(model: Model, q: Array, increment: Float[Array, " dof"]) -> Array:
-    """Coordinates after an increment."""
-    return q + increment if isinstance(model, Rod) else retract(model, q, increment)
-
-
 def squared(model: Model, q: Array, residual: Float[Array, " dof"]) -> Array:
     """As many equations as coordinates: the residual along the coordinates that it can
     move, and the norm of a quaternion along the one it cannot."""
-    if isinstance(model, Rod) or is_flat(model):
+    if is_flat(model):
         return residual
     still = jnp.zeros_like(residual)
     normal, along = jax.jvp(lambda d: retract(model, q, d), (still,), (residual,))
     return along + q - normal
-
-
-def increments(model: Model, q: Array) -> Float[Array, " dof"]:
-    """The coordinates in the places of their rates; zero where those are others."""
-    if isinstance(model, Rod) or is_flat(model):
-        return q
-    own = jnp.zeros(num_dof(model), q.dtype)
-    for at in slices(model):
-        own = own.at[at.rod_v].set(q[at.rod_q])
-        if at.joint_q.stop - at.joint_q.start == at.joint_v.stop - at.joint_v.start:
-            own = own.at[at.joint_v].set(q[at.joint_q])
-    return own
 
 
 def linearised(
@@ -161,7 +135,7 @@ def linearised(
     """A residual and its exact tangent, one forward pass for all columns."""
 
     def along(increment):
-        value = residual(moved(model, q, increment))
+        value = residual(retract(model, q, increment))
         return value, value
 
     still = jnp.zeros(num_dof(model), q.dtype)
@@ -225,16 +199,10 @@ def unit_energy(model: Model, metric: Float[Array, "dof dof"]) -> Float[Array, "
 
 def _units(model: Model) -> Float[Array, " dof"]:
     if isinstance(model, Rod):
-        one = jnp.ones((), model.length.dtype)
-        return jnp.concatenate(
-            [
-                jnp.full(
-                    model.basis.modes[name].count,
-                    one / model.length if is_curvature(name) else one,
-                )
-                for name in model.basis.active
-            ]
-        )
+        basis, one = model.basis, jnp.ones((), model.length.dtype)
+        sizes = [one / model.length if is_curvature(name) else one for name in basis.active]
+        counts = [basis.modes[name].count for name in basis.active]
+        return jnp.concatenate([jnp.full(n, x) for n, x in zip(counts, sizes, strict=True)])
     units = jnp.ones(num_dof(model), dtype_of(model))
     for part, at in zip(model.parts, slices(model), strict=True):
         if isinstance(part.body, Rod):
@@ -410,14 +378,14 @@ def newton(residual: Residual, guess: Array, search: Search) -> Found:
 
         def half(trial):
             length = trial[0] / 2
-            return length, size(residual(moved(search.model, q, length * step)))
+            return length, size(residual(retract(search.model, q, length * step)))
 
         # A step of rounding is nothing but noise: it is taken as it is. Any other is tried
         # first as a whole; the loop holds the only trial, so that it is compiled once.
         begin = jnp.where(small, 1.0, 2.0).astype(q.dtype), jnp.where(small, 0, jnp.inf) + start
         length, value = jax.lax.while_loop(too_long, half, begin)
         good = value <= start
-        new = jnp.where(good, moved(search.model, q, length * step), q)
+        new = jnp.where(good, retract(search.model, q, length * step), q)
         return new, slope, small & good, ~good, jnp.isfinite(start), count + 1
 
     def searching(state):

@@ -20,7 +20,7 @@ from sorojax.math.compiled import jit_public
 from sorojax.math.implicit_root import implicit_root
 from sorojax.math.status import Status
 from sorojax.rod.forces.loads import Load
-from sorojax.rod.model.assembly import dtype_of, num_dof
+from sorojax.rod.model.assembly import dtype_of, increments, num_dof, retract
 from sorojax.rod.model.model import Model, motion, operators
 from sorojax.rod.model.rod import Rod
 from sorojax.rod.statics import reaching as answer
@@ -28,10 +28,8 @@ from sorojax.rod.statics.equilibrium import (
     Solution,
     checked_status,
     first_guess,
-    increments,
     linearised,
     metric,
-    moved,
 )
 from sorojax.rod.statics.reaching import Rows, Tasks, all_rows, pushed, rows, step
 from sorojax.rod.statics.targets import AbstractTarget, ObstacleConstraint
@@ -161,7 +159,7 @@ def _fixed(model, tasks: Tasks, at, q: Array, push, iterations: int):
         here = at(q)
         damping = (here.error @ here.error) / tasks.length**2
         move = step(tasks, increments(model, q), here, push, _DAMPING * damping, 1.0)
-        return moved(model, q, move.increment), pushed(here, push, move.increment)
+        return retract(model, q, move.increment), pushed(here, push, move.increment)
 
     q, push = jax.lax.fori_loop(0, iterations, improve, (q, push))
     still = step(tasks, increments(model, q), at(q), push, 0.0, 0.0)
@@ -192,7 +190,7 @@ def _search(model, tasks: Tasks, at, q: Array, push, accuracy, max_iterations: i
         q, push, here, damping, growth, gain, bent, _, count = state
         slope = jax.lax.cond(bent, curved, straight, q, push, here)
         move = step(tasks, increments(model, q), here, push, damping, gain, slope)
-        new_q = moved(model, q, move.increment)
+        new_q = retract(model, q, move.increment)
         new = at(new_q)
         start, value = merit(here, push), merit(new, push)
         promised = start - _promise(here, push, move.increment)
@@ -271,15 +269,8 @@ def _length(model: Model) -> Float[Array, ""]:
     """Length of the rods [m], one if there is none."""
     bodies = [model] if isinstance(model, Rod) else [part.body for part in model.parts]
     lengths = [body.length for body in bodies if isinstance(body, Rod)]
-    total = jnp.ones((), dtype_of(model)) if not lengths else max_of(lengths)
-    return jax.lax.stop_gradient(total)
-
-
-def max_of(values: list[Array]) -> Array:
-    largest = values[0]
-    for value in values[1:]:
-        largest = jnp.maximum(largest, value)
-    return largest
+    one = jnp.ones((), dtype_of(model))
+    return jax.lax.stop_gradient(functools.reduce(jnp.maximum, lengths) if lengths else one)
 
 
 def _limits(model: Model, limits, dtype):

@@ -21,7 +21,7 @@ from sorojax.math.host import tell
 from sorojax.math.implicit_root import implicit_root
 from sorojax.math.status import Status
 from sorojax.rod.forces.loads import Load, total_force
-from sorojax.rod.model.assembly import dtype_of
+from sorojax.rod.model.assembly import dtype_of, retract
 from sorojax.rod.model.model import Model, motion, operators
 from sorojax.rod.statics.equilibrium import (
     Search,
@@ -29,7 +29,6 @@ from sorojax.rod.statics.equilibrium import (
     ended,
     first_guess,
     linearised,
-    moved,
     negative_eigenvalues,
     newton,
     prepare,
@@ -263,20 +262,22 @@ def arc_length_path(
     direction = _unit(jnp.append(answer, 1.0), weights) * jnp.sign(first)
     begin = jnp.abs(first) * jnp.sqrt(jnp.asarray(2.0, dtype))
 
+    def bordered(slope, rate, normal):
+        return jnp.concatenate([jnp.append(slope, rate[:, None], axis=1), normal[None]])
+
     def correct(point: _Point, length):
         """The equilibrium on the plane across the path at `length`."""
         normal = weights @ point.direction
 
         def at(shift):
-            return moved(model, point.q, shift[:-1]), point.factor + shift[-1]
+            return retract(model, point.q, shift[:-1]), point.factor + shift[-1]
 
         def improve(state):
             shift, _, count = state
             value, slope, rate = tangent(*at(shift))
             # The tangent is taken at the shifted place; increments add up to first order.
-            matrix = jnp.concatenate([jnp.append(slope, rate[:, None], axis=1), normal[None]])
             gap = jnp.append(value, normal @ shift - length)
-            step = -jnp.linalg.solve(matrix, gap)
+            step = -jnp.linalg.solve(bordered(slope, rate, normal), gap)
             return shift + step, jnp.sqrt(step @ weights @ step), count + 1
 
         def searching(state):
@@ -302,9 +303,7 @@ def arc_length_path(
         q, factor, length, done, count = jax.lax.while_loop(going, attempt, state)
         q, factor = jnp.where(done, q, point.q), jnp.where(done, factor, point.factor)
         _, slope, rate = tangent(q, factor)
-        border = jnp.concatenate(
-            [jnp.append(slope, rate[:, None], axis=1), (weights @ point.direction)[None]]
-        )
+        border = bordered(slope, rate, weights @ point.direction)
         right = jnp.zeros_like(point.direction).at[-1].set(1.0)
         direction = _unit(jnp.linalg.solve(border, right), weights)
         length = jnp.where(count <= _EASY, 1.5 * length, length)

@@ -10,13 +10,13 @@ from jaxtyping import Array, Bool, Float
 from sorojax.math.implicit_root import matrix_of
 from sorojax.math.linalg.dense import product, solve_symmetric
 from sorojax.rod.dynamics.fields import RodState
-from sorojax.rod.dynamics.points import Points, points
+from sorojax.rod.dynamics.points import points
 from sorojax.rod.dynamics.tree import AssemblyState, part_columns, part_motion
 from sorojax.rod.forces.loads import Load, total_force
-from sorojax.rod.model.assembly import index_of
+from sorojax.rod.model.assembly import increments, index_of
 from sorojax.rod.model.link import LinkState
 from sorojax.rod.model.model import Model
-from sorojax.rod.statics.equilibrium import increments, squared
+from sorojax.rod.statics.equilibrium import squared
 from sorojax.rod.statics.targets import AbstractTarget, Frames, ObstacleConstraint
 
 _ROUNDING = 16  # units in the last place that a coordinate on its limit may be away
@@ -242,15 +242,12 @@ def _frames(
 
 
 def _sections(moment: RodState | LinkState, s: Array) -> Frames:
-    at = (
-        moment.base
-        if isinstance(moment, LinkState)
-        else points(moment, s.astype(moment.q.dtype))
-    )
-    if isinstance(at, Points):
-        return Frames(at.directors, at.position, at.angular_jacobian, at.linear_jacobian)
-    base = (at.directors, at.position, at.angular_jacobian, at.linear_jacobian)
-    return Frames(*(jnp.broadcast_to(x, (s.shape[0], *x.shape)) for x in base))
+    is_link = isinstance(moment, LinkState)
+    at: Any = moment.base if is_link else points(moment, s.astype(moment.q.dtype))
+    frames = Frames(at.directors, at.position, at.angular_jacobian, at.linear_jacobian)
+    if not is_link:
+        return frames
+    return Frames(*(jnp.broadcast_to(x, (s.shape[0], *x.shape)) for x in frames))
 
 
 def _stacked(pairs) -> tuple[Array, Array]:
@@ -293,8 +290,7 @@ def balanced(model: Model, tasks: Tasks, at, q: Array, push) -> Ends:
         across = jnp.concatenate([across, change])
     left = multipliers @ across + share * here.pull
     if tasks.limits is not None:
-        lower, upper = bound_to(tasks.limits, increments(model, q), left)
-        free = jnp.where(lower | upper, jnp.zeros_like(left), jnp.ones_like(left))
+        free = _free(tasks.limits, increments(model, q), left)
         left, across = free * left, free[None] * across
     # Directions that the targets hardly see have no say: out of reach they amplify noise.
     least = float(jnp.finfo(q.dtype).eps) ** 0.3

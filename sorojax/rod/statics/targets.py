@@ -12,6 +12,7 @@ from sorojax import _check
 from sorojax._types import real
 from sorojax.math.lie import SE2, SE3, logarithm_and_change
 from sorojax.math.linalg.dense import product
+from sorojax.rod.dynamics.moving import swept
 from sorojax.sdf.base import AbstractSdf
 
 Errors = tuple[Float[Array, " rows"], Float[Array, "rows dof"]]
@@ -125,7 +126,7 @@ class Direction(AbstractTarget):
         size = jnp.sqrt(jnp.sum(self.direction**2, axis=1, keepdims=True))
         axis, spin = frames.directors[:, :, 0], frames.angular_jacobian
         missing = self.length * (self.direction / size - axis)
-        return missing.reshape(-1), self.length * _flat(_swept(spin, axis))
+        return missing.reshape(-1), self.length * _flat(swept(spin, axis))
 
 
 class OnSurface(AbstractTarget):
@@ -171,14 +172,6 @@ class ObstacleConstraint(eqx.Module):
         gap, slope = jax.vmap(jax.value_and_grad(self.obstacle))(frames.position)
         change = jnp.sum(slope[:, :, None] * frames.linear_jacobian, axis=1)
         return gap - self.distance, change
-
-
-def _swept(spin: Float[Array, "points rot dof"], axis: Float[Array, "points dim"]) -> Array:
-    """spin x axis."""
-    if axis.shape[1] == 2:
-        turned = jnp.stack([-axis[:, 1], axis[:, 0]], axis=1)
-        return turned[:, :, None] * spin
-    return jnp.cross(spin, axis[:, :, None], axis=1)
 
 
 def _flat(jacobians: Float[Array, "points rows dof"]) -> Float[Array, "all dof"]:

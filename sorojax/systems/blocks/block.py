@@ -82,6 +82,16 @@ class AbstractBlock(eqx.Module):
         return None
 
 
+class AbstractStateless(AbstractBlock):
+    """A block without memory."""
+
+    def initial_state(self):
+        return {}
+
+    def vector_field(self, t, state, inputs):
+        return {}
+
+
 # Identical blocks as one: stacked and evaluated side by side, not written out
 
 
@@ -117,16 +127,12 @@ class Stack(AbstractBlock):
         return jax.vmap(lambda block: block.initial_state())(self.block)
 
     def output(self, name, t, state, inputs):
-        def one(block, state, inputs):
-            return block.output(name, t, state, inputs)
-
-        return jax.vmap(one)(self.block, state, dict(inputs))
+        each = jax.vmap(lambda block, x, u: block.output(name, t, x, u))
+        return each(self.block, state, dict(inputs))
 
     def vector_field(self, t, state, inputs):
-        def one(block, state, inputs):
-            return block.vector_field(t, state, inputs)
-
-        return jax.vmap(one)(self.block, state, dict(inputs))
+        each = jax.vmap(lambda block, x, u: block.vector_field(t, x, u))
+        return each(self.block, state, dict(inputs))
 
     def _one(self) -> AbstractBlock:
         """One of the blocks, for its ports: shapes in place of arrays."""
@@ -155,7 +161,7 @@ def _kind(block: AbstractBlock):
     return structure, tuple((jnp.shape(x), jnp.result_type(x)) for x in leaves)
 
 
-class Function(AbstractBlock):
+class Function(AbstractStateless):
     """value = function(a, b, ...) of its inputs, in the order of their names.
 
     Attributes:
@@ -180,14 +186,8 @@ class Function(AbstractBlock):
     def outputs(self):
         return {"value": Output(self.unit, self.shape, frozenset(self.ports))}
 
-    def initial_state(self):
-        return {}
-
     def output(self, name, t, state, inputs):
         return self.function(*(inputs[port] for port in self.ports))
-
-    def vector_field(self, t, state, inputs):
-        return {}
 
 
 class Weighted(eqx.Module):
@@ -245,7 +245,7 @@ class Lag(AbstractBlock):
         return (inputs["a"] - state) / self.time
 
 
-class Sensor(AbstractBlock):
+class Sensor(AbstractStateless):
     """A measurement with offset and white noise, sampled and held.
 
     The noise of a sample depends on `key` and on its number alone, so a run can be repeated,
@@ -277,17 +277,11 @@ class Sensor(AbstractBlock):
     def outputs(self):
         return {"value": Output(self.unit, self.shape, frozenset({"a"}))}
 
-    def initial_state(self):
-        return {}
-
     def output(self, name, t: Any, state, inputs):
         # half a millionth, so that a sample taken on time counts as its own
         number = jnp.floor(t / self.period + 5e-7).astype(jnp.uint32)
         draw = jax.random.normal(jax.random.fold_in(self.key, number), self.shape, t.dtype)
         return inputs["a"] + self.offset + self.noise * draw
-
-    def vector_field(self, t, state, inputs):
-        return {}
 
 
 # Signals of time, and the block that puts one on a wire
@@ -354,15 +348,10 @@ class SmoothRamp(AbstractReference):
         _check.positive("SmoothRamp", "diff(times)", rises, "s", "Sort the waypoints.")
 
     def __call__(self, t):
-        last = self.times.shape[0] - 1
-        right = jnp.clip(jnp.searchsorted(self.times, t), 1, last)
-        start, end = self.times[right - 1], self.times[right]
-        x = jnp.clip((t - start) / (end - start), 0, 1)
-        share = x**3 * (10 + x * (6 * x - 15))
-        return self.values[right - 1] + share * (self.values[right] - self.values[right - 1])
+        return _between(self.times, self.values, t, smooth=True)
 
 
-class Source(AbstractBlock):
+class Source(AbstractStateless):
     """Puts a reference on a wire, as output `value` in `unit`."""
 
     reference: AbstractReference
@@ -377,14 +366,8 @@ class Source(AbstractBlock):
         shape = eqx.filter_eval_shape(self.reference, jnp.zeros(())).shape
         return {"value": Output(self.unit, shape)}
 
-    def initial_state(self):
-        return {}
-
     def output(self, name, t, state, inputs):
         return self.reference(t)
-
-    def vector_field(self, t, state, inputs):
-        return {}
 
 
 # Paths through waypoints, of a point or of several signals at once
@@ -413,10 +396,14 @@ class Waypoints(AbstractReference):
             )
 
     def __call__(self, t):
-        last = self.times.shape[0] - 1
-        after = jnp.clip(jnp.searchsorted(self.times, t, side="right"), 1, last)
-        start, length = self.times[after - 1], self.times[after] - self.times[after - 1]
-        share = (t - start) / jnp.where(length > 0, length, jnp.ones_like(length))
-        share = jnp.where(length > 0, jnp.clip(share, 0, 1), jnp.ones_like(share))
-        share = share**3 * (10 + share * (6 * share - 15)) if self.smooth else share
-        return self.values[after - 1] + share * (self.values[after] - self.values[after - 1])
+        return _between(self.times, self.values, t, self.smooth)
+
+
+def _between(times: Array, values: Array, t: Float[Array, ""], smooth: bool) -> Array:
+    """Values at `t` on the way from waypoint to waypoint."""
+    after = jnp.clip(jnp.searchsorted(times, t, side="right"), 1, times.shape[0] - 1)
+    start, length = times[after - 1], times[after] - times[after - 1]
+    share = (t - start) / jnp.where(length > 0, length, jnp.ones_like(length))
+    share = jnp.where(length > 0, jnp.clip(share, 0, 1), jnp.ones_like(share))
+    share = share**3 * (10 + share * (6 * share - 15)) if smooth else share
+    return values[after - 1] + share * (values[after] - values[after - 1])

@@ -8,7 +8,7 @@ from sorojax import _check
 from sorojax._types import optional_real, real
 from sorojax.contact import Penalty
 from sorojax.contact.facet import contacts
-from sorojax.math.lie import rotation_columns
+from sorojax.math.lie import quaternion_rate, rotation_matrix
 from sorojax.sdf.base import AbstractSdf
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output
 
@@ -83,7 +83,7 @@ class RigidBody(AbstractBlock):
 
     def initial_state(self):
         quaternion = _unit(self.quaternion)
-        turn = _rotation(quaternion)
+        turn = rotation_matrix(quaternion)
         spin = turn @ (self.inertia * (turn.T @ self.angular_velocity))
         return {
             "q": jnp.concatenate([self.position, quaternion]),
@@ -112,19 +112,16 @@ class RigidBody(AbstractBlock):
         for each in self.touch:
             push, moment = self._pushed(each, q, omega, velocity)
             force, torque = force + push, torque + moment
-        turn = _quaternion_rate(omega, q[3:])
-        return {
-            "q": jnp.concatenate([velocity, turn]),
-            "p": jnp.concatenate([torque, force]),
-        }
+        turn = quaternion_rate(omega, q[3:])
+        return {"q": jnp.concatenate([velocity, turn]), "p": jnp.concatenate([torque, force])}
 
     def _velocities(self, q, p):
-        turn = _rotation(_unit(q[3:]))
+        turn = rotation_matrix(_unit(q[3:]))
         return turn @ ((turn.T @ p[:3]) / self.inertia), p[3:] / self.mass
 
     def _pushed(self, touch: Touch, q, omega, velocity):
         """Force and torque about the centre of mass of one set of contacts."""
-        arms = touch.points @ _rotation(_unit(q[3:])).T
+        arms = touch.points @ rotation_matrix(_unit(q[3:])).T
         found = contacts(touch.law, touch.obstacle, q[None, :3] + arms, touch.areas)
         speed = velocity[None] + jnp.cross(jnp.broadcast_to(omega, arms.shape), arms)
         closing = -jnp.sum(found.normal * speed, axis=1)
@@ -137,16 +134,3 @@ class RigidBody(AbstractBlock):
 
 def _unit(quaternion: Array) -> Array:
     return quaternion / jnp.sqrt(jnp.sum(quaternion**2))
-
-
-def _rotation(quaternion: Array) -> Array:
-    """Matrix from body to world."""
-    w, x, y, z = quaternion
-    return jnp.stack([jnp.stack(c) for c in rotation_columns((w, x, y, z))], axis=1)
-
-
-def _quaternion_rate(omega: Array, quaternion: Array) -> Array:
-    """Half the product of the angular velocity, in axes of the world, with the quaternion."""
-    scalar, vector = quaternion[0], quaternion[1:]
-    rate = scalar * omega + jnp.cross(omega, vector)
-    return jnp.concatenate([-(omega @ vector)[None], rate]) / 2

@@ -28,12 +28,13 @@ from sorojax.rod import (
     tip_pose,
     total_force,
 )
-from sorojax.rod.dynamics.dynamics import coordinate_rate
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.forces.loads import Load
-from sorojax.rod.model.assembly import index_of
+from sorojax.rod.model.assembly import index_of, rate
 from sorojax.rod.statics.equilibrium import checked_status
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output
+
+_FLUID = {"volume": "m^3", "volume_rate": "m^3/s", "compliance": "m^3/Pa"}
 
 
 class RodBody(AbstractBlock):
@@ -82,8 +83,7 @@ class RodBody(AbstractBlock):
         chamber = self._chamber()
         if chamber is not None:
             needs = frozenset({"pressure"})
-            units = {"volume": "m^3", "volume_rate": "m^3/s", "compliance": "m^3/Pa"}
-            ports |= {name: Output(unit, chamber.ports, needs) for name, unit in units.items()}
+            ports |= {name: Output(unit, chamber.ports, needs) for name, unit in _FLUID.items()}
         return ports
 
     def initial_state(self):
@@ -103,13 +103,7 @@ class RodBody(AbstractBlock):
             return tip_angle(motion(self.rod, q))
         chamber = self._chamber()
         assert chamber is not None
-        pressure = inputs["pressure"]
-        volume = jax.grad(chamber.coenergy, argnums=1)
-        if name == "compliance":
-            one = jnp.ones_like(pressure)
-            return jax.jvp(lambda p: volume(q, p), (pressure,), (one,))[1]
-        value, rate = jax.jvp(lambda q: volume(q, pressure), (q,), (v,))
-        return value if name == "volume" else rate
+        return _fluid(chamber, name, q, v, inputs["pressure"])
 
     def vector_field(self, t, state, inputs):
         moment = motion(self.rod, state["q"], state["v"])
@@ -144,9 +138,6 @@ def body_motion(body: RodBody, state) -> RodState:
 
 
 # An assembly as a block: pressures of its rods in, volumes, tips and joint efforts
-
-
-_FLUID = {"volume": "m^3", "volume_rate": "m^3/s", "compliance": "m^3/Pa"}
 
 
 class AssemblyBody(AbstractBlock):
@@ -222,7 +213,7 @@ class AssemblyBody(AbstractBlock):
     def vector_field(self, t, state, inputs):
         q, v, constants = state["q"], state["v"], operators(self.assembly)
         a = acceleration(self.assembly, constants, t, q, v, self.acting(inputs))
-        return {"q": coordinate_rate(self.assembly, q, v), "v": a}
+        return {"q": rate(self.assembly, q, v), "v": a}
 
     def path_status(self, path):
         return checked_status(Status.successful, self.assembly, path["q"])

@@ -124,9 +124,7 @@ class PID(AbstractController):
         limited, wanted = self._command(target, measurement, rate, state.integral)
         growth = self._growth(target - measurement, limited, wanted)
         memory = PIDMemory(
-            state.integral + elapsed * growth,
-            measurement - lag * decay,
-            state.time + elapsed,
+            state.integral + elapsed * growth, measurement - lag * decay, state.time + elapsed
         )
         return limited, memory
 

@@ -5,7 +5,7 @@ inputs `q` and `v`, output `effort`, for a body with `driven=True`.
 """
 
 import abc
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -27,17 +27,17 @@ from sorojax.rod import (
 )
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.rollout import Trajectory
-from sorojax.systems.blocks.block import AbstractReference, Input, Output
+from sorojax.systems.blocks.block import AbstractReference, AbstractStateless, Input, Output
 from sorojax.systems.control.controller import AbstractController
 
 Effort = Float[Array, " dof"]
 
 
-class AbstractLaw(AbstractController):
+class AbstractLaw(AbstractStateless, AbstractController):
     """A static law from (t, q, v) to an effort in the coordinates of a rod."""
 
-    if TYPE_CHECKING:  # fields that subclasses have, in their own order
-        rod: ClassVar[Rod]
+    rod: Rod
+    forces: tuple[AbstractForce, ...]
 
     @abc.abstractmethod
     def effort(self, t: Float[Array, ""], q: Effort, v: Effort) -> Effort:
@@ -53,14 +53,8 @@ class AbstractLaw(AbstractController):
         dof = (self.rod.basis.num_dof,)
         return {"effort": Output(None, dof, frozenset({"q", "v"}))}
 
-    def initial_state(self):
-        return {}
-
     def output(self, name, t, state, inputs):
         return self.effort(t, inputs["q"], inputs["v"])
-
-    def vector_field(self, t, state, inputs):
-        return {}
 
     def start(self, t, measurement):
         return ()
@@ -79,8 +73,6 @@ class ComputedTorque(AbstractLaw):
         derivative: K_d [1/s].
     """
 
-    rod: Rod
-    forces: tuple[AbstractForce, ...]
     reference: AbstractReference
     proportional: Float[Array, "..."] = eqx.field(converter=real)
     derivative: Float[Array, "..."] = eqx.field(converter=real)
@@ -102,8 +94,6 @@ class Compensation(AbstractLaw):
         proportional, derivative: Stiffness and damping in the coordinates.
     """
 
-    rod: Rod
-    forces: tuple[AbstractForce, ...]
     reference: AbstractReference
     proportional: Float[Array, "..."] = eqx.field(converter=real)
     derivative: Float[Array, "..."] = eqx.field(converter=real)
@@ -126,8 +116,6 @@ class EnergyShaping(AbstractLaw):
         damping: In the coordinates; a number, or a vector.
     """
 
-    rod: Rod
-    forces: tuple[AbstractForce, ...]
     potential: eqx.Module
     damping: Float[Array, "..."] = eqx.field(converter=real)
 
@@ -174,8 +162,6 @@ class CartesianImpedance(AbstractLaw):
         2024, eq. 32 and 33.
     """
 
-    rod: Rod
-    forces: tuple[AbstractForce, ...]
     reference: AbstractReference
     stiffness: Float[Array, "..."] = eqx.field(converter=real)
     damping: Float[Array, "..."] = eqx.field(converter=real)
@@ -211,8 +197,6 @@ class FeedForward(AbstractLaw):
         reference: Coordinates over time.
     """
 
-    rod: Rod
-    forces: tuple[AbstractForce, ...]
     reference: AbstractReference
 
     def effort(self, t, q, v):

@@ -15,12 +15,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import optional_real, real
 from sorojax.math.compiled import jit_public
 from sorojax.math.linalg.dense import product, solve_columns, solve_symmetric
 from sorojax.math.status import Status
 from sorojax.rod import Rod, inertia, motion, operators, total_force
 from sorojax.rod.dynamics.dynamics import Forces
+from sorojax.rod.dynamics.moving import swept
 from sorojax.rod.dynamics.points import points
 from sorojax.rod.forces.loads import damping_matrix, tangent_stiffness
 from sorojax.rod.model.assembly import num_dof
@@ -38,7 +39,7 @@ class Markers(eqx.Module):
     rod: Rod
     s: Float[Array, " markers"] = eqx.field(converter=real)
     offset: Float[Array, "markers dim"] | None = eqx.field(
-        converter=lambda x: None if x is None else real(x), default=None
+        converter=optional_real, default=None
     )
 
     def __check_init__(self):
@@ -129,14 +130,7 @@ def places(markers: Markers, moment) -> tuple[Array, Array]:
     if markers.offset is None:
         return at.position, at.linear_jacobian
     arm = jnp.einsum("mij,mj->mi", at.directors, markers.offset)
-    if markers.rod.group.space_dim == 2:
-        swept = jnp.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None] * at.angular_jacobian
-    else:
-        swept = jnp.cross(
-            jnp.swapaxes(at.angular_jacobian, 1, 2), arm[:, None], axisa=2, axisb=2
-        )
-        swept = jnp.swapaxes(swept, 1, 2)
-    return at.position + arm, at.linear_jacobian + swept
+    return at.position + arm, at.linear_jacobian + swept(at.angular_jacobian, arm)
 
 
 def root_mean_square(error: Float[Array, " rows"], count: Int[Array, ""]) -> Float[Array, ""]:

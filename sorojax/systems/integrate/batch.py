@@ -110,11 +110,6 @@ def simulate_batch(
 
 
 @eqx.filter_jit
-def _whole(run, designs) -> Trajectory:
-    return _two_passes(run, designs)
-
-
-@eqx.filter_jit
 def _shared(run, designs, devices) -> Trajectory:
     mesh = jax.sharding.Mesh(np.array(devices), ("members",))
     split, whole = jax.P("members"), jax.P()
@@ -174,6 +169,9 @@ def _two_passes(run, designs) -> Trajectory:
     motion = _still(motion)
     film = jax.vmap(lambda d, m: film_of(make(d), time, inputs, m))(designs, motion)
     return eqx.tree_at(lambda film: film.stats, film, film.stats | {"stiff": again})
+
+
+_whole = eqx.filter_jit(_two_passes)
 
 
 def _cap(go: Callable[[Any], Integration], designs: PyTree, most: int) -> Array:

@@ -13,7 +13,7 @@ from sorojax._types import real
 from sorojax.fem.dynamics.step import Interval, Matter, State, begin_step, end_step
 from sorojax.fem.equilibrium.jit import prepare_traced
 from sorojax.fem.equilibrium.linear import Prepared
-from sorojax.math.ode.explicit import AbstractMethod, MethodStep, RungeKutta4, repeat
+from sorojax.math.ode.explicit import AbstractMethod, MethodStep, RungeKutta4, repeated
 from sorojax.math.ode.step_control import cut
 from sorojax.systems.blocks.fem_body import FemBody, acceleration
 from sorojax.systems.integrate.fem_step import (
@@ -221,7 +221,7 @@ def _marched(now: _Given, u: Fields) -> dict[str, PyTree]:
         return rates_of(now.network, t, y, at_time(now.inputs, t), names)
 
     count = now.method.substeps
-    return repeat(now.method.rest, rate, now.t, start, now.h / count, count)
+    return repeated(now.method.rest, rate, now.t, start, now.h / count, count)[0]
 
 
 def _between(now: _Given, u: Fields, share) -> dict[str, PyTree]:

@@ -165,9 +165,7 @@ def _run(network, loops, state, before, inputs, period, first, settings) -> Traj
         # The call at the seam was made before; further passes of a tick keep its commands.
         called = ((tick == first) & (first > 0)) | ~opens
         memories, held = jax.lax.cond(
-            called,
-            lambda: (memories, held),
-            lambda: call(tick, t, walk.state, memories, held),
+            called, lambda: (memories, held), lambda: call(tick, t, walk.state, memories, held)
         )
         given = (method, network, {**inputs, **held}, t, walk.state, walk.memory)
         new = walk.after(move.taken(given, h), t + h)

@@ -175,11 +175,12 @@ def simulate(
     state, first = _start(state, resume)
     supplied = {k: v if callable(v) else real(v) for k, v in (inputs or {}).items()}
     interval = real(duration) / (save - 1)
+    memory = None if resume is None else resume.memory
     if step is None:
         control = Control(rtol, atol, max_step=max_step)
         options = {"max_steps": max_steps, "adjoint": adjoint, "progress": progress}
         if not events:
-            options["seam"] = _seam_of(resume)
+            options["seam"] = memory if isinstance(memory, Resume) else None
         watch = (events, max_events, dense)
         solver = Tsit5() if solver is None else solver
         film = _adaptive(
@@ -189,7 +190,7 @@ def simulate(
         method = _fixed_method(network, solver)
         substeps = _substeps(duration, save, step)
         plan = (save, method, substeps, progress)
-        memory = None if resume is None else _memory_of(resume)
+        memory = None if isinstance(memory, Resume) else memory
         film = _fixed(network, state, supplied, first, interval, plan, memory)
     failed = throw and not is_traced(film)
     if failed and not bool(film.status == Status.successful):
@@ -275,16 +276,6 @@ def _start(state: PyTree, resume: Trajectory | None) -> tuple:
     interval = resume.time[1] - resume.time[0]
     number = jnp.round(resume.time[-1] / interval).astype(jnp.int32)
     return last_state(resume), number
-
-
-def _seam_of(resume: Trajectory | None) -> Resume | None:
-    if resume is None or not isinstance(resume.memory, Resume):
-        return None
-    return resume.memory
-
-
-def _memory_of(resume: Trajectory) -> Any:
-    return None if isinstance(resume.memory, Resume) else resume.memory
 
 
 def _fixed_method(network: Network, solver) -> AbstractMethod:
