@@ -10,13 +10,14 @@ from jaxtyping import Array, Float
 
 from sorojax._types import real
 from sorojax.sdf.base import (
+    OUTSIDE,
     AbstractSdf,
     Box,
     Exactness,
     absolute,
-    check_lengths,
     minimum,
     ordered,
+    positive,
     root,
 )
 from sorojax.sdf.shapes.bars import segment_square
@@ -36,14 +37,11 @@ class AbstractSurfaceLattice(AbstractSdf):
     F is steepest and thicker elsewhere.
     """
 
-    period: Float[Array, ""] = eqx.field(converter=real)
-    thickness: Float[Array, ""] = eqx.field(converter=real)
+    period: Float[Array, ""] = eqx.field(converter=positive)
+    thickness: Float[Array, ""] = eqx.field(converter=positive)
     level: Float[Array, ""] = eqx.field(converter=real, default=0.0)
     bound: ClassVar[float]
     dim: ClassVar[int] = 3
-
-    def __check_init__(self):
-        check_lengths(self, "period", "thickness")
 
     @abc.abstractmethod
     def surface(self, x: Array, y: Array, z: Array) -> Array:
@@ -130,14 +128,11 @@ class AbstractBeamLattice(AbstractSdf):
     in which the nearest beam lies too; `beams` are those of the wedge over period/2.
     """
 
-    period: Float[Array, ""] = eqx.field(converter=real)
-    width: Float[Array, ""] = eqx.field(converter=real)
+    period: Float[Array, ""] = eqx.field(converter=positive)
+    width: Float[Array, ""] = eqx.field(converter=positive)
     beams: ClassVar[tuple]
     dim: ClassVar[int] = 3
-    exactness: ClassVar[Exactness] = Exactness(outside=True, inside=False)
-
-    def __check_init__(self):
-        check_lengths(self, "period", "width")
+    exactness: ClassVar[Exactness] = OUTSIDE
 
     def distance(self, x, y, z):
         half = self.period / 2
@@ -186,11 +181,10 @@ class VoronoiFoam(AbstractSdf):
     """Walls of `thickness` [m] between the cells of explicit `seeds` [m], in 2-D or 3-D."""
 
     seeds: Float[Array, "seeds dim"] = eqx.field(converter=real)
-    thickness: Float[Array, ""] = eqx.field(converter=real)
-    exactness: ClassVar[Exactness] = Exactness(outside=True, inside=False)
+    thickness: Float[Array, ""] = eqx.field(converter=positive)
+    exactness: ClassVar[Exactness] = OUTSIDE
 
     def __check_init__(self):
-        check_lengths(self, "thickness")
         size = jnp.shape(self.seeds)
         if len(size) != 2 or size[1] not in (2, 3) or size[0] < 2:
             raise ValueError(

@@ -4,7 +4,6 @@ grid and height maps.
 
 import functools
 import itertools
-import math
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -18,18 +17,18 @@ from sorojax import _check
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import Numbers, integers, real
 from sorojax.sdf.base import (
-    AbstractSdf,
+    AbstractByLevel,
     Box,
     Box as Bounds,
     Number,
     absolute,
-    check_lengths,
     clip,
     maximum,
     minimum,
     norm,
     number,
     ordered,
+    positive,
     segment_side,
     steepest,
 )
@@ -138,10 +137,7 @@ MOST_FACES = 20_000
 class Octahedron(AbstractSolidShape):
     """Regular octahedron with its corners on the axes at `radius` [m]."""
 
-    radius: Float[Array, ""] = eqx.field(converter=real)
-
-    def __check_init__(self):
-        check_lengths(self, "radius")
+    radius: Float[Array, ""] = eqx.field(converter=positive)
 
     def distance(self, x, y, z):
         p = absolute(x), absolute(y), absolute(z)
@@ -156,11 +152,8 @@ class Octahedron(AbstractSolidShape):
 class Pyramid(AbstractSolidShape):
     """Square pyramid: base of side `width` [m] at z = 0, tip at z = `height` [m]."""
 
-    width: Float[Array, ""] = eqx.field(converter=real)
-    height: Float[Array, ""] = eqx.field(converter=real)
-
-    def __check_init__(self):
-        check_lengths(self, "width", "height")
+    width: Float[Array, ""] = eqx.field(converter=positive)
+    height: Float[Array, ""] = eqx.field(converter=positive)
 
     def distance(self, x, y, z):
         half, zero = self.width / 2, jnp.zeros_like(self.width)
@@ -299,7 +292,7 @@ def interpolate(values: Array, place: tuple[Array, ...]) -> Array:
     return total
 
 
-class Sampled(AbstractSdf):
+class Sampled(AbstractByLevel):
     """Distances `values` [m] on a grid, interpolated linearly; `origin` is node (0, 0).
 
     Beyond the grid the distance to it is added.
@@ -340,9 +333,6 @@ class Sampled(AbstractSdf):
         beyond = norm(*(c - h for c, h in zip(place, held, strict=True)))
         return interpolate(self.values, place) + self.spacing * beyond
 
-    def bounding_box(self) -> Box:
-        return self.level_box(0.0)
-
     def level_box(self, level) -> Box:
         last = jnp.asarray(np.array(self.values.shape) - 1.0, self.origin.dtype)
         # Shapes that run over the edge of the grid go on beyond it.
@@ -381,7 +371,7 @@ def image(mask: Numbers, pixel: float, origin: Numbers | None = None) -> Sampled
     return Sampled(field, start - pixel, pixel)
 
 
-class HeightMap(AbstractSdf):
+class HeightMap(AbstractByLevel):
     """Everything below the surface z = `heights` [m] over a grid, held at its edges.
 
     The field is the height over the surface, with a Lipschitz constant above one.
@@ -414,13 +404,7 @@ class HeightMap(AbstractSdf):
         place = tuple((c - self.origin[i]) / self.spacing[i] for i, c in enumerate((x, y)))
         return z - interpolate(self.heights, place)
 
-    def bounding_box(self) -> Box:
-        return self.level_box(0.0)
-
     def level_box(self, level) -> Box:
         top = jnp.max(self.heights) + level
-        infinity = jnp.full_like(top, math.inf)
-        return (
-            jnp.stack([-infinity, -infinity, -infinity]),
-            jnp.stack([infinity, infinity, top]),
-        )
+        infinity = jnp.full((3,), jnp.inf, top.dtype)
+        return -infinity, infinity.at[2].set(top)
