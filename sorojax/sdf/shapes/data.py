@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from sorojax import _check
 from sorojax._jax.trace_state import is_traced
@@ -40,6 +40,7 @@ from sorojax.sdf.trimesh.cells import Vector, solid_angle, triangle_side, triang
 from sorojax.sdf.trimesh.tree import TriangleTree, triangle_tree
 
 _SIZE = 64.0
+_ON_SURFACE = 16  # of rounding: points that near to the surface are on it
 
 
 class Outlines(AbstractPlaneShape):
@@ -62,15 +63,34 @@ class Outlines(AbstractPlaneShape):
             )
 
     def distance(self, x, y):
-        following = np.arange(1, self.vertices.shape[0] + 1)
-        following[np.array([*self.starts[1:], len(following)]) - 1] = self.starts
-        table = (self.vertices, self.vertices[following])
+        table = self._edges()
         square, cross = lambda row, *x: segment_square(x, *row), _crossing
         index, crossings = scan_rows(square, table, (x, y), cross)
         inside = jnp.round(crossings) % 2 == 1
         side = segment_side(x, y, *take(table, index))
-        outward = jnp.where(jax.lax.stop_gradient(side) < 0, inside, ~inside)
+        found, corners = jax.lax.stop_gradient((side, self.vertices))
+        outward = jnp.where(found < 0, inside, ~inside)
+        # On an edge rounding decides the sign, but not on which side the inside lies.
+        tiny = _ON_SURFACE * float(jnp.finfo(found.dtype).eps) * jnp.max(absolute(corners))
+        outward = jnp.where(absolute(found) <= tiny, ~self._inside_on_left()[index], outward)
         return jnp.where(outward, side, -side)
+
+    def _edges(self) -> tuple[Array, Array]:
+        """Corners (corners, 2) at which edges begin and end."""
+        following = np.arange(1, self.vertices.shape[0] + 1)
+        following[np.array([*self.starts[1:], len(following)]) - 1] = self.starts
+        return self.vertices, self.vertices[following]
+
+    def _inside_on_left(self) -> Bool[Array, " corners"]:
+        """Whether the inside lies on the left of each edge: by the sense of its outline, and
+        how many others that is within."""
+        a, b = jax.lax.stop_gradient(self._edges())
+        count = len(self.starts)
+        owner = np.repeat(np.arange(count), np.diff([*self.starts, len(a)]))
+        area = jnp.zeros(count, a.dtype).at[owner].add(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+        crossed = _crossing((a.T[..., None], b.T[..., None]), *a[np.array(self.starts)].T)
+        around = jnp.sum(jnp.where(owner[:, None] == np.arange(count), 0, crossed), axis=0)
+        return ((area > 0) == (jnp.round(around) % 2 == 0))[owner]
 
     def bounding_box(self) -> Box:
         return jnp.min(self.vertices, axis=0), jnp.max(self.vertices, axis=0)
@@ -178,9 +198,6 @@ class Pyramid(AbstractSolidShape):
 def _smaller(base: Array, flank: Array) -> Array:
     # Below the base the flank may be seen from behind: only its size counts there.
     return minimum(base, absolute(flank))
-
-
-_ON_SURFACE = 16  # of rounding: points that near to the surface are on it
 
 
 class TriangleMesh(AbstractSolidShape):

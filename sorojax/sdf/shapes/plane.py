@@ -33,36 +33,31 @@ from sorojax.sdf.base import (
 from sorojax.sdf.shapes.bars import AbstractHalf, check_places
 
 
-def touching_edges(vertices: np.ndarray) -> tuple[int, int] | None:
-    """Two edges of a closed polygon that meet away from a shared corner, or None."""
-    a, b = vertices, np.roll(vertices, -1, axis=0)
-    count = len(a)
+def touching_edges(*loops: np.ndarray) -> tuple[int, int] | None:
+    """Two edges of closed polygons that meet away from a shared corner, or None; edges are
+    numbered from loop to loop."""
+    a = np.concatenate(loops)
+    starts = np.cumsum([0, *map(len, loops[:-1])])
+    rows = [start + np.arange(len(loop)) for start, loop in zip(starts, loops, strict=True)]
+    after = np.concatenate([np.roll(row, -1) for row in rows])
+    b, way = a[after], a[after] - a
     lower, upper = np.minimum(a, b), np.maximum(a, b)
-    for i in range(count):
-        later = np.arange(i + 1, count)
-        near = np.all((lower[later] <= upper[i]) & (upper[later] >= lower[i]), axis=1)
-        for j in later[near]:
-            if _meet(a[i], b[i], a[j], b[j], next_to=j == i + 1 or (i == 0 and j == count - 1)):
-                return i, int(j)
+    for i in range(len(a)):
+        later = np.arange(i + 1, len(a))
+        j = later[np.all((lower[later] <= upper[i]) & (upper[later] >= lower[i]), axis=1)]
+        mine = _cross(way[i], a[j] - a[i]) * _cross(way[i], b[j] - a[i])
+        other = _cross(way[j], a[i] - a[j]) * _cross(way[j], b[i] - a[j])
+        # Neighbours share a corner; they touch elsewhere where one folds back on the other.
+        back = (_cross(way[i], way[j]) == 0) & (way[j] @ way[i] < 0)
+        next_to = (j == after[i]) | (after[j] == i)
+        touching = j[np.where(next_to, back, (mine <= 0) & (other <= 0))]
+        if len(touching):
+            return i, int(touching[0])
     return None
 
 
-def _meet(a, b, c, d, next_to: bool) -> bool:
-    if next_to:
-        # Neighbours share a corner; they touch elsewhere where one folds back on the other.
-        first, second = b - a, d - c
-        return abs(_cross(first, second)) == 0 and first @ second < 0
-    sides = (
-        _cross(b - a, c - a),
-        _cross(b - a, d - a),
-        _cross(d - c, a - c),
-        _cross(d - c, b - c),
-    )
-    return sides[0] * sides[1] <= 0 and sides[2] * sides[3] <= 0
-
-
-def _cross(u, v) -> float:
-    return float(u[0] * v[1] - u[1] * v[0])
+def _cross(u, v) -> np.ndarray:
+    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
 # Plane shapes; every field here is the exact distance
