@@ -237,9 +237,7 @@ def clip(a: Scalar, low: Scalar | float, high: Scalar | float) -> Scalar:
 
 def box_distance(*excess: Scalar) -> Scalar:
     """Distance to a box from the coordinates less its half sides."""
-    largest = excess[0]
-    for e in excess[1:]:
-        largest = maximum(largest, e)
+    largest = functools.reduce(maximum, excess)
     inner = minimum(largest, jnp.zeros_like(largest))
     return inner + norm(*(positive_part(e) for e in excess))
 

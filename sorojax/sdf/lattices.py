@@ -1,10 +1,12 @@
 """Periodic lattices that fill space: cut a solid out of them with `&`."""
 
 import abc
+import functools
 import math
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -24,12 +26,15 @@ from sorojax.sdf.shapes.bars import segment_square
 from sorojax.sdf.shapes.curves import nearest, take
 
 
-def _everywhere(like: Array) -> Box:
-    infinity = jnp.full((3,), jnp.inf, like.dtype)
-    return -infinity, infinity
+class AbstractLattice(AbstractSdf):
+    """A shape that fills space."""
+
+    def bounding_box(self) -> Box:
+        infinity = jnp.full((self.dim,), jnp.inf, jnp.result_type(*jax.tree.leaves(self)))
+        return -infinity, infinity
 
 
-class AbstractSurfaceLattice(AbstractSdf):
+class AbstractSurfaceLattice(AbstractLattice):
     """A wall along the surface F(phase) = `level`, F periodic in x, y, z.
 
     The field is |F - level| / (bound * 2 pi / period) - thickness / 2, where `bound`
@@ -51,9 +56,6 @@ class AbstractSurfaceLattice(AbstractSdf):
         w = 2 * math.pi / self.period
         value = self.surface(w * x, w * y, w * z) - self.level
         return absolute(value) / (self.bound * w) - self.thickness / 2
-
-    def bounding_box(self) -> Box:
-        return _everywhere(self.period)
 
 
 class Gyroid(AbstractSurfaceLattice):
@@ -121,7 +123,7 @@ class Iwp(AbstractSurfaceLattice):
         return 2 * (a * b + b * c + c * a) - doubled
 
 
-class AbstractBeamLattice(AbstractSdf):
+class AbstractBeamLattice(AbstractLattice):
     """Round beams of `width` [m] in cubic cells of `period` [m], a node at the origin.
 
     Mirror planes of the lattice fold space onto the wedge 0 <= z <= y <= x <= period/2,
@@ -143,17 +145,9 @@ class AbstractBeamLattice(AbstractSdf):
         middle, high = ordered(high, p[2])
         low, middle = ordered(low, middle)
         p = high, middle, low
-        squares = [segment_square(p, *self._ends(beam, x)) for beam in self.beams]
-        best = squares[0]
-        for square in squares[1:]:
-            best = minimum(best, square)
-        return half * root(best) - self.width / 2
-
-    def _ends(self, beam, x):
-        return tuple(tuple(jnp.asarray(c, x.dtype) for c in end) for end in beam)
-
-    def bounding_box(self) -> Box:
-        return _everywhere(self.period)
+        beams = jnp.asarray(self.beams, x.dtype)
+        squares = (segment_square(p, tuple(a), tuple(b)) for a, b in beams)
+        return half * root(functools.reduce(minimum, squares)) - self.width / 2
 
 
 class BccLattice(AbstractBeamLattice):
@@ -177,7 +171,7 @@ class KelvinLattice(AbstractBeamLattice):
     )
 
 
-class VoronoiFoam(AbstractSdf):
+class VoronoiFoam(AbstractLattice):
     """Walls of `thickness` [m] between the cells of explicit `seeds` [m], in 2-D or 3-D."""
 
     seeds: Float[Array, "seeds dim"] = eqx.field(converter=real)
@@ -201,10 +195,6 @@ class VoronoiFoam(AbstractSdf):
         (own,) = take(table, nearest(lambda row, *x: _square(x, row[0]), table, x))
         (other,) = take(table, nearest(lambda row, *x: _wall(x, own, row[0]), table, x))
         return _wall(x, own, other) - self.thickness / 2
-
-    def bounding_box(self) -> Box:
-        infinity = jnp.full((self.dim,), jnp.inf, self.seeds.dtype)
-        return -infinity, infinity
 
 
 def _square(x: tuple[Array, ...], seed) -> Array:

@@ -44,16 +44,20 @@ def over(p: Vector, a: Vector, b: Vector, c: Vector, slack: float = 0.0) -> tupl
 def triangle_square(p: Vector, a: Vector, b: Vector, c: Vector) -> Array:
     """Square of the distance to a triangle [m^2]."""
     height, within = over(p, a, b, c)
+    return jnp.where(within, height * height, _edge_square(p, a, b, c))
+
+
+def _edge_square(p: Vector, a: Vector, b: Vector, c: Vector) -> Array:
+    """Square of the distance to the edges of a triangle [m^2]."""
     edges = [segment_square(p, *ends) for ends in ((a, b), (b, c), (c, a))]
-    return jnp.where(within, height * height, minimum(edges[0], minimum(edges[1], edges[2])))
+    return minimum(edges[0], minimum(edges[1], edges[2]))
 
 
 def triangle_side(p: Vector, a: Vector, b: Vector, c: Vector, inside: Array) -> Array:
     """Signed distance to the nearest triangle; over its face it has a slope at zero too, and
     on an edge that of one of the faces beside it."""
     height, within = over(p, a, b, c, _ON_EDGE * float(jnp.finfo(p[0].dtype).eps))
-    edges = [segment_square(p, *ends) for ends in ((a, b), (b, c), (c, a))]
-    far = root(minimum(edges[0], minimum(edges[1], edges[2])))
+    far = root(_edge_square(p, a, b, c))
     return jnp.where(within, height, jnp.where(inside, -far, far))
 
 
