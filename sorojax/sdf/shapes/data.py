@@ -88,7 +88,8 @@ class Outlines(AbstractPlaneShape):
         count = len(self.starts)
         owner = np.repeat(np.arange(count), np.diff([*self.starts, len(a)]))
         area = jnp.zeros(count, a.dtype).at[owner].add(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-        crossed = _crossing((a.T[..., None], b.T[..., None]), *a[np.array(self.starts)].T)
+        firsts = a[np.array(self.starts)].T[:, None]
+        crossed = _crossing((a.T[..., None], b.T[..., None]), *firsts)
         around = jnp.sum(jnp.where(owner[:, None] == np.arange(count), 0, crossed), axis=0)
         return ((area > 0) == (jnp.round(around) % 2 == 0))[owner]
 
