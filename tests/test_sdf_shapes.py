@@ -180,6 +180,16 @@ def test_lattice_slope_climbs_to_its_bound(lattice):
     assert 0.98 < top / lattice.bound < 1 + 1e-9
 
 
+@pytest.mark.parametrize("sense", [1, -1])
+def test_gradient_on_an_outline_points_out(sense):
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])[::sense]
+    frame = sdf.outlines([square, 0.25 + square[::-1] / 2, 0.4 + square / 5])
+    sides = np.array([[0.5, 0.0], [1.0, 0.5], [0.5, 1.0], [0.0, 0.5]])
+    out = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+    for place, way in ((sides, out), (0.25 + sides / 2, -out), (0.4 + sides / 5, out)):
+        assert np.allclose(sdf.gradient(frame, jnp.asarray(place)), way)
+
+
 def test_one_outline_is_a_shape():
     square = sdf.outlines([np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])])
     assert np.isclose(square(jnp.array([0.5, 0.4])), -0.4)

@@ -24,6 +24,7 @@ from sorojax.mesh.elements.base import (
 from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.elements.polynomials import traced_shape_functions
 from sorojax.mesh.mesh import Mesh
+from sorojax.sdf.surface.marching import cross
 
 
 def cell_areas(mesh: Mesh) -> Float[Array, " cells"]:
@@ -113,14 +114,10 @@ def _under(ends) -> Float[Array, " sides"]:
     """Area between sides and the origin: x dy/2, with two thirds of chord times height
     for the parabola over a chord."""
     a, b = ends[0], ends[1]
-    area = _cross(a, b) / 2
+    area = cross(a, b) / 2
     if len(ends) == 3:
-        area = area + 2 / 3 * _cross(ends[2] - (a + b) / 2, b - a)
+        area = area + 2 / 3 * cross(ends[2] - (a + b) / 2, b - a)
     return area
-
-
-def _cross(a: Float[Array, "cells 2"], b: Float[Array, "cells 2"]) -> Float[Array, " cells"]:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 # Where points lie in a mesh, and what nodal fields are there

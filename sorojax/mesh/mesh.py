@@ -142,6 +142,18 @@ def with_side_nodes(
     return np.concatenate([points, middles]), np.concatenate([cells, columns], axis=1)
 
 
+def nodes_between(
+    cells: np.ndarray, element: AbstractElement, ends: np.ndarray
+) -> Int[np.ndarray, "..."]:
+    """Mid-side nodes of `cells` of a quadratic element between corners `ends` (.., 2)."""
+    sides, n = side_ends(element), np.int64(cells.max() + 1)
+    pairs = np.sort(np.concatenate([cells[:, list(s)] for s in sides]), axis=1)
+    middles = cells[:, element.num_corners :][:, : len(sides)].T.ravel()
+    order = np.argsort(pairs @ [n, 1])
+    place = np.searchsorted((pairs @ [n, 1])[order], np.sort(ends, axis=-1) @ [n, 1])
+    return middles[order][place]
+
+
 # Several bodies as one mesh
 
 

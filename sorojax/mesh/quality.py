@@ -12,7 +12,7 @@ from sorojax.mesh.measure import cell_areas as cell_areas, cell_volumes
 from sorojax.mesh.mesh import Mesh, boundary_facets, facet_table, valences
 from sorojax.mesh.solid.lattice import dihedral_cosines, radius_ratios
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.measure.moments import area
+from sorojax.sdf.measure.moments import area, volume
 
 _WORST = 8  # cells that are named
 _CUBE = ((1, 3, 4), (2, 0, 5), (3, 1, 6), (0, 2, 7), (7, 5, 0), (4, 6, 1), (5, 7, 2), (6, 4, 3))
@@ -73,7 +73,7 @@ def quality(mesh: Mesh, shape: AbstractSdf | None = None) -> Quality:
     ratio = np.where(parts > 0, ratio, 0.0)
     error = None
     if shape is not None:
-        error = total / float(area(shape) if plane else _volume(shape)) - 1
+        error = total / float(area(shape) if plane else volume(shape)) - 1
     tenths = np.histogram(ratio, bins=10, range=(0, 1 + 1e-9))[0]
     return Quality(
         low,
@@ -88,12 +88,6 @@ def quality(mesh: Mesh, shape: AbstractSdf | None = None) -> Quality:
         tuple(np.argsort(ratio, kind="stable")[:_WORST].tolist()),
         tuple(inverted.tolist()),
     )
-
-
-def _volume(shape: AbstractSdf):
-    from sorojax.sdf.measure.moments import volume
-
-    return volume(shape)
 
 
 def cell_ratios(mesh: Mesh) -> np.ndarray:
@@ -170,16 +164,7 @@ _SIMPLICES = {
     3: ((0, 1, 2),),
     (2, 4): ((0, 1, 3), (1, 2, 0), (2, 3, 1), (3, 0, 2)),
     (3, 4): ((0, 1, 2, 3),),
-    8: (
-        (0, 1, 3, 4),
-        (1, 2, 0, 5),
-        (2, 3, 1, 6),
-        (3, 0, 2, 7),
-        (4, 7, 5, 0),
-        (5, 4, 6, 1),
-        (6, 5, 7, 2),
-        (7, 6, 4, 3),
-    ),
+    8: tuple((corner, *others) for corner, others in enumerate(_CUBE)),
 }
 
 

@@ -8,7 +8,7 @@ from sorojax.math.host import KDTree
 from sorojax.mesh.plane.outline import Outline
 from sorojax.mesh.sizes import Sizes
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.sampling import CHUNK, land, values, values_and_gradients
+from sorojax.sdf.sampling import CHUNK, land, normals, unit, values, values_and_gradients
 
 _THIN = 0.25  # of the size: least thickness of a wall of a solid
 _FACING = -0.9  # cosine between the normals on both sides of a wall
@@ -39,12 +39,11 @@ def check_walls(where: str, shape: AbstractSdf, points, facets, size: Sizes) -> 
     """
     x = points[facets]
     middle = land(shape, x.mean(axis=1), 1)
-    n = np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])
-    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-300)
+    n = unit(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]))
     length = size(middle)
     f, g = values_and_gradients(shape, middle - 0.5 * _THIN * length[:, None] * n)
-    g /= np.maximum(np.linalg.norm(g, axis=1, keepdims=True), 1e-9)
-    thin = np.flatnonzero(((g * n).sum(axis=1) < _FACING) & (np.abs(f) < 0.5 * _THIN * length))
+    facing = (unit(g) * n).sum(axis=1) < _FACING
+    thin = np.flatnonzero(facing & (np.abs(f) < 0.5 * _THIN * length))
     if len(thin):
         # beside a chamfer the place may belong to another side: rays tell
         worst = thin[np.argsort(-f[thin] / length[thin])][:_PLACES]
@@ -162,8 +161,7 @@ def thinnest(shape: AbstractSdf, places: np.ndarray, reach: float):
     share = f[row, way, step] / (f[row, way, step] - f[row, way, step + 1])
     far = steps[step] + share * (steps[step + 1] - steps[step])
     hit = places[row] + far[:, None] * ways[way]
-    g = values_and_gradients(shape, hit)[1]
-    g /= np.maximum(np.linalg.norm(g, axis=1, keepdims=True), 1e-12)
+    g = normals(shape, hit)
     same = (row[1:] == row[:-1]) & (way[1:] == way[:-1])
     facing = np.flatnonzero(same & ((g[1:] * g[:-1]).sum(axis=1) < _OPPOSED))
     thick, middle = np.diff(far)[facing], (hit[:-1] + hit[1:])[facing] / 2

@@ -1,6 +1,7 @@
 """Nodes, cells and facets of a mesh chosen by place; all results are host arrays."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ from sorojax.mesh.elements.base import facet_corners
 from sorojax.mesh.measure import enclosed_volume
 from sorojax.mesh.mesh import Mesh, boundary_facets, facet_table
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.sampling import values
+from sorojax.sdf.sampling import connected, values
 
 Predicate = Callable[[Any], Any]
 Nodes = Int[np.ndarray, " nodes"]
@@ -155,9 +156,6 @@ def cells_connected(mesh: Mesh, start: Float[np.ndarray, " dim"], walls: Numbers
         start: A point in the part that is wanted.
         walls: Facets, as node numbers, that stop the flood: for example an interface.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     facets, _, _, number = facet_table(mesh)
     order = np.argsort(number, kind="stable")
     same = number[order][1:] == number[order][:-1]
@@ -169,9 +167,7 @@ def cells_connected(mesh: Mesh, start: Float[np.ndarray, " dim"], walls: Numbers
         corners = np.sort(facets[first][:, :count], axis=1).tolist()
         free = np.array([tuple(c) not in barred for c in corners], dtype=bool)
         first, second = first[free], second[free]
-    n = mesh.num_cells
-    graph = coo_matrix((np.ones(len(first)), (first % n, second % n)), shape=(n, n))
-    label = connected_components(graph, directed=False)[1]
+    label = connected(mesh.num_cells, first % mesh.num_cells, second % mesh.num_cells)
     centres = np.asarray(mesh.points)[np.asarray(mesh.cells)].mean(axis=1)
     home = int(np.argmin(((centres - np.asarray(start, float)) ** 2).sum(axis=1)))
     return np.flatnonzero(label == label[home])
@@ -218,15 +214,10 @@ class Chambers(NamedTuple):
 
 def boundary_loops(mesh: Mesh) -> list[Int[np.ndarray, "facets facet_nodes"]]:
     """Connected pieces of the boundary; in the plane in order along each loop."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     facets = boundary_facets(mesh)
     corners = facets[:, : facet_corners(mesh.element)]
     rows = np.repeat(corners[:, 0], corners.shape[1] - 1)
-    pattern = (np.ones(len(rows)), (rows, corners[:, 1:].ravel()))
-    graph = coo_matrix(pattern, shape=(mesh.num_nodes, mesh.num_nodes))
-    label = connected_components(graph, directed=False)[1][corners[:, 0]]
+    label = connected(mesh.num_nodes, rows, corners[:, 1:].ravel())[corners[:, 0]]
     pieces = [facets[label == k] for k in np.unique(label)]
     return [_in_order(p) for p in pieces] if mesh.element.dim == 2 else pieces
 
@@ -258,12 +249,4 @@ def chambers(mesh: Mesh) -> Chambers:
     names = [f"chamber_{i}" for i in range(len(found))]
     sets = {name: loop for name, (_, _, loop) in zip(names, found, strict=True)}
     volumes = {name: volume for name, (_, volume, _) in zip(names, found, strict=True)}
-    named = Mesh(
-        mesh.points,
-        mesh.cells,
-        mesh.element,
-        mesh.node_sets,
-        mesh.facet_sets | sets,
-        mesh.regions,
-    )
-    return Chambers(named, volumes)
+    return Chambers(replace(mesh, facet_sets=mesh.facet_sets | sets), volumes)

@@ -1,7 +1,7 @@
 """Regular meshes of boxes."""
 
 from collections.abc import Sequence
-from itertools import permutations
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from sorojax.mesh.elements.tensor import AbstractHypercube, Hex8, Quad4
 from sorojax.mesh.enrich import enrich
 from sorojax.mesh.mesh import Mesh, boundary_facets, with_side_nodes
 from sorojax.mesh.solid.lattice import signed_volumes, wedge
+from sorojax.sdf.measure.simplices import kuhn
 
 
 def rectangle(
@@ -116,11 +117,12 @@ def box(
     points = _grid(lower, upper, divisions)
     corner = _cube_corners(divisions)
     if element.num_corners == 8:
-        order = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
-        order += [(i, j, 1) for i, j, _ in order]
-        cells = np.stack([corner[c] for c in order], axis=1)
+        cells = np.stack([corner[c] for c in (0, 4, 6, 2, 1, 5, 7, 3)], axis=1)
     else:
-        cells = np.concatenate([_kuhn(corner, axes) for axes in permutations(range(3))])
+        paths = kuhn(3)
+        odd = [1, 2, 5]  # orders of the axes that turn the tetrahedron over
+        paths[odd] = paths[odd][:, [0, 2, 1, 3]]
+        cells = np.concatenate([np.stack(corner, axis=1)[:, path] for path in paths])
     if element.order == 2:
         points, cells = with_side_nodes(points, cells, element)
     names = (("left", "right"), ("front", "back"), ("bottom", "top"))
@@ -164,7 +166,7 @@ def _with_sides(mesh: Mesh, lower, upper, names, node_sets) -> Mesh:
             on = np.abs(points[:, axis] - place[axis]) <= 1e-9 * (upper - lower)[axis]
             node_sets[name] = np.flatnonzero(on)
             facet_sets[name] = facets[on[facets].all(axis=1)]
-    return Mesh(mesh.points, mesh.cells, mesh.element, node_sets, facet_sets)
+    return replace(mesh, node_sets=node_sets, facet_sets=facet_sets)
 
 
 def _quads(nx: int, ny: int) -> np.ndarray:
@@ -182,23 +184,12 @@ def _split_grid(nx: int, ny: int) -> np.ndarray:
     return np.concatenate([first, second])
 
 
-def _cube_corners(divisions) -> dict[tuple[int, int, int], np.ndarray]:
-    """Node numbers of the eight corners of every grid cell."""
+def _cube_corners(divisions) -> list[np.ndarray]:
+    """Node numbers of the eight corners of every grid cell, x slowest."""
     base = np.stack(np.meshgrid(*map(np.arange, divisions), indexing="ij"), -1).reshape(-1, 3)
     counts = tuple(n + 1 for n in divisions)
-    offsets = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-    return {o: np.asarray(np.ravel_multi_index(tuple((base + o).T), counts)) for o in offsets}
-
-
-def _kuhn(corner, axes: tuple[int, ...]) -> np.ndarray:
-    """The tetrahedron along one order of axes: neighbours match, diagonals are parallel."""
-    place, path = [0, 0, 0], [corner[0, 0, 0]]
-    for axis in axes:
-        place[axis] = 1
-        path.append(corner[tuple(place)])
-    if axes in ((0, 2, 1), (1, 0, 2), (2, 1, 0)):  # odd
-        path[1], path[2] = path[2], path[1]
-    return np.stack(path, axis=1)
+    places = (tuple((base + o).T) for o in np.ndindex(2, 2, 2))
+    return [np.asarray(np.ravel_multi_index(place, counts)) for place in places]
 
 
 # Cells between given lines, and a mesh without some of its cells
@@ -241,16 +232,14 @@ def submesh(mesh: Mesh, cells: Int[np.ndarray, " kept"]) -> Mesh:
     if not len(chosen):
         raise ValueError("mesh.submesh: got no cells, need one or more.")
     used, inverse = np.unique(np.asarray(mesh.cells)[chosen], return_inverse=True)
-    node_sets = {
-        name: np.flatnonzero(np.isin(used, np.asarray(ids)))
-        for name, ids in mesh.node_sets.items()
-    }
-    regions = {
-        name: np.flatnonzero(np.isin(chosen, np.asarray(ids)))
-        for name, ids in mesh.regions.items()
-    }
+    node_sets, regions = _left_of(mesh.node_sets, used), _left_of(mesh.regions, chosen)
     points = np.asarray(mesh.points)[used]
     return Mesh(points, inverse.reshape(len(chosen), -1), mesh.element, node_sets, {}, regions)
+
+
+def _left_of(sets: dict, kept: np.ndarray) -> dict[str, np.ndarray]:
+    """Which of the `kept` numbers are in each set, by their places."""
+    return {name: np.flatnonzero(np.isin(kept, np.asarray(ids))) for name, ids in sets.items()}
 
 
 # Solid meshes from plane ones: extruded, revolved, swept along frames
@@ -378,10 +367,6 @@ def _prisms(points, low, high) -> np.ndarray:
 
 def _carry_sets(mesh: Mesh, solid: Mesh, station, base, stations: int, closed: bool) -> Mesh:
     facets = boundary_facets(solid)
-    node_sets = {
-        name: np.flatnonzero(np.isin(base, np.asarray(ids)))
-        for name, ids in mesh.node_sets.items()
-    }
     roots = base[facets]
     low, high = roots.min(axis=1), roots.max(axis=1)
     # A side facet stands on two nodes of one edge; a cap has three or four.
@@ -396,7 +381,7 @@ def _carry_sets(mesh: Mesh, solid: Mesh, station, base, stations: int, closed: b
         for name, place in (("start", 0), ("end", stations - 1)):
             facet_sets[name] = facets[~side & (station[facets].max(axis=1) == place)]
     facet_sets["boundary"] = facets
-    return Mesh(solid.points, solid.cells, solid.element, node_sets, facet_sets)
+    return replace(solid, node_sets=_left_of(mesh.node_sets, base), facet_sets=facet_sets)
 
 
 # A mesh and its mirror image as one mesh, node for node the same on both sides

@@ -11,7 +11,7 @@ import abc
 import functools
 import math
 from dataclasses import fields
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -34,6 +34,7 @@ class Exactness(NamedTuple):
 
 
 EXACT = Exactness(outside=True, inside=True)
+OUTSIDE = Exactness(outside=True, inside=False)
 BOUND = Exactness(outside=False, inside=False)
 
 
@@ -50,10 +51,7 @@ class AbstractSdf(eqx.Module):
     """
 
     def __check_init__(self):
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if eqx.is_inexact_array(value):
-                _check.finite(type(self).__name__, field.name, value, "Give real numbers.")
+        check_numbers(self)
 
     @property
     @abc.abstractmethod
@@ -144,13 +142,31 @@ def number(value: Number) -> Number:
     return float(value) if _check.is_concrete(value) else value
 
 
-def check_lengths(shape: AbstractSdf, *names: str) -> None:
-    """Raise a `ValueError` unless the named fields are scalars above zero."""
+class AbstractByLevel(AbstractSdf):
+    """A shape whose bounding box is that of its level zero."""
+
+    @abc.abstractmethod
+    def level_box(self, level: Number) -> Box: ...
+
+    def bounding_box(self) -> Box:
+        return self.level_box(0.0)
+
+
+def positive(value: Any) -> Array:
+    """`value` as an array; a field with this converter holds one number above zero."""
+    return real(value)
+
+
+def check_numbers(shape: AbstractSdf) -> None:
+    """Raise a `ValueError` if a field is not finite, or not positive where it has to be."""
     where = type(shape).__name__
-    for name in names:
-        value = getattr(shape, name)
-        _check.shape(where, name, value, (), "Give one number.")
-        _check.positive(where, name, value, "m", "Give a length above zero.")
+    for field in fields(shape):
+        value = getattr(shape, field.name)
+        if field.metadata.get("converter") is positive:
+            _check.shape(where, field.name, value, (), "Give one number.")
+            _check.positive(where, field.name, value, "m", "Give a length above zero.")
+        elif eqx.is_inexact_array(value):
+            _check.finite(where, field.name, value, "Give real numbers.")
 
 
 def cast(shape: AbstractSdf, dtype: jnp.dtype) -> AbstractSdf:
@@ -221,9 +237,7 @@ def clip(a: Scalar, low: Scalar | float, high: Scalar | float) -> Scalar:
 
 def box_distance(*excess: Scalar) -> Scalar:
     """Distance to a box from the coordinates less its half sides."""
-    largest = excess[0]
-    for e in excess[1:]:
-        largest = maximum(largest, e)
+    largest = functools.reduce(maximum, excess)
     inner = minimum(largest, jnp.zeros_like(largest))
     return inner + norm(*(positive_part(e) for e in excess))
 

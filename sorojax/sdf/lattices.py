@@ -1,34 +1,40 @@
 """Periodic lattices that fill space: cut a solid out of them with `&`."""
 
 import abc
+import functools
 import math
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax._types import real
 from sorojax.sdf.base import (
+    OUTSIDE,
     AbstractSdf,
     Box,
     Exactness,
     absolute,
-    check_lengths,
     minimum,
     ordered,
+    positive,
     root,
 )
 from sorojax.sdf.shapes.bars import segment_square
 from sorojax.sdf.shapes.curves import nearest, take
 
 
-def _everywhere(like: Array) -> Box:
-    infinity = jnp.full((3,), jnp.inf, like.dtype)
-    return -infinity, infinity
+class AbstractLattice(AbstractSdf):
+    """A shape that fills space."""
+
+    def bounding_box(self) -> Box:
+        infinity = jnp.full((self.dim,), jnp.inf, jnp.result_type(*jax.tree.leaves(self)))
+        return -infinity, infinity
 
 
-class AbstractSurfaceLattice(AbstractSdf):
+class AbstractSurfaceLattice(AbstractLattice):
     """A wall along the surface F(phase) = `level`, F periodic in x, y, z.
 
     The field is |F - level| / (bound * 2 pi / period) - thickness / 2, where `bound`
@@ -36,14 +42,11 @@ class AbstractSurfaceLattice(AbstractSdf):
     F is steepest and thicker elsewhere.
     """
 
-    period: Float[Array, ""] = eqx.field(converter=real)
-    thickness: Float[Array, ""] = eqx.field(converter=real)
+    period: Float[Array, ""] = eqx.field(converter=positive)
+    thickness: Float[Array, ""] = eqx.field(converter=positive)
     level: Float[Array, ""] = eqx.field(converter=real, default=0.0)
     bound: ClassVar[float]
     dim: ClassVar[int] = 3
-
-    def __check_init__(self):
-        check_lengths(self, "period", "thickness")
 
     @abc.abstractmethod
     def surface(self, x: Array, y: Array, z: Array) -> Array:
@@ -53,9 +56,6 @@ class AbstractSurfaceLattice(AbstractSdf):
         w = 2 * math.pi / self.period
         value = self.surface(w * x, w * y, w * z) - self.level
         return absolute(value) / (self.bound * w) - self.thickness / 2
-
-    def bounding_box(self) -> Box:
-        return _everywhere(self.period)
 
 
 class Gyroid(AbstractSurfaceLattice):
@@ -123,21 +123,18 @@ class Iwp(AbstractSurfaceLattice):
         return 2 * (a * b + b * c + c * a) - doubled
 
 
-class AbstractBeamLattice(AbstractSdf):
+class AbstractBeamLattice(AbstractLattice):
     """Round beams of `width` [m] in cubic cells of `period` [m], a node at the origin.
 
     Mirror planes of the lattice fold space onto the wedge 0 <= z <= y <= x <= period/2,
     in which the nearest beam lies too; `beams` are those of the wedge over period/2.
     """
 
-    period: Float[Array, ""] = eqx.field(converter=real)
-    width: Float[Array, ""] = eqx.field(converter=real)
+    period: Float[Array, ""] = eqx.field(converter=positive)
+    width: Float[Array, ""] = eqx.field(converter=positive)
     beams: ClassVar[tuple]
     dim: ClassVar[int] = 3
-    exactness: ClassVar[Exactness] = Exactness(outside=True, inside=False)
-
-    def __check_init__(self):
-        check_lengths(self, "period", "width")
+    exactness: ClassVar[Exactness] = OUTSIDE
 
     def distance(self, x, y, z):
         half = self.period / 2
@@ -148,17 +145,9 @@ class AbstractBeamLattice(AbstractSdf):
         middle, high = ordered(high, p[2])
         low, middle = ordered(low, middle)
         p = high, middle, low
-        squares = [segment_square(p, *self._ends(beam, x)) for beam in self.beams]
-        best = squares[0]
-        for square in squares[1:]:
-            best = minimum(best, square)
-        return half * root(best) - self.width / 2
-
-    def _ends(self, beam, x):
-        return tuple(tuple(jnp.asarray(c, x.dtype) for c in end) for end in beam)
-
-    def bounding_box(self) -> Box:
-        return _everywhere(self.period)
+        beams = jnp.asarray(self.beams, x.dtype)
+        squares = (segment_square(p, tuple(a), tuple(b)) for a, b in beams)
+        return half * root(functools.reduce(minimum, squares)) - self.width / 2
 
 
 class BccLattice(AbstractBeamLattice):
@@ -182,15 +171,14 @@ class KelvinLattice(AbstractBeamLattice):
     )
 
 
-class VoronoiFoam(AbstractSdf):
+class VoronoiFoam(AbstractLattice):
     """Walls of `thickness` [m] between the cells of explicit `seeds` [m], in 2-D or 3-D."""
 
     seeds: Float[Array, "seeds dim"] = eqx.field(converter=real)
-    thickness: Float[Array, ""] = eqx.field(converter=real)
-    exactness: ClassVar[Exactness] = Exactness(outside=True, inside=False)
+    thickness: Float[Array, ""] = eqx.field(converter=positive)
+    exactness: ClassVar[Exactness] = OUTSIDE
 
     def __check_init__(self):
-        check_lengths(self, "thickness")
         size = jnp.shape(self.seeds)
         if len(size) != 2 or size[1] not in (2, 3) or size[0] < 2:
             raise ValueError(
@@ -207,10 +195,6 @@ class VoronoiFoam(AbstractSdf):
         (own,) = take(table, nearest(lambda row, *x: _square(x, row[0]), table, x))
         (other,) = take(table, nearest(lambda row, *x: _wall(x, own, row[0]), table, x))
         return _wall(x, own, other) - self.thickness / 2
-
-    def bounding_box(self) -> Box:
-        infinity = jnp.full((self.dim,), jnp.inf, self.seeds.dtype)
-        return -infinity, infinity
 
 
 def _square(x: tuple[Array, ...], seed) -> Array:

@@ -356,7 +356,14 @@ def curvature(shape: AbstractSdf, p: Points) -> Float[Array, "*points"]:
 
     Positive where the shape is convex: 1/r for a circle and for a sphere.
     """
-    return _divergence(shape, real(p)) / (shape.dim - 1)
+    p = real(p)
+    _, g = value_and_gradient(shape, p)
+    h = hessian(shape, p)
+    square = jnp.sum(g * g, axis=-1)
+    across = jnp.einsum("...i,...ij,...j->...", g, h, g)
+    trace = jnp.trace(h, axis1=-2, axis2=-1)
+    # The divergence of the unit normal is the sum of the principal curvatures.
+    return quotient(square * trace - across, square * root(square)) / (shape.dim - 1)
 
 
 def gaussian_curvature(shape: AbstractSdf, p: Points) -> Float[Array, "*points"]:
@@ -376,16 +383,6 @@ def gaussian_curvature(shape: AbstractSdf, p: Points) -> Float[Array, "*points"]
     )
     square = jnp.sum(g * g, axis=-1)
     return quotient(jnp.einsum("...i,...ij,...j->...", g, adjugate, g), square**2)
-
-
-def _divergence(shape: AbstractSdf, p: Points) -> Float[Array, "*points"]:
-    """Divergence of the unit normal: the sum of the principal curvatures."""
-    _, g = value_and_gradient(shape, p)
-    h = hessian(shape, p)
-    square = jnp.sum(g * g, axis=-1)
-    across = jnp.einsum("...i,...ij,...j->...", g, h, g)
-    trace = jnp.trace(h, axis1=-2, axis2=-1)
-    return quotient(square * trace - across, square * root(square))
 
 
 def closest_point(shape: AbstractSdf, p: Points) -> Points:

@@ -1,6 +1,7 @@
 """Fields sampled on the host: two compiled kernels of fixed size per kind of shape."""
 
-from typing import NoReturn
+from collections.abc import Callable
+from typing import Any, NoReturn
 
 import equinox as eqx
 import jax
@@ -31,22 +32,35 @@ def value_and_gradient(shape, p):
 _value_and_gradient = eqx.filter_jit(value_and_gradient)
 
 
-def _chunks(points: np.ndarray):
-    """Pieces of `points` padded to one length, with the number of true rows."""
-    dtype = jnp.result_type(float)
-    for start in range(0, len(points), CHUNK):
-        piece = points[start : start + CHUNK]
-        padded = np.concatenate([piece, np.repeat(piece[-1:], CHUNK - len(piece), axis=0)])
-        # As it is: the compiled call takes it over faster than `jnp.asarray` does.
-        yield padded.astype(dtype, copy=False), len(piece)
+def in_pieces(function: Callable[..., Any], size: int, *rows: np.ndarray) -> list[np.ndarray]:
+    """Results of a compiled `function` of `rows`, at least one, as NumPy arrays.
+
+    It gets `size` rows at a time, the last one again and again where they run out: one size
+    means one compilation.
+    """
+    found = []
+    for start in range(0, len(rows[0]), size):
+        pieces = [row[start : start + size] for row in rows]
+        true = len(pieces[0])
+        if true < size:
+            pad = np.minimum(np.arange(size), true - 1)
+            pieces = [piece[pad] for piece in pieces]
+        found.append((jax.tree.leaves(function(*pieces)), true))
+    parts = [[np.asarray(leaf)[:true] for leaf in leaves] for leaves, true in found]
+    return [np.concatenate(column) for column in zip(*parts, strict=True)]
+
+
+def _as_given(points: np.ndarray) -> np.ndarray:
+    # No `jnp.asarray`: the compiled call takes an array over faster as it is.
+    return points.astype(jnp.result_type(float), copy=False)
 
 
 def values(shape: AbstractSdf, points: np.ndarray) -> np.ndarray:
     """Field [m] at `points` (n, dim) [m]."""
     if not len(points):
         return np.zeros(0)
-    found = [np.asarray(_value(shape, p))[:n] for p, n in _chunks(points)]
-    return np.concatenate(found).astype(float)
+    (f,) = in_pieces(lambda p: _value(shape, p), CHUNK, _as_given(points))
+    return f.astype(float)
 
 
 def values_and_gradients(
@@ -55,9 +69,18 @@ def values_and_gradients(
     """Field [m] and slope [-] at `points` (n, dim) [m]."""
     if not len(points):
         return np.zeros(0), np.zeros((0, shape.dim))
-    pairs = [(_value_and_gradient(shape, p), n) for p, n in _chunks(points)]
-    f = np.concatenate([np.asarray(f)[:n] for (f, _), n in pairs]).astype(float)
-    return f, np.concatenate([np.asarray(g)[:n] for (_, g), n in pairs]).astype(float)
+    f, g = in_pieces(lambda p: _value_and_gradient(shape, p), CHUNK, _as_given(points))
+    return f.astype(float), g.astype(float)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """`vectors` (.., dim) of length one; zero ones stay."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)
+
+
+def normals(shape: AbstractSdf, points: np.ndarray) -> np.ndarray:
+    """Unit normals of the level sets through `points` (n, dim) [m]."""
+    return unit(values_and_gradients(shape, points)[1])
 
 
 def land(shape: AbstractSdf, points: np.ndarray, steps: int = 12) -> np.ndarray:
@@ -97,6 +120,17 @@ def finite_box(where: str, shape: AbstractSdf, dim: int) -> tuple[np.ndarray, np
             "Check that the parts of its intersection overlap."
         )
     return lower, upper
+
+
+def connected(count: int, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Number of the connected part that each of `count` things is in, by pairs of them."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    if not count:
+        return np.zeros(0, int)
+    graph = coo_array((np.ones(len(first), bool), (first, second)), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
 
 
 class EmptyShape(ValueError):

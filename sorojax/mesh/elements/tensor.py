@@ -14,13 +14,30 @@ _CUBE = np.concatenate(
 
 
 class AbstractHypercube(AbstractElement):
-    """A quadrilateral or hexahedron; Gauss rules are products of those of a line."""
+    """A quadrilateral or hexahedron; Gauss rules are products of those of a line.
+
+    Its functions are products of linear ones of each axis where it defines no others.
+    """
 
     def linear(self):
         return Quad4() if self.dim == 2 else Hex8()
 
+    def shape_functions(self, at):
+        return np.prod(1 + at[:, None] * self._corners(), axis=2) / 2**self.dim
+
+    def shape_gradients(self, at):
+        corners, slopes = self._corners(), []
+        factors = 1 + at[:, None] * corners
+        for i in range(self.dim):
+            others = np.prod(np.delete(factors, i, axis=2), axis=2)
+            slopes.append(corners[:, i] * others / 2**self.dim)
+        return np.stack(slopes, axis=2)
+
+    def _corners(self) -> np.ndarray:
+        return _SQUARE if self.dim == 2 else _CUBE
+
     def nodes(self):
-        corners = _corners(self)
+        corners = self._corners()
         middles = [corners[list(ends)].mean(0)[None] for ends in side_ends(self)]
         inner = np.zeros((self.num_nodes - len(corners) - len(middles), self.dim))
         return np.concatenate([corners, *middles, inner])
@@ -54,12 +71,6 @@ class Quad4(AbstractHypercube):
     cell_type: ClassVar[str | None] = "quad"
     pressure_order: ClassVar[int | None] = 0
 
-    def shape_functions(self, at):
-        return _multilinear(self, at)
-
-    def shape_gradients(self, at):
-        return _multilinear_slopes(self, at)
-
 
 class Quad8(AbstractHypercube):
     """Serendipity quadrilateral; sides may be curved."""
@@ -77,14 +88,14 @@ class Quad8(AbstractHypercube):
         u, v = (1 - x**2) / 2, (1 - y**2) / 2
         middles = [u * (1 - y), v * (1 + x), u * (1 + y), v * (1 - x)]
         bend = at @ _SQUARE.T - 1
-        return np.concatenate([_multilinear(self, at) * bend, *middles], axis=1)
+        return np.concatenate([super().shape_functions(at) * bend, *middles], axis=1)
 
     def shape_gradients(self, at):
         x, y = at[:, :1], at[:, 1:]
         u, v = (1 - x**2) / 2, (1 - y**2) / 2
         bend = at @ _SQUARE.T - 1
-        corners = _multilinear_slopes(self, at) * bend[..., None]
-        corners = corners + _multilinear(self, at)[..., None] * _SQUARE
+        corners = super().shape_gradients(at) * bend[..., None]
+        corners = corners + super().shape_functions(at)[..., None] * _SQUARE
         along_x = np.concatenate([-x * (1 - y), v, -x * (1 + y), -v], axis=1)
         along_y = np.concatenate([-u, -y * (1 + x), u, -y * (1 - x)], axis=1)
         return np.concatenate([corners, np.stack([along_x, along_y], axis=2)], axis=1)
@@ -136,28 +147,3 @@ class Hex8(AbstractHypercube):
     stiffness_degree: ClassVar[int] = 3
     cell_type: ClassVar[str | None] = "hexahedron"
     pressure_order: ClassVar[int | None] = 0
-
-    def shape_functions(self, at):
-        return _multilinear(self, at)
-
-    def shape_gradients(self, at):
-        return _multilinear_slopes(self, at)
-
-
-def _corners(element: AbstractHypercube) -> np.ndarray:
-    return _SQUARE if element.dim == 2 else _CUBE
-
-
-def _multilinear(element: AbstractHypercube, at: np.ndarray) -> np.ndarray:
-    """Products of linear functions of each axis, one for each corner."""
-    return np.prod(1 + at[:, None] * _corners(element), axis=2) / 2**element.dim
-
-
-def _multilinear_slopes(element: AbstractHypercube, at: np.ndarray) -> np.ndarray:
-    corners = _corners(element)
-    factors = 1 + at[:, None] * corners
-    slopes = []
-    for i in range(element.dim):
-        others = np.prod(np.delete(factors, i, axis=2), axis=2)
-        slopes.append(corners[:, i] * others / 2**element.dim)
-    return np.stack(slopes, axis=2)

@@ -10,9 +10,9 @@ from jaxtyping import Array, Float, Int
 
 from sorojax._jax.trace_state import evaluated_now
 from sorojax._types import integers, real
-from sorojax.sdf.base import AbstractSdf, cast, quotient
+from sorojax.sdf.base import AbstractSdf, quotient
 from sorojax.sdf.query import shape_tangent
-from sorojax.sdf.sampling import values_and_gradients
+from sorojax.sdf.sampling import value_and_gradient, values_and_gradients
 
 Fields = tuple[AbstractSdf, ...]
 # Parts of an edge at which the sides of a corner are looked at, one after the other.
@@ -41,21 +41,6 @@ class BoundaryPlan(eqx.Module):
     ridge: Int[Array, " ridges"] = eqx.field(converter=integers)
     tangent: Float[Array, "ridges dim"] = eqx.field(converter=real)
     fields: tuple[FieldPlan, ...]
-
-
-def _field_at(field: AbstractSdf, p: Float[Array, "points dim"]) -> Float[Array, " points"]:
-    return cast(field, p.dtype).distance(*(p[:, i] for i in range(field.dim)))
-
-
-def _slopes_at(field: AbstractSdf, p: Float[Array, "points dim"]):
-    """Field and gradient in one pass over all directions, which compiles faster."""
-
-    def pushed(direction):
-        return jax.jvp(
-            lambda q: _field_at(field, q), (p,), (jnp.broadcast_to(direction, p.shape),)
-        )
-
-    return jax.vmap(pushed, out_axes=(None, 1))(jnp.eye(p.shape[1], dtype=p.dtype))
 
 
 @eqx.filter_custom_jvp
@@ -97,7 +82,7 @@ def _meet(fields: Fields, plan: BoundaryPlan, start):
 @eqx.filter_jit
 def _meet_dot(fields, plan, normals, slopes, seen, fields_dot, start_dot):
     def fields_at(fields):
-        return tuple(_field_at(f, p) for f, p in zip(fields, seen, strict=True))
+        return tuple(f(p) for f, p in zip(fields, seen, strict=True))
 
     f_dot = jnp.concatenate(shape_tangent(fields_at, fields, fields_dot))
     across = jnp.sum(plan.tangent * start_dot[plan.ridge], axis=1)
@@ -110,7 +95,7 @@ def _sides_near(fields: Fields, plan: BoundaryPlan, x, zoom):
     for field, own in zip(fields, plan.fields, strict=True):
         step = zoom * own.along
         p = x[own.beside] + step
-        f, g = _slopes_at(field, p)
+        f, g = value_and_gradient(field, p)
         slope = jnp.sqrt(jnp.sum(g * g, axis=1))
         slope = jnp.where(slope > 0, slope, jnp.ones_like(slope))
         n = g / slope[:, None]
@@ -182,7 +167,7 @@ def _slide_one(field: AbstractSdf, normal, start):
 
     def descend(state):
         x, _, _, count = state
-        f, slope = jax.jvp(lambda q: _field_at(field, q), (x,), (normal,))
+        f, slope = jax.jvp(field, (x,), (normal,))
         new = x - quotient(f, slope)[:, None] * normal
         far = jnp.max(jnp.abs(new - x), initial=0) > tiny * jnp.max(jnp.abs(x), initial=0)
         return new, slope, far, count + 1
@@ -195,7 +180,7 @@ def _slide_one(field: AbstractSdf, normal, start):
 @eqx.filter_jit
 def _slide_dot(fields, plan, x, slopes, fields_dot, start_dot):
     def fields_at(both):
-        return tuple(_field_at(f, p) for f, p in zip(*both, strict=True))
+        return tuple(f(p) for f, p in zip(*both, strict=True))
 
     f_dot = shape_tangent(fields_at, (fields, x), (fields_dot, start_dot))
     return tuple(

@@ -223,25 +223,12 @@ def moved_points(
     if len(border.sharp):
         sharp = meet(fields, border, points[border.sharp])
         if motion.ridges is not None:
-            sharp = meet(fields, border, _ridge_guess(motion, points, sharp))
-    starts = _side_guess(motion, points, sharp)
-    return _everywhere(motion, points, sharp, slide(fields, border, starts))
-
-
-def _ridge_guess(motion: _Motion, points, sharp):
-    assert motion.ridges is not None
-    shift = spread(motion.ridges, _shift(motion, points, sharp))
-    return (points + _follow(motion, shift))[motion.border.sharp]
-
-
-def _side_guess(motion: _Motion, points, sharp):
+            shift = _follow(motion, spread(motion.ridges, _shift(motion, points, sharp)))
+            sharp = meet(fields, border, (points + shift)[border.sharp])
     shift = _shift(motion, points, sharp)
     if motion.surface is not None:
         shift = _follow(motion, spread(motion.surface, shift))
-    return _beside(motion, points, shift)
-
-
-def _everywhere(motion: _Motion, points, sharp, landed):
+    landed = slide(fields, border, _beside(motion, points, shift))
     shift = boundary = _boundary_shift(motion, points, sharp, landed)
     if motion.inside is not None:
         shift = spread(motion.inside, shift)

@@ -20,6 +20,7 @@ from sorojax.mesh.elements.base import (
 )
 from sorojax.mesh.mesh import Mesh, boundary_facets
 from sorojax.mesh.motion.boundary import BoundaryPlan, FieldPlan
+from sorojax.sdf.sampling import connected, unit
 
 
 class Harmonic(eqx.Module):
@@ -50,12 +51,8 @@ def harmonic(cells: np.ndarray, stiffness: np.ndarray, held: np.ndarray) -> Harm
 
 def _adrift(cells: np.ndarray, held: np.ndarray) -> np.ndarray:
     """Nodes in parts without any held node."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     first = np.repeat(cells[:, :1], cells.shape[1] - 1, axis=1).ravel()
-    ends = (np.ones(len(first)), (first, cells[:, 1:].ravel()))
-    label = connected_components(coo_matrix(ends, shape=(len(held),) * 2), directed=False)[1]
+    label = connected(len(held), first, cells[:, 1:].ravel())
     return ~np.isin(label, label[held])
 
 
@@ -184,10 +181,6 @@ class Sides(NamedTuple):
     patch: np.ndarray
 
 
-def unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)
-
-
 def facet_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Unit normals of triangles or quadrilaterals."""
     x = points[faces]
@@ -223,9 +216,6 @@ def surface_sides(points, faces, owner, known: np.ndarray | None = None) -> Side
 
 def _patches(faces: np.ndarray, first, second) -> np.ndarray:
     """Corners of facets joined where two facets share a smooth side."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     count = faces.shape[1]
     flat = faces.ravel()
 
@@ -236,8 +226,7 @@ def _patches(faces: np.ndarray, first, second) -> np.ndarray:
     partner = np.where(turned, after(second), second)
     other = np.where(turned, second, after(second))
     pairs = (np.concatenate([first, after(first)]), np.concatenate([partner, other]))
-    graph = coo_matrix((np.ones(len(pairs[0])), pairs), shape=(flat.size,) * 2)
-    return connected_components(graph, directed=False)[1].reshape(faces.shape)
+    return connected(flat.size, *pairs).reshape(faces.shape)
 
 
 # What `move` needs to know about the outline of a plane mesh, worked out on the host

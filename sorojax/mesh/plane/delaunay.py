@@ -7,6 +7,8 @@ Computers & Structures 47, 1993.
 """
 
 from collections import deque
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,8 +18,103 @@ from sorojax.mesh.plane.outline import _GRADING, Outline
 from sorojax.mesh.sizes import Sizes
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sampling import values
+from sorojax.sdf.surface.marching import cross
 
-_STEPS = (0.06, 0.15)  # of the sides: how far a node is tried away from its place
+# Nodes of poor cells moved to better places, in the plane and in space
+
+
+class Mover(NamedTuple):
+    """How nodes of poor cells are moved.
+
+    Attributes:
+        label: Of progress messages.
+        measure: How bad cells are by their corners (cells, corners, dim).
+        enough: Cells no worse than that are left alone.
+        rank: Which nodes come first, by the worst of their cells and random numbers.
+        ways: Unit vectors (ways, dim) along which a node is tried away from its place.
+        steps: How far, in mean lengths of the edges beside it.
+    """
+
+    label: str
+    measure: Callable[[np.ndarray], np.ndarray]
+    enough: float
+    rank: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    ways: np.ndarray
+    steps: tuple[float, float]
+
+
+def relocate(
+    mover: Mover,
+    points: np.ndarray,
+    cells: np.ndarray,
+    fixed: np.ndarray,
+    rounds: int,
+    hold: Callable[..., None] | None = None,
+) -> np.ndarray:
+    """`points` with nodes of poor simplices, but the `fixed` ones, moved where that helps.
+
+    In each round a set of nodes without common cells is moved, each to the best of a few
+    places, once `hold(places, movers, reach, row, ball)` has put these where nodes may be.
+    """
+    points, order = points.copy(), np.argsort(cells.ravel(), kind="stable")
+    start = np.searchsorted(cells.ravel()[order], np.arange(len(points) + 1))
+    bad = mover.measure(points[cells])
+    for turn in range(rounds):
+        movers = _independent(mover, cells, bad, fixed, turn)
+        if not len(movers):
+            report(mover.label, rounds, rounds)
+            break
+        count = start[movers + 1] - start[movers]
+        row = np.repeat(np.arange(len(movers)), count)
+        offset = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
+        ball = order[start[movers][row] + offset] // cells.shape[1]
+        places, reach = _places(mover, points, cells[ball], row, movers, count)
+        if hold is not None:
+            hold(places, movers, reach, row, cells[ball])
+        x, lines = points[cells[ball]], np.arange(len(movers))
+        at = np.argmax(cells[ball] == movers[row][:, None], axis=1)
+        worst = np.full(places.shape[:2], -np.inf)
+        for k in range(len(places)):
+            x[np.arange(len(ball)), at] = places[k, row]
+            np.maximum.at(worst[k], row, mover.measure(x))
+        best = worst.argmin(axis=0)
+        better = worst[best, lines] < worst[0] - 1e-9
+        points[movers[better]] = places[best, lines][better]
+        bad[ball] = mover.measure(points[cells[ball]])
+        report(mover.label, turn + 1, rounds, moved=int(better.sum()))
+    return points
+
+
+def _independent(mover: Mover, cells, bad, fixed: np.ndarray, turn: int) -> np.ndarray:
+    """Nodes of the worst cells, no two in one cell; other ones at every turn."""
+    rng = np.random.default_rng(turn)  # only breaks ties: the result is reproducible
+    worst, poor = np.full(len(fixed), -np.inf), bad > mover.enough
+    np.maximum.at(worst, cells[poor].ravel(), np.repeat(bad[poor], cells.shape[1]))
+    ranked = mover.rank(worst, rng.random(len(fixed)))
+    score = np.where(np.isfinite(worst) & ~fixed, ranked, 0.0)
+    top = score[cells].max(axis=1)
+    beaten = np.zeros(len(fixed), bool)
+    beaten[cells[(score[cells] < top[:, None]) & (top > 0)[:, None]]] = True
+    return np.flatnonzero((score > 0) & ~beaten)
+
+
+def _places(mover: Mover, points, ball, row, movers, count) -> tuple[np.ndarray, np.ndarray]:
+    """Places to try (tries, movers, dim), the first where the node is, and the mean length
+    (movers, 1) of the edges beside it."""
+    here, others = points[movers], (ball.shape[1] - 1) * count[:, None]
+    total, reach = np.zeros_like(here), np.zeros((len(here), 1))
+    np.add.at(total, row, points[ball].sum(axis=1) - here[row])
+    gaps = np.linalg.norm(points[ball] - here[row][:, None], axis=2)
+    np.add.at(reach, row, gaps.sum(axis=1, keepdims=True))
+    mean, reach = total / others, reach / others
+    tries = [here, mean, (here + mean) / 2]
+    tries += [here + step * reach * way for step in mover.steps for way in mover.ways]
+    return np.stack(tries), reach
+
+
+# Triangles: their angles, and how their nodes are moved
+
+
 _WAYS = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=1)
 
 
@@ -25,67 +122,18 @@ def least_angles(x: np.ndarray) -> np.ndarray:
     """Smallest angle [rad] of triangles with corners `x` (cells, 3, 2); negative where a
     triangle is turned over."""
     out, back = np.roll(x, -1, axis=1) - x, np.roll(x, 1, axis=1) - x
-    turn = out[..., 0] * back[..., 1] - out[..., 1] * back[..., 0]
-    angle = np.arctan2(turn, (out * back).sum(axis=2))
-    return angle.min(axis=1)
+    return np.arctan2(cross(out, back), (out * back).sum(axis=2)).min(axis=1)
 
 
 def polish(points, cells, fixed: int, enough: float, rounds: int) -> np.ndarray:
     """`points` with the nodes (the first `fixed` excepted) of triangles with an angle below
     `enough` [rad] moved to the best of a few places, where that helps."""
-    points, n = points.copy(), len(points)
-    order = np.argsort(cells.ravel(), kind="stable")
-    owner, start = order // 3, np.searchsorted(cells.ravel()[order], np.arange(n + 1))
-    angle = least_angles(points[cells])
-    for turn in range(rounds):
-        movers = _independent(cells, angle, fixed, enough, turn, n)
-        if not len(movers):
-            report("triangulate", rounds, rounds)
-            break
-        count = start[movers + 1] - start[movers]
-        row = np.repeat(np.arange(len(movers)), count)
-        offset = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
-        ball = owner[start[movers][row] + offset]
-        places = _places(points, cells[ball], row, movers, count)
-        x = points[cells[ball]]
-        at = np.argmax(cells[ball] == movers[row][:, None], axis=1)
-        least = np.full(places.shape[:2], np.inf)
-        for k in range(len(places)):
-            x[np.arange(len(ball)), at] = places[k, row]
-            np.minimum.at(least[k], row, least_angles(x))
-        best, lines = least.argmax(axis=0), np.arange(len(movers))
-        better = least[best, lines] > least[0] + 1e-9
-        points[movers[better]] = places[best, lines][better]
-        angle[ball] = least_angles(points[cells[ball]])
-        report("triangulate", turn + 1, rounds, moved=int(better.sum()))
-    return points
 
+    def rank(worst, random):
+        return (worst + enough) * (1 + random)
 
-def _independent(cells, angle, fixed: int, enough: float, turn: int, n: int) -> np.ndarray:
-    """Inner nodes of the worst triangles, no two in one; other ones at every turn."""
-    rng = np.random.default_rng(turn)  # only breaks ties: the result is reproducible
-    score = np.zeros(n)
-    poor = np.flatnonzero(angle < enough)
-    np.maximum.at(score, cells[poor].ravel(), np.repeat(enough - angle[poor], 3))
-    score = np.where(score > 0, score * (1 + rng.random(n)), 0.0)
-    score[:fixed] = 0.0
-    top = score[cells].max(axis=1)
-    beaten = np.zeros(n, bool)
-    beaten[cells[(score[cells] < top[:, None]) & (top > 0)[:, None]]] = True
-    return np.flatnonzero((score > 0) & ~beaten)
-
-
-def _places(points, ball_cells, row, movers, count) -> np.ndarray:
-    """Places to try, (tries, movers, 2); the first is where the node is."""
-    here = points[movers]
-    total, reach = np.zeros_like(here), np.zeros(len(here))
-    np.add.at(total, row, points[ball_cells].sum(axis=1) - here[row])
-    gaps = np.linalg.norm(points[ball_cells] - here[row][:, None], axis=2).sum(axis=1)
-    np.add.at(reach, row, gaps)
-    mean, reach = total / (2 * count)[:, None], (reach / (2 * count))[:, None]
-    tries = [here, mean, (here + mean) / 2]
-    tries += [here + s * reach * way for s in _STEPS for way in _WAYS]
-    return np.stack(tries)
+    mover = Mover("triangulate", lambda x: -least_angles(x), -enough, rank, _WAYS, (0.06, 0.15))
+    return relocate(mover, points, cells, np.arange(len(points)) < fixed, rounds)
 
 
 # Triangles of points that keep given edges, and those inside a closed outline of them
@@ -132,9 +180,7 @@ class _Sides:
 
     def __init__(self, points: np.ndarray):
         cells = Delaunay(points).simplices
-        x = points[cells]
-        a, b = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]
-        turned = a[:, 0] * b[:, 1] < a[:, 1] * b[:, 0]
+        turned = doubled_areas(points[cells]) < 0
         cells = np.where(turned[:, None], cells[:, [0, 2, 1]], cells)
         self.points, self.of = points.tolist(), {}
         self.beside: list[set[int]] = [set() for _ in points]
@@ -287,7 +333,7 @@ def triangles(shape: AbstractSdf, points: np.ndarray, size: float) -> np.ndarray
     """Delaunay triangles of `points` whose centre lies inside `shape`."""
     cells = Delaunay(points).simplices
     corners = points[cells]
-    doubled = _doubled_area(corners)
+    doubled = doubled_areas(corners)
     # Points in line give triangles without area along straight sides.
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     solid = np.abs(doubled) > 1e-6 * longest**2
@@ -297,9 +343,10 @@ def triangles(shape: AbstractSdf, points: np.ndarray, size: float) -> np.ndarray
     return np.where((doubled > 0)[:, None], cells, cells[:, ::-1])
 
 
-def _doubled_area(corners: np.ndarray) -> np.ndarray:
-    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+def doubled_areas(corners: np.ndarray) -> np.ndarray:
+    """Twice the areas of triangles whose `corners` (cells, 3, 2) come first; negative where
+    they run clockwise."""
+    return cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def fill(
@@ -409,7 +456,7 @@ def _adapt(points, cells, fixed: int, wanted: SizeField) -> np.ndarray:
 def _smooth(shape, points, cells, fixed: int, wanted: SizeField, guard: Guard):
     """One step towards an optimal Delaunay triangulation graded by the wanted size."""
     corners = points[cells]
-    center, area = _circumcenters(corners), _doubled_area(corners) / 2
+    center, area = _circumcenters(corners), doubled_areas(corners) / 2
     middle = corners.mean(axis=1)
     h = wanted(middle)
     far = ~(np.linalg.norm(center - middle, axis=1) <= 0.6 * h)  # or without area

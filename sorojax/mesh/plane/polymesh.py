@@ -21,9 +21,10 @@ from sorojax._types import real
 from sorojax.math.host import KDTree, Voronoi
 from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.mesh import Mesh, boundary_facets
+from sorojax.mesh.plane.triangulate import ring_area
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sampling import finite_box, raise_empty, values
-from sorojax.sdf.surface.marching import contour
+from sorojax.sdf.surface.marching import contour, cross
 
 _BENT = 1.08  # length of a piece of the boundary over its chord that asks for a point
 
@@ -128,7 +129,8 @@ def cut_cells(seeds: np.ndarray, border: Border) -> tuple[np.ndarray, list]:
     )
     diagram = Voronoi(np.concatenate([seeds, far]))
     vertices, offset = diagram.vertices, len(border.points)
-    inside = _inside(border, vertices)
+    ends = border.points[border.edges]
+    inside = _inside(ends[:, 0], ends[:, 1], vertices)
     crossings: dict[tuple[int, int], list[int]] = {}
     for k in np.flatnonzero(border.between[:, 0] >= 0):
         a, b = sorted(border.between[k].tolist())
@@ -147,8 +149,7 @@ def cut_cells(seeds: np.ndarray, border: Border) -> tuple[np.ndarray, list]:
             place = (border.points[found] - vertices[u]) @ along
             found = [found[k] for k in np.argsort(place)]
         stops = [offset + u, *found, offset + v]
-        turn = along[0] * (seeds[a] - vertices[u])[1] - along[1] * (seeds[a] - vertices[u])[0]
-        left, right = (a, b) if turn > 0 else (b, a)
+        left, right = (a, b) if cross(along, seeds[a] - vertices[u]) > 0 else (b, a)
         for i in range(0 if inside[u] else 1, len(stops) - 1, 2):
             sides[left].append((stops[i], stops[i + 1]))
             sides[right].append((stops[i + 1], stops[i]))
@@ -156,9 +157,8 @@ def cut_cells(seeds: np.ndarray, border: Border) -> tuple[np.ndarray, list]:
     return points, [face for own in sides for face in _faces(points, own)]
 
 
-def _inside(border: Border, p: np.ndarray) -> np.ndarray:
-    """Whether points lie inside the polygon, by counting sides to their right."""
-    a, b = border.points[border.edges[:, 0]], border.points[border.edges[:, 1]]
+def _inside(a: np.ndarray, b: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """Whether points lie inside polygons with sides from a to b: counts those to the right."""
     result = np.zeros(len(p), bool)
     for i in range(0, len(p), 1000):
         x, y = p[i : i + 1000, :1], p[i : i + 1000, 1:]
@@ -183,12 +183,13 @@ def _faces(points: np.ndarray, sides: list[tuple[int, int]]) -> list[list[list[i
             here = _pop(after, here)
         if len(loop) > 2:
             loops.append(loop)
-    areas = [_area(points[loop]) for loop in loops]
+    areas = [ring_area(points[loop]) for loop in loops]
     faces = [[loop] for loop, area in zip(loops, areas, strict=True) if area > 0]
     for loop, area in zip(loops, areas, strict=True):
         if area < 0:
-            around = [f for f in faces if _holds(points[f[0]], points[loop[0]])]
-            (around or faces)[0].append(loop)
+            rings = [points[face[0]] for face in faces]
+            holds = [_inside(x, np.roll(x, -1, axis=0), points[loop[:1]])[0] for x in rings]
+            faces[int(np.argmax(holds))].append(loop)
     return faces
 
 
@@ -197,19 +198,6 @@ def _pop(after: dict[int, list[int]], node: int) -> int:
     if not after[node]:
         del after[node]
     return found
-
-
-def _area(x: np.ndarray) -> float:
-    y = np.roll(x, -1, axis=0)
-    return float((x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]).sum() / 2)
-
-
-def _holds(x: np.ndarray, p: np.ndarray) -> bool:
-    y = np.roll(x, -1, axis=0)
-    spans = (x[:, 1] > p[1]) != (y[:, 1] > p[1])
-    x, y = x[spans], y[spans]
-    at = x[:, 0] + (p[1] - x[:, 1]) * (y[:, 0] - x[:, 0]) / (y[:, 1] - x[:, 1])
-    return bool((p[0] < at).sum() % 2)
 
 
 # Polygons with holes split into convex ones, without new points
@@ -231,13 +219,11 @@ def convex_parts(points: np.ndarray, loops: list[list[int]]) -> list[list[int]]:
 def is_convex(points: np.ndarray, ring: list[int]) -> bool:
     x = points[ring]
     into, out = x - np.roll(x, 1, axis=0), np.roll(x, -1, axis=0) - x
-    turn = into[:, 0] * out[:, 1] - into[:, 1] * out[:, 0]
-    return bool((turn >= -_FLAT * np.ptp(x, axis=0).max() ** 2).all())
+    return bool((cross(into, out) >= -_FLAT * np.ptp(x, axis=0).max() ** 2).all())
 
 
 def _turn(points, a: int, b: int, c: int) -> float:
-    u, v = points[b] - points[a], points[c] - points[a]
-    return float(u[0] * v[1] - u[1] * v[0])
+    return float(cross(points[b] - points[a], points[c] - points[a]))
 
 
 def _bridged(points, ring: list[int], hole: list[int]) -> list[int]:
@@ -288,7 +274,7 @@ def _blocked(points, ring, a: int, b: int, c: int) -> bool:
     inside = np.ones(len(p), bool)
     for u, v in ((a, b), (b, c), (c, a)):
         edge, to = points[v] - points[u], p - points[u]
-        inside &= edge[0] * to[:, 1] - edge[1] * to[:, 0] >= 0
+        inside &= cross(edge, to) >= 0
     return bool(inside.any())
 
 
@@ -473,14 +459,10 @@ def _packed(points: np.ndarray, cells: list[list[int]]) -> Mesh:
 
 def _check_area(mesh: Mesh, border) -> None:
     x = np.asarray(mesh.points)[np.asarray(mesh.cells)]
-    got = _shoelace(x, np.roll(x, -1, axis=1)).sum()
-    want = _shoelace(border.points[border.edges[:, 0]], border.points[border.edges[:, 1]]).sum()
+    got = (cross(x, np.roll(x, -1, axis=1)) / 2).sum()
+    want = (cross(*np.moveaxis(border.points[border.edges], 1, 0)) / 2).sum()
     if abs(got - want) > 1e-10 * want:
         raise ValueError(
             f"polymesher: the cells cover {got:.12g} m^2 of the {want:.12g} m^2 inside the "
             "boundary polygon: walls are far thinner than a cell. Raise `count`."
         )
-
-
-def _shoelace(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]) / 2

@@ -9,29 +9,15 @@ from jaxtyping import Float
 from sorojax import _check
 from sorojax._types import Numbers, real
 from sorojax.mesh.elements.simplex import Tri3, Tri6
-from sorojax.mesh.mesh import Mesh
-from sorojax.mesh.plane.delaunay import Missing, fill
+from sorojax.mesh.mesh import Mesh, nodes_between, with_side_nodes
+from sorojax.mesh.plane.delaunay import Missing, doubled_areas, fill
 from sorojax.mesh.plane.outline import Outline, outline, split
 from sorojax.mesh.resolution import bulging, raise_if_thin, raise_thin, unseen
 from sorojax.mesh.sizes import SizeFunction, Sizes, sizes
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sampling import EmptyShape, finite_box, land, raise_empty
-from sorojax.sdf.shapes.plane import Polygon
-
-
-def with_middles(
-    points: np.ndarray, cells: np.ndarray, edges: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points and cells with a node in the middle of every side, and those of `edges`."""
-    corners = [facet[:2] for facet in Tri6().facets]
-    sides = np.sort(np.concatenate([cells[:, list(c)] for c in corners]), axis=1)
-    n = len(points)
-    keys, number = np.unique(sides @ [n, 1], return_inverse=True)
-    ends = np.stack(np.divmod(keys, n), axis=-1)
-    middles = points[ends].mean(axis=1)
-    columns = n + number.reshape(3, -1).T
-    on_edges = n + np.searchsorted(keys, np.sort(edges, axis=1) @ [n, 1])
-    return np.concatenate([points, middles]), np.concatenate([cells, columns], 1), on_edges
+from sorojax.sdf.shapes.plane import Polygon, touching_edges
+from sorojax.sdf.surface.marching import cross
 
 
 def least_jacobian(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
@@ -40,26 +26,12 @@ def least_jacobian(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
     The determinant is a quadratic polynomial: its smallest Bernstein coefficient
     bounds it from below.
     """
-    x = points[cells]
-    at_nodes = np.stack([_determinant(x, *node) for node in _NODES], axis=1)
+    x, slopes = points[cells], Tri6().shape_gradients(Tri6().nodes())
+    at_nodes = np.linalg.det(np.einsum("cai,qad->cqid", x, slopes))
     middles = 2 * at_nodes[:, 3:] - (at_nodes[:, :3] + np.roll(at_nodes[:, :3], -1, 1)) / 2
-    return np.minimum(at_nodes[:, :3].min(axis=1), middles.min(axis=1)) / _scale(x)
-
-
-_NODES = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.5))
-
-
-def _scale(x: np.ndarray) -> np.ndarray:
-    a, b = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]
-    return np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-
-
-def _determinant(x: np.ndarray, r: float, s: float) -> np.ndarray:
-    t = 1 - r - s
-    dr = np.array([1 - 4 * t, 4 * r - 1, 0, 4 * (t - r), 4 * s, -4 * s])
-    ds = np.array([1 - 4 * t, 0, 4 * s - 1, -4 * r, 4 * r, 4 * (t - s)])
-    a, b = np.einsum("cni,n->ci", x, dr), np.einsum("cni,n->ci", x, ds)
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return np.minimum(at_nodes[:, :3].min(axis=1), middles.min(axis=1)) / np.abs(
+        doubled_areas(x)
+    )
 
 
 # From a plane shape to triangles: exact boundary, hexagonal inside, curved sides
@@ -155,7 +127,8 @@ def _filled(shape, interfaces, lengths: Sizes, box, iterations: int):
 
 def _curved(fields, lines: Outline, points, cells) -> Mesh:
     """The quadratic mesh, middles of outline edges moved onto their zero sets."""
-    points, cells, middles = with_middles(points, cells, lines.edges)
+    points, cells = with_side_nodes(points, cells, Tri6())
+    middles = nodes_between(cells, Tri6(), lines.edges)
     for i, field in enumerate(fields):
         mine = middles[lines.owner == i]
         points[mine] = land(field, points[mine])
@@ -256,19 +229,19 @@ def image_shape(
         ring = approximate_polygon(contour, smooth)[:-1]
         if len(ring) >= 3:
             rings.append(pixel * np.stack([ring[:, 1] - 0.5, len(image) - ring[:, 0] + 0.5], 1))
-    rings.sort(key=lambda r: -abs(_area(r)))
+    rings.sort(key=lambda r: -abs(ring_area(r)))
     _check_simple(rings)
-    first = np.sign(_area(rings[0]))
+    first = np.sign(ring_area(rings[0]))
     shape: AbstractSdf = Polygon(rings[0])
     for ring in rings[1:]:
         part = Polygon(ring)
-        shape = shape | part if np.sign(_area(ring)) == first else shape - part
+        shape = shape | part if np.sign(ring_area(ring)) == first else shape - part
     return shape
 
 
-def _area(x: np.ndarray) -> float:
-    y = np.roll(x, -1, axis=0)
-    return float((x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]).sum() / 2)
+def ring_area(x: np.ndarray) -> float:
+    """Area inside a polygon of corners (n, 2), negative where they run clockwise."""
+    return float(cross(x, np.roll(x, -1, axis=0)).sum() / 2)
 
 
 def _ring(corners) -> np.ndarray:
@@ -291,34 +264,9 @@ def _check_simple(rings: list[np.ndarray]) -> None:
             "allowed. Simplify them first."
         )
     b = np.concatenate([np.roll(r, -1, axis=0) for r in rings])
-    after = np.concatenate([np.roll(np.arange(len(r)), -1) + s for r, s in _starts(rings)])
-    for i in range(len(a)):
-        side = (_turn(a[i], b[i], a), _turn(a[i], b[i], b))
-        back = (_turn(a, b, a[i]), _turn(a, b, b[i]))
-        hit = (side[0] * side[1] <= 0) & (back[0] * back[1] <= 0)
-        flat = (side[0] == 0) & (side[1] == 0)
-        hit &= ~flat | _overlap(a[i], b[i], a, b)
-        hit[[i, after[i], int(np.flatnonzero(after == i)[0])]] = False
-        if hit.any():
-            raise ValueError(
-                f"from_polygon: the side from {a[i]} to {b[i]} m touches or crosses the one "
-                f"from {a[hit][0]} to {b[hit][0]} m. Separate them, or split the polygon."
-            )
-
-
-def _starts(rings):
-    start = 0
-    for ring in rings:
-        yield ring, start
-        start += len(ring)
-
-
-def _turn(a, b, p):
-    u, v = b - a, p - a
-    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
-
-
-def _overlap(p, q, a, b):
-    """Whether boxes of sides in one line overlap."""
-    low, high = np.minimum(p, q), np.maximum(p, q)
-    return ((np.maximum(a, b) >= low) & (np.minimum(a, b) <= high)).all(axis=1)
+    if edges := touching_edges(*rings):
+        i, j = edges
+        raise ValueError(
+            f"from_polygon: the side from {a[i]} to {b[i]} m touches or crosses the one "
+            f"from {a[j]} to {b[j]} m. Separate them, or split the polygon."
+        )

@@ -4,18 +4,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sorojax.mesh.motion.boundary import SETTLE_ZOOMS as ZOOMS, Sides, joined, no_sides, settle
+from sorojax.mesh.motion.boundary import SETTLE_ZOOMS as ZOOMS, Sides, joined, settle
 from sorojax.mesh.motion.plan import Sides as SurfaceSides, surface_sides
-from sorojax.mesh.solid.lattice import badness, inside_part, signed_volumes, unique_edges
+from sorojax.mesh.solid.lattice import (
+    FACES,
+    badness,
+    inside_parts,
+    signed_volumes,
+    unique_edges,
+)
 from sorojax.mesh.solid.ridges import Around, Features, boundary_triangles
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.sampling import values, values_and_gradients
+from sorojax.sdf.sampling import normals, values, values_and_gradients
 
 _NEAR = 0.35  # of the shortest edge beside a node: nodes that near are put on the set
 _DEEP = 0.1  # of an edge: what goes less deep through a layer is a bend, not a layer
 _OPPOSED = -0.7  # cosine between the slopes on both sides of a layer
 _THIN = np.cos(np.deg2rad(9.0))  # poorest dihedral angle that this may make
-_FACES = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))  # opposite to each corner, outward
 
 
 class Parts(NamedTuple):
@@ -39,7 +44,7 @@ class Parts(NamedTuple):
         """Triangles of zero set `number`; 0 is the boundary, the others seen from outside."""
         if number == 0:
             return boundary_triangles(self.cells)
-        faces = np.concatenate([self.cells[:, list(f)] for f in _FACES])
+        faces = np.concatenate([self.cells[:, list(f)] for f in FACES])
         keys = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True)[1].ravel()
         flag = np.tile(self.within[:, number - 1], 4)
         inner, outer = np.zeros(keys.max() + 1, bool), np.zeros(keys.max() + 1, bool)
@@ -82,10 +87,8 @@ def _check_seen(fields, parts: Parts, g: np.ndarray) -> None:
     depth = -(f * np.sign(ends[rows].sum(axis=1))[:, None]).min(axis=1, initial=np.inf)
     thin = depth > _DEEP * length[rows]
     rows, depth = rows[thin], depth[thin]
-    slopes = [values_and_gradients(fields[-1], x[rows])[1] for x in (a, b)]
-    cosine = (slopes[0] * slopes[1]).sum(axis=1)
-    cosine /= np.maximum(np.prod([np.linalg.norm(s, axis=1) for s in slopes], axis=0), 1e-300)
-    opposed = np.flatnonzero(cosine < _OPPOSED)
+    faces = [normals(fields[-1], x[rows]) for x in (a, b)]
+    opposed = np.flatnonzero((faces[0] * faces[1]).sum(axis=1) < _OPPOSED)
     if len(opposed):
         worst = opposed[depth[opposed].argmax()]
         where = np.round((a + b)[rows[worst]] / 2, 6)
@@ -181,16 +184,10 @@ def _cut(fields, parts: Parts, g: np.ndarray) -> Parts:
     inner.append(whole)
     rows = np.flatnonzero(both)
     for side in (1, -1):
-        own = side * sign
-        order = np.argsort(own[cells[rows]], axis=1, kind="stable")
-        cut = np.take_along_axis(cells[rows], order, axis=1)
-        low, on = (own[cut] < 0).sum(axis=1), (own[cut] == 0).sum(axis=1)
-        for m, z in {*zip(low.tolist(), on.tolist(), strict=True)}:
-            mine = (low == m) & (on == z)
-            for piece in inside_part(*cut[mine].T, m, z, middle):
-                halves.append(piece)
-                parents.append(rows[mine])
-                inner.append(np.full(len(piece), side == 1))
+        pieces, cut = inside_parts(cells[rows], side * sign, middle)
+        halves.append(pieces)
+        parents.append(rows[cut])
+        inner.append(np.full(len(pieces), side == 1))
     cells, parent = np.concatenate(halves), np.concatenate(parents)
     points = np.concatenate([points, places])
     turned = signed_volumes(points[cells]) < 0
@@ -245,14 +242,10 @@ def _extended(owner, features: Features, sides: Sides, points):
     new = Sides(base + sides.point[several], sides.field[several], sides.along[several])
     ridge = np.concatenate([features.ridge, count > 1])
     corner = np.concatenate([features.corner, count > 2])
-    return owner, Features(
-        joined(features.sides, new) if several.any() else features.sides, ridge, corner, points
-    )
+    return owner, Features(joined(features.sides, new), ridge, corner, points)
 
 
 def whole(points, cells, skin, features: Features) -> Parts:
     """A mesh without further shapes."""
-    owner = np.where(skin, 0, -1)
-    sides = features.sides if len(features.sides.point) else no_sides()
     within = np.zeros((len(cells), 0), bool)
-    return Parts(points, cells, owner, features._replace(sides=sides), within)
+    return Parts(points, cells, np.where(skin, 0, -1), features, within)

@@ -18,7 +18,7 @@ from sorojax.sdf.sampling import values
 _SNAP_LONG, _SNAP_SHORT = 0.25, 0.41  # share of an edge within which a node is moved
 _SNAP_ANY = 0.25  # the same where edges of the lattice are of many lengths
 _MOST_CUBES = 2e7
-_EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+_EDGES = np.array(((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)))
 
 
 class Lattice(NamedTuple):
@@ -104,7 +104,7 @@ def _near_cubes(shape: AbstractSdf, start, count, pitch: float) -> np.ndarray:
 
 def unique_edges(cells: np.ndarray, num_nodes: int) -> np.ndarray:
     """Distinct edges of tetrahedra, smaller node first."""
-    ends = np.concatenate([cells[:, list(e)] for e in _EDGES])
+    ends = np.concatenate([cells[:, e] for e in _EDGES])
     keys = np.unique(ends.min(axis=1) * np.int64(num_nodes) + ends.max(axis=1))
     return np.stack(np.divmod(keys, num_nodes), axis=1)
 
@@ -152,7 +152,8 @@ def snap(shape: AbstractSdf, points, f, cells, pitch: float | None):
 
 
 def clip(shape: AbstractSdf, points, f, cells):
-    """The part of the tetrahedra inside `shape`; on its surface, `(points, cells, skin)`."""
+    """The part of the tetrahedra inside `shape`: `(points, cells, skin)`, `skin` the nodes on
+    its surface; nodes outside are still among them."""
     sign = np.sign(f).astype(int)
     state = sign[cells]
     flat = (state == 0).all(axis=1)
@@ -172,20 +173,27 @@ def clip(shape: AbstractSdf, points, f, cells):
         key = np.minimum(p, q) * np.int64(base) + np.maximum(p, q)
         return base + np.searchsorted(keys, key)
 
-    order = np.argsort(sign[cut], axis=1, kind="stable")
-    cut = np.take_along_axis(cut, order, axis=1)
-    parts = [whole]
-    inside, on = (sign[cut] < 0).sum(axis=1), (sign[cut] == 0).sum(axis=1)
-    for m, z in {*zip(inside.tolist(), on.tolist(), strict=True)}:
-        parts += inside_part(*cut[(inside == m) & (on == z)].T, m, z, middle)
-    cells = np.concatenate(parts)
+    cells = np.concatenate([whole, inside_parts(cut, sign, middle)[0]])
     skin = np.concatenate([sign == 0, np.ones(len(crossing), bool)])
-    points = np.concatenate([points, crossing])
-    used, number = np.unique(cells, return_inverse=True)
-    return points[used], number.reshape(-1, 4), skin[used]
+    return np.concatenate([points, crossing]), cells, skin
 
 
-def inside_part(a, b, c, d, inside: int, on: int, middle) -> list[np.ndarray]:
+def inside_parts(cells, sign, middle) -> tuple[np.ndarray, np.ndarray]:
+    """Tetrahedra of the parts of `cells` where `sign` of their nodes is below zero, and which
+    cell each is of; `middle(p, q)` is the node between two of unlike sign."""
+    order = np.argsort(sign[cells], axis=1, kind="stable")
+    cells = np.take_along_axis(cells, order, axis=1)
+    inside, on = (sign[cells] < 0).sum(axis=1), (sign[cells] == 0).sum(axis=1)
+    parts, rows = [cells[:0]], [np.zeros(0, int)]
+    for m, z in {*zip(inside.tolist(), on.tolist(), strict=True)}:
+        mine = np.flatnonzero((inside == m) & (on == z))
+        found = _inside_part(*cells[mine].T, m, z, middle)
+        parts += found
+        rows += [mine] * len(found)
+    return np.concatenate(parts), np.concatenate(rows)
+
+
+def _inside_part(a, b, c, d, inside: int, on: int, middle) -> list[np.ndarray]:
     """Corners sorted inside, on, outside: the tetrahedra of the inside."""
     if inside == 1:
         others = [x if k < on else middle(a, x) for k, x in enumerate((b, c, d))]
@@ -229,7 +237,7 @@ def wedge(*corners: np.ndarray) -> list[np.ndarray]:
 # Numbers of tetrahedra: volumes, dihedral angles, radius ratios
 
 
-_FACES = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))  # opposite to each corner, outward
+FACES = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))  # opposite to each corner, outward
 
 
 def signed_volumes(x: np.ndarray) -> np.ndarray:
@@ -241,7 +249,7 @@ def signed_volumes(x: np.ndarray) -> np.ndarray:
 def dihedral_cosines(x: np.ndarray) -> np.ndarray:
     """Cosines of the six dihedral angles, (cells, 6)."""
     normals = []
-    for i, j, k in _FACES:
+    for i, j, k in FACES:
         n = np.cross(x[:, j] - x[:, i], x[:, k] - x[:, i])
         normals.append(n / np.maximum(np.sqrt((n * n).sum(axis=1)), 1e-300)[:, None])
     pairs = [(i, j) for i in range(4) for j in range(i)]
@@ -270,7 +278,7 @@ def radius_ratios(x: np.ndarray) -> np.ndarray:
     volume = np.abs(signed_volumes(x))
     faces = sum(
         np.linalg.norm(np.cross(x[:, j] - x[:, i], x[:, k] - x[:, i]), axis=1) / 2
-        for i, j, k in _FACES
+        for i, j, k in FACES
     )
     turns = ((a, b, c), (b, c, a), (c, a, b))
     center = sum((u * u).sum(axis=1)[:, None] * np.cross(v, w) for u, v, w in turns)
@@ -281,7 +289,6 @@ def radius_ratios(x: np.ndarray) -> np.ndarray:
 # A lattice of tetrahedra graded by bisection of longest edges
 
 
-_TET_EDGES = np.array(((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)))
 _COARSE = 1.12  # pitch of a cell over the wanted one: a bisection takes it to 0.9
 _UNIT = 2**12  # steps per cube: lengths are compared as whole numbers
 _MOST_CELLS = 10_000_000
@@ -328,7 +335,7 @@ class _Parts:
         return self.start + self.step * self.at
 
     def _keys(self, cells: np.ndarray) -> np.ndarray:
-        pairs = np.sort(cells[:, _TET_EDGES], axis=2)
+        pairs = np.sort(cells[:, _EDGES], axis=2)
         return pairs[..., 0] << 32 | pairs[..., 1]
 
     def pitches(self) -> np.ndarray:
@@ -349,7 +356,7 @@ class _Parts:
     def bisect(self, split: np.ndarray) -> None:
         cells, rows = self.cells[split], np.arange(int(split.sum()))
         keys, x = self._keys(cells), self.at[cells]
-        gap = x[:, _TET_EDGES[:, 0]] - x[:, _TET_EDGES[:, 1]]
+        gap = x[:, _EDGES[:, 0]] - x[:, _EDGES[:, 1]]
         square = (gap * gap).sum(axis=2)
         # Of edges of one length the same is taken from every side.
         longest = np.where(square == square.max(axis=1, keepdims=True), keys, -1).argmax(axis=1)
@@ -365,7 +372,7 @@ class _Parts:
         self.ends, self.middle = ends[order], middle[order]
         node = self.middle[np.searchsorted(self.ends, own)]
         halves = [cells.copy(), cells.copy()]
-        for half, end in zip(halves, _TET_EDGES[longest].T, strict=True):
+        for half, end in zip(halves, _EDGES[longest].T, strict=True):
             half[rows, end] = node
         self.cells = np.concatenate([self.cells[~split], *halves])
         self._drop()

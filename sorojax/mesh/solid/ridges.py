@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sorojax.mesh.elements.simplex import Tet4
 from sorojax.mesh.motion.boundary import (
     SETTLE_ZOOMS as ZOOMS,
     Sides,
@@ -16,11 +17,10 @@ from sorojax.mesh.motion.boundary import (
     settle,
 )
 from sorojax.mesh.sizes import Sizes
-from sorojax.mesh.solid.lattice import badness
+from sorojax.mesh.solid.lattice import badness, signed_volumes
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.sampling import values, values_and_gradients
+from sorojax.sdf.sampling import normals, values
 
-_FACES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2))
 _TURN = np.cos(np.deg2rad(20.0))  # of the normal that makes a ridge
 _TOUCH = 0.02  # of the way to the next triangle: nodes that near to a ridge are on it
 _SOLID = 0.05  # least volume of three unit normals that make a corner
@@ -31,7 +31,7 @@ _SLIM = 0.12  # least height of a triangle of ridge nodes over its longest side
 
 def boundary_triangles(cells: np.ndarray) -> np.ndarray:
     """Faces of one tetrahedron only, counter-clockwise from outside."""
-    faces = np.concatenate([cells[:, list(f)] for f in _FACES])
+    faces = np.concatenate([cells[:, list(f)] for f in Tet4.facets])
     rows = np.sort(faces, axis=1).astype(np.int64)
     n = rows.max(initial=0) + 1
     keys = np.unique(rows[:, 0] * n + rows[:, 1], return_inverse=True)[1] * n + rows[:, 2]
@@ -91,11 +91,6 @@ def _independent(normals: np.ndarray) -> list[int]:
     return [0, second, third] if solid[third] > _SOLID else [0, second]
 
 
-def _volumes(x: np.ndarray) -> np.ndarray:
-    a, b, c = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0], x[:, 3] - x[:, 0]
-    return (a * np.cross(b, c)).sum(axis=1)
-
-
 class Snapper:
     """Host state while nodes are put on ridges one after the other.
 
@@ -116,15 +111,11 @@ class Snapper:
         nodes = np.unique(triangles)
         self.skin = np.zeros(len(points), bool)
         self.skin[nodes] = True
-        self.normal[nodes] = self._normals(points[nodes])[:, None]
+        self.normal[nodes] = normals(shape, points[nodes])[:, None]
         a, b = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
         edges = np.stack([a, b], axis=1)[a < b]
         n = self.normal[edges, 0]
         self.edges = edges[(n[:, 0] * n[:, 1]).sum(axis=1) < _TURN]
-
-    def _normals(self, p: np.ndarray) -> np.ndarray:
-        g = values_and_gradients(self.shape, p)[1]
-        return g / np.maximum(np.linalg.norm(g, axis=1, keepdims=True), 1e-9)
 
     def snap_touching(self) -> None:
         """Nodes that lie on a ridge already have more sides than their own normal tells."""
@@ -137,11 +128,10 @@ class Snapper:
             self.points[node] + _TOUCH * (m - self.points[node])
             for node, m in zip(nodes, middle, strict=True)
         ]
-        normals = np.split(
-            self._normals(np.concatenate(near)), np.cumsum([len(m) for m in middle])[:-1]
-        )
+        every = normals(self.shape, np.concatenate(near))
+        ways = np.split(every, np.cumsum([len(m) for m in middle])[:-1])
         found = []
-        for node, m, n in zip(nodes, middle, normals, strict=True):
+        for node, m, n in zip(nodes, middle, ways, strict=True):
             picked = _independent(n)
             if len(picked) > 1:
                 rows = [*picked, *picked][:3]
@@ -177,7 +167,7 @@ class Snapper:
         x, n, good = _meeting(self.shape, seen, start, pitch)
         done = self.points[self.corner]
         parts = (x[good], triangles[good], seen[good], n[good], pitch[good])
-        for place, group, sides, normals, near in zip(*parts, strict=True):
+        for place, group, sides, ways, near in zip(*parts, strict=True):
             if len(done) and np.linalg.norm(done - place, axis=1).min() < 1e-3 * near:
                 continue
             done = np.concatenate([done, place[None]])
@@ -186,7 +176,7 @@ class Snapper:
             free &= ~self.corner[group]
             if free.any():
                 node = group[np.argmin(np.where(free, gap, np.inf))]
-                self._put(node, place, sides, normals)
+                self._put(node, place, sides, ways)
                 self.corner[node] = True
 
     def snap_ridges(self) -> None:
@@ -257,18 +247,18 @@ class Snapper:
                 return False
         cells = self.cells_around(node)
         x = self.points[cells]
-        old = _volumes(x)
-        new = _volumes(np.where((cells == node)[..., None], place, x))
+        old = 6 * signed_volumes(x)
+        new = 6 * signed_volumes(np.where((cells == node)[..., None], place, x))
         # A cell of the surface alone may become flat: it is taken away.
         flat = self.skin[cells].all(axis=1) & (new > -_FLAT * self.pitch[node] ** 3)
         return bool((flat | (new > _LEFT * old)).all())
 
-    def _put(self, node: int, place, seen: np.ndarray, normals: np.ndarray) -> None:
+    def _put(self, node: int, place, seen: np.ndarray, ways: np.ndarray) -> None:
         count = len(seen)
         self.parts[int(node)] = Sides(np.full(count, node), np.zeros(count, int), seen - place)
         self.points[node], self.ridge[node] = place, True
         self.seen[node] = seen[[0, 1, -1]]
-        self.normal[node] = normals[[0, 1, -1]]
+        self.normal[node] = ways[[0, 1, -1]]
 
     def sides(self) -> Sides:
         """The sides of all nodes on ridges."""
@@ -315,22 +305,10 @@ def sharpen(shape: AbstractSdf, points, cells, skin, size: Sizes):
         found.snap_corners()
         found.snap_ridges()
         edges, places = found.left() if turn < _TURNS else ([], [])
-        points = found.points
-        if not len(edges):
-            return (
-                points,
-                cells,
-                skin,
-                Features(found.sides(), found.ridge, found.corner, before),
-            )
-        points, cells = split_edges(points, cells, edges, places)
+        points, cells = split_edges(found.points, cells, edges, places)
         if len(points) == len(skin):
-            return (
-                points,
-                cells,
-                skin,
-                Features(found.sides(), found.ridge, found.corner, before),
-            )
+            features = Features(found.sides(), found.ridge, found.corner, before)
+            return points, cells, skin, features
         fresh = points[len(skin) :]
         skin = np.concatenate([skin, np.ones(len(fresh), bool)])
         before = np.concatenate([before, fresh])
@@ -342,7 +320,7 @@ def split_edges(points, cells, edges, places) -> tuple[np.ndarray, np.ndarray]:
     around = Around(cells, len(points))
     taken = np.zeros(len(cells), bool)
     halves, fresh = [], []
-    for (a, b), place in zip(edges.tolist(), places, strict=True):
+    for (a, b), place in zip(edges, places, strict=True):
         rows = np.intersect1d(around.rows_of(a), around.rows_of(b))
         x = points[cells[rows]]
         parts = [np.where((cells[rows] == old)[..., None], place, x) for old in (a, b)]

@@ -7,14 +7,14 @@ from typing import NamedTuple
 import numpy as np
 
 from sorojax import _check
-from sorojax._progress import report
 from sorojax._types import real
 from sorojax.mesh.elements.base import nodes as reference_nodes, quadrature, shape_gradients
 from sorojax.mesh.elements.simplex import Tet4, Tet10
-from sorojax.mesh.mesh import Mesh, boundary_facets, with_side_nodes
+from sorojax.mesh.mesh import Mesh, boundary_facets, nodes_between, with_side_nodes
 from sorojax.mesh.motion.boundary import SETTLE_ZOOMS as ZOOMS, Sides, normals_near, settle
 from sorojax.mesh.motion.move import movable
 from sorojax.mesh.motion.plan import surface_sides
+from sorojax.mesh.plane.delaunay import Mover, relocate
 from sorojax.mesh.resolution import (
     NotResolved,
     check_resolved,
@@ -25,6 +25,7 @@ from sorojax.mesh.resolution import (
 from sorojax.mesh.sizes import SizeFunction, Sizes, constant, sizes
 from sorojax.mesh.solid.interfaces import Parts, insert, whole
 from sorojax.mesh.solid.lattice import (
+    FACES,
     badness,
     clip,
     dihedral_cosines,
@@ -48,7 +49,6 @@ from sorojax.sdf.sampling import (
 # Flat tetrahedra at the surface taken away, as an exchange of a diagonal of the surface.
 
 
-_FACES = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))  # opposite to each corner
 _FLAT = np.cos(np.deg2rad(178.0))  # cosine of the angle between two faces that are one plane
 
 
@@ -68,7 +68,7 @@ def peel(points, cells, skin: np.ndarray, poor: float, rounds: int = 4) -> np.nd
 
 
 def _removable(points, cells, flat) -> list[int]:
-    faces = np.sort(np.concatenate([cells[:, list(f)] for f in _FACES]), axis=1)
+    faces = np.sort(np.concatenate([cells[:, list(f)] for f in FACES]), axis=1)
     rows = np.unique(faces, axis=0, return_inverse=True)[1].ravel()
     single = (np.bincount(rows) == 1)[rows].reshape(4, -1).T
     outer = np.sort(faces[single.T.ravel()], axis=1)
@@ -80,7 +80,7 @@ def _removable(points, cells, flat) -> list[int]:
             continue
         # The new side joins the corners opposite to the two faces.
         new = tuple(sorted(corners[free].tolist()))
-        normals = [_normal(points[corners[list(_FACES[k])]]) for k in free]
+        normals = [_normal(points[corners[list(FACES[k])]]) for k in free]
         if new in sides or normals[0] @ normals[1] < -_FLAT:
             continue
         gone.append(int(cell))
@@ -96,7 +96,6 @@ def _normal(x: np.ndarray) -> np.ndarray:
 # Better places for the nodes of the worst tetrahedra
 
 
-_STEPS = (0.08, 0.2)  # of the edges: how far a node is tried away from its place
 _SAME_SIDE = 0.8  # least cosine between normals before and after: nodes cross no ridge
 _LANDED = 1 - 1e-6  # cosine between the slopes before and after a landing beside a ridge
 _ABREAST = (0.1, 0.01, 1e-3, 1e-4)  # zooms for nodes that are near their ridge already
@@ -112,82 +111,23 @@ class Surface(NamedTuple):
 
 
 def improve(surface: Surface, points, cells, rounds: int, enough: float) -> np.ndarray:
-    """`points` with the nodes of cells worse than `enough` [rad] moved where that helps.
+    """`points` with the nodes of cells worse than `enough` [rad] moved where that helps:
+    nodes of the surface on it, those of ridges on both sides, corners not at all."""
+    features = surface.features
 
-    In each round a set of nodes without common cells is moved, each to the best of a
-    few places; nodes of the surface stay on it, those of ridges on both sides, and
-    corners where they are.
-    """
-    points, limit = points.copy(), np.cos(enough)
-    owner = np.argsort(cells.ravel(), kind="stable") // 4
-    start = np.searchsorted(np.sort(cells.ravel()), np.arange(len(points) + 1))
-    bad = badness(points[cells])
-    for i in range(rounds):
-        movers = _independent(cells, bad, limit, i, surface.features.corner)
-        if not len(movers):
-            report("tetrahedralise", rounds, rounds)
-            break
-        ball, row = _balls(owner, start, movers)
-        places = _places(surface, points, cells[ball], row, movers)
-        worst = np.zeros(places.shape[:2])
-        x = points[cells[ball]]
-        at = np.argmax(cells[ball] == movers[row][:, None], axis=1)
-        lines = np.arange(len(ball))
-        for k in range(places.shape[0]):
-            x[lines, at] = places[k, row]
-            np.maximum.at(worst[k], row, badness(x))
-        best = worst.argmin(axis=0)
-        better = worst[best, np.arange(len(movers))] < worst[0] - 1e-9
-        points[movers[better]] = places[best, np.arange(len(movers))][better]
-        bad[ball] = badness(points[cells[ball]])
-        report("tetrahedralise", i + 1, rounds, moved=int(better.sum()))
-    return points
+    def rank(worst, random):
+        return worst + 0.2 * random
 
+    def hold(places, movers, reach, row, ball) -> None:
+        ridge, beside = features.ridge[movers], np.zeros(len(movers), bool)
+        np.logical_or.at(beside, row, features.ridge[ball].any(axis=1))
+        for i, field in enumerate(surface.fields):
+            _hold_on_skin(field, places, (surface.owner[movers] == i) & ~ridge, beside)
+        _hold_on_ridges(surface, places, movers, ridge, reach[:, 0])
 
-def _independent(cells, bad, limit: float, turn: int, fixed: np.ndarray) -> np.ndarray:
-    """Nodes of the worst cells, no two in one cell; other ones at every turn."""
-    rng = np.random.default_rng(turn)  # only breaks ties: the result is reproducible
-    count = len(fixed)
-    score = np.zeros(count)
-    poor = np.flatnonzero(bad > limit)
-    np.maximum.at(score, cells[poor].ravel(), np.repeat(bad[poor], 4))
-    score = np.where((score > 0) & ~fixed, score + 0.2 * rng.random(count), 0.0)
-    top = score[cells].max(axis=1)
-    beaten = np.zeros(count, bool)
-    lower = (score[cells] < top[:, None]) & (top > 0)[:, None]
-    beaten[cells[lower]] = True
-    return np.flatnonzero((score > 0) & ~beaten)
-
-
-def _balls(owner, start, movers):
-    """Cells around each mover in one list, and which mover each belongs to."""
-    count = start[movers + 1] - start[movers]
-    row = np.repeat(np.arange(len(movers)), count)
-    offset = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
-    return owner[start[movers][row] + offset], row
-
-
-def _places(surface: Surface, points, ball_cells, row, movers) -> np.ndarray:
-    """Places to try, (tries, movers, 3); the first is where the node is."""
-    here = points[movers]
-    total, reach = np.zeros_like(here), np.zeros(len(here))
-    np.add.at(total, row, points[ball_cells].sum(axis=1) - here[row])
-    count = np.bincount(row, minlength=len(movers))
-    mean = total / (3 * count)[:, None]
-    gaps = np.linalg.norm(points[ball_cells] - here[row][:, None], axis=2).sum(axis=1)
-    np.add.at(reach, row, gaps)
-    reach = (reach / (3 * count))[:, None]
-    tries = [here, here + 0.5 * (mean - here), mean]
     axes = np.concatenate([np.eye(3), -np.eye(3)])
-    tries += [here + s * reach * axis for s in _STEPS for axis in axes]
-    places = np.stack(tries)
-    ridge = surface.features.ridge[movers]
-    beside = np.zeros(len(movers), bool)
-    np.logical_or.at(beside, row, surface.features.ridge[ball_cells].any(axis=1))
-    for i, field in enumerate(surface.fields):
-        _hold_on_skin(field, places, (surface.owner[movers] == i) & ~ridge, beside)
-    _hold_on_ridges(surface, places, movers, ridge, reach[:, 0])
-    return places
+    mover = Mover("tetrahedralise", badness, np.cos(enough), rank, axes, (0.08, 0.2))
+    return relocate(mover, points, cells, features.corner, rounds, hold)
 
 
 def _hold_on_skin(shape: AbstractSdf, places, on: np.ndarray, beside: np.ndarray) -> None:
@@ -239,7 +179,6 @@ def _hold_on_ridges(surface: Surface, places, movers, on: np.ndarray, reach) -> 
 # Ten-node tetrahedra on a shape, and the named sets of a solid mesh.
 
 
-_SIDES = ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))  # of the mid-side nodes
 _LEAST = 0.1  # least det dx/dxi over that of the straight cell
 
 
@@ -269,33 +208,23 @@ def solid_mesh(fields: tuple[AbstractSdf, ...], parts: Parts, order: int) -> Mes
 def _curved(fields, parts: Parts, facets, ridge):
     """Ten-node cells; mid-sides of the surfaces on them where all their cells stay valid."""
     straight, ten = with_side_nodes(parts.points, parts.cells, Tet10())
-    n = len(parts.points)
-    six = [_with_middles(own, ten, n, len(straight)) for own in facets]
+    sides = [np.stack([own, np.roll(own, -1, axis=1)], axis=-1) for own in facets]
+    middles = [nodes_between(ten, Tet10(), ends) for ends in sides]
+    six = [np.concatenate(both, axis=1) for both in zip(facets, middles, strict=True)]
     x = straight.copy()
     for field, own in zip(fields[::-1], six[::-1], strict=True):
         surface = np.unique(own[:, 3:])
         x[surface] = land(field, straight[surface])
     every, owner = np.concatenate(six), np.repeat(np.arange(len(six)), list(map(len, six)))
-    rim, sides, on_ridge = _rims(straight, every, owner, ridge)
+    rim, beside, on_ridge = _rims(straight, every, owner, ridge)
     if len(rim):
-        x[rim] = settle(fields, straight[rim], sides, (1.0, *ZOOMS))
+        x[rim] = settle(fields, straight[rim], beside, (1.0, *ZOOMS))
     for _ in range(20):
         folded = np.unique(ten[_least_jacobian(x[ten]) < _LEAST, 4:])
         if not len(folded):
             break
         x[folded] = straight[folded]
     return x, ten, six, rim[on_ridge]
-
-
-def _with_middles(faces, ten, n: int, count: int) -> np.ndarray:
-    """Triangles of corner nodes with the mid-side nodes of their sides."""
-    sides = np.concatenate([ten[:, [a, b, 4 + k]] for k, (a, b) in enumerate(_SIDES)])
-    keys = sides[:, :2].min(axis=1) * np.int64(count) + sides[:, :2].max(axis=1)
-    order = np.argsort(keys)
-    ends = np.stack([faces, np.roll(faces, -1, axis=1)])
-    wanted = ends.min(axis=0) * np.int64(count) + ends.max(axis=0)
-    middles = sides[order, 2][np.searchsorted(keys[order], wanted)]
-    return np.concatenate([faces, middles.reshape(-1, 3)], axis=1)
 
 
 def _rims(x, facets, owner, ridge) -> tuple[np.ndarray, Sides, np.ndarray]:

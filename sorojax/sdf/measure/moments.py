@@ -439,19 +439,12 @@ def volume(shape: AbstractSdf, resolution: int = 128) -> Float[Array, ""]:
         Min and Gibou, Geometric integration over irregular domains with application to
         level-set methods, J. Comput. Phys. 226, 2007, for the cut cells.
     """
-    rule = _solid_rule("volume", shape, resolution, 0)
+    rule = _rule("volume", shape, 3, resolution, 0)
     return frame(shape, rule.resolution)[1] ** 3 * moments(shape, rule)[0]
 
 
-def solid_centroid(shape: AbstractSdf, resolution: int = 128) -> Float[Array, "3"]:
-    """Centroid [m] of a solid shape, differentiable as `volume` is."""
-    rule = _solid_rule("centroid", shape, resolution, 1)
-    m = moments(shape, rule)
-    return middle_of_mass(m, *frame(shape, rule.resolution))
-
-
 @jax.jit
-def middle_of_mass(
+def _middle_of_mass(
     m: Float[Array, " moments"], middle: Float[Array, " dim"], size: Float[Array, ""]
 ) -> Float[Array, " dim"]:
     """Centroid [m] from moments in cells of `size` [m] about `middle` [m]."""
@@ -468,7 +461,7 @@ def inertia_tensor(
         density: Mass per volume [kg/m^3].
         resolution: Cells along the longest side of its bounding box.
     """
-    rule = _solid_rule("inertia_tensor", shape, resolution, 2)
+    rule = _rule("inertia_tensor", shape, 3, resolution, 2)
     size = frame(shape, rule.resolution)[1]
     return real(density) * _inertia(moments(shape, rule), size)
 
@@ -483,11 +476,16 @@ def _inertia(m: Float[Array, "10"], size: Float[Array, ""]) -> Float[Array, "3 3
     return size**5 * (jnp.trace(second) * identity - second)
 
 
-def _solid_rule(where: str, shape: AbstractSdf, resolution: int, order: int) -> Rule:
-    if shape.dim != 3:
+_INSTEAD = {
+    2: "sdf.volume, sdf.centroid and sdf.inertia_tensor for solids",
+    3: "sdf.area, sdf.centroid and sdf.second_moments for plane shapes",
+}
+
+
+def _rule(where: str, shape: AbstractSdf, dim: int, resolution: int, order: int) -> Rule:
+    if shape.dim != dim:
         raise ValueError(
-            f"{where}: the shape is {shape.dim}-D, need 3-D. Use sdf.area, sdf.centroid and "
-            "sdf.second_moments for plane shapes."
+            f"{where}: the shape is {shape.dim}-D, need {dim}-D. Use {_INSTEAD[dim]}."
         )
     if not 8 <= resolution <= 1024:
         raise ValueError(
@@ -527,16 +525,14 @@ def area(shape: AbstractSdf) -> Float[Array, ""]:
         Min and Gibou, Geometric integration over irregular domains with application to
         level-set methods, J. Comput. Phys. 226, 2007.
     """
-    m = moments(shape, _rule("area", shape, 0))
+    m = moments(shape, _rule("area", shape, 2, _CELLS, 0))
     return frame(shape, _CELLS)[1] ** 2 * m[0]
 
 
 def centroid(shape: AbstractSdf) -> Float[Array, " dim"]:
     """Centroid [m] of a shape, differentiable as `area` and, in space, `volume` are."""
-    if shape.dim == 3:
-        return solid_centroid(shape)
-    m = moments(shape, _rule("centroid", shape, 1))
-    return middle_of_mass(m, *frame(shape, _CELLS))
+    rule = _rule("centroid", shape, shape.dim, _CELLS if shape.dim == 2 else 128, 1)
+    return _middle_of_mass(moments(shape, rule), *frame(shape, rule.resolution))
 
 
 def second_moments(shape: AbstractSdf) -> Float[Array, "2 2"]:
@@ -544,7 +540,7 @@ def second_moments(shape: AbstractSdf) -> Float[Array, "2 2"]:
 
     Entry (0, 0) is that of x^2, which resists bending in x; the trace is the polar moment.
     """
-    m = moments(shape, _rule("second_moments", shape, 2))
+    m = moments(shape, _rule("second_moments", shape, 2, _CELLS, 2))
     return _second(m, frame(shape, _CELLS)[1])
 
 
@@ -553,12 +549,3 @@ def _second(m: Float[Array, "6"], size: Float[Array, ""]) -> Float[Array, "2 2"]
     """About the centroid [m^4], from moments in cells of `size` [m]."""
     xx, yy, xy = m[3:] - jnp.stack([m[1] * m[1], m[2] * m[2], m[1] * m[2]]) / m[0]
     return size**4 * jnp.stack([xx, xy, xy, yy]).reshape(2, 2)
-
-
-def _rule(where: str, shape: AbstractSdf, order: int) -> Rule:
-    if shape.dim != 2:
-        raise ValueError(
-            f"{where}: the shape is {shape.dim}-D, need 2-D. Use sdf.volume, sdf.centroid and "
-            "sdf.inertia_tensor for solids."
-        )
-    return Rule(where, _CELLS, order)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.sampling import values_and_gradients
+from sorojax.sdf.sampling import unit, values_and_gradients
 from sorojax.sdf.surface.blocks import Grid
 from sorojax.sdf.surface.marching import Surface
 
@@ -298,18 +298,15 @@ def _corners(field, vertices: np.ndarray, shift: np.ndarray) -> Nodes:
     t = vertices[rows, axis] - start[rows, axis]
     # Marching cubes puts a few vertices inside cells: those move along the slope.
     start[inner], t[inner] = vertices[inner], 0.0
-    slope = field(vertices[inner] + shift)[1]
-    direction[inner] = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-300)
+    direction[inner] = unit(field(vertices[inner] + shift)[1])
     low, high = np.where(inner, -1.0, 0.0), np.ones(len(t))
     return _roots(field, start + shift, direction, low, high, t)
 
 
 def _above(field, points: np.ndarray) -> Nodes:
     """Where lines through `points` along the slope there meet the surface."""
-    slope = field(points)[1]
-    direction = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-300)
     reach = np.ones(len(points))
-    return _roots(field, points, direction, -reach, reach, 0 * reach)
+    return _roots(field, points, unit(field(points)[1]), -reach, reach, 0 * reach)
 
 
 def _roots(field, start, direction, low, high, t) -> Nodes:

@@ -3,7 +3,7 @@
 import abc
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._types import real
 from sorojax.sdf.base import (
+    AbstractByLevel,
     AbstractSdf,
     Box,
     Exactness,
@@ -38,7 +39,17 @@ def hull(boxes: list[Box], low: Callable, high: Callable) -> Box:
     return lower, functools.reduce(high, (box[1] for box in boxes))
 
 
-class AbstractCombination(AbstractSdf):
+def around(shapes: Sequence[AbstractSdf], level: Number) -> Box:
+    """The box of all `shapes` below `level` [m]."""
+    return hull([shape.level_box(level) for shape in shapes], jnp.minimum, jnp.maximum)
+
+
+def common(shapes: Sequence[AbstractSdf], level: Number) -> Box:
+    """The box that those of all `shapes` below `level` [m] have in common."""
+    return hull([shape.level_box(level) for shape in shapes], jnp.maximum, jnp.minimum)
+
+
+class AbstractCombination(AbstractByLevel):
     """Several `shapes` of one dimension as one."""
 
     shapes: tuple[AbstractSdf, ...] = eqx.field(converter=tuple)
@@ -54,9 +65,6 @@ class AbstractCombination(AbstractSdf):
     def lipschitz(self) -> Number:
         return steepest(*(shape.lipschitz for shape in self.shapes))
 
-    def bounding_box(self) -> Box:
-        return self.level_box(0.0)
-
 
 class Union(AbstractCombination):
     """Inside any of `shapes`; the distance is exact outside them."""
@@ -69,8 +77,7 @@ class Union(AbstractCombination):
         return functools.reduce(minimum, (shape.distance(*x) for shape in self.shapes))
 
     def level_box(self, level) -> Box:
-        boxes = [shape.level_box(level) for shape in self.shapes]
-        return hull(boxes, jnp.minimum, jnp.maximum)
+        return around(self.shapes, level)
 
 
 class Intersection(AbstractCombination):
@@ -84,11 +91,10 @@ class Intersection(AbstractCombination):
         return functools.reduce(maximum, (shape.distance(*x) for shape in self.shapes))
 
     def level_box(self, level) -> Box:
-        boxes = [shape.level_box(level) for shape in self.shapes]
-        return hull(boxes, jnp.maximum, jnp.minimum)
+        return common(self.shapes, level)
 
 
-class Difference(AbstractSdf):
+class Difference(AbstractByLevel):
     """Inside `base` and outside `removed`."""
 
     base: AbstractSdf
@@ -111,9 +117,6 @@ class Difference(AbstractSdf):
 
     def distance(self, *x):
         return maximum(self.base.distance(*x), -self.removed.distance(*x))
-
-    def bounding_box(self) -> Box:
-        return self.base.bounding_box()
 
     def level_box(self, level) -> Box:
         return self.base.level_box(level)
@@ -229,18 +232,14 @@ class Chamfer(AbstractBlend):
         return minimum(minimum(a, b), (a + b - k) * math.sqrt(0.5))
 
 
-class AbstractBlended(AbstractSdf):
-    """Two shapes joined by a blend of width `k` [m]."""
+class AbstractPair(AbstractByLevel):
+    """Two shapes of one dimension as one."""
 
     first: AbstractSdf
     second: AbstractSdf
-    k: Float[Array, ""] = eqx.field(converter=real)
-    blend: AbstractBlend = Quadratic()
 
     def __check_init__(self):
-        where = type(self).__name__
-        check_same_dim(where, (self.first, self.second))
-        _check.positive(where, "k", self.k, "m", "Use `|`, `&` or `-` for a sharp edge.")
+        check_same_dim(type(self).__name__, (self.first, self.second))
 
     @property
     def dim(self) -> int:
@@ -248,14 +247,22 @@ class AbstractBlended(AbstractSdf):
 
     @property
     def lipschitz(self) -> Number:
-        slope = steepest(self.first.lipschitz, self.second.lipschitz)
-        return slope * self.blend.slope
+        return steepest(self.first.lipschitz, self.second.lipschitz)
 
-    @abc.abstractmethod
-    def level_box(self, level: Number) -> Box: ...
 
-    def bounding_box(self) -> Box:
-        return self.level_box(0.0)
+class AbstractBlended(AbstractPair):
+    """Two shapes joined by a blend of width `k` [m]."""
+
+    k: Float[Array, ""] = eqx.field(converter=real)
+    blend: AbstractBlend = Quadratic()
+
+    def __check_init__(self):
+        where = type(self).__name__
+        _check.positive(where, "k", self.k, "m", "Use `|`, `&` or `-` for a sharp edge.")
+
+    @property
+    def lipschitz(self) -> Number:
+        return super().lipschitz * self.blend.slope
 
 
 class SmoothUnion(AbstractBlended):
@@ -287,9 +294,7 @@ class SmoothUnion(AbstractBlended):
         return self.blend(self.first.distance(*x), self.second.distance(*x), self.k)
 
     def level_box(self, level) -> Box:
-        level = level + self.blend.dip * self.k
-        boxes: list[Box] = [self.first.level_box(level), self.second.level_box(level)]
-        return hull(boxes, jnp.minimum, jnp.maximum)
+        return around((self.first, self.second), level + self.blend.dip * self.k)
 
 
 class SmoothIntersection(AbstractBlended):
@@ -299,8 +304,7 @@ class SmoothIntersection(AbstractBlended):
         return -self.blend(-self.first.distance(*x), -self.second.distance(*x), self.k)
 
     def level_box(self, level) -> Box:
-        boxes: list[Box] = [self.first.level_box(level), self.second.level_box(level)]
-        return hull(boxes, jnp.maximum, jnp.minimum)
+        return common((self.first, self.second), level)
 
 
 class SmoothDifference(AbstractBlended):

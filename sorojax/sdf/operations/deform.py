@@ -7,7 +7,6 @@ the box takes over. So one constant holds in the whole space.
 
 import abc
 import math
-from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
@@ -28,40 +27,48 @@ from sorojax.sdf.base import (
     quotient,
     steepest,
 )
-from sorojax.sdf.operations.booleans import check_same_dim, hull
+from sorojax.sdf.operations.booleans import AbstractPair, around
 from sorojax.sdf.operations.transform import AbstractWrapped
 
 _MARGIN = 0.1  # of the size of the shape, between it and the side of its domain
 
 
-def _domain(lower: Array, upper: Array) -> Box:
-    margin = _MARGIN * jnp.max(upper - lower)
-    return lower - margin, upper + margin
+class AbstractConfined(AbstractSdf):
+    """A solid changed by `rate` along z; the change is followed within a domain around it."""
+
+    shape: AbstractSdf
+    rate: Float[Array, ""] = eqx.field(converter=real)
+    dim: ClassVar[int] = 3
+
+    @abc.abstractmethod
+    def _domain(self) -> Box:
+        """Corners [m] of the domain, which holds the changed solid."""
+
+    @abc.abstractmethod
+    def _straight(self, x: Array, y: Array, z: Array) -> tuple[Array, Array, Array]:
+        """Where points of the domain are in the solid as it was."""
+
+    def distance(self, *x):
+        lower, upper = self._domain()
+        held = tuple(clip(c, lower[i], upper[i]) for i, c in enumerate(x))
+        beyond = norm(*(c - h for c, h in zip(x, held, strict=True)))
+        value = self.shape.distance(*self._straight(*held))
+        return jnp.where(beyond > 0, maximum(value, beyond), value)
+
+    def bounding_box(self) -> Box:
+        return self._domain()
+
+    def level_box(self, level) -> Box:
+        lower, upper = self._domain()
+        return lower - level, upper + level
 
 
-def _confined(field: Callable, domain: Box, x: tuple[Array, ...]) -> Array:
-    """`field` inside the domain; beyond it at the nearest point of it, or further."""
-    lower, upper = domain
-    held = tuple(clip(c, lower[i], upper[i]) for i, c in enumerate(x))
-    beyond = norm(*(c - h for c, h in zip(x, held, strict=True)))
-    value = field(*held)
-    return jnp.where(beyond > 0, maximum(value, beyond), value)
-
-
-def _grown(domain: Box, level: Number) -> Box:
-    return domain[0] - level, domain[1] + level
-
-
-class Twisted(AbstractSdf):
+class Twisted(AbstractConfined):
     """A solid twisted about z by `rate` [rad/m].
 
     The Lipschitz constant is that of the solid times a + sqrt(1 + a^2), the stretch of
     the simple shear 2 a = rate * radius at the corner of its domain.
     """
-
-    shape: AbstractSdf
-    rate: Float[Array, ""] = eqx.field(converter=real)
-    dim: ClassVar[int] = 3
 
     def _domain(self) -> Box:
         lower, upper = self.shape.bounding_box()
@@ -77,12 +84,9 @@ class Twisted(AbstractSdf):
         stretch = half + jnp.sqrt(1 + half * half)  # largest singular value of the shear
         return steepest(self.shape.lipschitz * number(stretch), 1.0)
 
-    def distance(self, x, y, z):
-        def field(x, y, z):
-            c, s = jnp.cos(self.rate * z), jnp.sin(self.rate * z)
-            return self.shape.distance(c * x + s * y, c * y - s * x, z)
-
-        return _confined(field, self._domain(), (x, y, z))
+    def _straight(self, x, y, z):
+        c, s = jnp.cos(self.rate * z), jnp.sin(self.rate * z)
+        return c * x + s * y, c * y - s * x, z
 
     def bounding_box(self) -> Box:
         domain, (lower, upper) = self._domain(), self.shape.bounding_box()
@@ -91,16 +95,9 @@ class Twisted(AbstractSdf):
             jnp.concatenate([domain[1][:2], upper[2:]]),
         )
 
-    def level_box(self, level) -> Box:
-        return _grown(self._domain(), level)
 
-
-class Tapered(AbstractSdf):
+class Tapered(AbstractConfined):
     """A solid whose section at height z is scaled by 1 + `rate` z, rate in 1/m."""
-
-    shape: AbstractSdf
-    rate: Float[Array, ""] = eqx.field(converter=real)
-    dim: ClassVar[int] = 3
 
     def __check_init__(self):
         lower, upper = self._domain()
@@ -118,10 +115,11 @@ class Tapered(AbstractSdf):
         margin = _MARGIN * (upper[2] - lower[2])
         ends = jnp.stack([lower[2] - margin, upper[2] + margin])
         most = jnp.max(1 + self.rate * ends)
-        wide_lower, wide_upper = _domain(lower, upper)
+        wide = _MARGIN * jnp.max(upper - lower)
+        low, high = lower[:2] - wide, upper[:2] + wide
         return (
-            jnp.stack([*(jnp.minimum(wide_lower[:2] * most, wide_lower[:2])), ends[0]]),
-            jnp.stack([*(jnp.maximum(wide_upper[:2] * most, wide_upper[:2])), ends[1]]),
+            jnp.stack([*jnp.minimum(low * most, low), ends[0]]),
+            jnp.stack([*jnp.maximum(high * most, high), ends[1]]),
         )
 
     @property
@@ -134,18 +132,9 @@ class Tapered(AbstractSdf):
         stretch = jnp.maximum(1.0, 1 / least) + shear
         return steepest(self.shape.lipschitz * number(stretch), 1.0)
 
-    def distance(self, x, y, z):
-        def field(x, y, z):
-            size = 1 + self.rate * z
-            return self.shape.distance(x / size, y / size, z)
-
-        return _confined(field, self._domain(), (x, y, z))
-
-    def bounding_box(self) -> Box:
-        return self._domain()
-
-    def level_box(self, level) -> Box:
-        return _grown(self._domain(), level)
+    def _straight(self, x, y, z):
+        size = 1 + self.rate * z
+        return x / size, y / size, z
 
 
 class Bent(AbstractWrapped):
@@ -241,38 +230,23 @@ def bend(shape: AbstractSdf, curvature: Numbers) -> Bent:
 # Shapes mixed, roughened and scaled by axis: bounds of the distance
 
 
-class Morph(AbstractSdf):
+class Morph(AbstractPair):
     """The mean of two fields: `first` at `fraction` 0, `second` at 1."""
 
-    first: AbstractSdf
-    second: AbstractSdf
     fraction: Float[Array, ""] = eqx.field(converter=real)
 
     def __check_init__(self):
-        check_same_dim("morph", (self.first, self.second))
         _check.between(
             "morph", "fraction", self.fraction, -1e-12, 1 + 1e-12, "", "Choose a mean."
         )
-
-    @property
-    def dim(self) -> int:
-        return self.first.dim
-
-    @property
-    def lipschitz(self) -> Number:
-        return steepest(self.first.lipschitz, self.second.lipschitz)
 
     def distance(self, *x):
         a, b = self.first.distance(*x), self.second.distance(*x)
         return a + self.fraction * (b - a)
 
-    def bounding_box(self) -> Box:
-        return self.level_box(0.0)
-
     def level_box(self, level) -> Box:
         # Where the mean is below the level, one of the two is.
-        boxes: list[Box] = [self.first.level_box(level), self.second.level_box(level)]
-        return hull(boxes, jnp.minimum, jnp.maximum)
+        return around((self.first, self.second), level)
 
 
 class AbstractRelief(eqx.Module):

@@ -1,6 +1,5 @@
 """Solids from plane shapes, and shapes mirrored, stretched and arranged in a circle."""
 
-import abc
 import functools
 import math
 from typing import ClassVar
@@ -15,6 +14,7 @@ from sorojax import _check
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import Numbers, real
 from sorojax.sdf.base import (
+    AbstractByLevel,
     AbstractSdf,
     Box,
     Exactness,
@@ -31,7 +31,7 @@ from sorojax.sdf.operations.transform import AbstractWrapped, repeat, turned_box
 from sorojax.sdf.shapes.bars import check_direction
 
 
-class AbstractFromProfile(AbstractSdf):
+class AbstractFromProfile(AbstractByLevel):
     """A solid made of a plane shape, as steep as it."""
 
     profile: AbstractSdf
@@ -40,12 +40,6 @@ class AbstractFromProfile(AbstractSdf):
     @property
     def lipschitz(self) -> Number:
         return self.profile.lipschitz
-
-    @abc.abstractmethod
-    def level_box(self, level: Number) -> Box: ...
-
-    def bounding_box(self) -> Box:
-        return self.level_box(0.0)
 
 
 class Extruded(AbstractFromProfile):

@@ -1,6 +1,5 @@
 """Shapes moved, scaled, thickened, hollowed and repeated."""
 
-import abc
 import functools
 import math
 from typing import TYPE_CHECKING, ClassVar
@@ -13,11 +12,21 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import Numbers, real
-from sorojax.sdf.base import BOUND, AbstractSdf, Box, Exactness, Number, absolute, minimum, norm
+from sorojax.sdf.base import (
+    BOUND,
+    AbstractByLevel,
+    AbstractSdf,
+    Box,
+    Exactness,
+    Number,
+    absolute,
+    minimum,
+    norm,
+)
 from sorojax.sdf.shapes.bars import check_direction
 
 
-class AbstractWrapped(AbstractSdf):
+class AbstractWrapped(AbstractByLevel):
     """A shape made of one other shape of the same dimension and slope."""
 
     if TYPE_CHECKING:  # fields that subclasses have, in their own order
@@ -31,14 +40,16 @@ class AbstractWrapped(AbstractSdf):
     def lipschitz(self) -> Number:
         return self.shape.lipschitz
 
-    @abc.abstractmethod
-    def level_box(self, level: Number) -> Box: ...
 
-    def bounding_box(self) -> Box:
-        return self.level_box(0.0)
+class AbstractMoved(AbstractWrapped):
+    """A shape similar to another one: its field is as exact."""
+
+    @property
+    def exactness(self) -> Exactness:
+        return self.shape.exactness
 
 
-class Translated(AbstractWrapped):
+class Translated(AbstractMoved):
     """`shape` moved by `offset` [m]."""
 
     shape: AbstractSdf
@@ -49,10 +60,6 @@ class Translated(AbstractWrapped):
             "translate", "offset", self.offset, (self.shape.dim,), "One entry per axis."
         )
 
-    @property
-    def exactness(self) -> Exactness:
-        return self.shape.exactness
-
     def distance(self, *x):
         return self.shape.distance(*(c - self.offset[i] for i, c in enumerate(x)))
 
@@ -61,16 +68,12 @@ class Translated(AbstractWrapped):
         return lower + self.offset, upper + self.offset
 
 
-class Rotated(AbstractWrapped):
+class Rotated(AbstractMoved):
     """`shape` turned by `angle` [rad] about `center` [m], in space about the z axis."""
 
     shape: AbstractSdf
     angle: Float[Array, ""] = eqx.field(converter=real)
     center: Float[Array, "2"] = eqx.field(converter=real)
-
-    @property
-    def exactness(self) -> Exactness:
-        return self.shape.exactness
 
     def distance(self, *x):
         c, s = jnp.cos(self.angle), jnp.sin(self.angle)
@@ -80,24 +83,14 @@ class Rotated(AbstractWrapped):
 
     def level_box(self, level) -> Box:
         lower, upper = self.shape.level_box(level)
-        bounded = jnp.all(jnp.isfinite(lower[:2]) & jnp.isfinite(upper[:2]))
-        low = jnp.where(bounded, lower[:2], -jnp.ones_like(lower[:2]))
-        high = jnp.where(bounded, upper[:2], jnp.ones_like(upper[:2]))
         c, s = jnp.cos(self.angle), jnp.sin(self.angle)
-        middle, half = (low + high) / 2 - self.center, (high - low) / 2
-        center = self.center + jnp.stack(
-            [c * middle[0] - s * middle[1], s * middle[0] + c * middle[1]]
-        )
-        c, s = jnp.abs(c), jnp.abs(s)
-        reach = jnp.stack([c * half[0] + s * half[1], s * half[0] + c * half[1]])
-        reach = jnp.where(bounded, reach, jnp.full_like(reach, jnp.inf))
-        return (
-            jnp.concatenate([center - reach, lower[2:]]),
-            jnp.concatenate([center + reach, upper[2:]]),
-        )
+        matrix = jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
+        shift = self.center - matrix @ self.center
+        low, high = turned_box((lower[:2], upper[:2]), matrix, shift)
+        return jnp.concatenate([low, lower[2:]]), jnp.concatenate([high, upper[2:]])
 
 
-class Scaled(AbstractWrapped):
+class Scaled(AbstractMoved):
     """`shape` scaled by `factor` about the origin."""
 
     shape: AbstractSdf
@@ -105,10 +98,6 @@ class Scaled(AbstractWrapped):
 
     def __check_init__(self):
         _check.positive("scale", "factor", self.factor, "", "Mirror is another operation.")
-
-    @property
-    def exactness(self) -> Exactness:
-        return self.shape.exactness
 
     def distance(self, *x):
         return self.factor * self.shape.distance(*(c / self.factor for c in x))
@@ -328,7 +317,7 @@ def repeat(
 # Rotation in space about any axis
 
 
-class Turned(AbstractWrapped):
+class Turned(AbstractMoved):
     """A solid turned by `angle` [rad] about `axis` through `center` [m]."""
 
     shape: AbstractSdf
@@ -344,10 +333,6 @@ class Turned(AbstractWrapped):
         _check.shape("turn", "axis", self.axis, (3,), "Give (x, y, z).")
         _check.shape("turn", "center", self.center, (3,), "Give (x, y, z).")
         check_direction("turn", self.axis)
-
-    @property
-    def exactness(self) -> Exactness:
-        return self.shape.exactness
 
     def _matrix(self) -> Float[Array, "3 3"]:
         u = self.axis / norm(*(self.axis[i] for i in range(3)))

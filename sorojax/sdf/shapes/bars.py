@@ -17,22 +17,26 @@ from sorojax.sdf.base import (
     Exactness,
     absolute,
     box_distance,
-    check_lengths,
+    check_numbers,
     clip,
     norm,
+    positive,
     quotient,
     root,
 )
 
 
-def check_point(shape: AbstractSdf, *names: str) -> None:
-    """Raise a `ValueError` unless the named fields are points of one dimension, 2 or 3."""
+def check_places(shape: AbstractSdf, *names: str) -> None:
+    """Raise a `ValueError` unless the named fields have one number per axis: two or three."""
     where = type(shape).__name__
-    shapes = {jnp.shape(getattr(shape, name)) for name in names}
-    if len(shapes) != 1 or not shapes <= {(2,), (3,)}:
+    sizes = [jnp.shape(getattr(shape, name)) for name in names]
+    dim = type(shape).dim
+    fitting = [(dim,)] if isinstance(dim, int) else [(2,), (3,)]
+    if len(set(sizes)) != 1 or sizes[0] not in fitting:
         raise ValueError(
-            f"{where}: {', '.join(f'`{n}`' for n in names)} have shapes {sorted(shapes)}, "
-            "need all (2,) or all (3,). Give (x, y) or (x, y, z)."
+            f"{where}: {', '.join(f'`{n}`' for n in names)} have shape "
+            f"{', '.join(map(str, sizes))}, need all {' or all '.join(map(str, fitting))}. "
+            f"Give {' or '.join('(x, y)' if n == 2 else '(x, y, z)' for (n,) in fitting)}."
         )
 
 
@@ -54,59 +58,61 @@ def along_and_across(x: tuple[Array, ...], a: Array, b: Array) -> tuple[Array, A
     return along, norm(*(c - along * d for c, d in zip(p, u, strict=True))), length
 
 
-class Slab(AbstractSdf):
-    """Layer of `thickness` [m] centred on the line or plane through `point` [m]."""
+class AbstractAcross(AbstractSdf):
+    """A shape bounded by lines or planes across `normal`, one of which may hold `point` [m]."""
 
     point: Float[Array, " dim"] = eqx.field(converter=real)
     normal: Float[Array, " dim"] = eqx.field(converter=real)
-    thickness: Float[Array, ""] = eqx.field(converter=real)
     exactness: ClassVar[Exactness] = EXACT
 
     def __check_init__(self):
-        check_point(self, "point", "normal")
-        check_lengths(self, "thickness")
-        check_direction("Slab", self.normal)
+        check_places(self, "point", "normal")
+        check_direction(type(self).__name__, self.normal)
+
+    def _height(self, x: tuple[Array, ...]) -> Array:
+        """Distance along the normal from the one through `point` [m]."""
+        n = self.normal / norm(*(self.normal[i] for i in range(len(x))))
+        heights = ((c - self.point[i]) * n[i] for i, c in enumerate(x))
+        return sum(heights, start=jnp.zeros_like(x[0]))
+
+    def _bounded(self, below: Array, above: Array) -> Box:
+        """The box from `below` to `above` on the axis that `normal` is along, if any."""
+        axis = (self.normal != 0) & (jnp.sum(self.normal != 0) == 1)
+        infinity = jnp.full_like(self.point, jnp.inf)
+        return jnp.where(axis, below, -infinity), jnp.where(axis, above, infinity)
+
+
+class Slab(AbstractAcross):
+    """Layer of `thickness` [m] centred on the line or plane through `point` [m]."""
+
+    thickness: Float[Array, ""] = eqx.field(converter=positive)
 
     @property
     def dim(self) -> int:
         return self.point.shape[0]
 
     def distance(self, *x):
-        return absolute(_height(x, self.point, self.normal)) - self.thickness / 2
+        return absolute(self._height(x)) - self.thickness / 2
 
     def bounding_box(self) -> Box:
-        axis = _axis(self.normal)
-        infinity = jnp.full_like(self.point, jnp.inf)
-        half = self.thickness / 2
-        return (
-            jnp.where(axis, self.point - half, -infinity),
-            jnp.where(axis, self.point + half, infinity),
-        )
+        return self._bounded(self.point - self.thickness / 2, self.point + self.thickness / 2)
 
 
-class HalfSpace(AbstractSdf):
-    """Everything behind the plane through `point` [m] whose outward normal is `normal`."""
-
-    point: Float[Array, "3"] = eqx.field(converter=real)
-    normal: Float[Array, "3"] = eqx.field(converter=real)
-    dim: ClassVar[int] = 3
-    exactness: ClassVar[Exactness] = EXACT
-
-    def __check_init__(self):
-        _check.shape("HalfSpace", "point", self.point, (3,), "Give (x, y, z).")
-        _check.shape("HalfSpace", "normal", self.normal, (3,), "Give (x, y, z).")
-        check_direction("HalfSpace", self.normal)
+class AbstractHalf(AbstractAcross):
+    """Everything behind the line or plane through `point` whose outward normal is `normal`."""
 
     def distance(self, *x):
-        return _height(x, self.point, self.normal)
+        return self._height(x)
 
     def bounding_box(self) -> Box:
-        axis = _axis(self.normal)
-        infinity = jnp.full_like(self.point, jnp.inf)
-        return (
-            jnp.where(axis & (self.normal < 0), self.point, -infinity),
-            jnp.where(axis & (self.normal > 0), self.point, infinity),
-        )
+        below = jnp.where(self.normal < 0, self.point, -jnp.inf)
+        return self._bounded(below, jnp.where(self.normal > 0, self.point, jnp.inf))
+
+
+class HalfSpace(AbstractHalf):
+    """Everything behind the plane through `point` [m] whose outward normal is `normal`."""
+
+    dim: ClassVar[int] = 3
 
 
 def check_direction(where: str, normal: Array) -> None:
@@ -114,32 +120,33 @@ def check_direction(where: str, normal: Array) -> None:
         raise ValueError(f"{where}: the direction is zero. Give a vector along it.")
 
 
-def _height(x: tuple[Array, ...], point: Array, normal: Array) -> Array:
-    n = normal / norm(*(normal[i] for i in range(len(x))))
-    return sum(((c - point[i]) * n[i] for i, c in enumerate(x)), start=jnp.zeros_like(x[0]))
-
-
-def _axis(normal: Array) -> Array:
-    """Mask of the axis that `normal` is along; all false where it is along none."""
-    return (normal != 0) & (jnp.sum(normal != 0) == 1)
-
-
-class Strut(AbstractSdf):
-    """Bar with flat ends from `start` to `end` [m], round in space, `width` [m] across."""
+class AbstractBar(AbstractSdf):
+    """A body about the straight line from `start` to `end` [m]."""
 
     start: Float[Array, " dim"] = eqx.field(converter=real)
     end: Float[Array, " dim"] = eqx.field(converter=real)
-    width: Float[Array, ""] = eqx.field(converter=real)
     exactness: ClassVar[Exactness] = EXACT
 
     def __check_init__(self):
-        check_point(self, "start", "end")
-        check_lengths(self, "width")
-        check_apart("Strut", self.start, self.end)
+        check_places(self, "start", "end")
 
     @property
     def dim(self) -> int:
         return self.start.shape[0]
+
+    def _box(self, start_reach: Array, end_reach: Array) -> Box:
+        """The box of what reaches as far [m] from either end along the axes."""
+        lower = jnp.minimum(self.start - start_reach, self.end - end_reach)
+        return lower, jnp.maximum(self.start + start_reach, self.end + end_reach)
+
+
+class Strut(AbstractBar):
+    """Bar with flat ends from `start` to `end` [m], round in space, `width` [m] across."""
+
+    width: Float[Array, ""] = eqx.field(converter=positive)
+
+    def __check_init__(self):
+        check_apart("Strut", self.start, self.end)
 
     def distance(self, *x):
         along, across, length = along_and_across(x, self.start, self.end)
@@ -149,26 +156,13 @@ class Strut(AbstractSdf):
         u = self.end - self.start
         u = u / norm(*u)
         reach = self.width / 2 * root(1 - u * u)
-        return jnp.minimum(self.start, self.end) - reach, jnp.maximum(
-            self.start, self.end
-        ) + reach
+        return self._box(reach, reach)
 
 
-class Capsule(AbstractSdf):
+class Capsule(AbstractBar):
     """All points within `radius` [m] of the segment from `start` to `end` [m]."""
 
-    start: Float[Array, " dim"] = eqx.field(converter=real)
-    end: Float[Array, " dim"] = eqx.field(converter=real)
-    radius: Float[Array, ""] = eqx.field(converter=real)
-    exactness: ClassVar[Exactness] = EXACT
-
-    def __check_init__(self):
-        check_point(self, "start", "end")
-        check_lengths(self, "radius")
-
-    @property
-    def dim(self) -> int:
-        return self.start.shape[0]
+    radius: Float[Array, ""] = eqx.field(converter=positive)
 
     def distance(self, *x):
         a = tuple(self.start[i] for i in range(self.dim))
@@ -176,8 +170,7 @@ class Capsule(AbstractSdf):
         return segment_distance(x, a, b) - self.radius
 
     def bounding_box(self) -> Box:
-        a, b = self.start, self.end
-        return jnp.minimum(a, b) - self.radius, jnp.maximum(a, b) + self.radius
+        return self._box(self.radius, self.radius)
 
 
 def segment_distance(x: tuple[Array, ...], a: tuple, b: tuple) -> Array:
@@ -202,18 +195,15 @@ def stadium(length: Numbers, width: Numbers) -> Capsule:
     return Capsule(-half, half, width / 2)
 
 
-class RoundCone(AbstractSdf):
+class RoundCone(AbstractBar):
     """Convex hull of two balls, in the plane of two discs (uneven capsule)."""
 
-    start: Float[Array, " dim"] = eqx.field(converter=real)
-    end: Float[Array, " dim"] = eqx.field(converter=real)
-    start_radius: Float[Array, ""] = eqx.field(converter=real)
-    end_radius: Float[Array, ""] = eqx.field(converter=real)
-    exactness: ClassVar[Exactness] = EXACT
+    start_radius: Float[Array, ""] = eqx.field(converter=positive)
+    end_radius: Float[Array, ""] = eqx.field(converter=positive)
 
     def __check_init__(self):
-        check_point(self, "start", "end")
-        check_lengths(self, "start_radius", "end_radius")
+        check_places(self, "start", "end")
+        check_numbers(self)
         if all(_check.is_concrete(leaf) for leaf in jax.tree.leaves(self)):
             gap = float(np.linalg.norm(np.asarray(self.end) - np.asarray(self.start)))
             change = abs(float(self.start_radius) - float(self.end_radius))
@@ -222,10 +212,6 @@ class RoundCone(AbstractSdf):
                     f"RoundCone: one ball holds the other (radii differ by {change:g} m, "
                     f"centres by {gap:g} m). Use a Circle or a Sphere."
                 )
-
-    @property
-    def dim(self) -> int:
-        return self.start.shape[0]
 
     def distance(self, *x):
         along, across, length = along_and_across(x, self.start, self.end)
@@ -238,6 +224,4 @@ class RoundCone(AbstractSdf):
         return jnp.where(foot < 0, low, jnp.where(foot > c * length, high, flank))
 
     def bounding_box(self) -> Box:
-        lower = jnp.minimum(self.start - self.start_radius, self.end - self.end_radius)
-        upper = jnp.maximum(self.start + self.start_radius, self.end + self.end_radius)
-        return lower, upper
+        return self._box(self.start_radius, self.end_radius)

@@ -4,8 +4,9 @@ The nearest piece of a curve is found without derivatives, since it does not cha
 changes, and only that piece is differentiated; a tie takes the first.
 """
 
+import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -15,14 +16,15 @@ from jaxtyping import Array, Float, Int
 
 from sorojax._types import real
 from sorojax.sdf.base import (
+    OUTSIDE,
     AbstractSdf,
     Box,
     Exactness,
-    check_lengths,
     clip,
     maximum,
     minimum,
     norm,
+    positive,
     quotient,
     root,
 )
@@ -68,34 +70,39 @@ def take(table: Any, index: Int[Array, "..."]) -> tuple[tuple[Array, ...], ...]:
 # Bodies along curves in the plane or in space: polyline, Bezier, spline, helix
 
 
-TUBE = Exactness(outside=True, inside=False)  # where a tube meets itself it is deeper
+class AbstractTube(AbstractSdf):
+    """All points within `width` / 2 of a curve given by `points` [m], `least` of them or more.
 
-
-def check_points(shape: AbstractSdf, points: Array, least: int) -> None:
-    where = type(shape).__name__
-    size = jnp.shape(points)
-    if len(size) != 2 or size[1] not in (2, 3) or size[0] < least:
-        raise ValueError(
-            f"{where}: `points` has shape {size}, need at least {least} rows of (x, y) or "
-            "(x, y, z). One row per point, in order."
-        )
-
-
-class Polyline(AbstractSdf):
-    """All points within `width` / 2 of the line through `points` [m]; a tube in space."""
+    Where a tube meets itself it is deeper than half its width.
+    """
 
     points: Float[Array, "points dim"] = eqx.field(converter=real)
-    width: Float[Array, ""] = eqx.field(converter=real)
-    closed: bool = eqx.field(static=True, default=False)
-    exactness: ClassVar[Exactness] = TUBE
+    width: Float[Array, ""] = eqx.field(converter=positive)
+    least: ClassVar[int] = 3
+    exactness: ClassVar[Exactness] = OUTSIDE
 
     def __check_init__(self):
-        check_points(self, self.points, 2)
-        check_lengths(self, "width")
+        size = jnp.shape(self.points)
+        if len(size) != 2 or size[1] not in (2, 3) or size[0] < self.least:
+            raise ValueError(
+                f"{type(self).__name__}: `points` has shape {size}, need at least {self.least} "
+                "rows of (x, y) or (x, y, z). One row per point, in order."
+            )
 
     @property
     def dim(self) -> int:
         return self.points.shape[1]
+
+    def bounding_box(self) -> Box:
+        half = self.width / 2
+        return jnp.min(self.points, axis=0) - half, jnp.max(self.points, axis=0) + half
+
+
+class Polyline(AbstractTube):
+    """All points within `width` / 2 of the line through `points` [m]; a tube in space."""
+
+    closed: bool = eqx.field(static=True, default=False)
+    least: ClassVar[int] = 2
 
     def distance(self, *x):
         a = self.points
@@ -104,50 +111,29 @@ class Polyline(AbstractSdf):
         index = nearest(lambda row, *x: segment_square(x, *row), table, x)
         return root(segment_square(x, *take(table, index))) - self.width / 2
 
-    def bounding_box(self) -> Box:
-        half = self.width / 2
-        return jnp.min(self.points, axis=0) - half, jnp.max(self.points, axis=0) + half
 
-
-class Bezier(AbstractSdf):
+class Bezier(AbstractTube):
     """Quadratic Bezier curve of three control `points` [m], `width` [m] across."""
 
-    points: Float[Array, "3 dim"] = eqx.field(converter=real)
-    width: Float[Array, ""] = eqx.field(converter=real)
-    exactness: ClassVar[Exactness] = TUBE
-
     def __check_init__(self):
-        check_points(self, self.points, 3)
-        if self.points.shape[0] != 3:
+        if self.points.shape[0] > 3:
             raise ValueError(
                 f"Bezier: `points` has {self.points.shape[0]} rows, need 3. Join several "
                 "curves by `|`, or use a Spline."
             )
-        check_lengths(self, "width")
-
-    @property
-    def dim(self) -> int:
-        return self.points.shape[1]
 
     def distance(self, *x):
         return bezier_distance(self.points, x) - self.width / 2
-
-    def bounding_box(self) -> Box:
-        half = self.width / 2
-        return jnp.min(self.points, axis=0) - half, jnp.max(self.points, axis=0) + half
 
 
 class Parabola(AbstractSdf):
     """The piece |x| <= `half_width` of y = `bend` x^2, `width` [m] across; bend in 1/m."""
 
     bend: Float[Array, ""] = eqx.field(converter=real)
-    half_width: Float[Array, ""] = eqx.field(converter=real)
-    width: Float[Array, ""] = eqx.field(converter=real)
+    half_width: Float[Array, ""] = eqx.field(converter=positive)
+    width: Float[Array, ""] = eqx.field(converter=positive)
     dim: ClassVar[int] = 2
-    exactness: ClassVar[Exactness] = TUBE
-
-    def __check_init__(self):
-        check_lengths(self, "half_width", "width")
+    exactness: ClassVar[Exactness] = OUTSIDE
 
     def distance(self, x, y):
         return bezier_distance(self._control(), (x, y)) - self.width / 2
@@ -170,32 +156,32 @@ def bezier_distance(points: Float[Array, "3 dim"], x: tuple[Array, ...]) -> Arra
     The slope of the squared distance is a cubic; Newton's method from outside its
     roots runs to the first and to the last of them without passing.
     """
-    curve = [
-        (
-            points[0, i],
-            2 * (points[1, i] - points[0, i]),
-            points[0, i] - 2 * points[1, i] + points[2, i],
-        )
-        for i in range(len(x))
-    ]
+    curve = [(a, 2 * (b - a), a - 2 * b + c) for a, b, c in points.T]
+    ends = (jnp.full_like(x[0], end) for end in (0.0, 1.0))
+    feet = (foot(lambda t, x: curve_slope(t, x, curve), end, x, 12) for end in ends)
+    return functools.reduce(minimum, (norm(*curve_gap(t, x, curve)) for t in feet))
 
-    def slope(t, x):
-        first = second = jnp.zeros_like(t)
-        for c, (p, q, r) in zip(x, curve, strict=True):
-            gap, speed = p + t * (q + t * r) - c, q + 2 * t * r
-            first = first + gap * speed
-            second = second + speed * speed + 2 * gap * r
-        return first, second
 
-    best = None
-    for end in (0.0, 1.0):
-        t = foot(slope, jnp.full_like(x[0], end), x, 12)
-        square = sum(
-            ((p + t * (q + t * r) - c) ** 2 for c, (p, q, r) in zip(x, curve, strict=True)),
-            start=jnp.zeros_like(t),
-        )
-        best = square if best is None else minimum(best, square)
-    return root(best)
+def polynomial(t: Array, coefficients: Sequence[Array]) -> Array:
+    """Its value at t, the constant coefficient first."""
+    return functools.reduce(lambda total, c: c + t * total, reversed(coefficients))
+
+
+def curve_gap(t: Array, x: tuple[Array, ...], curve: Sequence[Sequence[Array]]) -> list[Array]:
+    """From x to the point t of a curve, for each axis a polynomial."""
+    return [polynomial(t, row) - c for c, row in zip(x, curve, strict=True)]
+
+
+def curve_slope(t: Array, x: tuple[Array, ...], curve: Sequence[Sequence[Array]]):
+    """First and second derivative in t of half the squared distance to a curve."""
+    first = second = jnp.zeros_like(t)
+    for gap, row in zip(curve_gap(t, x, curve), curve, strict=True):
+        rate = [k * c for k, c in enumerate(row)][1:]
+        bend = [k * c for k, c in enumerate(rate)][1:]
+        speed = polynomial(t, rate)
+        first = first + gap * speed
+        second = second + speed * speed + gap * polynomial(t, bend)
+    return first, second
 
 
 def foot(
@@ -224,15 +210,12 @@ def foot(
 class Helix(AbstractSdf):
     """Wire of `width` [m] wound about z at `radius` [m], `pitch` [m] per turn, from z = 0."""
 
-    radius: Float[Array, ""] = eqx.field(converter=real)
-    pitch: Float[Array, ""] = eqx.field(converter=real)
-    turns: Float[Array, ""] = eqx.field(converter=real)
-    width: Float[Array, ""] = eqx.field(converter=real)
+    radius: Float[Array, ""] = eqx.field(converter=positive)
+    pitch: Float[Array, ""] = eqx.field(converter=positive)
+    turns: Float[Array, ""] = eqx.field(converter=positive)
+    width: Float[Array, ""] = eqx.field(converter=positive)
     dim: ClassVar[int] = 3
-    exactness: ClassVar[Exactness] = TUBE
-
-    def __check_init__(self):
-        check_lengths(self, "radius", "pitch", "turns", "width")
+    exactness: ClassVar[Exactness] = OUTSIDE
 
     def distance(self, x, y, z):
         lead, whole = self.pitch / (2 * math.pi), 2 * math.pi
@@ -272,31 +255,18 @@ class Helix(AbstractSdf):
 _PARTS = 6  # of each piece, short enough to hold one closest point
 
 
-def _slope(t, x, curve):
-    """First and second derivative in t of half the squared distance to the cubic."""
-    first = second = jnp.zeros_like(t)
-    for c, (p, q, r, s) in zip(x, curve, strict=True):
-        gap, speed = p + t * (q + t * (r + t * s)) - c, q + t * (2 * r + 3 * t * s)
-        first = first + gap * speed
-        second = second + speed * speed + gap * (2 * r + 6 * t * s)
-    return first, second
-
-
 def _nearest_time(pieces, start, x):
     """Parameter of the closest point within one part, from that of its chord."""
     curve = tuple(zip(*pieces, strict=True))
     end = start + 1 / _PARTS
 
-    def at(t):
-        return tuple(p + t * (q + t * (r + t * s)) for p, q, r, s in curve)
-
-    a, b = at(start), at(end)
+    a, b = ([polynomial(t, row) for row in curve] for t in (start, end))
     zero = jnp.zeros_like(x[0])
     dot = sum(((c - p) * (q - p) for c, p, q in zip(x, a, b, strict=True)), start=zero)
     square = sum(((q - p) ** 2 for p, q in zip(a, b, strict=True)), start=zero)
     t = start + clip(quotient(dot, square), 0.0, 1.0) / _PARTS
     for _ in range(3):
-        first, second = _slope(t, x, curve)
+        first, second = curve_slope(t, x, curve)
         t = t - quotient(first, jnp.where(second > 0, second, zero))
         t = jnp.where(t < start, start, jnp.where(t > end, end, t))
     return t
@@ -305,29 +275,17 @@ def _nearest_time(pieces, start, x):
 def _square(pieces, start, x):
     curve = tuple(zip(*pieces, strict=True))
     t = _nearest_time(pieces, start, x)
-    gaps = (p + t * (q + t * (r + t * s)) - c for c, (p, q, r, s) in zip(x, curve, strict=True))
-    return sum((g * g for g in gaps), start=jnp.zeros_like(t))
+    return sum((g * g for g in curve_gap(t, x, curve)), start=jnp.zeros_like(t))
 
 
-class Spline(AbstractSdf):
+class Spline(AbstractTube):
     """Tube of `width` [m] along the cubic curve (Catmull-Rom) through `points` [m].
 
     The closest point is searched on six parts of every piece by Newton's method: exact
     outside unless one part bends around a point with two closest points.
     """
 
-    points: Float[Array, "points dim"] = eqx.field(converter=real)
-    width: Float[Array, ""] = eqx.field(converter=real)
     closed: bool = eqx.field(static=True, default=False)
-    exactness: ClassVar[Exactness] = Exactness(outside=True, inside=False)
-
-    def __check_init__(self):
-        check_points(self, self.points, 3)
-        check_lengths(self, "width")
-
-    @property
-    def dim(self) -> int:
-        return self.points.shape[1]
 
     def _pieces(self) -> tuple[Float[Array, "pieces dim"], ...]:
         """Coefficients of 1, t, t^2, t^3 of every piece, t in [0, 1]."""
@@ -353,13 +311,8 @@ class Spline(AbstractSdf):
         held = jax.lax.stop_gradient((table, x))
         near = _nearest_time(take(held[0][0], index), held[0][1][index], held[1])
         curve = tuple(zip(*take(pieces, index // _PARTS), strict=True))
-
-        at = foot(lambda t, x: _slope(t, x, curve), near, x, 8)
-        gaps = (
-            p + at * (q + at * (r + at * s)) - c
-            for c, (p, q, r, s) in zip(x, curve, strict=True)
-        )
-        return norm(*gaps) - self.width / 2
+        at = foot(lambda t, x: curve_slope(t, x, curve), near, x, 8)
+        return norm(*curve_gap(at, x, curve)) - self.width / 2
 
     def bounding_box(self) -> Box:
         # A piece lies in the hull of its four Bezier points.

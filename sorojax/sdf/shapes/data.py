@@ -4,7 +4,6 @@ grid and height maps.
 
 import functools
 import itertools
-import math
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -12,24 +11,24 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from sorojax import _check
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import Numbers, integers, real
 from sorojax.sdf.base import (
-    AbstractSdf,
+    AbstractByLevel,
     Box,
     Box as Bounds,
     Number,
     absolute,
-    check_lengths,
     clip,
     maximum,
     minimum,
     norm,
     number,
     ordered,
+    positive,
     segment_side,
     steepest,
 )
@@ -41,6 +40,7 @@ from sorojax.sdf.trimesh.cells import Vector, solid_angle, triangle_side, triang
 from sorojax.sdf.trimesh.tree import TriangleTree, triangle_tree
 
 _SIZE = 64.0
+_ON_SURFACE = 16  # of rounding: points that near to the surface are on it
 
 
 class Outlines(AbstractPlaneShape):
@@ -63,15 +63,35 @@ class Outlines(AbstractPlaneShape):
             )
 
     def distance(self, x, y):
-        following = np.arange(1, self.vertices.shape[0] + 1)
-        following[np.array([*self.starts[1:], len(following)]) - 1] = self.starts
-        table = (self.vertices, self.vertices[following])
+        table = self._edges()
         square, cross = lambda row, *x: segment_square(x, *row), _crossing
         index, crossings = scan_rows(square, table, (x, y), cross)
         inside = jnp.round(crossings) % 2 == 1
         side = segment_side(x, y, *take(table, index))
-        outward = jnp.where(jax.lax.stop_gradient(side) < 0, inside, ~inside)
+        found, corners = jax.lax.stop_gradient((side, self.vertices))
+        outward = jnp.where(found < 0, inside, ~inside)
+        # On an edge rounding decides the sign, but not on which side the inside lies.
+        tiny = _ON_SURFACE * float(jnp.finfo(found.dtype).eps) * jnp.max(absolute(corners))
+        outward = jnp.where(absolute(found) <= tiny, ~self._inside_on_left()[index], outward)
         return jnp.where(outward, side, -side)
+
+    def _edges(self) -> tuple[Array, Array]:
+        """Corners (corners, 2) at which edges begin and end."""
+        following = np.arange(1, self.vertices.shape[0] + 1)
+        following[np.array([*self.starts[1:], len(following)]) - 1] = self.starts
+        return self.vertices, self.vertices[following]
+
+    def _inside_on_left(self) -> Bool[Array, " corners"]:
+        """Whether the inside lies on the left of each edge: by the sense of its outline, and
+        how many others that is within."""
+        a, b = jax.lax.stop_gradient(self._edges())
+        count = len(self.starts)
+        owner = np.repeat(np.arange(count), np.diff([*self.starts, len(a)]))
+        area = jnp.zeros(count, a.dtype).at[owner].add(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+        firsts = a[np.array(self.starts)].T[:, None]
+        crossed = _crossing((a.T[..., None], b.T[..., None]), *firsts)
+        around = jnp.sum(jnp.where(owner[:, None] == np.arange(count), 0, crossed), axis=0)
+        return ((area > 0) == (jnp.round(around) % 2 == 0))[owner]
 
     def bounding_box(self) -> Box:
         return jnp.min(self.vertices, axis=0), jnp.max(self.vertices, axis=0)
@@ -138,10 +158,7 @@ MOST_FACES = 20_000
 class Octahedron(AbstractSolidShape):
     """Regular octahedron with its corners on the axes at `radius` [m]."""
 
-    radius: Float[Array, ""] = eqx.field(converter=real)
-
-    def __check_init__(self):
-        check_lengths(self, "radius")
+    radius: Float[Array, ""] = eqx.field(converter=positive)
 
     def distance(self, x, y, z):
         p = absolute(x), absolute(y), absolute(z)
@@ -156,11 +173,8 @@ class Octahedron(AbstractSolidShape):
 class Pyramid(AbstractSolidShape):
     """Square pyramid: base of side `width` [m] at z = 0, tip at z = `height` [m]."""
 
-    width: Float[Array, ""] = eqx.field(converter=real)
-    height: Float[Array, ""] = eqx.field(converter=real)
-
-    def __check_init__(self):
-        check_lengths(self, "width", "height")
+    width: Float[Array, ""] = eqx.field(converter=positive)
+    height: Float[Array, ""] = eqx.field(converter=positive)
 
     def distance(self, x, y, z):
         half, zero = self.width / 2, jnp.zeros_like(self.width)
@@ -185,9 +199,6 @@ class Pyramid(AbstractSolidShape):
 def _smaller(base: Array, flank: Array) -> Array:
     # Below the base the flank may be seen from behind: only its size counts there.
     return minimum(base, absolute(flank))
-
-
-_ON_SURFACE = 16  # of rounding: points that near to the surface are on it
 
 
 class TriangleMesh(AbstractSolidShape):
@@ -299,7 +310,7 @@ def interpolate(values: Array, place: tuple[Array, ...]) -> Array:
     return total
 
 
-class Sampled(AbstractSdf):
+class Sampled(AbstractByLevel):
     """Distances `values` [m] on a grid, interpolated linearly; `origin` is node (0, 0).
 
     Beyond the grid the distance to it is added.
@@ -340,9 +351,6 @@ class Sampled(AbstractSdf):
         beyond = norm(*(c - h for c, h in zip(place, held, strict=True)))
         return interpolate(self.values, place) + self.spacing * beyond
 
-    def bounding_box(self) -> Box:
-        return self.level_box(0.0)
-
     def level_box(self, level) -> Box:
         last = jnp.asarray(np.array(self.values.shape) - 1.0, self.origin.dtype)
         # Shapes that run over the edge of the grid go on beyond it.
@@ -381,7 +389,7 @@ def image(mask: Numbers, pixel: float, origin: Numbers | None = None) -> Sampled
     return Sampled(field, start - pixel, pixel)
 
 
-class HeightMap(AbstractSdf):
+class HeightMap(AbstractByLevel):
     """Everything below the surface z = `heights` [m] over a grid, held at its edges.
 
     The field is the height over the surface, with a Lipschitz constant above one.
@@ -414,13 +422,7 @@ class HeightMap(AbstractSdf):
         place = tuple((c - self.origin[i]) / self.spacing[i] for i, c in enumerate((x, y)))
         return z - interpolate(self.heights, place)
 
-    def bounding_box(self) -> Box:
-        return self.level_box(0.0)
-
     def level_box(self, level) -> Box:
         top = jnp.max(self.heights) + level
-        infinity = jnp.full_like(top, math.inf)
-        return (
-            jnp.stack([-infinity, -infinity, -infinity]),
-            jnp.stack([infinity, infinity, top]),
-        )
+        infinity = jnp.full((3,), jnp.inf, top.dtype)
+        return -infinity, infinity.at[2].set(top)

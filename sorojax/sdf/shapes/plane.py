@@ -13,52 +13,51 @@ from sorojax._types import Numbers, real
 from sorojax.sdf.base import (
     BOUND,
     EXACT,
+    OUTSIDE,
     AbstractSdf,
     Box,
     Exactness,
     absolute,
-    check_lengths,
+    box_distance,
+    check_numbers,
     maximum,
     minimum,
     norm,
+    positive,
     positive_part,
     quotient,
     root,
     sector,
     segment_side,
 )
+from sorojax.sdf.shapes.bars import AbstractHalf, check_places
 
 
-def touching_edges(vertices: np.ndarray) -> tuple[int, int] | None:
-    """Two edges of a closed polygon that meet away from a shared corner, or None."""
-    a, b = vertices, np.roll(vertices, -1, axis=0)
-    count = len(a)
+def touching_edges(*loops: np.ndarray) -> tuple[int, int] | None:
+    """Two edges of closed polygons that meet away from a shared corner, or None; edges are
+    numbered from loop to loop."""
+    a = np.concatenate(loops)
+    starts = np.cumsum([0, *map(len, loops[:-1])])
+    rows = [start + np.arange(len(loop)) for start, loop in zip(starts, loops, strict=True)]
+    after = np.concatenate([np.roll(row, -1) for row in rows])
+    b, way = a[after], a[after] - a
     lower, upper = np.minimum(a, b), np.maximum(a, b)
-    for i in range(count):
-        later = np.arange(i + 1, count)
-        near = np.all((lower[later] <= upper[i]) & (upper[later] >= lower[i]), axis=1)
-        for j in later[near]:
-            if _meet(a[i], b[i], a[j], b[j], next_to=j == i + 1 or (i == 0 and j == count - 1)):
-                return i, int(j)
+    for i in range(len(a)):
+        later = np.arange(i + 1, len(a))
+        j = later[np.all((lower[later] <= upper[i]) & (upper[later] >= lower[i]), axis=1)]
+        mine = _cross(way[i], a[j] - a[i]) * _cross(way[i], b[j] - a[i])
+        other = _cross(way[j], a[i] - a[j]) * _cross(way[j], b[i] - a[j])
+        # Neighbours share a corner; they touch elsewhere where one folds back on the other.
+        back = (_cross(way[i], way[j]) == 0) & (way[j] @ way[i] < 0)
+        next_to = (j == after[i]) | (after[j] == i)
+        touching = j[np.where(next_to, back, (mine <= 0) & (other <= 0))]
+        if len(touching):
+            return i, int(touching[0])
     return None
 
 
-def _meet(a, b, c, d, next_to: bool) -> bool:
-    if next_to:
-        # Neighbours share a corner; they touch elsewhere where one folds back on the other.
-        first, second = b - a, d - c
-        return abs(_cross(first, second)) == 0 and first @ second < 0
-    sides = (
-        _cross(b - a, c - a),
-        _cross(b - a, d - a),
-        _cross(d - c, a - c),
-        _cross(d - c, b - c),
-    )
-    return sides[0] * sides[1] <= 0 and sides[2] * sides[3] <= 0
-
-
-def _cross(u, v) -> float:
-    return float(u[0] * v[1] - u[1] * v[0])
+def _cross(u, v) -> np.ndarray:
+    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
 # Plane shapes; every field here is the exact distance
@@ -71,85 +70,74 @@ class AbstractPlaneShape(AbstractSdf):
     exactness: ClassVar[Exactness] = EXACT
 
 
-class Circle(AbstractPlaneShape):
-    """Disc of `radius` [m] about `center` [m]."""
+class AbstractBall(AbstractSdf):
+    """All points within `radius` [m] of `center` [m]."""
 
-    center: Float[Array, "2"] = eqx.field(converter=real)
-    radius: Float[Array, ""] = eqx.field(converter=real)
+    center: Float[Array, " dim"] = eqx.field(converter=real)
+    radius: Float[Array, ""] = eqx.field(converter=positive)
+    exactness: ClassVar[Exactness] = EXACT
 
     def __check_init__(self):
-        _check.shape("Circle", "center", self.center, (2,), "Give (x, y).")
-        _check.positive("Circle", "radius", self.radius, "m", "Give a length above zero.")
+        check_places(self, "center")
 
-    def distance(self, x, y):
-        return norm(x - self.center[0], y - self.center[1]) - self.radius
+    def distance(self, *x):
+        return norm(*(c - self.center[i] for i, c in enumerate(x))) - self.radius
 
     def bounding_box(self) -> Box:
         return self.center - self.radius, self.center + self.radius
 
 
-class Rectangle(AbstractPlaneShape):
-    """Box from `lower` to `upper` [m]; `radius` [m] rounds its corners inside it."""
+class Circle(AbstractBall):
+    """Disc of `radius` [m] about `center` [m]."""
 
-    lower: Float[Array, "2"] = eqx.field(converter=real)
-    upper: Float[Array, "2"] = eqx.field(converter=real)
+    dim: ClassVar[int] = 2
+
+
+class AbstractBlock(AbstractSdf):
+    """Box from `lower` to `upper` [m]; `radius` [m] rounds its edges inside it."""
+
+    lower: Float[Array, " dim"] = eqx.field(converter=real)
+    upper: Float[Array, " dim"] = eqx.field(converter=real)
     radius: Float[Array, ""] = eqx.field(converter=real, default=0.0)
+    exactness: ClassVar[Exactness] = EXACT
 
     def __check_init__(self):
-        check_box("Rectangle", self.lower, self.upper, self.radius, 2)
+        check_places(self, "lower", "upper")
+        if not all(_check.is_concrete(v) for v in (self.lower, self.upper, self.radius)):
+            return
+        where, radius = type(self).__name__, float(self.radius)
+        lower, upper = np.asarray(self.lower), np.asarray(self.upper)
+        sides = upper - lower
+        if not np.all(sides > 0):
+            raise ValueError(
+                f"{where}: `upper` must lie above `lower`, got {lower} m and {upper} m. Swap "
+                "them or give a positive extent."
+            )
+        if not 0 <= radius <= sides.min() / 2 * (1 + 1e-12):
+            raise ValueError(
+                f"{where}: `radius` must lie between 0 and half the shorter side "
+                f"({sides.min() / 2:g} m), got {radius:g} m. Round it less."
+            )
 
-    def distance(self, x, y):
+    def distance(self, *x):
         center, half = (self.lower + self.upper) / 2, (self.upper - self.lower) / 2
-        a = absolute(x - center[0]) - half[0] + self.radius
-        b = absolute(y - center[1]) - half[1] + self.radius
-        inner = minimum(maximum(a, b), jnp.zeros_like(a))
-        return inner + norm(positive_part(a), positive_part(b)) - self.radius
+        excess = (absolute(c - center[i]) - half[i] + self.radius for i, c in enumerate(x))
+        return box_distance(*excess) - self.radius
 
     def bounding_box(self) -> Box:
         return self.lower, self.upper
 
 
-def check_box(where: str, lower, upper, radius, dim: int) -> None:
-    """Raise a `ValueError` unless the corners and the rounding make a box."""
-    for name, corner in (("lower", lower), ("upper", upper)):
-        _check.shape(where, name, corner, (dim,), f"Give {dim} coordinates.")
-    if not all(_check.is_concrete(v) for v in (lower, upper, radius)):
-        return
-    sides = np.asarray(upper) - np.asarray(lower)
-    if not np.all(sides > 0):
-        raise ValueError(
-            f"{where}: `upper` must lie above `lower`, got {np.asarray(lower)} m and "
-            f"{np.asarray(upper)} m. Swap them or give a positive extent."
-        )
-    if not 0 <= float(radius) <= sides.min() / 2 * (1 + 1e-12):
-        raise ValueError(
-            f"{where}: `radius` must lie between 0 and half the shorter side "
-            f"({sides.min() / 2:g} m), got {float(radius):g} m. Round it less."
-        )
+class Rectangle(AbstractBlock):
+    """Box from `lower` to `upper` [m]; `radius` [m] rounds its corners inside it."""
+
+    dim: ClassVar[int] = 2
 
 
-class HalfPlane(AbstractPlaneShape):
+class HalfPlane(AbstractHalf):
     """Everything behind the line through `point` [m] whose outward normal is `normal`."""
 
-    point: Float[Array, "2"] = eqx.field(converter=real)
-    normal: Float[Array, "2"] = eqx.field(converter=real)
-
-    def __check_init__(self):
-        _check.shape("HalfPlane", "point", self.point, (2,), "Give (x, y).")
-        _check.shape("HalfPlane", "normal", self.normal, (2,), "Give (x, y).")
-        if _check.is_concrete(self.normal) and not np.any(np.asarray(self.normal)):
-            raise ValueError("HalfPlane: `normal` is zero. Give the outward direction.")
-
-    def distance(self, x, y):
-        n = self.normal / norm(self.normal[0], self.normal[1])
-        return (x - self.point[0]) * n[0] + (y - self.point[1]) * n[1]
-
-    def bounding_box(self) -> Box:
-        # Only a line along an axis bounds a coordinate.
-        across = self.normal[::-1] == 0
-        infinity = jnp.full_like(self.point, jnp.inf)
-        lower = jnp.where(across & (self.normal < 0), self.point, -infinity)
-        return lower, jnp.where(across & (self.normal > 0), self.point, infinity)
+    dim: ClassVar[int] = 2
 
 
 class Polygon(AbstractPlaneShape):
@@ -226,11 +214,10 @@ def _check_count(shape: "RegularPolygon | Star") -> None:
 class RegularPolygon(AbstractPlaneShape):
     """Polygon of `count` equal sides, its corners at `radius` [m], one side facing +x."""
 
-    radius: Float[Array, ""] = eqx.field(converter=real)
+    radius: Float[Array, ""] = eqx.field(converter=positive)
     count: int = eqx.field(static=True)
 
     def __check_init__(self):
-        check_lengths(self, "radius")
         _check_count(self)
 
     def distance(self, x, y):
@@ -248,13 +235,13 @@ class RegularPolygon(AbstractPlaneShape):
 class Star(AbstractPlaneShape):
     """Star of `count` tips at `radius` [m], the first on +x, notches at `inner_radius`."""
 
-    radius: Float[Array, ""] = eqx.field(converter=real)
-    inner_radius: Float[Array, ""] = eqx.field(converter=real)
+    radius: Float[Array, ""] = eqx.field(converter=positive)
+    inner_radius: Float[Array, ""] = eqx.field(converter=positive)
     count: int = eqx.field(static=True)
 
     def __check_init__(self):
-        check_lengths(self, "radius", "inner_radius")
         _check_count(self)
+        check_numbers(self)
         if _check.is_concrete(self.radius) and _check.is_concrete(self.inner_radius):
             _check.between(
                 "Star",
@@ -280,11 +267,8 @@ class Star(AbstractPlaneShape):
 class Ring(AbstractPlaneShape):
     """Annulus from `inner_radius` to `radius` [m]."""
 
-    inner_radius: Float[Array, ""] = eqx.field(converter=real)
-    radius: Float[Array, ""] = eqx.field(converter=real)
-
-    def __check_init__(self):
-        check_lengths(self, "radius", "inner_radius")
+    inner_radius: Float[Array, ""] = eqx.field(converter=positive)
+    radius: Float[Array, ""] = eqx.field(converter=positive)
 
     def distance(self, x, y):
         r = norm(x, y)
@@ -297,12 +281,13 @@ class Ring(AbstractPlaneShape):
 class Arc(AbstractPlaneShape):
     """Arc of `radius` [m] within `half_angle` [rad] of +x, `width` [m] thick, round ends."""
 
-    radius: Float[Array, ""] = eqx.field(converter=real)
+    radius: Float[Array, ""] = eqx.field(converter=positive)
     half_angle: Float[Array, ""] = eqx.field(converter=real)
-    width: Float[Array, ""] = eqx.field(converter=real)
+    width: Float[Array, ""] = eqx.field(converter=positive)
+    # Where the ends meet, the inside is deeper than half a width.
+    exactness: ClassVar[Exactness] = OUTSIDE
 
     def __check_init__(self):
-        check_lengths(self, "radius", "width")
         _check_half_angle(self)
 
     def distance(self, x, y):
@@ -315,11 +300,6 @@ class Arc(AbstractPlaneShape):
     def bounding_box(self) -> Box:
         reach = self.radius + self.width / 2
         return _centred(reach, reach)
-
-    @property
-    def exactness(self) -> Exactness:
-        # Where the ends meet, the inside is deeper than half a width.
-        return Exactness(outside=True, inside=False)
 
 
 def _check_half_angle(shape: "Arc | Pie") -> None:
@@ -337,11 +317,10 @@ def _check_half_angle(shape: "Arc | Pie") -> None:
 class Pie(AbstractPlaneShape):
     """Sector of a disc of `radius` [m] within `half_angle` [rad] of +x."""
 
-    radius: Float[Array, ""] = eqx.field(converter=real)
+    radius: Float[Array, ""] = eqx.field(converter=positive)
     half_angle: Float[Array, ""] = eqx.field(converter=real)
 
     def __check_init__(self):
-        check_lengths(self, "radius")
         _check_half_angle(self)
 
     def distance(self, x, y):
@@ -357,11 +336,11 @@ class Pie(AbstractPlaneShape):
 class Vesica(AbstractPlaneShape):
     """Lens between two arcs, `width` [m] wide along x and `height` [m] high along y."""
 
-    width: Float[Array, ""] = eqx.field(converter=real)
-    height: Float[Array, ""] = eqx.field(converter=real)
+    width: Float[Array, ""] = eqx.field(converter=positive)
+    height: Float[Array, ""] = eqx.field(converter=positive)
 
     def __check_init__(self):
-        check_lengths(self, "width", "height")
+        check_numbers(self)
         if _check.is_concrete(self.width) and _check.is_concrete(self.height):
             _check.between(
                 "Vesica",
@@ -387,13 +366,12 @@ class Vesica(AbstractPlaneShape):
 class Squircle(AbstractSdf):
     """Superellipse |x|^n + |y|^n = radius^n, n = `power` above 2; a bound of the distance."""
 
-    radius: Float[Array, ""] = eqx.field(converter=real)
+    radius: Float[Array, ""] = eqx.field(converter=positive)
     power: Float[Array, ""] = eqx.field(converter=real)
     dim: ClassVar[int] = 2
     exactness: ClassVar[Exactness] = BOUND
 
     def __check_init__(self):
-        check_lengths(self, "radius")
         _check.between(
             "Squircle", "power", self.power, 2, math.inf, "", "Use a Circle for power 2."
         )

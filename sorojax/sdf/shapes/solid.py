@@ -13,20 +13,21 @@ from sorojax import _check
 from sorojax._types import real
 from sorojax.sdf.base import (
     EXACT,
+    OUTSIDE,
     AbstractSdf,
     Box as Bounds,
     Exactness,
     absolute,
     box_distance,
-    check_lengths,
     maximum,
     minimum,
     norm,
+    positive,
     positive_part,
     sector,
     segment_side,
 )
-from sorojax.sdf.shapes.plane import check_box
+from sorojax.sdf.shapes.plane import AbstractBall, AbstractBlock
 
 
 class AbstractSolidShape(AbstractSdf):
@@ -36,45 +37,16 @@ class AbstractSolidShape(AbstractSdf):
     exactness: ClassVar[Exactness] = EXACT
 
 
-class Sphere(AbstractSolidShape):
+class Sphere(AbstractBall):
     """Ball of `radius` [m] about `center` [m]."""
 
-    center: Float[Array, "3"] = eqx.field(converter=real)
-    radius: Float[Array, ""] = eqx.field(converter=real)
-
-    def __check_init__(self):
-        _check.shape("Sphere", "center", self.center, (3,), "Give (x, y, z).")
-        _check.positive("Sphere", "radius", self.radius, "m", "Give a length above zero.")
-
-    def distance(self, x, y, z):
-        c = self.center
-        return norm(x - c[0], y - c[1], z - c[2]) - self.radius
-
-    def bounding_box(self) -> Bounds:
-        return self.center - self.radius, self.center + self.radius
+    dim: ClassVar[int] = 3
 
 
-class Box(AbstractSolidShape):
+class Box(AbstractBlock):
     """Cuboid from `lower` to `upper` [m]; `radius` [m] rounds its edges inside it."""
 
-    lower: Float[Array, "3"] = eqx.field(converter=real)
-    upper: Float[Array, "3"] = eqx.field(converter=real)
-    radius: Float[Array, ""] = eqx.field(converter=real, default=0.0)
-
-    def __check_init__(self):
-        check_box("Box", self.lower, self.upper, self.radius, 3)
-
-    def distance(self, x, y, z):
-        center, half = (self.lower + self.upper) / 2, (self.upper - self.lower) / 2
-        a = absolute(x - center[0]) - half[0] + self.radius
-        b = absolute(y - center[1]) - half[1] + self.radius
-        c = absolute(z - center[2]) - half[2] + self.radius
-        inner = minimum(maximum(a, maximum(b, c)), jnp.zeros_like(a))
-        outer = norm(positive_part(a), positive_part(b), positive_part(c))
-        return inner + outer - self.radius
-
-    def bounding_box(self) -> Bounds:
-        return self.lower, self.upper
+    dim: ClassVar[int] = 3
 
 
 # Solids with their centre at the origin and their axis along z, with exact distances
@@ -89,13 +61,12 @@ class BoxFrame(AbstractSolidShape):
     """The twelve edges of a cuboid of `size` [m] as square bars of `thickness` [m] inside."""
 
     size: Float[Array, "3"] = eqx.field(converter=real)
-    thickness: Float[Array, ""] = eqx.field(converter=real)
-    exactness: ClassVar[Exactness] = Exactness(outside=True, inside=False)
+    thickness: Float[Array, ""] = eqx.field(converter=positive)
+    exactness: ClassVar[Exactness] = OUTSIDE
 
     def __check_init__(self):
         _check.shape("BoxFrame", "size", self.size, (3,), "Give (x, y, z).")
         _check.positive("BoxFrame", "size", self.size, "m", "Give lengths above zero.")
-        check_lengths(self, "thickness")
 
     def distance(self, x, y, z):
         half, t = self.size / 2, self.thickness / 2
@@ -111,11 +82,8 @@ class BoxFrame(AbstractSolidShape):
 class Torus(AbstractSolidShape):
     """Ring about z: circle of `radius` [m], thickened by `tube_radius` [m]."""
 
-    radius: Float[Array, ""] = eqx.field(converter=real)
-    tube_radius: Float[Array, ""] = eqx.field(converter=real)
-
-    def __check_init__(self):
-        check_lengths(self, "radius", "tube_radius")
+    radius: Float[Array, ""] = eqx.field(converter=positive)
+    tube_radius: Float[Array, ""] = eqx.field(converter=positive)
 
     def distance(self, x, y, z):
         return norm(norm(x, y) - self.radius, z) - self.tube_radius
@@ -128,13 +96,12 @@ class Torus(AbstractSolidShape):
 class CappedTorus(AbstractSolidShape):
     """The part of a torus within `half_angle` [rad] of +x, with round ends."""
 
-    radius: Float[Array, ""] = eqx.field(converter=real)
-    tube_radius: Float[Array, ""] = eqx.field(converter=real)
+    radius: Float[Array, ""] = eqx.field(converter=positive)
+    tube_radius: Float[Array, ""] = eqx.field(converter=positive)
     half_angle: Float[Array, ""] = eqx.field(converter=real)
-    exactness: ClassVar[Exactness] = Exactness(outside=True, inside=False)
+    exactness: ClassVar[Exactness] = OUTSIDE
 
     def __check_init__(self):
-        check_lengths(self, "radius", "tube_radius")
         _check.between(
             "CappedTorus", "half_angle", self.half_angle, 0, np.pi, "rad", "Use a Torus."
         )
@@ -154,11 +121,10 @@ class CappedTorus(AbstractSolidShape):
 class InfiniteCylinder(AbstractSolidShape):
     """Cylinder of `radius` [m] without ends about the `axis` "x", "y" or "z"."""
 
-    radius: Float[Array, ""] = eqx.field(converter=real)
+    radius: Float[Array, ""] = eqx.field(converter=positive)
     axis: str = eqx.field(static=True, default="z")
 
     def __check_init__(self):
-        check_lengths(self, "radius")
         if self.axis not in ("x", "y", "z"):
             raise ValueError(
                 f"InfiniteCylinder: `axis` is {self.axis!r}, need 'x', 'y' or 'z'. Use `turn` "
@@ -177,12 +143,11 @@ class InfiniteCylinder(AbstractSolidShape):
 class Cylinder(AbstractSolidShape):
     """Cylinder of `radius` and `height` [m] about z; `rounding` [m] of its edges inside it."""
 
-    radius: Float[Array, ""] = eqx.field(converter=real)
-    height: Float[Array, ""] = eqx.field(converter=real)
+    radius: Float[Array, ""] = eqx.field(converter=positive)
+    height: Float[Array, ""] = eqx.field(converter=positive)
     rounding: Float[Array, ""] = eqx.field(converter=real, default=0.0)
 
     def __check_init__(self):
-        check_lengths(self, "radius", "height")
         if all(_check.is_concrete(v) for v in (self.radius, self.height, self.rounding)):
             most = min(float(self.radius), float(self.height) / 2)
             if not 0 <= float(self.rounding) <= most * (1 + 1e-12):
@@ -203,12 +168,9 @@ class Cylinder(AbstractSolidShape):
 class CappedCone(AbstractSolidShape):
     """Truncated cone about z: `radius` at the bottom, `top_radius` at the top [m]."""
 
-    radius: Float[Array, ""] = eqx.field(converter=real)
-    top_radius: Float[Array, ""] = eqx.field(converter=real)
-    height: Float[Array, ""] = eqx.field(converter=real)
-
-    def __check_init__(self):
-        check_lengths(self, "radius", "top_radius", "height")
+    radius: Float[Array, ""] = eqx.field(converter=positive)
+    top_radius: Float[Array, ""] = eqx.field(converter=positive)
+    height: Float[Array, ""] = eqx.field(converter=positive)
 
     def distance(self, x, y, z):
         return cone_distance(norm(x, y), z, self.radius, self.top_radius, self.height / 2)
@@ -221,11 +183,8 @@ class CappedCone(AbstractSolidShape):
 class Cone(AbstractSolidShape):
     """Cone about z of `radius` and `height` [m], its tip on top."""
 
-    radius: Float[Array, ""] = eqx.field(converter=real)
-    height: Float[Array, ""] = eqx.field(converter=real)
-
-    def __check_init__(self):
-        check_lengths(self, "radius", "height")
+    radius: Float[Array, ""] = eqx.field(converter=positive)
+    height: Float[Array, ""] = eqx.field(converter=positive)
 
     def distance(self, x, y, z):
         zero = jnp.zeros_like(self.radius)
@@ -256,11 +215,8 @@ def _beside(end: Array, past: Array, ends: Array) -> Array:
 class HexagonalPrism(AbstractSolidShape):
     """Hexagonal prism about z: corners at `radius` [m], `height` [m] high."""
 
-    radius: Float[Array, ""] = eqx.field(converter=real)
-    height: Float[Array, ""] = eqx.field(converter=real)
-
-    def __check_init__(self):
-        check_lengths(self, "radius", "height")
+    radius: Float[Array, ""] = eqx.field(converter=positive)
+    height: Float[Array, ""] = eqx.field(converter=positive)
 
     def distance(self, x, y, z):
         across, along = sector(x, y, 6)

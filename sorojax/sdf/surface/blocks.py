@@ -13,7 +13,7 @@ import numpy as np
 
 from sorojax._progress import report
 from sorojax.sdf.base import AbstractSdf, cast
-from sorojax.sdf.sampling import finite_box, raise_empty, values
+from sorojax.sdf.sampling import finite_box, in_pieces, raise_empty, values
 
 LEAF = 8  # cells along a block
 _TOP = 64
@@ -107,15 +107,11 @@ def _sample(shape, corners, size):
 
 def _sampled(shape: AbstractSdf, grid: Grid, blocks: np.ndarray) -> np.ndarray:
     """Field in cells (n, 9, 9, 9) of `blocks`."""
+    if not len(blocks):
+        return np.zeros((0, LEAF + 1, LEAF + 1, LEAF + 1), np.float32)
     dtype = jnp.result_type(float)
-    found = [np.zeros((0, LEAF + 1, LEAF + 1, LEAF + 1), np.float32)]
-    for start in range(0, len(blocks), _BATCH):
-        piece = blocks[start : start + _BATCH]
-        padded = np.concatenate([piece, np.repeat(piece[-1:], _BATCH - len(piece), axis=0)])
-        corners = jnp.asarray(grid.points(padded), dtype=dtype)
-        field = _sample(shape, corners, jnp.asarray(grid.size, dtype=dtype))
-        found.append(np.asarray(field)[: len(piece)])
-    return np.concatenate(found)
+    corners, size = grid.points(blocks).astype(dtype), jnp.asarray(grid.size, dtype=dtype)
+    return in_pieces(lambda at: _sample(shape, at, size), _BATCH, corners)[0]
 
 
 def leaf_fields(

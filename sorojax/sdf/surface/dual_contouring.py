@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.sampling import values
+from sorojax.sdf.sampling import in_pieces, values
 from sorojax.sdf.surface.blocks import Grid, leaf_fields
 from sorojax.sdf.surface.sheets import (
     Crossings,
@@ -41,7 +41,6 @@ from sorojax.sdf.surface.walls import (
     Lost,
     apply_forced,
     forced_nodes,
-    joined,
     keep_joined,
     lost_edges,
     with_blocks_around,
@@ -83,20 +82,10 @@ def gathered(
         q = quads[piece]
         # Neighbours in space are neighbours in number: a piece fills a short range.
         low, high = int(q.min()), int(q.max()) + 1
-        row = padded(_features, offset[piece], normal[piece], shift[piece])
+        (row,) = in_pieces(_features, _PIECE, offset[piece], normal[piece], shift[piece])
         ends = np.arange(q.size + 1, dtype=np.int32)
         data = (np.ones(q.size, np.float32), (q - low).ravel(), ends)
         total[low:high] += csc_array(data, shape=(high - low, q.size)) @ row.reshape(-1, SUMS)
-
-
-def padded(function, *rows) -> np.ndarray:
-    """`function` of up to 8192 rows, brought to that length so that it is compiled once."""
-    count = len(rows[0])
-    if count < _PIECE:
-        rows = tuple(
-            np.concatenate([r, np.repeat(r[-1:], _PIECE - count, axis=0)]) for r in rows
-        )
-    return np.asarray(function(*rows))[:count]
 
 
 @jax.jit
@@ -117,11 +106,9 @@ def place(total: np.ndarray, alone: np.ndarray) -> np.ndarray:
     damped problem leave no trace of the damping where planes meet at an edge or corner.
     Vertices that are not `alone` in their cell stay at the mean, which keeps them apart.
     """
-    found = np.empty((len(total), 3), np.float32)
-    for start in range(0, len(total), _PIECE):
-        piece = slice(start, start + _PIECE)
-        found[piece] = padded(_nearest, total[piece], alone[piece])
-    return found
+    if not len(total):
+        return np.zeros((0, 3), np.float32)
+    return in_pieces(_nearest, _PIECE, total, alone)[0]
 
 
 @jax.jit
@@ -215,7 +202,7 @@ def _split_piece(vertices, quads: Quads, first: int) -> tuple[np.ndarray, ...]:
     ends = vertices.take(v, axis=0)
     ends -= point[:, None]
     axis = quads.axis.astype(np.int32)
-    cut = padded(_cut, ends.astype(np.float32), quads.normal, axis, share)
+    (cut,) = in_pieces(_cut, _PIECE, ends.astype(np.float32), quads.normal, axis, share)
     other, turned = np.flatnonzero(cut == 1), v.copy()
     turned[other] = np.roll(v[other], -1, axis=1)
     pair = np.empty((2, len(v), 3), v.dtype)
@@ -363,7 +350,7 @@ def _crossed(shape, grid, blocks, forced: Forced) -> tuple[list[Crossings], Lost
         groups.append(crossings(shape, grid, group, field, done, forced))
         done += len(group)
         del field
-    return groups, joined(lost) if lost else NO_EDGES
+    return groups, Lost(*map(np.concatenate, zip(*lost, strict=True))) if lost else NO_EDGES
 
 
 def _numbered(shape, grid, blocks, before, groups: list[Crossings], forced: Forced) -> Cells:

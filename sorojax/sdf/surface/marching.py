@@ -1,12 +1,12 @@
 """The zero set of a plane shape as curves, of a solid shape as triangles."""
 
 import importlib.util
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.sampling import finite_box, land, raise_empty, values, values_and_gradients
+from sorojax.sdf.sampling import finite_box, land, normals, raise_empty, values
 from sorojax.sdf.surface.blocks import LEAF, Grid, active_blocks, grid_around, leaf_fields
 from sorojax.sdf.surface.dual_contouring import dual_contouring
 
@@ -85,11 +85,10 @@ def _refine(shape: AbstractSdf, rough: np.ndarray, size: float) -> Curve:
     closed = bool(np.allclose(rough[0], rough[-1], rtol=0, atol=1e-9 * size))
     points = land(shape, rough[:-1] if closed else rough)
     points = points[_spaced(points, 0.02 * size, closed)]
-    normals = _normals(shape, points)
-    step = np.diff(points, axis=0)
-    if (step[:, 1] * normals[:-1, 0] - step[:, 0] * normals[:-1, 1]).sum() < 0:
-        points, normals = points[::-1], normals[::-1]
-    return _with_corners(shape, points, normals, size, closed)
+    normal = normals(shape, points)
+    if cross(normal[:-1], np.diff(points, axis=0)).sum() < 0:
+        points, normal = points[::-1], normal[::-1]
+    return _with_corners(shape, points, normal, size, closed)
 
 
 def _spaced(points: np.ndarray, least: float, closed: bool) -> np.ndarray:
@@ -101,29 +100,20 @@ def _spaced(points: np.ndarray, least: float, closed: bool) -> np.ndarray:
     return keep
 
 
-def _normals(shape: AbstractSdf, points: np.ndarray) -> np.ndarray:
-    g = values_and_gradients(shape, points)[1]
-    return g / np.maximum(np.linalg.norm(g, axis=1, keepdims=True), 1e-300)
-
-
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def cross(a: Any, b: Any) -> Any:
+    """Third component of the product of plane vectors (.., 2)."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-def _with_corners(shape, points, normals, size, closed) -> Curve:
+def _with_corners(shape, points, normal, size, closed) -> Curve:
     """The curve with its corners put in, and points that crowd them left out."""
     last = len(points) if closed else len(points) - 1
     first = np.arange(last)
     second = (first + 1) % len(points)
-    turn = np.abs(
-        np.arctan2(
-            cross(normals[first], normals[second]),
-            (normals[first] * normals[second]).sum(axis=1),
-        )
-    )
+    turn = _turned(normal[first], normal[second])
     first, second = first[turn > _TURN], second[turn > _TURN]
     found, corners = locate_corners(
-        shape, points[first], points[second], normals[first], normals[second]
+        shape, points[first], points[second], normal[first], normal[second]
     )
     after, corners = first[found], corners[found]
     order = np.argsort(np.concatenate([np.arange(len(points)), after + 0.5]), kind="stable")
@@ -156,11 +146,15 @@ def locate_corners(shape, a, b, normal_a, normal_b) -> tuple[np.ndarray, np.ndar
         # Both sides in one call: a call costs as much for a few points as for thousands.
         both = land(shape, np.concatenate([corner - step_a, corner + step_b]), 4)
         a, b = np.split(both, 2)
-        normal_a, normal_b = np.split(_normals(shape, both), 2)
+        normal_a, normal_b = np.split(normals(shape, both), 2)
         corner = _meet(a, b, normal_a, normal_b, (a + b) / 2, gap)
-    turn = np.abs(np.arctan2(cross(normal_a, normal_b), (normal_a * normal_b).sum(axis=1)))
     near = np.linalg.norm(corner - middle, axis=1) < 1.5 * gap[:, 0]
-    return (turn > _CORNER) & near, corner
+    return (_turned(normal_a, normal_b) > _CORNER) & near, corner
+
+
+def _turned(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle [rad] between vectors."""
+    return np.abs(np.arctan2(cross(a, b), (a * b).sum(axis=1)))
 
 
 def tangents(normal: np.ndarray) -> np.ndarray:

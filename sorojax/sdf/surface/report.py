@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sorojax.sdf.sampling import connected
 from sorojax.sdf.surface.marching import Surface
 from sorojax.sdf.trimesh.tree import crossing_triangles, least_wall
 
@@ -131,9 +132,6 @@ def _checked(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
 
 def _parts(t, edge, uses, count) -> tuple[int, int, np.ndarray]:
     """Number of shells, of vertices used, and of triangle fans around each vertex."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     # Corners of triangles, joined to the same corner of the triangle across an edge.
     corner = np.arange(3 * len(t)).reshape(-1, 3)
     order = np.argsort(edge, kind="stable")
@@ -150,11 +148,7 @@ def _parts(t, edge, uses, count) -> tuple[int, int, np.ndarray]:
         ],
         axis=1,
     )
-    size = 3 * len(t)
-    graph = coo_array((np.ones(join.shape[1]), (join[0], join[1])), shape=(size, size))
-    fan = connected_components(graph, directed=False)[1] if size else np.zeros(0, int)
-    firsts = np.unique(fan, return_index=True)[1]
-    fans = np.bincount(flat[firsts], minlength=count) if size else np.zeros(count, int)
-    faces = coo_array((np.ones(len(row)), (row[:, 0], row[:, 1])), shape=2 * (len(t),))
-    shells = connected_components(faces, directed=False)[0] if len(t) else 0
-    return int(shells), len(np.unique(flat)), fans
+    firsts = np.unique(connected(flat.size, *join), return_index=True)[1]
+    fans = np.bincount(flat[firsts], minlength=count)
+    shells = len(np.unique(connected(len(t), *row.T)))
+    return shells, len(np.unique(flat)), fans

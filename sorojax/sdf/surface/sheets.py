@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.sampling import value_and_gradient
+from sorojax.sdf.sampling import in_pieces, value_and_gradient
 from sorojax.sdf.surface.blocks import LEAF, Grid
 from sorojax.sdf.surface.walls import Forced, ends_at, forced_crossings
 
@@ -273,17 +273,12 @@ def _codes(field: np.ndarray) -> np.ndarray:
 
 def _hermite(shape, grid, nodes, axis, a, b) -> tuple[np.ndarray, np.ndarray]:
     """Crossings seen from `nodes` [cells], and the normals there."""
-    offset, normal = (np.empty((len(nodes), 3), np.float32) for _ in range(2))
+    if not len(nodes):
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
     dtype = jnp.result_type(float)
     lower, size = jnp.asarray(grid.lower, dtype=dtype), jnp.asarray(grid.size, dtype=dtype)
-    for start in range(0, len(nodes), _CHUNK):
-        piece = slice(start, start + _CHUNK)
-        rows = nodes[piece], axis[piece], a[piece], b[piece]
-        pad = _CHUNK - len(rows[0])
-        if pad:
-            rows = tuple(np.concatenate([r, np.repeat(r[-1:], pad, axis=0)]) for r in rows)
-        found = _cross(shape, lower, size, *rows)
-        offset[piece], normal[piece] = (np.asarray(f)[: _CHUNK - pad] for f in found)
+    cross = functools.partial(_cross, shape, lower, size)
+    offset, normal = in_pieces(cross, _CHUNK, nodes, axis, a, b)
     return offset, normal
 
 

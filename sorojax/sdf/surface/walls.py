@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.sampling import values, values_and_gradients
+from sorojax.sdf.sampling import connected, normals, unit, values, values_and_gradients
 from sorojax.sdf.surface.blocks import LEAF, Grid
 
 _BATCH = 64
@@ -143,13 +143,9 @@ def _through(shape, grid, start, axis, ends) -> Lost:
 def _opposed(shape, grid, start, axis, deepest, depth) -> np.ndarray:
     """Whether the faces that edges enter and leave by face away from each other."""
     reach = 0.75 * depth / float(shape.lipschitz)
-    slopes = []
-    for share in (deepest - reach, deepest + reach):
-        at = start + share[:, None] * UNITS[axis]
-        slope = values_and_gradients(shape, grid.points(at))[1]
-        length = np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-300)
-        slopes.append(slope / length)
-    return (slopes[0] * slopes[1]).sum(axis=1) < _OPPOSED
+    shares = (deepest - reach)[:, None], (deepest + reach)[:, None]
+    faces = [normals(shape, grid.points(start + share * UNITS[axis])) for share in shares]
+    return (faces[0] * faces[1]).sum(axis=1) < _OPPOSED
 
 
 def _way_round(shape, grid, start, axis, side) -> np.ndarray:
@@ -164,11 +160,6 @@ def _way_round(shape, grid, start, axis, side) -> np.ndarray:
         f = values(shape, grid.points(points.reshape(-1, 3))).reshape(points.shape[:2])
         found[rows] = (f * side[rows] > 0).all(axis=1)
     return found
-
-
-def joined(parts: list[Lost]) -> Lost:
-    """All of them."""
-    return Lost(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 # Nodes that count to the side of a wall or a gap, so that it stays whole
@@ -216,7 +207,7 @@ def forced_nodes(shape: AbstractSdf, grid: Grid, lost: Lost, crossed: int) -> Fo
         _refuse(grid, lost, np.ones(len(lost.axis), bool))
     ends = np.stack([lost.start, lost.start + UNITS[lost.axis]], axis=1)
     f, slope = values_and_gradients(shape, grid.points(ends.reshape(-1, 3)))
-    slope = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-300)
+    slope = unit(slope)
     side = np.repeat(np.where(lost.inside, -1.0, 1.0), 2)
     touching = _grows_onto(shape, grid, ends.reshape(-1, 3), slope, side).reshape(-1, 2)
     cost = np.abs(f.reshape(-1, 2)) / grid.size + 10.0 * touching
@@ -239,17 +230,12 @@ def without_specks(
     A node that was chosen for a wall thinner than its neighbours see stays alone where the
     wall ends: a speck or a bubble smaller than a cell, that the shape does not have.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     if not len(forced.number):
         return vertices, triangles
     first, second = triangles[:, [0, 1]].ravel(), triangles[:, [1, 2]].ravel()
-    pairs = (np.ones(len(first), bool), (first, second))
-    shape = (len(vertices), len(vertices))
-    shells, shell = connected_components(coo_matrix(pairs, shape), directed=False)
-    count = np.bincount(shell, minlength=shells)
-    middle = [np.bincount(shell, axis, shells) / count for axis in vertices.T]
+    shell = connected(len(vertices), first, second)
+    count = np.bincount(shell)
+    middle = [np.bincount(shell, axis) / count for axis in vertices.T]
     node = np.rint(np.stack(middle, axis=1)).astype(int)
     speck = (count <= _SPECK) & (_chosen(grid, forced, node) >= 0)
     if not speck.any():

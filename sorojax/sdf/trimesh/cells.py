@@ -1,7 +1,5 @@
 """One triangle in space: distance, side and solid angle at separate coordinate arrays."""
 
-import functools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax.sdf.base import clip, minimum, quotient, root
+from sorojax.sdf.sampling import in_pieces
 from sorojax.sdf.shapes.bars import segment_square
 
 Vector = tuple[Array, ...]  # x, y, z
@@ -45,16 +44,20 @@ def over(p: Vector, a: Vector, b: Vector, c: Vector, slack: float = 0.0) -> tupl
 def triangle_square(p: Vector, a: Vector, b: Vector, c: Vector) -> Array:
     """Square of the distance to a triangle [m^2]."""
     height, within = over(p, a, b, c)
+    return jnp.where(within, height * height, _edge_square(p, a, b, c))
+
+
+def _edge_square(p: Vector, a: Vector, b: Vector, c: Vector) -> Array:
+    """Square of the distance to the edges of a triangle [m^2]."""
     edges = [segment_square(p, *ends) for ends in ((a, b), (b, c), (c, a))]
-    return jnp.where(within, height * height, minimum(edges[0], minimum(edges[1], edges[2])))
+    return minimum(edges[0], minimum(edges[1], edges[2]))
 
 
 def triangle_side(p: Vector, a: Vector, b: Vector, c: Vector, inside: Array) -> Array:
     """Signed distance to the nearest triangle; over its face it has a slope at zero too, and
     on an edge that of one of the faces beside it."""
     height, within = over(p, a, b, c, _ON_EDGE * float(jnp.finfo(p[0].dtype).eps))
-    edges = [segment_square(p, *ends) for ends in ((a, b), (b, c), (c, a))]
-    far = root(minimum(edges[0], minimum(edges[1], edges[2])))
+    far = root(_edge_square(p, a, b, c))
     return jnp.where(within, height, jnp.where(inside, -far, far))
 
 
@@ -176,7 +179,7 @@ def triangle_cells(
     low, edge = low[None], float(edge)
     pairs = np.zeros(len(triangles), np.int64), np.arange(len(triangles))
     child, lists, left, depth = [np.zeros(1, np.int64)], [], _WORK * len(triangles), 0
-    named, balls = 0, _balls(triangles)
+    named, balls = 0, balls_around(triangles)
     finest = max(float(balls[1].mean()), edge / 2**_DEPTH)
     while True:
         owner, face, apart, gap = _close(low, edge, balls, *pairs)
@@ -231,7 +234,7 @@ def _shortened(count, owner, face, apart) -> tuple[np.ndarray, np.ndarray]:
     return count, face[order[place < MOST]]
 
 
-def _balls(triangles) -> tuple[np.ndarray, np.ndarray]:
+def balls_around(triangles) -> tuple[np.ndarray, np.ndarray]:
     """Middles (3, n) and radii (n,) of balls that hold the triangles [m]."""
     middle = triangles.mean(axis=1)
     reach = np.sqrt(((triangles - middle[:, None]) ** 2).sum(axis=2)).max(axis=1)
@@ -261,7 +264,7 @@ def _possible(low, edge: float, triangles, owner, face):
     distance is convex, so it is below in between as well.
     """
     middle = low + low.dtype.type(edge / 2)
-    distance, way = _pieces(_seen, (middle, owner), (triangles, face))
+    distance, way = in_pieces(lambda o, f: _seen(middle[o], triangles[f]), _PIECE, owner, face)
     nearest = np.minimum.reduceat(distance, np.searchsorted(owner, np.arange(len(low))))
     rival = np.zeros(len(low), np.int64)
     lead = np.flatnonzero(distance == nearest[owner])
@@ -270,12 +273,12 @@ def _possible(low, edge: float, triangles, owner, face):
     slack = 64 * np.finfo(low.dtype).eps * (np.abs(low).max() + edge)
     offset = ((_LATTICE / 2 - 0.5) * (edge + slack)).astype(low.dtype)
     nodes = (middle[:, None] + offset).reshape(-1, 3)
-    upper = _pieces(_seen, (nodes, slice(None)), (triangles, np.repeat(rival, 27)))[0]
+    rivals = np.repeat(rival, 27)
+    upper = in_pieces(lambda p, f: _seen(p, triangles[f]), _PIECE, nodes, rivals)[0]
+    upper = upper.reshape(-1, 27)
     plane = np.concatenate([(distance - slack)[:, None], way], axis=1)
     sides = np.concatenate([np.ones((27, 1), low.dtype), offset], axis=1)
-    (below,) = _pieces(
-        functools.partial(_open, sides), (plane, slice(None)), (upper.reshape(-1, 27), owner)
-    )
+    (below,) = in_pieces(lambda p, o: _open(sides, p, upper[o]), _PIECE, plane, owner)
     kept = below.any(axis=1)
     return owner[kept], face[kept], distance[kept], below[kept]
 
@@ -284,7 +287,7 @@ def _possible(low, edge: float, triangles, owner, face):
 def _open(sides, plane, upper):
     """Whether `upper` is above the plane at any corner of the eighths."""
     above = upper >= plane @ sides.T
-    return (jnp.any(above[:, _EIGHTHS], axis=2),)
+    return jnp.any(above[:, _EIGHTHS], axis=2)
 
 
 @jax.jit
@@ -296,20 +299,3 @@ def _seen(p, triangle):
     distance = jnp.linalg.norm(away, axis=1)
     safe = jnp.where(distance > 0, distance, jnp.ones_like(distance))
     return distance, away / safe[:, None]
-
-
-def _pieces(function, *rows):
-    """`function` of rows of tables, always compiled for the same number of them."""
-    count = max(len(index) for _, index in rows if not isinstance(index, slice))
-    found = []
-    for i in range(0, count, _PIECE):
-        true = min(_PIECE, count - i)
-        part = [_some(table, index, i) for table, index in rows]
-        part = [np.pad(r, ((0, _PIECE - true),) + (r.ndim - 1) * ((0, 0),)) for r in part]
-        found.append([np.asarray(f)[:true] for f in function(*part)])
-    return [np.concatenate(column) for column in zip(*found, strict=True)]
-
-
-def _some(table, index, start: int):
-    where = slice(start, start + _PIECE)
-    return table[where] if isinstance(index, slice) else table[index[where]]

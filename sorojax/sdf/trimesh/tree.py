@@ -1,5 +1,7 @@
 """The nearest of many triangles by a tree of boxes, and the side of it a point is on."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,7 @@ from sorojax.sdf.trimesh.cells import (
     MOST,
     TriangleCells,
     Vector,
+    balls_around,
     dot,
     foot,
     minus,
@@ -190,16 +193,19 @@ def _next(node: Int[Array, " points"]) -> Int[Array, " points"]:
 
 def _boxes(triangles: Float[Array, "slots 3 3"]) -> tuple[Array, Array]:
     """Corners of the boxes of all nodes: the root is row 1, row i holds 2 i and 2 i + 1."""
-    lower = jnp.min(triangles.reshape(-1, 3 * LEAF, 3), axis=1)
-    upper = jnp.max(triangles.reshape(-1, 3 * LEAF, 3), axis=1)
-    levels = [(lower, upper)]
-    while len(lower) > 1:
-        lower = jnp.min(lower.reshape(-1, 2, 3), axis=1)
-        upper = jnp.max(upper.reshape(-1, 2, 3), axis=1)
-        levels.insert(0, (lower, upper))
-    levels.insert(0, levels[0])  # row 0 is no node
-    lower, upper = zip(*levels, strict=True)
+    levels = _levels(triangles)
+    lower, upper = zip(levels[0], *levels, strict=True)  # row 0 is no node
     return jnp.concatenate(lower), jnp.concatenate(upper)
+
+
+def _levels(triangles) -> list[tuple[Any, Any]]:
+    """Corners of the boxes of each level of the tree, the root first."""
+    slots = triangles.reshape(-1, 3 * LEAF, 3)
+    levels = [(slots.min(axis=1), slots.max(axis=1))]
+    while len(levels[0][0]) > 1:
+        lower, upper = (side.reshape(-1, 2, 3) for side in levels[0])
+        levels.insert(0, (lower.min(axis=1), upper.max(axis=1)))
+    return levels
 
 
 def triangle_tree(
@@ -253,7 +259,6 @@ def order_by_halving(centres: np.ndarray) -> np.ndarray:
 # Rays through triangles, on the host, and the thinnest wall between them.
 
 
-_LEAF = 4  # triangles in the smallest box
 _RAYS = 4000  # that measure a wall
 _FIRST, _PIECE = 32, 1024  # rays that are followed at once
 _OPPOSITE = -0.9  # cosine between the normals of the two sides of a wall
@@ -265,14 +270,8 @@ class TriangleBoxes:
     """Boxes around triangles (n, 3, 3), halved again and again."""
 
     def __init__(self, corners: np.ndarray):
-        from sorojax.sdf.trimesh.tree import order_by_halving
-
         self.corners, self.order = corners, order_by_halving(corners.mean(axis=1))
-        slots = corners[self.order].reshape(-1, 3 * _LEAF, 3)
-        self.levels = [(slots.min(axis=1), slots.max(axis=1))]
-        while len(self.levels[0][0]) > 1:
-            lower, upper = (a.reshape(-1, 2, 3) for a in self.levels[0])
-            self.levels.insert(0, (lower.min(axis=1), upper.max(axis=1)))
+        self.levels = _levels(corners[self.order])
 
     def first_hits(self, start: np.ndarray, way: np.ndarray, least: float, most: float):
         """Distance [m] along unit vectors `way` from `start` (rays, 3) to the first triangle
@@ -291,8 +290,8 @@ class TriangleBoxes:
             slack = 1e-12 * np.abs(leave)
             through = (enter <= leave + slack) & (leave >= 0) & (enter <= most)
             ray, box = ray[through], box[through]
-        ray = np.repeat(ray, _LEAF)
-        triangle = self.order[(_LEAF * box[:, None] + np.arange(_LEAF)).ravel()]
+        ray = np.repeat(ray, LEAF)
+        triangle = self.order[(LEAF * box[:, None] + np.arange(LEAF)).ravel()]
         distance = _distances(start[ray], way[ray], self.corners[triangle])
         distance[~((distance > least) & (distance <= most))] = np.inf
         far, hit = np.full(len(start), np.inf), np.full(len(start), -1)
@@ -374,13 +373,6 @@ _MOST = 1000  # pairs that are listed
 _PAIRS_AT_ONCE = 20_000
 
 
-def _circles(vertices, triangles) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (n, 3) of triangles and the reach (n,) of their corners [m]."""
-    corners = vertices[triangles]
-    centers = corners.mean(axis=1)
-    return centers, np.sqrt(((corners - centers[:, None]) ** 2).sum(axis=2)).max(axis=1)
-
-
 def crossing_triangles(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Pairs (n, 2) of triangles without a common vertex, an edge of one through the other.
 
@@ -388,7 +380,8 @@ def crossing_triangles(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarra
     """
     if len(triangles) < 2:
         return np.zeros((0, 2), int)
-    centers, reach = _circles(vertices, triangles)
+    centers, reach = balls_around(vertices[triangles])
+    centers = centers.T
     found, total = [np.zeros((0, 2), int)], 0
     # Triangles of one size together: a few large ones must not widen every search.
     rank = np.frexp(np.maximum(reach, 1e-300))[1]
