@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from sorojax._progress import report, reported_if_long
 from sorojax.fem.equilibrium import rules
-from sorojax.fem.equilibrium.linear import Linearised, Prepared, prepare
+from sorojax.fem.equilibrium.linear import Prepared, prepare
 from sorojax.fem.equilibrium.newton import Newton, newton_solve
 from sorojax.fem.problem import Problem
 from sorojax.fem.supports import known_values
@@ -51,7 +51,7 @@ class Start(NamedTuple):
 
     u: np.ndarray
     problem: Problem
-    tangent: Linearised | None
+    tangent: Float[Array, " nnz"] | None
 
 
 class Log:
@@ -74,13 +74,9 @@ class Log:
         return Stats(tuple(self.steps), self.cuts, self.reason)
 
 
-def begin_at(problem: Problem, begin: Start | np.ndarray | None) -> Start:
-    """Where to start from: the unloaded body, unless told otherwise."""
-    if isinstance(begin, Start):
-        return begin
-    if begin is None:
-        return Start(np.zeros(problem.mesh.points.shape), unloaded(problem), None)
-    return Start(begin, problem, None)
+def at_rest(problem: Problem) -> Start:
+    """The unloaded body."""
+    return Start(np.zeros(problem.mesh.points.shape), unloaded(problem), None)
 
 
 def follow(problem: Problem, begin: Start, log: Log) -> np.ndarray:
@@ -100,7 +96,7 @@ def follow(problem: Problem, begin: Start, log: Log) -> np.ndarray:
                 log.reason = result.reason
                 return u
             continue
-        u, tangent, kept = result.u, result.linearised, result.kept
+        u, tangent, kept = result.u, result.tangent, result.kept
         way = rules.accept(way, result.iterations)
         log.steps.append(
             LoadStep(goal, result.iterations, result.residual, result.negative_eigenvalues)
@@ -173,7 +169,7 @@ def solve_lanes(
             prepared = shared if same_body else prepare(problem)
             u, tried = _from_neighbour(problem, prepared, logs[neighbour].end, log), True
         if u is None:
-            u = follow(problem, begin_at(problem, None), log)
+            u = follow(problem, at_rest(problem), log)
         account.add(tried, problem.space.system.solver.num_factorisations - spent)
         answers[lane] = u
         report("lanes", count + 1, len(logs), iterations=log.stats().iterations)
@@ -213,7 +209,7 @@ def _from_neighbour(
     if found.reason or found.negative_eigenvalues != 0:
         return None
     log.steps.append(LoadStep(1.0, found.iterations, found.residual, 0))
-    log.end = Start(found.u, problem, found.linearised)
+    log.end = Start(found.u, problem, found.tangent)
     return found.u
 
 

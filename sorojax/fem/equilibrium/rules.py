@@ -47,12 +47,6 @@ def sound(residual_norm: Number, volume_ratio: Number) -> Truth:
     return (abs(residual_norm) < float("inf")) & (volume_ratio > 0)
 
 
-def imbalance(residual_norm: float, reference: float) -> float:
-    """Largest unbalanced force over the load or reaction that it is judged by; itself where
-    there is none [N]."""
-    return residual_norm / reference if reference > 0 else residual_norm
-
-
 def balanced(
     residual_norm: Number, reference: Number, rounding: Number, tolerance: Number
 ) -> Truth:
