@@ -187,7 +187,7 @@ class Run:
         if self.control.error is not None:
             args = self.control.error, np.asarray(displacement), float(self.prepared.length)
             ratio = rules.error_ratio(float(error), *args)
-            if not rules.error_fits(ratio):
+            if not ratio <= 1.0:
                 self.reason = f"an error of a step of {float(error):.3g} m"
                 return None
         self._easy = rules.is_easy(found.iterations, self.control.newton, ratio)

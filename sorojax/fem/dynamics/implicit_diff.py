@@ -117,7 +117,7 @@ def _attempt(dynamics, known, prepared: Prepared, control: Control, state, inter
     fine, ratio = (counts[0] == 0) & ~through & ~gained & keeps, 0.0
     if control.error is not None:
         ratio = rules.error_ratio(error, control.error, new.displacement, prepared.length)
-        fine = fine & rules.error_fits(ratio)
+        fine = fine & (ratio <= 1.0)
     return u, new, fine, rules.is_easy(counts[2], control.newton, ratio), counts[2]
 
 

@@ -36,7 +36,7 @@ class Numbers(NamedTuple):
 
     Attributes:
         damping: C [N s/m], where it is not the same in every step.
-        lead, drive: See `dynamics_step.Step`.
+        lead, drive: See `TimeStep`.
         origin: Displacement at the start [m].
         mass_rate, rate: What mass and damping are multiplied with [1/s^2, 1/s].
         share: How far within the step forces act.
@@ -305,7 +305,7 @@ class StepSolver:
                 found = u, now.residual, now.load, iterations, fresh
                 return Found(*found, self.kept, "", volume)
             exhausted = iterations >= rules.MOST_ITERATIONS * settings.max_iterations
-            if exhausted or rules.exhausted(fresh, settings):
+            if exhausted or (fresh >= settings.max_iterations):
                 reason = f"no convergence in {iterations} Newton iterations"
                 return self._failed(u, iterations, fresh, reason)
             slow = iterations > 0 and norm > _SLOW * last and not small

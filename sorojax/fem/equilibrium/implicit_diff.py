@@ -29,7 +29,7 @@ from sorojax.fem.equilibrium.lanes import Lanes, lane_operation
 from sorojax.fem.equilibrium.linear import linearise
 from sorojax.fem.equilibrium.load_stepping import (
     Log,
-    Start,
+    StartingPoint,
     Stats,
     at_rest,
     follow,
@@ -382,10 +382,10 @@ def _follow(problem: Problem, begin: Begin | None, log: Log) -> np.ndarray:
         return u
     if begin.terms is not None:
         start = with_terms(problem, begin.terms)
-        return follow(problem, Start(u, start, begin.tangent), log)
+        return follow(problem, StartingPoint(u, start, begin.tangent), log)
     # from a guess at full load; from rest along the load if it is too far away
     once = Log(log.newton, 1, 0)
-    u = follow(problem, Start(u, problem, begin.tangent), once)
+    u = follow(problem, StartingPoint(u, problem, begin.tangent), once)
     if once.reason:
         return follow(problem, at_rest(problem), log)
     log.steps, log.end = once.steps, once.end

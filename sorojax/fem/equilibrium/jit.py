@@ -221,7 +221,7 @@ def _examine(
         overran = more & rules.turned(state.slope, end)
         share = rules.shortened(state.share, state.slope, end)
     converged = ~collapsed & ~overran & valid & answer
-    exhausted = rules.exhausted(state.iterations, newton) & ~state.predict
+    exhausted = (state.iterations >= newton.max_iterations) & ~state.predict
     failed = ~collapsed & ~overran & ~converged & (~valid | exhausted)
     values = jnp.where(state.predict, state.tangent, found.values)
 

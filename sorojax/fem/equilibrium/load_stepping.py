@@ -46,7 +46,7 @@ class Stats(NamedTuple):
         return sum(step.iterations for step in self.steps)
 
 
-class Start(NamedTuple):
+class StartingPoint(NamedTuple):
     """A known equilibrium to start from, with the tangent there."""
 
     u: np.ndarray
@@ -64,7 +64,7 @@ class Log:
     def clear(self) -> None:
         self.steps: list[LoadStep] = []
         self.cuts, self.reason = 0, ""
-        self.end: Start
+        self.end: StartingPoint
 
     @property
     def status(self) -> Status:
@@ -74,12 +74,12 @@ class Log:
         return Stats(tuple(self.steps), self.cuts, self.reason)
 
 
-def at_rest(problem: Problem) -> Start:
+def at_rest(problem: Problem) -> StartingPoint:
     """The unloaded body."""
-    return Start(np.zeros(problem.mesh.points.shape), unloaded(problem), None)
+    return StartingPoint(np.zeros(problem.mesh.points.shape), unloaded(problem), None)
 
 
-def follow(problem: Problem, begin: Start, log: Log) -> np.ndarray:
+def follow(problem: Problem, begin: StartingPoint, log: Log) -> np.ndarray:
     """Step from `begin` to `problem`, halving steps that fail."""
     prepared = prepare(problem)
     u, tangent, kept, way = begin.u, begin.tangent, None, rules.first_step(log.num_steps)
@@ -101,7 +101,7 @@ def follow(problem: Problem, begin: Start, log: Log) -> np.ndarray:
         log.steps.append(
             LoadStep(goal, result.iterations, result.residual, result.negative_eigenvalues)
         )
-        log.end = Start(u, problem, tangent)
+        log.end = StartingPoint(u, problem, tangent)
         if len(log.steps) + log.cuts > 1:  # one step is no wait worth a line
             report("load", goal, 1.0, iterations=result.iterations, cuts=log.cuts)
     return u
@@ -196,7 +196,7 @@ def _is_stable(log: Log) -> bool:
 
 
 def _from_neighbour(
-    problem: Problem, prepared: Prepared, near: Start, log: Log
+    problem: Problem, prepared: Prepared, near: StartingPoint, log: Log
 ) -> np.ndarray | None:
     """Equilibrium by Newton from a neighbour's, or `None` if that is not to be trusted."""
     known = np.asarray(known_values(problem.supports, *near.u.shape))
@@ -209,7 +209,7 @@ def _from_neighbour(
     if found.reason or found.negative_eigenvalues != 0:
         return None
     log.steps.append(LoadStep(1.0, found.iterations, found.residual, 0))
-    log.end = Start(found.u, problem, found.tangent)
+    log.end = StartingPoint(found.u, problem, found.tangent)
     return found.u
 
 

@@ -332,7 +332,7 @@ def verdict(
     small = rules.balanced(norm, float(state.reference), float(state.rounding), tolerance)
     if rules.converged(small, size, still, settings):
         return ""
-    if rules.exhausted(iterations, settings):
+    if iterations >= settings.max_iterations:
         return f"no convergence in {iterations} Newton iterations"
     return None
 

@@ -76,11 +76,6 @@ def converged(is_balanced: Truth, size: Number, still: Truth, newton: "Newton") 
 MOST_ITERATIONS = 6
 
 
-def exhausted(iterations: Number, newton: "Newton") -> Truth:
-    """Whether there were as many iterations as there may be."""
-    return iterations >= newton.max_iterations
-
-
 # A step that runs too far along its way
 
 
@@ -155,14 +150,9 @@ def _chosen(condition: Truth, a: Number, b: Number) -> Number:
 
 
 def error_ratio(error: Number, allowed: Number, u: Values, length: Number) -> Number:
-    """Estimated error [m] of a time step to the displacement `u` [m] over the largest one:
-    the share `allowed` of `u`."""
+    """Estimated error [m] of a time step to the displacement `u` [m] over the largest one,
+    the share `allowed` of `u`: a step above 1 is not accepted."""
     return error / (allowed * (abs(u).max() + 0.01 * length))
-
-
-def error_fits(ratio: Number) -> Truth:
-    """Whether a time step may be accepted for its error."""
-    return ratio <= 1.0
 
 
 def is_easy(iterations: Number, newton: "Newton", ratio: Number) -> Truth:

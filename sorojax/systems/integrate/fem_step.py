@@ -202,7 +202,7 @@ def _judged(equations, newton, given, stages, unravel, now: _Pass, problems, fou
         small = _small(newton, stages, unravel, problems, found, now.u, values, gap)
         settled = ~jnp.any(jnp.stack([jnp.any(move != 0) for move in moves.values()]))
         converged = fine & rules.converged(small, now.update, settled, newton)
-        stop = converged | ~fine | rules.exhausted(now.iterations, newton)
+        stop = converged | ~fine | (now.iterations >= newton.max_iterations)
 
         def step():
             return _solved(
