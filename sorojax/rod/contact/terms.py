@@ -2,7 +2,7 @@
 forces, for steppers."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -26,51 +26,6 @@ from sorojax.rod.model.rod import Rod
 # twice the turn [rad], and twice the way over the length of a rod, that make a step long
 _TURN, _SHARE = 0.6, 0.02
 _SWIFT = 0.2  # twice the way over the narrowest radius that makes it swift
-
-
-class Parts(NamedTuple):
-    """The parts of `ContactTerms`.
-
-    Attributes:
-        plain: (t, motion) -> the forces without contacts.
-        passed: (motion before, motion after, h) -> whether anything went through anything.
-        stored: motion -> energy in contacts.
-    """
-
-    plain: Callable[[Array, Any], Array]
-    passed: Callable[[Any, Any, Array], Array]
-    stored: Callable[[Any], Any]
-
-
-def terms_of(
-    parts: Parts,
-    near: Callable,
-    force: Callable,
-    at: Callable[[Array, Array], Any],
-    inertia: Callable[[Any], tuple[Array, Array]],
-    symmetric: bool = True,
-) -> ContactTerms:
-    """The terms by (q, v), from those by motion."""
-
-    def free(t, q, v):
-        moment = at(q, v)
-        mass, coriolis = inertia(moment)
-        return mass, parts.plain(t, moment) - coriolis, moment
-
-    def passed(before, after, h):
-        return parts.passed(*still((at(*before), at(*after))), h)
-
-    def energy(q, v, near):
-        moment = still(at(q, v))
-        mass, _ = inertia(moment)
-        none = jnp.zeros((), q.dtype)
-        stored = jax.lax.cond(near, lambda: still(parts.stored(moment)), lambda: none)
-        return still(v @ mass @ v / 2), stored
-
-    def plain(t, q, v):
-        return still(parts.plain(t, at(q, v)))
-
-    return ContactTerms(free, near, force, passed, energy, plain, symmetric)
 
 
 def reached(contact: Any, h: Float[Array, ""], *bodies: Any) -> tuple[Array, Array, Array]:
@@ -141,7 +96,7 @@ def contacts_of(
         rows = list(zip(contacts, *columns, strict=True))
         return [one(*row) for row in rows] if single else each(one, rows)
 
-    def near(moment, h):
+    def near(moment, h) -> Any:
         rows = every(lambda contact, own: reached(contact, h, *own), bodies(moment))
         return tuple(any_of(flags) for flags in zip(*rows, strict=True))
 
@@ -162,18 +117,32 @@ def contacts_of(
         terms = every(one, bodies(moment), *columns)
         return Linearised(*(total(column) for column in zip(*terms, strict=True)))
 
+    def free(t, q, v):
+        moment = at(q, v)
+        mass, coriolis = inertia(moment)
+        return mass, total_force(plain, t, moment) - coriolis, moment
+
     def passed(before, after, h):
-        def one(contact, before, after):
-            return passed_by(contact, h, before, after)
+        ends = still((at(*before), at(*after)))
+        rows = every(lambda contact, *ends: passed_by(contact, h, *ends), *map(bodies, ends))
+        return any_of(rows)
 
-        return any_of(every(one, bodies(before), bodies(after)))
+    def energy(q, v, near):
+        moment = still(at(q, v))
+        mass, _ = inertia(moment)
 
-    def stored(moment):
-        return total(every(lambda contact, own: contact.stored(*own), bodies(moment)))
+        def stored():
+            rows = every(lambda contact, own: contact.stored(*own), bodies(moment))
+            return still(total(rows))
 
-    terms = Parts(lambda t, moment: total_force(plain, t, moment), passed, stored)
+        in_contacts = jax.lax.cond(near, stored, lambda: jnp.zeros((), q.dtype))
+        return still(v @ mass @ v / 2), in_contacts
+
+    def others(t, q, v):
+        return still(total_force(plain, t, at(q, v)))
+
     grips = any(contact.grips for contact in contacts)
-    return terms_of(terms, near, force, at, inertia, symmetric=not grips)
+    return ContactTerms(free, near, force, passed, energy, others, not grips)
 
 
 def any_contact(forces: tuple[Load, ...]) -> bool:
