@@ -161,7 +161,7 @@ class Equilibrium(NamedTuple):
 def response(at: Equilibrium, rates: Problem) -> Float[Array, "nodes dim"]:
     """du for the rates dp of the numbers that move, by operations that JAX differentiates."""
     system, matrix, known = _held_tangent(at)
-    if _supports_move(at):
+    if jax.tree.leaves(at.params.supports):
         rhs, move = _moved_unbalance(at, rates, known)
         return _answer(system, matrix, rhs, at.u) + move
     rhs = _unbalance(_without_supports(at), unsupported(rates), known)
@@ -191,17 +191,13 @@ class _Map:
 
     def pull_now(self, *changes) -> list:
         """By one back-substitution and the derivative of one number."""
-        if _supports_move(self.at):
+        if jax.tree.leaves(self.at.params.supports):
             return self.pull(*changes)
         system, matrix, known = _held_on_host(self.at)
         force = np.where(known, 0.0, np.asarray(changes[0]).ravel())
         # the last factor of the solve belongs to the state before the last, small update
         work = system.solver.solve_near(matrix, force)
         return jax.tree.leaves(_pulled(_without_supports(self.at), work, known))
-
-
-def _supports_move(at: Equilibrium) -> bool:
-    return bool(jax.tree.leaves(at.params.supports))
 
 
 def _without_supports(at: Equilibrium) -> Equilibrium:
@@ -318,11 +314,8 @@ def _derivative(call: Solve, primals, tangents):
         if call.num_values != call.num_all_values:
             values = jax.lax.slice_in_dim(values, 0, call.num_values)
     u_dot = response_at_once(at, rates) if concrete else response(at, rates)
-    return (u, counts, values), (u_dot, _still(counts), _still(values))
-
-
-def _still(x) -> SymbolicZero:
-    return SymbolicZero(jax.typeof(x).to_tangent_aval())
+    still = (SymbolicZero(jax.typeof(x).to_tangent_aval()) for x in (counts, values))
+    return (u, counts, values), (u_dot, *still)
 
 
 _equilibrium.defjvp(_derivative, symbolic_zeros=True)
