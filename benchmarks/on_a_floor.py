@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks import peers
 from benchmarks.harness import Row, Timing
 from sorojax import fem
-from sorojax.fem.contact.obstacle import areas_of
+from sorojax.fem.loads.facets import areas_of
 
 BAR = 0.2  # share of felupe's time that ours may take
 LAW = ("stiffness", "smoothing", "friction", "friction_velocity")

@@ -10,7 +10,7 @@ import pytest
 
 from sorojax import Status, contact, fem, material, mesh, sdf
 from sorojax.contact.friction import Grip, no_grip
-from sorojax.fem.contact.friction import moving
+from sorojax.fem.contact.obstacle import moving
 from sorojax.fem.dynamics.step import StepState
 from sorojax.units import mm
 

@@ -11,7 +11,6 @@ from sorojax.contact import LinePenalty
 from sorojax.math.lie import SE2, SE3
 from sorojax.math.status import Status
 from sorojax.rod.contact.obstacle import energy as energy_of_touch
-from sorojax.rod.contact.rods import touches
 
 RADIUS = 6e-3
 FINGER = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2000.0)
@@ -156,7 +155,7 @@ def test_rods_that_cross_press_against_each_other():
         def energy(q):
             pair, motion = crossed(q)
             bodies = [R.part_motion(motion, k) for k in (0, 1)]
-            found = touches(contact, *bodies)
+            found = contact.touches(*bodies)
             return sum(energy_of_touch(contact.law, touch) for touch in found)
 
         pair, motion = crossed(q)

@@ -42,13 +42,6 @@ def clearance(
 # Broad phase by balls: bodies that cannot touch, found by one number each
 
 
-def ball(points: Float[Array, "points dim"]) -> tuple[Array, Array]:
-    """Centre and radius [m] of a ball that holds all `points` [m]."""
-    centre = (jnp.min(points, axis=0) + jnp.max(points, axis=0)) / 2
-    square = jnp.sum((points - centre[None]) ** 2, axis=1)
-    return centre, jnp.sqrt(jnp.max(square))
-
-
 def near(
     obstacle: AbstractSdf, centre: Float[Array, " dim"], radius: Float[Array, ""]
 ) -> Bool[Array, ""]:

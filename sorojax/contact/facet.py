@@ -158,6 +158,15 @@ def gaps(
     return obstacle(points)
 
 
+def surface(
+    obstacle: AbstractSdf, points: Float[Array, "points dim"]
+) -> tuple[Float[Array, " points"], Float[Array, "points dim"], Float[Array, "points dim"]]:
+    """Distances of `points` [m] from `obstacle`, their slopes and the unit normals there."""
+    gap, slope = jax.vmap(jax.value_and_grad(obstacle))(points)
+    square = jnp.sum(slope**2, axis=1, keepdims=True)
+    return gap, slope, slope / jnp.sqrt(jnp.where(square > 0, square, jnp.ones_like(square)))
+
+
 def contacts(
     law: Penalty,
     obstacle: AbstractSdf,
@@ -172,13 +181,8 @@ def contacts(
     The force is pressure times area along the slope of the field, minus the derivative of
     the energy `sum(areas * law.energy(gaps))`.
     """
-
-    def one(point):
-        return gaps(obstacle, point, shift)
-
-    gap, slope = jax.vmap(jax.value_and_grad(one))(points)
+    local = points if shift is None else points - jnp.broadcast_to(shift, points.shape)
+    gap, slope, normal = surface(obstacle, local)
     pressure = law.pressure(gap if offset is None else gap - offset)
-    size = jnp.sqrt(jnp.sum(slope**2, axis=1, keepdims=True))
-    normal = slope / jnp.where(size > 0, size, jnp.ones_like(size))
     force = (areas * pressure)[:, None] * slope
     return Contacts(points, gap, pressure, normal, force, jnp.zeros_like(force))

@@ -92,10 +92,9 @@ class SpringSlider(eqx.Module):
         """Potential of a step per area [J/m^2]; friction is minus its slope."""
         whole, away = self._trial(grip, position)
         limit = self.law.limit(grip.pressure)
-        square = jnp.sum(away**2, axis=-1)
-        held = whole**2 * square <= limit**2
-        length = jnp.sqrt(jnp.where(held, jnp.ones_like(square), square))
+        held, length = _within(away, limit / whole)
         spring = jnp.where(limit > 0, whole, jnp.zeros_like(whole))  # none without pressure
+        square = jnp.sum(away**2, axis=-1)
         return jnp.where(held, spring * square / 2, limit * (length - limit / (2 * whole)))
 
     def traction(
@@ -104,9 +103,7 @@ class SpringSlider(eqx.Module):
         """Force of the obstacle on the points per area [Pa]."""
         whole, away = self._trial(grip, position)
         limit = self.law.limit(grip.pressure)
-        square = jnp.sum(away**2, axis=-1)
-        held = whole**2 * square <= limit**2
-        length = jnp.sqrt(jnp.where(held, jnp.ones_like(square), square))
+        held, length = _within(away, limit / whole)
         spring = jnp.where(limit > 0, whole, jnp.zeros_like(whole))
         return -jnp.where(held, spring, limit / length)[..., None] * away
 
@@ -138,10 +135,8 @@ class SpringSlider(eqx.Module):
     ) -> Float[Array, "*points dim"]:
         """A `stretch` [m] that a `pressure` [Pa] can hold: a spring beyond slides back."""
         longest = self.law.limit(pressure) / self.stiffness
-        square = jnp.sum(stretch**2, axis=-1)
-        held = square <= longest**2
-        length = jnp.sqrt(jnp.where(held, jnp.ones_like(square), square))
-        return jnp.where(held, jnp.ones_like(square), longest / length)[..., None] * stretch
+        held, length = _within(stretch, longest)
+        return jnp.where(held, jnp.ones_like(length), longest / length)[..., None] * stretch
 
     def stored(self, stretch: Float[Array, "*points dim"]) -> Float[Array, "..."]:
         """Energy in a spring of length `stretch` [m] per area [J/m^2]."""
@@ -155,6 +150,14 @@ class SpringSlider(eqx.Module):
             ..., None
         ]
         return whole, _across(position - centre, grip.normal)
+
+
+def _within(stretch, longest) -> tuple[Array, Array]:
+    """Whether springs are no longer than `longest`, and the length [m] of longer ones, one for
+    all others, whose root may have no derivative."""
+    square = jnp.sum(stretch**2, axis=-1)
+    held = square <= longest**2
+    return held, jnp.sqrt(jnp.where(held, jnp.ones_like(square), square))
 
 
 def no_grip(position: Float[Array, "*points dim"]) -> Grip:

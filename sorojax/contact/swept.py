@@ -95,12 +95,12 @@ def crosses(
         reach: Sum of the radii [m].
         allowed: Which pairs can meet; all if omitted.
     """
-    square = _products(before, others_before, before, others_before)
+    square = products(before, others_before, before, others_before)
     move, others = after - before, others_after - others_before
 
     def looked():
-        along = _products(before, others_before, move, others)
-        length = _products(move, others, move, others)
+        along = products(before, others_before, move, others)
+        length = products(move, others, move, others)
         root = along**2 - length * (square - reach**2)
         meets = (along < 0) & (root >= 0)
         entry = (-along - jnp.sqrt(jnp.where(meets, root, 0.0))) / jnp.where(
@@ -176,7 +176,7 @@ def _only(values, allowed, other):
     return values if allowed is None else jnp.where(allowed, values, other)
 
 
-def _products(a, b, c, d) -> Float[Array, "points others"]:
+def products(a, b, c, d) -> Float[Array, "points others"]:
     """(a_i - b_j) . (c_i - d_j)."""
     total = jnp.zeros((a.shape[0], b.shape[0]), a.dtype)
     for axis in range(a.shape[1]):

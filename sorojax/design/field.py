@@ -20,6 +20,8 @@ from sorojax._types import real
 from sorojax.mesh.measure import cell_areas, cell_volumes
 from sorojax.mesh.mesh import Mesh
 from sorojax.sdf.base import AbstractSdf, Box, Number, clip, norm, number
+from sorojax.sdf.shapes.bars import segment_square
+from sorojax.sdf.trimesh.cells import triangle_square
 
 _REACH = 1.0  # cells: radius of the means that fill the space between their centres
 _NEAR = {2: 16, 3: 48}  # cells within that radius, with room for uneven ones
@@ -186,31 +188,12 @@ def _distances(points: np.ndarray, pieces: np.ndarray) -> Float[np.ndarray, " po
 
     near = min(_CANDIDATES, len(pieces))
     found = KDTree(pieces.mean(axis=1)).query(points, k=near)[1].reshape(len(points), near)
+    square = segment_square if pieces.shape[1] == 2 else triangle_square
     least = np.full(len(points), np.inf)
     for column in found.T:
-        least = np.minimum(least, _square_distance(points, pieces[column]))
+        corners = (tuple(corner.T) for corner in np.moveaxis(pieces[column], 1, 0))
+        least = np.minimum(least, np.asarray(square(tuple(points.T), *corners)))
     return np.sqrt(least)
-
-
-def _square_distance(p: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Squared distance of each point to its own segment or triangle."""
-    count = corners.shape[1]
-    sides = [(i, (i + 1) % count) for i in range(count if count > 2 else 1)]
-    least = np.full(len(p), np.inf)
-    for i, j in sides:
-        a, along = corners[:, i], corners[:, j] - corners[:, i]
-        length = np.maximum((along * along).sum(axis=1), 1e-300)
-        share = np.clip(((p - a) * along).sum(axis=1) / length, 0.0, 1.0)
-        least = np.minimum(least, ((p - a - share[:, None] * along) ** 2).sum(axis=1))
-    if count == 2:
-        return least
-    a, u, v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    n = np.cross(u, v)
-    area = np.maximum((n * n).sum(axis=1), 1e-300)
-    s = (np.cross(p - a, v) * n).sum(axis=1) / area
-    t = (np.cross(u, p - a) * n).sum(axis=1) / area
-    above = ((p - a) * n).sum(axis=1) ** 2 / area
-    return np.where((s >= 0) & (t >= 0) & (s + t <= 1), np.minimum(least, above), least)
 
 
 def joined(level: np.ndarray, keep: int | None, least: float) -> tuple[np.ndarray, float]:

@@ -230,7 +230,9 @@ def held(problem: Any, known: np.ndarray) -> None:
     modes = rigid_modes(np.asarray(problem.mesh.points), problem.kinematics)
     rows = modes.reshape(len(modes), -1)[:, known]
     if springs := [load for load in problem.loads if load.holds]:
-        rows = np.concatenate([rows, _spring_stiffness(problem, springs, modes)], axis=1)
+        stiffness = np.asarray(_curvature(problem, springs, jnp.asarray(modes)))
+        size = max(np.abs(stiffness).max(), np.finfo(float).tiny)
+        rows = np.concatenate([rows, stiffness / size], axis=1)
     free = len(modes) - (np.linalg.matrix_rank(rows, tol=1e-8) if rows.size else 0)
     if free:
         raise ValueError(
@@ -239,15 +241,10 @@ def held(problem: Any, known: np.ndarray) -> None:
         )
 
 
-def _spring_stiffness(problem: Any, springs: list, modes: np.ndarray) -> np.ndarray:
-    """Second derivatives of the potential of springs in the rigid modes, of unit size."""
-
-    stiffness = np.asarray(_curvature(problem, springs, jnp.asarray(modes)))
-    return stiffness / max(np.abs(stiffness).max(), np.finfo(float).tiny)
-
-
 @eqx.filter_jit
 def _curvature(problem: Any, springs: list, modes) -> Float[Array, "modes modes"]:
+    """Second derivatives of the potential of springs in the rigid modes."""
+
     def energy(amounts):
         u = jnp.einsum("m,mni->ni", amounts, modes)
         return sum(load.potential(problem, u) for load in springs)

@@ -40,7 +40,6 @@ class AbstractKinematics(eqx.Module):
     slots: eqx.AbstractClassVar[tuple[Slot, ...]]
     num_columns: eqx.AbstractClassVar[int]
     has_volume: eqx.AbstractClassVar[bool]
-    num_rigid_modes: eqx.AbstractClassVar[int]
 
     @abc.abstractmethod
     def embed(self, F: Gradient) -> Tensor:
@@ -63,7 +62,6 @@ class PlaneStrain(AbstractKinematics):
     slots: ClassVar[tuple[Slot, ...]] = _square(2)
     num_columns: ClassVar[int] = 2
     has_volume: ClassVar[bool] = True
-    num_rigid_modes: ClassVar[int] = 3
 
     def __check_init__(self):
         _check_thickness("PlaneStrain", self.thickness)
@@ -90,7 +88,6 @@ class PlaneStress(AbstractKinematics):
     slots: ClassVar[tuple[Slot, ...]] = _square(2)
     num_columns: ClassVar[int] = 2
     has_volume: ClassVar[bool] = False
-    num_rigid_modes: ClassVar[int] = 3
 
     def __check_init__(self):
         _check_thickness("PlaneStress", self.thickness)
@@ -148,7 +145,6 @@ class Axisymmetric(AbstractKinematics):
     slots: ClassVar[tuple[Slot, ...]] = (*_square(2), Slot(0, 2, 2, 2))
     num_columns: ClassVar[int] = 3
     has_volume: ClassVar[bool] = True
-    num_rigid_modes: ClassVar[int] = 1
 
     def embed(self, F: Gradient) -> Tensor:
         a, b, c, d, hoop = F
@@ -165,7 +161,6 @@ class Solid(AbstractKinematics):
     slots: ClassVar[tuple[Slot, ...]] = _square(3)
     num_columns: ClassVar[int] = 3
     has_volume: ClassVar[bool] = True
-    num_rigid_modes: ClassVar[int] = 6
 
     def embed(self, F: Gradient) -> Tensor:
         return (F[:3], F[3:6], F[6:])  # type: ignore[return-value]
@@ -181,6 +176,31 @@ def _check_thickness(where: str, thickness) -> None:
 def identity(kinematics: AbstractKinematics) -> tuple[float, ...]:
     """The kept entries of F at rest."""
     return tuple(float(s.row == s.col) for s in kinematics.slots)
+
+
+def strain_pairs(
+    kinematics: AbstractKinematics | type[AbstractKinematics],
+) -> list[tuple[int, int]]:
+    """Entries (j, k), j <= k, of F'F that may differ from those of the identity."""
+    slots = kinematics.slots
+    pairs = {(a.col, b.col) for a in slots for b in slots if a.row == b.row}
+    return sorted((j, k) for j, k in pairs if j <= k)
+
+
+def green_rates(
+    kinematics: AbstractKinematics,
+    F: Float[Array, "entries ..."],
+    H: Float[Array, "entries ..."],
+) -> list[Float[Array, "..."]]:
+    """Entries of (F'H + H'F) / 2 in `strain_pairs`: rates of the Green strain for `H` of F."""
+    at = {(s.row, s.col): number for number, s in enumerate(kinematics.slots)}
+
+    def entry(j, k):
+        rows = [r for r in range(3) if (r, j) in at and (r, k) in at]
+        both = [F[at[r, j]] * H[at[r, k]] + F[at[r, k]] * H[at[r, j]] for r in rows]
+        return 0.5 * sum(both[1:], start=both[0])
+
+    return [entry(j, k) for j, k in strain_pairs(kinematics)]
 
 
 def component_pairs(dim: int) -> list[tuple[int, int]]:

@@ -18,11 +18,12 @@ from sorojax._arguments import sized
 from sorojax._display import displayed
 from sorojax.fem import checks
 from sorojax.fem.assembly.energy import Body, energy_density
-from sorojax.fem.assembly.fields import Points, deformation, pressure_modes, quadrature_points
+from sorojax.fem.assembly.geometry import Points, deformation, quadrature_points
 from sorojax.fem.assembly.space import (
     AbstractFormulation,
     Space,
     default_formulation,
+    modes,
     space as make_space,
 )
 from sorojax.fem.kinematics import AbstractKinematics, Solid
@@ -97,6 +98,11 @@ def exchanged(problem: Problem, **parts: Any) -> Problem:
     for name, part in parts.items():
         object.__setattr__(other, name, part)
     return other
+
+
+def with_terms(problem: Problem, terms: tuple) -> Problem:
+    """`problem` under other loads and supports."""
+    return exchanged(problem, loads=terms[0], supports=terms[1])
 
 
 def problem(
@@ -195,8 +201,8 @@ def body_at(problem: Problem, points: Points) -> Body:
     material = jax.tree.map(
         lambda leaf: leaf[None] if jnp.ndim(leaf) == 1 else leaf, problem.material
     )
-    modes = pressure_modes(problem.formulation, points)
-    return Body(material, problem.kinematics, modes, points.volumes)
+    pressures = modes(problem.formulation, points.position, points.volumes)
+    return Body(material, problem.kinematics, pressures, points.volumes)
 
 
 def potential_energy(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, ""]:

@@ -15,16 +15,15 @@ from jaxtyping import Array, Float, Int
 
 from sorojax._jax.trace_state import is_traced
 from sorojax.fem.assembly.energy import Entries, energy_density, pressure, stack_matrix
-from sorojax.fem.assembly.fields import (
+from sorojax.fem.assembly.geometry import (
     Points,
+    Tables,
     deformation,
-    node_points,
     points_at,
-    pressure_modes,
     quadrature_points,
+    tables_at,
 )
-from sorojax.fem.assembly.geometry import Tables
-from sorojax.fem.assembly.space import coefficients
+from sorojax.fem.assembly.space import coefficients, modes
 from sorojax.fem.kinematics import PlaneStress
 from sorojax.fem.loads.facets import cavity_volume
 from sorojax.fem.problem import Problem, body, body_at, residual
@@ -50,7 +49,7 @@ def deformation_gradient(
 
 @jax.jit
 def _deformation_gradient(problem: Problem, u) -> Float[Array, "cells cell_nodes 3 3"]:
-    points = node_points(problem.mesh, problem.kinematics)
+    points = _node_points(problem)
     F = _full(problem, points, deformation(problem.mesh, problem.kinematics, points, u))
     return jnp.swapaxes(stack_matrix(F, points.volumes), 0, 1)
 
@@ -88,7 +87,7 @@ def cauchy_stress(
 
 @jax.jit
 def _cauchy_stress(problem: Problem, u) -> Float[Array, "cells cell_nodes 3 3"]:
-    return stress_at(problem, u, node_points(problem.mesh, problem.kinematics))
+    return stress_at(problem, u, _node_points(problem))
 
 
 def stress_at(
@@ -108,6 +107,11 @@ def stress_at(
     spread = jnp.eye(3, dtype=J.dtype)[None, None]
     sigma = shape + _pressure_at(problem, u, points, J)[..., None, None] * spread
     return jnp.swapaxes(sigma, 0, 1)
+
+
+def _node_points(problem: Problem) -> Points:
+    """The nodes of every cell; their volumes mean nothing."""
+    return points_at(problem.mesh, problem.kinematics, tables_at(problem.mesh.element, "nodes"))
 
 
 def _full(problem: Problem, points: Points, F: Entries) -> Tensor:
@@ -140,7 +144,7 @@ def _extended(problem: Problem, inside: Points, points: Points):
     """The orthonormal pressure functions of the quadrature points, at other points."""
     given = jnp.stack(problem.formulation.pressures(inside.position))
     wanted = jnp.stack(problem.formulation.pressures(points.position))
-    from_given = pressure_modes(problem.formulation, inside)
+    from_given = modes(problem.formulation, inside.position, inside.volumes)
     assert from_given is not None
     weights = inside.volumes[None, None]
     gram = jnp.sum(weights * given[:, None] * given[None], axis=2)

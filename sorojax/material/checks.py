@@ -6,8 +6,14 @@ import jax
 import numpy as np
 
 from sorojax import _check
+from sorojax._types import real
 
 MODULUS = "Moduli are in Pa: write 0.2 * MPa."
+
+
+def reals(values: Any) -> tuple[Any, ...]:
+    """One leaf for each of several numbers."""
+    return tuple(real(value) for value in values)
 
 
 def leaves(where: str, material: Any) -> None:

@@ -29,6 +29,8 @@ from sorojax.material.rubbers import (
     Ogden,
     Yeoh,
     locking_stretch,
+    made_of,
+    shear_modulus,
 )
 
 Columns = Callable[[np.ndarray, np.ndarray], np.ndarray]  # (stretch, nonlinear) -> columns
@@ -94,11 +96,9 @@ def fit_curve(
             _gent, starts, lambda v: largest * (1 + np.exp(v)), stretch, stress, weight
         )
     starts = [np.array(chosen) for chosen in combinations(EXPONENTS, terms)]
-    return _project(_ogden, starts, _within_range, stretch, stress, weight)
-
-
-def _within_range(exponents):
-    return np.clip(exponents, 0.5, 20.0)
+    return _project(
+        _ogden, starts, lambda exponents: np.clip(exponents, 0.5, 20.0), stretch, stress, weight
+    )
 
 
 def _solve(columns, stress, weight, positive: bool) -> np.ndarray:
@@ -138,22 +138,13 @@ def build(
     model: type[AbstractHyperelastic], curve: Curve, poisson_ratio: float, density: Any
 ) -> AbstractHyperelastic:
     """The compressible material with the fitted curve and the small-strain ratio."""
-    c = curve.coefficients
+    c, further = curve.coefficients, curve.nonlinear
     if model is Ogden:
-        kept = c > 0
-        c, alpha = c[kept], curve.nonlinear[kept]
-        order = np.argsort(alpha)
-        shear = real(np.sum(c)) / 2
-        moduli, exponents = tuple((c / alpha)[order]), tuple(alpha[order])
-        return Ogden(moduli, exponents, bulk_modulus(shear, poisson_ratio), density)
-    if model is Gent:
-        bulk = bulk_modulus(c[0], poisson_ratio)
-        return Gent(c[0], curve.nonlinear[0], bulk, density)
-    if model is NeoHookean:
-        return NeoHookean(c[0], bulk_modulus(c[0], poisson_ratio), density)
-    if model is MooneyRivlin:
-        return MooneyRivlin(*c, bulk_modulus(2 * (c[0] + c[1]), poisson_ratio), density)
-    return Yeoh(*c, bulk_modulus(2 * c[0], poisson_ratio), density)
+        order = np.argsort(further[c > 0])
+        c, further = ((c / further)[c > 0][order], further[c > 0][order])
+    coefficients = (*c, *further)
+    bulk = bulk_modulus(real(shear_modulus(model, coefficients)), poisson_ratio)
+    return made_of(model, coefficients, bulk, density)
 
 
 def modulus_at_rest(curve: Curve) -> float:

@@ -136,6 +136,17 @@ class Quadratic(AbstractVolumetricLaw):
         return (J - 1) ** 2 / 2
 
 
+class AbstractRubber(AbstractHyperelastic):
+    """An energy whose volumetric part is K U(J), with `volumetric` for U."""
+
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        bulk_modulus: ClassVar[Float[Array, "..."]]
+        volumetric: ClassVar[AbstractVolumetricLaw]
+
+    def volumetric_energy(self, J: Entry) -> Entry:
+        return self.bulk_modulus * self.volumetric(J)
+
+
 class SimoMiehe(AbstractVolumetricLaw):
     """(J^2 - 1 - 2 ln J) / 4: convex in J and infinite at J = 0.
 

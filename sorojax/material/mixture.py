@@ -55,10 +55,6 @@ def _(material: Scaled):
     return None if base is None else lambda x: material.factor * base(x)
 
 
-def _reals(values) -> tuple:
-    return tuple(real(value) for value in values)
-
-
 class Mixed(AbstractHyperelastic):
     """sum_i weight_i Psi_i: shares of a composite, or 1 and 0 for cells of a region.
 
@@ -66,7 +62,7 @@ class Mixed(AbstractHyperelastic):
     """
 
     materials: tuple[AbstractHyperelastic, ...]
-    weights: tuple[Float[Array, "..."], ...] = eqx.field(converter=_reals)
+    weights: tuple[Float[Array, "..."], ...] = eqx.field(converter=checks.reals)
 
     def __check_init__(self):
         if len(self.materials) != len(self.weights) or not self.materials:
@@ -75,13 +71,10 @@ class Mixed(AbstractHyperelastic):
                 "need one weight per material, at least one."
             )
         checks.leaves("Mixed", self)
+        do = "Negative stiffness has no equilibrium: weights are shares from 0 to 1."
         for weight in self.weights:
-            _check.finite("Mixed", "weights", weight, "Weights are shares from 0 to 1.")
-            if _check.is_concrete(weight) and np.any(np.asarray(weight) < 0):
-                raise ValueError(
-                    f"Mixed: a weight is {np.min(np.asarray(weight)):g}, need 0 or more: "
-                    "negative stiffness has no equilibrium. Weights are shares from 0 to 1."
-                )
+            _check.finite("Mixed", "weights", weight, do)
+            _check.not_negative("Mixed", "weights", weight, "", do)
 
     @property
     def density(self):

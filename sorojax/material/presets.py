@@ -17,7 +17,14 @@ import numpy as np
 
 from sorojax.material import checks
 from sorojax.material.hyperelastic import AbstractHyperelastic, bulk_modulus
-from sorojax.material.rubbers import MooneyRivlin, NeoHookean, Ogden, Yeoh
+from sorojax.material.rubbers import (
+    MooneyRivlin,
+    NeoHookean,
+    Ogden,
+    Yeoh,
+    made_of,
+    shear_modulus,
+)
 from sorojax.units import kPa
 
 MARECHAL = "Marechal et al. 2021, doi:10.1089/soro.2019.0115, ODbL 1.0 / DbCL 1.0"
@@ -61,11 +68,7 @@ class Preset:
     @property
     def shear_modulus(self) -> float:
         """Small-strain shear modulus [Pa]."""
-        c = self.coefficients
-        if self.model is Ogden:
-            half = len(c) // 2
-            return sum(m * a for m, a in zip(c[:half], c[half:], strict=True)) / 2
-        return {NeoHookean: c[0], MooneyRivlin: 2 * sum(c[:2])}.get(self.model, 2 * c[0])
+        return shear_modulus(self.model, self.coefficients)
 
     def __str__(self) -> str:
         def percent(value: float | None) -> str:
@@ -169,11 +172,7 @@ def rubber(name: str, *, poisson_ratio: float | None = None) -> Any:
         ratio = 0.49 if poisson_ratio is None else poisson_ratio
         checks.poisson_ratio("presets.rubber", ratio)
         bulk = bulk_modulus(np.asarray(preset.shear_modulus), ratio)  # type: ignore[arg-type]
-    c = preset.coefficients
-    if preset.model is Ogden:
-        half = len(c) // 2
-        return Ogden(c[:half], c[half:], bulk, preset.density)
-    return preset.model(*c, bulk, preset.density)
+    return made_of(preset.model, preset.coefficients, bulk, preset.density)
 
 
 def table() -> str:

@@ -13,7 +13,7 @@ Reference: Hale, Higham & Trefethen, SIAM J. Numer. Anal. 46, 2008.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -26,6 +26,7 @@ from sorojax._types import optional_real, real
 from sorojax.material import checks
 from sorojax.material.hyperelastic import (
     AbstractHyperelastic,
+    AbstractRubber,
     AbstractVolumetricLaw,
     Quadratic,
     bulk_modulus,
@@ -45,7 +46,7 @@ from sorojax.material.kinematics import (
 GENT_LIMIT = 0.99  # share of the locking strain measure where the continuation begins
 
 
-class NeoHookean(AbstractHyperelastic):
+class NeoHookean(AbstractRubber):
     """Psi = mu/2 (I1_bar - 3) + K U(J); moduli in Pa, density in kg/m^3."""
 
     shear_modulus: Float[Array, "..."] = eqx.field(converter=real)
@@ -62,11 +63,8 @@ class NeoHookean(AbstractHyperelastic):
     def isochoric_energy(self, F: Tensor) -> Entry:
         return self.first_invariant_energy(isochoric_first_invariant(F) - 3)
 
-    def volumetric_energy(self, J: Entry) -> Entry:
-        return self.bulk_modulus * self.volumetric(J)
 
-
-class MooneyRivlin(AbstractHyperelastic):
+class MooneyRivlin(AbstractRubber):
     """Psi = c10 (I1_bar - 3) + c01 (I2_bar - 3) + K U(J); coefficients in Pa.
 
     The small-strain shear modulus is 2 (c10 + c01). A negative c01 is unstable in
@@ -91,11 +89,8 @@ class MooneyRivlin(AbstractHyperelastic):
         first = self.c10 * (isochoric_first_invariant(F) - 3)
         return first + self.c01 * (isochoric_second_invariant(F) - 3)
 
-    def volumetric_energy(self, J: Entry) -> Entry:
-        return self.bulk_modulus * self.volumetric(J)
 
-
-class Yeoh(AbstractHyperelastic):
+class Yeoh(AbstractRubber):
     """Psi = sum_i c_i (I1_bar - 3)^i + K U(J); coefficients in Pa.
 
     The small-strain shear modulus is 2 c1.
@@ -120,11 +115,8 @@ class Yeoh(AbstractHyperelastic):
     def isochoric_energy(self, F: Tensor) -> Entry:
         return self.first_invariant_energy(isochoric_first_invariant(F) - 3)
 
-    def volumetric_energy(self, J: Entry) -> Entry:
-        return self.bulk_modulus * self.volumetric(J)
 
-
-class Gent(AbstractHyperelastic):
+class Gent(AbstractRubber):
     """Psi = -mu Jm/2 ln(1 - (I1_bar - 3)/Jm) + K U(J): chains lock at I1_bar - 3 = Jm.
 
     Beyond 99 % of `locking` (Jm [-]) the logarithm continues as its second-order Taylor
@@ -153,9 +145,6 @@ class Gent(AbstractHyperelastic):
 
     def isochoric_energy(self, F: Tensor) -> Entry:
         return self.first_invariant_energy(isochoric_first_invariant(F) - 3)
-
-    def volumetric_energy(self, J: Entry) -> Entry:
-        return self.bulk_modulus * self.volumetric(J)
 
 
 def locking_stretch(gent: Gent) -> Float[Array, "..."]:
@@ -269,11 +258,7 @@ def _contour_sums(
 Numbers = tuple[Float[Array, "..."], ...]
 
 
-def _reals(values) -> Numbers:
-    return tuple(real(value) for value in values)
-
-
-class Ogden(AbstractHyperelastic):
+class Ogden(AbstractRubber):
     """Psi = sum_p mu_p/alpha_p (l1^alpha_p + l2^alpha_p + l3^alpha_p - 3) + K U(J).
 
     The stretches are isochoric, `moduli` mu_p in Pa, `exponents` alpha_p without unit,
@@ -284,8 +269,8 @@ class Ogden(AbstractHyperelastic):
     Reference: Ogden, Proc. R. Soc. Lond. A 326, 1972.
     """
 
-    moduli: Numbers = eqx.field(converter=_reals)
-    exponents: Numbers = eqx.field(converter=_reals)
+    moduli: Numbers = eqx.field(converter=checks.reals)
+    exponents: Numbers = eqx.field(converter=checks.reals)
     bulk_modulus: Float[Array, "..."] = eqx.field(converter=real)
     density: Float[Array, "..."] | None = eqx.field(converter=optional_real, default=None)
     volumetric: AbstractVolumetricLaw = Quadratic()
@@ -313,12 +298,36 @@ class Ogden(AbstractHyperelastic):
         terms = zip(self.moduli, self.exponents, sums, strict=True)
         return sum(mu / alpha * (total - 3) for mu, alpha, total in terms)
 
-    def volumetric_energy(self, J: Entry) -> Entry:
-        return self.bulk_modulus * self.volumetric(J)
-
 
 def ogden_shear_modulus(material: Ogden) -> Float[Array, "..."]:
     """Small-strain shear modulus, half of sum_p mu_p alpha_p [Pa]."""
     terms = zip(material.moduli, material.exponents, strict=True)
     first, *others = [mu * alpha / 2 for mu, alpha in terms]
     return sum(others, start=first)
+
+
+# Coefficients by model, as fits and presets have them
+
+
+def shear_modulus(model: type[AbstractHyperelastic], coefficients: Sequence[float]) -> float:
+    """Small-strain shear modulus [Pa] of the coefficients of a `model` in the order of its
+    fields, of `Ogden` the moduli, then the exponents."""
+    c, half = coefficients, len(coefficients) // 2
+    if model is Ogden:
+        return sum(mu * alpha for mu, alpha in zip(c[:half], c[half:], strict=True)) / 2
+    if model is MooneyRivlin:
+        return 2 * (c[0] + c[1])
+    return 2 * c[0] if model is Yeoh else c[0]
+
+
+def made_of(
+    model: type[AbstractHyperelastic],
+    coefficients: Sequence[float],
+    bulk_modulus: Float[Array, ""] | float,
+    density: float | None,
+) -> AbstractHyperelastic:
+    """The rubber of such coefficients."""
+    half = len(coefficients) // 2
+    if model is Ogden:
+        return Ogden(coefficients[:half], coefficients[half:], bulk_modulus, density)
+    return model(*coefficients, bulk_modulus, density)

@@ -15,6 +15,7 @@ from sorojax._types import optional_real, real
 from sorojax.material import checks
 from sorojax.material.hyperelastic import (
     AbstractHyperelastic,
+    AbstractRubber,
     AbstractVolumetricLaw,
     Quadratic,
     bulk_modulus,
@@ -33,10 +34,6 @@ from sorojax.material.kinematics import (
 Parameters = tuple[Float[Array, "..."], ...]
 
 
-def _reals(values) -> Parameters:
-    return tuple(real(value) for value in values)
-
-
 class UserEnergy(AbstractHyperelastic):
     """Psi = function(F, *parameters) + K U(J) of a function of the deformation gradient.
 
@@ -50,7 +47,7 @@ class UserEnergy(AbstractHyperelastic):
     """
 
     function: Callable[..., Entry] = eqx.field(static=True)
-    parameters: Parameters = eqx.field(converter=_reals, default=())
+    parameters: Parameters = eqx.field(converter=checks.reals, default=())
     bulk_modulus: Float[Array, "..."] | None = eqx.field(converter=optional_real, default=None)
     density: Float[Array, "..."] | None = eqx.field(converter=optional_real, default=None)
     volumetric: AbstractVolumetricLaw = Quadratic()
@@ -74,7 +71,7 @@ class UserEnergy(AbstractHyperelastic):
         return self.bulk_modulus * self.volumetric(J)
 
 
-class InvariantEnergy(AbstractHyperelastic):
+class InvariantEnergy(AbstractRubber):
     """Psi = function(I1_bar, I2_bar, *parameters) + K U(J); see `UserEnergy`.
 
     Both invariants are 3 at rest; for a stable rest state the sum of the slopes of
@@ -82,7 +79,7 @@ class InvariantEnergy(AbstractHyperelastic):
     """
 
     function: Callable[..., Entry] = eqx.field(static=True)
-    parameters: Parameters = eqx.field(converter=_reals, default=())
+    parameters: Parameters = eqx.field(converter=checks.reals, default=())
     bulk_modulus: Float[Array, "..."] = eqx.field(converter=real, kw_only=True)
     density: Float[Array, "..."] | None = eqx.field(converter=optional_real, default=None)
     volumetric: AbstractVolumetricLaw = Quadratic()
@@ -103,9 +100,6 @@ class InvariantEnergy(AbstractHyperelastic):
     def isochoric_energy(self, F: Tensor) -> Entry:
         first, second = isochoric_first_invariant(F), isochoric_second_invariant(F)
         return self.function(first, second, *self.parameters)
-
-    def volumetric_energy(self, J: Entry) -> Entry:
-        return self.bulk_modulus * self.volumetric(J)
 
 
 def _check_energy(where: str, parameters: Any, at_rest: Callable[[], Entry]) -> None:

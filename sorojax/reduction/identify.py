@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from sorojax._progress import report
 from sorojax._types import Numbers, real
-from sorojax.fem.assembly.fields import quadrature_points
+from sorojax.fem.assembly.geometry import quadrature_points
 from sorojax.fem.dynamics.damping import lumped_mass
 from sorojax.fem.equilibrium.response import tangent_solve
 from sorojax.fem.equilibrium.solve import Path

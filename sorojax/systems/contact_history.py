@@ -23,7 +23,6 @@ from sorojax.rod import (
     part_motion,
 )
 from sorojax.rod.contact.obstacle import Touch
-from sorojax.rod.contact.rods import touches
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.tree import columns_of, each
 from sorojax.rod.forces.loads import parts_of
@@ -121,8 +120,7 @@ def _seen(contact: Any, own: tuple[Array | None, ...], effort: Array, *bodies: A
     load = contact(jnp.zeros((), effort.dtype), *bodies)
     for part, columns in zip((load,) if len(bodies) == 1 else load, own, strict=True):
         effort = effort if columns is None else effort + part @ columns
-    is_pair = isinstance(contact, RodContact)
-    found = touches(contact, *bodies) if is_pair else (contact.touch(*bodies),)
+    found = contact.touches(*bodies)
     overlap = -jnp.min(jnp.concatenate([touch.gap for touch in found]))
     push = _resultant(found[0], contact.law)
     for touch in found[1:]:  # of two rods: the second searches the first

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax import fem, material, mesh, sdf
-from sorojax.fem.contact.friction import untouched
+from sorojax.fem.contact.obstacle import untouched
 from tests.derivatives.case import Case
 from tests.patches import POLYGON, patch
 

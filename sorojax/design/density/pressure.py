@@ -24,15 +24,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax import _check
 from sorojax._types import Numbers, real
 from sorojax.design.density.filters import heaviside_projection
 from sorojax.fem.assembly.energy import volume_ratio
-from sorojax.fem.assembly.fields import Points, deformation, quadrature_points
-from sorojax.fem.assembly.geometry import geometry
+from sorojax.fem.assembly.geometry import Points, deformation, geometry, quadrature_points
 from sorojax.fem.assembly.space import Displacement, Space
 from sorojax.fem.kinematics import AbstractKinematics, Axisymmetric
 from sorojax.fem.loads.facets import CurvedPart
@@ -263,51 +261,13 @@ class Darcy(eqx.Module):
         solid = heaviside_projection(density, self.sharpness, self.threshold)
         permeable = 1 - (1 - self.tight) * solid
         drained = (jnp.log(self.remainder) / self.depth) ** 2 * self.tight * solid
-        return _pressure(self, permeable, drained)
-
-
-@jax.custom_jvp
-def _pressure(seep: Darcy, permeable, drained) -> Float[Array, " nodes"]:
-    matrix = _values(seep, permeable, drained)
-    right = -sparse.product(seep.system, matrix, seep.given)
-    return _answer(seep, matrix, right) + seep.given
-
-
-def _pressure_derivative(primals, tangents):
-    seep, *factors = primals
-    seep_dot, *factors_dot = tangents
-    matrix, p = _values(*primals), _pressure(*primals)
-    own, right = p[seep.cells], jnp.zeros_like(p)
-    parts = (seep.conduction, seep.storage)
-    parts_dot = (seep_dot.conduction, seep_dot.storage)
-    given_dot = jnp.zeros_like(p)
-    if not isinstance(seep_dot.given, SymbolicZero):
-        given_dot = seep_dot.given
-        right = right - sparse.product(seep.system, matrix, given_dot)
-    for part, part_dot, factor, factor_dot in zip(
-        parts, parts_dot, factors, factors_dot, strict=True
-    ):
-        # cell by cell: the matrix itself is not differentiated
-        if not isinstance(factor_dot, SymbolicZero):
-            flux = jnp.sum(part * own[:, None], axis=2)
-            right = right.at[seep.cells].add(-factor_dot[:, None] * flux)
-        if not isinstance(part_dot, SymbolicZero):
-            flux = jnp.sum(part_dot * own[:, None], axis=2)
-            right = right.at[seep.cells].add(-factor[:, None] * flux)
-    return p, _answer(seep, matrix, right) + given_dot
-
-
-_pressure.defjvp(_pressure_derivative, symbolic_zeros=True)
-
-
-def _values(seep: Darcy, permeable, drained) -> Float[Array, " nnz"]:
-    flow = permeable[:, None, None] * seep.conduction
-    return sparse.assemble(seep.system, flow + drained[:, None, None] * seep.storage)
-
-
-def _answer(seep: Darcy, matrix, right) -> Float[Array, " nodes"]:
-    right = jnp.where(seep.known, jnp.zeros_like(right), right)
-    return sparse.solve(seep.system, sparse.fix(seep.system, matrix, seep.known), right)
+        flow = permeable[:, None, None] * self.conduction
+        stored = drained[:, None, None] * self.storage
+        matrix = sparse.assemble(self.system, flow + stored)
+        right = -sparse.product(self.system, matrix, self.given)
+        right = jnp.where(self.known, jnp.zeros_like(right), right)
+        held = sparse.fix(self.system, matrix, self.known)
+        return sparse.solve(self.system, held, right) + self.given
 
 
 def darcy(

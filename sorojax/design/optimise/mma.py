@@ -19,7 +19,7 @@ References:
 """
 
 import abc
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -254,13 +254,15 @@ class MMAState(eqx.Module):
 class AbstractMMA(AbstractOptimiser):
     """Common part of both versions: bounds, asymptotes and the convex functions."""
 
-    if TYPE_CHECKING:  # fields that subclasses have, in their own order
-        lower: ClassVar[Float[Array, "..."]]
-        upper: ClassVar[Float[Array, "..."]]
-        move: ClassVar[Float[Array, ""]]
+    lower: Float[Array, "..."] = eqx.field(converter=real, default=0.0)
+    upper: Float[Array, "..."] = eqx.field(converter=real, default=1.0)
+    move: Float[Array, ""] = eqx.field(converter=real, default=0.5)
+    spread: Float[Array, ""] = eqx.field(converter=real, default=0.5)
+    approach: Float[Array, ""] = eqx.field(converter=real, default=0.7)
+    retreat: Float[Array, ""] = eqx.field(converter=real, default=1.2)
 
     @abc.abstractmethod
-    def _curvature(self, state: MMAState, values: Values, span: Array) -> Array:
+    def _curvature(self, state: MMAState) -> Array:
         """Least curvature of each function."""
 
     def init(self, x: Float[Array, " n"], constraints: int) -> MMAState:
@@ -286,14 +288,7 @@ class MMA(AbstractMMA):
         approach, retreat: How asymptotes move in on variables that oscillate, and away.
     """
 
-    lower: Float[Array, "..."] = eqx.field(converter=real, default=0.0)
-    upper: Float[Array, "..."] = eqx.field(converter=real, default=1.0)
-    move: Float[Array, ""] = eqx.field(converter=real, default=0.5)
-    spread: Float[Array, ""] = eqx.field(converter=real, default=0.5)
-    approach: Float[Array, ""] = eqx.field(converter=real, default=0.7)
-    retreat: Float[Array, ""] = eqx.field(converter=real, default=1.2)
-
-    def _curvature(self, state, values, span):
+    def _curvature(self, state):
         return jnp.full_like(state.curvature, 1e-5)
 
     def update(self, x, values, memory, evaluate=None):
@@ -308,14 +303,9 @@ class GCMMA(AbstractMMA):
     counts as one where they do not.
     """
 
-    lower: Float[Array, "..."] = eqx.field(converter=real, default=0.0)
-    upper: Float[Array, "..."] = eqx.field(converter=real, default=1.0)
     move: Float[Array, ""] = eqx.field(converter=real, default=1.0)
-    spread: Float[Array, ""] = eqx.field(converter=real, default=0.5)
-    approach: Float[Array, ""] = eqx.field(converter=real, default=0.7)
-    retreat: Float[Array, ""] = eqx.field(converter=real, default=1.2)
 
-    def _curvature(self, state, values, span):
+    def _curvature(self, state):
         return state.curvature
 
     def update(self, x, values, memory, evaluate):
@@ -403,7 +393,7 @@ def _approximation(method, x, values: Values, state, low, high) -> Approximation
     most = jnp.minimum(high - 0.1 * (high - x), x + method.move * span)
     slopes = jnp.concatenate([values.gradient[None], values.slopes])
     up, down = jnp.maximum(slopes, 0), jnp.maximum(-slopes, 0)
-    curve = method._curvature(state, values, span)[:, None] / span[None]
+    curve = method._curvature(state)[:, None] / span[None]
     p = (high - x)[None] ** 2 * (1.001 * up + 0.001 * down + curve)
     q = (x - low)[None] ** 2 * (0.001 * up + 1.001 * down + curve)
     here = p @ (1 / (high - x)) + q @ (1 / (x - low))

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from sorojax.fem.assembly.energy import (
     Body,
@@ -21,7 +21,6 @@ from sorojax.fem.assembly.energy import (
     Response,
     Tangent,
     checked_volume_ratio,
-    energy_density,
     response,
     tangent_entries,
 )
@@ -151,7 +150,6 @@ class _Block(NamedTuple):
     """Arrays of the cells that are worked on together."""
 
     cells: Any
-    real: Bool[Array, " lanes"]
     gradients: Any
     volumes: Any
     modes: Modes | None
@@ -275,29 +273,9 @@ def kept_volume(
     return jnp.min(jax.lax.map(work, (space.cells, geometry.gradients, varying)))
 
 
-@jax.jit
-def strain_energy(
-    space: Space,
-    geometry: Geometry,
-    material: AbstractHyperelastic,
-    kinematics: AbstractKinematics,
-    u: Float[Array, "nodes dim"],
-) -> Float[Array, ""]:
-    """Stored energy of the body [J]."""
-    blocks, constant = _blocks(space, geometry, material)
-
-    def work(block: _Block):
-        body = _body(block, constant, kinematics)
-        F = deformation_gradient(kinematics, lanes(u, block.cells), block.gradients)
-        energy = jnp.sum(block.volumes * energy_density(body, F), axis=0)
-        return jnp.sum(jnp.where(block.real, energy, jnp.zeros_like(energy)))
-
-    return jnp.sum(jax.lax.map(work, blocks))
-
-
 def _blocks(space: Space, geometry: Geometry, material) -> tuple[_Block, Any]:
     varying, constant = per_block(space, material)
-    return _Block(space.cells, space.real, *geometry, varying), constant
+    return _Block(space.cells, *geometry, varying), constant
 
 
 def _body(block: _Block, constant, kinematics: AbstractKinematics) -> Body:

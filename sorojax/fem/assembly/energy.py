@@ -22,7 +22,13 @@ from jaxtyping import Array, Float
 
 from sorojax._jax.programs import depends
 from sorojax.fem.assembly.space import Modes, coefficients, project
-from sorojax.fem.kinematics import AbstractKinematics, component_pairs, entries_of, identity
+from sorojax.fem.kinematics import (
+    AbstractKinematics,
+    component_pairs,
+    entries_of,
+    identity,
+    strain_pairs,
+)
 from sorojax.material.hyperelastic import (
     AbstractHyperelastic,
     finite_share,
@@ -73,7 +79,7 @@ def volume_slopes(kinematics: AbstractKinematics, F: Entries) -> Entries:
 
 
 def second_piola(kinematics: AbstractKinematics, F: Entries, P: Entries) -> tuple[Entry, ...]:
-    """S = F^-1 P, the entries that `stress_pairs` lists."""
+    """S = F^-1 P, the entries that `strain_pairs` lists."""
     back = inverse(kinematics.embed(tuple(F)))
     return _pairs(kinematics, _product(back, _full(kinematics, P)))
 
@@ -105,13 +111,7 @@ def _product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _pairs(kinematics: AbstractKinematics, S: Tensor) -> tuple[Entry, ...]:
-    return tuple(S[i][j] for i, j in stress_pairs(type(kinematics)))
-
-
-def stress_pairs(kind: type[AbstractKinematics]) -> list[tuple[int, int]]:
-    """Columns (j, l), j <= l, of pairs of kept entries in one row of F."""
-    pairs = {(a.col, b.col) for a in kind.slots for b in kind.slots if a.row == b.row}
-    return sorted((j, l) for j, l in pairs if j <= l)
+    return tuple(S[i][j] for i, j in strain_pairs(kinematics))
 
 
 def stack_matrix(F: Tensor, like: Entry) -> Float[Array, "... 3 3"]:
@@ -225,7 +225,7 @@ def _first_invariant(kinematics: AbstractKinematics, F: Entries) -> tuple[Entry,
 
 
 _NEXT = (1, 2, 0)
-_Pairs = tuple[Entry | None, ...]  # of the columns that `stress_pairs` lists
+_Pairs = tuple[Entry | None, ...]  # of the columns that `strain_pairs` lists
 Block = Float[Array, "rows cols quad lanes"]
 
 
@@ -250,7 +250,7 @@ def point_tangent(
     if weight is not None:
         tilted = (*(weight * entry for entry in F), weight)
     if isinstance(shape, ShapeVectors):
-        pairs = zip(S, stress_pairs(type(kinematics)), strict=True)
+        pairs = zip(S, strain_pairs(kinematics), strict=True)
         S = tuple(_sum(s, shape.flat) if i == j else s for s, (i, j) in pairs)
     rows = [[e for e, _ in entries_of(kinematics, i)] for i in range(kinematics.dim)]
     blocks = [_block(shape, rows[i], rows[k]) for i, k in component_pairs(kinematics.dim)]
@@ -307,7 +307,7 @@ def tangent_entries(
 def _geometric_places(kind: type[AbstractKinematics]) -> dict[tuple[int, int], tuple[int, Any]]:
     """Which of the geometric parts is added to or subtracted from an entry of dP/dF: S between
     entries of one row of F, and d2J / dF dF, an entry of F, between others."""
-    slots, pairs = kind.slots, stress_pairs(kind)
+    slots, pairs = kind.slots, strain_pairs(kind)
     at = {(s.row, s.col): number for number, s in enumerate(slots)}
     places = {}
     for e, a in enumerate(slots):
@@ -369,7 +369,7 @@ def response(body: Body, F: Entries, F_before: Entries | None, alone: Alone) -> 
     if F_before is None:
         law = alone(lambda: _law(body, F))
         p = None if law.volumetric is None else law.volumetric[0]
-        straight = (None,) * len(stress_pairs(type(body.kinematics)))
+        straight = (None,) * len(strain_pairs(body.kinematics))
         return alone(lambda: _with_tangent(body, F, law, p, straight))
     law, before = alone(lambda: (_law(body, F), _before(body, F_before, F - F_before)))
     return alone(

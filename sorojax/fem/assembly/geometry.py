@@ -1,4 +1,4 @@
-"""Shape tables, shape gradients and volumes at the quadrature points, in blocks of cells.
+"""Shape tables, fields at points of all cells, and shape gradients in blocks of cells.
 
 Polygons have one table per number of corners. Their shape functions are rational, so no rule
 integrates them exactly; gradients are corrected by integrals over straight sides, so that a
@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 from sorojax.fem.assembly.energy import Entries, inverse
 from sorojax.fem.assembly.space import AbstractFormulation, Space, lanes, modes
 from sorojax.fem.kinematics import AbstractKinematics, Axisymmetric, identity
-from sorojax.material.kinematics import Tensor, determinant
+from sorojax.material.kinematics import Entry, Tensor, determinant
 from sorojax.mesh.elements.base import (
     AbstractElement,
     Quadrature,
@@ -30,6 +30,7 @@ from sorojax.mesh.elements.base import (
     shape_gradients,
 )
 from sorojax.mesh.elements.polygon import PolyN
+from sorojax.mesh.mesh import Mesh
 
 
 class Tables(NamedTuple):
@@ -44,23 +45,10 @@ class Tables(NamedTuple):
     weights: Float[np.ndarray, "kinds quad"]
 
 
-def quadrature_tables(element: AbstractElement) -> Tables:
-    """Tables at the quadrature points of the stiffness."""
-    return _tables(element, "quadrature")
-
-
-def mass_tables(element: AbstractElement) -> Tables:
-    """Tables at the quadrature points of the mass."""
-    return _tables(element, "mass")
-
-
-def node_tables(element: AbstractElement) -> Tables:
-    """Tables at the nodes."""
-    return _tables(element, "nodes")
-
-
 @cache
-def _tables(element: AbstractElement, at: str) -> Tables:
+def tables_at(element: AbstractElement, at: str) -> Tables:
+    """Tables at the points of the rule of the stiffness ("quadrature"), of that of the mass
+    ("mass"), or at the nodes ("nodes")."""
     if not isinstance(element, PolyN):
         rule = _rule(element, at)
         values, slopes = _at(element, rule)
@@ -180,15 +168,149 @@ def exact_areas(
     return areas * (1 + tilt[0] * away[0] + tilt[1] * away[1])
 
 
+# Fields at points of all cells at once, made for differentiation by parameters: one product
+# takes nodal values to reference gradients, the rest is elementwise on (points, cells)
+
+
+class Points(NamedTuple):
+    """Points of all cells: inverse of dX/dxi, reference volumes [m^3] and positions [m]."""
+
+    back: Tensor
+    volumes: Float[Array, "quad cells"]
+    position: Float[Array, "dim quad cells"]
+    tables: Tables
+    kinds: Int[Array, " cells"] | None
+
+
+def quadrature_points(mesh: Mesh, kinematics: AbstractKinematics) -> Points:
+    """The quadrature points of the stiffness."""
+    return points_at(mesh, kinematics, tables_at(mesh.element, "quadrature"))
+
+
+def points_at(mesh: Mesh, kinematics: AbstractKinematics, tables: Tables) -> Points:
+    """The points of every cell that `tables` are for."""
+    kinds = None
+    if isinstance(mesh.element, PolyN):  # the number of corners; the last is repeated
+        kinds = 1 + jnp.sum(mesh.cells[:, 1:] != mesh.cells[:, :-1], axis=1)
+    return _points(kinematics, tables, kinds, by_cell(mesh, mesh.points))
+
+
+def _points(kinematics: AbstractKinematics, tables: Tables, kinds, x) -> Points:
+    """The points of cells with corners at `x`, (dim, nodes, cells) [m]."""
+    jac = _slopes(tables, kinds, x)
+    full = _three([[jac[i, d] for d in range(len(jac))] for i in range(len(jac))])
+    areas = determinant(full) * _of_kinds(tables.weights, kinds, x.dtype)
+    position = _interpolate(tables, kinds, x)
+    if kinds is not None:
+        areas = exact_areas(polygon_sums(x, kinds, kinematics), position, areas)
+    volumes = areas * kinematics.depth(tuple(position))
+    return Points(inverse(full), volumes, position, tables, kinds)
+
+
+def deformation(
+    mesh: Mesh, kinematics: AbstractKinematics, points: Points, u: Float[Array, "nodes dim"]
+) -> Entries:
+    """Kept entries of F at the points."""
+    dim, moved = mesh.element.dim, by_cell(mesh, u)
+    reference = _slopes(points.tables, points.kinds, moved)
+    slopes = [
+        [
+            functools.reduce(jnp.add, (reference[i, d] * points.back[d][j] for d in range(dim)))
+            for j in range(dim)
+        ]
+        for i in range(dim)
+    ]
+    if points.kinds is not None:
+        slopes = _corrected(mesh, kinematics, points, moved, slopes)
+    if kinematics.num_columns > dim:
+        radial = _interpolate(points.tables, points.kinds, moved[:1])[0]
+        slopes[0].append(radial / points.position[0])
+    kept = jnp.stack([slopes[s.component][s.column] for s in kinematics.slots])
+    return kept + jnp.asarray(identity(kinematics), kept.dtype)[:, None, None]
+
+
+def interpolated(mesh: Mesh, points: Points, nodal: Float[Array, "nodes dim"]) -> Entry:
+    """A nodal field at the points, (dim, quad, cells)."""
+    return _interpolate(points.tables, points.kinds, by_cell(mesh, nodal))
+
+
+def node_gradients(
+    kinematics: AbstractKinematics, points: Points, x: Float[Array, "dim cell_nodes cells"]
+) -> Float[Array, "quad cell_nodes columns cells"]:
+    """Gradients of the shape functions [1/m] at the points of cells with nodes at `x` [m]; in a
+    body of revolution the third column is the shape function over the radius."""
+    dim, kinds = x.shape[0], points.kinds
+    N, slopes, _ = (_of_kinds(table, kinds, x.dtype) for table in points.tables)
+    gradients = [
+        functools.reduce(
+            jnp.add, (slopes[:, :, d] * points.back[d][j][:, None] for d in range(dim))
+        )
+        for j in range(dim)
+    ]
+    if kinds is not None:
+        sums, areas, share = _polygons(kinematics, points, x)
+        for j, side in enumerate(sums.sides):
+            exact = side - sums.hoop(j) * jnp.sum(areas[:, None] * N, axis=0)
+            mean = jnp.sum(share[:, None] * gradients[j], axis=0)
+            gradients[j] += (exact / sums.measure - mean)[None]
+    if kinematics.num_columns > dim:
+        gradients.append(N / points.position[0][:, None])
+    return jnp.stack(gradients, axis=2)
+
+
+def _corrected(mesh: Mesh, kinematics: AbstractKinematics, points: Points, moved, slopes):
+    """Polygons: slopes whose mean over a cell is that of its boundary."""
+    sums, areas, share = _polygons(kinematics, points, by_cell(mesh, mesh.points))
+    inside = jnp.sum(areas[None] * _interpolate(points.tables, points.kinds, moved), axis=1)
+
+    def fixed(i, j):
+        exact = jnp.sum(moved[i] * sums.sides[j], axis=0) - sums.hoop(j) * inside[i]
+        mean = jnp.sum(share * slopes[i][j], axis=0)
+        return slopes[i][j] + (exact / sums.measure[0] - mean)[None]
+
+    return [[fixed(i, j) for j in range(2)] for i in range(2)]
+
+
+def _polygons(kinematics: AbstractKinematics, points: Points, x):
+    """Sums of polygons, areas of their points and the weights of these in a mean slope."""
+    assert points.kinds is not None
+    sums = polygon_sums(x, points.kinds, kinematics)
+    areas = points.volumes / kinematics.depth(tuple(points.position))
+    return sums, areas, sums.shares(points.position, areas)
+
+
+def by_cell(mesh: Mesh, nodal: Float[Array, "nodes dim"]) -> Float[Array, "dim nodes cells"]:
+    """A nodal field at the nodes of every cell."""
+    return jnp.moveaxis(nodal.T[:, mesh.cells], -1, 1)
+
+
+def _slopes(tables: Tables, kinds, nodal) -> Float[Array, "dim dim_ref quad cells"]:
+    return jnp.einsum("qadc,iac->idqc", _of_kinds(tables.slopes, kinds, nodal.dtype), nodal)
+
+
+def _interpolate(tables: Tables, kinds, nodal) -> Float[Array, "dim quad cells"]:
+    return jnp.einsum("qac,iac->iqc", _of_kinds(tables.values, kinds, nodal.dtype), nodal)
+
+
+def _of_kinds(table: np.ndarray, kinds, dtype) -> Array:
+    """The table of every cell, with the axis of cells last (of length 1 if all are equal)."""
+    tables = jnp.asarray(table, dtype)
+    return jnp.moveaxis(tables if kinds is None else tables[kinds], 0, -1)
+
+
+def _three(rows) -> Tensor:
+    """A 2x2 or 3x3 matrix as a tensor."""
+    if len(rows) == 3:
+        return tuple(tuple(row) for row in rows)  # type: ignore[return-value]
+    return ((*rows[0], 0.0), (*rows[1], 0.0), (0.0, 0.0, 1.0))
+
+
 # Shape gradients and volumes of the quadrature points, in blocks of cells
 
 
 class Geometry(NamedTuple):
-    """Gradients of the shape functions, volumes and pressure functions of the points.
-
-    In a body of revolution the third column of a gradient is the shape function over the
-    radius.
-    """
+    """Gradients of the shape functions (see `node_gradients`), volumes and pressure functions
+    of the points."""
 
     gradients: Float[Array, "blocks quad cell_nodes columns lanes"]
     volumes: Float[Array, "blocks quad lanes"]
@@ -203,52 +325,15 @@ def geometry(
     points: Float[Array, "nodes dim"],
 ) -> Geometry:
     """Shape gradients [1/m] and quadrature volumes [m^3] of the cells at `points`."""
-    tables = quadrature_tables(space.element)
-    dim = space.dim
 
     def block(arrays):
         cells, kinds = arrays
         x = lanes(points, cells)
-        N, slopes, weights = (_of_kinds(jnp.asarray(table), kinds) for table in tables)
-        jac = jnp.einsum("iae,qade->idqe", x, slopes)
-        full = three([[jac[i, d] for d in range(dim)] for i in range(dim)])
-        J, back = determinant(full), inverse(full)
-        gradients = [
-            functools.reduce(
-                jnp.add, (slopes[:, :, d] * back[d][j][:, None] for d in range(dim))
-            )
-            for j in range(dim)
-        ]
-        areas = J * weights
-        position = jnp.einsum("iae,qae->iqe", x, N)
-        if isinstance(space.element, PolyN):
-            sums = polygon_sums(x, kinds, kinematics)
-            areas = exact_areas(sums, position, areas)
-            for j, side in enumerate(sums.sides):
-                exact = side - sums.hoop(j) * jnp.sum(areas[:, None] * N, axis=0)
-                share = sums.shares(position, areas)
-                mean = jnp.sum(share[:, None] * gradients[j], axis=0)
-                gradients[j] += (exact / sums.measure - mean)[None]
-        if kinematics.num_columns > dim:
-            gradients.append(N / position[0][:, None])
-        volumes = areas * kinematics.depth(tuple(position))
-        return jnp.stack(gradients, axis=2), volumes, modes(formulation, position, volumes)
+        at = _points(kinematics, tables_at(space.element, "quadrature"), kinds, x)
+        pressures = modes(formulation, at.position, at.volumes)
+        return node_gradients(kinematics, at, x), at.volumes, pressures
 
     return Geometry(*jax.lax.map(block, (space.cells, space.kinds)))
-
-
-def _of_kinds(table, kinds):
-    """The table of every lane, with the lane axis last (of length 1 if all are equal)."""
-    if kinds is None:
-        return jnp.moveaxis(table, 0, -1)
-    return jnp.moveaxis(table[kinds], 0, -1)
-
-
-def three(rows) -> Tensor:
-    """A 2x2 or 3x3 matrix as a tensor."""
-    if len(rows) == 3:
-        return tuple(tuple(row) for row in rows)  # type: ignore[return-value]
-    return ((*rows[0], 0.0), (*rows[1], 0.0), (0.0, 0.0, 1.0))
 
 
 def gradient_entries(

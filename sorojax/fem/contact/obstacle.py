@@ -1,9 +1,13 @@
-"""Contact of a body with a shape that does not deform: its facets, their areas and sizes, and
-the penalty law that suits them.
+"""Contact of a body with a shape that does not deform: facets, penalty, and what a contact
+remembers between steps, friction and overlap that is relaxed.
+
+Pressure and normal of friction are those of the step before, which keeps the tangent
+symmetric. So the friction impulse on sliding points is the coefficient times the normal
+impulse, one step later, whether steps resolve an impact or not, and are cut or not.
 """
 
 import dataclasses
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,29 +19,39 @@ from sorojax import _check
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import integers, optional_real, real
 from sorojax.contact import AbstractFriction, Penalty, SpringSlider
-from sorojax.contact.broadphase import far
-from sorojax.contact.facet import Contacts, contacts, gaps
-from sorojax.contact.friction import Grip, friction_law
-from sorojax.fem.contact.friction import Start, at_end, felt, gripped, released, untouched
-from sorojax.fem.loads.facets import CurvedPart, facet_tables, group_energy, normals
+from sorojax.contact.broadphase import clearance, far
+from sorojax.contact.facet import Contacts, contacts, gaps, surface
+from sorojax.contact.friction import Grip, friction_law, no_grip
+from sorojax.fem.loads.facets import CurvedPart, areas_of, blockwise, facet_tables, group_energy
 from sorojax.fem.loads.loads import AbstractLoad
 from sorojax.material.hyperelastic import small_strain_moduli
 from sorojax.mesh.elements.base import facet_corners
+from sorojax.mesh.mesh import Mesh
 from sorojax.sdf.base import AbstractSdf
 
+if TYPE_CHECKING:
+    from sorojax.fem.dynamics.step import StepState
+    from sorojax.fem.problem import Problem
+
+
+class Start(NamedTuple):
+    """Where a step of a contact begins: place of the obstacle, how far before its surface
+    pressure starts, how far points of a facet may move until one feels it [m], and the size
+    of the step [s], zero before a motion."""
+
+    place: Float[Array, " dim"]
+    shift: Float[Array, "facets quad"]
+    clear: Float[Array, " facets"]
+    step: Float[Array, ""]
+
+
+def at_end(share: Float[Array, ""]) -> Float[Array, ""]:
+    """Share of the pressure at the end of a step, beside that of its mean: none where
+    forces act in the middle of the step, all where they act after 2/3 of it or more."""
+    return jnp.clip(3 * (2 * share - 1), 0.0, 1.0)
+
+
 _TOGETHER = 32  # facets that the broad phase judges by one ball
-
-
-def areas_of(problem, facets: Int[Array, "facets facet_nodes"]) -> Float[Array, "facets quad"]:
-    """Reference areas of the quadrature points of facets [m^2]."""
-    tables, kinematics = facet_tables(problem.mesh.element), problem.kinematics
-    weights, values = jnp.asarray(tables.weights), jnp.asarray(tables.values)
-
-    def one(X):
-        size = jnp.sqrt(jnp.sum(normals(tables, X) ** 2, axis=1))
-        return weights * size * kinematics.depth(tuple((values @ X).T))
-
-    return jax.vmap(one)(problem.mesh.points[facets])
 
 
 def default_law(mesh, material, facets, stiffness, smoothing) -> tuple[Array, Array]:
@@ -75,10 +89,49 @@ def compact(mesh, facets) -> Int[np.ndarray, "facets facet_nodes"] | Array:
     return facets[np.concatenate(halved(np.arange(len(facets))))]
 
 
+class AbstractPenaltyContact(AbstractLoad):
+    """What contacts of the facets of a body share: the penalty, and its mean over a step."""
+
+    if TYPE_CHECKING:  # fields that subclasses have, in their own order
+        stiffness: ClassVar[Float[Array, ""] | None]
+        smoothing: ClassVar[Float[Array, ""] | None]
+        share: ClassVar[Float[Array, ""] | None]  # of a step, after which forces act
+    smooth: ClassVar[bool] = False
+    overshoots: ClassVar[bool] = True
+    units: eqx.AbstractClassVar[dict[str, str]]  # of numbers that have to be positive
+
+    @property
+    def law(self) -> Penalty:
+        if self.stiffness is None or self.smoothing is None:
+            raise ValueError(
+                f"fem.{type(self).__name__} '{self.name}': no stiffness yet. Take the load of "
+                "the problem, problem.loads, where the default is filled in."
+            )
+        return Penalty(self.stiffness, self.smoothing)
+
+    def density(self, gap, before) -> Float[Array, "..."]:
+        """Energy per area [J/m^2] at a `gap`, in a step that began at the gap `before`."""
+        density = self.law.energy(gap)
+        if self.share is None:
+            return density
+        ending, mean = at_end(self.share), self.law.energy_of_step(before, gap)
+        return self.share * (ending * density + (1 - ending) * mean)
+
+    def end_of_step(self, x, began):
+        """Positions at the end of a step, of those where forces act."""
+        return x if self.share is None else began + (x - began) / self.share
+
+    def check(self, where, mesh, kinematics):
+        for name, unit in self.units.items():
+            if (number := getattr(self, name)) is not None:
+                do = "Leave it out for the default."
+                _check.positive("fem.problem", f"{where} {name}", number, unit, do)
+
+
 # Contact of a body with a shape that does not deform
 
 
-class Contact(AbstractLoad):
+class Contact(AbstractPenaltyContact):
     """`facets` may not enter `obstacle`, which is `value` away from its place [m].
 
     A penalty per reference area at the quadrature points of the facets, `contact.Penalty`.
@@ -111,8 +164,13 @@ class Contact(AbstractLoad):
     multiplier of an augmented Lagrangian; `solve_contact` finds it.
     """
 
-    smooth: ClassVar[bool] = False
-    overshoots: ClassVar[bool] = True
+    units: ClassVar[dict[str, str]] = {
+        "stiffness": "Pa/m",
+        "smoothing": "m",
+        "friction_velocity": "m/s",
+        "friction_stiffness": "Pa/m",
+        "release_velocity": "m/s",
+    }
 
     facets: Int[Array, "facets facet_nodes"] = eqx.field(converter=integers)
     obstacle: AbstractSdf
@@ -136,15 +194,6 @@ class Contact(AbstractLoad):
     start: Start | None = None  # found
     grip: Grip | None = None  # found
     place: Float[Array, " dim"] | None = None  # of the obstacle at the end of the last step
-
-    @property
-    def law(self) -> Penalty:
-        if self.stiffness is None or self.smoothing is None:
-            raise ValueError(
-                f"fem.Contact '{self.name}': no stiffness yet. Take the load of the problem, "
-                "problem.loads, where the default is filled in."
-            )
-        return Penalty(self.stiffness, self.smoothing)
 
     @property
     def slider(self) -> SpringSlider:
@@ -240,7 +289,7 @@ class Contact(AbstractLoad):
         )
 
     def _energy(self, problem):
-        values, law = jnp.asarray(facet_tables(problem.mesh.element).values), self.law
+        values = jnp.asarray(facet_tables(problem.mesh.element).values)
         known = self.facets, self.offset, self.sunk, self.grip, self.began
         start = self.start
 
@@ -249,13 +298,10 @@ class Contact(AbstractLoad):
             facet, offset, sunk, grip, began = jax.tree.map(lambda leaf: leaf[row], known)
             areas, offset = areas_of(problem, facet[None])[0], _sum(offset, sunk)
             position = values @ x - self.value[None]
-            gap = self.gap_of(values @ self._end(x, began), offset)
-            density = law.energy(gap)
-            if self.share is not None and start is not None:
-                ending = at_end(self.share)
-                before = gaps(self.obstacle, values @ began, start.place)
-                mean = law.energy_of_step(before - start.shift[row], gap)
-                density = self.share * (ending * density + (1 - ending) * mean)
+            gap, before = self.gap_of(values @ self.end_of_step(x, began), offset), None
+            if start is not None:
+                before = gaps(self.obstacle, values @ began, start.place) - start.shift[row]
+            density = self.density(gap, before)
             if grip is not None:
                 density = density + self.slider.energy(grip, position)
             return jnp.sum(areas * density)
@@ -267,10 +313,6 @@ class Contact(AbstractLoad):
         gap = gaps(self.obstacle, points, self.value)
         return gap if offset is None else gap - offset
 
-    def _end(self, x, began):
-        """Positions at the end of a step, of those where forces act."""
-        return x if self.share is None else began + (x - began) / self.share
-
     def _idle(self, problem):
         shift, grip, start = self.shift(), self.grip, self.start
         reach = None if shift is None or start is not None else jnp.max(shift)
@@ -279,7 +321,7 @@ class Contact(AbstractLoad):
             """In a step nothing is asked of the field: it was where the step began."""
             assert start is not None and self.began is not None
             began = self.began[rows]
-            way = self.points_at(problem, self._end(x, began) - began)
+            way = self.points_at(problem, self.end_of_step(x, began) - began)
             way = way - (self.value - start.place)[None, None]
             return jnp.sum(way**2, axis=2) < start.clear[rows, None] ** 2
 
@@ -319,21 +361,162 @@ class Contact(AbstractLoad):
                 f"fem.problem: {where} has an obstacle in {self.obstacle.dim} dimensions, the "
                 f"mesh has {mesh.element.dim}. Use a shape of the same space."
             )
-        for what, number, unit in (
-            ("stiffness", self.stiffness, "Pa/m"),
-            ("smoothing", self.smoothing, "m"),
-            ("friction_velocity", self.friction_velocity, "m/s"),
-            ("friction_stiffness", self.friction_stiffness, "Pa/m"),
-            ("release_velocity", self.release_velocity, "m/s"),
-        ):
-            if number is None:
-                continue
-            _check.positive(
-                "fem.problem", f"{where} {what}", number, unit, "Leave it out for the default."
-            )
+        super().check(where, mesh, kinematics)
 
 
 def _sum(*terms: Array | None) -> Array | None:
     """Of those that there are."""
     given = [term for term in terms if term is not None]
     return sum(given[1:], start=given[0]) if given else None
+
+
+# The state of a contact between steps
+
+
+def untouched(load: "Contact", mesh: Mesh) -> "Contact":
+    """`load` that has touched nothing yet."""
+    load = dataclasses.replace(load, place=load.value)
+    if load.friction is None:
+        return load
+    stiffness = load.stiffness if load.friction_stiffness is None else load.friction_stiffness
+    grip = no_grip(_at_rest(load, mesh))
+    return dataclasses.replace(load, friction_stiffness=stiffness, grip=grip)
+
+
+def _at_rest(load: "Contact", mesh: Mesh) -> Float[Array, "facets quad dim"]:
+    values = jnp.asarray(facet_tables(mesh.element).values)
+    return jnp.einsum("qa,fai->fqi", values, mesh.points[load.facets])
+
+
+def moving(load: "Contact", mesh: Mesh, place: Float[Array, " dim"]) -> "Contact":
+    """`load` of a motion that begins with the obstacle at `place` [m]."""
+    none = jnp.zeros_like(_at_rest(load, mesh)[..., 0])
+    one = jnp.ones((), none.dtype)
+    load = dataclasses.replace(
+        load,
+        place=place,
+        began=mesh.points[load.facets],
+        share=one,
+        start=Start(place, none, none[:, 0], 0 * one),
+    )
+    if load.release_velocity is None:
+        return load
+    return dataclasses.replace(load, sunk=none, fresh=one)
+
+
+Nodal = Float[Array, "nodes dim"]
+
+_DEEP = 50.0  # times the smoothing: overlap under pressures of E / 20
+
+
+class Felt(NamedTuple):
+    """Of points where a step begins: pressure in the step before [Pa], normal of the obstacle,
+    and how far points of a facet may move until one feels it [m]."""
+
+    pressure: Float[Array, "facets quad"]
+    normal: Float[Array, "facets quad dim"]
+    clear: Float[Array, " facets"]
+
+
+def released(
+    load: "Contact", problem: "Problem", u: Nodal, step: Float[Array, ""]
+) -> "Contact":
+    """`load` for a step from `u`: overlap far beyond what contacts carry is not felt when a
+    motion begins, and let out at the velocity of release."""
+    assert load.sunk is not None and load.fresh is not None
+    assert load.release_velocity is not None and load.smoothing is not None
+    zero, depth = jnp.zeros_like(load.sunk), _DEEP * load.smoothing
+
+    def found():
+        gap = gaps(load.obstacle, load.points_of(problem, u), load.value)
+        return jnp.where(gap < -depth, gap, zero)
+
+    left = jnp.minimum(load.sunk + load.release_velocity * step, zero)
+    sunk = jax.lax.cond(load.fresh > 0, found, lambda: left)
+    fresh = jnp.zeros_like(load.fresh)
+    return eqx.tree_at(lambda load: (load.sunk, load.fresh), load, (sunk, fresh))
+
+
+def gripped(
+    load: "Contact", problem: "Problem", u: Nodal, step: "StepState | None", feels: Felt
+) -> "Contact":
+    """`load`, as the last step left it, with friction of the step from `u`, where its points
+    feel `feels`; its obstacle has moved from its last place to `value`. At rest without one."""
+    slider, share = load.slider, 1.0 if step is None else step.share
+    assert load.place is not None
+    place = load.value - share * (load.value - load.place)  # where the step begins
+    back = load.points_of(problem, u) - place[None, None]
+    pressure = feels.pressure if step is None else _kept_impulse(load, problem, u, step, feels)
+    anchor = back - slider.bounded(load.stretch(problem, u, load.place), pressure)
+    limit = slider.law.limit(pressure)
+    drag = jnp.zeros_like(limit)
+    if step is not None:
+        rests = step.step <= 0
+        rate = jnp.where(rests, 0.0, 1 / jnp.where(rests, 1.0, step.step))
+        drag = limit * rate / (slider.velocity * share)
+    grip = Grip(anchor, pressure, feels.normal, drag, back)
+    return eqx.tree_at(lambda load: (load.grip, load.place), load, (grip, load.value))
+
+
+def _kept_impulse(
+    load: "Contact", problem: "Problem", u: Nodal, step: "StepState", feels: Felt
+) -> Float[Array, "facets quad"]:
+    """Pressure of points [Pa] that has over a step, where they slid in the last one, the
+    impulse that it had in that, of another size if steps are cut or grow."""
+    assert load.grip is not None and load.place is not None and load.start is not None
+    same = (load.start.step <= 0) | (step.step <= 0)
+    ratio = jnp.where(same, 1.0, load.start.step / jnp.where(same, 1.0, step.step))
+    acted = load.acted(problem, u) - load.place[None, None]
+    slid = load.slider.loading(load.grip, acted) > 1
+    return jnp.where(slid, ratio * feels.pressure, feels.pressure)
+
+
+def felt(load: "Contact", problem: "Problem", u: Nodal) -> Felt:
+    """Contact of the points where a step from `u` begins, from `load` as the last step left
+    it; nothing where a block of facets was and is far from the obstacle."""
+    law, shift, start, bound = load.law, load.shift(), load.start, load.obstacle.lipschitz
+    assert load.place is not None
+    points = load.points_of(problem, u) - load.place[None, None]
+    was = (
+        None if start is None else load.points_at(problem, load.began) - start.place[None, None]
+    )
+    reach = None if shift is None else jnp.max(shift)
+
+    def near(points, row):
+        row, was = row
+        gap, _, normal = surface(load.obstacle, points)
+        gap = gap if shift is None else gap - shift[row]
+        pressure = law.pressure(gap)
+        if start is not None:
+            assert load.share is not None
+            ending = at_end(load.share)
+            mean = law.mean_pressure(gaps(load.obstacle, was) - start.shift[row], gap)
+            pressure = ending * pressure + (1 - ending) * mean
+        room = jnp.where(pressure > 0, jnp.zeros_like(gap), gap / bound)
+        return jnp.concatenate([pressure[:, None], normal, room[:, None]], axis=1)
+
+    def idle(points, row):
+        free = far(load.obstacle, points, reach)
+        if start is None:
+            return free
+        return free & far(load.obstacle, row[1], jnp.max(start.shift))
+
+    def away(points, _):
+        room = clearance(load.obstacle, points, reach)
+        nothing = jnp.zeros((*points.shape[:2], points.shape[2] + 1), points.dtype)
+        rooms = jnp.broadcast_to(room, nothing[..., :1].shape)
+        return jnp.concatenate([nothing, rooms], axis=2)
+
+    num, quad, dim = points.shape
+    rows = jnp.arange(num), was
+    found = blockwise(jax.vmap(near), idle, points, rows, (quad, dim + 2), away)
+    least = jax.lax.stop_gradient(jnp.min(found[..., -1], axis=1))
+    clear = jnp.maximum(least, jnp.zeros_like(least))
+    return Felt(found[..., 0], found[..., 1:-1], clear)
+
+
+@eqx.filter_jit
+def settled(load: "Contact", problem: "Problem", u: Nodal) -> "Contact":
+    """`load` after an equilibrium `u`, ready for the next one."""
+    load = dataclasses.replace(load, place=load.value)
+    return gripped(load, problem, u, None, felt(load, problem, u))

@@ -11,17 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sorojax import _check
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import integers, optional_real, real
-from sorojax.contact import Penalty
 from sorojax.contact.broadphase import close_pairs, listed
 from sorojax.contact.facet import Contacts, over, shared
 from sorojax.fem.checks import check_ids
-from sorojax.fem.contact.friction import at_end
-from sorojax.fem.contact.obstacle import areas_of, compact, default_law, mean_size
-from sorojax.fem.loads.facets import CurvedPart, facet_tables, group_energy, normals
-from sorojax.fem.loads.loads import AbstractLoad
+from sorojax.fem.contact.obstacle import (
+    AbstractPenaltyContact,
+    compact,
+    default_law,
+    mean_size,
+)
+from sorojax.fem.loads.facets import CurvedPart, areas_of, facet_tables, group_energy, normals
 from sorojax.mesh.elements.base import facet_corners, facet_element, flat_triangles
 from sorojax.mesh.mesh import Mesh
 
@@ -76,7 +77,7 @@ def _bodies(mesh: Mesh) -> Int[np.ndarray, " nodes"]:
 _CANDIDATES = {2: 4, 3: 8}
 
 
-class SelfContact(AbstractLoad):
+class SelfContact(AbstractPenaltyContact):
     """`facets` may not enter each other; with `others`, the two sets may not.
 
     A penalty per reference area, `contact.Penalty`, at the quadrature points of both
@@ -91,8 +92,7 @@ class SelfContact(AbstractLoad):
     omitted; `stiffness`, `smoothing` and `offset` are those of `Contact`.
     """
 
-    smooth: ClassVar[bool] = False
-    overshoots: ClassVar[bool] = True
+    units: ClassVar[dict[str, str]] = {"stiffness": "Pa/m", "smoothing": "m", "reach": "m"}
     forgets: ClassVar[bool] = True
 
     facets: Int[Array, "facets facet_nodes"] = eqx.field(converter=integers)
@@ -110,15 +110,6 @@ class SelfContact(AbstractLoad):
     real: Bool[Array, "rows candidates"] | None = None  # found
     began: Float[Array, "nodes dim"] | None = None  # found: positions [m]
     share: Float[Array, ""] | None = None  # found: of a step, after which forces act
-
-    @property
-    def law(self) -> Penalty:
-        if self.stiffness is None or self.smoothing is None:
-            raise ValueError(
-                f"fem.SelfContact '{self.name}': no stiffness yet. Take the load of the "
-                "problem, problem.loads, where the default is filled in."
-            )
-        return Penalty(self.stiffness, self.smoothing)
 
     @property
     def _reach(self) -> Float[Array, ""]:
@@ -148,10 +139,6 @@ class SelfContact(AbstractLoad):
         data = areas_of(problem, self.rows()) / 2, self.real, self.offset, began
         return CurvedPart(groups, self._energy(problem), data, self._idle(problem))
 
-    def _end(self, x, began):
-        """Positions at the end of a step, of those where forces act."""
-        return x if self.share is None else began + (x - began) / self.share
-
     def longest_share(self, du):
         """No facet moves by more than half the reach towards those that it looks for."""
         moves = jnp.mean(du[self.rows()], axis=1)
@@ -172,25 +159,22 @@ class SelfContact(AbstractLoad):
         return xp.concatenate([rows, found.reshape(len(rows), -1)], axis=1)
 
     def _energy(self, problem):
-        near, law = self._near(problem), self.law
+        near = self._near(problem)
 
         def energy(x, data):
             areas, real, offset, began = data
-            height, weight, _ = near(self._end(x, began), real)
-            gap = self._gap(height, offset)
-            density = law.energy(gap)
+            height, weight, _ = near(self.end_of_step(x, began), real)
+            gap, before = self._gap(height, offset), None
             if self.share is not None:
-                ending = at_end(self.share)
                 before = self._gap(near(began, real).height, offset)
-                mean = law.energy_of_step(before, gap)
-                density = self.share * (ending * density + (1 - ending) * mean)
+            density = self.density(gap, before)
             return jnp.sum(areas * jnp.sum(weight * density, axis=1))
 
         return energy
 
     def _gap(self, height, offset):
         gap = height - self.value
-        return gap if offset is None else gap - offset[:, None]
+        return gap if offset is None else gap - offset[..., None]
 
     def _near(self, problem):
         """Heights of the quadrature points of a facet over its candidates, weights and
@@ -222,10 +206,8 @@ class SelfContact(AbstractLoad):
 
         def idle(x, data):
             _, real, offset, began = data
-            height, weight, _ = jax.vmap(near)(self._end(x, began), real)
-            gap = height - self.value
-            gap = gap if offset is None else gap - offset[..., None]
-            return jnp.all((gap > 0) | (weight <= 0))
+            height, weight, _ = jax.vmap(near)(self.end_of_step(x, began), real)
+            return jnp.all((self._gap(height, offset) > 0) | (weight <= 0))
 
         return idle
 
@@ -255,19 +237,7 @@ class SelfContact(AbstractLoad):
         return alike and others.size > 0 and others.min() >= 0 and others.max() < mesh.num_nodes
 
     def check(self, where, mesh, kinematics):
-        for what, number, unit in (
-            ("stiffness", self.stiffness, "Pa/m"),
-            ("smoothing", self.smoothing, "m"),
-            ("reach", self.reach, "m"),
-        ):
-            if number is not None:
-                _check.positive(
-                    "fem.problem",
-                    f"{where} {what}",
-                    number,
-                    unit,
-                    "Leave it out for the default.",
-                )
+        super().check(where, mesh, kinematics)
         if self.others is None:
             return
         if self.others.ndim != 2 or self.others.shape[1] != self.facets.shape[1]:
@@ -326,7 +296,7 @@ class SelfContact(AbstractLoad):
         areas, real, offset, _ = part.data
         height, weight, normal = jax.vmap(near)(x, real)
         clear = height - self.value
-        pressure = self.law.pressure(clear if offset is None else clear - offset[..., None])
+        pressure = self.law.pressure(self._gap(height, offset))
         force = jnp.einsum("fq,fqk,fqki->fqi", areas, weight * pressure, normal)
         total = jnp.sum(weight, axis=2)
         seen = jnp.where(total > 0, total, jnp.ones_like(total))

@@ -14,8 +14,7 @@ from sorojax._jax.trace_state import is_traced
 from sorojax._progress import report
 from sorojax.contact.facet import Contacts
 from sorojax.fem.assembly.space import space
-from sorojax.fem.contact.friction import settled
-from sorojax.fem.contact.obstacle import Contact
+from sorojax.fem.contact.obstacle import Contact, settled
 from sorojax.fem.contact.self_contact import SelfContact, with_partners
 from sorojax.fem.equilibrium.solve import ConvergenceError, Solution, solve
 from sorojax.fem.loads import checks as checks_loads

@@ -8,10 +8,10 @@ from jaxtyping import Array, Bool, Float
 
 from sorojax.contact.broadphase import far
 from sorojax.contact.swept import passes
-from sorojax.fem.contact.obstacle import Contact, areas_of
+from sorojax.fem.contact.obstacle import AbstractPenaltyContact, Contact
 from sorojax.fem.contact.self_contact import SelfContact
 from sorojax.fem.dynamics.step import Dynamics, Matter, State, TimeStep
-from sorojax.fem.loads.facets import blockwise, facet_tables
+from sorojax.fem.loads.facets import areas_of, blockwise, facet_tables
 from sorojax.fem.problem import Problem, body, potential_energy
 from sorojax.math.linalg import sparse
 
@@ -40,7 +40,7 @@ def gains(
     work of the other loads and of the supports, in a step whose forces act at displacement
     `u` [m]. Not judged where an obstacle with friction moves, whose work momentum follows late.
     """
-    contacts = [load for load in step.terms[0] if isinstance(load, Contact | SelfContact)]
+    contacts = [load for load in step.terms[0] if isinstance(load, AbstractPenaltyContact)]
     if not contacts:
         return jnp.zeros((), bool)
     problem = body(dynamics.problem)
@@ -62,9 +62,9 @@ def gains(
     return gained & ~_drags(contacts)
 
 
-def _at_first(load: Contact | SelfContact, problem: Problem, u: Nodal):
+def _at_first(load: AbstractPenaltyContact, problem: Problem, u: Nodal):
     """Energy of a contact where a step begins [J]."""
-    if isinstance(load, SelfContact) or load.grip is None:
+    if not isinstance(load, Contact) or load.grip is None:
         return load.stored(problem, u)
     bare = dataclasses.replace(load, grip=None)
     held = load.slider.stored(load.grip.back - load.grip.anchor)

@@ -6,7 +6,7 @@ the finite element method", Earthquake Engineering & Structural Dynamics 4, 1976
 """
 
 import abc
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,14 +15,21 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._types import real
 from sorojax.fem.assembly import assemble as asm
-from sorojax.fem.assembly.fields import deformation, points_of, quadrature_points
-from sorojax.fem.assembly.geometry import geometry, mass_tables
+from sorojax.fem.assembly.geometry import (
+    by_cell,
+    deformation,
+    geometry,
+    node_gradients,
+    points_at,
+    quadrature_points,
+    tables_at,
+)
+from sorojax.fem.kinematics import green_rates, strain_pairs
 from sorojax.fem.problem import Problem
 from sorojax.math.linalg import sparse
 from sorojax.mesh.elements.polygon import PolyN
 
-if TYPE_CHECKING:
-    from sorojax.fem.problem import Problem
+_TAKES = "Damping takes energy."
 
 
 class AbstractDamping(eqx.Module):
@@ -32,11 +39,11 @@ class AbstractDamping(eqx.Module):
 
     @abc.abstractmethod
     def matrix(
-        self, problem: "Problem", mass: Float[Array, " nnz"], u: Float[Array, "nodes dim"]
+        self, problem: Problem, mass: Float[Array, " nnz"], u: Float[Array, "nodes dim"]
     ) -> Float[Array, " nnz"]:
         """C [N s/m] at the state u."""
 
-    def check(self, problem: "Problem") -> None:
+    def check(self, problem: Problem) -> None:
         """Raise a `ValueError` if the damping does not fit the body."""
 
 
@@ -54,7 +61,8 @@ class Rayleigh(AbstractDamping):
 
     def __check_init__(self):
         for name, unit in (("mass", "1/s"), ("stiffness", "s")):
-            _not_negative("Rayleigh", name, getattr(self, name), unit)
+            _check.finite("Rayleigh", name, getattr(self, name), _TAKES)
+            _check.not_negative("Rayleigh", name, getattr(self, name), unit, _TAKES)
 
     def matrix(self, problem, mass, u):
         rest = jnp.zeros_like(u)
@@ -79,7 +87,8 @@ class KelvinVoigt(AbstractDamping):
     constant: ClassVar[bool] = False
 
     def __check_init__(self):
-        _not_negative("KelvinVoigt", "viscosity", self.viscosity, "Pa s")
+        _check.finite("KelvinVoigt", "viscosity", self.viscosity, _TAKES)
+        _check.not_negative("KelvinVoigt", "viscosity", self.viscosity, "Pa s", _TAKES)
 
     def check(self, problem):
         if self.viscosity.shape not in ((), (problem.mesh.num_cells,)):
@@ -102,59 +111,22 @@ class KelvinVoigt(AbstractDamping):
 
 
 def strain_rates(
-    problem: "Problem", u: Float[Array, "nodes dim"]
+    problem: Problem, u: Float[Array, "nodes dim"]
 ) -> Float[Array, "strains cell_dofs quad cells"]:
     """Rates of the Green strain by the velocities of a cell's nodes [1/m], entries off the
     diagonal times the square root of 2."""
     mesh, kinematics = problem.mesh, problem.kinematics
     points = quadrature_points(mesh, kinematics)
-    F = deformation(mesh, kinematics, points, u)
-    G = _node_gradients(problem, points)  # nodes, columns, quad, cells
-    slots = kinematics.slots
-    dim, columns = mesh.element.dim, kinematics.num_columns
-    entry = {(s.row, s.col): number for number, s in enumerate(slots)}
-    rows = []
-    for j in range(columns):
-        for k in range(j, columns):
-            scale = 1.0 if j == k else 2.0**-0.5
-            per = [jnp.zeros_like(G[:, 0]) for _ in range(dim)]
-            for s in slots:  # dF[s] = G[node, s.column] v[s.component]
-                for a, b in ((j, k), (k, j)):
-                    if s.col == a and (s.row, b) in entry:
-                        weight = (0.5 if j == k else 1.0) * scale
-                        per[s.component] += weight * F[entry[s.row, b]][None] * G[:, s.column]
-            rows.append(jnp.stack(per, axis=1).reshape(-1, *G.shape[2:]))
-    return jnp.stack(rows)
-
-
-def _node_gradients(problem: "Problem", points) -> Float[Array, "nodes columns quad cells"]:
-    """Shape gradients in the order of the kinematics' columns."""
-    dim = problem.mesh.element.dim
-    slopes = jnp.asarray(points.tables.slopes[0])  # quad, nodes, dim
-    columns = [
-        sum(
-            slopes[:, :, d, None] * points.back[d][j][:, None]
-            for d in range(dim)
-            if not _absent(points.back[d][j])
-        )
-        for j in range(dim)
-    ]
-    if problem.kinematics.num_columns > dim:
-        values = jnp.asarray(points.tables.values[0])[:, :, None]
-        columns.append(values / points.position[0][:, None])
-    return jnp.moveaxis(jnp.stack(columns), 0, 1).transpose(2, 1, 0, 3)
-
-
-def _absent(entry) -> bool:
-    return isinstance(entry, float) and entry == 0.0
-
-
-def _not_negative(where: str, name: str, value, unit: str) -> None:
-    _check.finite(where, name, value, "Damping takes energy.")
-    if _check.is_concrete(value) and float(value.min()) < 0:
-        raise ValueError(
-            f"{where}: `{name}` must be 0 or more, got {value} {unit}. Damping takes energy."
-        )
+    F = deformation(mesh, kinematics, points, u)[:, None, None]
+    G = node_gradients(kinematics, points, by_cell(mesh, mesh.points))
+    G = jnp.moveaxis(G, 2, 0).swapaxes(1, 2)  # columns, nodes, quad, cells
+    unit = jnp.eye(mesh.element.dim, dtype=G.dtype)[:, None, :, None, None]
+    rates = jnp.stack([unit[s.component] * G[s.column][:, None] for s in kinematics.slots])
+    scale = [1.0 if j == k else 2.0**0.5 for j, k in strain_pairs(kinematics)]
+    rates = jnp.stack(
+        [a * E for a, E in zip(scale, green_rates(kinematics, F, rates), strict=True)]
+    )
+    return rates.reshape(len(scale), -1, *G.shape[2:])
 
 
 # Mass matrices: consistent in the pattern of the tangent, lumped on the diagonal
@@ -205,8 +177,8 @@ def _cell_masses(problem: Problem) -> Float[Array, "cells cell_nodes cell_nodes"
             "fem.mass_matrix: the material has no density, need one [kg/m^3]. Give `density` "
             "to the material; rubber has about 1070."
         )
-    tables = mass_tables(problem.mesh.element)
-    points = points_of(problem.mesh, problem.kinematics, tables)
+    tables = tables_at(problem.mesh.element, "mass")
+    points = points_at(problem.mesh, problem.kinematics, tables)
     weights = points.volumes * jnp.atleast_1d(jnp.asarray(density))[None]
     N = jnp.asarray(tables.values)
     if points.kinds is None:

@@ -187,12 +187,13 @@ class Run:
         if self.control.error is not None:
             args = self.control.error, np.asarray(displacement), float(self.prepared.length)
             ratio = rules.error_ratio(float(error), *args)
-            if not rules.error_fits(ratio):
+            if not ratio <= 1.0:
                 self.reason = f"an error of a step of {float(error):.3g} m"
                 return None
         self._easy = rules.is_easy(found.iterations, self.control.newton, ratio)
         self.steps += 1
-        self.rows.append((int(interval.index), *_ends(interval), found.u))
+        ends = float(interval.begin), float(interval.end)
+        self.rows.append((int(interval.index), *ends, found.u))
         return new
 
     def _given(self, found: Found) -> float:
@@ -216,10 +217,6 @@ class Run:
         self.iterations += found.iterations
         self.factorisations += found.factorisations
         return found
-
-
-def _ends(interval: Interval) -> tuple[float, float]:
-    return float(interval.begin), float(interval.end)
 
 
 def ended(dynamics: Dynamics, known: Matter, state: State, interval, step: TimeStep, u, *sums):

@@ -28,7 +28,8 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._types import real
 from sorojax.fem.assembly.energy import energy_density
-from sorojax.fem.assembly.fields import deformation, quadrature_points
+from sorojax.fem.assembly.geometry import deformation, quadrature_points
+from sorojax.fem.kinematics import AbstractKinematics, green_rates, strain_pairs
 from sorojax.fem.loads.loads import AbstractLoad
 from sorojax.fem.problem import body_at
 
@@ -136,27 +137,17 @@ class Conserving(AbstractLoad):
 def _difference(problem, before, middle) -> Float[Array, "nodes dim"]:
     points = quadrature_points(problem.mesh, problem.kinematics)
     body = body_at(problem, points)
-    volumes, slots = points.volumes, problem.kinematics.slots
-    pairs, entry = _pairs(slots)
+    volumes, kinematics = points.volumes, problem.kinematics
 
     def strain(u):
-        return deformation(problem.mesh, problem.kinematics, points, u)
+        return deformation(problem.mesh, kinematics, points, u)
 
     def green(F, H):
-        """Entries of (F'H + H'F) / 2."""
-        rows = []
-        for j, k in pairs:
-            both = [
-                F[entry[r, j]] * H[entry[r, k]] + F[entry[r, k]] * H[entry[r, j]]
-                for r in range(3)
-                if (r, j) in entry and (r, k) in entry
-            ]
-            rows.append(0.5 * sum(both[1:], start=both[0]))
-        return jnp.stack(rows)
+        return jnp.stack(green_rates(kinematics, F, H))
 
     def energies(C):
         """Stored energy of every cell, of a deformation without rotation."""
-        return jnp.sum(volumes * energy_density(body, _stretch(slots, pairs, C)), axis=0)
+        return jnp.sum(volumes * energy_density(body, _stretch(kinematics, C)), axis=0)
 
     F0, F1, F = strain(before), strain(2 * middle - before), strain(middle)
     C0, C1 = green(F0, F0), green(F1, F1)
@@ -184,25 +175,14 @@ def _difference(problem, before, middle) -> Float[Array, "nodes dim"]:
     return jax.grad(work)(middle) - jax.grad(stored)(middle)
 
 
-def _pairs(slots):
-    """Entries of C that may differ from those of the identity, and places of those of F."""
-    entry = {(s.row, s.col): number for number, s in enumerate(slots)}
-    pairs = [
-        (j, k)
-        for j in range(3)
-        for k in range(j, 3)
-        if any((r, j) in entry and (r, k) in entry for r in range(3))
-    ]
-    return pairs, entry
-
-
-def _stretch(slots, pairs, C):
+def _stretch(kinematics: AbstractKinematics, C):
     """The upper triangular F with F'F = C, as kept entries."""
-    at = {pair: C[number] for number, pair in enumerate(pairs)}
+    pairs = strain_pairs(kinematics)
+    at = dict(zip(pairs, C, strict=True))
     U: dict[tuple[int, int], Array] = {}
     for j, k in pairs:
         inner = [U[i, j] * U[i, k] for i in range(j) if (i, j) in U and (i, k) in U]
         left = at[j, k] - sum(inner[1:], start=inner[0]) if inner else at[j, k]
         U[j, k] = jnp.sqrt(left) if j == k else left / U[j, j]
     zero = jnp.zeros_like(C[0])
-    return jnp.stack([U.get((s.row, s.col), zero) for s in slots])
+    return jnp.stack([U.get((s.row, s.col), zero) for s in kinematics.slots])

@@ -21,7 +21,7 @@ from sorojax.fem.contact.self_contact import SelfContact, with_partners
 from sorojax.fem.contact.statics import update_contact_pairs
 from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import Prepared, add_load_stiffness
-from sorojax.fem.equilibrium.newton import Newton, Secants, safe_fraction
+from sorojax.fem.equilibrium.newton import Newton, Secants, left_to_move, safe_fraction
 from sorojax.fem.loads.loads import AbstractLoad
 from sorojax.fem.problem import Problem, body, load_force
 from sorojax.math.compiled import Split, kernel
@@ -36,7 +36,7 @@ class Numbers(NamedTuple):
 
     Attributes:
         damping: C [N s/m], where it is not the same in every step.
-        lead, drive: See `dynamics_step.Step`.
+        lead, drive: See `TimeStep`.
         origin: Displacement at the start [m].
         mass_rate, rate: What mass and damping are multiplied with [1/s^2, 1/s].
         share: How far within the step forces act.
@@ -61,12 +61,7 @@ class HostInertia:
     """
 
     def __init__(self, system: sparse.SparseSymmetric, mass: Values, damping: Values | None):
-        self._mass = _BothTriangles(system)
-        self._matrix, self._damping = self._mass.another(), self._mass.another()
-        self._mass.fill(mass)
-        self._damped = damping is not None
-        if damping is not None:
-            self._damping.fill(damping)
+        self._product, self._mass, self._damping = system.solver.product, mass, damping
         self.origin = self.values = self._pull = self._drag = np.zeros(0)
         self._rates, self.share = (0.0, 0.0), 1.0
 
@@ -75,58 +70,29 @@ class HostInertia:
         lead, drive, self.origin = (np.asarray(x) for x in (of.lead, of.drive, of.origin))
         rates, self.share = (float(of.mass_rate), float(of.rate)), float(of.share)
         if of.damping is not None:
-            self._damped = True
-            self._damping.fill(np.asarray(of.damping))
+            self._damping = np.asarray(of.damping)
         if rates != self._rates or of.damping is not None:
             self._rates = rates
             with np.errstate(invalid="ignore"):  # a step cut to nothing fails for its matrix
-                self.values = rates[0] * self._mass.values
-                if self._damped:
-                    self.values = self.values + rates[1] * self._damping.values
-            self._matrix.fill(self.values)
-        self._pull = self._mass @ drive.ravel()
-        if self._damped:
-            self._drag = self._damping @ lead.ravel()
+                self.values = rates[0] * self._mass
+                if self._damping is not None:
+                    self.values = self.values + rates[1] * self._damping
+        self._pull = self._product(self._mass, drive.ravel())
+        if self._damping is not None:
+            self._drag = self._product(self._damping, lead.ravel())
             self._pull -= self._drag
 
     def force(self, u: Float[np.ndarray, "nodes dim"]) -> Vector:
         """On the body at displacement `u` [N]."""
-        return self._pull - self._matrix @ (u - self.origin).ravel()
+        return self._pull - self._product(self.values, (u - self.origin).ravel())
 
     def taken(self, u: Float[np.ndarray, "nodes dim"]) -> float:
         """Energy that damping dissipates in a step whose forces act at `u` [J]."""
-        if not self._damped:
+        if self._damping is None:
             return 0.0
         moved = (u - self.origin).ravel()
-        drag = self._rates[1] * (self._damping @ moved) + self._drag
+        drag = self._rates[1] * self._product(self._damping, moved) + self._drag
         return float(drag @ moved) / self.share
-
-
-class _BothTriangles:
-    """A symmetric matrix in the pattern of `system` with both its triangles."""
-
-    def __init__(self, system: sparse.SparseSymmetric):
-        from scipy.sparse import csr_array
-
-        rows, cols = np.asarray(system.rows), np.asarray(system.cols)
-        off = np.flatnonzero(rows != cols)
-        number = np.concatenate([np.arange(len(rows)), off])
-        at = np.concatenate([rows, cols[off]]), np.concatenate([cols, rows[off]])
-        order = csr_array((number + 1.0, at), (system.size, system.size))
-        self._number = (order.data - 1).astype(np.int64)
-        self._csr, self.values = order, np.zeros(0)
-
-    def another(self) -> "_BothTriangles":
-        """One more matrix of the same pattern."""
-        made = object.__new__(_BothTriangles)
-        made._number, made._csr, made.values = self._number, self._csr.copy(), np.zeros(0)
-        return made
-
-    def fill(self, values: Values) -> None:
-        self.values, self._csr.data = values, values[self._number]
-
-    def __matmul__(self, x: Vector) -> Vector:
-        return self._csr @ x
 
 
 # Lists of near facets that follow a motion, on the host
@@ -327,7 +293,8 @@ class StepSolver:
         volume = now.volume_ratio
         last, refactor, iterations, secants = np.inf, self.kept is None, 0, Secants()
         while True:
-            move, moves = self._to_move(u, held)
+            move = 0.0 if self.free else left_to_move(self.known, held, u)
+            moves = bool(np.any(move))
             norm, reference = now.norm, now.reference
             if not rules.sound(norm, now.volume_ratio):
                 return self._failed(u, iterations, fresh, "an element inverts")
@@ -338,7 +305,7 @@ class StepSolver:
                 found = u, now.residual, now.load, iterations, fresh
                 return Found(*found, self.kept, "", volume)
             exhausted = iterations >= rules.MOST_ITERATIONS * settings.max_iterations
-            if exhausted or rules.exhausted(fresh, settings):
+            if exhausted or (fresh >= settings.max_iterations):
                 reason = f"no convergence in {iterations} Newton iterations"
                 return self._failed(u, iterations, fresh, reason)
             slow = iterations > 0 and norm > _SLOW * last and not small
@@ -350,7 +317,7 @@ class StepSolver:
             last, iterations = norm, iterations + 1
             rhs = -now.residual
             if moves:
-                rhs = rhs - np.asarray(self._product(move))
+                rhs = rhs - self.solver.product(self._values, np.asarray(move))
             rhs[self.known] = 0.0
             factor = self._factor()
             if factor is None:
@@ -364,13 +331,6 @@ class StepSolver:
                 change = now.residual + rhs
                 change[self.known] = 0.0
                 secants.add((u - before).ravel(), change)
-
-    def _to_move(self, u, held):
-        """Remaining prescribed displacement [m], and whether there is any."""
-        if self.free:
-            return 0.0, False
-        move = rules.left_to_move(np.where(self.known, held - u.ravel(), 0.0), held)
-        return move, bool(np.any(move))
 
     def _renew(self, u, before) -> bool:
         matrix = np.asarray(tangent(self._acting(u), u, before)) + self.inertia.values
@@ -390,9 +350,6 @@ class StepSolver:
         """Go on with the factor of `matrix`; False if it is not finite."""
         self.kept = Kept(matrix, float(np.abs(matrix).max()))
         return bool(np.isfinite(self.kept.largest))
-
-    def _product(self, move):
-        return sparse.product(self.system, self._values, jnp.asarray(move))
 
     def _acting(self, u) -> Acting:
         """Body and loads that act at `u`: a contact that is out of reach is left out, as long

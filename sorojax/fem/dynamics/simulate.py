@@ -15,19 +15,25 @@ from sorojax._jax.jit import once
 from sorojax._jax.trace_state import is_traced
 from sorojax._progress import report
 from sorojax._types import real
-from sorojax.fem.contact.friction import moving
-from sorojax.fem.contact.obstacle import Contact
+from sorojax.fem.contact.obstacle import Contact, moving
 from sorojax.fem.dynamics.damping import AbstractDamping
 from sorojax.fem.dynamics.host import Control, Run, compiled_matter
-from sorojax.fem.dynamics.implicit_diff import MotionCall, recorded
-from sorojax.fem.dynamics.jit import replay
+from sorojax.fem.dynamics.implicit_diff import MotionCall, recorded, replay
 from sorojax.fem.dynamics.methods import AbstractMethod, GeneralisedAlpha
-from sorojax.fem.dynamics.step import Dynamics, Mass, Matter, State, StepState
+from sorojax.fem.dynamics.step import (
+    Dynamics,
+    Mass,
+    Matter,
+    State,
+    StepState,
+    damping_matrix,
+    loads_at,
+)
 from sorojax.fem.dynamics.trajectory import Trajectory
 from sorojax.fem.equilibrium.jit import known_mask
 from sorojax.fem.equilibrium.newton import Newton
 from sorojax.fem.loads.loads import AbstractLoad, remembers
-from sorojax.fem.problem import Problem, body, residual
+from sorojax.fem.problem import Problem, body, exchanged, residual
 from sorojax.math.linalg import sparse
 from sorojax.math.status import Status
 from sorojax.mesh.mesh import Mesh
@@ -272,23 +278,16 @@ def _acceleration(dynamics: Dynamics, state: State) -> Float[Array, "nodes dim"]
 @once
 def _balance(dynamics: Dynamics, known: Matter, state: State):
     problem, u = dynamics.problem, state.displacement
-    kept = (
-        load if before is None else before
-        for load, before in zip(problem.loads, state.memory, strict=True)
-    )
-    loads = tuple(
-        load if row is None else eqx.tree_at(lambda load: load.value, load, row[0])
-        for load, row in zip(kept, dynamics.loads, strict=True)
-    )
     none = jnp.zeros((), u.dtype)
     rest = StepState(u, state.velocity, u, none, u, state.time, none)
     bare = body(problem)
+    loads = loads_at(dynamics, state, lambda row: row[0])
     loads = tuple(load.begun(bare, rest) for load in loads)
-    force = -residual(dataclasses.replace(problem, loads=loads), u).ravel()
-    v = state.velocity.ravel()
-    varying = [d.matrix(problem, known.mass, u) for d in dynamics.damping if not d.constant]
-    for values in varying if known.damping is None else [*varying, known.damping]:
-        force = force - sparse.product(problem.space.system, values, v)
+    force = -residual(exchanged(problem, loads=loads), u).ravel()
+    damping = damping_matrix(dynamics, known, u)
+    if damping is not None:
+        v = state.velocity.ravel()
+        force = force - sparse.product(problem.space.system, damping, v)
     mask = known_mask(problem.supports, *u.shape)
     matrix = sparse.fix(problem.space.system, known.mass, mask)
     return matrix, jnp.where(mask, jnp.zeros_like(force), force)

@@ -5,8 +5,8 @@ in u, so that inertia and damping are quadratic potentials beside those of the l
 may depend on the state at the begin of the step (`StepState`).
 """
 
-import dataclasses
-from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
+from collections.abc import Callable
+from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,12 +18,9 @@ from sorojax.fem.dynamics.damping import AbstractDamping, lumped_mass, mass_matr
 from sorojax.fem.dynamics.methods import Coefficients, Conserving
 from sorojax.fem.equilibrium.jit import known_mask
 from sorojax.fem.loads.loads import AbstractLoad
-from sorojax.fem.problem import Problem, body, residual
+from sorojax.fem.problem import Problem, body, exchanged, load_potential, residual, with_terms
 from sorojax.fem.supports import Prescribed, known_components, known_values
 from sorojax.math.linalg import sparse
-
-if TYPE_CHECKING:
-    from sorojax.fem.problem import Problem
 
 
 class StepState(NamedTuple):
@@ -104,7 +101,7 @@ def _half_square_slope(primals, tangents):
 _half_square.defjvp(_half_square_slope, symbolic_zeros=True)
 
 
-def mass_values(problem: "Problem", mass: Mass) -> Float[Array, " nnz"]:
+def mass_values(problem: Problem, mass: Mass) -> Float[Array, " nnz"]:
     """Mass matrix [kg] as values in the pattern of the tangent."""
     if mass == "consistent":
         return mass_matrix(problem)
@@ -208,7 +205,7 @@ def begin_step(dynamics: Dynamics, known: Matter, state: State, interval: Interv
     time = state.time + (1 - c.af) * h
     stage = StepState(u, v, u - lead / rate, rate, guess, time, h, 1 - c.af)
     loads = _begun(dynamics, state, interval, c.af, stage)
-    damping = _damping_matrix(dynamics, known, guess)
+    damping = damping_matrix(dynamics, known, guess)
     matrix, pull = c2 * known.mass, _times(dynamics, known.mass, drive)
     if damping is not None:
         matrix = matrix + rate * damping
@@ -265,12 +262,8 @@ def end_step(
 def _work(dynamics: Dynamics, step: TimeStep, loads, u_alpha, d) -> Float[Array, ""]:
     """Work [J] of loads and supports in a step, with the forces that the step takes."""
     problem = with_terms(dynamics.problem, step.terms)
-
-    def given(u):
-        terms = (load.potential(problem, u) for load in loads)
-        return sum(terms, start=jnp.zeros((), u.dtype))
-
-    work = -jax.jvp(given, (u_alpha,), (d,))[1] if loads else jnp.zeros((), d.dtype)
+    loaded = exchanged(problem, loads=loads)
+    work = -jax.jvp(lambda u: load_potential(loaded, u), (u_alpha,), (d,))[1]
     if all(support.ramped is None for support in dynamics.problem.supports):
         return work
     reaction = residual(problem, u_alpha)
@@ -283,11 +276,6 @@ def _taken(dynamics: Dynamics, step: TimeStep, v_alpha, d) -> Float[Array, ""]:
     if step.matrix is None:
         return jnp.zeros((), d.dtype)
     return jnp.sum(_times(dynamics, step.matrix, v_alpha) * d.ravel())
-
-
-def with_terms(problem: Problem, terms: tuple) -> Problem:
-    """`problem` under other loads and supports."""
-    return dataclasses.replace(problem, loads=terms[0], supports=terms[1])
 
 
 def _size(dynamics: Dynamics, interval: Interval) -> Float[Array, ""]:
@@ -304,20 +292,25 @@ def _at(row: Row, index, share) -> Float[Array, "..."]:
     return first + share * (last - first)
 
 
-def _begun(dynamics: Dynamics, state: State, interval: Interval, af, stage: StepState):
-    problem, found = dynamics.problem, []
-    share = interval.end - af * (interval.end - interval.begin)
-    bare = body(problem)
-    for load, row, before in zip(problem.loads, dynamics.loads, state.memory, strict=True):
-        value = load.value if row is None else _at(row, interval.index, share)
-        if before is not None or row is not None:
-            load = load if before is None else before
-            load = eqx.tree_at(lambda load: load.value, load, value)
-        found.append(load.begun(bare, stage))
+def loads_at(dynamics: Dynamics, state: State, at: Callable[[Row], Array]) -> tuple:
+    """The loads as they remember, those with a row of values with the one that `at` takes."""
+    found = []
+    rows = zip(dynamics.problem.loads, dynamics.loads, state.memory, strict=True)
+    for load, row, before in rows:
+        value = load.value if row is None else at(row)
+        kept = load if before is None else before
+        found.append(eqx.tree_at(lambda load: load.value, kept, value))
     return tuple(found)
 
 
-def _damping_matrix(dynamics: Dynamics, known: Matter, guess):
+def _begun(dynamics: Dynamics, state: State, interval: Interval, af, stage: StepState):
+    share = interval.end - af * (interval.end - interval.begin)
+    loads = loads_at(dynamics, state, lambda row: _at(row, interval.index, share))
+    bare = body(dynamics.problem)
+    return tuple(load.begun(bare, stage) for load in loads)
+
+
+def damping_matrix(dynamics: Dynamics, known: Matter, guess):
     problem = body(dynamics.problem)
     varying = [d.matrix(problem, known.mass, guess) for d in dynamics.damping if not d.constant]
     if known.damping is not None:

@@ -11,8 +11,8 @@ from sorojax._display import displayed, number, outcome
 from sorojax._jax.trace_state import is_traced
 from sorojax.fem.dynamics.damping import mass_matrix
 from sorojax.fem.dynamics.newton import has_lists, lists_of, with_lists
-from sorojax.fem.dynamics.step import Dynamics, State, matter
-from sorojax.fem.problem import Problem, body, potential_energy
+from sorojax.fem.dynamics.step import Dynamics, State, loads_at, matter
+from sorojax.fem.problem import Problem, body, exchanged, potential_energy
 from sorojax.math.linalg import sparse
 from sorojax.math.status import Status
 
@@ -109,31 +109,18 @@ def _energies(dynamics: Dynamics, states: State, points, lists) -> Energies:
     def one(row) -> Energies:
         state, index = eqx.combine(row[0], rest), row[1]
         u, v = state.displacement, state.velocity.ravel()
-        loads = _loads_at(dynamics, state, index)
+        loads = loads_at(dynamics, state, lambda row: row[index])
         loads = loads if lists is None else with_lists(loads, row[2])
-        loaded = eqx.tree_at(lambda p: p.loads, body(problem), loads)
+        loaded = exchanged(body(problem), loads=loads)
         return Energies(
             0.5 * jnp.sum(v * sparse.product(problem.space.system, mass, v)),
             potential_energy(body(problem), u),
-            sum(
-                (load.stored(loaded, u) for load in loaded.loads), start=jnp.zeros((), u.dtype)
-            ),
+            sum((load.stored(loaded, u) for load in loads), start=jnp.zeros((), u.dtype)),
             state.work,
             state.dissipated,
         )
 
     return jax.lax.map(one, (moving, points, lists))
-
-
-def _loads_at(dynamics: Dynamics, state: State, index) -> tuple:
-    """The loads at a point of the grid, as they remember."""
-    found = []
-    rows = zip(dynamics.problem.loads, dynamics.loads, state.memory, strict=True)
-    for load, row, before in rows:
-        value = load.value if row is None else row[index]
-        kept = load if before is None else before
-        found.append(eqx.tree_at(lambda load: load.value, kept, value))
-    return tuple(found)
 
 
 def momentum(

@@ -17,7 +17,6 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
-from sorojax._jax.operations import Rules, operation
 from sorojax._jax.trace_state import evaluated_now, is_traced, is_tracer
 from sorojax.fem.equilibrium.jit import (
     Begin,
@@ -25,20 +24,20 @@ from sorojax.fem.equilibrium.jit import (
     follow_traced,
     known_mask,
     prepare_traced,
-    with_terms,
 )
-from sorojax.fem.equilibrium.linear import Linearised, linearise
+from sorojax.fem.equilibrium.lanes import Lanes, lane_operation
+from sorojax.fem.equilibrium.linear import linearise
 from sorojax.fem.equilibrium.load_stepping import (
     Log,
-    Start,
+    StartingPoint,
     Stats,
-    begin_at,
+    at_rest,
     follow,
     scaled_features,
     solve_lanes,
 )
 from sorojax.fem.equilibrium.newton import Newton
-from sorojax.fem.problem import Problem, potential_energy, residual, unsupported
+from sorojax.fem.problem import Problem, potential_energy, residual, unsupported, with_terms
 from sorojax.fem.supports import known_dofs, known_values
 from sorojax.math.linalg import sparse
 from sorojax.math.linear_map import pushed
@@ -162,7 +161,7 @@ class Equilibrium(NamedTuple):
 def response(at: Equilibrium, rates: Problem) -> Float[Array, "nodes dim"]:
     """du for the rates dp of the numbers that move, by operations that JAX differentiates."""
     system, matrix, known = _held_tangent(at)
-    if _supports_move(at):
+    if jax.tree.leaves(at.params.supports):
         rhs, move = _moved_unbalance(at, rates, known)
         return _answer(system, matrix, rhs, at.u) + move
     rhs = _unbalance(_without_supports(at), unsupported(rates), known)
@@ -192,17 +191,13 @@ class _Map:
 
     def pull_now(self, *changes) -> list:
         """By one back-substitution and the derivative of one number."""
-        if _supports_move(self.at):
+        if jax.tree.leaves(self.at.params.supports):
             return self.pull(*changes)
         system, matrix, known = _held_on_host(self.at)
         force = np.where(known, 0.0, np.asarray(changes[0]).ravel())
         # the last factor of the solve belongs to the state before the last, small update
         work = system.solver.solve_near(matrix, force)
         return jax.tree.leaves(_pulled(_without_supports(self.at), work, known))
-
-
-def _supports_move(at: Equilibrium) -> bool:
-    return bool(jax.tree.leaves(at.params.supports))
 
 
 def _without_supports(at: Equilibrium) -> Equilibrium:
@@ -305,9 +300,7 @@ def _equilibrium(call: Solve, traced):
 
 
 def _solved(call: Solve, traced):
-    leaves = call.complete(traced)
-    batched = (False,) * len(leaves)
-    return tuple(_equilibrium_of(*leaves, call=call, lead=(), batched=batched))
+    return _equilibrium_of(call, call.complete(traced))
 
 
 def _derivative(call: Solve, primals, tangents):
@@ -321,11 +314,8 @@ def _derivative(call: Solve, primals, tangents):
         if call.num_values != call.num_all_values:
             values = jax.lax.slice_in_dim(values, 0, call.num_values)
     u_dot = response_at_once(at, rates) if concrete else response(at, rates)
-    return (u, counts, values), (u_dot, _still(counts), _still(values))
-
-
-def _still(x) -> SymbolicZero:
-    return SymbolicZero(jax.typeof(x).to_tangent_aval())
+    still = (SymbolicZero(jax.typeof(x).to_tangent_aval()) for x in (counts, values))
+    return (u, counts, values), (u_dot, *still)
 
 
 _equilibrium.defjvp(_derivative, symbolic_zeros=True)
@@ -369,37 +359,28 @@ _tangent_values.defjvp(_tangent_values_derivative, symbolic_zeros=True)
 _prepare_traced = eqx.filter_jit(prepare_traced)
 
 
-def _on_host(*leaves, call: Solve, lead: tuple[int, ...], batched: tuple[bool, ...]):
-    with evaluated_now():
-        if lead:
-            return _lanes_on_host(leaves, call, lead, batched)
-        log = Log(*call.settings)
-        call.record.keep([log], False)
-        u = call.record.displacement = _follow(*call.inputs(leaves), log)
-        return _outcome(call, u, log)
+def _alone(call: Solve, leaves) -> Outcome:
+    log = Log(*call.settings)
+    call.record.keep([log], False)
+    u = call.record.displacement = _follow(*call.inputs(leaves), log)
+    return _outcome(call, u, log)
 
 
 def _follow(problem: Problem, begin: Begin | None, log: Log) -> np.ndarray:
     if begin is None:
-        return follow(problem, begin_at(problem, None), log)
+        return follow(problem, at_rest(problem), log)
     u = np.asarray(begin.u)
     if not np.all(np.isfinite(u)):
         log.reason = "the state to start from is no equilibrium"
         return u
-    zero = jnp.zeros(())
-    values = begin.tangent
-    known = None if values is None else Linearised(zero, values, zero, zero, zero, zero)
     if begin.terms is not None:
-        return follow(problem, Start(u, with_terms(problem, begin.terms), known), log)
-    return _from_guess(problem, Start(u, problem, known), log)
-
-
-def _from_guess(problem: Problem, guess: Start, log: Log) -> np.ndarray:
-    """Newton from a guess at full load; from rest along the load if it is too far away."""
+        start = with_terms(problem, begin.terms)
+        return follow(problem, StartingPoint(u, start, begin.tangent), log)
+    # from a guess at full load; from rest along the load if it is too far away
     once = Log(log.newton, 1, 0)
-    u = follow(problem, guess, once)
+    u = follow(problem, StartingPoint(u, problem, begin.tangent), once)
     if once.reason:
-        return follow(problem, begin_at(problem, None), log)
+        return follow(problem, at_rest(problem), log)
     log.steps, log.end = once.steps, once.end
     return u
 
@@ -411,92 +392,36 @@ def _outcome(call: Solve, u: np.ndarray, log: Log) -> Outcome:
     counts = np.array(numbers, u.dtype)
     tangent = np.zeros(call.num_values, u.dtype)
     if call.num_values and not log.reason:
-        tangent = log.end.tangent.values  # type: ignore[union-attr]
+        tangent = log.end.tangent
     return Outcome(jnp.asarray(u), jnp.asarray(counts), jnp.asarray(tangent))
 
 
-def _lanes_on_host(leaves, call: Solve, lead, batched) -> list[jax.Array]:
+def _side_by_side(call: Solve, lanes: Lanes) -> list[Outcome]:
     """Every lane with its own record; lanes from rest help one another."""
-    num = int(np.prod(lead))
-    rows = [
-        np.asarray(x).reshape(num, *x.shape[len(lead) :]) if b else x
-        for x, b in zip(leaves, batched, strict=True)
-    ]
-
-    def lane(k: int) -> tuple[Problem, Begin | None]:
-        one = [jnp.asarray(x[k]) if b else x for x, b in zip(rows, batched, strict=True)]
-        return call.inputs(one)
-
-    logs = [Log(*call.settings) for _ in range(num)]
+    logs = [Log(*call.settings) for _ in range(lanes.count)]
     call.record.keep(logs, True)
-    if call.inputs(leaves)[1] is None:
-        varying = [x for x, b in zip(rows, batched, strict=True) if b and x.dtype.kind == "f"]
-        body = call.inputs(list(batched))[0]
+    if call.inputs(lanes.rows)[1] is None:
+        pairs = list(zip(lanes.rows, lanes.batched, strict=True))
+        varying = [x for x, b in pairs if b and x.dtype.kind == "f"]
+        body = call.inputs(list(lanes.batched))[0]
         shape = jax.tree.leaves((body.mesh, body.kinematics, body.formulation))
         same_body = not any(leaf is True for leaf in shape)
         features = scaled_features(varying)
-        answers = solve_lanes(lambda k: lane(k)[0], features, logs, same_body)
+        answers = solve_lanes(lambda k: call.problem(lanes.lane(k)), features, logs, same_body)
     else:
-        answers = [_follow(*lane(k), logs[k]) for k in range(num)]
-    outcomes = [_outcome(call, u, log) for u, log in zip(answers, logs, strict=True)]
-    stacked = [jnp.stack(column) for column in zip(*outcomes, strict=True)]
-    return [x.reshape(*lead, *x.shape[1:]) for x in stacked]
+        answers = [_follow(*call.inputs(lanes.lane(k)), log) for k, log in enumerate(logs)]
+    return [_outcome(call, u, log) for u, log in zip(answers, logs, strict=True)]
 
 
-def _shapes(*leaves, call: Solve, lead, batched):
-    dtype = jnp.result_type(float)
-    shapes = (call.shape, (5,), (call.num_values,))
-    return [jax.ShapeDtypeStruct((*lead, *shape), dtype) for shape in shapes]
+def _in_trace(call: Solve, leaves) -> list[Any]:
+    u, counts, tangent = follow_traced(*call.inputs(leaves), *call.settings)
+    return [u, counts, tangent[: call.num_values]]
 
 
-def _batch(leaves, axes, *, call: Solve, lead, batched):
-    rows, wide, batched = widened(leaves, axes, lead, batched)
-    return _equilibrium_of(*rows, call=call, lead=wide, batched=batched)
-
-
-def widened(leaves, axes, lead: tuple[int, ...], batched: tuple[bool, ...]):
-    """One more leading axis: arrays that have any of the axes get all of them."""
-    sizes = [x.shape[a] for x, a in zip(leaves, axes, strict=True) if a is not None]
-    wide = (sizes[0], *lead)
-    rows = []
-    for x, axis, before in zip(leaves, axes, batched, strict=True):
-        if axis is not None:
-            x = jnp.moveaxis(x, axis, 0)
-            if not before and lead:
-                x = x.reshape(x.shape[0], *(1 for _ in lead), *x.shape[1:])
-        if axis is not None or before:
-            own = x.shape[len(wide) :] if axis is not None else x.shape[len(lead) :]
-            x = jnp.broadcast_to(x, (*wide, *own))
-        rows.append(x)
-    return rows, wide, tuple(b or a is not None for a, b in zip(axes, batched, strict=True))
-
-
-def _in_trace(*leaves, call: Solve, lead, batched) -> list[Any]:
-    """The loop of `traced`; lanes run one after another, so that none waits for the slowest."""
-    # hidden from constant folding, which takes seconds on index arrays
-    leaves = jax.lax.optimization_barrier(leaves)
-
-    def one(leaves):
-        problem, begin = call.inputs(leaves)
-        u, counts, tangent = follow_traced(problem, begin, *call.settings)
-        return u, counts, tangent[: call.num_values]
-
-    return lane_after_lane(one, leaves, lead, batched)
-
-
-def lane_after_lane(one, leaves, lead: tuple[int, ...], batched) -> list[Any]:
-    """`one(leaves)` for every lane of the leading axes `lead`, inside a trace."""
-    if not lead:
-        return list(one(list(leaves)))
-    num = int(np.prod(lead))
-    rows = [x for x, b in zip(leaves, batched, strict=True) if b]
-
-    def lane(row):
-        row = iter(row)
-        return one([next(row) if b else x for x, b in zip(leaves, batched, strict=True)])
-
-    out = jax.lax.map(lane, [x.reshape(num, *x.shape[len(lead) :]) for x in rows])
-    return [x.reshape(*lead, *x.shape[1:]) for x in out]
-
-
-_equilibrium_of = operation("fem_equilibrium", Rules(_on_host, _in_trace, _shapes, _batch))
+_equilibrium_of = lane_operation(
+    "fem_equilibrium",
+    _alone,
+    _side_by_side,
+    _in_trace,
+    lambda call: (call.shape, (5,), (call.num_values,)),
+)

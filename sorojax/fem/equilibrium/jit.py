@@ -27,7 +27,7 @@ from sorojax.fem.equilibrium.linear import (
 )
 from sorojax.fem.equilibrium.load_stepping import between, unloaded
 from sorojax.fem.equilibrium.newton import Newton, overshoots, safe_fraction, share_of_step
-from sorojax.fem.problem import Problem, unsupported
+from sorojax.fem.problem import Problem, unsupported, with_terms
 from sorojax.fem.supports import known_components, known_values
 from sorojax.math.linalg import sparse
 
@@ -157,12 +157,6 @@ def _first(problem: Problem, begin: Begin | None) -> Problem:
     return with_terms(problem, begin.terms)
 
 
-def with_terms(problem: Problem, terms: tuple) -> Problem:
-    """`problem` under other loads and supports."""
-    loads, supports = terms
-    return eqx.tree_at(lambda p: (p.loads, p.supports), problem, (loads, supports))
-
-
 def _initial(problem: Problem, begin: Begin | None, steps: int) -> _State:
     points = problem.mesh.points
     u = jnp.zeros_like(points) if begin is None else jnp.asarray(begin.u, points.dtype)
@@ -171,25 +165,32 @@ def _initial(problem: Problem, begin: Begin | None, steps: int) -> _State:
     guess = begin is not None and begin.terms is None
     if tangent is None:
         tangent = jnp.zeros(problem.space.system.num_values, points.dtype)
-    false, none = jnp.asarray(False), jnp.asarray(0, jnp.int32)
     return _State(
         u=u,
         before=u,
         start=u,
         tangent=tangent,
         predict=predict,
-        moved=false,
-        shortened=false,
         guess=jnp.asarray(guess),
-        update=jnp.asarray(jnp.inf, points.dtype),
         way=_way(1 if guess else steps, points.dtype),
-        iterations=none,
-        total=none,
-        slope=jnp.zeros((), points.dtype),
-        share=jnp.ones((), points.dtype),
-        shortenings=none,
+        total=jnp.asarray(0, jnp.int32),
         running=jnp.all(jnp.isfinite(u)),
+        **_unmoved(points.dtype),
     )
+
+
+def _unmoved(dtype) -> dict[str, Array]:
+    """What a state knows of a load level before the first step there."""
+    false, none, zero = jnp.asarray(False), jnp.asarray(0, jnp.int32), jnp.zeros((), dtype)
+    return {
+        "moved": false,
+        "shortened": false,
+        "update": zero + jnp.inf,
+        "iterations": none,
+        "slope": zero,
+        "share": zero + 1,
+        "shortenings": none,
+    }
 
 
 def _way(steps: int, dtype) -> rules.LoadSteps:
@@ -220,7 +221,7 @@ def _examine(
         overran = more & rules.turned(state.slope, end)
         share = rules.shortened(state.share, state.slope, end)
     converged = ~collapsed & ~overran & valid & answer
-    exhausted = rules.exhausted(state.iterations, newton) & ~state.predict
+    exhausted = (state.iterations >= newton.max_iterations) & ~state.predict
     failed = ~collapsed & ~overran & ~converged & (~valid | exhausted)
     values = jnp.where(state.predict, state.tangent, found.values)
 
@@ -310,7 +311,7 @@ def _next(problem, prepared, state: _State, level: _Level, steps: int, max_cuts:
 
 def _accepted(state: _State, level: _Level, predicts: bool) -> _State:
     way = rules.accept(state.way, state.iterations)
-    state = state._replace(
+    return state._replace(
         before=state.u,
         start=state.u,
         tangent=level.values,
@@ -319,8 +320,8 @@ def _accepted(state: _State, level: _Level, predicts: bool) -> _State:
         guess=jnp.asarray(False),
         total=state.total + state.iterations,
         running=way.done < 1.0,
+        **_unmoved(state.u.dtype),
     )
-    return _fresh(state)
 
 
 def _cut(state: _State, steps: int, max_cuts: int) -> _State:
@@ -329,7 +330,7 @@ def _cut(state: _State, steps: int, max_cuts: int) -> _State:
     u = jnp.where(from_rest, jnp.zeros_like(state.start), state.start)
     shorter, first = rules.cut(state.way), _way(steps, state.u.dtype)
     way = jax.tree.map(lambda a, b: jnp.where(from_rest, a, b), first, shorter)
-    state = state._replace(
+    return state._replace(
         u=u,
         before=u,
         start=u,
@@ -337,19 +338,7 @@ def _cut(state: _State, steps: int, max_cuts: int) -> _State:
         predict=jnp.asarray(False),
         guess=jnp.asarray(False),
         running=from_rest | rules.goes_on(shorter, steps, max_cuts),
-    )
-    return _fresh(state)
-
-
-def _fresh(state: _State) -> _State:
-    return state._replace(
-        moved=jnp.asarray(False),
-        shortened=jnp.asarray(False),
-        update=jnp.full_like(state.update, jnp.inf),
-        iterations=jnp.zeros_like(state.iterations),
-        slope=jnp.zeros_like(state.slope),
-        share=jnp.ones_like(state.share),
-        shortenings=jnp.zeros_like(state.shortenings),
+        **_unmoved(u.dtype),
     )
 
 

@@ -73,8 +73,8 @@ def _largest_cell(points: np.ndarray, cells: np.ndarray) -> float:
 def linearise(
     problem: Problem,
     prepared: Prepared,
-    u: Float[Array, "nodes dim"],
-    u_before: Float[Array, "nodes dim"],
+    u: Float[Array | np.ndarray, "nodes dim"],
+    u_before: Float[Array | np.ndarray, "nodes dim"],
 ) -> Linearised:
     """Residual and tangent at `u`; see `assemble` for the part of `u_before`."""
     return _linearise(unsupported(problem), prepared, u, u_before)

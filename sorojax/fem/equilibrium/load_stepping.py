@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from sorojax._progress import report, reported_if_long
 from sorojax.fem.equilibrium import rules
-from sorojax.fem.equilibrium.linear import Linearised, Prepared, prepare
+from sorojax.fem.equilibrium.linear import Prepared, prepare
 from sorojax.fem.equilibrium.newton import Newton, newton_solve
 from sorojax.fem.problem import Problem
 from sorojax.fem.supports import known_values
@@ -46,12 +46,12 @@ class Stats(NamedTuple):
         return sum(step.iterations for step in self.steps)
 
 
-class Start(NamedTuple):
+class StartingPoint(NamedTuple):
     """A known equilibrium to start from, with the tangent there."""
 
     u: np.ndarray
     problem: Problem
-    tangent: Linearised | None
+    tangent: Float[Array, " nnz"] | None
 
 
 class Log:
@@ -64,7 +64,7 @@ class Log:
     def clear(self) -> None:
         self.steps: list[LoadStep] = []
         self.cuts, self.reason = 0, ""
-        self.end: Start
+        self.end: StartingPoint
 
     @property
     def status(self) -> Status:
@@ -74,16 +74,12 @@ class Log:
         return Stats(tuple(self.steps), self.cuts, self.reason)
 
 
-def begin_at(problem: Problem, begin: Start | np.ndarray | None) -> Start:
-    """Where to start from: the unloaded body, unless told otherwise."""
-    if isinstance(begin, Start):
-        return begin
-    if begin is None:
-        return Start(np.zeros(problem.mesh.points.shape), unloaded(problem), None)
-    return Start(begin, problem, None)
+def at_rest(problem: Problem) -> StartingPoint:
+    """The unloaded body."""
+    return StartingPoint(np.zeros(problem.mesh.points.shape), unloaded(problem), None)
 
 
-def follow(problem: Problem, begin: Start, log: Log) -> np.ndarray:
+def follow(problem: Problem, begin: StartingPoint, log: Log) -> np.ndarray:
     """Step from `begin` to `problem`, halving steps that fail."""
     prepared = prepare(problem)
     u, tangent, kept, way = begin.u, begin.tangent, None, rules.first_step(log.num_steps)
@@ -100,12 +96,12 @@ def follow(problem: Problem, begin: Start, log: Log) -> np.ndarray:
                 log.reason = result.reason
                 return u
             continue
-        u, tangent, kept = result.u, result.linearised, result.kept
+        u, tangent, kept = result.u, result.tangent, result.kept
         way = rules.accept(way, result.iterations)
         log.steps.append(
             LoadStep(goal, result.iterations, result.residual, result.negative_eigenvalues)
         )
-        log.end = Start(u, problem, tangent)
+        log.end = StartingPoint(u, problem, tangent)
         if len(log.steps) + log.cuts > 1:  # one step is no wait worth a line
             report("load", goal, 1.0, iterations=result.iterations, cuts=log.cuts)
     return u
@@ -173,7 +169,7 @@ def solve_lanes(
             prepared = shared if same_body else prepare(problem)
             u, tried = _from_neighbour(problem, prepared, logs[neighbour].end, log), True
         if u is None:
-            u = follow(problem, begin_at(problem, None), log)
+            u = follow(problem, at_rest(problem), log)
         account.add(tried, problem.space.system.solver.num_factorisations - spent)
         answers[lane] = u
         report("lanes", count + 1, len(logs), iterations=log.stats().iterations)
@@ -200,7 +196,7 @@ def _is_stable(log: Log) -> bool:
 
 
 def _from_neighbour(
-    problem: Problem, prepared: Prepared, near: Start, log: Log
+    problem: Problem, prepared: Prepared, near: StartingPoint, log: Log
 ) -> np.ndarray | None:
     """Equilibrium by Newton from a neighbour's, or `None` if that is not to be trusted."""
     known = np.asarray(known_values(problem.supports, *near.u.shape))
@@ -213,7 +209,7 @@ def _from_neighbour(
     if found.reason or found.negative_eigenvalues != 0:
         return None
     log.steps.append(LoadStep(1.0, found.iterations, found.residual, 0))
-    log.end = Start(found.u, problem, found.linearised)
+    log.end = StartingPoint(found.u, problem, found.tangent)
     return found.u
 
 

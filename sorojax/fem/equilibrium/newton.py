@@ -259,7 +259,7 @@ class Iterate(NamedTuple):
     """State after a load level: converged unless `reason` says why not."""
 
     u: np.ndarray
-    linearised: Linearised | None
+    tangent: Float[Array, " nnz"] | None
     iterations: int
     residual: float
     negative_eigenvalues: int
@@ -273,7 +273,7 @@ def newton_solve(
     start: np.ndarray,
     known_values: np.ndarray,
     settings: Newton,
-    tangent: Linearised | None = None,
+    tangent: Float[Array, " nnz"] | None = None,
     kept: KeptFactor | None = None,
     tell: Callable[..., None] = lambda done, imbalance: None,
 ) -> Iterate:
@@ -281,61 +281,74 @@ def newton_solve(
     guess at the price of a few back-substitutions with the factor `kept` from there. `tell`
     is called with the number of every iteration."""
     u, before = start, start
-    state = _linearise(problem, prepared, u, before)
+    state = linearise(problem, prepared, u, before)
     known = np.asarray(prepared.known)
-    move = _left_to_move(known, known_values, u)
+    move = left_to_move(known, known_values, u)
     iterations, negative, size = 0, 0, np.inf
     if kept is None:
         kept = KeptFactor(known, problem.mesh.element.dim, settings.residual_tolerance)
     if tangent is not None and rules.predicts(problem.loads):
         near = kept.near(u, 1.0, 0.0)
-        du, negative, new = step(problem, prepared, tangent.values, state.residual, move, near)
+        du, negative, new = step(problem, prepared, tangent, state.residual, move, near)
         kept.renew(new, u)
         if du is not None:
             u, before, state, size = _advance(problem, prepared, u, du)
-            move = _left_to_move(known, known_values, u)
+            move = left_to_move(known, known_values, u)
     while True:
-        norm, reference = float(state.residual_norm), float(state.reference)
-        ratio = rules.imbalance(norm, reference)
-        if not rules.sound(norm, float(state.volume_ratio)):
-            return Iterate(u, None, iterations, ratio, negative, "an element inverts")
-        tolerance, still = settings.residual_tolerance, not np.any(move)
-        small = rules.balanced(norm, reference, float(state.rounding), tolerance)
-        if rules.converged(small, size, still, settings):
-            return Iterate(u, state, iterations, ratio, negative, "", kept)
-        if rules.exhausted(iterations, settings):
-            reason = f"no convergence in {iterations} Newton iterations"
-            return Iterate(u, None, iterations, ratio, negative, reason)
-        near = kept.near(u, ratio, size)
-        du, negative, new = step(problem, prepared, state.values, state.residual, move, near)
-        kept.renew(new, u)
-        if du is None:
+        ratio, still = imbalance(state), not np.any(move)
+        reason, du = verdict(state, size, still, iterations, settings), None
+        if reason is None:
+            near = kept.near(u, ratio, size)
+            args = state.values, state.residual, move, near
+            du, negative, new = step(problem, prepared, *args)
+            kept.renew(new, u)
             reason = problem.space.system.unsolved
-            return Iterate(u, None, iterations, ratio, negative, reason)
+        if du is None:
+            values = None if reason else state.values
+            return Iterate(u, values, iterations, ratio, negative, reason, kept)
         iterations += 1
         tell(iterations, imbalance=ratio)
         if overshoots(problem) and still:
             args = (problem, prepared.known, state.residual, jnp.asarray(u), jnp.asarray(du))
             du = float(share_of_step(*args)) * du
         u, before, state, size = _advance(problem, prepared, u, du)
-        move = _left_to_move(known, known_values, u)
+        move = left_to_move(known, known_values, u)
 
 
-def _left_to_move(known: np.ndarray, known_values: np.ndarray, u: np.ndarray) -> np.ndarray:
+def imbalance(state: Linearised) -> float:
+    """Largest unbalanced force over the load or reaction that it is judged by; itself where
+    there is none [N]."""
+    norm, reference = float(state.residual_norm), float(state.reference)
+    return norm / reference if reference > 0 else norm
+
+
+def verdict(
+    state: Linearised, size: float, still: bool, iterations: int, settings: Newton
+) -> str | None:
+    """Why a search ends at an iterate, nothing where that is the answer; `None` to go on."""
+    norm, tolerance = float(state.residual_norm), settings.residual_tolerance
+    if not rules.sound(norm, float(state.volume_ratio)):
+        return "an element inverts"
+    small = rules.balanced(norm, float(state.reference), float(state.rounding), tolerance)
+    if rules.converged(small, size, still, settings):
+        return ""
+    if iterations >= settings.max_iterations:
+        return f"no convergence in {iterations} Newton iterations"
+    return None
+
+
+def left_to_move(known: np.ndarray, known_values: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """How far supports are from where they should be [m]."""
     return rules.left_to_move(np.where(known, known_values - u.ravel(), 0.0), known_values)
-
-
-def _linearise(problem, prepared, u: np.ndarray, before: np.ndarray) -> Linearised:
-    return linearise(problem, prepared, u, before)  # type: ignore[arg-type]
 
 
 def _advance(problem: Problem, prepared: Prepared, u: np.ndarray, du: np.ndarray):
     """The state after a step, shortened where a cell would collapse."""
     new = u + du
-    state = _linearise(problem, prepared, new, u)
+    state = linearise(problem, prepared, new, u)
     if not rules.keeps_volume(float(state.volume_ratio)):
         new = u + float(safe_fraction(problem, prepared, u, du)) * du
-        state = _linearise(problem, prepared, new, u)
+        state = linearise(problem, prepared, new, u)
     return new, u, state, rules.relative_size(du, new, float(prepared.length))
 
 

@@ -47,12 +47,6 @@ def sound(residual_norm: Number, volume_ratio: Number) -> Truth:
     return (abs(residual_norm) < float("inf")) & (volume_ratio > 0)
 
 
-def imbalance(residual_norm: float, reference: float) -> float:
-    """Largest unbalanced force over the load or reaction that it is judged by; itself where
-    there is none [N]."""
-    return residual_norm / reference if reference > 0 else residual_norm
-
-
 def balanced(
     residual_norm: Number, reference: Number, rounding: Number, tolerance: Number
 ) -> Truth:
@@ -80,11 +74,6 @@ def converged(is_balanced: Truth, size: Number, still: Truth, newton: "Newton") 
 #: Iterations of a time step at most, most of them with a kept factor, over how many `Newton`
 #: allows with a tangent of their own.
 MOST_ITERATIONS = 6
-
-
-def exhausted(iterations: Number, newton: "Newton") -> Truth:
-    """Whether there were as many iterations as there may be."""
-    return iterations >= newton.max_iterations
 
 
 # A step that runs too far along its way
@@ -161,14 +150,9 @@ def _chosen(condition: Truth, a: Number, b: Number) -> Number:
 
 
 def error_ratio(error: Number, allowed: Number, u: Values, length: Number) -> Number:
-    """Estimated error [m] of a time step to the displacement `u` [m] over the largest one:
-    the share `allowed` of `u`."""
+    """Estimated error [m] of a time step to the displacement `u` [m] over the largest one,
+    the share `allowed` of `u`: a step above 1 is not accepted."""
     return error / (allowed * (abs(u).max() + 0.01 * length))
-
-
-def error_fits(ratio: Number) -> Truth:
-    """Whether a time step may be accepted for its error."""
-    return ratio <= 1.0
 
 
 def is_easy(iterations: Number, newton: "Newton", ratio: Number) -> Truth:

@@ -21,7 +21,7 @@ from sorojax.fem.equilibrium.linear import linearise, prepare
 from sorojax.fem.equilibrium.load_stepping import LoadStep, Log, between, unloaded
 from sorojax.fem.equilibrium.newton import Newton
 from sorojax.fem.equilibrium.solve import ConvergenceError, Path, Solution
-from sorojax.fem.problem import Problem, load_force, load_potential, residual
+from sorojax.fem.problem import Problem, load_potential, residual
 from sorojax.fem.stability.arc_length import Border, newton_bordered
 from sorojax.fem.supports import known_values
 from sorojax.math.linalg import sparse
@@ -97,6 +97,7 @@ def with_pressures(
     return eqx.tree_at(lambda p: [p.loads[i].value for i in indices], problem, list(pressures))
 
 
+@eqx.filter_jit
 def volumes(
     problem: Problem, names: Names, u: Float[Array, "nodes dim"]
 ) -> Float[Array, " cavities"]:
@@ -108,16 +109,14 @@ def volumes(
     return -jax.grad(potential)(jnp.zeros(len(names), u.dtype))
 
 
-@eqx.filter_jit
-def contents_gap(
-    problem: Problem, names: Names, contents: tuple[AbstractContents, ...], u, pressures
-) -> Float[Array, " cavities"]:
-    """Volume of the contents minus that of the cavities [m^3]."""
-    return _wanted(contents, pressures) - volumes(problem, names, u)
-
-
 def _wanted(contents: tuple[AbstractContents, ...], pressures):
     return jnp.stack([c.volume_at(p) for c, p in zip(contents, pressures, strict=True)])
+
+
+@eqx.filter_jit
+def _slopes(problem: Problem, names: Names, u) -> Float[Array, "cavities dofs"]:
+    """Slopes of the volumes [m^2], nodal forces of a unit pressure in each cavity."""
+    return jax.jacrev(lambda u: volumes(problem, names, u))(u).reshape(len(names), -1)
 
 
 @eqx.filter_jit
@@ -128,7 +127,7 @@ def _border(problem: Problem, names: Names, contents, begin, share, u, pressures
         return begin + share * (_wanted(contents, pressures) - begin)
 
     inside = volumes(problem, names, u)
-    slope = jax.jacrev(lambda u: volumes(problem, names, u))(u).reshape(len(names), -1)
+    slope = _slopes(problem, names, u)
     known = known_values(problem.supports, *u.shape)
     # The potential is minus pressure times volume: B = C makes the border symmetric.
     return Border(
@@ -142,11 +141,6 @@ def _border(problem: Problem, names: Names, contents, begin, share, u, pressures
     )
 
 
-@eqx.filter_jit
-def begin_volumes(problem: Problem, names: Names, u) -> Float[Array, " cavities"]:
-    return volumes(problem, names, u)
-
-
 def follow_contents(
     problem: Problem,
     names: Names,
@@ -157,7 +151,7 @@ def follow_contents(
     """Displacement and pressures at equilibrium with the contents, in adaptive steps."""
     prepared = prepare(problem)
     u, pressures = np.asarray(begin.u), np.asarray(begin.pressures)
-    first = begin_volumes(problem, names, jnp.asarray(u))
+    first = volumes(problem, names, jnp.asarray(u))
     way = rules.first_step(log.num_steps)
     while way.done < 1.0:
         goal = rules.goal(way)
@@ -179,18 +173,6 @@ def follow_contents(
         log.steps.append(LoadStep(goal, found.iterations, found.residual, -1))
         report("contents", goal, 1.0, iterations=found.iterations, cuts=log.cuts)
     return u, pressures
-
-
-@eqx.filter_jit
-def pressure_force_rate(
-    problem: Problem, names: Names, u: Float[Array, "nodes dim"]
-) -> Float[Array, "cavities dofs"]:
-    """Nodal force of a unit pressure in each cavity: the slope of its volume [m^2]."""
-
-    def force(pressures):
-        return load_force(with_pressures(problem, names, pressures), u).ravel()
-
-    return jax.jacfwd(force)(jnp.zeros(len(names), u.dtype)).T
 
 
 # Equilibrium with closed cavities, differentiable by the implicit function theorem
@@ -380,7 +362,7 @@ def _tangent(rest, names: Names, state, params, params_dot):
     def unbalanced(params, u, pressures):
         problem, contents = eqx.combine(params, rest)
         here = with_pressures(problem, names, pressures)
-        gap = contents_gap(here, names, contents, u, pressures)
+        gap = _wanted(contents, pressures) - volumes(here, names, u)
         return residual(here, u).ravel(), gap
 
     _, move = jax.jvp(known, (params,), (params_dot,))
@@ -389,7 +371,7 @@ def _tangent(rest, names: Names, state, params, params_dot):
         unbalanced, (params, u, pressures), (params_dot, move.reshape(u.shape), still)
     )
     contents_rate = jax.jacfwd(lambda p: unbalanced(params, u, p)[1])(pressures)
-    slope = pressure_force_rate(problem, names, u)
+    slope = _slopes(problem, names, u)
     with evaluated_now(params, u):
         prepared = prepare(problem)
         values = linearise(problem, prepared, u, u).values

@@ -97,20 +97,24 @@ def cavity_volume(
     return jnp.sum(jax.vmap(lambda x: facet_volume(element, kinematics, x, flux_shares))(x))
 
 
+def areas_of(problem: "Problem", facets: Facets) -> Float[Array, "facets quad"]:
+    """Reference areas of the quadrature points of facets [m^2]."""
+    tables, kinematics = facet_tables(problem.mesh.element), problem.kinematics
+    weights, values = jnp.asarray(tables.weights), jnp.asarray(tables.values)
+
+    def one(X):
+        size = jnp.sqrt(jnp.sum(normals(tables, X) ** 2, axis=1))
+        return weights * size * kinematics.depth(tuple((values @ X).T))
+
+    return jax.vmap(one)(problem.mesh.points[facets])
+
+
 def facet_integral(
     problem: "Problem", facets: Facets, nodal: Float[Array, "nodes dim"]
 ) -> Float[Array, " dim"]:
     """Integral of a nodal field over the reference area of facets."""
-    tables, kinematics = facet_tables(problem.mesh.element), problem.kinematics
-
-    def one(X, value):
-        size = jnp.sqrt(jnp.sum(normals(tables, X) ** 2, axis=1))
-        values = jnp.asarray(tables.values, X.dtype)
-        position = values @ X
-        area = jnp.asarray(tables.weights, X.dtype) * size * kinematics.depth(tuple(position.T))
-        return area @ (values @ value)
-
-    return jnp.sum(jax.vmap(one)(problem.mesh.points[facets], nodal[facets]), axis=0)
+    values = jnp.asarray(facet_tables(problem.mesh.element).values)
+    return jnp.einsum("fq,qa,fai->i", areas_of(problem, facets), values, nodal[facets])
 
 
 def open_nodes(element: AbstractElement, facets: Int[np.ndarray, "facets nodes"]) -> np.ndarray:

@@ -9,15 +9,16 @@ import abc
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import integers, optional_real, real
-from sorojax.fem.assembly.fields import interpolated, quadrature_points
+from sorojax.fem.assembly.geometry import interpolated, quadrature_points
 from sorojax.fem.kinematics import Axisymmetric
-from sorojax.fem.loads.facets import CurvedPart, cavity_volume, facet_integral, facet_volume
+from sorojax.fem.loads.facets import CurvedPart, facet_integral, facet_volume
 
 if TYPE_CHECKING:
     from sorojax.fem.dynamics.step import StepState
@@ -36,9 +37,12 @@ class AbstractLoad(eqx.Module):
     dead: ClassVar[bool] = False  # whether its force is the same in every state
     forgets: ClassVar[bool] = False  # whether nothing that it knows of a step lasts
 
-    @abc.abstractmethod
     def potential(self, problem: "Problem", u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
-        """Potential energy of the load [J]."""
+        """Potential energy of the load [J]: that of its curved part where there is no other."""
+        part = self.curved_part(problem)
+        assert part is not None
+        x = (problem.mesh.points + u)[part.groups]
+        return jnp.sum(jax.vmap(part.energy)(x, part.data))
 
     def stored(self, problem: "Problem", u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
         """The part of the potential that is an energy at an instant [J]: all but that of
@@ -99,10 +103,6 @@ class Pressure(AbstractLoad):
     name: str = eqx.field(static=True, default="pressure")
     origin: Float[Array, " dim"] | None = eqx.field(converter=optional_real, default=None)
     flux_shares: tuple[float, ...] | None = eqx.field(static=True, default=None)  # found
-
-    def potential(self, problem, u):
-        shift = u if self.origin is None else u - self.origin[None]
-        return -self.value * cavity_volume(problem, shift, self.facets, self.flux_shares)
 
     def curved_part(self, problem):
         element, kinematics = problem.mesh.element, problem.kinematics
@@ -178,11 +178,6 @@ class Torque(AbstractLoad):
     value: Float[Array, ""] = eqx.field(converter=real)
     axis: Float[Array, "3"] | None = eqx.field(converter=optional_real, default=None)
     name: str = eqx.field(static=True, default="torque")
-    holds: ClassVar[bool] = False
-
-    def potential(self, problem, u):
-        X = problem.mesh.points[self.nodes]
-        return -self.value * mean_rotation(X, X + u[self.nodes], self.axis)
 
     def curved_part(self, problem):
         X = problem.mesh.points[self.nodes]

@@ -1,9 +1,6 @@
 """A set of nodes that moves as a rigid body, held together by stiff ties."""
 
-from typing import ClassVar
-
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -31,7 +28,6 @@ class Rigid(AbstractLoad):
     stiffness: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
     value: Float[Array, ""] = eqx.field(converter=real, default=0.0)
     name: str = eqx.field(static=True, default="rigid")
-    holds: ClassVar[bool] = False
 
     def _energy(self, x, data):
         """One node, then the leaders; each node carries its share of the bars."""
@@ -60,11 +56,6 @@ class Rigid(AbstractLoad):
     def _groups(self, xp):
         leaders = xp.broadcast_to(self.leaders, (self.nodes.size, self.leaders.size))
         return xp.concatenate([xp.asarray(self.nodes)[:, None], leaders], axis=1)
-
-    def potential(self, problem, u):
-        part = self.curved_part(problem)
-        x = (problem.mesh.points + u)[part.groups]
-        return jnp.sum(jax.vmap(self._energy)(x, part.data))
 
     def curved_part(self, problem):
         return CurvedPart(self._groups(jnp), self._energy, self._data(problem))

@@ -53,23 +53,12 @@ class Spring(AbstractLoad):
         )
         return ends, jnp.sqrt(jnp.sum((X[self.nodes] - ends) ** 2, axis=1))
 
-    def potential(self, problem, u):
-        ends, length = self._ends(problem.mesh.points)
-        rest = length - self.value
-        if self._to_nodes:
-            ends = ends + u[self.ends]
-        return jnp.sum(
-            _stretch_energy(
-                problem.mesh.points[self.nodes] + u[self.nodes] - ends, rest, self.stiffness
-            )
-        )
-
     def curved_part(self, problem):
         ends, length = self._ends(problem.mesh.points)
         rest = length - self.value
         stiffness = jnp.broadcast_to(self.stiffness, rest.shape)
         if self._to_nodes:
-            groups = jnp.stack([self.nodes, self.ends], axis=1)
+            groups = jnp.stack([self.nodes, self.ends.astype(self.nodes.dtype)], axis=1)
             return CurvedPart(
                 groups, lambda x, d: _stretch_energy(x[0] - x[1], *d), (rest, stiffness)
             )
@@ -128,19 +117,14 @@ class Foundation(AbstractLoad):
     name: str = eqx.field(static=True, default="foundation")
     holds: ClassVar[bool] = True
 
-    def _energy(self, u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
-        dim = u.shape[1]
-        stiffness, ground = (
-            jnp.broadcast_to(a, (dim,))[None] for a in (self.stiffness, self.value)
-        )
-        return 0.5 * jnp.sum(stiffness * (u - ground) ** 2)
-
-    def potential(self, problem, u):
-        return self._energy(u[self.nodes])
-
     def curved_part(self, problem):
-        X = problem.mesh.points[self.nodes]
-        return CurvedPart(self.nodes[:, None], lambda x, X: self._energy(x - X[None]), X)
+        def energy(x, X):
+            stiffness, ground = (
+                jnp.broadcast_to(a, X.shape) for a in (self.stiffness, self.value)
+            )
+            return 0.5 * jnp.sum(stiffness * (x[0] - X - ground) ** 2)
+
+        return CurvedPart(self.nodes[:, None], energy, problem.mesh.points[self.nodes])
 
     def check(self, where, mesh, kinematics):
         _check_sizes(where, self.stiffness, (mesh.element.dim,))
@@ -236,9 +220,6 @@ class Tendon(AbstractLoad):
         """[N]; with the slope of `value` at zero too, where paths of loads begin."""
         return jnp.where(self.value >= 0, self.value, jnp.zeros_like(self.value))
 
-    def potential(self, problem, u):
-        return self.tension * tendon_length(problem.mesh, u, self.route)
-
     def curved_part(self, problem):
         weights = self.route.weights
 
@@ -265,16 +246,6 @@ class Cable(AbstractLoad):
     stiffness: Float[Array, ""] = eqx.field(converter=real)
     value: Float[Array, ""] = eqx.field(converter=real, default=0.0)
     name: str = eqx.field(static=True, default="cable")
-    holds: ClassVar[bool] = False
-
-    def _energy(self, length, rest):
-        elongation = length - rest + self.value
-        taut = jnp.where(elongation > 0, elongation, jnp.zeros_like(elongation))
-        return 0.5 * self.stiffness * taut**2
-
-    def potential(self, problem, u):
-        rest = tendon_length(problem.mesh, jnp.zeros_like(u), self.route)
-        return self._energy(tendon_length(problem.mesh, u, self.route), rest)
 
     def curved_part(self, problem):
         # The tension depends on the whole length: all nodes of the cable are one group.
@@ -283,7 +254,9 @@ class Cable(AbstractLoad):
 
         def energy(x, weights):
             ends = jnp.einsum("pa,pai->pi", weights, x.reshape(*shape, -1))
-            return self._energy(jnp.sum(_lengths(ends)), rest)
+            elongation = jnp.sum(_lengths(ends)) - rest + self.value
+            taut = jnp.where(elongation > 0, elongation, jnp.zeros_like(elongation))
+            return 0.5 * self.stiffness * taut**2
 
         nodes = self.route.nodes.reshape(1, -1)
         return CurvedPart(nodes, energy, self.route.weights[None])

@@ -31,7 +31,13 @@ from jaxtyping import Array, Bool, Float
 from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import Linearised, Prepared, linearise
 from sorojax.fem.equilibrium.load_stepping import between, unloaded
-from sorojax.fem.equilibrium.newton import Newton, safe_fraction
+from sorojax.fem.equilibrium.newton import (
+    Newton,
+    imbalance,
+    left_to_move,
+    safe_fraction,
+    verdict,
+)
 from sorojax.fem.problem import Problem, load_force
 from sorojax.fem.supports import known_values
 from sorojax.math.linalg import sparse
@@ -105,19 +111,6 @@ def respond(
     return Response(x[0], x[1:], factor.negative_eigenvalues)
 
 
-def schur_complement(border: Border, rates: np.ndarray) -> np.ndarray:
-    """D - C' K^-1 B: what the further equations see of the further unknowns."""
-    return np.asarray(border.gap_slope) @ rates.T + np.asarray(border.gap_rate)
-
-
-def unknown_move(prepared: Prepared, border: Border, u: np.ndarray) -> np.ndarray:
-    """How far the supports are from where they should be [m]."""
-    known = np.asarray(border.known)
-    return rules.left_to_move(
-        np.where(np.asarray(prepared.known), known - u.ravel(), 0.0), known
-    )
-
-
 def newton_bordered(
     at: At, prepared: Prepared, u: np.ndarray, y: np.ndarray, settings: Newton
 ) -> BorderedIterate:
@@ -126,25 +119,19 @@ def newton_bordered(
     `at(u, y)` is the problem with the unknowns put in, and the border there.
     """
     problem, border = at(u, y)
-    state = linearise(problem, prepared, jnp.asarray(u), jnp.asarray(u))
+    state = linearise(problem, prepared, u, u)
     iterations, size = 0, np.inf
     while True:
-        norm, reference = float(state.residual_norm), float(state.reference)
-        ratio = rules.imbalance(norm, reference)
-        if not rules.sound(norm, float(state.volume_ratio)):
-            return BorderedIterate(u, y, None, iterations, ratio, "an element inverts")
-        move = unknown_move(prepared, border, u)
-        tolerance, still = settings.residual_tolerance, not np.any(move)
-        small = rules.balanced(norm, reference, float(state.rounding), tolerance)
+        move = left_to_move(np.asarray(prepared.known), np.asarray(border.known), u)
         closed = np.all(np.abs(border.gap) <= 1e-9 * np.asarray(border.scale))
-        if closed and rules.converged(small, size, still, settings):
-            return BorderedIterate(u, y, state, iterations, ratio, "")
-        if rules.exhausted(iterations, settings):
-            reason = f"no convergence in {iterations} Newton iterations"
-            return BorderedIterate(u, y, None, iterations, ratio, reason)
-        step = _step(problem, prepared, state, border, move)
+        still = bool(closed) and not np.any(move)
+        reason, step = verdict(state, size, still, iterations, settings), None
+        if reason is None:
+            step = _step(problem, prepared, state, border, move)
+            reason = "the tangent is singular"
         if step is None:
-            return BorderedIterate(u, y, None, iterations, ratio, "the tangent is singular")
+            linearised = None if reason else state
+            return BorderedIterate(u, y, linearised, iterations, imbalance(state), reason)
         iterations += 1
         du, dy = step[0].reshape(u.shape), step[1]
         before = u
@@ -158,7 +145,9 @@ def _step(problem, prepared, state, border, move) -> tuple[np.ndarray, np.ndarra
         return None
     gap = np.asarray(border.gap) + np.asarray(border.gap_slope) @ found.correction
     try:
-        dy = np.linalg.solve(schur_complement(border, found.rates), -gap)
+        # D - C' K^-1 B: what the further equations see of the further unknowns
+        seen = np.asarray(border.gap_slope) @ found.rates.T + np.asarray(border.gap_rate)
+        dy = np.linalg.solve(seen, -gap)
     except np.linalg.LinAlgError:
         return None
     return found.correction + dy @ found.rates, dy
@@ -170,7 +159,7 @@ def _advance(at: At, prepared: Prepared, problem: Problem, u, y, du, dy):
     while True:
         new_u, new_y = u + fraction * du, y + fraction * dy
         new_problem, border = at(new_u, new_y)
-        state = linearise(new_problem, prepared, jnp.asarray(new_u), jnp.asarray(u))
+        state = linearise(new_problem, prepared, new_u, u)
         if fraction < 1.0 or rules.keeps_volume(float(state.volume_ratio)):
             return new_u, new_y, new_problem, border, state
         fraction = float(safe_fraction(problem, prepared, u, du))
@@ -237,7 +226,7 @@ def tangent_state(
     that of growing load; `None` where the tangent is singular."""
     problem = loading.at(factor)
     if linearised is None:
-        linearised = linearise(problem, prepared, jnp.asarray(u), jnp.asarray(u))
+        linearised = linearise(problem, prepared, u, u)
     border = _border(loading, factor, u, np.zeros(u.size), np.zeros(1))
     still = np.zeros(u.size)
     found = respond(problem, prepared, linearised, border, still)
@@ -287,5 +276,5 @@ def arc_step(
 def _inside(loading: Loading, prepared: Prepared, start: PathState, u: np.ndarray):
     """The guess, or the start where the guess would invert a cell."""
     problem = loading.at(start.factor)
-    state = linearise(problem, prepared, jnp.asarray(u), jnp.asarray(start.u))
+    state = linearise(problem, prepared, u, start.u)
     return u if rules.keeps_volume(float(state.volume_ratio)) else start.u

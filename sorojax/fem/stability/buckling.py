@@ -8,9 +8,8 @@ from jaxtyping import Array, Float
 from sorojax._types import real
 from sorojax.fem.equilibrium.linear import linearise, prepare
 from sorojax.fem.problem import Problem
-from sorojax.fem.stability import spectrum
 from sorojax.fem.stability.arc_length import Loading, tangent_state
-from sorojax.fem.stability.modal import check_state
+from sorojax.fem.stability.modal import check_state, lowest_of_pair, pencil_of
 
 
 class CriticalLoads(eqx.Module):
@@ -73,7 +72,7 @@ def critical_loads(
     state = tangent_state(loading, prepared, np.asarray(u), factor)
     here = loading.at(factor)
     values = linearise(here, prepared, u, u).values
-    pencil = spectrum.pencil(problem.space.system, values, np.asarray(prepared.known))
+    pencil = pencil_of(problem.space.system, values, np.asarray(prepared.known))
     if state is None or pencil.negative_eigenvalues != 0:
         raise ValueError(
             f"{where}: the state at factor {factor:g} is not stable, need a positive definite "
@@ -81,7 +80,7 @@ def critical_loads(
         )
     slope = _tangent_slope(loading, prepared, u, factor, state.rate)
     free = int(np.sum(~np.asarray(prepared.known)))
-    nu, vectors = spectrum.lowest_of_pair(pencil, slope, min(count, free))
+    nu, vectors = lowest_of_pair(pencil, slope, min(count, free))
     ahead = nu < -1e-12 * np.abs(nu).max()
     shapes = vectors[ahead].reshape(-1, *u.shape)
     shapes = shapes / np.abs(shapes).max(axis=(1, 2), keepdims=True)

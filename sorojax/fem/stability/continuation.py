@@ -13,7 +13,7 @@ from sorojax import _check
 from sorojax._display import displayed, number, outcome
 from sorojax._progress import report
 from sorojax.fem.equilibrium.linear import Prepared, prepare
-from sorojax.fem.equilibrium.load_stepping import LoadStep, Log, Stats, begin_at, follow
+from sorojax.fem.equilibrium.load_stepping import LoadStep, Log, Stats, at_rest, follow
 from sorojax.fem.equilibrium.newton import Newton
 from sorojax.fem.equilibrium.solve import Path
 from sorojax.fem.problem import Problem
@@ -48,7 +48,8 @@ def locate(
     changes = abs(counts[1] - counts[0]) if min(counts) >= 0 else 0
     points = []
     if turned:
-        points.append(_point("limit point", loading, prepared, (first, last), newton, _slope))
+        ends = first, last
+        points.append(_point("limit point", loading, prepared, ends, newton, lambda s: s.slope))
     if changes > turned:
         lower = min(counts)
 
@@ -60,10 +61,6 @@ def locate(
             _point("bifurcation", loading, prepared, (first, last), newton, stiffness)
         )
     return [point for point in points if point is not None]
-
-
-def _slope(state: PathState) -> float:
-    return state.slope
 
 
 def _point(
@@ -215,7 +212,7 @@ def continuation(
     _check.positive(where, "abs(step)", abs(step), "", "A tenth of the load is a good start.")
     if largest_step is not None:
         _check.positive(where, "largest_step", largest_step, "m", "Give a length.")
-    until = _full_load if until is None else until
+    until = (lambda u, factor: factor >= 1.0) if until is None else until
     newton = Newton() if newton is None else newton
     walk = _Walk(loading, prepare(problem), newton, largest_step, max_cuts)
     walk.begin(start, step)
@@ -232,10 +229,6 @@ def continuation(
         )
     report("continuation", 1, 1, factor=walk.states[-1].factor)
     return walk.result()
-
-
-def _full_load(u: np.ndarray, factor: float) -> bool:
-    return factor >= 1.0
 
 
 class _Walk:
@@ -267,7 +260,7 @@ class _Walk:
 
     def _begin_at_rest(self, step: float) -> None:
         log = Log(self.newton, 1, self.max_cuts)
-        u = follow(self.loading.rest, begin_at(self.loading.rest, None), log)
+        u = follow(self.loading.rest, at_rest(self.loading.rest), log)
         found = None if log.reason else tangent_state(self.loading, self.prepared, u, 0.0)
         if found is None:
             self.reason = log.reason or "the tangent is singular, or the load does nothing"

@@ -1,19 +1,22 @@
 """Small vibrations about an equilibrium, motion reduced to a few modes, and derivatives of
 eigenvalues and shapes in the numbers of a problem.
 
-Reference: Nelson, "Simplified calculation of eigenvector derivatives", AIAA Journal 14,
-1976.
+Extreme eigenvalues are those of Lanczos with the direct factor of the tangent.
+
+References:
+    Ericsson and Ruhe, "The spectral transformation Lanczos method for the numerical solution
+    of large sparse generalized symmetric eigenvalue problems", Mathematics of Computation 35,
+    1980.
+    Nelson, "Simplified calculation of eigenvector derivatives", AIAA Journal 14, 1976.
 """
 
-import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from sorojax._display import displayed, number
@@ -21,37 +24,134 @@ from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
 from sorojax.fem.dynamics.damping import mass_matrix
 from sorojax.fem.equilibrium.jit import known_mask, prepare_traced
+from sorojax.fem.equilibrium.lanes import moving_part
 from sorojax.fem.equilibrium.linear import linearise, prepare
 from sorojax.fem.problem import Problem
-from sorojax.fem.stability import spectrum
 from sorojax.fem.supports import known_dofs
 from sorojax.math.linalg import sparse
+
+_DENSE = 40  # below this many unknowns Lanczos has no room
+
+
+class Pencil(NamedTuple):
+    """A symmetric matrix and its factor, with the unknowns that are free."""
+
+    system: sparse.SparseSymmetric
+    values: Float[np.ndarray, " nnz"]
+    free: np.ndarray
+    factor: sparse.Factor
+    shift: float
+
+    @property
+    def negative_eigenvalues(self) -> int:
+        return self.factor.negative_eigenvalues
+
+
+def pencil_of(
+    system: sparse.SparseSymmetric,
+    values: Float[Array, " nnz"],
+    known: np.ndarray,
+    mass: Float[Array, " nnz"] | None = None,
+) -> Pencil:
+    """Factor K, or K - sigma M with a tiny sigma where K is singular to rounding."""
+    diagonal = np.asarray(system.rows == system.cols).astype(float)
+    metric = diagonal if mass is None else np.asarray(mass)
+    fixed = jnp.asarray(known)
+    host = np.asarray(values)
+    scale = np.abs(host * diagonal).max() / np.abs(metric * diagonal).max()
+    for shift in (0.0, -1e-12 * scale, -1e-9 * scale):
+        matrix = sparse.fix(system, jnp.asarray(host - shift * metric), fixed)
+        factor = system.solver.factor(np.asarray(matrix))
+        if factor is not None:
+            return Pencil(system, host, np.flatnonzero(~known), factor, shift)
+    raise ValueError(
+        "eigenvalues: the tangent is singular or not finite, need a state at which it can be "
+        "factored. Check the supports and the displacement."
+    )
+
+
+def free_matrix(pencil: Pencil, values: np.ndarray):
+    """Values in the pattern as a SciPy matrix over the free unknowns."""
+    import scipy.sparse as sp
+
+    system, size = pencil.system, pencil.system.size
+    at = np.asarray(system.rows), np.asarray(system.cols)
+    upper = sp.csr_matrix((np.asarray(values), at), (size, size))
+    return (upper + sp.triu(upper, 1).T).tocsr()[pencil.free][:, pencil.free]
+
+
+def lowest(
+    pencil: Pencil, count: int, mass: Float[Array, " nnz"] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The `count` lowest eigenvalues of K phi = mu M phi, rising, and vectors (count, dofs)
+    with phi' M phi = 1; M is the identity when omitted.
+
+    Shift and invert finds those nearest zero. The inertia of K says how many of them are
+    negative, so that none below is missed.
+    """
+    stiffness = free_matrix(pencil, pencil.values)
+    metric = None if mass is None else free_matrix(pencil, np.asarray(mass))
+    negative = max(0, pencil.negative_eigenvalues)
+    wanted = count + negative
+    while True:
+        values, vectors = _near_zero(pencil, stiffness, metric, wanted)
+        tolerance = abs(pencil.shift)
+        if np.sum(values < tolerance) >= negative or len(values) == len(pencil.free):
+            order = np.argsort(values)[:count]
+            return values[order], _embed(pencil, vectors[:, order])
+        wanted = 2 * wanted
+
+
+def _near_zero(pencil: Pencil, stiffness, metric, count: int):
+    options = {"sigma": pencil.shift, "OPinv": _inverse(pencil), "ncv": max(2 * count + 1, 20)}
+    return _few(stiffness, metric, count, lambda values: np.abs(values), **options)
+
+
+def lowest_of_pair(pencil: Pencil, other: np.ndarray, count: int):
+    """The `count` most negative eigenvalues of `other` phi = nu K phi for a positive
+    definite K, and their vectors (count, dofs)."""
+    stiffness, other = free_matrix(pencil, pencil.values), free_matrix(pencil, other)
+    options = {"Minv": _inverse(pencil), "which": "SA", "ncv": max(4 * count, 40)}
+    values, vectors = _few(other, stiffness, count, lambda values: values, **options)
+    order = np.argsort(values)
+    return values[order], _embed(pencil, vectors[:, order])
+
+
+def _few(matrix, metric, count: int, rank, ncv: int, **options):
+    """The first `count` eigenvalues by `rank` and their vectors, by Lanczos with `options`
+    where there is room for it."""
+    import scipy.linalg
+    import scipy.sparse.linalg as spla
+
+    size = matrix.shape[0]
+    if count >= size - 1 or size <= _DENSE:
+        metric = None if metric is None else metric.toarray()
+        values, vectors = scipy.linalg.eigh(matrix.toarray(), metric)
+        first = np.argsort(rank(values))[:count]
+        return values[first], vectors[:, first]
+    start = np.random.default_rng(0).standard_normal(size)
+    return spla.eigsh(matrix, k=count, M=metric, v0=start, ncv=min(size, ncv), **options)
+
+
+def _inverse(pencil: Pencil):
+    """(K - shift M)^-1 on the free unknowns."""
+    import scipy.sparse.linalg as spla
+
+    def solve(b: np.ndarray) -> np.ndarray:
+        return pencil.factor.solve(_embed(pencil, b.reshape(-1, 1))[0])[pencil.free]
+
+    return spla.LinearOperator((len(pencil.free),) * 2, matvec=solve, dtype=float)
+
+
+def _embed(pencil: Pencil, vectors: np.ndarray) -> np.ndarray:
+    full = np.zeros((vectors.shape[1], pencil.system.size))
+    full[:, pencil.free] = vectors.T
+    return full
+
 
 _APART = 1e-8  # of the larger eigenvalue: below that two modes are no functions by themselves
 
 Find = Callable[[Problem, Array], tuple[Array, Array]]
-
-
-class _Call:
-    """A search with all that is no number; compared by identity, so it may be a parameter."""
-
-    def __init__(self, where: str, find: Find, rest: Any, tree: Any, massive: bool):
-        self.where, self.find, self.rest = where, find, rest
-        self.tree, self.massive = tree, massive
-
-    def inputs(self, leaves) -> tuple[Problem, Array]:
-        return eqx.combine(jax.tree.unflatten(self.tree, leaves), self.rest)
-
-    def moving(self, leaves, dots) -> tuple[Any, Any, Any]:
-        """The numbers that move, all else, and how they move."""
-        moves = [not isinstance(dot, SymbolicZero) for dot in dots]
-
-        def pick(values, wanted):
-            kept = [x if m == wanted else None for x, m in zip(values, moves, strict=True)]
-            return jax.tree.unflatten(self.tree, kept)
-
-        rest = eqx.combine(pick(leaves, False), self.rest)
-        return pick(leaves, True), rest, pick(dots, True)
 
 
 def differentiable(
@@ -65,19 +165,32 @@ def differentiable(
     Raises:
         ValueError: Inside `jit` and `vmap`, where there are no numbers to search with.
     """
-    moving, rest = eqx.partition((problem, u), eqx.is_inexact_array)
-    leaves, tree = jax.tree.flatten(moving)
-    return _found(_Call(where, find, rest, tree, massive), leaves)
+    params, static = eqx.partition((problem, u), eqx.is_inexact_array)
 
+    @jax.custom_jvp
+    def found(params):
+        if is_traced(params):
+            raise ValueError(
+                f"{where}: called inside jit or vmap, need concrete numbers. Call it outside; "
+                "grad, jvp and jacfwd of it are fine."
+            )
+        return find(*eqx.combine(params, static))
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _found(call: _Call, leaves):
-    if is_traced(leaves):
-        raise ValueError(
-            f"{call.where}: called inside jit or vmap, need concrete numbers. Call it outside; "
-            "grad, jvp and jacfwd of it are fine."
-        )
-    return call.find(*call.inputs(leaves))
+    def derivative(primals, tangents):
+        (params,), (rates,) = primals, tangents
+        moving, held, dot = moving_part(params, rates)
+        rest = eqx.combine(held, static)
+        answer = found(params)
+
+        def matrices(moving):
+            return _matrices(moving, rest, massive)
+
+        (K, M), (dK, dM) = jax.jvp(matrices, (moving,), (dot,))
+        problem = eqx.combine(params, static)[0]
+        return answer, _rates(problem, _Pair(K, M, dK, dM), *answer)
+
+    found.defjvp(derivative, symbolic_zeros=True)
+    return found(params)
 
 
 class _Pair(NamedTuple):
@@ -89,28 +202,16 @@ class _Pair(NamedTuple):
     dM: Array
 
 
-def _derivative(call: _Call, primals, tangents):
-    (leaves,), (dots,) = primals, tangents
-    eigenvalues, shapes = _found(call, leaves)
-    problem, _ = call.inputs(leaves)
-    moving, rest, dot = call.moving(leaves, dots)
-
-    def matrices(moving):
-        return _matrices(moving, rest, call.massive)
-
-    (K, M), (dK, dM) = jax.jvp(matrices, (moving,), (dot,))
+def _rates(problem: Problem, pair: _Pair, eigenvalues, shapes) -> tuple[Array, Array]:
+    """How eigenvalues and shapes move."""
     known = known_mask(problem.supports, *shapes.shape[1:])
-    pair, moves = _Pair(K, M, dK, dM), []
-    for k in range(len(eigenvalues)):
-        shape = shapes[k].ravel()
-        moves.append(_moved(problem.space.system, pair, known, eigenvalues[k], shape))
+    moves = [
+        _moved(problem.space.system, pair, known, value, shape.ravel())
+        for value, shape in zip(eigenvalues, shapes, strict=True)
+    ]
     slopes, vectors = (jnp.stack(column) for column in zip(*moves, strict=True))
     alone = _alone(eigenvalues)
-    vectors = vectors.reshape(shapes.shape) * alone[:, None, None]
-    return (eigenvalues, shapes), (slopes * alone, vectors)
-
-
-_found.defjvp(_derivative, symbolic_zeros=True)
+    return slopes * alone, vectors.reshape(shapes.shape) * alone[:, None, None]
 
 
 @eqx.filter_jit
@@ -253,8 +354,8 @@ def _modes(where: str, problem: Problem, displacement, count: int, massive: bool
     def find(problem: Problem, u):
         mass = mass_matrix(problem) if massive else None
         values = linearise(problem, prepare(problem), u, u).values
-        pencil = spectrum.pencil(problem.space.system, values, known, mass)
-        eigenvalues, vectors = spectrum.lowest(pencil, count, mass)
+        pencil = pencil_of(problem.space.system, values, known, mass)
+        eigenvalues, vectors = lowest(pencil, count, mass)
         shapes = _signed(vectors.reshape(count, *u.shape))
         return jnp.asarray(eigenvalues), jnp.asarray(shapes)
 

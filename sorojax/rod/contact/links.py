@@ -1,37 +1,31 @@
 """Contact of rods with rigid links of any shape, and of links with fixed obstacles."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import real
 from sorojax.contact.broadphase import near
+from sorojax.contact.facet import surface
 from sorojax.contact.law import LinePenalty
 from sorojax.contact.swept import passes
 from sorojax.rod.contact.obstacle import (
     AbstractContact,
-    Linearised,
+    AbstractPairContact,
     Side,
-    StepSize,
     Touch,
     check_line,
-    coupling,
-    energy,
     line,
-    press,
     reach_of,
-    tangent,
     travel,
     twice_turn,
 )
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.moving import levers
 from sorojax.rod.dynamics.points import safe_norm, spin_cross
-from sorojax.rod.forces.loads import AbstractPairForce
 from sorojax.rod.model.link import LinkState
 from sorojax.sdf.base import AbstractSdf
 
@@ -87,8 +81,11 @@ class LinkPoints(eqx.Module):
         return self.position - self.motion.base.position[None]
 
 
-class LinkContact(AbstractPairForce):
+class LinkContact(AbstractPairContact):
     """Contact of a rod with a rigid link: `Between("finger", "box", LinkContact(...))`.
+
+    The stiffness has what friction gains with pressure, and is not symmetric: a grip needs it,
+    where pressure and friction hold each other.
 
     Attributes:
         shape: Of the link, in its frame.
@@ -97,6 +94,8 @@ class LinkContact(AbstractPairForce):
         points: Number of points along the rod. Take about one per half radius.
         caps: Which ends of the rod are half balls: "tip", "both" or "none".
     """
+
+    grips: ClassVar[bool] = True
 
     shape: AbstractSdf
     radius: Float[Array, "*points"] = eqx.field(converter=real)
@@ -107,19 +106,11 @@ class LinkContact(AbstractPairForce):
     def __check_init__(self):
         check_line(self, self.radius)
 
-    def __call__(self, t, first, second):
-        def forces():
-            return press(self.law, self.touch(first, second))
-
-        none = jnp.zeros_like(first.v), jnp.zeros_like(second.v)
-        return jax.lax.cond(self.is_near(first, second, 0.0), forces, lambda: none)
-
     @property
-    def narrowest(self) -> Float[Array, ""]:
+    def narrowest(self):
         return jnp.min(self.radius)
 
-    def is_near(self, first: Any, second: Any, h: StepSize) -> Bool[Array, ""]:
-        """Whether they may touch within a step of `h` [s]; `False` is certain."""
+    def is_near(self, first, second, h):
         _check_kinds(first, second)
         centre, reach = reach_of(first)
         local = (centre - second.base.position) @ second.base.directors
@@ -131,46 +122,24 @@ class LinkContact(AbstractPairForce):
         """The contacts, with the sides (rod, link)."""
         at, weights, radius = line(first, self.radius, self.points, self.caps)
         turn, place = second.base.directors, second.base.position
-        gap, normal = _field(self.shape, (at.position - place[None]) @ turn)
-        normal = normal @ turn.T
-        arm = -radius[:, None] * _unit(normal)
+        gap, slope, normal = surface(self.shape, (at.position - place[None]) @ turn)
+        arm = -radius[:, None] * (normal @ turn.T)
         there: Any = LinkPoints(second, at.position + arm)
-        sides = Side(at, arm, 1.0), Side(there, jnp.zeros_like(arm), -1.0)
-        return Touch(gap - radius, normal, weights, sides)
+        sides = Side(at, arm, 1.0), Side(there, jnp.zeros_like(arm), -1.0, 1)
+        return Touch(gap - radius, slope @ turn.T, weights, sides)
 
-    def passed(self, before: tuple, after: tuple) -> Bool[Array, ""]:
-        """Whether the rod went through the link from one pair of motions to another."""
+    def touches(self, first, second):
+        return (self.touch(first, second),)
+
+    def passed(self, before, after):
         radius = line(before[0], self.radius, self.points, self.caps)[2]
         ways = [self._inside(*bodies) for bodies in (before, after)]
         return jnp.any(passes(self.shape, *ways, radius))
-
-    def stored(self, first: Any, second: Any) -> Float[Array, ""]:
-        """Energy [J]."""
-        return energy(self.law, self.touch(first, second))
 
     def _inside(self, rod: Any, link: Any) -> Float[Array, "points dim"]:
         """Points of the rod in the frame of the link [m]."""
         at, _, _ = line(rod, self.radius, self.points, self.caps)
         return (at.position - link.base.position[None]) @ link.base.directors
-
-    def linearised(self, t: Float[Array, ""], first: RodState, second: LinkState) -> Linearised:
-        """Force, stiffness and damping over the columns of both, one after the other.
-
-        The stiffness has what friction gains with pressure, and is not symmetric: a grip
-        needs it, where pressure and friction hold each other.
-        """
-        zero = jnp.zeros(first.v.shape[0] + second.v.shape[0], first.v.dtype)
-        none = jnp.zeros((*zero.shape, *zero.shape), zero.dtype)
-
-        def full():
-            touch = self.touch(first, second)
-            stiffness, damping = tangent(self.law, touch)
-            stiffness = stiffness + coupling(self.law, touch)
-            force = jnp.concatenate(press(self.law, touch))
-            return Linearised(force, stiffness, none if damping is None else damping)
-
-        is_near = self.is_near(first, second, 0.0)
-        return jax.lax.cond(is_near, full, lambda: Linearised(zero, none, none))
 
 
 class LinkObstacle(AbstractContact):
@@ -213,20 +182,10 @@ class LinkObstacle(AbstractContact):
     def touch(self, motion):
         link: Any = motion
         there = self._places(link)
-        gap, normal = _field(self.obstacle, there)
+        gap, normal, _ = surface(self.obstacle, there)
         at: Any = LinkPoints(link, there)
         side = Side(at, jnp.zeros_like(there), 1.0)
         return Touch(gap, normal, self.lengths, (side,))
-
-
-def _field(shape: AbstractSdf, points: Array) -> tuple[Array, Array]:
-    """Distances [m] and their slopes."""
-    return jax.vmap(jax.value_and_grad(shape))(points)
-
-
-def _unit(normal: Float[Array, "points dim"]) -> Float[Array, "points dim"]:
-    size = safe_norm(normal)
-    return normal / jnp.where(size > 0, size, jnp.ones_like(size))[:, None]
 
 
 def _check_kinds(first: Any, second: Any) -> None:

@@ -3,7 +3,8 @@ contacts of rods share.
 """
 
 import abc
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,12 +15,14 @@ from jaxtyping import Array, Bool, Float
 from sorojax import _check
 from sorojax._types import real
 from sorojax.contact.broadphase import near
+from sorojax.contact.facet import surface
 from sorojax.contact.law import LinePenalty
 from sorojax.contact.swept import passes
 from sorojax.math.compiled import jit_public
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.points import Points, moment_of, points, safe_norm, spin_cross
 from sorojax.rod.forces.forces import AbstractForce
+from sorojax.rod.forces.loads import AbstractPairForce
 from sorojax.rod.model.link import LinkState
 from sorojax.sdf.base import AbstractSdf
 
@@ -71,11 +74,13 @@ class Side(NamedTuple):
         points: Centres of the sections that touch.
         arm: From the centres to the points of contact [m].
         sign: 1 for the body that the normal points into, -1 for the other.
+        body: Its number among the bodies that the contact is asked about.
     """
 
     points: Points
     arm: Float[Array, "points dim"]
     sign: float
+    body: int = 0
 
 
 class Touch(NamedTuple):
@@ -99,23 +104,24 @@ def energy(law: LinePenalty, touch: Touch) -> Float[Array, ""]:
     return touch.weights @ law.energy(touch.gap)
 
 
-def press(law: LinePenalty, touch: Touch) -> tuple[Float[Array, " dof"], ...]:
-    """Generalised force on each side."""
+def press(law: LinePenalty, touch: Touch) -> list[Float[Array, " dof"]]:
+    """Generalised force on each body."""
     pressure = law.pressure(touch.gap)
-    if law.friction is None and law.damping is None:
-        load = (touch.weights * pressure)[:, None] * touch.normal
-        return tuple(side.points.generalised(side.sign * load) for side in touch.sides)
-    velocity = _velocity(law, touch)
-    pressure = pressure * law.approach(jnp.sum(touch.normal * velocity, axis=1))
+    velocity = None
+    if law.friction is not None or law.damping is not None:
+        velocity = _velocity(law, touch)
+        pressure = pressure * law.approach(jnp.sum(touch.normal * velocity, axis=1))
     load = (touch.weights * pressure)[:, None] * touch.normal
-    if law.friction is None:
-        return tuple(side.points.generalised(side.sign * load) for side in touch.sides)
+    if law.friction is None or velocity is None:
+        return _by_body(touch, lambda side: side.points.generalised(side.sign * load))
     sliding, size = _sliding(touch, velocity)
     load = load - (touch.weights * law.drag(pressure * size, sliding))[:, None] * sliding
-    return tuple(
-        side.points.generalised(side.sign * load, side.sign * moment_of(side.arm, load))
-        for side in touch.sides
-    )
+
+    def force(side: Side):
+        moment = side.sign * moment_of(side.arm, load)
+        return side.points.generalised(side.sign * load, moment)
+
+    return _by_body(touch, force)
 
 
 def tangent(
@@ -123,10 +129,10 @@ def tangent(
 ) -> tuple[Float[Array, "dof dof"], Float[Array, "dof dof"] | None]:
     """Stiffness and damping of the contacts, for implicit steppers.
 
-    Both are symmetric and positive, over the columns of the sides one after the other:
+    Both are symmetric and positive, over the columns of the bodies one after the other:
     the turn of the normal and the change of friction with pressure are left out.
     """
-    normal_rows = _rows(touch, lambda side: side.points.linear_jacobian, touch.normal)
+    normal_rows = _normal_rows(touch)
     weights = touch.weights
     stiffness, force = law.slope(touch.gap), law.pressure(touch.gap)
     viscous = None
@@ -145,10 +151,10 @@ def tangent(
     return _square(normal_rows, weights * stiffness), viscous
 
 
-def coupling(law: LinePenalty, touch: Touch) -> Float[Array, "dof dof"] | float:
+def coupling(law: LinePenalty, touch: Touch) -> Float[Array, "dof dof"]:
     """Stiffness from friction that grows with pressure; not symmetric."""
     if law.friction is None:
-        return 0.0
+        return jnp.zeros((), touch.gap.dtype)
     velocity = _velocity(law, touch)
     sliding, size = _sliding(touch, velocity)
     approach = law.approach(jnp.sum(touch.normal * velocity, axis=1))
@@ -157,8 +163,7 @@ def coupling(law: LinePenalty, touch: Touch) -> Float[Array, "dof dof"] | float:
     drag = jax.jvp(lambda pressure: law.drag(pressure, sliding), (at,), (along,))[1]
     load = (touch.weights * drag)[:, None] * sliding
     across = jnp.sum(_surface_rows(touch) * load[:, :, None], axis=1)
-    along = _rows(touch, lambda side: side.points.linear_jacobian, touch.normal)
-    return -(across.T @ along)
+    return -(across.T @ _normal_rows(touch))
 
 
 def _friction_square(touch: Touch, normal_rows, size, drag) -> Array:
@@ -187,24 +192,38 @@ def _sliding(touch: Touch, velocity: Array) -> tuple[Array, Array]:
     return velocity - jnp.sum(unit * velocity, axis=1, keepdims=True) * unit, size
 
 
-def _rows(touch: Touch, jacobian, normal: Array) -> Float[Array, "points dof"]:
-    blocks = [
-        side.sign * jnp.sum(normal[:, :, None] * jacobian(side), axis=1) for side in touch.sides
-    ]
-    return jnp.concatenate(blocks, axis=1)
+def _by_body(touch: Touch, term: Callable[[Side], Array]) -> list[Array]:
+    """Sum of the terms of the sides of each body."""
+    bodies = range(1 + max(side.body for side in touch.sides))
+    return [total([term(side) for side in touch.sides if side.body == k]) for k in bodies]
+
+
+def total(terms: Sequence[Array]) -> Array:
+    return sum(terms[1:], start=terms[0])
+
+
+def _normal_rows(touch: Touch) -> Float[Array, "points dof"]:
+    """Slope of the gap per rate."""
+
+    def along(side: Side):
+        jacobian = side.points.linear_jacobian
+        return side.sign * jnp.sum(touch.normal[:, :, None] * jacobian, axis=1)
+
+    return jnp.concatenate(_by_body(touch, along), axis=1)
 
 
 def _surface_rows(touch: Touch) -> Float[Array, "points dim dof"]:
     """Velocity of the first surface against the second, per rate."""
-    blocks = []
-    for side in touch.sides:
+
+    def rows(side: Side):
         angular, arm = side.points.angular_jacobian, side.arm[:, :, None]
         if arm.shape[1] == 2:
             turn = jnp.concatenate([-arm[:, 1:], arm[:, :1]], axis=1) * angular
         else:
             turn = jnp.cross(angular, jnp.broadcast_to(arm, angular.shape), axis=1)
-        blocks.append(side.sign * (side.points.linear_jacobian + turn))
-    return jnp.concatenate(blocks, axis=2)
+        return side.sign * (side.points.linear_jacobian + turn)
+
+    return jnp.concatenate(_by_body(touch, rows), axis=2)
 
 
 def _square(rows: Float[Array, "*rows dof"], weights: Float[Array, "*rows"]) -> Array:
@@ -227,15 +246,13 @@ class Linearised(NamedTuple):
     damping: Float[Array, "dof dof"]
 
 
-class AbstractContact(AbstractForce):
-    """A contact: implicit steppers ask for its stiffness, which comes and goes.
-
-    Implement `is_near`, `touch`, `passed`, `law` and `narrowest`; a contact that is far costs
-    one test.
-    """
+class AbstractTouching(eqx.Module):
+    """What contacts of one body and of two share: forces, energy, and a stiffness that comes
+    and goes, for implicit steppers. A contact that is far costs one test."""
 
     if TYPE_CHECKING:  # fields that subclasses have, in their own order
         law: ClassVar[LinePenalty]
+    grips: ClassVar[bool] = False  # whether the stiffness has what friction gains by pressure
 
     @property
     @abc.abstractmethod
@@ -243,44 +260,75 @@ class AbstractContact(AbstractForce):
         """Least radius of what meets [m]."""
 
     @abc.abstractmethod
-    def is_near(self, motion: RodState, h: StepSize) -> Bool[Array, ""]:
-        """Whether anything may touch within a step of `h` [s]; `False` is certain."""
+    def is_near(self, *bodies_and_step: Any) -> Bool[Array, ""]:
+        """Whether anything may touch within a step of `h` [s], the last argument; `False` is
+        certain."""
+
+    @abc.abstractmethod
+    def touches(self, *bodies: Any) -> tuple[Touch, ...]:
+        """The contacts and the sides that take their force."""
+
+    @abc.abstractmethod
+    def passed(self, before: tuple, after: tuple) -> Bool[Array, ""]:
+        """Whether anything went through anything in a step from some motions to others."""
+
+    def stored(self, *bodies: Any) -> Float[Array, ""]:
+        """Energy [J]."""
+        return total([energy(self.law, touch) for touch in self.touches(*bodies)])
+
+    def forces(self, *bodies: Any) -> list[Float[Array, " dof"]]:
+        """Generalised force on each body."""
+
+        def acting():
+            return _on_bodies(self.law, self.touches(*bodies))
+
+        none = [jnp.zeros_like(body.v) for body in bodies]
+        return jax.lax.cond(self.is_near(*bodies, 0.0), acting, lambda: none)
+
+    def linearised(self, t: Float[Array, ""], *bodies: Any) -> Linearised:
+        """Force, stiffness and damping over the columns of the bodies, one after the other."""
+        zero = jnp.concatenate([jnp.zeros_like(body.v) for body in bodies])
+        none = jnp.zeros((*zero.shape, *zero.shape), zero.dtype)
+
+        def full():
+            touches = self.touches(*bodies)
+            found = [tangent(self.law, touch) for touch in touches]
+            stiffness = total([term for term, _ in found])
+            if self.grips:
+                stiffness += total([coupling(self.law, touch) for touch in touches])
+            viscous = [term for _, term in found if term is not None]
+            damping = total(viscous) if viscous else none
+            force = jnp.concatenate(_on_bodies(self.law, touches))
+            return Linearised(force, stiffness, damping)
+
+        near = self.is_near(*bodies, 0.0)
+        return jax.lax.cond(near, full, lambda: Linearised(zero, none, none))
+
+
+def _on_bodies(law: LinePenalty, touches: tuple[Touch, ...]) -> list[Float[Array, " dof"]]:
+    return [total(terms) for terms in zip(*(press(law, t) for t in touches), strict=True)]
+
+
+class AbstractContact(AbstractTouching, AbstractForce):
+    """A contact of one body: implement `is_near`, `touch`, `passed`, `law` and `narrowest`."""
 
     @abc.abstractmethod
     def touch(self, motion: RodState) -> Touch:
         """The contacts and the sides that take their force, all of one motion."""
 
-    @abc.abstractmethod
-    def passed(self, before: tuple[RodState], after: tuple[RodState]) -> Bool[Array, ""]:
-        """Whether anything went through anything in a step from one motion to another."""
-
-    def stored(self, motion: RodState) -> Float[Array, ""]:
-        """Energy [J]."""
-        return energy(self.law, self.touch(motion))
+    def touches(self, *bodies):
+        return (self.touch(*bodies),)
 
     def __call__(self, t, motion):
-        def force():
-            return sum_sides(press(self.law, self.touch(motion)))
+        return self.forces(motion)[0]
 
-        none = jnp.zeros_like(motion.v)
-        return jax.lax.cond(self.is_near(motion, 0.0), force, lambda: none)
 
-    def linearised(self, t: Float[Array, ""], motion: RodState) -> Linearised:
-        """The force with its stiffness and damping."""
-        zero = jnp.zeros_like(motion.v)
-        none = jnp.zeros((zero.shape[0],) * 2, zero.dtype)
+class AbstractPairContact(AbstractTouching, AbstractPairForce):
+    """A contact of two bodies: implement `is_near`, `touches`, `passed`, `law` and
+    `narrowest`."""
 
-        def full():
-            touch = self.touch(motion)
-            count = len(touch.sides)
-            stiffness, damping = tangent(self.law, touch)
-            damping = none if damping is None else _fold(damping, count)
-            force = sum_sides(press(self.law, touch))
-            return Linearised(force, _fold(stiffness, count), damping)
-
-        return jax.lax.cond(
-            self.is_near(motion, 0.0), full, lambda: Linearised(zero, none, none)
-        )
+    def __call__(self, t, first, second):
+        return tuple(self.forces(first, second))
 
 
 class ObstacleContact(AbstractContact):
@@ -317,10 +365,8 @@ class ObstacleContact(AbstractContact):
 
     def touch(self, motion):
         at, weights, radius = line(motion, self.radius, self.points, self.caps)
-        gap, slope = jax.vmap(jax.value_and_grad(self.obstacle))(at.position)
-        size = jnp.sqrt(jnp.sum(slope**2, axis=1, keepdims=True))
-        arm = -radius[:, None] * slope / jnp.where(size > 0, size, jnp.ones_like(size))
-        return Touch(gap - radius, slope, weights, (Side(at, arm, 1.0),))
+        gap, slope, normal = surface(self.obstacle, at.position)
+        return Touch(gap - radius, slope, weights, (Side(at, -radius[:, None] * normal, 1.0),))
 
     def passed(self, before, after):
         (start, _, radius), (end, _, _) = (
@@ -391,18 +437,3 @@ def reach_of(motion: RodState) -> tuple[Float[Array, " dim"], Float[Array, ""]]:
         square = jnp.max(jnp.sum(motion.tangent**2, axis=1))
         half = half * _REACH * jnp.sqrt(square)
     return points(motion, np.array([0.5])).position[0], half
-
-
-def sum_sides(forces: tuple[Array, ...]) -> Float[Array, " dof"]:
-    total = forces[0]
-    for force in forces[1:]:
-        total = total + force
-    return total
-
-
-def _fold(matrix: Array, count: int) -> Float[Array, "dof dof"]:
-    """Sum over the sides of a matrix in the columns of one side after the other."""
-    if count == 1:
-        return matrix
-    dof = matrix.shape[0] // count
-    return jnp.sum(matrix.reshape(count, dof, count, dof), axis=(0, 2))

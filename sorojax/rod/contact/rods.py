@@ -13,27 +13,22 @@ from jaxtyping import Array, Bool, Float
 from sorojax import _check
 from sorojax._types import real
 from sorojax.contact.law import LinePenalty
-from sorojax.contact.swept import crosses
+from sorojax.contact.swept import crosses, products
 from sorojax.math.quadrature import integration_rows, interpolation_rows
 from sorojax.rod.contact.obstacle import (
     AbstractContact,
-    Linearised,
+    AbstractPairContact,
     Side,
-    StepSize,
     Touch,
     check_line,
-    energy,
     is_now,
     line,
-    press,
     reach_of,
     stations,
-    tangent,
     travel,
 )
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.points import Points, curvature, safe_norm
-from sorojax.rod.forces.loads import AbstractPairForce
 from sorojax.rod.model.link import LinkState
 
 _NEWTON = 2
@@ -97,7 +92,7 @@ def closest(
     if motion.base is not None:
         place = place + motion.base.position[None]
     held = jax.lax.stop_gradient((place, slope, to))
-    square = _squares(held[2], held[0])
+    square = products(held[2], held[0], held[2], held[0])
     if allowed is not None:
         square = jnp.where(allowed, square, jnp.inf)
     s = jnp.argmin(square, axis=1).astype(dtype) / line.count
@@ -110,13 +105,6 @@ def closest(
     index, u = _cell(line.count, s)
     rows = _blend(_hermite(u), *tables, index, line.count)
     return Points(motion, motion.rod.length * rows)
-
-
-def _squares(to: Array, ends: Array) -> Float[Array, "points ends"]:
-    total = jnp.zeros((to.shape[0], ends.shape[0]), to.dtype)
-    for axis in range(to.shape[1]):
-        total = total + (to[:, None, axis] - ends[None, :, axis]) ** 2
-    return total
 
 
 def _improve(count: int, place: Array, slope: Array, to: Array, s: Array) -> Array:
@@ -230,14 +218,21 @@ class SelfContact(AbstractContact):
         return touch._replace(gap=jnp.where(exists, touch.gap, motion.rod.length))
 
 
-def meeting(first, second, radius: Array, other_radius: Array, weights: Array) -> Touch:
+def meeting(
+    first: Points,
+    second: Points,
+    radius: Array,
+    other_radius: Array,
+    weights: Array,
+    bodies: tuple[int, int] = (0, 0),
+) -> Touch:
     """Contacts between points and their closest points on another centre line."""
     away = first.position - second.position
     distance = safe_norm(away)
     unit = away / jnp.where(distance > 0, distance, jnp.ones_like(distance))[:, None]
     sides = (
-        Side(first, -radius[:, None] * unit, 1.0),
-        Side(second, other_radius * unit, -1.0),
+        Side(first, -radius[:, None] * unit, 1.0, bodies[0]),
+        Side(second, other_radius * unit, -1.0, bodies[1]),
     )
     return Touch(distance - radius - other_radius, unit, weights, sides)
 
@@ -245,7 +240,7 @@ def meeting(first, second, radius: Array, other_radius: Array, weights: Array) -
 # Contact between two rods of an assembly, or of a rod with one that is held
 
 
-class RodContact(AbstractPairForce):
+class RodContact(AbstractPairContact):
     """Contact between two rods: `Between("left", "right", RodContact(...))`.
 
     Points of each meet the closest point of the other, with half of the force each, so
@@ -269,57 +264,24 @@ class RodContact(AbstractPairForce):
         _check.shape("RodContact", "radii", self.radii, (2,), do)
         _check.positive("RodContact", "radii", self.radii, "m", do)
 
-    def __call__(self, t, first, second):
-        first, second = rod_of(first), rod_of(second)
-
-        def forces():
-            return _forces(self.law, *touches(self, first, second))
-
-        none = jnp.zeros_like(first.v), jnp.zeros_like(second.v)
-        return jax.lax.cond(self.is_near(first, second, 0.0), forces, lambda: none)
-
     @property
-    def narrowest(self) -> Float[Array, ""]:
+    def narrowest(self):
         return jnp.min(self.radii)
 
-    def is_near(
-        self, first: RodState | LinkState, second: RodState | LinkState, h: StepSize
-    ) -> Bool[Array, ""]:
-        """Whether the rods may touch within a step of `h` [s]; `False` is certain."""
+    def is_near(self, first, second, h):
         first, second = rod_of(first), rod_of(second)
         (a, reach_a), (b, reach_b) = reach_of(first), reach_of(second)
         reach = reach_a + reach_b + jnp.sum(self.radii)
         reach = reach + travel(first, h) + travel(second, h)
         return jnp.sum((a - b) ** 2) <= reach**2
 
-    def linearised(
-        self, t: Float[Array, ""], first: RodState | LinkState, second: RodState | LinkState
-    ) -> Linearised:
-        """Force, stiffness and damping over the columns of both, one after the other."""
+    def touches(self, first, second):
+        """Contacts of the points of the first rod, then of the second; each has the sides
+        (searching rod, searched rod)."""
         first, second = rod_of(first), rod_of(second)
-        split, total = first.v.shape[0], first.v.shape[0] + second.v.shape[0]
-        none = jnp.zeros((total, total), first.v.dtype)
+        return _search(self, 0, first, second), _search(self, 1, second, first)
 
-        def full():
-            stiffness = damping = none
-            one, two = touches(self, first, second)
-            for touch, shift in ((one, 0), (two, split)):
-                term, viscous = tangent(self.law, touch)
-                stiffness = stiffness + _swap(term, shift)
-                damping = damping if viscous is None else damping + _swap(viscous, shift)
-            forces = jnp.concatenate(_forces(self.law, one, two))
-            return Linearised(forces, stiffness, damping)
-
-        is_near = self.is_near(first, second, 0.0)
-        return jax.lax.cond(is_near, full, lambda: Linearised(none[0], none, none))
-
-    def stored(self, first: RodState | LinkState, second: RodState | LinkState) -> Array:
-        """Energy [J]."""
-        one, two = touches(self, rod_of(first), rod_of(second))
-        return energy(self.law, one) + energy(self.law, two)
-
-    def passed(self, before: tuple, after: tuple) -> Bool[Array, ""]:
-        """Whether the rods went through each other from one pair of motions to another."""
+    def passed(self, before, after):
         lines = (ends(motion, self.points) for motion in (*before, *after))
         first, second, first_after, second_after = lines
         return crosses(first, first_after, second, second_after, jnp.sum(self.radii))
@@ -351,7 +313,7 @@ class HeldRod(AbstractContact):
         return self.pair.passed((*before, self.held), (*after, self.held))
 
     def touch(self, motion):
-        one, two = touches(self.pair, motion, self.held)
+        one, two = self.pair.touches(motion, self.held)
         mine, its = one.sides[0], two.sides[1]
         at = Points(motion, jnp.concatenate([mine.points.rows, its.points.rows]))
         side = Side(at, jnp.concatenate([mine.arm, its.arm]), 1.0)
@@ -363,16 +325,10 @@ class HeldRod(AbstractContact):
 _FIELDS = ("gap", "weights")
 
 
-def touches(pair: RodContact, first: RodState, second: RodState) -> tuple[Touch, Touch]:
-    """Contacts of the points of the first rod, then of the second; each has the sides
-    (searching rod, searched rod)."""
-    return _search(pair, 0, first, second), _search(pair, 1, second, first)
-
-
 def _search(pair: RodContact, index: int, mine: RodState, other: RodState) -> Touch:
     at, weights, radius = line(mine, pair.radii[index], pair.points, pair.caps)
     found = closest(other, curve(other, pair.points), at.position)
-    return meeting(at, found, radius, pair.radii[1 - index], weights / 2)
+    return meeting(at, found, radius, pair.radii[1 - index], weights / 2, (index, 1 - index))
 
 
 def rod_of(body: RodState | LinkState) -> RodState:
@@ -383,15 +339,3 @@ def rod_of(body: RodState | LinkState) -> RodState:
             "a link that does not move as an obstacle: On(name, ObstacleContact(...))."
         )
     return body
-
-
-def _forces(law: LinePenalty, one: Touch, two: Touch) -> tuple[Array, Array]:
-    """Generalised force on the first and on the second rod."""
-    on_first, on_second = press(law, one)
-    again_second, again_first = press(law, two)
-    return on_first + again_first, on_second + again_second
-
-
-def _swap(matrix: Array, shift: int) -> Array:
-    """Columns of the searching rod last where it is the second one."""
-    return jnp.roll(matrix, (shift, shift), (0, 1)) if shift else matrix

@@ -22,11 +22,11 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from sorojax import fem
-from sorojax.fem.dynamics.step import Dynamics, State, TimeStep, with_terms
+from sorojax.fem.dynamics.step import Dynamics, State, TimeStep
 from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import Linearised, Prepared, linearise
 from sorojax.fem.equilibrium.newton import safe_fraction
-from sorojax.fem.problem import load_force, residual
+from sorojax.fem.problem import load_force, residual, with_terms
 from sorojax.fem.supports import known_values
 from sorojax.math.linalg import sparse
 from sorojax.math.ode.step_control import filled
@@ -202,7 +202,7 @@ def _judged(equations, newton, given, stages, unravel, now: _Pass, problems, fou
         small = _small(newton, stages, unravel, problems, found, now.u, values, gap)
         settled = ~jnp.any(jnp.stack([jnp.any(move != 0) for move in moves.values()]))
         converged = fine & rules.converged(small, now.update, settled, newton)
-        stop = converged | ~fine | rules.exhausted(now.iterations, newton)
+        stop = converged | ~fine | (now.iterations >= newton.max_iterations)
 
         def step():
             return _solved(

@@ -194,13 +194,11 @@ def _pushes(model, q, part: str, contact):
 
 @eqx.filter_jit
 def _meets(model, q, pair):
-    from sorojax.rod.contact.rods import touches
-
     moment = R.motion(model, q)
     first, second = (
         R.part_motion(moment, model.names.index(k)) for k in (pair.first, pair.second)
     )
-    return [_normal_force(t, pair.force.law) for t in touches(pair.force, first, second)]
+    return [_normal_force(t, pair.force.law) for t in pair.force.touches(first, second)]
 
 
 def _normal_force(touch, law):
