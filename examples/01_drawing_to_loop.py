@@ -53,7 +53,7 @@ def main(quick: bool = False) -> dict[str, float]:
     )
     film = sj.systems.simulate(loop, 2.0)
     return {
-        "stiffness misfit": fit.stiffness_error,
+        "stiffness misfit": float(fit.stiffness_error),
         "angle at the end [deg]": float(film["body.tip_angle"][-1] / deg),
         "pressure at the end [kPa]": float(film["air.pressure"][-1] / kPa),
     }

@@ -65,7 +65,7 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
         "turn of the tip [deg]": float(turn / deg),
         "modes off orthonormal": float(np.abs(gram - np.eye(3)).max()),
         "waves of the first mode along the chambers": int(np.abs(np.fft.rfft(waves)).argmax()),
-        "curvature that three modes hold": held["kappa_z"],
+        "curvature that three modes hold": float(held["kappa_z"]),
         "mean distance of the backbones, worst [mm]": float(off),
         "overlap with the cylinder [mm]": overlap(problem, last, "cylinder"),
         "overlap of the walls [mm]": overlap(problem, last, "walls"),

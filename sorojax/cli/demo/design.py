@@ -136,7 +136,7 @@ class Reduced(NamedTuple):
 
     backbone: Backbone
     basis: rod.StrainBasis
-    captured: dict[str, float]
+    captured: dict[str, Float[Array, ""]]
     fit: Fit
     rod: rod.Rod
     forces: tuple

@@ -77,10 +77,10 @@ def numbers(r: Results) -> dict[str, list[view.Number]]:
               for name in r.slope.gradient if name != "wall_thickness"),
         ],
         "rod": [
-            N("captured squared curvature", r.reduced.captured["kappa_z"]),
+            N("captured squared curvature", float(r.reduced.captured["kappa_z"])),
             N("largest mean backbone error", gap / mm, "mm", "< 1 mm", gap < 1 * mm),
-            N("misfit of condensed stiffness", r.reduced.fit.stiffness_error),
-            N("misfit of volume change", r.reduced.fit.volume_error),
+            N("misfit of condensed stiffness", float(r.reduced.fit.stiffness_error)),
+            N("misfit of volume change", float(r.reduced.fit.volume_error)),
         ],
         "loop": [
             N("duration", float(r.film.time[-1]), "s"),
