@@ -160,7 +160,8 @@ def locate(
     if cells is None:
         cells = jnp.asarray(cells_at(mesh, points))
     nodes = mesh.cells[cells]
-    return Locations(nodes, _weights(mesh.points[nodes], real(points), mesh.element), cells)
+    points = real(points).astype(mesh.points.dtype)
+    return Locations(nodes, _weights(mesh.points[nodes], points, mesh.element), cells)
 
 
 def cells_at(mesh: Mesh, points) -> Int[np.ndarray, " points"]:

@@ -327,17 +327,24 @@ def condensed_stiffness(
     return jnp.stack(found)
 
 
-@eqx.filter_jit
 def _condensed_stiffness(
     problem: Problem, u: Array, at: Probe, basis: StrainBasis
 ) -> Float[Array, "dof dof"]:
     """Stiffness against generalised forces on q at an equilibrium: (H K^-1 H')^-1."""
+    H = _slopes(at, basis, u)
+    return _inverse(H, tangent_solve(problem, u, H))
 
-    def coordinates(u):
-        return project(at.strain(u), at.s, basis)
 
-    H = jax.jacrev(coordinates)(u).reshape(basis.num_dof, -1)
-    compliance = H @ tangent_solve(problem, u, H).T
+@eqx.filter_jit
+def _slopes(at: Probe, basis: StrainBasis, u) -> Float[Array, "dof dofs"]:
+    """H = dq/du of the coordinates."""
+    slopes = jax.jacrev(lambda u: project(at.strain(u), at.s, basis))(u)
+    return slopes.reshape(basis.num_dof, -1)
+
+
+@jax.jit
+def _inverse(H, answers) -> Float[Array, "dof dof"]:
+    compliance = H @ answers.T
     return jnp.linalg.inv((compliance + compliance.T) / 2)
 
 

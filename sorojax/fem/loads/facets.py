@@ -100,7 +100,8 @@ def cavity_volume(
 def areas_of(problem: "Problem", facets: Facets) -> Float[Array, "facets quad"]:
     """Reference areas of the quadrature points of facets [m^2]."""
     tables, kinematics = facet_tables(problem.mesh.element), problem.kinematics
-    weights, values = jnp.asarray(tables.weights), jnp.asarray(tables.values)
+    dtype = problem.mesh.points.dtype
+    weights, values = jnp.asarray(tables.weights, dtype), jnp.asarray(tables.values, dtype)
 
     def one(X):
         size = jnp.sqrt(jnp.sum(normals(tables, X) ** 2, axis=1))
@@ -113,7 +114,7 @@ def facet_integral(
     problem: "Problem", facets: Facets, nodal: Float[Array, "nodes dim"]
 ) -> Float[Array, " dim"]:
     """Integral of a nodal field over the reference area of facets."""
-    values = jnp.asarray(facet_tables(problem.mesh.element).values)
+    values = jnp.asarray(facet_tables(problem.mesh.element).values, nodal.dtype)
     return jnp.einsum("fq,qa,fai->i", areas_of(problem, facets), values, nodal[facets])
 
 
