@@ -67,17 +67,23 @@ class _Tangent:
         self.system, self.matrix, self.known = system, matrix, known
         self.inputs = self.outputs = (jax.ShapeDtypeStruct(shape, matrix.dtype),)
 
-    def push(self, rows):
+    def push(self, *rates):
+        (rows,) = rates
         free = jnp.where(self.known[None], jnp.zeros_like(rows), rows)
         solve = jax.vmap(lambda b: sparse.solve(self.system, self.matrix, b))
         return (jnp.where(self.known[None], jnp.zeros_like(rows), solve(free)),)
 
-    def push_now(self, rows):
+    def push_now(self, *rates):
+        (rows,) = rates
         free = np.where(self.known, 0.0, rows)
         found = self.system.solver.solve(np.asarray(self.matrix), free)
         return (jnp.asarray(np.where(self.known, 0.0, found)),)
 
-    pull, pull_now = push, push_now
+    def pull(self, *changes):
+        return self.push(*changes)
+
+    def pull_now(self, *changes):
+        return self.push_now(*changes)
 
     def solved(self, rows):
         """The image of rows without a derivative."""
