@@ -69,6 +69,16 @@ def _only(**terms):
     return problem
 
 
+def test_the_ends_of_springs_are_integers_of_any_length():
+    left, right = (np.asarray(BEAM.node_sets[side]) for side in ("left", "right"))
+    found = []
+    for kind in (np.int32, np.int64):
+        pairs = fem.Spring(right, left[: len(right)].astype(kind), 50.0, 5 * mm)
+        problem = _problem(pairs)
+        found.append(np.asarray(fem.solve(problem).displacement))
+    assert np.array_equal(*found) and np.abs(found[0]).max() > 0
+
+
 def _load(problem, name):
     return next(load for load in problem.loads if load.name == name)
 

@@ -16,22 +16,11 @@ from jax.flatten_util import ravel_pytree
 
 from benchmarks.harness import Row, measure_calls, quick
 from sorojax import SE2, fem, material, mesh, reduction, robots, rod, systems
-from sorojax.units import kPa, ml, mm
+from sorojax.cli.demo.design import bellows_problem, loop_of
+from sorojax.units import kPa, mm
 
 STEP = 1e-4  # of each number
 WORST = 1e-4
-STIFFER = 10.0  # how much stiffer the strain-limiting layer is
-WIRES = {
-    "pid.reference": "target.value",
-    "pid.measurement": "body.tip_angle",
-    "valve.setpoint": "pid.command",
-    "valve.pressure": "air.pressure",
-    "air.mass_flow": "valve.mass_flow",
-    "air.volume": "body.volume",
-    "air.volume_rate": "body.volume_rate",
-    "air.compliance": "body.compliance",
-    "body.pressure": "air.pressure",
-}
 
 
 def rows():
@@ -61,30 +50,23 @@ def loop(size: float, duration: float):
     """The numbers, the cost as a function of them, and how many cells the mesh has."""
     first = robots.BellowsActuator()
     flat = mesh.triangulate(first.body(), size=size, order=2, interfaces=(first.layer(),))
-    stiff = np.ones(flat.num_cells)
-    layer = first.layer()
-    stiff[mesh.cells_where(flat, lambda p: layer(p) < 0)] = STIFFER
     rubber = material.presets.dragon_skin_30()
-    start = robots.bellows_problem(
-        first, flat, material.Scaled(rubber, stiff), depth=20 * mm,
-        formulation=fem.Displacement(),
-    )  # fmt: skip
+    start = bellows_problem(first, flat, rubber, 20 * mm, fem.Displacement())
     near: list[reduction.Backbone] = []
 
     def reduced(actuator, law):
         """The rod, its identified laws, from the drawing and the rubber."""
         moved = mesh.move(flat, actuator.body(), interfaces=(actuator.layer(),))
         problem = eqx.tree_at(
-            lambda p: (p.mesh.points, p.material),
-            start,
-            (moved.points, material.Scaled(law, stiff)),
+            lambda p: (p.mesh.points, p.material.base), start, (moved.points, law)
         )
         path = fem.solve_path(problem, air=jnp.linspace(0, 12 * kPa, 11))
         middle = actuator.layer_thickness / 2
         ends = (jnp.stack([x, middle]) for x in (0 * middle, actuator.length))
         line = reduction.Line(*ends)
         backbone = reduction.strain_along(path, line, near=near[0] if near else None)
-        near.append(jax.lax.stop_gradient(backbone))
+        if not near:
+            near.append(jax.lax.stop_gradient(backbone))
         basis = reduction.pod_basis(backbone, modes={"kappa_z": 3})
         fit = reduction.identify(path, basis, backbone, line)
         made = rod.rod(SE2(), basis, fit.section, rod.elastic(law), length=fit.length)
@@ -93,22 +75,9 @@ def loop(size: float, duration: float):
     def cost(actuator, law, valve, pid):
         made, fit = reduced(actuator, law)
         target = systems.SmoothRamp([0.0, 0.4 * duration], [0.0, -0.4])
-        film = systems.simulate(
-            systems.Network(
-                {
-                    "target": systems.Source(target, unit="rad"),
-                    "pid": pid,
-                    "valve": valve,
-                    "air": systems.Reservoir(dead_volume=2 * ml),
-                    "body": systems.RodBody(
-                        made, (fit.elastic, fit.pressure, fit.damping(0.02))
-                    ),
-                },
-                WIRES,
-            ),
-            duration,
-            save=101,
-        )
+        body = systems.RodBody(made, (fit.elastic, fit.pressure, fit.damping(0.02)))
+        network = loop_of(systems.Source(target, unit="rad"), pid, valve, body)
+        film = systems.simulate(network, duration, save=101)
         return jnp.mean((film["body.tip_angle"] - film["target.value"]) ** 2)
 
     valve = systems.Regulator(1.5e-8, integral_gain=3e-8, max_flow=3e-5)

@@ -159,9 +159,14 @@ def locate(
         raise ValueError("locate: got polygons, need triangles, quadrilaterals or solid cells.")
     if cells is None:
         cells = jnp.asarray(cells_at(mesh, points))
-    nodes = mesh.cells[cells]
-    points = real(points).astype(mesh.points.dtype)
-    return Locations(nodes, _weights(mesh.points[nodes], points, mesh.element), cells)
+    nodes, points = mesh.cells[cells], real(points).astype(mesh.points.dtype)
+    corners = mesh.points[nodes]
+    if is_traced((corners, points)):
+        return Locations(nodes, _weights(corners, points, mesh.element), cells)
+    # without a program to compile
+    xi = _reference_coordinates(mesh, np.asarray(corners)[:, None], np.asarray(points))[:, 0]
+    weights = shape_functions(mesh.element, xi)
+    return Locations(nodes, jnp.asarray(weights, points.dtype), cells)
 
 
 def cells_at(mesh: Mesh, points) -> Int[np.ndarray, " points"]:

@@ -192,6 +192,11 @@ def _leading_directions_jvp(count, primals, tangents):
 
 def captured_energy(backbone: Backbone, basis: StrainBasis) -> dict[str, Float[Array, ""]]:
     """Share of the snapshots' squared strain that the basis holds, per strain."""
+    return _shares(backbone, basis)
+
+
+@eqx.filter_jit
+def _shares(backbone: Backbone, basis: StrainBasis) -> dict[str, Float[Array, ""]]:
     shares, q, w = {}, coordinates(backbone, basis), weights(backbone.s)
     for name in basis.active:
         held = q[:, columns(basis, name)] @ basis.modes[name](backbone.s).T

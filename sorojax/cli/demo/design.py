@@ -208,13 +208,24 @@ def closed_loop(reduced: Reduced, path: Path, duration: float) -> systems.Networ
     full = float(_tip_angle(reduced, -1))
     reference = systems.Source(reference_angle(full, duration), unit="rad")
     pid = controller(full, float(path.values[-1]))
+    valve = systems.Regulator(1.5e-8, integral_gain=3e-8, max_flow=3e-5)
+    return loop_of(reference, pid, valve, systems.RodBody(reduced.rod, reduced.forces))
+
+
+def loop_of(
+    target: systems.Source,
+    pid: systems.PID,
+    valve: systems.Regulator,
+    body: systems.RodBody,
+) -> systems.Network:
+    """The angle of the tip of `body` follows `target`, by air through `valve`."""
     return systems.Network(
         blocks={
-            "target": reference,
+            "target": target,
             "pid": pid,
-            "valve": systems.Regulator(1.5e-8, integral_gain=3e-8, max_flow=3e-5),
+            "valve": valve,
             "air": systems.Reservoir(dead_volume=2 * ml),
-            "body": systems.RodBody(reduced.rod, reduced.forces),
+            "body": body,
         },
         wires={
             "pid.reference": "target.value",

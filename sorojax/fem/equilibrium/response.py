@@ -30,6 +30,8 @@ def tangent_solve(
         matrix, known = _tangent(fixed, held)
         tangent = _Tangent(fixed.space.system, matrix, known, forces.shape)
         found = tangent.solved(right)
+    if not is_traced((problem, u, forces)):
+        return found
     if is_traced((fixed, held)):
         return found + tangent.push(forces - _products(problem, u, found))[0]
     return found + pushed((forces - _products(problem, u, found),), tangent)[0]
