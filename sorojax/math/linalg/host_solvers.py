@@ -229,13 +229,11 @@ class BandedFactor:
         self._lower, self._order = lower, order
 
     def solve(self, b: np.ndarray) -> np.ndarray:
-        from scipy.linalg import get_lapack_funcs
-
-        rows = np.atleast_2d(b)[:, self._order]
-        found = get_lapack_funcs("pbtrs", (self._lower,))(self._lower.T, rows.T, lower=1)[0]
-        x = np.empty_like(rows, np.float64)
-        x[:, self._order] = found.T
-        return x.reshape(b.shape)
+        found = np.ascontiguousarray(b[..., self._order], np.float64)
+        _solve(self._lower, found)
+        x = np.empty_like(found)
+        x[..., self._order] = found
+        return x
 
 
 class Banded:
@@ -314,9 +312,45 @@ def _followed(starts, neighbours, ends: np.ndarray):
 
 def _factor(lower: Float[np.ndarray, "size band"]) -> bool:
     """L in the place of A, diagonal by diagonal of each row; whether A is positive definite."""
-    from scipy.linalg import get_lapack_funcs
+    size, width = lower.shape
+    if (mkl := library()) is None:
+        from scipy.linalg import get_lapack_funcs
 
-    found, info = get_lapack_funcs("pbtrf", (lower,))(lower.T, lower=1, overwrite_ab=1)
-    if not np.shares_memory(found, lower):
-        lower[:] = found.T
-    return info == 0
+        dpbtrf = get_lapack_funcs("pbtrf", (lower,))
+        found, info = dpbtrf(lower.T, lower=1, overwrite_ab=1)
+        if not np.shares_memory(found, lower):
+            lower[:] = found.T
+        return info == 0
+    info = ctypes.c_int(0)
+    mkl.dpbtrf(
+        b"L",
+        _number(size),
+        _number(width - 1),
+        _pointer(lower),
+        _number(width),
+        ctypes.byref(info),
+    )
+    return info.value == 0
+
+
+def _solve(lower: Float[np.ndarray, "size band"], b: np.ndarray) -> None:
+    """x of L L' x = b in the place of b, for any leading axes."""
+    size, width = lower.shape
+    rows = b.reshape(-1, size)
+    if (mkl := library()) is None:
+        from scipy.linalg import get_lapack_funcs
+
+        dpbtrs = get_lapack_funcs("pbtrs", (lower,))
+        rows[:] = dpbtrs(lower.T, rows.T, lower=1)[0].T
+        return
+    mkl.dpbtrs(
+        b"L",
+        _number(size),
+        _number(width - 1),
+        _number(len(rows)),
+        _pointer(lower),
+        _number(width),
+        _pointer(rows),
+        _number(size),
+        ctypes.byref(ctypes.c_int(0)),
+    )
