@@ -61,7 +61,12 @@ class HostInertia:
     """
 
     def __init__(self, system: sparse.SparseSymmetric, mass: Values, damping: Values | None):
-        self._product, self._mass, self._damping = system.solver.product, mass, damping
+        self._mass = _BothTriangles(system)
+        self._matrix, self._damping = self._mass.another(), self._mass.another()
+        self._mass.fill(mass)
+        self._damped = damping is not None
+        if damping is not None:
+            self._damping.fill(damping)
         self.origin = self.values = self._pull = self._drag = np.zeros(0)
         self._rates, self.share = (0.0, 0.0), 1.0
 
@@ -70,29 +75,58 @@ class HostInertia:
         lead, drive, self.origin = (np.asarray(x) for x in (of.lead, of.drive, of.origin))
         rates, self.share = (float(of.mass_rate), float(of.rate)), float(of.share)
         if of.damping is not None:
-            self._damping = np.asarray(of.damping)
+            self._damped = True
+            self._damping.fill(np.asarray(of.damping))
         if rates != self._rates or of.damping is not None:
             self._rates = rates
             with np.errstate(invalid="ignore"):  # a step cut to nothing fails for its matrix
-                self.values = rates[0] * self._mass
-                if self._damping is not None:
-                    self.values = self.values + rates[1] * self._damping
-        self._pull = self._product(self._mass, drive.ravel())
-        if self._damping is not None:
-            self._drag = self._product(self._damping, lead.ravel())
+                self.values = rates[0] * self._mass.values
+                if self._damped:
+                    self.values = self.values + rates[1] * self._damping.values
+            self._matrix.fill(self.values)
+        self._pull = self._mass @ drive.ravel()
+        if self._damped:
+            self._drag = self._damping @ lead.ravel()
             self._pull -= self._drag
 
     def force(self, u: Float[np.ndarray, "nodes dim"]) -> Vector:
         """On the body at displacement `u` [N]."""
-        return self._pull - self._product(self.values, (u - self.origin).ravel())
+        return self._pull - self._matrix @ (u - self.origin).ravel()
 
     def taken(self, u: Float[np.ndarray, "nodes dim"]) -> float:
         """Energy that damping dissipates in a step whose forces act at `u` [J]."""
-        if self._damping is None:
+        if not self._damped:
             return 0.0
         moved = (u - self.origin).ravel()
-        drag = self._rates[1] * self._product(self._damping, moved) + self._drag
+        drag = self._rates[1] * (self._damping @ moved) + self._drag
         return float(drag @ moved) / self.share
+
+
+class _BothTriangles:
+    """A symmetric matrix in the pattern of `system` with both its triangles."""
+
+    def __init__(self, system: sparse.SparseSymmetric):
+        from scipy.sparse import csr_array
+
+        rows, cols = np.asarray(system.rows), np.asarray(system.cols)
+        off = np.flatnonzero(rows != cols)
+        number = np.concatenate([np.arange(len(rows)), off])
+        at = np.concatenate([rows, cols[off]]), np.concatenate([cols, rows[off]])
+        order = csr_array((number + 1.0, at), (system.size, system.size))
+        self._number = (order.data - 1).astype(np.int64)
+        self._csr, self.values = order, np.zeros(0)
+
+    def another(self) -> "_BothTriangles":
+        """One more matrix of the same pattern."""
+        made = object.__new__(_BothTriangles)
+        made._number, made._csr, made.values = self._number, self._csr.copy(), np.zeros(0)
+        return made
+
+    def fill(self, values: Values) -> None:
+        self.values, self._csr.data = values, values[self._number]
+
+    def __matmul__(self, x: Vector) -> Vector:
+        return self._csr @ x
 
 
 # Lists of near facets that follow a motion, on the host
