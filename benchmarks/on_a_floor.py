@@ -12,10 +12,11 @@ import numpy as np
 from benchmarks import peers
 from benchmarks.harness import Row, Timing
 from sorojax import fem
+from sorojax.contact import Coulomb
 from sorojax.fem.loads.facets import areas_of
 
 BAR = 0.2  # share of felupe's time that ours may take
-LAW = ("stiffness", "smoothing", "friction", "friction_velocity")
+LAW = ("stiffness", "smoothing", "friction_velocity")
 
 
 def timed(go, *arguments, **options) -> tuple[Timing, Any]:
@@ -50,7 +51,9 @@ def against_felupe(
         return float(np.abs(answer["displacement"][-1] - end).max() / np.abs(end).max())
 
     arrays, law, found = _arrays(problem, damping, steps, step, gait), problem.loads[-1], []
-    assert isinstance(law, fem.Contact)
+    assert isinstance(law, fem.Contact) and isinstance(law.friction, Coulomb)
+    numbers = {"friction": float(law.friction.coefficient)}
+    numbers |= {name: float(getattr(law, name)) for name in LAW}
     for solver in ("superlu", "pardiso"):
         found.append(
             peers.row(
@@ -65,7 +68,7 @@ def against_felupe(
                 tolerance=1e-6,
                 max_iterations=60,
                 solver=solver,
-                **{name: float(getattr(law, name)) for name in LAW},
+                **numbers,
             )
         )
         start = time.process_time()
