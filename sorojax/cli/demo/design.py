@@ -217,10 +217,16 @@ def loop_of(
     pid: systems.PID,
     valve: systems.Regulator,
     body: systems.RodBody,
+    sensor: systems.Function | None = None,
 ) -> systems.Network:
-    """The angle of the tip of `body` follows `target`, by air through `valve`."""
+    """The angle of the tip of `body` follows `target`, by air through `valve`; with a `sensor`
+    what that makes of the tip's position."""
+    seen = {"pid.measurement": "body.tip_angle"}
+    if sensor is not None:
+        seen = {"sensor.a": "body.tip_position", "pid.measurement": "sensor.value"}
     return systems.Network(
-        blocks={
+        blocks=({} if sensor is None else {"sensor": sensor})
+        | {
             "target": target,
             "pid": pid,
             "valve": valve,
@@ -229,7 +235,7 @@ def loop_of(
         },
         wires={
             "pid.reference": "target.value",
-            "pid.measurement": "body.tip_angle",
+            **seen,
             "valve.setpoint": "pid.command",
             "valve.pressure": "air.pressure",
             "air.mass_flow": "valve.mass_flow",
