@@ -159,7 +159,7 @@ def finger(
     solid = mesh.tetrahedralise(first.solid() - first.chamber(), size=size, order=order)
     found = mesh.chambers(solid)
     (chamber,) = found.volumes
-    rubber = robots.printed_rubber()
+    rubber = material.presets.dragon_skin_30()
     start = fem.problem(
         solid,
         rubber,
@@ -199,7 +199,7 @@ def finger(
 
 
 FINGER_PRESSURE = 40 * kPa
-FINGER_TIP = -1 * mm
+FINGER_TIP = -0.6 * mm
 
 
 def _across(position):

@@ -201,30 +201,30 @@ def test_without_the_rule_of_one_part_the_slopes_are_wrong(
 
 
 def test_designs_in_one_batch_end_as_one_by_one(start, first):
-    """The second is tangled: its wall is thicker than half the tube."""
-    heights = jnp.array([[12.0, 3.0], [12.0, 7.0], [12.1, 3.0]]) * mm
+    """The second is tangled: its walls nearly close the chamber."""
+    designs = jnp.array([[12.0, 3.0], [12.0, 3.8], [12.1, 3.0]]) * mm
 
     def at(dimensions):
         run = chain(start, dimensions, near=first)
         return run["body.tip_angle"][-1], run.parts, run.status
 
-    angles, parts, status = jax.vmap(at)(heights)
-    one = chain(start, heights[2], near=first)
+    angles, parts, status = jax.vmap(at)(designs)
+    one = chain(start, designs[2], near=first)
     np.testing.assert_allclose(angles[2], one["body.tip_angle"][-1], rtol=1e-8)
     np.testing.assert_allclose(angles[0], first["body.tip_angle"][-1], rtol=1e-8)
-    assert [str(Status[status[k]])[:6] for k in (0, 2)] == ["", ""]
-    assert bool(parts.mesh[1] == Status.tangled) and bool(status[1] == Status.tangled)
+    np.testing.assert_array_equal(status == Status.successful, [True, False, True])
+    np.testing.assert_array_equal(parts.mesh == Status.tangled, [False, True, False])
 
 
 def test_a_design_that_tangles_its_mesh_is_refused(start, first):
     with pytest.raises(ValueError, match="move: .*mesh can follow"):
-        chain(start, (12 * mm, 7 * mm), near=first)
+        chain(start, (12 * mm, 3.8 * mm), near=first)
 
     def at(wall):
         return chain(start, (12 * mm, wall), near=first)["body.tip_angle"][-1]
 
     with pytest.raises(RuntimeError, match="drawing_to_loop: mesh: A cell .* inside out"):
-        jax.grad(at)(jnp.array(7 * mm))
+        jax.grad(at)(jnp.array(3.8 * mm))
 
 
 def test_a_curve_outside_the_body_is_refused(start, first):
@@ -244,7 +244,7 @@ def test_modes_that_vanish_are_refused(start, first):
     with pytest.raises(ValueError, match="pod_basis: asked for 5 modes"):
         chain(start, START, modes={"kappa_z": 5})
     still = {"air": jnp.zeros(4), "near": first}
-    with pytest.raises(RuntimeError, match="drawing_to_loop: modes: .*fewer independent"):
+    with pytest.raises(ValueError, match="pod_basis: asked for 2 .* hold 1 to 0"):
         chain(start, START, **still)
     run = jax.jit(lambda x: chain(start, x, **still).parts)(START)
     assert bool(run.modes == Status.too_few_states)
