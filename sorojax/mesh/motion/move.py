@@ -37,7 +37,7 @@ _OFF = 1e-3  # of an edge: distance from the zero set of a node that was to be o
 _FAR = 0.25  # of an edge: motion of a corner beyond which its sides may be taken for others
 _ROUNDS = 5  # of taking nodes from ridges
 _NAMED = 24  # nodes at most of which the thinnest place is named
-_LOST = 0.02  # of the size: how far a sharp node may settle from where it is
+_LOST = 0.5  # of the size: how far a sharp node may settle from where it is
 
 
 def movable(where: str, fields: tuple[AbstractSdf, ...], mesh: Mesh, size: Sizes) -> Mesh:
