@@ -8,14 +8,13 @@ largest error of its gradient.
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from sorojax import design, fem, material, mesh, reduction, robots, sdf, systems
 from sorojax.cli.demo.design import bellows_problem, loop_of
-from sorojax.units import kPa, ml, mm
+from sorojax.units import kPa, mm
 
 STEP = 1e-4  # of each number
 
@@ -75,7 +74,7 @@ def bellows(size: float, duration: float, states: int = 11, **actuator: Any) -> 
     valve = systems.Regulator(1.5e-8, integral_gain=3e-8, max_flow=3e-5)
     pid = systems.PID(-8 * kPa, integral_gain=-60 * kPa, derivative=-0.8 * kPa, low=0.0)
 
-    def run(actuator, law, valve, pid, modes={"kappa_z": 3}, **options):
+    def run(actuator, law, valve, pid, **options):
         middle = actuator.layer_thickness / 2
         target = systems.SmoothRamp([0.0, 0.4 * duration], [0.0, -0.4])
         return design.drawing_to_loop(
@@ -84,12 +83,11 @@ def bellows(size: float, duration: float, states: int = 11, **actuator: Any) -> 
             reduction.Line(*(jnp.stack([x, middle]) for x in (0 * middle, actuator.length))),
             lambda body: loop_of(systems.Source(target, unit="rad"), pid, valve, body),
             duration,
-            modes=modes,
+            **({"modes": {"kappa_z": 3}} | options),
             damping=0.02,
             degree=min(5, states - 2),
             save=101,
             air=jnp.linspace(0, 12 * kPa, states),
-            **options,
         )
 
     return Robot((first, rubber, valve, pid), run, tracking, flat.num_cells)
@@ -117,7 +115,7 @@ def pneunet(size: float, duration: float, states: int = 11, **dimensions: Any) -
         per_angle, integral_gain=8 * per_angle, derivative=0.05 * per_angle, low=0.0
     )
 
-    def run(pneunet, law, valve, pid, modes={"kappa_z": 3}, **options):
+    def run(pneunet, law, valve, pid, **options):
         middle = pneunet.layer / 2
         turn = 0.6 * PNEUNET_TURN * pneunet.num_chambers
         target = systems.SmoothRamp([0.0, 0.4 * duration], [0.0, turn])
@@ -127,12 +125,11 @@ def pneunet(size: float, duration: float, states: int = 11, **dimensions: Any) -
             reduction.Line(*(jnp.stack([x, middle]) for x in (0 * middle, pneunet.length))),
             lambda body: loop_of(systems.Source(target, unit="rad"), pid, valve, body),
             duration,
-            modes=modes,
+            **({"modes": {"kappa_z": 3}} | options),
             damping=0.02,
             degree=min(5, states - 2),
             save=101,
             air=jnp.linspace(0, 4 * kPa, states),
-            **options,
         )
 
     return Robot((first, rubber, valve, pid), run, tracking, flat.num_cells)
@@ -156,7 +153,7 @@ def finger(
     first = robots.Finger(
         bellows, tip_radius=6.5 * mm, spine_width=7 * mm, spine_thickness=7.2 * mm
     )
-    solid = mesh.tetrahedralise(first.solid() - first.chamber(), size=size, order=order)
+    solid = mesh.tetrahedralise(blended(first), size=size, order=order)
     found = mesh.chambers(solid)
     (chamber,) = found.volumes
     rubber = material.presets.dragon_skin_30()
@@ -174,7 +171,7 @@ def finger(
     gains = {"integral_gain": 8 * gain, "derivative": 0.02 * gain}
     pid = systems.PID(gain, **gains, low=0.0, measurement_unit="m")
 
-    def run(finger, law, valve, pid, modes={"kappa_y": 2, "sigma_x": 1}, **options):
+    def run(finger, law, valve, pid, **options):
         b = finger.bellows
         x, zero = b.wall_thickness / 2 - b.outer_radius, 0 * b.cap
         foot = b.cap / 5  # the edge of the spine is round
@@ -182,17 +179,16 @@ def finger(
         target = systems.SmoothRamp([0.0, 0.4 * duration], [0.0, 0.6 * FINGER_TIP])
         return design.drawing_to_loop(
             eqx.tree_at(lambda p: p.material, start, law),
-            finger.solid() - finger.chamber(),
+            blended(finger),
             reduction.Line(jnp.stack([x, zero, foot]), jnp.stack([x, zero, end])),
             lambda body: loop_of(systems.Source(target, unit="m"), pid, valve, body, sensor),
             duration,
-            modes=modes,
+            **({"modes": {"kappa_y": 2, "sigma_x": 1}} | options),
             damping=0.02,
             degree=min(5, states - 2),
             up=[1.0, 0.0, 0.0],
             save=101,
             air=jnp.linspace(0, FINGER_PRESSURE, states),
-            **options,
         )
 
     return Robot((first, rubber, valve, pid), run, leaving, solid.num_cells)
@@ -200,6 +196,19 @@ def finger(
 
 FINGER_PRESSURE = 40 * kPa
 FINGER_TIP = -0.6 * mm
+
+
+def blended(finger: robots.Finger) -> sdf.AbstractSdf:
+    """The finger without its tip, its spine in smooth transition to the bellows: where two
+    faces meet at a small angle, a ridge of the mesh has no place that it keeps."""
+    b, half = finger.bellows, finger.spine_width / 2
+    outside = -b.outer_radius - finger.spine_thickness / 3
+    spine = sdf.Box(
+        jnp.stack([outside, -half, 0 * half]),
+        jnp.stack([outside + finger.spine_thickness, half, b.length - b.cap - b.pitch / 2]),
+        finger.spine_thickness / 4,
+    )
+    return sdf.SmoothUnion(b.solid(), spine, finger.tip_radius / 4) - finger.chamber()
 
 
 def _across(position):

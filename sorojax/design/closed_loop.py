@@ -29,7 +29,7 @@ from sorojax.reduction.backbone import probe
 from sorojax.reduction.identify import Fit
 from sorojax.reduction.pod import weights
 from sorojax.rod import AbstractModes, Elastic, Rod, StrainBasis, elastic, rod
-from sorojax.systems import Network, RodBody, Rodas4, simulate
+from sorojax.systems import Network, Rodas4, RodBody, simulate
 from sorojax.systems.integrate.simulate import Trajectory as Motion
 
 
