@@ -19,7 +19,6 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from sorojax._jax import diffrax_checks
 from sorojax.math.ode.explicit import AbstractMethod
-from sorojax.math.ode.step_control import Seam
 
 _CHECKPOINTS = 4096  # at most
 
@@ -57,7 +56,7 @@ class Run(NamedTuple):
 
     path: Float[Array, "time states"]
     last: Float[Array, " states"]
-    seam: Seam | None
+    seam: Any
     memory: PyTree
     instants: Float[Array, " time"]
     reached: Float[Array, ""]
