@@ -8,8 +8,8 @@ rests on and does without it where it is missing: slower, with the same numbers.
 import importlib
 
 _FAST_PATHS = (
-    "diffrax_checks", "host_call", "invariants", "operations", "programs", "small_kernels",
-    "small_products", "trace_state",
+    "diffrax_checks", "host_call", "operations", "programs", "small_kernels", "small_products",
+    "trace_state",
 )  # fmt: skip
 
 

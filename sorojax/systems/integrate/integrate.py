@@ -12,7 +12,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from sorojax._jax.invariants import split
+from sorojax._jax.programs import split
 from sorojax.math import host
 from sorojax.math.ode.explicit import AbstractMethod
 from sorojax.math.ode.step_control import Control, Seam

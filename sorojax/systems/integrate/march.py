@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
-from sorojax._jax.invariants import split
+from sorojax._jax.programs import split
 from sorojax.math.host import tell
 from sorojax.math.ode.explicit import AbstractMethod, finite, guarded, repeated
 from sorojax.math.ode.step_control import (
