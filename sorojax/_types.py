@@ -9,11 +9,14 @@ import numpy as np
 
 from sorojax._jax import devices
 
-Numbers = jax.Array | np.ndarray | np.generic | float | Sequence[Any]
+_Entry = jax.Array | np.ndarray | np.generic | float
+_Row = Sequence[_Entry]
+
+Numbers = _Entry | _Row | Sequence[_Row] | Sequence[Sequence[_Row]]
 """A number, or what becomes an array: of these, arguments without a fixed shape."""
 
 
-def real(value: Any) -> jax.Array:
+def real(value: Numbers) -> jax.Array:
     """`value` as a floating array that keeps one dtype and never retraces.
 
     Floating arrays keep their dtype; Python numbers and integers take the
@@ -43,12 +46,12 @@ def real(value: Any) -> jax.Array:
     return _array(np.asarray(value, dtype=np.float64), jnp.result_type(float))
 
 
-def optional_real(value: Any) -> jax.Array | None:
+def optional_real(value: Numbers | None) -> jax.Array | None:
     """Like `real`, and `None` stays `None`."""
     return None if value is None else real(value)
 
 
-def integers(value: Any) -> jax.Array:
+def integers(value: Numbers) -> jax.Array:
     """`value` as an int32 array: connectivity, slots and node numbers."""
     if type(value) is object:
         return value  # type: ignore[return-value]

@@ -132,3 +132,79 @@ def test_dense_output_is_the_motion_between_the_saved_instants():
         assert jnp.isclose(there, fine["d.x"][k], rtol=0, atol=1e-6)
     with pytest.raises(ValueError, match="dense=True"):
         S.state_at(fine, 1.0)
+
+
+# Reverse mode of adaptive runs
+
+
+class Spring(S.AbstractBlock):
+    """A driven oscillator with a table of numbers that never change."""
+
+    stiffness: jnp.ndarray
+    start: jnp.ndarray
+    inputs = {}
+    outputs = {}
+
+    def output(self, name, t, state, inputs):
+        raise AssertionError(name)
+
+    def initial_state(self):
+        return self.start
+
+    def vector_field(self, t, state, inputs):
+        q, v = state
+        return jnp.stack([v, jnp.cos(t) - jnp.sum(jnp.sqrt(self.stiffness)) * q**3 - 0.2 * v])
+
+
+def ends_of(numbers, solver, adjoint=None, save=40, **options):
+    """Sum of squares of the path and its end, of a run with many instants in a step."""
+    spring = Spring(numbers["stiffness"], numbers["start"])
+    film = S.simulate(
+        S.Network({"spring": spring}, {}),
+        numbers["duration"],
+        save=save,
+        solver=solver,
+        adjoint=adjoint,
+        **options,
+    )
+    return jnp.sum(film.state["spring"] ** 2) + film.state["spring"][-1, 0]
+
+
+NUMBERS = {
+    "stiffness": jnp.array([1.0, 2.0]),
+    "start": jnp.array([0.5, 0.1]),
+    "duration": jnp.array(3.0),
+}
+
+
+@pytest.mark.parametrize(
+    "solver", [S.Tsit5(), pytest.param(S.Rodas4(), marks=pytest.mark.slow)]
+)
+def test_the_replayed_run_has_the_derivative_of_the_run(solver):
+    """By start, constants and duration; few checkpoints, so that most states are computed
+    again; steps are chosen by the tolerance, so that differences carry its error."""
+    few = {"max_steps": 20_000, "rtol": 1e-8, "atol": 1e-10}
+    found = jax.grad(ends_of)(NUMBERS, solver, **few)
+    forward = jax.jacfwd(ends_of)(NUMBERS, solver, dfx.ForwardMode(), **few)
+    for name, slope in found.items():
+        np.testing.assert_allclose(slope, forward[name], rtol=1e-9, atol=1e-11)
+    h = 1e-4
+    late, early = ({**NUMBERS, "duration": 3.0 + s * h} for s in (1, -1))
+    tight = {"rtol": 1e-11, "atol": 1e-12}
+    by_hand = (ends_of(late, solver, **tight) - ends_of(early, solver, **tight)) / (2 * h)
+    np.testing.assert_allclose(found["duration"], by_hand, rtol=1e-5)
+
+
+def test_a_run_that_fails_has_finite_derivatives_in_lanes_too():
+    numbers = jax.tree.map(lambda x: jnp.stack([x, x]), NUMBERS)
+    numbers["stiffness"] = numbers["stiffness"].at[1].multiply(1e12)  # too many steps
+
+    def total(numbers):
+        one = lambda n: ends_of(n, S.Tsit5(), max_steps=60, throw=False)  # noqa: E731
+        return jnp.sum(jax.vmap(one)(numbers))
+
+    found = jax.grad(total)(numbers)
+    alone = jax.grad(ends_of)(NUMBERS, S.Tsit5(), max_steps=60)
+    for name, slope in found.items():
+        assert jnp.all(jnp.isfinite(slope)), name
+        np.testing.assert_allclose(slope[0], alone[name], rtol=1e-9)

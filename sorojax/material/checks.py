@@ -1,17 +1,19 @@
 """Checks of the numbers of materials."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import Numbers, real
 
 MODULUS = "Moduli are in Pa: write 0.2 * MPa."
 
 
-def reals(values: Any) -> tuple[Any, ...]:
+def reals(values: Sequence[Numbers]) -> tuple[Array, ...]:
     """One leaf for each of several numbers."""
     return tuple(real(value) for value in values)
 

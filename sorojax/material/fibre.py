@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import optional_real, real
+from sorojax._types import Numbers, optional_real, real
 from sorojax.material import checks
 from sorojax.material.hyperelastic import AbstractHyperelastic, rest_stretches
 from sorojax.material.kinematics import Entry, Tensor, plus, times
@@ -16,11 +16,12 @@ from sorojax.material.kinematics import Entry, Tensor, plus, times
 Direction = tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]
 
 
-def _direction(value: Any) -> Direction:
+def _direction(value: Numbers) -> Direction:
     """Three leaves from three numbers, an array (3,) or one row per cell (cells, 3)."""
+    entries: Any = value
     if not isinstance(value, list | tuple):
-        value = jnp.moveaxis(real(value), -1, 0) if np.ndim(value) else (value,)
-    return tuple(real(entry) for entry in value)  # type: ignore[return-value]
+        entries = jnp.moveaxis(real(value), -1, 0) if np.ndim(entries) else (entries,)
+    return tuple(real(entry) for entry in entries)  # type: ignore[return-value]
 
 
 class FibreReinforced(AbstractHyperelastic):

@@ -1,12 +1,10 @@
 """Growth, swelling and thermal expansion: a rest state that is not the reference one."""
 
-from typing import Any
-
 import equinox as eqx
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.material import checks
 from sorojax.material.hyperelastic import AbstractHyperelastic, rest_stretches
 from sorojax.material.kinematics import Entry, Tensor, absent
@@ -14,7 +12,7 @@ from sorojax.material.kinematics import Entry, Tensor, absent
 Stretches = tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]
 
 
-def _stretches(value: Any) -> Stretches:
+def _stretches(value: Numbers) -> Stretches:
     """Three leaves from one number (or one per cell), or from a tuple of three."""
     entries = value if isinstance(value, list | tuple) else (value,) * 3
     return tuple(real(entry) for entry in entries)  # type: ignore[return-value]

@@ -11,7 +11,7 @@ import abc
 import functools
 import math
 from dataclasses import fields
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Shaped
 
 from sorojax import _check
 from sorojax._display import displayed
-from sorojax._types import real
+from sorojax._types import Numbers, real
 
 Box = tuple[Float[Array, " dim"], Float[Array, " dim"]]
 Number = float | Float[Array, ""]
@@ -152,7 +152,7 @@ class AbstractByLevel(AbstractSdf):
         return self.level_box(0.0)
 
 
-def positive(value: Any) -> Array:
+def positive(value: Numbers) -> Array:
     """`value` as an array; a field with this converter holds one number above zero."""
     return real(value)
 

@@ -307,8 +307,9 @@ def _rows(where: str, problem: Problem, histories: dict[str, Any], times):
     def row(name, want):
         if name not in histories:
             return None
-        given = histories[name]
-        values = jax.vmap(lambda t: real(given(t)))(times) if callable(given) else real(given)
+        given: Any = histories[name]
+        follow = jax.vmap(lambda t: real(given(t)))  # pyright: ignore[reportArgumentType]
+        values = follow(times) if callable(given) else real(given)
         _check.shape(
             where,
             name,

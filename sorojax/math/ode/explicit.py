@@ -56,6 +56,15 @@ class AbstractMethod(dfx.AbstractSolver):
     def advance(self, field: Field, t: Time, y: PyTree, h: Time, memory: PyTree) -> MethodStep:
         """A step of `h` from `t`."""
 
+    def again(
+        self, field: Field, t: Time, y: PyTree, h: Time
+    ) -> tuple[PyTree, dict[str, PyTree], PyTree]:
+        """A step that was taken before, for its derivative: the state after it, what the
+        interpolation within it needs, and what it started from."""
+        memory = self.begin(field, t, y, h)
+        new = self.advance(field, t, y, h, memory)
+        return new.y, new.dense, memory
+
     @property
     def keeps(self) -> bool:
         """Whether one memory serves a whole run of fixed steps."""
@@ -231,6 +240,11 @@ class Tsit5(AbstractMethod):
         shifts = jax.tree.map(lambda *k: h * jnp.stack(k), *slopes)
         return MethodStep(new, error, slopes[-1], {"k": shifts})
 
+    def again(self, field, t, y, h):
+        new, slopes = _rolled(TSIT5, field, t, y, h, stages=len(TSIT5.rows) + 1)
+        shifts = jax.tree.map(lambda k: h * k, slopes)
+        return new, {"k": shifts}, jax.tree.map(lambda k: k[0], slopes)
+
 
 class RungeKutta4(AbstractMethod):
     """The classical method of order 4, for fixed steps; unstable beyond h omega = 2.8."""
@@ -292,23 +306,28 @@ def explicit_step(tableau: Tableau, field: Field, t, y: PyTree, h) -> Any:
 
 def rolled_step(tableau: Tableau, field: Field, t, y: PyTree, h) -> Any:
     """The same step traced once, however many stages there are: slower, compiles faster."""
+    return _rolled(tableau, field, t, y, h, stages=len(tableau.rows))[0]
+
+
+def _rolled(tableau: Tableau, field: Field, t, y: PyTree, h, stages: int) -> tuple[Any, Any]:
+    """The state after a step, and the slopes of its stages, of which one more is at its end."""
     rows, times = tableau
-    count = len(rows)
-    weights = jnp.array([(*row, *[0.0] * (count - len(row))) for row in rows], h.dtype)
-    starts = jnp.array([0.0, *times], h.dtype)
+    weights = jnp.array([(*row, *[0.0] * (stages - len(row))) for row in rows], h.dtype)
+    starts = jnp.array([0.0, *times, 1.0], h.dtype)
 
     def moved(row, slopes):
         return jax.tree.map(lambda x, k: x + h * jnp.tensordot(row, k, 1), y, slopes)
 
     def stage(i, slopes):
-        start = jnp.where(i == 0, jnp.zeros_like(starts), weights[i - 1])
+        start = jnp.where(i == 0, jnp.zeros_like(starts[:stages]), weights[i - 1])
         rates = field(t + starts[i] * h, moved(start, slopes))
         return jax.tree.map(
             lambda k, rate: jax.lax.dynamic_update_index_in_dim(k, rate, i, 0), slopes, rates
         )
 
-    blank = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), y)
-    return moved(weights[-1], jax.lax.fori_loop(0, count, stage, blank))
+    blank = jax.tree.map(lambda x: jnp.zeros((stages, *x.shape), x.dtype), y)
+    slopes = jax.lax.fori_loop(0, stages, stage, blank)
+    return moved(weights[-1], slopes), slopes
 
 
 def _slopes(tableau: Tableau, field: Field, t, y, h, first) -> list:

@@ -54,7 +54,8 @@ class Making(NamedTuple):
 
     @property
     def density(self) -> Array:
-        return real(self.material.density)
+        density: Any = self.material.density
+        return real(density)
 
 
 def printed_rubber() -> AbstractHyperelastic:

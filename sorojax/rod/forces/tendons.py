@@ -5,7 +5,7 @@ depends on the coordinates of the rod alone, and every derivative is exact.
 """
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -233,7 +233,7 @@ def _strains(rod: Rod, s: np.ndarray) -> tuple[Array, Array]:
 Signal = Float[Array, " inputs"] | Callable[[Array], Array]
 
 
-def _several(routes: Any) -> tuple[AbstractRoute, ...]:
+def _several(routes: AbstractRoute | Sequence[AbstractRoute]) -> tuple[AbstractRoute, ...]:
     return (routes,) if isinstance(routes, AbstractRoute) else tuple(routes)
 
 
@@ -354,5 +354,5 @@ class Actuation(AbstractForce):
 
 
 def _at(signal: Any, t, dtype) -> Float[Array, " inputs"]:
-    value = signal(t) if callable(signal) else signal
+    value: Any = signal(t) if callable(signal) else signal
     return jnp.atleast_1d(real(value)).astype(dtype)

@@ -208,7 +208,7 @@ def sum_of(weights: Numbers, *, shape=(), unit: str | None = None) -> Function:
 
 def gain(factor: Numbers, *, shape=(), unit: str | None = None, input_unit: str | None = None):
     """A block that multiplies its input `a`; the units say what the factor turns into what."""
-    return Function(Weighted([factor]), ("a",), shape, unit, shape, input_unit)
+    return Function(Weighted(real(factor)[None]), ("a",), shape, unit, shape, input_unit)
 
 
 class Lag(AbstractBlock):

@@ -1,6 +1,6 @@
 """A finite-element body as a block: loads in, volumes, places and energies out."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -238,6 +238,8 @@ def acceleration(
     return sparse.solve(system, matrix, free).reshape(u.shape)
 
 
-def _pairs(markers: Any) -> tuple[tuple[str, int], ...]:
+def _pairs(
+    markers: Mapping[str, int] | Sequence[tuple[str, int]],
+) -> tuple[tuple[str, int], ...]:
     items = markers.items() if isinstance(markers, Mapping) else markers
     return tuple((str(name), int(np.asarray(node))) for name, node in items)

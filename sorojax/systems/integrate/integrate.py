@@ -12,12 +12,13 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from sorojax._jax import diffrax_checks
+from sorojax._jax.programs import split
 from sorojax.math import host
 from sorojax.math.ode.explicit import AbstractMethod
 from sorojax.math.ode.step_control import Control, Seam
 from sorojax.math.status import Status
 from sorojax.systems.blocks.block import AbstractBlock
+from sorojax.systems.integrate.adjoint import Moving, Plan, replayed, solved
 from sorojax.systems.network import Network, at_time
 
 
@@ -82,14 +83,15 @@ class Resume(NamedTuple):
 
 
 class FlatField(eqx.Module):
-    """The rate of the state as one vector: fewer and larger kernels than a tree of states."""
+    """The rate of the state as one vector: fewer and larger kernels than a tree of states.
 
-    unravel: Callable[[Array], PyTree] = eqx.field(static=True)
+    What does not change within a run is computed before it: `args[0]`.
+    """
+
+    remainder: Callable[..., Array] = eqx.field(static=True)
 
     def __call__(self, t: Any, x: Array, args: Any) -> Array:
-        block, inputs, *_ = args
-        t = jnp.asarray(t, x.dtype)
-        return ravel_pytree(block.vector_field(t, self.unravel(x), at_time(inputs, t)))[0]
+        return self.remainder(args[0], jnp.asarray(t, x.dtype), x)
 
 
 class Conditions(NamedTuple):
@@ -130,10 +132,17 @@ def adaptive(
     start = time[0] if start is None else start
     flat, unravel = ravel_pytree(state)
     inputs = explicit_inputs(inputs, start)
+
+    def rate(t, x):
+        return ravel_pytree(block.vector_field(t, unravel(x), at_time(inputs, t)))[0]
+
+    constants, remainder = split(rate, jnp.zeros((), flat.dtype), flat)
     control, end = flat_tolerances(control, state), time[-1]
     going: Any = control
     free = isinstance(control, Control) and not conditions.signals
-    further = {}
+    further, watched = {}, (None, None, None)
+    if conditions.signals:
+        watched = (block, inputs, _sides(conditions, block, inputs, state, start))
     if free:
         longest = jnp.min(jnp.diff(time))
         control = going = going.to_end(time[-1], longest)
@@ -142,65 +151,59 @@ def adaptive(
         start, flat = seam.seam.time, seam.seam.state
         further = {"dt0": seam.seam.step, "controller_state": going.begun(seam.seam)}
         further["solver_state"] = None if seam.memory is None else (seam.memory, seam.memory)
-    with diffrax_checks.left_out():
-        solution = dfx.diffeqsolve(
-            dfx.ODETerm(FlatField(unravel)),
-            solver,
-            start,
-            end,
-            further.pop("dt0", None),
-            flat,
-            args=(block, inputs, _sides(conditions, block, inputs, state, start)),
-            saveat=dfx.SaveAt(
-                subs=[dfx.SubSaveAt(ts=jnp.maximum(time, start)), dfx.SubSaveAt(t1=True)],
-                dense=dense,
-                solver_state=free,
-                controller_state=free,
-            ),
-            stepsize_controller=control,
-            max_steps=max_steps,
-            adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
-            event=_event(conditions, unravel),
-            throw=False,
-            progress_meter=_meter(progress, start, end, time[-1]),
-            **further,
-        )
-    assert solution.ys is not None and solution.ts is not None
-    saved = jnp.isfinite(solution.ts[0])
-    last = solution.ys[1][0]
-    path = jnp.where(saved[:, None], solution.ys[0], last)
-    reached, status = solution.ts[1][0], _status(solution.result)
+    plan = Plan(
+        FlatField(remainder),
+        solver,
+        control,
+        start,
+        end,
+        watched,
+        _event(conditions, unravel),
+        _meter(progress, start, end, time[-1]),
+        adjoint,
+        further,
+        max_steps,
+        dense,
+        free,
+    )
+    moving = Moving(constants, flat, jnp.maximum(time, start))
+    plain = adjoint is None and free and not dense and seam is None
+    own = plain and isinstance(solver, AbstractMethod)
+    run = replayed(moving, _held(plan)) if own else solved(moving, plan)
+    last = run.last
+    saved = jnp.isfinite(run.instants)
+    path = jnp.where(saved[:, None], run.path, last)
+    reached, status = run.reached, _status(run.result)
     backwards = jnp.any(time[1:] < time[:-1])
     status = Status.where(backwards, Status.not_finite, status)
     if free:  # the last step may have gone further
         last = jnp.where(saved[-1], path[-1], last)
         reached = jnp.minimum(reached, time[-1])
-    masks = jax.tree.leaves(solution.event_mask)
+    masks = jax.tree.leaves(run.events)
     triggered = jnp.stack(masks) if masks else jnp.zeros(0, bool)
     return Integration(
         jax.vmap(unravel)(path),
         unravel(last),
         reached,
         status,
-        jnp.asarray(solution.stats["num_steps"]),
-        jnp.asarray(solution.stats["num_rejected_steps"]),
+        jnp.asarray(run.steps),
+        jnp.asarray(run.rejected),
         triggered,
-        solution.interpolation,
-        _seam(solution, solver) if free else None,
+        run.dense,
+        Resume(run.seam, run.memory) if free else None,
     )
+
+
+def _held(tree: PyTree) -> PyTree:
+    """The same without derivatives."""
+    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(jax.lax.stop_gradient(arrays), rest)
 
 
 def _meter(progress: bool | str, start, far, end) -> dfx.AbstractProgressMeter:
     if not progress:
         return dfx.NoProgressMeter()
     return Meter(start, far, end, progress if isinstance(progress, str) else "simulate")
-
-
-def _seam(solution: dfx.Solution, solver: dfx.AbstractSolver) -> Resume:
-    """Where the last step began, and what it began with."""
-    own: Any = solution.solver_state if isinstance(solver, AbstractMethod) else (None, None)
-    pace: Any = solution.controller_state
-    return Resume(pace.last, own[1])
 
 
 def explicit_inputs(inputs: Mapping[str, Any], t) -> dict[str, Any]:
@@ -247,7 +250,7 @@ def _event(conditions: Conditions, unravel) -> dfx.Event | None:
 
     def watch(number, signal):
         def value(t, y, args, **_):
-            block, inputs, sides = args
+            _, block, inputs, sides = args
             t = jnp.asarray(t, y.dtype)
             found = signal(t, unravel(y), block, at_time(inputs, t))
             if sides is None:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
+from sorojax._jax.programs import split
 from sorojax.math.host import tell
 from sorojax.math.ode.explicit import AbstractMethod, finite, guarded, repeated
 from sorojax.math.ode.step_control import (
@@ -48,17 +49,17 @@ def fixed(
     count = time.shape[0] - 1
     judged = judged and not method.carries
     parts = rows_between(count, substeps, judged)
-    state, unravel = as_vector(method, state)
-    move, short = interval_of(substeps // parts, unravel), interval / parts
+    state, unravel, rate = rate_of(method, block, inputs, state)
+    move, short = interval_of(substeps // parts), interval / parts
     if memory is None:
-        memory = move.begin((method, block, inputs, time[0], state), short)
+        memory = move.begin((method, rate, time[0], state), short)
     plan = passes(count * parts, substeps * count, judged)
 
     def advance(run: Doubled, one_pass):
         number, part, first, length = one_pass
         walk, h = run.begin(part), length * short
         t = time[number // parts] + first * short
-        given = (method, block, inputs, t, walk.state, walk.memory)
+        given = (method, rate, t, walk.state, walk.memory)
         if method.carries:  # a step is large: none is computed after one that failed
             moved = jax.lax.cond(walk.good, lambda: move.taken(given, h), lambda: walk.held)
         else:
@@ -130,13 +131,6 @@ class Walk(NamedTuple):
         return Status.where(self.good, Status.successful, failed)
 
 
-def as_vector(method: AbstractMethod, state: PyTree) -> tuple[PyTree, Unravel]:
-    """The state as `method` takes it in a run, and what makes it a tree again."""
-    if method.takes_vector and jax.tree.leaves(state):
-        return ravel_pytree(state)
-    return state, None
-
-
 def as_tree(unravel: Unravel, state: PyTree) -> PyTree:
     """A state that `as_vector` gave as the tree that it was."""
     return state if unravel is None else unravel(state)
@@ -148,31 +142,66 @@ def as_trees(unravel: Unravel, states: PyTree) -> PyTree:
 
 
 class Rate(eqx.Module):
-    """The rate of a block under inputs, for methods that may look at the block; of a state
-    that is one vector if there is an `unravel`."""
+    """The rate of a block under inputs, for methods that may look at the block."""
 
     block: AbstractBlock
     inputs: Mapping[str, Any]
-    unravel: Unravel = eqx.field(static=True, default=None)
 
     def __call__(self, t, state):
-        tree = as_tree(self.unravel, state)
-        rate = self.block.vector_field(t, tree, at_time(self.inputs, t))
-        return rate if self.unravel is None else ravel_pytree(rate)[0]
+        return self.block.vector_field(t, state, at_time(self.inputs, t))
+
+    def under(self, held: Mapping[str, Any]) -> "Rate":
+        """The same under commands that are held."""
+        return Rate(self.block, {**self.inputs, **held})
+
+
+class VectorRate(eqx.Module):
+    """The rate of a state that is one vector; what a run does not change is computed before."""
+
+    remainder: Callable[..., Array] = eqx.field(static=True)
+    constants: PyTree
+    held: Mapping[str, Any]
+
+    def __call__(self, t, state):
+        return self.remainder(self.constants, jnp.asarray(t, state.dtype), state, self.held)
+
+    def under(self, held: Mapping[str, Any]) -> "VectorRate":
+        """The same under commands that are held."""
+        return VectorRate(self.remainder, self.constants, held)
+
+
+def rate_of(
+    method: AbstractMethod,
+    block: AbstractBlock,
+    inputs: Mapping[str, Any],
+    state: PyTree,
+    held: Mapping[str, Any] | None = None,
+) -> tuple[PyTree, Unravel, Any]:
+    """The state as `method` takes it in a run, what makes it a tree again, and its rate, which
+    may be asked for `under` commands like those in `held`."""
+    held = {} if held is None else held
+    plain = Rate(block, inputs)
+    if not (method.takes_vector and jax.tree.leaves(state)):
+        return state, None, plain.under(held)
+    flat, unravel = ravel_pytree(state)
+
+    def rate(t, x, held):
+        return ravel_pytree(plain.under(held)(t, unravel(x)))[0]
+
+    constants, remainder = split(rate, jnp.zeros((), flat.dtype), flat, held)
+    return flat, unravel, VectorRate(remainder, constants, held)
 
 
 class interval_of(eqx.Module):
     """Moves a state by a number of steps that share an interval."""
 
     substeps: int = eqx.field(static=True)
-    unravel: Unravel = eqx.field(static=True, default=None)
 
     def begin(self, given, interval):
         """The memory of the method through the whole run, if it has one."""
-        method, block, inputs, t, state = given
+        method, rate, t, state = given
         if not (method.keeps or method.carries):
             return None
-        rate = Rate(block, inputs, self.unravel)
         return method.begin(rate, t, state, interval / self.substeps)
 
     def taken(self, given, interval) -> tuple[PyTree, Any, Array]:
@@ -184,7 +213,5 @@ class interval_of(eqx.Module):
         return new, memory, converged
 
     def __call__(self, given, interval):
-        method, block, inputs, t, state, memory = given
-        h = interval / self.substeps
-        rate = Rate(block, inputs, self.unravel)
-        return repeated(method, rate, t, state, h, self.substeps, memory)
+        method, rate, t, state, memory = given
+        return repeated(method, rate, t, state, interval / self.substeps, self.substeps, memory)

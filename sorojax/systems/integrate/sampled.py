@@ -22,7 +22,7 @@ from sorojax.math.ode.step_control import (
     whole_rows,
 )
 from sorojax.systems.integrate.integrate import explicit_inputs
-from sorojax.systems.integrate.march import Walk, as_tree, as_trees, as_vector, interval_of
+from sorojax.systems.integrate.march import Walk, as_tree, as_trees, interval_of, rate_of
 from sorojax.systems.integrate.simulate import (
     Trajectory,
     default_method,
@@ -141,9 +141,10 @@ def simulate_sampled(
 def _run(network, loops, state, before, inputs, period, first, settings) -> Trajectory:
     (ticks, substeps, method, progress), (memories, held, kept) = settings, before
     state = network.initial_state() if state is None else state
-    state, unravel = as_vector(method, state)
-    move = interval_of(substeps, unravel)
     inputs = explicit_inputs(inputs, period)
+    held = _nothing(network, loops, period.dtype) if held is None else held
+    state, unravel, rate = rate_of(method, network, inputs, state, held)
+    move = interval_of(substeps)
     time = period * (first + jnp.arange(ticks + 1, dtype=jnp.int32)).astype(period.dtype)
 
     def signals(t, state, held):
@@ -167,7 +168,7 @@ def _run(network, loops, state, before, inputs, period, first, settings) -> Traj
         memories, held = jax.lax.cond(
             called, lambda: (memories, held), lambda: call(tick, t, walk.state, memories, held)
         )
-        given = (method, network, {**inputs, **held}, t, walk.state, walk.memory)
+        given = (method, rate.under(held), t, walk.state, walk.memory)
         new = walk.after(move.taken(given, h), t + h)
         run = run.end(part, new)
         kept = jax.tree.map(lambda a, b: jnp.where(part == 0, a, b), walk.memory, kept)
@@ -176,7 +177,6 @@ def _run(network, loops, state, before, inputs, period, first, settings) -> Traj
         seen = (walk.state, {**signals(t, walk.state, held), **held}, memories, held)
         return (run, memories, held, kept), (seen, new.state)
 
-    held = _nothing(network, loops, period.dtype) if held is None else held
     if memories is None:
         seen = signals(time[0], state, held)
         memories = tuple(
@@ -184,7 +184,7 @@ def _run(network, loops, state, before, inputs, period, first, settings) -> Traj
         )
     if kept is None:
         _, commands = call(first, time[0], state, memories, held)
-        kept = move.begin((method, network, {**inputs, **commands}, time[0], state), period)
+        kept = move.begin((method, rate.under(commands), time[0], state), period)
     if method.carries:  # a step is large beside what it starts from
         advance = jax.checkpoint(advance, prevent_cse=False)  # pyright: ignore[reportPrivateImportUsage]
     walk = Walk(state, kept, finite(state), jnp.array(True), time[0])
