@@ -45,7 +45,8 @@ def bent(modulus, solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint):
         stepsize_controller=dfx.PIDController(rtol=1e-8, atol=1e-10),
         adjoint=adjoint,
     )
-    return run.ys["finger"]["q"][-1, 0]
+    last = jax.tree.map(lambda x: x[-1], run.ys)
+    return last["finger"]["q"][0]
 
 
 def slope(solver: dfx.AbstractSolver, adjoint: dfx.AbstractAdjoint):

@@ -1,9 +1,8 @@
 """What the uncertainty of numbers does to a result: first and second order of its moments."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,13 +10,11 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from sorojax import _check
-from sorojax._display import displayed
 from sorojax._types import Numbers, real
 from sorojax.sdf.base import root
 
 
-@displayed
-class Propagated(eqx.Module):
+class Propagated(NamedTuple):
     """Mean and standard deviation of a result, in its unit.
 
     Attributes:

@@ -158,7 +158,7 @@ def covariance_of(
         h = 1e-30 * abs(constants[k])
         moved = constants.astype(complex)
         moved[k] += 1j * h
-        columns.append(_stress(model, curve, moved, stretch).imag / h)
+        columns.append(np.imag(_stress(model, curve, moved, stretch)) / h)
     root = np.sqrt(weight)
     jacobian = root[:, None] * np.stack(columns, axis=1)
     freedom = int(np.sum(weight > 0)) - len(constants)
