@@ -26,6 +26,7 @@ class Robot(NamedTuple):
     run: Any
     cost: Any
     cells: int
+    modes: dict[str, int]
 
 
 class Loop:
@@ -34,7 +35,7 @@ class Loop:
     def __init__(self, robot: Robot, **options: Any):
         moving, self.rest = eqx.partition(robot.numbers, eqx.is_inexact_array)
         self.numbers, self.build = ravel_pytree(moving)
-        self.robot, self.options = robot, options
+        self.robot, self.options = robot, {"modes": robot.modes} | options
         self.near = self.run(self.numbers)
 
     def run(self, numbers, near=None, **options):
@@ -74,7 +75,7 @@ def bellows(size: float, duration: float, states: int = 11, **actuator: Any) -> 
     valve = systems.Regulator(1.5e-8, integral_gain=3e-8, max_flow=3e-5)
     pid = systems.PID(-8 * kPa, integral_gain=-60 * kPa, derivative=-0.8 * kPa, low=0.0)
 
-    def run(actuator, law, valve, pid, **options):
+    def run(actuator, law, valve, pid, **options: Any):
         middle = actuator.layer_thickness / 2
         target = systems.SmoothRamp([0.0, 0.4 * duration], [0.0, -0.4])
         return design.drawing_to_loop(
@@ -83,14 +84,14 @@ def bellows(size: float, duration: float, states: int = 11, **actuator: Any) -> 
             reduction.Line(*(jnp.stack([x, middle]) for x in (0 * middle, actuator.length))),
             lambda body: loop_of(systems.Source(target, unit="rad"), pid, valve, body),
             duration,
-            **({"modes": {"kappa_z": 3}} | options),
+            **options,
             damping=0.02,
             degree=min(5, states - 2),
             save=101,
             air=jnp.linspace(0, 12 * kPa, states),
         )
 
-    return Robot((first, rubber, valve, pid), run, tracking, flat.num_cells)
+    return Robot((first, rubber, valve, pid), run, tracking, flat.num_cells, {"kappa_z": 3})
 
 
 def pneunet(size: float, duration: float, states: int = 11, **dimensions: Any) -> Robot:
@@ -115,7 +116,7 @@ def pneunet(size: float, duration: float, states: int = 11, **dimensions: Any) -
         per_angle, integral_gain=8 * per_angle, derivative=0.05 * per_angle, low=0.0
     )
 
-    def run(pneunet, law, valve, pid, **options):
+    def run(pneunet, law, valve, pid, **options: Any):
         middle = pneunet.layer / 2
         turn = 0.6 * PNEUNET_TURN * pneunet.num_chambers
         target = systems.SmoothRamp([0.0, 0.4 * duration], [0.0, turn])
@@ -125,14 +126,14 @@ def pneunet(size: float, duration: float, states: int = 11, **dimensions: Any) -
             reduction.Line(*(jnp.stack([x, middle]) for x in (0 * middle, pneunet.length))),
             lambda body: loop_of(systems.Source(target, unit="rad"), pid, valve, body),
             duration,
-            **({"modes": {"kappa_z": 3}} | options),
+            **options,
             damping=0.02,
             degree=min(5, states - 2),
             save=101,
             air=jnp.linspace(0, 4 * kPa, states),
         )
 
-    return Robot((first, rubber, valve, pid), run, tracking, flat.num_cells)
+    return Robot((first, rubber, valve, pid), run, tracking, flat.num_cells, {"kappa_z": 3})
 
 
 PNEUNET_TURN = -0.08  # of a chamber at 4 kPa [rad]
@@ -168,10 +169,10 @@ def finger(
     valve = systems.Regulator(1.5e-8, integral_gain=3e-8, max_flow=3e-5)
     sensor = systems.Function(_across, ("a",), (), "m", (3,), "m")
     gain = FINGER_PRESSURE / FINGER_TIP
-    gains = {"integral_gain": 8 * gain, "derivative": 0.02 * gain}
-    pid = systems.PID(gain, **gains, low=0.0, measurement_unit="m")
+    slow, fast = 8 * gain, 0.02 * gain
+    pid = systems.PID(gain, integral_gain=slow, derivative=fast, low=0.0, measurement_unit="m")
 
-    def run(finger, law, valve, pid, **options):
+    def run(finger, law, valve, pid, **options: Any):
         b = finger.bellows
         x, zero = b.wall_thickness / 2 - b.outer_radius, 0 * b.cap
         foot = b.cap / 5  # the edge of the spine is round
@@ -183,7 +184,7 @@ def finger(
             reduction.Line(jnp.stack([x, zero, foot]), jnp.stack([x, zero, end])),
             lambda body: loop_of(systems.Source(target, unit="m"), pid, valve, body, sensor),
             duration,
-            **({"modes": {"kappa_y": 2, "sigma_x": 1}} | options),
+            **options,
             damping=0.02,
             degree=min(5, states - 2),
             up=[1.0, 0.0, 0.0],
@@ -191,7 +192,8 @@ def finger(
             air=jnp.linspace(0, FINGER_PRESSURE, states),
         )
 
-    return Robot((first, rubber, valve, pid), run, leaving, solid.num_cells)
+    modes = {"kappa_y": 2, "sigma_x": 1}
+    return Robot((first, rubber, valve, pid), run, leaving, solid.num_cells, modes)
 
 
 FINGER_PRESSURE = 40 * kPa

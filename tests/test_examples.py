@@ -2,9 +2,11 @@
 
 import re
 
+import diffrax as dfx
+import jax.numpy as jnp
 import pytest
 
-from tests.scripts import ROOT, main_of
+from tests.scripts import ROOT, main_of, user_code
 
 
 def test_drawing_to_loop_reaches_its_target():
@@ -46,3 +48,20 @@ def test_a_bench_on_a_desk_follows_its_target():
     assert numbers["estimate off the true tip [mm rms]"] < 0.5
     assert numbers["tip off its target [mm rms]"] < 3
     assert numbers["pictures used"] == 75
+
+
+@pytest.mark.slow
+def test_three_solvers_and_three_adjoints_of_diffrax_give_one_derivative():
+    """Explicit and implicit, in reverse by checkpoints and backwards in time, and forward."""
+    numbers = main_of("05_diffrax")()
+    assert len(numbers) == 5
+    bent = main_of("05_diffrax").__globals__["bent"]
+    solver, adjoint = dfx.Tsit5(), dfx.RecursiveCheckpointAdjoint()
+    ends = [float(bent(jnp.asarray(e), solver, adjoint)) for e in (0.999e6, 1.001e6)]
+    difference = (ends[1] - ends[0]) / 2e3 * 1e5
+    assert list(numbers.values()) == pytest.approx(5 * [difference], rel=1e-5)
+
+
+def test_the_example_with_diffrax_is_short_and_the_readme_names_it():
+    assert user_code("05_diffrax") <= 45
+    assert "examples/05_diffrax.py" in (ROOT / "README.md").read_text()

@@ -125,10 +125,6 @@ class Nothing(sdf.AbstractSdf):
             lambda: sdf.volume(sdf.Sphere([0, 0, 0], 1) & sdf.Sphere([1.9, 1.2, 0], 1), 16),
             "empty",
         ),
-        (
-            lambda: jax.jit(lambda r: sdf.volume(sdf.Sphere([0, 0, 0], r), 16))(1.0),
-            "traced, need concrete",
-        ),
     ],
 )
 def test_bad_shapes_name_the_remedy(make, message):

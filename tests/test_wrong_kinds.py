@@ -23,6 +23,7 @@ FREE = {
         "design.calibrate": "start lower upper logarithmic",
         "design.minimise": "start",
         "design.minimise_shape": "start",
+        "design.propagate_covariance": "numbers deviation",
         "io.load": "like",
         "io.save": "tree",
         "sweep.sweep": "designs config",

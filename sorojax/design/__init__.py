@@ -34,6 +34,7 @@ from sorojax.design.optimise.optimality import OptimalityCriteria
 from sorojax.design.optimise.shape_loop import minimise_shape
 from sorojax.design.part import Mirror, Part, Repeat, part, reanalyse, solid
 from sorojax.design.pneunet import optimise_pneunet, pneunet_cell
+from sorojax.design.uncertainty import Propagated, propagate_covariance
 
 __all__ = [
     "AbstractOptimiser",
@@ -46,6 +47,7 @@ __all__ = [
     "Mirrored",
     "OptimalityCriteria",
     "Part",
+    "Propagated",
     "Ramp",
     "Repeat",
     "Repeated",
@@ -74,6 +76,7 @@ __all__ = [
     "part",
     "path_error",
     "pneunet_cell",
+    "propagate_covariance",
     "reanalyse",
     "relax_to_minimum",
     "replaced_load",

@@ -120,7 +120,7 @@ def drawing_to_loop(
     shape: Drawing | None,
     curve: AbstractCurve,
     network: Callable[[RodBody], Network] | None = None,
-    duration: Numbers | None = None,
+    duration: float | Float[Array, ""] | None = None,
     *,
     modes: dict[str, int] | dict[str, float],
     damping: Numbers,
@@ -224,11 +224,12 @@ def drawing_to_loop(
     if near is not None:
         modes = _held_modes(problem.mesh, modes, samples, near)
 
-    def steps():
+    def chain():
         """Part after part: its name, how it ended, and what it has found."""
         moved = problem if shape is None else followed(problem, shape)
         yield "mesh", _mesh_status(problem.mesh, moved.mesh), {}
-        path = solve_path(moved, newton=newton, throw=throw, **values)
+        steps: Any = values
+        path = solve_path(moved, newton=newton, throw=throw, **steps)
         yield "path", path.status, {"path": path}
         held = None if near is None else near.backbone
         backbone = strain_along(path, curve, near=held, **along)
@@ -249,7 +250,7 @@ def drawing_to_loop(
         ("path", "backbone", "basis", "fit", "body", "motion")
     )
     ends: dict[str, Status] = {}
-    for part, status, made in steps():
+    for part, status, made in chain():
         found |= made
         ends[part] = status
         if not is_traced(status) and not bool(status == Status.successful):
@@ -343,13 +344,15 @@ def _unless(good, otherwise: Status) -> Status:
 
 
 def _body(problem: Problem, backbone: Backbone, basis, fit: Fit, damping, nodes) -> RodBody:
+    group: Any = SE2() if problem.mesh.element.dim == 2 else SE3()
+    rest: Any = None if backbone.rest is None else backbone.rest_strain
     made = rod(
-        SE2() if problem.mesh.element.dim == 2 else SE3(),
+        group,
         basis,
         fit.section,
         _elastic(problem),
         length=fit.length,
-        rest_strain=None if backbone.rest is None else backbone.rest_strain,
+        rest_strain=rest,
         nodes=nodes,
     )
     return RodBody(made, (fit.elastic, fit.pressure, fit.damping(damping)))

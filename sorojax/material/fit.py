@@ -138,13 +138,57 @@ def build(
     model: type[AbstractHyperelastic], curve: Curve, poisson_ratio: float, density: Any
 ) -> AbstractHyperelastic:
     """The compressible material with the fitted curve and the small-strain ratio."""
+    coefficients = tuple(_constants(model, curve))
+    bulk = bulk_modulus(real(shear_modulus(model, coefficients)), poisson_ratio)
+    return made_of(model, coefficients, bulk, density)
+
+
+def covariance_of(
+    model: type[AbstractHyperelastic],
+    curve: Curve,
+    stretch: np.ndarray,
+    stress: np.ndarray,
+    weight: np.ndarray,
+) -> np.ndarray:
+    """s^2 (J'W J)^-1 of the constants of the material that `build` makes of a curve, with J the
+    slope of the stress by them and s^2 the weighted square error per degree of freedom."""
+    constants = _constants(model, curve)
+    columns = []
+    for k in range(len(constants)):  # by complex steps: exact to rounding
+        h = 1e-30 * abs(constants[k])
+        moved = constants.astype(complex)
+        moved[k] += 1j * h
+        columns.append(np.imag(_stress(model, curve, moved, stretch)) / h)
+    root = np.sqrt(weight)
+    jacobian = root[:, None] * np.stack(columns, axis=1)
+    freedom = int(np.sum(weight > 0)) - len(constants)
+    scale = np.linalg.norm(jacobian, axis=0)
+    if freedom <= 0 or not np.all(scale > 0):
+        return np.full((len(constants),) * 2, np.nan)
+    triangle = np.linalg.qr(jacobian / scale, mode="r")
+    if np.linalg.cond(triangle) > 1e12:
+        return np.full((len(constants),) * 2, np.nan)
+    half = np.linalg.inv(triangle) / scale[:, None]
+    error = root * (curve(stretch) - stress)
+    return error @ error / freedom * (half @ half.T)
+
+
+def _constants(model: type[AbstractHyperelastic], curve: Curve) -> np.ndarray:
+    """Those of the material, in the order of its arguments."""
     c, further = curve.coefficients, curve.nonlinear
     if model is Ogden:
         order = np.argsort(further[c > 0])
         c, further = ((c / further)[c > 0][order], further[c > 0][order])
-    coefficients = (*c, *further)
-    bulk = bulk_modulus(real(shear_modulus(model, coefficients)), poisson_ratio)
-    return made_of(model, coefficients, bulk, density)
+    return np.concatenate([c, further])
+
+
+def _stress(model, curve: Curve, constants: np.ndarray, stretch: np.ndarray) -> np.ndarray:
+    """Engineering stress [Pa] of the incompressible bar with such constants."""
+    count = len(constants) - len(curve.nonlinear)
+    if model is Ogden:
+        count = len(constants) // 2
+    c, further = constants[:count], constants[count:]
+    return curve.columns(stretch, further) @ (c * further if model is Ogden else c)
 
 
 def modulus_at_rest(curve: Curve) -> float:
@@ -172,7 +216,10 @@ class TensileFit:
     scatter between repeats where all have data (root-mean-square standard deviation over
     root-mean-square mean, NaN for one repeat), and `stable_stretch` the uniaxial stretch
     at which the fitted stiffness turns negative (infinite if it never does below a
-    stretch of 20). `stability` has Drucker's criterion in three tests.
+    stretch of 20). `stability` has Drucker's criterion in three tests. `covariance` is that of
+    the fitted constants, in the order of the material's arguments, moduli in Pa: s^2 (J'J)^-1
+    of least squares, with s^2 the square error per degree of freedom, as if no constant were
+    at a bound; NaN where the points do not tell it.
     """
 
     material: Any
@@ -183,6 +230,7 @@ class TensileFit:
     spread: float
     num_repeats: int
     stability: Stability
+    covariance: Float[np.ndarray, "constants constants"]
 
 
 def fit_tensile(
@@ -233,7 +281,7 @@ def fit_tensile(
 
     Reference:
         Yeoh, Rubber Chem. Technol. 66, 1993; Ogden, Saccomandi and Sgura, Comput. Mech. 34,
-        2004.
+        2004; Seber and Wild, Nonlinear Regression, 1989, for the covariance.
     """
     checks.poisson_ratio("fit_tensile", poisson_ratio)
     need = _needed(model, terms)
@@ -257,6 +305,7 @@ def fit_tensile(
         spread=_spread(repeats),
         num_repeats=len(repeats),
         stability=drucker_stability(material, limit=max(3.0, 1.2 * float(1 + strains.max()))),
+        covariance=covariance_of(model, curve, 1 + strains, stresses, weight),
     )
     _check_stable(fit)
     return fit

@@ -80,6 +80,12 @@ SEEPS = {"threshold": 0.3, "sharpness": 6.0, "tight": 0.01, "remainder": 0.1}
 
 
 CASES = {
+    "propagate_covariance": Case(
+        lambda at: design.propagate_covariance(
+            lambda x: jnp.sin(x[0]) * x[1] ** 2, at[0], covariance=at[1] @ at[1].T, order=2
+        ),
+        (jnp.array([0.7, 1.3]), jnp.array([[0.2, 0.0], [0.1, 0.3]])),
+    ),
     "cone_filter": through(lambda: design.cone_filter(GRID, 0.6)),
     "factor of Simp": through(lambda: SIMP),
     "factor of Ramp": through(lambda: design.Ramp(8.0, 1e-3)),

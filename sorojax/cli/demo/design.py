@@ -221,12 +221,13 @@ def loop_of(
 ) -> systems.Network:
     """The angle of the tip of `body` follows `target`, by air through `valve`; with a `sensor`
     what that makes of the tip's position."""
-    seen = {"pid.measurement": "body.tip_angle"}
+    seen, sensors = {"pid.measurement": "body.tip_angle"}, {}
     if sensor is not None:
+        sensors = {"sensor": sensor}
         seen = {"sensor.a": "body.tip_position", "pid.measurement": "sensor.value"}
     return systems.Network(
-        blocks=({} if sensor is None else {"sensor": sensor})
-        | {
+        blocks={
+            **sensors,
             "target": target,
             "pid": pid,
             "valve": valve,

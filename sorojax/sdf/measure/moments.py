@@ -4,14 +4,13 @@ computed number itself.
 Smooth solids are measured by six-node triangles on the surface, to fourth order in the cell;
 plane shapes and solids with edges, narrow gaps or small fillets by cells that halve there. The
 grid moves with the bounding box, so a derivative needs only that of the field at fixed places
-of that frame, and agrees with finite differences at any resolution.
+of that frame, and agrees with finite differences at any resolution. Where the numbers of a
+shape are traced, `traced` counts the same cells in arrays of fixed size.
 """
 
-import functools
-import itertools
 import warnings
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,9 +18,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax._jax.trace_state import is_traced, is_tracer
 from sorojax._types import Numbers, real
 from sorojax.sdf.base import AbstractSdf
-from sorojax.sdf.measure import simplices as cut, simplices as six_node
+from sorojax.sdf.measure import simplices as cut, simplices as six_node, traced
+from sorojax.sdf.measure.cells import (
+    BENT,
+    LEVELS,
+    SHIFT,
+    STRAIGHT,
+    Rule,
+    differences_of,
+    frame,
+    halves_of,
+    lattice_of,
+    parts_of,
+    turn_of,
+)
 from sorojax.sdf.measure.simplices import turned
 from sorojax.sdf.query import shape_tangent
 from sorojax.sdf.sampling import finite_box, raise_empty, values
@@ -41,8 +54,6 @@ from sorojax.sdf.surface.marching import Surface, marching_cubes
 
 
 Field = Callable[[np.ndarray], np.ndarray]
-SHIFT = 0.3819660113  # cells; of the golden ratio: no face at a fraction falls on nodes
-_STRAIGHT, _BENT = 2e-3, 2e-2  # squared change of slope in a cell: kept as it is, halved
 _MOST = 1 << 20  # cells of one level
 _PIECE = 4096
 
@@ -80,44 +91,9 @@ class _Found(NamedTuple):
     doubt: list[float]
 
 
-@functools.cache
-def _lattice(dim: int) -> np.ndarray:
-    """The 3^dim nodes of a cell and its halves, in shares of its edge."""
-    return np.array(list(itertools.product((0.0, 0.5, 1.0), repeat=dim)))
-
-
-@functools.cache
-def _halves(dim: int) -> np.ndarray:
-    return np.array(list(itertools.product((0.0, 0.5), repeat=dim)))
-
-
-@functools.cache
-def _simplices(dim: int) -> tuple[np.ndarray, np.ndarray]:
-    """Simplices of the cell and of its halves as nodes, and the factor of each."""
-    stride = 3 ** np.arange(dim - 1, -1, -1)
-    corners = np.array(list(itertools.product((0, 1), repeat=dim)))
-    rows = cut.kuhn(dim)
-    coarse = (2 * corners @ stride)[rows]
-    fine = [((corners + start) @ stride)[rows] for start in corners]
-    factor = np.concatenate([np.full(len(rows), -1 / 3), np.full(len(rows) << dim, 4 / 3)])
-    return np.concatenate([coarse, *fine]), factor
-
-
-@functools.cache
-def _differences(dim: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows that take second and first differences along all lines of three nodes."""
-    unit = np.eye(3**dim).reshape(*dim * (3,), 3**dim)
-    second, first = [], []
-    for axis in range(dim):
-        a, b, c = np.moveaxis(unit, axis, 0)
-        second.append((a - 2 * b + c).reshape(-1, 3**dim))
-        first.append((c - a).reshape(-1, 3**dim))
-    return np.concatenate(second), np.concatenate(first)
-
-
 def bending(field: np.ndarray, dim: int) -> tuple[np.ndarray, np.ndarray]:
     """Squared second over squared first differences (n,), and its derivative (n, nodes)."""
-    second, first = _differences(dim)
+    second, first = differences_of(dim)
     bend, rise = field @ second.T, field @ first.T
     scale = np.maximum((rise * rise).sum(axis=1), 1e-300)
     ratio = (bend * bend).sum(axis=1) / scale
@@ -126,8 +102,8 @@ def bending(field: np.ndarray, dim: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _blend(ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    t = np.clip((ratio - _STRAIGHT) / (_BENT - _STRAIGHT), 0.0, 1.0)
-    return t * t * (3 - 2 * t), 6 * t * (1 - t) / (_BENT - _STRAIGHT)
+    t = np.clip((ratio - STRAIGHT) / (BENT - STRAIGHT), 0.0, 1.0)
+    return t * t * (3 - 2 * t), 6 * t * (1 - t) / (BENT - STRAIGHT)
 
 
 def first_level(
@@ -154,7 +130,7 @@ def first_level(
         total += moments.sum(axis=0)
         if edge == 1.0:
             break
-        low = (low[:, None] + edge * _halves(dim)).reshape(-1, dim)
+        low = (low[:, None] + edge * halves_of(dim)).reshape(-1, dim)
         edge /= 2
     return _sampled(field, low, edge, np.ones(len(low))), total
 
@@ -173,7 +149,7 @@ def _cull(field, reach, low, parent, edge, order):
 
 def _sampled(field: Field, low, edge, weight) -> Level:
     dim = low.shape[1]
-    points = low[:, None] + edge * _lattice(dim)
+    points = low[:, None] + edge * lattice_of(dim)
     return Level(low, edge, field(points.reshape(-1, dim)).reshape(len(low), 3**dim), weight)
 
 
@@ -198,14 +174,14 @@ def _counted(level: Level, order: int, slope: bool):
 def _pieces(level: Level, rows, order, slope):
     """As `_counted`, of cells with both signs."""
     dim = level.low.shape[1]
-    simplices, factor = _simplices(dim)
+    simplices, factor = parts_of(dim)
     f = level.field[rows][:, simplices]
     below = (f < 0).sum(axis=2)
     moments = np.zeros((len(rows), cut.count(dim, order)))
     steep = np.zeros((len(rows) * 3**dim, moments.shape[1]))
     for mask, whole in ((below == dim + 1, True), ((below > 0) & (below <= dim), False)):
         cell, kind = np.nonzero(mask)
-        corners = level.low[rows[cell], None] + level.edge * _lattice(dim)[simplices[kind]]
+        corners = level.low[rows[cell], None] + level.edge * lattice_of(dim)[simplices[kind]]
         if whole:
             found, sharp = cut.simplex_moments(corners, order)[1], None
         else:
@@ -261,7 +237,7 @@ def _descend(field, reach, level, levels, order, slope, out: _Found) -> np.ndarr
     inner = moments.copy()
     if len(bent):
         edge = level.edge / 2
-        low = (level.low[bent, None] + level.edge * _halves(dim)).reshape(-1, dim)
+        low = (level.low[bent, None] + level.edge * halves_of(dim)).reshape(-1, dim)
         low, parent, full = _cull(field, reach, low, np.repeat(bent, 1 << dim), edge, order)
         inner[bent] = full.reshape(len(bent), 1 << dim, -1).sum(axis=1)
         below = _sampled(field, low, edge, level.weight[parent] * share[parent])
@@ -280,7 +256,7 @@ def _keep(out: _Found, level: Level, rows, slopes) -> None:
     """Note the nodes of cells `rows` that have any of `slopes` (n, nodes, moments)."""
     dim = level.low.shape[1]
     cell, node = np.nonzero((slopes != 0).any(axis=2))
-    out.points.append(level.low[rows[cell]] + level.edge * _lattice(dim)[node])
+    out.points.append(level.low[rows[cell]] + level.edge * lattice_of(dim)[node])
     out.slopes.append(slopes[cell, node])
 
 
@@ -289,38 +265,22 @@ def _keep(out: _Found, level: Level, rows, slopes) -> None:
 
 _SMOOTH = 2e-2  # squared change of slope in a cell that six-node triangles follow
 _DOUBT = 1e-2  # of the volume within cells that may hide something
-_LEVELS = {2: 8, 3: 4}  # halvings of a cell where the field bends
 _ROWS = 1 << 12
-# Cells lie askew in space. All cells along an edge of a box would else be cut alike: what they
-# miss would add up, come and go with every cell the edge moves by, and spoil derivatives.
-_SPIN = np.array([[0.0, -0.31, 0.23], [0.31, 0.0, -0.17], [-0.23, 0.17, 0.0]])
-_TURN = np.linalg.solve(np.eye(3) - _SPIN, np.eye(3) + _SPIN)
-
-
-class Rule(NamedTuple):
-    """How to count, all of it fixed numbers: cells along the box, highest degree."""
-
-    where: str
-    resolution: int
-    order: int
-
-
-@eqx.filter_jit
-def frame(shape: AbstractSdf, resolution: int) -> tuple[Float[Array, " dim"], Float[Array, ""]]:
-    """Middle of the bounding box and cell size [m], differentiable."""
-    lower, upper = (jnp.asarray(c, dtype=jnp.result_type(float)) for c in shape.bounding_box())
-    return (lower + upper) / 2, jnp.max(upper - lower) / resolution
 
 
 @eqx.filter_custom_jvp
 def moments(shape: AbstractSdf, rule: Rule) -> Float[Array, " moments"]:
     """Moments of the inside in cells, about the middle of `frame`: see `cut_simplices`."""
+    if is_traced(shape):
+        return traced.counted(shape, rule)
     return jnp.asarray(_found(shape, rule, False).value, dtype=jnp.result_type(float))
 
 
 @moments.def_jvp
 def _moments_jvp(primals, tangents):
     shape, rule = primals
+    if is_traced(shape):
+        return _traced_jvp(shape, rule, tangents[0])
     found = _found(shape, rule, True)
     dtype = jnp.result_type(float)
     if not len(found.points):
@@ -331,6 +291,18 @@ def _moments_jvp(primals, tangents):
         lambda s: _weighted(s, points, weight, rule.resolution), shape, tangents[0]
     )
     return jnp.asarray(found.value, dtype=dtype), dot
+
+
+def _traced_jvp(shape: AbstractSdf, rule: Rule, shape_dot: Any) -> tuple[Array, Array]:
+    """Moments of a shape with traced numbers, and how they move with them."""
+    moving = jax.tree.map(lambda dot: dot is not None, shape_dot, is_leaf=lambda d: d is None)
+    varied, held = eqx.partition(shape, moving)
+    value, rows = traced.counted_with_rows(varied, held, rule)
+    dot = jnp.zeros_like(value)
+    pairs = zip(jax.tree.leaves(rows), jax.tree.leaves(shape_dot), strict=True)
+    for row, along in pairs:
+        dot = dot + row.reshape(len(value), -1) @ along.ravel()
+    return value, dot
 
 
 def _chunked(points: np.ndarray, slope: np.ndarray) -> tuple[Array, Array]:
@@ -366,7 +338,7 @@ def _found(shape: AbstractSdf, rule: Rule, slope: bool) -> Moments:
     lower, upper = finite_box(rule.where, shape, shape.dim)
     middle, size = (lower + upper) / 2, float((upper - lower).max()) / rule.resolution
 
-    turn = _TURN if shape.dim == 3 else np.eye(2)
+    turn = turn_of(shape.dim)
 
     def field(points):
         return values(shape, middle + size * points @ turn.T) / size
@@ -382,7 +354,7 @@ def _found(shape: AbstractSdf, rule: Rule, slope: bool) -> Moments:
     if shape.dim == 3 and bending(level.field, 3)[0].max(initial=0) <= _SMOOTH:
         found = _smooth(shape, rule, middle, size, upper - lower, slope)
     else:
-        found = integrate(field, reach, level, _LEVELS[shape.dim], rule.order, slope)
+        found = integrate(field, reach, level, LEVELS[shape.dim], rule.order, slope)
         back = turned(turn, rule.order)
         found = found._replace(
             value=back @ (found.value + full),
@@ -394,7 +366,7 @@ def _found(shape: AbstractSdf, rule: Rule, slope: bool) -> Moments:
     if found.doubt > _DOUBT * found.value[0]:
         warnings.warn(
             f"{rule.where}: details too fine for cells of {size:g} m, halved "
-            f"{_LEVELS[shape.dim]} times, fill {100 * found.doubt / found.value[0]:.2g} % of "
+            f"{LEVELS[shape.dim]} times, fill {100 * found.doubt / found.value[0]:.2g} % of "
             "the shape: the result may be off by as much. Raise `resolution`.",
             stacklevel=2,
         )
@@ -411,7 +383,9 @@ def _smooth(shape, rule, middle, size, extent, slope) -> Moments:
 # Volume, centroid and inertia of solid shapes, differentiable in their parameters
 
 
-def volume(shape: AbstractSdf, resolution: int = 128) -> Float[Array, ""]:
+def volume(
+    shape: AbstractSdf, resolution: int = 128, *, most_cells: int | None = None
+) -> Float[Array, ""]:
     """Volume of a solid shape, differentiable in its parameters.
 
     Smooth shapes are integrated over a closed surface of six-node triangles, to fourth order in
@@ -420,15 +394,19 @@ def volume(shape: AbstractSdf, resolution: int = 128) -> Float[Array, ""]:
     Warns where details finer than the smallest cells could change the result by 0.1 %.
 
     Args:
-        shape: A bounded solid shape, concrete: outside `jit`, inside `jax.grad` or `jax.jvp`.
-        resolution: Cells along the longest side of its bounding box, 8 to 1024.
+        shape: A bounded solid shape. Where its numbers are traced, by `jit` or `vmap`, smooth
+            solids are counted in cells too; what has no volume then is NaN, no error.
+        resolution: Cells along the longest side of its bounding box, 8 to 1024. Not traced.
+        most_cells: Where the shape is traced, cells that may hold surface, at most: memory is
+            laid out for them. If omitted, 16 for each cell of a face, and as for 128 at least;
+            the volume is NaN if there are more.
 
     Returns:
         The volume [m^3].
 
     Raises:
-        ValueError: If the shape is not solid, empty, unbounded or traced by `jit`, or if
-            `resolution` is out of range.
+        ValueError: If the shape is not solid, empty or unbounded; if `resolution` or
+            `most_cells` is traced or out of range.
 
     Example:
         >>> ball = sdf.Sphere([0, 0, 0], 10 * mm)
@@ -439,7 +417,7 @@ def volume(shape: AbstractSdf, resolution: int = 128) -> Float[Array, ""]:
         Min and Gibou, Geometric integration over irregular domains with application to
         level-set methods, J. Comput. Phys. 226, 2007, for the cut cells.
     """
-    rule = _rule("volume", shape, 3, resolution, 0)
+    rule = _rule("volume", shape, 3, resolution, 0, most_cells)
     return frame(shape, rule.resolution)[1] ** 3 * moments(shape, rule)[0]
 
 
@@ -452,7 +430,11 @@ def _middle_of_mass(
 
 
 def inertia_tensor(
-    shape: AbstractSdf, density: Numbers = 1.0, resolution: int = 128
+    shape: AbstractSdf,
+    density: Numbers = 1.0,
+    resolution: int = 128,
+    *,
+    most_cells: int | None = None,
 ) -> Float[Array, "3 3"]:
     """Moments of inertia [kg m^2] about the centroid, differentiable as `volume` is.
 
@@ -460,8 +442,9 @@ def inertia_tensor(
         shape: A bounded solid shape.
         density: Mass per volume [kg/m^3].
         resolution: Cells along the longest side of its bounding box.
+        most_cells: As in `volume`.
     """
-    rule = _rule("inertia_tensor", shape, 3, resolution, 2)
+    rule = _rule("inertia_tensor", shape, 3, resolution, 2, most_cells)
     size = frame(shape, rule.resolution)[1]
     return real(density) * _inertia(moments(shape, rule), size)
 
@@ -482,16 +465,32 @@ _INSTEAD = {
 }
 
 
-def _rule(where: str, shape: AbstractSdf, dim: int, resolution: int, order: int) -> Rule:
+def _rule(
+    where: str, shape: AbstractSdf, dim: int, resolution: int, order: int, most: int | None
+) -> Rule:
     if shape.dim != dim:
         raise ValueError(
             f"{where}: the shape is {shape.dim}-D, need {dim}-D. Use {_INSTEAD[dim]}."
         )
+    for name, given in (("resolution", resolution), ("most_cells", most)):
+        if is_tracer(given):
+            raise ValueError(
+                f"{where}: `{name}` is traced, need a whole number that is fixed when the "
+                "program is compiled. Leave it out of the arguments of jit, vmap and grad."
+            )
     if not 8 <= resolution <= 1024:
         raise ValueError(
             f"{where}: `resolution` is {resolution} cells, need 8 to 1024. 128 is usual."
         )
-    return Rule(where, int(resolution), order)
+    if most is None:
+        most = 16 * resolution * (1 if dim == 2 else max(resolution, 128))
+    if not 1 <= most <= 1 << 24:
+        raise ValueError(
+            f"{where}: `most_cells` is {most}, need 1 to {1 << 24}. Leave it out: "
+            "it is 16 for each cell along the box in the plane, on its face in space."
+        )
+    whole = -(-int(most) // traced.CHUNK) * traced.CHUNK
+    return Rule(where, dim, int(resolution), order, whole)
 
 
 # Area, centroid and second moments of plane shapes, differentiable in their parameters
@@ -500,7 +499,7 @@ def _rule(where: str, shape: AbstractSdf, dim: int, resolution: int, order: int)
 _CELLS = 512  # along the longest side; halved eight times at corners and narrow gaps
 
 
-def area(shape: AbstractSdf) -> Float[Array, ""]:
+def area(shape: AbstractSdf, *, most_cells: int | None = None) -> Float[Array, ""]:
     """Area of a plane shape, differentiable in its parameters.
 
     The integral over the cells that the boundary cuts, 512 along the longest side of the
@@ -508,13 +507,17 @@ def area(shape: AbstractSdf) -> Float[Array, ""]:
     number.
 
     Args:
-        shape: A bounded plane shape, concrete: outside `jit`, inside `jax.grad` or `jax.jvp`.
+        shape: A bounded plane shape. Where its numbers are traced, by `jit` or `vmap`, the
+            cells are the same; what has no area then is NaN, no error.
+        most_cells: Where the shape is traced, cells that may hold boundary, at most: memory is
+            laid out for them. 8192 if omitted; the area is NaN if there are more.
 
     Returns:
         The area [m^2].
 
     Raises:
-        ValueError: If the shape is not plane, empty, unbounded or traced by `jit`.
+        ValueError: If the shape is not plane, empty or unbounded, or `most_cells` is out of
+            range.
 
     Example:
         >>> plate = sdf.Rectangle([0, 0], [20 * mm, 10 * mm]) - sdf.Circle([0, 0], 5 * mm)
@@ -525,22 +528,23 @@ def area(shape: AbstractSdf) -> Float[Array, ""]:
         Min and Gibou, Geometric integration over irregular domains with application to
         level-set methods, J. Comput. Phys. 226, 2007.
     """
-    m = moments(shape, _rule("area", shape, 2, _CELLS, 0))
+    m = moments(shape, _rule("area", shape, 2, _CELLS, 0, most_cells))
     return frame(shape, _CELLS)[1] ** 2 * m[0]
 
 
-def centroid(shape: AbstractSdf) -> Float[Array, " dim"]:
-    """Centroid [m] of a shape, differentiable as `area` and, in space, `volume` are."""
-    rule = _rule("centroid", shape, shape.dim, _CELLS if shape.dim == 2 else 128, 1)
+def centroid(shape: AbstractSdf, *, most_cells: int | None = None) -> Float[Array, " dim"]:
+    """Centroid [m] of a shape, differentiable and traced as `area` and, in space, `volume`."""
+    cells = _CELLS if shape.dim == 2 else 128
+    rule = _rule("centroid", shape, shape.dim, cells, 1, most_cells)
     return _middle_of_mass(moments(shape, rule), *frame(shape, rule.resolution))
 
 
-def second_moments(shape: AbstractSdf) -> Float[Array, "2 2"]:
+def second_moments(shape: AbstractSdf, *, most_cells: int | None = None) -> Float[Array, "2 2"]:
     """Integral of r r^T over a plane shape, r from its centroid [m^4], as `area` is.
 
     Entry (0, 0) is that of x^2, which resists bending in x; the trace is the polar moment.
     """
-    m = moments(shape, _rule("second_moments", shape, 2, _CELLS, 2))
+    m = moments(shape, _rule("second_moments", shape, 2, _CELLS, 2, most_cells))
     return _second(m, frame(shape, _CELLS)[1])
 
 
