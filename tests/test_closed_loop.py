@@ -158,6 +158,7 @@ def off(slope, slopes):
     return float(np.max(np.abs(np.asarray(slope * NUMBERS) - slopes)) / np.abs(slopes).max())
 
 
+@pytest.mark.slow
 def test_both_modes_of_differentiation_give_the_slopes(start, first, slopes):
     def at(x):
         return turn(start, first, x)
@@ -240,6 +241,7 @@ def test_a_curve_outside_the_body_is_refused(start, first):
         run.time  # noqa: B018
 
 
+@pytest.mark.slow
 def test_modes_that_vanish_are_refused(start, first):
     with pytest.raises(ValueError, match="pod_basis: asked for 5 modes"):
         chain(start, START, modes={"kappa_z": 5})
