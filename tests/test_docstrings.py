@@ -29,7 +29,7 @@ VERBS = {
     "forward_kinematics inverse_kinematics operators piecewise_constant rod rollout tip_pose",
     "reduction": "identify pod_basis strain_along",
     "systems": "Network simulate simulate_batch simulate_sampled",
-    "design": "calibrate layout minimise minimise_shape propagate_covariance",
+    "design": "calibrate drawing_to_loop layout minimise minimise_shape propagate_covariance",
     "robots": "bellows_problem stepper",
     "io": "export_mesh import_surface load save",
     "view": "png show",

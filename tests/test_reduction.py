@@ -313,3 +313,8 @@ def test_a_rod_stands_where_the_solid_in_space_stands(beam_path):
         points = rod.forward_kinematics(body, q, backbone.s)[:, :3, 3]
         gap = jnp.linalg.norm(points - backbone.positions[-1], axis=1)
         assert jnp.max(gap) < error * sway
+
+
+def test_one_end_of_a_line_may_be_traced():
+    middle = jax.jacfwd(lambda end: reduction.Line([0.0, 0.0], end)(jnp.array([0.5]))[0])
+    np.testing.assert_array_equal(middle(jnp.array([2.0, 1.0])), 0.5 * np.eye(2))

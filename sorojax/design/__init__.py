@@ -3,6 +3,7 @@
 from sorojax._arguments import check_package as _check_package
 from sorojax.design.calibration.calibrate import calibrate
 from sorojax.design.calibration.calibration import Experiment, unidentifiable, validate
+from sorojax.design.closed_loop import drawing_to_loop
 from sorojax.design.density.filters import (
     cone_filter,
     greyness,
@@ -59,6 +60,7 @@ __all__ = [
     "darcy",
     "displacement",
     "displacement_along",
+    "drawing_to_loop",
     "flood",
     "graded",
     "greyness",

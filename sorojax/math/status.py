@@ -58,6 +58,18 @@ class Status(eqx.Enumeration):
         "The limit of events was reached. Raise `max_events`, or let the event rest: events "
         "that crowd together without end, as of a ball that comes to rest, need a threshold."
     )
+    tangled = (
+        "A cell of the moved mesh is inside out: the shape changes by more than the nodes of "
+        "its start mesh can follow. Change it less, or mesh the new shape."
+    )
+    outside_mesh = (
+        "A curve has left the cells that hold its samples. Move it back into the body, or "
+        "choose the cells anew."
+    )
+    too_few_states = (
+        "The states hold fewer independent strains than modes are asked for: what is left is "
+        "rounding. Ask for fewer modes, load further, or add states."
+    )
 
 
 class _Outcome(type(Status.successful)):  # pyright: ignore[reportGeneralTypeIssues]

@@ -46,7 +46,8 @@ class Line(AbstractCurve):
         do = "Give (x, y) in metres, or (x, y, z) in space."
         _check.shape("Line", "start", self.start, (dim,), do)
         _check.shape("Line", "end", self.end, (dim,), do)
-        if _check.is_concrete(self.start) and np.allclose(self.start, self.end, rtol=0, atol=0):
+        known = _check.is_concrete(self.start) and _check.is_concrete(self.end)
+        if known and np.array_equal(self.start, self.end):
             raise ValueError(
                 f"Line: `start` and `end` are both {np.asarray(self.start)} m. Give two points."
             )

@@ -19,6 +19,7 @@ NONE = {
         "minimise minimise_shape optimise_pneunet calibrate relax_to_minimum"
     ),
     "reports on a fit, on the host": "validate unidentifiable",
+    "a whole chain, compared by tests/test_closed_loop.py": "drawing_to_loop",
     "shapes and meshes of finished densities, on the host": "part reanalyse",
 }
 

@@ -217,10 +217,17 @@ def loop_of(
     pid: systems.PID,
     valve: systems.Regulator,
     body: systems.RodBody,
+    sensor: systems.Function | None = None,
 ) -> systems.Network:
-    """The angle of the tip of `body` follows `target`, by air through `valve`."""
+    """The angle of the tip of `body` follows `target`, by air through `valve`; with a `sensor`
+    what that makes of the tip's position."""
+    seen, sensors = {"pid.measurement": "body.tip_angle"}, {}
+    if sensor is not None:
+        sensors = {"sensor": sensor}
+        seen = {"sensor.a": "body.tip_position", "pid.measurement": "sensor.value"}
     return systems.Network(
         blocks={
+            **sensors,
             "target": target,
             "pid": pid,
             "valve": valve,
@@ -229,7 +236,7 @@ def loop_of(
         },
         wires={
             "pid.reference": "target.value",
-            "pid.measurement": "body.tip_angle",
+            **seen,
             "valve.setpoint": "pid.command",
             "valve.pressure": "air.pressure",
             "air.mass_flow": "valve.mass_flow",

@@ -151,7 +151,7 @@ def minimise_shape(
         follower.prepare(resume.step.design)
     remeshed, last = [], resume
 
-    def followed(function):
+    def moved(function):
         return lambda p: function(follower.problem(p), p)
 
     def after(step: DesignStep):
@@ -164,9 +164,9 @@ def minimise_shape(
             on_step(last)
 
     found = minimise(
-        followed(loss),
+        moved(loss),
         start,
-        constraints=tuple(map(followed, constraints)),
+        constraints=tuple(map(moved, constraints)),
         optimiser=optimiser,
         steps=steps,
         tolerance=tolerance,
@@ -218,13 +218,13 @@ class _Follower:
         """The problem with nodes moved to `parameters`; differentiable in them."""
         if not is_traced(parameters):
             self.prepare(parameters)
-        return _moved(self.base, self.drawing(parameters))
+        return followed(self.base, self.drawing(parameters))
 
     def _follows(self, parameters: PyTree) -> bool:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             try:
-                moved = _moved(self.base, self.drawing(parameters))
+                moved = followed(self.base, self.drawing(parameters))
             except (ValueError, UserWarning) as error:
                 if not str(error).startswith("move:"):
                     raise
@@ -232,7 +232,8 @@ class _Follower:
         return not bool(distortion(self.base.mesh, moved.mesh).remesh)
 
 
-def _moved(problem: Problem, drawing: Drawing) -> Problem:
+def followed(problem: Problem, drawing: Drawing) -> Problem:
+    """`problem` on its mesh with nodes moved to `drawing`; differentiable in the drawing."""
     shape, interfaces = _fields(drawing)
     points = move(problem.mesh, shape, interfaces=interfaces).points
     return eqx.tree_at(lambda p: p.mesh.points, problem, points)
