@@ -17,21 +17,12 @@ identification = sys.modules["sorojax.reduction.identify"]
 SHORT = {"step": 5e-4, "solver": systems.Rosenbrock2()}  # compiles in a quarter of the time
 
 
-def pneunet() -> loops.Loop:
+@pytest.mark.slow
+def test_every_number_from_drawing_to_controller_has_its_exact_slope():
+    """Of a PneuNet; `python -m benchmarks reduction.gradient` has two more robots."""
     wide = {"num_chambers": 2, "slot_width": 2 * mm, "chamber_width": 2 * mm}
     robot = loops.pneunet(2.5 * mm, 0.05, states=4, **wide)
-    return loops.Loop(robot, modes={"kappa_z": 2}, **SHORT)
-
-
-def finger() -> loops.Loop:
-    robot = loops.finger(2 * mm, 0.05, states=4, folds=2, order=1)
-    return loops.Loop(robot, modes={"kappa_y": 1}, **SHORT)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("make", [pneunet])
-def test_every_number_from_drawing_to_controller_has_its_exact_slope(make):
-    loop = make()
+    loop = loops.Loop(robot, modes={"kappa_z": 2}, **SHORT)
     assert loop.near.status == Status.successful
     assert len(loop.varied) >= 15
     assert loop.error(jax.grad(loop.cost)(loop.numbers)) < 1e-4

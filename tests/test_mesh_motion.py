@@ -91,3 +91,27 @@ def test_plane_quadrilaterals_follow_and_other_meshes_are_refused():
     cells = M.polymesher(sdf.Rectangle([0, 0], [1, 1]), 5, key=jax.random.key(0))
     with pytest.raises(ValueError, match="triangulate"):
         M.move(cells, sdf.Rectangle([0, 0], [1, 1]))
+
+
+def test_a_round_edge_that_ends_in_a_fillet_is_no_ridge():
+    """A node on it that counted as one moved otherwise than its derivative said, by 0.75."""
+
+    def shape(x):
+        zero, top = 0 * x[0], jnp.ones_like(x[0])
+        post = sdf.Box(jnp.stack([-x[0], -x[0], zero]), jnp.stack([x[0], x[0], 6 * top]))
+        low, high = (
+            jnp.stack([-x[0] - x[1], -0.9 * top, zero]),
+            jnp.stack([zero, 0.9 * top, 5 * top]),
+        )
+        return sdf.SmoothUnion(post, sdf.Box(low, high, x[2]), 0.8)
+
+    at, step = jnp.array([2.1, 1.1, 0.6]), 1e-5
+    solid = M.tetrahedralise(shape(at), size=0.8)
+
+    def points(x):
+        return M.move(solid, shape(x)).points
+
+    for way in step * jnp.eye(3):
+        slope = jax.jvp(points, (at,), (way,))[1]
+        difference = (points(at + way) - points(at - way)) / 2
+        assert float(jnp.abs(slope - difference).max()) < 0.01 * step

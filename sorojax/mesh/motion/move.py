@@ -17,7 +17,15 @@ from sorojax._types import integers, real
 from sorojax.mesh.elements.base import facet_corners, nodes as reference_nodes, shape_functions
 from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.mesh import Mesh, boundary_facets
-from sorojax.mesh.motion.boundary import ZOOMS, BoundaryPlan, Sides, meet, settle, slide
+from sorojax.mesh.motion.boundary import (
+    ZOOMS,
+    BoundaryPlan,
+    Sides,
+    meet,
+    normals_near,
+    settle,
+    slide,
+)
 from sorojax.mesh.motion.plan import (
     Harmonic,
     harmonic,
@@ -38,6 +46,7 @@ _FAR = 0.25  # of an edge: motion of a corner beyond which its sides may be take
 _ROUNDS = 5  # of taking nodes from ridges
 _NAMED = 24  # nodes at most of which the thinnest place is named
 _LOST = 0.5  # of the size: how far a sharp node may settle from where it is
+_ROUND = 0.9986  # cosine of 3 degrees: sides that meet at less are one, seen close by
 
 
 def movable(where: str, fields: tuple[AbstractSdf, ...], mesh: Mesh, size: Sizes) -> Mesh:
@@ -82,7 +91,18 @@ def _unsettled(fields: tuple[AbstractSdf, ...], mesh: Mesh, size: Sizes) -> np.n
     )
     found = settle(fields, x, sides, ZOOMS, np.asarray(plan.ridge), np.asarray(plan.tangent))
     off = np.linalg.norm(found - x, axis=1) / size(x)
-    return sharp[~(off < _LOST)]
+    return sharp[~(off < _LOST) | ~_meeting(fields, found, sides)]
+
+
+def _meeting(fields: tuple[AbstractSdf, ...], x: np.ndarray, sides: Sides) -> np.ndarray:
+    """Whether the sides of each point are more than one, seen from close by."""
+    normal = normals_near(fields, x, sides, ZOOMS[-3])[0]
+    mean = np.zeros_like(x)
+    np.add.at(mean, sides.point, normal)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
+    apart = np.ones(len(x))
+    np.minimum.at(apart, sides.point, (normal * mean[sides.point]).sum(axis=1))
+    return apart < _ROUND
 
 
 def check_followed(
