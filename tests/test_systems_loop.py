@@ -208,3 +208,16 @@ def test_a_run_that_fails_has_finite_derivatives_in_lanes_too():
     for name, slope in found.items():
         assert jnp.all(jnp.isfinite(slope)), name
         np.testing.assert_allclose(slope[0], alone[name], rtol=1e-9)
+
+
+def test_an_adaptive_run_has_second_derivatives():
+    def slope(stiffness):
+        run = {**NUMBERS, "stiffness": stiffness}
+        return jax.grad(ends_of)(run, S.Tsit5(), rtol=1e-9, atol=1e-11)["stiffness"]
+
+    at, h = NUMBERS["stiffness"], 1e-4
+    second = jax.jacfwd(slope)(at)
+    np.testing.assert_allclose(second, second.T, rtol=1e-6)
+    step = jnp.array([h, 0.0])
+    by_hand = (slope(at + step) - slope(at - step)) / (2 * h)
+    np.testing.assert_allclose(second[:, 0], by_hand, rtol=1e-6)

@@ -133,7 +133,9 @@ def _forward(perturbed, moving, plan):
     every = math.ceil(plan.max_steps / _CHECKPOINTS)
     ends = dfx.SubSaveAt(t0=True, steps=1, fn=lambda t, y, args: jnp.zeros(()))
     states = dfx.SubSaveAt(t0=True, steps=every)
-    solution = _solution(moving, plan, ends, states)
+    # plain loops, whose forward derivative makes second derivatives
+    plain = eqx.tree_at(lambda p: p.adjoint, plan, dfx.ForwardMode(), is_leaf=_is_none)
+    solution = _solution(moving, plain, ends, states)
     assert solution.ys is not None and solution.ts is not None
     run = _run(solution, plan)
     count = jnp.asarray(solution.stats["num_accepted_steps"], jnp.int32)
@@ -149,7 +151,7 @@ def _backward(residuals, changes, perturbed, moving: Moving, plan: Plan):
         lambda x, ct: jnp.zeros_like(x) if ct is None and eqx.is_inexact_array(x) else ct,
         run,
         changes,
-        is_leaf=lambda x: x is None,
+        is_leaf=_is_none,
     )
     replay = _Replay(moving, plan, wanted, held, times, changes, count)
     begin = _Pulled(
@@ -165,6 +167,10 @@ def _backward(residuals, changes, perturbed, moving: Moving, plan: Plan):
     number = -(-count // every)
     pulled = jax.lax.fori_loop(0, number, part, begin)
     return Moving(pulled.constants, pulled.state, pulled.time)
+
+
+def _is_none(leaf: Any) -> bool:
+    return leaf is None
 
 
 class _Pulled(NamedTuple):
