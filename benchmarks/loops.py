@@ -66,6 +66,19 @@ class Loop:
         return (8 * (at[1] - at[-1]) - (at[2] - at[-2])) / float(12 * STEP * self.numbers[k])
 
 
+def _following(end, unit: str, duration: float, pid, valve, sensor=None):
+    """From the body to its loop, whose target rises to `end` in 0.4 of the time."""
+    target = systems.Source(systems.SmoothRamp([0.0, 0.4 * duration], [0.0, end]), unit=unit)
+    return lambda body: loop_of(target, pid, valve, body, sensor)
+
+
+def _along(pressure: float, states: int, duration: float) -> dict[str, Any]:
+    """What all chains share, and the pressures of the path."""
+    air = jnp.linspace(0, pressure, states)
+    shared = {"damping": 0.02, "degree": min(5, states - 2), "save": 101}
+    return {"duration": duration, "air": air} | shared
+
+
 def bellows(size: float, duration: float, states: int = 11, **actuator: Any) -> Robot:
     """The bellows actuator of the demo with a PID on its tip angle."""
     first = robots.BellowsActuator(**actuator)
@@ -77,18 +90,13 @@ def bellows(size: float, duration: float, states: int = 11, **actuator: Any) -> 
 
     def run(actuator, law, valve, pid, **options: Any):
         middle = actuator.layer_thickness / 2
-        target = systems.SmoothRamp([0.0, 0.4 * duration], [0.0, -0.4])
         return design.drawing_to_loop(
             eqx.tree_at(lambda p: p.material.base, start, law),
             (actuator.body(), actuator.layer()),
             reduction.Line(*(jnp.stack([x, middle]) for x in (0 * middle, actuator.length))),
-            lambda body: loop_of(systems.Source(target, unit="rad"), pid, valve, body),
-            duration,
+            _following(-0.4, "rad", duration, pid, valve),
+            **_along(12 * kPa, states, duration),
             **options,
-            damping=0.02,
-            degree=min(5, states - 2),
-            save=101,
-            air=jnp.linspace(0, 12 * kPa, states),
         )
 
     return Robot((first, rubber, valve, pid), run, tracking, flat.num_cells, {"kappa_z": 3})
@@ -119,18 +127,13 @@ def pneunet(size: float, duration: float, states: int = 11, **dimensions: Any) -
     def run(pneunet, law, valve, pid, **options: Any):
         middle = pneunet.layer / 2
         turn = 0.6 * PNEUNET_TURN * pneunet.num_chambers
-        target = systems.SmoothRamp([0.0, 0.4 * duration], [0.0, turn])
         return design.drawing_to_loop(
             eqx.tree_at(lambda p: p.material.base, start, law),
             (pneunet.body(), layer_of(pneunet)),
             reduction.Line(*(jnp.stack([x, middle]) for x in (0 * middle, pneunet.length))),
-            lambda body: loop_of(systems.Source(target, unit="rad"), pid, valve, body),
-            duration,
+            _following(turn, "rad", duration, pid, valve),
+            **_along(4 * kPa, states, duration),
             **options,
-            damping=0.02,
-            degree=min(5, states - 2),
-            save=101,
-            air=jnp.linspace(0, 4 * kPa, states),
         )
 
     return Robot((first, rubber, valve, pid), run, tracking, flat.num_cells, {"kappa_z": 3})
@@ -177,19 +180,14 @@ def finger(
         x, zero = b.wall_thickness / 2 - b.outer_radius, 0 * b.cap
         foot = b.cap / 5  # the edge of the spine is round
         end = b.length - b.cap - b.pitch / 2 - finger.spine_thickness / 4
-        target = systems.SmoothRamp([0.0, 0.4 * duration], [0.0, 0.6 * FINGER_TIP])
         return design.drawing_to_loop(
             eqx.tree_at(lambda p: p.material, start, law),
             blended(finger),
             reduction.Line(jnp.stack([x, zero, foot]), jnp.stack([x, zero, end])),
-            lambda body: loop_of(systems.Source(target, unit="m"), pid, valve, body, sensor),
-            duration,
-            **options,
-            damping=0.02,
-            degree=min(5, states - 2),
+            _following(0.6 * FINGER_TIP, "m", duration, pid, valve, sensor),
             up=[1.0, 0.0, 0.0],
-            save=101,
-            air=jnp.linspace(0, FINGER_PRESSURE, states),
+            **_along(FINGER_PRESSURE, states, duration),
+            **options,
         )
 
     modes = {"kappa_y": 2, "sigma_x": 1}

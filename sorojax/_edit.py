@@ -123,3 +123,9 @@ def _is_same(old: Any, new: Any) -> bool:
     if before[1] != after[1]:
         return False
     return all(a is b for a, b in zip(before[0], after[0], strict=True))
+
+
+def without_derivatives(tree: Noun) -> Noun:
+    """The same noun, or tree, without derivatives."""
+    moving, rest = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(jax.lax.stop_gradient(moving), rest)

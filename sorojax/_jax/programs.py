@@ -216,7 +216,8 @@ def _content(constant: Any) -> Hashable:
 def _key(equation: Any, inputs: list[Any]) -> Hashable:
     """Equal for equations with equal results; None for those that are not compared."""
     inputs = [id(at) if isinstance(at, _Fixed) else at for at in inputs]
-    key = (equation.primitive, tuple(inputs), tuple(sorted(equation.params.items())))
+    params = tuple(sorted(equation.params.items()))
+    key = (equation.primitive, equation.ctx, tuple(inputs), params)
     with contextlib.suppress(TypeError):
         hash(key)
         return None if equation.effects else key

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax._display import displayed, number, outcome
+from sorojax._edit import without_derivatives
 from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax._types import Numbers
 from sorojax.design.optimise.shape_loop import Drawing, followed
@@ -27,7 +28,7 @@ from sorojax.mesh.quality import distortion
 from sorojax.reduction import AbstractCurve, Backbone, identify, pod_basis, strain_along
 from sorojax.reduction.backbone import probe
 from sorojax.reduction.identify import Fit
-from sorojax.reduction.pod import weights
+from sorojax.reduction.pod import RANK, weights
 from sorojax.rod import AbstractModes, Elastic, Rod, StrainBasis, elastic, rod
 from sorojax.systems import Network, Rodas4, RodBody, simulate
 from sorojax.systems.integrate.simulate import Trajectory as Motion
@@ -231,8 +232,8 @@ def drawing_to_loop(
         steps: Any = values
         path = solve_path(moved, newton=newton, throw=throw, **steps)
         yield "path", path.status, {"path": path}
-        held = None if near is None else near.backbone
-        backbone = strain_along(path, curve, near=held, **along)
+        before = None if near is None else near.backbone
+        backbone = strain_along(path, curve, near=before, **along)
         status = _curve_status(path.problem.mesh, curve, backbone, along)
         yield "curve", status, {"backbone": backbone}
         basis = pod_basis(backbone, modes=modes, within=within)
@@ -273,14 +274,14 @@ def _held_modes(mesh: Mesh, modes: dict, samples: int, near: Trajectory) -> dict
             f"drawing_to_loop: `near` has {seen} samples in a mesh of {cells} cells, need "
             f"{samples} in one of {mesh.num_cells}. Leave `near` out to choose anew."
         )
-    held = {name: of.count for name, of in near.basis.modes.items()}
-    wanted = {name: held.get(name) if isinstance(n, float) else n for name, n in modes.items()}
-    if wanted != held:
+    kept = {name: of.count for name, of in near.basis.modes.items()}
+    wanted = {name: kept.get(name) if isinstance(n, float) else n for name, n in modes.items()}
+    if wanted != kept:
         raise ValueError(
-            f"drawing_to_loop: got {modes} as modes, `near` has {held}, need the same. Leave "
+            f"drawing_to_loop: got {modes} as modes, `near` has {kept}, need the same. Leave "
             "`near` out to choose anew."
         )
-    return held
+    return kept
 
 
 # How the parts ended, of numbers without derivatives: at once where they are concrete.
@@ -297,7 +298,7 @@ _OUT = 0.5  # of the cell beside a sample
 
 
 def _curve_status(mesh: Mesh, curve, backbone: Backbone, along: dict) -> Status:
-    mesh, curve, backbone = _held((mesh, curve, backbone))
+    mesh, curve, backbone = without_derivatives((mesh, curve, backbone))
     with evaluated_now(mesh, curve, backbone):
         at = probe(mesh, curve, cells=backbone.cells, **along)
         corners = mesh.points[at.locations.nodes]
@@ -308,11 +309,10 @@ def _curve_status(mesh: Mesh, curve, backbone: Backbone, along: dict) -> Status:
 
 
 _STILL = 1e-9  # of a stretch, or of a turn over the length [rad]
-_RANK = 1e-10  # as `pod_basis` counts modes
 
 
 def _modes_status(backbone: Backbone, basis: StrainBasis) -> Status:
-    backbone = _held(backbone)
+    backbone = without_derivatives(backbone)
     with evaluated_now(backbone):
         root, enough = jnp.sqrt(weights(backbone.s))[None], True
         for name, of in basis.modes.items():
@@ -320,23 +320,18 @@ def _modes_status(backbone: Backbone, basis: StrainBasis) -> Status:
             size = jnp.linalg.svd(change, compute_uv=False)
             scale = backbone.length if name.startswith("kappa") else 1.0
             enough &= size[0] * scale > _STILL
-            enough &= size[of.count - 1] > _RANK * size[0]
+            enough &= size[of.count - 1] > RANK * size[0]
         return _unless(enough, Status.too_few_states)
 
 
 def _rod_status(fit: Fit) -> Status:
-    fit = _held(fit)
+    fit = without_derivatives(fit)
     with evaluated_now(fit):
         numbers = jax.tree.leaves(eqx.filter(fit, eqx.is_inexact_array))
         good = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in numbers]))
         stiff = jnp.linalg.eigvalsh(jnp.where(good, fit.elastic.stiffness, 0.0))[0] > 0
         unstable = _unless(stiff, Status.unstable_equilibrium)
         return Status.where(good, unstable, Status.not_finite)
-
-
-def _held(tree):
-    moving, rest = eqx.partition(tree, eqx.is_inexact_array)
-    return eqx.combine(jax.lax.stop_gradient(moving), rest)
 
 
 def _unless(good, otherwise: Status) -> Status:
@@ -370,7 +365,7 @@ def _elastic(problem: Problem) -> Elastic:
         return jnp.tensordot(share, x, 1) if per_cell else x
 
     rubber = jax.tree.map(mean, problem.material)
-    fixed = _held(rubber)
+    fixed = without_derivatives(rubber)
     with evaluated_now(fixed):
         made = elastic(fixed)
     return Elastic(made.young_modulus, made.poisson_ratio, rubber.density)

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sorojax._edit import without_derivatives
 from sorojax._jax.host_call import tell_host
 from sorojax._jax.trace_state import is_traced
 from sorojax.design.density.void import InterpolatedEnergy, interpolated_energy
@@ -251,8 +252,7 @@ class Follower:
         return solved_and_kept(problem, start, self.settings, throw=False)
 
     def _fallen(self, problem: Problem, start: np.ndarray, solution: Solution):
-        moving, rest = eqx.partition(problem, eqx.is_inexact_array)
-        here = eqx.combine(jax.lax.stop_gradient(moving), rest)
+        here = without_derivatives(problem)
         if is_traced((here, solution.load_fraction)):
             return solution, None
         u, stable = relax_to_minimum(here, start)

@@ -17,6 +17,9 @@ from sorojax.reduction.backbone import PLANAR, Backbone
 from sorojax.rod import AbstractModes, StrainBasis, orthonormalise
 from sorojax.rod.model.basis import STRAINS, Combined, SampledModes, columns
 
+#: Of the largest singular value: what a further mode has at least.
+RANK = 1e-10
+
 
 def weights(s: Float[Array, " samples"]) -> Float[Array, " samples"]:
     """Trapezoidal weights of samples in [0, 1]."""
@@ -124,7 +127,7 @@ def _count(name: str, wanted: int | float, root, values, snapshots) -> int:
     values, snapshots = root[:, None] * values, root[:, None] * snapshots
     coefficients = np.linalg.lstsq(values, snapshots, rcond=None)[0]
     left, size, right = np.linalg.svd(coefficients, full_matrices=False)
-    rank = int(np.sum(size > 1e-10 * max(size[0], 1e-300)))
+    rank = int(np.sum(size > RANK * max(size[0], 1e-300)))
     if isinstance(wanted, float) and 0 < wanted < 1:
         return _enough(name, wanted, snapshots, values @ left, size[:, None] * right)
     if not is_number or wanted < 1 or wanted > rank:

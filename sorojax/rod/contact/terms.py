@@ -4,11 +4,11 @@ forces, for steppers."""
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from sorojax._edit import without_derivatives
 from sorojax.math.ode.steppers import ContactTerms
 from sorojax.rod.contact.obstacle import (
     AbstractTouching,
@@ -49,7 +49,7 @@ def passed_by(
 ) -> Bool[Array, ""]:
     """Whether in a step of `h` [s] one body of a contact went through the other, at one test
     if they are far."""
-    contact = still(contact)
+    contact = without_derivatives(contact)
     is_near = contact.is_near(*before, h) | contact.is_near(*after, h)
     return jax.lax.cond(
         is_near, lambda: contact.passed(before, after), lambda: jnp.zeros((), bool)
@@ -58,12 +58,6 @@ def passed_by(
 
 def any_of(flags: Sequence[Array]) -> Bool[Array, ""]:
     return jnp.any(jnp.stack(flags))
-
-
-def still(tree: Any) -> Any:
-    """`tree` without derivatives."""
-    numbers, rest = eqx.partition(tree, eqx.is_inexact_array)
-    return eqx.combine(jax.lax.stop_gradient(numbers), rest)
 
 
 def contacts_of(
@@ -123,23 +117,23 @@ def contacts_of(
         return mass, total_force(plain, t, moment) - coriolis, moment
 
     def passed(before, after, h):
-        ends = still((at(*before), at(*after)))
+        ends = without_derivatives((at(*before), at(*after)))
         rows = every(lambda contact, *ends: passed_by(contact, h, *ends), *map(bodies, ends))
         return any_of(rows)
 
     def energy(q, v, near):
-        moment = still(at(q, v))
+        moment = without_derivatives(at(q, v))
         mass, _ = inertia(moment)
 
         def stored():
             rows = every(lambda contact, own: contact.stored(*own), bodies(moment))
-            return still(total(rows))
+            return without_derivatives(total(rows))
 
         in_contacts = jax.lax.cond(near, stored, lambda: jnp.zeros((), q.dtype))
-        return still(v @ mass @ v / 2), in_contacts
+        return without_derivatives(v @ mass @ v / 2), in_contacts
 
     def others(t, q, v):
-        return still(total_force(plain, t, at(q, v)))
+        return without_derivatives(total_force(plain, t, at(q, v)))
 
     grips = any(contact.grips for contact in contacts)
     return ContactTerms(free, near, force, passed, energy, others, not grips)

@@ -12,6 +12,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from sorojax._edit import without_derivatives
 from sorojax._jax.programs import split
 from sorojax.math import host
 from sorojax.math.ode.explicit import AbstractMethod
@@ -169,7 +170,7 @@ def adaptive(
     moving = Moving(constants, flat, jnp.maximum(time, start))
     plain = adjoint is None and free and not dense and seam is None
     own = plain and isinstance(solver, AbstractMethod)
-    run = replayed(moving, _held(plan)) if own else solved(moving, plan)
+    run = replayed(moving, without_derivatives(plan)) if own else solved(moving, plan)
     last = run.last
     saved = jnp.isfinite(run.instants)
     path = jnp.where(saved[:, None], run.path, last)
@@ -192,12 +193,6 @@ def adaptive(
         run.dense,
         Resume(run.seam, run.memory) if free else None,
     )
-
-
-def _held(tree: PyTree) -> PyTree:
-    """The same without derivatives."""
-    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
-    return eqx.combine(jax.lax.stop_gradient(arrays), rest)
 
 
 def _meter(progress: bool | str, start, far, end) -> dfx.AbstractProgressMeter:

@@ -132,7 +132,7 @@ class Walk(NamedTuple):
 
 
 def as_tree(unravel: Unravel, state: PyTree) -> PyTree:
-    """A state that `as_vector` gave as the tree that it was."""
+    """A state that `rate_of` gave as the tree that it was."""
     return state if unravel is None else unravel(state)
 
 

@@ -131,8 +131,8 @@ def simulate(
         max_steps: Limit of adaptive steps.
         events: Ends of the run, and resets of its state; none by default.
         max_events: Most resets.
-        adjoint: How diffrax differentiates; by default reverse mode with checkpoints.
-            `diffrax.ForwardMode()` for derivatives in a few parameters.
+        adjoint: How diffrax differentiates; by default in reverse, by the accepted steps
+            once more. `diffrax.ForwardMode()` for derivatives in a few parameters.
         dense: Keep the continuous solution, for `state_at`; takes memory by `max_steps`.
         progress: Report progress while running, which costs a little.
         resume: A run to go on from, with the state and the time of its end. Two halves
