@@ -115,3 +115,19 @@ def test_a_round_edge_that_ends_in_a_fillet_is_no_ridge():
         slope = jax.jvp(points, (at,), (way,))[1]
         difference = (points(at + way) - points(at - way)) / 2
         assert float(jnp.abs(slope - difference).max()) < 0.01 * step
+
+
+def test_a_round_chamber_takes_its_nodes_along():
+    """Nothing sharp holds them, and no side may be stretched while another is squeezed."""
+
+    def block(x):
+        chamber = sdf.Rectangle([x - 0.6, 0.5], [x + 0.6, 1.5], 0.3)
+        return sdf.Rectangle([0, 0], [4, 2]) - chamber
+
+    cells = M.triangulate(block(jnp.array(2.0)), size=0.2)
+    moved = M.move(cells, block(jnp.array(2.1)))
+    x = np.asarray(cells.points)
+    inner = np.all(np.abs(x - [2.0, 1.0]) < [0.61, 0.51], axis=1)
+    shift = np.asarray(moved.points - cells.points)[inner]
+    assert len(shift) > 15
+    assert np.abs(shift - [0.1, 0.0]).max() < 0.01

@@ -28,6 +28,7 @@ from sorojax.mesh.motion.boundary import (
 )
 from sorojax.mesh.motion.plan import (
     Harmonic,
+    carried,
     harmonic,
     laplace_cells,
     laplace_graph,
@@ -152,10 +153,11 @@ def move(mesh: Mesh, shape: AbstractSdf, *, interfaces: tuple[AbstractSdf, ...] 
     """`mesh` with its nodes moved to fit `shape`, differentiable in the parameters of `shape`.
 
     Corners move to where their sides meet, nodes on the ridges of a solid stay on both
-    sides, the others move along the normal of `mesh` from a place between the shifted
-    corners. Interior nodes follow by one Laplace solve with the stiffness of `mesh`;
-    straight sides stay straight. A mesh moved to its own shape stays as it is. Derivatives are
-    those of the implicit function f(x) = 0 on the boundary.
+    sides. The others move along the normal of `mesh` onto the surface, and along it so that
+    the sides between them change least: round parts are carried along. Interior nodes follow
+    by one Laplace solve with the stiffness of `mesh`; straight sides stay straight. A mesh
+    moved to its own shape stays as it is. Derivatives are those of the implicit function
+    f(x) = 0 on the boundary.
 
     The topology does not change: corners may move by a quarter of the edges beside them
     from where they are in `mesh`, and normals turn by less than a right angle. Outside a
@@ -228,6 +230,8 @@ class _Motion(eqx.Module):
     border: BoundaryPlan
     ridges: Harmonic | None
     surface: Harmonic | None
+    along: Harmonic | None
+    frames: Float[Array, "nodes dim dim"] = eqx.field(converter=real)
     inside: Harmonic | None
     middles: Int[Array, " middles"] = eqx.field(converter=integers)
     parents: Int[Array, "middles corners"] = eqx.field(converter=integers)
@@ -248,11 +252,33 @@ def moved_points(
     shift = _shift(motion, points, sharp)
     if motion.surface is not None:
         shift = _follow(motion, spread(motion.surface, shift))
-    landed = slide(fields, border, _beside(motion, points, shift))
-    shift = boundary = _boundary_shift(motion, points, sharp, landed)
+    shift = _landed(motion, fields, points, sharp, shift)
+    if motion.along is not None:
+        shift = _turned_back(motion, spread(motion.along, _turned(motion, shift)))
+        shift = _landed(motion, fields, points, sharp, shift)
+    boundary = shift
     if motion.inside is not None:
         shift = spread(motion.inside, shift)
     return _put(motion, points, shift, boundary)
+
+
+def _landed(motion: _Motion, fields, points, sharp, shift):
+    """Shifts of the boundary from beside it to the surface."""
+    landed = slide(fields, motion.border, _beside(motion, points, shift))
+    return _boundary_shift(motion, points, sharp, landed)
+
+
+@eqx.filter_jit
+def _turned(motion: _Motion, shift):
+    """Components of a shift in the frames of the nodes, one after the other."""
+    return jnp.einsum("nki,ni->nk", motion.frames, shift).reshape(-1, 1)
+
+
+@eqx.filter_jit
+def _turned_back(motion: _Motion, components):
+    """The shift with such components, that of mid-side nodes interpolated."""
+    components = components.reshape(motion.frames.shape[:2])
+    return _follow(motion, jnp.einsum("nki,nk->ni", motion.frames, components))
 
 
 @eqx.filter_jit
@@ -303,6 +329,7 @@ def _motion(mesh: Mesh, num_interfaces: int) -> _Motion:
         ridges = harmonic(plan.ridges, laplace_graph(points, plan.ridges), known)
     known[np.asarray(plan.plan.sharp)] = True
     surface = harmonic(plan.faces, laplace_graph(points, plan.faces), known)
+    along, frames = carried(points, plan)
     for own in plan.plan.fields:
         known[np.asarray(own.nodes)] = True
     corners = cells[:, : element.num_corners]
@@ -312,9 +339,8 @@ def _motion(mesh: Mesh, num_interfaces: int) -> _Motion:
     cell, column = np.divmod(place, max(others.shape[1], 1))
     share = shape_functions(linear, reference_nodes(element)[element.num_corners :])
     bent = middles[known[middles]]
-    return _Motion(
-        plan.plan, ridges, surface, inside, middles, corners[cell], share[column], bent
-    )
+    follows = (middles, corners[cell], share[column], bent)
+    return _Motion(plan.plan, ridges, surface, along, frames, inside, *follows)
 
 
 _recent: OrderedDict[tuple[int, int, int], Any] = OrderedDict()

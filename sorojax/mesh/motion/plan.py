@@ -157,6 +157,38 @@ def laplace_graph(points: np.ndarray, polygons: np.ndarray) -> np.ndarray:
     return total
 
 
+def carried(points: np.ndarray, plan: "Border") -> tuple[Harmonic | None, np.ndarray]:
+    """How nodes go along the surface where they are given across it, and their frames.
+
+    Of all displacements u with the given n . u at smooth nodes and the given u at sharp ones,
+    the one whose differences along the sides of facets are least: a part that moves without
+    changing its form is carried along. The unknowns are components of u in the `frames`
+    (nodes, dim, dim) of the nodes, whose first row is the normal.
+    """
+    count, dim = points.shape
+    frames = np.broadcast_to(np.eye(dim), (count, dim, dim)).copy()
+    held = np.ones((count, dim), bool)
+    for own in plan.plan.fields:
+        nodes = np.asarray(own.nodes)
+        frames[nodes] = _frames(np.asarray(own.normal))
+        held[nodes, 1:] = False
+    faces = plan.faces
+    turned = np.einsum("faki,fbli->fakbl", frames[faces], frames[faces])
+    stiffness = laplace_graph(points, faces)[:, :, None, :, None] * turned
+    size = faces.shape[1] * dim
+    unknowns = (dim * faces[:, :, None] + np.arange(dim)).reshape(-1, size)
+    return harmonic(unknowns, stiffness.reshape(-1, size, size), held.ravel()), frames
+
+
+def _frames(normal: np.ndarray) -> np.ndarray:
+    """Orthonormal rows, the first of which are unit `normal`s."""
+    if normal.shape[1] == 2:
+        return np.stack([normal, normal[:, ::-1] * [-1.0, 1.0]], axis=1)
+    least = np.eye(3)[np.abs(normal).argmin(axis=1)]
+    first = unit(np.cross(normal, least))
+    return np.stack([normal, first, np.cross(normal, first)], axis=1)
+
+
 # Sides between the facets of a surface: which are sharp, and the patches they bound
 
 
