@@ -224,12 +224,12 @@ def chunked_lanes(verb: Verb) -> Verb:
 
         # A rule gives what a function closes over no derivative, without an error.
         closed = eqx.filter_closure_convert(whole, arrays)
-        leaves, tree = jax.tree.flatten((arrays, eqx.filter(closed, _is_traced)))
-        rest_closed = eqx.filter(closed, _is_traced, inverse=True)
+        known, traced = eqx.partition(closed, _check.is_concrete)
+        leaves, tree = jax.tree.flatten((arrays, traced))
 
         def plain(*leaves: Array) -> Any:
             arrays, traced = jax.tree.unflatten(tree, leaves)
-            return eqx.combine(traced, rest_closed)(arrays)
+            return eqx.combine(known, traced)(arrays)
 
         lanes = jax.custom_batching.custom_vmap(plain)
 
@@ -251,10 +251,6 @@ def chunked_lanes(verb: Verb) -> Verb:
         return outer(*leaves)
 
     return call  # type: ignore[return-value]
-
-
-def _is_traced(value: Any) -> bool:
-    return isinstance(value, jax.core.Tracer)
 
 
 def _in_every_lane(found: Any, values: tuple[Array, ...]) -> Any:
