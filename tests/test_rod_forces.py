@@ -143,8 +143,8 @@ def test_a_tension_that_closes_over_numbers_has_their_derivative_in_motions(arc)
     def end(pull):
         tendon = R.Tendons(ROUTES[0], lambda t: pull * jnp.minimum(t / 2e-3, 1.0))
         rest = jnp.zeros(1)
-        run = dict(step=1e-3, saves=4, check=False)
-        return R.rollout(arc, rest, rest, (tendon,), **run).q[-1, 0]
+        path = R.rollout(arc, rest, rest, (tendon,), step=1e-3, saves=4, check=False)
+        return path.q[-1, 0]
 
     def total(pulls):
         ends = jax.vmap(end)(pulls)
