@@ -4,8 +4,10 @@ import re
 
 import diffrax as dfx
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
+import sorojax as sj
 from tests.scripts import ROOT, main_of, user_code
 
 
@@ -23,6 +25,38 @@ def test_a_tendon_finger_closes_on_a_ball():
     assert pull == pytest.approx(0.2 * 150 / bent, rel=0.01)
     assert 80 < numbers["tip angle around the ball [deg]"] < 110
     assert 0 < numbers["overlap over thickness [%]"] < 0.5
+
+
+@pytest.mark.slow
+def test_a_finger_and_its_tensions_are_better_found_together():
+    main = main_of("32_codesign_tendon")
+    numbers = main(quick=True)
+    ways = ("start", "body alone", "in turn", "together")
+    costs = [numbers[f"{way}: median cost [mm^2]"] for way in ways]
+    assert costs == sorted(costs, reverse=True)
+    assert numbers["better together"] == 2
+    assert numbers["motions that ended well"] == 8
+    _check_slopes(main.__globals__["total"])
+    assert user_code("32_codesign_tendon") <= 60
+
+
+def _check_slopes(total):
+    """Along one direction of the bodies, and along one of the tensions."""
+    random = np.random.default_rng(0)
+    shapes = {"radii": (2, 2), "places": (2, 2, 2, 2), "pull": (2, 6, 2)}
+    design = {k: jnp.asarray(random.uniform(0.2, 0.8, shape)) for k, shape in shapes.items()}
+    way = {k: jnp.asarray(random.normal(size=shape)) for k, shape in shapes.items()}
+    seen = []  # by the program that the example has compiled already
+    sj.design.minimise(
+        total, design, steps=1, change_gradient=lambda _, slope: seen.append(slope) or slope
+    )
+    for part in (("radii", "places"), ("pull",)):
+        ahead, behind = (
+            total({k: x + h * way[k] * float(k in part) for k, x in design.items()})
+            for h in (1e-5, -1e-5)
+        )
+        slope = sum(jnp.sum(seen[0][k] * way[k]) for k in part)
+        assert float(slope) == pytest.approx(float(ahead - behind) / 2e-5, rel=1e-6)
 
 
 def test_the_readme_says_how_programs_are_kept_for_the_next_run():

@@ -183,6 +183,32 @@ def test_lanes_in_chunks_and_their_derivatives(count):
 
 @pytest.mark.versions
 @pytest.mark.stress(92)
+@pytest.mark.parametrize("change", [lambda f: f, jax.jit], ids=["plain", "jit"])
+@pytest.mark.parametrize("lanes", [False, True])
+def test_lanes_of_what_a_function_closes_over_have_their_derivative(change, lanes):
+    """Of two results only one depends on it; there are as many lanes as numbers in each."""
+
+    def pair(force, x):
+        return force(x), jnp.outer(x, x)
+
+    def total(verb, a, x):
+        push, square = verb(lambda x: a * jnp.sin(x), x)
+        return jnp.sum(jnp.cumsum(square @ push))
+
+    def all_of(verb, a, x):
+        one = functools.partial(total, verb)
+        return jnp.sum(jax.vmap(jax.jit(one), (0, None))(a, x) ** 2) if lanes else one(a[0], x)
+
+    a, x = jnp.asarray([0.5, -1.0, 2.0]), jnp.asarray([0.3, 0.7, 1.1])
+    found, want = (
+        change(jax.grad(functools.partial(all_of, verb), argnums=(0, 1)))(a, x)
+        for verb in (chunked_lanes(pair), pair)
+    )
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-13), found, want)
+
+
+@pytest.mark.versions
+@pytest.mark.stress(92)
 @pytest.mark.parametrize(
     ("call", "shared", "own"),
     [

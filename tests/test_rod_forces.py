@@ -137,6 +137,24 @@ def test_a_straight_tendon_bends_to_constant_curvature(arc):
     assert np.isclose(slope, 2.0 / bending(arc), rtol=1e-9, atol=0)
 
 
+def test_a_tension_that_closes_over_numbers_has_their_derivative_in_motions(arc):
+    """The tension is linear in the numbers, and so is a short motion."""
+
+    def end(pull):
+        tendon = R.Tendons(ROUTES[0], lambda t: pull * jnp.minimum(t / 2e-3, 1.0))
+        rest = jnp.zeros(1)
+        path = R.rollout(arc, rest, rest, (tendon,), step=1e-3, saves=4, check=False)
+        return path.q[-1, 0]
+
+    def total(pulls):
+        ends = jax.vmap(end)(pulls)
+        return jnp.sum(ends), ends
+
+    pulls = jnp.array([0.01, 0.02])
+    slopes, ends = jax.jit(jax.grad(total, has_aux=True))(pulls)
+    assert jnp.allclose(slopes, ends / pulls, rtol=1e-3)
+
+
 def test_friction_takes_tension_as_on_a_capstan(arc):
     curvature, mu = 20.0, 0.3
 

@@ -218,10 +218,18 @@ def chunked_lanes(verb: Verb) -> Verb:
     @functools.wraps(verb)
     def call(*args: Any) -> Any:
         arrays, rest = eqx.partition(args, eqx.is_array)
-        leaves, tree = jax.tree.flatten(arrays)
+
+        def whole(arrays: Any) -> Any:
+            return verb(*eqx.combine(arrays, rest))
+
+        # A rule gives what a function closes over no derivative, without an error.
+        closed = eqx.filter_closure_convert(whole, arrays)
+        known, traced = eqx.partition(closed, _check.is_concrete)
+        leaves, tree = jax.tree.flatten((arrays, traced))
 
         def plain(*leaves: Array) -> Any:
-            return verb(*eqx.combine(jax.tree.unflatten(tree, leaves), rest))
+            arrays, traced = jax.tree.unflatten(tree, leaves)
+            return eqx.combine(known, traced)(arrays)
 
         lanes = jax.custom_batching.custom_vmap(plain)
 
@@ -234,11 +242,26 @@ def chunked_lanes(verb: Verb) -> Verb:
             found = batched(one)(moving) if count > 2 * CHUNK else jax.vmap(one)(moving)
             return found, jax.tree.map(lambda _: True, found)
 
+        def rule(values: tuple[Array, ...], rates: tuple[Any, ...]) -> Any:
+            found, rate = jax.jvp(plain, values, rates)
+            return _in_every_lane(found, values), rate
+
         outer = jax.custom_jvp(lanes)
-        outer.defjvp(lambda values, rates: jax.jvp(plain, values, rates))
+        outer.defjvp(rule)
         return outer(*leaves)
 
     return call  # type: ignore[return-value]
+
+
+def _in_every_lane(found: Any, values: tuple[Array, ...]) -> Any:
+    """`found`, with the lanes of `values` in all its arrays.
+
+    A function with a rule and that rule must have lanes in the same arrays: where they do not,
+    JAX (0.10.2 was tried) takes one axis for another.
+    """
+    firsts = (x[(0,) * x.ndim] for x in values if x.size)
+    never = functools.reduce(jnp.logical_or, (x > x for x in firsts))
+    return jax.tree.map(lambda x: x + never.astype(x.dtype), found)
 
 
 def _check_counts(arrays: Any) -> None:
