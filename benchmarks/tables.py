@@ -67,11 +67,12 @@ def scaling(lines: list[Line], seconds: Callable[[float | None], str]) -> str:
         told = line["settings"]
         if "against" not in told:
             return ""
-        exponent, memory = told.get("exponent"), told.get("peak_MB")
+        exponent, expected, memory = map(told.get, ("exponent", "expected", "peak_MB"))
         body.append((
             escape(told["method"]), f"{told[told['against']]} {escape(told['against'])}",
             seconds(line["compile_s"]), seconds(line["run_s"]),
-            "-" if exponent is None else f"{exponent:.2f}", f"{told['expected']:.3g}",
+            "-" if exponent is None else f"{exponent:.2f}",
+            "-" if expected is None else f"{expected:.3g}",
             "-" if memory is None else f"{memory:.3g} MB",
         ))  # fmt: skip
     head = ("what", "size", "compile", "run", "observed exponent", "expected", "peak memory")

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import devices, discover
+from benchmarks import devices, discover, page, rows
 from benchmarks.blocks import bent, block
 from benchmarks.fingers import finger, random_states
 from benchmarks.single import narrow
@@ -119,3 +119,20 @@ def test_motion_in_single_precision_stays_single():
     assert paths[0].q.dtype == paths[0].time.dtype == jnp.float32
     scale = jnp.abs(paths[1].q).max()
     assert jnp.abs(paths[0].q.astype(jnp.float64) - paths[1].q).max() < 1e-4 * scale
+
+
+def test_bodies_have_every_row_and_a_page():
+    """What an accelerator is compared in, by the CPU alone."""
+    case = discover.load("device.fem", discover.cases()["device.fem"])
+    small = block(mesh.Quad4(), (3, 3), fem.Displacement())
+    told = list(case._rows(devices.found()[0], small, {}))
+    assert [row.settings["method"].split(",")[0] for row in told] == [
+        "tangent",
+        "product",
+        "product of a stored matrix",
+        "linear system",
+        "equilibrium",
+    ]
+    assert all(row.holds is not False for row in told)
+    text = page.html([rows.line("device.fem", row) for row in told], {}, [])
+    assert text.count("<tr>") > len(told)

@@ -131,3 +131,39 @@ def test_a_round_chamber_takes_its_nodes_along():
     shift = np.asarray(moved.points - cells.points)[inner]
     assert len(shift) > 15
     assert np.abs(shift - [0.1, 0.0]).max() < 0.01
+
+
+def notched(v):
+    """A block with a notch, open above, and a chamber below it."""
+    width, height, depth = v
+    block = sdf.Rectangle([0, 0], jnp.stack([width, height]))
+    notch = sdf.Rectangle(
+        jnp.stack([width / 2 - 0.4, height - depth]),
+        jnp.stack([width / 2 + 0.4, height + 1.0]),
+        0.2,
+    )
+    chamber = sdf.Circle(jnp.stack([width / 2, 0.5 + 0 * width]), 0.3)
+    return block - notch - chamber
+
+
+def test_nodes_go_far_through_drawings_in_between():
+    start, end = np.array([4.0, 2.0, 0.7]), np.array([4.6, 2.3, 0.9])
+    cells = M.triangulate(notched(start), size=0.25, order=2)
+    far = functools.partial(M.move, cells, before=notched(start), stages=8)
+    moved = far(notched(end))
+    outline = np.asarray(moved.points)[np.unique(M.boundary_facets(moved))]
+    assert np.abs(np.asarray(notched(end)(outline))).max() < 1e-9
+    assert M.distortion(cells, moved).shape_ratio > 0.6
+    assert np.sum(M.cell_areas(moved)) == pytest.approx(
+        4.6 * 2.3 - 0.72 - 0.09 * np.pi, rel=0.01
+    )
+
+    def moment(v):  # of the areas, which knows where each node went
+        new = far(notched(v))
+        x = jnp.mean(new.points[new.cells], axis=1)
+        weights = jnp.arange(cells.num_cells) / cells.num_cells
+        return jnp.sum(weights * M.cell_areas(new) * (x[:, 0] + x[:, 1] ** 2))
+
+    slopes_agree(moment, end)
+    with pytest.raises(ValueError, match="another kind of drawing"):
+        far(notched(end) - sdf.Circle([0.5, 0.5], 0.1))

@@ -93,7 +93,7 @@ def _rows(device, problem, exact):
             reference="CPU" if exact else "",
         )
     system = iterating(problem).space.system
-    held = constrain(system, values, force, prepared.known, jnp.zeros_like(force))
+    held = constrain(system, values, force, prepared.known)
 
     def missed(x):
         left = sparse.product(system, held[0], x) - held[1]

@@ -126,6 +126,8 @@ def drawing_to_loop(
     modes: dict[str, int] | dict[str, float],
     damping: Numbers,
     near: Trajectory | None = None,
+    before: Drawing | None = None,
+    stages: int = 4,
     within: AbstractModes | None = None,
     samples: int = 81,
     arm: float | None = None,
@@ -167,6 +169,8 @@ def drawing_to_loop(
             share of the squared strain that they must hold [-].
         damping: Retardation time of the material [s], viscosity over modulus.
         near: A result for a design beside this one, on the same start mesh.
+        before, stages: As of `mesh.move`: with the drawing of the start mesh, nodes go farther
+            from it, so that one mesh holds for many designs.
         within: As of `pod_basis`: functions that the modes are combined of.
         samples: Along the curve; about one per cell.
         arm: As of `strain_along`: distance of the points beside the curve [m].
@@ -227,13 +231,13 @@ def drawing_to_loop(
 
     def chain():
         """Part after part: its name, how it ended, and what it has found."""
-        moved = problem if shape is None else followed(problem, shape)
+        moved = problem if shape is None else followed(problem, shape, before, stages)
         yield "mesh", _mesh_status(problem.mesh, moved.mesh), {}
         steps: Any = values
         path = solve_path(moved, newton=newton, throw=throw, **steps)
         yield "path", path.status, {"path": path}
-        before = None if near is None else near.backbone
-        backbone = strain_along(path, curve, near=before, **along)
+        seen = None if near is None else near.backbone
+        backbone = strain_along(path, curve, near=seen, **along)
         status = _curve_status(path.problem.mesh, curve, backbone, along)
         yield "curve", status, {"backbone": backbone}
         basis = pod_basis(backbone, modes=modes, within=within)

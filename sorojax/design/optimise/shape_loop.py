@@ -232,8 +232,12 @@ class _Follower:
         return not bool(distortion(self.base.mesh, moved.mesh).remesh)
 
 
-def followed(problem: Problem, drawing: Drawing) -> Problem:
-    """`problem` on its mesh with nodes moved to `drawing`; differentiable in the drawing."""
+def followed(
+    problem: Problem, drawing: Drawing, before: Drawing | None = None, stages: int = 4
+) -> Problem:
+    """`problem` on its mesh with nodes moved to `drawing`, as `mesh.move`; differentiable in
+    the drawing."""
     shape, interfaces = _fields(drawing)
-    points = move(problem.mesh, shape, interfaces=interfaces).points
+    way = {"interfaces": interfaces, "before": before, "stages": stages}
+    points = move(problem.mesh, shape, **way).points
     return eqx.tree_at(lambda p: p.mesh.points, problem, points)

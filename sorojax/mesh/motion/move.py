@@ -4,6 +4,7 @@ boundary of a mesh can follow its shape, and did.
 
 import warnings
 from collections import OrderedDict
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -107,7 +108,7 @@ def _meeting(fields: tuple[AbstractSdf, ...], x: np.ndarray, sides: Sides) -> np
 
 
 def check_followed(
-    plan: BoundaryPlan, fields: tuple[AbstractSdf, ...], mesh: Mesh, moved: np.ndarray
+    plan: BoundaryPlan, fields: tuple[AbstractSdf, ...], mesh: Mesh, moved, stages: int
 ) -> None:
     """Raise if nodes of the boundary missed their zero sets; warn if corners went far."""
     before, edge = np.asarray(mesh.points), _edges(mesh)
@@ -120,15 +121,16 @@ def check_followed(
             raise ValueError(
                 f"move: {len(lost)} nodes miss the new surface, the first near "
                 f"{moved[nodes[lost[0]]]} m by {off[lost[0]]:.2g} m: the shape changes by more "
-                "than this mesh can follow. Change it less, or mesh the new shape."
+                "than this mesh can follow. Give the drawing `before` and more `stages`, or "
+                "mesh the new shape."
             )
     sharp = np.asarray(plan.sharp)
-    share = np.linalg.norm(moved[sharp] - before[sharp], axis=1) / edge[sharp]
+    share = np.linalg.norm(moved[sharp] - before[sharp], axis=1) / edge[sharp] / stages
     if share.max(initial=0) > _FAR:
         warnings.warn(
             f"move: a corner or ridge near {before[sharp[share.argmax()]]} m moves by "
             f"{share.max():.2f} of the edges beside it, need {_FAR:g} or less for certain "
-            "derivatives. Mesh the new shape, or move in smaller steps of a new mesh each.",
+            "derivatives. Give the drawing `before` and more `stages`, or mesh the new shape.",
             stacklevel=3,
         )
 
@@ -149,7 +151,14 @@ def _edges(mesh: Mesh) -> np.ndarray:
 # Node positions as a differentiable function of a shape, on a fixed topology
 
 
-def move(mesh: Mesh, shape: AbstractSdf, *, interfaces: tuple[AbstractSdf, ...] = ()) -> Mesh:
+def move(
+    mesh: Mesh,
+    shape: AbstractSdf,
+    *,
+    interfaces: tuple[AbstractSdf, ...] = (),
+    before: AbstractSdf | tuple[AbstractSdf, ...] | None = None,
+    stages: int = 4,
+) -> Mesh:
     """`mesh` with its nodes moved to fit `shape`, differentiable in the parameters of `shape`.
 
     Corners move to where their sides meet, nodes on the ridges of a solid stay on both
@@ -162,7 +171,8 @@ def move(mesh: Mesh, shape: AbstractSdf, *, interfaces: tuple[AbstractSdf, ...] 
     The topology does not change: corners may move by a quarter of the edges beside them
     from where they are in `mesh`, and normals turn by less than a right angle. Outside a
     trace a warning says when corners go farther, and nodes that miss the new surface are
-    refused; under a trace check `distortion` to see when to mesh again.
+    refused; under a trace check `distortion` to see when to mesh again. With the drawing
+    `before`, nodes go there through drawings in between, and that far in each of them.
 
     Args:
         mesh: A concrete mesh whose boundary nodes lie on the zero set, as `triangulate`
@@ -170,13 +180,17 @@ def move(mesh: Mesh, shape: AbstractSdf, *, interfaces: tuple[AbstractSdf, ...] 
             it has them, sharp turns of the boundary otherwise.
         shape: The new shape, of the same structure; may be traced.
         interfaces: The new interfaces, in the order given to the mesher; none by default.
+        before: The shape that the mesh was made from, with interfaces a tuple of it and them;
+            of the same structure, so that its numbers can change step by step.
+        stages: Number of these steps; of use with `before` only.
 
     Returns:
         The same cells and sets with new points [m].
 
     Raises:
         ValueError: If the mesh is traced, made of polygons, has other interfaces, or
-            (outside a trace) if a cell would turn inside out or a node miss the surface.
+            (outside a trace) if a cell would turn inside out or a node miss the surface; if
+            `before` is another kind of drawing than the new one.
 
     Example:
         >>> cells = mesh.triangulate(sdf.Rectangle([0, 0], [40 * mm, 10 * mm]), size=5 * mm)
@@ -201,11 +215,33 @@ def move(mesh: Mesh, shape: AbstractSdf, *, interfaces: tuple[AbstractSdf, ...] 
             f"{[field.dim for field in fields]}-D. Pass the shape it was made from."
         )
     motion = _prepared(mesh, len(interfaces))
-    points = moved_points(motion, fields, mesh.points)
+    way = [fields] if before is None else _between(before, fields, stages)
+    points = moved_points(motion, way, mesh.points)
     if not is_traced(points):
         _check_upright(np.asarray(points), mesh)
-        check_followed(motion.border, fields, mesh, np.asarray(points))
+        check_followed(motion.border, fields, mesh, np.asarray(points), len(way))
     return eqx.tree_at(lambda m: m.points, mesh, points)
+
+
+def _between(before, fields: tuple[AbstractSdf, ...], stages: int) -> list:
+    """Drawings whose numbers go from those of `before` to those of `fields`."""
+    start = before if isinstance(before, tuple) else (before,)
+    moving, rest = eqx.partition((start, fields), eqx.is_inexact_array)
+    shapes = [[jnp.shape(x) for x in jax.tree.leaves(own)] for own in moving]
+    kinds = [jax.tree.structure(own) for own in moving]
+    if kinds[0] != kinds[1] or shapes[0] != shapes[1]:
+        raise ValueError(
+            "move: `before` is another kind of drawing than the new one, need the same with "
+            "other numbers. Draw both by one function, the interfaces in one order."
+        )
+    if stages < 1:
+        raise ValueError(f"move: got {stages} `stages`, need 1 or more. Four are usual.")
+
+    def at(share: float):
+        return jax.tree.map(lambda a, b: (1 - share) * a + share * b, *moving)
+
+    shares = np.arange(1, stages) / stages
+    return [*(eqx.combine(at(share), rest[1]) for share in shares), fields]
 
 
 def _check_upright(points: np.ndarray, mesh: Mesh) -> None:
@@ -216,7 +252,8 @@ def _check_upright(points: np.ndarray, mesh: Mesh) -> None:
         do = "triangulate" if mesh.element.dim == 2 else "mesh"
         raise ValueError(
             f"move: a cell turns inside out near {where} m: the shape changes by more than "
-            f"this mesh can follow. Change it less, or {do} the new shape."
+            "this mesh can follow. Give the drawing `before` and more `stages`, or "
+            f"{do} the new shape."
         )
 
 
@@ -240,26 +277,41 @@ class _Motion(eqx.Module):
 
 
 def moved_points(
-    motion: _Motion, fields: tuple[AbstractSdf, ...], points: Float[Array, "nodes dim"]
+    motion: _Motion,
+    stages: Sequence[tuple[AbstractSdf, ...]],
+    points: Float[Array, "nodes dim"],
 ) -> Float[Array, "nodes dim"]:
-    """Points of a mesh after its boundary has followed `fields`."""
-    border, sharp = motion.border, None
-    if len(border.sharp):
-        sharp = meet(fields, border, points[border.sharp])
-        if motion.ridges is not None:
-            shift = _follow(motion, spread(motion.ridges, _shift(motion, points, sharp)))
-            sharp = meet(fields, border, (points + shift)[border.sharp])
-    shift = _shift(motion, points, sharp)
-    if motion.surface is not None:
-        shift = _follow(motion, spread(motion.surface, shift))
-    shift = _landed(motion, fields, points, sharp, shift)
-    if motion.along is not None:
-        shift = _turned_back(motion, spread(motion.along, _turned(motion, shift)))
-        shift = _landed(motion, fields, points, sharp, shift)
+    """Points of a mesh after its boundary has followed fields, one stage after the other."""
+    shift = jnp.zeros_like(points)
+    for fields in stages:
+        shift = _boundary_to(motion, fields, points, shift)
     boundary = shift
     if motion.inside is not None:
         shift = spread(motion.inside, shift)
     return _put(motion, points, shift, boundary)
+
+
+def _boundary_to(motion: _Motion, fields: tuple[AbstractSdf, ...], points, shift):
+    """Shifts of the boundary from those of the stage before to the surfaces of `fields`."""
+    sharp = None
+    if len(motion.border.sharp):
+        sharp = _met(motion, fields, points, shift)
+        for lines in (motion.ridges, motion.surface):
+            if lines is None:
+                continue
+            step = spread(lines, _sharp_step(motion, points, shift, sharp))
+            shift = shift + _follow(motion, step)
+            if lines is motion.ridges:
+                sharp = _met(motion, fields, points, shift)
+    shift = _landed(motion, fields, points, sharp, shift)
+    if motion.along is not None:
+        shift = _turned_back(motion, spread(motion.along, _turned(motion, shift)))
+        shift = _landed(motion, fields, points, sharp, shift)
+    return shift
+
+
+def _met(motion: _Motion, fields, points, shift):
+    return meet(fields, motion.border, (points + shift)[motion.border.sharp])
 
 
 def _landed(motion: _Motion, fields, points, sharp, shift):
@@ -288,7 +340,9 @@ def _beside(motion: _Motion, points, shift):
 
 @eqx.filter_jit
 def _boundary_shift(motion: _Motion, points, sharp, landed):
-    shift = _shift(motion, points, sharp)
+    shift = jnp.zeros_like(points)
+    if sharp is not None:
+        shift = shift.at[motion.border.sharp].set(sharp - points[motion.border.sharp])
     for own, x in zip(motion.border.fields, landed, strict=True):
         shift = shift.at[own.nodes].set(x - points[own.nodes])
     return shift
@@ -301,12 +355,10 @@ def _put(motion: _Motion, points, shift, boundary):
 
 
 @eqx.filter_jit
-def _shift(motion: _Motion, points, sharp):
-    shift = jnp.zeros_like(points)
-    if sharp is None:
-        return shift
+def _sharp_step(motion: _Motion, points, shift, sharp):
+    """What is left to go for the sharp nodes."""
     at = motion.border.sharp
-    return shift.at[at].set(sharp - points[at])
+    return jnp.zeros_like(points).at[at].set(sharp - (points + shift)[at])
 
 
 @eqx.filter_jit
