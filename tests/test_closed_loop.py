@@ -121,6 +121,15 @@ def test_one_call_is_the_chain_of_its_parts(start, first):
     assert "Trajectory from a drawing" in str(first)
 
 
+def test_an_output_that_does_not_come_to_rest_is_named(start, first):
+    """The tip still moves while the pressure rises; it rests where it may move that much."""
+    run = chain(start, START, near=first, settle=("body.tip_angle", 1e-6), throw=False)
+    assert run.status == run.parts.loop == Status.not_settled
+    assert bool(jnp.array_equal(run["body.tip_angle"], first["body.tip_angle"]))
+    rest = chain(start, START, near=first, settle=("body.tip_angle", 1.0))
+    assert rest.status == Status.successful
+
+
 def turn(start, first, numbers):
     height, wall, shear, pressure = numbers
     problem = eqx.tree_at(lambda p: p.material.shear_modulus, start, shear)

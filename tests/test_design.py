@@ -228,6 +228,22 @@ def test_values_that_break_are_named_or_stop_the_run():
     assert found.status == Status.not_finite and np.all(np.isfinite(found.design))
 
 
+def test_a_design_that_a_function_refuses_is_named_and_the_last_good_one_kept():
+    """As `drawing_to_loop` refuses a drawing whose mesh is tangled, by an error."""
+
+    def thin(x):
+        if float(jax.lax.stop_gradient(x[0])) < 0.3:
+            raise RuntimeError("the mesh is tangled.")
+        return x[0] ** 2
+
+    with pytest.warns(UserWarning, match="step 1 went to a design that fails: the mesh is"):
+        found = design.minimise(thin, jnp.array([0.9]), optimiser=optax.sgd(0.4), steps=9)
+    assert found.status in (Status.not_finite, Status.max_steps)
+    assert 0.3 <= float(found.design[0]) < 0.5
+    with pytest.raises(RuntimeError, match="tangled"):
+        design.minimise(thin, jnp.array([0.1]), steps=2)
+
+
 GRID = mesh.rectangle([0, 0], [12.0, 6.0], divisions=(12, 6), element=mesh.Quad4())
 
 

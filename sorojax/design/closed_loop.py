@@ -136,6 +136,7 @@ def drawing_to_loop(
     nodes: int | None = None,
     newton: Newton | None = None,
     save: int = 201,
+    settle: tuple[str, float] | None = None,
     step: float | None = None,
     solver: dfx.AbstractSolver | None = None,
     adjoint: dfx.AbstractAdjoint | None = None,
@@ -179,6 +180,8 @@ def drawing_to_loop(
         nodes: Gauss nodes of the rod; by default what resolves the modes.
         newton: Tolerances of the equilibria.
         save: Number of saved instants.
+        settle: An output that has to come to rest, and the most that it may move in the last
+            tenth of the motion, in its unit; by default each finite motion is successful.
         step: A fixed step [s]; adaptive by default.
         solver: Time integration; `Rodas4()` by default, for regulators and valves are far
             faster than the body.
@@ -249,7 +252,7 @@ def drawing_to_loop(
             run = {"save": save, "step": step, "adjoint": adjoint, "throw": False}
             method = Rodas4() if solver is None else solver
             motion = simulate(network(body), duration, solver=method, **run)
-            yield "loop", motion.status, {"motion": motion}
+            yield "loop", _loop_status(motion, settle), {"motion": motion}
 
     found: dict[str, Any] = dict.fromkeys(
         ("path", "backbone", "basis", "fit", "body", "motion")
@@ -336,6 +339,18 @@ def _rod_status(fit: Fit) -> Status:
         stiff = jnp.linalg.eigvalsh(jnp.where(good, fit.elastic.stiffness, 0.0))[0] > 0
         unstable = _unless(stiff, Status.unstable_equilibrium)
         return Status.where(good, unstable, Status.not_finite)
+
+
+def _loop_status(motion: Motion, settle: tuple[str, float] | None) -> Status:
+    if settle is None:
+        return motion.status
+    name, most = settle
+    output = without_derivatives(motion[name])
+    with evaluated_now(output):
+        last = output[-max(len(output) // 10, 2) :]
+        still = jnp.all(jnp.ptp(last, axis=0) <= most)
+    rest = _unless(still, Status.not_settled)
+    return Status.where(motion.status == Status.successful, rest, motion.status)
 
 
 def _unless(good, otherwise: Status) -> Status:

@@ -62,6 +62,10 @@ class Status(eqx.Enumeration):
         "A cell of the moved mesh is inside out: the shape changes by more than the nodes of "
         "its start mesh can follow. Change it less, or mesh the new shape."
     )
+    not_settled = (
+        "The output still moves at the end, as in a limit cycle. Lower the gains or the delay, "
+        "raise the damping, or give it more time."
+    )
     outside_mesh = (
         "A curve has left the cells that hold its samples. Move it back into the body, or "
         "choose the cells anew."

@@ -1,5 +1,6 @@
 """The optimisation loop: any differentiable function of a pytree, constraints, any method."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
@@ -57,7 +58,8 @@ class Optimised(eqx.Module):
         status: `successful` when the change fell below the tolerance, `out_of_reach` when it
             did with a constraint broken, `not_converged` when it did because the method could
             find no longer step, `max_steps` when the steps ran out first, `not_finite` when a
-            value broke, after shorter steps too; the last good design then.
+            value broke or the functions refused the design with an error, after shorter steps
+            too; the last good design then.
         history: Objective, constraints (m columns) and change of every step.
         last: The last step; pass it as `resume` to go on.
     """
@@ -148,14 +150,14 @@ def minimise(
     values, size, last, history, step, stuck = None, None, flat, [], resume, 0
     status = Status.max_steps
     for k in range(first, steps):
-        values, finite = task.found(flat, k)
+        values, finite = _found(task, flat, k, retry=k > first)
         for _ in range(_RETREATS if k > first else 0):
             if finite:
                 break
             flat = (flat + last) / 2
-            values, finite = task.found(flat, k)
-        if not finite:
-            if k == first:
+            values, finite = _found(task, flat, k, retry=True)
+        if values is None or not finite:
+            if values is not None and k == first:
                 raise ValueError(
                     f"minimise: the objective is {values.objective} and the constraints "
                     f"{values.constraints} at the first design, with "
@@ -193,14 +195,41 @@ def minimise(
     if status == Status.not_finite:
         flat = last
     k_last = max(len(history) + first - 1, 0)
-    objective, held = task.last(flat, k_last)
-    if last is not None and not _all_finite(objective, held):
+    ends = _last(task, flat, k_last, retry=bool(history))
+    if last is not None and (ends is None or not _all_finite(*ends)):
         status = Status.not_finite
-        objective, held = task.last(flat := last, k_last)
+        ends = task.last(flat := last, k_last)
+    objective, held = ends
     columns = _columns(history)
     if status == Status.successful and _broken(held, columns):
         status = Status.out_of_reach
     return Optimised(back(flat), objective, held, status, columns, step)  # type: ignore
+
+
+def _found(task: Task, flat, k: int, retry: bool) -> tuple[Values | None, Any]:
+    """Values at a design and whether they are finite; with `retry` there are none where the
+    functions refuse it."""
+    try:
+        return task.found(flat, k)
+    except (RuntimeError, ValueError) as error:
+        return _refused(error, k, retry), False
+
+
+def _last(task: Task, flat, k: int, retry: bool):
+    try:
+        return task.last(flat, k)
+    except (RuntimeError, ValueError) as error:
+        return _refused(error, k, retry)
+
+
+def _refused(error: Exception, k: int, retry: bool) -> None:
+    if not retry:
+        raise error
+    warnings.warn(
+        f"minimise: step {k} went to a design that fails: {error} A design nearer to the one "
+        "before is taken. Lower `move`, or narrow the bounds.",
+        stacklevel=4,
+    )
 
 
 def _all_finite(objective: Array, held: Array) -> bool:
