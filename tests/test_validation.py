@@ -1,4 +1,4 @@
-"""Measured robots of `python -m benchmarks validation`: the data, and the model of the tentacle."""
+"""Measured robots of `python -m benchmarks validation`: their data, and the tentacle."""
 
 import json
 

@@ -1,8 +1,8 @@
 """Tendon-driven silicone tentacle: poses that a fit of physical parameters has not seen.
 
 `benchmarks/validation/tentacle.py` says what is fitted. Every pair of the 14 poses is left out
-once; a quick run leaves out seven pairs. The error is the median over pairs of the mean distance
-of the four markers [mm], not knowing in which recording marker 2 slipped.
+once; a quick run leaves out seven pairs. The error is the median over pairs of the mean
+distance of the four markers [mm], not knowing in which recording marker 2 slipped.
 """
 
 import numpy as np

@@ -1,12 +1,12 @@
-"""A clamped Dragon Skin 10 beam, released from the horizontal: elastic prediction of another load.
+"""A clamped Dragon Skin 10 beam, released from the horizontal: prediction of another load.
 
 The records are motion capture of `srl-ethz/diffPD_sim2real` (MIT licence, Copyright 2021 Soft
 Robotics Lab, ETH Zurich; arXiv:2201.12560): 100 Hz, three markers at the tip, two repeats with
 0 and with 0.51 N at the tip. Young's modulus is fitted to the drop without load, a viscosity to
 the damping ratio there; drop, frequency and damping ratio with a load are predicted.
 
-`predict` takes any function from a tip load to a body and its damping, so another material needs
-only another function beside `kelvin_voigt`.
+`predict` takes any function from a tip load to a body and its damping, so another material
+needs only another function beside `kelvin_voigt`.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""`python -m benchmarks validation`: what is predicted of measured robots, in a table and a page."""
+"""`python -m benchmarks validation`: what is predicted of measured robots, and how well."""
 
 import argparse
 from dataclasses import replace
@@ -56,7 +56,9 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks validation", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks validation", description=__doc__
+    )
     parser.add_argument("only", nargs="?", choices=("tentacle", "beam"), help="default: both")
     parser.add_argument(
         "--poses", type=Path, metavar="FILE",
@@ -95,7 +97,9 @@ def of_poses(file: Path) -> int:
         pull = " ".join(f"{x:7.3f}" for x in tension)
         print(f"{pull:>16}  {' '.join(f'{x:6.1f}' for x in row)}  {row.mean():6.1f}")
     each = " ".join(f"{x:.1f}" for x in errors.mean(axis=0))
-    print(f"mean of {len(errors)} poses {errors.mean():.2f} mm, by marker {each}, bar {BAR:g} mm")
+    print(
+        f"mean of {len(errors)} poses {errors.mean():.2f} mm, by marker {each}, bar {BAR:g} mm"
+    )
     return 0
 
 
@@ -106,16 +110,17 @@ def of_tentacle() -> tuple[list[Line], view.Section]:
     errors = tentacle.errors(p, record) / mm
     print(found)
     left = tentacle.leave_pairs_out(p)
-    pair = left.pairs[int(np.argmax(left.unknown))]
+    worst = " and ".join(str(k + 1) for k in left.pairs[int(np.argmax(left.unknown))])
+    known, unknown = left.known / mm, left.unknown / mm
     lines = [
         (
             "tendon-driven silicone tentacle, 14 poses (soromox, MIT)",
             f"{len(found.names)} physical parameters on 12 poses",
-            "the other 2, for all 91 pairs",
-            f"mean marker error: median {np.median(left.unknown) / mm:.1f} mm over pairs, worst "
-            f"{left.unknown.max() / mm:.1f} mm (poses {pair[0] + 1} and {pair[1] + 1}), bar "
-            f"{BAR:g} mm; median {np.median(left.known) / mm:.1f} and worst "
-            f"{left.known.max() / mm:.1f} mm where it is known in which recording marker 2 slipped",
+            f"the other 2, for {len(left.pairs)} pairs",
+            f"mean marker error: median {np.median(unknown):.1f} mm over pairs, worst "
+            f"{unknown.max():.1f} mm (poses {worst}), bar {BAR:g} mm; median "
+            f"{np.median(known):.1f} mm and worst {known.max():.1f} mm if it is known in which "
+            "recording marker 2 slipped",
             f"below {tentacle.NOISE / mm:g} mm",
             PEERS,
         ),
@@ -152,7 +157,9 @@ def scene(p: tentacle.Parameters, record: tentacle.Record, poses=SHOWN) -> view.
     for k in poses:
         q = rest(jnp.asarray(record.tension[k]))
         for part in view.scene_of(tentacle.body(p), q).parts:
-            parts.append(replace(part, points=part.points @ base[:3, :3].T + base[:3, 3]))
+            if isinstance(part, view.Surface):
+                points = part.points @ base[:3, :3].T + base[None, :3, 3]
+                parts.append(replace(part, points=points))
         parts.append(view.Lines(list(np.stack([found[k], record.markers[k]], 1)), "#c8553d"))
         parts.append(view.Dots(found[k], "#222222", 4.0))
         parts.append(view.Dots(record.markers[k], "#c8102e", 6.0))
