@@ -140,7 +140,7 @@ def of_tentacle() -> tuple[list[Line], view.Section]:
         "measured markers; dark: predicted ones. Parameters with their standard deviation "
         "from the fit to all poses:\n\n" + "\n\n".join(str(found).splitlines()[1:-2])
     )
-    picture = view.show(scene(p, record), view="iso", title="Tentacle: six poses")
+    picture = view.show(scene(p, record), view="iso")
     return lines, view.Section(
         "Tentacle", text, [("Fitted rod and measured markers", picture)], _numbers(lines)
     )
@@ -163,7 +163,7 @@ def scene(p: tentacle.Parameters, record: tentacle.Record, poses=SHOWN) -> view.
         parts.append(view.Lines(list(np.stack([found[k], record.markers[k]], 1)), "#c8553d"))
         parts.append(view.Dots(found[k], "#222222", 4.0))
         parts.append(view.Dots(record.markers[k], "#c8102e", 6.0))
-    return view.Scene(tuple(parts))
+    return view.Scene(tuple(parts), title="Tentacle, " + str(len(poses)) + " poses")
 
 
 def of_beam(tip_load: float | None) -> tuple[list[Line], view.Section]:

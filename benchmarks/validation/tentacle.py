@@ -137,6 +137,23 @@ def body(p: Parameters, modes: tuple[int, int, int] = (5, 3, 2)) -> rod.Rod:
     )  # fmt: skip
 
 
+def stored(p: Parameters, strain: Float[Array, "6"], s: Float[Array, ""]) -> Array:
+    """Energy per length [J/m] of an incompressible neo-Hookean section in uniaxial stress.
+
+    With W(l) = mu / 2 (l^2 + 2 / l - 3) of the stretch l along a fibre, to second order in the
+    bending: A W(l) + I W''(l) (curvature change)^2 / 2; the tendons shorten the thin end by up
+    to a fifth, where W'' is well above Young's modulus. Twist and shear are linear.
+    """
+    radius = jnp.interp(s, jnp.array([0.0, JOINT, 1.0]), jnp.array(RADII))
+    area, second = jnp.pi * radius**2, jnp.pi / 4 * radius**4
+    shear, stretch = p["young_modulus"] / 3, 1 + strain[3]
+    along = shear / 2 * (stretch**2 + 2 / stretch - 3)
+    slope = shear * (1 + 2 / stretch**3)
+    across = 0.9 * area * (strain[4] ** 2 + strain[5] ** 2)
+    bent = second * slope * (strain[1] ** 2 + strain[2] ** 2)
+    return area * along + (bent + shear * (2 * second * strain[0] ** 2 + across)) / 2
+
+
 def tendons(p: Parameters, tension: Float[Array, "2"]) -> rod.Tendons:
     """Both tendons; what is lost before the channels is lost by a tendon that pulls."""
     routes = []
@@ -164,7 +181,8 @@ def resting(p: Parameters, tension: Float[Array, "2"]) -> tuple[rod.Rod, Array]:
     """The rod and its coordinates at equilibrium, in the frame of its base."""
     turned, model = mounting(p)[:3, :3], body(p)
     weight = rod.Gravity(turned.T @ jnp.array([0.0, 0.0, -GRAVITY]))
-    return model, rod.equilibrium(model, (weight, tendons(p, tension))).q
+    silicone = rod.section_law(model, rod.EnergyLaw(functools.partial(stored, p)))
+    return model, rod.equilibrium(model, (silicone, weight, tendons(p, tension))).q
 
 
 def markers(
