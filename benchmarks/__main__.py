@@ -14,6 +14,11 @@ from sorojax._progress import report
 
 
 def main(argv: list[str] | None = None) -> int:
+    argv = sys.argv[1:] if argv is None else argv
+    if argv[:1] == ["validation"]:
+        from benchmarks.validation import report as validation
+
+        return validation.main(argv[1:])
     arguments = _parser().parse_args(argv)
     known = discover.cases(arguments.cases)
     if arguments.list:

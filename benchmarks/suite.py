@@ -68,6 +68,7 @@ ROWS = {
     "pictures": Cases(("view.skin",), ("view.film", "view.web")),
     "single precision": Cases(("precision.single",)),
     "what a scene does not need": Cases(("skip.features",)),
+    "measured robots": Cases((), ("validation.beam", "validation.tentacle")),
     "wrong answers": Cases(
         (), ("contact.grid", "contact.solids", "systems.steps", "mesh.fuzz")
     ),

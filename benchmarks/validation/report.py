@@ -1,0 +1,232 @@
+"""`python -m benchmarks validation`: what is predicted of measured robots, and how well."""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.discover import HERE
+from benchmarks.validation import beam, tentacle
+from sorojax import view
+from sorojax.units import mm
+
+PAGE = HERE / "results" / "validation.html"
+BAR = 8.0  # mm, mean marker error of poses that the fit has not seen
+SHOWN = (0, 2, 5, 8, 11, 12)  # poses in the picture
+PEERS = (
+    "soromox, section Va of its paper's results, stored arrays: 36.8 mm before a fit, 15.8 mm "
+    "with E, nu and density fitted (315 kPa, 0.45, 1318 kg/m3), 6.4 mm with a neural residual "
+    "force added, on the kind of poses that it was fitted to"
+)
+COLUMNS = ("data", "fitted", "predicted", "error", "measurement", "peers")
+Line = tuple[str, str, str, str, str, str]
+
+
+def main(argv: list[str] | None = None) -> int:
+    arguments = _parser().parse_args(argv)
+    jax.config.update("jax_enable_x64", True)
+    if arguments.poses is not None:
+        return of_poses(arguments.poses)
+    lines, sections = [], []
+    chosen = {arguments.only} if arguments.only else {"tentacle", "beam"}
+    if "tentacle" in chosen:
+        found, section = of_tentacle()
+        lines += found
+        sections.append(section)
+    if "beam" in chosen:
+        found, section = of_beam(arguments.tip_load)
+        lines += found
+        sections.append(section)
+    print("\n" + table(lines))
+    PAGE.parent.mkdir(exist_ok=True)
+    PAGE.write_text(
+        view.html_report(
+            "Measured robots, predicted",
+            sections,
+            lead="Measurements are those of others, named in each part; nothing that is "
+            "predicted was fitted.",
+        )
+    )
+    print(f"\n{PAGE}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks validation", description=__doc__
+    )
+    parser.add_argument("only", nargs="?", choices=("tentacle", "beam"), help="default: both")
+    parser.add_argument(
+        "--poses", type=Path, metavar="FILE",
+        help="fit the tentacle to the poses that are shipped and predict those of FILE",
+    )  # fmt: skip
+    parser.add_argument(
+        "--tip-load", type=float, metavar="N", help="predict the beam with this load too"
+    )
+    return parser
+
+
+def table(lines: list[Line]) -> str:
+    """The lines as text, one block for each, columns by name."""
+    blocks = []
+    for line in lines:
+        rows = zip(COLUMNS, line, strict=True)
+        blocks.append("\n".join(f"{name:<12} {text}" for name, text in rows if text))
+    return "\n\n".join(blocks)
+
+
+def _numbers(lines: list[Line]) -> list[view.Number]:
+    return [
+        view.Number(f"{line[0]}: {name}", text)
+        for line in lines
+        for name, text in zip(COLUMNS[1:], line[1:], strict=True)
+        if text
+    ]
+
+
+def of_poses(file: Path) -> int:
+    """Fit the shipped poses, predict those of `file`, print the errors of all markers."""
+    record = tentacle.read(file)
+    errors = tentacle.errors(tentacle.fit().parameters, record) / mm
+    print(f"{'tension [N]':>16}  errors of markers 1 to 4 [mm]  mean")
+    for tension, row in zip(record.tension, errors, strict=True):
+        pull = " ".join(f"{x:7.3f}" for x in tension)
+        print(f"{pull:>16}  {' '.join(f'{x:6.1f}' for x in row)}  {row.mean():6.1f}")
+    each = " ".join(f"{x:.1f}" for x in errors.mean(axis=0))
+    print(
+        f"mean of {len(errors)} poses {errors.mean():.2f} mm, by marker {each}, bar {BAR:g} mm"
+    )
+    return 0
+
+
+def of_tentacle() -> tuple[list[Line], view.Section]:
+    record = tentacle.read()
+    found = tentacle.fit()
+    p = found.parameters
+    errors = tentacle.errors(p, record) / mm
+    print(found)
+    left = tentacle.leave_pairs_out(p)
+    worst = " and ".join(str(k + 1) for k in left.pairs[int(np.argmax(left.unknown))])
+    known, unknown = left.known / mm, left.unknown / mm
+    lines = [
+        (
+            "tendon-driven silicone tentacle, 14 poses (soromox, MIT)",
+            f"{len(found.names)} physical parameters on 12 poses",
+            f"the other 2, for {len(left.pairs)} pairs",
+            f"mean marker error: median {np.median(unknown):.1f} mm over pairs, worst "
+            f"{unknown.max():.1f} mm (poses {worst}), bar {BAR:g} mm; median "
+            f"{np.median(known):.1f} mm and worst {known.max():.1f} mm if it is known in which "
+            "recording marker 2 slipped",
+            f"below {tentacle.NOISE / mm:g} mm",
+            PEERS,
+        ),
+        (
+            "the same",
+            f"{len(found.names)} physical parameters on 14 poses",
+            "nothing: what is left of the fit",
+            f"mean marker error {errors.mean():.1f} mm, worst {errors.max():.1f} mm, by marker "
+            + ", ".join(f"{x:.1f}" for x in errors.mean(axis=0)),
+            "",
+            "",
+        ),
+    ]
+    text = (
+        "A rod of two tapered links, its equilibrium under two tendons, and motion capture "
+        "(poses and geometry: soromox, section Va of its paper's results, MIT licence). Red: "
+        "measured markers; dark: predicted ones. Parameters with their standard deviation "
+        "from the fit to all poses:\n\n" + "\n\n".join(str(found).splitlines()[1:-2])
+    )
+    picture = view.show(scene(p, record), view="iso")
+    return lines, view.Section(
+        "Tentacle", text, [("Fitted rod and measured markers", picture)], _numbers(lines)
+    )
+
+
+def scene(p: tentacle.Parameters, record: tentacle.Record, poses=SHOWN) -> view.Scene:
+    """The rod in some poses with measured and predicted markers, in the world."""
+    base = np.asarray(tentacle.mounting(p))
+    parts: list[Any] = []
+    found = np.asarray(
+        tentacle.predicted(p, jnp.asarray(record.tension), jnp.asarray(record.second))
+    )
+    rest = jax.jit(lambda tension: tentacle.resting(p, tension)[1])
+    for k in poses:
+        q = rest(jnp.asarray(record.tension[k]))
+        for part in view.scene_of(tentacle.body(p), q).parts:
+            if isinstance(part, view.Surface):
+                points = part.points @ base[:3, :3].T + base[None, :3, 3]
+                parts.append(replace(part, points=points))
+        parts.append(view.Lines(list(np.stack([found[k], record.markers[k]], 1)), "#c8553d"))
+        parts.append(view.Dots(found[k], "#222222", 4.0))
+        parts.append(view.Dots(record.markers[k], "#c8102e", 6.0))
+    return view.Scene(tuple(parts), title="Tentacle, " + str(len(poses)) + " poses")
+
+
+def of_beam(tip_load: float | None) -> tuple[list[Line], view.Section]:
+    young, viscosity = beam.fitted()
+    body = beam.kelvin_voigt(young, viscosity)
+    lines, pictures = [], []
+    for load in (*beam.FILES, *(() if tip_load is None else (tip_load,))):
+        swing, time, height = beam.predict(body, load)
+        told = (
+            f"drop {swing.drops.mean():.2f} mm, frequency {swing.frequency:.2f} Hz, damping "
+            f"ratio {swing.ratio:.3f}"
+        )
+        repeats = beam.measured(load) if load in beam.FILES else []
+        lines.append(
+            (
+                f"Dragon Skin 10 beam, {load:.2f} N at the tip (diffPD_sim2real, MIT)",
+                f"E {young / 1e3:.0f} kPa from the drop and viscosity {viscosity:.0f} Pa s "
+                "from the damping ratio at 0 N",
+                told,
+                _beam_errors(swing, repeats),
+                _beam_measured(repeats),
+                "",
+            )
+        )
+        pictures.append((f"{load:.2f} N at the tip", _curve(load, time, height)))
+    text = (
+        "A clamped beam of 100 x 30 x 30 mm in plane stress, released from the horizontal "
+        "(records: srl-ethz/diffPD_sim2real, MIT licence, Copyright 2021 Soft Robotics Lab, "
+        "ETH Zurich; arXiv:2201.12560). The losses of a Kelvin-Voigt viscosity fall with the "
+        "frequency, those of this rubber hardly do."
+    )
+    return lines, view.Section("Beam", text, pictures, _numbers(lines))
+
+
+def _beam_errors(swing: beam.Swing, repeats: list[beam.Swing]) -> str:
+    if not repeats:
+        return "not measured"
+    drops = np.mean([x.drops for x in repeats], axis=0)
+    frequency = np.mean([x.frequency for x in repeats])
+    ratio = np.mean([x.ratio for x in repeats])
+    return (
+        f"drop {np.abs(swing.drops - drops).max():.2f} mm at most, frequency "
+        f"{100 * (swing.frequency / frequency - 1):+.1f} %, damping ratio "
+        f"{100 * (swing.ratio / ratio - 1):+.0f} %"
+    )
+
+
+def _beam_measured(repeats: list[beam.Swing]) -> str:
+    return "; ".join(
+        f"drop {x.drops.mean():.2f} mm, {x.frequency:.2f} Hz, {x.ratio:.3f}" for x in repeats
+    )
+
+
+def _curve(load: float, time, height):
+    """Height of the tip after the release, measured and predicted, as a figure."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(6.4, 3.0), layout="constrained")
+    for name in beam.FILES.get(load, ()):
+        own, drop = beam.released(*beam.read(beam.FOLDER / name))
+        axes.plot(own, -drop, color="#c8553d", lw=0.8, label="measured")
+    axes.plot(time, height - height[0], color="#0b6e99", lw=1.2, label="predicted")
+    axes.set(xlabel="time after the release [s]", ylabel="height [mm]", xlim=(0, time[-1]))
+    axes.legend()
+    plt.close(figure)
+    return figure
