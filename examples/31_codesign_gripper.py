@@ -12,6 +12,7 @@ modes and laws of the rod that touches the ball.
 import functools
 import sys
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -83,7 +84,7 @@ def chain(x, near=None):
         target = systems.Source(systems.Constant(1.0), unit="N")
         return loop_of(target, pid, valve, touching, sensor, seen="q")
 
-    run = sj.design.drawing_to_loop(
+    run: Any = sj.design.drawing_to_loop(
         solid(x), None, sj.reduction.Line([0, 1 * mm], [72 * mm, 1 * mm]), loop, 0.5, near=near,
         modes={"kappa_z": 3}, within=rod.Legendre(3), samples=41, nodes=6, degree=3, save=101,
         damping=0.02, air=jnp.linspace(0, 1.25, 6) * p, step=2.5e-3,
@@ -120,7 +121,7 @@ def search(x, free, steps, near):
 def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, float]:
     near, rows, half = chain(jnp.asarray(LOW + SPAN / 2))[1], [], 2 if quick else 8
     for key in jax.random.split(jax.random.key(0), 1 if quick else 5):
-        x = (LOW + SPAN * jax.random.uniform(key, (9,))).at[8].set(1.0)
+        x = jnp.asarray(LOW + SPAN * jax.random.uniform(key, (9,))).at[8].set(1.0)
         sequence = search(search(x, slice(6), half, near), slice(6, 9), half, near)
         rows.append((x, sequence, search(x, slice(9), 2 * half, near)))
     ends = [[chain(x, near) for x in row] for row in rows]
@@ -130,13 +131,16 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     gain = 100 * (1 - cost[:, 2] / cost[:, 1])
     if picture is not None:
         draw(rows[0], ends[0], cost, Path(picture))
-    told = {"starts": len(rows), "evaluations without a number": len(FAILED)}
-    for name, of in (("pressure [kPa]", pressure), ("error [N]", error), ("cost", cost)):
-        for who, middle in zip(NAMES, np.median(of, axis=0), strict=True):
-            told[f"{name}, {who}"] = float(middle)
+    told = {"starts": float(len(rows)), "evaluations without a number": float(len(FAILED))}
+    of = {"pressure [kPa]": pressure, "error of the force [N]": error, "cost": cost}
+    for name, values in of.items():
+        told |= {
+            f"{name}, {who}": float(np.median(v))
+            for who, v in zip(NAMES, values.T, strict=True)
+        }
     told["limits missed by [%]"] = 100 * float(np.maximum(1 - push, peak - 1)[:, 1:].max())
-    for name, share in zip(("least", "median", "most"), (0, 50, 100), strict=True):
-        told[f"gain by designing together, {name} [%]"] = float(np.percentile(gain, share))
+    for name, share in {"least": 0, "median": 50, "most": 100}.items():
+        told[f"gain of co-design, {name} [%]"] = float(np.percentile(gain, share))
     return told
 
 
@@ -148,46 +152,50 @@ def draw(designs, ends, cost, file: Path) -> None:
     from matplotlib import pyplot as plt
     from matplotlib.collections import PolyCollection
 
-    figure, axes = plt.subplots(2, 3, figsize=(10, 6.2), height_ratios=(1.15, 1))
-    names, colours = NAMES, ("#adb5bd", "#2a6f97", "#e76f51")
-    turn = np.linspace(0, 2 * np.pi, 90)
-    for axis, name, x, (values, _) in zip(axes[0], names, designs, ends, strict=True):
+    figure, axes = plt.subplots(
+        2, 3, figsize=(9, 5.4), height_ratios=(1.05, 1), layout="constrained"
+    )
+    colours, turn = ("#8d99ae", "#2a6f97", "#e76f51"), np.linspace(0, 2 * np.pi, 90)
+    under = mesh.facets_where(start()[0].mesh, lambda p: p[1] < 1e-9)
+    ring = np.asarray(start()[0].mesh.cells)[:, [0, 4, 1, 5, 2, 6, 3, 7]]
+    for k, (axis, x, (values, run)) in enumerate(zip(axes[0], designs, ends, strict=True)):
         made = solid(x)
-        under = mesh.facets_where(start()[0].mesh, lambda p: p[1] < 1e-9)
         made = fem.problem(
             made.mesh, made.material, kinematics=made.kinematics, supports=made.supports,
             loads=(*made.loads, fem.Contact(under, BALL, name="ball")),
         )  # fmt: skip
         u = fem.solve_path(made, air=jnp.linspace(0, x[5] * kPa, 6)).displacements[-1]
-        held = np.linalg.norm(fem.contact_state(made, u, "ball").total)
-        ring = np.array([0, 4, 1, 5, 2, 6, 3, 7])
-        corners = np.asarray(made.mesh.points + u)[np.asarray(made.mesh.cells)[:, ring]] / mm
-        stress = fem.von_mises_stress(made, u).mean(axis=1) / kPa
-        rest = np.asarray(made.mesh.points)[np.asarray(made.mesh.cells)[:, ring]] / mm
-        axis.add_collection(PolyCollection(rest, facecolors="#eceff1", edgecolors="none"))
-        cells = PolyCollection(corners, array=np.asarray(stress), cmap="YlGnBu", lw=0.2)
-        cells.set(clim=(0, 300), edgecolor="#012a4a")
+        held = float(np.linalg.norm(fem.contact_state(made, u, "ball").total))
+        stress = np.asarray(fem.von_mises_stress(made, u).mean(axis=1) / kPa)
+        rest = np.asarray(made.mesh.points)[ring] / mm
+        now = rest + np.asarray(u)[ring] / mm
+        axis.add_collection(
+            PolyCollection(list(rest), facecolors="#eceff1", edgecolors="#eceff1")
+        )
+        cells = PolyCollection(
+            list(now), array=stress, cmap="YlGnBu", lw=0.3, edgecolor="#012a4a"
+        )
+        cells.set_clim(0, 300)
         axis.add_collection(cells)
         axis.fill(50 + 22 * np.cos(turn), -24 + 22 * np.sin(turn), color="#f4a261", zorder=0)
-        axis.set(aspect="equal", xlim=(-3, 80), ylim=(-48, 27), xlabel="x [mm]")
-        axis.set_title(f"{name}: {float(x[5]):.1f} kPa", fontsize=10)
         text = f"rod {float(values[0]):.2f} N\nsolid {held:.2f} N"
-        axis.text(50, -27, text, ha="center", va="center", fontsize=8)
-    figure.colorbar(cells, ax=axes[0], label="Mises stress [kPa]", shrink=0.8, pad=0.02)
-    for name, colour, (_, run) in zip(names, colours, ends, strict=True):
-        axes[1, 0].plot(run.time, run["sensor.value"], color=colour, label=name)
-        axes[1, 1].plot(run.time, run["air.pressure"] / kPa, color=colour)
+        axis.text(50, -24, text, ha="center", va="center")
+        axis.set(aspect="equal", xlim=(-3, 83), ylim=(-48, 28), xlabel="x [mm]")
+        axis.set_title(f"{NAMES[k]}: {float(x[5]):.1f} kPa", color=colours[k], weight="bold")
+        axes[1, 0].plot(run.time, run["sensor.value"], color=colours[k], label=NAMES[k])
+        axes[1, 1].plot(run.time, run["air.pressure"] / kPa, color=colours[k])
+    figure.colorbar(cells, ax=axes[0], label="Mises stress [kPa]")
+    axes[0, 0].set_ylabel("y [mm]")
     axes[1, 0].axhline(1, color="black", lw=0.8, ls=":")
     axes[1, 0].set(xlabel="time [s]", ylabel="force on the ball [N]")
-    axes[1, 0].legend(frameon=False, fontsize=8)
+    axes[1, 0].legend(frameon=False)
     axes[1, 1].set(xlabel="time [s]", ylabel="pressure [kPa]")
     count = np.arange(1, len(cost) + 1)
-    for k, name in enumerate(names):
-        axes[1, 2].plot(count, cost[:, k], "o", color=colours[k], label=name)
+    axes[1, 2].vlines(count, cost[:, 1], cost[:, 2], color="#ced4da", zorder=0)
+    for k in (1, 2):
+        axes[1, 2].plot(count, cost[:, k], "o", color=colours[k])
     axes[1, 2].set(xlabel="random start", ylabel="cost", xticks=count)
-    for axis in axes[:, 1:].flat:
-        axis.tick_params(labelsize=9)
-    figure.savefig(file, dpi=110, bbox_inches="tight")
+    figure.savefig(file, dpi=110)
     plt.close(figure)
 
 
