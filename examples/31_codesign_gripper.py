@@ -7,6 +7,12 @@ the pressure over 50 kPa plus the rms error of the force in the first half secon
 sequence, half of the steps go to the body with the least pressure and half to the gains;
 together, all go to both. Nodes follow the lines of the drawing; strains of the solid give the
 modes and laws of the rod that touches the ball.
+
+From five random starts, designing together costs 0.8 to 2.7 % less, 1.2 % in the median: wider
+slots and a thicker floor fill faster, at 0.2 kPa more. It is little, as the body of the least
+pressure takes little air already, and with a regulator at its largest flow the gains change
+little. The solid in contact, drawn beside the numbers, holds 14 to 16 % less than the rod, whose
+sections do not shear.
 """
 
 import functools
@@ -181,7 +187,7 @@ def draw(designs, ends, cost, file: Path) -> None:
         text = f"rod {float(values[0]):.2f} N\nsolid {held:.2f} N"
         axis.text(50, -24, text, ha="center", va="center")
         axis.set(aspect="equal", xlim=(-3, 83), ylim=(-48, 28), xlabel="x [mm]")
-        axis.set_title(f"{NAMES[k]}: {float(x[5]):.1f} kPa", color=colours[k], weight="bold")
+        axis.set_title(f"{NAMES[k]}: {float(x[5]):.1f} kPa", color=colours[k], size=11)
         axes[1, 0].plot(run.time, run["sensor.value"], color=colours[k], label=NAMES[k])
         axes[1, 1].plot(run.time, run["air.pressure"] / kPa, color=colours[k])
     figure.colorbar(cells, ax=axes[0], label="Mises stress [kPa]")

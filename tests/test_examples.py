@@ -5,6 +5,7 @@ import re
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from tests.scripts import ROOT, main_of, user_code
@@ -79,6 +80,9 @@ def test_a_finger_and_its_controller_are_designed_together():
     chain, span = names["chain"], jnp.asarray(names["SPAN"])
     x = jnp.asarray(names["LOW"]) + 0.45 * span
     near = chain(x)[1]
+
+    values, _ = chain(x.at[5].set(300.0), near)
+    assert np.all(np.isposinf(values)) and "not stable" in names["FAILED"][-1]
 
     def total(share):
         return chain(x + share * span, near)[0] @ jnp.array([1.0, 2.0, 3.0])
