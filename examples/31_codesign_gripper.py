@@ -11,8 +11,8 @@ modes and laws of the rod that touches the ball.
 From five random starts, designing together costs 0.8 to 2.7 % less, 1.2 % in the median: wider
 slots and a thicker floor fill faster, at 0.2 kPa more. It is little, as the body of the least
 pressure takes little air already, and with a regulator at its largest flow the gains change
-little. The solid in contact, drawn beside the numbers, holds 14 to 16 % less than the rod, whose
-sections do not shear.
+little. The solid in contact, drawn beside the numbers, holds 14 to 16 % less than the rod,
+whose sections do not shear.
 """
 
 import functools
