@@ -99,7 +99,8 @@ def test_a_pneunet_is_meshed_between_its_lines():
     rubber = sj.material.presets.dragon_skin_30()
     made = robots.bellows_problem(robot, cells, rubber, depth=0.02)
     assert [load.name for load in made.loads] == ["air"]
-    assert made.loads[0].facets.shape == walls.shape
+    inside = made.loads[0]
+    assert isinstance(inside, sj.fem.Pressure) and inside.facets.shape == walls.shape
     with pytest.raises(ValueError, match="with a PneuNet, which has no bellows"):
         robots.bellows_problem(robot, cells, rubber, pushed=[0])
     with pytest.raises(ValueError, match="rising levels"):
