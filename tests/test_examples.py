@@ -3,6 +3,7 @@
 import re
 
 import diffrax as dfx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -99,3 +100,27 @@ def test_three_solvers_and_three_adjoints_of_diffrax_give_one_derivative():
 def test_the_example_with_diffrax_is_short_and_the_readme_names_it():
     assert user_code("05_diffrax") <= 45
     assert "examples/05_diffrax.py" in (ROOT / "README.md").read_text()
+
+
+@pytest.mark.slow
+def test_a_finger_and_its_controller_are_designed_together():
+    """Every number of the design, through drawing, modes, contact and loop, has its slope."""
+    main = main_of("31_codesign_gripper")
+    numbers, names = main(quick=True), main.__globals__
+    assert numbers["limits missed by [%]"] < 5
+    assert numbers["cost, together"] < numbers["cost, start"]
+
+    chain, span = names["chain"], jnp.asarray(names["SPAN"])
+    x = jnp.asarray(names["LOW"]) + 0.45 * span
+    near = chain(x)[1]
+
+    values, _ = chain(x.at[5].set(300.0), near)
+    assert np.all(np.isposinf(values)) and "not stable" in names["FAILED"][-1]
+
+    def total(share):
+        return chain(x + share * span, near)[0] @ jnp.array([1.0, 2.0, 3.0])
+
+    slope = jax.grad(total)(jnp.zeros(9))
+    for k, way in enumerate(1e-4 * jnp.eye(9)[:8]):
+        seen = (total(way) - total(-way)) / 2e-4
+        assert float(slope[k]) == pytest.approx(float(seen), rel=1e-3, abs=1e-4)

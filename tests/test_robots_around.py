@@ -96,6 +96,13 @@ def test_a_pneunet_is_meshed_between_its_lines():
     assert np.all(np.asarray(robot.body()(jnp.asarray(middle))) > 0)
     walls = M.facets_on(cells, robot.chambers())
     assert len(walls) > 20 and len(M.facets_on(cells, robot.slots())) > 8
+    rubber = sj.material.presets.dragon_skin_30()
+    made = robots.bellows_problem(robot, cells, rubber, depth=0.02)
+    assert [load.name for load in made.loads] == ["air"]
+    inside = made.loads[0]
+    assert isinstance(inside, sj.fem.Pressure) and inside.facets.shape == walls.shape
+    with pytest.raises(ValueError, match="with a PneuNet, which has no bellows"):
+        robots.bellows_problem(robot, cells, rubber, pushed=[0])
     with pytest.raises(ValueError, match="rising levels"):
         robots.PneuNet(roof=0.021)
     with pytest.raises(ValueError, match="walls above zero"):

@@ -95,64 +95,6 @@ class BellowsActuator(eqx.Module):
         return HalfPlane([0.0, self.layer_thickness], [0.0, 1.0])
 
 
-# The bellows actuator as a boundary value problem on its cross-section
-
-
-def bellows_problem(
-    actuator: BellowsActuator,
-    cells: mesh.Mesh,
-    rubber: AbstractHyperelastic,
-    *,
-    depth: float = 20 * mm,
-    gravity: Numbers | None = None,
-    pushed: Sequence[int] = (),
-    formulation: fem.Displacement | fem.LinearPressure | None = None,
-) -> fem.Problem:
-    """A bellows actuator as a boundary value problem on its side view, in plane strain.
-
-    It is clamped at its left end, with a pressure called "air" [Pa] in all chambers.
-
-    Args:
-        actuator: Its dimensions [m]; concrete.
-        cells: The mesh, of `mesh.triangulate(actuator.body(), ...)`.
-        rubber: One material, or one with a value per cell.
-        depth: Width across the plane of the side view [m].
-        gravity: Acceleration (x, y) [m/s^2], a load called "gravity"; no weight by default.
-        pushed: Numbers of bellows, counted from the clamp from 0 on, whose backs carry forces
-            called "push_0", "push_2" and so on [N], zero to begin with; none by default.
-        formulation: As of `fem.problem`, whose default it has.
-
-    Returns:
-        The problem.
-
-    Raises:
-        ValueError: If there is no such bellow, or as `fem.problem`.
-
-    Example:
-        >>> actuator = robots.BellowsActuator(num_bellows=2)
-        >>> cells = mesh.enrich(mesh.triangulate(actuator.body(), size=3 * mm, order=2))
-        >>> rubber = presets.dragon_skin_30()
-        >>> problem = robots.bellows_problem(actuator, cells, rubber, pushed=[1])
-        >>> [load.name for load in problem.loads]
-        ['air', 'push_1']
-    """
-    loads: list[Any] = [fem.Pressure(mesh.facets_on(cells, actuator.chambers()), name="air")]
-    if gravity is not None:
-        loads.append(fem.Gravity(gravity))
-    for k in pushed:
-        nodes = mesh.nodes_on_line(cells, *actuator.back(k))
-        loads.append(fem.Force(nodes, [0.0, 0.0], name=f"push_{k}"))
-    clamped = mesh.nodes_where(cells, lambda p: p[0] < 1e-9)
-    return fem.problem(
-        cells,
-        rubber,
-        kinematics=fem.PlaneStrain(depth),
-        supports=(fem.Fixed(clamped),),
-        loads=tuple(loads),
-        formulation=formulation,
-    )
-
-
 # A PneuNet: upright air chambers between slots whose walls come to touch, on a thin layer.
 #
 # Reference: Mosadegh et al., "Pneumatic networks for soft robotics that actuate rapidly",
@@ -251,3 +193,68 @@ def pneunet_mesh(pneunet: PneuNet) -> mesh.Mesh:
     made = mesh.submesh(grid, mesh.cells_inside(grid, pneunet.body()))
     below = mesh.cells_where(made, lambda p: p[1] < layer)
     return mesh.Mesh(made.points, made.cells, made.element, regions={"layer": below})
+
+
+# Both as boundary value problems on their side views
+
+
+def bellows_problem(
+    actuator: BellowsActuator | PneuNet,
+    cells: mesh.Mesh,
+    rubber: AbstractHyperelastic,
+    *,
+    depth: float = 20 * mm,
+    gravity: Numbers | None = None,
+    pushed: Sequence[int] = (),
+    formulation: fem.Displacement | fem.LinearPressure | None = None,
+) -> fem.Problem:
+    """A bellows actuator or PneuNet as a boundary value problem on its side view.
+
+    In plane strain, clamped at its left end, with a pressure called "air" [Pa] in all chambers.
+
+    Args:
+        actuator: Its dimensions [m]; concrete.
+        cells: The mesh, of `mesh.triangulate(actuator.body(), ...)` or of `pneunet_mesh`.
+        rubber: One material, or one with a value per cell.
+        depth: Width across the plane of the side view [m].
+        gravity: Acceleration (x, y) [m/s^2], a load called "gravity"; no weight by default.
+        pushed: Numbers of bellows, counted from the clamp from 0 on, whose backs carry forces
+            called "push_0", "push_2" and so on [N], zero to begin with; none by default, and
+            none on a PneuNet.
+        formulation: As of `fem.problem`, whose default it has.
+
+    Returns:
+        The problem.
+
+    Raises:
+        ValueError: If there is no such bellow, or as `fem.problem`.
+
+    Example:
+        >>> actuator = robots.BellowsActuator(num_bellows=2)
+        >>> cells = mesh.enrich(mesh.triangulate(actuator.body(), size=3 * mm, order=2))
+        >>> rubber = presets.dragon_skin_30()
+        >>> problem = robots.bellows_problem(actuator, cells, rubber, pushed=[1])
+        >>> [load.name for load in problem.loads]
+        ['air', 'push_1']
+    """
+    if pushed and not isinstance(actuator, BellowsActuator):
+        raise ValueError(
+            f"bellows_problem: got pushed={list(pushed)} with a PneuNet, which has no bellows. "
+            "Leave `pushed` out, and add a fem.Force on nodes of your own."
+        )
+    loads: list[Any] = [fem.Pressure(mesh.facets_on(cells, actuator.chambers()), name="air")]
+    if gravity is not None:
+        loads.append(fem.Gravity(gravity))
+    for k in pushed:
+        assert isinstance(actuator, BellowsActuator)
+        nodes = mesh.nodes_on_line(cells, *actuator.back(k))
+        loads.append(fem.Force(nodes, [0.0, 0.0], name=f"push_{k}"))
+    clamped = mesh.nodes_where(cells, lambda p: p[0] < 1e-9)
+    return fem.problem(
+        cells,
+        rubber,
+        kinematics=fem.PlaneStrain(depth),
+        supports=(fem.Fixed(clamped),),
+        loads=tuple(loads),
+        formulation=formulation,
+    )

@@ -218,13 +218,14 @@ def loop_of(
     valve: systems.Regulator,
     body: systems.RodBody,
     sensor: systems.Function | None = None,
+    seen: str = "tip_position",
 ) -> systems.Network:
     """The angle of the tip of `body` follows `target`, by air through `valve`; with a `sensor`
-    what that makes of the tip's position."""
-    seen, sensors = {"pid.measurement": "body.tip_angle"}, {}
+    what that makes of the output `seen` of the body."""
+    measured, sensors = {"pid.measurement": "body.tip_angle"}, {}
     if sensor is not None:
         sensors = {"sensor": sensor}
-        seen = {"sensor.a": "body.tip_position", "pid.measurement": "sensor.value"}
+        measured = {"sensor.a": f"body.{seen}", "pid.measurement": "sensor.value"}
     return systems.Network(
         blocks={
             **sensors,
@@ -236,7 +237,7 @@ def loop_of(
         },
         wires={
             "pid.reference": "target.value",
-            **seen,
+            **measured,
             "valve.setpoint": "pid.command",
             "valve.pressure": "air.pressure",
             "air.mass_flow": "valve.mass_flow",
