@@ -38,13 +38,21 @@ def test_every_number_with_a_bar_holds(out):
         for name, number in rows.items()
         if number["bar"]
     }
-    assert len(barred) == 4 and all(barred.values()), barred
+    assert len(barred) == 5 and all(barred.values()), barred
 
 
 def test_the_loop_follows_its_reference(out):
     loop = json.loads((out / "result.json").read_text())["loop"]
     assert loop["rms tracking error"]["value"] < 6  # deg, in 2 s for all three moves
     assert loop["largest bending"]["value"] > 30
+
+
+def test_the_error_has_a_slope_by_every_dimension_and_gain(out):
+    rows = json.loads((out / "result.json").read_text())["loop gradient"]
+    slopes = {name: row for name, row in rows.items() if name.startswith("d error / d ")}
+    assert len(slopes) == 7 + 4 and all(row["value"] != 0 for row in slopes.values())
+    assert slopes["d error / d gap"]["unit"] == "deg per mm"
+    assert slopes["d error / d derivative"]["unit"] == "deg per kPa s/rad"
 
 
 def test_a_folder_of_other_files_is_left_alone(tmp_path, capsys):

@@ -1,5 +1,6 @@
 """The bellows actuator: drawing, rubber, mesh and problem; its rod and the closed loop."""
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import SE2, fem, material, mesh, reduction, robots, rod, sdf, systems
+from sorojax.design import drawing_to_loop
 from sorojax.fem.equilibrium.solve import Path
 from sorojax.material.fit import TensileFit
 from sorojax.reduction.backbone import Backbone
@@ -71,6 +73,11 @@ def bellows_problem(
     return robots.bellows_problem(actuator, cells, scaled, depth=depth, formulation=formulation)
 
 
+DIMENSIONS = (
+    "wall_thickness", "bellow_width", "gap", "base", "chamber_height", "roof", "fillet",
+)  # fmt: skip
+
+
 class Sensitivity(NamedTuple):
     """Tip rotation [rad] at the top pressure and its derivative in every dimension.
 
@@ -89,10 +96,7 @@ class Sensitivity(NamedTuple):
 def sensitivity(design: Design, path: Path) -> Sensitivity:
     """d(tip rotation)/d(dimensions) by reverse mode, through mesh motion and equilibrium."""
     value, slopes = jax.value_and_grad(lambda a: tip_rotation(a, design, path))(design.actuator)
-    names = (
-        "wall_thickness", "bellow_width", "gap", "base", "chamber_height", "roof", "fillet",
-    )  # fmt: skip
-    gradient = {name: float(getattr(slopes, name)) for name in names}
+    gradient = {name: float(getattr(slopes, name)) for name in DIMENSIONS}
     return Sensitivity(float(value), gradient, _difference(design, path, 10e-6))
 
 
@@ -129,6 +133,7 @@ def _difference(design: Design, path: Path, h: float) -> float:
 
 #: Retardation time of the rubber [s]; an assumption, no measurement is public.
 DAMPING_TIME = 0.01
+VALVE = systems.Regulator(1.5e-8, integral_gain=3e-8, max_flow=3e-5)
 
 
 class Reduced(NamedTuple):
@@ -205,11 +210,10 @@ def controller(
 
 def closed_loop(reduced: Reduced, path: Path, duration: float) -> systems.Network:
     """Reservoir, regulator, rod and PID: the tip follows a reference angle."""
-    full = float(_tip_angle(reduced, -1))
+    full = full_angle(reduced)
     reference = systems.Source(reference_angle(full, duration), unit="rad")
     pid = controller(full, float(path.values[-1]))
-    valve = systems.Regulator(1.5e-8, integral_gain=3e-8, max_flow=3e-5)
-    return loop_of(reference, pid, valve, systems.RodBody(reduced.rod, reduced.forces))
+    return loop_of(reference, pid, VALVE, systems.RodBody(reduced.rod, reduced.forces))
 
 
 def loop_of(
@@ -249,6 +253,76 @@ def loop_of(
     )
 
 
+class LoopSensitivity(NamedTuple):
+    """Root mean square of the tracking error [rad] and its derivative in every dimension of the
+    drawing [rad/m] and every gain [rad per unit of the gain].
+
+    `differences` are central differences (order 4) in some of them.
+    """
+
+    rms: float
+    gradient: dict[str, float]
+    differences: dict[str, float]
+
+    @property
+    def error(self) -> float:
+        """The largest error of a derivative that was checked."""
+        return max(abs(self.gradient[k] / slope - 1) for k, slope in self.differences.items())
+
+
+GAINS = ("proportional", "integral_gain", "derivative", "feed_forward")
+
+
+def loop_sensitivity(
+    design: Design, path: Path, full: float, duration: float
+) -> LoopSensitivity:
+    """d(tracking error)/d(dimensions and gains) by reverse mode, through the whole chain from
+    the drawing to the closed loop; `full` is the angle at the top pressure [rad]."""
+    pid = controller(full, float(path.values[-1]))
+    target = systems.Source(reference_angle(full, duration), unit="rad")
+    start = {name: getattr(design.actuator, name) for name in DIMENSIONS}
+    start |= {name: getattr(pid, name) for name in GAINS}
+
+    def run(numbers, near=None):
+        of = {name: numbers[name] for name in DIMENSIONS}
+        actuator = dataclasses.replace(design.actuator, **of)
+        tuned = dataclasses.replace(pid, **{name: numbers[name] for name in GAINS})
+        middle = actuator.layer_thickness / 2
+        ends = jnp.stack([0 * middle, middle]), jnp.stack([actuator.length, middle])
+        return drawing_to_loop(
+            design.problem,
+            (actuator.body(), actuator.layer()),
+            reduction.Line(*ends),
+            lambda body: loop_of(target, tuned, VALVE, body),
+            duration,
+            modes={"kappa_z": 3},
+            damping=DAMPING_TIME,
+            near=near,
+            air=jnp.linspace(0.0, path.values[-1], 9),
+        )
+
+    first = run(start)
+
+    def cost(numbers):
+        return rms(run(numbers, first))
+
+    def difference(name: str, h: float) -> float:
+        def at(k: int) -> float:
+            return float(cost(start | {name: start[name] + k * h}))
+
+        return (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * h)
+
+    value, slopes = jax.value_and_grad(cost)(start)
+    steps = {name: 1e-3 * float(start[name]) for name in ("wall_thickness", "integral_gain")}
+    seen = {name: difference(name, h) for name, h in steps.items()}
+    return LoopSensitivity(float(value), {k: float(x) for k, x in slopes.items()}, seen)
+
+
+def rms(film) -> Float[Array, ""]:
+    """Of the tracking error [rad]."""
+    return jnp.sqrt(jnp.mean((film["body.tip_angle"] - film["target.value"]) ** 2))
+
+
 class Tracking(NamedTuple):
     """How well the tip followed its reference [rad]."""
 
@@ -268,5 +342,6 @@ def tracking(film: systems.Trajectory) -> Tracking:
     )
 
 
-def _tip_angle(reduced: Reduced, step: int) -> Float[Array, ""]:
-    return rod.tip_angle(rod.motion(reduced.rod, reduced.states[step]))
+def full_angle(reduced: Reduced) -> float:
+    """Of the tip at the top pressure [rad]."""
+    return float(rod.tip_angle(rod.motion(reduced.rod, reduced.states[-1])))

@@ -57,7 +57,12 @@ def run(out: Path, quick: bool = False) -> int:
         tell(
             f"{duration:g} s in {tracking.steps} steps, rms {np.degrees(tracking.rms):.2f} deg"
         )
-    results = Results(design, path, slope, reduced, film, tracking)
+    with clock.stage("gradient of the closed loop") as tell:
+        full = designs.full_angle(reduced)
+        loop_slope = designs.loop_sensitivity(design, path, full, 2.0)
+        count, off = len(loop_slope.gradient), loop_slope.error
+        tell(f"{count} dimensions and gains, central differences off by {off:.1e}")
+    results = Results(design, path, slope, reduced, film, tracking, loop_slope)
     with clock.stage("pictures and report") as tell, _all_or_nothing(out) as folder:
         drawn = pictures(results)
         write(folder, drawn, numbers(results), clock.seconds)
@@ -69,7 +74,7 @@ def run(out: Path, quick: bool = False) -> int:
 class _Clock:
     """Names the stages while they run and keeps their times [s]."""
 
-    count = 6
+    count = 7
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}

@@ -14,6 +14,7 @@ from sorojax.cli.demo.design import (
     DEPTH,
     LAYER_STIFFNESS,
     Design,
+    LoopSensitivity,
     Reduced,
     Sensitivity,
     Tracking,
@@ -34,6 +35,7 @@ class Results(NamedTuple):
     reduced: Reduced
     film: systems.Trajectory
     tracking: Tracking
+    loop_slope: LoopSensitivity
 
 
 def numbers(r: Results) -> dict[str, list[view.Number]]:
@@ -76,6 +78,7 @@ def numbers(r: Results) -> dict[str, list[view.Number]]:
             *(N(f"d rotation / d {name}", _deg_per_mm(r.slope, name), "deg/mm")
               for name in r.slope.gradient if name != "wall_thickness"),
         ],
+        "loop gradient": _loop_gradient(r.loop_slope),
         "rod": [
             N("captured squared curvature", float(r.reduced.captured["kappa_z"])),
             N("largest mean backbone error", gap / mm, "mm", "< 1 mm", gap < 1 * mm),
@@ -189,6 +192,27 @@ def _volume(problem, u, facets) -> float:
     return float(fem.enclosed_volume(problem, u, facets)) * 1e6
 
 
+_UNITS = {
+    "proportional": (kPa, "kPa/rad"),
+    "integral_gain": (kPa, "kPa/(rad s)"),
+    "derivative": (kPa, "kPa s/rad"),
+    "feed_forward": (kPa, "kPa/rad"),
+}
+
+
+def _loop_gradient(slope: LoopSensitivity) -> list[view.Number]:
+    rows = [
+        view.Number("rms tracking error in 2 s", np.degrees(slope.rms), "deg"),
+        view.Number("largest difference to central differences", slope.error, "", "< 1e-4",
+                    slope.error < 1e-4),
+    ]  # fmt: skip
+    for name, value in slope.gradient.items():
+        size, unit = _UNITS.get(name, (mm, "mm"))
+        per = f"deg per {unit}"
+        rows.append(view.Number(f"d error / d {name}", float(np.degrees(value)) * size, per))
+    return rows
+
+
 def _deg_per_mm(slope: Sensitivity, name: str) -> float:
     return float(np.degrees(slope.gradient[name])) * mm
 
@@ -202,6 +226,7 @@ _SECTIONS: tuple[tuple[str, str, dict[str, str]], ...] = (
         "deformed.png": "Deformed cross-sections, coloured by stress.",
     }),
     ("Gradient", "gradient", {}),
+    ("Gradient of the closed loop", "loop gradient", {}),
     ("Strain modes and rod", "rod", {
         "modes.png": "Curvature modes of the snapshots.",
         "backbones.png": "Backbones of solid and rod, and their distance.",
@@ -232,6 +257,12 @@ _TEXT = {
         "Derivative of the rotation of the free end at the top pressure in every dimension "
         "of the drawing, by reverse mode through mesh motion and equilibrium: one adjoint "
         "solve for all of them. The wall thickness is checked by central differences."
+    ),
+    "loop gradient": (
+        "Derivative of the root mean square of the tracking error, in a run of 2 s, in every "
+        "dimension of the drawing and every gain, by reverse mode through the whole chain: "
+        "mesh motion, equilibria, strain modes, laws of the rod and the closed loop. The wall "
+        "thickness and the integral gain are checked by central differences."
     ),
     "rod": (
         "The curvature of the middle of the layer at every pressure gives the modes; the "
