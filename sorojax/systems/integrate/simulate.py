@@ -19,6 +19,7 @@ from sorojax._types import real
 from sorojax.math.ode.explicit import AbstractMethod, RungeKutta4, Tsit5, finite
 from sorojax.math.ode.step_control import Control
 from sorojax.math.status import Status
+from sorojax.math.two_programs import two_programs
 from sorojax.systems.integrate.coupled import Coupled, bodies_of
 from sorojax.systems.integrate.integrate import (
     Event,
@@ -202,7 +203,7 @@ def simulate(
     return film
 
 
-@functools.partial(jit, kernels=False)
+@two_programs
 def _adaptive(
     network, state, inputs, first, interval, save, solver, control, watch, options
 ) -> Trajectory:

@@ -1,0 +1,149 @@
+"""Functions of which each derivative is one program: of concrete numbers, outside `jit`.
+
+JAX differentiates a compiled function in two programs more, one of which computes the value
+again and keeps all that its transpose needs. Here the value under `jax.grad` is the program of
+the value, and one program more computes it again and pulls back: half as much to compile, and
+nothing is kept but the arguments. It is compiled by itself, for speed of compilation. For
+functions that run faster than they compile.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+
+from sorojax._jax.jit import once
+from sorojax._jax.trace_state import evaluated_now, is_traced
+from sorojax.math.compiled import Split
+from sorojax.math.linear_map import pushed
+
+Verb = TypeVar("Verb", bound=Callable[..., Any])
+Leaves = list[Any]
+
+
+def two_programs(function: Verb) -> Verb:
+    """`function` of pytrees compiled, and its derivatives as one program each.
+
+    Arrays are traced, all else is static, also of what it returns. Under `jit`, `vmap` and in
+    second derivatives it is what `eqx.filter_jit` makes of it.
+    """
+    programs = _Programs(function)
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        given = Split(jax.tree.map(_as_array, (args, kwargs)))
+        if not is_traced(given.leaves):
+            return programs.value(given.leaves, given.form).whole()
+        return _differentiable(_Call(programs, given.form), given.leaves).whole()
+
+    return call  # type: ignore[return-value]
+
+
+def _as_array(leaf: Any) -> Any:
+    return jnp.asarray(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
+
+
+class _Programs:
+    """The value of a function of leaves and the form of their tree, and its derivatives by
+    the leaves that move; both lists have None in the places of the other."""
+
+    def __init__(self, function: Callable[..., Any]):
+        def value(leaves: Leaves, form: Any) -> Split:
+            args, kwargs = form.whole(leaves)
+            return Split(function(*args, **kwargs))
+
+        def wanted(moving: Leaves, rest: Leaves, form: Any, which: Sequence[int]) -> Leaves:
+            found = value(_joined(moving, rest), form).leaves
+            return [found[k] for k in which]
+
+        def push(moving, rest, rates, form, which):
+            by = functools.partial(wanted, rest=rest, form=form, which=which)
+            return jax.jvp(by, (moving,), (rates,))[1]
+
+        def pull(moving, rest, changes, form, which):
+            by = functools.partial(wanted, rest=rest, form=form, which=which)
+            return jax.vjp(by, moving)[1](changes)[0]
+
+        for part, end in ((value, ""), (push, "_pushed"), (pull, "_pulled")):
+            part.__name__ = part.__qualname__ = function.__name__ + end
+        self.value, self.push, self.pull = map(once, (value, push, pull))
+
+
+def _joined(some: Leaves, others: Leaves) -> Leaves:
+    return [y if x is None else x for x, y in zip(some, others, strict=True)]
+
+
+class _Call(NamedTuple):
+    programs: _Programs
+    form: Any
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _differentiable(of: _Call, leaves: Leaves) -> Split:
+    return of.programs.value(leaves, of.form)
+
+
+def _derivative(of: _Call, primals: Any, tangents: Any) -> tuple[Split, Split]:
+    (leaves,), (dots,) = primals, tangents
+    moves = [not isinstance(dot, SymbolicZero) for dot in dots]
+    moving, rates = ([x if m else None for x, m in zip(y, moves, strict=True)] for y in (leaves, dots))
+    rest = [None if m else x for x, m in zip(leaves, moves, strict=True)]
+    if is_traced(leaves):
+        by = lambda moving: of.programs.value(_joined(moving, rest), of.form)  # noqa: E731
+        return jax.jvp(by, (moving,), (rates,))
+    with evaluated_now(leaves):
+        found = of.programs.value(leaves, of.form)
+    which = tuple(k for k, x in enumerate(found.leaves) if eqx.is_inexact_array(x))
+    by = _Slope(of, moving, rest, {k: _shape(found.leaves[k]) for k in which})
+    changed = dict(zip(which, pushed(_present(rates), by), strict=True))
+    still = [changed.get(k, np.zeros(x.shape, jax.dtypes.float0)) for k, x in enumerate(found.leaves)]
+    return found, found.like(still)
+
+
+_differentiable.defjvp(_derivative, symbolic_zeros=True)
+
+
+def _present(leaves: Leaves) -> Leaves:
+    return [x for x in leaves if x is not None]
+
+
+def _shape(x: Any) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(x.shape, x.dtype)
+
+
+class _Slope:
+    """The derivative at concrete leaves as a `LinearMap`."""
+
+    def __init__(self, of: _Call, moving: Leaves, rest: Leaves, outputs: dict[int, Any]):
+        self._of, self._moving, self._rest, self._outputs = of, moving, rest, outputs
+
+    @property
+    def inputs(self) -> Leaves:
+        return _present(self._moving)
+
+    @property
+    def outputs(self) -> Leaves:
+        return list(self._outputs.values())
+
+    def onto(self, wanted: Sequence[bool]) -> "_Slope":
+        pairs = zip(self._outputs.items(), wanted, strict=True)
+        return _Slope(self._of, self._moving, self._rest, dict(x for x, w in pairs if w))
+
+    def push(self, *rates: Any) -> Leaves:
+        left = iter(rates)
+        rates = [None if x is None else next(left) for x in self._moving]
+        return self._of.programs.push(self._moving, self._rest, rates, *self._kind())
+
+    def pull(self, *changes: Any) -> Leaves:
+        found = self._of.programs.pull(self._moving, self._rest, list(changes), *self._kind())
+        return _present(found)
+
+    push_now, pull_now = push, pull
+
+    def _kind(self) -> tuple[Any, tuple[int, ...]]:
+        return self._of.form, tuple(self._outputs)
