@@ -22,6 +22,7 @@ from sorojax.fem import Newton, Problem, solve_path
 from sorojax.fem.equilibrium.solve import Path
 from sorojax.math.lie import SE2, SE3
 from sorojax.math.status import Status
+from sorojax.math.two_programs import two_programs
 from sorojax.mesh.measure import cell_areas, cell_volumes
 from sorojax.mesh.mesh import Mesh
 from sorojax.mesh.quality import distortion
@@ -360,16 +361,21 @@ def _body(problem: Problem, backbone: Backbone, basis, fit: Fit, damping, nodes)
 def _elastic(problem: Problem) -> Elastic:
     """Constants of the mean over the cells. Of these only the mass moves the rod, whose
     stiffness is that of its fit: the moduli have no derivative."""
-    flat = problem.mesh
-    sizes = (cell_areas if flat.element.dim == 2 else cell_volumes)(flat)
-    share, count = sizes / jnp.sum(sizes), flat.num_cells
+    rubber = _mean(problem.mesh, problem.material)
+    fixed = without_derivatives(rubber)
+    with evaluated_now(fixed):
+        made = elastic(fixed)
+    return Elastic(made.young_modulus, made.poisson_ratio, rubber.density)
+
+
+@two_programs
+def _mean(mesh: Mesh, material):
+    """The material with the mean of each number that differs from cell to cell."""
+    sizes = (cell_areas if mesh.element.dim == 2 else cell_volumes)(mesh)
+    share, count = sizes / jnp.sum(sizes), mesh.num_cells
 
     def mean(x):
         per_cell = eqx.is_inexact_array(x) and x.shape[:1] == (count,)
         return jnp.tensordot(share, x, 1) if per_cell else x
 
-    rubber = jax.tree.map(mean, problem.material)
-    fixed = without_derivatives(rubber)
-    with evaluated_now(fixed):
-        made = elastic(fixed)
-    return Elastic(made.young_modulus, made.poisson_ratio, rubber.density)
+    return jax.tree.map(mean, material)

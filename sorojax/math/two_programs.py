@@ -32,7 +32,7 @@ def two_programs(function: Verb) -> Verb:
     Arrays are traced, all else is static, also of what it returns. Under `jit`, `vmap` and in
     second derivatives it is what `eqx.filter_jit` makes of it.
     """
-    programs = _Programs(function)
+    programs = _Programs(_of_both(function))
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -44,8 +44,36 @@ def two_programs(function: Verb) -> Verb:
     return call  # type: ignore[return-value]
 
 
+def _of_both(function: Callable[..., Any]) -> Callable[[Any, Any], Any]:
+    @functools.wraps(function)
+    def call(args: Any, kwargs: Any) -> Any:
+        return function(*args, **kwargs)
+
+    return call
+
+
 def _as_array(leaf: Any) -> Any:
     return jnp.asarray(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
+
+
+def linear_program(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any, Any], Any]:
+    """`function(given, rates)`, linear in the arrays `rates`, as one program, and its transpose
+    as another; called with what its result is `like`, where `given` has no derivative."""
+    programs = _Programs(function)
+
+    def call(given: Any, rates: Any, like: Any) -> Any:
+        both = Split((given, rates))
+        outputs, tree = jax.tree.flatten(like)
+        if is_traced(given):
+            return jax.tree.unflatten(tree, programs.value(both.leaves, both.form).leaves)
+        count = len(both.leaves) - len(jax.tree.leaves(rates))
+        rest = [x if k < count else None for k, x in enumerate(both.leaves)]
+        with evaluated_now():
+            start = [None if k < count else jnp.zeros(x.shape, x.dtype) for k, x in enumerate(both.leaves)]
+        by = _Slope(_Call(programs, both.form), start, rest, dict(enumerate(map(_shape, outputs))))
+        return jax.tree.unflatten(tree, pushed(both.leaves[count:], by))
+
+    return call
 
 
 class _Programs:
@@ -54,8 +82,7 @@ class _Programs:
 
     def __init__(self, function: Callable[..., Any]):
         def value(leaves: Leaves, form: Any) -> Split:
-            args, kwargs = form.whole(leaves)
-            return Split(function(*args, **kwargs))
+            return Split(function(*form.whole(leaves)))
 
         def wanted(moving: Leaves, rest: Leaves, form: Any, which: Sequence[int]) -> Leaves:
             found = value(_joined(moving, rest), form).leaves

@@ -36,6 +36,30 @@ class AbstractCurve(eqx.Module):
     def __call__(self, s: Float[Array, " points"]) -> Float[Array, "points dim"]:
         """Points [m]."""
 
+    def spaced(self, s: Float[Array, " samples"]) -> "Spaced":
+        """The points at shares `s` of the arc length."""
+
+        def with_slope(s):
+            return jax.jvp(self, (s,), (jnp.ones_like(s),))
+
+        dense = jnp.linspace(0.0, 1.0, _DENSE)
+        speed = _lengths(with_slope(dense)[1])
+        way = jnp.cumsum((speed[1:] + speed[:-1]) / (2 * (_DENSE - 1)))
+        way = jnp.concatenate([jnp.zeros(1), way])
+        position, slope = with_slope(jnp.interp(s * way[-1], way, dense))
+        tangent = slope / _lengths(slope)[:, None]
+        return Spaced(position, tangent, way[-1], speed.min() / speed.max())
+
+
+class Spaced(NamedTuple):
+    """Points of a curve [m] with their unit tangents, its length [m], and the least speed of
+    its parametrisation over the largest."""
+
+    position: Float[Array, "samples dim"]
+    tangent: Float[Array, "samples dim"]
+    length: Float[Array, ""]
+    evenness: Float[Array, ""]
+
 
 class Line(AbstractCurve):
     """The straight line from `start` to `end` [m], in the plane or in space."""
@@ -56,6 +80,12 @@ class Line(AbstractCurve):
 
     def __call__(self, s):
         return self.start[None] + s[:, None] * (self.end - self.start)[None]
+
+    def spaced(self, s):
+        way = self.end - self.start
+        length = jnp.sqrt(jnp.sum(way**2))
+        tangent = jnp.broadcast_to(way / length, (s.shape[0], way.shape[0]))
+        return Spaced(self(s), tangent, length, jnp.ones_like(length))
 
 
 class Curve(AbstractCurve):
@@ -114,16 +144,8 @@ def reference(curve: AbstractCurve, samples: int, up=None) -> Reference:
 def _reference(curve: AbstractCurve, samples: int, up):
     """The samples, the least speed over the largest, and how much of `up` is across."""
 
-    def with_slope(s):
-        return jax.jvp(curve, (s,), (jnp.ones_like(s),))
-
-    dense = jnp.linspace(0.0, 1.0, _DENSE)
-    speed = _lengths(with_slope(dense)[1])
-    way = jnp.cumsum((speed[1:] + speed[:-1]) / (2 * (_DENSE - 1)))
-    way = jnp.concatenate([jnp.zeros(1), way])
-    s = jnp.linspace(0.0, 1.0, samples)
-    position, slope = with_slope(jnp.interp(s * way[-1], way, dense))
-    tangent, size = slope / _lengths(slope)[:, None], jnp.ones(())
+    s, size = jnp.linspace(0.0, 1.0, samples), jnp.ones(())
+    position, tangent, length, evenness = curve.spaced(s)
     if position.shape[1] == 2:
         normal = jnp.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
         frame = jnp.stack([tangent, normal], axis=2)
@@ -133,7 +155,7 @@ def _reference(curve: AbstractCurve, samples: int, up):
         across = up - jnp.dot(up, tangent[0]) * tangent[0]
         size = _lengths(across[None])[0]
         frame = _without_twist(position, tangent, across / size)
-    return Reference(s, way[-1], position, frame), speed.min() / speed.max(), size
+    return Reference(s, length, position, frame), evenness, size
 
 
 _compiled_reference = two_programs(_reference)

@@ -336,22 +336,23 @@ def _condensed_stiffness(
     path: Path, at: Probe, basis: StrainBasis
 ) -> Float[Array, "steps dof dof"]:
     """Stiffness against generalised forces on q at each equilibrium: (H K^-1 H')^-1."""
-    ways, answers = _slopes(at, basis, path.displacements), []
-    for k, u in enumerate(path.displacements):
-        answers.append(tangent_solve(path.problem_at(k), u, ways[k]))
-        report("identify", k + 1, len(path))
+    ways, states = _slopes(at, basis, path.displacements)
+    answers = []
+    for value, u, forces in zip(path.loading, states, ways, strict=True):
+        answers.append(tangent_solve(path.problem_under(value), u, forces))
+        report("identify", len(answers), len(path))
     return _inverse(ways, answers)
 
 
 @two_programs
-def _slopes(at: Probe, basis: StrainBasis, displacements) -> list[Float[Array, "dof dofs"]]:
-    """H = dq/du of the coordinates, at each state."""
+def _slopes(at: Probe, basis: StrainBasis, displacements) -> tuple[list[Array], list[Array]]:
+    """H = dq/du of the coordinates (dof, dofs), and the displacements, of each state."""
 
     def one(u):
         slopes = jax.jacrev(lambda u: project(at.strain(u), at.s, basis))(u)
         return slopes.reshape(basis.num_dof, -1)
 
-    return list(jax.vmap(one)(displacements))
+    return list(jax.vmap(one)(displacements)), list(displacements)
 
 
 @two_programs

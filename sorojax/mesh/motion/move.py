@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import integers, real
+from sorojax.math.two_programs import two_programs
 from sorojax.mesh.elements.base import facet_corners, nodes as reference_nodes, shape_functions
 from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.mesh import Mesh, boundary_facets
@@ -243,11 +244,11 @@ def moved_points(
     if len(border.sharp):
         sharp = meet(fields, border, points[border.sharp])
         if motion.ridges is not None:
-            shift = _follow(motion, spread(motion.ridges, _shift(motion, points, sharp)))
-            sharp = meet(fields, border, (points + shift)[border.sharp])
-    shift = _shift(motion, points, sharp)
+            shift = spread(motion.ridges, _shifted(motion, points, sharp))
+            sharp = meet(fields, border, _sharp_after(motion, points, shift))
+    shift = _shifted(motion, points, sharp)
     if motion.surface is not None:
-        shift = _follow(motion, spread(motion.surface, shift))
+        shift = spread(motion.surface, shift)
     landed = slide(fields, border, _beside(motion, points, shift))
     shift = boundary = _boundary_shift(motion, points, sharp, landed)
     if motion.inside is not None:
@@ -255,26 +256,6 @@ def moved_points(
     return _put(motion, points, shift, boundary)
 
 
-@eqx.filter_jit
-def _beside(motion: _Motion, points, shift):
-    return tuple((points + shift)[own.nodes] for own in motion.border.fields)
-
-
-@eqx.filter_jit
-def _boundary_shift(motion: _Motion, points, sharp, landed):
-    shift = _shift(motion, points, sharp)
-    for own, x in zip(motion.border.fields, landed, strict=True):
-        shift = shift.at[own.nodes].set(x - points[own.nodes])
-    return shift
-
-
-@eqx.filter_jit
-def _put(motion: _Motion, points, shift, boundary):
-    bent = motion.bent
-    return points + _follow(motion, shift).at[bent].set(boundary[bent])
-
-
-@eqx.filter_jit
 def _shift(motion: _Motion, points, sharp):
     shift = jnp.zeros_like(points)
     if sharp is None:
@@ -283,13 +264,41 @@ def _shift(motion: _Motion, points, sharp):
     return shift.at[at].set(sharp - points[at])
 
 
-@eqx.filter_jit
+_shifted = two_programs(_shift)
+
+
 def _follow(motion: _Motion, shift):
     """`shift` with that of all mid-side nodes interpolated from their cells."""
     if not len(motion.middles):
         return shift
     between = jnp.einsum("mk,mki->mi", motion.weights, shift[motion.parents])
     return shift.at[motion.middles].set(between)
+
+
+@two_programs
+def _sharp_after(motion: _Motion, points, shift):
+    return (points + _follow(motion, shift))[motion.border.sharp]
+
+
+@two_programs
+def _beside(motion: _Motion, points, shift):
+    if motion.surface is not None:
+        shift = _follow(motion, shift)
+    return tuple((points + shift)[own.nodes] for own in motion.border.fields)
+
+
+@two_programs
+def _boundary_shift(motion: _Motion, points, sharp, landed):
+    shift = _shift(motion, points, sharp)
+    for own, x in zip(motion.border.fields, landed, strict=True):
+        shift = shift.at[own.nodes].set(x - points[own.nodes])
+    return shift
+
+
+@two_programs
+def _put(motion: _Motion, points, shift, boundary):
+    bent = motion.bent
+    return points + _follow(motion, shift).at[bent].set(boundary[bent])
 
 
 def _motion(mesh: Mesh, num_interfaces: int) -> _Motion:
