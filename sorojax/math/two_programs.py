@@ -24,15 +24,18 @@ from sorojax.math.linear_map import pushed
 
 Verb = TypeVar("Verb", bound=Callable[..., Any])
 Leaves = list[Any]
+Again = Callable[..., tuple[Any, ...]]
 
 
-def two_programs(function: Verb) -> Verb:
+def two_programs(function: Verb, again: Again | None = None) -> Verb:
     """`function` of pytrees compiled, and its derivatives as one program each.
 
     Arrays are traced, all else is static, also of what it returns. Under `jit`, `vmap` and in
-    second derivatives it is what `eqx.filter_jit` makes of it.
+    second derivatives it is what `eqx.filter_jit` makes of it. `again` gives the arguments of
+    the function that is differentiated, from what it has returned and its arguments: with
+    the same arrays, and numbers that are static now that the first run has found them.
     """
-    programs = _Programs(_of_both(function))
+    programs = _Programs(_of_both(function), again)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -80,7 +83,7 @@ class _Programs:
     """The value of a function of leaves and the form of their tree, and its derivatives by
     the leaves that move; both lists have None in the places of the other."""
 
-    def __init__(self, function: Callable[..., Any]):
+    def __init__(self, function: Callable[..., Any], again: Again | None = None):
         def value(leaves: Leaves, form: Any) -> Split:
             return Split(function(*form.whole(leaves)))
 
@@ -99,6 +102,14 @@ class _Programs:
         for part, end in ((value, ""), (push, "_pushed"), (pull, "_pulled")):
             part.__name__ = part.__qualname__ = function.__name__ + end
         self.value, self.push, self.pull = map(once, (value, push, pull))
+        self._again = again
+
+    def form_again(self, form: Any, leaves: Leaves, found: Split) -> Any:
+        """The form of the arguments of the derivative."""
+        if self._again is None:
+            return form
+        args, kwargs = form.whole(leaves)
+        return Split((self._again(found.whole(), *args, **kwargs), {})).form
 
 
 def _joined(some: Leaves, others: Leaves) -> Leaves:
@@ -125,6 +136,7 @@ def _derivative(of: _Call, primals: Any, tangents: Any) -> tuple[Split, Split]:
         return jax.jvp(by, (moving,), (rates,))
     with evaluated_now(leaves):
         found = of.programs.value(leaves, of.form)
+        of = _Call(of.programs, of.programs.form_again(of.form, leaves, found))
     which = tuple(k for k, x in enumerate(found.leaves) if eqx.is_inexact_array(x))
     by = _Slope(of, moving, rest, {k: _shape(found.leaves[k]) for k in which})
     changed = dict(zip(which, pushed(_present(rates), by), strict=True))

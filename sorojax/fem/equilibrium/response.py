@@ -114,19 +114,24 @@ def _pulled(moving, rest, found, works: Float[Array, "rows dofs"]):
     """The derivatives of y (f - K x) by the numbers that move: of products with y = `works`
     and x = `found` alone, as K is the second derivative of an energy."""
 
-    def work(moving):
-        problem, u, forces = eqx.combine(moving, rest)
+    *body, forces = moving
 
-        def curved(x, y):
-            def slope(u):
-                return jax.jvp(lambda u: potential_energy(problem, u), (u,), (x,))[1]
+    def work(body, x, y):
+        problem, u = eqx.combine(tuple(body), rest[:2])
+        x, y = (way.reshape(u.shape) for way in (x, y))
 
-            return jax.jvp(slope, (u,), (y,))[1]
+        def slope(u):
+            return jax.jvp(lambda u: potential_energy(problem, u), (u,), (x,))[1]
 
-        ways = (rows.reshape(-1, *u.shape) for rows in (found, works))
-        return jnp.sum(works * forces) - jnp.sum(jax.vmap(curved)(*ways))
+        return -jax.jvp(slope, (u,), (y,))[1]
 
-    return jax.grad(work)(moving)
+    def add(total, ways):
+        return jax.tree.map(jnp.add, total, jax.grad(work)(body, *ways)), None
+
+    # row by row: the program holds one, and its arrays stay in the cache
+    start = jax.tree.map(jnp.zeros_like, body)
+    total, _ = jax.lax.scan(add, start, (found, works))
+    return *total, None if forces is None else works
 
 
 @eqx.filter_jit

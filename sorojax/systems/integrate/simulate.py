@@ -203,8 +203,7 @@ def simulate(
     return film
 
 
-@two_programs
-def _adaptive(
+def _run_adaptive(
     network, state, inputs, first, interval, save, solver, control, watch, options
 ) -> Trajectory:
     time = instants(first, interval, save)
@@ -217,6 +216,23 @@ def _adaptive(
     else:
         motion = adaptive(*run, dense=dense, **options)
     return film_of(network, time, inputs, motion, happened)
+
+
+_FEW = 4096  # steps of which every state is kept for the derivative
+
+
+def _run_again(film: Trajectory, *args: Any) -> tuple[Any, ...]:
+    """The arguments of the run that is differentiated: silent, and with as many steps as it
+    takes, so that few of its states are computed twice."""
+    *others, watch, options = args
+    _, _, dense = watch
+    most, taken = options["max_steps"], int(film.stats["steps"])
+    if not dense:
+        most = min(most, max(_FEW, 2 ** (taken + taken // 8).bit_length()))
+    return *others, watch, options | {"max_steps": most, "progress": False}
+
+
+_adaptive = two_programs(_run_adaptive, _run_again)
 
 
 @eqx.filter_jit
