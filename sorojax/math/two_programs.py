@@ -8,6 +8,7 @@ functions that run faster than they compile.
 """
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
@@ -17,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
-from sorojax._jax.jit import once
+from sorojax._jax.jit import jit
 from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax.math.compiled import Split
 from sorojax.math.linear_map import pushed
@@ -27,15 +28,19 @@ Leaves = list[Any]
 Again = Callable[..., tuple[Any, ...]]
 
 
-def two_programs(function: Verb, again: Again | None = None) -> Verb:
+def two_programs(function: Verb, again: Again | None = None, largest: float = math.inf) -> Verb:
     """`function` of pytrees compiled, and its derivatives as one program each.
 
     Arrays are traced, all else is static, also of what it returns. Under `jit`, `vmap` and in
-    second derivatives it is what `eqx.filter_jit` makes of it. `again` gives the arguments of
-    the function that is differentiated, from what it has returned and its arguments: with
-    the same arrays, and numbers that are static now that the first run has found them.
+    second derivatives it is what `eqx.filter_jit` makes of it.
+
+    Args:
+        function: Pure, and quick to run.
+        again: From what a first run returned and its arguments to those of the derivative:
+            the same arrays, and what is static as it is known now.
+        largest: As of `sorojax.jit`.
     """
-    programs = _Programs(_of_both(function), again)
+    programs = _Programs(_of_both(function), again, largest)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -70,20 +75,32 @@ def linear_program(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any, A
         if is_traced(given):
             return jax.tree.unflatten(tree, programs.value(both.leaves, both.form).leaves)
         count = len(both.leaves) - len(jax.tree.leaves(rates))
-        rest = [x if k < count else None for k, x in enumerate(both.leaves)]
+        moves = [k >= count for k in range(len(both.leaves))]
         with evaluated_now():
-            start = [None if k < count else jnp.zeros(x.shape, x.dtype) for k, x in enumerate(both.leaves)]
-        by = _Slope(_Call(programs, both.form), start, rest, dict(enumerate(map(_shape, outputs))))
+            zeros = [jnp.zeros(x.shape, x.dtype) for x in both.leaves]
+        start, rest = _only(moves, zeros), _only(moves, both.leaves, False)
+        shapes = dict(enumerate(map(_shape, outputs)))
+        by = _Slope(_Call(programs, both.form), start, rest, shapes)
         return jax.tree.unflatten(tree, pushed(both.leaves[count:], by))
 
     return call
+
+
+def _only(moves: Sequence[bool], leaves: Leaves, chosen: bool = True) -> Leaves:
+    """The leaves that move, or those that do not, with None in the place of the others."""
+    return [x if m is chosen else None for x, m in zip(leaves, moves, strict=True)]
 
 
 class _Programs:
     """The value of a function of leaves and the form of their tree, and its derivatives by
     the leaves that move; both lists have None in the places of the other."""
 
-    def __init__(self, function: Callable[..., Any], again: Again | None = None):
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        again: Again | None = None,
+        largest: float = math.inf,
+    ):
         def value(leaves: Leaves, form: Any) -> Split:
             return Split(function(*form.whole(leaves)))
 
@@ -101,7 +118,8 @@ class _Programs:
 
         for part, end in ((value, ""), (push, "_pushed"), (pull, "_pulled")):
             part.__name__ = part.__qualname__ = function.__name__ + end
-        self.value, self.push, self.pull = map(once, (value, push, pull))
+        compiled = functools.partial(jit, kernels=False, largest=largest)
+        self.value, self.push, self.pull = map(compiled, (value, push, pull))
         self._again = again
 
     def form_again(self, form: Any, leaves: Leaves, found: Split) -> Any:
@@ -129,8 +147,8 @@ def _differentiable(of: _Call, leaves: Leaves) -> Split:
 def _derivative(of: _Call, primals: Any, tangents: Any) -> tuple[Split, Split]:
     (leaves,), (dots,) = primals, tangents
     moves = [not isinstance(dot, SymbolicZero) for dot in dots]
-    moving, rates = ([x if m else None for x, m in zip(y, moves, strict=True)] for y in (leaves, dots))
-    rest = [None if m else x for x, m in zip(leaves, moves, strict=True)]
+    moving, rates = _only(moves, leaves), _only(moves, dots)
+    rest = _only(moves, leaves, False)
     if is_traced(leaves):
         by = lambda moving: of.programs.value(_joined(moving, rest), of.form)  # noqa: E731
         return jax.jvp(by, (moving,), (rates,))
@@ -140,7 +158,9 @@ def _derivative(of: _Call, primals: Any, tangents: Any) -> tuple[Split, Split]:
     which = tuple(k for k, x in enumerate(found.leaves) if eqx.is_inexact_array(x))
     by = _Slope(of, moving, rest, {k: _shape(found.leaves[k]) for k in which})
     changed = dict(zip(which, pushed(_present(rates), by), strict=True))
-    still = [changed.get(k, np.zeros(x.shape, jax.dtypes.float0)) for k, x in enumerate(found.leaves)]
+    still = [
+        changed.get(k, np.zeros(x.shape, jax.dtypes.float0)) for k, x in enumerate(found.leaves)
+    ]
     return found, found.like(still)
 
 
@@ -175,8 +195,8 @@ class _Slope:
 
     def push(self, *rates: Any) -> Leaves:
         left = iter(rates)
-        rates = [None if x is None else next(left) for x in self._moving]
-        return self._of.programs.push(self._moving, self._rest, rates, *self._kind())
+        moved = [None if x is None else next(left) for x in self._moving]
+        return self._of.programs.push(self._moving, self._rest, moved, *self._kind())
 
     def pull(self, *changes: Any) -> Leaves:
         found = self._of.programs.pull(self._moving, self._rest, list(changes), *self._kind())

@@ -263,7 +263,9 @@ def identify(
         >>> print(f"{float(fit.length) / mm:.1f} mm, {fit.elastic.stiffness.shape}")
         60.0 mm, (1, 1)
     """
-    return identified(path, basis, backbone, _probe(path, curve, backbone, arm, up), curve, degree, up)
+    return identified(
+        path, basis, backbone, _probe(path, curve, backbone, arm, up), curve, degree, up
+    )
 
 
 def identified(
@@ -279,7 +281,14 @@ def identified(
     condensed = _condensed_stiffness(path, at, basis)
     volumes = _volumes(body(problem), path.displacements, load.facets)
     laws, errors = _fitted(
-        path.values, backbone.s, backbone.strain, backbone.rest, basis, volumes, condensed, degree
+        path.values,
+        backbone.s,
+        backbone.strain,
+        backbone.rest,
+        basis,
+        volumes,
+        condensed,
+        degree,
     )
     return Fit(mean_section(problem, curve, up=up), backbone.length, *laws, *errors)
 

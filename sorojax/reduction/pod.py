@@ -23,7 +23,7 @@ from sorojax.rod.model.basis import STRAINS, Combined, SampledModes, columns
 RANK = 1e-10
 
 
-def weights(s: Float[Array, " samples"]) -> Float[Array, " samples"]:
+def weights(s: Float[Array | np.ndarray, " samples"]) -> Float[Array, " samples"]:
     """Trapezoidal weights of samples in [0, 1]."""
     gaps = jnp.pad(jnp.diff(s), 1)
     return (gaps[1:] + gaps[:-1]) / 2

@@ -243,7 +243,11 @@ def _unbalance(at: Equilibrium, rates: Problem, known: Bool[Array, " dofs"]):
 
 
 @once
-def _pulled(at: Equilibrium, work: Float[Array, " dofs"], known: Bool[Array, " dofs"]):
+def _pulled(
+    at: Equilibrium,
+    work: Float[Array | np.ndarray, " dofs"],
+    known: Bool[Array | np.ndarray, " dofs"],
+):
     """-work . dR by each of these numbers."""
     way = jnp.where(known, jnp.zeros_like(work), -_valid(at) * work).reshape(at.u.shape)
 

@@ -1,6 +1,5 @@
 """Time simulation of networks."""
 
-import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,7 +12,7 @@ from jaxtyping import Array, Float, PyTree
 
 from sorojax import _check
 from sorojax._display import displayed, number, outcome
-from sorojax._jax.jit import jit
+from sorojax._jax.small_kernels import LARGEST_GIVEN
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
 from sorojax.math.ode.explicit import AbstractMethod, RungeKutta4, Tsit5, finite
@@ -232,7 +231,7 @@ def _run_again(film: Trajectory, *args: Any) -> tuple[Any, ...]:
     return *others, watch, options | {"max_steps": most, "progress": False}
 
 
-_adaptive = two_programs(_run_adaptive, _run_again)
+_adaptive = two_programs(_run_adaptive, _run_again, LARGEST_GIVEN)
 
 
 @eqx.filter_jit
