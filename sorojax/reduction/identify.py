@@ -17,10 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax._edit import without_derivatives
+from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax._progress import report
 from sorojax._types import Numbers, real
 from sorojax.fem.assembly.geometry import quadrature_points
 from sorojax.fem.dynamics.damping import lumped_mass
+from sorojax.fem.equilibrium.linear import prepare
 from sorojax.fem.equilibrium.response import tangent_solve
 from sorojax.fem.equilibrium.solve import Path
 from sorojax.fem.kinematics import PlaneStrain, Solid
@@ -346,9 +349,11 @@ def _condensed_stiffness(
 ) -> Float[Array, "steps dof dof"]:
     """Stiffness against generalised forces on q at each equilibrium: (H K^-1 H')^-1."""
     ways, states = _slopes(at, basis, path.displacements)
-    answers = []
+    answers, fixed = [], without_derivatives(path.problem)
+    with evaluated_now(fixed):
+        prepared = None if is_traced(fixed) else prepare(fixed)
     for value, u, forces in zip(path.loading, states, ways, strict=True):
-        answers.append(tangent_solve(path.problem_under(value), u, forces))
+        answers.append(tangent_solve(path.problem_under(value), u, forces, prepared))
         report("identify", len(answers), len(path))
     return _inverse(ways, answers)
 

@@ -13,14 +13,17 @@ from sorojax._jax.jit import once
 from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax.fem.equilibrium.jit import prepare_traced
 from sorojax.fem.equilibrium.lanes import moving_part
-from sorojax.fem.equilibrium.linear import linearise
+from sorojax.fem.equilibrium.linear import Prepared, linearise, prepare
 from sorojax.fem.problem import Problem, potential_energy, residual, unsupported
 from sorojax.math.linalg import sparse
 from sorojax.math.linear_map import pushed
 
 
 def tangent_solve(
-    problem: Problem, u: Float[Array, "nodes dim"], forces: Float[Array, "rows dofs"]
+    problem: Problem,
+    u: Float[Array, "nodes dim"],
+    forces: Float[Array, "rows dofs"],
+    prepared: Prepared | None = None,
 ) -> Float[Array, "rows dofs"]:
     """Displacements x = K^-1 f [m] by small forces f [N] at the equilibrium `u`, zero where
     supports hold the body; K is the tangent there.
@@ -28,10 +31,14 @@ def tangent_solve(
     Differentiable once, forward and reverse, in the forces, in `u` and in every number of the
     problem: dx = K^-1 (df - dK x). So K is factored without a derivative of its assembly, and
     only the products K x, derivatives of the force of the body, are differentiated.
+    `prepared` is that of a concrete problem, for many states of one body.
     """
     fixed, held, right = jax.lax.stop_gradient((problem, u, forces))
     with evaluated_now(fixed, held, right):
-        matrix, known = _tangent(fixed, held)
+        if is_traced((fixed, held, right)):
+            matrix, known = _tangent(fixed, held)
+        else:
+            matrix, known = _tangent_on_host(fixed, held, prepared)
         tangent = _Tangent(fixed.space.system, matrix, known, forces.shape)
         found = tangent.solved(right)
     if not is_traced((problem, u, forces)):
@@ -134,6 +141,13 @@ def _pulled(moving, rest, found, works: Float[Array, "rows dofs"]):
     return *total, None if forces is None else works
 
 
+def _tangent_on_host(problem: Problem, u, prepared: Prepared | None):
+    """The same by the program that the search for equilibria has."""
+    prepared = prepare(problem) if prepared is None else prepared
+    values, known = linearise(problem, prepared, u, u).values, np.asarray(prepared.known)
+    return sparse.fixed_on_host(problem.space.system, np.asarray(values), known), known
+
+
 @eqx.filter_jit
 def _tangent(problem: Problem, u):
     """The tangent with its supports applied, and which unknowns these decide."""
@@ -159,8 +173,8 @@ class _Tangent:
     def __init__(
         self,
         system: sparse.SparseSymmetric,
-        matrix: Float[Array, " nnz"],
-        known: Bool[Array, " dofs"],
+        matrix: Float[Array | np.ndarray, " nnz"],
+        known: Bool[Array | np.ndarray, " dofs"],
         shape: tuple[int, ...],
     ):
         self.system, self.matrix, self.known = system, matrix, known
