@@ -40,24 +40,16 @@ def two_programs(function: Verb, again: Again | None = None, largest: float = ma
             the same arrays, and what is static as it is known now.
         largest: As of `sorojax.jit`.
     """
-    programs = _Programs(_of_both(function), again, largest)
+    programs = _Programs(function, again, largest)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
+        if not is_traced((args, kwargs)):
+            return programs.whole(*args, **kwargs)
         given = Split(jax.tree.map(_as_array, (args, kwargs)))
-        if not is_traced(given.leaves):
-            return programs.value(given.leaves, given.form).whole()
         return _differentiable(_Call(programs, given.form), given.leaves).whole()
 
     return call  # type: ignore[return-value]
-
-
-def _of_both(function: Callable[..., Any]) -> Callable[[Any, Any], Any]:
-    @functools.wraps(function)
-    def call(args: Any, kwargs: Any) -> Any:
-        return function(*args, **kwargs)
-
-    return call
 
 
 def _as_array(leaf: Any) -> Any:
@@ -70,10 +62,10 @@ def linear_program(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any, A
     programs = _Programs(function)
 
     def call(given: Any, rates: Any, like: Any) -> Any:
-        both = Split((given, rates))
-        outputs, tree = jax.tree.flatten(like)
         if is_traced(given):
-            return jax.tree.unflatten(tree, programs.value(both.leaves, both.form).leaves)
+            return programs.whole(given, rates)
+        both = Split(((given, rates), {}))
+        outputs, tree = jax.tree.flatten(like)
         count = len(both.leaves) - len(jax.tree.leaves(rates))
         moves = [k >= count for k in range(len(both.leaves))]
         with evaluated_now():
@@ -101,11 +93,9 @@ class _Programs:
         again: Again | None = None,
         largest: float = math.inf,
     ):
-        def value(leaves: Leaves, form: Any) -> Split:
-            return Split(function(*form.whole(leaves)))
-
         def wanted(moving: Leaves, rest: Leaves, form: Any, which: Sequence[int]) -> Leaves:
-            found = value(_joined(moving, rest), form).leaves
+            args, kwargs = form.whole(_joined(moving, rest))
+            found = Split(function(*args, **kwargs)).leaves
             return [found[k] for k in which]
 
         def push(moving, rest, rates, form, which):
@@ -116,11 +106,15 @@ class _Programs:
             by = functools.partial(wanted, rest=rest, form=form, which=which)
             return jax.vjp(by, moving)[1](changes)[0]
 
-        for part, end in ((value, ""), (push, "_pushed"), (pull, "_pulled")):
+        for part, end in ((push, "_pushed"), (pull, "_pulled")):
             part.__name__ = part.__qualname__ = function.__name__ + end
         compiled = functools.partial(jit, kernels=False, largest=largest)
-        self.value, self.push, self.pull = map(compiled, (value, push, pull))
+        self.whole, self.push, self.pull = map(compiled, (function, push, pull))
         self._again = again
+
+    def value(self, leaves: Leaves, form: Any) -> Split:
+        args, kwargs = form.whole(leaves)
+        return Split(self.whole(*args, **kwargs))
 
     def form_again(self, form: Any, leaves: Leaves, found: Split) -> Any:
         """The form of the arguments of the derivative."""
