@@ -6,8 +6,8 @@ of a line, modes, the identified rod, and the loop of valve, air, rod and PID. T
 mean square of the tracking error. `error` of the gradient is the largest difference to central
 differences of fourth order with the mesh's cells held, each number scaled by itself, over the
 larger of the component and a thousandth of the largest one; numbers that are zero or infinite
-are left out. `memory_MB` is the most that the process has held, compilation and the robots before
-included. No peer has such a gradient.
+are left out. `memory_MB` is the most that the process has held, compilation and the robots
+before included. No peer has such a gradient.
 """
 
 import jax

@@ -183,7 +183,8 @@ class _Tangent:
     def push(self, *rates):
         (rows,) = rates
         free = jnp.where(self.known[None], jnp.zeros_like(rows), rows)
-        solve = jax.vmap(lambda b: sparse.solve(self.system, self.matrix, b))
+        matrix = jnp.asarray(self.matrix)
+        solve = jax.vmap(lambda b: sparse.solve(self.system, matrix, b))
         return (jnp.where(self.known[None], jnp.zeros_like(rows), solve(free)),)
 
     def push_now(self, *rates):
