@@ -19,7 +19,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from sorojax._jax.jit import jit
-from sorojax._jax.trace_state import evaluated_now, is_traced
+from sorojax._jax.trace_state import evaluated_now, is_traced, is_tracer
 from sorojax.math.compiled import Split
 from sorojax.math.linear_map import pushed
 
@@ -44,7 +44,9 @@ def two_programs(function: Verb, again: Again | None = None, largest: float = ma
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        if not is_traced((args, kwargs)):
+        traced = [x for x in jax.tree.leaves((args, kwargs)) if is_tracer(x)]
+        # in a batch or under `jit`, and where nothing has a derivative
+        if not traced or is_traced(jax.lax.stop_gradient(traced)):
             return programs.whole(*args, **kwargs)
         given = Split(jax.tree.map(_as_array, (args, kwargs)))
         return _differentiable(_Call(programs, given.form), given.leaves).whole()
