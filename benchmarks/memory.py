@@ -16,6 +16,11 @@ def resident(entry: str) -> float:
     return int(line.split()[1]) / 1024
 
 
+def highest() -> float | None:
+    """Most memory [MB] that this process has held; `None` if the system does not tell."""
+    return resident("VmHWM") if _STATUS.exists() else None
+
+
 def forget_peak() -> None:
     """From here on, the highest is counted anew."""
     _CLEAR.write_text("5")

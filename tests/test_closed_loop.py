@@ -186,7 +186,7 @@ def held(function):
         (closed_loop, "solve_path"),
         (closed_loop, "pod_basis"),
         (identification, "_condensed_stiffness"),
-        (identification, "enclosed_volume"),
+        (identification, "_volumes"),
     ],
 )
 def test_without_the_rule_of_one_part_the_slopes_are_wrong(

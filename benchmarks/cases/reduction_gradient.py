@@ -6,13 +6,15 @@ of a line, modes, the identified rod, and the loop of valve, air, rod and PID. T
 mean square of the tracking error. `error` of the gradient is the largest difference to central
 differences of fourth order with the mesh's cells held, each number scaled by itself, over the
 larger of the component and a thousandth of the largest one; numbers that are zero or infinite
-are left out. No peer has such a gradient.
+are left out. `memory_MB` is the most that the process has held, compilation and the robots
+before included. No peer has such a gradient.
 """
 
 import jax
 
 from benchmarks import loops
 from benchmarks.harness import Row, measure_calls, quick
+from benchmarks.memory import highest
 from sorojax.units import mm
 
 WORST = 1e-4
@@ -42,6 +44,7 @@ def _rows(name: str, loop: loops.Loop):
         "loop_s": float(loop.near.time[-1]),
     }
     yield Row("sorojax", settings | {"method": f"{name}, value"}, **value.columns())
+    settings["memory_MB"] = highest()
     yield Row(
         "sorojax",
         settings | {"method": f"{name}, value and gradient"},

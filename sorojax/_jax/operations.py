@@ -18,6 +18,7 @@ from sorojax._jax.trace_state import is_traced
 _found, _status = every(
     ("jax.extend.core", "Primitive"),
     ("jax.core", "ShapedArray"),
+    ("jax.interpreters.ad", "Zero"),
     ("jax.interpreters.ad", "instantiate_zeros"),
     ("jax.interpreters.ad", "primitive_jvps"),
     ("jax.interpreters.ad", "primitive_transposes"),
@@ -38,8 +39,8 @@ class Rules(NamedTuple):
             answers results that are mapped along their first axis.
         derivative: Gets the arrays and their tangents, answers results and their tangents.
             Without it the operation has no derivative.
-        transpose: Gets the cotangents of the results, answers those of the arrays; for
-            operations that are linear in all their arrays.
+        transpose: Gets the cotangents of the results (`None` for zeros, where JAX knows),
+            answers those of the arrays; for operations that are linear in all their arrays.
         lowering: A rule of MLIR in place of `stage`, which is then the fallback.
     """
 
@@ -86,7 +87,8 @@ def _primitive(name: str, rules: Rules) -> Callable[..., list[Any]]:
         return rules.derivative(primals, [with_zeros(t) for t in tangents], **params)  # type: ignore[misc]
 
     def transposed(changes: Any, *_: Any, **params: Any) -> Any:
-        return rules.transpose([with_zeros(c) for c in changes], **params)  # type: ignore[misc]
+        given = [None if isinstance(c, _found["Zero"]) else c for c in changes]
+        return rules.transpose(given, **params)  # type: ignore[misc]
 
     _found["primitive_batchers"][one] = batched
     if rules.derivative is not None:

@@ -22,12 +22,13 @@ from sorojax.fem import Newton, Problem, solve_path
 from sorojax.fem.equilibrium.solve import Path
 from sorojax.math.lie import SE2, SE3
 from sorojax.math.status import Status
+from sorojax.math.two_programs import two_programs
 from sorojax.mesh.measure import cell_areas, cell_volumes
 from sorojax.mesh.mesh import Mesh
 from sorojax.mesh.quality import distortion
-from sorojax.reduction import AbstractCurve, Backbone, identify, pod_basis, strain_along
-from sorojax.reduction.backbone import probe
-from sorojax.reduction.identify import Fit
+from sorojax.reduction import AbstractCurve, Backbone, pod_basis
+from sorojax.reduction.backbone import Probe, sampled
+from sorojax.reduction.identify import Fit, identified
 from sorojax.reduction.pod import RANK, weights
 from sorojax.rod import AbstractModes, Elastic, Rod, StrainBasis, elastic, rod
 from sorojax.systems import Network, Rodas4, RodBody, simulate
@@ -228,7 +229,6 @@ def drawing_to_loop(
             "drawing_to_loop: got one of `network` and `duration`, need both for a motion, or "
             "none for the rod alone."
         )
-    along = {"samples": samples, "arm": arm, "up": up}
     if near is not None:
         modes = _held_modes(problem.mesh, modes, samples, near)
 
@@ -240,12 +240,12 @@ def drawing_to_loop(
         path = solve_path(moved, newton=newton, throw=throw, **steps)
         yield "path", path.status, {"path": path}
         seen = None if near is None else near.backbone
-        backbone = strain_along(path, curve, near=seen, **along)
-        status = _curve_status(path.problem.mesh, curve, backbone, along)
+        backbone, at = sampled(path, curve, samples, arm, up, seen)
+        status = _curve_status(path.problem.mesh, at)
         yield "curve", status, {"backbone": backbone}
         basis = pod_basis(backbone, modes=modes, within=within)
         yield "modes", _modes_status(backbone, basis), {"basis": basis}
-        fit = identify(path, basis, backbone, curve, degree=degree, arm=arm, up=up)
+        fit = identified(path, basis, backbone, at, curve, degree, up)
         body = _body(path.problem, backbone, basis, fit, damping, nodes)
         yield "rod", _rod_status(fit), {"fit": fit, "body": body}
         if network is not None and duration is not None:
@@ -304,15 +304,20 @@ def _mesh_status(mesh: Mesh, moved: Mesh) -> Status:
 _OUT = 0.5  # of the cell beside a sample
 
 
-def _curve_status(mesh: Mesh, curve, backbone: Backbone, along: dict) -> Status:
-    mesh, curve, backbone = without_derivatives((mesh, curve, backbone))
-    with evaluated_now(mesh, curve, backbone):
-        at = probe(mesh, curve, cells=backbone.cells, **along)
-        corners = mesh.points[at.locations.nodes]
-        low, high = jnp.min(corners, axis=1), jnp.max(corners, axis=1)
-        x = at.fibres.reshape(low.shape)
-        out = jnp.max(jnp.maximum(low - x, x - high) / (high - low))
+def _curve_status(mesh: Mesh, at: Probe):
+    points, fibres = without_derivatives((mesh.points, at.fibres))
+    with evaluated_now(points, fibres):
+        out = _farthest_out(points, fibres, at.locations.nodes)
         return _unless(out < _OUT, Status.outside_mesh)
+
+
+@jax.jit
+def _farthest_out(points, fibres, nodes) -> Array:
+    """Of the samples from the boxes around their cells, in sizes of these."""
+    corners = points[nodes]
+    low, high = jnp.min(corners, axis=1), jnp.max(corners, axis=1)
+    x = fibres.reshape(low.shape)
+    return jnp.max(jnp.maximum(low - x, x - high) / (high - low))
 
 
 _STILL = 1e-9  # of a stretch, or of a turn over the length [rad]
@@ -375,16 +380,21 @@ def _body(problem: Problem, backbone: Backbone, basis, fit: Fit, damping, nodes)
 def _elastic(problem: Problem) -> Elastic:
     """Constants of the mean over the cells. Of these only the mass moves the rod, whose
     stiffness is that of its fit: the moduli have no derivative."""
-    flat = problem.mesh
-    sizes = (cell_areas if flat.element.dim == 2 else cell_volumes)(flat)
-    share, count = sizes / jnp.sum(sizes), flat.num_cells
+    rubber = _mean(problem.mesh, problem.material)
+    fixed = without_derivatives(rubber)
+    with evaluated_now(fixed):
+        made = elastic(fixed)
+    return Elastic(made.young_modulus, made.poisson_ratio, rubber.density)
+
+
+@two_programs
+def _mean(mesh: Mesh, material):
+    """The material with the mean of each number that differs from cell to cell."""
+    sizes = (cell_areas if mesh.element.dim == 2 else cell_volumes)(mesh)
+    share, count = sizes / jnp.sum(sizes), mesh.num_cells
 
     def mean(x):
         per_cell = eqx.is_inexact_array(x) and x.shape[:1] == (count,)
         return jnp.tensordot(share, x, 1) if per_cell else x
 
-    rubber = jax.tree.map(mean, problem.material)
-    fixed = without_derivatives(rubber)
-    with evaluated_now(fixed):
-        made = elastic(fixed)
-    return Elastic(made.young_modulus, made.poisson_ratio, rubber.density)
+    return jax.tree.map(mean, material)

@@ -144,6 +144,10 @@ class Split:
     def whole(self) -> Any:
         return self.form.whole(self.leaves)
 
+    def like(self, leaves: list[Any]) -> "Split":
+        """The same tree with other `leaves`."""
+        return self.tree_unflatten(self.form, leaves)
+
     def tree_flatten(self):
         return self.leaves, self.form
 

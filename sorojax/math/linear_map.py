@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array
 
 from sorojax._jax.operations import Rules, operation
@@ -19,7 +20,8 @@ class LinearMap(Protocol):
     """A map at concrete numbers, compared by identity.
 
     `push` and `pull` are made of operations that JAX differentiates and batches; `push_now`
-    and `pull_now` get concrete arrays.
+    and `pull_now` get concrete arrays. A map whose outputs cost much has also `onto(wanted)`,
+    the map to some of them alone: where cotangents are zero, it is transposed.
     """
 
     @property
@@ -51,14 +53,24 @@ def _rules(way: str, to: str, other: Callable[[], Any], this: Callable[[], Any])
     def derivative(primals: Any, tangents: Any, by: LinearMap) -> Any:
         return this()(*primals, by=by), this()(*tangents, by=by)
 
+    def transpose(changes: Any, by: LinearMap) -> Any:
+        onto, given = getattr(by, "onto", None), [c for c in changes if c is not None]
+        if way == "push" and onto is not None:
+            return other()(*given, by=onto([c is not None for c in changes]))
+        return other()(*map(_filled, changes, getattr(by, to)), by=by)
+
     return Rules(
         run=lambda *values, by: getattr(by, f"{way}_now")(*values),
         stage=lambda *values, by: getattr(by, way)(*values),
         shapes=lambda *_, by: getattr(by, to),
         batch=batch,
         derivative=derivative,
-        transpose=lambda changes, by: other()(*changes, by=by),
+        transpose=transpose,
     )
+
+
+def _filled(change: Array | None, like: Any) -> Array:
+    return jnp.zeros(like.shape, like.dtype) if change is None else change
 
 
 _push = operation("linear_map", _rules("push", "outputs", lambda: _pull, lambda: _push))

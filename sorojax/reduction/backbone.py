@@ -15,8 +15,10 @@ from jaxtyping import Array, Float, Int
 
 from sorojax import _check
 from sorojax._display import displayed, number
+from sorojax._jax.trace_state import evaluated_now
 from sorojax._types import Numbers, real
 from sorojax.fem.equilibrium.solve import Path
+from sorojax.math.two_programs import two_programs
 from sorojax.mesh.measure import Locations, cells_at, locate
 from sorojax.mesh.mesh import Mesh
 from sorojax.rod.model.basis import STRAINS
@@ -33,6 +35,30 @@ class AbstractCurve(eqx.Module):
     @abc.abstractmethod
     def __call__(self, s: Float[Array, " points"]) -> Float[Array, "points dim"]:
         """Points [m]."""
+
+    def spaced(self, s: Float[Array, " samples"]) -> "Spaced":
+        """The points at shares `s` of the arc length."""
+
+        def with_slope(s):
+            return jax.jvp(self, (s,), (jnp.ones_like(s),))
+
+        dense = jnp.linspace(0.0, 1.0, _DENSE)
+        speed = _lengths(with_slope(dense)[1])
+        way = jnp.cumsum((speed[1:] + speed[:-1]) / (2 * (_DENSE - 1)))
+        way = jnp.concatenate([jnp.zeros(1), way])
+        position, slope = with_slope(jnp.interp(s * way[-1], way, dense))
+        tangent = slope / _lengths(slope)[:, None]
+        return Spaced(position, tangent, way[-1], speed.min() / speed.max())
+
+
+class Spaced(NamedTuple):
+    """Points of a curve [m] with their unit tangents, its length [m], and the least speed of
+    its parametrisation over the largest."""
+
+    position: Float[Array, "samples dim"]
+    tangent: Float[Array, "samples dim"]
+    length: Float[Array, ""]
+    evenness: Float[Array, ""]
 
 
 class Line(AbstractCurve):
@@ -54,6 +80,12 @@ class Line(AbstractCurve):
 
     def __call__(self, s):
         return self.start[None] + s[:, None] * (self.end - self.start)[None]
+
+    def spaced(self, s):
+        way = self.end - self.start
+        length = jnp.sqrt(jnp.sum(way**2))
+        tangent = jnp.broadcast_to(way / length, (s.shape[0], way.shape[0]))
+        return Spaced(self(s), tangent, length, jnp.ones_like(length))
 
 
 class Curve(AbstractCurve):
@@ -99,7 +131,7 @@ def reference(curve: AbstractCurve, samples: int, up=None) -> Reference:
     """
     if samples < 3:
         raise ValueError(f"backbone: got {samples} samples, need 3 or more. 81 are usual.")
-    known, slowest, across = _reference(curve, samples, None if up is None else real(up))
+    known, slowest, across = _compiled_reference(curve, samples, _real_or_none(up))
     if _check.is_concrete(slowest) and not slowest > 1e-9:
         raise ValueError(
             "backbone: the curve stands still at a point, need a smooth parametrisation."
@@ -109,20 +141,11 @@ def reference(curve: AbstractCurve, samples: int, up=None) -> Reference:
     return known
 
 
-@eqx.filter_jit
 def _reference(curve: AbstractCurve, samples: int, up):
     """The samples, the least speed over the largest, and how much of `up` is across."""
 
-    def with_slope(s):
-        return jax.jvp(curve, (s,), (jnp.ones_like(s),))
-
-    dense = jnp.linspace(0.0, 1.0, _DENSE)
-    speed = _lengths(with_slope(dense)[1])
-    way = jnp.cumsum((speed[1:] + speed[:-1]) / (2 * (_DENSE - 1)))
-    way = jnp.concatenate([jnp.zeros(1), way])
-    s = jnp.linspace(0.0, 1.0, samples)
-    position, slope = with_slope(jnp.interp(s * way[-1], way, dense))
-    tangent, size = slope / _lengths(slope)[:, None], jnp.ones(())
+    s, size = jnp.linspace(0.0, 1.0, samples), jnp.ones(())
+    position, tangent, length, evenness = curve.spaced(s)
     if position.shape[1] == 2:
         normal = jnp.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
         frame = jnp.stack([tangent, normal], axis=2)
@@ -132,7 +155,10 @@ def _reference(curve: AbstractCurve, samples: int, up):
         across = up - jnp.dot(up, tangent[0]) * tangent[0]
         size = _lengths(across[None])[0]
         frame = _without_twist(position, tangent, across / size)
-    return Reference(s, way[-1], position, frame), speed.min() / speed.max(), size
+    return Reference(s, length, position, frame), evenness, size
+
+
+_compiled_reference = two_programs(_reference)
 
 
 def _lengths(vectors: Float[Array, "n dim"]) -> Float[Array, " n"]:
@@ -279,7 +305,7 @@ class Backbone(eqx.Module):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the columns of `strain`."""
-        return STRAINS if self.strain.shape[-1] == 6 else PLANAR
+        return names_of(self.strain)
 
     def _text(self) -> str:
         steps, samples, dim = self.positions.shape
@@ -295,15 +321,26 @@ class Backbone(eqx.Module):
 
     @property
     def rest_or_straight(self) -> Float[Array, "samples strain"]:
-        if self.rest is not None:
-            return self.rest
-        straight = jnp.array([float(name == "sigma_x") for name in self.names])
-        return jnp.broadcast_to(straight, self.strain.shape[1:])
+        return rest_or_straight(self.strain, self.rest)
 
     def rest_strain(self, s: Float[Array, " points"]) -> Float[Array, "points strain"]:
         """Strain at rest between the samples: give it to `rod` as its `rest_strain`."""
         columns = self.rest_or_straight.T
         return jnp.stack([jnp.interp(s, self.s, column) for column in columns], axis=1)
+
+
+def names_of(strain: Float[Array, "*rows strain"]) -> tuple[str, ...]:
+    return STRAINS if strain.shape[-1] == 6 else PLANAR
+
+
+def rest_or_straight(
+    strain: Float[Array, "steps samples strain"], rest: Float[Array, "samples strain"] | None
+) -> Float[Array, "samples strain"]:
+    """The strain at rest, without one that of a straight line."""
+    if rest is not None:
+        return rest
+    straight = jnp.array([float(name == "sigma_x") for name in names_of(strain)])
+    return jnp.broadcast_to(straight, strain.shape[1:])
 
 
 class Probe(eqx.Module):
@@ -316,8 +353,8 @@ class Probe(eqx.Module):
     locations: Locations
     fibres: Float[Array, "fibres samples dim"]
     base: Float[Array, "dim dim"]
-    s: Float[Array, " samples"]
     length: Float[Array, ""]
+    s: Float[Array, " samples"]
 
     def __call__(self, u: Float[Array, "nodes dim"]) -> Float[Array, "samples dim"]:
         """Positions of the curve in the frame of its base [m]."""
@@ -358,26 +395,41 @@ def probe(
         ValueError: If the curve, or the fibres beside it, leave the mesh.
     """
     if cells is None:
-        known = reference(curve, samples, up)
-        fibres = _fibres(known, arm)
-        try:
-            cells = jnp.asarray(cells_at(mesh, fibres.reshape(-1, fibres.shape[-1])))
-        except ValueError as error:
-            if len(fibres) == 1:
-                raise
-            beside = known.length / _ARM if arm is None else arm
-            raise ValueError(
-                f"strain_along: {error} The fibres lie {beside:.3g} m beside it: lower `arm`."
-            ) from None
-    return _probe(mesh, curve, samples, arm, None if up is None else real(up), cells)
+        cells = _chosen_cells(mesh, curve, samples, arm, up)
+    return Probe(*_probe(mesh, curve, samples, arm, _real_or_none(up), cells), _even(samples))
 
 
-@eqx.filter_jit
-def _probe(mesh: Mesh, curve: AbstractCurve, samples: int, arm, up, cells) -> Probe:
+def _chosen_cells(mesh: Mesh, curve: AbstractCurve, samples: int, arm, up):
     known = reference(curve, samples, up)
     fibres = _fibres(known, arm)
+    try:
+        return jnp.asarray(cells_at(mesh, fibres.reshape(-1, fibres.shape[-1])))
+    except ValueError as error:
+        if len(fibres) == 1:
+            raise
+        beside = known.length / _ARM if arm is None else arm
+        raise ValueError(
+            f"strain_along: {error} The fibres lie {beside:.3g} m beside it: lower `arm`."
+        ) from None
+
+
+def _real_or_none(up):
+    return None if up is None else real(up)
+
+
+def _even(samples: int) -> Float[Array, " samples"]:
+    """Samples of any curve, which have no derivative."""
+    with evaluated_now():
+        return jnp.linspace(0.0, 1.0, samples)
+
+
+@two_programs
+def _probe(mesh: Mesh, curve: AbstractCurve, samples: int, arm, up, cells):
+    """All of a probe but its `s`."""
+    known = _reference(curve, samples, up)[0]
+    fibres = _fibres(known, arm)
     locations = locate(mesh, fibres.reshape(-1, fibres.shape[-1]), cells)
-    return Probe(locations, fibres, known.frame[0], known.s, known.length)
+    return locations, fibres, known.frame[0], known.length
 
 
 _ARM = 50  # length over the distance of the fibres, in space
@@ -475,15 +527,31 @@ def strain_along(
     Reference:
         Caasenbrood, Pogromsky and Nijmeijer, Sorotoki, IEEE Access 12, 2024, algorithm 1.
     """
-    cells = None if near is None else near.cells
-    at = probe(path.problem.mesh, curve, samples, arm=arm, up=up, cells=cells)
-    positions, strain = _snapshots(at, path.displacements)
-    rest = None
-    if not isinstance(curve, Line):
-        rest = _snapshots(at, jnp.zeros_like(path.displacements[:1]))[1][0]
-    return Backbone(at.s, at.length, positions, strain, rest, at.locations.cells)
+    return sampled(path, curve, samples, arm, up, near)[0]
 
 
-@eqx.filter_jit
-def _snapshots(at: Probe, displacements: Array) -> tuple[Array, Array]:
-    return jax.vmap(at)(displacements), jax.vmap(at.strain)(displacements)
+def sampled(
+    path: Path, curve: AbstractCurve, samples: int, arm, up, near: Backbone | None
+) -> tuple[Backbone, Probe]:
+    """The backbone of `strain_along`, and the probe that took it."""
+    mesh, cells = path.problem.mesh, None if near is None else near.cells
+    if cells is None:
+        cells = _chosen_cells(mesh, curve, samples, arm, up)
+    s = _even(samples)
+    at, (positions, strain), rest = _sampled(
+        mesh, curve, samples, arm, _real_or_none(up), cells, s, path.displacements
+    )
+    at = Probe(*at, s)
+    return Backbone(s, at.length, positions, strain, rest, at.locations.cells), at
+
+
+@two_programs
+def _sampled(mesh: Mesh, curve: AbstractCurve, samples: int, arm, up, cells, s, displacements):
+    """All of a probe but its `s`, positions and strains of the states, and those at rest of
+    a curve that is not straight."""
+    parts = _probe(mesh, curve, samples, arm, up, cells)
+    at = Probe(*parts, s)
+    states = jax.vmap(at)(displacements), jax.vmap(at.strain)(displacements)
+    if isinstance(curve, Line):
+        return parts, states, None
+    return parts, states, at.strain(jnp.zeros_like(displacements[0]))

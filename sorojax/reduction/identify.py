@@ -11,25 +11,27 @@ stiffness, dPsi*/dq = 0 the equilibrium, and dPsi*/dp the volume. One potential 
 and volume, so no energy is lost between gas and rod.
 """
 
-import functools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax._edit import without_derivatives
+from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax._progress import report
 from sorojax._types import Numbers, real
 from sorojax.fem.assembly.geometry import quadrature_points
 from sorojax.fem.dynamics.damping import lumped_mass
+from sorojax.fem.equilibrium.linear import prepare
 from sorojax.fem.equilibrium.response import tangent_solve
 from sorojax.fem.equilibrium.solve import Path
 from sorojax.fem.kinematics import PlaneStrain, Solid
+from sorojax.fem.loads.facets import cavity_volume
 from sorojax.fem.loads.loads import Pressure
-from sorojax.fem.problem import Problem
-from sorojax.fem.stress import enclosed_volume
+from sorojax.fem.problem import Problem, body
 from sorojax.math.linalg.dense import least_squares
+from sorojax.math.two_programs import two_programs
 from sorojax.mesh.mesh import Mesh
 from sorojax.reduction.backbone import (
     AbstractCurve,
@@ -39,9 +41,10 @@ from sorojax.reduction.backbone import (
     Reference,
     probe,
     reference,
+    rest_or_straight,
 )
 from sorojax.reduction.damping import ConstantDamping
-from sorojax.reduction.pod import coordinates, project
+from sorojax.reduction.pod import project
 from sorojax.rod import (
     AbstractForce,
     AbstractPressureMap,
@@ -73,10 +76,11 @@ def mean_section(
             f"mean_section: got {type(problem.kinematics).__name__}, need PlaneStrain or "
             "Solid. Give the rod a section of your own."
         )
-    return _mean_section(problem.mesh, problem.kinematics, reference(curve, _SAMPLES, up))
+    along = reference(curve, _SAMPLES, up)
+    return _mean_section(problem.mesh, problem.kinematics, along)
 
 
-@eqx.filter_jit
+@two_programs
 def _mean_section(mesh: Mesh, kinematics: PlaneStrain | Solid, known: Reference) -> Section:
     inside = quadrature_points(mesh, kinematics)
     points = jnp.moveaxis(inside.position, 0, -1).reshape(-1, kinematics.dim)
@@ -262,21 +266,32 @@ def identify(
         >>> print(f"{float(fit.length) / mm:.1f} mm, {fit.elastic.stiffness.shape}")
         60.0 mm, (1, 1)
     """
+    return identified(
+        path, basis, backbone, _probe(path, curve, backbone, arm, up), curve, degree, up
+    )
+
+
+def identified(
+    path: Path, basis: StrainBasis, backbone: Backbone, at: Probe, curve, degree: int, up
+) -> Fit:
+    """`identify` with a probe that is known."""
     problem, load = path.problem, _pressure(path)
     if len(path) < degree + 2:
         raise ValueError(
             f"identify: the path holds {len(path)} states, need {degree + 2} for `degree` "
             f"{degree}. Solve at more pressures or lower `degree`."
         )
-    q = coordinates(backbone, basis)
-    at = _probe(path, curve, backbone, arm, up)
-    volumes, condensed = [], []
-    for k, u in enumerate(path.displacements):
-        condensed.append(_condensed_stiffness(path.problem_at(k), u, at, basis))
-        volumes.append(enclosed_volume(problem, u, load.facets))
-        report("identify", len(volumes), len(path))
+    condensed = _condensed_stiffness(path, at, basis)
+    volumes = _volumes(body(problem), path.displacements, load.facets)
     laws, errors = _fitted(
-        path.values, q, jnp.stack(volumes), jnp.stack(condensed), degree=degree
+        path.values,
+        backbone.s,
+        backbone.strain,
+        backbone.rest,
+        basis,
+        volumes,
+        condensed,
+        degree,
     )
     return Fit(mean_section(problem, curve, up=up), backbone.length, *laws, *errors)
 
@@ -290,6 +305,12 @@ def _probe(path: Path, curve, backbone: Backbone, arm, up) -> Probe:
     if cells is not None and len(cells) != fibres * len(backbone.s):
         cells = None
     return probe(path.problem.mesh, curve, len(backbone.s), arm=arm, up=up, cells=cells)
+
+
+@two_programs
+def _volumes(problem: Problem, displacements, facets) -> Float[Array, " steps"]:
+    """Of the cavity at each state [m^3]."""
+    return jax.vmap(lambda u: cavity_volume(problem, u, facets))(displacements)
 
 
 def _pressure(path: Path) -> Pressure:
@@ -320,41 +341,49 @@ def condensed_stiffness(
     """
     cells = None if near is None else near.cells
     at = probe(path.problem.mesh, curve, samples, arm=arm, up=up, cells=cells)
-    found = [
-        _condensed_stiffness(path.problem_at(k), u, at, basis)
-        for k, u in enumerate(path.displacements)
-    ]
-    return jnp.stack(found)
+    return _condensed_stiffness(path, at, basis)
 
 
 def _condensed_stiffness(
-    problem: Problem, u: Array, at: Probe, basis: StrainBasis
-) -> Float[Array, "dof dof"]:
-    """Stiffness against generalised forces on q at an equilibrium: (H K^-1 H')^-1."""
-    H = _slopes(at, basis, u)
-    return _inverse(H, tangent_solve(problem, u, H))
+    path: Path, at: Probe, basis: StrainBasis
+) -> Float[Array, "steps dof dof"]:
+    """Stiffness against generalised forces on q at each equilibrium: (H K^-1 H')^-1."""
+    ways, states = _slopes(at, basis, path.displacements)
+    answers, fixed = [], without_derivatives(path.problem)
+    with evaluated_now(fixed):
+        prepared = None if is_traced(fixed) else prepare(fixed)
+    for value, u, forces in zip(path.loading, states, ways, strict=True):
+        answers.append(tangent_solve(path.problem_under(value), u, forces, prepared))
+        report("identify", len(answers), len(path))
+    return _inverse(ways, answers)
 
 
-@eqx.filter_jit
-def _slopes(at: Probe, basis: StrainBasis, u) -> Float[Array, "dof dofs"]:
-    """H = dq/du of the coordinates."""
-    slopes = jax.jacrev(lambda u: project(at.strain(u), at.s, basis))(u)
-    return slopes.reshape(basis.num_dof, -1)
+@two_programs
+def _slopes(at: Probe, basis: StrainBasis, displacements) -> tuple[list[Array], list[Array]]:
+    """H = dq/du of the coordinates (dof, dofs), and the displacements, of each state."""
+
+    def one(u):
+        slopes = jax.jacrev(lambda u: project(at.strain(u), at.s, basis))(u)
+        return slopes.reshape(basis.num_dof, -1)
+
+    return list(jax.vmap(one)(displacements)), list(displacements)
 
 
-@jax.jit
-def _inverse(H, answers) -> Float[Array, "dof dof"]:
-    compliance = H @ answers.T
-    return jnp.linalg.inv((compliance + compliance.T) / 2)
+@two_programs
+def _inverse(ways, answers) -> Float[Array, "steps dof dof"]:
+    compliance = jnp.einsum("kin,kjn->kij", jnp.stack(ways), jnp.stack(answers))
+    return jnp.linalg.inv((compliance + jnp.moveaxis(compliance, 1, 2)) / 2)
 
 
-@functools.partial(jax.jit, static_argnames="degree")
-def _fitted(p, q, volumes, condensed, *, degree: int):
+@two_programs
+def _fitted(p, s, strain, rest, basis: StrainBasis, volumes, condensed, degree: int):
     """Elastic law and pressure map, and the misfit of stiffness and volume.
 
     K and C of the least-squares fit K - p C, then g from the equilibria, then h from the
     volumes that remain.
     """
+    change = strain - rest_or_straight(strain, rest)[None]
+    q = jax.vmap(lambda change: project(change, s, basis))(change)
     scale = jnp.max(jnp.abs(p))
     x = p / scale
     linear = jnp.stack([jnp.ones_like(x), -x], axis=1)

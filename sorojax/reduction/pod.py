@@ -11,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sorojax._jax.trace_state import is_traced
+from sorojax._edit import without_derivatives
+from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax.math.linalg.dense import least_squares
-from sorojax.reduction.backbone import PLANAR, Backbone
+from sorojax.math.two_programs import two_programs
+from sorojax.reduction.backbone import PLANAR, Backbone, rest_or_straight
 from sorojax.rod import AbstractModes, StrainBasis, orthonormalise
 from sorojax.rod.model.basis import STRAINS, Combined, SampledModes, columns
 
@@ -21,7 +23,7 @@ from sorojax.rod.model.basis import STRAINS, Combined, SampledModes, columns
 RANK = 1e-10
 
 
-def weights(s: Float[Array, " samples"]) -> Float[Array, " samples"]:
+def weights(s: Float[Array | np.ndarray, " samples"]) -> Float[Array, " samples"]:
     """Trapezoidal weights of samples in [0, 1]."""
     gaps = jnp.pad(jnp.diff(s), 1)
     return (gaps[1:] + gaps[:-1]) / 2
@@ -69,62 +71,72 @@ def pod_basis(
         Caasenbrood, Pogromsky and Nijmeijer, Sorotoki, IEEE Access 12, 2024, section V-D4.
     """
     basis = {}
-    root = jnp.sqrt(weights(backbone.s))
     for name, wanted in modes.items():
         if name not in backbone.names:
             raise ValueError(
                 f"pod_basis: the strain `{name}` is not one of {', '.join(backbone.names)}. A "
                 "planar backbone bends about z."
             )
-        inner, values = _functions(backbone, name, within)
-        snapshots = _snapshots(backbone, name)
-        count = _count(name, wanted, *jax.lax.stop_gradient((root, values, snapshots)))
-        mix = _leading(root, values, snapshots, count)
-        basis[name] = _modes(backbone, inner, values, mix)
+        inner = _functions(backbone, name, within)
+        given = backbone.s, backbone.strain, backbone.rest, backbone.names.index(name), inner
+        count = _count(name, wanted, *without_derivatives(given))
+        basis[name] = _modes(backbone.s, inner, _leading(*given, count))
     return StrainBasis(basis)
 
 
 def _functions(backbone: Backbone, name: str, within: AbstractModes | None):
-    """Functions in which the snapshots are written, and their values at the samples.
+    """Functions in which the snapshots are written, if any are given.
 
     Orthonormal ones: then singular vectors give orthonormal modes.
     """
-    s = backbone.s
     if within is None:
-        return None, jnp.diag(1 / jnp.sqrt(weights(s)))
-    if within.count > len(s):
+        return None
+    if within.count > len(backbone.s):
         raise ValueError(
-            f"pod_basis: `within` has {within.count} modes, the backbone {len(s)} "
+            f"pod_basis: `within` has {within.count} modes, the backbone {len(backbone.s)} "
             "samples, need as many or more. Take more samples."
         )
-    inner = orthonormalise(StrainBasis({name: within})).modes[name]
-    return inner, jnp.asarray(inner(s))
+    return orthonormalise(StrainBasis({name: within})).modes[name]
 
 
-@functools.partial(jax.jit, static_argnums=3)
-def _leading(root, values, snapshots, count: int) -> Float[Array, "functions count"]:
-    """Combinations of the functions, from most to least energy, their integrals positive."""
-    coefficients = least_squares(root[:, None] * values, root[:, None] * snapshots)
-    mix = leading_directions(coefficients, count)
-    return mix * jnp.where(root**2 @ values @ mix < 0, -1.0, 1.0)[None]
+@two_programs
+def _leading(
+    s, strain, rest, column: int, inner: AbstractModes | None, count: int
+) -> Float[Array, "functions count"]:
+    """Combinations of the functions, or values at the samples, from most to least energy,
+    their integrals positive."""
+    root = jnp.sqrt(weights(s))
+    change = strain - rest_or_straight(strain, rest)[None]
+    snapshots = root[:, None] * change[:, :, column].T
+    if inner is None:
+        mix = values = leading_directions(snapshots, count) / root[:, None]
+    else:
+        functions = jnp.asarray(inner(s))
+        coefficients = least_squares(root[:, None] * functions, snapshots)
+        mix = leading_directions(coefficients, count)
+        values = functions @ mix
+    return mix * jnp.where(root**2 @ values < 0, -1.0, 1.0)[None]
 
 
-def _modes(backbone: Backbone, inner, values: Array, mix: Array) -> AbstractModes:
-    return SampledModes(backbone.s, values @ mix) if inner is None else Combined(inner, mix)
+def _modes(s, inner: AbstractModes | None, mix: Array) -> AbstractModes:
+    return SampledModes(s, mix) if inner is None else Combined(inner, mix)
 
 
-def _count(name: str, wanted: int | float, root, values, snapshots) -> int:
+def _count(name: str, wanted: int | float, s, strain, rest, column: int, inner) -> int:
     """The number of modes, from what is wanted: a number, or a share of the snapshots."""
     is_number = isinstance(wanted, int | np.integer) and not isinstance(wanted, bool)
-    if is_traced((values, snapshots)):
+    if is_traced((strain, rest)):
         if is_number:
             return int(wanted)
         raise ValueError(
             f"pod_basis: asked for {wanted} of `{name}` of traced snapshots, need a number of "
             "modes there. Choose it outside jit, by the length of a basis."
         )
-    root, values, snapshots = (np.asarray(x) for x in (root, values, snapshots))
-    values, snapshots = root[:, None] * values, root[:, None] * snapshots
+    with evaluated_now():
+        root = np.sqrt(weights(np.asarray(s)))
+        change = np.asarray(strain) - np.asarray(rest_or_straight(strain, rest))[None]
+        values = np.eye(len(s)) if inner is None else root[:, None] * np.asarray(inner(s))
+    snapshots = root[:, None] * change[:, :, column].T
     coefficients = np.linalg.lstsq(values, snapshots, rcond=None)[0]
     left, size, right = np.linalg.svd(coefficients, full_matrices=False)
     rank = int(np.sum(size > RANK * max(size[0], 1e-300)))

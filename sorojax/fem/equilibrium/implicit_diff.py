@@ -17,6 +17,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
+from sorojax._jax.jit import once
 from sorojax._jax.trace_state import evaluated_now, is_traced, is_tracer
 from sorojax.fem.equilibrium.jit import (
     Begin,
@@ -241,8 +242,12 @@ def _unbalance(at: Equilibrium, rates: Problem, known: Bool[Array, " dofs"]):
     return jnp.where(known, jnp.zeros_like(rate), -_valid(at) * rate)
 
 
-@jax.jit
-def _pulled(at: Equilibrium, work: Float[Array, " dofs"], known: Bool[Array, " dofs"]):
+@once
+def _pulled(
+    at: Equilibrium,
+    work: Float[Array | np.ndarray, " dofs"],
+    known: Bool[Array | np.ndarray, " dofs"],
+):
     """-work . dR by each of these numbers."""
     way = jnp.where(known, jnp.zeros_like(work), -_valid(at) * work).reshape(at.u.shape)
 

@@ -86,10 +86,18 @@ class Path(eqx.Module):
 
     def problem_at(self, k: int) -> Problem:
         """The problem with the loads of state `k`."""
+        return self.problem_under(self.loading[k])
+
+    @property
+    def loading(self) -> Float[Array, "steps ..."]:
+        """What `problem_under` takes, of each state."""
+        return self.values if self.pressures is None else self.pressures
+
+    def problem_under(self, value: Float[Array, "..."]) -> Problem:
+        """The problem with the load of one state."""
         if self.name is None:
-            return between(unloaded(self.problem), self.problem, self.values[k])
-        values = self.values if self.pressures is None else self.pressures
-        return with_load(self.problem, self.name, values[k])
+            return between(unloaded(self.problem), self.problem, value)
+        return with_load(self.problem, self.name, value)
 
     def _text(self) -> str:
         u = self.displacements

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from sorojax._jax.trace_state import evaluated_now
 from sorojax._types import integers, real
+from sorojax.math.two_programs import linear_program
 from sorojax.sdf.base import AbstractSdf, quotient
 from sorojax.sdf.query import shape_tangent
 from sorojax.sdf.sampling import value_and_gradient, values_and_gradients
@@ -57,8 +58,8 @@ def _meet_jvp(primals, tangents):
     fields, plan, start = primals
     with evaluated_now((fields, start)):
         x, normals, slopes, seen = _meet(fields, plan, start)
-    start_dot = jnp.zeros_like(start) if tangents[2] is None else tangents[2]
-    return x, _meet_dot(fields, plan, normals, slopes, seen, tangents[0], start_dot)
+    given = fields, plan, normals, slopes, seen
+    return x, _meet_dot(given, (tangents[0], tangents[2]), x)
 
 
 @eqx.filter_jit
@@ -79,8 +80,13 @@ def _meet(fields: Fields, plan: BoundaryPlan, start):
     return jax.lax.fori_loop(0, len(ZOOMS), closer, begin)
 
 
-@eqx.filter_jit
-def _meet_dot(fields, plan, normals, slopes, seen, fields_dot, start_dot):
+@linear_program
+def _meet_dot(given, rates):
+    fields, plan, normals, slopes, seen = given
+    fields_dot, start_dot = rates
+    if start_dot is None:
+        start_dot = jnp.zeros((plan.sharp.shape[0], normals.shape[1]), normals.dtype)
+
     def fields_at(fields):
         return tuple(f(p) for f, p in zip(fields, seen, strict=True))
 
@@ -144,13 +150,7 @@ def _slide_jvp(primals, tangents):
     fields, plan, start = primals
     with evaluated_now((fields, start)):
         x, slopes = _slide(fields, plan, start)
-    moving = jax.tree.map(
-        lambda s, dot: jnp.zeros_like(s) if dot is None else dot,
-        start,
-        tangents[2],
-        is_leaf=lambda leaf: leaf is None,
-    )
-    return x, _slide_dot(fields, plan, x, slopes, tangents[0], moving)
+    return x, _slide_dot((fields, plan, x, slopes), (tangents[0], tangents[2]), x)
 
 
 @eqx.filter_jit
@@ -177,8 +177,16 @@ def _slide_one(field: AbstractSdf, normal, start):
     return final[:2]
 
 
-@eqx.filter_jit
-def _slide_dot(fields, plan, x, slopes, fields_dot, start_dot):
+@linear_program
+def _slide_dot(given, rates):
+    fields, plan, x, slopes = given
+    fields_dot, start_dot = rates
+    if start_dot is None:
+        start_dot = (None,) * len(x)
+    start_dot = tuple(
+        jnp.zeros_like(at) if dot is None else dot for at, dot in zip(x, start_dot, strict=True)
+    )
+
     def fields_at(both):
         return tuple(f(p) for f, p in zip(*both, strict=True))
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import integers, real
+from sorojax.math.two_programs import two_programs
 from sorojax.mesh.elements.base import facet_corners, nodes as reference_nodes, shape_functions
 from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.mesh import Mesh, boundary_facets
@@ -295,23 +296,19 @@ def _boundary_to(motion: _Motion, fields: tuple[AbstractSdf, ...], points, shift
     """Shifts of the boundary from those of the stage before to the surfaces of `fields`."""
     sharp = None
     if len(motion.border.sharp):
-        sharp = _met(motion, fields, points, shift)
+        sharp = meet(fields, motion.border, _sharp_place(motion, points, shift))
         for lines in (motion.ridges, motion.surface):
             if lines is None:
                 continue
             step = spread(lines, _sharp_step(motion, points, shift, sharp))
-            shift = shift + _follow(motion, step)
+            shift = _stepped(motion, shift, step)
             if lines is motion.ridges:
-                sharp = _met(motion, fields, points, shift)
+                sharp = meet(fields, motion.border, _sharp_place(motion, points, shift))
     shift = _landed(motion, fields, points, sharp, shift)
     if motion.along is not None:
         shift = _turned_back(motion, spread(motion.along, _turned(motion, shift)))
         shift = _landed(motion, fields, points, sharp, shift)
     return shift
-
-
-def _met(motion: _Motion, fields, points, shift):
-    return meet(fields, motion.border, (points + shift)[motion.border.sharp])
 
 
 def _landed(motion: _Motion, fields, points, sharp, shift):
@@ -320,25 +317,50 @@ def _landed(motion: _Motion, fields, points, sharp, shift):
     return _boundary_shift(motion, points, sharp, landed)
 
 
-@eqx.filter_jit
+def _follow(motion: _Motion, shift):
+    """`shift` with that of all mid-side nodes interpolated from their cells."""
+    if not len(motion.middles):
+        return shift
+    between = jnp.einsum("mk,mki->mi", motion.weights, shift[motion.parents])
+    return shift.at[motion.middles].set(between)
+
+
+@two_programs
+def _sharp_place(motion: _Motion, points, shift):
+    return (points + shift)[motion.border.sharp]
+
+
+@two_programs
+def _sharp_step(motion: _Motion, points, shift, sharp):
+    """What is left to go for the sharp nodes."""
+    at = motion.border.sharp
+    return jnp.zeros_like(points).at[at].set(sharp - (points + shift)[at])
+
+
+@two_programs
+def _stepped(motion: _Motion, shift, step):
+    return shift + _follow(motion, step)
+
+
+@two_programs
 def _turned(motion: _Motion, shift):
     """Components of a shift in the frames of the nodes, one after the other."""
     return jnp.einsum("nki,ni->nk", motion.frames, shift).reshape(-1, 1)
 
 
-@eqx.filter_jit
+@two_programs
 def _turned_back(motion: _Motion, components):
     """The shift with such components, that of mid-side nodes interpolated."""
     components = components.reshape(motion.frames.shape[:2])
     return _follow(motion, jnp.einsum("nki,nk->ni", motion.frames, components))
 
 
-@eqx.filter_jit
+@two_programs
 def _beside(motion: _Motion, points, shift):
     return tuple((points + shift)[own.nodes] for own in motion.border.fields)
 
 
-@eqx.filter_jit
+@two_programs
 def _boundary_shift(motion: _Motion, points, sharp, landed):
     shift = jnp.zeros_like(points)
     if sharp is not None:
@@ -348,26 +370,10 @@ def _boundary_shift(motion: _Motion, points, sharp, landed):
     return shift
 
 
-@eqx.filter_jit
+@two_programs
 def _put(motion: _Motion, points, shift, boundary):
     bent = motion.bent
     return points + _follow(motion, shift).at[bent].set(boundary[bent])
-
-
-@eqx.filter_jit
-def _sharp_step(motion: _Motion, points, shift, sharp):
-    """What is left to go for the sharp nodes."""
-    at = motion.border.sharp
-    return jnp.zeros_like(points).at[at].set(sharp - (points + shift)[at])
-
-
-@eqx.filter_jit
-def _follow(motion: _Motion, shift):
-    """`shift` with that of all mid-side nodes interpolated from their cells."""
-    if not len(motion.middles):
-        return shift
-    between = jnp.einsum("mk,mki->mi", motion.weights, shift[motion.parents])
-    return shift.at[motion.middles].set(between)
 
 
 def _motion(mesh: Mesh, num_interfaces: int) -> _Motion:
