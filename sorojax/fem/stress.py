@@ -50,7 +50,9 @@ def deformation_gradient(
 @jax.jit
 def _deformation_gradient(problem: Problem, u) -> Float[Array, "cells cell_nodes 3 3"]:
     points = _node_points(problem)
-    F = _full(problem, points, deformation(problem.mesh, problem.kinematics, points, u))
+    F = full_deformation(
+        problem, points, deformation(problem.mesh, problem.kinematics, points, u)
+    )
     return jnp.swapaxes(stack_matrix(F, points.volumes), 0, 1)
 
 
@@ -94,7 +96,9 @@ def stress_at(
     problem: Problem, u: Float[Array, "nodes dim"], points: Points
 ) -> Float[Array, "cells points 3 3"]:
     """Cauchy stress at `points` of every cell [Pa]."""
-    F = _full(problem, points, deformation(problem.mesh, problem.kinematics, points, u))
+    F = full_deformation(
+        problem, points, deformation(problem.mesh, problem.kinematics, points, u)
+    )
     material = body_at(problem, points).material
     entries = jax.tree.map(
         lambda e: jnp.broadcast_to(jnp.asarray(e, points.volumes.dtype), points.volumes.shape),
@@ -114,7 +118,7 @@ def _node_points(problem: Problem) -> Points:
     return points_at(problem.mesh, problem.kinematics, tables_at(problem.mesh.element, "nodes"))
 
 
-def _full(problem: Problem, points: Points, F: Entries) -> Tensor:
+def full_deformation(problem: Problem, points: Points, F: Entries) -> Tensor:
     """F in three dimensions, the thickness stretch of a sheet included."""
     kinematics = problem.kinematics
     if not isinstance(kinematics, PlaneStress):

@@ -54,7 +54,6 @@ from sorojax.material.kinematics import (
     determinant,
     from_matrix,
     is_planar,
-    minus,
     plus,
     right_cauchy_green,
     times,
@@ -304,11 +303,22 @@ def inverse_strain(F: Tensor) -> Sym:
     )
 
 
-def _log_determinant(A: Sym) -> Entry:
+def overstress(material: AbstractHyperelastic) -> Tensor | None:
+    """The `stress` of a material within a step, `None` where there is none."""
+    return _tensor(tuple(material.stress)) if isinstance(material, Overstressed) else None
+
+
+def _tensor(a: Sym) -> Tensor:
     full: list[list[Entry]] = [[0.0] * 3 for _ in range(3)]
-    for (i, j), entry in zip(pairs(len(A)), A, strict=True):
+    for (i, j), entry in zip(pairs(len(a)), a, strict=True):
         full[i][j] = full[j][i] = entry
-    return jnp.log(determinant(tuple(map(tuple, full))))  # type: ignore[arg-type]
+    return tuple(map(tuple, full))  # type: ignore[return-value]
+
+
+def _inverse(a: Sym) -> Sym:
+    full = _tensor(a)
+    shrink = 1 / determinant(full)
+    return tuple(times(entry, shrink) for entry in _symmetric(full, cofactor(full)))
 
 
 # One step of the branches; `rows` are C^-1 and every A_i
@@ -340,13 +350,30 @@ def relaxed_by(weights: list[Weights], rows: list[Sym], inverse: Sym) -> list[Sy
     return new
 
 
-def branch_energy(moduli: Terms, rows: list[Sym], F: Tensor) -> Entry:
-    """Sum of W_i [J/m^3]; zero where all is relaxed."""
-    C = isochoric_strain(F)
+def borne(moduli: Terms, rows: list[Sym]) -> Sym:
+    """H [Pa] of the instant: sum of g_i mu A_i."""
+    scaled = [
+        tuple(modulus * entry for entry in state)
+        for modulus, state in zip(moduli, rows[1:], strict=True)
+    ]
+    return tuple(sum(column[1:], start=column[0]) for column in zip(*scaled, strict=True))
+
+
+def free_energy(moduli: Terms, rows: list[Sym]) -> Entry:
+    """Sum of W_i [J/m^3] without its part H : C / 2."""
     total: Entry = 0.0
     for modulus, A in zip(moduli, rows[1:], strict=True):
-        excess = minus(contraction(A, C), 3.0) - _log_determinant(A)
-        total = plus(total, modulus / 2 * excess)
+        total = plus(total, -modulus / 2 * (3 + jnp.log(determinant(_tensor(A)))))
+    return total
+
+
+def dissipation(moduli: Terms, spectrum: Prony, rows: list[Sym]) -> Entry:
+    """Sum of D_i [W/m^3], never negative."""
+    inverse, *states = rows
+    C, total = _inverse(inverse), 0.0
+    for modulus, tau, A in zip(moduli, spectrum.times, states, strict=True):
+        excess = contraction(A, C) + contraction(_inverse(A), inverse) - 6
+        total = plus(total, modulus / (2 * tau) * excess)
     return total
 
 

@@ -44,6 +44,7 @@ from sorojax.material.kinematics import (
     square_norm,
     times,
 )
+from sorojax.material.viscoelastic import overstress
 from sorojax.math.compiled import Alone
 from sorojax.math.linalg.dense import inverse_cube_root
 
@@ -141,20 +142,21 @@ def shape_stress(
     if W is None:
         return jax.grad(lambda F: jnp.sum(shape_energy(material, kinematics, F)))(F)
     x, slopes = _first_invariant(kinematics, F)
-    return _slope(W)(x)[None] * slopes
+    P = _slope(W)(x)[None] * slopes
+    return P if (H := overstress(material)) is None else P + _overstress(kinematics, F, H)[0]
 
 
 class ShapeVectors(NamedTuple):
     """The parts of dP/dF, where the energy is one of the first isochoric invariant: an outer
     product of `half` and C = dJ/dF with its transpose, `second` times that of the slopes of the
-    invariant (`None`: the energy is linear in it), a multiple `flat` of unity, and `weight`
-    times d2J / dF dF."""
+    invariant (`None`: the energy is linear in it), the matrix `flat` between entries of one row
+    of F by the pairs of columns, and `weight` times d2J / dF dF."""
 
     half: Entries
     C: Entries
     slopes: Entries
     second: Entry | None
-    flat: Entry
+    flat: "_Pairs"
     weight: Entry
 
 
@@ -175,9 +177,36 @@ def shape_response(
     if depends(_slope(W), x):
         second = jax.jvp(_slope(W), (x,), (jnp.ones_like(x),))[1]
     half = (first * scale * inverse)[None] * (5 / 9 * (I1 * inverse)[None] * C - 4 / 3 * F)
-    weight = -2 / 3 * first * scale * I1 * inverse
-    vectors = ShapeVectors(half, C, slopes, second, 2 * first * scale, weight)
-    return first[None] * slopes, vectors
+    weight, unity = -2 / 3 * first * scale * I1 * inverse, 2 * first * scale
+    flat = tuple(unity if i == j else None for i, j in strain_pairs(kinematics))
+    vectors = ShapeVectors(half, C, slopes, second, flat, weight)
+    P = first[None] * slopes
+    if (H := overstress(material)) is None:
+        return P, vectors
+    more, vectors = _overstress(kinematics, F, H, vectors)
+    return P + more, vectors
+
+
+def _overstress(
+    kinematics: AbstractKinematics, F: Entries, H: Tensor, vectors: ShapeVectors | None = None
+):
+    """Stress of J^(-2/3) tr(F H F') / 2, and `vectors` with its parts of the tangent."""
+    inverse, scale, _, C = _parts(kinematics, F)
+    full = kinematics.embed(tuple(F))
+    turned = _product(full, H)
+    FH = jnp.stack([turned[s.row][s.col] for s in kinematics.slots])
+    terms = (times(a, b) for two in zip(full, turned, strict=True) for a, b in zip(*two))
+    share = scale * inverse * reduce(plus, terms)
+    P = scale[None] * FH - (share / 3)[None] * C
+    if vectors is None:
+        return P, None
+    half = (5 / 18 * share * inverse)[None] * C - (2 / 3 * scale * inverse)[None] * FH
+    pairs = zip(vectors.flat, strain_pairs(kinematics), strict=True)
+    return P, vectors._replace(
+        half=vectors.half + half,
+        flat=tuple(_sum(a, scale * H[i][j]) for a, (i, j) in pairs),
+        weight=vectors.weight - share / 3,
+    )
 
 
 def stiffened(shape: Shape, bulk: Entry, C: Entries) -> Shape:
@@ -250,8 +279,7 @@ def point_tangent(
     if weight is not None:
         tilted = (*(weight * entry for entry in F), weight)
     if isinstance(shape, ShapeVectors):
-        pairs = zip(S, strain_pairs(kinematics), strict=True)
-        S = tuple(_sum(s, shape.flat) if i == j else s for s, (i, j) in pairs)
+        S = tuple(s if a is None else _sum(s, a) for s, a in zip(S, shape.flat, strict=True))
     rows = [[e for e, _ in entries_of(kinematics, i)] for i in range(kinematics.dim)]
     blocks = [_block(shape, rows[i], rows[k]) for i, k in component_pairs(kinematics.dim)]
     return Tangent(tuple(blocks), (*tilted, *S))
