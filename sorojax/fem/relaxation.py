@@ -31,6 +31,7 @@ from sorojax.material.viscoelastic import (
     remembered,
     step_weights,
 )
+from sorojax.math.compiled import apart
 
 Strains = Float[Array, "rows entries quad cells"]
 Nodal = Float[Array, "nodes dim"]
@@ -75,17 +76,15 @@ def after_step(
     dissipate in it [J]."""
     if moduli is None or strains is None:
         return None, jnp.zeros((), u.dtype)
-    spectrum, before = _spectrum(problem), _rows(strains)
+    spectrum, alone = _spectrum(problem), apart(step > 0)
     points = quadrature_points(problem.mesh, problem.kinematics)
     (ended,) = in_step(problem, moduli, strains, step)
-    inverse = _inverse(exchanged(problem, material=ended), points, u)
-    rows = relaxed_by(step_weights(spectrum, step), before, inverse)
-    mean = [
-        tuple((a + b) / 2 for a, b in zip(*two, strict=True))
-        for two in zip(before, rows, strict=True)
-    ]
-    taken = step * jnp.sum(points.volumes * dissipation(_by_point(moduli), spectrum, mean))
-    return jnp.stack([jnp.stack(row) for row in rows]), taken
+    inverse = alone(lambda: _inverse(exchanged(problem, material=ended), points, u))
+    rows = relaxed_by(step_weights(spectrum, step), _rows(strains), inverse)
+    new = jnp.stack([jnp.stack(row) for row in rows])
+    mean = _rows((strains + new) / 2)
+    rates = alone(lambda: dissipation(_by_point(moduli), spectrum, mean))
+    return new, step * jnp.sum(points.volumes * rates)
 
 
 def stored_energy(

@@ -161,8 +161,12 @@ def per_block(space: Space, tree: Any) -> tuple[Any, Any]:
     cells) as (blocks, ..., quad, lanes), and the others."""
 
     def blocks(leaf):
-        if jnp.ndim(leaf) > 1:
-            return jnp.moveaxis(leaf[..., space.ids], -2, 0)
+        if jnp.ndim(leaf) > 1:  # a copy: cells are in their order
+            shape = leaf.shape[:-1]
+            more = space.ids.size - space.num_cells
+            padding = jnp.broadcast_to(leaf[..., :1], (*shape, more))
+            whole = jnp.concatenate([leaf, padding], axis=-1)
+            return jnp.moveaxis(whole.reshape(*shape, *space.ids.shape), -2, 0)
         return leaf[space.ids][:, None] if jnp.ndim(leaf) else None
 
     varying = jax.tree.map(blocks, tree)
