@@ -43,6 +43,33 @@ def moduli(problem: Problem) -> Terms | None:
     return branch_moduli(material) if isinstance(material, Viscoelastic) else None
 
 
+class Past(eqx.Module):
+    """What a body brings along on a path over time: moduli [Pa] and strains."""
+
+    moduli: Terms | None
+    strains: Strains | None
+
+
+@eqx.filter_jit
+def from_past(problem: Problem, past: Past, step: Float[Array, ""]) -> Problem:
+    """`problem` with the material `step` [s] after the `past`."""
+    material = in_step(problem, past.moduli, past.strains, step)
+    return exchanged(problem, material=material[0]) if material else problem
+
+
+@eqx.filter_jit
+def next_past(problem: Problem, past: Past, step: Float[Array, ""], u: Nodal) -> Past:
+    """The past after a `step` [s] to equilibrium at `u` [m]."""
+    args = problem, past.moduli, past.strains, step, u
+    return Past(past.moduli, after_step(*args)[0])
+
+
+@eqx.filter_jit
+def first_past(problem: Problem, u: Nodal) -> Past:
+    """The past of a body that has relaxed at `u` [m]."""
+    return Past(moduli(problem), relaxed(problem, u))
+
+
 @eqx.filter_jit
 def relaxed(problem: Problem, u: Nodal) -> Strains | None:
     """The strains of a body that has been at displacement `u` [m] for long."""
@@ -85,6 +112,28 @@ def after_step(
     mean = _rows((strains + new) / 2)
     rates = alone(lambda: dissipation(_by_point(moduli), spectrum, mean))
     return new, step * jnp.sum(points.volumes * rates)
+
+
+def strain_rates(
+    problem: Problem, moduli: Terms | None, strains: Strains, u: Nodal, v: Nodal
+) -> tuple[Strains, Float[Array, ""]]:
+    """Rates of the strains [1/s], and the power that the branches dissipate [W], of a body at
+    displacement `u` [m] with velocity `v` [m/s]."""
+    assert moduli is not None
+    spectrum, rows = _spectrum(problem), _rows(strains)
+    points = quadrature_points(problem.mesh, problem.kinematics)
+    states = [
+        jnp.stack([(c - a) / tau for c, a in zip(rows[0], state, strict=True)])
+        for tau, state in zip(spectrum.times, rows[1:], strict=True)
+    ]
+
+    def inverse(strains, u):
+        return jnp.stack(_inverse(at_instant(problem, moduli, strains), points, u))
+
+    along = jnp.stack([jnp.zeros_like(states[0]), *states])
+    first = jax.jvp(inverse, (strains, u), (along, v))[1]
+    rates = dissipation(_by_point(moduli), spectrum, rows)
+    return jnp.stack([first, *states]), jnp.sum(points.volumes * rates)
 
 
 def stored_energy(

@@ -107,7 +107,7 @@ class Coupled(AbstractMethod):
             known[name] = _Known(block.matter(), prepare_traced(block.problem))
             loaded = block.loaded(block.values(own[name]))
             u, v = y[name]["u"], y[name]["v"]
-            a = acceleration(block, loaded, known[name].matter, u, v)
+            a = acceleration(block, loaded, known[name].matter, u, v, y[name].get("strains"))
             states[name] = eqx.tree_at(lambda s: s.acceleration, dynamics.start, a)
         return Memory(states, known)
 
@@ -157,6 +157,8 @@ def _attempt(given, offset, size, state):
             "work": end.work,
             "dissipated": end.dissipated,
         }
+        if end.strains is not None:
+            new[name]["strains"] = end.strains
     rest = _marched(now, u)
     return ({name: {**new, **rest}[name] for name in now.y}, bodies), converged
 
@@ -192,6 +194,7 @@ def _state(now: _Given, name: str) -> State:
         y["work"],
         y["dissipated"],
         kept.share,
+        strains=y.get("strains"),
     )
 
 
