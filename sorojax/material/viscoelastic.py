@@ -65,7 +65,8 @@ Terms = tuple[Float[Array, "..."], ...]
 
 def _terms(value: Any) -> Terms:
     """One leaf per branch: from a sequence, or the rows of an array."""
-    return tuple(real(entry) for entry in value) if np.ndim(value) else (real(value),)
+    many = isinstance(value, list | tuple) or np.ndim(value)
+    return tuple(real(entry) for entry in value) if many else (real(value),)
 
 
 class Prony(eqx.Module):
@@ -96,8 +97,8 @@ class Prony(eqx.Module):
         for early, late in zip(self.times[:-1], self.times[1:], strict=True):
             if _concrete(early, late) and np.any(np.asarray(early) >= np.asarray(late)):
                 raise ValueError(
-                    f"Prony: `times` are {_listed(self.times)} s, need each longer than the one "
-                    "before. Sort the branches by time and merge those of equal times."
+                    f"Prony: `times` are {_listed(self.times)} s, need each longer than the "
+                    "one before. Sort the branches by time and merge those of equal times."
                 )
 
 
@@ -399,8 +400,8 @@ def stress_history(
         >>> rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45)
         >>> silicone = material.Viscoelastic(rubber, material.Prony([0.5], [0.1]))
         >>> sheared = jnp.eye(3).at[0, 1].set(0.2)
-        >>> P = material.stress_history(
-        ...     silicone, jnp.array([0, 1e-6, 0.1, 1.0]), jnp.stack([jnp.eye(3), *3 * [sheared]]))
+        >>> times, F = jnp.array([0, 1e-6, 0.1, 1.0]), [jnp.eye(3), *3 * [sheared]]
+        >>> P = material.stress_history(silicone, times, jnp.stack(F))
         >>> (P[:, 0, 1] / kPa).round(1).tolist()
         [0.0, 103.4, 81.7, 69.0]
 

@@ -149,15 +149,17 @@ def shape_stress(
 class ShapeVectors(NamedTuple):
     """The parts of dP/dF, where the energy is one of the first isochoric invariant: an outer
     product of `half` and C = dJ/dF with its transpose, `second` times that of the slopes of the
-    invariant (`None`: the energy is linear in it), the matrix `flat` between entries of one row
-    of F by the pairs of columns, and `weight` times d2J / dF dF."""
+    invariant (`None`: the energy is linear in it), a multiple `flat` of unity, `weight` times
+    d2J / dF dF, and, with an overstress, `row` between entries of one row of F, by the pairs of
+    their columns."""
 
     half: Entries
     C: Entries
     slopes: Entries
     second: Entry | None
-    flat: "_Pairs"
+    flat: Entry
     weight: Entry
+    row: tuple[Entry, ...] | None = None
 
 
 #: dP/dF of the shape energy, or what it is made of.
@@ -177,9 +179,8 @@ def shape_response(
     if depends(_slope(W), x):
         second = jax.jvp(_slope(W), (x,), (jnp.ones_like(x),))[1]
     half = (first * scale * inverse)[None] * (5 / 9 * (I1 * inverse)[None] * C - 4 / 3 * F)
-    weight, unity = -2 / 3 * first * scale * I1 * inverse, 2 * first * scale
-    flat = tuple(unity if i == j else None for i, j in strain_pairs(kinematics))
-    vectors = ShapeVectors(half, C, slopes, second, flat, weight)
+    weight = -2 / 3 * first * scale * I1 * inverse
+    vectors = ShapeVectors(half, C, slopes, second, 2 * first * scale, weight)
     P = first[None] * slopes
     if (H := overstress(material)) is None:
         return P, vectors
@@ -195,17 +196,17 @@ def _overstress(
     full = kinematics.embed(tuple(F))
     turned = _product(full, H)
     FH = jnp.stack([turned[s.row][s.col] for s in kinematics.slots])
-    terms = (times(a, b) for two in zip(full, turned, strict=True) for a, b in zip(*two))
+    rows = zip(full, turned, strict=True)
+    terms = [times(a, b) for two in rows for a, b in zip(*two, strict=True)]
     share = scale * inverse * reduce(plus, terms)
     P = scale[None] * FH - (share / 3)[None] * C
     if vectors is None:
         return P, None
     half = (5 / 18 * share * inverse)[None] * C - (2 / 3 * scale * inverse)[None] * FH
-    pairs = zip(vectors.flat, strain_pairs(kinematics), strict=True)
     return P, vectors._replace(
         half=vectors.half + half,
-        flat=tuple(_sum(a, scale * H[i][j]) for a, (i, j) in pairs),
         weight=vectors.weight - share / 3,
+        row=tuple(scale * H[i][j] for i, j in strain_pairs(kinematics)),
     )
 
 
@@ -279,7 +280,10 @@ def point_tangent(
     if weight is not None:
         tilted = (*(weight * entry for entry in F), weight)
     if isinstance(shape, ShapeVectors):
-        S = tuple(s if a is None else _sum(s, a) for s, a in zip(S, shape.flat, strict=True))
+        if shape.row is not None:
+            S = tuple(_sum(s, a) for s, a in zip(S, shape.row, strict=True))
+        pairs = zip(S, strain_pairs(kinematics), strict=True)
+        S = tuple(_sum(s, shape.flat) if i == j else s for s, (i, j) in pairs)
     rows = [[e for e, _ in entries_of(kinematics, i)] for i in range(kinematics.dim)]
     blocks = [_block(shape, rows[i], rows[k]) for i, k in component_pairs(kinematics.dim)]
     return Tangent(tuple(blocks), (*tilted, *S))

@@ -237,9 +237,9 @@ class Found(NamedTuple):
 
 
 class Task(NamedTuple):
-    """A step to solve: its terms (see `with_terms`), those of loads that may not rest if any
-    may, how far nodes may move from where it begins until the others act [m], the force of dead loads that
-    change [N], and the numbers of inertia."""
+    """A step to solve: its terms (see `with_terms`), those without loads that may rest if any
+    may, how far nodes may move from where it begins until the others act [m], the force of
+    dead loads that change [N], and the numbers of inertia."""
 
     terms: Split
     few: Split | None

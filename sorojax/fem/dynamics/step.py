@@ -176,9 +176,10 @@ class Interval(NamedTuple):
 
 class TimeStep(NamedTuple):
     """A step to solve. `matrix` is the damping matrix; `terms` are the loads and supports of
-    its problem of equilibrium, and a viscoelastic material as it is then; `target` are displacements known at the end. Inertia pulls by
-    the mass times `drive` [m/s^2] minus the damping times `lead` [m/s], the velocity where
-    forces act of a body that keeps its displacement."""
+    its problem of equilibrium, and a viscoelastic material as it is then; `target` are
+    displacements known at the end. Inertia pulls by the mass times `drive` [m/s^2] minus the
+    damping times `lead` [m/s], the velocity where forces act of a body that keeps its
+    displacement."""
 
     terms: tuple
     guess: Float[Array, "nodes dim"]
@@ -225,8 +226,9 @@ def begin_step(dynamics: Dynamics, known: Matter, state: State, interval: Interv
     predicted = guess
     if all(load.smooth for load in dynamics.problem.loads):
         predicted = guess + (1 - c.af) * h**2 / 2 * a  # that of an impact is not the next one
-    material = in_step(dynamics.problem, known.moduli, state.strains, (1 - c.af) * h)
-    terms = (loads + extra, supports, *material)
+    terms = (loads + extra, supports)
+    if state.strains is not None:
+        terms += in_step(dynamics.problem, known.moduli, state.strains, (1 - c.af) * h)
     return TimeStep(terms, guess, predicted, damping, target, lead, drive)
 
 

@@ -20,9 +20,9 @@ from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
 from sorojax.fem.equilibrium.response import tangent_solve
 from sorojax.fem.problem import load_force, potential_energy, residual
+from sorojax.material import Viscoelastic
 from sorojax.math.linalg.sparse import SparseSymmetric, product
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output
-from sorojax.material import Viscoelastic
 from sorojax.systems.blocks.fem_body import FemBody, damping_force, port_of, with_values
 
 #: Shapes of which less than this share is new are left out.
