@@ -334,8 +334,7 @@ def times_and_push(count=12):
 
 @pytest.mark.parametrize("kinematics", [fem.PlaneStrain(10e-3), fem.PlaneStress(10e-3)])
 def test_a_body_creeps_from_the_stiff_to_the_slow_answer(kinematics):
-    """Small loads: the tip follows the creep of a point, however the body is shaped, where
-    the volume relaxes along; else it begins and ends where it must."""
+    """The instantaneous answer is that of the sum of all moduli; forces balance on the way."""
     times, push = times_and_push()
     path = fem.solve_path(problem(SILICONE, kinematics=kinematics), times=times, push=push)
     down = path.displacements[:, :, 1].min(axis=1)
@@ -345,7 +344,7 @@ def test_a_body_creeps_from_the_stiff_to_the_slow_answer(kinematics):
         for rubber in (stiff, RUBBER)
     )
     assert jnp.isclose(down[1], fast, rtol=1e-9) and jnp.isclose(down[-1], slow, rtol=1e-6)
-    assert bool(jnp.all(jnp.diff(down) <= 0)) and down[0] == 0
+    assert bool(jnp.all(jnp.diff(down) <= 0)) and abs(float(down[0])) < 1e-15
     held = path.problem_at(5)
     force = residual(held, path.displacements[5])[np.asarray(BAR.points[:, 0]) > 6e-3]
     assert float(jnp.abs(force).max()) < 1e-9
