@@ -413,8 +413,8 @@ def stress_history(
     _check.shape(
         "stress_history", "F", F, (times.shape[0], 3, 3), "Give one matrix for each time."
     )
-    for step in jnp.diff(times):
-        _check.positive("stress_history", "steps of times", step, "s", "Sort the times.")
+    steps = jnp.diff(times)
+    _check.positive("stress_history", "steps of times", steps, "s", "Sort the times.")
     moduli, spectrum = branch_moduli(material), material.relaxation
 
     def advance(rows, row):
@@ -427,7 +427,7 @@ def stress_history(
 
     first = jnp.stack(inverse_strain(from_matrix(F[0])))
     start = jnp.broadcast_to(first, (1 + len(moduli), *first.shape))
-    _, later = jax.lax.scan(advance, start, (jnp.diff(times), F[1:]))
+    _, later = jax.lax.scan(advance, start, (steps, F[1:]))
     at_start = first_piola_kirchhoff_stress(material, F[0])
     return jnp.concatenate([at_start[None], later])
 

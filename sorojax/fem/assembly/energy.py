@@ -143,7 +143,7 @@ def shape_stress(
         return jax.grad(lambda F: jnp.sum(shape_energy(material, kinematics, F)))(F)
     x, slopes = _first_invariant(kinematics, F)
     P = _slope(W)(x)[None] * slopes
-    return P if (H := overstress(material)) is None else P + _overstress(kinematics, F, H)[0]
+    return P if (H := overstress(material)) is None else P + _pulled(kinematics, F, H).stress
 
 
 class ShapeVectors(NamedTuple):
@@ -184,14 +184,21 @@ def shape_response(
     P = first[None] * slopes
     if (H := overstress(material)) is None:
         return P, vectors
-    more, vectors = _overstress(kinematics, F, H, vectors)
-    return P + more, vectors
+    more = _pulled(kinematics, F, H)
+    half, weight = vectors.half + more.half, vectors.weight + more.weight
+    return P + more.stress, vectors._replace(half=half, weight=weight, row=more.row)
 
 
-def _overstress(
-    kinematics: AbstractKinematics, F: Entries, H: Tensor, vectors: ShapeVectors | None = None
-):
-    """Stress of J^(-2/3) tr(F H F') / 2, and `vectors` with its parts of the tangent."""
+class _Pulled(NamedTuple):
+    """Stress of J^(-2/3) tr(F H F') / 2 and its parts of the tangent, as in `ShapeVectors`."""
+
+    stress: Entries
+    half: Entries
+    weight: Entry
+    row: tuple[Entry, ...]
+
+
+def _pulled(kinematics: AbstractKinematics, F: Entries, H: Tensor) -> _Pulled:
     inverse, scale, _, C = _parts(kinematics, F)
     full = kinematics.embed(tuple(F))
     turned = _product(full, H)
@@ -200,14 +207,9 @@ def _overstress(
     terms = [times(a, b) for two in rows for a, b in zip(*two, strict=True)]
     share = scale * inverse * reduce(plus, terms)
     P = scale[None] * FH - (share / 3)[None] * C
-    if vectors is None:
-        return P, None
     half = (5 / 18 * share * inverse)[None] * C - (2 / 3 * scale * inverse)[None] * FH
-    return P, vectors._replace(
-        half=vectors.half + half,
-        weight=vectors.weight - share / 3,
-        row=tuple(scale * H[i][j] for i, j in strain_pairs(kinematics)),
-    )
+    row = tuple(scale * H[i][j] for i, j in strain_pairs(kinematics))
+    return _Pulled(P, half, -share / 3, row)
 
 
 def stiffened(shape: Shape, bulk: Entry, C: Entries) -> Shape:

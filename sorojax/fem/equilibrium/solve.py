@@ -318,7 +318,9 @@ def solve_path(
 _FOREVER = 1e30  # time in which everything relaxes [s]; infinity would have no derivative
 
 
-def _aging(problem: Problem, row: Array, times: Float[Array, " steps"] | None):
+def _aging(
+    problem: Problem, row: Array, times: Float[Array, " steps"] | None
+) -> tuple[Any, Past | None]:
     """Time since the state before [s], and the past of a viscoelastic body that begins
     relaxed; without a past where time plays no part."""
     if times is None:

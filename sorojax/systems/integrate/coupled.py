@@ -1,5 +1,6 @@
 """The method for networks with large bodies: those implicitly, all else along with them."""
 
+import dataclasses
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax as dfx
@@ -150,7 +151,7 @@ def _attempt(given, offset, size, state):
     new, bodies = {}, {}
     for name, stage in _stages(now).items():
         end = _ended(now, name, stage, u[name], w[name])
-        bodies[name] = end
+        bodies[name] = dataclasses.replace(end, strains=None)  # those in `new` go on
         new[name] = {
             "u": end.displacement,
             "v": end.velocity,
