@@ -118,8 +118,8 @@ def _node_points(problem: Problem) -> Points:
     """The nodes of every cell; their volumes mean nothing."""
     if isinstance(problem.material, Overstressed):
         raise ValueError(
-            "fem.cauchy_stress: got a viscoelastic body at an instant, whose branches are known "
-            "at quadrature points only. Take fem.stress.stress_at(problem, u, points) at "
+            "fem.cauchy_stress: got a viscoelastic body at an instant, whose branches are "
+            "known at quadrature points only. Take fem.stress.stress_at(problem, u, points) at "
             "fem.assembly.geometry.quadrature_points(mesh, kinematics)."
         )
     return points_at(problem.mesh, problem.kinematics, tables_at(problem.mesh.element, "nodes"))

@@ -110,7 +110,7 @@ def _listed(values: Terms) -> list:
     return [np.asarray(value).tolist() for value in values]
 
 
-def prony_of_instantaneous(shares: Any, times: Any) -> Prony:
+def prony_of_instantaneous(shares: Numbers, times: Numbers) -> Prony:
     """The spectrum whose `shares` [-] are of the instantaneous modulus G_0 instead:
     G(t) / G_0 = 1 - sum_i s_i (1 - exp(-t / tau_i)), with a sum of shares below 1.
 

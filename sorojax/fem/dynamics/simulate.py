@@ -76,7 +76,9 @@ def simulate(
     Implicit steps of second order (generalised-alpha by default). Every step is the equilibrium
     of the body with its inertia and damping, found by Newton's method; one that does not
     converge, would invert a cell or takes a point through the obstacle of a `Contact` is
-    halved, and steps grow again afterwards.
+    halved, and steps grow again afterwards. The branches of a `material.Viscoelastic` relax on
+    the way, at first relaxed at the displacement that the motion begins with; every saved
+    state holds what they remember.
 
     Args:
         problem: What moves; its material needs a density.
