@@ -43,6 +43,7 @@ ROWS = {
             "fem.hertz",
             "fem.release",
             "fem.walker",
+            "material.viscoelastic",
         ),
     ),
     "SDF evaluation and surfaces": Cases(

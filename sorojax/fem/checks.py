@@ -21,6 +21,7 @@ from sorojax.fem.assembly.space import (
 from sorojax.fem.kinematics import AbstractKinematics, Axisymmetric
 from sorojax.fem.supports import AbstractSupport, known_components, known_dofs
 from sorojax.material.hyperelastic import AbstractHyperelastic, small_strain_moduli
+from sorojax.material.viscoelastic import Viscoelastic
 from sorojax.mesh.elements.base import nodes as reference_nodes, shape_gradients
 from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.mesh import Mesh
@@ -82,6 +83,14 @@ def cells(mesh: Mesh) -> None:
 
 
 def material(mesh: Mesh, given: AbstractHyperelastic) -> None:
+    inner = given.base if isinstance(given, Viscoelastic) else given
+    parts = jax.tree.leaves(inner, is_leaf=lambda part: isinstance(part, Viscoelastic))
+    if any(isinstance(part, Viscoelastic) for part in parts):
+        raise ValueError(
+            f"fem.problem: `material` is a {type(inner).__name__} of a Viscoelastic, which "
+            "stands outermost. Write Viscoelastic(the law of all cells, spectrum), with shares "
+            "per cell, 0 where there is no branch."
+        )
     for leaf in jax.tree.leaves(given):
         if jnp.ndim(leaf) and jnp.shape(leaf) != (mesh.num_cells,):
             raise ValueError(

@@ -101,8 +101,10 @@ def exchanged(problem: Problem, **parts: Any) -> Problem:
 
 
 def with_terms(problem: Problem, terms: tuple) -> Problem:
-    """`problem` under other loads and supports."""
-    return exchanged(problem, loads=terms[0], supports=terms[1])
+    """`problem` under other loads and supports, with another material if there is a third."""
+    loads, supports, *material = terms
+    other = exchanged(problem, loads=loads, supports=supports)
+    return exchanged(other, material=material[0]) if material else other
 
 
 def problem(

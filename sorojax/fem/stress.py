@@ -28,6 +28,7 @@ from sorojax.fem.kinematics import PlaneStress
 from sorojax.fem.loads.facets import cavity_volume
 from sorojax.fem.problem import Problem, body, body_at, residual
 from sorojax.material.kinematics import Entry, Tensor, determinant
+from sorojax.material.viscoelastic import Overstressed
 from sorojax.mesh.elements.base import (
     AbstractElement,
     nodes as reference_nodes,
@@ -50,7 +51,9 @@ def deformation_gradient(
 @jax.jit
 def _deformation_gradient(problem: Problem, u) -> Float[Array, "cells cell_nodes 3 3"]:
     points = _node_points(problem)
-    F = _full(problem, points, deformation(problem.mesh, problem.kinematics, points, u))
+    F = full_deformation(
+        problem, points, deformation(problem.mesh, problem.kinematics, points, u)
+    )
     return jnp.swapaxes(stack_matrix(F, points.volumes), 0, 1)
 
 
@@ -94,7 +97,9 @@ def stress_at(
     problem: Problem, u: Float[Array, "nodes dim"], points: Points
 ) -> Float[Array, "cells points 3 3"]:
     """Cauchy stress at `points` of every cell [Pa]."""
-    F = _full(problem, points, deformation(problem.mesh, problem.kinematics, points, u))
+    F = full_deformation(
+        problem, points, deformation(problem.mesh, problem.kinematics, points, u)
+    )
     material = body_at(problem, points).material
     entries = jax.tree.map(
         lambda e: jnp.broadcast_to(jnp.asarray(e, points.volumes.dtype), points.volumes.shape),
@@ -111,10 +116,16 @@ def stress_at(
 
 def _node_points(problem: Problem) -> Points:
     """The nodes of every cell; their volumes mean nothing."""
+    if isinstance(problem.material, Overstressed):
+        raise ValueError(
+            "fem.cauchy_stress: got a viscoelastic body at an instant, whose branches are "
+            "known at quadrature points only. Take fem.stress.stress_at(problem, u, points) at "
+            "fem.assembly.geometry.quadrature_points(mesh, kinematics)."
+        )
     return points_at(problem.mesh, problem.kinematics, tables_at(problem.mesh.element, "nodes"))
 
 
-def _full(problem: Problem, points: Points, F: Entries) -> Tensor:
+def full_deformation(problem: Problem, points: Points, F: Entries) -> Tensor:
     """F in three dimensions, the thickness stretch of a sheet included."""
     kinematics = problem.kinematics
     if not isinstance(kinematics, PlaneStress):

@@ -46,6 +46,16 @@ from sorojax.material.user import (
     UserEnergy,
     st_venant_kirchhoff,
 )
+from sorojax.material.viscoelastic import (
+    Prony,
+    Viscoelastic,
+    long_time_share,
+    loss_modulus,
+    prony_of_instantaneous,
+    relaxation_modulus,
+    storage_modulus,
+    stress_history,
+)
 
 __all__ = [
     "AbstractHyperelastic",
@@ -60,12 +70,14 @@ __all__ = [
     "MooneyRivlin",
     "NeoHookean",
     "Ogden",
+    "Prony",
     "Quadratic",
     "Scaled",
     "SimoMiehe",
     "SimoTaylor",
     "StVenantKirchhoff",
     "UserEnergy",
+    "Viscoelastic",
     "Yeoh",
     "bulk_modulus",
     "by_region",
@@ -78,15 +90,21 @@ __all__ = [
     "fit_tensile",
     "lateral_stretch",
     "locking_stretch",
+    "long_time_share",
+    "loss_modulus",
     "neo_hookean",
     "ogden_shear_modulus",
     "presets",
+    "prony_of_instantaneous",
     "pure_shear_stress",
+    "relaxation_modulus",
     "rest_stretches",
     "simple_shear_stress",
     "small_strain_moduli",
     "st_venant_kirchhoff",
+    "storage_modulus",
     "strain_energy_density",
+    "stress_history",
     "uniaxial_stress",
 ]
 

@@ -41,6 +41,7 @@ ENERGIES = {
     "NeoHookean": M.NeoHookean(3e5, 5e6),
     "Ogden": M.Ogden((3e5, -1e5), (2.0, -2.0), 5e6),
     "Scaled": M.Scaled(RUBBER, 0.4),
+    "Viscoelastic": M.Viscoelastic(RUBBER, M.Prony([0.3], [0.1])),
     "StVenantKirchhoff": M.StVenantKirchhoff(3e5, 5e6),
     "UserEnergy": M.UserEnergy(user, (2e5,), bulk_modulus=5e6),
     "Yeoh": RUBBER,
@@ -48,6 +49,10 @@ ENERGIES = {
     "SimoMiehe": M.NeoHookean(3e5, 5e6, volumetric=M.SimoMiehe()),
     "SimoTaylor": M.NeoHookean(3e5, 5e6, volumetric=M.SimoTaylor()),
 }
+
+
+SPECTRUM = M.Prony([0.3, 0.2], [0.1, 0.7])
+SILICONE, TIMES = M.Viscoelastic(GENT, SPECTRUM), jnp.array([0.1, 0.2, 0.6])
 
 
 def rows(F):
@@ -92,6 +97,11 @@ CASES = (
         for law in (RUBBER, ENERGIES["Ogden"])
     }
     | {
+        f"{verb.__name__}": in_both(verb, SPECTRUM, jnp.array([0.05, 0.9]))
+        for verb in (M.loss_modulus, M.relaxation_modulus, M.storage_modulus)
+    }
+    | {
+        "long_time_share": Case(M.long_time_share, SPECTRUM),
         "bulk_modulus": Case(lambda at: M.bulk_modulus(*at), (3e5, 0.4)),
         "by_region": Case(regional, 2e6),
         "cauchy_stress": in_both(M.cauchy_stress, RUBBER, F),
@@ -112,6 +122,13 @@ CASES = (
         "ogden_shear_modulus": Case(M.ogden_shear_modulus, ENERGIES["Ogden"]),
         "rest_stretches": Case(M.rest_stretches, ENERGIES["Grown"]),
         "simple_shear_stress": in_both(M.simple_shear_stress, RUBBER, jnp.array([-0.5, 0.2])),
+        "prony_of_instantaneous": Case(
+            lambda at: M.prony_of_instantaneous(*at),
+            (jnp.array([0.2, 0.1]), jnp.array([0.1, 0.7])),
+        ),
+        "stress_history": Case(
+            lambda at: M.stress_history(*at), (SILICONE, TIMES, jnp.stack([F, F.T, F @ F]))
+        ),
         "small_strain_moduli": Case(M.small_strain_moduli, ENERGIES["Ogden"]),
     }
 )

@@ -44,6 +44,7 @@ from sorojax.material.kinematics import (
     square_norm,
     times,
 )
+from sorojax.material.viscoelastic import overstress
 from sorojax.math.compiled import Alone
 from sorojax.math.linalg.dense import inverse_cube_root
 
@@ -141,14 +142,16 @@ def shape_stress(
     if W is None:
         return jax.grad(lambda F: jnp.sum(shape_energy(material, kinematics, F)))(F)
     x, slopes = _first_invariant(kinematics, F)
-    return _slope(W)(x)[None] * slopes
+    P = _slope(W)(x)[None] * slopes
+    return P if (H := overstress(material)) is None else P + _pulled(kinematics, F, H).stress
 
 
 class ShapeVectors(NamedTuple):
     """The parts of dP/dF, where the energy is one of the first isochoric invariant: an outer
     product of `half` and C = dJ/dF with its transpose, `second` times that of the slopes of the
-    invariant (`None`: the energy is linear in it), a multiple `flat` of unity, and `weight`
-    times d2J / dF dF."""
+    invariant (`None`: the energy is linear in it), a multiple `flat` of unity, `weight` times
+    d2J / dF dF, and, with an overstress, `row` between entries of one row of F, by the pairs of
+    their columns."""
 
     half: Entries
     C: Entries
@@ -156,6 +159,7 @@ class ShapeVectors(NamedTuple):
     second: Entry | None
     flat: Entry
     weight: Entry
+    row: tuple[Entry, ...] | None = None
 
 
 #: dP/dF of the shape energy, or what it is made of.
@@ -177,7 +181,35 @@ def shape_response(
     half = (first * scale * inverse)[None] * (5 / 9 * (I1 * inverse)[None] * C - 4 / 3 * F)
     weight = -2 / 3 * first * scale * I1 * inverse
     vectors = ShapeVectors(half, C, slopes, second, 2 * first * scale, weight)
-    return first[None] * slopes, vectors
+    P = first[None] * slopes
+    if (H := overstress(material)) is None:
+        return P, vectors
+    more = _pulled(kinematics, F, H)
+    half, weight = vectors.half + more.half, vectors.weight + more.weight
+    return P + more.stress, vectors._replace(half=half, weight=weight, row=more.row)
+
+
+class _Pulled(NamedTuple):
+    """Stress of J^(-2/3) tr(F H F') / 2 and its parts of the tangent, as in `ShapeVectors`."""
+
+    stress: Entries
+    half: Entries
+    weight: Entry
+    row: tuple[Entry, ...]
+
+
+def _pulled(kinematics: AbstractKinematics, F: Entries, H: Tensor) -> _Pulled:
+    inverse, scale, _, C = _parts(kinematics, F)
+    full = kinematics.embed(tuple(F))
+    turned = _product(full, H)
+    FH = jnp.stack([turned[s.row][s.col] for s in kinematics.slots])
+    rows = zip(full, turned, strict=True)
+    terms = [times(a, b) for two in rows for a, b in zip(*two, strict=True)]
+    share = scale * inverse * reduce(plus, terms)
+    P = scale[None] * FH - (share / 3)[None] * C
+    half = (5 / 18 * share * inverse)[None] * C - (2 / 3 * scale * inverse)[None] * FH
+    row = tuple(scale * H[i][j] for i, j in strain_pairs(kinematics))
+    return _Pulled(P, half, -share / 3, row)
 
 
 def stiffened(shape: Shape, bulk: Entry, C: Entries) -> Shape:
@@ -250,6 +282,8 @@ def point_tangent(
     if weight is not None:
         tilted = (*(weight * entry for entry in F), weight)
     if isinstance(shape, ShapeVectors):
+        if shape.row is not None:
+            S = tuple(_sum(s, a) for s, a in zip(S, shape.row, strict=True))
         pairs = zip(S, strain_pairs(kinematics), strict=True)
         S = tuple(_sum(s, shape.flat) if i == j else s for s, (i, j) in pairs)
     rows = [[e for e, _ in entries_of(kinematics, i)] for i in range(kinematics.dim)]

@@ -157,11 +157,20 @@ def _blocked(rows: np.ndarray, width: int) -> jax.Array:
 
 
 def per_block(space: Space, tree: Any) -> tuple[Any, Any]:
-    """Split a pytree into leaves per cell, as (blocks, 1, lanes), and the others."""
-    varying = jax.tree.map(
-        lambda leaf: leaf[space.ids][:, None] if jnp.ndim(leaf) == 1 else None, tree
-    )
-    constant = jax.tree.map(lambda leaf: None if jnp.ndim(leaf) == 1 else leaf, tree)
+    """Split a pytree into leaves per cell, as (blocks, 1, lanes), or per point, (..., quad,
+    cells) as (blocks, ..., quad, lanes), and the others."""
+
+    def blocks(leaf):
+        if jnp.ndim(leaf) > 1:  # a copy: cells are in their order
+            shape = leaf.shape[:-1]
+            more = space.ids.size - space.num_cells
+            padding = jnp.broadcast_to(leaf[..., :1], (*shape, more))
+            whole = jnp.concatenate([leaf, padding], axis=-1)
+            return jnp.moveaxis(whole.reshape(*shape, *space.ids.shape), -2, 0)
+        return leaf[space.ids][:, None] if jnp.ndim(leaf) else None
+
+    varying = jax.tree.map(blocks, tree)
+    constant = jax.tree.map(lambda leaf: None if jnp.ndim(leaf) else leaf, tree)
     return varying, constant
 
 

@@ -12,7 +12,8 @@ from sorojax.fem.contact.obstacle import AbstractPenaltyContact, Contact
 from sorojax.fem.contact.self_contact import SelfContact
 from sorojax.fem.dynamics.step import Dynamics, Matter, State, TimeStep
 from sorojax.fem.loads.facets import areas_of, blockwise, facet_tables
-from sorojax.fem.problem import Problem, body, potential_energy
+from sorojax.fem.problem import Problem, body
+from sorojax.fem.relaxation import stored_energy
 from sorojax.math.linalg import sparse
 
 Nodal = Float[Array, "nodes dim"]
@@ -49,7 +50,8 @@ def gains(
         v = at.velocity.ravel()
         moving = v @ sparse.product(problem.space.system, known.mass, v) / 2
         held = sum(stored(load, problem, at.displacement) for load in contacts)
-        return moving + potential_energy(problem, at.displacement) + held
+        stored_now = stored_energy(problem, known.moduli, at.strains, at.displacement)
+        return moving + stored_now + held
 
     def pushing(u):
         return sum((load.potential(problem, u) for load in contacts), start=0.0)

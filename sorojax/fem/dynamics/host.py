@@ -95,7 +95,7 @@ class Run:
         self.dynamics, problem = dynamics, dynamics.problem
         self.prepared = prepare(problem)
         self.matter = compiled_matter(dynamics)
-        mass, damping = jax.tree.map(np.asarray, tuple(self.matter))
+        mass, damping = jax.tree.map(np.asarray, tuple(self.matter)[:2])
         inertia = HostInertia(problem.space.system, mass, damping)
         same = zip(problem.loads, _steady(dynamics), strict=True)
         steady = tuple(load for load, always in same if always)
@@ -269,8 +269,9 @@ def _begin(fixed: tuple[Dynamics, Matter, Geometry], state: State, interval: Int
     loads, few, room = step.terms[0], None, jnp.zeros((), u.dtype)
     rooms = [x for x in (load.room(problem) for load in loads) if x is not None]
     acting = tuple(load for load in loads if not (load.dead or isinstance(load, Inertia)))
+    others = ((), *step.terms[2:])
     if rooms:
-        few = Split(tuple(load for load in acting if not may_rest(load)))
+        few = Split((tuple(load for load in acting if not may_rest(load)), *others))
         room = jnp.min(jnp.stack(rooms))
     same = zip(loads, _steady(dynamics), strict=False)
     changing = tuple(load for load, steady in same if load.dead and not steady)
@@ -279,9 +280,11 @@ def _begin(fixed: tuple[Dynamics, Matter, Geometry], state: State, interval: Int
     varying = None if all(term.constant for term in dynamics.damping) else step.matrix
     rates = (1 - c.am) / (c.beta * h**2 * (1 - c.af)), c.gamma / (c.beta * h)
     numbers = Numbers(varying, step.lead, step.drive, u, *rates, 1 - c.af)
-    needed = loads if dynamics.conserves else loads[: len(problem.loads)]
-    ending = step._replace(terms=(needed, step.terms[1]), matrix=None)
-    task = Task(Split(acting), few, room, dead, numbers)
+    needed = step.terms
+    if not dynamics.conserves:
+        needed = loads[: len(problem.loads)], step.terms[1]
+    ending = step._replace(terms=needed, matrix=None)
+    task = Task(Split((acting, *others)), few, room, dead, numbers)
     return Split(ending), task, known_values(step.terms[1], *u.shape), step.predicted
 
 

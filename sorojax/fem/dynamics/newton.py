@@ -23,7 +23,7 @@ from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import Prepared, add_load_stiffness
 from sorojax.fem.equilibrium.newton import Newton, Secants, left_to_move, safe_fraction
 from sorojax.fem.loads.loads import AbstractLoad
-from sorojax.fem.problem import Problem, body, load_force
+from sorojax.fem.problem import Problem, body, load_force, with_terms
 from sorojax.math.compiled import Split, kernel
 from sorojax.math.linalg import sparse
 
@@ -237,11 +237,11 @@ class Found(NamedTuple):
 
 
 class Task(NamedTuple):
-    """A step to solve: its loads, those of them that may not rest if any may, how far nodes
-    may move from where it begins until the others act [m], the force of dead loads that
-    change [N], and the numbers of inertia."""
+    """A step to solve: its terms (see `with_terms`), those without loads that may rest if any
+    may, how far nodes may move from where it begins until the others act [m], the force of
+    dead loads that change [N], and the numbers of inertia."""
 
-    loads: Split
+    terms: Split
     few: Split | None
     room: Array
     dead: Array | None
@@ -250,37 +250,39 @@ class Task(NamedTuple):
 
 class Acting(NamedTuple):
     """A problem whose parts were taken apart for the kernels: body and what is prepared once
-    per motion, and the loads of a step."""
+    per motion, and the terms of a step."""
 
     fixed: Split
-    loads: Split
+    terms: Split
 
 
 def acting(problem: Problem, prepared: Prepared) -> Acting:
     """`problem` taken apart."""
-    return Acting(Split((body(problem), prepared)), Split(problem.loads))
+    return Acting(Split((body(problem), prepared)), Split((problem.loads, ())))
 
 
 @kernel
-def forces(fixed, loads, u, before):
+def forces(fixed, terms, u, before):
     """Internal force and that of the loads but dead ones [N], and the smallest
     J / J_before; to be called with what is `acting`."""
     body, prepared = fixed
+    body = with_terms(body, terms)
     found = asm.assemble(
         body.space, prepared.geometry, body.material, body.kinematics, u, before
     )
-    rest = tuple(load for load in loads if not load.dead)
+    rest = tuple(load for load in body.loads if not load.dead)
     loaded = load_force(dataclasses.replace(body, loads=rest), u)
     return found.force, loaded.ravel(), found.volume_ratio
 
 
 @kernel
-def tangent(fixed, loads, u, before):
+def tangent(fixed, terms, u, before):
     """Values of the tangent [N/m] of body and loads, to be called with what is `acting`."""
     body, prepared = fixed
+    body = with_terms(body, terms)
     args = (body.space, prepared.geometry, body.material, body.kinematics)
     values = asm.assemble(*args, u, before).values
-    return add_load_stiffness(dataclasses.replace(body, loads=loads), prepared, u, values)
+    return add_load_stiffness(body, prepared, u, values)
 
 
 @kernel
@@ -314,7 +316,7 @@ class StepSolver:
         """Go on with another step."""
         self.inertia.begin(task.inertia)
         self._dead = self._steady + (0.0 if task.dead is None else np.asarray(task.dead))
-        self._of, self._room = Acting(self._fixed, task.loads), 0.0
+        self._of, self._room = Acting(self._fixed, task.terms), 0.0
         if task.few is not None:
             self._few, self._room = Acting(self._resting, task.few), float(task.room)
 

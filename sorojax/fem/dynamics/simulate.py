@@ -34,6 +34,7 @@ from sorojax.fem.equilibrium.jit import known_mask
 from sorojax.fem.equilibrium.newton import Newton
 from sorojax.fem.loads.loads import AbstractLoad, remembers
 from sorojax.fem.problem import Problem, body, exchanged, residual
+from sorojax.fem.relaxation import relaxed
 from sorojax.math.linalg import sparse
 from sorojax.math.status import Status
 from sorojax.mesh.mesh import Mesh
@@ -75,7 +76,9 @@ def simulate(
     Implicit steps of second order (generalised-alpha by default). Every step is the equilibrium
     of the body with its inertia and damping, found by Newton's method; one that does not
     converge, would invert a cell or takes a point through the obstacle of a `Contact` is
-    halved, and steps grow again afterwards.
+    halved, and steps grow again afterwards. The branches of a `material.Viscoelastic` relax on
+    the way, at first relaxed at the displacement that the motion begins with; every saved
+    state holds what they remember.
 
     Args:
         problem: What moves; its material needs a density.
@@ -229,7 +232,9 @@ def _rest(problem: Problem, rows: tuple[Array | None, ...]) -> State:
     memory = tuple(
         _placed(load, row, problem.mesh) if remembers(load) else None for load, row in first
     )
-    return State(none, zero, zero, zero, memory, none, none, jnp.ones_like(none))
+    strains = relaxed(body(problem), zero)
+    one = jnp.ones_like(none)
+    return State(none, zero, zero, zero, memory, none, none, one, strains=strains)
 
 
 def _placed(load: AbstractLoad, row: Array | None, mesh: Mesh) -> AbstractLoad:
@@ -247,6 +252,12 @@ def _state(where: str, dynamics: Dynamics, start: Start | None) -> State:
     if isinstance(start, Trajectory):
         start = start.end
     if isinstance(start, State):
+        if (start.strains is None) != (dynamics.start.strains is None):
+            raise ValueError(
+                f"{where}: got the `start` of a body that is viscoelastic and a problem that "
+                "is not, or the reverse, need the same. Give (displacement, velocity), to "
+                "begin relaxed."
+            )
         return start
     state = dynamics.start
     if start is not None:
@@ -260,7 +271,8 @@ def _state(where: str, dynamics: Dynamics, start: Start | None) -> State:
                 "Give one vector per node.",
             )
             _check.finite(where, f"start {name}", x, "Use SI units.")
-        state = eqx.tree_at(lambda s: (s.displacement, s.velocity), state, (u, v))
+        strains = relaxed(body(dynamics.problem), u)
+        state = dataclasses.replace(state, displacement=u, velocity=v, strains=strains)
     return eqx.tree_at(lambda s: s.acceleration, state, _acceleration(dynamics, state))
 
 

@@ -19,7 +19,9 @@ from sorojax.fem.dynamics.methods import Coefficients, Conserving
 from sorojax.fem.equilibrium.jit import known_mask
 from sorojax.fem.loads.loads import AbstractLoad
 from sorojax.fem.problem import Problem, body, exchanged, load_potential, residual, with_terms
+from sorojax.fem.relaxation import Strains, after_step, in_step, moduli
 from sorojax.fem.supports import Prescribed, known_components, known_values
+from sorojax.material.viscoelastic import Terms
 from sorojax.math.linalg import sparse
 
 
@@ -120,7 +122,8 @@ class State(eqx.Module):
     """A moving body at one instant: what continues.
 
     `memory` holds the loads that remember, such as friction; `work` and `dissipated` [J] are
-    what loads and supports gave and damping took since the start. `share` is the part of a
+    what loads and supports gave and damping took since the start. `strains` are what the
+    branches of a viscoelastic material remember (`fem.relaxation`). `share` is the part of a
     step that was taken last, `tangent` the matrix whose factor goes on being used and
     `listed` the displacement [m] that lists of near facets were made at, so that a run that
     is cut in two repeats the whole one to the last bit.
@@ -136,6 +139,7 @@ class State(eqx.Module):
     share: Float[Array, ""]
     tangent: Float[Array, " nnz"] | None = None
     listed: Float[Array, "nodes dim"] | None = None
+    strains: Strains | None = None
 
 
 class Dynamics(eqx.Module):
@@ -154,10 +158,12 @@ class Dynamics(eqx.Module):
 
 
 class Matter(NamedTuple):
-    """Mass matrix and constant part of the damping matrix, computed once per motion."""
+    """Mass matrix, constant part of the damping matrix and shear moduli of the branches of a
+    viscoelastic material [Pa], computed once per motion."""
 
     mass: Float[Array, " nnz"]
     damping: Float[Array, " nnz"] | None
+    moduli: Terms | None = None
 
 
 class Interval(NamedTuple):
@@ -170,9 +176,10 @@ class Interval(NamedTuple):
 
 class TimeStep(NamedTuple):
     """A step to solve. `matrix` is the damping matrix; `terms` are the loads and supports of
-    its problem of equilibrium; `target` are displacements known at the end. Inertia pulls by
-    the mass times `drive` [m/s^2] minus the damping times `lead` [m/s], the velocity where
-    forces act of a body that keeps its displacement."""
+    its problem of equilibrium, and a viscoelastic material as it is then; `target` are
+    displacements known at the end. Inertia pulls by the mass times `drive` [m/s^2] minus the
+    damping times `lead` [m/s], the velocity where forces act of a body that keeps its
+    displacement."""
 
     terms: tuple
     guess: Float[Array, "nodes dim"]
@@ -189,7 +196,8 @@ def matter(dynamics: Dynamics) -> Matter:
     mass = mass_values(problem, dynamics.mass)
     rest = jnp.zeros_like(problem.mesh.points)
     constant = [d.matrix(problem, mass, rest) for d in dynamics.damping if d.constant]
-    return Matter(mass, sum(constant[1:], start=constant[0]) if constant else None)
+    damping = sum(constant[1:], start=constant[0]) if constant else None
+    return Matter(mass, damping, moduli(problem))
 
 
 def begin_step(dynamics: Dynamics, known: Matter, state: State, interval: Interval) -> TimeStep:
@@ -218,7 +226,10 @@ def begin_step(dynamics: Dynamics, known: Matter, state: State, interval: Interv
     predicted = guess
     if all(load.smooth for load in dynamics.problem.loads):
         predicted = guess + (1 - c.af) * h**2 / 2 * a  # that of an impact is not the next one
-    return TimeStep((loads + extra, supports), guess, predicted, damping, target, lead, drive)
+    terms = (loads + extra, supports)
+    if state.strains is not None:
+        terms += in_step(dynamics.problem, known.moduli, state.strains, (1 - c.af) * h)
+    return TimeStep(terms, guess, predicted, damping, target, lead, drive)
 
 
 def end_step(
@@ -247,6 +258,11 @@ def end_step(
         work = _work(dynamics, step, loads, u_alpha, d)
     if taken is None:
         taken = _taken(dynamics, step, (1 - c.af) * v_new + c.af * v, d)
+    strains = state.strains
+    if strains is not None:
+        args = body(dynamics.problem), known.moduli, strains, h, u + d
+        strains, relaxing = after_step(*args)
+        taken = taken + relaxing
     return State(
         time=state.time + h,
         displacement=u + d,
@@ -256,6 +272,7 @@ def end_step(
         work=state.work + work,
         dissipated=state.dissipated + taken,
         share=state.share,
+        strains=strains,
     )
 
 

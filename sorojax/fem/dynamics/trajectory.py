@@ -12,7 +12,8 @@ from sorojax._jax.trace_state import is_traced
 from sorojax.fem.dynamics.damping import mass_matrix
 from sorojax.fem.dynamics.newton import has_lists, lists_of, with_lists
 from sorojax.fem.dynamics.step import Dynamics, State, loads_at, matter
-from sorojax.fem.problem import Problem, body, exchanged, potential_energy
+from sorojax.fem.problem import Problem, body, exchanged
+from sorojax.fem.relaxation import stored_energy
 from sorojax.math.linalg import sparse
 from sorojax.math.status import Status
 
@@ -21,7 +22,8 @@ class Energies(eqx.Module):
     """Energies [J] at the saved times.
 
     `loads` is the potential of the loads with the values of the instant; `work` is what
-    loads and moving supports gave since the start, `dissipated` what damping took.
+    loads and moving supports gave since the start, `dissipated` what damping and the branches
+    of a viscoelastic material took.
     """
 
     kinetic: Float[Array, " times"]
@@ -103,7 +105,7 @@ class Trajectory(eqx.Module):
 
 @eqx.filter_jit
 def _energies(dynamics: Dynamics, states: State, points, lists) -> Energies:
-    problem, mass = dynamics.problem, matter(dynamics).mass
+    problem, known = dynamics.problem, matter(dynamics)
     moving, rest = eqx.partition(states, eqx.is_inexact_array)
 
     def one(row) -> Energies:
@@ -113,8 +115,8 @@ def _energies(dynamics: Dynamics, states: State, points, lists) -> Energies:
         loads = loads if lists is None else with_lists(loads, row[2])
         loaded = exchanged(body(problem), loads=loads)
         return Energies(
-            0.5 * jnp.sum(v * sparse.product(problem.space.system, mass, v)),
-            potential_energy(body(problem), u),
+            0.5 * jnp.sum(v * sparse.product(problem.space.system, known.mass, v)),
+            stored_energy(body(problem), known.moduli, state.strains, u),
             sum((load.stored(loaded, u) for load in loads), start=jnp.zeros((), u.dtype)),
             state.work,
             state.dissipated,

@@ -21,7 +21,15 @@ from sorojax.fem.equilibrium.implicit_diff import Solve, equilibrium
 from sorojax.fem.equilibrium.jit import Begin
 from sorojax.fem.equilibrium.load_stepping import Stats, between, unloaded
 from sorojax.fem.equilibrium.newton import Newton
-from sorojax.fem.problem import Problem
+from sorojax.fem.problem import Problem, body
+from sorojax.fem.relaxation import (
+    Past,
+    at_instant,
+    first_past,
+    from_past,
+    moduli,
+    next_past,
+)
 from sorojax.math.status import Status
 
 
@@ -66,7 +74,8 @@ class Solution(eqx.Module):
 @displayed
 class Path(eqx.Module):
     """Equilibria along a path: `values` of the load `name`, or of the volume of that cavity
-    [m^3], whose gauge `pressures` [Pa] are found; one state for each.
+    [m^3], whose gauge `pressures` [Pa] are found; one state for each. A path over `times` [s]
+    has the `strains` that a viscoelastic body remembers at each (`fem.relaxation`).
 
     A path that stops early is cut there; under `jit` and `vmap` it keeps its length and
     is NaN from there on. `stats` has one entry for each value, as in `Solution`; it is
@@ -80,13 +89,18 @@ class Path(eqx.Module):
     status: Status
     stats: Any = eqx.field(static=True)  # one Stats per value, None under jit
     pressures: Float[Array, " steps"] | None = None
+    times: Float[Array, " steps"] | None = None
+    strains: Float[Array, "steps rows entries quad cells"] | None = None
 
     def __len__(self) -> int:
         return self.displacements.shape[0]
 
     def problem_at(self, k: int) -> Problem:
         """The problem with the loads of state `k`."""
-        return self.problem_under(self.loading[k])
+        problem = self.problem_under(self.loading[k])
+        if self.strains is None:
+            return problem
+        return at_instant(problem, moduli(problem), self.strains[k])
 
     @property
     def loading(self) -> Float[Array, "steps ..."]:
@@ -219,6 +233,7 @@ def _counted(counts: Float[Array, " 5"], stats):
 def solve_path(
     problem: Problem,
     *,
+    times: Float[Array, " steps"] | None = None,
     newton: Newton | None = None,
     max_cuts: int = 10,
     throw: bool = True,
@@ -226,11 +241,16 @@ def solve_path(
 ) -> Path:
     """Equilibria for a sequence of values of one named load, the others held.
 
+    With `times` a body of `material.Viscoelastic` relaxes and creeps on the way, without
+    inertia: the first state is that of the first value held for long, steps are of order 2.
+
     Newton's method from state to state with the tangent as predictor; a step that fails is
     halved. Every state is differentiable as that of `solve`.
 
     Args:
         problem: The problem; differentiable in each of its numbers.
+        times: Increasing times of the states [s]; without them the body has all the time
+            there is.
         newton: Tolerances; `Newton()` by default.
         max_cuts: How often a step between two values may be halved in a row.
         throw: Raise when a value has no equilibrium, otherwise stop the path there. Under
@@ -260,14 +280,19 @@ def solve_path(
     """
     name, row = _named_values(problem, values)
     newton = Newton() if newton is None else newton
+    times = None if times is None else real(times)
+    steps, past = _aging(problem, row, times)
 
     # inside jit even a constant is traced: one compiled loop over the values then
     if is_traced(jnp.zeros(())):
-        states, failed = _scan_path(problem, name, row, newton, max_cuts)
-        return Path(problem, states, row, name, _status(failed), None)
-    begin, states, stats, failed = None, [], [], jnp.asarray(False)
+        states, strains, failed = _scan_path(problem, name, row, steps, past, newton, max_cuts)
+        found = problem, states, row, name, _status(failed), None, None
+        return Path(*found, times, strains)
+    begin, states, stats, failed, strains = None, [], [], jnp.asarray(False), []
     for k, value in enumerate(row):
         target = with_load(problem, name, value)
+        if past is not None:
+            target = from_past(target, past, steps[k])
         call = Solve(target, begin, newton, 1, max_cuts, want_tangent=True)
         u, counts, tangent = equilibrium(call)
         record = call.stats
@@ -283,6 +308,9 @@ def solve_path(
         else:  # nothing to hide, and no operation that a derivative would stage
             at = _begun(call.record.displacement).u
         states.append(u)
+        if past is not None:
+            past = next_past(body(problem), past, steps[k], u)
+            strains.append(past.strains)
         begin = _fixed(Begin(at, (target.loads, target.supports), tangent))
         lanes = (record,) if isinstance(record, Stats) else record or ()
         report(
@@ -290,12 +318,34 @@ def solve_path(
         )
     shape = (0, *problem.mesh.points.shape)
     stacked = jnp.stack(states) if states else jnp.zeros(shape)
-    return Path(problem, stacked, row[: len(states)], name, _status(failed), tuple(stats))
+    found = problem, stacked, row[: len(states)], name, _status(failed), tuple(stats), None
+    times = None if times is None else times[: len(states)]
+    return Path(*found, times, jnp.stack(strains) if strains else None)
+
+
+_FOREVER = 1e30  # time in which everything relaxes [s]; infinity would have no derivative
+
+
+def _aging(
+    problem: Problem, row: Array, times: Float[Array, " steps"] | None
+) -> tuple[Any, Past | None]:
+    """Time since the state before [s], and the past of a viscoelastic body that begins
+    relaxed; without a past where time plays no part."""
+    if times is None:
+        return None, None
+    do = "Give one increasing time [s] for each value."
+    _check.shape("fem.solve_path", "times", times, (row.shape[0],), do)
+    steps = jnp.diff(times)
+    _check.positive("fem.solve_path", "steps of times", steps, "s", do)
+    past = first_past(body(problem), jnp.zeros_like(problem.mesh.points))
+    if past.strains is None:
+        return None, None
+    return jnp.concatenate([jnp.full(1, _FOREVER, steps.dtype), steps]), past
 
 
 def _scan_path(
-    problem: Problem, name: str, row, newton: Newton, max_cuts: int
-) -> tuple[Float[Array, "steps nodes dim"], Bool[Array, ""]]:
+    problem: Problem, name: str, row, steps, past: Past | None, newton: Newton, max_cuts: int
+) -> tuple[Float[Array, "steps nodes dim"], Any, Bool[Array, ""]]:
     """The same in a trace; NaN from the first failure on."""
     rest = unloaded(problem)
     u = jnp.zeros_like(problem.mesh.points)
@@ -303,19 +353,26 @@ def _scan_path(
     tangent = jnp.full(problem.space.system.num_values, jnp.nan, u.dtype)
     terms, static = eqx.partition((rest.loads, rest.supports), eqx.is_inexact_array)
 
-    def advance(carry, value):
-        u, terms, tangent = jax.lax.stop_gradient(carry)
+    def advance(carry, now):
+        (value, step), (before, past) = now, carry
+        u, terms, tangent = jax.lax.stop_gradient(before)
         target = with_load(problem, name, value)
+        if past is not None:
+            target = from_past(target, past, step)
         begin = Begin(u, eqx.combine(terms, static), tangent)
         call = Solve(target, begin, newton, 1, max_cuts, want_tangent=True)
         u, counts, tangent = equilibrium(call)
         failed = counts[0] != 0
         u = jnp.where(failed, jnp.nan, u)
         terms = eqx.filter((target.loads, target.supports), eqx.is_inexact_array)
-        return (u, terms, tangent), (u, failed)
+        if past is not None:
+            past = next_past(body(problem), past, step, u)
+        strains = None if past is None else past.strains
+        return ((u, terms, tangent), past), (u, strains, failed)
 
-    _, (states, failed) = jax.lax.scan(advance, (u, terms, tangent), row)
-    return states, jnp.any(failed)
+    start = (u, terms, tangent), past
+    _, (states, strains, failed) = jax.lax.scan(advance, start, (row, steps))
+    return states, strains, jnp.any(failed)
 
 
 def _fixed(begin: Begin) -> Begin:

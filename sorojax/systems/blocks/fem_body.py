@@ -16,7 +16,15 @@ from sorojax.fem.dynamics.methods import Coefficients
 from sorojax.fem.dynamics.step import Dynamics, Mass, Matter, State, matter
 from sorojax.fem.equilibrium.jit import known_mask
 from sorojax.fem.loads.loads import AbstractLoad, remembers
-from sorojax.fem.problem import body, load_force, potential_energy, residual
+from sorojax.fem.problem import body, load_force, residual
+from sorojax.fem.relaxation import (
+    Strains,
+    at_instant,
+    moduli,
+    relaxed,
+    stored_energy,
+    strain_rates,
+)
 from sorojax.math.linalg import sparse
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output
 
@@ -33,7 +41,8 @@ _UNITS = {
 
 class FemBody(AbstractBlock):
     """A hyperelastic body in motion; the state holds displacement u and velocity v of every
-    node, and the energies `work` of its loads and `dissipated` by damping since the start.
+    node, and the energies `work` of its loads and `dissipated` by damping since the start; of
+    a viscoelastic body also the `strains` that its branches remember.
 
     A `Pressure` of the name "air" opens the input `air_pressure` (gauge) and the outputs
     `air_volume` and `air_volume_rate`; one of the default name opens `pressure`, `volume`
@@ -123,19 +132,19 @@ class FemBody(AbstractBlock):
     def initial_state(self):
         rest = jnp.zeros_like(self.problem.mesh.points)
         none = jnp.zeros((), rest.dtype)
-        return {
-            "u": rest if self.u is None else self.u,
-            "v": rest if self.v is None else self.v,
-            "work": none,
-            "dissipated": none,
-        }
+        u = rest if self.u is None else self.u
+        v = rest if self.v is None else self.v
+        state = {"u": u, "v": v, "work": none, "dissipated": none}
+        strains = relaxed(body(self.problem), u)
+        return state if strains is None else {**state, "strains": strains}
 
     def output(self, name, t, state, inputs):
         u, v = state["u"], state["v"]
         if name in ("work", "dissipated"):
             return state[name]
         if name == "elastic_energy":
-            return potential_energy(body(self.problem), u)
+            bare = body(self.problem)
+            return stored_energy(bare, moduli(bare), state.get("strains"), u)
         if name == "kinetic_energy":
             system, mass = self.problem.space.system, self.matter().mass
             return jnp.sum(v.ravel() * sparse.product(system, mass, v.ravel())) / 2
@@ -155,12 +164,17 @@ class FemBody(AbstractBlock):
         known = self.matter()
         resisting = damping_force(self, known, u, v)
         given = jnp.sum(load_force(loaded, u) * v)
-        return {
+        strains = state.get("strains")
+        rates = {
             "u": v,
-            "v": acceleration(self, loaded, known, u, v),
+            "v": acceleration(self, loaded, known, u, v, strains),
             "work": given,
             "dissipated": jnp.sum(resisting * v.ravel()),
         }
+        if strains is None:
+            return rates
+        rate, taken = strain_rates(body(self.problem), known.moduli, strains, u, v)
+        return {**rates, "strains": rate, "dissipated": rates["dissipated"] + taken}
 
     def values(self, inputs: Mapping[str, Any]) -> dict[str, Array]:
         """Values of the driven loads, by name, from the inputs of the block."""
@@ -227,10 +241,11 @@ def damping_force(block: FemBody, known: Matter, u, v) -> Float[Array, " dofs"]:
 
 
 def acceleration(
-    block: FemBody, loaded: fem.Problem, known: Matter, u, v
+    block: FemBody, loaded: fem.Problem, known: Matter, u, v, strains: Strains | None
 ) -> Float[Array, "nodes dim"]:
     """Acceleration [m/s^2] that balances a state under loads."""
     system = loaded.space.system
+    loaded = at_instant(loaded, known.moduli, strains)
     force = -residual(loaded, u).ravel() - damping_force(block, known, u, v)
     mask = known_mask(loaded.supports, *u.shape)
     matrix = sparse.fix(system, known.mass, mask)

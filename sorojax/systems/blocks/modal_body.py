@@ -20,6 +20,7 @@ from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
 from sorojax.fem.equilibrium.response import tangent_solve
 from sorojax.fem.problem import load_force, potential_energy, residual
+from sorojax.material import Viscoelastic
 from sorojax.math.linalg.sparse import SparseSymmetric, product
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output
 from sorojax.systems.blocks.fem_body import FemBody, damping_force, port_of, with_values
@@ -311,6 +312,11 @@ def modal_body(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBo
     """
     if order is not None and order not in (1, 2, 3):
         raise ValueError(f"reduced: `order` must be 1, 2, 3 or None, got {order}.")
+    if isinstance(body.problem.material, Viscoelastic):
+        raise ValueError(
+            "modal_body: got a body of a Viscoelastic material, need one without memory. Give "
+            "its `base` to the problem, with fem.Rayleigh(...) for damping."
+        )
     values = {name: jnp.zeros_like(load.value) for name, load in body.drives.items()}
     free = body.loaded(values)
     rest = ProjectedForce(free, basis)

@@ -1,5 +1,6 @@
 """The method for networks with large bodies: those implicitly, all else along with them."""
 
+import dataclasses
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax as dfx
@@ -107,7 +108,7 @@ class Coupled(AbstractMethod):
             known[name] = _Known(block.matter(), prepare_traced(block.problem))
             loaded = block.loaded(block.values(own[name]))
             u, v = y[name]["u"], y[name]["v"]
-            a = acceleration(block, loaded, known[name].matter, u, v)
+            a = acceleration(block, loaded, known[name].matter, u, v, y[name].get("strains"))
             states[name] = eqx.tree_at(lambda s: s.acceleration, dynamics.start, a)
         return Memory(states, known)
 
@@ -150,13 +151,15 @@ def _attempt(given, offset, size, state):
     new, bodies = {}, {}
     for name, stage in _stages(now).items():
         end = _ended(now, name, stage, u[name], w[name])
-        bodies[name] = end
+        bodies[name] = dataclasses.replace(end, strains=None)  # those in `new` go on
         new[name] = {
             "u": end.displacement,
             "v": end.velocity,
             "work": end.work,
             "dissipated": end.dissipated,
         }
+        if end.strains is not None:
+            new[name]["strains"] = end.strains
     rest = _marched(now, u)
     return ({name: {**new, **rest}[name] for name in now.y}, bodies), converged
 
@@ -192,6 +195,7 @@ def _state(now: _Given, name: str) -> State:
         y["work"],
         y["dissipated"],
         kept.share,
+        strains=y.get("strains"),
     )
 
 

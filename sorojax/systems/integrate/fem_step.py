@@ -115,14 +115,14 @@ def _loaded(stage: Stage, values: dict[str, Array]) -> fem.Problem:
     """The problem of equilibrium, its driven loads on the way to `values`."""
     af = stage.dynamics.scheme.af
     now = {name: (1 - af) * values[name] + af * old for name, old in stage.drives.items()}
-    loads, supports = stage.step.terms
-    return with_terms(stage.dynamics.problem, (with_values(loads, now), supports))
+    loads, *others = stage.step.terms
+    return with_terms(stage.dynamics.problem, (with_values(loads, now), *others))
 
 
 def loaded_step(stage: Stage, values: dict[str, Array]) -> TimeStep:
     """The step with its driven loads on the way to `values`."""
-    problem = _loaded(stage, values)
-    return stage.step._replace(terms=(problem.loads, problem.supports))
+    loads = _loaded(stage, values).loads
+    return stage.step._replace(terms=(loads, *stage.step.terms[1:]))
 
 
 def _newton(equations: Equations, newton: fem.Newton, given):
