@@ -4,6 +4,11 @@ The tip is to swing by 20 degrees at 1 Hz, with at most 8 kPa. Four numbers of t
 four gains change; every design goes the whole way from its drawing to the closed loop, on one
 mesh whose nodes follow it. From random designs the method of moving asymptotes changes all
 numbers together, or, with as many gradients, first the body and then the gains.
+
+From five starts the error falls from 2.5 degrees (median) to 0.62 in turn and 0.58 together;
+from one start the two differ by 21 %, from the others by -5 to 4 %. The ways end alike since
+gains make up for most of a body: a thicker wall asks for more pressure, which feed-forward
+gives as long as it stays below the limit, and what is left is the lag of valve and rubber.
 """
 
 import sys
@@ -111,27 +116,40 @@ def draw(problem, near, found, errors, file) -> None:
     columns = {"start": 0, "in turn": 2, "together": 3}
     shown = int(np.argsort(errors[:, 3] / errors[:, 2])[len(errors) // 2])
     films = {name: run(problem, found[shown][k], near) for name, k in columns.items()}
-    figure = plt.figure(figsize=(7.2, 6.4), layout="constrained")
-    grid = figure.add_gridspec(2, 3, height_ratios=(1, 1.35))
-    for k, (name, film) in enumerate(films.items()):
-        axis = figure.add_subplot(grid[0, k])
-        mesh = film.path.problem.mesh
-        most = int(jnp.argmin(jnp.abs(film.path.values - jnp.max(film["air.pressure"]))))
+    figure = plt.figure(figsize=(7.2, 5.6), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(1, 1.7))
+    bodies = above.subplots(1, 3)
+    time, spread = below.subplots(1, 2, width_ratios=(2, 1))
+    for axis, (name, film) in zip(bodies, films.items(), strict=True):
+        path = film.path
+        assert path is not None
+        mesh = path.problem.mesh
+        most = int(jnp.argmin(jnp.abs(path.values - jnp.max(film["air.pressure"]))))
         corners = np.asarray(mesh.cells)[:, :3]
         rest = np.asarray(mesh.points)
-        for x, shade in ((rest, 0.25), (rest + np.asarray(film.path.displacements[most]), 1)):
-            tiles = PolyCollection(x[corners] / mm, fc=ways[name], ec="white", lw=0.2)
+        for x, shade in ((rest, 0.25), (rest + np.asarray(path.displacements[most]), 1)):
+            tiles = PolyCollection(list(x[corners] / mm), fc=ways[name], ec="white", lw=0.2)
             tiles.set_alpha(shade)
             axis.add_collection(tiles)
         sizes = [f"{x / mm:.1f}" for x in values(found[shown][columns[name]])[BODY]]
-        axis.set(xlim=(-1, 46), ylim=(-10, 18), aspect="equal", title=name)
+        axis.set(xlim=(-1, 46), ylim=(-7, 18), aspect="equal", title=name)
         wall, gap, base, chamber = sizes
-        axis.set_xlabel(f"wall {wall}, gap {gap},\nbase {base}, chamber {chamber} mm")
+        label = f"wall {wall}, gap {gap},\nbase {base}, chamber {chamber} mm"
+        axis.set_xlabel(label, fontsize=8)
         axis.set(xticks=[], yticks=[])
         axis.spines[:].set_visible(False)
-    time, spread = figure.add_subplot(grid[1, :2]), figure.add_subplot(grid[1, 2])
     for name, film in films.items():
-        time.plot(film.time, film["body.tip_angle"] / deg, color=ways[name], lw=1.8, label=name)
+        dashes = "--" if name == "in turn" else "-"
+        angle = film["body.tip_angle"] / deg
+        time.plot(
+            film.time,
+            angle,
+            dashes,
+            color=ways[name],
+            lw=1.8,
+            label=name,
+            zorder=2 + len(dashes),
+        )
     film = films["start"]
     time.plot(film.time, film["target.value"] / deg, "k:", lw=1.2, label="target")
     time.set(xlabel="time [s]", ylabel="angle of the tip [deg]", xlim=(0, DURATION))
@@ -140,7 +158,7 @@ def draw(problem, near, found, errors, file) -> None:
         spread.plot([0, 1, 2], row, color="#c5ccd0", lw=1, zorder=1)
     for k, (name, column) in enumerate(columns.items()):
         spread.plot(0 * errors[:, column] + k, errors[:, column], "o", color=ways[name])
-    spread.set(title="error [deg rms]", yscale="log", xlim=(-0.4, 2.4))
+    spread.set(title="error [deg rms]", ylim=(0, None), xlim=(-0.4, 2.4))
     spread.set_xticks([0, 1, 2], list(columns))
     for axis in (time, spread):
         axis.spines[["top", "right"]].set_visible(False)

@@ -60,6 +60,29 @@ def _check_slopes(total):
         assert float(slope) == pytest.approx(float(ahead - behind) / 2e-5, rel=1e-6)
 
 
+@pytest.mark.slow
+def test_a_bellows_actuator_and_its_gains_are_found_together():
+    """From the drawing to the loop; slopes of the body and of the gains beside differences."""
+    main = main_of("30_codesign_bellows")
+    numbers = main(quick=True)
+    for way in ("in turn", "together"):
+        assert 0 < numbers[f"{way} [deg rms]"] < 0.95 * numbers["start [deg rms]"]
+    script = main.__globals__
+    middle = jnp.full(8, 0.5)
+    problem = script["problem_of"](script["robot_of"](middle), 2.6e-3)
+    near = script["run"](problem, middle)
+
+    def of(shares):
+        return script["error"](script["run"](problem, shares, near))
+
+    shares = jnp.linspace(0.3, 0.7, 8)
+    slope = jax.grad(of)(shares)
+    for way in np.eye(8).reshape(2, 4, 8).sum(axis=1):
+        ahead, behind = (of(shares + h * way) for h in (1e-4, -1e-4))
+        assert float(slope @ way) == pytest.approx(float(ahead - behind) / 2e-4, rel=1e-4)
+    assert user_code("30_codesign_bellows") <= 60
+
+
 def test_the_readme_says_how_programs_are_kept_for_the_next_run():
     assert "sj.enable_compilation_cache()" in (ROOT / "README.md").read_text()
 

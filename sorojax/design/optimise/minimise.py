@@ -199,6 +199,7 @@ def minimise(
     if last is not None and (ends is None or not _all_finite(*ends)):
         status = Status.not_finite
         ends = task.last(flat := last, k_last)
+    assert ends is not None
     objective, held = ends
     columns = _columns(history)
     if status == Status.successful and _broken(held, columns):
