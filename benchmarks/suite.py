@@ -64,7 +64,9 @@ ROWS = {
         ("systems.easy", "systems.stiff"), ("systems.batch", "systems.fem", "systems.hand")
     ),
     "inverse kinematics and estimator": Cases(("rod.ik", "systems.estimator")),
-    "gradients": Cases(("fem.gradient",), ("reduction.gradient", "rod.gradient")),
+    "gradients": Cases(
+        ("fem.gradient",), ("reduction.gradient", "rod.gradient", "design.uncertainty")
+    ),
     "start": Cases(("cli.import", "rod.first_call"), ("cold.calls", "view.first")),
     "pictures": Cases(("view.skin",), ("view.film", "view.web")),
     "single precision": Cases(("precision.single",)),
