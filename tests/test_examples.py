@@ -128,7 +128,7 @@ def test_the_example_with_diffrax_is_short_and_the_readme_names_it():
 @pytest.mark.slow
 def test_a_finger_and_its_controller_are_designed_together():
     """Every number of the design, through drawing, modes, contact and loop, has its slope."""
-    main = main_of("31_codesign_gripper")
+    main = main_of("codesign_gripper")
     numbers, names = main(quick=True), main.__globals__
     assert numbers["limits missed by [%]"] < 5
     assert numbers["cost, together"] < numbers["cost, start"]
