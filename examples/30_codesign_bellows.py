@@ -117,7 +117,8 @@ def draw(problem, near, found, errors, file) -> None:
     shown = int(np.argsort(errors[:, 3] / errors[:, 2])[len(errors) // 2])
     films = {name: run(problem, found[shown][k], near) for name, k in columns.items()}
     figure = plt.figure(figsize=(7.2, 5.6), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(1, 1.7))
+    grid = figure.add_gridspec(2, 1, height_ratios=(1, 1.7))
+    above, below = (figure.add_subfigure(grid[k]) for k in (0, 1))
     bodies = above.subplots(1, 3)
     time, spread = below.subplots(1, 2, width_ratios=(2, 1))
     for axis, (name, film) in zip(bodies, films.items(), strict=True):

@@ -52,7 +52,9 @@ def rows():
         return jnp.mean((film["body.tip_angle"] - film["target.value"]) ** 2)
 
     count = 100 if quick("fewer samples") else SAMPLES
-    samples = np.random.default_rng(0).multivariate_normal(mean, covariance, count)
+    samples = np.random.default_rng(0).multivariate_normal(
+        np.asarray(mean), np.asarray(covariance), count
+    )
     seen = np.array([float(cost(jnp.asarray(x))) for x in samples])
     found = design.propagate_covariance(cost, mean, covariance=covariance)
     yield Row(
