@@ -59,6 +59,13 @@ def evaluated_now(*trees: Any) -> contextlib.AbstractContextManager[Any]:
     return jax.ensure_compile_time_eval()
 
 
+def called_as_outside(*trees: Any) -> contextlib.AbstractContextManager[Any]:
+    """`evaluated_now` for calls of compiled programs, which are then those compiled outside a
+    derivative; no context where JAX has `ensure_compile_time_eval` alone, under which checks
+    of Equinox within a program raise without cause."""
+    return evaluated_now(*trees) if _eval_context is not None else contextlib.nullcontext()
+
+
 def status() -> str:
     """Whether it is known that no transformation runs, for `sorojax info`."""
     return "on" if _state is not None else f"off: {reason(*_STATE)}"

@@ -19,7 +19,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from sorojax._jax.jit import jit
-from sorojax._jax.trace_state import evaluated_now, is_traced, is_tracer
+from sorojax._jax.trace_state import called_as_outside, evaluated_now, is_traced, is_tracer
 from sorojax.math.compiled import Split
 from sorojax.math.linear_map import pushed
 
@@ -145,12 +145,14 @@ def _derivative(of: _Call, primals: Any, tangents: Any) -> tuple[Split, Split]:
     moves = [not isinstance(dot, SymbolicZero) for dot in dots]
     moving, rates = _only(moves, leaves), _only(moves, dots)
     rest = _only(moves, leaves, False)
-    if is_traced(leaves):
+    found = None
+    if not is_traced(leaves):
+        with called_as_outside(leaves):
+            found = of.programs.value(leaves, of.form)
+    if found is None or is_traced(found):
         by = lambda moving: of.programs.value(_joined(moving, rest), of.form)  # noqa: E731
         return jax.jvp(by, (moving,), (rates,))
-    with evaluated_now(leaves):
-        found = of.programs.value(leaves, of.form)
-        of = _Call(of.programs, of.programs.form_again(of.form, leaves, found))
+    of = _Call(of.programs, of.programs.form_again(of.form, leaves, found))
     which = tuple(k for k, x in enumerate(found.leaves) if eqx.is_inexact_array(x))
     by = _Slope(of, moving, rest, {k: _shape(found.leaves[k]) for k in which})
     changed = dict(zip(which, pushed(_present(rates), by), strict=True))

@@ -1,6 +1,5 @@
 """Time simulation of networks."""
 
-import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,12 +12,13 @@ from jaxtyping import Array, Float, PyTree
 
 from sorojax import _check
 from sorojax._display import displayed, number, outcome
-from sorojax._jax.jit import jit
+from sorojax._jax.small_kernels import LARGEST_GIVEN
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
 from sorojax.math.ode.explicit import AbstractMethod, RungeKutta4, Tsit5, finite
 from sorojax.math.ode.step_control import Control
 from sorojax.math.status import Status
+from sorojax.math.two_programs import two_programs
 from sorojax.systems.integrate.coupled import Coupled, bodies_of
 from sorojax.systems.integrate.integrate import (
     Event,
@@ -202,8 +202,7 @@ def simulate(
     return film
 
 
-@functools.partial(jit, kernels=False)
-def _adaptive(
+def _run_adaptive(
     network, state, inputs, first, interval, save, solver, control, watch, options
 ) -> Trajectory:
     time = instants(first, interval, save)
@@ -216,6 +215,23 @@ def _adaptive(
     else:
         motion = adaptive(*run, dense=dense, **options)
     return film_of(network, time, inputs, motion, happened)
+
+
+_FEW = 4096  # steps of which every state is kept for the derivative
+
+
+def _run_again(film: Trajectory, *args: Any) -> tuple[Any, ...]:
+    """The arguments of the run that is differentiated: silent, and with as many steps as it
+    takes, so that few of its states are computed twice."""
+    *others, watch, options = args
+    _, _, dense = watch
+    most, taken = options["max_steps"], int(film.stats["steps"])
+    if not dense:
+        most = min(most, max(_FEW, 2 ** (taken + taken // 8).bit_length()))
+    return *others, watch, options | {"max_steps": most, "progress": False}
+
+
+_adaptive = two_programs(_run_adaptive, _run_again, LARGEST_GIVEN)
 
 
 @eqx.filter_jit
