@@ -19,11 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import sorojax as sj
-from sorojax.cli.demo.design import loop_of
+from sorojax.cli.demo.design import loop_of, valve
 from sorojax.units import deg, kPa, mm
 
 LIMIT, SWING, DURATION = 8 * kPa, 20 * deg, 1.2  # of the pressure; of the tip; s
-VALVE = sj.systems.Regulator(1.5e-8, integral_gain=3e-8, max_flow=3e-5)
 BODY, ALL = np.arange(4), np.arange(8)
 DIMENSIONS = ("wall_thickness", "gap", "base", "chamber_height")
 LOW, HIGH = np.array([  # of these [m], and of the gains from angle to pressure
@@ -61,7 +60,7 @@ def run(problem, shares, near=None):
     target = sj.systems.Source(wanted, unit="rad")
     pid = sj.systems.PID(*values(shares)[4:], low=0.0, high=LIMIT)
     return sj.design.drawing_to_loop(
-        problem, draw_sides(robot), curve, lambda rod: loop_of(target, pid, VALVE, rod),
+        problem, draw_sides(robot), curve, lambda rod: loop_of(target, pid, valve(), rod),
         DURATION, modes={"kappa_z": 2}, damping=0.02, near=near, before=draw_sides(middle),
         stages=8, samples=41, degree=4, nodes=24, step=2.5e-3, save=101,
         air=jnp.linspace(0, LIMIT, 7),

@@ -238,7 +238,7 @@ def test_a_design_that_a_function_refuses_is_named_and_the_last_good_one_kept():
 
     with pytest.warns(UserWarning, match="step 1 went to a design that fails: the mesh is"):
         found = design.minimise(thin, jnp.array([0.9]), optimiser=optax.sgd(0.4), steps=9)
-    assert found.status in (Status.not_finite, Status.max_steps)
+    assert found.status == Status.not_finite
     assert 0.3 <= float(found.design[0]) < 0.5
     with pytest.raises(RuntimeError, match="tangled"):
         design.minimise(thin, jnp.array([0.1]), steps=2)

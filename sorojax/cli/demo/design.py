@@ -133,7 +133,6 @@ def _difference(design: Design, path: Path, h: float) -> float:
 
 #: Retardation time of the rubber [s]; an assumption, no measurement is public.
 DAMPING_TIME = 0.01
-VALVE = systems.Regulator(1.5e-8, integral_gain=3e-8, max_flow=3e-5)
 
 
 class Reduced(NamedTuple):
@@ -154,9 +153,7 @@ def reduce(design: Design, path: Path) -> Reduced:
 
     `errors` is the mean distance [m] between the rod's backbone and that of the solid.
     """
-    a = design.actuator
-    middle = a.layer_thickness / 2
-    line = reduction.Line([0.0, middle], [a.length, middle])
+    line = _middle(design.actuator)
     backbone = reduction.strain_along(path, line)
     basis = reduction.pod_basis(backbone, modes={"kappa_z": 3})
     fit = reduction.identify(path, basis, backbone, line)
@@ -208,12 +205,17 @@ def controller(
     )
 
 
+def valve() -> systems.Regulator:
+    """A small bench regulator."""
+    return systems.Regulator(1.5e-8, integral_gain=3e-8, max_flow=3e-5)
+
+
 def closed_loop(reduced: Reduced, path: Path, duration: float) -> systems.Network:
     """Reservoir, regulator, rod and PID: the tip follows a reference angle."""
     full = full_angle(reduced)
     reference = systems.Source(reference_angle(full, duration), unit="rad")
     pid = controller(full, float(path.values[-1]))
-    return loop_of(reference, pid, VALVE, systems.RodBody(reduced.rod, reduced.forces))
+    return loop_of(reference, pid, valve(), systems.RodBody(reduced.rod, reduced.forces))
 
 
 def loop_of(
@@ -284,16 +286,14 @@ def loop_sensitivity(
     start |= {name: getattr(pid, name) for name in GAINS}
 
     def run(numbers, near=None):
-        of = {name: numbers[name] for name in DIMENSIONS}
-        actuator = dataclasses.replace(design.actuator, **of)
+        changed = {name: numbers[name] for name in DIMENSIONS}
+        actuator = dataclasses.replace(design.actuator, **changed)
         tuned = dataclasses.replace(pid, **{name: numbers[name] for name in GAINS})
-        middle = actuator.layer_thickness / 2
-        ends = jnp.stack([0 * middle, middle]), jnp.stack([actuator.length, middle])
         return drawing_to_loop(
             design.problem,
             (actuator.body(), actuator.layer()),
-            reduction.Line(*ends),
-            lambda body: loop_of(target, tuned, VALVE, body),
+            _middle(actuator),
+            lambda body: loop_of(target, tuned, valve(), body),
             duration,
             modes={"kappa_z": 3},
             damping=DAMPING_TIME,
@@ -306,16 +306,22 @@ def loop_sensitivity(
     def cost(numbers):
         return rms(run(numbers, first))
 
-    def difference(name: str, h: float) -> float:
-        def at(k: int) -> float:
-            return float(cost(start | {name: start[name] + k * h}))
-
-        return (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * h)
-
     value, slopes = jax.value_and_grad(cost)(start)
-    steps = {name: 1e-3 * float(start[name]) for name in ("wall_thickness", "integral_gain")}
-    seen = {name: difference(name, h) for name, h in steps.items()}
+    seen = {name: _slope(cost, start, name) for name in ("wall_thickness", "integral_gain")}
     return LoopSensitivity(float(value), {k: float(x) for k, x in slopes.items()}, seen)
+
+
+def _middle(actuator: BellowsActuator) -> reduction.Line:
+    """The middle of the layer, from the clamp to the tip."""
+    middle = actuator.layer_thickness / 2
+    return reduction.Line(jnp.stack([0 * middle, middle]), jnp.stack([actuator.length, middle]))
+
+
+def _slope(cost, start: dict[str, Array], name: str) -> float:
+    """By one number, from differences of fourth order."""
+    h = 1e-3 * float(start[name])
+    at = {k: float(cost(start | {name: start[name] + k * h})) for k in (-2, -1, 1, 2)}
+    return (8 * (at[1] - at[-1]) - (at[2] - at[-2])) / (12 * h)
 
 
 def rms(film) -> Float[Array, ""]:
@@ -333,10 +339,10 @@ class Tracking(NamedTuple):
 
 
 def tracking(film: systems.Trajectory) -> Tracking:
-    error = film["body.tip_angle"] - film["target.value"]
+    final = film["body.tip_angle"][-1] - film["target.value"][-1]
     return Tracking(
-        float(jnp.sqrt(jnp.mean(error**2))),
-        float(jnp.abs(error[-1])),
+        float(rms(film)),
+        float(jnp.abs(final)),
         float(jnp.max(film["air.pressure"])),
         int(film.stats["steps"]),
     )
