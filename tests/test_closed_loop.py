@@ -121,6 +121,14 @@ def test_one_call_is_the_chain_of_its_parts(start, first):
     assert "Trajectory from a drawing" in str(first)
 
 
+def test_states_on_the_way_of_a_viscoelastic_body_give_no_law(start):
+    """What they bear is in part what the branches remember."""
+    rubber = material.Viscoelastic(RUBBER, material.Prony([0.5], [0.1]))
+    silicone = eqx.tree_at(lambda p: p.material, start, rubber)
+    with pytest.raises(ValueError, match="viscoelastic body over `times`, need equilibria"):
+        chain(silicone, None, times=jnp.linspace(0.0, 1.0, 4))
+
+
 def test_an_output_that_does_not_come_to_rest_is_named(start, first):
     """The tip still moves while the pressure rises; it rests where it may move that much."""
     run = chain(start, START, near=first, settle=("body.tip_angle", 1e-6), throw=False)

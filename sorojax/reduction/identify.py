@@ -348,6 +348,11 @@ def _condensed_stiffness(
     path: Path, at: Probe, basis: StrainBasis
 ) -> Float[Array, "steps dof dof"]:
     """Stiffness against generalised forces on q at each equilibrium: (H K^-1 H')^-1."""
+    if path.strains is not None:
+        raise ValueError(
+            "identify: got states of a viscoelastic body over `times`, need equilibria "
+            "that have relaxed. Leave `times` out of fem.solve_path."
+        )
     ways, states = _slopes(at, basis, path.displacements)
     answers, fixed = [], without_derivatives(path.problem)
     with evaluated_now(fixed):
