@@ -286,6 +286,26 @@ def test_modes_that_come_together_span_what_differences_say(sizes):
     assert np.all(np.isfinite(turns))
 
 
+def test_the_span_of_modes_has_second_derivatives():
+    """Against differences of the first, at singular values down to 1e-4 of the largest."""
+    draw = np.random.default_rng(1)
+    snapshots = jnp.asarray(draw.normal(size=(7, 5)) * 10.0 ** -np.arange(5))
+    way = jnp.asarray(draw.normal(size=(7, 5))) * snapshots
+    test = jnp.asarray(draw.normal(size=(7, 7)))
+
+    def seen(snapshots):
+        modes = leading_directions(snapshots, 3)
+        return jnp.sum(modes @ modes.T * test)
+
+    slope = jax.jit(jax.grad(seen))
+    found = jax.jvp(slope, (snapshots,), (way,))[1]
+    step = 1e-4
+    differences = (slope(snapshots + step * way) - slope(snapshots - step * way)) / (2 * step)
+    assert np.allclose(found, differences, rtol=0, atol=1e-6 * np.abs(differences).max())
+    along = jax.hessian(lambda size: seen(snapshots + size * way))(0.0)
+    assert np.isclose(along, jnp.vdot(found, way), rtol=1e-8)
+
+
 def test_a_rod_stands_where_the_solid_in_space_stands(beam_path):
     sides = dict(samples=17, arm=2 * mm)
     backbone = reduction.strain_along(beam_path, BEAM, **sides)

@@ -126,8 +126,14 @@ def _count(name: str, wanted: int | float, s, strain, rest, column: int, inner) 
     """The number of modes, from what is wanted: a number, or a share of the snapshots."""
     is_number = isinstance(wanted, int | np.integer) and not isinstance(wanted, bool)
     if is_traced((strain, rest)):
-        if is_number:
+        most = min(strain.shape[0], len(s) if inner is None else inner.count)
+        if is_number and 1 <= wanted <= most:
             return int(wanted)
+        if is_number:
+            raise ValueError(
+                f"pod_basis: asked for {wanted} modes of `{name}`, the snapshots hold 1 to "
+                f"{most}. Add load steps or ask for fewer modes."
+            )
         raise ValueError(
             f"pod_basis: asked for {wanted} of `{name}` of traced snapshots, need a number of "
             "modes there. Choose it outside jit, by the length of a basis."
@@ -168,41 +174,56 @@ def _enough(name: str, wanted: float, snapshots, shapes, parts) -> int:
 def leading_directions(
     snapshots: Float[Array, "rows snapshots"], count: int
 ) -> Float[Array, "rows count"]:
-    r"""The first left singular vectors, orthonormal, with a derivative that stays finite.
+    r"""The first left singular vectors U, orthonormal, with derivatives that stay finite.
 
-    A change dA turns vector j towards vector k, by
+    A change dA turns vector j towards another of them, k, at the rate
 
-        w_kj = (s_j u_k' dA v_j + s_k v_k' dA' u_j) / (s_j^2 - s_k^2).
+        w_kj = (u_k' dA r_j + r_k' dA' u_j) / d,    r_j = A' u_j,  d = |r_j|^2 - |r_k|^2,
 
-    Between two of the vectors asked for, w / d with d = s_j^2 - s_k^2 is taken as
-    w d / (d^2 + e^2): where two singular values come together the vectors may turn in their
-    plane at any rate, and what depends on the subspace alone, as a rod with its identified
-    laws does, does not see it. The e is 1e-6 of the product of both singular values. Where
-    the last that is asked for and the first that is not come together, the subspace itself
-    has no derivative, and none is made up.
+    and out of their span by x, with P = I - U U' and B = P A,
+
+        (|r_j|^2 I - B B') x = P (dA r_j + B dA' u_j).
+
+    In place of 1 / d stands d / (d^2 + e^2), where e is 1e-6 |r_j| |r_k|: where two singular
+    values come together the vectors may turn in their plane at any rate, and what depends on
+    the subspace alone, as a rod with its identified laws does, does not see it. Where the
+    last that is asked for and the first that is not come together, the subspace itself has
+    no derivative, and none is made up. Only A and U are in these equations, so they have
+    derivatives of every order.
     """
-    return jnp.linalg.svd(snapshots)[0][:, :count]
+    return jnp.linalg.svd(snapshots, full_matrices=False)[0][:, :count]
 
 
 @leading_directions.defjvp
 def _leading_directions_jvp(count, primals, tangents):
     (A,), (dA,) = primals, tangents
-    left, size, right = jnp.linalg.svd(A, full_matrices=True)
-    rows = A.shape[0]
-    values = jnp.zeros(rows, A.dtype).at[: len(size)].set(size)
-    seen = left.T @ dA @ right.T  # u_k' dA v_j
-    across = jnp.zeros((rows, max(A.shape)), A.dtype).at[:, : A.shape[1]].set(seen)
-    forward = across[:, :count] * values[None, :count]
-    back = values[:, None] * across[:count].T[:rows]
-    # as a product, so that it is zero between equal values whatever is fused
-    first, second = values[None, :count], values[:, None]
-    apart = (first - second) * (first + second)
-    blur = 1e-6 * first * second
-    inside = jnp.arange(rows)[:, None] < count
-    inverse = jnp.where(inside, apart, 1.0) / jnp.where(inside, apart**2 + blur**2, apart)
-    itself = jnp.eye(rows, count, dtype=bool)
-    turn = jnp.where(itself, 0.0, (forward + back) * jnp.where(itself, 0.0, inverse))
-    return left[:, :count], left @ turn
+    U = leading_directions(A, count)
+    along = A.T @ U
+    squares = jnp.sum(along**2, axis=0)
+    rates = dA @ along
+    inside = U.T @ rates
+    turned = U @ ((inside + inside.T) * _inverse_gaps(squares))
+    outside = _without(U, A)
+    sources = _without(U, rates + outside @ (dA.T @ U))
+    rows = jnp.eye(A.shape[0], dtype=A.dtype)
+    remaining = squares[:, None, None] * rows[None] - (outside @ outside.T)[None]
+    leaving = jnp.linalg.solve(remaining, sources.T[:, :, None])[:, :, 0].T
+    return U, turned + _without(U, leaving)
+
+
+def _without(U: Float[Array, "rows count"], a: Float[Array, "rows columns"]) -> Array:
+    """`a` without its part in the span of U, taken out twice against rounding."""
+    for _ in range(2):
+        a = a - U @ (U.T @ a)
+    return a
+
+
+def _inverse_gaps(squares: Float[Array, " count"]) -> Float[Array, "count count"]:
+    """d / (d^2 + e^2) of every pair of squared singular values, 0 of one with itself."""
+    gaps = squares[None, :] - squares[:, None]
+    blurred = gaps**2 + 1e-12 * squares[None, :] * squares[:, None]
+    apart = blurred > 0
+    return jnp.where(apart, gaps, 0.0) / jnp.where(apart, blurred, 1.0)
 
 
 def captured_energy(backbone: Backbone, basis: StrainBasis) -> dict[str, Float[Array, ""]]:
