@@ -9,6 +9,7 @@ import pytest
 from sorojax import Status, fem, material, mesh
 from sorojax.fem.assembly import assemble as asm
 from sorojax.fem.equilibrium.linear import linearise, prepare
+from sorojax.fem.equilibrium.response import tangent_solve
 from sorojax.mesh import Mesh
 from sorojax.units import kPa, mm
 
@@ -316,3 +317,25 @@ def test_second_derivatives_of_equilibrium():
     rows = [(slope(at + d) - slope(at - d)) / (2 * h) for d in h * jnp.eye(2)]
     assert jnp.allclose(hessian, hessian.T, rtol=1e-9)
     assert jnp.allclose(hessian, jnp.stack(rows), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.versions
+@pytest.mark.parametrize("wrap", [lambda f: f, jax.jit], ids=["now", "jit"])
+def test_second_derivatives_of_the_answer_to_small_forces(wrap):
+    """By modulus, state and force, against differences of the first."""
+    base = _ring(8 * kPa)
+    u = fem.solve(base).displacement
+    draw = np.random.default_rng(0).normal(size=(2, u.size))
+
+    def answer(scale):
+        modulus = base.material.shear_modulus * scale[0]
+        problem = eqx.tree_at(lambda p: p.material.shear_modulus, base, modulus)
+        forces = jnp.asarray(draw[:1]) * scale[2]
+        return jnp.vdot(tangent_solve(problem, u * scale[1], forces), draw[1:])
+
+    at, h, slope = jnp.ones(3), 1e-4, wrap(jax.grad(answer))
+    hessian = wrap(jax.jacfwd(jax.grad(answer)))(at)
+    rows = [(slope(at + d) - slope(at - d)) / (2 * h) for d in h * jnp.eye(3)]
+    scale = jnp.max(jnp.abs(hessian))
+    assert jnp.allclose(hessian, hessian.T, rtol=0, atol=1e-9 * scale)
+    assert jnp.allclose(hessian, jnp.stack(rows), rtol=0, atol=1e-6 * scale)

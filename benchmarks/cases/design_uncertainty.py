@@ -1,5 +1,6 @@
-"""What print tolerances and the fit of the rubber do to the cost of a closed loop, from one
-gradient, against samples of the whole chain from the drawing to the loop.
+"""What print tolerances and the fit of the rubber do to the costs of a closed loop, from one
+gradient and from second derivatives, against samples of the whole chain from the drawing to
+the loop.
 """
 
 import dataclasses
@@ -46,29 +47,41 @@ def chain():
 def rows():
     run, mean, covariance = chain()
     first = run(mean)
+    designed = first["body.tip_angle"]
 
-    def cost(x):
-        film = run(x, first)
+    def tracking(film):
+        """Off its optimum: the slope counts."""
         return jnp.mean((film["body.tip_angle"] - film["target.value"]) ** 2)
 
+    def departure(film):
+        """From the motion of the design itself, where the slope vanishes: curvature counts."""
+        return jnp.mean((film["body.tip_angle"] - designed) ** 2)
+
+    costs = {"tracking": (tracking, 1), "departure": (departure, 2)}
     count = 100 if quick("fewer samples") else SAMPLES
     samples = np.random.default_rng(0).multivariate_normal(
         np.asarray(mean), np.asarray(covariance), count
     )
-    seen = np.array([float(cost(jnp.asarray(x))) for x in samples])
-    found = design.propagate_covariance(cost, mean, covariance=covariance)
-    yield Row(
-        "sorojax",
-        {
-            "method": "first order",
-            "deviation": float(found.deviation),
-            "sampled": float(seen.std(ddof=1)),
-            "mean": float(found.mean),
-            "mean of samples": float(seen.mean()),
-            "samples": count,
-        },
-        reference=f"{count} samples of the chain",
-        error=abs(float(found.deviation) / float(seen.std(ddof=1)) - 1),
-        bar=BAR,
-        bar_on="error",
-    )
+    films = (run(jnp.asarray(x), first) for x in samples)
+    seen = np.array([[float(cost(film)) for cost, _ in costs.values()] for film in films])
+    for (name, (cost, order)), column in zip(costs.items(), seen.T, strict=True):
+        found = design.propagate_covariance(
+            lambda x, cost=cost: cost(run(x, first)), mean, covariance=covariance, order=order
+        )
+        sampled = float(column.std(ddof=1))
+        yield Row(
+            "sorojax",
+            {
+                "cost": name,
+                "order": order,
+                "deviation": float(found.deviation),
+                "sampled": sampled,
+                "mean": float(found.mean),
+                "mean of samples": float(column.mean()),
+                "samples": count,
+            },
+            reference=f"{count} samples of the chain",
+            error=abs(float(found.deviation) / sampled - 1),
+            bar=BAR,
+            bar_on="error",
+        )

@@ -28,7 +28,7 @@ def tangent_solve(
     """Displacements x = K^-1 f [m] by small forces f [N] at the equilibrium `u`, zero where
     supports hold the body; K is the tangent there.
 
-    Differentiable once, forward and reverse, in the forces, in `u` and in every number of the
+    Differentiable, forward and reverse, in the forces, in `u` and in every number of the
     problem: dx = K^-1 (df - dK x). So K is factored without a derivative of its assembly, and
     only the products K x, derivatives of the force of the body, are differentiated.
     `prepared` is that of a concrete problem, for many states of one body.
@@ -44,7 +44,7 @@ def tangent_solve(
     if not is_traced((problem, u, forces)):
         return found
     if is_traced((fixed, held, right)):
-        return found + tangent.push(forces - _products(problem, u, found))[0]
+        return _solved(tangent, problem, u, forces)
     numbers, rest = eqx.partition((unsupported(problem), u, forces), eqx.is_inexact_array)
     return _answers(_Answers(tangent, rest, found), numbers)
 
@@ -70,11 +70,30 @@ def _answers(of: _Answers, numbers) -> Float[Array, "rows dofs"]:
 
 def _answers_derivative(of: _Answers, primals, tangents):
     moving, still, rates = moving_part(primals[0], tangents[0])
+    if is_traced(moving):  # within another derivative
+        rest = eqx.combine(still, of.rest)
+        answers = functools.partial(_solved, of.tangent)
+        return jax.jvp(lambda x: answers(*eqx.combine(x, rest)), (moving,), (rates,))
     leaves, tree = jax.tree.flatten(rates)
     return of.found, pushed(leaves, _Slope(of, moving, eqx.combine(still, of.rest), tree))[0]
 
 
 _answers.defjvp(_answers_derivative, symbolic_zeros=True)
+
+
+def _solved(tangent: "_Tangent", problem: Problem, u, forces) -> Float[Array, "rows dofs"]:
+    """The answers by operations that have derivatives of every order."""
+    held = tangent.known[None]
+
+    def product(x):
+        free = jnp.where(held, jnp.zeros_like(x), x)
+        return jnp.where(held, x, _products(problem, u, free))
+
+    def solve(_, b):
+        return jnp.where(held, b, tangent.push(b)[0])
+
+    free = jnp.where(held, jnp.zeros_like(forces), forces)
+    return jax.lax.custom_linear_solve(product, free, solve, symmetric=True)
 
 
 class _Slope:
