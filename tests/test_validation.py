@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from benchmarks.validation import beam, tentacle
+from benchmarks.validation import beam, tensile, tentacle
 from sorojax.units import mm
 
 
@@ -37,6 +37,17 @@ def test_drop_and_swing_of_the_beam_are_read(load, drop, frequency):
         np.testing.assert_allclose(swing.drops.mean(), drop, rtol=0.03)
         np.testing.assert_allclose(swing.frequency, frequency, rtol=0.02)
         assert 0.045 < swing.ratio < 0.065
+
+
+def test_rubbers_in_tension_are_predicted():
+    """The points that were fitted, those that were not, and what a small bulk modulus does."""
+    rubber = "Ecoflex 00-30"
+    found = tensile.predict(rubber, tensile.Yeoh)
+    assert np.abs(found.error[:6]).max() < 0.1 and np.abs(found.error[6:]).max() < 0.03
+    assert np.all(np.isfinite(found.fit.covariance))  # with c2 = 0, at its bound
+    softer = tensile.predict(rubber, tensile.Yeoh, tensile.USUAL_RATIO)
+    np.testing.assert_allclose(softer.fit.rms, found.fit.rms)
+    assert -0.055 < softer.error[5] - found.error[5] < -0.035
 
 
 def test_a_tendon_bends_the_tentacle_to_its_side(record):

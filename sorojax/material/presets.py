@@ -5,9 +5,12 @@ materials database of Marechal et al. (Soft Robotics 8, 2021, doi:10.1089/soro.2
 Open Database License): uniaxial pull to failure, one rate (450 mm/min), cross-head strain,
 mean curves of one batch. The specimens of a batch differ by about 1 %, but batches by far
 more: the Dragon Skin 10 of a published beam test (arXiv:2201.12560) is 1.6 times as stiff.
-The first 10 % of strain carry the play of the grips. A name ending in `_full` is an Ogden
-fit up to failure, stable everywhere; the others are Yeoh fits up to 300 %, better at
-moderate strain. Numbers of the `sorotoki_` family are those of its source code.
+The first 10 % of strain carry the play of the grips. Fits are those of an incompressible
+bar: at the usual Poisson ratio of 0.49 the material is softer in tension, by 3 % at 100 %
+strain and 5 to 9 % at 200 %; pass `poisson_ratio=0.4999` where that counts. A name ending
+in `_full` is an Ogden fit up to failure, stable everywhere; the others are Yeoh fits up to
+300 %, better at moderate strain. Numbers of the `sorotoki_` family are those of its source
+code.
 """
 
 from dataclasses import dataclass
