@@ -39,15 +39,14 @@ from sorojax.material.rubbers import (
     neo_hookean,
     ogden_shear_modulus,
 )
-from sorojax.material.spectrum_fit import (
+from sorojax.material.spectrum.fit import SpectrumFit, fit_spectrum
+from sorojax.material.spectrum.records import (
     AbstractViscoelasticTest,
     CreepTest,
     DynamicTest,
     RelaxationTest,
     RingDown,
-    SpectrumFit,
     creep_compliance,
-    fit_spectrum,
     predicted_readings,
 )
 from sorojax.material.user import (
