@@ -168,6 +168,18 @@ def test_noisy_readings_keep_the_number_of_branches_and_the_stated_errors(kind):
     assert 0.8 < errors.std() < 1.25 and np.mean(np.abs(errors) < 3) > 0.98
 
 
+def test_large_noise_leaves_the_modulus_unbiased():
+    """8 repeats with 10 % noise: the mean is within 3 of its standard errors."""
+    fits = [
+        material.fit_spectrum([measured("relaxation", SPECTRA[3], 0.1, seed)])
+        for seed in range(8)
+    ]
+    errors = np.log([fit.modulus / MODULUS for fit in fits])
+    deviation = np.sqrt(np.mean([fit.covariance[0, 0] for fit in fits]))
+    assert abs(errors.mean()) < 3 * deviation / np.sqrt(8)
+    assert np.all(np.abs(errors) < 4 * deviation)
+
+
 def test_the_criterion_is_least_at_the_number_that_it_chooses():
     fit = material.fit_spectrum([measured("relaxation", SPECTRA[3], 0.01, 7)])
     assert min(fit.criterion, key=fit.criterion.__getitem__) == len(fit.in_range) == 3

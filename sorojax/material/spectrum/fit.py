@@ -34,7 +34,7 @@ class SpectrumFit:
             stated by the scatter, s^2 (J'J)^-1; NaN where the readings do not tell it.
         criterion: Schwarz's criterion (BIC) by number of branches, up to a constant, up to two
             more than the best.
-        relative_rms: Of each test, root mean square of predicted over measured - 1.
+        relative_rms: Of each test, root mean square of log(predicted / measured).
         in_range: Of each time, whether the readings span it; others rest on the tail of a
             branch whose middle was not measured.
     """
@@ -74,14 +74,16 @@ def fit_spectrum(
 ) -> SpectrumFit:
     """Long-time modulus and relaxation spectrum nearest to several tests, fitted together.
 
-    min of sum ((predicted / measured - 1) / noise)^2 over the logarithms of modulus, shares and
+    min of sum (log(predicted / measured) / noise)^2 over the logarithms of modulus, shares and
     times, so that all are positive. It begins with the best nonnegative spectrum on a fine grid
     of times, whose neighbours are merged. The number of branches has the least criterion of
     Schwarz, chi^2 + k log n with k numbers and n readings (n log(rms^2) in place of chi^2 where
     the noise is not stated): unlike those of prediction errors (AIC) it finds the number that
     made the readings, if they are many. At most one branch is tried for each decade of times,
-    and one more, and one for four readings; one that does not differ from its neighbour or has
-    a share below 1e-6 is left out, also where `branches` asks for more.
+    and one more, and one for four readings. Branches that the readings do not tell are left
+    out, also where `branches` asks for more: a share below 1e-6, a time beside another, or a
+    standard error above a factor e, as of a branch slower than the readings, which cannot be
+    told from the modulus.
 
     Args:
         tests: Tests of one material, all with moduli of one kind.
@@ -110,24 +112,14 @@ def fit_spectrum(
     data = _data(tuple(tests), softest)
     most = _most(data) if branches is None else branches
     _need_readings(data, most)
-    grid = _on_grid(data)
-    program = _Program(data, most)
-    found: dict[int, _Fit] = {}
-    criterion: dict[int, float] = {}
-    for count in range(1, most + 1):
-        fit = min((_polished(program, x) for x in _starts(data, grid, count)), key=_misfit)
-        if _is_degenerate(fit):
-            break
-        found[count], criterion[count] = fit, _criterion(fit, data)
-        best = min(criterion, key=criterion.__getitem__)
-        if branches is None and count >= best + _PATIENCE:
-            break
+    found = _by_branches(data, most, patience=_PATIENCE if branches is None else most)
     if not found:
         raise ValueError(
             "fit_spectrum: got readings in which nothing relaxes, need a modulus that falls "
             "with time. Take the material without branches, or test faster and longer."
         )
-    chosen = best if branches is None else max(found)
+    criterion = {count: _criterion(fit, data) for count, fit in found.items()}
+    chosen = min(criterion, key=criterion.__getitem__) if branches is None else max(found)
     return _result(found[chosen], data, criterion)
 
 
@@ -135,7 +127,7 @@ class _Data(NamedTuple):
     """Tests, their noise (1 where it is unknown), and the times that they span."""
 
     tests: tuple[AbstractViscoelasticTest, ...]
-    noise: tuple[Array, ...]
+    noise: Float[np.ndarray, " readings"]
     is_stated: bool
     times: tuple[float, float]
 
@@ -146,6 +138,12 @@ class _Data(NamedTuple):
     @property
     def has_modulus(self) -> bool:
         return any(test.has_modulus for test in self.tests)
+
+    @property
+    def levels(self) -> tuple[float, float]:
+        """The least and the largest modulus of the readings; 1 and 2 if no test shows it."""
+        moduli = np.concatenate([np.asarray(test.moduli) for test in self.tests])
+        return (float(moduli.min()), float(moduli.max())) if moduli.size else (1.0, 2.0)
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -182,14 +180,22 @@ def _data(tests: tuple[AbstractViscoelasticTest, ...], softest: float) -> _Data:
         _check.float64("fit_spectrum", test.readings)
         _check_magnitudes(test, softest)
     _check_agreement(tests)
-    noise = tuple(jnp.asarray(1.0 if t.noise is None else t.noise) for t in tests)
+    noise = [
+        np.broadcast_to(1.0 if test.noise is None else test.noise, test.readings.shape)
+        for test in tests
+    ]
     times = np.concatenate([np.asarray(test.timescales) for test in tests])
     times = times[times > 0]
     if not times.size:
         raise ValueError(
             "fit_spectrum: all readings are at time 0, need later ones. Add those after it."
         )
-    return _Data(tests, noise, all(stated), (float(times.min()), float(times.max())))
+    return _Data(
+        tests,
+        np.concatenate([np.ravel(each) for each in noise]),
+        all(stated),
+        (float(times.min()), float(times.max())),
+    )
 
 
 def _check_magnitudes(test: AbstractViscoelasticTest, softest: float) -> None:
@@ -246,20 +252,35 @@ def _need_readings(data: _Data, branches: int) -> None:
         )
 
 
-@eqx.filter_jit
-def _errors(tests, noise, x: Float[Array, " n"]) -> tuple[Array, Array]:
-    """Errors over noise at (modulus, shares, times), and their slopes."""
+def _by_branches(data: _Data, most: int, patience: int) -> dict[int, _Fit]:
+    """The best fit of each number of branches that the readings tell, until so many in a row
+    have been no better."""
+    grid, program = _on_grid(data), _Program(data, most)
+    found: dict[int, _Fit] = {}
+    least, best = np.inf, most
+    for count in range(1, most + 1):
+        fits = [_polished(program, start) for start in _starts(data, grid, count)]
+        fits = [fit for fit in fits if not _is_degenerate(fit, data)]
+        if fits:
+            found[count] = min(fits, key=_misfit)
+            if _criterion(found[count], data) < least:
+                least, best = _criterion(found[count], data), count
+        if count >= best + patience:
+            break
+    return found
 
-    def errors(x):
+
+@eqx.filter_jit
+def _ratios(tests, x: Float[Array, " n"]) -> tuple[Array, Array]:
+    """Predicted over measured at (modulus, shares, times), and their slopes."""
+
+    def ratios(x):
         count = x.shape[0] // 2
         spectrum = Prony(tuple(x[1 : count + 1]), tuple(x[count + 1 :]))
-        rows = [
-            jnp.ravel((test.predicted(x[0], spectrum) / test.readings - 1) / deviation)
-            for test, deviation in zip(tests, noise, strict=True)
-        ]
+        rows = [jnp.ravel(test.predicted(x[0], spectrum) / test.readings) for test in tests]
         return jnp.concatenate(rows)
 
-    return errors(x), jax.jacfwd(errors)(x)
+    return ratios(x), jax.jacfwd(ratios)(x)
 
 
 class _Program(NamedTuple):
@@ -268,15 +289,19 @@ class _Program(NamedTuple):
     data: _Data
     most: int
 
-    def __call__(self, x: np.ndarray) -> _Fit:
-        """At (modulus, shares, times); the branches that it lacks have no share."""
+    def __call__(self, x: np.ndarray, linear: bool = False) -> _Fit:
+        """At (modulus, shares, times): the logarithm of predicted over measured, which has no
+        bias where the noise is large, or what it is for small errors. The branches that `x`
+        lacks have no share."""
         count = len(x) // 2
         idle = self.most - count
         rest = 10 * self.data.bounds[1] * 1.5 ** np.arange(idle)
         padded = np.concatenate([x[: count + 1], np.zeros(idle), x[count + 1 :], rest])
-        errors, slopes = _errors(self.data.tests, self.data.noise, jnp.asarray(padded))
+        ratios, slopes = map(np.asarray, _ratios(self.data.tests, jnp.asarray(padded)))
         own = np.r_[0 : count + 1, self.most + 1 : self.most + 1 + count]
-        return _Fit(x, np.asarray(errors), np.asarray(slopes)[:, own] * x[None])
+        errors = ratios - 1 if linear else np.log(ratios)
+        scale = self.data.noise if linear else self.data.noise * ratios
+        return _Fit(x, errors / self.data.noise, slopes[:, own] * x[None] / scale[:, None])
 
 
 class _Grid(NamedTuple):
@@ -290,14 +315,13 @@ class _Grid(NamedTuple):
 def _on_grid(data: _Data) -> _Grid:
     """The best nonnegative moduli of times on a grid, by steps of Gauss and Newton: one is
     enough for relaxation and vibration, which are linear in the moduli."""
-    low, high = data.bounds
+    low, high = data.times[0] / 2, data.times[1] * 2  # slower ones would be the modulus
     size = int(np.ceil(_PER_DECADE * np.log10(high / low))) + 1
     times, program = np.geomspace(low, high, size), _Program(data, size)
-    level = min((float(np.min(t.moduli)) for t in data.tests if t.moduli.size), default=1.0)
-    moduli = level * np.append(1.0, np.full(size, 0.5 / size))
+    moduli = data.levels[0] * np.append(1.0, np.full(size, 0.5 / size))
 
     def at(moduli):
-        return program(np.concatenate([moduli[:1], moduli[1:] / moduli[0], times]))
+        return program(np.concatenate([moduli[:1], moduli[1:] / moduli[0], times]), linear=True)
 
     fit = at(moduli)
     for _ in range(15):
@@ -335,8 +359,9 @@ def _nonnegative(fit: _Fit, moduli: np.ndarray, has_modulus: bool) -> np.ndarray
 def _starts(data: _Data, grid: _Grid, count: int) -> list[np.ndarray]:
     """First guesses of `count` branches: the grid with neighbours merged, even times."""
     even = np.geomspace(*data.times, count + 2)[1:-1]
-    share = max(grid.shares.sum(), 1e-3) / count
-    starts = [np.concatenate([[grid.modulus], np.full(count, share), even])]
+    low, high = data.levels
+    share = max(high / low - 1, 1e-3) / count
+    starts = [np.concatenate([[low], np.full(count, share), even])]
     kept = grid.shares > _FAINTEST
     if kept.any():
         merged = _merged(grid.shares[kept], grid.times[kept], count)
@@ -397,10 +422,14 @@ def _polished(program: _Program, start: np.ndarray) -> _Fit:
     return _Fit(fit.x[own], fit.errors, fit.slopes[:, own])
 
 
-def _is_degenerate(fit: _Fit) -> bool:
-    """Whether a branch is none of its own: without a share, or beside another."""
+def _is_degenerate(fit: _Fit, data: _Data) -> bool:
+    """Whether a branch is none of its own: without a share, beside another, or not told by the
+    readings, as one that is slower than all of them and stands in for the modulus."""
     shares, times = fit.x[1 : fit.branches + 1], fit.x[fit.branches + 1 :]
-    return bool(np.any(shares < _FAINTEST) or np.any(times[1:] < _CLOSEST * times[:-1]))
+    if np.any(shares < _FAINTEST) or np.any(times[1:] < _CLOSEST * times[:-1]):
+        return True
+    variance = np.diag(_covariance(fit, data))
+    return bool(np.any(variance > 1))  # of logarithms: a factor e; NaN is not
 
 
 def _criterion(fit: _Fit, data: _Data) -> float:
@@ -411,33 +440,31 @@ def _criterion(fit: _Fit, data: _Data) -> float:
 
 
 def _result(fit: _Fit, data: _Data, criterion: dict[int, float]) -> SpectrumFit:
-    count, seen = fit.branches, data.has_modulus
+    count = fit.branches
     shares, times = fit.x[1 : count + 1], fit.x[count + 1 :]
     low, high = data.times
     ends = np.cumsum([test.readings.size for test in data.tests])[:-1]
-    relative = zip(np.split(fit.errors, ends), data.tests, data.noise, strict=True)
-    rms = [
-        float(np.sqrt(np.mean((part.reshape(test.readings.shape) * np.asarray(noise)) ** 2)))
-        for part, test, noise in relative
-    ]
+    relative = np.split(fit.errors * data.noise, ends)
     return SpectrumFit(
-        modulus=float(fit.x[0]) if seen else float("nan"),
+        modulus=float(fit.x[0]) if data.has_modulus else float("nan"),
         spectrum=Prony(tuple(shares.tolist()), tuple(times.tolist())),
-        covariance=_covariance(fit.slopes[:, int(not seen) :], fit.errors, data.is_stated),
+        covariance=_covariance(fit, data),
         criterion=criterion,
-        relative_rms=tuple(rms),
+        relative_rms=tuple(float(np.sqrt(np.mean(part**2))) for part in relative),
         in_range=tuple(bool(low <= time <= high) for time in times),
     )
 
 
-def _covariance(slopes: np.ndarray, errors: np.ndarray, is_stated: bool) -> np.ndarray:
+def _covariance(fit: _Fit, data: _Data) -> np.ndarray:
+    """Of the logarithms of what is fitted; NaN where it is unknown."""
+    slopes, errors = fit.slopes[:, int(not data.has_modulus) :], fit.errors
     freedom = len(errors) - slopes.shape[1]
     scale = np.linalg.norm(slopes, axis=0)
     unknown = np.full((slopes.shape[1],) * 2, np.nan)
-    if not np.all(scale > 0) or (freedom <= 0 and not is_stated):
+    if not np.all(scale > 0) or freedom < 0 or (freedom == 0 and not data.is_stated):
         return unknown
     triangle = np.linalg.qr(slopes / scale[None], mode="r")
     if np.linalg.cond(triangle) > 1e12:
         return unknown
     half = np.linalg.inv(triangle) / scale[:, None]
-    return half @ half.T * (1.0 if is_stated else errors @ errors / freedom)
+    return half @ half.T * (1.0 if data.is_stated else errors @ errors / freedom)
