@@ -558,6 +558,24 @@ def test_presets_build_and_say_what_they_are_good_for():
     assert np.isclose((3 * bulk - 2 * shear) / (6 * bulk + 2 * shear), 0.48)
 
 
+def test_presets_relax_where_a_source_has_numbers_and_say_where_none_has():
+    listing = material.presets.table()
+    for preset in material.presets.PRESETS:
+        assert (preset.density is None) == (preset.density_source is None)
+        if preset.relaxation is None:
+            with pytest.raises(ValueError, match=f"got '{preset.name}' .*Fit a test"):
+                material.presets.rubber(preset.name, viscoelastic=True)
+            continue
+        solid = material.presets.rubber(preset.name, viscoelastic=True)
+        assert isinstance(solid, material.Viscoelastic)
+        assert jax.tree.leaves(solid.base) == jax.tree.leaves(
+            material.presets.rubber(preset.name)
+        )
+        assert tuple(map(float, solid.relaxation.times)) == preset.relaxation.times
+        assert preset.relaxation.source in listing
+    assert "friction, no source known: 24 of 24" in listing
+
+
 @pytest.mark.parametrize(
     ("name", "points"),
     [

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from benchmarks.validation import beam, tensile, tentacle
+from benchmarks.validation import beam, tensile, tentacle, tentacle_film
 from sorojax.units import mm
 
 
@@ -82,3 +82,20 @@ def test_the_slope_of_the_marker_error_is_that_of_differences(record):
     found, expected = slope * scale, np.array(differences) * scale
     np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
     assert np.count_nonzero(found) == len(flat)
+
+
+@pytest.mark.slow
+def test_the_film_shows_what_was_measured_where_it_stands_still(record):
+    """Of two poses before any fit: red markers while a pose is held, none between."""
+    two = tentacle.Record(record.tension[:2], record.markers[:2], record.second[:2])
+    film = tentacle_film.film(tentacle.parameters(), two, size=(240, 280))
+    assert film.frames == 2 * tentacle_film.HELD + tentacle_film.MOVING
+
+    def red(k):  # the axes of the picture are red too
+        red, green, blue = film.draw(k).astype(int).transpose(2, 0, 1)
+        return np.count_nonzero((red > green + 80) & (red > blue + 80))
+
+    held, moving = red(0), red(tentacle_film.HELD + 2)
+    assert held > moving + 10 and red(film.frames - 1) > moving + 10
+    tips = [film.draw(k) for k in (0, film.frames - 1)]
+    assert np.count_nonzero(tips[0] != tips[1]) > 100

@@ -1,22 +1,19 @@
 """`python -m benchmarks validation`: what is predicted of measured robots, and how well."""
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.discover import HERE
-from benchmarks.validation import beam, tensile, tentacle
+from benchmarks.validation import beam, tensile, tentacle, tentacle_film
 from sorojax import view
 from sorojax.units import kPa, mm
 
 PAGE = HERE / "results" / "validation.html"
+FILM = HERE / "results" / "tentacle.gif"
 BAR = 8.0  # mm, mean marker error of poses that the fit has not seen
-SHOWN = (0, 2, 5, 8, 11, 12)  # poses in the picture
 PEERS = (
     "soromox, section Va of its paper's results, stored arrays: 36.8 mm before a fit, 15.8 mm "
     "with E, nu and density fitted (315 kPa, 0.45, 1318 kg/m3), 6.4 mm with a neural residual "
@@ -145,30 +142,17 @@ def of_tentacle() -> tuple[list[Line], view.Section]:
         "measured markers; dark: predicted ones. Parameters with their standard deviation "
         "from the fit to all poses:\n\n" + "\n\n".join(str(found).splitlines()[1:-2])
     )
-    picture = view.show(scene(p, record), view="iso")
-    return lines, view.Section(
-        "Tentacle", text, [("Fitted rod and measured markers", picture)], _numbers(lines)
-    )
-
-
-def scene(p: tentacle.Parameters, record: tentacle.Record, poses=SHOWN) -> view.Scene:
-    """The rod in some poses with measured and predicted markers, in the world."""
-    base = np.asarray(tentacle.mounting(p))
-    parts: list[Any] = []
-    found = np.asarray(
-        tentacle.predicted(p, jnp.asarray(record.tension), jnp.asarray(record.second))
-    )
-    rest = jax.jit(lambda tension: tentacle.resting(p, tension)[1])
-    for k in poses:
-        q = rest(jnp.asarray(record.tension[k]))
-        for part in view.scene_of(tentacle.body(p), q).parts:
-            if isinstance(part, view.Surface):
-                points = part.points @ base[:3, :3].T + base[None, :3, 3]
-                parts.append(replace(part, points=points))
-        parts.append(view.Lines(list(np.stack([found[k], record.markers[k]], 1)), "#c8553d"))
-        parts.append(view.Dots(found[k], "#222222", 4.0))
-        parts.append(view.Dots(record.markers[k], "#c8102e", 6.0))
-    return view.Scene(tuple(parts), title="Tentacle, " + str(len(poses)) + " poses")
+    film = tentacle_film.film(p, record)
+    FILM.parent.mkdir(exist_ok=True)
+    print(film.save(FILM))
+    pictures = [
+        (
+            "Fitted rod and measured markers",
+            view.show(tentacle_film.scene(p, record), view="iso"),
+        ),
+        (f"All {len(record.tension)} poses, tensions between them interpolated", film),
+    ]
+    return lines, view.Section("Tentacle", text, pictures, _numbers(lines))
 
 
 def of_beam(tip_load: float | None) -> tuple[list[Line], view.Section]:

@@ -189,7 +189,13 @@ def markers(
     p: Parameters, tension: Float[Array, "2"], second: Float[Array, ""]
 ) -> Float[Array, "4 3"]:
     """Where the markers are in the world [m]."""
-    model, q = resting(p, tension)
+    return markers_on(p, *resting(p, tension), second)
+
+
+def markers_on(
+    p: Parameters, model: rod.Rod, q: Array, second: Float[Array, ""]
+) -> Float[Array, "4 3"]:
+    """Where the markers are in the world [m] on a rod with coordinates `q`."""
     at = rod.points(rod.motion(model, q), MARKERS)
     arms = jnp.asarray(OFFSETS).at[SLIPPED].add(second * p["slip"])
     local = at.position + jnp.sum(at.directors * arms[:, None, :], axis=2)

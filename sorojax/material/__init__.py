@@ -39,6 +39,16 @@ from sorojax.material.rubbers import (
     neo_hookean,
     ogden_shear_modulus,
 )
+from sorojax.material.spectrum.fit import SpectrumFit, fit_spectrum
+from sorojax.material.spectrum.records import (
+    AbstractViscoelasticTest,
+    CreepTest,
+    DynamicTest,
+    RelaxationTest,
+    RingDown,
+    creep_compliance,
+    predicted_readings,
+)
 from sorojax.material.user import (
     CompressibleNeoHookean,
     InvariantEnergy,
@@ -59,8 +69,11 @@ from sorojax.material.viscoelastic import (
 
 __all__ = [
     "AbstractHyperelastic",
+    "AbstractViscoelasticTest",
     "AbstractVolumetricLaw",
     "CompressibleNeoHookean",
+    "CreepTest",
+    "DynamicTest",
     "FibreReinforced",
     "Gent",
     "Grown",
@@ -72,9 +85,12 @@ __all__ = [
     "Ogden",
     "Prony",
     "Quadratic",
+    "RelaxationTest",
+    "RingDown",
     "Scaled",
     "SimoMiehe",
     "SimoTaylor",
+    "SpectrumFit",
     "StVenantKirchhoff",
     "UserEnergy",
     "Viscoelastic",
@@ -82,11 +98,13 @@ __all__ = [
     "bulk_modulus",
     "by_region",
     "cauchy_stress",
+    "creep_compliance",
     "drucker_stability",
     "elasticity_tensor",
     "equibiaxial_stress",
     "fibre_direction",
     "first_piola_kirchhoff_stress",
+    "fit_spectrum",
     "fit_tensile",
     "lateral_stretch",
     "locking_stretch",
@@ -94,6 +112,7 @@ __all__ = [
     "loss_modulus",
     "neo_hookean",
     "ogden_shear_modulus",
+    "predicted_readings",
     "presets",
     "prony_of_instantaneous",
     "pure_shear_stress",

@@ -11,10 +11,14 @@ strain and 5 to 9 % at 200 %; pass `poisson_ratio=0.4999` where that counts. A n
 in `_full` is an Ogden fit up to failure, stable everywhere; the others are Yeoh fits up to
 300 %, better at moderate strain. Numbers of the `sorotoki_` family are those of its source
 code.
+
+Densities of the others are those of the maker's data sheets. A relaxation spectrum is there for
+Dragon Skin 10 only, from the swings of one beam: for the others no source with numbers is known
+to this table, and none for friction of any of them, which belongs to two surfaces.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,11 +32,14 @@ from sorojax.material.rubbers import (
     made_of,
     shear_modulus,
 )
+from sorojax.material.viscoelastic import Prony, Viscoelastic
 from sorojax.units import kPa
 
 MARECHAL = "Marechal et al. 2021, doi:10.1089/soro.2019.0115, ODbL 1.0 / DbCL 1.0"
 SOROTOKI = "Sorotoki, Caasenbrood, MIT licence"
 FORMLABS = "Formlabs data sheet of Flexible 80A: 6.3 MPa at 100 %, 8.9 MPa at 120 %"
+SMOOTH_ON = "Smooth-On data sheet, specific gravity"
+BEAM = "swings of a beam, two loads, two repeats: diffPD_sim2real, MIT, arXiv:2201.12560"
 ASSUMED = FORMLABS + "; assumed: through both points, none measured below 100 %"
 
 #: Engineering strain [-] and engineering stress [Pa].
@@ -46,6 +53,21 @@ DRAGON_SKIN_10_POINTS = (
 )
 
 
+class Relaxation(NamedTuple):
+    """A spectrum fitted by `fit_spectrum`: shares [-] and times [s] of its branches, the
+    frequencies that were measured [Hz], and the relative error of the damping ratios."""
+
+    shares: tuple[float, ...]
+    times: tuple[float, ...]
+    frequency_range: tuple[float, float]
+    relative_rms: float
+    source: str
+
+
+#: Outside of 4 to 8 Hz nothing was measured, and one branch loses less and less there.
+DRAGON_SKIN_10_RELAXATION = Relaxation((0.2407,), (0.02405,), (4.29, 7.74), 0.0276, BEAM)
+
+
 @dataclass(frozen=True)
 class Preset:
     """Numbers of a rubber and what is known about them.
@@ -54,7 +76,8 @@ class Preset:
     moduli, then the exponents), `bulk_modulus` [Pa] is given where the source has one.
     `strain_range` and `relative_rms` are those of `fit_tensile`; `specimens` went into
     the mean curve, as its resolution shows, and `spread` is the largest deviation of one
-    from the mean where it broke. None is not known.
+    from the mean where it broke. `friction` is the coefficient of Coulomb's law, `relaxation`
+    the spectrum of `rubber(name, viscoelastic=True)`. None is not known.
     """
 
     name: str
@@ -67,6 +90,15 @@ class Preset:
     specimens: int | None = None
     spread: float | None = None
     bulk_modulus: float | None = None
+    relaxation: Relaxation | None = None
+    friction: float | None = None
+
+    @property
+    def density_source(self) -> str | None:
+        """Where the density is from; None where it is not known."""
+        if self.density is None:
+            return None
+        return SMOOTH_ON if self.source == MARECHAL else self.source
 
     @property
     def shear_modulus(self) -> float:
@@ -78,18 +110,21 @@ class Preset:
             return "-" if value is None else f"{100 * value:.1f} %"
 
         upto = "-" if self.strain_range is None else f"{100 * self.strain_range[1]:.0f} %"
+        density = "-" if self.density is None else f"{self.density:g}"
+        friction = "-" if self.friction is None else f"{self.friction:g}"
         return (
             f"{self.name:<26s} {self.model.__name__:<12s} {self.shear_modulus / kPa:8.4g} "
             f"{upto:>7s} {percent(self.relative_rms):>6s} {self.specimens or '-':>5} "
-            f"{percent(self.spread):>6s}  {self.source}"
+            f"{percent(self.spread):>6s} {density:>7} "
+            f"{'-' if self.relaxation is None else 'yes':>6} {friction:>8}  {self.source}"
         )
 
 
 # fmt: off
 PRESETS = (
-    Preset("ecoflex_00_10", Yeoh, (3605.0, 137.9, -0.1887), 1070.0, MARECHAL,
+    Preset("ecoflex_00_10", Yeoh, (3605.0, 137.9, -0.1887), 1040.0, MARECHAL,
            (0.045, 3.0), 0.0107, 3, 0.017),
-    Preset("ecoflex_00_10_full", Ogden, (5490.0, 2.779), 1070.0, MARECHAL,
+    Preset("ecoflex_00_10_full", Ogden, (5490.0, 2.779), 1040.0, MARECHAL,
            (0.045, 17.091), 0.0153, 3, 0.017),
     Preset("ecoflex_00_30", Yeoh, (7830.0, 103.4, -0.8065), 1070.0, MARECHAL,
            (0.068, 3.0), 0.0078, 1, None),
@@ -100,9 +135,9 @@ PRESETS = (
     Preset("ecoflex_00_50_full", Ogden, (59510.0, 6271.0, 0.5, 3.017), 1070.0, MARECHAL,
            (0.045, 16.409), 0.0063, 2, 0.003),
     Preset("dragon_skin_10", Yeoh, (24290.0, 2250.0, -54.28), 1070.0, MARECHAL,
-           (0.045, 3.0), 0.0142, None, None),
+           (0.045, 3.0), 0.0142, None, None, relaxation=DRAGON_SKIN_10_RELAXATION),
     Preset("dragon_skin_10_full", Ogden, (72860.0, 2.341), 1070.0, MARECHAL,
-           (0.045, 10.409), 0.0277, None, None),
+           (0.045, 10.409), 0.0277, None, None, relaxation=DRAGON_SKIN_10_RELAXATION),
     Preset("dragon_skin_20", Yeoh, (70400.0, 5223.0, -112.7), 1080.0, MARECHAL,
            (0.045, 3.0), 0.0116, 3, 0.005),
     Preset("dragon_skin_20_full", Ogden, (176900.0, 2.399), 1080.0, MARECHAL,
@@ -136,7 +171,7 @@ PRESETS = (
 # fmt: on
 
 
-def rubber(name: str, *, poisson_ratio: float | None = None) -> Any:
+def rubber(name: str, *, poisson_ratio: float | None = None, viscoelastic: bool = False) -> Any:
     """The material of a preset.
 
     Fits to tensile tests, see `table()` for the sources and how far each is good. The functions
@@ -146,12 +181,15 @@ def rubber(name: str, *, poisson_ratio: float | None = None) -> Any:
         name: As in `table()`, "dragon_skin_20_full" for example.
         poisson_ratio: Poisson's ratio at small strains [-], below 0.5; by default that of the
             source, or 0.49 where it has none.
+        viscoelastic: Whether it relaxes, as measured in the range of frequencies that `table()`
+            tells.
 
     Returns:
         The material, with its density if it is known.
 
     Raises:
-        ValueError: If there is no such preset or the ratio is out of range.
+        ValueError: If there is no such preset, the ratio is out of range, or no source has
+            numbers of its relaxation.
 
     Example:
         >>> rubber = presets.rubber("dragon_skin_30")
@@ -175,16 +213,47 @@ def rubber(name: str, *, poisson_ratio: float | None = None) -> Any:
         ratio = 0.49 if poisson_ratio is None else poisson_ratio
         checks.poisson_ratio("presets.rubber", ratio)
         bulk = bulk_modulus(np.asarray(preset.shear_modulus), ratio)  # type: ignore[arg-type]
-    return made_of(preset.model, preset.coefficients, bulk, preset.density)
+    elastic = made_of(preset.model, preset.coefficients, bulk, preset.density)
+    return Viscoelastic(elastic, _spectrum(preset)) if viscoelastic else elastic
+
+
+def _spectrum(preset: Preset) -> Prony:
+    if preset.relaxation is None:
+        measured = ", ".join(each.name for each in PRESETS if each.relaxation)
+        raise ValueError(
+            f"presets.rubber: got {preset.name!r} with viscoelastic=True, need one of "
+            f"{measured}: of the others no source with numbers is known. Fit a test with "
+            "fit_spectrum, and write Viscoelastic(rubber, fit.spectrum)."
+        )
+    return Prony(preset.relaxation.shares, preset.relaxation.times)
 
 
 def table() -> str:
-    """All presets: shear modulus [kPa], fitted strain, error, specimens, spread, source."""
+    """All presets: shear modulus [kPa], fitted strain, error, specimens, spread, density
+    [kg/m^3], whether there is a relaxation spectrum, coefficient of friction, source; then the
+    sources of densities and spectra."""
     head = (
         f"{'name':<26s} {'model':<12s} {'mu [kPa]':>8s} {'up to':>7s} {'error':>6s} "
-        f"{'tests':>5s} {'spread':>6s}  source"
+        f"{'tests':>5s} {'spread':>6s} {'density':>7s} {'relax.':>6s} {'friction':>8s}  source"
     )
-    return "\n".join([head, *map(str, PRESETS)])
+    return "\n".join([head, *map(str, PRESETS), "", *_sources()])
+
+
+def _sources() -> list[str]:
+    """Where densities and spectra are from, and for how many no source is known."""
+    found: dict[str, list[str]] = {}
+    for preset in PRESETS:
+        if preset.density_source is not None:
+            found.setdefault(f"density, {preset.density_source}", []).append(preset.name)
+        if preset.relaxation is not None:
+            low, high = preset.relaxation.frequency_range
+            told = f"relaxation, {low:g} to {high:g} Hz, {preset.relaxation.source}"
+            found.setdefault(told, []).append(preset.name)
+    rows = [f"{told}: {', '.join(names)}" for told, names in sorted(found.items())]
+    for what in ("density", "relaxation", "friction"):
+        missing = sum(getattr(each, what) is None for each in PRESETS)
+        rows.append(f"{what}, no source known: {missing} of {len(PRESETS)}")
+    return rows
 
 
 def ecoflex_00_10(*, poisson_ratio: float = 0.49) -> Yeoh:

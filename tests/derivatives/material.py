@@ -9,7 +9,7 @@ from sorojax.material.growth import growth_volume
 from tests.derivatives.case import Case
 
 NONE = {
-    "a search or a fit on the host, of numbers": "drucker_stability fit_tensile",
+    "a search or a fit on the host, of numbers": "drucker_stability fit_spectrum fit_tensile",
 }
 
 F = jnp.asarray(np.eye(3) + 0.2 * np.random.default_rng(2).uniform(-1, 1, (3, 3)))
@@ -52,6 +52,11 @@ ENERGIES = {
 
 
 SPECTRUM = M.Prony([0.3, 0.2], [0.1, 0.7])
+UNLIKE = M.Prony([0.3, 0.0, 0.2], [0.1, 0.3, 0.7])  # a branch without a share
+TESTS = (
+    M.RelaxationTest([0.1, 1.0], [3e5, 2e5]), M.CreepTest([0.1, 1.0], [3e-6, 5e-6]),
+    M.DynamicTest([0.3, 4.0], [3e5, 4e5], [2e4, 1e4]), M.RingDown([0.3, 4.0], [0.05, 0.2]),
+)  # fmt: skip
 SILICONE, TIMES = M.Viscoelastic(GENT, SPECTRUM), jnp.array([0.1, 0.2, 0.6])
 
 
@@ -101,6 +106,18 @@ CASES = (
         for verb in (M.loss_modulus, M.relaxation_modulus, M.storage_modulus)
     }
     | {
+        f"predicted_readings of {type(test).__name__}": in_both(
+            lambda modulus, spectrum, test=test: M.predicted_readings(test, modulus, spectrum),
+            2e5,
+            SPECTRUM,
+        )
+        for test in TESTS
+    }  # fmt: skip
+    | {
+        "creep_compliance": in_both(M.creep_compliance, SPECTRUM, jnp.array([0.05, 0.9])),
+        "creep_compliance with an empty branch": Case(
+            lambda times: M.creep_compliance(M.Prony(UNLIKE.shares, times), 0.2), UNLIKE.times
+        ),
         "long_time_share": Case(M.long_time_share, SPECTRUM),
         "bulk_modulus": Case(lambda at: M.bulk_modulus(*at), (3e5, 0.4)),
         "by_region": Case(regional, 2e6),

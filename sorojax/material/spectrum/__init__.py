@@ -1,0 +1,1 @@
+"""Relaxation spectra from tests."""
