@@ -55,6 +55,7 @@ from sorojax.material.viscoelastic import (
     relaxation_modulus,
     storage_modulus,
     stress_history,
+    uniaxial_spectrum,
 )
 
 __all__ = [
@@ -105,6 +106,7 @@ __all__ = [
     "storage_modulus",
     "strain_energy_density",
     "stress_history",
+    "uniaxial_spectrum",
     "uniaxial_stress",
 ]
 

@@ -16,7 +16,9 @@ from sorojax.math.ode.steppers import (
     Kinematic,
     SecondOrder,
     move,
+    remembered,
     start,
+    within,
 )
 
 _SHORTER = 0.4  # of a Newton step that did not help
@@ -68,32 +70,33 @@ class ContactMidpoint(AbstractStepper):
             return ImplicitMidpoint(self.passes).step(problem, t, h, state)
         if state.resolved is None:  # a loop that could not tell of a step that is held
             at = Span(t, h, self.theta * h)
-            return Kinematic(*_step(problem, at, _with_record(state), self)[0][:3])
+            new = _step(problem, at, _with_record(state), self)[0]
+            return new._replace(gained=None)
 
-        def whole(t, h, *state):
-            return _step(problem, Span(t, h, self.theta * h), Kinematic(*state), self)
+        def whole(t, h, state):
+            return _step(problem, Span(t, h, self.theta * h), state, self)
 
-        t, begun = jnp.asarray(t, h.dtype), state[:4]
-        method, numbers = jax.closure_convert(whole, t, h, *begun)
+        t, begun = jnp.asarray(t, h.dtype), state._replace(resolved=None)
+        method, numbers = jax.closure_convert(whole, t, h, begun)
 
         def attempt(given, offset, size, state):
             t, resolved, numbers = given
             return jax.lax.cond(
                 resolved,
-                lambda: method(t + offset, size, *state, *numbers),
+                lambda: method(t + offset, size, state, *numbers),
                 lambda: (state, jnp.zeros((), bool)),
             )
 
         given = t, state.resolved, tuple(numbers)
         new, reached = cut(attempt, _CUTS, given, h, begun)
-        return Kinematic(*new, state.resolved & reached)
+        return new._replace(resolved=state.resolved & reached)
 
 
 def _with_record(state: Kinematic) -> Kinematic:
     """The state with what contact keeps a record of."""
     if state.resolved is not None:
         return state
-    return Kinematic(*state[:3], jnp.zeros((), state.v.dtype), jnp.array(True))
+    return state._replace(gained=jnp.zeros((), state.v.dtype), resolved=jnp.array(True))
 
 
 class Span(NamedTuple):
@@ -106,8 +109,8 @@ class Span(NamedTuple):
 
 def _step(problem: SecondOrder, at: Span, state: Kinematic, method: ContactMidpoint):
     """The state after a step, without its flag, and whether the step can be taken."""
-    contact = problem.contact
-    assert contact is not None
+    problem = within(problem, at.part, state)
+    assert problem.contact is not None
     if method.lasting and method.passes == 1 and method.tolerance > 0:
         (near, long, swift), search = _solve_together(problem, at, state, method)
     else:
@@ -123,7 +126,8 @@ def _step(problem: SecondOrder, at: Span, state: Kinematic, method: ContactMidpo
         lambda: _balance(problem, at, (state, end), inner, near),
         lambda: (np.True_, 0 * at.h),
     )
-    return (*end[:3], state.gained + gained), ~passed & kept
+    memory = remembered(problem, at.h, state, end.q)
+    return end._replace(gained=state.gained + gained, memory=memory), ~passed & kept
 
 
 def passed_on_way(problem: SecondOrder, at: Span, state: Kinematic, inner: Array, long: Array):

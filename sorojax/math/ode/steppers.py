@@ -53,6 +53,25 @@ class ContactTerms(NamedTuple):
     symmetric: bool = True
 
 
+class MemoryTerms(NamedTuple):
+    """Forces that depend on the motion so far, by a memory that relaxes to the coordinates.
+
+    Attributes:
+        begin: The memory to begin with.
+        rate: (q, memory) -> its rate.
+        force: (q, memory) -> the force.
+        within: (span, q, memory) -> (force, stiffness) a `span` [s] after (q, memory): the
+            force as a function of the coordinates then, and about - d force / dq.
+        after: (h, q before, q after, memory before) -> the memory after a step of `h` [s].
+    """
+
+    begin: Float[Array, "branches dof"]
+    rate: Callable[[Array, Array], Array]
+    force: Callable[[Array, Array], Array]
+    within: Callable[[Array, Array, Array], tuple[Callable[[Array], Array], Array]]
+    after: Callable[[Array, Array, Array, Array], Array]
+
+
 class SecondOrder(NamedTuple):
     """Equations M(q) a = f(t, q, v) with the matrices an implicit method may lean on.
 
@@ -66,6 +85,7 @@ class SecondOrder(NamedTuple):
         retract: (q, increment of the rates' dimension) -> q moved; a sum if None.
         rate: (q, v) -> dq/dt; v if None.
         contact: Contact, which `equations` hold as well, apart; None without any.
+        memory: Forces with a memory, which `equations` do not hold; None without any.
     """
 
     equations: Callable[[Array, Array, Array], tuple[Array, Array]]
@@ -74,6 +94,7 @@ class SecondOrder(NamedTuple):
     retract: Callable[[Array, Array], Array] | None = None
     rate: Callable[[Array, Array], Array] | None = None
     contact: ContactTerms | None = None
+    memory: MemoryTerms | None = None
 
 
 class Kinematic(NamedTuple):
@@ -81,6 +102,7 @@ class Kinematic(NamedTuple):
 
     In contact, `resolved` says whether every step so far could be taken; where not, the state
     is that before the step. `gained` is the energy that steps gained by themselves [J].
+    `memory` is that of forces which have one.
     """
 
     q: Float[Array, " coordinates"]
@@ -88,6 +110,7 @@ class Kinematic(NamedTuple):
     a: Float[Array, " dof"]
     gained: Float[Array, ""] | None = None
     resolved: Bool[Array, ""] | None = None
+    memory: Float[Array, "branches dof"] | None = None
 
 
 class AbstractStepper(eqx.Module):
@@ -110,7 +133,50 @@ class AbstractStepper(eqx.Module):
 
 def start(problem: SecondOrder, t, q: Array, v: Array) -> Kinematic:
     """A state with the acceleration that belongs to (q, v)."""
-    return Kinematic(q, v, solve_symmetric(*problem.equations(t, q, v)))
+    mass, force = problem.equations(t, q, v)
+    if problem.memory is None:
+        return Kinematic(q, v, solve_symmetric(mass, force))
+    memory = problem.memory.begin
+    a = solve_symmetric(mass, force + problem.memory.force(q, memory))
+    return Kinematic(q, v, a, memory=memory)
+
+
+def within(problem: SecondOrder, span, state: Kinematic) -> SecondOrder:
+    """The equations `span` [s] after `state`, with the forces that have a memory."""
+    if problem.memory is None:
+        return problem
+    if state.memory is None:
+        raise ValueError(
+            "steppers: got a state without memory, need one, as a force remembers the motion. "
+            "Begin with `start(problem, t, q, v)`, or set `memory`."
+        )
+    push, stiffness = problem.memory.within(span, state.q, state.memory)
+
+    def pushed(t, q, v):
+        mass, force = problem.equations(t, q, v)
+        return mass, force + push(q)
+
+    contact = problem.contact
+    if contact is not None:
+        free, plain = contact.free, contact.plain
+
+        def pushed_free(t, q, v):
+            mass, force, moment = free(t, q, v)
+            return mass, force + push(q), moment
+
+        contact = contact._replace(
+            free=pushed_free, plain=lambda t, q, v: plain(t, q, v) + push(q)
+        )
+    return problem._replace(
+        equations=pushed, stiffness=problem.stiffness + stiffness, contact=contact
+    )
+
+
+def remembered(problem: SecondOrder, h, state: Kinematic, q: Array) -> Array | None:
+    """The memory after a step of `h` [s] from `state` to `q`."""
+    if problem.memory is None or state.memory is None:
+        return None
+    return problem.memory.after(h, state.q, q, state.memory)
 
 
 class GeneralisedAlpha(AbstractStepper):
@@ -141,18 +207,20 @@ class GeneralisedAlpha(AbstractStepper):
         q, v, a = state[:3]
         leap = h * v + h * h * (1 / 2 - beta) * a
         surge = v + h * (1 - gamma) * a
+        inner = within(problem, (1 - af) * h, state)
 
         def improve(_, new):
             middle_q = move(problem, q, (1 - af) * (leap + h * h * beta * new))
             middle_v = (1 - af) * (surge + h * gamma * new) + af * v
-            mass, force = problem.equations(t + (1 - af) * h, middle_q, middle_v)
-            implicit = gamma * h * problem.damping + beta * h**2 * problem.stiffness
+            mass, force = inner.equations(t + (1 - af) * h, middle_q, middle_v)
+            implicit = gamma * h * inner.damping + beta * h**2 * inner.stiffness
             residual = mass @ ((1 - am) * new + am * a) - force
             return new - solve_symmetric((1 - am) * mass + (1 - af) * implicit, residual)
 
         new = jax.lax.fori_loop(0, self.passes, improve, a)
         moved = move(problem, q, leap + h * h * beta * new)
-        return Kinematic(moved, surge + h * gamma * new, new)
+        memory = remembered(problem, h, state, moved)
+        return Kinematic(moved, surge + h * gamma * new, new, memory=memory)
 
 
 class ImplicitMidpoint(AbstractStepper):
@@ -167,16 +235,19 @@ class ImplicitMidpoint(AbstractStepper):
 
     def step(self, problem, t, h, state):
         q, v, a = state[:3]
+        inner = within(problem, h / 2, state)
 
         def improve(_, new):
             half = v + h / 2 * new
             middle = move(problem, q, h / 2 * half)
-            mass, force = problem.equations(t + h / 2, middle, half)
-            implicit = mass + h / 2 * problem.damping + h**2 / 4 * problem.stiffness
+            mass, force = inner.equations(t + h / 2, middle, half)
+            implicit = mass + h / 2 * inner.damping + h**2 / 4 * inner.stiffness
             return new - solve_symmetric(implicit, mass @ new - force)
 
         new = jax.lax.fori_loop(0, self.passes, improve, a)
-        return Kinematic(move(problem, q, h * (v + h / 2 * new)), v + h * new, new)
+        moved = move(problem, q, h * (v + h / 2 * new))
+        memory = remembered(problem, h, state, moved)
+        return Kinematic(moved, v + h * new, new, memory=memory)
 
 
 class TripleJump(AbstractStepper):
@@ -194,6 +265,11 @@ class TripleJump(AbstractStepper):
     settles: ClassVar[bool] = True
 
     def step(self, problem, t, h, state):
+        if problem.memory is not None:
+            raise ValueError(
+                "TripleJump: got a force that remembers the motion, need none: a step goes "
+                "back in time within, and a memory does not. Take ImplicitMidpoint()."
+            )
         midpoint, outer = ImplicitMidpoint(self.passes), 1 / (2 - 2 ** (1 / 3))
         shares = h * jnp.array([outer, 1 - 2 * outer, outer], h.dtype)
 
@@ -206,19 +282,20 @@ class TripleJump(AbstractStepper):
 
 
 class AbstractExplicit(AbstractStepper):
-    """Runge-Kutta methods of a `tableau`, which keep no acceleration."""
+    """Runge-Kutta methods of a `tableau`, which keep no acceleration. A memory is stepped as
+    coordinates are: stable for steps below some 2.8 of its shortest time."""
 
     tableau: eqx.AbstractClassVar[Tableau]
 
     def begin(self, problem, t, q, v):
-        return Kinematic(q, v, jnp.zeros_like(v))
+        return _still(problem, q, v)
 
     def step(self, problem, t, h, state):
-        field = vector_field(problem)
-        q, v = rolled_step(self.tableau, field, t, (state.q, state.v), h)
+        field, begun = vector_field(problem), (state.q, state.v, state.memory)
+        q, v, memory = rolled_step(self.tableau, field, t, begun, h)
         if problem.retract is not None:
             q = problem.retract(q, jnp.zeros_like(v))  # back on the manifold
-        return Kinematic(q, v, state.a)
+        return Kinematic(q, v, state.a, memory=memory)
 
 
 class RungeKutta4(AbstractExplicit):
@@ -239,14 +316,25 @@ def move(problem: SecondOrder, q: Array, increment: Array) -> Array:
 
 
 def vector_field(problem: SecondOrder) -> Field:
-    """(t, (q, v)) -> (dq/dt, dv/dt), for methods of first order."""
+    """(t, (q, v, memory)) -> their rates, for methods of first order; `memory` is None where
+    no force has one."""
 
     def field(t, y):
-        q, v = y
+        q, v, memory = y
         rate = v if problem.rate is None else problem.rate(q, v)
-        return rate, solve_symmetric(*problem.equations(t, q, v))
+        mass, force = problem.equations(t, q, v)
+        if problem.memory is None:
+            return rate, solve_symmetric(mass, force), None
+        force = force + problem.memory.force(q, memory)
+        return rate, solve_symmetric(mass, force), problem.memory.rate(q, memory)
 
     return field
+
+
+def _still(problem: SecondOrder, q: Array, v: Array) -> Kinematic:
+    """A state without acceleration."""
+    memory = None if problem.memory is None else problem.memory.begin
+    return Kinematic(q, v, jnp.zeros_like(v), memory=memory)
 
 
 def integrate(
@@ -292,7 +380,7 @@ def integrate(
         # A run of steps of no length finds the first acceleration: equations written out a
         # second time before the loop would compile for almost as long as the loop.
         made = tuple(np.insert(column, 0, 0) for column in made)
-        begin = Kinematic(q, v, jnp.zeros_like(v))
+        begin = _still(problem, q, v)
     else:
         begin = stepper.begin(problem, t, q, v)
     _, states = jax.lax.scan(advance, Doubled.at(begin), made)
