@@ -179,7 +179,7 @@ def memory_terms(
         return _after(branches, h, increments(model, q), increments(model, new), memory)
 
     return MemoryTerms(
-        _begin(branches, increments(model, q)) if memory is None else _given(branches, memory),
+        begun(branches, increments(model, q)) if memory is None else _given(branches, memory),
         lambda q, memory: memory_rate(branches, increments(model, q), memory),
         lambda q, memory: borne(branches, increments(model, q), memory),
         within,
@@ -187,7 +187,8 @@ def memory_terms(
     )
 
 
-def _begin(branches: Branches, x: Array) -> Memory:
+def begun(branches: Branches, x: Array) -> Memory:
+    """The memory of branches that have relaxed at coordinates x."""
     return jnp.broadcast_to(x[None], branches.shares.shape)
 
 
@@ -275,7 +276,7 @@ def branch_states(
         new = _after(branches, *row, memory)
         return new, new
 
-    begin = _begin(branches, x[0])
+    begin = begun(branches, x[0])
     _, states = jax.lax.scan(advance, begin, (jnp.diff(times), x[:-1], x[1:]))
     return jnp.concatenate([begin[None], states])
 
