@@ -91,8 +91,8 @@ def rollout(
             `memory` of a trajectory to go on from; relaxed at `q` by default.
 
     Returns:
-        Times [s], coordinates, rates, how the run ended, and the memory of branches. Nothing is raised where it fails:
-        check `status`.
+        Times [s], coordinates, rates, how the run ended, and the memory of branches. Nothing is
+        raised where it fails: check `status`.
 
     Raises:
         ValueError: If `saves` is negative or `every` below 1, or `memory` has the wrong shape.

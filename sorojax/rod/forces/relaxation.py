@@ -75,6 +75,14 @@ def branches_of(model: Model, forces: tuple[Load, ...], constants: Any = None):
     """The branches among the forces on a model; None without any."""
     if all(relaxation_of(force) is None for force in forces):
         return None
+    names = [name for name, *_ in _rods(model)]
+    for force in forces:
+        if relaxation_of(force) and parts_of(force) not in ((), *((name,) for name in names)):
+            raise ValueError(
+                f"rod: a Relaxation is on `{parts_of(force)[0]}`, need a rod"
+                + ("." if isinstance(model, Rod) else f", one of {', '.join(map(str, names))}.")
+                + " Take the name off on a single rod."
+            )
     constants = operators(model) if constants is None else constants
     start = rest(model)
     stiffness = tangent_stiffness(relaxed(forces), motion(model, start, constants=constants))
