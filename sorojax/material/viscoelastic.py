@@ -183,6 +183,9 @@ def uniaxial_spectrum(spectrum: Prony, poisson_ratio: Numbers) -> Prony:
         spectrum: Of the shear modulus, one number for each constant.
         poisson_ratio: Long-time ratio nu [-].
 
+    Returns:
+        Shares of E_inf and times [s], as many as those of the shear modulus.
+
     Raises:
         ValueError: If a constant is more than one number, or the ratio is outside (-1, 0.5].
 
@@ -190,11 +193,11 @@ def uniaxial_spectrum(spectrum: Prony, poisson_ratio: Numbers) -> Prony:
         >>> shear = material.Prony([0.5, 0.3], [0.01, 0.1])
         >>> pull = material.uniaxial_spectrum(shear, 0.4)
         >>> print([round(float(g), 3) for g in pull.shares])
-        [0.442, 0.273]
+        [0.432, 0.276]
 
     Reference:
-        Tschoegl, The Phenomenological Theory of Linear Viscoelastic Behavior, 1989, section
-        11.1, for the principle.
+        Tschoegl, The Phenomenological Theory of Linear Viscoelastic Behavior, 1989, for the
+        principle.
     """
     nu, do = real(poisson_ratio), "Give the ratio of slow loading; rubber has almost 0.5."
     _check.between("uniaxial_spectrum", "poisson_ratio", nu, -1, 0.5, "-", do, "(]")

@@ -166,8 +166,7 @@ class Relaxation(AbstractForce):
             `material.Viscoelastic`.
 
     Reference:
-        Lang and Arnold, Numerical aspects in the dynamic simulation of geometrically exact
-        rods, Appl. Numer. Math. 62, 2012, for viscous strains of a rod in one branch.
+        Simo and Hughes, Computational Inelasticity, 1998, chapter 10, for the branches.
     """
 
     spectrum: Prony

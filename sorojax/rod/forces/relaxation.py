@@ -12,7 +12,7 @@ known when it begins. Stored are d_i' K_i d_i / 2 with d_i = q - z_i, dissipated
 tau_i, both never negative.
 
 Reference:
-    Simo and Hughes, Computational Inelasticity, 1998, section 10.3, for the recurrence.
+    Simo and Hughes, Computational Inelasticity, 1998, chapter 10, for the recurrence.
 """
 
 from typing import Any, NamedTuple
@@ -271,7 +271,7 @@ def branch_states(
         [0.0, 0.0, 3.161]
 
     Reference:
-        Simo and Hughes, Computational Inelasticity, 1998, section 10.3.
+        Simo and Hughes, Computational Inelasticity, 1998, chapter 10.
     """
     times, q = real(times), real(q)
     _check.shape("branch_states", "times", times, (None,), "Give a list of times.")
