@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from sorojax.math.status import Status
 SHARES, TIMES = [0.5, 0.3], [0.01, 0.1]
 SPECTRUM = material.Prony(SHARES, TIMES)
 BRANCHES = R.Relaxation(SPECTRUM)
-SOFT = {"young_modulus": 1e6, "density": 1000.0, "length": 0.1}
+SOFT: dict[str, Any] = {"young_modulus": 1e6, "density": 1000.0, "length": 0.1}
 
 
 def planar(poisson_ratio=0.5, **modes):

@@ -39,7 +39,7 @@ class Trajectory(eqx.Module):
     q: Float[Array, "time coordinates"]
     v: Float[Array, "time dof"]
     status: Status
-    memory: Float[Array, "time branches dof"] | None = None
+    memory: Any = None  # Float[Array, "time branches dof"], None without branches
 
     def _text(self) -> str:
         return (

@@ -1,5 +1,7 @@
 """A rod as a block: pressure in, volume and tip out."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -251,13 +253,13 @@ def _maps(forces: tuple[Load, ...]) -> list[tuple[str, AbstractPressureMap]]:
     return [(f.part, f.force) for f in on if isinstance(f.force, AbstractPressureMap)]
 
 
-def _first_memory(model: Rod | Assembly, forces: tuple[Load, ...], q: Array) -> dict:
+def _first_memory(model: Rod | Assembly, forces: tuple[Any, ...], q: Array) -> dict:
     """The memory of branches that have relaxed at `q`, of a body that has some."""
     branches = branches_of(model, forces)
     return {} if branches is None else {"memory": begun(branches, increments(model, q))}
 
 
-def _branches(model: Rod | Assembly, forces: tuple[Load, ...], state, constants):
+def _branches(model: Rod | Assembly, forces: tuple[Any, ...], state, constants):
     """The force of the branches, None without any, and the rate of their memory."""
     branches = branches_of(model, forces, constants)
     if branches is None:
