@@ -65,6 +65,7 @@ from sorojax.material.viscoelastic import (
     relaxation_modulus,
     storage_modulus,
     stress_history,
+    uniaxial_spectrum,
 )
 
 __all__ = [
@@ -124,6 +125,7 @@ __all__ = [
     "storage_modulus",
     "strain_energy_density",
     "stress_history",
+    "uniaxial_spectrum",
     "uniaxial_stress",
 ]
 

@@ -170,18 +170,79 @@ def loss_modulus(spectrum: Prony, omega: Numbers) -> Float[Array, "..."]:
     return total
 
 
+def uniaxial_spectrum(spectrum: Prony, poisson_ratio: Numbers) -> Prony:
+    """The spectrum of Young's modulus, E(t) / E_inf, of a solid whose shear modulus relaxes by
+    `spectrum` while its bulk modulus is constant.
+
+    By the correspondence principle E = 9 K G / (3 K + G) holds between Laplace transforms. It
+    has a simple pole between each two of G, so E has as many branches as G: with K = G_inf /
+    (3 a) and a = (1 - 2 nu) / (2 + 2 nu) their rates are the roots of 1 + a G / G_inf, their
+    shares the residues there. For nu = 0.5 both spectra are the same.
+
+    Args:
+        spectrum: Of the shear modulus, one number for each constant.
+        poisson_ratio: Long-time ratio nu [-].
+
+    Returns:
+        Shares of E_inf and times [s], as many as those of the shear modulus.
+
+    Raises:
+        ValueError: If a constant is more than one number, or the ratio is outside (-1, 0.5].
+
+    Example:
+        >>> shear = material.Prony([0.5, 0.3], [0.01, 0.1])
+        >>> pull = material.uniaxial_spectrum(shear, 0.4)
+        >>> print([round(float(g), 3) for g in pull.shares])
+        [0.432, 0.276]
+
+    Reference:
+        Tschoegl, The Phenomenological Theory of Linear Viscoelastic Behavior, 1989, for the
+        principle.
+    """
+    nu, do = real(poisson_ratio), "Give the ratio of slow loading; rubber has almost 0.5."
+    _check.between("uniaxial_spectrum", "poisson_ratio", nu, -1, 0.5, "-", do, "(]")
+    for name, value in (("shares", spectrum.shares), ("times", spectrum.times)):
+        for entry in value:
+            do = "Make one spectrum per region."
+            _check.shape("uniaxial_spectrum", name, entry, (), do)
+    a, g, tau = (1 - 2 * nu) / (2 + 2 * nu), *map(jnp.stack, (spectrum.shares, spectrum.times))
+    eye = jnp.eye(g.shape[0], dtype=bool)
+
+    def shear(s):
+        """G / G_inf at -s, times the product of all 1 - s tau, and that product."""
+        factors = 1 - s * tau
+        others = jnp.prod(jnp.where(eye, 1.0, factors[None]), axis=1)
+        whole = jnp.prod(factors)
+        return whole - s * jnp.sum(g * tau * others), whole
+
+    def poles(s):
+        numerator, whole = shear(s)
+        return whole + a * numerator
+
+    u, slope = jnp.sqrt(g / tau), jax.vmap(jax.grad(poles))
+    matrix = jnp.diag(1 / tau) - a / (1 + a * (1 + jnp.sum(g))) * u[:, None] * u[None]
+    rates = jax.lax.stop_gradient(jnp.linalg.eigvalsh(matrix)[::-1])
+    for _ in range(3):  # removes rounding, and gives the roots their derivatives
+        rates = rates - jax.vmap(poles)(rates) / slope(rates)
+    shares = (1 + a) * jax.vmap(shear)(rates)[0] / (rates * slope(rates))
+    shares = shares - jax.lax.stop_gradient(jnp.minimum(shares, 0))  # rounding of a share of 0
+    return Prony(tuple(shares), tuple(1 / rates))
+
+
 Weights = tuple[Entry, Entry, Entry]
 
 
 def step_weights(spectrum: Prony, step: Float[Array, ""] | float) -> list[Weights]:
-    """Of each branch e^-x, f - e^-x and 1 - f with x = `step` / tau and f = (1 - e^-x) / x:
-    weights of its state before a step [s] and of what it relaxes to before and after."""
-    found = []
-    for tau in spectrum.times:
-        x = step / tau
-        decay, mean = jnp.exp(-x), -jnp.expm1(-x) / x
-        found.append((decay, mean - decay, 1 - mean))
-    return found
+    """`branch_weights` of each branch for a step [s]."""
+    return [branch_weights(tau, step) for tau in spectrum.times]
+
+
+def branch_weights(tau: Entry, step: Float[Array, ""] | float) -> Weights:
+    """e^-x, f - e^-x and 1 - f with x = `step` / `tau` and f = (1 - e^-x) / x: weights of the
+    state of a branch before a step [s] and of what it relaxes to before and after."""
+    x = step / tau
+    decay, mean = jnp.exp(-x), -jnp.expm1(-x) / x
+    return decay, mean - decay, 1 - mean
 
 
 # The materials: of a body, and of a body within a step

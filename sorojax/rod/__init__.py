@@ -53,6 +53,7 @@ from sorojax.rod.forces.forces import (
     LineWrench,
     PointWrench,
     Pressurised,
+    Relaxation,
     TipWrench,
     section_law,
 )
@@ -64,6 +65,7 @@ from sorojax.rod.forces.loads import (
     TimeVaryingForce,
     total_force,
 )
+from sorojax.rod.forces.relaxation import branch_energy, branch_force, branch_states
 from sorojax.rod.forces.tendons import (
     AbstractRoute,
     Actuation,
@@ -187,6 +189,7 @@ __all__ = [
     "Position",
     "Pressurised",
     "Prismatic",
+    "Relaxation",
     "Revolute",
     "Rod",
     "RodContact",
@@ -205,6 +208,9 @@ __all__ = [
     "assembly",
     "bernstein",
     "bias_force",
+    "branch_energy",
+    "branch_force",
+    "branch_states",
     "bspline",
     "chebyshev",
     "circle",

@@ -143,6 +143,9 @@ CASES = (
             lambda at: M.prony_of_instantaneous(*at),
             (jnp.array([0.2, 0.1]), jnp.array([0.1, 0.7])),
         ),
+        "uniaxial_spectrum": Case(
+            lambda at: M.uniaxial_spectrum(*at), (SPECTRUM, jnp.asarray(0.3))
+        ),
         "stress_history": Case(
             lambda at: M.stress_history(*at), (SILICONE, TIMES, jnp.stack([F, F.T, F @ F]))
         ),

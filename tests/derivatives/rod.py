@@ -181,6 +181,19 @@ def laws(at):
     )
 
 
+def branches(at):
+    model, spectrum, times, q, memory = at
+    forces = (R.Relaxation(spectrum),)
+    return (
+        R.branch_states(model, forces, times, jnp.stack([0 * q, q, 2 * q])),
+        R.branch_force(model, forces, q, memory),
+        R.branch_energy(model, forces, q, memory),
+    )
+
+
+SPECTRUM = material.Prony([0.3, 0.2], [0.01, 0.05])
+REMEMBERED = jnp.stack([0.5 * Q, -0.2 * Q])
+
 # Contact, where it presses
 
 LAW = LinePenalty(5e5, 2e-5, friction=0.3, damping=0.1)
@@ -390,6 +403,9 @@ CASES = (
         ),
         "section_law, strain, points": Case(
             laws, (FINGER, Q, jnp.array([0.1, 0.2, 0.2, 30.0, 10.0, 10.0]), jnp.asarray(2.0))
+        ),
+        "branch_states, branch_force, branch_energy": Case(
+            branches, (FINGER, SPECTRUM, jnp.array([0.0, 0.02, 0.03]), Q, REMEMBERED)
         ),
         "contact_energy, penetration: on a floor": Case(
             obstacle, (LAW, FLOOR, jnp.asarray(6e-3), PRESS, 0.1 * BENT), step=1e-6, rtol=1e-5

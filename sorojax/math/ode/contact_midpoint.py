@@ -109,7 +109,7 @@ class Span(NamedTuple):
 
 def _step(problem: SecondOrder, at: Span, state: Kinematic, method: ContactMidpoint):
     """The state after a step, without its flag, and whether the step can be taken."""
-    whole, problem = problem, within(problem, at.part, state)
+    problem = within(problem, at.part, state)
     assert problem.contact is not None
     if method.lasting and method.passes == 1 and method.tolerance > 0:
         (near, long, swift), search = _solve_together(problem, at, state, method)
@@ -126,7 +126,7 @@ def _step(problem: SecondOrder, at: Span, state: Kinematic, method: ContactMidpo
         lambda: _balance(problem, at, (state, end), inner, near),
         lambda: (np.True_, 0 * at.h),
     )
-    memory = remembered(whole, at.h, state, end.q)
+    memory = remembered(problem, at.h, state, end.q)
     return end._replace(gained=state.gained + gained, memory=memory), ~passed & kept
 
 

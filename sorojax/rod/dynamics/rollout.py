@@ -17,7 +17,14 @@ from sorojax.math.ode.steppers import AbstractStepper, GeneralisedAlpha, SecondO
 from sorojax.math.status import Status
 from sorojax.rod.contact.terms import any_contact, contacts_of
 from sorojax.rod.dynamics.dynamics import Forces
-from sorojax.rod.forces.loads import damping_matrix, on_model, tangent_stiffness, total_force
+from sorojax.rod.forces.loads import (
+    damping_matrix,
+    on_model,
+    relaxed,
+    tangent_stiffness,
+    total_force,
+)
+from sorojax.rod.forces.relaxation import memory_terms
 from sorojax.rod.model.assembly import is_flat, rate, retract
 from sorojax.rod.model.model import Model, inertia, motion, operators
 from sorojax.rod.statics.equilibrium import checked_status
@@ -25,12 +32,14 @@ from sorojax.rod.statics.equilibrium import checked_status
 
 @displayed
 class Trajectory(eqx.Module):
-    """A motion sampled in time: time [s], coordinates and their rates."""
+    """A motion sampled in time: time [s], coordinates and their rates, and what the branches
+    of a `Relaxation` remember, the coordinates at which they are free of force."""
 
     time: Float[Array, " time"]
     q: Float[Array, "time coordinates"]
     v: Float[Array, "time dof"]
     status: Status
+    memory: Any = None  # Float[Array, "time branches dof"], None without branches
 
     def _text(self) -> str:
         return (
@@ -53,6 +62,7 @@ def rollout(
     stepper: AbstractStepper | None = None,
     progress: bool = False,
     check: bool = True,
+    memory: Float[Array, "branches dof"] | None = None,
 ) -> Trajectory:
     """Motion of a rod or assembly by `saves * every` steps of fixed length.
 
@@ -77,13 +87,15 @@ def rollout(
             where errors add up to the motion: a twentieth of the time of a run of 160 steps
             or more, four half steps of a shorter one. Runs of fewer than 8 steps are
             not judged.
+        memory: What the branches of a `Relaxation` remember at `t`, as the last row of
+            `memory` of a trajectory to go on from; relaxed at `q` by default.
 
     Returns:
-        Times [s], coordinates, rates, and how the run ended. Nothing is raised where it fails:
-        check `status`.
+        Times [s], coordinates, rates, how the run ended, and the memory of branches. Nothing is
+        raised where it fails: check `status`.
 
     Raises:
-        ValueError: If `saves` is negative or `every` below 1.
+        ValueError: If `saves` is negative or `every` below 1, or `memory` has the wrong shape.
 
     Example:
         >>> finger = rod.rod(SE2(), rod.chebyshev(kappa_z=3), rod.circle(5 * mm), length=0.1,
@@ -106,15 +118,17 @@ def rollout(
         stepper = ContactMidpoint() if any_contact(forces) else GeneralisedAlpha()
     label = "rollout" if progress else None
     return _rollout(
-        model, q, v, forces, real(step), real(t), stepper, saves, every, label, check
+        model, q, v, forces, real(step), real(t), stepper, saves, every, label, check, memory
     )
 
 
 @jit_trees
 @full_products
-def _rollout(model, q, v, forces, step, t, stepper, saves, every, label, check) -> Trajectory:
+def _rollout(
+    model, q, v, forces, step, t, stepper, saves, every, label, check, memory
+) -> Trajectory:
     step, t, stepper = _like(q, (step, t, stepper))
-    problem = second_order(model, q, forces)
+    problem = second_order(model, q, forces, memory)
     path, too_long = integrate(
         stepper, problem, q, v, t=t, h=step, saves=saves, every=every, label=label, judged=check
     )
@@ -125,7 +139,7 @@ def _rollout(model, q, v, forces, step, t, stepper, saves, every, label, check) 
     time = t + step * every * jnp.arange(saves + 1, dtype=step.dtype)
     if check:
         status = checked_status(judged_status(status, too_long), model, path.q)
-    return Trajectory(time, path.q, path.v, status)
+    return Trajectory(time, path.q, path.v, status, path.memory)
 
 
 def _like(q, tree):
@@ -141,9 +155,17 @@ def _equations(model, constants, forces, t, q, v):
     return mass, total_force(forces, t, moment) - coriolis
 
 
-def second_order(model: Model, q: Float[Array, " coordinates"], forces: Forces) -> SecondOrder:
-    """The equations of the model, with its stiffness at `q` and its damping."""
-    constants, forces = operators(model), on_model(forces, model)
+def second_order(
+    model: Model,
+    q: Float[Array, " coordinates"],
+    forces: Forces,
+    memory: Float[Array, "branches dof"] | None = None,
+) -> SecondOrder:
+    """The equations of the model, with its stiffness at `q` and its damping, and its branches
+    with what they remember, relaxed at `q` by default."""
+    constants = operators(model)
+    branches = memory_terms(model, forces, constants, q, memory)
+    forces = on_model(relaxed(forces), model)
 
     def at(q, v):
         return motion(model, q, v, constants=constants)
@@ -164,4 +186,5 @@ def second_order(model: Model, q: Float[Array, " coordinates"], forces: Forces) 
         retract=tree and functools.partial(retract, tree),
         rate=tree and functools.partial(rate, tree),
         contact=contacts_of(model, forces, at, inertia),
+        memory=branches,
     )

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import optional_real, real
+from sorojax.material.viscoelastic import Prony
 from sorojax.math.quadrature import gauss_legendre
 from sorojax.rod.dynamics.fields import RodState, operators, strains_at
 from sorojax.rod.dynamics.moving import mass_jacobian
@@ -143,6 +144,50 @@ class Damping(AbstractDamping):
 
     def matrix(self, stiffness):
         return self.time * stiffness
+
+
+class Relaxation(AbstractForce):
+    """Maxwell branches beside the elasticity of a rod, of the spectrum of its material.
+
+    Branch i bears K_i (q - z_i) with dz_i/dt = (q - z_i) / tau_i and remembers z_i. Beside the
+    rod's own stiffness K, torsion and shear relax by the shear modulus, K_i = g_i K, bending
+    and stretch by Young's modulus, whose shares and times `material.uniaxial_spectrum` gives
+    from those of the shear modulus and Poisson's ratio, as in a solid of constant bulk
+    modulus. Beside an `AbstractElastic` K is the slope of that law at q = 0, and all of it
+    relaxes by the shear modulus: exact for a Poisson's ratio nu of 0.5; otherwise the
+    instantaneous stiffness in bending is too large by a share (1 - 2 nu) / 3 of the sum of g_i.
+
+    `rod.rollout`, `systems.RodBody` and `systems.AssemblyBody` carry z_i along and begin
+    relaxed; `equilibrium`, paths of it and `inverse_kinematics` have all the time there is
+    and leave the branches out. Elsewhere it is refused.
+
+    Attributes:
+        spectrum: Of the shear modulus, one number for each constant: that of
+            `material.Viscoelastic`.
+
+    Reference:
+        Simo and Hughes, Computational Inelasticity, 1998, chapter 10, for the branches.
+    """
+
+    spectrum: Prony
+
+    def __check_init__(self):
+        if not isinstance(self.spectrum, Prony):
+            raise TypeError(
+                f"Relaxation: `spectrum` is a {type(self.spectrum).__name__}, need a spectrum. "
+                "Write material.Prony(shares, times)."
+            )
+        do = "A rod has one spectrum: give one number per branch."
+        for name in ("shares", "times"):
+            for entry in getattr(self.spectrum, name):
+                _check.shape("Relaxation", name, entry, (), do)
+
+    def __call__(self, t, motion):
+        raise ValueError(
+            "rod: got a Relaxation where no branch remembers the motion, need a verb that "
+            "carries its memory: rollout, RodBody or AssemblyBody; equilibrium leaves it out. "
+            "Take it off the forces here, or add branch_force(model, forces, q, memory)."
+        )
 
 
 class Gravity(AbstractForce):

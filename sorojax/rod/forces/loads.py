@@ -25,6 +25,7 @@ from sorojax.rod.forces.forces import (
     AbstractPressureMap,
     Gravity,
     Pressurised,
+    Relaxation,
 )
 from sorojax.rod.model.assembly import Assembly, index_of, slices
 from sorojax.rod.model.link import LinkOperators, LinkState
@@ -87,6 +88,17 @@ def total_force(
     for term in _joint_forces(forces, motion):
         total = total + term
     return total
+
+
+def relaxed(forces: tuple[Load, ...]) -> tuple[Load, ...]:
+    """The forces without branches, which bear nothing after a long time."""
+    return tuple(force for force in forces if relaxation_of(force) is None)
+
+
+def relaxation_of(force: Load) -> Relaxation | None:
+    """The branches that a force is, on all rods or on a part."""
+    inner = force.force if isinstance(force, PartForce) else force
+    return inner if isinstance(inner, Relaxation) else None
 
 
 def on_model(forces: tuple[Load, ...], model: Rod | Assembly) -> tuple[Load, ...]:

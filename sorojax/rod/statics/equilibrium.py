@@ -23,7 +23,7 @@ from sorojax.math.quadrature import gauss_legendre, interpolation_rows
 from sorojax.math.status import Status
 from sorojax.rod.dynamics.fields import is_curvature, strains_at
 from sorojax.rod.dynamics.tree import rod_motion
-from sorojax.rod.forces.loads import Load, total_force
+from sorojax.rod.forces.loads import Load, relaxed, total_force
 from sorojax.rod.model.assembly import (
     dtype_of,
     increments,
@@ -324,7 +324,7 @@ def equilibrium(
     search = prepare(model, constants, tolerance, max_iterations)
 
     def residual(q: Array) -> Array:
-        return -total_force(forces, t, motion(model, q, constants=constants))
+        return -total_force(relaxed(forces), t, motion(model, q, constants=constants))
 
     def find(_, guess):
         found = newton(residual, guess, search)

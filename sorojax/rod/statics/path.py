@@ -20,7 +20,7 @@ from sorojax.math.compiled import jit_public
 from sorojax.math.host import tell
 from sorojax.math.implicit_root import implicit_root
 from sorojax.math.status import Status
-from sorojax.rod.forces.loads import Load, total_force
+from sorojax.rod.forces.loads import Load, relaxed, total_force
 from sorojax.rod.model.assembly import dtype_of, retract
 from sorojax.rod.model.model import Model, motion, operators
 from sorojax.rod.statics.equilibrium import (
@@ -126,7 +126,7 @@ def equilibrium_path(
     first = jnp.zeros_like(factors[0]) if begin is None else real(begin).astype(dtype)
 
     def residual(q: Array, factor: Array) -> Array:
-        return -total_force(loading(factor), t, motion(model, q, constants=constants))
+        return -total_force(relaxed(loading(factor)), t, motion(model, q, constants=constants))
 
     shares = jnp.linspace(0.0, 1.0, len(factors) + 1, dtype=dtype)[1:]
 
@@ -243,7 +243,7 @@ def arc_length_path(
     search = prepare(model, constants, tolerance, 50)
 
     def residual(q: Array, factor: Array) -> Array:
-        return -total_force(loading(factor), t, motion(model, q, constants=constants))
+        return -total_force(relaxed(loading(factor)), t, motion(model, q, constants=constants))
 
     def tangent(q, factor):
         """Residual, its tangent and its change with the factor."""

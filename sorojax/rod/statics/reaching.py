@@ -12,7 +12,7 @@ from sorojax.math.linalg.dense import product, solve_symmetric
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.points import points
 from sorojax.rod.dynamics.tree import AssemblyState, part_columns, part_motion
-from sorojax.rod.forces.loads import Load, total_force
+from sorojax.rod.forces.loads import Load, relaxed, total_force
 from sorojax.rod.model.assembly import increments, index_of
 from sorojax.rod.model.link import LinkState
 from sorojax.rod.model.model import Model
@@ -61,7 +61,7 @@ def rows(tasks: Tasks, t: Array, moment: RodState | AssemblyState) -> Rows:
     group = moment.rod.group if isinstance(moment, RodState) else moment.assembly.group
     pairs = [task.errors(group, _frames(moment, task)) for task in tasks.targets]
     gaps = [task.gaps(_frames(moment, task)) for task in tasks.obstacles]
-    pull = None if tasks.forces is None else total_force(tasks.forces, t, moment)
+    pull = None if tasks.forces is None else total_force(relaxed(tasks.forces), t, moment)
     error, jacobian = _stacked(pairs)
     gap, change = _stacked(gaps) if gaps else (None, None)
     return Rows(error, jacobian, gap, change, pull)

@@ -1,5 +1,7 @@
 """A rod as a block: pressure in, volume and tip out."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -29,8 +31,9 @@ from sorojax.rod import (
     total_force,
 )
 from sorojax.rod.dynamics.fields import RodState
-from sorojax.rod.forces.loads import Load
-from sorojax.rod.model.assembly import index_of, rate
+from sorojax.rod.forces.loads import Load, relaxed
+from sorojax.rod.forces.relaxation import begun, borne, branches_of, memory_rate
+from sorojax.rod.model.assembly import increments, index_of, rate
 from sorojax.rod.statics.equilibrium import checked_status
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output
 
@@ -38,7 +41,8 @@ _FLUID = {"volume": "m^3", "volume_rate": "m^3/s", "compliance": "m^3/Pa"}
 
 
 class RodBody(AbstractBlock):
-    """A rod with its forces; the state is {q, v}.
+    """A rod with its forces; the state is {q, v}, and with a `rod.Relaxation` among the forces
+    {q, v, memory}: what its branches remember.
 
     A pressure map among the forces opens the ports `pressure`, `volume`, `volume_rate` (at
     held pressure) and `compliance` of the walls. All come from the same potential as the
@@ -88,10 +92,9 @@ class RodBody(AbstractBlock):
 
     def initial_state(self):
         zero = jnp.zeros(self._dof(), self.rod.length.dtype)
-        return {
-            "q": zero if self.q is None else self.q,
-            "v": zero if self.v is None else self.v,
-        }
+        q = zero if self.q is None else self.q
+        state = {"q": q, "v": zero if self.v is None else self.v}
+        return state | _first_memory(self.rod, self.forces, q)
 
     def output(self, name, t, state, inputs):
         q, v = state["q"], state["v"]
@@ -108,10 +111,12 @@ class RodBody(AbstractBlock):
     def vector_field(self, t, state, inputs):
         moment = motion(self.rod, state["q"], state["v"])
         mass, coriolis = inertia(moment)
-        force = total_force(self._bound(inputs), t, moment)
+        force = total_force(relaxed(self._bound(inputs)), t, moment)
         if self.driven:
             force = force + inputs["effort"]
-        return {"q": state["v"], "v": solve_symmetric(mass, force - coriolis)}
+        pull, rates = _branches(self.rod, self.forces, state, moment.operators)
+        force = force if pull is None else force + pull
+        return {"q": state["v"], "v": solve_symmetric(mass, force - coriolis)} | rates
 
     def path_status(self, path):
         return checked_status(Status.successful, self.rod, path["q"])
@@ -141,7 +146,8 @@ def body_motion(body: RodBody, state) -> RodState:
 
 
 class AssemblyBody(AbstractBlock):
-    """An assembly with its forces; the state is {q, v}.
+    """An assembly with its forces; the state is {q, v}, and with a `rod.Relaxation` among the
+    forces {q, v, memory}: what the branches remember.
 
     Ports of a part are named after it. A pressure map, `On("finger", map)`, opens
     `finger_pressure`, `finger_volume`, `finger_volume_rate` (at held pressure) and
@@ -193,10 +199,9 @@ class AssemblyBody(AbstractBlock):
     def initial_state(self):
         start = rest(self.assembly)
         zero = jnp.zeros(num_dof(self.assembly), start.dtype)
-        return {
-            "q": start if self.q is None else self.q,
-            "v": zero if self.v is None else self.v,
-        }
+        q = start if self.q is None else self.q
+        state = {"q": q, "v": zero if self.v is None else self.v}
+        return state | _first_memory(self.assembly, self.forces, q)
 
     def output(self, name, t, state, inputs):
         q, v = state["q"], state["v"]
@@ -212,8 +217,15 @@ class AssemblyBody(AbstractBlock):
 
     def vector_field(self, t, state, inputs):
         q, v, constants = state["q"], state["v"], operators(self.assembly)
-        a = acceleration(self.assembly, constants, t, q, v, self.acting(inputs))
-        return {"q": rate(self.assembly, q, v), "v": a}
+        pull, rates = _branches(self.assembly, self.forces, state, constants)
+        forces = relaxed(self.acting(inputs))
+        if pull is None:
+            a = acceleration(self.assembly, constants, t, q, v, forces)
+        else:
+            moment = motion(self.assembly, q, v, constants=constants)
+            mass, coriolis = inertia(moment)
+            a = solve_symmetric(mass, total_force(forces, t, moment) - coriolis + pull)
+        return {"q": rate(self.assembly, q, v), "v": a} | rates
 
     def path_status(self, path):
         return checked_status(Status.successful, self.assembly, path["q"])
@@ -239,6 +251,21 @@ def _maps(forces: tuple[Load, ...]) -> list[tuple[str, AbstractPressureMap]]:
     """The pressure maps, with the parts that they are on."""
     on = [force for force in forces if isinstance(force, PartForce)]
     return [(f.part, f.force) for f in on if isinstance(f.force, AbstractPressureMap)]
+
+
+def _first_memory(model: Rod | Assembly, forces: tuple[Any, ...], q: Array) -> dict:
+    """The memory of branches that have relaxed at `q`, of a body that has some."""
+    branches = branches_of(model, forces)
+    return {} if branches is None else {"memory": begun(branches, increments(model, q))}
+
+
+def _branches(model: Rod | Assembly, forces: tuple[Any, ...], state, constants):
+    """The force of the branches, None without any, and the rate of their memory."""
+    branches = branches_of(model, forces, constants)
+    if branches is None:
+        return None, {}
+    x, memory = increments(model, state["q"]), state["memory"]
+    return borne(branches, x, memory), {"memory": memory_rate(branches, x, memory)}
 
 
 def _fluid(chamber: AbstractPressureMap, kind: str, q: Array, v: Array, pressure: Array):

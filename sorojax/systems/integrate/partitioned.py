@@ -100,11 +100,12 @@ def _move(
     def one(_, now: PartitionedState) -> PartitionedState:
         body = network.blocks[name]
         own = inputs_of(network, now.time, now.state, inputs, (name,))[name]
-        q, v = now.state[name]["q"], now.state[name]["v"]
-        problem = second_order(body.assembly, q, body.acting(own))
-        begun = Kinematic(q, v, now.acceleration, now.gained, now.resolved)
+        q, v, memory = (now.state[name].get(key) for key in ("q", "v", "memory"))
+        problem = second_order(body.assembly, q, body.acting(own), memory)
+        begun = Kinematic(q, v, now.acceleration, now.gained, now.resolved, memory)
         new = stepper.step(problem, now.time, h, begun)
-        state = now.state | {name: {"q": new.q, "v": new.v}}
+        kept = {} if new.memory is None else {"memory": new.memory}
+        state = now.state | {name: {"q": new.q, "v": new.v} | kept}
         state = _others(network, now.time, state, inputs, h, method, name)
         if new.resolved is None or new.gained is None:  # without contact
             return PartitionedState(state, new.a, now.time + h, now.gained, now.resolved)
