@@ -354,7 +354,7 @@ STEPS = {"step": 1e-3, "saves": 1}
         ),
         (
             lambda: R.rollout(FINGER, ZERO, ZERO, (R.PartForce("a", BRANCHES),), **STEPS),
-            "Take the name off",
+            "take the name off",
         ),
         (lambda: R.branch_states(FINGER, (), jnp.arange(2.0), jnp.zeros((2, 1))), "need one"),
         (lambda: R.Relaxation(material.Prony([np.ones(3)], [0.1])), "one number per branch"),

@@ -71,37 +71,42 @@ class BranchEnergy(NamedTuple):
     power: Float[Array, "*states"]
 
 
-def branches_of(model: Model, forces: tuple[Load, ...], constants: Any = None):
+def branches_of(
+    model: Model, forces: tuple[Load, ...], constants: Any = None
+) -> Branches | None:
     """The branches among the forces on a model; None without any."""
     if all(relaxation_of(force) is None for force in forces):
         return None
-    names = [name for name, *_ in _rods(model)]
-    for force in forces:
-        if relaxation_of(force) and parts_of(force) not in ((), *((name,) for name in names)):
-            raise ValueError(
-                f"rod: a Relaxation is on `{parts_of(force)[0]}`, need a rod"
-                + ("." if isinstance(model, Rod) else f", one of {', '.join(map(str, names))}.")
-                + " Take the name off on a single rod."
-            )
+    _check_parts(model, forces)
     constants = operators(model) if constants is None else constants
     start = rest(model)
     stiffness = tangent_stiffness(relaxed(forces), motion(model, start, constants=constants))
-    stiffness = (stiffness + stiffness.T) / 2
     found = [
         (at, *_spectrum_along(rod, listed[0], _is_replaced(forces, name)))
         for name, rod, at in _rods(model)
         if (listed := _listed(forces, name))
     ]
-    count = max(shares.shape[0] for _, shares, _ in found)
-    size = (count, num_dof(model))
+    size = (max(own.shape[0] for _, own, _ in found), num_dof(model))
     shares, times = jnp.zeros(size, start.dtype), jnp.ones(size, start.dtype)
+    kept = jnp.zeros_like(stiffness)
     for at, own, tau in found:
         shares = shares.at[: own.shape[0], at].set(own.astype(start.dtype))
         times = times.at[: own.shape[0], at].set(tau.astype(start.dtype))
-    has = jnp.zeros(size[1], bool)
-    for at, *_ in found:
-        has = has.at[at].set(True)
-    return Branches(shares, times, jnp.where(has[:, None] & has[None], stiffness, 0.0))
+        kept = kept.at[at, at].set((stiffness[at, at] + stiffness[at, at].T) / 2)
+    return Branches(shares, times, kept)
+
+
+def _check_parts(model: Model, forces: tuple[Load, ...]) -> None:
+    """Refuse branches that are on no rod."""
+    names = [name for name, *_ in _rods(model)]
+    rods = "no name on a single rod" if isinstance(model, Rod) else f"a rod among {names}"
+    for force in forces:
+        on = parts_of(force)
+        if relaxation_of(force) and not (names if on == () else on[0] in names):
+            raise ValueError(
+                f"rod: a Relaxation is on {on[0] if on else 'an assembly'}, need {rods}. "
+                "Wrap it, On(name, Relaxation(spectrum)), or take the name off."
+            )
 
 
 def _rods(model: Model) -> list[tuple[str | None, Rod, slice]]:
@@ -146,18 +151,12 @@ def _spectrum_along(rod: Rod, force: Relaxation, replaced: bool) -> tuple[Array,
         ratio, do = rod.material.poisson_ratio, "Give the rod one number."
         _check.shape("Relaxation", "poisson_ratio", ratio, (), do)
         pull = _stacked(uniaxial_spectrum(force.spectrum, ratio))
-    each = [
-        (pull if name in _UNIAXIAL else shear, rod.basis.modes[name].count)
-        for name in rod.basis.active
-    ]
-    shares, times = zip(
-        *(
-            tuple(jnp.repeat(x[:, None], count, axis=1) for x in spectrum)
-            for spectrum, count in each
-        ),
-        strict=True,
-    )
-    return jnp.concatenate(shares, axis=1), jnp.concatenate(times, axis=1)
+    rows = []
+    for name in rod.basis.active:
+        own, count = pull if name in _UNIAXIAL else shear, rod.basis.modes[name].count
+        rows.append([jnp.repeat(x[:, None], count, axis=1) for x in own])
+    shares, times = (jnp.concatenate(x, axis=1) for x in zip(*rows, strict=True))
+    return shares, times
 
 
 def _stacked(spectrum: Prony) -> tuple[Array, Array]:
