@@ -39,6 +39,7 @@ from sorojax.material.rubbers import (
     neo_hookean,
     ogden_shear_modulus,
 )
+from sorojax.material.softening.law import Softening, dissipated_energy, preconditioned
 from sorojax.material.user import (
     CompressibleNeoHookean,
     InvariantEnergy,
@@ -75,6 +76,7 @@ __all__ = [
     "Scaled",
     "SimoMiehe",
     "SimoTaylor",
+    "Softening",
     "StVenantKirchhoff",
     "UserEnergy",
     "Viscoelastic",
@@ -82,6 +84,7 @@ __all__ = [
     "bulk_modulus",
     "by_region",
     "cauchy_stress",
+    "dissipated_energy",
     "drucker_stability",
     "elasticity_tensor",
     "equibiaxial_stress",
@@ -94,6 +97,7 @@ __all__ = [
     "loss_modulus",
     "neo_hookean",
     "ogden_shear_modulus",
+    "preconditioned",
     "presets",
     "prony_of_instantaneous",
     "pure_shear_stress",
