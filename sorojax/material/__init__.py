@@ -39,6 +39,7 @@ from sorojax.material.rubbers import (
     neo_hookean,
     ogden_shear_modulus,
 )
+from sorojax.material.softening.fit import fit_cyclic
 from sorojax.material.softening.law import Softening, dissipated_energy, preconditioned
 from sorojax.material.user import (
     CompressibleNeoHookean,
@@ -90,6 +91,7 @@ __all__ = [
     "equibiaxial_stress",
     "fibre_direction",
     "first_piola_kirchhoff_stress",
+    "fit_cyclic",
     "fit_tensile",
     "lateral_stretch",
     "locking_stretch",

@@ -413,9 +413,12 @@ def stress_history(
         Lubliner, A model of rubber viscoelasticity, Mech. Res. Commun. 12, 1985.
     """
     if isinstance(material, Softening):
-        F = real(F)
-        _check.shape("stress_history", "F", F, (None, 3, 3), "Give a row of matrices.")
-        return _softened_history(material, F)
+        return _softened_history(material, real(F))
+    if times is None:
+        raise ValueError(
+            "stress_history: got no times of a Viscoelastic, need them: branches relax. Give "
+            "one increasing time [s] for each F."
+        )
     times, F = real(times), real(F)
     _check.shape("stress_history", "times", times, (None,), "Give a row of times [s].")
     _check.shape(
