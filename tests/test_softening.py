@@ -227,8 +227,10 @@ def test_bad_numbers_name_the_remedy(make, says):
 # ---- bodies
 
 
-@pytest.mark.parametrize("name", GRIDS)
-@pytest.mark.parametrize("law", ["closed form", "two invariants"])
+@pytest.mark.parametrize(
+    ("name", "law"),
+    [*((name, "closed form") for name in GRIDS), ("plane strain", "two invariants")],
+)
 def test_force_and_tangent_are_slopes_of_the_energy_of_a_step(name, law, getkey):
     grid, kinematics = GRIDS[name]()
     cells = np.linspace(1e2, 4e2, grid.num_cells)
@@ -252,8 +254,8 @@ def test_force_and_tangent_are_slopes_of_the_energy_of_a_step(name, law, getkey)
 PUSH = jnp.array([0.5, 1.0, 0.5, 0.0, 0.5, 1.0, 1.5, 0.7])
 
 
-def pushed(rubber, kinematics=None, **options):
-    row = PUSH[:, None] * jnp.array([20.0, -2.0])
+def pushed(rubber, kinematics=None, shares=PUSH, **options):
+    row = shares[:, None] * jnp.array([[20.0, -2.0]])
     return fem.solve_path(problem(rubber, kinematics=kinematics), push=row, **options)
 
 
@@ -288,7 +290,7 @@ def test_slopes_of_a_path_by_every_constant():
         law = material.NeoHookean(3e5 * theta[0], BULK * theta[1])
         soft = material.Softening(law, 1.8 * theta[2], 2e4 * theta[3], 0.2 * theta[4])
         newton = fem.Newton(residual_tolerance=1e-13, step_tolerance=1e-11)
-        u = pushed(soft, newton=newton).displacements
+        u = pushed(soft, shares=PUSH + 0.1, newton=newton).displacements
         return 1e3 * jnp.sum(u[:, -1] * jnp.arange(1.0, 9.0)[:, None])
 
     one = jnp.ones(5)
@@ -346,18 +348,23 @@ def test_without_softening_nothing_is_added():
 # ---- motions and networks
 
 
+SWINGING = {"softening": MILD, "relaxing too": SILICONE}
+
+
 @functools.cache
-def swing(step=5e-4, law=MILD):
-    start = fem.solve(problem(law)).displacement
-    return fem.simulate(problem(law, loads=()), 0.02, step, start=(4 * start, 0 * start))
+def swing(name, step=5e-4):
+    law = SWINGING[name]
+    push = fem.Force(BAR.node_sets["right"], [0.2, -0.1])
+    start = fem.solve(problem(law, loads=(push,))).displacement
+    return fem.simulate(problem(law, loads=()), 0.02, step, start=(start, 0 * start))
 
 
-@pytest.mark.parametrize("law", [MILD, SILICONE], ids=["softening", "relaxing too"])
-def test_a_motion_keeps_its_energy_but_for_what_turns_into_heat(law):
+@pytest.mark.parametrize("name", SWINGING)
+def test_a_motion_keeps_its_energy_but_for_what_turns_into_heat(name):
     left = []
     for step in (5e-4, 2.5e-4):
-        energies = swing(step, law).energies
+        energies = swing(name, step).energies
         left.append(float(jnp.abs(energies.balance - energies.balance[0]).max()))
-    assert bool(jnp.all(jnp.diff(energies.dissipated) >= 0))
-    assert float(energies.dissipated[-1]) > 0
+    assert float(jnp.diff(energies.dissipated).min()) > -1e-12 * float(energies.elastic[0])
+    assert float(energies.dissipated[-1]) > 1e-3 * float(energies.elastic[0])
     assert left[1] < 0.03 * float(energies.elastic[0]) and left[0] > 1.8 * left[1], left

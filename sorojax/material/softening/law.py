@@ -32,7 +32,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
-from sorojax._jax.trace_state import is_traced
+from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax._types import Numbers, optional_real, real
 from sorojax.material import checks
 from sorojax.material.homogeneous import lateral_stretch
@@ -94,7 +94,8 @@ class Softening(AbstractHyperelastic):
             _check.finite("Softening", "peak", self.peak, do)
             _check.not_negative("Softening", "peak", self.peak, "J/m^3", do)
         if not is_traced(self.base):
-            _check_rest(self.base)
+            with evaluated_now():
+                _check_rest(self.base)
 
     @property
     def density(self):
@@ -110,9 +111,12 @@ class Softening(AbstractHyperelastic):
         """psi [J/m^3] at the energy `W` of the first loading."""
         if self.peak is None:
             return W
-        s = self.m + self.beta * self.peak
-        below = jnp.where(W < self.peak, (self.peak - W) / s, jnp.zeros_like(W / s))
-        return W + s / self.r * _area(below) - dissipated_energy(self, self.peak)
+        # a body that is back at its peak meets it but for rounding, that of every program is
+        # its own: in all of them it shall be on the first loading, where slopes are those of both
+        peak = self.peak * (1 - jnp.finfo(self.peak.dtype).eps ** (2 / 3))
+        s = self.m + self.beta * peak
+        below = jnp.where(W < peak, (peak - W) / s, jnp.zeros_like(W / s))
+        return W + s / self.r * _area(below) - dissipated_energy(self, peak)
 
 
 def _check_rest(base: AbstractHyperelastic) -> None:
