@@ -21,7 +21,7 @@ VERBS = {
     "translate union volume",
     "mesh": "box enrich extrude facets_on move nodes_where polymesher rectangle "
     "tetrahedralise triangulate",
-    "material": "by_region fit_tensile neo_hookean stress_history",
+    "material": "by_region fit_cyclic fit_tensile neo_hookean preconditioned stress_history",
     "material.presets": "rubber",
     "fem": "cauchy_stress continuation critical_loads eigenmodes problem simulate solve "
     "solve_path solve_volume von_mises_stress",

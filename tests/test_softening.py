@@ -1,4 +1,4 @@
-"""Rubbers that soften: closed forms, loops, invariance, derivatives, bodies, networks, fits, cost."""
+"""Rubbers that soften: closed forms, loops, invariance, derivatives, bodies, networks, fits."""
 
 import dataclasses
 import functools
@@ -21,6 +21,7 @@ from sorojax.fem.relaxation import (
     relaxed,
 )
 from sorojax.material.kinematics import from_matrix
+from sorojax.material.softening.fit import first_loading
 from sorojax.material.softening.law import with_peak
 from sorojax.math.linalg import sparse
 from tests.test_viscoelastic import BAR, GRIDS, problem, shears, unimodular
@@ -62,7 +63,8 @@ def test_stress_is_that_of_the_first_loading_times_its_share(name, getkey):
     eta = share(W, np.maximum.accumulate(W))
     assert eta.min() < 0.7 and eta[0] == 1.0
     exact = whole + jnp.asarray(eta - 1)[:, None, None] * shape
-    assert float(jnp.abs(found - exact).max() / jnp.abs(exact).max()) < 1e-13
+    # peaks are taken for smaller than they are by the dtype's eps^(2/3), 4e-11
+    assert float(jnp.abs(found - exact).max() / jnp.abs(exact).max()) < 1e-9
 
 
 def test_energies_are_integrals_of_the_share():
@@ -368,3 +370,213 @@ def test_a_motion_keeps_its_energy_but_for_what_turns_into_heat(name):
     assert float(jnp.diff(energies.dissipated).min()) > -1e-12 * float(energies.elastic[0])
     assert float(energies.dissipated[-1]) > 1e-3 * float(energies.elastic[0])
     assert left[1] < 0.03 * float(energies.elastic[0]) and left[0] > 1.8 * left[1], left
+
+
+def test_a_run_in_two_parts_has_the_bits_of_the_whole():
+    whole = swing("softening")
+    free, first = whole.problem, whole.displacements[0]
+    half = fem.simulate(free, 0.01, 5e-4, start=(first, 0 * first))
+    rest = fem.simulate(free, 0.01, 5e-4, start=half)
+    assert jnp.array_equal(rest.end.displacement, whole.end.displacement)
+    assert jnp.array_equal(rest.end.peaks, whole.end.peaks)
+    with pytest.raises(ValueError, match="a body that softens and a problem that does not"):
+        fem.simulate(problem(RUBBER, loads=()), 0.01, 5e-4, start=half)
+
+
+def test_a_motion_in_a_trace_is_that_of_the_host_with_slopes_by_every_constant():
+    whole = swing("softening")
+    free, start = whole.problem, whole.displacements[0]
+    newton = fem.Newton(residual_tolerance=1e-13, step_tolerance=1e-11)
+
+    def way(theta):
+        rubber = material.NeoHookean(3e5 * theta[0], BULK * theta[1], 1000.0)
+        soft = material.Softening(rubber, 1.8 * theta[2], 2e2 * theta[3], 0.2 * theta[4])
+        given = dataclasses.replace(free, material=soft)
+        motion = fem.simulate(given, 0.01, 5e-4, start=(start, 0 * start), newton=newton)
+        return 1e3 * motion.displacements[-1].mean() + 1e6 * motion.end.dissipated
+
+    one = jnp.ones(5)
+    assert np.isclose(jax.jit(way)(one), way(one), rtol=1e-9)
+    slope = np.asarray(jax.grad(way)(one))
+    for k in range(5):
+        d = jnp.zeros(5).at[k].set(1e-4)  # kinks where a step just reaches its peak are rare
+        change = [float(way(one + n * d) - way(one - n * d)) for n in (1, 2)]
+        assert np.isclose(slope[k], (8 * change[0] - change[1]) / 12e-4, rtol=1e-6)
+
+
+def test_a_body_in_a_network_moves_as_alone():
+    whole = swing("softening")
+    start = whole.displacements[0]
+    node = int(BAR.node_sets["right"][0])
+    options = {"driven": ("push",), "markers": {"tip": node}, "energies": True}
+    block = S.FemBody(problem(MILD), u=start, **options)  # no wire: no push
+    network = S.Network({"bar": block}, {})
+    film = S.simulate(network, 0.02, step=5e-4, save=41)
+    alone = fem.simulate(
+        whole.problem,
+        0.02,
+        5e-4,
+        start=(start, 0 * start),
+        method=fem.GeneralisedAlpha(0.5),
+    )
+    tip = BAR.points[node][None] + alone.displacements[:, node]
+    assert jnp.allclose(film["bar.tip_position"][-1], tip[-1], atol=1e-9)
+    heat = film["bar.dissipated"]
+    assert np.isclose(heat[-1], alone.end.dissipated, rtol=1e-5) and float(heat[-1]) > 0
+    with pytest.raises(ValueError, match="need one of fixed steps"):
+        S.simulate(network, 1e-3, save=2, rtol=1e-6, atol=1e-9)
+
+
+AIR = mesh.rectangle([5e-3, 0], [8e-3, 4e-3], divisions=(1, 1), element=mesh.Quad4())
+
+
+def tube():
+    ends = tuple(fem.Fixed(AIR.node_sets[side], (1,)) for side in ("bottom", "top"))
+    load = fem.Pressure(AIR.facet_sets["left"], 1e3, name="air")
+    kinematics = fem.Axisymmetric()
+    return fem.problem(AIR, SOFT, kinematics=kinematics, supports=ends, loads=(load,))
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: fem.continuation(tube()), "continuation: got a body that softens"),
+        (
+            lambda: fem.volume_path(tube(), air=jnp.array([1e-6, 2e-6])),
+            "volume_path: got a body that softens",
+        ),
+        (
+            lambda: S.modal_body(S.FemBody(tube()), S.modal_basis(S.FemBody(tube()), 1)),
+            "modal_body: got a body that softens",
+        ),
+        (
+            lambda: fem.cauchy_stress(pushed(SOFT).problem_at(2), jnp.zeros_like(BAR.points)),
+            "memory is known at quadrature points only",
+        ),
+    ],
+)
+def test_what_does_not_remember_refuses_a_body_that_softens(call, says):
+    with pytest.raises(ValueError, match=says):
+        call()
+
+
+# ---- fits
+
+
+YEOH = material.Yeoh(1e5, 5e3, 100.0, 1e7)
+SOFT_YEOH = material.Softening(YEOH, r=2.0, m=1e4, beta=0.1)
+
+
+def stretched(*tops, count=12):
+    """Strains that go up to each of `tops` and back."""
+    up = np.linspace(0, 1, count)
+    return np.concatenate([top * way for top in tops for way in (up, up[::-1])])
+
+
+def pulled(rubber, strain):
+    """Engineering stress [Pa] of an incompressible bar."""
+    l = jnp.asarray(1 + strain)
+    side = l**-0.5
+    F = jax.vmap(jnp.diag)(jnp.stack([l, side, side], axis=1))
+    P = material.stress_history(rubber, None, F)
+    return np.asarray(P[:, 0, 0] - P[:, 1, 1] * l**-1.5)
+
+
+STRAIN = stretched(0.8, 1.4, 2.0)
+STRESS = pulled(SOFT_YEOH, STRAIN)
+
+
+def numbers(fit):
+    soft = fit.material
+    return np.array(
+        [float(x) for x in (*jax.tree.leaves(soft.base)[:3], soft.r, soft.m, soft.beta)]
+    )
+
+
+@pytest.mark.parametrize(
+    ("law", "model", "options"),
+    [
+        (YEOH, material.Yeoh, {}),
+        (material.Gent(3e5, 30.0, 1e7), material.Gent, {}),
+        (material.NeoHookean(3e5, 1e7), material.NeoHookean, {"beta": 0.1}),
+        (material.Ogden((2e5,), (2.6,), 1e7), material.Ogden, {"terms": 1}),
+    ],
+)
+def test_constants_are_found_from_cycles(law, model, options):
+    soft = dataclasses.replace(SOFT_YEOH, base=law)
+    fit = material.fit_cyclic(STRAIN, pulled(soft, STRAIN), model=model, **options)
+    found = [float(x) for x in (fit.material.r, fit.material.m, fit.material.beta)]
+    assert np.allclose(found, [2.0, 1e4, 0.1], rtol=1e-4)
+    assert fit.relative_rms < 1e-6 and fit.num_cycles == 3
+    both = (jax.tree.leaves(x)[: len(fit.covariance) - 3] for x in (fit.material.base, law))
+    assert np.allclose(*both, rtol=1e-4)
+    if options.get("beta"):
+        assert not np.any(fit.covariance[-1])
+
+
+def test_covariance_is_that_of_the_errors_of_all_points():
+    """By differences of both steps of the fit with every stress."""
+    noise = 1e-4 * np.sin(37.0 * np.arange(len(STRESS)) ** 2) * STRESS.max()
+    at = STRESS + noise
+    fit = material.fit_cyclic(STRAIN, at)
+    h, columns = 1e-5 * STRESS.max(), []
+    for k in range(len(at)):
+        d = np.zeros_like(at)
+        d[k] = h
+        ahead, back = (numbers(material.fit_cyclic(STRAIN, at + s * d)) for s in (1, -1))
+        columns.append((ahead - back) / (2 * h))
+    slopes = np.stack(columns, axis=1)
+    before = np.concatenate([[-1], np.maximum.accumulate(STRAIN)[:-1]])
+    first = before < STRAIN
+    below = fit.rms**2 * np.sum(~first) / (np.sum(~first) - 3)
+    above = fit.first.rms**2 * np.sum(first) / (np.sum(first) - 3)
+    exact = slopes * np.where(first, above, below) @ slopes.T
+    size = np.sqrt(np.diag(exact))
+    # slopes of a least-squares fit leave out its curvature times its errors, here of 0.01 %
+    assert np.abs((fit.covariance - exact) / np.outer(size, size)).max() < 0.01
+    assert 5e-5 < fit.relative_rms < 5e-4
+
+
+def test_a_tensile_fit_takes_the_first_loading_or_that_of_a_preconditioned_rubber():
+    strain = np.concatenate([stretched(2.0, 2.0, 2.0), [0.01]])
+    mild = material.Softening(YEOH, r=1.5, m=5e5)
+    stress = pulled(mild, strain)
+    first = material.fit_tensile(strain, stress, cycles="first")
+    assert np.isclose(float(first.material.c1), 1e5, rtol=1e-9)
+    last = material.fit_tensile(strain, stress, cycles="last", model=material.Ogden)
+    soft = material.preconditioned(mild, stretch=3.0)
+    stretch = jnp.linspace(1.0, 3.0, 21)
+    found, new, exact = (
+        np.asarray(first_loading(law, stretch)[1])
+        for law in (last.material, first.material, soft)
+    )
+    missed, new_missed = (np.sqrt(np.mean((x - exact) ** 2)) for x in (found, new))
+    assert missed < 1.5 * last.rms and new_missed > 3 * missed
+    assert last.strain_range == (0.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: material.fit_cyclic(STRAIN[:4], STRESS[:4]), "at least 6 points"),
+        (lambda: material.fit_cyclic(STRAIN[:12], STRESS[:12]), "need an unloading"),
+        (lambda: material.fit_cyclic(STRAIN[12:24], STRESS[12:24]), "points of the first"),
+        (lambda: material.fit_cyclic(100 * STRAIN, STRESS), "divide percent by 100"),
+        (lambda: material.fit_cyclic(STRAIN, STRESS / 1e6), "Multiply MPa by 1e6"),
+        (lambda: material.fit_cyclic(STRAIN - 0.5, STRESS), "in tension"),
+        (lambda: material.fit_cyclic(STRAIN[:24], STRESS[:24]), "Pass beta=0"),
+        (lambda: material.fit_cyclic(STRAIN, STRESS, beta=-1.0), "`beta` is -1"),
+        (lambda: material.fit_cyclic(STRAIN, pulled(YEOH_ALONE, STRAIN)), "need a softening"),
+        (lambda: material.fit_tensile(STRAIN, STRESS, cycles="third"), "need one of"),
+        (
+            lambda: material.fit_tensile(STRAIN[:20], STRESS[:20], cycles="last"),
+            "got 0 points in the last",
+        ),
+    ],
+)
+def test_bad_tests_name_the_remedy(call, says):
+    with pytest.raises(ValueError, match=says):
+        call()
+
+
+YEOH_ALONE = dataclasses.replace(SOFT_YEOH, r=jnp.asarray(1e9))

@@ -9,7 +9,7 @@ from sorojax.material.growth import growth_volume
 from tests.derivatives.case import Case
 
 NONE = {
-    "a search or a fit on the host, of numbers": "drucker_stability fit_tensile",
+    "a search or a fit on the host, of numbers": "drucker_stability fit_cyclic fit_tensile",
 }
 
 F = jnp.asarray(np.eye(3) + 0.2 * np.random.default_rng(2).uniform(-1, 1, (3, 3)))
@@ -42,6 +42,8 @@ ENERGIES = {
     "Ogden": M.Ogden((3e5, -1e5), (2.0, -2.0), 5e6),
     "Scaled": M.Scaled(RUBBER, 0.4),
     "Viscoelastic": M.Viscoelastic(RUBBER, M.Prony([0.3], [0.1])),
+    "Softening below its peak": M.Softening(RUBBER, 1.8, 2e4, 0.2, 1e5),
+    "Softening beyond its peak": M.Softening(RUBBER, 1.8, 2e4, 0.2, 1e3),
     "StVenantKirchhoff": M.StVenantKirchhoff(3e5, 5e6),
     "UserEnergy": M.UserEnergy(user, (2e5,), bulk_modulus=5e6),
     "Yeoh": RUBBER,
@@ -52,6 +54,7 @@ ENERGIES = {
 
 
 SPECTRUM = M.Prony([0.3, 0.2], [0.1, 0.7])
+SOFT = M.Softening(GENT, 1.8, 2e4, 0.2)
 SILICONE, TIMES = M.Viscoelastic(GENT, SPECTRUM), jnp.array([0.1, 0.2, 0.6])
 
 
@@ -128,6 +131,16 @@ CASES = (
         ),
         "stress_history": Case(
             lambda at: M.stress_history(*at), (SILICONE, TIMES, jnp.stack([F, F.T, F @ F]))
+        ),
+        "stress_history of softening": in_both(
+            lambda law, F: M.stress_history(law, None, F),
+            SOFT,
+            jnp.stack([F, F @ F, F.T, F @ F]),
+        ),
+        "dissipated_energy": in_both(M.dissipated_energy, SOFT, 3e4),
+        "preconditioned": Case(
+            lambda at: M.uniaxial_stress(M.preconditioned(at[0], stretch=at[1]), STRETCH),
+            (SOFT, 2.0),
         ),
         "small_strain_moduli": Case(M.small_strain_moduli, ENERGIES["Ogden"]),
     }

@@ -124,9 +124,9 @@ class State(eqx.Module):
     `memory` holds the loads that remember, such as friction; `work` and `dissipated` [J] are
     what loads and supports gave and damping took since the start. `strains` are what the
     branches of a viscoelastic material remember, `peaks` [J/m^3] what one that softens does
-    (`fem.relaxation`). `share` is the part of a step that was taken last, `tangent` the matrix whose factor goes on being used and
-    `listed` the displacement [m] that lists of near facets were made at, so that a run that
-    is cut in two repeats the whole one to the last bit.
+    (`fem.relaxation`). `share` is the part of a step that was taken last, `tangent` the matrix
+    whose factor goes on being used and `listed` the displacement [m] that lists of near facets
+    were made at, so that a run that is cut in two repeats the whole one to the last bit.
     """
 
     time: Float[Array, ""]

@@ -1,9 +1,9 @@
 """Constants of a softening rubber from cyclic tension.
 
 The first loading, where the strain is larger than all before, gives the law; how far the
-other points lie below it gives r, m and beta. Their stress is linear in 1/r, and the bar is
-incompressible: with W(l) the energy of the fitted law at the stretch l and M that at the largest
-stretch before, sigma = (1 - erf((M - W) / (m + beta M)) / r) dW/dl.
+other points lie below it gives r, m and beta. The bar is incompressible: with W(l) the energy
+of the fitted law at the stretch l and M that at the largest stretch before, the stress is
+(1 - erf((M - W) / (m + beta M)) / r) dW/dl.
 
 References:
     Ogden and Roxburgh, Proc. R. Soc. A 455, 1999. Murphy and Topel, "Estimation and inference
@@ -93,7 +93,8 @@ def fit_cyclic(
             stretch and no beta is given; or if the law of the first loading is refused.
 
     Example:
-        >>> rubber = material.Softening(material.Yeoh(1e5, 5e3, 100.0, 1e7), r=2.0, m=1e4, beta=0.1)
+        >>> yeoh = material.Yeoh(1e5, 5e3, 100.0, 1e7)
+        >>> rubber = material.Softening(yeoh, r=2.0, m=1e4, beta=0.1)
         >>> up, down = np.linspace(0, 1, 20), np.linspace(1, 0, 20)
         >>> strain = np.concatenate([0.8 * up, 0.8 * down, 2 * up, 2 * down])
         >>> l = jnp.asarray(1 + strain)
@@ -105,8 +106,7 @@ def fit_cyclic(
         r = 2.000, m = 10.000 kJ/m^3
 
     Reference:
-        Ogden and Roxburgh, A pseudo-elastic model for the Mullins effect in filled rubber, Proc.
-        R. Soc. A 455, 1999.
+        Ogden and Roxburgh, Proc. R. Soc. A 455, 1999.
     """
     checks.poisson_ratio(_WHERE, poisson_ratio)
     if beta is not None:
@@ -141,7 +141,7 @@ def fit_cyclic(
 
 
 class _Points(eqx.Module):
-    """Stretch, the largest stretch before and engineering stress [Pa] below the first loading."""
+    """Stretch, largest stretch before and engineering stress [Pa] below the first loading."""
 
     stretch: np.ndarray
     largest: np.ndarray
@@ -168,7 +168,7 @@ def _check_cycles(strain, kept, need: int, more: int) -> None:
 
 
 @jax.jit
-def _first_loading(law: AbstractHyperelastic, stretch: Float[Array, " points"]):
+def first_loading(law: AbstractHyperelastic, stretch: Float[Array, " points"]):
     """Energy [J/m^3] of an incompressible bar, and its slope, the engineering stress [Pa]."""
 
     def energy(l):
@@ -184,7 +184,7 @@ def _fitted(law: AbstractHyperelastic, points: _Points, beta: float | None) -> n
     from scipy.special import erf
 
     (W, slope), (M, _) = (
-        map(np.asarray, _first_loading(law, jnp.asarray(x)))
+        map(np.asarray, first_loading(law, jnp.asarray(x)))
         for x in (points.stretch, points.largest)
     )
     if beta is None and M.max() < _APART * M.min():
@@ -206,9 +206,9 @@ def _fitted(law: AbstractHyperelastic, points: _Points, beta: float | None) -> n
     q, m, *b = min((least_squares(error, z, **tight) for z in starts), key=lambda f: f.cost).x
     if not 1e-3 < q < 0.999:
         raise ValueError(
-            f"fit_cyclic: the fit gives r = {1 / max(q, 1e-9):.3g}, need a softening from 0.1 % to "
-            "99.9 %. Where the way back is that of the first loading, use fit_tensile; where "
-            "it is none of elastic stress, subtract the set from the strains."
+            f"fit_cyclic: the fit gives r = {1 / max(q, 1e-9):.3g}, need a softening from "
+            "0.1 % to 99.9 %. Where the way back is that of the first loading, use "
+            "fit_tensile; where a set remains, subtract it from the strains."
         )
     return np.array([1 / q, m * top, b[0] if b else beta])
 
@@ -224,8 +224,8 @@ def _slopes(first: TensileFit, points: _Points, found: np.ndarray):
 @jax.jit
 def _error_and_slopes(law: AbstractHyperelastic, found: Float[Array, "3"], points: _Points):
     def error(law, found):
-        W, slope = _first_loading(law, jnp.asarray(points.stretch))
-        M, _ = _first_loading(law, jnp.asarray(points.largest))
+        W, slope = first_loading(law, jnp.asarray(points.stretch))
+        M, _ = first_loading(law, jnp.asarray(points.largest))
         r, m, beta = found
         loss = jax.lax.erf((M - W) / (m + beta * M)) / r
         return (1 - loss) * slope - points.stress

@@ -152,7 +152,8 @@ def _attempt(given, offset, size, state):
     new, bodies = {}, {}
     for name, stage in _stages(now).items():
         end = _ended(now, name, stage, u[name], w[name])
-        bodies[name] = dataclasses.replace(end, strains=None, peaks=None)  # those in `new` go on
+        # what `new` holds goes on
+        bodies[name] = dataclasses.replace(end, strains=None, peaks=None)
         new[name] = {
             "u": end.displacement,
             "v": end.velocity,
