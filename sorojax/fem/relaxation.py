@@ -120,6 +120,7 @@ def in_step(
     loads and supports."""
     if moduli is None or strains is None:
         return () if peaks is None else (_base(problem, peaks),)
+    assert step is not None
     weights = step_weights(_spectrum(problem), step)
     stress = remembered(_by_point(moduli), weights, _rows(strains))
     return (Overstressed(_base(problem, peaks), jnp.stack(stress)),)
@@ -137,6 +138,7 @@ def after_step(
     dissipate in it [J]."""
     if moduli is None or strains is None:
         return None, jnp.zeros((), u.dtype)
+    assert step is not None
     spectrum, alone = _spectrum(problem), apart(step > 0)
     points = quadrature_points(problem.mesh, problem.kinematics)
     (ended,) = in_step(problem, moduli, strains, step, peaks)

@@ -431,13 +431,14 @@ def stress_history(
 
     def advance(carry, row):
         (rows, peak), (step, F) = carry, row
-        base = material.base if law is None else with_peak(law, peak)
+        softened = None if law is None else with_peak(law, peak)
+        base = material.base if softened is None else softened
         weights = step_weights(spectrum, step)
         before = [tuple(each) for each in rows]
         stress = jnp.stack(remembered(moduli, weights, before))
         P = first_piola_kirchhoff_stress(Overstressed(base, stress), F)
         rows = _stacked(relaxed_by(weights, before, inverse_strain(from_matrix(F))))
-        return (rows, None if law is None else raised(base, from_matrix(F))), P
+        return (rows, None if softened is None else raised(softened, from_matrix(F))), P
 
     first = jnp.stack(inverse_strain(from_matrix(F[0])))
     start = jnp.broadcast_to(first, (1 + len(moduli), *first.shape))
