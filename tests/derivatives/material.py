@@ -135,7 +135,7 @@ CASES = (
         "stress_history of softening": in_both(
             lambda law, F: M.stress_history(law, None, F),
             SOFT,
-            jnp.stack([F, F @ F, F.T, F @ F]),
+            jnp.stack([F, F @ F, F.T, F @ F @ F]),
         ),
         "dissipated_energy": in_both(M.dissipated_energy, SOFT, 3e4),
         "preconditioned": Case(

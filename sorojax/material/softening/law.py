@@ -227,7 +227,9 @@ def preconditioned(
             "preconditioned: got both of `stretch` and `energy`, or none, need one. Write "
             "preconditioned(rubber, stretch=2.0)."
         )
-    peak = real(energy) if stretch is None else uniaxial_energy(softening.base, stretch)
+    given = energy if stretch is None else uniaxial_energy(softening.base, stretch)
+    assert given is not None
+    peak = real(given)
     _check.not_negative("preconditioned", "energy", peak, "J/m^3", "That of a first loading.")
     made = with_peak(softening, peak)
     return Softening(made.base, made.r, made.m, made.beta, made.peak, remembers=False)
