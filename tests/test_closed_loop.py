@@ -129,6 +129,16 @@ def test_states_on_the_way_of_a_viscoelastic_body_give_no_law(start):
         chain(silicone, None, times=jnp.linspace(0.0, 1.0, 4))
 
 
+def test_a_body_that_softens_gives_no_law_but_a_preconditioned_one_does(start, first):
+    soft = material.Softening(RUBBER, r=2.0, m=1e3)
+    with pytest.raises(ValueError, match="identify: got a body that softens"):
+        chain(eqx.tree_at(lambda p: p.material, start, soft), None)
+    before = material.preconditioned(soft, stretch=1.3)
+    film = chain(eqx.tree_at(lambda p: p.material, start, before), None)
+    angles = [float(run["body.tip_angle"][-1]) for run in (film, first)]
+    assert film.status == Status.successful and abs(angles[0]) > 1.2 * abs(angles[1])
+
+
 def test_an_output_that_does_not_come_to_rest_is_named(start, first):
     """The tip still moves while the pressure rises; it rests where it may move that much."""
     run = chain(start, START, near=first, settle=("body.tip_angle", 1e-6), throw=False)

@@ -21,8 +21,8 @@ VERBS = {
     "translate union volume",
     "mesh": "box enrich extrude facets_on move nodes_where polymesher rectangle "
     "tetrahedralise triangulate",
-    "material": "by_region fit_spectrum fit_tensile neo_hookean predicted_readings "
-    "stress_history uniaxial_spectrum",
+    "material": "by_region fit_cyclic fit_spectrum fit_tensile neo_hookean preconditioned "
+    "predicted_readings stress_history uniaxial_spectrum",
     "material.presets": "rubber",
     "fem": "cauchy_stress continuation critical_loads eigenmodes problem simulate solve "
     "solve_path solve_volume von_mises_stress",

@@ -21,6 +21,7 @@ from sorojax.fem.assembly.space import (
 from sorojax.fem.kinematics import AbstractKinematics, Axisymmetric
 from sorojax.fem.supports import AbstractSupport, known_components, known_dofs
 from sorojax.material.hyperelastic import AbstractHyperelastic, small_strain_moduli
+from sorojax.material.softening.law import Softening
 from sorojax.material.viscoelastic import Viscoelastic
 from sorojax.mesh.elements.base import nodes as reference_nodes, shape_gradients
 from sorojax.mesh.elements.polygon import PolyN
@@ -84,19 +85,35 @@ def cells(mesh: Mesh) -> None:
 
 def material(mesh: Mesh, given: AbstractHyperelastic) -> None:
     inner = given.base if isinstance(given, Viscoelastic) else given
-    parts = jax.tree.leaves(inner, is_leaf=lambda part: isinstance(part, Viscoelastic))
-    if any(isinstance(part, Viscoelastic) for part in parts):
-        raise ValueError(
-            f"fem.problem: `material` is a {type(inner).__name__} of a Viscoelastic, which "
-            "stands outermost. Write Viscoelastic(the law of all cells, spectrum), with shares "
-            "per cell, 0 where there is no branch."
-        )
+    inner = inner.base if isinstance(inner, Softening) else inner
+    kinds = (Viscoelastic, Softening)
+    parts = jax.tree.leaves(inner, is_leaf=lambda part: isinstance(part, kinds))
+    for part in parts:
+        if isinstance(part, kinds):
+            raise ValueError(
+                f"fem.problem: `material` has a {type(part).__name__} within a "
+                f"{type(given).__name__}, but it stands outermost. Write "
+                "Viscoelastic(Softening(the law of all cells, r, m), spectrum), or one of the "
+                "two, with shares per cell, 0 where there is no branch, and r, infinite where "
+                "nothing softens."
+            )
     for leaf in jax.tree.leaves(given):
         if jnp.ndim(leaf) and jnp.shape(leaf) != (mesh.num_cells,):
             raise ValueError(
                 f"fem.problem: a leaf of `material` has shape {jnp.shape(leaf)}, need () or "
                 f"one number per cell, ({mesh.num_cells},)."
             )
+
+
+def no_peaks(where: str, given: AbstractHyperelastic) -> None:
+    """Refuse a material that softens where states before a state are not remembered."""
+    law = given.base if isinstance(given, Viscoelastic) else given
+    if isinstance(law, Softening) and law.remembers:
+        raise ValueError(
+            f"{where}: got a body that softens, need one without memory: fem.solve_path, "
+            "fem.simulate and networks remember. Take material.preconditioned(rubber, "
+            "stretch=...), or its `base`, the first loading."
+        )
 
 
 def formulation(mesh: Mesh, kinematics: AbstractKinematics, given: AbstractFormulation) -> None:

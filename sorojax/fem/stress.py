@@ -28,7 +28,6 @@ from sorojax.fem.kinematics import PlaneStress
 from sorojax.fem.loads.facets import cavity_volume
 from sorojax.fem.problem import Problem, body, body_at, residual
 from sorojax.material.kinematics import Entry, Tensor, determinant
-from sorojax.material.viscoelastic import Overstressed
 from sorojax.mesh.elements.base import (
     AbstractElement,
     nodes as reference_nodes,
@@ -116,9 +115,9 @@ def stress_at(
 
 def _node_points(problem: Problem) -> Points:
     """The nodes of every cell; their volumes mean nothing."""
-    if isinstance(problem.material, Overstressed):
+    if any(jnp.ndim(leaf) > 1 for leaf in jax.tree.leaves(problem.material)):
         raise ValueError(
-            "fem.cauchy_stress: got a viscoelastic body at an instant, whose branches are "
+            "fem.cauchy_stress: got a body at an instant, whose memory is "
             "known at quadrature points only. Take fem.stress.stress_at(problem, u, points) at "
             "fem.assembly.geometry.quadrature_points(mesh, kinematics)."
         )

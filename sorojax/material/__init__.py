@@ -39,6 +39,8 @@ from sorojax.material.rubbers import (
     neo_hookean,
     ogden_shear_modulus,
 )
+from sorojax.material.softening.fit import fit_cyclic
+from sorojax.material.softening.law import Softening, dissipated_energy, preconditioned
 from sorojax.material.spectrum.fit import SpectrumFit, fit_spectrum
 from sorojax.material.spectrum.records import (
     AbstractViscoelasticTest,
@@ -91,6 +93,7 @@ __all__ = [
     "Scaled",
     "SimoMiehe",
     "SimoTaylor",
+    "Softening",
     "SpectrumFit",
     "StVenantKirchhoff",
     "UserEnergy",
@@ -100,11 +103,13 @@ __all__ = [
     "by_region",
     "cauchy_stress",
     "creep_compliance",
+    "dissipated_energy",
     "drucker_stability",
     "elasticity_tensor",
     "equibiaxial_stress",
     "fibre_direction",
     "first_piola_kirchhoff_stress",
+    "fit_cyclic",
     "fit_spectrum",
     "fit_tensile",
     "lateral_stretch",
@@ -113,6 +118,7 @@ __all__ = [
     "loss_modulus",
     "neo_hookean",
     "ogden_shear_modulus",
+    "preconditioned",
     "predicted_readings",
     "presets",
     "prony_of_instantaneous",

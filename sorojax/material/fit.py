@@ -32,6 +32,7 @@ from sorojax.material.rubbers import (
     made_of,
     shear_modulus,
 )
+from sorojax.material.softening.cycles import CYCLES, chosen
 
 Columns = Callable[[np.ndarray, np.ndarray], np.ndarray]  # (stretch, nonlinear) -> columns
 EXPONENTS = (0.7, 1.3, 2.0, 3.0, 5.0, 8.0)
@@ -138,7 +139,7 @@ def build(
     model: type[AbstractHyperelastic], curve: Curve, poisson_ratio: float, density: Any
 ) -> AbstractHyperelastic:
     """The compressible material with the fitted curve and the small-strain ratio."""
-    coefficients = tuple(_constants(model, curve))
+    coefficients = tuple(constants_of(model, curve))
     bulk = bulk_modulus(real(shear_modulus(model, coefficients)), poisson_ratio)
     return made_of(model, coefficients, bulk, density)
 
@@ -152,7 +153,7 @@ def covariance_of(
 ) -> np.ndarray:
     """s^2 (J'W J)^-1 of the constants of the material that `build` makes of a curve, with J the
     slope of the stress by them and s^2 the weighted square error per degree of freedom."""
-    constants = _constants(model, curve)
+    constants = constants_of(model, curve)
     columns, h = [], 1e-30
     for k in range(len(constants)):  # by complex steps: exact to rounding
         moved = constants.astype(complex)
@@ -172,7 +173,7 @@ def covariance_of(
     return error @ error / freedom * (half @ half.T)
 
 
-def _constants(model: type[AbstractHyperelastic], curve: Curve) -> np.ndarray:
+def constants_of(model: type[AbstractHyperelastic], curve: Curve) -> np.ndarray:
     """Those of the material, in the order of its arguments."""
     c, further = curve.coefficients, curve.nonlinear
     if model is Ogden:
@@ -240,6 +241,7 @@ def fit_tensile(
     terms: int = 2,
     stable: bool = False,
     weights: Float[np.ndarray, " points"] | Sequence[Any] | None = None,
+    cycles: str = "all",
     poisson_ratio: float = 0.49,
     density: float | None = None,
 ) -> TensileFit:
@@ -262,6 +264,9 @@ def fit_tensile(
         terms: Terms of `Ogden`, 1 to 3; other models ignore it.
         stable: Allow no negative coefficient, so that the fit is stable everywhere.
         weights: Weight per point [-], shaped as `stress`; 1 everywhere by default.
+        cycles: Which points of a cyclic test, in the order of time: "first", beyond all strains
+            before, for the first loading; "last", of the last loading as far as the test had
+            been, for a preconditioned rubber; "all" by default. `fit_cyclic` fits both.
         poisson_ratio: Poisson's ratio of the returned material at small strains [-], below 0.5.
         density: Mass per reference volume [kg/m^3]; unknown by default.
 
@@ -286,8 +291,13 @@ def fit_tensile(
         2004; Seber and Wild, Nonlinear Regression, 1989, for the covariance.
     """
     checks.poisson_ratio("fit_tensile", poisson_ratio)
-    need = _needed(model, terms)
-    repeats = _repeats(strain, stress, weights, need)
+    need = needed("fit_tensile", model, terms)
+    if cycles not in CYCLES:
+        raise ValueError(
+            f"fit_tensile: `cycles` is {cycles!r}, need one of {CYCLES}. Take 'first' for a "
+            "part that is new, 'last' for one that has been stretched before."
+        )
+    repeats = _repeats(strain, stress, weights, need, cycles)
     strains, stresses, weight = (np.concatenate(part) for part in zip(*repeats, strict=True))
     curve = fit_curve(model, terms, stable, 1 + strains, stresses, weight)
     modulus = modulus_at_rest(curve)
@@ -313,24 +323,26 @@ def fit_tensile(
     return fit
 
 
-def _needed(model, terms: int) -> int:
+def needed(where: str, model, terms: int) -> int:
+    """Numbers that `model` has to be fitted."""
     if model not in MODELS:
         name = getattr(model, "__name__", repr(model))
         raise ValueError(
-            f"fit_tensile: `model` is {name}, need one of "
+            f"{where}: `model` is {name}, need one of "
             f"{', '.join(m.__name__ for m in MODELS)}. Fit others with an optimiser on "
             "uniaxial_stress."
         )
     if model is Ogden and terms not in (1, 2, 3):
-        raise ValueError(f"fit_tensile: `terms` is {terms}, need 1, 2 or 3. Ogden takes 2.")
+        raise ValueError(f"{where}: `terms` is {terms}, need 1, 2 or 3. Ogden takes 2.")
     return 2 * terms if model is Ogden else FEWEST[model]
 
 
-def _repeats(strain, stress, weights, need: int) -> list[tuple[np.ndarray, ...]]:
+def _repeats(strain, stress, weights, need: int, cycles: str) -> list[tuple[np.ndarray, ...]]:
     """(strain, stress, weight) of every repeat; the weights of each have mean 1 / points."""
+    where = "fit_tensile"
     if len(strain) == 0 or len(stress) == 0:
         raise ValueError(
-            f"fit_tensile: got {len(strain)} strains and {len(stress)} stresses, need as many "
+            f"{where}: got {len(strain)} strains and {len(stress)} stresses, need as many "
             "as the model has constants, or more. Give the points of the test."
         )
     several = np.ndim(strain[0]) > 0
@@ -340,53 +352,70 @@ def _repeats(strain, stress, weights, need: int) -> list[tuple[np.ndarray, ...]]
     )
     if not len(strains) == len(stresses) == len(given):
         raise ValueError(
-            f"fit_tensile: got {len(strains)} strain, {len(stresses)} stress and {len(given)} "
+            f"{where}: got {len(strains)} strain, {len(stresses)} stress and {len(given)} "
             "weight lists, need one of each per repeat. Repeat by repeat, in one order."
         )
     parts = zip(strains, stresses, given, strict=True)
-    return [_repeat(*part, need, len(strains)) for part in parts]
+    return [_repeat(*part, need, len(strains), cycles) for part in parts]
 
 
-def _repeat(strain, stress, weight, need: int, count: int) -> tuple[np.ndarray, ...]:
+def measured(where: str, strain, stress, need: int) -> tuple[np.ndarray, np.ndarray]:
+    """Engineering strain [-] and stress [Pa] of a test, at least `need` points of each."""
     if not number_like(strain) or not number_like(stress):
         raise TypeError(
-            f"fit_tensile: got {got(strain)} and {got(stress)}, need numbers. Give strains [-] "
+            f"{where}: got {got(strain)} and {got(stress)}, need numbers. Give strains [-] "
             "and stresses [Pa]."
         )
     strain, stress = np.asarray(strain, float), np.asarray(stress, float)
     if strain.shape != stress.shape or strain.ndim != 1 or len(strain) < need:
         raise ValueError(
-            f"fit_tensile: got strain {strain.shape} and stress {stress.shape}, need two "
+            f"{where}: got strain {strain.shape} and stress {stress.shape}, need two "
             f"equal lists of at least {need} points: {need} numbers are fitted."
         )
-    _check.finite("fit_tensile", "strain, stress", np.stack([strain, stress]), "Drop NaN.")
+    _check.finite(where, "strain, stress", np.stack([strain, stress]), "Drop NaN.")
     if np.any(strain <= -1) or np.max(np.abs(strain)) > 20:
         raise ValueError(
-            f"fit_tensile: strains {strain.min():g} to {strain.max():g} are not engineering "
+            f"{where}: strains {strain.min():g} to {strain.max():g} are not engineering "
             "strains of a tensile test; divide percent by 100."
         )
-    _check_units(strain, stress)
+    _check_units(where, strain, stress)
+    return strain, stress
+
+
+def _repeat(
+    strain, stress, weight, need: int, count: int, cycles: str
+) -> tuple[np.ndarray, ...]:
+    where = "fit_tensile"
+    strain, stress = measured(where, strain, stress, need)
     weight = np.ones_like(strain) if weight is None else np.asarray(weight, float)
     if weight.shape != strain.shape or not np.all(weight >= 0) or not np.any(weight > 0):
         raise ValueError(
-            f"fit_tensile: got weights {weight.shape} for {len(strain)} points, need one per "
+            f"{where}: got weights {weight.shape} for {len(strain)} points, need one per "
             "point, none negative. Leave `weights` out to weigh all points alike."
         )
+    kept = chosen(strain, cycles)
+    if kept is None or np.sum(kept & (weight > 0)) < need:
+        raise ValueError(
+            f"{where}: got {0 if kept is None else int(np.sum(kept))} points in the {cycles} "
+            f"loading, need at least {need}: {need} numbers are fitted. List the points in "
+            "the order of the test, and take cycles='all' for one without cycles."
+        )
+    strain, stress, weight = strain[kept], stress[kept], weight[kept]
     return strain, stress, weight / (np.mean(weight) * (len(strain) if count > 1 else 1))
 
 
-def _check_units(strain: np.ndarray, stress: np.ndarray) -> None:
+def _check_units(where: str, strain: np.ndarray, stress: np.ndarray) -> None:
     """Refuse what looks like another quantity or unit."""
     largest = np.max(np.abs(stress))
     if largest < _SOFTEST:
         raise ValueError(
-            f"fit_tensile: the largest stress is {largest:.3g}, need Pa, in which no rubber "
+            f"{where}: the largest stress is {largest:.3g}, need Pa, in which no rubber "
             f"or gel stays below {_SOFTEST:g}. Multiply MPa by 1e6, kPa by 1e3."
         )
     at_rest = _strain_without_stress(strain, stress)
     if np.min(strain) > 0 and abs(at_rest - 1) < 0.2:
         raise ValueError(
-            f"fit_tensile: the stress vanishes at a strain of {at_rest:.3g}, need engineering "
+            f"{where}: the stress vanishes at a strain of {at_rest:.3g}, need engineering "
             "strain, which is 0 there. Subtract 1 from stretch."
         )
 

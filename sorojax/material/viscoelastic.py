@@ -58,6 +58,7 @@ from sorojax.material.kinematics import (
     right_cauchy_green,
     times,
 )
+from sorojax.material.softening.law import Softening, raised, remembering, with_peak
 from sorojax.math.linalg.dense import inverse_cube_root
 
 Terms = tuple[Float[Array, "..."], ...]
@@ -440,15 +441,18 @@ def dissipation(moduli: Terms, spectrum: Prony, rows: list[Sym]) -> Entry:
 
 
 def stress_history(
-    material: Viscoelastic, times: Float[Array, " steps"], F: Float[Array, "steps 3 3"]
+    material: Viscoelastic | Softening,
+    times: Float[Array, " steps"] | None,
+    F: Float[Array, "steps 3 3"],
 ) -> Float[Array, "steps 3 3"]:
     """First Piola-Kirchhoff stress [Pa] along a history of the deformation gradient.
 
-    The material is relaxed at the first `F`; between two times C^-1 changes linearly.
+    The material is relaxed at the first `F`; between two times C^-1 changes linearly. One that
+    softens remembers the largest energy of the deformations before.
 
     Args:
         material: With one number for each constant.
-        times: Increasing times [s].
+        times: Increasing times [s]; None of a `Softening`, where they play no part.
         F: Deformation gradients, one for each time.
 
     Returns:
@@ -469,6 +473,13 @@ def stress_history(
     Reference:
         Lubliner, A model of rubber viscoelasticity, Mech. Res. Commun. 12, 1985.
     """
+    if isinstance(material, Softening):
+        return _softened_history(material, real(F))
+    if times is None:
+        raise ValueError(
+            "stress_history: got no times of a Viscoelastic, need them: branches relax. Give "
+            "one increasing time [s] for each F."
+        )
     times, F = real(times), real(F)
     _check.shape("stress_history", "times", times, (None,), "Give a row of times [s].")
     _check.shape(
@@ -477,20 +488,36 @@ def stress_history(
     steps = jnp.diff(times)
     _check.positive("stress_history", "steps of times", steps, "s", "Sort the times.")
     moduli, spectrum = branch_moduli(material), material.relaxation
+    law = remembering(material.base)
 
-    def advance(rows, row):
-        step, F = row
+    def advance(carry, row):
+        (rows, peak), (step, F) = carry, row
+        softened = None if law is None else with_peak(law, peak)
+        base = material.base if softened is None else softened
         weights = step_weights(spectrum, step)
         before = [tuple(each) for each in rows]
         stress = jnp.stack(remembered(moduli, weights, before))
-        P = first_piola_kirchhoff_stress(Overstressed(material.base, stress), F)
-        return _stacked(relaxed_by(weights, before, inverse_strain(from_matrix(F)))), P
+        P = first_piola_kirchhoff_stress(Overstressed(base, stress), F)
+        rows = _stacked(relaxed_by(weights, before, inverse_strain(from_matrix(F))))
+        return (rows, None if softened is None else raised(softened, from_matrix(F))), P
 
     first = jnp.stack(inverse_strain(from_matrix(F[0])))
     start = jnp.broadcast_to(first, (1 + len(moduli), *first.shape))
-    _, later = jax.lax.scan(advance, start, (steps, F[1:]))
+    peak = None if law is None else raised(law, from_matrix(F[0]))
+    _, later = jax.lax.scan(advance, (start, peak), (steps, F[1:]))
     at_start = first_piola_kirchhoff_stress(material, F[0])
     return jnp.concatenate([at_start[None], later])
+
+
+def _softened_history(softening: Softening, F: Float[Array, "steps 3 3"]):
+    if not softening.remembers:
+        return jax.vmap(lambda F: first_piola_kirchhoff_stress(softening, F))(F)
+
+    def advance(peak, F):
+        law = with_peak(softening, peak)
+        return raised(law, from_matrix(F)), first_piola_kirchhoff_stress(law, F)
+
+    return jax.lax.scan(advance, raised(softening, from_matrix(F[0])), F)[1]
 
 
 def _stacked(rows: list[Sym]) -> Array:

@@ -22,6 +22,7 @@ from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax._progress import report
 from sorojax._types import Numbers, real
 from sorojax.fem.assembly.geometry import quadrature_points
+from sorojax.fem.checks import no_peaks
 from sorojax.fem.dynamics.damping import lumped_mass
 from sorojax.fem.equilibrium.linear import prepare
 from sorojax.fem.equilibrium.response import tangent_solve
@@ -353,6 +354,7 @@ def _condensed_stiffness(
             "identify: got states of a viscoelastic body over `times`, need equilibria "
             "that have relaxed. Leave `times` out of fem.solve_path."
         )
+    no_peaks("identify", path.problem.material)
     ways, states = _slopes(at, basis, path.displacements)
     answers, fixed = [], without_derivatives(path.problem)
     with evaluated_now(fixed):

@@ -9,7 +9,8 @@ from sorojax.material.growth import growth_volume
 from tests.derivatives.case import Case
 
 NONE = {
-    "a search or a fit on the host, of numbers": "drucker_stability fit_spectrum fit_tensile",
+    "a search or a fit on the host, of numbers": "drucker_stability fit_cyclic fit_spectrum "
+    "fit_tensile",
 }
 
 F = jnp.asarray(np.eye(3) + 0.2 * np.random.default_rng(2).uniform(-1, 1, (3, 3)))
@@ -42,6 +43,8 @@ ENERGIES = {
     "Ogden": M.Ogden((3e5, -1e5), (2.0, -2.0), 5e6),
     "Scaled": M.Scaled(RUBBER, 0.4),
     "Viscoelastic": M.Viscoelastic(RUBBER, M.Prony([0.3], [0.1])),
+    "Softening below its peak": M.Softening(RUBBER, 1.8, 2e4, 0.2, 1e5),
+    "Softening beyond its peak": M.Softening(RUBBER, 1.8, 2e4, 0.2, 1e3),
     "StVenantKirchhoff": M.StVenantKirchhoff(3e5, 5e6),
     "UserEnergy": M.UserEnergy(user, (2e5,), bulk_modulus=5e6),
     "Yeoh": RUBBER,
@@ -57,6 +60,7 @@ TESTS = (
     M.RelaxationTest([0.1, 1.0], [3e5, 2e5]), M.CreepTest([0.1, 1.0], [3e-6, 5e-6]),
     M.DynamicTest([0.3, 4.0], [3e5, 4e5], [2e4, 1e4]), M.RingDown([0.3, 4.0], [0.05, 0.2]),
 )  # fmt: skip
+SOFT = M.Softening(GENT, 1.8, 2e4, 0.2)
 SILICONE, TIMES = M.Viscoelastic(GENT, SPECTRUM), jnp.array([0.1, 0.2, 0.6])
 
 
@@ -148,6 +152,16 @@ CASES = (
         ),
         "stress_history": Case(
             lambda at: M.stress_history(*at), (SILICONE, TIMES, jnp.stack([F, F.T, F @ F]))
+        ),
+        "stress_history of softening": in_both(
+            lambda law, F: M.stress_history(law, None, F),
+            SOFT,
+            jnp.stack([F, F @ F, F.T, F @ F @ F]),
+        ),
+        "dissipated_energy": in_both(M.dissipated_energy, SOFT, 3e4),
+        "preconditioned": Case(
+            lambda at: M.uniaxial_stress(M.preconditioned(at[0], stretch=at[1]), STRETCH),
+            (SOFT, 2.0),
         ),
         "small_strain_moduli": Case(M.small_strain_moduli, ENERGIES["Ogden"]),
     }

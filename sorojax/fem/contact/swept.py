@@ -50,8 +50,8 @@ def gains(
         v = at.velocity.ravel()
         moving = v @ sparse.product(problem.space.system, known.mass, v) / 2
         held = sum(stored(load, problem, at.displacement) for load in contacts)
-        stored_now = stored_energy(problem, known.moduli, at.strains, at.displacement)
-        return moving + stored_now + held
+        kept = known.moduli, at.strains, at.displacement, at.peaks
+        return moving + stored_energy(problem, *kept) + held
 
     def pushing(u):
         return sum((load.potential(problem, u) for load in contacts), start=0.0)

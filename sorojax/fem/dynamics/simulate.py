@@ -34,7 +34,7 @@ from sorojax.fem.equilibrium.jit import known_mask
 from sorojax.fem.equilibrium.newton import Newton
 from sorojax.fem.loads.loads import AbstractLoad, remembers
 from sorojax.fem.problem import Problem, body, exchanged, residual
-from sorojax.fem.relaxation import relaxed
+from sorojax.fem.relaxation import first_peaks, relaxed
 from sorojax.math.linalg import sparse
 from sorojax.math.status import Status
 from sorojax.mesh.mesh import Mesh
@@ -232,9 +232,13 @@ def _rest(problem: Problem, rows: tuple[Array | None, ...]) -> State:
     memory = tuple(
         _placed(load, row, problem.mesh) if remembers(load) else None for load, row in first
     )
-    strains = relaxed(body(problem), zero)
-    one = jnp.ones_like(none)
-    return State(none, zero, zero, zero, memory, none, none, one, strains=strains)
+    kept = _remembered(problem, zero)
+    return State(none, zero, zero, zero, memory, none, none, jnp.ones_like(none), **kept)
+
+
+def _remembered(problem: Problem, u: Array) -> dict[str, Array | None]:
+    """What a body remembers that a motion begins with at displacement `u` [m]."""
+    return {"strains": relaxed(body(problem), u), "peaks": first_peaks(body(problem), u)}
 
 
 def _placed(load: AbstractLoad, row: Array | None, mesh: Mesh) -> AbstractLoad:
@@ -252,10 +256,12 @@ def _state(where: str, dynamics: Dynamics, start: Start | None) -> State:
     if isinstance(start, Trajectory):
         start = start.end
     if isinstance(start, State):
-        if (start.strains is None) != (dynamics.start.strains is None):
+        for kept, word in (("strains", "is viscoelastic"), ("peaks", "softens")):
+            if (getattr(start, kept) is None) == (getattr(dynamics.start, kept) is None):
+                continue
             raise ValueError(
-                f"{where}: got the `start` of a body that is viscoelastic and a problem that "
-                "is not, or the reverse, need the same. Give (displacement, velocity), to "
+                f"{where}: got the `start` of a body that {word} and a problem that does "
+                "not, or the reverse, need the same. Give (displacement, velocity), to "
                 "begin relaxed."
             )
         return start
@@ -271,8 +277,8 @@ def _state(where: str, dynamics: Dynamics, start: Start | None) -> State:
                 "Give one vector per node.",
             )
             _check.finite(where, f"start {name}", x, "Use SI units.")
-        strains = relaxed(body(dynamics.problem), u)
-        state = dataclasses.replace(state, displacement=u, velocity=v, strains=strains)
+        kept = _remembered(dynamics.problem, u)
+        state = dataclasses.replace(state, displacement=u, velocity=v, **kept)
     return eqx.tree_at(lambda s: s.acceleration, state, _acceleration(dynamics, state))
 
 

@@ -19,7 +19,7 @@ from sorojax.fem.dynamics.methods import Coefficients, Conserving
 from sorojax.fem.equilibrium.jit import known_mask
 from sorojax.fem.loads.loads import AbstractLoad
 from sorojax.fem.problem import Problem, body, exchanged, load_potential, residual, with_terms
-from sorojax.fem.relaxation import Strains, after_step, in_step, moduli
+from sorojax.fem.relaxation import Peaks, Strains, after_step, in_step, moduli, raised_peaks
 from sorojax.fem.supports import Prescribed, known_components, known_values
 from sorojax.material.viscoelastic import Terms
 from sorojax.math.linalg import sparse
@@ -123,10 +123,10 @@ class State(eqx.Module):
 
     `memory` holds the loads that remember, such as friction; `work` and `dissipated` [J] are
     what loads and supports gave and damping took since the start. `strains` are what the
-    branches of a viscoelastic material remember (`fem.relaxation`). `share` is the part of a
-    step that was taken last, `tangent` the matrix whose factor goes on being used and
-    `listed` the displacement [m] that lists of near facets were made at, so that a run that
-    is cut in two repeats the whole one to the last bit.
+    branches of a viscoelastic material remember, `peaks` [J/m^3] what one that softens does
+    (`fem.relaxation`). `share` is the part of a step that was taken last, `tangent` the matrix
+    whose factor goes on being used and `listed` the displacement [m] that lists of near facets
+    were made at, so that a run that is cut in two repeats the whole one to the last bit.
     """
 
     time: Float[Array, ""]
@@ -140,6 +140,7 @@ class State(eqx.Module):
     tangent: Float[Array, " nnz"] | None = None
     listed: Float[Array, "nodes dim"] | None = None
     strains: Strains | None = None
+    peaks: Peaks | None = None
 
 
 class Dynamics(eqx.Module):
@@ -176,7 +177,7 @@ class Interval(NamedTuple):
 
 class TimeStep(NamedTuple):
     """A step to solve. `matrix` is the damping matrix; `terms` are the loads and supports of
-    its problem of equilibrium, and a viscoelastic material as it is then; `target` are
+    its problem of equilibrium, and a material that remembers as it is then; `target` are
     displacements known at the end. Inertia pulls by the mass times `drive` [m/s^2] minus the
     damping times `lead` [m/s], the velocity where forces act of a body that keeps its
     displacement."""
@@ -227,8 +228,9 @@ def begin_step(dynamics: Dynamics, known: Matter, state: State, interval: Interv
     if all(load.smooth for load in dynamics.problem.loads):
         predicted = guess + (1 - c.af) * h**2 / 2 * a  # that of an impact is not the next one
     terms = (loads + extra, supports)
-    if state.strains is not None:
-        terms += in_step(dynamics.problem, known.moduli, state.strains, (1 - c.af) * h)
+    if state.strains is not None or state.peaks is not None:
+        past = known.moduli, state.strains, (1 - c.af) * h, state.peaks
+        terms += in_step(dynamics.problem, *past)
     return TimeStep(terms, guess, predicted, damping, target, lead, drive)
 
 
@@ -258,11 +260,12 @@ def end_step(
         work = _work(dynamics, step, loads, u_alpha, d)
     if taken is None:
         taken = _taken(dynamics, step, (1 - c.af) * v_new + c.af * v, d)
-    strains = state.strains
-    if strains is not None:
-        args = body(dynamics.problem), known.moduli, strains, h, u + d
+    strains, peaks = state.strains, state.peaks
+    if strains is not None or peaks is not None:
+        args = body(dynamics.problem), known.moduli, strains, h, u + d, peaks
         strains, relaxing = after_step(*args)
-        taken = taken + relaxing
+        peaks, softening = raised_peaks(*args)
+        taken = taken + (relaxing if peaks is None else relaxing + softening)
     return State(
         time=state.time + h,
         displacement=u + d,
@@ -273,6 +276,7 @@ def end_step(
         dissipated=state.dissipated + taken,
         share=state.share,
         strains=strains,
+        peaks=peaks,
     )
 
 

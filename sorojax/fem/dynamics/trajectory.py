@@ -22,8 +22,8 @@ class Energies(eqx.Module):
     """Energies [J] at the saved times.
 
     `loads` is the potential of the loads with the values of the instant; `work` is what
-    loads and moving supports gave since the start, `dissipated` what damping and the branches
-    of a viscoelastic material took.
+    loads and moving supports gave since the start, `dissipated` what damping, the branches
+    of a viscoelastic material and softening took.
     """
 
     kinetic: Float[Array, " times"]
@@ -116,7 +116,7 @@ def _energies(dynamics: Dynamics, states: State, points, lists) -> Energies:
         loaded = exchanged(body(problem), loads=loads)
         return Energies(
             0.5 * jnp.sum(v * sparse.product(problem.space.system, known.mass, v)),
-            stored_energy(body(problem), known.moduli, state.strains, u),
+            stored_energy(body(problem), known.moduli, state.strains, u, state.peaks),
             sum((load.stored(loaded, u) for load in loads), start=jnp.zeros((), u.dtype)),
             state.work,
             state.dissipated,

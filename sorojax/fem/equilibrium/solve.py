@@ -29,6 +29,7 @@ from sorojax.fem.relaxation import (
     from_past,
     moduli,
     next_past,
+    softens,
 )
 from sorojax.math.status import Status
 
@@ -75,7 +76,8 @@ class Solution(eqx.Module):
 class Path(eqx.Module):
     """Equilibria along a path: `values` of the load `name`, or of the volume of that cavity
     [m^3], whose gauge `pressures` [Pa] are found; one state for each. A path over `times` [s]
-    has the `strains` that a viscoelastic body remembers at each (`fem.relaxation`).
+    has the `strains` that a viscoelastic body remembers at each, that of a body that softens
+    its `peaks` [J/m^3] (`fem.relaxation`).
 
     A path that stops early is cut there; under `jit` and `vmap` it keeps its length and
     is NaN from there on. `stats` has one entry for each value, as in `Solution`; it is
@@ -91,16 +93,16 @@ class Path(eqx.Module):
     pressures: Float[Array, " steps"] | None = None
     times: Float[Array, " steps"] | None = None
     strains: Float[Array, "steps rows entries quad cells"] | None = None
+    peaks: Float[Array, "steps quad cells"] | None = None
 
     def __len__(self) -> int:
         return self.displacements.shape[0]
 
     def problem_at(self, k: int) -> Problem:
-        """The problem with the loads of state `k`."""
+        """The problem with the loads of state `k`, and what the body remembers there."""
         problem = self.problem_under(self.loading[k])
-        if self.strains is None:
-            return problem
-        return at_instant(problem, moduli(problem), self.strains[k])
+        strains, peaks = (None if x is None else x[k] for x in (self.strains, self.peaks))
+        return at_instant(problem, moduli(problem), strains, peaks)
 
     @property
     def loading(self) -> Float[Array, "steps ..."]:
@@ -243,6 +245,7 @@ def solve_path(
 
     With `times` a body of `material.Viscoelastic` relaxes and creeps on the way, without
     inertia: the first state is that of the first value held for long, steps are of order 2.
+    A body of `material.Softening` remembers the largest energy of the states before.
 
     Newton's method from state to state with the tangent as predictor; a step that fails is
     halved. Every state is differentiable as that of `solve`.
@@ -285,14 +288,15 @@ def solve_path(
 
     # inside jit even a constant is traced: one compiled loop over the values then
     if is_traced(jnp.zeros(())):
-        states, strains, failed = _scan_path(problem, name, row, steps, past, newton, max_cuts)
+        states, kept, failed = _scan_path(problem, name, row, steps, past, newton, max_cuts)
         found = problem, states, row, name, _status(failed), None, None
-        return Path(*found, times, strains)
-    begin, states, stats, failed, strains = None, [], [], jnp.asarray(False), []
+        return Path(*found, times, *kept)
+    begin, states, stats, failed, kept = None, [], [], jnp.asarray(False), []
     for k, value in enumerate(row):
         target = with_load(problem, name, value)
         if past is not None:
-            target = from_past(target, past, steps[k])
+            since = None if steps is None else steps[k]
+            target = from_past(target, past, since)
         call = Solve(target, begin, newton, 1, max_cuts, want_tangent=True)
         u, counts, tangent = equilibrium(call)
         record = call.stats
@@ -309,8 +313,8 @@ def solve_path(
             at = _begun(call.record.displacement).u
         states.append(u)
         if past is not None:
-            past = next_past(body(problem), past, steps[k], u)
-            strains.append(past.strains)
+            past = next_past(body(problem), past, since, u)
+            kept.append((past.strains, past.peaks))
         begin = _fixed(Begin(at, (target.loads, target.supports), tangent))
         lanes = (record,) if isinstance(record, Stats) else record or ()
         report(
@@ -320,7 +324,8 @@ def solve_path(
     stacked = jnp.stack(states) if states else jnp.zeros(shape)
     found = problem, stacked, row[: len(states)], name, _status(failed), tuple(stats), None
     times = None if times is None else times[: len(states)]
-    return Path(*found, times, jnp.stack(strains) if strains else None)
+    rows = zip(*kept, strict=True) if kept else [(None,)] * 2
+    return Path(*found, times, *(None if r[0] is None else jnp.stack(r) for r in rows))
 
 
 _FOREVER = 1e30  # time in which everything relaxes [s]; infinity would have no derivative
@@ -329,17 +334,19 @@ _FOREVER = 1e30  # time in which everything relaxes [s]; infinity would have no 
 def _aging(
     problem: Problem, row: Array, times: Float[Array, " steps"] | None
 ) -> tuple[Any, Past | None]:
-    """Time since the state before [s], and the past of a viscoelastic body that begins
-    relaxed; without a past where time plays no part."""
+    """Time since the state before [s] where it plays a part, and the past of a body that
+    remembers and begins relaxed."""
     if times is None:
-        return None, None
+        if not softens(problem):
+            return None, None
+        return None, first_past(body(problem), jnp.zeros_like(problem.mesh.points), False)
     do = "Give one increasing time [s] for each value."
     _check.shape("fem.solve_path", "times", times, (row.shape[0],), do)
     steps = jnp.diff(times)
     _check.positive("fem.solve_path", "steps of times", steps, "s", do)
-    past = first_past(body(problem), jnp.zeros_like(problem.mesh.points))
+    past = first_past(body(problem), jnp.zeros_like(problem.mesh.points), True)
     if past.strains is None:
-        return None, None
+        return None, past if softens(problem) else None
     return jnp.concatenate([jnp.full(1, _FOREVER, steps.dtype), steps]), past
 
 
@@ -367,12 +374,12 @@ def _scan_path(
         terms = eqx.filter((target.loads, target.supports), eqx.is_inexact_array)
         if past is not None:
             past = next_past(body(problem), past, step, u)
-        strains = None if past is None else past.strains
-        return ((u, terms, tangent), past), (u, strains, failed)
+        kept = (None, None) if past is None else (past.strains, past.peaks)
+        return ((u, terms, tangent), past), (u, kept, failed)
 
     start = (u, terms, tangent), past
-    _, (states, strains, failed) = jax.lax.scan(advance, start, (row, steps))
-    return states, strains, jnp.any(failed)
+    _, (states, kept, failed) = jax.lax.scan(advance, start, (row, steps))
+    return states, kept, jnp.any(failed)
 
 
 def _fixed(begin: Begin) -> Begin:

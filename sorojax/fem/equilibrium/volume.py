@@ -16,6 +16,7 @@ from sorojax import _check
 from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax._progress import report
 from sorojax._types import real
+from sorojax.fem.checks import no_peaks
 from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import linearise, prepare
 from sorojax.fem.equilibrium.load_stepping import LoadStep, Log, between, unloaded
@@ -268,13 +269,14 @@ def volume_path(
     largest pressure. The path stops where a volume has no equilibrium; see `status`.
 
     Raises:
-        ValueError: If not exactly one pressure of the problem is named.
+        ValueError: If not exactly one pressure of the problem is named, or the body softens.
     """
     if len(row) != 1:
         raise ValueError(
             f"fem.volume_path: got volumes for {sorted(row)}, need those of one pressure. Name "
             "it, as in air=jnp.linspace(1e-5, 2e-5, 11)."
         )
+    no_peaks("fem.volume_path", problem.material)
     ((name, wanted),) = row.items()
     wanted, found = real(wanted), []
     _check.shape("fem.volume_path", name, wanted, (None,), "Give one volume per state.")

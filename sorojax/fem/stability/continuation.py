@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 from sorojax import _check
 from sorojax._display import displayed, number, outcome
 from sorojax._progress import report
+from sorojax.fem.checks import no_peaks
 from sorojax.fem.equilibrium.linear import Prepared, prepare
 from sorojax.fem.equilibrium.load_stepping import LoadStep, Log, Stats, at_rest, follow
 from sorojax.fem.equilibrium.newton import Newton
@@ -208,6 +209,7 @@ def continuation(
     """
     where = "fem.continuation"
     loading = Loading(where, problem, name)
+    no_peaks(where, problem.material)
     _check.finite(where, "step", step, "A tenth of the load is a good start.")
     _check.positive(where, "abs(step)", abs(step), "", "A tenth of the load is a good start.")
     if largest_step is not None:

@@ -18,8 +18,10 @@ from sorojax.fem.equilibrium.jit import known_mask
 from sorojax.fem.loads.loads import AbstractLoad, remembers
 from sorojax.fem.problem import body, load_force, residual
 from sorojax.fem.relaxation import (
+    Peaks,
     Strains,
     at_instant,
+    first_peaks,
     moduli,
     relaxed,
     stored_energy,
@@ -42,7 +44,8 @@ _UNITS = {
 class FemBody(AbstractBlock):
     """A hyperelastic body in motion; the state holds displacement u and velocity v of every
     node, and the energies `work` of its loads and `dissipated` by damping since the start; of
-    a viscoelastic body also the `strains` that its branches remember.
+    a viscoelastic body also the `strains` that its branches remember, of one that softens the
+    `peaks` [J/m^3] of energy.
 
     A `Pressure` of the name "air" opens the input `air_pressure` (gauge) and the outputs
     `air_volume` and `air_volume_rate`; one of the default name opens `pressure`, `volume`
@@ -135,8 +138,9 @@ class FemBody(AbstractBlock):
         u = rest if self.u is None else self.u
         v = rest if self.v is None else self.v
         state = {"u": u, "v": v, "work": none, "dissipated": none}
-        strains = relaxed(body(self.problem), u)
-        return state if strains is None else {**state, "strains": strains}
+        bare = body(self.problem)
+        kept = {"strains": relaxed(bare, u), "peaks": first_peaks(bare, u)}
+        return state | {name: x for name, x in kept.items() if x is not None}
 
     def output(self, name, t, state, inputs):
         u, v = state["u"], state["v"]
@@ -144,7 +148,8 @@ class FemBody(AbstractBlock):
             return state[name]
         if name == "elastic_energy":
             bare = body(self.problem)
-            return stored_energy(bare, moduli(bare), state.get("strains"), u)
+            kept = state.get("strains"), u, state.get("peaks")
+            return stored_energy(bare, moduli(bare), *kept)
         if name == "kinetic_energy":
             system, mass = self.problem.space.system, self.matter().mass
             return jnp.sum(v.ravel() * sparse.product(system, mass, v.ravel())) / 2
@@ -159,6 +164,12 @@ class FemBody(AbstractBlock):
         raise KeyError(name)
 
     def vector_field(self, t, state, inputs):
+        if "peaks" in state:
+            raise ValueError(
+                "FemBody: got a body that softens, whose memory changes abruptly, and a "
+                "method for differential equations, need one of fixed steps. Call "
+                "simulate(network, duration, step=...) with Coupled(), its default."
+            )
         u, v = state["u"], state["v"]
         loaded = self.loaded(self.values(inputs))
         known = self.matter()
@@ -241,11 +252,17 @@ def damping_force(block: FemBody, known: Matter, u, v) -> Float[Array, " dofs"]:
 
 
 def acceleration(
-    block: FemBody, loaded: fem.Problem, known: Matter, u, v, strains: Strains | None
+    block: FemBody,
+    loaded: fem.Problem,
+    known: Matter,
+    u,
+    v,
+    strains: Strains | None,
+    peaks: Peaks | None = None,
 ) -> Float[Array, "nodes dim"]:
     """Acceleration [m/s^2] that balances a state under loads."""
     system = loaded.space.system
-    loaded = at_instant(loaded, known.moduli, strains)
+    loaded = at_instant(loaded, known.moduli, strains, peaks)
     force = -residual(loaded, u).ravel() - damping_force(block, known, u, v)
     mask = known_mask(loaded.supports, *u.shape)
     matrix = sparse.fix(system, known.mass, mask)

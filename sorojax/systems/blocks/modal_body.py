@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from sorojax import fem
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
+from sorojax.fem.checks import no_peaks
 from sorojax.fem.equilibrium.response import tangent_solve
 from sorojax.fem.problem import load_force, potential_energy, residual
 from sorojax.material import Viscoelastic
@@ -317,6 +318,7 @@ def modal_body(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBo
             "modal_body: got a body of a Viscoelastic material, need one without memory. Give "
             "its `base` to the problem, with fem.Rayleigh(...) for damping."
         )
+    no_peaks("modal_body", body.problem.material)
     values = {name: jnp.zeros_like(load.value) for name, load in body.drives.items()}
     free = body.loaded(values)
     rest = ProjectedForce(free, basis)

@@ -108,7 +108,8 @@ class Coupled(AbstractMethod):
             known[name] = _Known(block.matter(), prepare_traced(block.problem))
             loaded = block.loaded(block.values(own[name]))
             u, v = y[name]["u"], y[name]["v"]
-            a = acceleration(block, loaded, known[name].matter, u, v, y[name].get("strains"))
+            kept = y[name].get("strains"), y[name].get("peaks")
+            a = acceleration(block, loaded, known[name].matter, u, v, *kept)
             states[name] = eqx.tree_at(lambda s: s.acceleration, dynamics.start, a)
         return Memory(states, known)
 
@@ -151,7 +152,8 @@ def _attempt(given, offset, size, state):
     new, bodies = {}, {}
     for name, stage in _stages(now).items():
         end = _ended(now, name, stage, u[name], w[name])
-        bodies[name] = dataclasses.replace(end, strains=None)  # those in `new` go on
+        # what `new` holds goes on
+        bodies[name] = dataclasses.replace(end, strains=None, peaks=None)
         new[name] = {
             "u": end.displacement,
             "v": end.velocity,
@@ -160,6 +162,8 @@ def _attempt(given, offset, size, state):
         }
         if end.strains is not None:
             new[name]["strains"] = end.strains
+        if end.peaks is not None:
+            new[name]["peaks"] = end.peaks
     rest = _marched(now, u)
     return ({name: {**new, **rest}[name] for name in now.y}, bodies), converged
 
@@ -196,6 +200,7 @@ def _state(now: _Given, name: str) -> State:
         y["dissipated"],
         kept.share,
         strains=y.get("strains"),
+        peaks=y.get("peaks"),
     )
 
 
