@@ -112,7 +112,6 @@ def _crawler():
             "factorisations": round(stats.factorisations / stats.steps, 2),
         }
         share = took / best[0, False] - 1
-        # iterations are the rest of the price of softening, whose stiffness has a kink
         bar = {"error": share, "bar": 0.15, "bar_on": "error"} if count and not softens else {}
         yield Row("sorojax", settings, run_s=took, reference="without memory", **bar)
 
