@@ -94,6 +94,25 @@ def test_a_falling_rod_does_not_sink_in_and_loses_energy(drop, start, speed):
     assert rise(energy) < 2e-4 * float(energy[0])
 
 
+def test_a_damped_contact_holds_back_what_closes():
+    """Its damping matrix is the slope of the force by the rates: of a straight rod that sinks
+    in along the normal, exactly."""
+    rod = R.rod(SE2(), R.chebyshev(kappa_z=1), R.circle(RADIUS), nodes=4, **FINGER)
+    body = R.assembly(SE2(), rod=R.Part(rod, R.Free()))
+    law = LinePenalty(stiffness=5e7, smoothing=6e-6, damping=2.0)
+    floor = R.ObstacleContact(FLOOR, RADIUS, law, points=8, caps="both")
+    q, v = jnp.zeros(4).at[2].set(RADIUS - 4e-6), jnp.zeros(4).at[2].set(-0.1)
+
+    def at(v):
+        return R.part_motion(R.motion(body, q, v), 0)
+
+    damping = floor.linearised(T0, at(v)).damping
+    slope = -jax.jacfwd(lambda v: floor.linearised(T0, at(v)).force)(v)
+    assert float(damping[2, 2]) > 0
+    assert np.allclose(damping[2, 2], slope[2, 2], rtol=1e-9)
+    assert size(floor.linearised(T0, at(-6 * v)).damping) == 0.0  # it has let go
+
+
 def test_twice_the_points_give_the_same_equilibrium():
     rod = R.rod(SE2(), R.chebyshev(kappa_z=3), R.circle(RADIUS), **FINGER)
     stone = sdf.Circle([0.045, -0.014], 6e-3)

@@ -141,7 +141,7 @@ def tangent(
         approach = law.approach(jnp.sum(touch.normal * velocity, axis=1))
         stiffness = stiffness * approach
         if law.damping is not None:
-            closing = law.damping * force * (approach > 0)
+            closing = jnp.where(approach > 0, law.damping * force, jnp.zeros_like(force))
             viscous = _square(normal_rows, weights * closing)
         if law.friction is not None:
             sliding, size = _sliding(touch, velocity)
