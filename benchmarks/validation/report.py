@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from benchmarks.discover import HERE
 from benchmarks.validation import beam, tensile, tentacle, tentacle_film
@@ -49,8 +50,8 @@ def main(argv: list[str] | None = None) -> int:
         view.html_report(
             "Measured robots, predicted",
             sections,
-            lead="Measurements are those of others, named in each part; nothing that is "
-            "predicted was fitted.",
+            lead="Measurements are those of others, named in each part, which says what was "
+            "fitted too.",
         )
     )
     print(f"\n{PAGE}")
@@ -139,9 +140,15 @@ def of_tentacle() -> tuple[list[Line], view.Section]:
     text = (
         "A rod of two tapered links, its equilibrium under two tendons, and motion capture "
         "(poses and geometry: soromox, section Va of its paper's results, MIT licence). Red: "
-        "measured markers; dark: predicted ones. Parameters with their standard deviation "
-        "from the fit to all poses:\n\n" + "\n\n".join(str(found).splitlines()[1:-2])
+        "measured markers; dark: predicted ones. The table ends with the parameters and their "
+        "standard deviations from the fit to all poses."
     )
+    deviations = ravel_pytree(found.standard_errors)[0]
+    values = zip(found.names, ravel_pytree(p)[0], deviations, strict=True)
+    fitted = [
+        view.Number(name, f"{x:.4g} +- {deviation:.2g}", tentacle.UNITS[name.split("[")[0]])
+        for name, x, deviation in values
+    ]
     film = tentacle_film.film(p, record)
     FILM.parent.mkdir(exist_ok=True)
     print(film.save(FILM))
@@ -152,7 +159,7 @@ def of_tentacle() -> tuple[list[Line], view.Section]:
         ),
         (f"All {len(record.tension)} poses, tensions between them interpolated", film),
     ]
-    return lines, view.Section("Tentacle", text, pictures, _numbers(lines))
+    return lines, view.Section("Tentacle", text, pictures, _numbers(lines) + fitted)
 
 
 def of_beam(tip_load: float | None) -> tuple[list[Line], view.Section]:
