@@ -204,6 +204,62 @@ def test_answer_does_not_depend_on_the_load_steps():
     assert jnp.max(jnp.abs(once.displacement - often.displacement)) < 1e-8 * largest
 
 
+def _pulled(move=0.0, angle=0.0) -> fem.Problem:
+    """A bar whose right end is moved, or turned by a support of its own kind."""
+    bar = mesh.rectangle([0, 0], [0.04, 0.01], divisions=(4, 1), element=mesh.Quad9())
+    right = bar.node_sets["right"]
+    ends = {
+        "moved": fem.Prescribed(right, [move, 0.0], name="end"),
+        "turned": fem.Rotated(right, bar.points[right], angle, [0.04, 0.005], name="end"),
+    }
+    rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45)
+    supports = (fem.Fixed(bar.node_sets["left"]), ends["turned" if angle else "moved"])
+    return fem.problem(bar, rubber, kinematics=fem.PlaneStrain(0.01), supports=supports)
+
+
+@pytest.mark.parametrize("wrap", [lambda f: f, jax.jit], ids=["host", "jit"])
+def test_a_path_follows_a_support_that_moves(wrap):
+    """Each state is that of a problem with the support there, and so are slopes."""
+    rows, problem = jnp.array([[2 * mm, 0.0], [4 * mm, 1 * mm]]), _pulled()
+    nodes = problem.supports[1].nodes
+
+    def pull(rows):
+        path = fem.solve_path(problem, end=rows)
+        last = path.problem_under(path.loading[-1])
+        return path.displacements, fem.reaction_force(last, path.displacements[-1], nodes)
+
+    u, force = wrap(pull)(rows)
+    assert jnp.allclose(u[:, nodes], rows[:, None], atol=1e-12)
+    for state, row in zip(u, rows, strict=True):
+        alone = fem.solve(fem.with_load(problem, "end", row)).displacement
+        assert jnp.allclose(state, alone, atol=1e-9)
+    ways = jnp.zeros_like(rows).at[1, 0].set(1.0)
+    slope = wrap(lambda rows: jax.jvp(lambda r: pull(r)[1], (rows,), (ways,))[1])(rows)
+    step = 1e-6
+    seen = (pull(rows + step * ways)[1] - pull(rows - step * ways)[1]) / (2 * step)
+    assert force[0] > 0 and jnp.allclose(slope, seen, rtol=1e-6)
+
+
+def test_a_path_turns_a_support_along_its_arc():
+    path = fem.solve_path(_pulled(angle=0.1), end=jnp.array([0.3, 0.9]))
+    turned = path.problem_under(path.loading[-1])
+    assert float(turned.supports[1].angle) == 0.9
+    alone = fem.solve(turned).displacement
+    assert jnp.allclose(path.displacements[-1], alone, atol=1e-9)
+
+
+def test_supports_of_a_path_are_named():
+    with pytest.raises(ValueError, match=r"need exactly one of .* \['end'\]"):
+        fem.solve_path(_pulled(), fixed=jnp.zeros((1, 2)))
+    with pytest.raises(ValueError, match="has shape"):
+        fem.solve_path(_pulled(), end=jnp.zeros(3))
+    two = eqx.tree_at(
+        lambda p: p.supports, _pulled(), _pulled().supports + _pulled().supports[1:]
+    )
+    with pytest.raises(ValueError, match="2 loads or moved supports are called 'end'"):
+        fem.solve_path(two, end=jnp.zeros((1, 2)))
+
+
 def test_a_path_has_small_residuals_and_needs_few_iterations():
     path = fem.solve_path(_ring(), air=jnp.linspace(0, 20 * kPa, 5))
     steps = [step for stats in path.stats for step in stats.steps]

@@ -315,7 +315,8 @@ def _volumes(problem: Problem, displacements, facets) -> Float[Array, " steps"]:
 
 
 def _pressure(path: Path) -> Pressure:
-    load = next(load for load in path.problem.loads if load.name == path.name)
+    terms = *path.problem.loads, *path.problem.supports
+    load = next(term for term in terms if term.name == path.name)
     if not isinstance(load, Pressure):
         raise ValueError(
             f"identify: the path is driven by the {type(load).__name__} '{path.name}', need a "

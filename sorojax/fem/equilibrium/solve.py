@@ -4,6 +4,7 @@ The derivative is that of the implicit function at the converged state: one more
 back-substitution per direction, whatever steps the solver took to get there.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -74,10 +75,10 @@ class Solution(eqx.Module):
 
 @displayed
 class Path(eqx.Module):
-    """Equilibria along a path: `values` of the load `name`, or of the volume of that cavity
-    [m^3], whose gauge `pressures` [Pa] are found; one state for each. A path over `times` [s]
-    has the `strains` that a viscoelastic body remembers at each, that of a body that softens
-    its `peaks` [J/m^3] (`fem.relaxation`).
+    """Equilibria along a path: `values` of the load or moved support `name`, or of the volume
+    of that cavity [m^3], whose gauge `pressures` [Pa] are found; one state for each. A path
+    over `times` [s] has the `strains` that a viscoelastic body remembers at each, that of a
+    body that softens its `peaks` [J/m^3] (`fem.relaxation`).
 
     A path that stops early is cut there; under `jit` and `vmap` it keeps its length and
     is NaN from there on. `stats` has one entry for each value, as in `Solution`; it is
@@ -241,7 +242,7 @@ def solve_path(
     throw: bool = True,
     **values: Float[Array, "steps ..."],
 ) -> Path:
-    """Equilibria for a sequence of values of one named load, the others held.
+    """Equilibria for a sequence of values of one named load or moved support, the others held.
 
     With `times` a body of `material.Viscoelastic` relaxes and creeps on the way, without
     inertia: the first state is that of the first value held for long, steps are of order 2.
@@ -259,15 +260,16 @@ def solve_path(
         throw: Raise when a value has no equilibrium, otherwise stop the path there. Under
             `jit` and `vmap` nothing is raised: check `status`.
         **values: One load by name, with one value per state in the unit of the load, as in
-            `solve_path(problem, air=jnp.linspace(0, 20 * kPa, 21))`.
+            `solve_path(problem, air=jnp.linspace(0, 20 * kPa, 21))`; or one `Prescribed` or
+            `Rotated` support, with its displacements [m] or angles [rad].
 
     Returns:
         Displacements [m], values, and how each search ended.
 
     Raises:
         ConvergenceError: If `throw` and a step failed after all cuts.
-        ValueError: If not exactly one existing load is named, or its values have the wrong
-            shape or are not finite.
+        ValueError: If not exactly one existing load or moved support is named, or its values
+            have the wrong shape or are not finite.
 
     Example:
         >>> bar = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1),
@@ -397,16 +399,16 @@ def _status(failed: Bool[Array, "..."]) -> Status:
 
 
 def _named_values(problem: Problem, values: dict) -> tuple[str, Float[Array, "steps ..."]]:
-    names = [load.name for load in problem.loads]
+    names = _names(problem)
     if len(values) != 1 or next(iter(values)) not in names:
         raise ValueError(
             f"fem.solve_path: got values for {sorted(values)}, need exactly one of the loads "
-            f"{names}. Name a load with `name=`."
+            f"and moved supports {names}. Name one with `name=`."
         )
     name, row = next(iter(values.items()))
     row = real(row)
     _check.finite("fem.solve_path", name, row, "Use SI units: jnp.linspace(0, 20 * kPa, 21).")
-    want = problem.loads[names.index(name)].value.shape
+    want = _value_of(problem, name)(problem).shape
     if row.shape[1:] != want or not row.shape:
         raise ValueError(
             f"fem.solve_path: `{name}` has shape {row.shape}, need (steps, *{want})."
@@ -414,18 +416,43 @@ def _named_values(problem: Problem, values: dict) -> tuple[str, Float[Array, "st
     return name, row
 
 
-def with_load(problem: Problem, name: str, value: Float[Array, "..."]) -> Problem:
-    """`problem` with the load called `name` set to `value`."""
-    names = [load.name for load in problem.loads]
+def _names(problem: Problem) -> list[str]:
+    """Names of the loads, then of the supports that move."""
+    moved = [support.name for support in problem.supports if support.ramped is not None]
+    return [load.name for load in problem.loads] + moved
+
+
+def _value_of(problem: Problem, name: str) -> Callable[[Problem], Float[Array, "..."]]:
+    """Where a problem has the value of the load or moved support of that name."""
+    names = _names(problem)
     if name not in names:
         raise ValueError(
-            f"fem.with_load: no load is called {name!r}, need one of {names}. Set `name=` "
-            "where a load is made."
+            f"fem.with_load: no load or moved support is called {name!r}, need one of {names}. "
+            "Set `name=` where it is made."
         )
-    index = names.index(name)
+    if names.count(name) > 1:
+        raise ValueError(
+            f"fem.with_load: {names.count(name)} loads or moved supports are called {name!r}, "
+            "need one. Give each its own `name=`."
+        )
+    index = names.index(name) - len(problem.loads)
+    if index < 0:
+        return lambda p: p.loads[index].value
+    moved = [k for k, s in enumerate(problem.supports) if s.ramped is not None]
+    place, field = moved[index], problem.supports[moved[index]].ramped
+    assert field is not None
+    return lambda p: getattr(p.supports[place], field)
+
+
+def with_load(problem: Problem, name: str, value: Float[Array, "..."]) -> Problem:
+    """`problem` with the load called `name` set to `value`, or the support of that name moved
+    by it: displacements [m] of a `Prescribed`, the angle [rad] of a `Rotated`."""
+    where = _value_of(problem, name)
     # a weakly typed number would compile every kernel again
-    made = eqx.tree_at(lambda p: p.loads[index].value, problem, real(value))
-    _check.same_space("fem.with_load", problem.loads[index], made.loads[index])
+    made = eqx.tree_at(where, problem, real(value))
+    if name in (names := [load.name for load in problem.loads]):
+        index = names.index(name)
+        _check.same_space("fem.with_load", problem.loads[index], made.loads[index])
     return made
 
 
