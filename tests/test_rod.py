@@ -462,6 +462,26 @@ def test_time_and_points_do_not_retrace():
 # Bad input
 
 
+def test_stiffness_and_mass_may_be_those_of_two_sections():
+    """Each of a tapered rod is that of the rod with its section alone, and so are slopes."""
+    thick = R.taper(R.circle, 9e-3, 5e-3)
+    made = finger(mass_section=thick)
+    heavy = R.rod(SE3(), R.chebyshev(kappa_y=3, kappa_z=3), thick, **FINGER)
+    q, _ = drawn_state()
+    assert jnp.array_equal(R.mass_matrix(made, q), R.mass_matrix(heavy, q))
+    stiff, soft = R.operators(finger()), R.operators(made)
+    assert jnp.array_equal(stiff.stiffness, soft.stiffness)
+
+    def tip_mass(scale):
+        return R.mass_matrix(finger(mass_section=R.scaled(DISC, scale)), q)[0, 0]
+
+    grown = (tip_mass(1.001) - tip_mass(0.999)) / 0.002
+    assert np.isclose(jax.grad(tip_mass)(1.0), grown, rtol=1e-5)
+    with pytest.raises(ValueError, match="`area` has shape"):
+        finger(mass_section=R.circle(np.ones(3)))
+
+
+@pytest.mark.versions
 def test_messages_name_the_remedy():
     with pytest.raises(ValueError, match="need one or more of kappa_x"):
         R.chebyshev(curvature=3)

@@ -12,6 +12,7 @@ from sorojax.math.linalg.dense import product
 from sorojax.math.quadrature import gauss_legendre, integration_matrix, interpolation_rows
 from sorojax.rod.model.basis import STRAINS
 from sorojax.rod.model.rod import Rod, strain_names
+from sorojax.rod.model.section import Section
 
 _CELL_POINTS = 12
 
@@ -122,7 +123,7 @@ def operators(rod: Rod) -> Operators:
         moments=length * _moments(rod, dtype),
         rest_moments=length * _rest_moments(rod, dtype),
         rest_strain=_rest_strain(rod, dtype),
-        mass=length * weights * _along(rod, rod.material.density * rod.section.area),
+        mass=length * weights * _along(rod, rod.material.density * _carrying(rod).area),
         rotary=length * weights[None, :] * rotary,
         stiffness=_stiffness(rod, rows, weights),
         mass_offset=_mass_offset(rod),
@@ -169,9 +170,14 @@ def _rest_strain(rod: Rod, dtype) -> Float[Array, "strain *quad"]:
     return jnp.array(straight, dtype)
 
 
+def _carrying(rod: Rod) -> Section:
+    """The section by which the rod carries mass."""
+    return rod.section if rod.mass_section is None else rod.mass_section
+
+
 def _rotary(rod: Rod) -> Float[Array, "rot quad"]:
     """Rotary inertia per length about the centres of mass [kg m]."""
-    section, density = rod.section, rod.material.density
+    section, density = _carrying(rod), rod.material.density
     about_y, about_z = section.second_moment_y, section.second_moment_z
     if section.mass_offset_z is not None:
         about_y = about_y - section.area * section.mass_offset_z**2
@@ -183,7 +189,7 @@ def _rotary(rod: Rod) -> Float[Array, "rot quad"]:
 
 
 def _mass_offset(rod: Rod) -> Float[Array, "across quad"] | None:
-    section = rod.section
+    section = _carrying(rod)
     offsets = [section.mass_offset_y, section.mass_offset_z][: rod.group.space_dim - 1]
     if all(offset is None for offset in offsets):
         return None

@@ -82,6 +82,7 @@ class Rod(eqx.Module, Generic[G]):
             node if they vary.
         nodes: Number of Gauss nodes along the rod.
         breaks: Where section or rest strain jump; those of the basis need no mention.
+        mass_section: Section by which the rod carries mass, if it is not that which resists.
     """
 
     group: G
@@ -92,6 +93,7 @@ class Rod(eqx.Module, Generic[G]):
     rest_strain: Float[Array, "strain *quad"] | None = eqx.field(converter=optional_real)
     nodes: int = eqx.field(static=True)
     breaks: tuple[float, ...] = eqx.field(static=True, default=())
+    mass_section: Section | None = None
 
     def __check_init__(self):
         _check.positive("rod", "length", self.length, "m", "Give the rest length.")
@@ -103,8 +105,8 @@ class Rod(eqx.Module, Generic[G]):
                 f"has {', '.join(names)}. A planar rod bends about z; use SE3() otherwise."
             )
         _check_nodes(self.nodes, self.basis, self.quadrature)
-        for part in (self.section, self.material):
-            for field in dataclasses.fields(part):
+        for part in (self.section, self.material, self.mass_section):
+            for field in () if part is None else dataclasses.fields(part):
                 _check_field(field.name, getattr(part, field.name), self.nodes)
         if self.rest_strain is not None:
             do = f"Give one value per strain: {', '.join(names)}; stretch rests at 1."
@@ -126,7 +128,8 @@ class Rod(eqx.Module, Generic[G]):
             f"Rod in {type(self.group).__name__}: length {number(self.length, 'm')}, modes "
             f"{modes}, {self.nodes} nodes\n"
             f"  section   area {number(section.area, 'm^2')}, second moments y "
-            f"{number(section.second_moment_y)}, z {number(section.second_moment_z, 'm^4')}\n"
+            f"{number(section.second_moment_y)}, z {number(section.second_moment_z, 'm^4')}"
+            f"{'' if self.mass_section is None else '; mass by another'}\n"
             f"  material  E {number(material.young_modulus, 'Pa')}, nu "
             f"{number(material.poisson_ratio)}, density {number(material.density, 'kg/m^3')}"
         )
@@ -145,6 +148,7 @@ def rod(
     rest_strain: Numbers | AlongRod[Any] | None = None,
     nodes: int | None = None,
     breaks: Sequence[float] = (),
+    mass_section: Section | AlongRod[Section] | None = None,
 ) -> Rod[G]:
     """A Cosserat rod whose strains are combinations of modes, clamped at its base.
 
@@ -170,6 +174,9 @@ def rod(
             where its numbers are known. Add some when the rod bends by turns. With breaks a
             multiple of the spans.
         breaks: Where section or rest strain jump or kink, in (0, 1); nowhere by default.
+        mass_section: Section whose area and second moments carry mass, where they are not
+            those that resist: a backbone within soft skin, cables, a fluid. `section` by
+            default.
 
     Returns:
         The rod.
@@ -207,7 +214,10 @@ def rod(
         material = Elastic(*(_at(given[name], s) for name in given))
     if callable(rest_strain):
         rest_strain = real(rest_strain(s)).T
-    return Rod(group, basis, _at(section, s), material, length, rest_strain, nodes, own)
+    carrying = _at(mass_section, s)
+    return Rod(
+        group, basis, _at(section, s), material, length, rest_strain, nodes, own, carrying
+    )
 
 
 _PER_NODE = 3.0  # [rad] of a coil; leaves less than 1e-4 of the length at the tip
