@@ -56,8 +56,10 @@ def test_links_of_the_readme_lead_somewhere_on_an_index_too():
     links = re.findall(r"\]\(([^)\s]+)\)", text)
     assert links and all(re.match("https://", link) for link in links), links
     ours = [link for link in links if PROJECT["urls"]["Source"] in link or "raw." in link]
-    beside = [link.split("/main/")[1] for link in ours]
-    assert [name for name in beside if not (ROOT / name).exists()] == []
+    beside = [link.split("/main/")[1].partition("#") for link in ours]
+    assert [name for name, *_ in beside if not (ROOT / name).exists()] == []
+    for name, _, heading in beside:
+        assert not heading or heading.replace("-", " ") in (ROOT / name).read_text().lower()
     assert all("raw." in link for link in re.findall(r"!\[[^]]*\]\(([^)]+)\)", text))
 
 
