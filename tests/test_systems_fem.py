@@ -266,6 +266,27 @@ def bellows():
     return S.FemBody(problem, fem.Rayleigh(5.0, 1e-3), markers={"tip": tip})
 
 
+def test_a_body_that_nothing_drives_moves_as_alone():
+    bar = mesh.rectangle([0, 0], [0.04, 0.01], divisions=(3, 1))
+    rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.3, density=1000.0)
+    problem = fem.problem(
+        bar,
+        rubber,
+        kinematics=fem.PlaneStrain(0.01),
+        supports=(fem.Fixed(bar.node_sets["left"]),),
+        loads=(fem.Gravity((0.0, -9.81)),),
+    )
+    tip = int(bar.node_sets["right"][0])
+    network = S.Network({"bar": S.FemBody(problem, markers={"tip": tip})}, {})
+    film = S.simulate(network, 0.01, step=1e-3, save=2)
+    alone = fem.simulate(problem, 0.01, 1e-3, method=fem.GeneralisedAlpha(0.5))
+    moved = film["bar.tip_position"][-1] - bar.points[tip]
+    assert moved[1] < -1e-4
+    assert jnp.allclose(
+        moved, alone.displacements[-1, tip], rtol=0, atol=1e-4 * jnp.abs(moved[1])
+    )
+
+
 @pytest.mark.slow
 def test_a_regulated_bellows_reaches_its_pressure_and_the_place_of_statics():
     body = bellows()

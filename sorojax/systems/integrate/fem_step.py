@@ -77,6 +77,12 @@ class _Pass(NamedTuple):
     running: Bool[Array, ""]
 
 
+def _ravelled(tree: PyTree) -> tuple[Array, Callable[[Array], PyTree]]:
+    """Numbers as one vector, and back; no numbers have the precision of others by default."""
+    flat, build = ravel_pytree(tree)
+    return (flat if flat.size else jnp.zeros(0)), build
+
+
 @eqx.filter_custom_jvp
 def balanced(
     equations: Equations, newton: fem.Newton, given: PyTree
@@ -100,7 +106,7 @@ def _balanced_jvp(primals, tangents):
         stages = equations.stages(given)
         forces = {k: residual(_loaded(s, w[k]), u[k]).ravel() for k, s in stages.items()}
         held = {k: known_values(s.step.terms[1], *u[k].shape) for k, s in stages.items()}
-        return forces, held, ravel_pytree(equations.answer(given, u))[0]
+        return forces, held, _ravelled(equations.answer(given, u))[0]
 
     forces, held, answer = filled(*eqx.filter_jvp(unbalanced, (given,), tangents[2:]))
     stages = equations.stages(given)
@@ -108,7 +114,7 @@ def _balanced_jvp(primals, tangents):
         k: linearise(_loaded(s, w[k]), s.prepared, u[k], u[k]).values for k, s in stages.items()
     }
     du, dw = _solved(equations, given, matrices, stages, u, w, forces, held, -answer)
-    return found, (du, ravel_pytree(w)[1](dw), None)
+    return found, (du, _ravelled(w)[1](dw), None)
 
 
 def _loaded(stage: Stage, values: dict[str, Array]) -> fem.Problem:
@@ -128,7 +134,7 @@ def loaded_step(stage: Stage, values: dict[str, Array]) -> TimeStep:
 def _newton(equations: Equations, newton: fem.Newton, given):
     stages = equations.stages(given)
     start = {k: s.state.displacement for k, s in stages.items()}
-    w, unravel = ravel_pytree({k: s.drives for k, s in stages.items()})
+    w, unravel = _ravelled({k: s.drives for k, s in stages.items()})
     zero, none = jnp.zeros((), w.dtype), jnp.zeros((), jnp.int32)
     still = jax.tree.map(jnp.zeros_like, start)
     begin = _Pass(
@@ -195,7 +201,7 @@ def _judged(equations, newton, given, stages, unravel, now: _Pass, problems, fou
 
     def examined():
         values = unravel(now.w)
-        answer = ravel_pytree(equations.answer(given, now.u))[0]
+        answer = _ravelled(equations.answer(given, now.u))[0]
         gap = now.w - answer
         held = {k: known_values(s.step.terms[1], *now.u[k].shape) for k, s in stages.items()}
         moves = {k: _move(s.prepared.known, held[k], now.u[k]) for k, s in stages.items()}
@@ -275,7 +281,7 @@ def _small(newton, stages, unravel, problems, found: dict[str, Linearised], u, v
 def _solved(equations, given, matrices, stages, u: Fields, values: Drives, forces, moves, gap):
     """du, dw of the bordered equations: tangents `matrices`, unbalanced `forces`, supports
     that move by `moves`, and the `gap` w - W."""
-    w, unravel = ravel_pytree(values)
+    w, unravel = _ravelled(values)
     first: dict[str, Array] = {}
     columns: dict[str, Array] = {}
     for name, stage in stages.items():
@@ -296,7 +302,7 @@ def _solved(equations, given, matrices, stages, u: Fields, values: Drives, force
         """How the answer moves with the bodies."""
         dots = {k: row.reshape(u[k].shape) for k, row in rows.items()}
         tangent = jax.jvp(lambda u: equations.answer(given, u), (u,), (dots,))[1]
-        return ravel_pytree(tangent)[0]
+        return _ravelled(tangent)[0]
 
     eye = jnp.eye(w.shape[0], dtype=w.dtype)
     dw = jnp.linalg.solve(eye - jax.vmap(along)(columns).T, along(first) - gap)
