@@ -30,14 +30,21 @@ def positive(where: str, name: str, value: Any, unit: str, do: str) -> None:
         numbers = np.asarray(value)
         if not (np.all(np.isfinite(numbers)) and np.all(numbers > 0)):
             raise ValueError(
-                f"{where}: `{name}` must be positive, got {_short(value)} {unit}. {do}"
+                f"{where}: `{name}` must be positive, got {_short(value)}{_after(unit)}. {do}"
             )
+
+
+def _after(unit: str) -> str:
+    """A unit behind its number; nothing where there is none."""
+    return f" {unit}" if unit else ""
 
 
 def not_negative(where: str, name: str, value: Any, unit: str, do: str) -> None:
     """Raise a `ValueError` if an entry of `value` is known to be negative."""
     if is_concrete(value) and np.any(np.asarray(value) < 0):
-        raise ValueError(f"{where}: `{name}` is {_short(value)} {unit}, need 0 or more. {do}")
+        raise ValueError(
+            f"{where}: `{name}` is {_short(value)}{_after(unit)}, need 0 or more. {do}"
+        )
 
 
 def between(
@@ -59,9 +66,9 @@ def between(
         above = numbers >= low - slack if ends[0] == "[" else numbers > low
         below = numbers <= high + slack if ends[1] == "]" else numbers < high
         if not (np.all(above) and np.all(below)):
+            span = f"{ends[0]}{low:g}, {high:g}{ends[1]}{_after(unit)}"
             raise ValueError(
-                f"{where}: `{name}` must lie in {ends[0]}{low:g}, {high:g}{ends[1]} {unit}, "
-                f"got {_short(value)} {unit}. {do}"
+                f"{where}: `{name}` must lie in {span}, got {_short(value)}{_after(unit)}. {do}"
             )
 
 
