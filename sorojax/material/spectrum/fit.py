@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax.material.fit import unit_covariance
 from sorojax.material.spectrum.records import AbstractViscoelasticTest
 from sorojax.material.viscoelastic import Prony
 
@@ -459,12 +460,6 @@ def _covariance(fit: _Fit, data: _Data) -> np.ndarray:
     """Of the logarithms of what is fitted; NaN where it is unknown."""
     slopes, errors = fit.slopes[:, int(not data.has_modulus) :], fit.errors
     freedom = len(errors) - slopes.shape[1]
-    scale = np.linalg.norm(slopes, axis=0)
-    unknown = np.full((slopes.shape[1],) * 2, np.nan)
-    if not np.all(scale > 0) or freedom < 0 or (freedom == 0 and not data.is_stated):
-        return unknown
-    triangle = np.linalg.qr(slopes / scale[None], mode="r")
-    if np.linalg.cond(triangle) > 1e12:
-        return unknown
-    half = np.linalg.inv(triangle) / scale[:, None]
-    return half @ half.T * (1.0 if data.is_stated else errors @ errors / freedom)
+    if freedom < 0 or (freedom == 0 and not data.is_stated):
+        return np.full((slopes.shape[1],) * 2, np.nan)
+    return unit_covariance(slopes) * (1.0 if data.is_stated else errors @ errors / freedom)
