@@ -120,8 +120,10 @@ def of_tentacle() -> tuple[list[Line], view.Section]:
             "tendon-driven silicone tentacle, 14 poses (soromox, MIT)",
             f"{len(found.names)} physical parameters on 12 poses",
             f"the other 2, for {len(left.pairs)} pairs",
-            f"mean marker error: median {np.median(unknown):.1f} mm over pairs, worst "
-            f"{unknown.max():.1f} mm (poses {worst}), bar {BAR:g} mm; median "
+            f"mean marker error: median {np.median(unknown):.1f} and mean "
+            f"{unknown.mean():.1f} mm over pairs, worst {unknown.max():.1f} mm "
+            f"(poses {worst}), {100 * np.mean(unknown < BAR):.0f} % of pairs below {BAR:g} mm; "
+            "median "
             f"{np.median(known):.1f} mm and worst {known.max():.1f} mm if it is known in which "
             "recording marker 2 slipped",
             f"below {tentacle.NOISE / mm:g} mm",

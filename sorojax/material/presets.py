@@ -6,11 +6,11 @@ Open Database License): uniaxial pull to failure, one rate (450 mm/min), cross-h
 mean curves of one batch. The specimens of a batch differ by about 1 %, but batches by far
 more: the Dragon Skin 10 of a published beam test (arXiv:2201.12560) is 1.6 times as stiff.
 The first 10 % of strain carry the play of the grips. Fits are those of an incompressible
-bar: at the usual Poisson ratio of 0.49 the material is softer in tension, by 3 % at 100 %
-strain and 5 to 9 % at 200 %; pass `poisson_ratio=0.4999` where that counts. A name ending
-in `_full` is an Ogden fit up to failure, stable everywhere; the others are Yeoh fits up to
-300 %, better at moderate strain. Numbers of the `sorotoki_` family are those of its source
-code.
+bar: at the usual Poisson ratio of 0.49 the material is softer in tension, by 2 to 4 % at
+100 % strain and 5 to 10 % at 200 %; pass `poisson_ratio=0.4999` where that counts. A name
+ending in `_full` is an Ogden fit up to failure, stable everywhere; the others are Yeoh fits
+up to 300 %, better at moderate strain. Numbers of the `sorotoki_` family are those of its
+source code.
 
 Densities of the others are those of the maker's data sheets. A relaxation spectrum is there for
 Dragon Skin 10 only, from the swings of one beam: for the others no source with numbers is known
