@@ -82,6 +82,7 @@ from sorojax.rod.model.assembly import (
     Assembly,
     Part,
     assembly,
+    close,
     num_coordinates,
     num_dof,
     rest,
@@ -98,7 +99,17 @@ from sorojax.rod.model.basis import (
     functions,
     orthonormalise,
 )
-from sorojax.rod.model.joint import AbstractJoint, Fixed, Free, Prismatic, Revolute, Screw
+from sorojax.rod.model.closure import Closure
+from sorojax.rod.model.joint import (
+    AbstractJoint,
+    Fixed,
+    Free,
+    Prismatic,
+    Revolute,
+    Roller,
+    Screw,
+    Spherical,
+)
 from sorojax.rod.model.link import Link
 from sorojax.rod.model.model import inertia, motion, operators
 from sorojax.rod.model.polynomials import (
@@ -159,6 +170,7 @@ __all__ = [
     "Bernstein",
     "Buoyancy",
     "Chebyshev",
+    "Closure",
     "Converging",
     "Damping",
     "Direction",
@@ -194,10 +206,12 @@ __all__ = [
     "Rod",
     "RodContact",
     "RodState",
+    "Roller",
     "Routed",
     "Screw",
     "Section",
     "SelfContact",
+    "Spherical",
     "Straight",
     "StrainBasis",
     "Tendons",
@@ -214,6 +228,7 @@ __all__ = [
     "bspline",
     "chebyshev",
     "circle",
+    "close",
     "columns",
     "constant",
     "contact_energy",

@@ -12,6 +12,7 @@ from sorojax import _check
 from sorojax._arguments import axis_lengths
 from sorojax._display import displayed
 from sorojax._types import optional_real, real
+from sorojax.rod.model.closure import Closure, check_closure
 from sorojax.rod.model.joint import AbstractJoint, Fixed, Group
 from sorojax.rod.model.link import Link
 from sorojax.rod.model.rod import Rod
@@ -49,17 +50,23 @@ class Assembly(eqx.Module):
         group: `SE2()` or `SE3()`.
         names: Names of the parts; a part comes after what carries it.
         parts: The parts.
+        loops: Names of the closures.
+        closures: Joints that close loops, or hold parts to the ground; `close` adds them.
     """
 
     group: Group
     names: tuple[str, ...] = eqx.field(static=True)
     parts: tuple[Part, ...]
+    loops: tuple[str, ...] = eqx.field(static=True, default=())
+    closures: tuple[Closure, ...] = ()
 
     def __check_init__(self):
         if not self.parts:
             raise ValueError("assembly: got no part, need one or more. Name it: arm=Part(rod).")
         for index, (name, part) in enumerate(zip(self.names, self.parts, strict=True)):
             _check_part(self.group, name, part, self.names[:index])
+        for name in self.loops:
+            check_closure(self, name)
 
     def __getitem__(self, name: str) -> Part:
         return self.parts[index_of(self, name)]
@@ -70,6 +77,9 @@ class Assembly(eqx.Module):
             where = f"on {part.on}" if part.on else "on the ground"
             kind, joint = type(part.body).__name__, type(part.joint).__name__
             rows.append(f"  {name}: {kind}, {joint} joint {where}")
+        for name, closure in zip(self.loops, self.closures, strict=True):
+            where, joint = closure.on or "the ground", type(closure.joint).__name__
+            rows.append(f"  {name}: {joint} joint of {closure.part} on {where}, closes a loop")
         return "\n".join(rows)
 
 
@@ -125,6 +135,48 @@ def serial(*rods: Rod, joint: AbstractJoint | None = None) -> Assembly:
     others = [Part(rod, on=f"segment_{k}") for k, rod in enumerate(rods[1:])]
     names = tuple(f"segment_{k}" for k in range(len(rods)))
     return Assembly(rods[0].group, names, (first, *others))
+
+
+def close(model: Rod | Assembly, **closures: Closure) -> Assembly:
+    """The model with joints between points of its parts, or to the ground, beside those of its
+    tree: rings, four-bars, parallel robots, rods held or driven at both ends.
+
+    Where the coordinates are q, the closures ask g(q, t) = 0 and give the forces G(q)' lambda
+    with G = dg/dq: `equilibrium`, paths of it and `rollout` find the reactions lambda.
+
+    Args:
+        model: A rod, which becomes an assembly with the part `rod`, or an assembly.
+        **closures: Closures by name.
+
+    Returns:
+        The assembly; its coordinates are those of the tree.
+
+    Raises:
+        ValueError: If a closure names no part, a name is taken, or a joint cannot close a loop.
+
+    Example:
+        >>> beam = rod.rod(SE2(), rod.chebyshev(kappa_z=4), rod.circle(5 * mm), length=0.1,
+        ...                young_modulus=1e6, poisson_ratio=0.5, density=1000)
+        >>> held = rod.close(beam, tip=rod.Closure("rod", rod.Roller(),
+        ...                                        offset=rod.tip_pose(beam, rod.rest(beam))))
+        >>> rest = rod.equilibrium(held, (rod.Gravity(),))
+        >>> print(f"{float(rest.reactions['tip'][2]) * 1e3:.1f} mN")
+        28.9 mN
+
+    Reference:
+        Featherstone, Rigid Body Dynamics Algorithms, 2008, chapter 8.
+    """
+    if isinstance(model, Rod):
+        model = Assembly(model.group, ("rod",), (Part(model),))
+    if taken := set(closures).intersection(model.loops):
+        raise ValueError(f"close: there is a closure `{min(taken)}` already. Rename one.")
+    return Assembly(
+        model.group,
+        model.names,
+        model.parts,
+        (*model.loops, *closures),
+        (*model.closures, *closures.values()),
+    )
 
 
 def index_of(assembly: Assembly, name: str) -> int:

@@ -65,6 +65,16 @@ class AbstractJoint(eqx.Module):
         """Force of the joint's own spring and damper."""
         return None
 
+    def violation(
+        self, group: Group, rotation: Float[Array, "dim dim"], position: Float[Array, " dim"]
+    ) -> Float[Array, " held"]:
+        """How far the moving frame is from where the joint can put it [rad], [m]: one number
+        for each motion that the joint holds. What a `Closure` keeps at zero."""
+        raise ValueError(
+            f"Closure: {type(self).__name__} cannot close a loop, need Fixed, Revolute, "
+            "Prismatic, Spherical or Roller. Put it between two parts of the tree instead."
+        )
+
 
 class Fixed(AbstractJoint):
     """No motion."""
@@ -77,6 +87,9 @@ class Fixed(AbstractJoint):
 
     def pose(self, group, q):
         return jnp.eye(group.space_dim, dtype=q.dtype), jnp.zeros(group.space_dim, q.dtype)
+
+    def violation(self, group, rotation, position):
+        return jnp.concatenate([_turn(rotation), position])
 
 
 class AbstractAxial(AbstractJoint):
@@ -127,6 +140,15 @@ class Revolute(AbstractAxial):
         x, y, z = sine * self._spin(group, q.dtype)
         return rotation_matrix((cosine, x, y, z)), still
 
+    def violation(self, group, rotation, position):
+        if group.space_dim == 2:
+            return position
+        axis = self._spin(group, position.dtype)
+        turned = rotation @ axis
+        # twice the sine of half the angle between both axes, which vanishes at zero alone
+        half = jnp.sqrt(jnp.maximum(1 + axis @ turned, _HALF_TURN) / 2)
+        return jnp.concatenate([_across(axis) @ turned / half, position])
+
     def _spin(self, group: Group, dtype) -> Array:
         if group.space_dim == 2:
             return jnp.ones(1, dtype)
@@ -149,10 +171,91 @@ class Prismatic(AbstractAxial):
     def pose(self, group, q):
         return jnp.eye(group.space_dim, dtype=q.dtype), q[0] * self._along(group, q.dtype)
 
+    def violation(self, group, rotation, position):
+        across = _across(self._along(group, position.dtype))
+        return jnp.concatenate([_turn(rotation), across @ position])
+
     def _along(self, group: Group, dtype) -> Array:
-        dim = group.space_dim
-        axis = jnp.zeros(dim).at[0].set(1.0) if self.axis is None else self.axis
-        return _unit(axis, dim, dtype)
+        return _along(self.axis, group, dtype)
+
+
+class Spherical(AbstractJoint):
+    """Any rotation about a point: a ball joint, in the plane a pin.
+
+    Coordinates: a unit quaternion (scalar first), in a plane the angle [rad]. Rates: angular
+    velocity along the axes of the joint frame [rad/s].
+    """
+
+    def num_coordinates(self, group):
+        return 4 if group.space_dim == 3 else 1
+
+    def num_dof(self, group):
+        return group.rotation_dim
+
+    def axes(self, group, dtype):
+        return jnp.eye(group.algebra_dim, group.rotation_dim, dtype=dtype)
+
+    def pose(self, group, q):
+        still = jnp.zeros(group.space_dim, q.dtype)
+        if group.space_dim == 2:
+            return plane_rotation(q[0]), still
+        return rotation_matrix(_unit_quaternion(q)), still
+
+    def rest(self, group, dtype):
+        rest = jnp.zeros(self.num_coordinates(group), dtype)
+        return rest if group.space_dim == 2 else rest.at[0].set(1)
+
+    def retract(self, group, q, increment):
+        return q + increment if group.space_dim == 2 else _turned(q, increment)
+
+    def rate(self, group, q, v):
+        return v if group.space_dim == 2 else quaternion_rate(v, q)
+
+    def violation(self, group, rotation, position):
+        return position
+
+
+class Roller(AbstractJoint):
+    """A pin that slides along an axis, in space a ball joint that does: a roller support.
+
+    Coordinates and rates are those of `Spherical`, then the place on the axis [m], [m/s].
+
+    Attributes:
+        axis: Direction in the joint frame, of any length; x if omitted.
+    """
+
+    axis: Float[Array, " dim"] | None = eqx.field(converter=optional_real, default=None)
+
+    def num_coordinates(self, group):
+        return 1 + Spherical().num_coordinates(group)
+
+    def num_dof(self, group):
+        return 1 + group.rotation_dim
+
+    def axes(self, group, dtype):
+        still = jnp.zeros(group.rotation_dim, dtype)
+        slide = jnp.concatenate([still, self._along(group, dtype)])
+        return jnp.concatenate([Spherical().axes(group, dtype), slide[:, None]], axis=1)
+
+    def pose(self, group, q):
+        rotation, _ = Spherical().pose(group, q[:-1])
+        return rotation, q[-1] * self._along(group, q.dtype)
+
+    def rest(self, group, dtype):
+        return jnp.append(Spherical().rest(group, dtype), jnp.zeros((), dtype))
+
+    def retract(self, group, q, increment):
+        turned = Spherical().retract(group, q[:-1], increment[:-1])
+        return jnp.append(turned, q[-1] + increment[-1])
+
+    def rate(self, group, q, v):
+        return jnp.append(Spherical().rate(group, q[:-1], v[:-1]), v[-1])
+
+    def violation(self, group, rotation, position):
+        return _across(self._along(group, position.dtype)) @ position
+
+    def _along(self, group: Group, dtype) -> Array:
+        return _along(self.axis, group, dtype)
 
 
 class Free(AbstractJoint):
@@ -184,9 +287,7 @@ class Free(AbstractJoint):
     def retract(self, group, q, increment):
         if group.space_dim == 2:
             return q + increment
-        x, y, z = increment[:3]
-        turned = multiply(exponential((x, y, z)), _unit_quaternion(q))
-        return jnp.concatenate([jnp.stack(turned), q[4:] + increment[3:]])
+        return jnp.concatenate([_turned(q[:4], increment[:3]), q[4:] + increment[3:]])
 
     def rate(self, group, q, v):
         if group.space_dim == 2:
@@ -198,6 +299,48 @@ def _unit_quaternion(q: Array):
     # Between retractions the norm is 1 up to the error of an integrator.
     scale = 1 / jnp.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
     return scale * q[0], scale * q[1], scale * q[2], scale * q[3]
+
+
+def _turned(q: Float[Array, "4"], angle: Float[Array, "3"]) -> Float[Array, "4"]:
+    """A quaternion after a rotation vector along the axes of the joint frame."""
+    x, y, z = angle
+    return jnp.stack(multiply(exponential((x, y, z)), _unit_quaternion(q)))
+
+
+_HALF_TURN = 1e-12  # cosine beyond -1 from where the measures of a turn are held
+
+
+def _turn(rotation: Float[Array, "dim dim"]) -> Float[Array, " rot"]:
+    """A rotation as a vector of length 2 sin(angle / 2), which is zero at no other than none;
+    in a plane the angle."""
+    if rotation.shape[0] == 2:
+        return jnp.arctan2(rotation[1, 0], rotation[0, 0])[None]
+    twice = rotation - rotation.T
+    sine = jnp.stack([twice[2, 1], twice[0, 2], twice[1, 0]])
+    return sine / jnp.sqrt(jnp.maximum(1 + jnp.trace(rotation), _HALF_TURN))
+
+
+def _across(axis: Float[Array, " dim"]) -> Float[Array, "others dim"]:
+    """Unit vectors across a unit vector, as rows.
+
+    Reference:
+        Duff et al., "Building an orthonormal basis, revisited", J. Computer Graphics
+        Techniques 6, 2017.
+    """
+    if axis.shape[0] == 2:
+        return jnp.stack([-axis[1], axis[0]])[None]
+    x, y, z = axis
+    sign = jnp.where(z >= 0, 1.0, -1.0).astype(axis.dtype)
+    share = -1 / (sign + z)
+    mixed = x * y * share
+    first = jnp.stack([1 + sign * x**2 * share, sign * mixed, -sign * x])
+    return jnp.stack([first, jnp.stack([mixed, sign + y**2 * share, -y])])
+
+
+def _along(axis: Array | None, group: Group, dtype) -> Float[Array, " dim"]:
+    """A direction of unit length; x if omitted."""
+    axis = jnp.zeros(group.space_dim).at[0].set(1.0) if axis is None else axis
+    return _unit(axis, group.space_dim, dtype)
 
 
 def _unit(axis: Array, dim: int, dtype) -> Float[Array, " dim"]:
