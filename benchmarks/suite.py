@@ -14,7 +14,7 @@ class Cases(NamedTuple):
 
 
 ROWS = {
-    "rod statics": Cases(("rod.statics",), ("rod.accuracy", "rod.frequencies")),
+    "rod statics": Cases(("rod.statics",), ("rod.accuracy", "rod.closed", "rod.frequencies")),
     "rod dynamics": Cases(
         ("rod.acceleration", "rod.simulation", "rod.continuum"),
         ("rod.assembly", "rod.contact", "rod.damped", "rod.drift", "rod.flight"),

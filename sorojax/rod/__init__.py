@@ -141,6 +141,7 @@ from sorojax.rod.model.section import (
 )
 from sorojax.rod.statics.equilibrium import equilibrium
 from sorojax.rod.statics.inverse_kinematics import inverse_kinematics
+from sorojax.rod.statics.mobility import Mobility, mobility
 from sorojax.rod.statics.path import arc_length_path, equilibrium_path
 from sorojax.rod.statics.targets import (
     AbstractTarget,
@@ -190,6 +191,7 @@ __all__ = [
     "Link",
     "LinkContact",
     "LinkObstacle",
+    "Mobility",
     "ObstacleConstraint",
     "ObstacleContact",
     "OnSurface",
@@ -256,6 +258,7 @@ __all__ = [
     "kinetic_energy",
     "legendre",
     "mass_matrix",
+    "mobility",
     "momentum",
     "motion",
     "num_coordinates",

@@ -18,7 +18,7 @@ NONE = {
         "orthonormalise piecewise piecewise_constant piecewise_linear"
     ),
     "says that it has none": "arc_length_path",
-    "names, counts and slices": "columns num_coordinates num_dof slices strain_names",
+    "names, counts and slices": "columns mobility num_coordinates num_dof slices strain_names",
     "zero at any numbers": "rest",
 }
 
@@ -251,6 +251,14 @@ def held(at):
     return R.equilibrium(model, forces).q
 
 
+def pinned(at):
+    model, wrench, place, end = at
+    pose = homogeneous(jnp.eye(2), place)
+    held = R.close(model, tip=R.Closure("rod", R.Revolute(), offset=pose, at=end))
+    found = R.equilibrium(held, (R.PartForce("rod", R.PointWrench(wrench, 0.5)),))
+    return found.q, found.reactions
+
+
 def pressed(at):
     wrench, floor = at
     contact = R.ObstacleContact(floor, 6e-3, LinePenalty(5e5, 2e-5), points=16)
@@ -420,6 +428,11 @@ CASES = (
             two_rods, (LAW, jnp.array([6e-3, 6e-3]), MEET, 0.05 * MEET), step=1e-6, rtol=1e-5
         ),
         "equilibrium: a finger": Case(held, (FINGER, WRENCH, DOWN), rtol=1e-6),
+        "close: a finger held at both ends": Case(
+            pinned,
+            (FLAT, FLAT_WRENCH, jnp.array([0.06, 0.01]), jnp.asarray(0.9)),
+            rtol=1e-6,
+        ),
         "equilibrium: pressed on a floor": Case(
             pressed, (-FLAT_WRENCH, FLOOR), rtol=1e-5, step=1e-5
         ),

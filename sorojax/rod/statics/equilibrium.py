@@ -23,20 +23,27 @@ from sorojax.math.quadrature import gauss_legendre, interpolation_rows
 from sorojax.math.status import Status
 from sorojax.rod.dynamics.fields import is_curvature, strains_at
 from sorojax.rod.dynamics.tree import rod_motion
-from sorojax.rod.forces.loads import Load, relaxed, total_force
+from sorojax.rod.forces.loads import Load, relaxed
 from sorojax.rod.model.assembly import (
     dtype_of,
-    increments,
     is_flat,
     num_coordinates,
     num_dof,
     rest,
     rest as at_rest,
-    retract,
     slices,
 )
 from sorojax.rod.model.model import Model, inertia, motion, operators
 from sorojax.rod.model.rod import Rod, strain_names
+from sorojax.rod.statics.loops import (
+    advanced,
+    reactions_at,
+    strained,
+    unbalanced,
+    with_reactions,
+    within_closures,
+    without_reactions,
+)
 
 _RESOLVED = 1e-3  # of the length: what the quadrature may leave of a rod's tip
 _LONGEST = 10.0  # stretch [-]: no solid of a soft robot keeps together beyond
@@ -56,9 +63,10 @@ def checked_status(
         model: The rod or assembly.
         path: Coordinates of the answer, or of all saved states.
     """
-    model, path = jax.lax.stop_gradient((model, jnp.atleast_2d(path)))
+    path = jax.lax.stop_gradient(jnp.atleast_2d(path))
     good = status == Status.successful
     for rod, at in _rods(model):
+        rod = jax.lax.stop_gradient(rod)
         own = path[:, at]
         largest = own[jnp.argmax(jnp.sum(own**2, axis=1))] if len(own) > 1 else own[0]
         stretch, least = jax.vmap(lambda q: _stretches(rod, q))(own)  # noqa: B023
@@ -119,26 +127,26 @@ def _rods(model: Model) -> list[tuple[Rod, slice]]:
 _INERTIA_SHARE = 1e-6  # of the mean square frequency, for joints without a spring
 
 
-def squared(model: Model, q: Array, residual: Float[Array, " dof"]) -> Array:
-    """As many equations as coordinates: the residual along the coordinates that it can
+def squared(model: Model, x: Array, residual: Float[Array, " unknowns"]) -> Array:
+    """As many equations as unknowns: the residual along the coordinates that it can
     move, and the norm of a quaternion along the one it cannot."""
     if is_flat(model):
         return residual
     still = jnp.zeros_like(residual)
-    normal, along = jax.jvp(lambda d: retract(model, q, d), (still,), (residual,))
-    return along + q - normal
+    normal, along = jax.jvp(lambda d: advanced(model, x, d), (still,), (residual,))
+    return along + x - normal
 
 
 def linearised(
-    residual: Callable[[Array], Array], model: Model, q: Array
-) -> tuple[Float[Array, " dof"], Float[Array, "dof dof"]]:
+    residual: Callable[[Array], Array], model: Model, x: Array
+) -> tuple[Float[Array, " unknowns"], Float[Array, "unknowns unknowns"]]:
     """A residual and its exact tangent, one forward pass for all columns."""
 
     def along(increment):
-        value = residual(retract(model, q, increment))
+        value = residual(advanced(model, x, increment))
         return value, value
 
-    still = jnp.zeros(num_dof(model), q.dtype)
+    still = jnp.zeros(num_dof(model) + x.shape[0] - num_coordinates(model), x.dtype)
     slope, value = jax.jacfwd(along, has_aux=True)(still)
     return value, slope
 
@@ -195,9 +203,10 @@ def metric(model: Model, constants) -> Float[Array, "dof dof"]:
     return stiffness + share * mass
 
 
-def unit_energy(model: Model, metric: Float[Array, "dof dof"]) -> Float[Array, ""]:
+def unit_energy(model: Model, metric: Float[Array, "..."]) -> Float[Array, ""]:
     """Size of `metric` at a bend of one radian and a strain of one."""
-    return jnp.diag(metric) @ _units(model) ** 2
+    units = _units(model)
+    return jnp.diag(metric)[: units.shape[0]] @ units**2
 
 
 def _units(model: Model) -> Float[Array, " dof"]:
@@ -233,6 +242,8 @@ class Solution(eqx.Module):
         error: Of inverse kinematics: norm of the weighted errors of all targets [m].
         overlap: Of inverse kinematics: by how much the worst section misses its distance to
             an obstacle [m].
+        reactions: Of an equilibrium: wrench of each closure on the part that it holds, by
+            name [N m], [N], world axes, the moment about the frame held; None without any.
     """
 
     q: Float[Array, " coordinates"]
@@ -241,6 +252,7 @@ class Solution(eqx.Module):
     negative_eigenvalues: Int[Array, ""] | None = None
     error: Float[Array, ""] | None = None
     overlap: Float[Array, ""] | None = None
+    reactions: dict[str, Float[Array, " twist"]] | None = None
 
     def _text(self) -> str:
         ways = f"{outcome(self.status)} after {number(self.iterations)} iterations"
@@ -289,9 +301,9 @@ def equilibrium(
     """Static equilibrium: coordinates at which the generalised forces vanish.
 
     Newton's method with the exact tangent and a line search on the residual, measured by the
-    elastic energy that it would store. The derivative in model and forces is that of the
-    implicit function, not of the iterations. Where the search fails, `equilibrium_path` applies
-    the load in steps.
+    elastic energy that it would store; the reactions of closures are unknowns beside the
+    coordinates. The derivative in model and forces is that of the implicit function, not of the
+    iterations. Where the search fails, `equilibrium_path` applies the load in steps.
 
     Args:
         model: The rod or assembly.
@@ -303,8 +315,9 @@ def equilibrium(
         max_iterations: Limit of the search.
 
     Returns:
-        Coordinates, how the search ended, and the number of negative eigenvalues of the tangent
-        (0 where stable). Nothing is raised where no equilibrium is found: check `status`.
+        Coordinates, how the search ended, the number of negative eigenvalues of the tangent
+        (0 where stable; of motions that keep loops closed), and the reactions of closures by
+        name. Nothing is raised where no equilibrium is found: check `status`.
 
     Raises:
         ValueError: If `q` has the wrong shape.
@@ -320,11 +333,11 @@ def equilibrium(
         Nocedal and Wright, Numerical Optimization, 2006, chapter 11.
     """
     constants, t = operators(model), real(t).astype(dtype_of(model))
-    guess = first_guess("equilibrium", model, q)
+    guess = without_reactions(model, first_guess("equilibrium", model, q))
     search = prepare(model, constants, tolerance, max_iterations)
 
-    def residual(q: Array) -> Array:
-        return -total_force(relaxed(forces), t, motion(model, q, constants=constants))
+    def residual(x: Array) -> Array:
+        return unbalanced(model, constants, relaxed(forces), t, x, search.metric)
 
     def find(_, guess):
         found = newton(residual, guess, search)
@@ -335,8 +348,10 @@ def equilibrium(
     rest, (done, finite, count, negative, unstable) = implicit_root(
         lambda q: squared(model, q, residual(q)), guess, find, _solve_tangent, has_aux=True
     )
-    status = checked_status(ended(done, rest, finite=finite, unstable=unstable), model, rest)
-    return Solution(rest, status, count.astype(jnp.int32), negative.astype(jnp.int32))
+    q, reactions = reactions_at(model, constants, t, rest)
+    status = checked_status(ended(done, rest, finite=finite, unstable=unstable), model, q)
+    counts = (x.astype(jnp.int32) for x in (count, negative))
+    return Solution(q, status, *counts, reactions=reactions)
 
 
 def first_guess(where: str, model: Model, q: Array | None) -> Float[Array, " coordinates"]:
@@ -350,7 +365,7 @@ def first_guess(where: str, model: Model, q: Array | None) -> Float[Array, " coo
 
 def prepare(model: Model, constants, tolerance, max_iterations: int) -> Search:
     """A search for the equilibria of `model`; its metric takes no part in derivatives."""
-    measure = jax.lax.stop_gradient(metric(model, constants))
+    measure = jax.lax.stop_gradient(with_reactions(model, metric(model, constants)))
     rounding = 4 * float(jnp.finfo(measure.dtype).eps)
     # Forces far larger than those of the rod, as of a stiff pin, leave rounding of their own.
     floor = (16 * rounding) ** 2 * jax.lax.stop_gradient(unit_energy(model, measure))
@@ -360,18 +375,18 @@ def prepare(model: Model, constants, tolerance, max_iterations: int) -> Search:
 
 def newton(residual: Residual, guess: Array, search: Search) -> Found:
     """A root of `residual`, by Newton with backtracking."""
-    factor = cho_factor(search.metric)
+    factor, model = cho_factor(search.metric), search.model
 
     def size(force):
         return force @ cho_solve(factor, force)
 
     def improve(state):
         q, *_, count = state
-        force, slope = linearised(residual, search.model, q)
+        force, slope = linearised(residual, model, q)
         step = -jnp.linalg.solve(slope, force)
-        shape = increments(search.model, q)
-        strained = shape @ search.metric @ shape
-        small = step @ search.metric @ step <= search.tolerance**2 * strained + search.floor
+        shape = strained(model, q)
+        energy = shape @ search.metric @ shape
+        small = step @ search.metric @ step <= search.tolerance**2 * energy + search.floor
         start = size(force)
 
         def too_long(trial):
@@ -381,14 +396,14 @@ def newton(residual: Residual, guess: Array, search: Search) -> Found:
 
         def half(trial):
             length = trial[0] / 2
-            return length, size(residual(retract(search.model, q, length * step)))
+            return length, size(residual(advanced(model, q, length * step)))
 
         # A step of rounding is nothing but noise: it is taken as it is. Any other is tried
         # first as a whole; the loop holds the only trial, so that it is compiled once.
         begin = jnp.where(small, 1.0, 2.0).astype(q.dtype), jnp.where(small, 0, jnp.inf) + start
         length, value = jax.lax.while_loop(too_long, half, begin)
         good = value <= start
-        new = jnp.where(good, retract(search.model, q, length * step), q)
+        new = jnp.where(good, advanced(model, q, length * step), q)
         return new, slope, small & good, ~good, jnp.isfinite(start), count + 1
 
     def searching(state):
@@ -405,8 +420,9 @@ def stability(
     slope: Float[Array, "dof dof"], search: Search
 ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
     """Negative eigenvalues at the end of a search, and whether they make it unstable."""
-    negative = negative_eigenvalues(slope, search.metric)
-    return negative, is_unstable(slope, search.metric, negative)
+    slope, measure = within_closures(search.model, slope, search.metric)
+    negative = negative_eigenvalues(slope, measure)
+    return negative, is_unstable(slope, measure, negative)
 
 
 def ended(

@@ -57,9 +57,11 @@ def inverse_kinematics(
     Damped least squares (Levenberg-Marquardt). Obstacles and limits are inequality constraints:
     they hold at the answer, and the targets are met as far as they allow. Where the targets
     leave freedom, the step in the null space of their Jacobian seeks the equilibrium under
-    `forces`, so that the answer does not depend on the first guess. Differentiable in model,
-    targets, obstacles, limits and forces by the optimality conditions at the answer, unless the
-    search was stopped before it converged.
+    `forces`, so that the answer does not depend on the first guess. Closed loops are targets
+    too, met where all targets are; the least energy of a parallel robot at a pose, also under
+    loads, is found faster by `equilibrium(close(model, goal=Closure(...)))`. Differentiable in
+    model, targets, obstacles, limits and forces by the optimality conditions at the answer,
+    unless the search was stopped before it converged.
 
     Args:
         model: The rod or assembly.

@@ -7,7 +7,7 @@ Reference:
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,9 +20,9 @@ from sorojax.math.compiled import jit_public
 from sorojax.math.host import tell
 from sorojax.math.implicit_root import implicit_root
 from sorojax.math.status import Status
-from sorojax.rod.forces.loads import Load, relaxed, total_force
-from sorojax.rod.model.assembly import dtype_of, retract
-from sorojax.rod.model.model import Model, motion, operators
+from sorojax.rod.forces.loads import Load, relaxed
+from sorojax.rod.model.assembly import dtype_of
+from sorojax.rod.model.model import Model, operators
 from sorojax.rod.statics.equilibrium import (
     Search,
     checked_status,
@@ -34,6 +34,13 @@ from sorojax.rod.statics.equilibrium import (
     prepare,
     squared,
     stability,
+)
+from sorojax.rod.statics.loops import (
+    advanced,
+    reactions_at,
+    unbalanced,
+    within_closures,
+    without_reactions,
 )
 
 Loading = Callable[[Array], tuple[Load, ...]]
@@ -54,6 +61,7 @@ class Path(eqx.Module):
         negative_eigenvalues: Of the symmetric part of the tangent; 0 is stable under dead
             loads.
         iterations: Of Newton's method; of a path by arc lengths the corrections.
+        reactions: Wrenches of closures by name, as in `equilibrium`; None without any.
     """
 
     q: Float[Array, "steps coordinates"]
@@ -61,6 +69,7 @@ class Path(eqx.Module):
     factors: Float[Array, "steps *loads"]
     negative_eigenvalues: Int[Array, " steps"]
     iterations: Int[Array, " steps"]
+    reactions: dict[str, Float[Array, "steps twist"]] | None = None
 
     def _text(self) -> str:
         count = self.q.shape[0]
@@ -78,7 +87,7 @@ def equilibrium_path(
     q: Float[Array, " coordinates"] | None = None,
     *,
     begin: Numbers | None = None,
-    t=0.0,
+    t: Numbers | Callable[[Array], Array] = 0.0,
     tolerance=1e-10,
     max_iterations: int = 25,
     max_cuts: int = 8,
@@ -97,7 +106,8 @@ def equilibrium_path(
             takes.
         q: Equilibrium to start from; at rest by default.
         begin: Factors at `q`; zero by default.
-        t: Time at which the forces act [s].
+        t: Time at which forces act and closures are moved [s], or a function of the factor
+            that gives it: `lambda factor: factor` takes driven ends along their motion.
         tolerance: Size of the last step relative to q, both in elastic energy norm [-].
         max_iterations: Limit of one search.
         max_cuts: How often a step may be halved.
@@ -120,13 +130,14 @@ def equilibrium_path(
         [-9.7, -19.0]
     """
     constants, dtype = operators(model), dtype_of(model)
-    factors, t = real(factors).astype(dtype), real(t).astype(dtype)
-    guess = first_guess("equilibrium_path", model, q)
+    factors, time_at = real(factors).astype(dtype), _time_of(t, dtype)
+    guess = without_reactions(model, first_guess("equilibrium_path", model, q))
     search = prepare(model, constants, tolerance, max_iterations)
     first = jnp.zeros_like(factors[0]) if begin is None else real(begin).astype(dtype)
 
-    def residual(q: Array, factor: Array) -> Array:
-        return -total_force(relaxed(loading(factor)), t, motion(model, q, constants=constants))
+    def residual(x: Array, factor: Array) -> Array:
+        forces = relaxed(loading(factor))
+        return unbalanced(model, constants, forces, time_at(factor), x, search.metric)
 
     shares = jnp.linspace(0.0, 1.0, len(factors) + 1, dtype=dtype)[1:]
 
@@ -146,15 +157,17 @@ def equilibrium_path(
         return jax.vmap(lambda q, f: squared(model, q, residual(q, f)))(q, factors)
 
     guesses = jnp.broadcast_to(guess, (factors.shape[0], guess.shape[0]))
+
     rest, (done, finite, count, negative, unstable) = implicit_root(
         balance, guesses, find, _solve_rows, has_aux=True
     )
     status = jax.vmap(lambda done, q, f, u: ended(done, q, finite=f, unstable=u))(
         done, rest, finite, unstable
     )
-    status = jax.vmap(lambda x, q: checked_status(x, model, q))(status, rest)
+    q, reactions = _reactions(model, constants, time_at, rest, factors)
+    status = jax.vmap(lambda x, q: checked_status(x, model, q))(status, q)
     counts = (x.astype(jnp.int32) for x in (negative, count))
-    return Path(rest, status, factors, *counts)
+    return Path(q, status, factors, *counts, reactions)
 
 
 def _step(residual, q: Array, last: Array, target: Array, alive, search: Search, max_cuts: int):
@@ -180,6 +193,18 @@ def _step(residual, q: Array, last: Array, target: Array, alive, search: Search,
     state = (q, 0 * whole, whole, jnp.array(True), jnp.array(0, jnp.int32), search.metric)
     q, at, _, finite, count, slope = jax.lax.while_loop(going, advance, state)
     return q, alive & (at >= 1), finite, count, *stability(slope, search)
+
+
+def _time_of(t: Numbers | Callable[[Array], Array], dtype: Any) -> Callable[[Array], Array]:
+    """Time as a function of the factor."""
+    if callable(t):
+        return lambda factor: real(t(factor)).astype(dtype)
+    return lambda _: real(t).astype(dtype)
+
+
+def _reactions(model: Model, constants: Any, time_at, x: Array, factors: Array):
+    """Coordinates, and wrenches of the closures by name, of all steps."""
+    return jax.vmap(lambda x, f: reactions_at(model, constants, time_at(f), x))(x, factors)
 
 
 def _solve_rows(linear, right: Float[Array, "steps unknowns"]) -> Array:
@@ -214,7 +239,7 @@ def arc_length_path(
     first=0.1,
     steps: int = 50,
     longest=2.0,
-    t=0.0,
+    t: Numbers | Callable[[Array], Array] = 0.0,
     tolerance=1e-10,
     max_cuts: int = 10,
     progress: bool = False,
@@ -233,17 +258,19 @@ def arc_length_path(
         first: Step of the factor at the start; negative to unload.
         steps: Number of steps.
         longest: Longest step relative to the first.
-        t: Time at which the forces act [s].
+        t: Time at which forces act and closures are moved [s], or a function of the factor.
         tolerance: Distance from equilibrium relative to the first step.
         max_cuts: How often a step may be halved.
         progress: Report progress while running; under `vmap` in one report.
     """
     constants, dtype = operators(model), dtype_of(model)
-    factor, first, longest, t = (real(x).astype(dtype) for x in (factor, first, longest, t))
+    factor, first, longest = (real(x).astype(dtype) for x in (factor, first, longest))
+    time_at = _time_of(t, dtype)
     search = prepare(model, constants, tolerance, 50)
 
-    def residual(q: Array, factor: Array) -> Array:
-        return -total_force(relaxed(loading(factor)), t, motion(model, q, constants=constants))
+    def residual(x: Array, factor: Array) -> Array:
+        forces = relaxed(loading(factor))
+        return unbalanced(model, constants, forces, time_at(factor), x, search.metric)
 
     def tangent(q, factor):
         """Residual, its tangent and its change with the factor."""
@@ -251,9 +278,8 @@ def arc_length_path(
         value, slope = linearised(lambda q: residual(q, factor), model, q)
         return value, slope, jax.jvp(lambda f: residual(q, f), (factor,), (one,))[1]
 
-    start = newton(
-        lambda q: residual(q, factor), first_guess("arc_length_path", model, q), search
-    )
+    guess = without_reactions(model, first_guess("arc_length_path", model, q))
+    start = newton(lambda q: residual(q, factor), guess, search)
     _, slope, rate = tangent(start.q, factor)
     answer = -jnp.linalg.solve(slope, rate)
     unit = answer @ search.metric @ answer
@@ -262,7 +288,7 @@ def arc_length_path(
     direction = _unit(jnp.append(answer, 1.0), weights) * jnp.sign(first)
     begin = jnp.abs(first) * jnp.sqrt(jnp.asarray(2.0, dtype))
 
-    def bordered(slope, rate, normal):
+    def with_plane(slope, rate, normal):
         return jnp.concatenate([jnp.append(slope, rate[:, None], axis=1), normal[None]])
 
     def correct(point: _Point, length):
@@ -270,14 +296,14 @@ def arc_length_path(
         normal = weights @ point.direction
 
         def at(shift):
-            return retract(model, point.q, shift[:-1]), point.factor + shift[-1]
+            return advanced(model, point.q, shift[:-1]), point.factor + shift[-1]
 
         def improve(state):
             shift, _, count = state
             value, slope, rate = tangent(*at(shift))
             # The tangent is taken at the shifted place; increments add up to first order.
             gap = jnp.append(value, normal @ shift - length)
-            step = -jnp.linalg.solve(bordered(slope, rate, normal), gap)
+            step = -jnp.linalg.solve(with_plane(slope, rate, normal), gap)
             return shift + step, jnp.sqrt(step @ weights @ step), count + 1
 
         def searching(state):
@@ -303,12 +329,12 @@ def arc_length_path(
         q, factor, length, done, count = jax.lax.while_loop(going, attempt, state)
         q, factor = jnp.where(done, q, point.q), jnp.where(done, factor, point.factor)
         _, slope, rate = tangent(q, factor)
-        border = bordered(slope, rate, weights @ point.direction)
+        border = with_plane(slope, rate, weights @ point.direction)
         right = jnp.zeros_like(point.direction).at[-1].set(1.0)
         direction = _unit(jnp.linalg.solve(border, right), weights)
         length = jnp.where(count <= _EASY, 1.5 * length, length)
         new = _Point(q, factor, direction, jnp.minimum(length, longest * begin), done)
-        negative = negative_eigenvalues(slope, search.metric)
+        negative = negative_eigenvalues(*within_closures(model, slope, search.metric))
         if progress:
             tell("arc length path", share)
         end = ended(done, q, finite=jnp.all(jnp.isfinite(rate)))
@@ -317,8 +343,9 @@ def arc_length_path(
     point = _Point(start.q, factor, direction, begin, start.done)
     shares = jnp.linspace(0.0, 1.0, steps + 1, dtype=dtype)[1:]
     _, (q, status, *rest) = jax.lax.scan(advance, point, shares)
+    q, reactions = _reactions(model, constants, time_at, q, rest[0])
     status = jax.vmap(lambda x, q: checked_status(x, model, q))(status, q)
-    return Path(q, status, *rest)
+    return Path(q, status, *rest, reactions)
 
 
 def _unit(vector: Array, weights: Array) -> Array:

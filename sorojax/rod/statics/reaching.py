@@ -17,6 +17,7 @@ from sorojax.rod.model.assembly import increments, index_of
 from sorojax.rod.model.link import LinkState
 from sorojax.rod.model.model import Model
 from sorojax.rod.statics.equilibrium import squared
+from sorojax.rod.statics.loops import closing
 from sorojax.rod.statics.targets import AbstractTarget, Frames, ObstacleConstraint
 
 _ROUNDING = 16  # units in the last place that a coordinate on its limit may be away
@@ -60,6 +61,8 @@ def rows(tasks: Tasks, t: Array, moment: RodState | AssemblyState) -> Rows:
     """The tasks at a moment."""
     group = moment.rod.group if isinstance(moment, RodState) else moment.assembly.group
     pairs = [task.errors(group, _frames(moment, task)) for task in tasks.targets]
+    if isinstance(moment, AssemblyState) and moment.assembly.closures:
+        pairs.append(closing(moment, t, tasks.length))
     gaps = [task.gaps(_frames(moment, task)) for task in tasks.obstacles]
     pull = None if tasks.forces is None else total_force(relaxed(tasks.forces), t, moment)
     error, jacobian = _stacked(pairs)
