@@ -16,7 +16,7 @@ BAR = 5e-3
 
 
 def bases(count, names):
-    return R.chebyshev(**dict.fromkeys(names, count))
+    return R.chebyshev(**{name: count for name in names})
 
 
 def turned(angle, *position):

@@ -1,13 +1,17 @@
-"""A flexible rod in free flight (D4): momentum after a pulse of force and moment on one end."""
+"""A flexible rod in free flight, in space and in the plane: momentum after a pulse of force
+and moment on one end, and its ends beside an independent solution."""
+
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.harness import Row, measure
+from benchmarks.discrete_rod import Bar, flight
+from benchmarks.harness import Row, measure, quick
 from sorojax._types import real
-from sorojax.math.lie import SE3, homogeneous
+from sorojax.math.lie import SE2, SE3, homogeneous, plane_rotation
 from sorojax.math.ode.steppers import DormandPrince, GeneralisedAlpha, TripleJump
 from sorojax.rod import (
     AbstractForce,
@@ -17,6 +21,7 @@ from sorojax.rod import (
     Section,
     assembly,
     chebyshev,
+    forward_kinematics,
     momentum,
     num_dof,
     rest,
@@ -32,13 +37,30 @@ REFERENCE = "momentum at the end of the pulse, 5 s to 10 s, relative"
 STEPS = ((GeneralisedAlpha(1.0), 4e-3), (TripleJump(), 2e-3), (DormandPrince(), 2e-3))
 
 
+TILT = np.array([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+START = np.array([0.0, 8.0, 0.0])
+BAR_OF_ENDS = 5e-3
+INDEPENDENT = "both ends after 5 s, discrete elements (SciPy), relative to the length"
+
+
+def rising(t):
+    """Of the pulse in space: it rises to PEAK and falls to END."""
+    return jnp.clip(jnp.minimum(t / PEAK, (END - t) / (END - PEAK)), 0, 1)
+
+
+def constant(t):
+    """Of the pulse in the plane: whole until PEAK."""
+    return jnp.where(t < PEAK, 1.0, 0.0)
+
+
 class Pulse(AbstractForce):
-    """A dead wrench on the base that rises to PEAK and falls to END."""
+    """A dead wrench on the base, times a function of time."""
 
     wrench: jax.Array = eqx.field(converter=real)
+    share: Callable = eqx.field(static=True, default=rising)
 
     def __call__(self, t, motion):
-        share = jnp.clip(jnp.minimum(t / PEAK, (END - t) / (END - PEAK)), 0, 1)
+        share = self.share(t)
         base = motion.base
         assert base is not None  # the rod floats
         columns = jnp.concatenate([base.angular_jacobian, base.linear_jacobian])
@@ -62,8 +84,7 @@ def spaghetti():
         nodes=NODES,
         mass_section=Section(1.0, 10.0, 10.0, 10.0, 1.0),
     )
-    tilt = jnp.array([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
-    start = homogeneous(tilt, jnp.array([0.0, 8.0, 0.0]))
+    start = homogeneous(jnp.array(TILT), jnp.array(START))
     return assembly(SE3(), rod=Part(beam, Free(), offset=start))
 
 
@@ -83,6 +104,42 @@ def fly(model, forces, stepper, step):
     return jax.vmap(lambda q, v: momentum(model, q, v))(path.q[10:], path.v[10:])
 
 
+def in_plane():
+    """The rod of Simo and Vu-Quoc, J. Appl. Mech. 53, 1986."""
+    beam = rod(
+        SE2(),
+        chebyshev(kappa_z=MODES, sigma_x=MODES - 1, sigma_y=MODES - 1),
+        Section(1.0, 0.05, 0.05, 0.05, 1.0),
+        length=LENGTH,
+        young_modulus=1e4,
+        poisson_ratio=-0.5,
+        density=1.0,
+        nodes=NODES,
+        mass_section=Section(1.0, 10.0, 10.0, 10.0, 1.0),
+    )
+    start = homogeneous(plane_rotation(jnp.arctan2(-0.8, 0.6)), jnp.array(START[:2]))
+    return assembly(SE2(), rod=Part(beam, Free(), offset=start))
+
+
+def ends(model, forces):
+    """Places of both ends after 5 s."""
+    options = {"step": 2e-3, "saves": 1, "every": 2500, "stepper": DormandPrince()}
+    path = rollout(model, rest(model), jnp.zeros(num_dof(model)), forces, **options)
+    poses = forward_kinematics(model, path.q[-1], jnp.array([0.0, 1.0]))["rod"]
+    return poses[:, :-1, -1]
+
+
+def independent(wrench, share, count):
+    """The same by discrete elements."""
+    bar = Bar(LENGTH, axial=1e4, bending=500.0, mass=1.0, rotary=10.0)
+
+    def push(t):
+        both = float(share(t)) * np.asarray(wrench)
+        return both[:3], both[3:]
+
+    return flight(bar, START, TILT, push, np.array([5.0]), count)[0]
+
+
 def drift(momenta):
     """Largest change, of the angular and of the linear part, each in its own size."""
     parts = [np.asarray(momenta[:, rows]) for rows in (slice(3), slice(3, 6))]
@@ -91,6 +148,30 @@ def drift(momenta):
 
 
 def rows():
+    yield from momenta()
+    count = 12 if quick("finer elements of the independent solution") else 32
+    flat = (0.0, 0.0, 80.0, 8.0, 0.0, 0.0)
+    for case, model, wrench, share in (
+        ("in space", spaghetti(), WRENCH, rising),
+        ("in the plane", in_plane(), flat, constant),
+    ):
+        own = wrench if case == "in space" else wrench[2:5]
+        forces = (PartForce("rod", Pulse(own, share)),)
+        timing = measure(ends, model, forces, repeats=2)
+        found = np.asarray(jax.jit(ends)(model, forces))
+        apart = found - independent(wrench, share, count)[:, : found.shape[1]]
+        yield Row(
+            "sorojax",
+            {"dof": num_dof(model), "flight": case},
+            **timing.columns(),
+            error=float(np.linalg.norm(apart, axis=1).max()) / LENGTH,
+            reference=INDEPENDENT,
+            bar=BAR_OF_ENDS,
+            bar_on="error",
+        )
+
+
+def momenta():
     model = spaghetti()
     forces = (PartForce("rod", Pulse(WRENCH)),)
     for stepper, h in STEPS:
