@@ -146,3 +146,11 @@ def test_a_finger_and_its_controller_are_designed_together():
     for k, way in enumerate(1e-4 * jnp.eye(9)[:8]):
         seen = (total(x + way) - total(x - way)) / 2e-4
         assert float(slope[k]) == pytest.approx(float(seen), rel=1e-3, abs=1e-4)
+
+
+def test_a_rod_in_free_flight_keeps_its_momentum():
+    numbers = main_of("43_flying_spaghetti")(quick=True)
+    assert numbers["ended well"] == 1
+    assert numbers["momentum lost in free flight"] < 1e-7
+    assert numbers["impulse over momentum"] == pytest.approx(1, rel=1e-6)
+    assert user_code("43_flying_spaghetti") <= 60
