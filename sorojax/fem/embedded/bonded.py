@@ -170,9 +170,7 @@ class BondedRod(AbstractLoad):
         if rod.bending_stiffness is None:
             return _Data(bond, stretch, None)
         # vertices at the ends do not turn: their groups are those of the next ones
-        span, share = (
-            row[0][near[:, 0]] for row in line.spans(rest[None], (False, False))
-        )
+        span, share = (row[0][near[:, 0]] for row in line.spans(rest[None], (False, False)))
         bending = jnp.broadcast_to(rod.bending_stiffness, (count,)) * inner
         across = jnp.einsum("pa,pai->pi", directors, points[rod.route.nodes])
         at_rest = jax.vmap(line.turning)(ends[near], across)
@@ -222,8 +220,8 @@ def bonded_rod(
 
     Example:
         >>> block = mesh.box([0, 0, 0], [60 * mm, 10 * mm, 10 * mm], divisions=(12, 2, 2))
-        >>> wire = fem.embedded_rod(block, [[5 * mm, 5 * mm, 5 * mm], [60 * mm, 5 * mm, 5 * mm]],
-        ...                         axial_stiffness=500.0, name="wire")
+        >>> line = [[5 * mm, 5 * mm, 5 * mm], [60 * mm, 5 * mm, 5 * mm]]
+        >>> wire = fem.embedded_rod(block, line, axial_stiffness=500.0, name="wire")
         >>> both, wire = fem.bonded_rod(block, wire, bond_strength=20.0, tie_stiffness=1e8)
         >>> both.num_nodes - block.num_nodes, both.node_sets["wire"].shape
         (12, (12,))

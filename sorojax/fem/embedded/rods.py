@@ -23,7 +23,7 @@ Reference:
     tied by mortar, and for its limits.
 """
 
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -41,9 +41,6 @@ from sorojax.fem.loads.springs import Route
 from sorojax.material.hyperelastic import AbstractHyperelastic, small_strain_moduli
 from sorojax.mesh.measure import Locations, cells_at, locate
 from sorojax.mesh.mesh import Mesh
-
-if TYPE_CHECKING:
-    from sorojax.fem.problem import Problem
 
 
 class _Data(NamedTuple):
@@ -282,7 +279,7 @@ def embedded_rod(
         >>> block = mesh.box([0, 0, 0], [60 * mm, 10 * mm, 10 * mm], divisions=(12, 2, 2))
         >>> wire = fem.embedded_rod(block, [[0, 5 * mm, 5 * mm], [60 * mm, 5 * mm, 5 * mm]],
         ...                         radius=0.3 * mm, young_modulus=2e9)
-        >>> print(f"{float(wire.axial_stiffness):.0f} N, {wire.route.weights.shape[0]} vertices")
+        >>> print(f"{float(wire.axial_stiffness):.0f} N, {len(wire.route.nodes)} vertices")
         565 N, 12 vertices
     """
     points = _polylines(mesh, points)
