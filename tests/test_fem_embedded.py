@@ -1,5 +1,6 @@
 """Rods in a solid whose mesh does not know them, against closed forms and resolved meshes."""
 
+import dataclasses
 from itertools import pairwise
 
 import equinox as eqx
@@ -163,3 +164,179 @@ def test_a_wavy_fibre_is_that_of_a_mesh_that_follows_it():
 
 def pull_of(cells):
     return fem.Prescribed(cells.node_sets["right"], [1 * mm, 0.0])
+
+
+# ---- bond slip
+
+
+def held_bar(**options):
+    """A fibre in a strip that is held everywhere, and what pulls it out."""
+    line = [[10 * mm, HEIGHT / 2], [90 * mm, HEIGHT / 2]]
+    fibre = fem.embedded_rod(STRIP, line, axial_stiffness=5.0, spacing=1 * mm)
+    options = {"bond_stiffness": 2e4, "tie_stiffness": 1e6} | options
+    cells, rod = fem.bonded_rod(STRIP, fibre, bond_strength=2.0, **options)
+    return cells, rod
+
+
+def pulled(cells, rod, far):
+    end = fem.Prescribed(rod.nodes[-1:], [far, 0.0], name="end")
+    still = fem.Fixed(np.arange(STRIP.num_nodes))
+    return fem.problem(
+        cells, RUBBER, kinematics=fem.PlaneStress(DEPTH), supports=(still, end), loads=(rod,)
+    )
+
+
+def force_of(problem, u):
+    return float(jnp.sum(fem.rod_forces(problem, u).on_solid[..., 0]))
+
+
+def test_pull_out_follows_shear_lag_and_ends_at_the_strength_of_the_bond():
+    """EA u'' = k u below the strength: P = EA b tanh(b L) u(L), b^2 = k / EA; then tau L."""
+    cells, rod = held_bar()
+    length, rate = 80 * mm, np.sqrt(2e4 / 5.0)
+    elastic = pulled(cells, rod, 0.05 * mm)
+    u = fem.solve(elastic).displacement
+    wanted = 5.0 * rate * np.tanh(rate * length) * 0.05 * mm
+    assert force_of(elastic, u) == pytest.approx(wanted, rel=2e-3)
+    slid = pulled(cells, rod, 4 * mm)
+    u = fem.solve(slid).displacement
+    assert force_of(slid, u) == pytest.approx(2.0 * length, rel=1e-9)
+    tension = fem.rod_forces(slid, u).tension[0]
+    np.testing.assert_allclose(tension, 2.0 * 1 * mm * (np.arange(80) + 0.5), rtol=1e-8)
+
+
+def test_a_bond_that_has_slid_stays_where_it_is():
+    """Unloading is elastic, from where the bond has slid to."""
+    cells, rod = held_bar()
+    there = pulled(cells, rod, 4 * mm)
+    u = fem.solve(there).displacement
+    knows = fem.update_friction(there, u)
+    again = fem.solve(knows, start=u)
+    assert force_of(knows, again.displacement) == pytest.approx(0.16, rel=1e-8)
+    (rod,) = knows.loads
+    back = pulled(cells, rod, 4 * mm - 0.02 * mm)
+    fell = 0.16 - force_of(back, fem.solve(back, start=u).displacement)
+    rate = np.sqrt(2e4 / 5.0)
+    assert fell == pytest.approx(5.0 * rate * np.tanh(rate * 80 * mm) * 0.02 * mm, rel=2e-3)
+
+
+def test_a_motion_remembers_slip():
+    """Pulled slowly beyond the strength and back: as the statics that is told of slip."""
+    cells, rod = held_bar()
+    rod = dataclasses.replace(
+        rod, rod=dataclasses.replace(rod.rod, mass_per_length=jnp.asarray(1e-3))
+    )
+    steps = 20
+    far = (
+        4 * mm * np.concatenate([np.linspace(0, 1, steps // 2 + 1), np.full(steps // 2, 0.995)])
+    )
+    motion = fem.simulate(
+        pulled(cells, rod, 0.0), 2.0, 2.0 / steps, end=far[:, None] * np.array([[1.0, 0.0]])
+    )
+    there = pulled(cells, rod, 4 * mm)
+    knows = fem.update_friction(there, fem.solve(there).displacement)
+    back = pulled(cells, knows.loads[0], 0.995 * 4 * mm)
+    wanted = fem.solve(back, start=motion.displacements[-1]).displacement
+    np.testing.assert_allclose(motion.displacements[-1], wanted, atol=2e-3 * mm)
+
+
+# ---- transformations, mass, errors
+
+
+def test_slopes_of_an_equilibrium_by_fibre_and_rubber_are_those_of_its_values():
+    """By the winding angle, where the fibre lies, its stiffness and that of the rubber."""
+    cells = mesh.box([0, 0, 0], [40 * mm, 10 * mm, 10 * mm], divisions=(4, 2, 2))
+    sharp = fem.Newton(residual_tolerance=1e-12, step_tolerance=1e-11)
+
+    def tip(numbers):
+        angle, radius, axial, bending, shear = numbers
+        along = jnp.linspace(0.02, 0.98, 40)
+        turn = along * 40 * mm * jnp.tan(angle) / radius
+        line = jnp.stack(
+            [40 * mm * along, 5 * mm + radius * jnp.cos(turn), 5 * mm + radius * jnp.sin(turn)],
+            axis=1,
+        )
+        rod = fem.embedded_rod(
+            cells, line, axial_stiffness=axial, bending_stiffness=bending, spacing=4.3 * mm
+        )
+        rubber = material.NeoHookean(shear, 3 * shear)
+        pull = fem.Traction(cells.facet_sets["right"], [2e4, 1e3, 0.0])
+        held = (fem.Fixed(cells.node_sets["left"]),)
+        problem = fem.problem(cells, rubber, supports=held, loads=(rod, pull))
+        u = fem.solve(problem, newton=sharp).displacement[cells.node_sets["right"]]
+        return jnp.sum(u[:, 0]) + jnp.sum(u[:, 2])
+
+    at = jnp.array([0.5, 3 * mm, 20.0, 1e-5, 4e4])
+    slope = jax.grad(tip)(at)
+    for k, size in enumerate(np.asarray(at)):
+        step = 1e-4 * size * np.eye(5)[k]
+        ahead, behind, far, before = (float(tip(at + s * step)) for s in (1, -1, 2, -2))
+        difference = (8 * (ahead - behind) - (far - before)) / (12 * 1e-4 * size)
+        assert float(slope[k]) == pytest.approx(difference, rel=1e-6)
+
+
+def test_solves_in_a_batch_are_those_one_by_one():
+    rod = fem.embedded_rod(STRIP, MIDDLE, axial_stiffness=2.0, bending_stiffness=1e-5)
+    force = fem.Force(STRIP.node_sets["right"], [1e-3, 1e-4], name="tip")
+    problem = strip(rod, force)
+
+    def tip(axial):
+        bent = eqx.tree_at(lambda p: p.loads[0].axial_stiffness, problem, axial)
+        return fem.solve(bent).displacement[-1]
+
+    stiffness = jnp.array([1.0, 3.0])
+    each = jnp.stack([tip(axial) for axial in stiffness])
+    np.testing.assert_allclose(jax.jit(jax.vmap(tip))(stiffness), each, rtol=1e-7, atol=1e-14)
+
+
+def test_the_mass_of_a_rod_is_that_of_its_length():
+    heavy = fem.embedded_rod(
+        BLOCK, np.stack([HELIX, HELIX]), radius=0.5 * mm, young_modulus=1e9, density=7800.0,
+        matrix=RUBBER,
+    )  # fmt: skip
+    length = np.linalg.norm(np.diff(heavy.vertices(BLOCK.points)[0], axis=0), axis=1).sum()
+    mass = heavy.lumped_mass(in_block(heavy))
+    section = np.pi * (0.5 * mm) ** 2
+    assert float(jnp.sum(mass)) == pytest.approx(2 * 7800 * section * length, rel=1e-12)
+    assert jnp.all(mass >= 0)
+    np.testing.assert_allclose(heavy.axial_stiffness, (1e9 - YOUNG) * section, rtol=1e-12)
+
+
+def test_a_heavy_rod_swings_slower():
+    """The first frequency of a bar that is stretched goes with the square root of the mass."""
+    heavy = fem.embedded_rod(STRIP, MIDDLE, axial_stiffness=1e-6)
+    own = 1000 * HEIGHT * DEPTH
+    heavy = dataclasses.replace(heavy, mass_per_length=jnp.asarray(3 * own))
+    start = strip().mesh.points
+    pull = jnp.stack([1e-3 * start[:, 0], 0 * start[:, 0]], axis=1)
+    sliding = fem.Fixed(STRIP.node_sets["left"]), fem.Fixed(np.arange(STRIP.num_nodes), (1,))
+    quarter = 4 * LENGTH / np.sqrt(YOUNG / (1 - 0.09) / 1000) / 4
+    ends = []
+    for loads, times in (((), 1), ((heavy,), 2)):
+        problem = strip(*loads, supports=sliding)
+        motion = fem.simulate(
+            problem, times * quarter, times * quarter / 40, start=(pull, 0 * pull)
+        )
+        ends.append(np.asarray(motion.displacements[:, -1, 0]))
+    np.testing.assert_allclose(ends[1], ends[0], atol=0.03 * ends[0][0])
+
+
+def test_wrong_rods_say_what_to_do():
+    with pytest.raises(ValueError, match=r"Give axial_stiffness, or radius"):
+        fem.embedded_rod(STRIP, MIDDLE)
+    with pytest.raises(ValueError, match=r"Give one row per corner"):
+        fem.embedded_rod(STRIP, HELIX, axial_stiffness=1.0)
+    with pytest.raises(ValueError, match=r"softer than the solid is a hole"):
+        fem.embedded_rod(STRIP, MIDDLE, radius=1 * mm, young_modulus=1e4, matrix=RUBBER)
+    with pytest.raises(ValueError, match=r"outside the mesh"):
+        fem.embedded_rod(STRIP, [[0, 0], [2 * LENGTH, 0]], axial_stiffness=1.0)
+    rod = fem.embedded_rod(STRIP, MIDDLE, axial_stiffness=1.0, clamped=(True, False))
+    with pytest.raises(ValueError, match=r"need one rod that is not clamped"):
+        fem.bonded_rod(STRIP, rod, bond_strength=1.0, material=RUBBER)
+    with pytest.raises(ValueError, match=r"need one of \[\]"):
+        fem.rod_forces(strip(), jnp.zeros_like(STRIP.points))
+    with pytest.raises(ValueError, match=r"Use a solid mesh"):
+        fem.problem(
+            STRIP, RUBBER, kinematics=fem.Axisymmetric(), loads=(rod,),
+            supports=(fem.Fixed(STRIP.node_sets["left"]),),
+        )  # fmt: skip

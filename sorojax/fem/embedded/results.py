@@ -44,6 +44,9 @@ def rod_forces(
         u: Displacement [m], of a solution.
         name: Of the term.
 
+    Returns:
+        Tension, moment, force on the solid and slip at the vertices.
+
     Raises:
         ValueError: If there is no such rod.
 

@@ -272,6 +272,9 @@ def embedded_rod(
         value: Share by which the rod is shorter than its place in the solid [-].
         name: Of the term.
 
+    Returns:
+        The term, all rods in one.
+
     Raises:
         ValueError: If a vertex lies outside the mesh, or it is not clear how stiff the rod is.
 
@@ -280,7 +283,7 @@ def embedded_rod(
         >>> wire = fem.embedded_rod(block, [[0, 5 * mm, 5 * mm], [60 * mm, 5 * mm, 5 * mm]],
         ...                         radius=0.3 * mm, young_modulus=2e9)
         >>> print(f"{float(wire.axial_stiffness):.0f} N, {len(wire.route.nodes)} vertices")
-        565 N, 12 vertices
+        565 N, 13 vertices
     """
     points = _polylines(mesh, points)
     given = axial_stiffness, bending_stiffness, radius, young_modulus
