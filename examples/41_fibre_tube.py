@@ -102,34 +102,33 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
 
 
 def draw(run, angles, found, file: Path) -> None:
-    """The tube at rest and pressed, and its twist by the angle of the threads."""
+    """The tube from the side, at rest and pressed, and its twist by the angle of the threads."""
     import matplotlib.pyplot as plt
-    from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-    figure = plt.figure(figsize=(10, 4.6))
-    outer = np.asarray(run.problem.mesh.facet_sets["right"])
-    for k, u in enumerate((0 * run.displacement, run.displacement)):
-        x = np.asarray(run.problem.mesh.points + u)[:, [0, 2, 1]] / mm
-        lines = np.asarray(fem.rod_forces(run.problem, u, "threads").positions)[..., [0, 2, 1]]
-        axes = figure.add_subplot(1, 4, k + 1, projection="3d")
-        axes.add_collection3d(
-            Poly3DCollection(
-                x[outer], facecolor="#cfe3ef", edgecolor="#9dbfd3", lw=0.2, alpha=0.6
-            )
-        )
-        colours = ["#e76f51"] + ["#2a6f97"] * (len(lines) - 1)
-        axes.add_collection3d(Line3DCollection(lines / mm, colors=colours, lw=1.2))
-        axes.set(xlim=(-10, 10), ylim=(-10, 10), zlim=(0, 62), box_aspect=(1, 1, 3.1))
-        axes.set_title(("at rest", f"{PRESSURE / kPa:.0f} kPa")[k])
-        axes.view_init(12, -60)
-        axes.set_axis_off()
-    axes = figure.add_subplot(1, 2, 2)
+    figure, axes = plt.subplots(1, 3, figsize=(10, 4.8), width_ratios=(1, 1, 2.6))
+    X, wall = np.asarray(run.problem.mesh.points), run.problem.mesh.facet_sets["right"]
+    outer = np.unique(np.asarray(wall))
+    levels = np.round(X[outer, 1], 6)
+    for side, u in zip(axes, (0 * run.displacement, run.displacement), strict=False):
+        x = (X + np.asarray(u))[outer] / mm
+        rows = [x[levels == level] for level in np.unique(levels)]
+        high, reach = [row[:, 1].mean() for row in rows], [abs(row[:, 0]).max() for row in rows]
+        side.fill_betweenx(high, -np.array(reach), reach, color="#cfe3ef")
+        lines = np.asarray(fem.rod_forces(run.problem, u, "threads").positions) / mm
+        for k, line in enumerate(lines):
+            color = "#e76f51" if k == 3 else "#2a6f97"
+            front = np.where(line[:, 2] > 0, line[:, 0], np.nan)
+            side.plot(line[:, 0], line[:, 1], color=color, lw=0.6, alpha=0.35)
+            side.plot(front, line[:, 1], color=color, lw=1.8)
+        title = "at rest" if not np.any(u) else f"{PRESSURE / kPa:.0f} kPa"
+        side.set(aspect="equal", xlim=(-11, 11), ylim=(-1, 62), title=title)
+        side.set_axis_off()
     many = np.linspace(2, 80, 79)
     exact = np.asarray(jax.vmap(even)(jnp.asarray(many) * deg))[:, 1] / deg
-    axes.plot(many, exact, color="#2a6f97", label="long tube, exact")
-    axes.plot(angles, found, "o", color="#e76f51", label="solid with embedded threads")
-    axes.set(xlabel="angle of the threads to the axis [deg]", ylabel="twist over 60 mm [deg]")
-    axes.legend()
+    axes[2].plot(many, exact, color="#2a6f97", label="long tube, exact")
+    axes[2].plot(angles, found, "o", color="#e76f51", label="solid with embedded threads")
+    axes[2].set(xlabel="angle of the threads to the axis [deg]", ylabel="twist [deg]")
+    axes[2].legend()
     figure.tight_layout()
     figure.savefig(file, dpi=90)
     plt.close(figure)

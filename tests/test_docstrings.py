@@ -29,6 +29,7 @@ VERBS = {
     "rod": "assembly branch_states bspline chebyshev circle equilibrium equilibrium_path "
     "forward_dynamics forward_kinematics inverse_kinematics operators piecewise_constant rod "
     "rollout tip_pose",
+    "coupling": "mounted_rod",
     "reduction": "identify pod_basis strain_along",
     "systems": "Network simulate simulate_batch simulate_sampled",
     "design": "calibrate drawing_to_loop layout minimise minimise_shape propagate_covariance",
@@ -46,7 +47,7 @@ NAMES = {
     "kPa": kPa, "material": material, "presets": material.presets,
 }  # fmt: skip
 PACKAGES = (
-    "design", "fem", "io", "mesh", "reduction", "robots", "rod", "sdf", "sweep", "systems",
+    "coupling", "design", "fem", "io", "mesh", "reduction", "robots", "rod", "sdf", "sweep", "systems",
     "view", "vision",
 )  # fmt: skip
 SECTIONS = ("Args", "Attributes", "Returns", "Raises", "Example", "Reference", "References")

@@ -36,6 +36,7 @@ class AbstractLoad(eqx.Module):
     overshoots: ClassVar[bool] = False  # whether steps may run past where its force changes
     dead: ClassVar[bool] = False  # whether its force is the same in every state
     stiff_in_positions: ClassVar[bool] = False  # whether rounding of positions is felt
+    directed: ClassVar[bool] = False  # whether its value is a vector of the space
     forgets: ClassVar[bool] = False  # whether nothing that it knows of a step lasts
 
     def potential(self, problem: "Problem", u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
