@@ -102,7 +102,7 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
 
 
 def draw(run, angles, found, file: Path) -> None:
-    """The tube from the side, at rest and pressed, and its twist by the angle of the threads."""
+    """The tube from the side, at rest and pressed, and its twist by winding angle."""
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 3, figsize=(10, 4.8), width_ratios=(1, 1, 2.6))

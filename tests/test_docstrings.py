@@ -47,8 +47,8 @@ NAMES = {
     "kPa": kPa, "material": material, "presets": material.presets,
 }  # fmt: skip
 PACKAGES = (
-    "coupling", "design", "fem", "io", "mesh", "reduction", "robots", "rod", "sdf", "sweep", "systems",
-    "view", "vision",
+    "coupling", "design", "fem", "io", "mesh", "reduction", "robots", "rod", "sdf", "sweep",
+    "systems", "view", "vision",
 )  # fmt: skip
 SECTIONS = ("Args", "Attributes", "Returns", "Raises", "Example", "Reference", "References")
 

@@ -93,5 +93,5 @@ def rows():
                 error=abs(energy / wanted - 1),
                 reference=wanted,
                 bar=5e-3 if first else None,
-                bar_on="error" if first else None,
+                bar_on="error",
             )

@@ -152,7 +152,7 @@ def _rotation(X, x, axes) -> Float[Array, "dim dim"]:
 def mounted_rod(
     mesh: Mesh,
     rod: Rod,
-    nodes: Int[np.ndarray, " nodes"],
+    nodes: Int[Array | np.ndarray, " nodes"],
     pose: Float[Array | np.ndarray, "h h"],
     *,
     value: Numbers | None = None,

@@ -15,7 +15,7 @@ from sorojax.fem.embedded import line
 from sorojax.fem.embedded.rods import EmbeddedRod
 from sorojax.fem.loads.facets import CurvedPart
 from sorojax.fem.loads.loads import AbstractLoad
-from sorojax.material.hyperelastic import small_strain_moduli
+from sorojax.material.hyperelastic import AbstractHyperelastic, small_strain_moduli
 from sorojax.mesh.mesh import Mesh
 
 if TYPE_CHECKING:
@@ -192,7 +192,7 @@ def bonded_rod(
     bond_strength: Numbers,
     bond_stiffness: Numbers | None = None,
     tie_stiffness: Numbers | None = None,
-    material=None,
+    material: AbstractHyperelastic | None = None,
 ) -> tuple[Mesh, BondedRod]:
     """The mesh with the vertices of `rod` as nodes of their own, and the rod that may slip.
 

@@ -8,7 +8,10 @@ would need multipliers or a penalty for the same tie, and a helix of many turns 
 
 Vertices should be as far apart as cells are wide: between them a displacement that has kinks
 at the faces of cells is smoothed. Nearer ones would count these kinks as curvature and make
-the rod too stiff, and further ones lose the shape.
+the rod too stiff, and further ones lose the shape. `benchmarks/cases/fem_embedded.py` has a
+fibre of a fifth of the width of a block, 100 times as stiff, straight and wavy: with cells of
+two and a half times its thickness the energy is that of a mesh that follows it to 0.15 %, with
+13 times fewer unknowns; with cells of 1.7 times it to 0.44 %.
 
 The section of the rod turns with the solid at the centreline, which is what an initially
 curved rod is bent against. The bond passes on forces, no torque about the axis: the twist of
@@ -23,7 +26,7 @@ Reference:
     tied by mortar, and for its limits.
 """
 
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -164,7 +167,7 @@ class EmbeddedRod(AbstractLoad):
                 beyond = beyond.at[:, end].set(ends[:, end] - ends[:, next_one])
         return beyond
 
-    def _padded(self, rows):
+    def _padded(self, rows: Any) -> Any:
         """`rows` of vertices, the first and the last once more where they are clamped."""
         xp = np if isinstance(rows, np.ndarray) else jnp
         held, (first, last) = self._width == 3, self.clamped
@@ -192,10 +195,10 @@ class EmbeddedRod(AbstractLoad):
         nodes = self._padded(self._by_rod(xp.asarray(self.route.nodes)))
         return _windows(nodes, self._width).reshape(-1, self._width * nodes.shape[2])
 
-    def _by_rod(self, rows):
+    def _by_rod(self, rows: Any) -> Any:
         return rows.reshape(self.rods, -1, *rows.shape[1:])
 
-    def _middle(self, rows):
+    def _middle(self, rows: Any) -> Any:
         """Of the vertices that turn."""
         inner = self._padded(self._by_rod(rows))[:, 1:-1]
         return inner.reshape(-1, *rows.shape[1:])
@@ -221,7 +224,7 @@ class EmbeddedRod(AbstractLoad):
                     )
 
 
-def _windows(rows, width: int):
+def _windows(rows: Any, width: int) -> Any:
     """Every `width` points in a row of each rod, (rods * groups, width, ...)."""
     count = rows.shape[1] - width + 1
     xp = np if isinstance(rows, np.ndarray) else jnp
@@ -231,7 +234,7 @@ def _windows(rows, width: int):
 
 def embedded_rod(
     mesh: Mesh,
-    points: Float[Array | np.ndarray, "*rods points dim"],
+    points: Numbers,
     *,
     axial_stiffness: Numbers | None = None,
     bending_stiffness: Numbers | None = None,
@@ -258,7 +261,8 @@ def embedded_rod(
     Args:
         mesh: Triangles, quadrilaterals or solid cells. In the plane stiffnesses are those of
             all rods in the depth together.
-        points: Corners of one polyline, or of several with as many corners each [m].
+        points: Corners of one polyline [m], (points, dim), or of several with as many corners
+            each, (rods, points, dim).
         axial_stiffness: EA [N].
         bending_stiffness: EI [N m^2], the same in all directions; a fibre has none.
         radius: Of a round section [m].
@@ -327,13 +331,12 @@ def _polylines(mesh: Mesh, points) -> Float[Array, "rods points dim"]:
 
 
 def _stiffnesses(axial, bending, radius, young, matrix):
-    round_section = radius is not None and young is not None
-    if (axial is None) == (not round_section) or ((radius is None) != (young is None)):
+    if (axial is None) == (radius is None) or (radius is None) != (young is None):
         raise ValueError(
             "fem.embedded_rod: got no stiffness, or two. Give axial_stiffness, or radius and "
             "young_modulus."
         )
-    if not round_section:
+    if radius is None or young is None:
         if matrix is not None:
             raise ValueError(
                 "fem.embedded_rod: got `matrix` without a section, need radius and "
@@ -352,8 +355,7 @@ def _stiffnesses(axial, bending, radius, young, matrix):
 
 
 def _width_of_cells(mesh: Mesh, points: Float[Array, "rods points dim"]) -> float:
-    """Mean edge of a cube of the volume of the cells along polylines [m]; of a tetrahedron
-    that of the three that make a cube of twice its edge."""
+    """Mean extent of the cells along polylines [m]."""
     count = 64
     fixed = jax.lax.stop_gradient(points)
     ends = line.resampled(fixed, count).reshape(-1, mesh.element.dim)
@@ -361,7 +363,7 @@ def _width_of_cells(mesh: Mesh, points: Float[Array, "rods points dim"]) -> floa
     x = np.asarray(jax.lax.stop_gradient(mesh.points))[np.asarray(mesh.cells)[cells]]
     corners = x[:, : mesh.element.num_corners]
     spread = np.asarray(ends).reshape(*points.shape[:1], count, -1)
-    along = np.gradient(spread, axis=1).reshape(len(corners), -1)
+    along = np.asarray(np.gradient(spread, axis=1)).reshape(len(corners), -1)
     along = along / np.linalg.norm(along, axis=1, keepdims=True)
     extent = np.ptp(np.einsum("pai,pi->pa", corners, along), axis=1)
     return float(np.mean(extent))
@@ -374,7 +376,7 @@ def _directors(mesh: Mesh, ends, cells, rods: int) -> Float[Array, "points cell_
     if dim == 2:
         return None
     spread = np.asarray(jax.lax.stop_gradient(ends)).reshape(rods, -1, dim)
-    along = np.gradient(spread, axis=1).reshape(-1, dim)
+    along = np.asarray(np.gradient(spread, axis=1)).reshape(-1, dim)
     sides = np.eye(dim)[np.argmin(np.abs(along), axis=1)]
     return jax.jvp(
         lambda at: locate(mesh, at, cells).weights,
