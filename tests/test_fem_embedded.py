@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import fem, material, mesh
+from sorojax import fem, material, mesh, systems
 from sorojax.units import mm
 
 YOUNG, LENGTH, HEIGHT, DEPTH = 1e5, 100 * mm, 5 * mm, 10 * mm
 RUBBER = material.neo_hookean(young_modulus=YOUNG, poisson_ratio=0.3, density=1000)
 STRIP = mesh.rectangle([0, 0], [LENGTH, HEIGHT], divisions=(20, 2), element=mesh.Quad8())
+OFF = np.array([[0, 1 * mm]])
+HIGH = [[10 * mm, HEIGHT / 4], [90 * mm, HEIGHT / 4]]
 MIDDLE = [[0, HEIGHT / 2], [LENGTH, HEIGHT / 2]]
 SECOND_MOMENT = DEPTH * HEIGHT**3 / 12
 BLOCK = mesh.box([0, 0, 0], [60 * mm, 10 * mm, 10 * mm], divisions=(6, 2, 2))
@@ -321,6 +323,34 @@ def test_a_heavy_rod_swings_slower():
     np.testing.assert_allclose(ends[1], ends[0], atol=0.03 * ends[0][0])
 
 
+def test_a_network_drives_a_rod_as_a_motion_does():
+    """A shortening that follows an input; a rod that slips beside it."""
+    cells, slips = fem.bonded_rod(
+        STRIP,
+        fem.embedded_rod(STRIP, HIGH, radius=0.1 * mm, young_modulus=1e8, density=2e3),
+        bond_strength=0.05, bond_stiffness=2e4, tie_stiffness=1e6,
+    )  # fmt: skip
+    slips = dataclasses.replace(slips, name="slips")
+    muscle = fem.embedded_rod(STRIP, MIDDLE + OFF, axial_stiffness=5.0, name="muscle")
+    problem = strip(muscle, slips, cells=cells)
+    step, count = 2e-3, 5
+    shares = 0.02 * np.arange(count + 1) / count
+    motion = fem.simulate(problem, count * step, step, muscle=shares)
+    tip = mesh.nearest_node(STRIP, MIDDLE[1])
+    body = systems.FemBody(problem, driven=("muscle",), markers={"tip": tip})
+    film = systems.simulate(
+        systems.Network({"body": body}, {}, exposed=("body.muscle",)),
+        count * step,
+        step=step,
+        save=count + 1,
+        inputs={"body.muscle": lambda t: 0.02 * t / (count * step)},
+    )
+    place = np.asarray(film["body.tip_position"])
+    moved = place[-1] - np.asarray(cells.points[tip])
+    np.testing.assert_allclose(moved, motion.displacements[-1, tip], rtol=1e-2, atol=1e-7)
+    assert abs(moved[1]) > 1e-5
+
+
 def test_wrong_rods_say_what_to_do():
     with pytest.raises(ValueError, match=r"Give axial_stiffness, or radius"):
         fem.embedded_rod(STRIP, MIDDLE)
@@ -333,6 +363,9 @@ def test_wrong_rods_say_what_to_do():
     rod = fem.embedded_rod(STRIP, MIDDLE, axial_stiffness=1.0, clamped=(True, False))
     with pytest.raises(ValueError, match=r"need one rod that is not clamped"):
         fem.bonded_rod(STRIP, rod, bond_strength=1.0, material=RUBBER)
+    cells, free = held_bar()
+    with pytest.raises(ValueError, match=r"needs a mass of its own"):
+        fem.simulate(pulled(cells, free, 0.0), 0.1, 0.05)
     with pytest.raises(ValueError, match=r"need one of \[\]"):
         fem.rod_forces(strip(), jnp.zeros_like(STRIP.points))
     with pytest.raises(ValueError, match=r"Use a solid mesh"):

@@ -131,7 +131,11 @@ class BondedRod(AbstractLoad):
 
     def lumped_mass(self, problem):
         mass = self.rod.mass_per_length
-        mass = jnp.zeros(()) if mass is None else mass
+        if mass is None:
+            raise ValueError(
+                f"fem.simulate: BondedRod '{self.name}' needs a mass of its own, as its "
+                "vertices move by themselves. Give `density` to fem.embedded_rod."
+            )
         length = self._data(problem.mesh.points).bond.length
         zero = jnp.zeros(problem.mesh.num_nodes, length.dtype)
         return zero.at[self.nodes].add(length * jnp.broadcast_to(mass, (1,)))
@@ -203,7 +207,7 @@ def bonded_rod(
     Args:
         mesh: That `rod` was made on.
         rod: One rod, `embedded_rod(mesh, points, ...)`, not clamped: supports may hold its
-            nodes.
+            nodes. For motions it needs a `density`.
         bond_strength: Largest force along the rod per length [N/m].
         bond_stiffness: That force over the slip, before it is reached [N/m^2]; that of the tie
             when omitted.
