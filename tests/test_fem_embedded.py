@@ -301,6 +301,8 @@ def test_the_mass_of_a_rod_is_that_of_its_length():
     section = np.pi * (0.5 * mm) ** 2
     assert float(jnp.sum(mass)) == pytest.approx(2 * 7800 * section * length, rel=1e-12)
     assert jnp.all(mass >= 0)
+    whole = float(fem.total_mass(in_block(heavy)))
+    assert whole == pytest.approx(1000 * 6e-6 + float(jnp.sum(mass)), rel=1e-12)
     np.testing.assert_allclose(heavy.axial_stiffness, (1e9 - YOUNG) * section, rtol=1e-12)
 
 

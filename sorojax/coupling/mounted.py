@@ -87,8 +87,8 @@ class MountedRod(AbstractLoad):
 
     def lumped_mass(self, problem):
         raise ValueError(
-            f"fem.simulate: MountedRod '{self.name}' has no mass matrix yet, need statics. Use "
-            "fem.solve or fem.solve_path, or a network with a rod of its own."
+            f"fem.mass_matrix: MountedRod '{self.name}' has no mass matrix yet, need statics. "
+            "Use fem.solve or fem.solve_path, or a network with a rod of its own."
         )
 
     def _unit(self) -> Float[Array, ""]:

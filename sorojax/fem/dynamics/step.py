@@ -112,17 +112,6 @@ def mass_values(problem: Problem, mass: Mass) -> Float[Array, " nnz"]:
     return jnp.where(system.rows == system.cols, spread, jnp.zeros_like(spread))
 
 
-def load_masses(problem: Problem) -> Float[Array, " nnz"] | Float[Array, ""]:
-    """Mass that loads add to nodes, such as rods in the solid, on the diagonal [kg]."""
-    system, bare = problem.space.system, body(problem)
-    found = [load.lumped_mass(bare) for load in problem.loads]
-    given = [mass for mass in found if mass is not None]
-    if not given:
-        return jnp.zeros((), problem.mesh.points.dtype)
-    mass = jnp.repeat(sum(given[1:], start=given[0]), problem.mesh.element.dim)[system.rows]
-    return jnp.where(system.rows == system.cols, mass, jnp.zeros_like(mass))
-
-
 # One time step as a problem of equilibrium, and the state after it; pure functions
 
 
@@ -205,8 +194,7 @@ class TimeStep(NamedTuple):
 def matter(dynamics: Dynamics) -> Matter:
     """Mass and constant damping of the body."""
     problem = body(dynamics.problem)
-    mass = mass_values(problem, dynamics.mass)
-    mass = mass + load_masses(dynamics.problem)
+    mass = mass_values(exchanged(problem, loads=dynamics.problem.loads), dynamics.mass)
     rest = jnp.zeros_like(problem.mesh.points)
     constant = [d.matrix(problem, mass, rest) for d in dynamics.damping if d.constant]
     damping = sum(constant[1:], start=constant[0]) if constant else None
