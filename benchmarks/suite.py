@@ -27,6 +27,7 @@ ROWS = {
             "fem.batch",
             "fem.beam_data",
             "fem.convergence",
+            "fem.embedded",
             "fem.iterative",
             "fem.pneunet",
             "fem.tube",

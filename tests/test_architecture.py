@@ -23,7 +23,7 @@ FLOOR = {
     **dict.fromkeys(("sdf", "material"), 1),
     **dict.fromkeys(("mesh", "contact"), 2),
     **dict.fromkeys(("fem", "rod"), 3),
-    **dict.fromkeys(("systems", "reduction"), 4),
+    **dict.fromkeys(("systems", "reduction", "coupling"), 4),
     **dict.fromkeys(("design", "robots"), 5),
     "io": 6,
     **dict.fromkeys(("view", "vision", "sweep"), 7),

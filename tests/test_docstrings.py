@@ -24,12 +24,13 @@ VERBS = {
     "material": "by_region fit_cyclic fit_spectrum fit_tensile neo_hookean preconditioned "
     "predicted_readings stress_history uniaxial_spectrum",
     "material.presets": "rubber",
-    "fem": "cauchy_stress continuation critical_loads eigenmodes problem simulate solve "
-    "solve_path solve_volume von_mises_stress",
+    "fem": "bonded_rod cauchy_stress continuation critical_loads eigenmodes embedded_rod "
+    "problem rod_forces simulate solve solve_path solve_volume von_mises_stress",
     "rod": "assembly branch_states bspline chebyshev circle close equilibrium equilibrium_path "
     "forward_dynamics forward_kinematics inverse_kinematics mobility operators "
     "piecewise_constant rod "
     "rollout tip_pose",
+    "coupling": "mounted_rod",
     "reduction": "identify pod_basis strain_along",
     "systems": "Network simulate simulate_batch simulate_sampled",
     "design": "calibrate drawing_to_loop layout minimise minimise_shape propagate_covariance",
@@ -47,8 +48,8 @@ NAMES = {
     "kPa": kPa, "material": material, "presets": material.presets,
 }  # fmt: skip
 PACKAGES = (
-    "design", "fem", "io", "mesh", "reduction", "robots", "rod", "sdf", "sweep", "systems",
-    "view", "vision",
+    "coupling", "design", "fem", "io", "mesh", "reduction", "robots", "rod", "sdf", "sweep",
+    "systems", "view", "vision",
 )  # fmt: skip
 SECTIONS = ("Args", "Attributes", "Returns", "Raises", "Example", "Reference", "References")
 

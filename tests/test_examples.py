@@ -83,6 +83,15 @@ def test_a_bellows_actuator_and_its_gains_are_found_together():
     assert user_code("30_codesign_bellows") <= 60
 
 
+@pytest.mark.slow
+def test_a_tube_wound_with_fibres_twists_as_the_exact_solution_says():
+    numbers = main_of("41_fibre_tube")(quick=True)
+    assert numbers["largest error over the largest twist"] < 0.025
+    slope = numbers["twist by winding angle at 30 deg [deg/deg]"]
+    assert slope == pytest.approx(numbers["the same of a long tube [deg/deg]"], rel=0.02)
+    assert user_code("41_fibre_tube") <= 60
+
+
 def test_the_readme_says_how_programs_are_kept_for_the_next_run():
     assert "sj.enable_compilation_cache()" in (ROOT / "README.md").read_text()
 

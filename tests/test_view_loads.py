@@ -219,3 +219,15 @@ def test_a_backbone_and_its_largest_change_are_drawn():
     assert "change of kappa_z" in words(picture)
     assert np.allclose(picture.panels[1].axes.lines[-1].get_ydata(), 15 * np.asarray(s))
     assert repr(backbone).startswith("Backbone: 3 snapshots of 21 samples in 2 dimensions")
+
+
+def test_a_rod_in_a_body_is_a_line_that_goes_along():
+    mesh = beam(2)
+    line = [[0.005, -0.001], [0.055, 0.002]]
+    rod = fem.embedded_rod(mesh, line, axial_stiffness=1.0, name="fibre")
+    _, free = fem.bonded_rod(mesh, rod, bond_strength=1.0, tie_stiffness=1.0)
+    problem = loaded(2, rod)
+    (drawn,) = load_parts(problem, 0.1 * np.asarray(mesh.points))
+    assert isinstance(drawn, Lines) and drawn.name == "fibre"
+    assert np.allclose(drawn.runs[0][[0, -1]], 1.1 * np.array(line))
+    assert free.nodes.shape[0] == len(drawn.runs[0])

@@ -23,6 +23,9 @@ from sorojax.fem.dynamics.methods import EnergyMomentum, GeneralisedAlpha, Newma
 from sorojax.fem.dynamics.simulate import MotionError, simulate
 from sorojax.fem.dynamics.step import State
 from sorojax.fem.dynamics.trajectory import Trajectory, momentum
+from sorojax.fem.embedded.bonded import BondedRod, bonded_rod
+from sorojax.fem.embedded.results import RodForces, rod_forces
+from sorojax.fem.embedded.rods import EmbeddedRod, embedded_rod
 from sorojax.fem.equilibrium.newton import Newton
 from sorojax.fem.equilibrium.solve import (
     ConvergenceError,
@@ -79,12 +82,14 @@ from sorojax.math.linalg.sparse import ConjugateGradient
 __all__ = [
     "AbstractContents",
     "Axisymmetric",
+    "BondedRod",
     "Cable",
     "ConjugateGradient",
     "ConstantPressure",
     "Contact",
     "ConvergenceError",
     "Displacement",
+    "EmbeddedRod",
     "EnergyMomentum",
     "Fixed",
     "Force",
@@ -104,6 +109,7 @@ __all__ = [
     "Pressure",
     "Problem",
     "Rayleigh",
+    "RodForces",
     "Rotated",
     "SelfContact",
     "Solid",
@@ -114,6 +120,7 @@ __all__ = [
     "Torque",
     "Traction",
     "Trajectory",
+    "bonded_rod",
     "cauchy_stress",
     "contact_state",
     "contact_switching",
@@ -121,6 +128,7 @@ __all__ = [
     "critical_loads",
     "deformation_gradient",
     "eigenmodes",
+    "embedded_rod",
     "enclosed_volume",
     "lumped_mass",
     "mass_matrix",
@@ -139,6 +147,7 @@ __all__ = [
     "reaction_force",
     "residual",
     "rigid",
+    "rod_forces",
     "rotated",
     "route",
     "sample_points",

@@ -132,7 +132,8 @@ def problem(
             for a plane mesh, thickness [m]; `Solid()`, the default, in space.
         supports: `Fixed(nodes)`, `Prescribed(nodes, displacement)` [m], `Rotated(...)`.
         loads: `Pressure`, `Traction`, `Force`, `Torque`, `Gravity`, `Spring`, `Foundation`,
-            `Tendon`, `Cable`, `Contact` and `rigid(mesh, nodes)`; none by default.
+            `Tendon`, `Cable`, `Contact`, `rigid(mesh, nodes)` and `embedded_rod(mesh, points)`;
+            none by default.
         formulation: How the pressure varies in a cell. By default `LinearPressure()` for
             Tri7, Quad9 and Tet15, `ConstantPressure()` for Quad4, Hex8 and polygons, and
             `Displacement()` for the rest and in plane stress.

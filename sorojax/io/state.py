@@ -98,8 +98,8 @@ def _array_of(data: bytes) -> np.ndarray:
 
 
 _PACKAGES = (
-    "contact", "design", "fem", "material", "math", "mesh", "reduction", "robots", "rod", "sdf",
-    "systems",
+    "contact", "coupling", "design", "fem", "material", "math", "mesh", "reduction", "robots",
+    "rod", "sdf", "systems",
 )  # fmt: skip
 _PLAIN = (type(None), bool, int, float, str)
 

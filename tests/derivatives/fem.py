@@ -88,6 +88,28 @@ def two_plates():
     return plate(contact, supports=(fem.Fixed(held),), cells=both)
 
 
+SOLID = patch(mesh.Hex8(), (0.0, 0.0, 0.0))
+SPATIAL = np.array([[0.1, 0.2, 0.15], [0.5, 0.4, 0.3], [0.85, 0.6, 0.8]])
+
+
+def backbone(cells, way=WAY, **options):
+    """Curved at rest, so that the directions of its sections count in space."""
+    options = {"axial_stiffness": 2.0, "bending_stiffness": 0.02, "spacing": 0.3} | options
+    return fem.embedded_rod(cells, np.asarray(way), value=0.01, **options)
+
+
+def in_space(rod):
+    held = mesh.nodes_where(SOLID, lambda p: p[0] < 1e-9)
+    return fem.problem(SOLID, RUBBER, supports=(fem.Fixed(held),), loads=(rod,))
+
+
+def slipping(cells):
+    """Some of the bond slides at the state of `moved`."""
+    numbers = {"bond_strength": 0.02, "bond_stiffness": 3.0, "tie_stiffness": 20.0}
+    wider, rod = fem.bonded_rod(cells, backbone(cells), **numbers)
+    return plate(rod, cells=wider)
+
+
 TERMS = {
     "Pressure": lambda: plate(fem.Pressure(ABOVE, 0.02, origin=[0.1, 0.2]), supports=ENDS),
     "Traction": lambda: plate(fem.Traction(ABOVE, [0.02, -0.03])),
@@ -100,6 +122,9 @@ TERMS = {
     "Tendon": lambda: plate(fem.Tendon(fem.route(PLATE, WAY), 0.1)),
     "Cable": lambda: plate(fem.Cable(fem.route(PLATE, WAY), 0.5, 0.3)),
     "Rigid": lambda: plate(fem.rigid(PLATE, RIGHT)),
+    "EmbeddedRod": lambda: plate(backbone(PLATE)),
+    "EmbeddedRod in space": lambda: in_space(backbone(SOLID, SPATIAL, axial_stiffness=3.0)),
+    "BondedRod": lambda: slipping(PLATE),
     "Contact": lambda: plate(touching(offset=np.full((3, 2), 0.01))),
     "Contact with friction": lambda: plate(touching(friction=0.4)),
     "SelfContact": two_plates,
@@ -213,6 +238,9 @@ MEASURES = {
     "tendon_length": (
         lambda p, u: fem.tendon_length(p.mesh, u, p.loads[0].route), TERMS["Cable"],
     ),
+    "rod_forces": (fem.rod_forces, TERMS["EmbeddedRod in space"]),
+    "rod_forces of a rod that slips": (fem.rod_forces, TERMS["BondedRod"]),
+    "update_friction of a bond": (fem.update_friction, TERMS["BondedRod"]),
     "contact_state": (fem.contact_state, TERMS["Contact"]),
     "overlap": (fem.overlap, TERMS["Contact"]),
     "update_friction": (first_touch, TERMS["Contact with friction"]),
@@ -222,6 +250,33 @@ MEASURES = {
     "with_load": (lambda p, u: fem.with_load(p, "force", 3 * u[0]), TERMS["Force"]),
 }  # fmt: skip
 CASES |= {name: at_state(verb, make) for name, (verb, make) in MEASURES.items()}
+
+
+def wound(at):
+    """From the points of the rod and of the mesh, by the cells that hold it."""
+    way, points, numbers = at
+    cells = eqx.tree_at(lambda m: m.points, SOLID, points)
+    rod = fem.embedded_rod(
+        cells, way, radius=numbers[0], young_modulus=numbers[1], matrix=RUBBER, spacing=0.3,
+        density=numbers[2],
+    )  # fmt: skip
+    both, free = fem.bonded_rod(cells, rod, bond_strength=numbers[3], material=RUBBER)
+    problem, u = moved(in_space(rod))
+    wide = dataclasses.replace(problem, mesh=both, loads=(free,))
+    return fem.potential_energy(problem, u), free.lumped_mass(wide), free.tie_stiffness
+
+
+CASES |= {
+    name: Case(
+        wound,
+        (jnp.asarray(SPATIAL), SOLID.points, jnp.asarray([0.1, 40.0, 2.0, 0.3])),
+        jit=False,
+        forward=False,
+        step=1e-5,
+        rtol=1e-6,
+    )
+    for name in ("embedded_rod", "bonded_rod")
+}
 ARC = drawn(1.0, (4, 3)), jnp.asarray(0.4), drawn(1.0, 3), drawn(1.0, 3, 4)
 CASES |= {
     "rotated": Case(lambda at: fem.rotated(*at), tuple(map(jnp.asarray, ARC))),

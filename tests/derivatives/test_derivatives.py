@@ -11,6 +11,7 @@ FLOORS = {
     floor: importlib.import_module(f"tests.derivatives.{floor}")
     for floor in (
         "contact",
+        "coupling",
         "design",
         "fem",
         "material",

@@ -16,6 +16,7 @@ from sorojax.contact.facet import Contacts
 from sorojax.fem.assembly.space import space
 from sorojax.fem.contact.obstacle import Contact, settled
 from sorojax.fem.contact.self_contact import SelfContact, with_partners
+from sorojax.fem.embedded.bonded import BondedRod
 from sorojax.fem.equilibrium.solve import ConvergenceError, Solution, solve
 from sorojax.fem.loads import checks as checks_loads
 from sorojax.fem.problem import Problem
@@ -35,14 +36,18 @@ def update_friction(problem: Problem, u: Float[Array, "nodes dim"]) -> Problem:
             u = fem.solve(pulled, start=u).displacement
             problem = fem.update_friction(pulled, u)
 
-    Differentiable; loads without memory stay as they are.
+    A rod that slips in the solid (`BondedRod`) remembers how far. Differentiable; loads
+    without memory stay as they are.
     """
-    loads = tuple(
-        settled(load, dataclasses.replace(problem, supports=(), loads=()), u)
-        if isinstance(load, Contact) and load.grip is not None
-        else load
-        for load in problem.loads
-    )
+    bare = dataclasses.replace(problem, supports=(), loads=())
+
+    def known(load):
+        if isinstance(load, BondedRod):
+            return load.advanced(bare, u)
+        rubs = isinstance(load, Contact) and load.grip is not None
+        return settled(load, bare, u) if rubs else load
+
+    loads = tuple(map(known, problem.loads))
     return eqx.tree_at(lambda p: p.loads, problem, loads)
 
 

@@ -136,7 +136,7 @@ def mass_matrix(problem: Problem) -> Float[Array, " nnz"]:
     """Consistent mass matrix [kg], as values in the pattern `problem.space.system`.
 
     `sparse.product(problem.space.system, mass_matrix(problem), v)` multiplies by it.
-    Differentiable in density, thickness and nodes.
+    That of embedded rods is on the diagonal. Differentiable in density, thickness and nodes.
 
     Raises:
         ValueError: If the material has no density.
@@ -146,8 +146,12 @@ def mass_matrix(problem: Problem) -> Float[Array, " nnz"]:
     dim = problem.mesh.element.dim
     each = jnp.eye(dim, dtype=scalar.dtype)
     full = scalar[:, :, None, :, None] * each[None, None, :, None, :]
-    size = nodes * dim
-    return sparse.assemble(problem.space.system, full.reshape(cells, size, size))
+    size, system = nodes * dim, problem.space.system
+    mass = sparse.assemble(system, full.reshape(cells, size, size))
+    if (more := _of_loads(problem)) is None:
+        return mass
+    added = jnp.repeat(more, dim)[system.rows]
+    return mass + jnp.where(system.rows == system.cols, added, jnp.zeros_like(added))
 
 
 def lumped_mass(problem: Problem) -> Float[Array, " dofs"]:
@@ -162,12 +166,21 @@ def lumped_mass(problem: Problem) -> Float[Array, " dofs"]:
     total = jnp.sum(scalar, axis=(1, 2))
     share = diagonal * (total / jnp.sum(diagonal, axis=1))[:, None]
     zero = jnp.zeros(problem.mesh.num_nodes, share.dtype)
-    return jnp.repeat(zero.at[problem.mesh.cells].add(share), problem.mesh.element.dim)
+    nodal, more = zero.at[problem.mesh.cells].add(share), _of_loads(problem)
+    return jnp.repeat(nodal if more is None else nodal + more, problem.mesh.element.dim)
 
 
 def total_mass(problem: Problem) -> Float[Array, ""]:
     """Mass of the body [kg]."""
-    return jnp.sum(_cell_masses(problem))
+    own, more = jnp.sum(_cell_masses(problem)), _of_loads(problem)
+    return own if more is None else own + jnp.sum(more)
+
+
+def _of_loads(problem: Problem) -> Float[Array, " nodes"] | None:
+    """Mass that loads add to the nodes [kg], such as rods in the solid."""
+    found = [load.lumped_mass(problem) for load in problem.loads]
+    given = [mass for mass in found if mass is not None]
+    return sum(given[1:], start=given[0]) if given else None
 
 
 def _cell_masses(problem: Problem) -> Float[Array, "cells cell_nodes cell_nodes"]:

@@ -307,6 +307,8 @@ class StepSolver:
         self.system = problem.space.system
         self.solver, self.sees = self.system.solver, has_lists(problem)
         self.known, self.length = np.asarray(prepared.known), float(prepared.length)
+        stiff = any(load.stiff_in_positions for load in problem.loads)
+        self.reach = float(np.abs(np.asarray(problem.mesh.points)).max()) if stiff else 0.0
         self.free, self.kept = not self.known.any(), None
         self._fixed = Split((body(problem), prepared))
         self._resting = Split((body(problem), _without_resting(problem, prepared)))
@@ -408,7 +410,7 @@ class StepSolver:
         if not self.free:
             norm = np.where(self.known, 0.0, size).max()
             reference = max(reference, np.where(self.known, size, 0.0).max())
-        length = np.abs(u).max() + self.length
+        length = np.abs(u).max() + self.length + self.reach
         return Balance(residual, load, float(norm), float(reference), length, float(ratio))
 
     def _advance(self, u, du, slope):

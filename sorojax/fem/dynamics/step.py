@@ -194,7 +194,7 @@ class TimeStep(NamedTuple):
 def matter(dynamics: Dynamics) -> Matter:
     """Mass and constant damping of the body."""
     problem = body(dynamics.problem)
-    mass = mass_values(problem, dynamics.mass)
+    mass = mass_values(exchanged(problem, loads=dynamics.problem.loads), dynamics.mass)
     rest = jnp.zeros_like(problem.mesh.points)
     constant = [d.matrix(problem, mass, rest) for d in dynamics.damping if d.constant]
     damping = sum(constant[1:], start=constant[0]) if constant else None

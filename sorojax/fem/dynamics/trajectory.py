@@ -131,7 +131,7 @@ def momentum(
     """Linear momentum [N s] and angular momentum about the origin [N m s] at every saved
     time, one component in the plane and three in space, with the consistent mass."""
     problem = motion.problem
-    mass = mass_matrix(body(problem))
+    mass = mass_matrix(problem)
 
     def one(u, v):
         p = sparse.product(problem.space.system, mass, v.ravel()).reshape(v.shape)

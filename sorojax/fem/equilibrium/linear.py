@@ -107,7 +107,10 @@ def unbalanced(problem: Problem, prepared: Prepared, force: Float[Array, " dofs"
     free = jnp.where(prepared.known, zero, residual)
     reaction = jnp.where(prepared.known, residual, zero)
     largest = jnp.maximum(jnp.max(jnp.abs(load)), jnp.max(jnp.abs(reaction)))
-    return residual, jnp.max(jnp.abs(free)), largest, jnp.max(jnp.abs(u)) + prepared.length
+    length = jnp.max(jnp.abs(u)) + prepared.length
+    if any(load.stiff_in_positions for load in problem.loads):
+        length = length + jnp.max(jnp.abs(problem.mesh.points))
+    return residual, jnp.max(jnp.abs(free)), largest, length
 
 
 def _curved_parts(problem: Problem) -> list[CurvedPart]:

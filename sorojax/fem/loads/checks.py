@@ -96,7 +96,8 @@ def room(space: Space, given: tuple[AbstractLoad, ...]) -> None:
 
 def _check_value(where: str, load: AbstractLoad, dim: int) -> None:
     """A vector where the load has a direction, else a number; a bed of springs has both."""
-    want = ((dim,),) if isinstance(load, Force | Traction | Gravity | Contact) else ((),)
+    directed = load.directed or isinstance(load, Force | Traction | Gravity | Contact)
+    want = ((dim,),) if directed else ((),)
     if isinstance(load, Foundation):
         want = ((), (dim,))
     if load.value.shape not in want:

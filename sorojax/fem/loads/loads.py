@@ -35,6 +35,8 @@ class AbstractLoad(eqx.Module):
     smooth: ClassVar[bool] = True  # whether the tangent at one load foretells the next
     overshoots: ClassVar[bool] = False  # whether steps may run past where its force changes
     dead: ClassVar[bool] = False  # whether its force is the same in every state
+    stiff_in_positions: ClassVar[bool] = False  # whether rounding of positions is felt
+    directed: ClassVar[bool] = False  # whether its value is a vector of the space
     forgets: ClassVar[bool] = False  # whether nothing that it knows of a step lasts
 
     def potential(self, problem: "Problem", u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
@@ -70,6 +72,10 @@ class AbstractLoad(eqx.Module):
     def tangent_values(self, problem: "Problem") -> Float[Array, " nnz"] | None:
         """Stiffness that does not depend on u, in the pattern of the tangent [N/m], beside
         that of `curved_part`; `None` adds nothing."""
+        return None
+
+    def lumped_mass(self, problem: "Problem") -> Float[Array, " nodes"] | None:
+        """Mass that the load adds to the nodes [kg]; `None` adds nothing."""
         return None
 
     def begun(self, problem: "Problem", step: "StepState") -> "AbstractLoad":

@@ -38,6 +38,8 @@ _UNITS = {
     fem.Cable: "m",
     fem.Gravity: "m/s^2",
     fem.Torque: "N m",
+    fem.EmbeddedRod: "-",
+    fem.BondedRod: "-",
 }
 
 

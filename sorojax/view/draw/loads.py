@@ -75,6 +75,12 @@ def _load(problem: Problem, load: AbstractLoad, points: Points, size: float) -> 
         line = np.asarray(Locations(load.route.nodes, load.route.weights)(jnp.asarray(points)))
         pull = f": {short(float(load.value), 'N')}" if isinstance(load, fem.Tendon) else ""
         return [Lines([line], style.COLOURS[3], 1.6, name=f"{load.name}{pull}")]
+    if isinstance(load, fem.EmbeddedRod):
+        runs = list(np.asarray(load.vertices(jnp.asarray(points))))
+        return [Lines(runs, style.COLOURS[3], 1.6, name=load.name)]
+    if isinstance(load, fem.BondedRod):
+        run = points[np.asarray(load.nodes)]
+        return [Lines([run], style.COLOURS[3], 1.6, name=load.name)]
     if isinstance(load, fem.Contact):
         shift = None if load.value is None else np.asarray(load.value)
         return obstacle_part(load.obstacle, points, size, shift)

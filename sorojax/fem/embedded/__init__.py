@@ -1,0 +1,1 @@
+"""Rods inside a solid whose mesh does not follow them."""
