@@ -51,6 +51,7 @@ from sorojax.fem.loads.springs import (
     tension,
 )
 from sorojax.fem.problem import Problem, potential_energy, problem, residual
+from sorojax.fem.reactions import Reaction, reaction_history, reactions
 from sorojax.fem.stability.buckling import critical_loads, with_imperfection
 from sorojax.fem.stability.continuation import continuation
 from sorojax.fem.stability.modal import (
@@ -104,6 +105,7 @@ __all__ = [
     "Pressure",
     "Problem",
     "Rayleigh",
+    "Reaction",
     "Rotated",
     "SelfContact",
     "Solid",
@@ -137,6 +139,8 @@ __all__ = [
     "principal_stresses",
     "problem",
     "reaction_force",
+    "reaction_history",
+    "reactions",
     "residual",
     "rigid",
     "rotated",

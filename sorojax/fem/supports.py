@@ -31,7 +31,7 @@ class Fixed(AbstractSupport):
 
     nodes: Int[Array, " nodes"] = eqx.field(converter=integers)
     components: tuple[int, ...] | None = eqx.field(static=True, default=None)
-    name: ClassVar[str] = "fixed"
+    name: str = eqx.field(static=True, default="fixed")
 
     @property
     def displacement(self) -> Float[Array, ""]:

@@ -206,6 +206,7 @@ MEASURES = {
     "strain_energy": (fem.strain_energy, sheet),
     "enclosed_volume": (lambda p, u: fem.enclosed_volume(p, u, jnp.asarray(ABOVE)), plate),
     "reaction_force": (lambda p, u: fem.reaction_force(p, u, jnp.asarray(LEFT)), plate),
+    "reactions": (lambda p, u: fem.reactions(p, u, about=u[1]), lambda: loaded()),
     "mass_matrix": (lambda p, u: fem.mass_matrix(p), quads),
     "lumped_mass": (lambda p, u: fem.lumped_mass(p), quads),
     "total_mass": (lambda p, u: fem.total_mass(p), quads),
@@ -437,6 +438,7 @@ CASES |= {
     "modal_force": modal(fem.modal_force),
     "simulate": lambda: moving(PULLED(), ALPHA, VISCOUS),
     "simulate with contact": lambda: moving(pressed(friction=0.4), ALPHA),
+    "reaction_history": lambda: moving(PULLED(), ALPHA, measure=fem.reaction_history),
     "momentum": lambda: moving(
         PULLED(), fem.Newmark(0.3, 0.55), measure=fem.momentum, mass="lumped"
     ),
