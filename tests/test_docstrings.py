@@ -24,8 +24,8 @@ VERBS = {
     "material": "by_region fit_cyclic fit_spectrum fit_tensile neo_hookean preconditioned "
     "predicted_readings stress_history uniaxial_spectrum",
     "material.presets": "rubber",
-    "fem": "cauchy_stress continuation critical_loads eigenmodes problem reaction_history "
-    "reactions simulate solve solve_path solve_volume von_mises_stress",
+    "fem": "cauchy_stress continuation critical_loads eigenmodes glue problem "
+    "reaction_history reactions simulate solve solve_path solve_volume von_mises_stress",
     "rod": "assembly branch_states bspline chebyshev circle equilibrium equilibrium_path "
     "forward_dynamics forward_kinematics inverse_kinematics operators piecewise_constant rod "
     "rollout tip_pose",

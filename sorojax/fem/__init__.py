@@ -39,6 +39,7 @@ from sorojax.fem.equilibrium.volume import (
     volume_path,
 )
 from sorojax.fem.kinematics import Axisymmetric, PlaneStrain, PlaneStress, Solid
+from sorojax.fem.loads.glue import Glue, glue
 from sorojax.fem.loads.loads import Force, Gravity, Pressure, Torque, Traction, mean_rotation
 from sorojax.fem.loads.rigid import rigid
 from sorojax.fem.loads.springs import (
@@ -92,6 +93,7 @@ __all__ = [
     "Foundation",
     "Gas",
     "GeneralisedAlpha",
+    "Glue",
     "Gravity",
     "KelvinVoigt",
     "LinearPressure",
@@ -124,6 +126,7 @@ __all__ = [
     "deformation_gradient",
     "eigenmodes",
     "enclosed_volume",
+    "glue",
     "lumped_mass",
     "mass_matrix",
     "mean_rotation",

@@ -15,7 +15,7 @@ from tests.patches import POLYGON, patch
 
 NONE = {
     "topology, on the host: pairs of nodes, patches of cells, cells that hold points": (
-        "space patches route rigid"
+        "space patches route rigid glue"
     ),
     "lists which facets are near, at concrete positions only": "update_contact_pairs",
     "paths and predictions found on the host; their docstrings promise no derivative": (
@@ -88,6 +88,17 @@ def two_plates():
     return plate(contact, supports=(fem.Fixed(held),), cells=both)
 
 
+def glued():
+    both = mesh.merge(
+        upper=mesh.rectangle([0, 0.5], [1.5, 1.0], divisions=(2, 1)),
+        lower=mesh.rectangle([0, 0], [1.5, 0.5], divisions=(3, 1)),
+    )
+    seam = fem.glue(
+        both, both.facet_sets["upper.bottom"], both.facet_sets["lower.top"], stiffness=20.0
+    )
+    return plate(seam, supports=(fem.Fixed(both.node_sets["lower.bottom"]),), cells=both)
+
+
 TERMS = {
     "Pressure": lambda: plate(fem.Pressure(ABOVE, 0.02, origin=[0.1, 0.2]), supports=ENDS),
     "Traction": lambda: plate(fem.Traction(ABOVE, [0.02, -0.03])),
@@ -103,6 +114,7 @@ TERMS = {
     "Contact": lambda: plate(touching(offset=np.full((3, 2), 0.01))),
     "Contact with friction": lambda: plate(touching(friction=0.4)),
     "SelfContact": two_plates,
+    "Glue": glued,
 }
 MATERIALS = {
     "NeoHookean": lambda: material.NeoHookean(0.4, 2.0),
