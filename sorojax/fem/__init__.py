@@ -75,13 +75,14 @@ from sorojax.fem.stress import (
     strain_energy,
     von_mises_stress,
 )
-from sorojax.fem.supports import Fixed, Prescribed, Rotated, rotated
+from sorojax.fem.supports import Carried, Fixed, Prescribed, Rotated, rotated
 from sorojax.math.linalg.sparse import ConjugateGradient
 
 __all__ = [
     "AbstractContents",
     "Axisymmetric",
     "Cable",
+    "Carried",
     "ConjugateGradient",
     "ConstantPressure",
     "Contact",

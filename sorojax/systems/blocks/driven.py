@@ -12,6 +12,7 @@ from sorojax import fem
 from sorojax.fem.loads.loads import AbstractLoad
 from sorojax.fem.problem import body
 from sorojax.fem.supports import AbstractSupport, known_values
+from sorojax.systems.blocks.block import Output
 
 Driven = AbstractLoad | AbstractSupport
 
@@ -27,11 +28,17 @@ _UNITS = {
     fem.Rotated: "rad",
 }
 #: What a support exerts, as output: the name after its own, and the unit.
-_REACTIONS = {fem.Prescribed: ("force", "N"), fem.Rotated: ("torque", "N m")}
+_REACTIONS = {
+    fem.Prescribed: ("force", "N"),
+    fem.Rotated: ("torque", "N m"),
+    fem.Carried: ("wrench", None),
+}
 
 
 def value_of(driven: Driven) -> Array:
-    """The number or array that an input sets."""
+    """The number or array that an input sets; the pose of the frame that carries nodes."""
+    if isinstance(driven, fem.Carried):
+        return driven.rest.at[:-1].add(driven.motion)
     return getattr(driven, _field(driven))
 
 
@@ -46,10 +53,13 @@ def port_of(driven: Driven, kind: str = "pressure") -> str:
     return kind if driven.name == "pressure" else f"{driven.name}_{kind}"
 
 
-def reaction_port(support: AbstractSupport) -> tuple[str, str]:
-    """Name and unit of the output of what a support exerts on the body."""
+def reaction_port(support: AbstractSupport) -> tuple[str, Output]:
+    """Name of the output of what a support exerts on the body, and the output."""
     word, unit = _REACTIONS[type(support)]
-    return f"{support.name}_{word}", unit
+    shape = value_of(support).shape
+    if isinstance(support, fem.Carried):
+        shape = ({2: 3, 3: 6}[support.points.shape[1]],)
+    return f"{support.name}_{word}", Output(unit, shape)
 
 
 def drivable(problem: fem.Problem) -> list[Driven]:
@@ -74,6 +84,9 @@ def with_places(
 def _set(driven: Driven, values: Mapping[str, Array]) -> Driven:
     if driven.name not in values:
         return driven
+    if isinstance(driven, fem.Carried):
+        moved = values[driven.name][:-1] - driven.rest[:-1]
+        return eqx.tree_at(lambda d: d.motion, driven, moved)
     field = _field(driven)
     return eqx.tree_at(lambda d: getattr(d, field), driven, values[driven.name])
 
@@ -98,10 +111,22 @@ def exerted(
 ) -> dict[str, Array]:
     """What the supports that are driven to `values` exert on a body, by name: the reaction
     `forces` [N] in the direction that each value moves their nodes in, so that its rate times
-    the answer is power [W]."""
+    the answer is power [W]; of nodes that a frame carries the wrench about its origin, moment
+    [N m] first, along the axes of the world."""
     named = {s.name: values[s.name] for s in supports if s.name in values}
 
     def held(named):
         return known_values(with_places(supports, named), *forces.shape)
 
-    return jax.vjp(held, named)[1](forces.ravel())[0]
+    found = jax.vjp(held, named)[1](forces.ravel())[0]
+    frames = [s.name for s in supports if isinstance(s, fem.Carried) and s.name in found]
+    return found | {name: _wrench(found[name][:-1], values[name]) for name in frames}
+
+
+def _wrench(slope: Float[Array, "dim h"], pose: Float[Array, "h h"]) -> Float[Array, " twist"]:
+    """Of forces f at places x of a frame, from the sum of f x' beside that of f."""
+    spread = pose[:-1, :-1] @ slope[:, :-1].T  # the sum of (R x) f'
+    turn = spread - spread.T
+    pairs = ((0, 1),) if len(turn) == 2 else ((1, 2), (2, 0), (0, 1))
+    moment = jnp.stack([turn[i, j] for i, j in pairs])
+    return jnp.concatenate([moment, slope[:, -1]])

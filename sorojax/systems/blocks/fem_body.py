@@ -57,9 +57,11 @@ class FemBody(AbstractBlock):
 
     A support that is driven opens an input too: "clamp", a `Prescribed`, the displacement
     `clamp` [m] and the output `clamp_force` [N] that it exerts on the body; a `Rotated` its
-    angle [rad] and `clamp_torque` [N m]. Nodes that are driven have the velocities and
-    accelerations of their motion; `u` and `v` have to begin with it. Of such a body the state
-    holds the `reactions` too; it moves by `Coupled()` only.
+    angle [rad] and `clamp_torque` [N m]; a `Carried` the pose of its frame, a homogeneous
+    matrix, and `clamp_wrench` about its origin along the axes of the world, moment [N m]
+    first: what `AssemblyBody(carrying=...)` gives and takes. Nodes that are driven have the
+    velocities and accelerations of their motion; `u` and `v` have to begin with it. Of such a
+    body the state holds the `reactions` too; it moves by `Coupled()` only.
 
     The equations are stiff and many. `Coupled()` steps them implicitly, together with what
     the rest of the network answers within the step: the default of `simulate(network,
@@ -144,8 +146,8 @@ class FemBody(AbstractBlock):
         for name, _ in self.markers:
             ports[f"{name}_position"] = Output("m", (dim,))
         for support in self.moved.values():
-            name, unit = reaction_port(support)
-            ports[name] = Output(unit, value_of(support).shape)
+            name, port = reaction_port(support)
+            ports[name] = port
         if self.energies:
             names = ("kinetic_energy", "elastic_energy", "work", "dissipated")
             ports |= {name: Output("J") for name in names}
