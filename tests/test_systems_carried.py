@@ -95,6 +95,7 @@ def test_link_and_solid_keep_their_energy():
     assert jnp.max(jnp.abs(total - total[0])) < 0.01 * size
 
 
+@pytest.mark.slow
 def test_slopes_through_link_and_solid_agree_with_differences():
     network = pendulum(3.0, modulus=1e6)
 

@@ -94,7 +94,19 @@ class Carried(AbstractSupport):
             self.rest = jnp.eye(dim + 1, dtype=self.points.dtype)
 
     @property
+    def pose(self) -> Float[Array, "h h"]:
+        """Where the frame is, a homogeneous matrix."""
+        assert self.rest is not None and self.motion is not None
+        return self.rest.at[:-1].add(self.motion)
+
+    def at(self, pose: Float[Array, "h h"]) -> "Carried":
+        """The support with its frame at a pose."""
+        assert self.rest is not None
+        return eqx.tree_at(lambda s: s.motion, self, pose[:-1] - self.rest[:-1])
+
+    @property
     def displacement(self) -> Float[Array, "nodes dim"]:
+        assert self.rest is not None and self.motion is not None
         turn, place = self.rest[:-1, :-1], self.rest[:-1, -1]
         inside = (self.points - place[None]) @ turn  # in the frame
         return inside @ self.motion[:, :-1].T + self.motion[:, -1][None]

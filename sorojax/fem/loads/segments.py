@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from sorojax.mesh.elements.base import (
     AbstractElement,
@@ -93,7 +93,7 @@ def _near(mine: np.ndarray, yours: np.ndarray) -> list[list[int]]:
     radii = np.linalg.norm(mine - centres[:, None], axis=2).max(axis=1)
     reach = np.linalg.norm(yours - seen[:, None], axis=2).max()
     normals, others = _normals(mine), _normals(yours)
-    listed = cKDTree(seen).query_ball_point(centres, 1.01 * (radii + reach))
+    listed = KDTree(seen).query_ball_point(centres, 1.01 * (radii + reach))
     return [[j for j in near if normals[k] @ others[j] < -0.5] for k, near in enumerate(listed)]
 
 

@@ -2,6 +2,7 @@
 body answers at them."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -38,7 +39,7 @@ _REACTIONS = {
 def value_of(driven: Driven) -> Array:
     """The number or array that an input sets; the pose of the frame that carries nodes."""
     if isinstance(driven, fem.Carried):
-        return driven.rest.at[:-1].add(driven.motion)
+        return driven.pose
     return getattr(driven, _field(driven))
 
 
@@ -81,12 +82,11 @@ def with_places(
     return tuple(s if s.ramped is None else _set(s, values) for s in supports)
 
 
-def _set(driven: Driven, values: Mapping[str, Array]) -> Driven:
+def _set(driven: Any, values: Mapping[str, Array]) -> Any:
     if driven.name not in values:
         return driven
     if isinstance(driven, fem.Carried):
-        moved = values[driven.name][:-1] - driven.rest[:-1]
-        return eqx.tree_at(lambda d: d.motion, driven, moved)
+        return driven.at(values[driven.name])
     field = _field(driven)
     return eqx.tree_at(lambda d: getattr(d, field), driven, values[driven.name])
 
