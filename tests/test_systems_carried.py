@@ -1,5 +1,7 @@
 """A solid on a link of a mechanism: the pose of the link in, its reaction out, in one step."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,7 +15,7 @@ G = 9.81
 LENGTH, WIDTH, ARM = 0.04, 0.02, 0.06  # of the solid; from the hinge to the solid [m]
 
 
-def pendulum(ratio, modulus=1e7):
+def pendulum(ratio, modulus=1e7) -> Any:
     """A link on a hinge, horizontal at first, that carries a solid `ratio` times as heavy."""
     cells = mesh.rectangle(
         [ARM, -WIDTH / 2], [ARM + LENGTH, WIDTH / 2], divisions=(2, 1), element=mesh.Quad8()
@@ -131,7 +133,7 @@ def test_slopes_through_link_and_solid_agree_with_differences():
 def test_the_wrench_of_a_carried_solid_is_that_of_its_reactions(element):
     """A solid whose frame has turned, not about the origin of the mesh, and that is heavy."""
     dim = element.dim
-    make = mesh.rectangle if dim == 2 else mesh.box
+    make: Any = mesh.rectangle if dim == 2 else mesh.box
     size = [0.02, 0.01, 0.01][:dim]
     cells = make([0.0] * dim, size, divisions=(2, 1, 1)[:dim], element=element)
     turn = np.eye(dim)

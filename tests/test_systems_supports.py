@@ -1,5 +1,7 @@
 """Networks that move the supports of finite-element bodies, and feel their reactions."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,7 +16,7 @@ from tests.test_fem_supports import RUBBER, SHARP, SIDE, shaken_bar
 class Shaker(systems.AbstractReference):
     """Displacement of a foot, along the bar."""
 
-    foot: object
+    foot: Any
 
     def __call__(self, t):
         return jnp.stack([self.foot(t), 0 * t])
@@ -74,7 +76,7 @@ class Ball(systems.AbstractBlock):
         return {"x": state["v"], "v": -inputs["force"] / self.mass}
 
 
-def carried(share, speed=(0.3, 0.0), start=None, gravity=None):
+def carried(share, speed: Any = (0.3, 0.0), start=None, gravity=None) -> Any:
     """A block of rubber that a ball of `share` of its mass carries."""
     cells = mesh.rectangle([0, 0], [0.04, 0.01], divisions=(2, 1), element=mesh.Quad4())
     held = fem.Prescribed(cells.node_sets["left"], [0.0, 0.0], name="grip")
@@ -131,7 +133,7 @@ def test_a_ball_falls_with_the_solid_that_it_carries():
     np.testing.assert_allclose(p, want, rtol=0.02)
 
 
-def turned_network(amplitude):
+def turned_network(amplitude) -> Any:
     cells = mesh.rectangle([0, 0], [0.04, 0.01], divisions=(2, 1), element=mesh.Quad4())
     left = cells.node_sets["left"]
     hand = fem.Rotated(left, cells.points[left], 0.0, [0.0, 0.005], name="hand")

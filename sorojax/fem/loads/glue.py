@@ -105,8 +105,8 @@ class Glue(AbstractLoad):
 
 def glue(
     mesh: Mesh,
-    facets: Int[np.ndarray, "facets facet_nodes"],
-    others: Int[np.ndarray, "others facet_nodes"],
+    facets: Int[Array | np.ndarray, "facets facet_nodes"],
+    others: Int[Array | np.ndarray, "others facet_nodes"],
     *,
     stiffness: Numbers | None = None,
     name: str = "glue",
