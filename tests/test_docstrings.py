@@ -24,8 +24,9 @@ VERBS = {
     "material": "by_region fit_cyclic fit_spectrum fit_tensile neo_hookean preconditioned "
     "predicted_readings stress_history uniaxial_spectrum",
     "material.presets": "rubber",
-    "fem": "bonded_rod cauchy_stress continuation critical_loads eigenmodes embedded_rod "
-    "problem rod_forces simulate solve solve_path solve_volume von_mises_stress",
+    "fem": "bonded_rod cauchy_stress continuation critical_loads eigenmodes embedded_rod glue "
+    "problem reaction_history reactions rod_forces simulate solve solve_path solve_volume "
+    "von_mises_stress",
     "rod": "assembly branch_states bspline chebyshev circle close equilibrium equilibrium_path "
     "forward_dynamics forward_kinematics inverse_kinematics mobility operators "
     "piecewise_constant rod "

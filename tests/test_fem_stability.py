@@ -316,7 +316,7 @@ def test_masses_add_up(column):
 
 def test_bad_calls_name_the_remedy(balloon, column):
     problem, path = balloon
-    with pytest.raises(ValueError, match="no load is called 'gas'"):
+    with pytest.raises(ValueError, match="no load or moved support is called 'gas'"):
         fem.continuation(problem, "gas")
     with pytest.raises(ValueError, match="abs\\(step\\)"):
         fem.continuation(problem, "air", step=0.0)

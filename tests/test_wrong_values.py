@@ -51,6 +51,7 @@ VALID = {
     "fem.residual": {"problem": PROBLEM, "u": U},
     "fem.enclosed_volume": {"problem": PROBLEM, "u": U, "facets": RIGHT},
     "fem.reaction_force": {"problem": PROBLEM, "u": U, "nodes": LEFT},
+    "fem.reactions": {"problem": PROBLEM, "u": U, "about": np.zeros(2)},
     "fem.with_load": {"problem": PROBLEM, "name": "push", "value": np.ones(2)},
     "fem.nodal_average": {"problem": PROBLEM, "field": np.ones((2, 3))},
     "fem.eigenmodes": {"problem": PROBLEM, "displacement": U, "count": 1},

@@ -42,6 +42,7 @@ from sorojax.fem.equilibrium.volume import (
     volume_path,
 )
 from sorojax.fem.kinematics import Axisymmetric, PlaneStrain, PlaneStress, Solid
+from sorojax.fem.loads.glue import Glue, glue
 from sorojax.fem.loads.loads import Force, Gravity, Pressure, Torque, Traction, mean_rotation
 from sorojax.fem.loads.rigid import rigid
 from sorojax.fem.loads.springs import (
@@ -54,6 +55,7 @@ from sorojax.fem.loads.springs import (
     tension,
 )
 from sorojax.fem.problem import Problem, potential_energy, problem, residual
+from sorojax.fem.reactions import Reaction, reaction_history, reactions
 from sorojax.fem.stability.buckling import critical_loads, with_imperfection
 from sorojax.fem.stability.continuation import continuation
 from sorojax.fem.stability.modal import (
@@ -76,7 +78,7 @@ from sorojax.fem.stress import (
     strain_energy,
     von_mises_stress,
 )
-from sorojax.fem.supports import Fixed, Prescribed, Rotated, rotated
+from sorojax.fem.supports import Carried, Fixed, Prescribed, Rotated, rotated
 from sorojax.math.linalg.sparse import ConjugateGradient
 
 __all__ = [
@@ -84,6 +86,7 @@ __all__ = [
     "Axisymmetric",
     "BondedRod",
     "Cable",
+    "Carried",
     "ConjugateGradient",
     "ConstantPressure",
     "Contact",
@@ -96,6 +99,7 @@ __all__ = [
     "Foundation",
     "Gas",
     "GeneralisedAlpha",
+    "Glue",
     "Gravity",
     "KelvinVoigt",
     "LinearPressure",
@@ -110,6 +114,7 @@ __all__ = [
     "Problem",
     "Rayleigh",
     "RodForces",
+    "Reaction",
     "Rotated",
     "SelfContact",
     "Solid",
@@ -130,6 +135,7 @@ __all__ = [
     "eigenmodes",
     "embedded_rod",
     "enclosed_volume",
+    "glue",
     "lumped_mass",
     "mass_matrix",
     "mean_rotation",
@@ -145,6 +151,8 @@ __all__ = [
     "principal_stresses",
     "problem",
     "reaction_force",
+    "reaction_history",
+    "reactions",
     "residual",
     "rigid",
     "rod_forces",

@@ -31,7 +31,7 @@ class Fixed(AbstractSupport):
 
     nodes: Int[Array, " nodes"] = eqx.field(converter=integers)
     components: tuple[int, ...] | None = eqx.field(static=True, default=None)
-    name: ClassVar[str] = "fixed"
+    name: str = eqx.field(static=True, default="fixed")
 
     @property
     def displacement(self) -> Float[Array, ""]:
@@ -68,6 +68,48 @@ class Rotated(AbstractSupport):
     @property
     def displacement(self) -> Float[Array, "nodes dim"]:
         return rotated(self.points, self.angle, self.about, self.axis)
+
+
+class Carried(AbstractSupport):
+    """Nodes that a rigid frame carries along: a link of a mechanism that they are fixed to.
+
+    `points` [m] are those of the nodes in the reference configuration, `mesh.points[nodes]`,
+    `rest` the pose of the frame there, a homogeneous matrix, by default the identity; `motion`
+    is its pose minus that, a matrix too, without its last row, so that zero is rest.
+    """
+
+    nodes: Int[Array, " nodes"] = eqx.field(converter=integers)
+    points: Float[Array, "nodes dim"] = eqx.field(converter=real)
+    motion: Float[Array, "dim h"] | None = eqx.field(converter=optional_real, default=None)
+    rest: Float[Array, "h h"] | None = eqx.field(converter=optional_real, default=None)
+    name: str = eqx.field(static=True, default="carried")
+    components: ClassVar[tuple[int, ...] | None] = None
+    ramped: ClassVar[str | None] = "motion"
+
+    def __post_init__(self):
+        dim = self.points.shape[1]
+        if self.motion is None:
+            self.motion = jnp.zeros((dim, dim + 1), self.points.dtype)
+        if self.rest is None:
+            self.rest = jnp.eye(dim + 1, dtype=self.points.dtype)
+
+    @property
+    def pose(self) -> Float[Array, "h h"]:
+        """Where the frame is, a homogeneous matrix."""
+        assert self.rest is not None and self.motion is not None
+        return self.rest.at[:-1].add(self.motion)
+
+    def at(self, pose: Float[Array, "h h"]) -> "Carried":
+        """The support with its frame at a pose."""
+        assert self.rest is not None
+        return eqx.tree_at(lambda s: s.motion, self, pose[:-1] - self.rest[:-1])
+
+    @property
+    def displacement(self) -> Float[Array, "nodes dim"]:
+        assert self.rest is not None and self.motion is not None
+        turn, place = self.rest[:-1, :-1], self.rest[:-1, -1]
+        inside = (self.points - place[None]) @ turn  # in the frame
+        return inside @ self.motion[:, :-1].T + self.motion[:, -1][None]
 
 
 def rotated(

@@ -15,7 +15,7 @@ from tests.patches import POLYGON, patch
 
 NONE = {
     "topology, on the host: pairs of nodes, patches of cells, cells that hold points": (
-        "space patches route rigid"
+        "space patches route rigid glue"
     ),
     "lists which facets are near, at concrete positions only": "update_contact_pairs",
     "paths and predictions found on the host; their docstrings promise no derivative": (
@@ -110,6 +110,17 @@ def slipping(cells):
     return plate(rod, cells=wider)
 
 
+def glued():
+    both = mesh.merge(
+        upper=mesh.rectangle([0, 0.5], [1.5, 1.0], divisions=(2, 1)),
+        lower=mesh.rectangle([0, 0], [1.5, 0.5], divisions=(3, 1)),
+    )
+    seam = fem.glue(
+        both, both.facet_sets["upper.bottom"], both.facet_sets["lower.top"], stiffness=20.0
+    )
+    return plate(seam, supports=(fem.Fixed(both.node_sets["lower.bottom"]),), cells=both)
+
+
 TERMS = {
     "Pressure": lambda: plate(fem.Pressure(ABOVE, 0.02, origin=[0.1, 0.2]), supports=ENDS),
     "Traction": lambda: plate(fem.Traction(ABOVE, [0.02, -0.03])),
@@ -128,6 +139,7 @@ TERMS = {
     "Contact": lambda: plate(touching(offset=np.full((3, 2), 0.01))),
     "Contact with friction": lambda: plate(touching(friction=0.4)),
     "SelfContact": two_plates,
+    "Glue": glued,
 }
 MATERIALS = {
     "NeoHookean": lambda: material.NeoHookean(0.4, 2.0),
@@ -231,6 +243,7 @@ MEASURES = {
     "strain_energy": (fem.strain_energy, sheet),
     "enclosed_volume": (lambda p, u: fem.enclosed_volume(p, u, jnp.asarray(ABOVE)), plate),
     "reaction_force": (lambda p, u: fem.reaction_force(p, u, jnp.asarray(LEFT)), plate),
+    "reactions": (lambda p, u: fem.reactions(p, u, about=u[1]), lambda: loaded()),
     "mass_matrix": (lambda p, u: fem.mass_matrix(p), quads),
     "lumped_mass": (lambda p, u: fem.lumped_mass(p), quads),
     "total_mass": (lambda p, u: fem.total_mass(p), quads),
@@ -492,6 +505,7 @@ CASES |= {
     "modal_force": modal(fem.modal_force),
     "simulate": lambda: moving(PULLED(), ALPHA, VISCOUS),
     "simulate with contact": lambda: moving(pressed(friction=0.4), ALPHA),
+    "reaction_history": lambda: moving(PULLED(), ALPHA, measure=fem.reaction_history),
     "momentum": lambda: moving(
         PULLED(), fem.Newmark(0.3, 0.55), measure=fem.momentum, mass="lumped"
     ),

@@ -20,7 +20,7 @@ from sorojax.fem.equilibrium.jit import known_mask
 from sorojax.fem.loads.loads import AbstractLoad
 from sorojax.fem.problem import Problem, body, exchanged, load_potential, residual, with_terms
 from sorojax.fem.relaxation import Peaks, Strains, after_step, in_step, moduli, raised_peaks
-from sorojax.fem.supports import Prescribed, known_components, known_values
+from sorojax.fem.supports import AbstractSupport, Prescribed, known_components, known_values
 from sorojax.material.viscoelastic import Terms
 from sorojax.math.linalg import sparse
 
@@ -351,7 +351,15 @@ def _held(dynamics: Dynamics, interval: Interval, af, u):
                 _at(row, interval.index, interval.end),
             )
         supports.append(support)
-    target = known_values(tuple(supports), *u.shape)
+    return held_within(tuple(supports), af, u)
+
+
+def held_within(
+    supports: tuple[AbstractSupport, ...], af, u: Float[Array, "nodes dim"]
+) -> tuple[Float[Array, " dofs"], tuple[AbstractSupport, ...]]:
+    """Displacements that `supports` know at the end of a step from `u`, and supports that
+    hold the nodes on the way there, where forces act."""
+    target = known_values(supports, *u.shape)
     held = (1 - af) * target.reshape(u.shape) + af * u
     dim = u.shape[1]
     fixed = []

@@ -408,7 +408,7 @@ def _named_values(problem: Problem, values: dict) -> tuple[str, Float[Array, "st
     name, row = next(iter(values.items()))
     row = real(row)
     _check.finite("fem.solve_path", name, row, "Use SI units: jnp.linspace(0, 20 * kPa, 21).")
-    want = _value_of(problem, name)(problem).shape
+    want = value_of(problem, name)(problem).shape
     if row.shape[1:] != want or not row.shape:
         raise ValueError(
             f"fem.solve_path: `{name}` has shape {row.shape}, need (steps, *{want})."
@@ -422,17 +422,19 @@ def _names(problem: Problem) -> list[str]:
     return [load.name for load in problem.loads] + moved
 
 
-def _value_of(problem: Problem, name: str) -> Callable[[Problem], Float[Array, "..."]]:
+def value_of(
+    problem: Problem, name: str, where: str = "fem.with_load"
+) -> Callable[[Problem], Float[Array, "..."]]:
     """Where a problem has the value of the load or moved support of that name."""
     names = _names(problem)
     if name not in names:
         raise ValueError(
-            f"fem.with_load: no load or moved support is called {name!r}, need one of {names}. "
+            f"{where}: no load or moved support is called {name!r}, need one of {names}. "
             "Set `name=` where it is made."
         )
     if names.count(name) > 1:
         raise ValueError(
-            f"fem.with_load: {names.count(name)} loads or moved supports are called {name!r}, "
+            f"{where}: {names.count(name)} loads or moved supports are called {name!r}, "
             "need one. Give each its own `name=`."
         )
     index = names.index(name) - len(problem.loads)
@@ -447,7 +449,7 @@ def _value_of(problem: Problem, name: str) -> Callable[[Problem], Float[Array, "
 def with_load(problem: Problem, name: str, value: Float[Array, "..."]) -> Problem:
     """`problem` with the load called `name` set to `value`, or the support of that name moved
     by it: displacements [m] of a `Prescribed`, the angle [rad] of a `Rotated`."""
-    where = _value_of(problem, name)
+    where = value_of(problem, name)
     # a weakly typed number would compile every kernel again
     made = eqx.tree_at(where, problem, real(value))
     if name in (names := [load.name for load in problem.loads]):

@@ -38,6 +38,7 @@ from sorojax.fem.equilibrium.newton import (
     safe_fraction,
     verdict,
 )
+from sorojax.fem.equilibrium.solve import value_of
 from sorojax.fem.problem import Problem, load_force
 from sorojax.fem.supports import known_values
 from sorojax.math.linalg import sparse
@@ -169,14 +170,16 @@ def _advance(at: At, prepared: Prepared, problem: Problem, u, y, du, dy):
 
 
 class Loading:
-    """A problem whose loads grow with one factor: all of them, or the one called `name`."""
+    """A problem whose loads and moved supports grow with one factor: all of them, or the one
+    called `name`."""
 
     def __init__(self, where: str, problem: Problem, name: str | None):
-        names = [load.name for load in problem.loads]
-        if name is not None and name not in names:
-            raise ValueError(f"{where}: no load is called {name!r}, need one of {names}.")
         self.full, self.name = problem, name
-        self.rest = unloaded(problem) if name is None else _without(problem, name)
+        if name is None:
+            self.rest = unloaded(problem)
+        else:
+            self.value = value_of(problem, name, where)
+            self.rest = eqx.tree_at(self.value, problem, replace_fn=jnp.zeros_like)
 
     def at(self, factor) -> Problem:
         """The problem at a load factor."""
@@ -185,11 +188,6 @@ class Loading:
     def rates(self, factor: float, u):
         """dR/df of the loads, the known displacements and their rate."""
         return _rates(self.rest, self.full, jnp.asarray(float(factor)), jnp.asarray(u))
-
-
-def _without(problem: Problem, name: str) -> Problem:
-    index = [load.name for load in problem.loads].index(name)
-    return eqx.tree_at(lambda p: p.loads[index].value, problem, replace_fn=jnp.zeros_like)
 
 
 @eqx.filter_jit

@@ -163,15 +163,17 @@ def continuation(
     max_cuts: int = 10,
     locate_critical_points: bool = True,
 ) -> Continuation:
-    """The path of equilibria under a growing load, by arc-length steps.
+    """The path of equilibria under a growing load or a support that moves, by arc-length steps.
 
     A step has a given length of displacement; the load factor is an unknown. So where the load
-    has a maximum the path goes on down, through unstable states too. The last state is where
+    has a maximum the path goes on down, through unstable states too; where the displacement of
+    a support has one, the path goes on back (snap-back). The last state is where
     `until` first holds. Runs on the host with concrete numbers; it has no derivative.
 
     Args:
         problem: Its loads and supports at factor one.
-        name: The load that grows; all loads and prescribed displacements by default.
+        name: The load that grows, or the support that moves (`Prescribed`, `Rotated`), from
+            zero while the others keep their values; all loads and supports by default.
         step: Load factor of the first step [-]; later ones follow the iterations.
         largest_step: Largest movement of a node between two states [m]; no limit by default.
         max_states: States at most, the first included.
@@ -189,7 +191,7 @@ def continuation(
         `status` says whether it was stopped by a step that failed.
 
     Raises:
-        ValueError: If no load has that name, or a step is zero or not finite.
+        ValueError: If no load or moved support has that name, or a step is zero or not finite.
 
     Example:
         >>> bar = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1),
@@ -336,8 +338,7 @@ class _Walk:
         factors = jnp.asarray([s.factor for s in self.states])
         values = factors
         if name is not None:
-            load = next(load for load in problem.loads if load.name == name)
-            values = jnp.tensordot(factors, load.value, axes=0)
+            values = jnp.tensordot(factors, self.loading.value(problem), axes=0)
         return Continuation(
             problem,
             jnp.stack([jnp.asarray(s.u) for s in self.states]),

@@ -16,7 +16,7 @@ from sorojax.fem.dynamics.methods import Coefficients
 from sorojax.fem.dynamics.step import Dynamics, Mass, Matter, State, matter
 from sorojax.fem.equilibrium.jit import known_mask
 from sorojax.fem.loads.loads import AbstractLoad, remembers
-from sorojax.fem.problem import body, load_force, residual
+from sorojax.fem.problem import body, load_force, residual, with_terms
 from sorojax.fem.relaxation import (
     Peaks,
     Strains,
@@ -27,20 +27,20 @@ from sorojax.fem.relaxation import (
     stored_energy,
     strain_rates,
 )
+from sorojax.fem.supports import AbstractSupport
 from sorojax.math.linalg import sparse
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output
-
-_UNITS = {
-    fem.Pressure: "Pa",
-    fem.Traction: "Pa",
-    fem.Force: "N",
-    fem.Tendon: "N",
-    fem.Cable: "m",
-    fem.Gravity: "m/s^2",
-    fem.Torque: "N m",
-    fem.EmbeddedRod: "-",
-    fem.BondedRod: "-",
-}
+from sorojax.systems.blocks.driven import (
+    drivable,
+    exerted,
+    port_of,
+    reaction_port,
+    unit_of,
+    value_of,
+    volume,
+    with_places,
+    with_values,
+)
 
 
 class FemBody(AbstractBlock):
@@ -55,6 +55,14 @@ class FemBody(AbstractBlock):
     energy is lost between gas and body. Other driven loads open an input of their name.
     Each marker opens `<marker>_position`.
 
+    A support that is driven opens an input too: "clamp", a `Prescribed`, the displacement
+    `clamp` [m] and the output `clamp_force` [N] that it exerts on the body; a `Rotated` its
+    angle [rad] and `clamp_torque` [N m]; a `Carried` the pose of its frame, a homogeneous
+    matrix, and `clamp_wrench` about its origin along the axes of the world, moment [N m]
+    first: what `AssemblyBody(carrying=...)` gives and takes. Nodes that are driven have the
+    velocities and accelerations of their motion; `u` and `v` have to begin with it. Of such a
+    body the state holds the `reactions` too; it moves by `Coupled()` only.
+
     The equations are stiff and many. `Coupled()` steps them implicitly, together with what
     the rest of the network answers within the step: the default of `simulate(network,
     duration, step=...)` for networks with such a body. Adaptive and explicit methods take
@@ -63,7 +71,8 @@ class FemBody(AbstractBlock):
     Attributes:
         problem: Body, supports and loads; its material has a density.
         damping: `fem.Rayleigh(...)` or `fem.KelvinVoigt(...)`.
-        driven: Names of the loads that follow an input; every pressure if omitted.
+        driven: Names of the loads and supports that follow an input; every pressure if
+            omitted.
         markers: Nodes whose places are outputs, by name.
         u, v: Displacement and velocity at the start [m], [m/s]; zero if omitted.
         energies: Open the outputs `kinetic_energy`, `elastic_energy`, `work`, `dissipated`.
@@ -90,12 +99,12 @@ class FemBody(AbstractBlock):
                 "FemBody: the material has no density, need one [kg/m^3]. Rubber has about "
                 "1070: material.neo_hookean(..., density=1070.0)."
             )
-        names = [load.name for load in self.problem.loads]
+        names = [one.name for one in drivable(self.problem)]
         for name in self.driven or ():
             if names.count(name) != 1:
                 raise ValueError(
-                    f"FemBody: `{name}` names {names.count(name)} loads of {names}, need one. "
-                    "Give loads a `name=` of their own."
+                    f"FemBody: `{name}` names {names.count(name)} loads and supports of "
+                    f"{names}, need one. Give each a `name=` of its own."
                 )
         ports = [*self.inputs, *self.outputs]
         if twice := {port for port in ports if ports.count(port) > 1}:
@@ -109,15 +118,22 @@ class FemBody(AbstractBlock):
     def drives(self) -> dict[str, AbstractLoad]:
         """Loads that follow an input, by name."""
         loads = self.problem.loads
-        wanted = [x.name for x in loads if isinstance(x, fem.Pressure)]
-        wanted = wanted if self.driven is None else self.driven
-        return {name: next(x for x in loads if x.name == name) for name in wanted}
+        if self.driven is None:
+            return {x.name: x for x in loads if isinstance(x, fem.Pressure)}
+        by_name = {x.name: x for x in loads}
+        return {name: by_name[name] for name in self.driven if name in by_name}
+
+    @property
+    def moved(self) -> dict[str, AbstractSupport]:
+        """Supports that follow an input, by name."""
+        supports = {x.name: x for x in self.problem.supports if x.ramped is not None}
+        return {name: supports[name] for name in self.driven or () if name in supports}
 
     @property
     def inputs(self):
         return {
-            port_of(load): Input(_UNITS.get(type(load)), load.value.shape, 0.0)
-            for load in self.drives.values()
+            port_of(one): Input(unit_of(one), value_of(one).shape, 0.0)
+            for one in (*self.drives.values(), *self.moved.values())
         }
 
     @property
@@ -129,6 +145,9 @@ class FemBody(AbstractBlock):
             ports[port_of(load, "volume_rate")] = Output("m^3/s")
         for name, _ in self.markers:
             ports[f"{name}_position"] = Output("m", (dim,))
+        for support in self.moved.values():
+            name, port = reaction_port(support)
+            ports[name] = port
         if self.energies:
             names = ("kinetic_energy", "elastic_energy", "work", "dissipated")
             ports |= {name: Output("J") for name in names}
@@ -142,7 +161,8 @@ class FemBody(AbstractBlock):
         state = {"u": u, "v": v, "work": none, "dissipated": none}
         bare = body(self.problem)
         kept = {"strains": relaxed(bare, u), "peaks": first_peaks(bare, u)}
-        return state | {name: x for name, x in kept.items() if x is not None}
+        state |= {name: x for name, x in kept.items() if x is not None}
+        return state | self._first_reactions(u, v) if self.moved else state
 
     def output(self, name, t, state, inputs):
         u, v = state["u"], state["v"]
@@ -158,6 +178,9 @@ class FemBody(AbstractBlock):
         for marker, node in self.markers:
             if name == f"{marker}_position":
                 return self.problem.mesh.points[node] + u[node]
+        for support in self.moved.values():
+            if name == reaction_port(support)[0]:
+                return state["reactions"][support.name]["now"]
         for load in self._cavities().values():
             if name == port_of(load, "volume"):
                 return volume(self.problem, load, u)
@@ -171,6 +194,13 @@ class FemBody(AbstractBlock):
                 "FemBody: got a body that softens, whose memory changes abruptly, and a "
                 "method for differential equations, need one of fixed steps. Call "
                 "simulate(network, duration, step=...) with Coupled(), its default."
+            )
+        if "reactions" in state:
+            raise ValueError(
+                f"FemBody: got supports that are driven, {sorted(self.moved)}, whose "
+                "acceleration is that of a step, and a method for differential equations, need "
+                "one of fixed steps. Call simulate(network, duration, step=...) with "
+                "Coupled(), its default."
             )
         u, v = state["u"], state["v"]
         loaded = self.loaded(self.values(inputs))
@@ -190,13 +220,17 @@ class FemBody(AbstractBlock):
         return {**rates, "strains": rate, "dissipated": rates["dissipated"] + taken}
 
     def values(self, inputs: Mapping[str, Any]) -> dict[str, Array]:
-        """Values of the driven loads, by name, from the inputs of the block."""
-        return {name: inputs[port_of(load)] for name, load in self.drives.items()}
+        """Values of the driven loads and supports, by name, from the inputs of the block."""
+        driven = {**self.drives, **self.moved}
+        return {name: inputs[port_of(one)] for name, one in driven.items()}
 
     def loaded(self, values: Mapping[str, Array]) -> fem.Problem:
-        """The problem under driven loads of these values."""
-        loads = with_values(self.problem.loads, values)
-        return eqx.tree_at(lambda p: p.loads, self.problem, loads)
+        """The problem with driven loads and supports of these values."""
+        terms = (
+            with_values(self.problem.loads, values),
+            with_places(self.problem.supports, values),
+        )
+        return with_terms(self.problem, terms)
 
     def matter(self) -> Matter:
         """Mass and constant damping."""
@@ -212,33 +246,20 @@ class FemBody(AbstractBlock):
         supports = tuple(None for _ in self.problem.supports)
         return Dynamics(self.problem, self.damping, scheme, loads, supports, rest, h, self.mass)
 
+    def _first_reactions(self, u, v) -> dict[str, Any]:
+        """Reactions at the start, where held nodes do not accelerate."""
+        known, problem = self.matter(), self.problem
+        kept = relaxed(body(problem), u), first_peaks(body(problem), u)
+        a = acceleration(self, problem, known, u, v, *kept)
+        loaded = at_instant(problem, known.moduli, *kept)
+        force = residual(loaded, u).ravel() + damping_force(self, known, u, v)
+        force = force + sparse.product(problem.space.system, known.mass, a.ravel())
+        places = {name: value_of(support) for name, support in self.moved.items()}
+        found = exerted(problem.supports, places, force.reshape(u.shape))
+        return {"reactions": {name: {"now": x, "step": x} for name, x in found.items()}}
+
     def _cavities(self) -> dict[str, fem.Pressure]:
         return {n: x for n, x in self.drives.items() if isinstance(x, fem.Pressure)}
-
-
-def port_of(load: AbstractLoad, kind: str = "pressure") -> str:
-    """Name of a port of a load."""
-    if not isinstance(load, fem.Pressure):
-        return load.name
-    return kind if load.name == "pressure" else f"{load.name}_{kind}"
-
-
-def with_values(
-    loads: tuple[AbstractLoad, ...], values: Mapping[str, Array]
-) -> tuple[AbstractLoad, ...]:
-    """The loads, those that are named with other values."""
-    return tuple(
-        eqx.tree_at(lambda load: load.value, load, values[load.name])
-        if load.name in values
-        else load
-        for load in loads
-    )
-
-
-def volume(problem: fem.Problem, load: fem.Pressure, u: Float[Array, "nodes dim"]) -> Array:
-    """Volume [m^3] that a pressure works on."""
-    one = eqx.tree_at(lambda load: load.value, load, jnp.ones((), u.dtype))
-    return -one.potential(body(problem), u)
 
 
 def damping_force(block: FemBody, known: Matter, u, v) -> Float[Array, " dofs"]:

@@ -24,7 +24,8 @@ from sorojax.fem.problem import load_force, potential_energy, residual
 from sorojax.material import Viscoelastic
 from sorojax.math.linalg.sparse import SparseSymmetric, product
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output
-from sorojax.systems.blocks.fem_body import FemBody, damping_force, port_of, with_values
+from sorojax.systems.blocks.driven import port_of, with_values
+from sorojax.systems.blocks.fem_body import FemBody, damping_force
 
 #: Shapes of which less than this share is new are left out.
 _NEW = 1e-6
@@ -309,8 +310,13 @@ def modal_body(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBo
             assembly per evaluation.
 
     Raises:
-        ValueError: If a driven load is not proportional to its input.
+        ValueError: If a driven load is not proportional to its input, or a support is driven.
     """
+    if body.moved:
+        raise ValueError(
+            f"modal_body: got driven supports {sorted(body.moved)}, need a body whose supports "
+            "stay, as its shapes do. Keep the FemBody."
+        )
     if order is not None and order not in (1, 2, 3):
         raise ValueError(f"reduced: `order` must be 1, 2, 3 or None, got {order}.")
     if isinstance(body.problem.material, Viscoelastic):

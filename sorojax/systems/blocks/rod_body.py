@@ -18,6 +18,7 @@ from sorojax.rod import (
     PartForce,
     Pressurised,
     Rod,
+    TipWrench,
     acceleration,
     inertia,
     motion,
@@ -154,11 +155,19 @@ class AssemblyBody(AbstractBlock):
     `finger_compliance`, all from one potential. A driven joint opens `wrist_effort`. Each
     part has `finger_position`, of its tip or of the frame of a link.
 
+    A part that is `carrying` something has the output `palm_pose`, a homogeneous matrix of its
+    tip or of the frame of a link, and takes the input `palm_reaction`: the wrench about that
+    place, along the axes of the world and moment [N m] first, that it exerts on what it
+    carries. A solid on a link is `FemBody(problem, driven=("grip",))` with a `fem.Carried`
+    support, wired both ways: `{"solid.grip": "arm.palm_pose", "arm.palm_reaction":
+    "solid.grip_wrench"}`.
+
     Attributes:
         assembly: The assembly.
         forces: Its forces; at most one pressure map per rod.
         driven: Parts whose joints take an effort from outside.
         q, v: Coordinates and rates at the start; at rest if omitted.
+        carrying: Parts that another block is fixed to.
     """
 
     assembly: Assembly
@@ -166,6 +175,7 @@ class AssemblyBody(AbstractBlock):
     driven: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
     q: Float[Array, " coordinates"] | None = eqx.field(converter=optional_real, default=None)
     v: Float[Array, " dof"] | None = eqx.field(converter=optional_real, default=None)
+    carrying: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
 
     def __check_init__(self):
         names = [part for part, _ in _maps(self.forces)]
@@ -175,7 +185,7 @@ class AssemblyBody(AbstractBlock):
                 f"AssemblyBody: `{min(twice)}` has {names.count(min(twice))} pressure maps, "
                 "need at most one per rod. Return several volumes from one map."
             )
-        for name in (*names, *self.driven):
+        for name in (*names, *self.driven, *self.carrying):
             index_of(self.assembly, name)
 
     @property
@@ -183,12 +193,16 @@ class AssemblyBody(AbstractBlock):
         ports = {f"{k}_pressure": Input("Pa", m.ports, 0.0) for k, m in self._maps().items()}
         for name in self.driven:
             ports[f"{name}_effort"] = Input(None, (self._joint_dof(name),), 0.0)
-        return ports
+        twist = self.assembly.group.algebra_dim
+        return ports | {
+            f"{name}_reaction": Input(None, (twist,), 0.0) for name in self.carrying
+        }
 
     @property
     def outputs(self):
         dim = self.assembly.group.space_dim
         ports = {f"{name}_position": Output("m", (dim,)) for name in self.assembly.names}
+        ports |= {f"{k}_pose": Output(None, (dim + 1, dim + 1)) for k in self.carrying}
         ports["q"] = Output(None, (num_coordinates(self.assembly),))
         for name, chamber in self._maps().items():
             needs = frozenset({f"{name}_pressure"})
@@ -213,6 +227,8 @@ class AssemblyBody(AbstractBlock):
                 at = slices(self.assembly)[index_of(self.assembly, part)]
                 own = (q[at.rod_q], v[at.rod_v])
                 return _fluid(chamber, kind, *own, inputs[f"{part}_pressure"])
+        if name in (f"{part}_pose" for part in self.carrying):
+            return tip_pose(self.assembly, q)[name.removesuffix("_pose")]
         return tip_pose(self.assembly, q)[name.removesuffix("_position")][:-1, -1]
 
     def vector_field(self, t, state, inputs):
@@ -238,7 +254,10 @@ class AssemblyBody(AbstractBlock):
             for part, chamber in self._maps().items()
         )
         driven = tuple(JointEffort(name, inputs[f"{name}_effort"]) for name in self.driven)
-        return (*plain, *bound, *driven)
+        carried = tuple(
+            PartForce(name, TipWrench(-inputs[f"{name}_reaction"])) for name in self.carrying
+        )
+        return (*plain, *bound, *driven, *carried)
 
     def _maps(self) -> dict[str, AbstractPressureMap]:
         return dict(_maps(self.forces))

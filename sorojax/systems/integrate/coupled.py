@@ -14,8 +14,10 @@ from sorojax._types import real
 from sorojax.fem.dynamics.step import Interval, Matter, State, begin_step, end_step
 from sorojax.fem.equilibrium.jit import prepare_traced
 from sorojax.fem.equilibrium.linear import Prepared
+from sorojax.fem.problem import residual
 from sorojax.math.ode.explicit import AbstractMethod, MethodStep, RungeKutta4, repeated
 from sorojax.math.ode.step_control import cut
+from sorojax.systems.blocks.driven import exerted
 from sorojax.systems.blocks.fem_body import FemBody, acceleration
 from sorojax.systems.integrate.fem_step import (
     Drives,
@@ -23,7 +25,9 @@ from sorojax.systems.integrate.fem_step import (
     Fields,
     Stage,
     balanced,
+    loaded,
     loaded_step,
+    on_the_way,
 )
 from sorojax.systems.integrate.march import Rate
 from sorojax.systems.network import Network, at_time, inputs_of, rates_of
@@ -39,10 +43,11 @@ class _Known(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """The memory of the method: acceleration and memory of loads, by body; and what it
-    keeps."""
+    """The memory of the method: acceleration and memory of loads, by body, and whether there
+    was a step (1 or 0); and what it keeps."""
 
     bodies: dict[str, State]
+    late: Float[Array, ""]
     known: dict[str, _Known]
 
 
@@ -57,6 +62,7 @@ class _Given(NamedTuple):
     h: Float[Array, ""]
     y: dict[str, PyTree]
     bodies: dict[str, State]
+    late: Float[Array, ""]
 
 
 class Coupled(AbstractMethod):
@@ -106,20 +112,19 @@ class Coupled(AbstractMethod):
                 fem.GeneralisedAlpha(0.5).coefficients(), jnp.ones_like(t)
             )
             known[name] = _Known(block.matter(), prepare_traced(block.problem))
-            loaded = block.loaded(block.values(own[name]))
+            given = block.loaded(block.values(own[name]))
             u, v = y[name]["u"], y[name]["v"]
             kept = y[name].get("strains"), y[name].get("peaks")
-            a = acceleration(block, loaded, known[name].matter, u, v, *kept)
+            a = acceleration(block, given, known[name].matter, u, v, *kept)
             states[name] = eqx.tree_at(lambda s: s.acceleration, dynamics.start, a)
-        return Memory(states, known)
+        return Memory(states, jnp.zeros_like(t), known)
 
     def advance(self, field, t, y, h, memory):
         network, inputs = _network(field)
         given = (self, network, inputs, memory.known, t)
-        (new, bodies), converged = cut(
-            _attempt, self.max_cuts, given, jnp.asarray(h), (y, memory.bodies)
-        )
-        return MethodStep(new, None, Memory(bodies, memory.known), {}, converged)
+        start = y, memory.bodies, memory.late
+        (new, *kept), converged = cut(_attempt, self.max_cuts, given, jnp.asarray(h), start)
+        return MethodStep(new, None, Memory(*kept, memory.known), {}, converged)
 
 
 def bodies_of(block: Any) -> Names:
@@ -150,7 +155,8 @@ def _attempt(given, offset, size, state):
     now = _Given(method, network, inputs, known, t + offset, size, *state)
     u, w, converged = balanced(Equations(_stages, _answer), method.newton, now)
     new, bodies = {}, {}
-    for name, stage in _stages(now).items():
+    stages = _stages(now)
+    for name, stage in stages.items():
         end = _ended(now, name, stage, u[name], w[name])
         # what `new` holds goes on
         bodies[name] = dataclasses.replace(end, strains=None, peaks=None)
@@ -164,8 +170,12 @@ def _attempt(given, offset, size, state):
             new[name]["strains"] = end.strains
         if end.peaks is not None:
             new[name]["peaks"] = end.peaks
-    rest = _marched(now, u)
-    return ({name: {**new, **rest}[name] for name in now.y}, bodies), converged
+    pushed = _exerted(now, stages, u, w)
+    for name, found in pushed.items():
+        new[name]["reactions"] = _later(now, name, found)
+    rest = _marched(now, u, pushed)
+    after = {name: {**new, **rest}[name] for name in now.y}
+    return (after, bodies, jnp.ones_like(now.late)), converged
 
 
 def _stages(now: _Given) -> dict[str, Stage]:
@@ -209,16 +219,57 @@ def _ended(now: _Given, name: str, stage: Stage, u, w) -> State:
     return end_step(stage.dynamics, matter, stage.state, _whole(now.h), step, u)
 
 
-def _answer(now: _Given, u: Fields) -> Drives:
-    """Loads of the bodies at the end of a step, when they move to `u`."""
+Pushed = dict[str, dict[str, Array]]  # what driven supports exert, by body and name
+
+
+def _answer(now: _Given, stages: dict[str, Stage], u: Fields, w: Drives) -> Drives:
+    """What drives the bodies at the end of a step, when they move to `u` under `w`."""
     network, t = now.network, now.t + now.h
-    names = bodies_of(network)
-    y = {**_marched(now, u), **_after(now, u)}
+    names, pushed = bodies_of(network), _exerted(now, stages, u, w)
+    y = {**_marched(now, u, pushed), **_after(now, u, pushed)}
     own = inputs_of(network, t, y, at_time(now.inputs, t), names)
     return {name: _block(network, name).values(own[name]) for name in names}
 
 
-def _marched(now: _Given, u: Fields) -> dict[str, PyTree]:
+def _exerted(now: _Given, stages: dict[str, Stage], u: Fields, w: Drives) -> Pushed:
+    """What driven supports exert where the forces of a step act, of bodies with some."""
+    found = {}
+    for name, stage in stages.items():
+        block = _block(now.network, name)
+        if not block.moved:
+            continue
+        forces = residual(loaded(stage, w[name]), u[name])
+        found[name] = exerted(block.problem.supports, _places(block, stage, w[name]), forces)
+    return found
+
+
+def _places(block: FemBody, stage: Stage, values: dict[str, Array]) -> dict[str, Array]:
+    """Where driven supports are when the forces of a step act."""
+    return {k: x for k, x in on_the_way(stage, values).items() if k in block.moved}
+
+
+def _later(now: _Given, name: str, pushed: dict[str, Array]) -> dict[str, dict[str, Array]]:
+    """Reactions at the end of a step: on the line through those of two steps."""
+    af = fem.GeneralisedAlpha(now.method.rho_inf).coefficients().af
+    before = now.y[name]["reactions"]
+    return {
+        k: {"now": x + now.late * af * (x - before[k]["step"]), "step": x}
+        for k, x in pushed.items()
+    }
+
+
+def _during(now: _Given, name: str, pushed: dict[str, Array]) -> dict[str, dict[str, Array]]:
+    """Reactions that the other blocks feel in a step: those of its middle, between the one of
+    this step and the one before. Held like this whatever mass hangs on a block is as stable
+    as one that the method moves itself; of the end of a step, extrapolated, it is not."""
+    af = fem.GeneralisedAlpha(now.method.rho_inf).coefficients().af
+    share, before = now.late * (0.5 - af), now.y[name]["reactions"]
+    return {
+        k: {"now": x + share * (before[k]["step"] - x), "step": x} for k, x in pushed.items()
+    }
+
+
+def _marched(now: _Given, u: Fields, pushed: Pushed) -> dict[str, PyTree]:
     """The other blocks at the end of a step."""
     names = tuple(name for name in now.y if name not in u)
     start = {name: now.y[name] for name in names}
@@ -226,14 +277,14 @@ def _marched(now: _Given, u: Fields) -> dict[str, PyTree]:
         return start
 
     def rate(t, x):
-        y = {**x, **_between(now, u, (t - now.t) / now.h)}
+        y = {**x, **_between(now, u, pushed, (t - now.t) / now.h)}
         return rates_of(now.network, t, y, at_time(now.inputs, t), names)
 
     count = now.method.substeps
     return repeated(now.method.rest, rate, now.t, start, now.h / count, count)[0]
 
 
-def _between(now: _Given, u: Fields, share) -> dict[str, PyTree]:
+def _between(now: _Given, u: Fields, pushed: Pushed, share) -> dict[str, PyTree]:
     """States of the bodies within a step: nodes move along straight lines at the mean
     velocity, so that rates of volumes are those of the volumes, however long the step."""
     af = fem.GeneralisedAlpha(now.method.rho_inf).coefficients().af
@@ -242,10 +293,12 @@ def _between(now: _Given, u: Fields, share) -> dict[str, PyTree]:
         start = now.y[name]
         move = (at - start["u"]) / (1 - af)
         found[name] = {**start, "u": start["u"] + share * move, "v": move / now.h}
+        if name in pushed:
+            found[name]["reactions"] = _during(now, name, pushed[name])
     return found
 
 
-def _after(now: _Given, u: Fields) -> dict[str, PyTree]:
+def _after(now: _Given, u: Fields, pushed: Pushed) -> dict[str, PyTree]:
     """States of the bodies at the end of a step."""
     scheme = fem.GeneralisedAlpha(now.method.rho_inf).coefficients()
     h, found = now.h, {}
@@ -255,4 +308,6 @@ def _after(now: _Given, u: Fields) -> dict[str, PyTree]:
         late = (move - h * start["v"]) / (scheme.beta * h**2) - (1 / (2 * scheme.beta) - 1) * a
         v = start["v"] + h * ((1 - scheme.gamma) * a + scheme.gamma * late)
         found[name] = {**start, "u": start["u"] + move, "v": v}
+        if name in pushed:
+            found[name]["reactions"] = _later(now, name, pushed[name])
     return found

@@ -1,15 +1,16 @@
 """One implicit step of finite-element bodies together with what a network answers.
 
 Unknown are the displacements u of the bodies, where the forces of the step act, and the
-values w of their loads at its end. With the equilibrium R(u, w) = 0 of the bodies, inertia
-included, and what the rest of the network makes of their motion, w = W(u), the equations
-of Newton's method are
+values w of their loads and driven supports at its end. With the equilibrium R(u, w) = 0 of the
+bodies, inertia included, and what the rest of the network makes of their motion and of the
+reactions at driven supports, w = W(u, w), the equations of Newton's method are
 
-    [ K   B] [du]     [  R  ]
-    [-W'  1] [dw] = - [w - W]
+    [  K       B   ] [du]     [  R  ]
+    [-W_u   1 - W_w] [dw] = - [w - W]
 
 solved by block elimination: the right-hand sides R and B take one factor of the sparse K,
-and W' is needed along their solutions only.
+and the slopes of W are needed along their solutions only. Nodes that a driven support holds
+move with w as it says.
 """
 
 from collections.abc import Callable
@@ -22,7 +23,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from sorojax import fem
-from sorojax.fem.dynamics.step import Dynamics, State, TimeStep
+from sorojax.fem.dynamics.step import Dynamics, State, TimeStep, held_within
 from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import Linearised, Prepared, linearise
 from sorojax.fem.equilibrium.newton import safe_fraction
@@ -30,14 +31,14 @@ from sorojax.fem.problem import load_force, residual, with_terms
 from sorojax.fem.supports import known_values
 from sorojax.math.linalg import sparse
 from sorojax.math.ode.step_control import filled
-from sorojax.systems.blocks.fem_body import with_values
+from sorojax.systems.blocks.driven import with_places, with_values
 
-Drives = dict[str, dict[str, Array]]  # values of driven loads, by body and load
+Drives = dict[str, dict[str, Array]]  # values of driven loads and supports, by body and name
 Fields = dict[str, Float[Array, "nodes dim"]]
 
 
 class Stage(NamedTuple):
-    """A body in a step: `state` before it, and the values of its loads then."""
+    """A body in a step: `state` before it, and the values of what is driven then."""
 
     dynamics: Dynamics
     prepared: Prepared
@@ -51,11 +52,11 @@ class Equations(NamedTuple):
 
     Attributes:
         stages: (given) -> the bodies in the step.
-        answer: (given, u) -> the values W of their loads at the end.
+        answer: (given, stages, u, w) -> the values W of what is driven at the end.
     """
 
     stages: Callable[[Any], dict[str, Stage]]
-    answer: Callable[[Any, Fields], Drives]
+    answer: Callable[[Any, dict[str, Stage], Fields, Drives], Drives]
 
 
 class _Pass(NamedTuple):
@@ -104,31 +105,47 @@ def _balanced_jvp(primals, tangents):
 
     def unbalanced(given):
         stages = equations.stages(given)
-        forces = {k: residual(_loaded(s, w[k]), u[k]).ravel() for k, s in stages.items()}
-        held = {k: known_values(s.step.terms[1], *u[k].shape) for k, s in stages.items()}
-        return forces, held, _ravelled(equations.answer(given, u))[0]
+        forces = {k: residual(loaded(s, w[k]), u[k]).ravel() for k, s in stages.items()}
+        held = {k: _held(s, w[k]) for k, s in stages.items()}
+        return forces, held, _ravelled(equations.answer(given, stages, u, w))[0]
 
     forces, held, answer = filled(*eqx.filter_jvp(unbalanced, (given,), tangents[2:]))
     stages = equations.stages(given)
     matrices = {
-        k: linearise(_loaded(s, w[k]), s.prepared, u[k], u[k]).values for k, s in stages.items()
+        k: linearise(loaded(s, w[k]), s.prepared, u[k], u[k]).values for k, s in stages.items()
     }
     du, dw = _solved(equations, given, matrices, stages, u, w, forces, held, -answer)
     return found, (du, _ravelled(w)[1](dw), None)
 
 
-def _loaded(stage: Stage, values: dict[str, Array]) -> fem.Problem:
-    """The problem of equilibrium, its driven loads on the way to `values`."""
+def on_the_way(stage: Stage, values: dict[str, Array]) -> dict[str, Array]:
+    """Values of what is driven where the forces of a step act."""
     af = stage.dynamics.scheme.af
-    now = {name: (1 - af) * values[name] + af * old for name, old in stage.drives.items()}
-    loads, *others = stage.step.terms
-    return with_terms(stage.dynamics.problem, (with_values(loads, now), *others))
+    return {name: (1 - af) * values[name] + af * old for name, old in stage.drives.items()}
+
+
+def loaded(stage: Stage, values: dict[str, Array]) -> fem.Problem:
+    """The problem of equilibrium, its loads and supports on the way to `values`."""
+    loads, supports, *others = stage.step.terms
+    loads = with_values(loads, on_the_way(stage, values))
+    given = stage.dynamics.problem
+    if any(support.name in values for support in given.supports):
+        moved = with_places(given.supports, values)
+        _, supports = held_within(moved, stage.dynamics.scheme.af, stage.state.displacement)
+    return with_terms(given, (loads, supports, *others))
 
 
 def loaded_step(stage: Stage, values: dict[str, Array]) -> TimeStep:
-    """The step with its driven loads on the way to `values`."""
-    loads = _loaded(stage, values).loads
-    return stage.step._replace(terms=(loads, *stage.step.terms[1:]))
+    """The step with its loads and supports on the way to `values`."""
+    problem = loaded(stage, values)
+    terms = (problem.loads, problem.supports, *stage.step.terms[2:])
+    return stage.step._replace(terms=terms)
+
+
+def _held(stage: Stage, values: dict[str, Array]) -> Float[Array, " dofs"]:
+    """Displacements that supports decide where the forces of the step act [m]."""
+    problem = loaded(stage, values)
+    return known_values(problem.supports, *stage.state.displacement.shape)
 
 
 def _newton(equations: Equations, newton: fem.Newton, given):
@@ -155,7 +172,7 @@ def _newton(equations: Equations, newton: fem.Newton, given):
 
     def one(now: _Pass) -> _Pass:
         values = unravel(now.w)
-        problems = {k: _loaded(s, values[k]) for k, s in stages.items()}
+        problems = {k: loaded(s, values[k]) for k, s in stages.items()}
         found = {
             k: linearise(problems[k], s.prepared, now.u[k], now.base[k])
             for k, s in stages.items()
@@ -201,9 +218,9 @@ def _judged(equations, newton, given, stages, unravel, now: _Pass, problems, fou
 
     def examined():
         values = unravel(now.w)
-        answer = _ravelled(equations.answer(given, now.u))[0]
+        answer = _ravelled(equations.answer(given, stages, now.u, values))[0]
         gap = now.w - answer
-        held = {k: known_values(s.step.terms[1], *now.u[k].shape) for k, s in stages.items()}
+        held = {k: _held(s, values[k]) for k, s in stages.items()}
         moves = {k: _move(s.prepared.known, held[k], now.u[k]) for k, s in stages.items()}
         small = _small(newton, stages, unravel, problems, found, now.u, values, gap)
         settled = ~jnp.any(jnp.stack([jnp.any(move != 0) for move in moves.values()]))
@@ -261,20 +278,24 @@ def _move(known, held, u):
 
 
 def _small(newton, stages, unravel, problems, found: dict[str, Linearised], u, values, gap):
-    """Whether forces are balanced, and would be under the loads that the network answers."""
+    """Whether forces are balanced, and would be under the loads that the network answers, and
+    driven supports are where it puts them."""
     fits = []
     for name, stage in stages.items():
         state = found[name]
         missed = unravel(gap)[name]
 
         def force(values, name=name, stage=stage):
-            return load_force(_loaded(stage, values), u[name]).ravel()
+            return load_force(loaded(stage, values), u[name]).ravel()
 
         lack = jax.jvp(force, (values[name],), (missed,))[1]
         lack = jnp.max(jnp.abs(_free(stage.prepared.known, lack)), initial=0.0)
         allowed = state.reference, state.rounding, newton.residual_tolerance
         norm = jnp.maximum(state.residual_norm, lack)  # of which neither may be NaN
         fits.append(rules.balanced(norm, *allowed))
+        off = jax.jvp(lambda v, s=stage: _held(s, v), (values[name],), (missed,))[1]
+        size = rules.relative_size(off, u[name], stage.prepared.length)
+        fits.append(size < newton.step_tolerance)
     return jnp.all(jnp.stack(fits))
 
 
@@ -286,25 +307,32 @@ def _solved(equations, given, matrices, stages, u: Fields, values: Drives, force
     columns: dict[str, Array] = {}
     for name, stage in stages.items():
         system, known = stage.dynamics.problem.space.system, stage.prepared.known
-        matrix = sparse.fix(system, matrices[name], known)
+        values_of, matrix = matrices[name], sparse.fix(system, matrices[name], known)
+
+        def answered(force, move, system=system, known=known, values=values_of, matrix=matrix):
+            """The displacement that balances a force, held nodes moving by `move`."""
+            left = force - sparse.product(system, values, move)
+            return sparse.solve(system, matrix, _free(known, left)) + move
 
         def force(w, name=name, stage=stage):
-            return load_force(_loaded(stage, unravel(w)[name]), u[name]).ravel()
+            return load_force(loaded(stage, unravel(w)[name]), u[name]).ravel()
 
-        move = moves[name]
-        left = -forces[name] - sparse.product(system, matrices[name], move)
-        first[name] = sparse.solve(system, matrix, _free(known, left)) + move
+        first[name] = answered(-forces[name], moves[name])
         pull = jax.jacfwd(force)(w).T  # what a unit of each value adds
-        pull = jnp.where(known[None], jnp.zeros_like(pull), pull)
-        columns[name] = jax.vmap(lambda b, s=system, m=matrix: sparse.solve(s, m, b))(pull)
+        lead = jax.jacfwd(lambda w, n=name, s=stage: _held(s, unravel(w)[n]))(w).T
+        columns[name] = jax.vmap(answered)(pull, lead)
 
-    def along(rows):
-        """How the answer moves with the bodies."""
+    def along(rows, dw):
+        """How the answer moves with the bodies, and with the values themselves."""
         dots = {k: row.reshape(u[k].shape) for k, row in rows.items()}
-        tangent = jax.jvp(lambda u: equations.answer(given, u), (u,), (dots,))[1]
-        return _ravelled(tangent)[0]
+
+        def answer(u, w):
+            return equations.answer(given, stages, u, unravel(w))
+
+        return _ravelled(jax.jvp(answer, (u, w), (dots, dw))[1])[0]
 
     eye = jnp.eye(w.shape[0], dtype=w.dtype)
-    dw = jnp.linalg.solve(eye - jax.vmap(along)(columns).T, along(first) - gap)
+    seen = jax.vmap(along)(columns, eye).T
+    dw = jnp.linalg.solve(eye - seen, along(first, jnp.zeros_like(w)) - gap)
     du = {k: (first[k] + dw @ rows).reshape(u[k].shape) for k, rows in columns.items()}
     return du, dw
