@@ -9,6 +9,7 @@ from sorojax.rod.contact.obstacle import (
     penetration,
 )
 from sorojax.rod.contact.rods import HeldRod, RodContact, SelfContact
+from sorojax.rod.dynamics.closed import closed
 from sorojax.rod.dynamics.dynamics import (
     acceleration,
     bias_force,
@@ -229,6 +230,7 @@ __all__ = [
     "chebyshev",
     "circle",
     "close",
+    "closed",
     "columns",
     "constant",
     "contact_energy",

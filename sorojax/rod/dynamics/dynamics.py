@@ -15,6 +15,8 @@ from jaxtyping import Array, Float
 from sorojax._types import Numbers, real
 from sorojax.math.compiled import batched, chunked_lanes, full_products, jit_public
 from sorojax.math.linalg.dense import solve_symmetric
+from sorojax.math.ode.held import accelerate
+from sorojax.rod.dynamics.closures import held
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.moving import mass_jacobian, mass_position
 from sorojax.rod.dynamics.points import moment_of
@@ -22,6 +24,7 @@ from sorojax.rod.dynamics.tree import AssemblyState, part_columns, part_motion
 from sorojax.rod.forces import loads
 from sorojax.rod.forces.forces import Gravity
 from sorojax.rod.model.assembly import increments, rate
+from sorojax.rod.model.closure import is_closed
 from sorojax.rod.model.link import LinkState
 from sorojax.rod.model.model import Model, inertia, motion, operators
 
@@ -103,7 +106,8 @@ def forward_dynamics(
         t: Time [s].
 
     Returns:
-        Second derivatives of the coordinates, units of q per s^2.
+        Second derivatives of the coordinates, units of q per s^2; with closures those that
+        keep the loops closed, where (q, q') do.
 
     Raises:
         ValueError: If the shapes do not fit the model or each other.
@@ -136,17 +140,28 @@ def acceleration(
     """`forward_dynamics` uncompiled, for loops that hold `operators(model)`."""
     moment = motion(model, q, v, constants=constants)
     mass, coriolis = inertia(moment)
-    return solve_symmetric(mass, loads.total_force(forces, t, moment) - coriolis)
+    force = loads.total_force(forces, t, moment) - coriolis
+    if isinstance(moment, AssemblyState) and is_closed(model):
+        return accelerate(mass, force, held(moment, t)).x
+    return solve_symmetric(mass, force)
 
 
 @jit_public
 def inverse_dynamics(
     model: Model, q: Coordinates, v: Rates, a: Rates, forces: Forces = (), *, t=0.0
 ) -> Rates:
-    """Generalised force that an actuator must add to reach the acceleration `a`."""
+    """Generalised force that an actuator must add to reach the acceleration `a`.
+
+    Where closures bear a part of it, the smallest one, in the metric of the inverse mass.
+    """
     moment = motion(model, q, v)
     mass, coriolis = inertia(moment)
-    return mass @ a + coriolis - loads.total_force(forces, real(t), moment)
+    force = mass @ a + coriolis - loads.total_force(forces, real(t), moment)
+    if isinstance(moment, AssemblyState) and is_closed(model):
+        still = held(moment, real(t))
+        still = still._replace(wanted=jnp.zeros_like(still.wanted))
+        return mass @ accelerate(mass, force, still).x
+    return force
 
 
 class VectorField(eqx.Module):

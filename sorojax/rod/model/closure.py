@@ -1,7 +1,7 @@
 """Closures: joints that close a loop of an assembly, or hold a part of it to the ground."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -49,6 +49,11 @@ class Closure(eqx.Module):
     def __check_init__(self):
         _check.between("Closure", "s", self.s, 0, 1, "-", "0 is the base.", "[]")
         _check.between("Closure", "at", self.at, 0, 1, "-", "0 is the base.", "[]")
+
+
+def is_closed(model: Any) -> bool:
+    """Whether a rod or assembly has closures."""
+    return bool(getattr(model, "closures", ()))
 
 
 def num_held(joint: AbstractJoint, group: Group) -> int:

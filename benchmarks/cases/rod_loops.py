@@ -1,0 +1,89 @@
+"""Closed loops in motion: how well they stay closed, what they cost over the open tree."""
+
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.harness import Row, measure
+from sorojax import rod
+from sorojax.math.lie import SE2, SE3, homogeneous
+from sorojax.math.ode.steppers import DormandPrince, GeneralisedAlpha
+from sorojax.rod.dynamics.closures import violations
+
+RUN = 10.0  # s
+GAP_BAR, DRIFT_BAR, COST_BAR, GRADIENT_BAR = 1e-10, 1e-6, 2.0, 1e-6
+SOFT = {"young_modulus": 1e6, "poisson_ratio": 0.5, "density": 1000.0}
+REFERENCE = "|g(q, t)| at most [rad], [m]"
+
+
+def four_bar():
+    """Three soft links of 4 coordinates and their joints; the ground is the fourth."""
+    basis = rod.chebyshev(kappa_z=3, sigma_x=1)
+    lengths = (0.1, 0.25, 0.2)
+    links = [
+        rod.rod(SE2(), basis, rod.circle(8e-3), length=x, nodes=8, **SOFT) for x in lengths
+    ]
+    tree = rod.assembly(
+        SE2(),
+        crank=rod.Part(links[0], rod.Revolute()),
+        coupler=rod.Part(links[1], rod.Revolute(), on="crank"),
+        rocker=rod.Part(links[2], rod.Revolute(), on="coupler"),
+    )
+    ground = homogeneous(jnp.eye(2), jnp.array([0.3, 0.0]))
+    loop = rod.close(tree, pin=rod.Closure("rocker", rod.Spherical(), offset=ground))
+    guess = rod.rest(tree).at[jnp.array([0, 5, 10])].set(jnp.array([1.0, -0.5, -1.5]))
+    return loop, rod.closed(loop, guess).q
+
+
+def three_rods():
+    """Three soft rods clamped to the ground and to a platform: two loops in space."""
+    basis = rod.chebyshev(kappa_x=1, kappa_y=3, kappa_z=3, sigma_x=1)
+    leg = rod.rod(SE3(), basis, rod.circle(4e-3), length=0.2, nodes=8, **SOFT)
+    up = jnp.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    places = [
+        0.05 * jnp.array([np.cos(x), np.sin(x), 0.0]) for x in 2 * np.pi / 3 * np.arange(3)
+    ]
+    legs = {
+        f"leg_{k}": rod.Part(leg, offset=homogeneous(up, place))
+        for k, place in enumerate(places)
+    }
+    down = homogeneous(up.T, -up.T @ places[0])
+    platform = rod.Link(0.03, [2e-5, 2e-5, 4e-5])
+    tree = rod.assembly(SE3(), **legs, platform=rod.Part(platform, on="leg_0", offset=down))
+    loop = rod.close(
+        tree,
+        **{
+            f"foot_{k}": rod.Closure(f"leg_{k}", on="platform", offset=homogeneous(up, at))
+            for k, at in enumerate(places)
+            if k
+        },
+    )
+    return loop, rod.rest(loop)
+
+
+def moved(loop, q, stepper, step, seconds, forces=(), size=1.0):
+    """A run from rates that close the loops after the projection at the start."""
+    v = size * jnp.asarray(np.random.default_rng(0).normal(size=rod.num_dof(loop)))
+    saves = 50
+    every = round(seconds / step / saves)
+    return rod.rollout(
+        loop, q, v, forces, step=step, saves=saves, every=every, stepper=stepper, check=False
+    )
+
+
+def gap(loop, path):
+    """Largest violation of a path."""
+    found = jax.vmap(lambda q: violations(rod.motion(loop, q), jnp.zeros(())))(path.q)
+    return float(jnp.max(jnp.abs(found)))
+
+
+def drift(loop, path):
+    """Largest change of the energy, relative."""
+
+    def energy(q, v):
+        return rod.kinetic_energy(loop, q, v) + rod.potential_energy(loop, q)
+
+    found = jax.vmap(energy)(path.q, path.v)
+    return float(jnp.max(jnp.abs(found - found[0])) / found[0])
