@@ -2,11 +2,12 @@
 
 import time
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.harness import Row, measure
+from benchmarks.harness import Row
 from sorojax import rod
 from sorojax.math.lie import SE2, SE3, homogeneous
 from sorojax.math.ode.steppers import DormandPrince, GeneralisedAlpha
@@ -15,7 +16,15 @@ from sorojax.rod.dynamics.closures import violations
 RUN = 10.0  # s
 GAP_BAR, DRIFT_BAR, COST_BAR, GRADIENT_BAR = 1e-10, 1e-6, 2.0, 1e-6
 SOFT = {"young_modulus": 1e6, "poisson_ratio": 0.5, "density": 1000.0}
-REFERENCE = "|g(q, t)| at most [rad], [m]"
+DAMPED = (rod.Gravity(), rod.Damping(0.02))
+SAVES = 50
+FINE = {"four-bar": 1e-4, "three rods": 2e-4}  # s, of the method of order 5
+REFERENCES = {
+    "violation": "|g(q, t)| at most [rad], [m], in 10 s",
+    "energy": "largest change in 10 s, relative",
+    "gradient": "central differences",
+    "cost": "CPU time of the open tree, run in turn",
+}
 
 
 def four_bar():
@@ -66,11 +75,9 @@ def three_rods():
 def moved(loop, q, stepper, step, seconds, forces=(), size=1.0):
     """A run from rates that close the loops after the projection at the start."""
     v = size * jnp.asarray(np.random.default_rng(0).normal(size=rod.num_dof(loop)))
-    saves = 50
-    every = round(seconds / step / saves)
-    return rod.rollout(
-        loop, q, v, forces, step=step, saves=saves, every=every, stepper=stepper, check=False
-    )
+    every = round(seconds / step / SAVES)
+    settings = {"step": step, "saves": SAVES, "every": every, "check": False}
+    return rod.rollout(loop, q, v, forces, stepper=stepper, **settings)
 
 
 def gap(loop, path):
@@ -87,3 +94,73 @@ def drift(loop, path):
 
     found = jax.vmap(energy)(path.q, path.v)
     return float(jnp.max(jnp.abs(found - found[0])) / found[0])
+
+
+def cost(loop, q, stepper, step):
+    """CPU time of a run over that of the open tree from the same state, run in turn."""
+    tree = rod.Assembly(loop.group, loop.names, loop.parts)
+    zero, settings = jnp.zeros(rod.num_dof(loop)), {"step": step, "saves": 20, "every": 20}
+
+    def run(model):
+        return rod.rollout(
+            model, q, zero, DAMPED, stepper=stepper, check=False, **settings
+        ).q
+
+    times = {}
+    for model in (loop, tree) * 8:
+        jax.block_until_ready(run(model))
+        start = time.process_time()
+        jax.block_until_ready(run(model))
+        times.setdefault(model is loop, []).append(time.process_time() - start)
+    return min(times[True]) / min(times[False])
+
+
+def gradient(loop, q):
+    """Derivative of a damped run by the stiffness of all rods, forward and in reverse, over
+    that of central differences."""
+
+    def end(scale):
+        model = jax.tree.map(lambda x: x, loop)
+        for k, part in enumerate(loop.parts):
+            if isinstance(part.body, rod.Rod):
+                young = part.body.material.young_modulus * scale
+                model = eqx.tree_at(
+                    lambda m, k=k: m.parts[k].body.material.young_modulus, model, young
+                )
+        path = rod.rollout(
+            model,
+            q,
+            jnp.zeros(rod.num_dof(loop)),
+            DAMPED,
+            step=2e-3,
+            saves=1,
+            every=50,
+            check=False,
+        )
+        return jnp.sum(path.q[-1])
+
+    one, h = jnp.ones(()), 1e-4
+    want = (end(one + h) - end(one - h)) / (2 * h)
+    forward, reverse = jax.jvp(end, (one,), (one,))[1], jax.grad(end)(one)
+    return max(abs(float(x / want - 1)) for x in (forward, reverse))
+
+
+def rows():
+    for name, make in (("four-bar", four_bar), ("three rods", three_rods)):
+        loop, q = make()
+        settings = {"model": name, "dof": rod.num_dof(loop)}
+
+        def row(of, error, bar, settings=settings, **more):
+            reference = REFERENCES[of]
+            more = settings | {"of": of} | more
+            return Row("sorojax", more, error=error, reference=reference, bar=bar, bar_on="error")
+
+        path = moved(loop, q, DormandPrince(), FINE[name], RUN)
+        yield row("energy", drift(loop, path), DRIFT_BAR, step=FINE[name])
+        yield row("violation", gap(loop, path), GAP_BAR, method="DormandPrince")
+        path = moved(loop, q, GeneralisedAlpha(), 2e-3, RUN, DAMPED)
+        yield row("violation", gap(loop, path), GAP_BAR, method="GeneralisedAlpha")
+        yield row("gradient", gradient(loop, q), GRADIENT_BAR)
+        for stepper, step in ((GeneralisedAlpha(), 2e-3), (DormandPrince(), FINE[name])):
+            ratio = cost(loop, q, stepper, step)
+            yield row("cost", ratio, COST_BAR, method=type(stepper).__name__)

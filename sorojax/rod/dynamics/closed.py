@@ -173,13 +173,13 @@ def closed(
 
     Example:
         >>> bar = rod.Link(0.1, 1e-5)
-        >>> along = lambda x: lie.homogeneous(jnp.eye(2), jnp.array([x, 0.0]))
+        >>> along = lambda x: sj.math.lie.homogeneous(jnp.eye(2), jnp.array([x, 0.0]))
         >>> arm = rod.assembly(SE2(), first=rod.Part(bar, rod.Revolute()), second=rod.Part(
         ...     bar, rod.Revolute(), on="first", offset=along(0.1)))
         >>> loop = rod.close(arm, end=rod.Closure(
         ...     "second", rod.Spherical(), offset=along(0.15), frame=along(0.1)))
         >>> found = rod.closed(loop, jnp.array([0.5, -1.0]))
-        >>> (found.q / deg).round(2).tolist()  # a triangle of sides 10, 10 and 15 cm
+        >>> jnp.degrees(found.q).round(2).tolist()  # a triangle of sides 10, 10 and 15 cm
         [41.41, -82.82]
 
     Reference:

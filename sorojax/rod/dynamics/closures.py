@@ -140,9 +140,17 @@ def closure_change(moment: AssemblyState, t: Float[Array, ""]) -> Change:
     return Change(*(jnp.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def held(moment: AssemblyState, t: Float[Array, ""]) -> Held:
-    """What the closures ask of accelerations: G a = G dv/dt - d^2 g/dt^2."""
-    return Held(closure_jacobian(moment, t), -closure_change(moment, t).bias)
+def held(moment: AssemblyState, t: Float[Array, ""], pull: float = 0.0) -> Held:
+    """What the closures ask of accelerations: d^2 g/dt^2 = 0, or with a `pull` [1/s] what
+    brings back a violation as a critically damped spring does.
+
+    Reference:
+        Baumgarte, Comput. Methods Appl. Mech. Engrg. 1, 1972, for the pull.
+    """
+    change, rows = closure_change(moment, t), closure_jacobian(moment, t)
+    if pull == 0:
+        return Held(rows, -change.bias)
+    return Held(rows, -change.bias - 2 * pull * change.rate - pull**2 * change.value)
 
 
 def held_rates(

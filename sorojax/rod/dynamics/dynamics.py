@@ -31,6 +31,7 @@ from sorojax.rod.model.model import Model, inertia, motion, operators
 Coordinates = Float[Array, " coordinates"]
 Rates = Float[Array, " dof"]
 Forces = tuple[loads.Load, ...]
+PULL = 50.0  # 1/s, at which closures that a step has opened go back where nothing projects
 
 
 @jit_public
@@ -135,14 +136,21 @@ def forward_dynamics(
 @chunked_lanes
 @full_products
 def acceleration(
-    model: Model, constants: Any, t: Float[Array, ""], q: Coordinates, v: Rates, forces: Forces
+    model: Model,
+    constants: Any,
+    t: Float[Array, ""],
+    q: Coordinates,
+    v: Rates,
+    forces: Forces,
+    pull: float = 0.0,
 ) -> Rates:
-    """`forward_dynamics` uncompiled, for loops that hold `operators(model)`."""
+    """`forward_dynamics` uncompiled, for loops that hold `operators(model)`; with a `pull`
+    [1/s] back on closures that have opened."""
     moment = motion(model, q, v, constants=constants)
     mass, coriolis = inertia(moment)
     force = loads.total_force(forces, t, moment) - coriolis
     if isinstance(moment, AssemblyState) and is_closed(model):
-        return accelerate(mass, force, held(moment, t)).x
+        return accelerate(mass, force, held(moment, t, pull)).x
     return solve_symmetric(mass, force)
 
 
@@ -167,6 +175,9 @@ def inverse_dynamics(
 class VectorField(eqx.Module):
     """(t, (q, v), args) -> (dq/dt, dv/dt): the right-hand side that diffrax integrates.
 
+    Closures that open by the error of a step are pulled shut at the rate `pull` [1/s];
+    `rollout` projects instead, to round-off.
+
     The field is a pytree: `diffrax.ODETerm(vector_field(rod, forces))` is differentiable
     in the rod and its forces.
     """
@@ -174,11 +185,12 @@ class VectorField(eqx.Module):
     model: Model
     constants: Any
     forces: Forces
+    pull: float = eqx.field(static=True, default=PULL)
 
     def __call__(self, t: Any, state: tuple[Array, Array], args: Any = None):
         q, v = state
         t = jnp.asarray(t, q.dtype)
-        a = acceleration(self.model, self.constants, t, q, v, self.forces)
+        a = acceleration(self.model, self.constants, t, q, v, self.forces, self.pull)
         return rate(self.model, q, v), a
 
 
