@@ -102,9 +102,7 @@ def cost(loop, q, stepper, step):
     zero, settings = jnp.zeros(rod.num_dof(loop)), {"step": step, "saves": 20, "every": 20}
 
     def run(model):
-        return rod.rollout(
-            model, q, zero, DAMPED, stepper=stepper, check=False, **settings
-        ).q
+        return rod.rollout(model, q, zero, DAMPED, stepper=stepper, check=False, **settings).q
 
     times = {}
     for model in (loop, tree) * 8:
@@ -153,7 +151,9 @@ def rows():
         def row(of, error, bar, settings=settings, **more):
             reference = REFERENCES[of]
             more = settings | {"of": of} | more
-            return Row("sorojax", more, error=error, reference=reference, bar=bar, bar_on="error")
+            return Row(
+                "sorojax", more, error=error, reference=reference, bar=bar, bar_on="error"
+            )
 
         path = moved(loop, q, DormandPrince(), FINE[name], RUN)
         yield row("energy", drift(loop, path), DRIFT_BAR, step=FINE[name])

@@ -12,7 +12,6 @@ Reference:
     pseudo-inverse.
 """
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -61,7 +60,7 @@ class HeldTerms(NamedTuple):
         place: (t, q) -> (g, `Held` of rates).
         by: The independent equations.
         near: Inverse of the inertia at the start, along which explicit steps go back.
-        """
+    """
 
     accelerations: Callable[[Array, Array, Array], tuple[Array, Array, Held]]
     rates: Callable[[Array, Array, Array], tuple[Array, Array, Held]]
@@ -170,5 +169,5 @@ def projected(
 
 def _share(reach: Array, inverse: Array) -> Float[Array, ""]:
     """One over the condition number in the norm of the largest row sum; no derivative."""
-    sizes = (jnp.max(jnp.sum(jnp.abs(x), axis=1)) for x in (reach, inverse))
-    return jax.lax.stop_gradient(1 / math.prod(sizes))
+    first, second = (jnp.max(jnp.sum(jnp.abs(x), axis=1)) for x in (reach, inverse))
+    return jax.lax.stop_gradient(1 / (first * second))

@@ -149,9 +149,7 @@ class _Search(NamedTuple):
 
 
 @jit_public
-def closed(
-    model: Assembly, q: Float[Array, " coordinates"] | None = None, *, t=0.0
-) -> Closed:
+def closed(model: Assembly, q: Float[Array, " coordinates"] | None = None, *, t=0.0) -> Closed:
     """Coordinates near a guess that keep the closures: the loops of an assembly closed.
 
     Newton's method on g(q, t) = 0 with the step of least size in a metric of inertia and

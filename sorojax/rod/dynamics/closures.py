@@ -233,7 +233,9 @@ def _relative(pair: _Pair, held: _Rates, holder: _Rates | None, t: Array) -> Any
 
     def later(x):
         half = x**2 / 2
-        return rotation + x * turned + half * bent, position + x * first[rot:] + half * second[rot:]
+        return rotation + x * turned + half * bent, position + x * first[rot:] + half * second[
+            rot:
+        ]
 
     return later
 

@@ -1,7 +1,7 @@
 """Closures: joints that close a loop of an assembly, or hold a part of it to the ground."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import equinox as eqx
 import jax
@@ -51,7 +51,7 @@ class Closure(eqx.Module):
         _check.between("Closure", "at", self.at, 0, 1, "-", "0 is the base.", "[]")
 
 
-def is_closed(model: Any) -> bool:
+def is_closed(model: Any) -> "TypeGuard[Assembly]":
     """Whether a rod or assembly has closures."""
     return bool(getattr(model, "closures", ()))
 
