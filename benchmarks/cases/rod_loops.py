@@ -1,6 +1,7 @@
 """Closed loops in motion: how well they stay closed, what they cost over the open tree."""
 
 import time
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,7 +16,7 @@ from sorojax.rod.dynamics.closures import violations
 
 RUN = 10.0  # s
 GAP_BAR, DRIFT_BAR, COST_BAR, GRADIENT_BAR = 1e-10, 1e-6, 2.0, 1e-6
-SOFT = {"young_modulus": 1e6, "poisson_ratio": 0.5, "density": 1000.0}
+SOFT: dict[str, Any] = {"young_modulus": 1e6, "poisson_ratio": 0.5, "density": 1000.0}
 DAMPED = (rod.Gravity(), rod.Damping(0.02))
 SAVES = 50
 FINE = {"four-bar": 1e-4, "three rods": 2e-4}  # s, of the method of order 5

@@ -177,8 +177,8 @@ def closed(model: Assembly, q: Float[Array, " coordinates"] | None = None, *, t=
         >>> loop = rod.close(arm, end=rod.Closure(
         ...     "second", rod.Spherical(), offset=along(0.15), frame=along(0.1)))
         >>> found = rod.closed(loop, jnp.array([0.5, -1.0]))
-        >>> jnp.degrees(found.q).round(2).tolist()  # a triangle of sides 10, 10 and 15 cm
-        [41.41, -82.82]
+        >>> print(jnp.degrees(found.q).round(2))  # a triangle of sides 10, 10 and 15 cm
+        [ 41.41 -82.82]
 
     Reference:
         Haug, Computer Aided Kinematics and Dynamics of Mechanical Systems, 1989, chapter 4,

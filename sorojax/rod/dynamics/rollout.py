@@ -51,7 +51,7 @@ class Trajectory(eqx.Module):
     v: Float[Array, "time dof"]
     status: Status
     memory: Any = None  # Float[Array, "time branches dof"], None without branches
-    reactions: dict[str, Float[Array, "time twist"]] | None = None  # None without closures
+    reactions: Any = None  # dict[str, Float[Array, "time twist"]], None without closures
 
     def _text(self) -> str:
         return (
