@@ -264,10 +264,14 @@ def loaded(at):
     ).q
 
 
-HELD = R.close(
-    FLAT,
-    tip=R.Closure("rod", R.Roller(), offset=homogeneous(jnp.eye(2), jnp.array([0.07, 0.01]))),
+BAR = R.Link(0.1, 1e-5)
+ARM = R.assembly(
+    SE2(),
+    first=R.Part(BAR, R.Revolute()),
+    second=R.Part(BAR, R.Revolute(), on="first", offset=homogeneous(jnp.eye(2), 0.1 * AT)),
 )
+GROUND, END = (homogeneous(jnp.eye(2), jnp.array([x, 0.02])) for x in (0.12, 0.09))
+TRIANGLE = R.close(ARM, end=R.Closure("second", R.Spherical(), offset=GROUND, frame=END))
 FLAT_WRENCH = jnp.array([1e-3, 0.01, 0.05])
 BALL = sdf.Circle((0.05, 0.012), 8e-3)
 EVERYWHERE = np.linspace(0.05, 1.0, 16)
@@ -436,7 +440,7 @@ CASES = (
             built, (1e6, 2e3, 0.08, 6e-3, jnp.array([1.0, 2.0, 5.0, 1.05, 0.1, -0.05]))
         ),
         "elastic": Case(elastic, (3e5, 5e6)),
-        "closed": Case(lambda at: R.closed(*at).q, (HELD, BENT)),
+        "closed": Case(lambda model: R.closed(model, jnp.array([0.5, -1.0])).q, TRIANGLE),
         "tip_angle": Case(lambda q: R.tip_angle(R.motion(FLAT, q)), BENT),
         "part_motion": Case(
             lambda at: R.part_motion(R.motion(*at), 1).tangent, (TREE, W, RATES)

@@ -154,7 +154,8 @@ def closed(model: Assembly, q: Float[Array, " coordinates"] | None = None, *, t=
 
     Newton's method on g(q, t) = 0 with the step of least size in a metric of inertia and
     elastic stiffness, shortened until the violation falls; so rods bend rather than stretch.
-    The derivative is that of such a step at the answer.
+    The derivative is that of such a step at the answer: what the closures determine changes
+    as they do, what they leave free by the least, and not as the search would go elsewhere.
 
     Args:
         model: An assembly with closures.
