@@ -73,9 +73,9 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     return {
         "ended well": float(path.status == sj.Status.successful),
         "platform down [mm]": float(lifts.min()),
-        "platform up [mm]": float(lifts.max()),
+        "platform at the end [mm]": float(lifts[-1]),
         "clamp open by [m]": float(jnp.abs(apart).max()),
-        "weight on sliders at the start [N]": sum(
+        "push of the sliders at the start [N]": sum(
             float(path.reactions[f"slider_{k}"][0, 5]) for k in range(3)
         ),
     }
