@@ -17,7 +17,15 @@ ROWS = {
     "rod statics": Cases(("rod.statics",), ("rod.accuracy", "rod.closed", "rod.frequencies")),
     "rod dynamics": Cases(
         ("rod.acceleration", "rod.simulation", "rod.continuum"),
-        ("rod.assembly", "rod.contact", "rod.damped", "rod.drift", "rod.flight"),
+        (
+            "rod.assembly",
+            "rod.contact",
+            "rod.damped",
+            "rod.drift",
+            "rod.flight",
+            "rod.loops",
+            "rod.spin",
+        ),
     ),
     "rod batches": Cases(("rod.batch",)),
     "FEM assembly": Cases(("fem.assembly",), ("fem.newton",)),

@@ -36,7 +36,7 @@ def turned(angle, *position):
 
 def held(joint, **options):
     closure = R.Closure("rod", joint, offset=shift(LENGTH, 0.0), **options)
-    return R.close(PLANE, tip=closure)
+    return R.with_closures(PLANE, tip=closure)
 
 
 @pytest.mark.parametrize("group", [SE2(), SE3()])
@@ -54,7 +54,7 @@ def test_reactions_do_work_on_the_rates_of_violations(group, joint):
         b=R.Part(link, R.Spherical(), on="a"),
         c=R.Part(body, R.Roller(), on="b", offset=away),
     )
-    model = R.close(
+    model = R.with_closures(
         tree,
         pair=R.Closure("c", joint, on="a", s=0.4, offset=away, at=0.7, frame=away),
         ground=R.Closure("b", joint, offset=away, frame=away),
@@ -103,7 +103,7 @@ def test_a_beam_held_at_its_end_bears_its_weight(joint, upward):
 def test_a_sunk_support_has_the_reaction_of_the_closed_form_and_its_derivative():
     def reaction(depth):
         closure = R.Closure("rod", R.Roller(), offset=shift(LENGTH, -depth))
-        return R.equilibrium(R.close(PLANE, tip=closure)).reactions["tip"][2]
+        return R.equilibrium(R.with_closures(PLANE, tip=closure)).reactions["tip"][2]
 
     stiffness = 3 * STIFFNESS / LENGTH**3
     small = 1e-5
@@ -115,7 +115,7 @@ def test_a_sunk_support_has_the_reaction_of_the_closed_form_and_its_derivative()
 
 
 def test_a_ring_bears_one_moment():
-    seam = R.close(PLANE, seam=R.Closure("rod", on="rod", s=0.0))
+    seam = R.with_closures(PLANE, seam=R.Closure("rod", on="rod", s=0.0))
     bend = 2 * np.pi / LENGTH
     rest = R.equilibrium(seam, (), jnp.array([1.1 * bend, 0.0, 5.0, 0.0]))
     assert rest.status == Status.successful
@@ -153,7 +153,7 @@ def test_a_ring_folds_to_a_third():
         "rod", R.Prismatic([0, 1, 0]), offset=shift(*pose[:3, 3]), frame=axes, motion=about_y
     )
     angles = jnp.linspace(0, 2 * np.pi, 31)[1:]
-    model = R.close(half, turned=folding)
+    model = R.with_closures(half, turned=folding)
     path = R.equilibrium_path(model, lambda _: (), angles, t=lambda factor: factor)
     assert bool(jnp.all(path.status == Status.successful))
     across = R.tip_pose(model, path.q[-1])["rod"][1, 3]
@@ -177,7 +177,7 @@ def lee(modes=4):
         near=R.Part(part(0.2), on="column", offset=turned(-np.pi / 2, 0.0, 0.0)),
         far=R.Part(part(0.8), on="near"),
     )
-    return R.close(frame, pin=R.Closure("far", R.Revolute(), offset=shift(1.0, 1.0)))
+    return R.with_closures(frame, pin=R.Closure("far", R.Revolute(), offset=shift(1.0, 1.0)))
 
 
 def pressed(factor):
@@ -205,7 +205,7 @@ def four_bar(**spring):
         b=R.Part(link, R.Revolute(), on="a", offset=along),
         c=R.Part(link, R.Revolute(), on="b", offset=along),
     )
-    return R.close(chain, pin=R.Closure("c", R.Revolute(), offset=along, frame=along))
+    return R.with_closures(chain, pin=R.Closure("c", R.Revolute(), offset=along, frame=along))
 
 
 UPRIGHT = jnp.array([1.0, -1.0, -1.0]) * np.pi / 2
@@ -255,7 +255,7 @@ def test_a_parallel_robot_takes_the_pose_that_it_is_asked():
         ),
         right=R.Part(leg, rail, offset=turned(np.pi / 2, 0.05, 0.0)),
     )
-    robot = R.close(
+    robot = R.with_closures(
         robot, hinge=R.Closure("right", R.Revolute(), on="top", offset=shift(0.1, 0.0))
     )
 
@@ -267,7 +267,7 @@ def test_a_parallel_robot_takes_the_pose_that_it_is_asked():
 
     def least_energy(x):
         goal = R.Closure("top", offset=turned(0.1, x, 0.185))
-        return R.equilibrium(R.close(robot, goal=goal), (), found.q)
+        return R.equilibrium(R.with_closures(robot, goal=goal), (), found.q)
 
     same = least_energy(-0.04)
     assert same.status == Status.successful and same.iterations < 6
@@ -291,12 +291,12 @@ def test_a_parallel_robot_takes_the_pose_that_it_is_asked():
 )
 def test_what_cannot_close_is_refused(closure, message):
     with pytest.raises(ValueError, match=message):
-        R.close(PLANE, tip=closure())
+        R.with_closures(PLANE, tip=closure())
 
 
 def test_names_of_closures_are_taken_once():
     with pytest.raises(ValueError, match="closure `tip` already"):
-        R.close(held(R.Fixed()), tip=R.Closure("rod"))
+        R.with_closures(held(R.Fixed()), tip=R.Closure("rod"))
 
 
 def test_a_model_without_closures_pays_nothing():
@@ -305,5 +305,5 @@ def test_a_model_without_closures_pays_nothing():
 
     q = jnp.zeros(4)
     single = R.assembly(SE2(), rod=R.Part(PLANE))
-    assert text(single) == text(R.close(single))
+    assert text(single) == text(R.with_closures(single))
     assert text(single) != text(held(R.Fixed()))

@@ -27,10 +27,9 @@ VERBS = {
     "fem": "bonded_rod cauchy_stress continuation critical_loads eigenmodes embedded_rod glue "
     "problem reaction_history reactions rod_forces simulate solve solve_path solve_volume "
     "von_mises_stress",
-    "rod": "assembly branch_states bspline chebyshev circle close equilibrium equilibrium_path "
-    "forward_dynamics forward_kinematics inverse_kinematics mobility operators "
-    "piecewise_constant rod "
-    "rollout tip_pose",
+    "rod": "assembly branch_states bspline chebyshev circle close_loops equilibrium "
+    "equilibrium_path forward_dynamics forward_kinematics inverse_kinematics mobility "
+    "operators piecewise_constant rod rollout tip_pose with_closures",
     "coupling": "mounted_rod",
     "reduction": "identify pod_basis strain_along",
     "systems": "Network simulate simulate_batch simulate_sampled",

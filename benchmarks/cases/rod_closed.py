@@ -51,7 +51,9 @@ def frame(modes):
         near=R.Part(part(0.2), on="column", offset=turned(-np.pi / 2, 0.0, 0.0)),
         far=R.Part(part(0.8), on="near"),
     )
-    return R.close(whole, pin=R.Closure("far", R.Revolute(), offset=turned(0.0, 1.0, 1.0)))
+    return R.with_closures(
+        whole, pin=R.Closure("far", R.Revolute(), offset=turned(0.0, 1.0, 1.0))
+    )
 
 
 def pressed(factor):
@@ -98,7 +100,7 @@ def half_ring(modes):
     place = jnp.eye(4).at[:3, 3].set(pose[:3, 3])
     axes = jnp.eye(4).at[:3, :3].set(pose[:3, :3].T)
     closure = R.Closure("rod", R.Prismatic([0, 1, 0]), offset=place, frame=axes, motion=about_y)
-    return R.close(half, turned=closure)
+    return R.with_closures(half, turned=closure)
 
 
 def unloaded(_):
@@ -137,7 +139,7 @@ def twisted(modes, ratio):
     # in its plane, as a ring of no own curvature turns about its tangent without energy
     far = R.Closure("rod", R.Roller([0, 1, 0]), at=0.5, offset=jnp.eye(4).at[1, 3].set(2.0))
     seam = R.Closure("rod", on="rod", s=0.0, motion=about_x)
-    return R.close(ring, seam=seam, far=far)
+    return R.with_closures(ring, seam=seam, far=far)
 
 
 def critical_twist(modes, ratio):

@@ -62,6 +62,12 @@ class Status(eqx.Enumeration):
         "A cell of the moved mesh is inside out: the shape changes by more than the nodes of "
         "its start mesh can follow. Change it less, or mesh the new shape."
     )
+    singular = (
+        "A pose is singular, or all but: closures lose hold of a motion there, or one of them "
+        "no longer does what the others do not, as in a four-bar stretched out. Reactions and "
+        "the way out are not determined. Start elsewhere, drive the mechanism through, or give "
+        "it another closure."
+    )
     not_settled = (
         "The output still moves at the end, as in a limit cycle. Lower the gains or the delay, "
         "raise the damping, or give it more time."

@@ -9,6 +9,7 @@ from sorojax.rod.contact.obstacle import (
     penetration,
 )
 from sorojax.rod.contact.rods import HeldRod, RodContact, SelfContact
+from sorojax.rod.dynamics.closed import close_loops
 from sorojax.rod.dynamics.dynamics import (
     acceleration,
     bias_force,
@@ -82,12 +83,12 @@ from sorojax.rod.model.assembly import (
     Assembly,
     Part,
     assembly,
-    close,
     num_coordinates,
     num_dof,
     rest,
     serial,
     slices,
+    with_closures,
 )
 from sorojax.rod.model.basis import (
     AbstractModes,
@@ -230,7 +231,7 @@ __all__ = [
     "bspline",
     "chebyshev",
     "circle",
-    "close",
+    "close_loops",
     "columns",
     "constant",
     "contact_energy",
@@ -294,6 +295,7 @@ __all__ = [
     "tip_pose",
     "total_force",
     "vector_field",
+    "with_closures",
 ]
 
 _check_package(__name__)

@@ -254,7 +254,7 @@ def held(at):
 def pinned(at):
     model, wrench, place, end = at
     pose = homogeneous(jnp.eye(2), place)
-    held = R.close(model, tip=R.Closure("rod", R.Revolute(), offset=pose, at=end))
+    held = R.with_closures(model, tip=R.Closure("rod", R.Revolute(), offset=pose, at=end))
     found = R.equilibrium(held, (R.PartForce("rod", R.PointWrench(wrench, 0.5)),))
     return found.q, found.reactions
 
@@ -272,6 +272,16 @@ def loaded(at):
     ).q
 
 
+BAR = R.Link(0.1, 1e-5)
+ARM = R.assembly(
+    SE2(),
+    first=R.Part(BAR, R.Revolute()),
+    second=R.Part(BAR, R.Revolute(), on="first", offset=homogeneous(jnp.eye(2), 0.1 * AT)),
+)
+GROUND, END = (homogeneous(jnp.eye(2), jnp.array([x, 0.02])) for x in (0.12, 0.09))
+TRIANGLE = R.with_closures(
+    ARM, end=R.Closure("second", R.Spherical(), offset=GROUND, frame=END)
+)
 FLAT_WRENCH = jnp.array([1e-3, 0.01, 0.05])
 BALL = sdf.Circle((0.05, 0.012), 8e-3)
 EVERYWHERE = np.linspace(0.05, 1.0, 16)
@@ -428,7 +438,7 @@ CASES = (
             two_rods, (LAW, jnp.array([6e-3, 6e-3]), MEET, 0.05 * MEET), step=1e-6, rtol=1e-5
         ),
         "equilibrium: a finger": Case(held, (FINGER, WRENCH, DOWN), rtol=1e-6),
-        "close: a finger held at both ends": Case(
+        "with_closures: a finger held at both ends": Case(
             pinned,
             (FLAT, FLAT_WRENCH, jnp.array([0.06, 0.01]), jnp.asarray(0.9)),
             rtol=1e-6,
@@ -445,6 +455,9 @@ CASES = (
             built, (1e6, 2e3, 0.08, 6e-3, jnp.array([1.0, 2.0, 5.0, 1.05, 0.1, -0.05]))
         ),
         "elastic": Case(elastic, (3e5, 5e6)),
+        "close_loops": Case(
+            lambda model: R.close_loops(model, jnp.array([0.5, -1.0])).q, TRIANGLE, rtol=1e-6
+        ),
         "tip_angle": Case(lambda q: R.tip_angle(R.motion(FLAT, q)), BENT),
         "part_motion": Case(
             lambda at: R.part_motion(R.motion(*at), 1).tangent, (TREE, W, RATES)

@@ -68,6 +68,11 @@ class ContactMidpoint(AbstractStepper):
     def step(self, problem, t, h, state):
         if problem.contact is None:
             return ImplicitMidpoint(self.passes).step(problem, t, h, state)
+        if problem.held is not None:
+            raise ValueError(
+                "ContactMidpoint: got contact on a model with closures, need one of both: its "
+                "steps do not solve for reactions. Replace the closures by stiff springs."
+            )
         if state.resolved is None:  # a loop that could not tell of a step that is held
             at = Span(t, h, self.theta * h)
             new = _step(problem, at, _with_record(state), self)[0]

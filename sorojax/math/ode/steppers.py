@@ -1,6 +1,7 @@
 """Fixed-step integrators of second-order equations, M a = f, for loops of known cost."""
 
 import abc
+import functools
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
@@ -20,6 +21,7 @@ from sorojax.math.ode.explicit import (
     Tableau,
     rolled_step,
 )
+from sorojax.math.ode.held import Held, HeldTerms, projected, solve_held
 from sorojax.math.ode.step_control import (
     Doubled,
     after_start,
@@ -86,6 +88,7 @@ class SecondOrder(NamedTuple):
         rate: (q, v) -> dq/dt; v if None.
         contact: Contact, which `equations` hold as well, apart; None without any.
         memory: Forces with a memory, which `equations` do not hold; None without any.
+        held: What holds the coordinates to equations of their own; None without any.
     """
 
     equations: Callable[[Array, Array, Array], tuple[Array, Array]]
@@ -95,6 +98,7 @@ class SecondOrder(NamedTuple):
     rate: Callable[[Array, Array], Array] | None = None
     contact: ContactTerms | None = None
     memory: MemoryTerms | None = None
+    held: HeldTerms | None = None
 
 
 class Kinematic(NamedTuple):
@@ -102,7 +106,8 @@ class Kinematic(NamedTuple):
 
     In contact, `resolved` says whether every step so far could be taken; where not, the state
     is that before the step. `gained` is the energy that steps gained by themselves [J].
-    `memory` is that of forces which have one.
+    `memory` is that of forces which have one, `share` tells how far equations that hold the
+    coordinates have been from dependent.
     """
 
     q: Float[Array, " coordinates"]
@@ -111,6 +116,7 @@ class Kinematic(NamedTuple):
     gained: Float[Array, ""] | None = None
     resolved: Bool[Array, ""] | None = None
     memory: Float[Array, "branches dof"] | None = None
+    share: Float[Array, ""] | None = None
 
 
 class AbstractStepper(eqx.Module):
@@ -133,12 +139,31 @@ class AbstractStepper(eqx.Module):
 
 def start(problem: SecondOrder, t, q: Array, v: Array) -> Kinematic:
     """A state with the acceleration that belongs to (q, v)."""
-    mass, force = problem.equations(t, q, v)
+    still = _still(problem, t, q, v)
     if problem.memory is None:
-        return Kinematic(q, v, solve_symmetric(mass, force))
-    memory = problem.memory.begin
-    a = solve_symmetric(mass, force + problem.memory.force(q, memory))
-    return Kinematic(q, v, a, memory=memory)
+        return still._replace(a=acceleration(problem, t, still.q, still.v))
+    push = problem.memory.force(still.q, problem.memory.begin)
+    return still._replace(a=acceleration(problem, t, still.q, still.v, push))
+
+
+def acceleration(problem: SecondOrder, t, q: Array, v: Array, push: Array | None = None):
+    """That of a state, under one more force."""
+    if problem.held is None:
+        mass, force = problem.equations(t, q, v)
+        return solve_symmetric(mass, force if push is None else force + push)
+    mass, force, held = problem.held.accelerations(t, q, v)
+    force = force if push is None else force + push
+    return solve_held(mass, force, held, problem.held.by).x
+
+
+def placed(problem: SecondOrder, t, state: Kinematic, pulled: Array | None = None) -> Kinematic:
+    """A state at `t` on what holds the coordinates, along the motions `pulled`."""
+    if problem.held is None:
+        return state
+    by = functools.partial(move, problem)
+    q, v, share = projected(problem.held, by, t, (state.q, state.v), pulled)
+    share = share if state.share is None else jnp.minimum(share, state.share)
+    return state._replace(q=q, v=v, share=share)
 
 
 def within(problem: SecondOrder, span, state: Kinematic) -> SecondOrder:
@@ -156,6 +181,15 @@ def within(problem: SecondOrder, span, state: Kinematic) -> SecondOrder:
         mass, force = problem.equations(t, q, v)
         return mass, force + push(q)
 
+    held = problem.held
+    if held is not None:
+        bound = held.rates
+
+        def pushed_bound(t, q, v):
+            mass, force, rows = bound(t, q, v)
+            return mass, force + push(q), rows
+
+        held = held._replace(rates=pushed_bound)
     contact = problem.contact
     if contact is not None:
         free, plain = contact.free, contact.plain
@@ -168,7 +202,10 @@ def within(problem: SecondOrder, span, state: Kinematic) -> SecondOrder:
             free=pushed_free, plain=lambda t, q, v: plain(t, q, v) + push(q)
         )
     return problem._replace(
-        equations=pushed, stiffness=problem.stiffness + stiffness, contact=contact
+        equations=pushed,
+        stiffness=problem.stiffness + stiffness,
+        contact=contact,
+        held=held,
     )
 
 
@@ -177,6 +214,33 @@ def remembered(problem: SecondOrder, h, state: Kinematic, q: Array) -> Array | N
     if problem.memory is None or state.memory is None:
         return None
     return problem.memory.after(h, state.q, q, state.memory)
+
+
+def balance(problem: SecondOrder, t, q: Array, v: Array) -> tuple[Array, Array, Held | None]:
+    """Mass matrix, force, and the equations that rates keep; None without any."""
+    if problem.held is None:
+        return *problem.equations(t, q, v), None
+    return problem.held.rates(t, q, v)
+
+
+def _guessed(problem: SecondOrder, a: Array) -> tuple[Array, Array | None]:
+    """An acceleration, and room for the motions that reactions make."""
+    if problem.held is None:
+        return a, None
+    return a, jnp.zeros((a.shape[0], problem.held.by.spare.shape[0]), a.dtype)
+
+
+def _corrected(
+    problem: SecondOrder, new: Array, matrix: Array, residual: Array, held: Held | None, rate
+) -> tuple[Array, Array | None]:
+    """An acceleration after a Newton pass, at which a rate keeps its equations, and the motions
+    that reactions make. `rate` is that rate, and its derivative by the acceleration."""
+    if held is None or problem.held is None:
+        return new - solve_symmetric(matrix, residual), None
+    value, slope = rate
+    left = Held(held.rows, (held.rows @ value - held.wanted) / slope)
+    found = solve_held(matrix, residual, left, problem.held.by)
+    return new - found.x, found.pulled
 
 
 class GeneralisedAlpha(AbstractStepper):
@@ -209,18 +273,22 @@ class GeneralisedAlpha(AbstractStepper):
         surge = v + h * (1 - gamma) * a
         inner = within(problem, (1 - af) * h, state)
 
-        def improve(_, new):
+        def improve(_, run):
+            new, _ = run
             middle_q = move(problem, q, (1 - af) * (leap + h * h * beta * new))
             middle_v = (1 - af) * (surge + h * gamma * new) + af * v
-            mass, force = inner.equations(t + (1 - af) * h, middle_q, middle_v)
+            mass, force, held = balance(inner, t + (1 - af) * h, middle_q, middle_v)
             implicit = gamma * h * inner.damping + beta * h**2 * inner.stiffness
             residual = mass @ ((1 - am) * new + am * a) - force
-            return new - solve_symmetric((1 - am) * mass + (1 - af) * implicit, residual)
+            matrix = (1 - am) * mass + (1 - af) * implicit
+            rate = middle_v, (1 - af) * gamma * h
+            return _corrected(inner, new, matrix, residual, held, rate)
 
-        new = jax.lax.fori_loop(0, self.passes, improve, a)
+        new, pulled = jax.lax.fori_loop(0, self.passes, improve, _guessed(problem, a))
         moved = move(problem, q, leap + h * h * beta * new)
         memory = remembered(problem, h, state, moved)
-        return Kinematic(moved, surge + h * gamma * new, new, memory=memory)
+        end = Kinematic(moved, surge + h * gamma * new, new, memory=memory, share=state.share)
+        return placed(problem, t + h, end, pulled)
 
 
 class ImplicitMidpoint(AbstractStepper):
@@ -237,17 +305,20 @@ class ImplicitMidpoint(AbstractStepper):
         q, v, a = state[:3]
         inner = within(problem, h / 2, state)
 
-        def improve(_, new):
+        def improve(_, run):
+            new, _ = run
             half = v + h / 2 * new
             middle = move(problem, q, h / 2 * half)
-            mass, force = inner.equations(t + h / 2, middle, half)
+            mass, force, held = balance(inner, t + h / 2, middle, half)
             implicit = mass + h / 2 * inner.damping + h**2 / 4 * inner.stiffness
-            return new - solve_symmetric(implicit, mass @ new - force)
+            residual = mass @ new - force
+            return _corrected(inner, new, implicit, residual, held, (half, h / 2))
 
-        new = jax.lax.fori_loop(0, self.passes, improve, a)
+        new, pulled = jax.lax.fori_loop(0, self.passes, improve, _guessed(problem, a))
         moved = move(problem, q, h * (v + h / 2 * new))
         memory = remembered(problem, h, state, moved)
-        return Kinematic(moved, v + h * new, new, memory=memory)
+        end = Kinematic(moved, v + h * new, new, memory=memory, share=state.share)
+        return placed(problem, t + h, end, pulled)
 
 
 class TripleJump(AbstractStepper):
@@ -288,14 +359,15 @@ class AbstractExplicit(AbstractStepper):
     tableau: eqx.AbstractClassVar[Tableau]
 
     def begin(self, problem, t, q, v):
-        return _still(problem, q, v)
+        return _still(problem, t, q, v)
 
     def step(self, problem, t, h, state):
         field, begun = vector_field(problem), (state.q, state.v, state.memory)
         q, v, memory = rolled_step(self.tableau, field, t, begun, h)
         if problem.retract is not None:
             q = problem.retract(q, jnp.zeros_like(v))  # back on the manifold
-        return Kinematic(q, v, state.a, memory=memory)
+        end = Kinematic(q, v, state.a, memory=memory, share=state.share)
+        return placed(problem, t + h, end)
 
 
 class RungeKutta4(AbstractExplicit):
@@ -322,19 +394,19 @@ def vector_field(problem: SecondOrder) -> Field:
     def field(t, y):
         q, v, memory = y
         rate = v if problem.rate is None else problem.rate(q, v)
-        mass, force = problem.equations(t, q, v)
         if problem.memory is None:
-            return rate, solve_symmetric(mass, force), None
-        force = force + problem.memory.force(q, memory)
-        return rate, solve_symmetric(mass, force), problem.memory.rate(q, memory)
+            return rate, acceleration(problem, t, q, v), None
+        force = problem.memory.force(q, memory)
+        return rate, acceleration(problem, t, q, v, force), problem.memory.rate(q, memory)
 
     return field
 
 
-def _still(problem: SecondOrder, q: Array, v: Array) -> Kinematic:
+def _still(problem: SecondOrder, t, q: Array, v: Array) -> Kinematic:
     """A state without acceleration."""
     memory = None if problem.memory is None else problem.memory.begin
-    return Kinematic(q, v, jnp.zeros_like(v), memory=memory)
+    still = Kinematic(q, v, jnp.zeros_like(v), memory=memory)
+    return placed(problem, t, still)
 
 
 def integrate(
@@ -357,7 +429,7 @@ def integrate(
     rows = rows_between(saves, every, judged)
     short, count = every // rows, saves * rows
     plan, pause = passes(count, saves * every, judged), max(1, count // 100)
-    idle = stepper.settles and count >= _WORTH_IDLING
+    idle = stepper.settles and count >= _WORTH_IDLING and problem.held is None
 
     def advance(run: Doubled, one_pass):
         number, part, first, length = one_pass
@@ -380,7 +452,7 @@ def integrate(
         # A run of steps of no length finds the first acceleration: equations written out a
         # second time before the loop would compile for almost as long as the loop.
         made = tuple(np.insert(column, 0, 0) for column in made)
-        begin = _still(problem, q, v)
+        begin = _still(problem, t, q, v)
     else:
         begin = stepper.begin(problem, t, q, v)
     _, states = jax.lax.scan(advance, Doubled.at(begin), made)

@@ -14,16 +14,23 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from sorojax.rod.dynamics.fields import RodState
-from sorojax.rod.dynamics.moving import spin_cross, swept, turned_pose
-from sorojax.rod.dynamics.points import Points, from_base, moment_of
-from sorojax.rod.dynamics.tree import AssemblyState, gather, part_columns, part_motion
-from sorojax.rod.model.assembly import index_of
+from sorojax.math.ode.held import Held
+from sorojax.rod.dynamics.moving import spin_cross, swept, turned_pose, turned_twists
+from sorojax.rod.dynamics.points import moment_of
+from sorojax.rod.dynamics.tree import (
+    AssemblyState,
+    Section,
+    bias_accelerations,
+    bias_rates,
+    gather,
+    in_own_frames,
+    part_columns,
+    sections,
+)
+from sorojax.rod.model.assembly import index_of, slices
 from sorojax.rod.model.closure import Closure, equations
-from sorojax.rod.model.link import LinkState
 
 
 class _End(NamedTuple):
@@ -31,16 +38,19 @@ class _End(NamedTuple):
 
     Attributes:
         rotation, position: Of the frame.
-        centre: Of the section or link frame [m].
         index: Of the part; None of the ground.
-        body: The section at which loads act; None of the ground.
+        directors, centre: Of the section or link frame [m].
+        jacobian: Its twist, world axes, per twist and coordinate of its part.
+        rows: Integrals from the base of a rod to the section [m]; None of a link.
     """
 
     rotation: Float[Array, "dim dim"]
     position: Float[Array, " dim"]
-    centre: Float[Array, " dim"]
     index: int | None
-    body: Points | LinkState | None
+    directors: Float[Array, "dim dim"]
+    centre: Float[Array, " dim"]
+    jacobian: Float[Array, "twist own"] | None = None
+    rows: Float[Array, "1 quad"] | None = None
 
 
 class _Pair(NamedTuple):
@@ -53,6 +63,15 @@ class _Pair(NamedTuple):
     position: Float[Array, " dim"]
 
 
+class Change(NamedTuple):
+    """How the violations change with time: themselves, their rates, and their second
+    derivatives where no coordinate accelerates."""
+
+    value: Float[Array, " equations"]
+    rate: Float[Array, " equations"]
+    bias: Float[Array, " equations"]
+
+
 def violations(moment: AssemblyState, t: Float[Array, ""]) -> Float[Array, " equations"]:
     """g(q, t) of all closures [rad], [m]: zero where the loops are closed."""
     group, pairs = moment.assembly.group, _pairs(moment, t)
@@ -61,16 +80,26 @@ def violations(moment: AssemblyState, t: Float[Array, ""]) -> Float[Array, " equ
     )
 
 
+def violations_and_drift(
+    moment: AssemblyState, t: Float[Array, ""]
+) -> tuple[Float[Array, " equations"], Float[Array, " equations"]]:
+    """g(q, t), and its rate by time alone, which driven ends have."""
+    if all(closure.motion is None for closure in moment.assembly.closures):
+        value = violations(moment, t)
+        return value, jnp.zeros_like(value)
+    return jax.jvp(lambda t: violations(moment, t), (t,), (jnp.ones_like(t),))
+
+
 def closure_force(
     moment: AssemblyState, t: Float[Array, ""], reactions: Float[Array, " equations"]
 ) -> Float[Array, " dof"]:
     """Generalised force G' lambda of the closures."""
-    loads: list[Any] = [None] * len(moment.frames)
+    loads: list[Array | None] = [None] * len(moment.frames)
     pairs = _pairs(moment, t)
     for pair, wrench in zip(pairs, _wrenches(moment, pairs, reactions), strict=True):
         for end, sign in ((pair.held, 1), (pair.holder, -1)):
             if end.index is not None:
-                load = _load(end, pair.held.position, sign * wrench)
+                load = _load(moment, end, pair.held.position, sign * wrench)
                 before = loads[end.index]
                 loads[end.index] = load if before is None else before + load
     return gather(moment, loads)
@@ -99,41 +128,187 @@ def closure_wrenches(
     return dict(zip(names, _wrenches(moment, pairs, reactions), strict=True))
 
 
+def closure_change(moment: AssemblyState, t: Float[Array, ""]) -> Change:
+    """The violations g, dg/dt = G v + g_t, and d^2 g/dt^2 - G dv/dt, by the second order in
+    time of the poses of both ends."""
+    biases, parts = _section_biases(moment), []
+    for pair in _pairs(moment, t):
+        rates = [_rates(moment, end, biases) for end in (pair.held, pair.holder)]
+        assert rates[0] is not None
+        later = _relative(pair, rates[0], rates[1], t)
+        parts.append(_second_order(moment, pair, t, later))
+    return Change(*(jnp.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def held(moment: AssemblyState, t: Float[Array, ""], pull: float = 0.0) -> Held:
+    """What the closures ask of accelerations: d^2 g/dt^2 = 0, or with a `pull` [1/s] what
+    brings back a violation as a critically damped spring does.
+
+    Reference:
+        Baumgarte, Comput. Methods Appl. Mech. Engrg. 1, 1972, for the pull.
+    """
+    change, rows = closure_change(moment, t), closure_jacobian(moment, t)
+    if pull == 0:
+        return Held(rows, -change.bias)
+    return Held(rows, -change.bias - 2 * pull * change.rate - pull**2 * change.value)
+
+
+def held_rates(
+    moment: AssemblyState, t: Float[Array, ""]
+) -> tuple[Float[Array, " equations"], Held]:
+    """The violations, and what the closures ask of rates: G v = - g_t."""
+    value, drift = violations_and_drift(moment, t)
+    return value, Held(closure_jacobian(moment, t), -drift)
+
+
+class _Rates(NamedTuple):
+    """How a frame moves, along world axes: spin and velocity, and their rates."""
+
+    spin: Float[Array, " rot"]
+    velocity: Float[Array, " dim"]
+    turning: Float[Array, " rot"]
+    acceleration: Float[Array, " dim"]
+
+
+def _rates(moment: AssemblyState, end: _End, biases: list) -> _Rates | None:
+    """Of a frame where no coordinate accelerates; None of the ground."""
+    if end.index is None or end.jacobian is None:
+        return None
+    group, frame = moment.assembly.group, moment.frames[end.index]
+    rot = group.rotation_dim
+    own = moment.v[slices(moment.assembly)[end.index].rod_v]
+    twist = end.jacobian @ jnp.concatenate([frame.twist, own])
+    start, along = biases[end.index]
+    bias = jnp.zeros_like(frame.twist) if start is None else start
+    if end.rows is not None:
+        bias = bias + jnp.concatenate([(end.rows @ rate)[0] for rate in along])
+    bias = turned_twists(frame.rotation, bias[:, None], rot)[:, 0]
+    if start is not None and end.rows is not None:
+        turning = turned_twists(frame.rotation, start[:, None], rot)[:rot, 0]
+        bias = bias.at[rot:].add(_cross(turning, end.centre - frame.position))
+    at_centre = _Rates(twist[:rot], twist[rot:], bias[:rot], bias[rot:])
+    return _on_arm(at_centre, end.position - end.centre)
+
+
+def _on_arm(rates: _Rates, arm: Float[Array, " dim"]) -> _Rates:
+    """Of a frame at the end of an arm on the same body."""
+    swept = _cross(rates.spin, arm)
+    fall = _cross(rates.turning, arm) + _cross(rates.spin, swept)
+    return rates._replace(
+        velocity=rates.velocity + swept, acceleration=rates.acceleration + fall
+    )
+
+
+def _section_biases(moment: AssemblyState) -> list:
+    """Of each part that a closure is on: the acceleration of its frame along its own axes, and
+    how those of its sections grow along it, where no coordinate accelerates."""
+    names = {n for c in moment.assembly.closures for n in (c.part, c.on) if n is not None}
+    among = {index_of(moment.assembly, name) for name in names}
+    along = in_own_frames(moment, bias_rates, among=among)
+    return list(zip(bias_accelerations(moment), along, strict=True))
+
+
+def _relative(pair: _Pair, held: _Rates, holder: _Rates | None, t: Array) -> Any:
+    """The violation of a closure after a short time, exact to the second order."""
+    rotation, position = pair.rotation, pair.position
+    turn, spin, turning = pair.holder.rotation.T, held.spin, held.turning
+    velocity, acceleration = held.velocity, held.acceleration
+    if holder is not None:
+        # seen from a frame that turns itself
+        apart = pair.held.position - pair.holder.position
+        velocity, acceleration = velocity - holder.velocity, acceleration - holder.acceleration
+        spin = spin - holder.spin
+        swept = _cross(holder.spin, apart)
+        acceleration = acceleration - _cross(holder.turning, apart)
+        acceleration = acceleration + _cross(holder.spin, swept - 2 * velocity)
+        velocity = velocity - swept
+        turning = turning - holder.turning
+        if spin.shape[0] == 3:
+            turning = turning - jnp.cross(holder.spin, spin)
+    rot = spin.shape[0]
+    both = jnp.stack([jnp.concatenate(x) for x in ((spin, velocity), (turning, acceleration))])
+    first, second = turned_twists(turn, both.T, rot).T
+    turned = _spun(first[:rot], rotation)
+    bent = _spun(second[:rot], rotation) + _spun(first[:rot], turned)
+
+    def later(x):
+        half = x**2 / 2
+        return rotation + x * turned + half * bent, position + x * first[rot:] + half * second[
+            rot:
+        ]
+
+    return later
+
+
+def _second_order(moment: AssemblyState, pair: _Pair, t: Array, later) -> Change:
+    group, closure = moment.assembly.group, pair.closure
+
+    def violation(x):
+        rotation, position = later(x)
+        if closure.motion is not None:
+            # `later` sees the joint frame as it stands at t
+            now, moved = (closure.motion(at).astype(moment.q.dtype) for at in (t, t + x))
+            turn = moved[:-1, :-1].T @ now[:-1, :-1]
+            position = turn @ position + moved[:-1, :-1].T @ (now[:-1, -1] - moved[:-1, -1])
+            rotation = turn @ rotation
+        return closure.joint.violation(group, rotation, position)
+
+    def rate(x):
+        return jax.jvp(violation, (x,), (jnp.ones_like(x),))
+
+    zero = jnp.zeros((), moment.q.dtype)
+    (value, first), (_, second) = jax.jvp(rate, (zero,), (jnp.ones_like(zero),))
+    return Change(value, first, second)
+
+
+def _cross(spin: Float[Array, " rot"], arm: Float[Array, " dim"]) -> Float[Array, " dim"]:
+    return spin_cross(spin[None], arm[None])[0]
+
+
+def _spun(spin: Float[Array, " rot"], axes: Float[Array, "dim dim"]) -> Array:
+    """spin x each column."""
+    return spin_cross(spin[None], axes.T).T
+
+
 def _pairs(moment: AssemblyState, t: Float[Array, ""]) -> list[_Pair]:
     """The ends of every closure."""
-    places: dict[int, Any] = {}
-    found = []
+    found, ends = [], iter(_ends(moment))
     for closure in moment.assembly.closures:
-        held = _end(moment, places, closure.part, closure.at, closure.frame)
-        holder = _end(moment, places, closure.on, closure.s, closure.offset)
+        held, holder = next(ends), next(ends)
         if closure.motion is not None:
-            moved = closure.motion(t).astype(moment.q.dtype)
-            holder = _beyond(holder, moved)
+            holder = _beyond(holder, closure.motion(t).astype(moment.q.dtype))
         turn = holder.rotation.T
         rotation, position = turned_pose(turn, held.rotation, held.position - holder.position)
         found.append(_Pair(closure, held, holder, rotation, position))
     return found
 
 
-def _end(
-    moment: AssemblyState, places: dict[int, Any], part: str | None, s: Array, pose: Any
-) -> _End:
-    dim, dtype = moment.assembly.group.space_dim, moment.q.dtype
-    if part is None:
-        origin = jnp.zeros(dim, dtype)
-        end = _End(jnp.asarray(np.eye(dim), dtype), origin, origin, None, None)
-    else:
-        index = index_of(moment.assembly, part)
-        if index not in places:
-            places[index] = part_motion(moment, index)
-        body = places[index]
-        if isinstance(body, RodState):
-            at = Points(body, from_base(body.rod, s[None].astype(dtype)))
-            end = _End(at.directors[0], at.position[0], at.position[0], index, at)
-        else:
-            base = body.base
-            end = _End(base.directors, base.position, base.position, index, body)
-    return end if pose is None else _beyond(end, pose.astype(dtype))
+def _ends(moment: AssemblyState) -> list[_End]:
+    """The frame that is held and the one that holds it, of every closure in turn."""
+    model, dtype = moment.assembly, moment.q.dtype
+    places = []
+    for closure, rows in zip(model.closures, moment.operators.ends, strict=True):
+        for part, own in zip((closure.part, closure.on), rows, strict=True):
+            places.append((None if part is None else index_of(model, part), own))
+    poses = [x for closure in model.closures for x in (closure.frame, closure.offset)]
+    found = []
+    for (index, rows), section, pose in zip(
+        places, sections(moment, places), poses, strict=True
+    ):
+        end = _in_world(moment, index, section)._replace(rows=rows)
+        found.append(end if pose is None else _beyond(end, pose.astype(dtype)))
+    return found
+
+
+def _in_world(moment: AssemblyState, index: int | None, section: Section) -> _End:
+    rotation, centre, angular, linear = section
+    if index is None:
+        return _End(rotation, centre, None, rotation, centre)
+    frame = moment.frames[index]
+    rotation, arm = turned_pose(frame.rotation, rotation, centre)
+    centre, jacobian = frame.position + arm, jnp.concatenate([angular, linear])
+    jacobian = turned_twists(frame.rotation, jacobian, moment.assembly.group.rotation_dim)
+    return _End(rotation, centre, index, rotation, centre, jacobian)
 
 
 def _beyond(end: _End, pose: Float[Array, "h h"]) -> _End:
@@ -149,9 +324,7 @@ def _wrenches(moment: AssemblyState, pairs: list[_Pair], reactions: Array) -> li
         _, pull = jax.vjp(_violation_after(moment, pair), _still(moment))
         (wrench,) = pull(reactions[at])
         rot = moment.assembly.group.rotation_dim
-        turned = pair.holder.rotation @ wrench[rot:]
-        spun = pair.holder.rotation @ wrench[:rot] if rot == 3 else wrench[:rot]
-        found.append(jnp.concatenate([spun, turned]))
+        found.append(turned_twists(pair.holder.rotation, wrench[:, None], rot)[:, 0])
     return found
 
 
@@ -170,7 +343,7 @@ def _violation_after(moment: AssemblyState, pair: _Pair):
     rot = group.rotation_dim
 
     def after(twist):
-        turned = pair.rotation + spin_cross(twist[None, :rot], pair.rotation.T).T
+        turned = pair.rotation + _spun(twist[:rot], pair.rotation)
         return pair.closure.joint.violation(group, turned, pair.position + twist[rot:])
 
     return after
@@ -178,33 +351,27 @@ def _violation_after(moment: AssemblyState, pair: _Pair):
 
 def _seen_from(rotation: Array, twists: Float[Array, "twist n"]) -> Float[Array, "twist n"]:
     """World twists along the axes of a frame."""
-    rot = twists.shape[0] - rotation.shape[0]
-    spins = rotation.T @ twists[:rot] if rot == 3 else twists[:rot]
-    return jnp.concatenate([spins, rotation.T @ twists[rot:]])
+    return turned_twists(rotation.T, twists, twists.shape[0] - rotation.shape[0])
 
 
-def _load(end: _End, point: Array, wrench: Float[Array, " twist"]) -> Float[Array, " own"]:
+def _load(
+    moment: AssemblyState, end: _End, point: Array, wrench: Float[Array, " twist"]
+) -> Float[Array, " own"]:
     """Generalised force, in the columns of its part, of a wrench about a point."""
+    assert end.jacobian is not None
     dim = point.shape[0]
-    force = wrench[-dim:]
     arm = (point - end.centre)[None]
-    moment = wrench[:-dim] + moment_of(arm, force[None])[0]
-    if isinstance(end.body, Points):
-        return end.body.generalised(force[None], moment[None])
-    assert end.body is not None
-    return jnp.concatenate([moment, force]) @ end.body.tip_jacobian
+    spin = wrench[:-dim] + moment_of(arm, wrench[None, -dim:])[0]
+    return jnp.concatenate([spin, wrench[-dim:]]) @ end.jacobian
 
 
 def _moved(
     end: _End, point: Array, columns: tuple[Float[Array, "own dof"], ...]
 ) -> Float[Array, "twist dof"]:
     """Twist of the body of an end at a point, world axes, per rate of the assembly."""
-    body = end.body
-    assert end.index is not None and body is not None
-    if isinstance(body, Points):
-        angular, linear = body.angular_jacobian[0], body.linear_jacobian[0]
-    else:
-        angular, linear = body.base.angular_jacobian, body.base.linear_jacobian
+    assert end.index is not None and end.jacobian is not None
+    dim = point.shape[0]
     arm = (point - end.centre)[None]
+    angular, linear = end.jacobian[:-dim], end.jacobian[-dim:]
     linear = linear + swept(angular[None], arm)[0]
     return jnp.concatenate([angular, linear]) @ columns[end.index]

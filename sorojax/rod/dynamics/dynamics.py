@@ -15,6 +15,8 @@ from jaxtyping import Array, Float
 from sorojax._types import Numbers, real
 from sorojax.math.compiled import batched, chunked_lanes, full_products, jit_public
 from sorojax.math.linalg.dense import solve_symmetric
+from sorojax.math.ode.held import accelerate
+from sorojax.rod.dynamics.closures import held
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.moving import mass_jacobian, mass_position
 from sorojax.rod.dynamics.points import moment_of
@@ -22,12 +24,14 @@ from sorojax.rod.dynamics.tree import AssemblyState, part_columns, part_motion
 from sorojax.rod.forces import loads
 from sorojax.rod.forces.forces import Gravity
 from sorojax.rod.model.assembly import increments, rate
+from sorojax.rod.model.closure import is_closed
 from sorojax.rod.model.link import LinkState
 from sorojax.rod.model.model import Model, inertia, motion, operators
 
 Coordinates = Float[Array, " coordinates"]
 Rates = Float[Array, " dof"]
 Forces = tuple[loads.Load, ...]
+PULL = 50.0  # 1/s, at which closures that a step has opened go back where nothing projects
 
 
 @jit_public
@@ -103,7 +107,8 @@ def forward_dynamics(
         t: Time [s].
 
     Returns:
-        Second derivatives of the coordinates, units of q per s^2.
+        Second derivatives of the coordinates, units of q per s^2; with closures those that
+        keep the loops closed, where (q, q') do.
 
     Raises:
         ValueError: If the shapes do not fit the model or each other.
@@ -131,26 +136,47 @@ def forward_dynamics(
 @chunked_lanes
 @full_products
 def acceleration(
-    model: Model, constants: Any, t: Float[Array, ""], q: Coordinates, v: Rates, forces: Forces
+    model: Model,
+    constants: Any,
+    t: Float[Array, ""],
+    q: Coordinates,
+    v: Rates,
+    forces: Forces,
+    pull: float = 0.0,
 ) -> Rates:
-    """`forward_dynamics` uncompiled, for loops that hold `operators(model)`."""
+    """`forward_dynamics` uncompiled, for loops that hold `operators(model)`; with a `pull`
+    [1/s] back on closures that have opened."""
     moment = motion(model, q, v, constants=constants)
     mass, coriolis = inertia(moment)
-    return solve_symmetric(mass, loads.total_force(forces, t, moment) - coriolis)
+    force = loads.total_force(forces, t, moment) - coriolis
+    if isinstance(moment, AssemblyState) and is_closed(model):
+        return accelerate(mass, force, held(moment, t, pull)).x
+    return solve_symmetric(mass, force)
 
 
 @jit_public
 def inverse_dynamics(
     model: Model, q: Coordinates, v: Rates, a: Rates, forces: Forces = (), *, t=0.0
 ) -> Rates:
-    """Generalised force that an actuator must add to reach the acceleration `a`."""
+    """Generalised force that an actuator must add to reach the acceleration `a`.
+
+    Where closures bear a part of it, the smallest one, in the metric of the inverse mass.
+    """
     moment = motion(model, q, v)
     mass, coriolis = inertia(moment)
-    return mass @ a + coriolis - loads.total_force(forces, real(t), moment)
+    force = mass @ a + coriolis - loads.total_force(forces, real(t), moment)
+    if isinstance(moment, AssemblyState) and is_closed(model):
+        still = held(moment, real(t))
+        still = still._replace(wanted=jnp.zeros_like(still.wanted))
+        return mass @ accelerate(mass, force, still).x
+    return force
 
 
 class VectorField(eqx.Module):
     """(t, (q, v), args) -> (dq/dt, dv/dt): the right-hand side that diffrax integrates.
+
+    Closures that open by the error of a step are pulled shut at the rate `pull` [1/s];
+    `rollout` projects instead, to round-off.
 
     The field is a pytree: `diffrax.ODETerm(vector_field(rod, forces))` is differentiable
     in the rod and its forces.
@@ -159,11 +185,12 @@ class VectorField(eqx.Module):
     model: Model
     constants: Any
     forces: Forces
+    pull: float = eqx.field(static=True, default=PULL)
 
     def __call__(self, t: Any, state: tuple[Array, Array], args: Any = None):
         q, v = state
         t = jnp.asarray(t, q.dtype)
-        a = acceleration(self.model, self.constants, t, q, v, self.forces)
+        a = acceleration(self.model, self.constants, t, q, v, self.forces, self.pull)
         return rate(self.model, q, v), a
 
 

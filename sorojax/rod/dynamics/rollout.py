@@ -12,10 +12,18 @@ from sorojax._display import displayed, number, outcome
 from sorojax._types import Numbers, real
 from sorojax.math.compiled import chunked_lanes, full_products, jit_trees
 from sorojax.math.ode.contact_midpoint import ContactMidpoint
+from sorojax.math.ode.held import singular
 from sorojax.math.ode.step_control import judged_status
 from sorojax.math.ode.steppers import AbstractStepper, GeneralisedAlpha, SecondOrder, integrate
 from sorojax.math.status import Status
 from sorojax.rod.contact.terms import any_contact, contacts_of
+from sorojax.rod.dynamics.closed import (
+    CLOSED,
+    held_terms,
+    reactions_along,
+    refuse_contact,
+    refuse_open,
+)
 from sorojax.rod.dynamics.dynamics import Forces
 from sorojax.rod.forces.loads import (
     damping_matrix,
@@ -26,20 +34,24 @@ from sorojax.rod.forces.loads import (
 )
 from sorojax.rod.forces.relaxation import memory_terms
 from sorojax.rod.model.assembly import is_flat, rate, retract
+from sorojax.rod.model.closure import is_closed
 from sorojax.rod.model.model import Model, inertia, motion, operators
 from sorojax.rod.statics.equilibrium import checked_status
 
 
 @displayed
 class Trajectory(eqx.Module):
-    """A motion sampled in time: time [s], coordinates and their rates, and what the branches
-    of a `Relaxation` remember, the coordinates at which they are free of force."""
+    """A motion sampled in time: time [s], coordinates and their rates; what the branches of a
+    `Relaxation` remember, the coordinates at which they are free of force; and the wrench
+    [N m], [N] of each closure on the part that it holds, world axes, the moment about the
+    origin of the frame that is held."""
 
     time: Float[Array, " time"]
     q: Float[Array, "time coordinates"]
     v: Float[Array, "time dof"]
     status: Status
     memory: Any = None  # Float[Array, "time branches dof"], None without branches
+    reactions: Any = None  # dict[str, Float[Array, "time twist"]], None without closures
 
     def _text(self) -> str:
         return (
@@ -70,9 +82,15 @@ def rollout(
     functions of time and motion; a rod in a loop with air and controllers is a block of a
     `systems.Network`.
 
+    Closures hold at the end of every step, in coordinates and rates: accelerations and
+    reactions solve M a = f + G' lambda with d^2 g/dt^2 = 0, and a projection takes out what the
+    step leaves. It runs at the start too, so rates that pull a loop open, or are not those of
+    a driven end, change by the least that closes it.
+
     Args:
         model: The rod or assembly.
-        q: Coordinates at `t`; curvature modes in [1/m].
+        q: Coordinates at `t`; curvature modes in [1/m]. `rod.close_loops` finds some that
+            keep the closures.
         v: Their rates, per second.
         forces: Generalised forces beside elasticity; none by default.
         step: Length of one step [s]; 1e-3 to 5e-3 suit soft fingers.
@@ -91,11 +109,13 @@ def rollout(
             `memory` of a trajectory to go on from; relaxed at `q` by default.
 
     Returns:
-        Times [s], coordinates, rates, how the run ended, and the memory of branches. Nothing is
-        raised where it fails: check `status`.
+        Times [s], coordinates, rates, how the run ended, the memory of branches and the
+        reactions of closures. Nothing is raised where it fails: check `status`, which is
+        `singular` where closures became dependent on the way.
 
     Raises:
-        ValueError: If `saves` is negative or `every` below 1, or `memory` has the wrong shape.
+        ValueError: If `saves` is negative or `every` below 1, `memory` has the wrong shape, `q`
+            does not keep the closures, or there is contact beside closures.
 
     Example:
         >>> finger = rod.rod(SE2(), rod.chebyshev(kappa_z=3), rod.circle(5 * mm), length=0.1,
@@ -107,7 +127,9 @@ def rollout(
 
     Reference:
         Chung and Hulbert, J. Appl. Mech. 60, 1993, for generalised-alpha; Hairer, Norsett and
-        Wanner, Solving Ordinary Differential Equations I, 1993, section II.4, for the check.
+        Wanner, Solving Ordinary Differential Equations I, 1993, section II.4, for the check;
+        Hairer, Lubich and Wanner, Geometric Numerical Integration, 2006, section IV.4, for
+        closures.
     """
     if saves < 0 or every < 1:
         raise ValueError(
@@ -116,6 +138,9 @@ def rollout(
         )
     if stepper is None:
         stepper = ContactMidpoint() if any_contact(forces) else GeneralisedAlpha()
+    if is_closed(model):
+        refuse_open("rollout", model, q, t)
+        refuse_contact("rollout", forces)
     label = "rollout" if progress else None
     return _rollout(
         model, q, v, forces, real(step), real(t), stepper, saves, every, label, check, memory
@@ -128,7 +153,7 @@ def _rollout(
     model, q, v, forces, step, t, stepper, saves, every, label, check, memory
 ) -> Trajectory:
     step, t, stepper = _like(q, (step, t, stepper))
-    problem = second_order(model, q, forces, memory)
+    problem = second_order(model, q, forces, memory, t)
     path, too_long = integrate(
         stepper, problem, q, v, t=t, h=step, saves=saves, every=every, label=label, judged=check
     )
@@ -139,7 +164,12 @@ def _rollout(
     time = t + step * every * jnp.arange(saves + 1, dtype=step.dtype)
     if check:
         status = checked_status(judged_status(status, too_long), model, path.q)
-    return Trajectory(time, path.q, path.v, status, path.memory)
+    reactions = None
+    if path.share is not None:
+        status = Status.where(singular(path.share), Status.singular, status)
+        reactions, off = reactions_along(model, problem, time, path)
+        status = Status.where(off > CLOSED, Status.unstable, status)
+    return Trajectory(time, path.q, path.v, status, path.memory, reactions)
 
 
 def _like(q, tree):
@@ -160,9 +190,11 @@ def second_order(
     q: Float[Array, " coordinates"],
     forces: Forces,
     memory: Float[Array, "branches dof"] | None = None,
+    t=0.0,
 ) -> SecondOrder:
-    """The equations of the model, with its stiffness at `q` and its damping, and its branches
-    with what they remember, relaxed at `q` by default."""
+    """The equations of the model, with its stiffness at `q` and its damping, its branches
+    with what they remember, relaxed at `q` by default, and its closures, which hold at `q` and
+    time `t` [s]."""
     constants = operators(model)
     branches = memory_terms(model, forces, constants, q, memory)
     forces = on_model(relaxed(forces), model)
@@ -179,6 +211,9 @@ def second_order(
     stiffness = tangent_stiffness(forces, motion(model, q, constants=constants))
     damping = damping_matrix(forces, model, constants)
     tree: Any = None if is_flat(model) else model
+    held = None
+    if is_closed(model):
+        held = held_terms(model, constants, forces, jnp.asarray(t, q.dtype), q)
     return SecondOrder(
         equations,
         stiffness,
@@ -187,4 +222,5 @@ def second_order(
         rate=tree and functools.partial(rate, tree),
         contact=contacts_of(model, forces, at, inertia),
         memory=branches,
+        held=held,
     )

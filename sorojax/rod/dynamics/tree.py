@@ -80,6 +80,8 @@ class AssemblyOperators(NamedTuple):
         batches: Those of equal rods, stacked.
         rows: Integrals from the base of the carrier to each mount [m].
         stiffness, damping: Linear elasticity of rods and joints, damping of joints.
+        ends: Integrals from the base of a rod to where each closure holds it, and to where
+            it carries that closure [m]; None of links and of the ground.
     """
 
     parts: tuple[Operators | LinkOperators, ...]
@@ -87,6 +89,7 @@ class AssemblyOperators(NamedTuple):
     rows: tuple[Float[Array, "1 quad"] | None, ...]
     stiffness: Float[Array, "dof dof"]
     damping: Float[Array, "dof dof"]
+    ends: tuple[tuple[Float[Array, "1 quad"] | None, ...], ...] = ()
 
 
 class Mount(NamedTuple):
@@ -158,12 +161,11 @@ def assembly_operators(assembly: Assembly) -> AssemblyOperators:
     dtype, total = dtype_of(assembly), num_dof(assembly)
     parts, rows = [], []
     stiffness, damping = jnp.zeros((total, total), dtype), jnp.zeros((total, total), dtype)
-    for part, on, at in zip(assembly.parts, parents(assembly), slices(assembly), strict=True):
+    for part, at in zip(assembly.parts, slices(assembly), strict=True):
         body = part.body
         own = operators(body) if isinstance(body, Rod) else link_operators(body, dtype)
         parts.append(own)
-        carrier = None if on is None else assembly.parts[on].body
-        rows.append(from_base(carrier, part.s[None]) if isinstance(carrier, Rod) else None)
+        rows.append(_rows(assembly, part.on, part.s))
         spring, damper = part.joint.matrices(assembly.group, dtype)
         stiffness = stiffness.at[at.joint_v, at.joint_v].set(spring)
         damping = damping.at[at.joint_v, at.joint_v].set(damper)
@@ -173,7 +175,17 @@ def assembly_operators(assembly: Assembly) -> AssemblyOperators:
         jax.tree.map(lambda *leaves: jnp.stack(leaves), *(parts[k] for k in members))
         for members in batches(assembly)
     )
-    return AssemblyOperators(tuple(parts), stacks, tuple(rows), stiffness, damping)
+    ends = tuple(
+        (_rows(assembly, c.part, c.at), _rows(assembly, c.on, c.s)) for c in assembly.closures
+    )
+    return AssemblyOperators(tuple(parts), stacks, tuple(rows), stiffness, damping, ends)
+
+
+def _rows(assembly: Assembly, part: str | None, s: Array) -> Float[Array, "1 quad"] | None:
+    """Weights that integrate a field from the base of a rod to `s` [m]; None of a link and of
+    the ground."""
+    body = None if part is None else assembly[part].body
+    return from_base(body, s[None]) if isinstance(body, Rod) else None
 
 
 def assembly_motion(
@@ -258,24 +270,28 @@ def part_motion(moment: AssemblyState, index: int) -> Any:
 Section = tuple[Array, Array, Array, Array]
 
 
-def _sections(moment: AssemblyState) -> list[Section]:
-    """Rotation, position and Jacobians (angular, linear) of what carries each part, in the
-    frame of the carrier and its columns; those on equal rods together."""
+def sections(
+    moment: AssemblyState, places: Sequence[tuple[int | None, Float[Array, "1 quad"] | None]]
+) -> list[Section]:
+    """Rotation, position and Jacobians (angular, linear) of sections of parts, in the frame
+    and the columns of the part: where `rows` integrate to, of a link its frame, and the ground
+    where the part is None; those of equal rods together."""
     group, dtype = moment.assembly.group, moment.q.dtype
     dim, rot, twist = group.space_dim, group.rotation_dim, group.algebra_dim
-    eye, on = jnp.asarray(np.eye(twist), dtype), parents(moment.assembly)
+    eye = jnp.asarray(np.eye(twist), dtype)
     ground = (jnp.asarray(np.eye(dim), dtype), jnp.zeros(dim, dtype), eye[:rot], eye[rot:])
-    found: list[Section] = [ground] * len(on)
-    weights = {k: rows for k, rows in enumerate(moment.operators.rows) if rows is not None}
+    found: list[Section] = [ground] * len(places)
+    on = [index for index, _ in places]
+    weights = {k: rows for k, (_, rows) in enumerate(places) if rows is not None}
     for members, stack in zip(batches(moment.assembly), moment.batches, strict=True):
         carried = [k for k in weights if on[k] in members]
         if not carried:
             continue
-        places = [members.index(on[k]) for k in carried]
+        taken = [members.index(on[k]) for k in carried]  # pyright: ignore[reportArgumentType]
         rows = jnp.stack([weights[k] for k in carried])
         # A slice is a view, a gather a loop.
-        in_row = places == list(range(places[0], places[0] + len(places)))
-        at = slice(places[0], places[0] + len(places)) if in_row else np.array(places)
+        in_row = taken == list(range(taken[0], taken[0] + len(taken)))
+        at = slice(taken[0], taken[0] + len(taken)) if in_row else np.array(taken)
         every = eqx.filter_vmap(_section)(_taken(stack, at), rows)
         for nth, k in enumerate(carried):
             rotation, centre, angular, linear = (field[nth] for field in every)
@@ -297,7 +313,8 @@ def _section(moment: RodState, rows: Float[Array, "1 quad"]) -> Section:
 def _carry(moment: AssemblyState) -> tuple[tuple[Mount, ...], tuple[Frame, ...]]:
     """The pass from the ground outwards: poses and twists."""
     assembly, mounts, frames = moment.assembly, [], []
-    places, carriers = slices(assembly), _sections(moment)
+    rows = zip(parents(assembly), moment.operators.rows, strict=True)
+    places, carriers = slices(assembly), sections(moment, list(rows))
     for index, on in enumerate(parents(assembly)):
         mount, position = _mount(moment, index, on, carriers[index])
         v = moment.v[places[index].joint_v]

@@ -51,7 +51,8 @@ class Assembly(eqx.Module):
         names: Names of the parts; a part comes after what carries it.
         parts: The parts.
         loops: Names of the closures.
-        closures: Joints that close loops, or hold parts to the ground; `close` adds them.
+        closures: Joints that close loops, or hold parts to the ground; `with_closures` adds
+            them.
     """
 
     group: Group
@@ -137,7 +138,7 @@ def serial(*rods: Rod, joint: AbstractJoint | None = None) -> Assembly:
     return Assembly(rods[0].group, names, (first, *others))
 
 
-def close(model: Rod | Assembly, **closures: Closure) -> Assembly:
+def with_closures(model: Rod | Assembly, **closures: Closure) -> Assembly:
     """The model with joints between points of its parts, or to the ground, beside those of its
     tree: rings, four-bars, parallel robots, rods held or driven at both ends.
 
@@ -157,7 +158,7 @@ def close(model: Rod | Assembly, **closures: Closure) -> Assembly:
     Example:
         >>> beam = rod.rod(SE2(), rod.chebyshev(kappa_z=4), rod.circle(5 * mm), length=0.1,
         ...                young_modulus=1e6, poisson_ratio=0.5, density=1000)
-        >>> held = rod.close(beam, tip=rod.Closure("rod", rod.Roller(),
+        >>> held = rod.with_closures(beam, tip=rod.Closure("rod", rod.Roller(),
         ...                                        offset=rod.tip_pose(beam, rod.rest(beam))))
         >>> rest = rod.equilibrium(held, (rod.Gravity(),))
         >>> print(f"{float(rest.reactions['tip'][2]) * 1e3:.1f} mN")
@@ -169,7 +170,9 @@ def close(model: Rod | Assembly, **closures: Closure) -> Assembly:
     if isinstance(model, Rod):
         model = Assembly(model.group, ("rod",), (Part(model),))
     if taken := set(closures).intersection(model.loops):
-        raise ValueError(f"close: there is a closure `{min(taken)}` already. Rename one.")
+        raise ValueError(
+            f"with_closures: there is a closure `{min(taken)}` already. Rename one."
+        )
     return Assembly(
         model.group,
         model.names,

@@ -1,7 +1,7 @@
 """Closures: joints that close a loop of an assembly, or hold a part of it to the ground."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import equinox as eqx
 import jax
@@ -51,6 +51,11 @@ class Closure(eqx.Module):
         _check.between("Closure", "at", self.at, 0, 1, "-", "0 is the base.", "[]")
 
 
+def is_closed(model: Any) -> "TypeGuard[Assembly]":
+    """Whether a rod or assembly has closures."""
+    return bool(getattr(model, "closures", ()))
+
+
 def num_held(joint: AbstractJoint, group: Group) -> int:
     """Motions that a joint holds: equations of a closure with it."""
     pose = jnp.eye(group.space_dim), jnp.zeros(group.space_dim)
@@ -69,7 +74,7 @@ def equations(model: "Assembly") -> tuple[slice, ...]:
 
 def check_closure(model: "Assembly", name: str) -> None:
     """Refuse a closure of unknown parts, or one that cannot hold them."""
-    where, closure = f"close: closure `{name}`", model.closures[model.loops.index(name)]
+    where, closure = f"with_closures: closure `{name}`", model.closures[model.loops.index(name)]
     for part in (closure.part, closure.on):
         if part is not None and part not in model.names:
             raise ValueError(

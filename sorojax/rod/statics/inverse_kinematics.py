@@ -59,9 +59,9 @@ def inverse_kinematics(
     leave freedom, the step in the null space of their Jacobian seeks the equilibrium under
     `forces`, so that the answer does not depend on the first guess. Closed loops are targets
     too, met where all targets are; the least energy of a parallel robot at a pose, also under
-    loads, is found faster by `equilibrium(close(model, goal=Closure(...)))`. Differentiable in
-    model, targets, obstacles, limits and forces by the optimality conditions at the answer,
-    unless the search was stopped before it converged.
+    loads, is found faster by `equilibrium(with_closures(model, goal=Closure(...)))`.
+    Differentiable in model, targets, obstacles, limits and forces by the optimality conditions
+    at the answer, unless the search was stopped before it converged.
 
     Args:
         model: The rod or assembly.

@@ -70,7 +70,7 @@ def mobility(
     Example:
         >>> link = rod.Link(0.1, 1e-4)
         >>> arm = rod.assembly(SE2(), a=rod.Part(link, rod.Revolute()))
-        >>> held = rod.close(arm, pin=rod.Closure("a", rod.Revolute()))
+        >>> held = rod.with_closures(arm, pin=rod.Closure("a", rod.Revolute()))
         >>> rod.mobility(held)
         Mobility: 1 freedoms, redundant: pin 2, regular pose
 

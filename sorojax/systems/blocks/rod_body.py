@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from sorojax._types import optional_real
 from sorojax.math.linalg.dense import solve_symmetric
+from sorojax.math.ode.held import accelerate
 from sorojax.math.status import Status
 from sorojax.rod import (
     AbstractForce,
@@ -31,10 +32,13 @@ from sorojax.rod import (
     tip_pose,
     total_force,
 )
+from sorojax.rod.dynamics.closures import held
+from sorojax.rod.dynamics.dynamics import PULL
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.forces.loads import Load, relaxed
 from sorojax.rod.forces.relaxation import begun, borne, branches_of, memory_rate
 from sorojax.rod.model.assembly import increments, index_of, rate
+from sorojax.rod.model.closure import is_closed
 from sorojax.rod.statics.equilibrium import checked_status
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output
 
@@ -153,7 +157,9 @@ class AssemblyBody(AbstractBlock):
     Ports of a part are named after it. A pressure map, `On("finger", map)`, opens
     `finger_pressure`, `finger_volume`, `finger_volume_rate` (at held pressure) and
     `finger_compliance`, all from one potential. A driven joint opens `wrist_effort`. Each
-    part has `finger_position`, of its tip or of the frame of a link.
+    part has `finger_position`, of its tip or of the frame of a link. Closures hold to the
+    tolerance of the run: what a step opens is pulled shut at 50 1/s. Ends are driven by a
+    `motion` in time of the closure.
 
     A part that is `carrying` something has the output `palm_pose`, a homogeneous matrix of its
     tip or of the frame of a link, and takes the input `palm_reaction`: the wrench about that
@@ -236,11 +242,15 @@ class AssemblyBody(AbstractBlock):
         pull, rates = _branches(self.assembly, self.forces, state, constants)
         forces = relaxed(self.acting(inputs))
         if pull is None:
-            a = acceleration(self.assembly, constants, t, q, v, forces)
+            a = acceleration(self.assembly, constants, t, q, v, forces, PULL)
         else:
             moment = motion(self.assembly, q, v, constants=constants)
             mass, coriolis = inertia(moment)
-            a = solve_symmetric(mass, total_force(forces, t, moment) - coriolis + pull)
+            force = total_force(forces, t, moment) - coriolis + pull
+            if is_closed(self.assembly):
+                a = accelerate(mass, force, held(moment, t, PULL)).x
+            else:
+                a = solve_symmetric(mass, force)
         return {"q": rate(self.assembly, q, v), "v": a} | rates
 
     def path_status(self, path):
