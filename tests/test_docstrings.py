@@ -27,8 +27,8 @@ VERBS = {
     "fem": "cauchy_stress continuation critical_loads eigenmodes problem simulate solve "
     "solve_path solve_volume von_mises_stress",
     "rod": "assembly branch_states bspline chebyshev circle equilibrium equilibrium_path "
-    "forward_dynamics forward_kinematics inverse_kinematics operators piecewise_constant rod "
-    "rollout tip_pose",
+    "forward_dynamics forward_kinematics inverse_kinematics joint_wrenches operators "
+    "piecewise_constant rod rollout tip_pose",
     "reduction": "identify pod_basis strain_along",
     "systems": "Network simulate simulate_batch simulate_sampled",
     "design": "calibrate drawing_to_loop layout minimise minimise_shape propagate_covariance",
