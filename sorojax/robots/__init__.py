@@ -1,7 +1,9 @@
 """Ready-made and printable bodies as parametric programs."""
 
 from sorojax._arguments import check_package as _check_package
+from sorojax.robots.arms import arm_mjcf
 from sorojax.robots.bellows import BellowsActuator, PneuNet, bellows_problem, pneunet_mesh
+from sorojax.robots.imported import BodyFrame, ImportedRobot, actuator_forces, mount
 from sorojax.robots.locomotion import (
     Crawler,
     Walker,
@@ -41,15 +43,19 @@ __all__ = [
     "Bellows",
     "BellowsActuator",
     "BendingActuator",
+    "BodyFrame",
     "Crawler",
     "Finger",
     "Hand",
+    "ImportedRobot",
     "Manipulator",
     "PlanarActuator",
     "PneuNet",
     "Port",
     "Supply",
     "Walker",
+    "actuator_forces",
+    "arm_mjcf",
     "bellows_problem",
     "bench",
     "contact_stepper",
@@ -60,6 +66,7 @@ __all__ = [
     "gait",
     "middle",
     "model",
+    "mount",
     "pair_angles",
     "pneunet_mesh",
     "pose_below",
