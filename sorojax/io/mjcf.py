@@ -127,7 +127,8 @@ def export_mjcf(
     if segments < 2:
         raise ValueError(f"{_WHERE}: `segments` is {segments}, need 2 or more. Take 10 to 30.")
     if isinstance(model, Rod):
-        forces = tuple(f if isinstance(f, Gravity) else PartForce("rod", f) for f in forces)
+        listed = loads.plain(forces, model.group)
+        forces = tuple(f if isinstance(f, Gravity) else PartForce("rod", f) for f in listed)
         model = Assembly(model.group, ("rod",), (Part(model),))
     writer = _Writer(model, forces, segments)
     text = writer.text()
@@ -286,7 +287,7 @@ class _Chain:
         starts, sizes = self.edges[:-1, None], np.diff(self.edges)[:, None]
         self._inner = starts + sizes * gauss_legendre(4)[0]
         self._rest = jax.tree.map(
-            np.asarray, _at_rest(rod, forces, np.append(self.edges, self._inner))
+            np.asarray, _at_rest(rod, forces, jnp.append(self.edges, self._inner))
         )
         poses = np.stack([_lifted(pose) for pose in self._rest.poses])
         self.frames, self.tip = poses[: count + 1], poses[count + 1]
@@ -297,7 +298,8 @@ class _Chain:
 
     def _along(self, values: Any, s: np.ndarray) -> np.ndarray:
         """What is known at the nodes, at `s`."""
-        return interpolation_rows(self.rod.quadrature, s) @ np.asarray(values, float).T
+        rows = np.asarray(interpolation_rows(self.rod.quadrature, s))
+        return rows @ np.asarray(values, float).T
 
     def _piece(self, k: int) -> tuple[float, np.ndarray, np.ndarray]:
         """Mass [kg], centre [m] and inertia about it [kg m^2], in the frame of the piece."""
@@ -391,7 +393,7 @@ class _Chain:
                 body, "geom", type="capsule", size=_row([radius]), fromto=_row([0, 0, 0, *end])
             )
         at = np.linalg.inv(on) @ self.tip
-        ET.SubElement(body, "site", name=f"{self.name}_tip", **_place(at))
+        ET.SubElement(body, "site", {"name": f"{self.name}_tip", **_place(at)})
 
     def _joints(self, j: int, body: ET.Element) -> None:
         """Slides, then hinges: those along axes that the hinges have not turned."""
@@ -446,7 +448,7 @@ def _twists(rows: Any) -> Float[np.ndarray, "6 n"]:
 
 
 def _body(on: ET.Element, name: str, at: Pose) -> ET.Element:
-    return ET.SubElement(on, "body", name=name, **_place(at))
+    return ET.SubElement(on, "body", {"name": name, **_place(at)})
 
 
 def _place(at: Pose) -> dict[str, str]:

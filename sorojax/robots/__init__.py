@@ -3,7 +3,13 @@
 from sorojax._arguments import check_package as _check_package
 from sorojax.robots.arms import arm_mjcf
 from sorojax.robots.bellows import BellowsActuator, PneuNet, bellows_problem, pneunet_mesh
-from sorojax.robots.imported import BodyFrame, ImportedRobot, actuator_forces, mount
+from sorojax.robots.imported import (
+    BodyFrame,
+    ImportedRobot,
+    actuator_forces,
+    computed_torque,
+    mount,
+)
 from sorojax.robots.locomotion import (
     Crawler,
     Walker,
@@ -34,6 +40,7 @@ from sorojax.robots.surroundings import (
     replay,
     rim,
     ring,
+    standing_ball,
     standing_cylinder,
     upside_down,
     with_contacts,
@@ -58,6 +65,7 @@ __all__ = [
     "arm_mjcf",
     "bellows_problem",
     "bench",
+    "computed_torque",
     "contact_stepper",
     "crawler_gait",
     "crawler_problem",
@@ -75,6 +83,7 @@ __all__ = [
     "rim",
     "ring",
     "rod_stepper",
+    "standing_ball",
     "standing_cylinder",
     "stepper",
     "unit_cell",

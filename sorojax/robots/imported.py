@@ -1,9 +1,11 @@
 """Robots read from a file: joints, limits, actuators, named frames, and soft parts on them."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -11,7 +13,16 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._display import displayed
 from sorojax._types import Numbers, real
-from sorojax.rod import Assembly, JointEffort, Part, slices
+from sorojax.rod import (
+    Assembly,
+    Gravity,
+    JointEffort,
+    Part,
+    inverse_dynamics,
+    num_coordinates,
+    num_dof,
+    slices,
+)
 from sorojax.sdf import Surface
 
 
@@ -101,7 +112,69 @@ def actuator_forces(robot: ImportedRobot, control: Numbers) -> tuple[JointEffort
     do = f"The actuators are {', '.join(robot.actuators) or 'none'}."
     _check.shape("actuator_forces", "control", control, (count,), do)
     efforts = robot.gears @ control + robot.preload
-    assembly = robot.assembly
+    return _on_joints(robot.assembly, efforts)
+
+
+def computed_torque(
+    robot: ImportedRobot,
+    plan: Callable[[Float[Array, ""]], Float[Array, " coordinates"]],
+    t: Float[Array, ""],
+    q: Float[Array, " coordinates"],
+    v: Float[Array, " dof"],
+    *,
+    frequency: Numbers = 20.0,
+) -> tuple[JointEffort, ...]:
+    """Efforts in the joints of a robot that take it along a plan.
+
+    Inverse dynamics of the robot alone, with its weight, dampers and springs, at the
+    acceleration of the plan and what the error needs to die out, critically damped. What the
+    robot carries acts as a disturbance.
+
+    Args:
+        robot: As `io.import_robot` reads it, without a free base.
+        plan: Coordinates [rad or m] as a function of time [s] that is two times
+            differentiable, e.g. `systems.Waypoints(..., smooth=True)`.
+        t: Time [s].
+        q: Coordinates of the robot, or of an assembly that begins with it.
+        v: Their rates.
+        frequency: Of the error, in radians per second.
+
+    Returns:
+        One `rod.JointEffort` for each part that moves.
+
+    Raises:
+        ValueError: If the robot has a free base.
+
+    Example:
+        >>> iiwa = sj.io.import_robot(robots.arm_mjcf("iiwa7"))
+        >>> torques = robots.computed_torque(iiwa, lambda t: iiwa.rest, 0.0, iiwa.rest + 0.1,
+        ...                                  jnp.zeros(7))
+        >>> a = rod.forward_dynamics(iiwa.assembly, iiwa.rest + 0.1, jnp.zeros(7),
+        ...                          (rod.Gravity(), *torques))
+        >>> a.round(6).tolist()[:2]  # -0.1 times the square of the frequency
+        [-40.0, -40.0]
+
+    Reference:
+        Siciliano et al., Robotics: Modelling, Planning and Control, 2009, section 8.5.2.
+    """
+    assembly, frequency, t = robot.assembly, real(frequency), real(t)
+    if num_coordinates(assembly) != num_dof(assembly):
+        raise ValueError(
+            "computed_torque: the robot has a free base, need one on the ground: no joint "
+            "drives a base. Weld it, or write a controller of your own."
+        )
+    here, speed = q[: num_dof(assembly)], v[: num_dof(assembly)]
+
+    def rate(of):
+        return lambda t: jax.jvp(of, (t,), (jnp.ones_like(t),))[1]
+
+    wanted = rate(rate(plan))(t) + 2 * frequency * (rate(plan)(t) - speed)
+    wanted = wanted + frequency**2 * (plan(t) - here)
+    efforts = inverse_dynamics(assembly, here, speed, wanted, (Gravity(robot.gravity),))
+    return _on_joints(assembly, efforts)
+
+
+def _on_joints(assembly: Assembly, efforts: Float[Array, " dof"]) -> tuple[JointEffort, ...]:
     return tuple(
         JointEffort(name, efforts[at.joint_v])
         for name, at in zip(assembly.names, slices(assembly), strict=True)

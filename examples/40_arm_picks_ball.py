@@ -1,0 +1,151 @@
+"""An arm of seven joints with a pneumatic finger picks a ball up and carries it away.
+
+The arm is a KUKA LBR iiwa 7 by public numbers, read from MJCF; on its flange stands a stem with
+a rubber finger of one chamber. A computed-torque controller at 250 Hz knows the arm alone and
+takes what hangs on it for a disturbance; the pressure curls the finger round a ball on a table.
+Nothing holds the ball but contact and friction. `python -m benchmarks robots.arm` takes the
+balance of forces and moments over every joint on the way.
+"""
+
+import sys
+import time
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import sorojax as sj
+from sorojax import robots, rod, systems
+from sorojax.math import ContactMidpoint
+from sorojax.units import kPa, mm
+
+BALL, MASS, TABLE, PERIOD = 20 * mm, 0.025, 350 * mm, 4e-3  # radius; kg; height; s of control
+LAW = sj.contact.LinePenalty(stiffness=2e6, smoothing=2e-5, friction=0.8, slip=1e-3)
+ALONG = jnp.array([[0, 0, 1.0, 0], [0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]])  # x along z
+# seconds, place of the base of the finger beside the ball [mm], pressure [kPa]
+WAY = np.array([
+    [0.0, -5, -100, 60, 0], [0.8, -5, -27, 0, 0], [0.9, -5, -27, 0, 0], [1.5, -5, -27, 0, 300],
+    [1.7, -5, -27, 0, 300], [2.4, -5, -27, 120, 300], [3.2, -105, 173, 120, 300],
+])  # fmt: skip
+
+
+def scene():
+    """Arm, arm with finger and ball, contacts, chamber; plans of joints and pressure."""
+    arm = sj.io.import_robot(robots.arm_mjcf("iiwa7"))
+    rubber = dict(young_modulus=0.8e6, poisson_ratio=0.49, density=1070)
+    basis = rod.chebyshev(kappa_x=2, kappa_y=3, kappa_z=6)
+    finger = rod.rod(sj.SE3(), basis, rod.rectangle(22 * mm, 9 * mm), length=140 * mm, **rubber)
+    stem, half = robots.cylinder(0.05, 9 * mm, 80 * mm), robots.pose_below(-40 * mm)
+    ball, table = robots.standing_ball(MASS, BALL, LAW, at=[0.65, 0.0, TABLE])
+    base = rod.Part(stem, on="flange", offset=half)
+    tool = rod.Part(finger, on="stem", offset=half @ ALONG)
+    whole = robots.mount(arm, stem=base, finger=tool, ball=ball)
+    grip = rod.LinkContact(sj.sdf.Sphere([0, 0, 0], BALL), 4.5 * mm, LAW, points=24)
+    contacts = rod.PairForce("finger", "ball", grip), rod.PartForce("ball", table)
+    chamber = rod.thread_chambers(finger, rod.Straight([-2.5 * mm, 0.0]), 70 * mm**2)
+    q, reach = rod.rest(whole).at[:7].set(jnp.array([0.0, 0.5, 0, -1.9, 0, -0.9, 0])), []
+    for place in WAY[:, 1:4] * mm:
+        base = rod.Pose(ball.offset.at[:3, 3].add(place), s=0.0, part="finger")
+        q = rod.inverse_kinematics(whole, base, q).q
+        reach.append(q[:7])
+    values = jnp.stack(reach), WAY[:, 4] * kPa
+    plan, push = (systems.Waypoints(WAY[:, 0], x, True) for x in values)
+    return arm, whole, contacts, chamber, plan, push
+
+
+def forces(setup, t, q, v):
+    """What acts in a period that begins at t: weight, pressure, contact, computed torque."""
+    arm, _, contacts, chamber, plan, push = setup
+    gas = rod.PartForce("finger", rod.Pressurised(chamber, push(t)))
+    torques = robots.computed_torque(arm, plan, t, q, v)
+    return rod.Gravity(), rod.Damping(0.02), gas, *contacts, *torques
+
+
+@eqx.filter_jit
+def run(setup, ticks):
+    """Coordinates and rates at the ticks of the controller."""
+
+    def period(state, t):
+        how = dict(
+            step=PERIOD / 2, every=2, stepper=ContactMidpoint(tolerance=1e-6), check=False
+        )
+        path = rod.rollout(setup[1], *state, forces(setup, t, *state), saves=1, t=t, **how)
+        return (path.q[-1], path.v[-1]), state
+
+    start = rod.rest(setup[1]).at[:7].set(setup[4](ticks[0]))
+    return jax.lax.scan(period, (start, jnp.zeros(rod.num_dof(setup[1]))), ticks)[1]
+
+
+def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, float]:
+    setup, ticks = scene(), PERIOD * jnp.arange(round((2.6 if quick else 3.4) / PERIOD))
+    run(setup, ticks)  # compiles
+    start = time.process_time()
+    q, v = jax.block_until_ready(run(setup, ticks))
+    cpu = time.process_time() - start
+    lifts = systems.contact_history(*setup[1:3], q, v, ["ball"]).effort[:, :, -1]
+    poses = jax.lax.map(lambda q: rod.tip_pose(setup[1], q), q)
+    held = (jnp.linalg.inv(poses["stem"]) @ poses["ball"])[ticks > 2, :3, 3]
+    if picture is not None:
+        draw(setup, ticks, q, lifts, picture)
+    return {
+        "lift [mm]": float(poses["ball"][:, 2, 3].max() - TABLE - BALL) / mm,
+        "finger on ball over weight": float(lifts[ticks > 2, 0].mean()) / (9.81 * MASS),
+        "moved in the grip [mm]": float(jnp.linalg.norm(held - held[0], axis=1).max()) / mm,
+        "simulated over computing time": float(ticks[-1]) / cpu,
+    }
+
+
+def draw(setup, ticks, q, lifts, file) -> None:
+    """Six moments; height, pressure, forces and joints over time."""
+    import dataclasses
+    import io
+
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    arm, whole, moments = setup[0], setup[1], (0.0, 0.85, 1.2, 1.6, 2.4, 3.3)
+    shapes = arm.shapes | {
+        "ball": sj.sdf.Sphere([0, 0, 0], BALL),
+        "stem": sj.sdf.Cylinder(9 * mm, 80 * mm),
+    }
+    pillar = sj.sdf.translate(sj.sdf.Cylinder(90 * mm, TABLE), [0.62, 0.03, TABLE / 2])
+    table = sj.view.scene_of(pillar).parts
+    figure = plt.figure(figsize=(12, 8), layout="constrained")
+    grid = figure.add_gridspec(3, 6, height_ratios=(1.25, 1.25, 1))
+    for place, t in enumerate(moments):
+        scene = sj.view.scene_of(whole, q[round(t / PERIOD)], shapes=shapes)
+        box = ([-0.15, -0.25, 0.0], [0.8, 0.3, 0.75])
+        scene = dataclasses.replace(scene, parts=scene.parts + table, extent=box)
+        shown = sj.view.show(scene, view=sj.view.Camera(-50.0, 22.0), renderer="own")
+        row, column = divmod(place, 3)
+        axes = figure.add_subplot(grid[row, 2 * column : 2 * column + 2])
+        axes.imshow(plt.imread(io.BytesIO(shown.png)))
+        axes.set_title(f"{t:g} s")
+        axes.set_axis_off()
+    panels = [figure.add_subplot(grid[2, k : k + 2]) for k in (0, 2, 4)]
+    ball = jax.lax.map(lambda q: rod.tip_pose(whole, q)["ball"], q)[:, 2, 3]
+    panels[0].plot(ticks, (ball - TABLE - BALL) / mm, label="height of the ball [mm]")
+    panels[0].plot(ticks, jax.vmap(setup[5])(ticks) / kPa, label="pressure [kPa]")
+    panels[1].plot(ticks, lifts[:, 0], label="finger lifts the ball [N]")
+    panels[1].plot(ticks, lifts[:, 1], label="table lifts it [N]")
+    panels[1].axhline(9.81 * MASS, color="0.6", lw=0.8)
+    panels[2].plot(ticks, np.degrees(q[:, :7]), label=[f"joint {k}" for k in range(1, 8)])
+    panels[2].set_ylabel("[deg]")
+    for panel in panels:
+        panel.set_xlabel("time [s]")
+        panel.legend(frameon=False, fontsize=8)
+    figure.savefig(Path(file), dpi=90)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    sj.enable_compilation_cache()
+    quick = "--quick" in sys.argv
+    file = None if quick else Path(__file__).with_suffix(".png")
+    for name, value in main(quick, file).items():
+        print(f"{name:<42} {value:.4g}")
