@@ -21,7 +21,7 @@ from sorojax import robots, rod, systems
 from sorojax.math import ContactMidpoint
 from sorojax.units import kPa, mm
 
-BALL, MASS, TABLE, PERIOD = 20 * mm, 0.025, 350 * mm, 4e-3  # radius; kg; height; s of control
+BALL, MASS, TABLE, PERIOD = 20 * mm, 0.025, 350 * mm, 4e-3  # radius; kg; height; step in s
 LAW = sj.contact.LinePenalty(stiffness=2e6, smoothing=2e-5, friction=0.8, slip=1e-3)
 ALONG = jnp.array([[0, 0, 1.0, 0], [0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]])  # x along z
 # seconds, place of the base of the finger beside the ball [mm], pressure [kPa]
@@ -68,9 +68,7 @@ def run(setup, ticks):
     """Coordinates and rates at the ticks of the controller."""
 
     def period(state, t):
-        how = dict(
-            step=PERIOD / 2, every=2, stepper=ContactMidpoint(tolerance=1e-6), check=False
-        )
+        how = dict(step=PERIOD, stepper=ContactMidpoint(tolerance=1e-6), check=False)
         path = rod.rollout(setup[1], *state, forces(setup, t, *state), saves=1, t=t, **how)
         return (path.q[-1], path.v[-1]), state
 

@@ -1,6 +1,7 @@
 """Every example runs and gives its number; the README's program is one of them."""
 
 import re
+from types import SimpleNamespace
 
 import diffrax as dfx
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import sorojax as sj
+from benchmarks.cases import robots_arm
 from tests.scripts import ROOT, main_of, user_code
 
 
@@ -146,3 +148,19 @@ def test_a_finger_and_its_controller_are_designed_together():
     for k, way in enumerate(1e-4 * jnp.eye(9)[:8]):
         seen = (total(x + way) - total(x - way)) / 2e-4
         assert float(slope[k]) == pytest.approx(float(seen), rel=1e-3, abs=1e-4)
+
+
+@pytest.mark.slow
+def test_an_arm_with_a_pneumatic_finger_picks_a_ball():
+    """In the air nothing but the finger holds the ball, and every joint is in balance."""
+    pytest.importorskip("mujoco", reason="the extra `robots` is not installed")
+    main = main_of("40_arm_picks_ball")
+    numbers = main(quick=True)
+    assert numbers["lift [mm]"] > 100
+    assert numbers["finger on ball over weight"] == pytest.approx(1, abs=0.1)
+    assert numbers["moved in the grip [mm]"] < 4
+    script = SimpleNamespace(**main.__globals__)
+    setup, ticks = script.scene(), script.PERIOD * jnp.arange(650)
+    q, v = script.run(setup, ticks)
+    assert robots_arm.unbalanced(script, setup, ticks, q, v) < 1e-8
+    assert user_code("40_arm_picks_ball") <= 60

@@ -118,7 +118,7 @@ def export_mjcf(
         >>> made = io.export_mjcf("finger.xml", finger, (rod.Gravity(), rod.Damping(0.01)))
         >>> fit = made.chains["rod"]
         >>> print(f"{fit.frequency:.2f} Hz, in the chain {fit.chain_frequency:.2f} Hz")
-        3.69 Hz, in the chain 3.69 Hz
+        3.68 Hz, in the chain 3.68 Hz
 
     Reference:
         The MuJoCo documentation, XML reference; midpoint rule for the cells.
