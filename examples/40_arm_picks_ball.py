@@ -10,6 +10,7 @@ balance of forces and moments over every joint on the way.
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -21,24 +22,25 @@ from sorojax import robots, rod, systems
 from sorojax.math import ContactMidpoint
 from sorojax.units import kPa, mm
 
-BALL, MASS, TABLE, PERIOD = 20 * mm, 0.025, 350 * mm, 4e-3  # radius; kg; height; step in s
+BALL, MASS, PERIOD, SPOT = 20 * mm, 0.025, 4e-3, np.array([0.65, 0.0, 0.35])  # m, kg, s, m
 LAW = sj.contact.LinePenalty(stiffness=2e6, smoothing=2e-5, friction=0.8, slip=1e-3)
 ALONG = jnp.array([[0, 0, 1.0, 0], [0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]])  # x along z
-# seconds, place of the base of the finger beside the ball [mm], pressure [kPa]
-WAY = np.array([
-    [0.0, -5, -100, 60, 0], [0.8, -5, -27, 0, 0], [0.9, -5, -27, 0, 0], [1.5, -5, -27, 0, 300],
-    [1.7, -5, -27, 0, 300], [2.4, -5, -27, 120, 300], [3.2, -105, 173, 120, 300],
-])  # fmt: skip
+# seconds, place of the base of the finger from where the ball stands [mm], pressure [kPa]
+WAY = np.array([[0.0, -5, -100, 80, 0], [0.8, -5, -27, 20, 0], [0.9, -5, -27, 20, 0],
+    [1.5, -5, -27, 20, 300], [1.7, -5, -27, 20, 300], [2.4, -5, -27, 140, 300],
+    [3.2, -105, 173, 140, 300]])  # fmt: skip
 
 
 def scene():
-    """Arm, arm with finger and ball, contacts, chamber; plans of joints and pressure."""
+    """Arm, arm with finger and ball, contacts, chamber, plan of joints and pressure."""
     arm = sj.io.import_robot(robots.arm_mjcf("iiwa7"))
-    rubber = dict(young_modulus=0.8e6, poisson_ratio=0.49, density=1070)
-    basis = rod.chebyshev(kappa_x=2, kappa_y=3, kappa_z=6)
-    finger = rod.rod(sj.SE3(), basis, rod.rectangle(22 * mm, 9 * mm), length=140 * mm, **rubber)
+    basis, rubber = (
+        rod.chebyshev(kappa_x=2, kappa_y=3, kappa_z=6),
+        rod.Elastic(0.8e6, 0.49, 1070),
+    )
+    finger = rod.rod(sj.SE3(), basis, rod.rectangle(22 * mm, 9 * mm), rubber, length=140 * mm)
     stem, half = robots.cylinder(0.05, 9 * mm, 80 * mm), robots.pose_below(-40 * mm)
-    ball, table = robots.standing_ball(MASS, BALL, LAW, at=[0.65, 0.0, TABLE])
+    ball, table = robots.standing_ball(MASS, BALL, LAW, at=SPOT)
     base = rod.Part(stem, on="flange", offset=half)
     tool = rod.Part(finger, on="stem", offset=half @ ALONG)
     whole = robots.mount(arm, stem=base, finger=tool, ball=ball)
@@ -47,19 +49,18 @@ def scene():
     chamber = rod.thread_chambers(finger, rod.Straight([-2.5 * mm, 0.0]), 70 * mm**2)
     q, reach = rod.rest(whole).at[:7].set(jnp.array([0.0, 0.5, 0, -1.9, 0, -0.9, 0])), []
     for place in WAY[:, 1:4] * mm:
-        base = rod.Pose(ball.offset.at[:3, 3].add(place), s=0.0, part="finger")
-        q = rod.inverse_kinematics(whole, base, q).q
+        goal = rod.Pose(jnp.eye(4).at[:3, 3].set(SPOT + place), s=0.0, part="finger")
+        q = rod.inverse_kinematics(whole, goal, q).q
         reach.append(q[:7])
-    values = jnp.stack(reach), WAY[:, 4] * kPa
-    plan, push = (systems.Waypoints(WAY[:, 0], x, True) for x in values)
-    return arm, whole, contacts, chamber, plan, push
+    plan = jnp.column_stack([jnp.stack(reach), WAY[:, 4] * kPa])
+    return arm, whole, contacts, chamber, systems.Waypoints(WAY[:, 0], plan, smooth=True)
 
 
 def forces(setup, t, q, v):
     """What acts in a period that begins at t: weight, pressure, contact, computed torque."""
-    arm, _, contacts, chamber, plan, push = setup
-    gas = rod.PartForce("finger", rod.Pressurised(chamber, push(t)))
-    torques = robots.computed_torque(arm, plan, t, q, v)
+    arm, _, contacts, chamber, plan = setup
+    gas = rod.PartForce("finger", rod.Pressurised(chamber, plan(t)[7]))
+    torques = robots.computed_torque(arm, lambda t: plan(t)[:7], t, q, v)
     return rod.Gravity(), rod.Damping(0.02), gas, *contacts, *torques
 
 
@@ -68,11 +69,12 @@ def run(setup, ticks):
     """Coordinates and rates at the ticks of the controller."""
 
     def period(state, t):
-        how = dict(step=PERIOD, stepper=ContactMidpoint(tolerance=1e-6), check=False)
-        path = rod.rollout(setup[1], *state, forces(setup, t, *state), saves=1, t=t, **how)
+        (q, v), grasp = state, ContactMidpoint(tolerance=1e-6)
+        acting, how = forces(setup, t, q, v), dict[str, Any](stepper=grasp, check=False)
+        path = rod.rollout(setup[1], q, v, acting, step=PERIOD, saves=1, t=t, **how)
         return (path.q[-1], path.v[-1]), state
 
-    start = rod.rest(setup[1]).at[:7].set(setup[4](ticks[0]))
+    start = rod.rest(setup[1]).at[:7].set(setup[4](ticks[0])[:7])
     return jax.lax.scan(period, (start, jnp.zeros(rod.num_dof(setup[1]))), ticks)[1]
 
 
@@ -82,15 +84,15 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     start = time.process_time()
     q, v = jax.block_until_ready(run(setup, ticks))
     cpu = time.process_time() - start
-    lifts = systems.contact_history(*setup[1:3], q, v, ["ball"]).effort[:, :, -1]
+    lifts = systems.contact_history(setup[1], setup[2], q, v, ["ball"]).effort[:, :, -1]
     poses = jax.lax.map(lambda q: rod.tip_pose(setup[1], q), q)
     held = (jnp.linalg.inv(poses["stem"]) @ poses["ball"])[ticks > 2, :3, 3]
     if picture is not None:
         draw(setup, ticks, q, lifts, picture)
     return {
-        "lift [mm]": float(poses["ball"][:, 2, 3].max() - TABLE - BALL) / mm,
+        "lift [mm]": float(poses["ball"][:, 2, 3].max() - SPOT[2] - BALL) / mm,
         "finger on ball over weight": float(lifts[ticks > 2, 0].mean()) / (9.81 * MASS),
-        "moved in the grip [mm]": float(jnp.linalg.norm(held - held[0], axis=1).max()) / mm,
+        "moved in the grip [mm]": float(jnp.linalg.norm(held - held[:1], axis=1).max()) / mm,
         "simulated over computing time": float(ticks[-1]) / cpu,
     }
 
@@ -110,7 +112,7 @@ def draw(setup, ticks, q, lifts, file) -> None:
         "ball": sj.sdf.Sphere([0, 0, 0], BALL),
         "stem": sj.sdf.Cylinder(9 * mm, 80 * mm),
     }
-    pillar = sj.sdf.translate(sj.sdf.Cylinder(90 * mm, TABLE), [0.62, 0.03, TABLE / 2])
+    pillar = sj.sdf.translate(sj.sdf.Cylinder(90 * mm, SPOT[2]), [0.62, 0.03, SPOT[2] / 2])
     table = sj.view.scene_of(pillar).parts
     figure = plt.figure(figsize=(12, 8), layout="constrained")
     grid = figure.add_gridspec(3, 6, height_ratios=(1.25, 1.25, 1))
@@ -126,8 +128,8 @@ def draw(setup, ticks, q, lifts, file) -> None:
         axes.set_axis_off()
     panels = [figure.add_subplot(grid[2, k : k + 2]) for k in (0, 2, 4)]
     ball = jax.lax.map(lambda q: rod.tip_pose(whole, q)["ball"], q)[:, 2, 3]
-    panels[0].plot(ticks, (ball - TABLE - BALL) / mm, label="height of the ball [mm]")
-    panels[0].plot(ticks, jax.vmap(setup[5])(ticks) / kPa, label="pressure [kPa]")
+    panels[0].plot(ticks, (ball - SPOT[2] - BALL) / mm, label="height of the ball [mm]")
+    panels[0].plot(ticks, jax.vmap(setup[4])(ticks)[:, 7] / kPa, label="pressure [kPa]")
     panels[1].plot(ticks, lifts[:, 0], label="finger lifts the ball [N]")
     panels[1].plot(ticks, lifts[:, 1], label="table lifts it [N]")
     panels[1].axhline(9.81 * MASS, color="0.6", lw=0.8)

@@ -129,16 +129,20 @@ def _compiled(source: str | os.PathLike, meshes: bool, root: Any) -> Any:
 
 
 def _drop_meshes(mujoco: Any, spec: Any) -> None:
-    kind = mujoco.mjtGeom.mjGEOM_MESH
-    for geom in [geom for geom in spec.geoms if geom.type == kind]:
-        if not geom.parent.explicitinertial and geom.parent.name != "world":
+    def drop(entry: Any) -> None:  # by itself until MuJoCo 3.3
+        entry.delete() if hasattr(entry, "delete") else spec.delete(entry)
+
+    for body in spec.bodies:
+        drawn = [geom for geom in body.geoms if geom.type == mujoco.mjtGeom.mjGEOM_MESH]
+        if drawn and not body.explicitinertial and body.name != "world":
             raise ValueError(
-                f"the body `{geom.parent.name}` has its mass from a mesh; read the meshes, or "
-                "give it an inertial"
+                f"the body `{body.name}` has its mass from a mesh; read the meshes, or give it "
+                "an inertial"
             )
-        spec.delete(geom)
+        for geom in drawn:
+            drop(geom)
     for mesh in list(spec.meshes):
-        spec.delete(mesh)
+        drop(mesh)
 
 
 class _Mass(NamedTuple):
