@@ -9,6 +9,7 @@ balance of forces and moments over every joint on the way.
 
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,7 @@ def scene():
     whole = robots.mount(arm, stem=base, finger=tool, ball=ball)
     grip = rod.LinkContact(sj.sdf.Sphere([0, 0, 0], BALL), 4.5 * mm, LAW, points=24)
     contacts = rod.PairForce("finger", "ball", grip), rod.PartForce("ball", table)
-    chamber = rod.thread_chambers(finger, rod.Straight([-2.5 * mm, 0.0]), 70 * mm**2)
+    chamber = rod.thread_chambers(finger, rod.Straight([-2.5 * mm, 0.0]), 140 * mm**2)
     q, reach = rod.rest(whole).at[:7].set(jnp.array([0.0, 0.5, 0, -1.9, 0, -0.9, 0])), []
     for place in WAY[:, 1:4] * mm:
         goal = rod.Pose(jnp.eye(4).at[:3, 3].set(SPOT + place), s=0.0, part="finger")
@@ -98,8 +99,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
 
 
 def draw(setup, ticks, q, lifts, file) -> None:
-    """Six moments; height, pressure, forces and joints over time."""
-    import dataclasses
+    """The arm at three moments, the tool at four; height, pressure, forces and joints."""
     import io
 
     import matplotlib
@@ -107,36 +107,53 @@ def draw(setup, ticks, q, lifts, file) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    arm, whole, moments = setup[0], setup[1], (0.0, 0.85, 1.2, 1.6, 2.4, 3.3)
-    shapes = arm.shapes | {
+    whole = setup[1]
+    shapes = setup[0].shapes | {
         "ball": sj.sdf.Sphere([0, 0, 0], BALL),
         "stem": sj.sdf.Cylinder(9 * mm, 80 * mm),
     }
-    pillar = sj.sdf.translate(sj.sdf.Cylinder(90 * mm, SPOT[2]), [0.62, 0.03, SPOT[2] / 2])
-    table = sj.view.scene_of(pillar).parts
-    figure = plt.figure(figsize=(12, 8), layout="constrained")
-    grid = figure.add_gridspec(3, 6, height_ratios=(1.25, 1.25, 1))
-    for place, t in enumerate(moments):
-        scene = sj.view.scene_of(whole, q[round(t / PERIOD)], shapes=shapes)
-        box = ([-0.15, -0.25, 0.0], [0.8, 0.3, 0.75])
-        scene = dataclasses.replace(scene, parts=scene.parts + table, extent=box)
-        shown = sj.view.show(scene, view=sj.view.Camera(-50.0, 22.0), renderer="own")
-        row, column = divmod(place, 3)
-        axes = figure.add_subplot(grid[row, 2 * column : 2 * column + 2])
-        axes.imshow(plt.imread(io.BytesIO(shown.png)))
-        axes.set_title(f"{t:g} s")
-        axes.set_axis_off()
-    panels = [figure.add_subplot(grid[2, k : k + 2]) for k in (0, 2, 4)]
+    pillar = sj.sdf.translate(sj.sdf.Cylinder(80 * mm, SPOT[2]), [0.63, 0.02, SPOT[2] / 2])
+    table = tuple(replace(part, colour="#b8b0a6") for part in sj.view.scene_of(pillar).parts)
+
+    def shown(t, box, camera):
+        *links, finger, ball = sj.view.scene_of(
+            whole, q[round(t / PERIOD)], shapes=shapes
+        ).parts
+        soft = replace(finger, colour="#e76f51"), replace(ball, colour="#2a9d8f")
+        scene = replace(sj.view.scene_of(pillar), parts=(*links, *soft, *table), extent=box)
+        picture = sj.view.show(scene, view=sj.view.Camera(*camera), renderer="own")
+        return plt.imread(io.BytesIO(picture.png))
+
+    figure = plt.figure(figsize=(12, 9), layout="constrained")
+    grid = figure.add_gridspec(3, 12, height_ratios=(1.3, 1.1, 1))
+    far, near = ([0.0, -0.2, 0.1], [0.7, 0.25, 0.7]), (SPOT - 0.05, SPOT + [0.15, 0.1, 0.15])
+    for row, (times, box, camera) in enumerate((
+        ((0.0, 1.6, 3.3), far, (-55.0, 18.0)), ((0.85, 1.2, 1.6, 2.2), near, (-50.0, 40.0)),
+    )):  # fmt: skip
+        wide = 12 // len(times)
+        for place, t in enumerate(times):
+            axes = figure.add_subplot(grid[row, wide * place : wide * (place + 1)])
+            image = shown(t, box, camera)
+            rows, columns = image.shape[:2]
+            axes.imshow(image[: int(0.9 * rows), int(0.12 * columns) : int(0.88 * columns)])
+            axes.set_title(f"{t:g} s")
+            axes.set_axis_off()
+    panels = [figure.add_subplot(grid[2, 4 * k : 4 * k + 4]) for k in range(3)]
     ball = jax.lax.map(lambda q: rod.tip_pose(whole, q)["ball"], q)[:, 2, 3]
     panels[0].plot(ticks, (ball - SPOT[2] - BALL) / mm, label="height of the ball [mm]")
     panels[0].plot(ticks, jax.vmap(setup[4])(ticks)[:, 7] / kPa, label="pressure [kPa]")
-    panels[1].plot(ticks, lifts[:, 0], label="finger lifts the ball [N]")
-    panels[1].plot(ticks, lifts[:, 1], label="table lifts it [N]")
+    panels[1].plot(ticks, lifts[:, 1], label="table lifts the ball [N]", lw=0.8)
+    panels[1].plot(ticks, lifts[:, 0], label="finger lifts it [N]", lw=0.8)
     panels[1].axhline(9.81 * MASS, color="0.6", lw=0.8)
-    panels[2].plot(ticks, np.degrees(q[:, :7]), label=[f"joint {k}" for k in range(1, 8)])
-    panels[2].set_ylabel("[deg]")
+    panels[1].set_ylim(-0.5, 1.5)
+    lines = panels[2].plot(ticks, np.degrees(q[:, :7]))
+    panels[2].legend(
+        lines, [f"joint {k} [deg]" for k in range(1, 8)], frameon=False, fontsize=7
+    )
+    panels[2].set_xlim(0, 5.5)
     for panel in panels:
         panel.set_xlabel("time [s]")
+    for panel in panels[:2]:
         panel.legend(frameon=False, fontsize=8)
     figure.savefig(Path(file), dpi=90)
     plt.close(figure)

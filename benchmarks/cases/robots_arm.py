@@ -106,14 +106,14 @@ def example():
 
 
 def unbalanced(script, setup, ticks, q, v) -> float:
-    """Worst moment [N m] or force [N] that a joint carries beyond what the parts behind it
-    need, over the largest of its kind, ten times a second while the ball is in the air."""
+    """Worst moment or force that a joint carries beyond what the parts behind it need, over the
+    largest of its kind in that joint, ten times a second while the ball is in the air."""
     up = slice(round(2.0 / script.PERIOD), None, 25)
     at = ticks[up], q[up], v[up]
     found, needed = eqx.filter_jit(_balance)(script, setup, at)
     off = np.abs(found - needed).reshape(*found.shape[:-1], 2, 3)
-    size = np.abs(needed).reshape(off.shape).max(axis=(0, 1, 3))
-    return float((off.max(axis=(0, 1, 3)) / size).max())
+    size = np.abs(needed).reshape(off.shape).max(axis=(0, 3))
+    return float((off.max(axis=(0, 3)) / size).max())
 
 
 def _balance(script, setup, at):
