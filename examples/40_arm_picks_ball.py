@@ -35,11 +35,10 @@ WAY = np.array([[0.0, -5, -100, 80, 0], [0.8, -5, -27, 20, 0], [0.9, -5, -27, 20
 def scene():
     """Arm, arm with finger and ball, contacts, chamber, plan of joints and pressure."""
     arm = sj.io.import_robot(robots.arm_mjcf("iiwa7"))
-    basis, rubber = (
-        rod.chebyshev(kappa_x=2, kappa_y=3, kappa_z=6),
-        rod.Elastic(0.8e6, 0.49, 1070),
-    )
-    finger = rod.rod(sj.SE3(), basis, rod.rectangle(22 * mm, 9 * mm), rubber, length=140 * mm)
+    basis = rod.chebyshev(kappa_x=2, kappa_y=3, kappa_z=6)
+    rubber = rod.Elastic(young_modulus=1.2e6, poisson_ratio=0.5, density=1070)
+    band = rod.rectangle(30 * mm, 9 * mm)
+    finger = rod.rod(sj.SE3(), basis, band, rubber, length=140 * mm, nodes=18)
     stem, half = robots.cylinder(0.05, 9 * mm, 80 * mm), robots.pose_below(-40 * mm)
     ball, table = robots.standing_ball(MASS, BALL, LAW, at=SPOT)
     base = rod.Part(stem, on="flange", offset=half)
