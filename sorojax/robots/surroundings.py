@@ -200,7 +200,7 @@ def standing_ball(
     height, turn = 1 - np.arange(1, 2 * count, 2) / count, _GOLDEN * np.arange(count)
     flat = np.sqrt(1 - height**2)
     points = radius * np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
-    lengths = np.full(count, 2 * radius * np.sqrt(np.pi / count))  # of a point's share of it
+    lengths = np.full(count, 2 * radius * np.sqrt(np.pi / count))  # squared, the share of each
     up = jnp.array([0.0, 0.0, 1.0])
     part = Part(
         Link(mass, jnp.full(3, 0.4 * mass * radius**2)),
