@@ -80,9 +80,8 @@ def lowest(model):
     """Lowest frequency [Hz] of the chain in MuJoCo, at rest."""
     data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
     mujoco.mj_forward(model, data)
-    mujoco.mj_fullM(model, data, mass) if hasattr(data, "M") else mujoco.mj_fullM(
-        model, mass, data.qM
-    )
+    for row, unit in zip(mass, np.eye(model.nv), strict=True):
+        mujoco.mj_mulM(model, data, row, unit)
     stiffness = np.zeros(model.nv)
     stiffness[model.jnt_dofadr] = model.jnt_stiffness
     values = scipy.linalg.eigh(np.diag(stiffness), mass, eigvals_only=True)

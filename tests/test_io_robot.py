@@ -130,10 +130,8 @@ class Pair:
 
     def mass(self):
         found = np.zeros((self.model.nv, self.model.nv))
-        if hasattr(self.data, "M"):
-            mujoco.mj_fullM(self.model, self.data, found)
-        else:
-            mujoco.mj_fullM(self.model, found, self.data.qM)
+        for row, unit in zip(found, np.eye(self.model.nv), strict=True):
+            mujoco.mj_mulM(self.model, self.data, row, unit)
         return found
 
     def jacobian(self, body):

@@ -11,6 +11,7 @@ import numpy as np
 
 from benchmarks.harness import Row, measure, missing, quick
 from sorojax import io, robots, rod
+from sorojax.io._mujoco import parser
 
 STATES = 20
 EXAMPLE = Path(__file__).parents[2] / "examples" / "40_arm_picks_ball.py"
@@ -27,8 +28,8 @@ def rows():
 
 def beside_mujoco(name):
     try:
-        import mujoco
-    except ImportError as reason:
+        mujoco = parser("benchmarks")
+    except ModuleNotFoundError as reason:
         yield missing("mujoco", str(reason), arm=name)
         return
     text = robots.arm_mjcf(name)
@@ -51,7 +52,8 @@ def beside_mujoco(name):
         data.qpos[:], data.qvel[:] = draw.uniform(-2.5, 2.5, dof), draw.normal(size=dof)
         mujoco.mj_forward(theirs, data)
         mass, spin, move = np.zeros((dof, dof)), np.zeros((3, dof)), np.zeros((3, dof))
-        mujoco.mj_fullM(theirs, data, mass)
+        for row, unit in zip(mass, np.eye(dof), strict=True):
+            mujoco.mj_mulM(theirs, data, row, unit)
         jacobians = []
         for part in arm.joints.values():
             mujoco.mj_jacBody(theirs, data, move, spin, theirs.body(part).id)
