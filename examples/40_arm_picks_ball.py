@@ -69,7 +69,7 @@ def run(setup, ticks):
     """Coordinates and rates at the ticks of the controller."""
 
     def period(state, t):
-        (q, v), grasp = state, ContactMidpoint(tolerance=1e-6)
+        (q, v), grasp = state, ContactMidpoint(theta=1.0, tolerance=1e-6)
         acting, how = forces(setup, t, q, v), dict[str, Any](stepper=grasp, check=False)
         path = rod.rollout(setup[1], q, v, acting, step=PERIOD, saves=1, t=t, **how)
         return (path.q[-1], path.v[-1]), state
