@@ -1,7 +1,6 @@
 """Every example runs and gives its number; the README's program is one of them."""
 
 import re
-from types import SimpleNamespace
 
 import diffrax as dfx
 import jax
@@ -159,8 +158,8 @@ def test_an_arm_with_a_pneumatic_finger_picks_a_ball():
     assert numbers["lift [mm]"] > 100
     assert numbers["finger on ball over weight"] == pytest.approx(1, abs=0.1)
     assert numbers["moved in the grip [mm]"] < 4
-    script = SimpleNamespace(**main.__globals__)
-    setup, ticks = script.scene(), script.PERIOD * jnp.arange(650)
-    q, v = script.run(setup, ticks)
-    assert robots_arm.unbalanced(script, setup, ticks, q, v) < 1e-8
+    script = main.__globals__
+    setup, ticks = script["scene"](), jnp.array(script["PERIOD"] * np.arange(650))
+    q, v = script["run"](setup, ticks)
+    assert robots_arm.unbalanced(script["forces"], setup, ticks, q, v) < 1e-8
     assert user_code("40_arm_picks_ball") <= 60
