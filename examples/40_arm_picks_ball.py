@@ -79,10 +79,7 @@ def run(setup, ticks):
 
 
 def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, float]:
-    setup, ticks = (
-        scene(),
-        jnp.array(PERIOD * np.arange(round((2.6 if quick else 3.4) / PERIOD))),
-    )
+    setup, ticks = scene(), jnp.array(np.arange(0.0, 2.6 if quick else 3.4, PERIOD))
     run(setup, ticks)  # compiles
     start = time.process_time()
     q, v = jax.block_until_ready(run(setup, ticks))
