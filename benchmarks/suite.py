@@ -16,7 +16,7 @@ class Cases(NamedTuple):
 ROWS = {
     "rod statics": Cases(("rod.statics",), ("rod.accuracy", "rod.closed", "rod.frequencies")),
     "rod dynamics": Cases(
-        ("rod.acceleration", "rod.simulation", "rod.continuum"),
+        ("rod.acceleration", "rod.simulation", "rod.continuum", "robots.arm"),
         (
             "rod.assembly",
             "rod.contact",

@@ -41,7 +41,15 @@ CALLBACKS_AND_OPTIONS = {
     "Primitive",
     "set_xla_metadata",
 }
-ONLY_WHERE_USED = {"cv2", "pyvista", "skimage", "meshio", "matplotlib", "pyrealsense2"}
+ONLY_WHERE_USED = {
+    "cv2",
+    "pyvista",
+    "skimage",
+    "meshio",
+    "matplotlib",
+    "mujoco",
+    "pyrealsense2",
+}
 MAX_LINES = 600
 LONGER: set[str] = set()  # files of numbers and nothing else
 

@@ -28,14 +28,14 @@ VERBS = {
     "problem reaction_history reactions rod_forces simulate solve solve_path solve_volume "
     "von_mises_stress",
     "rod": "assembly branch_states bspline chebyshev circle close_loops equilibrium "
-    "equilibrium_path forward_dynamics forward_kinematics inverse_kinematics mobility "
-    "operators piecewise_constant rod rollout tip_pose with_closures",
+    "equilibrium_path forward_dynamics forward_kinematics inverse_kinematics joint_wrenches "
+    "mobility operators piecewise_constant rod rollout tip_pose with_closures",
     "coupling": "mounted_rod",
     "reduction": "identify pod_basis strain_along",
     "systems": "Network simulate simulate_batch simulate_sampled",
     "design": "calibrate drawing_to_loop layout minimise minimise_shape propagate_covariance",
-    "robots": "bellows_problem stepper",
-    "io": "export_mesh import_surface load save",
+    "robots": "actuator_forces arm_mjcf bellows_problem computed_torque mount stepper",
+    "io": "export_mesh export_mjcf import_robot import_surface load save",
     "view": "png show",
     "vision": "calibrate",
     "sweep": "sweep",

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import sorojax as sj
+from benchmarks.cases import robots_arm
 from tests.scripts import ROOT, main_of, user_code
 
 
@@ -163,3 +164,19 @@ def test_a_rod_in_free_flight_keeps_its_momentum():
     assert numbers["momentum lost in free flight"] < 1e-7
     assert numbers["impulse over momentum"] == pytest.approx(1, rel=1e-6)
     assert user_code("43_flying_spaghetti") <= 60
+
+
+@pytest.mark.slow
+def test_an_arm_with_a_pneumatic_finger_picks_a_ball():
+    """In the air nothing but the finger holds the ball, and every joint is in balance."""
+    pytest.importorskip("mujoco", reason="the extra `robots` is not installed")
+    main = main_of("40_arm_picks_ball")
+    numbers = main(quick=True)
+    assert numbers["lift [mm]"] > 100
+    assert numbers["finger on ball over weight"] == pytest.approx(1, abs=0.1)
+    assert numbers["moved in the grip [mm]"] < 4
+    script = main.__globals__
+    setup, ticks = script["scene"](), jnp.array(script["PERIOD"] * np.arange(650))
+    q, v = script["run"](setup, ticks)
+    assert robots_arm.unbalanced(script["forces"], setup, ticks, q, v) < 1e-8
+    assert user_code("40_arm_picks_ball") <= 60

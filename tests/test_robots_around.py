@@ -31,6 +31,23 @@ def test_a_ring_hangs_and_closes_inwards():
             robots.ring(finger, *wrong)
 
 
+def test_a_ball_stands_on_points_that_are_spread_over_it():
+    law = LinePenalty(1e6, 1e-5)
+    part, floor = robots.standing_ball(0.2, 0.03, law, at=[0.1, 0.2, 0.3])
+    assert np.allclose(part.offset[:3, 3], [0.1, 0.2, 0.33]) and float(part.body.mass) == 0.2
+    assert np.allclose(part.body.inertia, 0.4 * 0.2 * 0.03**2)
+    points = np.asarray(floor.points)
+    assert np.allclose(np.linalg.norm(points, axis=1), 0.03)
+    assert np.abs(points.mean(axis=0)).max() < 0.02 * 0.03  # as many on all sides
+    spread = points.T @ points / len(points)
+    assert np.allclose(spread, 0.03**2 / 3 * np.eye(3), atol=0.02 * 0.03**2)
+    share = np.sum(np.asarray(floor.lengths) ** 2)
+    assert share == pytest.approx(4 * np.pi * 0.03**2)  # what the points stand for
+    assert float(floor.obstacle(jnp.array([0.0, 0.0, 0.35]))) == pytest.approx(0.05)
+    with pytest.raises(ValueError, match="standing_ball: `at`"):
+        robots.standing_ball(0.2, 0.03, law, at=[0.1, 0.2])
+
+
 def test_a_cylinder_has_its_inertia_and_its_rim():
     link = robots.cylinder(0.3, 0.02, 0.05)
     rng = np.random.default_rng(0)

@@ -1,7 +1,15 @@
 """Ready-made and printable bodies as parametric programs."""
 
 from sorojax._arguments import check_package as _check_package
+from sorojax.robots.arms import arm_mjcf
 from sorojax.robots.bellows import BellowsActuator, PneuNet, bellows_problem, pneunet_mesh
+from sorojax.robots.imported import (
+    BodyFrame,
+    ImportedRobot,
+    actuator_forces,
+    computed_torque,
+    mount,
+)
 from sorojax.robots.locomotion import (
     Crawler,
     Walker,
@@ -32,6 +40,7 @@ from sorojax.robots.surroundings import (
     replay,
     rim,
     ring,
+    standing_ball,
     standing_cylinder,
     upside_down,
     with_contacts,
@@ -41,17 +50,22 @@ __all__ = [
     "Bellows",
     "BellowsActuator",
     "BendingActuator",
+    "BodyFrame",
     "Crawler",
     "Finger",
     "Hand",
+    "ImportedRobot",
     "Manipulator",
     "PlanarActuator",
     "PneuNet",
     "Port",
     "Supply",
     "Walker",
+    "actuator_forces",
+    "arm_mjcf",
     "bellows_problem",
     "bench",
+    "computed_torque",
     "contact_stepper",
     "crawler_gait",
     "crawler_problem",
@@ -60,6 +74,7 @@ __all__ = [
     "gait",
     "middle",
     "model",
+    "mount",
     "pair_angles",
     "pneunet_mesh",
     "pose_below",
@@ -68,6 +83,7 @@ __all__ = [
     "rim",
     "ring",
     "rod_stepper",
+    "standing_ball",
     "standing_cylinder",
     "stepper",
     "unit_cell",

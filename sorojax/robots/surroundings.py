@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._edit import replace
 from sorojax._jax.jit import once
-from sorojax._types import real
+from sorojax._types import Numbers, real
 from sorojax.contact import LinePenalty
 from sorojax.math.compiled import Split, kernel
 from sorojax.math.lie import homogeneous
@@ -178,6 +178,39 @@ def standing_cylinder(
     floor = HalfSpace([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     points, lengths = rim(radius, -height / 2)
     return part, LinkObstacle(obstacle=floor, points=points, lengths=lengths, law=law)
+
+
+def standing_ball(
+    mass: float, radius: float, law: LinePenalty, *, at: Numbers = (0.0, 0.0, 0.0)
+) -> tuple[Part, LinkObstacle]:
+    """A free ball that stands on a level floor, and its contact with it.
+
+    The contact is that of 120 points spread over the ball: it rolls over their edges, and
+    stops by itself.
+
+    Args:
+        mass: [kg].
+        radius: [m].
+        law: Between the points and the floor.
+        at: Where it stands on the floor [m].
+    """
+    spot = real(at)
+    _check.shape("standing_ball", "at", spot, (3,), "Give x, y and the height of the floor.")
+    count = 120
+    height, turn = 1 - np.arange(1, 2 * count, 2) / count, _GOLDEN * np.arange(count)
+    flat = np.sqrt(1 - height**2)
+    points = radius * np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
+    lengths = np.full(count, 2 * radius * np.sqrt(np.pi / count))  # squared, the share of each
+    up = jnp.array([0.0, 0.0, 1.0])
+    part = Part(
+        Link(mass, jnp.full(3, 0.4 * mass * radius**2)),
+        Free(),
+        offset=homogeneous(jnp.eye(3, dtype=spot.dtype), spot + radius * up),
+    )
+    return part, LinkObstacle(HalfSpace(spot, up), points, lengths, law)
+
+
+_GOLDEN = np.pi * (3 - np.sqrt(5))  # [rad] from point to point of an even spiral
 
 
 def middle(

@@ -23,6 +23,7 @@ from sorojax.rod.dynamics.dynamics import (
     kinetic_energy,
     mass_matrix,
     momentum,
+    part_momenta,
     potential_energy,
     stiffness_matrix,
     vector_field,
@@ -39,6 +40,7 @@ from sorojax.rod.dynamics.kinematics import (
 from sorojax.rod.dynamics.points import points
 from sorojax.rod.dynamics.rollout import rollout, second_order
 from sorojax.rod.dynamics.tree import AssemblyState, part_motion
+from sorojax.rod.dynamics.wrenches import joint_wrenches
 from sorojax.rod.forces.forces import (
     AbstractChamber,
     AbstractDamping,
@@ -256,6 +258,7 @@ __all__ = [
     "inverse_kinematics",
     "jacobian",
     "jacobian_rate_product",
+    "joint_wrenches",
     "kinetic_energy",
     "legendre",
     "mass_matrix",
@@ -266,6 +269,7 @@ __all__ = [
     "num_dof",
     "operators",
     "orthonormalise",
+    "part_momenta",
     "part_motion",
     "penetration",
     "piecewise",

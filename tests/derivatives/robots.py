@@ -13,12 +13,13 @@ NONE = {
         "bellows_problem crawler_problem walker_problem pneunet_mesh"
     ),
     "robots put together on the host, from cells solved there: slopes are those of systems": (
-        "model unit_cell with_pneumatics with_contacts standing_cylinder rim"
+        "model unit_cell with_pneumatics with_contacts standing_ball standing_cylinder rim"
     ),
     "what a board drives, step by step on the host": (
         "bench stepper rod_stepper contact_stepper"
     ),
     "records as arrays of the host": "replay gait",
+    "a text of given numbers": "arm_mjcf",
     "given materials": "printed_rubber crawler_rubbers walker_rubber",
 }
 
@@ -56,7 +57,38 @@ def pressures(numbers):
     return [port(t) for port in robots.crawler_gait(*numbers).values() for t in TIMES]
 
 
+def driven(at):
+    """An arm of two joints with a link on its tool, under its actuators and on a plan."""
+    stiffness, gears, offset, control, q, v = at
+    hinge = rod.Revolute([0.0, 1.0, 0.0], stiffness=stiffness, armature=0.01)
+    link = rod.Link(0.5, [1e-3, 2e-3, 3e-3], [0.1, 0.0, 0.02])
+    wide = jnp.array([[-jnp.inf, jnp.inf]] * 2)
+    arm = robots.ImportedRobot(
+        rod.assembly(sj.SE3(), a=rod.Part(link, hinge), b=rod.Part(link, hinge, on="a")),
+        joints={"first": "a", "second": "b"}, limits=wide, effort_limits=wide,
+        actuators=("motor", "servo"), gears=gears, preload=jnp.array([0.1, 0.2]),
+        control_range=wide, rest=jnp.zeros(2), keyframes={}, gravity=jnp.array([0, 0, -9.81]),
+        frames={"tool": robots.BodyFrame("b", np.eye(4))}, shapes={}, unmapped=(),
+    )  # fmt: skip
+    whole = robots.mount(arm, tip=rod.Part(link, on="tool", offset=offset))
+    forces = robots.actuator_forces(arm, control)
+    forces += robots.computed_torque(arm, lambda t: control * jnp.sin(t), 0.4, q, v)
+    return rod.forward_dynamics(whole, q, v, forces)
+
+
 CASES = {
+    "actuator_forces, computed_torque, mount": Case(
+        driven,
+        (
+            jnp.asarray(2.0),
+            jnp.array([[3.0, 0.1], [0.0, 2.0]]),
+            jnp.eye(4).at[:3, 3].set(jnp.array([0.1, 0.0, 0.05])),
+            jnp.array([0.3, -0.2]),
+            jnp.array([0.4, 0.7]),
+            jnp.array([1.0, -0.5]),
+        ),
+        rtol=1e-6,
+    ),
     "pose_below": Case(robots.pose_below, 0.3),
     "upside_down": Case(robots.upside_down, 0.3),
     "cylinder": Case(lambda at: robots.cylinder(*at), (0.3, 0.02, 0.05)),

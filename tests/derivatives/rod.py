@@ -112,6 +112,13 @@ def dynamics(at):
 DYNAMICS = "forward_dynamics, inverse_dynamics, vector_field, acceleration, second_order"
 WRENCH = jnp.array([0.003, -0.001, 0.002, 0.1, 0.2, -0.3])
 
+
+def carried(at):
+    model, q, v, a, wrench = at
+    forces = (R.Gravity(DOWN), R.PartForce("finger", R.TipWrench(wrench)))
+    return R.joint_wrenches(model, q, v, a, forces), R.part_momenta(model, q, v)
+
+
 # Forces, each by itself
 
 ROUTES = (
@@ -459,6 +466,9 @@ CASES = (
             lambda model: R.close_loops(model, jnp.array([0.5, -1.0])).q, TRIANGLE, rtol=1e-6
         ),
         "tip_angle": Case(lambda q: R.tip_angle(R.motion(FLAT, q)), BENT),
+        "joint_wrenches, part_momenta": Case(
+            carried, (TREE, W, RATES, 20 * RATES, WRENCH), step=1e-4, reverse=False
+        ),
         "part_motion": Case(
             lambda at: R.part_motion(R.motion(*at), 1).tangent, (TREE, W, RATES)
         ),

@@ -4,6 +4,7 @@ Each function compiles once per structure of the model and its forces. Loops use
 `inertia` and `total_force` directly, with `operators` taken outside.
 """
 
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -23,7 +24,7 @@ from sorojax.rod.dynamics.points import moment_of
 from sorojax.rod.dynamics.tree import AssemblyState, part_columns, part_motion
 from sorojax.rod.forces import loads
 from sorojax.rod.forces.forces import Gravity
-from sorojax.rod.model.assembly import increments, rate
+from sorojax.rod.model.assembly import Assembly, increments, rate
 from sorojax.rod.model.closure import is_closed
 from sorojax.rod.model.link import LinkState
 from sorojax.rod.model.model import Model, inertia, motion, operators
@@ -237,19 +238,28 @@ def momentum(
     model: Model, q: Float[Array, " coordinates"], v: Float[Array, " dof"]
 ) -> Float[Array, " twist"]:
     """Angular momentum about the origin [kg m^2/s], then linear momentum [kg m/s]."""
-    total = None
-    for part, _ in _parts(motion(model, q, v)):
-        mass, rotary, linear, local = _rows(part)
-        velocity = linear @ part.v
-        push = mass[:, None] * velocity
-        spin = jnp.einsum("pij,pj->pi", rotary, local @ part.v)
-        if spin.shape[1] == 3:
-            spin = jnp.einsum("pij,pj->pi", part.directors, spin)
-        angular = spin + moment_of(mass_position(part), push)
-        term = jnp.concatenate([jnp.sum(angular, axis=0), jnp.sum(push, axis=0)])
-        total = term if total is None else total + term
-    assert total is not None
-    return total
+    return functools.reduce(
+        jnp.add, [_momentum(part) for part, _ in _parts(motion(model, q, v))]
+    )
+
+
+@jit_public
+def part_momenta(
+    model: Assembly, q: Float[Array, " coordinates"], v: Float[Array, " dof"]
+) -> dict[str, Float[Array, " twist"]]:
+    """`momentum` of every part by name, all about the origin of the ground."""
+    parts = [_momentum(part) for part, _ in _parts(motion(model, q, v))]
+    return dict(zip(model.names, parts, strict=True))
+
+
+def _momentum(part: RodState | LinkState) -> Float[Array, " twist"]:
+    mass, rotary, linear, local = _rows(part)
+    push = mass[:, None] * (linear @ part.v)
+    spin = jnp.einsum("pij,pj->pi", rotary, local @ part.v)
+    if spin.shape[1] == 3:
+        spin = jnp.einsum("pij,pj->pi", part.directors, spin)
+    angular = spin + moment_of(mass_position(part), push)
+    return jnp.concatenate([jnp.sum(angular, axis=0), jnp.sum(push, axis=0)])
 
 
 @jit_public

@@ -197,11 +197,12 @@ def _mass_offset(rod: Rod) -> Float[Array, "across quad"] | None:
     return jnp.stack([_along(rod, none if offset is None else offset) for offset in offsets])
 
 
-def _stiffness(rod: Rod, rows: Array, weights: Array) -> Float[Array, "dof dof"]:
+def rigidities(rod: Rod) -> dict[str, Float[Array, " quad"]]:
+    """Stiffness of the section at the nodes by strain: N m^2 of curvatures, N of others."""
     section, young = rod.section, rod.material.young_modulus
     shear = young / (2 * (1 + rod.material.poisson_ratio))
     along_z = section.shear_factor if section.shear_factor_z is None else section.shear_factor_z
-    rigidity = {
+    every = {
         "kappa_x": shear * section.torsion_constant,
         "kappa_y": young * section.second_moment_y,
         "kappa_z": young * section.second_moment_z,
@@ -209,7 +210,12 @@ def _stiffness(rod: Rod, rows: Array, weights: Array) -> Float[Array, "dof dof"]
         "sigma_y": shear * section.shear_factor * section.area,
         "sigma_z": shear * along_z * section.area,
     }
-    scale = jnp.stack([_along(rod, rigidity[name]) for name in rod.basis.active])
+    return {name: _along(rod, value) for name, value in every.items()}
+
+
+def _stiffness(rod: Rod, rows: Array, weights: Array) -> Float[Array, "dof dof"]:
+    every = rigidities(rod)
+    scale = jnp.stack([every[name] for name in rod.basis.active])
     scale = rod.length * scale * weights[None, :]
     return jnp.einsum("aqm,aq,aqn->mn", rows, scale, rows)
 

@@ -435,7 +435,15 @@ def assembly_inertia(
     # Parts come after what carries them, so the rows hold the lower triangle.
     lower = jnp.tril(lower)
     mass = lower + lower.T - jnp.diag(jnp.diagonal(lower))
-    return mass, gather(moment, biases)
+    return _with_rotors(mass, moment.assembly), gather(moment, biases)
+
+
+def _with_rotors(mass: Float[Array, "dof dof"], assembly: Assembly) -> Float[Array, "dof dof"]:
+    for part, at in zip(assembly.parts, slices(assembly), strict=True):
+        rotor = part.joint.rotor_inertia()
+        if rotor is not None:
+            mass = mass.at[at.joint_v, at.joint_v].add(jnp.diag(rotor.astype(mass.dtype)))
+    return mass
 
 
 def gather(

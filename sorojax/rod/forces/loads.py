@@ -74,7 +74,18 @@ def total_force(
 ) -> Float[Array, " dof"]:
     """Sum of the listed forces and of the elasticity of rods and joints."""
     if isinstance(motion, RodState):
-        return one.total_force(_plain(forces, motion.rod.group), t, motion)
+        return one.total_force(plain(forces, motion.rod.group), t, motion)
+    total = gather(motion, part_loads(forces, t, motion))
+    for term in _joint_forces(forces, motion):
+        total = total + term
+    return total
+
+
+def part_loads(
+    forces: tuple[Load, ...], t: Float[Array, ""], motion: AssemblyState
+) -> list[Float[Array, " own"] | None]:
+    """Loads on each part in its own columns, with the elasticity of a rod; None without one.
+    Springs, dampers and actuators of the joints, which act on two parts, are not among them."""
     check(motion.assembly, forces)
     loads: list = [_part_load(forces, t, motion, k) for k in range(len(motion.frames))]
     for force in forces:
@@ -84,10 +95,7 @@ def total_force(
             ends = [index_of(motion.assembly, name) for name in (force.first, force.second)]
             pair = force.force(t, *(part_motion(motion, k) for k in ends))
             _add(loads, dict(zip(ends, pair, strict=True)))
-    total = gather(motion, loads)
-    for term in _joint_forces(forces, motion):
-        total = total + term
-    return total
+    return loads
 
 
 def relaxed(forces: tuple[Load, ...]) -> tuple[Load, ...]:
@@ -104,7 +112,7 @@ def relaxation_of(force: Load) -> Relaxation | None:
 def on_model(forces: tuple[Load, ...], model: Rod | Assembly) -> tuple[Load, ...]:
     """The forces on `model` alone: what does not move is made, once before a loop."""
     if isinstance(model, Rod):
-        return tuple(_on_body(force, model) for force in _plain(forces, model.group))
+        return tuple(_on_body(force, model) for force in plain(forces, model.group))
     check(model, forces)
     return tuple(
         PartForce(f.part, _on_body(f.force, model[f.part].body))
@@ -133,7 +141,7 @@ def tangent_stiffness(
 ) -> Float[Array, "dof dof"]:
     """Elastic stiffness at the coordinates of `motion`, replaced laws included."""
     if isinstance(motion, RodState):
-        return one.tangent_stiffness(_plain(forces), motion)
+        return one.tangent_stiffness(plain(forces), motion)
     stiffness = motion.operators.stiffness
     for k, at in enumerate(slices(motion.assembly)):
         listed = _on(forces, motion.assembly, k)
@@ -148,7 +156,7 @@ def damping_matrix(
 ) -> Float[Array, "dof dof"]:
     """Sum of the dampings of rods and joints; zeros without one."""
     if isinstance(model, Rod):
-        return one.damping_matrix(_plain(forces), constants.stiffness)
+        return one.damping_matrix(plain(forces), constants.stiffness)
     damping = constants.damping
     for k, at in enumerate(slices(model)):
         if isinstance(model.parts[k].body, Rod):
@@ -189,7 +197,7 @@ def _on(forces: tuple[Load, ...], assembly: Assembly, index: int) -> tuple:
     )
 
 
-def _plain(forces: tuple[Load, ...], group: Any = None) -> Any:
+def plain(forces: tuple[Load, ...], group: Any = None) -> Any:
     """Forces that may act on a single rod, with vectors of its `group` where that is given."""
     for force in forces:
         if isinstance(force, PartForce | PairForce | JointEffort):

@@ -14,7 +14,7 @@ from sorojax._display import displayed
 from sorojax._types import optional_real, real
 from sorojax.rod.model.closure import Closure, check_closure
 from sorojax.rod.model.joint import AbstractJoint, Fixed, Group
-from sorojax.rod.model.link import Link
+from sorojax.rod.model.link import Link, is_massless
 from sorojax.rod.model.rod import Rod
 
 
@@ -68,6 +68,9 @@ class Assembly(eqx.Module):
             _check_part(self.group, name, part, self.names[:index])
         for name in self.loops:
             check_closure(self, name)
+        carriers = {part.on for part in self.parts}
+        for name, part in zip(self.names, self.parts, strict=True):
+            _check_mass(self.group, name, part, name in carriers)
 
     def __getitem__(self, name: str) -> Part:
         return self.parts[index_of(self, name)]
@@ -320,3 +323,12 @@ def _check_part(group: Group, name: str, part: Part, before: tuple[str, ...]) ->
         size = group.space_dim + 1
         do = "Give a homogeneous matrix, e.g. sorojax.math.lie.homogeneous(R, p)."
         _check.shape(where, "offset", part.offset, (size, size), do)
+
+
+def _check_mass(group: Group, name: str, part: Part, carries: bool) -> None:
+    bare = isinstance(part.body, Link) and is_massless(part.body)
+    if bare and not carries and type(part.joint).num_dof(part.joint, group) > 0:
+        raise ValueError(
+            f"assembly: the link `{name}` moves and has no mass, need one, or a part that it "
+            "carries. Give its mass [kg] and inertia [kg m^2]."
+        )

@@ -75,6 +75,10 @@ class AbstractJoint(eqx.Module):
             "Prismatic, Spherical or Roller. Put it between two parts of the tree instead."
         )
 
+    def rotor_inertia(self) -> Float[Array, " dof"] | None:
+        """What a rotor behind a gear adds to the diagonal of the mass matrix, per rate."""
+        return None
+
 
 class Fixed(AbstractJoint):
     """No motion."""
@@ -98,6 +102,7 @@ class AbstractAxial(AbstractJoint):
     axis: Float[Array, " dim"] | None = eqx.field(converter=optional_real, default=None)
     stiffness: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
     damping: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
+    armature: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
 
     def __check_init__(self):
         axis = self.axis
@@ -118,6 +123,9 @@ class AbstractAxial(AbstractJoint):
         terms = [-k * x for k, x in pairs if k is not None]
         return functools.reduce(jnp.add, terms) if terms else None
 
+    def rotor_inertia(self):
+        return None if self.armature is None else self.armature[None]
+
 
 class Revolute(AbstractAxial):
     """Rotation about an axis [rad].
@@ -126,6 +134,8 @@ class Revolute(AbstractAxial):
         axis: Direction in the joint frame, of any length; z if omitted. None in a plane.
         stiffness: Spring towards rest [N m/rad].
         damping: [N m s/rad].
+        armature: Inertia of the rotor times the gear ratio squared [kg m^2]; it turns against
+            the carrier, and its own momentum is left out.
     """
 
     def axes(self, group, dtype):
@@ -162,6 +172,7 @@ class Prismatic(AbstractAxial):
         axis: Direction in the joint frame, of any length; x if omitted.
         stiffness: Spring towards rest [N/m].
         damping: [N s/m].
+        armature: The same of a drive: rotor inertia by the square of rotation per travel [kg].
     """
 
     def axes(self, group, dtype):

@@ -18,7 +18,7 @@ class Link(eqx.Module):
     """A rigid body.
 
     Attributes:
-        mass: [kg].
+        mass: [kg]; 0, with an inertia of 0, of a frame between two joints.
         inertia: About the centre of mass, along the axes of the link [kg m^2]: a number in
             a plane; in space three principal moments or a symmetric matrix.
         center: Centre of mass in the frame of the link [m]; its origin if omitted.
@@ -29,15 +29,21 @@ class Link(eqx.Module):
     center: Float[Array, " dim"] | None = eqx.field(converter=optional_real, default=None)
 
     def __check_init__(self):
-        _check.positive("Link", "mass", self.mass, "kg", "A frame without mass is no link.")
+        do = "Give [kg]; only a frame between two joints has none."
+        _check.not_negative("Link", "mass", self.mass, "kg", do)
         if jnp.shape(self.inertia) not in ((), (3,), (3, 3)):
             raise ValueError(
                 f"Link: `inertia` has shape {jnp.shape(self.inertia)}, need () in a plane, "
                 "(3) or (3, 3) in space. Give principal moments [kg m^2]."
             )
-        if self.inertia.ndim < 2:
+        if self.inertia.ndim < 2 and not is_massless(self):
             do = "Give moments in kg m^2, e.g. 2/5 m r^2 for a ball."
             _check.positive("Link", "inertia", self.inertia, "kg m^2", do)
+
+
+def is_massless(link: Link) -> bool:
+    """Whether a link is known to have no mass."""
+    return _check.is_concrete(link.mass) and float(link.mass) == 0
 
 
 class LinkOperators(NamedTuple):

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from sorojax import _check, rod as R
 from sorojax.rod import Assembly, Rod, Section
+from sorojax.rod.model.link import is_massless
 from sorojax.sdf import AbstractSdf, Surface as Triangles
 from sorojax.view import style
 from sorojax.view.draw.loads import turning
@@ -137,7 +138,8 @@ def rod_scene(
             contacts as arrows with what is touched, wrenches and weight as arrows and arcs.
         section: Plane shape of the section (y, z), where constants do not tell it.
         shapes: Bodies of links by name, a solid shape or triangles in the frame of the
-            link; without one a link is the ellipsoid of its inertia.
+            link; without one a link is the ellipsoid of its inertia, and a frame
+            without mass nothing.
         directors: Draw the axes of some sections, x red, y green, z blue.
         title: Title of the figure.
     """
@@ -218,6 +220,8 @@ def _link(name: str, body, pose: np.ndarray, shapes: Shapes | None, colour: str)
         make: Any = shape_scene if isinstance(shape, AbstractSdf) else surface_scene
         surface = make(shape).parts[0]
         return [Surface(surface.points @ turn.T + place, surface.triangles, colour)]
+    if is_massless(body):
+        return []
     if dim == 2:
         centre = np.zeros(2) if body.center is None else np.asarray(body.center)
         radius = np.sqrt(2 * float(body.inertia) / float(body.mass))  # of a disc

@@ -212,9 +212,11 @@ def _tube(rod: Rod, outline: Outline | None, around: int, stations: int):
 
 def ellipsoid(link: Link, around: int, thinnest: float = 0.1):
     """The solid ellipsoid with the mass and moments of a link, at least `thinnest` times as
-    thick as long; a ball for a planar one."""
+    thick as long; a ball for a planar one, a point for a frame without mass."""
     mass, inertia, axes = float(link.mass), np.asarray(link.inertia, float), np.eye(3)
-    if inertia.ndim == 0:
+    if mass == 0:
+        half = np.zeros(3)
+    elif inertia.ndim == 0:
         half = np.full(3, np.sqrt(2.5 * inertia / mass))
     else:
         moments = inertia
