@@ -7,6 +7,7 @@ import pytest
 
 from sorojax import SE2, SE3, rod as R
 from sorojax.math.lie import homogeneous, plane_rotation
+from sorojax.math.quadrature import gauss_legendre
 from sorojax.math.status import Status
 from sorojax.rod.dynamics.closures import closure_force, closure_jacobian, violations
 from sorojax.rod.model.assembly import retract
@@ -114,6 +115,26 @@ def test_a_sunk_support_has_the_reaction_of_the_closed_form_and_its_derivative()
     forward, back = jax.jacfwd(reaction)(at), jax.grad(reaction)(at)
     difference = (reaction(at + step) - reaction(at - step)) / (2 * step)
     assert abs(forward / difference - 1) < 1e-6 and abs(back / forward - 1) < 1e-12
+
+
+def test_joints_bear_what_closures_do_not():
+    body = beam(SE2(), {"kappa_z": 4, "sigma_x": 1})
+    on_pin = R.Closure("rod", R.Roller(), offset=shift(LENGTH, 0.0))
+    model, forces = R.with_closures(body, tip=on_pin), (R.Gravity(),)
+    rest = R.equilibrium(model, forces)
+    still = jnp.zeros(5)
+    clamp = R.joint_wrenches(model, rest.q, still, still, forces)["rod"]
+    tip, place = rest.reactions["tip"], R.tip_pose(model, rest.q)["rod"][:2, 2]
+    assert abs(float(clamp[2] + tip[2]) / (LOAD * LENGTH) - 1) < 1e-9
+    assert abs(float(clamp[1] + tip[1])) < 1e-9 * LOAD * LENGTH
+    moved = jax.jit(lambda q: R.points(R.part_motion(R.motion(model, q), 0), NODES).position)
+    weights = body.length * jnp.asarray(WEIGHTS)
+    weight = LOAD * jnp.sum(weights * moved(rest.q)[:, 0])
+    about = clamp[0] + place[0] * tip[2] - place[1] * tip[1]
+    assert abs(float(about / weight) - 1) < 1e-9
+
+
+NODES, WEIGHTS = gauss_legendre(10)
 
 
 def test_a_ring_bears_one_moment():

@@ -94,6 +94,13 @@ def closure_force(
     moment: AssemblyState, t: Float[Array, ""], reactions: Float[Array, " equations"]
 ) -> Float[Array, " dof"]:
     """Generalised force G' lambda of the closures."""
+    return gather(moment, closure_loads(moment, t, reactions))
+
+
+def closure_loads(
+    moment: AssemblyState, t: Float[Array, ""], reactions: Float[Array, " equations"]
+) -> list[Float[Array, " own"] | None]:
+    """The same on each part, in its own columns; None without a closure."""
     loads: list[Array | None] = [None] * len(moment.frames)
     pairs = _pairs(moment, t)
     for pair, wrench in zip(pairs, _wrenches(moment, pairs, reactions), strict=True):
@@ -102,7 +109,7 @@ def closure_force(
                 load = _load(moment, end, pair.held.position, sign * wrench)
                 before = loads[end.index]
                 loads[end.index] = load if before is None else before + load
-    return gather(moment, loads)
+    return loads
 
 
 def closure_jacobian(

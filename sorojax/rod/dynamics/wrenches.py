@@ -2,16 +2,25 @@
 
 from typing import overload
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax._types import real
 from sorojax.math.compiled import jit_public
+from sorojax.math.ode.held import accelerate
+from sorojax.rod.dynamics.closures import closure_loads, held
 from sorojax.rod.dynamics.dynamics import Coordinates, Forces, Rates
 from sorojax.rod.dynamics.moving import turned_twists
-from sorojax.rod.dynamics.tree import AssemblyState, part_columns, part_inertias
+from sorojax.rod.dynamics.tree import (
+    AssemblyState,
+    assembly_inertia,
+    part_columns,
+    part_inertias,
+)
 from sorojax.rod.forces.forces import Gravity
-from sorojax.rod.forces.loads import PartForce, part_loads, plain
+from sorojax.rod.forces.loads import PartForce, part_loads, plain, total_force
 from sorojax.rod.model.assembly import Assembly, Part, parents
+from sorojax.rod.model.closure import is_closed
 from sorojax.rod.model.model import Model, motion
 from sorojax.rod.model.rod import Rod
 
@@ -35,7 +44,8 @@ def joint_wrenches(
     By the equations of Newton and Euler of each part, taken from the tips inwards: what a part
     and all that it carries need to accelerate, less the loads on them, passes through its
     joint. A wrench holds all that the joint transmits: what it constrains, and the effort of
-    its spring, damper and actuator. With a = `forward_dynamics(model, q, v, forces)` it is that
+    its spring, damper and actuator. Closures act on the parts that they join; their reactions
+    are those that balance `a` best. With a = `forward_dynamics(model, q, v, forces)` it is that
     of the motion; with other accelerations, of a motion that actuators force on the joints.
 
     Args:
@@ -89,6 +99,12 @@ def _wrenches(moment: AssemblyState, a: Array, forces: Forces, t: Array) -> list
         needed if load is None else needed - load[:size]
         for needed, load in zip(total, loads, strict=True)
     ]
+    if is_closed(moment.assembly):
+        borne = closure_loads(moment, t, _reactions(moment, a, forces, t))
+        total = [
+            needed if load is None else needed - load[:size]
+            for needed, load in zip(total, borne, strict=True)
+        ]
     for index, on in reversed(list(enumerate(parents(moment.assembly)))):
         if on is not None:
             carried = moment.mounts[index].carried[:, :size]
@@ -97,3 +113,14 @@ def _wrenches(moment: AssemblyState, a: Array, forces: Forces, t: Array) -> list
         turned_twists(frame.rotation, wrench[:, None], rot)[:, 0]
         for frame, wrench in zip(moment.frames, total, strict=True)
     ]
+
+
+def _reactions(
+    moment: AssemblyState, a: Array, forces: Forces, t: Array
+) -> Float[Array, " equations"]:
+    """Reactions of closures that leave the least to be done by actuators."""
+    mass, coriolis = assembly_inertia(moment)
+    needed = mass @ a + coriolis - total_force(forces, t, moment)
+    still = held(moment, t)
+    still = still._replace(wanted=jnp.zeros_like(still.wanted))
+    return -accelerate(mass, needed, still).reactions
