@@ -28,6 +28,7 @@ class Pulse(rod.AbstractForce):
     def __call__(self, t, motion):
         share = jnp.clip(jnp.minimum(t, 5.0 - t) / 2.5, 0, 1)
         base = motion.base
+        assert base is not None  # the rod floats
         return (
             share * self.wrench @ jnp.concatenate([base.angular_jacobian, base.linear_jacobian])
         )
@@ -83,6 +84,7 @@ def draw(places: np.ndarray, file: Path) -> None:
     """The rod every half second, from above and from the side."""
     import matplotlib.pyplot as plt
     from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
 
     figure, views = plt.subplots(2, 1, figsize=(8, 7), sharex=True, layout="constrained")
     colours = plt.get_cmap("viridis")
@@ -97,7 +99,7 @@ def draw(places: np.ndarray, file: Path) -> None:
         axis.spines[["top", "right"]].set_visible(False)
     views[0].set_title("every half second; a dot on the end that is pushed, dashed the middle")
     views[1].set_xlabel("x [m]")
-    shown = ScalarMappable(plt.Normalize(0, 10), colours)
+    shown = ScalarMappable(Normalize(0, 10), colours)
     figure.colorbar(shown, ax=views, label="time [s]", shrink=0.6)
     figure.savefig(file, dpi=130)
     plt.close(figure)
