@@ -88,24 +88,29 @@ def draw(path, poses, file) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    figure = plt.figure(figsize=(11, 3.4))
+    figure = plt.figure(figsize=(11, 4.2))
     for column, row in enumerate((0, 60, 75, 90)):
-        axes = figure.add_subplot(1, 5, column + 1, projection="3d")
+        axes = figure.add_axes((0.185 * column, 0, 0.2, 0.92), projection="3d")
         for k in range(3):
             axes.plot(*(poses[f"leg_{k}"][row, :, :3, 3] / mm).T, lw=4)
         tips = np.stack([poses[f"leg_{k % 3}"][row, -1, :3, 3] for k in range(4)])
         axes.plot(*(tips / mm).T, "k", lw=2)
-        axes.set(xlim=(-60, 60), ylim=(-60, 60), zlim=(-30, 190))
+        axes.set(xlim=(-75, 75), ylim=(-75, 75), zlim=(-30, 190))
         axes.set_title(f"{float(path.time[row]):.1f} s")
-        axes.set_box_aspect((12, 12, 22))
-        axes.set_xticklabels([])
-        axes.set_yticklabels([])
-    axes = figure.add_subplot(1, 5, 5)
+        axes.set_box_aspect((15, 15, 22), zoom=1.05)
+        axes.set(xticks=(-40, 0, 40), yticks=(-40, 0, 40), zticks=(0, 50, 100, 150))
+        axes.tick_params(labelsize=7, pad=-2)
+        if column < 3:
+            axes.set_zticklabels([])
+        axes.view_init(elev=18, azim=-60)
+    axes = figure.add_axes((0.81, 0.14, 0.18, 0.74))
     for k in range(3):
         axes.plot(path.time, path.reactions[f"slider_{k}"][:, 5])
     axes.set(xlabel="time [s]", title="push of the sliders [N]")
-    figure.tight_layout()
-    figure.savefig(file, dpi=120)
+    axes.title.set_size(10)
+    figure.text(0.01, 0.02, "lengths in mm", size=8)
+    figure.savefig(file, dpi=130)
+    plt.close(figure)
 
 
 if __name__ == "__main__":

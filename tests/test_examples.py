@@ -180,3 +180,13 @@ def test_an_arm_with_a_pneumatic_finger_picks_a_ball():
     q, v = script["run"](setup, ticks)
     assert robots_arm.unbalanced(script["forces"], setup, ticks, q, v) < 1e-8
     assert user_code("40_arm_picks_ball") <= 60
+
+
+@pytest.mark.slow
+def test_three_rods_carry_a_platform():
+    numbers = main_of("42_three_rods")(quick=True)
+    assert numbers["ended well"] == 1
+    assert numbers["clamp open by [m]"] < 1e-10
+    # platform and rods, by the density of the rubber
+    assert 0.1 < numbers["push of the sliders at the start [N]"] < 1
+    assert user_code("42_three_rods") <= 60
