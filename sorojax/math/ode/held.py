@@ -24,6 +24,7 @@ from sorojax.math.linalg.dense import solve_columns, solve_symmetric
 _RANK = 1e-10  # of the largest eigenvalue of G M^-1 G', rows of equal size: dependent below
 _NEAR_SINGULAR = 1e-4  # of one over the condition number at the start
 _WELL = 1e-7  # [rad], [m]: what one pass leaves of a smaller violation is its square
+_PASSES = 3  # at most, in a step
 
 
 class Held(NamedTuple):
@@ -159,11 +160,15 @@ def projected(
         inverse = jnp.linalg.inv(reach)
         change = along @ (inverse @ missing)
         size = jnp.max(jnp.abs(jax.lax.stop_gradient(value)))
-        return move(q, -change[:, 0]), v - change[:, 1], (size, _share(reach, inverse))
+        return move(q, -change[:, 0]), v - change[:, 1], _share(reach, inverse), size
 
-    q, v = state
-    q, v, (size, share) = nearer(q, v)
-    q, v = jax.lax.cond(size > _WELL, lambda: nearer(q, v)[:2], lambda: (q, v))
+    def again(found, _):
+        q, v, share, size = found
+        return jax.lax.cond(size > _WELL, lambda: nearer(q, v), lambda: found), None
+
+    one = jnp.ones((), state[0].dtype)
+    begin = *state, one, jnp.inf * one
+    (q, v, share, _), _ = jax.lax.scan(again, begin, length=_PASSES)
     return q, v, share
 
 

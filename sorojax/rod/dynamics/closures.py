@@ -14,8 +14,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax.math.lie import homogeneous
 from sorojax.math.ode.held import Held
 from sorojax.rod.dynamics.moving import spin_cross, swept, turned_pose, turned_twists
 from sorojax.rod.dynamics.points import moment_of
@@ -254,7 +256,7 @@ def _second_order(moment: AssemblyState, pair: _Pair, t: Array, later) -> Change
         rotation, position = later(x)
         if closure.motion is not None:
             # `later` sees the joint frame as it stands at t
-            now, moved = (closure.motion(at).astype(moment.q.dtype) for at in (t, t + x))
+            now, moved = (_pose(closure, at, moment.q.dtype) for at in (t, t + x))
             turn = moved[:-1, :-1].T @ now[:-1, :-1]
             position = turn @ position + moved[:-1, :-1].T @ (now[:-1, -1] - moved[:-1, -1])
             rotation = turn @ rotation
@@ -283,7 +285,7 @@ def _pairs(moment: AssemblyState, t: Float[Array, ""]) -> list[_Pair]:
     for closure in moment.assembly.closures:
         held, holder = next(ends), next(ends)
         if closure.motion is not None:
-            holder = _beyond(holder, closure.motion(t).astype(moment.q.dtype))
+            holder = _beyond(holder, _pose(closure, t, moment.q.dtype))
         turn = holder.rotation.T
         rotation, position = turned_pose(turn, held.rotation, held.position - holder.position)
         found.append(_Pair(closure, held, holder, rotation, position))
@@ -316,6 +318,15 @@ def _in_world(moment: AssemblyState, index: int | None, section: Section) -> _En
     centre, jacobian = frame.position + arm, jnp.concatenate([angular, linear])
     jacobian = turned_twists(frame.rotation, jacobian, moment.assembly.group.rotation_dim)
     return _End(rotation, centre, index, rotation, centre, jacobian)
+
+
+def _pose(closure: Closure, t: Array, dtype: Any) -> Float[Array, "h h"]:
+    """Where the motion of a closure has its joint."""
+    assert closure.motion is not None
+    moved = closure.motion(t).astype(dtype)
+    if moved.ndim == 2:
+        return moved
+    return homogeneous(jnp.asarray(np.eye(moved.shape[0]), dtype), moved)
 
 
 def _beyond(end: _End, pose: Float[Array, "h h"]) -> _End:

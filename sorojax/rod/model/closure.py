@@ -33,8 +33,8 @@ class Closure(eqx.Module):
         frame: Pose in the part of the frame that is held; that of the link, or of the section
             at `at` of the rod, if omitted.
         at: Where on a rod that is held, in [0, 1].
-        motion: From time [s] to the pose of the joint beyond `offset`, homogeneous, position
-            [m]: an end that is driven. Twice differentiable for a run in time.
+        motion: From time [s] to the pose of the joint beyond `offset`, homogeneous, or to its
+            position alone [m]: an end that is driven. Twice differentiable for a run in time.
     """
 
     part: str = eqx.field(static=True)

@@ -1,5 +1,6 @@
 """A rod as a block: pressure in, volume and tip out."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -8,13 +9,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax._types import optional_real
+from sorojax.math.lie import homogeneous
 from sorojax.math.linalg.dense import solve_symmetric
-from sorojax.math.ode.held import accelerate
+from sorojax.math.ode.held import Reacted, accelerate
 from sorojax.math.status import Status
 from sorojax.rod import (
     AbstractForce,
     AbstractPressureMap,
     Assembly,
+    Closure,
+    Free,
     JointEffort,
     PartForce,
     Pressurised,
@@ -32,9 +36,10 @@ from sorojax.rod import (
     tip_pose,
     total_force,
 )
-from sorojax.rod.dynamics.closures import held
+from sorojax.rod.dynamics.closures import closure_wrenches, held
 from sorojax.rod.dynamics.dynamics import PULL
 from sorojax.rod.dynamics.fields import RodState
+from sorojax.rod.dynamics.moving import spin_cross
 from sorojax.rod.forces.loads import Load, relaxed
 from sorojax.rod.forces.relaxation import begun, borne, branches_of, memory_rate
 from sorojax.rod.model.assembly import increments, index_of, rate
@@ -42,6 +47,7 @@ from sorojax.rod.model.closure import is_closed
 from sorojax.rod.statics.equilibrium import checked_status
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output
 
+SERVO = 500.0  # 1/s: how fast the joint of a closure follows an input
 _FLUID = {"volume": "m^3", "volume_rate": "m^3/s", "compliance": "m^3/Pa"}
 
 
@@ -157,9 +163,13 @@ class AssemblyBody(AbstractBlock):
     Ports of a part are named after it. A pressure map, `On("finger", map)`, opens
     `finger_pressure`, `finger_volume`, `finger_volume_rate` (at held pressure) and
     `finger_compliance`, all from one potential. A driven joint opens `wrist_effort`. Each
-    part has `finger_position`, of its tip or of the frame of a link. Closures hold to the
-    tolerance of the run: what a step opens is pulled shut at 50 1/s. Ends are driven by a
-    `motion` in time of the closure.
+    part has `finger_position`, of its tip or of the frame of a link.
+
+    Closures hold to the tolerance of the run: what a step opens is pulled shut at 50 1/s. Each
+    has the output `base_wrench`, on the part that it holds [N m], [N]. Ends are driven by a
+    `motion` in time of the closure, or by the network: a closure that is `moved` takes the
+    input `base_velocity` [rad/s], [m/s], along the axes of the frame that holds it, and its
+    joint follows what that adds up to, kept in the state, as a servo of 500 1/s does.
 
     A part that is `carrying` something has the output `palm_pose`, a homogeneous matrix of its
     tip or of the frame of a link, and takes the input `palm_reaction`: the wrench about that
@@ -174,6 +184,7 @@ class AssemblyBody(AbstractBlock):
         driven: Parts whose joints take an effort from outside.
         q, v: Coordinates and rates at the start; at rest if omitted.
         carrying: Parts that another block is fixed to.
+        moved: Closures whose joint an input moves.
     """
 
     assembly: Assembly
@@ -182,6 +193,7 @@ class AssemblyBody(AbstractBlock):
     q: Float[Array, " coordinates"] | None = eqx.field(converter=optional_real, default=None)
     v: Float[Array, " dof"] | None = eqx.field(converter=optional_real, default=None)
     carrying: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
+    moved: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=())
 
     def __check_init__(self):
         names = [part for part, _ in _maps(self.forces)]
@@ -193,6 +205,13 @@ class AssemblyBody(AbstractBlock):
             )
         for name in (*names, *self.driven, *self.carrying):
             index_of(self.assembly, name)
+        for name in self.moved:
+            if name not in self.assembly.loops or self._closure(name).motion is not None:
+                raise ValueError(
+                    f"AssemblyBody: `moved` names `{name}`, need a closure without a motion of "
+                    f"its own, of {', '.join(self.assembly.loops) or 'none'}. Add one by "
+                    "rod.with_closures."
+                )
 
     @property
     def inputs(self):
@@ -200,9 +219,9 @@ class AssemblyBody(AbstractBlock):
         for name in self.driven:
             ports[f"{name}_effort"] = Input(None, (self._joint_dof(name),), 0.0)
         twist = self.assembly.group.algebra_dim
-        return ports | {
-            f"{name}_reaction": Input(None, (twist,), 0.0) for name in self.carrying
-        }
+        wrenches = {f"{name}_reaction": Input(None, (twist,), 0.0) for name in self.carrying}
+        moved = {f"{name}_velocity": Input(None, (twist,), 0.0) for name in self.moved}
+        return ports | wrenches | moved
 
     @property
     def outputs(self):
@@ -210,6 +229,8 @@ class AssemblyBody(AbstractBlock):
         ports = {f"{name}_position": Output("m", (dim,)) for name in self.assembly.names}
         ports |= {f"{k}_pose": Output(None, (dim + 1, dim + 1)) for k in self.carrying}
         ports["q"] = Output(None, (num_coordinates(self.assembly),))
+        felt, twist = frozenset(self.inputs), self.assembly.group.algebra_dim
+        ports |= {f"{k}_wrench": Output(None, (twist,), felt) for k in self.assembly.loops}
         for name, chamber in self._maps().items():
             needs = frozenset({f"{name}_pressure"})
             for kind, unit in _FLUID.items():
@@ -221,12 +242,18 @@ class AssemblyBody(AbstractBlock):
         zero = jnp.zeros(num_dof(self.assembly), start.dtype)
         q = start if self.q is None else self.q
         state = {"q": q, "v": zero if self.v is None else self.v}
-        return state | _first_memory(self.assembly, self.forces, q)
+        group = self.assembly.group
+        places = {f"{name}_place": Free().rest(group, q.dtype) for name in self.moved}
+        return state | places | _first_memory(self.assembly, self.forces, q)
 
     def output(self, name, t, state, inputs):
         q, v = state["q"], state["v"]
         if name == "q":
             return q
+        for loop in self.assembly.loops:
+            if name == f"{loop}_wrench":
+                moment, found, _ = self._solved(t, state, inputs)
+                return closure_wrenches(moment, t, found.reactions)[loop]
         for part, chamber in self._maps().items():
             kind = name.removeprefix(f"{part}_")
             if name != kind and kind in _FLUID:
@@ -238,20 +265,45 @@ class AssemblyBody(AbstractBlock):
         return tip_pose(self.assembly, q)[name.removesuffix("_position")][:-1, -1]
 
     def vector_field(self, t, state, inputs):
-        q, v, constants = state["q"], state["v"], operators(self.assembly)
-        pull, rates = _branches(self.assembly, self.forces, state, constants)
-        forces = relaxed(self.acting(inputs))
-        if pull is None:
-            a = acceleration(self.assembly, constants, t, q, v, forces, PULL)
+        q, v = state["q"], state["v"]
+        if not is_closed(self.assembly) and branches_of(self.assembly, self.forces) is None:
+            constants, forces = operators(self.assembly), self.acting(inputs)
+            a = acceleration(self.assembly, constants, t, q, v, forces)
+            return {"q": rate(self.assembly, q, v), "v": a}
+        _, found, rates = self._solved(t, state, inputs)
+        return {"q": rate(self.assembly, q, v), "v": found.x} | rates
+
+    def _solved(self, t, state, inputs) -> tuple[Any, Any, dict[str, Array]]:
+        """The moment, the acceleration with its reactions, and the rates of what remembers."""
+        model, rates = self._with_motions(t, state, inputs)
+        constants = operators(model)
+        pull, remembering = _branches(model, self.forces, state, constants)
+        moment: Any = motion(model, state["q"], state["v"], constants=constants)
+        mass, coriolis = inertia(moment)
+        force = total_force(relaxed(self.acting(inputs)), t, moment) - coriolis
+        force = force if pull is None else force + pull
+        if is_closed(model):
+            pull_shut = SERVO if self.moved else PULL
+            found = accelerate(mass, force, held(moment, t, pull_shut))
         else:
-            moment = motion(self.assembly, q, v, constants=constants)
-            mass, coriolis = inertia(moment)
-            force = total_force(forces, t, moment) - coriolis + pull
-            if is_closed(self.assembly):
-                a = accelerate(mass, force, held(moment, t, PULL)).x
-            else:
-                a = solve_symmetric(mass, force)
-        return {"q": rate(self.assembly, q, v), "v": a} | rates
+            none = jnp.zeros(0, force.dtype)
+            found = Reacted(solve_symmetric(mass, force), none, none[None])
+        return moment, found, rates | remembering
+
+    def _with_motions(self, t, state, inputs) -> tuple[Assembly, dict[str, Array]]:
+        """The assembly with moved closures where they are, and the rates of their places."""
+        model, rates, closures = self.assembly, {}, []
+        for name, closure in zip(model.loops, model.closures, strict=True):
+            if name in self.moved:
+                place, twist = state[f"{name}_place"], inputs[f"{name}_velocity"]
+                pose = Free().pose(model.group, place)
+                closure = dataclasses.replace(closure, motion=_Moving(*pose, twist, t))
+                rates[f"{name}_place"] = Free().rate(model.group, place, twist)
+            closures.append(closure)
+        return dataclasses.replace(model, closures=tuple(closures)), rates
+
+    def _closure(self, name: str) -> Closure:
+        return self.assembly.closures[self.assembly.loops.index(name)]
 
     def path_status(self, path):
         return checked_status(Status.successful, self.assembly, path["q"])
@@ -274,6 +326,21 @@ class AssemblyBody(AbstractBlock):
 
     def _joint_dof(self, name: str) -> int:
         return self.assembly[name].joint.num_dof(self.assembly.group)
+
+
+class _Moving(eqx.Module):
+    """A pose that moves with a twist: exact to the first order in time from `now`."""
+
+    rotation: Float[Array, "dim dim"]
+    position: Float[Array, " dim"]
+    twist: Float[Array, " twist"]
+    now: Float[Array, ""]
+
+    def __call__(self, t):
+        ahead, rot = t - self.now, self.twist.shape[0] - self.position.shape[0]
+        spun = spin_cross(self.twist[None, :rot], self.rotation.T).T
+        position = self.position + ahead * self.twist[rot:]
+        return homogeneous(self.rotation + ahead * spun, position)
 
 
 def _maps(forces: tuple[Load, ...]) -> list[tuple[str, AbstractPressureMap]]:
