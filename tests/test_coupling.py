@@ -26,6 +26,7 @@ def mounted(**options):
     )
 
 
+@pytest.mark.versions
 def test_rod_and_solid_are_each_in_equilibrium_with_the_wrench_between_them():
     gravity = [0.0, -2.0]
     problem = mounted(value=PULL, gravity=gravity)

@@ -217,8 +217,8 @@ def test_masses_a_million_times_as_heavy():
     film = R.rollout(chain, q, v, (R.Gravity(),), step=1e-3, saves=20, every=10)
     assert film.status == Status.successful
     assert jnp.abs(film.v).max() < 1e3
-    with pytest.raises(ValueError, match="without mass"):
-        R.Link(0.0, 1e-3)
+    with pytest.raises(ValueError, match="moves and has no mass"):
+        R.assembly(SE2(), only=R.Part(R.Link(0.0, 1e-3), R.Revolute()))
 
 
 @pytest.mark.stress(50)
