@@ -23,7 +23,7 @@ from sorojax.math.linalg.dense import solve_columns, solve_symmetric
 
 _RANK = 1e-10  # of the largest eigenvalue of G M^-1 G', rows of equal size: dependent below
 _NEAR_SINGULAR = 1e-4  # of one over the condition number at the start
-_WELL = 1e-7  # [rad], [m]: what one pass leaves of a smaller violation is its square
+_WELL = 1e-9  # [rad], [m]: of a smaller violation one pass leaves less than 1e-10
 _PASSES = 3  # at most, in a step
 
 
