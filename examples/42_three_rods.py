@@ -8,6 +8,7 @@ by which the sliders push.
 """
 
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -90,7 +91,7 @@ def draw(path, poses, file) -> None:
 
     figure = plt.figure(figsize=(11, 4.2))
     for column, row in enumerate((0, 60, 75, 90)):
-        axes = figure.add_axes((0.185 * column, 0, 0.2, 0.92), projection="3d")
+        axes: Any = figure.add_axes((0.185 * column, 0, 0.2, 0.92), projection="3d")
         for k in range(3):
             axes.plot(*(poses[f"leg_{k}"][row, :, :3, 3] / mm).T, lw=4)
         tips = np.stack([poses[f"leg_{k % 3}"][row, -1, :3, 3] for k in range(4)])
@@ -106,8 +107,8 @@ def draw(path, poses, file) -> None:
     axes = figure.add_axes((0.81, 0.14, 0.18, 0.74))
     for k in range(3):
         axes.plot(path.time, path.reactions[f"slider_{k}"][:, 5])
-    axes.set(xlabel="time [s]", title="push of the sliders [N]")
-    axes.title.set_size(10)
+    axes.set(xlabel="time [s]")
+    axes.set_title("push of the sliders [N]", fontsize=10)
     figure.text(0.01, 0.02, "lengths in mm", size=8)
     figure.savefig(file, dpi=130)
     plt.close(figure)
