@@ -25,6 +25,7 @@ ROWS = {
             "rod.flight",
             "rod.loops",
             "rod.spin",
+            "robots.export",
         ),
     ),
     "rod batches": Cases(("rod.batch",)),

@@ -5,10 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.cases import rod_closed
 from sorojax import SE2, SE3, rod as R
 from sorojax.math.lie import homogeneous, plane_rotation
 from sorojax.math.quadrature import gauss_legendre
 from sorojax.math.status import Status
+from sorojax.rod.dynamics import closures
 from sorojax.rod.dynamics.closures import closure_force, closure_jacobian, violations
 from sorojax.rod.model.assembly import retract
 from sorojax.rod.model.closure import equations
@@ -149,73 +151,23 @@ def test_a_ring_bears_one_moment():
     assert jnp.hypot(*force) < 1e-8 * moment / LENGTH
 
 
-RADIUS = 20.0
-
-
-def about_y(t):
-    c, s, o, i = jnp.cos(t), jnp.sin(t), jnp.zeros_like(t), jnp.ones_like(t)
-    return jnp.array([[c, o, s, o], [o, i, o, o], [-s, o, c, o], [o, o, o, i]])
-
-
 def test_a_ring_folds_to_a_third():
     """Goto, Watanabe, Kasugai, Obata, Int. J. Solids Structures 29, 1992."""
-    half = R.rod(
-        SE3(),
-        R.chebyshev(kappa_x=5, kappa_y=5, kappa_z=5),
-        R.rectangle(1.0, 1 / 3),
-        length=np.pi * RADIUS,
-        young_modulus=2.1e7,
-        poisson_ratio=0.3,
-        density=1.0,
-        rest_strain=[0, 0, 1 / RADIUS, 1, 0, 0],
-        nodes=20,
-    )
-    pose = R.tip_pose(half, R.rest(half))
-    axes = jnp.eye(4).at[:3, :3].set(pose[:3, :3].T)
-    folding = R.Closure(
-        "rod", R.Prismatic([0, 1, 0]), offset=shift(*pose[:3, 3]), frame=axes, motion=about_y
-    )
-    angles = jnp.linspace(0, 2 * np.pi, 31)[1:]
-    model = R.with_closures(half, turned=folding)
-    path = R.equilibrium_path(model, lambda _: (), angles, t=lambda factor: factor)
+    path = rod_closed.fold(5, steps=30)
     assert bool(jnp.all(path.status == Status.successful))
-    across = R.tip_pose(model, path.q[-1])["rod"][1, 3]
-    assert abs(float(across) / (2 * RADIUS / 3) - 1) < 1e-6
-
-
-def lee(modes=4):
-    """A right-angled frame on two pins, loaded near its corner; E I = L = 1."""
-
-    def part(length):
-        section = R.Section(1.0, 1 / 21600, 1 / 21600, 1 / 10800, 1.0)  # L^2 A / I = 43200 / 2
-        basis = R.chebyshev(kappa_z=modes, sigma_x=2)
-        return R.rod(
-            SE2(), basis, section, length=length, young_modulus=21600.0, poisson_ratio=0.0,
-            density=1.0,
-        )  # fmt: skip
-
-    frame = R.assembly(
-        SE2(),
-        column=R.Part(part(1.0), R.Revolute(), offset=turned(np.pi / 2, 0.0, 0.0)),
-        near=R.Part(part(0.2), on="column", offset=turned(-np.pi / 2, 0.0, 0.0)),
-        far=R.Part(part(0.8), on="near"),
-    )
-    return R.with_closures(frame, pin=R.Closure("far", R.Revolute(), offset=shift(1.0, 1.0)))
-
-
-def pressed(factor):
-    return (R.PartForce("near", R.TipWrench(factor * jnp.array([0.0, 0.0, -1.0]))),)
+    across = R.tip_pose(rod_closed.half_ring(5), path.q[-1])["rod"][1, 3]
+    assert abs(float(across) / (2 * rod_closed.RADIUS / 3) - 1) < 1e-6
 
 
 def test_a_frame_on_two_pins_snaps_through():
     """Lee, Manuel, Rossow, J. Eng. Mech. Div. 94, 1968: first limit load 18.552."""
-    path = R.arc_length_path(lee(), pressed, first=2.5, steps=40, longest=1.0)
+    path = rod_closed.snap(4)
     assert bool(jnp.all(path.status == Status.successful))
-    largest = float(jnp.max(path.factors))
-    assert abs(largest / 18.552 - 1) < 5e-3
-    turned_back = jnp.argmax(path.factors)
-    assert jnp.all(path.negative_eigenvalues[:turned_back] == 0)
-    assert path.negative_eigenvalues[turned_back + 1] == 1
+    turn = int(jnp.argmax(path.factors))
+    assert 0 < turn < len(path.factors) - 1
+    assert abs(rod_closed.peak(path) / rod_closed.LIMIT - 1) < 5e-3
+    assert jnp.all(path.negative_eigenvalues[:turn] == 0)
+    assert path.negative_eigenvalues[turn + 1] == 1
 
 
 def four_bar(**spring):
@@ -322,11 +274,24 @@ def test_names_of_closures_are_taken_once():
         R.with_closures(held(R.Fixed()), tip=R.Closure("rod"))
 
 
-def test_a_model_without_closures_pays_nothing():
-    def text(model):
-        return jax.jit(lambda q: R.equilibrium(model, (R.Gravity(),), q).q).lower(q).as_text()
+@pytest.mark.parametrize("verb", [R.equilibrium, R.rollout, R.forward_dynamics])
+def test_a_model_without_closures_does_not_meet_them(verb, monkeypatch):
+    def met(*_):
+        raise RuntimeError("a closure is looked at")
 
-    q = jnp.zeros(4)
-    single = R.assembly(SE2(), rod=R.Part(PLANE))
-    assert text(single) == text(R.with_closures(single))
-    assert text(single) != text(held(R.Fixed()))
+    monkeypatch.setattr(closures, "_pairs", met)
+    zero = jnp.zeros(4)
+
+    def traced(model):
+        options = {} if verb is R.equilibrium else {"v": zero}
+        if verb is R.rollout:
+            options |= {"step": 1e-3, "saves": 8}
+
+        def call(q):
+            return verb(model, q=q, forces=(R.Gravity(),), **options)
+
+        return jax.eval_shape(call, zero)
+
+    traced(R.assembly(SE2(), rod=R.Part(PLANE)))
+    with pytest.raises(RuntimeError, match="looked at"):
+        traced(held(R.Roller()))

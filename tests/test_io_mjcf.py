@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from benchmarks.cases.robots_export import balanced, lowest
 from sorojax import io, rod as R
 from sorojax.math.lie import SE2, SE3, homogeneous
 
@@ -45,47 +46,12 @@ def reduced():
 RODS = {f.__name__: f for f in (straight, curved, planar, reduced)}
 
 
-def balanced(model, data, site, load):
-    """The state of MuJoCo that does not accelerate, with a force on a site, by Newton."""
-    rows = np.zeros((2, 3, model.nv))
-
-    def force(q):
-        data.qpos[:], data.qvel[:] = q, 0
-        mujoco.mj_forward(model, data)
-        mujoco.mj_jacSite(model, data, *rows, site)
-        moment = load[:3] @ rows[1] + load[3:] @ rows[0]
-        return data.qfrc_passive - data.qfrc_bias + moment
-
-    q = model.qpos0.copy()
-    for _ in range(30):
-        now, steps = force(q), 1e-6 * np.eye(model.nv)
-        slope = np.stack([(force(q + h) - force(q - h)) / 2e-6 for h in steps], axis=1)
-        change = np.linalg.solve(slope, -now)
-        q = q + change * min(1.0, 0.3 / np.abs(change).max())
-        if np.abs(change).max() < 1e-9:
-            break
-    assert np.abs(force(q)).max() < 1e-10
-    return data.site_xpos[site].copy()
-
-
 def spatial(wrench):
     """A wrench or place of the plane in space."""
     wrench = np.asarray(wrench)
     if len(wrench) == 3:
         return np.array([0, 0, wrench[0], wrench[1], wrench[2], 0])
     return wrench
-
-
-def lowest(model):
-    """Lowest frequency [Hz] of the chain in MuJoCo, at rest."""
-    data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
-    mujoco.mj_forward(model, data)
-    for row, unit in zip(mass, np.eye(model.nv), strict=True):
-        mujoco.mj_mulM(model, data, row, unit)
-    stiffness = np.zeros(model.nv)
-    stiffness[model.jnt_dofadr] = model.jnt_stiffness
-    values = scipy.linalg.eigh(np.diag(stiffness), mass, eigvals_only=True)
-    return np.sqrt(values[0]) / (2 * np.pi)
 
 
 @pytest.fixture(scope="module", params=RODS)

@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.discrete_rod import Bar, flight
 from benchmarks.harness import Row, measure, quick
 from sorojax._types import real
-from sorojax.math.lie import SE2, SE3, homogeneous, plane_rotation
+from sorojax.math.lie import SE2, SE3, homogeneous
 from sorojax.math.ode.steppers import DormandPrince, GeneralisedAlpha, TripleJump
 from sorojax.rod import (
     AbstractForce,
@@ -67,16 +67,16 @@ class Pulse(AbstractForce):
         return share * self.wrench @ columns
 
 
-def spaghetti():
-    """The rod of Simo and Vu-Quoc (1988)."""
-    few = MODES - 1
-    basis = chebyshev(
-        kappa_x=few, kappa_y=MODES, kappa_z=MODES, sigma_x=few, sigma_y=few, sigma_z=few
-    )
+def flying(group, turn, start):
+    """A rod on a free base: 1e4 N in stretch and shear, 500 N m^2 in bending and torsion."""
+    names = ("kappa_z", "sigma_x", "sigma_y")
+    if group.space_dim == 3:
+        names = ("kappa_x", "kappa_y", *names, "sigma_z")
+    bends = ("kappa_y", "kappa_z")
     beam = rod(
-        SE3(),
-        basis,
-        Section(1.0, 0.05, 0.05, 0.05, 1.0),  # 1e4 N in stretch and shear, 500 N m^2
+        group,
+        chebyshev(**{name: MODES - (name not in bends) for name in names}),
+        Section(1.0, 0.05, 0.05, 0.05, 1.0),
         length=LENGTH,
         young_modulus=1e4,
         poisson_ratio=-0.5,
@@ -84,8 +84,18 @@ def spaghetti():
         nodes=NODES,
         mass_section=Section(1.0, 10.0, 10.0, 10.0, 1.0),
     )
-    start = homogeneous(jnp.array(TILT), jnp.array(START))
-    return assembly(SE3(), rod=Part(beam, Free(), offset=start))
+    pose = homogeneous(jnp.array(turn), jnp.array(start))
+    return assembly(group, rod=Part(beam, Free(), offset=pose))
+
+
+def spaghetti():
+    """The rod of Simo and Vu-Quoc (1988)."""
+    return flying(SE3(), TILT, START)
+
+
+def in_plane():
+    """The rod of Simo and Vu-Quoc, J. Appl. Mech. 53, 1986."""
+    return flying(SE2(), TILT[:2, :2], START[:2])
 
 
 def fly(model, forces, stepper, step):
@@ -102,23 +112,6 @@ def fly(model, forces, stepper, step):
         stepper=stepper,
     )
     return jax.vmap(lambda q, v: momentum(model, q, v))(path.q[10:], path.v[10:])
-
-
-def in_plane():
-    """The rod of Simo and Vu-Quoc, J. Appl. Mech. 53, 1986."""
-    beam = rod(
-        SE2(),
-        chebyshev(kappa_z=MODES, sigma_x=MODES - 1, sigma_y=MODES - 1),
-        Section(1.0, 0.05, 0.05, 0.05, 1.0),
-        length=LENGTH,
-        young_modulus=1e4,
-        poisson_ratio=-0.5,
-        density=1.0,
-        nodes=NODES,
-        mass_section=Section(1.0, 10.0, 10.0, 10.0, 1.0),
-    )
-    start = homogeneous(plane_rotation(jnp.arctan2(-0.8, 0.6)), jnp.array(START[:2]))
-    return assembly(SE2(), rod=Part(beam, Free(), offset=start))
 
 
 def ends(model, forces):

@@ -107,6 +107,12 @@ def small_strain_moduli(
     return jax.vmap(_moduli_at_rest, in_axes=(axes,))(material)
 
 
+def small_strain_young_modulus(material: AbstractHyperelastic) -> Float[Array, "..."]:
+    """Young's modulus of `material` at rest [Pa], one per cell if leaves are."""
+    shear, bulk = small_strain_moduli(material)
+    return 9 * bulk * shear / (3 * bulk + shear)
+
+
 @once
 def _moduli_at_rest(material):
     stretch = jnp.stack(

@@ -24,7 +24,7 @@ from sorojax.contact.facet import Contacts, contacts, gaps, surface
 from sorojax.contact.friction import Grip, friction_law, no_grip
 from sorojax.fem.loads.facets import CurvedPart, areas_of, blockwise, facet_tables, group_energy
 from sorojax.fem.loads.loads import AbstractLoad
-from sorojax.material.hyperelastic import small_strain_moduli
+from sorojax.material.hyperelastic import small_strain_young_modulus
 from sorojax.mesh.elements.base import facet_corners
 from sorojax.mesh.mesh import Mesh
 from sorojax.sdf.base import AbstractSdf
@@ -57,8 +57,7 @@ _TOGETHER = 32  # facets that the broad phase judges by one ball
 def default_law(mesh, material, facets, stiffness, smoothing) -> tuple[Array, Array]:
     """Stiffness [Pa/m] and smoothing [m], where they are not given, from the size of the
     facets and the softest cells at their nodes."""
-    shear, bulk = small_strain_moduli(material)
-    young = jnp.broadcast_to(9 * bulk * shear / (3 * bulk + shear), (mesh.num_cells,))
+    young = jnp.broadcast_to(small_strain_young_modulus(material), (mesh.num_cells,))
     of_nodes = jnp.full(mesh.num_nodes, jnp.inf, young.dtype)
     young = jnp.mean(of_nodes.at[mesh.cells].min(young[:, None])[facets])
     stiffness = 10 * young / mean_size(mesh, facets) if stiffness is None else stiffness
@@ -149,7 +148,7 @@ class Contact(AbstractPenaltyContact):
     held points give way by the coefficient times the overlap, and `friction_velocity` [m/s]
     that of its dashpot. Friction has a memory: `simulate` keeps it; in statics `solve` takes
     friction at the pressures that the load knows of, none at first, and
-    `advanced(problem, u)` lets it know of an equilibrium.
+    `fem.update_friction(problem, u)` lets it know of an equilibrium.
 
     Points that are deep inside when a motion begins are let out at `release_velocity` [m/s],
     not shot out; with `None` the whole overlap pushes at once. In a step the pressure is
@@ -264,6 +263,9 @@ class Contact(AbstractPenaltyContact):
         traction = self.slider.traction(self.grip, points - self.value[None, None])
         friction = (areas[..., None] * traction).reshape(flat.shape)
         return found._replace(force=found.force + friction, friction=friction)
+
+    def remembered(self, problem, u):
+        return self if self.grip is None else settled(self, problem, u)
 
     def begun(self, problem, step):
         load, at_first = self, self

@@ -14,9 +14,8 @@ from sorojax._jax.trace_state import is_traced
 from sorojax._progress import report
 from sorojax.contact.facet import Contacts
 from sorojax.fem.assembly.space import space
-from sorojax.fem.contact.obstacle import Contact, settled
+from sorojax.fem.contact.obstacle import Contact
 from sorojax.fem.contact.self_contact import SelfContact, with_partners
-from sorojax.fem.embedded.bonded import BondedRod
 from sorojax.fem.equilibrium.solve import ConvergenceError, Solution, solve
 from sorojax.fem.loads import checks as checks_loads
 from sorojax.fem.problem import Problem
@@ -41,13 +40,7 @@ def update_friction(problem: Problem, u: Float[Array, "nodes dim"]) -> Problem:
     """
     bare = dataclasses.replace(problem, supports=(), loads=())
 
-    def known(load):
-        if isinstance(load, BondedRod):
-            return load.advanced(bare, u)
-        rubs = isinstance(load, Contact) and load.grip is not None
-        return settled(load, bare, u) if rubs else load
-
-    loads = tuple(map(known, problem.loads))
+    loads = tuple(load.remembered(bare, u) for load in problem.loads)
     return eqx.tree_at(lambda p: p.loads, problem, loads)
 
 

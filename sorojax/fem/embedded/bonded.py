@@ -15,7 +15,7 @@ from sorojax.fem.embedded import line
 from sorojax.fem.embedded.rods import EmbeddedRod
 from sorojax.fem.loads.facets import CurvedPart
 from sorojax.fem.loads.loads import AbstractLoad
-from sorojax.material.hyperelastic import AbstractHyperelastic, small_strain_moduli
+from sorojax.material.hyperelastic import AbstractHyperelastic, small_strain_young_modulus
 from sorojax.mesh.mesh import Mesh
 
 if TYPE_CHECKING:
@@ -117,14 +117,14 @@ class BondedRod(AbstractLoad):
             gap, ends[self._near(jnp)]
         )
 
-    def advanced(self, problem: "Problem", u) -> "BondedRod":
+    def remembered(self, problem, u):
         """The load that knows of the equilibrium `u` [m]: the bond has slid to its limit."""
         slip, limit = self.slips(problem, u), self.bond_strength / self.bond_stiffness
         stretch = jnp.clip(slip - self.slipped, -limit, limit)
         return dataclasses.replace(self, slipped=slip - stretch)
 
     def begun(self, problem, step):
-        return self.advanced(problem, step.u)
+        return self.remembered(problem, step.u)
 
     def couples(self):
         return self._groups(np)
@@ -241,8 +241,7 @@ def bonded_rod(
                 "fem.bonded_rod: got neither `tie_stiffness` nor `material`, need one. Give "
                 "the material of the solid."
             )
-        shear, bulk = small_strain_moduli(material)
-        tie_stiffness = _TIE * jnp.mean(9 * bulk * shear / (3 * bulk + shear))
+        tie_stiffness = _TIE * jnp.mean(small_strain_young_modulus(material))
     bond_stiffness = tie_stiffness if bond_stiffness is None else bond_stiffness
     ends = rod.vertices(mesh.points)[0]
     nodes = mesh.num_nodes + np.arange(len(ends))

@@ -41,7 +41,7 @@ from sorojax.fem.kinematics import Axisymmetric
 from sorojax.fem.loads.facets import CurvedPart
 from sorojax.fem.loads.loads import AbstractLoad
 from sorojax.fem.loads.springs import Route
-from sorojax.material.hyperelastic import AbstractHyperelastic, small_strain_moduli
+from sorojax.material.hyperelastic import AbstractHyperelastic, small_strain_young_modulus
 from sorojax.mesh.measure import Locations, cells_at, locate
 from sorojax.mesh.mesh import Mesh
 
@@ -347,8 +347,7 @@ def _stiffnesses(axial, bending, radius, young, matrix):
     for name, number, unit in (("radius", radius, "m"), ("young_modulus", young, "Pa")):
         _check.positive("fem.embedded_rod", name, number, unit, "SI units: 0.5 * mm, 2 * GPa.")
     if matrix is not None:
-        shear, bulk = small_strain_moduli(matrix)
-        young = young - jnp.mean(9 * bulk * shear / (3 * bulk + shear))
+        young = young - jnp.mean(small_strain_young_modulus(matrix))
         do = "A rod softer than the solid is a hole: mesh it."
         _check.positive("fem.embedded_rod", "young_modulus - matrix", young, "Pa", do)
     return young * jnp.pi * radius**2, young * jnp.pi * radius**4 / 4

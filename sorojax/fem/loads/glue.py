@@ -12,7 +12,7 @@ from sorojax._types import Numbers, integers, optional_real, real
 from sorojax.fem.loads.facets import CurvedPart
 from sorojax.fem.loads.loads import AbstractLoad
 from sorojax.fem.loads.segments import functions_at, pieces
-from sorojax.material.hyperelastic import small_strain_moduli
+from sorojax.material.hyperelastic import small_strain_young_modulus
 from sorojax.mesh.elements.base import facet_corners
 from sorojax.mesh.measure import locate
 from sorojax.mesh.mesh import Mesh, facet_table
@@ -82,8 +82,7 @@ class Glue(AbstractLoad):
     def completed(self, mesh, material, kinematics):
         if self.stiffness is not None:
             return self
-        shear, bulk = small_strain_moduli(material)
-        modulus = jnp.max(9 * bulk * shear / (3 * bulk + shear))
+        modulus = jnp.max(small_strain_young_modulus(material))
         length = jnp.mean(jnp.ptp(mesh.points[mesh.cells], axis=1))
         return eqx.tree_at(
             lambda load: load.stiffness,

@@ -83,6 +83,11 @@ class AbstractLoad(eqx.Module):
         returns is the load that the next step begins with, its `value` set anew."""
         return self
 
+    def remembered(self, problem: "Problem", u: Float[Array, "nodes dim"]) -> "AbstractLoad":
+        """The load that knows of the equilibrium `u` of a step, for the next one: itself where
+        it has no memory."""
+        return self
+
     def completed(self, mesh: Any, material: Any, kinematics: Any) -> "AbstractLoad":
         """The load with the numbers filled in that it takes from body and mesh."""
         return self

@@ -9,7 +9,7 @@ from sorojax import _check
 from sorojax._types import Numbers, integers, optional_real, real
 from sorojax.fem.loads.facets import CurvedPart
 from sorojax.fem.loads.loads import AbstractLoad
-from sorojax.material.hyperelastic import small_strain_moduli
+from sorojax.material.hyperelastic import small_strain_young_modulus
 from sorojax.mesh.mesh import Mesh
 
 _STIFFNESS = 1e4  # times that of the material around
@@ -66,8 +66,7 @@ class Rigid(AbstractLoad):
     def completed(self, mesh, material, kinematics):
         if self.stiffness is not None:
             return self
-        shear, bulk = small_strain_moduli(material)
-        modulus = jnp.max(9 * bulk * shear / (3 * bulk + shear))
+        modulus = jnp.max(small_strain_young_modulus(material))
         length = jnp.mean(jnp.ptp(mesh.points[mesh.cells], axis=1))
         if mesh.element.dim == 2:
             middle = tuple(jnp.mean(mesh.points, axis=0))

@@ -71,7 +71,7 @@ class HeldTerms(NamedTuple):
 
 
 @jax.custom_jvp
-def _pseudo_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def pseudo_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Of a symmetric matrix without negative eigenvalues, of one rank all around."""
     values, vectors = jnp.linalg.eigh(matrix)
     kept = values > _RANK * values[-1:]
@@ -79,10 +79,10 @@ def _pseudo_inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return (vectors * inverse[None]) @ vectors.T
 
 
-@_pseudo_inverse.defjvp
+@pseudo_inverse.defjvp
 def _pseudo_inverse_jvp(primals, tangents):
     (matrix,), (change,) = primals, tangents
-    inverse = _pseudo_inverse(matrix)
+    inverse = pseudo_inverse(matrix)
     spare = jnp.eye(matrix.shape[0], dtype=matrix.dtype) - matrix @ inverse
     side = spare @ change @ inverse @ inverse
     return inverse, side + side.T - inverse @ change @ inverse
@@ -94,7 +94,7 @@ def hold(reach: Float[Array, "equations equations"]) -> Hold:
     known = size > 0
     scale = jnp.where(known, 1 / jnp.sqrt(jnp.where(known, size, jnp.ones_like(size))), 0.0)
     scaled = reach * scale[:, None] * scale[None]
-    kept = scaled @ _pseudo_inverse(scaled)
+    kept = scaled @ pseudo_inverse(scaled)
     kept = (kept + kept.T) / 2
     return Hold(kept * scale[None], jnp.eye(reach.shape[0], dtype=reach.dtype) - kept)
 

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax.math.lie import homogeneous
-from sorojax.math.ode.held import Held
+from sorojax.math.ode.held import Held, accelerate
 from sorojax.rod.dynamics.moving import spin_cross, swept, turned_pose, turned_twists
 from sorojax.rod.dynamics.points import moment_of
 from sorojax.rod.dynamics.tree import (
@@ -160,6 +160,16 @@ def held(moment: AssemblyState, t: Float[Array, ""], pull: float = 0.0) -> Held:
     if pull == 0:
         return Held(rows, -change.bias)
     return Held(rows, -change.bias - 2 * pull * change.rate - pull**2 * change.value)
+
+
+def divided(
+    moment: AssemblyState, t: Float[Array, ""], mass: Array, force: Float[Array, " dof"]
+) -> tuple[Float[Array, " dof"], Float[Array, " equations"]]:
+    """A generalised force as the least effort, in the metric of the inverse mass, and the
+    reactions of closures beside it."""
+    rows = closure_jacobian(moment, t)
+    found = accelerate(mass, force, Held(rows, jnp.zeros(rows.shape[0], rows.dtype)))
+    return mass @ found.x, -found.reactions
 
 
 def held_rates(

@@ -17,7 +17,7 @@ from sorojax._types import Numbers, real
 from sorojax.math.compiled import batched, chunked_lanes, full_products, jit_public
 from sorojax.math.linalg.dense import solve_symmetric
 from sorojax.math.ode.held import accelerate
-from sorojax.rod.dynamics.closures import held
+from sorojax.rod.dynamics.closures import divided, held
 from sorojax.rod.dynamics.fields import RodState
 from sorojax.rod.dynamics.moving import mass_jacobian, mass_position
 from sorojax.rod.dynamics.points import moment_of
@@ -167,9 +167,7 @@ def inverse_dynamics(
     mass, coriolis = inertia(moment)
     force = mass @ a + coriolis - loads.total_force(forces, real(t), moment)
     if isinstance(moment, AssemblyState) and is_closed(model):
-        still = held(moment, real(t))
-        still = still._replace(wanted=jnp.zeros_like(still.wanted))
-        return mass @ accelerate(mass, force, still).x
+        return divided(moment, real(t), mass, force)[0]
     return force
 
 

@@ -2,13 +2,11 @@
 
 from typing import overload
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax._types import real
 from sorojax.math.compiled import jit_public
-from sorojax.math.ode.held import accelerate
-from sorojax.rod.dynamics.closures import closure_loads, held
+from sorojax.rod.dynamics.closures import closure_loads, divided
 from sorojax.rod.dynamics.dynamics import Coordinates, Forces, Rates
 from sorojax.rod.dynamics.moving import turned_twists
 from sorojax.rod.dynamics.tree import (
@@ -121,6 +119,4 @@ def _reactions(
     """Reactions of closures that leave the least to be done by actuators."""
     mass, coriolis = assembly_inertia(moment)
     needed = mass @ a + coriolis - total_force(forces, t, moment)
-    still = held(moment, t)
-    still = still._replace(wanted=jnp.zeros_like(still.wanted))
-    return -accelerate(mass, needed, still).reactions
+    return divided(moment, t, mass, needed)[1]

@@ -35,6 +35,8 @@ class Closure(eqx.Module):
         at: Where on a rod that is held, in [0, 1].
         motion: From time [s] to the pose of the joint beyond `offset`, homogeneous, or to its
             position alone [m]: an end that is driven. Twice differentiable for a run in time.
+            An `eqx.Module` passes through `jax.jit` with the model, and its numbers have
+            derivatives; a plain function needs a closure over the model, or `eqx.filter_jit`.
     """
 
     part: str = eqx.field(static=True)

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sorojax.math.ode.held import pseudo_inverse
 from sorojax.rod.dynamics.closures import (
     closure_force,
     closure_jacobian,
@@ -30,7 +31,6 @@ from sorojax.rod.model.closure import equations
 from sorojax.rod.model.model import Model, motion
 from sorojax.rod.model.rod import Rod
 
-_DEPENDENT = 1e-10  # of a compliance squared: below it an equation follows from others
 _FLOOR = 1e-6  # of the mean compliance of the closures, where one finds none at rest
 
 
@@ -124,14 +124,11 @@ def within_closures(
     scale = jnp.sqrt(jnp.diag(metric)[:dof])
     inner = slope[:dof, :dof] / (scale[:, None] * scale[None])
     rows = slope[dof:, :dof] / scale[None]
-    rows = rows / jnp.sqrt(jnp.sum(rows**2, axis=1, keepdims=True))
-    values, vectors = jnp.linalg.eigh(rows @ rows.T)
-    least = _DEPENDENT**0.5 * jnp.max(values)
-    inverse = jnp.where(values > least, 1 / jnp.where(values > least, values, 1.0), 0.0)
-    across = rows.T @ (vectors * inverse[None]) @ vectors.T @ rows
-    along = jnp.asarray(jnp.eye(dof), slope.dtype) - across
-    stiff = jnp.max(jnp.abs(inner)) * across
-    kept = along @ inner @ along + stiff
+    size = jnp.sqrt(jnp.sum(rows**2, axis=1, keepdims=True))
+    rows = rows / jnp.where(size > 0, size, jnp.ones_like(size))
+    across = rows.T @ pseudo_inverse(rows @ rows.T) @ rows
+    along = jnp.eye(dof, dtype=slope.dtype) - across
+    kept = along @ inner @ along + jnp.max(jnp.abs(inner)) * across
     return kept * (scale[:, None] * scale[None]), metric[:dof, :dof]
 
 

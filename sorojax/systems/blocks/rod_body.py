@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from sorojax._types import optional_real
 from sorojax.math.lie import homogeneous
 from sorojax.math.linalg.dense import solve_symmetric
-from sorojax.math.ode.held import Reacted, accelerate
+from sorojax.math.ode.held import accelerate
 from sorojax.math.status import Status
 from sorojax.rod import (
     AbstractForce,
@@ -252,8 +252,9 @@ class AssemblyBody(AbstractBlock):
             return q
         for loop in self.assembly.loops:
             if name == f"{loop}_wrench":
-                moment, found, _ = self._solved(t, state, inputs)
-                return closure_wrenches(moment, t, found.reactions)[loop]
+                moment, _, reactions, _ = self._solved(t, state, inputs)
+                assert reactions is not None  # there is a loop
+                return closure_wrenches(moment, t, reactions)[loop]
         for part, chamber in self._maps().items():
             kind = name.removeprefix(f"{part}_")
             if name != kind and kind in _FLUID:
@@ -270,11 +271,12 @@ class AssemblyBody(AbstractBlock):
             constants, forces = operators(self.assembly), self.acting(inputs)
             a = acceleration(self.assembly, constants, t, q, v, forces)
             return {"q": rate(self.assembly, q, v), "v": a}
-        _, found, rates = self._solved(t, state, inputs)
-        return {"q": rate(self.assembly, q, v), "v": found.x} | rates
+        _, a, _, rates = self._solved(t, state, inputs)
+        return {"q": rate(self.assembly, q, v), "v": a} | rates
 
-    def _solved(self, t, state, inputs) -> tuple[Any, Any, dict[str, Array]]:
-        """The moment, the acceleration with its reactions, and the rates of what remembers."""
+    def _solved(self, t, state, inputs) -> tuple[Any, Array, Array | None, dict[str, Array]]:
+        """The moment, the acceleration, the reactions of closures, and the rates of what is
+        kept beside q and v."""
         model, rates = self._with_motions(t, state, inputs)
         constants = operators(model)
         pull, remembering = _branches(model, self.forces, state, constants)
@@ -282,13 +284,11 @@ class AssemblyBody(AbstractBlock):
         mass, coriolis = inertia(moment)
         force = total_force(relaxed(self.acting(inputs)), t, moment) - coriolis
         force = force if pull is None else force + pull
-        if is_closed(model):
-            pull_shut = SERVO if self.moved else PULL
-            found = accelerate(mass, force, held(moment, t, pull_shut))
-        else:
-            none = jnp.zeros(0, force.dtype)
-            found = Reacted(solve_symmetric(mass, force), none, none[None])
-        return moment, found, rates | remembering
+        rates = rates | remembering
+        if not is_closed(model):
+            return moment, solve_symmetric(mass, force), None, rates
+        found = accelerate(mass, force, held(moment, t, SERVO if self.moved else PULL))
+        return moment, found.x, found.reactions, rates
 
     def _with_motions(self, t, state, inputs) -> tuple[Assembly, dict[str, Array]]:
         """The assembly with moved closures where they are, and the rates of their places."""

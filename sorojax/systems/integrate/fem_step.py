@@ -129,10 +129,15 @@ def loaded(stage: Stage, values: dict[str, Array]) -> fem.Problem:
     loads, supports, *others = stage.step.terms
     loads = with_values(loads, on_the_way(stage, values))
     given = stage.dynamics.problem
-    if any(support.name in values for support in given.supports):
+    if _moves_supports(stage, values):
         moved = with_places(given.supports, values)
         _, supports = held_within(moved, stage.dynamics.scheme.af, stage.state.displacement)
     return with_terms(given, (loads, supports, *others))
+
+
+def _moves_supports(stage: Stage, values: dict[str, Array]) -> bool:
+    """Whether supports are among what is driven."""
+    return any(support.name in values for support in stage.dynamics.problem.supports)
 
 
 def loaded_step(stage: Stage, values: dict[str, Array]) -> TimeStep:
@@ -293,9 +298,10 @@ def _small(newton, stages, unravel, problems, found: dict[str, Linearised], u, v
         allowed = state.reference, state.rounding, newton.residual_tolerance
         norm = jnp.maximum(state.residual_norm, lack)  # of which neither may be NaN
         fits.append(rules.balanced(norm, *allowed))
-        off = jax.jvp(lambda v, s=stage: _held(s, v), (values[name],), (missed,))[1]
-        size = rules.relative_size(off, u[name], stage.prepared.length)
-        fits.append(size < newton.step_tolerance)
+        if _moves_supports(stage, values[name]):
+            off = jax.jvp(lambda v, s=stage: _held(s, v), (values[name],), (missed,))[1]
+            size = rules.relative_size(off, u[name], stage.prepared.length)
+            fits.append(size < newton.step_tolerance)
     return jnp.all(jnp.stack(fits))
 
 
@@ -319,6 +325,10 @@ def _solved(equations, given, matrices, stages, u: Fields, values: Drives, force
 
         first[name] = answered(-forces[name], moves[name])
         pull = jax.jacfwd(force)(w).T  # what a unit of each value adds
+        if not _moves_supports(stage, values[name]):
+            pull = jnp.where(known[None], jnp.zeros_like(pull), pull)
+            columns[name] = jax.vmap(lambda b, s=system, m=matrix: sparse.solve(s, m, b))(pull)
+            continue
         lead = jax.jacfwd(lambda w, n=name, s=stage: _held(s, unravel(w)[n]))(w).T
         columns[name] = jax.vmap(answered)(pull, lead)
 
