@@ -12,6 +12,7 @@ Reference:
     pseudo-inverse.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -24,7 +25,7 @@ from sorojax.math.linalg.dense import solve_columns, solve_symmetric
 _RANK = 1e-10  # of the largest eigenvalue of G M^-1 G', rows of equal size: dependent below
 _NEAR_SINGULAR = 1e-4  # of one over the condition number at the start
 _WELL = 1e-9  # [rad], [m]: of a smaller violation one pass leaves less than 1e-10
-_PASSES = 3  # at most, in a step
+_PASSES = 4  # after the first, at most, in a step
 
 
 class Held(NamedTuple):
@@ -59,6 +60,7 @@ class HeldTerms(NamedTuple):
         accelerations: (t, q, v) -> (mass matrix, force, `Held` of accelerations).
         rates: (t, q, v) -> (mass matrix, force, `Held` of rates).
         place: (t, q) -> (g, `Held` of rates).
+        gap: (t, q) -> g.
         by: The independent equations.
         near: Inverse of the inertia at the start, along which explicit steps go back.
     """
@@ -66,6 +68,7 @@ class HeldTerms(NamedTuple):
     accelerations: Callable[[Array, Array, Array], tuple[Array, Array, Held]]
     rates: Callable[[Array, Array, Array], tuple[Array, Array, Held]]
     place: Callable[[Array, Array], tuple[Array, Held]]
+    gap: Callable[[Array, Array], Array]
     by: Hold
     near: Float[Array, "dof dof"]
 
@@ -139,7 +142,8 @@ def projected(
     pulled: Float[Array, "dof equations"] | None = None,
 ) -> tuple[Array, Array, Array]:
     """Coordinates and rates that keep the equations, and how far these are from dependent:
-    one over the condition number of the matrix of their reactions.
+    one over the condition number of the matrix of their reactions. Coordinates go back by
+    simplified Newton passes, with the slopes of the first, at which rates are judged too.
 
     Args:
         terms: What holds.
@@ -148,28 +152,25 @@ def projected(
         state: Coordinates and rates.
         pulled: Motions by which they may change; those of reactions at the start if omitted.
     """
-    by = terms.by
+    by, (q, v) = terms.by, state
+    value, held = terms.place(t, q)
+    rows = by.combine @ held.rows
+    along = terms.near @ rows.T if pulled is None else pulled
+    reach = rows @ along + by.spare
+    inverse = jnp.linalg.inv(reach)
+    back = along @ inverse @ by.combine
+    v = v - back @ (held.rows @ v - held.wanted)
 
-    def nearer(q, v):
-        value, held = terms.place(t, q)
-        rows = by.combine @ held.rows
-        along = terms.near @ rows.T if pulled is None else pulled
-        missing = by.combine @ jnp.stack([value, -held.wanted], axis=1)
-        missing = missing.at[:, 1].add(rows @ v)
-        reach = rows @ along + by.spare
-        inverse = jnp.linalg.inv(reach)
-        change = along @ (inverse @ missing)
-        size = jnp.max(jnp.abs(jax.lax.stop_gradient(value)))
-        return move(q, -change[:, 0]), v - change[:, 1], _share(reach, inverse), size
+    def nearer(q, value):
+        return move(q, -back @ value), jnp.max(jnp.abs(jax.lax.stop_gradient(value)))
 
     def again(found, _):
-        q, v, share, size = found
-        return jax.lax.cond(size > _WELL, lambda: nearer(q, v), lambda: found), None
+        q, size = found
+        closer = functools.partial(nearer, q)
+        return jax.lax.cond(size > _WELL, lambda: closer(terms.gap(t, q)), lambda: found), None
 
-    one = jnp.ones((), state[0].dtype)
-    begin = *state, one, jnp.inf * one
-    (q, v, share, _), _ = jax.lax.scan(again, begin, length=_PASSES)
-    return q, v, share
+    (q, _), _ = jax.lax.scan(again, nearer(q, value), length=_PASSES)
+    return q, v, _share(reach, inverse)
 
 
 def _share(reach: Array, inverse: Array) -> Float[Array, ""]:

@@ -66,11 +66,14 @@ def held_terms(
     def place(t, q):
         return held_rates(motion(model, q, constants=constants), t)
 
+    def gap(t, q):
+        return violations(motion(model, q, constants=constants), t)
+
     moment = motion(model, q, constants=constants)
     near = jnp.linalg.inv(inertia(moment)[0])
     rows = closure_jacobian(moment, t)
     by = hold(rows @ near @ rows.T)
-    return HeldTerms(accelerations, rates, place, by, near)
+    return HeldTerms(accelerations, rates, place, gap, by, near)
 
 
 def reactions_along(

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from sorojax.math.lie import homogeneous
 from sorojax.math.ode.held import Held, accelerate
-from sorojax.rod.dynamics.moving import spin_cross, swept, turned_pose, turned_twists
+from sorojax.rod.dynamics.moving import spin_cross, turned_pose, turned_twists
 from sorojax.rod.dynamics.points import moment_of
 from sorojax.rod.dynamics.tree import (
     AssemblyState,
@@ -28,10 +28,8 @@ from sorojax.rod.dynamics.tree import (
     bias_rates,
     gather,
     in_own_frames,
-    part_columns,
-    sections,
 )
-from sorojax.rod.model.assembly import index_of, slices
+from sorojax.rod.model.assembly import closure_ends, slices
 from sorojax.rod.model.closure import Closure, equations
 
 
@@ -106,11 +104,9 @@ def closure_loads(
     loads: list[Array | None] = [None] * len(moment.frames)
     pairs = _pairs(moment, t)
     for pair, wrench in zip(pairs, _wrenches(moment, pairs, reactions), strict=True):
-        for end, sign in ((pair.held, 1), (pair.holder, -1)):
-            if end.index is not None:
-                load = _load(moment, end, pair.held.position, sign * wrench)
-                before = loads[end.index]
-                loads[end.index] = load if before is None else before + load
+        for index, load in _pulled(pair, wrench[None]):
+            before = loads[index]
+            loads[index] = load[0] if before is None else before + load[0]
     return loads
 
 
@@ -118,12 +114,13 @@ def closure_jacobian(
     moment: AssemblyState, t: Float[Array, ""]
 ) -> Float[Array, "equations dof"]:
     """G: rates of the violations per rate of the assembly."""
-    columns, rows = part_columns(moment), []
+    rows = []
     for pair in _pairs(moment, t):
-        twist = _moved(pair.held, pair.held.position, columns)
-        if pair.holder.index is not None:
-            twist = twist - _moved(pair.holder, pair.held.position, columns)
-        rows.append(_slopes(moment, pair) @ _seen_from(pair.holder.rotation, twist))
+        loads: list[Array | None] = [None] * len(moment.frames)
+        for index, load in _pulled(pair, _unit_wrenches(moment, pair)):
+            before = loads[index]
+            loads[index] = load if before is None else before + load
+        rows.append(gather(moment, loads))
     return jnp.concatenate(rows)
 
 
@@ -206,6 +203,8 @@ def _rates(moment: AssemblyState, end: _End, biases: list) -> _Rates | None:
         turning = turned_twists(frame.rotation, start[:, None], rot)[:rot, 0]
         bias = bias.at[rot:].add(_cross(turning, end.centre - frame.position))
     at_centre = _Rates(twist[:rot], twist[rot:], bias[:rot], bias[rot:])
+    if end.position is end.centre:
+        return at_centre
     return _on_arm(at_centre, end.position - end.centre)
 
 
@@ -221,8 +220,7 @@ def _on_arm(rates: _Rates, arm: Float[Array, " dim"]) -> _Rates:
 def _section_biases(moment: AssemblyState) -> list:
     """Of each part that a closure is on: the acceleration of its frame along its own axes, and
     how those of its sections grow along it, where no coordinate accelerates."""
-    names = {n for c in moment.assembly.closures for n in (c.part, c.on) if n is not None}
-    among = {index_of(moment.assembly, name) for name in names}
+    among = {index for index in closure_ends(moment.assembly) if index is not None}
     along = in_own_frames(moment, bias_rates, among=among)
     return list(zip(bias_accelerations(moment), along, strict=True))
 
@@ -305,15 +303,10 @@ def _pairs(moment: AssemblyState, t: Float[Array, ""]) -> list[_Pair]:
 def _ends(moment: AssemblyState) -> list[_End]:
     """The frame that is held and the one that holds it, of every closure in turn."""
     model, dtype = moment.assembly, moment.q.dtype
-    places = []
-    for closure, rows in zip(model.closures, moment.operators.ends, strict=True):
-        for part, own in zip((closure.part, closure.on), rows, strict=True):
-            places.append((None if part is None else index_of(model, part), own))
     poses = [x for closure in model.closures for x in (closure.frame, closure.offset)]
+    places = closure_ends(model), moment.ends, moment.operators.ends, poses
     found = []
-    for (index, rows), section, pose in zip(
-        places, sections(moment, places), poses, strict=True
-    ):
+    for index, section, rows, pose in zip(*places, strict=True):
         end = _in_world(moment, index, section)._replace(rows=rows)
         found.append(end if pose is None else _beyond(end, pose.astype(dtype)))
     return found
@@ -350,15 +343,18 @@ def _wrenches(moment: AssemblyState, pairs: list[_Pair], reactions: Array) -> li
     found = []
     for pair, at in zip(pairs, equations(moment.assembly), strict=True):
         _, pull = jax.vjp(_violation_after(moment, pair), _still(moment))
-        (wrench,) = pull(reactions[at])
-        rot = moment.assembly.group.rotation_dim
-        found.append(turned_twists(pair.holder.rotation, wrench[:, None], rot)[:, 0])
+        found.append(_along_world(pair, pull(reactions[at])[0][None])[0])
     return found
 
 
-def _slopes(moment: AssemblyState, pair: _Pair) -> Float[Array, "held twist"]:
-    """Rates of the violation per relative twist."""
-    return jax.jacrev(_violation_after(moment, pair))(_still(moment))
+def _unit_wrenches(moment: AssemblyState, pair: _Pair) -> Float[Array, "held twist"]:
+    """Those of reactions of one, along world axes."""
+    return _along_world(pair, jax.jacrev(_violation_after(moment, pair))(_still(moment)))
+
+
+def _along_world(pair: _Pair, wrenches: Float[Array, "n twist"]) -> Float[Array, "n twist"]:
+    turn = pair.holder.rotation
+    return turned_twists(turn, wrenches.T, wrenches.shape[1] - turn.shape[0]).T
 
 
 def _still(moment: AssemblyState) -> Float[Array, " twist"]:
@@ -377,29 +373,15 @@ def _violation_after(moment: AssemblyState, pair: _Pair):
     return after
 
 
-def _seen_from(rotation: Array, twists: Float[Array, "twist n"]) -> Float[Array, "twist n"]:
-    """World twists along the axes of a frame."""
-    return turned_twists(rotation.T, twists, twists.shape[0] - rotation.shape[0])
-
-
-def _load(
-    moment: AssemblyState, end: _End, point: Array, wrench: Float[Array, " twist"]
-) -> Float[Array, " own"]:
-    """Generalised force, in the columns of its part, of a wrench about a point."""
-    assert end.jacobian is not None
-    dim = point.shape[0]
-    arm = (point - end.centre)[None]
-    spin = wrench[:-dim] + moment_of(arm, wrench[None, -dim:])[0]
-    return jnp.concatenate([spin, wrench[-dim:]]) @ end.jacobian
-
-
-def _moved(
-    end: _End, point: Array, columns: tuple[Float[Array, "own dof"], ...]
-) -> Float[Array, "twist dof"]:
-    """Twist of the body of an end at a point, world axes, per rate of the assembly."""
-    assert end.index is not None and end.jacobian is not None
-    dim = point.shape[0]
-    arm = (point - end.centre)[None]
-    angular, linear = end.jacobian[:-dim], end.jacobian[-dim:]
-    linear = linear + swept(angular[None], arm)[0]
-    return jnp.concatenate([angular, linear]) @ columns[end.index]
+def _pulled(
+    pair: _Pair, wrenches: Float[Array, "n twist"]
+) -> list[tuple[int, Float[Array, "n own"]]]:
+    """Generalised forces, in the columns of its part, on each end that is not on the ground:
+    of wrenches on the frame that is held, along world axes, and their opposites."""
+    found, point = [], pair.held.position
+    for end, sign in ((pair.held, 1), (pair.holder, -1)):
+        if end.index is not None and end.jacobian is not None:
+            moment, force = wrenches[:, : -point.shape[0]], wrenches[:, -point.shape[0] :]
+            moment = moment + moment_of((point - end.centre)[None], force)
+            found.append((end.index, sign * jnp.concatenate([moment, force], 1) @ end.jacobian))
+    return found

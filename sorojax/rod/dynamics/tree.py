@@ -26,6 +26,7 @@ from sorojax.rod.dynamics.moving import release, spin_cross, turned_twists
 from sorojax.rod.dynamics.points import Points, from_base
 from sorojax.rod.model.assembly import (
     Assembly,
+    closure_ends,
     dtype_of,
     num_coordinates,
     num_dof,
@@ -80,7 +81,7 @@ class AssemblyOperators(NamedTuple):
         batches: Those of equal rods, stacked.
         rows: Integrals from the base of the carrier to each mount [m].
         stiffness, damping: Linear elasticity of rods and joints, damping of joints.
-        ends: Integrals from the base of a rod to where each closure holds it, and to where
+        ends: Integrals from the base of a rod to where each closure holds it, then to where
             it carries that closure [m]; None of links and of the ground.
     """
 
@@ -89,7 +90,7 @@ class AssemblyOperators(NamedTuple):
     rows: tuple[Float[Array, "1 quad"] | None, ...]
     stiffness: Float[Array, "dof dof"]
     damping: Float[Array, "dof dof"]
-    ends: tuple[tuple[Float[Array, "1 quad"] | None, ...], ...] = ()
+    ends: tuple[Float[Array, "1 quad"] | None, ...] = ()
 
 
 class Mount(NamedTuple):
@@ -121,6 +122,9 @@ class Frame(NamedTuple):
     twist: Float[Array, " twist"]
 
 
+Section = tuple[Array, Array, Array, Array]
+
+
 class AssemblyState(eqx.Module):
     """An assembly at one moment; forces see its parts by `part_motion`.
 
@@ -130,6 +134,7 @@ class AssemblyState(eqx.Module):
         q, v: Coordinates and rates.
         batches: Motions of equal rods, clamped in their own frames, stacked.
         mounts, frames: How each part is carried, and where it is.
+        ends: Sections that each closure holds and that carry it, in turn.
     """
 
     assembly: Assembly
@@ -139,6 +144,7 @@ class AssemblyState(eqx.Module):
     batches: tuple[RodState, ...]
     mounts: tuple[Mount, ...]
     frames: tuple[Frame, ...]
+    ends: tuple[Section, ...]
 
 
 def batches(assembly: Assembly) -> tuple[tuple[int, ...], ...]:
@@ -175,9 +181,9 @@ def assembly_operators(assembly: Assembly) -> AssemblyOperators:
         jax.tree.map(lambda *leaves: jnp.stack(leaves), *(parts[k] for k in members))
         for members in batches(assembly)
     )
-    ends = tuple(
-        (_rows(assembly, c.part, c.at), _rows(assembly, c.on, c.s)) for c in assembly.closures
-    )
+    closures = assembly.closures
+    held = [x for c in closures for x in ((c.part, c.at), (c.on, c.s))]
+    ends = tuple(_rows(assembly, *place) for place in held)
     return AssemblyOperators(tuple(parts), stacks, tuple(rows), stiffness, damping, ends)
 
 
@@ -210,9 +216,8 @@ def assembly_motion(
         own_v = jnp.stack([v[places[k].rod_v] for k in members])
         every = eqx.filter_vmap(lambda c, q, v, rod=rod: rod_motion(rod, q, v, c))
         moments.append(every(stack, own_q, own_v))
-    blank = AssemblyState(assembly, constants, q, v, tuple(moments), (), ())
-    mounts, frames = _carry(blank)
-    return AssemblyState(assembly, constants, q, v, tuple(moments), mounts, frames)
+    blank = AssemblyState(assembly, constants, q, v, tuple(moments), (), (), ())
+    return AssemblyState(assembly, constants, q, v, tuple(moments), *_carry(blank))
 
 
 def clamped(moment: AssemblyState, index: int) -> RodState:
@@ -267,9 +272,6 @@ def part_motion(moment: AssemblyState, index: int) -> Any:
     return place_link(link_motion(body, constants, twist), rotation, position)
 
 
-Section = tuple[Array, Array, Array, Array]
-
-
 def sections(
     moment: AssemblyState, places: Sequence[tuple[int | None, Float[Array, "1 quad"] | None]]
 ) -> list[Section]:
@@ -310,11 +312,14 @@ def _section(moment: RodState, rows: Float[Array, "1 quad"]) -> Section:
     return at.directors[0], centre, angular, linear
 
 
-def _carry(moment: AssemblyState) -> tuple[tuple[Mount, ...], tuple[Frame, ...]]:
-    """The pass from the ground outwards: poses and twists."""
+def _carry(
+    moment: AssemblyState,
+) -> tuple[tuple[Mount, ...], tuple[Frame, ...], tuple[Section, ...]]:
+    """The pass from the ground outwards: poses and twists; and the ends of closures."""
     assembly, mounts, frames = moment.assembly, [], []
-    rows = zip(parents(assembly), moment.operators.rows, strict=True)
-    places, carriers = slices(assembly), sections(moment, list(rows))
+    rows = list(zip(parents(assembly), moment.operators.rows, strict=True))
+    held = zip(closure_ends(assembly), moment.operators.ends, strict=True)
+    places, carriers = slices(assembly), sections(moment, [*rows, *held])
     for index, on in enumerate(parents(assembly)):
         mount, position = _mount(moment, index, on, carriers[index])
         v = moment.v[places[index].joint_v]
@@ -327,7 +332,7 @@ def _carry(moment: AssemblyState) -> tuple[tuple[Mount, ...], tuple[Frame, ...]]
             position = carrier.position + moved
         mounts.append(mount)
         frames.append(Frame(rotation, position, twist))
-    return tuple(mounts), tuple(frames)
+    return tuple(mounts), tuple(frames), tuple(carriers[len(rows) :])
 
 
 def _mount(
@@ -447,24 +452,27 @@ def _with_rotors(mass: Float[Array, "dof dof"], assembly: Assembly) -> Float[Arr
 
 
 def gather(
-    moment: AssemblyState, loads: Sequence[Float[Array, " own"] | None]
-) -> Float[Array, " dof"]:
+    moment: AssemblyState, loads: Sequence[Float[Array, "*rows own"] | None]
+) -> Float[Array, "*rows dof"]:
     """Generalised force of loads on the parts, each in the columns of its part: the pass
-    inwards. None is no load."""
+    inwards; of several cases of loads at once where they are rows. None is no load."""
     carriers, size = parents(moment.assembly), moment.assembly.group.algebra_dim
+    rows = next((load.shape[:-1] for load in loads if load is not None), ())
     total: list = list(loads)
     pieces = []
     for index in reversed(range(len(carriers))):
         on, mount, load = carriers[index], moment.mounts[index], total[index]
         if load is None:
             at = slices(moment.assembly)[index]
-            pieces.append(jnp.zeros(at.rod_v.stop - at.joint_v.start, moment.v.dtype))
+            count = at.rod_v.stop - at.joint_v.start
+            pieces.append(jnp.zeros((*rows, count), moment.v.dtype))
             continue
-        pieces.append(jnp.concatenate([load[:size] @ mount.axes, load[size:]]))
+        twist, own = load[..., :size], load[..., size:]
+        pieces.append(jnp.concatenate([twist @ mount.axes, own], axis=-1))
         if on is not None:
-            passed = load[:size] @ mount.carried
+            passed = twist @ mount.carried
             total[on] = passed if total[on] is None else total[on] + passed
-    return jnp.concatenate(pieces[::-1])
+    return jnp.concatenate(pieces[::-1], axis=-1)
 
 
 def part_inertias(moment: AssemblyState) -> tuple[list[Array], list[Array]]:

@@ -200,6 +200,12 @@ def parents(assembly: Assembly) -> tuple[int | None, ...]:
     return tuple(None if p.on is None else names.index(p.on) for p in assembly.parts)
 
 
+def closure_ends(assembly: Assembly) -> tuple[int | None, ...]:
+    """Index of the part that each closure holds, then of the part that carries it, in turn."""
+    names = [name for c in assembly.closures for name in (c.part, c.on)]
+    return tuple(None if name is None else index_of(assembly, name) for name in names)
+
+
 def slices(assembly: Assembly) -> tuple[Slices, ...]:
     """Where each part has its coordinates and rates."""
     found, q, v, group = [], 0, 0, assembly.group
