@@ -26,6 +26,7 @@ from sorojax.systems.blocks.block import (
 from sorojax.systems.blocks.fem_body import FemBody
 from sorojax.systems.blocks.fluidic import Regulator, Reservoir, Valve
 from sorojax.systems.blocks.modal_body import displacement, modal_basis, modal_body
+from sorojax.systems.blocks.sampled_force import SampledBody, sampled_body
 from sorojax.systems.blocks.rigid_body import RigidBody, Touch
 from sorojax.systems.blocks.rod_body import AssemblyBody, RodBody, body_motion
 from sorojax.systems.contact_history import contact_history
@@ -86,6 +87,7 @@ __all__ = [
     "Rosenbrock2",
     "RungeKutta4",
     "Sampled",
+    "SampledBody",
     "SemiImplicitEuler",
     "Sensor",
     "ShapeFilter",
@@ -111,6 +113,7 @@ __all__ = [
     "modal_body",
     "outputs",
     "partitioned",
+    "sampled_body",
     "simulate",
     "simulate_batch",
     "simulate_sampled",

@@ -75,10 +75,10 @@ def modal_basis(
     found.append(_answers(body, u))
     first = jnp.concatenate(found).reshape(-1, u.size)
     system, mass = problem.space.system, body.matter().mass
-    chosen = _orthonormal(system, mass, first)
+    chosen = orthonormal(system, mass, first)
     if bending:
         more = _shape_derivatives(problem, u, chosen.reshape(-1, *u.shape))
-        chosen = _orthonormal(system, mass, jnp.concatenate([chosen, more]))
+        chosen = orthonormal(system, mass, jnp.concatenate([chosen, more]))
     return Basis(u, chosen.reshape(-1, *u.shape))
 
 
@@ -116,7 +116,7 @@ def _shape_derivatives(problem: fem.Problem, u, shapes) -> Float[Array, "pairs d
     return tangent_solve(problem, u, -forces)
 
 
-def _orthonormal(
+def orthonormal(
     system: SparseSymmetric, mass: Float[Array, " nnz"], rows: Float[Array, "rows dofs"]
 ) -> Float[Array, "kept dofs"]:
     """The rows one after the other, each without what those before it hold, by Gram and
@@ -343,8 +343,8 @@ def modal_body(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBo
             name: (_place(body, basis, node), basis.shapes[:, node])
             for name, node in body.markers
         },
-        zero if body.u is None else _coordinates(body, basis, u),
-        zero if body.v is None else _coordinates(body, basis, v),
+        zero if body.u is None else coordinates(body, basis, u),
+        zero if body.v is None else coordinates(body, basis, v),
         tuple(
             (name, port_of(load), load.value.shape, body.inputs[port_of(load)].unit)
             for name, load in body.drives.items()
@@ -362,7 +362,7 @@ def _place(body: FemBody, basis: Basis, node: int) -> Array:
     return body.problem.mesh.points[node] + basis.displacement[node]
 
 
-def _coordinates(body: FemBody, basis: Basis, field) -> Modes:
+def coordinates(body: FemBody, basis: Basis, field) -> Modes:
     """Coordinates of a field of the nodes, nearest in the mass."""
     weighed = product(body.problem.space.system, body.matter().mass, field.ravel())
     return basis.shapes.reshape(len(basis), -1) @ weighed
@@ -393,10 +393,10 @@ def _work(body: FemBody, name: str, basis: Basis) -> Polynomial:
             f"reduced: `{name}` is a {type(load).__name__}, whose force is not proportional "
             "to its input. Drive the body by pressures, forces or tendons."
         )
-    return Polynomial(_derivatives(work, zero, 3))
+    return Polynomial(derivatives(work, zero, 3))
 
 
-def _derivatives(function: Callable[[Modes], Array], at: Modes, order: int) -> tuple:
+def derivatives(function: Callable[[Modes], Array], at: Modes, order: int) -> tuple:
     """Value and derivatives of a cheap function."""
     found: list[Any] = [function]
     for _ in range(order):

@@ -1,0 +1,129 @@
+"""A bellows reduced to a few shapes and the force of a few weighted cells.
+
+Trained on equilibria under pressure alone; then filled with air by a regulator to a pressure
+that the training has not seen, beside the full body in the same network.
+"""
+
+import time
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.cases.systems_fem import DURATION, STEP, STEPS, network
+from benchmarks.harness import Row, measure_calls
+from sorojax import fem, material, mesh, systems
+from sorojax.robots import BellowsActuator
+from sorojax.units import MPa, kPa, mm
+
+MODES, TOLERANCE = 10, 5e-3
+PRESSURES = np.linspace(0, 8 * kPa, 17)
+ERROR_BAR, CELLS_BAR, STEP_BAR, MEMBER_BAR, GRADIENT_BAR = 1e-2, 0.02, 200e-6, 50e-6, 1e-5
+MEMBERS = (1, 64, 1024, 4096)
+
+
+def body(size=0.7 * mm) -> systems.FemBody:
+    """Five bellows, side view, plane strain."""
+    actuator = BellowsActuator()
+    cells = mesh.triangulate(actuator.body(), size=size, order=2)
+    problem = fem.problem(
+        cells,
+        material.NeoHookean(400 * kPa, 4 * MPa, density=1080.0),
+        kinematics=fem.PlaneStrain(20 * mm),
+        supports=(fem.Fixed(mesh.nodes_where(cells, lambda p: p[0] < 1e-9)),),
+        loads=(fem.Pressure(mesh.facets_on(cells, actuator.chambers()), name="air"),),
+    )
+    tip = mesh.nearest_node(cells, (float(actuator.length), 0.0))
+    return systems.FemBody(problem, fem.Rayleigh(5.0, 1e-3), markers={"tip": tip})
+
+
+def trained(full, tolerance=TOLERANCE, modes=MODES):
+    return systems.sampled_body(full, [{"air": PRESSURES}], modes=modes, tolerance=tolerance)
+
+
+def moves(block, step, solver=None):
+    """Places of the tip while the network fills the body."""
+    film = systems.simulate(
+        network(block), DURATION, save=STEPS + 1, step=step, solver=solver
+    )
+    return film["body.tip_position"] - film["body.tip_position"][0]
+
+
+def stepped(block, count):
+    """`count` steps of the body alone under a pressure, as one function of state and pressure."""
+    solver, h = systems.Rosenbrock2(refresh=True), STEP / 4
+
+    def run(pressure):
+        alone = systems.Network(
+            {"body": block, "air": systems.Source(systems.Constant(pressure), unit="Pa")},
+            {"body.air_pressure": "air.value"},
+        )
+        film = systems.simulate(alone, count * h, save=2, step=h, solver=solver)
+        return film["body.tip_position"][-1]
+
+    return run
+
+
+def per_step(block, members, count=40):
+    """CPU time of a step of one member [s]."""
+    run = jax.jit(jax.vmap(stepped(block, count)))
+    pressures = jnp.linspace(1 * kPa, 6 * kPa, members)
+    jax.block_until_ready(run(pressures))
+    times = []
+    for _ in range(3):
+        start = time.process_time()
+        jax.block_until_ready(run(pressures))
+        times.append(time.process_time() - start)
+    return min(times) / count / members
+
+
+def gradient(block):
+    """Derivative of a run by stiffness and pressure, over that of differences."""
+
+    def end(numbers):
+        scaled = eqx.tree_at(
+            lambda b: b.force.body.material.shear_modulus,
+            block,
+            block.force.body.material.shear_modulus * numbers[0],
+        )
+        return stepped(scaled, 20)(4 * kPa * numbers[1])[1]
+
+    end, at, way = jax.jit(end), jnp.ones(2), jnp.array([1.0, 0.7])
+    found = jax.jit(jax.grad(end))(at) @ way
+    steps = {k: end(at + k * 1e-3 * way) for k in (-2, -1, 1, 2)}
+    want = (8 * (steps[1] - steps[-1]) - (steps[2] - steps[-2])) / 12e-3
+    return abs(float(found / want - 1))
+
+
+def rows():
+    full = body()
+    count = full.problem.mesh.num_cells
+    start = time.perf_counter()
+    small = trained(full)
+    took = time.perf_counter() - start
+    share = len(small.cells) / count
+    settings = {"shapes": len(small.body.basis), "cells": len(small.cells), "of": count}
+    want, got = moves(full, STEP), moves(small.body, STEP / 4, systems.Rosenbrock2(refresh=True))
+    scale = float(jnp.max(jnp.abs(want)))
+
+    def row(of, error, bar, reference, **columns):
+        more = {"quantity": of} | settings
+        bars = {"bar": bar, "bar_on": "error"}
+        return Row("sorojax", more, error=error, reference=reference, **bars, **columns)
+
+    reference = "the full body, over its largest move"
+    off = float(jnp.max(jnp.abs(got - want))) / scale
+    yield row("tip in a network", off, ERROR_BAR, reference, compile_s=took)
+    seen = float(small.error)
+    yield row("equilibria between those of training", seen, ERROR_BAR, reference)
+    yield row("share of the cells", share, CELLS_BAR, "all cells")
+    yield row("gradient", gradient(small.body), GRADIENT_BAR, "central differences")
+    timing = measure_calls(lambda: moves(full, STEP), 1)
+    columns = timing.per(STEPS).columns()
+    yield Row("sorojax", {"quantity": "a step of the full body", "of": count}, **columns)
+    for members in MEMBERS:
+        took = per_step(small.body, members)
+        more = {"quantity": "a step of a member", "members": members} | settings
+        bar = STEP_BAR if members == 1 else MEMBER_BAR
+        yield Row("sorojax", more, run_s=took, bar=bar, bar_on="run_s")

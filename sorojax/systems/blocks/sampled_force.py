@@ -1,0 +1,390 @@
+"""A reduced body whose force comes from a few weighted cells (hyper-reduction): trained from
+the full body by one verb.
+
+Shapes are the main directions of equilibria under given inputs, of their derivatives by these
+inputs, and the lowest eigenmodes. Weights make the work of the chosen cells along every shape
+that of all cells, in the states of training; as none is negative, the sum is an energy, and a
+reduced body stays as stable as the full one.
+
+Reference:
+    Farhat, Chapman, Avery, Structure-preserving, stability, and accuracy properties of the
+    energy-conserving sampling and weighting method for the hyper reduction of nonlinear finite
+    element dynamic models, Int. J. Num. Meth. Eng. 102, 2015.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sorojax import fem
+from sorojax._display import displayed
+from sorojax._progress import report
+from sorojax.fem.assembly.energy import Body, Entries, energy_density
+from sorojax.fem.assembly.geometry import deformation, quadrature_points
+from sorojax.fem.equilibrium.response import tangent_solve
+from sorojax.fem.problem import body as bare, body_at, load_force
+from sorojax.math.linalg.sparse import product
+from sorojax.systems.blocks.fem_body import FemBody
+from sorojax.systems.blocks.modal_body import (
+    AbstractModalForce,
+    Basis,
+    ModalBody,
+    Modes,
+    Polynomial,
+    coordinates,
+    derivatives,
+    displacement,
+    modal_body,
+    orthonormal,
+)
+
+_EIGENMODES = 2  # of the shapes, beside those of the equilibria
+_AROUND = 0.05  # of the spread of states: how far more of them are drawn about each
+_SLOPES = 0.2  # weight of the slopes of the force, beside it
+_SMALL = 0.1  # of the largest displacement: errors of smaller ones count as of one of this size
+_PASSES = 12  # of Newton's method to an equilibrium
+_MOST = 400  # cells that are chosen at most
+
+
+class SampledForce(AbstractModalForce):
+    """The force of a few cells, each times a weight.
+
+    Attributes:
+        body: Data of the energy of the chosen cells.
+        rest: Kept entries of F at q = 0.
+        slopes: Their derivatives by the modal coordinates [1/m].
+        volumes: Of the quadrature points, times the weight of their cell [m^3].
+        loads: Force of the loads that are not driven.
+    """
+
+    body: Body
+    rest: Entries
+    slopes: Float[Array, "entries quad cells modes"]
+    volumes: Float[Array, "quad cells"]
+    loads: Polynomial
+
+    def __call__(self, q):
+        return jax.grad(self._stored)(q) - self.loads(q)
+
+    def energy(self, q):
+        zero, terms = jnp.zeros_like(q), self.loads.terms
+        scaled = tuple(term / (k + 1) for k, term in enumerate(terms))
+        return self._stored(q) - self._stored(zero) - Polynomial(scaled)(q) @ q
+
+    def stored_by(self, F: Entries) -> Float[Array, ""]:
+        """Energy of the cells [J] with these entries of F."""
+        return jnp.sum(self.volumes * energy_density(self.body, F))
+
+    def _stored(self, q: Modes) -> Float[Array, ""]:
+        return self.stored_by(self.rest + self.slopes @ q)
+
+
+def sampled_force(
+    body: FemBody,
+    basis: Basis,
+    cells: Int[np.ndarray, " kept"],
+    weights: Float[Array | np.ndarray, " kept"],
+) -> SampledForce:
+    """The force of `cells` of a body, each times its weight."""
+    free = body.loaded({name: jnp.zeros_like(x.value) for name, x in body.drives.items()})
+    whole = _cells(free, basis)
+    chosen = _taken(whole, np.asarray(cells), free.mesh.num_cells)
+
+    def loads(q):
+        force = load_force(free, displacement(basis, q))
+        return jnp.einsum("kni,ni->k", basis.shapes, force)
+
+    zero = jnp.zeros(len(basis), basis.shapes.dtype)
+    made = Polynomial(derivatives(loads, zero, 3))
+    volumes = chosen.volumes * jnp.asarray(weights)[None]
+    return eqx.tree_at(lambda f: (f.volumes, f.loads), chosen, (volumes, made))
+
+
+def _cells(problem: fem.Problem, basis: Basis) -> SampledForce:
+    """Every cell of a problem, once."""
+    mesh, kinematics = problem.mesh, problem.kinematics
+    points = quadrature_points(mesh, kinematics)
+    rest = deformation(mesh, kinematics, points, basis.displacement)
+    still = jnp.zeros_like(basis.displacement)
+    identity = deformation(mesh, kinematics, points, still)
+    moved = jax.lax.map(lambda s: deformation(mesh, kinematics, points, s), basis.shapes)
+    slopes = jnp.moveaxis(moved - identity[None], 0, -1)
+    energy = body_at(bare(problem), points)
+    none = Polynomial((jnp.zeros(len(basis), rest.dtype),))
+    return SampledForce(energy, rest, slopes, points.volumes, none)
+
+
+def _taken(force: SampledForce, cells: np.ndarray, count: int) -> SampledForce:
+    """The force of some of the cells."""
+
+    def last(leaf):
+        by_cell = eqx.is_array(leaf) and leaf.ndim > 0 and leaf.shape[-1] == count
+        return leaf[..., cells] if by_cell else leaf
+
+    energy, rest, volumes = jax.tree.map(last, (force.body, force.rest, force.volumes))
+    return SampledForce(energy, rest, force.slopes[:, :, cells], volumes, force.loads)
+
+
+# Training: shapes from equilibria, cells and weights from their forces
+
+
+@displayed
+class SampledBody(eqx.Module):
+    """A trained reduction: `sampled_body(body, paths)`.
+
+    Attributes:
+        body: The reduced body, a block with the ports of the full one.
+        cells: Those that its force comes from.
+        weights: How many cells each stands for.
+        training_error: Of the force in the states of training, in the norm of the work that
+            it does on the elastic answer, relative.
+        error: Of the displacement at equilibria that the training has not seen, in the norm
+            of the mass, over the largest displacement.
+        num_cells: Of the full body.
+    """
+
+    body: ModalBody
+    cells: Int[Array, " kept"]
+    weights: Float[Array, " kept"]
+    training_error: Float[Array, ""]
+    error: Float[Array, ""]
+    num_cells: int = eqx.field(static=True)
+
+    def _text(self) -> str:
+        share = len(self.cells) / self.num_cells
+        return (
+            f"SampledBody: {len(self.body.basis)} shapes, {len(self.cells)} of "
+            f"{self.num_cells} cells ({share:.1%})\n  force off by "
+            f"{float(self.training_error):.2g} in training, displacement by "
+            f"{float(self.error):.2g} beside it"
+        )
+
+
+Inputs = Mapping[str, Float[Array | np.ndarray, "states ..."]]
+
+
+def sampled_body(
+    body: FemBody,
+    paths: Sequence[Inputs],
+    *,
+    modes: int = 12,
+    tolerance: float = 1e-2,
+    states: int = 3,
+    seed: int = 0,
+) -> SampledBody:
+    """The body in a few shapes, with the force of a few weighted cells, trained on equilibria.
+
+    Of every path of inputs the equilibria and their derivatives by the inputs are found; the
+    first are halved into those that are trained on and those that tell the error. Driven loads
+    work as in `modal_body`: of a pressure exactly, as the volume is a cubic of the shapes.
+
+    Args:
+        body: The full body.
+        paths: Of the inputs, each from rest: values of driven loads by name, one row per
+            equilibrium, in the unit of the load; one load in a path.
+        modes: Number of shapes.
+        tolerance: Relative error of the force in training at which no more cells are chosen.
+        states: How many states are drawn around each equilibrium, so that the force is right
+            beside the paths too.
+        seed: Of these.
+
+    Returns:
+        The reduced body, and how well it stands for the full one. Reports its progress.
+
+    Raises:
+        ValueError: If there are too few equilibria for the shapes, a path names no driven
+            load, or `modal_body` refuses the body.
+    """
+    _checked(body, paths, modes)
+    rest = {name: jnp.zeros_like(load.value) for name, load in body.drives.items()}
+    found = _Equilibria([], [], [])
+    for number, path in enumerate(paths):
+        report("sampled_body: equilibria", number, len(paths))
+        ((name, rows),) = path.items()
+        rows = jnp.asarray(rows)
+        solved = fem.solve_path(body.loaded(rest), **{name: rows})
+        found.displacements.extend(solved.displacements)
+        found.inputs.extend({**rest, name: row} for row in rows)
+        reach = jnp.max(jnp.abs(rows), axis=0)
+        for u, row in list(zip(solved.displacements, rows, strict=True))[::2]:
+            found.slopes.extend(_slopes(body, u, {**rest, name: row}, name, reach))
+    report("sampled_body: cells", 0, 1)
+    seen = found.displacements[::2]
+    basis = snapshot_basis(body, jnp.stack([*seen, *found.slopes]), modes)
+    whole = modal_body(body, basis, order=None)
+    count = body.problem.mesh.num_cells
+    every = sampled_force(body, basis, np.arange(count), np.ones(count))
+    whole = eqx.tree_at(lambda b: b.force, whole, every)
+    at = jnp.stack([coordinates(body, basis, u) for u in found.displacements])
+    cells, weights, left = _chosen(whole, at[::2], found.inputs[::2], tolerance, states, seed)
+    force = sampled_force(body, basis, cells, weights)
+    small = eqx.tree_at(lambda b: b.force, whole, force)
+    told = zip(at[1::2], at[::2], found.inputs[1::2], strict=False)
+    answers = jnp.stack([_equilibrium(small, values, start) for _, start, values in told])
+    off = jax.vmap(lambda u, q: _size(body, u - displacement(basis, q)))
+    error = jnp.max(off(jnp.stack(found.displacements[1::2]), answers))
+    error = error / jnp.max(jnp.linalg.norm(at, axis=1))
+    report("sampled_body: cells", 1, 1)
+    return SampledBody(small, *map(jnp.asarray, (cells, weights, left)), error, count)
+
+
+class _Equilibria(NamedTuple):
+    """Displacements and inputs of equilibria, and displacements by the inputs."""
+
+    displacements: list[Array]
+    slopes: list[Array]
+    inputs: list[dict[str, Array]]
+
+
+def _checked(body: FemBody, paths: Sequence[Inputs], modes: int) -> None:
+    for path in paths:
+        if len(path) != 1 or not set(path) <= set(body.drives):
+            raise ValueError(
+                f"sampled_body: got a path of {sorted(path)}, need one driven load of "
+                f"{sorted(body.drives)}. Give one path per load."
+            )
+    count = sum(len(rows) for path in paths for rows in path.values())
+    if count < 4 or modes < 1 + _EIGENMODES:
+        raise ValueError(
+            f"sampled_body: got {count} equilibria and {modes} modes, need 4 and "
+            f"{1 + _EIGENMODES} or more. Give longer paths."
+        )
+
+
+def _slopes(body: FemBody, u, values, name: str, reach) -> list[Float[Array, "nodes dim"]]:
+    """What each component of an input adds to an equilibrium, times its range."""
+    problem = body.loaded(values)
+
+    def force(value):
+        return load_force(body.loaded({**values, name: value}), u).ravel()
+
+    slopes = jax.jacfwd(force)(values[name]).reshape(u.size, -1).T
+    found = tangent_solve(problem, u, slopes * reach.reshape(-1, 1))
+    return list(found.reshape(-1, *u.shape))
+
+
+def _size(body: FemBody, u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
+    """Norm of a displacement in the mass."""
+    weighed = product(body.problem.space.system, body.matter().mass, u.ravel())
+    return jnp.sqrt(u.ravel() @ weighed)
+
+
+def snapshot_basis(
+    body: FemBody, displacements: Float[Array, "states nodes dim"], modes: int
+) -> Basis:
+    """Shapes for `modal_body`: the lowest eigenmodes and the main directions of displacements
+    from rest (proper orthogonal decomposition in the mass)."""
+    system, mass = body.problem.space.system, body.matter().mass
+    rows = displacements.reshape(displacements.shape[0], -1)
+    sizes = jax.vmap(lambda row: jnp.sqrt(row @ product(system, mass, row)))(rows)
+    rows = rows[np.asarray(sizes) > 1e-12 * float(jnp.max(sizes))]
+    weighed = jax.vmap(lambda row: product(system, mass, row))(rows)
+    values, vectors = jnp.linalg.eigh(rows @ weighed.T)
+    main = (vectors[:, ::-1].T @ rows)[: modes - _EIGENMODES]
+    still = jnp.zeros_like(displacements[0])
+    eigen = fem.eigenmodes(body.problem, still, _EIGENMODES).shapes
+    both = jnp.concatenate([main, eigen.reshape(_EIGENMODES, -1)])
+    shapes = orthonormal(system, mass, both)
+    return Basis(still, shapes.reshape(-1, *still.shape))
+
+
+def _chosen(
+    body: ModalBody,
+    states: Float[Array, "states modes"],
+    inputs: Sequence[Mapping[str, Array]],
+    tolerance: float,
+    more: int,
+    seed: int,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Cells and their weights, and the error that is left.
+
+    Each state has rows of the force, as the displacement that it makes there, and of its
+    slopes, as a metric sees them that makes their sum one: small errors in stiff directions
+    would otherwise hide soft ones.
+    """
+    whole, upper = body.force, np.triu_indices(states.shape[1])
+    assert isinstance(whole, SampledForce)
+
+    def of_cells(q):
+        P = jax.grad(whole.stored_by)(whole.rest + whole.slopes @ q)
+        return jnp.einsum("eqc,eqcm->mc", P, whole.slopes)
+
+    @jax.jit
+    def rows_of(q, tangent):
+        slopes = jax.jacfwd(of_cells)(q)
+        values, vectors = jnp.linalg.eigh(jnp.sum(slopes, axis=1))
+        half = vectors.T / jnp.sqrt(jnp.abs(values))[:, None]
+        bent = jnp.einsum("am,mcn,bn->abc", half, slopes, half)[upper]
+        size = jnp.sqrt(jnp.asarray(len(values), q.dtype))
+        return jnp.linalg.solve(tangent, of_cells(q)), _SLOPES * bent / size
+
+    draw = np.random.default_rng(seed).normal(size=(len(states), more, states.shape[1]))
+    spread = _AROUND * jnp.std(states, axis=0)
+    forces, slopes = [], []
+    for q, values, away in zip(states, inputs, draw, strict=True):
+        tangent = -jax.jacfwd(lambda q, values=values: _accelerated(body, q, values))(q)
+        for near in (q, *(q + spread * jnp.asarray(a) for a in away)):
+            force, slope = rows_of(near, tangent)
+            forces.append(np.asarray(force))
+            slopes.append(np.asarray(slope))
+    sizes = np.array([np.linalg.norm(force.sum(axis=1)) for force in forces])
+    sizes = np.maximum(sizes, _SMALL * sizes.max())
+    rows = [force / size for force, size in zip(forces, sizes, strict=True)]
+    return sparse_weights(np.concatenate([*rows, *slopes]), tolerance)
+
+
+def sparse_weights(
+    rows: Float[np.ndarray, "rows cells"], tolerance: float
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Few columns and weights, none negative, whose weighted sum is that of all columns up to
+    a relative error, and that error: Lawson and Hanson's method, ended early.
+
+    Reference:
+        Chapman, Avery, Collins, Farhat, Accelerated mesh sampling for the hyper reduction of
+        nonlinear computational models, Int. J. Num. Meth. Eng. 109, 2017.
+    """
+    want = rows.sum(axis=1)
+    size, left = np.linalg.norm(want), want
+    chosen, weights = np.zeros(0, int), np.zeros(0)
+    while np.linalg.norm(left) > tolerance * size and len(chosen) < min(_MOST, rows.shape[1]):
+        gain = rows.T @ left
+        gain[chosen] = -np.inf
+        best = int(np.argmax(gain))
+        if not gain[best] > 0:
+            break
+        chosen, weights = np.append(chosen, best), np.append(weights, 0.0)
+        while True:
+            trial = np.linalg.lstsq(rows[:, chosen], want, rcond=None)[0]
+            if (trial > 0).all():
+                weights = trial
+                break
+            low = trial <= 0
+            share = np.min(weights[low] / (weights[low] - trial[low]))
+            weights = weights + share * (trial - weights)
+            kept = weights > 1e-12 * weights.max()
+            chosen, weights = chosen[kept], weights[kept]
+        left = want - rows[:, chosen] @ weights
+    order = np.argsort(chosen)
+    return chosen[order], weights[order], float(np.linalg.norm(left) / size)
+
+
+def _accelerated(body: ModalBody, q: Modes, values: Mapping[str, Array]) -> Modes:
+    """Acceleration from rest under values of the driven loads."""
+    inputs = {port: values[name] for name, port, *_ in body.ports}
+    return body.vector_field(0.0 * q[0], {"q": q, "v": 0.0 * q}, inputs)["v"]
+
+
+@jax.jit
+def _equilibrium(body: ModalBody, values: Mapping[str, Array], start: Modes) -> Modes:
+    """Coordinates at rest, by Newton's method."""
+
+    def closer(q, _):
+        slope = jax.jacfwd(lambda q: _accelerated(body, q, values))(q)
+        return q - jnp.linalg.solve(slope, _accelerated(body, q, values)), None
+
+    return jax.lax.scan(closer, start, length=_PASSES)[0]
