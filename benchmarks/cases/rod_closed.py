@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
-from benchmarks.harness import Row, measure_calls, quick
+from benchmarks.harness import Row, measure_calls, measure_once, quick
 from sorojax import SE2, SE3, rod as R
 from sorojax.math.lie import homogeneous, plane_rotation
 
@@ -142,15 +142,20 @@ def twisted(modes, ratio):
     return R.with_closures(ring, seam=seam, far=far)
 
 
-def critical_twist(modes, ratio):
+SHARES = np.concatenate([np.linspace(0.1, 0.9, 9), np.arange(0.983, 1.017, 0.002)])
+
+
+def twist(ring, twists):
+    modes = R.num_dof(ring) // 3
+    start = jnp.zeros(3 * modes).at[2 * modes].set(1.0)
+    return R.equilibrium_path(ring, unloaded, twists, start, t=same)
+
+
+def critical(path):
     """Half way between the last stable twist and the first unstable one, of twists 0.2 % of
     the closed form apart."""
-    closed = 2 * np.pi * np.sqrt(3) * (1 + ratio)
-    shares = np.concatenate([np.linspace(0.1, 0.9, 9), np.arange(0.983, 1.017, 0.002)])
-    start = jnp.zeros(3 * modes).at[2 * modes].set(1.0)
-    path = R.equilibrium_path(twisted(modes, ratio), unloaded, closed * shares, start, t=same)
     first = int(np.argmax(np.asarray(path.negative_eigenvalues) > 0))
-    return (shares[first - 1] + shares[first]) / 2 if first else float("nan")
+    return (SHARES[first - 1] + SHARES[first]) / 2 if first else float("nan")
 
 
 # Ibrahimbegovic, CMAME 149, 1997
@@ -175,6 +180,10 @@ def roll(modes):
 
 def rolled(factor):
     return (R.TipWrench(factor * jnp.array([0, 0, MOMENT, 0, 0, ACROSS])),)
+
+
+def load(model, factors):
+    return R.equilibrium_path(model, rolled, factors)
 
 
 def shot(factor, guess):
@@ -212,14 +221,14 @@ def rows():
         error = abs(across / (2 * RADIUS / 3) - 1)
         yield _row("Goto's ring", modes, timing, error, "radius / 3 after a whole turn")
     for ratio, modes in ((0.0, 13),) if few else ((0.0, 13), (0.5, 17)):
-        timing = measure_calls(lambda m=modes, r=ratio: critical_twist(m, r), repeats=1)
-        error = abs(critical_twist(modes, ratio) - 1)
+        twists = jnp.asarray(2 * np.pi * np.sqrt(3) * (1 + ratio) * SHARES)
+        timing, path = measure_once(twist, twisted(modes, ratio), twists)
+        error = abs(critical(path) - 1)
         case = f"Michell's ring, Poisson ratio {ratio}"
         yield _row(case, modes, timing, error, "critical twist 2 pi sqrt(3) E I / (G J)")
     for share, modes in ((0.5, 16),) if few else ((0.5, 16), (1.0, 24)):
         factors = jnp.linspace(0, share, round(100 * share) + 1)[1:]
-        run = lambda m=modes, f=factors: R.equilibrium_path(roll(m), rolled, f)  # noqa: E731
-        timing, path = measure_calls(run, repeats=1), run()
+        timing, path = measure_once(load, roll(modes), factors)
         tip = np.asarray(R.tip_pose(roll(modes), path.q[-1])[:3, 3])
         error = float(np.linalg.norm(tip - shot(share, tip))) / LENGTH
         case = f"roll-up into {round(10 * share)} turns"
