@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
-from benchmarks.harness import Row, measure_calls, measure_once, quick
+from benchmarks.harness import Row, measure_once, quick
 from sorojax import SE2, SE3, rod as R
 from sorojax.math.lie import homogeneous, plane_rotation
 
@@ -60,8 +60,8 @@ def pressed(factor):
     return (R.PartForce("near", R.TipWrench(factor * jnp.array([0.0, 0.0, -1.0]))),)
 
 
-def snap(modes):
-    return R.arc_length_path(frame(modes), pressed, first=2.0, steps=60, longest=1.0)
+def snap(model):
+    return R.arc_length_path(model, pressed, first=2.0, steps=60, longest=1.0)
 
 
 def peak(path):
@@ -111,9 +111,9 @@ def same(factor):
     return factor
 
 
-def fold(modes, steps=40):
+def fold(ring, steps=40):
     angles = jnp.linspace(0, 2 * np.pi, steps + 1)[1:]
-    return R.equilibrium_path(half_ring(modes), unloaded, angles, t=same)
+    return R.equilibrium_path(ring, unloaded, angles, t=same)
 
 
 # Michell, Messenger of Mathematics 11, 1889: a straight rod bent to a ring, its ends turned
@@ -211,12 +211,12 @@ def shot(factor, guess):
 def rows():
     few = quick("more modes, the roll-up beyond half of its load")
     for modes in (4,) if few else (4, 6):
-        timing = measure_calls(lambda modes=modes: snap(modes), repeats=2)
-        error = abs(peak(snap(modes)) / LIMIT - 1)
+        timing, path = measure_once(snap, frame(modes))
+        error = abs(peak(path) / LIMIT - 1)
         yield _row("Lee's frame", modes, timing, error, "first limit load 18.552 E I / L^2")
     for modes in (5,) if few else (5, 8):
-        timing = measure_calls(lambda modes=modes: fold(modes), repeats=2)
-        model, path = half_ring(modes), fold(modes)
+        model = half_ring(modes)
+        timing, path = measure_once(fold, model)
         across = float(R.tip_pose(model, path.q[-1])["rod"][1, 3])
         error = abs(across / (2 * RADIUS / 3) - 1)
         yield _row("Goto's ring", modes, timing, error, "radius / 3 after a whole turn")
