@@ -142,7 +142,8 @@ def twisted(modes, ratio):
     return R.with_closures(ring, seam=seam, far=far)
 
 
-SHARES = np.concatenate([np.linspace(0.1, 0.9, 9), np.arange(0.983, 1.017, 0.002)])
+# the search goes no further than some 0.05 rad of twist, and larger steps are tried and cut
+SHARES = np.concatenate([0.004 * np.arange(1, 246), np.arange(0.983, 1.017, 0.002)])
 
 
 def twist(ring, twists):
