@@ -76,6 +76,22 @@ def measure_together(
     return {name: Timing(compile_s[name], tuple(runs[name])) for name in functions}
 
 
+def measure_once(function: Callable[..., Any], *args: Any) -> tuple[Timing, Any]:
+    """As `measure`, of a program that takes long: it runs once, and what it yields is kept."""
+    import equinox as eqx
+    import jax
+
+    results: dict[str, Any] = {}
+
+    def call():
+        results["last"] = jax.block_until_ready(compiled(*args))
+
+    start = time.perf_counter()
+    compiled = eqx.filter_jit(function).lower(*args).compile()
+    compile_s = time.perf_counter() - start
+    return Timing(compile_s, _runs(call, 1)), results["last"]
+
+
 def measure_calls(function: Callable[[], Any], repeats: int = 5) -> Timing:
     """Time a function that compiles what it needs at its first call.
 

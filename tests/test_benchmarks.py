@@ -6,12 +6,16 @@ import sys
 import xml.etree.ElementTree as xml
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from benchmarks import discover, harness, memory, page, scaling, suite, svg
 from benchmarks.__main__ import main
-from benchmarks.peers import row
+from benchmarks.discrete_rod import Bar, _ends as ends_of
+from benchmarks.peers import call, row
+from benchmarks.peers.call import status
 from benchmarks.rows import KEYS, Row, Timing, line
 from benchmarks.runner import run_case
 
@@ -146,6 +150,46 @@ def test_a_bar_is_on_time_or_on_error(bar_on, holds):
     found = Row("sorojax", run_s=1.0, error=3.0, bar=2.0, bar_on=bar_on)
     assert found.holds is holds
     assert Row("sorojax", bar=1.0).holds is False  # not measured is not met
+
+
+def test_a_long_program_runs_once_and_keeps_its_answer():
+    turns = []
+
+    def scaled(x, count):
+        jax.debug.callback(lambda: turns.append(count))
+        return (count * x,)
+
+    timing, found = harness.measure_once(scaled, jnp.ones(2), 3)
+    jax.effects_barrier()
+    assert turns == [3] and len(timing.runs) == 1 and timing.compile_s > 0
+    assert found[0].tolist() == [3, 3]
+
+
+def test_pyelastica_has_the_stiffness_and_inertia_that_it_is_given():
+    """Ends of a short flight beside the discrete rod, and the tip of an arm that is turned."""
+    if not status("pyelastica")["ok"]:
+        pytest.skip("make peers PEERS=pyelastica")
+    push = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    arrays = {
+        "bar": np.array([1.0, 50.0, 50.0, 0.5, 1.0, 0.01]),
+        "base": np.array([0.0, 1.0, 0.0]),
+        "axes": np.eye(3),
+        "wrench": push / 20,
+        "times": np.array([0.0, 1.0]),
+        "shares": np.array([1.0, 1.0]),
+    }
+    options = {"elements": 12, "share": 0.05, "duration": 0.4, "save_dt": 0.4, "repeats": 1}
+    _, found = call("pyelastica", "flight", arrays, **options)
+    rod = Bar(1.0, axial=50.0, bending=0.5, mass=1.0, rotary=0.01)
+    whole = push[:3] / 20, push[3:] / 20
+    want = ends_of(rod, arrays["base"], np.eye(3), lambda t: whole, np.array([0.4]), 12)
+    moved = want - np.array([[0.0, 1.0, 0.0], [1.0, 1.0, 0.0]])[None]
+    assert np.abs(found["ends"] - want).max() < 0.01 * np.abs(moved).max()
+    arm = {"bar": np.array([1.0, 1e4, 1e4, 1e4, 1.0, 1.0]), "turn": np.array([0.2, 2.0])}
+    options |= {"share": 0.5, "save_dt": 0.1}
+    _, found = call("pyelastica", "spin", arm, **options)
+    angles = np.arctan2(*found["tips"].T[::-1])
+    assert np.allclose(angles[[2, 4]], [0.2, 0.6], atol=5e-3)  # it turns by 2 (t - 0.1)
 
 
 def test_timing_is_the_median_per_call():

@@ -183,6 +183,20 @@ def test_closures_that_say_the_same_twice_do_no_harm():
     )
 
 
+@pytest.mark.parametrize("group", [SE2(), SE3()])
+def test_a_damped_ball_with_a_rotor_loses_what_its_damper_takes(group):
+    """About its centre a ball of inertia I with a rotor J turns as exp(-d t / (I + J))."""
+    joint = rod.Spherical(damping=0.3, armature=0.02)
+    inertia = 0.04 * np.ones(group.rotation_dim if group.space_dim == 3 else ())
+    model = rod.assembly(group, ball=rod.Part(rod.Link(1.0, inertia), joint))
+    v = jnp.arange(1.0, 1 + rod.num_dof(model))
+    for stepper, tol in ((RungeKutta4(), 1e-8), (GeneralisedAlpha(1.0), 1e-4)):
+        path = rod.rollout(
+            model, rod.rest(model), v, step=2e-3, saves=1, every=100, stepper=stepper
+        )
+        assert np.allclose(path.v[-1], v * np.exp(-0.2 * 0.3 / 0.06), rtol=tol)
+
+
 SOFT = {"young_modulus": 1e6, "poisson_ratio": 0.5, "density": 1000}
 BEAM = rod.rod(
     SE2(), rod.chebyshev(kappa_z=2, sigma_x=1), rod.circle(5e-3), length=0.1, nodes=6, **SOFT

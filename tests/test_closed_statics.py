@@ -153,7 +153,7 @@ def test_a_ring_bears_one_moment():
 
 def test_a_ring_folds_to_a_third():
     """Goto, Watanabe, Kasugai, Obata, Int. J. Solids Structures 29, 1992."""
-    path = rod_closed.fold(5, steps=30)
+    path = rod_closed.fold(rod_closed.half_ring(5), steps=30)
     assert bool(jnp.all(path.status == Status.successful))
     across = R.tip_pose(rod_closed.half_ring(5), path.q[-1])["rod"][1, 3]
     assert abs(float(across) / (2 * rod_closed.RADIUS / 3) - 1) < 1e-6
@@ -161,7 +161,7 @@ def test_a_ring_folds_to_a_third():
 
 def test_a_frame_on_two_pins_snaps_through():
     """Lee, Manuel, Rossow, J. Eng. Mech. Div. 94, 1968: first limit load 18.552."""
-    path = rod_closed.snap(4)
+    path = rod_closed.snap(rod_closed.frame(4))
     assert bool(jnp.all(path.status == Status.successful))
     turn = int(jnp.argmax(path.factors))
     assert 0 < turn < len(path.factors) - 1

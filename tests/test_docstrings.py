@@ -28,8 +28,9 @@ VERBS = {
     "problem reaction_history reactions rod_forces simulate solve solve_path solve_volume "
     "von_mises_stress",
     "rod": "assembly branch_states bspline chebyshev circle close_loops equilibrium "
-    "equilibrium_path forward_dynamics forward_kinematics inverse_kinematics joint_wrenches "
-    "mobility operators piecewise_constant rod rollout tip_pose with_closures",
+    "equilibrium_path forward_dynamics forward_kinematics inverse_kinematics "
+    "joint_wrenches mobility motion_from_velocity operators piecewise_constant rod "
+    "rollout tip_pose with_closures",
     "coupling": "mounted_rod",
     "reduction": "identify pod_basis strain_along",
     "systems": "Network simulate simulate_batch simulate_sampled",

@@ -1,5 +1,7 @@
 """Rods and assemblies as chains, checked in MuJoCo itself: tip, lowest frequency, motion."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import scipy.linalg
 from benchmarks.cases.robots_export import balanced, lowest
 from sorojax import io, rod as R
 from sorojax.math.lie import SE2, SE3, homogeneous
+from sorojax.rod.model.assembly import retract
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `robots` is not installed")
 
@@ -161,6 +164,22 @@ def test_an_arm_with_a_finger_hangs_as_it_does_here(arm, tmp_path):
         R.stiffness_matrix(fixed), R.mass_matrix(fixed, zero), eigvals_only=True
     )
     assert lowest(model) == pytest.approx(np.sqrt(values[0]) / (2 * np.pi), rel=0.05)
+
+
+@pytest.mark.parametrize("group", [SE2(), SE3()])
+def test_a_ball_joint_goes_out_and_comes_back(group, tmp_path):
+    dim = group.space_dim
+    link = R.Link(0.3, 1e-3 if dim == 2 else [1e-3, 2e-3, 2e-3], [0.1, *np.zeros(dim - 1)])
+    ball = R.Part(link, R.Spherical(damping=0.2, armature=0.05))
+    model = R.assembly(group, arm=ball, hand=dataclasses.replace(ball, on="arm"))
+    made = io.export_mjcf(tmp_path / "ball.xml", model, (R.Gravity(),))
+    assert made.unmapped == () and made.text.count('type="ball"') == 2 * (dim - 2)
+    back = io.import_robot(made.text).assembly
+    q = retract(model, R.rest(model), jnp.linspace(-0.5, 1, R.num_dof(model)))
+    assert np.allclose(R.mass_matrix(back, q), R.mass_matrix(model, q), rtol=1e-10)
+    rates = jnp.arange(1.0, 1 + R.num_dof(model))
+    a, b = (R.inverse_dynamics(x, q, rates, 0 * rates) for x in (model, back))
+    assert np.allclose(a, b, rtol=1e-9, atol=1e-12)
 
 
 def test_what_the_file_has_not_is_named(arm, tmp_path):

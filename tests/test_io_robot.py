@@ -56,6 +56,37 @@ ODD = """
 </mujoco>
 """
 
+BALLS = """
+<mujoco model="balls">
+  <compiler angle="radian" autolimits="true"/>
+  <option gravity="0.3 -0.2 -9.6"/>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body name="arm" pos="0.1 0 0.2" euler="0.2 0.1 0">
+      <joint name="rail" type="slide" axis="1 0.2 0" armature="0.1"/>
+      <joint name="shoulder" type="ball" pos="0.01 0.02 -0.03" damping="0.3" armature="0.02"/>
+      <geom type="capsule" size="0.03" fromto="0 0 0 0.3 0.05 0" mass="1.2"/>
+      <body name="forearm" pos="0.3 0 0" euler="0.4 0 0.3">
+        <joint name="elbow" axis="0 1 0" damping="0.05"/>
+        <geom type="box" size="0.1 0.02 0.03" pos="0.1 0 0" mass="0.5"/>
+        <body name="hand" pos="0.2 0.01 0">
+          <joint name="wrist" type="ball"/>
+          <geom type="ellipsoid" size="0.05 0.04 0.02" pos="0.05 0.01 0" mass="0.3"/>
+        </body>
+      </body>
+    </body>
+    <body name="drone" pos="1 0 1" euler="0.3 0 0">
+      <freejoint name="base"/>
+      <geom type="box" size="0.1 0.05 0.02" pos="0.02 0.01 0" mass="0.7"/>
+      <body name="load" pos="0 0.01 -0.1"><joint name="rope" type="ball" damping="0.01"/>
+        <geom size="0.02" pos="0.02 0 -0.1" mass="0.1"/></body>
+    </body>
+  </worldbody>
+  <actuator><motor name="lift" jointinparent="shoulder" gear="1 -2 0.5"/>
+    <motor name="flex" joint="elbow"/></actuator>
+</mujoco>
+"""
+
 
 def row(numbers):
     return " ".join(repr(float(x)) for x in numbers)
@@ -112,9 +143,14 @@ class Pair:
         data.qvel[:] = draw.normal(size=model.nv)
         self.q, self.v = data.qpos.copy(), data.qvel.copy()
         # rates of ours = turn @ rates of MuJoCo: of a free base they are in another order, and
-        # its angular velocity along the ground's axes
+        # its angular velocity along the ground's axes, that of a ball along those of the
+        # joint; both turn about themselves only, so that accelerations are related as rates
         self.turn = np.eye(model.nv)
         mujoco.mj_forward(model, data)
+        for joint in np.flatnonzero(model.jnt_type == 1):
+            at, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
+            own = turned(data.qpos[at : at + 4]).as_matrix()
+            self.turn[dof : dof + 3, dof : dof + 3] = own
         for joint in np.flatnonzero(model.jnt_type == 0):
             at, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
             self.q[at : at + 7] = np.roll(self.q[at : at + 7], 4)
@@ -145,7 +181,7 @@ def off(found, wanted):
 
 
 ARMS = ("iiwa7", "ur5e", "gen3")
-TEXTS = {name: robots.arm_mjcf(name) for name in ARMS} | {"odd": ODD}
+TEXTS = {name: robots.arm_mjcf(name) for name in ARMS} | {"odd": ODD, "balls": BALLS}
 
 
 @pytest.fixture(scope="module", params=TEXTS)
@@ -157,9 +193,8 @@ def test_inertia_bias_and_jacobians_are_those_of_mujoco(pair):
     model, (q, v), robot = pair.robot.assembly, (pair.q, pair.v), pair.robot
     ours = pair.turn.T @ R.mass_matrix(model, q) @ pair.turn
     assert off(ours, pair.mass()) < 1e-12
-    if not (pair.model.jnt_type == 0).any():  # whose rates do not turn
-        bias = R.bias_force(model, q, v, robot.gravity)
-        assert off(pair.theirs(bias), pair.data.qfrc_bias) < 1e-12
+    bias = R.bias_force(model, q, v, robot.gravity)
+    assert off(pair.theirs(bias), pair.data.qfrc_bias) < 1e-12
     rows = R.jacobian(model, q)
     for body in range(1, pair.model.nbody):
         name = pair.model.body(body).name
@@ -175,9 +210,6 @@ def test_inertia_bias_and_jacobians_are_those_of_mujoco(pair):
 
 def test_forward_dynamics_with_control_are_those_of_mujoco(pair):
     robot, data = pair.robot, pair.data
-    if (pair.model.jnt_type == 0).any():
-        data.qvel[:] = 0  # its rates turn against ours
-        pair.v = 0 * pair.v
     control = np.linspace(-0.3, 0.4, len(robot.actuators))
     data.ctrl[:] = control
     mujoco.mj_forward(pair.model, data)
@@ -260,6 +292,37 @@ def test_what_does_not_map_is_listed():
     assert robot.actuators == ("servo",)
 
 
+def test_of_a_ball_joint_springs_ranges_and_turning_motors_are_listed():
+    text = """
+    <mujoco><compiler autolimits="true"/><worldbody><body><joint name="hip" type="ball"
+      stiffness="2" range="0 30" frictionloss="0.1"/><geom size="0.1" pos="0.1 0 0"
+      contype="0" conaffinity="0"/></body></worldbody>
+      <actuator><motor name="own" joint="hip" gear="1 0 0"/>
+        <motor name="held" jointinparent="hip" gear="1 0 2"/>
+        <velocity name="slow" jointinparent="hip" kv="1"/></actuator></mujoco>"""
+    with pytest.warns(UserWarning, match="range of joint hip"):
+        robot = io.import_robot(text)
+    assert set(robot.unmapped) == {
+        "frictionloss of joint hip", "stiffness of joint hip", "range of joint hip",
+        "actuator own", "actuator slow",
+    }  # fmt: skip
+    assert robot.actuators == ("held",) and robot.gears.T.tolist() == [[1, 0, 2]]
+    assert robot.rest.tolist() == [1, 0, 0, 0]
+    with pytest.raises(ValueError, match="a free base or a ball joint, need hinges"):
+        robots.computed_torque(robot, lambda t: robot.rest, 0.0, robot.rest, jnp.zeros(3))
+
+
+def test_a_spherical_joint_of_a_urdf():
+    """A type of its own of Bullet and MuJoCo; URDF itself has none."""
+    text = """<robot name="r"><link name="a"/><link name="b"><inertial><mass value="1"/>
+      <inertia ixx="1" iyy="2" izz="2" ixy="0" ixz="0" iyz="0"/></inertial></link>
+      <joint name="hip" type="spherical"><parent link="a"/><child link="b"/>
+      <dynamics damping="0.3"/></joint></robot>"""
+    robot = io.import_robot(text)
+    assert float(robot.assembly["b"].joint.damping) == 0.3 and robot.unmapped == ()
+    assert R.mass_matrix(robot.assembly, robot.rest).tolist() == np.diag([1, 2, 2]).tolist()
+
+
 def test_meshes_make_pictures_and_may_be_left_out(tmp_path):
     corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
@@ -282,9 +345,6 @@ def test_meshes_make_pictures_and_may_be_left_out(tmp_path):
 
 
 def test_what_cannot_be_read_says_what_to_do():
-    ball = '<mujoco><worldbody><body><joint name="hip" type="ball"/><geom size="1"/></body>'
-    with pytest.raises(ValueError, match="`hip` is a ball, need hinges"):
-        io.import_robot(ball + "</worldbody></mujoco>")
     with pytest.raises(ValueError, match="MuJoCo refuses the file"):
         io.import_robot("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>")
     with pytest.raises(ValueError, match="no joint and no mass"):

@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
-from benchmarks.harness import Row, measure_calls, quick
+from benchmarks.harness import Row, measure_once, quick
 from sorojax import SE2, SE3, rod as R
 from sorojax.math.lie import homogeneous, plane_rotation
 
@@ -60,8 +60,8 @@ def pressed(factor):
     return (R.PartForce("near", R.TipWrench(factor * jnp.array([0.0, 0.0, -1.0]))),)
 
 
-def snap(modes):
-    return R.arc_length_path(frame(modes), pressed, first=2.0, steps=60, longest=1.0)
+def snap(model):
+    return R.arc_length_path(model, pressed, first=2.0, steps=60, longest=1.0)
 
 
 def peak(path):
@@ -111,9 +111,9 @@ def same(factor):
     return factor
 
 
-def fold(modes, steps=40):
+def fold(ring, steps=40):
     angles = jnp.linspace(0, 2 * np.pi, steps + 1)[1:]
-    return R.equilibrium_path(half_ring(modes), unloaded, angles, t=same)
+    return R.equilibrium_path(ring, unloaded, angles, t=same)
 
 
 # Michell, Messenger of Mathematics 11, 1889: a straight rod bent to a ring, its ends turned
@@ -142,15 +142,21 @@ def twisted(modes, ratio):
     return R.with_closures(ring, seam=seam, far=far)
 
 
-def critical_twist(modes, ratio):
+# the search goes no further than some 0.05 rad of twist, and larger steps are tried and cut
+SHARES = np.concatenate([0.004 * np.arange(1, 246), np.arange(0.983, 1.017, 0.002)])
+
+
+def twist(ring, twists):
+    modes = R.num_dof(ring) // 3
+    start = jnp.zeros(3 * modes).at[2 * modes].set(1.0)
+    return R.equilibrium_path(ring, unloaded, twists, start, t=same)
+
+
+def critical(path):
     """Half way between the last stable twist and the first unstable one, of twists 0.2 % of
     the closed form apart."""
-    closed = 2 * np.pi * np.sqrt(3) * (1 + ratio)
-    shares = np.concatenate([np.linspace(0.1, 0.9, 9), np.arange(0.983, 1.017, 0.002)])
-    start = jnp.zeros(3 * modes).at[2 * modes].set(1.0)
-    path = R.equilibrium_path(twisted(modes, ratio), unloaded, closed * shares, start, t=same)
     first = int(np.argmax(np.asarray(path.negative_eigenvalues) > 0))
-    return (shares[first - 1] + shares[first]) / 2 if first else float("nan")
+    return (SHARES[first - 1] + SHARES[first]) / 2 if first else float("nan")
 
 
 # Ibrahimbegovic, CMAME 149, 1997
@@ -175,6 +181,10 @@ def roll(modes):
 
 def rolled(factor):
     return (R.TipWrench(factor * jnp.array([0, 0, MOMENT, 0, 0, ACROSS])),)
+
+
+def load(model, factors):
+    return R.equilibrium_path(model, rolled, factors)
 
 
 def shot(factor, guess):
@@ -202,24 +212,24 @@ def shot(factor, guess):
 def rows():
     few = quick("more modes, the roll-up beyond half of its load")
     for modes in (4,) if few else (4, 6):
-        timing = measure_calls(lambda modes=modes: snap(modes), repeats=2)
-        error = abs(peak(snap(modes)) / LIMIT - 1)
+        timing, path = measure_once(snap, frame(modes))
+        error = abs(peak(path) / LIMIT - 1)
         yield _row("Lee's frame", modes, timing, error, "first limit load 18.552 E I / L^2")
     for modes in (5,) if few else (5, 8):
-        timing = measure_calls(lambda modes=modes: fold(modes), repeats=2)
-        model, path = half_ring(modes), fold(modes)
+        model = half_ring(modes)
+        timing, path = measure_once(fold, model)
         across = float(R.tip_pose(model, path.q[-1])["rod"][1, 3])
         error = abs(across / (2 * RADIUS / 3) - 1)
         yield _row("Goto's ring", modes, timing, error, "radius / 3 after a whole turn")
     for ratio, modes in ((0.0, 13),) if few else ((0.0, 13), (0.5, 17)):
-        timing = measure_calls(lambda m=modes, r=ratio: critical_twist(m, r), repeats=1)
-        error = abs(critical_twist(modes, ratio) - 1)
+        twists = jnp.asarray(2 * np.pi * np.sqrt(3) * (1 + ratio) * SHARES)
+        timing, path = measure_once(twist, twisted(modes, ratio), twists)
+        error = abs(critical(path) - 1)
         case = f"Michell's ring, Poisson ratio {ratio}"
         yield _row(case, modes, timing, error, "critical twist 2 pi sqrt(3) E I / (G J)")
     for share, modes in ((0.5, 16),) if few else ((0.5, 16), (1.0, 24)):
         factors = jnp.linspace(0, share, round(100 * share) + 1)[1:]
-        run = lambda m=modes, f=factors: R.equilibrium_path(roll(m), rolled, f)  # noqa: E731
-        timing, path = measure_calls(run, repeats=1), run()
+        timing, path = measure_once(load, roll(modes), factors)
         tip = np.asarray(R.tip_pose(roll(modes), path.q[-1])[:3, 3])
         error = float(np.linalg.norm(tip - shot(share, tip))) / LENGTH
         case = f"roll-up into {round(10 * share)} turns"

@@ -1,5 +1,5 @@
 """A flexible rod in free flight, in space and in the plane: momentum after a pulse of force
-and moment on one end, and its ends beside an independent solution."""
+and moment on one end, and its ends beside an independent solution and PyElastica."""
 
 from collections.abc import Callable
 
@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks import peers
 from benchmarks.discrete_rod import Bar, flight
 from benchmarks.harness import Row, measure, quick
 from sorojax._types import real
@@ -40,6 +41,10 @@ STEPS = ((GeneralisedAlpha(1.0), 4e-3), (TripleJump(), 2e-3), (DormandPrince(), 
 TILT = np.array([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
 START = np.array([0.0, 8.0, 0.0])
 BAR_OF_ENDS = 5e-3
+FINER = (4, 12), (6, 14), (10, 24)  # modes, nodes
+ELASTICA = 20, 40, 80, 160  # elements, at half of the step that the stiffest mode can bear
+FLAT = (0.0, 0.0, 80.0, 8.0, 0.0, 0.0)
+NUMBERS = dict(axial=1e4, bending=500.0, mass=1.0, rotary=10.0)
 INDEPENDENT = "both ends after 5 s, discrete elements (SciPy), relative to the length"
 
 
@@ -67,7 +72,7 @@ class Pulse(AbstractForce):
         return share * self.wrench @ columns
 
 
-def flying(group, turn, start):
+def flying(group, turn, start, modes=MODES, nodes=NODES):
     """A rod on a free base: 1e4 N in stretch and shear, 500 N m^2 in bending and torsion."""
     names = ("kappa_z", "sigma_x", "sigma_y")
     if group.space_dim == 3:
@@ -75,27 +80,27 @@ def flying(group, turn, start):
     bends = ("kappa_y", "kappa_z")
     beam = rod(
         group,
-        chebyshev(**{name: MODES - (name not in bends) for name in names}),
+        chebyshev(**{name: modes - (name not in bends) for name in names}),
         Section(1.0, 0.05, 0.05, 0.05, 1.0),
         length=LENGTH,
         young_modulus=1e4,
         poisson_ratio=-0.5,
         density=1.0,
-        nodes=NODES,
+        nodes=nodes,
         mass_section=Section(1.0, 10.0, 10.0, 10.0, 1.0),
     )
     pose = homogeneous(jnp.array(turn), jnp.array(start))
     return assembly(group, rod=Part(beam, Free(), offset=pose))
 
 
-def spaghetti():
+def spaghetti(**size):
     """The rod of Simo and Vu-Quoc (1988)."""
-    return flying(SE3(), TILT, START)
+    return flying(SE3(), TILT, START, **size)
 
 
-def in_plane():
+def in_plane(**size):
     """The rod of Simo and Vu-Quoc, J. Appl. Mech. 53, 1986."""
-    return flying(SE2(), TILT[:2, :2], START[:2])
+    return flying(SE2(), TILT[:2, :2], START[:2], **size)
 
 
 def fly(model, forces, stepper, step):
@@ -124,7 +129,7 @@ def ends(model, forces):
 
 def independent(wrench, share, count):
     """The same by discrete elements."""
-    bar = Bar(LENGTH, axial=1e4, bending=500.0, mass=1.0, rotary=10.0)
+    bar = Bar(LENGTH, **NUMBERS)
 
     def push(t):
         both = float(share(t)) * np.asarray(wrench)
@@ -142,26 +147,62 @@ def drift(momenta):
 
 def rows():
     yield from momenta()
+    some = slice(1) if quick("finer rods than of 4 modes or 20 elements") else slice(None)
     count = 12 if quick("finer elements of the independent solution") else 32
-    flat = (0.0, 0.0, 80.0, 8.0, 0.0, 0.0)
-    for case, model, wrench, share in (
-        ("in space", spaghetti(), WRENCH, rising),
-        ("in the plane", in_plane(), flat, constant),
+    for case, make, wrench, share in (
+        ("in space", spaghetti, WRENCH, rising),
+        ("in the plane", in_plane, FLAT, constant),
     ):
+        want = independent(wrench, share, count)
         own = wrench if case == "in space" else wrench[2:5]
         forces = (PartForce("rod", Pulse(own, share)),)
-        timing = measure(ends, model, forces, repeats=2)
-        found = np.asarray(jax.jit(ends)(model, forces))
-        apart = found - independent(wrench, share, count)[:, : found.shape[1]]
-        yield Row(
-            "sorojax",
-            {"dof": num_dof(model), "flight": case},
-            **timing.columns(),
-            error=float(np.linalg.norm(apart, axis=1).max()) / LENGTH,
-            reference=INDEPENDENT,
-            bar=BAR_OF_ENDS,
-            bar_on="error",
-        )
+        for modes, nodes in FINER[some]:
+            model = make(modes=modes, nodes=nodes)
+            timing = measure(ends, model, forces, repeats=2)
+            yield Row(
+                "sorojax",
+                {"dof": num_dof(model), "flight": case},
+                **timing.columns(),
+                error=apart(jax.jit(ends)(model, forces), want),
+                reference=INDEPENDENT,
+                bar=BAR_OF_ENDS,
+                bar_on="error",
+            )
+        for elements in ELASTICA[some]:
+            yield elastica(case, wrench, share, want, elements)
+
+
+def apart(found, want):
+    """Of the ends, by the length; in the plane two coordinates."""
+    found = np.asarray(found)
+    return float(np.linalg.norm(found - want[:, : found.shape[1]], axis=1).max()) / LENGTH
+
+
+def elastica(case, wrench, share, want, elements):
+    """The same rod in PyElastica, whose section shrinks as it stretches."""
+    knots = np.array([0.0, PEAK - 1e-9, PEAK, END])
+    stiffness, inertia = ("axial", "axial", "bending"), ("mass", "rotary")
+    arrays = {
+        "bar": np.array([LENGTH, *(NUMBERS[k] for k in stiffness + inertia)]),
+        "base": START,
+        "axes": TILT,
+        "wrench": np.array(wrench),
+        "times": knots,
+        "shares": np.asarray(share(knots)),
+    }
+    return peers.row(
+        "pyelastica",
+        "flight",
+        arrays,
+        lambda answer: apart(answer["ends"][-1], want),
+        INDEPENDENT,
+        elements=elements,
+        share=0.5,
+        flight=case,
+        duration=END,
+        save_dt=END,
+        repeats=3,
+    )
 
 
 def momenta():

@@ -90,7 +90,9 @@ def row(
     except PeerMissing as reason:
         return missing(peer, str(reason), **options)
     runs = sorted(answer["runs"])
-    told = {key: answer[key] for key in ("version", "solver", "iterations") if key in answer}
+    told = {
+        key: answer[key] for key in ("version", "solver", "iterations", "step") if key in answer
+    }
     return Row(
         peer,
         options | told,

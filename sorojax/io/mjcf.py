@@ -28,6 +28,7 @@ from sorojax.rod import (
     Prismatic,
     Revolute,
     Rod,
+    Spherical,
     columns,
     forward_kinematics,
     jacobian,
@@ -110,8 +111,8 @@ def export_mjcf(
         other kinds, closures, and a chain whose lowest frequency is off by more than 5 %.
 
     Raises:
-        ValueError: If a joint is neither fixed, revolute, prismatic nor a free base, `segments`
-            is below 2, or the path leaves `root`.
+        ValueError: If a joint is neither fixed, revolute, prismatic, spherical nor a free
+            base, `segments` is below 2, or the path leaves `root`.
 
     Example:
         >>> finger = rod.rod(sj.SE3(), rod.chebyshev(kappa_y=4, kappa_z=4), rod.circle(6 * mm),
@@ -216,18 +217,24 @@ class _Writer:
         if isinstance(joint, Free) and grounded and not planar:
             ET.SubElement(body, "freejoint", name=name)
             return
-        if not isinstance(joint, Revolute | Prismatic):
+        if not isinstance(joint, Revolute | Prismatic | Spherical):
             raise ValueError(
                 f"{_WHERE}: the joint of `{name}` is a {type(joint).__name__}, need Fixed, "
-                "Revolute, Prismatic, or Free in space on the ground. Give it another one."
+                "Revolute, Prismatic, Spherical, or Free in space on the ground. Give it "
+                "another one."
             )
-        turns = isinstance(joint, Revolute)
+        ball = isinstance(joint, Spherical)
+        turns = isinstance(joint, Revolute) or ball
         axis = np.array([0.0, 0.0, 1.0] if turns else [1.0, 0.0, 0.0])
-        if joint.axis is not None and not (planar and turns):
-            axis = np.pad(np.asarray(joint.axis, float), (0, 3 - len(joint.axis)))
-        numbers = {"stiffness": joint.stiffness, "damping": joint.damping}
-        numbers["armature"] = joint.armature
+        numbers = {"damping": joint.damping, "armature": joint.armature}
+        if not ball:
+            numbers["stiffness"] = joint.stiffness
+            if joint.axis is not None and not (planar and turns):
+                axis = np.pad(np.asarray(joint.axis, float), (0, 3 - len(joint.axis)))
         given = {key: _row([value]) for key, value in numbers.items() if value is not None}
+        if ball and not planar:
+            ET.SubElement(body, "joint", {"name": name, "type": "ball", **given})
+            return
         kind = "hinge" if turns else "slide"
         ET.SubElement(body, "joint", {"name": name, "type": kind, "axis": _row(axis), **given})
 

@@ -22,6 +22,7 @@ from sorojax.rod import (
     Part,
     Prismatic,
     Revolute,
+    Spherical,
     num_coordinates,
     num_dof,
 )
@@ -30,6 +31,7 @@ from sorojax.sdf import Surface
 Pose = Float[np.ndarray, "4 4"]
 _WHERE = "import_robot"
 _FREE, _BALL, _SLIDE, _HINGE = range(4)  # numbers of MuJoCo, as those below
+_IN_JOINT, _IN_PARENT = 0, 1  # the frame of an actuator's axis
 _QUIET = "contact", "sensor"
 
 
@@ -46,8 +48,9 @@ def import_robot(
     of frames without mass. Springs, dampers and armature go to the joints, and so does what a
     position or velocity servo adds to them; motors, gears, limits, keyframes, named bodies
     and sites are told beside. Coordinates keep order and zero of the file, but of a free
-    base, whose quaternion comes before its position. Geoms are pictures: contact is put on
-    by `rod.LinkContact` and `rod.LinkObstacle`.
+    base, whose quaternion comes before its position. Rates of a ball joint or a free base are
+    along the axes of the joint frame, where MuJoCo turns those of rotation with the body.
+    Geoms are pictures: contact is put on by `rod.LinkContact` and `rod.LinkObstacle`.
 
     Args:
         source: Name of a file, or its text (all that has a "<").
@@ -61,7 +64,7 @@ def import_robot(
 
     Raises:
         ModuleNotFoundError: If MuJoCo is missing.
-        ValueError: If MuJoCo refuses the text, or a joint is a ball.
+        ValueError: If MuJoCo refuses the text, or nothing of it has a mass.
 
     Example:
         >>> pendulum = '''<mujoco><worldbody><body name="bob"><joint name="hinge" axis="0 1 0"/>
@@ -245,10 +248,10 @@ def _joint(model: Any, joint: int, at: Pose) -> tuple[AbstractJoint, Pose | None
     if kind == _FREE:
         return Free(), None, np.eye(4)
     if kind == _BALL:
-        raise ValueError(
-            f"{_WHERE}: the joint `{_name(model, 'joint', joint)}` is a ball, need hinges, "
-            "slides or a free base. Write three hinges in its place."
-        )
+        dof = model.jnt_dofadr[joint]
+        numbers = dict(damping=model.dof_damping[dof], armature=model.dof_armature[dof])
+        given = {key: float(value) for key, value in numbers.items() if value}
+        return Spherical(**given), at @ _moved(place), _moved(-place)
     dof, zero = model.jnt_dofadr[joint], float(model.qpos0[model.jnt_qposadr[joint]])
     stiffness, damping = (float(x) for x in _spring(model, joint))
     armature = float(model.dof_armature[dof])
@@ -313,10 +316,12 @@ def _actuator_table(model: Any) -> dict[str, Any]:
         rest = model.qpos_spring[model.jnt_qposadr[joint]]
         preload[model.jnt_dofadr[joint]] = model.jnt_stiffness[joint] * rest
     for column, actuator in enumerate(every):
-        dof = model.jnt_dofadr[model.actuator_trnid[actuator, 0]]
-        gear, gain = model.actuator_gear[actuator, 0], model.actuator_gainprm[actuator, 0]
-        gears[dof, column] = gear * gain
-        preload[dof] += gear * _bias(model, actuator)[0]
+        joint = model.actuator_trnid[actuator, 0]
+        width = 3 if model.jnt_type[joint] == _BALL else 1
+        dofs = slice(model.jnt_dofadr[joint], model.jnt_dofadr[joint] + width)
+        gear, gain = model.actuator_gear[actuator, :width], model.actuator_gainprm[actuator, 0]
+        gears[dofs, column] = gear * gain
+        preload[dofs] += gear * _bias(model, actuator)[0]
         if model.actuator_ctrllimited[actuator]:
             span[column] = model.actuator_ctrlrange[actuator]
         if model.actuator_forcelimited[actuator] and not _bias(model, actuator).any():
@@ -342,12 +347,20 @@ def _axial(model: Any) -> list[int]:
 
 
 def _mapped(model: Any) -> list[int]:
-    """Actuators of a hinge or slide, with a force that is linear in control."""
+    """Actuators of a hinge or slide, with a force that is linear in control, and motors of a
+    ball joint along axes of its carrier."""
+
+    def moves(actuator: int) -> bool:
+        kind = model.jnt_type[model.actuator_trnid[actuator, 0]]
+        held = model.actuator_trntype[actuator] == _IN_PARENT
+        motor = not _bias(model, actuator)[1:].any()
+        return kind in (_SLIDE, _HINGE) or (kind == _BALL and held and motor)
+
     return [
         actuator
         for actuator in range(model.nactuator if hasattr(model, "nactuator") else model.nu)
-        if model.actuator_trntype[actuator] in (0, 1)
-        and model.jnt_type[model.actuator_trnid[actuator, 0]] in (_SLIDE, _HINGE)
+        if model.actuator_trntype[actuator] in (_IN_JOINT, _IN_PARENT)
+        and moves(actuator)
         and model.actuator_dyntype[actuator] == 0
         and model.actuator_gaintype[actuator] == 0
         and model.actuator_biastype[actuator] in (0, 1)
@@ -370,13 +383,15 @@ def _coordinates(model: Any, positions: np.ndarray) -> Any:
 def _unmapped(model: Any):
     """Names of all that moves the robot of the file and not the assembly."""
     for joint in range(model.njnt):
-        first = model.jnt_dofadr[joint]
-        axial = model.jnt_type[joint] in (_SLIDE, _HINGE)
-        dofs = slice(first, first + (1 if axial else 6))
+        first, kind = model.jnt_dofadr[joint], model.jnt_type[joint]
+        dofs = slice(first, first + {_FREE: 6, _BALL: 3}.get(kind, 1))
         rows = {"frictionloss": model.dof_frictionloss[dofs]}
-        if not axial:
+        if kind == _FREE:
             rows |= {"damping": model.dof_damping[dofs], "armature": model.dof_armature[dofs]}
+        if kind in (_FREE, _BALL):
             rows |= {"stiffness": model.jnt_stiffness[joint : joint + 1]}
+        if kind == _BALL:
+            rows |= {"range": model.jnt_limited[joint : joint + 1]}
         for field in ("dof_dampingpoly", "jnt_stiffnesspoly", "jnt_springyield"):
             if hasattr(model, field):
                 values = getattr(model, field)

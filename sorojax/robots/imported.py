@@ -131,7 +131,7 @@ def computed_torque(
     robot carries acts as a disturbance.
 
     Args:
-        robot: As `io.import_robot` reads it, without a free base.
+        robot: As `io.import_robot` reads it, without a free base or a ball joint.
         plan: Coordinates [rad or m] as a function of time [s] that is two times
             differentiable, e.g. `systems.Waypoints(..., smooth=True)`.
         t: Time [s].
@@ -143,7 +143,7 @@ def computed_torque(
         One `rod.JointEffort` for each part that moves.
 
     Raises:
-        ValueError: If the robot has a free base.
+        ValueError: If the robot has a free base or a ball joint.
 
     Example:
         >>> iiwa = sj.io.import_robot(robots.arm_mjcf("iiwa7"))
@@ -160,8 +160,9 @@ def computed_torque(
     assembly, frequency, t = robot.assembly, real(frequency), real(t)
     if num_coordinates(assembly) != num_dof(assembly):
         raise ValueError(
-            "computed_torque: the robot has a free base, need one on the ground: no joint "
-            "drives a base. Weld it, or write a controller of your own."
+            "computed_torque: the robot has a free base or a ball joint, need hinges and "
+            "slides on the ground: a quaternion has no error by difference. Weld the base, or "
+            "write a controller of your own."
         )
     here, speed = q[: num_dof(assembly)], v[: num_dof(assembly)]
 

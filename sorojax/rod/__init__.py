@@ -103,6 +103,7 @@ from sorojax.rod.model.basis import (
     orthonormalise,
 )
 from sorojax.rod.model.closure import Closure
+from sorojax.rod.model.driven import DrivenMotion, motion_from_velocity
 from sorojax.rod.model.joint import (
     AbstractJoint,
     Fixed,
@@ -179,6 +180,7 @@ __all__ = [
     "Damping",
     "Direction",
     "Drag",
+    "DrivenMotion",
     "Elastic",
     "EnergyLaw",
     "Fixed",
@@ -265,6 +267,7 @@ __all__ = [
     "mobility",
     "momentum",
     "motion",
+    "motion_from_velocity",
     "num_coordinates",
     "num_dof",
     "operators",

@@ -293,6 +293,7 @@ GROUND, END = (homogeneous(jnp.eye(2), jnp.array([x, 0.02])) for x in (0.12, 0.0
 TRIANGLE = R.with_closures(
     ARM, end=R.Closure("second", R.Spherical(), offset=GROUND, frame=END)
 )
+TWISTS = jnp.array([[0.1, 0.2, 0.3, 1, 2, 3], [1, -1, 0.5, 0, 1, 2], [0, 2, 1, 1, 0, -1]])
 FLAT_WRENCH = jnp.array([1e-3, 0.01, 0.05])
 BALL = sdf.Circle((0.05, 0.012), 8e-3)
 EVERYWHERE = np.linspace(0.05, 1.0, 16)
@@ -468,6 +469,10 @@ CASES = (
         "elastic": Case(elastic, (3e5, 5e6)),
         "close_loops": Case(
             lambda model: R.close_loops(model, jnp.array([0.5, -1.0])).q, TRIANGLE, rtol=1e-6
+        ),
+        "motion_from_velocity": Case(
+            lambda at: R.motion_from_velocity(*at, axes="moving")(jnp.asarray(0.7)),
+            (jnp.array([0.0, 0.4, 1.0]), TWISTS, homogeneous(jnp.eye(3), jnp.ones(3))),
         ),
         "tip_angle": Case(lambda q: R.tip_angle(R.motion(FLAT, q)), BENT),
         "joint_wrenches, part_momenta": Case(

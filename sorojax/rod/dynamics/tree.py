@@ -447,7 +447,8 @@ def _with_rotors(mass: Float[Array, "dof dof"], assembly: Assembly) -> Float[Arr
     for part, at in zip(assembly.parts, slices(assembly), strict=True):
         rotor = part.joint.rotor_inertia()
         if rotor is not None:
-            mass = mass.at[at.joint_v, at.joint_v].add(jnp.diag(rotor.astype(mass.dtype)))
+            every = jnp.broadcast_to(rotor, at.joint_v.stop - at.joint_v.start)
+            mass = mass.at[at.joint_v, at.joint_v].add(jnp.diag(every.astype(mass.dtype)))
     return mass
 
 

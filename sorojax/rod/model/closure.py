@@ -35,6 +35,7 @@ class Closure(eqx.Module):
         at: Where on a rod that is held, in [0, 1].
         motion: From time [s] to the pose of the joint beyond `offset`, homogeneous, or to its
             position alone [m]: an end that is driven. Twice differentiable for a run in time.
+            `motion_from_velocity` makes one of a velocity.
             An `eqx.Module` passes through `jax.jit` with the model, and its numbers have
             derivatives; a plain function needs a closure over the model, or `eqx.filter_jit`.
     """

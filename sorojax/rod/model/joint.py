@@ -75,8 +75,9 @@ class AbstractJoint(eqx.Module):
             "Prismatic, Spherical or Roller. Put it between two parts of the tree instead."
         )
 
-    def rotor_inertia(self) -> Float[Array, " dof"] | None:
-        """What a rotor behind a gear adds to the diagonal of the mass matrix, per rate."""
+    def rotor_inertia(self) -> Float[Array, " rotors"] | None:
+        """What a rotor behind a gear adds to the diagonal of the mass matrix, per rate; one
+        number for all of them, or one for each."""
         return None
 
 
@@ -195,7 +196,14 @@ class Spherical(AbstractJoint):
 
     Coordinates: a unit quaternion (scalar first), in a plane the angle [rad]. Rates: angular
     velocity along the axes of the joint frame [rad/s].
+
+    Attributes:
+        damping: The same about every axis [N m s/rad].
+        armature: Inertia of a rotor about every axis, as that of `Revolute` [kg m^2].
     """
+
+    damping: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
+    armature: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
 
     def num_coordinates(self, group):
         return 4 if group.space_dim == 3 else 1
@@ -222,8 +230,18 @@ class Spherical(AbstractJoint):
     def rate(self, group, q, v):
         return v if group.space_dim == 2 else quaternion_rate(v, q)
 
+    def matrices(self, group, dtype):
+        eye = jnp.eye(group.rotation_dim, dtype=dtype)
+        return 0 * eye, _scalar(self.damping, dtype) * eye
+
+    def effort(self, q, v):
+        return None if self.damping is None else -self.damping * v
+
     def violation(self, group, rotation, position):
         return position
+
+    def rotor_inertia(self):
+        return None if self.armature is None else self.armature[None]
 
 
 class Roller(AbstractJoint):
