@@ -1,0 +1,146 @@
+"""Reduced bodies whose force comes from a few weighted cells: exact with all of them, close
+with few, and what they refuse."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sorojax import fem, material, mesh, systems
+from sorojax.systems.blocks.modal_body import ProjectedForce
+from sorojax.systems.blocks.sampled_force import (
+    sampled_force,
+    snapshot_basis,
+    sparse_weights,
+)
+
+PUSH = jnp.stack([jnp.zeros(9), -jnp.linspace(0, 0.2, 9)], axis=1)  # N
+
+
+def beam(formulation=None) -> systems.FemBody:
+    """A cantilever in the plane, its free end driven by a force, under its weight."""
+    cells = mesh.rectangle([0, 0], [0.08, 0.01], divisions=(16, 2), element=mesh.Quad8())
+    rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.4, density=1000.0)
+    stiffer = np.where(np.arange(cells.num_cells) % 2, 1.0, 1.5)
+    problem = fem.problem(
+        cells,
+        material.Scaled(rubber, stiffer),
+        kinematics=fem.PlaneStrain(0.01),
+        supports=(fem.Fixed(cells.node_sets["left"]),),
+        loads=(
+            fem.Force(cells.node_sets["right"], [0.0, 0.0], name="push"),
+            fem.Gravity([0.0, -9.81]),
+        ),
+        formulation=formulation,
+    )
+    return systems.FemBody(problem, driven=("push",))
+
+
+@functools.cache
+def trained() -> systems.SampledBody:
+    return systems.sampled_body(beam(), [{"push": PUSH}], modes=6, tolerance=5e-3)
+
+
+@pytest.mark.parametrize("formulation", [fem.Displacement(), fem.ConstantPressure()])
+def test_all_cells_make_the_projected_force(formulation):
+    body = beam(formulation)
+    draw = np.random.default_rng(0)
+    points = body.problem.mesh.points
+    field = jnp.asarray(1e-3 * draw.normal(size=(5, *points.shape)))
+    basis = snapshot_basis(body, field.at[:, body.problem.supports[0].nodes].set(0.0), 6)
+    count = body.problem.mesh.num_cells
+    got = sampled_force(body, basis, np.arange(count), np.ones(count))
+    want = ProjectedForce(body.problem, basis)
+    q = 1e-5 * jnp.asarray(draw.normal(size=len(basis)))
+    size = float(jnp.max(jnp.abs(want(q))))
+    np.testing.assert_allclose(got(q), want(q), atol=1e-11 * size)
+    np.testing.assert_allclose(got.energy(q), want.energy(q), rtol=1e-9)
+    np.testing.assert_allclose(jax.grad(got.energy)(q), got(q), atol=1e-11 * size)
+
+
+def test_few_cells_find_equilibria_that_were_not_trained_on():
+    found = trained()
+    assert len(found.cells) < found.num_cells / 2
+    assert np.all(np.asarray(found.weights) > 0)
+    assert found.training_error <= 5e-3
+    assert found.error < 1e-2
+    assert f"{len(found.cells)} of {found.num_cells} cells" in repr(found)
+
+
+def test_it_follows_the_full_body_in_a_network():
+    """Whose end is pushed as far as in training, in a tenth of its period."""
+    ramp = systems.SmoothRamp([0.0, 0.05], [[0.0, 0.0], [0.0, -0.12]])
+    push = systems.Source(ramp, unit="N")
+    films = []
+    for block, solver in (
+        (beam(), systems.Coupled()),
+        (trained().body, systems.Rosenbrock2(refresh=True)),
+    ):
+        network = systems.Network({"body": block, "push": push}, {"body.push_force": "push.value"})
+        films.append(systems.simulate(network, 0.05, save=6, step=1e-3, solver=solver))
+    want = films[0].state["body"]["u"]
+    basis = trained().body.basis
+    got = jax.vmap(lambda q: systems.displacement(basis, q))(films[1].state["body"]["q"])
+    assert jnp.max(jnp.abs(got - want)) < 0.02 * jnp.max(jnp.abs(want))
+
+
+def test_the_derivative_by_the_stiffness_is_that_of_differences():
+    body = trained().body
+    q = 1e-4 * jnp.arange(1.0, 1 + len(body.basis)) * body.q.at[0].set(1.0)
+
+    def energy(scale):
+        stiff = body.force.body.material.base.shear_modulus * scale
+        at = eqx.tree_at(lambda f: f.body.material.base.shear_modulus, body.force, stiff)
+        return at.energy(q)
+
+    slope = jax.grad(energy)(1.0)
+    h = 1e-4
+    np.testing.assert_allclose(slope, (energy(1 + h) - energy(1 - h)) / (2 * h), rtol=1e-8)
+
+
+def test_weights_of_repeated_columns_are_found():
+    """Three kinds of columns, many of each: one of each and its number would do."""
+    draw = np.random.default_rng(0)
+    kinds, counts = draw.uniform(0.1, 1.0, (12, 3)), (5, 9, 2)
+    rows = np.repeat(kinds, counts, axis=1)
+    cells, weights, left = sparse_weights(rows, 1e-9)
+    assert len(cells) == 3 and left < 1e-9
+    np.testing.assert_allclose(np.sort(weights), np.sort(counts), rtol=1e-6)
+
+
+def test_weights_stop_at_the_tolerance_and_are_positive():
+    rows = np.random.default_rng(1).normal(size=(40, 200)) + 0.3
+    found = [sparse_weights(rows, tolerance) for tolerance in (0.3, 0.1, 0.03)]
+    assert len(found[0][0]) < len(found[1][0]) < len(found[2][0])
+    for (cells, weights, left), tolerance in zip(found, (0.3, 0.1, 0.03), strict=True):
+        assert left <= tolerance and (weights > 0).all()
+        want = rows.sum(axis=1)
+        gap = np.linalg.norm(rows[:, cells] @ weights - want) / np.linalg.norm(want)
+        np.testing.assert_allclose(gap, left, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("path", "modes", "text"),
+    [
+        ({"pull": PUSH}, 6, "need one driven load of \\['push'\\]"),
+        ({"push": PUSH[:2]}, 6, "got 2 equilibria"),
+        ({"push": PUSH}, 2, "2 modes, need 4 and 3"),
+    ],
+)
+def test_what_cannot_train_is_refused(path: Any, modes, text):
+    with pytest.raises(ValueError, match=text):
+        systems.sampled_body(beam(), [path], modes=modes)
+
+
+def test_a_body_with_moved_supports_is_refused():
+    body = beam()
+    moved = fem.Prescribed(body.problem.supports[0].nodes, [0.0, 0.0], name="clamp")
+    problem = dataclasses.replace(body.problem, supports=(moved,))
+    body = systems.FemBody(problem, driven=("push", "clamp"))
+    with pytest.raises(ValueError, match="driven supports"):
+        systems.sampled_body(body, [{"push": PUSH}], modes=6)
