@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,9 +37,7 @@ def on_block(dim, ratio, modulus, *, held=False, density=1000.0, **options):
         one = whisker(SE3(), rod.chebyshev(kappa_y=2, kappa_z=2), density=density)
     base = np.eye(dim + 1)
     base[0, -1] = SIZE / 2
-    cells, load = coupling.mounted_rod(
-        block, one, block.node_sets["right"], base, **options
-    )
+    cells, load = coupling.mounted_rod(block, one, block.node_sets["right"], base, **options)
     rubber = material.neo_hookean(
         young_modulus=modulus, poisson_ratio=0.3, density=ROD_MASS / ratio / SIZE**3
     )
@@ -59,7 +58,9 @@ def total(motion):
     return energies.kinetic + energies.elastic + energies.loads
 
 
-@pytest.mark.parametrize("dim,ratio", [(2, 0.1), (2, 10.0), (3, 1.0)])
+@pytest.mark.parametrize(
+    "dim,ratio", [(2, 0.1), (2, 10.0), pytest.param(3, 1.0, marks=pytest.mark.slow)]
+)
 def test_a_rod_on_a_hard_block_in_flight_moves_as_their_assembly(dim, ratio):
     """They tumble three quarters of a turn in the plane; the rod lags and swings."""
     problem, one, base = on_block(dim, ratio, 1e7)
@@ -126,7 +127,6 @@ def test_a_rod_that_continues_a_beam_has_the_frequencies_of_the_whole():
         for x, y in ((cells, (load,)), (beam(2 * long, (24, 2)), ()))
     )
     found, want = (jnp.sqrt(fem.eigenmodes(x, count=2).eigenvalues) for x in (both, whole))
-    print(found / want - 1)
     np.testing.assert_allclose(found, want, rtol=0.01)
 
 
@@ -134,13 +134,13 @@ def test_a_rod_that_continues_a_beam_has_the_frequencies_of_the_whole():
 def test_a_soft_block_and_its_rod_keep_their_energy(ratio):
     problem, _, _ = on_block(2, ratio, 3e4, held=True, gravity=[0.0, -9.81])
     motion = fem.simulate(problem, 0.4, 1e-3, save=41)
-    energy, moving = total(motion), motion.energies.kinetic
-    size = float(jnp.max(moving))
-    assert float(jnp.max(motion.energies.elastic)) > 0.01 * size
-    print(ratio, jnp.max(jnp.abs(energy - energy[0])) / size)
-    assert jnp.max(jnp.abs(energy - energy[0])) < 0.01 * size
-    balance = motion.energies.balance
-    assert jnp.max(jnp.abs(balance - balance[0])) < 0.01 * size
+    energy, size = total(motion), float(jnp.max(motion.energies.kinetic))
+    assert float(jnp.max(motion.energies.elastic)) > 1e-3 * size
+    assert jnp.max(jnp.abs(energy - energy[0])) < 1e-3 * size
+    # work is counted where forces act: of second order where that is the middle of a step
+    even = fem.simulate(problem, 0.4, 1e-3, save=41, method=fem.GeneralisedAlpha(1.0))
+    for kept in (total(even), even.energies.balance):
+        assert jnp.max(jnp.abs(kept - kept[0])) < 0.01 * size
 
 
 def test_supports_bear_weight_and_inertia_of_the_rod():
@@ -148,12 +148,12 @@ def test_supports_bear_weight_and_inertia_of_the_rod():
     gravity = np.array([0.0, -9.81])
     problem, _, _ = on_block(2, 1.0, 3e4, held=True, gravity=gravity)
     motion = fem.simulate(problem, 0.02, 2.5e-4, method=fem.Newmark())
-    found = fem.reactions(motion)["fixed"].force
+    found = fem.reaction_history(motion)["fixed"].force
     linear = fem.momentum(motion)[0]
     rate = (linear[2:] - linear[:-2]) / 5e-4
     weight = ROD_MASS * gravity
-    print(jnp.max(jnp.abs(found[1:-1] - (rate - weight))) / abs(weight[1]))
-    np.testing.assert_allclose(found[1:-1], rate - weight, atol=0.01 * abs(weight[1]))
+    assert float(jnp.max(jnp.abs(rate))) > 0.5 * abs(weight[1])
+    np.testing.assert_allclose(found[1:-1], rate - weight[None], atol=0.01 * abs(weight[1]))
 
 
 def test_a_network_moves_block_and_rod_as_fem_does():
@@ -161,7 +161,7 @@ def test_a_network_moves_block_and_rod_as_fem_does():
     start = fem.simulate(problem, 0.02, 1e-3).end
     u, v = start.displacement, start.velocity
     body = systems.FemBody(problem, driven=("rod",), u=u, v=v, energies=True)
-    network = systems.Network({"body": body})
+    network = systems.Network({"body": body}, {}, exposed=("body.rod",))
     pull = {"body.rod": lambda t: jnp.stack([0 * t, 0.01 - t])}
     film = systems.simulate(network, 0.02, step=1e-3, save=21, inputs=pull)
     assert film.status == Status.successful
@@ -176,20 +176,24 @@ def test_a_network_moves_block_and_rod_as_fem_does():
 
 
 def test_slopes_of_a_motion_are_those_of_its_values():
+    given, _, _ = on_block(2, 1.0, 3e4, held=True)
+    still = jnp.zeros_like(given.mesh.points)
+
     def end(numbers):
         modulus, density, speed = numbers
-        problem, _, _ = on_block(2, 1.0, modulus, held=True, density=density)
-        still = jnp.zeros_like(problem.mesh.points)
-        load: Any = problem.loads[0]
-        start = still, still.at[load.places[0], 0].set(speed)
-        motion = fem.simulate(problem, 0.01, 1e-3, start=start, newton=SHARP)
+        problem = eqx.tree_at(
+            lambda p: (p.material.shear_modulus, p.loads[0].rod.material.density),
+            given,
+            (modulus, density),
+        )
+        start = still, still.at[given.loads[0].places[0], 0].set(speed)
+        motion = fem.simulate(problem, 0.01, 2e-3, start=start, newton=SHARP)
         return 1e3 * coupling.mount_wrench(problem, motion.end.displacement).tip[1, 2]
 
-    at = jnp.array([3e4, 1200.0, 0.3])
+    at = jnp.array([1e4, 1200.0, 0.3])
     end, slope = jax.jit(end), jax.jit(jax.grad(end))(at)
     for k, size in enumerate(np.asarray(at)):
         step = 1e-3 * size * np.eye(3)[k]
         values = [float(end(at + s * step)) for s in (-2, -1, 1, 2)]
         want = np.dot(values, [1, -8, 8, -1]) / (12e-3 * size)
-        print(k, slope[k], want)
         assert float(slope[k]) == pytest.approx(want, rel=1e-6)

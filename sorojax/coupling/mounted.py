@@ -3,7 +3,8 @@
 The base moves with the mean position of the patch and the rotation that brings its reference
 shape closest to where its nodes are (least squares), so the patch stays free to deform. The
 coordinates of the rod are unknowns beside the displacements, kept as those of a few more nodes,
-and the rod is one potential of all of them: elastic energy, weight and a force at the tip.
+and the rod is one potential of all of them: elastic energy, weight and a force at the tip. In
+motion its sections are masses whose places depend on these unknowns (`fem.dynamics.masses`).
 """
 
 import dataclasses
@@ -18,8 +19,8 @@ from jaxtyping import Array, Float, Int
 from sorojax import _check
 from sorojax._types import Numbers, integers, optional_real, real
 from sorojax.fem.dynamics.masses import (
-    MassMotion,
     Masses,
+    MassMotion,
     begun_motion,
     inertia_energy,
     no_motion,
@@ -43,9 +44,10 @@ if TYPE_CHECKING:
 class MountedRod(AbstractLoad):
     """A rod on a patch of a solid: `mounted_rod(mesh, rod, nodes, ...)`.
 
-    `value` [N] is a dead force at its tip, in the axes of the mesh. `places` are the nodes
-    whose displacements hold the coordinates of the rod, curvatures times the square of its
-    length, others times the length [m].
+    `value` [N] is a dead force at its tip, in the axes of the mesh; `simulate` takes its values
+    in time by the name of the rod. `places` are the nodes whose displacements hold the
+    coordinates of the rod, curvatures times the square of its length, others times the length
+    [m].
     """
 
     directed: ClassVar[bool] = True
@@ -213,8 +215,11 @@ def mounted_rod(
     """The mesh with room for the coordinates of `rod`, and the rod on a patch of the solid.
 
     In `fem.problem(mesh, ..., loads=(mounted,))` rod and solid are in equilibrium together, in
-    large rotations of both; `solve`, `solve_path` and their derivatives are as elsewhere. So
-    far in statics only.
+    large rotations of both; `solve`, `solve_path` and their derivatives are as elsewhere. They
+    move together in `simulate`, in `eigenmodes` and as a `systems.FemBody`, whatever the one
+    weighs beside the other; the rod has the inertia of its sections and no damping of its own.
+    A rod with other forces, chambers or contact stands on a solid in a network: a part of an
+    assembly on a free `rod.Link` without mass that is `carrying` the face.
 
     Args:
         mesh: The solid.

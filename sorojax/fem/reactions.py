@@ -9,8 +9,8 @@ from sorojax import _check
 from sorojax._display import displayed, number
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import Numbers, real
-from sorojax.fem.dynamics.newton import has_lists, lists_of, with_lists
 from sorojax.fem.dynamics.masses import swing_force, with_masses
+from sorojax.fem.dynamics.newton import has_lists, lists_of, with_lists
 from sorojax.fem.dynamics.step import (
     Dynamics,
     Row,
