@@ -27,7 +27,7 @@ def whisker(group, basis, young=2e5, density=1000.0):
     )
 
 
-def on_block(dim, ratio, modulus, *, held=False, density=1000.0, **options):
+def on_block(dim, ratio, modulus, *, held=False, density=1000.0, **options) -> Any:
     """A block with a rod `ratio` times as heavy, the rod and the base."""
     if dim == 2:
         block = mesh.rectangle([-SIZE / 2] * 2, [SIZE / 2] * 2, divisions=(1, 1), order=2)
@@ -84,7 +84,9 @@ def test_a_rod_on_a_hard_block_in_flight_moves_as_their_assembly(dim, ratio):
     np.testing.assert_allclose(fem.total_mass(problem), ROD_MASS + mass, rtol=1e-12)
     errors, kept = [], []
     for step in (1e-3, 5e-4):
-        motion = fem.simulate(problem, 0.08, step, start=(0 * X, start), save=5)
+        motion = fem.simulate(
+            problem, 0.08, step, start=(jnp.asarray(0 * X), jnp.asarray(start)), save=5
+        )
         found = jax.vmap(lambda u: coupling.mount_wrench(problem, u).tip[:-1, -1])
         errors.append(float(jnp.max(jnp.abs(found(motion.displacements) - tips))))
         energy, (linear, angular) = total(motion), fem.momentum(motion)
@@ -175,6 +177,36 @@ def test_a_network_moves_block_and_rod_as_fem_does():
     np.testing.assert_allclose(film.outputs["body.kinetic_energy"], kinetic, rtol=1e-5)
 
 
+@pytest.mark.slow
+def test_a_rod_on_a_link_without_mass_that_carries_the_face_moves_alike():
+    """The way for rods with other forces; the face is then rigid, as it is on a hard block."""
+    problem, one, base = on_block(2, 10.0, 1e7, held=True, gravity=[0.0, -9.81])
+    motion = fem.simulate(problem, 0.05, 1e-3, save=6)
+    find = jax.vmap(lambda u: coupling.mount_wrench(problem, u).tip[:-1, -1])
+    want = find(motion.displacements)
+    block = mesh.rectangle([-SIZE / 2] * 2, [SIZE / 2] * 2, divisions=(1, 1), order=2)
+    right = block.node_sets["right"]
+    face = fem.Carried(right, block.points[right], rest=base, name="face")
+    supports = (fem.Fixed(block.node_sets["left"]), face)
+    plane, rubber = problem.kinematics, problem.material
+    solid = fem.problem(block, rubber, kinematics=plane, supports=supports)
+    foot = rod.Part(rod.Link(0.0, 0.0), rod.Free(), offset=base)
+    model = rod.assembly(SE2(), foot=foot, rod=rod.Part(one, on="foot"))
+    weight = (rod.Gravity([0.0, -9.81]),)
+    network = systems.Network(
+        {
+            "rod": systems.AssemblyBody(model, weight, carrying=("foot",)),
+            "solid": systems.FemBody(solid, driven=("face",)),
+        },
+        {"solid.face": "rod.foot_pose", "rod.foot_reaction": "solid.face_wrench"},
+    )
+    film = systems.simulate(network, 0.05, step=1e-3, save=6)
+    assert film.status == Status.successful
+    found, size = film.outputs["rod.rod_position"], jnp.max(jnp.abs(want - want[:1]))
+    assert jnp.max(jnp.abs(found - want)) < 2e-3 * size
+
+
+@pytest.mark.slow
 def test_slopes_of_a_motion_are_those_of_its_values():
     given, _, _ = on_block(2, 1.0, 3e4, held=True)
     still = jnp.zeros_like(given.mesh.points)

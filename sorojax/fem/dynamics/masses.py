@@ -73,7 +73,7 @@ def begun_motion(
 ) -> MassMotion:
     """The inertia of masses in a step, as generalised-alpha and Newmark have it."""
     c, h = step.scheme, step.step
-    assert c is not None
+    assert c is not None and step.a is not None
     before = (problem.mesh.points + step.u)[masses.nodes]
     first = _derivatives(masses, before, step.v[masses.nodes], step.a[masses.nodes])
     later = _ended(masses, past, before, c)
