@@ -3,7 +3,8 @@
 The base moves with the mean position of the patch and the rotation that brings its reference
 shape closest to where its nodes are (least squares), so the patch stays free to deform. The
 coordinates of the rod are unknowns beside the displacements, kept as those of a few more nodes,
-and the rod is one potential of all of them: elastic energy, weight and a force at the tip.
+and the rod is one potential of all of them: elastic energy, weight and a force at the tip. In
+motion its sections are masses whose places depend on these unknowns (`fem.dynamics.masses`).
 """
 
 import dataclasses
@@ -17,6 +18,13 @@ from jaxtyping import Array, Float, Int
 
 from sorojax import _check
 from sorojax._types import Numbers, integers, optional_real, real
+from sorojax.fem.dynamics.masses import (
+    Masses,
+    MassMotion,
+    begun_motion,
+    inertia_energy,
+    no_motion,
+)
 from sorojax.fem.kinematics import Axisymmetric
 from sorojax.fem.loads.facets import CurvedPart
 from sorojax.fem.loads.loads import AbstractLoad, mean_rotation
@@ -24,8 +32,9 @@ from sorojax.mesh.mesh import Mesh
 from sorojax.rod.dynamics.dynamics import potential_energy
 from sorojax.rod.dynamics.fields import is_curvature
 from sorojax.rod.dynamics.kinematics import tip_pose
+from sorojax.rod.dynamics.moving import mass_position
 from sorojax.rod.model.basis import columns
-from sorojax.rod.model.model import operators
+from sorojax.rod.model.model import motion, operators
 from sorojax.rod.model.rod import Rod
 
 if TYPE_CHECKING:
@@ -35,9 +44,10 @@ if TYPE_CHECKING:
 class MountedRod(AbstractLoad):
     """A rod on a patch of a solid: `mounted_rod(mesh, rod, nodes, ...)`.
 
-    `value` [N] is a dead force at its tip, in the axes of the mesh. `places` are the nodes
-    whose displacements hold the coordinates of the rod, curvatures times the square of its
-    length, others times the length [m].
+    `value` [N] is a dead force at its tip, in the axes of the mesh; `simulate` takes its values
+    in time by the name of the rod. `places` are the nodes whose displacements hold the
+    coordinates of the rod, curvatures times the square of its length, others times the length
+    [m].
     """
 
     directed: ClassVar[bool] = True
@@ -50,6 +60,7 @@ class MountedRod(AbstractLoad):
     value: Float[Array, " dim"] = eqx.field(converter=real)
     name: str = eqx.field(static=True, default="rod")
     gravity: Float[Array, " dim"] | None = eqx.field(converter=optional_real, default=None)
+    motion: MassMotion | None = None  # in a step
 
     def coordinates(self, problem: "Problem", u: Float[Array, "nodes dim"]) -> Array:
         """Coordinates of the rod at displacement `u` [m]."""
@@ -65,7 +76,10 @@ class MountedRod(AbstractLoad):
 
         def energy(x, X):
             base = self._base(X[:count], x[:count])
-            return self.energy(base, x[count:] - X[count:])
+            energy = self.energy(base, x[count:] - X[count:])
+            if self.motion is None:
+                return energy
+            return energy + inertia_energy(self.masses(problem), self.motion, x)
 
         groups = self._group(jnp)
         return CurvedPart(groups, energy, points[groups])
@@ -85,11 +99,50 @@ class MountedRod(AbstractLoad):
         held = 0.5 * self._unit() * jnp.sum(unused**2)
         return energy - jnp.sum(self.value * tip) + held
 
-    def lumped_mass(self, problem):
-        raise ValueError(
-            f"fem.mass_matrix: MountedRod '{self.name}' has no mass matrix yet, need statics. "
-            "Use fem.solve or fem.solve_path, or a network with a rod of its own."
-        )
+    def masses(self, problem):
+        group, count = self._group(jnp)[0], self.nodes.shape[0]
+        X = problem.mesh.points[group]
+        constants = operators(self.rod)
+        across = constants.rotary[-1:0:-1] if X.shape[1] == 3 else constants.rotary
+        each = jnp.broadcast_to(constants.mass, (X.shape[1], *constants.mass.shape))
+
+        def places(x):
+            base = self._base(X[:count], x[:count])
+            centres, axes, unused = self._sections(x[count:] - X[count:])
+            turn, shift = base[:-1, :-1], base[:-1, -1]
+            centres, axes = centres @ turn.T + shift[None], axes @ turn.T
+            return jnp.concatenate([centres.T.ravel(), axes.ravel(), unused])
+
+        unused = self.places.shape[0] * X.shape[1] - self.rod.basis.num_dof
+        total = jnp.broadcast_to(jnp.sum(constants.mass), (unused,))
+        turning = jnp.repeat(across, X.shape[1])
+        weights = jnp.concatenate([each.ravel(), turning, total])
+        return Masses(group, places, weights, self.places)
+
+    def in_motion(self, problem):
+        masses = self.masses(problem)
+        return dataclasses.replace(self, motion=no_motion(masses, problem.mesh.points))
+
+    def begun(self, problem, step):
+        if step.scheme is None:
+            return self.without_inertia()
+        assert self.motion is not None
+        motion = begun_motion(self.masses(problem), self.motion, problem, step)
+        return dataclasses.replace(self, motion=motion)
+
+    def without_inertia(self):
+        return dataclasses.replace(self, motion=None)
+
+    def stored(self, problem, u):
+        return self.without_inertia().potential(problem, u)
+
+    def _sections(self, moved: Float[Array, "places dim"]):
+        """Centres of mass of the sections and their axes across, one after the other, in the
+        axes of the base; and the entries that hold no coordinate."""
+        q = self._coordinates(moved)
+        moment = motion(self.rod, q)
+        axes = jnp.moveaxis(moment.directors, 2, 0)[1:].reshape(-1, moved.shape[1])
+        return mass_position(moment), axes, moved.ravel()[q.shape[0] :]
 
     def _unit(self) -> Float[Array, ""]:
         """A stiffness of the size of the rod's [N/m], for entries that hold no coordinate."""
@@ -162,8 +215,11 @@ def mounted_rod(
     """The mesh with room for the coordinates of `rod`, and the rod on a patch of the solid.
 
     In `fem.problem(mesh, ..., loads=(mounted,))` rod and solid are in equilibrium together, in
-    large rotations of both; `solve`, `solve_path` and their derivatives are as elsewhere. So
-    far in statics only.
+    large rotations of both; `solve`, `solve_path` and their derivatives are as elsewhere. They
+    move together in `simulate`, in `eigenmodes` and as a `systems.FemBody`, whatever the one
+    weighs beside the other; the rod has the inertia of its sections and no damping of its own.
+    A rod with other forces, chambers or contact stands on a solid in a network: a part of an
+    assembly on a free `rod.Link` without mass that is `carrying` the face.
 
     Args:
         mesh: The solid.

@@ -9,6 +9,7 @@ from sorojax import _check
 from sorojax._display import displayed, number
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import Numbers, real
+from sorojax.fem.dynamics.masses import swing_force, with_masses
 from sorojax.fem.dynamics.newton import has_lists, lists_of, with_lists
 from sorojax.fem.dynamics.step import (
     Dynamics,
@@ -186,14 +187,15 @@ def _motion_forces(dynamics: Dynamics, states: State, points, lists):
     driven = _driven_accelerations(dynamics, states.displacement[0])
     driven = driven[jnp.minimum(points, driven.shape[0] - 1)]
     mask = known_mask(problem.supports, *states.displacement.shape[1:])
-    matrix = sparse.fix(system, known.mass, mask)
 
     def one(row):
         state, a, at, index = eqx.combine(row[0], rest), row[1].ravel(), row[2], row[3]
         left = _without_inertia(dynamics, known, state, index, at)
-        pulled = -left - sparse.product(system, known.mass, a)
+        mass = with_masses(problem, state.displacement, known.mass)
+        matrix = sparse.fix(system, mass, mask)
+        pulled = -left - sparse.product(system, mass, a)
         free = sparse.solve(system, matrix, jnp.where(mask, jnp.zeros_like(pulled), pulled))
-        return left + sparse.product(system, known.mass, a + free)
+        return left + sparse.product(system, mass, a + free)
 
     forces = jax.lax.map(one, (rows, driven, lists, points))
     return forces.reshape(states.displacement.shape)
@@ -210,6 +212,7 @@ def _without_inertia(dynamics: Dynamics, known, state: State, index, lists):
     loads = tuple(load.begun(bare, now) for load in loads)
     loaded = at_instant(bare, known.moduli, state.strains, state.peaks)
     force = residual(exchanged(loaded, loads=loads), u).ravel()
+    force = force + swing_force(problem, u, v).ravel()
     damping = damping_matrix(dynamics, known, u)
     if damping is None:
         return force

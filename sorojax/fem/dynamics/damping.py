@@ -24,6 +24,12 @@ from sorojax.fem.assembly.geometry import (
     quadrature_points,
     tables_at,
 )
+from sorojax.fem.dynamics.masses import (
+    kinetic_energy,
+    masses_of,
+    moving_nodes,
+    with_masses,
+)
 from sorojax.fem.kinematics import green_rates, strain_pairs
 from sorojax.fem.problem import Problem
 from sorojax.math.linalg import sparse
@@ -132,15 +138,25 @@ def strain_rates(
 # Mass matrices: consistent in the pattern of the tangent, lumped on the diagonal
 
 
-def mass_matrix(problem: Problem) -> Float[Array, " nnz"]:
+def mass_matrix(
+    problem: Problem, displacement: Float[Array, "nodes dim"] | None = None
+) -> Float[Array, " nnz"]:
     """Consistent mass matrix [kg], as values in the pattern `problem.space.system`.
 
     `sparse.product(problem.space.system, mass_matrix(problem), v)` multiplies by it.
-    That of embedded rods is on the diagonal. Differentiable in density, thickness and nodes.
+    That of embedded rods is on the diagonal; that of mounted ones depends on the
+    `displacement` [m], zero if omitted. Differentiable in density, thickness, nodes and
+    displacement.
 
     Raises:
         ValueError: If the material has no density.
     """
+    u = jnp.zeros_like(problem.mesh.points) if displacement is None else displacement
+    return with_masses(problem, u, nodal_mass(problem))
+
+
+def nodal_mass(problem: Problem) -> Float[Array, " nnz"]:
+    """`mass_matrix` without the masses of loads that are elsewhere than at nodes."""
     scalar = _cell_masses(problem)
     cells, nodes, _ = scalar.shape
     dim = problem.mesh.element.dim
@@ -173,7 +189,12 @@ def lumped_mass(problem: Problem) -> Float[Array, " dofs"]:
 def total_mass(problem: Problem) -> Float[Array, ""]:
     """Mass of the body [kg]."""
     own, more = jnp.sum(_cell_masses(problem)), _of_loads(problem)
-    return own if more is None else own + jnp.sum(more)
+    own = own if more is None else own + jnp.sum(more)
+    if not masses_of(problem):
+        return own
+    still = jnp.zeros_like(problem.mesh.points)
+    shift = still.at[:, 0].set(moving_nodes(problem))
+    return own + 2 * kinetic_energy(problem, still, shift)
 
 
 def _of_loads(problem: Problem) -> Float[Array, " nodes"] | None:

@@ -39,7 +39,7 @@ from sorojax.fem.dynamics.step import (
 from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import prepare
 from sorojax.fem.equilibrium.newton import Newton
-from sorojax.fem.loads.loads import AbstractLoad
+from sorojax.fem.loads.loads import AbstractLoad, has_masses
 from sorojax.fem.problem import Problem, body, load_force
 from sorojax.fem.supports import known_values
 from sorojax.math.compiled import Split, kernel
@@ -113,6 +113,12 @@ class Run:
                 self.solver.keep(kept.matrix)
 
     @property
+    def _loads_only(self) -> bool:
+        """Whether the forces on nodes are those of loads and supports, and nothing else's."""
+        inertial = any(map(has_masses, self.dynamics.problem.loads))
+        return not (inertial or self.dynamics.conserves)
+
+    @property
     def state(self) -> State:
         return self.now.whole()
 
@@ -170,7 +176,7 @@ class Run:
             self.reason = found.reason
             return None
         taken = self.solver.inertia.taken(found.u)
-        given = None if self.dynamics.conserves else np.float64(self._given(found))
+        given = np.float64(self._given(found)) if self._loads_only else None
         args = interval, found.u, given, np.float64(taken)
         new, displacement, error, through, gained = _end((self._fixed, self.now, step), *args)
         if through:

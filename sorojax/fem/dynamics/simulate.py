@@ -19,6 +19,7 @@ from sorojax.fem.contact.obstacle import Contact, moving
 from sorojax.fem.dynamics.damping import AbstractDamping
 from sorojax.fem.dynamics.host import Control, Run, compiled_matter
 from sorojax.fem.dynamics.implicit_diff import MotionCall, recorded, replay
+from sorojax.fem.dynamics.masses import swing_force, with_masses
 from sorojax.fem.dynamics.methods import AbstractMethod, GeneralisedAlpha
 from sorojax.fem.dynamics.step import (
     Dynamics,
@@ -230,7 +231,8 @@ def _rest(problem: Problem, rows: tuple[Array | None, ...]) -> State:
     none = jnp.zeros((), zero.dtype)
     first = zip(problem.loads, rows, strict=True)
     memory = tuple(
-        _placed(load, row, problem.mesh) if remembers(load) else None for load, row in first
+        _placed(load, row, problem.mesh).in_motion(problem) if remembers(load) else None
+        for load, row in first
     )
     kept = _remembered(problem, zero)
     return State(none, zero, zero, zero, memory, none, none, jnp.ones_like(none), **kept)
@@ -306,8 +308,10 @@ def _balance(dynamics: Dynamics, known: Matter, state: State):
     if damping is not None:
         v = state.velocity.ravel()
         force = force - sparse.product(problem.space.system, damping, v)
+    force = force - swing_force(problem, u, state.velocity).ravel()
     mask = known_mask(problem.supports, *u.shape)
-    matrix = sparse.fix(problem.space.system, known.mass, mask)
+    mass = with_masses(problem, u, known.mass)
+    matrix = sparse.fix(problem.space.system, mass, mask)
     return matrix, jnp.where(mask, jnp.zeros_like(force), force)
 
 

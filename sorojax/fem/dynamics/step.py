@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
-from sorojax.fem.dynamics.damping import AbstractDamping, lumped_mass, mass_matrix
+from sorojax.fem.dynamics.damping import AbstractDamping, lumped_mass, nodal_mass
 from sorojax.fem.dynamics.methods import Coefficients, Conserving
 from sorojax.fem.equilibrium.jit import known_mask
 from sorojax.fem.loads.loads import AbstractLoad
@@ -39,6 +39,8 @@ class StepState(NamedTuple):
         t: Time of that state [s].
         step: Size of the step [s].
         share: How far within the step the state is that forces act at.
+        a: Acceleration at the start of the step [m/s^2]; None at an instant, of no step.
+        scheme: The method; None at an instant.
     """
 
     u: Float[Array, "nodes dim"]
@@ -49,6 +51,8 @@ class StepState(NamedTuple):
     t: Float[Array, ""]
     step: Float[Array, ""]
     share: Float[Array, ""] | float = 1.0
+    a: Float[Array, "nodes dim"] | None = None
+    scheme: Coefficients | None = None
 
 
 # Inertia and damping of one time step, as a quadratic potential
@@ -104,9 +108,9 @@ _half_square.defjvp(_half_square_slope, symbolic_zeros=True)
 
 
 def mass_values(problem: Problem, mass: Mass) -> Float[Array, " nnz"]:
-    """Mass matrix [kg] as values in the pattern of the tangent."""
+    """Mass matrix of the nodes [kg] as values in the pattern of the tangent."""
     if mass == "consistent":
-        return mass_matrix(problem)
+        return nodal_mass(problem)
     system, lumped = problem.space.system, lumped_mass(problem)
     spread = lumped[system.rows]
     return jnp.where(system.rows == system.cols, spread, jnp.zeros_like(spread))
@@ -212,7 +216,7 @@ def begin_step(dynamics: Dynamics, known: Matter, state: State, interval: Interv
     drive = (1 - c.am) * (v / (c.beta * h) + (1 / (2 * c.beta) - 1) * a) - c.am * a
     guess = u + (1 - c.af) * h * v
     time = state.time + (1 - c.af) * h
-    stage = StepState(u, v, u - lead / rate, rate, guess, time, h, 1 - c.af)
+    stage = StepState(u, v, u - lead / rate, rate, guess, time, h, 1 - c.af, a, c)
     loads = _begun(dynamics, state, interval, c.af, stage)
     damping = damping_matrix(dynamics, known, guess)
     matrix, pull = c2 * known.mass, _times(dynamics, known.mass, drive)
@@ -283,7 +287,7 @@ def end_step(
 def _work(dynamics: Dynamics, step: TimeStep, loads, u_alpha, d) -> Float[Array, ""]:
     """Work [J] of loads and supports in a step, with the forces that the step takes."""
     problem = with_terms(dynamics.problem, step.terms)
-    loaded = exchanged(problem, loads=loads)
+    loaded = exchanged(problem, loads=tuple(load.without_inertia() for load in loads))
     work = -jax.jvp(lambda u: load_potential(loaded, u), (u_alpha,), (d,))[1]
     if all(support.ramped is None for support in dynamics.problem.supports):
         return work

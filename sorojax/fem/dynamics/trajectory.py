@@ -9,7 +9,8 @@ from jaxtyping import Array, Float, Int
 
 from sorojax._display import displayed, number, outcome
 from sorojax._jax.trace_state import is_traced
-from sorojax.fem.dynamics.damping import mass_matrix
+from sorojax.fem.dynamics.damping import nodal_mass
+from sorojax.fem.dynamics.masses import kinetic_energy, moving_nodes, with_masses
 from sorojax.fem.dynamics.newton import has_lists, lists_of, with_lists
 from sorojax.fem.dynamics.step import Dynamics, State, loads_at, matter
 from sorojax.fem.problem import Problem, body, exchanged
@@ -114,8 +115,9 @@ def _energies(dynamics: Dynamics, states: State, points, lists) -> Energies:
         loads = loads_at(dynamics, state, lambda row: row[index])
         loads = loads if lists is None else with_lists(loads, row[2])
         loaded = exchanged(body(problem), loads=loads)
+        own = 0.5 * jnp.sum(v * sparse.product(problem.space.system, known.mass, v))
         return Energies(
-            0.5 * jnp.sum(v * sparse.product(problem.space.system, known.mass, v)),
+            own + kinetic_energy(problem, u, state.velocity),
             stored_energy(body(problem), known.moduli, state.strains, u, state.peaks),
             sum((load.stored(loaded, u) for load in loads), start=jnp.zeros((), u.dtype)),
             state.work,
@@ -130,11 +132,13 @@ def momentum(
 ) -> tuple[Float[Array, "times dim"], Float[Array, "times turns"]]:
     """Linear momentum [N s] and angular momentum about the origin [N m s] at every saved
     time, one component in the plane and three in space, with the consistent mass."""
-    problem = motion.problem
-    mass = mass_matrix(problem)
+    problem, share = motion.problem, moving_nodes(motion.problem)
+    nodal = nodal_mass(problem)
 
     def one(u, v):
+        mass = with_masses(problem, u, nodal)
         p = sparse.product(problem.space.system, mass, v.ravel()).reshape(v.shape)
+        p = share[:, None] * p
         x = problem.mesh.points + u
         turns = x[:, 0] * p[:, 1] - x[:, 1] * p[:, 0] if x.shape[1] == 2 else jnp.cross(x, p)
         return jnp.sum(p, axis=0), jnp.atleast_1d(jnp.sum(turns, axis=0))

@@ -97,7 +97,8 @@ def prepare_traced(problem: Problem) -> Prepared:
     mesh, dim = problem.mesh, problem.mesh.element.dim
     known = known_mask(problem.supports, mesh.num_nodes, dim)
     parts = [load.curved_part(problem) for load in problem.loads]
-    slots = tuple(_slots(problem.space.system, p.groups, dim) for p in parts if p is not None)
+    groups = [part.groups for part in parts if part is not None]
+    slots = tuple(group_slots(problem.space.system, group, dim) for group in groups)
     shape = geometry(problem.space, problem.kinematics, problem.formulation, mesh.points)
     length = jnp.max(jnp.ptp(mesh.points[mesh.cells], axis=1))
     return Prepared(shape, known, length, slots)
@@ -112,7 +113,8 @@ def known_mask(supports: tuple, num_nodes: int, dim: int) -> Bool[Array, " dofs"
     return known.ravel()
 
 
-def _slots(system: sparse.SparseSymmetric, groups, dim: int):
+def group_slots(system: sparse.SparseSymmetric, groups, dim: int):
+    """Slots of the upper triangles of groups of nodes, whose numbers may be traced."""
     dofs = (groups[:, :, None] * dim + jnp.arange(dim, dtype=groups.dtype)[None, None]).astype(
         jnp.int64
     )

@@ -21,6 +21,7 @@ from sorojax.fem.kinematics import Axisymmetric
 from sorojax.fem.loads.facets import CurvedPart, facet_integral, facet_volume
 
 if TYPE_CHECKING:
+    from sorojax.fem.dynamics.masses import Masses
     from sorojax.fem.dynamics.step import StepState
     from sorojax.fem.problem import Problem
 
@@ -78,6 +79,18 @@ class AbstractLoad(eqx.Module):
         """Mass that the load adds to the nodes [kg]; `None` adds nothing."""
         return None
 
+    def masses(self, problem: "Problem") -> "Masses | None":
+        """Masses that the load has elsewhere than at nodes; `None` if there are none."""
+        return None
+
+    def in_motion(self, problem: "Problem") -> "AbstractLoad":
+        """The load with room for what it remembers in a motion."""
+        return self
+
+    def without_inertia(self) -> "AbstractLoad":
+        """The load without the inertia of its masses in a step that it has begun."""
+        return self
+
     def begun(self, problem: "Problem", step: "StepState") -> "AbstractLoad":
         """The load for one time step: what depends on rates or on the state before. What it
         returns is the load that the next step begins with, its `value` set anew."""
@@ -99,6 +112,11 @@ class AbstractLoad(eqx.Module):
 def remembers(load: AbstractLoad) -> bool:
     """Whether a step of a motion hands what the load knows on to the next one."""
     return type(load).begun is not AbstractLoad.begun and not load.forgets
+
+
+def has_masses(load: AbstractLoad) -> bool:
+    """Whether some mass of the load may be elsewhere than at nodes."""
+    return type(load).masses is not AbstractLoad.masses
 
 
 class Pressure(AbstractLoad):

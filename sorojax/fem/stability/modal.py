@@ -221,7 +221,7 @@ def _matrices(moving, rest, massive: bool) -> tuple[Array, Array]:
     system = problem.space.system
     K = linearise(problem, prepare_traced(problem), u, u).values
     if massive:
-        return K, mass_matrix(problem)
+        return K, mass_matrix(problem, u)
     return K, jnp.where(system.rows == system.cols, jnp.ones_like(K), jnp.zeros_like(K))
 
 
@@ -352,7 +352,7 @@ def _modes(where: str, problem: Problem, displacement, count: int, massive: bool
         raise ValueError(f"{where}: `count` is {count}, need 1 to {free}, the free unknowns.")
 
     def find(problem: Problem, u):
-        mass = mass_matrix(problem) if massive else None
+        mass = mass_matrix(problem, u) if massive else None
         values = linearise(problem, prepare(problem), u, u).values
         pencil = pencil_of(problem.space.system, values, known, mass)
         eigenvalues, vectors = lowest(pencil, count, mass)
@@ -398,5 +398,6 @@ def modal_coordinates(
     """Modal coordinates of a displacement: phi_k' M (u - u_0), for modes of `eigenmodes`."""
     system = modes.problem.space.system
     moved = (real(displacement) - modes.displacement).ravel()
-    momentum = sparse.product(system, mass_matrix(modes.problem), moved)
+    mass = mass_matrix(modes.problem, modes.displacement)
+    momentum = sparse.product(system, mass, moved)
     return modes.shapes.reshape(len(modes), -1) @ momentum

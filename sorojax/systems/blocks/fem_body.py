@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from sorojax import fem
 from sorojax._types import optional_real
 from sorojax.fem.dynamics.damping import AbstractDamping
+from sorojax.fem.dynamics.masses import kinetic_energy, swing_force, with_masses
 from sorojax.fem.dynamics.methods import Coefficients
 from sorojax.fem.dynamics.step import Dynamics, Mass, Matter, State, matter
 from sorojax.fem.equilibrium.jit import known_mask
@@ -174,7 +175,8 @@ class FemBody(AbstractBlock):
             return stored_energy(bare, moduli(bare), *kept)
         if name == "kinetic_energy":
             system, mass = self.problem.space.system, self.matter().mass
-            return jnp.sum(v.ravel() * sparse.product(system, mass, v.ravel())) / 2
+            own = jnp.sum(v.ravel() * sparse.product(system, mass, v.ravel())) / 2
+            return own + kinetic_energy(self.problem, u, v)
         for marker, node in self.markers:
             if name == f"{marker}_position":
                 return self.problem.mesh.points[node] + u[node]
@@ -240,7 +242,10 @@ class FemBody(AbstractBlock):
         """Data of a step of `h` [s] of this body."""
         zero = jnp.zeros_like(self.problem.mesh.points)
         none = jnp.zeros((), zero.dtype)
-        memory = tuple(load if remembers(load) else None for load in self.problem.loads)
+        loads = self.problem.loads
+        memory = tuple(
+            load.in_motion(self.problem) if remembers(load) else None for load in loads
+        )
         rest = State(none, zero, zero, zero, memory, none, none, jnp.ones_like(none))
         loads = tuple(None for _ in self.problem.loads)
         supports = tuple(None for _ in self.problem.supports)
@@ -253,7 +258,9 @@ class FemBody(AbstractBlock):
         a = acceleration(self, problem, known, u, v, *kept)
         loaded = at_instant(problem, known.moduli, *kept)
         force = residual(loaded, u).ravel() + damping_force(self, known, u, v)
-        force = force + sparse.product(problem.space.system, known.mass, a.ravel())
+        force = force + swing_force(problem, u, v).ravel()
+        mass = with_masses(problem, u, known.mass)
+        force = force + sparse.product(problem.space.system, mass, a.ravel())
         places = {name: value_of(support) for name, support in self.moved.items()}
         found = exerted(problem.supports, places, force.reshape(u.shape))
         return {"reactions": {name: {"now": x, "step": x} for name, x in found.items()}}
@@ -287,8 +294,9 @@ def acceleration(
     system = loaded.space.system
     loaded = at_instant(loaded, known.moduli, strains, peaks)
     force = -residual(loaded, u).ravel() - damping_force(block, known, u, v)
+    force = force - swing_force(loaded, u, v).ravel()
     mask = known_mask(loaded.supports, *u.shape)
-    matrix = sparse.fix(system, known.mass, mask)
+    matrix = sparse.fix(system, with_masses(loaded, u, known.mass), mask)
     free = jnp.where(mask, jnp.zeros_like(force), force)
     return sparse.solve(system, matrix, free).reshape(u.shape)
 

@@ -20,6 +20,7 @@ from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
 from sorojax.fem.checks import no_peaks
 from sorojax.fem.equilibrium.response import tangent_solve
+from sorojax.fem.loads.loads import has_masses
 from sorojax.fem.problem import load_force, potential_energy, residual
 from sorojax.material import Viscoelastic
 from sorojax.math.linalg.sparse import SparseSymmetric, product
@@ -61,6 +62,9 @@ def modal_basis(
         displacement: The equilibrium [m]; at rest when omitted.
         bending: Add the derivatives: with n shapes up to n (n + 1) / 2 more.
 
+    Raises:
+        ValueError: If a rod is mounted on the body, whose mass depends on its motion.
+
     Differentiable once outside `jit`, in the numbers of the body and in the displacement. Which
     shapes are new enough to be kept has no derivative. Eigenmodes of one frequency have none of
     their own; what depends only on the displacements that the shapes span has.
@@ -70,6 +74,11 @@ def modal_basis(
         Comput. Methods Appl. Mech. Engrg. 49, 1985, for the derivatives.
     """
     problem = body.problem
+    if any(map(has_masses, problem.loads)):
+        raise ValueError(
+            "modal_basis: got masses that are not at nodes, of a mounted rod, need a body of "
+            "constant mass. Keep the FemBody."
+        )
     u = jnp.zeros_like(problem.mesh.points) if displacement is None else real(displacement)
     found = [fem.eigenmodes(problem, u, modes).shapes] if modes else []
     found.append(_answers(body, u))
