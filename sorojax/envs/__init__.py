@@ -1,6 +1,7 @@
 """Environments of reinforcement learning: soft robots at tasks, in batches and with gradients."""
 
 from sorojax._arguments import check_package as _check_package
+from sorojax.envs.adapters import register, to_brax, to_gymnasium, to_gymnasium_vector
 from sorojax.envs.core import (
     AbstractEnv,
     State,
@@ -24,9 +25,13 @@ __all__ = [
     "TentacleParams",
     "TentaclePush",
     "randomised",
+    "register",
     "reset",
     "step",
     "step_with_reset",
+    "to_brax",
+    "to_gymnasium",
+    "to_gymnasium_vector",
 ]
 
 _check_package(__name__)

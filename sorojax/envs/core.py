@@ -19,6 +19,9 @@ from sorojax._types import Numbers, real
 from sorojax.envs.supply_line import LATE_STEPS, Delivery, Supplied, SupplyLine, begun, sent
 from sorojax.math.ode.explicit import finite
 
+if TYPE_CHECKING:
+    from sorojax.view import Scene
+
 
 class State(eqx.Module):
     """All that a step needs to go on.
@@ -132,6 +135,10 @@ class AbstractEnv(eqx.Module):
         self, before: State, action: Float[Array, " actions"], after: State, params: Any
     ) -> Verdict:
         """Reward, end and news of a step."""
+
+    @abc.abstractmethod
+    def scene(self, state: State, params: Any) -> "Scene":
+        """What the robot and its task look like, for `view.show`."""
 
 
 BOUND = 2.0  # of an observation, to both sides

@@ -13,15 +13,18 @@ from sorojax._types import real
 from sorojax.envs.core import AbstractEnv, State, Verdict, in_shares
 from sorojax.envs.rods import Inflated, RodBody, near_base, places, rolled, settled
 from sorojax.envs.supply_line import SupplyLine
-from sorojax.math.lie import SE3
+from sorojax.math.lie import SE3, homogeneous
 from sorojax.math.ode.steppers import ImplicitMidpoint
 from sorojax.rod import (
     AbstractPressureMap,
     Damping,
     Gravity,
+    Part,
+    PartForce,
     Pressurised,
     Rod,
     Straight,
+    assembly,
     chebyshev,
     circle,
     rest,
@@ -33,6 +36,7 @@ from sorojax.units import kPa, mm
 
 _MARKERS = np.array([0.25, 0.5, 0.75, 1.0])
 _POISSON = 0.49
+_DOWN = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # of x, in pictures
 
 
 class FingerParams(eqx.Module):
@@ -61,7 +65,7 @@ class FingerParams(eqx.Module):
     chamber_area: Float[Array, ""] = eqx.field(converter=real, default=40 * mm**2)
     max_pressure: Float[Array, ""] = eqx.field(converter=real, default=100 * kPa)
     gravity: Float[Array, ""] = eqx.field(converter=real, default=9.81)
-    supply: SupplyLine = SupplyLine(0.05, 0.01)
+    supply: SupplyLine = eqx.field(default_factory=lambda: SupplyLine(0.05, 0.01))
     marker_noise: Float[Array, ""] = eqx.field(converter=real, default=0.1 * mm)
 
 
@@ -142,6 +146,18 @@ class FingerReach(AbstractEnv):
         reward = 1 - distance / params.length - 0.05 * jnp.sum(change**2) / 4
         news = {"distance": distance, "success": distance < self.tolerance}
         return Verdict(reward, jnp.zeros((), bool), news)
+
+    def scene(self, state, params):
+        from sorojax import view
+
+        model, chambers = _finger(params)
+        hung = assembly(SE3(), finger=Part(model, offset=homogeneous(_DOWN, jnp.zeros(3))))
+        inside = (PartForce("finger", Pressurised(chambers, state.supply.value)),)
+        drawn = view.scene_of(hung, np.asarray(state.body.q), forces=inside)
+        target = np.asarray(state.goal.target)[None] @ _DOWN.T
+        tip = np.asarray(self.markers(state.body, params))[-1:] @ _DOWN.T
+        marks = view.Dots(target, "#c0392b", 9.0, "target"), view.Dots(tip, size=5.0)
+        return view.merge_scenes(drawn, view.Scene(marks))
 
 
 def _distance(state: State, markers: Array) -> Float[Array, ""]:

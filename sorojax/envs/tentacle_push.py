@@ -1,5 +1,6 @@
 """A tentacle is pushed through clutter and steers with two tendons."""
 
+from dataclasses import replace
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -78,7 +79,7 @@ class TentacleParams(eqx.Module):
     servo_mass: Float[Array, ""] = eqx.field(converter=real, default=0.2)
     post_radius: Float[Array, ""] = eqx.field(converter=real, default=8 * mm)
     friction: Float[Array, ""] = eqx.field(converter=real, default=0.3)
-    supply: SupplyLine = SupplyLine(0.03, 0.01)
+    supply: SupplyLine = eqx.field(default_factory=lambda: SupplyLine(0.03, 0.01))
     marker_noise: Float[Array, ""] = eqx.field(converter=real, default=0.2 * mm)
 
 
@@ -147,7 +148,7 @@ class TentaclePush(AbstractEnv):
         return jnp.clip(moved, 0.0, most)
 
     def moved(self, body, delivery, goal, params):
-        posts = union(*(Circle(post, params.post_radius) for post in goal.posts))
+        posts = _posts(goal, params)
         after = rolled(
             _tentacle(params),
             body,
@@ -179,6 +180,21 @@ class TentaclePush(AbstractEnv):
         reward = 1 - distance / params.length - 0.02 * jnp.sum(action**2) / 3
         news = {"distance": distance, "success": distance < self.tolerance}
         return Verdict(reward, jnp.zeros((), bool), news)
+
+    def scene(self, state, params):
+        from sorojax import view
+
+        posts = view.scene_of(_posts(state.goal, params))
+        drawn = view.scene_of(_tentacle(params), np.asarray(state.body.q))
+        target = view.Dots(np.asarray(state.goal.target)[None], "#c0392b", 9.0, "target")
+        merged = view.merge_scenes(posts, drawn, view.Scene((target,)))
+        size = float(params.length)
+        lower, upper = np.array([-0.04, -0.36]) * size, np.array([1.55, 0.36]) * size
+        return replace(merged, extent=(lower, upper))
+
+
+def _posts(goal: ClutterGoal, params: TentacleParams) -> AbstractSdf:
+    return union(*(Circle(post, params.post_radius) for post in goal.posts))
 
 
 def _most(params: TentacleParams) -> Float[Array, "3"]:
