@@ -29,15 +29,15 @@ for _name in ("compiled", "jit", "listen"):
 __version__ = "0.1.0"
 
 _FLOORS = (
-    "contact", "coupling", "design", "envs", "fem", "io", "material", "math", "mesh", "reduction",
-    "robots", "rod", "sdf", "sweep", "systems", "view", "vision",
+    "contact", "coupling", "design", "envs", "fem", "io", "material", "math", "mesh",
+    "reduction", "robots", "rod", "sdf", "sweep", "systems", "view", "vision",
 )  # fmt: skip
 _CLASSES = {"SE2": "math.lie", "SE3": "math.lie", "Status": "math.status"}
 __all__ = [
     "SE2", "SE3", "Status", "compiled", "enable_compilation_cache", "enable_low_latency", "jit",
     "listen", "replace", "silent", "units",
-    "contact", "coupling", "design", "envs", "fem", "io", "material", "math", "mesh", "reduction",
-    "robots", "rod", "sdf", "sweep", "systems", "view", "vision",
+    "contact", "coupling", "design", "envs", "fem", "io", "material", "math", "mesh",
+    "reduction", "robots", "rod", "sdf", "sweep", "systems", "view", "vision",
 ]  # fmt: skip
 
 if TYPE_CHECKING:

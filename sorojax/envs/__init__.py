@@ -1,4 +1,4 @@
-"""Environments of reinforcement learning: soft robots at tasks, in batches and with gradients."""
+"""Environments of reinforcement learning: soft robots at tasks, in batches, with gradients."""
 
 from sorojax._arguments import check_package as _check_package
 from sorojax.envs.adapters import register, to_brax, to_gymnasium, to_gymnasium_vector

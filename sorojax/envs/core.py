@@ -348,9 +348,7 @@ def _observation(env: AbstractEnv, state: State, params: Any) -> Array:
 
 def _measured(key: Array, markers: Array, params: Any) -> Array:
     """Positions of markers with the noise of a camera."""
-    return markers + params.marker_noise * jax.random.normal(
-        key, markers.shape, markers.dtype
-    )
+    return markers + params.marker_noise * jax.random.normal(key, markers.shape, markers.dtype)
 
 
 def _without_bad_slopes(tree: PyTree) -> PyTree:

@@ -151,7 +151,9 @@ class FingerReach(AbstractEnv):
         from sorojax import view
 
         model, chambers = _finger(params)
-        hung = assembly(SE3(), finger=Part(model, offset=homogeneous(_DOWN, jnp.zeros(3))))
+        hung = assembly(
+            SE3(), finger=Part(model, offset=homogeneous(jnp.asarray(_DOWN), jnp.zeros(3)))
+        )
         inside = (PartForce("finger", Pressurised(chambers, state.supply.value)),)
         drawn = view.scene_of(hung, np.asarray(state.body.q), forces=inside)
         target = np.asarray(state.goal.target)[None] @ _DOWN.T

@@ -1,7 +1,7 @@
 """Environments in the shape of Gymnasium, alone and in batches; imported where it is used."""
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import jax
@@ -32,14 +32,15 @@ def _spaces(env: core.AbstractEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spac
 class GymnasiumEnv(gymnasium.Env):
     """One environment; numbers leave it in single precision."""
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 50}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}
 
     def __init__(self, env: core.AbstractEnv, params: Any, render_mode: str | None = None):
         _check_mode(render_mode)
         self.env, self.params, self.render_mode = env, params, render_mode
         self.metadata = self.metadata | {"render_fps": round(1 / env.period)}
         self.observation_space, self.action_space = _spaces(env)
-        self._key, self._state = None, None
+        self._key: Any = None
+        self._state: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         super().reset(seed=seed)

@@ -76,9 +76,7 @@ def settled(model: Rod | Assembly, forces: tuple[Any, ...]) -> RodBody:
     a search for equilibrium may go to another one, or to none."""
     time_step, steps = _SETTLING
     start = RodBody(rest(model), jnp.zeros(num_dof(model), rest(model).dtype))
-    return rolled(
-        model, start, forces, LinearlyImplicit(), time_step=time_step, steps=steps
-    )
+    return rolled(model, start, forces, LinearlyImplicit(), time_step=time_step, steps=steps)
 
 
 def places(

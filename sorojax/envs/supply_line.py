@@ -64,7 +64,7 @@ def sent(
     its end: tau p' = u(t - d) - p, exact for held commands."""
     commands = jnp.concatenate([command[None], supplied.commands[:-1]])
     late = jnp.clip(line.dead_time / period, 0.0, LATE_STEPS)
-    whole = jnp.floor(late).astype(int)
-    change = (late - whole) * period
-    delivery = Delivery(supplied.value, commands[whole + 1], commands[whole], change, line.lag)
+    whole = jnp.floor(late)
+    change, k = (late - whole) * period, whole.astype(jnp.int32)
+    delivery = Delivery(supplied.value, commands[k + 1], commands[k], change, line.lag)
     return delivery, Supplied(delivery(period), commands)

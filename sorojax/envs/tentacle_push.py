@@ -223,7 +223,9 @@ def _tentacle(params: TentacleParams) -> Assembly:
     return assembly(SE2(), arm=Part(body, feed))
 
 
-def _forces(params: TentacleParams, delivery, period: float, posts: AbstractSdf) -> tuple[Any, ...]:
+def _forces(
+    params: TentacleParams, delivery, period: float, posts: AbstractSdf
+) -> tuple[Any, ...]:
     """Servo, tendons, posts and the damping of the rubber."""
     aim = params.servo_stiffness * delivery(jnp.asarray(period, params.length.dtype))[0]
     side = jnp.asarray([1.0, 0.0], params.length.dtype) * params.tendon_offset
