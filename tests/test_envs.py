@@ -1,5 +1,7 @@
 """Environments: members that end alone, gradients, the shapes of Gymnasium and of Brax."""
 
+import subprocess
+import sys
 import warnings
 
 import equinox as eqx
@@ -355,6 +357,19 @@ def test_a_vector_takes_numbers_for_each_member(getkey):
             seen = many.step(actions)[0]
         found.append(np.ptp(seen[:, 20]))
     assert found[0] < 1e-6 < found[1]  # the side of the tip
+
+
+def test_environments_need_no_gymnasium_until_they_are_asked_for_it():
+    code = (
+        "import sys; from sorojax import envs; e = envs.FingerReach(); envs.to_brax(e);"
+        "assert 'gymnasium' not in sys.modules; sys.modules['gymnasium'] = None\n"
+        "try: envs.to_gymnasium(e)\n"
+        "except ModuleNotFoundError as error: print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "need it for its interface. Install it with `pip install 'sorojax[envs]'`" in (
+        done.stdout
+    ), done.stderr
 
 
 def test_names_make_environments_and_vectors():
