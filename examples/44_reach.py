@@ -23,10 +23,11 @@ from sorojax import envs
 
 ENV = envs.FingerReach(time_step=4e-3, substeps=5, max_steps=96)
 FINGERS, HORIZON = 64, 32
+COMMANDS = slice(3, 6)  # of an observation
 
 
 def policy(key) -> eqx.nn.MLP:
-    """From what the bench measures to three commands."""
+    """From what the bench measures to changes of the three commands."""
     sizes = ENV.num_observations, ENV.num_actions, 64, 2
     return eqx.nn.MLP(*sizes, jax.nn.tanh, jnp.tanh, key=key)
 
@@ -37,7 +38,8 @@ def rolled(net, key, params, steps):
 
     def one(carry, key):
         state, seen = carry
-        after = envs.step(ENV, key, state, net(seen), params)
+        moved = seen[COMMANDS] + 0.3 * net(seen)  # a command that is right is left alone
+        after = envs.step(ENV, key, state, moved, params)
         out = after.reward, after.info["distance"], after.info["diverged"], state
         return (after.state, after.observation), out
 
@@ -75,7 +77,7 @@ def trained(net, key, updates, rate=3e-3):
 
 def main(quick: bool = False, file: Path | None = None) -> dict[str, float]:
     """Train, then try on 256 new fingers and targets."""
-    updates, count = (40, 32) if quick else (400, 256)
+    updates, count = (40, 32) if quick else (250, 256)
     net, rewards = trained(policy(jax.random.key(1)), jax.random.key(2), updates)
     judge = eqx.filter_jit(lambda net: tried(net, jax.random.key(3), count, ENV.max_steps))
     params, _, distance, diverged, states = judge(net)
@@ -96,8 +98,8 @@ def draw(rewards: np.ndarray, distance: np.ndarray, params, states, file: Path) 
     """The reward in training, the distance in an episode, and one of these as a strip."""
     import matplotlib.pyplot as plt
 
-    figure = plt.figure(figsize=(10, 6.4), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(1, 1.15))
+    figure = plt.figure(figsize=(10, 5.4), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(1, 0.85))
     left, right = above.subplots(1, 2)
     left.plot(rewards, color="#1f5f8b", lw=1)
     left.set(xlabel="updates, of 64 fingers by 32 steps each", ylabel="mean reward")

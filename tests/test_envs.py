@@ -190,10 +190,10 @@ def test_the_gradient_through_steps_is_that_of_the_values(env, getkey):
 
         return jnp.sum(jax.lax.scan(one, state, None, length=3)[1])
 
-    x = jnp.asarray([0.4, -0.3, 0.2, 0.5])
+    x = jnp.asarray([0.4, 0.3, 0.2, 0.5])
     slope = jax.jit(jax.grad(total))(x)
     along = jnp.asarray([0.5, 1.0, -0.7, 0.8])
-    h = 2e-3
+    h = 2e-4
     f = [float(total(x + k * h * along)) for k in (-2, -1, 1, 2)]
     seen = (8 * (f[2] - f[1]) - (f[3] - f[0])) / (12 * h)
     assert float(slope @ along) == pytest.approx(seen, rel=1e-6)
@@ -243,7 +243,7 @@ def test_a_dead_time_that_the_line_cannot_hold_is_refused():
 def test_an_action_of_another_length_is_refused(getkey):
     (_, states, _, _), _ = members(REACH, getkey())
     state = jax.tree.map(lambda x: x[0], states)
-    with pytest.raises(ValueError, match=r"envs.step: `action` has shape \(2,\), need \(3,\)"):
+    with pytest.raises(ValueError, match=r"envs.step: `action` has shape \(2,\), need \(3\)"):
         envs.step(REACH, getkey(), state, jnp.zeros(2))
 
 
@@ -355,8 +355,8 @@ def test_a_vector_takes_numbers_for_each_member(getkey):
         many.reset(seed=[3, 3, 3, 3])
         for _ in range(2):
             seen = many.step(actions)[0]
-        found.append(np.ptp(seen[:, 20]))
-    assert found[0] < 1e-6 < found[1]  # the side of the tip
+        found.append(np.ptp(seen[:, 19]))
+    assert found[0] < 1e-6 and found[1] > 1e-5  # the side of the tip, under one noise
 
 
 def test_environments_need_no_gymnasium_until_they_are_asked_for_it():
@@ -378,7 +378,7 @@ def test_names_make_environments_and_vectors():
         "sorojax/FingerReach-v0",
         num_envs=2,
         max_steps=7,
-        vector_kwargs={"autoreset_mode": AutoresetMode.DISABLED},
+        autoreset_mode=AutoresetMode.DISABLED,
     )
     assert many.metadata["autoreset_mode"] == AutoresetMode.DISABLED
     assert many.unwrapped.env.max_steps == 7 and many.observation_space.shape == (2, 33)
