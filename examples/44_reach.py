@@ -11,6 +11,7 @@ import io
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -23,11 +24,10 @@ from sorojax import envs
 
 ENV = envs.FingerReach(time_step=4e-3, substeps=5, max_steps=96)
 FINGERS, HORIZON = 64, 32
-COMMANDS = slice(3, 6)  # of an observation
 
 
 def policy(key) -> eqx.nn.MLP:
-    """From what the bench measures to changes of the three commands."""
+    """From what the bench measures to three commands."""
     sizes = ENV.num_observations, ENV.num_actions, 64, 2
     return eqx.nn.MLP(*sizes, jax.nn.tanh, jnp.tanh, key=key)
 
@@ -38,8 +38,7 @@ def rolled(net, key, params, steps):
 
     def one(carry, key):
         state, seen = carry
-        moved = seen[COMMANDS] + 0.3 * net(seen)  # a command that is right is left alone
-        after = envs.step(ENV, key, state, moved, params)
+        after = envs.step(ENV, key, state, net(seen), params)
         out = after.reward, after.info["distance"], after.info["diverged"], state
         return (after.state, after.observation), out
 
@@ -47,8 +46,8 @@ def rolled(net, key, params, steps):
 
 
 def tried(net, key, count, steps):
-    """Episodes of fingers within 10 % of the drawn one, with targets of their own."""
-    params = envs.randomised(ENV.default_params(), key, 0.1, members=count)
+    """Episodes of fingers within 4 % of the drawn one, with targets of their own."""
+    params = envs.randomised(ENV.default_params(), key, 0.04, members=count)
     run = jax.vmap(lambda key, own: rolled(net, key, own, steps))
     return params, *run(jax.random.split(key, count), params)
 
@@ -99,7 +98,8 @@ def draw(rewards: np.ndarray, distance: np.ndarray, params, states, file: Path) 
     import matplotlib.pyplot as plt
 
     figure = plt.figure(figsize=(10, 5.4), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(1, 0.85))
+    halves: Any = figure.subfigures(2, 1, height_ratios=(1, 0.85))
+    above, below = halves
     left, right = above.subplots(1, 2)
     left.plot(rewards, color="#1f5f8b", lw=1)
     left.set(xlabel="updates, of 64 fingers by 32 steps each", ylabel="mean reward")

@@ -182,7 +182,9 @@ def test_the_gradient_through_steps_is_that_of_the_values(env, getkey):
     @jax.jit
     def total(x):
         params = env.default_params()
-        params = eqx.tree_at(lambda p: p.length, params, params.length * (1 + 1e-3 * x[-1]))
+        # so much that the rounding of a stiff contact is small beside the differences
+        length = params.length * (1 + 0.05 * (x[-1] - 0.5))
+        params = eqx.tree_at(lambda p: p.length, params, length)
 
         def one(now, _):
             after = envs.step(env, key, now, x[:-1], params)
