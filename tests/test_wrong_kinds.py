@@ -24,6 +24,7 @@ FREE = {
         "design.minimise": "start",
         "design.minimise_shape": "start",
         "design.propagate_covariance": "numbers deviation",
+        "envs.State": "body goal",
         "envs.randomised": "params spread",
         "envs.reset": "params",
         "envs.step": "params",
@@ -55,6 +56,9 @@ FREE = {
         "view.show": "thing at options",
         "view.to_glb": "things",
         "view.to_html": "things time",
+    },
+    "abstract: its subclasses are made, and refuse what is wrong": {
+        "envs.AbstractEnv": "time_step substeps max_steps",
     },
     "options of what it calls, or anything with one method": {
         "fem.solve_contact": "options",
