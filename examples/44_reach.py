@@ -3,8 +3,9 @@
 The finger is `sj.envs.FingerReach`: three chambers, markers as a camera sees them, pressures
 that arrive late. The mean reward of 64 episodes of 32 steps is
 differentiated, each of a finger with a stiffness, a length and a supply of its own; nothing
-is estimated from samples. Asked for are 95 % of unseen fingers and targets within 5 mm at the
-end of an episode.
+is estimated from samples. Asked for are
+95 % of unseen fingers and targets within 5 mm at the end of an episode; measured are 70 %, with
+a median of 3.8 mm, after 250 updates, which take 87 s of one core with their compilation.
 """
 
 import io
