@@ -270,7 +270,7 @@ def test_a_spread_may_name_what_varies(getkey):
 def test_the_checker_of_gymnasium_has_nothing_to_say(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        made = gymnasium.make(name, substeps=2, max_steps=4, render_mode="rgb_array")
+        made = gymnasium.make(name, substeps=10, max_steps=4, render_mode="rgb_array")
         check_env(made.unwrapped)
     made.reset(seed=0)
     ends = [made.step(made.action_space.sample())[2:4] for _ in range(4)]

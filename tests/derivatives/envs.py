@@ -14,7 +14,7 @@ NONE = {
     "a step of the same environment in another shape": "to_brax",
 }
 
-ENV = envs.FingerReach(substeps=3)
+ENV = envs.FingerReach(time_step=4e-3, substeps=3)
 KEY = jax.random.key(0)
 
 
