@@ -14,7 +14,8 @@ NONE = {
     "a step of the same environment in another shape": "to_brax",
 }
 
-ENV = envs.FingerReach(time_step=4e-3, substeps=3)
+# no middle of a step is where the command arrives, 10 ms, a kink of what is delivered
+ENV = envs.FingerReach(time_step=5e-3, substeps=3)
 KEY = jax.random.key(0)
 
 
