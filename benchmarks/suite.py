@@ -74,6 +74,7 @@ ROWS = {
         ("systems.easy", "systems.stiff"), ("systems.batch", "systems.fem", "systems.hand")
     ),
     "inverse kinematics and estimator": Cases(("rod.ik", "systems.estimator")),
+    "environments": Cases(("envs.steps",)),
     "gradients": Cases(
         ("fem.gradient",), ("reduction.gradient", "rod.gradient", "design.uncertainty")
     ),

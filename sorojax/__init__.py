@@ -2,7 +2,7 @@
 
 `import sorojax as sj`, then `sj.sdf`, `sj.mesh`, `sj.material`, `sj.contact`, `sj.fem`,
 `sj.rod`, `sj.coupling`, `sj.reduction`, `sj.systems`, `sj.design`, `sj.robots`, `sj.io`,
-`sj.view`, `sj.vision`, `sj.sweep`. Importing sets no JAX flag; mechanics needs
+`sj.view`, `sj.vision`, `sj.sweep`, `sj.envs`. Importing sets no JAX flag; mechanics needs
 `jax.config.update("jax_enable_x64", True)`.
 """
 
@@ -29,15 +29,15 @@ for _name in ("compiled", "jit", "listen"):
 __version__ = "0.1.0"
 
 _FLOORS = (
-    "contact", "coupling", "design", "fem", "io", "material", "math", "mesh", "reduction",
-    "robots", "rod", "sdf", "sweep", "systems", "view", "vision",
+    "contact", "coupling", "design", "envs", "fem", "io", "material", "math", "mesh",
+    "reduction", "robots", "rod", "sdf", "sweep", "systems", "view", "vision",
 )  # fmt: skip
 _CLASSES = {"SE2": "math.lie", "SE3": "math.lie", "Status": "math.status"}
 __all__ = [
     "SE2", "SE3", "Status", "compiled", "enable_compilation_cache", "enable_low_latency", "jit",
     "listen", "replace", "silent", "units",
-    "contact", "coupling", "design", "fem", "io", "material", "math", "mesh", "reduction",
-    "robots", "rod", "sdf", "sweep", "systems", "view", "vision",
+    "contact", "coupling", "design", "envs", "fem", "io", "material", "math", "mesh",
+    "reduction", "robots", "rod", "sdf", "sweep", "systems", "view", "vision",
 ]  # fmt: skip
 
 if TYPE_CHECKING:
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
         contact,
         coupling,
         design,
+        envs,
         fem,
         io,
         material,

@@ -27,7 +27,7 @@ FLOOR = {
     **dict.fromkeys(("design", "robots"), 5),
     "io": 6,
     **dict.fromkeys(("view", "vision", "sweep"), 7),
-    "cli": 8,
+    **dict.fromkeys(("cli", "envs"), 8),
     "__main__": 9,
 }
 NOT_PROMISED = (

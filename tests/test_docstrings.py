@@ -36,6 +36,8 @@ VERBS = {
     "systems": "Network simulate simulate_batch simulate_sampled",
     "design": "calibrate drawing_to_loop layout minimise minimise_shape propagate_covariance",
     "robots": "actuator_forces arm_mjcf bellows_problem computed_torque mount stepper",
+    "envs": "randomised register reset step step_with_reset to_brax to_gymnasium "
+    "to_gymnasium_vector",
     "io": "export_mesh export_mjcf import_robot import_surface load save",
     "view": "png show",
     "vision": "calibrate",
@@ -49,8 +51,8 @@ NAMES = {
     "kPa": kPa, "material": material, "presets": material.presets,
 }  # fmt: skip
 PACKAGES = (
-    "coupling", "design", "fem", "io", "mesh", "reduction", "robots", "rod", "sdf", "sweep",
-    "systems", "view", "vision",
+    "coupling", "design", "envs", "fem", "io", "mesh", "reduction", "robots", "rod", "sdf",
+    "sweep", "systems", "view", "vision",
 )  # fmt: skip
 SECTIONS = ("Args", "Attributes", "Returns", "Raises", "Example", "Reference", "References")
 

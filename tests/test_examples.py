@@ -167,6 +167,15 @@ def test_a_rod_in_free_flight_keeps_its_momentum():
 
 
 @pytest.mark.slow
+def test_a_finger_learns_to_reach():
+    numbers = main_of("44_reach")(quick=True)
+    assert numbers["reward of the last updates"] > numbers["reward of the first updates"] + 0.1
+    assert numbers["median distance at the end [mm]"] < 15  # 30 mm where nothing is learnt
+    assert numbers["diverged"] == 0
+    assert user_code("44_reach") <= 60
+
+
+@pytest.mark.slow
 def test_an_arm_with_a_pneumatic_finger_picks_a_ball():
     """In the air nothing but the finger holds the ball, and every joint is in balance."""
     pytest.importorskip("mujoco", reason="the extra `robots` is not installed")

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sorojax import replace, rod as R, systems as S
 from sorojax.math.lie import SE2, SE3, homogeneous
+from sorojax.math.ode.linearly_implicit import LinearlyImplicit
 from sorojax.math.ode.steppers import (
     DormandPrince,
     GeneralisedAlpha,
@@ -269,6 +270,7 @@ def thrown():
     [
         (GeneralisedAlpha(1.0), 2),
         (ImplicitMidpoint(), 2),
+        (LinearlyImplicit(), 1),
         (TripleJump(3), 4),
         (RungeKutta4(), 4),
         (DormandPrince(), 5),

@@ -9,6 +9,7 @@ import pytest
 from sorojax import rod as R, sdf
 from sorojax.contact import LinePenalty
 from sorojax.math.lie import SE2, SE3
+from sorojax.math.ode.linearly_implicit import LinearlyImplicit
 from sorojax.math.status import Status
 from sorojax.rod.contact.obstacle import energy as energy_of_touch
 
@@ -129,6 +130,18 @@ def test_twice_the_points_give_the_same_equilibrium():
         assert 0 < float(depth) < 0.01 * RADIUS
         ends.append(rest.q)
     assert size(ends[0] - ends[1]) < 0.02 * size(ends[1])
+
+
+def test_one_linear_solution_per_step_comes_to_rest_where_contact_balances():
+    rod = R.rod(SE2(), R.chebyshev(kappa_z=3), R.circle(RADIUS), **FINGER)
+    smooth = LinePenalty(stiffness=5e7, smoothing=6e-6)
+    stone = R.ObstacleContact(sdf.Circle([0.045, -0.014], 6e-3), RADIUS, smooth)
+    rest = R.equilibrium(rod, (R.Gravity(), stone))
+    forces, zero = (R.Gravity(), stone, R.Damping(0.05)), jnp.zeros(3)
+    options = {"step": 2e-3, "saves": 1, "every": 1000, "check": False}
+    path = R.rollout(rod, zero, zero, forces, stepper=LinearlyImplicit(), **options)
+    assert path.status == rest.status == Status.successful
+    assert size(path.q[-1] - rest.q) < 1e-8 * size(rest.q) and size(path.v[-1]) < 1e-6
 
 
 # Bodies against each other, at one moment

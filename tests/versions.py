@@ -99,7 +99,7 @@ def _runs(file: Path, version: str) -> bool:
 def pins(project: dict[str, Any]) -> list[str]:
     """The lowest versions that a project allows of what its tests need."""
     needed, pinned = list(project["dependencies"]), []
-    for extra in ("pardiso", "test", "sweep", "vision"):
+    for extra in ("pardiso", "test", "envs", "sweep", "vision"):
         needed += project["optional-dependencies"][extra]
     for line in needed:
         requirement, _, where = line.partition(";")

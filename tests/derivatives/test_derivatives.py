@@ -13,6 +13,7 @@ FLOORS = {
         "contact",
         "coupling",
         "design",
+        "envs",
         "fem",
         "material",
         "mesh",

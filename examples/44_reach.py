@@ -1,0 +1,142 @@
+"""A soft finger learns to reach: a policy trained by gradients through the physics.
+
+The finger is `sj.envs.FingerReach`: three chambers, markers as a camera sees them, pressures
+that arrive late. The mean reward of 64 episodes of 32 steps is
+differentiated, each of a finger with a stiffness, a length and a supply of its own; nothing
+is estimated from samples. Asked for are
+95 % of unseen fingers and targets within 5 mm at the end of an episode; measured are 70 %, with
+a median of 3.8 mm, after 250 updates, which take 87 s of one core with their compilation.
+"""
+
+import io
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+import sorojax as sj
+from sorojax import envs
+
+ENV = envs.FingerReach(time_step=4e-3, substeps=5, max_steps=96)
+FINGERS, HORIZON = 64, 32
+
+
+def policy(key) -> eqx.nn.MLP:
+    """From what the bench measures to three commands."""
+    sizes = ENV.num_observations, ENV.num_actions, 64, 2
+    return eqx.nn.MLP(*sizes, jax.nn.tanh, jnp.tanh, key=key)
+
+
+def rolled(net, key, params, steps):
+    """Rewards, distances and states of one finger in an episode, from its beginning."""
+    start, *later = jax.random.split(key, steps + 1)
+
+    def one(carry, key):
+        state, seen = carry
+        after = envs.step(ENV, key, state, net(seen), params)
+        out = after.reward, after.info["distance"], after.info["diverged"], state
+        return (after.state, after.observation), out
+
+    return jax.lax.scan(one, envs.reset(ENV, start, params), jnp.stack(later))[1]
+
+
+def tried(net, key, count, steps):
+    """Episodes of fingers within 4 % of the drawn one, with targets of their own."""
+    params = envs.randomised(ENV.default_params(), key, 0.04, members=count)
+    run = jax.vmap(lambda key, own: rolled(net, key, own, steps))
+    return params, *run(jax.random.split(key, count), params)
+
+
+@eqx.filter_jit
+def trained(net, key, updates, rate=3e-3):
+    """The policy after some updates, and the mean reward of each."""
+    weights, form = eqx.partition(net, eqx.is_inexact_array)
+    optimiser = optax.chain(
+        optax.clip_by_global_norm(1.0), optax.adam(optax.cosine_decay_schedule(rate, updates))
+    )
+
+    def loss(weights, key):
+        return -tried(eqx.combine(weights, form), key, FINGERS, HORIZON)[1].mean()
+
+    def update(carry, key):
+        weights, moments = carry
+        value, slope = jax.value_and_grad(loss)(weights, key)
+        change, moments = optimiser.update(slope, moments)
+        return (optax.apply_updates(weights, change), moments), -value
+
+    start, keys = (weights, optimiser.init(weights)), jax.random.split(key, updates)
+    (weights, _), rewards = jax.lax.scan(update, start, keys)
+    return eqx.combine(weights, form), rewards
+
+
+def main(quick: bool = False, file: Path | None = None) -> dict[str, float]:
+    """Train, then try on 256 new fingers and targets."""
+    updates, count = (40, 32) if quick else (250, 256)
+    net, rewards = trained(policy(jax.random.key(1)), jax.random.key(2), updates)
+    judge = eqx.filter_jit(lambda net: tried(net, jax.random.key(3), count, ENV.max_steps))
+    params, _, distance, diverged, states = judge(net)
+    before = judge(policy(jax.random.key(1)))[2]
+    if file is not None:
+        draw(np.asarray(rewards), 1e3 * np.asarray(distance), params, states, file)
+    return {
+        "reward of the first updates": float(rewards[:5].mean()),
+        "reward of the last updates": float(rewards[-5:].mean()),
+        "reached before training [%]": 100 * float((before[:, -1] < ENV.tolerance).mean()),
+        "reached [%]": 100 * float((distance[:, -1] < ENV.tolerance).mean()),
+        "median distance at the end [mm]": 1e3 * float(jnp.median(distance[:, -1])),
+        "diverged": float(diverged.sum()),
+    }
+
+
+def draw(rewards: np.ndarray, distance: np.ndarray, params, states, file: Path) -> None:
+    """The reward in training, the distance in an episode, and one of these as a strip."""
+    import matplotlib.pyplot as plt
+
+    figure = plt.figure(figsize=(10, 5.4), layout="constrained")
+    halves: Any = figure.subfigures(2, 1, height_ratios=(1, 0.85))
+    above, below = halves
+    left, right = above.subplots(1, 2)
+    left.plot(rewards, color="#1f5f8b", lw=1)
+    left.set(xlabel="updates, of 64 fingers by 32 steps each", ylabel="mean reward")
+    time = ENV.period * np.arange(1, distance.shape[1] + 1)
+    for share, style in ((50, "-"), (95, "--")):
+        right.plot(time, np.percentile(distance, share, axis=0), style, color="#1f5f8b")
+    right.axhline(1e3 * ENV.tolerance, color="#c0392b", lw=1)
+    right.set(xlabel="time [s]", ylabel="to the target [mm]", yscale="log")
+    right.set_title("median, and 95 % of unseen fingers and targets", fontsize=9)
+    for axes in (left, right):
+        axes.spines[["top", "right"]].set_visible(False)
+    one = int(np.argsort(distance[:, 0])[-3])  # of those that begin far away
+    moments = [0, 3, 6, 9, 14, 20, 40]
+    scenes = [
+        ENV.scene(*(jax.tree.map(lambda x, at=at: x[at], tree) for at, tree in
+                    (((one, k), states), ((one,), params))))
+        for k in moments
+    ]  # fmt: skip
+    corners = np.stack([scene.box for scene in scenes])
+    extent = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
+    for axes, scene, k in zip(below.subplots(1, len(scenes)), scenes, moments, strict=True):
+        shown = replace(scene, extent=extent)
+        seen = sj.view.show(shown, renderer="own", view=sj.view.Camera(-60.0, 8.0))
+        picture = plt.imread(io.BytesIO(seen.png))
+        axes.imshow(picture[90:-90, 120:-120])
+        axes.set_title(f"{ENV.period * k:.2f} s", fontsize=9)
+        axes.axis("off")
+        plt.close(seen.figure)
+    figure.savefig(file, dpi=130)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    sj.enable_compilation_cache()
+    quick = "--quick" in sys.argv
+    picture = None if quick else Path(__file__).with_suffix(".png")
+    for name, value in main(quick, picture).items():
+        print(f"{name:<44} {value:.4g}")

@@ -1,0 +1,37 @@
+"""Environments of reinforcement learning: soft robots at tasks, in batches, with gradients."""
+
+from sorojax._arguments import check_package as _check_package
+from sorojax.envs.adapters import register, to_brax, to_gymnasium, to_gymnasium_vector
+from sorojax.envs.core import (
+    AbstractEnv,
+    State,
+    Step,
+    randomised,
+    reset,
+    step,
+    step_with_reset,
+)
+from sorojax.envs.finger_reach import FingerParams, FingerReach
+from sorojax.envs.supply_line import SupplyLine
+from sorojax.envs.tentacle_push import TentacleParams, TentaclePush
+
+__all__ = [
+    "AbstractEnv",
+    "FingerParams",
+    "FingerReach",
+    "State",
+    "Step",
+    "SupplyLine",
+    "TentacleParams",
+    "TentaclePush",
+    "randomised",
+    "register",
+    "reset",
+    "step",
+    "step_with_reset",
+    "to_brax",
+    "to_gymnasium",
+    "to_gymnasium_vector",
+]
+
+_check_package(__name__)
