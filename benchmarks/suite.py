@@ -71,7 +71,8 @@ ROWS = {
         ),
     ),
     "system integration": Cases(
-        ("systems.easy", "systems.stiff"), ("systems.batch", "systems.fem", "systems.hand")
+        ("systems.easy", "systems.stiff"),
+        ("systems.batch", "systems.fem", "systems.hand", "systems.sampled"),
     ),
     "inverse kinematics and estimator": Cases(("rod.ik", "systems.estimator")),
     "environments": Cases(("envs.steps",)),

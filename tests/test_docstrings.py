@@ -33,7 +33,7 @@ VERBS = {
     "rollout tip_pose with_closures",
     "coupling": "mounted_rod",
     "reduction": "identify pod_basis strain_along",
-    "systems": "Network simulate simulate_batch simulate_sampled",
+    "systems": "Network sampled_body simulate simulate_batch simulate_sampled",
     "design": "calibrate drawing_to_loop layout minimise minimise_shape propagate_covariance",
     "robots": "actuator_forces arm_mjcf bellows_problem computed_torque mount stepper",
     "envs": "randomised register reset step step_with_reset to_brax to_gymnasium "

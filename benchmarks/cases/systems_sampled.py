@@ -44,14 +44,12 @@ def trained(full, tolerance=TOLERANCE, modes=MODES):
 
 def moves(block, step, solver=None):
     """Places of the tip while the network fills the body."""
-    film = systems.simulate(
-        network(block), DURATION, save=STEPS + 1, step=step, solver=solver
-    )
+    film = systems.simulate(network(block), DURATION, save=STEPS + 1, step=step, solver=solver)
     return film["body.tip_position"] - film["body.tip_position"][0]
 
 
 def stepped(block, count):
-    """`count` steps of the body alone under a pressure, as one function of state and pressure."""
+    """Where the tip is after `count` steps of the body alone under a pressure."""
     solver, h = systems.Rosenbrock2(refresh=True), STEP / 4
 
     def run(pressure):
@@ -104,7 +102,10 @@ def rows():
     took = time.perf_counter() - start
     share = len(small.cells) / count
     settings = {"shapes": len(small.body.basis), "cells": len(small.cells), "of": count}
-    want, got = moves(full, STEP), moves(small.body, STEP / 4, systems.Rosenbrock2(refresh=True))
+    want, got = (
+        moves(full, STEP),
+        moves(small.body, STEP / 4, systems.Rosenbrock2(refresh=True)),
+    )
     scale = float(jnp.max(jnp.abs(want)))
 
     def row(of, error, bar, reference, **columns):

@@ -13,6 +13,7 @@ from tests.derivatives.case import Case
 
 NONE = {
     "a film's reader, or a loop that moves on the host": "last_state partitioned",
+    "chooses cells on the host; what it makes has derivatives": "sampled_body",
 }
 
 SLOW = ("simulate_batch",)
