@@ -69,7 +69,7 @@ class SampledForce(AbstractModalForce):
     loads: Polynomial
 
     def __call__(self, q):
-        return jax.grad(self._stored)(q) - self.loads(q)
+        return _of_cells(self, q) - self.loads(q)
 
     def energy(self, q):
         zero, terms = jnp.zeros_like(q), self.loads.terms
@@ -80,8 +80,45 @@ class SampledForce(AbstractModalForce):
         """Energy of the cells [J] with these entries of F."""
         return jnp.sum(self.volumes * energy_density(self.body, F))
 
+    def stiffness(self, q: Modes) -> Float[Array, "modes modes"]:
+        """Derivative of the force of the cells: dP/dF at each point, between the slopes."""
+        F = self.rest + self.slopes @ q
+
+        def stress(F):
+            return jax.grad(self.stored_by)(F)
+
+        if self.body.modes is not None:  # the pressure of a cell couples its points
+            moved = jnp.moveaxis(self.slopes, -1, 0)
+            bent = jax.vmap(lambda d: jax.jvp(stress, (F,), (d,))[1])(moved)
+            return jnp.einsum("eqcm,neqc->mn", self.slopes, bent)
+        units = jnp.broadcast_to(
+            jnp.eye(F.shape[0], dtype=F.dtype)[:, :, None, None], (F.shape[0], *F.shape)
+        )
+        tangent = jax.vmap(lambda d: jax.jvp(stress, (F,), (d,))[1])(units)
+        bent = jnp.einsum("feqc,fqcn->eqcn", tangent, self.slopes)
+        count = self.slopes.shape[-1]
+        return self.slopes.reshape(-1, count).T @ bent.reshape(-1, count)
+
     def _stored(self, q: Modes) -> Float[Array, ""]:
         return self.stored_by(self.rest + self.slopes @ q)
+
+
+@eqx.filter_custom_jvp
+def _of_cells(force: SampledForce, q: Modes) -> Modes:
+    """Force of the cells. Its derivative by all coordinates, which implicit steps ask for, is
+    one stiffness and not a pass for each."""
+    return jax.grad(force._stored)(q)
+
+
+@_of_cells.def_jvp
+def _(primals, tangents):
+    (force, q), (numbers, way) = primals, tangents
+    found = jax.grad(force._stored)(q)
+    change = jnp.zeros_like(found) if way is None else force.stiffness(q) @ way
+    if any(leaf is not None for leaf in jax.tree.leaves(numbers, is_leaf=lambda x: x is None)):
+        by_numbers = eqx.filter_jvp(lambda f: jax.grad(f._stored)(q), (force,), (numbers,))[1]
+        change = change + by_numbers
+    return found, change
 
 
 def sampled_force(
@@ -172,6 +209,7 @@ def sampled_body(
     body: FemBody,
     paths: Sequence[Inputs],
     *,
+    motions: Sequence[Float[Array | np.ndarray, "frames nodes dim"]] = (),
     modes: int = 12,
     tolerance: float = 1e-2,
     states: int = 3,
@@ -181,13 +219,15 @@ def sampled_body(
 
     Of every path of inputs the equilibria and their derivatives by the inputs are found; every
     second equilibrium is trained on, the others tell the error. Driven loads work as in
-    `modal_body`: of a pressure exactly, as the volume is a cubic of the shapes. Made for slow
-    motion: what a fast one adds to the shapes of equilibria is not in them.
+    `modal_body`: of a pressure exactly, as the volume is a cubic of the shapes. What a fast
+    motion adds to the shapes of equilibria has to be seen: give some `motions` too.
 
     Args:
         body: The full body.
         paths: Of the inputs, each from rest: values of driven loads by name, one row per
             equilibrium, in the unit of the load; one load in a path.
+        motions: Displacements of the full body in motions like those that are asked for later
+            [m], `film.state["body"]["u"]` of a network or those of `fem.simulate`.
         modes: Number of shapes.
         tolerance: Relative error of the force in training at which no more cells are chosen.
         states: How many states are drawn around each equilibrium, so that the force is right
@@ -230,13 +270,22 @@ def sampled_body(
             found.slopes.extend(_slopes(body, u, {**rest, name: row}, name, reach))
     report("sampled_body: cells", 0, 1)
     seen = found.displacements[::2]
-    basis = snapshot_basis(body, jnp.stack([*seen, *found.slopes]), modes)
+    shown = [jnp.asarray(u) for frames in motions for u in frames]
+    basis = snapshot_basis(body, jnp.stack([*seen, *found.slopes, *shown]), modes)
     whole = modal_body(body, basis, order=None)
     count = body.problem.mesh.num_cells
     every = sampled_force(body, basis, np.arange(count), np.ones(count))
     whole = eqx.tree_at(lambda b: b.force, whole, every)
     at = jnp.stack([coordinates(body, basis, u) for u in found.displacements])
-    cells, weights, left = _chosen(whole, at[::2], found.inputs[::2], tolerance, states, seed)
+    tangents = [
+        -jax.jacfwd(lambda q, values=values: _accelerated(whole, q, values))(q)
+        for q, values in zip(at[::2], found.inputs[::2], strict=True)
+    ]
+    free = [coordinates(body, basis, u) for u in shown]
+    near = [(q, tangent, states) for q, tangent in zip(at[::2], tangents, strict=True)]
+    near += [(q, None, 0) for q in free]
+    spread = _AROUND * jnp.std(jnp.stack([*at[::2], *free]), axis=0)
+    cells, weights, left = _chosen(every, near, spread, tolerance, seed)
     force = sampled_force(body, basis, cells, weights)
     small = eqx.tree_at(lambda b: b.force, whole, force)
     told = zip(at[1::2], at[::2], found.inputs[1::2], strict=False)
@@ -309,48 +358,48 @@ def snapshot_basis(
 
 
 def _chosen(
-    body: ModalBody,
-    states: Float[Array, "states modes"],
-    inputs: Sequence[Mapping[str, Array]],
+    whole: SampledForce,
+    states: Sequence[tuple[Modes, Float[Array, "modes modes"] | None, int]],
+    spread: Modes,
     tolerance: float,
-    more: int,
     seed: int,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Cells and their weights, and the error that is left.
+    """Cells and their weights, and the error that is left; from coordinates, the stiffness at
+    equilibria, and how many more states are drawn about each.
 
     Each state has rows of the force, as the displacement that it makes there, and of its
     slopes, as a metric sees them that makes their sum one: small errors in stiff directions
     would otherwise hide soft ones.
     """
-    whole, upper = body.force, np.triu_indices(states.shape[1])
-    assert isinstance(whole, SampledForce)
+    upper = np.triu_indices(len(spread))
 
     def of_cells(q):
         P = jax.grad(whole.stored_by)(whole.rest + whole.slopes @ q)
         return jnp.einsum("eqc,eqcm->mc", P, whole.slopes)
 
     @jax.jit
-    def rows_of(q, tangent):
+    def rows_of(q, stiffness):
         slopes = jax.jacfwd(of_cells)(q)
         values, vectors = jnp.linalg.eigh(jnp.sum(slopes, axis=1))
         half = vectors.T / jnp.sqrt(jnp.abs(values))[:, None]
         bent = jnp.einsum("am,mcn,bn->abc", half, slopes, half)[upper]
         size = jnp.sqrt(jnp.asarray(len(values), q.dtype))
-        return jnp.linalg.solve(tangent, of_cells(q)), _SLOPES * bent / size
+        force = of_cells(q)
+        moved = half.T @ half @ force
+        if stiffness is not None:
+            moved = jnp.linalg.solve(stiffness, force)
+        return moved, _SLOPES * bent / size
 
-    draw = np.random.default_rng(seed).normal(size=(len(states), more, states.shape[1]))
-    spread = _AROUND * jnp.std(states, axis=0)
-    forces, slopes = [], []
-    for q, values, away in zip(states, inputs, draw, strict=True):
-        tangent = -jax.jacfwd(lambda q, values=values: _accelerated(body, q, values))(q)
-        for near in (q, *(q + spread * jnp.asarray(a) for a in away)):
-            force, slope = rows_of(near, tangent)
-            forces.append(np.asarray(force))
-            slopes.append(np.asarray(slope))
+    draw = np.random.default_rng(seed)
+    rows = []
+    for q, stiffness, more in states:
+        for away in (0.0, *draw.normal(size=(more, len(q)))):
+            rows.append(rows_of(q + spread * jnp.asarray(away), stiffness))
+    forces, slopes = ([np.asarray(x) for x in kind] for kind in zip(*rows, strict=True))
     sizes = np.array([np.linalg.norm(force.sum(axis=1)) for force in forces])
     sizes = np.maximum(sizes, _SMALL * sizes.max())
-    rows = [force / size for force, size in zip(forces, sizes, strict=True)]
-    return sparse_weights(np.concatenate([*rows, *slopes]), tolerance)
+    sized = [force / size for force, size in zip(forces, sizes, strict=True)]
+    return sparse_weights(np.concatenate([*sized, *slopes]), tolerance)
 
 
 def sparse_weights(
