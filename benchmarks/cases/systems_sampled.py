@@ -1,7 +1,7 @@
 """A bellows reduced to a few shapes and the force of a few weighted cells.
 
-Trained on equilibria under pressure alone; then filled with air by a regulator to a pressure
-that the training has not seen, beside the full body in the same network.
+Trained on equilibria under pressure and on two motions; then filled with air by a regulator to
+another pressure in another time, beside the full body in the same network.
 """
 
 import time
@@ -17,7 +17,9 @@ from sorojax import fem, material, mesh, systems
 from sorojax.robots import BellowsActuator
 from sorojax.units import MPa, kPa, mm
 
-MODES, TOLERANCE = 10, 5e-3
+MODES, TOLERANCE = 10, 1e-2
+SEEN = ((7 * kPa, 0.05), (3 * kPa, 0.03))  # pressures, and times to them [s], of training
+TARGET, RISE = 5 * kPa, 0.04
 PRESSURES = np.linspace(0, 8 * kPa, 17)
 ERROR_BAR, CELLS_BAR, STEP_BAR, MEMBER_BAR, GRADIENT_BAR = 1e-2, 0.02, 200e-6, 50e-6, 1e-5
 MEMBERS = (1, 64, 1024, 4096)
@@ -38,14 +40,24 @@ def body(size=0.7 * mm) -> systems.FemBody:
     return systems.FemBody(problem, fem.Rayleigh(5.0, 1e-3), markers={"tip": tip})
 
 
-def trained(full, tolerance=TOLERANCE, modes=MODES):
-    return systems.sampled_body(full, [{"air": PRESSURES}], modes=modes, tolerance=tolerance)
+def filled(block, pressure, rise, step, solver=None):
+    """The network that fills the body to a pressure [Pa] in a time [s]."""
+    net = network(block)
+    goal = systems.Source(systems.SmoothRamp([0.0, rise], [0.0, pressure]), unit="Pa")
+    net = systems.Network({**net.blocks, "goal": goal}, dict(net.wires))
+    return systems.simulate(net, DURATION, save=STEPS + 1, step=step, solver=solver)
+
+
+def trained(full):
+    motions = [filled(full, *seen, STEP).state["body"]["u"][3::3] for seen in SEEN]
+    paths = [{"air": PRESSURES}]
+    return systems.sampled_body(full, paths, motions=motions, modes=MODES, tolerance=TOLERANCE)
 
 
 def moves(block, step, solver=None):
-    """Places of the tip while the network fills the body."""
-    film = systems.simulate(network(block), DURATION, save=STEPS + 1, step=step, solver=solver)
-    return film["body.tip_position"] - film["body.tip_position"][0]
+    """Where the tip goes while the network fills the body."""
+    place = filled(block, TARGET, RISE, step, solver)["body.tip_position"]
+    return place - place[0]
 
 
 def stepped(block, count):
