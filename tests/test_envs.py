@@ -60,6 +60,7 @@ def spoilt(states, k):
     return eqx.tree_at(lambda s: s.body.v, states, states.body.v.at[k].set(1e200))
 
 
+@pytest.mark.versions
 @pytest.mark.parametrize("env", TASKS)
 def test_a_member_of_a_batch_with_its_own_numbers_is_what_it_is_alone(env, getkey):
     given, observations = members(env, getkey())

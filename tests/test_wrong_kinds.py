@@ -3,6 +3,7 @@ that its signature invites, answers got - need - do before it does anything."""
 
 import dataclasses
 import importlib
+import inspect
 import linecache
 import re
 import traceback
@@ -187,4 +188,5 @@ def test_what_is_free_takes_anything():
     """The list of exceptions holds none that is no exception."""
     for place in IS_FREE:
         path, _, name = place.rpartition(".")
-        assert CHECKED[path].__arguments__.kinds[name].accepts(OBJECT), place
+        if not inspect.isabstract(CHECKED[path]):
+            assert CHECKED[path].__arguments__.kinds[name].accepts(OBJECT), place

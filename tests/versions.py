@@ -100,7 +100,7 @@ def pins(project: dict[str, Any]) -> list[str]:
     """The lowest versions that a project allows of what its tests need."""
     needed, pinned = list(project["dependencies"]), []
     for extra in ("pardiso", "test", "envs", "sweep", "vision"):
-        needed += project["optional-dependencies"][extra]
+        needed += project["optional-dependencies"].get(extra, ())
     for line in needed:
         requirement, _, where = line.partition(";")
         name = re.split(r"[^\w.-]", requirement.strip())[0]
