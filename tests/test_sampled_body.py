@@ -92,7 +92,7 @@ def test_it_follows_the_full_body_in_a_network():
 
 
 def test_the_derivative_by_the_stiffness_is_that_of_differences():
-    body = trained().body
+    body: Any = trained().body
     q = 1e-4 * jnp.arange(1.0, 1 + len(body.basis)) * body.q.at[0].set(1.0)
 
     def energy(scale):
