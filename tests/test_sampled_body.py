@@ -11,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import fem, material, mesh, systems
+from sorojax import fem, material, mesh, sdf, systems
 from sorojax.systems.blocks.modal_body import ProjectedForce
 from sorojax.systems.blocks.sampled_force import (
+    _equilibria,
+    _error,
     sampled_force,
     snapshot_basis,
     sparse_weights,
@@ -146,3 +148,39 @@ def test_a_body_with_moved_supports_is_refused():
     body = systems.FemBody(problem, driven=("push", "clamp"))
     with pytest.raises(ValueError, match="driven supports"):
         systems.sampled_body(body, [{"push": PUSH}], modes=6)
+
+
+def test_a_body_in_contact_is_refused():
+    body = beam()
+    floor = fem.Contact(
+        body.problem.mesh.facet_sets["bottom"], sdf.HalfPlane([0.0, -0.01], [0.0, 1.0])
+    )
+    body = systems.FemBody(
+        fem.problem(
+            body.problem.mesh,
+            body.problem.material,
+            kinematics=body.problem.kinematics,
+            supports=body.problem.supports,
+            loads=(body.problem.loads[0], floor),
+        ),
+        driven=("push",),
+    )
+    with pytest.raises(ValueError, match="got contact \\['contact'\\]"):
+        systems.sampled_body(body, [{"push": PUSH}], modes=6)
+
+
+def test_two_paths_of_odd_length_each_train_on_every_second_state():
+    """The states that tell the error are those between, of each path by itself."""
+    paths = [{"push": PUSH}, {"push": -PUSH[:5]}]
+    seen, told, slopes = _equilibria(beam(), paths)
+    assert (len(seen), len(told), len(slopes)) == (8, 6, 16)
+    want = np.concatenate([PUSH[1::2], -PUSH[1:5:2]])
+    np.testing.assert_allclose(np.stack([s.inputs["push"] for s in told]), want)
+    np.testing.assert_array_equal(told[4].before, seen[5].u)
+
+
+def test_an_equilibrium_that_is_not_found_is_an_infinite_error():
+    body = trained().body
+    lost = eqx.tree_at(lambda b: b.force.volumes, body, jnp.nan * body.force.volumes)  # pyright: ignore
+    _, told, _ = _equilibria(beam(), [{"push": PUSH[:2]}])
+    assert float(_error(beam(), lost, told)) == np.inf

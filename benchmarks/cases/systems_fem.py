@@ -17,9 +17,9 @@ STEPS = round(DURATION / STEP)
 MODES = 3
 
 
-def body() -> systems.FemBody:
+def body(size: float = 1.5 * mm) -> systems.FemBody:
     actuator = BellowsActuator()
-    cells = mesh.triangulate(actuator.body(), size=1.5 * mm, order=2)
+    cells = mesh.triangulate(actuator.body(), size=size, order=2)
     problem = fem.problem(
         cells,
         material.NeoHookean(400 * kPa, 4 * MPa, density=1080.0),

@@ -11,33 +11,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.cases.systems_fem import DURATION, STEP, STEPS, network
+from benchmarks.cases.systems_fem import DURATION, STEP, STEPS, body, network
 from benchmarks.harness import Row, measure_calls
-from sorojax import fem, material, mesh, systems
-from sorojax.robots import BellowsActuator
-from sorojax.units import MPa, kPa, mm
+from sorojax import systems
+from sorojax.units import kPa, mm
 
-MODES, TOLERANCE = 10, 1e-2
+SIZE, MODES, TOLERANCE = 0.7 * mm, 10, 1e-2
 SEEN = ((7 * kPa, 0.05), (3 * kPa, 0.03))  # pressures, and times to them [s], of training
 TARGET, RISE = 5 * kPa, 0.04
 PRESSURES = np.linspace(0, 8 * kPa, 17)
 ERROR_BAR, CELLS_BAR, STEP_BAR, MEMBER_BAR, GRADIENT_BAR = 1e-2, 0.02, 200e-6, 50e-6, 1e-5
 MEMBERS = (1, 64, 1024, 4096)
-
-
-def body(size=0.7 * mm) -> systems.FemBody:
-    """Five bellows, side view, plane strain."""
-    actuator = BellowsActuator()
-    cells = mesh.triangulate(actuator.body(), size=size, order=2)
-    problem = fem.problem(
-        cells,
-        material.NeoHookean(400 * kPa, 4 * MPa, density=1080.0),
-        kinematics=fem.PlaneStrain(20 * mm),
-        supports=(fem.Fixed(mesh.nodes_where(cells, lambda p: p[0] < 1e-9)),),
-        loads=(fem.Pressure(mesh.facets_on(cells, actuator.chambers()), name="air"),),
-    )
-    tip = mesh.nearest_node(cells, (float(actuator.length), 0.0))
-    return systems.FemBody(problem, fem.Rayleigh(5.0, 1e-3), markers={"tip": tip})
 
 
 def filled(block, pressure, rise, step, solver=None):
@@ -107,7 +91,7 @@ def gradient(block):
 
 
 def rows():
-    full = body()
+    full = body(SIZE)
     count = full.problem.mesh.num_cells
     start = time.perf_counter()
     small = trained(full)

@@ -74,11 +74,7 @@ def modal_basis(
         Comput. Methods Appl. Mech. Engrg. 49, 1985, for the derivatives.
     """
     problem = body.problem
-    if any(map(has_masses, problem.loads)):
-        raise ValueError(
-            "modal_basis: got masses that are not at nodes, of a mounted rod, need a body of "
-            "constant mass. Keep the FemBody."
-        )
+    _constant_mass("modal_basis", body)
     u = jnp.zeros_like(problem.mesh.points) if displacement is None else real(displacement)
     found = [fem.eigenmodes(problem, u, modes).shapes] if modes else []
     found.append(_answers(body, u))
@@ -321,19 +317,9 @@ def modal_body(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBo
     Raises:
         ValueError: If a driven load is not proportional to its input, or a support is driven.
     """
-    if body.moved:
-        raise ValueError(
-            f"modal_body: got driven supports {sorted(body.moved)}, need a body whose supports "
-            "stay, as its shapes do. Keep the FemBody."
-        )
+    reducible("modal_body", body)
     if order is not None and order not in (1, 2, 3):
         raise ValueError(f"reduced: `order` must be 1, 2, 3 or None, got {order}.")
-    if isinstance(body.problem.material, Viscoelastic):
-        raise ValueError(
-            "modal_body: got a body of a Viscoelastic material, need one without memory. Give "
-            "its `base` to the problem, with fem.Rayleigh(...) for damping."
-        )
-    no_peaks("modal_body", body.problem.material)
     values = {name: jnp.zeros_like(load.value) for name, load in body.drives.items()}
     free = body.loaded(values)
     rest = ProjectedForce(free, basis)
@@ -365,6 +351,30 @@ def modal_body(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBo
         body.energies,
         tuple(name for name, load in body.drives.items() if isinstance(load, fem.Tendon)),
     )
+
+
+def reducible(where: str, body: FemBody) -> None:
+    """Refuse a body that is not a function of a few coordinates and their rates."""
+    if body.moved:
+        raise ValueError(
+            f"{where}: got driven supports {sorted(body.moved)}, need a body whose supports "
+            "stay, as its shapes do. Keep the FemBody."
+        )
+    if isinstance(body.problem.material, Viscoelastic):
+        raise ValueError(
+            f"{where}: got a body of a Viscoelastic material, need one without memory. Give "
+            "its `base` to the problem, with fem.Rayleigh(...) for damping."
+        )
+    no_peaks(where, body.problem.material)
+    _constant_mass(where, body)
+
+
+def _constant_mass(where: str, body: FemBody) -> None:
+    if any(map(has_masses, body.problem.loads)):
+        raise ValueError(
+            f"{where}: got masses that are not at nodes, of a mounted rod, need a body of "
+            "constant mass. Keep the FemBody."
+        )
 
 
 def _place(body: FemBody, basis: Basis, node: int) -> Array:

@@ -3,8 +3,7 @@ the full body by one verb.
 
 Shapes are the main directions of equilibria under given inputs, of their derivatives by these
 inputs, and the lowest eigenmodes. Weights make the work of the chosen cells along every shape
-that of all cells, in the states of training; as none is negative, the sum is an energy, and a
-reduced body stays as stable as the full one.
+that of all cells, in the states of training; as none is negative, the sum is an energy.
 
 Reference:
     Farhat, Chapman, Avery, Structure-preserving, stability, and accuracy properties of the
@@ -41,6 +40,7 @@ from sorojax.systems.blocks.modal_body import (
     displacement,
     modal_body,
     orthonormal,
+    reducible,
 )
 
 _EIGENMODES = 2  # of the shapes, beside those of the equilibria
@@ -178,10 +178,10 @@ class SampledBody(eqx.Module):
         body: The reduced body, a block with the ports of the full one.
         cells: Those that its force comes from.
         weights: How many cells each stands for.
-        training_error: Of the force in the states of training, in the norm of the work that
-            it does on the elastic answer, relative.
+        training_error: Of the force and its slopes in the states of training, relative, each
+            as the displacement that it makes.
         error: Of the displacement at equilibria that the training has not seen, in the norm
-            of the mass, over the largest displacement.
+            of the mass, over the largest displacement; infinite where none is found.
         num_cells: Of the full body.
     """
 
@@ -239,7 +239,7 @@ def sampled_body(
 
     Raises:
         ValueError: If there are too few equilibria for the shapes, a path names no driven
-            load, or `modal_body` refuses the body.
+            load, a body is in contact, or `modal_body` refuses it.
 
     Example:
         >>> bar = mesh.rectangle([0, 0], [80 * mm, 10 * mm], divisions=(12, 2))
@@ -255,57 +255,78 @@ def sampled_body(
         (6, True)
     """
     _checked(body, paths, modes)
+    seen, told, slopes = _equilibria(body, paths)
+    report("sampled_body: cells", 0, 1)
+    shown = [jnp.asarray(u) for frames in motions for u in frames]
+    basis = snapshot_basis(body, jnp.stack([*(s.u for s in seen), *slopes, *shown]), modes)
+    count = body.problem.mesh.num_cells
+    every = sampled_force(body, basis, np.arange(count), np.ones(count))
+    whole = modal_body(body, basis, order=None)
+    whole = eqx.tree_at(lambda b: b.force, whole, every)
+    known = [coordinates(body, basis, s.u) for s in seen]
+    free = [coordinates(body, basis, u) for u in shown]
+    near: list = [(q, None, 0) for q in free]
+    for q, state in zip(known, seen, strict=True):
+        slope = jax.jacfwd(lambda q, state=state: _accelerated(whole, q, state.inputs))(q)
+        near.append((q, -slope, states))
+    spread = _AROUND * jnp.std(jnp.stack([*known, *free]), axis=0)
+    cells, weights, left = _chosen(every, near, spread, tolerance, seed)
+    chosen = sampled_force(body, basis, cells, weights)
+    small = eqx.tree_at(lambda b: b.force, whole, chosen)
+    error = _error(body, small, told)
+    report("sampled_body: cells", 1, 1)
+    return SampledBody(small, *map(jnp.asarray, (cells, weights, left)), error, count)
+
+
+class _State(NamedTuple):
+    """An equilibrium [m], its inputs, and the equilibrium before it on its path [m]."""
+
+    u: Float[Array, "nodes dim"]
+    inputs: dict[str, Array]
+    before: Float[Array, "nodes dim"]
+
+
+def _equilibria(
+    body: FemBody, paths: Sequence[Inputs]
+) -> tuple[list[_State], list[_State], list[Float[Array, "nodes dim"]]]:
+    """Those to train on, those that tell the error, and displacements by the inputs."""
     rest = {name: jnp.zeros_like(load.value) for name, load in body.drives.items()}
-    found = _Equilibria([], [], [])
+    seen, told, slopes = [], [], []
     for number, path in enumerate(paths):
         report("sampled_body: equilibria", number, len(paths))
         ((name, rows),) = path.items()
         rows = jnp.asarray(rows)
         driven: dict[str, Any] = {name: rows}
-        solved = fem.solve_path(body.loaded(rest), **driven)
-        found.displacements.extend(solved.displacements)
-        found.inputs.extend({**rest, name: row} for row in rows)
+        solved = fem.solve_path(body.loaded(rest), **driven).displacements
         reach = jnp.max(jnp.abs(rows), axis=0)
-        for u, row in list(zip(solved.displacements, rows, strict=True))[::2]:
-            found.slopes.extend(_slopes(body, u, {**rest, name: row}, name, reach))
-    report("sampled_body: cells", 0, 1)
-    seen = found.displacements[::2]
-    shown = [jnp.asarray(u) for frames in motions for u in frames]
-    basis = snapshot_basis(body, jnp.stack([*seen, *found.slopes, *shown]), modes)
-    whole = modal_body(body, basis, order=None)
-    count = body.problem.mesh.num_cells
-    every = sampled_force(body, basis, np.arange(count), np.ones(count))
-    whole = eqx.tree_at(lambda b: b.force, whole, every)
-    at = jnp.stack([coordinates(body, basis, u) for u in found.displacements])
-    tangents = [
-        -jax.jacfwd(lambda q, values=values: _accelerated(whole, q, values))(q)
-        for q, values in zip(at[::2], found.inputs[::2], strict=True)
-    ]
-    free = [coordinates(body, basis, u) for u in shown]
-    near = [(q, tangent, states) for q, tangent in zip(at[::2], tangents, strict=True)]
-    near += [(q, None, 0) for q in free]
-    spread = _AROUND * jnp.std(jnp.stack([*at[::2], *free]), axis=0)
-    cells, weights, left = _chosen(every, near, spread, tolerance, seed)
-    force = sampled_force(body, basis, cells, weights)
-    small = eqx.tree_at(lambda b: b.force, whole, force)
-    told = zip(at[1::2], at[::2], found.inputs[1::2], strict=False)
-    answers = jnp.stack([_equilibrium(small, values, start) for _, start, values in told])
-    off = jax.vmap(lambda u, q: _size(body, u - displacement(basis, q)))
-    error = jnp.max(off(jnp.stack(found.displacements[1::2]), answers))
-    error = error / jnp.max(jnp.linalg.norm(at, axis=1))
-    report("sampled_body: cells", 1, 1)
-    return SampledBody(small, *map(jnp.asarray, (cells, weights, left)), error, count)
+        for k, (u, row) in enumerate(zip(solved, rows, strict=True)):
+            state = _State(u, {**rest, name: row}, solved[max(k - 1, 0)])
+            (told if k % 2 else seen).append(state)
+            if k % 2 == 0:
+                slopes.extend(_slopes(body, u, state.inputs, name, reach))
+    return seen, told, slopes
 
 
-class _Equilibria(NamedTuple):
-    """Displacements and inputs of equilibria, and displacements by the inputs."""
-
-    displacements: list[Array]
-    slopes: list[Array]
-    inputs: list[dict[str, Array]]
+def _error(body: FemBody, small: ModalBody, told: Sequence[_State]) -> Float[Array, ""]:
+    """Largest difference to equilibria in the norm of the mass, over the largest of these."""
+    off, sizes = [], []
+    for state in told:
+        start = coordinates(body, small.basis, state.before)
+        q = _equilibrium(small, state.inputs, start)
+        off.append(_size(body, state.u - displacement(small.basis, q)))
+        sizes.append(_size(body, state.u))
+    error = jnp.max(jnp.stack(off)) / jnp.max(jnp.stack(sizes))
+    return jnp.where(jnp.isfinite(error), error, jnp.inf)
 
 
 def _checked(body: FemBody, paths: Sequence[Inputs], modes: int) -> None:
+    reducible("sampled_body", body)
+    touching = [load.name for load in body.problem.loads if not load.smooth]
+    if touching:
+        raise ValueError(
+            f"sampled_body: got contact {touching}, need loads that are smooth functions of "
+            "the displacement. Keep the FemBody, or modal_body(..., order=None)."
+        )
     for path in paths:
         if len(path) != 1 or not set(path) <= set(body.drives):
             raise ValueError(
