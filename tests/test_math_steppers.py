@@ -10,7 +10,7 @@ import pytest
 from sorojax.math.ode.explicit import RungeKutta4, SemiImplicitEuler, Tsit5, repeated
 from sorojax.math.ode.generalised_alpha import GeneralisedAlpha
 from sorojax.math.ode.rosenbrock import Rodas4, Rosenbrock2
-from sorojax.math.ode.step_control import Control
+from sorojax.math.ode.step_control import Control, SearchedAttempt, cut
 
 
 def repeat(*args):
@@ -223,6 +223,67 @@ def test_a_step_that_does_not_converge_is_cut_and_never_accepted():
 def _stored(q):
     """The integral of arctanh."""
     return q * jnp.arctanh(q) + jnp.log1p(-(q**2)) / 2
+
+
+def _implicit(size, x, rate):
+    """x after a step of the implicit Euler method for x' = -rate x^2, in closed form."""
+    return (jnp.sqrt(1 + 4 * size * rate * x) - 1) / (2 * size * rate)
+
+
+@jax.custom_jvp
+def _at(size, x, rate, found):
+    return found
+
+
+@_at.defjvp
+def _at_jvp(primals, tangents):
+    size, x, rate, y = primals
+    dsize, dx, drate, _ = tangents
+    slope = 1 + 2 * size * rate * y  # of y + size rate y^2 - x = 0
+    return y, (dx - y**2 * (dsize * rate + size * drate)) / slope
+
+
+LONGEST = 0.3  # at x = 1 the longest step that converges; longer ones the smaller x is
+
+
+def _searched(given, offset, size, x):
+    return _implicit(size, x, given), size * x <= LONGEST
+
+
+def _taken(given, offset, size, x, found):
+    return _at(size, x, given, found)
+
+
+def _plain(given, offset, size, x):
+    return _implicit(size, x, given), size * x <= LONGEST
+
+
+@pytest.mark.parametrize("attempt", [_plain, SearchedAttempt(_searched, _taken)])
+def test_derivatives_of_a_step_in_parts_are_those_of_the_parts(attempt):
+    """Lanes of a batch are cut differently: whole, in halves and in quarters, and held."""
+    start, steps = jnp.array([0.25, 0.5, 0.9, 1e6]), jnp.array([1, 2, 4, 0])
+
+    def after(x, h, rate):
+        return cut(attempt, 8, rate, h, x)
+
+    def expected(count, x, h, rate):
+        for _ in range(count):
+            x = _implicit(h / count, x, rate)
+        return x
+
+    h, rate = jnp.array(1.0), jnp.array(0.7)
+    values, reached = jax.vmap(lambda x: after(x, h, rate))(start)
+    assert jnp.array_equal(reached, steps > 0)
+    for slopes in (jax.jacfwd, jax.jacrev):
+        found = jax.vmap(lambda x: slopes(after, (0, 1, 2), has_aux=True)(x, h, rate)[0])
+        for k, rows in enumerate(zip(*found(start), strict=True)):
+            if steps[k] == 0:
+                assert values[k] == start[k]
+                continue
+            count = int(steps[k])
+            assert np.isclose(values[k], expected(count, start[k], h, rate), rtol=1e-13)
+            wanted = jax.grad(expected, (1, 2, 3))(count, start[k], h, rate)
+            assert np.allclose(rows, wanted, rtol=1e-11)
 
 
 def test_generalised_alpha_is_a_solver_of_diffrax(exact):

@@ -209,11 +209,26 @@ def _spread(tolerance: PyTree, like: PyTree) -> PyTree:
 #: (given, offset, size, state) -> state after a step of `size` at `offset`, converged or not.
 Attempt = Callable[[Any, Array, Array, PyTree], tuple[PyTree, Bool[Array, ""]]]
 
+
+class SearchedAttempt(NamedTuple):
+    """An attempt as a search, and a step that knows what was found.
+
+    Attributes:
+        search: (given, offset, size, state) -> the unknowns, found or not; without derivative.
+        step: (given, offset, size, state, unknowns) -> state after the step, whose derivative
+            is that of the equations at the unknowns.
+    """
+
+    search: Callable[[Any, Array, Array, PyTree], tuple[PyTree, Bool[Array, ""]]]
+    step: Callable[[Any, Array, Array, PyTree, PyTree], PyTree]
+
+
 _ROWS = 32  # parts of a step at most
 
 
 class _Walk(NamedTuple):
-    """A step on its way: what is done of it, in parts whose ends `ends` holds."""
+    """A step on its way: what is done of it, in parts whose ends `ends` holds, and the
+    unknowns of the parts where those are kept."""
 
     state: PyTree
     done: Float[Array, ""]
@@ -221,12 +236,17 @@ class _Walk(NamedTuple):
     failures: Int[Array, ""]
     row: Int[Array, ""]
     ends: Float[Array, " rows"]
+    unknowns: PyTree
     running: Bool[Array, ""]
 
 
 @eqx.filter_custom_jvp
 def cut(
-    attempt: Attempt, max_cuts: int, given: PyTree, h: Float[Array, ""], state: PyTree
+    attempt: Attempt | SearchedAttempt,
+    max_cuts: int,
+    given: PyTree,
+    h: Float[Array, ""],
+    state: PyTree,
 ) -> tuple[PyTree, Bool[Array, ""]]:
     """The state after a step of `h`, taken in parts where it does not converge whole.
 
@@ -235,7 +255,8 @@ def cut(
     the state before the step comes back, and False.
 
     Derivatives are those of the parts that were taken; their choice has none. `attempt`
-    closes over nothing that is differentiated.
+    closes over nothing that is differentiated. The derivative of a `SearchedAttempt` searches
+    once; of another one a step that is whole is made once, others twice.
     """
     walk = _walked(attempt, max_cuts, given, h, state)
     return _held(walk, walk.state, state)
@@ -245,24 +266,27 @@ def cut(
 def _cut_jvp(primals, tangents):
     attempt, max_cuts, given, h, state = primals
 
-    def whole(given, h, state):
-        return attempt(given, jnp.zeros_like(h), h, state)
-
-    (new, converged), (moved, _) = eqx.filter_jvp(whole, primals[2:], tangents[2:])
-    fine = _fine(new, converged)
-
     def in_parts():
-        walk = _walked(attempt, max_cuts, given, h, state)
-        ends = jax.lax.stop_gradient(walk.ends)
+        walk = _walked(attempt, max_cuts, given, h, state, keep=True)
+        ends, unknowns = jax.lax.stop_gradient((walk.ends, walk.unknowns))
 
         def replayed(given, h, state):
-            return _replay(attempt, ends, given, h, state)
+            return _replay(attempt, ends, unknowns, given, h, state)
 
         moved = eqx.filter_jvp(replayed, primals[2:], tangents[2:])[1]
         reached = walk.done >= 1.0
         kept = jax.tree.map(lambda a: jnp.where(reached, a, jnp.zeros_like(a)), moved)
         return _held(walk, walk.state, state), kept
 
+    if isinstance(attempt, SearchedAttempt):
+        values, moved = in_parts()
+        return values, (moved, None)
+
+    def whole(given, h, state):
+        return attempt(given, jnp.zeros_like(h), h, state)
+
+    (new, converged), (moved, _) = eqx.filter_jvp(whole, primals[2:], tangents[2:])
+    fine = _fine(new, converged)
     # most steps are whole, whose derivative needs no replay
     return_whole = (new, fine), moved
     values, moved = jax.lax.cond(any_of_lanes(~fine), in_parts, lambda: return_whole)
@@ -297,12 +321,16 @@ def may_double(share, end):
     return (2 * share <= 1.0) & (end % (2 * share) == 0.0)
 
 
-def _walked(attempt: Attempt, max_cuts: int, given, h, state) -> _Walk:
+def _walked(attempt, max_cuts: int, given, h, state, keep: bool = False) -> _Walk:
     def one_pass(walk: _Walk) -> _Walk:
-        new, converged = attempt(given, walk.done * h, walk.share * h, walk.state)
+        at = given, walk.done * h, walk.share * h, walk.state
+        new, converged, unknowns = _tried(attempt, at)
         fine = _fine(new, converged)
         end = walk.done + walk.share
         grown = jnp.where(may_double(walk.share, end), 2 * walk.share, walk.share)
+        rows = walk.unknowns
+        if keep:
+            rows = jax.tree.map(lambda a, x: a.at[walk.row].set(x), rows, unknowns)
         accepted = _Walk(
             new,
             end,
@@ -310,33 +338,59 @@ def _walked(attempt: Attempt, max_cuts: int, given, h, state) -> _Walk:
             jnp.zeros_like(walk.failures),
             walk.row + 1,
             walk.ends.at[walk.row].set(end),
+            rows,
             (end < 1.0) & (walk.row + 1 < _ROWS),
         )
         share, failures, running = halved(walk.share, walk.failures, max_cuts)
-        cut = walk._replace(share=share, failures=failures, running=running)
+        cut = walk._replace(share=share, failures=failures, running=running, unknowns=rows)
         return jax.tree.map(lambda a, b: jnp.where(fine, a, b), accepted, cut)
 
     zero, none = jnp.zeros_like(h), jnp.zeros((), jnp.int32)
     ends = jnp.zeros(_ROWS, h.dtype)
-    begin = _Walk(state, zero, zero + 1, none, none, ends, jnp.array(True))
+    rows = None
+    if keep:
+        one = jax.eval_shape(lambda: _tried(attempt, (given, zero, h, state))[2])
+        rows = jax.tree.map(lambda x: jnp.zeros((_ROWS, *x.shape), x.dtype), one)
+    begin = _Walk(state, zero, zero + 1, none, none, ends, rows, jnp.array(True))
     return jax.lax.while_loop(lambda walk: walk.running, one_pass, begin)
 
 
-def _replay(attempt: Attempt, ends, given, h, state) -> PyTree:
+def _tried(attempt, at) -> tuple[PyTree, Bool[Array, ""], PyTree]:
+    """The state after a part, whether it converged, and the unknowns of a search."""
+    if isinstance(attempt, SearchedAttempt):
+        unknowns, converged = attempt.search(*at)
+        return attempt.step(*at, unknowns), converged, unknowns
+    return *attempt(*at), None
+
+
+def _replay(attempt, ends, unknowns, given, h, state) -> PyTree:
     """The parts of a walk again, in a loop of known length."""
     starts = jnp.concatenate([jnp.zeros_like(ends[:1]), ends[:-1]])
+    # what a lane does that has no part where others of a batch have one, for nothing: a part
+    # known to converge, as no derivative may be NaN
+    first = jnp.zeros_like(h), jnp.where(ends[0] > 0, ends[0], 1.0)
+    first = *first, jax.tree.map(lambda x: x[0], unknowns), state
 
-    def one(state, part):
-        start, end = part
+    def one(now, row):
+        start, end, taken, known = row
 
-        def taken(state):
-            return attempt(given, start * h, (end - start) * h, state)[0]
+        def moved():
+            mine = end > start
+            part = start, end, known, now
+            begin, stop, found, at = _where(mine, part, first)
+            at = given, begin * h, (stop - begin) * h, at
+            if isinstance(attempt, SearchedAttempt):
+                new = attempt.step(*at, found)
+            else:
+                new = attempt(*at)[0]
+            return _where(mine, new, now)
 
-        return jax.lax.cond(end > start, taken, lambda state: state, state), None
+        return jax.lax.cond(taken, moved, lambda: now), None
 
     # only the states between the parts are kept for a derivative in reverse
     part = jax.checkpoint(one, prevent_cse=False)  # pyright: ignore[reportPrivateImportUsage]
-    return jax.lax.scan(part, state, (starts, ends))[0]
+    rows = starts, ends, any_of_lanes(ends > starts), unknowns
+    return jax.lax.scan(part, state, rows)[0]
 
 
 # Whether the steps of a run are short enough: a few of them made as two halves too

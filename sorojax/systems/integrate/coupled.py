@@ -16,7 +16,7 @@ from sorojax.fem.equilibrium.jit import prepare_traced
 from sorojax.fem.equilibrium.linear import Prepared
 from sorojax.fem.problem import residual
 from sorojax.math.ode.explicit import AbstractMethod, MethodStep, RungeKutta4, repeated
-from sorojax.math.ode.step_control import cut
+from sorojax.math.ode.step_control import SearchedAttempt, cut
 from sorojax.systems.blocks.driven import exerted
 from sorojax.systems.blocks.fem_body import FemBody, acceleration
 from sorojax.systems.integrate.fem_step import (
@@ -28,6 +28,7 @@ from sorojax.systems.integrate.fem_step import (
     loaded,
     loaded_step,
     on_the_way,
+    search,
 )
 from sorojax.systems.integrate.march import Rate
 from sorojax.systems.network import Network, at_time, inputs_of, rates_of
@@ -123,7 +124,7 @@ class Coupled(AbstractMethod):
         network, inputs = _network(field)
         given = (self, network, inputs, memory.known, t)
         start = y, memory.bodies, memory.late
-        (new, *kept), converged = cut(_attempt, self.max_cuts, given, jnp.asarray(h), start)
+        (new, *kept), converged = cut(_PART, self.max_cuts, given, jnp.asarray(h), start)
         return MethodStep(new, None, Memory(*kept, memory.known), {}, converged)
 
 
@@ -149,11 +150,20 @@ def _block(network: Network, name: str) -> FemBody:
     return block
 
 
-def _attempt(given, offset, size, state):
-    """A part of a step: everything after it, and whether it converged."""
+def _part(given, offset, size, state) -> _Given:
     method, network, inputs, known, t = given
-    now = _Given(method, network, inputs, known, t + offset, size, *state)
-    u, w, converged = balanced(Equations(_stages, _answer), method.newton, now)
+    return _Given(method, network, inputs, known, t + offset, size, *state)
+
+
+def _searched(*part):
+    now = _part(*part)
+    return search(_EQUATIONS, now.method.newton, now)
+
+
+def _taken(given, offset, size, state, found):
+    """Everything after a part of a step."""
+    now = _part(given, offset, size, state)
+    u, w = balanced(_EQUATIONS, now, found)
     new, bodies = {}, {}
     stages = _stages(now)
     for name, stage in stages.items():
@@ -175,7 +185,7 @@ def _attempt(given, offset, size, state):
         new[name]["reactions"] = _later(now, name, found)
     rest = _marched(now, u, pushed)
     after = {name: {**new, **rest}[name] for name in now.y}
-    return (after, bodies, jnp.ones_like(now.late)), converged
+    return after, bodies, jnp.ones_like(now.late)
 
 
 def _stages(now: _Given) -> dict[str, Stage]:
@@ -311,3 +321,7 @@ def _after(now: _Given, u: Fields, pushed: Pushed) -> dict[str, PyTree]:
         if name in pushed:
             found[name]["reactions"] = _later(now, name, pushed[name])
     return found
+
+
+_EQUATIONS = Equations(_stages, _answer)
+_PART = SearchedAttempt(_searched, _taken)

@@ -84,24 +84,26 @@ def _ravelled(tree: PyTree) -> tuple[Array, Callable[[Array], PyTree]]:
     return (flat if flat.size else jnp.zeros(0)), build
 
 
+def search(
+    equations: Equations, newton: fem.Newton, given: PyTree
+) -> tuple[tuple[Fields, Drives], Bool[Array, ""]]:
+    """Displacements and load values of a step, and whether they were found."""
+    u, w, converged = _newton(equations, newton, given)
+    return (u, w), converged
+
+
 @eqx.filter_custom_jvp
 def balanced(
-    equations: Equations, newton: fem.Newton, given: PyTree
-) -> tuple[Fields, Drives, Bool[Array, ""]]:
-    """Displacements and load values of a step, and whether they were found.
-
-    The derivative is that of the equations, by the implicit function theorem: one tangent,
-    one factor and as many back-substitutions as there are values, however many iterations
-    there were.
-    """
-    return _newton(equations, newton, given)
+    equations: Equations, given: PyTree, found: tuple[Fields, Drives]
+) -> tuple[Fields, Drives]:
+    """What `search` found, with the derivative of the equations there by the implicit function
+    theorem: one tangent, one factor and as many back-substitutions as there are values."""
+    return found
 
 
 @balanced.def_jvp
 def _balanced_jvp(primals, tangents):
-    equations, newton, given = primals
-    u, w, converged = found = _newton(equations, newton, given)
-    u, w = jax.lax.stop_gradient((u, w))
+    equations, given, (u, w) = primals
 
     def unbalanced(given):
         stages = equations.stages(given)
@@ -109,13 +111,13 @@ def _balanced_jvp(primals, tangents):
         held = {k: _held(s, w[k]) for k, s in stages.items()}
         return forces, held, _ravelled(equations.answer(given, stages, u, w))[0]
 
-    forces, held, answer = filled(*eqx.filter_jvp(unbalanced, (given,), tangents[2:]))
+    forces, held, answer = filled(*eqx.filter_jvp(unbalanced, (given,), (tangents[1],)))
     stages = equations.stages(given)
     matrices = {
         k: linearise(loaded(s, w[k]), s.prepared, u[k], u[k]).values for k, s in stages.items()
     }
     du, dw = _solved(equations, given, matrices, stages, u, w, forces, held, -answer)
-    return found, (du, _ravelled(w)[1](dw), None)
+    return (u, w), (du, _ravelled(w)[1](dw))
 
 
 def on_the_way(stage: Stage, values: dict[str, Array]) -> dict[str, Array]:
