@@ -6,6 +6,7 @@ command gives another.
 """
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -48,7 +49,7 @@ COOK = {
 
 def draw(file: Path = FILE) -> Path:
     """The three panels as a PNG file."""
-    style = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
+    style: Any = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
     with plt.rc_context(style):
         widths = {"width_ratios": (1.3, 1, 1)}
         figure, axes = plt.subplots(1, 3, figsize=(11.6, 3.1), gridspec_kw=widths)
