@@ -9,10 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
-
-matplotlib.use("Agg")  # before pyplot, on machines without a display
-
-from matplotlib import pyplot as plt  # noqa: E402
+from matplotlib.figure import Figure
 
 FILE = Path(__file__).parent.parent / "docs" / "explanation" / "speed_and_accuracy.png"
 BLUE, RED, GREY = "#0b6e99", "#c8553d", "#8a8a8a"
@@ -50,15 +47,14 @@ COOK = {
 def draw(file: Path = FILE) -> Path:
     """The three panels as a PNG file."""
     style: Any = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
-    with plt.rc_context(style):
-        widths = {"width_ratios": (1.3, 1, 1)}
-        figure, axes = plt.subplots(1, 3, figsize=(11.6, 3.1), gridspec_kw=widths)
+    with matplotlib.rc_context(style):
+        figure = Figure(figsize=(11.6, 3.1))
+        axes = figure.subplots(1, 3, width_ratios=(1.3, 1, 1))
         _flight(axes[0])
         _bars(axes[1], ACCELERATION, "us", "Acceleration of a finger, 6 coordinates")
         _bars(axes[2], COOK, "%", "Cook's membrane: error")
         figure.tight_layout(w_pad=2.0)
         figure.savefig(file, dpi=110)
-        plt.close(figure)
     return file
 
 
