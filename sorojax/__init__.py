@@ -26,7 +26,7 @@ _devices.leave_out_absent()
 for _name in ("compiled", "jit", "listen"):
     globals()[_name] = _public(__name__, _name, globals()[_name])
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _FLOORS = (
     "contact", "coupling", "design", "envs", "fem", "io", "material", "math", "mesh",

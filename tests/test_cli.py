@@ -3,11 +3,12 @@
 import os
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import jax
 import pytest
+from hatchling.metadata.core import ProjectMetadata
+from hatchling.plugin.manager import PluginManager
 
 import sorojax
 from sorojax._cache import cache_directory, enable_compilation_cache
@@ -28,8 +29,7 @@ def command(*words, **environment):
 
 
 def test_version_is_that_of_the_package():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert project["version"] == sorojax.__version__
+    assert ProjectMetadata(str(ROOT), PluginManager()).version == sorojax.__version__
     assert command("--version").stdout == f"sorojax {sorojax.__version__}\n"
 
 

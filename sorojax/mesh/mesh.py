@@ -160,7 +160,7 @@ def nodes_between(
 def merge(**bodies: Mesh) -> Mesh:
     """One mesh of several bodies that share no nodes, for contact between them.
 
-    `joined(finger=a, ball=b)` names the cells of each body in `regions`, its nodes in
+    `merge(finger=a, ball=b)` names the cells of each body in `regions`, its nodes in
     `node_sets`, and its sets "finger.top"; nodes keep their order, body after body.
     Differentiable in the points.
 

@@ -84,11 +84,11 @@ class SelfContact(AbstractPenaltyContact):
     sides, each for half of its area, along the normal of the facet that is closest among
     the `candidates` listed for a facet: those that were nearest, within `reach` [m], when
     the lists were made. They hold while points move by less than about half of it;
-    `updated(problem, u)` makes them anew. A point counts as inside up to a depth of
+    `fem.update_contact_pairs` makes them anew. A point counts as inside up to a depth of
     `reach`, and where the surfaces face each other.
 
-    Two sets belong to one mesh, `mesh.merge(first, second)` for two bodies. `value` [m] is
-    a clearance kept between the surfaces. `reach` is twice the mean size of the facets when
+    Two sets belong to one mesh, `mesh.merge(a=..., b=...)` for two bodies. `value` [m] is a
+    clearance kept between the surfaces. `reach` is twice the mean size of the facets when
     omitted; `stiffness`, `smoothing` and `offset` are those of `Contact`.
     """
 

@@ -246,7 +246,7 @@ def _corrected(
 class GeneralisedAlpha(AbstractStepper):
     """Generalised-alpha with approximate Newton passes: implicit, second order.
 
-    Its cost is known beforehand. `math.alpha.GeneralisedAlpha`, for any y' = f(t, y), solves
+    Its cost is known beforehand. `math.ode.generalised_alpha`, for any y' = f(t, y), solves
     every step to a tolerance, with line search, and cuts steps that do not converge.
 
     Attributes:
