@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from sorojax import _check
 from sorojax._types import real
 from sorojax.math.ode.explicit import AbstractMethod, MethodStep
-from sorojax.math.ode.step_control import cut, filled
+from sorojax.math.ode.step_control import SearchedAttempt, cut, filled
 
 _SHORTENINGS = 10
 _ROUNDING = 1e-9  # share of a rate, below which a residual need not fall
@@ -85,7 +85,7 @@ class GeneralisedAlpha(AbstractMethod):
 
     def advance(self, field, t, y, h, memory):
         given = (field, self, t)
-        (new, rate), converged = cut(_attempt, self.max_cuts, given, h, (y, memory))
+        (new, rate), converged = cut(_PART, self.max_cuts, given, h, (y, memory))
         return MethodStep(new, None, rate, {}, converged)
 
     def weights(self) -> tuple[Array, Array, Array]:
@@ -95,11 +95,19 @@ class GeneralisedAlpha(AbstractMethod):
         return am, af, 1 / 2 + am - af
 
 
-def _attempt(given, offset, size, state):
+def _part(given, offset, size, state) -> _Part:
     field, method, t = given
-    part = _Part(field, method, t + offset, size, *state)
-    x, converged = _solution(part)
-    return (x, _new_rate(part, x)), converged
+    return _Part(field, method, t + offset, size, *state)
+
+
+def _searched(*at):
+    return _newton(_part(*at))
+
+
+def _taken(given, offset, size, state, found):
+    part = _part(given, offset, size, state)
+    x = _solution(part, found)
+    return x, _new_rate(part, x)
 
 
 def _new_rate(part: _Part, x: PyTree) -> PyTree:
@@ -121,20 +129,19 @@ def _unbalanced(part: _Part, x: PyTree) -> PyTree:
 
 
 @eqx.filter_custom_jvp
-def _solution(part: _Part) -> tuple[PyTree, Bool[Array, ""]]:
-    """The state at the end of a part, with the derivative of its equations."""
-    return _newton(part)
+def _solution(part: _Part, found: PyTree) -> PyTree:
+    """The state found at the end of a part, with the derivative of its equations."""
+    return found
 
 
 @_solution.def_jvp
 def _solution_jvp(primals, tangents):
-    (part,) = primals
-    x, converged = _newton(part)
+    part, x = primals
     flat, unravel = ravel_pytree(x)
-    moved = filled(*eqx.filter_jvp(lambda part: _unbalanced(part, x), (part,), tangents))
+    moved = filled(*eqx.filter_jvp(lambda part: _unbalanced(part, x), (part,), tangents[:1]))
     jacobian = jax.jacfwd(lambda x: ravel_pytree(_unbalanced(part, unravel(x)))[0])(flat)
     dot = -jnp.linalg.solve(jacobian, ravel_pytree(moved)[0])
-    return (x, converged), (unravel(dot), None)
+    return x, unravel(dot)
 
 
 def _newton(part: _Part) -> tuple[PyTree, Bool[Array, ""]]:
@@ -188,3 +195,6 @@ def _newton(part: _Part) -> tuple[PyTree, Bool[Array, ""]]:
     begin = _Search(guess, first, step(guess, first), whole, none, none, false, ~false)
     end = jax.lax.while_loop(lambda now: now.running, one, begin)
     return unravel(end.x), end.converged
+
+
+_PART = SearchedAttempt(_searched, _taken)

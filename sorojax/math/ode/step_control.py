@@ -224,6 +224,7 @@ class SearchedAttempt(NamedTuple):
 
 
 _ROWS = 32  # parts of a step at most
+_BLOCK = 8  # of which as many are replayed together
 
 
 class _Walk(NamedTuple):
@@ -389,8 +390,17 @@ def _replay(attempt, ends, unknowns, given, h, state) -> PyTree:
 
     # only the states between the parts are kept for a derivative in reverse
     part = jax.checkpoint(one, prevent_cse=False)  # pyright: ignore[reportPrivateImportUsage]
+
+    def one_block(now, rows):
+        def replayed():
+            return jax.lax.scan(part, now, rows)[0]
+
+        return jax.lax.cond(rows[2][0], replayed, lambda: now), None
+
+    # in blocks, as few steps have more parts than one block
     rows = starts, ends, any_of_lanes(ends > starts), unknowns
-    return jax.lax.scan(part, state, rows)[0]
+    blocks = jax.tree.map(lambda x: x.reshape(_ROWS // _BLOCK, _BLOCK, *x.shape[1:]), rows)
+    return jax.lax.scan(one_block, state, blocks)[0]
 
 
 # Whether the steps of a run are short enough: a few of them made as two halves too
