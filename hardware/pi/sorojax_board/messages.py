@@ -87,6 +87,7 @@ def floats(payload: bytes, count: int) -> tuple[float, ...]:
 
 
 def pack_floats(values: Sequence[float]) -> bytes:
+    """Numbers one after the other, four bytes each, the lowest first."""
     return struct.pack(f"<{len(values)}f", *values)
 
 
@@ -96,6 +97,7 @@ def pack_set(mask: int, pressures: Sequence[float]) -> bytes:
 
 
 def unpack_set(payload: bytes, ports: int) -> tuple[int, tuple[float, ...]]:
+    """The mask of the ports that are meant, and set-points [Pa] of all `ports`."""
     if len(payload) < 4:
         raise Malformed(f"{len(payload)} bytes, need {4 + 4 * ports}")
     return struct.unpack_from("<I", payload)[0], floats(payload[4:], ports)
@@ -108,16 +110,19 @@ def pack_arm(ranges: Sequence[tuple[float, float]]) -> bytes:
 
 
 def unpack_arm(payload: bytes, ports: int) -> list[tuple[float, float]]:
+    """Lowest and highest pressure of every port [Pa]."""
     values = floats(payload, 2 * ports)
     return list(zip(values[::2], values[1::2], strict=True))
 
 
 def pack_welcome(welcome: Welcome) -> bytes:
+    """What the board answers to the first frame: its times and the limits of its ports."""
     flat = [number for limits in welcome.limits for number in limits]
     return pack_floats([welcome.watchdog, welcome.ramp, *flat])
 
 
 def unpack_welcome(payload: bytes) -> Welcome:
+    """The times and limits of a board; their number is that of its ports."""
     ports, rest = divmod(len(payload) - 8, 12)
     if rest or not 0 < ports <= MAX_PORTS:
         raise Malformed(f"{len(payload)} bytes, need 8 and 12 for each port")
@@ -130,6 +135,7 @@ _REPORT = struct.Struct("<IQBHI")
 
 
 def pack_report(report: Report) -> bytes:
+    """State, pressures and flags of the board, as it sends them."""
     head = _REPORT.pack(
         report.sequence, report.time, report.state, report.fault, report.refused & 0xFFFFFFFF
     )
@@ -138,6 +144,7 @@ def pack_report(report: Report) -> bytes:
 
 
 def unpack_report(payload: bytes) -> Report:
+    """State, pressures and flags of a board with as many ports as the payload has."""
     ports, rest = divmod(len(payload) - _REPORT.size, 9)
     if rest or not 0 < ports <= MAX_PORTS:
         raise Malformed(f"{len(payload)} bytes, need {_REPORT.size} and 9 for each port")
@@ -160,10 +167,12 @@ def unpack_report(payload: bytes) -> Report:
 
 
 def pack_refused(sequence: int, why: Refusal) -> bytes:
+    """Which frame the board did not follow, and why."""
     return struct.pack("<IB", sequence, why)
 
 
 def unpack_refused(payload: bytes) -> tuple[int, Refusal]:
+    """Which frame the board did not follow, and why."""
     try:
         sequence, why = struct.unpack("<IB", payload)
         return sequence, Refusal(why)
