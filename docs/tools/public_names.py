@@ -3,6 +3,7 @@
 import importlib
 import inspect
 import pkgutil
+import re
 import types
 import typing
 from collections.abc import Iterator
@@ -130,30 +131,32 @@ def signature_of(name: Public) -> inspect.Signature | None:
 
 
 def undescribed(name: Public) -> list[str]:
-    """What the docstring of a public name lacks: all of it, arguments, or what comes back."""
+    """What a docstring lacks: all of it, or of a verb arguments by name, or what comes back."""
     if name.kind == "data":
         return []
     if not name.text:
         return ["docstring"]
     if name.kind == "class":
         return []
-    signature, lacks = inspect.signature(name.plain), []
-    if signature.parameters and "\nArgs:" not in name.text:
-        lacks.append("Args")
-    if signature.return_annotation is not None and "\nReturns:" not in name.text:
-        lacks.append("Returns")
-    return lacks
+    signature, told = inspect.signature(name.plain), described(name.text)
+    lacks = [parameter for parameter in signature.parameters if parameter not in told]
+    gives = signature.return_annotation is not None
+    return [*lacks, *["Returns"] * (gives and "\nReturns:" not in name.text)]
+
+
+def described(text: str) -> set[str]:
+    """Arguments that a docstring describes; "lower, upper: ..." are two."""
+    part = re.search(r"^Args:\n((?:    .*\n?|\n)+)", text, re.M)
+    heads = re.findall(r"^    ([*\w]+(?:, [*\w]+)*):", part[1] if part else "", re.M)
+    return {name.strip(" *") for head in heads for name in head.split(",")}
 
 
 def main() -> None:
-    """Say how many public names have a docstring, and which verbs lack a section of it."""
+    """Say how many public names have a docstring, and what those of verbs lack."""
     names = everything()
     missing = {name.path: lacks for name in names if (lacks := undescribed(name))}
-    verbs = [name for name in names if name.kind == "function"]
-    bare = [path for path, lacks in missing.items() if "docstring" in lacks]
-    print(f"{len(names)} public names, {len(bare)} without docstring")
-    partly = [path for path in missing if path not in bare]
-    print(f"{len(verbs)} verbs, {len(partly)} without a section Args or Returns")
+    verbs = sum(name.kind == "function" for name in names)
+    print(f"{len(names)} public names, {verbs} of them verbs; {len(missing)} lack something")
     for path, lacks in missing.items():
         print(f"  {path}: {', '.join(lacks)}")
 
