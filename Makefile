@@ -17,7 +17,7 @@ define install
 	  $(PIP) -e '.$(if $(1),[$(1)])'; }
 endef
 
-.PHONY: demo test test-versions fuzz stress lint bench bench-device peers clean help
+.PHONY: demo test test-versions fuzz stress lint bench bench-device peers docs clean help
 
 help:
 	@echo "make demo   set up .venv, run the main job, write out/"
@@ -30,7 +30,8 @@ help:
 	@echo "make bench  all benchmarks, page in benchmarks/results/; QUICK=1 for the main ones"
 	@echo "make bench-device  kernels on an accelerator and on the CPU (jax[cuda13] in .venv)"
 	@echo "make peers  the codes that the benchmarks compare with, one .peers/<name> each"
-	@echo "make clean  remove .venv, .venvs, .peers, out and benchmarks/results"
+	@echo "make docs   the documentation, offline, in docs/_build/html"
+	@echo "make clean  remove .venv, .venvs, .peers, out, benchmarks/results and built docs"
 
 demo: $(VENV)/.run
 	@$(PY) -m sorojax demo
@@ -59,6 +60,10 @@ bench: $(VENV)/.run
 bench-device: $(VENV)/.run
 	JAX_PLATFORMS=cuda,cpu $(PY) -m benchmarks device.sdf device.rods device.fem
 
+docs: $(VENV)/.docs
+	$(PY) -m sphinx -b html -q -W --keep-going docs docs/_build/html
+	@echo "wrote docs/_build/html/index.html"
+
 peers: $(VENV)/.run
 	$(PY) -m benchmarks.peers install $(PEERS)
 
@@ -85,5 +90,9 @@ $(VENV)/.dev: pyproject.toml $(VENV)/.made
 	$(call install,test$(comma)dev)
 	@touch $(VENV)/.run $(VENV)/.test $@
 
+$(VENV)/.docs: pyproject.toml $(VENV)/.made
+	$(call install,docs)
+	@touch $(VENV)/.run $@
+
 clean:
-	rm -rf $(VENV) .venvs .peers out benchmarks/results
+	rm -rf $(VENV) .venvs .peers out benchmarks/results docs/_build docs/_generated docs/reference

@@ -109,15 +109,15 @@ def _section(name: str, lines: list[Line], took: float | None) -> str:
     references = {str(x["reference"]) for x in lines if x["reference"]}
     against = f"Error against: {'; '.join(sorted(references))}." if references else ""
     special = tables.features(lines, seconds) or tables.scaling(lines, seconds)
-    body = _plots(lines) + (special or f'<div class="wide">{_table(lines)}</div>')
+    body = plots(lines) + (special or f'<div class="wide">{_table(lines)}</div>')
     head = name if took is None else f"{name} ({took:.0f} s)"
     left = f"<p class=small>Left out of a quick run: {escape('; '.join(notes))}.</p>"
     return f"<h3>{escape(head)}</h3><p>{escape(against)}</p>{body}{left if notes else ''}"
 
 
-def _plots(lines: list[Line]) -> str:
+def plots(lines: list[Line]) -> str:
     """Error over run time, or run time over each size that was varied."""
-    plots: dict[tuple[str, str], svg.Points] = {}
+    found: dict[tuple[str, str], svg.Points] = {}
     for line in lines:
         size = line["settings"].get("against")
         x, y = (
@@ -127,8 +127,8 @@ def _plots(lines: list[Line]) -> str:
             labels = (size, "run time [s]") if size else ("run time [s]", "error")
             told = line["settings"]
             label = f"{line['code']} {told.get('method', told.get('case', ''))}".strip()
-            plots.setdefault(labels, {}).setdefault(label, []).append((x, y))
-    return "".join(svg.loglog(series, *labels) for labels, series in plots.items())
+            found.setdefault(labels, {}).setdefault(label, []).append((x, y))
+    return "".join(svg.loglog(series, *labels) for labels, series in found.items())
 
 
 def _table(lines: list[Line]) -> str:

@@ -167,7 +167,14 @@ def reported_if_long(label: str, total: float) -> Iterator[Callable[..., None]]:
 
 @contextlib.contextmanager
 def listen(listener: Listener | None) -> Iterator[None]:
-    """Send progress to `listener` inside the block."""
+    """Send progress to `listener` inside the block.
+
+    Args:
+        listener: Called with every report; None for none at all.
+
+    Returns:
+        A context manager.
+    """
     global _listener
     before, _listener = _listener, listener
     try:
@@ -177,5 +184,9 @@ def listen(listener: Listener | None) -> Iterator[None]:
 
 
 def silent() -> contextlib.AbstractContextManager[None]:
-    """No progress inside the block."""
+    """No progress inside the block.
+
+    Returns:
+        A context manager.
+    """
     return listen(None)

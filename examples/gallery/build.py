@@ -34,8 +34,10 @@ def scripts(folder: Path) -> list[Path]:
     return sorted(folder.glob("[0-9][0-9]_*.py"))
 
 
-def picture_of(script: Path) -> Path | None:
-    """The picture of an example, named like it with or without its number."""
+def picture_of(script: Path, paper: dict[str, Any]) -> Path | None:
+    """The picture of an example, named like it with or without its number, or in `paper`."""
+    if "picture" in paper:
+        return script.with_name(paper["picture"])
     names = (f"{script.stem}.png", f"{script.stem[3:]}.png")
     return next((p for p in map(script.with_name, names) if p.exists()), None)
 
@@ -105,16 +107,17 @@ def page(folder: Path, store: Path, paper: dict[str, Any]) -> str:
     return _PAGE.format(links=links, cards=cards, notebooks=_notebooks(folder / "notebooks"))
 
 
+def words_of(script: Path) -> tuple[str, list[str]]:
+    """The first sentence of the docstring of an example, and its other paragraphs."""
+    text = ast.get_docstring(ast.parse(script.read_text())) or script.stem
+    first, *rest = text.split("\n\n")
+    return first.replace("\n", " "), [paragraph for paragraph in rest if paragraph.strip()]
+
+
 def _card(script: Path, store: Path, paper: dict[str, Any]) -> str:
-    source = script.read_text()
-    title, _, rest = (ast.get_docstring(ast.parse(source)) or script.stem).partition("\n")
-    if rest and not rest.startswith("\n"):  # a first sentence of two lines
-        more, _, rest = rest.partition("\n\n")
-        title = f"{title} {more}"
-    words = "".join(f"<p>{html.escape(x)}</p>" for x in rest.split("\n\n") if x.strip())
-    image = picture_of(script)
-    if "picture" in paper:
-        image = script.with_name(paper["picture"])
+    source, (title, rest) = script.read_text(), words_of(script)
+    words = "".join(f"<p>{html.escape(x)}</p>" for x in rest)
+    image = picture_of(script, paper)
     drawn = (
         f'<a href="../{image.name}"><img src="../{image.name}" alt="{html.escape(title)}" '
         'loading="lazy"></a>'
@@ -139,7 +142,7 @@ def _table(script: Path, store: Path, paper: dict[str, Any]) -> str:
     numbers = found["numbers"] if found else {}
     body = ""
     for name in [*numbers, *(name for name in wanted if name not in numbers)]:
-        here = _text(numbers[name]) if name in numbers else "-"
+        here = html.escape(text(numbers[name])) if name in numbers else "-"
         told = html.escape(wanted.get(name, ""))
         body += f"<tr><td>{html.escape(name)}</td><td>{here}</td><td>{told}</td></tr>"
     note = "not measured yet: run build.py --run"
@@ -151,9 +154,10 @@ def _table(script: Path, store: Path, paper: dict[str, Any]) -> str:
     return f"<table>{head}{body}</table><p class=note>{html.escape(note)}</p>"
 
 
-def _text(value: float | int | str) -> str:
+def text(value: float | int | str) -> str:
+    """A number in four digits, whole ones as they are."""
     if isinstance(value, str):
-        return html.escape(value)
+        return value
     whole = isinstance(value, int) or (math.isfinite(value) and value == int(value))
     return f"{int(value)}" if whole and abs(value) < 1e9 else f"{value:.4g}"
 

@@ -72,6 +72,9 @@ def simulated(
         period: Step of the model [s].
         **options: Of `ModelValves`; 4 ms of dead time unless given.
 
+    Returns:
+        The valves, and the limits of a board for them.
+
     Raises:
         ImportError: If the module is not installed.
         ValueError: If it has no such function.

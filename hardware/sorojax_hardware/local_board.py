@@ -90,6 +90,9 @@ def simulated_board(
         slew: Fastest change of a set-point [Pa/s].
         clock: `board.clock`; a `SimulatedClock` if omitted.
         **options: Of `ModelValves`.
+
+    Returns:
+        The board, armed, and its valves.
     """
     low, high = np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, float)) for x in limits))
     each = tuple(Limits(float(a), float(b), slew) for a, b in zip(low, high, strict=True))

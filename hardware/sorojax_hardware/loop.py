@@ -75,6 +75,9 @@ def run_loop(
         max_skipped: Ticks that the loop may be behind before it gives up.
         record: Takes every tick; make it with `tick_recorder`.
 
+    Returns:
+        The ticks, one after the other, as they happen.
+
     Raises:
         ValueError: If a time or a limit makes no sense, or a command is not finite.
         Overrun: If a tick overran more than `max_skipped` others.
@@ -156,7 +159,16 @@ def _ticks(board, clock, see, controller, state, pace: _Pace, bounds, record):
 
 
 def tick_recorder(path: str | Path, num_ports: int, **about) -> Recorder:
-    """A file for the ticks of one run; `load_record` gives time, late, pressure, setpoint."""
+    """A file for the ticks of one run; `load_record` gives time, late, pressure, setpoint.
+
+    Args:
+        path: File name.
+        num_ports: Ports of the board.
+        **about: What is told about the run.
+
+    Returns:
+        The recorder, for `run_loop`.
+    """
     columns = ["time", "late"]
     for name in ("pressure", "setpoint"):
         columns += [f"{name}[{port}]" for port in range(num_ports)]
@@ -176,7 +188,15 @@ def _checked(command: Any, num_ports: int, t: float) -> np.ndarray:
 
 
 def deadlines(ticks: Iterable[Tick], period: float) -> Deadlines:
-    """Statistics of the ticks of one run at `period` [s]."""
+    """Statistics of the ticks of one run at `period` [s].
+
+    Args:
+        ticks: Of the run.
+        period: Between them [s].
+
+    Returns:
+        How late ticks were, and how many were missed.
+    """
     seen = list(ticks)
     late = np.array([tick.late for tick in seen] or [0.0])
     planned = round((seen[-1].time - seen[-1].late) / period) + 1 if seen else 0

@@ -80,6 +80,12 @@ def load_record(path: str | Path) -> tuple[dict[str, np.ndarray], dict]:
     """Columns by name, and what was told about the run. "pressure[0]", "pressure[1]" ... come
     back as one array "pressure", a row per sample.
 
+    Args:
+        path: File name.
+
+    Returns:
+        Columns by name, and what was told about the run.
+
     Raises:
         ValueError: If the file is no record.
     """

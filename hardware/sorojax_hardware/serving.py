@@ -89,6 +89,14 @@ def serve(settings: Settings, backend: Backend, **options) -> Iterator[Server]:
 
     Connect with `TcpBoard(port=s.port)`. `options` are those of `sorojax_board.server.Server`;
     the port is a free one unless given.
+
+    Args:
+        settings: Limits of the board.
+        backend: The valves.
+        **options: Of `sorojax_board.server.Server`.
+
+    Returns:
+        A context manager of the server.
     """
     from time import monotonic
 

@@ -139,6 +139,15 @@ class TcpBoard:
 def connect(host: str = "127.0.0.1", port: int = 5053, *, attempts: int = 6, **options):
     """A `TcpBoard`, tried again with growing pauses (0.1 s, 0.2 s, ...) while there is none.
 
+    Args:
+        host: Name or address of the board.
+        port: Where it listens.
+        attempts: Number of tries.
+        **options: Of `TcpBoard`.
+
+    Returns:
+        The board, connected.
+
     Raises:
         ConnectionError: If the last attempt fails too.
     """

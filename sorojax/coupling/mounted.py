@@ -299,6 +299,14 @@ def mount_wrench(
     """Force and moment of the mounted rod called `name` on the solid at displacement `u` [m],
     and how the rod stands. Differentiable.
 
+    Args:
+        problem: With the mounted rod.
+        u: Displacement [m].
+        name: Of the rod.
+
+    Returns:
+        Force [N], moment [N m], and how the rod stands.
+
     Raises:
         ValueError: If there is no such rod.
     """

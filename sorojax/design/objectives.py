@@ -49,6 +49,9 @@ def relax_to_minimum(
         u: Where to begin.
         steps: Most factorisations.
         tolerance: Largest unbalanced force over the largest load or reaction.
+
+    Returns:
+        The displacement [m], and whether it is a stable equilibrium.
     """
     prepared, u = prepare(problem), np.asarray(u)
     size = _diagonal(problem.space.system, _linearised(problem, prepared, 0 * u).values)
@@ -103,6 +106,14 @@ def graded(problem: Problem, factor: Float[Array, " cells"], **settings: float) 
     Every compiled function between a design and its equilibrium adds to the gradient: for a
     small body compile all from the variables to `interpolated_energy` in one by `jax.jit`,
     and put that in its place.
+
+    Args:
+        problem: The problem.
+        factor: Of the stiffness of each cell [-].
+        **settings: `threshold` and `sharpness` of `interpolated_energy`.
+
+    Returns:
+        The problem of the design.
     """
     material = interpolated_energy(solid_of(problem), factor, **settings)
     return exchanged(problem, material=material)
@@ -114,7 +125,15 @@ def solid_of(problem: Problem) -> AbstractHyperelastic:
 
 
 def replaced_load(problem: Problem, load: AbstractLoad) -> Problem:
-    """`problem` with the load of the same name exchanged for `load`."""
+    """`problem` with the load of the same name exchanged for `load`.
+
+    Args:
+        problem: The problem.
+        load: Of the name of the one that it replaces.
+
+    Returns:
+        The problem with it.
+    """
     names = [old.name for old in problem.loads]
     if load.name not in names:
         raise ValueError(
@@ -129,7 +148,16 @@ def work_of_loads(
     problem: Problem, u: Float[Array, "nodes dim"], names: tuple[str, ...] | None = None
 ) -> Float[Array, ""]:
     """f'u of dead loads and p dV of pressures at the displacement `u` [J], of the loads in
-    `names` or of all that hold nothing: the compliance of a body at full load."""
+    `names` or of all that hold nothing: the compliance of a body at full load.
+
+    Args:
+        problem: The problem.
+        u: Displacement of the nodes [m].
+        names: Of the loads that count.
+
+    Returns:
+        Work [J].
+    """
     return _work(_loaded(problem, names), u)
 
 
@@ -152,7 +180,16 @@ def _work(problem: Problem, u):
 def displacement_along(
     u: Float[Array, "nodes dim"], nodes: Int[Any, " n"], direction: Float[Any, " dim"]
 ) -> Float[Array, ""]:
-    """L'x: mean displacement of `nodes` along `direction` [m]."""
+    """L'x: mean displacement of `nodes` along `direction` [m].
+
+    Args:
+        u: Displacement of the nodes [m].
+        nodes: Node numbers.
+        direction: Unit vector, or any weights.
+
+    Returns:
+        The mean [m].
+    """
     return _mean_along(u, jnp.asarray(nodes), jnp.asarray(direction, u.dtype))
 
 
@@ -174,6 +211,16 @@ def mechanism(
     `output` is L'x, of `displacement_along` or `rotation`. With b1 = 0 it is the compliance;
     f_u of the reference is read as the displacement where the loads f_e act.
 
+    Args:
+        problem: The problem.
+        u: Displacement of the nodes [m].
+        output: Displacement [m] or rotation [rad] that is wanted.
+        output_weight: b1.
+        work_weight: b2.
+
+    Returns:
+        The number to be minimised.
+
     Reference: Caasenbrood, Pogromsky, Nijmeijer, "Sorotoki: a Matlab toolkit for design,
     modeling, and control of soft robots", IEEE Access 12, 2024, equation 11.
     """
@@ -188,7 +235,16 @@ def _weighed(problem: Problem, u, output, output_weight, work_weight):
 def rotation(
     problem: Problem, u: Float[Array, "nodes dim"], nodes: Int[Any, " n"]
 ) -> Float[Array, ""]:
-    """Mean angle by which `nodes` of a plane body turn, counter-clockwise [rad]."""
+    """Mean angle by which `nodes` of a plane body turn, counter-clockwise [rad].
+
+    Args:
+        problem: The problem.
+        u: Displacement of the nodes [m].
+        nodes: Node numbers.
+
+    Returns:
+        The angle [rad].
+    """
     return _turn(problem.mesh.points, u, jnp.asarray(nodes))
 
 
@@ -203,6 +259,14 @@ def path_error(
     """Mean square distance of the middle of `nodes` from `targets` over a load path [m^2].
 
     `path` is that of `fem.solve_path`; `targets` are positions, one for each of its values.
+
+    Args:
+        path: From `fem.solve_path`.
+        nodes: Node numbers.
+        targets: Positions [m], one for each value of the path.
+
+    Returns:
+        The mean square [m^2].
     """
     points = path.problem.mesh.points
     return _miss(points, path.displacements, jnp.asarray(nodes), jnp.asarray(targets))

@@ -122,6 +122,9 @@ def part(
         keep: Number of pieces to keep, the largest ones; None for all.
         detail: Islands and holes smaller than that [m] are dropped; a cell if omitted.
 
+    Returns:
+        The shape and what it is worth as a piece.
+
     Raises:
         ValueError: If the mesh does not fill its box and no domain is given, or the volume
             does not fit into it.
@@ -278,6 +281,9 @@ def reanalyse(
         size: Wanted length of the sides [m].
         order: Degree of the cells.
         surface: Triangles of the exported part, to be checked as well.
+
+    Returns:
+        The performance of the piece beside the one promised.
     """
     fill = triangulate if made.cell.dim == 2 else tetrahedralise
     mesh = fill(made.cell, size=size, order=order)
@@ -294,7 +300,15 @@ def reanalyse(
 
 
 def solid(made: Part, thickness: float | None = None) -> AbstractSdf:
-    """The whole part in space: a plane one drawn out by `thickness` [m]."""
+    """The whole part in space: a plane one drawn out by `thickness` [m].
+
+    Args:
+        made: The part, from `part`.
+        thickness: Of a plane part [m].
+
+    Returns:
+        The shape in space.
+    """
     if made.shape.dim == 3:
         return made.shape
     if thickness is None:

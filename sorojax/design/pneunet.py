@@ -150,6 +150,9 @@ def pneunet_cell(
         output_stiffness: Of the springs on the right side, in all [N/m].
         chamber: How the pressure finds the void, "darcy" or "flood".
 
+    Returns:
+        Mesh, problem and filters of the cell.
+
     Raises:
         ValueError: If a size is not positive or `chamber` is neither.
     """
@@ -237,6 +240,9 @@ def optimise_pneunet(
         move: Largest change of a variable in a step.
         on_step: As in `minimise`.
         resume: As in `minimise`.
+
+    Returns:
+        The design, and how the loop went.
     """
     solved = Follower()
     plan = cell.plan

@@ -209,7 +209,15 @@ def body_at(problem: Problem, points: Points) -> Body:
 
 
 def potential_energy(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
-    """Stored energy plus the potential of all loads [J]."""
+    """Stored energy plus the potential of all loads [J].
+
+    Args:
+        problem: The boundary value problem.
+        u: Displacement of the nodes [m].
+
+    Returns:
+        Energy [J].
+    """
     return _potential_energy(unsupported(problem), u)
 
 
@@ -222,7 +230,15 @@ def _potential_energy(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[A
 
 
 def residual(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, "nodes dim"]:
-    """Unbalanced force at every node [N]: zero at equilibrium, reactions at supports."""
+    """Unbalanced force at every node [N]: zero at equilibrium, reactions at supports.
+
+    Args:
+        problem: The boundary value problem.
+        u: Displacement of the nodes [m].
+
+    Returns:
+        Force [N].
+    """
     return _residual(unsupported(problem), u)
 
 

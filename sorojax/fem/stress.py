@@ -43,7 +43,15 @@ from sorojax.mesh.mesh import Mesh, boundary_facets
 def deformation_gradient(
     problem: Problem, u: Float[Array, "nodes dim"]
 ) -> Float[Array, "cells cell_nodes 3 3"]:
-    """F in three dimensions at the nodes of every cell."""
+    """F in three dimensions at the nodes of every cell.
+
+    Args:
+        problem: The boundary value problem.
+        u: Displacement of the nodes [m].
+
+    Returns:
+        The gradient F [-].
+    """
     return _deformation_gradient(body(problem), u)
 
 
@@ -202,7 +210,15 @@ def _von_mises(sigma: Float[Array, "cells cell_nodes 3 3"]):
 def principal_stresses(
     problem: Problem, u: Float[Array, "nodes dim"]
 ) -> Float[Array, "cells cell_nodes 3"]:
-    """Principal Cauchy stresses at the nodes of every cell, rising [Pa]."""
+    """Principal Cauchy stresses at the nodes of every cell, rising [Pa].
+
+    Args:
+        problem: The boundary value problem.
+        u: Displacement of the nodes [m].
+
+    Returns:
+        Three stresses [Pa].
+    """
     return jnp.linalg.eigvalsh(cauchy_stress(problem, u))
 
 
@@ -210,7 +226,15 @@ def nodal_average(
     problem: Problem, field: Float[Array, "cells cell_nodes *value"]
 ) -> Float[Array, "nodes *value"]:
     """Mean over the cells that share a node, of numbers, vectors or tensors at the nodes of
-    every cell."""
+    every cell.
+
+    Args:
+        problem: The boundary value problem.
+        field: Values at the nodes of every cell.
+
+    Returns:
+        One value per node.
+    """
     return _nodal_average(problem.mesh, field)
 
 
@@ -224,7 +248,16 @@ def _nodal_average(mesh: Mesh, field: Float[Array, "cells cell_nodes *value"]):
 def reaction_force(
     problem: Problem, u: Float[Array, "nodes dim"], nodes: Int[Array, " nodes"]
 ) -> Float[Array, " dim"]:
-    """Force that the supports of `nodes` exert on the body [N]."""
+    """Force that the supports of `nodes` exert on the body [N].
+
+    Args:
+        problem: The boundary value problem.
+        u: Displacement of the nodes [m].
+        nodes: Numbers of supported nodes.
+
+    Returns:
+        Force [N].
+    """
     return jnp.sum(residual(problem, u)[nodes], axis=0)
 
 
@@ -234,6 +267,14 @@ def enclosed_volume(
     facets: Int[Array, "facets facet_nodes"],
 ) -> Float[Array, ""]:
     """Volume of the cavities that closed sets of `facets` enclose [m^3].
+
+    Args:
+        problem: The boundary value problem.
+        u: Displacement of the nodes [m].
+        facets: Nodes of the facets, one row per facet.
+
+    Returns:
+        Volume [m^3].
 
     Raises:
         ValueError: If there is no facet.
@@ -276,6 +317,12 @@ def patches(mesh: Mesh) -> Patches:
     that mean, triangles and tetrahedra the fit, in which near samples count more: each is the
     better one at the root of an ellipse (NAFEMS LE1) and at the rim of a hole.
 
+    Args:
+        mesh: Cells that are not polygons.
+
+    Returns:
+        What `nodal_stress` needs of the mesh.
+
     Raises:
         ValueError: If the mesh is traced, has polygons, or too few cells for a fit.
     """
@@ -317,6 +364,14 @@ def nodal_stress(
     costs nothing once and is enough for pictures. At an interface of two materials, where
     stress jumps, it is smoothed. Pass `patches(problem.mesh)` to compute them once for many
     states.
+
+    Args:
+        problem: The boundary value problem.
+        u: Displacement of the nodes [m].
+        fit: `patches(problem.mesh)`; computed here if omitted.
+
+    Returns:
+        Stress [Pa].
     """
     fit = patches(problem.mesh) if fit is None else fit
     return _fitted(body(problem), u, fit)
@@ -329,7 +384,15 @@ def _fitted(problem: Problem, u, fit: Patches) -> Float[Array, "nodes 3 3"]:
 
 
 def strain_energy(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, " cells"]:
-    """Stored energy of every cell [J]."""
+    """Stored energy of every cell [J].
+
+    Args:
+        problem: The boundary value problem.
+        u: Displacement of the nodes [m].
+
+    Returns:
+        Energy [J].
+    """
     return _strain_energy(body(problem), u)
 
 
@@ -342,7 +405,14 @@ def _strain_energy(problem: Problem, u) -> Float[Array, " cells"]:
 
 def sample_points(mesh: Mesh) -> Float[Array, "cells samples dim"]:
     """Where the stresses of a cell are taken [m]: its points of reduced integration, in
-    quadrilaterals and Hex8 its nodes as well."""
+    quadrilaterals and Hex8 its nodes as well.
+
+    Args:
+        mesh: The mesh.
+
+    Returns:
+        Points [m] of every cell.
+    """
     values = jnp.asarray(_sample_table(mesh.element).values[0])
     return jnp.einsum("qa,cai->cqi", values, mesh.points[mesh.cells])
 

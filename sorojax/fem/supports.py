@@ -124,6 +124,15 @@ def rotated(
     Differentiable; `Prescribed(nodes, rotated(mesh.points[nodes], angle, about))` holds nodes
     there, `Rotated` also takes them along the arc while the load is stepped up.
 
+    Args:
+        points: In the reference configuration [m].
+        angle: Angle [rad].
+        about: A point that stays [m].
+        axis: Direction of the rotation, in space.
+
+    Returns:
+        Displacement of each point [m].
+
     Raises:
         ValueError: If a point in space has no axis, or one in the plane has one.
     """

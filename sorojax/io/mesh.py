@@ -264,6 +264,9 @@ def import_mesh(
         root: Folder that the file must lie in, links followed.
         max_bytes: Larger files are refused unread.
 
+    Returns:
+        The mesh, points [m].
+
     Raises:
         ValueError: If the file is damaged or too large, holds mixed or unknown cells, or
             the path leaves `root`.
@@ -411,6 +414,9 @@ def mesh_surface(
         mesher: "pytetwild" (Python package, with its extra "all") or "gmsh" (program on the
             PATH, run as a process of its own).
         timeout: Time after which gmsh is stopped [s].
+
+    Returns:
+        The mesh, points [m].
 
     Raises:
         ModuleNotFoundError: If pytetwild is missing.

@@ -440,6 +440,9 @@ def leaves(
         root: Folder that the file must lie in.
         max_bytes: Larger files, and files that unpack to more, are refused.
 
+    Returns:
+        Arrays by name.
+
     Raises:
         ValueError: If the file is damaged or newer than this version.
     """

@@ -474,7 +474,13 @@ def export_contour(
     *,
     root: str | os.PathLike | None = None,
 ) -> None:
-    """Write the curves of `sdf.contour` as SVG in millimetres, whole or not at all."""
+    """Write the curves of `sdf.contour` as SVG in millimetres, whole or not at all.
+
+    Args:
+        path: File name.
+        curves: From `sdf.contour` [m].
+        root: Folder that the file must lie in.
+    """
     where = "export_contour"
     file = _files.inside(where, path, root)
     _ending(where, file.suffix, (".svg",))

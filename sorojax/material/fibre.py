@@ -106,6 +106,13 @@ def _spring(strain: Entry, slack: Entry | None) -> Entry:
 
 
 def fibre_direction(angle: Float[Any, "..."]) -> Direction:
-    """Direction in the plane at `angle` [rad] from the first axis, a number or per cell."""
+    """Direction in the plane at `angle` [rad] from the first axis, a number or per cell.
+
+    Args:
+        angle: Angle [rad].
+
+    Returns:
+        The components of a unit vector.
+    """
     angle = real(angle)
     return jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)

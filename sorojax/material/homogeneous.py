@@ -27,21 +27,45 @@ LONGEST_STEP = 0.3  # of the logarithm of the stretch across
 def uniaxial_stress(
     material: AbstractHyperelastic, stretch: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """Engineering stress [Pa] of a bar at `stretch` with free sides."""
+    """Engineering stress [Pa] of a bar at `stretch` with free sides.
+
+    Args:
+        material: The material.
+        stretch: Length over that at rest [-].
+
+    Returns:
+        Stress [Pa].
+    """
     return _stress(material, stretch, stretch**-0.5, lambda l, t: _diagonal(l, t, t))
 
 
 def equibiaxial_stress(
     material: AbstractHyperelastic, stretch: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """Engineering stress [Pa] of a sheet at `stretch` in both directions with free faces."""
+    """Engineering stress [Pa] of a sheet at `stretch` in both directions with free faces.
+
+    Args:
+        material: The material.
+        stretch: Length over that at rest [-].
+
+    Returns:
+        Stress [Pa].
+    """
     return _stress(material, stretch, stretch**-2.0, lambda l, t: _diagonal(l, l, t)) / 2
 
 
 def pure_shear_stress(
     material: AbstractHyperelastic, stretch: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """Engineering stress [Pa] of a wide strip at `stretch`, held in width, with free faces."""
+    """Engineering stress [Pa] of a wide strip at `stretch`, held in width, with free faces.
+
+    Args:
+        material: The material.
+        stretch: Length over that at rest [-].
+
+    Returns:
+        Stress [Pa].
+    """
 
     def state(l, t):
         return _diagonal(l, jnp.ones_like(l), t)
@@ -52,7 +76,15 @@ def pure_shear_stress(
 def simple_shear_stress(
     material: AbstractHyperelastic, shear: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """Shear stress [Pa] of a block sheared by F = I + `shear` e1 e2."""
+    """Shear stress [Pa] of a block sheared by F = I + `shear` e1 e2.
+
+    Args:
+        material: The material.
+        shear: Tangent of the angle of shear [-].
+
+    Returns:
+        Stress [Pa].
+    """
 
     def energy(g):
         one = jnp.ones_like(g)
@@ -65,7 +97,15 @@ def simple_shear_stress(
 def lateral_stretch(
     material: AbstractHyperelastic, stretch: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """Stretch across a bar at `stretch` with free sides [-]."""
+    """Stretch across a bar at `stretch` with free sides [-].
+
+    Args:
+        material: The material.
+        stretch: Length over that at rest [-].
+
+    Returns:
+        The stretch across [-].
+    """
     return _free_stretch(material, stretch, stretch**-0.5, lambda l, t: _diagonal(l, t, t))
 
 
@@ -172,6 +212,9 @@ def drucker_stability(material: AbstractHyperelastic, *, limit: float = 10.0) ->
     Args:
         material: One number per leaf; take a region's own material.
         limit: Largest stretch to look at.
+
+    Returns:
+        Bounds of the stretch in each test.
 
     Raises:
         ValueError: If leaves hold one number per cell, or `limit` is not above 1.

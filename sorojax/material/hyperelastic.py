@@ -39,6 +39,13 @@ class AbstractHyperelastic(eqx.Module):
 def bulk_modulus(shear_modulus: Float[Array, "..."], poisson_ratio: float):
     """K of a solid with small-strain `shear_modulus` [Pa] and `poisson_ratio` [Pa].
 
+    Args:
+        shear_modulus: At small strains [Pa].
+        poisson_ratio: At small strains [-].
+
+    Returns:
+        The modulus [Pa].
+
     Raises:
         ValueError: If `poisson_ratio` is outside (-1, 0.5).
     """
@@ -48,28 +55,60 @@ def bulk_modulus(shear_modulus: Float[Array, "..."], poisson_ratio: float):
 
 
 def strain_energy_density(material: AbstractHyperelastic, F: Tensor) -> Entry:
-    """Psi per reference volume [J/m^3], elementwise on the entries of F."""
+    """Psi per reference volume [J/m^3], elementwise on the entries of F.
+
+    Args:
+        material: The material.
+        F: Rows of the deformation gradient [-], each entry a number or an array.
+
+    Returns:
+        Energy per reference volume [J/m^3].
+    """
     return material.isochoric_energy(F) + material.volumetric_energy(determinant(F))
 
 
 def first_piola_kirchhoff_stress(
     material: AbstractHyperelastic, F: Float[Array, "3 3"]
 ) -> Float[Array, "3 3"]:
-    """P = dPsi/dF [Pa]."""
+    """P = dPsi/dF [Pa].
+
+    Args:
+        material: The material.
+        F: Deformation gradient [-].
+
+    Returns:
+        Stress [Pa].
+    """
     return jax.grad(lambda F: strain_energy_density(material, from_matrix(F)))(F)
 
 
 def cauchy_stress(
     material: AbstractHyperelastic, F: Float[Array, "3 3"]
 ) -> Float[Array, "3 3"]:
-    """sigma = P F' / J [Pa]."""
+    """sigma = P F' / J [Pa].
+
+    Args:
+        material: The material.
+        F: Deformation gradient [-].
+
+    Returns:
+        Stress [Pa].
+    """
     return first_piola_kirchhoff_stress(material, F) @ F.T / determinant(from_matrix(F))
 
 
 def elasticity_tensor(
     material: AbstractHyperelastic, F: Float[Array, "3 3"]
 ) -> Float[Array, "3 3 3 3"]:
-    """A = dP/dF [Pa]."""
+    """A = dP/dF [Pa].
+
+    Args:
+        material: The material.
+        F: Deformation gradient [-].
+
+    Returns:
+        The tensor [Pa].
+    """
     return jax.jacfwd(lambda F: first_piola_kirchhoff_stress(material, F))(F)
 
 
@@ -88,7 +127,14 @@ def finite_share(material: AbstractHyperelastic) -> Float[Array, "..."] | None:
 
 @functools.singledispatch
 def rest_stretches(material: AbstractHyperelastic) -> tuple[Entry, Entry, Entry]:
-    """Stretches along the axes at which `material` is free of stress [-]."""
+    """Stretches along the axes at which `material` is free of stress [-].
+
+    Args:
+        material: The material.
+
+    Returns:
+        Stretch along x, y and z [-].
+    """
     return 1.0, 1.0, 1.0
 
 
@@ -100,6 +146,12 @@ def small_strain_moduli(
     The stiffness is that of Cauchy stress about the stress-free state, so growth changes
     no modulus. Of a material with a stiff direction it is the average over all
     directions; take `elasticity_tensor` to see them.
+
+    Args:
+        material: The material.
+
+    Returns:
+        Shear modulus, bulk modulus [Pa].
     """
     axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, material)
     if all(axis is None for axis in jax.tree.leaves(axes, is_leaf=lambda a: a is None)):

@@ -231,7 +231,11 @@ def _spectrum(preset: Preset) -> Prony:
 def table() -> str:
     """All presets: shear modulus [kPa], fitted strain, error, specimens, spread, density
     [kg/m^3], whether there is a relaxation spectrum, coefficient of friction, source; then the
-    sources of densities and spectra."""
+    sources of densities and spectra.
+
+    Returns:
+        One line for each preset.
+    """
     head = (
         f"{'name':<26s} {'model':<12s} {'mu [kPa]':>8s} {'up to':>7s} {'error':>6s} "
         f"{'tests':>5s} {'spread':>6s} {'density':>7s} {'relax.':>6s} {'friction':>8s}  source"
@@ -257,37 +261,86 @@ def _sources() -> list[str]:
 
 
 def ecoflex_00_10(*, poisson_ratio: float = 0.49) -> Yeoh:
-    """Yeoh fit of Smooth-On Ecoflex 00-10 for strains up to 300 %."""
+    """Yeoh fit of Smooth-On Ecoflex 00-10 for strains up to 300 %.
+
+    Args:
+        poisson_ratio: At small strains [-], below 0.5.
+
+    Returns:
+        The material.
+    """
     return rubber("ecoflex_00_10", poisson_ratio=poisson_ratio)
 
 
 def ecoflex_00_30(*, poisson_ratio: float = 0.49) -> Yeoh:
-    """Yeoh fit of Smooth-On Ecoflex 00-30 for strains up to 300 %."""
+    """Yeoh fit of Smooth-On Ecoflex 00-30 for strains up to 300 %.
+
+    Args:
+        poisson_ratio: At small strains [-], below 0.5.
+
+    Returns:
+        The material.
+    """
     return rubber("ecoflex_00_30", poisson_ratio=poisson_ratio)
 
 
 def ecoflex_00_50(*, poisson_ratio: float = 0.49) -> Yeoh:
-    """Yeoh fit of Smooth-On Ecoflex 00-50 for strains up to 300 %."""
+    """Yeoh fit of Smooth-On Ecoflex 00-50 for strains up to 300 %.
+
+    Args:
+        poisson_ratio: At small strains [-], below 0.5.
+
+    Returns:
+        The material.
+    """
     return rubber("ecoflex_00_50", poisson_ratio=poisson_ratio)
 
 
 def dragon_skin_10(*, poisson_ratio: float = 0.49) -> Yeoh:
-    """Yeoh fit of Smooth-On Dragon Skin 10 Medium for strains up to 300 %."""
+    """Yeoh fit of Smooth-On Dragon Skin 10 Medium for strains up to 300 %.
+
+    Args:
+        poisson_ratio: At small strains [-], below 0.5.
+
+    Returns:
+        The material.
+    """
     return rubber("dragon_skin_10", poisson_ratio=poisson_ratio)
 
 
 def dragon_skin_20(*, poisson_ratio: float = 0.49) -> Yeoh:
-    """Yeoh fit of Smooth-On Dragon Skin 20 for strains up to 300 %."""
+    """Yeoh fit of Smooth-On Dragon Skin 20 for strains up to 300 %.
+
+    Args:
+        poisson_ratio: At small strains [-], below 0.5.
+
+    Returns:
+        The material.
+    """
     return rubber("dragon_skin_20", poisson_ratio=poisson_ratio)
 
 
 def dragon_skin_30(*, poisson_ratio: float = 0.49) -> Yeoh:
-    """Yeoh fit of Smooth-On Dragon Skin 30 for strains up to 300 %."""
+    """Yeoh fit of Smooth-On Dragon Skin 30 for strains up to 300 %.
+
+    Args:
+        poisson_ratio: At small strains [-], below 0.5.
+
+    Returns:
+        The material.
+    """
     return rubber("dragon_skin_30", poisson_ratio=poisson_ratio)
 
 
 def flexible_80a(*, poisson_ratio: float = 0.49) -> Yeoh:
     """Formlabs Flexible 80A: an assumption, not a fit. Two moduli through the two points of
     the maker's data sheet, 6.3 MPa at 100 % and 8.9 MPa at 120 % where it breaks; nothing
-    public says how stiff it is below. Stands for Elastic 80A, of which no data are public."""
+    public says how stiff it is below. Stands for Elastic 80A, of which no data are public.
+
+    Args:
+        poisson_ratio: At small strains [-], below 0.5.
+
+    Returns:
+        The material.
+    """
     return rubber("flexible_80a", poisson_ratio=poisson_ratio)

@@ -148,7 +148,14 @@ class Gent(AbstractRubber):
 
 
 def locking_stretch(gent: Gent) -> Float[Array, "..."]:
-    """Uniaxial stretch at which the incompressible chains of `gent` are straight [-]."""
+    """Uniaxial stretch at which the incompressible chains of `gent` are straight [-].
+
+    Args:
+        gent: The material.
+
+    Returns:
+        The stretch [-].
+    """
     ratio = 3 / (3 + gent.locking)
     return 2 * jnp.sqrt(1 / ratio) * jnp.cos(jnp.arccos(-(ratio**1.5)) / 3)
 
@@ -300,7 +307,14 @@ class Ogden(AbstractRubber):
 
 
 def ogden_shear_modulus(material: Ogden) -> Float[Array, "..."]:
-    """Small-strain shear modulus, half of sum_p mu_p alpha_p [Pa]."""
+    """Small-strain shear modulus, half of sum_p mu_p alpha_p [Pa].
+
+    Args:
+        material: The material.
+
+    Returns:
+        The modulus [Pa].
+    """
     terms = zip(material.moduli, material.exponents, strict=True)
     first, *others = [mu * alpha / 2 for mu, alpha in terms]
     return sum(others, start=first)

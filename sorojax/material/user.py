@@ -188,6 +188,9 @@ def st_venant_kirchhoff(
         poisson_ratio: Small-strain ratio, below 0.5.
         density: Mass per reference volume [kg/m^3].
 
+    Returns:
+        The material.
+
     Raises:
         ValueError: If a number is out of range.
     """

@@ -122,6 +122,9 @@ def prony_of_instantaneous(shares: Numbers, times: Numbers) -> Prony:
         shares: Moduli of the branches over G_0 [-].
         times: Relaxation times [s].
 
+    Returns:
+        The spectrum.
+
     Raises:
         ValueError: If the shares leave no long-time modulus, or `Prony` refuses them.
     """
@@ -138,12 +141,27 @@ def prony_of_instantaneous(shares: Numbers, times: Numbers) -> Prony:
 
 
 def long_time_share(spectrum: Prony) -> Float[Array, "..."]:
-    """Long-time modulus over the instantaneous one [-]."""
+    """Long-time modulus over the instantaneous one [-].
+
+    Args:
+        spectrum: Shares and relaxation times.
+
+    Returns:
+        The share [-].
+    """
     return 1 / relaxation_modulus(spectrum, 0.0)
 
 
 def relaxation_modulus(spectrum: Prony, t: Numbers) -> Float[Array, "..."]:
-    """G(t) / G_inf at the time `t` [s] after a step of strain."""
+    """G(t) / G_inf at the time `t` [s] after a step of strain.
+
+    Args:
+        spectrum: Shares and relaxation times.
+        t: Time [s].
+
+    Returns:
+        Modulus over that of slow loading [-].
+    """
     t = real(t)
     total = jnp.ones_like(t)
     for g, tau in zip(spectrum.shares, spectrum.times, strict=True):
@@ -152,7 +170,15 @@ def relaxation_modulus(spectrum: Prony, t: Numbers) -> Float[Array, "..."]:
 
 
 def storage_modulus(spectrum: Prony, omega: Numbers) -> Float[Array, "..."]:
-    """G'(omega) / G_inf, in phase with a strain of the angular frequency `omega` [rad/s]."""
+    """G'(omega) / G_inf, in phase with a strain of the angular frequency `omega` [rad/s].
+
+    Args:
+        spectrum: Shares and relaxation times.
+        omega: Angular frequency [rad/s].
+
+    Returns:
+        Modulus over that of slow loading [-].
+    """
     omega = real(omega)
     total = jnp.ones_like(omega)
     for g, tau in zip(spectrum.shares, spectrum.times, strict=True):
@@ -162,7 +188,15 @@ def storage_modulus(spectrum: Prony, omega: Numbers) -> Float[Array, "..."]:
 
 
 def loss_modulus(spectrum: Prony, omega: Numbers) -> Float[Array, "..."]:
-    """G''(omega) / G_inf, a quarter of a period ahead of the strain."""
+    """G''(omega) / G_inf, a quarter of a period ahead of the strain.
+
+    Args:
+        spectrum: Shares and relaxation times.
+        omega: Angular frequency [rad/s].
+
+    Returns:
+        Modulus over that of slow loading [-].
+    """
     omega = real(omega)
     total = jnp.zeros_like(omega)
     for g, tau in zip(spectrum.shares, spectrum.times, strict=True):

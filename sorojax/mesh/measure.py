@@ -28,7 +28,14 @@ from sorojax.sdf.surface.marching import cross
 
 
 def cell_areas(mesh: Mesh) -> Float[Array, " cells"]:
-    """Area of each plane cell [m^2], curved sides included; differentiable in the points."""
+    """Area of each plane cell [m^2], curved sides included; differentiable in the points.
+
+    Args:
+        mesh: A plane mesh.
+
+    Returns:
+        Areas [m^2].
+    """
     if mesh.element.dim != 2:
         raise ValueError(
             f"cell_areas: the mesh has {mesh.element.name} cells, need plane ones. Use "
@@ -48,7 +55,14 @@ def _areas(mesh: Mesh) -> Float[Array, " cells"]:
 
 
 def cell_volumes(mesh: Mesh) -> Float[Array, " cells"]:
-    """Volume of each solid cell [m^3], curved faces included; differentiable in the points."""
+    """Volume of each solid cell [m^3], curved faces included; differentiable in the points.
+
+    Args:
+        mesh: A mesh in space.
+
+    Returns:
+        Volumes [m^3].
+    """
     if mesh.element.dim != 3:
         raise ValueError(
             f"cell_volumes: the mesh has {mesh.element.name} cells, need solid ones. Use "
@@ -74,6 +88,13 @@ def enclosed_volume(
 ) -> Float[Array, ""]:
     """Volume [m^3] of the cavity that closed `facets` of a body surround (area [m^2] in
     the plane); negative for an outer surface. Differentiable in the points.
+
+    Args:
+        mesh: The mesh.
+        facets: Nodes of the facets, one row per facet.
+
+    Returns:
+        Volume [m^3]; area [m^2] in the plane.
 
     Raises:
         ValueError: If there is no facet.
@@ -150,6 +171,9 @@ def locate(
         points: Where to look [m].
         cells: Those chosen before, for a mesh with the same cells. Needed under `jit` and
             `vmap`, where nothing can be chosen.
+
+    Returns:
+        Cells and local coordinates of the points.
 
     Raises:
         ValueError: If a point lies outside the mesh, the cells are polygons, or mesh or

@@ -97,7 +97,14 @@ def axis_lengths(mesh: Mesh) -> dict[str, int]:
 
 
 def boundary_facets(mesh: Mesh) -> Int[np.ndarray, "facets facet_nodes"]:
-    """Facets that belong to one cell only, outward as in `facet_sets` (host array)."""
+    """Facets that belong to one cell only, outward as in `facet_sets` (host array).
+
+    Args:
+        mesh: The mesh.
+
+    Returns:
+        Nodes of the facets, one row per facet.
+    """
     facets, first, count, _ = facet_table(mesh)
     return facets[np.sort(first[count == 1])]
 
@@ -163,6 +170,12 @@ def merge(**bodies: Mesh) -> Mesh:
     `merge(finger=a, ball=b)` names the cells of each body in `regions`, its nodes in
     `node_sets`, and its sets "finger.top"; nodes keep their order, body after body.
     Differentiable in the points.
+
+    Args:
+        **bodies: Meshes by name.
+
+    Returns:
+        The mesh of all.
 
     Raises:
         ValueError: If there is no body, or the elements differ.

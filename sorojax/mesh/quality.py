@@ -65,7 +65,15 @@ class Quality(NamedTuple):
 
 
 def quality(mesh: Mesh, shape: AbstractSdf | None = None) -> Quality:
-    """Shape numbers of a mesh, and its size against `shape` if given."""
+    """Shape numbers of a mesh, and its size against `shape` if given.
+
+    Args:
+        mesh: The mesh.
+        shape: The shape.
+
+    Returns:
+        Angles and radius ratios of the cells, and what is wrong with any.
+    """
     low, high, ratio = _angles_and_ratios(mesh)
     plane = mesh.element.dim == 2
     parts = np.asarray(cell_areas(mesh) if plane else cell_volumes(mesh))
@@ -188,6 +196,13 @@ def distortion(mesh: Mesh, moved: Mesh) -> Distortion:
 
     The shape number of a simplex is its size over that of an equilateral one with the
     same mean square edge.
+
+    Args:
+        mesh: The mesh.
+        moved: Its cells with other points.
+
+    Returns:
+        Its worst cell, compared with the same cell of `mesh`.
     """
     if isinstance(mesh.element, PolyN):
         raise ValueError(

@@ -48,6 +48,9 @@ def repair(
         element: The element of the cells.
         tol: Nodes nearer than that are one [m]; 1e-9 of the extent when omitted.
 
+    Returns:
+        The mesh, and what was changed.
+
     Raises:
         ValueError: With the ids, if cells name missing nodes, points are not finite, or
             cells have no area.

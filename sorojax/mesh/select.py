@@ -44,13 +44,29 @@ def nodes_where(mesh: Mesh, predicate: Predicate) -> Nodes:
 
 
 def cells_where(mesh: Mesh, predicate: Predicate) -> Cells:
-    """Cells whose centroid (mean of the corners) satisfies `predicate(p)`."""
+    """Cells whose centroid (mean of the corners) satisfies `predicate(p)`.
+
+    Args:
+        mesh: The mesh.
+        predicate: Takes a point [m] to True or False.
+
+    Returns:
+        Cell numbers in rising order.
+    """
     corners = mesh.cells[:, : mesh.element.num_corners]
     return np.flatnonzero(_holds(jnp.mean(mesh.points[corners], axis=1), predicate))
 
 
 def facets_where(mesh: Mesh, predicate: Predicate) -> Facets:
-    """Boundary facets, as node numbers, whose midpoint satisfies `predicate(p)`."""
+    """Boundary facets, as node numbers, whose midpoint satisfies `predicate(p)`.
+
+    Args:
+        mesh: The mesh.
+        predicate: Takes a point [m] to True or False.
+
+    Returns:
+        Nodes of the facets, one row per facet.
+    """
     facets = boundary_facets(mesh)
     return facets[_holds(_middles(mesh, facets), predicate)]
 
@@ -92,7 +108,15 @@ def facets_on(mesh: Mesh, shape: AbstractSdf, tol: float | None = None) -> Facet
 
 
 def nearest_node(mesh: Mesh, point: Float[Any, " dim"]) -> int:
-    """The node closest to `point` [m]."""
+    """The node closest to `point` [m].
+
+    Args:
+        mesh: The mesh.
+        point: Where to look [m].
+
+    Returns:
+        The node number.
+    """
     gap = np.asarray(mesh.points) - np.asarray(point, dtype=float)
     return int(np.argmin((gap**2).sum(axis=1)))
 
@@ -100,7 +124,16 @@ def nearest_node(mesh: Mesh, point: Float[Any, " dim"]) -> int:
 def nodes_in_box(
     mesh: Mesh, lower: Float[np.ndarray, " dim"], upper: Float[np.ndarray, " dim"]
 ) -> Nodes:
-    """Nodes between two corners [m], faces included to 1e-9 of the extent."""
+    """Nodes between two corners [m], faces included to 1e-9 of the extent.
+
+    Args:
+        mesh: The mesh.
+        lower: Corner with the lowest coordinates [m].
+        upper: Corner with the highest [m].
+
+    Returns:
+        Node numbers in rising order.
+    """
     points = np.asarray(mesh.points)
     tol = 1e-9 * float(np.ptp(points, axis=0).max())
     low, high = np.asarray(lower, float) - tol, np.asarray(upper, float) + tol
@@ -113,7 +146,17 @@ def nodes_on_line(
     end: Float[np.ndarray, " dim"],
     tol: float | None = None,
 ) -> Nodes:
-    """Nodes within `tol` [m] of a straight line, in order from `start` to `end` [m]."""
+    """Nodes within `tol` [m] of a straight line, in order from `start` to `end` [m].
+
+    Args:
+        mesh: The mesh.
+        start: First end [m].
+        end: Last end [m].
+        tol: Distance from the line [m]; 1e-6 of the extent if omitted.
+
+    Returns:
+        Node numbers along the line.
+    """
     points = np.asarray(mesh.points)
     if tol is None:
         tol = 1e-6 * float(np.ptp(points, axis=0).max())
@@ -125,18 +168,42 @@ def nodes_on_line(
 
 
 def nodes_inside(mesh: Mesh, shape: AbstractSdf, tol: float = 0.0) -> Nodes:
-    """Nodes inside `shape`, or within `tol` [m] of it."""
+    """Nodes inside `shape`, or within `tol` [m] of it.
+
+    Args:
+        mesh: The mesh.
+        shape: The shape.
+        tol: Distance outside that still counts [m].
+
+    Returns:
+        Node numbers in rising order.
+    """
     return np.flatnonzero(values(shape, np.asarray(mesh.points)) <= tol)
 
 
 def cells_inside(mesh: Mesh, shape: AbstractSdf) -> Cells:
-    """Cells whose centroid (mean of the corners) lies inside `shape`."""
+    """Cells whose centroid (mean of the corners) lies inside `shape`.
+
+    Args:
+        mesh: The mesh.
+        shape: The shape.
+
+    Returns:
+        Cell numbers in rising order.
+    """
     corners = np.asarray(mesh.cells)[:, : mesh.element.num_corners]
     return np.flatnonzero(values(shape, np.asarray(mesh.points)[corners].mean(axis=1)) < 0)
 
 
 def named(mesh: Mesh, name: str) -> np.ndarray:
     """The node set, facet set or region called `name`.
+
+    Args:
+        mesh: The mesh.
+        name: Of a set.
+
+    Returns:
+        Node numbers, facets or cell numbers.
 
     Raises:
         ValueError: If there is none, with the names that exist.
@@ -155,6 +222,9 @@ def cells_connected(mesh: Mesh, start: Float[np.ndarray, " dim"], walls: Numbers
         mesh: Any mesh.
         start: A point in the part that is wanted.
         walls: Facets, as node numbers, that stop the flood: for example an interface.
+
+    Returns:
+        Cell numbers in rising order.
     """
     facets, _, _, number = facet_table(mesh)
     order = np.argsort(number, kind="stable")
@@ -213,7 +283,14 @@ class Chambers(NamedTuple):
 
 
 def boundary_loops(mesh: Mesh) -> list[Int[np.ndarray, "facets facet_nodes"]]:
-    """Connected pieces of the boundary; in the plane in order along each loop."""
+    """Connected pieces of the boundary; in the plane in order along each loop.
+
+    Args:
+        mesh: The mesh.
+
+    Returns:
+        The facets of each piece.
+    """
     facets = boundary_facets(mesh)
     corners = facets[:, : facet_corners(mesh.element)]
     rows = np.repeat(corners[:, 0], corners.shape[1] - 1)
@@ -238,6 +315,12 @@ def chambers(mesh: Mesh) -> Chambers:
     """Every closed inner loop or surface as a facet set, and the volume it encloses.
 
     `enclosed_volume(mesh, facets)` gives the same number differentiably.
+
+    Args:
+        mesh: The mesh.
+
+    Returns:
+        Facets and volume of each cavity.
     """
     points = np.asarray(mesh.points)
     found = []

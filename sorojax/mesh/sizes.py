@@ -39,6 +39,9 @@ def grade(shape: AbstractSdf, *, near: float, far: float, growth: float = 0.3) -
         near: Length on the zero set [m].
         far: Largest length [m].
         growth: Growth of the length per distance; above 0.4 triangles get poor.
+
+    Returns:
+        A function of points, as `triangulate` takes it for `size`.
     """
     _check.positive("grade", "near", near, "m", "Give a length above zero.")
     _check.positive("grade", "far", far - near, "m", "`far` must be above `near`.")

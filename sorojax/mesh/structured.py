@@ -203,6 +203,13 @@ def between_lines(
     `between_lines(x, y, element=Quad8())` fills a rectangle, three lists a cuboid. Sets are
     those of `rectangle` and `box`.
 
+    Args:
+        *lines: Coordinates of the lines across one axis [m], rising; one list per axis.
+        element: The element of the cells.
+
+    Returns:
+        The mesh, points [m].
+
     Raises:
         ValueError: If a list does not rise, or the element does not fit.
     """
@@ -227,6 +234,13 @@ def submesh(mesh: Mesh, cells: Int[np.ndarray, " kept"]) -> Mesh:
 
     Node sets and regions keep what is left of them; facet sets, whose facets may have gone,
     are dropped: choose facets anew with `facets_where` or `facets_on`.
+
+    Args:
+        mesh: The mesh.
+        cells: Cell numbers to keep.
+
+    Returns:
+        The mesh of these cells.
     """
     chosen = np.asarray(cells)
     if not len(chosen):
@@ -282,6 +296,14 @@ def revolve(mesh: Mesh, *, layers: int, angle: float = 2 * np.pi) -> Mesh:
 
     A full turn closes on itself. Triangles may touch the axis, quadrilaterals not.
 
+    Args:
+        mesh: A plane mesh.
+        layers: Cells around.
+        angle: Of the whole turn [rad].
+
+    Returns:
+        The solid mesh, points [m].
+
     Raises:
         ValueError: If nodes have negative radius, or a quadrilateral touches the axis.
     """
@@ -314,6 +336,13 @@ def sweep(mesh: Mesh, frames: np.ndarray) -> Mesh:
     """`mesh` carried along `frames`, (stations, 4, 4) poses; its z axis is the way on.
 
     Each frame is a homogeneous matrix that takes (x, y, 0) to space.
+
+    Args:
+        mesh: A plane mesh.
+        frames: Pose of each station.
+
+    Returns:
+        The solid mesh, points [m].
     """
     frames = np.asarray(frames, dtype=float)
     if frames.ndim != 3 or frames.shape[1:] != (4, 4) or len(frames) < 2:
@@ -397,11 +426,22 @@ def mirror(mesh: Mesh, axis: int, at: float) -> Mesh:
     moved onto it, images come after them. Sets hold the images too; facets on the plane,
     which no longer bound anything, leave theirs.
 
+    Args:
+        mesh: The mesh.
+        axis: Number of the axis that the plane stands across.
+        at: Place of the plane on that axis [m].
+
+    Returns:
+        The mesh of both halves.
+
     Raises:
         ValueError: For polygons, or if the mesh reaches across the plane.
 
     Example:
-        `mirrored(mirrored(quarter, 0, 20 * mm), 1, 20 * mm)` is the whole square.
+        >>> quarter = mesh.rectangle([0, 0], [20 * mm, 20 * mm], divisions=(2, 2))
+        >>> whole = mesh.mirror(mesh.mirror(quarter, 0, 20 * mm), 1, 20 * mm)
+        >>> whole.num_cells
+        32
     """
     if isinstance(mesh.element, PolyN):
         raise ValueError("mesh.mirror: got polygons, need another kind of cells.")

@@ -82,6 +82,9 @@ def identify_damping(
         v: Rates [per s]; differences of order 4 if omitted.
         window: Samples in a window. More average noise away, up to about a period.
 
+    Returns:
+        The matrix as a force, and how well it explains the motion.
+
     Raises:
         ValueError: If times are not equally spaced, samples too few for a window, or a
             strain does not move in as many ways as it has coordinates.

@@ -69,6 +69,14 @@ def mean_section(
     polar moment, an upper bound. Differentiable in the nodes and in the curve; which section a
     point belongs to has no derivative.
 
+    Args:
+        problem: The body, in plane strain or solid.
+        curve: Axis of the rod [m].
+        up: In space, a direction near which local z of the section points [-].
+
+    Returns:
+        The constants of the section.
+
     Raises:
         ValueError: If the body is neither plane strain nor solid.
     """
@@ -153,6 +161,9 @@ def offset_weight(problem: Problem, line: Line, acceleration: Numbers) -> Offset
         problem: The solid, with a density.
         line: Of the rod.
         acceleration: Of gravity [m/s^2].
+
+    Returns:
+        One of the forces on the rod.
     """
     shares = lumped_mass(problem).reshape(-1, 2)[:, 0]
     along = line.end - line.start
@@ -340,6 +351,18 @@ def condensed_stiffness(
     That at rest is the elastic law of a rod: `LinearElastic(condensed_stiffness(...)[0])`.
     The arguments are those of `strain_along`. Differentiable in the numbers of the problem, the
     displacements, the curve and the modes, once: see `tangent_solve`.
+
+    Args:
+        path: Equilibria, from `fem.solve_path`.
+        basis: Modes, e.g. from `pod_basis`.
+        curve: A `Line` or any `Curve` in the reference configuration [m].
+        samples: Equally spaced samples along the curve.
+        arm: As in `strain_along` [m].
+        up: As in `strain_along`.
+        near: As in `strain_along`.
+
+    Returns:
+        A symmetric matrix per state.
     """
     cells = None if near is None else near.cells
     at = probe(path.problem.mesh, curve, samples, arm=arm, up=up, cells=cells)

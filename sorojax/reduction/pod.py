@@ -227,7 +227,15 @@ def _inverse_gaps(squares: Float[Array, " count"]) -> Float[Array, "count count"
 
 
 def captured_energy(backbone: Backbone, basis: StrainBasis) -> dict[str, Float[Array, ""]]:
-    """Share of the snapshots' squared strain that the basis holds, per strain."""
+    """Share of the snapshots' squared strain that the basis holds, per strain.
+
+    Args:
+        backbone: Snapshots, from `strain_along`.
+        basis: Modes, e.g. from `pod_basis`.
+
+    Returns:
+        A share of at most 1 for each strain [-].
+    """
     return _shares(backbone, basis)
 
 
@@ -243,7 +251,15 @@ def _shares(backbone: Backbone, basis: StrainBasis) -> dict[str, Float[Array, ""
 
 @eqx.filter_jit
 def coordinates(backbone: Backbone, basis: StrainBasis) -> Float[Array, "steps dof"]:
-    """Coordinates of the snapshots: least squares at the samples, any basis."""
+    """Coordinates of the snapshots: least squares at the samples, any basis.
+
+    Args:
+        backbone: Snapshots, from `strain_along`.
+        basis: Modes, e.g. from `pod_basis`.
+
+    Returns:
+        One row per snapshot.
+    """
     return jax.vmap(lambda change: project(change, backbone.s, basis))(backbone.change)
 
 

@@ -176,7 +176,14 @@ class PneuNet(eqx.Module):
 
 
 def pneunet_mesh(pneunet: PneuNet) -> mesh.Mesh:
-    """Quad8 cells between the lines of the drawing, two across a wall; region "layer"."""
+    """Quad8 cells between the lines of the drawing, two across a wall; region "layer".
+
+    Args:
+        pneunet: Its dimensions.
+
+    Returns:
+        The mesh, points [m].
+    """
     x = np.asarray(pneunet.middles)
     half, pitch = float(pneunet.chamber_width) / 2, float(pneunet.pitch)
     slot, gap = x[:-1] + pitch / 2, float(pneunet.slot_width) / 2

@@ -91,7 +91,11 @@ class Crawler(eqx.Module):
 
 
 def crawler_rubbers() -> tuple[AbstractHyperelastic, AbstractHyperelastic]:
-    """A soft rubber for the body, and one five times as stiff for the sole."""
+    """A soft rubber for the body, and one five times as stiff for the sole.
+
+    Returns:
+        Rubber of the body, rubber of the sole.
+    """
     return (
         neo_hookean(young_modulus=0.2 * MPa, poisson_ratio=0.4, density=1070.0),
         neo_hookean(young_modulus=1 * MPa, poisson_ratio=0.4, density=1070.0),
@@ -157,6 +161,9 @@ def crawler_problem(
         depth: Width across the plane of the side view [m].
         stiffness: Of the contact with the floor [Pa/m]. It carries a body so light that the
             default of `fem.Contact` would be a thousand times more than needed.
+
+    Returns:
+        The problem, for `fem.simulate`.
     """
     cells = crawler_mesh(crawler, size, across)
     soft, stiff = crawler_rubbers() if rubbers is None else rubbers
@@ -199,6 +206,14 @@ def crawler_gait(
 
     Positive half waves of a sine of `frequency` [Hz], each port `lag` [rad] after the one
     before it, from the rear to the front.
+
+    Args:
+        amplitude: Highest pressure [Pa].
+        frequency: Of the gait [Hz].
+        lag: Between neighbouring ports [rad].
+
+    Returns:
+        A function of time by the name of each port.
     """
     amplitude, frequency, lag = real(amplitude), real(frequency), real(lag)
 
@@ -239,6 +254,13 @@ class Gait(NamedTuple):
 
 def gait(times: Float[np.ndarray, " times"], angles: Float[np.ndarray, "times pairs"]) -> Gait:
     """Rhythm of legs from their angles [rad] at evenly spaced `times` [s].
+
+    Args:
+        times: Evenly spaced [s].
+        angles: Of each pair of legs [rad].
+
+    Returns:
+        Frequency and lag of every pair, and how alike periods are.
 
     Raises:
         ValueError: If half the record is shorter than 0.15 s.
@@ -342,7 +364,11 @@ class Walker(eqx.Module):
 
 
 def walker_rubber() -> AbstractHyperelastic:
-    """The rubber of the walker, heavy with metal powder."""
+    """The rubber of the walker, heavy with metal powder.
+
+    Returns:
+        The material.
+    """
     return neo_hookean(young_modulus=1.2 * MPa, poisson_ratio=0.49, density=3600.0)
 
 
@@ -350,7 +376,16 @@ def pair_angles(
     walker: Walker, cells: mesh.Mesh, displacements: Float[Array, "times nodes 2"]
 ) -> Float[Array, "times pairs"]:
     """Angle between the two legs of every pair [rad], of the straight lines from the apex to
-    the feet; 90 degrees at rest."""
+    the feet; 90 degrees at rest.
+
+    Args:
+        walker: Its dimensions.
+        cells: Its mesh.
+        displacements: Of the nodes at each time [m].
+
+    Returns:
+        Angles [rad].
+    """
     down = float(walker.reach)
     found = []
     for apex in np.asarray(walker.apexes()):
@@ -387,6 +422,9 @@ def walker_problem(
         depth: Width across the plane of the side view [m].
         stiffness: Of the contact with the floor [Pa/m]: round feet sink in by some 0.01 mm.
         friction_velocity: Of the dashpot of friction [m/s]; feet move at 0.5 m/s.
+
+    Returns:
+        The problem, for `fem.simulate`.
     """
     feet = np.asarray(walker.bottoms())
 

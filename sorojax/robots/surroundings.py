@@ -68,14 +68,28 @@ def _hanging(angle: float, radius: Float[Array, ""]) -> Float[Array, "4 4"]:
 
 
 def pose_below(depth: Float[Array, ""] | float) -> Float[Array, "4 4"]:
-    """Pose of what hangs `depth` [m] below the middle of a ring, not turned."""
+    """Pose of what hangs `depth` [m] below the middle of a ring, not turned.
+
+    Args:
+        depth: Distance [m].
+
+    Returns:
+        A homogeneous matrix.
+    """
     depth = real(depth)
     zero = jnp.zeros_like(depth)
     return homogeneous(jnp.eye(3, dtype=depth.dtype), jnp.stack([zero, zero, -depth]))
 
 
 def upside_down(height: Float[Array, ""] | float) -> Float[Array, "4 4"]:
-    """Pose of what hangs from a beam at `height` [m], its z axis down, its x axis kept."""
+    """Pose of what hangs from a beam at `height` [m], its z axis down, its x axis kept.
+
+    Args:
+        height: Of the beam [m].
+
+    Returns:
+        A homogeneous matrix.
+    """
     height = real(height)
     zero = jnp.zeros_like(height)
     turn = jnp.diag(jnp.asarray([1.0, -1.0, -1.0], height.dtype))
@@ -93,6 +107,9 @@ def cylinder(
         mass: [kg].
         radius: [m].
         length: [m].
+
+    Returns:
+        The rigid link.
     """
     mass, radius, length = real(mass), real(radius), real(length)
     across = mass * (3 * radius**2 + length**2) / 12
@@ -109,6 +126,9 @@ def rim(
         radius: [m].
         height: Of the edge in the frame of the cylinder [m].
         count: Number of points, three or more.
+
+    Returns:
+        Points, and the length of each [m].
     """
     if count < 3 or not radius > 0:
         raise ValueError(
@@ -137,6 +157,9 @@ def with_contacts(
         forces: `On(part, force)` and `Between(first, second, contact)`, of old and new parts.
         mount: Pose of the robot, in which it was drawn if omitted; weight keeps its direction.
         **parts: The bodies by name, in the frame of the ground unless a part carries them.
+
+    Returns:
+        The robot among the bodies.
 
     Raises:
         ValueError: If a name is taken.
@@ -173,6 +196,9 @@ def standing_cylinder(
         radius: [m].
         height: [m].
         law: Between its lower rim and the floor.
+
+    Returns:
+        The part, and its contact.
     """
     part = Part(cylinder(mass, radius, height), Free(), offset=pose_below(-height / 2))
     floor = HalfSpace([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
@@ -193,6 +219,9 @@ def standing_ball(
         radius: [m].
         law: Between the points and the floor.
         at: Where it stands on the floor [m].
+
+    Returns:
+        The part, and its contact.
     """
     spot = real(at)
     _check.shape("standing_ball", "at", spot, (3,), "Give x, y and the height of the floor.")
@@ -216,7 +245,16 @@ _GOLDEN = np.pi * (3 - np.sqrt(5))  # [rad] from point to point of an even spira
 def middle(
     model: Assembly, q: Float[Array, " coordinates"], names: Sequence[str]
 ) -> Float[Array, " dim"]:
-    """Mean position of the tips or frames of some parts [m]: between fingers, for example."""
+    """Mean position of the tips or frames of some parts [m]: between fingers, for example.
+
+    Args:
+        model: The assembly.
+        q: Coordinates.
+        names: Of the parts.
+
+    Returns:
+        The position [m].
+    """
     poses = tip_pose(model, q)
     return jnp.mean(jnp.stack([poses[name][:-1, -1] for name in names]), axis=0)
 
@@ -253,6 +291,9 @@ def replay(
         states: In the order of time.
         parts: Those whose poses are asked for; all if omitted. Few compile faster.
 
+    Returns:
+        Coordinates, rates, and poses by part.
+
     Raises:
         ValueError: If the model has no part of such a name.
     """
@@ -288,6 +329,10 @@ def contact_stepper(
         substeps: Steps in one.
         stepper: Of the body; one for grasps if omitted: a `ContactMidpoint` that keeps
             contacts from step to step and finds their forces in one pass.
+
+    Returns:
+        `advance(state, setpoint [Pa], dt [s]) -> (state, pressure [Pa])`, and the state to
+        start from.
 
     Raises:
         RuntimeError: By `advance`, if a step does not converge, or if contact cannot hold

@@ -24,7 +24,14 @@ Points = Float[Array, "*points dim"]
 
 
 def bounding_box(shape: AbstractSdf) -> Box:
-    """Lower and upper corner [m] of a box that holds the inside of `shape`."""
+    """Lower and upper corner [m] of a box that holds the inside of `shape`.
+
+    Args:
+        shape: The shape.
+
+    Returns:
+        Lower and upper corner [m].
+    """
     return shape.bounding_box()
 
 
@@ -75,7 +82,15 @@ def slope_along(shape: AbstractSdf, x: tuple[Array, ...], axis: int) -> tuple[Ar
 
 
 def normal(shape: AbstractSdf, p: Points) -> Points:
-    """Outward unit normal of the level set through `p`; zero where the slope is zero."""
+    """Outward unit normal of the level set through `p`; zero where the slope is zero.
+
+    Args:
+        shape: The shape.
+        p: Points [m].
+
+    Returns:
+        Unit vectors.
+    """
     g = gradient(shape, p)
     length = root(jnp.sum(g * g, axis=-1, keepdims=True))
     return quotient(g, length + jnp.zeros_like(g))
@@ -94,6 +109,9 @@ def project(shape: AbstractSdf, p: Points) -> Points:
     Args:
         shape: Any shape; `p` should lie within the radius of curvature of its surface.
         p: Points [m].
+
+    Returns:
+        Points on the surface [m].
     """
     p = real(p)
     return _project(cast(shape, p.dtype), p.reshape(-1, p.shape[-1])).reshape(p.shape)
@@ -170,6 +188,13 @@ def evaluate(shape: AbstractSdf, points: Float[Array, "points dim"]) -> Float[Ar
     """Field [m] at many `points` [m]: as `shape(points)`, compiled once for any number.
 
     The number is padded to a power of two; above 2^20 points come in blocks.
+
+    Args:
+        shape: The shape.
+        points: Points [m].
+
+    Returns:
+        Signed distances [m].
     """
     return _blocks(_value, shape, _checked(shape, points))
 
@@ -177,7 +202,15 @@ def evaluate(shape: AbstractSdf, points: Float[Array, "points dim"]) -> Float[Ar
 def value_and_normal(
     shape: AbstractSdf, points: Float[Array, "points dim"]
 ) -> tuple[Float[Array, " points"], Float[Array, "points dim"]]:
-    """Field [m] and unit normal at many `points` [m], as `evaluate`."""
+    """Field [m] and unit normal at many `points` [m], as `evaluate`.
+
+    Args:
+        shape: The shape.
+        points: Points [m].
+
+    Returns:
+        Signed distances [m], and unit vectors.
+    """
     return _blocks(_value_and_normal, shape, _checked(shape, points))
 
 
@@ -326,6 +359,13 @@ def frame(shape: AbstractSdf, p: Points) -> Float[Array, "*points dim dim"]:
 
     In the plane the tangent keeps the inside on its left; in space the two tangents
     follow a branch that jumps only where the normal is along -z.
+
+    Args:
+        shape: The shape.
+        p: Points [m].
+
+    Returns:
+        One matrix per point.
     """
     n = normal(shape, p)
     if shape.dim == 2:
@@ -341,7 +381,15 @@ def frame(shape: AbstractSdf, p: Points) -> Float[Array, "*points dim dim"]:
 
 
 def hessian(shape: AbstractSdf, p: Points) -> Float[Array, "*points dim dim"]:
-    """Second derivatives of the field at `p` [1/m]."""
+    """Second derivatives of the field at `p` [1/m].
+
+    Args:
+        shape: The shape.
+        p: Points [m].
+
+    Returns:
+        One matrix per point [1/m].
+    """
     p = real(p)
     columns = []
     for i in range(shape.dim):
@@ -355,6 +403,13 @@ def curvature(shape: AbstractSdf, p: Points) -> Float[Array, "*points"]:
     """Signed curvature of a plane level set, or mean curvature in space [1/m].
 
     Positive where the shape is convex: 1/r for a circle and for a sphere.
+
+    Args:
+        shape: The shape.
+        p: Points [m].
+
+    Returns:
+        Curvature [1/m].
     """
     p = real(p)
     _, g = value_and_gradient(shape, p)
@@ -367,7 +422,15 @@ def curvature(shape: AbstractSdf, p: Points) -> Float[Array, "*points"]:
 
 
 def gaussian_curvature(shape: AbstractSdf, p: Points) -> Float[Array, "*points"]:
-    """Product of the principal curvatures of a level set in space [1/m^2]."""
+    """Product of the principal curvatures of a level set in space [1/m^2].
+
+    Args:
+        shape: A solid.
+        p: Points [m].
+
+    Returns:
+        Curvature [1/m^2].
+    """
     if shape.dim != 3:
         raise ValueError(
             f"gaussian_curvature: the shape is {shape.dim}-D, need 3-D. Use `curvature` in "
@@ -395,6 +458,9 @@ def closest_point(shape: AbstractSdf, p: Points) -> Points:
     Args:
         shape: Any shape; `p` should lie within the radius of curvature of its surface.
         p: Points [m].
+
+    Returns:
+        Points on the surface [m].
     """
     p = real(p)
     shape = cast(shape, p.dtype)

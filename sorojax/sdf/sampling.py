@@ -155,7 +155,16 @@ _BAND = 5e-3  # of the extent: half the layer whose points are moved onto the su
 def sample_interior(
     shape: AbstractSdf, count: int, *, key: Key[Array, ""]
 ) -> Float[Array, "count dim"]:
-    """`count` points spread evenly over the inside [m], by rejection."""
+    """`count` points spread evenly over the inside [m], by rejection.
+
+    Args:
+        shape: The shape.
+        count: Number of points.
+        key: Random key.
+
+    Returns:
+        Points [m].
+    """
     return _collect("sample_interior", shape, count, key, _inside)
 
 
@@ -166,6 +175,14 @@ def sample_boundary(
 
     Points of a thin layer around the surface are moved onto it: even up to the square
     of curvature times 0.5 % of the extent.
+
+    Args:
+        shape: The shape.
+        count: Number of points.
+        key: Random key.
+
+    Returns:
+        Points [m].
     """
     return _collect("sample_boundary", shape, count, key, _landed)
 
@@ -201,7 +218,15 @@ def _collect(where, shape, count, key, choose):
 
 
 def grid(shape: AbstractSdf, size: float) -> Float[Array, "*nodes dim"]:
-    """Regular nodes [m] over the bounding box, at most `size` [m] apart along each axis."""
+    """Regular nodes [m] over the bounding box, at most `size` [m] apart along each axis.
+
+    Args:
+        shape: The shape.
+        size: Largest distance of neighbours [m].
+
+    Returns:
+        Points [m], indexed along each axis.
+    """
     if not size > 0:
         raise ValueError(f"grid: `size` must be positive, got {size} m. Give a distance.")
     lower, upper = finite_box("grid", shape, shape.dim)

@@ -117,6 +117,13 @@ def dask_local(workers: int, **options: Any) -> Any:
     """A Dask client with worker processes of one thread on this machine's loopback.
 
     Needs `distributed`, the extra `sorojax[sweep]`. Close it: `client.shutdown()`.
+
+    Args:
+        workers: Number of processes.
+        **options: Of `distributed.LocalCluster`.
+
+    Returns:
+        The client, for `sweep`.
     """
     from distributed import Client, LocalCluster
 

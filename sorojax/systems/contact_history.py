@@ -63,6 +63,9 @@ def contact_history(
         parts: Of an assembly, those over whose rates to tell the efforts, one part after
             the other; all if omitted. Few compile faster.
 
+    Returns:
+        Overlaps and forces at every moment.
+
     Raises:
         TypeError: If one of `contacts` is no contact.
         ValueError: If the model has no part of such a name.

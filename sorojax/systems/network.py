@@ -124,7 +124,17 @@ class Network(AbstractBlock):
 def outputs(
     network: Network, t: Float[Array, ""], state: PyTree, inputs: Signals | None = None
 ) -> dict[str, Array]:
-    """Every output of every block at one moment, `{"block.output": value}`."""
+    """Every output of every block at one moment, `{"block.output": value}`.
+
+    Args:
+        network: The network, or any block.
+        t: Time [s].
+        state: Of the network.
+        inputs: Values of free inputs by name.
+
+    Returns:
+        Values by "block.output".
+    """
     names = list(network.outputs)
     signals = _signals(network, t, state, inputs or {}, names)
     return {name: signals[name] for name in names}
@@ -184,6 +194,13 @@ def as_term(network: AbstractBlock, inputs: Signals | None = None) -> dfx.ODETer
     The block itself travels through `args`, so that it may be differentiated: call
     `diffrax.diffeqsolve(as_term(network), ..., args=network)`. With `args=None` the block
     given here is used.
+
+    Args:
+        network: The network, or any block.
+        inputs: Values of free inputs by name.
+
+    Returns:
+        A term for `diffrax.diffeqsolve`.
     """
 
     return dfx.ODETerm(_Field(network, dict(inputs or {})))

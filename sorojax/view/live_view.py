@@ -315,6 +315,9 @@ def live(what: Rig | AbstractSink, **options: Any) -> Feed:
             `live`, `Recording(path, size)`.
         **options: Those of `Browser`: `port`, `title`, `fps`.
 
+    Returns:
+        The feed, a context manager.
+
     Raises:
         RuntimeError: If the viewer did not start.
 

@@ -45,6 +45,9 @@ def html_report(title: str, sections: Sequence[Section], *, lead: str = "") -> s
         sections: `Section`s; their pictures are `(caption, figure)`, where a figure is a
             `Picture`, a matplotlib figure, a `Film`, or the bytes of a PNG or GIF file.
         lead: Short text under the title.
+
+    Returns:
+        The page as text.
     """
     body = "\n".join(_section(section, k) for k, section in enumerate(sections))
     links = "".join(

@@ -110,7 +110,14 @@ def _given(at: tuple[Any, ...], options: dict[str, Any]) -> str:
 
 
 def options(thing: Any) -> Any:
-    """The function that `show` calls for `thing`; its signature lists the options."""
+    """The function that `show` calls for `thing`; its signature lists the options.
+
+    Args:
+        thing: What is to be drawn.
+
+    Returns:
+        The function.
+    """
     found = show.dispatch(type(thing))
     return _known(thing) if found is show.dispatch(object) else found
 
@@ -170,6 +177,9 @@ def scene_of(thing: Any, *at: Any, **options: Any) -> Scene:
         thing: What is to be drawn.
         *at: Coordinates, of a rod or an assembly.
         **options: As of `show`, but `view` and `renderer`.
+
+    Returns:
+        The scene, for `show` and `merge_scenes`.
 
     Raises:
         TypeError: If `thing` has no scene.

@@ -52,7 +52,15 @@ class Pose(NamedTuple):
 
 
 def project(camera: Camera, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
-    """Pixels of points in the camera frame [m]; NaN behind the camera."""
+    """Pixels of points in the camera frame [m]; NaN behind the camera.
+
+    Args:
+        camera: Its calibration.
+        points: In the camera frame [m].
+
+    Returns:
+        Column and row [px].
+    """
     points = np.asarray(points, float)
     depth = points[..., 2:]
     plane = np.divide(
@@ -65,7 +73,16 @@ def deproject(
     camera: Camera, pixels: Float[np.ndarray, "*n 2"], depth: Float[np.ndarray, "*n"]
 ) -> Float[np.ndarray, "*n 3"]:
     """Points in the camera frame [m] from pixels and their depth along the axis [m]; NaN
-    where the depth is not positive, as a sensor marks what it could not see."""
+    where the depth is not positive, as a sensor marks what it could not see.
+
+    Args:
+        camera: Its calibration.
+        pixels: Column and row [px].
+        depth: Along the axis [m].
+
+    Returns:
+        Points [m].
+    """
     depth = np.asarray(depth, float)
     depth = np.where(depth > 0, depth, np.nan)[..., None]
     plane = rays(camera, pixels)
@@ -93,7 +110,16 @@ def rays(camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray,
 def depth_at(
     depth: Float[np.ndarray, "height width"], pixels: Float[np.ndarray, "n 2"], reach: int = 2
 ) -> Float[np.ndarray, " n"]:
-    """Median of the known depths within `reach` pixels [m]; zero where none is known."""
+    """Median of the known depths within `reach` pixels [m]; zero where none is known.
+
+    Args:
+        depth: Of every pixel [m].
+        pixels: Column and row [px].
+        reach: Half of the side of the window [px].
+
+    Returns:
+        Depths [m].
+    """
     height, width = depth.shape
     found = np.zeros(len(pixels))
     for k, (x, y) in enumerate(np.rint(pixels).astype(int)):
@@ -129,12 +155,23 @@ def _slopes(camera: Camera, plane: np.ndarray):
 
 
 def save_camera(path: str | Path, camera: Camera) -> None:
-    """Write a calibration as JSON."""
+    """Write a calibration as JSON.
+
+    Args:
+        path: File name.
+        camera: The calibration.
+    """
     Path(path).write_text(json.dumps(camera._asdict(), indent=1))
 
 
 def load_camera(path: str | Path) -> Camera:
     """Read a calibration.
+
+    Args:
+        path: File name.
+
+    Returns:
+        The camera.
 
     Raises:
         ValueError: If the file does not hold a camera.

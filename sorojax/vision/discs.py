@@ -24,7 +24,15 @@ RED, GREEN, BLUE = Colour(0.0), Colour(122.0, 54.0), Colour(228.0, 56.0)
 
 
 def colour_mask(image: Image, colour: Colour) -> Bool[np.ndarray, "height width"]:
-    """Pixels of a blue-green-red image that have the colour."""
+    """Pixels of a blue-green-red image that have the colour.
+
+    Args:
+        image: Blue, green, red, 8 bits each.
+        colour: Its range.
+
+    Returns:
+        True where the pixel has it.
+    """
     hsv = opencv().cvtColor(np.ascontiguousarray(image), opencv().COLOR_BGR2HSV)
     return masked(hsv, colour).astype(bool)
 
@@ -83,6 +91,9 @@ def find_discs(
         colours: What to look for.
         radius: Smallest and largest radius [px].
         refine: Whether to find centres to a fraction of a pixel.
+
+    Returns:
+        Centres and radii [px], and colours.
     """
     cv2, (smallest, largest) = opencv(), radius
     stride = 2 if smallest >= 6 else 1
@@ -105,6 +116,14 @@ def refine_discs(image: Image, discs: Discs, colours: tuple[Colour, ...]) -> Dis
 
     Works from centres that are a few pixels off, which is how a tracker uses it. Where
     there is no colour at all the centre is NaN.
+
+    Args:
+        image: Blue, green, red, 8 bits each.
+        discs: With centres that are a few pixels off.
+        colours: What to look for.
+
+    Returns:
+        The discs.
     """
     centres = discs.centre.astype(float)
     for k, index in enumerate(discs.colour):
@@ -124,6 +143,15 @@ def hough_discs(
 
     For discs that are half hidden or touch others; by itself about 0.6 px exact, and
     several times slower than `find_discs`.
+
+    Args:
+        image: Blue, green, red, 8 bits each.
+        colours: What to look for.
+        radius: Smallest and largest radius [px].
+        refine: Whether to find centres to a fraction of a pixel.
+
+    Returns:
+        Centres and radii [px], and colours.
     """
     cv2 = opencv()
     hsv = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_BGR2HSV)
@@ -197,7 +225,14 @@ _JUMP = 0.8  # of the radius: farther than that the moments have caught somethin
 
 
 def start_tracks(discs: Discs) -> Tracks:
-    """Identities for discs, in their order."""
+    """Identities for discs, in their order.
+
+    Args:
+        discs: From `find_discs`.
+
+    Returns:
+        One track per disc.
+    """
     count = len(discs.radius)
     return Tracks(discs, np.zeros((count, 2)), np.zeros(count, int))
 
@@ -208,6 +243,14 @@ def follow(image: Image, tracks: Tracks, colours: tuple[Colour, ...]) -> Tracks:
     Only windows around the predicted centres are looked at. A marker that is not there is
     searched for in the whole image, nearest first; what is not found moves on at its
     speed, slowing down.
+
+    Args:
+        image: Blue, green, red, 8 bits each.
+        tracks: Of the frame before.
+        colours: What to look for.
+
+    Returns:
+        The tracks of this frame.
     """
     guess = tracks.discs._replace(centre=tracks.discs.centre + tracks.velocity)
     seen = refine_discs(image, guess, colours).centre

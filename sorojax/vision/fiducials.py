@@ -28,6 +28,9 @@ def find_fiducials(image: np.ndarray, dictionary: str = "6X6_250") -> Fiducials:
         image: Of 8-bit numbers.
         dictionary: Name in OpenCV without `DICT_`.
 
+    Returns:
+        Numbers of the markers, and their corners [px].
+
     Raises:
         ValueError: If OpenCV has no such dictionary.
     """
@@ -44,12 +47,28 @@ def find_fiducials(image: np.ndarray, dictionary: str = "6X6_250") -> Fiducials:
 
 
 def marker_corners(size: float) -> Float[np.ndarray, "4 3"]:
-    """Corners of a marker of side `size` [m] in its frame: x right, y up, z to the viewer."""
+    """Corners of a marker of side `size` [m] in its frame: x right, y up, z to the viewer.
+
+    Args:
+        size: Side of the marker [m].
+
+    Returns:
+        Corners [m], from the upper left one clockwise.
+    """
     return size / 2 * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
 
 
 def marker_pose(camera: Camera, corners: Float[np.ndarray, "4 2"], size: float) -> Pose:
-    """Pose of one marker of side `size` [m] in the camera frame."""
+    """Pose of one marker of side `size` [m] in the camera frame.
+
+    Args:
+        camera: Its calibration.
+        corners: In the image [px], in the order of `marker_corners`.
+        size: Side of the marker [m].
+
+    Returns:
+        The pose.
+    """
     cv2 = opencv()
     points, bent = marker_corners(size), np.array(camera.distortion)
     method = cv2.SOLVEPNP_IPPE_SQUARE
@@ -63,6 +82,14 @@ def world_frame(
     places: Mapping[int, Float[np.ndarray, "4 3"]],
 ) -> Pose:
     """Pose of the world in the camera frame, from markers whose corners [m] are known there.
+
+    Args:
+        camera: Its calibration.
+        found: From `find_fiducials`.
+        places: Corners of each marker in the world [m], by its number.
+
+    Returns:
+        The pose.
 
     Raises:
         ValueError: If none of the known markers was found.

@@ -21,7 +21,15 @@ class Disturbance(NamedTuple):
 
 
 def background(width: int, height: int) -> Float[np.ndarray, "height width 3"]:
-    """A dim, uneven grey."""
+    """A dim, uneven grey.
+
+    Args:
+        width: Of the canvas [px].
+        height: Of the canvas [px].
+
+    Returns:
+        A canvas to draw on.
+    """
     x, y = np.arange(width), np.arange(height)[:, None]
     grey = 110 + 25 * np.sin(x / 190) + 12 * np.cos(y / 130)
     return np.repeat(grey[..., None], 3, axis=2)
@@ -34,7 +42,18 @@ def draw_discs(
     colour: Int[np.ndarray, " n"],
     fine: int = 8,
 ) -> Float[np.ndarray, "height width 3"]:
-    """Discs on a canvas, edges covered to 1 / `fine`^2 of a pixel."""
+    """Discs on a canvas, edges covered to 1 / `fine`^2 of a pixel.
+
+    Args:
+        canvas: Blue, green, red, 0 to 255.
+        centres: Column and row [px].
+        radius: Of each disc [px].
+        colour: Number of the colour of each disc.
+        fine: Samples per pixel and direction.
+
+    Returns:
+        The canvas.
+    """
     canvas = canvas.copy()
     for (x, y), r, kind in zip(centres, radius, colour, strict=True):
         x0, y0, side = int(np.floor(x - r)) - 2, int(np.floor(y - r)) - 2, 2 * int(r) + 6
@@ -62,6 +81,17 @@ def draw_plane(
 
     The picture's middle is the origin of `pose`, x to its right, y up. Exact: every sample
     of a pixel is followed back to the plane, distortion included.
+
+    Args:
+        canvas: Blue, green, red, 0 to 255.
+        camera: Its calibration.
+        pose: Of the plane in the camera frame.
+        picture: Grey levels.
+        size: Width and height [m].
+        fine: Samples per pixel and direction.
+
+    Returns:
+        The canvas.
     """
     outline = project(camera, pose.apply(marker_corners(1.0) * [*size, 0]))
     x0, y0 = np.clip(np.floor(outline.min(axis=0)) - 1, 0, None).astype(int)
@@ -89,7 +119,15 @@ def draw_plane(
 
 
 def fiducial_picture(number: int, dictionary: str = "6X6_250") -> np.ndarray:
-    """A marker with a quiet zone of one square around it: 10 by 10 squares for 6X6."""
+    """A marker with a quiet zone of one square around it: 10 by 10 squares for 6X6.
+
+    Args:
+        number: Of the marker.
+        dictionary: Name in OpenCV without `DICT_`.
+
+    Returns:
+        Grey levels.
+    """
     words = marker_words("fiducial_picture", dictionary)
     side = words.markerSize + 2
     picture = opencv().aruco.generateImageMarker(words, number, side, borderBits=1)
@@ -101,7 +139,16 @@ def photograph(
     disturbance: Disturbance,
     random: np.random.Generator,
 ) -> Image:
-    """The image that a sensor makes of a canvas."""
+    """The image that a sensor makes of a canvas.
+
+    Args:
+        canvas: Blue, green, red, 0 to 255.
+        disturbance: Blur and noise.
+        random: Source of the noise.
+
+    Returns:
+        The image.
+    """
     cv2 = opencv()
     if disturbance.blur > 0:
         canvas = cv2.GaussianBlur(canvas, (0, 0), disturbance.blur)
@@ -138,6 +185,15 @@ def draw_balls(
 
     Rays of `fine`^2 samples a pixel meet the balls exactly, distortion included. Balls hide
     each other in the order of their distances.
+
+    Args:
+        canvas: Blue, green, red, 0 to 255.
+        camera: Its calibration.
+        balls: Centres [m], radii [m] and colours.
+        fine: Samples per pixel and direction.
+
+    Returns:
+        The canvas, and the depth of every pixel [m].
     """
     canvas, depth = canvas.copy(), np.full(canvas.shape[:2], np.inf)
     part = (np.arange(fine) + 0.5) / fine - 0.5

@@ -28,7 +28,18 @@ class Settings(NamedTuple):
 
 
 def settings(ports: int = 12, low=-100e3, high=100e3, slew=2e6, **more) -> Settings:
-    """Equal limits for every port."""
+    """Equal limits for every port.
+
+    Args:
+        ports: Number of ports.
+        low: Lowest set-point [Pa].
+        high: Highest set-point [Pa].
+        slew: Fastest change of a set-point [Pa/s].
+        **more: Other numbers of `Settings`.
+
+    Returns:
+        The settings.
+    """
     return Settings(limits=(Limits(low, high, slew),) * ports, **more)
 
 
@@ -67,6 +78,10 @@ _WIRE = {
 
 def check(where: str, settings: Settings) -> None:
     """Refuse limits that would not protect.
+
+    Args:
+        where: Who asks, for the message.
+        settings: What is to be checked.
 
     Raises:
         ValueError: If a number is not in its range; it names the number.
@@ -127,6 +142,12 @@ def read_config(path: Path | None) -> tuple[Settings, tuple[Wiring, ...]]:
     "watchdog": 0.1, "wiring": [{"bus": 1, "dac": 96, "adc": 72}, ...]}`.
 
     The other numbers of `Settings` may be given as well.
+
+    Args:
+        path: File name; None for the limits and the wiring of the control platform.
+
+    Returns:
+        Settings, and the wiring of each port.
 
     Raises:
         ValueError: If the file is no such JSON, or a number is missing or not in its range;

@@ -45,7 +45,15 @@ class Frame(NamedTuple):
 
 
 def encode(frame: Frame, key: bytes) -> bytes:
-    """The bytes of a frame, signed with `key`."""
+    """The bytes of a frame, signed with `key`.
+
+    Args:
+        frame: The frame.
+        key: Of the session.
+
+    Returns:
+        The bytes.
+    """
     if len(frame.payload) > MAX_PAYLOAD:
         raise ValueError(
             f"encode: the payload has {len(frame.payload)} bytes, need {MAX_PAYLOAD} or fewer."
@@ -58,7 +66,15 @@ def encode(frame: Frame, key: bytes) -> bytes:
 
 
 def authentic(frame: Frame, key: bytes) -> bool:
-    """Whether the holder of `key` sent the frame; takes the same time either way."""
+    """Whether the holder of `key` sent the frame; takes the same time either way.
+
+    Args:
+        frame: The frame.
+        key: Of the session.
+
+    Returns:
+        Whether the signature is right.
+    """
     return hmac.compare_digest(_tag(key, frame.signed), frame.tag)
 
 
@@ -74,13 +90,29 @@ class Keys(NamedTuple):
 
 
 def session_keys(shared: bytes, board_nonce: bytes, client_nonce: bytes) -> Keys:
-    """Keys from the shared key and both nonces: no frame of another session fits."""
+    """Keys from the shared key and both nonces: no frame of another session fits.
+
+    Args:
+        shared: The key that board and client share.
+        board_nonce: Random bytes of the board.
+        client_nonce: Random bytes of the client.
+
+    Returns:
+        A key for each direction.
+    """
     session = hmac.digest(shared, b"sorojax-board 1" + board_nonce + client_nonce, "sha256")
     return Keys(*(hmac.digest(session, way, "sha256") for way in (b"board", b"client")))
 
 
 def challenge_key(shared: bytes) -> bytes:
-    """Key of the one frame that comes before the nonces are exchanged."""
+    """Key of the one frame that comes before the nonces are exchanged.
+
+    Args:
+        shared: The key that board and client share.
+
+    Returns:
+        The key.
+    """
     return hmac.digest(shared, b"sorojax-board 1 challenge", "sha256")
 
 

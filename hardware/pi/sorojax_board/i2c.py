@@ -40,40 +40,90 @@ _VOLTS_PER_STEP = 4.096 / 2048
 
 
 def pressure_of_command(u: float) -> float:
-    """Set-point [Pa] of a command in [0, 1]."""
+    """Set-point [Pa] of a command in [0, 1].
+
+    Args:
+        u: Command, 0 to 1.
+
+    Returns:
+        Set-point [Pa].
+    """
     return (200 * u - 100) * 1e3
 
 
 def voltage_of_pressure(pressure: float) -> float:
-    """Sensor voltage [V] of a pressure [Pa]."""
+    """Sensor voltage [V] of a pressure [Pa].
+
+    Args:
+        pressure: Pressure [Pa].
+
+    Returns:
+        Voltage [V].
+    """
     return pressure / 20e3 + 5
 
 
 def dac_code(pressure: float) -> int:
-    """12-bit code of a set-point [Pa] in -100 .. 100 kPa, cut to the range."""
+    """12-bit code of a set-point [Pa] in -100 .. 100 kPa, cut to the range.
+
+    Args:
+        pressure: Pressure [Pa].
+
+    Returns:
+        The code, 0 to 4095.
+    """
     u = (pressure * 1e-3 + 100) / 200
     return min(max(round(u * 4095), 0), 4095)
 
 
 def dac_pressure(code: int) -> float:
-    """Set-point [Pa] of a 12-bit code."""
+    """Set-point [Pa] of a 12-bit code.
+
+    Args:
+        code: 0 to 4095.
+
+    Returns:
+        Set-point [Pa].
+    """
     return pressure_of_command(code / 4095)
 
 
 def dac_bytes(pressure: float) -> bytes:
-    """MCP4725 fast mode: four command bits, then the code."""
+    """MCP4725 fast mode: four command bits, then the code.
+
+    Args:
+        pressure: Pressure [Pa].
+
+    Returns:
+        Two bytes.
+    """
     return dac_code(pressure).to_bytes(2, "big")
 
 
 def adc_request(channel: int) -> bytes:
-    """ADS1015: start one conversion of `channel` to ground, 4.096 V, 3300 samples/s."""
+    """ADS1015: start one conversion of `channel` to ground, 4.096 V, 3300 samples/s.
+
+    Args:
+        channel: 0 to 3.
+
+    Returns:
+        The bytes to write.
+    """
     start, mux, gain, single, rate, no_alert = 1 << 15, 4 + channel, 1, 1, 6, 3
     config = start | mux << 12 | gain << 9 | single << 8 | rate << 5 | no_alert
     return bytes([_CONFIGURATION]) + config.to_bytes(2, "big")
 
 
 def adc_pressure(data: bytes, gain: float) -> float:
-    """Pressure [Pa] of a conversion register: p = 20 (V - 5) kPa."""
+    """Pressure [Pa] of a conversion register: p = 20 (V - 5) kPa.
+
+    Args:
+        data: Bytes of the register.
+        gain: Of the divider in front of the converter.
+
+    Returns:
+        Pressure [Pa].
+    """
     steps = int.from_bytes(data, "big", signed=True) >> 4
     return (steps * _VOLTS_PER_STEP * gain - 5) * 20e3
 
@@ -114,6 +164,12 @@ class I2CValves:
 
 def open_bus(number: int) -> Bus:
     """The bus /dev/i2c-`number` through smbus2.
+
+    Args:
+        number: Of the bus.
+
+    Returns:
+        The bus.
 
     Raises:
         ImportError: If smbus2 is not installed.

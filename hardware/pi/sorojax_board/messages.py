@@ -80,22 +80,55 @@ class Malformed(ValueError):
 
 
 def floats(payload: bytes, count: int) -> tuple[float, ...]:
-    """`count` single-precision numbers and nothing else."""
+    """`count` single-precision numbers and nothing else.
+
+    Args:
+        payload: Bytes of the frame.
+        count: How many there must be.
+
+    Returns:
+        The numbers.
+    """
     if len(payload) != 4 * count:
         raise Malformed(f"{len(payload)} bytes, need {4 * count}")
     return struct.unpack(f"<{count}f", payload)
 
 
 def pack_floats(values: Sequence[float]) -> bytes:
+    """Numbers one after the other in single precision, the lowest byte first.
+
+    Args:
+        values: The numbers.
+
+    Returns:
+        The bytes.
+    """
     return struct.pack(f"<{len(values)}f", *values)
 
 
 def pack_set(mask: int, pressures: Sequence[float]) -> bytes:
-    """Set-points [Pa]; ports whose bit in `mask` is zero keep theirs."""
+    """Set-points [Pa]; ports whose bit in `mask` is zero keep theirs.
+
+    Args:
+        mask: One bit per port.
+        pressures: Of all ports [Pa].
+
+    Returns:
+        The payload.
+    """
     return struct.pack("<I", mask) + pack_floats(pressures)
 
 
 def unpack_set(payload: bytes, ports: int) -> tuple[int, tuple[float, ...]]:
+    """The mask of the ports that are meant, and set-points [Pa] of all `ports`.
+
+    Args:
+        payload: Bytes of the frame.
+        ports: Number of ports.
+
+    Returns:
+        Mask, and set-points [Pa].
+    """
     if len(payload) < 4:
         raise Malformed(f"{len(payload)} bytes, need {4 + 4 * ports}")
     return struct.unpack_from("<I", payload)[0], floats(payload[4:], ports)
@@ -103,21 +136,53 @@ def unpack_set(payload: bytes, ports: int) -> tuple[int, tuple[float, ...]]:
 
 def pack_arm(ranges: Sequence[tuple[float, float]]) -> bytes:
     """Lowest and highest pressure of every port [Pa]; the board takes them where they are
-    narrower than its own."""
+    narrower than its own.
+
+    Args:
+        ranges: Lowest and highest of every port [Pa].
+
+    Returns:
+        The payload.
+    """
     return pack_floats([bound for low_high in ranges for bound in low_high])
 
 
 def unpack_arm(payload: bytes, ports: int) -> list[tuple[float, float]]:
+    """Lowest and highest pressure of every port [Pa].
+
+    Args:
+        payload: Bytes of the frame.
+        ports: Number of ports.
+
+    Returns:
+        Lowest and highest of every port [Pa].
+    """
     values = floats(payload, 2 * ports)
     return list(zip(values[::2], values[1::2], strict=True))
 
 
 def pack_welcome(welcome: Welcome) -> bytes:
+    """Times of the board and limits of its ports, as it sends them.
+
+    Args:
+        welcome: What is sent.
+
+    Returns:
+        The payload.
+    """
     flat = [number for limits in welcome.limits for number in limits]
     return pack_floats([welcome.watchdog, welcome.ramp, *flat])
 
 
 def unpack_welcome(payload: bytes) -> Welcome:
+    """The times and limits of a board; their number is that of its ports.
+
+    Args:
+        payload: Bytes of the frame.
+
+    Returns:
+        What was sent.
+    """
     ports, rest = divmod(len(payload) - 8, 12)
     if rest or not 0 < ports <= MAX_PORTS:
         raise Malformed(f"{len(payload)} bytes, need 8 and 12 for each port")
@@ -130,6 +195,14 @@ _REPORT = struct.Struct("<IQBHI")
 
 
 def pack_report(report: Report) -> bytes:
+    """State, pressures and flags of the board, as it sends them.
+
+    Args:
+        report: What is sent.
+
+    Returns:
+        The payload.
+    """
     head = _REPORT.pack(
         report.sequence, report.time, report.state, report.fault, report.refused & 0xFFFFFFFF
     )
@@ -138,6 +211,14 @@ def pack_report(report: Report) -> bytes:
 
 
 def unpack_report(payload: bytes) -> Report:
+    """State, pressures and flags of a board with as many ports as the payload has.
+
+    Args:
+        payload: Bytes of the frame.
+
+    Returns:
+        What was sent.
+    """
     ports, rest = divmod(len(payload) - _REPORT.size, 9)
     if rest or not 0 < ports <= MAX_PORTS:
         raise Malformed(f"{len(payload)} bytes, need {_REPORT.size} and 9 for each port")
@@ -160,10 +241,27 @@ def unpack_report(payload: bytes) -> Report:
 
 
 def pack_refused(sequence: int, why: Refusal) -> bytes:
+    """Which frame the board did not follow, and why.
+
+    Args:
+        sequence: Number of the frame.
+        why: The reason.
+
+    Returns:
+        The payload.
+    """
     return struct.pack("<IB", sequence, why)
 
 
 def unpack_refused(payload: bytes) -> tuple[int, Refusal]:
+    """Which frame the board did not follow, and why.
+
+    Args:
+        payload: Bytes of the frame.
+
+    Returns:
+        Number of the frame, and the reason.
+    """
     try:
         sequence, why = struct.unpack("<IB", payload)
         return sequence, Refusal(why)

@@ -281,6 +281,13 @@ def unidentifiable(calibration: Calibration, limit: float = 1.0) -> tuple[Combin
 
     A standard deviation of 1 is a factor of e for logarithmic parameters and the size of the
     first guess for others. An experiment that moves the combination would determine it.
+
+    Args:
+        calibration: From `calibrate`.
+        limit: Least standard deviation that is listed [-].
+
+    Returns:
+        The combinations.
     """
     found = []
     for value, row in zip(calibration.singular_values, calibration.combinations, strict=True):
@@ -300,6 +307,13 @@ def validate(
     """Further records beside their predictions: held out, they tell what the model is worth.
 
     Each takes one solve and one back-substitution for every parameter.
+
+    Args:
+        calibration: From `calibrate`.
+        experiments: Records that the calibration has not seen.
+
+    Returns:
+        One prediction with its error per record.
     """
     p, covariance = calibration.parameters, calibration.covariance
     return tuple(compared(e, p, covariance) for e in experiments)

@@ -54,6 +54,9 @@ def cone_filter(
         periods: By axis, the length [m] after which the layout repeats, `None` where it
             does not: cells at one end are then neighbours of those at the other.
 
+    Returns:
+        A function of the values of the cells.
+
     Raises:
         ValueError: If a period is shorter than two radii or than the mesh.
     """
@@ -133,6 +136,9 @@ def helmholtz_filter(
         periods: By axis, the length of the mesh [m] where the layout repeats after it,
             `None` where it does not. Nodes at both ends have to lie opposite each other.
 
+    Returns:
+        A function of the values of the cells.
+
     Raises:
         ValueError: If the cells are not Tri3 or Quad4, or the ends of a period do not match.
     """
@@ -196,7 +202,16 @@ def heaviside_projection(
     x: Float[Array, "..."], sharpness: Numbers, threshold: Float[Array, ""] | float = 0.5
 ) -> Float[Array, "..."]:
     """Pushes densities to 0 and 1: a smooth step at `threshold`, the steeper the larger
-    `sharpness` (1 does next to nothing, 16 and more make black and white)."""
+    `sharpness` (1 does next to nothing, 16 and more make black and white).
+
+    Args:
+        x: Densities, 0 to 1.
+        sharpness: Of the step [-].
+        threshold: Density that becomes one half [-].
+
+    Returns:
+        Densities, 0 to 1.
+    """
     settings = (s if isinstance(s, float) else real(s) for s in (sharpness, threshold))
     return _projected(real(x), *settings)
 
@@ -208,7 +223,14 @@ def _projected(x, beta, eta):
 
 
 def greyness(density: Float[Array, " cells"]) -> Float[Array, ""]:
-    """Mean of 4 d (1 - d): 0 for black and white, 1 for all grey [-]."""
+    """Mean of 4 d (1 - d): 0 for black and white, 1 for all grey [-].
+
+    Args:
+        density: Of every cell, 0 to 1.
+
+    Returns:
+        The mean [-].
+    """
     return jnp.mean(4 * density * (1 - density))
 
 
@@ -216,6 +238,14 @@ def sensitivity_filtered(
     smooth: ConeFilter, x: Float[Array, " cells"], gradient: Float[Array, " cells"]
 ) -> Float[Array, " cells"]:
     """Sigmund's filter of the gradient itself, a heuristic: not the derivative of anything.
+
+    Args:
+        smooth: From `cone_filter`.
+        x: Densities.
+        gradient: Of the objective by `x`.
+
+    Returns:
+        The filtered gradient.
 
     Reference: Sigmund, "A 99 line topology optimization code written in Matlab", Struct.
     Multidisc. Optim. 21, 2001.

@@ -33,6 +33,12 @@ def linear(problem: Problem) -> Linear:
     """`problem` for small displacements: its cells, loads, springs and supports at rest.
 
     Prescribed displacements count as zero. Differentiable in every number of the problem.
+
+    Args:
+        problem: The problem.
+
+    Returns:
+        What `displacement` and `compliance` solve.
     """
     rest = jnp.zeros_like(problem.mesh.points)
     known = known_dofs(problem.supports, problem.mesh.num_nodes, problem.mesh.element.dim)
@@ -50,6 +56,14 @@ def displacement(
 
     Differentiable in `model`, `factor` and `force` (that of the problem's loads if omitted),
     at one back-substitution with the same factorisation.
+
+    Args:
+        model: From `linear`.
+        factor: Of the stiffness of each cell [-].
+        force: On every node [N].
+
+    Returns:
+        Displacement of the nodes [m].
     """
     return _solved(model, factor, model.force if force is None else force)
 
@@ -141,6 +155,13 @@ def compliance(model: Linear, factor: Float[Array, " cells"]) -> Float[Array, ""
     """Work of the loads f'u [J]: small where the body is stiff.
 
     Differentiable in `model` and `factor`; its gradient takes no further solve.
+
+    Args:
+        model: From `linear`.
+        factor: Of the stiffness of each cell [-].
+
+    Returns:
+        Work [J].
     """
     return _work(model, factor)
 

@@ -119,9 +119,14 @@ def void_pressure(
     """`VoidPressure` of `share` times `value` [Pa] on the cells of `mesh`.
 
     Args:
+        mesh: The cells.
         share: One number per cell, or per node with `per="node"`; may be traced.
         value: The pressure where the share is 1 [Pa, gauge].
-        per: "cell" (of `flooded`) or "node" (of `darcy_pressure`).
+        per: "cell" (as `flood` gives them) or "node" (as `darcy` does).
+        name: Of the load.
+
+    Returns:
+        One of the loads of a problem.
 
     Raises:
         ValueError: If `share` does not fit the mesh.
@@ -193,6 +198,9 @@ def flood(mesh: Mesh, sources: Numbers, *, threshold: float = 0.1) -> Flood:
         mesh: The cells.
         sources: Cells where the pressure enters; they count as empty.
         threshold: Density up to which a cell lets the pressure through.
+
+    Returns:
+        A function of the densities of the cells.
 
     Raises:
         ValueError: If there are no sources, or they are no cells of the mesh.
@@ -290,6 +298,9 @@ def darcy(
         drains: Nodes without pressure: the parts of the edge that lie in the open.
         depth: See `Darcy`; two cells are usual [m].
         **settings: `threshold`, `sharpness`, `tight` and `remainder` of `Darcy`.
+
+    Returns:
+        The problem, a function of the densities of the cells.
 
     Raises:
         ValueError: If there are no sources or a node is a source and a drain.

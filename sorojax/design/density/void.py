@@ -105,6 +105,9 @@ def interpolated_energy(
         factor: Of a design, `Simp()(density)` for example: 1 is solid.
         threshold: Factor at which a cell is half linear.
         sharpness: Of the change from one to the other, as in `heaviside_projection`.
+
+    Returns:
+        The material, one number per cell.
     """
     factor = real(factor)
     share = heaviside_projection(factor, sharpness, threshold)

@@ -86,6 +86,9 @@ def space(
             CPU; "conjugate_gradient", or `ConjugateGradient(...)` with settings of its own,
             iterates in the compiled program, on an accelerator too.
 
+    Returns:
+        The space, for problems on meshes of the same cells.
+
     Raises:
         ValueError: If the cells are traced: topology is fixed before any trace; or if the
             solver is not known.

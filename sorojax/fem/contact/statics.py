@@ -37,6 +37,13 @@ def update_friction(problem: Problem, u: Float[Array, "nodes dim"]) -> Problem:
 
     A rod that slips in the solid (`BondedRod`) remembers how far. Differentiable; loads
     without memory stay as they are.
+
+    Args:
+        problem: The boundary value problem.
+        u: Displacement of the nodes [m].
+
+    Returns:
+        The problem of the next step.
     """
     bare = dataclasses.replace(problem, supports=(), loads=())
 
@@ -67,6 +74,9 @@ def solve_contact(
             a trace all updates are made and nothing is raised.
         **options: Of `solve`.
 
+    Returns:
+        Displacement and status of the last solve; its problem holds the offsets.
+
     Raises:
         ConvergenceError: If `throw` and a solve failed or the overlap stayed larger.
 
@@ -91,7 +101,15 @@ def solve_contact(
 
 
 def overlap(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
-    """Largest penetration of all contacts at displacement `u` [m]."""
+    """Largest penetration of all contacts at displacement `u` [m].
+
+    Args:
+        problem: The boundary value problem.
+        u: Displacement of the nodes [m].
+
+    Returns:
+        The depth [m]; zero where nothing touches.
+    """
     loads = [load for load in problem.loads if isinstance(load, Touching)]
     if not loads:
         raise ValueError(
@@ -108,6 +126,14 @@ def contact_state(
     `.total` is the force of the obstacle on the body [N], friction included, `.active` the
     points that touch, `.torque(about)` and `.power(velocity)` [W] that of the forces. In a
     self-contact the points of both sides are listed and their forces balance.
+
+    Args:
+        problem: The boundary value problem.
+        u: Displacement of the nodes [m].
+        name: Of the contact.
+
+    Returns:
+        What the contact does at each quadrature point, and in all.
     """
     loads = [load for load in problem.loads if load.name == name]
     if not loads or not isinstance(loads[0], Touching):
@@ -127,6 +153,13 @@ def update_contact_pairs(problem: Problem, u: Float[Array, "nodes dim"]) -> Prob
     The sparse pattern, and with it the analysis of the solver, stays as long as it has room
     for the new pairs; where no list changes the problem itself is returned. Lists depend on
     concrete positions: call it outside `jit` and `grad`.
+
+    Args:
+        problem: The boundary value problem.
+        u: Displacement of the nodes [m].
+
+    Returns:
+        The problem with its new lists, or `problem` itself.
 
     Raises:
         ValueError: If positions are traced.

@@ -39,6 +39,14 @@ def contact_switching(
     """How near `motion` came to switching points, at its saved times; save every step to see
     all of them. Runs inside `jit`, `grad` (as auxiliary output) and `vmap`.
 
+    Args:
+        motion: A motion, from `simulate`.
+        share: Of the limit of friction, and of the smoothing of the contact, within which a
+            point is near to switching [-].
+
+    Returns:
+        Distances from switching, and what switched, at every saved time.
+
     Raises:
         ValueError: If the motion has no `Contact`.
     """

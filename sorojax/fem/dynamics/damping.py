@@ -148,6 +148,13 @@ def mass_matrix(
     `displacement` [m], zero if omitted. Differentiable in density, thickness, nodes and
     displacement.
 
+    Args:
+        problem: The boundary value problem.
+        displacement: At which mounted rods are [m].
+
+    Returns:
+        Entries of the matrix [kg].
+
     Raises:
         ValueError: If the material has no density.
     """
@@ -174,6 +181,12 @@ def lumped_mass(problem: Problem) -> Float[Array, " dofs"]:
     """Mass of every unknown [kg], the diagonal of the consistent matrix of each cell scaled
     to its mass; positive for every element.
 
+    Args:
+        problem: The boundary value problem.
+
+    Returns:
+        The diagonal of the mass matrix [kg].
+
     Raises:
         ValueError: If the material has no density.
     """
@@ -187,7 +200,14 @@ def lumped_mass(problem: Problem) -> Float[Array, " dofs"]:
 
 
 def total_mass(problem: Problem) -> Float[Array, ""]:
-    """Mass of the body [kg]."""
+    """Mass of the body [kg].
+
+    Args:
+        problem: The boundary value problem.
+
+    Returns:
+        Mass [kg].
+    """
     own, more = jnp.sum(_cell_masses(problem)), _of_loads(problem)
     own = own if more is None else own + jnp.sum(more)
     if not masses_of(problem):

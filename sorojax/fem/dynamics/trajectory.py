@@ -131,7 +131,14 @@ def momentum(
     motion: Trajectory,
 ) -> tuple[Float[Array, "times dim"], Float[Array, "times turns"]]:
     """Linear momentum [N s] and angular momentum about the origin [N m s] at every saved
-    time, one component in the plane and three in space, with the consistent mass."""
+    time, one component in the plane and three in space, with the consistent mass.
+
+    Args:
+        motion: A motion, from `simulate`.
+
+    Returns:
+        Linear, then angular momentum.
+    """
     problem, share = motion.problem, moving_nodes(motion.problem)
     nodal = nodal_mass(problem)
 

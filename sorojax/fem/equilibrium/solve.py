@@ -448,7 +448,16 @@ def value_of(
 
 def with_load(problem: Problem, name: str, value: Float[Array, "..."]) -> Problem:
     """`problem` with the load called `name` set to `value`, or the support of that name moved
-    by it: displacements [m] of a `Prescribed`, the angle [rad] of a `Rotated`."""
+    by it: displacements [m] of a `Prescribed`, the angle [rad] of a `Rotated`.
+
+    Args:
+        problem: The boundary value problem.
+        name: Of the load or support.
+        value: In the unit of the load.
+
+    Returns:
+        The problem with that value.
+    """
     where = value_of(problem, name)
     # a weakly typed number would compile every kernel again
     made = eqx.tree_at(where, problem, real(value))

@@ -268,6 +268,15 @@ def volume_path(
     """Equilibria for a row of volumes [m^3] of one cavity: the curve of a balloon, over its
     largest pressure. The path stops where a volume has no equilibrium; see `status`.
 
+    Args:
+        problem: The boundary value problem.
+        newton: Tolerances; `Newton()` by default.
+        max_cuts: How often a step between two volumes may be halved in a row.
+        **row: Volumes [m^3], by the name of the `Pressure` load of the cavity.
+
+    Returns:
+        Displacements [m], pressures [Pa] and how each search ended.
+
     Raises:
         ValueError: If not exactly one pressure of the problem is named, or the body softens.
     """

@@ -246,7 +246,16 @@ def mean_rotation(
     axis: Float[Array, "3"] | None = None,
 ) -> Float[Array, ""]:
     """Angle [rad] about `axis` by which points `X` turn to come closest to `x`, each about
-    their centre, in (-pi, pi]."""
+    their centre, in (-pi, pi].
+
+    Args:
+        X: Points in the reference configuration [m].
+        x: The same points after the motion [m].
+        axis: Of the rotation, in space.
+
+    Returns:
+        The angle [rad].
+    """
     a, b = (p - jnp.mean(p, axis=0, keepdims=True) for p in (X, x))
     if axis is None:
         sine = jnp.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])

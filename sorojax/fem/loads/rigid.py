@@ -108,6 +108,9 @@ def rigid(
         stiffness: Of the tie of one node [N/m].
         name: Name of the term.
 
+    Returns:
+        One of the loads of a problem.
+
     Raises:
         ValueError: If fewer than two nodes are named, or all are at one place.
     """

@@ -171,6 +171,13 @@ class Route(eqx.Module):
 def route(mesh: Mesh, points: Float[np.ndarray, "points dim"]) -> Route:
     """The way of a tendon through `points` [m] of the reference configuration, in order.
 
+    Args:
+        mesh: The mesh.
+        points: In order [m]; a tendon is fixed to the last one.
+
+    Returns:
+        The way, as `Tendon`, `Cable` and embedded rods take it.
+
     Raises:
         ValueError: If there are fewer than two points, two in a row are the same, or one
             lies outside the mesh.
@@ -192,7 +199,16 @@ def route(mesh: Mesh, points: Float[np.ndarray, "points dim"]) -> Route:
 
 
 def tendon_length(mesh: Mesh, u: Float[Array, "nodes dim"], route: Route) -> Float[Array, ""]:
-    """Length of the polyline of a tendon at displacement `u` [m]."""
+    """Length of the polyline of a tendon at displacement `u` [m].
+
+    Args:
+        mesh: The mesh.
+        u: Displacement of the nodes [m].
+        route: The way of the tendon.
+
+    Returns:
+        Length [m].
+    """
     return jnp.sum(route.lengths(mesh.points + u))
 
 
@@ -276,7 +292,16 @@ class Cable(AbstractLoad):
 
 def tension(problem: "Problem", u: Float[Array, "nodes dim"], name: str) -> Float[Array, ""]:
     """Tension [N] in the tendon or cable called `name`, the sum over the springs of one
-    term."""
+    term.
+
+    Args:
+        problem: The boundary value problem.
+        u: Displacement of the nodes [m].
+        name: Of the tendon or cable.
+
+    Returns:
+        Tension [N].
+    """
     load = next(load for load in problem.loads if load.name == name)
     if isinstance(load, Tendon):
         return load.tension

@@ -102,7 +102,16 @@ def with_imperfection(
     problem: Problem, shape: Float[Array, "nodes dim"], amplitude: float
 ) -> Problem:
     """`problem` with its nodes moved, free of stress, by `shape` scaled to a largest entry
-    of `amplitude` [m]: the seed that makes a path follow a buckling mode."""
+    of `amplitude` [m]: the seed that makes a path follow a buckling mode.
+
+    Args:
+        problem: The boundary value problem.
+        shape: Displacement of the nodes, in any scale.
+        amplitude: Its largest entry [m].
+
+    Returns:
+        The problem on the mesh with these nodes.
+    """
     shape = real(shape)
     check_state("fem.with_imperfection", problem, shape)
     moved = problem.mesh.points + amplitude * shape / jnp.max(jnp.abs(shape))

@@ -337,6 +337,9 @@ def tangent_modes(
         displacement: The equilibrium [m]; at rest when omitted.
         count: Number of eigenvalues.
 
+    Returns:
+        Eigenvalues [N/m], rising, and their modes.
+
     Raises:
         ValueError: If `count` is no possible number.
     """
@@ -380,7 +383,15 @@ def _signed(shapes: np.ndarray) -> np.ndarray:
 def modal_displacement(
     modes: Modes, coordinates: Float[Array, "... modes"]
 ) -> Float[Array, "... nodes dim"]:
-    """Displacement [m] of modal coordinates q: u = u_0 + sum_k q_k phi_k."""
+    """Displacement [m] of modal coordinates q: u = u_0 + sum_k q_k phi_k.
+
+    Args:
+        modes: Modes, from `eigenmodes`.
+        coordinates: One per mode; axes in front are samples.
+
+    Returns:
+        Displacement of the nodes [m].
+    """
     moved = jnp.tensordot(real(coordinates), modes.shapes, axes=1)
     lead = (1,) * (moved.ndim - 2)
     return modes.displacement.reshape(*lead, *modes.displacement.shape) + moved
@@ -388,14 +399,30 @@ def modal_displacement(
 
 def modal_force(modes: Modes, force: Float[Array, "nodes dim"]) -> Float[Array, " modes"]:
     """Generalised force phi_k . f of a nodal force [N]; with unit modal mass the reduced
-    motion is q'' + omega^2 q = phi . f."""
+    motion is q'' + omega^2 q = phi . f.
+
+    Args:
+        modes: Modes, from `eigenmodes`.
+        force: On every node [N].
+
+    Returns:
+        One generalised force per mode.
+    """
     return jnp.einsum("kni,ni->k", modes.shapes, real(force))
 
 
 def modal_coordinates(
     modes: Modes, displacement: Float[Array, "nodes dim"]
 ) -> Float[Array, " modes"]:
-    """Modal coordinates of a displacement: phi_k' M (u - u_0), for modes of `eigenmodes`."""
+    """Modal coordinates of a displacement: phi_k' M (u - u_0), for modes of `eigenmodes`.
+
+    Args:
+        modes: Modes, from `eigenmodes`.
+        displacement: Of the nodes [m].
+
+    Returns:
+        One coordinate per mode.
+    """
     system = modes.problem.space.system
     moved = (real(displacement) - modes.displacement).ravel()
     mass = mass_matrix(modes.problem, modes.displacement)

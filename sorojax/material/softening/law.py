@@ -176,6 +176,9 @@ def dissipated_energy(softening: Softening, peak: Numbers) -> Float[Array, "..."
         softening: The rubber; its own `peak` plays no part.
         peak: Largest energy of the first loading [J/m^3].
 
+    Returns:
+        Energy per reference volume [J/m^3].
+
     Example:
         >>> rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.45)
         >>> soft = material.Softening(rubber, r=2.0, m=2e4)

@@ -168,6 +168,15 @@ def from_polygon(
 ) -> Mesh:
     """Triangles inside a polygon [m] with holes; every corner becomes a node.
 
+    Args:
+        outer: Corners of the outline [m].
+        holes: Corners of each hole [m].
+        size: Wanted length of the sides [m], a number or a function of points.
+        order: 1 for `Tri3`, 2 for `Tri6`.
+
+    Returns:
+        The mesh, points [m].
+
     Raises:
         ValueError: If a ring has fewer than 3 corners, or rings touch or cross.
     """
@@ -200,6 +209,9 @@ def from_image(
         order: 1 for `Tri3`, 2 for `Tri6`.
         level: Grey level of the outline; midway between darkest and brightest if omitted.
         smooth: Largest distance of the outline from the contour [pixels].
+
+    Returns:
+        The mesh, points [m].
     """
     return triangulate(
         image_shape(image, pixel=pixel, level=level, smooth=smooth), size=size, order=order
@@ -209,7 +221,17 @@ def from_image(
 def image_shape(
     image: Numbers, *, pixel: float, level: float | None = None, smooth: float = 0.35
 ) -> AbstractSdf:
-    """The bright part of a picture as polygons minus their holes."""
+    """The bright part of a picture as polygons minus their holes.
+
+    Args:
+        image: Grey levels, rows from top to bottom.
+        pixel: Side of a pixel [m].
+        level: Grey level of the outline; midway between darkest and brightest if omitted.
+        smooth: Largest distance of the outline from the contour [pixels].
+
+    Returns:
+        The shape.
+    """
     from skimage.measure import approximate_polygon, find_contours
 
     image = np.asarray(image, dtype=float)

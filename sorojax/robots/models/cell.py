@@ -300,6 +300,9 @@ def unit_cell(
         size: Of the boxes [m]; half a wall is good.
         mirrors: Other axes (1: y, 2: z) about whose zero the body is its own mirror image;
             each halves the work.
+
+    Returns:
+        Its stiffness, and what its gas does, per length of rod.
     """
     lower, upper = (np.array(corner) for corner in body.bounding_box())
     lower[0], upper[0] = span

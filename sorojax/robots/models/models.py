@@ -59,7 +59,11 @@ class Making(NamedTuple):
 
 
 def printed_rubber() -> AbstractHyperelastic:
-    """The preset "elastic_80a" at a Poisson's ratio of 0.49, with a density."""
+    """The preset "elastic_80a" at a Poisson's ratio of 0.49, with a density.
+
+    Returns:
+        The material.
+    """
     rubber = materials.presets.rubber("elastic_80a", poisson_ratio=0.49)
     return replace(rubber, lambda m: m.density, DENSITY)
 
@@ -90,6 +94,9 @@ def model(
         size: Of the boxes on which a cell is solved [m]; half its wall if omitted.
         modes: Of the bending of actuators and fingers.
 
+    Returns:
+        The network with what a board sees of it.
+
     Raises:
         TypeError: If there is no model of `robot`.
     """
@@ -106,6 +113,10 @@ def bench(name: str, period: float = 5e-3, **options: Any) -> tuple[Advance, Run
         name: "bending", "planar", "hand" or "manipulator".
         period: Of every step [s].
         **options: Of `model`.
+
+    Returns:
+        `advance`, the state to start from, and the lowest and highest pressure of each port
+        [Pa].
 
     Raises:
         ValueError: If there is no such robot.

@@ -139,6 +139,9 @@ def with_pneumatics(
             `PART_volume` and `PART_volume_rate` of every part that a port names.
         ports: By name.
         supply: Tubes and regulators; `Supply()` if omitted.
+
+    Returns:
+        The network with its supply.
     """
     supply = Supply() if supply is None else supply
     blocks: dict[str, Any] = {"body": body}
@@ -313,6 +316,9 @@ def rod_stepper(
         ports: Number of pressures.
         lag: Time constant of the valves [s].
         stepper: `GeneralisedAlpha()` if omitted.
+
+    Returns:
+        `advance`, and the state to start from.
     """
     _check.positive("rod_stepper", "lag", lag, "s", "Small regulators take 0.03.")
     step, delay = GeneralisedAlpha() if stepper is None else stepper, real(lag)

@@ -377,13 +377,29 @@ class ObstacleContact(AbstractContact):
 
 @jit_public
 def contact_energy(contact: AbstractContact, motion: RodState) -> Float[Array, ""]:
-    """Energy stored in a contact [J]."""
+    """Energy stored in a contact [J].
+
+    Args:
+        contact: The contact.
+        motion: State of the rod, from `motion`.
+
+    Returns:
+        Energy [J].
+    """
     return contact.stored(motion)
 
 
 @jit_public
 def penetration(contact: AbstractContact, motion: RodState) -> Float[Array, ""]:
-    """Largest overlap of the surfaces [m]; zero without contact."""
+    """Largest overlap of the surfaces [m]; zero without contact.
+
+    Args:
+        contact: The contact.
+        motion: State of the rod, from `motion`.
+
+    Returns:
+        The depth [m].
+    """
     gap = contact.touch(motion).gap
     return jnp.maximum(-jnp.min(gap), jnp.zeros((), gap.dtype))
 

@@ -37,13 +37,30 @@ PULL = 50.0  # 1/s, at which closures that a step has opened go back where nothi
 
 @jit_public
 def mass_matrix(model: Model, q: Coordinates) -> Float[Array, "dof dof"]:
-    """Inertia of the model in its coordinates."""
+    """Inertia of the model in its coordinates.
+
+    Args:
+        model: The rod or assembly.
+        q: Coordinates.
+
+    Returns:
+        The matrix M(q), symmetric and positive definite.
+    """
     return inertia(motion(model, q))[0]
 
 
 @jit_public
 def coriolis_force(model: Model, q: Coordinates, v: Rates) -> Rates:
-    """C(q, v) v: what velocity alone adds to the left of the equations of motion."""
+    """C(q, v) v: what velocity alone adds to the left of the equations of motion.
+
+    Args:
+        model: The rod or assembly.
+        q: Coordinates.
+        v: Their rates, per second.
+
+    Returns:
+        Generalised force, on the left of the equations of motion.
+    """
     return inertia(motion(model, q, v))[1]
 
 
@@ -55,33 +72,69 @@ def gravity_force(model: Model, q: Coordinates, gravity: Numbers | None = None) 
         model: The rod or assembly.
         q: Coordinates.
         gravity: [m/s^2]; by default 9.81 against the last axis.
+
+    Returns:
+        Generalised force, on the left of the equations of motion.
     """
     return -loads.weight(Gravity(gravity), _zero(q), motion(model, q))
 
 
 @jit_public
 def bias_force(model: Model, q: Coordinates, v: Rates, gravity: Numbers | None = None) -> Rates:
-    """C(q, v) v + g(q), what a computed-torque controller cancels."""
+    """C(q, v) v + g(q), what a computed-torque controller cancels.
+
+    Args:
+        model: The rod or assembly.
+        q: Coordinates.
+        v: Their rates, per second.
+        gravity: Acceleration [m/s^2]; by default 9.81 against the last axis.
+
+    Returns:
+        Generalised force, on the left of the equations of motion.
+    """
     moment = motion(model, q, v)
     return inertia(moment)[1] - loads.weight(Gravity(gravity), _zero(q), moment)
 
 
 @jit_public
 def stiffness_matrix(model: Model) -> Float[Array, "dof dof"]:
-    """Stiffness of the linear elasticity of rods and joints."""
+    """Stiffness of the linear elasticity of rods and joints.
+
+    Args:
+        model: The rod or assembly.
+
+    Returns:
+        The matrix K; its force is K q on the left of the equations of motion.
+    """
     return operators(model).stiffness
 
 
 @jit_public
 def elastic_force(model: Model, q: Coordinates) -> Rates:
-    """K q, on the left of the equations of motion."""
+    """K q, on the left of the equations of motion.
+
+    Args:
+        model: The rod or assembly.
+        q: Coordinates.
+
+    Returns:
+        Generalised force, on the left of the equations of motion.
+    """
     moment = motion(model, q)
     return -loads.total_force((), _zero(q), moment)
 
 
 @jit_public
 def damping_matrix(model: Model, forces: Forces) -> Float[Array, "dof dof"]:
-    """Sum of the damping terms among `forces` and of the dampers of joints."""
+    """Sum of the damping terms among `forces` and of the dampers of joints.
+
+    Args:
+        model: The rod or assembly.
+        forces: Generalised forces beside elasticity.
+
+    Returns:
+        The matrix D; its force is -D v.
+    """
     return loads.damping_matrix(forces, model, operators(model))
 
 
@@ -146,7 +199,20 @@ def acceleration(
     pull: float = 0.0,
 ) -> Rates:
     """`forward_dynamics` uncompiled, for loops that hold `operators(model)`; with a `pull`
-    [1/s] back on closures that have opened."""
+    [1/s] back on closures that have opened.
+
+    Args:
+        model: The rod or assembly.
+        constants: `operators(model)`.
+        t: Time [s].
+        q: Coordinates.
+        v: Their rates, per second.
+        forces: Generalised forces beside elasticity.
+        pull: Rate at which closures that have opened are pulled back [1/s].
+
+    Returns:
+        Accelerations, the rates of `v`.
+    """
     moment = motion(model, q, v, constants=constants)
     mass, coriolis = inertia(moment)
     force = loads.total_force(forces, t, moment) - coriolis
@@ -162,6 +228,17 @@ def inverse_dynamics(
     """Generalised force that an actuator must add to reach the acceleration `a`.
 
     Where closures bear a part of it, the smallest one, in the metric of the inverse mass.
+
+    Args:
+        model: The rod or assembly.
+        q: Coordinates.
+        v: Their rates, per second.
+        a: Accelerations wanted.
+        forces: Generalised forces beside elasticity.
+        t: Time at which the forces act [s].
+
+    Returns:
+        The generalised force of the actuator.
     """
     moment = motion(model, q, v)
     mass, coriolis = inertia(moment)
@@ -194,7 +271,15 @@ class VectorField(eqx.Module):
 
 
 def vector_field(model: Model, forces: Forces = ()) -> VectorField:
-    """The equations of first order of a model, for any solver of diffrax."""
+    """The equations of first order of a model, for any solver of diffrax.
+
+    Args:
+        model: The rod or assembly.
+        forces: Generalised forces beside elasticity.
+
+    Returns:
+        A function of (t, (q, v), args), which returns the rates of q and v.
+    """
     return VectorField(model, operators(model), forces)
 
 
@@ -209,7 +294,16 @@ def _zero(q: Coordinates) -> Float[Array, ""]:
 def kinetic_energy(
     model: Model, q: Float[Array, " coordinates"], v: Float[Array, " dof"]
 ) -> Float[Array, ""]:
-    """v' M v / 2 [J]."""
+    """v' M v / 2 [J].
+
+    Args:
+        model: The rod or assembly.
+        q: Coordinates.
+        v: Their rates, per second.
+
+    Returns:
+        Energy [J].
+    """
     return v @ inertia(motion(model, q))[0] @ v / 2
 
 
@@ -217,7 +311,16 @@ def kinetic_energy(
 def potential_energy(
     model: Model, q: Float[Array, " coordinates"], gravity: Numbers | None = None
 ) -> Float[Array, ""]:
-    """Linear elastic energy [J], and that of the weight in `gravity` [m/s^2] if given."""
+    """Linear elastic energy [J], and that of the weight in `gravity` [m/s^2] if given.
+
+    Args:
+        model: The rod or assembly.
+        q: Coordinates.
+        gravity: Acceleration [m/s^2]; without it weight is left out.
+
+    Returns:
+        Energy [J].
+    """
     moment = motion(model, q)
     strains = increments(model, q)
     energy = strains @ moment.operators.stiffness @ strains / 2
@@ -235,7 +338,16 @@ def potential_energy(
 def momentum(
     model: Model, q: Float[Array, " coordinates"], v: Float[Array, " dof"]
 ) -> Float[Array, " twist"]:
-    """Angular momentum about the origin [kg m^2/s], then linear momentum [kg m/s]."""
+    """Angular momentum about the origin [kg m^2/s], then linear momentum [kg m/s].
+
+    Args:
+        model: The rod or assembly.
+        q: Coordinates.
+        v: Their rates, per second.
+
+    Returns:
+        Angular, then linear momentum, in the axes of the ground.
+    """
     return functools.reduce(
         jnp.add, [_momentum(part) for part, _ in _parts(motion(model, q, v))]
     )
@@ -245,7 +357,16 @@ def momentum(
 def part_momenta(
     model: Assembly, q: Float[Array, " coordinates"], v: Float[Array, " dof"]
 ) -> dict[str, Float[Array, " twist"]]:
-    """`momentum` of every part by name, all about the origin of the ground."""
+    """`momentum` of every part by name, all about the origin of the ground.
+
+    Args:
+        model: The assembly.
+        q: Coordinates.
+        v: Their rates, per second.
+
+    Returns:
+        Angular [kg m^2/s], then linear momentum [kg m/s] of each part.
+    """
     parts = [_momentum(part) for part, _ in _parts(motion(model, q, v))]
     return dict(zip(model.names, parts, strict=True))
 
@@ -265,6 +386,14 @@ def coriolis_matrix(
     model: Model, q: Float[Array, " coordinates"], v: Float[Array, " dof"]
 ) -> Float[Array, "dof dof"]:
     """C(q, v) with C v the Coriolis force, and dM/dt - 2 C skew-symmetric.
+
+    Args:
+        model: The rod or assembly.
+        q: Coordinates.
+        v: Their rates, per second.
+
+    Returns:
+        The matrix C.
 
     Reference:
         Murray, Li, Sastry, A Mathematical Introduction to Robotic Manipulation, 1994,

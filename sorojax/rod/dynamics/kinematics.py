@@ -42,6 +42,9 @@ def strain(
         rod: The rod.
         q: Coordinates.
         s: Where, in [0, 1]; the Gauss nodes if omitted.
+
+    Returns:
+        One strain per place.
     """
     rest, rows = strains_at(rod, None if s is None else real(s).astype(q.dtype))
     return rest + rows @ q
@@ -132,6 +135,10 @@ def jacobian(
         model: The rod; of an assembly the Jacobians of every part by name, one for a link.
         q: Coordinates.
         s: Where, in [0, 1]; the Gauss nodes if omitted.
+
+    Returns:
+        One matrix per place, of six rows in space and three in the plane; by part for an
+        assembly.
     """
     if isinstance(model, Rod):
         return _jacobian(rod_motion(model, q), s)
@@ -156,6 +163,9 @@ def jacobian_rate_product(
         q: Coordinates.
         v: Their rates.
         s: Where, in [0, 1]; the Gauss nodes if omitted.
+
+    Returns:
+        One twist rate per place; by part for an assembly.
     """
     if isinstance(model, Rod):
         return _rate_product(rod_motion(model, q, v), s, None)
@@ -173,7 +183,14 @@ def jacobian_rate_product(
 
 def tip_angle(moment: RodState) -> Float[Array, ""]:
     """Angle of the last section of a planar rod on its base [rad], continuous past half a
-    turn."""
+    turn.
+
+    Args:
+        moment: State of a planar rod, from `motion`.
+
+    Returns:
+        The angle [rad].
+    """
     if moment.rod.group.space_dim != 2:
         raise ValueError("tip_angle: needs a planar rod, got a spatial one. Use tip_pose.")
     bending = moment.angular_rate[:, 0] @ moment.q

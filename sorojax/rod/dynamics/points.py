@@ -91,7 +91,15 @@ class Points(eqx.Module):
 
 
 def points(motion: RodState, s: Float[Array, " points"] | np.ndarray) -> Points:
-    """The points of `motion` at `s` in [0, 1]; a NumPy `s` makes constants."""
+    """The points of `motion` at `s` in [0, 1]; a NumPy `s` makes constants.
+
+    Args:
+        motion: State of the rod, from `motion`.
+        s: Places along the rod, in [0, 1].
+
+    Returns:
+        Position, velocity, spin, directors and Jacobians at each.
+    """
     return Points(motion, from_base(motion.rod, s))
 
 

@@ -194,7 +194,18 @@ def second_order(
 ) -> SecondOrder:
     """The equations of the model, with its stiffness at `q` and its damping, its branches
     with what they remember, relaxed at `q` by default, and its closures, which hold at `q` and
-    time `t` [s]."""
+    time `t` [s].
+
+    Args:
+        model: The rod or assembly.
+        q: Coordinates at which stiffness and damping are taken.
+        forces: Generalised forces beside elasticity.
+        memory: What the branches of a `Relaxation` remember there.
+        t: Time [s].
+
+    Returns:
+        What a stepper of second order integrates.
+    """
     constants = operators(model)
     branches = memory_terms(model, forces, constants, q, memory)
     forces = on_model(relaxed(forces), model)

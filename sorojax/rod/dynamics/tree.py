@@ -262,7 +262,15 @@ def in_own_frames(
 
 def part_motion(moment: AssemblyState, index: int) -> Any:
     """A part in the world frame, a `RodState` or a `LinkState`; its columns are its own twist
-    and coordinates."""
+    and coordinates.
+
+    Args:
+        moment: State of the assembly, from `motion`.
+        index: Number of the part, in the order of the assembly.
+
+    Returns:
+        The state of the part.
+    """
     rotation, position, twist = moment.frames[index]
     body = moment.assembly.parts[index].body
     if isinstance(body, Rod):

@@ -307,6 +307,9 @@ def section_law(
         stress: (strain beyond that at rest, s) -> moments [N m] and forces [N], both in the
             order of `strain_names(rod.group)`. The gradient of an energy per length keeps
             energy.
+
+    Returns:
+        The law, one of the forces of `equilibrium` or `rollout`.
     """
     s = jnp.asarray(gauss_legendre(rod.quadrature)[0], rod.length.dtype)
     return SectionLaw(stress, *_rows(rod), s)

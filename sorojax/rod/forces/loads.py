@@ -72,7 +72,16 @@ Load = AbstractForce | PartForce | PairForce | JointEffort
 def total_force(
     forces: tuple[Load, ...], t: Float[Array, ""], motion: RodState | AssemblyState
 ) -> Float[Array, " dof"]:
-    """Sum of the listed forces and of the elasticity of rods and joints."""
+    """Sum of the listed forces and of the elasticity of rods and joints.
+
+    Args:
+        forces: Generalised forces beside elasticity.
+        t: Time [s].
+        motion: State of the model, from `motion`.
+
+    Returns:
+        Generalised force, on the right of the equations of motion.
+    """
     if isinstance(motion, RodState):
         return one.total_force(plain(forces, motion.rod.group), t, motion)
     total = gather(motion, part_loads(forces, t, motion))

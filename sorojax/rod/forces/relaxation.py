@@ -303,6 +303,9 @@ def branch_force(
         forces: With a `Relaxation`, as for `branch_states`.
         q: Coordinates.
         memory: What the branches remember there.
+
+    Returns:
+        Generalised force, on the right of the equations of motion.
     """
     branches = _some("branch_force", model, forces)
     return _each(branches, lambda x, z: borne(branches, x, z), model, q, memory)
@@ -323,6 +326,9 @@ def branch_energy(
         forces: With a `Relaxation`, as for `branch_states`.
         q: Coordinates, of one state or many.
         memory: What the branches remember there.
+
+    Returns:
+        Stored energy [J] and dissipated power [W] of each state.
     """
     branches = _some("branch_energy", model, forces)
 

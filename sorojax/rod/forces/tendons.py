@@ -162,7 +162,16 @@ def thread_length(thread: Thread, q: Float[Array, " dof"]) -> Float[Array, ""]:
 def thread_lengths(
     rod: Rod, routes: tuple[AbstractRoute, ...], q: Float[Array, " dof"]
 ) -> Float[Array, " threads"]:
-    """Lengths [m] of the threads in `rod`."""
+    """Lengths [m] of the threads in `rod`.
+
+    Args:
+        rod: The rod.
+        routes: The routings of the threads.
+        q: Coordinates.
+
+    Returns:
+        Lengths [m], one per thread.
+    """
     return jnp.stack([thread_length(thread(rod, route), q) for route in routes])
 
 
@@ -173,7 +182,17 @@ def thread_rates(
     q: Float[Array, " dof"],
     v: Float[Array, " dof"],
 ) -> Float[Array, " threads"]:
-    """Rates [m/s] of the lengths of the threads."""
+    """Rates [m/s] of the lengths of the threads.
+
+    Args:
+        rod: The rod.
+        routes: The routings of the threads.
+        q: Coordinates.
+        v: Their rates, per second.
+
+    Returns:
+        Rates [m/s], one per thread.
+    """
     return jax.jvp(lambda q: thread_lengths(rod, routes, q), (q,), (v,))[1]
 
 
@@ -316,6 +335,14 @@ def thread_chambers(
 
     One routing gives a scalar port, a tuple one port per chamber. The map is of this rod:
     build it again, inside a trace too, where the rod changes.
+
+    Args:
+        rod: The rod.
+        routes: One routing, or a tuple of them.
+        areas: Cross-section of each chamber [m^2].
+
+    Returns:
+        The pressure map, for `Pressurised`.
 
     Raises:
         ValueError: If an area is not positive or their number is not that of the routings.

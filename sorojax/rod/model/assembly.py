@@ -132,6 +132,9 @@ def serial(*rods: Rod, joint: AbstractJoint | None = None) -> Assembly:
     Args:
         *rods: The segments, from the base on.
         joint: Between the ground and the first; clamped if omitted.
+
+    Returns:
+        The assembly.
     """
     if not rods:
         raise ValueError("serial: got no rod, need one or more.")
@@ -207,7 +210,14 @@ def closure_ends(assembly: Assembly) -> tuple[int | None, ...]:
 
 
 def slices(assembly: Assembly) -> tuple[Slices, ...]:
-    """Where each part has its coordinates and rates."""
+    """Where each part has its coordinates and rates.
+
+    Args:
+        assembly: The assembly.
+
+    Returns:
+        Slices of q and v, of the joint and of the rod, one entry per part.
+    """
     found, q, v, group = [], 0, 0, assembly.group
     for part in assembly.parts:
         body = part.body.basis.num_dof if isinstance(part.body, Rod) else 0
@@ -222,12 +232,26 @@ def slices(assembly: Assembly) -> tuple[Slices, ...]:
 
 
 def num_coordinates(model: Rod | Assembly) -> int:
-    """Length of q."""
+    """Length of q.
+
+    Args:
+        model: The rod or assembly.
+
+    Returns:
+        The number of coordinates.
+    """
     return model.basis.num_dof if isinstance(model, Rod) else slices(model)[-1].rod_q.stop
 
 
 def num_dof(model: Rod | Assembly) -> int:
-    """Length of v, and of generalised forces."""
+    """Length of v, and of generalised forces.
+
+    Args:
+        model: The rod or assembly.
+
+    Returns:
+        The number of rates.
+    """
     return model.basis.num_dof if isinstance(model, Rod) else slices(model)[-1].rod_v.stop
 
 
@@ -238,7 +262,14 @@ def _(model: Rod | Assembly) -> dict[str, int]:
 
 
 def rest(model: Rod | Assembly) -> Float[Array, " coordinates"]:
-    """Coordinates at which rods are unstrained and joints at rest."""
+    """Coordinates at which rods are unstrained and joints at rest.
+
+    Args:
+        model: The rod or assembly.
+
+    Returns:
+        The coordinates.
+    """
     dtype = dtype_of(model)
     if isinstance(model, Rod):
         return jnp.zeros(model.basis.num_dof, dtype)

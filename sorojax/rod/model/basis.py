@@ -113,7 +113,15 @@ class StrainBasis(eqx.Module):
 
 
 def columns(basis: StrainBasis, name: str) -> slice:
-    """Where the coordinates of strain `name` lie in q."""
+    """Where the coordinates of strain `name` lie in q.
+
+    Args:
+        basis: The strain basis.
+        name: Of an active strain, `kappa_z` for example.
+
+    Returns:
+        A slice of q.
+    """
     if name not in basis.modes:
         raise ValueError(
             f"columns: the strain `{name}` is not active, need one of "
@@ -271,6 +279,9 @@ def functions(
         breaks: Where they jump or kink, in (0, 1).
         modes: A function from points to (points, modes), or one function per mode.
 
+    Returns:
+        The basis; a coordinate has the unit of its strain, [1/m] or [-].
+
     Raises:
         ValueError: If a function gives another shape.
     """
@@ -336,6 +347,12 @@ def orthonormalise(basis: StrainBasis) -> StrainBasis:
 
     They span what the modes of `basis` span, and mode k uses the first k of them only.
 
+    Args:
+        basis: The strain basis.
+
+    Returns:
+        The basis that spans the same strains.
+
     Raises:
         ValueError: If the modes of a strain depend on each other.
     """
@@ -365,6 +382,9 @@ def fitted(basis: StrainBasis, to: AbstractModes) -> StrainBasis:
     Args:
         basis: Modes; those that are not sampled stay as they are.
         to: What to combine, e.g. `Legendre(12)` or `BSpline((0.25, 0.5, 0.75))`.
+
+    Returns:
+        The basis with the same strains and as many modes of each.
 
     Raises:
         ValueError: If there are fewer samples than modes in `to`.

@@ -70,6 +70,10 @@ def motion(
         q: Coordinates.
         v: Their rates; zero if omitted.
         constants: `operators(model)`, if a loop has them already.
+
+    Returns:
+        A `RodState`, or an `AssemblyState` of an assembly; what is not read of it is not
+        computed.
     """
     if isinstance(model, Assembly):
         return assembly_motion(model, q, v, constants)
@@ -80,7 +84,14 @@ def motion(
 def inertia(
     moment: RodState | AssemblyState,
 ) -> tuple[Float[Array, "dof dof"], Float[Array, " dof"]]:
-    """Mass matrix and Coriolis force of a moment."""
+    """Mass matrix and Coriolis force of a moment.
+
+    Args:
+        moment: State of the model, from `motion`.
+
+    Returns:
+        The mass matrix M(q), and the force C(q, v) v.
+    """
     if isinstance(moment, AssemblyState):
         return assembly_inertia(moment)
     return rod_inertia(moment)

@@ -101,22 +101,50 @@ def chebyshev(**modes: int) -> StrainBasis:
 
 
 def legendre(**modes: int) -> StrainBasis:
-    """Legendre modes per strain: `legendre(kappa_z=4, sigma_x=1)`."""
+    """Legendre modes per strain: `legendre(kappa_z=4, sigma_x=1)`.
+
+    Args:
+        **modes: Number of modes of each strain, by its name.
+
+    Returns:
+        The basis.
+    """
     return _basis("legendre", Legendre, modes)
 
 
 def bernstein(**modes: int) -> StrainBasis:
-    """Bernstein modes per strain: `bernstein(kappa_z=4)` are cubics."""
+    """Bernstein modes per strain: `bernstein(kappa_z=4)` are cubics.
+
+    Args:
+        **modes: Number of modes of each strain, by its name.
+
+    Returns:
+        The basis.
+    """
     return _basis("bernstein", Bernstein, modes)
 
 
 def fourier(**modes: int) -> StrainBasis:
-    """Fourier modes per strain: `fourier(kappa_z=5)` has two full waves."""
+    """Fourier modes per strain: `fourier(kappa_z=5)` has two full waves.
+
+    Args:
+        **modes: Number of modes of each strain, by its name.
+
+    Returns:
+        The basis.
+    """
     return _basis("fourier", Fourier, modes)
 
 
 def constant(*names: str) -> StrainBasis:
-    """One constant mode per strain: `constant("kappa_z", "sigma_x")`."""
+    """One constant mode per strain: `constant("kappa_z", "sigma_x")`.
+
+    Args:
+        *names: Of the active strains.
+
+    Returns:
+        The basis, of one coordinate per strain.
+    """
     return StrainBasis({name: Legendre(1) for name in names})
 
 
@@ -182,6 +210,9 @@ def piecewise(basis: StrainBasis, segments: int | Sequence[float]) -> StrainBasi
         basis: Modes of one segment.
         segments: Number of equal segments, or where they meet in (0, 1).
 
+    Returns:
+        The basis of as many segments, each with the modes of `basis`.
+
     Raises:
         ValueError: If there are no segments, or the joints do not rise inside (0, 1).
     """
@@ -221,6 +252,12 @@ def piecewise_linear(**knots: int) -> StrainBasis:
     """Continuous, linear between the values at equal knots: `piecewise_linear(kappa_z=4)`.
 
     For linear strains that may jump use `piecewise(legendre(kappa_z=2), segments)`.
+
+    Args:
+        **knots: Number of knots of each strain, by its name, both ends among them.
+
+    Returns:
+        The basis; a coordinate is the strain at a knot.
     """
     counts = each_count("piecewise_linear", knots)
     few = [name for name, count in counts.items() if count < 2]

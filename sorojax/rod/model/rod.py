@@ -51,6 +51,12 @@ class Elastic(eqx.Module):
 def elastic(material: AbstractHyperelastic) -> Elastic:
     """Small-strain constants of a hyperelastic material.
 
+    Args:
+        material: Hyperelastic, with a density.
+
+    Returns:
+        Young's modulus [Pa], Poisson's ratio [-] and density [kg/m^3].
+
     Raises:
         ValueError: If the material has no density.
     """
@@ -269,5 +275,12 @@ def _check_field(name: str, value: Any, nodes: int) -> None:
 
 
 def strain_names(group: SE2 | SE3) -> tuple[str, ...]:
-    """Names of the strain components in their order."""
+    """Names of the strain components in their order.
+
+    Args:
+        group: `SE2()` or `SE3()`.
+
+    Returns:
+        The names, as `chebyshev` takes them.
+    """
     return _PLANAR if group.space_dim == 2 else STRAINS

@@ -84,7 +84,15 @@ class Section(eqx.Module):
 
 
 def scaled(section: Section, factor: Numbers) -> Section:
-    """The same shape `factor` times as large [-]; an array gives one section per entry."""
+    """The same shape `factor` times as large [-]; an array gives one section per entry.
+
+    Args:
+        section: The section.
+        factor: Ratio of lengths [-].
+
+    Returns:
+        The section of that size.
+    """
     factor = real(factor)
     _check.positive("scaled", "factor", factor, "-", "1 leaves the section as it is.")
     return Section(
@@ -108,6 +116,9 @@ def taper(
         section: Makes a section of sizes, e.g. `circle`, or `lambda k: scaled(made, k)`.
         start: Size [m] at the base, or a tuple with one per argument of `section`.
         end: The same at the tip.
+
+    Returns:
+        A function of s in [0, 1] that `rod` takes in place of a section.
 
     Raises:
         ValueError: If `start` and `end` hold different numbers of sizes.
@@ -166,6 +177,14 @@ def _disc(radius):
 def ring(radius: Numbers, inner_radius: Numbers, *, poisson_ratio=0.5) -> Section:
     """A tube of outer `radius` and `inner_radius` [m].
 
+    Args:
+        radius: Outer radius [m].
+        inner_radius: Inner radius [m].
+        poisson_ratio: Poisson's ratio in the shear factor [-].
+
+    Returns:
+        The constants of the section.
+
     Reference:
         Shear factor: Cowper, J. Appl. Mech. 33, 1966.
     """
@@ -194,6 +213,9 @@ def rectangle(width: Numbers, height: Numbers, *, shear_factor=5 / 6) -> Section
         height: Size along local y [m], in the plane of a planar rod.
         shear_factor: Share of the area that carries shear [-]; 10 (1 + nu) / (12 + 11 nu)
             after Cowper, of which the default is the value at nu = 0.
+
+    Returns:
+        The constants of the section.
 
     Reference:
         Torsion by Saint-Venant's series, exact to rounding: Timoshenko, Goodier, Theory of
@@ -231,6 +253,9 @@ def ellipse(half_width: Numbers, half_height: Numbers, *, poisson_ratio=0.5) -> 
         half_height: Semi-axis along local y [m].
         poisson_ratio: Poisson's ratio in the shear factors [-].
 
+    Returns:
+        The constants of the section.
+
     Reference:
         Shear factors: Cowper, J. Appl. Mech. 33, 1966.
     """
@@ -258,6 +283,14 @@ def squircle(radius: Numbers, power: Numbers, *, shear_factor=5 / 6) -> Section:
 
     The torsion constant is that of the harmonic function fitted to the boundary: within
     1e-4 for powers up to 8.
+
+    Args:
+        radius: Half of the width [m].
+        power: Exponent [-], from 2 to below 50.
+        shear_factor: Share of the area that carries shear [-].
+
+    Returns:
+        The constants of the section.
     """
     radius = _length("squircle", "radius", radius, "Give half the side.")
     n = real(power)
@@ -322,6 +355,9 @@ def from_shape(
         poisson_ratio: Poisson's ratio in the shear factors [-].
         principal: Turn the shape to its principal axes, the stiffer bending about z.
 
+    Returns:
+        The constants of the section.
+
     Raises:
         ValueError: If bending about y and z is coupled and `principal` is not set, or the
             shape cannot be meshed.
@@ -335,7 +371,16 @@ def from_shape(
 
 
 def from_mesh(mesh: Mesh, *, poisson_ratio=0.5, principal: bool = False) -> Section:
-    """The section of a plane mesh of triangles, as `from_shape`; differentiable in points."""
+    """The section of a plane mesh of triangles, as `from_shape`; differentiable in points.
+
+    Args:
+        mesh: Triangles of the section [m]: x is local y of the rod, y is local z.
+        poisson_ratio: Poisson's ratio in the shear factors [-].
+        principal: Turn the section to its principal axes, the stiffer bending about z.
+
+    Returns:
+        The constants of the section.
+    """
     found = plane_constants(mesh, principal=principal)
     _check_uncoupled(found)
     along_y, along_z = shear_factors(found, poisson_ratio)

@@ -262,6 +262,9 @@ def arc_length_path(
         tolerance: Distance from equilibrium relative to the first step.
         max_cuts: How often a step may be halved.
         progress: Report progress while running; under `vmap` in one report.
+
+    Returns:
+        Load factors, coordinates and how each search ended, from the first equilibrium on.
     """
     constants, dtype = operators(model), dtype_of(model)
     factor, first, longest = (real(x).astype(dtype) for x in (factor, first, longest))

@@ -443,6 +443,9 @@ def inertia_tensor(
         density: Mass per volume [kg/m^3].
         resolution: Cells along the longest side of its bounding box.
         most_cells: As in `volume`.
+
+    Returns:
+        A symmetric matrix [kg m^2].
     """
     rule = _rule("inertia_tensor", shape, 3, resolution, 2, most_cells)
     size = frame(shape, rule.resolution)[1]
@@ -533,7 +536,15 @@ def area(shape: AbstractSdf, *, most_cells: int | None = None) -> Float[Array, "
 
 
 def centroid(shape: AbstractSdf, *, most_cells: int | None = None) -> Float[Array, " dim"]:
-    """Centroid [m] of a shape, differentiable and traced as `area` and, in space, `volume`."""
+    """Centroid [m] of a shape, differentiable and traced as `area` and, in space, `volume`.
+
+    Args:
+        shape: A bounded shape.
+        most_cells: As in `volume`.
+
+    Returns:
+        The point [m].
+    """
     cells = _CELLS if shape.dim == 2 else 128
     rule = _rule("centroid", shape, shape.dim, cells, 1, most_cells)
     return _middle_of_mass(moments(shape, rule), *frame(shape, rule.resolution))
@@ -543,6 +554,13 @@ def second_moments(shape: AbstractSdf, *, most_cells: int | None = None) -> Floa
     """Integral of r r^T over a plane shape, r from its centroid [m^4], as `area` is.
 
     Entry (0, 0) is that of x^2, which resists bending in x; the trace is the polar moment.
+
+    Args:
+        shape: A bounded plane shape.
+        most_cells: As in `volume`.
+
+    Returns:
+        A symmetric matrix [m^4].
     """
     m = moments(shape, _rule("second_moments", shape, 2, _CELLS, 2, most_cells))
     return _second(m, frame(shape, _CELLS)[1])

@@ -147,7 +147,14 @@ def union(*shapes: AbstractSdf) -> Union:
 
 
 def intersection(*shapes: AbstractSdf) -> Intersection:
-    """One flat `Intersection` of `shapes`."""
+    """One flat `Intersection` of `shapes`.
+
+    Args:
+        *shapes: Two shapes or more.
+
+    Returns:
+        Their common part.
+    """
     flat = (s.shapes if isinstance(s, Intersection) else (s,) for s in shapes)
     return Intersection(sum(flat, start=()))
 

@@ -213,17 +213,41 @@ def _arc(x: Array, near: Array, across: Array, k: Array) -> Array:
 
 
 def twist(shape: AbstractSdf, rate: Numbers) -> Twisted:
-    """A solid twisted about z by `rate` [rad/m]."""
+    """A solid twisted about z by `rate` [rad/m].
+
+    Args:
+        shape: A solid.
+        rate: Angle per height [rad/m].
+
+    Returns:
+        The twisted solid.
+    """
     return Twisted(shape, rate)
 
 
 def taper(shape: AbstractSdf, rate: Numbers) -> Tapered:
-    """A solid whose section at height z is scaled by 1 + `rate` z, rate in 1/m."""
+    """A solid whose section at height z is scaled by 1 + `rate` z, rate in 1/m.
+
+    Args:
+        shape: A solid.
+        rate: Change of scale per height [1/m].
+
+    Returns:
+        The tapered solid.
+    """
     return Tapered(shape, rate)
 
 
 def bend(shape: AbstractSdf, curvature: Numbers) -> Bent:
-    """A bar along x bent in the plane of x and y to `curvature` [1/m]."""
+    """A bar along x bent in the plane of x and y to `curvature` [1/m].
+
+    Args:
+        shape: A bar along x.
+        curvature: Of its axis [1/m].
+
+    Returns:
+        The bent bar.
+    """
     return Bent(shape, curvature)
 
 
@@ -328,15 +352,40 @@ class Stretched(AbstractWrapped):
 
 
 def morph(first: AbstractSdf, second: AbstractSdf, fraction: Numbers) -> Morph:
-    """The mean of two fields: `first` at `fraction` 0, `second` at 1."""
+    """The mean of two fields: `first` at `fraction` 0, `second` at 1.
+
+    Args:
+        first: The shape at 0.
+        second: The shape at 1.
+        fraction: Between them [-].
+
+    Returns:
+        The shape between.
+    """
     return Morph(first, second, fraction)
 
 
 def displace(shape: AbstractSdf, relief: AbstractRelief) -> Displaced:
-    """`shape` with `relief` added to its field, such as `Waves`."""
+    """`shape` with `relief` added to its field, such as `Waves`.
+
+    Args:
+        shape: The shape.
+        relief: What is added, in metres.
+
+    Returns:
+        The shape with the relief.
+    """
     return Displaced(shape, relief)
 
 
 def stretch(shape: AbstractSdf, factors: Numbers) -> Stretched:
-    """`shape` scaled by one of `factors` per axis; a bound of the distance."""
+    """`shape` scaled by one of `factors` per axis; a bound of the distance.
+
+    Args:
+        shape: The shape.
+        factors: One per axis [-].
+
+    Returns:
+        The stretched shape.
+    """
     return Stretched(shape, factors)

@@ -263,12 +263,29 @@ def revolve(profile: AbstractSdf) -> Revolved:
 
 
 def mirror(shape: AbstractSdf, normal: Numbers, point: Numbers | None = None) -> Mirrored:
-    """`shape` together with its mirror image at the plane through `point` [m]."""
+    """`shape` together with its mirror image at the plane through `point` [m].
+
+    Args:
+        shape: The shape.
+        normal: Of the plane.
+        point: On the plane [m]; the origin if omitted.
+
+    Returns:
+        Both as one shape.
+    """
     return Mirrored(shape, normal, [0.0] * shape.dim if point is None else point)
 
 
 def elongate(shape: AbstractSdf, amount: Numbers) -> Elongated:
-    """`shape` cut at the origin and drawn apart by `amount` [m] per axis."""
+    """`shape` cut at the origin and drawn apart by `amount` [m] per axis.
+
+    Args:
+        shape: The shape.
+        amount: Length of the straight part along each axis [m].
+
+    Returns:
+        The longer shape.
+    """
     return Elongated(shape, amount)
 
 
@@ -277,6 +294,13 @@ def polar_repeat(shape: AbstractSdf, count: int) -> PolarRepeated:
 
     Right for parts without symmetry: as many neighbours are looked at as the part is
     wide, seen from the centre; all of them for a bound or under a trace.
+
+    Args:
+        shape: The first copy.
+        count: Number of copies.
+
+    Returns:
+        The copies as one shape.
     """
     everything = PolarRepeated(shape, int(count), reach=int(count))
     if is_traced(shape) or not shape.exactness.outside:
@@ -307,6 +331,9 @@ def grid_repeat(
         spacing: Distance [m] between copies, one per axis.
         counts: Number of copies along each axis.
         separate: As in `repeat`, along every axis.
+
+    Returns:
+        The copies as one shape.
     """
     spacing = real(spacing)
     _check.shape("grid_repeat", "spacing", spacing, (shape.dim,), "One per axis.")

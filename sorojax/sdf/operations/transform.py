@@ -241,7 +241,15 @@ def rotate(shape: AbstractSdf, angle: Numbers, center=(0.0, 0.0)) -> Rotated:
 
 
 def scale(shape: AbstractSdf, factor: Numbers) -> Scaled:
-    """`shape` scaled by `factor` about the origin; distances scale along."""
+    """`shape` scaled by `factor` about the origin; distances scale along.
+
+    Args:
+        shape: The shape.
+        factor: Ratio of lengths [-].
+
+    Returns:
+        The scaled shape.
+    """
     return Scaled(shape, factor)
 
 
@@ -267,7 +275,15 @@ def offset(shape: AbstractSdf, thickness: Numbers) -> Offset:
 
 
 def shell(shape: AbstractSdf, thickness: Numbers) -> Shell:
-    """A wall of `thickness` [m] centred on the surface of `shape`."""
+    """A wall of `thickness` [m] centred on the surface of `shape`.
+
+    Args:
+        shape: The shape.
+        thickness: Of the wall [m].
+
+    Returns:
+        The wall.
+    """
     return Shell(shape, thickness)
 
 
@@ -283,6 +299,9 @@ def repeat(
         separate: Whether the boxes of the copies stay apart along the step, which makes
             two copies per point enough. Found from the boxes if omitted, which needs their
             sizes: under a trace it must be stated. False evaluates every copy.
+
+    Returns:
+        The copies as one shape.
 
     Raises:
         ValueError: If `step` is zero, copies stated to be separate overlap, or `separate`
@@ -369,5 +388,15 @@ def turned_box(box: Box, matrix: Float[Array, "dim dim"], shift: Array) -> Box:
 
 
 def turn(shape: AbstractSdf, axis: Numbers, angle: Numbers, center=(0.0, 0.0, 0.0)) -> Turned:
-    """A solid turned by `angle` [rad] about `axis` through `center` [m]."""
+    """A solid turned by `angle` [rad] about `axis` through `center` [m].
+
+    Args:
+        shape: A solid.
+        axis: Direction of the axis.
+        angle: Angle [rad].
+        center: A point of the axis [m].
+
+    Returns:
+        The turned solid.
+    """
     return Turned(shape, axis, angle, center)

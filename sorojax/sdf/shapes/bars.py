@@ -189,7 +189,15 @@ def segment_square(x: tuple[Array, ...], a: tuple, b: tuple) -> Array:
 
 
 def stadium(length: Numbers, width: Numbers) -> Capsule:
-    """Plane stadium along x about the origin, `length` [m] over all, `width` [m] high."""
+    """Plane stadium along x about the origin, `length` [m] over all, `width` [m] high.
+
+    Args:
+        length: Over all [m].
+        width: Height, twice the radius of the ends [m].
+
+    Returns:
+        The stadium.
+    """
     width = real(width)
     half = jnp.stack([(real(length) - width) / 2, jnp.zeros_like(width)])
     return Capsule(-half, half, width / 2)

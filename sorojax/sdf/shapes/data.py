@@ -106,7 +106,14 @@ def _crossing(row: tuple[Array, Array], x: Array, y: Array) -> Array:
 
 
 def outlines(loops: Sequence[Numbers]) -> Outlines:
-    """The region between closed `loops`, each an array of corners (n, 2) [m]."""
+    """The region between closed `loops`, each an array of corners (n, 2) [m].
+
+    Args:
+        loops: Corners of each loop [m].
+
+    Returns:
+        The region.
+    """
     loops = [real(loop) for loop in loops]
     if not loops:
         raise ValueError("outlines: got no loop, need at least one. Give arrays of corners.")
@@ -128,6 +135,9 @@ def text(line: str, height: Numbers, font: str = "DejaVu Sans") -> Outlines:
         line: What to write.
         height: Size of the type, its em [m]; capitals are about 0.73 of it.
         font: Family of the font, as matplotlib finds it.
+
+    Returns:
+        The region of the letters.
     """
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextPath
@@ -371,6 +381,9 @@ def image(mask: Numbers, pixel: float, origin: Numbers | None = None) -> Sampled
             the plane; volumes are indexed (x, y, z).
         pixel: Size of a pixel [m].
         origin: Centre of the first pixel [m].
+
+    Returns:
+        The shape, by its distances at the pixels.
     """
     from scipy.ndimage import distance_transform_edt
 

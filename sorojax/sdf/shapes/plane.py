@@ -402,12 +402,30 @@ def _power(base: Array, power: Array) -> Array:
 
 
 def triangle(a: Numbers, b: Numbers, c: Numbers) -> Polygon:
-    """Triangle of three corners [m]."""
+    """Triangle of three corners [m].
+
+    Args:
+        a: First corner [m].
+        b: Second corner [m].
+        c: Third corner [m].
+
+    Returns:
+        The triangle.
+    """
     return Polygon(jnp.stack([real(a), real(b), real(c)]))
 
 
 def trapezoid(width: Numbers, top_width: Numbers, height: Numbers) -> Polygon:
-    """Symmetric trapezoid about the origin, `width` wide below, `top_width` above [m]."""
+    """Symmetric trapezoid about the origin, `width` wide below, `top_width` above [m].
+
+    Args:
+        width: Length of the lower side [m].
+        top_width: Length of the upper side [m].
+        height: Distance of both [m].
+
+    Returns:
+        The trapezoid.
+    """
     low, high, rise = real(width) / 2, real(top_width) / 2, real(height) / 2
     corners = [(-low, -rise), (low, -rise), (high, rise), (-high, rise)]
     return Polygon(jnp.stack([jnp.stack(corner) for corner in corners]))

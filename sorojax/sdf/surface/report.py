@@ -73,6 +73,12 @@ class SurfaceReport(NamedTuple):
 def surface_report(surface: Surface) -> SurfaceReport:
     """Check a surface: open, crowded and turned edges, shells, genus, volume, area.
 
+    Args:
+        surface: Vertices [m] and triangles.
+
+    Returns:
+        What was found.
+
     Raises:
         ValueError: If a triangle names a vertex that is not there, or a vertex is not
             finite.

@@ -144,6 +144,12 @@ class Stack(AbstractBlock):
 def stack(blocks: Sequence[AbstractBlock]) -> Stack:
     """Stack blocks of one class, one structure and one shape.
 
+    Args:
+        blocks: Two or more.
+
+    Returns:
+        One block with an axis in front.
+
     Raises:
         ValueError: If they differ in more than their numbers.
     """
@@ -200,14 +206,33 @@ class Weighted(eqx.Module):
 
 
 def sum_of(weights: Numbers, *, shape=(), unit: str | None = None) -> Function:
-    """A block that adds inputs `a`, `b`, ... with one weight each; -1 subtracts."""
+    """A block that adds inputs `a`, `b`, ... with one weight each; -1 subtracts.
+
+    Args:
+        weights: One per input.
+        shape: Of inputs and output.
+        unit: Of all.
+
+    Returns:
+        The block.
+    """
     law = Weighted(weights)
     ports = tuple("abcdefghijklmnop"[: law.weights.shape[0]])
     return Function(law, ports, shape, unit, shape, unit)
 
 
 def gain(factor: Numbers, *, shape=(), unit: str | None = None, input_unit: str | None = None):
-    """A block that multiplies its input `a`; the units say what the factor turns into what."""
+    """A block that multiplies its input `a`; the units say what the factor turns into what.
+
+    Args:
+        factor: Output over input.
+        shape: Of input and output.
+        unit: Of the output.
+        input_unit: Of the input.
+
+    Returns:
+        The block.
+    """
     return Function(Weighted(real(factor)[None]), ("a",), shape, unit, shape, input_unit)
 
 

@@ -62,6 +62,9 @@ def modal_basis(
         displacement: The equilibrium [m]; at rest when omitted.
         bending: Add the derivatives: with n shapes up to n (n + 1) / 2 more.
 
+    Returns:
+        The shapes.
+
     Raises:
         ValueError: If a rod is mounted on the body, whose mass depends on its motion.
 
@@ -300,7 +303,15 @@ class ModalBody(AbstractBlock):
 
 
 def displacement(basis: Basis, q: Modes) -> Float[Array, "nodes dim"]:
-    """Displacement [m] of every node."""
+    """Displacement [m] of every node.
+
+    Args:
+        basis: From `modal_basis`.
+        q: Modal coordinates.
+
+    Returns:
+        Displacement [m].
+    """
     return basis.displacement + jnp.tensordot(q, basis.shapes, 1)
 
 
@@ -313,6 +324,9 @@ def modal_body(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBo
         order: Of the polynomial that stands for the force, 1 (linear) to 3; None projects the
             force of the mesh itself, as far as the shapes reach, at the price of one
             assembly per evaluation.
+
+    Returns:
+        The reduced block, with the ports of `body`.
 
     Raises:
         ValueError: If a driven load is not proportional to its input, or a support is driven.

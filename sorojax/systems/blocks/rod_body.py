@@ -149,7 +149,15 @@ class RodBody(AbstractBlock):
 
 
 def body_motion(body: RodBody, state) -> RodState:
-    """The fields of the rod in a state of the body, for pictures and energies."""
+    """The fields of the rod in a state of the body, for pictures and energies.
+
+    Args:
+        body: The rod as a block.
+        state: Its state.
+
+    Returns:
+        What forces and pictures read.
+    """
     return motion(body.rod, state["q"], state["v"])
 
 

@@ -254,7 +254,15 @@ class Tracking(NamedTuple):
 
 @jit_public
 def tracking(law: CartesianImpedance, path: Trajectory) -> Tracking:
-    """Set-points, tips and efforts of `law` along the motion `path` of its rod."""
+    """Set-points, tips and efforts of `law` along the motion `path` of its rod.
+
+    Args:
+        law: The controller.
+        path: From `rod.rollout`.
+
+    Returns:
+        What was wanted and what was done, at every moment.
+    """
 
     def at(t, q, v):
         return Tracking(law.reference(t), tip_pose(law.rod, q)[:-1, -1], law.effort(t, q, v))

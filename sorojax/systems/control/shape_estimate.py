@@ -92,6 +92,9 @@ def estimate_shape(
         trust: Weight of the model against the markers [-]; larger where markers are noisy
             and the forces are known.
         iterations: Steps.
+
+    Returns:
+        Coordinates, and how well they meet the markers.
     """
     rod, constants = markers.rod, operators(markers.rod)
     seen = jnp.all(jnp.isfinite(positions), axis=1)
@@ -203,6 +206,14 @@ def start_filter(
     """A filter at rest at `q` (zero if omitted).
 
     `spread` is how far off that may be: the displacement of the tip over the length.
+
+    Args:
+        estimator: The filter.
+        q: Coordinates at which it begins.
+        spread: Displacement of the tip over the length [-].
+
+    Returns:
+        The first estimate.
     """
     rod = estimator.markers.rod
     q = jnp.zeros(num_dof(rod)) if q is None else real(q)
@@ -234,6 +245,9 @@ def update_filter(
         positions: Markers [m] in the rod's base frame; NaN if not seen.
         forces: On the rod over the period: damping, gravity, what is commanded.
         t: Time at the start of the period [s].
+
+    Returns:
+        The new estimate with its covariance.
     """
     dof = last.q.shape[0]
     before = jnp.concatenate([last.q, last.v])

@@ -68,6 +68,9 @@ def partitioned(
         stepper: `ContactMidpoint()` if omitted.
         method: For the other blocks; `Rosenbrock2(refresh=True)` if omitted.
 
+    Returns:
+        `move`, and the state to start from.
+
     Raises:
         ValueError: If the network has no such body.
     """

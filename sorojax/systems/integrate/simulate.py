@@ -72,12 +72,27 @@ class Trajectory(eqx.Module):
 
 
 def last_state(film: Trajectory) -> PyTree:
-    """The state at the end of a motion."""
+    """The state at the end of a motion.
+
+    Args:
+        film: From `simulate`.
+
+    Returns:
+        The state, to go on from.
+    """
     return jax.tree.map(lambda x: x[-1], film.state)
 
 
 def state_at(film: Trajectory, t: Float[Array, ""]) -> PyTree:
-    """The state at any time [s] of a run made with `dense=True`."""
+    """The state at any time [s] of a run made with `dense=True`.
+
+    Args:
+        film: From `simulate`.
+        t: Time [s].
+
+    Returns:
+        The state of the network.
+    """
     if film.dense is None:
         raise ValueError(
             "state_at: this motion holds saved instants only. Run simulate(..., dense=True)."

@@ -49,6 +49,9 @@ def show_file(
         renderer: Of what is solid.
         title: Title; the name of the file if omitted.
 
+    Returns:
+        The picture.
+
     Raises:
         ValueError: If the file is damaged, of no known kind, or has no such field.
     """
@@ -84,7 +87,18 @@ def animate_file(
     fps: float = 10.0,
     **options: Any,
 ) -> Film:
-    """A film of a series of results (.pvd); options of `animate`."""
+    """A film of a series of results (.pvd); options of `animate`.
+
+    Args:
+        path: File name.
+        field: Which values of a result; the first scalar ones if omitted.
+        unit: What 1 in the file means [m].
+        fps: Frames per second.
+        **options: Of `animate`.
+
+    Returns:
+        The film.
+    """
     from sorojax.view.film.animation import Track, animate
 
     states = [_state(file, field, unit) for file in _series(Path(path))]

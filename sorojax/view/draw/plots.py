@@ -79,7 +79,16 @@ def show_basis(
 def backbone_errors(
     backbone: Backbone, rod: Rod, qs: Float[Array, "steps dof"]
 ) -> Float[Array, " steps"]:
-    """Mean distance between backbone and rod over their samples, per snapshot [m]."""
+    """Mean distance between backbone and rod over their samples, per snapshot [m].
+
+    Args:
+        backbone: Snapshots, from `strain_along`.
+        rod: The rod that should follow them.
+        qs: Coordinates of the rod at the snapshots.
+
+    Returns:
+        One distance per snapshot [m].
+    """
     gap = _rod_lines(rod, qs, backbone.s) - backbone.positions
     return jnp.mean(jnp.sqrt(jnp.sum(gap**2, axis=2)), axis=1)
 
@@ -107,6 +116,9 @@ def show_backbones(
         pressures: Pressure of each snapshot [Pa]; counted if omitted.
         bar: The largest error that is accepted [m].
         title: Title of the figure.
+
+    Returns:
+        The picture.
     """
     steps = len(backbone.positions)
     solid = 1e3 * np.asarray(backbone.positions)
@@ -144,6 +156,9 @@ def show_signals(time: Float[Any, " time"], panels: Signals, *, title: str = "")
         panels: `{"tip angle [deg]": {"reference": y0, "rod": y1}, ...}`; a name with
             "reference", "target" or "setpoint" is drawn dashed and dark.
         title: Title of the figure.
+
+    Returns:
+        The picture.
     """
     time = np.asarray(time)
     high = [max(1.6, 0.34 * len(lines)) for lines in panels.values()]

@@ -77,6 +77,9 @@ def animate(
         title: Heading of the film.
         **options: What to draw, as of `show`: `field=`, `limits=`, `forces=`, `section=`.
 
+    Returns:
+        The film, drawn frame by frame while it is saved.
+
     Raises:
         TypeError: If the result does not move.
         ValueError: If times do not rise or a frame cannot be drawn.

@@ -113,6 +113,9 @@ def animate_figure(
         frames: Number of frames.
         fps: Frames per second.
         label: Name in the progress report.
+
+    Returns:
+        The film.
     """
     if frames < 1 or not 0 < fps <= 240:
         raise ValueError(

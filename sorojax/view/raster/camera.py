@@ -70,13 +70,29 @@ def camera_at(view: View, share: float = 0.0) -> Camera:
 
 
 def orbit(start: str | Camera = "iso", *, turns: float = 1.0) -> Callable[[float], Camera]:
-    """A path about the z axis, `turns` times round in a film."""
+    """A path about the z axis, `turns` times round in a film.
+
+    Args:
+        start: Camera or preset at the start.
+        turns: Full turns [-].
+
+    Returns:
+        A function of the share of the film in [0, 1].
+    """
     first = camera_at(start)
     return lambda share: replace(first, azimuth=first.azimuth + 360.0 * turns * share)
 
 
 def between(first: str | Camera, last: str | Camera) -> Callable[[float], Camera]:
-    """A path from one view to another, slow at both ends."""
+    """A path from one view to another, slow at both ends.
+
+    Args:
+        first: Camera or preset at the start.
+        last: At the end.
+
+    Returns:
+        A function of the share of the film in [0, 1].
+    """
     a, b = camera_at(first), camera_at(last)
 
     def at(share: float) -> Camera:

@@ -152,7 +152,15 @@ def box_of(parts: Sequence[Part]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def merge_scenes(*scenes: Scene, title: str = "") -> Scene:
-    """One scene of the parts of all, with the first scale that one of them has."""
+    """One scene of the parts of all, with the first scale that one of them has.
+
+    Args:
+        *scenes: From `scene_of`.
+        title: Of the scene.
+
+    Returns:
+        The scene.
+    """
     parts = tuple(part for scene in scenes for part in scene.parts)
     scale = next((scene.scale for scene in scenes if scene.scale is not None), None)
     return Scene(parts, scale, title or next((s.title for s in scenes if s.title), ""))

@@ -62,6 +62,9 @@ def rig(
         stations: Frames along a rod.
         **options: `base`, `parts` and `blend` of `bind`.
 
+    Returns:
+        Model and surface, for `pose`, `show` and `live`.
+
     Raises:
         ValueError: If shapes or names do not fit, or triangles name missing vertices.
     """
@@ -94,6 +97,13 @@ def pose(
 
     Together with `rod.inverse_kinematics` a rig follows a hand: pose it with what that
     found.
+
+    Args:
+        rig: From `rig`.
+        q: Coordinates, or one row per frame.
+
+    Returns:
+        Vertices [m].
     """
     q = rest(rig.model) if q is None else real(q)
     count = num_coordinates(rig.model)

@@ -87,6 +87,9 @@ def bind(
             rod if omitted.
         stations: Frames along a rod; the surface is smooth between them.
 
+    Returns:
+        The bound points, for `deform`.
+
     Raises:
         ValueError: If a shape or a name does not fit.
     """
@@ -151,6 +154,14 @@ def deform(
 
     Sections stay flat and keep their size. Differentiable in `q`, in the leaves of the
     model and in `skin.local`. Map over times with `jax.lax.map`.
+
+    Args:
+        skin: From `bind`.
+        model: The rod or assembly.
+        q: Coordinates.
+
+    Returns:
+        Points [m].
     """
     table = frame_table(model, q, skin.stations, skin.local.shape[0], skin.base)
     return carried(skin, table)

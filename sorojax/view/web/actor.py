@@ -68,6 +68,9 @@ def actor(
         colour: As "#rrggbb".
         name: Shown in viewers that list objects.
 
+    Returns:
+        What `to_html` and `to_glb` take.
+
     Raises:
         TypeError: If there is no way to draw `thing`.
         ValueError: If shapes do not fit or numbers are not finite.

@@ -142,6 +142,9 @@ def to_html(
         title: Shown above the picture.
         path: Where to write the page as well.
 
+    Returns:
+        The page; `save` writes it, a notebook shows it.
+
     Raises:
         ValueError: If there is nothing to show or numbers of frames differ.
     """
