@@ -128,14 +128,17 @@ def raise_thin(
     found = (thinnest(field, places, size.largest) for field in fields)
     name, at, thick = min(found, key=lambda one: one[2])
     length = float(size(at[None])[0])
+    place = ", ".join(f"{x:.4g}" for x in np.round(at / length, 6) * length)
     if thick >= length / 2:
         raise NotResolved(
-            f"{where}: cells of {length:g} m cannot follow the surface near {at} m, where the "
-            f"thinnest {name} is about {thick:.2g} m thick. Lower `size`, or round it.",
+            f"{where}: cells of {length:g} m cannot follow the surface near ({place}) m, where "
+            f"the thinnest {name} is about {thick:.2g} m thick. Lower `size`, round it, or let "
+            "shapes that are joined or cut out overlap: two that end on one line leave a skin "
+            "without thickness.",
             thin=False,
         )
     raise NotResolved(
-        f"{where}: a {name} near {at} m is about {thick:.2g} m thick, need about half of the "
+        f"{where}: a {name} near ({place}) m is about {thick:.2g} m thick, need about half of the "
         f"`size` of {length:g} m or more. Lower `size`, or thicken the {name}."
     )
 

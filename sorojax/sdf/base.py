@@ -84,11 +84,13 @@ class AbstractSdf(eqx.Module):
     def level_box(self, level: Number) -> Box:
         """Corners [m] of a box that holds all points where the field is below `level` [m].
 
-        A bound may stay small far from the surface, so nothing is known of it in general.
+        A bound may stay small far from the surface, so nothing is known of it outside.
         """
         lower, upper = self.bounding_box()
         if self.exactness.outside:
             return lower - level, upper + level
+        if _check.is_concrete(level) and level <= 0:
+            return lower, upper
         return jnp.full_like(lower, -jnp.inf), jnp.full_like(upper, jnp.inf)
 
     def __call__(self, p: Float[Array, "*points dim"]) -> Float[Array, "*points"]:

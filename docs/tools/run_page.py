@@ -1,0 +1,136 @@
+"""Run the programs of a page of the documentation and compare what they print with the page.
+
+python docs/tools/run_page.py PAGE... [--pictures] [--write]
+"""
+
+import argparse
+import contextlib
+import io
+import math
+import re
+import sys
+import tempfile
+import textwrap
+import time
+import types
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+from PIL import Image
+
+DOCS = Path(__file__).resolve().parents[1]
+_FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+
+
+class Block(NamedTuple):
+    """A program of a page, the line it begins at, and the text that follows it, if any."""
+
+    line: int
+    code: str
+    expected: str | None
+    span: tuple[int, int] | None  # of that text, in characters of the page
+
+
+def blocks(path: Path) -> list[Block]:
+    """The ``python`` blocks of a page, each with the ``text`` block right after it."""
+    page, found = path.read_text(), []
+    fences = list(_FENCE.finditer(page))
+    for fence, after in zip(fences, [*fences[1:], None], strict=True):
+        if fence[1] != "python":
+            continue
+        follows = after is not None and after[1] == "text"
+        follows = follows and not page[fence.end() : after.start()].strip()
+        told = (after[2], after.span(2)) if follows else (None, None)
+        found.append(Block(page.count("\n", 0, fence.start(2)) + 1, fence[2], *told))
+    return found
+
+
+def run(path: Path, folder: Path) -> None:
+    """Run all programs of a page in one namespace, with the working folder `folder`.
+
+    Raises:
+        AssertionError: With page and line, if a program prints other words than the page
+            says or a number that is off by more than 2 %, or a picture was not drawn.
+    """
+    for block, printed in outputs(path, folder):
+        if why := difference(block.expected or "", printed):
+            raise AssertionError(f"{path}, program at line {block.line}: {why}\n{printed}")
+    shown = re.findall(r"\.\./pictures/([\w.]+)\)", path.read_text())
+    missing = [name for name in shown if not (folder / name).exists()]
+    assert not missing, f"{path}: shows {missing}, which its programs do not draw"
+
+
+def outputs(path: Path, folder: Path) -> list[tuple[Block, str]]:
+    """The programs of a page and what they print; a warning meant for users is an error."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    page = types.ModuleType(f"page_{path.stem}")
+    sys.modules[page.__name__] = page  # classes of the page look their module up
+    found = []
+    with contextlib.ExitStack() as around:
+        for one in (
+            contextlib.chdir(folder), warnings.catch_warnings(), jax.enable_x64(True),
+            jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"),
+        ):  # fmt: skip
+            around.enter_context(one)
+        warnings.simplefilter("default")
+        warnings.simplefilter("error", UserWarning)
+        for block in blocks(path):
+            code = compile("\n" * (block.line - 1) + block.code, str(path), "exec")
+            with contextlib.redirect_stdout(io.StringIO()) as printed:
+                exec(code, vars(page))
+            found.append((block, printed.getvalue()))
+    return found
+
+
+def difference(expected: str, printed: str) -> str:
+    """Where two texts differ, apart from line breaks and 2 % of each number; empty if not."""
+    if _NUMBER.sub("#", expected).split() != _NUMBER.sub("#", printed).split():
+        return f"prints other words than\n{expected}"
+    pairs = zip(_NUMBER.findall(expected), _NUMBER.findall(printed), strict=True)
+    off = [(a, b) for a, b in pairs if not math.isclose(float(a), float(b), rel_tol=0.02)]
+    return ", ".join(f"{a} is now {b}" for a, b in off)
+
+
+def written(path: Path, found: list[tuple[Block, str]]) -> str:
+    """The page with its expected texts replaced by what was printed."""
+    page = path.read_text()
+    for block, printed in reversed(found):
+        if block.span is not None:
+            lines = [textwrap.fill(line, 92) for line in printed.rstrip().split("\n")]
+            page = page[: block.span[0]] + "\n".join([*lines, ""]) + page[block.span[1] :]
+    return page
+
+
+def keep(picture: Path) -> None:
+    """Store a picture for the pages, 900 pixels wide at most, in 128 colours."""
+    image = Image.open(picture).convert("RGB")
+    image.thumbnail((900, 900))
+    image.quantize(128).save(DOCS / "pictures" / picture.name, optimize=True)
+
+
+def main(pages: list[Path], pictures: bool, write: bool) -> None:
+    for path in pages:
+        begin = time.process_time()
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            if write:
+                path.write_text(written(path, outputs(path.resolve(), folder)))
+            else:
+                run(path.resolve(), folder)
+            for picture in folder.glob("*.png") if pictures else ():
+                keep(picture)
+        print(f"{path}: {time.process_time() - begin:.1f} s of CPU")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("pages", nargs="+", type=Path)
+    parser.add_argument("--pictures", action="store_true", help="keep the pictures in docs")
+    parser.add_argument("--write", action="store_true", help="write what is printed into pages")
+    told = parser.parse_args()
+    main(told.pages, told.pictures, told.write)
