@@ -3,10 +3,10 @@
 Study VI-A of the Sorotoki paper, after Suzumori and Saito (2008). The paper damps the motion by
 1.5 1/s times the mass, a loss of one percent at 20 Hz, and by its contact and integrator. Here
 the rubber itself is viscous: without that the body gets faster until it falls or comes to rest,
-and no gait lasts. No source gives that viscosity, nor the friction of the feet: 800 Pa s and 0.7
-are calibrated, so that the gait on 30 degrees lasts and has the 21.1 Hz of the paper. What both
-do to the frequency is printed. Predicted without touching them are other slopes, and legs 29 mm
-apart for 27.5 mm.
+and no gait lasts. No source gives that viscosity, nor the friction of the feet: 800 Pa s and
+0.7 are calibrated, so that the gait on 30 degrees lasts and has the 21.1 Hz of the paper. What
+they do to the frequency is printed. Predicted without touching them are other slopes, and legs
+that stand 29 mm apart for 27.5 mm.
 """
 
 import sys

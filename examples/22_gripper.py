@@ -104,33 +104,6 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     return told
 
 
-def bodies(name) -> dict[str, sj.sdf.Surface]:
-    """Printed fingers for the rods, and what the cylinder stands for, by the name of the part.
-    Jaw, knurl, socket and shank lie off the places where the fingers touch."""
-    bellows = robots.Bellows(6 * mm, 4 * mm, 7.9 * mm, 4.7 * mm, 0.9 * mm, 2 * mm, 0.8 * mm, 9)
-    printed = robots.Finger(bellows, 5 * mm, 6.5 * mm, 2.2 * mm)
-    stood = sdf.isosurface(printed.solid(), 0.6 * mm)
-    along = stood.vertices @ np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])  # x along, y inwards
-    cylinder = sdf.Cylinder
-    if name == "beaker":
-        hollow = sdf.translate(cylinder(18.5 * mm, 60 * mm), [0, 0, 1.5 * mm])
-        thing = cylinder(20 * mm, 60 * mm, 1 * mm) - hollow
-    elif name == "wrench":
-        slot = sdf.Box([-6 * mm, -9 * mm, -22 * mm], [6 * mm, 9 * mm, 0])
-        disc = sdf.turn(sdf.Cylinder(13 * mm, 9 * mm, 1 * mm), [1, 0, 0], np.pi / 2)
-        head = disc - slot
-        thing = cylinder(5 * mm, 100 * mm, 1 * mm) | sdf.translate(head, [0, 0, -58 * mm])
-    else:
-        groove = sdf.translate(cylinder(1.5 * mm, 50 * mm), [28.6 * mm, 0, 0])
-        mark = sdf.Box([20 * mm, -3 * mm, -30 * mm], [30 * mm, 3 * mm, 30 * mm])
-        socket = sdf.extrude(sdf.RegularPolygon(14 * mm, 6), 24 * mm)
-        head = cylinder(28 * mm, 44 * mm, 1.5 * mm) - sdf.polar_repeat(groove, 30) - mark
-        shank = sdf.translate(cylinder(13 * mm, 50 * mm), [0, 0, -40 * mm])
-        thing = (head - sdf.translate(socket, [0, 0, 18 * mm])) | shank
-    fingers = {f"finger_{k}": sdf.Surface(along, stood.triangles) for k in range(4)}
-    return fingers | {"thing": sdf.isosurface(thing, 0.8 * mm)}
-
-
 def draw(films, file) -> None:
     """Three things in the fingers, a step of the bolt, and how far it turns."""
     from matplotlib import pyplot as plt
@@ -140,13 +113,39 @@ def draw(films, file) -> None:
     plate = sdf.translate(sdf.Cylinder(46 * mm, 7 * mm, 1 * mm), [0, 0, 3.4 * mm])
     plate = view.scene_of(plate - sdf.Cylinder(29.5 * mm, 30 * mm))
     rubber, orange = "#8fbce6", "#f9c274"
-    colours = {f"finger_{k}": rubber for k in range(4)} | {"thing": orange}
+    colours = {f"finger_{k}": rubber for k in range(4)}
+    names = (*THINGS, "left")
+
+    def thing(name) -> sj.sdf.Surface:
+        """What a cylinder stands for, with the round sides that the fingers touch."""
+        if name == "beaker":
+            hollow = sdf.translate(sdf.Cylinder(18.5 * mm, 60 * mm), [0, 0, 1.5 * mm])
+            made = sdf.Cylinder(20 * mm, 60 * mm, 1 * mm) - hollow
+        elif name == "wrench":
+            disc = sdf.turn(sdf.Cylinder(13 * mm, 9 * mm, 1 * mm), [1, 0, 0], np.pi / 2)
+            jaw = disc - sdf.Box([-6 * mm, -9 * mm, -22 * mm], [6 * mm, 9 * mm, 0])
+            bar = sdf.Cylinder(5 * mm, 100 * mm, 1 * mm)
+            made = bar | sdf.translate(jaw, [0, 0, -58 * mm])
+        else:
+            groove = sdf.translate(sdf.Cylinder(1.5 * mm, 50 * mm), [28.6 * mm, 0, 0])
+            mark = sdf.Box([20 * mm, -3 * mm, -30 * mm], [30 * mm, 3 * mm, 30 * mm])
+            socket = sdf.extrude(sdf.RegularPolygon(14 * mm, 6), 24 * mm)
+            head = sdf.Cylinder(28 * mm, 44 * mm, 1.5 * mm) - sdf.polar_repeat(groove, 30)
+            shank = sdf.translate(sdf.Cylinder(13 * mm, 50 * mm), [0, 0, -40 * mm])
+            made = (head - mark - sdf.translate(socket, [0, 0, 18 * mm])) | shank
+        return sdf.isosurface(made, 0.8 * mm)
+
+    bellows = robots.Bellows(6 * mm, 4 * mm, 7.9 * mm, 4.7 * mm, 0.9 * mm, 2 * mm, 0.8 * mm, 9)
+    printed = robots.Finger(bellows, 5 * mm, 6.5 * mm, 2.2 * mm).along_x()
+    fingers = dict.fromkeys(colours, sdf.isosurface(printed, 0.6 * mm))
+    solids = {name: fingers | {"thing": thing(name)} for name in names}
 
     def scene(name, at):
         model, path = films[name][:2]
-        return view.scene_of(model, path.q[at], shapes=solids[name], colours=colours)
+        return view.scene_of(
+            model, path.q[at], shapes=solids[name], colours=colours | {"thing": orange}
+        )
 
-    solids = {name: bodies(name) for name in films if name != "right"}
     last = len(films["left"][1].time) - 1
     times = np.array([3.9, 4.3, 4.46, 4.6])
     steps = np.searchsorted(np.asarray(films["left"][1].time), times)
@@ -166,7 +165,6 @@ def draw(films, file) -> None:
     for axes, title in zip((*held, *walk), titles, strict=True):
         axes.set_title(title, fontsize=10, y=0.98)
         axes.set_axis_off()
-    names = (*THINGS, "left")
     whole = [view.merge_scenes(scene(name, last), plate) for name in names]
     view.draw_into(held, whole, view=view.Camera(-62.0, 14.0))
     above = view.Camera(-62.0, 62.0)

@@ -138,7 +138,8 @@ def draw_into(
     Example:
         >>> from matplotlib.figure import Figure
         >>> figure = Figure(figsize=(4, 3), layout="constrained")
-        >>> view.draw_into(figure.add_subplot(), view.scene_of(sdf.Sphere([0, 0, 0], 10 * mm)))
+        >>> ball = view.scene_of(sdf.Sphere([0, 0, 0], 10 * mm))
+        >>> view.draw_into(figure.add_subplot(), ball)
     """
     every = [axes] if not isinstance(axes, Sequence | np.ndarray) else list(axes)
     scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)

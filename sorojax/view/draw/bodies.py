@@ -313,10 +313,11 @@ def chosen_states(where: str, count: int, states: Sequence[int] | None) -> list[
         raise ValueError(f"{where}: the path has no state. Look at its status.")
     if states is None:
         return spread(count, 7)[-6:]
+    states = [int(k) for k in states]
     wrong = [k for k in states if not -count <= k < count]
     if wrong or not states:
         raise ValueError(
-            f"{where}: `states` is {list(states)}, there are states 0 to {count - 1}. Choose "
+            f"{where}: `states` is {states}, there are states 0 to {count - 1}. Choose "
             "one or more of them."
         )
     return [k % count for k in states]
