@@ -10,6 +10,7 @@ that stand 29 mm apart for 27.5 mm.
 """
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -92,40 +93,76 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
 
 
 def draw(problem, motion, angles, path, others, numbers, file: Path) -> None:
-    """Moments of a period, angles, the way of the front foot, and what changes the rhythm."""
+    """The stress at two moments of a period, the angles of the legs, the way of the front foot,
+    and what changes the rhythm."""
     import matplotlib.pyplot as plt
 
-    times = np.asarray(motion.time)
-    facets = np.asarray(mesh.boundary_facets(problem.mesh))[:, [0, 2, 1]]
-    positions = np.asarray(problem.mesh.points + motion.displacements) / mm
-    turn = np.array([[np.cos(SLOPE), -np.sin(SLOPE)], [np.sin(SLOPE), np.cos(SLOPE)]])
-    figure, axes = plt.subplots(2, 2, figsize=(10, 7))
-    left, right = axes[0]
-    start, period = 0.6 * times[-1], 1 / numbers["frequency of the gait [Hz]"]
-    for k in range(3):
-        now = positions[np.searchsorted(times, start + 2.5 * k * period)] - [0, 26 * k]
-        for line in now[facets] @ turn:
-            left.plot(*line.T, color="#2a6f97", lw=0.8)
-        ground = np.array([[-16, -26 * k], [130, -26 * k]]) @ turn
-        left.plot(*ground.T, color="#e76f51", lw=1)
-    left.set(aspect="equal", xticks=[], yticks=[], title="every two and a half periods")
-    last = times > times[-1] - 0.2
-    for k in range(angles.shape[1]):
-        right.plot(1e3 * times[last], angles[last, k], label=f"pair {k + 1}")
-    right.set(xlabel="time [ms]", ylabel="angle between its legs [deg]")
-    right.legend(loc="upper right")
-    left, right = axes[1]
-    left.plot(times, path[:, 0], color="#2a6f97", label="down the slope")
-    left.plot(times, 10 * path[:, 1], color="#e76f51", label="off it, ten times")
-    left.set(xlabel="time [s]", ylabel="front foot [mm]")
-    left.legend()
-    right.barh(list(others)[::-1], list(others.values())[::-1], color="#8ab6d6")
-    right.axvspan(19, 23, color="#2a9d8f", alpha=0.2, lw=0)
-    right.axvline(21.1, color="#e76f51", lw=1, label="paper")
-    right.set(xlabel="frequency of the gait [Hz]", title="what is changed, first 0.4 s")
-    right.legend(loc="lower left")
-    figure.tight_layout()
-    figure.savefig(file, dpi=110)
+    from sorojax import sdf, view
+
+    times, period = np.asarray(motion.time), 1 / numbers["frequency of the gait [Hz]"]
+    last = np.flatnonzero(times > times[-1] - 1.5 * period)
+    states = np.sort([last[angles[last, 1].argmax()], last[angles[last, 1].argmin()]])
+    c, s = np.cos(SLOPE), np.sin(SLOPE)
+    down = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])  # of rows of points
+
+    def on_slope(scene):
+        body, rim = view.extrude(scene, 10 * mm).parts
+        body = replace(body, points=body.points @ down)
+        return view.Scene(
+            (body, replace(rim, runs=[run @ down for run in rim.runs])), scene.scale
+        )
+
+    bodies = view.scenes_of(motion, states, field="von_mises", rest=False)
+    (left, _), (right, _) = bodies[0].box
+    floor = sdf.Box([left - 10 * mm, -12 * mm, -4 * mm], [right + 10 * mm, 12 * mm, 0.0])
+    floor = view.scene_of(sdf.turn(floor, [0, 1, 0], SLOPE))
+    figure = plt.figure(figsize=(7, 8.2), dpi=200, layout="constrained")
+    grid = figure.add_gridspec(3, 1, height_ratios=(1.35, 1, 1.3))
+    shown, below = (
+        [figure.add_subplot(at) for at in grid[k].subgridspec(1, 2)] for k in (0, 1)
+    )
+    for axes, t in zip(shown, times[states], strict=True):
+        axes.set_title(f"{1e3 * t:.0f} ms", fontsize=10)
+    late, colours = times > times[-1] - 0.15, ("#0072B2", "#D55E00", "#009E73")
+    for k, colour in enumerate(colours):
+        below[0].plot(
+            1e3 * times[late], angles[late, k], lw=1.8, color=colour, label=f"pair {k + 1}"
+        )
+    below[0].plot(1e3 * times[states], angles[states, 1], "o", ms=4.5, color="#1f2430")
+    below[0].set(xlabel="time [ms]", ylabel="legs' angle [deg]", ylim=(83, 103))
+    below[0].legend(ncols=3, frameon=False, fontsize=9, loc="upper center", columnspacing=1)
+    below[1].plot(1e3 * times, path[:, 0], lw=1.8, color=colours[0])
+    below[1].set(xlabel="time [ms]", ylabel="front foot [mm]")
+    axes = figure.add_subplot(grid[2])
+    axes.axvline(21.1, color="#1f2430", lw=1.2, label="paper, 21.1 Hz")
+    axes.axvspan(19, 23, color="#1f2430", alpha=0.08, lw=0)
+    for label, colour in zip(
+        ("numerics", "calibrated", "predicted"), ("#8a8f98", *colours[1::-1])
+    ):
+        axes.plot([], [], "o", color=colour, label=label)
+    axes.legend(frameon=False, fontsize=9, loc="upper right")
+    ours = {
+        "friction": colours[1],
+        "viscosity": colours[1],
+        "slope": colours[0],
+        "legs": colours[0],
+    }
+    for k, (name, gait) in enumerate(others.items()):
+        lasts, colour = gait.repeats > 0.8, ours.get(name.split()[0], "#8a8f98")
+        face = colour if lasts else "white"
+        axes.plot(gait.frequencies.mean(), k, "o", ms=7, color=colour, mfc=face)
+        if not lasts:
+            axes.text(
+                gait.frequencies.mean() - 0.4, k, "no gait lasts", ha="right", va="center"
+            )
+    axes.set_yticks(range(len(others)), list(others), fontsize=9)
+    axes.set(xlabel="frequency of the gait in the first 0.4 s [Hz]", xlim=(14, 32))
+    axes.invert_yaxis()
+    for plot in (*below, axes):
+        plot.spines[["top", "right"]].set_visible(False)
+    scenes = [view.merge_scenes(on_slope(body), floor) for body in bodies]
+    view.draw_into(shown, scenes, view=view.Camera(-75.0, 22.0))
+    figure.savefig(file)
     plt.close(figure)
 
 
