@@ -136,9 +136,8 @@ def draw(problem, motion, angles, path, others, numbers, file: Path) -> None:
     axes = figure.add_subplot(grid[2])
     axes.axvline(21.1, color="#1f2430", lw=1.2, label="paper, 21.1 Hz")
     axes.axvspan(19, 23, color="#1f2430", alpha=0.08, lw=0)
-    for label, colour in zip(
-        ("numerics", "calibrated", "predicted"), ("#8a8f98", *colours[1::-1])
-    ):
+    kinds = {"numerics": "#8a8f98", "calibrated": colours[1], "predicted": colours[0]}
+    for label, colour in kinds.items():
         axes.plot([], [], "o", color=colour, label=label)
     axes.legend(frameon=False, fontsize=9, loc="upper right")
     ours = {

@@ -163,8 +163,8 @@ def draw_into(
 def _check_axes(axes: list, scenes: list) -> None:
     if not scenes or len(axes) != len(scenes):
         raise ValueError(
-            f"view.draw_into: got {len(axes)} axes for {len(scenes)} scenes, need as many. Pass "
-            "one of each, or two sequences of one length."
+            f"view.draw_into: got {len(axes)} axes for {len(scenes)} scenes, need as many. "
+            "Pass one of each, or two sequences of one length."
         )
     if any(scene.dim != 3 for scene in scenes):
         raise ValueError(
