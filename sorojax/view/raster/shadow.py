@@ -14,7 +14,9 @@ from sorojax.view.raster.scene import Lines, Part, Scene, corners_of
 
 _SIZE = 1400  # pixels across the map
 _SOFT = 3  # half width of the softened edge [pixels of the map]
-_BIAS = 7.0  # depth that does not count as behind [pixels of the map]
+# Depth that does not count as behind [pixels of the map]: what a face that is lit at 54
+# degrees from its normal rises over the width of the softened edge.
+_BIAS = 7.0
 
 
 def lamp_of(camera: Camera) -> Camera:
