@@ -41,26 +41,37 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
 
 
 def draw(problem, motion, centre, file: Path) -> None:
-    """Four moments of a cycle, and the way of the centre."""
+    """The stress at four moments of a cycle, and the way of the centre."""
     import matplotlib.pyplot as plt
 
-    facets = np.asarray(sj.mesh.boundary_facets(problem.mesh))[:, [0, 2, 1]]
-    positions = np.asarray(problem.mesh.points + motion.displacements) / mm
-    times = np.asarray(motion.time)
-    figure, axes = plt.subplots(5, 1, figsize=(7, 6), height_ratios=[1, 1, 1, 1, 2])
-    for k, share in enumerate((0.0, 0.25, 0.5, 0.75)):
-        now = positions[np.searchsorted(times, (times[-1] // PERIOD - 1 + share) * PERIOD)]
-        for line in now[facets]:
-            axes[k].plot(*line.T, color="#2a6f97", lw=0.8)
-        axes[k].axhline(0.0, color="#e76f51", lw=1)
-        axes[k].set(aspect="equal", xticks=[], yticks=[], xlim=(-8, 160), ylim=(-1, 34))
-        axes[k].set_ylabel(f"{share:g} T")
-    axes[4].plot(times, centre[:, 0], color="#2a6f97", label="forwards")
-    axes[4].plot(times, centre[:, 1], color="#e76f51", label="upwards")
-    axes[4].set(xlabel="time [s]", ylabel="centre of mass [mm]")
-    axes[4].legend()
-    figure.tight_layout()
-    figure.savefig(file, dpi=110)
+    from sorojax import sdf, view
+
+    times, depth = np.asarray(motion.time), float(problem.kinematics.thickness)
+    starts = (times[-1] // PERIOD - 1 + np.array([0.2, 0.35, 0.55, 0.75])) * PERIOD
+    states = np.searchsorted(times, starts)
+    field = {"field": "von_mises", "label": "", "rest": False}
+    bodies = [view.extrude(scene, depth) for scene in view.scenes_of(motion, states, **field)]
+    low, high = (1e3 * corner for corner in bodies[0].box)
+    ground = sdf.Box(
+        [low[0] * mm - 6 * mm, -32 * mm, -5 * mm], [high[0] * mm + 6 * mm, 32 * mm, 0]
+    )
+    floor = view.scene_of(ground)
+    figure = plt.figure(figsize=(7, 6.4), dpi=200, layout="constrained")
+    grid = figure.add_gridspec(2, 1, height_ratios=(1.75, 1))
+    shown = [figure.add_subplot(place) for place in grid[0].subgridspec(2, 2)]
+    for axes, t in zip(shown, times[states], strict=True):
+        axes.set_title(f"{(t - starts[0]) / PERIOD + 0.2:.2f} of a cycle", fontsize=10, y=0.92)
+    axes = figure.add_subplot(grid[1])
+    axes.plot(times, centre[:, 0], color="#0072B2", lw=1.8)
+    axes.plot(times, centre[:, 1], color="#D55E00", lw=1.8)
+    axes.text(times[-1], centre[-1, 0], " forwards", va="center", color="#0072B2")
+    axes.text(times[-1], centre[-1, 1], " upwards", va="center", color="#D55E00")
+    axes.plot(times[states], centre[states, 0], "o", ms=4.5, color="#1f2430")
+    axes.set(xlabel="time [s]", ylabel="centre of mass [mm]", xlim=(0, 1.16 * times[-1]))
+    axes.spines[["top", "right"]].set_visible(False)
+    scenes = [view.merge_scenes(body, floor) for body in bodies]
+    view.draw_into(shown, scenes, view=view.Camera(-72.0, 20.0))
+    figure.savefig(file)
     plt.close(figure)
 
 

@@ -100,42 +100,61 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
 
 
 def draw(rest, full, path, widths, first, file: Path) -> None:
-    """Four modes at rest and at 12.5 %, the square past buckling, and its width."""
+    """The square between its plates on its way, four modes at 0 and at 12.5 %, its width."""
     import matplotlib.pyplot as plt
     from matplotlib.tri import Triangulation
 
-    figure = plt.figure(figsize=(11, 8.2), layout="constrained")
-    grid = figure.add_gridspec(3, 4)
-    mesh_, points = full.problem.mesh, np.asarray(full.problem.mesh.points)
-    corners = np.asarray(mesh_.cells)[:, :3]
+    from sorojax import view
 
-    def show(place, u, values, name, limits):
-        axes = figure.add_subplot(place)
-        x, y = (points + u).T / mm
-        cut = Triangulation(x, y, corners)
-        axes.tripcolor(cut, values, cmap="coolwarm", clim=limits, shading="gouraud")
-        axes.set(aspect="equal", xlim=(-5, 45), ylim=(-1, 41))
-        axes.set_title(name, fontsize=10)
-        axes.set_axis_off()
-
-    for row, (modes, name) in enumerate(((rest, "0 %"), (full, "12.5 %"))):
+    figure = plt.figure(figsize=(7, 8.3), dpi=200, layout="constrained")
+    grid = figure.add_gridspec(3, 1, height_ratios=(1.25, 1.75, 1))
+    points = np.asarray(full.problem.mesh.points)
+    corners = np.asarray(full.problem.mesh.cells)[:, :3]
+    places, drawn = iter(grid[1].subgridspec(2, 4)), []
+    for modes, name in ((rest, "0 %"), (full, "12.5 %")):
         for k, shape in enumerate(np.asarray(modes.shapes)):
             shape = 3 * mm * shape / np.abs(shape).max()
-            show(grid[row, k], np.asarray(modes.displacement) + shape, shape[:, 0],
-                 f"mode {k + 1} at {name}", (-3 * mm, 3 * mm))  # fmt: skip
-    bent = np.asarray(path.displacements[-1])
-    show(
-        grid[2, 0],
-        bent,
-        bent[:, 0],
-        f"past buckling, {100 * widths[0][-1]:.1f} %",
-        (-5 * mm, 5 * mm),
-    )
-    axes = figure.add_subplot(grid[2, 1:])
-    axes.plot(*(100 * np.asarray(w) for w in widths), "o-", color="#2a6f97", ms=3)
-    axes.axvline(100 * first, color="#e76f51", lw=1)
+            x, y = (points + np.asarray(modes.displacement) + shape).T / mm
+            axes = figure.add_subplot(next(places))
+            tinted = axes.tripcolor(
+                Triangulation(x, y, corners), shape[:, 0] / mm, cmap="coolwarm",
+                clim=(-3, 3), shading="gouraud", rasterized=True,
+            )  # fmt: skip
+            axes.set(aspect="equal", xlim=(-4, 44), ylim=(-1, 41))
+            axes.set_title(f"mode {k + 1} at {name}", fontsize=10)
+            axes.set_axis_off()
+            drawn.append(axes)
+    figure.colorbar(tinted, ax=drawn, aspect=30, pad=0.02, label="sideways [mm]")
+    pressed, widening = (100 * np.asarray(w) for w in widths)
+    states = np.array([0, np.abs(pressed - 100 * first).argmin(), len(pressed) - 1])
+    axes = figure.add_subplot(grid[2])
+    axes.plot(pressed, widening, color="#0072B2", lw=1.8)
+    axes.plot(pressed[states], widening[states], "o", color="#1f2430", ms=4.5)
+    axes.axvline(100 * first, color="#D55E00", lw=1.2)
+    axes.text(100 * first, -1.9, f"ellipses from {100 * first:.1f} %  ", ha="right")
+    axes.axvline(12.5, color="#8a8f98", lw=1.2, ls="--")
+    axes.text(12.5, 2.6, "paper, 12.5 %  ", ha="right")
     axes.set(xlabel="compression [%]", ylabel="widening [%]")
-    figure.savefig(file, dpi=75)
+    axes.spines[["top", "right"]].set_visible(False)
+
+    def pressing(scene, share):
+        """The square, 12 mm deep, with the plates that hold it."""
+        plates = [
+            sdf.Box([-5 * mm, -9 * mm, low], [45 * mm, 9 * mm, low + 3 * mm])
+            for low in (-3 * mm, 40 * mm * (1 - share / 100))
+        ]
+        square = view.extrude(scene, 12 * mm)
+        return view.merge_scenes(square, *(view.scene_of(plate) for plate in plates))
+
+    bodies = view.scenes_of(path, states, field="von_mises", rest=False)
+    shown = [figure.add_subplot(place) for place in grid[0].subgridspec(1, 3)]
+    for axes, share in zip(shown, pressed[states], strict=True):
+        axes.set_title(f"pressed by {share:.1f} %", fontsize=10)
+    scenes = [
+        pressing(body, share) for body, share in zip(bodies, pressed[states], strict=True)
+    ]
+    view.draw_into(shown, scenes, view=view.Camera(-66.0, 14.0))
+    figure.savefig(file)
     plt.close(figure)
 
 

@@ -8,6 +8,7 @@ fingers leave a palm of 20 mm, 25 degrees outwards. Their skin, not their centre
 """
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -75,26 +76,27 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
 
 def draw(angles, q, file: Path) -> None:
     """The six fingers on the ball, from the side and from below."""
-    import io
-
     import matplotlib.pyplot as plt
+
+    from sorojax import view
 
     fingers = {
         f"f{k}": rod.Part(make_finger(), offset=mount(angle)) for k, angle in enumerate(angles)
     }
-    palm = sdf.translate(sdf.Cylinder(PALM + 4 * mm, 4 * mm), [0, 0, 2 * mm])
     hand = rod.assembly(sj.SE3(), **fingers)
-    scene = sj.view.merge_scenes(
-        *(sj.view.scene_of(shape) for shape in (sdf.Sphere(CENTER, RADIUS), palm)),
-        sj.view.scene_of(hand, np.asarray(q).ravel()),
-    )
-    views = sj.view.Camera(-60.0, 8.0), sj.view.Camera(-60.0, -55.0)
-    figure, axes = plt.subplots(1, 2, figsize=(11, 5.5), layout="constrained")
-    for place, view in zip(axes, views, strict=True):
-        shown = sj.view.show(scene, view=view, renderer="own")
-        place.imshow(plt.imread(io.BytesIO(shown.png)))
+    held = view.scene_of(hand, np.asarray(q).ravel(), colours=dict.fromkeys(fingers, "#f29b4b"))
+    palm = sdf.translate(sdf.Cylinder(PALM + 4 * mm, 4 * mm, 1 * mm), [0, 0, 2 * mm])
+    stem = sdf.translate(sdf.Cylinder(6 * mm, 14 * mm), [0, 0, 10 * mm])
+    (ball,) = view.scene_of(sdf.Sphere(CENTER, RADIUS)).parts
+    ball = view.Scene((replace(ball, colour="#a9d3ee"),))
+    scene = view.merge_scenes(held, ball, view.scene_of(palm | stem))
+    figure, axes = plt.subplots(1, 2, figsize=(7, 4.1), dpi=200, layout="constrained")
+    for place, name in zip(axes, ("from the side", "from below"), strict=True):
+        place.set_title(name, fontsize=10)
         place.set_axis_off()
-    figure.savefig(file, dpi=100)
+    view.draw_into(axes[0], scene, view=view.Camera(-60.0, 8.0))
+    view.draw_into(axes[1], scene, view=view.Camera(-60.0, -55.0), scale=False)
+    figure.savefig(file)
     plt.close(figure)
 
 

@@ -9,7 +9,6 @@ its tube, for 180 ml. The wave runs from -5 to 80 kPa as in the experiment, for 
 """
 
 import dataclasses
-import io
 import math
 import sys
 from pathlib import Path
@@ -100,53 +99,71 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
 
 
 def draw(film, angle, pressure, file: Path) -> None:
-    """Pressures, angles, and the hand at four moments."""
+    """The hand at four moments of a period in the skins of its printed fingers, coloured by
+    their pressure; pressures and angles."""
     import matplotlib.pyplot as plt
 
-    def place(k):  # the thumb lower and aside, turned by 45 degrees about the hand's axis
-        pose, turn = np.eye(4), -45 * deg if k == 0 else 0.0
-        across = np.array([np.cos(turn), np.sin(turn), 0.0])
-        axes = np.stack([[0, 0, 1], across, np.cross([0, 0, 1], across)], axis=1)
-        pose[:3, :3], pose[:3, 3] = axes, ((6, 83, -38) if k == 0 else (0, 88 - 22 * k, 0))
-        pose[:3, 3] *= mm
-        return pose
+    from sorojax import robots, sdf, view
 
-    def body(length):
-        return rod.rod(
+    hand, turn = robots.Hand(), np.array([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]])  # fingers up
+
+    def pose(axes, place=(0.0, 0.0, 0.0)):
+        return np.block([[axes, np.asarray(place)[:, None]], [np.zeros(3), 1.0]])
+
+    def mounted(name, length):
+        foot, angle = (np.asarray(x) for x in hand.places()[name])
+        along, palm = np.array([-np.sin(angle), np.cos(angle), 0.0]), np.array([0.0, 0, -1])
+        body = rod.rod(
             sj.SE3(), rod.chebyshev(kappa_z=MODES), rod.rectangle(*SECTION), length=length,
             young_modulus=1.0, poisson_ratio=0.4, density=1.0,
         )  # fmt: skip
+        axes = np.stack([along, palm, np.cross(along, palm)], axis=1)
+        return rod.Part(body, on="palm", offset=pose(axes, foot))
 
-    parts = {f"f{k}": rod.Part(body(LENGTHS[k]), offset=place(k)) for k in range(5)}
-    figure = plt.figure(figsize=(11, 7), layout="constrained")
-    grid = figure.add_gridspec(2, 4, height_ratios=(1.2, 1))
-    moments = [
-        -1 - round(share * 2 * math.pi / RATE / PERIOD) for share in (0.75, 0.5, 0.25, 0)
-    ]
+    names = "thumb", "index", "middle", "ring", "little"
+    base = rod.Part(robots.cylinder(1.0, 1.0, 1.0), offset=pose(turn))
+    fingers = {name: mounted(name, x) for name, x in zip(names, LENGTHS, strict=True)}
+    whole = rod.assembly(sj.SE3(), palm=base, **fingers)
+    skins = dict.fromkeys(names, sdf.isosurface(hand.finger.along_x(), 0.7 * mm))
+    skins["thumb"] = sdf.isosurface(hand.thumb.along_x(), 0.7 * mm)
+    skins["palm"] = sdf.isosurface(hand.palm(), 1.5 * mm)
+    slab = sdf.Box([-54 * mm, -38 * mm, -4 * mm], [54 * mm, 34 * mm, 0.0])
+    table, scale = view.scene_of(slab), view.Scale("pressure [kPa]", -10.0, 90.0)
+    plain = {"palm": "#e9e4da"}
     states = np.asarray(film.state["fingers"]["body"]["q"])
-    scenes = [
-        sj.view.scene_of(rod.assembly(sj.SE3(), **parts), states[k].ravel()) for k in moments
-    ]
-    low = np.min([scene.box[0] for scene in scenes], axis=0)
-    high = np.max([scene.box[1] for scene in scenes], axis=0)
-    for column, (k, scene) in enumerate(zip(moments, scenes, strict=True)):
-        shown = sj.view.show(dataclasses.replace(scene, extent=(low, high)),
-                             view=sj.view.Camera(-40.0, 15.0), renderer="own")  # fmt: skip
-        axes = figure.add_subplot(grid[0, column])
-        axes.imshow(plt.imread(io.BytesIO(shown.png)))
-        axes.set_title(f"{float(film.time[k]):.2f} s")
-        axes.set_axis_off()
-    names = "thumb", "first", "second", "third", "fourth"
-    panels = (pressure / kPa, "pressure [kPa]"), (angle / deg, "angle of the tip [deg]")
-    below = [figure.add_subplot(grid[1, at : at + 2]) for at in (0, 2)]
-    for axes, (values, label) in zip(below, panels, strict=True):
-        for k, name in enumerate(names):
-            axes.plot(film.time, values[:, k], label=name, lw=1.3)
-        axes.set(xlabel="time [s]", ylabel=label)
-    below[1].legend(
-        frameon=False, ncols=5, fontsize=9, loc="lower right", bbox_to_anchor=(1, 1)
+
+    def scene(k):
+        palm, *bent = view.scene_of(whole, states[k].ravel(), shapes=skins, colours=plain).parts
+        blown = [
+            dataclasses.replace(part, values=np.full(len(part.points), p / kPa))
+            for part, p in zip(bent, np.asarray(pressure)[k], strict=True)
+        ]
+        return view.Scene((palm, *blown, *table.parts), scale)
+
+    figure = plt.figure(figsize=(7, 5.4), dpi=200, layout="constrained")
+    grid = figure.add_gridspec(2, 1, height_ratios=(1.35, 1))
+    above, below = grid[0].subgridspec(1, 4), grid[1].subgridspec(1, 2)
+    moments = [-1 - round(x * 2 * math.pi / RATE / PERIOD) for x in (0.8, 0.55, 0.3, 0.05)]
+    times, colours = (
+        np.asarray(film.time),
+        ["#D55E00", *plt.get_cmap("Blues")([0.4, 0.6, 0.8, 1.0])],
     )
-    figure.savefig(file, dpi=100)
+    panels = (pressure / kPa, "pressure [kPa]"), (angle / deg, "angle of the tip [deg]")
+    for at, (values, label) in zip(below, panels, strict=True):
+        axes = figure.add_subplot(at)
+        for k, name in enumerate(names):
+            axes.plot(times, values[:, k], label=name, lw=1.5, color=colours[k])
+        for k in moments:
+            axes.axvline(times[k], color="0.75", lw=0.8, zorder=0)
+        axes.set(xlabel="time [s]", ylabel=label, xlim=(times[-1] - 2, times[-1]))
+        axes.spines[["top", "right"]].set_visible(False)
+    lines = axes.get_legend_handles_labels()
+    figure.legend(*lines, loc="outside lower center", ncols=5, frameon=False)
+    shown = [figure.add_subplot(place) for place in above]
+    for axes, k in zip(shown, moments, strict=True):
+        axes.set_title(f"{times[k]:.2f} s", fontsize=10)
+    view.draw_into(shown, [scene(k) for k in moments], view=view.Camera(-62.0, 16.0))
+    figure.savefig(file)
     plt.close(figure)
 
 

@@ -96,46 +96,61 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
 
 
 def draw(whole, q, time, place, force, ticks, file) -> None:
-    """Six moments from the front, and heights, forces and pressures over time."""
-    import dataclasses
-    import io
+    """The printed robot at six moments; heights, forces and pressures over time."""
+    from dataclasses import replace
 
-    import matplotlib
-
-    matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
+    from sorojax import sdf, view
+
+    printed = view.scene_of(robots.Manipulator(), size=1.2 * mm).parts[-1]
+    hung, up = printed.points, np.asarray(robots.upside_down(BEAM))
+    hung = hung @ up[:3, :3].T + up[:3, 3]
+    soft = tuple(name for name in whole.names if name != "cylinder")
+    rig = view.rig(whole, (hung, printed.triangles), parts=soft, blend=4 * mm)
+    cylinder, floor, beam = (
+        view.scene_of(sdf.Cylinder(RADIUS, HEIGHT, 1 * mm)).parts[0],
+        view.scene_of(sdf.Box([-55 * mm, -48 * mm, -4 * mm], [75 * mm, 48 * mm, 0.0])),
+        view.scene_of(sdf.Box([-55 * mm, -45 * mm, BEAM], [55 * mm, 45 * mm, BEAM + 8 * mm])),
+    )
+
+    def scene(t):
+        now = q[round(t / PERIOD)]
+        pose = np.asarray(rod.tip_pose(whole, now)["cylinder"])
+        held = replace(
+            cylinder, points=cylinder.points @ pose[:3, :3].T + pose[:3, 3], colour="#f9c274"
+        )
+        (skin,) = view.scene_of(rig, now).parts
+        bodies = view.Scene((replace(skin, colour="#8fbce6"), held))
+        return view.merge_scenes(bodies, floor, beam)
+
     moments = (0.1, 0.7, 1.6, 2.6, 3.5, 4.85)
-    shapes = {"cylinder": sj.sdf.Cylinder(RADIUS, HEIGHT)}
-    scenes = [sj.view.scene_of(whole, q[round(t / PERIOD)], shapes=shapes) for t in moments]
-    low = np.min([scene.box[0] for scene in scenes], axis=0)
-    high = np.max([scene.box[1] for scene in scenes], axis=0)
-    figure = plt.figure(figsize=(12, 6.4), layout="constrained")
-    grid = figure.add_gridspec(2, 6, height_ratios=(1.35, 1))
-    for column, (t, scene) in enumerate(zip(moments, scenes, strict=True)):
-        scene = dataclasses.replace(scene, extent=(low, high))
-        shown = sj.view.show(scene, view=sj.view.Camera(-90.0, 8.0), renderer="own")
-        axes = figure.add_subplot(grid[0, column])
-        image = plt.imread(io.BytesIO(shown.png))
-        rows, columns = image.shape[:2]
-        axes.imshow(image[: int(0.93 * rows), int(0.2 * columns) : int(0.82 * columns)])
-        axes.set_title(f"{t:g} s")
-        axes.set_axis_off()
-    panels = [figure.add_subplot(grid[1, k : k + 2]) for k in (0, 2, 4)]
+    words = "comes", "reaches down", "lifts", "carries", "puts down", "leaves"
+    figure = plt.figure(figsize=(7, 8.6), dpi=200, layout="constrained")
+    grid = figure.add_gridspec(2, 1, height_ratios=(2.6, 1))
+    shown = [figure.add_subplot(at) for at in grid[0].subgridspec(2, 3)]
+    for axes, t, word in zip(shown, moments, words, strict=True):
+        axes.set_title(f"{t:g} s: {word}", fontsize=10)
+    panels = [figure.add_subplot(at) for at in grid[1].subgridspec(1, 3)]
+    panels[0].axhline(TARGET / mm, color="0.7", lw=1)
     for k, name in ((0, "x"), (2, "z")):
-        panels[0].plot(time, place[:, k] / mm, label=f"{name} of the cylinder")
-    panels[0].axhline(TARGET / mm, color="0.6", lw=0.8)
-    panels[0].set(xlabel="time [s]", ylabel="[mm]")
-    panels[1].plot(time, force, color="#2a6f97", label="lift of the fingers")
-    panels[1].axhline(9.81 * MASS, color="#e76f51", lw=1, label="weight")
-    panels[1].set(xlabel="time [s]", ylabel="[N]", ylim=(-0.6, 1.2))
+        panels[0].plot(time, place[:, k] / mm, lw=1.6, label=name)
+    panels[0].set_ylabel("place of the cylinder [mm]")
+    panels[1].axhline(9.81 * MASS, color="0.7", lw=1)
+    panels[1].plot(time, force, color="#0072B2", lw=1.4)
+    panels[1].text(4.9, 9.81 * MASS + 0.04, "weight", ha="right", fontsize=9)
+    panels[1].set(ylabel="lift of the fingers [N]", ylim=(-0.6, 0.8))
     pressures = np.array([tick.pressure for tick in ticks]) / kPa
-    panels[2].plot([tick.time for tick in ticks], pressures)
-    panels[2].set(xlabel="time [s]", ylabel="measured pressure [kPa]")
-    panels[2].legend(["bellows 1", "2", "3", "gripper"], frameon=False, fontsize=8)
-    for panel in panels[:2]:
-        panel.legend(frameon=False, fontsize=8)
-    figure.savefig(Path(file), dpi=90)
+    lines = panels[2].plot([tick.time for tick in ticks], pressures, lw=1.4)
+    panels[2].set(ylabel="pressure [kPa]", ylim=(-38, 125))
+    look = {"frameon": False, "ncols": 2, "fontsize": 8, "handlelength": 1, "columnspacing": 1}
+    panels[2].legend(lines, ["bellows 1", "2", "3", "gripper"], **look)
+    panels[0].legend(frameon=False, fontsize=9)
+    for panel in panels:
+        panel.set_xlabel("time [s]")
+        panel.spines[["top", "right"]].set_visible(False)
+    view.draw_into(shown, [scene(t) for t in moments], view=view.Camera(-68.0, 12.0))
+    figure.savefig(Path(file))
     plt.close(figure)
 
 

@@ -99,12 +99,13 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
 
 def draw(density, cell, found, made, paths, feet, pressures, file) -> None:
     """The densities and the smooth chamber, its width, and the chain under air."""
-    import matplotlib
-
-    matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    figure, axes = plt.subplots(1, 4, figsize=(13, 4.2), width_ratios=(0.8, 0.8, 1.7, 1.1))
+    from sorojax import view
+
+    figure = plt.figure(figsize=(7, 5.1), dpi=200, layout="constrained")
+    grid = figure.add_gridspec(2, 1, height_ratios=(0.85, 1.15))
+    axes = [figure.add_subplot(place) for place in grid[1].subgridspec(1, 3)]
     points = np.asarray(cell.problem.mesh.points) / mm
     cells = np.asarray(cell.problem.mesh.cells)
     corners = points[cells].mean(axis=1)
@@ -113,27 +114,30 @@ def draw(density, cell, found, made, paths, feet, pressures, file) -> None:
     box = (0, SIZE[0] / mm, 0, SIZE[1] / mm)
     axes[0].imshow(density[order].reshape(rows, -1), origin="lower", cmap="Greys", extent=box)
     for curve in sdf.contour(made.cell, 0.2 * mm):
-        axes[0].plot(*(np.asarray(curve.points).T / mm), color="#e76f51", lw=1.2)
-    axes[0].set(xlabel="[mm]", title="densities, the body in red")
+        axes[0].plot(*(np.asarray(curve.points).T / mm), color="#D55E00", lw=1.5)
+    axes[0].set(xlabel="x [mm]", ylabel="y [mm]")
+    axes[0].set_title("densities and outline", fontsize=10)
     heights, wide = widths(made)
-    axes[1].plot(wide / mm, heights / mm, color="#2a6f97")
+    axes[1].plot(wide / mm, heights / mm, color="#0072B2", lw=1.8)
     axes[1].set(xlabel="width of the chamber [mm]", ylabel="height [mm]", xlim=(0, None))
-    fine = paths[1]
-    facets = np.asarray(mesh.boundary_facets(fine.problem.mesh))[:, [0, 2, 1]]
-    for k, shade in ((0, 0.3), (len(pressures) // 2, 0.55), (len(pressures) - 1, 1.0)):
-        now = np.asarray(fine.problem.mesh.points + fine.displacements[k]) / mm
-        for side in now[facets]:
-            axes[2].plot(*side.T, color="#2a6f97", lw=0.8, alpha=shade)
-    axes[2].set(aspect="equal", xlabel="x [mm]", title="a chain at 0, 40 and 80 kPa")
-    for places_, style, name in zip(
-        feet, ("o", "-"), ("first mesh", "finer mesh"), strict=True
-    ):
+    for places_, style, name in zip(feet, ("o", "-"), ("mesh", "finer mesh"), strict=True):
         way = np.linalg.norm(places_[:, -2] - places_[0, -2], axis=1) / mm
-        axes[3].plot(np.asarray(pressures) / kPa, way, style, label=name)
-    axes[3].set(xlabel="pressure [kPa]", ylabel="way of the lower end [mm]")
-    axes[3].legend(frameon=False)
-    figure.tight_layout()
-    figure.savefig(Path(file), dpi=100)
+        axes[2].plot(np.asarray(pressures) / kPa, way, style, label=name, ms=4.5)
+    axes[2].set(xlabel="pressure [kPa]", ylabel="way of the lower end [mm]")
+    axes[2].legend(frameon=False, fontsize=9)
+    for plot in axes[1:]:
+        plot.spines[["top", "right"]].set_visible(False)
+    states = (0, len(pressures) // 2, len(pressures) - 1)
+    shown = [figure.add_subplot(place) for place in grid[0].subgridspec(1, 3)]
+    for place, k in zip(shown, states, strict=True):
+        place.set_title(f"{float(pressures[k]) / kPa:.0f} kPa", fontsize=10)
+    plate = sdf.Box([-4 * mm, -17 * mm, -4 * mm], [0, 17 * mm, SIZE[1] + 4 * mm])
+    bodies = view.scenes_of(paths[1], states, field="von_mises", rest=False)
+    scenes = [
+        view.merge_scenes(view.extrude(body, DEPTH), view.scene_of(plate)) for body in bodies
+    ]
+    view.draw_into(shown, scenes, view=view.Camera(-58.0, 20.0))
+    figure.savefig(Path(file))
     plt.close(figure)
 
 

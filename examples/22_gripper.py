@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array
 
 import sorojax as sj
-from sorojax import robots, rod, systems
+from sorojax import robots, rod, sdf, systems, view
 from sorojax.math import ContactMidpoint
 from sorojax.rod import PairForce, Part, PartForce, TimeVaryingForce
 from sorojax.units import mm
@@ -105,36 +105,71 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
 
 
 def draw(films, file) -> None:
-    """The fingers at the end, seen from the side, and the way of the bolt."""
-    import matplotlib
-
-    matplotlib.use("Agg")
+    """Three things in the fingers, a step of the bolt, and how far it turns."""
     from matplotlib import pyplot as plt
-    from matplotlib.patches import Rectangle
 
-    figure, axes = plt.subplots(1, 4, figsize=(13, 3.8), width_ratios=(1, 1, 1, 1.7))
-    points = np.linspace(0, 1, 30)
-    for axis, name in zip(axes, (*THINGS, "left"), strict=False):
-        model, path, _, (radius, length, *_) = films[name]
-        poses = rod.forward_kinematics(model, path.q[-1], points)
-        for finger, shade in zip(model.names, (1.0, 0.4, 1.0, 0.4), strict=False):
-            x, _, z = np.asarray(poses[finger])[:, :3, 3].T / mm
-            axis.plot(x, z, color="#2a6f97", alpha=shade, lw=9, solid_capstyle="round")
-        middle = np.asarray(poses["thing"])[0, :3, 3] / mm
-        corner = middle[0] - radius / mm, middle[2] - length / 2 / mm
-        box = Rectangle(corner, 2 * radius / mm, length / mm, color="#e76f51", alpha=0.8)
-        axis.add_patch(box)
-        title = "bolt" if name == "left" else name
-        axis.set(aspect="equal", xlim=(-55, 55), ylim=(-170, 15), title=title, xlabel="[mm]")
-    for name in ("left", "right"):
-        path = films[name][1]
-        axes[3].plot(
-            path.time, np.asarray(path.q[:, -1]) / (2 * np.pi), label=f"phase of {name}"
+    figure = plt.figure(figsize=(7, 7.4), dpi=200, layout="constrained")
+    grid = figure.add_gridspec(3, 12, height_ratios=(3.3, 1.8, 1.6))
+    plate = sdf.translate(sdf.Cylinder(46 * mm, 7 * mm, 1 * mm), [0, 0, 3.4 * mm])
+    plate = view.scene_of(plate - sdf.Cylinder(29.5 * mm, 30 * mm))
+    rubber, orange = "#8fbce6", "#f9c274"
+    colours = {f"finger_{k}": rubber for k in range(4)}
+    names = (*THINGS, "left")
+
+    def thing(name) -> sj.sdf.Surface:
+        """What a cylinder stands for, with the round sides that the fingers touch."""
+        if name == "beaker":
+            hollow = sdf.translate(sdf.Cylinder(18.5 * mm, 60 * mm), [0, 0, 1.5 * mm])
+            made = sdf.Cylinder(20 * mm, 60 * mm, 1 * mm) - hollow
+        elif name == "wrench":
+            disc = sdf.turn(sdf.Cylinder(13 * mm, 9 * mm, 1 * mm), [1, 0, 0], np.pi / 2)
+            jaw = disc - sdf.Box([-6 * mm, -9 * mm, -22 * mm], [6 * mm, 9 * mm, 0])
+            bar = sdf.Cylinder(5 * mm, 100 * mm, 1 * mm)
+            made = bar | sdf.translate(jaw, [0, 0, -58 * mm])
+        else:
+            groove = sdf.translate(sdf.Cylinder(1.5 * mm, 50 * mm), [28.6 * mm, 0, 0])
+            mark = sdf.Box([20 * mm, -3 * mm, -30 * mm], [30 * mm, 3 * mm, 30 * mm])
+            socket = sdf.extrude(sdf.RegularPolygon(14 * mm, 6), 24 * mm)
+            head = sdf.Cylinder(28 * mm, 44 * mm, 1.5 * mm) - sdf.polar_repeat(groove, 30)
+            shank = sdf.translate(sdf.Cylinder(13 * mm, 50 * mm), [0, 0, -40 * mm])
+            made = (head - mark - sdf.translate(socket, [0, 0, 18 * mm])) | shank
+        return sdf.isosurface(made, 0.8 * mm)
+
+    bellows = robots.Bellows(6 * mm, 4 * mm, 7.9 * mm, 4.7 * mm, 0.9 * mm, 2 * mm, 0.8 * mm, 9)
+    printed = robots.Finger(bellows, 5 * mm, 6.5 * mm, 2.2 * mm).along_x()
+    fingers = dict.fromkeys(colours, sdf.isosurface(printed, 0.6 * mm))
+    solids = {name: fingers | {"thing": thing(name)} for name in names}
+
+    def scene(name, at):
+        model, path = films[name][:2]
+        return view.scene_of(
+            model, path.q[at], shapes=solids[name], colours=colours | {"thing": orange}
         )
-    axes[3].set(xlabel="time [s]", ylabel="turns of the bolt")
-    axes[3].legend(frameon=False)
-    figure.tight_layout()
-    figure.savefig(Path(file), dpi=100)
+
+    last = len(films["left"][1].time) - 1
+    times = np.array([3.9, 4.3, 4.46, 4.6])
+    steps = np.searchsorted(np.asarray(films["left"][1].time), times)
+    turns = figure.add_subplot(grid[2, :])
+    for name, high in (("left", 0.75), ("right", -0.9)):
+        path = films[name][1]
+        angle = np.asarray(path.q[:, -1]) / (2 * np.pi)
+        turns.plot(path.time, angle, lw=1.8, color=rubber if name == "right" else "#d98d1f")
+        turns.text(0.6, high, f"fingers walk to the {name}")
+        if name == "left":
+            turns.plot(times, angle[steps], "o", ms=4.5, color="#1f2430")
+    turns.set(xlabel="time [s]", ylabel="turns of the bolt", ylim=(-1.15, 1.15))
+    turns.spines[["top", "right"]].set_visible(False)
+    held = [figure.add_subplot(grid[0, 4 * k : 4 * k + 4]) for k in range(3)]
+    walk = [figure.add_subplot(grid[1, 3 * k : 3 * k + 3]) for k in range(4)]
+    titles = ("a beaker", "a wrench", "a bolt", *(f"{t:.2f} s, no plate" for t in times))
+    for axes, title in zip((*held, *walk), titles, strict=True):
+        axes.set_title(title, fontsize=10, y=0.98)
+        axes.set_axis_off()
+    whole = [view.merge_scenes(scene(name, last), plate) for name in names]
+    view.draw_into(held, whole, view=view.Camera(-62.0, 14.0))
+    above = view.Camera(-62.0, 62.0)
+    view.draw_into(walk, [scene("left", k) for k in steps], view=above, scale=False)
+    figure.savefig(Path(file))
     plt.close(figure)
 
 

@@ -8,6 +8,7 @@ the tip is round, the set-point comes to the wall within 1 s and keeps off the e
 """
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -96,31 +97,43 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     }
 
 
-def draw(rod, path, goal, tips, push, asked, solid, file) -> None:
-    """The rod on its way, and the force that it holds the wall with."""
-    import matplotlib
-
-    matplotlib.use("Agg")
+def draw(arm, path, goal, tips, push, asked, solid, file) -> None:
+    """The arm on its way along the wall, and the force that it holds it with."""
     from matplotlib import pyplot as plt
 
-    time, s = path.time, jnp.linspace(0, 1, 40)
-    lines = jax.vmap(lambda q: sj.rod.forward_kinematics(rod, q, s)[:, :2, 2])(path.q)
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.2), width_ratios=(1, 1.2))
-    outline = np.asarray(solid.vertices) / mm
-    left.fill(-outline[:, 1], outline[:, 0], color="#adb5bd", lw=0)
-    for k in np.linspace(0, len(time) - 1, 9).astype(int):
-        shade = 0.25 + 0.75 * k / len(time)
-        left.plot(-lines[k, :, 1] / mm, lines[k, :, 0] / mm, color="#2a6f97", alpha=shade, lw=4)
-    for name, way, colour in (("goal", goal, "#e76f51"), ("tip", tips, "#012a4a")):
-        left.plot(-way[:, 1] / mm, way[:, 0] / mm, color=colour, label=name)
-    left.set(aspect="equal", xlabel="x [mm]", ylabel="y [mm]", xlim=(-290, 20), ylim=(0, 420))
-    left.legend(frameon=False, loc="lower right")
-    right.plot(time, push, color="#012a4a", label="force on the wall")
-    right.plot(time, asked, "--", color="#e76f51", label="stiffness times offset")
-    right.set(xlabel="time [s]", ylabel="[N]", ylim=(0, 6))
-    right.legend(frameon=False)
-    figure.tight_layout()
-    figure.savefig(Path(file), dpi=110)
+    from sorojax import rod, sdf, view
+
+    tube = rod.rod(
+        sj.SE3(), rod.piecewise_constant(kappa_z=6), rod.rectangle(60 * mm, 2 * HALF),
+        length=arm.length, young_modulus=1.0, poisson_ratio=0.3, density=1.0,
+    )  # fmt: skip
+    upright = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # of rows: the arm stands
+    states = np.array([0, 106, 180, 290, 420, 540, 700])
+    *before, last = view.scene_of(tube, np.asarray(path.q)[states]).parts
+    thin = upright * [1, 0.9, 1]  # earlier states are narrower, so that they do not hide it
+    turned = [replace(part, points=part.points @ thin) for part in before]
+    turned.append(replace(last, points=last.points @ upright, colour="#6db1e8"))
+    wall = view.scene_of(sdf.extrude(solid, 60 * mm)).parts[0]
+    turned.append(replace(wall, points=wall.points @ upright, colour=view.Surface.colour))
+    for way, colour in ((goal, "#D55E00"), (tips, "#1f2430")):
+        lifted = np.insert(np.asarray(way), 2, 31 * mm, axis=1) @ upright
+        turned.append(view.Lines([lifted], colour, 2.2))
+    foot = sdf.Box([-60 * mm, -40 * mm, -12 * mm], [60 * mm, 40 * mm, 0.0])
+    figure = plt.figure(figsize=(7, 6.8), dpi=200, layout="constrained")
+    grid = figure.add_gridspec(2, 1, height_ratios=(2.1, 1))
+    right, left = figure.add_subplot(grid[1]), figure.add_subplot(grid[0])
+    right.plot(path.time, push, color="#0072B2", lw=1.4, label="force on the wall")
+    right.plot(path.time, asked, "--", color="#D55E00", lw=1.6, label="stiffness times offset")
+    right.plot(np.asarray(path.time)[states], push[states], "o", color="#1f2430", ms=4.5)
+    right.set(xlabel="time [s]", ylabel="force [N]", ylim=(-0.2, 6))
+    right.spines[["top", "right"]].set_visible(False)
+    right.legend(frameon=False, fontsize=9)
+    left.plot([], [], color="#D55E00", lw=2.2, label="set-point")
+    left.plot([], [], color="#1f2430", lw=2.2, label="tip")
+    left.legend(frameon=False, fontsize=9, loc="upper left")
+    scene = view.merge_scenes(view.Scene(tuple(turned)), view.scene_of(foot))
+    view.draw_into(left, scene, view=view.Camera(-76.0, 16.0))
+    figure.savefig(Path(file))
     plt.close(figure)
 
 

@@ -64,9 +64,24 @@ def test_numbers_of_the_paper_stand_beside_measured_ones():
     paper = json.loads((FOLDER / "gallery" / "paper.json").read_text())
     for name, entry in paper.items():
         file = FOLDER / "gallery" / "numbers" / f"{name}.json"
-        if entry.get("numbers") and file.exists():
-            measured = json.loads(file.read_text())["numbers"]
-            assert set(entry["numbers"]) <= set(measured), name
+        compared = {*entry.get("numbers", ()), *entry.get("asked", ())}
+        if compared and file.exists():
+            assert compared <= set(json.loads(file.read_text())["numbers"]), name
+
+
+def test_figures_and_contradictions_of_the_paper_are_named(written):
+    """The figures of an example are those whose captions show it; none belongs to two."""
+    paper = json.loads((FOLDER / "gallery" / "paper.json").read_text())
+    figures = []
+    for entry in paper.values():
+        if "section" in entry:
+            first, *last = map(int, re.findall(r"\d+", entry["section"].partition("figure")[2]))
+            figures += range(first, (last or [first])[0] + 1)
+            assert f"paper {entry['section']}<" in written
+        assert html.escape(entry.get("note", "")) in written
+    assert sorted(figures) == [4, 5, *range(7, 10), *range(12, 37)]
+    assert "12.5 %" in paper["12_buckling"]["note"]
+    assert "<th>ours</th><th>paper</th><th>asked</th>" in written
 
 
 def test_a_new_script_is_found_measured_and_shown(tmp_path):
@@ -74,7 +89,8 @@ def test_a_new_script_is_found_measured_and_shown(tmp_path):
     (tmp_path / "31_spring.png").write_bytes(b"")
     (tmp_path / "32_broken.py").write_text(BROKEN)
     (tmp_path / "gallery").mkdir()
-    paper = {"31_spring": {"section": "II", "numbers": {"way [mm]": "3 < x", "mass": "1"}}}
+    spring = {"section": "II", "numbers": {"way [mm]": "3 < x", "mass": "1"}}
+    paper = {"31_spring": spring | {"asked": {"springs": "5"}, "note": "Ours & theirs."}}
     (tmp_path / "gallery" / "paper.json").write_text(json.dumps(paper))
     done = build("--folder", tmp_path, "--run")
     assert done.returncode == 1 and "no such spring" in done.stderr
@@ -84,6 +100,8 @@ def test_a_new_script_is_found_measured_and_shown(tmp_path):
     text = (tmp_path / "gallery" / "index.html").read_text()
     assert "<td>way [mm]</td><td>2.5</td><td>3 &lt; x</td>" in text
     assert "<td>mass</td><td>-</td><td>1</td>" in text and "paper II" in text
+    assert "<td>springs</td><td>4</td><td></td><td>5</td>" in text
+    assert "<p>Ours &amp; theirs.</p>" in text
     assert '<img src="../31_spring.png"' in text and "&lt;signs&gt;" in text
     assert "not measured yet" in text  # the one that failed
     again = build("--folder", tmp_path, "--run", "31", "--quick")

@@ -4,8 +4,9 @@
     python examples/gallery/build.py --run           measure all examples again, then write it
     python examples/gallery/build.py --run 12 14     only those whose names begin so
 
-Measured numbers lie in `numbers/NAME.json` with the machine that gave them, those of the paper
-in `paper.json`. A new script `NN_name.py` beside a picture `NN_name.png` is found by itself; a
+Measured numbers lie in `numbers/NAME.json` with the machine that gave them; what the paper
+says, what this project asks of a number, and a sentence where we contradict the paper, in
+`paper.json`. A new script `NN_name.py` beside a picture `NN_name.png` is found by itself; a
 picture of another name is named there too.
 """
 
@@ -136,22 +137,24 @@ def _card(script: Path, store: Path, paper: dict[str, Any]) -> str:
 
 
 def _table(script: Path, store: Path, paper: dict[str, Any]) -> str:
-    """Numbers here and in the paper, and where they come from."""
-    file, wanted = store / f"{script.stem}.json", dict(paper.get("numbers", {}))
+    """Numbers here, in the paper and asked for, and where they come from."""
+    file = store / f"{script.stem}.json"
+    told, asked = (dict(paper.get(key, {})) for key in ("numbers", "asked"))
     found = json.loads(file.read_text()) if file.exists() else None
     numbers = found["numbers"] if found else {}
     body = ""
-    for name in [*numbers, *(name for name in wanted if name not in numbers)]:
+    for name in dict.fromkeys((*numbers, *told, *asked)):
         here = html.escape(text(numbers[name])) if name in numbers else "-"
-        told = html.escape(wanted.get(name, ""))
-        body += f"<tr><td>{html.escape(name)}</td><td>{here}</td><td>{told}</td></tr>"
+        cells = html.escape(name), here, *(html.escape(r.get(name, "")) for r in (told, asked))
+        body += f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
     note = "not measured yet: run build.py --run"
     if found:
         mode = ", quick mode" if found["quick"] else ""
         note = f"{found['seconds']:g} s on {found['machine']}; {found['versions']}; "
         note += f"{found['day']}{mode}"
-    head = "<tr><th></th><th>here</th><th>paper, or what was asked</th></tr>" if body else ""
-    return f"<table>{head}{body}</table><p class=note>{html.escape(note)}</p>"
+    head = "<tr><th></th><th>ours</th><th>paper</th><th>asked</th></tr>" if body else ""
+    said = f"<p>{html.escape(paper['note'])}</p>" if "note" in paper else ""
+    return f"<table>{head}{body}</table>{said}<p class=note>{html.escape(note)}</p>"
 
 
 def text(value: float | int | str) -> str:
@@ -198,8 +201,8 @@ details {{ margin-top: .5em }} summary {{ cursor: pointer }} a {{ color: #0072b2
 </style></head><body><h1>Gallery</h1>
 <p>Every example of this folder with what it draws and the numbers that its <code>main()</code>
 returns, beside those of the paper: Caasenbrood, Pogromsky, Nijmeijer, <i>Sorotoki: a Matlab
-toolkit for design, modeling, and control of soft robots</i>, IEEE Access 12, 2024. Where the
-paper gives no number its bar is that of this project.</p><p>{links}</p>
+toolkit for design, modeling, and control of soft robots</i>, IEEE Access 12, 2024. What is
+asked is the bar of this project. Numbers of figures are those of the paper.</p><p>{links}</p>
 {cards}
 {notebooks}
 </body></html>

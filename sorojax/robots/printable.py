@@ -190,6 +190,11 @@ class Finger(eqx.Module):
         )
         return b.solid() | tip | spine
 
+    def along_x(self) -> AbstractSdf:
+        """The solid finger from the origin along x, as rods carry it: a positive curvature
+        about z bends it towards its spine, which lies at +y."""
+        return LaidAlong(rotate(self.solid(), np.pi), 0)
+
 
 # The hand: a palm with five soft fingers, each with an air supply of its own
 

@@ -8,13 +8,15 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from sorojax._arguments import check_package as _check_package, public as _public
-from sorojax.view.picture import Picture
+from sorojax.view.picture import Picture, draw_into
 from sorojax.view.raster.camera import Camera, between, orbit
+from sorojax.view.raster.extruded import extrude
 from sorojax.view.raster.scene import Arrows, Dots, Lines, Scale, Scene, Surface, merge_scenes
 from sorojax.view.show import options, scene_of, show
 from sorojax.view.style import png
 
 _NAMES = {
+    "draw.bodies": ("scenes_of",),
     "draw.plots": (
         "Convergence",
         "WorkPrecision",
@@ -60,6 +62,7 @@ _NAMES = {
 _MODULE = {name: module for module, names in _NAMES.items() for name in names}
 
 if TYPE_CHECKING:
+    from sorojax.view.draw.bodies import scenes_of
     from sorojax.view.draw.files import animate_file, show_file
     from sorojax.view.draw.plots import (
         Convergence,
@@ -103,6 +106,8 @@ __all__ = [
     "between",
     "bind",
     "deform",
+    "draw_into",
+    "extrude",
     "html_report",
     "live",
     "merge_scenes",
@@ -112,6 +117,7 @@ __all__ = [
     "pose",
     "rig",
     "scene_of",
+    "scenes_of",
     "show",
     "show_backbones",
     "show_file",

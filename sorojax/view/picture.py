@@ -107,6 +107,72 @@ def show_scene(scene: Scene, *, view: View = "iso", renderer: str = "auto") -> P
     return Picture(figure, (Panel(figure.axes[0], lens),))
 
 
+def draw_into(
+    axes: "Axes | Sequence[Axes]",
+    scenes: Scene | Sequence[Scene],
+    *,
+    view: View = "iso",
+    renderer: str = "own",
+    shadows: bool = True,
+    bar: bool = True,
+    scale: bool = True,
+) -> None:
+    """Draw solid scenes into axes of a figure of your own, all by one lens and on one scale.
+
+    Call it after everything else is in the figure: its layout is computed and kept then, and
+    each scene is drawn as large as its axes are. Axes of later calls are switched off before.
+    Lengths are told by a bar in the first axes.
+
+    Args:
+        axes: Of matplotlib; one, or one per scene. Those of one size show one scale.
+        scenes: From `scene_of`, `scenes_of`, `extrude` or `merge_scenes`.
+        view: Of all.
+        renderer: "own" gives the same picture everywhere; "auto" is pyvista where it is.
+        shadows: Whether bodies throw shadows on each other.
+        bar: Put a colour bar beside the axes if the first scene has a scale of values.
+        scale: Put a bar of known length into the first axes.
+
+    Raises:
+        ValueError: If there are not as many axes as scenes, or a scene is plane.
+
+    Example:
+        >>> from matplotlib.figure import Figure
+        >>> figure = Figure(figsize=(4, 3), layout="constrained")
+        >>> ball = view.scene_of(sdf.Sphere([0, 0, 0], 10 * mm))
+        >>> view.draw_into(figure.add_subplot(), ball)
+    """
+    every = [axes] if not isinstance(axes, Sequence | np.ndarray) else list(axes)
+    scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
+    _check_axes(every, scenes)
+    figure = every[0].figure
+    for each in every:
+        each.set_axis_off()
+    if bar and scenes[0].scale is not None:
+        bar_beside(figure, every, scenes[0].scale)
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for k, (each, scene) in enumerate(zip(every, scenes, strict=True)):
+        lens = solid.lens_of(scenes, view, solid.size_of(each))
+        solid.draw_solid(figure, each, scene, renderer=renderer, lens=lens, shadows=shadows)
+        if scale and k == 0:
+            unit = figure.dpi / 72
+            low = lens.size[1] - 6 * unit
+            solid.scale_bar(each, lens, 2 * unit, low, 4 * unit)
+
+
+def _check_axes(axes: list, scenes: list) -> None:
+    if not scenes or len(axes) != len(scenes):
+        raise ValueError(
+            f"view.draw_into: got {len(axes)} axes for {len(scenes)} scenes, need as many. "
+            "Pass one of each, or two sequences of one length."
+        )
+    if any(scene.dim != 3 for scene in scenes):
+        raise ValueError(
+            "view.draw_into: got a plane scene, need solid ones. Give it a depth by "
+            "view.extrude, or draw it by view.show."
+        )
+
+
 def panels(
     scenes: Sequence[Scene],
     names: Sequence[str],

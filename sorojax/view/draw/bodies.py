@@ -178,13 +178,33 @@ def show_path(
         **options: As of a solution; supports and loads are left out.
     """
     chosen = chosen_states("view.show", len(path), states)
-    moved = np.asarray(path.displacements)
-    problems = problems_of(path, chosen)
-    options = {"loads": False} | options
-    scene_at, _ = body_scenes(problems, moved[chosen], **options)
-    scenes = joint_extent([scene_at(k) for k in range(len(chosen))])
     names = [state_name(path, k) for k in chosen]
+    scenes = scenes_of(path, chosen, **options)
     return panels(scenes, names, view=view, renderer=renderer, title=title)
+
+
+def scenes_of(path: Any, states: Sequence[int] | None = None, **options: Any) -> list[Scene]:
+    """States along a load path, a continuation or a motion as scenes, on one scale.
+
+    Args:
+        path: From `fem.solve_path`, `fem.volume_path`, `fem.continuation` or `fem.simulate`.
+        states: Which of them; up to six, evenly spaced, if omitted.
+        **options: As of a solution (`view.options(solution)`); supports and loads are left
+            out.
+
+    Returns:
+        One scene per state, all with the box and the colour scale of all.
+
+    Raises:
+        ValueError: If the path has no such state.
+
+    Example:
+        `view.draw_into(axes, [view.extrude(s, 20 * mm) for s in view.scenes_of(motion)])`
+    """
+    chosen = chosen_states("view.scenes_of", len(path), states)
+    moved = np.asarray(path.displacements)[chosen]
+    scene_at, _ = body_scenes(problems_of(path, chosen), moved, **{"loads": False} | options)
+    return joint_extent([scene_at(k) for k in range(len(chosen))])
 
 
 def show_vibration(
@@ -293,10 +313,11 @@ def chosen_states(where: str, count: int, states: Sequence[int] | None) -> list[
         raise ValueError(f"{where}: the path has no state. Look at its status.")
     if states is None:
         return spread(count, 7)[-6:]
+    states = [int(k) for k in states]
     wrong = [k for k in states if not -count <= k < count]
     if wrong or not states:
         raise ValueError(
-            f"{where}: `states` is {list(states)}, there are states 0 to {count - 1}. Choose "
+            f"{where}: `states` is {states}, there are states 0 to {count - 1}. Choose "
             "one or more of them."
         )
     return [k % count for k in states]

@@ -29,7 +29,9 @@ from sorojax.view.draw.shapes import shape_scene, surface_scene
 from sorojax.view.picture import Picture, plotted, spread
 from sorojax.view.raster.glyphs import circle, tube
 from sorojax.view.raster.scene import Arrows, Dots, Lines, Part, Scene, Surface, short
+from sorojax.view.rigging.frames import pose_rows
 from sorojax.view.rigging.rig import Rig, ellipsoid, pose as posed_rig
+from sorojax.view.rigging.skin import bind, carried
 
 _ALONG = 9  # arrows of a force per length
 _LENGTH, _RADIUS = 0.2, 0.07  # of the body: the longest arrow, an arc
@@ -125,6 +127,7 @@ def rod_scene(
     forces: Sequence[Any] = (),
     section: AbstractSdf | None = None,
     shapes: Shapes | None = None,
+    colours: Mapping[str, str] | None = None,
     directors: bool = False,
     title: str = "",
 ) -> Scene:
@@ -137,9 +140,11 @@ def rod_scene(
         forces: As given to its verbs: tendons and chambers are drawn in their place,
             contacts as arrows with what is touched, wrenches and weight as arrows and arcs.
         section: Plane shape of the section (y, z), where constants do not tell it.
-        shapes: Bodies of links by name, a solid shape or triangles in the frame of the
-            link; without one a link is the ellipsoid of its inertia, and a frame
-            without mass nothing.
+        shapes: Bodies of parts by name, a solid shape or triangles in the frame of the
+            link or of the base of the rod at rest, which carries them as a skin; "rod" is the
+            name of a single rod. Without one a rod is what its section sweeps, a link the
+            ellipsoid of its inertia, and a frame without mass nothing.
+        colours: Of parts by name, as matplotlib takes them.
         directors: Draw the axes of some sections, x red, y green, z blue.
         title: Title of the figure.
     """
@@ -152,12 +157,15 @@ def rod_scene(
         last = k == len(rows) - 1
         shade = 0.0 if last else 0.75 - 0.5 * k / len(rows)
         parts += _state(
-            model, row, forces if last else (), section, shapes, directors and last, shade
-        )
+            model, row, forces if last else (), section, shapes, directors and last, shade,
+            colours or {},
+        )  # fmt: skip
     return Scene(tuple(parts), title=title)
 
 
-def _state(model, q, forces, section, shapes, directors: bool, shade) -> list[Part]:
+def _state(
+    model, q, forces, section, shapes, directors: bool, shade, colours: Mapping[str, str]
+) -> list[Part]:
     s = np.linspace(0.0, 1.0, _STATIONS)
     poses = R.forward_kinematics(model, jnp.asarray(q, float), s)
     bodies: dict[str, Any] = {"": model}
@@ -167,12 +175,16 @@ def _state(model, q, forces, section, shapes, directors: bool, shade) -> list[Pa
     found = acting(model, forces)
     inside = any(found.threads.values())
     opacity = _SEE_THROUGH if inside or directors else 1.0
-    colour = style.pale(style.BODY, shade)
     parts: list[Part] = []
     for name, body in bodies.items():
         pose = np.asarray(where[name])
+        colour = style.pale(colours.get(name or "rod", style.BODY), shade)
+        skin = (shapes or {}).get(name or "rod")
         if isinstance(body, Rod):
-            parts += _rod(body, pose, s, section, colour, opacity)
+            if skin is None:
+                parts += _rod(body, pose, s, section, colour, opacity)
+            else:
+                parts.append(_skinned(body, pose, skin, colour, opacity))
             parts += thread_parts(body, found.threads.get(name, ()), pose, s)
             if directors:
                 parts += director_parts(pose[::10], 0.06 * float(body.length))
@@ -191,6 +203,24 @@ def _rod(body: Rod, pose, s, section, colour: str, opacity: float) -> list[Part]
     across = np.swapaxes(turn[:, :, 1:], 1, 2)
     points, triangles = tube(centres, across, outer, inner=hole)
     return [Surface(points, triangles, colour, opacity=opacity)]
+
+
+def _skinned(body: Rod, pose, shape, colour: str, opacity: float) -> Surface:
+    """A shape that the rod carries, its sections at `pose`."""
+    if pose.shape[1] != 4:
+        raise ValueError(
+            "view.show: got a shape for a planar rod, need a rod in SE3(). Draw it by a rod in "
+            "space with the same coordinates."
+        )
+    surface = _surface_of(shape)
+    skin = bind(surface.points, body, stations=_STATIONS)
+    table = pose_rows(jnp.asarray(pose), np.array([_STATIONS - 1]))
+    return Surface(np.asarray(carried(skin, table)), surface.triangles, colour, opacity=opacity)
+
+
+def _surface_of(shape: AbstractSdf | Triangles) -> Surface:
+    make: Any = shape_scene if isinstance(shape, AbstractSdf) else surface_scene
+    return make(shape).parts[0]
 
 
 def _band(centres, across, y, hole, colour: str, opacity: float) -> list[Part]:
@@ -217,8 +247,7 @@ def _link(name: str, body, pose: np.ndarray, shapes: Shapes | None, colour: str)
     turn, place = pose[:dim, :dim], pose[:dim, dim]
     shape = (shapes or {}).get(name)
     if shape is not None:
-        make: Any = shape_scene if isinstance(shape, AbstractSdf) else surface_scene
-        surface = make(shape).parts[0]
+        surface = _surface_of(shape)
         return [Surface(surface.points @ turn.T + place, surface.triangles, colour)]
     if is_massless(body):
         return []

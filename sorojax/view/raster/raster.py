@@ -5,6 +5,7 @@ The visible triangle is found for every sample of every pixel. Light is expensiv
 slowly, so it is computed once per pixel, and for all samples only where they differ.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -323,7 +324,7 @@ def painted(soup: Soup, triangle, shares, scale: Scale | None) -> Float[np.ndarr
 
 
 INK = np.array([0.12, 0.14, 0.19], np.float32)
-_KEY = np.array([-0.45, 0.62, 0.65])  # right, up, towards the eye
+KEY = np.array([-0.45, 0.62, 0.65])  # the first lamp: right, up, towards the eye
 _FILL = np.array([0.70, 0.10, 0.55])
 _SHINE = 0.10
 
@@ -335,6 +336,7 @@ def lit_colour(
     triangle: Int[np.ndarray, " n"],
     pixel: Int[np.ndarray, " n"],
     wire: float,
+    dark: Any = 0.0,
 ) -> Float[np.ndarray, "n 3"]:
     """Red, green and blue of pixels that see `triangle`.
 
@@ -345,6 +347,7 @@ def lit_colour(
         triangle: What each pixel sees.
         pixel: Their numbers, row by row.
         wire: Width of the sides of cells [pixels].
+        dark: Share of the light of the first lamp that is kept off each pixel.
     """
     row, column = np.divmod(pixel, lens.size[0])
     shares = barycentric(soup.pixels, triangle, column, row)
@@ -355,12 +358,13 @@ def lit_colour(
         total = in_space[0] + in_space[1] + in_space[2]
         in_space = [share / total for share in in_space]
     colour = painted(soup, triangle, in_space, scale)
-    colour = _lit(colour, soup, triangle, in_space, lens.camera.axes)
+    colour = _lit(colour, soup, triangle, in_space, lens.camera.axes, np.float32(1) - dark)
     return _wired(colour, soup, triangle, shares, wire)
 
 
-def _lit(colour, soup: Soup, triangle, shares, axes) -> Float[np.ndarray, "n 3"]:
-    """Two lamps that move with the eye; both sides of a surface are lit."""
+def _lit(colour, soup: Soup, triangle, shares, axes, reached) -> Float[np.ndarray, "n 3"]:
+    """Two lamps that move with the eye, of the first the share that is `reached`; both sides
+    of a surface are lit."""
     turned = (soup.normals @ axes.T).astype(np.float32)
     x, y, z = (
         sum(shares[c] * turned[:, c, k].take(triangle) for c in range(3)) for k in range(3)
@@ -368,7 +372,7 @@ def _lit(colour, soup: Soup, triangle, shares, axes) -> Float[np.ndarray, "n 3"]
     size = np.sqrt(x * x + y * y + z * z)
     size = np.where(z < 0, np.float32(-1), np.float32(1)) / np.maximum(size, np.float32(1e-12))
     normal = (x * size, y * size, z * size)
-    key, fill = _KEY / np.linalg.norm(_KEY), _FILL / np.linalg.norm(_FILL)
+    key, fill = KEY / np.linalg.norm(KEY), _FILL / np.linalg.norm(_FILL)
     half = key + np.array([0, 0, 1.0])
     bright, weak = _facing(normal, key), _facing(normal, fill)
     gleam = _facing(normal, half / np.linalg.norm(half))
@@ -380,8 +384,9 @@ def _lit(colour, soup: Soup, triangle, shares, axes) -> Float[np.ndarray, "n 3"]
     def weight(coloured: float, plain: float):
         return _each(np.where(valued, coloured, plain).astype(np.float32), triangle)
 
-    light = weight(0.72, 0.42) + weight(0.24, 0.52) * bright + weight(0.10, 0.16) * weak
-    gleam *= weight(0.4, 1.0)
+    light = weight(0.72, 0.42) + weight(0.10, 0.16) * weak
+    light = light + weight(0.24, 0.52) * bright * reached
+    gleam *= weight(0.4, 1.0) * reached
     if not np.all(lit):
         shown = lit.take(triangle)
         light = np.where(shown, light, np.float32(1.0))
@@ -429,16 +434,28 @@ _FAR = 0.04  # of the depth of the scene: from there on a nearer surface has an 
 
 
 class _Layer(NamedTuple):
-    """Triangles with the samples that see them; of each part its share of the colour."""
+    """Triangles with the samples that see them; of each part its share of the colour; of each
+    sample the share of light that others keep off."""
 
     soup: Soup
     triangle: Int[np.ndarray, " samples"]
     edge: Bool[np.ndarray, " samples"]
     opacity: Float[np.ndarray, " parts"] | None = None
+    dark: Float[np.ndarray, " samples"] | None = None
+
+
+Shadow = Callable[
+    [Scene, Lens, Float[np.ndarray, "height width"]], Float[np.ndarray, " samples"]
+]
 
 
 def shade(
-    scene: Scene, lens: Lens, *, samples: int = 2, dots_per_point: float = 1.4
+    scene: Scene,
+    lens: Lens,
+    *,
+    samples: int = 2,
+    dots_per_point: float = 1.4,
+    shadow: Shadow | None = None,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """The scene through `lens` on white paper.
 
@@ -447,12 +464,14 @@ def shade(
         lens: From `camera.fit`.
         samples: Per pixel and direction; 2 smooths edges.
         dots_per_point: Pixels that a point of print has.
+        shadow: Of the scene, the lens and the depth of every sample, the share of the light of
+            the first lamp that does not get there; nothing is kept off if omitted.
     """
     width, height = lens.size
     size = (width * samples, height * samples)
     fine = replace(lens, size=size, scale=lens.scale * samples, shift=lens.shift * samples)
     points = dots_per_point * samples
-    layers = _layers(scene, fine, points)
+    layers = _layers(scene, fine, points, shadow)
 
     def lit(at: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
         return _lit_colours(layers, at, scene, fine, points, samples)
@@ -470,14 +489,15 @@ def shade(
     return (255 * np.clip(picture, 0, 1) + 0.5).astype(np.uint8)
 
 
-def _layers(scene: Scene, lens: Lens, points: float) -> list[_Layer]:
+def _layers(scene: Scene, lens: Lens, points: float, shadow: Shadow | None) -> list[_Layer]:
     """The opaque layer, and the transparent one before it."""
     numbered: list[tuple[int, Part]] = list(enumerate(scene.parts))
     clear = [pair for pair in numbered if isinstance(pair[1], Surface) and pair[1].opacity < 1]
     solid = [pair for pair in numbered if pair not in clear]
     soup = soup_of(solid, lens, points)
     seen = rasterise(soup.pixels, *lens.size)
-    layers = [_Layer(soup, seen.triangle.ravel(), _outlined(soup, seen).ravel())]
+    dark = None if shadow is None else shadow(scene, lens, seen.depth)
+    layers = [_Layer(soup, seen.triangle.ravel(), _outlined(soup, seen).ravel(), dark=dark)]
     if clear:
         soup = soup_of(clear, lens, points)
         above = rasterise(soup.pixels, *lens.size)
@@ -491,13 +511,15 @@ def _layers(scene: Scene, lens: Lens, points: float) -> list[_Layer]:
 def _lit_colours(layers, at, scene: Scene, lens: Lens, points: float, samples: int):
     """Red, green and blue of the samples `at`: every layer over the one below."""
     colours = np.ones((len(at), 3), np.float32)
-    for soup, seen, edge, opacity in layers:
+    for soup, seen, edge, opacity, dark in layers:
         triangle = seen.take(at)
         hit = np.flatnonzero(triangle >= 0)
         if not len(hit):
             continue
         triangle = triangle.take(hit).astype(np.intp)
-        found = lit_colour(soup, lens, scene.scale, triangle, at.take(hit), 0.45 * points)
+        kept_off = 0.0 if dark is None else dark.take(at.take(hit))
+        wire = 0.45 * points
+        found = lit_colour(soup, lens, scene.scale, triangle, at.take(hit), wire, kept_off)
         if opacity is not None:
             share = opacity.take(soup.part.take(triangle).astype(int))[:, None]
             found = share * found + (1 - share) * colours[hit]
@@ -512,7 +534,7 @@ def _rough(layers, picture, size: tuple[int, int], samples: int) -> Bool[np.ndar
     """Pixels whose samples see different parts or an outline, or which differ from the next."""
     width, height = size
     rough = np.zeros((height, width), bool)
-    for soup, triangle, edge, _ in layers:
+    for soup, triangle, edge, *_ in layers:
         part = np.append(soup.part, -1).astype(np.int16).take(triangle)  # -1 takes the last
         for whole, differ in ((part, np.not_equal), (edge, np.logical_or)):
             block = whole.reshape(height, samples, width, samples)

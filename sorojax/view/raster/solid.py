@@ -23,6 +23,7 @@ from sorojax.view.raster.scene import (
     box_of,
     corners_of,
 )
+from sorojax.view.raster.shadow import in_shadow
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,6 +40,7 @@ def picture_of(
     renderer: str = "auto",
     samples: int = 2,
     dots_per_point: float = 1.4,
+    shadows: bool = False,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """The pixels of a solid scene, by pyvista where it is installed.
 
@@ -49,10 +51,12 @@ def picture_of(
             it is not.
         samples: Per pixel and direction, of the own renderer.
         dots_per_point: Pixels that a point of print has.
+        shadows: Whether bodies throw shadows on each other.
     """
     if chosen_renderer(renderer) == "pyvista":
-        return screenshot(scene, lens, dots_per_point)
-    return shade(scene, lens, samples=samples, dots_per_point=dots_per_point)
+        return screenshot(scene, lens, dots_per_point, shadows)
+    how: dict[str, Any] = {"samples": samples, "dots_per_point": dots_per_point}
+    return shade(scene, lens, **how, shadow=in_shadow if shadows else None)
 
 
 def chosen_renderer(renderer: str) -> str:
@@ -106,11 +110,13 @@ def draw_solid(
     view: View = "iso",
     renderer: str = "auto",
     lens: Lens | None = None,
+    shadows: bool = False,
 ) -> Lens:
     """Shade `scene` into `axes`, whose place in the figure is final; returns the lens."""
     size = size_of(axes)
     lens = lens_of([scene], view, size) if lens is None else lens
-    picture = picture_of(scene, lens, renderer=renderer, dots_per_point=figure.dpi / 72)
+    look: dict[str, Any] = {"renderer": renderer, "dots_per_point": figure.dpi / 72}
+    picture = picture_of(scene, lens, **look, shadows=shadows)
     axes.set_xlim(0, size[0])
     axes.set_ylim(size[1], 0)
     axes.imshow(
@@ -166,14 +172,19 @@ def annotate(figure: "Figure", axes: "Axes", scene: Scene, lens: Lens) -> None:
         colour, tip = style.AXES[k], corner + step
         axes.plot(*np.stack([corner, tip]).T, color=colour, lw=1.4, solid_capstyle="round")
         style.write(axes, *(corner + 1.35 * step), "xyz"[k], color=colour)
-    length = _round_length(0.22 * width / lens.scale)
-    start, end = 4.2 * unit, 4.2 * unit + length * lens.scale
     low = height - 0.6 * unit
-    axes.plot([start, end], [low, low], color=style.INK, lw=2.0, solid_capstyle="butt")
-    style.write(axes, end + 0.4 * unit, low, _length_text(length), ha="left")
+    scale_bar(axes, lens, 4.2 * unit, low, 0.4 * unit)
     if scene.note:
         style.write(axes, width - 0.4 * unit, low, scene.note, ha="right")
     _names(axes, scene)
+
+
+def scale_bar(axes: "Axes", lens: Lens, start: float, low: float, gap: float) -> None:
+    """A bar of a round length from the pixel (`start`, `low`), its length `gap` behind it."""
+    length = _round_length(0.22 * lens.size[0] / lens.scale)
+    end = start + length * lens.scale
+    axes.plot([start, end], [low, low], color=style.INK, lw=2.0, solid_capstyle="butt")
+    style.write(axes, end + gap, low, _length_text(length), ha="left")
 
 
 def _names(axes: "Axes", scene: Scene) -> None:
@@ -240,11 +251,14 @@ def aspect_of(scene: Scene, view: View) -> float:
 _held: dict[tuple[int, int], Any] = {}
 
 
-def screenshot(scene: Scene, lens: Lens, dots_per_point: float) -> UInt8[np.ndarray, "h w 3"]:
+def screenshot(
+    scene: Scene, lens: Lens, dots_per_point: float, shadows: bool = False
+) -> UInt8[np.ndarray, "h w 3"]:
     """The scene through `lens`, off-screen, on white paper; the window is kept for the next
     picture of this size."""
     plotter = _plotter(lens.size)
     plotter.clear_actors()
+    (plotter.enable_shadows if shadows else plotter.disable_shadows)()
     for part in scene.parts:
         _add(plotter, part, scene, lens, dots_per_point)
     _aim(plotter, scene, lens)
