@@ -107,21 +107,27 @@ def _plain(text: str) -> str:
     return text.replace("`", "").replace("[", "(").replace("]", ")")
 
 
+_OTHERS = {"numbers": "paper", "asked": "asked"}  # columns, by their name in paper.json
+
+
 def _numbers(build, script: Path, paper: dict[str, Any]) -> str:
     """The table of what an example printed, beside the paper's numbers."""
     file = EXAMPLES / "gallery" / "numbers" / f"{script.stem}.json"
     if not file.exists():
         return f"Numbers: run `python examples/{script.name}`.\n\n"
-    found, wanted = json.loads(file.read_text()), paper.get("numbers", {})
-    head = "| | here | paper, or what was asked |\n| --- | --- | --- |\n"
-    head = head if wanted else "| | here |\n| --- | --- |\n"
+    found = json.loads(file.read_text())
+    others = {key: paper[kind] for kind, key in _OTHERS.items() if paper.get(kind)}
+    head = "".join(f" {key} |" for key in ("ours", *others))
+    head = f"| |{head}\n| --- |{' --- |' * (1 + len(others))}\n"
     rows = ""
-    for name, value in found["numbers"].items():
-        last = f" {wanted.get(name, '')} |" if wanted else ""
-        rows += f"| {name} | {build.text(value)} |{last}\n"
+    for name in dict.fromkeys((*found["numbers"], *(n for o in others.values() for n in o))):
+        ours = build.text(found["numbers"][name]) if name in found["numbers"] else "-"
+        cells = (ours, *(other.get(name, "") for other in others.values()))
+        rows += f"| {name} |{''.join(f' {cell} |' for cell in cells)}\n"
+    said = f"{paper['note']}\n\n" if "note" in paper else ""
     quick = ", quick mode" if found["quick"] else ""
     note = f"{found['seconds']:g} s on {found['machine']}; {found['versions']}; {found['day']}"
-    return f"{head}{rows}\n{{.note}}\n{note}{quick}\n\n"
+    return f"{head}{rows}\n{said}{{.note}}\n{note}{quick}\n\n"
 
 
 def section(path: Path, title: str) -> str:
