@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import SE2, Status, fem, material, mesh, rod, systems
+from sorojax import SE2, Status, fem, material, mesh, replace, rod, systems
 from tests.test_fem_supports import SHARP
 
 G = 9.81
@@ -94,6 +94,22 @@ def test_link_and_solid_keep_their_energy():
     size = float(jnp.max(moving))
     assert float(jnp.max(bent)) > 1e-3 * size
     assert jnp.max(jnp.abs(total - total[0])) < 0.01 * size
+
+
+@pytest.mark.slow
+def test_the_derivative_goes_through_link_and_solid():
+    base = pendulum(1.0, modulus=3e5)
+
+    def angle(stiffer):
+        rubber = jax.tree.map(lambda x: x * stiffer, base.blocks["solid"].problem.material)
+        moved = replace(base, lambda n: n.blocks["solid"].problem.material, rubber)
+        film = systems.simulate(moved, 0.02, step=4e-3, save=2)
+        return film.state["arm"]["q"][-1, 0] + 0.01 * film.state["arm"]["v"][-1, 0]
+
+    both = jax.jit(jax.value_and_grad(angle))  # one program for values and slopes
+    h = 1e-3
+    values = np.asarray([both(1.0 + k * h)[0] for k in (-2, -1, 1, 2)])
+    assert np.isclose(both(1.0)[1], values @ [1, -8, 8, -1] / (12 * h), rtol=1e-7, atol=0)
 
 
 @pytest.mark.parametrize("element", [mesh.Quad4(), mesh.Hex8()], ids=lambda e: e.name)
