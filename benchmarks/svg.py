@@ -5,7 +5,10 @@ from html import escape
 
 WIDTH, HEIGHT = 600, 340
 LEFT, RIGHT, TOP, BOTTOM = 62, 180, 14, 46
-COLOURS = ("#0b6e99", "#c8553d", "#588157", "#8e5ea2", "#b08900", "#444444")
+COLOURS = (
+    "#0b6e99", "#c8553d", "#588157", "#8e5ea2", "#b08900", "#444444", "#d17ba5", "#5b5bd6",
+    "#7a5230", "#00a39b",
+)  # fmt: skip
 Points = dict[str, list[tuple[float, float]]]
 
 
@@ -17,8 +20,9 @@ def loglog(series: Points, x_label: str, y_label: str) -> str:
     parts = [_grid(x, y), _labels(x_label, y_label)]
     for index, (name, points) in enumerate(series.items()):
         parts.append(_series(name, index, sorted(points), x, y))
+    width = WIDTH - RIGHT + max(RIGHT, 32 + 6 * max(map(len, series)))  # room for names
     return (
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" xmlns="http://www.w3.org/2000/svg" '
+        f'<svg viewBox="0 0 {width} {HEIGHT}" xmlns="http://www.w3.org/2000/svg" '
         f'role="img">{"".join(parts)}</svg>'
     )
 

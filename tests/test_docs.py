@@ -3,6 +3,7 @@ every public name has its entry. `make docs` builds the pages and takes warnings
 
 import functools
 import importlib.util
+import json
 import re
 import sys
 from pathlib import Path
@@ -150,3 +151,21 @@ def test_signatures_name_axes_and_nouns():
     assert answer == "Float[dof, dof]"
     text, _ = tool("signatures").signature(fem.Pressure, paths)
     assert "value: Numbers = 0.0" in text and "origin: Numbers | None = None" in text
+
+
+def test_the_gallery_has_every_example_with_its_numbers(tmp_path):
+    data = tool("data_pages")
+    data.write(tmp_path)
+    text = (tmp_path / "gallery.md").read_text()
+    for script in (ROOT / "examples").glob("[0-9][0-9]_*.py"):
+        entry = text.split(f"({script.stem})=")[1].split(")=\n###")[0]
+        stored = ROOT / "examples" / "gallery" / "numbers" / f"{script.stem}.json"
+        names = json.loads(stored.read_text())["numbers"] if stored.exists() else ()
+        assert all(f"| {name} |" in entry for name in names), script
+    shown = set(re.findall(r"_generated/pictures/([\w.]+)", text))
+    assert shown == {picture.name for picture in (tmp_path / "pictures").iterdir()}
+    assert all(path.stat().st_size < 150e3 for path in (tmp_path / "pictures").iterdir())
+    assert "| six silicones in tension" in (tmp_path / "robots.md").read_text()
+    assert (tmp_path / "device.md").read_text().count("<svg") >= 3
+    with pytest.raises(AssertionError, match="no section 'Ghosts'"):
+        data.section(ROOT / "README.md", "Ghosts")

@@ -30,7 +30,7 @@ def write(folder: Path) -> None:
         "gallery.md": gallery(folder),
         "robots.md": section(ROOT / "benchmarks" / "README.md", "Measured robots and rubbers"),
         "others.md": section(ROOT / "benchmarks" / "recorded" / "README.md", "Measurements by"),
-        "peers.md": section(ROOT / "benchmarks" / "README.md", "Peers"),
+        "peers.md": table(section(ROOT / "benchmarks" / "README.md", "Peers")),
         "device.md": device(),
     }
     for name, text in texts.items():
@@ -137,6 +137,11 @@ def section(path: Path, title: str) -> str:
     return re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", found[1]).strip() + "\n"
 
 
+def table(text: str) -> str:
+    """The rows of the table of a section."""
+    return "\n".join(line for line in text.split("\n") if line.startswith("|")) + "\n"
+
+
 def device() -> str:
     """Plots of the recorded run on an accelerator, and the table of its readme."""
     sys.path.insert(0, str(ROOT))
@@ -145,6 +150,10 @@ def device() -> str:
     recorded = ROOT / "benchmarks" / "recorded"
     lines = [json.loads(x) for x in (recorded / "h100.jsonl").read_text().splitlines()]
     parts = [(recorded / "README.md").read_text().split("## ")[0].partition("\n")[2].strip()]
+    for line in lines:  # all are of one code and one device: names short enough for a plot
+        line["code"] = ""
+        method = line["settings"]["method"]
+        line["settings"]["method"] = method.replace("NVIDIA H100 80GB HBM3", "H100")
     for case in dict.fromkeys(line["case"] for line in lines):
         drawn = page.plots([line for line in lines if line["case"] == case])
         parts.append(f"### {case}\n\n```{{raw}} html\n<div class='plot'>{drawn}</div>\n```")

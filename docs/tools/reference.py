@@ -128,12 +128,13 @@ def _index() -> str:
 
 
 def _toctree(packages: tuple[str, ...]) -> list[str]:
-    rows = [".. list-table::", "   :widths: 20 12 68", ""]
+    rows = [".. list-table::", "   :widths: 20 10 70", "   :header-rows: 1", ""]
+    rows += ["   * - package", "     - names", "     - what it is"]
     for package in packages:
         text = inspect.cleandoc(importlib.import_module(package).__doc__ or "")
         rows += [
             f"   * - :doc:`{package.removeprefix('sorojax.')} <{file_name(package)}>`",
-            f"     - {len(public(package))} names",
+            f"     - {len(public(package))}",
             f"     - {as_rst(first_sentence(text))}",
         ]
     hidden = ["", ".. toctree::", "   :hidden:", ""]

@@ -25,14 +25,14 @@ _BACKTICKED = re.compile(r"(?:sj\.|sorojax\.)?((?:[A-Za-z]\w*\.)*[A-Za-z]\w*)(?:
 
 def target(text: str, package: str | None = None) -> str | None:
     """The public name that a text in backticks is, `sj.rod.rollout(...)` as well as
-    `rod.rollout`; a bare class is looked up in `package` and then everywhere."""
+    `rod.rollout`; on the page of a package a bare class too, of it or of one other."""
     if not (found := _BACKTICKED.fullmatch(text.strip())):
         return None
     words = found[1]
     for path in (words, f"sorojax.{words}"):
         if path in PATHS and ("." in words or text.startswith(("sj.", "sorojax."))):
             return path
-    if "." in words or not words[0].isupper():
+    if "." in words or not words[0].isupper() or package is None:
         return None
     near = f"{package}.{words}"
     far = [path for path in PATHS if path.endswith(f".{words}")]
