@@ -193,3 +193,22 @@ def test_gradient_on_an_outline_points_out(sense):
 def test_one_outline_is_a_shape():
     square = sdf.outlines([np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])])
     assert np.isclose(square(jnp.array([0.5, 0.4])), -0.4)
+
+
+class Lens(sdf.AbstractSdf):
+    """What the docstring of the base asks for, and no more: a field that is a bound."""
+
+    half: float
+    dim = 2
+
+    def distance(self, x, y):
+        return (jnp.abs(x) + jnp.abs(y) - self.half) / 2
+
+    def bounding_box(self):
+        return jnp.full(2, -self.half), jnp.full(2, self.half)
+
+
+def test_a_hole_can_be_cut_into_a_shape_of_ones_own():
+    lower, upper = (Lens(1.0) - sdf.Circle([0.0, 0.0], 0.2)).bounding_box()
+    assert np.array_equal([lower, upper], [[-1.0, -1.0], [1.0, 1.0]])
+    assert not np.isfinite(Lens(1.0).level_box(0.1)[0]).any()  # a bound may stay small

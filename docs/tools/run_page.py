@@ -18,20 +18,22 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
+import matplotlib
 from PIL import Image
 
-DOCS = Path(__file__).resolve().parents[1]
-_FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+PICTURES = Path(__file__).resolve().parents[1] / "pictures"
+_FENCE = re.compile(r"^```([\w-]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+matplotlib.use("Agg")
 
 
 class Block(NamedTuple):
-    """A program of a page, the line it begins at, and the text that follows it, if any."""
+    """A program of a page, its first line, and the text that follows, with its place."""
 
     line: int
     code: str
     expected: str | None
-    span: tuple[int, int] | None  # of that text, in characters of the page
+    span: tuple[int, int] | None
 
 
 def blocks(path: Path) -> list[Block]:
@@ -41,43 +43,32 @@ def blocks(path: Path) -> list[Block]:
     for fence, after in zip(fences, [*fences[1:], None], strict=True):
         if fence[1] != "python":
             continue
-        follows = after is not None and after[1] == "text"
-        follows = follows and not page[fence.end() : after.start()].strip()
-        told = (after[2], after.span(2)) if follows else (None, None)
+        told = None, None
+        if after and after[1] == "text" and not page[fence.end() : after.start()].strip():
+            told = after[2], after.span(2)
         found.append(Block(page.count("\n", 0, fence.start(2)) + 1, fence[2], *told))
     return found
 
 
 def run(path: Path, folder: Path) -> None:
-    """Run all programs of a page in one namespace, with the working folder `folder`.
-
-    Raises:
-        AssertionError: With page and line, if a program prints other words than the page
-            says or a number that is off by more than 2 %, or a picture was not drawn.
-    """
+    """Run all programs of a page in one namespace, in `folder`. An `AssertionError` tells page
+    and line where they print other words or numbers, or a picture was not drawn."""
     for block, printed in outputs(path, folder):
         if why := difference(block.expected or "", printed):
             raise AssertionError(f"{path}, program at line {block.line}: {why}\n{printed}")
-    shown = re.findall(r"\.\./pictures/([\w.]+)\)", path.read_text())
-    missing = [name for name in shown if not (folder / name).exists()]
-    assert not missing, f"{path}: shows {missing}, which its programs do not draw"
+    for name in re.findall(r"/pictures/([\w.]+)\)", path.read_text()):
+        assert (folder / name).exists(), f"{path}: its programs do not draw {name}"
 
 
 def outputs(path: Path, folder: Path) -> list[tuple[Block, str]]:
     """The programs of a page and what they print; a warning meant for users is an error."""
-    import matplotlib
-
-    matplotlib.use("Agg")
     page = types.ModuleType(f"page_{path.stem}")
     sys.modules[page.__name__] = page  # classes of the page look their module up
-    found = []
-    with contextlib.ExitStack() as around:
-        for one in (
-            contextlib.chdir(folder), warnings.catch_warnings(), jax.enable_x64(True),
-            jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"),
-        ):  # fmt: skip
-            around.enter_context(one)
-        warnings.simplefilter("default")
+    found, ranks, kinds = [], jax.numpy_rank_promotion, jax.numpy_dtype_promotion
+    with (
+        contextlib.chdir(folder), jax.enable_x64(True), warnings.catch_warnings(),
+        ranks("allow"), kinds("standard"),
+    ):  # fmt: skip
         warnings.simplefilter("error", UserWarning)
         for block in blocks(path):
             code = compile("\n" * (block.line - 1) + block.code, str(path), "exec")
@@ -88,7 +79,7 @@ def outputs(path: Path, folder: Path) -> list[tuple[Block, str]]:
 
 
 def difference(expected: str, printed: str) -> str:
-    """Where two texts differ, apart from line breaks and 2 % of each number; empty if not."""
+    """Where texts differ, but for line breaks and 2 % of a number; empty if nowhere."""
     if _NUMBER.sub("#", expected).split() != _NUMBER.sub("#", printed).split():
         return f"prints other words than\n{expected}"
     pairs = zip(_NUMBER.findall(expected), _NUMBER.findall(printed), strict=True)
@@ -106,31 +97,23 @@ def written(path: Path, found: list[tuple[Block, str]]) -> str:
     return page
 
 
-def keep(picture: Path) -> None:
-    """Store a picture for the pages, 900 pixels wide at most, in 128 colours."""
-    image = Image.open(picture).convert("RGB")
-    image.thumbnail((900, 900))
-    image.quantize(128).save(DOCS / "pictures" / picture.name, optimize=True)
-
-
 def main(pages: list[Path], pictures: bool, write: bool) -> None:
     for path in pages:
-        begin = time.process_time()
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
+        with tempfile.TemporaryDirectory() as folder:
             if write:
-                path.write_text(written(path, outputs(path.resolve(), folder)))
+                path.write_text(written(path, outputs(path.resolve(), Path(folder))))
             else:
-                run(path.resolve(), folder)
-            for picture in folder.glob("*.png") if pictures else ():
-                keep(picture)
-        print(f"{path}: {time.process_time() - begin:.1f} s of CPU")
+                run(path.resolve(), Path(folder))
+            for picture in Path(folder).glob("*.png") if pictures else ():
+                image = Image.open(picture).convert("RGB")
+                image.thumbnail((900, 900))
+                image.quantize(128).save(PICTURES / picture.name, optimize=True)
+        print(f"{path}: done, {time.process_time():.1f} s of CPU up to here")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("pages", nargs="+", type=Path)
-    parser.add_argument("--pictures", action="store_true", help="keep the pictures in docs")
+    parser.add_argument("--pictures", action="store_true", help="keep pictures in the docs")
     parser.add_argument("--write", action="store_true", help="write what is printed into pages")
-    told = parser.parse_args()
-    main(told.pages, told.pictures, told.write)
+    main(**vars(parser.parse_args()))

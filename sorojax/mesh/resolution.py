@@ -138,8 +138,8 @@ def raise_thin(
             thin=False,
         )
     raise NotResolved(
-        f"{where}: a {name} near ({place}) m is about {thick:.2g} m thick, need about half of the "
-        f"`size` of {length:g} m or more. Lower `size`, or thicken the {name}."
+        f"{where}: a {name} near ({place}) m is about {thick:.2g} m thick, need about half of "
+        f"the `size` of {length:g} m or more. Lower `size`, or thicken the {name}."
     )
 
 

@@ -316,12 +316,8 @@ def chambers(mesh: Mesh) -> Chambers:
 
     `enclosed_volume(mesh, facets)` gives the same number differentiably.
 
-    Args:
-        mesh: A concrete mesh.
-
     Returns:
-        `mesh` with the facet sets "chamber_0", ..., in the order of their centres, and
-        `volumes` by these names [m^3], in the plane [m^2].
+        `mesh` with the facet sets "chamber_0", ..., from left to right, and `volumes` by name.
     """
     points = np.asarray(mesh.points)
     found = []
