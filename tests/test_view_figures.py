@@ -171,7 +171,7 @@ def test_all_parts_of_a_scene_go_with_a_pose():
     assert volume(ball) == pytest.approx(volume(BALL), rel=1e-9)
     assert {part.colour for part in (ball, lines, arrows, dots)} == {"red"}
     assert view.place(Scene((BALL,)), np.eye(4)).parts[0].colour == BALL.colour
-    with pytest.raises(ValueError, match="view.place: `pose`"):
+    with pytest.raises(ValueError, match="view.place: got .* for `pose`"):
         view.place(Scene((BALL,)), np.eye(3))
     with pytest.raises(ValueError, match="view.place: the scene is plane"):
         view.place(Scene((Dots(np.zeros((1, 2))),)), np.eye(4))

@@ -68,7 +68,6 @@ def place(scene: Scene, pose: Float[Any, "4 4"], colour: str | None = None) -> S
     if scene.dim != 3:
         raise ValueError("view.place: the scene is plane, need a solid one. Call view.extrude.")
     pose = np.asarray(pose, float)
-    _check.shape("view.place", "pose", pose, (4, 4), "Give a homogeneous matrix.")
     look = {} if colour is None else {"colour": colour}
     parts = tuple(replace(part, **_placed(part, pose), **look) for part in scene.parts)
     return replace(scene, parts=parts, extent=None)
