@@ -8,7 +8,6 @@ fingers leave a palm of 20 mm, 25 degrees outwards. Their skin, not their centre
 """
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -87,8 +86,7 @@ def draw(angles, q, file: Path) -> None:
     held = view.scene_of(hand, np.asarray(q).ravel(), colours=dict.fromkeys(fingers, "#f29b4b"))
     palm = sdf.translate(sdf.Cylinder(PALM + 4 * mm, 4 * mm, 1 * mm), [0, 0, 2 * mm])
     stem = sdf.translate(sdf.Cylinder(6 * mm, 14 * mm), [0, 0, 10 * mm])
-    (ball,) = view.scene_of(sdf.Sphere(CENTER, RADIUS)).parts
-    ball = view.Scene((replace(ball, colour="#a9d3ee"),))
+    ball = view.place(view.scene_of(sdf.Sphere(CENTER, RADIUS)), np.eye(4), "#a9d3ee")
     scene = view.merge_scenes(held, ball, view.scene_of(palm | stem))
     figure, axes = plt.subplots(1, 2, figsize=(7, 4.1), dpi=200, layout="constrained")
     for place, name in zip(axes, ("from the side", "from below"), strict=True):

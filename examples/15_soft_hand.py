@@ -124,16 +124,18 @@ def draw(film, angle, pressure, file: Path) -> None:
     base = rod.Part(robots.cylinder(1.0, 1.0, 1.0), offset=pose(turn))
     fingers = {name: mounted(name, x) for name, x in zip(names, LENGTHS, strict=True)}
     whole = rod.assembly(sj.SE3(), palm=base, **fingers)
-    skins = dict.fromkeys(names, sdf.isosurface(hand.finger.along_x(), 0.7 * mm))
-    skins["thumb"] = sdf.isosurface(hand.thumb.along_x(), 0.7 * mm)
-    skins["palm"] = sdf.isosurface(hand.palm(), 1.5 * mm)
+    finger = sdf.isosurface(hand.finger.along_x(), 0.7 * mm)
+    thumb = sdf.isosurface(hand.thumb.along_x(), 0.7 * mm)
+    own = {"thumb": thumb, "palm": sdf.isosurface(hand.palm(), 1.5 * mm)}
+    skins = dict.fromkeys(names, finger) | own
     slab = sdf.Box([-54 * mm, -38 * mm, -4 * mm], [54 * mm, 34 * mm, 0.0])
     table, scale = view.scene_of(slab), view.Scale("pressure [kPa]", -10.0, 90.0)
     plain = {"palm": "#e9e4da"}
     states = np.asarray(film.state["fingers"]["body"]["q"])
 
     def scene(k):
-        palm, *bent = view.scene_of(whole, states[k].ravel(), shapes=skins, colours=plain).parts
+        drawn = view.scene_of(whole, states[k].ravel(), shapes=skins, colours=plain).parts
+        palm, *bent = (part for part in drawn if isinstance(part, view.Surface))
         blown = [
             dataclasses.replace(part, values=np.full(len(part.points), p / kPa))
             for part, p in zip(bent, np.asarray(pressure)[k], strict=True)
@@ -149,7 +151,7 @@ def draw(film, angle, pressure, file: Path) -> None:
         ["#D55E00", *plt.get_cmap("Blues")([0.4, 0.6, 0.8, 1.0])],
     )
     panels = (pressure / kPa, "pressure [kPa]"), (angle / deg, "angle of the tip [deg]")
-    for at, (values, label) in zip(below, panels, strict=True):
+    for at, (values, label) in zip((below[0], below[1]), panels, strict=True):
         axes = figure.add_subplot(at)
         for k, name in enumerate(names):
             axes.plot(times, values[:, k], label=name, lw=1.5, color=colours[k])

@@ -97,32 +97,24 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
 
 def draw(whole, q, time, place, force, ticks, file) -> None:
     """The printed robot at six moments; heights, forces and pressures over time."""
-    from dataclasses import replace
-
     from matplotlib import pyplot as plt
 
     from sorojax import sdf, view
 
-    printed = view.scene_of(robots.Manipulator(), size=1.2 * mm).parts[-1]
-    hung, up = printed.points, np.asarray(robots.upside_down(BEAM))
-    hung = hung @ up[:3, :3].T + up[:3, 3]
+    printed = view.scene_of(robots.Manipulator(), size=1.2 * mm).parts[-1:]
+    (hung,) = view.place(view.Scene(printed), robots.upside_down(BEAM)).parts
+    assert isinstance(hung, view.Surface)
     soft = tuple(name for name in whole.names if name != "cylinder")
-    rig = view.rig(whole, (hung, printed.triangles), parts=soft, blend=4 * mm)
-    cylinder, floor, beam = (
-        view.scene_of(sdf.Cylinder(RADIUS, HEIGHT, 1 * mm)).parts[0],
-        view.scene_of(sdf.Box([-55 * mm, -48 * mm, -4 * mm], [75 * mm, 48 * mm, 0.0])),
-        view.scene_of(sdf.Box([-55 * mm, -45 * mm, BEAM], [55 * mm, 45 * mm, BEAM + 8 * mm])),
-    )
+    rig = view.rig(whole, (hung.points, hung.triangles), parts=soft, blend=4 * mm)
+    cylinder = view.scene_of(sdf.Cylinder(RADIUS, HEIGHT, 1 * mm))
+    floor = view.scene_of(sdf.Box([-55 * mm, -48 * mm, -4 * mm], [75 * mm, 48 * mm, 0.0]))
+    beam = sdf.Box([-55 * mm, -45 * mm, BEAM], [55 * mm, 45 * mm, BEAM + 8 * mm])
 
     def scene(t):
         now = q[round(t / PERIOD)]
-        pose = np.asarray(rod.tip_pose(whole, now)["cylinder"])
-        held = replace(
-            cylinder, points=cylinder.points @ pose[:3, :3].T + pose[:3, 3], colour="#f9c274"
-        )
-        (skin,) = view.scene_of(rig, now).parts
-        bodies = view.Scene((replace(skin, colour="#8fbce6"), held))
-        return view.merge_scenes(bodies, floor, beam)
+        held = view.place(cylinder, rod.tip_pose(whole, now)["cylinder"], "#f9c274")
+        robot = view.place(view.scene_of(rig, now), np.eye(4), "#8fbce6")
+        return view.merge_scenes(robot, held, floor, view.scene_of(beam))
 
     moments = (0.1, 0.7, 1.6, 2.6, 3.5, 4.85)
     words = "comes", "reaches down", "lifts", "carries", "puts down", "leaves"

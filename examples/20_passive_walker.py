@@ -10,7 +10,6 @@ that stand 29 mm apart for 27.5 mm.
 """
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -102,20 +101,12 @@ def draw(problem, motion, angles, path, others, numbers, file: Path) -> None:
     times, period = np.asarray(motion.time), 1 / numbers["frequency of the gait [Hz]"]
     last = np.flatnonzero(times > times[-1] - 1.5 * period)
     states = np.sort([last[angles[last, 1].argmax()], last[angles[last, 1].argmin()]])
-    c, s = np.cos(SLOPE), np.sin(SLOPE)
-    down = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])  # of rows of points
-
-    def on_slope(scene):
-        body, rim = view.extrude(scene, 10 * mm).parts
-        body = replace(body, points=body.points @ down)
-        return view.Scene(
-            (body, replace(rim, runs=[run @ down for run in rim.runs])), scene.scale
-        )
-
+    down = np.eye(4)
+    down[:3:2, :3:2] = [[np.cos(SLOPE), np.sin(SLOPE)], [-np.sin(SLOPE), np.cos(SLOPE)]]
     bodies = view.scenes_of(motion, states, field="von_mises", rest=False)
     (left, _), (right, _) = bodies[0].box
     floor = sdf.Box([left - 10 * mm, -12 * mm, -4 * mm], [right + 10 * mm, 12 * mm, 0.0])
-    floor = view.scene_of(sdf.turn(floor, [0, 1, 0], SLOPE))
+    floor = view.scene_of(floor)
     figure = plt.figure(figsize=(7, 8.2), dpi=200, layout="constrained")
     grid = figure.add_gridspec(3, 1, height_ratios=(1.35, 1, 1.3))
     shown, below = (
@@ -159,7 +150,8 @@ def draw(problem, motion, angles, path, others, numbers, file: Path) -> None:
     axes.invert_yaxis()
     for plot in (*below, axes):
         plot.spines[["top", "right"]].set_visible(False)
-    scenes = [view.merge_scenes(on_slope(body), floor) for body in bodies]
+    level = [view.merge_scenes(view.extrude(body, 10 * mm), floor) for body in bodies]
+    scenes = [view.place(scene, down) for scene in level]
     view.draw_into(shown, scenes, view=view.Camera(-75.0, 22.0))
     figure.savefig(file)
     plt.close(figure)

@@ -8,7 +8,6 @@ the tip is round, the set-point comes to the wall within 1 s and keeps off the e
 """
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -107,17 +106,20 @@ def draw(arm, path, goal, tips, push, asked, solid, file) -> None:
         sj.SE3(), rod.piecewise_constant(kappa_z=6), rod.rectangle(60 * mm, 2 * HALF),
         length=arm.length, young_modulus=1.0, poisson_ratio=0.3, density=1.0,
     )  # fmt: skip
-    upright = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # of rows: the arm stands
+    upright = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    thin = np.diag([1.0, 1, 0.9, 1])  # earlier states are narrower, so that they do not hide it
     states = np.array([0, 106, 180, 290, 420, 540, 700])
-    *before, last = view.scene_of(tube, np.asarray(path.q)[states]).parts
-    thin = upright * [1, 0.9, 1]  # earlier states are narrower, so that they do not hide it
-    turned = [replace(part, points=part.points @ thin) for part in before]
-    turned.append(replace(last, points=last.points @ upright, colour="#6db1e8"))
-    wall = view.scene_of(sdf.extrude(solid, 60 * mm)).parts[0]
-    turned.append(replace(wall, points=wall.points @ upright, colour=view.Surface.colour))
-    for way, colour in ((goal, "#D55E00"), (tips, "#1f2430")):
-        lifted = np.insert(np.asarray(way), 2, 31 * mm, axis=1) @ upright
-        turned.append(view.Lines([lifted], colour, 2.2))
+    ways = [np.insert(np.asarray(way), 2, 31 * mm, axis=1) for way in (goal, tips)]
+    told = [
+        view.Lines([way], c, 2.2) for way, c in zip(ways, ("#D55E00", "#1f2430"), strict=True)
+    ]
+    q = np.asarray(path.q)[states]
+    lying = view.merge_scenes(
+        view.place(view.scene_of(tube, q[:-1]), thin),
+        view.scene_of(tube, q[-1], colours={"rod": "#6db1e8"}),
+        view.place(view.scene_of(sdf.extrude(solid, 60 * mm)), np.eye(4), "#c9d3df"),
+        view.Scene(tuple(told)),
+    )
     foot = sdf.Box([-60 * mm, -40 * mm, -12 * mm], [60 * mm, 40 * mm, 0.0])
     figure = plt.figure(figsize=(7, 6.8), dpi=200, layout="constrained")
     grid = figure.add_gridspec(2, 1, height_ratios=(2.1, 1))
@@ -131,7 +133,7 @@ def draw(arm, path, goal, tips, push, asked, solid, file) -> None:
     left.plot([], [], color="#D55E00", lw=2.2, label="set-point")
     left.plot([], [], color="#1f2430", lw=2.2, label="tip")
     left.legend(frameon=False, fontsize=9, loc="upper left")
-    scene = view.merge_scenes(view.Scene(tuple(turned)), view.scene_of(foot))
+    scene = view.merge_scenes(view.place(lying, upright), view.scene_of(foot))
     view.draw_into(left, scene, view=view.Camera(-76.0, 16.0))
     figure.savefig(Path(file))
     plt.close(figure)

@@ -14,7 +14,6 @@ than without the task. Here it is Dragon Skin 30, with 12 mN at most on each of 
 import functools
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -106,21 +105,20 @@ def draw(path, shapes, true, tip, lines, off, file) -> None:
 
     frames, depth = np.linspace(5, len(shapes) - 5, 5).astype(int), 20 * mm
     moved = sj.replace(path, lambda x: x.displacements, jnp.stack([shapes[k] for k in frames]))
-    hang = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])  # of rows: the length points down
+    hang = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])  # x is down
     colours = {"tip alone": "#D55E00", "tip and balance of forces": "#0072B2"}
     plate = view.scene_of(sdf.Box([-8 * mm, -16 * mm, 0.0], [36 * mm, 16 * mm, 4 * mm]))
 
     def scene(body, k):
         """The solid with the lines in front of it."""
-        solid, rim = view.extrude(body, depth).parts
-        parts = [replace(solid, points=solid.points @ hang)]
-        parts.append(replace(rim, runs=[run @ hang for run in rim.runs], width=0.5))
-        for shape, (name, colour) in zip(lines[::-1], colours.items(), strict=True):
-            run = np.insert(shape[k], 1, -depth / 2 - 1 * mm, axis=1) @ hang
-            parts.append(view.Lines([run], colour, 2.2, name=name))
-        marker = np.insert(tip[k], 1, -depth / 2 - 2 * mm)[None] @ hang
-        parts.append(view.Dots(marker, "#1f2430", 6.0))
-        return view.merge_scenes(view.Scene(tuple(parts), body.scale), plate)
+        front = -depth / 2 - 1 * mm
+        told = [
+            view.Lines([np.insert(shape[k], 1, front, axis=1)], colour, 2.2)
+            for shape, colour in zip(lines[::-1], colours.values(), strict=True)
+        ]
+        marker = view.Dots(np.insert(tip[k], 1, front - 1 * mm)[None], "#1f2430", 6.0)
+        seen = view.merge_scenes(view.extrude(body, depth), view.Scene((*told, marker)))
+        return view.merge_scenes(view.place(seen, hang), plate)
 
     figure = plt.figure(figsize=(7, 6.6), dpi=200, layout="constrained")
     grid = figure.add_gridspec(2, 1, height_ratios=(1.5, 1))

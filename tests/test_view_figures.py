@@ -20,6 +20,7 @@ FLOOR = Surface(
 BALL = view.scene_of(sdf.Sphere([0.0, 0.0, 2.0], 0.6)).parts[0]
 VIEW = view.Camera(-70.0, 40.0)
 SIZE = (160, 120)
+_QUARTER = homogeneous(jnp.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), jnp.array([0.1, 0, 0]))
 
 
 def seen(scene, **options):
@@ -158,6 +159,24 @@ def test_a_solid_scene_and_a_depth_of_zero_are_refused(plate):
         view.extrude(view.scene_of(plate), 0.0)
 
 
+def test_all_parts_of_a_scene_go_with_a_pose():
+    spot = np.array([[1.0, 2.0, 3.0]])
+    parts = (BALL, Lines([spot, 2 * spot]), Arrows(spot, spot), Dots(spot))
+    ball, lines, arrows, dots = view.place(Scene(parts), _QUARTER, "red").parts
+    turned = np.array([[-2.0, 1.0, 3.0]])
+    assert np.allclose(dots.points, turned + [0.1, 0, 0], rtol=0, atol=1e-12)
+    assert np.allclose(lines.runs[1], 2 * turned + [0.1, 0, 0], rtol=0, atol=1e-12)
+    assert np.allclose(arrows.starts, dots.points, rtol=0, atol=1e-12)
+    assert np.allclose(arrows.vectors, turned, rtol=0, atol=1e-12)  # not shifted
+    assert volume(ball) == pytest.approx(volume(BALL), rel=1e-9)
+    assert {part.colour for part in (ball, lines, arrows, dots)} == {"red"}
+    assert view.place(Scene((BALL,)), np.eye(4)).parts[0].colour == BALL.colour
+    with pytest.raises(ValueError, match="view.place: got .* for `pose`"):
+        view.place(Scene((BALL,)), np.eye(3))
+    with pytest.raises(ValueError, match="view.place: the scene is plane"):
+        view.place(Scene((Dots(np.zeros((1, 2))),)), np.eye(4))
+
+
 # Scenes of a path, in figures
 
 
@@ -228,9 +247,6 @@ def test_axes_and_scenes_that_do_not_fit_are_refused(plate):
 
 
 # Rods in the skin of what is printed
-
-
-_QUARTER = homogeneous(jnp.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), jnp.array([0.1, 0, 0]))
 
 
 def bar(length):

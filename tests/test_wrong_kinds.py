@@ -54,6 +54,7 @@ FREE = {
         "view.options": "thing",
         "view.rig": "options",
         "view.scene_of": "thing at options",
+        "view.scenes_of": "path options",
         "view.show": "thing at options",
         "view.to_glb": "things",
         "view.to_html": "things time",
@@ -68,6 +69,7 @@ FREE = {
         "sweep.sweep": "executor",
         "systems.simulate_sampled": "controller",
         "view.Feed": "process",
+        "view.draw_into": "axes",  # matplotlib is not imported for its types
         "vision.MarkerStream": "camera",
     },
 }

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from sorojax._arguments import check_package as _check_package, public as _public
 from sorojax.view.picture import Picture, draw_into
 from sorojax.view.raster.camera import Camera, between, orbit
-from sorojax.view.raster.extruded import extrude
+from sorojax.view.raster.extruded import extrude, place
 from sorojax.view.raster.scene import Arrows, Dots, Lines, Scale, Scene, Surface, merge_scenes
 from sorojax.view.show import options, scene_of, show
 from sorojax.view.style import png
@@ -113,6 +113,7 @@ __all__ = [
     "merge_scenes",
     "options",
     "orbit",
+    "place",
     "png",
     "pose",
     "rig",

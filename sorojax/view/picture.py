@@ -144,7 +144,7 @@ def draw_into(
     every = [axes] if not isinstance(axes, Sequence | np.ndarray) else list(axes)
     scenes = [scenes] if isinstance(scenes, Scene) else list(scenes)
     _check_axes(every, scenes)
-    figure = every[0].figure
+    figure = _root(every[0])
     for each in every:
         each.set_axis_off()
     if bar and scenes[0].scale is not None:
@@ -158,6 +158,14 @@ def draw_into(
             unit = figure.dpi / 72
             low = lens.size[1] - 6 * unit
             solid.scale_bar(each, lens, 2 * unit, low, 4 * unit)
+
+
+def _root(axes: "Axes") -> "Figure":
+    """The figure that holds the layout: not a subfigure."""
+    figure: Any = axes.figure
+    while not hasattr(figure, "set_layout_engine"):
+        figure = figure.figure
+    return figure
 
 
 def _check_axes(axes: list, scenes: list) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from sorojax import fem
 from sorojax.design.optimise.shape_loop import OptimisedShape
@@ -38,6 +38,7 @@ from sorojax.view.raster.scene import (
 )
 
 NodalField = Callable[[Problem, Float[Array, "nodes dim"]], Float[Array, " nodes"]]
+States = Sequence[int] | Int[Any, " states"] | None
 Field = str | NodalField | Float[Any, " values"] | None
 
 
@@ -183,7 +184,7 @@ def show_path(
     return panels(scenes, names, view=view, renderer=renderer, title=title)
 
 
-def scenes_of(path: Any, states: Sequence[int] | None = None, **options: Any) -> list[Scene]:
+def scenes_of(path: Any, states: States = None, **options: Any) -> list[Scene]:
     """States along a load path, a continuation or a motion as scenes, on one scale.
 
     Args:
@@ -203,7 +204,8 @@ def scenes_of(path: Any, states: Sequence[int] | None = None, **options: Any) ->
     """
     chosen = chosen_states("view.scenes_of", len(path), states)
     moved = np.asarray(path.displacements)[chosen]
-    scene_at, _ = body_scenes(problems_of(path, chosen), moved, **{"loads": False} | options)
+    options = {"loads": False} | options
+    scene_at, _ = body_scenes(problems_of(path, chosen), moved, **options)
     return joint_extent([scene_at(k) for k in range(len(chosen))])
 
 
@@ -307,7 +309,7 @@ def coloured(
     return robust_scale(label, values, limits=limits), values
 
 
-def chosen_states(where: str, count: int, states: Sequence[int] | None) -> list[int]:
+def chosen_states(where: str, count: int, states: States) -> list[int]:
     """States to draw: those asked for, or up to six."""
     if not count:
         raise ValueError(f"{where}: the path has no state. Look at its status.")

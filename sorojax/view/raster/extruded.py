@@ -1,6 +1,7 @@
-"""Plane scenes as solid ones: the body that a side view is a section of."""
+"""Plane scenes as solid ones, and scenes brought to another place."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -45,6 +46,41 @@ def extrude(scene: Scene, depth: float) -> Scene:
         extent = lower - half, upper + half
     parts = tuple(_solid(part, depth) for part in scene.parts)
     return replace(scene, parts=parts, extent=extent)
+
+
+def place(scene: Scene, pose: Float[Any, "4 4"], colour: str | None = None) -> Scene:
+    """A solid scene where `pose` takes it, all of it in `colour` if one is given.
+
+    Args:
+        scene: As it was drawn.
+        pose: Homogeneous matrix from the old to the new coordinates [m].
+        colour: As matplotlib takes it.
+
+    Raises:
+        ValueError: If the scene is plane, or the pose is not 4 x 4.
+
+    Example:
+        >>> ball = view.scene_of(sdf.Sphere([0, 0, 0], 10 * mm))
+        >>> lifted = view.place(ball, robots.pose_below(-30 * mm), "tab:blue")
+        >>> print(np.round(1e3 * lifted.box[0]))
+        [-10. -10.  20.]
+    """
+    if scene.dim != 3:
+        raise ValueError("view.place: the scene is plane, need a solid one. Call view.extrude.")
+    pose = np.asarray(pose, float)
+    look = {} if colour is None else {"colour": colour}
+    parts = tuple(replace(part, **_placed(part, pose), **look) for part in scene.parts)
+    return replace(scene, parts=parts, extent=None)
+
+
+def _placed(part: Part, pose: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
+    """What changes of a part."""
+    turn, shift = pose[:3, :3].T, pose[:3, 3]
+    if isinstance(part, Lines):
+        return {"runs": [np.asarray(run) @ turn + shift for run in part.runs]}
+    if isinstance(part, Arrows):
+        return {"starts": part.starts @ turn + shift, "vectors": part.vectors @ turn}
+    return {"points": np.asarray(part.points) @ turn + shift}
 
 
 def _at(points: Float[np.ndarray, "points 2"], place: float) -> Float[np.ndarray, "points 3"]:
