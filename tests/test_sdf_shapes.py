@@ -1,5 +1,7 @@
 """Every primitive, lattice and operator: distance, slope, box and derivatives."""
 
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -199,7 +201,7 @@ class Lens(sdf.AbstractSdf):
     """What the docstring of the base asks for, and no more: a field that is a bound."""
 
     half: float
-    dim = 2
+    dim: ClassVar[int] = 2
 
     def distance(self, x, y):
         return (jnp.abs(x) + jnp.abs(y) - self.half) / 2
