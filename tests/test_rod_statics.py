@@ -43,6 +43,18 @@ def test_the_cases_of_the_literature(name, modes):
         assert cases.error(name, found, np.array(references[key])) < bar
 
 
+def test_every_member_of_a_batch_ends_as_it_does_alone():
+    """Of many searches some come to where no step makes the residual any smaller."""
+
+    def hanging(radius):
+        rod = R.rod(SE2(), R.chebyshev(kappa_z=3), R.circle(radius), **FINGER)
+        return R.equilibrium(rod, (R.Gravity(),))
+
+    rest = jax.jit(jax.vmap(hanging))(jnp.linspace(2e-3, 6e-3, 500))
+    assert jnp.all(rest.status == Status.successful)
+    assert jnp.all(rest.iterations <= 7)
+
+
 LOADS = jnp.linspace(0.5, 12.0, 4) * BENDING / 0.08**2
 
 

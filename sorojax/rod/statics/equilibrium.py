@@ -400,7 +400,7 @@ def newton(residual: Residual, guess: Array, search: Search) -> Found:
 
         # A step of rounding is nothing but noise: it is taken as it is. Any other is tried
         # first as a whole; the loop holds the only trial, so that it is compiled once.
-        begin = jnp.where(small, 1.0, 2.0).astype(q.dtype), jnp.where(small, 0, jnp.inf) + start
+        begin = jnp.where(small, 1.0, 2.0).astype(q.dtype), jnp.where(small, 0 * start, jnp.inf)
         length, value = jax.lax.while_loop(too_long, half, begin)
         good = value <= start
         new = jnp.where(good, advanced(model, q, length * step), q)
