@@ -316,8 +316,12 @@ def chambers(mesh: Mesh) -> Chambers:
 
     `enclosed_volume(mesh, facets)` gives the same number differentiably.
 
+    Args:
+        mesh: A concrete mesh.
+
     Returns:
-        `mesh` with the facet sets "chamber_0", ..., from left to right, and `volumes` by name.
+        `mesh` with the facet sets "chamber_0", ..., from left to right, and `volumes` by these
+        names [m^3], in the plane [m^2].
     """
     points = np.asarray(mesh.points)
     found = []
