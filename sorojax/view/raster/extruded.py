@@ -56,6 +56,9 @@ def place(scene: Scene, pose: Float[Any, "4 4"], colour: str | None = None) -> S
         pose: Homogeneous matrix from the old to the new coordinates [m].
         colour: As matplotlib takes it.
 
+    Returns:
+        The scene there.
+
     Raises:
         ValueError: If the scene is plane, or the pose is not 4 x 4.
 
