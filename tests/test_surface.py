@@ -243,6 +243,24 @@ def test_report_names_what_is_wrong():
         sdf.surface_report(sdf.Surface(points * np.nan, tetra))
 
 
+def test_report_finds_shells_that_face_the_wrong_way():
+    boxes = [sdf.Box([-r] * 3, [r] * 3) for r in (1, 0.7, 0.4)]
+    outer, cavity, core = (sdf.isosurface(box, 0.3) for box in boxes)
+    count = len(outer.triangles)
+    points = np.concatenate([s.vertices for s in (outer, cavity, core)])
+    rows = [outer.triangles, cavity.triangles + len(outer.vertices)]
+    rows.append(core.triangles + len(outer.vertices) + len(cavity.vertices))
+    wrong = sdf.surface_report(sdf.Surface(points, np.concatenate(rows)))
+    mended = np.arange(count, count + len(rows[1]))
+    assert wrong.watertight and wrong.inverted_triangles.tolist() == mended.tolist()
+    assert "inverted_triangles" in repr(wrong)
+    rows[1] = rows[1][:, ::-1]
+    right = sdf.surface_report(sdf.Surface(points, np.concatenate(rows)))
+    assert not len(right.inverted_triangles)
+    inside_out = sdf.surface_report(outer._replace(triangles=outer.triangles[:, ::-1]))
+    assert len(inside_out.inverted_triangles) == count and inside_out.volume < 0
+
+
 def test_report_measures_walls_and_finds_crossings():
     hollow = sdf.Sphere([0, 0, 0], 1) - sdf.Sphere([0, 0, 0], 0.7)
     report = sdf.surface_report(sdf.isosurface(hollow, 0.1))

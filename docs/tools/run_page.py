@@ -56,7 +56,7 @@ def run(path: Path, folder: Path) -> None:
     for block, printed in outputs(path, folder):
         if why := difference(block.expected or "", printed):
             raise AssertionError(f"{path}, program at line {block.line}: {why}\n{printed}")
-    for name in re.findall(r"/pictures/([\w.]+)\)", path.read_text()):
+    for name in re.findall(r"(?<!_generated)/pictures/([\w.]+)\)", path.read_text()):
         assert (folder / name).exists(), f"{path}: its programs do not draw {name}"
 
 

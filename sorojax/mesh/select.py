@@ -317,7 +317,7 @@ def chambers(mesh: Mesh) -> Chambers:
     `enclosed_volume(mesh, facets)` gives the same number differentiably.
 
     Args:
-        mesh: A concrete mesh.
+        mesh: Cells of a body with closed cavities; one that opens to the outside is none.
 
     Returns:
         `mesh` with the facet sets "chamber_0", ..., from left to right, and `volumes` by these

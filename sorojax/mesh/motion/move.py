@@ -77,7 +77,8 @@ def movable(where: str, fields: tuple[AbstractSdf, ...], mesh: Mesh, size: Sizes
     raise ValueError(
         f"{where}: {len(lost)} nodes of sharp edges are beside a {name}, a layer or a bend "
         f"too narrow for the cells, the thinnest near {at} m about {thick:.2g} m thick. "
-        "Lower `size` to the thinnest wall or layer or less, or thicken it."
+        f"Lower `size`, now {size.largest:g} m, to the thinnest wall or layer of the whole "
+        "body or less, or thicken it."
     )
 
 

@@ -268,7 +268,8 @@ class Tendons(AbstractForce):
 
     Attributes:
         routes: One routing per tendon.
-        tension: [N], one per tendon, or a function of time that returns them.
+        tension: [N], one per tendon, or a function of time that returns them. In a network
+            tensions are commanded through the `effort` of `systems.RodBody`.
         friction: Coefficient [-] by which tensions fall along the routing; None costs
             nothing.
     """

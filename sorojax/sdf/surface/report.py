@@ -8,6 +8,8 @@ from sorojax.sdf.sampling import connected
 from sorojax.sdf.surface.marching import Surface
 from sorojax.sdf.trimesh.tree import crossing_triangles, least_wall
 
+_SHELLS = 64  # of which it is sought whether they face the right way
+
 
 class SurfaceReport(NamedTuple):
     """Findings about a triangle surface.
@@ -27,6 +29,10 @@ class SurfaceReport(NamedTuple):
             surface, and where no such sides are.
         volume: Enclosed volume [m^3], negative where triangles face inwards.
         area: Surface area [m^2].
+        inverted_triangles: Triangles of shells that face the wrong way, such as a cavity
+            whose normals point into the body: it then counts as filled. Swap two columns of
+            these rows. Sought where the surface is closed, without crossings, and has at
+            most 64 shells.
     """
 
     open_edges: np.ndarray
@@ -40,11 +46,12 @@ class SurfaceReport(NamedTuple):
     area: float
     crossings: np.ndarray
     wall_thickness: float
+    inverted_triangles: np.ndarray
 
     def __repr__(self) -> str:
         faults = (
             "open_edges", "crowded_edges", "turned_edges", "pinched_vertices", "degenerate",
-            "crossings",
+            "crossings", "inverted_triangles",
         )  # fmt: skip
         found = [f"{len(getattr(self, f))} {f}" for f in faults if len(getattr(self, f))]
         return (
@@ -71,7 +78,7 @@ class SurfaceReport(NamedTuple):
 
 
 def surface_report(surface: Surface) -> SurfaceReport:
-    """Check a surface: open, crowded and turned edges, shells, genus, volume, area.
+    """Check a surface: open, crowded and turned edges, inverted shells, genus, volume, area.
 
     Args:
         surface: Vertices [m] and triangles.
@@ -97,11 +104,14 @@ def surface_report(surface: Surface) -> SurfaceReport:
     balance = np.bincount(edge, np.where(half[:, 0] < half[:, 1], 1, -1), len(first))
     edges = ordered[first]
     turned = edges[(uses == 2) & (balance != 0)]
-    shells, used, fans = _parts(t, edge, uses, len(vertices))
+    shell, used, fans = _parts(t, edge, uses, len(vertices))
     corners = vertices[t]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
     euler = used - len(edges) + len(t)
     closed = not np.any(uses != 2)
+    shells = shell.max(initial=-1) + 1
+    crossings = crossing_triangles(vertices, t)
+    simple = closed and not len(turned) and not len(crossings) and shells <= _SHELLS
     return SurfaceReport(
         open_edges=edges[uses == 1],
         crowded_edges=edges[uses > 2],
@@ -112,8 +122,9 @@ def surface_report(surface: Surface) -> SurfaceReport:
         genus=shells - euler // 2 if closed else -1,
         volume=float((corners.mean(axis=1) * normal).sum() / 3),
         area=float(np.sqrt((normal * normal).sum(axis=1)).sum()),
-        crossings=crossing_triangles(vertices, t),
+        crossings=crossings,
         wall_thickness=least_wall(vertices, t) if closed and len(t) else np.inf,
+        inverted_triangles=_inverted(corners, shell, shells) if simple else np.zeros(0, int),
     )
 
 
@@ -136,8 +147,32 @@ def _checked(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
     return vertices, triangles
 
 
-def _parts(t, edge, uses, count) -> tuple[int, int, np.ndarray]:
-    """Number of shells, of vertices used, and of triangle fans around each vertex."""
+def _inverted(corners: np.ndarray, shell: np.ndarray, shells: int) -> np.ndarray:
+    """Triangles of shells whose volume has not the sign of their depth: even depths are
+    outsides, odd ones cavities."""
+    parts = [corners[shell == k] for k in range(shells)]
+    low = np.array([part.min(axis=(0, 1)) for part in parts]).reshape(-1, 3)
+    high = np.array([part.max(axis=(0, 1)) for part in parts]).reshape(-1, 3)
+    wrong = np.zeros(shells, dtype=bool)
+    for k, part in enumerate(parts):
+        around = np.flatnonzero(((low < low[k]) & (high > high[k])).all(axis=1))
+        depth = sum(abs(_turns(part[0].mean(axis=0), parts[j])) > 0.5 for j in around)
+        a, b, c = np.moveaxis(part - low[k], 1, 0)
+        wrong[k] = ((a * np.cross(b, c)).sum() > 0) == (depth % 2 == 1)
+    return np.flatnonzero(wrong[shell])
+
+
+def _turns(p: np.ndarray, corners: np.ndarray) -> float:
+    """How often closed triangles go around a point (Van Oosterom and Strackee)."""
+    a, b, c = np.moveaxis(corners - p, 1, 0)
+    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    ab, bc, ca = ((u * v).sum(axis=1) for u, v in ((a, b), (b, c), (c, a)))
+    triple = (a * np.cross(b, c)).sum(axis=1)
+    return np.arctan2(triple, la * lb * lc + ab * lc + bc * la + ca * lb).sum() / (2 * np.pi)
+
+
+def _parts(t, edge, uses, count) -> tuple[np.ndarray, int, np.ndarray]:
+    """Shell of each triangle, number of vertices used, of triangle fans around each vertex."""
     # Corners of triangles, joined to the same corner of the triangle across an edge.
     corner = np.arange(3 * len(t)).reshape(-1, 3)
     order = np.argsort(edge, kind="stable")
@@ -156,5 +191,5 @@ def _parts(t, edge, uses, count) -> tuple[int, int, np.ndarray]:
     )
     firsts = np.unique(connected(flat.size, *join), return_index=True)[1]
     fans = np.bincount(flat[firsts], minlength=count)
-    shells = len(np.unique(connected(len(t), *row.T)))
-    return shells, len(np.unique(flat)), fans
+    shell = np.unique(connected(len(t), *row.T), return_inverse=True)[1]
+    return shell, len(np.unique(flat)), fans

@@ -63,7 +63,8 @@ class RodBody(AbstractBlock):
         rod: The rod.
         forces: Its forces; at most one pressure map (of one or several ports).
         q, v: Coordinates and rates at the start; zero if omitted.
-        driven: Open an input `effort`, a generalised force from outside.
+        driven: Open an input `effort`, a generalised force from outside. Threads of lengths
+            l(q), `rod.thread_lengths`, under commanded tensions give it -tension @ dl/dq.
     """
 
     rod: Rod
