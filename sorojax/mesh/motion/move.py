@@ -39,7 +39,7 @@ from sorojax.mesh.motion.plan import (
     spread,
 )
 from sorojax.mesh.quality import least_corner
-from sorojax.mesh.resolution import thinnest
+from sorojax.mesh.resolution import raise_thin
 from sorojax.mesh.sizes import Sizes
 from sorojax.sdf.base import AbstractSdf
 from sorojax.sdf.sampling import values_and_gradients
@@ -47,7 +47,6 @@ from sorojax.sdf.sampling import values_and_gradients
 _OFF = 1e-3  # of an edge: distance from the zero set of a node that was to be on it
 _FAR = 0.25  # of an edge: motion of a corner beyond which its sides may be taken for others
 _ROUNDS = 5  # of taking nodes from ridges
-_NAMED = 24  # nodes at most of which the thinnest place is named
 _LOST = 0.5  # of the size: how far a sharp node may settle from where it is
 _ROUND = 0.9986  # cosine of 3 degrees: sides that meet at less are one, seen close by
 
@@ -70,16 +69,7 @@ def movable(where: str, fields: tuple[AbstractSdf, ...], mesh: Mesh, size: Sizes
         if all(len(kept[k]) == len(mesh.node_sets[k]) for k in kept):
             break
         mesh = fewer
-    x = np.asarray(mesh.points)[lost]
-    name, at, thick = min(
-        (thinnest(field, x[:_NAMED], size.largest) for field in fields), key=lambda f: f[2]
-    )
-    raise ValueError(
-        f"{where}: {len(lost)} nodes of sharp edges are beside a {name}, a layer or a bend "
-        f"too narrow for the cells, the thinnest near {at} m about {thick:.2g} m thick. "
-        f"Lower `size`, now {size.largest:g} m, to the thinnest wall or layer of the whole "
-        "body or less, or thicken it."
-    )
+    raise_thin(where, fields, np.asarray(mesh.points)[lost], size)
 
 
 def _unsettled(fields: tuple[AbstractSdf, ...], mesh: Mesh, size: Sizes) -> np.ndarray:
