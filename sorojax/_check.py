@@ -5,6 +5,8 @@ because there a value cannot be known, and statuses report instead.
 """
 
 import dataclasses
+import inspect
+import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any, get_args
 
@@ -16,6 +18,17 @@ from sorojax._jax.trace_state import is_tracer
 
 def is_concrete(value: Any) -> bool:
     return not is_tracer(value)
+
+
+_BETWEEN = {"sorojax", "jax", "equinox"}  # packages that a call of the user passes through
+
+
+def warn(message: str) -> None:
+    """A `UserWarning` at the line of the user that led to it."""
+    level, frame = 1, inspect.currentframe()
+    while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] in _BETWEEN:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, stacklevel=level)
 
 
 def finite(where: str, name: str, value: Any, do: str) -> None:

@@ -95,8 +95,9 @@ def test_narrow_slits_are_counted():
 
 def test_details_too_fine_are_reported():
     foam = sdf.repeat(sdf.Sphere([0.0, 0.0, 0.0], 0.004), [0.05, 0.0, 0.0], 20)
-    with pytest.warns(UserWarning, match="Raise `resolution`"):
+    with pytest.warns(UserWarning, match="Raise `resolution`") as seen:
         sdf.volume(foam, 8)
+    assert seen[0].filename == __file__  # the line of the user, not one of ours
 
 
 class Nothing(sdf.AbstractSdf):

@@ -1,6 +1,5 @@
 """Checks of what `fem.problem` is given, before any long computation."""
 
-import warnings
 from typing import Any
 
 import equinox as eqx
@@ -170,12 +169,11 @@ def locking(
     if mesh.element.order == 2 and ratio > _NOTICED:
         share = ratio / (ratio + _NOTICED)
         poisson = (3 * ratio - 2) / (6 * ratio + 2)
-        warnings.warn(
+        _check.warn(
             f"fem.problem: {mesh.element.name} at a Poisson ratio of {poisson:.3f} is too "
             f"stiff, in bending by about {12 * share:.0f} % with one cell through a wall and "
             f"{1.7 * share:.1f} % with two. Call mesh.enrich(mesh) first; to accept it pass "
-            "formulation=fem.Displacement().",
-            stacklevel=3,
+            "formulation=fem.Displacement()."
         )
 
 

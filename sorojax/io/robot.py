@@ -1,7 +1,6 @@
 """Robots from files in MJCF or URDF, with MuJoCo as the parser."""
 
 import os
-import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -86,9 +85,8 @@ def import_robot(
     unmapped = tuple(_unmapped(model))
     loud = [name for name in unmapped if not name.startswith(_QUIET)]
     if loud:
-        warnings.warn(
-            f"{_WHERE}: the assembly has not: {'; '.join(loud)}. It moves without them.",
-            stacklevel=2,
+        _check.warn(
+            f"{_WHERE}: the assembly has not: {'; '.join(loud)}. It moves without them."
         )
     return ImportedRobot(
         assembly,

@@ -1,6 +1,5 @@
 """The optimisation loop: any differentiable function of a pytree, constraints, any method."""
 
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
@@ -226,10 +225,9 @@ def _last(task: Task, flat, k: int, retry: bool):
 def _refused(error: Exception, k: int, retry: bool) -> None:
     if not retry:
         raise error
-    warnings.warn(
+    _check.warn(
         f"minimise: step {k} went to a design that fails: {error} A design nearer to the one "
-        "before is taken. Lower `move`, or narrow the bounds.",
-        stacklevel=4,
+        "before is taken. Lower `move`, or narrow the bounds."
     )
 
 

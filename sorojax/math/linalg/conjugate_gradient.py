@@ -6,7 +6,6 @@ eigenvalues. The status says whether a system is solved.
 """
 
 import functools
-import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -189,12 +188,11 @@ class IterativeFactor:
         end = found(self.levels, *args)
         solved = np.asarray(end.converged)
         if not solved.all():
-            warnings.warn(
+            _check.warn(
                 f"conjugate gradients: {solved.size - solved.sum()} of {solved.size} systems "
                 f"not solved to {settings.tolerance:g} in at most "
                 f"{settings.max_iterations} iterations, their answer is NaN. Raise "
-                "max_iterations, or take the direct solver.",
-                stacklevel=2,
+                "max_iterations, or take the direct solver."
             )
         return np.where(solved[..., None], np.asarray(end.x), np.nan)
 

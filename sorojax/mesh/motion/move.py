@@ -2,7 +2,6 @@
 boundary of a mesh can follow its shape, and did.
 """
 
-import warnings
 from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any
@@ -119,11 +118,10 @@ def check_followed(
     sharp = np.asarray(plan.sharp)
     share = np.linalg.norm(moved[sharp] - before[sharp], axis=1) / edge[sharp] / stages
     if share.max(initial=0) > _FAR:
-        warnings.warn(
+        _check.warn(
             f"move: a corner or ridge near {before[sharp[share.argmax()]]} m moves by "
             f"{share.max():.2f} of the edges beside it, need {_FAR:g} or less for certain "
-            "derivatives. Give the drawing `before` and more `stages`, or mesh the new shape.",
-            stacklevel=3,
+            "derivatives. Give the drawing `before` and more `stages`, or mesh the new shape."
         )
 
 

@@ -8,7 +8,6 @@ of that frame, and agrees with finite differences at any resolution. Where the n
 shape are traced, `traced` counts the same cells in arrays of fixed size.
 """
 
-import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -364,11 +363,10 @@ def _found(shape: AbstractSdf, rule: Rule, slope: bool) -> Moments:
     if not found.value[0] > 0:
         raise_empty(rule.where, lower, upper, size)
     if found.doubt > _DOUBT * found.value[0]:
-        warnings.warn(
+        _check.warn(
             f"{rule.where}: details too fine for cells of {size:g} m, halved "
             f"{LEVELS[shape.dim]} times, fill {100 * found.doubt / found.value[0]:.2g} % of "
-            "the shape: the result may be off by as much. Raise `resolution`.",
-            stacklevel=2,
+            "the shape: the result may be off by as much. Raise `resolution`."
         )
     return found
 

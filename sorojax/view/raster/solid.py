@@ -2,7 +2,6 @@
 
 import contextlib
 import importlib
-import warnings
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -79,10 +78,9 @@ def chosen_renderer(renderer: str) -> str:
         )
     if not _warned:
         _warned = True
-        warnings.warn(
+        _check.warn(
             "view: pyvista is not installed, solid pictures are shaded by sorojax's own "
-            'renderer. Run pip install "sorojax[view]" for pyvista, or pass renderer="own".',
-            stacklevel=4,
+            'renderer. Run pip install "sorojax[view]" for pyvista, or pass renderer="own".'
         )
     return "own"
 
