@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from sorojax import _check
 from sorojax.io._files import inside
 from sorojax.io._mujoco import parser
 from sorojax.math.lie import SE3

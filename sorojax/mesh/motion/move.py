@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sorojax import _check
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import integers, real
 from sorojax.math.two_programs import two_programs

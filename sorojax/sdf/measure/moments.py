@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax import _check
 from sorojax._jax.trace_state import is_traced, is_tracer
 from sorojax._types import Numbers, real
 from sorojax.sdf.base import AbstractSdf

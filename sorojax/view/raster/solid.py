@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import UInt8
 
+from sorojax import _check
 from sorojax.view import style
 from sorojax.view.raster.camera import Lens, View, box_corners, camera_at, fit
 from sorojax.view.raster.glyphs import arrow_triangles, ball_triangles
