@@ -268,18 +268,18 @@ class Tendons(AbstractForce):
 
     Attributes:
         routes: One routing per tendon.
-        tension: [N], one per tendon, or a function of time that returns them. In a network
-            tensions are commanded through the `effort` of `systems.RodBody`.
+        tension: [N], one per tendon, or a function of time that returns them; None where a
+            network commands them, by the input `tension` of `systems.RodBody`.
         friction: Coefficient [-] by which tensions fall along the routing; None costs
             nothing.
     """
 
     routes: tuple[AbstractRoute, ...] = eqx.field(converter=_several)
-    tension: Signal = eqx.field(converter=_signal)
+    tension: Signal | None = eqx.field(converter=_signal, default=None)
     friction: Float[Array, ""] | None = eqx.field(converter=optional_real, default=None)
 
     def __check_init__(self):
-        if not callable(self.tension):
+        if self.tension is not None and not callable(self.tension):
             do = "Tendons pull; put one on the other side to pull back."
             _check.not_negative("Tendons", "tension", self.tension, "N", do)
 
@@ -287,7 +287,21 @@ class Tendons(AbstractForce):
         return self.on_rod(motion.rod)(t, motion)
 
     def on_rod(self, rod):
+        if self.tension is None:
+            raise ValueError(
+                "Tendons: got no `tension`, need one per routing. Give it [N], or list the "
+                "tendons in a RodBody and wire its `tension`."
+            )
         return _Threads(_threads(rod, self.routes), self.tension, self.friction)
+
+    @property
+    def ports(self) -> tuple[int, ...]:
+        """Shape of commanded tensions: a number for one tendon."""
+        return () if len(self.routes) == 1 else (len(self.routes),)
+
+    def pulled(self, tension: Float[Array, "*ports"]) -> "Tendons":
+        """The same under `tension` [N], which may be negative and is then none."""
+        return Tendons(self.routes, lambda t: jnp.atleast_1d(tension), self.friction)
 
 
 class _Threads(AbstractForce):

@@ -1,7 +1,7 @@
-"""A rod as a block: pressure in, volume and tip out."""
+"""A rod as a block: pressures and tensions in, volumes, lengths of tendons and tip out."""
 
 import dataclasses
-from typing import Any
+from typing import Any, TypeGuard
 
 import equinox as eqx
 import jax
@@ -23,6 +23,7 @@ from sorojax.rod import (
     PartForce,
     Pressurised,
     Rod,
+    Tendons,
     TipWrench,
     acceleration,
     inertia,
@@ -32,6 +33,8 @@ from sorojax.rod import (
     operators,
     rest,
     slices,
+    thread_lengths,
+    thread_rates,
     tip_angle,
     tip_pose,
     total_force,
@@ -49,6 +52,7 @@ from sorojax.systems.blocks.block import AbstractBlock, Input, Output
 
 SERVO = 500.0  # 1/s: how fast the joint of a closure follows an input
 _FLUID = {"volume": "m^3", "volume_rate": "m^3/s", "compliance": "m^3/Pa"}
+_THREAD = {"tendon_length": "m", "tendon_rate": "m/s"}
 
 
 class RodBody(AbstractBlock):
@@ -59,12 +63,16 @@ class RodBody(AbstractBlock):
     held pressure) and `compliance` of the walls. All come from the same potential as the
     force, so no energy is lost between fluid and rod.
 
+    `rod.Tendons(routes)` without a tension opens the input `tension` [N] and the outputs
+    `tendon_length` and `tendon_rate`, a number for one tendon, else one each. A tendon pulls:
+    what a negative command asks for is no tension.
+
     Attributes:
         rod: The rod.
-        forces: Its forces; at most one pressure map (of one or several ports).
+        forces: Its forces; at most one pressure map (of one or several ports), and one
+            `rod.Tendons` (of one or several routings) that is commanded.
         q, v: Coordinates and rates at the start; zero if omitted.
-        driven: Open an input `effort`, a generalised force from outside. Threads of lengths
-            l(q), `rod.thread_lengths`, under commanded tensions give it -tension @ dl/dq.
+        driven: Open an input `effort`, a generalised force from outside.
     """
 
     rod: Rod
@@ -80,14 +88,21 @@ class RodBody(AbstractBlock):
                 f"RodBody: got {len(maps)} pressure maps, need at most one. Return several "
                 "volumes from one map: it then has one port per chamber."
             )
+        if (count := sum(map(_is_commanded, self.forces))) > 1:
+            raise ValueError(
+                f"RodBody: got {count} Tendons without tension, need at most one. List all "
+                "routings in one: it then has one port per tendon."
+            )
 
     @property
     def inputs(self):
         chamber = self._chamber()
-        effort = {"effort": Input(None, self._dof(), 0.0)} if self.driven else {}
-        if chamber is None:
-            return effort
-        return effort | {"pressure": Input("Pa", chamber.ports, default=0.0)}
+        ports = {"effort": Input(None, self._dof(), 0.0)} if self.driven else {}
+        if chamber is not None:
+            ports["pressure"] = Input("Pa", chamber.ports, 0.0)
+        if (tendons := self._tendons()) is not None:
+            ports["tension"] = Input("N", tendons.ports, 0.0)
+        return ports
 
     @property
     def outputs(self):
@@ -100,6 +115,8 @@ class RodBody(AbstractBlock):
         if chamber is not None:
             needs = frozenset({"pressure"})
             ports |= {name: Output(unit, chamber.ports, needs) for name, unit in _FLUID.items()}
+        if (tendons := self._tendons()) is not None:
+            ports |= {name: Output(unit, tendons.ports) for name, unit in _THREAD.items()}
         return ports
 
     def initial_state(self):
@@ -116,6 +133,10 @@ class RodBody(AbstractBlock):
             return tip_pose(self.rod, q)[:-1, -1]
         if name == "tip_angle":
             return tip_angle(motion(self.rod, q))
+        if name in _THREAD:
+            tendons = self._tendons()
+            assert tendons is not None
+            return _threaded(tendons, name, self.rod, q, v)
         chamber = self._chamber()
         assert chamber is not None
         return _fluid(chamber, name, q, v, inputs["pressure"])
@@ -134,11 +155,11 @@ class RodBody(AbstractBlock):
         return checked_status(Status.successful, self.rod, path["q"])
 
     def _bound(self, inputs) -> tuple[AbstractForce, ...]:
-        return tuple(
-            Pressurised(force, inputs["pressure"])
-            if isinstance(force, AbstractPressureMap)
-            else force
-            for force in self.forces
+        return tuple(_under(force, inputs, "") for force in self.forces)
+
+    def _tendons(self) -> Tendons | None:
+        return next(
+            (f for f in self.forces if isinstance(f, Tendons) and _is_commanded(f)), None
         )
 
     def _chamber(self) -> AbstractPressureMap | None:
@@ -169,10 +190,12 @@ class AssemblyBody(AbstractBlock):
     """An assembly with its forces; the state is {q, v}, and with a `rod.Relaxation` among the
     forces {q, v, memory}: what the branches remember.
 
-    Ports of a part are named after it. A pressure map, `On("finger", map)`, opens
+    Ports of a part are named after it. A pressure map, `PartForce("finger", map)`, opens
     `finger_pressure`, `finger_volume`, `finger_volume_rate` (at held pressure) and
-    `finger_compliance`, all from one potential. A driven joint opens `wrist_effort`. Each
-    part has `finger_position`, of its tip or of the frame of a link.
+    `finger_compliance`, all from one potential. Tendons without a tension,
+    `PartForce("finger", rod.Tendons(routes))`, open `finger_tension`, `finger_tendon_length`
+    and `finger_tendon_rate`. A driven joint opens `wrist_effort`. Each part has
+    `finger_position`, of its tip or of the frame of a link.
 
     Closures hold to the tolerance of the run: what a step opens is pulled shut at 50 1/s. Each
     has the output `base_wrench`, on the part that it holds [N m], [N]. Ends are driven by a
@@ -189,7 +212,7 @@ class AssemblyBody(AbstractBlock):
 
     Attributes:
         assembly: The assembly.
-        forces: Its forces; at most one pressure map per rod.
+        forces: Its forces; at most one pressure map and one commanded set of tendons per rod.
         driven: Parts whose joints take an effort from outside.
         q, v: Coordinates and rates at the start; at rest if omitted.
         carrying: Parts that another block is fixed to.
@@ -206,13 +229,16 @@ class AssemblyBody(AbstractBlock):
 
     def __check_init__(self):
         names = [part for part, _ in _maps(self.forces)]
-        twice = {name for name in names if names.count(name) > 1}
-        if twice:
-            raise ValueError(
-                f"AssemblyBody: `{min(twice)}` has {names.count(min(twice))} pressure maps, "
-                "need at most one per rod. Return several volumes from one map."
-            )
-        for name in (*names, *self.driven, *self.carrying):
+        pulled = [part for part, _ in _tendons(self.forces)]
+        for parts, what in ((names, "pressure maps"), (pulled, "Tendons without tension")):
+            twice = {name for name in parts if parts.count(name) > 1}
+            if twice:
+                raise ValueError(
+                    f"AssemblyBody: `{min(twice)}` has {parts.count(min(twice))} {what}, need "
+                    "at most one per rod. Return several volumes from one map, and list all "
+                    "routings of a rod in one Tendons."
+                )
+        for name in (*names, *pulled, *self.driven, *self.carrying):
             index_of(self.assembly, name)
         for name in self.moved:
             if name not in self.assembly.loops or self._closure(name).motion is not None:
@@ -225,6 +251,8 @@ class AssemblyBody(AbstractBlock):
     @property
     def inputs(self):
         ports = {f"{k}_pressure": Input("Pa", m.ports, 0.0) for k, m in self._maps().items()}
+        for part, tendons in _tendons(self.forces):
+            ports[f"{part}_tension"] = Input("N", tendons.ports, 0.0)
         for name in self.driven:
             ports[f"{name}_effort"] = Input(None, (self._joint_dof(name),), 0.0)
         twist = self.assembly.group.algebra_dim
@@ -244,6 +272,8 @@ class AssemblyBody(AbstractBlock):
             needs = frozenset({f"{name}_pressure"})
             for kind, unit in _FLUID.items():
                 ports[f"{name}_{kind}"] = Output(unit, chamber.ports, needs)
+        for part, tendons in _tendons(self.forces):
+            ports |= {f"{part}_{k}": Output(unit, tendons.ports) for k, unit in _THREAD.items()}
         return ports
 
     def initial_state(self):
@@ -270,6 +300,12 @@ class AssemblyBody(AbstractBlock):
                 at = slices(self.assembly)[index_of(self.assembly, part)]
                 own = (q[at.rod_q], v[at.rod_v])
                 return _fluid(chamber, kind, *own, inputs[f"{part}_pressure"])
+        for part, tendons in _tendons(self.forces):
+            kind, body = name.removeprefix(f"{part}_"), self.assembly[part].body
+            if name != kind and kind in _THREAD:
+                at = slices(self.assembly)[index_of(self.assembly, part)]
+                assert isinstance(body, Rod)  # links have no threads
+                return _threaded(tendons, kind, body, q[at.rod_q], v[at.rod_v])
         if name in (f"{part}_pose" for part in self.carrying):
             return tip_pose(self.assembly, q)[name.removesuffix("_pose")]
         return tip_pose(self.assembly, q)[name.removesuffix("_position")][:-1, -1]
@@ -319,11 +355,15 @@ class AssemblyBody(AbstractBlock):
 
     def acting(self, inputs) -> tuple[Load, ...]:
         """The forces under given inputs: maps with their pressures, joints with efforts."""
-        plain = tuple(force for force in self.forces if not _maps((force,)))
-        bound = tuple(
-            PartForce(part, Pressurised(chamber, inputs[f"{part}_pressure"]))
-            for part, chamber in self._maps().items()
-        )
+        plain: list[Load] = []
+        bound: list[Load] = []
+        for force in self.forces:
+            if isinstance(force, PartForce) and _takes_input(force.force):
+                bound.append(
+                    PartForce(force.part, _under(force.force, inputs, f"{force.part}_"))
+                )
+            else:
+                plain.append(force)
         driven = tuple(JointEffort(name, inputs[f"{name}_effort"]) for name in self.driven)
         carried = tuple(
             PartForce(name, TipWrench(-inputs[f"{name}_reaction"])) for name in self.carrying
@@ -350,6 +390,35 @@ class _Moving(eqx.Module):
         spun = spin_cross(self.twist[None, :rot], self.rotation.T).T
         position = self.position + ahead * self.twist[rot:]
         return homogeneous(self.rotation + ahead * spun, position)
+
+
+def _is_commanded(force: Any) -> TypeGuard[Tendons]:
+    return isinstance(force, Tendons) and force.tension is None
+
+
+def _takes_input(force: Any) -> bool:
+    """Whether a force has its pressure or tension from the network."""
+    return isinstance(force, AbstractPressureMap) or _is_commanded(force)
+
+
+def _under(force: Any, inputs, prefix: str) -> AbstractForce:
+    """A force under the inputs that it takes."""
+    if isinstance(force, AbstractPressureMap):
+        return Pressurised(force, inputs[f"{prefix}pressure"])
+    return force.pulled(inputs[f"{prefix}tension"]) if _is_commanded(force) else force
+
+
+def _threaded(tendons: Tendons, name: str, rod: Rod, q: Array, v: Array) -> Array:
+    """Lengths of tendons, or their rates."""
+    if name == "tendon_length":
+        return thread_lengths(rod, tendons.routes, q).reshape(tendons.ports)
+    return thread_rates(rod, tendons.routes, q, v).reshape(tendons.ports)
+
+
+def _tendons(forces: tuple[Load, ...]) -> list[tuple[str, Tendons]]:
+    """The commanded tendons, with the parts that they are in."""
+    on = [force for force in forces if isinstance(force, PartForce)]
+    return [(f.part, f.force) for f in on if _is_commanded(f.force)]
 
 
 def _maps(forces: tuple[Load, ...]) -> list[tuple[str, AbstractPressureMap]]:

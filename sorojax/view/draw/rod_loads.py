@@ -69,7 +69,7 @@ def part_and_force(force: Any) -> tuple[str, Any]:
 def _threads(body: Rod, force: Any) -> list[Drawn]:
     if isinstance(force, R.Tendons):
         names = ["tendon"] * len(force.routes)
-        if not callable(force.tension):
+        if force.tension is not None and not callable(force.tension):
             names = [f"tendon: {short(float(pull), 'N')}" for pull in force.tension]
         return [_tendon(route, name) for route, name in zip(force.routes, names, strict=True)]
     chamber, pressure = force, None
