@@ -1,5 +1,6 @@
 """What the project makes public, package by package, and what is written about it."""
 
+import dataclasses
 import importlib
 import inspect
 import pkgutil
@@ -131,22 +132,39 @@ def signature_of(name: Public) -> inspect.Signature | None:
 
 
 def undescribed(name: Public) -> list[str]:
-    """What a docstring lacks: all of it, or of a verb arguments by name, or what comes back."""
+    """What a docstring lacks: all of it, of a noun fields by name, of a verb arguments or what
+    comes back."""
     if name.kind == "data":
         return []
     if not name.text:
         return ["docstring"]
     if name.kind == "class":
-        return []
+        return [field for field in fields(name.value) if field not in told_of(name.value)]
     signature, told = inspect.signature(name.plain), described(name.text)
     lacks = [parameter for parameter in signature.parameters if parameter not in told]
     gives = signature.return_annotation is not None
     return [*lacks, *["Returns"] * (gives and "\nReturns:" not in name.text)]
 
 
+def fields(kind: type) -> list[str]:
+    """Public fields of a noun, be it a data class or a named tuple."""
+    is_data = dataclasses.is_dataclass(kind)
+    named = [field.name for field in dataclasses.fields(kind)] if is_data else ()
+    return [name for name in named or getattr(kind, "_fields", ()) if name[0] != "_"]
+
+
+def told_of(kind: type) -> set[str]:
+    """What docstrings of a class and its bases describe under `Attributes` or name in
+    backticks."""
+    own = [base for base in kind.__mro__ if base.__module__.startswith("sorojax")]
+    texts = [inspect.cleandoc(base.__doc__ or "") for base in own]
+    spans = [span for text in texts for span in re.findall(r"`+([^`]+)`+", text)]
+    return set().union(*map(described, texts), *(re.findall(r"\w+", span) for span in spans))
+
+
 def described(text: str) -> set[str]:
-    """Arguments that a docstring describes; "lower, upper: ..." are two."""
-    part = re.search(r"^Args:\n((?:    .*\n?|\n)+)", text, re.M)
+    """Arguments or fields that a docstring describes; "lower, upper: ..." are two."""
+    part = re.search(r"^(?:Args|Attributes):\n((?:    .*\n?|\n)+)", text, re.M)
     heads = re.findall(r"^    ([*\w]+(?:, [*\w]+)*):", part[1] if part else "", re.M)
     return {name.strip(" *") for head in heads for name in head.split(",")}
 

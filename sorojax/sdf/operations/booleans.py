@@ -240,7 +240,7 @@ class Chamfer(AbstractBlend):
 
 
 class AbstractPair(AbstractByLevel):
-    """Two shapes of one dimension as one."""
+    """Two shapes of one dimension, `first` and `second`, as one."""
 
     first: AbstractSdf
     second: AbstractSdf
@@ -258,7 +258,7 @@ class AbstractPair(AbstractByLevel):
 
 
 class AbstractBlended(AbstractPair):
-    """Two shapes joined by a blend of width `k` [m]."""
+    """Two shapes joined by a `blend` of width `k` [m]."""
 
     k: Float[Array, ""] = eqx.field(converter=real)
     blend: AbstractBlend = Quadratic()
