@@ -26,8 +26,8 @@ class AbstractSupport(eqx.Module):
 
 
 class Fixed(AbstractSupport):
-    """Nodes that do not move; `components=(0,)` lets them slide in the plane x = const,
-    the condition of symmetry."""
+    """`nodes` that do not move; `components=(0,)` lets them slide in the plane x = const, the
+    condition of symmetry."""
 
     nodes: Int[Array, " nodes"] = eqx.field(converter=integers)
     components: tuple[int, ...] | None = eqx.field(static=True, default=None)
@@ -39,8 +39,8 @@ class Fixed(AbstractSupport):
 
 
 class Prescribed(AbstractSupport):
-    """Nodes moved by `displacement` [m], one vector for all or one per node, with one entry
-    per known component."""
+    """`nodes` moved by `displacement` [m], one vector for all or one per node, with one entry
+    for each of the known `components` (0 is x), all of them if omitted."""
 
     nodes: Int[Array, " nodes"] = eqx.field(converter=integers)
     displacement: Float[Array, "..."] = eqx.field(converter=real)

@@ -125,6 +125,9 @@ Row = Float[Array, "grid ..."]
 class State(eqx.Module):
     """A moving body at one instant: what continues.
 
+    `time` [s], and of the nodes `displacement` [m], `velocity` [m/s] and `acceleration`
+    [m/s^2], which is that of the method.
+
     `memory` holds the loads that remember, such as friction; `work` and `dissipated` [J] are
     what loads and supports gave and damping took since the start. `strains` are what the
     branches of a viscoelastic material remember, `peaks` [J/m^3] what one that softens does

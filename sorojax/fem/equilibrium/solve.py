@@ -37,7 +37,7 @@ from sorojax.math.status import Status
 
 @displayed
 class Solution(eqx.Module):
-    """Displacement at equilibrium [m], or at the last converged fraction of the load.
+    """`displacement` at equilibrium [m], or at the last converged fraction of the load.
 
     Every array gets the batch axes of `jax.vmap` in front, so each lane has its own
     `status`, `load_fraction`, Newton `iterations`, accepted `load_steps` and `cuts`. Of

@@ -62,7 +62,7 @@ class Straight(AbstractRoute):
 
 
 class Converging(AbstractRoute):
-    """A thread whose place (y, z) [m] moves linearly from that at the base to that at the
+    """A thread whose place (y, z) [m] moves linearly from `first` at the base to `last` at the
     end of the rod, whatever part of it the thread takes."""
 
     first: Float[Array, "2"] = eqx.field(converter=real)
