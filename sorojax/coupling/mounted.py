@@ -49,8 +49,8 @@ class MountedRod(AbstractLoad):
     a dead force at its tip, in the axes of the mesh; `simulate` takes its values in time by the
     name of the rod. `places` are the nodes whose displacements hold the coordinates of the rod,
     curvatures times the square of its length, others times the length [m]. `axes` span the
-    plane of the patch, None on a plane mesh, and `motion` is what its masses remember in a step;
-    `mounted_rod` and `simulate` set these.
+    plane of the patch, None on a plane mesh, and `motion` is what its masses remember in a
+    step; `mounted_rod` and `simulate` set these.
     """
 
     directed: ClassVar[bool] = True

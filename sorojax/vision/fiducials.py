@@ -164,7 +164,13 @@ _LEAST_CORNERS, _LEAST_VIEWS = 6, 5
 
 
 class CharucoBoard(NamedTuple):
-    """A chess board with ArUco markers on its white squares; sizes in m."""
+    """A chess board with ArUco markers on its white squares.
+
+    Attributes:
+        columns, rows: Squares across and down.
+        square, marker: Sides of a square and of a marker [m].
+        dictionary: Name of the ArUco dictionary, without `DICT_`.
+    """
 
     columns: int = 8
     rows: int = 6
