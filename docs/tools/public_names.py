@@ -1,6 +1,5 @@
 """What the project makes public, package by package, and what is written about it."""
 
-import dataclasses
 import importlib
 import inspect
 import pkgutil
@@ -8,7 +7,7 @@ import re
 import types
 import typing
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, cached_property
 from typing import Any
 
@@ -139,27 +138,27 @@ def undescribed(name: Public) -> list[str]:
     if not name.text:
         return ["docstring"]
     if name.kind == "class":
-        return [field for field in fields(name.value) if field not in told_of(name.value)]
+        told = told_of(name.value)
+        return [field for field in fields_of(name.value) if field not in told]
     signature, told = inspect.signature(name.plain), described(name.text)
     lacks = [parameter for parameter in signature.parameters if parameter not in told]
     gives = signature.return_annotation is not None
     return [*lacks, *["Returns"] * (gives and "\nReturns:" not in name.text)]
 
 
-def fields(kind: type) -> list[str]:
-    """Public fields of a noun, be it a data class or a named tuple."""
-    is_data = dataclasses.is_dataclass(kind)
-    named = [field.name for field in dataclasses.fields(kind)] if is_data else ()
-    return [name for name in named or getattr(kind, "_fields", ()) if name[0] != "_"]
+def fields_of(kind: type) -> list[str]:
+    """Public fields of a noun, a data class or a named tuple."""
+    data = [field.name for field in fields(kind)] if is_dataclass(kind) else ()
+    return [name for name in data or getattr(kind, "_fields", ()) if name[0] != "_"]
 
 
 def told_of(kind: type) -> set[str]:
-    """What docstrings of a class and its bases describe under `Attributes` or name in
-    backticks."""
-    own = [base for base in kind.__mro__ if base.__module__.startswith("sorojax")]
-    texts = [inspect.cleandoc(base.__doc__ or "") for base in own]
+    """Names that the docstrings of a class and of its bases in the project describe under
+    `Attributes`, or have in backticks: `radius`, `closed=True`."""
+    bases = [base for base in kind.__mro__[1:] if base.__module__.startswith("sorojax")]
+    texts = [inspect.cleandoc(each.__doc__ or "") for each in (kind, *bases)]
     spans = [span for text in texts for span in re.findall(r"`+([^`]+)`+", text)]
-    return set().union(*map(described, texts), *(re.findall(r"\w+", span) for span in spans))
+    return {span.partition("=")[0] for span in spans}.union(*map(described, texts))
 
 
 def described(text: str) -> set[str]:
@@ -170,7 +169,7 @@ def described(text: str) -> set[str]:
 
 
 def main() -> None:
-    """Say how many public names have a docstring, and what those of verbs lack."""
+    """Say how many public names there are, and what their docstrings lack."""
     names = everything()
     missing = {name.path: lacks for name in names if (lacks := undescribed(name))}
     verbs = sum(name.kind == "function" for name in names)

@@ -44,13 +44,14 @@ if TYPE_CHECKING:
 class MountedRod(AbstractLoad):
     """A rod on a patch of a solid: `mounted_rod(mesh, rod, nodes, ...)`.
 
-    `pose` is that of its base in the reference configuration, a homogeneous matrix with the
-    position in m, and `gravity` [m/s^2] gives the rod its weight, None for none. `value` [N] is
-    a dead force at its tip, in the axes of the mesh; `simulate` takes its values in time by the
-    name of the rod. `places` are the nodes whose displacements hold the coordinates of the rod,
-    curvatures times the square of its length, others times the length [m]. `axes` span the
-    plane of the patch, None on a plane mesh, and `motion` is what its masses remember in a
-    step; `mounted_rod` and `simulate` set these.
+    `rod` is glued with its base to `nodes`. `pose` is that of its base in the reference
+    configuration, a homogeneous matrix with the position in m, and `gravity` [m/s^2] gives the
+    rod its weight, None for none. `value` [N] is a dead force at its tip, in the axes of the
+    mesh; `simulate` takes its values in time by the name of the rod. `places` are the nodes
+    whose displacements hold the coordinates of the rod, curvatures times the square of its
+    length, others times the length [m]. `axes` span the plane of the patch, None on a plane
+    mesh, and `motion` is what its masses remember in a step; `mounted_rod` and `simulate` set
+    these.
     """
 
     directed: ClassVar[bool] = True

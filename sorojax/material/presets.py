@@ -71,7 +71,7 @@ DRAGON_SKIN_10_RELAXATION = Relaxation((0.2407,), (0.02405,), (4.29, 7.74), 0.02
 
 @dataclass(frozen=True)
 class Preset:
-    """Numbers of a rubber and what is known about them.
+    """Numbers of a rubber called `name` and what is known about them.
 
     `coefficients` are those of `model` in the order of its fields [Pa] (for `Ogden` the
     moduli, then the exponents), `bulk_modulus` [Pa] is given where the source has one,

@@ -97,7 +97,7 @@ class Helical(AbstractRoute):
 
 
 class Routed(AbstractRoute):
-    """A thread at `place(s)` -> (y, z) [m], any smooth function of s in [0, 1]."""
+    """A thread at its `place`, any smooth function from s in [0, 1] to (y, z) [m]."""
 
     place: Callable[[Array], Array]
     start: float = eqx.field(static=True, default=0.0)
