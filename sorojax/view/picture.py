@@ -26,7 +26,7 @@ _KINDS = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp")
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One drawing in a picture: its axes, and the lens if it is solid."""
+    """One drawing in a picture: its `axes`, and the `lens` if it is solid."""
 
     axes: "Axes"
     lens: Lens | None = None

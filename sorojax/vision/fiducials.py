@@ -15,7 +15,8 @@ from sorojax.vision.camera import Camera, Pose, marker_words, opencv
 
 
 class Fiducials(NamedTuple):
-    """Identity and corners [px] of markers, from the marker's own top left, clockwise."""
+    """Identity (`ids`) and `corners` [px] of markers, from the marker's own top left,
+    clockwise."""
 
     ids: Int[np.ndarray, " n"]
     corners: Float[np.ndarray, "n 4 2"]

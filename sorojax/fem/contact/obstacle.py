@@ -35,9 +35,14 @@ if TYPE_CHECKING:
 
 
 class Start(NamedTuple):
-    """Where a step of a contact begins: place of the obstacle, how far before its surface
-    pressure starts, how far points of a facet may move until one feels it [m], and the size
-    of the step [s], zero before a motion."""
+    """Where a step of a contact begins.
+
+    Attributes:
+        place: Of the obstacle [m].
+        shift: How far before its surface pressure starts [m].
+        clear: How far points of a facet may move until one feels it [m].
+        step: Size of the step, zero before a motion [s].
+    """
 
     place: Float[Array, " dim"]
     shift: Float[Array, "facets quad"]

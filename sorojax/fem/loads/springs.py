@@ -158,7 +158,7 @@ def _check_sizes(where: str, stiffness, shape: tuple[int, ...]) -> None:
 
 
 class Route(eqx.Module):
-    """Points of a body: nodes of the cells that hold them and the weights of these nodes."""
+    """Points of a body: `nodes` of the cells that hold them and the `weights` of these [-]."""
 
     nodes: Int[Array, "points cell_nodes"] = eqx.field(converter=integers)
     weights: Float[Array, "points cell_nodes"] = eqx.field(converter=real)

@@ -312,7 +312,9 @@ class _Threads(AbstractForce):
 class ThreadChambers(AbstractChamber):
     """Thin fluidic chambers of constant section along threads, from `thread_chambers`.
 
-    The pressure pushes with p A along the thread, by the change of its volume.
+    The pressure pushes with p A along the thread, by the change of its volume. `areas` [m^2]
+    are the sections A, one for each of `threads`. Where `is_single` there is one, and pressure
+    and volume are numbers.
     """
 
     threads: tuple[Thread, ...]

@@ -46,8 +46,8 @@ _ON_SURFACE = 16  # of rounding: points that near to the surface are on it
 class Outlines(AbstractPlaneShape):
     """Region between closed outlines: one within another is a hole, by the even-odd rule.
 
-    Outline k takes the rows of `vertices` [m] from `starts[k]` to the next; outlines may
-    not touch. A gradient costs one edge, however many there are.
+    Outline k takes the rows of `vertices` [m] from entry k of `starts` to the next; outlines
+    may not touch. A gradient costs one edge, however many there are.
     """
 
     vertices: Float[Array, "corners 2"] = eqx.field(converter=real)
