@@ -105,7 +105,7 @@ def _check_plane(where: str, profile: AbstractSdf) -> None:
 
 
 class Mirrored(AbstractWrapped):
-    """`shape` together with its image behind the plane through `point` [m] with that `normal`."""
+    """`shape` together with its image behind the plane through `point` [m] with `normal`."""
 
     shape: AbstractSdf
     normal: Float[Array, " dim"] = eqx.field(converter=real)
