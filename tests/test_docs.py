@@ -6,7 +6,9 @@ import importlib.util
 import json
 import re
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -96,9 +98,10 @@ def test_every_public_name_has_its_entry():
 
 
 def test_every_public_name_is_described():
-    """All have a docstring, verbs with every argument and what comes back."""
+    """All have a docstring, nouns with every field, verbs with every argument and what comes
+    back."""
     names = tool("public_names")
-    lacks = {x.path: names.undescribed(x) for x in names.everything()}
+    lacks = {x.path: names.undescribed(x) for x in names.listed()}
     assert {path: missing for path, missing in lacks.items() if missing} == {}
 
 
@@ -115,6 +118,34 @@ def test_what_a_docstring_lacks_is_found():
     assert found == ["ends", "Returns"]
     spring.__doc__ = ""
     assert names.undescribed(names.Public("a.spring", "a", spring)) == ["docstring"]
+
+
+def test_fields_that_no_docstring_tells_are_found():
+    """A word of the text is not enough, and a private field needs none."""
+
+    @dataclass
+    class Spring:
+        """Spring of `stiffness` [N/m] and some colour, `slack=True` if it never pushes.
+
+        Attributes:
+            start, end: Where it is [m].
+        """
+
+        stiffness: float
+        colour: str
+        slack: bool
+        start: float
+        end: float
+        _found: float
+
+    class Drop(NamedTuple):
+        """Volume [m^3]."""
+
+        volume: float
+
+    names = tool("public_names")
+    assert names.undescribed(names.Public("a.Spring", "a", Spring)) == ["colour"]
+    assert names.undescribed(names.Public("a.Drop", "a", Drop)) == ["volume"]
 
 
 def test_no_page_takes_anything_from_another_host():

@@ -7,7 +7,7 @@ import re
 import types
 import typing
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, cached_property
 from typing import Any
 
@@ -99,6 +99,11 @@ def reached(package: str) -> list[Public]:
     return sorted(mine, key=lambda x: x.name.lower())
 
 
+def listed() -> list[Public]:
+    """All that the reference tells of."""
+    return everything() + [name for package in PACKAGES for name in reached(package)]
+
+
 def page_of(path: str) -> str:
     """The package that tells of a name: the nearest above it."""
     above = [package for package in PACKAGES if path.startswith(f"{package}.")]
@@ -131,30 +136,47 @@ def signature_of(name: Public) -> inspect.Signature | None:
 
 
 def undescribed(name: Public) -> list[str]:
-    """What a docstring lacks: all of it, or of a verb arguments by name, or what comes back."""
+    """What a docstring lacks: all of it, of a noun fields by name, of a verb arguments or what
+    comes back."""
     if name.kind == "data":
         return []
     if not name.text:
         return ["docstring"]
     if name.kind == "class":
-        return []
+        told = told_of(name.value)
+        return [field for field in fields_of(name.value) if field not in told]
     signature, told = inspect.signature(name.plain), described(name.text)
     lacks = [parameter for parameter in signature.parameters if parameter not in told]
     gives = signature.return_annotation is not None
     return [*lacks, *["Returns"] * (gives and "\nReturns:" not in name.text)]
 
 
+def fields_of(kind: type) -> list[str]:
+    """Public fields of a noun, a data class or a named tuple."""
+    data = [field.name for field in fields(kind)] if is_dataclass(kind) else ()
+    return [name for name in data or getattr(kind, "_fields", ()) if name[0] != "_"]
+
+
+def told_of(kind: type) -> set[str]:
+    """Names that the docstrings of a class and of its bases in the project describe under
+    `Attributes`, or have in backticks: `radius`, `closed=True`."""
+    bases = [base for base in kind.__mro__[1:] if base.__module__.startswith("sorojax")]
+    texts = [inspect.cleandoc(each.__doc__ or "") for each in (kind, *bases)]
+    spans = [span for text in texts for span in re.findall(r"`+([^`]+)`+", text)]
+    return {span.partition("=")[0] for span in spans}.union(*map(described, texts))
+
+
 def described(text: str) -> set[str]:
-    """Arguments that a docstring describes; "lower, upper: ..." are two."""
-    part = re.search(r"^Args:\n((?:    .*\n?|\n)+)", text, re.M)
+    """Arguments or fields that a docstring describes; "lower, upper: ..." are two."""
+    part = re.search(r"^(?:Args|Attributes):\n((?:    .*\n?|\n)+)", text, re.M)
     heads = re.findall(r"^    ([*\w]+(?:, [*\w]+)*):", part[1] if part else "", re.M)
     return {name.strip(" *") for head in heads for name in head.split(",")}
 
 
 def main() -> None:
-    """Say how many public names have a docstring, and what those of verbs lack."""
+    """Say how many public names there are, and what their docstrings lack."""
     names = everything()
-    missing = {name.path: lacks for name in names if (lacks := undescribed(name))}
+    missing = {name.path: lacks for name in listed() if (lacks := undescribed(name))}
     verbs = sum(name.kind == "function" for name in names)
     print(f"{len(names)} public names, {verbs} of them verbs; {len(missing)} lack something")
     for path, lacks in missing.items():

@@ -15,11 +15,10 @@ import data_pages
 import reference
 import signatures
 from docstrings import as_rst
-from public_names import PACKAGES, Public, everything, reached
+from public_names import listed
 
-_NAMES: list[Public] = [*everything(), *(x for p in PACKAGES for x in reached(p))]
-PATHS = {name.path: name for name in _NAMES}
-CLASSES = {name.value: name.path for name in reversed(_NAMES) if name.kind == "class"}
+PATHS = {name.path: name for name in listed()}
+CLASSES = {name.value: name.path for name in reversed(listed()) if name.kind == "class"}
 _BACKTICKED = re.compile(r"(?:sj\.|sorojax\.)?((?:[A-Za-z]\w*\.)*[A-Za-z]\w*)(?:\(.*\))?", re.S)
 
 

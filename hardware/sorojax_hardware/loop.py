@@ -13,24 +13,39 @@ from sorojax_hardware.recorder import Recorder
 
 
 class Tick(NamedTuple):
-    """One period of the loop."""
+    """One period of the loop.
 
-    time: float  # s since the loop started
-    pressure: np.ndarray  # Pa, measured
-    setpoint: np.ndarray  # Pa, written
-    state: Any  # of the controller, after this tick
-    late: float  # s between the planned and the real start
+    Attributes:
+        time: Since the loop started [s].
+        pressure: Measured, one per port [Pa].
+        setpoint: Written, one per port [Pa].
+        state: Of the controller, after this tick.
+        late: From the planned to the real start [s].
+    """
+
+    time: float
+    pressure: np.ndarray
+    setpoint: np.ndarray
+    state: Any
+    late: float
 
 
 class Deadlines(NamedTuple):
-    """How well a loop kept its period."""
+    """How well a loop kept its period.
+
+    Attributes:
+        num_ticks: Ticks that ran.
+        num_skipped: Planned ones that were left out after an overrun.
+        num_behind: Ticks that began more than a period late.
+        median_late, p99_late, max_late: Median, 99th percentile and maximum of delays [s].
+    """
 
     num_ticks: int
-    num_skipped: int  # planned ticks left out after an overrun
-    num_behind: int  # ticks that began more than a period late
-    median_late: float  # s
-    p99_late: float  # s
-    max_late: float  # s
+    num_skipped: int
+    num_behind: int
+    median_late: float
+    p99_late: float
+    max_late: float
 
 
 class Overrun(RuntimeError):

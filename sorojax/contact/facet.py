@@ -107,8 +107,9 @@ def _ramp(x, width: float):
 
 
 class Contacts(NamedTuple):
-    """State of contact points: gap [m], pressure [Pa], outward normal of the obstacle, force
-    of the obstacle on each point [N] and the part of it that is friction."""
+    """State of contact points: `position` [m], `gap` [m], `pressure` [Pa], outward `normal` of
+    the obstacle, `force` of the obstacle on each point [N] and the part of it that is
+    `friction` [N]."""
 
     position: Float[Array, "points dim"]
     gap: Float[Array, " points"]

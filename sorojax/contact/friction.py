@@ -49,9 +49,11 @@ def friction_law(given: AbstractFriction | Numbers | None) -> AbstractFriction |
 class Grip(NamedTuple):
     """State of friction at each point, in the frame of the obstacle.
 
-    Where the spring has no force [m], the pressure [Pa] and the normal that friction is
-    taken at, the stiffness of the dashpot over a step [Pa/m], and where the point was when
-    the step began [m], where the dashpot has no force.
+    Attributes:
+        anchor: Where the spring has no force [m].
+        pressure, normal: Those that friction is taken at, the first in Pa.
+        drag: Stiffness of the dashpot over a step [Pa/m].
+        back: Where the point was when the step began, and the dashpot has no force [m].
     """
 
     anchor: Float[Array, "*points dim"]

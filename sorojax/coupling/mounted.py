@@ -44,10 +44,14 @@ if TYPE_CHECKING:
 class MountedRod(AbstractLoad):
     """A rod on a patch of a solid: `mounted_rod(mesh, rod, nodes, ...)`.
 
-    `value` [N] is a dead force at its tip, in the axes of the mesh; `simulate` takes its values
-    in time by the name of the rod. `places` are the nodes whose displacements hold the
-    coordinates of the rod, curvatures times the square of its length, others times the length
-    [m].
+    `rod` is glued with its base to `nodes`. `pose` is that of its base in the reference
+    configuration, a homogeneous matrix with the position in m, and `gravity` [m/s^2] gives the
+    rod its weight, None for none. `value` [N] is a dead force at its tip, in the axes of the
+    mesh; `simulate` takes its values in time by the name of the rod. `places` are the nodes
+    whose displacements hold the coordinates of the rod, curvatures times the square of its
+    length, others times the length [m]. `axes` span the plane of the patch, None on a plane
+    mesh, and `motion` is what its masses remember in a step; `mounted_rod` and `simulate` set
+    these.
     """
 
     directed: ClassVar[bool] = True
@@ -56,11 +60,11 @@ class MountedRod(AbstractLoad):
     places: Int[Array, " places"] = eqx.field(converter=integers)
     rod: Rod
     pose: Float[Array, "h h"] = eqx.field(converter=real)
-    axes: Float[Array, "dim 2"] | None  # of the patch, found
+    axes: Float[Array, "dim 2"] | None
     value: Float[Array, " dim"] = eqx.field(converter=real)
     name: str = eqx.field(static=True, default="rod")
     gravity: Float[Array, " dim"] | None = eqx.field(converter=optional_real, default=None)
-    motion: MassMotion | None = None  # in a step
+    motion: MassMotion | None = None
 
     def coordinates(self, problem: "Problem", u: Float[Array, "nodes dim"]) -> Array:
         """Coordinates of the rod at displacement `u` [m]."""

@@ -31,7 +31,7 @@ _FAR = 4.0  # nodes of the grid: how far the surface may move to keep the volume
 
 
 class Mirror(eqx.Module):
-    """The body goes on as its image behind the plane x[axis] = `at` [m]."""
+    """The body goes on as its image behind the plane x[`axis`] = `at` [m]; axis 0 is x."""
 
     axis: int = eqx.field(static=True)
     at: float = eqx.field(static=True)
@@ -51,7 +51,7 @@ class Mirror(eqx.Module):
 
 
 class Repeat(eqx.Module):
-    """The body `count` times in a row along an axis, each copy beside the last."""
+    """The body `count` times in a row along `axis` (0 is x), each copy beside the last."""
 
     axis: int = eqx.field(static=True)
     count: int = eqx.field(static=True)

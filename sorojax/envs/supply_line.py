@@ -31,7 +31,7 @@ class SupplyLine(eqx.Module):
 
 
 class Supplied(NamedTuple):
-    """What arrives now, and the commands on their way, the newest first."""
+    """`value`, what arrives now, and the `commands` on their way, the newest first."""
 
     value: Float[Array, " actions"]
     commands: Float[Array, "late actions"]

@@ -40,6 +40,15 @@ class Problem(eqx.Module):
     """A hyperelastic body, how it is held and what loads it.
 
     Every number in it can carry a gradient; print it to see what is paid for.
+
+    Attributes:
+        mesh: The body at rest.
+        material: Its stored energy and density, with one number or one per cell.
+        kinematics: Plane strain, plane stress, axisymmetric or solid.
+        supports: Displacements that are known.
+        loads: What acts on the body, each with a potential.
+        formulation: How the pressure varies inside a cell.
+        space: Unknowns of the mesh and pattern of the tangent, from mesh and loads.
     """
 
     mesh: Mesh

@@ -293,8 +293,8 @@ _SURE = 0.02  # smallest singular value of a fit over the largest
 
 
 class Patches(NamedTuple):
-    """For every node the samples of the cells around it, as cell times samples per cell
-    plus sample, and the weights that add up to the value there; padded by zero weights."""
+    """For every node the `samples` of the cells around it, as cell times samples per cell plus
+    sample, and the `weights` that add up to the value there; padded by zero weights."""
 
     samples: Int[Array, "nodes patch"]
     weights: Float[Array, "nodes patch"]

@@ -26,8 +26,8 @@ class AbstractSupport(eqx.Module):
 
 
 class Fixed(AbstractSupport):
-    """Nodes that do not move; `components=(0,)` lets them slide in the plane x = const,
-    the condition of symmetry."""
+    """`nodes` that do not move; `components=(0,)` lets them slide in the plane x = const, the
+    condition of symmetry."""
 
     nodes: Int[Array, " nodes"] = eqx.field(converter=integers)
     components: tuple[int, ...] | None = eqx.field(static=True, default=None)
@@ -39,8 +39,8 @@ class Fixed(AbstractSupport):
 
 
 class Prescribed(AbstractSupport):
-    """Nodes moved by `displacement` [m], one vector for all or one per node, with one entry
-    per known component."""
+    """`nodes` moved by `displacement` [m], one vector for all or one per node, with one entry
+    for each of the known `components` (0 is x), all of them if omitted."""
 
     nodes: Int[Array, " nodes"] = eqx.field(converter=integers)
     displacement: Float[Array, "..."] = eqx.field(converter=real)
@@ -50,10 +50,11 @@ class Prescribed(AbstractSupport):
 
 
 class Rotated(AbstractSupport):
-    """Nodes turned by `angle` [rad] about the point `about` [m], along arcs: all their
-    displacements are those of `rotated(points, angle, about, axis)`.
+    """`nodes` turned by `angle` [rad] about the point `about` [m], in space about the direction
+    `axis`, along arcs.
 
-    `points` [m] are those of the nodes in the reference configuration, `mesh.points[nodes]`.
+    All their displacements are those of `rotated(points, angle, about, axis)`; `points` [m] are
+    where they are in the reference configuration, `mesh.points[nodes]`.
     """
 
     nodes: Int[Array, " nodes"] = eqx.field(converter=integers)
@@ -71,9 +72,9 @@ class Rotated(AbstractSupport):
 
 
 class Carried(AbstractSupport):
-    """Nodes that a rigid frame carries along: a link of a mechanism that they are fixed to.
+    """`nodes` that a rigid frame carries along: a link of a mechanism that they are fixed to.
 
-    `points` [m] are those of the nodes in the reference configuration, `mesh.points[nodes]`,
+    `points` [m] are where they are in the reference configuration, `mesh.points[nodes]`,
     `rest` the pose of the frame there, a homogeneous matrix, by default the identity; `motion`
     is its pose minus that, a matrix too, without its last row, so that zero is rest.
     """

@@ -218,17 +218,17 @@ FEWEST = {NeoHookean: 1, MooneyRivlin: 2, Yeoh: 3, Gent: 2}  # numbers per model
 @displayed
 @dataclass(frozen=True)
 class TensileFit:
-    """A fitted material with the range that it is good for.
+    """A fitted `material` with the range that it is good for.
 
-    `rms` is the root-mean-square error of engineering stress [Pa], `relative_rms` its
-    ratio to the root-mean-square stress, `strain_range` the fitted strains, `spread` the
-    scatter between repeats where all have data (root-mean-square standard deviation over
-    root-mean-square mean, NaN for one repeat), and `stable_stretch` the uniaxial stretch
-    at which the fitted stiffness turns negative (infinite if it never does below a
-    stretch of 20). `stability` has Drucker's criterion in three tests. `covariance` is that of
-    the fitted constants, in the order of the material's arguments, moduli in Pa: s^2 (J'J)^-1
-    of least squares, with s^2 the square error per degree of freedom, as if no constant were
-    at a bound; NaN where the points do not tell it.
+    `rms` is the root-mean-square error of engineering stress [Pa], `relative_rms` its ratio to
+    the root-mean-square stress, `strain_range` the fitted strains, `spread` the scatter between
+    `num_repeats` repeats where all have data (root-mean-square standard deviation over
+    root-mean-square mean, NaN for one repeat), and `stable_stretch` the uniaxial stretch at
+    which the fitted stiffness turns negative (infinite if it never does below a stretch of 20).
+    `stability` has Drucker's criterion in three tests. `covariance` is that of the fitted
+    constants, in the order of the material's arguments, moduli in Pa: s^2 (J'J)^-1 of least
+    squares, with s^2 the square error per degree of freedom, as if no constant were at a bound;
+    NaN where the points do not tell it.
     """
 
     material: Any

@@ -173,7 +173,8 @@ _BASES = np.array([[[0, 1], [-2, 1]], [[1, 0], [1, -2]], [[1, -1], [1, 1]]]) / n
 
 @dataclass(frozen=True)
 class Stability:
-    """Smallest and largest stretch [-] between which a material is stable, by test.
+    """Smallest and largest stretch [-] between which a material is stable, in `uniaxial`,
+    `equibiaxial` and `pure_shear` tests.
 
     A bound equal to `limit` (or its reciprocal) is where the search ended.
     """

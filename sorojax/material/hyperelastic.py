@@ -20,8 +20,9 @@ from sorojax.material.kinematics import Entry, Tensor, determinant, from_matrix
 class AbstractHyperelastic(eqx.Module):
     """A stored energy per reference volume, isochoric plus volumetric.
 
-    The hooks are elementwise code on the entries of F, so one call serves any number
-    of points. A leaf may also hold one number per cell of a mesh.
+    The hooks are elementwise code on the entries of F, so one call serves any number of points.
+    `density` [kg/m^3] is for weight and inertia, None without. A leaf may also hold one number
+    per cell of a mesh.
     """
 
     if TYPE_CHECKING:  # fields that subclasses have, in their own order
@@ -195,7 +196,8 @@ class Quadratic(AbstractVolumetricLaw):
 
 
 class AbstractRubber(AbstractHyperelastic):
-    """An energy whose volumetric part is K U(J), with `volumetric` for U."""
+    """An energy whose volumetric part is K U(J), with `bulk_modulus` for K [Pa] and
+    `volumetric` for U."""
 
     if TYPE_CHECKING:  # fields that subclasses have, in their own order
         bulk_modulus: ClassVar[Float[Array, "..."]]

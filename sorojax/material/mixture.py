@@ -58,6 +58,7 @@ def _(material: Scaled):
 class Mixed(AbstractHyperelastic):
     """sum_i weight_i Psi_i: shares of a composite, or 1 and 0 for cells of a region.
 
+    `weights` are the shares [-] of the `materials`, each a number or one per cell of the mesh.
     Every energy is evaluated everywhere, so two materials cost twice as much as one.
     """
 

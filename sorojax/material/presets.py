@@ -54,8 +54,9 @@ DRAGON_SKIN_10_POINTS = (
 
 
 class Relaxation(NamedTuple):
-    """A spectrum fitted by `fit_spectrum`: shares [-] and times [s] of its branches, the
-    frequencies that were measured [Hz], and the relative error of the damping ratios."""
+    """A spectrum fitted by `fit_spectrum`: `shares` [-] and `times` [s] of its branches, the
+    `frequency_range` that was measured [Hz], `relative_rms`, the error of the damping ratios
+    [-], and the `source` of the measurement."""
 
     shares: tuple[float, ...]
     times: tuple[float, ...]
@@ -70,10 +71,11 @@ DRAGON_SKIN_10_RELAXATION = Relaxation((0.2407,), (0.02405,), (4.29, 7.74), 0.02
 
 @dataclass(frozen=True)
 class Preset:
-    """Numbers of a rubber and what is known about them.
+    """Numbers of a rubber called `name` and what is known about them.
 
     `coefficients` are those of `model` in the order of its fields [Pa] (for `Ogden` the
-    moduli, then the exponents), `bulk_modulus` [Pa] is given where the source has one.
+    moduli, then the exponents), `bulk_modulus` [Pa] is given where the source has one,
+    and `density` is in kg/m^3; `source` says where the numbers are from.
     `strain_range` and `relative_rms` are those of `fit_tensile`; `specimens` went into
     the mean curve, as its resolution shows, and `spread` is the largest deviation of one
     from the mean where it broke. `friction` is the coefficient of Coulomb's law, `relaxation`

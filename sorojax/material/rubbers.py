@@ -47,7 +47,8 @@ GENT_LIMIT = 0.99  # share of the locking strain measure where the continuation 
 
 
 class NeoHookean(AbstractRubber):
-    """Psi = mu/2 (I1_bar - 3) + K U(J); moduli in Pa, density in kg/m^3."""
+    """Psi = mu/2 (I1_bar - 3) + K U(J); `shear_modulus` mu and `bulk_modulus` K in Pa,
+    `density` in kg/m^3."""
 
     shear_modulus: Float[Array, "..."] = eqx.field(converter=real)
     bulk_modulus: Float[Array, "..."] = eqx.field(converter=real)
@@ -65,9 +66,10 @@ class NeoHookean(AbstractRubber):
 
 
 class MooneyRivlin(AbstractRubber):
-    """Psi = c10 (I1_bar - 3) + c01 (I2_bar - 3) + K U(J); coefficients in Pa.
+    """Psi = c10 (I1_bar - 3) + c01 (I2_bar - 3) + K U(J).
 
-    The small-strain shear modulus is 2 (c10 + c01). A negative c01 is unstable in
+    `c10`, `c01` and `bulk_modulus` K are in Pa, `density` in kg/m^3. The small-strain shear
+    modulus is 2 (c10 + c01). A negative c01 is unstable in
     equibiaxial tension: see `drucker_stability`.
 
     Reference: Rivlin & Saunders, Phil. Trans. R. Soc. A 243, 1951.
@@ -91,9 +93,10 @@ class MooneyRivlin(AbstractRubber):
 
 
 class Yeoh(AbstractRubber):
-    """Psi = sum_i c_i (I1_bar - 3)^i + K U(J); coefficients in Pa.
+    """Psi = sum_i c_i (I1_bar - 3)^i + K U(J).
 
-    The small-strain shear modulus is 2 c1.
+    `c1`, `c2`, `c3` and `bulk_modulus` K are in Pa, `density` in kg/m^3. The small-strain shear
+    modulus is 2 c1.
 
     Reference: Yeoh, Rubber Chem. Technol. 66, 1993.
     """
@@ -120,9 +123,9 @@ class Gent(AbstractRubber):
     """Psi = -mu Jm/2 ln(1 - (I1_bar - 3)/Jm) + K U(J): chains lock at I1_bar - 3 = Jm.
 
     Beyond 99 % of `locking` (Jm [-]) the logarithm continues as its second-order Taylor
-    polynomial, so that the energy is finite and twice continuously differentiable
-    everywhere and a solver can come back; results there are not Gent's.
-    `locking_stretch` gives the limit.
+    polynomial, so that the energy is finite and twice continuously differentiable everywhere
+    and a solver can come back; results there are not Gent's. `locking_stretch` gives the limit.
+    `shear_modulus` mu and `bulk_modulus` K are in Pa, `density` is in kg/m^3.
 
     Reference: Gent, Rubber Chem. Technol. 69, 1996.
     """
@@ -268,10 +271,10 @@ Numbers = tuple[Float[Array, "..."], ...]
 class Ogden(AbstractRubber):
     """Psi = sum_p mu_p/alpha_p (l1^alpha_p + l2^alpha_p + l3^alpha_p - 3) + K U(J).
 
-    The stretches are isochoric, `moduli` mu_p in Pa, `exponents` alpha_p without unit,
-    both tuples with one entry per term. The small-strain shear modulus is
-    sum_p mu_p alpha_p / 2; terms with mu_p alpha_p > 0 are stable at every stretch. Exact to
-    third derivatives where stretches coincide.
+    The stretches are isochoric, `moduli` mu_p in Pa, `exponents` alpha_p without unit, both
+    tuples with one entry per term. The small-strain shear modulus is sum_p mu_p alpha_p / 2,
+    `bulk_modulus` K is in Pa, `density` in kg/m^3. Terms with mu_p alpha_p > 0 are stable at
+    every stretch. Exact to third derivatives where stretches coincide.
 
     Reference: Ogden, Proc. R. Soc. Lond. A 326, 1972.
     """

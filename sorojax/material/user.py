@@ -37,11 +37,11 @@ Parameters = tuple[Float[Array, "..."], ...]
 class UserEnergy(AbstractHyperelastic):
     """Psi = function(F, *parameters) + K U(J) of a function of the deformation gradient.
 
-    `function` takes the nine entries of F as three rows of three, `F[i][j]`, works
-    elementwise with `jnp`, and returns J/m^3; entries of a planar state may be the
-    numbers 0.0 and 1.0. What it writes in terms of J alone is better left to
-    `bulk_modulus` [Pa], because formulations for nearly incompressible solids treat that
-    part apart; without one there is no second part. `parameters` are the numbers to
+    `function` takes the nine entries of F as three rows of three, `F[i][j]`, works elementwise
+    with `jnp`, and returns J/m^3; entries of a planar state may be the numbers 0.0 and 1.0.
+    What it writes in terms of J alone is better left to `bulk_modulus` [Pa], because
+    formulations for nearly incompressible solids treat that part apart; without one there is no
+    second part. `volumetric` is U, `density` in kg/m^3. `parameters` are the numbers to
     differentiate by and may hold one number per cell; other numbers are constants of the
     function. Define the function once: every new lambda compiles anew.
     """
@@ -75,7 +75,8 @@ class InvariantEnergy(AbstractRubber):
     """Psi = function(I1_bar, I2_bar, *parameters) + K U(J); see `UserEnergy`.
 
     Both invariants are 3 at rest; for a stable rest state the sum of the slopes of
-    `function` there, half the shear modulus, must be positive.
+    `function` there, half the shear modulus, must be positive. `parameters` are the numbers to
+    differentiate by, `bulk_modulus` is K [Pa], `volumetric` is U, `density` is in kg/m^3.
     """
 
     function: Callable[..., Entry] = eqx.field(static=True)
@@ -119,12 +120,13 @@ def _check_energy(where: str, parameters: Any, at_rest: Callable[[], Entry]) -> 
 
 
 class StVenantKirchhoff(AbstractHyperelastic):
-    """Psi = lambda/2 tr(E)^2 + mu E:E of the Green-Lagrange strain; moduli in Pa.
+    """Psi = lambda/2 tr(E)^2 + mu E:E of the Green-Lagrange strain.
 
     Linear elasticity for large rotations. The trace of E is no function of J, so all of
     the energy is in the first hook and formulations that treat J apart do not relieve
     it: keep nu below 0.45. It loses stiffness in compression, to zero at a uniaxial
-    stretch of 0.58; use it for small strains.
+    stretch of 0.58; use it for small strains. `shear_modulus` is mu and `bulk_modulus`
+    lambda + 2/3 mu, both in Pa; `density` is in kg/m^3.
     """
 
     shear_modulus: Float[Array, "..."] = eqx.field(converter=real)
@@ -152,9 +154,10 @@ class StVenantKirchhoff(AbstractHyperelastic):
 
 
 class CompressibleNeoHookean(AbstractHyperelastic):
-    """Psi = mu/2 (I1 - 3 - 2 ln J) + lambda/2 (ln J)^2; moduli in Pa.
+    """Psi = mu/2 (I1 - 3 - 2 ln J) + lambda/2 (ln J)^2, `shear_modulus` mu in Pa.
 
-    The form of many finite element codes; `bulk_modulus` is K = lambda + 2/3 mu.
+    The form of many finite element codes; `bulk_modulus` [Pa] is K = lambda + 2/3 mu, `density`
+    is in kg/m^3.
 
     Reference: Bonet & Wood, Nonlinear Continuum Mechanics for Finite Element Analysis,
     2008, section 6.4.3.

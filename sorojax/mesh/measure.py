@@ -145,7 +145,8 @@ def _under(ends) -> Float[Array, " sides"]:
 
 
 class Locations(NamedTuple):
-    """Nodes of the cells that hold the points, the weights of these nodes, and the cells."""
+    """Places in a mesh: `nodes` of the cells that hold the points, the `weights` [-] of these
+    nodes, and the numbers of these `cells`, None where they are not kept."""
 
     nodes: Int[Array, "points cell_nodes"]
     weights: Float[Array, "points cell_nodes"]

@@ -23,10 +23,12 @@ def _int_sets(sets: dict[str, Any]) -> dict[str, jax.Array]:
 class Mesh(eqx.Module):
     """Cells of one element type over points, in the reference configuration.
 
-    `node_sets` holds node numbers, `regions` cell numbers. `facet_sets` holds facets as
-    their node numbers, `(facets, facet_nodes)`, corners first, in the plane with the
-    domain on the left, in space counter-clockwise as seen from outside; then mid-side
-    nodes. Only `points` can carry a gradient: topology is built outside any trace.
+    `cells` holds the numbers of the nodes of each cell in the order of `element`, the type of
+    the cells, and `points` where the nodes are [m]. `node_sets` holds node numbers, `regions`
+    cell numbers. `facet_sets` holds facets as their node numbers, `(facets, facet_nodes)`,
+    corners first, in the plane with the domain on the left, in space counter-clockwise as seen
+    from outside; then mid-side nodes. Only `points` can carry a gradient: topology is built
+    outside any trace.
     """
 
     points: Float[Array, "nodes dim"] = eqx.field(converter=real)

@@ -89,7 +89,7 @@ class Line(AbstractCurve):
 
 
 class Curve(AbstractCurve):
-    """Any smooth curve, by a function from s in [0, 1] to points (n, dim) [m]."""
+    """Any smooth curve, by a `function` from s in [0, 1] to points (n, dim) [m]."""
 
     function: Callable = eqx.field(static=True)
 
@@ -290,9 +290,10 @@ PLANAR = ("kappa_z", "sigma_x", "sigma_y")
 class Backbone(eqx.Module):
     """Snapshots of a curve in the frame of its base: x along the curve at rest.
 
-    `strain` holds kappa_z [1/m], sigma_x and sigma_y [-] at the samples `s` in [0, 1], in
-    space all six strains; `rest` is that of the unloaded curve, None for a straight one.
-    `cells` are those of the mesh that hold the samples, where there is a mesh.
+    `positions` [m] are those of the samples in every snapshot, `length` [m] is that of the
+    curve at rest. `strain` holds kappa_z [1/m], sigma_x and sigma_y [-] at the samples `s` in
+    [0, 1], in space all six strains; `rest` is that of the unloaded curve, None for a straight
+    one. `cells` are those of the mesh that hold the samples, where there is a mesh.
     """
 
     s: Float[Array, " samples"]

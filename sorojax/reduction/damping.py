@@ -36,7 +36,7 @@ from sorojax.rod.model.basis import columns
 
 
 class ConstantDamping(AbstractDamping):
-    """Linear damping by a constant matrix [N m s per coordinate rate]."""
+    """Linear damping by a constant matrix, `coefficients` [N m s per coordinate rate]."""
 
     coefficients: Float[Array, "dof dof"] = eqx.field(converter=real)
 

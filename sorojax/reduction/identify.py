@@ -186,6 +186,7 @@ class PressureMap(AbstractPressureMap):
         force: Coefficients of g, powers 1, 2, ...
         walls: Coefficients of h [J], powers 1, 2, ...
         scale: Largest pressure of the path [Pa].
+        ports: Shape of the pressure: (), one number.
     """
 
     coupling: Float[Array, "dof dof"] = eqx.field(converter=real)

@@ -21,11 +21,11 @@ from sorojax.units import mm
 class BellowsActuator(eqx.Module):
     """Dimensions of the side view [m]; x runs along the actuator from its clamp.
 
-    Bellows of `bellow_width` stand `gap` apart behind a solid clamp block. Each holds one
-    chamber inside walls of `wall_thickness` and a roof; below the chambers lies a base
-    whose lowest `layer_thickness` is the strain-limiting layer. All concave and chamber
-    corners are rounded by `fillet`. The defaults are those of a bending actuator of
-    66 x 15 mm with five bellows.
+    `num_bellows` bellows of `bellow_width` stand `gap` apart behind a solid block, `clamp`
+    long. Each holds one chamber of `chamber_height` inside walls of `wall_thickness` and below
+    a roof, `roof` thick; under the chambers lies a base, `base` thick, whose lowest
+    `layer_thickness` is the strain-limiting layer. All concave and chamber corners are rounded
+    by `fillet`. The defaults are those of a bending actuator of 66 x 15 mm with five bellows.
     """
 
     wall_thickness: Float[Array, ""] = eqx.field(converter=real, default=2 * mm)
@@ -108,6 +108,18 @@ class PneuNet(eqx.Module):
     Narrow slots part the chambers above `notch`; under air neighbouring walls meet, and the
     upper side grows longer than the lower one. A flat strip goes on beyond the last chamber.
     The defaults are 117 x 20 mm with 14 chambers.
+
+    Attributes:
+        pitch: From one chamber to the next.
+        first: Where the middle of the first one is, along x.
+        chamber_width, slot_width: Of a chamber and of a slot, along x.
+        layer: Height of the strain-limiting layer.
+        floor, roof: Where chambers begin and end in height; the strip is as high as the floor.
+        notch: Where slots begin in height.
+        height: Of the whole.
+        end: From the middle of the last chamber to the strip.
+        strip: Length of the strip.
+        num_chambers: How many there are.
     """
 
     pitch: Float[Array, ""] = eqx.field(converter=real, default=7.47 * mm)

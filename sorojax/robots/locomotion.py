@@ -37,6 +37,13 @@ class Crawler(eqx.Module):
     Three groups of chambers stand `group_spacing` apart, each with a port of its own. Under
     air a group gets longer on top but not in its sole, the lowest `sole_thickness`, and
     arches its back. The defaults are 150 x 12 mm with 3 x 11 chambers.
+
+    Attributes:
+        length, height: Of the whole.
+        base: Thickness of the rubber below the chambers, with the sole.
+        chamber_width, chamber_height: Of a chamber.
+        wall_thickness: Between the chambers of a group.
+        num_chambers: Of a group.
     """
 
     length: Float[Array, ""] = eqx.field(converter=real, default=150 * mm)
@@ -300,6 +307,12 @@ class Walker(eqx.Module):
     From each of `num_pairs` apexes, `spacing` apart on the spine, two legs lead down at 45
     degrees to feet `reach` away. Each leg carries a toe at a right angle that points inwards
     and stands on the floor as well. Square weights stand on a corner midway between pairs.
+
+    Attributes:
+        leg_width: Of legs and toes.
+        toe_start: Share of the leg above its toe [-].
+        spine_thickness: Of the spine.
+        weight_diagonal: Of the square weights.
     """
 
     spacing: Float[Array, ""] = eqx.field(converter=real, default=27.5 * mm)

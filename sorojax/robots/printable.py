@@ -44,6 +44,7 @@ class Bellows(eqx.Module):
     """A round bellows standing on z = 0, closed at both ends [m].
 
     `num_folds` folds of `outer_radius` stand `pitch` apart on a tube of `inner_radius`;
+    each is `fold_height` high, and `fillet` is the width over which it blends into the tube;
     the wall is at least `wall_thickness` everywhere, the ends are `cap` thick.
     """
 
@@ -155,7 +156,13 @@ _slim = functools.partial(
 
 @displayed
 class Finger(eqx.Module):
-    """Dimensions [m]; it stands on z = 0 and bends towards its spine at -x."""
+    """Dimensions [m]; it stands on z = 0 and bends towards its spine at -x.
+
+    Attributes:
+        bellows: What bends.
+        tip_radius: Of the ball at its end.
+        spine_width, spine_thickness: Of the bar along its folds, along y and x.
+    """
 
     bellows: Bellows = eqx.field(default_factory=lambda: _slim(num_folds=9))
     tip_radius: Float[Array, ""] = eqx.field(converter=real, default=7.5 * mm)
@@ -205,6 +212,17 @@ class Hand(eqx.Module):
 
     About 190 x 100 x 40 mm: fingers of 90 mm, a thumb of 80 mm. The fingers bend towards
     -z and take -10 to 60 kPa; their ports open on the back of the hand.
+
+    Attributes:
+        finger, thumb: Each of the four fingers, and the thumb.
+        palm_width, palm_length, palm_thickness: Of the palm along x, y and z.
+        palm_fillet: Radius of its edges.
+        socket_depth: How deep the feet of all five lie in the palm.
+        finger_spacing: From one finger to the next.
+        splay: Angle between neighbouring fingers.
+        thumb_angle: Between thumb and y.
+        thumb_height: Where its foot is, along y.
+        port_radius: Of the ports of the chambers.
     """
 
     finger: Finger = eqx.field(
@@ -288,6 +306,14 @@ class Manipulator(eqx.Module):
     Each bellows has a port through the lower plate and takes -10 to 30 kPa. A ring in the
     upper plate feeds the gripper (-30 to 60 kPa) from the hollow core, which also holds
     cables. The gripper closes around objects of 40 mm.
+
+    Attributes:
+        bellows, finger: Each of the three of the arm, and each of the three of its gripper.
+        center_distance, finger_distance: From z to the axes of the bellows and of the fingers.
+        plate_radius, plate_thickness: Of both plates.
+        core_radius: Of the hole along z.
+        port_radius: Of the ports, and of the ring and its inlets.
+        fillet: Radius of the edges of the plates.
     """
 
     bellows: Bellows = eqx.field(
@@ -385,6 +411,13 @@ class PlanarActuator(eqx.Module):
 
     Unequal pressures bend it in the plane of x and z, equal ones stretch it; it takes
     -10 to 50 kPa. Each bellows has a port of its own through the lower plate.
+
+    Attributes:
+        bellows: Each of the two.
+        spacing: Between their axes.
+        plate_thickness: Of the two end plates.
+        port_radius: Of the ports.
+        fillet: Radius of the edges of the plates.
     """
 
     bellows: Bellows = eqx.field(default_factory=Bellows)
@@ -435,6 +468,15 @@ class BendingActuator(eqx.Module):
     One channel through necks between the bellows joins all chambers and opens at the end
     x = 0. Every wall of the air is `wall_thickness` or more. Printed in an 80 Shore A
     elastomer it takes -10 to 100 kPa.
+
+    Attributes:
+        width, height: Along y and z.
+        base: Thickness of the layer below the bellows.
+        pitch: From one bellows to the next.
+        gap: Between the outsides of two.
+        channel_radius: Of the channel.
+        fillet: Radius of the outer edges.
+        num_bellows: How many there are.
     """
 
     width: Float[Array, ""] = eqx.field(converter=real, default=20 * mm)

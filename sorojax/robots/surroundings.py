@@ -260,7 +260,7 @@ def middle(
 
 
 class InContact(NamedTuple):
-    """A robot of `contact_stepper` at one moment."""
+    """A robot of `contact_stepper` at one moment: the state of its `network`."""
 
     network: PartitionedState
 
@@ -274,7 +274,7 @@ class InContact(NamedTuple):
 
 
 class Replay(NamedTuple):
-    """Coordinates, rates and poses by part along a motion."""
+    """Coordinates `q`, rates `v` and `poses` by part along a motion."""
 
     q: Float[Array, "moments coordinates"]
     v: Float[Array, "moments dof"]

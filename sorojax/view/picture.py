@@ -26,7 +26,7 @@ _KINDS = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".webp")
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One drawing in a picture: its axes, and the lens if it is solid."""
+    """One drawing in a picture: its `axes`, and the `lens` if it is solid."""
 
     axes: "Axes"
     lens: Lens | None = None
@@ -34,7 +34,8 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A figure of matplotlib with what is needed to write it and to find points in it."""
+    """A `figure` of matplotlib with what is needed to write it and to find points in it:
+    `panels` has one for each drawing."""
 
     figure: "Figure"
     panels: tuple[Panel, ...] = field(default=(), repr=False)

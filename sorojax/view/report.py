@@ -18,7 +18,8 @@ Drawn = Union["Figure", Picture, Film, bytes]
 
 @dataclass(frozen=True)
 class Number:
-    """A row of a table: what was found, what was asked for, whether it holds."""
+    """A row of a table: `name` and `value` of what was found with its `unit`, what was asked
+    for (`bar`, as text), and whether it `holds`, None where nothing was asked."""
 
     name: str
     value: float | int | str
@@ -29,7 +30,8 @@ class Number:
 
 @dataclass(frozen=True)
 class Section:
-    """A heading with text, pictures and a table; paragraphs are split at empty lines."""
+    """A `heading` with `text`, whose paragraphs are split at empty lines, then `pictures` as
+    (caption, picture), and `numbers` as the rows of a table."""
 
     heading: str
     text: str = ""

@@ -19,9 +19,14 @@ _NONE = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Camera(NamedTuple):
-    """Intrinsics: focal lengths and principal point [px], distortion, image size [px].
+    """Intrinsics of a camera and the size of its images.
 
-    `rms` is the error of the calibration that found them [px].
+    Attributes:
+        fx, fy: Focal lengths [px].
+        cx, cy: Principal point [px].
+        distortion: Coefficients k1, k2, p1, p2, k3 of OpenCV's model [-].
+        width, height: Of the image [px].
+        rms: Error of the calibration that found them [px].
     """
 
     fx: float
@@ -39,7 +44,7 @@ class Camera(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """Maps points of its own frame to another one: rotation @ x + translation [m]."""
+    """Maps points of its own frame to another one: `rotation` @ x + `translation` [m]."""
 
     rotation: Float[np.ndarray, "3 3"]
     translation: Float[np.ndarray, " 3"]

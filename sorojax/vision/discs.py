@@ -12,7 +12,8 @@ Image = UInt8[np.ndarray, "height width 3"]
 
 
 class Colour(NamedTuple):
-    """A window of hue [degrees, 0 to 360] with least saturation and value [0 to 1]."""
+    """A window of hue, `width` wide about `hue` [degrees, 0 to 360], with the least
+    `saturation` and `value` [0 to 1]."""
 
     hue: float
     width: float = 24.0
@@ -67,7 +68,8 @@ _MARGIN = 3.5  # px around a disc that its blur reaches
 
 
 class Discs(NamedTuple):
-    """Discs that were found: centre and radius [px], and the index of their colour."""
+    """Discs that were found: `centre` and `radius` [px], and `colour`, its number among those
+    asked for."""
 
     centre: Float[np.ndarray, "n 2"]
     radius: Float[np.ndarray, " n"]

@@ -15,7 +15,8 @@ from sorojax.vision.camera import Camera, Pose, marker_words, opencv
 
 
 class Fiducials(NamedTuple):
-    """Identity and corners [px] of markers, from the marker's own top left, clockwise."""
+    """Identity (`ids`) and `corners` [px] of markers, from the marker's own top left,
+    clockwise."""
 
     ids: Int[np.ndarray, " n"]
     corners: Float[np.ndarray, "n 4 2"]
@@ -164,7 +165,13 @@ _LEAST_CORNERS, _LEAST_VIEWS = 6, 5
 
 
 class CharucoBoard(NamedTuple):
-    """A chess board with ArUco markers on its white squares; sizes in m."""
+    """A chess board with ArUco markers on its white squares.
+
+    Attributes:
+        columns, rows: Squares across and down.
+        square, marker: Sides of a square and of a marker [m].
+        dictionary: Name of the ArUco dictionary, without `DICT_`.
+    """
 
     columns: int = 8
     rows: int = 6

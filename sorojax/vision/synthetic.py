@@ -14,7 +14,7 @@ PAINTS = ((40.0, 40.0, 210.0), (45.0, 190.0, 50.0), (205.0, 70.0, 40.0))
 
 
 class Disturbance(NamedTuple):
-    """Errors of lens and sensor: blur [px] and noise [grey levels], standard deviations."""
+    """Errors of lens and sensor, standard deviations: `blur` [px] and `noise` [grey levels]."""
 
     blur: float = 0.8
     noise: float = 4.0

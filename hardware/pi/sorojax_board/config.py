@@ -15,16 +15,27 @@ from sorojax_board.messages import MAX_PORTS, Limits
 
 
 class Settings(NamedTuple):
-    """What the board enforces; times in s, pressures in Pa, gauge."""
+    """What the board enforces; pressures are gauge.
+
+    Attributes:
+        limits: Of each port.
+        watchdog: Time without a set-point after which it vents [s].
+        ramp: Time in which it then takes set-points to zero [s].
+        rate: Set-points that it follows in a second [1/s].
+        over_pressure: How far a measurement may lie beyond the limits of its port [Pa].
+        tracking: How far it may lie from the set-point [Pa] for longer than `patience`.
+        patience: See `tracking` [s].
+        plausible: Lowest and highest pressure that a working sensor can read [Pa].
+    """
 
     limits: tuple[Limits, ...]
     watchdog: float = 0.1
     ramp: float = 0.45
-    rate: float = 1000.0  # set-points a second
-    over_pressure: float = 10e3  # beyond the limits of a port
-    tracking: float = 30e3  # between set-point and measurement
-    patience: float = 1.0  # how long that may last
-    plausible: tuple[float, float] = (-120e3, 140e3)  # what a working sensor can read
+    rate: float = 1000.0
+    over_pressure: float = 10e3
+    tracking: float = 30e3
+    patience: float = 1.0
+    plausible: tuple[float, float] = (-120e3, 140e3)
 
 
 def settings(ports: int = 12, low=-100e3, high=100e3, slew=2e6, **more) -> Settings:
@@ -44,7 +55,7 @@ def settings(ports: int = 12, low=-100e3, high=100e3, slew=2e6, **more) -> Setti
 
 
 class Range(NamedTuple):
-    """Bounds of a number, both allowed, and its unit."""
+    """Bounds of a number, `low` and `high`, both allowed, and its `unit`."""
 
     low: float
     high: float

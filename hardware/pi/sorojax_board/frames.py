@@ -34,11 +34,20 @@ class Kind(IntEnum):
 
 
 class Frame(NamedTuple):
-    """One message. `signed` and `tag` are what arrived, empty in a frame to be sent."""
+    """One message.
+
+    Attributes:
+        kind: What it says, a `Kind`.
+        sequence: Its number; in each direction they rise.
+        time: On the monotonic clock of the sender [ns].
+        payload: What it carries.
+        signed, tag: Header and payload as they arrived, and their signature; both empty in a
+            frame to be sent.
+    """
 
     kind: int
     sequence: int
-    time: int  # ns, monotonic clock of the sender
+    time: int
     payload: bytes = b""
     signed: bytes = b""
     tag: bytes = b""
@@ -83,7 +92,8 @@ def _tag(key: bytes, signed: bytes) -> bytes:
 
 
 class Keys(NamedTuple):
-    """Keys of one connection, one for each direction."""
+    """Keys of one connection: `to_board` signs what the client sends, `to_client` what the
+    board does."""
 
     to_board: bytes
     to_client: bytes

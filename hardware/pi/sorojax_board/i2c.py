@@ -19,7 +19,14 @@ class Bus(Protocol):
 
 
 class Wiring(NamedTuple):
-    """Where one port is connected. `gain` is sensor volts per volt at the converter."""
+    """Where one port is connected.
+
+    Attributes:
+        bus: Number of the I2C bus.
+        dac, adc: Addresses on it of the converters to the regulator and from the sensor.
+        channel: Input of the latter that the sensor is on, 0 to 3.
+        gain: Sensor volts per volt at the converter.
+    """
 
     bus: int
     dac: int = 0x60

@@ -47,7 +47,8 @@ class Refusal(IntEnum):
 
 
 class Limits(NamedTuple):
-    """Range of the set-point of one port [Pa, gauge] and its fastest change [Pa/s]."""
+    """Range of the set-point of one port, `low` to `high` [Pa, gauge], and its fastest change,
+    `slew` [Pa/s]."""
 
     low: float
     high: float
@@ -55,7 +56,8 @@ class Limits(NamedTuple):
 
 
 class Welcome(NamedTuple):
-    """What the board is: time-out [s] and duration of the ramp to zero [s], and its ports."""
+    """What the board is: `watchdog`, its time-out [s], `ramp`, how long it takes to zero [s],
+    and the `limits` of each port."""
 
     watchdog: float
     ramp: float
@@ -63,15 +65,24 @@ class Welcome(NamedTuple):
 
 
 class Report(NamedTuple):
-    """The state of the board. `sequence` and `time` are those of the last SET it followed."""
+    """The state of the board.
+
+    Attributes:
+        sequence, time: Of the last SET that it followed; the time is its sender's [ns].
+        state: What it does.
+        fault: Why it vented.
+        refused: Number of frames that it has not followed.
+        pressure, setpoint: Measured and in force, one per port [Pa, gauge].
+        flags: What it did with the last set-point of each port.
+    """
 
     sequence: int
     time: int
     state: State
     fault: Fault
     refused: int
-    pressure: tuple[float, ...]  # Pa, gauge, measured
-    setpoint: tuple[float, ...]  # Pa, gauge, in force
+    pressure: tuple[float, ...]
+    setpoint: tuple[float, ...]
     flags: tuple[Flag, ...]
 
 

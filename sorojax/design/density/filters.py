@@ -27,7 +27,9 @@ from sorojax.mesh.mesh import Mesh
 class ConeFilter(eqx.Module):
     """Means over neighbours, weighed by how much nearer than the radius they are.
 
-    Made by `cone_filter`. Called with one number per cell it returns one per cell.
+    Made by `cone_filter`: cell `first` of each pair takes the value of cell `second` times
+    `weights` [-], whose sum is one for each cell. Called with one number per cell it returns
+    one per cell.
     """
 
     first: Int[Array, " pairs"]
@@ -109,7 +111,9 @@ class HelmholtzFilter(eqx.Module):
     """The solution y of y - l^2 laplace(y) = x with no flux through the boundary, or the
     same on both sides of a layout that repeats.
 
-    Made by `helmholtz_filter`; costs one back-substitution, whatever the radius.
+    Made by `helmholtz_filter`; costs one back-substitution, whatever the radius. `system` and
+    `values` are the matrix between the nodes, `cells` the nodes of the cells, and `shares` what
+    a cell gives each of them.
     """
 
     system: sparse.SparseSymmetric

@@ -100,9 +100,11 @@ def shared_variables(
 class Layout(eqx.Module):
     """Variables -> symmetric -> smoothed -> projected -> densities, by `layout`.
 
-    Called with `num_variables` numbers from 0 to 1 and the sharpness of the projection
-    (`None` for none) it returns one density per cell. Cells of `solid` and `void` have
-    theirs whatever the variables say.
+    Called with `num_variables` numbers from 0 to 1 and the sharpness of the projection (`None`
+    for none) it returns one density per cell. Cells of `solid` and `void` have theirs whatever
+    the variables say. `number` is that of the variable of each cell, `smooth` the filter,
+    `volumes` are those of the cells, areas in the plane, and `threshold` is that of the
+    projection.
     """
 
     number: Int[Array, " cells"]

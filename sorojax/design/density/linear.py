@@ -20,7 +20,15 @@ from sorojax.mesh.elements.base import AbstractElement
 
 
 class Linear(eqx.Module):
-    """A problem linearised at rest, by `linear`."""
+    """A problem linearised at rest, by `linear`.
+
+    Attributes:
+        space: Of the problem.
+        stiffness: Matrices of the cells, in the blocks of the space.
+        others: What loads add to the tangent, in the order of its values.
+        force: Of the loads on every node [N].
+        known: Unknowns that supports hold.
+    """
 
     space: Space
     stiffness: Float[Array, "blocks entries lanes"]

@@ -173,10 +173,11 @@ def _is_plane(problem) -> bool:
 class Flood(eqx.Module):
     """Where a pressure enters and how it spreads, by `flood`.
 
-    Called with densities it returns the share of the pressure in each cell: 1 in empty
-    cells that are connected to a source through cells less dense than `threshold`, falling
-    smoothly to 0 at that density, and 0 elsewhere. Differentiable in the densities as long
-    as the same cells are reached.
+    Called with densities it returns the share of the pressure in each cell: 1 in empty cells
+    that are connected to a source through cells less dense than `threshold`, falling smoothly
+    to 0 at that density, and 0 elsewhere. Differentiable in the densities as long as the same
+    cells are reached. `first` and `second` are the numbers of cells that share a facet, both
+    ways, and `source` is true for those where the pressure enters.
     """
 
     first: Int[Array, " pairs"]
@@ -251,6 +252,10 @@ class Darcy(eqx.Module):
         threshold, sharpness: Of the step H from void to solid, in `heaviside_projection`.
         tight: Permeability of the solid over that of the void.
         depth: Of a wall behind which `remainder` of the pressure is left [m].
+        system: Pattern of the matrix between the nodes.
+        conduction, storage: Integrals of products of shape gradients and of shape functions.
+        cells: Nodes of each cell.
+        known, given: Nodes whose share is known, and what it is [-].
     """
 
     system: sparse.SparseSymmetric

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float, PyTree
 
 
 class Values(NamedTuple):
-    """Objective and constraints (each <= 0) at one design, with their derivatives."""
+    """`objective` and `constraints` (each <= 0) at one design, with their derivatives:
+    `gradient` is that of the objective, row i of `slopes` that of constraint i."""
 
     objective: Float[Array, ""]
     gradient: Float[Array, " n"]

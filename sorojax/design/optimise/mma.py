@@ -301,6 +301,12 @@ class GCMMA(AbstractMMA):
     Each proposal is evaluated and made again with more curvature (`stiffen`) until they do, so
     the objective of feasible designs never rises. A proposal where a function is not finite
     counts as one where they do not.
+
+    Attributes:
+        lower, upper: Bounds of the variables, numbers or one per variable.
+        move: Largest change of a variable in a step, relative to its range, by default all.
+        spread: Distance of the first asymptotes, relative to the range.
+        approach, retreat: How asymptotes move in on variables that oscillate, and away.
     """
 
     move: Float[Array, ""] = eqx.field(converter=real, default=1.0)

@@ -33,6 +33,9 @@ from sorojax.mesh.mesh import Mesh, valences
 class Space(eqx.Module):
     """Displacements on the nodes of a mesh.
 
+    `system` is the pattern of the tangent, `cells` are the nodes of the cells of type
+    `element`, `ids` their numbers; of the mesh there are `num_nodes` and `num_cells`.
+
     Arrays over cells are kept in blocks with the cell axis last, padded by repeats of
     cell 0 that `real` switches off. Unknown `dim * node + component` is a displacement.
     `slots` follows the order of `block_entries`; `kinds` numbers the shape tables of the

@@ -35,9 +35,14 @@ if TYPE_CHECKING:
 
 
 class Start(NamedTuple):
-    """Where a step of a contact begins: place of the obstacle, how far before its surface
-    pressure starts, how far points of a facet may move until one feels it [m], and the size
-    of the step [s], zero before a motion."""
+    """Where a step of a contact begins.
+
+    Attributes:
+        place: Of the obstacle [m].
+        shift: How far before its surface pressure starts [m].
+        clear: How far points of a facet may move until one feels it [m].
+        step: Size of the step, zero before a motion [s].
+    """
 
     place: Float[Array, " dim"]
     shift: Float[Array, "facets quad"]
@@ -161,6 +166,19 @@ class Contact(AbstractPenaltyContact):
 
     `offset` [m] of every point is how far the pressure starts before the surface, the
     multiplier of an augmented Lagrangian; `solve_contact` finds it.
+
+    `problem`, `simulate` and `update_friction` set the fields that follow; leave them out.
+
+    Attributes:
+        sunk: Overlap that has not been let out yet, zero or less [m]; None where all of it
+            is felt.
+        fresh: One before the first step of a motion, then zero.
+        began: Where the nodes of the facets were when the step began [m].
+        share: Of the step, after which forces act [-].
+        start: Where the obstacle was when it began, where its pressure started, and how far
+            points could move until one felt it.
+        grip: Friction at every point: its spring, and the pressure and normal it is taken at.
+        place: Displacement of the obstacle at the end of the last step [m].
     """
 
     units: ClassVar[dict[str, str]] = {
@@ -186,13 +204,13 @@ class Contact(AbstractPenaltyContact):
         converter=optional_real, default=None
     )
     release_velocity: Float[Array, ""] | None = eqx.field(converter=optional_real, default=0.1)
-    sunk: Float[Array, "facets quad"] | None = None  # found: overlap not let out yet [m]
-    fresh: Float[Array, ""] | None = None  # found: one before a motion, then zero
-    began: Float[Array, "facets facet_nodes dim"] | None = None  # found: positions [m]
-    share: Float[Array, ""] | None = None  # found: of a step, after which forces act
-    start: Start | None = None  # found
-    grip: Grip | None = None  # found
-    place: Float[Array, " dim"] | None = None  # of the obstacle at the end of the last step
+    sunk: Float[Array, "facets quad"] | None = None
+    fresh: Float[Array, ""] | None = None
+    began: Float[Array, "facets facet_nodes dim"] | None = None
+    share: Float[Array, ""] | None = None
+    start: Start | None = None
+    grip: Grip | None = None
+    place: Float[Array, " dim"] | None = None
 
     @property
     def slider(self) -> SpringSlider:

@@ -90,6 +90,15 @@ class SelfContact(AbstractPenaltyContact):
     Two sets belong to one mesh, `mesh.merge(a=..., b=...)` for two bodies. `value` [m] is a
     clearance kept between the surfaces. `reach` is twice the mean size of the facets when
     omitted; `stiffness`, `smoothing` and `offset` are those of `Contact`.
+
+    The fields that follow are set by `problem` and `update_contact_pairs`, in a motion by
+    `simulate`; leave them out.
+
+    Attributes:
+        partners: The listed facets of each facet, by number in `facets` and `others` together.
+        real: Where `partners` lists one; the rest fills up the rows.
+        began: Where the nodes were when the step began [m].
+        share: Of the step, after which forces act [-].
     """
 
     units: ClassVar[dict[str, str]] = {"stiffness": "Pa/m", "smoothing": "m", "reach": "m"}
@@ -106,10 +115,10 @@ class SelfContact(AbstractPenaltyContact):
     name: str = eqx.field(static=True, default="self_contact")
     candidates: int | None = eqx.field(static=True, default=None)
     offset: Float[Array, "rows quad"] | None = eqx.field(converter=optional_real, default=None)
-    partners: Int[Array, "rows candidates"] | None = None  # found
-    real: Bool[Array, "rows candidates"] | None = None  # found
-    began: Float[Array, "nodes dim"] | None = None  # found: positions [m]
-    share: Float[Array, ""] | None = None  # found: of a step, after which forces act
+    partners: Int[Array, "rows candidates"] | None = None
+    real: Bool[Array, "rows candidates"] | None = None
+    began: Float[Array, "nodes dim"] | None = None
+    share: Float[Array, ""] | None = None
 
     @property
     def _reach(self) -> Float[Array, ""]:

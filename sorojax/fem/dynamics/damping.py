@@ -54,7 +54,7 @@ class AbstractDamping(eqx.Module):
 
 
 class Rayleigh(AbstractDamping):
-    """C = mass M + stiffness K, of the body at rest without loads.
+    """C = `mass` M + `stiffness` K, of the body at rest without loads.
 
     The damping ratio at the angular frequency w is (mass / w + stiffness w) / 2. The part of
     the stiffness [s] also resists large rotations; `KelvinVoigt` does not. That of the mass

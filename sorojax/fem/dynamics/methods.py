@@ -79,7 +79,8 @@ class GeneralisedAlpha(AbstractMethod):
 
 
 class Newmark(AbstractMethod):
-    """Newmark's method, by default that of constant average acceleration; of order 2 where
+    """Newmark's method, by default that of constant average acceleration; `beta` and `gamma`
+    [-] are the weights of the new acceleration in displacement and velocity. Of order 2 where
     `gamma` is 1/2, which damps nothing."""
 
     beta: Float[Array, ""] = eqx.field(converter=real, default=0.25)

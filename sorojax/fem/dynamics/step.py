@@ -125,6 +125,9 @@ Row = Float[Array, "grid ..."]
 class State(eqx.Module):
     """A moving body at one instant: what continues.
 
+    `time` [s], and of the nodes `displacement` [m], `velocity` [m/s] and `acceleration`
+    [m/s^2], which is that of the method.
+
     `memory` holds the loads that remember, such as friction; `work` and `dissipated` [J] are
     what loads and supports gave and damping took since the start. `strains` are what the
     branches of a viscoelastic material remember, `peaks` [J/m^3] what one that softens does
@@ -148,8 +151,17 @@ class State(eqx.Module):
 
 
 class Dynamics(eqx.Module):
-    """All that a motion depends on. `loads` and `supports` hold a row of values on the grid
-    of times for those that follow one; `step` is the distance of the grid [s]."""
+    """All that a motion depends on.
+
+    Attributes:
+        problem, damping: The body, and what damps it.
+        scheme: Of the method.
+        loads, supports: A row of values on the grid of times for those that follow one.
+        start: State that the motion begins with.
+        step: Distance of the grid [s].
+        mass: "consistent" or "lumped".
+        conserves: Whether forces of the body keep its energy.
+    """
 
     problem: Problem
     damping: tuple[AbstractDamping, ...]

@@ -44,10 +44,12 @@ class Energies(eqx.Module):
 class Trajectory(eqx.Module):
     """States of a body in motion, and how the run ended.
 
-    Outside a trace a run that stops early is cut there; inside one it keeps its length and
-    is NaN from there on. `end` is the last state reached, to go on from; `points` are the
-    saved points of the grid of steps. `steps` were accepted, `cuts` were halved, in Newton
-    `iterations`. `stats` is kept on the host and `None` inside a trace.
+    Outside a trace a run that stops early is cut there; inside one it keeps its length and is
+    NaN from there on. `states` are the saved ones in one `State`, whose arrays have the times
+    as first axis, and `status` says how the run ended. `dynamics` is what the motion depends
+    on: problem, damping, method and loads in time. `end` is the last state reached, to go on
+    from; `points` are the saved points of the grid of steps. `steps` were accepted, `cuts` were
+    halved, in Newton `iterations`. `stats` is kept on the host and `None` inside a trace.
     """
 
     dynamics: Dynamics

@@ -45,11 +45,12 @@ class _Data(NamedTuple):
 class BondedRod(AbstractLoad):
     """A rod that slips in the solid where the bond is overcome: `bonded_rod(mesh, rod, ...)`.
 
-    Its vertices are nodes of their own, `nodes`; forces and supports may act on them. A
-    vertex is tied across the rod to its point of the solid by `tie_stiffness` [N/m^2], force
-    per length over distance. Along the rod the bond carries `bond_stiffness` [N/m^2] times
-    the slip up to `bond_strength` [N/m] and slides at that force: it is elastic, then
-    perfectly plastic. `slipped` [m] is what it has slid.
+    The vertices of `rod`, which says how stiff it is, are nodes of their own, `nodes`; forces
+    and supports may act on them. `value` [-] is the share by which it is shorter than at rest.
+    A vertex is tied across the rod to its point of the solid by `tie_stiffness` [N/m^2], force
+    per length over distance. Along the rod the bond carries `bond_stiffness` [N/m^2] times the
+    slip up to `bond_strength` [N/m] and slides at that force: it is elastic, then perfectly
+    plastic. `slipped` [m] is what it has slid.
 
     Slip has a memory: `simulate` keeps it, and `update_friction(problem, u)` lets the next
     `solve` know of an equilibrium. A tie holds a vertex on the tangent through its point, so

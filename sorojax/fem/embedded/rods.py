@@ -67,6 +67,10 @@ class EmbeddedRod(AbstractLoad):
     `clamped` says at which ends, the first and the last, the direction of the rod is that of
     the reference configuration: in a wall that holds the solid, or across a plane of symmetry.
     Elsewhere the end of a rod carries no moment.
+
+    `route` places the vertices of all `rods`, so many with as many vertices each, one after the
+    other in the cells that hold them. `directors` [1/m] are the slopes of its weights across
+    the rod, by which the section turns with the solid; None in the plane and for a fibre.
     """
 
     route: Route
@@ -79,7 +83,7 @@ class EmbeddedRod(AbstractLoad):
     mass_per_length: Float[Array, "*rods"] | None = eqx.field(
         converter=optional_real, default=None
     )
-    directors: Float[Array, "points cell_nodes"] | None = None  # slopes across, found
+    directors: Float[Array, "points cell_nodes"] | None = None
     rods: int = eqx.field(static=True, default=1)
     tension_only: bool = eqx.field(static=True, default=False)
     clamped: line.Ends = eqx.field(static=True, default=(False, False))

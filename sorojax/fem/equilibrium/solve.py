@@ -37,7 +37,7 @@ from sorojax.math.status import Status
 
 @displayed
 class Solution(eqx.Module):
-    """Displacement at equilibrium [m], or at the last converged fraction of the load.
+    """`displacement` at equilibrium [m], or at the last converged fraction of the load.
 
     Every array gets the batch axes of `jax.vmap` in front, so each lane has its own
     `status`, `load_fraction`, Newton `iterations`, accepted `load_steps` and `cuts`. Of
@@ -75,14 +75,15 @@ class Solution(eqx.Module):
 
 @displayed
 class Path(eqx.Module):
-    """Equilibria along a path: `values` of the load or moved support `name`, or of the volume
-    of that cavity [m^3], whose gauge `pressures` [Pa] are found; one state for each. A path
-    over `times` [s] has the `strains` that a viscoelastic body remembers at each, that of a
-    body that softens its `peaks` [J/m^3] (`fem.relaxation`).
+    """Equilibria of a `problem` along a path: `values` of the load or moved support `name`, or
+    of the volume of that cavity [m^3], whose gauge `pressures` [Pa] are found; one state for
+    each, with its `displacements` [m]. A path over `times` [s] has the `strains` that a
+    viscoelastic body remembers at each, that of a body that softens its `peaks` [J/m^3]
+    (`fem.relaxation`).
 
-    A path that stops early is cut there; under `jit` and `vmap` it keeps its length and
-    is NaN from there on. `stats` has one entry for each value, as in `Solution`; it is
-    `None` under `jit`.
+    `status` says how the path ended. One that stops early is cut there; under `jit` and `vmap`
+    it keeps its length and is NaN from there on. `stats` has one entry for each value, as in
+    `Solution`; it is `None` under `jit`.
     """
 
     problem: Problem

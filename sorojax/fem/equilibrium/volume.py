@@ -55,6 +55,7 @@ class Gas(AbstractContents):
 
     It takes `volume` [m^3] at the gauge `pressure` [Pa]; `exponent` is 1 for slow and 1.4
     for fast changes of air. Where symmetry cuts the cavity `volume` is that of the part.
+    `ambient` is the absolute pressure outside [Pa].
     """
 
     volume: Float[Array, ""] = eqx.field(converter=real)

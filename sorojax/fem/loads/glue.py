@@ -27,6 +27,15 @@ class Glue(AbstractLoad):
     of the other one that face them is continued to the point; the gap between the two is zero
     at rest and stays so in every rigid motion. Its means, weighted by the linear functions of
     the corners, are held by `stiffness` [N/m^3]. `value` has no meaning.
+
+    Attributes:
+        values, slopes: Shape functions of the facet of each point there, and their slopes by
+            the facet's own coordinates [-].
+        hats: Linear functions of its corners there [-].
+        weights: Of the points; those of a whole facet add up to the size of the reference one.
+        groups: Nodes that the mean gap at each corner depends on.
+        rows: Row of `groups` of each corner of the facet of a point.
+        places: Where the nodes of facet and cell are in that row.
     """
 
     sides: Int[Array, "quad facet_nodes"] = eqx.field(converter=integers)

@@ -125,13 +125,16 @@ class Pressure(AbstractLoad):
     Give the facets of whole cavities, `facets_on(mesh, cavity)`; the cavity may be cut by
     planes of symmetry through `origin` [m], the origin of the mesh when omitted, and by
     planes across some of the axes anywhere. Nodes of an end have to stay on their plane.
+
+    `flux_shares` [-], one per axis, say how much of the flux along each makes the volume of a
+    cavity whose ends may slide; `problem` sets them, None are equal shares.
     """
 
     facets: Int[Array, "facets facet_nodes"] = eqx.field(converter=integers)
     value: Float[Array, ""] = eqx.field(converter=real, default=0.0)
     name: str = eqx.field(static=True, default="pressure")
     origin: Float[Array, " dim"] | None = eqx.field(converter=optional_real, default=None)
-    flux_shares: tuple[float, ...] | None = eqx.field(static=True, default=None)  # found
+    flux_shares: tuple[float, ...] | None = eqx.field(static=True, default=None)
 
     def curved_part(self, problem):
         element, kinematics = problem.mesh.element, problem.kinematics

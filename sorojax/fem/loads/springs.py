@@ -158,7 +158,7 @@ def _check_sizes(where: str, stiffness, shape: tuple[int, ...]) -> None:
 
 
 class Route(eqx.Module):
-    """Points of a body: nodes of the cells that hold them and the weights of these nodes."""
+    """Points of a body: `nodes` of the cells that hold them and the `weights` of these [-]."""
 
     nodes: Int[Array, "points cell_nodes"] = eqx.field(converter=integers)
     weights: Float[Array, "points cell_nodes"] = eqx.field(converter=real)
@@ -213,7 +213,7 @@ def tendon_length(mesh: Mesh, u: Float[Array, "nodes dim"], route: Route) -> Flo
 
 
 class Tendon(AbstractLoad):
-    """Cable of tension `value` [N] along `route(mesh, points)`, fixed to its last point.
+    """Cable of tension `value` [N] along `route`, a `route(mesh, points)`, fixed to its end.
 
     Without friction the tension is the same all along, and the potential is tension times
     length. The force at the first point is that of a cable which leaves the body there
@@ -251,7 +251,7 @@ class Tendon(AbstractLoad):
 
 
 class Cable(AbstractLoad):
-    """Elastic cable along `route(mesh, points)`, shortened by `value` [m].
+    """Elastic cable along `route`, a `route(mesh, points)`, shortened by `value` [m].
 
     Tension = stiffness (length - rest length + value) [N] where that is positive, slack
     otherwise; the rest length is that of the reference configuration. A high `stiffness`

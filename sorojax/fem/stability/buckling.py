@@ -13,8 +13,8 @@ from sorojax.fem.stability.modal import check_state, lowest_of_pair, pencil_of
 
 
 class CriticalLoads(eqx.Module):
-    """Load factors at which the tangent is predicted to be singular, nearest first, and the
-    modes there, with a largest entry of one."""
+    """Load `factors` at which the tangent is predicted to be singular, nearest first, and the
+    `shapes` of the modes there, with a largest entry of one."""
 
     factors: Float[Array, " modes"]
     shapes: Float[Array, "modes nodes dim"]

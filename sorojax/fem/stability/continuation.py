@@ -26,10 +26,12 @@ _MAX_TRIALS = 12
 
 
 class CriticalPoint(eqx.Module):
-    """A state with a singular tangent, and the mode it is singular in (largest entry 1).
+    """A state with a singular tangent, its `displacement` [m], and the `shape` of the mode it
+    is singular in (largest entry 1).
 
-    `kind` is "limit point", where the load has a maximum or minimum, or "bifurcation",
-    where another path crosses.
+    `kind` is "limit point", where the load has a maximum or minimum, or "bifurcation", where
+    another path crosses. `factor` is that of the load, and `negative` the number of negative
+    eigenvalues beside the one that is zero.
     """
 
     kind: str = eqx.field(static=True)
@@ -133,8 +135,9 @@ _RESOLVED = 4  # cuts after which a turn is one of the path, not of the step
 @displayed
 class Continuation(Path):
     """A path over limit points: `factors` of the load, which are the `values` too where all
-    loads grow together, and the number of negative eigenvalues of the tangent (0 where stable,
-    -1 unknown)."""
+    loads grow together, and `negative_eigenvalues`, how many the tangent has (0 where stable,
+    -1 unknown). `critical_points` were found on the way; `length` is that of the last step and
+    `end` where the next would begin."""
 
     factors: Float[Array, " states"] = eqx.field(kw_only=True)
     negative_eigenvalues: Int[Array, " states"] = eqx.field(kw_only=True)

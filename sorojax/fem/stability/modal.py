@@ -261,7 +261,8 @@ def _alone(eigenvalues: Float[Array, " modes"]) -> Float[Array, " modes"]:
 
 @displayed
 class Modes(eqx.Module):
-    """Shapes and eigenvalues about the equilibrium `displacement`, lowest first.
+    """`shapes` and `eigenvalues` about the equilibrium `displacement` [m] of a `problem`,
+    lowest first.
 
     Vibration modes have `eigenvalues` omega^2 [1/s^2] and shapes of unit modal mass;
     those of the tangent alone have the stiffness [N/m] and shapes of unit length. An

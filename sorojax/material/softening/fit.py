@@ -37,7 +37,7 @@ _STARTS = [(q, m, b) for q in (0.3, 0.8) for m in (0.03, 0.3) for b in (0.02, 0.
 @displayed
 @dataclass(frozen=True)
 class CyclicFit:
-    """A softening rubber with the range that it is good for.
+    """A softening rubber, `material`, with the range that it is good for.
 
     `first` is the fit of the first loading. `rms` is the root-mean-square error of engineering
     stress [Pa] on the way back and when loaded again, `relative_rms` its ratio to the

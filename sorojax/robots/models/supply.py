@@ -185,8 +185,8 @@ def with_pneumatics(
 
 
 class Running(NamedTuple):
-    """A model at one moment: the state of its network, the memory of the method, and for how
-    many calls it has had that."""
+    """A model at one moment: the `state` of its network, the `memory` of the method, and its
+    `age`, for how many calls it has had that."""
 
     state: Any
     memory: Any
@@ -292,7 +292,7 @@ def check_moved(where: str, good: Array, period: float, setpoint: Any) -> None:
 
 
 class RodBehindValves(NamedTuple):
-    """Coordinates, rates, and pressures [Pa] of a rod at one moment."""
+    """Coordinates `q`, rates `v`, and `pressure` [Pa] by port of a rod at one moment."""
 
     q: Float[Array, " coordinates"]
     v: Float[Array, " dof"]

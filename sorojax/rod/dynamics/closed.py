@@ -133,8 +133,8 @@ def gaps(model: Assembly, q: Float[Array, " coordinates"], t) -> Float[Array, " 
 
 @displayed
 class Closed(eqx.Module):
-    """Coordinates that keep the closures, how far they are from it [rad], [m], and how the
-    search ended."""
+    """Coordinates `q` that keep the closures, `gap`, how far they are from it [rad], [m], and
+    `status`, how the search ended."""
 
     q: Float[Array, " coordinates"]
     gap: Float[Array, ""]

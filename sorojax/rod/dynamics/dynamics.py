@@ -251,6 +251,7 @@ def inverse_dynamics(
 class VectorField(eqx.Module):
     """(t, (q, v), args) -> (dq/dt, dv/dt): the right-hand side that diffrax integrates.
 
+    `model` is the rod or assembly, `constants` are its operators, and `forces` act on it.
     Closures that open by the error of a step are pulled shut at the rate `pull` [1/s];
     `rollout` projects instead, to round-off.
 

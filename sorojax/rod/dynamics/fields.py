@@ -49,7 +49,13 @@ class Operators(NamedTuple):
 
 
 class Base(eqx.Module):
-    """Frame on which a rod or a link starts, and its Jacobians in the columns of a motion."""
+    """Frame on which a rod or a link starts.
+
+    Attributes:
+        directors: Columns are its axes.
+        position: Of its origin [m].
+        angular_jacobian, linear_jacobian: Its velocities per rate, in the columns of a motion.
+    """
 
     directors: Float[Array, "dim dim"]
     position: Float[Array, " dim"]

@@ -41,10 +41,17 @@ from sorojax.rod.statics.equilibrium import checked_status
 
 @displayed
 class Trajectory(eqx.Module):
-    """A motion sampled in time: time [s], coordinates and their rates; what the branches of a
-    `Relaxation` remember, the coordinates at which they are free of force; and the wrench
-    [N m], [N] of each closure on the part that it holds, world axes, the moment about the
-    origin of the frame that is held."""
+    """A motion sampled in time.
+
+    Attributes:
+        time: [s].
+        q, v: Coordinates and their rates.
+        status: How the run ended.
+        memory: What the branches of a `Relaxation` remember, the coordinates at which they are
+            free of force, (time, branches, dof); None without branches.
+        reactions: By closure the wrench [N m], [N] on the part that it holds, (time, twist), in
+            world axes, the moment about the origin of the frame that is held; None without one.
+    """
 
     time: Float[Array, " time"]
     q: Float[Array, "time coordinates"]

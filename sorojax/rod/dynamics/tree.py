@@ -115,7 +115,8 @@ class Mount(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """Where the frame of a part is in the world, and its twist along its own axes."""
+    """Frame of a part in the world: `rotation`, whose columns are its axes, `position` [m], and
+    its `twist` along these axes."""
 
     rotation: Float[Array, "dim dim"]
     position: Float[Array, " dim"]

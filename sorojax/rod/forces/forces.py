@@ -125,7 +125,8 @@ class AbstractChamber(AbstractPressureMap):
 
 
 class LinearElastic(AbstractElastic):
-    """Elasticity K q with a matrix of its own, e.g. identified from data."""
+    """Elasticity K q with a matrix of its own, `stiffness`, e.g. identified from data: energy
+    [J] per product of two coordinates, q'Kq / 2 in all."""
 
     stiffness: Float[Array, "dof dof"] = eqx.field(converter=real)
 
@@ -221,7 +222,7 @@ class TipWrench(AbstractForce):
 
 
 class Pressurised(AbstractForce):
-    """A pressure map at a given gauge pressure [Pa], scalar or one per port."""
+    """A pressure map, `chamber`, at a given gauge `pressure` [Pa], scalar or one per port."""
 
     chamber: AbstractPressureMap
     pressure: Float[Array, "*ports"] = eqx.field(converter=real)
@@ -322,7 +323,7 @@ def _rows(rod: Rod) -> tuple[Array, Array]:
 
 
 class EnergyLaw(eqx.Module):
-    """The stress of an energy per length [J/m], a function of (strain, s)."""
+    """The stress of an `energy` per length [J/m], a function of (strain, s)."""
 
     energy: Callable[[Float[Array, " strain"], Float[Array, ""]], Float[Array, ""]]
 

@@ -35,7 +35,8 @@ _SHAPE_ONLY = (AbstractElastic, AbstractDamping, Pressurised, AbstractPressureMa
 
 
 class PartForce(eqx.Module):
-    """A force on one part, named as in the assembly."""
+    """`force` on one `part`, named as in the assembly; a pressure map gets its pressure in a
+    network."""
 
     part: str = eqx.field(static=True)
     force: AbstractForce | AbstractPressureMap
@@ -52,7 +53,7 @@ class AbstractPairForce(eqx.Module):
 
 
 class PairForce(eqx.Module):
-    """A force between two parts, named as in the assembly."""
+    """`force` between two parts, `first` and `second`, named as in the assembly."""
 
     first: str = eqx.field(static=True)
     second: str = eqx.field(static=True)
@@ -60,7 +61,8 @@ class PairForce(eqx.Module):
 
 
 class JointEffort(eqx.Module):
-    """Effort of an actuator in the joint of a part: torque [N m] or force [N] per rate."""
+    """`effort` of an actuator in the joint of a part, whose name is `part`: torque [N m] or
+    force [N], one for each rate of the joint."""
 
     part: str = eqx.field(static=True)
     effort: Float[Array, "*joint"] = eqx.field(converter=real)

@@ -65,7 +65,7 @@ class Branches(NamedTuple):
 
 
 class BranchEnergy(NamedTuple):
-    """Energy in the branches [J], and the power that they dissipate [W]."""
+    """Energy `stored` in the branches [J], and the `power` that they dissipate [W]."""
 
     stored: Float[Array, "*states"]
     power: Float[Array, "*states"]

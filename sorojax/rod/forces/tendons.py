@@ -62,7 +62,7 @@ class Straight(AbstractRoute):
 
 
 class Converging(AbstractRoute):
-    """A thread whose place (y, z) [m] moves linearly from that at the base to that at the
+    """A thread whose place (y, z) [m] moves linearly from `first` at the base to `last` at the
     end of the rod, whatever part of it the thread takes."""
 
     first: Float[Array, "2"] = eqx.field(converter=real)
@@ -97,7 +97,7 @@ class Helical(AbstractRoute):
 
 
 class Routed(AbstractRoute):
-    """A thread at `place(s)` -> (y, z) [m], any smooth function of s in [0, 1]."""
+    """A thread at its `place`, any smooth function from s in [0, 1] to (y, z) [m]."""
 
     place: Callable[[Array], Array]
     start: float = eqx.field(static=True, default=0.0)
@@ -326,7 +326,9 @@ class _Threads(AbstractForce):
 class ThreadChambers(AbstractChamber):
     """Thin fluidic chambers of constant section along threads, from `thread_chambers`.
 
-    The pressure pushes with p A along the thread, by the change of its volume.
+    The pressure pushes with p A along the thread, by the change of its volume. `areas` [m^2]
+    are the sections A, one for each of `threads`. Where `is_single` there is one, and pressure
+    and volume are numbers.
     """
 
     threads: tuple[Thread, ...]

@@ -88,7 +88,8 @@ class Assembly(eqx.Module):
 
 
 class Slices(NamedTuple):
-    """Where a part has its numbers: q of joint and rod, v of joint and rod."""
+    """Where a part has its numbers: in q those of its joint, `joint_q`, and of its rod,
+    `rod_q`, in v `joint_v` and `rod_v`."""
 
     joint_q: slice
     rod_q: slice

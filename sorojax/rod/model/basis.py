@@ -54,7 +54,7 @@ class AbstractModes(eqx.Module):
 
 @displayed
 class StrainBasis(eqx.Module):
-    """Modes of each active strain; a strain that is not named has no coordinate.
+    """`modes` of each active strain by name; a strain that is not named has no coordinate.
 
     The coordinates are ordered by strain (`kappa_x kappa_y kappa_z sigma_x sigma_y
     sigma_z`), then by mode: [1/m] for curvatures, [-] for stretch and shear, times the

@@ -240,7 +240,7 @@ class Chamfer(AbstractBlend):
 
 
 class AbstractPair(AbstractByLevel):
-    """Two shapes of one dimension as one."""
+    """Two shapes of one dimension, `first` and `second`, as one."""
 
     first: AbstractSdf
     second: AbstractSdf
@@ -258,7 +258,7 @@ class AbstractPair(AbstractByLevel):
 
 
 class AbstractBlended(AbstractPair):
-    """Two shapes joined by a blend of width `k` [m]."""
+    """Two shapes joined by a `blend` of width `k` [m]."""
 
     k: Float[Array, ""] = eqx.field(converter=real)
     blend: AbstractBlend = Quadratic()
@@ -305,7 +305,8 @@ class SmoothUnion(AbstractBlended):
 
 
 class SmoothIntersection(AbstractBlended):
-    """Intersection whose edges are rounded off where the fields differ by less than `k`."""
+    """Intersection of `first` and `second` whose edges are rounded off where the fields differ
+    by less than `k` [m]; `blend` is one of those of `SmoothUnion`."""
 
     def distance(self, *x):
         return -self.blend(-self.first.distance(*x), -self.second.distance(*x), self.k)
@@ -315,7 +316,8 @@ class SmoothIntersection(AbstractBlended):
 
 
 class SmoothDifference(AbstractBlended):
-    """`first` without `second`; the edges between them are rounded off over `k` [m]."""
+    """`first` without `second`; the edges between them are rounded off over `k` [m], as `blend`
+    of `SmoothUnion` has it."""
 
     def distance(self, *x):
         return -self.blend(-self.first.distance(*x), self.second.distance(*x), self.k)

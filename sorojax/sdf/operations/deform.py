@@ -34,7 +34,8 @@ _MARGIN = 0.1  # of the size of the shape, between it and the side of its domain
 
 
 class AbstractConfined(AbstractSdf):
-    """A solid changed by `rate` along z; the change is followed within a domain around it."""
+    """A solid, `shape`, changed by `rate` along z; the change is followed within a domain
+    around it."""
 
     shape: AbstractSdf
     rate: Float[Array, ""] = eqx.field(converter=real)

@@ -32,7 +32,7 @@ from sorojax.sdf.shapes.bars import check_direction
 
 
 class AbstractFromProfile(AbstractByLevel):
-    """A solid made of a plane shape, as steep as it."""
+    """A solid made of a plane shape, `profile`, as steep as it."""
 
     profile: AbstractSdf
     dim: ClassVar[int] = 3
@@ -74,6 +74,7 @@ class Revolved(AbstractFromProfile):
 
     What the profile holds at negative x is left out; the distance is exact where the
     profile lies at x >= 0 or is symmetric, and a bound otherwise.
+    `clear` says that its box lies at x >= 0.
     """
 
     clear: bool = eqx.field(static=True)
@@ -104,7 +105,7 @@ def _check_plane(where: str, profile: AbstractSdf) -> None:
 
 
 class Mirrored(AbstractWrapped):
-    """`shape` together with its image behind the plane through `point` [m]."""
+    """`shape` together with its image behind the plane through `point` [m] with `normal`."""
 
     shape: AbstractSdf
     normal: Float[Array, " dim"] = eqx.field(converter=real)

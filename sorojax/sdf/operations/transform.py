@@ -27,7 +27,7 @@ from sorojax.sdf.shapes.bars import check_direction
 
 
 class AbstractWrapped(AbstractByLevel):
-    """A shape made of one other shape of the same dimension and slope."""
+    """A shape made of one other, `shape`, of the same dimension and slope."""
 
     if TYPE_CHECKING:  # fields that subclasses have, in their own order
         shape: ClassVar[AbstractSdf]
@@ -152,8 +152,9 @@ class Shell(AbstractWrapped):
 class Repeated(AbstractWrapped):
     """`count` copies of `shape`, each `step` [m] from the one before.
 
-    Only the copies within `reach` of the nearest cell are evaluated: with a shape
-    that is `w` wide along the step, 1 + w/|step| cells always hold the closest one.
+    Only the copies within `reach` of the nearest cell are evaluated: with a shape that is `w`
+    wide along the step, 1 + w/|step| cells always hold the closest one. `separate` says that
+    boxes of copies do not overlap along the step.
     """
 
     shape: AbstractSdf

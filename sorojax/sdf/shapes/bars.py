@@ -204,7 +204,8 @@ def stadium(length: Numbers, width: Numbers) -> Capsule:
 
 
 class RoundCone(AbstractBar):
-    """Convex hull of two balls, in the plane of two discs (uneven capsule)."""
+    """Convex hull of two balls, in the plane of two discs (uneven capsule): one of
+    `start_radius` about `start` and one of `end_radius` about `end` [m]."""
 
     start_radius: Float[Array, ""] = eqx.field(converter=positive)
     end_radius: Float[Array, ""] = eqx.field(converter=positive)

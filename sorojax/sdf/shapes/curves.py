@@ -99,7 +99,8 @@ class AbstractTube(AbstractSdf):
 
 
 class Polyline(AbstractTube):
-    """All points within `width` / 2 of the line through `points` [m]; a tube in space."""
+    """All points within `width` / 2 of the line through `points` [m]; a tube in space.
+    Where it is `closed` it goes on from the last point to the first."""
 
     closed: bool = eqx.field(static=True, default=False)
     least: ClassVar[int] = 2
@@ -208,7 +209,8 @@ def foot(
 
 
 class Helix(AbstractSdf):
-    """Wire of `width` [m] wound about z at `radius` [m], `pitch` [m] per turn, from z = 0."""
+    """Wire of `width` [m] wound about z at `radius` [m], `pitch` [m] per turn, from z = 0 on;
+    `turns` [-] need not be a whole number."""
 
     radius: Float[Array, ""] = eqx.field(converter=positive)
     pitch: Float[Array, ""] = eqx.field(converter=positive)
@@ -279,7 +281,8 @@ def _square(pieces, start, x):
 
 
 class Spline(AbstractTube):
-    """Tube of `width` [m] along the cubic curve (Catmull-Rom) through `points` [m].
+    """Tube of `width` [m] along the cubic curve (Catmull-Rom) through `points` [m]. Where it is
+    `closed` the curve goes on from the last point to the first.
 
     The closest point is searched on six parts of every piece by Newton's method: exact
     outside unless one part bends around a point with two closest points.

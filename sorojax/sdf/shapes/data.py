@@ -46,8 +46,8 @@ _ON_SURFACE = 16  # of rounding: points that near to the surface are on it
 class Outlines(AbstractPlaneShape):
     """Region between closed outlines: one within another is a hole, by the even-odd rule.
 
-    Outline k takes the rows of `vertices` [m] from `starts[k]` to the next; outlines may
-    not touch. A gradient costs one edge, however many there are.
+    Outline k takes the rows of `vertices` [m] from entry k of `starts` to the next; outlines
+    may not touch. A gradient costs one edge, however many there are.
     """
 
     vertices: Float[Array, "corners 2"] = eqx.field(converter=real)
@@ -214,6 +214,10 @@ def _smaller(base: Array, flank: Array) -> Array:
 class TriangleMesh(AbstractSolidShape):
     """Solid inside a closed triangle mesh, by the nearest of its triangles.
 
+    `vertices` [m] are its points, `faces` their numbers, three each and all in one sense.
+    `tree` is found from them: the boxes in which the nearest is searched, None for a mesh with
+    gaps or one built under a trace.
+
     A watertight mesh is searched by a tree of boxes and its sign is that of the normal at
     the closest face, edge or corner. A mesh with gaps, or one built under a trace, is
     searched face by face and takes the winding number for its sign, to which small gaps
@@ -321,7 +325,8 @@ def interpolate(values: Array, place: tuple[Array, ...]) -> Array:
 
 
 class Sampled(AbstractByLevel):
-    """Distances `values` [m] on a grid, interpolated linearly; `origin` is node (0, 0).
+    """Distances `values` [m] on a grid, interpolated linearly; `origin` [m] is node (0, 0), and
+    nodes are `spacing` [m] apart along every axis.
 
     Beyond the grid the distance to it is added.
     """
@@ -405,7 +410,8 @@ def image(mask: Numbers, pixel: float, origin: Numbers | None = None) -> Sampled
 class HeightMap(AbstractByLevel):
     """Everything below the surface z = `heights` [m] over a grid, held at its edges.
 
-    The field is the height over the surface, with a Lipschitz constant above one.
+    Node (0, 0) of the grid is at `origin` (x, y) [m], nodes are `spacing` [m] apart along x and
+    y. The field is the height over the surface, with a Lipschitz constant above one.
     """
 
     heights: Float[Array, "x y"] = eqx.field(converter=real)

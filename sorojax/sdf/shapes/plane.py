@@ -364,7 +364,8 @@ class Vesica(AbstractPlaneShape):
 
 
 class Squircle(AbstractSdf):
-    """Superellipse |x|^n + |y|^n = radius^n, n = `power` above 2; a bound of the distance."""
+    """Superellipse |x|^n + |y|^n = r^n, r = `radius` [m], n = `power` [-] above 2; a bound of
+    the distance."""
 
     radius: Float[Array, ""] = eqx.field(converter=positive)
     power: Float[Array, ""] = eqx.field(converter=real)

@@ -94,7 +94,8 @@ class Torus(AbstractSolidShape):
 
 
 class CappedTorus(AbstractSolidShape):
-    """The part of a torus within `half_angle` [rad] of +x, with round ends."""
+    """The part of a torus about z within `half_angle` [rad] of +x, with round ends: a tube of
+    `tube_radius` [m] whose centre line has `radius` [m]."""
 
     radius: Float[Array, ""] = eqx.field(converter=positive)
     tube_radius: Float[Array, ""] = eqx.field(converter=positive)
@@ -166,7 +167,7 @@ class Cylinder(AbstractSolidShape):
 
 
 class CappedCone(AbstractSolidShape):
-    """Truncated cone about z: `radius` at the bottom, `top_radius` at the top [m]."""
+    """Truncated cone of `height` about z: `radius` below and `top_radius` above [m]."""
 
     radius: Float[Array, ""] = eqx.field(converter=positive)
     top_radius: Float[Array, ""] = eqx.field(converter=positive)

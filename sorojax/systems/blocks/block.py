@@ -321,7 +321,7 @@ class AbstractReference(eqx.Module):
 
 
 class Constant(AbstractReference):
-    """The same value at all times."""
+    """The same `value` at all times."""
 
     value: Float[Array, "..."] = eqx.field(converter=real)
 
@@ -341,7 +341,8 @@ class Step(AbstractReference):
 
 
 class Sine(AbstractReference):
-    """offset + amplitude sin(2 pi frequency t + phase); frequency in Hz, phase in rad."""
+    """`offset` + `amplitude` sin(2 pi `frequency` t + `phase`); the frequency is in Hz, the
+    phase in rad."""
 
     amplitude: Float[Array, "..."] = eqx.field(converter=real)
     frequency: Float[Array, ""] = eqx.field(converter=real)
@@ -377,7 +378,7 @@ class SmoothRamp(AbstractReference):
 
 
 class Source(AbstractStateless):
-    """Puts a reference on a wire, as output `value` in `unit`."""
+    """Puts a `reference`, a signal of time, on a wire, as output `value` in `unit`."""
 
     reference: AbstractReference
     unit: str | None = eqx.field(static=True, default=None)

@@ -33,7 +33,7 @@ _NEW = 1e-6
 
 
 class Basis(eqx.Module):
-    """Shapes of unit modal mass about the equilibrium `displacement` [m]."""
+    """`shapes` of unit modal mass about the equilibrium `displacement` [m]."""
 
     displacement: Float[Array, "nodes dim"]
     shapes: Float[Array, "modes nodes dim"]
@@ -239,6 +239,9 @@ class ModalBody(AbstractBlock):
         works: What each driven load works on, in the unit of work over that of the load: of
             a pressure its volume.
         ports: Of the driven loads: name, input, shape, unit, and the name of the volume.
+        volumes: Of the pressures with a volume: name of the load, of the output of the
+            volume, and of that of its rate.
+        energies: Whether energies are outputs.
         pulls: Loads that are tendons: they do not push, whatever the input.
         markers: Places at q = 0 and how they move, by name.
         q, v: At the start.

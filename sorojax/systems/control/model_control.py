@@ -34,7 +34,8 @@ Effort = Float[Array, " dof"]
 
 
 class AbstractLaw(AbstractStateless, AbstractController):
-    """A static law from (t, q, v) to an effort in the coordinates of a rod."""
+    """A static law from (t, q, v) to an effort in the coordinates of a `rod`, on which `forces`
+    act."""
 
     rod: Rod
     forces: tuple[AbstractForce, ...]

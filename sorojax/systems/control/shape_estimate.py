@@ -181,11 +181,14 @@ class ShapeFilter(eqx.Module):
 
 
 class FilterState(eqx.Module):
-    """State of a filter: coordinates, rates, their covariance, and since when.
+    """State of a filter.
 
     Attributes:
+        q, v: Coordinates and rates.
+        covariance: Of both, q first.
         missed: Updates since a marker was last seen; the estimate is `stale` from three on.
         error: Root mean square distance of the seen markers to the prediction [m].
+        status: Whether numbers stayed finite.
     """
 
     q: Float[Array, " dof"]

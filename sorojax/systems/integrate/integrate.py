@@ -288,7 +288,8 @@ class Event(eqx.Module):
 
 
 class EventLog(eqx.Module):
-    """The events of a run: how many, when [s] (infinite beyond), and which of the events."""
+    """The events of a run: their `count`, the `time` of each [s] (infinite beyond), and `which`
+    of the events it was, by number."""
 
     count: Array
     time: Float[Array, " most"]

@@ -16,7 +16,14 @@ from sorojax.view import style
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """Which colours values have: the name with its unit, the limits, what is cut off."""
+    """Which colours values have.
+
+    Attributes:
+        label: Name of the values with their unit.
+        low, high: Limits; values beyond have the colour of the limit.
+        extend: At which ends there are such values: `neither`, `min`, `max` or `both`.
+        colours: Name of a colour map of matplotlib.
+    """
 
     label: str
     low: float
@@ -78,7 +85,8 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Runs of points, each an array (points, dim) [m]; `width` in points of print."""
+    """`runs` of points, each an array (points, dim) [m], in one `colour`; `width` is in points
+    of print, they may be `dashed`, and `name` is for the legend."""
 
     runs: Sequence[Float[np.ndarray, "points dim"]]
     colour: str = style.INK
@@ -89,7 +97,8 @@ class Lines:
 
 @dataclass(frozen=True, eq=False)
 class Arrows:
-    """Arrows that start at `starts` [m]; their `vectors` [m] are drawn to scale."""
+    """Arrows that start at `starts` [m]; their `vectors` [m] are drawn to scale, in one
+    `colour`, and `name` is for the legend."""
 
     starts: Float[np.ndarray, "arrows dim"]
     vectors: Float[np.ndarray, "arrows dim"]
@@ -99,7 +108,8 @@ class Arrows:
 
 @dataclass(frozen=True, eq=False)
 class Dots:
-    """Marks of `size` points of print."""
+    """Marks at `points` [m] of `size` points of print, in one `colour`; `name` is for the
+    legend."""
 
     points: Float[np.ndarray, "dots dim"]
     colour: str = style.INK
@@ -112,7 +122,15 @@ Part = Surface | Lines | Arrows | Dots
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Parts in the order they are drawn, with the scale of their values and a heading."""
+    """What a picture shows.
+
+    Attributes:
+        parts: In the order they are drawn.
+        scale: Of their values, if they have any.
+        title: Heading of the picture.
+        note: Small print at its edge.
+        extent: Lower and upper corner [m] of what must be in it, of the parts by default.
+    """
 
     parts: tuple[Part, ...]
     scale: Scale | None = None

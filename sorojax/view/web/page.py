@@ -94,7 +94,7 @@ def _planes(steps: np.ndarray) -> bytes:
 
 @dataclass(frozen=True)
 class Page:
-    """A page; the last line of a notebook cell shows it."""
+    """A page, `html`; the last line of a notebook cell shows it."""
 
     html: str
 
