@@ -40,6 +40,7 @@ TOLERANCE = {"float64": 1e-10, "float32": 1e-4}
 DEEPEST = 3  # loops and branches inside of others
 BATCH = 250  # programs of one process
 THREADED = 4  # every so many batches run in threads
+SHORT = 25  # operations: in every other batch a kernel holds no longer loop, but those within
 ENOUGH = 0.6  # of the programs have a kernel, or the others show little
 BAD = {
     "abort": "aborts",
@@ -506,8 +507,9 @@ def faulty(call: Callable[..., Any], fault: str) -> Callable[..., Any]:
     return broken
 
 
-def prepare() -> None:
-    """Double precision, nothing kept on disk, kernels on every jaxlib, and counted."""
+def prepare(seed: int) -> None:
+    """Double precision, nothing kept on disk, kernels on every jaxlib, and counted; for the
+    batch of `seed`."""
     gc.set_threshold(100_000, 20, 20)  # tracing makes so many objects
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_enable_compilation_cache", False)
@@ -523,11 +525,13 @@ def prepare() -> None:
 
     kernels.PROVEN = (*kernels.PROVEN, metadata.version("jaxlib"))
     kernels._IS_PROVEN = kernels.status() == "on"
+    if seed // BATCH % 2:
+        kernels.LONGEST = SHORT
 
 
 def serve(seeds: list[int], threads: int, fault: str) -> None:
     """In a child process: a line when a program begins, a line when it is done."""
-    prepare()
+    prepare(seeds[0])
     lock = threading.Lock()
 
     def say(**what: Any) -> None:
@@ -607,7 +611,7 @@ def table(counts: Counter[str]) -> str:
 
 def show(seed: int) -> dict[str, Any]:
     """One program, printed and run in this process."""
-    prepare()
+    prepare(seed)
     program = Program(seed)
     args, named = program.arguments()
     print(eqx.filter_make_jaxpr(program)(*args, **named)[0], flush=True)

@@ -92,6 +92,27 @@ def test_loops_over_large_arrays_and_long_ones_stay_as_they_are(monkeypatch):
     assert not has_mark(run, jnp.ones(500))
 
 
+@marked
+@pytest.mark.parametrize("outer", ["scan", "while"])
+def test_loops_within_a_loop_that_no_kernel_can_hold_are_kernels(outer):
+    def inner(x):
+        return jax.lax.fori_loop(0, 5, lambda _, x: 0.5 * x + jnp.sin(x), x)
+
+    def turn(x):
+        return jnp.linalg.inv(jnp.diag(2.0 + inner(x))) @ inner(0.1 * x)  # by a library
+
+    def run(x):
+        if outer == "scan":
+            return jax.lax.scan(lambda x, row: (turn(x) + row, x), x, jnp.ones((4, 3)))
+        return jax.lax.while_loop(lambda x: x[0] < 9, lambda x: x + jnp.abs(turn(x)) + 1, x)
+
+    x = jnp.array([0.2, 0.5, 0.9])
+    assert has_mark(run, x)
+    found, want = compiled(run, x)(x)[0], jax.jit(run)(x)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(want), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-13)
+
+
 def test_inside_other_programs_it_is_part_of_them():
     traces = []
 

@@ -13,7 +13,7 @@ programs of `jax.extend.core`. A jaxlib that is not among `PROVEN` gets the plai
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -74,13 +74,13 @@ _HELD = _LOOPS | _INLINED | set(_ALONE) | {
     "atan", "atan2", "atanh", "broadcast_in_dim", "cbrt", "ceil", "clamp", "concatenate",
     "cond", "convert_element_type", "copy", "copy_p", "cos", "cosh", "cumsum",
     "custom_linear_solve", "div", "dot_general", "dynamic_slice", "dynamic_update_slice", "eq",
-    "erf", "erf_inv", "erfc", "exp", "exp2", "expand_dims", "expm1", "floor", "gather", "ge",
-    "gt", "integer_pow", "iota", "is_finite", "le", "log", "log1p", "logistic", "lt", "max",
-    "min", "mul", "ne", "neg", "nextafter", "not", "or", "pad", "platform_index", "pow",
-    "reduce_and", "reduce_max", "reduce_min", "reduce_or", "reduce_prod", "reduce_sum", "rem",
-    "reshape", "rev", "round", "rsqrt", "select_n", "sign", "sin", "sinh", "slice",
-    "small_product", "split", "sqrt", "square", "squeeze", "stack", "stop_gradient", "sub",
-    "tan", "tanh", "tile", "transpose", "unstack", "xor",
+    "eq_to", "erf", "erf_inv", "erfc", "exp", "exp2", "expand_dims", "expm1", "floor", "gather",
+    "ge", "gt", "integer_pow", "iota", "is_finite", "le", "le_to", "log", "log1p", "logistic",
+    "lt", "lt_to", "max", "min", "mul", "ne", "neg", "nextafter", "not", "or", "pad",
+    "platform_index", "pow", "reduce_and", "reduce_max", "reduce_min", "reduce_or",
+    "reduce_prod", "reduce_sum", "rem", "reshape", "rev", "round", "rsqrt", "select_n", "sign",
+    "sin", "sinh", "slice", "small_product", "split", "sqrt", "square", "squeeze", "stack",
+    "stop_gradient", "sub", "tan", "tanh", "tile", "transpose", "unstack", "xor",
 }  # fmt: skip
 
 Answer = TypeVar("Answer")
@@ -103,7 +103,7 @@ def one_kernel(function: Callable[..., Answer]) -> Callable[..., tuple[Answer, A
         reads = [known[0].reshape(-1)[0].astype(_NUMBER)]
         leaves = _run(closed.jaxpr, closed.consts, arrays, reads)
         answer = eqx.combine(jax.tree.unflatten(jax.tree.structure(shapes), leaves), rest)
-        return answer, functools.reduce(jnp.add, reads)
+        return answer, reads[-1]
 
     return marked
 
@@ -147,11 +147,69 @@ def _values(evaluate: Any, jaxpr: Any, consts: Any, args: list[Any]) -> list[Any
 
 def _answer(jaxpr: Any, equation: Any, given: list[Any], reads: list[Any]) -> list[Any]:
     name, inner = equation.primitive.name, _bodies(equation)
-    if name in _LOOPS and _passes_few(equation) and _is_small(equation):
+    if name in _LOOPS and _is_held(equation):
         return _in_one(functools.partial(_inside, jaxpr, equation), given, reads)
     if name in _INLINED and len(inner) == 1:
         return _run(*inner[0], given, reads)
+    if name in _LOOPS and not _is_batched(equation) and _marks_within(equation):
+        return _with_kernels(equation, given, reads)
     return _bound(jaxpr, equation, given)
+
+
+def _marks_within(loop: Any) -> bool:
+    """Whether a loop that no kernel can hold has loops within that one can."""
+    return any(
+        each.primitive.name in _LOOPS and (_is_held(each) or _marks_within(each))
+        for body, _ in _bodies(loop)
+        for each in _inlined(body)
+    )
+
+
+def _inlined(jaxpr: Any) -> Iterator[Any]:
+    """The equations, with those of the calls among them."""
+    for each in jaxpr.eqns:
+        inner = _bodies(each)
+        if each.primitive.name in _INLINED and len(inner) == 1:
+            yield from _inlined(inner[0][0])
+        else:
+            yield each
+
+
+def _with_kernels(loop: Any, given: list[Any], reads: list[Any]) -> list[Any]:
+    """A loop with kernels within; the number that they hand on goes from turn to turn."""
+    params = loop.params
+
+    def turn(body: Any, number: Any, args: list[Any]) -> tuple[Any, list[Any]]:
+        inside = [number]
+        found = _run(body.jaxpr, body.consts, args, inside)
+        return inside[-1], found
+
+    if loop.primitive.name == "scan":
+        fixed, ends = _constants_and_carry(params)
+
+        def step(carry: Any, row: Any) -> Any:
+            args = [*given[:fixed], *carry[1], *row]
+            number, found = turn(params["jaxpr"], carry[0], args)
+            return (number, found[: ends - fixed]), found[ends - fixed :]
+
+        how = {key: params[key] for key in ("length", "reverse", "unroll")}
+        start = (reads[-1], given[fixed:ends])
+        (number, carry), rows = jax.lax.scan(step, start, given[ends:], **how)
+        reads.append(number)
+        return [*carry, *rows]
+    first = params["cond_nconsts"]
+    second = first + params["body_nconsts"]
+
+    def goes_on(state: Any) -> Any:
+        closed, args = params["cond_jaxpr"], [*given[:first], *state[1]]
+        return _found["eval_jaxpr"](closed.jaxpr, closed.consts, *args)[0]
+
+    def once(state: Any) -> Any:
+        return turn(params["body_jaxpr"], state[0], [*given[first:second], *state[1]])
+
+    number, carry = jax.lax.while_loop(goes_on, once, (reads[-1], given[second:]))
+    reads.append(number)
+    return carry
 
 
 def _in_one(function: Callable[..., list[Any]], given: list[Any], reads: list[Any]) -> Any:
@@ -169,7 +227,7 @@ def _in_one(function: Callable[..., list[Any]], given: list[Any], reads: list[An
         return function(given)
     packs = [
         jnp.concatenate(
-            [reads[0].reshape(1).astype(kind), *(given[k].reshape(-1) for k in places)]
+            [reads[-1].reshape(1).astype(kind), *(given[k].reshape(-1) for k in places)]
         )
         for kind, places in kinds.items()
     ]
@@ -184,7 +242,7 @@ def _in_one(function: Callable[..., list[Any]], given: list[Any], reads: list[An
                     values[k] = jax.lax.slice(pack, (start,), (start + size,)).reshape(shape)
                     start += size
             first = [pack[:1].astype(_NUMBER) for pack in packs]
-            return function(values), functools.reduce(jnp.add, first)[0]
+            return function(values), functools.reduce(jnp.maximum, first)[0]
 
     with _found["set_xla_metadata"](**MARK):
         found, number = jax.jit(marked)(*packs)
@@ -264,7 +322,7 @@ def _is_small(equation: Any) -> bool:
     # A branch may leave an argument unused; a batched condition is a loop of its own kind.
     if name == "cond" and equation.params.get("branches_platforms") is None:
         return False
-    if name == "while" and equation.params["cond_jaxpr"].out_avals[0].shape:
+    if _is_batched(equation):
         return False
     if name == "dot_general" and _multiplications(equation) > LARGEST_PRODUCT:
         return False
@@ -277,6 +335,18 @@ def _is_small(equation: Any) -> bool:
         for jaxpr, _ in inner
         for each in jaxpr.eqns
     )
+
+
+def _is_held(loop: Any) -> bool:
+    """Whether one kernel can hold a loop."""
+    return _passes_few(loop) and _is_small(loop)
+
+
+def _is_batched(loop: Any) -> bool:
+    """Whether it is a loop whose condition has one value for each lane."""
+    if loop.primitive.name != "while":
+        return False
+    return bool(loop.params["cond_jaxpr"].out_avals[0].shape)
 
 
 def _passes_few(loop: Any) -> bool:

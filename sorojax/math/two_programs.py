@@ -28,7 +28,13 @@ Leaves = list[Any]
 Again = Callable[..., tuple[Any, ...]]
 
 
-def two_programs(function: Verb, again: Again | None = None, largest: float = math.inf) -> Verb:
+def two_programs(
+    function: Verb,
+    again: Again | None = None,
+    *,
+    kernels: bool = False,
+    largest: float = math.inf,
+) -> Verb:
     """`function` of pytrees compiled, and its derivatives as one program each.
 
     Arrays are traced, all else is static, also of what it returns. Under `jit`, `vmap` and in
@@ -38,9 +44,9 @@ def two_programs(function: Verb, again: Again | None = None, largest: float = ma
         function: Pure, and quick to run.
         again: From what a first run returned and its arguments to those of the derivative:
             the same arrays, and what is static as it is known now.
-        largest: As of `sorojax.jit`.
+        kernels, largest: As of `sorojax.jit`.
     """
-    programs = _Programs(function, again, largest)
+    programs = _Programs(function, again, kernels=kernels, largest=largest)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -93,6 +99,8 @@ class _Programs:
         self,
         function: Callable[..., Any],
         again: Again | None = None,
+        *,
+        kernels: bool = False,
         largest: float = math.inf,
     ):
         def wanted(moving: Leaves, rest: Leaves, form: Any, which: Sequence[int]) -> Leaves:
@@ -110,7 +118,7 @@ class _Programs:
 
         for part, end in ((push, "_pushed"), (pull, "_pulled")):
             part.__name__ = part.__qualname__ = function.__name__ + end
-        compiled = functools.partial(jit, kernels=False, largest=largest)
+        compiled = functools.partial(jit, kernels=kernels, largest=largest)
         self.whole, self.push, self.pull = map(compiled, (function, push, pull))
         self._again = again
 

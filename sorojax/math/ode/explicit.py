@@ -56,14 +56,11 @@ class AbstractMethod(dfx.AbstractSolver):
     def advance(self, field: Field, t: Time, y: PyTree, h: Time, memory: PyTree) -> MethodStep:
         """A step of `h` from `t`."""
 
-    def again(
-        self, field: Field, t: Time, y: PyTree, h: Time
-    ) -> tuple[PyTree, dict[str, PyTree], PyTree]:
-        """A step that was taken before, for its derivative: the state after it, what the
-        interpolation within it needs, and what it started from."""
+    def again(self, field: Field, t: Time, y: PyTree, h: Time) -> tuple[MethodStep, PyTree]:
+        """A step for the programs of derivatives, which compiles fast, and the memory that it
+        started from."""
         memory = self.begin(field, t, y, h)
-        new = self.advance(field, t, y, h, memory)
-        return new.y, new.dense, memory
+        return self.advance(field, t, y, h, memory), memory
 
     @property
     def keeps(self) -> bool:
@@ -109,6 +106,26 @@ class AbstractMethod(dfx.AbstractSolver):
         failed: dfx.RESULTS = dfx.RESULTS.nonlinear_divergence  # type: ignore[assignment]
         ended = dfx.RESULTS.where(new.converged, dfx.RESULTS.successful, failed)
         return new.y, new.error, dense, (new.memory, now), ended
+
+
+class Again(AbstractMethod):
+    """`method` by the steps that compile fast."""
+
+    method: AbstractMethod
+
+    @property
+    def num_order(self) -> int:
+        return self.method.num_order
+
+    @property
+    def interpolation_cls(self):
+        return self.method.interpolation_cls
+
+    def begin(self, field, t, y, h):
+        return self.method.begin(field, t, y, h)
+
+    def advance(self, field, t, y, h, memory):
+        return self.method.again(field, t, y, h)[0]
 
 
 def repeated(
@@ -242,8 +259,12 @@ class Tsit5(AbstractMethod):
 
     def again(self, field, t, y, h):
         new, slopes = _rolled(TSIT5, field, t, y, h, stages=len(TSIT5.rows) + 1)
+        weights = jnp.array(_TSIT5_ERROR, h.dtype)
+        error = jax.tree.map(lambda k: h * jnp.tensordot(weights, k, 1), slopes)
         shifts = jax.tree.map(lambda k: h * k, slopes)
-        return new, {"k": shifts}, jax.tree.map(lambda k: k[0], slopes)
+        first = jax.tree.map(lambda k: k[0], slopes)
+        last = jax.tree.map(lambda k: k[-1], slopes)
+        return MethodStep(new, error, last, {"k": shifts}), first
 
 
 class RungeKutta4(AbstractMethod):

@@ -37,7 +37,7 @@ class DrivenMotion(eqx.Module):
         none = jnp.zeros_like(self.twists[:1])
         slopes = jnp.diff(self.twists, axis=0) / jnp.diff(self.times)[:, None]
         slopes = jnp.concatenate([none, slopes, none])  # held before the first, after the last
-        interval = jnp.searchsorted(self.times, t, side="right")
+        interval = jnp.searchsorted(self.times, t, side="right", method="compare_all")
         at = jnp.maximum(interval - 1, 0)
         change = self.twists[at], slopes[interval]
         return _after(self.poses[at], *change, t - self.times[at], self.moving)

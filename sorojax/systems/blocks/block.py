@@ -427,7 +427,8 @@ class Waypoints(AbstractReference):
 
 def _between(times: Array, values: Array, t: Float[Array, ""], smooth: bool) -> Array:
     """Values at `t` on the way from waypoint to waypoint."""
-    after = jnp.clip(jnp.searchsorted(times, t, side="right"), 1, times.shape[0] - 1)
+    passed = jnp.searchsorted(times, t, side="right", method="compare_all")
+    after = jnp.clip(passed, 1, times.shape[0] - 1)
     start, length = times[after - 1], times[after] - times[after - 1]
     share = (t - start) / jnp.where(length > 0, length, jnp.ones_like(length))
     share = jnp.where(length > 0, jnp.clip(share, 0, 1), jnp.ones_like(share))

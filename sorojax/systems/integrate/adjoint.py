@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
 from sorojax._jax import diffrax_checks
-from sorojax.math.ode.explicit import AbstractMethod
+from sorojax.math.ode.explicit import AbstractMethod, Again
 
 _CHECKPOINTS = 4096  # at most
 
@@ -134,7 +134,10 @@ def _forward(perturbed, moving, plan):
     ends = dfx.SubSaveAt(t0=True, steps=1, fn=lambda t, y, args: jnp.zeros(()))
     states = dfx.SubSaveAt(t0=True, steps=every)
     # plain loops, whose forward derivative makes second derivatives
-    plain = eqx.tree_at(lambda p: p.adjoint, plan, dfx.ForwardMode(), is_leaf=_is_none)
+    quick: Any = Again(plan.solver)  # type: ignore[arg-type]
+    plain = eqx.tree_at(
+        lambda p: (p.adjoint, p.solver), plan, (dfx.ForwardMode(), quick), is_leaf=_is_none
+    )
     solution = _solution(moving, plain, ends, states)
     assert solution.ys is not None and solution.ts is not None
     run = _run(solution, plan)
@@ -195,19 +198,22 @@ class _Replay(NamedTuple):
 
     def part(self, number, every: int, kept, pulled: _Pulled) -> _Pulled:
         """Back through the steps from one kept state to the next."""
-        steps = number * every + jnp.arange(every, dtype=jnp.int32)
+        first = number * every
+        if every == 1:
+            return self._pull(first, kept[first], pulled)
+        steps = jnp.minimum(every, self.count - first)
 
-        def forward(y, k):
-            again = lambda: self._step(self.wanted, k, y)[0]  # noqa: E731
-            return jax.lax.cond(k < self.count, again, lambda: y), y
+        def forward(k, states):
+            again = self._step(self.wanted, first + k, states[k])[0]
+            return jax.lax.dynamic_update_index_in_dim(states, again, k + 1, 0)
 
-        def back(pulled, step):
-            k, y = step
-            pull = lambda: self._pull(k, y, pulled)  # noqa: E731
-            return jax.lax.cond(k < self.count, pull, lambda: pulled), None
+        def back(k, pulled):
+            k = steps - 1 - k
+            return self._pull(first + k, states[k], pulled)
 
-        states = jax.lax.scan(forward, kept[number], steps)[1]
-        return jax.lax.scan(back, pulled, (steps, states), reverse=True)[0]
+        states = jnp.zeros((every, *kept.shape[1:]), kept.dtype).at[0].set(kept[number])
+        states = jax.lax.fori_loop(0, steps - 1, forward, states)
+        return jax.lax.fori_loop(0, steps, back, pulled)
 
     def _step(self, wanted, k, y):
         """State after step `k` from `y`, what its interpolation needs, and what it started
@@ -215,7 +221,8 @@ class _Replay(NamedTuple):
         args = (eqx.combine(wanted, self.held), *self.plan.watched)
         t, h = self.times[k], self.times[k + 1] - self.times[k]
         method: Any = self.plan.solver
-        return method.again(lambda t, y: self.plan.field(t, y, args), t, y, h)
+        step, memory = method.again(lambda t, y: self.plan.field(t, y, args), t, y, h)
+        return step.y, step.dense, memory
 
     def _pull(self, k, y, pulled: _Pulled) -> _Pulled:
         (new, dense, memory), pull = jax.vjp(lambda c, y: self._step(c, k, y), self.wanted, y)
@@ -254,6 +261,7 @@ class _Replay(NamedTuple):
             _, pull = jax.vjp(at, t, ends)
             slope, found = pull(jnp.where(reached, change, 0.0))
             sums = jax.tree.map(jnp.add, sums, found)
-            return sums, time.at[instant].add(slope), instant - 1
+            time = jax.lax.dynamic_update_index_in_dim(time, slope, instant, 0)
+            return sums, time, instant - 1
 
         return jax.lax.while_loop(inside, one, (zeros, pulled.time, pulled.instant))

@@ -246,7 +246,7 @@ def _run_again(film: Trajectory, *args: Any) -> tuple[Any, ...]:
     return *others, watch, options | {"max_steps": most, "progress": False}
 
 
-_adaptive = two_programs(_run_adaptive, _run_again, LARGEST_GIVEN)
+_adaptive = two_programs(_run_adaptive, _run_again, kernels=True, largest=LARGEST_GIVEN)
 
 
 @eqx.filter_jit
