@@ -10,6 +10,9 @@ Reference:
     Featherstone, Rigid Body Dynamics Algorithms, 2008, chapter 8.
 """
 
+import functools
+import itertools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -26,11 +29,13 @@ from sorojax.rod.dynamics.tree import (
     Section,
     bias_accelerations,
     bias_rates,
+    each,
     gather,
     in_own_frames,
 )
 from sorojax.rod.model.assembly import closure_ends, slices
 from sorojax.rod.model.closure import Closure, equations
+from sorojax.rod.model.joint import AbstractJoint, Group
 
 
 class _End(NamedTuple):
@@ -53,14 +58,22 @@ class _End(NamedTuple):
     rows: Float[Array, "1 quad"] | None = None
 
 
+class _Seen(NamedTuple):
+    """The frame that a closure holds as its joint frame sees it, and how that is turned."""
+
+    joint: AbstractJoint
+    rotation: Float[Array, "dim dim"]
+    position: Float[Array, " dim"]
+    turn: Float[Array, "dim dim"]
+
+
 class _Pair(NamedTuple):
-    """The two ends of a closure, and the frame that is held as the joint frame sees it."""
+    """The two ends of a closure, and the one as the other sees it."""
 
     closure: Closure
     held: _End
     holder: _End
-    rotation: Float[Array, "dim dim"]
-    position: Float[Array, " dim"]
+    seen: _Seen
 
 
 class Change(NamedTuple):
@@ -76,7 +89,7 @@ def violations(moment: AssemblyState, t: Float[Array, ""]) -> Float[Array, " equ
     """g(q, t) of all closures [rad], [m]: zero where the loops are closed."""
     group, pairs = moment.assembly.group, _pairs(moment, t)
     return jnp.concatenate(
-        [p.closure.joint.violation(group, p.rotation, p.position) for p in pairs]
+        [p.seen.joint.violation(group, p.seen.rotation, p.seen.position) for p in pairs]
     )
 
 
@@ -103,10 +116,10 @@ def closure_loads(
     """The same on each part, in its own columns; None without a closure."""
     loads: list[Array | None] = [None] * len(moment.frames)
     pairs = _pairs(moment, t)
-    for pair, wrench in zip(pairs, _wrenches(moment, pairs, reactions), strict=True):
-        for index, load in _pulled(pair, wrench[None]):
-            before = loads[index]
-            loads[index] = load[0] if before is None else before + load[0]
+    wrenches = [wrench[None] for wrench in _wrenches(moment, pairs, reactions)]
+    for index, load in itertools.chain(*_pulled(pairs, wrenches)):
+        before = loads[index]
+        loads[index] = load[0] if before is None else before + load[0]
     return loads
 
 
@@ -114,13 +127,24 @@ def closure_jacobian(
     moment: AssemblyState, t: Float[Array, ""]
 ) -> Float[Array, "equations dof"]:
     """G: rates of the violations per rate of the assembly."""
-    rows = []
-    for pair in _pairs(moment, t):
-        loads: list[Array | None] = [None] * len(moment.frames)
-        for index, load in _pulled(pair, _unit_wrenches(moment, pair)):
-            before = loads[index]
-            loads[index] = load if before is None else before + load
-        rows.append(gather(moment, loads))
+    pairs = _pairs(moment, t)
+    group = moment.assembly.group
+    units = each(
+        functools.partial(_unit_wrenches, group), [p.seen for p in pairs], at_once=True
+    )
+    pieces: list[dict[int, Array]] = [{} for _ in moment.frames]
+    for k, loads in enumerate(_pulled(pairs, units)):
+        for index, load in loads:
+            pieces[index][k] = pieces[index][k] + load if k in pieces[index] else load
+    return gather(moment, [_stacked(piece, units) for piece in pieces])
+
+
+def _stacked(piece: dict[int, Array], units: list[Array]) -> Array | None:
+    """Rows of all closures in the columns of one part: zero of those that are not on it."""
+    if not piece:
+        return None
+    own, dtype = next((x.shape[1], x.dtype) for x in piece.values())
+    rows = [piece.get(k, jnp.zeros((x.shape[0], own), dtype)) for k, x in enumerate(units)]
     return jnp.concatenate(rows)
 
 
@@ -137,12 +161,12 @@ def closure_wrenches(
 def closure_change(moment: AssemblyState, t: Float[Array, ""]) -> Change:
     """The violations g, dg/dt = G v + g_t, and d^2 g/dt^2 - G dv/dt, by the second order in
     time of the poses of both ends."""
-    biases, parts = _section_biases(moment), []
+    biases, rows = _section_biases(moment), []
     for pair in _pairs(moment, t):
         rates = [_rates(moment, end, biases) for end in (pair.held, pair.holder)]
-        assert rates[0] is not None
-        later = _relative(pair, rates[0], rates[1], t)
-        parts.append(_second_order(moment, pair, t, later))
+        apart = pair.held.position - pair.holder.position
+        rows.append((pair.seen, pair.closure.motion, apart, *rates, t))
+    parts = each(functools.partial(_second_order, moment.assembly.group), rows, at_once=True)
     return Change(*(jnp.concatenate(column) for column in zip(*parts, strict=True)))
 
 
@@ -225,14 +249,14 @@ def _section_biases(moment: AssemblyState) -> list:
     return list(zip(bias_accelerations(moment), along, strict=True))
 
 
-def _relative(pair: _Pair, held: _Rates, holder: _Rates | None, t: Array) -> Any:
-    """The violation of a closure after a short time, exact to the second order."""
-    rotation, position = pair.rotation, pair.position
-    turn, spin, turning = pair.holder.rotation.T, held.spin, held.turning
+def _relative(seen: _Seen, apart: Array, held: _Rates, holder: _Rates | None) -> Any:
+    """The frame that is held, seen by the joint frame after a short time, exact to the second
+    order."""
+    rotation, position = seen.rotation, seen.position
+    turn, spin, turning = seen.turn.T, held.spin, held.turning
     velocity, acceleration = held.velocity, held.acceleration
     if holder is not None:
         # seen from a frame that turns itself
-        apart = pair.held.position - pair.holder.position
         velocity, acceleration = velocity - holder.velocity, acceleration - holder.acceleration
         spin = spin - holder.spin
         swept = _cross(holder.spin, apart)
@@ -257,23 +281,25 @@ def _relative(pair: _Pair, held: _Rates, holder: _Rates | None, t: Array) -> Any
     return later
 
 
-def _second_order(moment: AssemblyState, pair: _Pair, t: Array, later) -> Change:
-    group, closure = moment.assembly.group, pair.closure
+def _second_order(
+    group: Group, seen: _Seen, motion: Any, apart: Array, held: _Rates, holder: Any, t: Array
+) -> Change:
+    later, dtype = _relative(seen, apart, held, holder), seen.position.dtype
 
     def violation(x):
         rotation, position = later(x)
-        if closure.motion is not None:
+        if motion is not None:
             # `later` sees the joint frame as it stands at t
-            now, moved = (_pose(closure, at, moment.q.dtype) for at in (t, t + x))
+            now, moved = (_pose(motion, at, dtype) for at in (t, t + x))
             turn = moved[:-1, :-1].T @ now[:-1, :-1]
             position = turn @ position + moved[:-1, :-1].T @ (now[:-1, -1] - moved[:-1, -1])
             rotation = turn @ rotation
-        return closure.joint.violation(group, rotation, position)
+        return seen.joint.violation(group, rotation, position)
 
     def rate(x):
         return jax.jvp(violation, (x,), (jnp.ones_like(x),))
 
-    zero = jnp.zeros((), moment.q.dtype)
+    zero = jnp.zeros((), dtype)
     (value, first), (_, second) = jax.jvp(rate, (zero,), (jnp.ones_like(zero),))
     return Change(value, first, second)
 
@@ -293,10 +319,10 @@ def _pairs(moment: AssemblyState, t: Float[Array, ""]) -> list[_Pair]:
     for closure in moment.assembly.closures:
         held, holder = next(ends), next(ends)
         if closure.motion is not None:
-            holder = _beyond(holder, _pose(closure, t, moment.q.dtype))
-        turn = holder.rotation.T
-        rotation, position = turned_pose(turn, held.rotation, held.position - holder.position)
-        found.append(_Pair(closure, held, holder, rotation, position))
+            holder = _beyond(holder, _pose(closure.motion, t, moment.q.dtype))
+        apart = held.position - holder.position
+        seen = turned_pose(holder.rotation.T, held.rotation, apart)
+        found.append(_Pair(closure, held, holder, _Seen(closure.joint, *seen, holder.rotation)))
     return found
 
 
@@ -323,10 +349,9 @@ def _in_world(moment: AssemblyState, index: int | None, section: Section) -> _En
     return _End(rotation, centre, index, rotation, centre, jacobian)
 
 
-def _pose(closure: Closure, t: Array, dtype: Any) -> Float[Array, "h h"]:
+def _pose(motion: Callable[[Array], Array], t: Array, dtype: Any) -> Float[Array, "h h"]:
     """Where the motion of a closure has its joint."""
-    assert closure.motion is not None
-    moved = closure.motion(t).astype(dtype)
+    moved = motion(t).astype(dtype)
     if moved.ndim == 2:
         return moved
     return homogeneous(jnp.asarray(np.eye(moved.shape[0]), dtype), moved)
@@ -340,48 +365,60 @@ def _beyond(end: _End, pose: Float[Array, "h h"]) -> _End:
 
 def _wrenches(moment: AssemblyState, pairs: list[_Pair], reactions: Array) -> list[Array]:
     """Of each closure on the frame that is held, along world axes."""
-    found = []
-    for pair, at in zip(pairs, equations(moment.assembly), strict=True):
-        _, pull = jax.vjp(_violation_after(moment, pair), _still(moment))
-        found.append(_along_world(pair, pull(reactions[at])[0][None])[0])
-    return found
-
-
-def _unit_wrenches(moment: AssemblyState, pair: _Pair) -> Float[Array, "held twist"]:
-    """Those of reactions of one, along world axes."""
-    return _along_world(pair, jax.jacrev(_violation_after(moment, pair))(_still(moment)))
-
-
-def _along_world(pair: _Pair, wrenches: Float[Array, "n twist"]) -> Float[Array, "n twist"]:
-    turn = pair.holder.rotation
-    return turned_twists(turn, wrenches.T, wrenches.shape[1] - turn.shape[0]).T
-
-
-def _still(moment: AssemblyState) -> Float[Array, " twist"]:
-    return jnp.zeros(moment.assembly.group.algebra_dim, moment.q.dtype)
-
-
-def _violation_after(moment: AssemblyState, pair: _Pair):
-    """The violation as a function of a small relative twist."""
     group = moment.assembly.group
+
+    def one(seen: _Seen, reaction: Array) -> Array:
+        _, pull = jax.vjp(_violation_after(group, seen), _still(group, reaction.dtype))
+        return _along_world(seen, pull(reaction)[0][None])[0]
+
+    ends = zip(pairs, equations(moment.assembly), strict=True)
+    return each(one, [(pair.seen, reactions[at]) for pair, at in ends], at_once=True)
+
+
+def _unit_wrenches(group: Group, *seen: Any) -> Float[Array, "held twist"]:
+    """Those of reactions of one, along world axes."""
+    at = _Seen(*seen)
+    still = _still(group, at.position.dtype)
+    return _along_world(at, jax.jacrev(_violation_after(group, at))(still))
+
+
+def _along_world(seen: _Seen, wrenches: Float[Array, "n twist"]) -> Float[Array, "n twist"]:
+    return turned_twists(seen.turn, wrenches.T, wrenches.shape[1] - seen.turn.shape[0]).T
+
+
+def _still(group: Group, dtype: Any) -> Float[Array, " twist"]:
+    return jnp.zeros(group.algebra_dim, dtype)
+
+
+def _violation_after(group: Group, seen: _Seen):
+    """The violation as a function of a small relative twist."""
     rot = group.rotation_dim
 
     def after(twist):
-        turned = pair.rotation + _spun(twist[:rot], pair.rotation)
-        return pair.closure.joint.violation(group, turned, pair.position + twist[rot:])
+        turned = seen.rotation + _spun(twist[:rot], seen.rotation)
+        return seen.joint.violation(group, turned, seen.position + twist[rot:])
 
     return after
 
 
 def _pulled(
-    pair: _Pair, wrenches: Float[Array, "n twist"]
-) -> list[tuple[int, Float[Array, "n own"]]]:
-    """Generalised forces, in the columns of its part, on each end that is not on the ground:
-    of wrenches on the frame that is held, along world axes, and their opposites."""
-    found, point = [], pair.held.position
-    for end, sign in ((pair.held, 1), (pair.holder, -1)):
-        if end.index is not None and end.jacobian is not None:
-            moment, force = wrenches[:, : -point.shape[0]], wrenches[:, -point.shape[0] :]
-            moment = moment + moment_of((point - end.centre)[None], force)
-            found.append((end.index, sign * jnp.concatenate([moment, force], 1) @ end.jacobian))
+    pairs: list[_Pair], wrenches: list[Float[Array, "n twist"]]
+) -> list[list[tuple[int, Float[Array, "n own"]]]]:
+    """Generalised forces, in the columns of its part, on each end that is not on the ground,
+    of each closure: of wrenches on the frame that is held, along world axes, and their
+    opposites."""
+    places, rows = [], []
+    for k, (pair, wrench) in enumerate(zip(pairs, wrenches, strict=True)):
+        for end, push in ((pair.held, wrench), (pair.holder, -wrench)):
+            if end.index is not None and end.jacobian is not None:
+                places.append((k, end.index))
+                rows.append((push, pair.held.position - end.centre, end.jacobian))
+
+    def force(wrench: Array, arm: Array, jacobian: Array) -> Array:
+        moment, force = wrench[:, : -arm.shape[0]], wrench[:, -arm.shape[0] :]
+        return jnp.concatenate([moment + moment_of(arm[None], force), force], 1) @ jacobian
+
+    found: list[list[tuple[int, Array]]] = [[] for _ in pairs]
+    for (k, index), load in zip(places, each(force, rows, at_once=True), strict=True):
+        found[k].append((index, load))
     return found

@@ -371,11 +371,14 @@ def _mount(
     return Mount(carried, axes, turn, along, arm, angular), centre
 
 
-# Rows of equal structure worked on one after the other: a program holds the work once
+# Rows of equal structure worked on together: a program holds the work once
 
 
-def each(function: Callable[..., Any], rows: Sequence[tuple[Any, ...]]) -> list[Any]:
-    """`[function(*row) for row in rows]`; rows that differ in numbers alone share a loop."""
+def each(
+    function: Callable[..., Any], rows: Sequence[tuple[Any, ...]], at_once: bool = False
+) -> list[Any]:
+    """`[function(*row) for row in rows]`; rows that differ in numbers alone share a loop, or
+    are worked on `at_once`."""
     groups: dict[Any, list[int]] = {}
     parted = [eqx.partition(row, eqx.is_array) for row in rows]
     for place, (arrays, rest) in enumerate(parted):
@@ -390,7 +393,8 @@ def each(function: Callable[..., Any], rows: Sequence[tuple[Any, ...]]) -> list[
             continue
         rest = parted[places[0]][1]
         stacked = jax.tree.map(lambda *x: jnp.stack(x), *(parted[k][0] for k in places))
-        answers = jax.lax.map(lambda row, rest=rest: function(*eqx.combine(row, rest)), stacked)
+        one = lambda row, rest=rest: function(*eqx.combine(row, rest))  # noqa: E731
+        answers = jax.vmap(one)(stacked) if at_once else jax.lax.map(one, stacked)
         for nth, place in enumerate(places):
             found[place] = jax.tree.map(lambda leaf, nth=nth: leaf[nth], answers)
     return found
