@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import fem, material, mesh, sdf, systems
+from sorojax import fem, io, material, mesh, sdf, systems
 from sorojax.systems.blocks.modal_body import ProjectedForce
 from sorojax.systems.blocks.sampled_force import (
     _equilibria,
@@ -184,3 +184,21 @@ def test_an_equilibrium_that_is_not_found_is_an_infinite_error():
     lost = eqx.tree_at(lambda b: b.force.volumes, body, jnp.nan * body.force.volumes)  # pyright: ignore
     _, told, _ = _equilibria(beam(), [{"push": PUSH[:2]}])
     assert float(_error(beam(), lost, told)) == np.inf
+
+
+def test_a_stored_one_is_the_same_body(tmp_path):
+    """Read from a file alone, with no tree of its structure beside."""
+    file = tmp_path / "small.npz"
+    io.save(file, trained())
+    again = io.load(file)
+    assert repr(again) == repr(trained())
+    push = systems.Source(systems.Constant([0.0, -0.1]), unit="N")
+    films = [
+        systems.simulate(
+            systems.Network({"body": each.body, "push": push}, {"body.push": "push.value"}),
+            0.01, save=3, step=1e-3, solver=systems.Rosenbrock2(refresh=True),
+        )
+        for each in (trained(), again)
+    ]  # fmt: skip
+    np.testing.assert_array_equal(films[1]["body.q"], films[0]["body.q"])
+    assert np.any(np.asarray(films[0]["body.q"][-1]) != 0)

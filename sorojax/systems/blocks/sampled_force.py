@@ -267,8 +267,7 @@ def sampled_body(
     free = [coordinates(body, basis, u) for u in shown]
     near: list = [(q, None, 0) for q in free]
     for q, state in zip(known, seen, strict=True):
-        slope = jax.jacfwd(lambda q, state=state: _accelerated(whole, q, state.inputs))(q)
-        near.append((q, -slope, states))
+        near.append((q, -_slope(whole, state.inputs, q), states))
     spread = _AROUND * jnp.std(jnp.stack([*known, *free]), axis=0)
     cells, weights, left = _chosen(every, near, spread, tolerance, seed)
     chosen = sampled_force(body, basis, cells, weights)
@@ -465,11 +464,17 @@ def _accelerated(body: ModalBody, q: Modes, values: Mapping[str, Array]) -> Mode
 
 
 @jax.jit
+def _slope(body: ModalBody, values: Mapping[str, Array], q: Modes):
+    """Derivative of the acceleration from rest by the coordinates: one program for all."""
+    return jax.jacfwd(lambda q: _accelerated(body, q, values))(q)
+
+
+@jax.jit
 def _equilibrium(body: ModalBody, values: Mapping[str, Array], start: Modes) -> Modes:
     """Coordinates at rest, by Newton's method."""
 
     def closer(q, _):
-        slope = jax.jacfwd(lambda q: _accelerated(body, q, values))(q)
+        slope = _slope(body, values, q)
         return q - jnp.linalg.solve(slope, _accelerated(body, q, values)), None
 
     return jax.lax.scan(closer, start, length=_PASSES)[0]
