@@ -168,7 +168,7 @@ def helmholtz_filter(
     system = sparse.from_cells(int(number.max()) + 1, cells)
     return HelmholtzFilter(
         system,
-        sparse.assemble(system, jnp.asarray(matrix)),
+        jnp.asarray(sparse.assembled_on_host(system, matrix)),
         jnp.asarray(cells, jnp.int32),
         jnp.asarray(np.einsum("qa,cq->ca", N, volume)),
     )

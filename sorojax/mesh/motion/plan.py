@@ -44,9 +44,11 @@ def harmonic(cells: np.ndarray, stiffness: np.ndarray, held: np.ndarray) -> Harm
     if fixed.all():
         return None
     system = sparse.from_cells(len(nodes), number)
-    mask = jnp.asarray(fixed)
-    values, fixed_values = _assembled(system, jnp.asarray(stiffness), mask)
-    return Harmonic(system, values, fixed_values, mask, nodes)
+    values = sparse.assembled_on_host(system, stiffness)
+    held_values = sparse.fixed_on_host(system, values, fixed)
+    return Harmonic(
+        system, jnp.asarray(values), jnp.asarray(held_values), jnp.asarray(fixed), nodes
+    )
 
 
 def _adrift(cells: np.ndarray, held: np.ndarray) -> np.ndarray:
@@ -54,12 +56,6 @@ def _adrift(cells: np.ndarray, held: np.ndarray) -> np.ndarray:
     first = np.repeat(cells[:, :1], cells.shape[1] - 1, axis=1).ravel()
     label = connected(len(held), first, cells[:, 1:].ravel())
     return ~np.isin(label, label[held])
-
-
-@eqx.filter_jit
-def _assembled(system, stiffness, held):
-    values = sparse.assemble(system, stiffness)
-    return values, sparse.fix(system, values, held)
 
 
 def spread(
