@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from sorojax import fem, io, material, mesh, sdf, systems
+from sorojax.math.status import Status
 from sorojax.systems.blocks.modal_body import ProjectedForce
 from sorojax.systems.blocks.sampled_force import (
     _equilibria,
@@ -91,6 +92,22 @@ def test_it_follows_the_full_body_in_a_network():
     basis = trained().body.basis
     got = jax.vmap(lambda q: systems.displacement(basis, q))(films[1].state["body"]["q"])
     assert jnp.max(jnp.abs(got - want)) < 0.02 * jnp.max(jnp.abs(want))
+
+
+@pytest.mark.parametrize(
+    ("most", "ends"), [(0.12, Status.successful), (0.6, Status.outside_model)]
+)
+def test_a_motion_far_outside_of_the_training_is_named(most, ends):
+    """Pushed to 0.2 N in training."""
+    rise = systems.Sine([0.0, -most], 5.0)  # to its largest at 0.05 s
+    network = systems.Network(
+        {"body": trained().body, "push": systems.Source(rise, unit="N")},
+        {"body.push": "push.value"},
+    )
+    solver = systems.Rosenbrock2(refresh=True)
+    film = systems.simulate(network, 0.05, save=6, step=1e-3, solver=solver, throw=False)
+    assert film.status == ends
+    assert (float(jnp.max(film["body.reach"])) > 1.25) == (ends == Status.outside_model)
 
 
 def test_the_derivative_by_the_stiffness_is_that_of_differences():

@@ -31,8 +31,9 @@ class Status(eqx.Enumeration):
         "load, raise it in steps, or check units and signs."
     )
     outside_model = (
-        "A state left what its model describes: gas below vacuum, or a rod stretched more than "
-        "tenfold. Check units and limits, or take shorter steps."
+        "A state left what its model describes: gas below vacuum, a rod stretched more than "
+        "tenfold, or a trained body strained far beyond its training. Check units and limits, "
+        "take shorter steps, or train with larger inputs."
     )
     unresolved = (
         "Nodes or steps are too coarse: with twice as many nodes a rod would end elsewhere, or "

@@ -24,12 +24,15 @@ from sorojax.fem.loads.loads import has_masses
 from sorojax.fem.problem import load_force, potential_energy, residual
 from sorojax.material import Viscoelastic
 from sorojax.math.linalg.sparse import SparseSymmetric, product
+from sorojax.math.status import Status
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output
 from sorojax.systems.blocks.driven import port_of, with_values
 from sorojax.systems.blocks.fem_body import FemBody, damping_force
 
 #: Shapes of which less than this share is new are left out.
 _NEW = 1e-6
+#: Reach beyond which a trained force is not to be trusted: at 1.2 it is off by some 7 %.
+_FARTHEST = 1.25
 
 
 class Basis(eqx.Module):
@@ -196,6 +199,15 @@ class AbstractModalForce(eqx.Module):
     def energy(self, q: Modes) -> Float[Array, ""]:
         """Energy [J] above that at q = 0."""
 
+    @property
+    def is_trained(self) -> bool:
+        """Whether it holds only as far as a training went."""
+        return False
+
+    def reach(self, q: Modes) -> Float[Array, ""]:
+        """Strain over the largest of the training; 0 without one."""
+        return jnp.zeros_like(q[0])
+
 
 class TaylorForce(AbstractModalForce):
     """The force as a polynomial: a few small products, whatever the mesh."""
@@ -229,7 +241,8 @@ class ProjectedForce(AbstractModalForce):
 class ModalBody(AbstractBlock):
     """A body that moves in the shapes of a basis; made by `modal_body`. The state is {q, v}.
 
-    Ports are those of the `FemBody` that it stands for, and `q`. Some tens of states of
+    Ports are those of the `FemBody` that it stands for, and `q`; of a trained body also
+    `reach`, the strain over the largest of its training. Some tens of states of
     moderate stiffness: `Rosenbrock2()` or `Rodas4()` step it.
 
     Attributes:
@@ -272,7 +285,17 @@ class ModalBody(AbstractBlock):
         ports |= {f"{name}_position": Output("m", (dim,)) for name in self.markers}
         if self.energies:
             ports |= {"kinetic_energy": Output("J"), "elastic_energy": Output("J")}
+        if self.force.is_trained:
+            ports |= {"reach": Output(None)}
         return ports
+
+    def path_status(self, path):
+        if not self.force.is_trained:
+            return None
+        reach = jax.vmap(self.force.reach)(jax.lax.stop_gradient(path["q"]))
+        return Status.where(
+            jnp.all(reach <= _FARTHEST), Status.successful, Status.outside_model
+        )
 
     def initial_state(self):
         return {"q": self.q, "v": self.v}
@@ -285,6 +308,8 @@ class ModalBody(AbstractBlock):
             return v @ v / 2
         if name == "elastic_energy":
             return self.force.energy(q)
+        if name == "reach":
+            return self.force.reach(q)
         for load, value, rate in self.volumes:
             if name == value:
                 return self.works[load](q)[0]

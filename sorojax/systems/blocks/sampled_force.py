@@ -11,6 +11,7 @@ Reference:
     element dynamic models, Int. J. Num. Meth. Eng. 102, 2015.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -60,6 +61,7 @@ class SampledForce(AbstractModalForce):
         slopes: Their derivatives by the modal coordinates [1/m].
         volumes: Of the quadrature points, times the weight of their cell [m^3].
         loads: Force of the loads that are not driven.
+        trained: Largest change of an entry of F that the training has seen; None without one.
     """
 
     body: Body
@@ -67,6 +69,19 @@ class SampledForce(AbstractModalForce):
     slopes: Float[Array, "entries quad cells modes"]
     volumes: Float[Array, "quad cells"]
     loads: Polynomial
+    trained: Float[Array, ""] | None = None
+
+    @property
+    def is_trained(self):
+        return self.trained is not None
+
+    def reach(self, q):
+        assert self.trained is not None
+        return self.strain(q) / self.trained
+
+    def strain(self, q: Modes) -> Float[Array, ""]:
+        """Largest change of an entry of F from q = 0."""
+        return jnp.max(jnp.abs(self.slopes @ q))
 
     def __call__(self, q):
         return _of_cells(self, q) - self.loads(q)
@@ -175,7 +190,7 @@ class SampledBody(eqx.Module):
     """A trained reduction: `sampled_body(body, paths)`.
 
     Attributes:
-        body: The reduced body, a block with the ports of the full one.
+        body: The reduced body, a block with the ports of the full one and `reach`.
         cells: Those that its force comes from.
         weights: How many cells each stands for.
         training_error: Of the force and its slopes in the states of training, relative, each
@@ -241,6 +256,9 @@ def sampled_body(
         ValueError: If there are too few equilibria for the shapes, a path names no driven
             load, a body is in contact, or `modal_body` refuses it.
 
+    Its output `reach` is the largest strain in the chosen cells over that of the training. A
+    run in which it passes 1.25 ends as `Status.outside_model`.
+
     Example:
         >>> bar = mesh.rectangle([0, 0], [80 * mm, 10 * mm], divisions=(12, 2))
         >>> rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.4, density=1000)
@@ -271,6 +289,9 @@ def sampled_body(
     spread = _AROUND * jnp.std(jnp.stack([*known, *free]), axis=0)
     cells, weights, left = _chosen(every, near, spread, tolerance, seed)
     chosen = sampled_force(body, basis, cells, weights)
+    known += [coordinates(body, basis, s.u) for s in told]
+    trained = jnp.max(jax.vmap(chosen.strain)(jnp.stack([*known, *free])))
+    chosen = dataclasses.replace(chosen, trained=trained)
     small = eqx.tree_at(lambda b: b.force, whole, chosen)
     error = _error(body, small, told)
     report("sampled_body: cells", 1, 1)
