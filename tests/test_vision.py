@@ -204,6 +204,21 @@ def test_pixels_and_points():
 
 
 @pytest.mark.stress(54)
+def test_rays_end_on_a_plane_before_the_camera():
+    lens = Camera(610.0, 605.0, 320.0, 240.0, (0.1, -0.05, 1e-3, -2e-3, 0.01))
+    turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
+    turn = np.diag([1.0, -1.0, -1.0]) @ (np.eye(3) + 0.1 * (turn - turn.T))
+    plane = Pose(np.linalg.qr(turn)[0], np.array([0.02, -0.01, 0.6]))
+    places = np.random.default_rng(1).uniform(-0.1, 0.1, (50, 2))
+    seen = plane.apply(np.concatenate([places, np.full((50, 1), 0.02)], axis=1))
+    found = vision.on_plane(lens, vision.project(lens, seen), plane, height=0.02)
+    np.testing.assert_allclose(found, places, atol=1e-12)
+    behind = Pose(plane.rotation, -plane.translation)
+    along = Pose(np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([0.1, 0.0, 0.0]))
+    for other in (behind, along):
+        assert np.all(np.isnan(vision.on_plane(lens, np.array([[320.0, 240.0]]), other)))
+
+
 def test_depth_of_a_marker_ignores_holes():
     depth = np.full((20, 30), 0.8)
     depth[8:11, 10:13] = 0.0

@@ -7,6 +7,7 @@ from sorojax.vision.camera import (
     deproject,
     depth_at,
     load_camera,
+    on_plane,
     project,
     save_camera,
 )
@@ -71,6 +72,7 @@ __all__ = [
     "load_camera",
     "marker_corners",
     "marker_pose",
+    "on_plane",
     "photograph",
     "project",
     "refine_discs",

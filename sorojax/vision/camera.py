@@ -112,6 +112,37 @@ def rays(camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray,
     return plane
 
 
+def on_plane(
+    camera: Camera, pixels: Float[np.ndarray, "*n 2"], plane: Pose, height: float = 0.0
+) -> Float[np.ndarray, "*n 2"]:
+    """Where the rays of pixels meet a plane: places of markers that one colour camera sees.
+
+    Args:
+        camera: Its calibration.
+        pixels: Column and row [px].
+        plane: Frame whose x and y lie in the plane, as the camera sees it: from `world_frame`
+            or `marker_pose`.
+        height: Of the markers over the plane, along its z axis [m].
+
+    Returns:
+        x and y in the frame of the plane [m]; NaN where a ray does not meet it before the
+        camera.
+
+    Example:
+        >>> lens = vision.Camera(fx=600, fy=600, cx=320, cy=240)
+        >>> wall = vision.Pose(np.eye(3), np.array([0.0, 0.0, 0.5]))  # half a metre away
+        >>> pixels = vision.project(lens, wall.apply(np.array([[0.02, 0.03, 0.0]])))
+        >>> vision.on_plane(lens, pixels, wall).round(6)
+        array([[0.02, 0.03]])
+    """
+    ways = deproject(camera, pixels, np.ones(np.shape(pixels)[:-1])) @ plane.rotation
+    eye = plane.inverse().translation
+    gap = np.broadcast_to(height - eye[2], ways[..., 2].shape)
+    depth = np.divide(gap, ways[..., 2], where=ways[..., 2] != 0, out=np.zeros(gap.shape))
+    depth = np.where(depth > 0, depth, np.nan)
+    return eye[:2] + ways[..., :2] * depth[..., None]
+
+
 def depth_at(
     depth: Float[np.ndarray, "height width"], pixels: Float[np.ndarray, "n 2"], reach: int = 2
 ) -> Float[np.ndarray, " n"]:
