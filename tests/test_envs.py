@@ -13,7 +13,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-from sorojax import envs
+from sorojax import envs, io
 from sorojax.envs.core import BOUND
 from sorojax.envs.supply_line import LATE_STEPS, begun, sent
 
@@ -126,6 +126,16 @@ def test_same_key_same_result(env, getkey):
     assert same_bits(stepped(env, *given), stepped(env, *given))
     other = started(env, keys[::-1], params)[1]
     assert not np.array_equal(other, observations)
+
+
+@pytest.mark.parametrize("env", TASKS)
+def test_stored_states_and_numbers_go_on_to_the_same_bits(env, tmp_path, getkey):
+    keys, states, actions, params = members(env, getkey())[0]
+    io.save(tmp_path / "batch.npz", (env, states, params))
+    again, states_again, params_again = io.load(tmp_path / "batch.npz")
+    assert again == env
+    want = stepped(env, keys, states, actions, params)
+    assert same_bits(stepped(again, keys, states_again, actions, params_again), want)
 
 
 def test_the_pressures_of_the_goal_hold_the_tip_there(getkey):

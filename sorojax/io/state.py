@@ -98,9 +98,10 @@ def _array_of(data: bytes) -> np.ndarray:
 
 
 _PACKAGES = (
-    "contact", "coupling", "design", "fem", "material", "math", "mesh", "reduction", "robots",
-    "rod", "sdf", "systems",
+    "contact", "coupling", "design", "envs", "fem", "material", "math", "mesh", "reduction",
+    "robots", "rod", "sdf", "systems",
 )  # fmt: skip
+_FOREIGN = ("sorojax.envs.gym_adapter",)  # needs a package that need not be there; no data
 _PLAIN = (type(None), bool, int, float, str)
 
 
@@ -196,7 +197,8 @@ def _data_classes(package: str) -> dict[str, type]:
     walked = pkgutil.walk_packages(home.__path__, f"{home.__name__}.")
     named: dict[str, list[type]] = {}
     found = {}
-    for module in (importlib.import_module(entry.name) for entry in walked):
+    modules = [entry.name for entry in walked if entry.name not in _FOREIGN]
+    for module in map(importlib.import_module, modules):
         for own, value in vars(module).items():
             if _is_data(value, module.__name__, own):
                 named.setdefault(f"{package}.{own}", []).append(value)
