@@ -76,9 +76,9 @@ def linear_program(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any, A
         outputs, tree = jax.tree.flatten(like)
         count = len(both.leaves) - len(jax.tree.leaves(rates))
         moves = [k >= count for k in range(len(both.leaves))]
-        with evaluated_now():
-            zeros = [jnp.zeros(x.shape, x.dtype) for x in both.leaves]
-        start, rest = _only(moves, zeros), _only(moves, both.leaves, False)
+        with evaluated_now():  # from NumPy: a program for every shape is not compiled
+            zeros = [jnp.asarray(np.zeros(x.shape, x.dtype)) for x in both.leaves[count:]]
+        start, rest = [None] * count + zeros, _only(moves, both.leaves, False)
         shapes = dict(enumerate(map(_shape, outputs)))
         by = _Slope(_Call(programs, both.form), start, rest, shapes)
         return jax.tree.unflatten(tree, pushed(both.leaves[count:], by))
