@@ -15,6 +15,7 @@ from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
 from sorojax.design.optimise.minimise import DesignStep, Optimised, Optimiser, minimise
 from sorojax.fem import Problem
+from sorojax.math.status import Status
 from sorojax.mesh.mesh import Mesh
 from sorojax.mesh.motion.move import move
 from sorojax.mesh.plane.triangulate import triangulate
@@ -68,6 +69,10 @@ class OptimisedShape(eqx.Module):
         return self.optimised.objective
 
     @property
+    def status(self) -> Status:
+        return self.optimised.status
+
+    @property
     def history(self) -> dict[str, np.ndarray]:
         return self.optimised.history
 
@@ -116,7 +121,7 @@ def minimise_shape(
         resume: A step to go on from; gives the bits of the run that was not stopped.
 
     Returns:
-        Dimensions, objective, history, and the problem at these dimensions.
+        Dimensions, objective, `status`, history, and the problem at these dimensions.
 
     Raises:
         ValueError: If neither `size` nor `mesher` is given, or as `minimise` and the mesher.
