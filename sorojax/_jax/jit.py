@@ -14,9 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sorojax import _mappings
 from sorojax._jax.small_kernels import LARGEST_GIVEN, OPTIONS, one_kernel, runs_alone
 
 Verb = TypeVar("Verb", bound=Callable[..., Any])
+
+_mappings.watch()
 
 
 def jit(function: Verb, *, kernels: bool = True, largest: float = LARGEST_GIVEN) -> Verb:
