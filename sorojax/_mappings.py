@@ -50,6 +50,6 @@ def look(allowed: int | None = None) -> None:
         _check.warn(
             f"jax: the compiled programs of this process take {taken} memory mappings, need "
             f"less than {allowed}, the limit of the system, beyond which JAX ends the process. "
-            "Call jax.clear_caches() from time to time; what is needed again is read from the "
-            "compilation cache."
+            "Call jax.clear_caches() from time to time; what is needed again is compiled again "
+            "or, after sorojax.enable_compilation_cache(), read from disk."
         )

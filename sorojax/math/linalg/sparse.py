@@ -265,7 +265,7 @@ def assemble(
 def assembled_on_host(
     system: SparseSymmetric, matrices: Float[np.ndarray, "cells dofs dofs"]
 ) -> Float[np.ndarray, " nnz"]:
-    """The same by NumPy, for what stays on the host; a sum a value, cell by cell."""
+    """The values of `assemble` by NumPy, without a program: for what is made on the host."""
     first, second = np.triu_indices(matrices.shape[-1])
     upper, slots = matrices[:, first, second], np.asarray(system.slots)
     return np.bincount(slots.ravel(), upper.ravel(), minlength=system.num_values)

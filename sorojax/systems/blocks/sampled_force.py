@@ -257,7 +257,7 @@ def sampled_body(
             load, a body is in contact, or `modal_body` refuses it.
 
     Its output `reach` is the largest strain in the chosen cells over that of the training. A
-    run in which it passes 1.25 ends as `Status.outside_model`.
+    run that passes 1.25 at a saved instant ends as `Status.outside_model`.
 
     Example:
         >>> bar = mesh.rectangle([0, 0], [80 * mm, 10 * mm], divisions=(12, 2))
