@@ -23,9 +23,11 @@ from sorojax.systems.blocks.block import (
     stack,
     sum_of,
 )
+from sorojax.systems.blocks.carrying_body import CarryingBody
 from sorojax.systems.blocks.fem_body import FemBody
 from sorojax.systems.blocks.fluidic import Regulator, Reservoir, Valve
-from sorojax.systems.blocks.modal_body import displacement, modal_basis, modal_body
+from sorojax.systems.blocks.modal_basis import displacement, modal_basis
+from sorojax.systems.blocks.modal_body import modal_body
 from sorojax.systems.blocks.rigid_body import RigidBody, Touch
 from sorojax.systems.blocks.rod_body import AssemblyBody, RodBody, body_motion
 from sorojax.systems.blocks.sampled_force import SampledBody, sampled_body
@@ -62,6 +64,7 @@ __all__ = [
     "AbstractController",
     "AbstractReference",
     "AssemblyBody",
+    "CarryingBody",
     "CartesianImpedance",
     "Compensation",
     "ComputedTorque",

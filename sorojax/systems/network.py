@@ -10,8 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from sorojax._display import displayed
-from sorojax.math.status import Status
-from sorojax.systems.blocks.block import AbstractBlock, Input, Output, Signals
+from sorojax.systems.blocks.block import AbstractBlock, Input, Output, Signals, first_defect
 from sorojax.systems.schedule import (
     check_wires,
     consistent,
@@ -104,14 +103,7 @@ class Network(AbstractBlock):
         return rates_of(self, t, state, inputs or {}, tuple(self.blocks))
 
     def path_status(self, path):
-        every = [block.path_status(path[name]) for name, block in self.blocks.items()]
-        found = [one for one in every if one is not None]
-        if not found:
-            return None
-        status, *others = found
-        for one in others:
-            status = Status.where(status == Status.successful, one, status)
-        return status
+        return first_defect(b.path_status(path[name]) for name, b in self.blocks.items())
 
     def _text(self) -> str:
         rows = [f"Network: {len(self.blocks)} blocks, {len(self.wires)} wires"]

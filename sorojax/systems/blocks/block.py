@@ -3,7 +3,7 @@ functions, lags and sensors."""
 
 import abc
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -78,8 +78,18 @@ class AbstractBlock(eqx.Module):
     def path_status(self, path: PyTree) -> Status | None:
         """The defect of a run through the states `path`, with a leading time axis, e.g.
         `Status.outside_model`; None where there is nothing to look at."""
-        del path
         return None
+
+
+def first_defect(found: Iterable[Status | None]) -> Status | None:
+    """The first status that is not successful; None where none was looked at."""
+    seen = [one for one in found if one is not None]
+    if not seen:
+        return None
+    status, *others = seen
+    for one in others:
+        status = Status.where(status == Status.successful, one, status)
+    return status
 
 
 class AbstractStateless(AbstractBlock):

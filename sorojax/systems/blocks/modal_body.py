@@ -1,8 +1,4 @@
-"""A finite-element body reduced to a few shapes, as a block with the ports of the full one.
-
-The shapes are eigenmodes, static responses to its loads, and their derivatives, which hold
-how both change at large displacements.
-"""
+"""A finite-element body reduced to a few shapes, as a block with the ports of the full one."""
 
 import abc
 from collections.abc import Callable
@@ -17,159 +13,24 @@ from jaxtyping import Array, Float
 
 from sorojax import fem
 from sorojax._jax.trace_state import is_traced
-from sorojax._types import real
 from sorojax.fem.checks import no_peaks
-from sorojax.fem.equilibrium.response import tangent_solve
-from sorojax.fem.loads.loads import has_masses
-from sorojax.fem.problem import load_force, potential_energy, residual
+from sorojax.fem.problem import potential_energy, residual
 from sorojax.material import Viscoelastic
-from sorojax.math.linalg.sparse import SparseSymmetric, product
 from sorojax.math.status import Status
 from sorojax.systems.blocks.block import AbstractBlock, Input, Output
-from sorojax.systems.blocks.driven import port_of, with_values
+from sorojax.systems.blocks.driven import port_of
 from sorojax.systems.blocks.fem_body import FemBody, damping_force
+from sorojax.systems.blocks.modal_basis import (
+    Basis,
+    Modes,
+    constant_mass,
+    coordinates,
+    displacement,
+)
+from sorojax.systems.blocks.modal_inertia import ModalInertia, modal_inertia
 
-#: Shapes of which less than this share is new are left out.
-_NEW = 1e-6
 #: Reach beyond which a trained force is not trusted; a bellows' tip is off by 7 % at 1.22.
 _FARTHEST = 1.25
-
-
-class Basis(eqx.Module):
-    """`shapes` of unit modal mass about the equilibrium `displacement` [m]."""
-
-    displacement: Float[Array, "nodes dim"]
-    shapes: Float[Array, "modes nodes dim"]
-
-    def __len__(self) -> int:
-        return self.shapes.shape[0]
-
-
-def modal_basis(
-    body: FemBody,
-    modes: int = 4,
-    *,
-    displacement: Float[Array, "nodes dim"] | None = None,
-    bending: bool = True,
-) -> Basis:
-    """Shapes for `modal_body(body, basis)`, made once.
-
-    The lowest eigenmodes about an equilibrium; the static answer to each driven load, without
-    which a pressure would find few modes to work on; and, with `bending`, the static
-    derivatives of all these along each other, which let thin walls turn without being
-    stretched. They are made orthonormal in the mass.
-
-    Args:
-        body: The body with the loads that hold it at the equilibrium.
-        modes: Number of eigenmodes.
-        displacement: The equilibrium [m]; at rest when omitted.
-        bending: Add the derivatives: with n shapes up to n (n + 1) / 2 more.
-
-    Returns:
-        The shapes.
-
-    Raises:
-        ValueError: If a rod is mounted on the body, whose mass depends on its motion.
-
-    Differentiable once outside `jit`, in the numbers of the body and in the displacement. Which
-    shapes are new enough to be kept has no derivative. Eigenmodes of one frequency have none of
-    their own; what depends only on the displacements that the shapes span has.
-
-    Reference:
-        Idelsohn, Cardona, A reduction method for nonlinear structural dynamic analysis,
-        Comput. Methods Appl. Mech. Engrg. 49, 1985, for the derivatives.
-    """
-    problem = body.problem
-    _constant_mass("modal_basis", body)
-    u = jnp.zeros_like(problem.mesh.points) if displacement is None else real(displacement)
-    found = [fem.eigenmodes(problem, u, modes).shapes] if modes else []
-    found.append(_answers(body, u))
-    first = jnp.concatenate(found).reshape(-1, u.size)
-    system, mass = problem.space.system, body.matter().mass
-    chosen = orthonormal(system, mass, first)
-    if bending:
-        more = _shape_derivatives(problem, u, chosen.reshape(-1, *u.shape))
-        chosen = orthonormal(system, mass, jnp.concatenate([chosen, more]))
-    return Basis(u, chosen.reshape(-1, *u.shape))
-
-
-def _answers(body: FemBody, u) -> Float[Array, "loads nodes dim"]:
-    """Static displacements by a unit of each component of each driven load."""
-    problem = body.problem
-    now = {name: load.value for name, load in body.drives.items()}
-    if not now:
-        return jnp.zeros((0, *u.shape), u.dtype)
-
-    def force(values):
-        loads = with_values(problem.loads, values)
-        return load_force(eqx.tree_at(lambda p: p.loads, problem, loads), u).ravel()
-
-    slopes = jax.jacfwd(force)(now)
-    rows = [jnp.moveaxis(s, 0, -1).reshape(-1, u.size) for s in slopes.values()]
-    found = tangent_solve(problem, u, jnp.concatenate(rows))
-    return found.reshape(-1, *u.shape)
-
-
-def _shape_derivatives(problem: fem.Problem, u, shapes) -> Float[Array, "pairs dofs"]:
-    """How each shape changes, in equilibrium, on the way along another."""
-    first, second = np.triu_indices(shapes.shape[0])
-
-    def curvature(pair):
-        a, b = shapes[pair[0]], shapes[pair[1]]
-
-        def along(u):
-            return jax.jvp(lambda u: residual(problem, u), (u,), (a,))[1]
-
-        return jax.jvp(along, (u,), (b,))[1].ravel()
-
-    pairs = jnp.asarray(np.stack([first, second], axis=1))
-    forces = jax.lax.map(curvature, pairs)
-    return tangent_solve(problem, u, -forces)
-
-
-def orthonormal(
-    system: SparseSymmetric, mass: Float[Array, " nnz"], rows: Float[Array, "rows dofs"]
-) -> Float[Array, "kept dofs"]:
-    """The rows one after the other, each without what those before it hold, by Gram and
-    Schmidt; a row that holds next to nothing new is left out.
-
-    The combinations are found on the host and held; what they make is orthonormal, so its
-    Cholesky factor is one, with the derivative of the method.
-    """
-    mix = _combinations(system, *(np.asarray(jax.lax.stop_gradient(x)) for x in (mass, rows)))
-    made = jnp.asarray(mix) @ rows
-    weighed = jax.vmap(lambda row: product(system, mass, row))(made)
-    factor = jnp.linalg.cholesky(made @ weighed.T)
-    return jax.scipy.linalg.solve_triangular(factor, made, lower=True)
-
-
-def _combinations(system, mass: np.ndarray, rows: np.ndarray) -> Float[np.ndarray, "kept rows"]:
-    """Coefficients of the rows in each of the orthonormal ones that are kept."""
-    kept: list[np.ndarray] = []
-    heavy: list[np.ndarray] = []
-    mixes: list[np.ndarray] = []
-    for row, mix in zip(rows, np.eye(len(rows)), strict=True):
-        size = np.sqrt(max(system.solver.product(mass, row) @ row, 0.0))
-        if not size > 0:
-            continue
-        row, mix = row / size, mix / size
-        for _ in range(2):
-            for one, weighed, its in zip(kept, heavy, mixes, strict=True):
-                share = weighed @ row
-                row, mix = row - share * one, mix - share * its
-        weighed = system.solver.product(mass, row)
-        left = np.sqrt(max(weighed @ row, 0.0))
-        if left > _NEW:
-            kept.append(row / left)
-            heavy.append(weighed / left)
-            mixes.append(mix / left)
-    return np.stack(mixes)
-
-
-# A finite-element body in a few shapes, as a block with the ports of the full one
-
-
-Modes = Float[Array, " modes"]
 
 
 class Polynomial(eqx.Module):
@@ -256,6 +117,8 @@ class ModalBody(AbstractBlock):
             volume, and of that of its rate.
         energies: Whether energies are outputs.
         pulls: Loads that are tendons: they do not push, whatever the input.
+        inertia: Of a body that a frame carries; `CarryingBody` moves it with a link.
+        pushes: Of a body that a frame carries: wrench by a unit of each load that has one.
         markers: Places at q = 0 and how they move, by name.
         q, v: At the start.
     """
@@ -271,6 +134,8 @@ class ModalBody(AbstractBlock):
     volumes: tuple[tuple[str, str, str], ...] = eqx.field(static=True)
     energies: bool = eqx.field(static=True, default=False)
     pulls: tuple[str, ...] = eqx.field(static=True, default=())
+    inertia: ModalInertia | None = None
+    pushes: dict[str, Polynomial] = eqx.field(default_factory=dict)
 
     @property
     def inputs(self):
@@ -319,28 +184,36 @@ class ModalBody(AbstractBlock):
         return place + q @ moves
 
     def vector_field(self, t, state, inputs):
-        q, v = state["q"], state["v"]
+        if self.inertia is not None:
+            raise ValueError(
+                "ModalBody: got a body that a frame carries, need a link that moves it. Put "
+                "systems.CarryingBody(arm, {link: body}) into the network."
+            )
+        return {"q": state["v"], "v": self.pull(state["q"], state["v"], inputs)}
+
+    def pull(self, q: Modes, v: Modes, inputs) -> Modes:
+        """Force on the modal coordinates in a frame that rests."""
         total = -self.force(q) - self.damping @ v
-        for load, port, *_ in self.ports:
+        for load, given in self._given(inputs):
             _, pull = jax.vjp(self.works[load], q)
+            total = total + pull(given)[0]
+        return total
+
+    def push(self, q: Modes, inputs) -> Float[Array, "6"]:
+        """Wrench of the driven loads about the frame that carries the body."""
+        total = jnp.zeros(6, q.dtype)
+        for load, given in self._given(inputs):
+            if load in self.pushes:
+                total = total + given @ self.pushes[load](q).reshape(-1, 6)
+        return total
+
+    def _given(self, inputs):
+        """Driven loads and their values."""
+        for load, port, *_ in self.ports:
             given = inputs[port].reshape(-1)
             if load in self.pulls:
                 given = jnp.where(given >= 0, given, jnp.zeros_like(given))
-            total = total + pull(given)[0]
-        return {"q": v, "v": total}
-
-
-def displacement(basis: Basis, q: Modes) -> Float[Array, "nodes dim"]:
-    """Displacement [m] of every node.
-
-    Args:
-        basis: From `modal_basis`.
-        q: Modal coordinates.
-
-    Returns:
-        Displacement [m].
-    """
-    return basis.displacement + jnp.tensordot(q, basis.shapes, 1)
+            yield load, given
 
 
 def modal_body(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBody:
@@ -357,11 +230,14 @@ def modal_body(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBo
         The reduced block, with the ports of `body`.
 
     Raises:
-        ValueError: If a driven load is not proportional to its input, or a support is driven.
+        ValueError: If a driven load is not proportional to its input, or a support is driven,
+            but for a `fem.Carried` that is the only one: see `CarryingBody`.
     """
     reducible("modal_body", body)
     if order is not None and order not in (1, 2, 3):
         raise ValueError(f"reduced: `order` must be 1, 2, 3 or None, got {order}.")
+    inertia, pushes = _in_a_frame(body, basis) if body.moved else (None, {})
+    body = without_weight(body)
     values = {name: jnp.zeros_like(load.value) for name, load in body.drives.items()}
     free = body.loaded(values)
     rest = ProjectedForce(free, basis)
@@ -392,41 +268,103 @@ def modal_body(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBo
         ),
         body.energies,
         tuple(name for name, load in body.drives.items() if isinstance(load, fem.Tendon)),
+        inertia,
+        pushes,
     )
 
 
 def reducible(where: str, body: FemBody) -> None:
     """Refuse a body that is not a function of a few coordinates and their rates."""
-    if body.moved:
+    carried = [s for s in body.moved.values() if isinstance(s, fem.Carried)]
+    if body.moved and (len(carried) != 1 or len(body.problem.supports) != 1):
         raise ValueError(
             f"{where}: got driven supports {sorted(body.moved)}, need a body whose supports "
-            "stay, as its shapes do. Keep the FemBody."
+            "stay, as its shapes do, or one fem.Carried alone. Keep the FemBody."
         )
+    if body.moved:
+        _carriable(where, body)
     if isinstance(body.problem.material, Viscoelastic):
         raise ValueError(
             f"{where}: got a body of a Viscoelastic material, need one without memory. Give "
             "its `base` to the problem, with fem.Rayleigh(...) for damping."
         )
     no_peaks(where, body.problem.material)
-    _constant_mass(where, body)
+    constant_mass(where, body)
 
 
-def _constant_mass(where: str, body: FemBody) -> None:
-    if any(map(has_masses, body.problem.loads)):
+def _carriable(where: str, body: FemBody) -> None:
+    """Refuse loads that do not turn with the frame that carries the body."""
+    for load in body.problem.loads:
+        driven = load.name in body.drives
+        if isinstance(load, fem.Gravity) != driven and isinstance(load, _TURNING):
+            continue
+        need = "a weight that is not driven" if isinstance(load, fem.Gravity) else ""
         raise ValueError(
-            f"{where}: got masses that are not at nodes, of a mounted rod, need a body of "
-            "constant mass. Keep the FemBody."
+            f"{where}: got the load `{load.name}`, a {type(load).__name__}, on a body that a "
+            f"frame carries, need {need or 'weight, and driven pressures or tendons'}. Keep "
+            "the FemBody."
         )
+
+
+_TURNING = (fem.Gravity, fem.Pressure, fem.Tendon)
+
+
+def without_weight(body: FemBody) -> FemBody:
+    """A body that a frame carries without its weight, which turns in the frame."""
+    if not body.moved:
+        return body
+    loads = tuple(x for x in body.problem.loads if not isinstance(x, fem.Gravity))
+    return eqx.tree_at(lambda b: b.problem.loads, body, loads)
+
+
+def _in_a_frame(body: FemBody, basis: Basis) -> tuple[ModalInertia, dict[str, Polynomial]]:
+    """Inertia in the frame that carries the body, and wrenches of its loads there."""
+    problem = body.problem
+    (support,) = body.moved.values()
+    assert isinstance(support, fem.Carried) and support.rest is not None
+    rest, dim = support.rest, problem.mesh.points.shape[1]
+    weights = [x.value for x in problem.loads if isinstance(x, fem.Gravity)]
+    gravity = sum(weights, jnp.zeros(dim, basis.shapes.dtype))
+    points = problem.mesh.points + basis.displacement
+    known = (problem.space.system, body.matter().mass, points, basis.shapes, rest, gravity)
+    pushes = {name: _push(body, name, basis, rest) for name in body.drives}
+    return modal_inertia(*known), {n: x for n, x in pushes.items() if x is not None}
+
+
+def _push(body: FemBody, name: str, basis: Basis, pose) -> Polynomial | None:
+    """Wrench of a unit of a driven load about a frame, to third order; None of a load that
+    turns with the body and has none, as a closed chamber."""
+    load, points = body.drives[name], body.problem.mesh.points
+    dim, zero = points.shape[1], jnp.zeros(len(basis), basis.shapes.dtype)
+
+    def work(u):
+        own = lambda value: eqx.tree_at(lambda load: load.value, load, value)  # noqa: E731
+        slope = jax.grad(lambda value: own(value).potential(body.problem, u))
+        return -slope(jnp.zeros_like(load.value)).reshape(-1)
+
+    def forces(q):
+        u = displacement(basis, q)
+        inside = (points + u - pose[None, :dim, dim]) @ pose[:dim, :dim]
+        return inside, jax.jacrev(work)(u) @ pose[:dim, :dim]
+
+    def wrench(q):
+        inside, force = forces(q)
+        pad = [(0, 0)] * (force.ndim - 1) + [(0, 3 - dim)]
+        arm, force = jnp.pad(inside, pad[1:])[None], jnp.pad(force, pad)
+        both = jnp.concatenate([jnp.cross(arm, force), force], axis=-1)
+        return jnp.sum(both, axis=1).reshape(-1)
+
+    _, force = forces(zero)
+    found = [wrench(zero), wrench(zero + 1e-3)]
+    if not is_traced(found):
+        size = float(jnp.sum(jnp.abs(force)))
+        if max(float(jnp.max(jnp.abs(x[3:]))) for x in found) <= 1e-9 * size:
+            return None
+    return Polynomial(derivatives(wrench, zero, 3))
 
 
 def _place(body: FemBody, basis: Basis, node: int) -> Array:
     return body.problem.mesh.points[node] + basis.displacement[node]
-
-
-def coordinates(body: FemBody, basis: Basis, field) -> Modes:
-    """Coordinates of a field of the nodes, nearest in the mass."""
-    weighed = product(body.problem.space.system, body.matter().mass, field.ravel())
-    return basis.shapes.reshape(len(basis), -1) @ weighed
 
 
 def _damping(body: FemBody, basis: Basis) -> Float[Array, "modes modes"]:

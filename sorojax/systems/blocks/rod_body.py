@@ -1,6 +1,7 @@
 """A rod as a block: pressures and tensions in, volumes, lengths of tendons and tip out."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, TypeGuard
 
 import equinox as eqx
@@ -291,7 +292,7 @@ class AssemblyBody(AbstractBlock):
             return q
         for loop in self.assembly.loops:
             if name == f"{loop}_wrench":
-                moment, _, reactions, _ = self._solved(t, state, inputs)
+                moment, _, reactions, _ = self.solved(t, state, inputs)
                 assert reactions is not None  # there is a loop
                 return closure_wrenches(moment, t, reactions)[loop]
         for part, chamber in self._maps().items():
@@ -316,12 +317,18 @@ class AssemblyBody(AbstractBlock):
             constants, forces = operators(self.assembly), self.acting(inputs)
             a = acceleration(self.assembly, constants, t, q, v, forces)
             return {"q": rate(self.assembly, q, v), "v": a}
-        _, a, _, rates = self._solved(t, state, inputs)
+        _, a, _, rates = self.solved(t, state, inputs)
         return {"q": rate(self.assembly, q, v), "v": a} | rates
 
-    def _solved(self, t, state, inputs) -> tuple[Any, Array, Array | None, dict[str, Array]]:
+    def moment(self, state) -> Any:
+        """The assembly as it moves in a state."""
+        return motion(self.assembly, state["q"], state["v"])
+
+    def solved(
+        self, t, state, inputs, added: Callable[[Any], tuple[Any, Any]] | None = None
+    ) -> tuple[Any, Array, Array | None, dict[str, Array]]:
         """The moment, the acceleration, the reactions of closures, and the rates of what is
-        kept beside q and v."""
+        kept beside q and v; with the mass and the force that are `added` at a moment."""
         model, rates = self._with_motions(t, state, inputs)
         constants = operators(model)
         pull, remembering = _branches(model, self.forces, state, constants)
@@ -329,6 +336,9 @@ class AssemblyBody(AbstractBlock):
         mass, coriolis = inertia(moment)
         force = total_force(relaxed(self.acting(inputs)), t, moment) - coriolis
         force = force if pull is None else force + pull
+        if added is not None:
+            more = added(moment)
+            mass, force = mass + more[0], force + more[1]
         rates = rates | remembering
         if not is_closed(model):
             return moment, solve_symmetric(mass, force), None, rates

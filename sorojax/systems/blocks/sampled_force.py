@@ -30,18 +30,21 @@ from sorojax.fem.equilibrium.response import tangent_solve
 from sorojax.fem.problem import body as bare, body_at, load_force
 from sorojax.math.linalg.sparse import product
 from sorojax.systems.blocks.fem_body import FemBody
+from sorojax.systems.blocks.modal_basis import (
+    Basis,
+    Modes,
+    coordinates,
+    displacement,
+    orthonormal,
+)
 from sorojax.systems.blocks.modal_body import (
     AbstractModalForce,
-    Basis,
     ModalBody,
-    Modes,
     Polynomial,
-    coordinates,
     derivatives,
-    displacement,
     modal_body,
-    orthonormal,
     reducible,
+    without_weight,
 )
 
 _EIGENMODES = 2  # of the shapes, beside those of the equilibria
@@ -273,13 +276,14 @@ def sampled_body(
         (6, True)
     """
     _checked(body, paths, modes)
+    weighed, body = body, without_weight(body)
     seen, told, slopes = _equilibria(body, paths)
     report("sampled_body: cells", 0, 1)
     shown = [jnp.asarray(u) for frames in motions for u in frames]
     basis = snapshot_basis(body, jnp.stack([*(s.u for s in seen), *slopes, *shown]), modes)
     count = body.problem.mesh.num_cells
     every = sampled_force(body, basis, np.arange(count), np.ones(count))
-    whole = modal_body(body, basis, order=None)
+    whole = modal_body(weighed, basis, order=None)
     whole = eqx.tree_at(lambda b: b.force, whole, every)
     known = [coordinates(body, basis, s.u) for s in seen]
     free = [coordinates(body, basis, u) for u in shown]
@@ -481,7 +485,7 @@ def sparse_weights(
 def _accelerated(body: ModalBody, q: Modes, values: Mapping[str, Array]) -> Modes:
     """Acceleration from rest under values of the driven loads."""
     inputs = {port: values[name] for name, port, *_ in body.ports}
-    return body.vector_field(0.0 * q[0], {"q": q, "v": 0.0 * q}, inputs)["v"]
+    return body.pull(q, 0.0 * q, inputs)
 
 
 @jax.jit
