@@ -144,3 +144,12 @@ def test_the_wrench_of_a_carried_solid_is_that_of_its_reactions(element):
     want = jnp.concatenate([found.moment, found.force])
     np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-9 * float(jnp.max(jnp.abs(want))))
     assert body.outputs["grip_wrench"].shape == want.shape
+
+
+def test_a_solid_that_begins_beside_its_link_is_named():
+    base = pendulum(1.0)
+    arm = base.blocks["arm"]
+    turned = systems.AssemblyBody(arm.assembly, arm.forces, q=[0.5], carrying=("bar",))
+    apart = systems.Network({**base.blocks, "arm": turned}, base.wires)
+    with pytest.raises(ValueError, match="`solid` with nodes 30 mm from where"):
+        systems.simulate(apart, 0.01, step=2e-3)

@@ -7,14 +7,17 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from sorojax import fem
+from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
 from sorojax.fem.dynamics.step import Interval, Matter, State, begin_step, end_step
-from sorojax.fem.equilibrium.jit import prepare_traced
+from sorojax.fem.equilibrium.jit import known_mask, prepare_traced
 from sorojax.fem.equilibrium.linear import Prepared
 from sorojax.fem.problem import residual
+from sorojax.fem.supports import known_values
 from sorojax.math.ode.explicit import AbstractMethod, MethodStep, RungeKutta4, repeated
 from sorojax.math.ode.step_control import SearchedAttempt, cut
 from sorojax.systems.blocks.driven import exerted
@@ -132,6 +135,38 @@ def bodies_of(block: Any) -> Names:
     """Names of the large bodies of a network."""
     blocks = block.blocks if isinstance(block, Network) else {}
     return tuple(name for name, one in blocks.items() if isinstance(one, FemBody))
+
+
+def check_places(network: Network, t, y: PyTree | None, inputs: dict[str, Any]) -> None:
+    """Refuse bodies whose driven nodes do not begin where their supports are."""
+    names = tuple(n for n in bodies_of(network) if _block(network, n).moved)
+    if not names or is_traced((network, t, y, inputs)):
+        return
+    y = network.initial_state() if y is None else y
+    for name, far in _strayed(network, t, y, at_time(inputs, t), names).items():
+        if far > _OFF * np.max(np.ptp(_block(network, name).problem.mesh.points, axis=0)):
+            raise ValueError(
+                f"simulate: got `{name}` with nodes {float(far) * 1e3:.3g} mm from where its "
+                f"driven supports hold them at {float(t):g} s, need them there. Give "
+                "FemBody(..., u=) the displacement at the start, or mesh it at that place."
+            )
+
+
+@eqx.filter_jit
+def _strayed(network: Network, t, y, inputs, names: Names) -> dict[str, Float[Array, ""]]:
+    """Largest distance of a coordinate of a driven node from where its support is [m]."""
+    far, own = {}, inputs_of(network, t, y, inputs, names)
+    for name in names:
+        block, u = _block(network, name), y[name]["u"]
+        supports = block.loaded(block.values(own[name])).supports
+        driven = tuple(s for s in supports if s.name in block.moved)
+        mask = known_mask(driven, *u.shape)
+        off = jnp.abs(known_values(driven, *u.shape) - u.ravel())
+        far[name] = jnp.max(jnp.where(mask, off, jnp.zeros_like(off)))
+    return far
+
+
+_OFF = 1e-4  # of the size of a body: farther away nodes would jump in the first step
 
 
 def _network(field) -> tuple[Network, dict[str, Any]]:

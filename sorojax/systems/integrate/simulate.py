@@ -19,7 +19,7 @@ from sorojax.math.ode.explicit import AbstractMethod, RungeKutta4, Tsit5, finite
 from sorojax.math.ode.step_control import Control
 from sorojax.math.status import Status
 from sorojax.math.two_programs import two_programs
-from sorojax.systems.integrate.coupled import Coupled, bodies_of
+from sorojax.systems.integrate.coupled import Coupled, bodies_of, check_places
 from sorojax.systems.integrate.integrate import (
     Event,
     EventLog,
@@ -161,7 +161,8 @@ def simulate(
     Raises:
         RuntimeError: If the run failed and `throw` is set.
         ValueError: If `duration` is not positive, `save` is below 2, a fixed `step` comes with
-            events or `dense`, or `state` with `resume`.
+            events or `dense`, or `state` with `resume`; if nodes of a body do not begin where
+            its driven supports are.
 
     Example:
         >>> network = systems.Network({"valve": systems.Lag(0.1)}, {}, exposed=("valve.a",))
@@ -206,6 +207,7 @@ def simulate(
         substeps = _substeps(duration, save, step)
         plan = (save, method, substeps, progress)
         memory = None if isinstance(memory, Resume) else memory
+        check_places(network, first.astype(interval.dtype) * interval, state, supplied)
         film = _fixed(network, state, supplied, first, interval, plan, memory)
     failed = throw and not is_traced(film)
     if failed and not bool(film.status == Status.successful):
