@@ -111,8 +111,10 @@ class Trajectory(eqx.Module):
         ends = ", ".join(f"{k} {outcome(v)}" for k, v in self.parts._asdict().items())
         rows = [f"Trajectory from a drawing: {ends}"]
         if self.fit is not None:
-            misfit = number(self.fit.stiffness_error), number(self.fit.volume_error)
-            rows.append(f"  misfit of stiffness {misfit[0]}, of volume {misfit[1]}")
+            fit = self.fit
+            misfit = map(number, (fit.stiffness_error, fit.volume_error, fit.position_error))
+            told = zip(("stiffness", "volume", "line"), misfit, strict=True)
+            rows.append("  misfit of " + ", of ".join(" ".join(pair) for pair in told))
         whole = (self.path, self.backbone, self.rod, self.motion)
         return "\n".join(rows + [str(part) for part in whole if part is not None])
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax import _check
 from sorojax._edit import without_derivatives
 from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax._progress import report
@@ -31,6 +32,7 @@ from sorojax.fem.kinematics import PlaneStrain, Solid
 from sorojax.fem.loads.facets import cavity_volume
 from sorojax.fem.loads.loads import Pressure
 from sorojax.fem.problem import Problem, body
+from sorojax.math.lie import SE2, SE3
 from sorojax.math.linalg.dense import least_squares
 from sorojax.math.two_programs import two_programs
 from sorojax.mesh.mesh import Mesh
@@ -40,6 +42,7 @@ from sorojax.reduction.backbone import (
     Line,
     Probe,
     Reference,
+    names_of,
     probe,
     reference,
     rest_or_straight,
@@ -215,6 +218,9 @@ class Fit(eqx.Module):
         pressure: Pressure map.
         stiffness_error: Largest misfit of the condensed stiffness, relative.
         volume_error: Largest misfit of the enclosed volume, relative to its change.
+        position_error: Largest distance between the line of the rod at rest under a pressure of
+            the path and that of the solid, relative to the largest way of a point of the
+            latter. It is large where the modes leave out a strain that matters.
     """
 
     section: Section
@@ -223,6 +229,7 @@ class Fit(eqx.Module):
     pressure: PressureMap
     stiffness_error: Float[Array, ""]
     volume_error: Float[Array, ""]
+    position_error: Float[Array, ""]
 
     def damping(self, time) -> ConstantDamping:
         """Kelvin-Voigt damping with a retardation `time` [s] of the identified stiffness."""
@@ -256,7 +263,8 @@ def identify(
         up: Direction of local z of the first section [-], as given to `strain_along`.
 
     Returns:
-        Section, length, elastic law and pressure map of the rod, and the misfit of both.
+        Section, length, elastic law and pressure map of the rod, and what they miss. A line
+        that is more than a tenth off gives a warning.
 
     Raises:
         ValueError: If the path is not driven by a pressure, or has fewer than `degree` + 2
@@ -279,9 +287,20 @@ def identify(
         >>> print(f"{float(fit.length) / mm:.1f} mm, {fit.elastic.stiffness.shape}")
         60.0 mm, (1, 1)
     """
-    return identified(
-        path, basis, backbone, _probe(path, curve, backbone, arm, up), curve, degree, up
-    )
+    at = _probe(path, curve, backbone, arm, up)
+    fit = identified(path, basis, backbone, at, curve, degree, up)
+    off = fit.position_error
+    if _check.is_concrete(off) and float(off) > _FAR:
+        left = [name for name in backbone.names if name not in basis.active]
+        _check.warn(
+            f"identify: the line of the rod is {float(off):.0%} of its way off that of the "
+            f"solid. Give the basis more modes{f', or {left}' if left else ''}: `pod_basis("
+            "backbone, modes=...)`."
+        )
+    return fit
+
+
+_FAR = 0.1  # of the largest way: the rod does not stand for the solid
 
 
 def identified(
@@ -304,6 +323,8 @@ def identified(
         basis,
         volumes,
         condensed,
+        backbone.positions,
+        backbone.length,
         degree,
     )
     return Fit(mean_section(problem, curve, up=up), backbone.length, *laws, *errors)
@@ -408,8 +429,10 @@ def _inverse(ways, answers) -> Float[Array, "steps dof dof"]:
 
 
 @two_programs
-def _fitted(p, s, strain, rest, basis: StrainBasis, volumes, condensed, degree: int):
-    """Elastic law and pressure map, and the misfit of stiffness and volume.
+def _fitted(
+    p, s, strain, rest, basis: StrainBasis, volumes, condensed, positions, length, degree: int
+):
+    """Elastic law and pressure map, and the misfit of stiffness, volume and positions.
 
     K and C of the least-squares fit K - p C, then g from the equilibria, then h from the
     volumes that remain.
@@ -430,11 +453,39 @@ def _fitted(p, s, strain, rest, basis: StrainBasis, volumes, condensed, degree: 
     pressure = PressureMap(C, force, least_squares(slopes, (volumes - bent) * scale), scale)
     misfit = jnp.max(jnp.abs(K[None] - p[:, None, None] * C[None] - condensed))
     found = jax.vmap(jax.grad(pressure.coenergy, argnums=1))(q, p)
+    pushes = powers @ force
+    still = jax.vmap(lambda p, push: jnp.linalg.solve(K - p * C, push))(p, pushes)
     errors = (
         misfit / jnp.max(jnp.abs(condensed)),
         jnp.max(jnp.abs(found - volumes)) / jnp.ptp(volumes),
+        _off(still, basis, s, rest_or_straight(strain, rest), positions, length),
     )
     return (LinearElastic(K), pressure), errors
+
+
+def _off(q, basis: StrainBasis, s, rest, positions, length) -> Float[Array, ""]:
+    """Largest distance of the lines of a rod with coordinates q from `positions`, over the
+    largest way of these from rest."""
+    dim, names, shapes = positions.shape[2], names_of(rest), jnp.asarray(basis(s))
+    group = SE2() if dim == 2 else SE3()
+
+    def line(q):
+        strain = rest
+        for row, name in zip(shapes, basis.active, strict=True):
+            strain = strain.at[:, names.index(name)].add(row @ q)
+        steps = (strain[1:] + strain[:-1]) / 2 * (jnp.diff(s) * length)[:, None]
+
+        def onward(pose, step):
+            pose = pose @ group.exp(step)
+            return pose, pose[:dim, dim]
+
+        first = jnp.eye(dim + 1, dtype=rest.dtype)
+        return jax.lax.scan(onward, first, steps)[1]
+
+    way = positions[:, 1:] - line(jnp.zeros_like(q[0]))[None]
+    gap = positions[:, 1:] - jax.vmap(line)(q)
+    farthest, largest = (jnp.max(jnp.sum(x**2, axis=-1)) for x in (gap, way))
+    return jax.lax.stop_gradient(jnp.sqrt(farthest / largest))
 
 
 def _powers(x: Float[Array, ""], count: int) -> Float[Array, " powers"]:
