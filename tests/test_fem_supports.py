@@ -253,3 +253,35 @@ def test_a_reaction_in_motion_has_a_derivative():
     low2, low, high, high2 = (pushed(at + k * step) for k in (-2, -1, 1, 2))
     want = (low2 - 8 * low + 8 * high - high2) / (12 * step)
     np.testing.assert_allclose(jax.grad(pushed)(at), want, rtol=1e-6)
+
+
+def test_reactions_along_a_path_are_those_of_each_state():
+    bar = mesh.rectangle([0, 0], [0.04, 0.01], divisions=(2, 1), element=mesh.Quad8())
+    right = fem.Prescribed(bar.node_sets["right"], [0.0, 0.0], name="hand")
+    wall = fem.Fixed(bar.node_sets["left"], name="wall")
+    problem = fem.problem(bar, RUBBER, kinematics=DEPTH, supports=(wall, right))
+    pull = jnp.stack([jnp.linspace(0, 4e-3, 3), jnp.zeros(3)], axis=1)
+    path = fem.solve_path(problem, hand=pull)
+    found = fem.reaction_history(path)
+    for k in range(3):
+        each = fem.reactions(path.problem_at(k), path.displacements[k])
+        for name in ("wall", "hand"):
+            assert jnp.allclose(found[name].force[k], each[name].force, rtol=1e-12, atol=1e-15)
+
+
+def test_the_reaction_to_a_held_stretch_relaxes_to_its_long_term_share():
+    bar = mesh.rectangle([0, 0], [0.04, 0.01], divisions=(2, 1), element=mesh.Quad8())
+    right = fem.Prescribed(bar.node_sets["right"], [0.0, 0.0], name="hand")
+    wall = fem.Fixed(bar.node_sets["left"], name="wall")
+    relaxing = material.Viscoelastic(RUBBER, material.Prony([0.4], [0.05]))
+    problem = fem.problem(bar, relaxing, kinematics=DEPTH, supports=(wall, right))
+    times = jnp.array([0.0, 1e-4, 0.1, 0.5, 1.0])
+    pull = jnp.stack([jnp.array([0.0, 1e-5, 1e-5, 1e-5, 1e-5]), jnp.zeros(5)], axis=1)
+    path = fem.solve_path(problem, times=times, hand=pull)
+    found = fem.reaction_history(path)
+    assert jnp.allclose(found["wall"].force, -found["hand"].force, rtol=0, atol=1e-9)
+    at_first, at_last = found["hand"].force[jnp.array([1, 4]), 0]
+    elastic = fem.problem(bar, RUBBER, kinematics=DEPTH, supports=(wall, right))
+    rest = fem.reaction_history(fem.solve_path(elastic, hand=pull[:2]))["hand"].force[1, 0]
+    assert abs(at_last / rest - 1) < 1e-4
+    assert 1.25 < at_first / rest < 1.4  # the branch adds 40 % of the shear modulus alone

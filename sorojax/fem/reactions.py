@@ -22,6 +22,7 @@ from sorojax.fem.dynamics.step import (
 )
 from sorojax.fem.dynamics.trajectory import Trajectory
 from sorojax.fem.equilibrium.jit import known_mask
+from sorojax.fem.equilibrium.solve import Path
 from sorojax.fem.kinematics import Axisymmetric
 from sorojax.fem.problem import Problem, body, exchanged, residual
 from sorojax.fem.relaxation import at_instant
@@ -88,20 +89,22 @@ def reactions(
 
 
 def reaction_history(
-    motion: Trajectory, *, about: Numbers | None = None
+    motion: Trajectory | Path, *, about: Numbers | None = None
 ) -> dict[str, Reaction]:
-    """What every support exerts on a body in motion, by name, at every saved time.
+    """What every support exerts on a body in motion or along a path, by name, at every state.
 
-    The force is M a + C v + f_int(u) - f_ext(t) at the held components. There a is that of
+    Of equilibria it is that of `reactions`, with what a body remembers there. In motion the
+    force is M a + C v + f_int(u) - f_ext(t) at the held components. There a is that of
     the given motion, by differences on the grid of steps, elsewhere the one that balances the
     state; so reactions are of second order in the step, as u and v are.
 
     Args:
-        motion: What `fem.simulate` returned; supports of one name count together.
+        motion: What `fem.simulate`, `solve_path` or `continuation` returned; supports of one
+            name count together.
         about: Point that moments are about [m]; the origin by default.
 
     Returns:
-        Forces [N] and moments [N m] by name, with a leading axis of saved times.
+        Forces [N] and moments [N m] by name, with a leading axis of saved times or states.
 
     Raises:
         ValueError: If `about` is no point.
@@ -120,10 +123,13 @@ def reaction_history(
     """
     problem = motion.problem
     about = _point("fem.reaction_history", problem, about)
-    lists = None
-    if has_lists(problem) and not is_traced((problem, motion.displacements)):
-        lists = lists_of(problem, motion.displacements)
-    forces = _motion_forces(motion.dynamics, motion.states, motion.points, lists)
+    if isinstance(motion, Path):
+        forces = _path_forces(motion)
+    else:
+        lists = None
+        if has_lists(problem) and not is_traced((problem, motion.displacements)):
+            lists = lists_of(problem, motion.displacements)
+        forces = _motion_forces(motion.dynamics, motion.states, motion.points, lists)
     each = jax.vmap(lambda u, force: _split(problem, about, u, force))
     found = each(motion.displacements, forces)
     return {name: eqx.tree_at(lambda r: r.nodes, r, r.nodes[0]) for name, r in found.items()}
@@ -173,6 +179,13 @@ def wrench(
     else:
         turns = jnp.cross(arms, forces)
     return total, jnp.atleast_1d(jnp.sum(turns, axis=0))
+
+
+@eqx.filter_jit
+def _path_forces(path: Path) -> Float[Array, "steps nodes dim"]:
+    """Internal force less the loads at every state: zero but at supports [N]."""
+    states = jnp.arange(path.displacements.shape[0])
+    return jax.lax.map(lambda k: residual(path.problem_at(k), path.displacements[k]), states)
 
 
 # A body in motion: the acceleration of every node at an instant

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import fem
+from sorojax._types import real
 from sorojax.fem.loads.loads import AbstractLoad
 from sorojax.fem.problem import body
 from sorojax.fem.supports import AbstractSupport, known_values
@@ -90,7 +91,7 @@ def _set(driven: Any, values: Mapping[str, Array]) -> Any:
     if isinstance(driven, fem.Carried):
         return driven.at(values[driven.name])
     field = _field(driven)
-    return eqx.tree_at(lambda d: getattr(d, field), driven, values[driven.name])
+    return eqx.tree_at(lambda d: getattr(d, field), driven, real(values[driven.name]))
 
 
 def _field(driven: Driven) -> str:
