@@ -1,5 +1,6 @@
 """Sweeps: the same result hash whatever dies on the way."""
 
+import functools
 import os
 import signal
 import subprocess
@@ -9,10 +10,12 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import _progress, sweep as W
+from sorojax import _progress, envs, sweep as W
 
 ROOT = Path(__file__).parent.parent
 DESIGNS = {"x": np.linspace(0.0, 1.0, 30), "n": np.arange(30)}
@@ -94,6 +97,70 @@ def test_the_key_holds_code_config_designs_and_seed(tmp_path):
     assert seen[0].hash == seen[3].hash == seen[2].hash != seen[1].hash
     halves = W.sweep(noise, DESIGNS, store, chunk=15, seed=0)
     assert not np.array_equal(halves.result["y"][:15], halves.result["y"][15:])
+
+
+def scaled(block, config):
+    return {"y": block["x"] * np.asarray(config["gain"])[-1]}
+
+
+def test_arrays_of_the_config_and_arguments_that_are_held_are_in_the_key(tmp_path):
+    """Their text is cut short, so that other numbers would find the results of these."""
+    store, gain = W.Store(tmp_path), np.ones(2000)
+    other = np.concatenate([gain[:-1], [3.0]])
+    middle = np.where(np.arange(2000) == 1000, 3.0, 1.0)
+    assert repr(gain) == repr(middle)
+    runs = [
+        W.sweep(
+            scaled, DESIGNS, store, chunk=30, config={"gain": jnp.asarray(g), "law": np.sin}
+        )
+        for g in (gain, middle, other, gain)
+    ]
+    assert [r.computed for r in runs] == [1, 1, 1, 0]
+    assert np.array_equal(runs[2].result["y"], 3 * DESIGNS["x"])
+    held = [
+        W.sweep(functools.partial(scaled, config={"gain": g}), DESIGNS, store, chunk=30)
+        for g in (gain, other, gain)
+    ]
+    assert [r.computed for r in held] == [1, 1, 0]
+    keys = [
+        W.sweep(
+            scaled, DESIGNS, store, chunk=30, config={"gain": gain, "key": jax.random.key(k)}
+        )
+        for k in (0, 1, 0)
+    ]
+    assert [r.computed for r in keys] == [1, 1, 0]
+
+
+def ended(block, config):
+    """Distance [m] of the tip from the target after three steps, of members by number."""
+    task, policy, key = config["task"], config["policy"], config["key"]
+    params = task.default_params()
+
+    def one(number):
+        first, *later = jax.random.split(jax.random.fold_in(key, number), 4)
+        state, seen = envs.reset(task, first, params)
+        for own in later:
+            after = envs.step(task, own, state, policy @ seen, params)
+            state, seen = after.state, after.observation
+        return after.info["distance"]
+
+    return {"distance": jax.jit(jax.vmap(one))(jnp.asarray(block))}
+
+
+def test_rollouts_of_a_policy_go_on_to_the_bit_and_another_policy_has_its_own(tmp_path):
+    task = envs.FingerReach(time_step=4e-3, substeps=2, max_steps=4)
+    shape = task.num_actions, task.num_observations
+    config: dict = {"task": task, "key": jax.random.key(5)}
+    config["policy"] = 0.05 * jax.random.normal(jax.random.key(0), shape)
+    store = W.Store(tmp_path)
+    found = [W.sweep(ended, np.arange(8), store, chunk=4, config=config) for _ in range(2)]
+    again = W.sweep(ended, np.arange(12), store, chunk=4, config=config)
+    assert (found[0].hash, found[0].computed, found[1].computed) == (found[1].hash, 2, 0)
+    assert (again.computed, again.found) == (1, 2)
+    assert np.array_equal(again.result["distance"][:8], found[0].result["distance"])
+    softer = {**config, "policy": 2 * config["policy"]}
+    other = W.sweep(ended, np.arange(8), store, chunk=4, config=softer)
+    assert other.computed == 2 and other.hash != found[0].hash
 
 
 def test_a_damaged_file_is_made_again(tmp_path, serial):

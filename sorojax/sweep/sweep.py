@@ -29,6 +29,7 @@ import hashlib
 import inspect
 import json
 import os
+import re
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
@@ -37,6 +38,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
@@ -186,7 +188,8 @@ def sweep(
     `config` it is called as `function(block, config)`; with `seed`, a last argument is a
     NumPy integer that differs from chunk to chunk.
 
-    A chunk is known by the versions of code and JAX, the config, its designs and its seed:
+    A chunk is known by the versions of code and JAX, the config, what a `functools.partial`
+    holds, its designs and its seed:
     the same sweep again finds its results, also after a crash of driver or workers, and a
     longer one only computes what is new. Workers write results themselves.
 
@@ -198,8 +201,8 @@ def sweep(
         executor: Anything with `submit`: a process pool, a Dask client; one chunk after the
             other in this process by default.
         chunk: Designs per call.
-        config: What else the result depends on; JSON, or it must have a faithful `repr`.
-            Nothing by default.
+        config: What else the result depends on, a pytree such as a rod or a policy: known by
+            the bits of its arrays and the `repr` of all else. Nothing by default.
         seed: Seed of random results; none by default.
         version: Name of the code; by default the version of sorojax and the source of the
             function. Give one where the function calls code of your own that changes.
@@ -227,7 +230,7 @@ def sweep(
     jobs, order = {}, []
     for number, block in enumerate(blocks):
         own = None if seed is None else _seed(seed, number)
-        order.append(_key(code, config, block, own))
+        order.append(_key(code, (config, _given(function)), block, own))
         jobs.setdefault(order[-1], (block, tuple(x for x in (config, own) if x is not None)))
     results = {key: found for key in jobs if (found := store.read(key)) is not None}
     known = len(results)
@@ -333,12 +336,35 @@ def _code(function: Callable) -> str:
     return f"{__version__} {source}"
 
 
+def _given(function: Callable) -> list[Any]:
+    """Arguments that partial functions hold."""
+    held = []
+    while isinstance(function, functools.partial):
+        held.append([function.args, function.keywords])
+        function = function.func
+    return held
+
+
 def _key(code: str, config: Any, block: PyTree, seed: Any) -> str:
-    leaves, structure = jax.tree.flatten(block)
     hashed = hashlib.sha256()
     modes = {name: str(jax.config.values[name]) for name in _MODES}
-    about = [code, jax.__version__, modes, str(structure), repr(seed)]
+    about = [code, jax.__version__, modes, repr(seed)]
     hashed.update(json.dumps(about, sort_keys=True).encode())
-    hashed.update(json.dumps(config, sort_keys=True, default=repr).encode())
-    hashed.update(digest({str(k): leaf for k, leaf in enumerate(leaves)}).encode())
+    for tree in (config, block):
+        _add(hashed, tree)
     return hashed.hexdigest()
+
+
+def _add(hashed: Any, tree: PyTree) -> None:
+    """Arrays by their bits, all else by its words, without places in memory."""
+    leaves, structure = jax.tree.flatten(tree)
+    arrays, others = {}, {}
+    for number, leaf in enumerate(leaves):
+        if not isinstance(leaf, np.ndarray | np.generic | jax.Array):
+            others[number] = leaf
+            continue
+        is_key = isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        arrays[str(number)] = np.asarray(jax.random.key_data(leaf) if is_key else leaf)
+    words = json.dumps([str(structure), others], sort_keys=True, default=repr)
+    hashed.update(re.sub(" at 0x[0-9a-f]+", "", words).encode())
+    hashed.update(digest(arrays).encode())
