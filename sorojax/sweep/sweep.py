@@ -363,8 +363,9 @@ def _add(hashed: Any, tree: PyTree) -> None:
         if not isinstance(leaf, np.ndarray | np.generic | jax.Array):
             others[number] = leaf
             continue
-        is_key = isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-        arrays[str(number)] = np.asarray(jax.random.key_data(leaf) if is_key else leaf)
+        if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaf = jax.random.key_data(leaf)
+        arrays[str(number)] = np.asarray(leaf)
     words = json.dumps([str(structure), others], sort_keys=True, default=repr)
     hashed.update(re.sub(" at 0x[0-9a-f]+", "", words).encode())
     hashed.update(digest(arrays).encode())
