@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import discover, harness, memory, page, scaling, suite, svg
+from benchmarks import cold_peers, discover, harness, memory, page, scaling, suite, svg
 from benchmarks.__main__ import main
 from benchmarks.discrete_rod import Bar, _ends as ends_of
 from benchmarks.peers import call, row
@@ -143,6 +143,46 @@ def test_a_peer_answers_arrays_and_times(folder, monkeypatch):
     found = row("soromox", "double", {"x": 2.0}, lambda a: abs(a["y"] - 4), "exact", size=1)
     assert (found.run_s_min, found.run_s, found.run_s_max, found.error) == (1, 2, 3, 0)
     assert found.settings == {"size": 1, "version": "0"}
+
+
+CHAIN = """
+import json, os, pathlib, sys
+import numpy as np
+folder = pathlib.Path(sys.argv[-1])
+kept = pathlib.Path(os.environ["JAX_COMPILATION_CACHE_DIR"]) / "kept"
+seconds = [1.0 if kept.exists() else 5.0, 0.5]
+kept.touch()
+request = json.loads((folder / "request.json").read_text())
+arrays = np.load(folder / "request.npz")
+x, v, h, found = arrays["start"], 0 * arrays["start"], request["dt"] / 50, [arrays["start"]]
+for k in range(50 * request["saves"]):
+    v = v - h / 2 * arrays["chain"] @ x
+    x = x + h * v
+    v = v - h / 2 * arrays["chain"] @ x
+    found += [x] if k % 50 == 49 else []
+(folder / "answer.json").write_text(json.dumps({"seconds": seconds}))
+np.savez(folder / "answer.npz", result=np.array(found))
+"""
+
+
+def test_first_calls_of_a_peer_with_an_empty_cache_and_a_filled_one(tmp_path, monkeypatch):
+    """Its answer is held against the exact motion; without the peer there is a reason."""
+    monkeypatch.setenv("SOROJAX_PEERS", str(tmp_path))
+    task = cold_peers._chain("plain", 3, 0.1, 0.01, "motion")
+    (none,) = cold_peers._peer(task)
+    assert "not installed" in none.settings["reason"] and none.run_s is None
+    (tmp_path / "diffrax").mkdir()
+    (tmp_path / "diffrax" / "status.json").write_text('{"ok": true, "version": "0"}')
+    (tmp_path / "diffrax.py").write_text(CHAIN)
+    call = sys.modules["benchmarks.peers.call"]
+    monkeypatch.setattr(call, "interpreter", lambda peer: Path(sys.executable))
+    monkeypatch.setattr(call, "HERE", tmp_path)
+    rows = list(cold_peers._peer(task))
+    seconds = {row.settings["cache"]: row.run_s for row in rows}
+    assert seconds == {"empty": 5.0, "filled": 1.0, "second call": 0.5}
+    assert all(row.holds and row.error is not None and row.error < 1e-4 for row in rows)
+    wrong = next(cold_peers._peer(task._replace(wanted=1.01 * task.wanted)))
+    assert wrong.holds is False
 
 
 @pytest.mark.parametrize("bar_on, holds", [("run_s", True), ("error", False)])

@@ -1,12 +1,13 @@
 """First calls of common verbs in fresh processes: without a cache, and with one that is filled.
 
 Scenes are built before; what they compile (a mesh, say) is no part of the first call. Second
-calls compile nothing.
+calls compile nothing. Other codes have some of these tasks, or a plain one of the same size.
 """
 
 import tempfile
 from pathlib import Path
 
+from benchmarks import cold_peers
 from benchmarks.cold import CALLS, FROM_CACHE, counted, measured
 from benchmarks.harness import Row, quick
 
@@ -29,3 +30,5 @@ def rows():
             "sorojax", {"call": name, "cache": "filled"}, run_s=filled.first, bar=FROM_CACHE
         )
         yield Row("sorojax", {"call": name, "cache": "second call"}, run_s=empty.second)
+    if not quick("other codes"):
+        yield from cold_peers.rows()
