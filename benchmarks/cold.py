@@ -19,10 +19,12 @@ Call = Callable[[], Any]
 
 
 class Cold(NamedTuple):
-    """Seconds of the first call and of the second."""
+    """Seconds of the first call and of the second, and CPU seconds of this process."""
 
     first: float
     second: float
+    first_cpu: float
+    second_cpu: float
 
 
 class Programs(NamedTuple):
@@ -269,7 +271,11 @@ FROM_CACHE = 1.0  # s, the bar of all of them with a filled cache
 
 def measured(name: str, cache: Path) -> Cold:
     """Both calls in a process of their own."""
-    return Cold(*_told(cache, name))
+    return cold(*_told(cache, name))
+
+
+def cold(seconds: list[float], cpu: list[float]) -> Cold:
+    return Cold(*seconds, *cpu)
 
 
 def counted(name: str, cache: Path) -> Programs:
@@ -285,7 +291,7 @@ def user_environment() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name != "EQX_ON_ERROR"}
 
 
-def _told(cache: Path, *words: str) -> list[float]:
+def _told(cache: Path, *words: str) -> list[list[float]]:
     done = subprocess.run(
         [sys.executable, "-m", "benchmarks.cold", *words],
         env=user_environment() | {"SOROJAX_CACHE": str(cache)},
@@ -310,10 +316,10 @@ def _main(name: str, programs: str | None = None) -> None:
         jax.config.update("jax_dump_ir_to", programs)
     seconds = []
     for _ in range(2):
-        start = time.perf_counter()
+        start = time.perf_counter(), time.process_time()
         jax.block_until_ready(call())
-        seconds.append(time.perf_counter() - start)
-    print(json.dumps(seconds))
+        seconds.append((time.perf_counter() - start[0], time.process_time() - start[1]))
+    print(json.dumps([*zip(*seconds, strict=True)]))
 
 
 if __name__ == "__main__":

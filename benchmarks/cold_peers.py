@@ -6,6 +6,7 @@ linear equation of the same size: what the first call of a motion costs at least
 
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -66,36 +67,50 @@ def error(found: np.ndarray, wanted: np.ndarray) -> float:
     return float(np.linalg.norm(gap) / np.linalg.norm(wanted))
 
 
+def three(
+    code: str,
+    call: str,
+    empty: cold.Cold,
+    filled: cold.Cold,
+    counts: dict[str, int] | None = None,
+    **columns: Any,
+) -> Iterator[Row]:
+    """The rows of a call: first with an empty cache, with a filled one, and the second call."""
+    for cache, run_s, cpu_s, told in (
+        ("empty", empty.first, empty.first_cpu, counts or {}),
+        ("filled", filled.first, filled.first_cpu, {}),
+        ("second call", empty.second, empty.second_cpu, {}),
+    ):
+        settings = {"call": call, "cache": cache, "cpu_s": round(cpu_s, 4)} | told
+        yield Row(code, settings, run_s=run_s, **columns)
+
+
 def _sorojax(call: str, wrong: float, reference: str) -> Iterator[Row]:
     with tempfile.TemporaryDirectory() as cache:
-        runs = [cold.measured(call, Path(cache)) for _ in range(2)]
-    seconds = {"empty": runs[0].first, "filled": runs[1].first, "second call": runs[0].second}
-    for name, value in seconds.items():
-        settings = {"call": call, "cache": name}
-        yield Row("sorojax", settings, run_s=value, error=wrong, reference=reference)
+        empty, filled = (cold.measured(call, Path(cache)) for _ in range(2))
+    yield from three("sorojax", call, empty, filled, error=wrong, reference=reference)
 
 
 def _peer(task: Task) -> Iterator[Row]:
-    settings: dict[str, Any] = {"call": task.call, "agrees_to": task.agrees_to}
+    told = {"agrees_to": task.agrees_to}
     try:
         with tempfile.TemporaryDirectory() as cache:
             (empty, arrays), (filled, _) = (_asked(task, cache) for _ in range(2))
     except peers.PeerMissing as reason:
-        yield missing(task.peer, str(reason), **settings)
+        yield missing(task.peer, str(reason), call=task.call, **told)
         return
-    settings |= {"version": empty["version"]}
-    (first, second), (from_cache, _) = empty["seconds"], filled["seconds"]
-    wrong = error(arrays["result"], task.wanted)
-    for name, value in (("empty", first), ("filled", from_cache), ("second call", second)):
-        yield Row(
-            task.peer,
-            settings | {"cache": name},
-            run_s=value,
-            error=wrong,
-            reference=task.reference,
-            bar=task.agrees_to,
-            bar_on="error",
-        )
+    told |= {"version": empty["version"]}
+    for row in three(
+        task.peer,
+        task.call,
+        cold.cold(empty["seconds"], empty["cpu"]),
+        cold.cold(filled["seconds"], filled["cpu"]),
+        error=error(arrays["result"], task.wanted),
+        reference=task.reference,
+        bar=task.agrees_to,
+        bar_on="error",
+    ):
+        yield replace(row, settings=row.settings | told)
 
 
 def _asked(task: Task, cache: str) -> tuple[dict[str, Any], Arrays]:

@@ -160,7 +160,8 @@ for k in range(50 * request["saves"]):
     x = x + h * v
     v = v - h / 2 * arrays["chain"] @ x
     found += [x] if k % 50 == 49 else []
-(folder / "answer.json").write_text(json.dumps({"seconds": seconds}))
+answer = {"seconds": seconds, "cpu": [second / 2 for second in seconds]}
+(folder / "answer.json").write_text(json.dumps(answer))
 np.savez(folder / "answer.npz", result=np.array(found))
 """
 
@@ -180,6 +181,7 @@ def test_first_calls_of_a_peer_with_an_empty_cache_and_a_filled_one(tmp_path, mo
     rows = list(cold_peers._peer(task))
     seconds = {row.settings["cache"]: row.run_s for row in rows}
     assert seconds == {"empty": 5.0, "filled": 1.0, "second call": 0.5}
+    assert [row.settings["cpu_s"] for row in rows] == [2.5, 0.5, 0.25]
     assert all(row.holds and row.error is not None and row.error < 1e-4 for row in rows)
     wrong = next(cold_peers._peer(task._replace(wanted=1.01 * task.wanted)))
     assert wrong.holds is False
