@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import cold_peers, discover, harness, memory, page, scaling, suite, svg
+from benchmarks import cold_peers, curves, discover, harness, memory, page, scaling, suite, svg
 from benchmarks.__main__ import main
 from benchmarks.discrete_rod import Bar, _ends as ends_of
 from benchmarks.peers import call, row
@@ -44,6 +44,16 @@ def rows():
 '''
 
 
+SLEEPY = '''"""A call that waits."""
+import time
+
+from benchmarks.harness import Row, measure_calls
+
+def rows():
+    yield Row("sorojax", {}, **measure_calls(lambda: time.sleep(0.1) or 0, 1).columns())
+'''
+
+
 SHORT = '''"""Of two sizes, one in a quick run."""
 from benchmarks.harness import Row, quick
 
@@ -64,9 +74,9 @@ def folder(tmp_path, monkeypatch):
     return tmp_path / "cases"
 
 
-def run(folder, name):
+def run(folder, name, *options):
     file = folder.parent / "lines.json"
-    status = main([name, "--json", str(file), "--cases", str(folder)])
+    status = main([name, *options, "--json", str(file), "--cases", str(folder)])
     return status, [json.loads(text) for text in file.read_text().splitlines()]
 
 
@@ -115,6 +125,30 @@ def test_a_case_that_hangs_is_ended(folder):
     (folder / "math_hang.py").write_text("import time\ntime.sleep(60)\n")
     (found,) = run_case("math.hang", folder / "math_hang.py", limit=3.0)
     assert found["settings"]["reason"] == "not finished after 3 s"
+
+
+def test_cpu_seconds_leave_out_what_waits(folder, monkeypatch):
+    (folder / "math_sleepy.py").write_text(SLEEPY)
+    (clock,) = run(folder, "math.sleepy")[1]
+    monkeypatch.setenv("SOROJAX_BENCH_CPU", "0")  # so that it is as before afterwards
+    (cpu,) = run(folder, "math.sleepy", "--cpu")[1]
+    assert clock["run_s"] >= 0.1 > 0.05 > cpu["run_s"]
+
+
+def test_curves_are_drawn_from_the_recorded_run(tmp_path):
+    """Every panel has its curves; the pictures are small and on the page."""
+    lines = curves.read()
+    for panels in curves.FIGURES.values():
+        for panel in panels:
+            found = curves.curves(panel, lines)
+            assert any(len(points) > 1 for points in found.values()), panel.case
+            assert len({curve.group for curve in found}) <= len(curves.COLOURS)
+    page = (Path(__file__).parent.parent / "docs" / "benchmarks.md").read_text()
+    for picture in curves.draw(lines, tmp_path):
+        assert (curves.PICTURES / picture.name).stat().st_size < 200_000
+        assert f"(pictures/{picture.name})" in page
+    (statics,) = curves.FIGURES["rod_statics"]
+    assert statics.curve({"settings": {"case": "roll-up"}}) is None  # an error of rounding only
 
 
 def test_unknown_case_is_named(folder, capsys):
