@@ -37,6 +37,8 @@ def main(argv: list[str] | None = None) -> int:
     names = arguments.names or (suite.quick() if arguments.quick else known)
     if arguments.quick:
         os.environ["SOROJAX_BENCH_QUICK"] = "1"  # for the processes of the cases
+    if arguments.cpu:
+        os.environ["SOROJAX_BENCH_CPU"] = "1"  # for those of peers too
     chosen = {name: known[name] for name in names}
     left_out = [name for name in known if name not in chosen] if arguments.quick else []
     lines = _to_json(chosen, arguments.json) if arguments.json else _to_page(chosen, left_out)
@@ -50,6 +52,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--list", action="store_true", help="name the cases and stop")
     parser.add_argument(
         "--quick", action="store_true", help="few cases of every row of the report, few sizes"
+    )
+    parser.add_argument(
+        "--cpu", action="store_true", help="CPU seconds, for a machine that others use"
     )
     parser.add_argument(
         "--json", type=Path, metavar="FILE", help="write JSON lines there, and nothing else"

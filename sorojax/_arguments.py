@@ -19,6 +19,7 @@ import numpy as np
 from sorojax import _explain
 from sorojax._explain import axis_lengths as axis_lengths
 from sorojax._kinds import ANYTHING, NUMBERS, PUBLIC, Kind, converted, kind_of, number_like
+from sorojax._signatures import Signature
 
 
 class Parameters:
@@ -169,6 +170,7 @@ def checked(function: Callable[..., Any], where: str) -> Callable[..., Any]:
             raise better from None  # the one beneath can be pages of a program
 
     call.__arguments__ = parameters  # type: ignore[attr-defined]
+    call.__signature__ = Signature(function=function)  # type: ignore[attr-defined]
     return call
 
 
@@ -192,6 +194,7 @@ def _check_noun(noun: type) -> None:
                 raise
             raise wrong from None
 
+    init.__signature__ = Signature(function=make)  # type: ignore[attr-defined]
     noun.__init__ = init  # type: ignore[misc]
     noun.__arguments__ = parameters  # type: ignore[attr-defined]
 

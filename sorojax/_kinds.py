@@ -142,7 +142,6 @@ def whole(value: Any) -> bool:
 
 PUBLIC: dict[type, str] = {}  # what the packages loaded so far make public
 
-_NUMBERS = set(typing.get_args(Numbers))
 ANYTHING = Kind(lambda value: True, "anything")
 NUMBERS = Kind(number_like, "a number or an array of numbers")
 _ROWS = Kind(lambda value: (rank(value) or 0) > 0, "an array of numbers")
@@ -189,8 +188,6 @@ def kind_of(annotation: Any, scope: dict[str, Any], loose: bool = False) -> Kind
         return _array(annotation, loose)
     origin, args = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):
-        if set(args) >= _NUMBERS:
-            return _any_of([NUMBERS, *(inner(arg) for arg in args if arg not in _NUMBERS)])
         return _any_of([inner(arg) for arg in args])
     if origin is typing.Literal:
         words = [repr(arg) for arg in args]

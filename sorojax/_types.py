@@ -1,7 +1,7 @@
 """Conversion of user numbers to strongly typed arrays."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -9,11 +9,17 @@ import numpy as np
 
 from sorojax._jax import devices
 
-_Entry = jax.Array | np.ndarray | np.generic | float
-_Row = Sequence[_Entry]
+if TYPE_CHECKING:
+    _Entry = jax.Array | np.ndarray | np.generic | float
+    _Row = Sequence[_Entry]
+    Numbers = _Entry | _Row | Sequence[_Row] | Sequence[Sequence[_Row]]
+else:
 
-Numbers = _Entry | _Row | Sequence[_Row] | Sequence[Sequence[_Row]]
-"""A number, or what becomes an array: of these, arguments without a fixed shape."""
+    class Numbers:
+        """A number, or what becomes an array: of these, arguments without a fixed shape.
+
+        Type checkers see the union; in signatures it is one word.
+        """
 
 
 def real(value: Numbers) -> jax.Array:

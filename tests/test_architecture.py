@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent
 CORE, HARDWARE = ROOT / "sorojax", ROOT / "hardware"
 BASEMENT = {
     "units", "_types", "_check", "_display", "_edit", "_progress", "_cache", "_jax",
-    "_arguments", "_explain", "_kinds", "_mappings",
+    "_arguments", "_explain", "_kinds", "_mappings", "_signatures",
 }  # fmt: skip
 FLOOR = {
     "math": 0,

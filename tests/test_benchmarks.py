@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import discover, harness, memory, page, scaling, suite, svg
+from benchmarks import cold_peers, curves, discover, harness, memory, page, scaling, suite, svg
 from benchmarks.__main__ import main
 from benchmarks.discrete_rod import Bar, _ends as ends_of
 from benchmarks.peers import call, row
@@ -44,6 +44,16 @@ def rows():
 '''
 
 
+SLEEPY = '''"""A call that waits."""
+import time
+
+from benchmarks.harness import Row, measure_calls
+
+def rows():
+    yield Row("sorojax", {}, **measure_calls(lambda: time.sleep(0.1) or 0, 1).columns())
+'''
+
+
 SHORT = '''"""Of two sizes, one in a quick run."""
 from benchmarks.harness import Row, quick
 
@@ -64,9 +74,9 @@ def folder(tmp_path, monkeypatch):
     return tmp_path / "cases"
 
 
-def run(folder, name):
+def run(folder, name, *options):
     file = folder.parent / "lines.json"
-    status = main([name, "--json", str(file), "--cases", str(folder)])
+    status = main([name, *options, "--json", str(file), "--cases", str(folder)])
     return status, [json.loads(text) for text in file.read_text().splitlines()]
 
 
@@ -117,6 +127,30 @@ def test_a_case_that_hangs_is_ended(folder):
     assert found["settings"]["reason"] == "not finished after 3 s"
 
 
+def test_cpu_seconds_leave_out_what_waits(folder, monkeypatch):
+    (folder / "math_sleepy.py").write_text(SLEEPY)
+    (clock,) = run(folder, "math.sleepy")[1]
+    monkeypatch.setenv("SOROJAX_BENCH_CPU", "0")  # so that it is as before afterwards
+    (cpu,) = run(folder, "math.sleepy", "--cpu")[1]
+    assert clock["run_s"] >= 0.1 > 0.05 > cpu["run_s"]
+
+
+def test_curves_are_drawn_from_the_recorded_run(tmp_path):
+    """Every panel has its curves; the pictures are small and on the page."""
+    lines = curves.read()
+    for panels in curves.FIGURES.values():
+        for panel in panels:
+            found = curves.curves(panel, lines)
+            assert any(len(points) > 1 for points in found.values()), panel.case
+            assert len({curve.group for curve in found}) <= len(curves.COLOURS)
+    page = (Path(__file__).parent.parent / "docs" / "benchmarks.md").read_text()
+    for picture in curves.draw(lines, tmp_path):
+        assert (curves.PICTURES / picture.name).stat().st_size < 200_000
+        assert f"(pictures/{picture.name})" in page
+    (statics,) = curves.FIGURES["rod_statics"]
+    assert statics.curve({"settings": {"case": "roll-up"}}) is None  # an error of rounding only
+
+
 def test_unknown_case_is_named(folder, capsys):
     assert main(["math.nothing", "--cases", str(folder)]) == 2
     assert "math.product" in capsys.readouterr().err
@@ -143,6 +177,48 @@ def test_a_peer_answers_arrays_and_times(folder, monkeypatch):
     found = row("soromox", "double", {"x": 2.0}, lambda a: abs(a["y"] - 4), "exact", size=1)
     assert (found.run_s_min, found.run_s, found.run_s_max, found.error) == (1, 2, 3, 0)
     assert found.settings == {"size": 1, "version": "0"}
+
+
+CHAIN = """
+import json, os, pathlib, sys
+import numpy as np
+folder = pathlib.Path(sys.argv[-1])
+kept = pathlib.Path(os.environ["JAX_COMPILATION_CACHE_DIR"]) / "kept"
+seconds = [1.0 if kept.exists() else 5.0, 0.5]
+kept.touch()
+request = json.loads((folder / "request.json").read_text())
+arrays = np.load(folder / "request.npz")
+x, v, h, found = arrays["start"], 0 * arrays["start"], request["dt"] / 50, [arrays["start"]]
+for k in range(50 * request["saves"]):
+    v = v - h / 2 * arrays["chain"] @ x
+    x = x + h * v
+    v = v - h / 2 * arrays["chain"] @ x
+    found += [x] if k % 50 == 49 else []
+answer = {"seconds": seconds, "cpu": [second / 2 for second in seconds]}
+(folder / "answer.json").write_text(json.dumps(answer))
+np.savez(folder / "answer.npz", result=np.array(found))
+"""
+
+
+def test_first_calls_of_a_peer_with_an_empty_cache_and_a_filled_one(tmp_path, monkeypatch):
+    """Its answer is held against the exact motion; without the peer there is a reason."""
+    monkeypatch.setenv("SOROJAX_PEERS", str(tmp_path))
+    task = cold_peers._chain("plain", 3, 0.1, 0.01, "motion")
+    (none,) = cold_peers._peer(task)
+    assert "not installed" in none.settings["reason"] and none.run_s is None
+    (tmp_path / "diffrax").mkdir()
+    (tmp_path / "diffrax" / "status.json").write_text('{"ok": true, "version": "0"}')
+    (tmp_path / "diffrax.py").write_text(CHAIN)
+    call = sys.modules["benchmarks.peers.call"]
+    monkeypatch.setattr(call, "interpreter", lambda peer: Path(sys.executable))
+    monkeypatch.setattr(call, "HERE", tmp_path)
+    rows = list(cold_peers._peer(task))
+    seconds = {row.settings["cache"]: row.run_s for row in rows}
+    assert seconds == {"empty": 5.0, "filled": 1.0, "second call": 0.5}
+    assert [row.settings["cpu_s"] for row in rows] == [2.5, 0.5, 0.25]
+    assert all(row.holds and row.error is not None and row.error < 1e-4 for row in rows)
+    wrong = next(cold_peers._peer(task._replace(wanted=1.01 * task.wanted)))
+    assert wrong.holds is False
 
 
 @pytest.mark.parametrize("bar_on, holds", [("run_s", True), ("error", False)])

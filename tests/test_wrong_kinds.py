@@ -118,7 +118,8 @@ def invited(parameter, converts):
     yield "an object", OBJECT
     if not known or converts or "TypeVar" in text or "~" in text:
         return
-    numbers = any(word in text for word in ("Float", "Int[", "Bool[", "float", "int", "Array"))
+    words = ("Numbers", "Float", "Int[", "Bool[", "float", "int", "Array")
+    numbers = any(word in text for word in words)
     if "None" not in text:
         yield "None", None
     if not re.search(r"\bstr\b|path|Path|Any|Mapping", text):

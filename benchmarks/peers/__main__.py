@@ -66,6 +66,7 @@ PEERS = {
         "jax_fem.problem",
         "GPL-3.0: only in its own process",
     ),
+    "diffrax": Peer(("diffrax>=0.7,<0.8",), "diffrax", "Apache-2.0"),
     "torch_fem": Peer(("torch-fem>=0.14,<0.15",), "torchfem", "MIT"),
 }
 

@@ -37,13 +37,18 @@ def status(peer: str) -> dict[str, Any]:
 
 
 def call(
-    peer: str, task: str, arrays: dict[str, np.ndarray], limit: float = 900.0, **options: Any
+    peer: str,
+    task: str,
+    arrays: dict[str, np.ndarray],
+    limit: float = 900.0,
+    environment: dict[str, str] | None = None,
+    **options: Any,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Run `task` of `peers/<peer>.py` in a process of its own.
 
     The script finds `request.json` and `request.npz` in the folder that is its only
     argument and leaves `answer.json` and `answer.npz` there. It inherits the pinned
-    core of the case.
+    core of the case, and its environment unless another is given.
 
     Raises:
         PeerMissing: With the reason.
@@ -55,17 +60,24 @@ def call(
         folder = Path(name)
         (folder / "request.json").write_text(json.dumps({"task": task} | options))
         np.savez(folder / "request.npz", **arrays)
-        _run(peer, folder, limit)
+        _run(peer, folder, limit, environment)
         answer = json.loads((folder / "answer.json").read_text())
         with np.load(folder / "answer.npz") as file:
             return answer | {"version": state["version"]}, dict(file)
 
 
-def _run(peer: str, folder: Path, limit: float) -> None:
+def _run(peer: str, folder: Path, limit: float, environment: dict[str, str] | None) -> None:
     # Isolated, so that `soromox.py` here does not shadow the package that it imports.
     command = [interpreter(peer), "-I", HERE / f"{peer}.py", folder]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=limit)
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            timeout=limit,
+            env=(os.environ if environment is None else environment)
+            | {"JAX_TRACEBACK_FILTERING": "off"},  # the last line is then the reason
+        )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise PeerMissing(str(error)) from error
     if done.returncode or not (folder / "answer.npz").exists():

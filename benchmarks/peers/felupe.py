@@ -4,6 +4,7 @@ felupe is GPL: it is only ever run as this separate program.
 """
 
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -21,6 +22,8 @@ except ImportError:
     from scipy.sparse.linalg import spsolve
 
     SOLVER = "superlu"
+
+clock = time.process_time if os.environ.get("SOROJAX_BENCH_CPU") == "1" else time.perf_counter
 
 
 def repair_quadratic_triangle():
@@ -68,7 +71,7 @@ def pressure(request, arrays):
     `part` (cells,), `mu` and `bulk` per part, `fixed` dofs, cavity `edges`, `levels`.
     """
     repair_quadratic_triangle()
-    start = time.perf_counter()
+    start = clock()
     points, load = arrays["points"], area_matrix(arrays["edges"], arrays["points"].size)
     bodies = [body(arrays, k) for k in range(len(arrays["mu"]))]
     free = np.setdiff1d(np.arange(points.size), arrays["fixed"])
@@ -88,7 +91,7 @@ def pressure(request, arrays):
         else:
             sys.exit(f"felupe: no convergence at pressure {level:g}")
         found.append(u)
-    seconds = time.perf_counter() - start
+    seconds = clock() - start
     answer = {"compile_s": 0.0, "runs": [seconds], "iterations": iterations}
     return answer | {"solver": SOLVER}, {"displacement": np.array(found)}
 

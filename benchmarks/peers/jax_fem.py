@@ -1,7 +1,8 @@
-"""Assembly in jax-fem: `python -I jax_fem.py FOLDER`.
+"""Assembly and Newton's method in jax-fem: `python -I jax_fem.py FOLDER`.
 
 jax-fem is GPL: it is only ever run as this separate program. Its solvers need PETSc; its
-assembly does not, the sum of equal entries is left to SciPy as it does itself.
+assembly does not, the sum of equal entries is left to SciPy as it does itself. Newton's method
+here is its loop with SciPy's direct solver.
 """
 
 import json
@@ -16,10 +17,11 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import scipy.sparse as sp  # noqa: E402
+import scipy.sparse.linalg as spl  # noqa: E402
 from jax_fem.generate_mesh import Mesh  # noqa: E402
 from jax_fem.problem import Problem  # noqa: E402
 
-NAMES = {"Tri3": "TRI3", "Quad4": "QUAD4", "Tet10": "TET10", "Hex8": "HEX8"}
+NAMES = {"Tri3": "TRI3", "Tri6": "TRI6", "Quad4": "QUAD4", "Tet10": "TET10", "Hex8": "HEX8"}
 
 
 def body(request, arrays):
@@ -36,9 +38,14 @@ def body(request, arrays):
             stress = jax.grad(energy)
             return lambda gradient: stress(gradient + jnp.eye(dim))
 
-    name = NAMES[request["element"]]
+    class Heavy(Rubber):
+        def get_mass_map(self):
+            weight = jnp.asarray(arrays["weight"])
+            return lambda u, x: -weight
+
+    name, kind = NAMES[request["element"]], Heavy if "weight" in arrays else Rubber
     mesh = Mesh(arrays["points"], arrays["cells"], ele_type=name)
-    return Rubber(mesh, vec=dim, dim=dim, ele_type=name)
+    return kind(mesh, vec=dim, dim=dim, ele_type=name, gauss_order=request.get("degree"))
 
 
 def assembly(request, arrays):
@@ -61,6 +68,36 @@ def assembly(request, arrays):
         runs.append(time.process_time() - start)
     product = matrix @ arrays["way"].ravel()
     return {"compile_s": max(0.0, first - min(runs)), "runs": runs}, {"product": product}
+
+
+def first_calls(request, arrays):
+    """Seconds of the first solve under a weight and of the second, from zero; `fixed` dofs."""
+    solid = body(request, arrays)
+    shape, size = arrays["points"].shape, arrays["points"].size
+    free = np.setdiff1d(np.arange(size), arrays["fixed"])
+    jax.block_until_ready(jnp.zeros(3) + 1)
+
+    def solve():
+        u, iterations = np.zeros(size), 0
+        while iterations < request["max_iterations"]:
+            (residual,) = solid.newton_update([jnp.asarray(u.reshape(shape))])
+            unbalanced = np.asarray(residual).ravel()[free]
+            entries = (np.asarray(solid.V), (np.asarray(solid.I), np.asarray(solid.J)))
+            tangent = sp.csr_array(entries, (size, size))[free][:, free]
+            step = np.zeros(size)
+            step[free] = spl.spsolve(tangent.tocsc(), -unbalanced)
+            u, iterations = u + step, iterations + 1
+            if np.linalg.norm(step) <= request["tolerance"] * np.linalg.norm(u):
+                return u.reshape(shape), iterations
+        sys.exit(f"jax_fem: no convergence in {iterations} iterations")
+
+    seconds, cpu = [], []
+    for _ in range(2):
+        start = time.perf_counter(), time.process_time()
+        u, iterations = solve()
+        seconds.append(time.perf_counter() - start[0])
+        cpu.append(time.process_time() - start[1])
+    return {"seconds": seconds, "cpu": cpu, "iterations": iterations}, {"result": u}
 
 
 if __name__ == "__main__":

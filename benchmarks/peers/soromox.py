@@ -1,9 +1,11 @@
-"""The D1 finger in soromox. Run by its own interpreter: `python -I soromox.py FOLDER`.
+"""The D1 finger in soromox, and one that stretches and twists too.
 
-Answers coordinates in the order of the request: the modes of kappa_y, then of kappa_z.
+Run by its own interpreter: `python -I soromox.py FOLDER`. Answers coordinates strain by strain,
+in the order of their names: the modes of kappa_y, then of kappa_z.
 """
 
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -15,11 +17,14 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from soromox.systems import SystemState  # noqa: E402
-from soromox.systems.components import JointSpec, LinkSpec  # noqa: E402
+from soromox.systems.components import IsotropicMaterialParams, JointSpec, LinkSpec  # noqa: E402
 from soromox.systems.gvs import GVS, GVSSegment, StrainBasisSpec  # noqa: E402
 
+clock = time.process_time if os.environ.get("SOROJAX_BENCH_CPU") == "1" else time.perf_counter
 
-def finger(num_nodes, num_modes):
+
+def finger(num_nodes, strains, orders):
+    """With polynomials of such orders for the strains that are named."""
     link = LinkSpec.circular(
         length=0.08,
         radius=0.006,
@@ -31,7 +36,7 @@ def finger(num_nodes, num_modes):
     segment = GVSSegment(
         link=link,
         joint=JointSpec(type="fixed"),
-        basis=StrainBasisSpec("chebyshev", ("kappa_y", "kappa_z"), num_modes - 1),
+        basis=StrainBasisSpec("chebyshev", tuple(strains), orders),
         num_gauss_points=num_nodes,
     )
     # Its base pose is a scalar-last quaternion and a position.
@@ -39,22 +44,27 @@ def finger(num_nodes, num_modes):
     return GVS.from_segments([segment], gravity=jnp.array([0, 0, -9.81]), base_pose=base)
 
 
+def bending(request):
+    """The finger that bends only, with as many modes of both curvatures."""
+    return finger(request["nodes"], ("kappa_y", "kappa_z"), request["modes"] - 1)
+
+
 def measure(function, *args, repeats):
-    start = time.perf_counter()
+    start = clock()
     compiled = jax.jit(function).lower(*args).compile()
-    compile_s = time.perf_counter() - start
+    compile_s = clock() - start
     result = jax.block_until_ready(compiled(*args))
     runs = []
     for _ in range(repeats):
-        start = time.perf_counter()
+        start = clock()
         jax.block_until_ready(compiled(*args))
-        runs.append(time.perf_counter() - start)
+        runs.append(clock() - start)
     return result, {"compile_s": compile_s, "runs": runs}
 
 
 def acceleration(request, arrays):
     """Accelerations at (q, v), and the time of one in a compiled loop."""
-    robot = finger(request["nodes"], request["modes"])
+    robot = bending(request)
     states = jnp.concatenate([arrays["q"], arrays["v"]], axis=-1)
     half = arrays["q"].shape[-1]
 
@@ -72,7 +82,7 @@ def acceleration(request, arrays):
 
 def simulation(request, arrays):
     """Tips of the released finger every `save_dt`, without the first."""
-    robot = finger(request["nodes"], request["modes"])
+    robot = bending(request)
     rest = jnp.zeros(2 * robot.num_internal_dofs)
 
     def tips(y):
@@ -91,6 +101,39 @@ def simulation(request, arrays):
     return timing, {
         "tips": np.asarray(result)[-round(request["duration"] / request["save_dt"]) :]
     }
+
+
+def first_calls(request, arrays):
+    """Seconds of the first call and of the second of a rollout, or of its gradient.
+
+    By Young's modulus; the end of the gradient is the sum of the last coordinates.
+    """
+    robot = finger(request["nodes"], request["strains"], request["orders"])
+    rest = jnp.zeros(2 * robot.num_internal_dofs)
+    jax.block_until_ready(jnp.zeros(3) + 1)
+
+    def coordinates(young_modulus):
+        material = IsotropicMaterialParams(young_modulus=young_modulus, poisson_ratio=0.3)
+        states = robot.with_isotropic_material(material).rollout_to(
+            SystemState(t=0.0, y=rest),
+            t1=request["duration"],
+            solver_dt=request["dt"],
+            save_dt=request["save_dt"],
+            max_steps=round(request["duration"] / request["dt"]) + 2,
+        )
+        return states.y[:, : rest.size // 2]
+
+    function = {
+        "rollout": coordinates,
+        "gradient": jax.grad(lambda young: jnp.sum(coordinates(young)[-1])),
+    }[request["what"]]
+    call, seconds, cpu = jax.jit(function), [], []
+    for _ in range(2):
+        start = time.perf_counter(), time.process_time()
+        result = jax.block_until_ready(call(jnp.array(1e6)))
+        seconds.append(time.perf_counter() - start[0])
+        cpu.append(time.process_time() - start[1])
+    return {"seconds": seconds, "cpu": cpu}, {"result": np.asarray(result)}
 
 
 if __name__ == "__main__":
