@@ -11,7 +11,8 @@ walls do not touch up to the paper's 30 kPa. For every pressure the rod is made 
 One marker cannot tell pushes apart, so the middle is worse the larger they are and the farther
 air bends it. Its largest error is 7 to 9 % of the way of the tip everywhere: 1.9 mm at 6 kPa
 with pushes of 12 mN, 3.7 mm at 30 kPa with the same, 8.7 mm with 60 mN. Without the task it is
-1.6 to 2.5 times that, and what the task is worth falls with the pushes. The picture is of 6 kPa.
+1.6 to 2.5 times that, and what the task is worth falls with the pushes. The picture is of 6
+kPa.
 """
 
 import functools
