@@ -81,7 +81,27 @@ def test_figures_and_contradictions_of_the_paper_are_named(written):
         assert html.escape(entry.get("note", "")) in written
     assert sorted(figures) == [4, 5, *range(7, 10), *range(12, 37)]
     assert "12.5 %" in paper["12_buckling"]["note"]
-    assert "<th>ours</th><th>paper</th><th>asked</th>" in written
+    assert "<th>ours</th><th>paper</th><th>asked</th><th>kind</th>" in written
+
+
+def test_most_numbers_have_a_kind_and_every_kind_has_numbers(written):
+    paper = json.loads((FOLDER / "gallery" / "paper.json").read_text())
+    without, count = [], 0
+    for file in (FOLDER / "gallery" / "numbers").glob("*.json"):
+        kinds = paper.get(file.stem, {}).get("kinds", {})
+        assert set(kinds) <= {"calibrated", "predicted", "check"}
+        names = json.loads(file.read_text())["numbers"]
+        starts = [start for each in kinds.values() for start in each]
+        assert len(set(starts)) == len(starts), file.stem
+        for start in starts:
+            assert any(name.startswith(start) for name in names), (file.stem, start)
+        without += [name for name in names if not name.startswith(tuple(starts))]
+        count += len(names)
+    assert len(without) < 0.1 * count, without
+    row = written.partition("<td>frequency of the gait [Hz]</td>")[2].partition("</tr>")[0]
+    assert row.endswith("<td>calibrated</td>")
+    row = written.partition("<td>frequency, slope 25 deg [Hz]</td>")[2].partition("</tr>")[0]
+    assert row.endswith("<td>predicted</td>")
 
 
 def test_a_new_script_is_found_measured_and_shown(tmp_path):

@@ -89,7 +89,7 @@ def test_a_gripper_carries_a_cylinder_to_its_place():
     assert numbers["lift [mm]"] > 8
     assert numbers["contact forces over weight, carried"] == pytest.approx(1, abs=0.01)
     assert numbers["moved in the grip [mm]"] < 0.5
-    assert numbers["place off its target [mm]"] < 2
+    assert numbers["place off its target [mm]"] < 1.5
     assert numbers["tilt at the end [deg]"] < 0.1 and numbers["farthest tilt [deg]"] > 10
     assert numbers["speed at the end [mm/s]"] < 0.1
     assert 0 < numbers["overlap with fingers, greatest [mm]"] < 0.1
@@ -97,7 +97,7 @@ def test_a_gripper_carries_a_cylinder_to_its_place():
     assert numbers["gripper lets go [mm]"] > 0.5
 
 
-def test_a_chamber_that_nobody_drew_is_a_drop_and_bends():
+def test_a_chamber_that_nobody_drew_is_wide_below_and_bends():
     numbers = main_of("21_pneunet_topology")(quick=True)
     assert (
         numbers["output of the cell [mm]"] > 1.5 * numbers["output of the cell at first [mm]"]
@@ -105,10 +105,12 @@ def test_a_chamber_that_nobody_drew_is_a_drop_and_bends():
     assert numbers["volume over the largest allowed"] == pytest.approx(1, abs=0.02)
     assert numbers["grey measure"] < 0.05
     assert numbers["widest part of the chamber, share of its height"] < 0.5
-    assert numbers["width of the lower third over that of the upper"] > 1.2
+    assert numbers["width, lower over upper third"] > 1.2
+    upside_down = numbers["output of the chamber upside down [mm]"]
+    assert 0.9 < upside_down / numbers["output of the cell [mm]"] < 1
     assert numbers["finer mesh off the first [mm]"] < 2
     assert numbers["tip moves by [mm]"] > 3
-    assert numbers["turn grows with pressure"] and numbers["watertight"]
-    assert numbers["volume of the triangles over that of the body"] == pytest.approx(
-        1, abs=0.02
-    )
+    assert numbers["watertight"]
+    for name in ("", "plain, same air: ", "plain, thinnest sides: "):
+        some, more = (numbers[f"{name}tip turns {x} [deg]"] for x in ("at 20 kPa", "by"))
+        assert 0 < 2 * some < more

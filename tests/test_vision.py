@@ -213,6 +213,10 @@ def test_rays_end_on_a_plane_before_the_camera():
     seen = plane.apply(np.concatenate([places, np.full((50, 1), 0.02)], axis=1))
     found = vision.on_plane(lens, vision.project(lens, seen), plane, height=0.02)
     np.testing.assert_allclose(found, places, atol=1e-12)
+    heights = np.linspace(0.0, 0.04, 50)
+    seen = plane.apply(np.concatenate([places, heights[:, None]], axis=1))
+    found = vision.on_plane(lens, vision.project(lens, seen), plane, heights)
+    np.testing.assert_allclose(found, places, atol=1e-12)
     behind = Pose(plane.rotation, -plane.translation)
     along = Pose(np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([0.1, 0.0, 0.0]))
     for other in (behind, along):

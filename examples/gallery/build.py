@@ -5,9 +5,9 @@
     python examples/gallery/build.py --run 12 14     only those whose names begin so
 
 Measured numbers lie in `numbers/NAME.json` with the machine that gave them; what the paper
-says, what this project asks of a number, and a sentence where we contradict the paper, in
-`paper.json`. A new script `NN_name.py` beside a picture `NN_name.png` is found by itself; a
-picture of another name is named there too.
+says, what this project asks of a number, of what kind it is (by the longest beginning of its
+name), and a sentence where we contradict the paper, in `paper.json`. A new script `NN_name.py`
+beside a picture `NN_name.png` is found by itself; a picture of another name is named there too.
 """
 
 import argparse
@@ -145,16 +145,26 @@ def _table(script: Path, store: Path, paper: dict[str, Any]) -> str:
     body = ""
     for name in dict.fromkeys((*numbers, *told, *asked)):
         here = html.escape(text(numbers[name])) if name in numbers else "-"
-        cells = html.escape(name), here, *(html.escape(r.get(name, "")) for r in (told, asked))
+        said = (told.get(name, ""), asked.get(name, ""), kind_of(name, paper.get("kinds", {})))
+        cells = html.escape(name), here, *map(html.escape, said)
         body += f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
     note = "not measured yet: run build.py --run"
     if found:
         mode = ", quick mode" if found["quick"] else ""
         note = f"{found['seconds']:g} s on {found['machine']}; {found['versions']}; "
         note += f"{found['day']}{mode}"
-    head = "<tr><th></th><th>ours</th><th>paper</th><th>asked</th></tr>" if body else ""
+    heads = "".join(f"<th>{head}</th>" for head in ("", "ours", "paper", "asked", "kind"))
+    head = f"<tr>{heads}</tr>" if body else ""
     said = f"<p>{html.escape(paper['note'])}</p>" if "note" in paper else ""
     return f"<table>{head}{body}</table>{said}<p class=note>{html.escape(note)}</p>"
+
+
+def kind_of(name: str, kinds: dict[str, list[str]]) -> str:
+    """Whether a number is calibrated, predicted or a check; empty where nobody says."""
+    found = [
+        (len(start), kind) for kind in kinds for start in kinds[kind] if name.startswith(start)
+    ]
+    return max(found)[1] if found else ""
 
 
 def text(value: float | int | str) -> str:
@@ -202,7 +212,11 @@ details {{ margin-top: .5em }} summary {{ cursor: pointer }} a {{ color: #0072b2
 <p>Every example of this folder with what it draws and the numbers that its <code>main()</code>
 returns, beside those of the paper: Caasenbrood, Pogromsky, Nijmeijer, <i>Sorotoki: a Matlab
 toolkit for design, modeling, and control of soft robots</i>, IEEE Access 12, 2024. What is
-asked is the bar of this project. Numbers of figures are those of the paper.</p><p>{links}</p>
+asked is the bar of this project. Numbers of figures are those of the paper. The kind says what
+a number is worth: <i>calibrated</i>, something in the script was chosen so that it comes out
+like its source; <i>predicted</i>, it follows from sizes, materials and inputs, and could have
+come out otherwise; <i>check</i>, it compares our own parts with an exact value or with each
+other. Sizes and times have none.</p><p>{links}</p>
 {cards}
 {notebooks}
 </body></html>

@@ -113,7 +113,10 @@ def rays(camera: Camera, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray,
 
 
 def on_plane(
-    camera: Camera, pixels: Float[np.ndarray, "*n 2"], plane: Pose, height: float = 0.0
+    camera: Camera,
+    pixels: Float[np.ndarray, "*n 2"],
+    plane: Pose,
+    height: float | Float[np.ndarray, "*n"] = 0.0,
 ) -> Float[np.ndarray, "*n 2"]:
     """Where the rays of pixels meet a plane: places of markers that one colour camera sees.
 
@@ -122,7 +125,7 @@ def on_plane(
         pixels: Column and row [px].
         plane: Frame whose x and y lie in the plane, as the camera sees it: from `world_frame`
             or `marker_pose`.
-        height: Of the markers over the plane, along its z axis [m].
+        height: Of all markers over the plane, or of each, along its z axis [m].
 
     Returns:
         x and y in the frame of the plane [m]; NaN where a ray does not meet it before the
