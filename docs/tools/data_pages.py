@@ -117,12 +117,16 @@ def _numbers(build, script: Path, paper: dict[str, Any]) -> str:
         return f"Numbers: run `python examples/{script.name}`.\n\n"
     found = json.loads(file.read_text())
     others = {key: paper[kind] for kind, key in _OTHERS.items() if paper.get(kind)}
-    head = "".join(f" {key} |" for key in ("ours", *others))
-    head = f"| |{head}\n| --- |{' --- |' * (1 + len(others))}\n"
+    kinds = paper.get("kinds", {})
+    heads = ("ours", *others, *(("kind",) if kinds else ()))
+    head = "".join(f" {key} |" for key in heads)
+    head = f"| |{head}\n| --- |{' --- |' * len(heads)}\n"
     rows = ""
     for name in dict.fromkeys((*found["numbers"], *(n for o in others.values() for n in o))):
         ours = build.text(found["numbers"][name]) if name in found["numbers"] else "-"
-        cells = (ours, *(other.get(name, "") for other in others.values()))
+        cells = [ours, *(other.get(name, "") for other in others.values())]
+        if kinds:
+            cells.append(build.kind_of(name, kinds))
         rows += f"| {name} |{''.join(f' {cell} |' for cell in cells)}\n"
     said = f"{paper['note']}\n\n" if "note" in paper else ""
     quick = ", quick mode" if found["quick"] else ""
