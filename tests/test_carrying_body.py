@@ -233,6 +233,9 @@ def test_solids_are_carried_by_links_and_links_alone_move_them():
     free = replace(solid, lambda b: b.inertia, None)
     with pytest.raises(ValueError, match="the solid on `bar` is fixed to the ground"):
         systems.CarryingBody(arm, {"bar": free})
+    held = rod.with_closures(arm.assembly, bar=rod.Closure("bar", rod.Revolute()))
+    with pytest.raises(ValueError, match="bar_wrench is the name of two ports or states"):
+        systems.CarryingBody(systems.AssemblyBody(held), {"bar": solid})
     finger = rod.rod(
         SE2(), rod.chebyshev(kappa_z=2), rod.circle(5e-3), length=0.1, young_modulus=1e6,
         poisson_ratio=0.5, density=1000,

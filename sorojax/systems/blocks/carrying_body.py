@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from sorojax.rod import Link
 from sorojax.rod.dynamics.tree import (
     AssemblyState,
+    Frame,
     bias_accelerations,
     part_columns,
 )
@@ -109,11 +110,12 @@ class CarryingBody(AbstractBlock):
                     f"CarryingBody: the solid on `{name}` is of {dim} dimensions, need "
                     f"{assembly.group.space_dim} as the assembly."
                 )
-        ports = [*self.arm.inputs, *self._driven(), *self.outputs]
-        if twice := {port for port in ports if ports.count(port) > 1}:
+        ports = [*self.arm.inputs, *self._driven(), *self.arm.outputs, *self._told()]
+        names = [*ports, *self.arm.initial_state(), *self.solids]
+        if twice := {name for name in names if names.count(name) > 1} - {"q"}:
             raise ValueError(
-                f"CarryingBody: {min(twice)} is the name of two ports. Rename the part, or the "
-                "load or marker of the solid."
+                f"CarryingBody: {min(twice)} is the name of two ports or states. Rename the "
+                "part, or the closure, load or marker."
             )
 
     @property
@@ -129,8 +131,11 @@ class CarryingBody(AbstractBlock):
 
     @property
     def outputs(self):
+        return self.arm.outputs | self._told()
+
+    def _told(self):
         felt, twist = frozenset(self.inputs), self.arm.assembly.group.algebra_dim
-        ports = dict(self.arm.outputs)
+        ports = {}
         for part, solid in self.solids.items():
             ports |= {f"{part}_{name}": port for name, port in solid.outputs.items()}
             ports[f"{part}_wrench"] = Output(None, (twist,), felt)
@@ -182,11 +187,9 @@ class CarryingBody(AbstractBlock):
             columns, biases = part_columns(moment), bias_accelerations(moment)
             mass, force = 0.0, 0.0
             for part, solid in self.solids.items():
-                at = index_of(self.arm.assembly, part)
-                one = _share(solid, state[part], self._taken(part, inputs), moment, at)
-                one = one._replace(columns=columns[at])
-                if (bias := biases[at]) is not None:
-                    one = one._replace(bias=bias)
+                at, taken = index_of(self.arm.assembly, part), self._taken(part, inputs)
+                link = moment.frames[at], columns[at], biases[at]
+                one = _share(solid, state[part], taken, *link)
                 mass = mass + one.columns.T @ one.inertia @ one.columns
                 force = force - one.columns.T @ (one.inertia @ one.bias + one.wrench)
                 shares[part] = one
@@ -212,22 +215,20 @@ def _rows(dim: int) -> np.ndarray:
     return np.array(_PLANAR if dim == 2 else range(6))
 
 
-def _share(solid: ModalBody, own, inputs, moment: AssemblyState, at: int) -> _Share:
-    """The columns and the bias of the link are left zero."""
-    frame, inertia = moment.frames[at], solid.inertia
+def _share(solid: ModalBody, own, inputs, frame: Frame, columns, bias) -> _Share:
+    """Of a solid in a state `own` on a link with this frame, whose twist has these `columns`
+    and whose acceleration is `bias` where that of the coordinates is zero."""
+    inertia, rows = solid.inertia, _rows(len(frame.position))
     assert isinstance(inertia, ModalInertia)
-    rows = _rows(frame.rotation.shape[0])
     twist = jnp.zeros(6, own["q"].dtype).at[rows].set(frame.twist)
     whole = inertia.moved(own["q"], own["v"], twist[:3])
-    matrix, coupling = whole.matrix[rows][:, rows], whole.coupling[rows]
-    weight = jnp.zeros(6, twist.dtype).at[3 : 3 + len(frame.position)]
-    weight = weight.set(frame.rotation.T @ inertia.gravity)[rows]
-    pull = solid.pull(own["q"], own["v"], inputs) - whole.swing
+    coupling = whole.coupling[rows]
     # as seen from a frame that accelerates against gravity, nothing has weight
-    left = matrix - coupling @ coupling.T
+    weight = jnp.zeros_like(frame.twist).at[-len(frame.position) :]
+    weight = weight.set(frame.rotation.T @ inertia.gravity)
+    left = whole.matrix[rows][:, rows] - coupling @ coupling.T
+    pull = solid.pull(own["q"], own["v"], inputs) - whole.swing
     wrench = whole.wrench[rows] + coupling @ pull - left @ weight
     wrench = wrench - solid.push(own["q"], inputs)[rows]
-    still = jnp.zeros((len(rows), moment.v.shape[0]), twist.dtype)
-    return _Share(
-        left, wrench, coupling, pull + coupling.T @ weight, still, jnp.zeros_like(weight)
-    )
+    bias = jnp.zeros_like(frame.twist) if bias is None else bias
+    return _Share(left, wrench, coupling, pull + coupling.T @ weight, columns, bias)
