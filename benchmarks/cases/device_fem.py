@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks import devices
-from benchmarks.blocks import bent, block
-from benchmarks.cases.fem_iterative import iterating, varied
+from benchmarks.blocks import bent, block, softened
+from benchmarks.cases.fem_iterative import iterating
 from benchmarks.harness import Row, measure, measure_calls, quick
 from sorojax import fem, mesh
 from sorojax.fem.equilibrium.linear import constrain, linearise, prepare
@@ -116,7 +116,7 @@ def _equilibrium(device, problem, prepared, exact):
     """By conjugate gradients in one program, by the direct solver on the CPU."""
     cpu = device.platform == "cpu"
     if cpu:
-        others = varied(problem)
+        others = softened(problem)
         timing = measure_calls(lambda: fem.solve(next(others)).displacement, repeats=2)
         u = exact["equilibrium"] = fem.solve(problem).displacement
     else:
