@@ -45,7 +45,7 @@ TIMES = np.array([0, 0.5, 0.7, 0.9, 1.1, 1.6, 2.8, 3.4, 4.6, 4.8, 5.0, 5.1, 5.9,
 HIGH = np.array([47, 30.5, 30.5, 30.5, 30.5, 40, 40, 40, 30.3, 30.3, 30.3, 30.3, 45, 45]) * mm
 
 
-def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, float]:
+def main(quick: bool = False, picture: str | Path | None = None) -> dict:
     thing, floor = robots.standing_cylinder(MASS, RADIUS, HEIGHT, FLOOR)
     grip = rod.LinkContact(sj.sdf.Cylinder(RADIUS, HEIGHT), SPINE, GRIP, points=16)
     forces = *(PairForce(t[:-4], "cylinder", grip) for t in TIPS), PartForce("cylinder", floor)

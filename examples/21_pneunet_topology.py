@@ -79,7 +79,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     both = density, density.at[:, free].set(density[:, free][:, ::-1])  # and upside down
     moved, flipped = (fem.solve(pneunet.body(cell, x.ravel())).displacement for x in both)
 
-    made = design.part(cell.problem.mesh, density.ravel(), folds=(design.Repeat(0, count),))
+    made = design.part(cell.problem.mesh, np.ravel(density), folds=(design.Repeat(0, count),))
     length, size = count * SIZE[0] + CAP, (1.6 if quick else 1.2) * mm  # with a solid end
     block = sdf.Rectangle([0, 0], [length, SIZE[1]])
     body = made.shape | sdf.Rectangle([length - 1.1 * CAP, 0], [length, SIZE[1]])

@@ -88,7 +88,7 @@ def study(problem, line, most, push, frames):
     return (path, shapes[1:], true, tip, lines, off), spent[1:frames]  # the first is compiled
 
 
-def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, float]:
+def main(quick: bool = False, picture: str | Path | None = None) -> dict:
     actuator = BellowsActuator(num_bellows=9)
     mesh = sj.mesh.triangulate(actuator.body(), size=(2.0 if quick else 1.2) * mm, order=2)
     # the third, fifth and eighth bellow are pushed
