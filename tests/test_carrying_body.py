@@ -215,9 +215,17 @@ def _forced(solid):
     return systems.FemBody(_with(solid, fem.Force([1], [0.0, 1.0])), driven=("grip",))
 
 
+def _begun(solid):
+    return replace(solid, lambda b: b.u, jnp.zeros_like(solid.problem.mesh.points))
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
-    [(_pinned, "one fem.Carried alone"), (_forced, "need weight, and driven pressures")],
+    [
+        (_pinned, "one fem.Carried alone"),
+        (_forced, "need weight, and driven pressures"),
+        (_begun, "begins at rest in its frame"),
+    ],
 )
 def test_what_a_frame_cannot_carry_is_refused(change, says):
     solid = change(pendulum(1.0).blocks["solid"])

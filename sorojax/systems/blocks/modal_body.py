@@ -293,7 +293,12 @@ def reducible(where: str, body: FemBody) -> None:
 
 
 def _carriable(where: str, body: FemBody) -> None:
-    """Refuse loads that do not turn with the frame that carries the body."""
+    """Refuse what does not turn with the frame that carries the body."""
+    if body.u is not None or body.v is not None:
+        raise ValueError(
+            f"{where}: got `u` or `v` at the start, in the world, of a body that a frame "
+            "carries, need one that begins at rest in its frame. Leave both out."
+        )
     for load in body.problem.loads:
         driven = load.name in body.drives
         if isinstance(load, fem.Gravity) != driven and isinstance(load, _TURNING):
@@ -354,11 +359,12 @@ def _push(body: FemBody, name: str, basis: Basis, pose) -> Polynomial | None:
         both = jnp.concatenate([jnp.cross(arm, force), force], axis=-1)
         return jnp.sum(both, axis=1).reshape(-1)
 
-    _, force = forces(zero)
+    inside, force = forces(zero)
     found = [wrench(zero), wrench(zero + 1e-3)]
     if not is_traced(found):
-        size = float(jnp.sum(jnp.abs(force)))
-        if max(float(jnp.max(jnp.abs(x[3:]))) for x in found) <= 1e-9 * size:
+        size, length = jnp.sum(jnp.abs(force)), jnp.max(jnp.abs(inside))
+        least = 1e-9 * size * jnp.repeat(jnp.stack([length, jnp.ones_like(length)]), 3)
+        if all(bool(jnp.all(jnp.abs(x.reshape(-1, 6)) <= least[None])) for x in found):
             return None
     return Polynomial(derivatives(wrench, zero, 3))
 
