@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import Status, fem, material, mesh
+from sorojax import Status, fem, material, mesh, sdf
 from sorojax.fem.problem import load_force
 from sorojax.math.linalg import sparse
 
@@ -139,6 +139,27 @@ def test_a_body_of_revolution_is_pulled_along_its_axis():
     np.testing.assert_allclose(found["pull"].force, [0, want], rtol=1e-5)
     np.testing.assert_allclose(found["foot"].force, -found["pull"].force, rtol=1e-8)
     assert found["pull"].moment.shape == (1,)
+
+
+@pytest.mark.parametrize("kinematics", [fem.PlaneStrain(0.5), fem.Axisymmetric()])
+@pytest.mark.parametrize("origin", [None, [0.0, -0.1]])
+def test_pressure_in_an_open_cavity_pushes_its_walls_alone(kinematics, origin):
+    """A cup upside down, held at its rim: it is pushed up by pressure times opening."""
+    sheet = mesh.rectangle([0, 0], [0.03, 0.05], divisions=(3, 5))
+    cup = mesh.submesh(sheet, mesh.cells_where(sheet, lambda p: (p[0] > 0.02) | (p[1] > 0.04)))
+    rim = np.flatnonzero(np.asarray(cup.points)[:, 1] == 0)
+    inside = mesh.facets_on(cup, sdf.Rectangle([-0.01, 0.0], [0.02, 0.04]))
+    supports = (
+        fem.Fixed(cup.node_sets["left"], components=(0,)),
+        fem.Fixed(rim, name="rim"),
+    )
+    loads = (fem.Pressure(inside, 2e3, origin=origin),)
+    problem = fem.problem(cup, RUBBER, kinematics=kinematics, supports=supports, loads=loads)
+    u = fem.solve(problem, newton=SHARP).displacement
+    opening = np.pi * 0.02**2 if isinstance(kinematics, fem.Axisymmetric) else 0.02 * 0.5
+    force = fem.reactions(problem, u)["rim"].force[1]
+    np.testing.assert_allclose(force, -2e3 * opening, rtol=1e-8)
+    np.testing.assert_allclose(fem.reaction_force(problem, u, rim)[1], force, rtol=1e-12)
 
 
 def test_a_reaction_has_a_derivative_by_material_and_place():

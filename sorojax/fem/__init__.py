@@ -55,7 +55,7 @@ from sorojax.fem.loads.springs import (
     tension,
 )
 from sorojax.fem.problem import Problem, potential_energy, problem, residual
-from sorojax.fem.reactions import Reaction, reaction_history, reactions
+from sorojax.fem.reactions import Reaction, reaction_force, reaction_history, reactions
 from sorojax.fem.stability.buckling import critical_loads, with_imperfection
 from sorojax.fem.stability.continuation import continuation
 from sorojax.fem.stability.modal import (
@@ -73,7 +73,6 @@ from sorojax.fem.stress import (
     nodal_stress,
     patches,
     principal_stresses,
-    reaction_force,
     sample_points,
     strain_energy,
     von_mises_stress,

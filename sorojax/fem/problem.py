@@ -239,7 +239,8 @@ def _potential_energy(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[A
 
 
 def residual(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, "nodes dim"]:
-    """Unbalanced force at every node [N]: zero at equilibrium, reactions at supports.
+    """Slope of the potential energy by every node [N]: zero at equilibrium but at supports,
+    where `reactions` tells what these exert.
 
     Args:
         problem: The boundary value problem.

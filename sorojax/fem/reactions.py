@@ -24,6 +24,7 @@ from sorojax.fem.dynamics.trajectory import Trajectory
 from sorojax.fem.equilibrium.jit import known_mask
 from sorojax.fem.equilibrium.solve import Path
 from sorojax.fem.kinematics import Axisymmetric
+from sorojax.fem.loads.loads import Pressure
 from sorojax.fem.problem import Problem, body, exchanged, residual
 from sorojax.fem.relaxation import at_instant
 from sorojax.fem.supports import AbstractSupport, known_components, known_values
@@ -85,7 +86,23 @@ def reactions(
         Bathe, Finite Element Procedures, 1996.
     """
     about = _point("fem.reactions", problem, about)
-    return _split(problem, about, u, residual(problem, u))
+    return _split(problem, about, u, balance(problem, u))
+
+
+def reaction_force(
+    problem: Problem, u: Float[Array, "nodes dim"], nodes: Int[Array, " nodes"]
+) -> Float[Array, " dim"]:
+    """Force that the supports of `nodes` exert on the body [N].
+
+    Args:
+        problem: The boundary value problem.
+        u: Displacement of the nodes [m].
+        nodes: Numbers of supported nodes.
+
+    Returns:
+        Force [N].
+    """
+    return jnp.sum(balance(problem, u)[nodes], axis=0)
 
 
 def reaction_history(
@@ -133,6 +150,19 @@ def reaction_history(
     each = jax.vmap(lambda u, force: _split(problem, about, u, force))
     found = each(motion.displacements, forces)
     return {name: eqx.tree_at(lambda r: r.nodes, r, r.nodes[0]) for name, r in found.items()}
+
+
+@jax.jit
+def balance(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, "nodes dim"]:
+    """Internal force less the loads at every node [N]: reactions at supports, where pressures
+    act on their facets alone, also on the edges of an open cavity."""
+    force = residual(problem, u)
+    pressures = [load for load in problem.loads if isinstance(load, Pressure)]
+    if not pressures:
+        return force
+    held = known_mask(problem.supports, *u.shape).reshape(u.shape)
+    beyond = sum((load.edge_force(problem, u) for load in pressures), jnp.zeros_like(u))
+    return force - jnp.where(held, beyond, jnp.zeros_like(u))
 
 
 def _point(where: str, problem: Problem, about: Numbers | None) -> Float[Array, " dim"]:
@@ -185,7 +215,7 @@ def wrench(
 def _path_forces(path: Path) -> Float[Array, "steps nodes dim"]:
     """Internal force less the loads at every state: zero but at supports [N]."""
     states = jnp.arange(path.displacements.shape[0])
-    return jax.lax.map(lambda k: residual(path.problem_at(k), path.displacements[k]), states)
+    return jax.lax.map(lambda k: balance(path.problem_at(k), path.displacements[k]), states)
 
 
 # A body in motion: the acceleration of every node at an instant
@@ -224,7 +254,7 @@ def _without_inertia(dynamics: Dynamics, known, state: State, index, lists):
     loads = loads if lists is None else with_lists(loads, lists)
     loads = tuple(load.begun(bare, now) for load in loads)
     loaded = at_instant(bare, known.moduli, state.strains, state.peaks)
-    force = residual(exchanged(loaded, loads=loads), u).ravel()
+    force = balance(exchanged(loaded, loads=loads), u).ravel()
     force = force + swing_force(problem, u, v).ravel()
     damping = damping_matrix(dynamics, known, u)
     if damping is None:

@@ -26,7 +26,7 @@ from sorojax.fem.assembly.geometry import (
 from sorojax.fem.assembly.space import coefficients, modes
 from sorojax.fem.kinematics import PlaneStress
 from sorojax.fem.loads.facets import cavity_volume
-from sorojax.fem.problem import Problem, body, body_at, residual
+from sorojax.fem.problem import Problem, body, body_at
 from sorojax.material.kinematics import Entry, Tensor, determinant
 from sorojax.mesh.elements.base import (
     AbstractElement,
@@ -243,22 +243,6 @@ def _nodal_average(mesh: Mesh, field: Float[Array, "cells cell_nodes *value"]):
     zero = jnp.zeros((mesh.num_nodes, *field.shape[2:]), field.dtype)
     total = zero.at[mesh.cells].add(field)
     return total / zero.at[mesh.cells].add(jnp.ones_like(field))
-
-
-def reaction_force(
-    problem: Problem, u: Float[Array, "nodes dim"], nodes: Int[Array, " nodes"]
-) -> Float[Array, " dim"]:
-    """Force that the supports of `nodes` exert on the body [N].
-
-    Args:
-        problem: The boundary value problem.
-        u: Displacement of the nodes [m].
-        nodes: Numbers of supported nodes.
-
-    Returns:
-        Force [N].
-    """
-    return jnp.sum(residual(problem, u)[nodes], axis=0)
 
 
 def enclosed_volume(

@@ -12,6 +12,7 @@ import numpy as np
 
 from sorojax import _check, fem
 from sorojax.fem.equilibrium.solve import Path as FemPath
+from sorojax.fem.reactions import balance
 from sorojax.io import _files
 from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.mesh import valences
@@ -163,7 +164,7 @@ def _values(problem, u, fields):
             "principal": np.linalg.eigvalsh(np.nan_to_num(stress)),
         }
     if "reaction" in fields:
-        nodes["reaction"] = _three(np.asarray(fem.residual(problem, u)))
+        nodes["reaction"] = _three(np.asarray(balance(problem, u)))
     if "energy" in fields:
         cells["energy"] = np.asarray(fem.strain_energy(problem, u))
     return {name: nodes[name] for name in fields if name in nodes}, cells

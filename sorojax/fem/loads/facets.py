@@ -97,6 +97,21 @@ def cavity_volume(
     return jnp.sum(jax.vmap(lambda x: facet_volume(element, kinematics, x, flux_shares))(x))
 
 
+def pressure_force(
+    problem: "Problem", u: Float[Array, "nodes dim"], facets: Facets
+) -> Float[Array, "nodes dim"]:
+    """Nodal forces of a unit of pressure on the outer side of deformed facets [m^2]."""
+    tables, kinematics = facet_tables(problem.mesh.element), problem.kinematics
+    weights, values = (jnp.asarray(x, u.dtype) for x in (tables.weights, tables.values))
+
+    def one(x):
+        depth = weights * kinematics.depth(tuple((values @ x).T))
+        return -jnp.einsum("q,qa,qi->ai", depth, values, normals(tables, x))
+
+    pushed = jax.vmap(one)((problem.mesh.points + u)[facets])
+    return jnp.zeros_like(u).at[facets].add(pushed)
+
+
 def areas_of(problem: "Problem", facets: Facets) -> Float[Array, "facets quad"]:
     """Reference areas of the quadrature points of facets [m^2]."""
     tables, kinematics = facet_tables(problem.mesh.element), problem.kinematics

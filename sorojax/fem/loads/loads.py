@@ -18,7 +18,7 @@ from sorojax._jax.trace_state import is_traced
 from sorojax._types import integers, optional_real, real
 from sorojax.fem.assembly.geometry import interpolated, quadrature_points
 from sorojax.fem.kinematics import Axisymmetric
-from sorojax.fem.loads.facets import CurvedPart, facet_integral, facet_volume
+from sorojax.fem.loads.facets import CurvedPart, facet_integral, facet_volume, pressure_force
 
 if TYPE_CHECKING:
     from sorojax.fem.dynamics.masses import Masses
@@ -144,6 +144,14 @@ class Pressure(AbstractLoad):
             return -self.value * facet_volume(element, kinematics, x, self.flux_shares)
 
         return CurvedPart(self.facets, energy)
+
+    def edge_force(
+        self, problem: "Problem", u: Float[Array, "nodes dim"]
+    ) -> Float[Array, "nodes dim"]:
+        """What the pressure exerts beyond its potential [N]: at the edges of an open cavity,
+        where they are held; the potential is that of the cavity with lids through `origin`."""
+        slope = jax.grad(lambda u: self.potential(problem, u))(u)
+        return self.value * pressure_force(problem, u, self.facets) + slope
 
 
 class Traction(AbstractLoad):

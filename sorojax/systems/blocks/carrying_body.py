@@ -229,6 +229,5 @@ def _share(solid: ModalBody, own, inputs, frame: Frame, columns, bias) -> _Share
     left = whole.matrix[rows][:, rows] - coupling @ coupling.T
     pull = solid.pull(own["q"], own["v"], inputs) - whole.swing
     wrench = whole.wrench[rows] + coupling @ pull - left @ weight
-    wrench = wrench - solid.push(own["q"], inputs)[rows]
     bias = jnp.zeros_like(frame.twist) if bias is None else bias
     return _Share(left, wrench, coupling, pull + coupling.T @ weight, columns, bias)

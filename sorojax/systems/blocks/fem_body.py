@@ -10,12 +10,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import fem
+from sorojax._jax.trace_state import is_traced
 from sorojax._types import optional_real
 from sorojax.fem.dynamics.damping import AbstractDamping
 from sorojax.fem.dynamics.masses import kinetic_energy, swing_force, with_masses
 from sorojax.fem.dynamics.methods import Coefficients
 from sorojax.fem.dynamics.step import Dynamics, Mass, Matter, State, matter
 from sorojax.fem.equilibrium.jit import known_mask
+from sorojax.fem.loads.facets import open_nodes
 from sorojax.fem.loads.loads import AbstractLoad, remembers
 from sorojax.fem.problem import body, load_force, residual, with_terms
 from sorojax.fem.relaxation import (
@@ -62,7 +64,8 @@ class FemBody(AbstractBlock):
     matrix, and `clamp_wrench` about its origin along the axes of the world, moment [N m]
     first: what `AssemblyBody(carrying=...)` gives and takes. Nodes that are driven have the
     velocities and accelerations of their motion; `u` and `v` have to begin with it. Of such a
-    body the state holds the `reactions` too; it moves by `Coupled()` only.
+    body the state holds the `reactions` too; it moves by `Coupled()` only. A chamber that is
+    open where a driven support holds its edge has no volume of its own and is refused.
 
     The equations are stiff and many. `Coupled()` steps them implicitly, together with what
     the rest of the network answers within the step: the default of `simulate(network,
@@ -114,6 +117,24 @@ class FemBody(AbstractBlock):
             )
         for damping in self.damping:
             damping.check(self.problem)
+        self._check_chambers()
+
+    def _check_chambers(self):
+        """Refuse a pressure on an open run of facets whose ends a driven support moves."""
+        moved = list(self.moved.values())
+        pressures = [x for x in self.problem.loads if isinstance(x, fem.Pressure)]
+        if not moved or is_traced((moved, pressures)):
+            return
+        taken = np.concatenate([np.asarray(support.nodes) for support in moved])
+        for load in pressures:
+            ends = open_nodes(self.problem.mesh.element, np.asarray(load.facets))
+            if (ends := np.intersect1d(ends, taken)).size:
+                raise ValueError(
+                    f"FemBody: the pressure `{load.name}` acts on facets with an open end at "
+                    f"nodes {ends[:4].tolist()}, which a driven support moves, so that its "
+                    "volume is not known, need a closed chamber. Close it by a wall of the "
+                    "mesh."
+                )
 
     @property
     def drives(self) -> dict[str, AbstractLoad]:

@@ -118,7 +118,6 @@ class ModalBody(AbstractBlock):
         energies: Whether energies are outputs.
         pulls: Loads that are tendons: they do not push, whatever the input.
         inertia: Of a body that a frame carries; `CarryingBody` moves it with a link.
-        pushes: Of a body that a frame carries: wrench by a unit of each load that has one.
         markers: Places at q = 0 and how they move, by name.
         q, v: At the start.
     """
@@ -135,7 +134,6 @@ class ModalBody(AbstractBlock):
     energies: bool = eqx.field(static=True, default=False)
     pulls: tuple[str, ...] = eqx.field(static=True, default=())
     inertia: ModalInertia | None = None
-    pushes: dict[str, Polynomial] = eqx.field(default_factory=dict)
 
     @property
     def inputs(self):
@@ -194,26 +192,13 @@ class ModalBody(AbstractBlock):
     def pull(self, q: Modes, v: Modes, inputs) -> Modes:
         """Force on the modal coordinates in a frame that rests."""
         total = -self.force(q) - self.damping @ v
-        for load, given in self._given(inputs):
-            _, pull = jax.vjp(self.works[load], q)
-            total = total + pull(given)[0]
-        return total
-
-    def push(self, q: Modes, inputs) -> Float[Array, "6"]:
-        """Wrench of the driven loads about the frame that carries the body."""
-        total = jnp.zeros(6, q.dtype)
-        for load, given in self._given(inputs):
-            if load in self.pushes:
-                total = total + given @ self.pushes[load](q).reshape(-1, 6)
-        return total
-
-    def _given(self, inputs):
-        """Driven loads and their values."""
         for load, port, *_ in self.ports:
             given = inputs[port].reshape(-1)
             if load in self.pulls:
                 given = jnp.where(given >= 0, given, jnp.zeros_like(given))
-            yield load, given
+            _, pull = jax.vjp(self.works[load], q)
+            total = total + pull(given)[0]
+        return total
 
 
 def modal_body(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBody:
@@ -236,7 +221,7 @@ def modal_body(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBo
     reducible("modal_body", body)
     if order is not None and order not in (1, 2, 3):
         raise ValueError(f"reduced: `order` must be 1, 2, 3 or None, got {order}.")
-    inertia, pushes = _in_a_frame(body, basis) if body.moved else (None, {})
+    inertia = _in_a_frame(body, basis) if body.moved else None
     body = without_weight(body)
     values = {name: jnp.zeros_like(load.value) for name, load in body.drives.items()}
     free = body.loaded(values)
@@ -269,7 +254,6 @@ def modal_body(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBo
         body.energies,
         tuple(name for name, load in body.drives.items() if isinstance(load, fem.Tendon)),
         inertia,
-        pushes,
     )
 
 
@@ -322,8 +306,8 @@ def without_weight(body: FemBody) -> FemBody:
     return eqx.tree_at(lambda b: b.problem.loads, body, loads)
 
 
-def _in_a_frame(body: FemBody, basis: Basis) -> tuple[ModalInertia, dict[str, Polynomial]]:
-    """Inertia in the frame that carries the body, and wrenches of its loads there."""
+def _in_a_frame(body: FemBody, basis: Basis) -> ModalInertia:
+    """Inertia in the frame that carries the body."""
     problem = body.problem
     (support,) = body.moved.values()
     assert isinstance(support, fem.Carried) and support.rest is not None
@@ -332,41 +316,7 @@ def _in_a_frame(body: FemBody, basis: Basis) -> tuple[ModalInertia, dict[str, Po
     gravity = sum(weights, jnp.zeros(dim, basis.shapes.dtype))
     points = problem.mesh.points + basis.displacement
     known = (problem.space.system, body.matter().mass, points, basis.shapes, rest, gravity)
-    pushes = {name: _push(body, name, basis, rest) for name in body.drives}
-    return modal_inertia(*known), {n: x for n, x in pushes.items() if x is not None}
-
-
-def _push(body: FemBody, name: str, basis: Basis, pose) -> Polynomial | None:
-    """Wrench of a unit of a driven load about a frame, to third order; None of a load that
-    turns with the body and has none, as a closed chamber."""
-    load, points = body.drives[name], body.problem.mesh.points
-    dim, zero = points.shape[1], jnp.zeros(len(basis), basis.shapes.dtype)
-
-    def work(u):
-        own = lambda value: eqx.tree_at(lambda load: load.value, load, value)  # noqa: E731
-        slope = jax.grad(lambda value: own(value).potential(body.problem, u))
-        return -slope(jnp.zeros_like(load.value)).reshape(-1)
-
-    def forces(q):
-        u = displacement(basis, q)
-        inside = (points + u - pose[None, :dim, dim]) @ pose[:dim, :dim]
-        return inside, jax.jacrev(work)(u) @ pose[:dim, :dim]
-
-    def wrench(q):
-        inside, force = forces(q)
-        pad = [(0, 0)] * (force.ndim - 1) + [(0, 3 - dim)]
-        arm, force = jnp.pad(inside, pad[1:])[None], jnp.pad(force, pad)
-        both = jnp.concatenate([jnp.cross(arm, force), force], axis=-1)
-        return jnp.sum(both, axis=1).reshape(-1)
-
-    inside, force = forces(zero)
-    found = [wrench(zero), wrench(zero + 1e-3)]
-    if not is_traced(found):
-        size, length = jnp.sum(jnp.abs(force)), jnp.max(jnp.abs(inside))
-        least = 1e-9 * size * jnp.repeat(jnp.stack([length, jnp.ones_like(length)]), 3)
-        if all(bool(jnp.all(jnp.abs(x.reshape(-1, 6)) <= least[None])) for x in found):
-            return None
-    return Polynomial(derivatives(wrench, zero, 3))
+    return modal_inertia(*known)
 
 
 def _place(body: FemBody, basis: Basis, node: int) -> Array:
