@@ -102,36 +102,45 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
 
 
 def draw(run, angles, found, file: Path) -> None:
-    """The tube from the side, at rest and pressed, and its twist by winding angle."""
+    """The tube, at rest and pressed, and its twist by winding angle."""
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, 3, figsize=(10, 4.8), width_ratios=(1, 1, 2.6))
-    X, wall = np.asarray(run.problem.mesh.points), run.problem.mesh.facet_sets["right"]
-    outer = np.unique(np.asarray(wall))
-    levels = np.round(X[outer, 1], 6)
-    for side, u in zip(axes, (0 * run.displacement, run.displacement), strict=False):
-        x = (X + np.asarray(u))[outer] / mm
-        rows = [x[levels == level] for level in np.unique(levels)]
-        high, reach = [row[:, 1].mean() for row in rows], [abs(row[:, 0]).max() for row in rows]
-        side.fill_betweenx(high, -np.array(reach), reach, color="#cfe3ef")
-        lines = np.asarray(fem.rod_forces(run.problem, u, "threads").positions) / mm
-        for k, line in enumerate(lines):
-            color = "#e76f51" if k == 3 else "#2a6f97"
-            front = np.where(line[:, 2] > 0, line[:, 0], np.nan)
-            side.plot(line[:, 0], line[:, 1], color=color, lw=0.6, alpha=0.35)
-            side.plot(front, line[:, 1], color=color, lw=1.8)
-        title = "at rest" if not np.any(u) else f"{PRESSURE / kPa:.0f} kPa"
-        side.set(aspect="equal", xlim=(-11, 11), ylim=(-1, 62), title=title)
-        side.set_axis_off()
-    many = np.linspace(2, 80, 79)
+    from sorojax import view
+
+    figure = plt.figure(figsize=(7, 3.6), dpi=200, layout="constrained")
+    grid = figure.add_gridspec(1, 4, width_ratios=(1, 1, 0.1, 2.8))
+    shown = [figure.add_subplot(grid[k]) for k in range(2)]
+    still = sj.replace(run, lambda run: run.displacement, 0 * run.displacement)
+    scenes = [scene(still), scene(run)]
+    for axes, title in zip(shown, ("at rest", f"{PRESSURE / kPa:.0f} kPa"), strict=True):
+        axes.set_title(title, fontsize=10)
+    axes, many = figure.add_subplot(grid[3]), np.linspace(2, 80, 79)
     exact = np.asarray(jax.vmap(even)(jnp.asarray(many) * deg))[:, 1] / deg
-    axes[2].plot(many, exact, color="#2a6f97", label="long tube, exact")
-    axes[2].plot(angles, found, "o", color="#e76f51", label="solid with embedded threads")
-    axes[2].set(xlabel="angle of the threads to the axis [deg]", ylabel="twist [deg]")
-    axes[2].legend()
-    figure.tight_layout()
-    figure.savefig(file, dpi=90)
+    axes.plot(many, exact, color="#0072B2", lw=1.8)
+    axes.plot(angles, found, "o", ms=5.5, color="#D55E00")
+    axes.text(40, -45, "long tube, exact", color="#0072B2")
+    axes.text(33, -28, "solid with embedded threads", color="#D55E00")
+    axes.set(
+        xlabel="angle of the threads to the axis [deg]", ylabel="twist [deg]", xlim=(0, 84)
+    )
+    axes.spines[["top", "right"]].set_visible(False)
+    view.draw_into(shown, scenes, view=view.Camera(-60.0, 12.0))
+    figure.savefig(file)
     plt.close(figure)
+
+
+def scene(run):
+    """The rubber, seen through, and the threads in it; the axis of the tube upright."""
+    from sorojax import view
+
+    upright = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    drawn = view.scene_of(run, field=None, rest=False, loads=False).parts
+    skin = next(part for part in drawn if isinstance(part, view.Surface))
+    wall = view.Surface(skin.points @ upright, skin.triangles, "#8fbce6", opacity=0.4)
+    lines = fem.rod_forces(run.problem, run.displacement, "threads").positions
+    ways = [np.asarray(line) @ upright for line in lines]
+    rest, first = view.Lines(ways[1:], "#1f4e79", 1.3), view.Lines(ways[:1], "#D55E00", 1.8)
+    return view.Scene((wall, rest, first))
 
 
 if __name__ == "__main__":

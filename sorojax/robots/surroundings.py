@@ -154,7 +154,8 @@ def with_contacts(
 
     Args:
         model: A robot, of `robots.model`.
-        forces: `On(part, force)` and `Between(first, second, contact)`, of old and new parts.
+        forces: `PartForce(part, force)` and `PairForce(first, second, contact)`, of old and
+            new parts.
         mount: Pose of the robot, in which it was drawn if omitted; weight keeps its direction.
         **parts: The bodies by name, in the frame of the ground unless a part carries them.
 

@@ -56,8 +56,8 @@ def contact_history(
 
     Args:
         model: The rod or assembly.
-        contacts: As given to its verbs: contacts of a rod, `On(part, contact)` and
-            `Between(first, second, contact)`.
+        contacts: As given to its verbs: contacts of a rod, `PartForce(part, contact)` and
+            `PairForce(first, second, contact)`.
         q: Coordinates, e.g. of a rod's trajectory.
         v: Rates; they set the friction.
         parts: Of an assembly, those over whose rates to tell the efforts, one part after

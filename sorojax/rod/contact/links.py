@@ -82,7 +82,7 @@ class LinkPoints(eqx.Module):
 
 
 class LinkContact(AbstractPairContact):
-    """Contact of a rod with a rigid link: `Between("finger", "box", LinkContact(...))`.
+    """Contact of a rod with a rigid link: `PairForce("finger", "box", LinkContact(...))`.
 
     The stiffness has what friction gains with pressure, and is not symmetric: a grip needs it,
     where pressure and friction hold each other.
@@ -145,7 +145,7 @@ class LinkContact(AbstractPairContact):
 class LinkObstacle(AbstractContact):
     """Contact of points of a rigid link with an obstacle that does not move.
 
-    `On("box", LinkObstacle(floor, corners, lengths, law))`.
+    `PartForce("box", LinkObstacle(floor, corners, lengths, law))`.
 
     Attributes:
         obstacle: Its signed distance, in the world frame.
@@ -192,6 +192,6 @@ def _check_kinds(first: Any, second: Any) -> None:
     if not (isinstance(first, RodState) and isinstance(second, LinkState)):
         raise ValueError(
             f"LinkContact: got a {type(first).__name__} and a {type(second).__name__}, need a "
-            "rod and then a link. Write Between(rod, link, LinkContact(...)); two rods have "
+            "rod and then a link. Write PairForce(rod, link, LinkContact(...)); two rods have "
             "RodContact."
         )

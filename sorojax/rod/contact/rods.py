@@ -241,7 +241,7 @@ def meeting(
 
 
 class RodContact(AbstractPairContact):
-    """Contact between two rods: `Between("left", "right", RodContact(...))`.
+    """Contact between two rods: `PairForce("left", "right", RodContact(...))`.
 
     Points of each meet the closest point of the other, with half of the force each, so
     neither is the master.
@@ -336,6 +336,6 @@ def rod_of(body: RodState | LinkState) -> RodState:
     if not isinstance(body, RodState):
         raise ValueError(
             "RodContact: one of the parts is a rigid link, need two rods. Give the shape of "
-            "a link that does not move as an obstacle: On(name, ObstacleContact(...))."
+            "a link that does not move as an obstacle: PartForce(name, ObstacleContact(...))."
         )
     return body

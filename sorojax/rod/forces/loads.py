@@ -1,7 +1,7 @@
 """Forces on assemblies: which part each acts on, and their sum in the coordinates.
 
 A `Gravity` or a damping that is listed by itself acts on every part; any other force names
-its part: `On("finger", TipWrench(...))`.
+its part: `PartForce("finger", TipWrench(...))`.
 """
 
 import abc
@@ -186,7 +186,7 @@ def check(assembly: Assembly, forces: tuple[Load, ...]) -> None:
         if not names and not isinstance(force, Gravity | AbstractDamping):
             raise ValueError(
                 f"assembly: the force {type(force).__name__} names no part, need one of "
-                f"{', '.join(assembly.names)}. Wrap it: On(name, force)."
+                f"{', '.join(assembly.names)}. Wrap it: rod.PartForce(name, force)."
             )
 
 
@@ -274,8 +274,8 @@ def _add(loads: list, terms: dict[int, Array]) -> None:
 class TimeVaryingForce(AbstractForce):
     """A force made anew at every instant from a signal: `make(signal(t))`.
 
-    `Varying(TipWrench, wave)` is a tip wrench that follows `wave`, any function of time
-    [s]; with a module as the signal its numbers are differentiable and never retrace.
+    `TimeVaryingForce(TipWrench, wave)` is a tip wrench that follows `wave`, any function of
+    time [s]; with a module as the signal its numbers are differentiable and never retrace.
 
     Attributes:
         make: From the value of the signal to a force.

@@ -105,7 +105,7 @@ def _check_parts(model: Model, forces: tuple[Load, ...]) -> None:
         if relaxation_of(force) and not (names if on == () else on[0] in names):
             raise ValueError(
                 f"rod: a Relaxation is on {on[0] if on else 'an assembly'}, need {rods}. "
-                "Wrap it, On(name, Relaxation(spectrum)), or take the name off."
+                "Wrap it, PartForce(name, Relaxation(spectrum)), or take the name off."
             )
 
 

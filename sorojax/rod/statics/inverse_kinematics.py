@@ -67,7 +67,8 @@ def inverse_kinematics(
         model: The rod or assembly.
         targets: One or more of `Position`, `Pose`, `Direction`, `OnSurface`.
         q: First guess, e.g. the last answer; at rest by default.
-        obstacles: Shapes that sections must stay clear of, as `Clear(...)`; none by default.
+        obstacles: Shapes that sections must stay clear of, as `ObstacleConstraint(...)`; none
+            by default.
         limits: Lowest and highest coordinates, each a number or one per rate, in the units of
             the coordinates; no limits by default.
         forces: Seek the equilibrium under these in the null space: `()` for least elastic
