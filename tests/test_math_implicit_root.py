@@ -79,3 +79,17 @@ def test_what_comes_with_the_root_has_no_derivative():
     )
     np.testing.assert_allclose([value, slope], [0.5 + 1.5, -0.25])
     assert bool(done)
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_an_equation_may_close_over_integers_of_a_trace(mode):
+    @jax.jit
+    def at(scale, rows):
+        def equation(x):
+            return scale * (A @ x)[rows] + x[rows] ** 3 - B[rows]
+
+        return implicit_root(equation, B, by_newton, by_jacobian)
+
+    scale, rows = jnp.asarray(1.3), jnp.array([1, 0])
+    want = exact(np.asarray(root(scale, A)), 1.3, np.asarray(A))
+    np.testing.assert_allclose(mode(at)(scale, rows), want, rtol=1e-12)

@@ -7,6 +7,7 @@ Used in place of `jax.lax.custom_root`, which since jax 0.12 (0.12.0.1 was tried
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,8 +39,8 @@ def implicit_root(
         found = solve(f, guess)
         return found if has_aux else (found, ())
 
-    equation, numbers = jax.closure_convert(f, guess)
-    method, constants = jax.closure_convert(search, guess)
+    equation, numbers = _opened(f, guess)
+    method, constants = _opened(search, guess)
 
     @jax.custom_jvp
     def root(numbers: Any, constants: Any, guess: Array) -> tuple[Array, Any]:
@@ -67,6 +68,19 @@ def implicit_root(
     root.defjvp(derivative, symbolic_zeros=True)
     x, more = root(tuple(numbers), tuple(constants), guess)
     return (x, more) if has_aux else x
+
+
+def _opened(function: Function, x: Array) -> tuple[Function, list[Array]]:
+    """A function of what `function` closes over too, and these arrays: integers as well, as a
+    derivative is taken where those of a trace are gone."""
+    closed = eqx.filter_closure_convert(function, x)
+    arrays, rest = eqx.partition(closed, eqx.is_array)
+    leaves, tree = jax.tree.flatten(arrays)
+
+    def call(x: Array, *leaves: Array) -> Any:
+        return eqx.combine(jax.tree.unflatten(tree, leaves), rest)(x)
+
+    return call, leaves
 
 
 def matrix_of(linear: Function, like: Array) -> Array:
