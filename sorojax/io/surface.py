@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple, NoReturn
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from sorojax import _check
 from sorojax.io import _files
@@ -552,7 +552,7 @@ def _welded(name: str, surface: Surface, distance: float) -> Surface:
             f"import_surface: {name}: `weld` is {distance:g} m, need at most half of a usual "
             f"edge, {side:.3g} m. Give it in metres, just above the gaps of the seam."
         )
-    pairs = cKDTree(vertices).query_pairs(distance, output_type="ndarray")
+    pairs = KDTree(vertices).query_pairs(distance, output_type="ndarray")
     group = connected(len(vertices), *pairs.T)
     _, first, number = np.unique(group, return_index=True, return_inverse=True)
     rows = number[triangles].astype(np.int32)
