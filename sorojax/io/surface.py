@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple, NoReturn
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from sorojax import _check
 from sorojax.io import _files
 from sorojax.io.animation import ARRAY, UPRIGHT, Document
+from sorojax.math.host import KDTree
 from sorojax.sdf import Surface
 from sorojax.sdf.sampling import connected
 from sorojax.sdf.surface.marching import Curve
