@@ -76,6 +76,9 @@ def _do(kind: Kind, name: str, value: Any) -> str:
     if isinstance(value, type) and noun and issubclass(value, noun):
         return f"Make one: {value.__name__}(...)."
     if inspect.isroutine(value):
+        if noun is not None and "__call__" in getattr(noun, "__abstractmethods__", ()):
+            own = f"class Mine({noun.__name__})"
+            return f"{made_by(noun)} For a function of yours write {own} with __call__."
         return "Call it, and give what it returns."
     if "whole number" in kind.need and not number_like(value) and kind.dims != ():
         return (
@@ -141,7 +144,7 @@ def unbound(
         names = ", ".join(str(each).partition(":")[0] for each in all_of_them)
         verb = parameters.where.rpartition(".")[2]
         return TypeError(
-            f"{parameters.where}: got {len(args) + len(kwargs)} arguments, {error}. Need "
+            f"{parameters.where}: got {len(args) + len(kwargs)} arguments: {error}. Need "
             f"{verb}({names})."
         )
     return None

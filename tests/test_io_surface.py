@@ -218,3 +218,29 @@ def test_bad_surfaces_are_not_written(tmp_path):
     with pytest.raises(ValueError, match="export_contour"):
         io.export_surface(tmp_path / "a.svg", BOX)
     assert os.listdir(tmp_path) == []
+
+
+def test_seams_that_do_not_quite_close_are_welded(tmp_path):
+    corners = BOX.vertices[BOX.triangles]
+    seam = np.abs(corners[..., 0] - corners[..., 0].max()) < 1e-9
+    corners[seam] += np.random.default_rng(0).uniform(-1e-6, 1e-6, (seam.sum(), 3))
+    loose = sdf.Surface(corners.reshape(-1, 3), np.arange(corners.size // 3).reshape(-1, 3))
+    io.export_surface(tmp_path / "a.stl", loose)
+    open_ = sdf.surface_report(io.import_surface(tmp_path / "a.stl"))
+    assert len(open_.open_edges) and "weld=" in repr(open_)
+    closed = io.import_surface(tmp_path / "a.stl", weld=10e-6)
+    assert sdf.surface_report(closed).manifold and len(closed.vertices) == len(BOX.vertices)
+    assert np.isclose(sdf.surface_report(closed).volume, 6e-6, rtol=1e-3)
+    with pytest.raises(ValueError, match="half of a usual edge"):
+        io.import_surface(tmp_path / "a.stl", weld=2.0)
+    with pytest.raises(ValueError, match="need 0 or more"):
+        io.import_surface(tmp_path / "a.stl", weld=-1e-6)
+
+
+def test_triangles_within_a_weld_vanish(tmp_path):
+    thin = [[0, 0, 0], [30, 0, 0], [30, 1e-4, 0]]
+    data = stl(*(BOX.vertices[BOX.triangles] / mm), thin)
+    (tmp_path / "a.stl").write_bytes(data)
+    assert len(io.import_surface(tmp_path / "a.stl").triangles) == len(BOX.triangles) + 1
+    back = io.import_surface(tmp_path / "a.stl", weld=1e-6)
+    assert len(back.triangles) == len(BOX.triangles)

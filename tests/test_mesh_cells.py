@@ -138,3 +138,32 @@ def test_distortion_says_when_to_mesh_anew():
     assert np.isclose(M.distortion(mesh, mesh).shape_ratio, 1)
     report = jax.jit(lambda m: M.distortion(mesh, m))(flat)
     assert bool(report.remesh) and np.isclose(report.size_ratio, 0.1)
+
+
+@pytest.mark.parametrize("cell", [M.Tri3(), M.Tet4()], ids=lambda cell: cell.name)
+def test_linear_cells_become_quadratic_with_their_sets(cell):
+    plain = (
+        M.rectangle([0, 0], [2, 1], divisions=(2, 2), element=cell)
+        if cell.dim == 2
+        else M.box([0, 0, 0], [2, 1, 1], divisions=(2, 2, 1), element=cell)
+    )
+    left = M.nodes_where(plain, lambda p: p[0] < 1e-9)
+    own = M.facets_where(plain, lambda p: p[0] < 1e-9)
+    plain = M.Mesh(
+        plain.points, plain.cells, plain.element, {"left": left}, {"left": own}, {"all": [0]}
+    )
+    made = M.quadratic(plain)
+    assert made.element.name == {"Tri3": "Tri6", "Tet4": "Tet10"}[cell.name]
+    assert jnp.array_equal(made.points[: plain.num_nodes], plain.points)
+    assert np.isclose(M.quality(made).area, 2) and not M.quality(made).inverted
+    at = M.nodes_where(made, lambda p: p[0] < 1e-9)
+    assert set(np.asarray(made.node_sets["left"])) == set(np.asarray(at))
+    assert np.allclose(made.points[made.facet_sets["left"]][..., 0], 0)
+    expected = M.facets_where(made, lambda p: p[0] < 1e-9)
+    rows = np.sort(np.asarray(made.facet_sets["left"]), axis=1)
+    assert set(map(tuple, rows)) == set(map(tuple, np.sort(np.asarray(expected), axis=1)))
+    assert M.enrich(made).element.plain.name == made.element.name
+    with pytest.raises(ValueError, match="ready for `enrich`"):
+        M.quadratic(made)
+    with pytest.raises(ValueError, match="mesh.quadratic"):
+        M.enrich(plain)

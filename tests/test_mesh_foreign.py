@@ -114,10 +114,12 @@ def test_a_printed_part_becomes_a_mesh(tmp_path):
 
 
 @pytest.mark.parametrize("mesher", ["pytetwild", "gmsh"])
-def test_other_meshers_take_surfaces(mesher, monkeypatch):
+def test_other_meshers_take_surfaces(mesher, monkeypatch, tmp_path):
     surface = sdf.isosurface(sdf.Box([0, 0, 0], [1, 0.8, 0.6]), 0.1, "dual_contouring")
     with pytest.raises(ValueError, match="need .pytetwild. or .gmsh."):
         io.mesh_surface(surface, 0.2, mesher="other")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="need 1 .Tet4. or 2 .Tet10."):
+        io.mesh_surface(surface, 0.2, mesher=mesher, order=3)
     if mesher == "gmsh":
         half = sdf.Surface(surface.vertices, surface.triangles[::2])
         if shutil.which("gmsh"):
@@ -131,8 +133,12 @@ def test_other_meshers_take_surfaces(mesher, monkeypatch):
         with pytest.raises(ModuleNotFoundError, match="pip install"):
             io.mesh_surface(surface, 0.2)
         pytest.skip("pytetwild is not installed")
+    monkeypatch.chdir(tmp_path)
     quality = M.quality(io.mesh_surface(surface, 0.2, mesher=mesher))
     assert quality.watertight and np.isclose(quality.area, 0.48, rtol=2e-2)
+    assert not list(tmp_path.iterdir())  # nothing is left where it runs
+    ten = io.mesh_surface(surface, 0.2, mesher=mesher, order=2)
+    assert ten.element.name == "Tet10" and ten.facet_sets["boundary"].shape[1] == 6
 
 
 def bored(wall, radius=0.15):

@@ -132,5 +132,7 @@ def test_the_backs_of_bellows_lie_on_the_body():
     middles = jnp.asarray(ends.mean(axis=1))
     assert np.allclose(robot.body()(middles), 0, atol=1e-12)
     assert np.allclose(np.diff(ends[:, 0, 0]), float(robot.pitch))
+    with pytest.raises(ValueError, match="need one or more"):
+        robots.BellowsActuator(num_bellows=0)
     with pytest.raises(ValueError, match="need 0 to 2"):
         robot.back(3)

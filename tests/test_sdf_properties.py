@@ -209,6 +209,9 @@ def test_mesh_by_its_tree_is_as_by_every_face():
     assert loose.tree is not None
     assert jnp.allclose(values(loose, p)[0], values(mesh, p)[0], rtol=0, atol=1e-12)
     assert sdf.TriangleMesh(vertices, faces[1:]).tree is None
+    fine = sdf.isosurface(sdf.Sphere([0, 0, 0], 1), 0.1)
+    with pytest.warns(UserWarning, match="leave gaps.*weld="):
+        sdf.TriangleMesh(fine.vertices, fine.triangles[1:])
 
 
 def test_middle_of_a_dense_ball_where_every_triangle_may_be_closest(getkey):

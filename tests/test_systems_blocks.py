@@ -199,6 +199,17 @@ def test_gains_carry_units():
         S.Network(blocks, {"l.a": "g.value", "g.a": "l.value"})
 
 
+def test_refused_signals_are_told_what_takes_them():
+    two = S.Source(S.Constant([1.0, 2.0]), unit="rad")
+    pid = S.PID(1.0, reference=S.Constant(0.0), command_unit="N")
+    with pytest.raises(ValueError, match="systems.stack"):
+        S.Network({"two": two, "pid": pid}, {"pid.measurement": "two.value"})
+    both = S.Network({"two": two, "pid": S.stack([pid, pid])}, {"pid.measurement": "two.value"})
+    assert S.simulate(both, 0.1, save=2)["pid.command"].shape == (2, 2)
+    with pytest.raises(TypeError, match=r"class Mine\(AbstractReference\) with __call__"):
+        S.Source(lambda t: t)  # pyright: ignore[reportArgumentType]
+
+
 # Rigid bodies
 
 

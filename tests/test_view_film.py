@@ -299,3 +299,19 @@ def test_a_trajectory_needs_to_know_what_moved(beam):
         view.animate(film)
     with pytest.raises(ValueError, match="the bodies body"):
         view.animate(film, network=network, block="arm")
+
+
+def test_the_stamp_stays_clear_of_the_names():
+    wire = R.rod(
+        SE3(), R.chebyshev(kappa_z=2), R.circle(2e-3), length=0.1, young_modulus=1e6,
+        poisson_ratio=0.5, density=1000,
+    )  # fmt: skip
+    threads = R.Tendons([R.Straight([5e-3, 0.0]), R.Straight([-5e-3, 0.0])])
+    body = systems.RodBody(wire, (R.Gravity(), R.Damping(0.05), threads))
+    network = systems.Network({"body": body}, {}, exposed=("body.tension",))
+    run = systems.simulate(network, 0.2, save=5, inputs={"body.tension": [0.1, 0.0]})
+    look = {"network": network, "fps": 10, "renderer": "own", "size": (320, 240)}
+    plain = view.animate(run, stamp=False, **look).draw(1)
+    added = np.any(view.animate(run, **look).draw(1) != plain, axis=2)
+    assert (plain[:24, :160] < 128).any()  # names
+    assert added.any() and (plain[added] > 240).all()  # the stamp is on blank paper

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sorojax import fem, material, mesh as M, rod as R, view
+from sorojax import fem, material, mesh as M, rod as R, sdf, view
 from sorojax.fem.equilibrium.solve import Path
 from sorojax.math.lie import SE2, SE3, homogeneous
 from sorojax.math.status import Status
@@ -231,3 +231,21 @@ def test_a_rod_in_a_body_is_a_line_that_goes_along():
     assert isinstance(drawn, Lines) and drawn.name == "fibre"
     assert np.allclose(drawn.runs[0][[0, -1]], 1.1 * np.array(line))
     assert free.nodes.shape[0] == len(drawn.runs[0])
+
+
+def test_arrows_of_a_pressure_are_spread_over_its_chambers():
+    holes = [sdf.Rectangle([x, 2e-3], [x + 6e-3, 8e-3]) for x in (2e-3, 12e-3, 22e-3, 32e-3)]
+    plate = M.triangulate(
+        sdf.Rectangle([0, 0], [40e-3, 10e-3]) - sdf.union(*holes), size=1.5e-3, order=2
+    )
+    walls = M.facets_on(plate, sdf.union(*holes))
+    problem = fem.problem(
+        plate,
+        RUBBER,
+        kinematics=fem.PlaneStrain(0.01),
+        supports=(fem.Fixed(M.nodes_where(plate, lambda p: p[0] < 1e-9)),),
+        loads=(fem.Pressure(walls, 1e3),),
+    )
+    (arrows,) = [part for part in parts_of(problem) if isinstance(part, Arrows)]
+    count = np.histogram((arrows.starts + arrows.vectors)[:, 0], [0, 0.01, 0.02, 0.03, 0.04])[0]
+    assert count.sum() == 24 and count.min() >= 4

@@ -107,7 +107,7 @@ def main(pages: list[Path], pictures: bool, write: bool) -> None:
             for picture in Path(folder).glob("*.png") if pictures else ():
                 image = Image.open(picture).convert("RGB")
                 image.thumbnail((900, 900))
-                image.quantize(128).save(PICTURES / picture.name, optimize=True)
+                image.quantize(256).save(PICTURES / picture.name, optimize=True)
         print(f"{path}: done, {time.process_time():.1f} s of CPU up to here")
 
 

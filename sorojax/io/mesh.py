@@ -16,7 +16,7 @@ import numpy as np
 from sorojax import _check
 from sorojax.io import _files
 from sorojax.io.surface import export_surface
-from sorojax.mesh import Mesh, Tet4, repair
+from sorojax.mesh import Mesh, Tet4, quadratic, repair
 from sorojax.mesh.elements.base import AbstractElement, exported_elements, facet_element
 from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.mesh import boundary_facets
@@ -400,6 +400,7 @@ def mesh_surface(
     size: float,
     *,
     mesher: Literal["pytetwild", "gmsh"] = "pytetwild",
+    order: int = 1,
     timeout: float = 600.0,
 ) -> Mesh:
     """Tetrahedra inside a surface from elsewhere, by a mesher that is installed apart.
@@ -413,6 +414,7 @@ def mesh_surface(
         size: Wanted length of an edge [m].
         mesher: "pytetwild" (Python package, with its extra "all") or "gmsh" (program on the
             PATH, run as a process of its own).
+        order: 1 for `Tet4`, 2 for `Tet10` with straight sides, which rubber needs.
         timeout: Time after which gmsh is stopped [s].
 
     Returns:
@@ -421,8 +423,8 @@ def mesh_surface(
     Raises:
         ModuleNotFoundError: If pytetwild is missing.
         FileNotFoundError: If there is no program `gmsh`.
-        ValueError: If the surface is empty or, for gmsh, not one closed shell; if the
-            mesher fails.
+        ValueError: If the surface is empty or, for gmsh, not one closed shell; if `order`
+            is neither 1 nor 2; if the mesher fails.
 
     Reference: Hu et al., Fast tetrahedral meshing in the wild, SIGGRAPH 2020; Geuzaine and
         Remacle, Gmsh, Int. J. Numer. Meth. Eng. 79 (2009).
@@ -436,10 +438,14 @@ def mesh_surface(
             f"{where}: the surface has {len(surface.triangles)} triangles, need at least 4. "
             "Export the part again."
         )
+    if order not in (1, 2):
+        raise ValueError(f"{where}: `order` is {order}, need 1 (Tet4) or 2 (Tet10).")
     makers = {"pytetwild": _by_pytetwild, "gmsh": _by_gmsh}
     if mesher not in makers:
         raise ValueError(f"{where}: `mesher` is {mesher!r}, need one of {', '.join(makers)}.")
     found = makers[mesher](Surface(vertices, np.asarray(surface.triangles)), size, timeout)
+    if order == 2:
+        found = quadratic(found)
     return Mesh(
         found.points, found.cells, found.element, {}, {"boundary": boundary_facets(found)}
     )
@@ -455,13 +461,17 @@ def _by_pytetwild(surface: Surface, size: float, timeout: float) -> Mesh:
             "it with `pip install 'pytetwild[all]'`, or use mesher='gmsh'."
         ) from reason
     extent = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
-    points, cells = tetrahedralize(
-        surface.vertices,
-        surface.triangles.astype(np.int32),
-        optimize=True,
-        edge_length_fac=min(size / extent, 1.0),
-        quiet=True,
-    )
+    with (
+        tempfile.TemporaryDirectory(prefix="mesh_surface.") as folder,
+        contextlib.chdir(folder),  # it leaves a file of the surface where it runs
+    ):
+        points, cells = tetrahedralize(
+            surface.vertices,
+            surface.triangles.astype(np.int32),
+            optimize=True,
+            edge_length_fac=min(size / extent, 1.0),
+            quiet=True,
+        )
     if not len(cells):
         raise ValueError(
             "mesh_surface: pytetwild found no inside. Check that the triangles face outwards, "

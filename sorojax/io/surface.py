@@ -14,7 +14,9 @@ import numpy as np
 from sorojax import _check
 from sorojax.io import _files
 from sorojax.io.animation import ARRAY, UPRIGHT, Document
+from sorojax.math.host import KDTree
 from sorojax.sdf import Surface
+from sorojax.sdf.sampling import connected
 from sorojax.sdf.surface.marching import Curve
 from sorojax.units import mm
 
@@ -497,6 +499,7 @@ def import_surface(
     path: str | os.PathLike,
     *,
     unit: float | None = None,
+    weld: float = 0.0,
     root: str | os.PathLike | None = None,
     max_bytes: int = _files.MAX_BYTES,
 ) -> Surface:
@@ -509,6 +512,8 @@ def import_surface(
         path: File name; its ending gives the format.
         unit: What 1 in the file means [m]. By default a millimetre, and a surface whose
             longest side is then not between 1 mm and 100 m is refused.
+        weld: Vertices nearer than that become one [m], for seams that do not quite close;
+            triangles that vanish by it are left out. A tenth of the shortest edge is safe.
         root: Folder that the file must lie in, links followed; any by default.
         max_bytes: Larger files are refused unread.
 
@@ -529,11 +534,30 @@ def import_surface(
     kind = _ending("import_surface", file.suffix, tuple(_READERS))
     scale = mm if unit is None else unit
     _check.positive("import_surface", "unit", scale, "m", "Write unit=sorojax.units.mm.")
+    _check.not_negative("import_surface", "weld", weld, "m", "Leave it out to keep all.")
     data = _files.read("import_surface", file, max_bytes)
     surface = _READERS[kind](data, f"import_surface: {file.name}", scale)
     if unit is None:
         _check_size(file.name, surface)
-    return surface
+    return _welded(file.name, surface, weld) if weld else surface
+
+
+def _welded(name: str, surface: Surface, distance: float) -> Surface:
+    """Chains of vertices nearer than `distance` become their first vertex."""
+    vertices, triangles = surface
+    corners = vertices[triangles]
+    side = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)))
+    if distance > side / 2:
+        raise ValueError(
+            f"import_surface: {name}: `weld` is {distance:g} m, need at most half of a usual "
+            f"edge, {side:.3g} m. Give it in metres, just above the gaps of the seam."
+        )
+    pairs = KDTree(vertices).query_pairs(distance, output_type="ndarray")
+    group = connected(len(vertices), *pairs.T)
+    _, first, number = np.unique(group, return_index=True, return_inverse=True)
+    rows = number[triangles].astype(np.int32)
+    whole = (rows != np.roll(rows, 1, axis=1)).all(axis=1)
+    return Surface(vertices[first], rows[whole])
 
 
 def _check_size(name: str, surface: Surface) -> None:

@@ -5,7 +5,7 @@ from sorojax.mesh.elements.base import AbstractElement
 from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.elements.simplex import Tet4, Tet10, Tet15, Tri3, Tri6, Tri7
 from sorojax.mesh.elements.tensor import Hex8, Quad4, Quad8, Quad9
-from sorojax.mesh.enrich import enrich
+from sorojax.mesh.enrich import enrich, quadratic
 from sorojax.mesh.measure import cell_areas, cell_volumes, enclosed_volume, locate
 from sorojax.mesh.mesh import Mesh, boundary_facets, merge
 from sorojax.mesh.motion.move import move
@@ -86,6 +86,7 @@ __all__ = [
     "nodes_on_line",
     "nodes_where",
     "polymesher",
+    "quadratic",
     "quality",
     "rectangle",
     "repair",

@@ -1,4 +1,4 @@
-"""Quadratic cells with the inner nodes that a linear pressure needs."""
+"""Quadratic cells from linear ones, and the inner nodes that a linear pressure needs."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,8 +10,73 @@ from sorojax.mesh.elements.base import (
     facet_corners,
     nodes as reference_nodes,
     shape_functions,
+    side_ends,
 )
-from sorojax.mesh.mesh import Mesh
+from sorojax.mesh.elements.simplex import Tet4, Tet10, Tri3, Tri6
+from sorojax.mesh.mesh import Mesh, with_side_nodes
+
+_QUADRATIC: dict[str, AbstractElement] = {Tri3().name: Tri6(), Tet4().name: Tet10()}
+
+
+def quadratic(mesh: Mesh) -> Mesh:
+    """`mesh` with a node in the middle of every side: Tri3 becomes Tri6, Tet4 Tet10.
+
+    For meshes from elsewhere, which mostly have linear cells; `enrich` goes on from there.
+    Sides stay straight, where `triangulate` and `tetrahedralise` with `order=2` put their
+    nodes on the shape. Old nodes keep their numbers. A node set gains the middles of the
+    sides whose ends it both holds.
+
+    Args:
+        mesh: A mesh of `Tri3` or `Tet4` cells.
+
+    Returns:
+        The mesh with more nodes.
+
+    Raises:
+        ValueError: If the mesh has other cells, or if they are traced.
+
+    Example:
+        >>> plain = mesh.rectangle([0, 0], [40 * mm, 10 * mm], divisions=(4, 1), element=Tri3())
+        >>> mesh.enrich(mesh.quadratic(plain)).element.name
+        'Tri7'
+    """
+    if is_traced(mesh.cells):
+        raise ValueError("quadratic: `mesh.cells` is traced. Make the mesh outside jit.")
+    if mesh.element.name not in _QUADRATIC:
+        raise ValueError(
+            f"quadratic: got {mesh.element.name} cells, need one of {', '.join(_QUADRATIC)}. "
+            "Quadratic cells are ready for `enrich`."
+        )
+    element, old = _QUADRATIC[mesh.element.name], np.asarray(mesh.cells)
+    cells = with_side_nodes(np.zeros((mesh.num_nodes, 1)), old, element)[1]
+    first = np.unique(cells[:, old.shape[1] :], return_index=True)[1]
+    ends = old[:, side_ends(element)].reshape(-1, 2)[first]
+    points = jnp.concatenate([mesh.points, jnp.mean(mesh.points[ends], axis=1)])
+    rows = np.concatenate([cells[:, facet] for facet in element.facets])
+    sets = {name: _found(rows, np.asarray(own)) for name, own in mesh.facet_sets.items()}
+    nodes = {}
+    for name, ids in mesh.node_sets.items():
+        held = np.zeros(mesh.num_nodes, bool)
+        held[np.asarray(ids)] = True
+        middles = mesh.num_nodes + np.flatnonzero(held[ends].all(axis=1))
+        nodes[name] = np.concatenate([np.asarray(ids), middles])
+    return Mesh(points, cells, element, nodes, sets, mesh.regions)
+
+
+def _found(rows: np.ndarray, facets: np.ndarray) -> np.ndarray:
+    """Of the `rows`, facets of all cells, those with the corners of `facets`."""
+    count = facets.shape[1]
+    both = np.sort(np.concatenate([rows[:, :count], facets]), axis=1)
+    key = np.unique(both, axis=0, return_inverse=True)[1].ravel()
+    lookup = np.full(key.max(initial=0) + 1, -1)
+    lookup[key[: len(rows)]] = np.arange(len(rows))
+    place = lookup[key[len(rows) :]]
+    if (place < 0).any():
+        raise ValueError(
+            f"quadratic: {int((place < 0).sum())} of {len(facets)} facets belong to no cell of "
+            "the mesh. Take them from this mesh."
+        )
+    return rows[place]
 
 
 def enrich(mesh: Mesh) -> Mesh:
@@ -45,7 +110,8 @@ def enrich(mesh: Mesh) -> Mesh:
     richer = {kind.plain.name: kind() for kind in exported_elements() if kind.plain}
     if mesh.element.name not in richer:
         names = ", ".join(richer)
-        raise ValueError(f"enrich: got {mesh.element.name} cells, need one of {names}.")
+        how = " Make them so by `mesh.quadratic`." if mesh.element.name in _QUADRATIC else ""
+        raise ValueError(f"enrich: got {mesh.element.name} cells, need one of {names}.{how}")
     element = richer[mesh.element.name]
     cells = np.asarray(mesh.cells)
     new = reference_nodes(element)[mesh.element.num_nodes :]

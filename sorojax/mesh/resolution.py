@@ -130,7 +130,11 @@ def raise_thin(
     length = float(size(at[None])[0])
     place = ", ".join(f"{x:.4g}" for x in np.round(at / length, 6) * length)
     if thick >= length / 2:
-        read = " Read from a file? Look at sdf.surface_report." if len(at) == 3 else ""
+        read = (
+            " Read from a file? Look at sdf.surface_report, and where it finds no fault, take "
+            "io.mesh_surface(part, size, order=2)."
+        )
+        read = read if len(at) == 3 else ""
         raise NotResolved(
             f"{where}: cells of {length:g} m cannot follow the surface near ({place}) m, where "
             f"the thinnest {name} is about {thick:.2g} m thick. Lower `size`, round it, or let "

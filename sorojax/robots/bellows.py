@@ -45,6 +45,10 @@ class BellowsActuator(eqx.Module):
         name = "bellow_width - 2 wall_thickness - 2 fillet"
         do = "A chamber holds at least two fillets: thinner walls or wider bellows."
         _check.not_negative("BellowsActuator", name, left, "m", do)
+        if self.num_bellows < 1:
+            raise ValueError(
+                f"BellowsActuator: got {self.num_bellows} bellows, need one or more."
+            )
 
     @property
     def pitch(self) -> Float[Array, ""]:

@@ -127,9 +127,14 @@ def _need_known(kind: str, name: str, ports: Mapping, why: str) -> None:
 
 def _need_fit(target: str, port, source: str, made) -> None:
     if not _fits(port, made):
+        many = (
+            f" For {made.shape[0]} signals, `systems.stack` {made.shape[0]} such blocks."
+            if port.shape == () and len(made.shape) == 1 and made.shape[0] > 1
+            else ""
+        )
         raise ValueError(
             f"Network: `{source}` [{made.unit}, shape {made.shape}] cannot drive `{target}` "
-            f"[{port.unit}, shape {port.shape}]. Connect ports of one unit and one shape."
+            f"[{port.unit}, shape {port.shape}]. Connect ports of one unit and one shape.{many}"
         )
 
 

@@ -323,6 +323,8 @@ def tetrahedralise(
                 continue
             if isinstance(found, EmptyShape):
                 raise_if_thin(where, shape, lower, upper, lengths)
+            if finer < 1 and isinstance(found, NotResolved):
+                found.args = (f"{found} That is {finer:g} of the `size` given, the last try.",)
             raise
     raise AssertionError("unreachable")
 

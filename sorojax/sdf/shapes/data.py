@@ -163,6 +163,7 @@ def _thinned(loop) -> np.ndarray:
 
 
 MOST_FACES = 20_000
+_MANY_FACES = 1000  # of a surface with gaps, from which searching all of them is felt
 
 
 class Octahedron(AbstractSolidShape):
@@ -247,6 +248,14 @@ class TriangleMesh(AbstractSolidShape):
             raise ValueError(
                 f"TriangleMesh: got {self.faces.shape[0]} faces that leave gaps, need at "
                 f"most {MOST_FACES} unless every edge joins two. Repair or decimate the mesh."
+            )
+        count = self.faces.shape[0]
+        if self.tree is None and count > _MANY_FACES and not is_traced((vertices, faces)):
+            _check.warn(
+                f"TriangleMesh: got {count} faces that leave gaps, need a closed surface: each "
+                "point now asks every face, and a mesh takes minutes instead of seconds. "
+                "sdf.surface_report tells what is open, io.import_surface(..., weld=...) joins "
+                "a seam."
             )
 
     def distance(self, x, y, z):

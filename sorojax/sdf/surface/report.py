@@ -57,8 +57,16 @@ class SurfaceReport(NamedTuple):
         return (
             f"SurfaceReport: {self.num_shells} shell(s) of genus {self.genus}, volume "
             f"{self.volume:.4g} m^3, area {self.area:.4g} m^2, wall {self.wall_thickness:.4g} "
-            f"m\n  {', '.join(found) or 'no fault found'}"
+            f"m\n  {', '.join(found) or 'no fault found'}{self._do()}"
         )
+
+    def _do(self) -> str:
+        if len(self.open_edges):
+            return (
+                "\n  A seam that does not quite close? Read by import_surface(..., weld=...).\n"
+                "  Holes? Take mesh_surface."
+            )
+        return "\n  Crossings: mesh_surface mends them." if len(self.crossings) else ""
 
     @property
     def watertight(self) -> bool:

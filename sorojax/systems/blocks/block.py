@@ -323,7 +323,7 @@ class Sensor(AbstractStateless):
 
 
 class AbstractReference(eqx.Module):
-    """A signal of time [s]."""
+    """A signal of time [s]. For one of your own write a subclass with `__call__(self, t)`."""
 
     @abc.abstractmethod
     def __call__(self, t: Float[Array, ""]) -> Float[Array, "..."]:

@@ -60,6 +60,7 @@ class RodBody(AbstractBlock):
     """A rod with its forces; the state is {q, v}, and with a `rod.Relaxation` among the forces
     {q, v, memory}: what its branches remember.
 
+    It has the outputs `tip_position` [m], `q`, `v` and, in the plane, `tip_angle` [rad].
     A pressure map among the forces opens the ports `pressure`, `volume`, `volume_rate` (at
     held pressure) and `compliance` of the walls. All come from the same potential as the
     force, so no energy is lost between fluid and rod.

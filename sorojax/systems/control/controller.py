@@ -48,7 +48,8 @@ class PID(AbstractController):
 
     Wired in a network it runs in continuous time; called as a function it takes a step
     of the same equations, of several signals at once if measurement and reference are
-    vectors. Gains are in command units per measurement unit.
+    vectors. In a network it has one signal, and `stack([pid, pid])` two. Gains are in
+    command units per measurement unit.
 
     Attributes:
         proportional, integral_gain, derivative: Gains [-], [1/s], [s] times those units.
@@ -57,7 +58,8 @@ class PID(AbstractController):
         filter_time: Of the derivative [s].
         tracking_time: In which the integral yields to a limit [s].
         start_measurement: What a continuous PID takes for the measurement before t = 0.
-        reference: Signal to follow; without one the block has an input `reference`.
+        reference: Signal to follow, an `AbstractReference`; without one the block has an
+            input `reference`, which a `Source` may drive.
         measurement_unit, command_unit: Compared at wiring.
     """
 

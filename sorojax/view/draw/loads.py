@@ -198,13 +198,13 @@ def _arrows(problem: Problem, load: AbstractLoad, points: Points, size: float) -
     """Arrows in proportion to a load that has a direction, named with its size."""
     value = np.asarray(getattr(load, "value", 0.0))
     if isinstance(load, fem.Pressure):
-        starts, normals = _facet_frames(problem, _thinned(load.facets), points)
+        starts, normals = _facet_frames(problem, _thinned(problem, load.facets), points)
         vectors, strength = -value * normals, float(value)
     elif value.shape != (points.shape[1],):
         return []
     else:
         if isinstance(load, fem.Traction):
-            starts, _ = _facet_frames(problem, _thinned(load.facets), points)
+            starts, _ = _facet_frames(problem, _thinned(problem, load.facets), points)
         elif isinstance(load, fem.Force):
             starts = points[np.asarray(load.nodes)].mean(axis=0)[None]
         elif isinstance(load, fem.Gravity):
@@ -240,9 +240,15 @@ def _facet_frames(problem: Problem, facets: np.ndarray, points: np.ndarray):
     return x.mean(axis=1), normal
 
 
-def _thinned(facets) -> np.ndarray:
-    """At most so many facets that their arrows can be distinguished."""
-    return np.asarray(facets)[:: max(1, len(facets) // _MOST)]
+def _thinned(problem: Problem, facets) -> np.ndarray:
+    """At most so many facets, far from each other, that their arrows can be distinguished."""
+    facets = np.asarray(facets)
+    middles = np.asarray(problem.mesh.points)[facets].mean(axis=1)
+    chosen, off = [], np.full(len(facets), np.inf)
+    while len(chosen) < min(_MOST, len(facets)):  # the one farthest from those before
+        chosen.append(int(np.argmax(off)))
+        off = np.minimum(off, np.linalg.norm(middles - middles[chosen[-1]], axis=1))
+    return facets[chosen]
 
 
 def _kind(support: AbstractSupport, problem: Problem) -> str:

@@ -225,7 +225,9 @@ class _Solid(_Stage):
         self.canvas: Any = self.figure.canvas
         self.canvas.draw()
         self.still = np.asarray(self.canvas.buffer_rgba())[:, :, :3].copy()
-        self.text = self.stamp_on(self.figure, 0.015, 0.965, "top")
+        named = [axes for axes in self.figure.axes if axes.get_legend() is not None]
+        top = named[0].get_position().y1 - 0.01 if named else 0.965  # below the names
+        self.text = self.stamp_on(self.figure, 0.015, top, "top")
         return self._frame
 
     def _lens(self, track: Track, size: tuple[int, int], share: float):
