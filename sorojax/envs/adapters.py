@@ -107,7 +107,7 @@ def register() -> tuple[str, ...]:
 
     Example:
         >>> envs.register()
-        ('sorojax/FingerReach-v0', 'sorojax/TentaclePush-v0')
+        ('sorojax/FingerReach-v0', 'sorojax/TentaclePush-v0', 'sorojax/TipTracking-v0')
     """
     return _adapter("register").register()
 

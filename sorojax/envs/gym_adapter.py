@@ -15,11 +15,13 @@ from sorojax._types import real
 from sorojax.envs import core
 from sorojax.envs.finger_reach import FingerReach
 from sorojax.envs.tentacle_push import TentaclePush
+from sorojax.envs.tip_tracking import TipTracking
 from sorojax.math.compiled import jit_trees
 
 TASKS: dict[str, type[core.AbstractEnv]] = {
     "FingerReach": FingerReach,
     "TentaclePush": TentaclePush,
+    "TipTracking": TipTracking,
 }
 
 
