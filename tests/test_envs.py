@@ -21,7 +21,8 @@ from sorojax.envs.supply_line import LATE_STEPS, begun, sent
 REACH = envs.FingerReach(time_step=4e-3, substeps=5, max_steps=3)
 PUSH = envs.TentaclePush(time_step=2e-3, substeps=5, max_steps=60)
 TRACK = envs.TipTracking(time_step=4e-3, substeps=5, max_steps=100)
-TASKS = [pytest.param(env, id=type(env).__name__) for env in (REACH, PUSH, TRACK)]
+CRAWL = envs.CrawlerRun(time_step=1e-3, substeps=10, max_steps=100)
+TASKS = [pytest.param(env, id=type(env).__name__) for env in (REACH, PUSH, TRACK, CRAWL)]
 MEMBERS = 4
 
 
@@ -248,6 +249,45 @@ def test_a_static_inverse_with_a_preview_follows_and_without_one_comes_late(getk
     assert still < late - 0.1 and late < early - 0.05 and early > 0.93
 
 
+def test_the_order_of_the_chambers_makes_the_way_of_a_crawler(getkey):
+    """Half waves from the rear to the front, the other way round, all at once, and no air."""
+    (keys, states, _, _), _ = members(CRAWL, getkey())
+    level = jnp.zeros(MEMBERS)
+    states = eqx.tree_at(lambda s: s.goal.slope, states, level)
+    params = envs.randomised(CRAWL.default_params(), getkey(), 0.0, members=MEMBERS)
+    lags = np.array([1.0, -1.0, 0.0, 0.0])[:, None] * np.arange(3)
+    places = []
+    for k in range(150):
+        wave = np.sin(2 * np.pi * 2 * k * CRAWL.period - lags)
+        share = np.maximum(wave, 0) * np.array([1.0, 1.0, 1.0, 0.0])[:, None]
+        after = stepped(CRAWL, keys, states, jnp.asarray(2 * share - 1), params)
+        states = after.state
+        places.append(np.asarray(states.seen[:, 0, :, 0].mean(axis=1)))
+    way = places[-1] - places[49]  # m, of two periods, a second
+    assert not after.info["diverged"].any()
+    assert way[0] > 10e-3 and way[1] < -10e-3 and abs(way[0] + way[1]) < 0.3 * way[0]
+    assert abs(way[2]) < 0.4 * way[0] and abs(way[3]) < 0.2e-3  # noise of the markers
+
+
+def test_a_crawler_slides_down_where_the_floor_is_steeper_than_its_friction(getkey):
+    (keys, states, actions, _), _ = members(CRAWL, getkey())
+    params = envs.randomised(CRAWL.default_params(), getkey(), 0.0, members=MEMBERS)
+    slopes = jnp.arctan(jnp.asarray([0.5, 0.9, -0.9, 0.0]))
+    states = eqx.tree_at(lambda s: s.goal.slope, states, slopes)
+    speeds = []
+    for _ in range(20):
+        after = stepped(CRAWL, keys, states, 0 * actions - 1, params)
+        states = after.state
+        speeds.append(np.asarray(after.info["velocity"]))
+    friction, slip = 0.6, 2e-3  # m/s, below which friction is viscous
+    share = 0.5 / friction
+    creep = slip * share / np.sqrt(1 - share**2)
+    assert speeds[-1][0] == pytest.approx(-creep, rel=1e-3)
+    gained = (speeds[-1] - speeds[9]) / (10 * CRAWL.period)
+    want = 9.81 * np.cos(slopes[1]) * (0.9 - friction)
+    np.testing.assert_allclose(gained[1:], [-want, want, 0], rtol=0.03, atol=1e-6)
+
+
 @pytest.mark.parametrize("env", TASKS)
 def test_the_gradient_through_steps_is_that_of_the_values(env, getkey):
     """Of three steps, in contact where there are posts, by actions and a length."""
@@ -454,7 +494,7 @@ def test_environments_need_no_gymnasium_until_they_are_asked_for_it():
 
 
 def test_names_make_environments_and_vectors():
-    tasks = "FingerReach", "TentaclePush", "TipTracking"
+    tasks = "CrawlerRun", "FingerReach", "TentaclePush", "TipTracking"
     assert envs.register() == tuple(f"sorojax/{name}-v0" for name in tasks)
     many = gymnasium.make_vec(
         "sorojax/FingerReach-v0",

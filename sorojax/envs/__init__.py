@@ -11,6 +11,7 @@ from sorojax.envs.core import (
     step,
     step_with_reset,
 )
+from sorojax.envs.crawler_run import CrawlerParams, CrawlerRun
 from sorojax.envs.finger import FingerParams
 from sorojax.envs.finger_reach import FingerReach
 from sorojax.envs.supply_line import SupplyLine
@@ -19,6 +20,8 @@ from sorojax.envs.tip_tracking import TipTracking, TrackingParams
 
 __all__ = [
     "AbstractEnv",
+    "CrawlerParams",
+    "CrawlerRun",
     "FingerParams",
     "FingerReach",
     "State",
