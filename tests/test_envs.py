@@ -14,12 +14,15 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from sorojax import envs, io
+from sorojax.envs import finger
 from sorojax.envs.core import BOUND
 from sorojax.envs.supply_line import LATE_STEPS, begun, sent
 
 REACH = envs.FingerReach(time_step=4e-3, substeps=5, max_steps=3)
 PUSH = envs.TentaclePush(time_step=2e-3, substeps=5, max_steps=60)
-TASKS = [pytest.param(env, id=type(env).__name__) for env in (REACH, PUSH)]
+TRACK = envs.TipTracking(time_step=4e-3, substeps=5, max_steps=100)
+CRAWL = envs.CrawlerRun(time_step=1e-3, substeps=10, max_steps=100)
+TASKS = [pytest.param(env, id=type(env).__name__) for env in (REACH, PUSH, TRACK, CRAWL)]
 MEMBERS = 4
 
 
@@ -180,6 +183,111 @@ def test_a_post_that_is_passed_through_ends_the_episode(getkey):
     assert after.info["diverged"].tolist() == [False, True, False, False]
 
 
+def test_a_reference_stays_where_the_finger_can_rest(getkey):
+    """The reach is less than that of two chambers in their weakest direction, at 30 degrees."""
+    (_, states, _, _), observed = members(TRACK, getkey())
+    params, goal = TRACK.default_params(), states.goal
+    steps = jnp.arange(TRACK.max_steps + 1)
+    path = jax.vmap(lambda goal: TRACK.reference(goal, steps))(goal)
+    radius = np.linalg.norm(path, axis=-1)
+    assert (radius[:, 0] == 0).all() and (radius[:, 25:].max(axis=1) > 0.1 * goal.reach).all()
+    assert (radius.max(axis=1) <= goal.reach).all()
+    weakest = params.max_pressure * jnp.asarray([1.0, 0.5, 0.0])
+    most = np.linalg.norm(jax.jit(finger.tip_at_rest)(weakest, params)[1:])
+    assert (goal.reach < most).all() and (goal.reach > 0.8 * most).all()
+    ahead = (path[:, 1] - path[:, 0]) / params.length
+    np.testing.assert_allclose(observed[:, 8:10], ahead, atol=1e-15)
+
+
+def test_each_episode_of_tracking_has_a_supply_of_its_own(getkey):
+    (keys, states, actions, _), _ = members(TRACK, getkey())
+    params, line = TRACK.default_params(), states.goal.supply
+    for name in ("lag", "dead_time"):
+        drawn = np.asarray(getattr(line, name))
+        low, high = (float(getattr(x, name)) for x in (params.fastest, params.supply))
+        assert (low < drawn).all() and (drawn < high).all() and np.ptp(drawn) > 0
+    many = envs.randomised(params, getkey(), 0.0, members=MEMBERS)
+    after = stepped(TRACK, keys, states, 0 * actions + 1, many)
+    late = np.maximum(TRACK.period - line.dead_time, 0.0)
+    want = -np.expm1(-late / line.lag) * params.max_pressure
+    np.testing.assert_allclose(after.state.supply.value[:, 0], want, rtol=1e-9)
+
+
+def test_a_static_inverse_with_a_preview_follows_and_without_one_comes_late(getkey):
+    (keys, states, _, _), _ = members(TRACK, getkey())
+    params = TRACK.default_params()
+    many = envs.randomised(params, getkey(), 0.0, members=MEMBERS)
+    shares = np.linspace(0.0, 1.0, 11)
+    rest = jax.vmap(lambda p: finger.tip_at_rest(p, params))
+    tips = rest(params.max_pressure * jnp.asarray(shares[:, None] * np.array([[1.0, 0, 0]])))
+    aside = np.asarray(tips[:, 1])  # of the first chamber, towards -y
+    angles = 2 * np.pi * np.arange(3) / 3
+    sides = -np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+    def inverse(wanted):
+        far = np.linalg.norm(wanted, axis=1, keepdims=True)
+        moment = wanted / np.maximum(far, 1e-9) * np.interp(far, -aside, shares)
+        pressure = 2 / 3 * moment @ sides.T
+        return 2 * np.clip(pressure - pressure.min(axis=1, keepdims=True), 0, 1) - 1
+
+    reference = jax.jit(jax.vmap(lambda goal, k: TRACK.reference(goal, k[None])[0]))
+
+    def mean_reward(preview):
+        now, rewards = states, []
+        for _ in range(TRACK.max_steps):
+            wanted = reference(now.goal, now.steps + preview)
+            after = stepped(TRACK, keys, now, jnp.asarray(inverse(np.asarray(wanted))), many)
+            now = after.state
+            rewards.append(after.reward)
+        return np.mean(rewards)
+
+    steps = jnp.arange(1, TRACK.max_steps + 1)
+    path = jax.vmap(lambda goal: TRACK.reference(goal, steps))(states.goal)
+    reach = np.asarray(states.goal.reach)
+    still = 1 - np.mean(np.linalg.norm(path, axis=-1) / reach[:, None])
+    late, early = mean_reward(0), mean_reward(6)
+    assert still < late - 0.1 and late < early - 0.05 and early > 0.93
+
+
+def test_the_order_of_the_chambers_makes_the_way_of_a_crawler(getkey):
+    """Half waves from the rear to the front, the other way round, all at once, and no air."""
+    (keys, states, _, _), _ = members(CRAWL, getkey())
+    level = jnp.zeros(MEMBERS)
+    states = eqx.tree_at(lambda s: s.goal.slope, states, level)
+    params = envs.randomised(CRAWL.default_params(), getkey(), 0.0, members=MEMBERS)
+    lags = np.array([1.0, -1.0, 0.0, 0.0])[:, None] * np.arange(3)
+    places = []
+    for k in range(150):
+        wave = np.sin(2 * np.pi * 2 * k * CRAWL.period - lags)
+        share = np.maximum(wave, 0) * np.array([1.0, 1.0, 1.0, 0.0])[:, None]
+        after = stepped(CRAWL, keys, states, jnp.asarray(2 * share - 1), params)
+        states = after.state
+        places.append(np.asarray(states.seen[:, 0, :, 0].mean(axis=1)))
+    way = places[-1] - places[49]  # m, of two periods, a second
+    assert not after.info["diverged"].any()
+    assert way[0] > 10e-3 and way[1] < -10e-3 and abs(way[0] + way[1]) < 0.3 * way[0]
+    assert abs(way[2]) < 0.4 * way[0] and abs(way[3]) < 0.2e-3  # noise of the markers
+
+
+def test_a_crawler_slides_down_where_the_floor_is_steeper_than_its_friction(getkey):
+    (keys, states, actions, _), _ = members(CRAWL, getkey())
+    params = envs.randomised(CRAWL.default_params(), getkey(), 0.0, members=MEMBERS)
+    slopes = jnp.arctan(jnp.asarray([0.5, 0.9, -0.9, 0.0]))
+    states = eqx.tree_at(lambda s: s.goal.slope, states, slopes)
+    speeds = []
+    for _ in range(20):
+        after = stepped(CRAWL, keys, states, 0 * actions - 1, params)
+        states = after.state
+        speeds.append(np.asarray(after.info["velocity"]))
+    friction, slip = 0.6, 2e-3  # m/s, below which friction is viscous
+    share = 0.5 / friction
+    creep = slip * share / np.sqrt(1 - share**2)
+    assert speeds[-1][0] == pytest.approx(-creep, rel=1e-3)
+    gained = (speeds[-1] - speeds[9]) / (10 * CRAWL.period)
+    want = 9.81 * np.cos(slopes[1]) * (0.9 - friction)
+    np.testing.assert_allclose(gained[1:], [-want, want, 0], rtol=0.03, atol=1e-6)
+
+
 @pytest.mark.parametrize("env", TASKS)
 def test_the_gradient_through_steps_is_that_of_the_values(env, getkey):
     """Of three steps, in contact where there are posts, by actions and a length."""
@@ -281,7 +389,7 @@ def test_a_spread_may_name_what_varies(getkey):
 def test_the_checker_of_gymnasium_has_nothing_to_say(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        made = gymnasium.make(name, substeps=10, max_steps=4, render_mode="rgb_array")
+        made = gymnasium.make(name, max_steps=4, render_mode="rgb_array")
         check_env(made.unwrapped)
     made.reset(seed=0)
     ends = [made.step(made.action_space.sample())[2:4] for _ in range(4)]
@@ -386,7 +494,8 @@ def test_environments_need_no_gymnasium_until_they_are_asked_for_it():
 
 
 def test_names_make_environments_and_vectors():
-    assert envs.register() == ("sorojax/FingerReach-v0", "sorojax/TentaclePush-v0")
+    tasks = "CrawlerRun", "FingerReach", "TentaclePush", "TipTracking"
+    assert envs.register() == tuple(f"sorojax/{name}-v0" for name in tasks)
     many = gymnasium.make_vec(
         "sorojax/FingerReach-v0",
         num_envs=2,

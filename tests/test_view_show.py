@@ -359,7 +359,7 @@ def test_a_rod_is_a_tube_where_its_sections_are(arm):
 
 
 def test_threads_directors_and_pressures_are_inside_a_clear_tube(arm):
-    routes = (R.Straight([-0.003, 0.003]), R.Straight([-0.003, -0.003]))
+    routes = (R.Straight([-0.003, 0.003]), R.Straight([-0.003, -0.003], 0.25, 0.75))
     chambers = R.thread_chambers(arm, routes, [1e-5, 2e-5])
     forces = (R.Tendons(R.Helical(0.005, 1.0), 1.5), R.Pressurised(chambers, [2e4, 1e4]))
     picture = view.show(
@@ -372,6 +372,7 @@ def test_threads_directors_and_pressures_are_inside_a_clear_tube(arm):
     for thread, route, area in zip(drawn[1:], routes, (1e-5, 2e-5), strict=True):
         assert np.allclose(thread.place, route.place, rtol=0, atol=1e-9)  # found again
         assert np.isclose(np.pi * thread.radius**2, area)
+        assert np.allclose((thread.start, thread.stop), (route.start, route.stop))
 
 
 def test_contact_is_an_arrow_and_its_obstacle(arm):

@@ -1,4 +1,4 @@
-"""Steps of environments a second: finger reach and tentacle push.
+"""Steps of environments a second: finger reach, tentacle push, tracking, crawler.
 
 Each member has numbers of its own. A step is 20 ms: 20 steps of physics of 1 ms, measurements,
 reward. `run_s` is that of one member of a batch, one over the steps a second. The finger is
@@ -17,6 +17,8 @@ TASKS = {
     "finger reach": envs.FingerReach(),
     "finger reach, 5 of 4 ms": envs.FingerReach(time_step=4e-3, substeps=5),
     "tentacle push": envs.TentaclePush(),
+    "tip tracking": envs.TipTracking(),
+    "crawler": envs.CrawlerRun(),
 }
 
 

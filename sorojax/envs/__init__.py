@@ -11,12 +11,17 @@ from sorojax.envs.core import (
     step,
     step_with_reset,
 )
-from sorojax.envs.finger_reach import FingerParams, FingerReach
+from sorojax.envs.crawler_run import CrawlerParams, CrawlerRun
+from sorojax.envs.finger import FingerParams
+from sorojax.envs.finger_reach import FingerReach
 from sorojax.envs.supply_line import SupplyLine
 from sorojax.envs.tentacle_push import TentacleParams, TentaclePush
+from sorojax.envs.tip_tracking import TipTracking, TrackingParams
 
 __all__ = [
     "AbstractEnv",
+    "CrawlerParams",
+    "CrawlerRun",
     "FingerParams",
     "FingerReach",
     "State",
@@ -24,6 +29,8 @@ __all__ = [
     "SupplyLine",
     "TentacleParams",
     "TentaclePush",
+    "TipTracking",
+    "TrackingParams",
     "randomised",
     "register",
     "reset",

@@ -106,8 +106,8 @@ def register() -> tuple[str, ...]:
         ModuleNotFoundError: If gymnasium is not installed.
 
     Example:
-        >>> envs.register()
-        ('sorojax/FingerReach-v0', 'sorojax/TentaclePush-v0')
+        >>> envs.register()[:2]
+        ('sorojax/CrawlerRun-v0', 'sorojax/FingerReach-v0')
     """
     return _adapter("register").register()
 

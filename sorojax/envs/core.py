@@ -116,6 +116,10 @@ class AbstractEnv(eqx.Module):
         """The command after the last one, in the unit of its actuator, of an action within
         [-1, 1]."""
 
+    def supply_line(self, goal: PyTree, params: Any) -> SupplyLine:
+        """The supply of an episode: `params.supply`, unless the goal has its own."""
+        return params.supply
+
     @abc.abstractmethod
     def moved(
         self, body: PyTree, delivery: Delivery, goal: PyTree, params: Any
@@ -219,7 +223,8 @@ def step(
     before, action, params = _without_bad_slopes((state, action, params))
     action = jnp.clip(action, -1.0, 1.0)
     command = env.commanded(before.supply.commands[0], action, params)
-    delivery, supply = sent(params.supply, before.supply, command, env.period)
+    line = env.supply_line(before.goal, params)
+    delivery, supply = sent(line, before.supply, command, env.period)
     body, fine = env.moved(before.body, delivery, before.goal, params)
     seen = _measured(key, env.markers(body, params), params)
     seen = jnp.stack([seen, before.seen[0]])

@@ -13,13 +13,17 @@ from jaxtyping import Array, Bool, Float
 
 from sorojax._types import real
 from sorojax.envs import core
+from sorojax.envs.crawler_run import CrawlerRun
 from sorojax.envs.finger_reach import FingerReach
 from sorojax.envs.tentacle_push import TentaclePush
+from sorojax.envs.tip_tracking import TipTracking
 from sorojax.math.compiled import jit_trees
 
 TASKS: dict[str, type[core.AbstractEnv]] = {
+    "CrawlerRun": CrawlerRun,
     "FingerReach": FingerReach,
     "TentaclePush": TentaclePush,
+    "TipTracking": TipTracking,
 }
 
 

@@ -116,6 +116,7 @@ class Thread(NamedTuple):
         tangent, tangent_rows: d place / ds along the axes of the section [-].
         curvature, curvature_rows: Curvature of the rod there [1/m].
         rule: Where the points are.
+        start: Where on the rod it begins [m].
         span: Length of rod that the thread takes [m].
     """
 
@@ -125,6 +126,7 @@ class Thread(NamedTuple):
     curvature: Float[Array, "points 3"]
     curvature_rows: Float[Array, "points 3 dof"]
     rule: Quadrature
+    start: Float[Array, ""]
     span: Float[Array, ""]
 
 
@@ -149,6 +151,7 @@ def thread(rod: Rod, route: AbstractRoute) -> Thread:
         curvature=rest[:, :3],
         curvature_rows=rows[:, :3],
         rule=rule,
+        start=rod.length * route.start,
         span=rod.length * share,
     )
 

@@ -103,12 +103,12 @@ def _chamber(body: Rod, thread: Thread, radius: float, colour: str, name: str) -
     slope = np.moveaxis(rows, 1, 2)  # points, dof, 3
     bend = np.moveaxis(kappa, 1, 2)
     along_y, along_z = np.cross(bend, [0.0, 1.0, 0.0]), np.cross(bend, [0.0, 0.0, 1.0])
-    share = float(thread.span / body.length)
+    start, span = float(thread.start / body.length), float(thread.span / body.length)
     places = []
     for k in range(len(kappa)):
         matrix = np.stack([along_y[k].ravel(), along_z[k].ravel()], axis=1)
         places.append(np.linalg.lstsq(matrix, slope[k].ravel(), rcond=1e-9)[0])
-    return Drawn(0.0, share, np.array(places), radius, colour, name)
+    return Drawn(start, start + span, np.array(places), radius, colour, name)
 
 
 def _heat(pressure: np.ndarray | None, k: int) -> str:
