@@ -24,9 +24,17 @@ from jaxtyping import Array, Float, Int
 from sorojax import fem
 from sorojax._display import displayed
 from sorojax._progress import report
-from sorojax.fem.assembly.energy import Body, Entries, energy_density
+from sorojax.fem.assembly.energy import (
+    Body,
+    Entries,
+    Response,
+    energy_density,
+    response,
+    tangent_entries,
+)
 from sorojax.fem.assembly.geometry import deformation, quadrature_points
 from sorojax.fem.equilibrium.response import tangent_solve
+from sorojax.fem.kinematics import component_pairs, entries_of
 from sorojax.fem.problem import body as bare, body_at, load_force
 from sorojax.math.linalg.sparse import product
 from sorojax.systems.blocks.fem_body import FemBody
@@ -69,7 +77,7 @@ class SampledForce(AbstractModalForce):
 
     body: Body
     rest: Entries
-    slopes: Float[Array, "entries quad cells modes"]
+    slopes: Float[Array, "modes entries quad cells"]
     volumes: Float[Array, "quad cells"]
     loads: Polynomial
     trained: Float[Array, ""] | None = None
@@ -84,7 +92,7 @@ class SampledForce(AbstractModalForce):
 
     def strain(self, q: Modes) -> Float[Array, ""]:
         """Largest change of an entry of F from q = 0."""
-        return jnp.max(jnp.abs(self.slopes @ q))
+        return jnp.max(jnp.abs(jnp.tensordot(q, self.slopes, 1)))
 
     def __call__(self, q):
         return _of_cells(self, q) - self.loads(q)
@@ -100,25 +108,35 @@ class SampledForce(AbstractModalForce):
 
     def stiffness(self, q: Modes) -> Float[Array, "modes modes"]:
         """Derivative of the force of the cells: dP/dF at each point, between the slopes."""
-        F = self.rest + self.slopes @ q
+        answer = response(self.body, self._gradients(q), None, lambda work: work())
+        kinematics, count = self.body.kinematics, q.shape[0]
+        blocks = tangent_entries(kinematics, answer.tangent)
+        tangent = {}
+        for (i, k), block in zip(component_pairs(kinematics.dim), blocks, strict=True):
+            for (e, _), row in zip(entries_of(kinematics, i), block, strict=True):
+                for (f, _), entry in zip(entries_of(kinematics, k), row, strict=True):
+                    tangent[e, f] = tangent[f, e] = (self.volumes * entry)[None]
+        # points last, so that many members are one product of matrices
+        every = range(self.slopes.shape[1])
+        bent = [sum(tangent[e, f] * self.slopes[:, f] for f in every) for e in every]
+        flat = self.slopes.reshape(count, -1)
+        total = jnp.stack(bent, axis=1).reshape(count, -1) @ flat.T
+        return total if self.body.modes is None else total + self._bulk(answer)
 
-        def stress(F):
-            return jax.grad(self.stored_by)(F)
-
-        if self.body.modes is not None:  # the pressure of a cell couples its points
-            moved = jnp.moveaxis(self.slopes, -1, 0)
-            bent = jax.vmap(lambda d: jax.jvp(stress, (F,), (d,))[1])(moved)
-            return jnp.einsum("eqcm,neqc->mn", self.slopes, bent)
-        units = jnp.broadcast_to(
-            jnp.eye(F.shape[0], dtype=F.dtype)[:, :, None, None], (F.shape[0], *F.shape)
-        )
-        tangent = jax.vmap(lambda d: jax.jvp(stress, (F,), (d,))[1])(units)
-        bent = jnp.einsum("feqc,fqcn->eqcn", tangent, self.slopes)
-        count = self.slopes.shape[-1]
-        return self.slopes.reshape(-1, count).T @ bent.reshape(-1, count)
+    def _bulk(self, answer: Response) -> Float[Array, "modes modes"]:
+        """Stiffness of the pressures of the cells, which couple the points of each."""
+        modes, volumes = self.body.modes, self.body.volumes
+        assert modes is not None and answer.slopes is not None and answer.stiffness is not None
+        turned = jnp.einsum("eqc,meqc->mqc", answer.slopes, self.slopes)
+        each = jnp.einsum("aqc,qc,mqc->mac", modes, volumes, turned)
+        weights = self.volumes[0] / volumes[0]
+        return jnp.einsum("c,mac,abc,nbc->mn", weights, each, answer.stiffness, each)
 
     def _stored(self, q: Modes) -> Float[Array, ""]:
-        return self.stored_by(self.rest + self.slopes @ q)
+        return self.stored_by(self._gradients(q))
+
+    def _gradients(self, q: Modes) -> Entries:
+        return self.rest + jnp.tensordot(q, self.slopes, 1)
 
 
 @eqx.filter_custom_jvp
@@ -168,7 +186,7 @@ def _cells(problem: fem.Problem, basis: Basis) -> SampledForce:
     still = jnp.zeros_like(basis.displacement)
     identity = deformation(mesh, kinematics, points, still)
     moved = jax.lax.map(lambda s: deformation(mesh, kinematics, points, s), basis.shapes)
-    slopes = jnp.moveaxis(moved - identity[None], 0, -1)
+    slopes = moved - identity[None]
     energy = body_at(bare(problem), points)
     none = Polynomial((jnp.zeros(len(basis), rest.dtype),))
     return SampledForce(energy, rest, slopes, points.volumes, none)
@@ -182,7 +200,7 @@ def _taken(force: SampledForce, cells: np.ndarray, count: int) -> SampledForce:
         return leaf[..., cells] if by_cell else leaf
 
     energy, rest, volumes = jax.tree.map(last, (force.body, force.rest, force.volumes))
-    return SampledForce(energy, rest, force.slopes[:, :, cells], volumes, force.loads)
+    return SampledForce(energy, rest, force.slopes[..., cells], volumes, force.loads)
 
 
 # Training: shapes from equilibria, cells and weights from their forces
@@ -419,8 +437,8 @@ def _chosen(
     upper = np.triu_indices(len(spread))
 
     def of_cells(q):
-        P = jax.grad(whole.stored_by)(whole.rest + whole.slopes @ q)
-        return jnp.einsum("eqc,eqcm->mc", P, whole.slopes)
+        P = jax.grad(whole.stored_by)(whole.rest + jnp.tensordot(q, whole.slopes, 1))
+        return jnp.einsum("eqc,meqc->mc", P, whole.slopes)
 
     @jax.jit
     def rows_of(q, stiffness):
