@@ -41,7 +41,8 @@ def test_fingers_hold_things_that_can_turn_and_turn_a_bolt():
         assert abs(found[f"{thing}: sinks by [mm/s]"]) < 3
         assert found[f"{thing}: turned by [deg]"] < 6
     # held harder, a beaker twists the fingers; held less, a wrench falls
-    assert found["beaker, 20 mN m: turned by [deg]"] > 8
+    turned = found["beaker: turned by [deg]"]
+    assert found["beaker, 20 mN m: turned by [deg]"] > 4 * turned
     assert found["wrench, 20 mN m: contact forces over weight"] == 0
     left, right = (found[f"bolt {side}: turns a second"] for side in ("left", "right"))
     assert 0.12 < abs(left) < 0.25 and right == pytest.approx(-left, rel=0.02)
