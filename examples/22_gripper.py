@@ -34,7 +34,7 @@ GRIP = sj.contact.LinePenalty(stiffness=5e5, smoothing=50e-6, friction=0.8, slip
 HELD = ContactMidpoint(passes=1, lasting=True, theta=1.0, tolerance=1e-4)
 # half widths, radius of the edges, length, depth of the middle below the feet of the fingers
 # [mm], mass [g], and what its inertia is divided by: 4 if round
-BEAKER, BOLT = (20, 20, 20, 60, 75, 50, 4), (28, 28, 28, 44, 58, 12, 4)
+BEAKER, BOLT = (20.0, 20, 20, 60, 75, 50, 4), (28.0, 28, 28, 44, 58, 12, 4)
 WRENCH, WALK = (2.5, 5, 0.5, 100, 95, 40, 3), (0.02, 0.02, 0.02)
 # damping of the bolt [N m s], moments of even and odd fingers inwards and of all sideways
 # [N m], and the phase between the two
