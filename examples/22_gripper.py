@@ -92,7 +92,7 @@ def main(quick: bool = False, picture: str | Path | None = None, modes: int = 3)
     grid, told, films = (step, round(seconds / step), modes), {}, {}
     for name, (size, damping, *moments) in list(RUNS.items())[: 6 if quick else None]:
         joint = rod.Screw(turn=1.0, advance=0.0, damping=damping) if damping else rod.Free()
-        films[name] = _, path, pull = run(joint, *map(jnp.array, (moments, size)), *grid)
+        films[name] = _, path, pull = run(joint, jnp.array(moments), jnp.array(size), *grid)
         if not damping:
             told[f"{name}: contact forces over weight"] = float(pull) / (9.81e-3 * size[5])
             told[f"{name}: sinks by [mm/s]"] = -float(path.v[-1, -1]) / mm
