@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import sorojax as sj
 from benchmarks.cases.systems_fem import DURATION, STEP, STEPS, body, network
 from benchmarks.harness import Row, measure_calls
 from sorojax import systems
+from sorojax.math import batched
 from sorojax.units import kPa, mm
 
 SIZE, MODES, TOLERANCE = 0.7 * mm, 10, 1e-2
@@ -62,7 +62,7 @@ def stepped(block, count):
 
 def per_step(block, members, count=40):
     """CPU time of a step of one member [s]."""
-    run = jax.jit(sj.batched(stepped(block, count)))
+    run = jax.jit(batched(stepped(block, count)))
     pressures = jnp.linspace(1 * kPa, 6 * kPa, members)
     jax.block_until_ready(run(pressures))
     times = []
