@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.cases.systems_fem import DURATION, STEP, STEPS, body, network
 from benchmarks.harness import Row, measure_calls
 from sorojax import systems
-from sorojax.math import batched
+from sorojax.math.compiled import batched
 from sorojax.units import kPa, mm
 
 SIZE, MODES, TOLERANCE = 0.7 * mm, 10, 1e-2

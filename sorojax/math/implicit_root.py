@@ -70,7 +70,7 @@ def implicit_root(
     return (x, more) if has_aux else x
 
 
-def _opened(function: Function, x: Array) -> tuple[Function, list[Array]]:
+def _opened(function: Callable[[Array], Any], x: Array) -> tuple[Any, list[Array]]:
     """A function of what `function` closes over too, and these arrays: integers as well, as a
     derivative is taken where those of a trace are gone."""
     closed = eqx.filter_closure_convert(function, x)
