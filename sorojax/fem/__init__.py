@@ -12,6 +12,7 @@ from sorojax.fem.contact.statics import (
     update_friction,
 )
 from sorojax.fem.contact.switching import contact_switching
+from sorojax.fem.crossings import self_crossings
 from sorojax.fem.dynamics.damping import (
     KelvinVoigt,
     Rayleigh,
@@ -158,6 +159,7 @@ __all__ = [
     "rotated",
     "route",
     "sample_points",
+    "self_crossings",
     "simulate",
     "solve",
     "solve_contact",

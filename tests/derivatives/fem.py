@@ -17,6 +17,7 @@ NONE = {
     "topology, on the host: pairs of nodes, patches of cells, cells that hold points": (
         "space patches route rigid glue"
     ),
+    "pairs of facets, on the host": "self_crossings",
     "lists which facets are near, at concrete positions only": "update_contact_pairs",
     "paths and predictions found on the host; their docstrings promise no derivative": (
         "continuation critical_loads"

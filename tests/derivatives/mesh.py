@@ -93,6 +93,7 @@ CASES = {
     "cell_volumes of hexahedra": in_points(M.cell_volumes, block),
     "distortion": distorted,
     "enclosed_volume": around_the_hole,
+    "quadratic": in_points(lambda mesh: M.quadratic(mesh).points, egg),
     "enrich": in_points(lambda mesh: M.enrich(mesh).points, plate),
     "move in the plane": moved_in_the_plane,
     "move in space": moved_in_space,

@@ -18,10 +18,13 @@ from sorojax._display import displayed, number, outcome
 from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax._progress import report
 from sorojax._types import real
+from sorojax.fem.contact.self_contact import SelfContact
+from sorojax.fem.crossings import self_crossings
 from sorojax.fem.equilibrium.implicit_diff import Solve, equilibrium
 from sorojax.fem.equilibrium.jit import Begin
 from sorojax.fem.equilibrium.load_stepping import Stats, between, unloaded
 from sorojax.fem.equilibrium.newton import Newton
+from sorojax.fem.loads.glue import Glue
 from sorojax.fem.problem import Problem, body
 from sorojax.fem.relaxation import (
     Past,
@@ -33,6 +36,8 @@ from sorojax.fem.relaxation import (
     softens,
 )
 from sorojax.math.status import Status
+
+_MANY_CELLS = 50_000  # beyond, a print does not look for sides that pass through each other
 
 
 @displayed
@@ -70,7 +75,7 @@ class Solution(eqx.Module):
             assert self.pressures is not None and self.volumes is not None
             p, volume = number(self.pressures[..., k], "Pa"), self.volumes[..., k]
             rows.append(f"  {name}: {p} in {number(volume, 'm^3')}")
-        return "\n".join(rows + _unstable([self.stats]))
+        return "\n".join(rows + _unstable([self.stats]) + _crossed(self.problem, u))
 
 
 @displayed
@@ -120,10 +125,23 @@ class Path(eqx.Module):
     def _text(self) -> str:
         u = self.displacements
         largest = number(jnp.max(jnp.sqrt(jnp.sum(u**2, axis=-1))), "m") if u.size else "none"
+        last = _crossed(self.problem, u[-1]) if u.size else []
         return (
             f"Path: {len(self)} states, {outcome(self.status)}, largest displacement "
             f"{largest}\n  {self.name} {number(self.values)}"
-        ) + "".join(f"\n{row}" for row in _unstable(self.stats))
+        ) + "".join(f"\n{row}" for row in _unstable(self.stats) + last)
+
+
+def _crossed(problem: Problem, u: Array) -> list[str]:
+    """A line of a print about a body that passes through itself."""
+    keeps = any(isinstance(load, SelfContact | Glue) for load in problem.loads)
+    many = problem.mesh.points.ndim > 2 or problem.mesh.num_cells > _MANY_CELLS
+    if keeps or many or u.ndim > 2 or is_traced((problem, u)):
+        return []
+    count = len(self_crossings(problem, u))
+    if count == 0:
+        return []
+    return [f"  the body passes through itself, {count} pairs of facets: see fem.SelfContact"]
 
 
 def _unstable(records: Any) -> list[str]:
