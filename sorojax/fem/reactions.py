@@ -254,7 +254,8 @@ def _without_inertia(dynamics: Dynamics, known, state: State, index, lists):
     loads = loads if lists is None else with_lists(loads, lists)
     loads = tuple(load.begun(bare, now) for load in loads)
     loaded = at_instant(bare, known.moduli, state.strains, state.peaks)
-    force = balance(exchanged(loaded, loads=loads), u).ravel()
+    loaded = exchanged(loaded, loads=loads, supports=problem.supports)
+    force = balance(loaded, u).ravel()
     force = force + swing_force(problem, u, v).ravel()
     damping = damping_matrix(dynamics, known, u)
     if damping is None:
