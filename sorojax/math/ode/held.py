@@ -162,11 +162,14 @@ def projected(
     along = terms.near @ rows.T if pulled is None else pulled
     reach = rows @ along + by.spare
     opposite = inverse(reach)
-    back = along @ opposite @ by.combine
-    v = v - back @ (held.rows @ v - held.wanted)
+
+    def back(value):
+        return along @ (opposite @ (by.combine @ value))
+
+    v = v - back(held.rows @ v - held.wanted)
 
     def nearer(q, value):
-        return move(q, -back @ value), jnp.max(jnp.abs(jax.lax.stop_gradient(value)))
+        return move(q, -back(value)), jnp.max(jnp.abs(jax.lax.stop_gradient(value)))
 
     def again(found, _):
         q, size = found
