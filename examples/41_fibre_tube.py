@@ -107,6 +107,17 @@ def draw(run, angles, found, file: Path) -> None:
 
     from sorojax import view
 
+    def scene(run):
+        """The rubber, seen through, and the threads in it; the axis of the tube upright."""
+        upright = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+        drawn = view.scene_of(run, field=None, rest=False, loads=False).parts
+        skin = next(part for part in drawn if isinstance(part, view.Surface))
+        wall = view.Surface(skin.points @ upright, skin.triangles, "#8fbce6", opacity=0.4)
+        lines = fem.rod_forces(run.problem, run.displacement, "threads").positions
+        ways = [np.asarray(line) @ upright for line in lines]
+        rest, first = view.Lines(ways[1:], "#1f4e79", 1.3), view.Lines(ways[:1], "#D55E00", 1.8)
+        return view.Scene((wall, rest, first))
+
     figure = plt.figure(figsize=(7, 3.6), dpi=200, layout="constrained")
     grid = figure.add_gridspec(1, 4, width_ratios=(1, 1, 0.1, 2.8))
     shown = [figure.add_subplot(grid[k]) for k in range(2)]
@@ -127,20 +138,6 @@ def draw(run, angles, found, file: Path) -> None:
     view.draw_into(shown, scenes, view=view.Camera(-60.0, 12.0))
     figure.savefig(file)
     plt.close(figure)
-
-
-def scene(run):
-    """The rubber, seen through, and the threads in it; the axis of the tube upright."""
-    from sorojax import view
-
-    upright = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
-    drawn = view.scene_of(run, field=None, rest=False, loads=False).parts
-    skin = next(part for part in drawn if isinstance(part, view.Surface))
-    wall = view.Surface(skin.points @ upright, skin.triangles, "#8fbce6", opacity=0.4)
-    lines = fem.rod_forces(run.problem, run.displacement, "threads").positions
-    ways = [np.asarray(line) @ upright for line in lines]
-    rest, first = view.Lines(ways[1:], "#1f4e79", 1.3), view.Lines(ways[:1], "#D55E00", 1.8)
-    return view.Scene((wall, rest, first))
 
 
 if __name__ == "__main__":
