@@ -15,7 +15,6 @@ from jaxtyping import Array, Float
 
 from sorojax.math.quadrature import polynomial
 
-LOOP_BELOW = 16  # a loop of eliminations beats several calls of LAPACK, measured at 12
 UNROLL_BELOW = 9  # written out, LDL' beats a LAPACK call up to 8 unknowns
 
 
@@ -68,27 +67,13 @@ def solve_columns(
 ) -> Float[Array, "dof columns"]:
     """`solve_symmetric` for every column of `right`."""
     fixed = jax.lax.stop_gradient(matrix)
-    if matrix.shape[0] < LOOP_BELOW:
+    if matrix.shape[0] < UNROLL_BELOW:
         solve = functools.partial(_eliminated, fixed)
     else:
         solve = _cholesky(fixed)
     return jax.lax.custom_linear_solve(
         lambda x: matrix @ x, right, lambda _, r: solve(r), symmetric=True
     )
-
-
-@jax.custom_jvp
-def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Of a matrix that is all but symmetric positive definite: nothing is pivoted."""
-    if matrix.shape[0] >= LOOP_BELOW:
-        return _batch_first(jnp.linalg.inv(matrix))
-    return _batch_first(_eliminated(matrix, jnp.eye(matrix.shape[0], dtype=matrix.dtype)))
-
-
-@inverse.defjvp
-def _inverse_jvp(primals, tangents):
-    found = inverse(*primals)
-    return found, _batch_first(-(found @ tangents[0] @ found))
 
 
 def _eliminated(matrix: Array, right: Array) -> Array:

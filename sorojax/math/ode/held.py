@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sorojax.math.linalg.dense import UNROLL_BELOW, inverse, solve_columns, solve_symmetric
+from sorojax.math.linalg.dense import solve_columns, solve_symmetric
 
 _RANK = 1e-10  # of the largest eigenvalue of G M^-1 G', rows of equal size: dependent below
 _NEAR_SINGULAR = 1e-4  # of one over the condition number at the start
@@ -118,11 +118,7 @@ def solve_held(
     found = solve_columns(matrix, jnp.concatenate([right[:, None], rows.T], axis=1))
     free, pulled = found[:, 0], found[:, 1:]
     missing = by.combine @ held.wanted - rows @ free
-    apart = rows @ pulled + by.spare
-    if apart.shape[0] < UNROLL_BELOW:
-        reaction = solve_symmetric(apart, missing)
-    else:
-        reaction = solve_columns(apart, missing[:, None])[:, 0]
+    reaction = solve_symmetric(rows @ pulled + by.spare, missing)
     return Reacted(free + pulled @ reaction, reaction @ by.combine, pulled)
 
 
@@ -161,15 +157,12 @@ def projected(
     rows = by.combine @ held.rows
     along = terms.near @ rows.T if pulled is None else pulled
     reach = rows @ along + by.spare
-    opposite = inverse(reach)
-
-    def back(value):
-        return along @ (opposite @ (by.combine @ value))
-
-    v = v - back(held.rows @ v - held.wanted)
+    inverse = jnp.linalg.inv(reach)
+    back = along @ inverse @ by.combine
+    v = v - back @ (held.rows @ v - held.wanted)
 
     def nearer(q, value):
-        return move(q, -back(value)), jnp.max(jnp.abs(jax.lax.stop_gradient(value)))
+        return move(q, -back @ value), jnp.max(jnp.abs(jax.lax.stop_gradient(value)))
 
     def again(found, _):
         q, size = found
@@ -177,7 +170,7 @@ def projected(
         return jax.lax.cond(size > _WELL, lambda: closer(terms.gap(t, q)), lambda: found), None
 
     (q, _), _ = jax.lax.scan(again, nearer(q, value), length=_PASSES)
-    return q, v, _share(reach, opposite)
+    return q, v, _share(reach, inverse)
 
 
 def _share(reach: Array, inverse: Array) -> Float[Array, ""]:
