@@ -166,6 +166,20 @@ def test_pressure_in_an_open_cavity_pushes_its_walls_alone(kinematics, origin):
         np.testing.assert_allclose(moving, force, rtol=1e-6)
 
 
+@pytest.mark.parametrize("origin", [None, [0.0, 0.0, -0.1]])
+def test_pressure_in_an_open_cavity_in_space_pushes_its_walls_alone(origin):
+    block = mesh.box([0, 0, 0], [0.03, 0.03, 0.03], divisions=(3, 3, 3))
+    low, high = jnp.array([0.01, 0.01, -0.01]), jnp.array([0.02, 0.02, 0.02])
+    cup = mesh.submesh(
+        block, mesh.cells_where(block, lambda p: jnp.any((p < low) | (p > high)))
+    )
+    rim = np.flatnonzero(np.asarray(cup.points)[:, 2] == 0)
+    loads = (fem.Pressure(mesh.facets_on(cup, sdf.Box(low, high)), 2e3, origin=origin),)
+    problem = fem.problem(cup, RUBBER, supports=(fem.Fixed(rim, name="rim"),), loads=loads)
+    u = fem.solve(problem, newton=SHARP).displacement
+    np.testing.assert_allclose(fem.reactions(problem, u)["rim"].force[2], -0.2, rtol=1e-8)
+
+
 def test_a_reaction_has_a_derivative_by_material_and_place():
     problem = _block()
 
