@@ -14,6 +14,7 @@ from sorojax.rod.dynamics import closures
 from sorojax.rod.dynamics.closures import closure_force, closure_jacobian, violations
 from sorojax.rod.model.assembly import retract
 from sorojax.rod.model.closure import equations
+from sorojax.rod.model.joint import AbstractJoint
 
 LENGTH, LOAD = 0.1, 9.81 * 1000 * np.pi * 0.005**2  # m, N/m
 STIFFNESS = 1e6 * np.pi / 4 * 0.005**4
@@ -77,6 +78,16 @@ def test_reactions_do_work_on_the_rates_of_violations(group, joint):
     # in space the Jacobian of a rod is that of its position up to the quadrature
     assert jnp.abs(rows - slopes).max() < (1e-14 if dim == 2 else 1e-4) * jnp.abs(rows).max()
     assert jnp.abs(force - rows.T @ reactions).max() < 1e-14
+
+
+@pytest.mark.parametrize("group", [SE2(), SE3()])
+def test_slopes_of_violations_are_those_of_differentiation(group):
+    rng, dim = np.random.default_rng(0), group.space_dim
+    pose = group.exp(jnp.array(rng.standard_normal(group.algebra_dim)))
+    for joint in (R.Fixed(), R.Revolute(), R.Prismatic(), R.Spherical(), R.Roller()):
+        slopes = joint.slopes(group, pose[:dim, :dim], pose[:dim, dim])
+        want = AbstractJoint.slopes(joint, group, pose[:dim, :dim], pose[:dim, dim])
+        np.testing.assert_allclose(slopes, want, atol=1e-15, err_msg=str(joint))
 
 
 def test_no_violation_where_the_joint_moves():
@@ -279,7 +290,7 @@ def test_a_model_without_closures_does_not_meet_them(verb, monkeypatch):
     def met(*_):
         raise RuntimeError("a closure is looked at")
 
-    monkeypatch.setattr(closures, "_pairs", met)
+    monkeypatch.setattr(closures, "_ends", met)
     zero = jnp.zeros(4)
 
     def traced(model):

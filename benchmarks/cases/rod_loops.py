@@ -98,20 +98,22 @@ def drift(loop, path):
 
 
 def cost(loop, q, stepper, step):
-    """CPU time of a run over that of the open tree from the same state, run in turn."""
+    """CPU time of a run over that of the open tree from the same state: medians of runs in
+    turn."""
     tree = rod.Assembly(loop.group, loop.names, loop.parts)
     zero, settings = jnp.zeros(rod.num_dof(loop)), {"step": step, "saves": 20, "every": 20}
 
     def run(model):
         return rod.rollout(model, q, zero, DAMPED, stepper=stepper, check=False, **settings).q
 
-    times = {}
-    for model in (loop, tree) * 8:
+    times = {True: [], False: []}
+    for model in (loop, tree):
         jax.block_until_ready(run(model))
+    for model in (loop, tree) * 25:
         start = time.process_time()
         jax.block_until_ready(run(model))
-        times.setdefault(model is loop, []).append(time.process_time() - start)
-    return min(times[True]) / min(times[False])
+        times[model is loop].append(time.process_time() - start)
+    return float(np.median(times[True]) / np.median(times[False]))
 
 
 def gradient(loop, q):

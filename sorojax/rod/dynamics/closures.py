@@ -10,9 +10,7 @@ Reference:
     Featherstone, Rigid Body Dynamics Algorithms, 2008, chapter 8.
 """
 
-import functools
-import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -26,6 +24,7 @@ from sorojax.rod.dynamics.moving import spin_cross, turned_pose, turned_twists
 from sorojax.rod.dynamics.points import moment_of
 from sorojax.rod.dynamics.tree import (
     AssemblyState,
+    Frame,
     Section,
     bias_accelerations,
     bias_rates,
@@ -34,8 +33,33 @@ from sorojax.rod.dynamics.tree import (
     in_own_frames,
 )
 from sorojax.rod.model.assembly import closure_ends, slices
-from sorojax.rod.model.closure import Closure, equations
+from sorojax.rod.model.closure import equations
 from sorojax.rod.model.joint import AbstractJoint, Group
+
+
+class _Place(NamedTuple):
+    """What a frame of a closure is fixed to, and where on it.
+
+    Attributes:
+        frame: Of the part, in the world; None of the ground.
+        section: Of a rod or the frame of a link, in the frame of the part.
+        rows: Integrals from the base of a rod to the section [m]; None of a link.
+        pose: Of the frame in the section; None where they are one.
+    """
+
+    frame: Frame | None
+    section: Section
+    rows: Float[Array, "1 quad"] | None
+    pose: Float[Array, "h h"] | None
+
+
+class _Ends(NamedTuple):
+    """Both ends of a closure, its joint, and how that is driven."""
+
+    joint: AbstractJoint
+    motion: Callable[[Array], Array] | None
+    held: _Place
+    holder: _Place
 
 
 class _End(NamedTuple):
@@ -43,37 +67,25 @@ class _End(NamedTuple):
 
     Attributes:
         rotation, position: Of the frame.
-        index: Of the part; None of the ground.
-        directors, centre: Of the section or link frame [m].
-        jacobian: Its twist, world axes, per twist and coordinate of its part.
-        rows: Integrals from the base of a rod to the section [m]; None of a link.
+        centre: Of the section or link frame [m].
+        jacobian: Its twist, world axes, per twist and coordinate of its part; None of the
+            ground.
     """
 
     rotation: Float[Array, "dim dim"]
     position: Float[Array, " dim"]
-    index: int | None
-    directors: Float[Array, "dim dim"]
     centre: Float[Array, " dim"]
-    jacobian: Float[Array, "twist own"] | None = None
-    rows: Float[Array, "1 quad"] | None = None
+    jacobian: Float[Array, "twist own"] | None
 
 
 class _Seen(NamedTuple):
-    """The frame that a closure holds as its joint frame sees it, and how that is turned."""
+    """The two ends of a closure, and the frame held as the joint frame sees it."""
 
     joint: AbstractJoint
-    rotation: Float[Array, "dim dim"]
-    position: Float[Array, " dim"]
-    turn: Float[Array, "dim dim"]
-
-
-class _Pair(NamedTuple):
-    """The two ends of a closure, and the one as the other sees it."""
-
-    closure: Closure
     held: _End
     holder: _End
-    seen: _Seen
+    rotation: Float[Array, "dim dim"]
+    position: Float[Array, " dim"]
 
 
 class Change(NamedTuple):
@@ -87,10 +99,9 @@ class Change(NamedTuple):
 
 def violations(moment: AssemblyState, t: Float[Array, ""]) -> Float[Array, " equations"]:
     """g(q, t) of all closures [rad], [m]: zero where the loops are closed."""
-    group, pairs = moment.assembly.group, _pairs(moment, t)
-    return jnp.concatenate(
-        [p.seen.joint.violation(group, p.seen.rotation, p.seen.position) for p in pairs]
-    )
+    group, rows = moment.assembly.group, [(ends,) for ends in _ends(moment)]
+    one = lambda ends: _violation(group, _seen(ends, t))  # noqa: E731
+    return jnp.concatenate(each(one, rows, at_once=True))
 
 
 def violations_and_drift(
@@ -114,10 +125,15 @@ def closure_loads(
     moment: AssemblyState, t: Float[Array, ""], reactions: Float[Array, " equations"]
 ) -> list[Float[Array, " own"] | None]:
     """The same on each part, in its own columns; None without a closure."""
+    group, places = moment.assembly.group, equations(moment.assembly)
+
+    def one(ends: _Ends, reaction: Array) -> tuple[Array | None, Array | None]:
+        seen = _seen(ends, t)
+        return _pulled(seen, (reaction @ _slopes(group, seen))[None])
+
+    rows = [(ends, reactions[at]) for ends, at in zip(_ends(moment), places, strict=True)]
     loads: list[Array | None] = [None] * len(moment.frames)
-    pairs = _pairs(moment, t)
-    wrenches = [wrench[None] for wrench in _wrenches(moment, pairs, reactions)]
-    for index, load in itertools.chain(*_pulled(pairs, wrenches)):
+    for _, index, load in _on_parts(moment, each(one, rows, at_once=True)):
         before = loads[index]
         loads[index] = load[0] if before is None else before + load[0]
     return loads
@@ -127,25 +143,46 @@ def closure_jacobian(
     moment: AssemblyState, t: Float[Array, ""]
 ) -> Float[Array, "equations dof"]:
     """G: rates of the violations per rate of the assembly."""
-    pairs = _pairs(moment, t)
+    return _violations_and_jacobian(moment, t)[1]
+
+
+def _violations_and_jacobian(
+    moment: AssemblyState, t: Float[Array, ""]
+) -> tuple[Float[Array, " equations"], Float[Array, "equations dof"]]:
     group = moment.assembly.group
-    units = each(
-        functools.partial(_unit_wrenches, group), [p.seen for p in pairs], at_once=True
-    )
+
+    def one(ends: _Ends) -> tuple[Array, Any]:
+        seen = _seen(ends, t)
+        return _violation(group, seen), _pulled(seen, _slopes(group, seen))
+
+    found = each(one, [(ends,) for ends in _ends(moment)], at_once=True)
+    values = [value for value, _ in found]
     pieces: list[dict[int, Array]] = [{} for _ in moment.frames]
-    for k, loads in enumerate(_pulled(pairs, units)):
-        for index, load in loads:
-            pieces[index][k] = pieces[index][k] + load if k in pieces[index] else load
-    return gather(moment, [_stacked(piece, units) for piece in pieces])
+    for k, index, load in _on_parts(moment, [loads for _, loads in found]):
+        pieces[index][k] = pieces[index][k] + load if k in pieces[index] else load
+    return jnp.concatenate(values), gather(moment, [_stacked(x, values) for x in pieces])
 
 
-def _stacked(piece: dict[int, Array], units: list[Array]) -> Array | None:
+def _stacked(piece: dict[int, Array], values: list[Array]) -> Array | None:
     """Rows of all closures in the columns of one part: zero of those that are not on it."""
     if not piece:
         return None
     own, dtype = next((x.shape[1], x.dtype) for x in piece.values())
-    rows = [piece.get(k, jnp.zeros((x.shape[0], own), dtype)) for k, x in enumerate(units)]
+    rows = [piece.get(k, jnp.zeros((x.shape[0], own), dtype)) for k, x in enumerate(values)]
     return jnp.concatenate(rows)
+
+
+def _on_parts(
+    moment: AssemblyState, loads: list[tuple[Array | None, Array | None]]
+) -> Iterator[tuple[int, int, Array]]:
+    """Number of the closure, index of the part, and load, of every end that is not on the
+    ground."""
+    on = iter(closure_ends(moment.assembly))
+    for k, both in enumerate(loads):
+        for load in both:
+            index = next(on)
+            if index is not None and load is not None:
+                yield k, index, load
 
 
 def closure_wrenches(
@@ -153,20 +190,25 @@ def closure_wrenches(
 ) -> dict[str, Float[Array, " twist"]]:
     """Wrench [N m], [N] of each closure on the part that it holds, world axes, the moment
     about the origin of the frame that is held."""
-    pairs = _pairs(moment, t)
-    names = moment.assembly.loops
-    return dict(zip(names, _wrenches(moment, pairs, reactions), strict=True))
+    group, model = moment.assembly.group, moment.assembly
+    one = lambda ends, reaction: reaction @ _slopes(group, _seen(ends, t))  # noqa: E731
+    places = zip(_ends(moment), equations(model), strict=True)
+    found = each(one, [(ends, reactions[at]) for ends, at in places], at_once=True)
+    return dict(zip(model.loops, found, strict=True))
 
 
 def closure_change(moment: AssemblyState, t: Float[Array, ""]) -> Change:
     """The violations g, dg/dt = G v + g_t, and d^2 g/dt^2 - G dv/dt, by the second order in
     time of the poses of both ends."""
-    biases, rows = _section_biases(moment), []
-    for pair in _pairs(moment, t):
-        rates = [_rates(moment, end, biases) for end in (pair.held, pair.holder)]
-        apart = pair.held.position - pair.holder.position
-        rows.append((pair.seen, pair.closure.motion, apart, *rates, t))
-    parts = each(functools.partial(_second_order, moment.assembly.group), rows, at_once=True)
+    group, moves = moment.assembly.group, _moves(moment)
+
+    def one(ends: _Ends, held: _Move, holder: _Move | None) -> Change:
+        seen = _seen(ends, t)
+        rates = _rates(ends.held, seen.held, held), _rates(ends.holder, seen.holder, holder)
+        return _second_order(group, seen, ends.motion, *rates, t)
+
+    rows = list(zip(_ends(moment), moves[::2], moves[1::2], strict=True))
+    parts = each(one, rows, at_once=True)
     return Change(*(jnp.concatenate(column) for column in zip(*parts, strict=True)))
 
 
@@ -197,8 +239,24 @@ def held_rates(
     moment: AssemblyState, t: Float[Array, ""]
 ) -> tuple[Float[Array, " equations"], Held]:
     """The violations, and what the closures ask of rates: G v = - g_t."""
-    value, drift = violations_and_drift(moment, t)
-    return value, Held(closure_jacobian(moment, t), -drift)
+    value, rows = _violations_and_jacobian(moment, t)
+    if all(closure.motion is None for closure in moment.assembly.closures):
+        return value, Held(rows, jnp.zeros_like(value))
+    return value, Held(rows, -violations_and_drift(moment, t)[1])
+
+
+class _Move(NamedTuple):
+    """How a part moves where no coordinate accelerates.
+
+    Attributes:
+        rates: Twist of its frame, own axes, and rates of its coordinates.
+        start: Acceleration of its frame, own axes; None where it has none.
+        along: How that of its sections grows along it, at the nodes.
+    """
+
+    rates: Float[Array, " own"]
+    start: Float[Array, " twist"] | None
+    along: Any
 
 
 class _Rates(NamedTuple):
@@ -210,24 +268,21 @@ class _Rates(NamedTuple):
     acceleration: Float[Array, " dim"]
 
 
-def _rates(moment: AssemblyState, end: _End, biases: list) -> _Rates | None:
+def _rates(place: _Place, end: _End, move: _Move | None) -> _Rates | None:
     """Of a frame where no coordinate accelerates; None of the ground."""
-    if end.index is None or end.jacobian is None:
+    if place.frame is None or end.jacobian is None or move is None:
         return None
-    group, frame = moment.assembly.group, moment.frames[end.index]
-    rot = group.rotation_dim
-    own = moment.v[slices(moment.assembly)[end.index].rod_v]
-    twist = end.jacobian @ jnp.concatenate([frame.twist, own])
-    start, along = biases[end.index]
-    bias = jnp.zeros_like(frame.twist) if start is None else start
-    if end.rows is not None:
-        bias = bias + jnp.concatenate([(end.rows @ rate)[0] for rate in along])
+    frame, rot = place.frame, end.jacobian.shape[0] - end.centre.shape[0]
+    twist = end.jacobian @ move.rates
+    bias = jnp.zeros_like(twist) if move.start is None else move.start
+    if place.rows is not None:
+        bias = bias + jnp.concatenate([(place.rows @ rate)[0] for rate in move.along])
     bias = turned_twists(frame.rotation, bias[:, None], rot)[:, 0]
-    if start is not None and end.rows is not None:
-        turning = turned_twists(frame.rotation, start[:, None], rot)[:rot, 0]
+    if move.start is not None and place.rows is not None:
+        turning = turned_twists(frame.rotation, move.start[:, None], rot)[:rot, 0]
         bias = bias.at[rot:].add(_cross(turning, end.centre - frame.position))
     at_centre = _Rates(twist[:rot], twist[rot:], bias[:rot], bias[rot:])
-    if end.position is end.centre:
+    if place.pose is None:
         return at_centre
     return _on_arm(at_centre, end.position - end.centre)
 
@@ -241,19 +296,26 @@ def _on_arm(rates: _Rates, arm: Float[Array, " dim"]) -> _Rates:
     )
 
 
-def _section_biases(moment: AssemblyState) -> list:
-    """Of each part that a closure is on: the acceleration of its frame along its own axes, and
-    how those of its sections grow along it, where no coordinate accelerates."""
-    among = {index for index in closure_ends(moment.assembly) if index is not None}
-    along = in_own_frames(moment, bias_rates, among=among)
-    return list(zip(bias_accelerations(moment), along, strict=True))
+def _moves(moment: AssemblyState) -> list[_Move | None]:
+    """Of the part at each end of each closure; None of the ground."""
+    on = closure_ends(moment.assembly)
+    along = in_own_frames(moment, bias_rates, among={k for k in on if k is not None})
+    starts, at = bias_accelerations(moment), slices(moment.assembly)
+
+    def move(index: int) -> _Move:
+        own = moment.v[at[index].rod_v]
+        rates = jnp.concatenate([moment.frames[index].twist, own])
+        return _Move(rates, starts[index], along[index])
+
+    return [None if index is None else move(index) for index in on]
 
 
-def _relative(seen: _Seen, apart: Array, held: _Rates, holder: _Rates | None) -> Any:
+def _relative(seen: _Seen, held: _Rates, holder: _Rates | None) -> Any:
     """The frame that is held, seen by the joint frame after a short time, exact to the second
     order."""
     rotation, position = seen.rotation, seen.position
-    turn, spin, turning = seen.turn.T, held.spin, held.turning
+    turn, spin, turning = seen.holder.rotation.T, held.spin, held.turning
+    apart = seen.held.position - seen.holder.position
     velocity, acceleration = held.velocity, held.acceleration
     if holder is not None:
         # seen from a frame that turns itself
@@ -282,9 +344,9 @@ def _relative(seen: _Seen, apart: Array, held: _Rates, holder: _Rates | None) ->
 
 
 def _second_order(
-    group: Group, seen: _Seen, motion: Any, apart: Array, held: _Rates, holder: Any, t: Array
+    group: Group, seen: _Seen, motion: Any, held: Any, holder: _Rates | None, t: Array
 ) -> Change:
-    later, dtype = _relative(seen, apart, held, holder), seen.position.dtype
+    later, dtype = _relative(seen, held, holder), seen.position.dtype
 
     def violation(x):
         rotation, position = later(x)
@@ -313,40 +375,38 @@ def _spun(spin: Float[Array, " rot"], axes: Float[Array, "dim dim"]) -> Array:
     return spin_cross(spin[None], axes.T).T
 
 
-def _pairs(moment: AssemblyState, t: Float[Array, ""]) -> list[_Pair]:
-    """The ends of every closure."""
-    found, ends = [], iter(_ends(moment))
-    for closure in moment.assembly.closures:
-        held, holder = next(ends), next(ends)
-        if closure.motion is not None:
-            holder = _beyond(holder, _pose(closure.motion, t, moment.q.dtype))
-        apart = held.position - holder.position
-        seen = turned_pose(holder.rotation.T, held.rotation, apart)
-        found.append(_Pair(closure, held, holder, _Seen(closure.joint, *seen, holder.rotation)))
-    return found
-
-
-def _ends(moment: AssemblyState) -> list[_End]:
-    """The frame that is held and the one that holds it, of every closure in turn."""
+def _ends(moment: AssemblyState) -> list[_Ends]:
+    """Where both ends of every closure are."""
     model, dtype = moment.assembly, moment.q.dtype
     poses = [x for closure in model.closures for x in (closure.frame, closure.offset)]
-    places = closure_ends(model), moment.ends, moment.operators.ends, poses
-    found = []
-    for index, section, rows, pose in zip(*places, strict=True):
-        end = _in_world(moment, index, section)._replace(rows=rows)
-        found.append(end if pose is None else _beyond(end, pose.astype(dtype)))
-    return found
+    on, rows = closure_ends(model), moment.operators.ends
+    frames = [None if index is None else moment.frames[index] for index in on]
+    poses = [None if pose is None else pose.astype(dtype) for pose in poses]
+    places = [_Place(*x) for x in zip(frames, moment.ends, rows, poses, strict=True)]
+    both = zip(model.closures, places[::2], places[1::2], strict=True)
+    return [_Ends(closure.joint, closure.motion, *ends) for closure, *ends in both]
 
 
-def _in_world(moment: AssemblyState, index: int | None, section: Section) -> _End:
-    rotation, centre, angular, linear = section
-    if index is None:
-        return _End(rotation, centre, None, rotation, centre)
-    frame = moment.frames[index]
-    rotation, arm = turned_pose(frame.rotation, rotation, centre)
-    centre, jacobian = frame.position + arm, jnp.concatenate([angular, linear])
-    jacobian = turned_twists(frame.rotation, jacobian, moment.assembly.group.rotation_dim)
-    return _End(rotation, centre, index, rotation, centre, jacobian)
+def _seen(ends: _Ends, t: Float[Array, ""]) -> _Seen:
+    """A closure at `t`."""
+    held, holder = _in_world(ends.held), _in_world(ends.holder)
+    if ends.motion is not None:
+        holder = _beyond(holder, _pose(ends.motion, t, holder.position.dtype))
+    apart = held.position - holder.position
+    pose = turned_pose(holder.rotation.T, held.rotation, apart)
+    return _Seen(ends.joint, held, holder, *pose)
+
+
+def _in_world(place: _Place) -> _End:
+    rotation, centre, angular, linear = place.section
+    jacobian = None
+    if place.frame is not None:
+        frame = place.frame
+        rotation, arm = turned_pose(frame.rotation, rotation, centre)
+        centre, jacobian = frame.position + arm, jnp.concatenate([angular, linear])
+        jacobian = turned_twists(frame.rotation, jacobian, angular.shape[0])
+    end = _End(rotation, centre, centre, jacobian)
+    return end if place.pose is None else _beyond(end, place.pose)
 
 
 def _pose(motion: Callable[[Array], Array], t: Array, dtype: Any) -> Float[Array, "h h"]:
@@ -363,62 +423,28 @@ def _beyond(end: _End, pose: Float[Array, "h h"]) -> _End:
     return end._replace(rotation=rotation, position=end.position + arm)
 
 
-def _wrenches(moment: AssemblyState, pairs: list[_Pair], reactions: Array) -> list[Array]:
-    """Of each closure on the frame that is held, along world axes."""
-    group = moment.assembly.group
-
-    def one(seen: _Seen, reaction: Array) -> Array:
-        _, pull = jax.vjp(_violation_after(group, seen), _still(group, reaction.dtype))
-        return _along_world(seen, pull(reaction)[0][None])[0]
-
-    ends = zip(pairs, equations(moment.assembly), strict=True)
-    return each(one, [(pair.seen, reactions[at]) for pair, at in ends], at_once=True)
+def _violation(group: Group, seen: _Seen) -> Float[Array, " held"]:
+    return seen.joint.violation(group, seen.rotation, seen.position)
 
 
-def _unit_wrenches(group: Group, *seen: Any) -> Float[Array, "held twist"]:
-    """Those of reactions of one, along world axes."""
-    at = _Seen(*seen)
-    still = _still(group, at.position.dtype)
-    return _along_world(at, jax.jacrev(_violation_after(group, at))(still))
-
-
-def _along_world(seen: _Seen, wrenches: Float[Array, "n twist"]) -> Float[Array, "n twist"]:
-    return turned_twists(seen.turn, wrenches.T, wrenches.shape[1] - seen.turn.shape[0]).T
-
-
-def _still(group: Group, dtype: Any) -> Float[Array, " twist"]:
-    return jnp.zeros(group.algebra_dim, dtype)
-
-
-def _violation_after(group: Group, seen: _Seen):
-    """The violation as a function of a small relative twist."""
-    rot = group.rotation_dim
-
-    def after(twist):
-        turned = seen.rotation + _spun(twist[:rot], seen.rotation)
-        return seen.joint.violation(group, turned, seen.position + twist[rot:])
-
-    return after
+def _slopes(group: Group, seen: _Seen) -> Float[Array, "held twist"]:
+    """Wrenches of reactions of one on the frame that is held, along world axes."""
+    wrenches = seen.joint.slopes(group, seen.rotation, seen.position)
+    return turned_twists(seen.holder.rotation, wrenches.T, group.rotation_dim).T
 
 
 def _pulled(
-    pairs: list[_Pair], wrenches: list[Float[Array, "n twist"]]
-) -> list[list[tuple[int, Float[Array, "n own"]]]]:
-    """Generalised forces, in the columns of its part, on each end that is not on the ground,
-    of each closure: of wrenches on the frame that is held, along world axes, and their
-    opposites."""
-    places, rows = [], []
-    for k, (pair, wrench) in enumerate(zip(pairs, wrenches, strict=True)):
-        for end, push in ((pair.held, wrench), (pair.holder, -wrench)):
-            if end.index is not None and end.jacobian is not None:
-                places.append((k, end.index))
-                rows.append((push, pair.held.position - end.centre, end.jacobian))
+    seen: _Seen, wrenches: Float[Array, "n twist"]
+) -> tuple[Float[Array, "n own"] | None, Float[Array, "n own"] | None]:
+    """Generalised forces on the parts at both ends, in their own columns, of wrenches on the
+    frame that is held, along world axes, and of their opposites; None on the ground."""
 
-    def force(wrench: Array, arm: Array, jacobian: Array) -> Array:
-        moment, force = wrench[:, : -arm.shape[0]], wrench[:, -arm.shape[0] :]
-        return jnp.concatenate([moment + moment_of(arm[None], force), force], 1) @ jacobian
+    def force(end: _End, push: Array) -> Array | None:
+        if end.jacobian is None:
+            return None
+        arm = seen.held.position - end.centre
+        moment, force = push[:, : -arm.shape[0]], push[:, -arm.shape[0] :]
+        turning = moment + moment_of(arm[None], force)
+        return jnp.concatenate([turning, force], axis=1) @ end.jacobian
 
-    found: list[list[tuple[int, Array]]] = [[] for _ in pairs]
-    for (k, index), load in zip(places, each(force, rows, at_once=True), strict=True):
-        found[k].append((index, load))
-    return found
+    return force(seen.held, wrenches), force(seen.holder, -wrenches)

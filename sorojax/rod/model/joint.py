@@ -4,7 +4,9 @@ import abc
 import functools
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
@@ -75,6 +77,19 @@ class AbstractJoint(eqx.Module):
             "Prismatic, Spherical or Roller. Put it between two parts of the tree instead."
         )
 
+    def slopes(
+        self, group: Group, rotation: Float[Array, "dim dim"], position: Float[Array, " dim"]
+    ) -> Float[Array, "held twist"]:
+        """Change of the violation per small twist of the moving frame: rotation and
+        displacement of its origin, along the axes of the joint frame."""
+        rot = group.rotation_dim
+
+        def after(twist):
+            turn = group.exp(twist)[:-1, :-1]
+            return self.violation(group, turn @ rotation, position + twist[rot:])
+
+        return jax.jacfwd(after)(jnp.zeros(group.algebra_dim, position.dtype))
+
     def rotor_inertia(self) -> Float[Array, " rotors"] | None:
         """What a rotor behind a gear adds to the diagonal of the mass matrix, per rate; one
         number for all of them, or one for each."""
@@ -95,6 +110,9 @@ class Fixed(AbstractJoint):
 
     def violation(self, group, rotation, position):
         return jnp.concatenate([_turn(rotation), position])
+
+    def slopes(self, group, rotation, position):
+        return _blocks(_turn_slopes(rotation), jnp.eye(group.space_dim, dtype=position.dtype))
 
 
 class AbstractAxial(AbstractJoint):
@@ -160,6 +178,18 @@ class Revolute(AbstractAxial):
         half = jnp.sqrt(jnp.maximum(1 + axis @ turned, _HALF_TURN) / 2)
         return jnp.concatenate([_across(axis) @ turned / half, position])
 
+    def slopes(self, group, rotation, position):
+        shift = jnp.eye(group.space_dim, dtype=position.dtype)
+        if group.space_dim == 2:
+            return _shifted(shift, 1)
+        axis = self._spin(group, position.dtype)
+        across, turned = _across(axis), rotation @ axis
+        half = jnp.sqrt(jnp.maximum(1 + axis @ turned, _HALF_TURN) / 2)
+        tilted = jnp.cross(turned[None], jnp.concatenate([across, axis[None]]))
+        less = tilted[2] / (4 * half**2)
+        tilt = (tilted[:2] - (across @ turned)[:, None] * less[None]) / half
+        return _blocks(tilt, shift)
+
     def _spin(self, group: Group, dtype) -> Array:
         if group.space_dim == 2:
             return jnp.ones(1, dtype)
@@ -186,6 +216,9 @@ class Prismatic(AbstractAxial):
     def violation(self, group, rotation, position):
         across = _across(self._along(group, position.dtype))
         return jnp.concatenate([_turn(rotation), across @ position])
+
+    def slopes(self, group, rotation, position):
+        return _blocks(_turn_slopes(rotation), _across(self._along(group, position.dtype)))
 
     def _along(self, group: Group, dtype) -> Array:
         return _along(self.axis, group, dtype)
@@ -240,6 +273,10 @@ class Spherical(AbstractJoint):
     def violation(self, group, rotation, position):
         return position
 
+    def slopes(self, group, rotation, position):
+        eye = jnp.eye(group.space_dim, dtype=position.dtype)
+        return _shifted(eye, group.rotation_dim)
+
     def rotor_inertia(self):
         return None if self.armature is None else self.armature[None]
 
@@ -282,6 +319,10 @@ class Roller(AbstractJoint):
 
     def violation(self, group, rotation, position):
         return _across(self._along(group, position.dtype)) @ position
+
+    def slopes(self, group, rotation, position):
+        across = _across(self._along(group, position.dtype))
+        return _shifted(across, group.rotation_dim)
 
     def _along(self, group: Group, dtype) -> Array:
         return _along(self.axis, group, dtype)
@@ -347,6 +388,29 @@ def _turn(rotation: Float[Array, "dim dim"]) -> Float[Array, " rot"]:
     twice = rotation - rotation.T
     sine = jnp.stack([twice[2, 1], twice[0, 2], twice[1, 0]])
     return sine / jnp.sqrt(jnp.maximum(1 + jnp.trace(rotation), _HALF_TURN))
+
+
+def _turn_slopes(rotation: Float[Array, "dim dim"]) -> Float[Array, "rot rot"]:
+    """Change of `_turn` per small rotation after it."""
+    if rotation.shape[0] == 2:
+        return jnp.ones((1, 1), rotation.dtype)
+    twice, trace = rotation - rotation.T, jnp.trace(rotation)
+    sine = jnp.stack([twice[2, 1], twice[0, 2], twice[1, 0]])
+    square = jnp.maximum(1 + trace, _HALF_TURN)
+    eye = jnp.asarray(np.eye(3), rotation.dtype)
+    bent = sine[:, None] * sine[None] / (2 * square)
+    return (trace * eye - rotation + bent) / jnp.sqrt(square)
+
+
+def _blocks(turn: Float[Array, "turns rot"], shift: Float[Array, "shifts dim"]) -> Array:
+    """Slopes of measures of turns, then of measures of shifts."""
+    beside = jnp.pad(turn, ((0, 0), (0, shift.shape[1])))
+    return jnp.concatenate([beside, _shifted(shift, turn.shape[1])])
+
+
+def _shifted(shift: Float[Array, "shifts dim"], rot: int) -> Float[Array, "shifts twist"]:
+    """Slopes of measures of shifts alone."""
+    return jnp.pad(shift, ((0, 0), (rot, 0)))
 
 
 def _across(axis: Float[Array, " dim"]) -> Float[Array, "others dim"]:
