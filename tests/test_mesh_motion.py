@@ -132,6 +132,14 @@ def test_a_round_chamber_takes_its_nodes_along():
     assert len(shift) > 15
     assert np.abs(shift - [0.1, 0.0]).max() < 0.01
 
+    def along(x):
+        return jnp.sum(M.move(cells, block(x)).points)
+
+    for verb in (along, jax.grad(along)):
+        verb(jnp.array(2.3))
+        with pytest.raises(ValueError, match="turns inside out"):
+            verb(jnp.array(2.6))
+
 
 def notched(v):
     """A block with a notch, open above, and a chamber below it."""

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
-from sorojax._jax.trace_state import is_traced
+from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax._types import integers, real
 from sorojax.math.two_programs import two_programs
 from sorojax.mesh.elements.base import facet_corners, nodes as reference_nodes, shape_functions
@@ -160,9 +160,9 @@ def move(
     f(x) = 0 on the boundary.
 
     The topology does not change: corners may move by a quarter of the edges beside them
-    from where they are in `mesh`, and normals turn by less than a right angle. Outside a
-    trace a warning says when corners go farther, and nodes that miss the new surface are
-    refused; under a trace check `distortion` to see when to mesh again. With the drawing
+    from where they are in `mesh`, and normals turn by less than a right angle. A warning
+    says when corners go farther, and nodes that miss the new surface are refused, also under
+    `jax.grad`; under `jit` and `vmap` check `distortion` to see when to mesh again. With the drawing
     `before`, nodes go there through drawings in between, and that far in each of them.
 
     Args:
@@ -180,8 +180,8 @@ def move(
 
     Raises:
         ValueError: If the mesh is traced, made of polygons, has other interfaces, or
-            (outside a trace) if a cell would turn inside out or a node miss the surface; if
-            `before` is another kind of drawing than the new one.
+            (outside `jit`, `vmap`) if a cell would turn inside out or a node miss the surface;
+            if `before` is another kind of drawing than the new one.
 
     Example:
         >>> cells = mesh.triangulate(sdf.Rectangle([0, 0], [40 * mm, 10 * mm]), size=5 * mm)
@@ -208,10 +208,31 @@ def move(
     motion = _prepared(mesh, len(interfaces))
     way = [fields] if before is None else _between(before, fields, stages)
     points = moved_points(motion, way, mesh.points)
-    if not is_traced(points):
-        _check_upright(np.asarray(points), mesh)
-        check_followed(motion.border, fields, mesh, np.asarray(points), len(way))
+    points = _checked(points, fields, _Check(mesh, motion.border, len(way)))
     return eqx.tree_at(lambda m: m.points, mesh, points)
+
+
+class _Check(eqx.Module):
+    """What the points of a moved mesh are compared with."""
+
+    mesh: Mesh
+    plan: BoundaryPlan
+    stages: int = eqx.field(static=True)
+
+
+@eqx.filter_custom_jvp
+def _checked(points: Array, fields: tuple[AbstractSdf, ...], by: _Check) -> Array:
+    """The same points, refused where they are known and cells or nodes went wrong."""
+    if not is_traced((points, fields)):
+        with evaluated_now():
+            _check_upright(np.asarray(points), by.mesh)
+            check_followed(by.plan, fields, by.mesh, np.asarray(points), by.stages)
+    return points
+
+
+@_checked.def_jvp
+def _checked_jvp(primals, tangents):
+    return _checked(*primals), tangents[0]
 
 
 def _between(before, fields: tuple[AbstractSdf, ...], stages: int) -> list:
