@@ -79,12 +79,16 @@ def _along(pressure: float, states: int, duration: float) -> dict[str, Any]:
     return {"duration": duration, "air": air} | shared
 
 
-def bellows(size: float, duration: float, states: int = 11, **actuator: Any) -> Robot:
-    """The bellows actuator of the demo with a PID on its tip angle."""
+def bellows(
+    size: float, duration: float, states: int = 11, mixed: bool = False, **actuator: Any
+) -> Robot:
+    """The bellows actuator of the demo with a PID on its tip angle; with pressures as unknowns
+    in `mixed` cells."""
     first = robots.BellowsActuator(**actuator)
     flat = mesh.triangulate(first.body(), size=size, order=2, interfaces=(first.layer(),))
+    flat = mesh.enrich(flat) if mixed else flat
     rubber = material.presets.dragon_skin_30()
-    start = bellows_problem(first, flat, rubber, 20 * mm, fem.Displacement())
+    start = bellows_problem(first, flat, rubber, 20 * mm, None if mixed else fem.Displacement())
     valve = systems.Regulator(1.5e-8, integral_gain=3e-8, max_flow=3e-5)
     pid = systems.PID(-8 * kPa, integral_gain=-60 * kPa, derivative=-0.8 * kPa, low=0.0)
 

@@ -162,8 +162,8 @@ def move(
     The topology does not change: corners may move by a quarter of the edges beside them
     from where they are in `mesh`, and normals turn by less than a right angle. A warning
     says when corners go farther, and nodes that miss the new surface are refused, also under
-    `jax.grad`; under `jit` and `vmap` check `distortion` to see when to mesh again. With the drawing
-    `before`, nodes go there through drawings in between, and that far in each of them.
+    `jax.grad`; under `jit` and `vmap` check `distortion` to see when to mesh again. With the
+    drawing `before`, nodes go there through drawings in between, and that far in each.
 
     Args:
         mesh: A concrete mesh whose boundary nodes lie on the zero set, as `triangulate`
