@@ -77,7 +77,8 @@ ROWS = {
     "inverse kinematics and estimator": Cases(("rod.ik", "systems.estimator")),
     "environments": Cases(("envs.steps",)),
     "gradients": Cases(
-        ("fem.gradient",), ("reduction.gradient", "rod.gradient", "design.uncertainty")
+        ("fem.gradient",),
+        ("reduction.gradient", "reduction.remesh", "rod.gradient", "design.uncertainty"),
     ),
     "start": Cases(("cli.import", "rod.first_call"), ("cold.calls", "view.first")),
     "pictures": Cases(("view.skin",), ("view.film", "view.web")),
