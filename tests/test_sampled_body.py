@@ -14,26 +14,27 @@ import pytest
 from sorojax import fem, io, material, mesh, sdf, systems
 from sorojax.math.status import Status
 from sorojax.systems.blocks.modal_body import ProjectedForce
-from sorojax.systems.blocks.sampled_force import (
+from sorojax.systems.blocks.sampled_body import (
     _equilibria,
     _error,
-    sampled_force,
     snapshot_basis,
     sparse_weights,
 )
+from sorojax.systems.blocks.sampled_force import sampled_force
 
 PUSH = jnp.stack([jnp.zeros(9), -jnp.linspace(0, 0.2, 9)], axis=1)  # N
 
 
-def beam(formulation=None) -> systems.FemBody:
+def beam(formulation=None, relaxation=None, kinematics=None) -> systems.FemBody:
     """A cantilever in the plane, its free end driven by a force, under its weight."""
     cells = mesh.rectangle([0, 0], [0.08, 0.01], divisions=(16, 2), element=mesh.Quad8())
     rubber = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.4, density=1000.0)
     stiffer = np.where(np.arange(cells.num_cells) % 2, 1.0, 1.5)
+    law = material.Scaled(rubber, stiffer)
     problem = fem.problem(
         cells,
-        material.Scaled(rubber, stiffer),
-        kinematics=fem.PlaneStrain(0.01),
+        law if relaxation is None else material.Viscoelastic(law, relaxation),
+        kinematics=kinematics or fem.PlaneStrain(0.01),
         supports=(fem.Fixed(cells.node_sets["left"]),),
         loads=(
             fem.Force(cells.node_sets["right"], [0.0, 0.0], name="push"),
@@ -47,6 +48,15 @@ def beam(formulation=None) -> systems.FemBody:
 @functools.cache
 def trained() -> systems.SampledBody:
     return systems.sampled_body(beam(), [{"push": PUSH}], modes=6, tolerance=5e-3)
+
+
+RELAXING = material.Prony([0.4, 0.2], [0.02, 0.2])
+
+
+@functools.cache
+def relaxing() -> systems.SampledBody:
+    body = beam(relaxation=RELAXING)
+    return systems.sampled_body(body, [{"push": PUSH}], modes=8, tolerance=5e-3)
 
 
 @pytest.mark.parametrize("formulation", [fem.Displacement(), fem.ConstantPressure()])
@@ -78,20 +88,44 @@ def test_few_cells_find_equilibria_that_were_not_trained_on():
     assert f"{len(found.cells)} of {found.num_cells} cells" in repr(found)
 
 
-def test_it_follows_the_full_body_in_a_network():
+@pytest.mark.parametrize(
+    ("full", "small", "off"),
+    [(beam, trained, 0.02), (functools.partial(beam, relaxation=RELAXING), relaxing, 0.01)],
+    ids=["elastic", "relaxing"],
+)
+def test_it_follows_the_full_body_in_a_network(full, small, off):
     """Whose end is pushed to and fro, less than in training."""
     push = systems.Source(systems.Sine([0.0, -0.12], 5.0), unit="N")
     films = []
     for block, solver in (
-        (beam(), systems.Coupled()),
-        (trained().body, systems.Rosenbrock2(refresh=True)),
+        (full(), systems.Coupled()),
+        (small().body, systems.Rosenbrock2(refresh=True)),
     ):
         network = systems.Network({"body": block, "push": push}, {"body.push": "push.value"})
         films.append(systems.simulate(network, 0.05, save=6, step=1e-3, solver=solver))
     want = films[0].state["body"]["u"]
-    basis = trained().body.basis
+    basis = small().body.basis
     got = jax.vmap(lambda q: systems.displacement(basis, q))(films[1].state["body"]["q"])
-    assert jnp.max(jnp.abs(got - want)) < 0.02 * jnp.max(jnp.abs(want))
+    assert jnp.max(jnp.abs(got - want)) < off * jnp.max(jnp.abs(want))
+
+
+def test_branches_have_no_force_where_they_have_relaxed():
+    body: Any = relaxing().body
+    q = jnp.zeros_like(body.q).at[:2].set(jnp.array([3e-4, 2e-5]))
+    rest, away = jnp.stack([q, q]), jnp.stack([0.5 * q, -0.3 * q])
+    force, size = body.force, float(jnp.max(jnp.abs(body.force(q))))
+    assert size > 0
+    np.testing.assert_allclose(force.with_branches(q, rest), force(q), atol=1e-10 * size)
+    assert abs(float(force.stored_by_branches(q, rest))) < 1e-12
+    stored = jax.jacfwd(force.stored_by_branches)(q, away)
+    np.testing.assert_allclose(
+        force.with_branches(q, away) - force(q), stored, atol=1e-9 * size
+    )
+    found = jax.jacfwd(force.with_branches, (0, 1))(q, away)
+    want = jax.jacfwd(jax.jacrev(force.stored_by_branches), (0, 1))(q, away)
+    want = want[0] + jax.jacfwd(force)(q), want[1]
+    for a, b in zip(found, want, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-9 * float(jnp.max(jnp.abs(b))))
 
 
 @pytest.mark.parametrize(
@@ -167,6 +201,19 @@ def test_a_body_with_moved_supports_is_refused():
         systems.sampled_body(body, [{"push": PUSH}], modes=6)
 
 
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"kinematics": fem.PlaneStress(0.01)}, "sheet in plane stress"),
+        ({"relaxation": material.Prony([0.4], [jnp.linspace(0.1, 0.2, 32)])}, "times per cell"),
+    ],
+)
+def test_relaxation_that_coordinates_cannot_have_is_refused(options, text):
+    body = beam(**{"relaxation": RELAXING, **options})
+    with pytest.raises(ValueError, match=text):
+        systems.sampled_body(body, [{"push": PUSH}], modes=6)
+
+
 def test_a_body_in_contact_is_refused():
     body = beam()
     floor = fem.Contact(
@@ -189,7 +236,8 @@ def test_a_body_in_contact_is_refused():
 def test_two_paths_of_odd_length_each_train_on_every_second_state():
     """The states that tell the error are those between, of each path by itself."""
     paths = [{"push": PUSH}, {"push": -PUSH[:5]}]
-    seen, told, slopes = _equilibria(beam(), paths)
+    body = beam()
+    seen, told, slopes = _equilibria(body, paths, body.problem)
     assert (len(seen), len(told), len(slopes)) == (8, 6, 16)
     want = np.concatenate([PUSH[1::2], -PUSH[1:5:2]])
     np.testing.assert_allclose(np.stack([s.inputs["push"] for s in told]), want)
@@ -199,23 +247,25 @@ def test_two_paths_of_odd_length_each_train_on_every_second_state():
 def test_an_equilibrium_that_is_not_found_is_an_infinite_error():
     body = trained().body
     lost = eqx.tree_at(lambda b: b.force.volumes, body, jnp.nan * body.force.volumes)  # pyright: ignore
-    _, told, _ = _equilibria(beam(), [{"push": PUSH[:2]}])
-    assert float(_error(beam(), lost, told)) == np.inf
+    whole = beam()
+    _, told, _ = _equilibria(whole, [{"push": PUSH[:2]}], whole.problem)
+    assert float(_error(whole, lost, told)) == np.inf
 
 
-def test_a_stored_one_is_the_same_body(tmp_path):
+@pytest.mark.parametrize("small", [trained, relaxing])
+def test_a_stored_one_is_the_same_body(small, tmp_path):
     """Read from a file alone, with no tree of its structure beside."""
     file = tmp_path / "small.npz"
-    io.save(file, trained())
+    io.save(file, small())
     again = io.load(file)
-    assert repr(again) == repr(trained())
+    assert repr(again) == repr(small())
     push = systems.Source(systems.Constant([0.0, -0.1]), unit="N")
     films = [
         systems.simulate(
             systems.Network({"body": each.body, "push": push}, {"body.push": "push.value"}),
             0.01, save=3, step=1e-3, solver=systems.Rosenbrock2(refresh=True),
         )
-        for each in (trained(), again)
+        for each in (small(), again)
     ]  # fmt: skip
     np.testing.assert_array_equal(films[1]["body.q"], films[0]["body.q"])
     assert np.any(np.asarray(films[0]["body.q"][-1]) != 0)

@@ -30,7 +30,7 @@ from sorojax.systems.blocks.modal_basis import displacement, modal_basis
 from sorojax.systems.blocks.modal_body import modal_body
 from sorojax.systems.blocks.rigid_body import RigidBody, Touch
 from sorojax.systems.blocks.rod_body import AssemblyBody, RodBody, body_motion
-from sorojax.systems.blocks.sampled_force import SampledBody, sampled_body
+from sorojax.systems.blocks.sampled_body import SampledBody, sampled_body
 from sorojax.systems.contact_history import contact_history
 from sorojax.systems.control.controller import PID, AbstractController
 from sorojax.systems.control.model_control import (

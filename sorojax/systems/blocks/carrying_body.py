@@ -104,6 +104,11 @@ class CarryingBody(AbstractBlock):
                     "whose one support is a driven fem.Carried. Reduce FemBody(problem, "
                     "driven=(its name,))."
                 )
+            if solid.force.relaxation_times is not None:
+                raise ValueError(
+                    f"CarryingBody: the solid on `{name}` relaxes, need one without memory. "
+                    "Reduce a body of the `base` of its material."
+                )
             dim = solid.basis.displacement.shape[1]
             if dim != assembly.group.space_dim:
                 raise ValueError(

@@ -69,6 +69,19 @@ class AbstractModalForce(eqx.Module):
         """Strain over the largest of the training; 0 without one."""
         return jnp.zeros_like(q[0])
 
+    @property
+    def relaxation_times(self) -> Float[Array, " branches"] | None:
+        """Of Maxwell branches beside the force [s]; None without any."""
+        return None
+
+    def with_branches(self, q: Modes, relaxed: Float[Array, "branches modes"]) -> Modes:
+        """The slope of the energy with branches that are free of stress at `relaxed`."""
+        return self(q)
+
+    def stored_by_branches(self, q: Modes, relaxed: Float[Array, "branches modes"]) -> Array:
+        """Energy of the branches [J]."""
+        return jnp.zeros_like(q[0])
+
 
 class TaylorForce(AbstractModalForce):
     """The force as a polynomial: a few small products, whatever the mesh."""
@@ -100,7 +113,8 @@ class ProjectedForce(AbstractModalForce):
 
 
 class ModalBody(AbstractBlock):
-    """A body that moves in the shapes of a basis; made by `modal_body`. The state is {q, v}.
+    """A body that moves in the shapes of a basis; made by `modal_body`. The state is {q, v}; of
+    a body that relaxes also `relaxed`: coordinates at which each branch has no stress.
 
     Ports are those of the `FemBody` that it stands for, and `q`; of a trained body also
     `reach`, the strain over the largest of its training. Some tens of states of
@@ -161,7 +175,10 @@ class ModalBody(AbstractBlock):
         )
 
     def initial_state(self):
-        return {"q": self.q, "v": self.v}
+        state, times = {"q": self.q, "v": self.v}, self.force.relaxation_times
+        if times is None:
+            return state
+        return state | {"relaxed": jnp.broadcast_to(self.q, (*times.shape, *self.q.shape))}
 
     def output(self, name, t, state, inputs):
         q, v = state["q"], state["v"]
@@ -170,7 +187,10 @@ class ModalBody(AbstractBlock):
         if name == "kinetic_energy":
             return v @ v / 2
         if name == "elastic_energy":
-            return self.force.energy(q)
+            stored = self.force.energy(q)
+            if "relaxed" not in state:
+                return stored
+            return stored + self.force.stored_by_branches(q, state["relaxed"])
         if name == "reach":
             return self.force.reach(q)
         for load, value, rate in self.volumes:
@@ -187,11 +207,18 @@ class ModalBody(AbstractBlock):
                 "ModalBody: got a body that a frame carries, need a link that moves it. Put "
                 "systems.CarryingBody(arm, {link: body}) into the network."
             )
-        return {"q": state["v"], "v": self.pull(state["q"], state["v"], inputs)}
+        q, times, relaxed = state["q"], self.force.relaxation_times, state.get("relaxed")
+        rates = {"q": state["v"], "v": self.pull(q, state["v"], inputs, relaxed)}
+        if times is None or relaxed is None:
+            return rates
+        return rates | {"relaxed": (q[None] - relaxed) / times[:, None]}
 
-    def pull(self, q: Modes, v: Modes, inputs) -> Modes:
+    def pull(
+        self, q: Modes, v: Modes, inputs, relaxed: Float[Array, "branches modes"] | None = None
+    ) -> Modes:
         """Force on the modal coordinates in a frame that rests."""
-        total = -self.force(q) - self.damping @ v
+        force = self.force(q) if relaxed is None else self.force.with_branches(q, relaxed)
+        total = -force - self.damping @ v
         for load, port, *_ in self.ports:
             given = inputs[port].reshape(-1)
             if load in self.pulls:
