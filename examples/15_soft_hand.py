@@ -167,6 +167,11 @@ def draw(film, angle, pressure, file: Path) -> None:
     view.draw_into(shown, [scene(k) for k in moments], view=view.Camera(-62.0, 16.0))
     figure.savefig(file)
     plt.close(figure)
+    last = np.arange(len(times))[-361::6]  # two periods
+    moving = view.Track(times[last], lambda k: scene(last[k]), scale)
+    look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-62.0, 16.0)}
+    film = view.animate(moving, speed=0.5, title="Waves through a soft hand", **look)
+    film.save(file.with_suffix(".webp"))
 
 
 if __name__ == "__main__":
