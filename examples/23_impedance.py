@@ -142,16 +142,18 @@ def draw(arm, time, q, goal, tips, push, asked, solid, file) -> None:
 
     def now(k):
         """The arm, and where set-point and tip have been."""
-        colours = ("#D55E00", "#1f2430")
-        gone = [view.Lines([w[: k + 2]], c, 2.2) for w, c in zip(ways, colours, strict=True)]
+        looks = {"set-point": "#D55E00", "tip": "#1f2430"}
+        gone = [
+            view.Lines([way[: k + 2]], colour, 2.2, name=name)
+            for way, (name, colour) in zip(ways, looks.items(), strict=True)
+        ]
         arm = view.scene_of(tube, every[k], colours={"rod": "#6db1e8"})
         moved = view.merge_scenes(arm, still, view.Scene(tuple(gone)))
         return view.merge_scenes(view.place(moved, upright), view.scene_of(foot))
 
     moving = view.Track(time[::8], lambda k: now(8 * k))
     look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-76.0, 16.0)}
-    title = "A tip like a spring; orange the set-point, black the tip"
-    film = view.animate(moving, fps=15.0, title=title, **look)
+    film = view.animate(moving, fps=14.0, title="A tip that feels like a spring", **look)
     film.save(Path(file).with_suffix(".webp"))
 
 
