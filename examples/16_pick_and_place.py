@@ -163,7 +163,7 @@ def draw(whole, q, time, place, force, ticks, file) -> None:
     film_times = np.arange(0.0, time[-1], 0.08)
     moving = view.Track(film_times, lambda k: scene(film_times[k]))
     look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-68.0, 12.0)}
-    film = view.animate(moving, fps=12.5, size=(460, 460), title="Pick and place", **look)
+    film = view.animate(moving, fps=12.5, size=(540, 540), title="Pick and place", **look)
     film.save(Path(file).with_suffix(".webp"))
 
 
