@@ -169,22 +169,6 @@ def draw(designs, ends, cost, file) -> None:
     figure.savefig(file, dpi=110)
     plt.close(figure)
 
-    from sorojax import sdf, view
-
-    path = fem.solve_path(made, air=jnp.linspace(0, designs[-1][5] * kPa, 31))  # together
-    bodies = view.scenes_of(path, range(31), field="von_mises", rest=False)
-    upright = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-    ball = view.scene_of(sdf.extrude(contact().obstacle, 40 * mm))
-    ball = view.place(view.place(ball, upright), np.eye(4), "#f4a261")
-
-    def scene(k):
-        return view.merge_scenes(view.extrude(bodies[k], 25 * mm), ball)
-
-    moving = view.Track(np.asarray(path.values) / kPa, scene, bodies[0].scale, "kPa")
-    look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-68.0, 16.0)}
-    film = view.animate(moving, fps=10.0, title="Found together, on the ball", **look)
-    film.save(Path(file).with_suffix(".webp"))
-
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)

@@ -168,7 +168,8 @@ def draw(setup, ticks, q, lifts, file) -> None:
         "shadows": True,
         "view": sj.view.Camera(-55.0, 18.0),
     }
-    moving = sj.view.Track(np.asarray(ticks)[::15], scene, extent=tuple(map(np.asarray, far)))
+    room = np.array(far[0]), np.array([0.7, 0.25, 0.85])
+    moving = sj.view.Track(np.asarray(ticks)[::15], scene, extent=room)
     title = "An arm picks a ball by a soft finger"
     film = sj.view.animate(moving, speed=0.8, fps=13.0, title=title, **look)
     film.save(Path(file).with_suffix(".webp"))

@@ -15,7 +15,7 @@ FOLDER = ROOT / "examples"
 BUILD = FOLDER / "gallery" / "build.py"
 SCRIPTS = sorted(FOLDER.glob("[0-9][0-9]_*.py"))
 MOVING = {"04", "12", "13", "14", "15", "16", "20", "21", "22", "23", "24"}
-MOVING |= {"31", "32", "40", "42", "43", "44"}
+MOVING |= {"32", "40", "42", "43", "44"}
 SCRIPT = '''"""A spring: how far it goes.
 
 A second paragraph with <signs>.
