@@ -132,7 +132,9 @@ def draw(cases, file) -> None:
         drawn = []
         for body, k in zip(made, frames, strict=True):
             told = [
-                view.Lines([np.insert(shape[k], 1, front, axis=1)], colour, 2.2, name=f"by {name}")
+                view.Lines(
+                    [np.insert(shape[k], 1, front, axis=1)], colour, 2.2, name=f"by {name}"
+                )
                 for shape, (name, colour) in zip(lines[::-1], colours.items(), strict=True)
             ]
             marker = view.Dots(np.insert(tip[k], 1, front - 1 * mm)[None], "#1f2430", 6.0)
