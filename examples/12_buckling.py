@@ -156,8 +156,9 @@ def draw(rest, full, path, widths, first, file: Path) -> None:
     view.draw_into(shown, scenes, view=view.Camera(-66.0, 14.0))
     figure.savefig(file)
     plt.close(figure)
-    finer = dict(step=0.02, largest_step=0.16 * mm, locate_critical_points=False)
-    path = fem.continuation(path.problem, **finer)
+    path = fem.continuation(
+        path.problem, step=0.02, largest_step=0.16 * mm, locate_critical_points=False
+    )
     way = np.flatnonzero(np.append(True, np.diff(path.factors) > 0))
     bodies = view.scenes_of(path, way, field="von_mises", rest=False)
     by = 100 * LARGEST * np.asarray(path.factors)[way]  # compressed [%]

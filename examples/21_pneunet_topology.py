@@ -163,9 +163,9 @@ def draw(density, made, paths, feet, file) -> None:
     view.draw_into(shown, scenes, view=view.Camera(-58.0, 20.0))
     figure.savefig(Path(file))
     plt.close(figure)
-    finer, tracks = jnp.linspace(0, MOST, 41), []
+    finer, tracks = np.linspace(0, MOST, 41), []
     for path in paths[1:3]:
-        path = fem.solve_path(path.problem, air=finer)
+        path = fem.solve_path(path.problem, air=jnp.array(finer))
         bodies = view.scenes_of(path, range(41), field="von_mises", rest=False)
         solids = [
             view.merge_scenes(view.extrude(x, DEPTH), view.scene_of(plate)) for x in bodies

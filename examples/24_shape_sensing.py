@@ -145,7 +145,10 @@ def draw(cases, file) -> None:
     figure = plt.figure(figsize=(7, 6.4), dpi=200, layout="constrained")
     grid = figure.add_gridspec(2, 1, height_ratios=(1.35, 1))
     shown = [figure.add_subplot(place) for place in grid[0].subgridspec(1, len(cases))]
-    below = grid[1].subgridspec(1, len(cases)).subplots(sharey=True)
+    below = [figure.add_subplot(place) for place in grid[1].subgridspec(1, len(cases))]
+    for axes in below[1:]:
+        axes.sharey(below[0])
+        axes.tick_params(labelleft=False)
     worst = {name: int(found[-1][1, :, middle].argmax()) for name, found in cases.items()}
     for above, axes, (name, found) in zip(shown, below, cases.items(), strict=True):
         above.set_title(name, fontsize=10)

@@ -120,11 +120,10 @@ def draw(robot, path, file) -> None:
     axes.set(xlabel="time [s]", ylabel="push of a slider [N]")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=9, ncols=3)
-    look = {"view": view.Camera(-60.0, 16.0)}
-    view.draw_into(shown, [scene(k) for k in moments], **look)
+    view.draw_into(shown, [scene(k) for k in moments], view=view.Camera(-60.0, 16.0))
     figure.savefig(file)
     plt.close(figure)
-    look |= {"renderer": "own", "samples": 2, "shadows": True}
+    look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-60.0, 16.0)}
     moving = view.Track(times[::2], lambda k: scene(2 * k))
     title = "A platform on three soft rods"
     film = view.animate(moving, speed=0.5, fps=12.5, size=(480, 560), title=title, **look)
