@@ -26,7 +26,13 @@ extensions = [
     "myst_nb",
     "sphinx_pages",
 ]
-exclude_patterns = ["_build", "_generated/*.md", "tools", "**.ipynb_checkpoints"]
+exclude_patterns = [
+    "_build",
+    "_generated/*.md",
+    "_generated/tutorials",
+    "tools",
+    "**.ipynb_checkpoints",
+]
 default_role = "literal"
 smartquotes_action = "D"  # dashes, no quotation marks
 

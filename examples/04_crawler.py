@@ -108,11 +108,13 @@ def draw(problem, motion, centre, file: Path) -> None:
     states = np.searchsorted(times, starts)
     field = {"field": "von_mises", "label": "", "rest": False}
     bodies = [view.extrude(scene, depth) for scene in view.scenes_of(motion, states, **field)]
-    low, high = (1e3 * corner for corner in bodies[0].box)
-    ground = sdf.Box(
-        [low[0] * mm - 6 * mm, -32 * mm, -5 * mm], [high[0] * mm + 6 * mm, 32 * mm, 0]
-    )
-    floor = view.scene_of(ground)
+
+    def with_floor(bodies):
+        (left, *_), (right, *_) = bodies[0].box
+        ends = [left - 6 * mm, -32 * mm, -5 * mm], [right + 6 * mm, 32 * mm, 0]
+        floor = view.scene_of(sdf.Box(*ends))
+        return [view.merge_scenes(body, floor) for body in bodies]
+
     figure = plt.figure(figsize=(7, 6.4), dpi=200, layout="constrained")
     grid = figure.add_gridspec(2, 1, height_ratios=(1.75, 1))
     shown = [figure.add_subplot(place) for place in grid[0].subgridspec(2, 2)]
@@ -126,10 +128,16 @@ def draw(problem, motion, centre, file: Path) -> None:
     axes.plot(times[states], centre[states, 0], "o", ms=4.5, color="#1f2430")
     axes.set(xlabel="time [s]", ylabel="centre of mass [mm]", xlim=(0, 1.16 * times[-1]))
     axes.spines[["top", "right"]].set_visible(False)
-    scenes = [view.merge_scenes(body, floor) for body in bodies]
-    view.draw_into(shown, scenes, view=view.Camera(-72.0, 20.0))
+    view.draw_into(shown, with_floor(bodies), view=view.Camera(-72.0, 20.0))
     figure.savefig(file)
     plt.close(figure)
+    way = np.arange(0, len(times), 15)
+    bodies = [view.extrude(scene, depth) for scene in view.scenes_of(motion, way, **field)]
+    moving = view.Track(times[way], with_floor(bodies).__getitem__, bodies[0].scale)
+    look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-72.0, 20.0)}
+    title = f"A soft crawler, {AIR / kPa:.0f} kPa, {RATE} times a second"
+    film = view.animate(moving, speed=0.4, fps=13.3, size=(640, 380), title=title, **look)
+    film.save(file.with_suffix(".webp"))
 
 
 if __name__ == "__main__":

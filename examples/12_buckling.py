@@ -156,6 +156,17 @@ def draw(rest, full, path, widths, first, file: Path) -> None:
     view.draw_into(shown, scenes, view=view.Camera(-66.0, 14.0))
     figure.savefig(file)
     plt.close(figure)
+    path = fem.continuation(
+        path.problem, step=0.02, largest_step=0.16 * mm, locate_critical_points=False
+    )
+    way = np.flatnonzero(np.append(True, np.diff(path.factors) > 0))
+    bodies = view.scenes_of(path, way, field="von_mises", rest=False)
+    by = 100 * LARGEST * np.asarray(path.factors)[way]  # compressed [%]
+    moving = view.Track(by, lambda k: pressing(bodies[k], by[k]), bodies[0].scale, "%")
+    look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-66.0, 14.0)}
+    title = "A square pressed between plates"
+    film = view.animate(moving, speed=2.5, size=(520, 420), title=title, **look)
+    film.save(file.with_suffix(".webp"))
 
 
 if __name__ == "__main__":

@@ -110,6 +110,23 @@ def draw(robot, path, backbone, body, q, shapes, file: Path) -> None:
     figure.savefig(file, dpi=100)
     plt.close(figure)
 
+    from sorojax import view
+
+    solid = sdf.extrude(sdf.Circle(CENTRE, RADIUS), 30 * mm)
+    cylinder = view.place(view.scene_of(solid), np.eye(4), "#d9cfbd")
+    upright = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    bodies = view.scenes_of(path, range(steps + 1), field="von_mises", rest=False)
+
+    def scene(k):
+        return view.merge_scenes(
+            view.extrude(bodies[k], 20 * mm), view.place(cylinder, upright)
+        )
+
+    moving = view.Track(np.asarray(path.values) / kPa, scene, bodies[0].scale, "kPa")
+    look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-70.0, 18.0)}
+    film = view.animate(moving, fps=7.0, title="A PneuNet curls round a cylinder", **look)
+    film.save(file.with_suffix(".webp"))
+
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)

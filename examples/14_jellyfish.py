@@ -74,7 +74,8 @@ def main(quick: bool = False, picture: str | None = None) -> dict[str, float]:
 
 
 def draw(angles, q, file: Path) -> None:
-    """The six fingers on the ball, from the side and from below."""
+    """The six fingers on the ball, from the side and from below; a film in which they bend
+    evenly from straight to laid, which no simulation tells."""
     import matplotlib.pyplot as plt
 
     from sorojax import view
@@ -83,19 +84,28 @@ def draw(angles, q, file: Path) -> None:
         f"f{k}": rod.Part(make_finger(), offset=mount(angle)) for k, angle in enumerate(angles)
     }
     hand = rod.assembly(sj.SE3(), **fingers)
-    held = view.scene_of(hand, np.asarray(q).ravel(), colours=dict.fromkeys(fingers, "#f29b4b"))
+    orange, laid = dict.fromkeys(fingers, "#f29b4b"), np.asarray(q).ravel()
     palm = sdf.translate(sdf.Cylinder(PALM + 4 * mm, 4 * mm, 1 * mm), [0, 0, 2 * mm])
     stem = sdf.translate(sdf.Cylinder(6 * mm, 14 * mm), [0, 0, 10 * mm])
     ball = view.place(view.scene_of(sdf.Sphere(CENTER, RADIUS)), np.eye(4), "#a9d3ee")
-    scene = view.merge_scenes(held, ball, view.scene_of(palm | stem))
+    rest = view.merge_scenes(ball, view.scene_of(palm | stem))
+
+    def scene(share):
+        return view.merge_scenes(view.scene_of(hand, share * laid, colours=orange), rest)
+
     figure, axes = plt.subplots(1, 2, figsize=(7, 4.1), dpi=200, layout="constrained")
     for place, name in zip(axes, ("from the side", "from below"), strict=True):
         place.set_title(name, fontsize=10)
         place.set_axis_off()
-    view.draw_into(axes[0], scene, view=view.Camera(-60.0, 8.0))
-    view.draw_into(axes[1], scene, view=view.Camera(-60.0, -55.0), scale=False)
+    view.draw_into(axes[0], scene(1.0), view=view.Camera(-60.0, 8.0))
+    view.draw_into(axes[1], scene(1.0), view=view.Camera(-60.0, -55.0), scale=False)
     figure.savefig(file)
     plt.close(figure)
+    shares = np.concatenate([np.linspace(0, 1, 46), np.ones(15)])
+    moving = view.Track(np.arange(61) / 20, lambda k: scene(shares[k]), unit="")
+    look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-40.0, -22.0)}
+    film = view.animate(moving, title="Fingers laid on a ball", **look)
+    film.save(file.with_suffix(".webp"))
 
 
 if __name__ == "__main__":

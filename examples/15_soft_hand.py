@@ -164,9 +164,17 @@ def draw(film, angle, pressure, file: Path) -> None:
     shown = [figure.add_subplot(place) for place in above]
     for axes, k in zip(shown, moments, strict=True):
         axes.set_title(f"{times[k]:.2f} s", fontsize=10)
-    view.draw_into(shown, [scene(k) for k in moments], view=view.Camera(-62.0, 16.0))
+    scenes = [scene(k) for k in moments]
+    view.draw_into(shown, scenes, view=view.Camera(-62.0, 16.0))
     figure.savefig(file)
     plt.close(figure)
+    last = np.arange(len(times))[-361::6]  # two periods
+    low, high = np.swapaxes([each.box for each in scenes], 0, 1)
+    extent = low.min(axis=0), high.max(axis=0)
+    moving = view.Track(times[last], lambda k: scene(last[k]), scale, extent=extent)
+    look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-62.0, 16.0)}
+    film = view.animate(moving, speed=0.5, title="Waves through a soft hand", **look)
+    film.save(file.with_suffix(".webp"))
 
 
 if __name__ == "__main__":

@@ -160,6 +160,11 @@ def draw(whole, q, time, place, force, ticks, file) -> None:
     view.draw_into(shown, [scene(t) for t in moments], view=view.Camera(-68.0, 12.0))
     figure.savefig(Path(file))
     plt.close(figure)
+    film_times = np.arange(0.0, time[-1], 0.08)
+    moving = view.Track(film_times, lambda k: scene(film_times[k]))
+    look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-68.0, 12.0)}
+    film = view.animate(moving, fps=12.5, size=(540, 540), title="Pick and place", **look)
+    film.save(Path(file).with_suffix(".webp"))
 
 
 if __name__ == "__main__":

@@ -104,9 +104,14 @@ def draw(problem, motion, angles, path, others, numbers, file: Path) -> None:
     down = np.eye(4)
     down[:3:2, :3:2] = [[np.cos(SLOPE), np.sin(SLOPE)], [-np.sin(SLOPE), np.cos(SLOPE)]]
     bodies = view.scenes_of(motion, states, field="von_mises", rest=False)
-    (left, _), (right, _) = bodies[0].box
-    floor = sdf.Box([left - 10 * mm, -12 * mm, -4 * mm], [right + 10 * mm, 12 * mm, 0.0])
-    floor = view.scene_of(floor)
+
+    def on_slope(bodies):
+        (left, _), (right, _) = bodies[0].box
+        floor = sdf.Box([left - 10 * mm, -12 * mm, -4 * mm], [right + 10 * mm, 12 * mm, 0.0])
+        floor = view.scene_of(floor)
+        level = (view.merge_scenes(view.extrude(body, 10 * mm), floor) for body in bodies)
+        return [view.place(scene, down) for scene in level]
+
     figure = plt.figure(figsize=(7, 8.2), dpi=200, layout="constrained")
     grid = figure.add_gridspec(3, 1, height_ratios=(1.35, 1, 1.3))
     shown, below = (
@@ -150,11 +155,15 @@ def draw(problem, motion, angles, path, others, numbers, file: Path) -> None:
     axes.invert_yaxis()
     for plot in (*below, axes):
         plot.spines[["top", "right"]].set_visible(False)
-    level = [view.merge_scenes(view.extrude(body, 10 * mm), floor) for body in bodies]
-    scenes = [view.place(scene, down) for scene in level]
-    view.draw_into(shown, scenes, view=view.Camera(-75.0, 22.0))
+    view.draw_into(shown, on_slope(bodies), view=view.Camera(-75.0, 22.0))
     figure.savefig(file)
     plt.close(figure)
+    way = np.flatnonzero(times > times[-1] - 0.3)[::4]
+    bodies = view.scenes_of(motion, way, field="von_mises", rest=False)
+    moving = view.Track(times[way], on_slope(bodies).__getitem__, bodies[0].scale)
+    look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-75.0, 22.0)}
+    film = view.animate(moving, speed=0.08, title="Down a slope by itself", **look)
+    film.save(file.with_suffix(".webp"))
 
 
 if __name__ == "__main__":

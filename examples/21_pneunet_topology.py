@@ -163,6 +163,18 @@ def draw(density, made, paths, feet, file) -> None:
     view.draw_into(shown, scenes, view=view.Camera(-58.0, 20.0))
     figure.savefig(Path(file))
     plt.close(figure)
+    finer, tracks = np.linspace(0, MOST, 41), []
+    for path in paths[1:3]:
+        path = fem.solve_path(path.problem, air=jnp.array(finer))
+        bodies = view.scenes_of(path, range(41), field="von_mises", rest=False)
+        solids = [
+            view.merge_scenes(view.extrude(x, DEPTH), view.scene_of(plate)) for x in bodies
+        ]
+        tracks.append(view.Track(finer / kPa, solids.__getitem__, bodies[0].scale, "kPa"))
+    look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-58.0, 20.0)}
+    look |= {"names": ("the chamber that was found", "plain, same air"), "size": (760, 400)}
+    film = view.animate(tracks[0], beside=tracks[1], fps=12.0, **look)
+    film.save(Path(file).with_suffix(".webp"))
 
 
 if __name__ == "__main__":

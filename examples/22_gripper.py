@@ -178,6 +178,28 @@ def draw(films, file) -> None:
     view.draw_into(walk, [scene("bolt left", k) for k in steps], view=above, scale=False)
     figure.savefig(Path(file))
     plt.close(figure)
+    coarse = dict.fromkeys(colours, sdf.isosurface(printed, 1 * mm))
+    beside = np.eye(4)
+    beside[0, 3] = 0.17
+    ticks = np.arange(0, last + 1, round(0.1 * last / 5))
+
+    def both(k):
+        """A beaker that is held, and a bolt that is turned."""
+        drawn = []
+        for name, place in (("beaker", np.eye(4)), ("bolt left", beside)):
+            model, path = films[name][:2]
+            shapes = coarse | {"thing": solids[name]["thing"]}
+            look = {"shapes": shapes, "colours": colours | {"thing": orange}}
+            robot = view.scene_of(model, path.q[ticks[k]], **look)
+            drawn.append(view.place(view.merge_scenes(robot, plate), place))
+        return view.merge_scenes(*drawn)
+
+    extent = np.array([-0.06, -0.06, -0.11]), np.array([0.25, 0.06, 0.012])
+    moving = view.Track(np.asarray(films["beaker"][1].time)[ticks], both, extent=extent)
+    look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-70.0, 16.0)}
+    title = "Four fingers hold a beaker and turn a bolt"
+    film = view.animate(moving, fps=10.0, size=(680, 400), title=title, **look)
+    film.save(Path(file).with_suffix(".webp"))
 
 
 if __name__ == "__main__":

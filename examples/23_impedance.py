@@ -109,7 +109,7 @@ def draw(arm, time, q, goal, tips, push, asked, solid, file) -> None:
     )  # fmt: skip
     upright = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
     thin = np.diag([1.0, 1, 0.9, 1])  # earlier states are narrower, so that they do not hide it
-    states = np.array([0, 106, 180, 290, 420, 540, 700])
+    states, every = np.array([0, 106, 180, 290, 420, 540, 700]), q
     ways = [np.insert(np.asarray(way), 2, 31 * mm, axis=1) for way in (goal, tips)]
     told = [
         view.Lines([way], c, 2.2) for way, c in zip(ways, ("#D55E00", "#1f2430"), strict=True)
@@ -138,6 +138,23 @@ def draw(arm, time, q, goal, tips, push, asked, solid, file) -> None:
     view.draw_into(left, scene, view=view.Camera(-76.0, 16.0))
     figure.savefig(Path(file))
     plt.close(figure)
+    still = view.place(view.scene_of(sdf.extrude(solid, 60 * mm)), np.eye(4), "#c9d3df")
+
+    def now(k):
+        """The arm, and where set-point and tip have been."""
+        looks = {"set-point": "#D55E00", "tip": "#1f2430"}
+        gone = [
+            view.Lines([way[: k + 2]], colour, 2.2, name=name)
+            for way, (name, colour) in zip(ways, looks.items(), strict=True)
+        ]
+        arm = view.scene_of(tube, every[k], colours={"rod": "#6db1e8"})
+        moved = view.merge_scenes(arm, still, view.Scene(tuple(gone)))
+        return view.merge_scenes(view.place(moved, upright), view.scene_of(foot))
+
+    moving = view.Track(time[::8], lambda k: now(8 * k))
+    look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-76.0, 16.0)}
+    film = view.animate(moving, fps=14.0, title="A tip that feels like a spring", **look)
+    film.save(Path(file).with_suffix(".webp"))
 
 
 if __name__ == "__main__":

@@ -192,6 +192,27 @@ def draw(found, films, costs, file) -> None:
     figure.savefig(Path(file), dpi=130, bbox_inches="tight")
     plt.close(figure)
 
+    from sorojax import view
+
+    hang = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])  # x is down
+    ceiling = view.scene_of(sj.sdf.Box([-8 * mm, -20 * mm, -20 * mm], [0.0, 20 * mm, 20 * mm]))
+    marks = view.Dots(TARGETS, "#1f2430", 8.0)
+
+    def scene(k):
+        """The finger with its tendons, the targets, and where the tip has been."""
+        drawn = view.scene_of(
+            finger, films["together"][0].q[shown, k], forces=(sj.rod.Tendons(routes),),
+            colours={"rod": "#9ec5dc"},
+        )  # fmt: skip
+        gone = view.Lines([tips["together"][: k + 2] * mm], ways["together"], 2.0)
+        told = view.Scene((marks, gone) if k else (marks,))
+        return view.place(view.merge_scenes(drawn, ceiling, told), hang)
+
+    moving = view.Track(np.linspace(0, END, 61), scene)
+    look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-60.0, 12.0)}
+    film = view.animate(moving, speed=0.15, fps=15.0, title="Past three targets", **look)
+    film.save(Path(file).with_suffix(".webp"))
+
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)

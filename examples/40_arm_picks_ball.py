@@ -157,6 +157,23 @@ def draw(setup, ticks, q, lifts, file) -> None:
     figure.savefig(Path(file), dpi=90)
     plt.close(figure)
 
+    def scene(k):
+        *links, finger, ball = sj.view.scene_of(whole, q[15 * k], shapes=shapes).parts
+        soft = replace(finger, colour="#e76f51"), replace(ball, colour="#2a9d8f")
+        return sj.view.Scene((*links, *soft, *table))
+
+    look = {
+        "renderer": "own",
+        "samples": 2,
+        "shadows": True,
+        "view": sj.view.Camera(-55.0, 18.0),
+    }
+    room = np.array(far[0]), np.array([0.7, 0.25, 0.85])
+    moving = sj.view.Track(np.asarray(ticks)[::15], scene, extent=room)
+    title = "An arm picks a ball by a soft finger"
+    film = sj.view.animate(moving, speed=0.8, fps=13.0, title=title, **look)
+    film.save(Path(file).with_suffix(".webp"))
+
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)

@@ -8,7 +8,6 @@ by which the sliders push.
 """
 
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -70,7 +69,7 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     tips = poses["leg_1"][:, -1, :3, 3], poses["platform"][:, 0, :3, :3]
     apart = tips[0] - poses["platform"][:, 0, :3, 3] - tips[1] @ PLACES[1]
     if picture is not None:
-        draw(path, poses, picture)
+        draw(robot, path, picture)
     return {
         "ended well": float(path.status == sj.Status.successful),
         "platform down [mm]": float(lifts.min()),
@@ -82,36 +81,53 @@ def main(quick: bool = False, picture: str | Path | None = None) -> dict[str, fl
     }
 
 
-def draw(path, poses, file) -> None:
-    """Four moments, and the forces of the sliders along z."""
+def draw(robot, path, file) -> None:
+    """Four moments, and the forces of the sliders along z; a film of all moments."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    figure = plt.figure(figsize=(11, 4.2))
-    for column, row in enumerate((0, 60, 75, 90)):
-        axes: Any = figure.add_axes((0.185 * column, 0, 0.2, 0.92), projection="3d")
-        for k in range(3):
-            axes.plot(*(poses[f"leg_{k}"][row, :, :3, 3] / mm).T, lw=4)
-        tips = np.stack([poses[f"leg_{k % 3}"][row, -1, :3, 3] for k in range(4)])
-        axes.plot(*(tips / mm).T, "k", lw=2)
-        axes.set(xlim=(-75, 75), ylim=(-75, 75), zlim=(-30, 190))
-        axes.set_title(f"{float(path.time[row]):.1f} s")
-        axes.set_box_aspect((15, 15, 22), zoom=1.05)
-        axes.set(xticks=(-40, 0, 40), yticks=(-40, 0, 40), zticks=(0, 50, 100, 150))
-        axes.tick_params(labelsize=7, pad=-2)
-        if column < 3:
-            axes.set_zticklabels([])
-        axes.view_init(elev=18, azim=-60)
-    axes = figure.add_axes((0.81, 0.14, 0.18, 0.74))
-    for k in range(3):
-        axes.plot(path.time, path.reactions[f"slider_{k}"][:, 5])
-    axes.set(xlabel="time [s]")
-    axes.set_title("push of the sliders [N]", fontsize=10)
-    figure.text(0.01, 0.02, "lengths in mm", size=8)
-    figure.savefig(file, dpi=130)
+    from sorojax import sdf, view
+
+    colours, times = ("#0072B2", "#D55E00", "#009E73"), np.asarray(path.time)
+    looks = {f"leg_{k}": colour for k, colour in enumerate(colours)} | {"platform": "#e9e4da"}
+    plate = sdf.translate(sdf.Cylinder(50 * mm, 5 * mm, 1 * mm), [0, 0, 2.5 * mm])
+    low = -STROKE - 30 * mm
+    ground = sdf.translate(sdf.Cylinder(64 * mm, 4 * mm, 1 * mm), [0, 0, low - 2 * mm])
+
+    def scene(k):
+        """The robot on its sliders, which are pistons here."""
+        parts = list(
+            view.scene_of(robot, path.q[k], shapes={"platform": plate}, colours=looks).parts
+        )
+        for place, phase in zip(PLACES, TURNS, strict=True):
+            high = float(Slider(jnp.array(place), phase)(times[k])[2, 3])
+            piston = sdf.Cylinder(9 * mm, high - low, 1 * mm)
+            parts += view.scene_of(sdf.translate(piston, [*place[:2], (high + low) / 2])).parts
+        return view.Scene((*parts, *view.scene_of(ground).parts))
+
+    figure = plt.figure(figsize=(7, 5.6), dpi=200, layout="constrained")
+    grid, moments = figure.add_gridspec(2, 1, height_ratios=(1.6, 1)), (0, 60, 75, 90)
+    shown = [figure.add_subplot(place) for place in grid[0].subgridspec(1, len(moments))]
+    for axes, k in zip(shown, moments, strict=True):
+        axes.set_title(f"{times[k]:.1f} s", fontsize=10)
+    axes = figure.add_subplot(grid[1])
+    for k, colour in enumerate(colours):
+        push = path.reactions[f"slider_{k}"][:, 5]
+        axes.plot(times, push, color=colour, lw=1.8, label=f"slider {k + 1}")
+        axes.plot(times[list(moments)], push[np.array(moments)], "o", ms=4, color=colour)
+    axes.set(xlabel="time [s]", ylabel="push of a slider [N]")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=9, ncols=3)
+    view.draw_into(shown, [scene(k) for k in moments], view=view.Camera(-60.0, 16.0))
+    figure.savefig(file)
     plt.close(figure)
+    look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-60.0, 16.0)}
+    moving = view.Track(times[::2], lambda k: scene(2 * k))
+    title = "A platform on three soft rods"
+    film = view.animate(moving, speed=0.5, fps=12.5, size=(480, 560), title=title, **look)
+    film.save(Path(file).with_suffix(".webp"))
 
 
 if __name__ == "__main__":

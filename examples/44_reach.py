@@ -131,6 +131,30 @@ def draw(rewards: np.ndarray, distance: np.ndarray, params, states, file: Path) 
         plt.close(seen.figure)
     figure.savefig(file, dpi=130)
     plt.close(figure)
+    far = np.argsort(distance[:, 0])[-3:]  # of those that begin far away
+    beside = [np.eye(4) + 0.16 * k * np.eye(4, k=3) for k in range(len(far))]
+
+    def three(k):
+        """Three fingers side by side, each on its way to a target of its own."""
+        drawn = []
+        for one, place in zip(far, beside, strict=True):
+            state = jax.tree.map(lambda x, one=one: x[one, 2 * k], states)
+            own = jax.tree.map(lambda x, one=one: x[one], params)
+            drawn.append(sj.view.place(ENV.scene(state, own), place))
+        whole = sj.view.merge_scenes(*drawn)
+        plain = (replace(part, name="") for part in whole.parts)  # pressures change
+        return replace(whole, parts=tuple(plain))
+
+    moving = sj.view.Track(time[::2], three)
+    look = {
+        "renderer": "own",
+        "samples": 2,
+        "shadows": True,
+        "view": sj.view.Camera(-60.0, 8.0),
+    }
+    title = "Three fingers that have learnt to reach"
+    film = sj.view.animate(moving, speed=0.4, fps=10.0, size=(760, 420), title=title, **look)
+    film.save(Path(file).with_suffix(".webp"))
 
 
 if __name__ == "__main__":

@@ -87,6 +87,26 @@ def test_a_broken_link_is_found(tmp_path, monkeypatch):
     assert broken(page) == ["no.md", "d.png"]
 
 
+@pytest.mark.parametrize("page", sorted(DOCS.glob("tutorials/0*.md")), ids=label)
+def test_a_tutorial_is_a_notebook_too(page, tmp_path):
+    """With every program of the page, what these print, and the pictures that they draw."""
+    nbformat = pytest.importorskip("nbformat", reason="the extra `docs` is not installed")
+    tool("notebooks").write(tmp_path)
+    book = nbformat.read(tmp_path / f"{page.stem}.ipynb", as_version=4)
+    nbformat.validate(book)
+    cells = [cell for cell in book.cells if cell.cell_type == "code"]
+    told = tool("run_page").blocks(page)
+    assert [cell.source for cell in cells] == [block.code.rstrip("\n") for block in told]
+    for cell, block in zip(cells, told, strict=True):
+        printed = [o.text for o in cell.outputs if o.output_type == "stream"]
+        assert printed == ([] if block.expected is None else [block.expected])
+    drawn = [o for cell in cells for o in cell.outputs if o.output_type == "display_data"]
+    text = page.read_text()
+    assert len(drawn) == len(re.findall(r"^!\[", text, re.M)) > 0
+    words = "\n".join(cell.source for cell in book.cells if cell.cell_type == "markdown")
+    assert words.startswith(text.partition("\n")[0]) and "](../" not in words
+
+
 def test_every_public_name_has_its_entry():
     """As the object of a directive, once."""
     names = [name.path for name in tool("public_names").everything()]
@@ -196,6 +216,10 @@ def test_the_gallery_has_every_example_with_its_numbers(tmp_path):
     shown = set(re.findall(r"_generated/pictures/([\w.]+)", text))
     assert shown == {picture.name for picture in (tmp_path / "pictures").iterdir()}
     assert all(path.stat().st_size < 150e3 for path in (tmp_path / "pictures").iterdir())
+    films = {film.name for film in (ROOT / "examples").glob("*.webp")}
+    assert set(re.findall(r"_generated/films/([\w.]+)", text)) == films
+    assert {film.name for film in (tmp_path / "films").iterdir()} == films
+    assert text.count('<details class="film">') == len(films) > 0
     assert "| six silicones in tension" in (tmp_path / "robots.md").read_text()
     assert (tmp_path / "device.md").read_text().count("<svg") >= 3
     with pytest.raises(AssertionError, match="no section 'Ghosts'"):

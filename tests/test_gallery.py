@@ -7,12 +7,15 @@ import subprocess
 import sys
 
 import pytest
+from PIL import Image
 
 from tests.scripts import ROOT
 
 FOLDER = ROOT / "examples"
 BUILD = FOLDER / "gallery" / "build.py"
 SCRIPTS = sorted(FOLDER.glob("[0-9][0-9]_*.py"))
+MOVING = {"04", "12", "13", "14", "15", "16", "20", "21", "22", "23", "24"}
+MOVING |= {"32", "40", "42", "43", "44"}
 SCRIPT = '''"""A spring: how far it goes.
 
 A second paragraph with <signs>.
@@ -58,6 +61,30 @@ def test_every_picture_has_its_place(written):
     assert numbered
     for picture in numbered:
         assert f'<img src="../{picture.name}"' in written
+
+
+def test_what_moves_has_a_film_that_takes_the_place_of_its_picture(written):
+    films = sorted(FOLDER.glob("*.webp"))
+    assert {film.stem[:2] for film in films} >= MOVING
+    for film in films:
+        image = Image.open(film)
+        assert image.n_frames >= 20, film
+        image.seek(image.n_frames - 1)
+        image.load()
+        length = image.info["timestamp"] + image.info["duration"]  # of the last frame too
+        assert 2500 <= length <= 8000, film
+        assert film.stat().st_size < 600e3, film
+        picture = film.with_suffix(".png")
+        assert picture.exists() and "save(file.with_suffix(" in drawing(film)
+        card = written.partition(f'<section id="{film.stem}">')[2].partition("</section>")[0]
+        places = [card.find(f'src="../{file.name}"') for file in (picture, film)]
+        assert 0 < places[0] < card.find("</summary>") < places[1]
+    assert sum(film.stat().st_size for film in films) < 6e6
+
+
+def drawing(film):
+    """The script that draws a film."""
+    return film.with_suffix(".py").read_text().replace("Path(file)", "file")
 
 
 def test_numbers_of_the_paper_stand_beside_measured_ones():

@@ -109,6 +109,18 @@ def test_slow_motion_and_stamp():
         view.animate(1.0)
 
 
+def test_bodies_of_a_film_throw_shadows():
+    def scene(k):
+        ball = view.scene_of(sdf.Sphere([0, 0, 0.02], 0.01))
+        return view.merge_scenes(ball, view.scene_of(sdf.Box([-0.05] * 3, [0.05, 0.05, 0])))
+
+    still = view.Track(np.arange(2.0), scene)
+    look = {"renderer": "own", "size": (160, 120), "stamp": False}
+    lit, shaded = (view.animate(still, shadows=x, **look).draw(0) for x in (False, True))
+    darker = np.any(shaded.astype(int) < lit.astype(int) - 30, axis=2)
+    assert 0.002 < darker.mean() < 0.2 and not np.any(shaded > lit.astype(int) + 2)
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_two_results_side_by_side_at_the_same_instants(dim):
     wide = {"size": (400, 200), "view": "front", "renderer": "own"}
@@ -194,7 +206,12 @@ def test_a_film_is_written_as_gif_and_pictures(tmp_path):
     assert Image.open(io.BytesIO(film._repr_png_())).size == (160, 120)
     fast = view.animate(track(count=101), fps=100, renderer="own", size=(160, 120))
     assert Image.open(io.BytesIO(fast.gif)).n_frames == 51  # every second of 101
-    with pytest.raises(ValueError, match="need .gif, .mp4"):
+    webp = Image.open(film.save(tmp_path / "a.webp"))
+    assert (webp.n_frames, webp.size) == (5, (160, 120))
+    webp.seek(3)
+    off = np.asarray(webp.convert("RGB")).astype(int) - film.draw(3)
+    assert np.abs(off).mean() < 3 and webp.info["timestamp"] == 3 * 250
+    with pytest.raises(ValueError, match="need .webp, .gif, .mp4"):
         film.save(tmp_path / "a.doc")
 
 

@@ -25,7 +25,8 @@ GROUPS = {
 def write(folder: Path) -> None:
     """Write the parts into `folder`, where the pages include them."""
     (folder / "pictures").mkdir(parents=True, exist_ok=True)
-    (folder / "notebooks").mkdir(exist_ok=True)
+    for kind in ("films", "notebooks"):
+        (folder / kind).mkdir(exist_ok=True)
     texts = {
         "gallery.md": gallery(folder),
         "robots.md": section(ROOT / "benchmarks" / "README.md", "Measured robots and rubbers"),
@@ -56,15 +57,23 @@ def gallery(folder: Path) -> str:
         image = build.picture_of(script, told)
         picture = image and f"_generated/pictures/{small(image, folder / 'pictures').name}"
         title, rest = build.words_of(script)
+        film = build.film_of(script)
+        if film is not None:
+            _copy(film, folder / "films" / film.name)
+            film = f"_generated/films/{film.name}"
         if group and f"## {group}\n" not in entries:
             entries += f"## {group}\n\n"
         cards += _card(script, title, picture)
-        entries += _entry(build, script, title, rest, picture, told)
+        entries += _entry(build, script, title, rest, _drawn(title, picture, film), told)
     for book in sorted((EXAMPLES / "notebooks").glob("*.ipynb")):
-        target = folder / "notebooks" / book.name
-        if not target.exists() or target.read_bytes() != book.read_bytes():
-            target.write_bytes(book.read_bytes())
+        _copy(book, folder / "notebooks" / book.name)
     return f":::::{{grid}} 2 2 3 4\n:gutter: 2\n\n{cards}:::::\n\n{entries}"
+
+
+def _copy(file: Path, target: Path) -> None:
+    """Write only what changed: pages that include it are not built again."""
+    if not target.exists() or target.read_bytes() != file.read_bytes():
+        target.write_bytes(file.read_bytes())
 
 
 def small(picture: Path, folder: Path) -> Path:
@@ -89,9 +98,26 @@ def _name(script: Path) -> str:
     return script.stem[3:].replace("_", " ")
 
 
-def _entry(build, script, title, rest, picture, paper: dict[str, Any]) -> str:
+def _drawn(title: str, picture: str | None, film: str | None) -> str:
+    """The picture; where there is a film, it takes the place of the picture on a click."""
+    if picture is None:
+        return ""
+
+    def image(name, alt):
+        return f"```{{image}} {name}\n:alt: {alt}\n:loading: lazy\n```\n\n"
+
+    def raw(text):
+        return f"```{{raw}} html\n{text}\n```\n\n"
+
+    still = image(picture, _plain(title))
+    if film is None:
+        return still
+    opened, closed = raw('<details class="film"><summary>'), raw("<span></span></summary>")
+    return f"{opened}{still}{closed}{image(film, f'film: {_plain(title)}')}{raw('</details>')}"
+
+
+def _entry(build, script, title, rest, drawn, paper: dict[str, Any]) -> str:
     about = "\n\n".join(rest)
-    drawn = f"![{_plain(title)}]({picture})\n\n" if picture else ""
     more = f":::{{dropdown}} About this example\n{about}\n:::\n\n" if about else ""
     where = f"`examples/{script.name}`"
     if "section" in paper:

@@ -12,6 +12,7 @@ from sphinx.application import Sphinx
 from sphinx.transforms import SphinxTransform
 
 import data_pages
+import notebooks
 import reference
 import signatures
 from docstrings import as_rst
@@ -101,10 +102,21 @@ def _skip(
 def _write(app: Sphinx) -> None:
     reference.write(Path(app.srcdir) / "reference")
     data_pages.write(Path(app.srcdir) / "_generated")
+    notebooks.write(Path(app.srcdir) / "_generated" / "tutorials")
+
+
+def _offer_notebook(app: Sphinx, page: str, source: list[str]) -> None:
+    """A link to the notebook below the title of a tutorial."""
+    folder, _, name = page.rpartition("/")
+    if folder == "tutorials" and name in [page.stem for page in notebooks.pages()]:
+        title, _, rest = source[0].partition("\n")
+        file = f"../_generated/tutorials/{name}.ipynb"
+        source[0] = f"{title}\n\n{{download}}`This page as a notebook <{file}>`\n{rest}"
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("builder-inited", _write)
+    app.connect("source-read", _offer_notebook)
     app.connect("autodoc-process-docstring", _docstring, priority=100)
     app.connect("autodoc-process-signature", _signature)
     app.connect("autodoc-skip-member", _skip)

@@ -1,4 +1,5 @@
-"""The gallery: every example with its picture, its script and its numbers beside the paper's.
+"""The gallery: every example with its picture, its film, its script and its numbers beside the
+paper's.
 
     python examples/gallery/build.py                 write index.html from what is stored
     python examples/gallery/build.py --run           measure all examples again, then write it
@@ -8,6 +9,7 @@ Measured numbers lie in `numbers/NAME.json` with the machine that gave them; wha
 says, what this project asks of a number, of what kind it is (by the longest beginning of its
 name), and a sentence where we contradict the paper, in `paper.json`. A new script `NN_name.py`
 beside a picture `NN_name.png` is found by itself; a picture of another name is named there too.
+A film `NN_name.webp` lies beside the picture: the drawing of an example writes both.
 """
 
 import argparse
@@ -41,6 +43,12 @@ def picture_of(script: Path, paper: dict[str, Any]) -> Path | None:
         return script.with_name(paper["picture"])
     names = (f"{script.stem}.png", f"{script.stem[3:]}.png")
     return next((p for p in map(script.with_name, names) if p.exists()), None)
+
+
+def film_of(script: Path) -> Path | None:
+    """The film of an example, if it has one."""
+    film = script.with_suffix(".webp")
+    return film if film.exists() else None
 
 
 def measured(script: Path, quick: bool = False) -> dict[str, Any]:
@@ -118,13 +126,7 @@ def words_of(script: Path) -> tuple[str, list[str]]:
 def _card(script: Path, store: Path, paper: dict[str, Any]) -> str:
     source, (title, rest) = script.read_text(), words_of(script)
     words = "".join(f"<p>{html.escape(x)}</p>" for x in rest)
-    image = picture_of(script, paper)
-    drawn = (
-        f'<a href="../{image.name}"><img src="../{image.name}" alt="{html.escape(title)}" '
-        'loading="lazy"></a>'
-        if image
-        else "<p class=none>no picture: it prints its numbers</p>"
-    )
+    drawn = _drawn(picture_of(script, paper), film_of(script), html.escape(title))
     told = paper.get("section")
     section = f"<span class=section>paper {told}</span>" if told else ""
     return (
@@ -133,6 +135,19 @@ def _card(script: Path, store: Path, paper: dict[str, Any]) -> str:
         f"<details><summary>about</summary>{words}</details><details><summary>script: <a href="
         f'"../{script.name}">{script.name}</a></summary><pre>{html.escape(source)}</pre>'
         "</details></section>"
+    )
+
+
+def _drawn(image: Path | None, film: Path | None, title: str) -> str:
+    """The picture; where there is a film, it takes the place of the picture on a click."""
+    if image is None:
+        return "<p class=none>no picture: it prints its numbers</p>"
+    still = f'<img src="../{image.name}" alt="{title}" loading="lazy">'
+    if film is None:
+        return f'<a href="../{image.name}">{still}</a>'
+    return (
+        f"<details class=film><summary>{still}<span></span></summary>"
+        f'<img src="../{film.name}" alt="film: {title}" loading="lazy"></details>'
     )
 
 
@@ -207,6 +222,9 @@ td, th {{ padding: .15em .6em .15em 0; text-align: left; vertical-align: top;
   white-space: nowrap }} .note, .none {{ color: #6b7079; font-size: .8em }}
 .section {{ color: #6b7079; font-weight: normal; font-size: .85em }}
 pre {{ background: #f6f7f9; padding: 1em; overflow-x: auto; font-size: .8em }}
+.film summary {{ list-style: none }} .film[open] summary img {{ display: none }}
+.film span::after {{ content: "\25b6 show the film"; color: #0072b2 }}
+.film[open] span::after {{ content: "\25a0 show the picture" }}
 details {{ margin-top: .5em }} summary {{ cursor: pointer }} a {{ color: #0072b2 }}
 </style></head><body><h1>Gallery</h1>
 <p>Every example of this folder with what it draws and the numbers that its <code>main()</code>

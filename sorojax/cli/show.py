@@ -14,7 +14,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--out",
         type=Path,
-        help="what to write: .png .pdf .svg, .gif or .mp4 of a .pvd "
+        help="what to write: .png .pdf .svg, .webp, .gif or .mp4 of a .pvd "
         "(default: FILE.png in this folder)",
     )
     parser.add_argument("--field", help="values that colour it, e.g. von_mises")
@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     out = arguments.out or Path(f"{arguments.file.stem}.png")
     shared = {"field": arguments.field, "view": arguments.view, "renderer": _renderer()}
-    if out.suffix.lower() in (".gif", ".mp4", ".webm"):
+    if out.suffix.lower() in (".webp", ".gif", ".mp4", ".webm"):
         if arguments.file.suffix.lower() != ".pvd":
             raise ValueError(
                 f"show: {out.suffix} is a film, need a .pvd of several results to draw one, "

@@ -53,12 +53,13 @@ def animate(
     view: View = "iso",
     renderer: str = "auto",
     samples: int = 1,
+    shadows: bool = False,
     stamp: bool = True,
     size: tuple[int, int] = (640, 480),
     title: str = "",
     **options: Any,
 ) -> Film:
-    """A film of a motion; `.save("name.mp4")` or `.gif` writes it.
+    """A film of a motion; `.save("name.webp")`, `.gif` or `.mp4` writes it.
 
     Args:
         result: A trajectory of a body, a rod (with `model=`) or a network (with `network=`), a
@@ -72,6 +73,7 @@ def animate(
         view: A preset, a `Camera`, or a path of them, `orbit()` or `between(a, b)`.
         renderer: Of solid pictures: "auto", "own" or "pyvista".
         samples: Per pixel and direction, of the own renderer; 2 is smoother and slower.
+        shadows: Whether bodies throw shadows on each other, in solid pictures.
         stamp: Write the time into the picture.
         size: Width and height [pixels].
         title: Heading of the film.
@@ -96,7 +98,8 @@ def animate(
         speed = 1.0 if main.unit in ("s", "") else float(np.ptp(main.time)) / 3.0 or 1.0
     chosen = frames_at(main.time, fps, float(speed))
     stage = _Solid if main.scene(0).dim == 3 else _Plane
-    drawn = stage(tracks, chosen, view, renderer, samples, stamp, size, title)
+    looks = {"renderer": renderer, "samples": samples, "shadows": shadows}
+    drawn = stage(tracks, chosen, view, looks, stamp, size, title)
     return Film(drawn.frame, len(chosen), fps)
 
 
@@ -122,9 +125,9 @@ def _extent(track: Track) -> tuple[np.ndarray, np.ndarray]:
 class _Stage(abc.ABC):
     """A figure of which only the panels and the stamp are drawn again."""
 
-    def __init__(self, tracks, chosen, view, renderer, samples, stamp, size, title):
-        self.tracks, self.chosen, self.view, self.samples = tracks, chosen, view, samples
-        self.renderer, self.stamp, self.title = renderer, stamp, title
+    def __init__(self, tracks, chosen, view, looks, stamp, size, title):
+        self.tracks, self.chosen, self.view, self.looks = tracks, chosen, view, looks
+        self.stamp, self.title = stamp, title
         self.boxes = [_extent(track) for track in tracks]
         self.figure = style.new_figure(size[0] / 100, size[1] / 100, layout=self.layout)
         self.figure.set_dpi(100)
@@ -154,6 +157,8 @@ class _Stage(abc.ABC):
         if not self.stamp or not track.unit:
             return ""
         digits = max(0, 2 - int(np.floor(np.log10(max(np.ptp(track.time), 1e-9)))))
+        if np.all(track.time == np.round(track.time)):  # steps
+            digits = 0
         return f"{value:.{min(digits, 6)}f} {track.unit}"
 
 
@@ -199,7 +204,7 @@ class _Solid(_Stage):
     """Shaded pictures put into a frame that is drawn once."""
 
     def prepare(self) -> Callable[[int], Frame]:
-        chosen_renderer(self.renderer)
+        chosen_renderer(self.looks["renderer"])
         self.firsts = [track.scene(0).parts for track in self.tracks]
         self.places, count = [], len(self.tracks)
         first = replace(self.scene(self.tracks[0], 0), title=self.title)
@@ -238,7 +243,7 @@ class _Solid(_Stage):
     def _frame(self, k: int) -> Frame:
         picture = self.still.copy()
         share = k / max(len(self.chosen) - 1, 1)
-        look = {"renderer": self.renderer, "samples": self.samples, "dots_per_point": 100 / 72}
+        look = self.looks | {"dots_per_point": 100 / 72}
         for track, ((x, y), size) in zip(self.tracks, self.places, strict=True):
             lens = self._lens(track, size, share)
             seen = picture_of(self.scene(track, k), lens, **look)

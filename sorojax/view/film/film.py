@@ -1,4 +1,4 @@
-"""Films: frames drawn on request, written as GIF, MP4 or single pictures."""
+"""Films: frames drawn on request, written as WebP, GIF, MP4 or single pictures."""
 
 import functools
 import importlib.util
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _COLOURS = 96
 _SAMPLES = 6
 _GIF_FPS = 50.0
+_QUALITY = 75
 
 Frame = UInt8[np.ndarray, "height width 3"]
 
@@ -40,7 +41,7 @@ class Film:
 
     def __repr__(self) -> str:
         seconds = self.frames / self.fps
-        return f"Film: {self.frames} frames, {seconds:.3g} s; .save('name.mp4' or '.gif')"
+        return f"Film: {self.frames} frames, {seconds:.3g} s; .save('name.webp' or '.mp4')"
 
     def __iter__(self) -> Iterator[Frame]:
         for k in range(self.frames):
@@ -62,8 +63,9 @@ class Film:
         """Write the film and return the path.
 
         Args:
-            path: Ending in .gif; in .mp4, .mov, .mkv or .webm, which need the extra
-                `view`; or a folder or a name ending in .png for numbered pictures.
+            path: Ending in .webp, small and shown by every browser, or .gif; in .mp4, .mov,
+                .mkv or .webm, which need the extra `view`; or a folder or a name ending in
+                .png for numbered pictures.
 
         Raises:
             ValueError: If the ending is another one, or the extra is missing.
@@ -72,14 +74,16 @@ class Film:
         kind = path.suffix.lower()
         if kind == ".gif":
             path.write_bytes(self.gif)
+        elif kind == ".webp":
+            _webp(self, path)
         elif kind in (".mp4", ".mov", ".mkv", ".webm"):
             _encode(self, path)
         elif kind in ("", ".png"):
             _numbered(self, path)
         else:
             raise ValueError(
-                f"Film.save: the file name ends in `{kind}`, need .gif, .mp4, .webm, .png or a "
-                "folder."
+                f"Film.save: the file name ends in `{kind}`, need .webp, .gif, .mp4, .webm, "
+                ".png or a folder."
             )
         return path
 
@@ -167,6 +171,15 @@ def _gif(film: Film, every: int) -> bytes:
     rest = pictures[1:]
     pictures[0].save(buffer, "GIF", save_all=True, append_images=rest, duration=length, **look)
     return buffer.getvalue()
+
+
+def _webp(film: Film, path: Path) -> None:
+    """Lossy, which shading takes; every frame for a whole number of milliseconds."""
+    from PIL import Image
+
+    first, *rest = (Image.fromarray(frame) for frame in film)
+    look = {"quality": _QUALITY, "method": 4, "loop": 0, "duration": round(1000 / film.fps)}
+    first.save(path, "WEBP", save_all=True, append_images=rest, **look)
 
 
 def _palette(pictures: "list[Image]") -> "Image":
