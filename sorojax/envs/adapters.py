@@ -107,7 +107,7 @@ def register() -> tuple[str, ...]:
 
     Example:
         >>> envs.register()[:2]
-        ('sorojax/CrawlerRun-v0', 'sorojax/FingerReach-v0')
+        ('sorojax/BallTurn-v0', 'sorojax/CrawlerRun-v0')
     """
     return _adapter("register").register()
 
