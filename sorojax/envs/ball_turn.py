@@ -50,7 +50,7 @@ from sorojax.rod import (
 )
 from sorojax.rod.contact.links import LinkPoints
 from sorojax.rod.contact.obstacle import AbstractContact, Side, Touch
-from sorojax.sdf import Box, Sphere
+from sorojax.sdf import Box, Cylinder, Sphere, translate
 from sorojax.units import deg, mm
 
 _FINGERS, _BALL = ("finger_0", "finger_1", "finger_2"), "ball"
@@ -71,7 +71,7 @@ def _around(angles: np.ndarray, height: float) -> Float[np.ndarray, "points 3"]:
 
 
 _KNOBS = _around(_ANGLES + np.pi / 3, -float(np.cos(_SPREAD)))
-_MARKS = np.concatenate([np.zeros((1, 3)), _around(np.pi / 3 * np.array([1, 3]), 0.6)])
+_MARKS = np.concatenate([np.zeros((1, 3)), _around(np.pi / 3 * np.array([-1, 1]), 0.6)])
 
 
 class BallParams(GraspParams):
@@ -212,6 +212,7 @@ class BallTurn(AbstractGrasp):
         hand = view.scene_of(model, q, forces=inside, shapes=ball)
         wide = float(_ring(params) + params.radius)
         palm = view.scene_of(Box([-wide, -wide, -6 * mm], [wide, wide, 0.0]))
+        pegs = [_peg(np.asarray(knob)) for knob in _knobs(params)]
         marks = of_thing(model, state.body.q, _BALL, 1.02 * _marks(params))[1:]
         wanted = _middle(state.body.q, params)[None] + 1.1 * _turned(
             _marks(params), state.goal.turn
@@ -220,7 +221,7 @@ class BallTurn(AbstractGrasp):
             view.Dots(np.asarray(marks), size=6.0),
             view.Dots(np.asarray(wanted)[1:], "#c0392b", 6.0, "wanted"),
         )
-        return view.merge_scenes(palm, hand, view.Scene(dots))
+        return view.merge_scenes(palm, *pegs, hand, view.Scene(dots))
 
 
 class Knobs(AbstractContact):
@@ -264,6 +265,21 @@ class Knobs(AbstractContact):
 def _ring(params: BallParams) -> Float[Array, ""]:
     """Radius of the circle on which the fingers stand [m]."""
     return params.ball_radius + params.radius + params.clearance
+
+
+def _knobs(params: BallParams) -> Float[Array, "3 3"]:
+    """Middles of the knobs, so that they just touch the ball [m]."""
+    apart = (params.ball_radius + _KNOB) * jnp.asarray(_KNOBS, params.length.dtype)
+    return apart.at[:, 2].add(params.height)
+
+
+def _peg(knob: Float[np.ndarray, "3"]):
+    """A knob and the peg that carries it, as a scene."""
+    from sorojax import view
+
+    up = float(knob[2])
+    peg = translate(Cylinder(0.6 * _KNOB, up), [float(knob[0]), float(knob[1]), up / 2])
+    return view.scene_of(peg | Sphere(knob, _KNOB))
 
 
 def _marks(params: BallParams) -> Float[Array, "3 3"]:
@@ -328,8 +344,7 @@ def _forces(params: BallParams, finger: Rod, delivery) -> tuple[Any, ...]:
     grip = LinkContact(Sphere([0.0, 0.0, 0.0], params.ball_radius), params.radius,
                        soft(params), points=POINTS)  # fmt: skip
     ball = params.ball_radius
-    apart = (ball + _KNOB) * jnp.asarray(_KNOBS, ball.dtype)
-    knobs = Knobs(apart.at[:, 2].add(params.height), _KNOB, ball, hard(params, real(_KNOB)))
+    knobs = Knobs(_knobs(params), _KNOB, ball, hard(params, real(_KNOB)))
     down = params.gravity * jnp.asarray([0.0, 0.0, -1.0], ball.dtype)
     inside = [
         PartForce(name, Inflated(chambers, Share(delivery, 2 * k, 2 * k + 2)))

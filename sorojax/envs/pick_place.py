@@ -51,6 +51,7 @@ from sorojax.rod import (
     assembly,
     chebyshev,
     circle,
+    forward_kinematics,
     rod,
     thread_chambers,
     tip_pose,
@@ -65,6 +66,7 @@ _BEGIN, _END = (-90 * mm, -50 * mm), (75 * mm, 105 * mm)  # where the box may st
 _EDGE = 50 * mm  # of the shelf
 _LEAN = 45 * deg  # of the box, that is a fall
 _STILL = 10 * mm  # speed of a box that stands [m/s]
+_HANGING = np.array([[0.0, 1.0], [-1.0, 0.0]])  # x of a finger down, y to the right
 _ROUND = 2 * mm  # radius of the corners of the box
 _WINDOW = (-0.16, -0.02), (0.16, 0.2)  # of pictures [m]
 
@@ -227,23 +229,20 @@ class PickPlace(AbstractGrasp):
         from sorojax import view
 
         model, finger = _gripper(params)
-        pressure = state.supply.value[2:]
-        inside = tuple(
-            PartForce(name, Pressurised(_chamber(params, finger, side), pressure))
-            for name, side in zip(_FINGERS, _SIDES, strict=True)
-        )
-        drawn = view.scene_of(model, np.asarray(state.body.q), forces=inside)
+        drawn = _fingers_drawn(params, model, finger, state)
         lower, upper = (np.array(corner) for corner in _WINDOW)
-        pose = np.asarray(tip_pose(model, state.body.q)["box"])
+        poses = tip_pose(model, state.body.q)
+        pose, foot = (np.asarray(poses[name]) for name in ("box", "up"))
         w, h = float(params.box_width) / 2, float(params.box_height) / 2
         corners = np.array([[-w, -h], [w, -h], [w, h], [-w, h], [-w, -h]])
         outline = corners @ pose[:2, :2].T + pose[:2, 2]
         shelf = float(params.shelf_height)
         ground = np.array([[lower[0], 0.0], [_EDGE, 0.0], [_EDGE, shelf], [upper[0], shelf]])
-        feet = np.asarray(lines(model, state.body.q, _FINGERS, np.array([0.0]))[:, 0])
+        wide = float(_half(params) + params.radius)
+        beam = foot[:2, 2] + np.array([[-wide, 0.0], [wide, 0.0]])
         goal = np.asarray(state.goal.target)
         parts = (
-            view.Lines([ground, feet], width=1.5),
+            view.Lines([ground, beam], width=2.0),
             view.Lines([corners + goal], "#c0392b", 0.8, name="target"),
             view.Lines([outline], "#1f3b57", 2.0, name="box"),
         )
@@ -260,6 +259,33 @@ def _shares(state, params: PickParams) -> Float[Array, "6"]:
     both = jnp.stack([state.supply.value, state.supply.commands[0]])
     place = both[:, :2] / params.max_travel[None]
     return jnp.concatenate([place, in_shares(both[:, 2:], params.max_pressure)], axis=1).ravel()
+
+
+def _fingers_drawn(params: PickParams, model: Assembly, finger: Rod, state):
+    """The fingers alone, as a scene, with the air in their chambers."""
+    from dataclasses import replace
+
+    from sorojax import view
+
+    poses = forward_kinematics(model, state.body.q, np.array([0.0]))
+    hung = {name: Part(finger, offset=poses[name][0]) for name in _FINGERS}
+    q = state.body.q[2:-3]  # between the gantry and the box
+    inside = tuple(
+        PartForce(name, Pressurised(_chamber(params, finger, side), state.supply.value[2:]))
+        for name, side in zip(_FINGERS, _SIDES, strict=True)
+    )
+    drawn = view.scene_of(assembly(SE2(), **hung), np.asarray(q), forces=inside)
+    named = [part.name for part in drawn.parts]
+    once = (
+        replace(part, name="") if part.name in named[:k] else part
+        for k, part in enumerate(drawn.parts)
+    )
+    return replace(drawn, parts=tuple(once))
+
+
+def _half(params: PickParams) -> Float[Array, ""]:
+    """From the middle of the gripper to the axis of a finger [m]."""
+    return params.box_width / 2 + params.radius + params.clearance
 
 
 def _box(params: PickParams) -> AbstractSdf:
@@ -294,9 +320,8 @@ def _gripper(params: PickParams) -> tuple[Assembly, Rod]:
     axis = Link(params.servo_mass, params.servo_mass * (10 * mm) ** 2)
     drive = {"stiffness": params.servo_stiffness, "damping": params.servo_damping}
     level, up = jnp.eye(2, dtype=dtype), jnp.asarray([0.0, 1.0], dtype)
-    hanging = jnp.asarray([[0.0, 1.0], [-1.0, 0.0]], dtype)  # x down, y to the right
-    half = params.box_width / 2 + params.radius + params.clearance
-    out = half * jnp.asarray([1.0, 0.0], dtype)
+    hanging = jnp.asarray(_HANGING, dtype)
+    out = _half(params) * jnp.asarray([1.0, 0.0], dtype)
     foot = homogeneous(level, params.foot_height * up)
     parts = {
         "across": Part(axis, Prismatic([1.0, 0.0], **drive), offset=foot),
