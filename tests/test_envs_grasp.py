@@ -49,7 +49,7 @@ def test_a_script_does_what_is_asked(env, script):
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_pressure_on_one_side_turns_the_ball_to_that_side(sign):
-    """Clockwise from above by the first chambers."""
+    """Counter-clockwise from above by the first chambers."""
     keys, params = jax.random.key(0)[None], BALL.default_params()
     states = begun(BALL, keys, params)
     actions = jnp.tile(jnp.asarray([1.0, -1.0][:: int(sign)]), 3)[None]
@@ -57,7 +57,7 @@ def test_pressure_on_one_side_turns_the_ball_to_that_side(sign):
         after = stepped(BALL, keys, states, actions, params)
         states = after.state
     aside = np.asarray(BALL.markers(jax.tree.map(lambda x: x[0], states.body), params))[1]
-    assert sign * aside[1] < -10 * mm  # the tip of the finger at y = 0, x > 0
+    assert sign * aside[1] > 10 * mm  # the tip of the finger at y = 0, x > 0
 
 
 def test_a_ball_rests_on_its_knobs_and_one_out_of_the_fingers_is_dropped(getkey):

@@ -111,7 +111,7 @@ class BallTurn(AbstractGrasp):
     observed.
 
     Actions, 6 in [-1, 1]: the commanded pressures from 0 to the greatest, for each finger of
-    the chamber that bends it clockwise, as seen from above, and of the other one. They arrive
+    the chamber that bends it counter-clockwise, from above, and of the other one. They arrive
     by the supply.
 
     Observations, 72: the pressures and the commands, in shares of the greatest from -1 to 1;
