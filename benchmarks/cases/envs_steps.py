@@ -1,8 +1,8 @@
-"""Steps of environments a second: finger reach, tentacle push, tracking, crawler.
+"""Steps of environments a second: finger reach, tentacle push, tracking, crawler, grasps.
 
-Each member has numbers of its own. A step is 20 ms: 20 steps of physics of 1 ms, measurements,
-reward. `run_s` is that of one member of a batch, one over the steps a second. The finger is
-timed with five steps of 4 ms too.
+Each member has numbers of its own. A step is 20 ms: 20 steps of physics of 1 ms, or 10 of 2 ms
+of grasps, measurements, reward. `run_s` is that of one member of a batch, one over the steps a
+second. The finger is timed with five steps of 4 ms too.
 """
 
 import jax
@@ -19,6 +19,8 @@ TASKS = {
     "tentacle push": envs.TentaclePush(),
     "tip tracking": envs.TipTracking(),
     "crawler": envs.CrawlerRun(),
+    "ball turn": envs.BallTurn(),
+    "pick and place": envs.PickPlace(),
 }
 
 

@@ -128,7 +128,7 @@ class AbstractEnv(eqx.Module):
 
     @abc.abstractmethod
     def markers(self, body: PyTree, params: Any) -> Float[Array, "markers dim"]:
-        """Where the markers are [m], the tip last."""
+        """Where the markers are [m]; of a single finger the tip last."""
 
     @abc.abstractmethod
     def observed(self, state: State, params: Any) -> Float[Array, " observations"]:

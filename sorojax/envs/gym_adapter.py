@@ -13,15 +13,19 @@ from jaxtyping import Array, Bool, Float
 
 from sorojax._types import real
 from sorojax.envs import core
+from sorojax.envs.ball_turn import BallTurn
 from sorojax.envs.crawler_run import CrawlerRun
 from sorojax.envs.finger_reach import FingerReach
+from sorojax.envs.pick_place import PickPlace
 from sorojax.envs.tentacle_push import TentaclePush
 from sorojax.envs.tip_tracking import TipTracking
 from sorojax.math.compiled import jit_trees
 
 TASKS: dict[str, type[core.AbstractEnv]] = {
+    "BallTurn": BallTurn,
     "CrawlerRun": CrawlerRun,
     "FingerReach": FingerReach,
+    "PickPlace": PickPlace,
     "TentaclePush": TentaclePush,
     "TipTracking": TipTracking,
 }

@@ -68,3 +68,9 @@ def sent(
     change, k = (late - whole) * period, whole.astype(jnp.int32)
     delivery = Delivery(supplied.value, commands[k + 1], commands[k], change, line.lag)
     return delivery, Supplied(delivery(period), commands)
+
+
+def between(fast: SupplyLine, slow: SupplyLine, share: Float[Array, "2"]) -> SupplyLine:
+    """A line whose lag and dead time are so far from a fast to a slow one, 0 to 1 each."""
+    lag = fast.lag + share[0] * (slow.lag - fast.lag)
+    return SupplyLine(lag, fast.dead_time + share[1] * (slow.dead_time - fast.dead_time))

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from sorojax._types import real
 from sorojax.envs import finger
 from sorojax.envs.core import Verdict
-from sorojax.envs.supply_line import SupplyLine
+from sorojax.envs.supply_line import SupplyLine, between
 from sorojax.units import mm
 
 _AHEAD = 1, 2, 4, 8  # steps of the preview
@@ -91,11 +91,9 @@ class TipTracking(finger.AbstractFinger):
         reach = finger.distance(finger.tip_at_rest(one, params)[1:])
         radius = (0.5 + 0.5 * draw[0]) * reach * jnp.stack([draw[1], 1 - draw[1]])
         rate = 2 * jnp.pi * params.max_frequency * (2 * draw[2:4] - 1)
-        fast, slow = params.fastest, params.supply
-        lag = fast.lag + draw[4] * (slow.lag - fast.lag)
-        dead_time = fast.dead_time + draw[5] * (slow.dead_time - fast.dead_time)
+        line = between(params.fastest, params.supply, draw[4:6])
         phase = 2 * jnp.pi * draw[6:8]
-        goal = TrackingGoal(radius, rate, phase, reach, SupplyLine(lag, dead_time))
+        goal = TrackingGoal(radius, rate, phase, reach, line)
         return finger.hanging(params), jnp.zeros_like(one), goal
 
     def supply_line(self, goal, params):

@@ -2,6 +2,8 @@
 
 from typing import ClassVar
 
+import jax.numpy as jnp
+
 from sorojax.math.linalg.dense import solve_symmetric
 from sorojax.math.ode.steppers import (
     AbstractStepper,
@@ -42,13 +44,16 @@ class LinearlyImplicit(AbstractStepper):
         inner = within(problem, h, state)
         ahead = move(problem, state.q, h * state.v)
         damping, stiffness = inner.damping, inner.stiffness
+        solve = solve_symmetric
         if inner.contact is None:
             mass, force = inner.equations(t + h, ahead, state.v)
         else:
             mass, force, _ = inner.contact.free(t + h, ahead, state.v)
             touching, grown, viscous = inner.contact.force(t + h, ahead, state.v)
             force, stiffness, damping = force + touching, stiffness + grown, damping + viscous
-        a = solve_symmetric(mass + h * damping + h**2 * stiffness, force)
+            # what friction gains with pressure is on one side of the diagonal
+            solve = solve_symmetric if inner.contact.symmetric else jnp.linalg.solve
+        a = solve(mass + h * damping + h**2 * stiffness, force)
         v = state.v + h * a
         q = move(problem, state.q, h * v)
         memory = remembered(problem, h, state, q)
