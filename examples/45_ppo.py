@@ -1,166 +1,112 @@
-"""PPO beside gradients through the physics: one finger, one task, two ways to learn."""
+"""PPO in plain JAX: 256 soft fingers learn to reach, each update one compiled program."""
 
 import sys
-import time
-from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.tree_util import Partial
 
 import sorojax as sj
 from sorojax import envs
-from sorojax.envs import finger
 
 ENV = envs.FingerReach(time_step=4e-3, substeps=5, max_steps=96)
-THRESHOLD = 0.8  # of unseen fingers and targets, within 5 mm at the end of an episode
-FINGERS, STEPS, EPOCHS, PARTS, BLOCK = 256, 48, 4, 8, 10
-DISCOUNT, TRACE, CLIP = 0.95, 0.95, 0.2
-SCALE = np.repeat([1.0, 10.0, 3.0], [6, 3, 24])  # of observations, to about 1 each
+SCALE = np.repeat([1.0, 10.0, 3.0], [6, 3, 24])  # of what is seen, to about 1 each
+FINGERS, STEPS, PASSES, PARTS = 256, 48, 4, 8
+ADAM = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam())
 
 
 class Agent(eqx.Module):
-    """Mean and spread of the change of the commands, and the value of what is seen."""
+    """What changes the commands, what a state is worth, and the spread of the noise."""
 
     actor: eqx.nn.MLP
     critic: eqx.nn.MLP
     log_std: jax.Array
 
-    def mean(self, seen):
-        return seen[3:6] + 0.5 * jnp.tanh(self.actor(SCALE * seen))
+    def command(self, seen, _=None):
+        """The last command, which is seen too, and a change."""
+        return seen[3:6] + jnp.tanh(self.actor(SCALE * seen)) / 2
 
-    def value(self, seen):
-        return self.critic(SCALE * seen)
+    def noisy(self, seen, key):
+        return self.command(seen) + jnp.exp(self.log_std) * jax.random.normal(key, (3,))
 
-    def log_chance(self, seen, action):
-        off = (action - self.mean(seen)) * jnp.exp(-self.log_std)
-        return -jnp.sum(0.5 * off**2 + self.log_std)
+    def judged(self, seen, action):
+        """Logarithm of the density of an action, but for a constant, and value of the state."""
+        off = (action - self.command(seen)) / jnp.exp(self.log_std)
+        return -jnp.sum(off**2 / 2 + self.log_std), self.critic(SCALE * seen)
 
 
 def agent(key) -> Agent:
-    nets = [eqx.nn.MLP(33, n, 64, 2, jax.nn.tanh, key=k)
-            for n, k in zip((3, "scalar"), jax.random.split(key), strict=True)]  # fmt: skip
+    form = Partial(jnp.tanh), Partial(jnp.positive)  # trees without leaves, unlike functions
+    nets = [eqx.nn.MLP(33, n, 64, 2, *form, key=key) for n in (3, "scalar")]
     return Agent(*nets, jnp.full(3, -1.5))
 
 
-def tried(control, memory, key, count, steps):
-    """Episodes of fingers within 4 % of the drawn one, with targets of their own."""
-
-    def one(carry, key):
-        state, seen, memory, own = carry
-        action, memory = control(seen, memory, key)
-        after = envs.step(ENV, key, state, action, own)
-        out = seen, action, after.reward, after.info["distance"]
-        return (after.state, after.observation, memory, own), out
+def episodes(act, key, count, steps):
+    """Fingers within 4 % of the drawn one, with targets of their own, from the beginning."""
 
     def episode(key, own):
+        def one(carry, key):
+            action = act(carry[1], jax.random.fold_in(key, 1))
+            after = envs.step(ENV, key, carry[0], action, own)
+            out = carry[1], action, after.reward, after.info["distance"]
+            return (after.state, after.observation), out
+
         start, *later = jax.random.split(key, steps + 1)
-        begin = (*envs.reset(ENV, start, own), memory, own)
-        last, out = jax.lax.scan(one, begin, jnp.stack(later))
-        return *out, last[1]
+        return jax.lax.scan(one, envs.reset(ENV, start, own), jnp.stack(later))[1]
 
     params = envs.randomised(ENV.default_params(), key, 0.04, members=count)
     return jax.vmap(episode)(jax.random.split(key, count), params)
 
 
-def advantages(agent, seen, reward, last):
-    """Generalised advantage of each step of one episode, and its return."""
-    value = jax.vmap(agent.value)(seen)
-    ahead = jnp.append(value[1:], agent.value(last))
-
-    def back(sum_, x):
-        sum_ = x + DISCOUNT * TRACE * sum_
-        return sum_, sum_
-
-    gain = jax.lax.scan(back, jnp.zeros(()), reward + DISCOUNT * ahead - value, reverse=True)[1]
-    return gain, gain + value
+def tested(act, count=256):
+    """Share of unseen fingers and targets within 5 mm at the end, and the mean reward."""
+    *_, reward, distance = episodes(act, jax.random.key(3), count, ENV.max_steps)
+    return (distance[:, -1] < ENV.tolerance).mean(), reward.mean()
 
 
-def ppo_loss(agent, data):
-    seen, action, before, gain, wanted = data
-    ratio = jnp.exp(jax.vmap(agent.log_chance)(seen, action) - before)
-    gain = (gain - gain.mean()) / (gain.std() + 1e-8)
-    kept = jnp.minimum(ratio * gain, jnp.clip(ratio, 1 - CLIP, 1 + CLIP) * gain)
-    return jnp.mean((jax.vmap(agent.value)(seen) - wanted) ** 2) - kept.mean()
+def loss(agent, data, clip=0.2):
+    seen, action, before, gain, worth = data
+    chance, value = jax.vmap(agent.judged)(seen, action)
+    ratio, gain = jnp.exp(chance - before), (gain - gain.mean()) / gain.std()
+    kept = jnp.minimum(ratio * gain, jnp.clip(ratio, 1 - clip, 1 + clip) * gain)
+    return jnp.mean((value - worth) ** 2) - kept.mean()
 
 
-def ppo(optimiser, carry, key):
-    """One update: episodes of noisy commands, and some passes over their steps."""
-    agent, moments = carry
-
-    def noisy(seen, memory, key):
-        noise = jax.random.normal(key, (3,), seen.dtype)
-        return agent.mean(seen) + jnp.exp(agent.log_std) * noise, memory
-
-    seen, action, reward, _, last = tried(noisy, None, key, FINGERS, STEPS)
-    gain, wanted = jax.vmap(lambda *x: advantages(agent, *x))(seen, reward, last)
-    before = jax.vmap(jax.vmap(agent.log_chance))(seen, action)
-    data = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (seen, action, before, gain, wanted))
-
-    def part(carry, rows):
-        agent, moments = carry
-        slope = eqx.filter_grad(ppo_loss)(agent, [x[rows] for x in data])
-        change, moments = optimiser.update(slope, moments)
-        return (eqx.apply_updates(agent, change), moments), None
-    rows = jnp.concatenate([jax.random.permutation(k, FINGERS * STEPS).reshape(PARTS, -1)
-            for k in jax.random.split(key, EPOCHS)])
-    return carry_scan(part, carry, rows), reward.mean()
+def improved(loss, rate, carry, data):
+    """Agent and moments after one step of Adam."""
+    change, moments = ADAM.update(jax.grad(loss)(carry[0], data), carry[1])
+    return (jax.tree.map(lambda w, way: w - rate * way, carry[0], change), moments), None
 
 
-def carry_scan(f, carry, xs):
-    dyn, static = eqx.partition(carry, eqx.is_array)
-    def g(d, x):
-        c, _ = f(eqx.combine(d, static), x)
-        return eqx.filter(c, eqx.is_array), None
-    return eqx.combine(jax.lax.scan(g, dyn, xs)[0], static)
+def update(carry, key, discount=0.95, trace=0.95):
+    """Episodes with noise on the commands, then some passes over their steps in parts."""
+    seen, action, reward, _ = episodes(carry[0].noisy, key, FINGERS, STEPS + 1)
+    chance, value = jax.vmap(jax.vmap(carry[0].judged))(seen, action)
+    off = reward[:, :-1] + discount * value[:, 1:] - value[:, :-1]
+    later = np.subtract.outer(np.arange(STEPS), np.arange(STEPS))
+    gain = off @ np.tril((discount * trace) ** later)  # generalised advantages
+    told = seen, action, chance, gain, gain + value[:, :-1]
+    rows = [jax.random.permutation(k, FINGERS * STEPS) for k in jax.random.split(key, PASSES)]
+    rows = jnp.stack(rows).reshape(PASSES * PARTS, -1)
+    parts = [x[:, :STEPS].reshape(-1, *x.shape[2:])[rows] for x in told]
+    return jax.lax.scan(Partial(improved, loss, 1e-3), carry, parts)[0], reward.mean()
 
 
-GF, GS = 64, 32
-def gradient(optimiser, carry, key):
-    agent, moments = carry
-    def loss(agent):
-        return -tried(lambda s, m, k: (agent.mean(s), m), None, key, GF, GS)[2].mean()
-    value, slope = eqx.filter_value_and_grad(loss)(agent)
-    change, moments = optimiser.update(slope, moments)
-    return (eqx.apply_updates(agent, change), moments), -value
-
-
-@eqx.filter_jit
-def judge(agent, key):
-    out = tried(lambda s, m, k: (agent.mean(s), m), None, key, 256, 96)
-    return (out[3][:, -1] < ENV.tolerance).mean(), out[2].mean(), jnp.median(out[3][:, -1])
-
-
-def learned(method, rate, updates, seed, block, verbose=True):
-    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate))
-    carry = agent(jax.random.key(seed))
-    carry = carry, optimiser.init(eqx.filter(carry, eqx.is_inexact_array))
-    dyn, static = eqx.partition(carry, eqx.is_array)
-    @jax.jit
-    def many(dyn, keys):
-        def g(d, k):
-            c, r = method(optimiser, eqx.combine(d, static), k)
-            return eqx.filter(c, eqx.is_array), r
-        return jax.lax.scan(g, dyn, keys)
-    start = time.perf_counter(); curve = []
-    for i, keys in enumerate(jax.random.split(jax.random.key(100 + seed), (updates // block, block))):
-        dyn, r = many(dyn, keys)
-        r = float(r.mean()); t = time.perf_counter() - start
-        a = eqx.combine(dyn, static)[0]
-        s = [float(x) for x in judge(a, jax.random.key(3))]
-        curve.append((i, t, r, *s))
-        if verbose and i % 2 == 1: print((i + 1) * block, "%.1f s  r %.4f  success %.3f  ret %.4f median %.2f mm" % (t, r, s[0], s[1], 1e3 * s[2]), "std", np.round(np.exp(np.asarray(a.log_std)), 3), flush=True)
-    return a, curve
+def main(quick: bool = False) -> dict[str, float]:
+    """Learn, and try before and after."""
+    begin = agent(jax.random.key(0))
+    keys = jax.random.split(jax.random.key(1), 4 if quick else 60)
+    learned = jax.jit(lambda *x: jax.lax.scan(update, *x))
+    (end, _), rewards = learned((begin, ADAM.init(begin)), keys)
+    before, after = (100 * float(jax.jit(tested)(a.command)[0]) for a in (begin, end))
+    return {"reached before [%]": before, "reached [%]": after, "reward": float(rewards[-1])}
 
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_numpy_dtype_promotion", "standard")
-    kind, n, rate = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
-    if kind == "ppo":
-        learned(ppo, optax.linear_schedule(rate, rate * 0.05, n * EPOCHS * PARTS), n, 0, 10)
-    else:
-        learned(gradient, optax.cosine_decay_schedule(rate, n), n, 0, 5)
+    sj.enable_compilation_cache()
+    for name, value in main("--quick" in sys.argv).items():
+        print(f"{name:<44} {value:.4g}")
