@@ -1,0 +1,105 @@
+"""What PPO learned runs a simulated bench: valve board, late air, noise on all it measures."""
+
+import runpy
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+
+import sorojax as sj
+from sorojax import envs
+from sorojax.envs import finger
+from sorojax_hardware import run_loop, simulated_board
+
+PPO = runpy.run_path(str(Path(__file__).with_name("45_ppo.py")))
+ENV, KEY = PPO["ENV"], jax.random.key(11)
+FINE = replace(ENV, substeps=1)  # the robot moves in steps of 4 ms, the policy acts in 20 ms
+EXTRA, NOISE = 0.03, 0.01  # s of dead time beside the 10 ms of the training; share of a range
+
+
+def learned(updates):
+    first = PPO["agent"](jax.random.key(0))
+    keys = jax.random.split(jax.random.key(1), updates)
+    run = jax.jit(lambda *x: jax.lax.scan(PPO["update"], *x))
+    return run((first, PPO["ADAM"].init(first)), keys)[0][0]
+
+
+@jax.jit
+def moved(robot, setpoint, dt):
+    """A step of the finger under set-points that have arrived: the board has the dead time."""
+    state, own = robot
+    at_once = eqx.tree_at(lambda p: p.supply.dead_time, own, jnp.zeros(()))
+    after = envs.step(FINE, KEY, state, 2 * setpoint / own.max_pressure - 1, at_once).state
+    return (after, own), after.supply.value
+
+
+@jax.jit
+def commanded(agent, robot, pressure, noise, last):
+    """Set-points from what the bench measures, from the last ones and the markers before."""
+    state, own = robot
+    markers = ENV.markers(state.body, own) + NOISE * own.length * noise
+    told = pressure, last[0][None], jnp.stack([markers, last[1]])
+    told = eqx.tree_at(lambda s: (s.supply.value, s.supply.commands, s.seen), state, told)
+    setpoint = (
+        own.max_pressure * (1 + jnp.clip(agent.command(ENV.observed(told, own)), -1, 1)) / 2
+    )
+    return setpoint, (setpoint, markers)
+
+
+@jax.jit
+def rewarded(bodies, setpoints, goal, own):
+    """As the environment rewards, and how far off the tip is at the end."""
+    tips = jax.vmap(lambda body: ENV.markers(body, own)[-1])(bodies)
+    far = jax.vmap(finger.distance)(tips - goal.target[None])
+    change = jnp.diff(setpoints, axis=0, prepend=jnp.zeros((1, 3))) / own.max_pressure
+    return (1 - far / own.length - 0.05 * jnp.sum(change**2, axis=1)).mean(), far[-1]
+
+
+def on_bench(agent, key, own, seed):
+    """Mean reward of an episode behind the board, and the distance at its end."""
+    start, random = envs.reset(ENV, key, own)[0], np.random.default_rng(seed)
+    limits = np.zeros(3), np.full(3, float(own.max_pressure))
+    # a set-point that arrives within a step of the model acts from the beginning of that step
+    late, noise = float(own.supply.dead_time) + EXTRA + FINE.period, NOISE * limits[1][0]
+    options = {"period": FINE.period, "dead_time": late, "noise": noise, "seed": seed}
+    board, valves = simulated_board(moved, (start, own), limits, keep=True, **options)
+    ticks = run_loop(
+        board, board.clock, lambda t, seen, last: commanded(agent, *seen, last),
+        (jnp.zeros(3), start.seen[0]), limits=limits,
+        measure=lambda t, p: (valves.state, jnp.asarray(p), random.standard_normal((4, 3))),
+        period=ENV.period, duration=ENV.period * (ENV.max_steps + 1),
+    )  # fmt: skip
+    setpoints = jnp.stack([tick.setpoint for tick in ticks])[:-1]
+    each = [state.body for state, _ in valves.states[:: ENV.substeps][1:]]
+    bodies = jax.tree.map(lambda *x: jnp.stack(x), *each)
+    return rewarded(bodies, setpoints, start.goal, own)
+
+
+def main(quick: bool = False) -> dict[str, float]:
+    """Train, and compare episodes in the environment with the same ones behind the board."""
+    agent, count = learned(2 if quick else 60), 2 if quick else 64
+    run = jax.jit(lambda act: PPO["episodes"](act, KEY, count, ENV.max_steps)[2:])
+    still = run(Partial(lambda seen, _: jnp.full(3, -1.0)))[0].mean()
+    reward, distance = run(agent.command)
+    fingers = envs.randomised(ENV.default_params(), KEY, 0.04, members=count)
+    keys = [jax.random.split(key, ENV.max_steps + 1)[0] for key in jax.random.split(KEY, count)]
+    each = [(key, jax.tree.map(lambda x, k=k: x[k], fingers)) for k, key in enumerate(keys)]
+    there, off = np.array([on_bench(agent, *one, k) for k, one in enumerate(each)]).T
+    kept, more = there.mean() / reward.mean(), (there.mean() - still) / (reward.mean() - still)
+    numbers = {"kept of the return [%]": 100 * kept, "kept of what was learned [%]": 100 * more}
+    for name, x in ("in the environment", np.asarray(distance[:, -1])), ("on the bench", off):
+        numbers[f"reached {name} [%]"] = 100 * np.mean(x < ENV.tolerance)
+        numbers[f"median off {name} [mm]"] = 1e3 * np.median(x)
+    return {name: float(value) for name, value in numbers.items()}
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    sj.enable_compilation_cache()
+    for name, value in main("--quick" in sys.argv).items():
+        print(f"{name:<44} {value:.4g}")
