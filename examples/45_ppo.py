@@ -41,7 +41,7 @@ class Agent(eqx.Module):
 def agent(key) -> Agent:
     form = Partial(jnp.tanh), Partial(jnp.positive)  # trees without leaves, unlike functions
     nets = [eqx.nn.MLP(33, n, 64, 2, *form, key=key) for n in (3, "scalar")]
-    return Agent(*nets, jnp.full(3, -1.5))
+    return Agent(*nets, jnp.full(3, -1.5, float))
 
 
 def episodes(act, key, count, steps):

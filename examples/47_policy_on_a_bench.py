@@ -23,10 +23,9 @@ EXTRA, NOISE = 0.03, 0.01  # s of dead time beside the 10 ms of the training; sh
 
 
 def learned(updates):
-    first = PPO["agent"](jax.random.key(0))
-    keys = jax.random.split(jax.random.key(1), updates)
+    one, keys = PPO["agent"](jax.random.key(0)), jax.random.split(jax.random.key(1), updates)
     run = jax.jit(lambda *x: jax.lax.scan(PPO["update"], *x))
-    return run((first, PPO["ADAM"].init(first)), keys)[0][0]
+    return run((one, PPO["ADAM"].init(one)), keys)[0][0]
 
 
 @jax.jit
@@ -45,9 +44,8 @@ def commanded(agent, robot, pressure, noise, last):
     markers = ENV.markers(state.body, own) + NOISE * own.length * noise
     told = pressure, last[0][None], jnp.stack([markers, last[1]])
     told = eqx.tree_at(lambda s: (s.supply.value, s.supply.commands, s.seen), state, told)
-    setpoint = (
-        own.max_pressure * (1 + jnp.clip(agent.command(ENV.observed(told, own)), -1, 1)) / 2
-    )
+    action = jnp.clip(agent.command(ENV.observed(told, own)), -1, 1)
+    setpoint = own.max_pressure * (1 + action) / 2
     return setpoint, (setpoint, markers)
 
 
