@@ -97,12 +97,12 @@ def update(carry, key, discount=0.95, trace=0.95):
 
 def main(quick: bool = False) -> dict[str, float]:
     """Learn, and try before and after."""
-    begin = agent(jax.random.key(0))
-    keys = jax.random.split(jax.random.key(1), 4 if quick else 60)
-    learned = jax.jit(lambda *x: jax.lax.scan(update, *x))
-    (end, _), rewards = learned((begin, ADAM.init(begin)), keys)
-    before, after = (100 * float(jax.jit(tested)(a.command)[0]) for a in (begin, end))
-    return {"reached before [%]": before, "reached [%]": after, "reward": float(rewards[-1])}
+    one, count = agent(jax.random.key(0)), 4 if quick else 60
+    run = jax.jit(lambda *x: jax.lax.scan(update, *x))
+    (end, _), rewards = run((one, ADAM.init(one)), jax.random.split(jax.random.key(1), count))
+    found = rewards[0], rewards[-1], 100 * jax.jit(tested)(end.command)[0]
+    names = "reward of the first update", "reward of the last update", "reached [%]"
+    return dict(zip(names, map(float, found), strict=True))
 
 
 if __name__ == "__main__":

@@ -76,7 +76,7 @@ def main(quick: bool = False, file: Path | None = None) -> dict[str, float]:
     for name, act in ("random", Partial(random)), ("PI", tuned(*grid)):
         numbers[f"{name}: reached [%]"] = 100 * float(test(act)[0])
     full = PPO["FINGERS"] * (PPO["STEPS"] + 1)
-    ways = ("PPO", PPO["update"], 3, 15, full), ("gradients", by_gradients, 5, 12, FEW * SHORT)
+    ways = ("PPO", PPO["update"], 3, 15, full), ("gradients", by_gradients, 5, 24, FEW * SHORT)
     for name, way, updates, blocks, size in ways:
         block = jax.jit(lambda carry, keys, way=way: jax.lax.scan(way, carry, keys)[0])
         compiled = learned(block, updates, 1, 99)[0, 0]
