@@ -44,8 +44,8 @@ def agent(key) -> Agent:
     return Agent(*nets, jnp.full(3, -1.5, float))
 
 
-def episodes(act, key, count, steps):
-    """Fingers within 4 % of the drawn one, with targets of their own, from the beginning."""
+def episodes(act, key, count, steps, about=None, spread=0.04):
+    """Fingers within 4 % of the usual one, with targets of their own, from the beginning."""
 
     def episode(key, own):
         def one(carry, key):
@@ -57,7 +57,7 @@ def episodes(act, key, count, steps):
         start, *later = jax.random.split(key, steps + 1)
         return jax.lax.scan(one, envs.reset(ENV, start, own), jnp.stack(later))[1]
 
-    params = envs.randomised(ENV.default_params(), key, 0.04, members=count)
+    params = envs.randomised(about or ENV.default_params(), key, spread, members=count)
     return jax.vmap(episode)(jax.random.split(key, count), params)
 
 
@@ -81,9 +81,9 @@ def improved(loss, rate, carry, data):
     return (jax.tree.map(lambda w, way: w - rate * way, carry[0], change), moments), None
 
 
-def update(carry, key, discount=0.95, trace=0.95):
+def update(carry, key, about=None, spread=0.04, discount=0.95, trace=0.95):
     """Episodes with noise on the commands, then some passes over their steps in parts."""
-    seen, action, reward, _ = episodes(carry[0].noisy, key, FINGERS, STEPS + 1)
+    seen, action, reward, _ = episodes(carry[0].noisy, key, FINGERS, STEPS + 1, about, spread)
     chance, value = jax.vmap(jax.vmap(carry[0].judged))(seen, action)
     off = reward[:, :-1] + discount * value[:, 1:] - value[:, :-1]
     later = np.subtract.outer(np.arange(STEPS), np.arange(STEPS))

@@ -109,21 +109,16 @@ def draw(curves, numbers: dict[str, float], file: Path) -> None:
         left.plot(steps, reached.mean(axis=1), color=colour, lw=2.5, label=name)
         right.plot(spent, reached, color=colour, lw=0.8)
         right.plot(spent.mean(axis=1), reached.mean(axis=1), color=colour, lw=2.5, label=name)
+    lines = {"asked for": (THRESHOLD, "-"), "PI": (numbers["PI: reached [%]"], "--")}
+    lines["random"] = numbers["random: reached [%]"], ":"
     for axes in (left, right):
-        for name, style in (("PI", "--"), ("random", ":")):
-            axes.axhline(numbers[f"{name}: reached [%]"], color="#8a8f98", ls=style, lw=1.2)
-        axes.axhline(THRESHOLD, color="#1f2430", lw=0.8)
+        for share, style in lines.values():
+            axes.axhline(share, color="#8a8f98", ls=style, lw=1.2)
         axes.spines[["top", "right"]].set_visible(False)
-    far = left.get_xlim()[1]
-    for name, below in (("PI", 4.0), ("random", -2.0)):
-        left.text(
-            far,
-            numbers[f"{name}: reached [%]"] - below,
-            f"{name}",
-            ha="right",
-            va="top" if name == "PI" else "bottom",
-            fontsize=8,
-        )
+    for name, (share, _) in lines.items():
+        above = "top" if name == "PI" else "bottom"
+        place = {"transform": right.get_yaxis_transform(), "ha": "right", "va": above}
+        right.text(0.99, share, name, fontsize=8, **place)
     left.set(
         xlabel="steps of the environment", ylabel="unseen targets reached [%]", xscale="log"
     )
