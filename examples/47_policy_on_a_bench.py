@@ -33,8 +33,7 @@ def varied():
     """Dead times of 10 to 40 ms and noise of 0.1 to 1 mm, the rest within 4 %."""
     usual = finger.FingerParams(supply=envs.SupplyLine(0.05, 0.02), marker_noise=1e-3 / 10**0.5)
     spread = jax.tree.map(lambda x: jnp.full_like(x, 0.04), usual)
-    line = replace(spread.supply, dead_time=np.log(2))
-    return usual, replace(spread, supply=line, marker_noise=np.log(10) / 2)
+    return usual, replace(spread, supply=envs.SupplyLine(0.04, 0.69), marker_noise=1.15)
 
 
 @jax.jit
@@ -81,10 +80,8 @@ def on_bench(agent, key, own, seed):
 
 def main(quick: bool = False, rough: bool = True) -> dict[str, float]:
     """Train, and compare episodes in the environment with the same ones behind the board."""
-    agent, count = (
-        learned(2 if quick else 120, *(varied() if rough else ())),
-        2 if quick else 64,
-    )
+    drawn = varied() if rough else ()
+    agent, count = learned(2 if quick else 120, *drawn), 2 if quick else 64
     run = jax.jit(lambda act: PPO["episodes"](act, KEY, count, ENV.max_steps)[2:])
     still = run(Partial(lambda seen, _: jnp.full(3, -1.0)))[0].mean()
     reward, distance = run(agent.command)
