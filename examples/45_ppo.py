@@ -3,7 +3,7 @@
 The task is that of example 44. The network gives the change of the commands, and sees the last
 ones: at rest it holds, and the loop has integral action. Asked for were 80 % of 256 unseen
 fingers and targets within 5 mm at the end of an episode, more than random pressures (1 %) and a
-tuned PI (76 %, example 46) reach. Five seeds reach 92 to 95 % in 564,000 steps of the
+tuned PI (76 %) reach. In example 46 five seeds reach 92 to 95 % in 564,000 steps of the
 environment, 16 s of one core, and 15 s more for compilation.
 """
 
