@@ -1,10 +1,10 @@
 """Two ways to learn the same: PPO, and gradients through the physics, over five seeds.
 
 Agent, task and test are those of example 45. The threshold was set when the PI was known and
-before any training. Reached are 93 % by PPO (worst seed 92), 89 % by gradients (worst 86), 76 %
-by the best PI of 25 and 1 % by random pressures. PPO passes the threshold after 339,000 steps of
-the environment and 9 s of one core, gradients after 20,500 and 1.6 s (medians), with 15 and 33 s
-of compilation before.
+before any training. Reached are 93 % by PPO (worst seed 92), 89 % by gradients (worst 86),
+76 % by the best PI of 25 and 1 % by random pressures. PPO passes the threshold after 339,000
+steps of the environment and 9 s of one core, gradients after 20,500 and 1.6 s (medians), with
+15 and 33 s of compilation before.
 """
 
 import runpy
