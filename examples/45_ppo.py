@@ -8,6 +8,7 @@ environment, 16 s of one core, and 15 s more for compilation.
 """
 
 import sys
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -45,10 +46,10 @@ class Agent(eqx.Module):
         return -jnp.sum(off**2 / 2 + self.log_std), self.critic(SCALE * seen)
 
 
-def agent(key) -> Agent:
+def agent(key) -> Any:
     form = Partial(jnp.tanh), Partial(jnp.positive)  # trees without leaves, unlike functions
-    nets = [eqx.nn.MLP(33, n, 64, 2, *form, key=key) for n in (3, "scalar")]
-    return Agent(*nets, jnp.full(3, -1.5, float))
+    actor, critic = (eqx.nn.MLP(33, n, 64, 2, *form, key=key) for n in (3, "scalar"))
+    return Agent(actor, critic, jnp.full(3, -1.5, float))
 
 
 def episodes(act, key, count, steps, about=None, spread=0.04):

@@ -12,6 +12,7 @@ import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -30,7 +31,7 @@ FINE = replace(ENV, substeps=1)  # the robot moves in steps of 4 ms, the policy 
 EXTRA, NOISE = 0.03, 0.01  # s of dead time beside the 10 ms of the training; share of a range
 
 
-def learned(updates, about=None, spread=0.04):
+def learned(updates, about=None, spread: Any = 0.04):
     one, keys = PPO["agent"](jax.random.key(0)), jax.random.split(jax.random.key(1), updates)
     update = Partial(PPO["update"], about=about, spread=spread)
     return jax.jit(partial(jax.lax.scan, update))((one, PPO["ADAM"].init(one)), keys)[0][0]
