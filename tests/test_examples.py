@@ -177,6 +177,31 @@ def test_a_finger_learns_to_reach():
 
 
 @pytest.mark.slow
+def test_a_finger_learns_from_samples():
+    with jax.numpy_dtype_promotion("standard"):
+        numbers = main_of("45_ppo")(quick=True)
+    assert numbers["reward of the last update"] > numbers["reward of the first update"] + 0.05
+    assert user_code("45_ppo") <= 60
+
+
+@pytest.mark.slow
+def test_gradients_and_a_tuned_controller_beside_ppo():
+    with jax.numpy_dtype_promotion("standard"):
+        numbers = main_of("46_two_ways_to_learn")(quick=True)
+    assert numbers["PI: reached [%]"] > numbers["random: reached [%]"] + 30
+    assert numbers["gradients: reached, mean [%]"] > numbers["random: reached [%]"] + 15
+    assert user_code("46_two_ways_to_learn") <= 60
+
+
+@pytest.mark.slow
+def test_a_policy_behind_the_board_keeps_most_of_its_return():
+    with jax.numpy_dtype_promotion("standard"):
+        numbers = main_of("47_policy_on_a_bench")(quick=True)
+    assert 80 < numbers["kept of the return [%]"] < 101
+    assert user_code("47_policy_on_a_bench") <= 60
+
+
+@pytest.mark.slow
 def test_an_arm_with_a_pneumatic_finger_picks_a_ball():
     """In the air nothing but the finger holds the ball, and every joint is in balance."""
     pytest.importorskip("mujoco", reason="the extra `robots` is not installed")

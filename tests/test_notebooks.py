@@ -8,13 +8,15 @@ notebook runs in a real kernel too.
 import ast
 import json
 
+import jax
 import pytest
 
 from sorojax import silent
 from tests.scripts import ROOT
 
 FOLDER = ROOT / "examples" / "notebooks"
-NAMES = ("batched_sweep", "design_loop", "estimator")
+NAMES = ("batched_sweep", "design_loop", "estimator", "learning")
+SLOW = ("learning",)
 MOST = 300_000  # bytes
 
 
@@ -48,7 +50,9 @@ def test_the_folder_holds_these_notebooks():
     assert sorted(file.stem for file in FOLDER.glob("*.ipynb")) == sorted(NAMES)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in NAMES]
+)
 def test_a_notebook_runs_and_gives_what_it_stores(name):
     file, cells = FOLDER / f"{name}.ipynb", cells_of(name)
     assert file.stat().st_size < MOST
@@ -56,7 +60,7 @@ def test_a_notebook_runs_and_gives_what_it_stores(name):
     outputs = [output for cell in cells for output in cell["outputs"]]
     assert not [o for o in outputs if o["output_type"] == "error"]
     assert sum("image/png" in o.get("data", {}) for o in outputs) >= 2
-    with silent():
+    with silent(), jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
         names, ends = run(cells)
     pictures = [end for end in ends if getattr(end, "_repr_png_", lambda: None)()]
     assert len(pictures) == sum("image/png" in o.get("data", {}) for o in outputs)
@@ -87,7 +91,18 @@ def _estimator(numbers):
     assert numbers["tip, worst while hidden [mm]"] < 10
 
 
-CHECKS = {"design_loop": _design, "batched_sweep": _sweep, "estimator": _estimator}
+def _learning(numbers):
+    """Both ways learn; gradients take a twentieth of the steps."""
+    assert numbers["PPO: reaches more than half"] and numbers["gradients: reach more than half"]
+    assert numbers["gradients: thousand steps"] < 0.2 * numbers["PPO: thousand steps"]
+
+
+CHECKS = {
+    "design_loop": _design,
+    "batched_sweep": _sweep,
+    "estimator": _estimator,
+    "learning": _learning,
+}
 
 
 def test_a_kernel_runs_a_notebook():
