@@ -65,7 +65,7 @@ def turned_in_strokes(env, start, now, params, memory, step):
 
 def carried_over(env, start, now, params, memory, step):
     """A plan by the clock: over the box, down, close, up, over the shelf, down, open, up."""
-    t = (step + 1) * env.period
+    t = (step + 1).astype(params.box_height.dtype) * env.period
     low = jnp.stack([params.box_height / 2, start.goal.target[1]]) + _ABOVE - params.foot_height
     from_to = jnp.stack([start.body.q[-2], start.goal.target[0]])
     there = _THERE[:, None] * np.array([[-1.0, 1.0]]) + np.array([[1.0, 0.0]])
