@@ -169,6 +169,20 @@ def draw(designs, ends, cost, file) -> None:
     figure.savefig(file, dpi=110)
     plt.close(figure)
 
+    from sorojax import view
+
+    upright = np.array([[1.0, 0, 0, 50 * mm], [0, 0, -1, 0], [0, 1, 0, -24 * mm], [0, 0, 0, 1]])
+    ball = view.place(view.scene_of(sj.sdf.Cylinder(22 * mm, 12 * mm)), upright)
+    rising = np.linspace(0, float(designs[2][5]), 31)  # kPa
+    path = fem.solve_path(made, air=jnp.array(rising) * kPa)
+    bodies = view.scenes_of(path, range(31), field="von_mises", rest=False)
+    solids = [view.merge_scenes(view.extrude(body, 25 * mm), ball) for body in bodies]
+    moving = view.Track(rising, solids.__getitem__, bodies[0].scale, "kPa")
+    look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-62.0, 16.0)}
+    title, speed = "1 N on a ball", rising[-1] / 3
+    film = view.animate(moving, speed=speed, fps=10.0, size=(420, 340), title=title, **look)
+    film.save(Path(file).with_suffix(".webp"))
+
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)

@@ -135,9 +135,19 @@ def draw(run, angles, found, file: Path) -> None:
         xlabel="angle of the threads to the axis [deg]", ylabel="twist [deg]", xlim=(0, 84)
     )
     axes.spines[["top", "right"]].set_visible(False)
-    view.draw_into(shown, scenes, view=view.Camera(-60.0, 12.0))
+    camera = view.Camera(-60.0, 12.0)
+    view.draw_into(shown, scenes, view=camera)
     figure.savefig(file)
     plt.close(figure)
+
+    rising = np.linspace(0, PRESSURE, 31)
+    ways = fem.solve_path(run.problem, pressure=jnp.array(rising)).displacements
+    bodies = [scene(sj.replace(run, lambda run: run.displacement, u)) for u in ways]
+    moving = view.Track(rising / kPa, bodies.__getitem__, None, "kPa")
+    look = {"renderer": "own", "samples": 2, "shadows": True, "view": camera}
+    speed = PRESSURE / kPa / 3
+    film = view.animate(moving, speed=speed, fps=10.0, size=(300, 400), **look)
+    film.save(file.with_suffix(".webp"))
 
 
 if __name__ == "__main__":
