@@ -165,6 +165,23 @@ def draw(problem, near, found, errors, file) -> None:
     figure.savefig(file, dpi=130)
     plt.close(figure)
 
+    from sorojax import view
+
+    moments, tracks = np.linspace(0, DURATION, 49), []
+    for name in ("start", "together"):
+        film, path = films[name], films[name].path
+        air = np.interp(moments, film.time, film["air.pressure"])
+        path = sj.fem.solve_path(path.problem, air=jnp.linspace(0, air.max(), 33))
+        bodies = view.scenes_of(path, range(33), field="von_mises", rest=False)
+        nearest = np.abs(np.subtract.outer(air, np.asarray(path.values))).argmin(axis=1)
+        solids = [view.extrude(body, 20 * mm) for body in bodies]
+        seen = [solids[k] for k in nearest]
+        tracks.append(view.Track(moments, seen.__getitem__, bodies[0].scale))
+    look = {"renderer": "own", "samples": 2, "shadows": True, "view": view.Camera(-62.0, 16.0)}
+    look |= {"names": ("the start", "together"), "size": (560, 260)}
+    moving = view.animate(tracks[0], beside=tracks[1], speed=0.3, fps=12.0, **look)
+    moving.save(Path(file).with_suffix(".webp"))
+
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
