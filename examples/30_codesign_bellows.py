@@ -171,6 +171,7 @@ def draw(problem, near, found, errors, file) -> None:
     for name in ("start", "together"):
         film, path = films[name], films[name].path
         air = np.interp(moments, film.time, film["air.pressure"])
+        assert path is not None
         path = sj.fem.solve_path(path.problem, air=jnp.linspace(0, air.max(), 33))
         bodies = view.scenes_of(path, range(33), field="von_mises", rest=False)
         nearest = np.abs(np.subtract.outer(air, np.asarray(path.values))).argmin(axis=1)

@@ -1,12 +1,12 @@
 """What environments of rods share: forces that a supply drives, markers, and a motion."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from sorojax.envs.supply_line import Delivery
 from sorojax.math.ode.linearly_implicit import LinearlyImplicit
 from sorojax.math.ode.steppers import AbstractStepper
 from sorojax.rod import (
@@ -38,7 +38,7 @@ class Inflated(AbstractForce):
     """
 
     chambers: AbstractPressureMap
-    pressure: Delivery
+    pressure: Callable[[Array], Array]
 
     def __call__(self, t, motion):
         return Pressurised(self.chambers, self.pressure(t))(t, motion)

@@ -114,7 +114,7 @@ class SampledForce(AbstractModalForce):
 
     def _strains(self, strain: Callable, F: Entries) -> Float[Array, "pairs quad cells"]:
         """Entries of a symmetric tensor of the deformation at the points."""
-        return jnp.stack(jnp.broadcast_arrays(*strain(self.body.kinematics.embed(F))))
+        return jnp.stack(jnp.broadcast_arrays(*strain(self.body.kinematics.embed(tuple(F)))))
 
     def _turned(self, strain: Callable, q: Modes) -> Float[Array, "modes pairs quad cells"]:
         """Its derivative by the coordinates."""
