@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+import nbformat
 import pytest
 
 from tests.scripts import ROOT
@@ -90,7 +91,6 @@ def test_a_broken_link_is_found(tmp_path, monkeypatch):
 @pytest.mark.parametrize("page", sorted(DOCS.glob("tutorials/0*.md")), ids=label)
 def test_a_tutorial_is_a_notebook_too(page, tmp_path):
     """With every program of the page, what these print, and the pictures that they draw."""
-    nbformat = pytest.importorskip("nbformat", reason="the extra `docs` is not installed")
     tool("notebooks").write(tmp_path)
     book = nbformat.read(tmp_path / f"{page.stem}.ipynb", as_version=4)
     nbformat.validate(book)
