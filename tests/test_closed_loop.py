@@ -242,7 +242,7 @@ def test_a_design_that_tangles_its_mesh_is_refused(start, first):
     def at(wall):
         return chain(start, (30 * mm, wall), near=first)["body.tip_angle"][-1]
 
-    with pytest.raises(RuntimeError, match="drawing_to_loop: mesh: A cell .* inside out"):
+    with pytest.raises(ValueError, match="move: .*mesh can follow"):
         jax.grad(at)(jnp.array(9 * mm))
 
 
