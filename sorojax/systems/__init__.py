@@ -56,6 +56,7 @@ from sorojax.systems.integrate.integrate import Event
 from sorojax.systems.integrate.partitioned import partitioned
 from sorojax.systems.integrate.sampled import Sampled, simulate_sampled
 from sorojax.systems.integrate.simulate import Trajectory, last_state, simulate, state_at
+from sorojax.systems.integrate.staggered import Staggered
 from sorojax.systems.network import Network, as_term, outputs
 
 __all__ = [
@@ -98,6 +99,7 @@ __all__ = [
     "SmoothRamp",
     "Source",
     "Stack",
+    "Staggered",
     "Step",
     "TipSpring",
     "Touch",

@@ -282,6 +282,9 @@ class Contact(AbstractPenaltyContact):
         friction = (areas[..., None] * traction).reshape(flat.shape)
         return found._replace(force=found.force + friction, friction=friction)
 
+    def in_motion(self, problem):
+        return self if self.start is not None else moving(self, problem.mesh, self.value)
+
     def remembered(self, problem, u):
         return self if self.grip is None else settled(self, problem, u)
 

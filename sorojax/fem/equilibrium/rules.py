@@ -27,7 +27,7 @@ SAFE = 0.9
 #: that were 1e-15, less than the rounding that a slender body amplifies.
 _NO_DISPLACEMENT = 1e-6
 _NO_MOVE = 1e-12  # of the largest prescribed displacement
-_TURNED = 0.5  # share of its slope at the start, that the energy may rise with at the end
+TURNED = 0.5  # share of its slope at the start, that the energy may rise with at the end
 MAX_SHORTENINGS = 12  # for that reason, of one step
 
 _EASY, _GROWTH = 5, 1.5  # iterations of a load step after which the next one is longer
@@ -82,7 +82,7 @@ MOST_ITERATIONS = 6
 def turned(slope: Number, end: Number) -> Truth:
     """Whether the energy, which falls by `slope` [J] along a step at its start, rises too
     steeply at its `end`."""
-    return (slope < 0) & (end > -_TURNED * slope)
+    return (slope < 0) & (end > -TURNED * slope)
 
 
 def shortened(share: Number, slope: Number, end: Number) -> Number:

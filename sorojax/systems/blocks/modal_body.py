@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from itertools import combinations_with_replacement
+from itertools import combinations_with_replacement, zip_longest
 from typing import Any
 
 import equinox as eqx
@@ -28,6 +28,11 @@ from sorojax.systems.blocks.modal_basis import (
     displacement,
 )
 from sorojax.systems.blocks.modal_inertia import ModalInertia, modal_inertia
+from sorojax.systems.blocks.surface_contact import (
+    SurfaceContact,
+    contacts_of,
+    surface_contact,
+)
 
 #: Reach beyond which a trained force is not trusted; a bellows' tip is off by 7 % at 1.22.
 _FARTHEST = 1.25
@@ -132,6 +137,7 @@ class ModalBody(AbstractBlock):
         energies: Whether energies are outputs.
         pulls: Loads that are tendons: they do not push, whatever the input.
         inertia: Of a body that a frame carries; `CarryingBody` moves it with a link.
+        contacts: Of its surface with shapes that do not deform; `Staggered()` moves it.
         markers: Places at q = 0 and how they move, by name.
         q, v: At the start.
     """
@@ -148,6 +154,7 @@ class ModalBody(AbstractBlock):
     energies: bool = eqx.field(static=True, default=False)
     pulls: tuple[str, ...] = eqx.field(static=True, default=())
     inertia: ModalInertia | None = None
+    contacts: tuple[SurfaceContact, ...] = ()
 
     @property
     def inputs(self):
@@ -175,7 +182,10 @@ class ModalBody(AbstractBlock):
         )
 
     def initial_state(self):
-        state, times = {"q": self.q, "v": self.v}, self.force.relaxation_times
+        times = self.force.relaxation_times
+        state: dict[str, Any] = {"q": self.q, "v": self.v}
+        if self.contacts:
+            state["stretch"] = tuple(one.unstretched() for one in self.contacts)
         if times is None:
             return state
         return state | {"relaxed": jnp.broadcast_to(self.q, (*times.shape, *self.q.shape))}
@@ -207,6 +217,12 @@ class ModalBody(AbstractBlock):
                 "ModalBody: got a body that a frame carries, need a link that moves it. Put "
                 "systems.CarryingBody(arm, {link: body}) into the network."
             )
+        if self.contacts:
+            raise ValueError(
+                "ModalBody: got a body in contact, whose friction remembers the steps before, "
+                "and a method for differential equations, need one of fixed steps. Call "
+                "simulate(network, duration, step=...) with Staggered(), its default."
+            )
         q, times, relaxed = state["q"], self.force.relaxation_times, state.get("relaxed")
         rates = {"q": state["v"], "v": self.pull(q, state["v"], inputs, relaxed)}
         if times is None or relaxed is None:
@@ -218,14 +234,21 @@ class ModalBody(AbstractBlock):
     ) -> Modes:
         """Force on the modal coordinates in a frame that rests."""
         force = self.force(q) if relaxed is None else self.force.with_branches(q, relaxed)
-        total = -force - self.damping @ v
+        return self.loads(inputs)(q) - force - self.damping @ v
+
+    def loads(self, inputs) -> Polynomial:
+        """Force of the driven loads on the modal coordinates, as a function of these."""
+        zero = jnp.zeros_like(self.q)
+        terms = [zero]
         for load, port, *_ in self.ports:
             given = inputs[port].reshape(-1)
             if load in self.pulls:
                 given = jnp.where(given >= 0, given, jnp.zeros_like(given))
-            _, pull = jax.vjp(self.works[load], q)
-            total = total + pull(given)[0]
-        return total
+            # the slope of a polynomial is one of the next lower order
+            slope = [jnp.tensordot(given, term, 1) for term in self.works[load].terms[1:]]
+            pairs = zip_longest(terms, slope)
+            terms = [b if a is None else a if b is None else a + b for a, b in pairs]
+        return Polynomial(tuple(terms))
 
 
 def modal_body(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBody:
@@ -249,7 +272,9 @@ def modal_body(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBo
     if order is not None and order not in (1, 2, 3):
         raise ValueError(f"reduced: `order` must be 1, 2, 3 or None, got {order}.")
     inertia = _in_a_frame(body, basis) if body.moved else None
-    body = without_weight(body)
+    touching = contacts_of(body.problem)
+    contacts = tuple(surface_contact(body.problem, load, basis) for load in touching)
+    body = without_contacts(without_weight(body))
     values = {name: jnp.zeros_like(load.value) for name, load in body.drives.items()}
     free = body.loaded(values)
     rest = ProjectedForce(free, basis)
@@ -281,6 +306,7 @@ def modal_body(body: FemBody, basis: Basis, *, order: int | None = 3) -> ModalBo
         body.energies,
         tuple(name for name, load in body.drives.items() if isinstance(load, fem.Tendon)),
         inertia,
+        contacts,
     )
 
 
@@ -298,6 +324,17 @@ def reducible(where: str, body: FemBody) -> None:
         raise ValueError(
             f"{where}: got a body of a Viscoelastic material, need one without memory. Give "
             "its `base` to the problem, with fem.Rayleigh(...) for damping."
+        )
+    touching = {load.name for load in contacts_of(body.problem)}
+    if moved := sorted(touching & set(body.drives)):
+        raise ValueError(
+            f"{where}: got contacts with driven obstacles {moved}, need obstacles that stay. "
+            "Keep the FemBody."
+        )
+    if touching and body.moved:
+        raise ValueError(
+            f"{where}: got contact {sorted(touching)} of a body that a frame carries, need a "
+            "body whose supports stay. Keep the FemBody."
         )
     no_peaks(where, body.problem.material)
     constant_mass(where, body)
@@ -330,6 +367,14 @@ def without_weight(body: FemBody) -> FemBody:
     if not body.moved:
         return body
     loads = tuple(x for x in body.problem.loads if not isinstance(x, fem.Gravity))
+    return eqx.tree_at(lambda b: b.problem.loads, body, loads)
+
+
+def without_contacts(body: FemBody) -> FemBody:
+    """A body that touches nothing."""
+    if not contacts_of(body.problem):
+        return body
+    loads = tuple(x for x in body.problem.loads if not isinstance(x, fem.Contact))
     return eqx.tree_at(lambda b: b.problem.loads, body, loads)
 
 
@@ -375,15 +420,18 @@ def _work(body: FemBody, name: str, basis: Basis) -> Polynomial:
             f"reduced: `{name}` is a {type(load).__name__}, whose force is not proportional "
             "to its input. Drive the body by pressures, forces or tendons."
         )
-    return Polynomial(derivatives(work, zero, 3))
+    return taylor(work, zero, 3)
 
 
-def derivatives(function: Callable[[Modes], Array], at: Modes, order: int) -> tuple:
-    """Value and derivatives of a cheap function."""
+def taylor(function: Callable[[Modes], Array], at: Modes, order: int) -> Polynomial:
+    """A cheap function about a point, without the last terms where they are zero."""
     found: list[Any] = [function]
     for _ in range(order):
         found.append(jax.jacfwd(found[-1]))
-    return tuple(jax.jit(f)(at) for f in found)
+    terms = [jax.jit(f)(at) for f in found]
+    while not is_traced(terms) and len(terms) > 1 and not np.any(np.asarray(terms[-1])):
+        terms.pop()
+    return Polynomial(tuple(terms))
 
 
 def _taylor(force: AbstractModalForce, count: int, order: int) -> Polynomial:

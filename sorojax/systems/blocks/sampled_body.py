@@ -38,14 +38,28 @@ from sorojax.systems.blocks.modal_basis import (
     displacement,
     orthonormal,
 )
-from sorojax.systems.blocks.modal_body import ModalBody, modal_body, reducible, without_weight
-from sorojax.systems.blocks.sampled_force import Branches, SampledForce, sampled_force
+from sorojax.systems.blocks.modal_body import (
+    ModalBody,
+    modal_body,
+    reducible,
+    without_contacts,
+    without_weight,
+)
+from sorojax.systems.blocks.sampled_force import (
+    Branches,
+    SampledForce,
+    pieces,
+    sampled_force,
+)
 
 _EIGENMODES = 2  # of the shapes, beside those of the equilibria
 _AROUND = 0.05  # of the spread of states: how far more of them are drawn about each
 _SLOPES = 0.2  # weight of the slopes of the force, beside it
 _SMALL = 0.1  # of the largest displacement: errors of smaller ones count as of one of this size
+_FREE = 1e-9  # of the largest stiffness: below it a shape moves the body as a whole
 _PASSES = 12  # of Newton's method to an equilibrium
+_CANDIDATES = 6000  # cells or points among which is chosen, at most
+_FRAMES = 200  # of the motions that cells are chosen by, at most about
 _MOST = 400  # cells that are chosen at most
 
 
@@ -55,12 +69,16 @@ class SampledBody(eqx.Module):
 
     Attributes:
         body: The reduced body, a block with the ports of the full one and `reach`.
-        cells: Those that its force comes from.
-        weights: How many cells each stands for.
+        cells: Those that its force comes from. A cell stands there for each of its points
+            that are chosen, where these can be chosen one by one: where no pressure is one
+            unknown of the whole cell.
+        weights: How many cells, or points, each stands for.
         training_error: Of the force and its slopes in the states of training, relative, each
             as the displacement that it makes.
         error: Of the displacement at equilibria that the training has not seen, in the norm
-            of the mass, over the largest displacement; infinite where none is found.
+            of the mass, over the largest displacement; infinite where none is found. Without
+            paths, at frames of the motions.
+        share: Of all quadrature points, those that are evaluated.
         num_cells: Of the full body.
     """
 
@@ -69,13 +87,14 @@ class SampledBody(eqx.Module):
     weights: Float[Array, " kept"]
     training_error: Float[Array, ""]
     error: Float[Array, ""]
+    share: Float[Array, ""]
     num_cells: int = eqx.field(static=True)
 
     def _text(self) -> str:
-        share = len(self.cells) / self.num_cells
+        cells = len(np.unique(np.asarray(self.cells)))
         return (
-            f"SampledBody: {len(self.body.basis)} shapes, {len(self.cells)} of "
-            f"{self.num_cells} cells ({share:.1%})\n  force off by "
+            f"SampledBody: {len(self.body.basis)} shapes, {float(self.share):.1%} of the "
+            f"quadrature points, in {cells} of {self.num_cells} cells\n  force off by "
             f"{float(self.training_error):.2g} in training, displacement by "
             f"{float(self.error):.2g} beside it"
         )
@@ -86,7 +105,7 @@ Inputs = Mapping[str, Float[Array | np.ndarray, "states ..."]]
 
 def sampled_body(
     body: FemBody,
-    paths: Sequence[Inputs],
+    paths: Sequence[Inputs] = (),
     *,
     motions: Sequence[Float[Array | np.ndarray, "frames nodes dim"]] = (),
     modes: int = 12,
@@ -140,32 +159,36 @@ def sampled_body(
         (6, True)
     """
     given, body = body, _without_memory(body)
-    _checked(body, paths, modes)
-    weighed, body = body, without_weight(body)
+    shown = [jnp.asarray(u) for frames in motions for u in frames]
+    _checked(body, paths, modes, len(shown))
+    weighed, body = body, without_contacts(without_weight(body))
     seen, told, slopes = _equilibria(body, paths, given.problem)
     report("sampled_body: cells", 0, 1)
-    shown = [jnp.asarray(u) for frames in motions for u in frames]
+    shown, beside = (shown, []) if paths else (shown[::2], shown[1::2])
     basis = snapshot_basis(body, jnp.stack([*(s.u for s in seen), *slopes, *shown]), modes)
-    count = body.problem.mesh.num_cells
-    every = sampled_force(body, basis, np.arange(count), np.ones(count))
+    cells, points = pieces(body)
+    every = sampled_force(body, basis, cells, np.ones(len(cells)), points)
     whole = modal_body(weighed, basis, order=None)
     whole = eqx.tree_at(lambda b: b.force, whole, every)
     known = [coordinates(body, basis, s.u) for s in seen]
-    free = [coordinates(body, basis, u) for u in shown]
+    free = [coordinates(body, basis, u) for u in shown[:: 1 + len(shown) // _FRAMES]]
     near: list = [(q, None, 0) for q in free]
     for q, state in zip(known, seen, strict=True):
         near.append((q, -_slope(whole, state.inputs, q), states))
     spread = _AROUND * jnp.std(jnp.stack([*known, *free]), axis=0)
-    cells, weights, left = _chosen(every, near, spread, tolerance, seed)
-    chosen = sampled_force(body, basis, cells, weights)
+    kept, weights, left = _chosen(every, near, spread, tolerance, seed)
+    cells, points = cells[kept], None if points is None else points[kept]
+    chosen = sampled_force(body, basis, cells, weights, points)
     known += [coordinates(body, basis, s.u) for s in told]
     trained = jnp.max(jax.vmap(chosen.strain)(jnp.stack([*known, *free])))
     branches = _branches(given, cells)
     chosen = dataclasses.replace(chosen, trained=trained, branches=branches)
     small = eqx.tree_at(lambda b: b.force, whole, chosen)
-    error = _error(body, small, told)
+    error = _error(body, small, told) if told else _error_of_frames(body, small, whole, beside)
     report("sampled_body: cells", 1, 1)
-    return SampledBody(small, *map(jnp.asarray, (cells, weights, left)), error, count)
+    share = chosen.volumes.size / every.volumes.size
+    told = map(jnp.asarray, (cells, weights, left, error, share))
+    return SampledBody(small, *told, body.problem.mesh.num_cells)
 
 
 def _without_memory(body: FemBody) -> FemBody:
@@ -240,25 +263,54 @@ def _error(body: FemBody, small: ModalBody, told: Sequence[_State]) -> Float[Arr
     return jnp.where(jnp.isfinite(error), error, jnp.inf)
 
 
-def _checked(body: FemBody, paths: Sequence[Inputs], modes: int) -> None:
+def _error_of_frames(
+    body: FemBody, small: ModalBody, whole: ModalBody, beside: Sequence[Array]
+) -> Float[Array, ""]:
+    """Largest error of displacements that were not trained on, what the shapes miss of them and
+    what the cells do, over the largest of them without their part in a motion of the whole."""
+
+    def squares(u):
+        q = coordinates(body, small.basis, u)
+        missed = _size(body, u - displacement(small.basis, q))
+        lack = small.force(q) - whole.force(q)
+        values, vectors = jnp.linalg.eigh(jax.jacfwd(whole.force)(q))
+        held = values > _FREE * values[-1]
+        moved = jnp.where(held, vectors.T @ lack / jnp.where(held, values, 1.0), 0.0)
+        bent = jnp.where(held, vectors.T @ (q - small.q), 0.0)
+        return missed**2 + moved @ moved, missed**2 + bent @ bent
+
+    off, size = jax.lax.map(squares, jnp.stack(beside))
+    return jnp.sqrt(jnp.max(off) / jnp.max(size))
+
+
+def _checked(body: FemBody, paths: Sequence[Inputs], modes: int, frames: int) -> None:
     reducible("sampled_body", body)
-    touching = [load.name for load in body.problem.loads if not load.smooth]
-    if touching:
-        raise ValueError(
-            f"sampled_body: got contact {touching}, need loads that are smooth functions of "
-            "the displacement. Keep the FemBody, or modal_body(..., order=None)."
-        )
+    for load in body.problem.loads:
+        if not (load.smooth or isinstance(load, fem.Contact)):
+            raise ValueError(
+                f"sampled_body: got the contact `{load.name}` of the body with itself, need "
+                "loads that are smooth functions of the displacement, or fem.Contact. Keep "
+                "the FemBody."
+            )
     for path in paths:
         if len(path) != 1 or not set(path) <= set(body.drives):
             raise ValueError(
                 f"sampled_body: got a path of {sorted(path)}, need one driven load of "
                 f"{sorted(body.drives)}. Give one path per load."
             )
-    count = sum(len(rows) for path in paths for rows in path.values())
-    if count < 4 or modes < 1 + _EIGENMODES:
+    free = not body.problem.supports
+    if free and paths:
         raise ValueError(
-            f"sampled_body: got {count} equilibria and {modes} modes, need 4 and "
-            f"{1 + _EIGENMODES} or more. Give longer paths."
+            "sampled_body: got paths of a body without supports, which has no equilibria of "
+            "its own, need motions. Leave `paths` out and give `motions`."
+        )
+    count = sum(len(rows) for path in paths for rows in path.values())
+    least = 1 + _EIGENMODES
+    if modes < least or (count < 4 if paths else frames < 2 * modes):
+        need = "4 equilibria" if paths else f"{2 * modes} frames, as there is no path,"
+        raise ValueError(
+            f"sampled_body: got {count} equilibria, {frames} frames and {modes} modes, need "
+            f"{need} and {least} modes or more. Give longer paths or motions."
         )
 
 
@@ -284,19 +336,33 @@ def snapshot_basis(
     body: FemBody, displacements: Float[Array, "states nodes dim"], modes: int
 ) -> Basis:
     """Shapes for `modal_body`: the lowest eigenmodes and the main directions of displacements
-    from rest (proper orthogonal decomposition in the mass)."""
+    from rest (proper orthogonal decomposition in the mass). Of a body without supports its
+    translations take the place of the eigenmodes."""
     system, mass = body.problem.space.system, body.matter().mass
+    still, free = jnp.zeros_like(displacements[0]), not body.problem.supports
     rows = displacements.reshape(displacements.shape[0], -1)
-    sizes = jax.vmap(lambda row: jnp.sqrt(row @ product(system, mass, row)))(rows)
+    weigh = jax.vmap(lambda row: product(system, mass, row))
+    fixed = orthonormal(system, mass, _translations(body.problem)) if free else rows[:0]
+    rows = rows - rows @ weigh(fixed).T @ fixed if free else rows
+    sizes = jnp.sqrt(jnp.sum(rows * weigh(rows), axis=1))
     rows = rows[np.asarray(sizes) > 1e-12 * float(jnp.max(sizes))]
-    weighed = jax.vmap(lambda row: product(system, mass, row))(rows)
-    values, vectors = jnp.linalg.eigh(rows @ weighed.T)
-    main = (vectors[:, ::-1].T @ rows)[: modes - _EIGENMODES]
-    still = jnp.zeros_like(displacements[0])
-    eigen = fem.eigenmodes(body.problem, still, _EIGENMODES).shapes
-    both = jnp.concatenate([main, eigen.reshape(_EIGENMODES, -1)])
-    shapes = orthonormal(system, mass, both)
+    _, vectors = jnp.linalg.eigh(rows @ weigh(rows).T)
+    beside = [fixed] if free else [_eigenmodes(body.problem, still)]
+    main = (vectors[:, ::-1].T @ rows)[: modes - len(beside[0])]
+    both = [*beside, main] if free else [main, *beside]
+    shapes = orthonormal(system, mass, jnp.concatenate(both))
     return Basis(still, shapes.reshape(-1, *still.shape))
+
+
+def _eigenmodes(problem: fem.Problem, still) -> Float[Array, "modes dofs"]:
+    return fem.eigenmodes(problem, still, _EIGENMODES).shapes.reshape(_EIGENMODES, -1)
+
+
+def _translations(problem: fem.Problem) -> Float[Array, "directions dofs"]:
+    """Displacements by one length of all nodes, along each axis of the world."""
+    nodes, dim = problem.mesh.points.shape
+    first = 1 if isinstance(problem.kinematics, fem.Axisymmetric) else 0
+    return jnp.tile(jnp.eye(dim)[first:], (1, nodes))
 
 
 def _chosen(
@@ -323,7 +389,10 @@ def _chosen(
     def rows_of(q, stiffness):
         slopes = jax.jacfwd(of_cells)(q)
         values, vectors = jnp.linalg.eigh(jnp.sum(slopes, axis=1))
-        half = vectors.T / jnp.sqrt(jnp.abs(values))[:, None]
+        size = jnp.abs(values)
+        held = size > _FREE * jnp.max(size)
+        half = jnp.where(held, 1 / jnp.sqrt(jnp.where(held, size, 1.0)), 0.0)
+        half = half[:, None] * vectors.T
         bent = jnp.einsum("am,mcn,bn->abc", half, slopes, half)[upper]
         size = jnp.sqrt(jnp.asarray(len(values), q.dtype))
         force = of_cells(q)
@@ -333,28 +402,34 @@ def _chosen(
         return moved, _SLOPES * bent / size
 
     draw = np.random.default_rng(seed)
+    # so many slopes have nearly the scalar products of all of them
+    count, pieces = min(len(upper[0]), len(spread)), whole.volumes.shape[1]
+    some = np.sort(draw.permutation(pieces)[:_CANDIDATES])
     rows = []
     for q, stiffness, more in states:
         for away in (0.0, *draw.normal(size=(more, len(q)))):
-            rows.append(rows_of(q + spread * jnp.asarray(away), stiffness))
-    forces, slopes = ([np.asarray(x) for x in kind] for kind in zip(*rows, strict=True))
-    sizes = np.array([np.linalg.norm(force.sum(axis=1)) for force in forces])
+            moved, bent = rows_of(q + spread * jnp.asarray(away), stiffness)
+            mix = draw.normal(size=(count, len(bent))) / np.sqrt(count)
+            each = np.asarray(moved), mix @ np.asarray(bent)
+            rows.append([(row[:, some], row.sum(axis=1)) for row in each])
+    sizes = np.array([np.linalg.norm(moved[1]) for moved, _ in rows])
     sizes = np.maximum(sizes, _SMALL * sizes.max())
-    sized = [force / size for force, size in zip(forces, sizes, strict=True)]
-    return sparse_weights(np.concatenate([*sized, *slopes]), tolerance)
+    sized = [(x / size for x in moved) for (moved, _), size in zip(rows, sizes, strict=True)]
+    of_some, of_all = zip(*sized, *(bent for _, bent in rows), strict=True)
+    found = sparse_weights(np.concatenate(of_some), np.concatenate(of_all), tolerance)
+    return some[found[0]], *found[1:]
 
 
 def sparse_weights(
-    rows: Float[np.ndarray, "rows cells"], tolerance: float
+    rows: Float[np.ndarray, "rows columns"], want: Float[np.ndarray, " rows"], tolerance: float
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Few columns and weights, none negative, whose weighted sum is that of all columns up to
-    a relative error, and that error: Lawson and Hanson's method, ended early.
+    """Few columns and weights, none negative, whose weighted sum is `want` up to a relative
+    error, and that error: Lawson and Hanson's method, ended early.
 
     Reference:
         Chapman, Avery, Collins, Farhat, Accelerated mesh sampling for the hyper reduction of
         nonlinear computational models, Int. J. Num. Meth. Eng. 109, 2017.
     """
-    want = rows.sum(axis=1)
     size, left = np.linalg.norm(want), want
     chosen, weights = np.zeros(0, int), np.zeros(0)
     while np.linalg.norm(left) > tolerance * size and len(chosen) < min(_MOST, rows.shape[1]):

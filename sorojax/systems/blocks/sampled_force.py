@@ -47,7 +47,7 @@ from sorojax.systems.blocks.modal_basis import (
 from sorojax.systems.blocks.modal_body import (
     AbstractModalForce,
     Polynomial,
-    derivatives,
+    taylor,
 )
 
 
@@ -235,18 +235,20 @@ def sampled_force(
     basis: Basis,
     cells: Int[np.ndarray, " kept"],
     weights: Float[Array | np.ndarray, " kept"],
+    points: Int[np.ndarray, " kept"] | None = None,
 ) -> SampledForce:
-    """The force of `cells` of a body, each times its weight."""
+    """The force of `cells` of a body, each times its weight, or of one of the quadrature
+    `points` of each."""
     free = body.loaded({name: jnp.zeros_like(x.value) for name, x in body.drives.items()})
     whole = _cells(free, basis)
-    chosen = _taken(whole, np.asarray(cells), free.mesh.num_cells)
+    chosen = _taken(whole, np.asarray(cells), points, free.mesh.num_cells)
 
     def loads(q):
         force = load_force(free, displacement(basis, q))
         return jnp.einsum("kni,ni->k", basis.shapes, force)
 
     zero = jnp.zeros(len(basis), basis.shapes.dtype)
-    made = Polynomial(derivatives(loads, zero, 3))
+    made = taylor(loads, zero, 3)
     volumes = chosen.volumes * jnp.asarray(weights)[None]
     return eqx.tree_at(lambda f: (f.volumes, f.loads), chosen, (volumes, made))
 
@@ -265,12 +267,29 @@ def _cells(problem: fem.Problem, basis: Basis) -> SampledForce:
     return SampledForce(energy, rest, slopes, points.volumes, none)
 
 
-def _taken(force: SampledForce, cells: np.ndarray, count: int) -> SampledForce:
-    """The force of some of the cells."""
+def pieces(body: FemBody) -> tuple[Int[np.ndarray, " all"], Int[np.ndarray, " all"] | None]:
+    """All that may be chosen: cells, and points of these where no pressure couples them."""
+    problem = body.problem
+    points = quadrature_points(problem.mesh, problem.kinematics)
+    cells, count = np.arange(problem.mesh.num_cells), points.volumes.shape[0]
+    if body_at(bare(problem), points).modes is not None:
+        return cells, None
+    return np.tile(cells, count), np.repeat(np.arange(count), len(cells))
 
-    def last(leaf):
-        by_cell = eqx.is_array(leaf) and leaf.ndim > 0 and leaf.shape[-1] == count
-        return leaf[..., cells] if by_cell else leaf
 
-    energy, rest, volumes = jax.tree.map(last, (force.body, force.rest, force.volumes))
-    return SampledForce(energy, rest, force.slopes[..., cells], volumes, force.loads)
+def _taken(
+    force: SampledForce, cells: np.ndarray, points: np.ndarray | None, count: int
+) -> SampledForce:
+    """The force of some of the cells, or of one point of each."""
+    quad = force.volumes.shape[0]
+
+    def taken(leaf):
+        if not (eqx.is_array(leaf) and leaf.ndim > 0 and leaf.shape[-1] == count):
+            return leaf
+        if points is None:
+            return leaf[..., cells]
+        every = jnp.broadcast_to(leaf, (*leaf.shape[:-2], quad, count))
+        return every[..., points, cells][..., None, :]
+
+    energy, rest, volumes = jax.tree.map(taken, (force.body, force.rest, force.volumes))
+    return SampledForce(energy, rest, taken(force.slopes), volumes, force.loads)

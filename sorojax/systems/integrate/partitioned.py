@@ -109,7 +109,7 @@ def _move(
         new = stepper.step(problem, now.time, h, begun)
         kept = {} if new.memory is None else {"memory": new.memory}
         state = now.state | {name: {"q": new.q, "v": new.v} | kept}
-        state = _others(network, now.time, state, inputs, h, method, name)
+        state = others_moved(network, now.time, state, inputs, h, method, (name,))
         if new.resolved is None or new.gained is None:  # without contact
             return PartitionedState(state, new.a, now.time + h, now.gained, now.resolved)
         moved = PartitionedState(state, new.a, now.time + h, new.gained, new.resolved)
@@ -119,13 +119,15 @@ def _move(
     return jax.lax.fori_loop(0, count, one, parted)
 
 
-def _others(network, t, state, inputs, h, method, body: str):
-    """The state after a step of all blocks but the body, which stays."""
-    names = tuple(name for name in network.blocks if name != body)
+def others_moved(network, t, state, inputs, h, method: AbstractMethod, bodies: tuple[str, ...]):
+    """The state after a step of all blocks but the `bodies`, which stay."""
+    names = tuple(name for name in network.blocks if name not in bodies)
 
     def field(t, part):
         return rates_of(network, t, state | part, inputs, names)
 
     part = {name: state[name] for name in names}
+    if not jax.tree.leaves(part):
+        return state
     moved = method.advance(field, t, part, h, method.begin(field, t, part, h))
     return state | moved.y

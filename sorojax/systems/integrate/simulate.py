@@ -29,6 +29,7 @@ from sorojax.systems.integrate.integrate import (
     run_with_events,
 )
 from sorojax.systems.integrate.march import fixed
+from sorojax.systems.integrate.staggered import Staggered, touching_bodies
 from sorojax.systems.network import Network, at_time, outputs
 
 
@@ -141,8 +142,8 @@ def simulate(
             and goes from being stepped over, and two events from falling into one step, where
             the first listed would win.
         solver: By default `Tsit5()`, `RungeKutta4()` with a fixed step, `Coupled()` where
-            there is a `FemBody`. `Rodas4()` where a regulator, a valve or a filter is far
-            faster than the body.
+            there is a `FemBody`, `Staggered()` where a reduced body touches something.
+            `Rodas4()` where a regulator, a valve or a filter is far faster than the body.
         max_steps: Limit of adaptive steps.
         events: Ends of the run, and resets of its state; none by default.
         max_events: Most resets.
@@ -323,7 +324,9 @@ def _fixed_method(network: Network, solver) -> AbstractMethod:
 
 def default_method(network: Network) -> AbstractMethod:
     """The method of fixed steps of a network."""
-    return Coupled() if bodies_of(network) else RungeKutta4()
+    if bodies_of(network):
+        return Coupled()
+    return Staggered() if touching_bodies(network) else RungeKutta4()
 
 
 def _substeps(duration, save: int, step) -> int:

@@ -1,0 +1,129 @@
+"""Contact of the surface of a reduced body with shapes that do not deform: the penalty and the
+friction of `fem.Contact`, on points that move in the shapes of a basis."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sorojax import fem
+from sorojax.contact import Penalty, SpringSlider
+from sorojax.contact.facet import surface
+from sorojax.contact.friction import Grip
+from sorojax.fem.loads.facets import areas_of
+from sorojax.sdf.base import AbstractSdf
+from sorojax.systems.blocks.modal_basis import Basis, Modes
+
+#: Length of the spring at every point [m]; None without friction.
+Stretch = Float[Array, "points dim"] | None
+
+
+class SurfaceContact(eqx.Module):
+    """Points of the surface, each for an area, that an obstacle keeps out.
+
+    Friction is a spring at every point that slides at the limit of its law, so points that
+    hold do not creep. What it remembers from step to step is the `stretch` of the springs. As
+    in `fem.Contact` pressure and normal of friction are those where the step begins.
+
+    Attributes:
+        obstacle: In the world.
+        law: Pressure by the gap.
+        slider: Friction; None without any.
+        places: Of the points at q = 0 [m].
+        moves: Their derivatives by the modal coordinates.
+        areas: At rest [m^2].
+        offset: How far before the obstacle pressure starts [m]; None for nothing.
+    """
+
+    obstacle: AbstractSdf
+    law: Penalty
+    slider: SpringSlider | None
+    places: Float[Array, "points dim"]
+    moves: Float[Array, "modes points dim"]
+    areas: Float[Array, " points"]
+    offset: Float[Array, " points"] | None = None
+
+    def points(self, q: Modes) -> Float[Array, "points dim"]:
+        """Where the points are [m]."""
+        return self.places + jnp.tensordot(q, self.moves, 1)
+
+    def gap(self, q: Modes) -> Float[Array, " points"]:
+        """How far the points are from where pressure starts [m]; negative inside."""
+        return self._shifted(surface(self.obstacle, self.points(q))[0])
+
+    def unstretched(self) -> Stretch:
+        """The springs of friction without load."""
+        return None if self.slider is None else jnp.zeros_like(self.places)
+
+    def begun(self, q: Modes, stretch: Stretch, h: Float[Array, ""]) -> Grip | None:
+        """Friction of a step of `h` [s] that begins at `q` with springs of this length [m]."""
+        if self.slider is None or stretch is None:
+            return None
+        back = self.points(q)
+        gap, _, normal = surface(self.obstacle, back)
+        pressure = self.law.pressure(self._shifted(gap))
+        limit = self.slider.law.limit(pressure)
+        anchor = back - self.slider.bounded(stretch, pressure)
+        drag = limit / (self.slider.velocity * h)
+        return Grip(anchor, pressure, normal, drag, back)
+
+    def stretched(self, q: Modes, grip: Grip | None) -> Stretch:
+        """Length of the springs after a step to `q` [m]."""
+        if self.slider is None or grip is None:
+            return None
+        return self.slider.stretch(grip, self.points(q))
+
+    def push(self, q: Modes, grip: Grip | None) -> Modes:
+        """Force on the modal coordinates."""
+        force = self.areas[:, None] * self._traction(self.points(q), grip)
+        return jnp.tensordot(self.moves, force, 2)
+
+    def linearised(
+        self, q: Modes, grip: Grip | None
+    ) -> tuple[Modes, Float[Array, "modes modes"]]:
+        """The force, and minus its derivative."""
+        x, moves = self.points(q), self.moves
+
+        def along(axis: Float[Array, " dim"]):
+            way = jnp.broadcast_to(axis, x.shape)
+            return jax.jvp(lambda x: self._traction(x, grip), (x,), (way,))
+
+        traction, slopes = jax.vmap(along, out_axes=(None, 0))(jnp.eye(x.shape[1]))
+        force = jnp.tensordot(moves, self.areas[:, None] * traction, 2)
+        weighed = -self.areas[None, :, None] * slopes
+        turned = jnp.einsum("mpj,jpi->mpi", moves, weighed)
+        count = len(moves)
+        return force, moves.reshape(count, -1) @ turned.reshape(count, -1).T
+
+    def _traction(self, x: Float[Array, "points dim"], grip: Grip | None):
+        """Force of the obstacle per area [Pa]."""
+        gap, slope, _ = surface(self.obstacle, x)
+        pushed = self.law.pressure(self._shifted(gap))[:, None] * slope
+        if self.slider is None or grip is None:
+            return pushed
+        return pushed + self.slider.traction(grip, x)
+
+    def _shifted(self, gap: Float[Array, " points"]) -> Float[Array, " points"]:
+        return gap if self.offset is None else gap - self.offset
+
+
+def surface_contact(problem: fem.Problem, load: fem.Contact, basis: Basis) -> SurfaceContact:
+    """A contact of a problem, on the points of its quadrature."""
+    still = load.points_of(problem, basis.displacement)
+    rest = load.points_of(problem, jnp.zeros_like(basis.displacement))
+    moved = jax.vmap(lambda shape: load.points_of(problem, shape))(basis.shapes)
+    flat = (-1, still.shape[-1])
+    return SurfaceContact(
+        load.obstacle,
+        load.law,
+        None if load.friction is None else load.slider,
+        (still - load.value[None, None]).reshape(flat),
+        (moved - rest[None]).reshape(len(basis), *flat),
+        areas_of(problem, load.facets).ravel(),
+        None if load.offset is None else load.offset.ravel(),
+    )
+
+
+def contacts_of(problem: fem.Problem) -> tuple[fem.Contact, ...]:
+    """Contacts of the surface of a body with shapes that do not deform."""
+    return tuple(load for load in problem.loads if isinstance(load, fem.Contact))
