@@ -14,12 +14,12 @@ from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from sorojax._jax.jit import jit
 from sorojax._jax.trace_state import called_as_outside, evaluated_now, is_traced, is_tracer
+from sorojax._types import from_host
 from sorojax.math.compiled import Split
 from sorojax.math.linear_map import pushed
 
@@ -67,7 +67,7 @@ def two_programs(
 
 
 def _as_array(leaf: Any) -> Any:
-    return jnp.asarray(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
+    return from_host(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
 
 
 def linear_program(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any, Any], Any]:
@@ -83,7 +83,7 @@ def linear_program(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any, A
         count = len(both.leaves) - len(jax.tree.leaves(rates))
         moves = [k >= count for k in range(len(both.leaves))]
         with evaluated_now():  # from NumPy: a program for every shape is not compiled
-            zeros = [jnp.asarray(np.zeros(x.shape, x.dtype)) for x in both.leaves[count:]]
+            zeros = [from_host(np.zeros(x.shape, x.dtype)) for x in both.leaves[count:]]
         start, rest = [None] * count + zeros, _only(moves, both.leaves, False)
         shapes = dict(enumerate(map(_shape, outputs)))
         by = _Slope(_Call(programs, both.form), start, rest, shapes)

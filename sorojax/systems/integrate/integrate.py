@@ -178,10 +178,11 @@ def adaptive(
     moving = Moving(constants, flat, jnp.maximum(time, start))
     plain = adjoint is None and free and not dense and seam is None
     own = plain and isinstance(solver, AbstractMethod)
-    steps = None
     if own:
         room = _room(solver, flat.size) if recorded and record is None else 0
         run, steps = replayed(moving, without_derivatives(plan), room, record)
+        if steps is not None:
+            record = jax.lax.stop_gradient(Record(run, steps))
     else:
         run = solved(moving, plan)
     last = run.last
@@ -205,7 +206,7 @@ def adaptive(
         triggered,
         run.dense,
         Resume(run.seam, run.memory) if free else None,
-        None if steps is None else jax.lax.stop_gradient(Record(run, steps)),
+        record,
     )
 
 

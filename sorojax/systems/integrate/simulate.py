@@ -266,7 +266,7 @@ def _run_again(found: tuple[Trajectory, Record | None], *args: Any) -> tuple[Any
     most, taken = options["max_steps"], int(film.stats["steps"])
     if not dense:
         most = min(most, max(_FEW, 2 ** (taken + taken // 8).bit_length()))
-    return *others, watch, options | {"max_steps": most}, None, False
+    return *others, watch, options | {"max_steps": most}
 
 
 _adaptive = two_programs(
