@@ -74,7 +74,7 @@ def to_sharp(motion: Any, points, shift, sharp) -> Float[Array, "nodes dim"]:
     at = motion.border.sharp
 
     def staged(points, shift, sharp):
-        return (jnp.zeros_like(points).at[at].set(sharp - (points + shift)[at]),)
+        return (_set(jnp.zeros_like(points), at, sharp - (points + shift)[at]),)
 
     def there(points, shift, sharp):
         return (_put(points, at, sharp - (points + shift)[at]),)
@@ -110,7 +110,7 @@ def on_boundary(motion: Any, points, sharp, landed) -> Float[Array, "nodes dim"]
     def staged(points, *landed):
         shift = jnp.zeros_like(points)
         for at, x in zip(groups, landed, strict=True):
-            shift = shift.at[at].set(x - points[at])
+            shift = _set(shift, at, x - points[at])
         return (shift,)
 
     def there(points, *landed):
@@ -167,7 +167,7 @@ def arrived(motion: Any, points, shift, boundary) -> Float[Array, "nodes dim"]:
     bent = motion.bent
 
     def staged(points, shift, boundary):
-        return (points + followed(motion, shift).at[bent].set(boundary[bent]),)
+        return (points + _set(followed(motion, shift), bent, boundary[bent]),)
 
     def there(points, shift, boundary):
         new = _followed(motion, shift)
@@ -188,7 +188,12 @@ def followed(motion: Any, shift):
     if not len(motion.middles):
         return shift
     between = jnp.einsum("mk,mki->mi", motion.weights, shift[motion.parents])
-    return shift.at[motion.middles].set(between)
+    return _set(shift, motion.middles, between)
+
+
+def _set(rows, at, new):
+    """With new rows, each at a place of its own."""
+    return rows.at[at].set(new, unique_indices=True)
 
 
 def _followed(motion: Any, shift: np.ndarray) -> np.ndarray:
