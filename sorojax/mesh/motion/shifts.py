@@ -4,48 +4,22 @@ Outside `jit` NumPy takes them, also in derivatives: a program for each would be
 longer than all of them run.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax._jax.trace_state import is_traced
-from sorojax._types import from_host
-from sorojax.math.linear_map import pushed
-
-Numbers = Callable[..., Sequence[Any]]
+from sorojax.math.linear_map import OnHost, Parts, pushed
 
 
-class _Step:
-    """A linear function as a `LinearMap`: by JAX where it is staged, else `there` and `back`
-    by NumPy."""
-
-    def __init__(self, staged: Numbers, there: Numbers, back: Numbers, given, found):
-        self.push, self._there, self._back = staged, there, back
-        self.inputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in given]
-        self.outputs = [jax.ShapeDtypeStruct(shape, given[0].dtype) for shape in found]
-
-    def pull(self, *changes: Any) -> Sequence[Any]:
-        def listed(*rates: Any) -> list[Any]:
-            return list(self.push(*rates))
-
-        return jax.linear_transpose(listed, *self.inputs)(list(changes))
-
-    def push_now(self, *rates: Any) -> list[Array]:
-        return [from_host(x) for x in self._there(*map(np.asarray, rates))]
-
-    def pull_now(self, *changes: Any) -> list[Array]:
-        return [from_host(x) for x in self._back(*map(np.asarray, changes))]
-
-
-def _taken(motion: Any, staged: Numbers, there: Numbers, back: Numbers, given, *found):
+def _taken(motion: Any, staged: Parts, there: Parts, back: Parts, given, *found):
     """The results of a step, of the shapes `found`."""
     if is_traced(motion):
         return list(staged(*given))
-    return pushed(given, _Step(staged, there, back, given, found))
+    return pushed(given, OnHost(staged, there, back, given, found))
 
 
 def placed(
