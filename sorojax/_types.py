@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax._jax import devices
+from sorojax._jax.trace_state import outside_transformations
 
 if TYPE_CHECKING:
     _Entry = jax.Array | np.ndarray | np.generic | float
@@ -67,11 +68,25 @@ def integers(value: Numbers) -> jax.Array:
 def _array(value: Any, dtype: Any) -> jax.Array:
     """A new array; the first one of a program starts JAX, whatever its plug-ins do."""
     try:
-        return jnp.asarray(value, dtype=dtype)
+        return from_host(value, dtype)
     except Exception as error:
         if not devices.start(error):
             raise
         return jnp.asarray(value, dtype=dtype)
+
+
+_FEW = 16  # numbers in an array of which shapes come again
+
+
+def from_host(value: Any, dtype: Any = None) -> jax.Array:
+    """`jnp.asarray`, which compiles a program for every shape and kind of NumPy's arrays; here
+    they are copied without. That takes 10 us more, so not for few numbers of one kind."""
+    plain = isinstance(value, np.ndarray) and value.dtype.kind in "biuf"
+    if plain and outside_transformations():
+        kind = value.dtype if dtype is None else dtype
+        if value.size > _FEW or value.dtype != kind:
+            return jax.device_put(np.array(value, kind))
+    return jnp.asarray(value, dtype=dtype)
 
 
 def platform() -> str:

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from sorojax import _progress, io, systems as S
-from sorojax._types import real
+from sorojax._types import from_host, real
 from sorojax.math.status import Status
+from sorojax.systems.integrate import integrate
 
 ROOT = Path(__file__).parent.parent
 
@@ -386,3 +387,23 @@ def test_a_run_that_goes_on_has_the_slope_of_the_first_half(options):
         return later["air.pressure"][-1]
 
     assert jnp.isclose(jax.grad(end)(jnp.asarray(5e4)), jnp.exp(-1.0), rtol=1e-6)
+
+
+def test_gradient_by_the_noted_steps_is_that_of_a_run_again(monkeypatch):
+    def end(start, most):
+        vessel = S.Network({"air": S.Reservoir(start, volume=1e-4, leakage=0.5)}, {})
+        run = S.simulate(vessel, 1.0, save=5, solver=S.Rodas4(), max_steps=most)
+        return run["air.pressure"][-1]
+
+    noted = jax.grad(end)(jnp.asarray(5e4), 1000)
+    monkeypatch.setattr(integrate, "_room", lambda *_: 0)
+    again = jax.grad(end)(jnp.asarray(5e4), 1001)
+    assert jnp.isclose(noted, again, rtol=1e-12)
+    assert jnp.isclose(noted, jnp.exp(-0.5), rtol=1e-5)
+
+
+def test_arrays_of_numpy_are_copied():
+    given = np.arange(40.0)
+    made = from_host(given)
+    given[:] = 0.0
+    assert made[-1] == 39.0 and made.dtype == given.dtype

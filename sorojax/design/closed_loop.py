@@ -11,7 +11,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sorojax._display import displayed, number, outcome
 from sorojax._edit import without_derivatives
@@ -328,24 +328,36 @@ _STILL = 1e-9  # of a stretch, or of a turn over the length [rad]
 def _modes_status(backbone: Backbone, basis: StrainBasis) -> Status:
     backbone = without_derivatives(backbone)
     with evaluated_now(backbone):
-        root, enough = jnp.sqrt(weights(backbone.s))[None], True
-        for name, of in basis.modes.items():
-            change = backbone.change[:, :, backbone.names.index(name)] * root
-            size = jnp.linalg.svd(change, compute_uv=False)
-            scale = backbone.length if name.startswith("kappa") else 1.0
-            enough &= size[0] * scale > _STILL
-            enough &= size[of.count - 1] > RANK * size[0]
-        return _unless(enough, Status.too_few_states)
+        counts = {name: of.count for name, of in basis.modes.items()}
+        return _unless(_are_held(backbone, counts), Status.too_few_states)
+
+
+@eqx.filter_jit
+def _are_held(backbone: Backbone, counts: dict[str, int]) -> Bool[Array, ""]:
+    """Whether the states hold so many modes of each strain."""
+    root, enough = jnp.sqrt(weights(backbone.s))[None], jnp.array(True)
+    for name, count in counts.items():
+        change = backbone.change[:, :, backbone.names.index(name)] * root
+        size = jnp.linalg.svd(change, compute_uv=False)
+        scale = backbone.length if name.startswith("kappa") else 1.0
+        enough &= size[0] * scale > _STILL
+        enough &= size[count - 1] > RANK * size[0]
+    return enough
 
 
 def _rod_status(fit: Fit) -> Status:
     fit = without_derivatives(fit)
     with evaluated_now(fit):
         numbers = jax.tree.leaves(eqx.filter(fit, eqx.is_inexact_array))
-        good = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in numbers]))
-        stiff = jnp.linalg.eigvalsh(jnp.where(good, fit.elastic.stiffness, 0.0))[0] > 0
+        good, stiff = _finite_and_stiff(numbers, fit.elastic.stiffness)
         unstable = _unless(stiff, Status.unstable_equilibrium)
         return Status.where(good, unstable, Status.not_finite)
+
+
+@jax.jit
+def _finite_and_stiff(numbers: list[Array], stiffness: Array) -> tuple[Array, Array]:
+    good = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in numbers]))
+    return good, jnp.linalg.eigvalsh(jnp.where(good, stiffness, 0.0))[0] > 0
 
 
 def _loop_status(motion: Motion, settle: tuple[str, float] | None) -> Status:

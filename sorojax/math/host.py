@@ -42,6 +42,18 @@ any_of_lanes = _over_lanes(lambda x: jnp.any(x, axis=0))
 largest_of_lanes = _over_lanes(lambda x: jnp.max(x, axis=0))
 
 
+@jax.custom_batching.custom_vmap
+def true_alone(condition: Any) -> Any:
+    """A condition that is true, a constant, unless there are lanes, each with its own."""
+    return jnp.ones_like(condition)
+
+
+@true_alone.def_vmap
+def _(axis_size, in_batched, condition):
+    del axis_size
+    return (condition, True) if in_batched[0] else (true_alone(condition), False)
+
+
 # Independent work of the host at the same time: compilers and BLAS leave Python to others
 
 

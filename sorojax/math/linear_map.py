@@ -9,9 +9,11 @@ from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from sorojax._jax.operations import Rules, operation
+from sorojax._types import from_host
 
 Shapes = Sequence[jax.ShapeDtypeStruct | Array]
 
@@ -37,6 +39,38 @@ class LinearMap(Protocol):
     def push_now(self, *rates: Any) -> Sequence[Any]: ...
 
     def pull_now(self, *changes: Any) -> Sequence[Any]: ...
+
+
+Parts = Callable[..., Sequence[Any]]
+
+
+class OnHost:
+    """A linear function as a `LinearMap`: by JAX where it is `staged`, else by NumPy, without
+    a program that would be compiled for longer than it runs.
+
+    Args:
+        staged: The function, of JAX.
+        there, back: It and its transpose, of NumPy.
+        given: What has the shapes of its arguments.
+        found: The shapes of its results, of the first argument's type.
+    """
+
+    def __init__(self, staged: Parts, there: Parts, back: Parts, given: Any, found: Any):
+        self.push, self._there, self._back = staged, there, back
+        self.inputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in given]
+        self.outputs = [jax.ShapeDtypeStruct(shape, given[0].dtype) for shape in found]
+
+    def pull(self, *changes: Any) -> Sequence[Any]:
+        def listed(*rates: Any) -> list[Any]:
+            return list(self.push(*rates))
+
+        return jax.linear_transpose(listed, *self.inputs)(list(changes))
+
+    def push_now(self, *rates: Any) -> list[Array]:
+        return [from_host(x) for x in self._there(*map(np.asarray, rates))]
+
+    def pull_now(self, *changes: Any) -> list[Array]:
+        return [from_host(x) for x in self._back(*map(np.asarray, changes))]
 
 
 def pushed(rates: Sequence[Array], by: LinearMap) -> list[Array]:

@@ -14,12 +14,12 @@ from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from sorojax._jax.jit import jit
 from sorojax._jax.trace_state import called_as_outside, evaluated_now, is_traced, is_tracer
+from sorojax._types import from_host
 from sorojax.math.compiled import Split
 from sorojax.math.linear_map import pushed
 
@@ -31,6 +31,7 @@ Again = Callable[..., tuple[Any, ...]]
 def two_programs(
     function: Verb,
     again: Again | None = None,
+    within: Callable[..., Any] | None = None,
     *,
     kernels: bool = False,
     largest: float = math.inf,
@@ -43,17 +44,22 @@ def two_programs(
     Args:
         function: Pure, and quick to run.
         again: From what a first run returned and its arguments to those of the derivative:
-            the same arrays, and what is static as it is known now.
+            the same arrays, what is static as it is known now, and behind them arrays that the
+            run has found and the derivative need not compute again.
+        within: What takes the place of the function under `jit` and `vmap`.
         kernels, largest: As of `sorojax.jit`.
     """
     programs = _Programs(function, again, kernels=kernels, largest=largest)
+    inside = programs.whole if within is None else eqx.filter_jit(within)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         traced = [x for x in jax.tree.leaves((args, kwargs)) if is_tracer(x)]
         # in a batch or under `jit`, and where nothing has a derivative
-        if not traced or is_traced(jax.lax.stop_gradient(traced)):
+        if not traced:
             return programs.whole(*args, **kwargs)
+        if is_traced(jax.lax.stop_gradient(traced)):
+            return inside(*args, **kwargs)
         given = Split(jax.tree.map(_as_array, (args, kwargs)))
         return _differentiable(_Call(programs, given.form), given.leaves).whole()
 
@@ -61,7 +67,7 @@ def two_programs(
 
 
 def _as_array(leaf: Any) -> Any:
-    return jnp.asarray(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
+    return from_host(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
 
 
 def linear_program(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any, Any], Any]:
@@ -77,7 +83,7 @@ def linear_program(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any, A
         count = len(both.leaves) - len(jax.tree.leaves(rates))
         moves = [k >= count for k in range(len(both.leaves))]
         with evaluated_now():  # from NumPy: a program for every shape is not compiled
-            zeros = [jnp.asarray(np.zeros(x.shape, x.dtype)) for x in both.leaves[count:]]
+            zeros = [from_host(np.zeros(x.shape, x.dtype)) for x in both.leaves[count:]]
         start, rest = [None] * count + zeros, _only(moves, both.leaves, False)
         shapes = dict(enumerate(map(_shape, outputs)))
         by = _Slope(_Call(programs, both.form), start, rest, shapes)
@@ -118,20 +124,26 @@ class _Programs:
 
         for part, end in ((push, "_pushed"), (pull, "_pulled")):
             part.__name__ = part.__qualname__ = function.__name__ + end
-        compiled = functools.partial(jit, kernels=kernels, largest=largest)
-        self.whole, self.push, self.pull = map(compiled, (function, push, pull))
-        self._again = again
+        self.whole = jit(function, kernels=kernels, largest=largest)
+        # what a first run has found is no argument that makes a call large
+        alone = [jit(part, kernels=kernels, largest=math.inf) for part in (push, pull)]
+        self.derivatives = {True: alone, False: [eqx.filter_jit(x) for x in (push, pull)]}
+        self._again, self._largest = again, largest
 
     def value(self, leaves: Leaves, form: Any) -> Split:
         args, kwargs = form.whole(leaves)
         return Split(self.whole(*args, **kwargs))
 
-    def form_again(self, form: Any, leaves: Leaves, found: Split) -> Any:
-        """The form of the arguments of the derivative."""
-        if self._again is None:
-            return form
+    def is_small(self, leaves: Leaves) -> bool:
+        """Whether a call with these arguments is one of small arrays."""
+        return all(getattr(x, "size", 0) <= self._largest for x in leaves)
+
+    def given_again(self, form: Any, leaves: Leaves, found: Split) -> Split:
+        """The arguments of the derivative."""
         args, kwargs = form.whole(leaves)
-        return Split((self._again(found.whole(), *args, **kwargs), {})).form
+        if self._again is None:
+            return Split((args, kwargs))
+        return Split((self._again(found.whole(), *args, **kwargs), {}))
 
 
 def _joined(some: Leaves, others: Leaves) -> Leaves:
@@ -141,6 +153,7 @@ def _joined(some: Leaves, others: Leaves) -> Leaves:
 class _Call(NamedTuple):
     programs: _Programs
     form: Any
+    small: bool = True
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -160,7 +173,10 @@ def _derivative(of: _Call, primals: Any, tangents: Any) -> tuple[Split, Split]:
     if found is None or is_traced(found):
         by = lambda moving: of.programs.value(_joined(moving, rest), of.form)  # noqa: E731
         return jax.jvp(by, (moving,), (rates,))
-    of = _Call(of.programs, of.programs.form_again(of.form, leaves, found))
+    given = of.programs.given_again(of.form, leaves, found)
+    of = _Call(of.programs, given.form, of.programs.is_small(leaves))
+    more = given.leaves[len(leaves) :]
+    moving, rest = [*moving, *[None] * len(more)], [*rest, *more]
     which = tuple(k for k, x in enumerate(found.leaves) if eqx.is_inexact_array(x))
     by = _Slope(of, moving, rest, {k: _shape(found.leaves[k]) for k in which})
     changed = dict(zip(which, pushed(_present(rates), by), strict=True))
@@ -202,10 +218,12 @@ class _Slope:
     def push(self, *rates: Any) -> Leaves:
         left = iter(rates)
         moved = [None if x is None else next(left) for x in self._moving]
-        return self._of.programs.push(self._moving, self._rest, moved, *self._kind())
+        push, _ = self._of.programs.derivatives[self._of.small]
+        return push(self._moving, self._rest, moved, *self._kind())
 
     def pull(self, *changes: Any) -> Leaves:
-        found = self._of.programs.pull(self._moving, self._rest, list(changes), *self._kind())
+        _, pull = self._of.programs.derivatives[self._of.small]
+        found = pull(self._moving, self._rest, list(changes), *self._kind())
         return _present(found)
 
     push_now, pull_now = push, pull

@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -214,8 +215,13 @@ def distortion(mesh: Mesh, moved: Mesh) -> Distortion:
             f"distortion: the meshes have {mesh.num_cells} and {moved.num_cells} cells, need "
             "one mesh and the same mesh moved."
         )
-    size, shape = _size_and_shape(mesh)
-    new_size, new_shape = _size_and_shape(moved)
+    return _compared(mesh.element, mesh.points, mesh.cells, moved.points, moved.cells)
+
+
+@eqx.filter_jit
+def _compared(element: AbstractElement, points, cells, new_points, new_cells) -> Distortion:
+    size, shape = _size_and_shape(element, points, cells)
+    new_size, new_shape = _size_and_shape(element, new_points, new_cells)
     size_ratio, shape_ratio = jnp.min(new_size / size), jnp.min(new_shape / shape)
     return Distortion(size_ratio, shape_ratio, (size_ratio < 0.2) | (shape_ratio < 0.4))
 
@@ -240,14 +246,16 @@ def _size(x: Any, numpy: Any) -> Any:
     return numpy.sum(a * numpy.cross(b, x[:, 3] - x[:, 0]), axis=1)
 
 
-def _size_and_shape(mesh: Mesh) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    corners = mesh.points[mesh.cells[:, : mesh.element.num_corners]]
+def _size_and_shape(
+    element: AbstractElement, points, cells
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    corners = points[cells[:, : element.num_corners]]
     sizes, shapes = [], []
-    for simplex in corner_simplices(mesh.element.linear()):
+    for simplex in corner_simplices(element.linear()):
         x = corners[:, jnp.asarray(simplex)]
         pairs = [(i, j) for i in range(len(simplex)) for j in range(i)]
         square = sum(jnp.sum((x[:, i] - x[:, j]) ** 2, axis=1) for i, j in pairs)
         size = _size(x, jnp)
         sizes.append(size)
-        shapes.append(size / (square / len(pairs)) ** (mesh.element.dim / 2))
+        shapes.append(size / (square / len(pairs)) ** (element.dim / 2))
     return jnp.stack(sizes), jnp.stack(shapes)

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax._jax.trace_state import is_traced
-from sorojax._types import platform
+from sorojax._types import from_host, platform
 from sorojax.fem.kinematics import AbstractKinematics
 from sorojax.material.kinematics import Entry
 from sorojax.math.linalg import sparse
@@ -116,8 +116,8 @@ def space(
     return Space(
         system=system,
         cells=_blocked(cells[ids].astype(np.int32), width),
-        ids=jnp.asarray(ids.reshape(num_blocks, width)),
-        real=jnp.asarray(real.reshape(num_blocks, width)),
+        ids=from_host(ids.reshape(num_blocks, width)),
+        real=from_host(real.reshape(num_blocks, width)),
         slots=_blocked(slots.astype(np.int32), width),
         kinds=jnp.asarray(valences(mesh)[ids].reshape(num_blocks, width)) if polygons else None,
         element=mesh.element,
@@ -159,7 +159,7 @@ def block_entries(element: AbstractElement) -> Int[np.ndarray, " entries"]:
 def _blocked(rows: np.ndarray, width: int) -> jax.Array:
     """(cells, n) as (blocks, n, lanes)."""
     blocks = rows.reshape(-1, width, rows.shape[1])
-    return jnp.asarray(np.ascontiguousarray(np.moveaxis(blocks, 1, -1)))
+    return from_host(np.ascontiguousarray(np.moveaxis(blocks, 1, -1)))
 
 
 def per_block(space: Space, tree: Any) -> tuple[Any, Any]:

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from sorojax._jax.jit import once
 from sorojax._jax.trace_state import evaluated_now, is_traced, is_tracer
+from sorojax._types import from_host
 from sorojax.fem.equilibrium.jit import (
     Begin,
     Outcome,
@@ -398,7 +399,7 @@ def _outcome(call: Solve, u: np.ndarray, log: Log) -> Outcome:
     tangent = np.zeros(call.num_values, u.dtype)
     if call.num_values and not log.reason:
         tangent = log.end.tangent
-    return Outcome(jnp.asarray(u), jnp.asarray(counts), jnp.asarray(tangent))
+    return Outcome(from_host(u), from_host(counts), from_host(tangent))
 
 
 def _side_by_side(call: Solve, lanes: Lanes) -> list[Outcome]:

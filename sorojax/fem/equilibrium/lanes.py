@@ -13,6 +13,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from sorojax._jax.operations import Rules, operation
 from sorojax._jax.trace_state import evaluated_now
+from sorojax._types import from_host
 
 Arrays = Sequence[Any]
 
@@ -27,7 +28,7 @@ class Lanes(NamedTuple):
     def lane(self, k: int) -> list[Any]:
         """The arrays of one of them."""
         pairs = zip(self.rows, self.batched, strict=True)
-        return [jnp.asarray(x[k]) if b else x for x, b in pairs]
+        return [from_host(x[k]) if b else x for x, b in pairs]
 
 
 def lane_operation(

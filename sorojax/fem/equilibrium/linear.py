@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from sorojax._types import from_host
 from sorojax.fem.assembly import assemble as asm
 from sorojax.fem.assembly.geometry import Geometry, geometry
 from sorojax.fem.loads.facets import CurvedPart, group_matrices
@@ -51,7 +52,7 @@ def prepare(problem: Problem) -> Prepared:
         slots.append(sparse.slots_of(problem.space.system, dofs))
     return Prepared(
         geometry(problem.space, problem.kinematics, problem.formulation, problem.mesh.points),
-        jnp.asarray(known),
+        from_host(known),
         jnp.asarray(_largest_cell(points, np.asarray(problem.mesh.cells))),
         tuple(slots),
     )

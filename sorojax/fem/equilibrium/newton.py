@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sorojax._jax.jit import once
+from sorojax._types import from_host
 from sorojax.fem.assembly import assemble as asm
 from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import Linearised, Neighbour, Prepared, linearise, step
@@ -309,7 +310,7 @@ def newton_solve(
         iterations += 1
         tell(iterations, imbalance=ratio)
         if overshoots(problem) and still:
-            args = (problem, prepared.known, state.residual, jnp.asarray(u), jnp.asarray(du))
+            args = (problem, prepared.known, state.residual, from_host(u), from_host(du))
             du = float(share_of_step(*args)) * du
         u, before, state, size = _advance(problem, prepared, u, du)
         move = left_to_move(known, known_values, u)
@@ -354,7 +355,7 @@ def _advance(problem: Problem, prepared: Prepared, u: np.ndarray, du: np.ndarray
 
 def safe_fraction(problem: Problem, prepared: Prepared, u, du) -> Float[Array, ""]:
     """Fraction of a step `du` [m] from `u` [m] that keeps enough of every volume."""
-    args = (problem.space, prepared.geometry, problem.kinematics, jnp.asarray(u))
+    args = (problem.space, prepared.geometry, problem.kinematics, from_host(u))
     share = finite_share(problem.material)
-    longest = asm.largest_step(*args, jnp.asarray(du), keep=rules.LEAST_VOLUME, share=share)
+    longest = asm.largest_step(*args, from_host(du), keep=rules.LEAST_VOLUME, share=share)
     return rules.SAFE * longest

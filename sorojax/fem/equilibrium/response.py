@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from sorojax._jax.jit import once
 from sorojax._jax.trace_state import evaluated_now, is_traced
+from sorojax._types import from_host
 from sorojax.fem.equilibrium.jit import prepare_traced
 from sorojax.fem.equilibrium.lanes import moving_part
 from sorojax.fem.equilibrium.linear import Prepared, linearise, prepare
@@ -202,7 +203,7 @@ class _Tangent:
     def push(self, *rates):
         (rows,) = rates
         free = jnp.where(self.known[None], jnp.zeros_like(rows), rows)
-        matrix = jnp.asarray(self.matrix)
+        matrix = from_host(self.matrix)
         solve = jax.vmap(lambda b: sparse.solve(self.system, matrix, b))
         return (jnp.where(self.known[None], jnp.zeros_like(rows), solve(free)),)
 
@@ -210,7 +211,7 @@ class _Tangent:
         (rows,) = rates
         free = np.where(self.known, 0.0, rows)
         found = self.system.solver.solve(np.asarray(self.matrix), free)
-        return (jnp.asarray(np.where(self.known, 0.0, found)),)
+        return (from_host(np.where(self.known, 0.0, found)),)
 
     def pull(self, *changes):
         return self.push(*changes)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax._progress import report
-from sorojax._types import real
+from sorojax._types import from_host, real
 from sorojax.fem.checks import no_peaks
 from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import linearise, prepare
@@ -353,7 +353,7 @@ def _equilibrium(problem, names: Names, contents, begin: CavityStart, log: Log):
         with evaluated_now():
             start = eqx.combine(held, pattern)
             found = follow_contents(problem, names, contents, start, log)
-            return jnp.asarray(found[0]), jnp.asarray(found[1])
+            return from_host(found[0]), from_host(found[1])
 
     @equilibrium.defjvp
     def derivative(primals, tangents):

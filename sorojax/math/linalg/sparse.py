@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from sorojax._jax.host_call import host_call
 from sorojax._jax.trace_state import is_traced
+from sorojax._types import from_host
 from sorojax.math.linalg import conjugate_gradient as cg
 from sorojax.math.linalg.conjugate_gradient import (
     ConjugateGradient as ConjugateGradient,
@@ -153,10 +154,10 @@ def from_cells(
         iterative = cg.Iterative(solver, maps)
         key = pattern_key(rows, cols, (solver, points))
     return SparseSymmetric(
-        rows=jnp.asarray(rows),
-        cols=jnp.asarray(cols),
-        slots=jnp.asarray(inverse[: own.size].reshape(own.shape), jnp.int32),
-        key=jnp.asarray(key),
+        rows=from_host(rows),
+        cols=from_host(cols),
+        slots=from_host(inverse[: own.size].reshape(own.shape), jnp.int32),
+        key=from_host(key),
         iterative=iterative,
         size=size,
         _kept=_Kept(_solver_of(key, rows, cols, iterative, owned=True)),
@@ -198,7 +199,7 @@ def from_pattern(
         rows,
         cols,
         slots,
-        jnp.asarray(np.stack(keys).reshape(key.shape)),
+        from_host(np.stack(keys).reshape(key.shape)),
         iterative,
         size,
         _kept_again(keys[-1], starts, k, iterative, _double()),
@@ -250,7 +251,7 @@ def slots_of(
             "slots_of: these unknowns have no place in the pattern. Take facets of this mesh, "
             "or name the groups when the pattern is built."
         )
-    return jnp.asarray(slots, jnp.int32)
+    return from_host(slots, jnp.int32)
 
 
 def assemble(

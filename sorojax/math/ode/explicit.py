@@ -63,6 +63,11 @@ class AbstractMethod(dfx.AbstractSolver):
         return self.advance(field, t, y, h, memory), memory
 
     @property
+    def solves(self) -> bool:
+        """Whether a step factors a matrix."""
+        return False
+
+    @property
     def keeps(self) -> bool:
         """Whether one memory serves a whole run of fixed steps."""
         return False

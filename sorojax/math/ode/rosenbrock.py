@@ -89,6 +89,10 @@ class Rodas4(AbstractMethod):
     num_order: ClassVar[int] = 4
     interpolation_cls: ClassVar = CubicWithin
 
+    @property
+    def solves(self) -> bool:
+        return True
+
     def begin(self, field, t, y, h):
         return ()
 

@@ -1,6 +1,6 @@
 """Where boundary nodes go when the shape changes, by the implicit-function rule."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sorojax._jax.trace_state import evaluated_now
-from sorojax._types import integers, real
+from sorojax._jax.trace_state import evaluated_now, is_traced
+from sorojax._types import from_host, integers, real
+from sorojax.math.linear_map import OnHost, pushed
 from sorojax.math.two_programs import linear_program
 from sorojax.sdf.base import AbstractSdf, quotient
 from sorojax.sdf.query import shape_tangent
@@ -58,6 +59,12 @@ def _meet_jvp(primals, tangents):
     fields, plan, start = primals
     with evaluated_now((fields, start)):
         x, normals, slopes, seen = _meet(fields, plan, start)
+    if not is_traced(primals):
+        f_dot = _fields_dot(fields, plan, seen, tangents[0])
+        by = _meet_slope(plan, np.asarray(normals), np.asarray(slopes), [*f_dot, start])
+        with evaluated_now():
+            rate = jnp.zeros_like(start) if tangents[2] is None else tangents[2]
+        return x, pushed([*f_dot, rate], by)[0]
     given = fields, plan, normals, slopes, seen
     return x, _meet_dot(given, (tangents[0], tangents[2]), x)
 
@@ -124,16 +131,17 @@ def _least_squares(plan: BoundaryPlan, normals, levels, across):
     return _cramer(matrix, rhs)
 
 
-def _cramer(matrix: Float[Array, "n dim dim"], rhs: Float[Array, "n dim"]):
-    """Solutions of small systems; a library call would compile for a second."""
+def _cramer(matrix, rhs, numpy: Any = jnp):
+    """Solutions of small systems, one per row; a library call would compile for a second."""
     if rhs.shape[1] == 2:
-        (a, b), (c, d) = jnp.moveaxis(matrix, 0, 2)
+        (a, b), (c, d) = numpy.moveaxis(matrix, 0, 2)
         x, y = rhs.T
-        return jnp.stack([d * x - b * y, a * y - c * x], axis=1) / (a * d - b * c)[:, None]
-    a, b, c = jnp.moveaxis(matrix, 2, 0)
-    cofactors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
-    det = jnp.sum(a * cofactors[:, 0], axis=1)
-    return jnp.sum(cofactors * rhs[:, None, :], axis=2) / det[:, None]
+        return numpy.stack([d * x - b * y, a * y - c * x], axis=1) / (a * d - b * c)[:, None]
+    a, b, c = numpy.moveaxis(matrix, 2, 0)
+    cross = numpy.cross
+    cofactors = numpy.stack([cross(b, c), cross(c, a), cross(a, b)], axis=1)
+    det = numpy.sum(a * cofactors[:, 0], axis=1)
+    return numpy.sum(cofactors * rhs[:, None, :], axis=2) / det[:, None]
 
 
 @eqx.filter_custom_jvp
@@ -149,7 +157,18 @@ def slide(
 def _slide_jvp(primals, tangents):
     fields, plan, start = primals
     with evaluated_now((fields, start)):
-        x, slopes = _slide(fields, plan, start)
+        x, gradients = _slide(fields, plan, start)
+    if not is_traced(primals):
+        f_dot = _fields_dot(fields, plan, x, tangents[0])
+        by = _slide_slope(plan, list(map(np.asarray, gradients)), [*f_dot, *start])
+        rates = (None,) * len(x) if tangents[2] is None else tangents[2]
+        with evaluated_now():
+            ways = zip(start, rates, strict=True)
+            rates = [jnp.zeros_like(a) if r is None else r for a, r in ways]
+        return x, tuple(pushed([*f_dot, *rates], by))
+    slopes = tuple(
+        jnp.sum(g * own.normal, axis=1) for g, own in zip(gradients, plan.fields, strict=True)
+    )
     return x, _slide_dot((fields, plan, x, slopes), (tangents[0], tangents[2]), x)
 
 
@@ -159,7 +178,7 @@ def _slide(fields: Fields, plan: BoundaryPlan, start):
         _slide_one(field, own.normal, x)
         for field, own, x in zip(fields, plan.fields, start, strict=True)
     ]
-    return tuple(x for x, _ in pairs), tuple(slope for _, slope in pairs)
+    return tuple(x for x, _ in pairs), tuple(gradient for _, gradient in pairs)
 
 
 def _slide_one(field: AbstractSdf, normal, start):
@@ -167,12 +186,13 @@ def _slide_one(field: AbstractSdf, normal, start):
 
     def descend(state):
         x, _, _, count = state
-        f, slope = jax.jvp(field, (x,), (normal,))
+        f, gradient = value_and_gradient(field, x)
+        slope = jnp.sum(gradient * normal, axis=1)
         new = x - quotient(f, slope)[:, None] * normal
         far = jnp.max(jnp.abs(new - x), initial=0) > tiny * jnp.max(jnp.abs(x), initial=0)
-        return new, slope, far, count + 1
+        return new, gradient, far, count + 1
 
-    begin = (start, jnp.zeros_like(start[:, 0]), jnp.array(start.size > 0), 0)
+    begin = (start, jnp.zeros_like(start), jnp.array(start.size > 0), 0)
     final = jax.lax.while_loop(lambda s: s[2] & (s[3] < _MOST_STEPS), descend, begin)
     return final[:2]
 
@@ -195,6 +215,134 @@ def _slide_dot(given, rates):
         dot - quotient(f, slope)[:, None] * own.normal
         for dot, f, slope, own in zip(start_dot, f_dot, slopes, plan.fields, strict=True)
     )
+
+
+# Rates outside `jit`: one program for those of the fields, the rest by NumPy
+
+
+def _filled(rows: np.ndarray, room: int) -> np.ndarray:
+    """`rows`, the first one again and again behind them."""
+    rows = np.asarray(rows)
+    full = np.zeros((room, *rows.shape[1:]), rows.dtype)
+    full[: len(rows)] = rows
+    if len(rows):
+        full[len(rows) :] = rows[0]
+    return full
+
+
+@linear_program
+def _fields_moved(given, fields_dot):
+    fields, points = given
+
+    def fields_at(fields):
+        return tuple(f(p) for f, p in zip(fields, points, strict=True))
+
+    return shape_tangent(fields_at, fields, fields_dot)
+
+
+def _fields_dot(fields: Fields, plan: BoundaryPlan, points, fields_dot) -> list[Array]:
+    """Rates of each field at its points, more rows than these: as many in both searches."""
+    most = max(max(len(own.nodes), len(own.beside)) for own in plan.fields)
+    room = 1 << max(most - 1, 0).bit_length()
+    with evaluated_now():
+        seen = tuple(from_host(_filled(p, room)) for p in points)
+        still = [from_host(np.zeros(room, p.dtype)) for p in seen]
+    if all(x is None for x in jax.tree.leaves(fields_dot, is_leaf=lambda x: x is None)):
+        return still
+    return list(_fields_moved((fields, seen), fields_dot, tuple(still)))
+
+
+class _Corners:
+    """Steps of all sharp nodes, with the normals of their sides."""
+
+    def __init__(self, plan: BoundaryPlan, normals: np.ndarray):
+        beside = [np.asarray(own.beside) for own in plan.fields]
+        self._beside = np.concatenate([*beside, np.asarray(plan.ridge)])
+        self._rows = np.concatenate([normals, np.asarray(plan.tangent, normals.dtype)])
+        self._shape = count, dim = plan.sharp.shape[0], self._rows.shape[1]
+        eye = 1e-9 * np.eye(dim, dtype=normals.dtype)
+        self._matrix = np.broadcast_to(eye, (count, dim, dim)).copy()
+        outer = self._rows[:, :, None] * self._rows[:, None, :]
+        np.add.at(self._matrix, self._beside, outer)
+
+    def step(self, levels: np.ndarray) -> np.ndarray:
+        """By the levels of all sides, then those along the ridges."""
+        rhs = np.zeros(self._shape, self._rows.dtype)
+        np.add.at(rhs, self._beside, self._rows * levels[:, None])
+        return _cramer(self._matrix, rhs, np)
+
+    def back(self, change: np.ndarray) -> np.ndarray:
+        """The transpose of `step`."""
+        return (self._rows * _cramer(self._matrix, change, np)[self._beside]).sum(axis=1)
+
+
+def _meet_slope(plan: BoundaryPlan, normals, slopes: np.ndarray, given) -> OnHost:
+    """From the rates of the fields, and of where sharp nodes start, to those of the nodes."""
+    corners = _Corners(plan, normals)
+    counts = [len(own.beside) for own in plan.fields]
+    rooms = [x.shape[0] for x in given[:-1]]
+    ridge, tangent = np.asarray(plan.ridge), np.asarray(plan.tangent)
+
+    def staged(*rates):
+        *f_dot, start_dot = rates
+        levels = [-f[:n] for f, n in zip(f_dot, counts, strict=True)]
+        across = jnp.sum(plan.tangent * start_dot[plan.ridge], axis=1)
+        return (_least_squares(plan, normals, jnp.concatenate(levels) / slopes, across),)
+
+    def there(*rates):
+        *f_dot, start_dot = rates
+        levels = np.concatenate([-f[:n] for f, n in zip(f_dot, counts, strict=True)])
+        across = (tangent * start_dot[ridge]).sum(axis=1)
+        return (corners.step(np.concatenate([levels / slopes, across])),)
+
+    def back(change):
+        levels, across = np.split(corners.back(change), [len(slopes)])
+        start = np.zeros_like(change)
+        np.add.at(start, ridge, tangent * across[:, None])
+        parts = np.split(-levels / slopes, np.cumsum(counts)[:-1])
+        return [*map(_padded, parts, rooms), start]
+
+    return OnHost(staged, there, back, given, [given[-1].shape])
+
+
+def _divided(f: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """`quotient` by NumPy."""
+    return np.where(slope == 0, 0, f) / np.where(slope == 0, 1, slope).astype(f.dtype)
+
+
+def _slide_slope(plan: BoundaryPlan, gradients: list[np.ndarray], given) -> OnHost:
+    """From the rates of the fields, and of where smooth nodes start, to those of the nodes."""
+    pairs = zip(plan.fields, gradients, strict=True)
+    normals = [np.asarray(own.normal, g.dtype) for own, g in pairs]
+    slopes = [(g * n).sum(axis=1) for g, n in zip(gradients, normals, strict=True)]
+    count, rooms = len(normals), [x.shape[0] for x in given]
+
+    def moved(divided, rates):
+        sides = gradients, normals, slopes
+        for f, dot, g, n, slope in zip(rates[:count], rates[count:], *sides, strict=True):
+            rate = f[: len(g)] + (g * dot).sum(axis=1)
+            yield dot - divided(rate, slope)[:, None] * n
+
+    def staged(*rates):
+        return list(moved(quotient, rates))
+
+    def there(*rates):
+        return list(moved(_divided, rates))
+
+    def back(*changes):
+        rates = [
+            -_divided((change * n).sum(axis=1), slope)
+            for change, n, slope in zip(changes, normals, slopes, strict=True)
+        ]
+        ways = zip(changes, rates, gradients, strict=True)
+        starts = [change + rate[:, None] * g for change, rate, g in ways]
+        return [*map(_padded, rates, rooms[:count]), *starts]
+
+    return OnHost(staged, there, back, given, [g.shape for g in gradients])
+
+
+def _padded(row: np.ndarray, room: int) -> np.ndarray:
+    return np.concatenate([row, np.zeros(room - len(row), row.dtype)])
 
 
 # Points put where several sides of zero sets meet, on the host

@@ -15,10 +15,10 @@ from jaxtyping import Array, Float, Int
 from sorojax import _check
 from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax._types import integers, real
-from sorojax.math.two_programs import two_programs
 from sorojax.mesh.elements.base import facet_corners, nodes as reference_nodes, shape_functions
 from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.mesh import Mesh, boundary_facets
+from sorojax.mesh.motion import shifts
 from sorojax.mesh.motion.boundary import (
     ZOOMS,
     BoundaryPlan,
@@ -300,91 +300,41 @@ def moved_points(
     boundary = shift
     if motion.inside is not None:
         shift = spread(motion.inside, shift)
-    return _put(motion, points, shift, boundary)
+    return shifts.arrived(motion, points, shift, boundary)
 
 
 def _boundary_to(motion: _Motion, fields: tuple[AbstractSdf, ...], points, shift):
     """Shifts of the boundary from those of the stage before to the surfaces of `fields`."""
     sharp = None
     if len(motion.border.sharp):
-        sharp = meet(fields, motion.border, _sharp_place(motion, points, shift))
+        sharp = _met(motion, fields, points, shift)
         for lines in (motion.ridges, motion.surface):
             if lines is None:
                 continue
-            step = spread(lines, _sharp_step(motion, points, shift, sharp))
-            shift = _stepped(motion, shift, step)
+            step = spread(lines, shifts.to_sharp(motion, points, shift, sharp))
+            shift = shifts.stepped(motion, shift, step)
             if lines is motion.ridges:
-                sharp = meet(fields, motion.border, _sharp_place(motion, points, shift))
+                sharp = _met(motion, fields, points, shift)
     shift = _landed(motion, fields, points, sharp, shift)
     if motion.along is not None:
-        shift = _turned_back(motion, spread(motion.along, _turned(motion, shift)))
+        components = spread(motion.along, shifts.turned(motion, shift))
+        shift = shifts.turned_back(motion, components)
         shift = _landed(motion, fields, points, sharp, shift)
     return shift
 
 
+def _met(motion: _Motion, fields, points, shift):
+    """Where the sharp nodes go."""
+    (start,) = shifts.placed(motion, [motion.border.sharp], points, shift)
+    return meet(fields, motion.border, start)
+
+
 def _landed(motion: _Motion, fields, points, sharp, shift):
     """Shifts of the boundary from beside it to the surface."""
-    landed = slide(fields, motion.border, _beside(motion, points, shift))
-    return _boundary_shift(motion, points, sharp, landed)
-
-
-def _follow(motion: _Motion, shift):
-    """`shift` with that of all mid-side nodes interpolated from their cells."""
-    if not len(motion.middles):
-        return shift
-    between = jnp.einsum("mk,mki->mi", motion.weights, shift[motion.parents])
-    return shift.at[motion.middles].set(between)
-
-
-@two_programs
-def _sharp_place(motion: _Motion, points, shift):
-    return (points + shift)[motion.border.sharp]
-
-
-@two_programs
-def _sharp_step(motion: _Motion, points, shift, sharp):
-    """What is left to go for the sharp nodes."""
-    at = motion.border.sharp
-    return jnp.zeros_like(points).at[at].set(sharp - (points + shift)[at])
-
-
-@two_programs
-def _stepped(motion: _Motion, shift, step):
-    return shift + _follow(motion, step)
-
-
-@two_programs
-def _turned(motion: _Motion, shift):
-    """Components of a shift in the frames of the nodes, one after the other."""
-    return jnp.einsum("nki,ni->nk", motion.frames, shift).reshape(-1, 1)
-
-
-@two_programs
-def _turned_back(motion: _Motion, components):
-    """The shift with such components, that of mid-side nodes interpolated."""
-    components = components.reshape(motion.frames.shape[:2])
-    return _follow(motion, jnp.einsum("nki,nk->ni", motion.frames, components))
-
-
-@two_programs
-def _beside(motion: _Motion, points, shift):
-    return tuple((points + shift)[own.nodes] for own in motion.border.fields)
-
-
-@two_programs
-def _boundary_shift(motion: _Motion, points, sharp, landed):
-    shift = jnp.zeros_like(points)
-    if sharp is not None:
-        shift = shift.at[motion.border.sharp].set(sharp - points[motion.border.sharp])
-    for own, x in zip(motion.border.fields, landed, strict=True):
-        shift = shift.at[own.nodes].set(x - points[own.nodes])
-    return shift
-
-
-@two_programs
-def _put(motion: _Motion, points, shift, boundary):
-    bent = motion.bent
-    return points + _follow(motion, shift).at[bent].set(boundary[bent])
+    groups = [own.nodes for own in motion.border.fields]
+    beside = shifts.placed(motion, groups, points, shift)
+    landed = slide(fields, motion.border, tuple(beside))
+    return shifts.on_boundary(motion, points, sharp, landed)
 
 
 def _motion(mesh: Mesh, num_interfaces: int) -> _Motion:
@@ -420,7 +370,7 @@ def _prepared(mesh: Mesh, num_interfaces: int) -> _Motion:
     key = (id(mesh.points), id(mesh.cells), num_interfaces)
     if key not in _recent:
         # Concrete work, also when called under the user's trace.
-        with jax.ensure_compile_time_eval():
+        with evaluated_now():
             # The arrays are kept alive, so that their ids stay theirs.
             _recent[key] = (_motion(mesh, num_interfaces), mesh.points, mesh.cells)
         if len(_recent) > 4:

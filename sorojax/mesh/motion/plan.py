@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax._jax.trace_state import is_traced
-from sorojax._types import integers
+from sorojax._types import from_host, integers
 from sorojax.math.linalg import sparse
 from sorojax.math.linear_map import pushed
 from sorojax.mesh.elements.base import (
@@ -46,9 +46,7 @@ def harmonic(cells: np.ndarray, stiffness: np.ndarray, held: np.ndarray) -> Harm
     system = sparse.from_cells(len(nodes), number)
     values = sparse.assembled_on_host(system, stiffness)
     held_values = sparse.fixed_on_host(system, values, fixed)
-    return Harmonic(
-        system, jnp.asarray(values), jnp.asarray(held_values), jnp.asarray(fixed), nodes
-    )
+    return Harmonic(system, from_host(values), from_host(held_values), from_host(fixed), nodes)
 
 
 def _adrift(cells: np.ndarray, held: np.ndarray) -> np.ndarray:
@@ -100,7 +98,7 @@ class _Spread:
         """`nodal` with the values `own` at the nodes of the problem."""
         whole = np.array(nodal)
         whole[np.asarray(self._problem.nodes)] = own
-        return (jnp.asarray(whole),)
+        return (from_host(whole),)
 
     def _solved(self, force: np.ndarray) -> np.ndarray:
         """Of the free nodes by `force` on them; zero at the held ones."""

@@ -1,5 +1,4 @@
-"""Adaptive runs by diffrax, and their derivative in reverse: the accepted steps once more, from
-the last one.
+"""The derivative in reverse of adaptive runs: the accepted steps once more, from the last one.
 
 The discrete adjoint with the lengths of the steps held, as they are chosen and have no
 derivative. Every so many steps the state is kept; those between are computed again.
@@ -11,144 +10,43 @@ Reference:
 import math
 from typing import Any, NamedTuple
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
-from sorojax._jax import diffrax_checks
-from sorojax.math.ode.explicit import AbstractMethod, Again
+from sorojax.math.ode.explicit import Again
+from sorojax.systems.integrate.free_run import Moving, Plan, Record, Run, Steps, marched
 
-_CHECKPOINTS = 4096  # at most
-
-
-class Moving(NamedTuple):
-    """What a run has derivatives by: the constants of its rate, its first state, and the
-    instants [s] of which the states are kept."""
-
-    constants: PyTree
-    state: Float[Array, " states"]
-    time: Float[Array, " time"]
-
-
-class Plan(eqx.Module):
-    """All else that diffrax needs, and what is asked for: `free` runs step past their end."""
-
-    field: Any
-    solver: dfx.AbstractSolver
-    control: dfx.AbstractStepSizeController
-    start: Float[Array, ""]
-    end: Float[Array, ""]
-    watched: Any
-    event: dfx.Event | None
-    meter: dfx.AbstractProgressMeter
-    adjoint: dfx.AbstractAdjoint | None
-    further: dict[str, Any]
-    max_steps: int = eqx.field(static=True)
-    dense: bool = eqx.field(static=True)
-    free: bool = eqx.field(static=True)
-
-
-class Run(NamedTuple):
-    """The path at the instants (infinite where it was not reached), the last state, the last
-    step that was taken, what it started from, and how the run ended."""
-
-    path: Float[Array, "time states"]
-    last: Float[Array, " states"]
-    seam: Any
-    memory: PyTree
-    instants: Float[Array, " time"]
-    reached: Float[Array, ""]
-    result: dfx.RESULTS
-    steps: Int[Array, ""]
-    rejected: Int[Array, ""]
-    events: Any
-    dense: Any
-
-
-def solved(moving: Moving, plan: Plan) -> Run:
-    """The run, with the derivative that diffrax gives it."""
-    return _run(_solution(moving, plan), plan)
-
-
-def _solution(moving: Moving, plan: Plan, *more: dfx.SubSaveAt) -> dfx.Solution:
-    """The solution, with what `more` saves behind the path and the last state."""
-    further = dict(plan.further)
-    adjoint = dfx.RecursiveCheckpointAdjoint() if plan.adjoint is None else plan.adjoint
-    with diffrax_checks.left_out():
-        return dfx.diffeqsolve(
-            dfx.ODETerm(plan.field),
-            plan.solver,
-            plan.start,
-            plan.end,
-            further.pop("dt0", None),
-            moving.state,
-            args=(moving.constants, *plan.watched),
-            saveat=dfx.SaveAt(
-                subs=[dfx.SubSaveAt(ts=moving.time), dfx.SubSaveAt(t1=True), *more],
-                dense=plan.dense,
-                solver_state=plan.free,
-                controller_state=plan.free,
-            ),
-            stepsize_controller=plan.control,
-            max_steps=plan.max_steps,
-            adjoint=adjoint,
-            event=plan.event,
-            throw=False,
-            progress_meter=plan.meter,
-            **further,
-        )
-
-
-def _run(solution: dfx.Solution, plan: Plan) -> Run:
-    assert solution.ys is not None and solution.ts is not None
-    pace: Any = solution.controller_state
-    own: Any = (None, None)
-    if isinstance(plan.solver, AbstractMethod):
-        own = solution.solver_state
-    return Run(
-        solution.ys[0],
-        solution.ys[1][0],
-        pace.last if plan.free else None,
-        own[1] if plan.free else None,
-        solution.ts[0],
-        solution.ts[1][0],
-        solution.result,
-        solution.stats["num_steps"],
-        solution.stats["num_rejected_steps"],
-        solution.event_mask,
-        solution.interpolation,
-    )
+CHECKPOINTS = 4096  # at most
 
 
 @eqx.filter_custom_vjp
-def replayed(moving: Moving, plan: Plan) -> Run:
-    """The same of a free run by one of our methods, with a derivative in reverse alone."""
-    return solved(moving, plan)
+def replayed(moving: Moving, plan: Plan, room: int, record: Record | None) -> tuple[Run, Any]:
+    """A free run by one of our methods, with a derivative in reverse alone, and its steps as
+    `marched` gives them for so much `room`. With the `record` of a run its derivative needs
+    no other."""
+    return marched(moving, plan, room)
 
 
 @replayed.def_fwd
-def _forward(perturbed, moving, plan):
-    every = math.ceil(plan.max_steps / _CHECKPOINTS)
-    ends = dfx.SubSaveAt(t0=True, steps=1, fn=lambda t, y, args: jnp.zeros(()))
-    states = dfx.SubSaveAt(t0=True, steps=every)
-    # plain loops, whose forward derivative makes second derivatives
+def _forward(perturbed, moving, plan, room, record):
+    if record is not None:
+        return (record.run, None), record
+    # with the steps that compile fast
     quick: Any = Again(plan.solver)  # type: ignore[arg-type]
-    plain = eqx.tree_at(
-        lambda p: (p.adjoint, p.solver), plan, (dfx.ForwardMode(), quick), is_leaf=_is_none
-    )
-    solution = _solution(moving, plain, ends, states)
-    assert solution.ys is not None and solution.ts is not None
-    run = _run(solution, plan)
-    count = jnp.asarray(solution.stats["num_accepted_steps"], jnp.int32)
-    return run, (solution.ts[2], solution.ys[3], count, run)
+    plan = eqx.tree_at(lambda p: p.solver, plan, quick)
+    every = math.ceil(plan.max_steps / CHECKPOINTS)
+    run, steps = marched(moving, plan, plan.max_steps + 1, every)
+    return (run, _blank(steps, room) if room else None), Record(run, steps)
 
 
 @replayed.def_bwd
-def _backward(residuals, changes, perturbed, moving: Moving, plan: Plan):
-    times, kept, count, run = residuals
-    every = math.ceil(plan.max_steps / _CHECKPOINTS)
+def _backward(record, changes, perturbed, moving: Moving, plan: Plan, room, _):
+    (run, (times, kept, count)), (changes, _) = record, changes
+    every = 1
+    if kept.shape[0] < times.shape[0]:
+        every = math.ceil(plan.max_steps / CHECKPOINTS)
     wanted, held = eqx.partition(moving.constants, perturbed.constants)
     changes = jax.tree.map(
         lambda x, ct: jnp.zeros_like(x) if ct is None and eqx.is_inexact_array(x) else ct,
@@ -170,6 +68,12 @@ def _backward(residuals, changes, perturbed, moving: Moving, plan: Plan):
     number = -(-count // every)
     pulled = jax.lax.fori_loop(0, number, part, begin)
     return Moving(pulled.constants, pulled.state, pulled.time)
+
+
+def _blank(steps: Steps, room: int) -> Steps:
+    """Steps of which no one asks."""
+    rows = [jnp.zeros((room, *x.shape[1:]), x.dtype) for x in (steps.time, steps.state)]
+    return Steps(*rows, steps.count)
 
 
 def _is_none(leaf: Any) -> bool:

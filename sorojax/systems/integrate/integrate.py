@@ -14,12 +14,14 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from sorojax._edit import without_derivatives
 from sorojax._jax.programs import split
+from sorojax._jax.small_kernels import LARGEST
 from sorojax.math import host
 from sorojax.math.ode.explicit import AbstractMethod
 from sorojax.math.ode.step_control import Control, Seam
 from sorojax.math.status import Status
 from sorojax.systems.blocks.block import AbstractBlock
-from sorojax.systems.integrate.adjoint import Moving, Plan, replayed, solved
+from sorojax.systems.integrate.adjoint import CHECKPOINTS, replayed
+from sorojax.systems.integrate.free_run import Moving, Plan, Record, solved
 from sorojax.systems.network import Network, at_time
 
 
@@ -63,6 +65,7 @@ class Integration(NamedTuple):
         triggered: Which of the events ended the run.
         dense: The continuous solution, if asked for.
         memory: Of a method that keeps one for the whole run.
+        record: The run as its derivative needs it, if asked for.
     """
 
     path: PyTree
@@ -74,6 +77,7 @@ class Integration(NamedTuple):
     triggered: Bool[Array, " events"]
     dense: Any
     memory: Any = None
+    record: Record | None = None
 
 
 class Resume(NamedTuple):
@@ -123,12 +127,16 @@ def adaptive(
     dense: bool = False,
     progress: bool | str = False,
     seam: Resume | None = None,
+    recorded: bool = False,
+    record: Record | None = None,
 ) -> Integration:
     """Run from `start`, by default time[0], to time[-1]; what the grid holds before `start`
     is the first state. With a `seam` go on from there.
 
     Steps are not shortened to end at time[-1], which is interpolated, unless there are
-    conditions: so that a run that is cut in two takes the steps of the whole one.
+    conditions: so that a run that is cut in two takes the steps of the whole one. If `recorded`
+    the steps are kept where there are few; the derivative of a run with the `record` of itself
+    takes no steps but those.
     """
     start = time[0] if start is None else start
     flat, unravel = ravel_pytree(state)
@@ -170,7 +178,13 @@ def adaptive(
     moving = Moving(constants, flat, jnp.maximum(time, start))
     plain = adjoint is None and free and not dense and seam is None
     own = plain and isinstance(solver, AbstractMethod)
-    run = replayed(moving, without_derivatives(plan)) if own else solved(moving, plan)
+    if own:
+        room = _room(solver, flat.size) if recorded and record is None else 0
+        run, steps = replayed(moving, without_derivatives(plan), room, record)
+        if steps is not None:
+            record = jax.lax.stop_gradient(Record(run, steps))
+    else:
+        run = solved(moving, plan)
     last = run.last
     saved = jnp.isfinite(run.instants)
     path = jnp.where(saved[:, None], run.path, last)
@@ -192,7 +206,14 @@ def adaptive(
         triggered,
         run.dense,
         Resume(run.seam, run.memory) if free else None,
+        record,
     )
+
+
+def _room(method: AbstractMethod, states: int) -> int:
+    """For how many steps there is room. Of methods that solve nothing the loop over steps is
+    one kernel, which holds small arrays only."""
+    return CHECKPOINTS if method.solves else min(CHECKPOINTS, LARGEST // max(1, states))
 
 
 def _meter(progress: bool | str, start, far, end) -> dfx.AbstractProgressMeter:

@@ -20,6 +20,7 @@ from sorojax.math.ode.step_control import Control
 from sorojax.math.status import Status
 from sorojax.math.two_programs import two_programs
 from sorojax.systems.integrate.coupled import Coupled, bodies_of, check_places
+from sorojax.systems.integrate.free_run import Record
 from sorojax.systems.integrate.integrate import (
     Event,
     EventLog,
@@ -202,7 +203,7 @@ def simulate(
         solver = Tsit5() if solver is None else solver
         film = _adaptive(
             network, state, supplied, first, interval, save, solver, control, watch, options
-        )
+        )[0]
     else:
         method = _fixed_method(network, solver)
         substeps = _substeps(duration, save, step)
@@ -221,8 +222,19 @@ def simulate(
 
 
 def _run_adaptive(
-    network, state, inputs, first, interval, save, solver, control, watch, options
-) -> Trajectory:
+    network,
+    state,
+    inputs,
+    first,
+    interval,
+    save,
+    solver,
+    control,
+    watch,
+    options,
+    record=None,
+    recorded=True,
+) -> tuple[Trajectory, Record | None]:
     time = instants(first, interval, save)
     state = network.initial_state() if state is None else state
     events, most, dense = watch
@@ -231,25 +243,36 @@ def _run_adaptive(
     if events:
         motion, happened = run_with_events(*run, events, most, **options)
     else:
-        motion = adaptive(*run, dense=dense, **options)
-    return film_of(network, time, inputs, motion, happened)
+        motion = adaptive(*run, dense=dense, recorded=recorded, record=record, **options)
+    return film_of(network, time, inputs, motion, happened), motion.record
+
+
+def _run_within(*args: Any) -> tuple[Trajectory, None]:
+    """The same within `jit` and `vmap`."""
+    return _run_adaptive(*args, recorded=False)[0], None
 
 
 _FEW = 4096  # steps of which every state is kept for the derivative
 
 
-def _run_again(film: Trajectory, *args: Any) -> tuple[Any, ...]:
-    """The arguments of the run that is differentiated: silent, and with as many steps as it
-    takes, so that few of its states are computed twice."""
+def _run_again(found: tuple[Trajectory, Record | None], *args: Any) -> tuple[Any, ...]:
+    """The arguments of the run that is differentiated: silent, with the steps that it took, or
+    with as many steps as it takes, so that few of its states are computed twice."""
+    film, record = found
     *others, watch, options = args
+    options = options | {"progress": False}
+    if record is not None and int(record.steps.count) < record.steps.time.shape[0]:
+        return *others, watch, options, record
     _, _, dense = watch
     most, taken = options["max_steps"], int(film.stats["steps"])
     if not dense:
         most = min(most, max(_FEW, 2 ** (taken + taken // 8).bit_length()))
-    return *others, watch, options | {"max_steps": most, "progress": False}
+    return *others, watch, options | {"max_steps": most}
 
 
-_adaptive = two_programs(_run_adaptive, _run_again, kernels=True, largest=LARGEST_GIVEN)
+_adaptive = two_programs(
+    _run_adaptive, _run_again, _run_within, kernels=True, largest=LARGEST_GIVEN
+)
 
 
 @eqx.filter_jit
