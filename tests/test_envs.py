@@ -14,9 +14,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from sorojax import envs, io
-from sorojax.envs import finger
 from sorojax.envs.core import BOUND
 from sorojax.envs.supply_line import LATE_STEPS, begun, sent
+from sorojax.envs.tasks import finger
 
 REACH = envs.FingerReach(time_step=4e-3, substeps=5, max_steps=3)
 PUSH = envs.TentaclePush(time_step=2e-3, substeps=5, max_steps=60)
