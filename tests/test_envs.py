@@ -23,8 +23,11 @@ PUSH = envs.TentaclePush(time_step=2e-3, substeps=5, max_steps=60)
 TRACK = envs.TipTracking(time_step=4e-3, substeps=5, max_steps=100)
 CRAWL = envs.CrawlerRun(time_step=1e-3, substeps=10, max_steps=100)
 BALL, PICK = envs.BallTurn(), envs.PickPlace()
+SMALL = envs.solid_finger(4e-3, modes=6, tolerance=0.05)
+SOLID = envs.SolidReach(max_steps=3, body=SMALL)
 TASKS = [
-    pytest.param(env, id=type(env).__name__) for env in (REACH, PUSH, TRACK, CRAWL, BALL, PICK)
+    pytest.param(env, id=type(env).__name__)
+    for env in (REACH, PUSH, TRACK, CRAWL, BALL, PICK, SOLID)
 ]
 MEMBERS = 4
 
@@ -293,7 +296,8 @@ def test_a_crawler_slides_down_where_the_floor_is_steeper_than_its_friction(getk
 
 @pytest.mark.parametrize("env", TASKS)
 def test_the_gradient_through_steps_is_that_of_the_values(env, getkey):
-    """Of three steps, in contact where there are posts, by actions and a length."""
+    """Of three steps, in contact where there are posts, by actions and a number of the
+    body."""
     state, _ = started(env, getkey()[None], env.default_params())
     state = jax.tree.map(lambda x: x[0], state)
     if env is PUSH:  # the tip leans on a post at once
@@ -311,8 +315,9 @@ def test_the_gradient_through_steps_is_that_of_the_values(env, getkey):
     def total(x):
         params = env.default_params()
         # so much that the rounding of a stiff contact is small beside the differences
-        length = params.length * (1 + 0.05 * (x[-1] - 0.5))
-        params = eqx.tree_at(lambda p: p.length, params, length)
+        factor = 1 + 0.05 * (x[-1] - 0.5)
+        number = (lambda p: p.stiffness) if env is SOLID else (lambda p: p.length)
+        params = eqx.tree_at(number, params, number(params) * factor)
 
         def one(now, _):
             after = envs.step(env, key, now, x[:-1], params)
@@ -399,7 +404,8 @@ def test_a_spread_may_name_what_varies(getkey):
 def test_the_checker_of_gymnasium_has_nothing_to_say(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        made = gymnasium.make(name, max_steps=4, render_mode="rgb_array")
+        body = {"body": SMALL} if "Solid" in name else {}
+        made = gymnasium.make(name, max_steps=4, render_mode="rgb_array", **body)
         check_env(made.unwrapped)
     made.reset(seed=0)
     ends = [made.step(made.action_space.sample())[2:4] for _ in range(4)]
@@ -504,7 +510,15 @@ def test_environments_need_no_gymnasium_until_they_are_asked_for_it():
 
 
 def test_names_make_environments_and_vectors():
-    tasks = "BallTurn", "CrawlerRun", "FingerReach", "PickPlace", "TentaclePush", "TipTracking"
+    tasks = (
+        "BallTurn",
+        "CrawlerRun",
+        "FingerReach",
+        "PickPlace",
+        "SolidReach",
+        "TentaclePush",
+        "TipTracking",
+    )
     assert envs.register() == tuple(f"sorojax/{name}-v0" for name in tasks)
     many = gymnasium.make_vec(
         "sorojax/FingerReach-v0",

@@ -17,6 +17,8 @@ from sorojax.envs.tasks.crawler_run import CrawlerParams, CrawlerRun
 from sorojax.envs.tasks.finger import FingerParams
 from sorojax.envs.tasks.finger_reach import FingerReach
 from sorojax.envs.tasks.pick_place import PickParams, PickPlace
+from sorojax.envs.tasks.solid_finger import SolidFinger, solid_finger
+from sorojax.envs.tasks.solid_reach import SolidParams, SolidReach
 from sorojax.envs.tasks.tentacle_push import TentacleParams, TentaclePush
 from sorojax.envs.tasks.tip_tracking import TipTracking, TrackingParams
 
@@ -30,6 +32,9 @@ __all__ = [
     "FingerReach",
     "PickParams",
     "PickPlace",
+    "SolidFinger",
+    "SolidParams",
+    "SolidReach",
     "State",
     "Step",
     "SupplyLine",
@@ -40,6 +45,7 @@ __all__ = [
     "randomised",
     "register",
     "reset",
+    "solid_finger",
     "step",
     "step_with_reset",
     "to_brax",

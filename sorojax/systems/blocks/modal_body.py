@@ -383,11 +383,15 @@ def _work(body: FemBody, name: str, basis: Basis) -> Polynomial:
 
 
 def derivatives(function: Callable[[Modes], Array], at: Modes, order: int) -> tuple:
-    """Value and derivatives of a cheap function."""
+    """Value and derivatives of a cheap function; without the last ones where they are zero, as
+    of a weight or of an area, since the largest tensors would cost the most."""
     found: list[Any] = [function]
     for _ in range(order):
         found.append(jax.jacfwd(found[-1]))
-    return tuple(jax.jit(f)(at) for f in found)
+    made = [jax.jit(f)(at) for f in found]
+    while len(made) > 1 and not is_traced(made[-1]) and not np.any(made[-1]):
+        made.pop()
+    return tuple(made)
 
 
 def _taylor(force: AbstractModalForce, count: int, order: int) -> Polynomial:

@@ -136,7 +136,7 @@ class SampledForce(AbstractModalForce):
             sum(F[at[s.row, k]] * rates[k, s.col] for k in range(3) if (s.row, k) in at)
             for s in kinematics.slots
         ]
-        return 2 * self.viscosity * jnp.stack(total)
+        return 2 * self.viscosity[None, None] * jnp.stack(total)
 
     def _between(
         self, tangent: Float[Array, "entries entries quad cells"]
