@@ -73,9 +73,7 @@ class SolidReach(AbstractEnv):
     time_step: float = eqx.field(static=True, default=4e-3)
     substeps: int = eqx.field(static=True, default=5)
     tolerance: float = eqx.field(static=True, default=2 * mm)
-    body: SolidFinger = eqx.field(
-        converter=lambda body: solid_finger() if body is None else body, default=None
-    )
+    body: SolidFinger = eqx.field(default_factory=solid_finger)
     num_actions: ClassVar[int] = 2
     num_observations: ClassVar[int] = 2 * 2 + 2 + 2 * 4 * 2
 
