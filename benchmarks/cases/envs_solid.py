@@ -56,7 +56,8 @@ def whole_tip(env, acts: np.ndarray) -> np.ndarray:
         **given,
     )
     _, node = full.markers[-1]
-    return np.asarray(full.problem.mesh.points[node] + motion.displacements[FINE::FINE, node])
+    moved = np.asarray(motion.displacements[FINE::FINE, node])
+    return np.asarray(full.problem.mesh.points[node]) + moved
 
 
 def reduced_tip(env, acts: np.ndarray) -> np.ndarray:
