@@ -18,7 +18,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 import sorojax as sj
-from sorojax.envs import finger
+from sorojax.envs.tasks import finger
 
 PPO = runpy.run_path(str(Path(__file__).with_name("45_ppo.py")))
 ENV, ADAM, agent, episodes = (PPO[name] for name in ("ENV", "ADAM", "agent", "episodes"))

@@ -22,7 +22,7 @@ from jax.tree_util import Partial
 
 import sorojax as sj
 from sorojax import envs
-from sorojax.envs import finger
+from sorojax.envs.tasks import finger
 from sorojax_hardware import run_loop, simulated_board
 
 PPO = runpy.run_path(str(Path(__file__).with_name("45_ppo.py")))

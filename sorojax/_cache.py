@@ -1,5 +1,5 @@
 """The persistent compilation cache: on in the command line, examples, tests and
-benchmarks; never switched on by an import.
+benchmarks; never switched on by an import. Beside it a folder of trained models.
 
 Whoever can write to the cache can run code in the process that reads it, so the
 directory belongs to one user and to nobody else. Compiled programs hold instructions of the
@@ -67,6 +67,15 @@ def enable_compilation_cache() -> Path | None:
     return directory
 
 
+def trained_directory() -> Path:
+    """Where trained models are kept, made if it is not there: `$SOROJAX_CACHE/trained`.
+
+    Raises:
+        ValueError: If the directory belongs to, or can be written by, someone else.
+    """
+    return _private(_root(), _root() / "trained")
+
+
 def _root() -> Path:
     if own := os.environ.get("SOROJAX_CACHE"):
         return Path(own).expanduser().absolute()
@@ -85,13 +94,18 @@ def _processor() -> str:
 
 
 def _private_directory() -> Path:
-    root, directory = _root(), cache_directory()
-    root.parent.mkdir(parents=True, exist_ok=True)
-    for path in (root, directory.parent, directory):
+    directory = cache_directory()
+    return _private(_root(), directory.parent, directory)
+
+
+def _private(*folders: Path) -> Path:
+    """The last of the folders, each in the one before, made and closed to others."""
+    folders[0].parent.mkdir(parents=True, exist_ok=True)
+    for path in folders:
         path.mkdir(mode=0o700, exist_ok=True)
         _refuse_shared(path)
         path.chmod(0o700)
-    return directory
+    return folders[-1]
 
 
 def _refuse_shared(path: Path) -> None:

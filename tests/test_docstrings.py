@@ -36,8 +36,8 @@ VERBS = {
     "systems": "Network sampled_body simulate simulate_batch simulate_sampled",
     "design": "calibrate drawing_to_loop layout minimise minimise_shape propagate_covariance",
     "robots": "actuator_forces arm_mjcf bellows_problem computed_torque mount stepper",
-    "envs": "randomised register reset step step_with_reset to_brax to_gymnasium "
-    "to_gymnasium_vector",
+    "envs": "randomised register reset solid_finger step step_with_reset to_brax "
+    "to_gymnasium to_gymnasium_vector",
     "io": "export_mesh export_mjcf import_robot import_surface load save",
     "view": "png show",
     "vision": "calibrate",

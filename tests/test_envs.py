@@ -14,9 +14,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from sorojax import envs, io
-from sorojax.envs import finger
 from sorojax.envs.core import BOUND
 from sorojax.envs.supply_line import LATE_STEPS, begun, sent
+from sorojax.envs.tasks import finger
 
 REACH = envs.FingerReach(time_step=4e-3, substeps=5, max_steps=3)
 PUSH = envs.TentaclePush(time_step=2e-3, substeps=5, max_steps=60)
@@ -26,7 +26,17 @@ BALL, PICK = envs.BallTurn(), envs.PickPlace()
 TASKS = [
     pytest.param(env, id=type(env).__name__) for env in (REACH, PUSH, TRACK, CRAWL, BALL, PICK)
 ]
+TASKS.append(pytest.param(None, id="SolidReach"))  # is trained where it is used
 MEMBERS = 4
+
+
+def small_body():
+    return envs.solid_finger(4e-3, modes=6, tolerance=0.05)
+
+
+@pytest.fixture
+def env(request):
+    return request.param or envs.SolidReach(max_steps=3, body=small_body())
 
 
 @eqx.filter_jit
@@ -67,7 +77,7 @@ def spoilt(states, k):
 
 
 @pytest.mark.versions
-@pytest.mark.parametrize("env", TASKS)
+@pytest.mark.parametrize("env", TASKS, indirect=True)
 def test_a_member_of_a_batch_with_its_own_numbers_is_what_it_is_alone(env, getkey):
     given, observations = members(env, getkey())
     assert observations.shape == (MEMBERS, env.num_observations)
@@ -81,7 +91,7 @@ def test_a_member_of_a_batch_with_its_own_numbers_is_what_it_is_alone(env, getke
     assert (np.abs(together.observation) <= BOUND).all()
 
 
-@pytest.mark.parametrize("env", TASKS)
+@pytest.mark.parametrize("env", TASKS, indirect=True)
 def test_a_member_that_diverges_ends_alone_and_changes_no_bit(env, getkey):
     (keys, states, actions, params), _ = members(env, getkey())
     sound = stepped(env, keys, states, actions, params)
@@ -99,7 +109,7 @@ def test_a_member_that_diverges_ends_alone_and_changes_no_bit(env, getkey):
     assert np.isfinite(after.observation).all()
 
 
-@pytest.mark.parametrize("env", TASKS)
+@pytest.mark.parametrize("env", TASKS, indirect=True)
 def test_a_member_that_diverges_leaves_the_gradient_of_the_others(env, getkey):
     (keys, states, actions, params), _ = members(env, getkey())
 
@@ -124,7 +134,7 @@ def test_a_member_that_diverges_leaves_the_gradient_of_the_others(env, getkey):
     assert float(shared) == pytest.approx(float(own @ given[0]), rel=1e-9)
 
 
-@pytest.mark.parametrize("env", TASKS)
+@pytest.mark.parametrize("env", TASKS, indirect=True)
 def test_same_key_same_result(env, getkey):
     given, observations = members(env, getkey())
     keys, params = given[0], env.default_params()
@@ -134,7 +144,7 @@ def test_same_key_same_result(env, getkey):
     assert not np.array_equal(other, observations)
 
 
-@pytest.mark.parametrize("env", TASKS)
+@pytest.mark.parametrize("env", TASKS, indirect=True)
 def test_stored_states_and_numbers_go_on_to_the_same_bits(env, tmp_path, getkey):
     keys, states, actions, params = members(env, getkey())[0]
     io.save(tmp_path / "batch.npz", (env, states, params))
@@ -291,9 +301,10 @@ def test_a_crawler_slides_down_where_the_floor_is_steeper_than_its_friction(getk
     np.testing.assert_allclose(gained[1:], [-want, want, 0], rtol=0.03, atol=1e-6)
 
 
-@pytest.mark.parametrize("env", TASKS)
+@pytest.mark.parametrize("env", TASKS, indirect=True)
 def test_the_gradient_through_steps_is_that_of_the_values(env, getkey):
-    """Of three steps, in contact where there are posts, by actions and a length."""
+    """Of three steps, in contact where there are posts, by actions and a number of the
+    body."""
     state, _ = started(env, getkey()[None], env.default_params())
     state = jax.tree.map(lambda x: x[0], state)
     if env is PUSH:  # the tip leans on a post at once
@@ -311,8 +322,13 @@ def test_the_gradient_through_steps_is_that_of_the_values(env, getkey):
     def total(x):
         params = env.default_params()
         # so much that the rounding of a stiff contact is small beside the differences
-        length = params.length * (1 + 0.05 * (x[-1] - 0.5))
-        params = eqx.tree_at(lambda p: p.length, params, length)
+        factor = 1 + 0.05 * (x[-1] - 0.5)
+        number = (
+            (lambda p: p.stiffness)
+            if isinstance(env, envs.SolidReach)
+            else (lambda p: p.length)
+        )
+        params = eqx.tree_at(number, params, number(params) * factor)
 
         def one(now, _):
             after = envs.step(env, key, now, x[:-1], params)
@@ -399,7 +415,8 @@ def test_a_spread_may_name_what_varies(getkey):
 def test_the_checker_of_gymnasium_has_nothing_to_say(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        made = gymnasium.make(name, max_steps=4, render_mode="rgb_array")
+        body = {"body": small_body()} if "Solid" in name else {}
+        made = gymnasium.make(name, max_steps=4, render_mode="rgb_array", **body)
         check_env(made.unwrapped)
     made.reset(seed=0)
     ends = [made.step(made.action_space.sample())[2:4] for _ in range(4)]
@@ -504,7 +521,15 @@ def test_environments_need_no_gymnasium_until_they_are_asked_for_it():
 
 
 def test_names_make_environments_and_vectors():
-    tasks = "BallTurn", "CrawlerRun", "FingerReach", "PickPlace", "TentaclePush", "TipTracking"
+    tasks = (
+        "BallTurn",
+        "CrawlerRun",
+        "FingerReach",
+        "PickPlace",
+        "SolidReach",
+        "TentaclePush",
+        "TipTracking",
+    )
     assert envs.register() == tuple(f"sorojax/{name}-v0" for name in tasks)
     many = gymnasium.make_vec(
         "sorojax/FingerReach-v0",

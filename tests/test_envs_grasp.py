@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import grasping
 from sorojax import envs
-from sorojax.envs.gripping import LOST
+from sorojax.envs.tasks.gripping import LOST
 from sorojax.units import deg, mm
 
 BALL, PICK = envs.BallTurn(), envs.PickPlace()

@@ -2,7 +2,6 @@
 
 from sorojax._arguments import check_package as _check_package
 from sorojax.envs.adapters import register, to_brax, to_gymnasium, to_gymnasium_vector
-from sorojax.envs.ball_turn import BallParams, BallTurn
 from sorojax.envs.core import (
     AbstractEnv,
     State,
@@ -12,13 +11,16 @@ from sorojax.envs.core import (
     step,
     step_with_reset,
 )
-from sorojax.envs.crawler_run import CrawlerParams, CrawlerRun
-from sorojax.envs.finger import FingerParams
-from sorojax.envs.finger_reach import FingerReach
-from sorojax.envs.pick_place import PickParams, PickPlace
 from sorojax.envs.supply_line import SupplyLine
-from sorojax.envs.tentacle_push import TentacleParams, TentaclePush
-from sorojax.envs.tip_tracking import TipTracking, TrackingParams
+from sorojax.envs.tasks.ball_turn import BallParams, BallTurn
+from sorojax.envs.tasks.crawler_run import CrawlerParams, CrawlerRun
+from sorojax.envs.tasks.finger import FingerParams
+from sorojax.envs.tasks.finger_reach import FingerReach
+from sorojax.envs.tasks.pick_place import PickParams, PickPlace
+from sorojax.envs.tasks.solid_finger import SolidFinger, solid_finger
+from sorojax.envs.tasks.solid_reach import SolidParams, SolidReach
+from sorojax.envs.tasks.tentacle_push import TentacleParams, TentaclePush
+from sorojax.envs.tasks.tip_tracking import TipTracking, TrackingParams
 
 __all__ = [
     "AbstractEnv",
@@ -30,6 +32,9 @@ __all__ = [
     "FingerReach",
     "PickParams",
     "PickPlace",
+    "SolidFinger",
+    "SolidParams",
+    "SolidReach",
     "State",
     "Step",
     "SupplyLine",
@@ -40,6 +45,7 @@ __all__ = [
     "randomised",
     "register",
     "reset",
+    "solid_finger",
     "step",
     "step_with_reset",
     "to_brax",

@@ -13,12 +13,13 @@ from jaxtyping import Array, Bool, Float
 
 from sorojax._types import real
 from sorojax.envs import core
-from sorojax.envs.ball_turn import BallTurn
-from sorojax.envs.crawler_run import CrawlerRun
-from sorojax.envs.finger_reach import FingerReach
-from sorojax.envs.pick_place import PickPlace
-from sorojax.envs.tentacle_push import TentaclePush
-from sorojax.envs.tip_tracking import TipTracking
+from sorojax.envs.tasks.ball_turn import BallTurn
+from sorojax.envs.tasks.crawler_run import CrawlerRun
+from sorojax.envs.tasks.finger_reach import FingerReach
+from sorojax.envs.tasks.pick_place import PickPlace
+from sorojax.envs.tasks.solid_reach import SolidReach
+from sorojax.envs.tasks.tentacle_push import TentaclePush
+from sorojax.envs.tasks.tip_tracking import TipTracking
 from sorojax.math.compiled import jit_trees
 
 TASKS: dict[str, type[core.AbstractEnv]] = {
@@ -26,6 +27,7 @@ TASKS: dict[str, type[core.AbstractEnv]] = {
     "CrawlerRun": CrawlerRun,
     "FingerReach": FingerReach,
     "PickPlace": PickPlace,
+    "SolidReach": SolidReach,
     "TentaclePush": TentaclePush,
     "TipTracking": TipTracking,
 }

@@ -74,6 +74,10 @@ class AbstractModalForce(eqx.Module):
         """Strain over the largest of the training; 0 without one."""
         return jnp.zeros_like(q[0])
 
+    def viscous(self, q: Modes, v: Modes) -> Modes:
+        """Force of a viscosity that turns with the body."""
+        return jnp.zeros_like(v)
+
     @property
     def relaxation_times(self) -> Float[Array, " branches"] | None:
         """Of Maxwell branches beside the force [s]; None without any."""
@@ -128,7 +132,7 @@ class ModalBody(AbstractBlock):
     Attributes:
         basis: Shapes of unit modal mass.
         force: Of the body on the modal coordinates.
-        damping: Matrix [1/s].
+        damping: Matrix [1/s], of what is the same in every state.
         works: What each driven load works on, in the unit of work over that of the load: of
             a pressure its volume.
         ports: Of the driven loads: name, input, shape, unit, and the name of the volume.
@@ -234,7 +238,7 @@ class ModalBody(AbstractBlock):
     ) -> Modes:
         """Force on the modal coordinates in a frame that rests."""
         force = self.force(q) if relaxed is None else self.force.with_branches(q, relaxed)
-        return self.loads(inputs)(q) - force - self.damping @ v
+        return self.loads(inputs)(q) - force - self.damping @ v - self.force.viscous(q, v)
 
     def loads(self, inputs) -> Polynomial:
         """Force of the driven loads on the modal coordinates, as a function of these."""

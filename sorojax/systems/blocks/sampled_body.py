@@ -168,7 +168,7 @@ def sampled_body(
     basis = snapshot_basis(body, jnp.stack([*(s.u for s in seen), *slopes, *shown]), modes)
     cells, points = pieces(body)
     every = sampled_force(body, basis, cells, np.ones(len(cells)), points)
-    whole = modal_body(weighed, basis, order=None)
+    whole = modal_body(_without_viscosity(weighed), basis, order=None)
     whole = eqx.tree_at(lambda b: b.force, whole, every)
     known = [coordinates(body, basis, s.u) for s in seen]
     free = [coordinates(body, basis, u) for u in shown[:: 1 + len(shown) // _FRAMES]]
@@ -182,7 +182,10 @@ def sampled_body(
     known += [coordinates(body, basis, s.u) for s in told]
     trained = jnp.max(jax.vmap(chosen.strain)(jnp.stack([*known, *free])))
     branches = _branches(given, cells)
-    chosen = dataclasses.replace(chosen, trained=trained, branches=branches)
+    viscosity = _viscosity(given, cells)
+    chosen = dataclasses.replace(
+        chosen, trained=trained, branches=branches, viscosity=viscosity
+    )
     small = eqx.tree_at(lambda b: b.force, whole, chosen)
     error = _error(body, small, told) if told else _error_of_frames(body, small, whole, beside)
     report("sampled_body: cells", 1, 1)
@@ -215,6 +218,18 @@ def _branches(body: FemBody, cells: np.ndarray) -> Branches | None:
         return None
     shear = [jnp.broadcast_to(modulus, (count,))[cells] for modulus in branch_moduli(law)]
     return Branches(jnp.stack(shear)[:, None], jnp.stack(law.relaxation.times))
+
+
+def _without_viscosity(body: FemBody) -> FemBody:
+    """The body with the damping that is the same in every state."""
+    return dataclasses.replace(body, damping=tuple(x for x in body.damping if x.constant))
+
+
+def _viscosity(body: FemBody, cells: np.ndarray) -> Float[Array, " kept"] | None:
+    """Of the cells [Pa s], all there is together; None without any."""
+    count = body.problem.mesh.num_cells
+    found = [x.viscosity for x in body.damping if isinstance(x, fem.KelvinVoigt)]
+    return sum(jnp.broadcast_to(x, (count,))[cells] for x in found) if found else None
 
 
 class _State(NamedTuple):

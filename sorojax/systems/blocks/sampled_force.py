@@ -30,7 +30,7 @@ from sorojax.fem.assembly.energy import (
     tangent_entries,
 )
 from sorojax.fem.assembly.geometry import deformation, quadrature_points
-from sorojax.fem.kinematics import component_pairs, entries_of
+from sorojax.fem.kinematics import component_pairs, entries_of, green_rates, strain_pairs
 from sorojax.fem.problem import body as bare, body_at, load_force
 from sorojax.material.viscoelastic import (
     Overstressed,
@@ -78,6 +78,8 @@ class SampledForce(AbstractModalForce):
         volumes: Of the quadrature points, times the weight of their cell [m^3].
         loads: Force of the loads that are not driven.
         trained: Largest change of an entry of F that the training has seen; None without one.
+        branches: Of a viscoelastic body; None without any.
+        viscosity: Of `fem.KelvinVoigt` in the chosen cells [Pa s]; None without it.
     """
 
     body: Body
@@ -87,6 +89,7 @@ class SampledForce(AbstractModalForce):
     loads: Polynomial
     trained: Float[Array, ""] | None = None
     branches: Branches | None = None
+    viscosity: Float[Array, " #cells"] | None = None
 
     @property
     def is_trained(self):
@@ -95,6 +98,56 @@ class SampledForce(AbstractModalForce):
     @property
     def relaxation_times(self):
         return None if self.branches is None else self.branches.times
+
+    def viscous(self, q, v):
+        if self.viscosity is None:
+            return jnp.zeros_like(v)
+        return _braking(self, q, v)
+
+    def viscous_matrix(self, q: Modes) -> Float[Array, "modes modes"]:
+        """C(q) [1/s] of the viscosity: what rotates is not held back."""
+        assert self.viscosity is not None
+        kinematics, F = self.body.kinematics, self._gradients(q)
+        rates = green_rates(kinematics, F[:, None], jnp.moveaxis(self.slopes, 0, 1))
+        twice = [1.0 if j == k else 2.0**0.5 for j, k in strain_pairs(kinematics)]
+        root = jnp.sqrt(2 * self.volumes * self.viscosity[None])[None]
+        rows = [a * root * rate for a, rate in zip(twice, rates, strict=True)]
+        flat = jnp.stack(rows, axis=1).reshape(q.shape[0], -1)
+        return flat @ flat.T
+
+    def viscous_stiffness(self, q: Modes, v: Modes) -> Float[Array, "modes modes"]:
+        """Derivative of C(q) v by q."""
+        F, H = self._gradients(q), jnp.tensordot(v, self.slopes, 1)
+        count = F.shape[0]
+        ways = jnp.broadcast_to(jnp.eye(count)[:, :, None, None], (count, *F.shape))
+        one = jax.vmap(lambda way: jax.jvp(lambda F: self._viscous_stress(F, H), (F,), (way,)))
+        return self._between(one(ways)[1])
+
+    def _viscous_stress(self, F: Entries, H: Entries) -> Entries:
+        """First Piola-Kirchhoff stress 2 viscosity F dE/dt, for the rate H of F."""
+        assert self.viscosity is not None
+        kinematics = self.body.kinematics
+        at = {(s.row, s.col): number for number, s in enumerate(kinematics.slots)}
+        rates = {}
+        pairs = strain_pairs(kinematics)
+        for (j, k), rate in zip(pairs, green_rates(kinematics, F, H), strict=True):
+            rates[j, k] = rates[k, j] = rate
+        total = [
+            sum(F[at[s.row, k]] * rates[k, s.col] for k in range(3) if (s.row, k) in at)
+            for s in kinematics.slots
+        ]
+        return 2 * self.viscosity[None, None] * jnp.stack(total)
+
+    def _between(
+        self, tangent: Float[Array, "entries entries quad cells"]
+    ) -> Float[Array, "modes modes"]:
+        """Sum over the points of a derivative of P, the first axis that of F."""
+        weighed = (self.volumes[None, None] * tangent)[:, :, None]
+        every = range(self.slopes.shape[1])
+        bent = [sum(weighed[f, e] * self.slopes[:, f] for f in every) for e in every]
+        count = self.slopes.shape[0]
+        flat = self.slopes.reshape(count, -1)
+        return flat @ jnp.stack(bent, axis=1).reshape(count, -1).T
 
     def with_branches(self, q, relaxed):
         return _of_branches(self, q, relaxed) - self.loads(q)
@@ -202,6 +255,30 @@ def _(primals, tangents):
     if any(leaf is not None for leaf in jax.tree.leaves(numbers, is_leaf=lambda x: x is None)):
         by_numbers = eqx.filter_jvp(lambda f: jax.grad(f._stored)(q), (force,), (numbers,))[1]
         change = change + by_numbers
+    return found, change
+
+
+def _braked(force: SampledForce, q: Modes, v: Modes) -> Modes:
+    """Force of the viscosity."""
+    stress = force._viscous_stress(force._gradients(q), jnp.tensordot(v, force.slopes, 1))
+    return jnp.einsum("eqc,qc,meqc->m", stress, force.volumes, force.slopes)
+
+
+@eqx.filter_custom_jvp
+def _braking(force: SampledForce, q: Modes, v: Modes) -> Modes:
+    """The same; its derivatives by all coordinates and rates are two matrices."""
+    return _braked(force, q, v)
+
+
+@_braking.def_jvp
+def _(primals, tangents):
+    (force, q, v), (numbers, way, speed) = primals, tangents
+    found = _braked(force, q, v)
+    change = jnp.zeros_like(v) if speed is None else force.viscous_matrix(q) @ speed
+    if way is not None:
+        change = change + force.viscous_stiffness(q, v) @ way
+    if any(leaf is not None for leaf in jax.tree.leaves(numbers, is_leaf=lambda x: x is None)):
+        change = change + eqx.filter_jvp(lambda f: _braked(f, q, v), (force,), (numbers,))[1]
     return found, change
 
 

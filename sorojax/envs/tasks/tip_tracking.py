@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax._types import real
-from sorojax.envs import finger
 from sorojax.envs.core import Verdict
 from sorojax.envs.supply_line import SupplyLine, between
+from sorojax.envs.tasks import finger
 from sorojax.units import mm
 
 _AHEAD = 1, 2, 4, 8  # steps of the preview

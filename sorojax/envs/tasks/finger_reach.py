@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sorojax.envs import finger
 from sorojax.envs.core import Verdict
+from sorojax.envs.tasks import finger
 from sorojax.units import mm
 
 

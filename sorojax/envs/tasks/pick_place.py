@@ -10,7 +10,9 @@ from jaxtyping import Array, Float
 
 from sorojax._types import real
 from sorojax.envs.core import Verdict, in_shares
-from sorojax.envs.gripping import (
+from sorojax.envs.rods import Inflated, rolled
+from sorojax.envs.supply_line import SupplyLine, between
+from sorojax.envs.tasks.gripping import (
     LOST,
     POINTS,
     POISSON,
@@ -25,8 +27,6 @@ from sorojax.envs.gripping import (
     soft,
     within,
 )
-from sorojax.envs.rods import Inflated, rolled
-from sorojax.envs.supply_line import SupplyLine, between
 from sorojax.math.lie import SE2, homogeneous
 from sorojax.math.ode.linearly_implicit import LinearlyImplicit
 from sorojax.rod import (

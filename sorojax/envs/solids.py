@@ -1,0 +1,123 @@
+"""What environments of reduced solids share: their rubber, their motion, and their rest."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from sorojax.systems.blocks.modal_body import ModalBody
+from sorojax.systems.blocks.sampled_force import SampledForce
+
+_FARTHEST = 1.25  # of the strains of the training, as in a network
+_SETTLING = (0.05, 40, 20)  # [s], steps, and how many of them raise the pressures
+
+
+class SolidBody(NamedTuple):
+    """Coordinates of a reduced solid and their rates."""
+
+    q: Float[Array, " modes"]
+    v: Float[Array, " modes"]
+
+
+class Rubber(NamedTuple):
+    """Factors of stiffness, viscosity and density, over those of the training [-]."""
+
+    stiffness: Float[Array, ""]
+    damping: Float[Array, ""]
+    density: Float[Array, ""]
+
+
+class Solid(NamedTuple):
+    """A reduced body of another rubber than that of its training.
+
+    Attributes:
+        body: With the forces of that rubber.
+        mass: Of each coordinate, in that of the training [-].
+    """
+
+    body: ModalBody
+    mass: Float[Array, ""]
+
+
+def of_rubber(body: ModalBody, rubber: Rubber) -> Solid:
+    """The body of `sampled_body`, which is loaded by its weight and by what is driven alone,
+    in another rubber: exactly, as shapes and cells are the same."""
+    force = body.force
+    assert isinstance(force, SampledForce)
+    parts = [force.volumes * rubber.stiffness]
+    parts += [rubber.density * term for term in force.loads.terms]
+    where = [lambda b: b.force.volumes, lambda b: b.damping]
+    body = eqx.tree_at(where[0], body, parts[0])
+    body = eqx.tree_at(lambda b: b.force.loads.terms, body, tuple(parts[1:]))
+    body = eqx.tree_at(where[1], body, body.damping * rubber.damping)
+    if force.viscosity is not None:
+        viscosity = force.viscosity * rubber.damping / rubber.stiffness
+        body = eqx.tree_at(lambda b: b.force.viscosity, body, viscosity)
+    return Solid(body, rubber.density)
+
+
+def rolled(
+    solid: Solid,
+    state: SolidBody,
+    inputs: Callable[[Array], Float[Array, " inputs"]],
+    *,
+    time_step: float,
+    steps: int,
+    implicit: float = 0.5,
+) -> SolidBody:
+    """The body after some steps of one length [s], from the time 0, under inputs by the time,
+    in the order of the ports.
+
+    A step of the implicit midpoint rule with one Newton pass from rest, (m + h/2 D + h^2/4 K) a
+    = f(t + h/2, q + h/2 v, v): of second order, of the same cost in every state. D and K are
+    the derivatives of all forces there. `implicit` 1 in place of 1/2 is backward Euler.
+    """
+    unit = jnp.eye(state.q.shape[0], dtype=state.q.dtype)
+    h, early = time_step, implicit * time_step
+
+    def one(state: SolidBody, number: Array):
+        given = inputs((number + implicit) * h)
+        ahead = state.q + early * state.v
+
+        def pull(q, v):
+            return solid.body.pull(q, v, _by_port(solid.body, given))
+
+        stiffness, damping = (
+            jax.jacfwd(lambda q: pull(q, state.v))(ahead),
+            jax.jacfwd(lambda v: pull(ahead, v))(state.v),
+        )
+        matrix = solid.mass * unit - early * damping - early**2 * stiffness
+        a = jnp.linalg.solve(matrix, pull(ahead, state.v))
+        return SolidBody(state.q + h * (state.v + early * a), state.v + h * a), None
+
+    numbers = jnp.arange(steps, dtype=state.q.dtype)
+    return jax.lax.scan(one, state, numbers)[0]
+
+
+def settled(solid: Solid, given: Float[Array, " inputs"]) -> SolidBody:
+    """The body when it has come to rest under held inputs, by long steps of a damped method
+    while they rise from zero: a search for equilibrium may go to another one, or to none."""
+    time_step, steps, rising = _SETTLING
+    start = SolidBody(jnp.zeros_like(solid.body.q), jnp.zeros_like(solid.body.q))
+
+    def raised(t):
+        return given * jnp.minimum(t / (rising * time_step), 1.0)
+
+    return rolled(solid, start, raised, time_step=time_step, steps=steps, implicit=1.0)
+
+
+def places(body: ModalBody, q: Float[Array, " modes"]) -> Float[Array, "markers dim"]:
+    """Where the markers of the body are [m]."""
+    return jnp.stack([place + q @ moves for place, moves in body.markers.values()])
+
+
+def known(body: ModalBody, q: Float[Array, " modes"]) -> Bool[Array, ""]:
+    """Whether the strains are as far as the training allows."""
+    return body.force.reach(q) <= _FARTHEST
+
+
+def _by_port(body: ModalBody, given: Float[Array, " inputs"]) -> dict[str, Array]:
+    return {port: x for (_, port, *_), x in zip(body.ports, given, strict=True)}
