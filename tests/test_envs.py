@@ -31,7 +31,7 @@ MEMBERS = 4
 
 
 def small_body():
-    return envs.solid_finger(4e-3, modes=6, tolerance=0.05)
+    return envs.solid_finger(4e-3, modes=6, tolerance=0.01)
 
 
 @pytest.fixture

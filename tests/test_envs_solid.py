@@ -15,7 +15,7 @@ from sorojax.systems.blocks.modal_basis import coordinates
 from sorojax.systems.blocks.modal_body import ProjectedForce, modal_body
 from sorojax.systems.blocks.sampled_force import sampled_force
 
-SETTINGS = {"size": 4e-3, "modes": 6, "tolerance": 0.05}
+SETTINGS = {"size": 4e-3, "modes": 6, "tolerance": 0.01}
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +145,7 @@ def test_a_training_is_kept_and_a_damaged_file_trained_again(small, tmp_path, mo
 @pytest.mark.slow
 def test_the_tip_is_where_that_of_the_whole_finger_is():
     """Under pressures that were not in the training, of both sides."""
-    env, acts = envs.SolidReach(), envs_solid.actions()
+    env, acts = envs.SolidReach(), envs_solid.actions(101)
     tips = envs_solid.reduced_tip(env, acts)
     off, move = envs_solid.error_of(tips, envs_solid.whole_tip(env, acts))
-    assert move > 15e-3 and off < 0.01 * move
+    assert move > 15e-3 and off < 0.025 * move

@@ -229,7 +229,9 @@ def _viscosity(body: FemBody, cells: np.ndarray) -> Float[Array, " kept"] | None
     """Of the cells [Pa s], all there is together; None without any."""
     count = body.problem.mesh.num_cells
     found = [x.viscosity for x in body.damping if isinstance(x, fem.KelvinVoigt)]
-    return sum(jnp.broadcast_to(x, (count,))[cells] for x in found) if found else None
+    if not found:
+        return None
+    return jnp.sum(jnp.stack([jnp.broadcast_to(x, (count,))[cells] for x in found]), axis=0)
 
 
 class _State(NamedTuple):

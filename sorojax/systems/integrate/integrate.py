@@ -177,8 +177,7 @@ def adaptive(
     )
     moving = Moving(constants, flat, jnp.maximum(time, start))
     plain = adjoint is None and free and not dense and seam is None
-    own = plain and isinstance(solver, AbstractMethod)
-    if own:
+    if plain and isinstance(solver, AbstractMethod):
         room = _room(solver, flat.size) if recorded and record is None else 0
         run, steps = replayed(moving, without_derivatives(plan), room, record)
         if steps is not None:
