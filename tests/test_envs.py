@@ -1,5 +1,6 @@
 """Environments: members that end alone, gradients, the shapes of Gymnasium and of Brax."""
 
+import functools
 import subprocess
 import sys
 import warnings
@@ -16,7 +17,7 @@ from gymnasium.vector import AutoresetMode
 from sorojax import envs, io
 from sorojax.envs.core import BOUND
 from sorojax.envs.supply_line import LATE_STEPS, begun, sent
-from sorojax.envs.tasks import finger
+from sorojax.envs.tasks import finger, solid_crawler
 
 REACH = envs.FingerReach(time_step=4e-3, substeps=5, max_steps=3)
 PUSH = envs.TentaclePush(time_step=2e-3, substeps=5, max_steps=60)
@@ -26,7 +27,8 @@ BALL, PICK = envs.BallTurn(), envs.PickPlace()
 TASKS = [
     pytest.param(env, id=type(env).__name__) for env in (REACH, PUSH, TRACK, CRAWL, BALL, PICK)
 ]
-TASKS.append(pytest.param(None, id="SolidReach"))  # is trained where it is used
+SOLIDS = "SolidReach", "SolidCrawl"  # trained where they are used
+TASKS += [pytest.param(name, id=name) for name in SOLIDS]
 MEMBERS = 4
 
 
@@ -34,9 +36,22 @@ def small_body():
     return envs.solid_finger(4e-3, modes=6, tolerance=0.01)
 
 
+@functools.cache
+def small_crawler():
+    """Trained on the first tenth of a second of a gait alone."""
+    time = 2e-3 * np.arange(51)
+    waves = np.maximum(np.sin(15 * time[None] - np.arange(3)[:, None]), 0.0)
+    command = jnp.asarray(solid_crawler.MAX_PRESSURE * waves)
+    return solid_crawler.trained_on(solid_crawler.full_crawler(), [command], 6, 0.05)
+
+
 @pytest.fixture
 def env(request):
-    return request.param or envs.SolidReach(max_steps=3, body=small_body())
+    if request.param == "SolidReach":
+        return envs.SolidReach(max_steps=3, body=small_body())
+    if request.param == "SolidCrawl":
+        return envs.SolidCrawl(max_steps=100, substeps=2, body=small_crawler())
+    return request.param
 
 
 @eqx.filter_jit
@@ -325,7 +340,7 @@ def test_the_gradient_through_steps_is_that_of_the_values(env, getkey):
         factor = 1 + 0.05 * (x[-1] - 0.5)
         number = (
             (lambda p: p.stiffness)
-            if isinstance(env, envs.SolidReach)
+            if isinstance(env, envs.SolidReach | envs.SolidCrawl)
             else (lambda p: p.length)
         )
         params = eqx.tree_at(number, params, number(params) * factor)
@@ -415,7 +430,8 @@ def test_a_spread_may_name_what_varies(getkey):
 def test_the_checker_of_gymnasium_has_nothing_to_say(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        body = {"body": small_body()} if "Solid" in name else {}
+        made = {"SolidReach": small_body, "SolidCrawl": small_crawler}
+        body = {"body": make() for task, make in made.items() if task in name}
         made = gymnasium.make(name, max_steps=4, render_mode="rgb_array", **body)
         check_env(made.unwrapped)
     made.reset(seed=0)
@@ -526,6 +542,7 @@ def test_names_make_environments_and_vectors():
         "CrawlerRun",
         "FingerReach",
         "PickPlace",
+        "SolidCrawl",
         "SolidReach",
         "TentaclePush",
         "TipTracking",

@@ -22,7 +22,7 @@ TASKS = {
     "ball turn": envs.BallTurn(),
     "pick and place": envs.PickPlace(),
 }
-SOLID = "solid reach"  # its training, once on a computer, is not of the import
+SOLIDS = {"solid reach": envs.SolidReach, "solid crawl": envs.SolidCrawl}  # trained once
 
 
 def batches(env, sizes):
@@ -40,7 +40,7 @@ def batches(env, sizes):
 
 def rows():
     sizes = SIZES[:2] if quick("batches above 64") else SIZES
-    for name, env in (TASKS | {SOLID: envs.SolidReach()}).items():
+    for name, env in (TASKS | {name: kind() for name, kind in SOLIDS.items()}).items():
         step = jax.vmap(lambda *one, env=env: envs.step(env, *one))
         for members, given in batches(env, sizes):
             found = {}

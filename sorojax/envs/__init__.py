@@ -17,6 +17,8 @@ from sorojax.envs.tasks.crawler_run import CrawlerParams, CrawlerRun
 from sorojax.envs.tasks.finger import FingerParams
 from sorojax.envs.tasks.finger_reach import FingerReach
 from sorojax.envs.tasks.pick_place import PickParams, PickPlace
+from sorojax.envs.tasks.solid_crawl import SolidCrawl, SolidCrawlParams
+from sorojax.envs.tasks.solid_crawler import SolidCrawler, solid_crawler
 from sorojax.envs.tasks.solid_finger import SolidFinger, solid_finger
 from sorojax.envs.tasks.solid_reach import SolidParams, SolidReach
 from sorojax.envs.tasks.tentacle_push import TentacleParams, TentaclePush
@@ -32,6 +34,9 @@ __all__ = [
     "FingerReach",
     "PickParams",
     "PickPlace",
+    "SolidCrawl",
+    "SolidCrawlParams",
+    "SolidCrawler",
     "SolidFinger",
     "SolidParams",
     "SolidReach",
@@ -45,6 +50,7 @@ __all__ = [
     "randomised",
     "register",
     "reset",
+    "solid_crawler",
     "solid_finger",
     "step",
     "step_with_reset",

@@ -17,6 +17,7 @@ from sorojax.envs.tasks.ball_turn import BallTurn
 from sorojax.envs.tasks.crawler_run import CrawlerRun
 from sorojax.envs.tasks.finger_reach import FingerReach
 from sorojax.envs.tasks.pick_place import PickPlace
+from sorojax.envs.tasks.solid_crawl import SolidCrawl
 from sorojax.envs.tasks.solid_reach import SolidReach
 from sorojax.envs.tasks.tentacle_push import TentaclePush
 from sorojax.envs.tasks.tip_tracking import TipTracking
@@ -27,6 +28,7 @@ TASKS: dict[str, type[core.AbstractEnv]] = {
     "CrawlerRun": CrawlerRun,
     "FingerReach": FingerReach,
     "PickPlace": PickPlace,
+    "SolidCrawl": SolidCrawl,
     "SolidReach": SolidReach,
     "TentaclePush": TentaclePush,
     "TipTracking": TipTracking,

@@ -1,18 +1,70 @@
-"""What environments of reduced solids share: their rubber, their motion, and their rest."""
+"""What environments of reduced solids share: their training, which is kept on the computer,
+their rubber, their motion, and their rest."""
 
+import hashlib
+import inspect
 from collections.abc import Callable
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from sorojax import _cache, io
+from sorojax.systems.blocks import (
+    modal_basis,
+    modal_body,
+    sampled_body,
+    sampled_force,
+    surface_contact,
+)
 from sorojax.systems.blocks.modal_body import ModalBody
 from sorojax.systems.blocks.sampled_force import SampledForce
 
 _FARTHEST = 1.25  # of the strains of the training, as in a network
 _SETTLING = (0.05, 40, 20)  # [s], steps, and how many of them raise the pressures
+
+
+_TRAINING = modal_basis, modal_body, sampled_body, sampled_force, surface_contact
+
+
+def kept(
+    where: str,
+    settings: tuple[float, ...],
+    source: Path,
+    train: Callable[..., Any],
+    keep: bool = True,
+) -> Any:
+    """What `train(*settings)` makes, read from `$SOROJAX_CACHE/trained` if it was kept there by
+    an earlier call. It is known by the settings, the version, and the text of what trains,
+    that of the file `source` included.
+
+    Raises:
+        ValueError: Without double precision.
+    """
+    if not jax.config.jax_enable_x64:  # pyright: ignore
+        raise ValueError(
+            f"{where}: got single precision, need double precision to train and to read. "
+            'Call jax.config.update("jax_enable_x64", True) first.'
+        )
+    if not keep:
+        return train(*settings)
+    from sorojax import __version__
+
+    told = repr([float(x) for x in settings]) + __version__ + source.read_text()
+    text = told + "".join(inspect.getsource(part) for part in _TRAINING)
+    name = hashlib.sha256(text.encode()).hexdigest()[:24]
+    path = _cache.trained_directory() / f"{where}-{name}.npz"
+    if path.exists():
+        try:
+            return io.load(path)
+        except ValueError:  # damaged, or of other classes: train again
+            pass
+    made = train(*settings)
+    io.save(path, made)
+    return made
 
 
 class SolidBody(NamedTuple):

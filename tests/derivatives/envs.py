@@ -10,7 +10,7 @@ from tests.derivatives.case import Case
 NONE = {
     "a goal is drawn, and the way to it has no slope of use": "reset step_with_reset",
     "names of Gymnasium": "register",
-    "a training, which chooses cells": "solid_finger",
+    "a training, which chooses cells": "solid_crawler solid_finger",
     "numbers for the host": "to_gymnasium to_gymnasium_vector",
     "a step of the same environment in another shape": "to_brax",
 }

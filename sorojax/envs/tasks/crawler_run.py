@@ -1,19 +1,17 @@
 """A soft crawler goes forward on a rough floor by the pressures of its three chambers."""
 
-from dataclasses import replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax._types import real
 from sorojax.contact import LinePenalty
-from sorojax.envs.core import AbstractEnv, Verdict, in_shares
 from sorojax.envs.rods import Inflated, RodBody, places, rolled
 from sorojax.envs.supply_line import SupplyLine
+from sorojax.envs.tasks.crawl import MARKERS, AbstractCrawler, FloorGoal, on_floor
 from sorojax.math.lie import SE2
 from sorojax.math.ode.linearly_implicit import LinearlyImplicit
 from sorojax.rod import (
@@ -38,12 +36,10 @@ from sorojax.rod import (
 from sorojax.sdf import HalfPlane
 from sorojax.units import deg, kPa, mm
 
-_MARKERS = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
+_MARKERS = np.linspace(0.0, 1.0, MARKERS)
 _POISSON, _POINTS = 0.49, 24
 _STIFF = 0.2  # of the floor, in Young's moduli: it carries no more than the weight
 _NAME = "crawler"  # of the only part
-_TICK = 10 * mm  # of the floor in pictures; that of the start is longer
-_WINDOW = (-0.7, -0.1), (0.7, 0.45)  # of pictures, around the middle, over the length
 
 
 class CrawlerParams(eqx.Module):
@@ -80,13 +76,7 @@ class CrawlerParams(eqx.Module):
     marker_noise: Float[Array, ""] = eqx.field(converter=real, default=0.2 * mm)
 
 
-class FloorGoal(NamedTuple):
-    """Angle by which the floor rises ahead [rad]."""
-
-    slope: Float[Array, ""]
-
-
-class CrawlerRun(AbstractEnv):
+class CrawlerRun(AbstractCrawler):
     """Crawl forward on a rough floor by arching the back, third by third.
 
     The crawler is a planar Cosserat rod, seen from the side and free to move, with a constant
@@ -108,21 +98,16 @@ class CrawlerRun(AbstractEnv):
     diverges: the axis is below the floor, for example. `info` has `velocity` [m/s].
     """
 
-    max_steps: int = eqx.field(static=True, default=200)
-    num_actions: ClassVar[int] = 3
-    num_observations: ClassVar[int] = 2 * 3 + 2 * 5 * 2
-
     def default_params(self) -> CrawlerParams:
         return CrawlerParams()
 
-    def begin(self, key, params):
-        slope = params.max_slope * jax.random.uniform(key, (), params.length.dtype, -1.0)
+    def length(self, params):
+        return params.length
+
+    def resting(self, params):
         q = rest(_crawler(params)[0])  # angle, place of the rear, strains
         q = q.at[1].set(-params.length / 2).at[2].set(params.radius)
-        return RodBody(q, jnp.zeros_like(q)), jnp.zeros(3, q.dtype), FloorGoal(slope)
-
-    def commanded(self, command, action, params):
-        return params.max_pressure * (1 + action) / 2
+        return RodBody(q, jnp.zeros_like(q))
 
     def moved(self, body, delivery, goal, params):
         model, chambers = _crawler(params)
@@ -141,36 +126,14 @@ class CrawlerRun(AbstractEnv):
     def markers(self, body, params):
         return places(_crawler(params)[0], body.q, _MARKERS)
 
-    def observed(self, state, params):
-        middle = jnp.mean(state.seen[0, :, 0])
-        seen = state.seen.at[:, :, 0].add(-middle) / params.length
-        supplied = jnp.stack([state.supply.value, state.supply.commands[0]])
-        shares = in_shares(supplied, params.max_pressure)
-        return jnp.concatenate([shares.ravel(), seen.ravel()])
-
-    def judged(self, before, action, after, params):
-        start, end = (self.markers(x.body, params)[:, 0] for x in (before, after))
-        velocity = jnp.mean(end - start) / self.period
-        change = action - in_shares(before.supply.commands[0], params.max_pressure)
-        reward = 10 * velocity / params.length - 0.1 * jnp.sum(change**2) / 4
-        return Verdict(reward, jnp.zeros((), bool), {"velocity": velocity})
-
     def scene(self, state, params):
         from sorojax import view
 
         model, chambers = _crawler(params)
         inside = (PartForce(_NAME, Pressurised(chambers, state.supply.value)),)
         drawn = view.scene_of(model, np.asarray(state.body.q), forces=inside)
-        size = float(params.length)
         middle = float(self.markers(state.body, params)[:, 0].mean())
-        lower, upper = (np.array([middle + x * size, y * size]) for x, y in _WINDOW)
-        first, last = np.ceil(lower[0] / _TICK), np.floor(upper[0] / _TICK)
-        ticks = _TICK * np.arange(first, last + 1)
-        deep = 0.3 * lower[1]
-        floor = [np.array([[lower[0], 0.0], [upper[0], 0.0]])]
-        floor += [np.array([[x, 0.0], [x, deep * (2.5 if x == 0 else 1)]]) for x in ticks]
-        merged = view.merge_scenes(drawn, view.Scene((view.Lines(floor),)))
-        return replace(merged, extent=(lower, upper))
+        return on_floor(drawn, middle, float(params.length))
 
 
 def _crawler(params: CrawlerParams) -> tuple[Assembly, AbstractPressureMap]:

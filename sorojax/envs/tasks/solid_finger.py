@@ -1,20 +1,15 @@
 """The planar finger of finite elements that a task reduces, and its training."""
 
-import hashlib
-import inspect
-from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sorojax import _cache, _check, fem, io, material, mesh, systems
+from sorojax import _check, fem, material, mesh, systems
 from sorojax._display import displayed
-from sorojax.systems.blocks import modal_basis, modal_body, sampled_body, sampled_force
+from sorojax.envs import solids
 from sorojax.units import kPa, mm
 
 PORTS = "left", "right"  # loads of the chambers at x < 0 and x > 0
@@ -78,33 +73,8 @@ def solid_finger(
         (6, ())
     """
     _check.positive("solid_finger", "size", size, "m", "1e-3 is that of the task.")
-    if not jax.config.jax_enable_x64:  # pyright: ignore
-        raise ValueError(
-            "solid_finger: got single precision, need double precision to train and to read. "
-            'Call jax.config.update("jax_enable_x64", True) first.'
-        )
-    if not keep:
-        return _trained(size, modes, tolerance)
-    path = _cache.trained_directory() / f"finger-{_known_by(size, modes, tolerance)}.npz"
-    if path.exists():
-        try:
-            return io.load(path)
-        except ValueError:  # damaged, or of other classes: train again
-            pass
-    made = _trained(size, modes, tolerance)
-    io.save(path, made)
-    return made
-
-
-def _known_by(*settings: float) -> str:
-    """A name for what a training depends on: settings, version, and the text of what trains,
-    which changes between versions too."""
-    from sorojax import __version__
-
-    told = repr([float(x) for x in settings]) + __version__
-    parts: Sequence[ModuleType] = (modal_basis, modal_body, sampled_body, sampled_force)
-    text = "".join(inspect.getsource(part) for part in parts) + Path(__file__).read_text()
-    return hashlib.sha256((told + text).encode()).hexdigest()[:24]
+    settings = size, modes, tolerance
+    return solids.kept("solid_finger", settings, Path(__file__), _trained, keep)
 
 
 def full_finger(

@@ -25,7 +25,7 @@ from sorojax.systems.blocks.modal_basis import Modes
 from sorojax.systems.blocks.modal_body import ModalBody
 
 _TRIES = 8  # of the length of a step
-_SMALL = 1e-8  # of the forces, that may be left without balance
+_SMALL = 1e-9  # of the forces, that may be left without balance; more in single precision
 
 
 class Moved(NamedTuple):
@@ -172,12 +172,13 @@ def _relaxed(relaxed, q: Modes, span, times):
 def _newton(now: _Step, guess: Modes, most: int) -> tuple[Modes, tuple[Array, Array]]:
     """The acceleration that balances a step, 1 where it was found, and the passes."""
     still = jax.jacfwd(now.unmoved)(guess)
+    small = max(_SMALL, 64 * float(jnp.finfo(guess.dtype).eps))
 
     def one(at: _Pass) -> _Pass:
         a = at.base + at.share * at.way
         left, matrix, size = now.linearised(a, still)
         rise, count = left @ at.way, at.count + 1
-        balanced = jnp.max(jnp.abs(left)) <= _SMALL * size
+        balanced = jnp.max(jnp.abs(left)) <= small * size
         onward = _whole(a, -jnp.linalg.solve(matrix, left), left, count)
         onward = onward._replace(balanced=balanced)
         chosen = balanced | _enough(at, rise)
