@@ -27,8 +27,6 @@ BALL, PICK = envs.BallTurn(), envs.PickPlace()
 TASKS = [
     pytest.param(env, id=type(env).__name__) for env in (REACH, PUSH, TRACK, CRAWL, BALL, PICK)
 ]
-SOLIDS = "SolidReach", "SolidCrawl"  # trained where they are used
-TASKS += [pytest.param(name, id=name) for name in SOLIDS]
 MEMBERS = 4
 
 
@@ -43,6 +41,10 @@ def small_crawler():
     waves = np.maximum(np.sin(15 * time[None] - np.arange(3)[:, None]), 0.0)
     command = jnp.asarray(solid_crawler.MAX_PRESSURE * waves)
     return solid_crawler.trained_on(solid_crawler.full_crawler(), [command], 6, 0.05)
+
+
+SOLIDS = {"SolidReach": small_body, "SolidCrawl": small_crawler}  # trained where they are used
+TASKS += [pytest.param(name, id=name) for name in SOLIDS]
 
 
 @pytest.fixture
@@ -430,8 +432,8 @@ def test_a_spread_may_name_what_varies(getkey):
 def test_the_checker_of_gymnasium_has_nothing_to_say(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        made = {"SolidReach": small_body, "SolidCrawl": small_crawler}
-        body = {"body": make() for task, make in made.items() if task in name}
+        kind = next((kind for kind in SOLIDS if kind in name), None)
+        body = {} if kind is None else {"body": SOLIDS[kind]()}
         made = gymnasium.make(name, max_steps=4, render_mode="rgb_array", **body)
         check_env(made.unwrapped)
     made.reset(seed=0)

@@ -1,5 +1,7 @@
 """Tasks of reduced solids: another rubber, where the training is kept, and the full body."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,13 +9,15 @@ import numpy as np
 import pytest
 
 from benchmarks.cases import envs_solid
-from sorojax import envs, io
+from sorojax import envs, fem, io, systems
 from sorojax.envs import solids
-from sorojax.envs.tasks import solid_finger
+from sorojax.envs.tasks import solid_crawler, solid_finger
+from sorojax.envs.tasks.crawl import FloorGoal
 from sorojax.math.linalg.sparse import product
 from sorojax.systems.blocks.modal_basis import coordinates
-from sorojax.systems.blocks.modal_body import ProjectedForce, modal_body
-from sorojax.systems.blocks.sampled_force import sampled_force
+from sorojax.systems.blocks.modal_body import ProjectedForce, modal_body, without_contacts
+from sorojax.systems.blocks.sampled_body import snapshot_basis
+from sorojax.systems.blocks.sampled_force import pieces, sampled_force
 
 SETTINGS = {"size": 4e-3, "modes": 6, "tolerance": 0.01}
 
@@ -140,6 +144,82 @@ def test_a_training_is_kept_and_a_damaged_file_trained_again(small, tmp_path, mo
     assert len(calls) == 3
     with pytest.raises(ValueError, match="solid_finger: `size` must be positive"):
         envs.solid_finger(-1.0)
+
+
+def test_another_rubber_and_floor_of_a_crawler_are_those_of_its_mesh():
+    """With the force of all points: accelerations by factors are those of a body that was
+    assembled with the rubber, on the floor."""
+    usual = solid_crawler.full_crawler()
+    points = usual.problem.mesh.points
+    draw = np.random.default_rng(3)
+    x, y = np.asarray(points / 0.1).T
+    field = 1e-3 * np.stack([x * y, x**2, y - x, x**3 * y, x**2 * y])[:, :, None]
+    basis = snapshot_basis(usual, jnp.asarray(field * draw.normal(size=(5, 1, 2))), 6)
+    cells, quad = pieces(usual)
+
+    def assembled(full):
+        free = without_contacts(full)
+        force = sampled_force(free, basis, cells, np.ones(len(cells)), quad)
+        small = modal_body(full, basis, order=None)
+        return eqx.tree_at(lambda b: b.force, small, dataclasses.replace(force, trained=1.0))
+
+    axes = [jnp.broadcast_to(axis, points.shape) for axis in jnp.eye(2)]
+    weight = jnp.stack([coordinates(usual, basis, axis) for axis in axes])
+    none = jnp.zeros(1), jnp.zeros(()), jnp.zeros(()), jnp.zeros(())
+    known = systems.SampledBody(assembled(usual), jnp.zeros(1, int), *none, 1)
+    body = solid_crawler.SolidCrawler(usual.problem.mesh, known, weight)
+    env = envs.SolidCrawl(body=body)
+    stiffness, density, friction, slope = 1.3, 0.8, 0.4, 0.1
+    params = envs.SolidCrawlParams(stiffness, density=density, friction=friction)
+    got = env._solid(params, FloorGoal(jnp.asarray(slope)))
+    factors = {"stiffness": stiffness, "density": density}
+    want = assembled(solid_crawler.full_crawler(friction=friction, slope=slope, **factors))
+    q = jnp.asarray(2e-5 * draw.normal(size=6)) - 1e-3 * weight[1]
+    air = {f"{name}_pressure": jnp.asarray(5e3) for name in solid_crawler.PORTS}
+    over = {name: x / density for name, x in air.items()}
+    pull = want.pull(q, 0 * q, air) / density
+    np.testing.assert_allclose(got.pull(q, 0 * q, over), pull, rtol=1e-9)
+    h, (one,), (other,) = jnp.asarray(1e-3), got.contacts, want.contacts
+    # whose smoothing follows the rubber that it is made with
+    other = dataclasses.replace(other, law=one.law)
+    grips = [c.begun(q, c.unstretched(), h) for c in (one, other)]
+    ahead = q + 1e-5 * weight[0]
+    push = other.push(ahead, grips[1]) / density
+    assert float(jnp.abs(push).max()) > 0
+    np.testing.assert_allclose(one.push(ahead, grips[0]), push, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_crawler_goes_as_far_as_the_whole_one():
+    """Under a gait that was not in the training, on another floor: six tenths of a second."""
+    env = envs.SolidCrawl(body=solid_crawler.solid_crawler(), time_step=1e-3, substeps=20)
+    slope, friction = 0.01, 0.5
+    params = envs.SolidCrawlParams(friction=friction)
+    time = 2e-3 * np.arange(301)
+    waves = np.maximum(np.sin(9 * time[None] - 1.3 * np.arange(3)[:, None]), 0.0)
+    pressures = jnp.asarray(0.9 * solid_crawler.MAX_PRESSURE * waves)
+    full = solid_crawler.full_crawler(friction=friction, slope=slope)
+    given = dict(zip(solid_crawler.PORTS, pressures, strict=True))
+    motion = fem.simulate(full.problem, 0.6, 2e-3, damping=full.damping, **given)
+    nodes = np.array([node for _, node in full.markers])
+    want = motion.displacements[::10, nodes]
+    body, seen = env.resting(params), []
+    goal = FloorGoal(jnp.asarray(slope))
+
+    @jax.jit
+    def moved(body, start):
+        def air(t):
+            return jnp.stack([jnp.interp(start + t, time, row) for row in pressures])
+
+        return env.moved(body, air, goal, params)
+
+    first = env.markers(body, params)
+    for k in range(30):
+        body, fine = moved(body, 0.02 * k)
+        assert bool(fine)
+        seen.append(env.markers(body, params) - first)
+    off = jnp.abs(jnp.stack(seen) - want[1:])
+    assert float(off.max()) < 0.08 * float(jnp.ptp(want[..., 1]))
 
 
 @pytest.mark.slow
