@@ -209,10 +209,14 @@ def adaptive(
     )
 
 
+_RECORDED = 2**22  # numbers of the states of a run that are kept for its derivative, at most
+
+
 def _room(method: AbstractMethod, states: int) -> int:
     """For how many steps there is room. Of methods that solve nothing the loop over steps is
     one kernel, which holds small arrays only."""
-    return CHECKPOINTS if method.solves else min(CHECKPOINTS, LARGEST // max(1, states))
+    largest = _RECORDED if method.solves else LARGEST
+    return min(CHECKPOINTS, largest // max(1, states))
 
 
 def _meter(progress: bool | str, start, far, end) -> dfx.AbstractProgressMeter:
