@@ -9,6 +9,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from sorojax._jax import diffrax_checks
@@ -158,7 +159,7 @@ def marched(moving: Moving, plan: Plan, room: int = 0, every: int = 1) -> tuple[
     control: Any = plan.control
     terms, args = dfx.ODETerm(plan.field), (moving.constants, *plan.watched)
     order, start, y = method.error_order(terms), plan.start, moving.state
-    y = y.astype(jnp.promote_types(y.dtype, start.dtype))
+    y = y.astype(np.promote_types(y.dtype, start.dtype))
     asked = start, plan.end, y
     late, pace = control.init(terms, *asked, None, args, method.func, order)
     memory = method.init(terms, start, late, y, args)
