@@ -98,7 +98,7 @@ def test_a_block_rests_on_the_pressure_of_its_weight():
 
 
 def lip() -> systems.FemBody:
-    """A cantilever above a floor that air in a slot bends down onto it."""
+    """A cantilever above a floor, onto which a force at its end bends it."""
     cells = mesh.rectangle([0, 0], [60 * mm, 6 * mm], divisions=(20, 2), element=mesh.Quad8())
     rubber = material.neo_hookean(young_modulus=5e5, poisson_ratio=0.4, density=1000.0)
     floor = fem.Contact(

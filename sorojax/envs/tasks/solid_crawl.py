@@ -80,7 +80,7 @@ class SolidCrawl(AbstractCrawler):
 
     Attributes:
         body: The crawler, from `solid_crawler`; that without arguments if omitted, which trains
-            for some minutes on a computer where it has not been trained before.
+            for a minute on a computer where it has not been trained before.
     """
 
     time_step: float = eqx.field(static=True, default=2e-3)
