@@ -217,6 +217,29 @@ def of_all(draw: Draw, pool: list[Any]) -> Any:
     ))()  # fmt: skip
 
 
+def of_matrix(draw: Draw, pool: list[Any]) -> Any:
+    """Factors and solutions."""
+    n, kind = draw.number(1, 6), draw.real()
+    table = jnp.tanh(finite(value(draw, pool, kind, (n, n))))
+    right = finite(value(draw, pool, kind, draw.one(((n,), (n, 2)))))
+    one = jnp.eye(n, dtype=kind)
+    even, other = 2 * one + table @ table.T / n, 1.3 * one[::-1] + table / (2 * n)
+    how = {
+        "lower": draw.chance(0.5),
+        "transpose_a": draw.chance(0.5),
+        "unit_diagonal": draw.chance(0.3),
+    }
+    wide = (right.T if right.ndim > 1 else right[None]) / 4
+    return draw.one((
+        lambda: jnp.linalg.cholesky(even), lambda: jnp.linalg.solve(even, right),
+        lambda: jnp.tanh(jnp.linalg.solve(other, right)),
+        lambda: lax.linalg.triangular_solve(even, wide, **how),
+        lambda: jax.grad(lambda x: jnp.sum(jnp.linalg.solve(even, x) ** 2))(right),
+        lambda: jax.grad(lambda x: jnp.sum(jnp.linalg.inv(even + jnp.diag(x))))(table[0] / 4),
+        lambda: jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(even), right),
+    ))()  # fmt: skip
+
+
 def of_parts(draw: Draw, pool: list[Any]) -> Any:
     """Parts of arrays, and arrays of parts."""
     x = value(draw, pool, draw.kind())
@@ -368,7 +391,8 @@ def solved(x: Any) -> Any:
     return lax.custom_linear_solve(lambda y: 1.7 * y, x, solve, solve)
 
 
-EASY = [of_one] * 8 + [of_two] * 4 + [of_whole] * 2 + [of_truth, *[of_all] * 2] + [of_parts] * 3
+EASY = [of_one] * 8 + [of_two] * 4 + [of_whole] * 2 + [of_truth, *[of_all] * 2]
+EASY += [of_parts] * 3 + [of_matrix] * 2
 DEEP = [loop] * 4 + [branch] * 3 + [around] * 4 + [with_rules]
 
 

@@ -21,10 +21,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sorojax._jax.in_kernels import cholesky, cosine, lu, sine, sort, triangular_solve
 from sorojax._jax.optional import every
 from sorojax._jax.small_products import multiplications
 from sorojax._jax.trace_state import is_tracer, outside_transformations
-from sorojax._jax.trigonometry import cosine, sine
 from sorojax._jax.versions import installed
 
 #: Releases of jaxlib on which random programs agree with the plain ones (`make fuzz`).
@@ -32,6 +32,7 @@ PROVEN = ("0.10.2", "0.12.0.1")
 LARGEST = 4096  # numbers in an array that is made inside a loop: some 32 kB
 LARGEST_PASSED = 65536  # numbers in an array that a loop is given, or leaves
 LARGEST_PRODUCT = 8192  # multiplications of a matrix product; beyond that a library is faster
+LARGEST_SOLVED = 12  # unknowns of a factor: beyond that a library is faster
 LONGEST = 4000  # operations in a loop: beyond that one kernel compiles slowly
 LARGEST_GIVEN = 1024  # numbers in an argument: batches of states are no small arrays
 MARK = {"xla_cpu_small_call": "true", "inlineable": "false"}
@@ -61,6 +62,7 @@ _INLINED = {
     "checkpoint", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call",
     "custom_vjp_call_jaxpr", "custom_vmap_call", "jit", "pjit", "remat", "remat2",
 }  # fmt: skip
+_HOW = "left_side", "lower", "transpose_a", "unit_diagonal"
 # In a kernel a library would be called for every entry.
 _FAST = {"sin": sine, "cos": cosine}
 # What solvers of diffrax ask for in batches, where there is none.
@@ -68,8 +70,9 @@ _ALONE: dict[str, Callable[..., Any]] = {
     "nonbatchable": lambda x: x, "nontraceable": lambda x: x, "unvmap_any": jnp.any,
     "unvmap_all": jnp.all, "unvmap_max": jnp.max, "select_if_vmap": lambda _, x, other: x,
 }  # fmt: skip
-_OTHER = {"while", *_FAST, *_ALONE}
-_HELD = _LOOPS | _INLINED | set(_ALONE) | {
+_SOLVES = {"cholesky", "lu", "sort", "triangular_solve"}
+_OTHER = {"while", *_FAST, *_ALONE, *_SOLVES}
+_HELD = _LOOPS | _INLINED | _SOLVES | set(_ALONE) | {
     "abs", "acos", "acosh", "add", "add_any", "and", "argmax", "argmin", "asin", "asinh",
     "atan", "atan2", "atanh", "broadcast_in_dim", "cbrt", "ceil", "clamp", "concatenate",
     "cond", "convert_element_type", "copy", "copy_p", "cos", "cosh", "cumsum",
@@ -89,8 +92,8 @@ Answer = TypeVar("Answer")
 def one_kernel(function: Callable[..., Answer]) -> Callable[..., tuple[Answer, Any]]:
     """`function` with its small loops marked, to be compiled by itself with `OPTIONS`.
 
-    Beside the answer it returns a number that no one needs: the kernels hand it on, and so
-    none of them can do without its arguments.
+    Beside the answer it returns a number that no one needs, where it has kernels: they hand it
+    on, and so none of them can do without its arguments.
     """
 
     @functools.wraps(function)
@@ -103,7 +106,7 @@ def one_kernel(function: Callable[..., Answer]) -> Callable[..., tuple[Answer, A
         reads = [known[0].reshape(-1)[0].astype(_NUMBER)]
         leaves = _run(closed.jaxpr, closed.consts, arrays, reads)
         answer = eqx.combine(jax.tree.unflatten(jax.tree.structure(shapes), leaves), rest)
-        return answer, reads[-1]
+        return answer, reads[-1] if len(reads) > 1 else None
 
     return marked
 
@@ -111,11 +114,17 @@ def one_kernel(function: Callable[..., Answer]) -> Callable[..., tuple[Answer, A
 def runs_alone(*args: Any, largest: float = LARGEST_GIVEN) -> bool:
     """Whether a call with `args` is a program by itself on a CPU, of arrays of at most
     `largest` numbers, and its kernels are proven."""
+    if not is_alone():
+        return False
+    return not any(
+        is_tracer(leaf) or getattr(leaf, "size", 0) > largest for leaf in jax.tree.leaves(args)
+    )
+
+
+def is_alone() -> bool:
+    """Whether a program called here runs by itself on a CPU, and its kernels are proven."""
     if not _IS_PROVEN or not outside_transformations():
         return False
-    for leaf in jax.tree.leaves(args):
-        if is_tracer(leaf) or getattr(leaf, "size", 0) > largest:
-            return False
     return jax.default_backend() == "cpu" and jax.device_count() == 1
 
 
@@ -257,6 +266,8 @@ def _inside(jaxpr: Any, equation: Any, given: Any) -> list[Any]:
         return [_FAST[name](given[0])]
     if name in _ALONE:
         return [_ALONE[name](*given)]
+    if name in _SOLVES:
+        return _solved(name, given, params)
     if name != "while" and not any(_holds(body, _OTHER) for body, _ in _bodies(equation)):
         return _bound(jaxpr, equation, given)  # a scan counts anyway
     if name == "scan":
@@ -283,10 +294,31 @@ def _inside(jaxpr: Any, equation: Any, given: Any) -> list[Any]:
 
         start = (jnp.zeros((), "uint32"), given[second:])
         return jax.lax.while_loop(goes_on, turn, start)[1]
+    if name == "custom_linear_solve":
+        return _linear_solution(params, given)
     inner = _bodies(equation)
     if name in _INLINED and len(inner) == 1:
         return _evaluate(_found["ClosedJaxpr"](*inner[0]), given)
     return _bound(jaxpr, equation, given)
+
+
+def _solved(name: str, given: list[Any], params: Any) -> list[Any]:
+    if name == "cholesky":
+        return [cholesky(*given)]
+    if name == "lu":
+        return [*lu(*given)]
+    if name == "sort":
+        return sort(*given)
+    how = {key: params[key] for key in _HOW}
+    return [triangular_solve(*given, **how)]
+
+
+def _linear_solution(params: Any, given: list[Any]) -> list[Any]:
+    """By its solver, as it has no derivative any more."""
+    counts, solver = params["const_lengths"], params["jaxprs"].solve
+    start = counts.matvec + counts.vecmat
+    constants = given[start : start + counts.solve]
+    return _evaluate(solver, [*constants, *given[sum(counts) :]])
 
 
 def _constants_and_carry(params: Any) -> tuple[int, int]:
@@ -324,6 +356,8 @@ def _is_small(equation: Any) -> bool:
         return False
     if _is_batched(equation):
         return False
+    if name in _SOLVES and not _is_small_solve(equation):
+        return False
     if name == "dot_general" and _multiplications(equation) > LARGEST_PRODUCT:
         return False
     if not all(_is_number(var.aval) for var in (*equation.invars, *equation.outvars)):
@@ -335,6 +369,17 @@ def _is_small(equation: Any) -> bool:
         for jaxpr, _ in inner
         for each in jaxpr.eqns
     )
+
+
+def _is_small_solve(equation: Any) -> bool:
+    given = [var.aval for var in equation.invars]
+    if not all(0 < size <= LARGEST_SOLVED for size in given[0].shape):
+        return False
+    if equation.primitive.name == "sort":
+        one_key = equation.params["num_keys"] == 1 and given[0].dtype.kind == "i"
+        return one_key and all(x.ndim == 1 for x in given)
+    square = given[0].shape[:1] == given[0].shape[1:]
+    return square and all(x.ndim == 2 and x.dtype.kind == "f" for x in given)
 
 
 def _is_held(loop: Any) -> bool:
@@ -379,9 +424,11 @@ def _length(equation: Any) -> int:
 
 def _bodies(equation: Any) -> list[tuple[Any, Any]]:
     """The programs inside an equation, with their constants."""
-    found = []
+    found, params = [], equation.params
+    if equation.primitive.name == "custom_linear_solve":  # what runs: it has no derivative more
+        params = {"solve": params["jaxprs"].solve}
     leaves = jax.tree.leaves(
-        list(equation.params.values()),
+        list(params.values()),
         is_leaf=lambda x: isinstance(x, (_found["Jaxpr"], _found["ClosedJaxpr"])),
     )
     for leaf in leaves:

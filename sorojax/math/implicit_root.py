@@ -24,6 +24,7 @@ def implicit_root(
     tangent_solve: Callable[[Function, Array], Array],
     *,
     has_aux: bool = False,
+    with_matrix: Callable[[Function, Array], Any] | None = None,
 ) -> Any:
     """The x with f(x) = 0 near `guess`; dx = -f_x^-1 df by the numbers that `f` closes over.
 
@@ -33,23 +34,40 @@ def implicit_root(
         solve: Of `f` and `guess`, answers x, or x and more with `has_aux`; not differentiated.
         tangent_solve: Of a linear map and a right-hand side, answers its solution.
         has_aux: Whether `solve` answers a pair, whose second part has no derivative.
+        with_matrix: Takes the place of `solve` where there is a derivative: answers what that
+            does, and f_x at the root, for the searches that know it.
     """
 
     def search(guess: Array) -> tuple[Array, Any]:
         found = solve(f, guess)
         return found if has_aux else (found, ())
 
+    def full_search(guess: Array) -> tuple[Array, Any, Array | None]:
+        if with_matrix is None:
+            return *search(guess), None
+        found, matrix = with_matrix(f, guess)
+        return (*found, matrix) if has_aux else (found, (), matrix)
+
     equation, numbers = _opened(f, guess)
-    method, constants = _opened(search, guess)
+    (method, constants), (full_method, more_constants) = (
+        _opened(way, guess) for way in (search, full_search)
+    )
 
     @jax.custom_jvp
-    def root(numbers: Any, constants: Any, guess: Array) -> tuple[Array, Any]:
+    def root(numbers: Any, constants: Any, more_constants: Any, guess: Array) -> Any:
         return jax.tree.map(jnp.asarray, method(guess, *constants))  # constants are numbers
 
-    def derivative(primals: Any, tangents: Any) -> Any:
+    @jax.custom_jvp
+    def full_root(numbers: Any, constants: Any, more_constants: Any, guess: Array) -> Any:
+        return jax.tree.map(jnp.asarray, full_method(guess, *more_constants))
+
+    def full_derivative(primals: Any, tangents: Any) -> Any:
         numbers, rates = primals[0], tangents[0]
-        x, more = root(*primals)
+        x, more, matrix = full_root(*primals)
         moving = [k for k, rate in enumerate(rates) if not isinstance(rate, SymbolicZero)]
+        still = jax.tree.map(_still, (more, matrix))
+        if not moving:
+            return (x, more, matrix), (jnp.zeros_like(x), *still)
 
         def moved(*values: Array) -> Array:
             own = dict(zip(moving, values, strict=True))
@@ -58,16 +76,31 @@ def implicit_root(
         def linear(rate: Array) -> Array:
             return jax.jvp(lambda x: equation(x, *numbers), (x,), (rate,))[1]
 
-        still = jax.tree.map(_still, more)
-        if not moving:
-            return (x, more), (jnp.zeros_like(x), still)
         values, dots = ([each[k] for k in moving] for each in (numbers, rates))
         change = jax.jvp(moved, values, dots)[1]
-        return (x, more), (-tangent_solve(linear, change), still)
+        if matrix is None:
+            return (x, more, None), (-tangent_solve(linear, change), *still)
+        return (x, more, matrix), (-_solved_by(matrix, linear, change), *still)
+
+    def derivative(primals: Any, tangents: Any) -> Any:
+        (x, more, _), (change, still, _) = full_derivative(primals, tangents)
+        return (x, more), (change, still)
 
     root.defjvp(derivative, symbolic_zeros=True)
-    x, more = root(tuple(numbers), tuple(constants), guess)
+    full_root.defjvp(full_derivative, symbolic_zeros=True)
+    x, more = root(tuple(numbers), tuple(constants), tuple(more_constants), guess)
     return (x, more) if has_aux else x
+
+
+def _solved_by(matrix: Array, linear: Function, right: Array) -> Array:
+    """x with linear(x) = right by the known `matrix`, with the derivative of `linear`."""
+    matrix = jax.lax.stop_gradient(matrix)
+    return jax.lax.custom_linear_solve(
+        linear,
+        right,
+        lambda _, right: jnp.linalg.solve(matrix, right),
+        lambda _, right: jnp.linalg.solve(matrix.T, right),
+    )
 
 
 def _opened(function: Callable[[Array], Any], x: Array) -> tuple[Any, list[Array]]:

@@ -20,7 +20,7 @@ from jax.custom_derivatives import SymbolicZero
 from sorojax._jax.jit import jit
 from sorojax._jax.trace_state import called_as_outside, evaluated_now, is_traced, is_tracer
 from sorojax._types import from_host
-from sorojax.math.compiled import Split
+from sorojax.math.compiled import Split, jit_trees
 from sorojax.math.linear_map import pushed
 
 Verb = TypeVar("Verb", bound=Callable[..., Any])
@@ -33,6 +33,7 @@ def two_programs(
     again: Again | None = None,
     within: Callable[..., Any] | None = None,
     *,
+    keeps: bool = False,
     kernels: bool = False,
     largest: float = math.inf,
 ) -> Verb:
@@ -47,9 +48,12 @@ def two_programs(
             the same arrays, what is static as it is known now, and behind them arrays that the
             run has found and the derivative need not compute again.
         within: What takes the place of the function under `jit` and `vmap`.
+        keeps: Where it has a derivative, the value is a program that keeps what the derivative
+            needs, and each direction one program more that computes nothing again: for
+            functions that take long to compile, of few numbers.
         kernels, largest: As of `sorojax.jit`.
     """
-    programs = _Programs(function, again, kernels=kernels, largest=largest)
+    programs = _Programs(function, again, keeps=keeps, kernels=kernels, largest=largest)
     inside = programs.whole if within is None else eqx.filter_jit(within)
 
     @functools.wraps(function)
@@ -106,9 +110,24 @@ class _Programs:
         function: Callable[..., Any],
         again: Again | None = None,
         *,
+        keeps: bool = False,
         kernels: bool = False,
         largest: float = math.inf,
     ):
+        def linearised(moving, rest, form):
+            forms = []
+
+            def by(moving):
+                args, kwargs = form.whole(_joined(moving, rest))
+                found = Split(function(*args, **kwargs))
+                forms.append(found.form)
+                which = [eqx.is_inexact_array(x) for x in found.leaves]
+                return _only(which, found.leaves), _only(which, found.leaves, False)
+
+            found, slope, others = jax.linearize(by, moving, has_aux=True)
+            leaves = _joined(found, others)
+            return Split.tree_unflatten(forms[-1], leaves), slope
+
         def wanted(moving: Leaves, rest: Leaves, form: Any, which: Sequence[int]) -> Leaves:
             args, kwargs = form.whole(_joined(moving, rest))
             found = Split(function(*args, **kwargs)).leaves
@@ -122,13 +141,16 @@ class _Programs:
             by = functools.partial(wanted, rest=rest, form=form, which=which)
             return jax.vjp(by, moving)[1](changes)[0]
 
-        for part, end in ((push, "_pushed"), (pull, "_pulled")):
+        parts = (push, "_pushed"), (pull, "_pulled"), (linearised, "_linearised")
+        for part, end in parts:
             part.__name__ = part.__qualname__ = function.__name__ + end
-        self.whole = jit(function, kernels=kernels, largest=largest)
+        self.whole = jit_trees(function, kernels=kernels, largest=largest)
         # what a first run has found is no argument that makes a call large
         alone = [jit(part, kernels=kernels, largest=math.inf) for part in (push, pull)]
         self.derivatives = {True: alone, False: [eqx.filter_jit(x) for x in (push, pull)]}
         self._again, self._largest = again, largest
+        self.linearised = jit_trees(linearised, kernels=kernels, largest=largest)
+        self.keeps = keeps
 
     def value(self, leaves: Leaves, form: Any) -> Split:
         args, kwargs = form.whole(leaves)
@@ -166,24 +188,33 @@ def _derivative(of: _Call, primals: Any, tangents: Any) -> tuple[Split, Split]:
     moves = [not isinstance(dot, SymbolicZero) for dot in dots]
     moving, rates = _only(moves, leaves), _only(moves, dots)
     rest = _only(moves, leaves, False)
-    found = None
+    found = by = None
     if not is_traced(leaves):
         with called_as_outside(leaves):
-            found = of.programs.value(leaves, of.form)
+            if of.programs.keeps:
+                found, slope = of.programs.linearised(moving, rest, of.form)
+                by = _Kept(slope, moving, _inexact(found))
+            else:
+                found = of.programs.value(leaves, of.form)
     if found is None or is_traced(found):
-        by = lambda moving: of.programs.value(_joined(moving, rest), of.form)  # noqa: E731
-        return jax.jvp(by, (moving,), (rates,))
-    given = of.programs.given_again(of.form, leaves, found)
-    of = _Call(of.programs, given.form, of.programs.is_small(leaves))
-    more = given.leaves[len(leaves) :]
-    moving, rest = [*moving, *[None] * len(more)], [*rest, *more]
-    which = tuple(k for k, x in enumerate(found.leaves) if eqx.is_inexact_array(x))
-    by = _Slope(of, moving, rest, {k: _shape(found.leaves[k]) for k in which})
-    changed = dict(zip(which, pushed(_present(rates), by), strict=True))
+        alone = lambda moving: of.programs.value(_joined(moving, rest), of.form)  # noqa: E731
+        return jax.jvp(alone, (moving,), (rates,))
+    if by is None:
+        by = _slope_again(of, leaves, moves, found)
+    changed = dict(zip(by.places, pushed(_present(rates), by), strict=True))
     still = [
         changed.get(k, np.zeros(x.shape, jax.dtypes.float0)) for k, x in enumerate(found.leaves)
     ]
     return found, found.like(still)
+
+
+def _slope_again(of: _Call, leaves: Leaves, moves: list[bool], found: Split) -> "_Slope":
+    given = of.programs.given_again(of.form, leaves, found)
+    of = _Call(of.programs, given.form, of.programs.is_small(leaves))
+    more = given.leaves[len(leaves) :]
+    moving = [*_only(moves, leaves), *[None] * len(more)]
+    rest = [*_only(moves, leaves, False), *more]
+    return _Slope(of, moving, rest, _inexact(found))
 
 
 _differentiable.defjvp(_derivative, symbolic_zeros=True)
@@ -195,6 +226,11 @@ def _present(leaves: Leaves) -> Leaves:
 
 def _shape(x: Any) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(x.shape, x.dtype)
+
+
+def _inexact(found: Split) -> dict[int, jax.ShapeDtypeStruct]:
+    """What has a derivative, by its place."""
+    return {k: _shape(x) for k, x in enumerate(found.leaves) if eqx.is_inexact_array(x)}
 
 
 class _Slope:
@@ -211,15 +247,16 @@ class _Slope:
     def outputs(self) -> Leaves:
         return list(self._outputs.values())
 
+    @property
+    def places(self) -> tuple[int, ...]:
+        return tuple(self._outputs)
+
     def onto(self, wanted: Sequence[bool]) -> "_Slope":
-        pairs = zip(self._outputs.items(), wanted, strict=True)
-        return _Slope(self._of, self._moving, self._rest, dict(x for x, w in pairs if w))
+        return _Slope(self._of, self._moving, self._rest, _chosen(self._outputs, wanted))
 
     def push(self, *rates: Any) -> Leaves:
-        left = iter(rates)
-        moved = [None if x is None else next(left) for x in self._moving]
         push, _ = self._of.programs.derivatives[self._of.small]
-        return push(self._moving, self._rest, moved, *self._kind())
+        return push(self._moving, self._rest, _placed(rates, self._moving), *self._kind())
 
     def pull(self, *changes: Any) -> Leaves:
         _, pull = self._of.programs.derivatives[self._of.small]
@@ -229,4 +266,60 @@ class _Slope:
     push_now, pull_now = push, pull
 
     def _kind(self) -> tuple[Any, tuple[int, ...]]:
-        return self._of.form, tuple(self._outputs)
+        return self._of.form, self.places
+
+
+def _chosen(outputs: dict[int, Any], wanted: Sequence[bool]) -> dict[int, Any]:
+    return dict(x for x, w in zip(outputs.items(), wanted, strict=True) if w)
+
+
+def _placed(rates: Sequence[Any], moving: Leaves) -> Leaves:
+    left = iter(rates)
+    return [None if x is None else next(left) for x in moving]
+
+
+class _Kept:
+    """The derivative as a `LinearMap`, from what the program of the value kept for it."""
+
+    def __init__(self, slope: Any, moving: Leaves, outputs: dict[int, Any]):
+        self._slope, self._moving, self._outputs = slope, moving, outputs
+
+    @property
+    def inputs(self) -> Leaves:
+        return _present(self._moving)
+
+    @property
+    def outputs(self) -> Leaves:
+        return list(self._outputs.values())
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        return tuple(self._outputs)
+
+    def onto(self, wanted: Sequence[bool]) -> "_Kept":
+        return _Kept(self._slope, self._moving, _chosen(self._outputs, wanted))
+
+    def push(self, *rates: Any) -> Leaves:
+        return _pushed_by(self._slope, _placed(rates, self._moving), self.places)
+
+    def pull(self, *changes: Any) -> Leaves:
+        like = [None if x is None else (x.shape, x.dtype) for x in self._moving]
+        return _present(_pulled_by(self._slope, list(changes), like, self.places))
+
+    push_now, pull_now = push, pull
+
+
+@jit_trees
+def _pushed_by(slope: Any, rates: Leaves, which: tuple[int, ...]) -> Leaves:
+    changed = slope(rates)
+    return [changed[k] for k in which]
+
+
+@jit_trees
+def _pulled_by(slope: Any, changes: Leaves, like: Leaves, which: tuple[int, ...]) -> Leaves:
+    def by(rates: Leaves) -> Leaves:
+        changed = slope(rates)
+        return [changed[k] for k in which]
+
+    rates = [None if x is None else jax.ShapeDtypeStruct(*x) for x in like]
+    return jax.linear_transpose(by, rates)(changes)[0]

@@ -6,9 +6,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sorojax._display import displayed, number, outcome
+from sorojax._jax.trace_state import called_as_outside, is_tracer
 from sorojax._types import Numbers, real
 from sorojax.math.compiled import chunked_lanes, full_products, jit_trees
 from sorojax.math.ode.contact_midpoint import ContactMidpoint
@@ -16,6 +17,7 @@ from sorojax.math.ode.held import singular
 from sorojax.math.ode.step_control import judged_status
 from sorojax.math.ode.steppers import AbstractStepper, GeneralisedAlpha, SecondOrder, integrate
 from sorojax.math.status import Status
+from sorojax.math.two_programs import two_programs
 from sorojax.rod.contact.terms import any_contact, contacts_of
 from sorojax.rod.dynamics.closed import (
     CLOSED,
@@ -149,16 +151,31 @@ def rollout(
         refuse_open("rollout", model, q, t)
         refuse_contact("rollout", forces)
     label = "rollout" if progress else None
-    return _rollout(
+    path, too_long = _rollout(
         model, q, v, forces, real(step), real(t), stepper, saves, every, label, check, memory
     )
+    if not check:
+        return path
+    given = jax.tree.map(_without_derivative, (path.status, model, path.q, too_long))
+    with called_as_outside(given):
+        status = _checked(*given)
+    return Trajectory(path.time, path.q, path.v, status, path.memory, path.reactions)
 
 
-@jit_trees
+def _without_derivative(x):
+    return jax.lax.stop_gradient(x) if is_tracer(x) else x
+
+
+@functools.partial(jit_trees, kernels=False, optimised=False)
+def _checked(status, model, path, too_long) -> Status:
+    return checked_status(judged_status(status, too_long), model, path)
+
+
+@functools.partial(two_programs, keeps=True, kernels=True)
 @full_products
 def _rollout(
     model, q, v, forces, step, t, stepper, saves, every, label, check, memory
-) -> Trajectory:
+) -> tuple[Trajectory, Bool[Array, ""]]:
     step, t, stepper = _like(q, (step, t, stepper))
     problem = second_order(model, q, forces, memory, t)
     path, too_long = integrate(
@@ -169,14 +186,12 @@ def _rollout(
     if path.resolved is not None:
         status = Status.where(jnp.all(path.resolved), status, Status.unresolved)
     time = t + step * every * jnp.arange(saves + 1, dtype=step.dtype)
-    if check:
-        status = checked_status(judged_status(status, too_long), model, path.q)
     reactions = None
     if path.share is not None:
         status = Status.where(singular(path.share), Status.singular, status)
         reactions, off = reactions_along(model, problem, time, path)
         status = Status.where(off > CLOSED, Status.unstable, status)
-    return Trajectory(time, path.q, path.v, status, path.memory, reactions)
+    return Trajectory(time, path.q, path.v, status, path.memory, reactions), too_long
 
 
 def _like(q, tree):

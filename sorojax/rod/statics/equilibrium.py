@@ -5,6 +5,7 @@ Coordinates may outnumber rates, as a quaternion does: searches step in the rate
 and a root is found in as many equations as there are coordinates.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -17,10 +18,11 @@ from jaxtyping import Array, Bool, Float, Int
 from sorojax import _check
 from sorojax._display import number, outcome, printed
 from sorojax._types import real
-from sorojax.math.compiled import jit_public
+from sorojax.math.compiled import floats_traced, full_products
 from sorojax.math.implicit_root import implicit_root, matrix_of
 from sorojax.math.quadrature import gauss_legendre, interpolation_rows
 from sorojax.math.status import Status
+from sorojax.math.two_programs import two_programs
 from sorojax.rod.dynamics.fields import is_curvature, strains_at
 from sorojax.rod.dynamics.tree import rod_motion
 from sorojax.rod.forces.loads import Load, relaxed
@@ -288,7 +290,9 @@ class Found(NamedTuple):
     count: Int[Array, ""]
 
 
-@jit_public
+@floats_traced
+@functools.partial(two_programs, keeps=True, kernels=True)
+@full_products
 def equilibrium(
     model: Model,
     forces: tuple[Load, ...] = (),
@@ -339,14 +343,20 @@ def equilibrium(
     def residual(x: Array) -> Array:
         return unbalanced(model, constants, relaxed(forces), t, x, search.metric)
 
-    def find(_, guess):
-        found = newton(residual, guess, search)
+    def find(_, guess, at_root=False):
+        found = newton(residual, guess, search, at_root=at_root)
         # What comes with a root has a derivative of zero, so it is floating.
         ends = (found.done, found.finite, found.count, *stability(found.slope, search))
-        return found.q, tuple(x.astype(guess.dtype) for x in ends)
+        answer = found.q, tuple(x.astype(guess.dtype) for x in ends)
+        return (answer, found.slope) if at_root else answer
 
     rest, (done, finite, count, negative, unstable) = implicit_root(
-        lambda q: squared(model, q, residual(q)), guess, find, _solve_tangent, has_aux=True
+        lambda q: squared(model, q, residual(q)),
+        guess,
+        find,
+        _solve_tangent,
+        has_aux=True,
+        with_matrix=functools.partial(find, at_root=True) if is_flat(model) else None,
     )
     q, reactions = reactions_at(model, constants, t, rest)
     status = checked_status(ended(done, rest, finite=finite, unstable=unstable), model, q)
@@ -373,15 +383,16 @@ def prepare(model: Model, constants, tolerance, max_iterations: int) -> Search:
     return Search(model, measure, floor, tolerance, max_iterations)
 
 
-def newton(residual: Residual, guess: Array, search: Search) -> Found:
-    """A root of `residual`, by Newton with backtracking."""
+def newton(residual: Residual, guess: Array, search: Search, *, at_root: bool = False) -> Found:
+    """A root of `residual`, by Newton with backtracking; one more pass finds the tangent
+    `at_root`."""
     factor, model = cho_factor(search.metric), search.model
 
     def size(force):
         return force @ cho_solve(factor, force)
 
     def improve(state):
-        q, *_, count = state
+        q, _, before, *_, count = state
         force, slope = linearised(residual, model, q)
         step = -jnp.linalg.solve(slope, force)
         shape = strained(model, q)
@@ -403,16 +414,20 @@ def newton(residual: Residual, guess: Array, search: Search) -> Found:
         begin = jnp.where(small, 1.0, 2.0).astype(q.dtype), jnp.where(small, 0 * start, jnp.inf)
         length, value = jax.lax.while_loop(too_long, half, begin)
         good = value <= start
-        new = jnp.where(good, advanced(model, q, length * step), q)
-        return new, slope, small & good, ~good, jnp.isfinite(start), count + 1
+        moves = good & ~before if at_root else good
+        new = jnp.where(moves, advanced(model, q, length * step), q)
+        ends = before if at_root else small & good
+        return new, slope, before | (small & good), ends | ~good, jnp.isfinite(start), count + 1
 
     def searching(state):
-        _, _, done, stuck, _, count = state
-        return ~done & ~stuck & (count < search.max_iterations)
+        _, _, done, ended, _, count = state
+        most = search.max_iterations
+        return ~ended & (count < jnp.where(done, most + 1, most))
 
     no = jnp.array(False)
     begin = (guess, search.metric, no, no, ~no, jnp.array(0, dtype=jnp.int32))
     q, slope, done, _, finite, count = jax.lax.while_loop(searching, improve, begin)
+    count = count - done.astype(count.dtype) if at_root else count
     return Found(q, slope, done & jnp.all(jnp.isfinite(q)), finite, count)
 
 
