@@ -139,30 +139,76 @@ _IS_PROVEN = status() == "on"
 
 
 def _run(jaxpr: Any, consts: Any, args: list[Any], reads: list[Any]) -> list[Any]:
-    return _values(functools.partial(_answer, reads=reads), jaxpr, consts, args)
+    return _values(functools.partial(_outside, reads=reads), jaxpr, consts, args)
 
 
-def _values(evaluate: Any, jaxpr: Any, consts: Any, args: list[Any]) -> list[Any]:
+Evaluate = Callable[[list[Any]], list[Any]]
+
+
+def _values(
+    made_anew: Callable[[Any, Any], Evaluate | None], jaxpr: Any, consts: Any, args: list[Any]
+) -> list[Any]:
+    """What a program yields, equations in another way where `made_anew` tells one."""
     values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True))
+    as_they_are: list[Any] = []
 
     def read(atom: Any) -> Any:
         return atom.val if isinstance(atom, _found["Literal"]) else values[atom]
 
     for equation in jaxpr.eqns:
-        found = evaluate(jaxpr, equation, [read(atom) for atom in equation.invars])
+        evaluate = made_anew(jaxpr, equation)
+        if evaluate is None:
+            as_they_are.append(equation)
+            continue
+        values.update(_bound(jaxpr, as_they_are, values))
+        as_they_are.clear()
+        found = evaluate([read(atom) for atom in equation.invars])
         values.update(zip(equation.outvars, found, strict=True))
+    values.update(_bound(jaxpr, as_they_are, values))
     return [read(atom) for atom in jaxpr.outvars]
 
 
-def _answer(jaxpr: Any, equation: Any, given: list[Any], reads: list[Any]) -> list[Any]:
+def _bound(jaxpr: Any, equations: list[Any], values: dict[Any, Any]) -> dict[Any, Any]:
+    """What equations yield."""
+    if not equations:
+        return {}
+    made = [var for each in equations for var in each.outvars]
+    own = set(made)
+    given = dict.fromkeys(
+        var
+        for each in equations
+        for var in each.invars
+        if not isinstance(var, _found["Literal"]) and var not in own
+    )
+    parts = {"eqns": [*equations], "outvars": made, "constvars": []}
+    unnamed = jaxpr.debug_info._replace(arg_names=None, result_paths=None)
+    alone = jaxpr.replace(invars=list(given), **parts, debug_info=unnamed)
+    found = _found["eval_jaxpr"](alone, (), *(values[var] for var in given))
+    return dict(zip(made, found, strict=True))
+
+
+def _outside(jaxpr: Any, equation: Any, reads: list[Any]) -> Evaluate | None:
+    """How to evaluate an equation outside of kernels."""
     name, inner = equation.primitive.name, _bodies(equation)
     if name in _LOOPS and _is_held(equation):
-        return _in_one(functools.partial(_inside, jaxpr, equation), given, reads)
-    if name in _INLINED and len(inner) == 1:
-        return _run(*inner[0], given, reads)
+        whole = functools.partial(_equation_inside, jaxpr, equation)
+        return lambda given: _in_one(whole, given, reads)
+    if name in _INLINED and len(inner) == 1 and _holds(inner[0][0], _LOOPS):
+        return lambda given: _run(*inner[0], given, reads)
     if name in _LOOPS and not _is_batched(equation) and _marks_within(equation):
-        return _with_kernels(equation, given, reads)
-    return _bound(jaxpr, equation, given)
+        return lambda given: _with_kernels(equation, given, reads)
+    return None
+
+
+def _equation_inside(jaxpr: Any, equation: Any, given: list[Any]) -> list[Any]:
+    """One equation in a kernel."""
+    evaluate = _inside(jaxpr, equation)
+    if evaluate is not None:
+        return evaluate(given)
+    pairs = zip(equation.invars, given, strict=True)
+    values = {v: x for v, x in pairs if not isinstance(v, _found["Literal"])}
+    found = _bound(jaxpr, [equation], values)
+    return [found[var] for var in equation.outvars]
 
 
 def _marks_within(loop: Any) -> bool:
@@ -259,47 +305,55 @@ def _in_one(function: Callable[..., list[Any]], given: list[Any], reads: list[An
     return found
 
 
-def _inside(jaxpr: Any, equation: Any, given: Any) -> list[Any]:
-    """One equation in a kernel. Every loop counts: what forgets its state has no argument."""
-    name, params = equation.primitive.name, equation.params
-    if name in _FAST and given[0].dtype == np.float64:
-        return [_FAST[name](given[0])]
+def _inside(jaxpr: Any, equation: Any) -> Evaluate | None:
+    """How to evaluate an equation in a kernel. Every loop counts: what forgets its state has no
+    argument."""
+    name, params, inner = equation.primitive.name, equation.params, _bodies(equation)
+    if name in _FAST and equation.invars[0].aval.dtype == np.float64:
+        return lambda given: [_FAST[name](given[0])]
     if name in _ALONE:
-        return [_ALONE[name](*given)]
+        return lambda given: [_ALONE[name](*given)]
     if name in _SOLVES:
-        return _solved(name, given, params)
-    if name != "while" and not any(_holds(body, _OTHER) for body, _ in _bodies(equation)):
-        return _bound(jaxpr, equation, given)  # a scan counts anyway
-    if name == "scan":
-        fixed, ends = _constants_and_carry(params)
-
-        def step(carry: Any, row: Any) -> Any:
-            found = _evaluate(params["jaxpr"], [*given[:fixed], *carry, *row])
-            return found[: ends - fixed], found[ends - fixed :]
-
-        how = {key: params[key] for key in ("length", "reverse", "unroll")}
-        carry, rows = jax.lax.scan(step, given[fixed:ends], given[ends:], **how)
-        return [*carry, *rows]
+        return lambda given: _solved(name, given, params)
     if name == "while":
-        first = params["cond_nconsts"]
-        second = first + params["body_nconsts"]
-
-        def goes_on(state: Any) -> Any:
-            on = _evaluate(params["cond_jaxpr"], [*given[:first], *state[1]])[0]
-            return on & (state[0] != 1)  # it is even
-
-        def turn(state: Any) -> Any:
-            new = _evaluate(params["body_jaxpr"], [*given[first:second], *state[1]])
-            return state[0] + 2, new
-
-        start = (jnp.zeros((), "uint32"), given[second:])
-        return jax.lax.while_loop(goes_on, turn, start)[1]
+        return lambda given: _counted(params, given)
+    if not any(_holds(body, _OTHER) for body, _ in inner):
+        return None  # a scan counts anyway
+    if name == "scan":
+        return lambda given: _scanned(params, given)
     if name == "custom_linear_solve":
-        return _linear_solution(params, given)
-    inner = _bodies(equation)
+        return lambda given: _linear_solution(params, given)
     if name in _INLINED and len(inner) == 1:
-        return _evaluate(_found["ClosedJaxpr"](*inner[0]), given)
-    return _bound(jaxpr, equation, given)
+        return lambda given: _evaluate(_found["ClosedJaxpr"](*inner[0]), given)
+    return None
+
+
+def _scanned(params: Any, given: list[Any]) -> list[Any]:
+    fixed, ends = _constants_and_carry(params)
+
+    def step(carry: Any, row: Any) -> Any:
+        found = _evaluate(params["jaxpr"], [*given[:fixed], *carry, *row])
+        return found[: ends - fixed], found[ends - fixed :]
+
+    how = {key: params[key] for key in ("length", "reverse", "unroll")}
+    carry, rows = jax.lax.scan(step, given[fixed:ends], given[ends:], **how)
+    return [*carry, *rows]
+
+
+def _counted(params: Any, given: list[Any]) -> list[Any]:
+    first = params["cond_nconsts"]
+    second = first + params["body_nconsts"]
+
+    def goes_on(state: Any) -> Any:
+        on = _evaluate(params["cond_jaxpr"], [*given[:first], *state[1]])[0]
+        return on & (state[0] != 1)  # it is even
+
+    def turn(state: Any) -> Any:
+        new = _evaluate(params["body_jaxpr"], [*given[first:second], *state[1]])
+        return state[0] + 2, new
+
+    start = (jnp.zeros((), "uint32"), given[second:])
+    return jax.lax.while_loop(goes_on, turn, start)[1]
 
 
 def _solved(name: str, given: list[Any], params: Any) -> list[Any]:
@@ -331,19 +385,6 @@ def _constants_and_carry(params: Any) -> tuple[int, int]:
 
 def _evaluate(closed: Any, args: list[Any]) -> list[Any]:
     return _values(_inside, closed.jaxpr, closed.consts, args)
-
-
-def _bound(jaxpr: Any, equation: Any, given: Any) -> list[Any]:
-    """The answer of one equation."""
-    pairs = {
-        var: value
-        for var, value in zip(equation.invars, given, strict=True)
-        if not isinstance(var, _found["Literal"])
-    }
-    parts = {"eqns": [equation], "outvars": equation.outvars, "constvars": []}
-    unnamed = jaxpr.debug_info._replace(arg_names=None, result_paths=None)
-    alone = jaxpr.replace(invars=list(pairs), **parts, debug_info=unnamed)
-    return _found["eval_jaxpr"](alone, (), *pairs.values())
 
 
 def _is_small(equation: Any) -> bool:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sorojax._jax.jit import once
 from sorojax._types import integers, optional_real, real
 
 
@@ -165,7 +166,7 @@ def known_dofs(supports: tuple[AbstractSupport, ...], num_nodes: int, dim: int) 
     return mask.ravel()
 
 
-@eqx.filter_jit
+@once
 def known_values(
     supports: tuple[AbstractSupport, ...], num_nodes: int, dim: int
 ) -> Float[Array, " dofs"]:

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sorojax._jax.jit import once
 from sorojax.fem.assembly.energy import Entries, inverse
 from sorojax.fem.assembly.space import AbstractFormulation, Space, lanes, modes
 from sorojax.fem.kinematics import AbstractKinematics, Axisymmetric, identity
@@ -317,7 +318,7 @@ class Geometry(NamedTuple):
     modes: Float[Array, "blocks modes quad lanes"] | None
 
 
-@jax.jit
+@once
 def geometry(
     space: Space,
     kinematics: AbstractKinematics,

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sorojax._jax.jit import once
 from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax._types import from_host, integers, real
 from sorojax.math.linear_map import OnHost, pushed
@@ -69,7 +70,7 @@ def _meet_jvp(primals, tangents):
     return x, _meet_dot(given, (tangents[0], tangents[2]), x)
 
 
-@eqx.filter_jit
+@once
 def _meet(fields: Fields, plan: BoundaryPlan, start):
     zooms = jnp.asarray(ZOOMS, start.dtype)
 
@@ -172,7 +173,7 @@ def _slide_jvp(primals, tangents):
     return x, _slide_dot((fields, plan, x, slopes), (tangents[0], tangents[2]), x)
 
 
-@eqx.filter_jit
+@once
 def _slide(fields: Fields, plan: BoundaryPlan, start):
     pairs = [
         _slide_one(field, own.normal, x)
