@@ -2,6 +2,7 @@
 programs they are."""
 
 import contextlib
+import functools
 
 import equinox as eqx
 import jax
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sorojax._jax import small_kernels
 from sorojax.math.two_programs import linear_program, two_programs
 
 pytestmark = pytest.mark.versions
@@ -26,13 +28,14 @@ def plain(spring, x, power):
     return {"force": force, "spring": Spring(2 * spring.stiffness), "count": jnp.arange(2)}
 
 
-whole = two_programs(plain)
+whole, keeping = two_programs(plain), two_programs(plain, keeps=True)
 
 
 def energy(function, stiffness, x):
     return jnp.sum(function(Spring(stiffness), x, 2)["force"] ** 2)
 
 
+@pytest.mark.parametrize("programs", [whole, keeping])
 @pytest.mark.parametrize(
     "way",
     [
@@ -48,8 +51,8 @@ def energy(function, stiffness, x):
         ),
     ],
 )
-def test_derivatives_are_those_of_the_plain_function(way):
-    found, known = (way(lambda s, x, f=f: energy(f, s, x))(X[0], X) for f in (whole, plain))
+def test_derivatives_are_those_of_the_plain_function(way, programs):
+    found, known = (way(lambda s, x, f=f: energy(f, s, x))(X[0], X) for f in (programs, plain))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13), found, known)
 
 
@@ -87,6 +90,60 @@ def test_a_gradient_is_the_program_of_the_value_and_one_more():
         again = jax.vjp(lambda x: lonely(x)[0], 2 * X)[1](X)
     assert not [name for name in names if "lonely" in name]
     assert not np.allclose(cotangents[0], again[0])
+
+
+def test_a_value_with_what_its_derivative_needs_and_a_program_for_each_direction():
+    @functools.partial(two_programs, keeps=True)
+    def alone(x):
+        return jnp.cumsum(jnp.tanh(x)), jnp.prod(x), jnp.arange(2)
+
+    def sums(x):
+        return alone(x)[0]
+
+    with compiled() as names:
+        pulled = jax.vjp(sums, X)[1](X)[0]
+        jax.vjp(sums, 2 * X)[1](X)
+    programs = [name for name in names if "alone" in name or "_by" in name]
+    assert programs == ["jit(alone_linearised)", "jit(_pulled_by)"]
+    with compiled() as names:
+        pushed = jax.jvp(sums, (X,), (X,))[1]
+    assert [name for name in names if "alone" in name or "_by" in name] == ["jit(_pushed_by)"]
+    slope = jnp.tril(jnp.ones((3, 3))) / jnp.cosh(X)[None] ** 2
+    np.testing.assert_allclose(pulled, slope.T @ X)
+    np.testing.assert_allclose(pushed, slope @ X)
+
+
+def test_lanes_that_go_one_after_the_other():
+    def steps(x, limit):
+        """As many as a lane needs."""
+        return jax.lax.while_loop(lambda x: jnp.sum(x) < limit, lambda x: x + 0.3, x)
+
+    apart = two_programs(steps, lanes_apart=True, kernels=True)
+    many, limits = jnp.linspace(0.1, 1.0, 15).reshape(5, 3), jnp.linspace(1.0, 30.0, 5)
+    for axes in ((0, None), (None, 0), (0, 0)):
+        given = [x if a == 0 else x[2] for a, x in zip(axes, (many, limits), strict=True)]
+        found, known = (jax.vmap(f, axes)(*given) for f in (apart, steps))
+        np.testing.assert_allclose(found, known, rtol=1e-13)
+    twice = jax.vmap(jax.vmap(apart, (0, None)), (None, 0))(many, limits)
+    np.testing.assert_allclose(twice[1], jax.vmap(apart, (0, None))(many, limits[1]))
+    with compiled() as names:
+        jax.vmap(apart, (0, None))(many[:4], limits[0])
+    if small_kernels.status() == "on":
+        assert "jit(steps_lanes)" in names
+
+
+@pytest.mark.parametrize("keeps", [False, True])
+@pytest.mark.parametrize("way", [jax.grad, jax.jacfwd])
+def test_functions_that_close_over_what_is_differentiated(keeps, way):
+    @functools.partial(two_programs, keeps=keeps)
+    def applied(x, function):
+        return function(x)
+
+    def both(y):
+        return applied(2 * y, lambda x: jnp.sin(x) * y)
+
+    want = 2 * jnp.cos(2.0) + jnp.sin(2.0)
+    assert float(way(both)(1.0)) == pytest.approx(float(want))
 
 
 def test_the_derivative_may_have_other_static_arguments():

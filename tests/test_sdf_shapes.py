@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from sorojax import sdf
+from sorojax._jax.jit import once
 from sorojax.sdf.sampling import value_and_gradient
 
 TRIANGLE = sdf.triangle([0.3, -0.2], [0.9, 0.1], [0.5, 0.3])
@@ -80,7 +81,7 @@ def kinks(dim: int) -> np.ndarray:
     return np.concatenate([np.zeros((1, dim)), eye, -eye, eye / 2, np.full((1, dim), 0.5)])
 
 
-@jax.jit
+@once
 def looked_at(shape, p):
     """Value, slope and change of the slope along one direction, in one program."""
     way = jnp.broadcast_to(jnp.array([1.0, 0.7, -0.4])[: shape.dim], p.shape)

@@ -12,6 +12,7 @@ Rests on a mark and options of XLA's compiler for CPUs, on `set_xla_metadata`, a
 programs of `jax.extend.core`. A jaxlib that is not among `PROVEN` gets the plain program.
 """
 
+import contextvars
 import functools
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
@@ -89,7 +90,12 @@ _HELD = _LOOPS | _INLINED | _SOLVES | set(_ALONE) | {
 Answer = TypeVar("Answer")
 
 
-def one_kernel(function: Callable[..., Answer]) -> Callable[..., tuple[Answer, Any]]:
+_product = contextvars.ContextVar("largest_product", default=LARGEST_PRODUCT)
+
+
+def one_kernel(
+    function: Callable[..., Answer], *, largest_product: int = LARGEST_PRODUCT
+) -> Callable[..., tuple[Answer, Any]]:
     """`function` with its small loops marked, to be compiled by itself with `OPTIONS`.
 
     Beside the answer it returns a number that no one needs, where it has kernels: they hand it
@@ -104,7 +110,11 @@ def one_kernel(function: Callable[..., Answer]) -> Callable[..., tuple[Answer, A
         if not known:
             return function(*args, **kwargs), None
         reads = [known[0].reshape(-1)[0].astype(_NUMBER)]
-        leaves = _run(closed.jaxpr, closed.consts, arrays, reads)
+        before = _product.set(largest_product)
+        try:
+            leaves = _run(closed.jaxpr, closed.consts, arrays, reads)
+        finally:
+            _product.reset(before)
         answer = eqx.combine(jax.tree.unflatten(jax.tree.structure(shapes), leaves), rest)
         return answer, reads[-1] if len(reads) > 1 else None
 
@@ -399,7 +409,7 @@ def _is_small(equation: Any) -> bool:
         return False
     if name in _SOLVES and not _is_small_solve(equation):
         return False
-    if name == "dot_general" and _multiplications(equation) > LARGEST_PRODUCT:
+    if name == "dot_general" and _multiplications(equation) > _product.get():
         return False
     if not all(_is_number(var.aval) for var in (*equation.invars, *equation.outvars)):
         return False

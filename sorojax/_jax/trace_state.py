@@ -6,10 +6,12 @@ Rests on `jax.core.Tracer`, `jax.core.eval_context` and
 
 import contextlib
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from sorojax._jax.optional import optional, reason
 
@@ -36,6 +38,21 @@ def _concrete() -> tuple[type, ...]:
 def is_traced(tree: Any) -> bool:
     """Whether any leaf of `tree` is an abstract value of a JAX transformation."""
     return any(is_tracer(leaf) for leaf in jax.tree.leaves(tree))
+
+
+def are_lanes(values: Sequence[Any]) -> bool:
+    """Whether tracers are lanes of `jax.vmap` alone, outside of other transformations."""
+    lane = _lane()
+    whole = [x.val if isinstance(x, lane) and hasattr(x, "val") else x for x in values]
+    return not any(is_tracer(x) for x in whole)
+
+
+@functools.cache
+def _lane() -> type:
+    """The class of a lane in `jax.vmap`."""
+    found: list[type] = []
+    jax.vmap(lambda x: found.append(type(x)) or x)(np.zeros(1))
+    return found[0]
 
 
 def outside_transformations() -> bool:

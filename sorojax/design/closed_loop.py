@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from sorojax._display import displayed, number, outcome
 from sorojax._edit import without_derivatives
+from sorojax._jax.jit import once
 from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax._types import Numbers
 from sorojax.design.optimise.shape_loop import Drawing, followed
@@ -332,7 +333,7 @@ def _modes_status(backbone: Backbone, basis: StrainBasis) -> Status:
         return _unless(_are_held(backbone, counts), Status.too_few_states)
 
 
-@eqx.filter_jit
+@once
 def _are_held(backbone: Backbone, counts: dict[str, int]) -> Bool[Array, ""]:
     """Whether the states hold so many modes of each strain."""
     root, enough = jnp.sqrt(weights(backbone.s))[None], jnp.array(True)

@@ -2,13 +2,13 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._jax.jit import once
 from sorojax._jax.trace_state import is_traced
 from sorojax.fem.assembly.space import (
     AbstractFormulation,
@@ -265,7 +265,7 @@ def held(problem: Any, known: np.ndarray) -> None:
         )
 
 
-@eqx.filter_jit
+@once
 def _curvature(problem: Any, springs: list, modes) -> Float[Array, "modes modes"]:
     """Second derivatives of the potential of springs in the rigid modes."""
 

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float, Int
 
 from sorojax import _check
 from sorojax._display import displayed, number
+from sorojax._jax.jit import once
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import Numbers, real
 from sorojax.fem.dynamics.masses import swing_force, with_masses
@@ -211,7 +212,7 @@ def wrench(
     return total, jnp.atleast_1d(jnp.sum(turns, axis=0))
 
 
-@eqx.filter_jit
+@once
 def _path_forces(path: Path) -> Float[Array, "steps nodes dim"]:
     """Internal force less the loads at every state: zero but at supports [N]."""
     states = jnp.arange(path.displacements.shape[0])
@@ -221,7 +222,7 @@ def _path_forces(path: Path) -> Float[Array, "steps nodes dim"]:
 # A body in motion: the acceleration of every node at an instant
 
 
-@eqx.filter_jit
+@once
 def _motion_forces(dynamics: Dynamics, states: State, points, lists):
     """M a + C v + f_int - f_ext at the saved states: zero but at supports [N]."""
     problem, known = dynamics.problem, matter(dynamics)

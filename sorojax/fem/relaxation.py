@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sorojax._jax.jit import once
 from sorojax.fem.assembly.geometry import Points, deformation, quadrature_points
 from sorojax.fem.problem import Problem, exchanged, potential_energy
 from sorojax.fem.stress import full_deformation
@@ -63,21 +64,21 @@ class Past(eqx.Module):
     peaks: Peaks | None
 
 
-@eqx.filter_jit
+@once
 def from_past(problem: Problem, past: Past, step: Float[Array, ""] | None) -> Problem:
     """`problem` with the material `step` [s] after the `past`."""
     material = in_step(problem, past.moduli, past.strains, step, past.peaks)
     return exchanged(problem, material=material[0]) if material else problem
 
 
-@eqx.filter_jit
+@once
 def next_past(problem: Problem, past: Past, step: Float[Array, ""] | None, u: Nodal) -> Past:
     """The past after a `step` [s] to equilibrium at `u` [m]."""
     args = problem, past.moduli, past.strains, step, u, past.peaks
     return Past(past.moduli, after_step(*args)[0], raised_peaks(*args)[0])
 
 
-@eqx.filter_jit
+@once
 def first_past(problem: Problem, u: Nodal, timed: bool) -> Past:
     """The past of a body that has relaxed at `u` [m]; without branches unless `timed`."""
     peaks = first_peaks(problem, u)
@@ -86,7 +87,7 @@ def first_past(problem: Problem, u: Nodal, timed: bool) -> Past:
     return Past(moduli(problem), relaxed(problem, u), peaks)
 
 
-@eqx.filter_jit
+@once
 def relaxed(problem: Problem, u: Nodal) -> Strains | None:
     """The strains of a body that has been at displacement `u` [m] for long."""
     if not isinstance(problem.material, Viscoelastic):
@@ -101,7 +102,7 @@ def first_peaks(problem: Problem, u: Nodal) -> Peaks | None:
     return _first_peaks(problem, u) if softens(problem) else None
 
 
-@eqx.filter_jit
+@once
 def _first_peaks(problem: Problem, u: Nodal) -> Peaks:
     points, law = quadrature_points(problem.mesh, problem.kinematics), _softening(problem)
     assert law is not None

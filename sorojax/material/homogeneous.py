@@ -9,13 +9,13 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._jax.jit import once
 from sorojax.material.hyperelastic import AbstractHyperelastic, strain_energy_density
 from sorojax.material.kinematics import Entry, Tensor
 from sorojax.math.implicit_root import implicit_root
@@ -237,7 +237,7 @@ def drucker_stability(material: AbstractHyperelastic, *, limit: float = 10.0) ->
     return Stability(*ranges, limit)
 
 
-@eqx.filter_jit
+@once
 def _is_stable(material, strains: Float[Array, "modes points 2"]):
     def energy(log):
         a, b = jnp.exp(log)

@@ -9,7 +9,6 @@ a branch is written to memory once.
 
 import functools
 import inspect
-import math
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -46,13 +45,7 @@ def floats_traced(verb: Verb) -> Verb:
     return call  # type: ignore[return-value]
 
 
-def jit_trees(
-    function: Verb,
-    *,
-    kernels: bool = True,
-    largest: float = math.inf,
-    optimised: bool = True,
-) -> Verb:
+def jit_trees(function: Verb, *, kernels: bool = True, **how: Any) -> Verb:
     """`function` of pytrees compiled: arrays are traced, all else is static.
 
     It does what `sorojax.jit` does for functions of arrays and nouns, with a third less to
@@ -60,8 +53,8 @@ def jit_trees(
 
     Args:
         function: Of pytrees.
-        kernels, largest: As of `sorojax.jit`.
-        optimised: Work that is next to nothing compiles in a third of the time without.
+        kernels: As of `sorojax.jit`.
+        how: As of `by_itself`.
     """
     early = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
     parameters = inspect.signature(function).parameters.values()
@@ -75,7 +68,7 @@ def jit_trees(
         return Split(function(*args, **kwargs))
 
     flat.__name__ = flat.__qualname__ = function.__name__
-    compiled = by_itself(flat, kernels=kernels, largest=largest, optimised=optimised)
+    compiled = by_itself(flat, kernels=kernels, **how)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:

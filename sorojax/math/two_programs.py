@@ -17,8 +17,14 @@ import jax
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
-from sorojax._jax.jit import jit
-from sorojax._jax.trace_state import called_as_outside, evaluated_now, is_traced, is_tracer
+from sorojax._jax.jit import is_alone, jit
+from sorojax._jax.trace_state import (
+    are_lanes,
+    called_as_outside,
+    evaluated_now,
+    is_traced,
+    is_tracer,
+)
 from sorojax._types import from_host
 from sorojax.math.compiled import Split, jit_trees
 from sorojax.math.linear_map import pushed
@@ -28,12 +34,16 @@ Leaves = list[Any]
 Again = Callable[..., tuple[Any, ...]]
 
 
+_PRODUCT_OF_LANES = 40_000  # multiplications: a library costs more than it saves in a search
+
+
 def two_programs(
     function: Verb,
     again: Again | None = None,
     within: Callable[..., Any] | None = None,
     *,
     keeps: bool = False,
+    lanes_apart: bool = False,
     kernels: bool = False,
     largest: float = math.inf,
 ) -> Verb:
@@ -51,6 +61,8 @@ def two_programs(
         keeps: Where it has a derivative, the value is a program that keeps what the derivative
             needs, and each direction one program more that computes nothing again: for
             functions that take long to compile, of few numbers.
+        lanes_apart: Lanes of `jax.vmap` outside `jit` go one after the other, each by kernels:
+            for searches, of which lanes take differently many steps.
         kernels, largest: As of `sorojax.jit`.
     """
     programs = _Programs(function, again, keeps=keeps, kernels=kernels, largest=largest)
@@ -62,12 +74,35 @@ def two_programs(
         # in a batch or under `jit`, and where nothing has a derivative
         if not traced:
             return programs.whole(*args, **kwargs)
+        if lanes_apart and are_lanes(traced):
+            return _one_by_one(programs, Split((args, kwargs))).whole()
         if is_traced(jax.lax.stop_gradient(traced)):
             return inside(*args, **kwargs)
         given = Split(jax.tree.map(_as_array, (args, kwargs)))
-        return _differentiable(_Call(programs, given.form), given.leaves).whole()
+        try:
+            return _differentiable(_Call(programs, given.form), given.leaves).whole()
+        except jax.errors.UnexpectedTracerError:  # of a function that closes over one
+            return inside(*args, **kwargs)
 
     return call  # type: ignore[return-value]
+
+
+def _one_by_one(programs: "_Programs", given: Split) -> Split:
+    @jax.custom_batching.custom_vmap
+    def lane(*leaves: Any) -> Split:
+        return programs.value(list(leaves), given.form)
+
+    @lane.def_vmap
+    def _(count: int, moves: list[bool], *leaves: Any) -> Any:
+        lanes, rest = _only(moves, leaves), _only(moves, leaves, False)
+        if is_alone():
+            found = programs.lanes(lanes, rest, given.form)
+        else:
+            one = lambda lane: programs.value(_joined(lane, rest), given.form)  # noqa: E731
+            found = jax.vmap(one)(lanes)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return lane(*given.leaves)
 
 
 def _as_array(leaf: Any) -> Any:
@@ -141,7 +176,15 @@ class _Programs:
             by = functools.partial(wanted, rest=rest, form=form, which=which)
             return jax.vjp(by, moving)[1](changes)[0]
 
+        def lanes(moving, rest, form):
+            def one(lane):
+                args, kwargs = form.whole(_joined(lane, rest))
+                return Split(function(*args, **kwargs))
+
+            return jax.lax.map(one, moving)
+
         parts = (push, "_pushed"), (pull, "_pulled"), (linearised, "_linearised")
+        parts = *parts, (lanes, "_lanes")
         for part, end in parts:
             part.__name__ = part.__qualname__ = function.__name__ + end
         self.whole = jit_trees(function, kernels=kernels, largest=largest)
@@ -151,6 +194,7 @@ class _Programs:
         self._again, self._largest = again, largest
         self.linearised = jit_trees(linearised, kernels=kernels, largest=largest)
         self.keeps = keeps
+        self.lanes = jit_trees(lanes, kernels=kernels, largest_product=_PRODUCT_OF_LANES)
 
     def value(self, leaves: Leaves, form: Any) -> Split:
         args, kwargs = form.whole(leaves)

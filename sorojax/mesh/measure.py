@@ -3,13 +3,13 @@
 import functools
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
+from sorojax._jax.jit import once
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
 from sorojax.math.host import KDTree
@@ -44,7 +44,7 @@ def cell_areas(mesh: Mesh) -> Float[Array, " cells"]:
     return _areas(mesh)
 
 
-@eqx.filter_jit
+@once
 def _areas(mesh: Mesh) -> Float[Array, " cells"]:
     x = mesh.points[mesh.cells]
     total = jnp.zeros_like(x[:, 0, 0])
@@ -71,7 +71,7 @@ def cell_volumes(mesh: Mesh) -> Float[Array, " cells"]:
     return _volumes(mesh)
 
 
-@eqx.filter_jit
+@once
 def _volumes(mesh: Mesh) -> Float[Array, " cells"]:
     rule = quadrature(mesh.element, max(3, mesh.element.stiffness_degree))
     slopes = jnp.asarray(shape_gradients(mesh.element, rule.points), mesh.points.dtype)
@@ -112,7 +112,7 @@ def check_some(where: str, facets: Any) -> None:
         )
 
 
-@eqx.filter_jit
+@once
 def _enclosed(points, facets, element) -> Float[Array, ""]:
     x = points[facets]
     if element.dim == 2:

@@ -2,11 +2,11 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from sorojax._jax.jit import once
 from sorojax.mesh.elements.base import AbstractElement, facet_corners
 from sorojax.mesh.elements.polygon import PolyN
 from sorojax.mesh.measure import cell_areas as cell_areas, cell_volumes
@@ -218,7 +218,7 @@ def distortion(mesh: Mesh, moved: Mesh) -> Distortion:
     return _compared(mesh.element, mesh.points, mesh.cells, moved.points, moved.cells)
 
 
-@eqx.filter_jit
+@once
 def _compared(element: AbstractElement, points, cells, new_points, new_cells) -> Distortion:
     size, shape = _size_and_shape(element, points, cells)
     new_size, new_shape = _size_and_shape(element, new_points, new_cells)

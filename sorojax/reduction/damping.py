@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._jax.jit import once
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
 from sorojax.rod import (
@@ -125,7 +126,7 @@ def _step(times: np.ndarray, window: int) -> float:
     return float(steps.mean())
 
 
-@eqx.filter_jit
+@once
 def _balance(rod: Rod, t, q, v, forces) -> tuple[Array, Array]:
     """Momentum M v, and the force that changes it but for damping, of each sample."""
     constants = operators(rod)
@@ -156,7 +157,7 @@ def _windows(samples: int, window: int, step: float) -> tuple[np.ndarray, np.nda
     return rows[0], rows[1]
 
 
-@eqx.filter_jit
+@once
 def _fitted(rod: Rod, rates, momentum, force, weight, slope):
     """The damping matrix, the share of the force that it leaves unexplained, and for each
     strain how little its coordinates move in one way over how much in another."""

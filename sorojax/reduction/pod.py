@@ -5,13 +5,13 @@ Reference: Caasenbrood et al., Sorotoki, IEEE Access 2024, section V-D4.
 
 import functools
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax._edit import without_derivatives
+from sorojax._jax.jit import once
 from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax.math.linalg.dense import least_squares
 from sorojax.math.two_programs import two_programs
@@ -239,7 +239,7 @@ def captured_energy(backbone: Backbone, basis: StrainBasis) -> dict[str, Float[A
     return _shares(backbone, basis)
 
 
-@eqx.filter_jit
+@once
 def _shares(backbone: Backbone, basis: StrainBasis) -> dict[str, Float[Array, ""]]:
     shares, q, w = {}, coordinates(backbone, basis), weights(backbone.s)
     for name in basis.active:
@@ -249,7 +249,7 @@ def _shares(backbone: Backbone, basis: StrainBasis) -> dict[str, Float[Array, ""
     return shares
 
 
-@eqx.filter_jit
+@once
 def coordinates(backbone: Backbone, basis: StrainBasis) -> Float[Array, "steps dof"]:
     """Coordinates of the snapshots: least squares at the samples, any basis.
 

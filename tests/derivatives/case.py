@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from sorojax._jax.jit import once
+
 
 class Case(NamedTuple):
     """A verb as a function of what it promises to be differentiable in.
@@ -76,7 +78,7 @@ def slopes(case: Case):
             reverse = slope @ direction
         return value, reverse, along, found
 
-    every = jax.jit(every) if case.jit else every
+    every = once(every) if case.jit else every
     # The sizes of the outputs, without a program of their own where the call is traced.
     shapes = jax.tree.leaves(jax.eval_shape(outputs, flat) if case.jit else outputs(flat))
     draw = np.random.default_rng(1)

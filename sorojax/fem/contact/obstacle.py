@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
+from sorojax._jax.jit import once
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import integers, optional_real, real
 from sorojax.contact import AbstractFriction, Penalty, SpringSlider
@@ -538,7 +539,7 @@ def felt(load: "Contact", problem: "Problem", u: Nodal) -> Felt:
     return Felt(found[..., 0], found[..., 1:-1], clear)
 
 
-@eqx.filter_jit
+@once
 def settled(load: "Contact", problem: "Problem", u: Nodal) -> "Contact":
     """`load` after an equilibrium `u`, ready for the next one."""
     load = dataclasses.replace(load, place=load.value)

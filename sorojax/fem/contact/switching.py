@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from sorojax._jax.jit import once
 from sorojax.fem.contact.obstacle import Contact
 from sorojax.fem.dynamics.trajectory import Trajectory
 from sorojax.fem.problem import body
@@ -58,7 +59,7 @@ def contact_switching(
     return _switching(motion, jnp.asarray(share, motion.displacements.dtype))
 
 
-@eqx.filter_jit
+@once
 def _switching(motion: Trajectory, share) -> ContactSwitching:
     moving, rest = eqx.partition(motion.states.memory, eqx.is_inexact_array)
     problem = body(motion.problem)

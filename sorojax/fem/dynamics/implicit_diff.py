@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from sorojax._jax.jit import once
 from sorojax.fem.assembly import assemble as asm
 from sorojax.fem.dynamics.host import Control, Run, ended
 from sorojax.fem.dynamics.step import (
@@ -151,7 +152,7 @@ def interval_of(entry: Float[Array, "3"]) -> tuple[Interval, Bool[Array, ""]]:
     return Interval(entry[0].astype(jnp.int32), begin, end), taken
 
 
-@eqx.filter_jit
+@once
 def replay(dynamics: Dynamics, record: Record, grid: int, every: int) -> tuple[State, State]:
     """States at every `every`th point of the grid, NaN where the record does not reach, and
     the last state."""

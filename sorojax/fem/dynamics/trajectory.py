@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sorojax._display import displayed, number, outcome
+from sorojax._jax.jit import once
 from sorojax._jax.trace_state import is_traced
 from sorojax.fem.dynamics.damping import nodal_mass
 from sorojax.fem.dynamics.masses import kinetic_energy, moving_nodes, with_masses
@@ -106,7 +107,7 @@ class Trajectory(eqx.Module):
         )
 
 
-@eqx.filter_jit
+@once
 def _energies(dynamics: Dynamics, states: State, points, lists) -> Energies:
     problem, known = dynamics.problem, matter(dynamics)
     moving, rest = eqx.partition(states, eqx.is_inexact_array)

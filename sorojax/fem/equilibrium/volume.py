@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._jax.jit import once
 from sorojax._jax.trace_state import evaluated_now, is_traced
 from sorojax._progress import report
 from sorojax._types import from_host, real
@@ -99,7 +100,7 @@ def with_pressures(
     return eqx.tree_at(lambda p: [p.loads[i].value for i in indices], problem, list(pressures))
 
 
-@eqx.filter_jit
+@once
 def volumes(
     problem: Problem, names: Names, u: Float[Array, "nodes dim"]
 ) -> Float[Array, " cavities"]:
@@ -115,13 +116,13 @@ def _wanted(contents: tuple[AbstractContents, ...], pressures):
     return jnp.stack([c.volume_at(p) for c, p in zip(contents, pressures, strict=True)])
 
 
-@eqx.filter_jit
+@once
 def _slopes(problem: Problem, names: Names, u) -> Float[Array, "cavities dofs"]:
     """Slopes of the volumes [m^2], nodal forces of a unit pressure in each cavity."""
     return jax.jacrev(lambda u: volumes(problem, names, u))(u).reshape(len(names), -1)
 
 
-@eqx.filter_jit
+@once
 def _border(problem: Problem, names: Names, contents, begin, share, u, pressures) -> Border:
     """The border on the way from the volumes `begin` to those of the contents."""
 

@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from sorojax._jax.jit import once
 from sorojax.fem.equilibrium import rules
 from sorojax.fem.equilibrium.linear import Linearised, Prepared, linearise
 from sorojax.fem.equilibrium.load_stepping import between, unloaded
@@ -190,7 +191,7 @@ class Loading:
         return _rates(self.rest, self.full, jnp.asarray(float(factor)), jnp.asarray(u))
 
 
-@eqx.filter_jit
+@once
 def _rates(rest: Problem, full: Problem, factor, u):
     def at(factor):
         problem = between(rest, full, factor)

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax._display import displayed, number
+from sorojax._jax.jit import once
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
 from sorojax.fem.dynamics.damping import mass_matrix
@@ -214,7 +215,7 @@ def _rates(problem: Problem, pair: _Pair, eigenvalues, shapes) -> tuple[Array, A
     return slopes * alone, vectors.reshape(shapes.shape) * alone[:, None, None]
 
 
-@eqx.filter_jit
+@once
 def _matrices(moving, rest, massive: bool) -> tuple[Array, Array]:
     """Values of K, and of M or the identity."""
     problem, u = eqx.combine(moving, rest)

@@ -11,13 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._jax.jit import once
 from sorojax.material.fit import unit_covariance
 from sorojax.material.spectrum.records import AbstractViscoelasticTest
 from sorojax.material.viscoelastic import Prony
@@ -271,7 +271,7 @@ def _by_branches(data: _Data, most: int, patience: int) -> dict[int, _Fit]:
     return found
 
 
-@eqx.filter_jit
+@once
 def _ratios(tests, x: Float[Array, " n"]) -> tuple[Array, Array]:
     """Predicted over measured at (modulus, shares, times), and their slopes."""
 

@@ -171,7 +171,7 @@ def _checked(status, model, path, too_long) -> Status:
     return checked_status(judged_status(status, too_long), model, path)
 
 
-@functools.partial(two_programs, keeps=True, kernels=True)
+@functools.partial(two_programs, keeps=True, lanes_apart=True, kernels=True)
 @full_products
 def _rollout(
     model, q, v, forces, step, t, stepper, saves, every, label, check, memory

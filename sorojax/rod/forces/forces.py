@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._jax.jit import once
 from sorojax._types import optional_real, real
 from sorojax.material.viscoelastic import Prony
 from sorojax.math.quadrature import gauss_legendre
@@ -316,7 +317,7 @@ def section_law(
     return SectionLaw(stress, *_rows(rod), s)
 
 
-@eqx.filter_jit
+@once
 def _rows(rod: Rod) -> tuple[Array, Array]:
     """Strain per coordinate at the Gauss nodes, and their weights [m]."""
     return strains_at(rod)[1], operators(rod).weights

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._jax.jit import once
 from sorojax._types import Numbers, optional_real, real
 from sorojax.math.compiled import jit_public
 from sorojax.math.lie import cross_columns
@@ -376,7 +377,7 @@ def thread_chambers(
     return ThreadChambers(_threads(rod, routes), areas, is_single)
 
 
-@eqx.filter_jit
+@once
 def _threads(rod: Rod, routes: tuple[AbstractRoute, ...]) -> tuple[Thread, ...]:
     return tuple(thread(rod, route) for route in routes)
 

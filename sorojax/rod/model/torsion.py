@@ -12,13 +12,13 @@ Reference:
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._jax.jit import once
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
 from sorojax.math.compiled import jit_public
@@ -90,7 +90,7 @@ def shear_factors(
     return found[0], found[1]
 
 
-@eqx.filter_jit
+@once
 def _constants(mesh: Mesh, system: sparse.SparseSymmetric, principal: bool) -> PlaneConstants:
     middle = _moments(mesh, mesh.points)[1]
     points = mesh.points - middle[None]

@@ -291,7 +291,7 @@ class Found(NamedTuple):
 
 
 @floats_traced
-@functools.partial(two_programs, keeps=True, kernels=True)
+@functools.partial(two_programs, keeps=True, lanes_apart=True, kernels=True)
 @full_products
 def equilibrium(
     model: Model,

@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import fem
+from sorojax._jax.jit import once
 from sorojax.design.optimise.shape_loop import OptimisedShape
 from sorojax.fem import Problem
 from sorojax.fem.equilibrium.solve import Path
@@ -42,19 +42,19 @@ States = Sequence[int] | Int[Any, " states"] | None
 Field = str | NodalField | Float[Any, " values"] | None
 
 
-@eqx.filter_jit
+@once
 def _nodal_von_mises(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, " nodes"]:
     """Von Mises stress at the nodes, averaged between cells [kPa]."""
     return fem.nodal_average(problem, fem.von_mises_stress(problem, u)) / 1e3
 
 
-@eqx.filter_jit
+@once
 def _mean_stress(problem: Problem, u) -> Float[Array, " nodes"]:
     sigma = fem.cauchy_stress(problem, u)
     return fem.nodal_average(problem, jnp.trace(sigma, axis1=-2, axis2=-1) / 3)
 
 
-@eqx.filter_jit
+@once
 def _largest_stretch(problem: Problem, u) -> Float[Array, " nodes"]:
     F = fem.deformation_gradient(problem, u)
     C = jnp.swapaxes(F, -1, -2) @ F

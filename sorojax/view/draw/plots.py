@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -371,7 +370,7 @@ def show_fit(
     return _tensile(fit.material, stretch, stress, points, title or text)
 
 
-@eqx.filter_jit
+@once
 def _isochoric_stress(
     material: AbstractHyperelastic, stretch: Float[Array, " points"]
 ) -> Float[Array, " points"]:

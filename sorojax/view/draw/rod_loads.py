@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +11,7 @@ from jaxtyping import Float
 from scipy.optimize import brentq
 
 from sorojax import rod as R
+from sorojax._jax.jit import once
 from sorojax.rod import Assembly, Rod, Section
 from sorojax.rod.forces.tendons import Thread, ThreadChambers
 from sorojax.sdf import AbstractSdf, contour
@@ -90,7 +90,7 @@ def _tendon(route: R.AbstractRoute, name: str) -> Drawn:
     return Drawn(route.start, route.stop, place, None, style.COLOURS[3], name)
 
 
-@eqx.filter_jit
+@once
 def _places(route, s):
     return jax.vmap(route.offset)(s)
 
@@ -182,7 +182,7 @@ def size_of(model: Rod | Assembly) -> float:
     return max((float(body.length) for body in rods), default=0.1)
 
 
-@eqx.filter_jit
+@once
 def _pushes(model, q, part: str, contact):
     """Points of contact [m] and the normal forces there [N]."""
     moment = R.motion(model, q)
@@ -192,7 +192,7 @@ def _pushes(model, q, part: str, contact):
     return _normal_force(touch, contact.law)
 
 
-@eqx.filter_jit
+@once
 def _meets(model, q, pair):
     moment = R.motion(model, q)
     first, second = (

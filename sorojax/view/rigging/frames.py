@@ -8,13 +8,13 @@ import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sorojax import _check
+from sorojax._jax.jit import once
 from sorojax.math.host import KDTree
 from sorojax.math.lie import SE2, SE3, homogeneous, logarithm
 from sorojax.rod import Assembly, Rod, forward_kinematics
@@ -66,7 +66,7 @@ def frame_table(
     return pose_rows(poses, ends)
 
 
-compiled_table = eqx.filter_jit(frame_table)
+compiled_table = once(frame_table)
 
 
 def position_columns(dim: int) -> slice:

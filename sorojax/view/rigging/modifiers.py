@@ -6,13 +6,13 @@ the points and in their numbers.
 
 from typing import Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import _check
+from sorojax._jax.jit import once
 from sorojax._types import real
 from sorojax.math.compiled import jit_public
 from sorojax.math.lie import homogeneous
@@ -92,7 +92,7 @@ def taper(points: Points, factor, *, along: Axis = "x", start, end) -> Points:
     return _taper(points, real(factor).astype(points.dtype), i, start, end)
 
 
-@eqx.filter_jit
+@once
 def _taper(points: Points, factor, i: int, start, end) -> Points:
     share = jnp.clip((points[:, i] - start) / (end - start), 0, 1)
     scaled = points * (1 + (factor - 1) * share)[:, None]

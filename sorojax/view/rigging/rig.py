@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from sorojax import _check
 from sorojax._display import displayed
+from sorojax._jax.jit import once
 from sorojax._types import integers, real
 from sorojax.math.compiled import jit_public
 from sorojax.math.quadrature import interpolation_rows
@@ -115,7 +116,7 @@ def pose(
     return _poses(rig, q)
 
 
-@eqx.filter_jit
+@once
 def _poses(rig: Rig, qs: Float[Array, "frames coordinates"]):
     return jax.lax.map(lambda q: deform(rig.skin, rig.model, q), qs)
 
