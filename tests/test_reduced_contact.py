@@ -13,6 +13,7 @@ import pytest
 from sorojax import fem, io, material, mesh, sdf, systems
 from sorojax.math.status import Status
 from sorojax.systems.blocks.modal_basis import Basis
+from sorojax.systems.blocks.modal_body import AbstractModalForce
 from sorojax.systems.blocks.sampled_body import snapshot_basis
 from sorojax.systems.integrate.modal_step import modal_step
 from sorojax.units import deg, mm
@@ -95,6 +96,25 @@ def test_a_block_rests_on_the_pressure_of_its_weight():
     pressure = contact.law.pressure(contact.gap(q))
     weight = 1000.0 * G * 20 * mm * 10 * mm * 10 * mm
     np.testing.assert_allclose(float(pressure @ contact.areas), weight, rtol=1e-6)
+
+
+class Rounded(AbstractModalForce):
+    """A force of zero at rest, but for rounding."""
+
+    force: AbstractModalForce
+
+    def __call__(self, q):
+        noise = jnp.sin(1e27 * jax.lax.stop_gradient(q) + jnp.arange(1.0, 1.0 + len(q)))
+        return self.force(q) - self.force(0 * q) + 1e-12 * noise
+
+    def energy(self, q):
+        return self.force.energy(q)
+
+
+def test_a_block_without_load_stays_where_it_is():
+    body = eqx.tree_at(lambda b: b.force, reduced(block(0.0)), replace_fn=Rounded)
+    film = moved(body, 0.1)
+    assert np.abs(along(body, film)).max() < 1e-15
 
 
 def lip() -> systems.FemBody:

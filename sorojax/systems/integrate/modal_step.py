@@ -172,14 +172,17 @@ def _relaxed(relaxed, q: Modes, span, times):
 def _newton(now: _Step, guess: Modes, most: int) -> tuple[Modes, tuple[Array, Array]]:
     """The acceleration that balances a step, 1 where it was found, and the passes."""
     still = jax.jacfwd(now.unmoved)(guess)
-    small = max(_SMALL, 64 * float(jnp.finfo(guess.dtype).eps))
+    eps = float(jnp.finfo(guess.dtype).eps)
+    small, least = max(_SMALL, 64 * eps), _rounding(now, eps)
 
     def one(at: _Pass) -> _Pass:
         a = at.base + at.share * at.way
         left, matrix, size = now.linearised(a, still)
         rise, count = left @ at.way, at.count + 1
-        balanced = jnp.max(jnp.abs(left)) <= small * size
-        onward = _whole(a, -jnp.linalg.solve(matrix, left), left, count)
+        way = -jnp.linalg.solve(matrix, left)
+        # at rest without a load, forces are nothing but rounding
+        balanced = (jnp.max(jnp.abs(left)) <= small * size) | jnp.all(jnp.abs(way) <= least)
+        onward = _whole(a, way, left, count)
         onward = onward._replace(balanced=balanced)
         chosen = balanced | _enough(at, rise)
         within = _shorter(at, rise)._replace(count=count)
@@ -188,6 +191,17 @@ def _newton(now: _Step, guess: Modes, most: int) -> tuple[Modes, tuple[Array, Ar
     begun = _whole(guess, 0 * guess, guess, jnp.zeros((), jnp.int32))
     end = jax.lax.while_loop(lambda at: ~at.balanced & (at.count < most), one, begun)
     return end.base, (end.balanced.astype(guess.dtype), end.count.astype(guess.dtype))
+
+
+def _rounding(now: _Step, eps: float) -> Modes:
+    """Accelerations that move no point on the surface by more than its place is rounded by."""
+    least = jnp.zeros_like(now.before)
+    for one in now.body.contacts:
+        room = eps * jnp.max(jnp.abs(one.places)) / (now.scheme.beta * now.h**2)
+        most = len(one.moves) * jnp.max(jnp.abs(one.moves), axis=(1, 2))
+        share = jnp.where(most > 0, room / jnp.where(most > 0, most, 1.0), 0.0)
+        least = jnp.maximum(least, share)
+    return least
 
 
 def _whole(base: Modes, way: Modes, left: Modes, count) -> _Pass:
