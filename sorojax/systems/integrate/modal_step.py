@@ -25,6 +25,7 @@ from sorojax.systems.blocks.modal_basis import Modes
 from sorojax.systems.blocks.modal_body import ModalBody
 
 _TRIES = 8  # of the length of a step
+_ROUNDING = 64  # roundings of the largest place of a point
 _SMALL = 1e-9  # of the forces, that may be left without balance; more in single precision
 
 
@@ -172,8 +173,7 @@ def _relaxed(relaxed, q: Modes, span, times):
 def _newton(now: _Step, guess: Modes, most: int) -> tuple[Modes, tuple[Array, Array]]:
     """The acceleration that balances a step, 1 where it was found, and the passes."""
     still = jax.jacfwd(now.unmoved)(guess)
-    eps = float(jnp.finfo(guess.dtype).eps)
-    small, least = max(_SMALL, 64 * eps), _rounding(now, eps)
+    small = max(_SMALL, 64 * float(jnp.finfo(guess.dtype).eps))
 
     def one(at: _Pass) -> _Pass:
         a = at.base + at.share * at.way
@@ -181,7 +181,7 @@ def _newton(now: _Step, guess: Modes, most: int) -> tuple[Modes, tuple[Array, Ar
         rise, count = left @ at.way, at.count + 1
         way = -jnp.linalg.solve(matrix, left)
         # at rest without a load, forces are nothing but rounding
-        balanced = (jnp.max(jnp.abs(left)) <= small * size) | jnp.all(jnp.abs(way) <= least)
+        balanced = (jnp.max(jnp.abs(left)) <= small * size) | ~_moves(now, way)
         onward = _whole(a, way, left, count)
         onward = onward._replace(balanced=balanced)
         chosen = balanced | _enough(at, rise)
@@ -193,15 +193,15 @@ def _newton(now: _Step, guess: Modes, most: int) -> tuple[Modes, tuple[Array, Ar
     return end.base, (end.balanced.astype(guess.dtype), end.count.astype(guess.dtype))
 
 
-def _rounding(now: _Step, eps: float) -> Modes:
-    """Accelerations that move no point on the surface by more than its place is rounded by."""
-    least = jnp.zeros_like(now.before)
+def _moves(now: _Step, change: Modes) -> Bool[Array, ""]:
+    """Whether a change of the acceleration moves the surface by more than what places are
+    rounded by."""
+    moves, eps = jnp.zeros((), bool), float(jnp.finfo(change.dtype).eps)
     for one in now.body.contacts:
-        room = eps * jnp.max(jnp.abs(one.places)) / (now.scheme.beta * now.h**2)
-        most = len(one.moves) * jnp.max(jnp.abs(one.moves), axis=(1, 2))
-        share = jnp.where(most > 0, room / jnp.where(most > 0, most, 1.0), 0.0)
-        least = jnp.maximum(least, share)
-    return least
+        way = now.scheme.beta * now.h**2 * jnp.abs(change)
+        most = way @ jnp.max(jnp.abs(one.moves), axis=(1, 2))
+        moves = moves | (most > _ROUNDING * eps * jnp.max(jnp.abs(one.places)))
+    return moves
 
 
 def _whole(base: Modes, way: Modes, left: Modes, count) -> _Pass:
