@@ -135,7 +135,7 @@ def test_lanes_that_go_one_after_the_other():
 @pytest.mark.parametrize("keeps", [False, True])
 @pytest.mark.parametrize("way", [jax.grad, jax.jacfwd])
 def test_functions_that_close_over_what_is_differentiated(keeps, way):
-    @functools.partial(two_programs, keeps=keeps)
+    @functools.partial(two_programs, keeps=keeps, lanes_apart=True)
     def applied(x, function):
         return function(x)
 
@@ -144,6 +144,7 @@ def test_functions_that_close_over_what_is_differentiated(keeps, way):
 
     want = 2 * jnp.cos(2.0) + jnp.sin(2.0)
     assert float(way(both)(1.0)) == pytest.approx(float(want))
+    np.testing.assert_allclose(jax.vmap(both)(X), jnp.sin(2 * X) * X)
 
 
 def test_the_derivative_may_have_other_static_arguments():

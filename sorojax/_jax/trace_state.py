@@ -1,7 +1,7 @@
 """The state of tracing: which values are abstract, whether a transformation runs.
 
-Rests on `jax.core.Tracer`, `jax.core.eval_context` and
-`jax.extend.core.get_opaque_trace_state`.
+Rests on `jax.core.Tracer`, `jax.core.eval_context`,
+`jax.extend.core.get_opaque_trace_state`, and what a lane of `jax.vmap` calls its batch, `val`.
 """
 
 import contextlib

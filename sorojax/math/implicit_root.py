@@ -20,11 +20,11 @@ Function = Callable[[Array], Array]
 def implicit_root(
     f: Function,
     guess: Array,
-    solve: Callable[[Function, Array], Any],
+    solve: Callable[..., Any],
     tangent_solve: Callable[[Function, Array], Array],
     *,
     has_aux: bool = False,
-    with_matrix: Callable[[Function, Array], Any] | None = None,
+    has_matrix: bool = False,
 ) -> Any:
     """The x with f(x) = 0 near `guess`; dx = -f_x^-1 df by the numbers that `f` closes over.
 
@@ -34,32 +34,25 @@ def implicit_root(
         solve: Of `f` and `guess`, answers x, or x and more with `has_aux`; not differentiated.
         tangent_solve: Of a linear map and a right-hand side, answers its solution.
         has_aux: Whether `solve` answers a pair, whose second part has no derivative.
-        with_matrix: Takes the place of `solve` where there is a derivative: answers what that
-            does, and f_x at the root, for the searches that know it.
+        has_matrix: Whether `solve`, of `f`, `guess` and whether there is a derivative, answers
+            a pair of all that and a matrix, where there is a derivative f_x at the root.
     """
 
-    def search(guess: Array) -> tuple[Array, Any]:
-        found = solve(f, guess)
-        return found if has_aux else (found, ())
-
-    def full_search(guess: Array) -> tuple[Array, Any, Array | None]:
-        if with_matrix is None:
-            return *search(guess), None
-        found, matrix = with_matrix(f, guess)
+    def search(guess: Array, at_root: Array) -> tuple[Array, Any, Array | None]:
+        found, matrix = solve(f, guess, at_root) if has_matrix else (solve(f, guess), None)
         return (*found, matrix) if has_aux else (found, (), matrix)
 
     equation, numbers = _opened(f, guess)
-    (method, constants), (full_method, more_constants) = (
-        _opened(way, guess) for way in (search, full_search)
-    )
+    method, constants = _opened(search, guess, jnp.array(False))
 
     @jax.custom_jvp
-    def root(numbers: Any, constants: Any, more_constants: Any, guess: Array) -> Any:
-        return jax.tree.map(jnp.asarray, method(guess, *constants))  # constants are numbers
+    def root(numbers: Any, constants: Any, guess: Array) -> tuple[Array, Any]:
+        x, more, _ = method(guess, jnp.array(False), *constants)
+        return jax.tree.map(jnp.asarray, (x, more))  # constants are numbers
 
     @jax.custom_jvp
-    def full_root(numbers: Any, constants: Any, more_constants: Any, guess: Array) -> Any:
-        return jax.tree.map(jnp.asarray, full_method(guess, *more_constants))
+    def full_root(numbers: Any, constants: Any, guess: Array) -> Any:
+        return jax.tree.map(jnp.asarray, method(guess, jnp.array(True), *constants))
 
     def full_derivative(primals: Any, tangents: Any) -> Any:
         numbers, rates = primals[0], tangents[0]
@@ -88,7 +81,7 @@ def implicit_root(
 
     root.defjvp(derivative, symbolic_zeros=True)
     full_root.defjvp(full_derivative, symbolic_zeros=True)
-    x, more = root(tuple(numbers), tuple(constants), tuple(more_constants), guess)
+    x, more = root(tuple(numbers), tuple(constants), guess)
     return (x, more) if has_aux else x
 
 
@@ -103,15 +96,16 @@ def _solved_by(matrix: Array, linear: Function, right: Array) -> Array:
     )
 
 
-def _opened(function: Callable[[Array], Any], x: Array) -> tuple[Any, list[Array]]:
+def _opened(function: Callable[..., Any], *args: Array) -> tuple[Any, list[Array]]:
     """A function of what `function` closes over too, and these arrays: integers as well, as a
     derivative is taken where those of a trace are gone."""
-    closed = eqx.filter_closure_convert(function, x)
+    closed = eqx.filter_closure_convert(function, *args)
     arrays, rest = eqx.partition(closed, eqx.is_array)
     leaves, tree = jax.tree.flatten(arrays)
 
-    def call(x: Array, *leaves: Array) -> Any:
-        return eqx.combine(jax.tree.unflatten(tree, leaves), rest)(x)
+    def call(*values: Array) -> Any:
+        own, leaves = values[: len(args)], values[len(args) :]
+        return eqx.combine(jax.tree.unflatten(tree, leaves), rest)(*own)
 
     return call, leaves
 

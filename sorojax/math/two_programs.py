@@ -7,6 +7,7 @@ nothing is kept but the arguments. It is compiled by itself, for speed of compil
 functions that run faster than they compile.
 """
 
+import contextlib
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -74,15 +75,16 @@ def two_programs(
         # in a batch or under `jit`, and where nothing has a derivative
         if not traced:
             return programs.whole(*args, **kwargs)
+        # A static function may close over a tracer, which JAX finds as late as in the program.
         if lanes_apart and are_lanes(traced):
-            return _one_by_one(programs, Split((args, kwargs))).whole()
+            with contextlib.suppress(AssertionError):
+                return _one_by_one(programs, Split((args, kwargs))).whole()
         if is_traced(jax.lax.stop_gradient(traced)):
             return inside(*args, **kwargs)
         given = Split(jax.tree.map(_as_array, (args, kwargs)))
-        try:
+        with contextlib.suppress(jax.errors.UnexpectedTracerError):
             return _differentiable(_Call(programs, given.form), given.leaves).whole()
-        except jax.errors.UnexpectedTracerError:  # of a function that closes over one
-            return inside(*args, **kwargs)
+        return inside(*args, **kwargs)
 
     return call  # type: ignore[return-value]
 

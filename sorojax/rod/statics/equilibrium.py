@@ -343,12 +343,14 @@ def equilibrium(
     def residual(x: Array) -> Array:
         return unbalanced(model, constants, relaxed(forces), t, x, search.metric)
 
-    def find(_, guess, at_root=False):
+    flat = is_flat(model)
+
+    def find(_, guess, at_root=None):
         found = newton(residual, guess, search, at_root=at_root)
         # What comes with a root has a derivative of zero, so it is floating.
         ends = (found.done, found.finite, found.count, *stability(found.slope, search))
         answer = found.q, tuple(x.astype(guess.dtype) for x in ends)
-        return (answer, found.slope) if at_root else answer
+        return (answer, found.slope) if flat else answer
 
     rest, (done, finite, count, negative, unstable) = implicit_root(
         lambda q: squared(model, q, residual(q)),
@@ -356,7 +358,7 @@ def equilibrium(
         find,
         _solve_tangent,
         has_aux=True,
-        with_matrix=functools.partial(find, at_root=True) if is_flat(model) else None,
+        has_matrix=flat,
     )
     q, reactions = reactions_at(model, constants, t, rest)
     status = checked_status(ended(done, rest, finite=finite, unstable=unstable), model, q)
@@ -383,9 +385,12 @@ def prepare(model: Model, constants, tolerance, max_iterations: int) -> Search:
     return Search(model, measure, floor, tolerance, max_iterations)
 
 
-def newton(residual: Residual, guess: Array, search: Search, *, at_root: bool = False) -> Found:
-    """A root of `residual`, by Newton with backtracking; one more pass finds the tangent
-    `at_root`."""
+def newton(
+    residual: Residual, guess: Array, search: Search, *, at_root: Bool[Array, ""] | None = None
+) -> Found:
+    """A root of `residual`, by Newton with backtracking; where it is asked for, one more pass
+    finds the tangent `at_root`."""
+    once_more = jnp.array(False) if at_root is None else at_root
     factor, model = cho_factor(search.metric), search.model
 
     def size(force):
@@ -414,20 +419,19 @@ def newton(residual: Residual, guess: Array, search: Search, *, at_root: bool = 
         begin = jnp.where(small, 1.0, 2.0).astype(q.dtype), jnp.where(small, 0 * start, jnp.inf)
         length, value = jax.lax.while_loop(too_long, half, begin)
         good = value <= start
-        moves = good & ~before if at_root else good
-        new = jnp.where(moves, advanced(model, q, length * step), q)
-        ends = before if at_root else small & good
+        new = jnp.where(good & ~before, advanced(model, q, length * step), q)
+        ends = jnp.where(once_more, before, small & good)
         return new, slope, before | (small & good), ends | ~good, jnp.isfinite(start), count + 1
 
     def searching(state):
         _, _, done, ended, _, count = state
         most = search.max_iterations
-        return ~ended & (count < jnp.where(done, most + 1, most))
+        return ~ended & (count < jnp.where(done & once_more, most + 1, most))
 
     no = jnp.array(False)
     begin = (guess, search.metric, no, no, ~no, jnp.array(0, dtype=jnp.int32))
     q, slope, done, _, finite, count = jax.lax.while_loop(searching, improve, begin)
-    count = count - done.astype(count.dtype) if at_root else count
+    count = count - (done & once_more).astype(count.dtype)
     return Found(q, slope, done & jnp.all(jnp.isfinite(q)), finite, count)
 
 
