@@ -96,7 +96,8 @@ def _one_by_one(programs: "_Programs", given: Split) -> Split:
 
     @lane.def_vmap
     def _(count: int, moves: list[bool], *leaves: Any) -> Any:
-        lanes, rest = _only(moves, leaves), _only(moves, leaves, False)
+        every = list(leaves)
+        lanes, rest = _only(moves, every), _only(moves, every, False)
         if is_alone():
             found = programs.lanes(lanes, rest, given.form)
         else:
@@ -151,23 +152,24 @@ class _Programs:
         kernels: bool = False,
         largest: float = math.inf,
     ):
+        def at(moving: Leaves, rest: Leaves, form: Any) -> Split:
+            args, kwargs = form.whole(_joined(moving, rest))
+            return Split(function(*args, **kwargs))
+
         def linearised(moving, rest, form):
             forms = []
 
             def by(moving):
-                args, kwargs = form.whole(_joined(moving, rest))
-                found = Split(function(*args, **kwargs))
+                found = at(moving, rest, form)
                 forms.append(found.form)
                 which = [eqx.is_inexact_array(x) for x in found.leaves]
                 return _only(which, found.leaves), _only(which, found.leaves, False)
 
             found, slope, others = jax.linearize(by, moving, has_aux=True)
-            leaves = _joined(found, others)
-            return Split.tree_unflatten(forms[-1], leaves), slope
+            return Split.tree_unflatten(forms[-1], _joined(found, others)), slope
 
         def wanted(moving: Leaves, rest: Leaves, form: Any, which: Sequence[int]) -> Leaves:
-            args, kwargs = form.whole(_joined(moving, rest))
-            found = Split(function(*args, **kwargs)).leaves
+            found = at(moving, rest, form).leaves
             return [found[k] for k in which]
 
         def push(moving, rest, rates, form, which):
@@ -179,20 +181,16 @@ class _Programs:
             return jax.vjp(by, moving)[1](changes)[0]
 
         def lanes(moving, rest, form):
-            def one(lane):
-                args, kwargs = form.whole(_joined(lane, rest))
-                return Split(function(*args, **kwargs))
+            return jax.lax.map(lambda lane: at(lane, rest, form), moving)
 
-            return jax.lax.map(one, moving)
-
-        parts = (push, "_pushed"), (pull, "_pulled"), (linearised, "_linearised")
-        parts = *parts, (lanes, "_lanes")
-        for part, end in parts:
+        for part in (push, pull, linearised, lanes):
+            end = {push: "_pushed", pull: "_pulled"}.get(part, f"_{part.__name__}")
             part.__name__ = part.__qualname__ = function.__name__ + end
         self.whole = jit_trees(function, kernels=kernels, largest=largest)
         # what a first run has found is no argument that makes a call large
-        alone = [jit(part, kernels=kernels, largest=math.inf) for part in (push, pull)]
-        self.derivatives = {True: alone, False: [eqx.filter_jit(x) for x in (push, pull)]}
+        both: list[Callable[..., Any]] = [push, pull]
+        alone = [jit(part, kernels=kernels, largest=math.inf) for part in both]
+        self.derivatives = {True: alone, False: [eqx.filter_jit(part) for part in both]}
         self._again, self._largest = again, largest
         self.linearised = jit_trees(linearised, kernels=kernels, largest=largest)
         self.keeps = keeps
