@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
-from sorojax._jax.jit import is_alone, jit
+from sorojax._jax.jit import is_alone
 from sorojax._jax.trace_state import (
     are_lanes,
     called_as_outside,
@@ -47,6 +47,7 @@ def two_programs(
     lanes_apart: bool = False,
     kernels: bool = False,
     largest: float = math.inf,
+    optimised: bool = True,
 ) -> Verb:
     """`function` of pytrees compiled, and its derivatives as one program each.
 
@@ -65,8 +66,10 @@ def two_programs(
         lanes_apart: Lanes of `jax.vmap` outside `jit` go one after the other, each by kernels:
             for searches, of which lanes take differently many steps.
         kernels, largest: As of `sorojax.jit`.
+        optimised: As of `jit_trees`, of small work.
     """
-    programs = _Programs(function, again, keeps=keeps, kernels=kernels, largest=largest)
+    how = {"kernels": kernels, "largest": largest, "optimised": optimised}
+    programs = _Programs(function, again, keeps=keeps, **how)
     inside = programs.whole if within is None else eqx.filter_jit(within)
 
     @functools.wraps(function)
@@ -151,6 +154,7 @@ class _Programs:
         keeps: bool = False,
         kernels: bool = False,
         largest: float = math.inf,
+        optimised: bool = True,
     ):
         def at(moving: Leaves, rest: Leaves, form: Any) -> Split:
             args, kwargs = form.whole(_joined(moving, rest))
@@ -186,13 +190,14 @@ class _Programs:
         for part in (push, pull, linearised, lanes):
             end = {push: "_pushed", pull: "_pulled"}.get(part, f"_{part.__name__}")
             part.__name__ = part.__qualname__ = function.__name__ + end
-        self.whole = jit_trees(function, kernels=kernels, largest=largest)
+        how: dict[str, Any] = {"kernels": kernels, "optimised": optimised}
+        self.whole = jit_trees(function, largest=largest, **how)
         # what a first run has found is no argument that makes a call large
         both: list[Callable[..., Any]] = [push, pull]
-        alone = [jit(part, kernels=kernels, largest=math.inf) for part in both]
+        alone = [jit_trees(part, **how) for part in both]
         self.derivatives = {True: alone, False: [eqx.filter_jit(part) for part in both]}
         self._again, self._largest = again, largest
-        self.linearised = jit_trees(linearised, kernels=kernels, largest=largest)
+        self.linearised = jit_trees(linearised, largest=largest, **how)
         self.keeps = keeps
         self.lanes = jit_trees(lanes, kernels=kernels, largest_product=_PRODUCT_OF_LANES)
 

@@ -11,6 +11,8 @@ stiffness, dPsi*/dq = 0 the equilibrium, and dPsi*/dp the volume. One potential 
 and volume, so no energy is lost between gas and rod.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -92,7 +94,7 @@ def mean_section(
     return _mean_section(problem.mesh, problem.kinematics, along)
 
 
-@two_programs
+@functools.partial(two_programs, optimised=False)
 def _mean_section(mesh: Mesh, kinematics: PlaneStrain | Solid, known: Reference) -> Section:
     inside = quadrature_points(mesh, kinematics)
     points = jnp.moveaxis(inside.position, 0, -1).reshape(-1, kinematics.dim)
@@ -422,13 +424,13 @@ def _slopes(at: Probe, basis: StrainBasis, displacements) -> tuple[list[Array], 
     return list(jax.vmap(one)(displacements)), list(displacements)
 
 
-@two_programs
+@functools.partial(two_programs, optimised=False)
 def _inverse(ways, answers) -> Float[Array, "steps dof dof"]:
     compliance = jnp.einsum("kin,kjn->kij", jnp.stack(ways), jnp.stack(answers))
     return jnp.linalg.inv((compliance + jnp.moveaxis(compliance, 1, 2)) / 2)
 
 
-@two_programs
+@functools.partial(two_programs, optimised=False)
 def _fitted(
     p, s, strain, rest, basis: StrainBasis, volumes, condensed, positions, length, degree: int
 ):

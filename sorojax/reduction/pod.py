@@ -99,7 +99,7 @@ def _functions(backbone: Backbone, name: str, within: AbstractModes | None):
     return orthonormalise(StrainBasis({name: within})).modes[name]
 
 
-@two_programs
+@functools.partial(two_programs, optimised=False)
 def _leading(
     s, strain, rest, column: int, inner: AbstractModes | None, count: int
 ) -> Float[Array, "functions count"]:
