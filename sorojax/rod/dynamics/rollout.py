@@ -151,7 +151,8 @@ def rollout(
         refuse_open("rollout", model, q, t)
         refuse_contact("rollout", forces)
     label = "rollout" if progress else None
-    path, too_long = _rollout(
+    run = _lanes_together if progress else _lanes_apart
+    path, too_long = run(
         model, q, v, forces, real(step), real(t), stepper, saves, every, label, check, memory
     )
     if not check:
@@ -171,7 +172,6 @@ def _checked(status, model, path, too_long) -> Status:
     return checked_status(judged_status(status, too_long), model, path)
 
 
-@functools.partial(two_programs, keeps=True, lanes_apart=True, kernels=True)
 @full_products
 def _rollout(
     model, q, v, forces, step, t, stepper, saves, every, label, check, memory
@@ -192,6 +192,10 @@ def _rollout(
         reactions, off = reactions_along(model, problem, time, path)
         status = Status.where(off > CLOSED, Status.unstable, status)
     return Trajectory(time, path.q, path.v, status, path.memory, reactions), too_long
+
+
+_lanes_apart = two_programs(_rollout, keeps=True, lanes_apart=True, kernels=True)
+_lanes_together = two_programs(_rollout, keeps=True, kernels=True)  # in one report
 
 
 def _like(q, tree):
