@@ -8,10 +8,11 @@ functions that run faster than they compile.
 """
 
 import contextlib
+import copy
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
 import equinox as eqx
 import jax
@@ -78,7 +79,8 @@ def two_programs(
         # in a batch or under `jit`, and where nothing has a derivative
         if not traced:
             return programs.whole(*args, **kwargs)
-        # A static function may close over a tracer, which JAX finds as late as in the program.
+        # A static function may close over a tracer, which JAX finds as late as in the program
+        # and refuses by these errors; `inside` takes it, and raises the caller's own again.
         if lanes_apart and are_lanes(traced):
             with contextlib.suppress(AssertionError):
                 return _one_by_one(programs, Split((args, kwargs))).whole()
@@ -282,11 +284,11 @@ def _inexact(found: Split) -> dict[int, jax.ShapeDtypeStruct]:
     return {k: _shape(x) for k, x in enumerate(found.leaves) if eqx.is_inexact_array(x)}
 
 
-class _Slope:
-    """The derivative at concrete leaves as a `LinearMap`."""
+class _Derivative:
+    """What a derivative at concrete leaves takes, and yields, by its place."""
 
-    def __init__(self, of: _Call, moving: Leaves, rest: Leaves, outputs: dict[int, Any]):
-        self._of, self._moving, self._rest, self._outputs = of, moving, rest, outputs
+    _moving: Leaves
+    _outputs: dict[int, Any]
 
     @property
     def inputs(self) -> Leaves:
@@ -300,8 +302,17 @@ class _Slope:
     def places(self) -> tuple[int, ...]:
         return tuple(self._outputs)
 
-    def onto(self, wanted: Sequence[bool]) -> "_Slope":
-        return _Slope(self._of, self._moving, self._rest, _chosen(self._outputs, wanted))
+    def onto(self, wanted: Sequence[bool]) -> Self:
+        part, pairs = copy.copy(self), zip(self._outputs.items(), wanted, strict=True)
+        part._outputs = dict(x for x, w in pairs if w)
+        return part
+
+
+class _Slope(_Derivative):
+    """The derivative at concrete leaves as a `LinearMap`."""
+
+    def __init__(self, of: _Call, moving: Leaves, rest: Leaves, outputs: dict[int, Any]):
+        self._of, self._moving, self._rest, self._outputs = of, moving, rest, outputs
 
     def push(self, *rates: Any) -> Leaves:
         push, _ = self._of.programs.derivatives[self._of.small]
@@ -318,35 +329,16 @@ class _Slope:
         return self._of.form, self.places
 
 
-def _chosen(outputs: dict[int, Any], wanted: Sequence[bool]) -> dict[int, Any]:
-    return dict(x for x, w in zip(outputs.items(), wanted, strict=True) if w)
-
-
 def _placed(rates: Sequence[Any], moving: Leaves) -> Leaves:
     left = iter(rates)
     return [None if x is None else next(left) for x in moving]
 
 
-class _Kept:
+class _Kept(_Derivative):
     """The derivative as a `LinearMap`, from what the program of the value kept for it."""
 
     def __init__(self, slope: Any, moving: Leaves, outputs: dict[int, Any]):
         self._slope, self._moving, self._outputs = slope, moving, outputs
-
-    @property
-    def inputs(self) -> Leaves:
-        return _present(self._moving)
-
-    @property
-    def outputs(self) -> Leaves:
-        return list(self._outputs.values())
-
-    @property
-    def places(self) -> tuple[int, ...]:
-        return tuple(self._outputs)
-
-    def onto(self, wanted: Sequence[bool]) -> "_Kept":
-        return _Kept(self._slope, self._moving, _chosen(self._outputs, wanted))
 
     def push(self, *rates: Any) -> Leaves:
         return _pushed_by(self._slope, _placed(rates, self._moving), self.places)
