@@ -32,7 +32,7 @@ def test_all_results_are_there_and_nothing_else(out):
 def test_every_number_with_a_bar_holds(out):
     result = json.loads((out / "result.json").read_text())
     barred = {
-        name: number["holds"]
+        f"{section}: {name}": number["holds"]
         for section, rows in result.items()
         if section != "seconds"
         for name, number in rows.items()

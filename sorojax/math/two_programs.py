@@ -119,8 +119,9 @@ def _as_array(leaf: Any) -> Any:
 
 def linear_program(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any, Any], Any]:
     """`function(given, rates)`, linear in the arrays `rates`, as one program, and its transpose
-    as another; called with what its result is `like`, where `given` has no derivative."""
-    programs = _Programs(function)
+    as another; called with what its result is `like`, where `given` has no derivative. Compiled
+    for speed of compilation, as for small work."""
+    programs = _Programs(function, optimised=False)
 
     def call(given: Any, rates: Any, like: Any) -> Any:
         if is_traced(given):

@@ -4,6 +4,7 @@ Twists from section to section by the logarithm of the relative motion, safe at 
 """
 
 import abc
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -158,7 +159,7 @@ def _reference(curve: AbstractCurve, samples: int, up):
     return Reference(s, length, position, frame), evenness, size
 
 
-_compiled_reference = two_programs(_reference)
+_compiled_reference = two_programs(_reference, optimised=False)
 
 
 def _lengths(vectors: Float[Array, "n dim"]) -> Float[Array, " n"]:
@@ -424,7 +425,7 @@ def _even(samples: int) -> Float[Array, " samples"]:
         return jnp.linspace(0.0, 1.0, samples)
 
 
-@two_programs
+@functools.partial(two_programs, optimised=False)
 def _probe(mesh: Mesh, curve: AbstractCurve, samples: int, arm, up, cells):
     """All of a probe but its `s`."""
     known = _reference(curve, samples, up)[0]
@@ -546,7 +547,7 @@ def sampled(
     return Backbone(s, at.length, positions, strain, rest, at.locations.cells), at
 
 
-@two_programs
+@functools.partial(two_programs, optimised=False)
 def _sampled(mesh: Mesh, curve: AbstractCurve, samples: int, arm, up, cells, s, displacements):
     """All of a probe but its `s`, positions and strains of the states, and those at rest of
     a curve that is not straight."""

@@ -1,22 +1,19 @@
-"""The bellows actuator: drawing, rubber, mesh and problem; its rod and the closed loop."""
+"""The bellows actuator: drawing, rubber, mesh and problem; from there to its closed loop."""
 
 import dataclasses
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sorojax import SE2, fem, material, mesh, reduction, robots, rod, sdf, systems
+from sorojax import fem, material, mesh, reduction, robots, rod, sdf, systems, view
 from sorojax.design import drawing_to_loop
-from sorojax.fem.equilibrium.solve import Path
+from sorojax.design.closed_loop import Trajectory
 from sorojax.material.fit import TensileFit
-from sorojax.reduction.backbone import Backbone
-from sorojax.reduction.identify import Fit
 from sorojax.robots import BellowsActuator
-from sorojax.units import kPa, ml, mm
+from sorojax.units import deg, kPa, ml, mm
 
 DEPTH = 20 * mm
 LAYER_STIFFNESS = 10.0
@@ -73,111 +70,12 @@ def bellows_problem(
     return robots.bellows_problem(actuator, cells, scaled, depth=depth, formulation=formulation)
 
 
-DIMENSIONS = (
-    "wall_thickness", "bellow_width", "gap", "base", "chamber_height", "roof", "fillet",
-)  # fmt: skip
-
-
-class Sensitivity(NamedTuple):
-    """Tip rotation [rad] at the top pressure and its derivative in every dimension.
-
-    `difference` is the central difference (order 4) in the wall thickness [rad/m].
-    """
-
-    rotation: float
-    gradient: dict[str, float]
-    difference: float
-
-    @property
-    def error(self) -> float:
-        return abs(self.gradient["wall_thickness"] / self.difference - 1)
-
-
-def sensitivity(design: Design, path: Path) -> Sensitivity:
-    """d(tip rotation)/d(dimensions) by reverse mode, through mesh motion and equilibrium."""
-    value, slopes = jax.value_and_grad(lambda a: tip_rotation(a, design, path))(design.actuator)
-    gradient = {name: float(getattr(slopes, name)) for name in DIMENSIONS}
-    return Sensitivity(float(value), gradient, _difference(design, path, 10e-6))
-
-
-def tip_rotation(actuator: BellowsActuator, design: Design, path: Path) -> Float[Array, ""]:
-    """Rotation of the end face [rad] at the last pressure of `path`, negative when the
-    actuator curls towards its layer."""
-    flat = design.problem.mesh
-    moved = mesh.move(flat, actuator.body(), interfaces=(actuator.layer(),))
-    problem = eqx.tree_at(
-        lambda p: (p.mesh.points, p.loads[0].value),
-        design.problem,
-        (moved.points, path.values[-1]),
-    )
-    tight = fem.Newton(residual_tolerance=1e-12)
-    solution = fem.solve(problem, start=path.displacements[-1], newton=tight)
-    a = design.actuator
-    ends = [mesh.nearest_node(flat, [a.length, y]) for y in (0.0, a.height)]
-    face = (problem.mesh.points + solution.displacement)[jnp.array(ends)]
-    across = face[1] - face[0]
-    return jnp.arctan2(-across[0], across[1])
-
-
-def _difference(design: Design, path: Path, h: float) -> float:
-    def at(k: int) -> float:
-        wall = design.actuator.wall_thickness + k * h
-        changed = eqx.tree_at(lambda a: a.wall_thickness, design.actuator, wall)
-        return float(tip_rotation(changed, design, path))
-
-    return (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * h)
-
-
-# The rod that stands in for the solid, and the closed loop around it.
-
+# The closed loop around the rod that stands in for the solid.
 
 #: Retardation time of the rubber [s]; an assumption, no measurement is public.
 DAMPING_TIME = 0.01
-
-
-class Reduced(NamedTuple):
-    """Backbone snapshots, strain modes, identified laws and the rod with them."""
-
-    backbone: Backbone
-    basis: rod.StrainBasis
-    captured: dict[str, Float[Array, ""]]
-    fit: Fit
-    rod: rod.Rod
-    forces: tuple
-    states: Float[Array, "steps dof"]
-    errors: Float[np.ndarray, " steps"]
-
-
-def reduce(design: Design, path: Path) -> Reduced:
-    """Three bending modes from the path, and the rod's own equilibrium at every pressure.
-
-    `errors` is the mean distance [m] between the rod's backbone and that of the solid.
-    """
-    line = _middle(design.actuator)
-    backbone = reduction.strain_along(path, line)
-    basis = reduction.pod_basis(backbone, modes={"kappa_z": 3})
-    fit = reduction.identify(path, basis, backbone, line)
-    body = rod.rod(
-        SE2(), basis, fit.section, rod.elastic(design.tensile.material), length=fit.length
-    )
-    states = [jnp.zeros(basis.num_dof)]
-    for pressure in path.values:
-        loads = (fit.elastic, rod.Pressurised(fit.pressure, pressure))
-        states.append(rod.equilibrium(body, loads, states[-1]).q)
-    q = jnp.stack(states[1:])
-    poses = jax.vmap(lambda q: rod.forward_kinematics(body, q, backbone.s))(q)
-    gap = jnp.linalg.norm(poses[:, :, :2, 2] - backbone.positions, axis=-1)
-    forces = (fit.elastic, fit.pressure, fit.damping(DAMPING_TIME))
-    return Reduced(
-        backbone,
-        basis,
-        reduction.captured_energy(backbone, basis),
-        fit,
-        body,
-        forces,
-        q,
-        np.asarray(jnp.mean(gap, axis=1)),
-    )
+#: By which the end turns at the top pressure, as the controller has it [rad].
+FULL_ANGLE = -71.5 * deg
 
 
 def reference_angle(full: float, duration: float) -> systems.SmoothRamp:
@@ -208,14 +106,6 @@ def controller(
 def valve() -> systems.Regulator:
     """A small bench regulator."""
     return systems.Regulator(1.5e-8, integral_gain=3e-8, max_flow=3e-5)
-
-
-def closed_loop(reduced: Reduced, path: Path, duration: float) -> systems.Network:
-    """Reservoir, regulator, rod and PID: the tip follows a reference angle."""
-    full = full_angle(reduced)
-    reference = systems.Source(reference_angle(full, duration), unit="rad")
-    pid = controller(full, float(path.values[-1]))
-    return loop_of(reference, pid, valve(), systems.RodBody(reduced.rod, reduced.forces))
 
 
 def loop_of(
@@ -255,60 +145,50 @@ def loop_of(
     )
 
 
-class LoopSensitivity(NamedTuple):
-    """Root mean square of the tracking error [rad] and its derivative in every dimension of the
-    drawing [rad/m] and every gain [rad per unit of the gain].
+# From the drawing to the closed loop, and the derivatives of all of it.
 
-    `differences` are central differences (order 4) in some of them.
-    """
-
-    rms: float
-    gradient: dict[str, float]
-    differences: dict[str, float]
-
-    @property
-    def error(self) -> float:
-        """The largest error of a derivative that was checked."""
-        return max(abs(self.gradient[k] / slope - 1) for k, slope in self.differences.items())
-
-
+DIMENSIONS = (
+    "wall_thickness", "bellow_width", "gap", "base", "chamber_height", "roof", "fillet",
+)  # fmt: skip
 GAINS = ("proportional", "integral_gain", "derivative", "feed_forward")
 
 
-def loop_sensitivity(
-    design: Design, path: Path, full: float, duration: float
-) -> LoopSensitivity:
-    """d(tracking error)/d(dimensions and gains) by reverse mode, through the whole chain from
-    the drawing to the closed loop; `full` is the angle at the top pressure [rad]."""
-    pid = controller(full, float(path.values[-1]))
-    target = systems.Source(reference_angle(full, duration), unit="rad")
-    start = {name: getattr(design.actuator, name) for name in DIMENSIONS}
-    start |= {name: getattr(pid, name) for name in GAINS}
+class Job(NamedTuple):
+    """The design with its pressures [Pa] and the time that it has for its moves [s]."""
 
-    def run(numbers, near=None):
+    design: Design
+    pressures: Float[Array, " steps"]
+    duration: float
+
+    @property
+    def numbers(self) -> dict[str, Array]:
+        """Every dimension of the drawing [m] and every gain."""
+        sources = ((DIMENSIONS, self.design.actuator), (GAINS, self.pid))
+        return {name: getattr(of, name) for names, of in sources for name in names}
+
+    @property
+    def pid(self) -> systems.PID:
+        return controller(FULL_ANGLE, TOP_PRESSURE)
+
+    def run(self, numbers: dict[str, Array], near: Trajectory | None = None) -> Trajectory:
+        """The motion of the closed loop of the actuator with these numbers."""
         changed = {name: numbers[name] for name in DIMENSIONS}
-        actuator = dataclasses.replace(design.actuator, **changed)
-        tuned = dataclasses.replace(pid, **{name: numbers[name] for name in GAINS})
+        actuator = dataclasses.replace(self.design.actuator, **changed)
+        pid = dataclasses.replace(self.pid, **{name: numbers[name] for name in GAINS})
+        moves = reference_angle(FULL_ANGLE, self.duration)
+        target = systems.Source(moves, unit="rad")
         return drawing_to_loop(
-            design.problem,
+            self.design.problem,
             (actuator.body(), actuator.layer()),
             _middle(actuator),
-            lambda body: loop_of(target, tuned, valve(), body),
-            duration,
+            lambda body: loop_of(target, pid, valve(), body),
+            self.duration,
             modes={"kappa_z": 3},
             damping=DAMPING_TIME,
             near=near,
-            air=jnp.linspace(0.0, path.values[-1], 9),
+            save=int(100 * self.duration) + 1,
+            air=self.pressures,
         )
-
-    first = run(start)
-
-    def cost(numbers):
-        return rms(run(numbers, first))
-
-    value, slopes = jax.value_and_grad(cost)(start)
-    seen = {name: _slope(cost, start, name) for name in ("wall_thickness", "integral_gain")}
-    return LoopSensitivity(float(value), {k: float(x) for k, x in slopes.items()}, seen)
 
 
 def _middle(actuator: BellowsActuator) -> reduction.Line:
@@ -317,16 +197,72 @@ def _middle(actuator: BellowsActuator) -> reduction.Line:
     return reduction.Line(jnp.stack([0 * middle, middle]), jnp.stack([actuator.length, middle]))
 
 
-def _slope(cost, start: dict[str, Array], name: str) -> float:
-    """By one number, from differences of fourth order."""
-    h = 1e-3 * float(start[name])
-    at = {k: float(cost(start | {name: start[name] + k * h})) for k in (-2, -1, 1, 2)}
-    return (8 * (at[1] - at[-1]) - (at[2] - at[-2])) / (12 * h)
+def rotation(job: Job, run: Trajectory) -> Float[Array, ""]:
+    """Of the end face of the solid at the top pressure [rad], negative towards the layer."""
+    assert run.path is not None
+    flat, robot = job.design.problem.mesh, job.design.actuator
+    ends = [mesh.nearest_node(flat, [robot.length, y]) for y in (0.0, robot.height)]
+    bent = run.path.problem.mesh.points + run.path.displacements[-1]
+    across = bent[ends[1]] - bent[ends[0]]
+    return jnp.arctan2(-across[0], across[1])
 
 
 def rms(film) -> Float[Array, ""]:
     """Of the tracking error [rad]."""
     return jnp.sqrt(jnp.mean((film["body.tip_angle"] - film["target.value"]) ** 2))
+
+
+class Sensitivity(NamedTuple):
+    """A number of the run, its derivative in every dimension and gain by reverse mode, and how
+    far it is from central differences, in each `direction` relative to them [-]."""
+
+    value: float
+    gradient: dict[str, float]
+    errors: dict[str, float]
+
+    @property
+    def error(self) -> float:
+        return max(self.errors.values())
+
+
+def sensitivities(job: Job, first: Trajectory) -> dict[str, Sensitivity]:
+    """Of the `rotation` [rad] and the `rms` [rad] by all numbers: through the motion of the
+    mesh, equilibria, strain modes, laws of the rod and the closed loop."""
+
+    def cost(numbers: dict[str, Array]) -> dict[str, Array]:
+        run = job.run(numbers, first)
+        return {"rotation": rotation(job, run), "rms": rms(run)}
+
+    values, pull = jax.vjp(cost, job.numbers)
+    slopes, found = {}, {}
+    for name in values:
+        seed = {k: jnp.array(float(k == name)) for k in values}
+        slopes[name] = {k: float(x) for k, x in pull(seed)[0].items()}
+    differences = {
+        "dimensions": _differences(cost, job.numbers, DIMENSIONS, slopes["rms"]),
+        "gains": _differences(cost, job.numbers, GAINS, slopes["rms"]),
+    }
+    for name, value in values.items():
+        errors = {}
+        for direction, (way, change) in differences.items():
+            along = sum(slopes[name][k] * x for k, x in way.items())
+            if abs(change[name]) > 0:  # gains do not turn the solid
+                errors[direction] = abs(along / change[name] - 1)
+        found[name] = Sensitivity(float(value), slopes[name], errors)
+    return found
+
+
+def _differences(cost, start, names, slope) -> tuple[dict[str, float], dict[str, float]]:
+    """Along all `names` at once, each by its own size and the way that the cost rises."""
+    way = {name: float(jnp.sign(slope[name]) * start[name]) for name in names}
+    h = 1e-4
+
+    def at(side: int) -> dict[str, float]:
+        changed = {name: start[name] + side * h * x for name, x in way.items()}
+        return {k: float(x) for k, x in cost(start | changed).items()}
+
+    ahead, behind = at(1), at(-1)
+    return way, {k: (x - behind[k]) / (2 * h) for k, x in ahead.items()}
 
 
 class Tracking(NamedTuple):
@@ -338,16 +274,33 @@ class Tracking(NamedTuple):
     steps: int
 
 
-def tracking(film: systems.Trajectory) -> Tracking:
-    final = film["body.tip_angle"][-1] - film["target.value"][-1]
+def tracking(run: Trajectory) -> Tracking:
+    assert run.motion is not None
+    final = run["body.tip_angle"][-1] - run["target.value"][-1]
     return Tracking(
-        float(rms(film)),
+        float(rms(run)),
         float(jnp.abs(final)),
-        float(jnp.max(film["air.pressure"])),
-        int(film.stats["steps"]),
+        float(jnp.max(run["air.pressure"])),
+        int(run.motion.stats["steps"]),
     )
 
 
-def full_angle(reduced: Reduced) -> float:
-    """Of the tip at the top pressure [rad]."""
-    return float(rod.tip_angle(rod.motion(reduced.rod, reduced.states[-1])))
+class Bent(NamedTuple):
+    """The rod at rest under each pressure, and the mean distance of its backbone from that of
+    the solid [m]."""
+
+    states: Float[Array, "steps dof"]
+    errors: Float[np.ndarray, " steps"]
+
+
+def bent(run: Trajectory) -> Bent:
+    """The rod's own equilibria beside those of the solid."""
+    assert run.rod is not None and run.fit is not None
+    assert run.path is not None and run.backbone is not None
+    body, fit = run.rod, run.fit
+    states = [jnp.zeros(body.basis.num_dof)]
+    for pressure in run.path.values:
+        loads = (fit.elastic, rod.Pressurised(fit.pressure, pressure))
+        states.append(rod.equilibrium(body, loads, states[-1]).q)
+    q = jnp.stack(states[1:])
+    return Bent(q, np.asarray(view.backbone_errors(run.backbone, body, q)))

@@ -7,21 +7,25 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from sorojax import fem, material, systems, view
+from sorojax import fem, material, view
+from sorojax._jax.jit import once
 from sorojax.cli.demo.design import (
     DAMPING_TIME,
     DEPTH,
+    DIMENSIONS,
     LAYER_STIFFNESS,
+    Bent,
     Design,
-    LoopSensitivity,
-    Reduced,
     Sensitivity,
     Tracking,
 )
-from sorojax.fem.equilibrium.solve import Path as FemPath
+from sorojax.design.closed_loop import Trajectory
 from sorojax.math.lie import homogeneous
 from sorojax.mesh import chambers
+from sorojax.reduction import captured_energy
+from sorojax.rod import Rod
 from sorojax.units import kPa, mm
 from sorojax.view.film.film import Film
 
@@ -30,25 +34,28 @@ class Results(NamedTuple):
     """Results of all stages."""
 
     design: Design
-    path: FemPath
-    slope: Sensitivity
-    reduced: Reduced
-    film: systems.Trajectory
+    run: Trajectory
+    slopes: dict[str, Sensitivity]
     tracking: Tracking
-    loop_slope: LoopSensitivity
+    beside: Bent
 
 
 def numbers(r: Results) -> dict[str, list[view.Number]]:
     """Tables of the report, by section."""
     N = view.Number
     rubber, problem = r.design.tensile, r.design.problem
-    steps = [step for stats in r.path.stats for step in stats.steps]
+    path, fit, modes, backbone = r.run.path, r.run.fit, r.run.basis, r.run.backbone
+    assert path is not None and fit is not None
+    assert modes is not None and backbone is not None
+    steps = [step for stats in path.stats for step in stats.steps]
     worst = max(step.residual for step in steps)
     area_error = abs(r.design.meshed_area / r.design.area - 1)
-    gap = float(r.reduced.errors.max())
-    u = r.path.displacements[-1]
+    gap = float(r.beside.errors.max())
+    captured = float(captured_energy(backbone, modes)["kappa_z"])
+    turn, loop = r.slopes["rotation"], r.slopes["rms"]
+    u = path.displacements[-1]
     facets = r.design.chamber_facets
-    angle = r.film["body.tip_angle"]
+    angle = r.run["body.tip_angle"]
     return {
         "rubber": [
             N("c1", float(rubber.material.c1) / kPa, "kPa"),
@@ -66,27 +73,24 @@ def numbers(r: Results) -> dict[str, list[view.Number]]:
         "equilibrium": [
             N("Newton iterations", sum(step.iterations for step in steps)),
             N("largest residual over load", worst, "", "< 1e-8", worst < 1e-8),
-            N("tip rotation", np.degrees(r.slope.rotation), "deg"),
+            N("tip rotation", np.degrees(turn.value), "deg"),
             N("chamber volume at rest", _volume(problem, 0 * u, facets), "ml"),
             N("chamber volume at the top pressure", _volume(problem, u, facets), "ml"),
         ],
         "gradient": [
-            N("d rotation / d wall thickness", _deg_per_mm(r.slope, "wall_thickness"),
-              "deg/mm"),
-            N("difference to central differences", r.slope.error, "", "< 1e-4",
-              r.slope.error < 1e-4),
-            *(N(f"d rotation / d {name}", _deg_per_mm(r.slope, name), "deg/mm")
-              for name in r.slope.gradient if name != "wall_thickness"),
+            _off(turn),
+            *(N(f"d rotation / d {name}", np.degrees(turn.gradient[name]) * mm, "deg/mm")
+              for name in DIMENSIONS),
         ],
-        "loop gradient": _loop_gradient(r.loop_slope),
+        "loop gradient": _loop_gradient(loop),
         "rod": [
-            N("captured squared curvature", float(r.reduced.captured["kappa_z"])),
+            N("captured squared curvature", captured),
             N("largest mean backbone error", gap / mm, "mm", "< 1 mm", gap < 1 * mm),
-            N("misfit of condensed stiffness", float(r.reduced.fit.stiffness_error)),
-            N("misfit of volume change", float(r.reduced.fit.volume_error)),
+            N("misfit of condensed stiffness", float(fit.stiffness_error)),
+            N("misfit of volume change", float(fit.volume_error)),
         ],
         "loop": [
-            N("duration", float(r.film.time[-1]), "s"),
+            N("duration", float(r.run.time[-1]), "s"),
             N("integration steps", r.tracking.steps),
             N("rms tracking error", np.degrees(r.tracking.rms), "deg"),
             N("tracking error at the end", np.degrees(r.tracking.final), "deg"),
@@ -98,27 +102,30 @@ def numbers(r: Results) -> dict[str, list[view.Number]]:
 
 def pictures(r: Results) -> dict[str, Any]:
     """Figures and the film, by file name."""
-    r_ = r.reduced
-    time, film = np.asarray(r.film.time), r.film
+    run, time = r.run, np.asarray(r.run.time)
+    assert run.path is not None and run.backbone is not None
+    assert run.basis is not None and run.fit is not None and run.rod is not None
     bending = {
-        "reference": -np.degrees(film["target.value"]),
-        "rod": -np.degrees(film["body.tip_angle"]),
+        "reference": -np.degrees(run["target.value"]),
+        "rod": -np.degrees(run["body.tip_angle"]),
     }
     signals = {
         "bending [deg]": bending,
         "pressure [kPa]": {
-            "set-point": np.asarray(film["pid.command"]) / kPa,
-            "chambers": np.asarray(film["air.pressure"]) / kPa,
+            "set-point": np.asarray(run["pid.command"]) / kPa,
+            "chambers": np.asarray(run["air.pressure"]) / kPa,
         },
     }
-    flow = {"mass flow [mg/s]": {"valve": 1e6 * np.asarray(film["valve.mass_flow"])}}
+    flow = {"mass flow [mg/s]": {"valve": 1e6 * np.asarray(run["valve.mass_flow"])}}
     points = material.presets.DRAGON_SKIN_30_POINTS
     return {
         "rubber.png": view.show(r.design.tensile, points=points),
-        "deformed.png": view.show(r.path),
-        "modes.png": view.show(r_.basis, length=r_.fit.length, energy=r_.captured),
+        "deformed.png": view.show(run.path),
+        "modes.png": view.show(
+            run.basis, length=run.fit.length, energy=captured_energy(run.backbone, run.basis)
+        ),
         "backbones.png": view.show_backbones(
-            r_.backbone, r_.rod, r_.states, pressures=r.path.values
+            run.backbone, run.rod, r.beside.states, pressures=run.path.values
         ),
         "loop.png": view.show_signals(time, signals | flow),
         "actuator.gif": _film(r),
@@ -127,15 +134,16 @@ def pictures(r: Results) -> dict[str, Any]:
 
 def _film(r: Results) -> Film:
     """The mesh on the rod, its chambers coloured by pressure, and the wanted direction."""
-    mesh, actuator, film = r.design.problem.mesh, r.design.actuator, r.film
+    mesh, actuator, run = r.design.problem.mesh, r.design.actuator, r.run
+    assert run.rod is not None
     middle = float(actuator.layer_thickness) / 2
     base = homogeneous(jnp.eye(2), jnp.array([0.0, middle]))
-    skin = view.bind(mesh.points, r.reduced.rod, base=base)
-    moved = jax.lax.map(lambda q: view.deform(skin, r.reduced.rod, q), film["body.q"])
-    moved, angle = np.asarray(moved), np.asarray(film["target.value"])
-    tip = np.asarray(film["body.tip_position"]) + np.array([0.0, middle])
+    skin = view.bind(mesh.points, run.rod, base=base)
+    moved = np.asarray(_moved(skin, run.rod, run["body.q"]))
+    angle = np.asarray(run["target.value"])
+    tip = np.asarray(run["body.tip_position"]) + np.array([0.0, middle])
     ahead = tip + 15 * mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    pressure = np.asarray(film["air.pressure"]) / kPa
+    pressure = np.asarray(run["air.pressure"]) / kPa
     scale = view.Scale("pressure [kPa]", 0.0, max(float(pressure.max()), 1e-3), colours="OrRd")
     body = view.scene_of(mesh).parts[0]
     assert isinstance(body, view.Surface)
@@ -152,8 +160,13 @@ def _film(r: Results) -> Film:
         )
         return view.Scene((solid, inside, wanted))
 
-    track = view.Track(np.asarray(film.time), scene, scale)
+    track = view.Track(np.asarray(run.time), scene, scale)
     return view.animate(track, title="closed loop on the bending angle")
+
+
+@once
+def _moved(skin, rod: Rod, qs: Float[Array, "frames dof"]):
+    return jax.lax.map(lambda q: view.deform(skin, rod, q), qs)
 
 
 def _fan(facets: np.ndarray) -> np.ndarray:
@@ -200,21 +213,18 @@ _UNITS = {
 }
 
 
-def _loop_gradient(slope: LoopSensitivity) -> list[view.Number]:
-    rows = [
-        view.Number("rms tracking error in 2 s", np.degrees(slope.rms), "deg"),
-        view.Number("largest difference to central differences", slope.error, "", "< 1e-4",
-                    slope.error < 1e-4),
-    ]  # fmt: skip
+def _off(slope: Sensitivity) -> view.Number:
+    name, off = "largest difference to central differences", slope.error
+    return view.Number(name, off, "", "< 1e-4", off < 1e-4)
+
+
+def _loop_gradient(slope: Sensitivity) -> list[view.Number]:
+    rows = [view.Number("rms tracking error", np.degrees(slope.value), "deg"), _off(slope)]
     for name, value in slope.gradient.items():
         size, unit = _UNITS.get(name, (mm, "mm"))
         per = f"deg per {unit}"
         rows.append(view.Number(f"d error / d {name}", float(np.degrees(value)) * size, per))
     return rows
-
-
-def _deg_per_mm(slope: Sensitivity, name: str) -> float:
-    return float(np.degrees(slope.gradient[name])) * mm
 
 
 _SECTIONS: tuple[tuple[str, str, dict[str, str]], ...] = (
@@ -255,14 +265,14 @@ _TEXT = {
     ),
     "gradient": (
         "Derivative of the rotation of the free end at the top pressure in every dimension "
-        "of the drawing, by reverse mode through mesh motion and equilibrium: one adjoint "
-        "solve for all of them. The wall thickness is checked by central differences."
+        "of the drawing, by reverse mode through mesh motion and equilibria. It is checked by "
+        "central differences along a change of all dimensions at once."
     ),
     "loop gradient": (
-        "Derivative of the root mean square of the tracking error, in a run of 2 s, in every "
-        "dimension of the drawing and every gain, by reverse mode through the whole chain: "
-        "mesh motion, equilibria, strain modes, laws of the rod and the closed loop. The wall "
-        "thickness and the integral gain are checked by central differences."
+        "Derivative of the root mean square of the tracking error in every dimension of the "
+        "drawing and every gain, by reverse mode through the whole chain: mesh motion, "
+        "equilibria, strain modes, laws of the rod and the closed loop. It is checked by "
+        "central differences along a change of all dimensions, and along one of all gains."
     ),
     "rod": (
         "The curvature of the middle of the layer at every pressure gives the modes; the "

@@ -1,5 +1,6 @@
 """Time simulation of networks."""
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -201,9 +202,10 @@ def simulate(
             options["seam"] = memory if isinstance(memory, Resume) else None
         watch = (events, max_events, dense)
         solver = Tsit5() if solver is None else solver
-        film = _adaptive(
+        time, motion, happened, _ = _adaptive(
             network, state, supplied, first, interval, save, solver, control, watch, options
-        )[0]
+        )
+        film = film_of(network, time, supplied, motion, happened)
     else:
         method = _fixed_method(network, solver)
         substeps = _substeps(duration, save, step)
@@ -234,7 +236,7 @@ def _run_adaptive(
     options,
     record=None,
     recorded=True,
-) -> tuple[Trajectory, Record | None]:
+) -> tuple[Array, Integration, EventLog | None, Record | None]:
     time = instants(first, interval, save)
     state = network.initial_state() if state is None else state
     events, most, dense = watch
@@ -244,27 +246,27 @@ def _run_adaptive(
         motion, happened = run_with_events(*run, events, most, **options)
     else:
         motion = adaptive(*run, dense=dense, recorded=recorded, record=record, **options)
-    return film_of(network, time, inputs, motion, happened), motion.record
+    return time, motion._replace(record=None), happened, motion.record
 
 
-def _run_within(*args: Any) -> tuple[Trajectory, None]:
+def _run_within(*args: Any) -> tuple[Array, Integration, EventLog | None, None]:
     """The same within `jit` and `vmap`."""
-    return _run_adaptive(*args, recorded=False)[0], None
+    return *_run_adaptive(*args, recorded=False)[:3], None
 
 
 _FEW = 4096  # steps of which every state is kept for the derivative
 
 
-def _run_again(found: tuple[Trajectory, Record | None], *args: Any) -> tuple[Any, ...]:
+def _run_again(found: tuple[Any, Integration, Any, Record | None], *args: Any) -> tuple:
     """The arguments of the run that is differentiated: silent, with the steps that it took, or
     with as many steps as it takes, so that few of its states are computed twice."""
-    film, record = found
+    _, motion, _, record = found
     *others, watch, options = args
     options = options | {"progress": False}
     if record is not None and int(record.steps.count) < record.steps.time.shape[0]:
         return *others, watch, options, record
     _, _, dense = watch
-    most, taken = options["max_steps"], int(film.stats["steps"])
+    most, taken = options["max_steps"], int(motion.steps)
     if not dense:
         most = min(most, max(_FEW, 2 ** (taken + taken // 8).bit_length()))
     return *others, watch, options | {"max_steps": most}
@@ -289,19 +291,9 @@ def instants(first: Array, interval: Array, save: int) -> Float[Array, " time"]:
     return interval * (first + jnp.arange(save, dtype=jnp.int32)).astype(interval.dtype)
 
 
-def film_of(network, time, inputs, motion: Integration, happened=None) -> Trajectory:
+def film_of(network, time, inputs, motion, happened=None) -> Trajectory:
     """The motion with every output."""
-
-    def one(moment):
-        t, state = moment
-        return outputs(network, t, state, at_time(inputs, t))
-
-    every = (time, motion.path)
-    large = bool(bodies_of(network))  # all instants at once would fill the memory
-    values = jax.lax.map(one, every) if large else jax.vmap(one)(every)
-    status, good = motion.status, finite(values)
-    status = Status.where((status == Status.successful) & ~good, Status.not_finite, status)
-    status = within_model(network, status, motion.path)
+    values, status = _seen(network, time, inputs, motion.path, motion.status)
     stats = {"steps": motion.steps, "rejected": motion.rejected, "reached": motion.reached}
     return Trajectory(
         time,
@@ -313,6 +305,21 @@ def film_of(network, time, inputs, motion: Integration, happened=None) -> Trajec
         happened=happened,
         dense=motion.dense,
     )
+
+
+@functools.partial(two_programs, kernels=True, largest=LARGEST_GIVEN, optimised=False)
+def _seen(network, time, inputs, path, status) -> tuple[dict[str, Array], Status]:
+    """Every output along a path, and the status of a run that ended with `status`."""
+
+    def one(moment):
+        t, state = moment
+        return outputs(network, t, state, at_time(inputs, t))
+
+    large = bool(bodies_of(network))  # all instants at once would fill the memory
+    values = jax.lax.map(one, (time, path)) if large else jax.vmap(one)((time, path))
+    failed = (status == Status.successful) & ~finite(values)
+    status = Status.where(failed, Status.not_finite, status)
+    return values, within_model(network, status, path)
 
 
 def within_model(network: Network, status: Status, path: PyTree) -> Status:
