@@ -43,10 +43,10 @@ def run(out: Path, quick: bool = False) -> int:
             f"0 to {designs.TOP_PRESSURE / kPa:g} kPa in {steps} states, {duration:g} s of "
             f"loop in {tracking.steps} steps, rms {np.degrees(tracking.rms):.2f} deg"
         )
-    with clock.stage("gradients by dimensions and gains, and differences") as tell:
+    with clock.stage("gradients by dimensions and gains, and a difference") as tell:
         slopes = designs.sensitivities(job, first)
         off = max(slope.error for slope in slopes.values())
-        tell(f"2 gradients by {len(job.numbers)} numbers, differences off by {off:.1e}")
+        tell(f"2 gradients by {len(job.numbers)} numbers, central difference off by {off:.1e}")
     with clock.stage("rod beside the solid") as tell:
         beside = designs.bent(first)
         tell(f"3 bending modes, backbone within {beside.errors.max() / mm:.3f} mm")

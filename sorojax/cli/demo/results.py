@@ -214,7 +214,7 @@ _UNITS = {
 
 
 def _off(slope: Sensitivity) -> view.Number:
-    name, off = "largest difference to central differences", slope.error
+    name, off = "difference to a central difference", slope.error
     return view.Number(name, off, "", "< 1e-4", off < 1e-4)
 
 
@@ -266,13 +266,13 @@ _TEXT = {
     "gradient": (
         "Derivative of the rotation of the free end at the top pressure in every dimension "
         "of the drawing, by reverse mode through mesh motion and equilibria. It is checked by "
-        "central differences along a change of all dimensions at once."
+        "a central difference along a change of all dimensions at once."
     ),
     "loop gradient": (
         "Derivative of the root mean square of the tracking error in every dimension of the "
         "drawing and every gain, by reverse mode through the whole chain: mesh motion, "
         "equilibria, strain modes, laws of the rod and the closed loop. It is checked by "
-        "central differences along a change of all dimensions, and along one of all gains."
+        "a central difference along a change of all dimensions and gains at once."
     ),
     "rod": (
         "The curvature of the middle of the layer at every pressure gives the modes; the "
