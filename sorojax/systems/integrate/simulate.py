@@ -291,7 +291,7 @@ def instants(first: Array, interval: Array, save: int) -> Float[Array, " time"]:
     return interval * (first + jnp.arange(save, dtype=jnp.int32)).astype(interval.dtype)
 
 
-def film_of(network, time, inputs, motion, happened=None) -> Trajectory:
+def film_of(network, time, inputs, motion: Integration, happened=None) -> Trajectory:
     """The motion with every output."""
     values, status = _seen(network, time, inputs, motion.path, motion.status)
     stats = {"steps": motion.steps, "rejected": motion.rejected, "reached": motion.reached}
