@@ -1,7 +1,9 @@
 """The bellows actuator: reference case A, its drawing, and the gradient by its walls."""
 
+import dataclasses
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -44,6 +46,28 @@ def test_mesh_area_is_that_of_the_drawing(path):
     exact = 66 * 15 - (300 - 5 * (4 - math.pi)) - 4 * (3 * 12 - (2 - math.pi / 2))
     assert abs(drawn / (exact * mm**2) - 1) < 1e-4
     assert abs(float(jnp.sum(mesh.cell_areas(path.problem.mesh))) / drawn - 1) < 1e-3
+
+
+def test_gradient_by_the_wall_thickness_agrees_with_central_differences():
+    design = designs.draw(1.5 * mm)
+    robot, flat = design.actuator, design.problem.mesh
+    path = fem.solve_path(design.problem, air=jnp.array([8 * kPa]))
+    ends = jnp.array([mesh.nearest_node(flat, [robot.length, y]) for y in (0.0, robot.height)])
+    tight = fem.Newton(residual_tolerance=1e-12)
+
+    def rotation(wall):
+        drawn = dataclasses.replace(robot, wall_thickness=wall)
+        moved = mesh.move(flat, drawn.body(), interfaces=(drawn.layer(),))
+        problem = eqx.tree_at(lambda p: p.mesh.points, path.problem_at(-1), moved.points)
+        solution = fem.solve(problem, start=path.displacements[-1], newton=tight)
+        face = (moved.points + solution.displacement)[ends]
+        across = face[1] - face[0]
+        return jnp.arctan2(-across[0], across[1])
+
+    wall, h = robot.wall_thickness, 10e-6
+    at = {k: float(rotation(wall + k * h)) for k in (-2, -1, 1, 2)}
+    difference = (8 * (at[1] - at[-1]) - (at[2] - at[-2])) / (12 * h)
+    assert abs(float(jax.grad(rotation)(wall)) / difference - 1) < 1e-6
 
 
 def test_gradients_of_rotation_and_tracking_agree_with_central_differences():
