@@ -3,6 +3,7 @@
 
 PYTHON  ?= $(shell command -v python3.11 || command -v python3)
 WORKERS ?= 2
+COMPILER ?= user
 PROGRAMS ?= 2000
 
 VENV := .venv
@@ -21,7 +22,8 @@ endef
 
 help:
 	@echo "make demo   set up .venv, run the main job, write out/"
-	@echo "make test   set up .venv, run the tests (WORKERS=$(WORKERS) processes)"
+	@echo "make test   set up .venv, run the tests (WORKERS=$(WORKERS) processes); COMPILER=quick"
+	@echo "            optimises their programs less and takes half of the time"
 	@echo "make test-versions  the tests on each Python found, with the oldest dependencies and"
 	@echo "            without AVX-512, one table; ONLY=3.13,oldest,avx2 ARGS=tests/test_fem.py"
 	@echo "make fuzz   PROGRAMS=$(PROGRAMS) random programs against their plain evaluation"
@@ -37,7 +39,8 @@ demo: $(VENV)/.run
 	@$(PY) -m sorojax demo
 
 test: $(VENV)/.test
-	$(PY) -m pytest -n $(WORKERS) --dist loadfile --max-worker-restart 0 $(ARGS)
+	SOROJAX_TEST_COMPILER=$(COMPILER) $(PY) -m pytest -n $(WORKERS) --dist loadfile \
+	--max-worker-restart 0 $(ARGS)
 
 test-versions: $(VENV)/.made
 	@$(PY) -m tests.versions --only '$(ONLY)' --workers $(WORKERS) -- $(ARGS)

@@ -1,8 +1,11 @@
 """Tests run in float64 with strict promotion, a persistent compilation cache and the compiler
-that users have."""
+that users have, or with `make test COMPILER=quick` one that takes half of the time."""
 
 import gc
+import importlib.metadata
 import itertools
+import math
+import os
 import time
 
 import jax
@@ -18,6 +21,35 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 enable_compilation_cache()
 
 _MAX_MAPPINGS = 20_000
+_BEGUN = time.monotonic()
+
+
+def _compile_quickly():
+    """XLA without most of LLVM's optimisation and, where it can do without, its emitters of
+    fused loops: set before anything is computed, and in the programs that tests start."""
+    flags = [os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=0"]
+    if importlib.metadata.version("jaxlib").startswith("0.10."):
+        flags.append("--xla_cpu_use_fusion_emitters=false")
+    os.environ["XLA_FLAGS"] = " ".join(flags).strip()
+
+
+if os.environ.pop("SOROJAX_TEST_COMPILER", "user") == "quick":
+    _compile_quickly()
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--minutes",
+        type=float,
+        default=math.inf,
+        help="skip tests that would begin later than this, and say so",
+    )
+
+
+def pytest_runtest_setup(item):
+    minutes = item.config.option.minutes
+    if time.monotonic() > _BEGUN + 60 * minutes:
+        pytest.skip(f"not begun within --minutes {minutes:g}: this machine is slow")
 
 
 def pytest_collection_finish(session):

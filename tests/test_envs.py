@@ -44,7 +44,8 @@ def small_crawler():
 
 
 SOLIDS = {"SolidReach": small_body, "SolidCrawl": small_crawler}  # trained where they are used
-TASKS += [pytest.param(name, id=name) for name in SOLIDS]
+TASKS += [pytest.param("SolidReach", id="SolidReach")]
+TASKS += [pytest.param("SolidCrawl", id="SolidCrawl", marks=pytest.mark.slow)]
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from sorojax import _check
 from sorojax._arguments import sized
 from sorojax._display import displayed
+from sorojax._jax.jit import once
 from sorojax.fem import checks
 from sorojax.fem.assembly.energy import Body, energy_density
 from sorojax.fem.assembly.geometry import Points, deformation, quadrature_points
@@ -230,7 +231,7 @@ def potential_energy(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Ar
     return _potential_energy(unsupported(problem), u)
 
 
-@jax.jit
+@once
 def _potential_energy(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
     points = quadrature_points(problem.mesh, problem.kinematics)
     F = deformation(problem.mesh, problem.kinematics, points, u)
@@ -252,7 +253,7 @@ def residual(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, "no
     return _residual(unsupported(problem), u)
 
 
-@jax.jit
+@once
 def _residual(problem: Problem, u: Float[Array, "nodes dim"]) -> Float[Array, "nodes dim"]:
     return jax.grad(_potential_energy, argnums=1)(problem, u)
 

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sorojax._jax.trace_state import is_traced
+from sorojax._types import from_host
 from sorojax.mesh.elements.base import (
     AbstractElement,
     exported_elements,
@@ -115,13 +116,15 @@ def enrich(mesh: Mesh) -> Mesh:
     element = richer[mesh.element.name]
     cells = np.asarray(mesh.cells)
     new = reference_nodes(element)[mesh.element.num_nodes :]
-    at = jnp.asarray(shape_functions(mesh.element, new), mesh.points.dtype)
-    where = jnp.einsum("an,cni->cai", at, mesh.points[mesh.cells])
+    xp = jnp if is_traced(mesh.points) else np  # NumPy has nothing to compile
+    old = xp.asarray(mesh.points)
+    at = shape_functions(mesh.element, new).astype(old.dtype)
+    where = xp.einsum("an,cni->cai", at, old[cells])
     first, number = np.unique(_owners(mesh, element), return_index=True, return_inverse=True)[
         1:
     ]
     columns = mesh.num_nodes + number.reshape(len(cells), -1)
-    points = jnp.concatenate([mesh.points, where.reshape(-1, element.dim)[first]])
+    points = from_host(xp.concatenate([old, where.reshape(-1, element.dim)[first]]))
     richer = Mesh(points, np.concatenate([cells, columns], axis=1), element)
     sets = {name: with_centres(richer, f) for name, f in mesh.facet_sets.items()}
     nodes = {name: _with_inner(mesh, columns, ids) for name, ids in mesh.node_sets.items()}

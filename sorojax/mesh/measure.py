@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from sorojax import _check
 from sorojax._jax.jit import once
 from sorojax._jax.trace_state import is_traced
-from sorojax._types import real
+from sorojax._types import from_host, real
 from sorojax.math.host import KDTree
 from sorojax.mesh.elements.base import (
     AbstractElement,
@@ -184,14 +184,16 @@ def locate(
         raise ValueError("locate: got polygons, need triangles, quadrilaterals or solid cells.")
     if cells is None:
         cells = jnp.asarray(cells_at(mesh, points))
-    nodes, points = mesh.cells[cells], real(points).astype(mesh.points.dtype)
-    corners = mesh.points[nodes]
-    if is_traced((corners, points)):
-        return Locations(nodes, _weights(corners, points, mesh.element), cells)
+    points = real(points).astype(mesh.points.dtype)
+    if is_traced((mesh, points, cells)):
+        nodes = mesh.cells[cells]
+        return Locations(nodes, _weights(mesh.points[nodes], points, mesh.element), cells)
     # without a program to compile
-    xi = _reference_coordinates(mesh, np.asarray(corners)[:, None], np.asarray(points))[:, 0]
+    nodes = np.asarray(mesh.cells)[np.asarray(cells)]
+    corners = np.asarray(mesh.points)[nodes]
+    xi = _reference_coordinates(mesh, corners[:, None], np.asarray(points))[:, 0]
     weights = shape_functions(mesh.element, xi)
-    return Locations(nodes, jnp.asarray(weights, points.dtype), cells)
+    return Locations(from_host(nodes), from_host(weights, points.dtype), cells)
 
 
 def cells_at(mesh: Mesh, points) -> Int[np.ndarray, " points"]:

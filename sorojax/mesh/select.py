@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from sorojax._types import Numbers
 from sorojax.mesh.elements.base import facet_corners
@@ -53,8 +53,8 @@ def cells_where(mesh: Mesh, predicate: Predicate) -> Cells:
     Returns:
         Cell numbers in rising order.
     """
-    corners = mesh.cells[:, : mesh.element.num_corners]
-    return np.flatnonzero(_holds(jnp.mean(mesh.points[corners], axis=1), predicate))
+    corners = np.asarray(mesh.cells)[:, : mesh.element.num_corners]
+    return np.flatnonzero(_holds(np.asarray(mesh.points)[corners].mean(axis=1), predicate))
 
 
 def facets_where(mesh: Mesh, predicate: Predicate) -> Facets:
@@ -243,11 +243,11 @@ def cells_connected(mesh: Mesh, start: Float[np.ndarray, " dim"], walls: Numbers
     return np.flatnonzero(label == label[home])
 
 
-def _middles(mesh: Mesh, facets: np.ndarray) -> jax.Array:
-    return jnp.mean(mesh.points[facets[:, : facet_corners(mesh.element)]], axis=1)
+def _middles(mesh: Mesh, facets: np.ndarray) -> np.ndarray:
+    return np.asarray(mesh.points)[facets[:, : facet_corners(mesh.element)]].mean(axis=1)
 
 
-def _holds(points: jax.Array, predicate: Predicate) -> np.ndarray:
+def _holds(points: Array | np.ndarray, predicate: Predicate) -> np.ndarray:
     if not len(points):
         return np.zeros(0, bool)
     return np.asarray(jax.vmap(lambda p: jnp.asarray(predicate(p), dtype=bool))(points))

@@ -1,5 +1,6 @@
 """A derivative that a public verb promises, and its comparison with differences."""
 
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -7,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 from sorojax._jax.jit import once
 
@@ -35,17 +35,33 @@ class Case(NamedTuple):
     jit: bool = True
 
 
-def direction_of(flat, moves, seed=0):
+def flattened(moves):
+    """All numbers of a tree in one row, by NumPy, and the function that puts them back: every
+    operation of JAX on a new shape would be a program of its own."""
+    leaves, structure = jax.tree.flatten(moves)
+    ends = np.cumsum([0, *(leaf.size for leaf in leaves)])
+
+    def build(flat):
+        parts = [flat[a:b] for a, b in itertools.pairwise(ends)]
+        again = [
+            part.reshape(x.shape).astype(x.dtype) for part, x in zip(parts, leaves, strict=True)
+        ]
+        return jax.tree.unflatten(structure, [jnp.asarray(x) for x in again])
+
+    return np.concatenate([np.ravel(leaf) for leaf in leaves] or [np.zeros(0)]), build
+
+
+def direction_of(moves, seed=0):
     """A random direction: each leaf by its own size, by one where it is zero, not at all where
     it is a bound at infinity."""
     draw = np.random.default_rng(seed)
-    parts = []
+    parts = [np.zeros(0)]
     for leaf in jax.tree.leaves(moves):
-        size = float(jnp.max(jnp.abs(leaf), initial=0.0)) or 1.0
+        size = float(np.abs(leaf).max(initial=0.0)) or 1.0
         signs = draw.choice([-1, 1], leaf.size) if np.isfinite(size) else np.zeros(leaf.size)
         parts.append(draw.uniform(0.3, 1.0, leaf.size) * signs)
         parts[-1] *= size if np.isfinite(size) else 0.0
-    return jnp.asarray(np.concatenate(parts)) if parts else jnp.zeros_like(flat)
+    return np.concatenate(parts)
 
 
 def as_numbers(at):
@@ -57,8 +73,8 @@ def slopes(case: Case):
     """Along a random direction, of a random sum of all outputs: by differences of fourth
     order, in reverse and in forward mode, and the size of what was summed."""
     moves, rest = eqx.partition(as_numbers(case.at), eqx.is_inexact_array)
-    flat, build = ravel_pytree(moves)
-    direction = direction_of(flat, moves)
+    flat, build = flattened(moves)
+    direction = direction_of(moves)
 
     def outputs(flat):
         return eqx.filter(case.call(eqx.combine(build(flat), rest)), eqx.is_inexact_array)
@@ -71,7 +87,7 @@ def slopes(case: Case):
         """The sum, its slopes in reverse and forward mode, and all outputs."""
         reverse = along = jnp.nan
         if case.forward:
-            way = (flat,), (direction,)
+            way = (flat,), (jnp.asarray(direction),)
             value, along, found = jax.jvp(lambda x: total(x, weights), *way, has_aux=True)
         if case.reverse:
             (value, found), slope = jax.value_and_grad(total, has_aux=True)(flat, weights)

@@ -56,9 +56,11 @@ def plate(*loads, supports=CLAMP, rubber=RUBBER, kinematics=DEPTH, cells=PLATE, 
 
 def moved(problem, size=0.03):
     """`problem` and a smooth displacement of its nodes, of any shape."""
-    x, y, *_ = problem.mesh.points.T
-    wave = [jnp.sin(2 * x + y), jnp.cos(x - 3 * y), jnp.sin(x + 2 * y)]
-    return problem, size * jnp.stack(wave[: problem.mesh.element.dim], axis=1)
+    points = problem.mesh.points
+    xp = jnp if isinstance(points, jax.core.Tracer) else np  # programs only where traced
+    x, y, *_ = xp.asarray(points).T
+    wave = [xp.sin(2 * x + y), xp.cos(x - 3 * y), xp.sin(x + 2 * y)]
+    return problem, jnp.asarray(size * xp.stack(wave[: problem.mesh.element.dim], axis=1))
 
 
 def at_state(verb, make, **options):

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sorojax._jax.jit import once
 from sorojax.fem.assembly.energy import (
     Body,
     Entries,
@@ -200,7 +201,7 @@ def assemble(
     return Assembly(total.force[:-1].ravel(), total.values[:-1], total.volume_ratio)
 
 
-@jax.jit
+@once
 def cell_matrices(
     space: Space,
     geometry: Geometry,

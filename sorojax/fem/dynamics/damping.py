@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sorojax import _check
+from sorojax._jax.jit import once
 from sorojax._types import real
 from sorojax.fem.assembly import assemble as asm
 from sorojax.fem.assembly.geometry import (
@@ -224,6 +225,7 @@ def _of_loads(problem: Problem) -> Float[Array, " nodes"] | None:
     return sum(given[1:], start=given[0]) if given else None
 
 
+@once
 def _cell_masses(problem: Problem) -> Float[Array, "cells cell_nodes cell_nodes"]:
     density = problem.material.density
     if density is None:

@@ -22,6 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sorojax._jax.jit import once
+
 
 class Stretch(NamedTuple):
     """Segments: their lengths at rest [m], the share that a group has of them, EA [N]."""
@@ -124,6 +126,7 @@ def spans(
     return span, own / span
 
 
+@once
 def resampled(
     points: Float[Array, "rods points dim"], count: int
 ) -> Float[Array, "rods count dim"]:

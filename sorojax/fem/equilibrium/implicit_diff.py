@@ -192,13 +192,14 @@ class _Map:
         return list(jax.linear_transpose(self.push, *self.inputs)(changes))
 
     def pull_now(self, *changes) -> list:
-        """By one back-substitution and the derivative of one number."""
-        if jax.tree.leaves(self.at.params.supports):
-            return self.pull(*changes)
+        """By one back-substitution and the derivative of one number, or with supports that
+        move of the force and the displacement that they prescribe."""
         system, matrix, known = _held_on_host(self.at)
         force = np.where(known, 0.0, np.asarray(changes[0]).ravel())
         # the last factor of the solve belongs to the state before the last, small update
         work = system.solver.solve_near(matrix, force)
+        if jax.tree.leaves(self.at.params.supports):
+            return jax.tree.leaves(_pulled_with_supports(self.at, work, changes[0], known))
         return jax.tree.leaves(_pulled(_without_supports(self.at), work, known))
 
 
@@ -216,9 +217,9 @@ def _held_tangent(at: Equilibrium):
 
 
 def _held_on_host(at: Equilibrium):
-    """The same as arrays of the host, where supports do not move."""
+    """The same as arrays of the host."""
     system = eqx.combine(at.params.space.system, at.rest.space.system)
-    known = known_dofs(at.rest.supports, *at.u.shape)
+    known = known_dofs(eqx.combine(at.params.supports, at.rest.supports), *at.u.shape)
     return system, sparse.fixed_on_host(system, np.asarray(at.values), known), known
 
 
@@ -261,8 +262,8 @@ def _pulled(
     return jax.grad(along)(at.params)
 
 
-@eqx.filter_jit
-def _moved_unbalance(at: Equilibrium, rates: Problem, known: Bool[Array, " dofs"]):
+@once
+def _moved_unbalance(at: Equilibrium, rates: Problem, known: Bool[Array | np.ndarray, " dofs"]):
     """-dR with the displacements that supports prescribe, and how these move [m]."""
 
     def prescribed(params):
@@ -275,6 +276,21 @@ def _moved_unbalance(at: Equilibrium, rates: Problem, known: Bool[Array, " dofs"
     move = _valid(at) * move.reshape(at.u.shape)
     _, rate = jax.jvp(unbalanced, (at.params, at.u), (rates, move))
     return jnp.where(known, jnp.zeros_like(rate), -_valid(at) * rate), move
+
+
+@once
+def _pulled_with_supports(
+    at: Equilibrium,
+    work: Float[Array | np.ndarray, " dofs"],
+    change: Float[Array, "nodes dim"],
+    known: Bool[Array | np.ndarray, " dofs"],
+) -> Problem:
+    """What `_moved_unbalance` gives of `work` and of a change of the displacements."""
+
+    def moved(rates: Problem):
+        return _moved_unbalance(at, rates, known)
+
+    return jax.linear_transpose(moved, at.params)((work, change))[0]
 
 
 @jax.jit

@@ -238,14 +238,11 @@ def _moved(system: sparse.SparseSymmetric, pair: _Pair, known, value, shape):
     weight = product(pair.M, shape)
     # the largest entry stays: what is left of K - value M is regular
     fixed = known.at[jnp.argmax(jnp.abs(shape))].set(True)
-    matrix = _fix(system, pair.K - value * pair.M, fixed)
+    matrix = sparse.fix(system, pair.K - value * pair.M, fixed)
     rhs = jnp.where(fixed, jnp.zeros_like(change), slope * weight - change)
     part = sparse.solve(system, matrix, rhs)
     along = weight @ part + shape @ product(pair.dM, shape) / 2
     return slope, part - along * shape
-
-
-_fix = jax.jit(sparse.fix)
 
 
 def _alone(eigenvalues: Float[Array, " modes"]) -> Float[Array, " modes"]:

@@ -254,6 +254,7 @@ def slots_of(
     return from_host(slots, jnp.int32)
 
 
+@jax.jit
 def assemble(
     system: SparseSymmetric, matrices: Float[Array, "cells dofs dofs"]
 ) -> Float[Array, " nnz"]:
@@ -282,6 +283,7 @@ def product(
     return upper.at[system.cols].add(off * x[system.rows])
 
 
+@jax.jit
 def fix(
     system: SparseSymmetric, values: Float[Array, " nnz"], fixed: Array
 ) -> Float[Array, " nnz"]:

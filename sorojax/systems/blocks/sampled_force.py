@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sorojax import fem
+from sorojax._jax.jit import once
 from sorojax.fem.assembly.energy import (
     Body,
     Entries,
@@ -317,8 +318,7 @@ def sampled_force(
     """The force of `cells` of a body, each times its weight, or of one of the quadrature
     `points` of each."""
     free = body.loaded({name: jnp.zeros_like(x.value) for name, x in body.drives.items()})
-    whole = _cells(free, basis)
-    chosen = _taken(whole, np.asarray(cells), points, free.mesh.num_cells)
+    chosen = _chosen(free, basis, np.asarray(cells), points)
 
     def loads(q):
         force = load_force(free, displacement(basis, q))
@@ -328,6 +328,12 @@ def sampled_force(
     made = taylor(loads, zero, 3)
     volumes = chosen.volumes * jnp.asarray(weights)[None]
     return eqx.tree_at(lambda f: (f.volumes, f.loads), chosen, (volumes, made))
+
+
+@once
+def _chosen(problem: fem.Problem, basis: Basis, cells, points) -> SampledForce:
+    """The force of some of the cells, or of one point of each."""
+    return _taken(_cells(problem, basis), cells, points, problem.mesh.num_cells)
 
 
 def _cells(problem: fem.Problem, basis: Basis) -> SampledForce:
