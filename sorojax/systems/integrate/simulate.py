@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, PyTree
 
 from sorojax import _check
 from sorojax._display import displayed, number, outcome
+from sorojax._jax.jit import once
 from sorojax._jax.small_kernels import LARGEST_GIVEN
 from sorojax._jax.trace_state import is_traced
 from sorojax._types import real
@@ -212,7 +213,8 @@ def simulate(
         plan = (save, method, substeps, progress)
         memory = None if isinstance(memory, Resume) else memory
         check_places(network, first.astype(interval.dtype) * interval, state, supplied)
-        film = _fixed(network, state, supplied, first, interval, plan, memory)
+        run = _fixed_with_solids if bodies_of(network) else _fixed
+        film = run(network, state, supplied, first, interval, plan, memory)
     failed = throw and not is_traced(film)
     if failed and not bool(film.status == Status.successful):
         raise RuntimeError(
@@ -277,13 +279,17 @@ _adaptive = two_programs(
 )
 
 
-@eqx.filter_jit
-def _fixed(network, state, inputs, first, interval, plan, memory) -> Trajectory:
+def _run_fixed(network, state, inputs, first, interval, plan, memory) -> Trajectory:
     save, method, substeps, progress = plan
     time = instants(first, interval, save)
     state = network.initial_state() if state is None else state
     motion = fixed(network, inputs, state, time, interval, method, substeps, memory, progress)
     return film_of(network, time, inputs, motion)
+
+
+_fixed = once(_run_fixed)
+# The products of many cells run faster by the compiler's own loops.
+_fixed_with_solids = eqx.filter_jit(_run_fixed)
 
 
 def instants(first: Array, interval: Array, save: int) -> Float[Array, " time"]:
