@@ -16,6 +16,8 @@ from sorojax.rod.model.assembly import retract
 from sorojax.rod.model.closure import equations
 from sorojax.rod.model.joint import AbstractJoint
 
+pytestmark = pytest.mark.quick
+
 LENGTH, LOAD = 0.1, 9.81 * 1000 * np.pi * 0.005**2  # m, N/m
 STIFFNESS = 1e6 * np.pi / 4 * 0.005**4
 NONE = jnp.zeros(())

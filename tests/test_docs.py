@@ -15,6 +15,8 @@ import pytest
 
 from tests.scripts import ROOT
 
+pytestmark = pytest.mark.quick
+
 DOCS = ROOT / "docs"
 TOOLS = DOCS / "tools"
 WRITTEN = ("_build", "_generated", "reference")  # by the build

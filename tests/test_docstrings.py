@@ -15,6 +15,8 @@ import sorojax
 from sorojax import SE2, SE3, material, silent
 from sorojax.units import kPa, mm
 
+pytestmark = pytest.mark.quick
+
 VERBS = {
     "": "compiled jit replace",
     "sdf": "SmoothUnion area contour extrude gradient isosurface offset revolve rotate "

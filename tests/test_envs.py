@@ -19,6 +19,8 @@ from sorojax.envs.core import BOUND
 from sorojax.envs.supply_line import LATE_STEPS, begun, sent
 from sorojax.envs.tasks import finger, solid_crawler
 
+pytestmark = pytest.mark.quick
+
 REACH = envs.FingerReach(time_step=4e-3, substeps=5, max_steps=3)
 PUSH = envs.TentaclePush(time_step=2e-3, substeps=5, max_steps=60)
 TRACK = envs.TipTracking(time_step=4e-3, substeps=5, max_steps=100)

@@ -13,6 +13,8 @@ from sorojax.fem.equilibrium.response import tangent_solve
 from sorojax.mesh import Mesh
 from sorojax.units import kPa, mm
 
+pytestmark = pytest.mark.quick
+
 RUBBER = material.neo_hookean(young_modulus=1e6, poisson_ratio=0.49, density=1000.0)
 
 

@@ -13,6 +13,8 @@ import pytest
 from sorojax import Status, fem, material, mesh, sdf
 from sorojax.units import mm
 
+pytestmark = pytest.mark.quick
+
 HEIGHT = 11 * mm  # of the centre
 OUTSIDE = sdf.Circle([0.0, HEIGHT], 10 * mm)
 RING = mesh.triangulate(OUTSIDE - sdf.Circle([0.0, HEIGHT], 7 * mm), size=4 * mm, order=2)

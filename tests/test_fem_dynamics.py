@@ -14,6 +14,8 @@ from sorojax.fem.equilibrium.linear import linearise, prepare
 from sorojax.fem.equilibrium.newton import Secants
 from sorojax.io.fields import export_fields
 
+pytestmark = pytest.mark.quick
+
 GRID = mesh.rectangle([0, 0], [0.1, 0.01], divisions=(6, 1), order=2)
 SPACE = fem.space(GRID)
 TIP = int(mesh.nearest_node(GRID, (0.1, 0.0)))

@@ -10,6 +10,8 @@ from scipy.optimize import brentq
 from sorojax import fem, material, mesh
 from sorojax.fem.equilibrium.linear import linearise, prepare
 
+pytestmark = pytest.mark.quick
+
 RUBBER = material.neo_hookean(young_modulus=1.0, poisson_ratio=0.49)
 D, P0, P1 = fem.Displacement(), fem.ConstantPressure(), fem.LinearPressure()
 STRAIN, STRESS, AXIAL = fem.PlaneStrain(0.5), fem.PlaneStress(0.1), fem.Axisymmetric()

@@ -8,6 +8,8 @@ import pytest
 from sorojax import Status, fem, material, mesh, sdf
 from sorojax.units import mm
 
+pytestmark = pytest.mark.quick
+
 GRID = mesh.rectangle([0, 0], [1, 1], divisions=(8, 1), element=mesh.Quad4())
 
 

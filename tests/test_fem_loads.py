@@ -13,6 +13,8 @@ from sorojax.fem.problem import load_force
 from sorojax.math.linalg import sparse
 from sorojax.units import mm
 
+pytestmark = pytest.mark.quick
+
 RUBBER = material.neo_hookean(young_modulus=1e5, poisson_ratio=0.3)
 BEAM = mesh.rectangle([0, 0], [60 * mm, 10 * mm], divisions=(6, 2), element=mesh.Quad8())
 CUBE = mesh.box([0, 0, 0], [20 * mm, 20 * mm, 20 * mm], divisions=(2, 1, 1))

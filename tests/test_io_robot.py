@@ -13,6 +13,8 @@ import sorojax as sj
 from sorojax import io, robots, rod as R
 from sorojax.math.lie import SE3
 
+pytestmark = pytest.mark.quick
+
 mujoco = pytest.importorskip("mujoco", reason="the extra `robots` is not installed")
 
 ODD = """

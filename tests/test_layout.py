@@ -20,6 +20,8 @@ from sorojax.material.kinematics import from_matrix
 from sorojax.math.linalg import sparse
 from sorojax.mesh.mesh import Mesh, boundary_facets
 
+pytestmark = pytest.mark.quick
+
 RUBBER = material.neo_hookean(young_modulus=1.0, poisson_ratio=0.4)
 SLOPE = np.array([[0.2, -0.3, 0.1], [0.25, -0.1, 0.05], [0.0, 0.15, 0.3]])
 

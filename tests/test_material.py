@@ -12,6 +12,8 @@ from sorojax import fem, material, mesh
 from sorojax.material.kinematics import from_matrix
 from sorojax.units import kPa
 
+pytestmark = pytest.mark.quick
+
 K = 5e6
 LAME = K - 2 / 3 * 1e5
 

@@ -18,6 +18,8 @@ from sorojax.fem.assembly.energy import (
 )
 from sorojax.fem.kinematics import component_pairs, entries_of, identity
 
+pytestmark = pytest.mark.quick
+
 KINEMATICS = (fem.PlaneStrain(1.0), fem.PlaneStress(1.0), fem.Axisymmetric(), fem.Solid())
 RUBBERS = (
     material.neo_hookean(young_modulus=1.0, poisson_ratio=0.45),

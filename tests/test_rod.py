@@ -22,6 +22,8 @@ from sorojax.math.quadrature import gauss_legendre
 from sorojax.math.status import Status
 from sorojax.rod.model.basis import SampledModes
 
+pytestmark = pytest.mark.quick
+
 FINGER = dict(length=0.08, young_modulus=1e6, poisson_ratio=0.3, density=2000.0)
 DISC = R.circle(6e-3, shear_factor=27 / 28)
 

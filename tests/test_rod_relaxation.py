@@ -16,6 +16,8 @@ from sorojax.math.ode import steppers
 from sorojax.math.ode.contact_midpoint import ContactMidpoint
 from sorojax.math.status import Status
 
+pytestmark = pytest.mark.quick
+
 SHARES, TIMES = [0.5, 0.3], [0.01, 0.1]
 SPECTRUM = material.Prony(SHARES, TIMES)
 BRANCHES = R.Relaxation(SPECTRUM)

@@ -11,6 +11,8 @@ from sorojax import sdf
 from sorojax.sdf.query import value_and_normal_at
 from sorojax.sdf.trimesh.tree import order_by_halving
 
+pytestmark = pytest.mark.quick
+
 POINTS = np.random.default_rng(3).uniform(-2, 2, (256, 2))
 number = st.floats(-0.8, 0.8).map(lambda v: round(v, 3))
 length = st.floats(0.2, 0.9).map(lambda v: round(v, 3))

@@ -12,6 +12,8 @@ from sorojax import sdf
 from sorojax._jax.jit import once
 from sorojax.sdf.sampling import value_and_gradient
 
+pytestmark = pytest.mark.quick
+
 TRIANGLE = sdf.triangle([0.3, -0.2], [0.9, 0.1], [0.5, 0.3])
 BAR = sdf.Box([-1, -0.2, -0.3], [1, 0.3, 0.3])
 TALL = sdf.Box([-0.5, -0.3, -0.8], [0.4, 0.3, 0.8])

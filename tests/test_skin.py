@@ -10,6 +10,8 @@ from sorojax.math.lie import SE2, SE3, homogeneous, rotation_columns
 from sorojax.view.rigging import modifiers
 from sorojax.view.rigging.rig import placed
 
+pytestmark = pytest.mark.quick
+
 LENGTH = 0.06
 RUBBER = {"young_modulus": 1e5, "poisson_ratio": 0.49, "density": 1e3}
 

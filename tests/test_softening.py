@@ -26,6 +26,8 @@ from sorojax.material.softening.law import with_peak
 from sorojax.math.linalg import sparse
 from tests.test_viscoelastic import BAR, GRIDS, problem, shears, unimodular
 
+pytestmark = pytest.mark.quick
+
 BULK = 3e6
 RUBBER = material.NeoHookean(3e5, BULK, 1000.0)
 LAWS = {

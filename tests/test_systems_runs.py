@@ -277,7 +277,6 @@ for name, run in runs.items():
 """
 
 
-@pytest.mark.rounding
 @pytest.mark.parametrize("solver", ["Tsit5", pytest.param("Rodas4", marks=pytest.mark.slow)])
 def test_two_halves_in_two_processes_give_the_bits_of_the_whole(tmp_path, solver):
     """Also adaptively: the second half takes the steps that the whole run takes."""
@@ -312,7 +311,6 @@ def _half(film):
     return eqx.tree_at(lambda f: (f.time, f.state, f.outputs), shapes, parts)
 
 
-@pytest.mark.rounding
 @pytest.mark.parametrize(
     "go",
     [

@@ -17,6 +17,8 @@ from sorojax.material import viscoelastic as V
 from sorojax.material.kinematics import from_matrix
 from sorojax.math.linalg import sparse
 
+pytestmark = pytest.mark.quick
+
 SHEAR = 3e5
 RUBBER = material.NeoHookean(SHEAR, 3e6, 1000.0)
 ONE = material.Prony([0.7], [0.1])

@@ -7,6 +7,8 @@ import pytest
 
 from tests.derivatives.case import check
 
+pytestmark = pytest.mark.quick
+
 FLOORS = {
     floor: importlib.import_module(f"tests.derivatives.{floor}")
     for floor in (
