@@ -333,7 +333,19 @@ def sampled_force(
 @once
 def _chosen(problem: fem.Problem, basis: Basis, cells, points) -> SampledForce:
     """The force of some of the cells, or of one point of each."""
-    return _taken(_cells(problem, basis), cells, points, problem.mesh.num_cells)
+    force, count = _cells(problem, basis), problem.mesh.num_cells
+    quad = force.volumes.shape[0]
+
+    def taken(leaf):
+        if not (eqx.is_array(leaf) and leaf.ndim > 0 and leaf.shape[-1] == count):
+            return leaf
+        if points is None:
+            return leaf[..., cells]
+        every = jnp.broadcast_to(leaf, (*leaf.shape[:-2], quad, count))
+        return every[..., points, cells][..., None, :]
+
+    energy, rest, volumes = jax.tree.map(taken, (force.body, force.rest, force.volumes))
+    return SampledForce(energy, rest, taken(force.slopes), volumes, force.loads)
 
 
 def _cells(problem: fem.Problem, basis: Basis) -> SampledForce:
@@ -358,21 +370,3 @@ def pieces(body: FemBody) -> tuple[Int[np.ndarray, " all"], Int[np.ndarray, " al
     if body_at(bare(problem), points).modes is not None:
         return cells, None
     return np.tile(cells, count), np.repeat(np.arange(count), len(cells))
-
-
-def _taken(
-    force: SampledForce, cells: np.ndarray, points: np.ndarray | None, count: int
-) -> SampledForce:
-    """The force of some of the cells, or of one point of each."""
-    quad = force.volumes.shape[0]
-
-    def taken(leaf):
-        if not (eqx.is_array(leaf) and leaf.ndim > 0 and leaf.shape[-1] == count):
-            return leaf
-        if points is None:
-            return leaf[..., cells]
-        every = jnp.broadcast_to(leaf, (*leaf.shape[:-2], quad, count))
-        return every[..., points, cells][..., None, :]
-
-    energy, rest, volumes = jax.tree.map(taken, (force.body, force.rest, force.volumes))
-    return SampledForce(energy, rest, taken(force.slopes), volumes, force.loads)
