@@ -228,4 +228,4 @@ def test_the_tip_is_where_that_of_the_whole_finger_is():
     env, acts = envs.SolidReach(), envs_solid.actions(101)
     tips = envs_solid.reduced_tip(env, acts)
     off, move = envs_solid.error_of(tips, envs_solid.whole_tip(env, acts))
-    assert move > 15e-3 and off < 0.025 * move
+    assert move > 15e-3 and off < 0.01 * move

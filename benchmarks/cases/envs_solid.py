@@ -20,7 +20,7 @@ from sorojax.units import mm
 
 WORKERS = 1  # nothing here calls the host
 SEEDS = (101, 102, 103, 104)  # of commands that nothing was chosen by
-HELD, CHANGES, FINE = 10, 6, 4  # steps of the task, commands, states of the whole in a step
+HELD, CHANGES, FINE = 10, 6, 16  # steps of the task, commands, states of the whole in a step
 BAR = 1e-2
 
 

@@ -16,10 +16,12 @@ jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
+from soromox.actuation import ThreadlikeActuator, ThreadlikeRouting  # noqa: E402
 from soromox.systems import SystemState  # noqa: E402
 from soromox.systems.components import IsotropicMaterialParams, JointSpec, LinkSpec  # noqa: E402
 from soromox.systems.gvs import GVS, GVSSegment, StrainBasisSpec  # noqa: E402
 
+ORDERS = (0, 1, 1, 0, 0, 0)  # of kappa_x, kappa_y, kappa_z, sigma_x, sigma_y, sigma_z
 clock = time.process_time if os.environ.get("SOROJAX_BENCH_CPU") == "1" else time.perf_counter
 
 
@@ -101,6 +103,62 @@ def simulation(request, arrays):
     return timing, {
         "tips": np.asarray(result)[-round(request["duration"] / request["save_dt"]) :]
     }
+
+
+def chambered(request):
+    """The finger of `sorojax.envs.FingerReach`: it hangs, and air in chambers moves it."""
+    angles = 2 * np.pi * np.arange(request["chambers"]) / request["chambers"]
+    sides = np.stack([0 * angles, np.cos(angles), np.sin(angles)], axis=1)
+    chambers = ThreadlikeActuator.pressure_chambers(
+        ThreadlikeRouting.linear(intercept=jnp.asarray(request["chamber_offset"] * sides)),
+        effective_areas=jnp.full(request["chambers"], request["chamber_area"]),
+    )
+
+    def built(damping):
+        link = LinkSpec.circular(
+            length=request["length"],
+            radius=request["radius"],
+            young_modulus=request["young_modulus"],
+            poisson_ratio=request["poisson_ratio"],
+            density=request["density"],
+            reference_strain=[0.0, 0.0, 0.0, 1.0, 0.0, 0.0],
+            damping=damping,
+        )
+        segment = GVSSegment(
+            link=link,
+            joint=JointSpec(type="fixed"),
+            basis=StrainBasisSpec("chebyshev", ("kappa_y", "kappa_z", "sigma_x"), ORDERS),
+            num_gauss_points=request["nodes"],
+        )
+        base = jnp.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+        down = jnp.array([request["gravity"], 0.0, 0.0])
+        return GVS.from_segments([segment], gravity=down, base_pose=base, actuators=[chambers])
+
+    still = built(None)
+    return built(request["damping"] * still.params.link.stiffness[0])
+
+
+def members(request, arrays):
+    """Tips of a batch after a few steps, each member under pressures of its own."""
+    robot = chambered(request)
+    rest = jnp.zeros(2 * robot.num_internal_dofs)
+
+    def tip(pressure):
+        states = robot.rollout_to(
+            SystemState(t=0.0, y=rest),
+            u=pressure,
+            t1=request["steps"] * request["dt"],
+            solver_dt=request["dt"],
+            save_ts=jnp.array([request["steps"] * request["dt"]]),
+            max_steps=request["steps"] + 2,
+        )
+        q = states.y[-1, : rest.size // 2]
+        return robot.forward_kinematics(q, robot.length)[:3, 3]
+
+    pressures = jnp.asarray(arrays["pressures"])
+    tips, timing = measure(jax.vmap(tip), pressures, repeats=request["repeats"])
+    timing["runs"] = [run / len(pressures) for run in timing["runs"]]
+    return timing, {"tips": np.asarray(tips)}
 
 
 def first_calls(request, arrays):

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from sorojax.view import Scene
 
 MARKERS = np.array([0.25, 0.5, 0.75, 1.0])
-_POISSON = 0.49
+POISSON = 0.49
 _DOWN = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # of x, in pictures
 
 
@@ -161,7 +161,7 @@ def _finger(params: FingerParams) -> tuple[Rod, AbstractPressureMap]:
         circle(params.radius),
         length=params.length,
         young_modulus=params.young_modulus,
-        poisson_ratio=_POISSON,
+        poisson_ratio=POISSON,
         density=params.density,
         nodes=6,
     )

@@ -1,9 +1,8 @@
-"""A reduced body whose force comes from a few weighted cells: trained from the full body by one
-verb.
+"""A reduced body whose force comes from a few weighted cells, trained by one verb.
 
 Shapes are the main directions of equilibria under given inputs, of their derivatives by these
-inputs, and the lowest eigenmodes. Weights make the work of the chosen cells along every shape
-that of all cells, in the states of training.
+inputs, and of motions, or else the lowest eigenmodes. Weights make the work of the chosen cells
+along every shape that of all cells, in the states of training.
 
 Reference:
     Farhat, Chapman, Avery, Structure-preserving, stability, and accuracy properties of the
@@ -19,11 +18,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from sorojax import fem
 from sorojax._display import displayed
 from sorojax._progress import report
+from sorojax.fem.equilibrium.linear import linearise, prepare
 from sorojax.fem.equilibrium.response import tangent_solve
 from sorojax.fem.problem import load_force
 from sorojax.fem.relaxation import at_instant, moduli, relaxed
@@ -52,10 +53,11 @@ from sorojax.systems.blocks.sampled_force import (
     sampled_force,
 )
 
-_EIGENMODES = 2  # of the shapes, beside those of the equilibria
-_AROUND = 0.05  # of the spread of states: how far more of them are drawn about each
+_EIGENMODES = 2  # of the shapes, where no motion is shown
+_AROUND = 0.02  # of the spread of states: how far more of them are drawn about each
 _SLOPES = 0.2  # weight of the slopes of the force, beside it
 _SMALL = 0.1  # of the largest displacement: errors of smaller ones count as of one of this size
+_SOFTEST = 0.1  # of the stiffness without loads: what errors of the force are divided by
 _FREE = 1e-9  # of the largest stiffness: below it a shape moves the body as a whole
 _PASSES = 12  # of Newton's method to an equilibrium
 _CANDIDATES = 6000  # cells or points among which is chosen, at most
@@ -165,14 +167,16 @@ def sampled_body(
     seen, told, slopes = _equilibria(body, paths, given.problem)
     report("sampled_body: cells", 0, 1)
     shown, beside = (shown, []) if paths else (shown[::2], shown[1::2])
-    basis = snapshot_basis(body, jnp.stack([*(s.u for s in seen), *slopes, *shown]), modes)
+    eigen = 0 if motions else _EIGENMODES
+    known = jnp.stack([*(s.u for s in seen), *slopes, *shown])
+    basis = snapshot_basis(body, known, modes, eigen=eigen)
     cells, points = pieces(body)
     every = sampled_force(body, basis, cells, np.ones(len(cells)), points)
     whole = modal_body(_without_viscosity(weighed), basis, order=None)
     whole = eqx.tree_at(lambda b: b.force, whole, every)
     known = [coordinates(body, basis, s.u) for s in seen]
     free = [coordinates(body, basis, u) for u in shown[:: 1 + len(shown) // _FRAMES]]
-    near: list = [(q, None, 0) for q in free]
+    near = [(q, _stiffness_in_motion(whole, q), 0) for q in free]
     for q, state in zip(known, seen, strict=True):
         near.append((q, -_slope(whole, state.inputs, q), states))
     spread = _AROUND * jnp.std(jnp.stack([*known, *free]), axis=0)
@@ -350,29 +354,50 @@ def _size(body: FemBody, u: Float[Array, "nodes dim"]) -> Float[Array, ""]:
 
 
 def snapshot_basis(
-    body: FemBody, displacements: Float[Array, "states nodes dim"], modes: int
+    body: FemBody,
+    displacements: Float[Array, "states nodes dim"],
+    modes: int,
+    *,
+    eigen: int = 0,
 ) -> Basis:
-    """Shapes for `modal_body`: the lowest eigenmodes and the main directions of displacements
-    from rest (proper orthogonal decomposition in the mass). Of a body without supports its
-    translations take the place of the eigenmodes."""
+    """Shapes for `modal_body`: the main directions of displacements from rest (proper
+    orthogonal decomposition), and as many of the lowest eigenmodes as `eigen` says. Of a body
+    without supports its translations come first.
+
+    Directions are ordered by their strain energy in small deformation and their mass, each as
+    a share of the sum over all displacements. What a body in few shapes is off by is bounded by
+    the energy that they miss: by mass alone the tip of a finger was off three times as far. A
+    body without supports, which friction moves, gained nothing by it and keeps to the mass.
+    """
     system, mass = body.problem.space.system, body.matter().mass
     still, free = jnp.zeros_like(displacements[0]), not body.problem.supports
     rows = displacements.reshape(displacements.shape[0], -1)
-    weigh = jax.vmap(lambda row: product(system, mass, row))
+
+    def weighed(matrix, rows):
+        return jax.vmap(lambda row: product(system, matrix, row))(rows)
+
     fixed = orthonormal(system, mass, _translations(body.problem)) if free else rows[:0]
-    rows = rows - rows @ weigh(fixed).T @ fixed if free else rows
-    sizes = jnp.sqrt(jnp.sum(rows * weigh(rows), axis=1))
-    rows = rows[np.asarray(sizes) > 1e-12 * float(jnp.max(sizes))]
-    _, vectors = jnp.linalg.eigh(rows @ weigh(rows).T)
-    beside = [fixed] if free else [_eigenmodes(body.problem, still)]
-    main = (vectors[:, ::-1].T @ rows)[: modes - len(beside[0])]
-    both = [*beside, main] if free else [main, *beside]
-    shapes = orthonormal(system, mass, jnp.concatenate(both))
+    rows = rows - rows @ weighed(mass, fixed).T @ fixed if free else rows
+    by_mass = rows @ weighed(mass, rows).T
+    both = by_mass / jnp.trace(by_mass)
+    if not free:
+        unloaded = eqx.tree_at(lambda p: p.loads, body.problem, ())
+        stiffness = linearise(unloaded, prepare(unloaded), still, still).values
+        by_energy = rows @ weighed(stiffness, rows).T
+        both = both + by_energy / jnp.trace(by_energy)
+    kept = np.sqrt(np.asarray(jnp.diag(by_mass)))
+    kept = np.flatnonzero(kept > 1e-12 * kept.max())
+    _, vectors = jnp.linalg.eigh(both[jnp.ix_(kept, kept)])
+    beside = [fixed] if free else [_eigenmodes(body.problem, still, eigen)] if eigen else []
+    main = (vectors[:, ::-1].T @ rows[kept])[: modes - sum(map(len, beside))]
+    shapes = orthonormal(
+        system, mass, jnp.concatenate([*beside, main] if free else [main, *beside])
+    )
     return Basis(still, shapes.reshape(-1, *still.shape))
 
 
-def _eigenmodes(problem: fem.Problem, still) -> Float[Array, "modes dofs"]:
-    return fem.eigenmodes(problem, still, _EIGENMODES).shapes.reshape(_EIGENMODES, -1)
+def _eigenmodes(problem: fem.Problem, still, count: int) -> Float[Array, "modes dofs"]:
+    return fem.eigenmodes(problem, still, count).shapes.reshape(count, -1)
 
 
 def _translations(problem: fem.Problem) -> Float[Array, "directions dofs"]:
@@ -384,17 +409,17 @@ def _translations(problem: fem.Problem) -> Float[Array, "directions dofs"]:
 
 def _chosen(
     whole: SampledForce,
-    states: Sequence[tuple[Modes, Float[Array, "modes modes"] | None, int]],
+    states: Sequence[tuple[Modes, Float[Array, "modes modes"], int]],
     spread: Modes,
     tolerance: float,
     seed: int,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Cells and their weights, and the error that is left; from coordinates, the stiffness at
-    equilibria, and how many more states are drawn about each.
+    """Cells and their weights, and the error that is left; from coordinates, the stiffness
+    under the loads there, and how many more states are drawn about each.
 
-    Each state has rows of the force, as the displacement that it makes there, and of its
-    slopes, as a metric sees them that makes their sum one: small errors in stiff directions
-    would otherwise hide soft ones.
+    Each state has rows of the force, as the displacement that it makes under these loads, and
+    of its slopes, as a metric sees them that makes their sum one: small errors in stiff
+    directions would otherwise hide soft ones.
     """
     upper = np.triu_indices(len(spread))
 
@@ -405,17 +430,12 @@ def _chosen(
     @jax.jit
     def rows_of(q, stiffness):
         slopes = jax.jacfwd(of_cells)(q)
-        values, vectors = jnp.linalg.eigh(jnp.sum(slopes, axis=1))
-        size = jnp.abs(values)
-        held = size > _FREE * jnp.max(size)
-        half = jnp.where(held, 1 / jnp.sqrt(jnp.where(held, size, 1.0)), 0.0)
-        half = half[:, None] * vectors.T
+        half = _whitened(jnp.sum(slopes, axis=1))
         bent = jnp.einsum("am,mcn,bn->abc", half, slopes, half)[upper]
-        size = jnp.sqrt(jnp.asarray(len(values), q.dtype))
-        force = of_cells(q)
-        moved = half.T @ half @ force
-        if stiffness is not None:
-            moved = jnp.linalg.solve(stiffness, force)
+        size = jnp.sqrt(jnp.asarray(len(q), q.dtype))
+        values, vectors = jnp.linalg.eigh(half @ stiffness @ half.T)
+        ways = vectors.T @ half
+        moved = ways.T @ ((ways @ of_cells(q)) / jnp.maximum(values, _SOFTEST)[:, None])
         return moved, _SLOPES * bent / size
 
     draw = np.random.default_rng(seed)
@@ -435,6 +455,31 @@ def _chosen(
     of_some, of_all = zip(*sized, *(bent for _, bent in rows), strict=True)
     found = sparse_weights(np.concatenate(of_some), np.concatenate(of_all), tolerance)
     return some[found[0]], *found[1:]
+
+
+def _whitened(stiffness: Float[Array, "modes modes"]) -> Float[Array, "modes modes"]:
+    """Combinations of the shapes, one a row, whose stiffness is one; nothing in the rows of
+    those that move the body as a whole."""
+    values, vectors = jnp.linalg.eigh(stiffness)
+    size = jnp.abs(values)
+    held = size > _FREE * jnp.max(size)
+    return jnp.where(held, 1 / jnp.sqrt(jnp.where(held, size, 1.0)), 0.0)[:, None] * vectors.T
+
+
+@jax.jit
+def _stiffness_in_motion(body: ModalBody, q: Modes) -> Float[Array, "modes modes"]:
+    """Stiffness at a frame of a motion, whose loads are not given: those that balance the
+    force of the body best. Pressures may leave a tenth of what is stiff without them. What
+    touches a body in contact is not known, so there it is the stiffness without loads."""
+    force, stiffness = body.force(q), jax.jacfwd(body.force)(q)
+    if body.contacts or not body.ports:
+        return stiffness
+    none = {port: jnp.zeros(shape, q.dtype) for _, port, shape, _ in body.ports}
+    flat, inputs = ravel_pytree(none)
+    half = _whitened(stiffness)
+    pushes = jax.jacfwd(lambda values: body.loads(inputs(values))(q))(flat)
+    values = jnp.linalg.lstsq(half @ pushes, half @ force)[0]
+    return stiffness - jax.jacfwd(body.loads(inputs(values)))(q)
 
 
 def sparse_weights(
