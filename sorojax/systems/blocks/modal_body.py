@@ -34,7 +34,7 @@ from sorojax.systems.blocks.surface_contact import (
     surface_contact,
 )
 
-#: Reach beyond which a trained force is not trusted; a bellows' tip is off by 7 % at 1.22.
+#: Reach beyond which a trained force is not trusted; a bellows' tip is off by 6 % at 1.28.
 _FARTHEST = 1.25
 
 
