@@ -60,6 +60,7 @@ _SMALL = 0.1  # of the largest displacement: errors of smaller ones count as of 
 _SOFTEST = 0.1  # of the stiffness without loads: what errors of the force are divided by
 _FREE = 1e-9  # of the largest stiffness: below it a shape moves the body as a whole
 _PASSES = 12  # of Newton's method to an equilibrium
+_ROOT = 1e-6  # of the largest coordinate: change by which it is one
 _CANDIDATES = 6000  # cells or points among which is chosen, at most
 _FRAMES = 200  # of the motions that cells are chosen by, at most about
 _MOST = 400  # cells that are chosen at most
@@ -239,11 +240,10 @@ def _viscosity(body: FemBody, cells: np.ndarray) -> Float[Array, " kept"] | None
 
 
 class _State(NamedTuple):
-    """An equilibrium [m], its inputs, and the equilibrium before it on its path [m]."""
+    """An equilibrium [m], and its inputs."""
 
     u: Float[Array, "nodes dim"]
     inputs: dict[str, Array]
-    before: Float[Array, "nodes dim"]
 
 
 def _equilibria(
@@ -261,7 +261,7 @@ def _equilibria(
         solved = fem.solve_path(body.loaded(rest), **driven).displacements
         reach = jnp.max(jnp.abs(rows), axis=0)
         for k, (u, row) in enumerate(zip(solved, rows, strict=True)):
-            state = _State(u, {**rest, name: row}, solved[max(k - 1, 0)])
+            state = _State(u, {**rest, name: row})
             (told if k % 2 else seen).append(state)
             if k % 2 == 0:
                 slopes.extend(_slopes(body, u, state.inputs, name, reach))
@@ -276,8 +276,7 @@ def _error(body: FemBody, small: ModalBody, told: Sequence[_State]) -> Float[Arr
     """Largest difference to equilibria in the norm of the mass, over the largest of these."""
     off, sizes = [], []
     for state in told:
-        start = coordinates(body, small.basis, state.before)
-        q = _equilibrium(small, state.inputs, start)
+        q = _equilibrium(small, state.inputs, coordinates(body, small.basis, state.u))
         off.append(_size(body, state.u - displacement(small.basis, q)))
         sizes.append(_size(body, state.u))
     error = jnp.max(jnp.stack(off)) / jnp.max(jnp.stack(sizes))
@@ -530,10 +529,13 @@ def _slope(body: ModalBody, values: Mapping[str, Array], q: Modes):
 
 @jax.jit
 def _equilibrium(body: ModalBody, values: Mapping[str, Array], start: Modes) -> Modes:
-    """Coordinates at rest, by Newton's method."""
+    """Coordinates at rest, by Newton's method; infinite where it finds none."""
 
     def closer(q, _):
         slope = _slope(body, values, q)
-        return q - jnp.linalg.solve(slope, _accelerated(body, q, values)), None
+        change = jnp.linalg.solve(slope, _accelerated(body, q, values))
+        return q - change, jnp.max(jnp.abs(change))
 
-    return jax.lax.scan(closer, start, length=_PASSES)[0]
+    q, changes = jax.lax.scan(closer, start, length=_PASSES)
+    found = changes[-1] <= _ROOT * jnp.maximum(jnp.max(jnp.abs(q)), jnp.max(jnp.abs(start)))
+    return jnp.where(found, q, jnp.inf)
