@@ -35,15 +35,18 @@ def finger(num_nodes, strains, orders):
         density=2000.0,
         reference_strain=[0.0, 0.0, 0.0, 1.0, 0.0, 0.0],
     )
+    basis = StrainBasisSpec("chebyshev", tuple(strains), orders)
+    return clamped(link, basis, num_nodes, [0.0, 0.0, -9.81])
+
+
+def clamped(link, basis, num_nodes, gravity, **more):
+    """One link on a base that stays."""
     segment = GVSSegment(
-        link=link,
-        joint=JointSpec(type="fixed"),
-        basis=StrainBasisSpec("chebyshev", tuple(strains), orders),
-        num_gauss_points=num_nodes,
+        link=link, joint=JointSpec(type="fixed"), basis=basis, num_gauss_points=num_nodes
     )
     # Its base pose is a scalar-last quaternion and a position.
     base = jnp.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    return GVS.from_segments([segment], gravity=jnp.array([0, 0, -9.81]), base_pose=base)
+    return GVS.from_segments([segment], gravity=jnp.array(gravity), base_pose=base, **more)
 
 
 def bending(request):
@@ -124,15 +127,9 @@ def chambered(request):
             reference_strain=[0.0, 0.0, 0.0, 1.0, 0.0, 0.0],
             damping=damping,
         )
-        segment = GVSSegment(
-            link=link,
-            joint=JointSpec(type="fixed"),
-            basis=StrainBasisSpec("chebyshev", ("kappa_y", "kappa_z", "sigma_x"), ORDERS),
-            num_gauss_points=request["nodes"],
-        )
-        base = jnp.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-        down = jnp.array([request["gravity"], 0.0, 0.0])
-        return GVS.from_segments([segment], gravity=down, base_pose=base, actuators=[chambers])
+        basis = StrainBasisSpec("chebyshev", ("kappa_y", "kappa_z", "sigma_x"), ORDERS)
+        down = [request["gravity"], 0.0, 0.0]
+        return clamped(link, basis, request["nodes"], down, actuators=[chambers])
 
     still = built(None)
     return built(request["damping"] * still.params.link.stiffness[0])

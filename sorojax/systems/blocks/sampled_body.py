@@ -169,8 +169,8 @@ def sampled_body(
     report("sampled_body: cells", 0, 1)
     shown, beside = (shown, []) if paths else (shown[::2], shown[1::2])
     eigen = 0 if motions else _EIGENMODES
-    known = jnp.stack([*(s.u for s in seen), *slopes, *shown])
-    basis = snapshot_basis(body, known, modes, eigen=eigen)
+    snapshots = jnp.stack([*(s.u for s in seen), *slopes, *shown])
+    basis = snapshot_basis(body, snapshots, modes, eigen=eigen)
     cells, points = pieces(body)
     every = sampled_force(body, basis, cells, np.ones(len(cells)), points)
     whole = modal_body(_without_viscosity(weighed), basis, order=None)
