@@ -75,7 +75,7 @@ ROWS = {
         ("systems.batch", "systems.fem", "systems.hand", "systems.sampled"),
     ),
     "inverse kinematics and estimator": Cases(("rod.ik", "systems.estimator")),
-    "environments": Cases(("envs.steps",)),
+    "environments": Cases(("envs.steps",), ("envs.contact_steps",)),
     "gradients": Cases(
         ("fem.gradient",),
         ("reduction.gradient", "reduction.remesh", "rod.gradient", "design.uncertainty"),

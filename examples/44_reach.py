@@ -1,16 +1,18 @@
 """A soft finger learns to reach: a policy trained by gradients through the physics.
 
 The finger is `sj.envs.FingerReach`: three chambers, markers as a camera sees them, pressures
-that arrive late. The mean reward of 64 episodes of 32 steps is
-differentiated, each of a finger with a stiffness, a length and a supply of its own; nothing
-is estimated from samples. Asked for are
-95 % of unseen fingers and targets within 5 mm at the end of an episode; measured are 70 %, with
-a median of 3.8 mm, after 250 updates, which take 87 s of one core with their compilation.
+that arrive late. The policy gives the change of the commands, so the loop has integral action.
+64 fingers, each with a stiffness, a length and a supply of its own, go through episodes of 96
+steps; after every 32 of these the policy follows the gradient of their mean reward, and they
+go on from where they are. Nothing is estimated from samples. Asked for are 95 % of unseen
+fingers and targets within 5 mm at the end of an episode; measured are 98 %, with a median of
+0.65 mm, after 501 updates, four minutes of one slow core with their compilation.
 """
 
 import io
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,68 +27,84 @@ from sorojax import envs
 
 ENV = envs.FingerReach(time_step=4e-3, substeps=5, max_steps=96)
 FINGERS, HORIZON = 64, 32
+WINDOWS = ENV.max_steps // HORIZON  # of an episode
 
 
 def policy(key) -> eqx.nn.MLP:
-    """From what the bench measures to three commands."""
+    """From what the bench measures to the change of three commands."""
     sizes = ENV.num_observations, ENV.num_actions, 64, 2
     return eqx.nn.MLP(*sizes, jax.nn.tanh, jnp.tanh, key=key)
 
 
-def rolled(net, key, params, steps):
-    """Rewards, distances and states of one finger in an episode, from its beginning."""
-    start, *later = jax.random.split(key, steps + 1)
+def command(net, seen):
+    """The last commands, which are seen too, and a change; at a limit its slope goes on."""
+    free = seen[3:6] + net(seen) / 4
+    return free + jax.lax.stop_gradient(jnp.clip(free, -1, 1) - free)
+
+
+def begun(key, count):
+    """Fingers within 4 % of the usual one, each with a target of its own, at rest."""
+    params = envs.randomised(ENV.default_params(), key, 0.04, members=count)
+    return params, jax.vmap(partial(envs.reset, ENV))(jax.random.split(key, count), params)
+
+
+@partial(jax.vmap, in_axes=(None, 0, 0, 0))
+def rolled(net, keys, params, begin):
+    """Where fingers are after some steps, and rewards, distances and states on the way."""
 
     def one(carry, key):
-        state, seen = carry
-        after = envs.step(ENV, key, state, net(seen), params)
-        out = after.reward, after.info["distance"], after.info["diverged"], state
+        after = envs.step(ENV, key, carry[0], command(net, carry[1]), params)
+        out = after.reward, after.info["distance"], after.info["diverged"], carry[0]
         return (after.state, after.observation), out
 
-    return jax.lax.scan(one, envs.reset(ENV, start, params), jnp.stack(later))[1]
-
-
-def tried(net, key, count, steps):
-    """Episodes of fingers within 4 % of the drawn one, with targets of their own."""
-    params = envs.randomised(ENV.default_params(), key, 0.04, members=count)
-    run = jax.vmap(lambda key, own: rolled(net, key, own, steps))
-    return params, *run(jax.random.split(key, count), params)
+    return jax.lax.scan(one, begin, keys)
 
 
 @eqx.filter_jit
-def trained(net, key, updates, rate=3e-3):
-    """The policy after some updates, and the mean reward of each."""
+def trained(net, key, episodes, rate=6e-3):
+    """The policy after some episodes, and the mean reward of each update."""
     weights, form = eqx.partition(net, eqx.is_inexact_array)
-    optimiser = optax.chain(
-        optax.clip_by_global_norm(1.0), optax.adam(optax.cosine_decay_schedule(rate, updates))
-    )
+    adam = optax.adam(optax.cosine_decay_schedule(rate, WINDOWS * episodes))
+    optimiser = optax.chain(optax.clip_by_global_norm(1.0), adam)
 
-    def loss(weights, key):
-        return -tried(eqx.combine(weights, form), key, FINGERS, HORIZON)[1].mean()
+    def loss(weights, key, params, begin):
+        keys = jax.random.split(key, (FINGERS, HORIZON))
+        end, out = rolled(eqx.combine(weights, form), keys, params, begin)
+        return -out[0].mean(), end
 
-    def update(carry, key):
-        weights, moments = carry
-        value, slope = jax.value_and_grad(loss)(weights, key)
-        change, moments = optimiser.update(slope, moments)
-        return (optax.apply_updates(weights, change), moments), -value
+    def episode(carry, key):
+        first, *keys = jax.random.split(key, 1 + WINDOWS)
+        params, begin = begun(first, FINGERS)
 
-    start, keys = (weights, optimiser.init(weights)), jax.random.split(key, updates)
-    (weights, _), rewards = jax.lax.scan(update, start, keys)
+        def update(carry, key):
+            weights, moments, now = carry
+            find = jax.value_and_grad(loss, has_aux=True)
+            (value, now), slope = find(weights, key, params, now)
+            change, moments = optimiser.update(slope, moments)
+            return (optax.apply_updates(weights, change), moments, now), -value
+
+        (*carry, _), rewards = jax.lax.scan(update, (*carry, begin), jnp.stack(keys))
+        return tuple(carry), rewards
+
+    start = weights, optimiser.init(weights)
+    (weights, _), rewards = jax.lax.scan(episode, start, jax.random.split(key, episodes))
     return eqx.combine(weights, form), rewards
 
 
 def main(quick: bool = False, file: Path | None = None) -> dict[str, float]:
     """Train, then try on 256 new fingers and targets."""
-    updates, count = (40, 32) if quick else (250, 256)
-    net, rewards = trained(policy(jax.random.key(1)), jax.random.key(2), updates)
-    judge = eqx.filter_jit(lambda net: tried(net, jax.random.key(3), count, ENV.max_steps))
-    params, _, distance, diverged, states = judge(net)
-    before = judge(policy(jax.random.key(1)))[2]
+    episodes, count = (14, 32) if quick else (167, 256)
+    net, rewards = trained(policy(jax.random.key(1)), jax.random.key(2), episodes)
+    params, begin = begun(jax.random.key(3), count)
+    keys = jax.random.split(jax.random.key(4), (count, ENV.max_steps))
+    judge = eqx.filter_jit(lambda net: rolled(net, keys, params, begin)[1])
+    _, distance, diverged, states = judge(net)
+    before = judge(policy(jax.random.key(1)))[1]
     if file is not None:
         draw(np.asarray(rewards), 1e3 * np.asarray(distance), params, states, file)
     return {
-        "reward of the first updates": float(rewards[:5].mean()),
-        "reward of the last updates": float(rewards[-5:].mean()),
+        "reward of the first episodes": float(rewards[:2].mean()),
+        "reward of the last episodes": float(rewards[-2:].mean()),
         "reached before training [%]": 100 * float((before[:, -1] < ENV.tolerance).mean()),
         "reached [%]": 100 * float((distance[:, -1] < ENV.tolerance).mean()),
         "median distance at the end [mm]": 1e3 * float(jnp.median(distance[:, -1])),
@@ -102,8 +120,8 @@ def draw(rewards: np.ndarray, distance: np.ndarray, params, states, file: Path) 
     halves: Any = figure.subfigures(2, 1, height_ratios=(1, 0.85))
     above, below = halves
     left, right = above.subplots(1, 2)
-    left.plot(rewards, color="#1f5f8b", lw=1)
-    left.set(xlabel="updates, of 64 fingers by 32 steps each", ylabel="mean reward")
+    left.plot(rewards.mean(axis=1), color="#1f5f8b", lw=1)
+    left.set(xlabel="episodes of 64 fingers by 96 steps", ylabel="mean reward")
     time = ENV.period * np.arange(1, distance.shape[1] + 1)
     for share, style in ((50, "-"), (95, "--")):
         right.plot(time, np.percentile(distance, share, axis=0), style, color="#1f5f8b")
