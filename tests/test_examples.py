@@ -170,7 +170,9 @@ def test_a_rod_in_free_flight_keeps_its_momentum():
 def test_a_finger_learns_to_reach():
     with jax.numpy_dtype_promotion("standard"):  # optax mixes integers and floats
         numbers = main_of("44_reach")(quick=True)
-    assert numbers["reward of the last episodes"] > numbers["reward of the first episodes"] + 0.1
+    assert (
+        numbers["reward of the last episodes"] > numbers["reward of the first episodes"] + 0.1
+    )
     assert numbers["median distance at the end [mm]"] < 15  # 30 mm where nothing is learnt
     assert numbers["diverged"] == 0
     assert user_code("44_reach") <= 60

@@ -294,7 +294,7 @@ def plan_outline(mesh: Mesh, num_interfaces: int) -> Border:
     points = np.asarray(mesh.points)
     groups = facet_groups(mesh, num_interfaces)
     if "corners" in mesh.node_sets:
-        corners = np.asarray(mesh.node_sets["corners"])
+        corners = np.unique(mesh.node_sets["corners"])
     else:
         corners = _sharp_nodes(points, groups[0])
     place = np.full(len(points), -1)
