@@ -97,7 +97,8 @@ def by_steps(
             return jax.vmap(lambda row: jnp.interp(begin + t, times, row))(given.T)
 
         count = round(period / step)
-        after = solids.rolled(solid, state, air, time_step=step, steps=count, implicit=implicit)
+        how = {"time_step": step, "steps": count, "implicit": implicit}
+        after, _ = solids.rolled(solid, state, air, **how)
         return after, solids.places(small, after.q)[-1]
 
     start = solids.settled(solid, jnp.zeros(len(PORTS)))

@@ -169,5 +169,6 @@ def _check_closed(where: str, load: Pressure, mesh: Mesh, kinematics, known) -> 
             f"fem.problem: {where} acts on facets with an open end at nodes "
             f"{ends[~safe][:4].tolist()}, so it has no potential: its work depends on the "
             "way that the end takes. Close the cavity, fix the nodes at its ends, let them "
-            "slide in planes of symmetry through `origin`, or use fem.Traction."
+            "slide in planes of symmetry through `origin`, or use fem.Traction. Where the "
+            "drawing is closed, its mesh is too coarse: lower `size`."
         )
