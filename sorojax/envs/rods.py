@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from sorojax.math.compiled import chunked_lanes
 from sorojax.math.ode.linearly_implicit import LinearlyImplicit
 from sorojax.math.ode.steppers import AbstractStepper
 from sorojax.rod import (
@@ -54,18 +55,13 @@ def rolled(
     steps: int,
 ) -> RodBody:
     """The body after some steps of one length [s], from the time 0."""
-    path = rollout(
-        model,
-        body.q,
-        body.v,
-        forces,
-        step=time_step,
-        saves=1,
-        every=steps,
-        stepper=stepper,
-        check=False,
-    )
-    return RodBody(path.q[-1], path.v[-1])
+    how = {"saves": 1, "every": steps, "stepper": stepper, "check": False}
+
+    def run(model: Rod | Assembly, body: RodBody, forces: tuple[Any, ...]) -> RodBody:
+        path = rollout(model, body.q, body.v, forces, step=time_step, **how)
+        return RodBody(path.q[-1], path.v[-1])
+
+    return chunked_lanes(run)(model, body, forces)
 
 
 _SETTLING = (0.05, 40)  # [s], steps: what is left then is rounding
