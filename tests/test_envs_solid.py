@@ -94,7 +94,7 @@ def test_all_cells_make_the_force_of_the_mesh(small):
     np.testing.assert_allclose(body.force(q), want, atol=1e-10 * float(jnp.abs(want).max()))
 
 
-def test_steps_are_of_second_order_and_say_where_they_do_not_end(small):
+def test_steps_are_of_second_order(small):
     """A quarter of the error by steps of half the length."""
     solid = solids.Solid(small.reduced.body, jnp.ones(()))
     start = solids.SolidBody(small.reduced.body.q, small.reduced.body.v)
@@ -102,14 +102,12 @@ def test_steps_are_of_second_order_and_say_where_they_do_not_end(small):
     def air(t):
         return 8e3 * jnp.stack([1 - jnp.cos(20 * t), jnp.sin(15 * t) ** 2])
 
-    def end(steps, **how):
-        return solids.rolled(solid, start, air, time_step=0.16 / steps, steps=steps, **how)
+    def end(steps):
+        return solids.rolled(solid, start, air, time_step=0.16 / steps, steps=steps).q
 
-    (fine, _), *coarse = (end(n) for n in (2560, 40, 80, 160))
-    errors = [float(jnp.linalg.norm(after.q - fine.q)) for after, _ in coarse]
+    fine = end(2560)
+    errors = [float(jnp.linalg.norm(end(n) - fine)) for n in (40, 80, 160)]
     assert 3.3 < errors[0] / errors[1] < 5 and 3.3 < errors[1] / errors[2] < 5
-    assert all(balanced for _, balanced in coarse)
-    assert not end(40, passes=1)[1]
 
 
 def test_a_body_that_is_strained_beyond_its_training_ends_the_episode(small, getkey):

@@ -97,8 +97,7 @@ def by_steps(
             return jax.vmap(lambda row: jnp.interp(begin + t, times, row))(given.T)
 
         count = round(period / step)
-        how = {"time_step": step, "steps": count, "implicit": implicit}
-        after, _ = solids.rolled(solid, state, air, **how)
+        after = solids.rolled(solid, state, air, time_step=step, steps=count, implicit=implicit)
         return after, solids.places(small, after.q)[-1]
 
     start = solids.settled(solid, jnp.zeros(len(PORTS)))

@@ -26,10 +26,7 @@ from sorojax.systems.blocks.sampled_force import SampledForce
 
 _FARTHEST = 1.25  # of the strains of the training, as in a network
 _SETTLING = (0.05, 40, 20)  # [s], steps, and how many of them raise the pressures
-_PASSES = 3  # of a step
 _LANES = 4  # members at once on a CPU, whose cache holds what they need
-_KNOWN = 1e-3  # of a change: below, a pass tells nothing of the derivative
-_UNBALANCED = 1e-2  # of the strains of the training, by which a step may be off
 
 
 _TRAINING = modal_basis, modal_body, sampled_body, sampled_force, surface_contact
@@ -124,86 +121,37 @@ def rolled(
     time_step: float,
     steps: int,
     implicit: float = 0.5,
-    passes: int = _PASSES,
-) -> tuple[SolidBody, Bool[Array, ""]]:
+) -> SolidBody:
     """The body after some steps of one length [s], from the time 0, under inputs by the time,
-    in the order of the ports, and whether the forces of all steps balance.
+    in the order of the ports.
 
-    Steps of the implicit midpoint rule, m a = f(t + h/2, q + h/2 v + h^2/4 a, v + h/2 a), by a
-    fixed number of passes of a quasi-Newton method: of second order, of the same cost in every
-    state. The derivatives of all forces are found once, at the beginning, and follow the motion
-    by updates of rank one. `implicit` 1 in place of 1/2 is backward Euler.
-
-    Reference:
-        Broyden, A class of methods for solving nonlinear simultaneous equations, Math. Comp.
-        19, 1965.
+    A step of the implicit midpoint rule with one Newton pass from rest, (m + h/2 D + h^2/4 K) a
+    = f(t + h/2, q + h/2 v, v): of second order, of the same cost in every state. D and K are
+    the derivatives of all forces there. `implicit` 1 in place of 1/2 is backward Euler.
     """
-    h, early = time_step, implicit * time_step
+    unit = jnp.eye(state.q.shape[0], dtype=state.q.dtype)
     numbers = jnp.arange(steps, dtype=state.q.dtype)
+    h, early = time_step, implicit * time_step
 
-    def run(solid: Solid, state: SolidBody) -> tuple[SolidBody, Array]:
-        def one(now: _Step, number: Array) -> tuple[_Step, Array]:
-            given = _by_port(solid.body, inputs((number + implicit) * h))
-            return _stepped(solid, now, given, h, early, passes)
+    def run(solid: Solid, state: SolidBody) -> SolidBody:
+        def one(state: SolidBody, number: Array) -> tuple[SolidBody, None]:
+            given = inputs((number + implicit) * h)
+            ahead = state.q + early * state.v
 
-        inverse = _inverse(solid, state, inputs(jnp.asarray(early, state.q.dtype)), early)
-        start = _Step(state, jnp.zeros_like(state.q), inverse)
-        after, changes = jax.lax.scan(one, start, numbers)
-        last = changes[jnp.argmax(jnp.sum(changes**2, axis=1))]
-        return after.state, solid.body.force.reach(h * early * last)
+            def pull(q, v):
+                return solid.body.pull(q, v, _by_port(solid.body, given))
 
-    after, off = chunked_lanes(run, _LANES)(solid, state)
-    return after, off <= _UNBALANCED
+            stiffness, damping = (
+                jax.jacfwd(lambda q: pull(q, state.v))(ahead),
+                jax.jacfwd(lambda v: pull(ahead, v))(state.v),
+            )
+            matrix = solid.mass * unit - early * damping - early**2 * stiffness
+            a = jnp.linalg.solve(matrix, pull(ahead, state.v))
+            return SolidBody(state.q + h * (state.v + early * a), state.v + h * a), None
 
+        return jax.lax.scan(one, state, numbers)[0]
 
-class _Step(NamedTuple):
-    """State, acceleration, and the inverse of the derivative of what is left of balance."""
-
-    state: SolidBody
-    a: Float[Array, " modes"]
-    inverse: Float[Array, "modes modes"]
-
-
-def _stepped(
-    solid: Solid, now: _Step, given: dict[str, Array], h: float, early: float, passes: int
-) -> tuple[_Step, Float[Array, " modes"]]:
-    """After a step, and the last change of the acceleration."""
-    (q, v), a, inverse = now
-
-    def left(a: Array) -> Array:
-        ahead = v + early * a
-        return solid.body.pull(q + early * ahead, ahead, given) - solid.mass * a
-
-    lacks = left(a)
-    change = inverse @ lacks
-    for _ in range(passes - 1):
-        a, before = a + change, lacks
-        lacks = left(a)
-        inverse = _updated(inverse, change, before - lacks)
-        change = inverse @ lacks
-    a = a + change
-    return _Step(SolidBody(q + h * (v + early * a), v + h * a), a, inverse), change
-
-
-def _inverse(solid: Solid, state: SolidBody, given: Float[Array, " inputs"], early: float):
-    """Of the derivative of m a - f by a, after a time `early` without acceleration; without
-    that of the viscosity by the shape, which is small and dear."""
-    ahead, pressures = state.q + early * state.v, _by_port(solid.body, given)
-    loads, unit = solid.body.loads(pressures), jnp.eye(state.q.shape[0], dtype=state.q.dtype)
-    stiffness = jax.jacfwd(lambda q: loads(q) - solid.body.force(q))(ahead)
-    damping = jax.jacfwd(lambda v: solid.body.pull(ahead, v, pressures))(state.v)
-    return jnp.linalg.inv(solid.mass * unit - early * damping - early**2 * stiffness)
-
-
-def _updated(
-    inverse: Float[Array, "modes modes"], change: Float[Array, " modes"], fell: Array
-) -> Float[Array, "modes modes"]:
-    """The inverse that makes of what the balance `fell` by the `change` that it came from."""
-    row, along = change @ inverse, inverse @ fell
-    share = row @ fell
-    known = jnp.abs(share) > _KNOWN * (change @ change)
-    new = inverse + jnp.outer(change - along, row) / jnp.where(known, share, 1.0)
-    return jnp.where(known, new, inverse)
+    return chunked_lanes(run, _LANES)(solid, state)
 
 
 def settled(solid: Solid, given: Float[Array, " inputs"]) -> SolidBody:
@@ -212,14 +160,10 @@ def settled(solid: Solid, given: Float[Array, " inputs"]) -> SolidBody:
     time_step, steps, rising = _SETTLING
     start = SolidBody(jnp.zeros_like(solid.body.q), jnp.zeros_like(solid.body.q))
 
-    def one(state: SolidBody, number: Array):
-        def raised(t):
-            return given * jnp.minimum((number + t / time_step) / rising, 1.0)
+    def raised(t):
+        return given * jnp.minimum(t / (rising * time_step), 1.0)
 
-        how = {"time_step": time_step, "steps": 1, "implicit": 1.0, "passes": 1}
-        return rolled(solid, state, raised, **how)[0], None
-
-    return jax.lax.scan(one, start, jnp.arange(steps, dtype=start.q.dtype))[0]
+    return rolled(solid, start, raised, time_step=time_step, steps=steps, implicit=1.0)
 
 
 def places(body: ModalBody, q: Float[Array, " modes"]) -> Float[Array, "markers dim"]:

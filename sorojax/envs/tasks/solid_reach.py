@@ -93,10 +93,10 @@ class SolidReach(AbstractEnv):
 
     def moved(self, body, delivery, goal, params):
         solid = self._solid(params)
-        after, balanced = solids.rolled(
+        after = solids.rolled(
             solid, body, delivery, time_step=self.time_step, steps=self.substeps
         )
-        return after, balanced & solids.known(solid.body, after.q)
+        return after, solids.known(solid.body, after.q)
 
     def markers(self, body, params):
         return solids.places(self.body.reduced.body, body.q)
