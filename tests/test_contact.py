@@ -225,3 +225,5 @@ def test_a_number_is_the_coefficient_of_coulombs_law():
         contact.LinePenalty(1e6, 1e-5, friction=-1.0)
     with pytest.raises(TypeError, match="friction"):
         contact.LinePenalty(1e6, 1e-5, friction="dry")  # type: ignore
+    with pytest.raises(TypeError, match="DirectionalCoulomb.*Give a number or a Coulomb"):
+        contact.LinePenalty(1e6, 1e-5, friction=contact.DirectionalCoulomb(0.2, 0.8, [1.0, 0]))

@@ -17,6 +17,8 @@ from sorojax.units import mm
 FRICTION, WEIGHT, LENGTH, DEPTH = 0.5, 981.0, 20 * mm, 0.03  # [-], N/m^3, m, m
 FLOOR = sdf.HalfPlane([0.0, 0.0], [0.0, 1.0])
 LAW = contact.SpringSlider(contact.Coulomb(FRICTION), 1e8, 1e-3)
+HAIRS = contact.DirectionalCoulomb(0.2, 0.8, [2.0, 0.0])
+ONE_WAY = contact.SpringSlider(HAIRS, 1e8, 1e-3)
 
 
 def block(pull=(0.0, 0.0), stiffness=None, friction=FRICTION) -> fem.Problem:
@@ -43,7 +45,8 @@ NORMAL = 1e3 * LENGTH * DEPTH  # N
 LIMIT = FRICTION * NORMAL / 50.0  # m, by which five springs of 10 N/m slip
 
 
-def test_the_step_of_friction_has_a_potential_and_a_memory():
+@pytest.mark.parametrize("law", [LAW, ONE_WAY], ids=["Coulomb", "directional"])
+def test_the_step_of_friction_has_a_potential_and_a_memory(law):
     key = jax.random.key(0)
     normal = jnp.array([0.6, 0.8])
     anchor, back, position = 1e-5 * jax.random.normal(key, (3, 40, 2))
@@ -54,15 +57,18 @@ def test_the_step_of_friction_has_a_potential_and_a_memory():
         jnp.linspace(1e8, 0, 40),
         back,
     )
-    traction = LAW.traction(grip, position)
-    slope = jax.grad(lambda x: jnp.sum(LAW.energy(grip, x)))(position)
+    traction = law.traction(grip, position)
+    slope = jax.grad(lambda x: jnp.sum(law.energy(grip, x)))(position)
     assert jnp.allclose(traction, -slope, rtol=1e-12, atol=1e-12)
     assert jnp.max(jnp.abs(traction @ normal)) < 1e-9
-    size, limit = jnp.linalg.norm(traction, axis=1), FRICTION * grip.pressure
+    middle = law.law.middle(grip.pressure, grip.normal)
+    pull = -traction if middle is None else -traction - middle
+    size, limit = jnp.linalg.norm(pull, axis=1), law.law.limit(grip.pressure)
     assert jnp.all(size <= limit * (1 + 1e-12))
     assert 5 < jnp.sum(size < 0.999 * limit) < 35  # some hold, some slide
+    assert jnp.array_equal(law.loading(grip, position) > 1, size >= limit * (1 - 1e-9))
     # spring and dashpot together carry the traction; a point that rests keeps its anchor
-    spring = LAW.stretch(grip, position)
+    spring = law.stretch(grip, position)
     before = back - anchor
     before = before - (before @ normal)[:, None] * normal[None]
     together = 1e8 * spring + grip.drag[:, None] * (spring - before)
@@ -70,17 +76,17 @@ def test_the_step_of_friction_has_a_potential_and_a_memory():
     rest = Grip(anchor, jnp.full(40, 1e9), grip.normal, 0 * grip.drag, back)
     moved = position - anchor
     assert jnp.allclose(
-        LAW.stretch(rest, position), moved - (moved @ normal)[:, None] * normal[None]
+        law.stretch(rest, position), moved - (moved @ normal)[:, None] * normal[None]
     )
     # what forces at a later half of the step do on its way, springs have lost, or more
     pressure = jnp.linspace(0, 4e3, 40)
-    held = grip._replace(anchor=back - LAW.bounded(before, pressure))
+    held = grip._replace(anchor=back - law.bounded(before, pressure, grip.normal))
     for share in (0.5, 0.8, 1.0):
         way = (position - back) / share
-        rise = LAW.stored(LAW.stretch(held, position, share)) - LAW.stored(back - held.anchor)
-        lost = -jnp.sum(LAW.traction(held, position) * way, axis=1) - rise
+        rise = law.stored(law.stretch(held, position, share)) - law.stored(back - held.anchor)
+        lost = -jnp.sum(law.traction(held, position) * way, axis=1) - rise
         assert jnp.min(lost) > -1e-12 * jnp.max(lost)
-    curvature = jax.hessian(lambda x: jnp.sum(LAW.energy(no_grip(x), x)))(position[0])
+    curvature = jax.hessian(lambda x: jnp.sum(law.energy(no_grip(x), x)))(position[0])
     assert jnp.all(curvature == 0)  # nothing of a point that does not touch, NaN neither
 
 
@@ -118,6 +124,30 @@ def test_a_block_holds_below_the_threshold_and_slides_above():
     assert jnp.allclose(u[np.asarray(slid.loads[1].nodes), 0].mean(), 2 * LIMIT, rtol=5e-3)
     force = fem.contact_state(slid, u, "floor").friction[:, 0]
     assert jnp.allclose(jnp.sum(force), -FRICTION * NORMAL, rtol=1e-3)
+
+
+def test_bristles_hold_more_one_way_than_back():
+    for way, coefficient in ((2.0, 0.2), (-2.0, 0.8)):
+        states, _ = pulled(block(friction=HAIRS), [0.0, way * LIMIT, way * LIMIT])
+        slid, u = states[-1]
+        force = fem.contact_state(slid, u, "floor").friction[:, 0]
+        want = -np.sign(way) * coefficient * NORMAL
+        assert jnp.allclose(jnp.sum(force), want, rtol=1e-3)
+    # in space: the coefficients along the direction, the root of their product sideways, and
+    # half the pull loads a point half as much
+    law = contact.SpringSlider(contact.DirectionalCoulomb(0.2, 0.8, [1.0, 0.0, 0.0]), 1e6)
+    grip = no_grip(jnp.zeros(3))._replace(
+        pressure=jnp.asarray(10.0), normal=jnp.array([0.0, 0.0, 1.0])
+    )
+    for way, most in (([1.0, 0, 0], 2.0), ([-1.0, 0, 0], 8.0), ([0, 1.0, 0], 4.0)):
+        way = jnp.asarray(way)
+        far = law.traction(grip, way)
+        assert jnp.linalg.norm(far) <= 8.0 and far @ way < 0
+        for share in (0.5, 1 - 1e-9, 1 + 1e-9):
+            at = share * most / 1e6 * way
+            assert jnp.allclose(law.loading(grip, at), share, rtol=1e-12)
+            pulled_back = law.traction(grip, at)
+            assert jnp.allclose(pulled_back, -jnp.minimum(share, 1.0) * most * way, atol=1e-6)
 
 
 def test_a_moving_obstacle_takes_the_block_along():
@@ -184,6 +214,11 @@ def test_bad_friction_is_refused(name):
     with pytest.raises(ValueError, match=f"{what}.*must be positive"):
         floor = dataclasses.replace(problem.loads[2], grip=None, **{name: -1.0})
         floor.check("Contact 'floor'", problem.mesh, problem.kinematics)
+
+
+def test_a_direction_of_friction_has_the_axes_of_the_mesh():
+    with pytest.raises(ValueError, match="direction of friction"):
+        block(friction=contact.DirectionalCoulomb(0.2, 0.8, [1.0, 0.0, 0.0]))
 
 
 def free_block() -> fem.Problem:

@@ -33,6 +33,41 @@ def test_the_mesh_of_the_crawler_is_its_drawing():
     assert float(floor.points_of(problem, zero)[..., 1].min()) == 0.0
 
 
+@pytest.mark.parametrize("groups", [1, 2, 3])
+def test_a_crawler_may_stand_on_feet(groups):
+    length = (50 * groups + 10) * mm
+    crawler = robots.Crawler(length, num_groups=groups, num_chambers=9, foot_height=2 * mm)
+    cells = crawler_mesh(crawler, 3 * mm)
+    assert float(jnp.sum(mesh.cell_areas(cells))) == pytest.approx(
+        float(sdf.area(crawler.body())), rel=1e-4
+    )
+    feet = crawler.feet()
+    wide = float(jnp.sum(feet[:, 1] - feet[:, 0]))
+    sole = float(jnp.sum(mesh.cell_areas(cells)[cells.regions["sole"]]))
+    assert sole == pytest.approx(2 * mm * (float(length) + wide), rel=1e-9)
+    problem = robots.crawler_problem(crawler, size=3 * mm)
+    names = [load.name for load in problem.loads]
+    assert names == ["gravity", *crawler.ports, "floor"] and len(feet) == groups + 1
+    floor = problem.loads[-1]
+    assert isinstance(floor, fem.Contact)
+    x, y = np.moveaxis(np.asarray(floor.points_of(problem, 0 * cells.points)), -1, 0)
+    on_floor = x[(y < 1e-9) & (x > 1e-9) & (x < length - 1e-9)]
+    stands = [np.any((a < on_floor) & (on_floor < b)) for a, b in np.asarray(feet)]
+    inside = [
+        np.any((on_floor > a) & (on_floor < b))
+        for a, b in zip(feet[:-1, 1], feet[1:, 0], strict=True)
+    ]
+    assert all(stands) and not any(inside)
+    assert tuple(robots.crawler_gait(ports=crawler.ports)) == crawler.ports
+
+
+def test_a_crawler_has_at_most_three_groups():
+    with pytest.raises(ValueError, match="got 4 for `num_groups`"):
+        robots.Crawler(num_groups=4)
+    with pytest.raises(ValueError, match="foot_height"):
+        robots.Crawler(foot_height=-1 * mm)
+
+
 def test_the_gait_is_a_row_of_half_waves():
     gait = robots.crawler_gait(8 * kPa, 2.0, np.pi / 3)
     assert tuple(gait) == PORTS

@@ -22,6 +22,13 @@ class AbstractFriction(eqx.Module):
         """Greatest tangential traction under a normal pressure, which is never negative: both
         per area [Pa], or per length of a rod [N/m]. It is zero without pressure."""
 
+    def middle(
+        self, pressure: Float[Array, "*points"], normal: Float[Array, "*points dim"]
+    ) -> Float[Array, "*points dim"] | None:
+        """Middle of the ball of tractions, of radius `limit`, that points can put on their
+        obstacle without sliding: tangential, and not outside the ball. None for zero."""
+        return None
+
 
 class Coulomb(AbstractFriction):
     """The traction is at most `coefficient` [-] times the pressure."""
@@ -34,6 +41,42 @@ class Coulomb(AbstractFriction):
 
     def limit(self, pressure):
         return self.coefficient * pressure
+
+
+class DirectionalCoulomb(AbstractFriction):
+    """Another coefficient [-] one way than back, as of bristles, scales or hooks.
+
+    The tractions that hold fill a ball in place of one round zero: `forward` times the pressure
+    against sliding along `direction`, `backward` times the pressure against sliding back, and
+    the root of their product sideways.
+
+    Attributes:
+        forward, backward: Coefficients of sliding along the direction and back [-].
+        direction: Of easy or hard sliding, in the frame of the obstacle; of any length.
+
+    References:
+        Goyal, Ruina, Papadopoulos, Planar sliding with dry friction, part 1, Wear 143, 1991:
+        limit surfaces of friction that are convex and hold zero.
+    """
+
+    forward: Float[Array, ""] = eqx.field(converter=real)
+    backward: Float[Array, ""] = eqx.field(converter=real)
+    direction: Float[Array, " dim"] = eqx.field(converter=real)
+
+    def __check_init__(self):
+        name = "contact.DirectionalCoulomb"
+        for side in ("forward", "backward"):
+            _check.positive(name, side, getattr(self, side), "-", "Use 1e-3 for almost none.")
+        length = jnp.linalg.norm(self.direction)
+        _check.positive(name, "length of `direction`", length, "-", "Give where it points.")
+
+    def limit(self, pressure):
+        return (self.forward + self.backward) / 2 * pressure
+
+    def middle(self, pressure, normal):
+        along = self.direction / jnp.linalg.norm(self.direction)
+        along = _across(jnp.broadcast_to(along, normal.shape), normal)
+        return ((self.forward - self.backward) / 2 * pressure)[..., None] * along
 
 
 def friction_law(given: AbstractFriction | Numbers | None) -> AbstractFriction | None:
@@ -93,21 +136,27 @@ class SpringSlider(eqx.Module):
     def energy(self, grip: Grip, position: Float[Array, "*points dim"]) -> Float[Array, "..."]:
         """Potential of a step per area [J/m^2]; friction is minus its slope."""
         whole, away = self._trial(grip, position)
-        limit = self.law.limit(grip.pressure)
-        held, length = _within(away, limit / whole)
+        limit, middle, beyond = self._ball(grip.pressure, grip.normal, whole, away)
+        held, length = _within(beyond, limit / whole)
         spring = jnp.where(limit > 0, whole, jnp.zeros_like(whole))  # none without pressure
         square = jnp.sum(away**2, axis=-1)
-        return jnp.where(held, spring * square / 2, limit * (length - limit / (2 * whole)))
+        slid = limit * (length - limit / (2 * whole))
+        if middle is not None:
+            slid = slid + jnp.sum(middle * (away - middle / (2 * whole[..., None])), axis=-1)
+        return jnp.where(held, spring * square / 2, slid)
 
     def traction(
         self, grip: Grip, position: Float[Array, "*points dim"]
     ) -> Float[Array, "*points dim"]:
         """Force of the obstacle on the points per area [Pa]."""
         whole, away = self._trial(grip, position)
-        limit = self.law.limit(grip.pressure)
-        held, length = _within(away, limit / whole)
+        limit, middle, beyond = self._ball(grip.pressure, grip.normal, whole, away)
+        held, length = _within(beyond, limit / whole)
         spring = jnp.where(limit > 0, whole, jnp.zeros_like(whole))
-        return -jnp.where(held, spring, limit / length)[..., None] * away
+        if middle is None:
+            return -jnp.where(held, spring, limit / length)[..., None] * away
+        slid = middle + (limit / length)[..., None] * beyond
+        return -jnp.where(held[..., None], spring[..., None] * away, slid)
 
     def loading(
         self, grip: Grip, position: Float[Array, "*points dim"]
@@ -115,10 +164,15 @@ class SpringSlider(eqx.Module):
         """Pull of spring and dashpot over the limit: points hold below 1 and slide above;
         infinite without pressure."""
         whole, away = self._trial(grip, position)
-        limit = self.law.limit(grip.pressure)
+        limit, middle, _ = self._ball(grip.pressure, grip.normal, whole, away)
         touches = limit > 0
-        pull = whole * jnp.sqrt(jnp.sum(away**2, axis=-1))
-        return jnp.where(touches, pull / jnp.where(touches, limit, 1.0), jnp.inf)
+        square, radius = whole**2 * jnp.sum(away**2, axis=-1), jnp.where(touches, limit, 1.0)
+        if middle is None:
+            return jnp.where(touches, jnp.sqrt(square) / radius, jnp.inf)
+        # the pull is on the ball of `loading` times the middle and the radius
+        along = whole * jnp.sum(away * middle, axis=-1)
+        room = jnp.where(touches, limit**2 - jnp.sum(middle**2, axis=-1), 1.0)
+        return jnp.where(touches, (jnp.sqrt(along**2 + room * square) - along) / room, jnp.inf)
 
     def stretch(
         self,
@@ -133,16 +187,29 @@ class SpringSlider(eqx.Module):
         return before + (pull / (self.stiffness + grip.drag)[..., None] - before) / share
 
     def bounded(
-        self, stretch: Float[Array, "*points dim"], pressure: Float[Array, "*points"]
+        self,
+        stretch: Float[Array, "*points dim"],
+        pressure: Float[Array, "*points"],
+        normal: Float[Array, "*points dim"],
     ) -> Float[Array, "*points dim"]:
         """A `stretch` [m] that a `pressure` [Pa] can hold: a spring beyond slides back."""
-        longest = self.law.limit(pressure) / self.stiffness
-        held, length = _within(stretch, longest)
-        return jnp.where(held, jnp.ones_like(length), longest / length)[..., None] * stretch
+        limit, middle, beyond = self._ball(pressure, normal, self.stiffness, stretch)
+        longest = limit / self.stiffness
+        held, length = _within(beyond, longest)
+        share = jnp.where(held, jnp.ones_like(length), longest / length)[..., None]
+        return stretch - beyond + share * beyond if middle is not None else share * stretch
 
     def stored(self, stretch: Float[Array, "*points dim"]) -> Float[Array, "..."]:
         """Energy in a spring of length `stretch` [m] per area [J/m^2]."""
         return self.stiffness / 2 * jnp.sum(stretch**2, axis=-1)
+
+    def _ball(self, pressure, normal, stiffness, away):
+        """Radius and middle of the ball of tractions that hold, and `away` from its middle."""
+        middle = self.law.middle(pressure, normal)
+        beyond = away
+        if middle is not None:
+            beyond = away - middle / jnp.broadcast_to(stiffness, pressure.shape)[..., None]
+        return self.law.limit(pressure), middle, beyond
 
     def _trial(self, grip: Grip, position):
         """Stiffness of spring and dashpot together, and how far the point is from where

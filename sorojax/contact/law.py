@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from sorojax import _check
 from sorojax._types import optional_real, real
-from sorojax.contact.friction import AbstractFriction, friction_law
+from sorojax.contact.friction import AbstractFriction, DirectionalCoulomb, friction_law
 
 
 class Penalty(eqx.Module):
@@ -149,6 +149,11 @@ class LinePenalty(eqx.Module):
         do = "Five to fifty Young's moduli suit the stiffness, 0.2 % of the radius the depth."
         for name, unit in (("stiffness", "N/m^2"), ("smoothing", "m"), ("slip", "m/s")):
             _check.positive("contact.LinePenalty", name, getattr(self, name), unit, do)
+        if isinstance(self.friction, DirectionalCoulomb):
+            raise TypeError(
+                "contact.LinePenalty: got a DirectionalCoulomb for `friction`, which holds "
+                "without creep. Give a number or a Coulomb; fem.Contact takes both."
+            )
         if self.damping is not None:
             do = "Leave it out for none."
             _check.positive("contact.LinePenalty", "damping", self.damping, "s/m", do)

@@ -3,6 +3,7 @@
 Reference: Shepherd et al., "Multigait soft robot", PNAS 108, 2011.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,6 +14,7 @@ from jaxtyping import Array, Float
 from sorojax import _check, fem, mesh
 from sorojax._display import displayed
 from sorojax._types import real
+from sorojax.contact import AbstractFriction
 from sorojax.material import AbstractHyperelastic, by_region, neo_hookean
 from sorojax.robots.printable import check_metres
 from sorojax.sdf import (
@@ -28,22 +30,26 @@ from sorojax.sdf import (
 from sorojax.units import MPa, deg, kPa, mm
 
 PORTS = ("rear", "middle", "front")
+_PORTS = {1: PORTS[1:2], 2: PORTS[::2], 3: PORTS}  # by the number of groups
 
 
 @displayed
 class Crawler(eqx.Module):
-    """Dimensions of the side view [m]; x runs along the crawler, y is 0 under its sole.
+    """Dimensions of the side view [m]; x runs along the crawler, y is 0 where it stands.
 
-    Three groups of chambers stand `group_spacing` apart, each with a port of its own. Under
+    Groups of chambers stand `group_spacing` apart, each with a port of its own. Under
     air a group gets longer on top but not in its sole, the lowest `sole_thickness`, and
-    arches its back. The defaults are 150 x 12 mm with 3 x 11 chambers.
+    arches its back. The defaults are 150 x 12 mm with 3 x 11 chambers, without feet.
 
     Attributes:
-        length, height: Of the whole.
+        length, height: Of the body.
         base: Thickness of the rubber below the chambers, with the sole.
         chamber_width, chamber_height: Of a chamber.
         wall_thickness: Between the chambers of a group.
+        foot_height: Of feet of the material of the sole, under both ends of the body and
+            between the groups.
         num_chambers: Of a group.
+        num_groups: 1 (port "middle"), 2 ("rear", "front") or 3 (all).
     """
 
     length: Float[Array, ""] = eqx.field(converter=real, default=150 * mm)
@@ -54,20 +60,29 @@ class Crawler(eqx.Module):
     chamber_height: Float[Array, ""] = eqx.field(converter=real, default=8.4 * mm)
     wall_thickness: Float[Array, ""] = eqx.field(converter=real, default=0.85 * mm)
     group_spacing: Float[Array, ""] = eqx.field(converter=real, default=50.5 * mm)
+    foot_height: Float[Array, ""] = eqx.field(converter=real, default=0.0)
     num_chambers: int = eqx.field(static=True, default=11)
+    num_groups: int = eqx.field(static=True, default=3)
 
     def __check_init__(self):
         check_metres(
             self, "height", "base", "sole_thickness", "chamber_width", "wall_thickness"
         )
+        if self.num_groups not in _PORTS:
+            raise ValueError(
+                f"Crawler: got {self.num_groups} for `num_groups`, need 1, 2 or 3. "
+                "Use `num_chambers` for longer groups."
+            )
         left = {
             "height of the roof": self.height - self.base - self.chamber_height,
             "distance between groups": self.group_spacing - self.group_length,
-            "length of both ends": self.length - 2 * self.group_spacing - self.group_length,
+            "length of both ends": 2 * self._first,
         }
         for name, size in left.items():
             do = "Make chambers smaller or the body larger."
             _check.positive("Crawler", name, size, "m", do)
+        do = "Lengths are in metres: write 2 * mm."
+        _check.not_negative("Crawler", "foot_height", self.foot_height, "m", do)
 
     @property
     def group_length(self) -> Float[Array, ""]:
@@ -76,25 +91,49 @@ class Crawler(eqx.Module):
             self.wall_thickness
         )
 
+    @property
+    def ports(self) -> tuple[str, ...]:
+        """Names of the pressures of its groups."""
+        return _PORTS[self.num_groups]
+
+    @property
+    def _first(self) -> Float[Array, ""]:
+        """Where the first group begins [m]."""
+        between = (self.num_groups - 1) * self.group_spacing
+        return (self.length - between - self.group_length) / 2
+
     def chambers(self, group: int) -> AbstractSdf:
-        """The air of a group: 0 at the rear, 1, or 2 in front."""
-        left = (self.length - self.group_length) / 2 + (group - 1) * self.group_spacing
-        first = Rectangle(
-            [0.0 * left, self.base], [self.chamber_width, self.base + self.chamber_height]
-        )
+        """The air of a group: 0 at the rear, and on towards the front."""
+        left = self._first + group * self.group_spacing
+        low = self.foot_height + self.base
+        first = Rectangle([0.0 * left, low], [self.chamber_width, low + self.chamber_height])
         pitch = jnp.stack([self.chamber_width + self.wall_thickness, 0.0 * left])
         row = repeat(first, pitch, self.num_chambers, separate=True)
         return translate(row, jnp.stack([left, 0.0 * left]))
 
     def sole(self) -> AbstractSdf:
         """The stiff layer and everything below it."""
-        return HalfPlane([0.0 * self.height, self.sole_thickness], [0.0, 1.0])
+        top = self.foot_height + self.sole_thickness
+        return HalfPlane([0.0 * top, top], [0.0, 1.0])
+
+    def feet(self) -> Float[Array, "feet 2"]:
+        """From where to where each foot reaches along x [m]: below the blocks of rubber at
+        both ends and between the groups."""
+        numbers = jnp.arange(self.num_groups, dtype=self.length.dtype)
+        lefts = self._first + self.group_spacing * numbers
+        ends = jnp.stack([0.0 * self.length, self.length])
+        starts = jnp.concatenate([ends[:1], lefts + self.group_length])
+        return jnp.stack([starts, jnp.concatenate([lefts, ends[1:]])], axis=1)
 
     def body(self) -> AbstractSdf:
         """The rubber."""
-        zero = jnp.zeros_like(self.length)
-        block = Rectangle([zero, zero], [self.length, self.height])
-        return block - self.chambers(0) - self.chambers(1) - self.chambers(2)
+        low, zero = self.foot_height, jnp.zeros_like(self.length)
+        into = low + self.sole_thickness / 2  # shapes that end on one line leave a skin
+        feet = (Rectangle([left, zero], [right, into]) for left, right in self.feet())
+        rubber = union(Rectangle([zero, low], [self.length, low + self.height]), *feet)
+        for group in range(self.num_groups):
+            rubber = rubber - self.chambers(group)
+        return rubber
 
 
 def crawler_rubbers() -> tuple[AbstractHyperelastic, AbstractHyperelastic]:
@@ -118,24 +157,27 @@ def crawler_mesh(crawler: Crawler, size: float, across: int = 1) -> mesh.Mesh:
     """
     _check.positive("crawler_mesh", "size", size, "m", "Take the width of a chamber / 3.")
     inner = 2 * crawler.num_chambers  # walls of the chambers of a group
-    left = (crawler.length - crawler.group_length) / 2 - crawler.group_spacing
     pitch = float(crawler.chamber_width + crawler.wall_thickness)
-    start = float(left) + pitch * np.arange(crawler.num_chambers)
+    start = float(crawler._first) + pitch * np.arange(crawler.num_chambers)
     group = np.stack([start, start + float(crawler.chamber_width)], axis=1).ravel()
     spacing = float(crawler.group_spacing)
-    walls = [group + k * spacing for k in range(len(PORTS))]
+    walls = [group + k * spacing for k in range(crawler.num_groups)]
     x = _divided(np.concatenate([[0.0], *walls, [float(crawler.length)]]), size, across)
-    top = float(crawler.base + crawler.chamber_height)
-    marks = [0.0, float(crawler.sole_thickness), float(crawler.base), top]
-    y = _divided(np.array([*marks, float(crawler.height)]), size, across)
+    heights = crawler.sole_thickness, crawler.base, crawler.base + crawler.chamber_height
+    low = float(crawler.foot_height)
+    sole, base, top = (low + float(height) for height in heights)
+    marks = np.unique([0.0, low, sole, base, top, low + float(crawler.height)])
+    y = _divided(marks, size, across)
     grid = mesh.between_lines(x, y, element=mesh.Quad8())
     middle = np.asarray(grid.points)[np.asarray(grid.cells)[:, :4]].mean(axis=1)
     number = np.searchsorted(np.concatenate(walls), middle[:, 0])
     in_group = (number % inner) % 2 == 1
-    hollow = in_group & (middle[:, 1] > marks[2]) & (middle[:, 1] < top)
-    made = mesh.submesh(grid, np.flatnonzero(~hollow))
-    sole = np.flatnonzero(middle[~hollow, 1] < marks[1])
-    return mesh.Mesh(made.points, made.cells, made.element, regions={"sole": sole})
+    hollow = in_group & (middle[:, 1] > base) & (middle[:, 1] < top)
+    below = (number % inner != 0) & (middle[:, 1] < low)  # a group, whose feet are beside it
+    left = ~(hollow | below)
+    made = mesh.submesh(grid, np.flatnonzero(left))
+    stiff = np.flatnonzero(middle[left, 1] < sole)
+    return mesh.Mesh(made.points, made.cells, made.element, regions={"sole": stiff})
 
 
 def _divided(lines: np.ndarray, size: float, least: int) -> np.ndarray:
@@ -152,19 +194,19 @@ def crawler_problem(
     size: float,
     across: int = 1,
     rubbers: tuple[AbstractHyperelastic, AbstractHyperelastic] | None = None,
-    friction: float = 0.6,
+    friction: AbstractFriction | float = 0.6,
     depth: float = 40 * mm,
     stiffness: float = 2e8,
 ) -> fem.Problem:
-    """The crawler on a flat floor, free to move: loads "gravity", "floor" and the pressures
-    "rear", "middle" and "front" [Pa].
+    """The crawler on a flat floor, free to move: loads "gravity", "floor" and the pressures of
+    its ports [Pa].
 
     Args:
         crawler: Its dimensions; concrete.
         size: Length of the sides of its cells [m].
         across: Cells across a wall at least.
         rubbers: Of body and sole, of one class; `crawler_rubbers()` when omitted.
-        friction: Coulomb coefficient of sole and floor [-].
+        friction: Of crawler and floor: a law, or the coefficient [-] of Coulomb's.
         depth: Width across the plane of the side view [m].
         stiffness: Of the contact with the floor [Pa/m]. It carries a body so light that the
             default of `fem.Contact` would be a thousand times more than needed.
@@ -178,13 +220,13 @@ def crawler_problem(
     side = float(crawler.length)
 
     def outside(p):
-        """The sole and both ends."""
+        """The lowest line and both ends."""
         ends = (p[0] < 1e-6 * side) | (p[0] > (1 - 1e-6) * side)
         return (p[1] < 1e-6 * side) | ends
 
     air = tuple(
         fem.Pressure(mesh.facets_on(cells, crawler.chambers(k)), name=name)
-        for k, name in enumerate(PORTS)
+        for k, name in enumerate(crawler.ports)
     )
     floor = fem.Contact(
         mesh.facets_where(cells, outside),
@@ -207,6 +249,8 @@ def crawler_gait(
     amplitude: float | Float[Array, ""] = 15 * kPa,
     frequency: float | Float[Array, ""] = 2.5,
     lag: float | Float[Array, ""] = jnp.pi / 3,
+    *,
+    ports: Sequence[str] = PORTS,
 ) -> dict[str, Any]:
     """Pressures [Pa] of the ports, functions of time [s], for
     `fem.simulate(problem, ..., **gait)`.
@@ -218,6 +262,7 @@ def crawler_gait(
         amplitude: Highest pressure [Pa].
         frequency: Of the gait [Hz].
         lag: Between neighbouring ports [rad].
+        ports: Of the crawler, from the rear to the front.
 
     Returns:
         A function of time by the name of each port.
@@ -231,7 +276,7 @@ def crawler_gait(
 
         return at
 
-    return {name: pressure(k) for k, name in enumerate(PORTS)}
+    return {name: pressure(k) for k, name in enumerate(ports)}
 
 
 # The rhythm of legs

@@ -22,7 +22,7 @@ from sorojax._types import integers, optional_real, real
 from sorojax.contact import AbstractFriction, Penalty, SpringSlider
 from sorojax.contact.broadphase import clearance, far
 from sorojax.contact.facet import Contacts, contacts, gaps, surface
-from sorojax.contact.friction import Grip, friction_law, no_grip
+from sorojax.contact.friction import DirectionalCoulomb, Grip, friction_law, no_grip
 from sorojax.fem.loads.facets import CurvedPart, areas_of, blockwise, facet_tables, group_energy
 from sorojax.fem.loads.loads import AbstractLoad
 from sorojax.material.hyperelastic import small_strain_young_modulus
@@ -385,6 +385,10 @@ class Contact(AbstractPenaltyContact):
                 f"fem.problem: {where} has an obstacle in {self.obstacle.dim} dimensions, the "
                 f"mesh has {mesh.element.dim}. Use a shape of the same space."
             )
+        if isinstance(self.friction, DirectionalCoulomb):
+            given = f"{where} direction of friction"
+            do = "Give as many numbers as the mesh has axes."
+            _check.shape("fem.problem", given, self.friction.direction, (mesh.element.dim,), do)
         super().check(where, mesh, kinematics)
 
 
@@ -471,7 +475,7 @@ def gripped(
     place = load.value - share * (load.value - load.place)  # where the step begins
     back = load.points_of(problem, u) - place[None, None]
     pressure = feels.pressure if step is None else _kept_impulse(load, problem, u, step, feels)
-    anchor = back - slider.bounded(load.stretch(problem, u, load.place), pressure)
+    anchor = back - slider.bounded(load.stretch(problem, u, load.place), pressure, feels.normal)
     limit = slider.law.limit(pressure)
     drag = jnp.zeros_like(limit)
     if step is not None:

@@ -63,7 +63,7 @@ class SurfaceContact(eqx.Module):
         gap, _, normal = surface(self.obstacle, back)
         pressure = self.law.pressure(self._shifted(gap))
         limit = self.slider.law.limit(pressure)
-        anchor = back - self.slider.bounded(stretch, pressure)
+        anchor = back - self.slider.bounded(stretch, pressure, normal)
         drag = limit / (self.slider.velocity * h)
         return Grip(anchor, pressure, normal, drag, back)
 

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 
 from sorojax.robots import Crawler
-from sorojax.robots.locomotion import PORTS
 from sorojax.sdf import AbstractSdf, contour, offset
 from sorojax.sdf.sampling import finite_box
 from sorojax.view import style
@@ -50,7 +49,7 @@ def robot_scene(robot: Any, *, size: float | None = None, title: str = "") -> Sc
 def air_of(robot: Any) -> dict[str, AbstractSdf]:
     """The hollows of a robot by name."""
     if isinstance(robot, Crawler):
-        return {f"air, {port}": robot.chambers(k) for k, port in enumerate(PORTS)}
+        return {f"air, {port}": robot.chambers(k) for k, port in enumerate(robot.ports)}
     if hasattr(robot, "chambers"):
         return {"air": robot.chambers()}
     return {"air": robot.chamber()} if hasattr(robot, "chamber") else {}
