@@ -40,7 +40,7 @@ def small_body():
 def small_crawler():
     """Trained on the first tenth of a second of a gait alone."""
     time = 2e-3 * np.arange(51)
-    waves = np.maximum(np.sin(15 * time[None] - np.arange(3)[:, None]), 0.0)
+    waves = np.maximum(np.sin(15 * time[None] - np.arange(2)[:, None]), 0.0)
     command = jnp.asarray(solid_crawler.MAX_PRESSURE * waves)
     return solid_crawler.trained_on(solid_crawler.full_crawler(), [command], 6, 0.05)
 

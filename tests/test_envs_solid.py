@@ -169,7 +169,7 @@ def test_another_rubber_and_floor_of_a_crawler_are_those_of_its_mesh():
     known = systems.SampledBody(assembled(usual), jnp.zeros(1, int), *none, 1)
     body = solid_crawler.SolidCrawler(usual.problem.mesh, known, weight)
     env = envs.SolidCrawl(body=body)
-    stiffness, density, friction, slope = 1.3, 0.8, 0.4, 0.1
+    stiffness, density, friction, slope = 1.3, 0.8, 0.7, 0.1
     params = envs.SolidCrawlParams(stiffness, density=density, friction=friction)
     got = env._solid(params, FloorGoal(jnp.asarray(slope)))
     factors = {"stiffness": stiffness, "density": density}
@@ -193,10 +193,10 @@ def test_another_rubber_and_floor_of_a_crawler_are_those_of_its_mesh():
 def test_a_crawler_goes_as_far_as_the_whole_one():
     """Under a gait that was not in the training, on another floor: six tenths of a second."""
     env = envs.SolidCrawl(body=solid_crawler.solid_crawler(), time_step=1e-3, substeps=20)
-    slope, friction = 0.01, 0.5
+    slope, friction = 0.01, 0.8
     params = envs.SolidCrawlParams(friction=friction)
     time = 2e-3 * np.arange(301)
-    waves = np.maximum(np.sin(9 * time[None] - 1.3 * np.arange(3)[:, None]), 0.0)
+    waves = np.maximum(np.sin(9 * time[None] - 1.3 * np.arange(2)[:, None]), 0.0)
     pressures = jnp.asarray(0.9 * solid_crawler.MAX_PRESSURE * waves)
     full = solid_crawler.full_crawler(friction=friction, slope=slope)
     given = dict(zip(solid_crawler.PORTS, pressures, strict=True))
@@ -219,7 +219,9 @@ def test_a_crawler_goes_as_far_as_the_whole_one():
         assert bool(fine)
         seen.append(env.markers(body, params) - first)
     off = jnp.abs(jnp.stack(seen) - want[1:])
-    assert float(off.max()) < 0.08 * float(jnp.ptp(want[..., 1]))
+    assert float(off.max()) < 0.05 * float(jnp.ptp(want[..., 1]))
+    way, along = float(jnp.mean(seen[-1][:, 0])), float(jnp.mean(want[-1, :, 0]))
+    assert along > 2e-3 and abs(way / along - 1) < 0.03
 
 
 @pytest.mark.slow

@@ -220,9 +220,9 @@ def crawler_problem(
     side = float(crawler.length)
 
     def outside(p):
-        """The lowest line and both ends."""
+        """The lowest line; without feet both ends, too."""
         ends = (p[0] < 1e-6 * side) | (p[0] > (1 - 1e-6) * side)
-        return (p[1] < 1e-6 * side) | ends
+        return (p[1] < 1e-6 * side) | (ends & (crawler.foot_height == 0))
 
     air = tuple(
         fem.Pressure(mesh.facets_on(cells, crawler.chambers(k)), name=name)

@@ -27,13 +27,19 @@ class FloorGoal(NamedTuple):
     slope: Float[Array, ""]
 
 
+def observations(chambers: int) -> int:
+    """How many numbers a crawler observes: pressures, commands, and markers twice."""
+    return 2 * chambers + 2 * MARKERS * 2
+
+
 class AbstractCrawler(AbstractEnv):
-    """A crawler with three chambers from the rear to the front, which arch its back; its body
-    is left open. `max_pressure` and `max_slope` are among the parameters."""
+    """A crawler with chambers from the rear to the front, three of them unless told otherwise,
+    which arch its back; its body is left open. `max_pressure` and `max_slope` are among the
+    parameters."""
 
     max_steps: int = eqx.field(static=True, default=200)
     num_actions: ClassVar[int] = 3
-    num_observations: ClassVar[int] = 2 * 3 + 2 * MARKERS * 2
+    num_observations: ClassVar[int] = observations(3)
 
     @abc.abstractmethod
     def length(self, params: Any) -> Float[Array, ""]:
@@ -47,7 +53,7 @@ class AbstractCrawler(AbstractEnv):
         body = self.resting(params)
         number = params.max_slope.dtype
         slope = params.max_slope * jax.random.uniform(key, (), number, -1.0)
-        return body, jnp.zeros(3, number), FloorGoal(slope)
+        return body, jnp.zeros(self.num_actions, number), FloorGoal(slope)
 
     def commanded(self, command, action, params):
         return params.max_pressure * (1 + action) / 2

@@ -1,7 +1,7 @@
 """A soft crawler of finite elements goes forward on a rough floor."""
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,13 +10,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sorojax._types import real
+from sorojax.contact import DirectionalCoulomb
 from sorojax.envs import solids
 from sorojax.envs.supply_line import SupplyLine
-from sorojax.envs.tasks.crawl import AbstractCrawler, FloorGoal, on_floor
+from sorojax.envs.tasks.crawl import AbstractCrawler, FloorGoal, observations, on_floor
 from sorojax.envs.tasks.solid_crawler import (
-    FRICTION,
     LENGTH,
     MAX_PRESSURE,
+    PORTS,
     SolidCrawler,
     solid_crawler,
 )
@@ -35,8 +36,8 @@ _LANES = 4  # members at once on a CPU: a step takes as long as the longest of t
 
 
 class SolidCrawlParams(eqx.Module):
-    """Numbers of the crawler, its supply and the floor; those of its rubber over those of the
-    training.
+    """Numbers of the crawler, its supply and the floor; those of its rubber and its friction
+    over those of the training.
 
     Attributes:
         stiffness: Of the rubber [-].
@@ -44,7 +45,7 @@ class SolidCrawlParams(eqx.Module):
         density: Inertia and weight [-].
         max_pressure: Of the supply [Pa].
         max_slope: Of the floor, up or down [rad].
-        friction: Coefficient between crawler and floor [-].
+        friction: Of the bristles on the floor, both ways [-].
         supply: Dead time and lag of the pressures.
         marker_noise: Standard deviation of measured positions [m].
     """
@@ -54,7 +55,7 @@ class SolidCrawlParams(eqx.Module):
     density: Float[Array, ""] = eqx.field(converter=real, default=1.0)
     max_pressure: Float[Array, ""] = eqx.field(converter=real, default=MAX_PRESSURE)
     max_slope: Float[Array, ""] = eqx.field(converter=real, default=1 * deg)
-    friction: Float[Array, ""] = eqx.field(converter=real, default=FRICTION)
+    friction: Float[Array, ""] = eqx.field(converter=real, default=1.0)
     supply: SupplyLine = eqx.field(default_factory=lambda: SupplyLine(0.04, 0.01))
     marker_noise: Float[Array, ""] = eqx.field(converter=real, default=0.2 * mm)
 
@@ -71,21 +72,25 @@ class CrawlingSolid(NamedTuple):
 class SolidCrawl(AbstractCrawler):
     """Crawl forward on a rough floor with a body of finite elements in contact.
 
-    The crawler is the side view of `robots.Crawler`: a soft body with three groups of chambers
-    on a stiff sole, free to move. It moves in a few shapes, with the force of a few weighted
-    points and the contact of its whole surface (`systems.sampled_body`). Friction holds without
-    creep. Filled in turns, the groups carry it forward by some millimetres a second. The floor
-    rises or falls ahead by an angle drawn evenly up to `max_slope`, which is not observed.
+    The crawler is the side view of a `robots.Crawler`: a soft body with two groups of chambers
+    on a stiff sole, free to move on three feet, whose bristles slide forward at a third of the
+    friction that holds them back. It moves in a few shapes, with the force of a few weighted
+    points and the contact of its feet (`systems.sampled_body`). Friction holds without creep.
+    Whenever a group arches the back and lets it down the feet go forward. The floor rises or
+    falls ahead by an angle drawn evenly up to `max_slope`, which is not observed.
 
-    Actions, observations and reward are those of `CrawlerRun`. An episode ends by its time
-    alone, or where it diverges: forces of a step do not balance, or a chosen point is strained
-    by more than 1.25 times the largest strain of the training. `info` has `velocity` [m/s].
+    Actions, observations and reward are those of `CrawlerRun`, for two chambers. An episode
+    ends by its time alone, or where it diverges: forces of a step do not balance, or a chosen
+    point is strained by more than 1.25 times the largest strain of the training. `info` has
+    `velocity` [m/s].
 
     Attributes:
         body: The crawler, from `solid_crawler`; that without arguments if omitted, which trains
             for a minute on a computer where it has not been trained before.
     """
 
+    num_actions: ClassVar[int] = len(PORTS)
+    num_observations: ClassVar[int] = observations(len(PORTS))
     time_step: float = eqx.field(static=True, default=2e-3)
     substeps: int = eqx.field(static=True, default=10)
     body: SolidCrawler = eqx.field(
@@ -142,13 +147,16 @@ class SolidCrawl(AbstractCrawler):
         down = -_GRAVITY * jnp.stack([jnp.sin(goal.slope), jnp.cos(goal.slope)])
         (floor,) = small.contacts
         assert floor.slider is not None and isinstance(small.force, SampledForce)
+        law = floor.slider.law
+        assert isinstance(law, DirectionalCoulomb)
         return eqx.tree_at(
             lambda b: (
                 b.force.volumes,
                 b.force.loads.terms,
                 b.damping,
                 b.contacts[0].areas,
-                b.contacts[0].slider.law.coefficient,
+                b.contacts[0].slider.law.forward,
+                b.contacts[0].slider.law.backward,
             ),
             small,
             (
@@ -156,6 +164,7 @@ class SolidCrawl(AbstractCrawler):
                 (down @ self.body.weight,),
                 small.damping * params.damping / params.density,
                 floor.areas / params.density,
-                params.friction,
+                law.forward * params.friction,
+                law.backward * params.friction,
             ),
         )

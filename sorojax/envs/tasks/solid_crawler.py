@@ -10,20 +10,22 @@ from jaxtyping import Array, Float
 
 from sorojax import _check, fem, mesh, robots, systems
 from sorojax._display import displayed
+from sorojax.contact import DirectionalCoulomb
 from sorojax.envs import solids
 from sorojax.envs.tasks.crawl import MARKERS
 from sorojax.material import neo_hookean
 from sorojax.systems.blocks.modal_basis import coordinates
 from sorojax.units import MPa, kPa, mm
 
-PORTS = "rear", "middle", "front"
-LENGTH = float(robots.Crawler().length)
-MAX_PRESSURE, FRICTION = 8 * kPa, 0.6  # of the default supply, and of the training
+CRAWLER = robots.Crawler(110 * mm, num_groups=2, foot_height=2 * mm)
+PORTS, LENGTH = CRAWLER.ports, float(CRAWLER.length)
+MAX_PRESSURE = 8 * kPa  # of the default supply, and of the training
+FORWARD, BACKWARD = 0.3, 0.9  # coefficients of friction of the bristles of its feet
 _SOFT, _STIFF, _POISSON, _DENSITY = 0.2 * MPa, 1 * MPa, 0.4, 1070.0  # body, sole
 _VISCOUS = 1e-3  # retardation time of the rubber [s]
 _SIZE, _MODES = 3 * mm, 20
 _STEP, _LONG = 2e-3, 1.6  # of the motions of the training [s]
-_RATE, _LAG = 1.25, np.pi / 3  # Hz, of gaits; between neighbouring chambers, either way
+_RATE, _LAG = 1.25, np.pi / 2  # Hz, of gaits; between the groups, either way
 _HELD, _DELAY, _DRAWN = 0.2, 0.05, 3  # [s] of drawn commands, and how many such motions
 _EVERY = 4  # frames
 
@@ -51,9 +53,9 @@ def solid_crawler(
 ) -> SolidCrawler:
     """The soft crawler of `SolidCrawl`, trained once and kept on this computer.
 
-    The side view of `robots.Crawler`, 150 mm long, in plane strain, free to move on a rough
-    floor. It is trained on motions in which its three groups of chambers are filled in turns,
-    from the rear and from the front, and at random.
+    The side view of a `robots.Crawler`, 110 mm long, in plane strain, free to move on three
+    feet with bristles. It is trained on motions in which its two groups of chambers are filled
+    in turns, from the rear and from the front, and at random.
 
     Args:
         size: Of the sides of its cells [m].
@@ -79,11 +81,11 @@ def full_crawler(
     *,
     stiffness: float = 1.0,
     density: float = 1.0,
-    friction: float = FRICTION,
+    friction: float = 1.0,
     slope: float = 0.0,
 ) -> systems.FemBody:
-    """The whole crawler, with factors of its rubber, on a floor that rises by `slope` [rad]."""
-    crawler = robots.Crawler()
+    """The whole crawler, with factors of its rubber and its friction, on a floor that rises by
+    `slope` [rad]."""
     rubbers = [
         neo_hookean(
             young_modulus=stiffness * young,
@@ -92,12 +94,13 @@ def full_crawler(
         )
         for young in (_SOFT, _STIFF)
     ]
+    bristles = DirectionalCoulomb(FORWARD * friction, BACKWARD * friction, [1.0, 0.0])
     problem = robots.crawler_problem(
-        crawler, size=size, rubbers=(rubbers[0], rubbers[1]), friction=friction
+        CRAWLER, size=size, rubbers=(rubbers[0], rubbers[1]), friction=bristles
     )
     down = -9.81 * jnp.asarray([np.sin(slope), np.cos(slope)])
     problem = eqx.tree_at(lambda p: p.loads[0].value, problem, down)
-    top = float(crawler.height)
+    top = float(CRAWLER.foot_height + CRAWLER.height)
     ends = {
         f"marker_{k}": mesh.nearest_node(problem.mesh, [LENGTH * k / (MARKERS - 1), top])
         for k in range(MARKERS)
@@ -138,16 +141,16 @@ def _times() -> np.ndarray:
 
 def _gait(lag: float) -> Float[Array, "ports times"]:
     """Half waves of pressure [Pa], one port after the other."""
-    phase = 2 * np.pi * _RATE * _times()[None] - lag * np.arange(3)[:, None]
+    phase = 2 * np.pi * _RATE * _times()[None] - lag * np.arange(len(PORTS))[:, None]
     return jnp.asarray(MAX_PRESSURE * np.maximum(np.sin(phase), 0.0))
 
 
 def _drawn(seed: int) -> Float[Array, "ports times"]:
     """Pressures [Pa] that follow commands drawn at random by a lag."""
     draw, count = np.random.default_rng(seed), round(_LONG / _HELD)
-    wanted = MAX_PRESSURE * draw.uniform(0.0, 1.0, (count, 3))
+    wanted = MAX_PRESSURE * draw.uniform(0.0, 1.0, (count, len(PORTS)))
     number = np.minimum((_times() / _HELD).astype(int), count - 1)
-    pressure = [np.zeros(3)]
+    pressure = [np.zeros(len(PORTS))]
     for k in number[1:]:
         pressure.append(wanted[k] + (pressure[-1] - wanted[k]) * np.exp(-_STEP / _DELAY))
     return jnp.asarray(np.transpose(pressure))
