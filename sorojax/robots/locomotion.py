@@ -199,7 +199,7 @@ def crawler_problem(
     stiffness: float = 2e8,
 ) -> fem.Problem:
     """The crawler on a flat floor, free to move: loads "gravity", "floor" and the pressures of
-    its ports [Pa].
+    its ports [Pa]. A crawler with feet touches the floor with these alone.
 
     Args:
         crawler: Its dimensions; concrete.
