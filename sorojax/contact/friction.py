@@ -52,7 +52,8 @@ class DirectionalCoulomb(AbstractFriction):
 
     Attributes:
         forward, backward: Coefficients of sliding along the direction and back [-].
-        direction: Of easy or hard sliding, in the frame of the obstacle; of any length.
+        direction: Of easy or hard sliding, in the frame of the obstacle; of any length. Its
+            part along the normal does not count.
 
     References:
         Goyal, Ruina, Papadopoulos, Planar sliding with dry friction, part 1, Wear 143, 1991:

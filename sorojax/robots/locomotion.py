@@ -199,7 +199,8 @@ def crawler_problem(
     stiffness: float = 2e8,
 ) -> fem.Problem:
     """The crawler on a flat floor, free to move: loads "gravity", "floor" and the pressures of
-    its ports [Pa]. A crawler with feet touches the floor with these alone.
+    its ports [Pa]. A crawler with feet touches the floor with these alone: make them higher
+    than its sole sags.
 
     Args:
         crawler: Its dimensions; concrete.
