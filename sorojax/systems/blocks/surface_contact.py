@@ -78,22 +78,18 @@ class SurfaceContact(eqx.Module):
         force = self.areas[:, None] * self._traction(self.points(q), grip)
         return jnp.tensordot(self.moves, force, 2)
 
-    def linearised(
-        self, q: Modes, grip: Grip | None
-    ) -> tuple[Modes, Float[Array, "modes modes"]]:
-        """The force, and minus its derivative."""
+    def stiffness(self, q: Modes, grip: Grip | None) -> Float[Array, "modes modes"]:
+        """Minus the derivative of the force."""
         x, moves = self.points(q), self.moves
 
         def along(axis: Float[Array, " dim"]):
             way = jnp.broadcast_to(axis, x.shape)
-            return jax.jvp(lambda x: self._traction(x, grip), (x,), (way,))
+            return jax.jvp(lambda x: self._traction(x, grip), (x,), (way,))[1]
 
-        traction, slopes = jax.vmap(along, out_axes=(None, 0))(jnp.eye(x.shape[1]))
-        force = jnp.tensordot(moves, self.areas[:, None] * traction, 2)
-        weighed = -self.areas[None, :, None] * slopes
+        weighed = -self.areas[None, :, None] * jax.vmap(along)(jnp.eye(x.shape[1]))
         turned = jnp.einsum("mpj,jpi->mpi", moves, weighed)
         count = len(moves)
-        return force, moves.reshape(count, -1) @ turned.reshape(count, -1).T
+        return moves.reshape(count, -1) @ turned.reshape(count, -1).T
 
     def _traction(self, x: Float[Array, "points dim"], grip: Grip | None):
         """Force of the obstacle per area [Pa]."""

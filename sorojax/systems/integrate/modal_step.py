@@ -76,25 +76,30 @@ class _Step(NamedTuple):
 
     def residual(self, a: Modes) -> Modes:
         """What is left of balance."""
-        q, _ = self.ends(a)
-        pairs = zip(self.body.contacts, self.grips, strict=True)
-        return self.unmoved(a) - sum(one.push(q, grip) for one, grip in pairs)
+        return self.balance(a)[0]
 
-    def linearised(self, a: Modes, still: Float[Array, "modes modes"]):
-        """That, its derivative, and the size of the forces; `still` is the derivative without
-        contact."""
+    def balance(self, a: Modes) -> tuple[Modes, Float[Array, ""]]:
+        """That, and the size of the forces."""
         q, _ = self.ends(a)
-        left, matrix = self.unmoved(a), still
+        left = self.unmoved(a)
         size = jnp.max(jnp.abs(left)) + jnp.max(jnp.abs(a))
         for one, grip in zip(self.body.contacts, self.grips, strict=True):
-            push, stiffness = one.linearised(q, grip)
+            push = one.push(q, grip)
             left, size = left - push, size + jnp.max(jnp.abs(push))
-            matrix = matrix + self.scheme.beta * self.h**2 * stiffness
-        return left, matrix, size
+        return left, size
+
+    def matrix(
+        self, a: Modes, still: Float[Array, "modes modes"]
+    ) -> Float[Array, "modes modes"]:
+        """Its derivative, where `still` is that without contact."""
+        q, _ = self.ends(a)
+        pairs = zip(self.body.contacts, self.grips, strict=True)
+        stiffness = sum(one.stiffness(q, grip) for one, grip in pairs)
+        return still + self.scheme.beta * self.h**2 * stiffness
 
 
 class _Pass(NamedTuple):
-    """Newton's method on its way: from `base` a `share` of `way`.
+    """Newton's method on its way: from `base` a `share` of `way`, where `left` is not balanced.
 
     Along the way the energy falls by `slope` at first; it has its least value between the
     shares `low`, where it still falls by `falls`, and `high`, where it rises by `rises`.
@@ -103,6 +108,7 @@ class _Pass(NamedTuple):
     base: Modes
     way: Modes
     share: Float[Array, ""]
+    left: Modes
     slope: Float[Array, ""]
     low: Float[Array, ""]
     falls: Float[Array, ""]
@@ -175,22 +181,26 @@ def _newton(now: _Step, guess: Modes, most: int) -> tuple[Modes, tuple[Array, Ar
     still = jax.jacfwd(now.unmoved)(guess)
     small = max(_SMALL, 64 * float(jnp.finfo(guess.dtype).eps))
 
+    def judged(at: _Pass, still: Bool[Array, ""]) -> _Pass:
+        left, size = now.balance(at.base + at.share * at.way)
+        # at rest without a load, forces are nothing but rounding
+        balanced = (jnp.max(jnp.abs(left)) <= small * size) | still
+        return at._replace(left=left, balanced=balanced)
+
     def one(at: _Pass) -> _Pass:
         a = at.base + at.share * at.way
-        left, matrix, size = now.linearised(a, still)
-        rise, count = left @ at.way, at.count + 1
-        way = -jnp.linalg.solve(matrix, left)
-        # at rest without a load, forces are nothing but rounding
-        balanced = (jnp.max(jnp.abs(left)) <= small * size) | ~_moves(now, way)
-        onward = _whole(a, way, left, count)
-        onward = onward._replace(balanced=balanced)
-        chosen = balanced | _enough(at, rise)
-        within = _shorter(at, rise)._replace(count=count)
-        return jax.tree.map(lambda a, b: jnp.where(chosen, a, b), onward, within)
+        way = -jnp.linalg.solve(now.matrix(a, still), at.left)
+        chosen = _enough(at, at.left @ at.way)
+        onward = _whole(a, way, at.left, at.count + 1)
+        within = _shorter(at, at.left @ at.way)._replace(count=at.count + 1)
+        new = jax.tree.map(lambda a, b: jnp.where(chosen, a, b), onward, within)
+        return judged(new, chosen & ~_moves(now, way))
 
-    begun = _whole(guess, 0 * guess, guess, jnp.zeros((), jnp.int32))
+    none = jnp.zeros((), jnp.int32)
+    begun = judged(_whole(guess, 0 * guess, guess, none), jnp.zeros((), bool))
     end = jax.lax.while_loop(lambda at: ~at.balanced & (at.count < most), one, begun)
-    return end.base, (end.balanced.astype(guess.dtype), end.count.astype(guess.dtype))
+    a = end.base + end.share * end.way
+    return a, (end.balanced.astype(guess.dtype), end.count.astype(guess.dtype))
 
 
 def _moves(now: _Step, change: Modes) -> Bool[Array, ""]:
@@ -209,7 +219,7 @@ def _whole(base: Modes, way: Modes, left: Modes, count) -> _Pass:
     slope = left @ way
     zero, one, none = jnp.zeros_like(slope), jnp.ones_like(slope), jnp.zeros_like(count)
     return _Pass(
-        base, way, one, slope, zero, slope, one, zero, none, count, jnp.zeros((), bool)
+        base, way, one, left, slope, zero, slope, one, zero, none, count, jnp.zeros((), bool)
     )
 
 
