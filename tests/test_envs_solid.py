@@ -15,7 +15,12 @@ from sorojax.envs.tasks import solid_crawler, solid_finger
 from sorojax.envs.tasks.crawl import FloorGoal
 from sorojax.math.linalg.sparse import product
 from sorojax.systems.blocks.modal_basis import coordinates
-from sorojax.systems.blocks.modal_body import ProjectedForce, modal_body, without_contacts
+from sorojax.systems.blocks.modal_body import (
+    AbstractModalForce,
+    ProjectedForce,
+    modal_body,
+    without_contacts,
+)
 from sorojax.systems.blocks.sampled_body import snapshot_basis
 from sorojax.systems.blocks.sampled_force import pieces, sampled_force
 
@@ -83,6 +88,18 @@ def test_the_viscosity_of_all_cells_is_that_of_the_body_where_it_is_bent(small):
     slope = jax.jacfwd(body.force.viscous)(q, v)
     known = jax.jacfwd(lambda q: body.force.viscous_matrix(q) @ v)(q)
     np.testing.assert_allclose(slope, known, atol=1e-10 * np.abs(known).max())
+
+
+def test_the_matrix_of_a_step_is_the_derivative_of_the_forces_at_rest(small):
+    air = {"left_pressure": jnp.asarray(9e3), "right_pressure": jnp.asarray(1e3)}
+    body, rate, zero = small.reduced.body, 300.0, jnp.zeros_like(small.reduced.body.q)
+    q = solids.settled(solids.Solid(body, jnp.ones(())), jnp.asarray([12e3, 0.0])).q
+    by_q, by_v = (jax.jacfwd(lambda *at: -body.pull(*at, air), n)(q, zero) for n in range(2))
+    want = by_q + rate * by_v
+    got = body.tangent(q, air, rate)
+    np.testing.assert_allclose(got, want, atol=1e-10 * np.abs(want).max())
+    got, want = body.force.tangent(q, rate), AbstractModalForce.tangent(body.force, q, rate)
+    np.testing.assert_allclose(got, want, atol=1e-10 * np.abs(want).max())
 
 
 def test_all_cells_make_the_force_of_the_mesh(small):

@@ -385,6 +385,23 @@ def prepare(model: Model, constants, tolerance, max_iterations: int) -> Search:
     return Search(model, measure, floor, tolerance, max_iterations)
 
 
+class _Pass(NamedTuple):
+    """Newton's method on its way: the next pass tries a `length` of `step` from `q`.
+
+    `size` is that of the residual at `q` and `slope` its tangent there. A `small` step is
+    nothing but rounding; it is taken as it is.
+    """
+
+    q: Float[Array, " unknowns"]
+    step: Float[Array, " unknowns"]
+    slope: Float[Array, "unknowns unknowns"]
+    length: Float[Array, ""]
+    size: Float[Array, ""]
+    small: Bool[Array, ""]
+    ended: Bool[Array, ""]
+    count: Int[Array, ""]
+
+
 def newton(
     residual: Residual, guess: Array, search: Search, *, at_root: Bool[Array, ""] | None = None
 ) -> Found:
@@ -393,46 +410,43 @@ def newton(
     once_more = jnp.array(False) if at_root is None else at_root
     factor, model = cho_factor(search.metric), search.model
 
-    def size(force):
-        return force @ cho_solve(factor, force)
-
-    def improve(state):
-        q, _, before, *_, count = state
+    def one(at: _Pass) -> _Pass:
+        # The tangent is found where a length is tried, too, so that the residual is compiled
+        # and evaluated once in a pass.
+        q = advanced(model, at.q, at.length * at.step)
         force, slope = linearised(residual, model, q)
-        step = -jnp.linalg.solve(slope, force)
-        shape = strained(model, q)
+        size = force @ cho_solve(factor, force)
+        step, shape = -jnp.linalg.solve(slope, force), strained(model, q)
         energy = shape @ search.metric @ shape
         small = step @ search.metric @ step <= search.tolerance**2 * energy + search.floor
-        start = size(force)
+        onward = _Pass(q, step, slope, one_, size, small, small & ~once_more, at.count + 1)
+        least, first = at.length <= _SHORTEST, jnp.isinf(at.size)
+        enough = jnp.where(least, 1.0, 1 - 2 * _DECREASE * at.length).astype(q.dtype)
+        good = size <= enough * at.size
+        shorter = at._replace(length=_shorter(at, size), ended=~good & (least | first))
+        new = jax.tree.map(lambda a, b: jnp.where(good, a, b), onward, shorter)
+        last = at._replace(slope=slope, ended=~no)
+        return jax.tree.map(lambda a, b: jnp.where(at.small, a, b), last, new)
 
-        def too_long(trial):
-            length, value = trial
-            enough = value <= (1 - 2 * _DECREASE * length) * start
-            return ~enough & (length > _SHORTEST)
+    def searching(at: _Pass):
+        return ~at.ended & (at.small | (at.count < search.max_iterations))
 
-        def half(trial):
-            length = trial[0] / 2
-            return length, size(residual(advanced(model, q, length * step)))
+    no, one_ = jnp.array(False), jnp.ones((), guess.dtype)
+    still, none = jnp.zeros(search.metric.shape[0], guess.dtype), jnp.zeros((), jnp.int32)
+    begin = _Pass(guess, still, search.metric, one_, jnp.inf * one_, no, no, none)
+    end = jax.lax.while_loop(searching, one, begin)
+    q = jnp.where(end.small, advanced(model, end.q, end.step), end.q)
+    done = end.small & jnp.all(jnp.isfinite(q))
+    return Found(q, end.slope, done, jnp.isfinite(end.size), end.count)
 
-        # A step of rounding is nothing but noise: it is taken as it is. Any other is tried
-        # first as a whole; the loop holds the only trial, so that it is compiled once.
-        begin = jnp.where(small, 1.0, 2.0).astype(q.dtype), jnp.where(small, 0 * start, jnp.inf)
-        length, value = jax.lax.while_loop(too_long, half, begin)
-        good = value <= start
-        new = jnp.where(good & ~before, advanced(model, q, length * step), q)
-        ends = jnp.where(once_more, before, small & good)
-        return new, slope, before | (small & good), ends | ~good, jnp.isfinite(start), count + 1
 
-    def searching(state):
-        _, _, done, ended, _, count = state
-        most = search.max_iterations
-        return ~ended & (count < jnp.where(done & once_more, most + 1, most))
-
-    no = jnp.array(False)
-    begin = (guess, search.metric, no, no, ~no, jnp.array(0, dtype=jnp.int32))
-    q, slope, done, _, finite, count = jax.lax.while_loop(searching, improve, begin)
-    count = count - (done & once_more).astype(count.dtype)
-    return Found(q, slope, done & jnp.all(jnp.isfinite(q)), finite, count)
+def _shorter(at: _Pass, size: Float[Array, ""]) -> Float[Array, ""]:
+    """A length at which the parabola through both sizes, with the slope that Newton's method
+    promises, is least; between a tenth and half of the last one."""
+    promised = at.size * at.length
+    share = promised / (size - at.size + 2 * promised)
+    share = jnp.where(jnp.isfinite(size), share, jnp.zeros_like(share))
+    return at.length * jnp.clip(share, 0.1, 0.5)
 
 
 def stability(

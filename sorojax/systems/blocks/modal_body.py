@@ -78,6 +78,11 @@ class AbstractModalForce(eqx.Module):
         """Force of a viscosity that turns with the body."""
         return jnp.zeros_like(v)
 
+    def tangent(self, q: Modes, rate: Float[Array, ""] | float) -> Float[Array, "modes modes"]:
+        """Derivative by q, and `rate` [1/s] times that of the viscous force by v."""
+        by_rates = jax.jacfwd(lambda v: self.viscous(q, v))(jnp.zeros_like(q))
+        return jax.jacfwd(self)(q) + rate * by_rates
+
     @property
     def relaxation_times(self) -> Float[Array, " branches"] | None:
         """Of Maxwell branches beside the force [s]; None without any."""
@@ -239,6 +244,13 @@ class ModalBody(AbstractBlock):
         """Force on the modal coordinates in a frame that rests."""
         force = self.force(q) if relaxed is None else self.force.with_branches(q, relaxed)
         return self.loads(inputs)(q) - force - self.damping @ v - self.force.viscous(q, v)
+
+    def tangent(
+        self, q: Modes, inputs, rate: Float[Array, ""] | float
+    ) -> Float[Array, "modes modes"]:
+        """Derivative of minus `pull` by q at v = 0, and `rate` [1/s] times that by v."""
+        by_rates = rate * self.damping
+        return self.force.tangent(q, rate) - jax.jacfwd(self.loads(inputs))(q) + by_rates
 
     def loads(self, inputs) -> Polynomial:
         """Force of the driven loads on the modal coordinates, as a function of these."""

@@ -51,6 +51,9 @@ from sorojax.systems.blocks.modal_body import (
     taylor,
 )
 
+#: Derivative of a stress at the points, by the numbers of two entries of F.
+Tangents = dict[tuple[int, int], Float[Array, "quad cells"]]
+
 
 class Branches(NamedTuple):
     """Maxwell branches of the chosen cells.
@@ -107,14 +110,25 @@ class SampledForce(AbstractModalForce):
 
     def viscous_matrix(self, q: Modes) -> Float[Array, "modes modes"]:
         """C(q) [1/s] of the viscosity: what rotates is not held back."""
+        return self._between(self._viscous_tangent(self._gradients(q)))
+
+    def _viscous_tangent(self, F: Entries) -> Tangents:
+        """Derivative of the stress by the rate H of F, viscosity (F F'_ik 1_jl + F_il F_kj)."""
         assert self.viscosity is not None
-        kinematics, F = self.body.kinematics, self._gradients(q)
-        rates = green_rates(kinematics, F[:, None], jnp.moveaxis(self.slopes, 0, 1))
-        twice = [1.0 if j == k else 2.0**0.5 for j, k in strain_pairs(kinematics)]
-        root = jnp.sqrt(2 * self.volumes * self.viscosity[None])[None]
-        rows = [a * root * rate for a, rate in zip(twice, rates, strict=True)]
-        flat = jnp.stack(rows, axis=1).reshape(q.shape[0], -1)
-        return flat @ flat.T
+        slots, eta = self.body.kinematics.slots, self.viscosity[None]
+        at = {(s.row, s.col): F[number] for number, s in enumerate(slots)}
+
+        def entry(a, b):
+            total = jnp.zeros_like(F[0])
+            if (a.row, b.col) in at and (b.row, a.col) in at:
+                total = at[a.row, b.col] * at[b.row, a.col]
+            if a.col == b.col:
+                both = [k for k in range(3) if (a.row, k) in at and (b.row, k) in at]
+                total = total + sum(at[a.row, k] * at[b.row, k] for k in both)
+            return eta * total
+
+        every = list(enumerate(slots))
+        return {(e, f): entry(a, b) for e, a in every for f, b in every}
 
     def viscous_stiffness(self, q: Modes, v: Modes) -> Float[Array, "modes modes"]:
         """Derivative of C(q) v by q."""
@@ -122,7 +136,9 @@ class SampledForce(AbstractModalForce):
         count = F.shape[0]
         ways = jnp.broadcast_to(jnp.eye(count)[:, :, None, None], (count, *F.shape))
         one = jax.vmap(lambda way: jax.jvp(lambda F: self._viscous_stress(F, H), (F,), (way,)))
-        return self._between(one(ways)[1])
+        found = one(ways)[1]
+        every = range(count)
+        return self._between({(e, f): found[f, e] for e in every for f in every})
 
     def _viscous_stress(self, F: Entries, H: Entries) -> Entries:
         """First Piola-Kirchhoff stress 2 viscosity F dE/dt, for the rate H of F."""
@@ -139,16 +155,14 @@ class SampledForce(AbstractModalForce):
         ]
         return 2 * self.viscosity[None, None] * jnp.stack(total)
 
-    def _between(
-        self, tangent: Float[Array, "entries entries quad cells"]
-    ) -> Float[Array, "modes modes"]:
-        """Sum over the points of a derivative of P, the first axis that of F."""
-        weighed = (self.volumes[None, None] * tangent)[:, :, None]
-        every = range(self.slopes.shape[1])
-        bent = [sum(weighed[f, e] * self.slopes[:, f] for f in every) for e in every]
-        count = self.slopes.shape[0]
+    def _between(self, tangent: Tangents) -> Float[Array, "modes modes"]:
+        """Sum over the points of dP_e/dF_f between the slopes."""
+        # points last, so that many members are one product of matrices
+        every, count = range(self.slopes.shape[1]), self.slopes.shape[0]
+        weighed = {at: (self.volumes * entry)[None] for at, entry in tangent.items()}
+        bent = [sum(weighed[e, f] * self.slopes[:, e] for e in every) for f in every]
         flat = self.slopes.reshape(count, -1)
-        return flat @ jnp.stack(bent, axis=1).reshape(count, -1).T
+        return jnp.stack(bent, axis=1).reshape(count, -1) @ flat.T
 
     def with_branches(self, q, relaxed):
         return _of_branches(self, q, relaxed) - self.loads(q)
@@ -208,22 +222,27 @@ class SampledForce(AbstractModalForce):
         """Energy of the cells [J] with these entries of F."""
         return jnp.sum(self.volumes * energy_density(self.body, F))
 
-    def stiffness(self, q: Modes) -> Float[Array, "modes modes"]:
-        """Derivative of the force of the cells: dP/dF at each point, between the slopes."""
-        answer = response(self.body, self._gradients(q), None, lambda work: work())
-        kinematics, count = self.body.kinematics, q.shape[0]
+    def stiffness(
+        self, q: Modes, rate: Float[Array, ""] | float | None = None
+    ) -> Float[Array, "modes modes"]:
+        """Derivative of the force of the cells: dP/dF at each point, between the slopes; and
+        `rate` [1/s] times the derivative of the viscous force by the rates, if it is given."""
+        F = self._gradients(q)
+        answer = response(self.body, F, None, lambda work: work())
+        kinematics, tangent = self.body.kinematics, {}
         blocks = tangent_entries(kinematics, answer.tangent)
-        tangent = {}
         for (i, k), block in zip(component_pairs(kinematics.dim), blocks, strict=True):
             for (e, _), row in zip(entries_of(kinematics, i), block, strict=True):
                 for (f, _), entry in zip(entries_of(kinematics, k), row, strict=True):
-                    tangent[e, f] = tangent[f, e] = (self.volumes * entry)[None]
-        # points last, so that many members are one product of matrices
-        every = range(self.slopes.shape[1])
-        bent = [sum(tangent[e, f] * self.slopes[:, f] for f in every) for e in every]
-        flat = self.slopes.reshape(count, -1)
-        total = jnp.stack(bent, axis=1).reshape(count, -1) @ flat.T
+                    tangent[e, f] = tangent[f, e] = entry
+        if rate is not None and self.viscosity is not None:
+            braking = self._viscous_tangent(F)
+            tangent = {at: entry + rate * braking[at] for at, entry in tangent.items()}
+        total = self._between(tangent)
         return total if self.body.modes is None else total + self._bulk(answer)
+
+    def tangent(self, q, rate):
+        return self.stiffness(q, rate) - jax.jacfwd(self.loads)(q)
 
     def _bulk(self, answer: Response) -> Float[Array, "modes modes"]:
         """Stiffness of the pressures of the cells, which couple the points of each."""
