@@ -15,13 +15,14 @@ from benchmarks.harness import Row, measure_once
 from sorojax import envs, fem, systems
 from sorojax.envs import solids
 from sorojax.envs.supply_line import begun, sent
-from sorojax.envs.tasks.solid_finger import PORTS, SolidFinger, full_finger
+from sorojax.envs.tasks.solid_finger import MAX_PRESSURE, PORTS, SolidFinger, full_finger
 from sorojax.units import mm
 
 WORKERS = 1  # nothing here calls the host
 SEEDS = (101, 102, 103, 104)  # of commands that nothing was chosen by
 HELD, CHANGES, FINE = 10, 6, 16  # steps of the task, commands, states of the whole in a step
 BAR = 1e-2
+MEMBERS, STEP_BAR, MEMBER_BAR = (1, 64, 1024, 4096), 200e-6, 50e-6
 
 
 def actions(seed: int) -> np.ndarray:
@@ -168,3 +169,33 @@ def rows():
                 error=error_of(np.asarray(tips), fine)[0] / move,
                 reference="midpoint in steps of 0.1 ms, over the largest move",
             )
+    for members in MEMBERS:
+        yield Row(
+            "sorojax",
+            {"quantity": "a step of a member", "step [ms]": 4.0, "members": members},
+            run_s=per_step(body, members),
+            bar=STEP_BAR if members == 1 else MEMBER_BAR,
+            bar_on="run_s",
+        )
+
+
+def per_step(body: SolidFinger, members: int) -> float:
+    """CPU time of a step of one member [s], each under its own pressures."""
+    count = 500 if members == 1 else 50
+    small = body.reduced.body
+    solid, zero = solids.Solid(small, jnp.ones(())), jnp.zeros_like(small.q)
+    held = jax.random.uniform(jax.random.key(0), (members, len(PORTS))) * MAX_PRESSURE
+
+    @jax.jit
+    @jax.vmap
+    def run(air):
+        start = solids.SolidBody(zero, zero)
+        return solids.rolled(solid, start, lambda t: air, time_step=4e-3, steps=count)
+
+    jax.block_until_ready(run(held))
+    times = []
+    for _ in range(3):
+        start = time.process_time()
+        jax.block_until_ready(run(held))
+        times.append(time.process_time() - start)
+    return sorted(times)[1] / count / members
