@@ -181,10 +181,10 @@ def _newton(now: _Step, guess: Modes, most: int) -> tuple[Modes, tuple[Array, Ar
     still = jax.jacfwd(now.unmoved)(guess)
     small = max(_SMALL, 64 * float(jnp.finfo(guess.dtype).eps))
 
-    def judged(at: _Pass, still: Bool[Array, ""]) -> _Pass:
+    def judged(at: _Pass, unmoved: Bool[Array, ""]) -> _Pass:
         left, size = now.balance(at.base + at.share * at.way)
         # at rest without a load, forces are nothing but rounding
-        balanced = (jnp.max(jnp.abs(left)) <= small * size) | still
+        balanced = (jnp.max(jnp.abs(left)) <= small * size) | unmoved
         return at._replace(left=left, balanced=balanced)
 
     def one(at: _Pass) -> _Pass:
