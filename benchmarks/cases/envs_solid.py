@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.harness import Row, measure_once
+from benchmarks.harness import Row, measure, measure_once
 from sorojax import envs, fem, systems
 from sorojax.envs import solids
 from sorojax.envs.supply_line import begun, sent
@@ -170,32 +170,25 @@ def rows():
                 reference="midpoint in steps of 0.1 ms, over the largest move",
             )
     for members in MEMBERS:
+        steps = 500 if members == 1 else 50
+        held = jax.random.uniform(jax.random.key(0), (members, len(PORTS))) * MAX_PRESSURE
+        timing = measure(lambda air, n=steps: held_steps(body, n, air), held, repeats=3)
         yield Row(
             "sorojax",
             {"quantity": "a step of a member", "step [ms]": 4.0, "members": members},
-            run_s=per_step(body, members),
+            **timing.per(steps * members).columns(),
             bar=STEP_BAR if members == 1 else MEMBER_BAR,
             bar_on="run_s",
         )
 
 
-def per_step(body: SolidFinger, members: int) -> float:
-    """CPU time of a step of one member [s], each under its own pressures."""
-    count = 500 if members == 1 else 50
+def held_steps(body: SolidFinger, count: int, held: jax.Array):
+    """Members after steps of the task from rest, each under its own pressures [Pa]."""
     small = body.reduced.body
     solid, zero = solids.Solid(small, jnp.ones(())), jnp.zeros_like(small.q)
-    held = jax.random.uniform(jax.random.key(0), (members, len(PORTS))) * MAX_PRESSURE
+    start = solids.SolidBody(zero, zero)
 
-    @jax.jit
-    @jax.vmap
     def run(air):
-        start = solids.SolidBody(zero, zero)
         return solids.rolled(solid, start, lambda t: air, time_step=4e-3, steps=count)
 
-    jax.block_until_ready(run(held))
-    times = []
-    for _ in range(3):
-        start = time.process_time()
-        jax.block_until_ready(run(held))
-        times.append(time.process_time() - start)
-    return sorted(times)[1] / count / members
+    return jax.vmap(run)(held)

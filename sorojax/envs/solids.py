@@ -136,12 +136,10 @@ def rolled(
 
     def run(solid: Solid, state: SolidBody) -> SolidBody:
         def one(state: SolidBody, number: Array) -> tuple[SolidBody, None]:
-            given = inputs((number + implicit) * h)
+            given = _by_port(solid.body, inputs((number + implicit) * h))
             ahead = state.q + early * state.v
-
-            inputs_now = _by_port(solid.body, given)
-            tangent = solid.body.tangent(ahead, inputs_now, 1 / early)
-            force = solid.body.pull(ahead, state.v, inputs_now)
+            tangent = solid.body.tangent(ahead, given, 1 / early)
+            force = solid.body.pull(ahead, state.v, given)
             a = jnp.linalg.solve(solid.mass * unit + early**2 * tangent, force)
             return SolidBody(state.q + h * (state.v + early * a), state.v + h * a), None
 
