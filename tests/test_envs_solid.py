@@ -140,6 +140,20 @@ def test_a_body_that_is_strained_beyond_its_training_ends_the_episode(small, get
     assert any(over) and not over[0] and bool(jnp.isfinite(state.body.q).all())
 
 
+def test_single_precision_is_that_of_the_process_and_moves_alike(small):
+    """Trained in double precision all the same; motion to 1e-4 of the largest coordinate."""
+    with jax.enable_x64(False):
+        single = envs.solid_finger(**SETTINGS)
+    numbers = [x for x in jax.tree.leaves(single) if eqx.is_inexact_array(x)]
+    assert numbers and all(x.dtype == jnp.float32 for x in numbers)
+    air = 0.8 * solid_finger.MAX_PRESSURE * jnp.eye(2)
+    want = envs_solid.held_steps(small.reduced.body, 50, air)
+    got = envs_solid.held_steps(single.reduced.body, 50, air.astype(jnp.float32))
+    for a, b in zip(got, want, strict=True):
+        assert a.dtype == jnp.float32
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-4 * float(jnp.abs(b).max()))
+
+
 def test_a_training_is_kept_and_a_damaged_file_trained_again(small, tmp_path, monkeypatch):
     monkeypatch.setenv("SOROJAX_CACHE", str(tmp_path))
     calls = []

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from sorojax import fem, mesh, robots, sdf
+from sorojax.fem.loads.facets import areas_of
 from sorojax.robots.locomotion import PORTS, crawler_mesh
 from sorojax.units import kPa, mm
 from tests.scripts import main_of
@@ -58,6 +59,9 @@ def test_a_crawler_may_stand_on_feet(groups):
         for a, b in zip(feet[:-1, 1], feet[1:, 0], strict=True)
     ]
     assert all(stands) and not any(inside)
+    assert np.ptp(y) == pytest.approx(2 * mm, rel=1e-3)
+    between = areas_of(problem, floor.facets)[y > (2 - 1e-6) * mm]  # holds up what sags
+    assert np.sum(between) == pytest.approx(40 * mm * (float(length) - wide))
     assert tuple(robots.crawler_gait(ports=crawler.ports)) == crawler.ports
 
 

@@ -176,6 +176,21 @@ def test_a_cantilever_on_a_floor_follows_the_full_body():
     assert float(small["body.reach"].max()) < 1.1
 
 
+@pytest.mark.slow
+def test_what_touched_nothing_in_training_may_touch_nothing_later():
+    """Points near the clamp are left out; a floor that rises to them ends the model."""
+    small = trained().body
+    (floor,) = small.contacts
+    assert len(floor.apart.places) > 0 and len(floor.places) > len(floor.apart.places)
+    film = pushed(small, 0.25)
+    nearest = jax.vmap(floor.clearance)(film.state["body"]["q"]).min()
+    assert film.status == Status.successful and 0.4 * mm < nearest < 4 * mm
+    higher = sdf.HalfPlane([0.0, nearest - 3.9 * mm], [0.0, 1.0])
+    raised = eqx.tree_at(lambda b: b.contacts[0].apart.obstacle, small, higher)
+    with pytest.raises(RuntimeError, match="left what its model describes"):
+        pushed(raised, 0.25)
+
+
 def end(numbers, body):
     """Where a block is after 30 ms, by its friction, its stiffness and the law of the floor."""
     changed = eqx.tree_at(

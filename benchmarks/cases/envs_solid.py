@@ -1,10 +1,11 @@
 """The finger of finite elements in its task beside the whole one: where the tip is, and what a
-step of each method costs.
+step of each method costs, in double and in single precision.
 
 Commands of both sides are drawn, and held for 0.2 s each; the whole finger moves by
 `fem.simulate` under the pressures that the supply delivers.
 """
 
+import itertools
 import time
 
 import jax
@@ -12,10 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.harness import Row, measure, measure_once
+from benchmarks.single import narrow
 from sorojax import envs, fem, systems
 from sorojax.envs import solids
 from sorojax.envs.supply_line import begun, sent
 from sorojax.envs.tasks.solid_finger import MAX_PRESSURE, PORTS, SolidFinger, full_finger
+from sorojax.systems.blocks.modal_body import ModalBody
 from sorojax.units import mm
 
 WORKERS = 1  # nothing here calls the host
@@ -23,6 +26,7 @@ SEEDS = (101, 102, 103, 104)  # of commands that nothing was chosen by
 HELD, CHANGES, FINE = 10, 6, 16  # steps of the task, commands, states of the whole in a step
 BAR = 1e-2
 MEMBERS, STEP_BAR, MEMBER_BAR = (1, 64, 1024, 4096), 200e-6, 50e-6
+PRECISIONS = ("double", "single")
 
 
 def actions(seed: int) -> np.ndarray:
@@ -62,18 +66,22 @@ def whole_tip(env, acts: np.ndarray) -> np.ndarray:
     return np.asarray(full.problem.mesh.points[node]) + moved
 
 
-def reduced_tip(env, acts: np.ndarray) -> np.ndarray:
+def reduced_tip(env, acts: np.ndarray, precision: str = "double") -> np.ndarray:
     """That of the task [m]."""
-    params = env.default_params()
+    env, params, acts = in_precision((env, env.default_params(), jnp.asarray(acts)), precision)
     state, _ = envs.reset(env, jax.random.key(0), params)
 
     def one(state, act):
         after = envs.step(env, jax.random.key(1), state, act, params)
         return after.state, (env.markers(after.state.body, params)[-1], after.info["diverged"])
 
-    tips, diverged = jax.jit(lambda s: jax.lax.scan(one, s, jnp.asarray(acts))[1])(state)
+    tips, diverged = jax.jit(lambda s: jax.lax.scan(one, s, acts)[1])(state)
     assert not diverged.any()
     return np.asarray(tips)
+
+
+def in_precision(tree, precision: str):
+    return narrow(tree) if precision == "single" else tree
 
 
 def error_of(tips: np.ndarray, want: np.ndarray) -> tuple[float, float]:
@@ -140,17 +148,20 @@ def rows():
     share = 100 * float(found.share)
     for seed in SEEDS:
         acts = actions(seed)
-        off, move = error_of(reduced_tip(env, acts), whole_tip(env, acts))
-        known = {"largest move [mm]": move / mm, "points [%]": share, **settings}
-        yield Row(
-            "sorojax",
-            {"quantity": "tip in the task", "commands": seed, **known},
-            error=off / move,
-            reference="fem.simulate, over its largest move",
-            bar=BAR,
-            bar_on="error",
-            compile_s=took,
-        )
+        want = whole_tip(env, acts)
+        for precision in PRECISIONS:
+            off, move = error_of(reduced_tip(env, acts, precision), want)
+            known = {"largest move [mm]": move / mm, "points [%]": share, **settings}
+            asked = {"quantity": "tip in the task", "commands": seed, "precision": precision}
+            yield Row(
+                "sorojax",
+                asked | known,
+                error=off / move,
+                reference="fem.simulate, over its largest move",
+                bar=BAR,
+                bar_on="error",
+                compile_s=took,
+            )
     given = jnp.asarray(pressures(env, acts))
     fine = np.asarray(by_steps(body, given, env.period, 1e-4, 0.5))
     methods = {
@@ -169,23 +180,24 @@ def rows():
                 error=error_of(np.asarray(tips), fine)[0] / move,
                 reference="midpoint in steps of 0.1 ms, over the largest move",
             )
-    for members in MEMBERS:
+    for members, precision in itertools.product(MEMBERS, PRECISIONS):
         steps = 500 if members == 1 else 50
-        held = jax.random.uniform(jax.random.key(0), (members, len(PORTS))) * MAX_PRESSURE
-        timing = measure(lambda air, n=steps: held_steps(body, n, air), held, repeats=3)
+        air = jax.random.uniform(jax.random.key(0), (members, len(PORTS))) * MAX_PRESSURE
+        solid, held = in_precision((body.reduced.body, air), precision)
+        timing = measure(lambda air, b=solid, n=steps: held_steps(b, n, air), held, repeats=3)
+        asked = {"quantity": "a step of a member", "step [ms]": 4.0, "members": members}
         yield Row(
             "sorojax",
-            {"quantity": "a step of a member", "step [ms]": 4.0, "members": members},
+            asked | {"precision": precision},
             **timing.per(steps * members).columns(),
             bar=STEP_BAR if members == 1 else MEMBER_BAR,
             bar_on="run_s",
         )
 
 
-def held_steps(body: SolidFinger, count: int, held: jax.Array):
+def held_steps(body: ModalBody, count: int, held: jax.Array):
     """Members after steps of the task from rest, each under its own pressures [Pa]."""
-    small = body.reduced.body
-    solid, zero = solids.Solid(small, jnp.ones(())), jnp.zeros_like(small.q)
+    solid, zero = solids.Solid(body, jnp.ones((), body.q.dtype)), jnp.zeros_like(body.q)
     start = solids.SolidBody(zero, zero)
 
     def run(air):

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from sorojax import _cache, io
 from sorojax.math.compiled import chunked_lanes
@@ -24,7 +24,6 @@ from sorojax.systems.blocks import (
 from sorojax.systems.blocks.modal_body import ModalBody
 from sorojax.systems.blocks.sampled_force import SampledForce
 
-_FARTHEST = 1.25  # of the strains of the training, as in a network
 _SETTLING = (0.05, 40, 20)  # [s], steps, and how many of them raise the pressures
 _LANES = 4  # members at once on a CPU, whose cache holds what they need
 
@@ -43,14 +42,21 @@ def kept(
     an earlier call. It is known by the settings, the version, and the text of what trains,
     that of the file `source` included.
 
-    Raises:
-        ValueError: Without double precision.
+    Trained and kept in double precision always; given in that of the process.
     """
-    if not jax.config.jax_enable_x64:  # pyright: ignore
-        raise ValueError(
-            f"{where}: got single precision, need double precision to train and to read. "
-            'Call jax.config.update("jax_enable_x64", True) first.'
-        )
+    double = jax.config.jax_enable_x64  # pyright: ignore
+    with jax.enable_x64(True):
+        made = _trained(where, settings, source, train, keep)
+        return made if double else jax.tree.map(_narrowed, made)
+
+
+def _trained(
+    where: str,
+    settings: tuple[float, ...],
+    source: Path,
+    train: Callable[..., Any],
+    keep: bool,
+) -> Any:
     if not keep:
         return train(*settings)
     from sorojax import __version__
@@ -67,6 +73,10 @@ def kept(
     made = train(*settings)
     io.save(path, made)
     return made
+
+
+def _narrowed(leaf: Any) -> Any:
+    return leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf
 
 
 class SolidBody(NamedTuple):
@@ -163,11 +173,6 @@ def settled(solid: Solid, given: Float[Array, " inputs"]) -> SolidBody:
 def places(body: ModalBody, q: Float[Array, " modes"]) -> Float[Array, "markers dim"]:
     """Where the markers of the body are [m]."""
     return jnp.stack([place + q @ moves for place, moves in body.markers.values()])
-
-
-def known(body: ModalBody, q: Float[Array, " modes"]) -> Bool[Array, ""]:
-    """Whether the strains are as far as the training allows."""
-    return body.force.reach(q) <= _FARTHEST
 
 
 def _by_port(body: ModalBody, given: Float[Array, " inputs"]) -> dict[str, Array]:

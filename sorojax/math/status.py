@@ -32,8 +32,8 @@ class Status(eqx.Enumeration):
     )
     outside_model = (
         "A state left what its model describes: gas below vacuum, a rod stretched more than "
-        "tenfold, or a trained body strained far beyond its training. Check units and limits, "
-        "take shorter steps, or train with larger inputs."
+        "tenfold, or a trained body strained or touching beyond its training. Check units "
+        "and limits, take shorter steps, or train with larger inputs."
     )
     unresolved = (
         "Nodes or steps are too coarse: with twice as many nodes a rod would end elsewhere, or "

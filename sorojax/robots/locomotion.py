@@ -199,8 +199,7 @@ def crawler_problem(
     stiffness: float = 2e8,
 ) -> fem.Problem:
     """The crawler on a flat floor, free to move: loads "gravity", "floor" and the pressures of
-    its ports [Pa]. A crawler with feet touches the floor with these alone: make them higher
-    than its sole sags.
+    its ports [Pa]. The floor holds up its whole underside, feet and what is between them.
 
     Args:
         crawler: Its dimensions; concrete.
@@ -218,12 +217,12 @@ def crawler_problem(
     cells = crawler_mesh(crawler, size, across)
     soft, stiff = crawler_rubbers() if rubbers is None else rubbers
     rubber = by_region(cells.num_cells, cells.regions, soft, {"sole": stiff})
-    side = float(crawler.length)
+    side, low = float(crawler.length), float(crawler.foot_height)
 
     def outside(p):
-        """The lowest line; without feet both ends, too."""
+        """The underside; without feet both ends, too."""
         ends = (p[0] < 1e-6 * side) | (p[0] > (1 - 1e-6) * side)
-        return (p[1] < 1e-6 * side) | (ends & (crawler.foot_height == 0))
+        return (p[1] < low + 1e-6 * side) | (ends & (low == 0))
 
     air = tuple(
         fem.Pressure(mesh.facets_on(cells, crawler.chambers(k)), name=name)

@@ -127,7 +127,7 @@ class SolidCrawl(AbstractCrawler):
 
         small = self._solid(params, goal)
         after, resolved = chunked_lanes(run, _LANES)(small, body)
-        return after, resolved & solids.known(small, after.q)
+        return after, resolved & small.is_known(after.q)
 
     def markers(self, body, params):
         return solids.places(self.body.reduced.body, body.q)

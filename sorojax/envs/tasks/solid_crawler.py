@@ -68,8 +68,7 @@ def solid_crawler(
         The crawler. Reports the progress of a training.
 
     Raises:
-        ValueError: If the size is not positive or there are too few shapes, and without double
-            precision.
+        ValueError: If the size is not positive or there are too few shapes.
     """
     _check.positive("solid_crawler", "size", size, "m", "3e-3 is that of the task.")
     settings = size, modes, tolerance

@@ -64,8 +64,7 @@ def solid_finger(
         The finger. Reports the progress of a training.
 
     Raises:
-        ValueError: If the size is not positive or there are too few shapes, and without double
-            precision.
+        ValueError: If the size is not positive or there are too few shapes.
 
     Example:
         >>> small = envs.solid_finger(4 * mm, modes=6, tolerance=0.05, keep=False)

@@ -96,7 +96,7 @@ class SolidReach(AbstractEnv):
         after = solids.rolled(
             solid, body, delivery, time_step=self.time_step, steps=self.substeps
         )
-        return after, solids.known(solid.body, after.q)
+        return after, solid.body.is_known(after.q)
 
     def markers(self, body, params):
         return solids.places(self.body.reduced.body, body.q)

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sorojax import fem
 from sorojax._jax.trace_state import is_traced
@@ -185,10 +185,14 @@ class ModalBody(AbstractBlock):
     def path_status(self, path):
         if not self.force.is_trained:
             return None
-        reach = jax.vmap(self.force.reach)(jax.lax.stop_gradient(path["q"]))
-        return Status.where(
-            jnp.all(reach <= _FARTHEST), Status.successful, Status.outside_model
-        )
+        known = jax.vmap(self.is_known)(jax.lax.stop_gradient(path["q"]))
+        return Status.where(jnp.all(known), Status.successful, Status.outside_model)
+
+    def is_known(self, q: Modes) -> Bool[Array, ""]:
+        """Whether the strains are as far as the training allows, and nothing touches that
+        touched nothing there."""
+        clear = [one.clearance(q) > 0 for one in self.contacts]
+        return jnp.all(jnp.stack([self.force.reach(q) <= _FARTHEST, *clear]))
 
     def initial_state(self):
         times = self.force.relaxation_times

@@ -185,13 +185,15 @@ def sampled_body(
     cells, points = cells[kept], None if points is None else points[kept]
     chosen = sampled_force(body, basis, cells, weights, points)
     known += [coordinates(body, basis, s.u) for s in told]
-    trained = jnp.max(jax.vmap(chosen.strain)(jnp.stack([*known, *free])))
+    shown_at = jnp.stack([*known, *free])
+    trained = jnp.max(jax.vmap(chosen.strain)(shown_at))
     branches = _branches(given, cells)
     viscosity = _viscosity(given, cells)
     chosen = dataclasses.replace(
         chosen, trained=trained, branches=branches, viscosity=viscosity
     )
-    small = eqx.tree_at(lambda b: b.force, whole, chosen)
+    touching = tuple(one.near(shown_at) for one in whole.contacts)
+    small = dataclasses.replace(whole, force=chosen, contacts=touching)
     error = _error(body, small, told) if told else _error_of_frames(body, small, whole, beside)
     report("sampled_body: cells", 1, 1)
     share = chosen.volumes.size / every.volumes.size

@@ -1,10 +1,13 @@
 """Contact of the surface of a reduced body with shapes that do not deform: the penalty and the
 friction of `fem.Contact`, on points that move in the shapes of a basis."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from sorojax import fem
 from sorojax.contact import Penalty, SpringSlider
@@ -16,6 +19,8 @@ from sorojax.systems.blocks.modal_basis import Basis, Modes
 
 #: Length of the spring at every point [m]; None without friction.
 Stretch = Float[Array, "points dim"] | None
+
+_NEAR = 0.03  # of the largest change of a gap in training
 
 
 class SurfaceContact(eqx.Module):
@@ -33,6 +38,7 @@ class SurfaceContact(eqx.Module):
         moves: Their derivatives by the modal coordinates.
         areas: At rest [m^2].
         offset: How far before the obstacle pressure starts [m]; None for nothing.
+        apart: Points that training left out, as they came nowhere near; None for none.
     """
 
     obstacle: AbstractSdf
@@ -42,6 +48,7 @@ class SurfaceContact(eqx.Module):
     moves: Float[Array, "modes points dim"]
     areas: Float[Array, " points"]
     offset: Float[Array, " points"] | None = None
+    apart: "SurfaceContact | None" = None
 
     def points(self, q: Modes) -> Float[Array, "points dim"]:
         """Where the points are [m]."""
@@ -50,6 +57,29 @@ class SurfaceContact(eqx.Module):
     def gap(self, q: Modes) -> Float[Array, " points"]:
         """How far the points are from where pressure starts [m]; negative inside."""
         return self._shifted(surface(self.obstacle, self.points(q))[0])
+
+    def clearance(self, q: Modes) -> Float[Array, ""]:
+        """Smallest gap of the points that were left out [m]; negative once one is inside."""
+        return jnp.min(self.apart.gap(q)) if self.apart is not None else jnp.asarray(jnp.inf)
+
+    def near(self, states: Float[Array, "states modes"]) -> "SurfaceContact":
+        """Without the points that come in none of these states as near as 3 % of the
+        largest change of a gap among them."""
+        gaps = np.asarray(jax.vmap(self.gap)(states))
+        close = gaps.min(axis=0) <= _NEAR * np.ptp(gaps, axis=0).max()
+        if close.all():
+            return self
+        return dataclasses.replace(self._of(close), apart=self._of(~close))
+
+    def _of(self, chosen: Bool[np.ndarray, " points"]) -> "SurfaceContact":
+        (at,) = np.nonzero(chosen)
+        return dataclasses.replace(
+            self,
+            places=self.places[at],
+            moves=self.moves[:, at],
+            areas=self.areas[at],
+            offset=None if self.offset is None else self.offset[at],
+        )
 
     def unstretched(self) -> Stretch:
         """The springs of friction without load."""
