@@ -27,7 +27,7 @@ FLOORS = {"training": 1.0, "asked": 0.85}  # coefficients of friction, over the 
 EVERY = 6  # frames of training
 DAMPING = fem.Rayleigh(mass=1.0, stiffness=1e-3)
 ERROR_BAR, SHARE_BAR, STEP_BAR, MEMBER_BAR, GRADIENT_BAR = 1e-2, 0.02, 200e-6, 50e-6, 1e-5
-MEMBERS = (1, 64, 1024, 4096)
+MEMBERS = {"inchworm": (1, 64, 1024, 4096), "flat sole": (1, 64, 1024)}
 
 CRAWLERS = {
     "inchworm": robots.Crawler(60 * mm, num_groups=1, foot_height=2 * mm),
@@ -192,7 +192,7 @@ def compared(name):
     slope = gradient(scene.stepped(small, 200))
     yield row("gradient", slope, GRADIENT_BAR, "central differences")
     yield Row("sorojax", cells | {"quantity": "a step of the full body"}, run_s=full_step)
-    for members in MEMBERS:
+    for members in MEMBERS[name]:
         count = 800 if members == 1 else 200  # a cycle, or its first quarter
         took = per_step(scene.stepped(small, count), count, members)
         known = cells | {"quantity": "a step of a member", "members": members}

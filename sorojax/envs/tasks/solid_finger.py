@@ -44,7 +44,7 @@ class SolidFinger(eqx.Module):
 
 
 def solid_finger(
-    size: float = _SIZE, *, modes: int = _MODES, tolerance: float = 5e-3, keep: bool = True
+    size: float = _SIZE, *, modes: int = _MODES, tolerance: float = 4.5e-3, keep: bool = True
 ) -> SolidFinger:
     """The silicone finger of `SolidReach`, trained once and kept on this computer.
 
