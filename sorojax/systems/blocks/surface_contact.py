@@ -64,10 +64,10 @@ class SurfaceContact(eqx.Module):
 
     def near(self, states: Float[Array, "states modes"]) -> "SurfaceContact":
         """Without the points that come in none of these states as near as 3 % of the
-        largest change of a gap among them."""
+        largest change of a gap among them; with all if none does."""
         gaps = np.asarray(jax.vmap(self.gap)(states))
         close = gaps.min(axis=0) <= _NEAR * np.ptp(gaps, axis=0).max()
-        if close.all():
+        if close.all() or not close.any():
             return self
         return dataclasses.replace(self._of(close), apart=self._of(~close))
 
