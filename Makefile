@@ -61,7 +61,7 @@ bench: $(VENV)/.run
 	$(PY) -m benchmarks $(if $(QUICK),--quick)
 
 bench-device: $(VENV)/.run
-	JAX_PLATFORMS=cuda,cpu $(PY) -m benchmarks device.sdf device.rods device.fem
+	JAX_PLATFORMS=cuda,cpu $(PY) -m benchmarks device.sdf device.rods device.fem device.envs
 
 docs: $(VENV)/.docs
 	$(PY) -m sphinx -b html -q -W --keep-going docs docs/_build/html

@@ -9,14 +9,15 @@ import pytest
 
 from benchmarks import devices, discover, page, rows
 from benchmarks.blocks import bent, block
+from benchmarks.cases import device_envs
 from benchmarks.fingers import finger, random_states
 from benchmarks.single import narrow
-from sorojax import fem, mesh, rod as R
+from sorojax import envs, fem, mesh, rod as R
 from sorojax.fem.equilibrium.linear import linearise, prepare
 from sorojax.math import compiled as compiled_module
 
 
-@pytest.mark.parametrize("name", ["device.fem", "device.rods", "device.sdf"])
+@pytest.mark.parametrize("name", ["device.envs", "device.fem", "device.rods", "device.sdf"])
 def test_without_an_accelerator_a_case_says_so(name):
     (row,) = discover.load(name, discover.cases()[name]).rows()
     assert "Install jax[cuda13]" in row.settings["reason"]
@@ -42,6 +43,15 @@ def test_both_devices_have_a_row_with_their_error():
         for row in rows:
             assert row.holds and row.error <= error
             assert row.settings["device"] == "one CPU core"
+
+
+def test_steps_of_environments_have_rows_on_both_devices(monkeypatch):
+    """Two CPUs stand for both."""
+    monkeypatch.setattr(devices, "found", lambda: devices.jax.devices("cpu")[:1] * 2)
+    monkeypatch.setattr(device_envs, "quick", lambda: True)
+    found = list(device_envs.rows({"finger": (envs.FingerReach, (True,))}, shared=64))
+    assert [row.settings["members"] for row in found] == [64, 64, 1024]
+    assert all(row.holds for row in found) and found[0].error < 1e-9
 
 
 def test_an_accelerator_takes_all_cells_at_once_with_the_same_tangent(monkeypatch):

@@ -216,6 +216,31 @@ def test_a_batch_is_shared_among_devices():
     run(DEVICES, XLA_FLAGS="--xla_force_host_platform_device_count=2")
 
 
+ENVIRONMENTS = """
+import jax
+jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp
+import numpy as np
+from sorojax import envs
+env = envs.FingerReach()
+params, key = env.default_params(), jax.random.key(0)
+states, _ = jax.vmap(lambda key: envs.reset(env, key, params))(jax.random.split(key, 4))
+actions = jax.random.uniform(key, (4, env.num_actions), minval=-1.0)
+step = jax.vmap(lambda state, action: envs.step(env, key, state, action, params))
+apart = jax.P("members")
+mesh = jax.sharding.Mesh(np.array(jax.devices()), ("members",))
+split = jax.shard_map(step, mesh=mesh, in_specs=apart, out_specs=apart, check_vma=False)
+alone, both = jax.jit(step)(states, actions), jax.jit(split)(states, actions)
+assert len(both.reward.sharding.device_set) == 2
+assert jnp.allclose(alone.observation, both.observation, rtol=0, atol=1e-9)
+"""
+
+
+@pytest.mark.slow
+def test_environments_are_shared_among_devices():
+    run(ENVIRONMENTS, XLA_FLAGS="--xla_force_host_platform_device_count=2")
+
+
 # Sampling
 
 
